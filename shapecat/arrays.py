@@ -1,0 +1,96 @@
+"""Shape-checked, read-only arrays for the records."""
+
+from dataclasses import dataclass, field, fields
+from typing import Any, TypeAlias, dataclass_transform
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike, NDArray
+
+__all__ = ["F4", "F8", "I4", "U1", "U2", "U4", "Bool", "Record", "array", "freeze"]
+
+F4: TypeAlias = NDArray[Any]
+F8: TypeAlias = NDArray[Any]
+I4: TypeAlias = NDArray[Any]
+U1: TypeAlias = NDArray[Any]
+U2: TypeAlias = NDArray[Any]
+U4: TypeAlias = NDArray[Any]
+Bool: TypeAlias = NDArray[Any]
+# The aliases name the element type for the reader; `freeze` enforces it when a record is made.
+
+
+def freeze(
+    value: ArrayLike, shape: str, dtype: DTypeLike, sizes: dict[str, int] | None = None
+) -> NDArray[Any]:
+    """Return ``value`` as a read-only array of the stated shape and type.
+
+    Parameters
+    ----------
+    value : anything numpy can read without loss of kind.
+    shape : axes separated by blanks: a number is that size, a name is any size, the same
+        name always the same size. ``""`` is a scalar.
+    dtype : numpy type of the result.
+    sizes : sizes of named axes met so far; new names are added to it.
+
+    Returns
+    -------
+    A read-only view where the type fits already, otherwise a read-only copy.
+
+    Raises
+    ------
+    ValueError : the shape does not fit.
+
+    Examples
+    --------
+    >>> freeze([[0, 0, 1]], "n 3", "f4").flags.writeable
+    False
+    >>> freeze([1, 2], "3", "f4")
+    Traceback (most recent call last):
+    ...
+    ValueError: expected shape (3), got (2,)
+    """
+    sizes = {} if sizes is None else sizes
+    result = np.asarray(value, dtype=dtype).view()
+    axes = shape.split()
+    fits = len(axes) == result.ndim and all(
+        size == (int(axis) if axis.isdigit() else sizes.setdefault(axis, size))
+        for axis, size in zip(axes, result.shape, strict=True)
+    )
+    if not fits:
+        known = f" with {sizes}" if sizes else ""
+        msg = f"expected shape ({', '.join(axes)}){known}, got {result.shape}"
+        raise ValueError(msg)
+    result.flags.writeable = False
+    return result
+
+
+def array(shape: str, dtype: str, **options: Any) -> Any:
+    """Declare an array field of a `Record`: its shape as in `freeze`, and its type."""
+    return field(metadata={"shape": shape, "dtype": dtype}, **options)
+
+
+@dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(array, field))
+class Record:
+    """Base of the frozen records: array fields are checked, frozen, and tied in their sizes.
+
+    Every subclass is a frozen dataclass. A field declared by ``array("n 3", "f4")`` has as many
+    rows as every other field of the same record that names an axis ``n``. A field whose value is
+    ``None`` is left alone.
+    """
+
+    def __init_subclass__(cls) -> None:
+        """Make the subclass a frozen dataclass."""
+        dataclass(frozen=True, eq=False)(cls)
+
+    def __post_init__(self) -> None:
+        """Freeze the array fields."""
+        sizes: dict[str, int] = {}
+        for item in fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
+            value = getattr(self, item.name)
+            if "shape" not in item.metadata or value is None:
+                continue
+            try:
+                frozen = freeze(value, item.metadata["shape"], item.metadata["dtype"], sizes)
+            except ValueError as error:
+                msg = f"{type(self).__name__}.{item.name}: {error}"
+                raise ValueError(msg) from None
+            object.__setattr__(self, item.name, frozen)

@@ -1,0 +1,171 @@
+"""The settings: one frozen tree with defaults, read from TOML, stored in every output."""
+
+import dataclasses
+import difflib
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+
+from shapecat.errors import ConfigError
+
+__all__ = [
+    "DetectionSettings",
+    "OutputSettings",
+    "Settings",
+    "SurfaceSettings",
+    "TrackingSettings",
+    "load_settings",
+    "with_overrides",
+]
+
+
+@dataclass(frozen=True)
+class DetectionSettings:
+    """Planes and object candidates (thesis ch. 4). Lengths in metres, angles in degrees."""
+
+    max_range_m: float = 2.0
+    """Points farther from the sensor are ignored (thesis 4.2)."""
+    min_points: int = 60
+    """Candidates with fewer points at full resolution are dropped."""
+
+
+@dataclass(frozen=True)
+class SurfaceSettings:
+    """Growing Neural Gas (thesis ch. 5)."""
+
+    method: Literal["fritzke", "thesis"] = "fritzke"
+    """When a neuron is inserted: every lambda signals, or on accumulated error (Alg. 4)."""
+    neurons: int = 80
+    """Neurons to grow to; fewer on small clouds."""
+    signals: int = 6000
+    """Signals fired in all."""
+    voxel_m: float = 0.005
+    """Edge of the voxels an object's points are averaged in before the gas."""
+
+
+@dataclass(frozen=True)
+class TrackingSettings:
+    """Nearest-centroid tracker and fusion (thesis 7.5.2)."""
+
+    association: Literal["hungarian", "greedy"] = "hungarian"
+    gate_m: float = 0.12
+    """Largest distance between a track and the centroid of its next detection."""
+    min_hits: int = 2
+    """Detections a track needs to be confirmed; fewer only if the recording is that short."""
+    max_missed_s: float = 5.0
+    """A track that was not seen for longer has ended."""
+    fusion: Literal["mean", "product", "vote"] = "mean"
+
+
+@dataclass(frozen=True)
+class OutputSettings:
+    """What annotated.mcap and review.rrd hold."""
+
+    markers: bool = False
+    """Also write visualization_msgs/MarkerArray for RViz."""
+    cloud_points: int = 30_000
+    """Points of a cloud kept in review.rrd; 0 keeps all."""
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The whole tree. ``seed`` fixes every random choice."""
+
+    seed: int = 0
+    detection: DetectionSettings = field(default_factory=DetectionSettings)
+    surface: SurfaceSettings = field(default_factory=SurfaceSettings)
+    tracking: TrackingSettings = field(default_factory=TrackingSettings)
+    outputs: OutputSettings = field(default_factory=OutputSettings)
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the tree as plain dictionaries, as stored in the outputs."""
+        return dataclasses.asdict(self)
+
+
+def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Settings:
+    """Read settings from a TOML file, then apply ``a.b=value`` overrides.
+
+    Raises
+    ------
+    ConfigError : the file cannot be read, or names a setting that does not exist (the nearest
+        name is offered) or a value that does not fit.
+    """
+    tree: Mapping[str, Any] = {}
+    if path is not None:
+        try:
+            tree = tomllib.loads(path.read_text("utf-8"))
+        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+            msg = f"{path}: not a readable TOML file: {error}"
+            raise ConfigError(msg) from error
+    return with_overrides(_build(Settings(), tree, ""), overrides)
+
+
+def with_overrides(settings: Settings, overrides: Sequence[str]) -> Settings:
+    """Apply overrides such as ``detection.max_range_m=1.5``, in order.
+
+    Examples
+    --------
+    >>> with_overrides(Settings(), ["tracking.gate_m=0.2"]).tracking.gate_m
+    0.2
+    """
+    for text in overrides:
+        name, equals, value = text.partition("=")
+        if not equals:
+            msg = f"--set {text}: expected name=value, for example tracking.gate_m=0.2"
+            raise ConfigError(msg)
+        tree: Any = _parse_value(value)
+        for part in reversed(name.strip().split(".")):
+            tree = {part: tree}
+        settings = _build(settings, tree, "")
+    return settings
+
+
+def _parse_value(text: str) -> Any:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return text.strip()
+
+
+def _build(base: Any, tree: Mapping[str, Any], path: str) -> Any:
+    hints = get_type_hints(type(base))
+    changes = {}
+    for key, value in tree.items():
+        name = f"{path}{key}"
+        if key not in hints:
+            near = difflib.get_close_matches(key, hints, 1)
+            hint = f"; did you mean {path}{near[0]}?" if near else f"; known: {', '.join(hints)}"
+            msg = f"unknown setting {name}{hint}"
+            raise ConfigError(msg)
+        current = getattr(base, key)
+        if dataclasses.is_dataclass(current):
+            if not isinstance(value, Mapping):
+                msg = f"{name} is a group of settings, got {value!r}"
+                raise ConfigError(msg)
+            changes[key] = _build(current, value, f"{name}.")
+        else:
+            changes[key] = _checked(name, value, hints[key])
+    return dataclasses.replace(base, **changes)
+
+
+def _checked(name: str, value: Any, kind: Any) -> Any:
+    if get_origin(kind) is Literal:
+        if value not in get_args(kind):
+            msg = f"{name} must be one of {', '.join(map(str, get_args(kind)))}, got {value!r}"
+            raise ConfigError(msg)
+        return value
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if type(value) is not kind:
+        msg = f"{name} must be {kind.__name__}, got {value!r}"
+        raise ConfigError(msg)
+    if isinstance(value, float) and not abs(value) < float("inf"):
+        msg = f"{name} must be finite, got {value!r}"
+        raise ConfigError(msg)
+    if not isinstance(value, bool | str) and value < 0:
+        msg = f"{name} must not be negative, got {value!r}"
+        raise ConfigError(msg)
+    return value

@@ -1,0 +1,149 @@
+"""Poses, quaternions, boxes and the gravity frame: small numeric pieces shared by the stages."""
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shapecat.arrays import F4, F8
+from shapecat.jit import kernel
+from shapecat.types import Box, Pose
+
+__all__ = [
+    "IDENTITY",
+    "compose",
+    "gravity_rotation",
+    "inverse",
+    "quaternion_from_rotation",
+    "rotation_from_quaternion",
+    "transform",
+    "upright_box",
+]
+
+IDENTITY = Pose(np.eye(3), np.zeros(3))
+"""The pose that changes nothing."""
+
+
+def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
+    """Chain two poses into ``a_from_c``."""
+    return Pose(
+        a_from_b.rotation @ b_from_c.rotation,
+        a_from_b.rotation @ b_from_c.translation + a_from_b.translation,
+    )
+
+
+def inverse(a_from_b: Pose) -> Pose:
+    """Return ``b_from_a``."""
+    return Pose(a_from_b.rotation.T, -a_from_b.rotation.T @ a_from_b.translation)
+
+
+def transform(a_from_b: Pose, points: ArrayLike) -> F8:
+    """Move points (n, 3) or one point (3,) from frame b to frame a."""
+    return np.asarray(np.asarray(points, np.float64) @ a_from_b.rotation.T + a_from_b.translation)
+
+
+def rotation_from_quaternion(quaternion: ArrayLike) -> F8:
+    """Return the (3, 3) rotation of a quaternion (x, y, z, w) of any length but zero.
+
+    Raises
+    ------
+    ValueError : the quaternion is zero or not finite.
+    """
+    q = np.asarray(quaternion, np.float64)
+    norm = float(q @ q)
+    if not (np.isfinite(norm) and norm > 1e-12):
+        msg = f"not a rotation: quaternion {q.tolist()}"
+        raise ValueError(msg)
+    x, y, z, w = q
+    s = 2.0 / norm
+    return np.array(
+        [
+            [1 - s * (y * y + z * z), s * (x * y - z * w), s * (x * z + y * w)],
+            [s * (x * y + z * w), 1 - s * (x * x + z * z), s * (y * z - x * w)],
+            [s * (x * z - y * w), s * (y * z + x * w), 1 - s * (x * x + y * y)],
+        ]
+    )
+
+
+def quaternion_from_rotation(rotation: ArrayLike) -> F8:
+    """Return the unit quaternion (x, y, z, w), w >= 0, of a rotation matrix.
+
+    Source: Shepperd 1978, by the largest of the four squared components.
+    """
+    r = np.asarray(rotation, np.float64)
+    trace = float(np.trace(r))
+    squared = np.array([*(2 * np.diag(r) - trace), trace]) + 1.0
+    largest = int(np.argmax(squared))
+    x, y, z = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+    if largest == 3:
+        q = np.array([x, y, z, squared[3]])
+    else:
+        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
+        q = np.zeros(4)
+        q[i] = squared[i]
+        q[j] = r[i, j] + r[j, i]
+        q[k] = r[i, k] + r[k, i]
+        q[3] = (x, y, z)[i]
+    q /= np.linalg.norm(q)
+    return -q if q[3] < 0 else q
+
+
+def gravity_rotation(up: ArrayLike) -> F8:
+    """Return ``level_from_sensor``: a (3, 3) rotation that turns ``up`` into +z.
+
+    The level x axis is the sensor's x axis made horizontal, or its y axis where that is steeper
+    than about 45 degrees, so that the result changes smoothly with ``up``.
+
+    Examples
+    --------
+    >>> gravity_rotation([0, -1, 0]) @ [0, -1, 0]
+    array([0., 0., 1.])
+    """
+    z = np.asarray(up, np.float64)
+    z = z / np.linalg.norm(z)
+    axis = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.7 else np.array([0.0, 1.0, 0.0])
+    x = axis - (axis @ z) * z
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def upright_box(points: F4, up: ArrayLike) -> Box:
+    """Return the smallest box around ``points`` (n, 3) with its z axis along ``up``.
+
+    Its yaw is the one of 60 (every 1.5 degrees) with the smallest horizontal area, the first on
+    ties. A single point gives a box of size 0.
+
+    Raises
+    ------
+    ValueError : there is no point.
+    """
+    if len(points) == 0:
+        msg = "a box needs at least one point"
+        raise ValueError(msg)
+    level = gravity_rotation(up)
+    local = np.ascontiguousarray((points @ level.T.astype(np.float32)).T)
+    angles = np.arange(60) * (np.pi / 120)
+    c, s = np.cos(angles), np.sin(angles)
+    along = _range_along(local[0], local[1], c, s)
+    across = _range_along(local[0], local[1], -s, c)
+    best = int(np.argmin((along[:, 1] - along[:, 0]) * (across[:, 1] - across[:, 0])))
+    low = np.array([along[best, 0], across[best, 0], local[2].min()])
+    high = np.array([along[best, 1], across[best, 1], local[2].max()])
+    box_from_level = np.array([[c[best], s[best], 0.0], [-s[best], c[best], 0.0], [0.0, 0.0, 1.0]])
+    sensor_from_box = (box_from_level @ level).T
+    return Box(
+        sensor_from_box @ ((low + high) / 2), high - low, quaternion_from_rotation(sensor_from_box)
+    )
+
+
+@kernel(fast=True)
+def _range_along(x: F4, y: F4, dx: F8, dy: F8) -> F8:
+    """Return (k, 2) the least and greatest ``x * dx + y * dy`` for each of k directions."""
+    result = np.zeros((dx.size, 2), np.float64)
+    for k in range(dx.size):
+        a, b = np.float32(dx[k]), np.float32(dy[k])
+        low = high = a * x[0] + b * y[0]
+        for i in range(x.size):
+            value = a * x[i] + b * y[i]
+            low = value if value < low else low
+            high = value if value > high else high
+        result[k] = low, high
+    return result

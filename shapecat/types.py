@@ -1,0 +1,262 @@
+"""The records that travel through the house: frozen, shape-checked, read-only.
+
+Units are metres, seconds, radians; stamps are integer nanoseconds; quaternions are x, y, z, w.
+Transforms are named ``a_from_b``. "Sensor frame" is the frame named by ``frame_id``; a depth
+camera's is the optical frame (x right, y down, z forward).
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, U2, U4, Record, array
+
+__all__ = [
+    "CATEGORIES",
+    "Box",
+    "Camera",
+    "Candidate",
+    "Detection",
+    "Frame",
+    "LabelledFrame",
+    "LabelledObject",
+    "NeuralGas",
+    "Perception",
+    "Plane",
+    "Pose",
+    "Scene",
+]
+
+CATEGORIES = ("cup", "can", "box", "bottle", "bowl", "plate", "ball")
+"""The shape categories of the default model, in the order of every posterior."""
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera: pixel (u, v) sees the ray ((u - cx) / fx, (v - cy) / fy, 1)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+class Pose(Record):
+    """A rigid transform ``a_from_b``: ``p_a = rotation @ p_b + translation``."""
+
+    rotation: F8 = array("3 3", "f8")
+    translation: F8 = array("3", "f8")
+
+
+class Frame(Record):
+    """One reading of a depth sensor.
+
+    Either organized, ``depth`` with its ``camera``, or unorganized, ``points``; never both.
+    Indices into a frame count pixels row by row, or points.
+
+    Attributes
+    ----------
+    topic : the stream it came from.
+    index : its number in that stream, from 0, counting skipped frames too.
+    stamp_ns : time of the measurement (``header.stamp``).
+    log_time_ns : time it was recorded.
+    frame_id : name of the sensor frame.
+    depth : (h, w) metres along the optical axis; 0 where there is no reading, never NaN.
+    points : (n, 3) metres, sensor frame, finite; rows of NaN where there is no reading.
+    """
+
+    topic: str
+    index: int
+    stamp_ns: int
+    log_time_ns: int
+    frame_id: str
+    depth: F4 | None = array("h w", "f4", default=None)
+    camera: Camera | None = None
+    points: F4 | None = array("n 3", "f4", default=None)
+
+    def __post_init__(self) -> None:
+        """Check that the frame is of exactly one kind."""
+        super().__post_init__()
+        if (self.depth is None) == (self.points is None):
+            msg = "a Frame has either depth or points"
+            raise ValueError(msg)
+        if self.depth is not None and (
+            self.camera is None or self.depth.shape != (self.camera.height, self.camera.width)
+        ):
+            msg = f"depth {self.depth.shape} needs a camera of the same size, got {self.camera}"
+            raise ValueError(msg)
+
+    @property
+    def organized(self) -> bool:
+        """Whether the frame is a depth image."""
+        return self.depth is not None
+
+    def xyz(self, indices: U4 | None = None) -> F4:
+        """Return the points at ``indices`` (all by default): (n, 3) metres, sensor frame.
+
+        Points without a reading are rows of NaN.
+        """
+        if self.depth is None or self.camera is None:
+            points = self.points if self.points is not None else np.zeros((0, 3), np.float32)
+            return points if indices is None else points[indices]
+        camera, flat = self.camera, self.depth.reshape(-1)
+        pixel = np.arange(flat.size) if indices is None else np.asarray(indices, np.int64)
+        z = flat[pixel]
+        v, u = np.divmod(pixel, camera.width)
+        z = np.where(z > 0, z, np.float32(np.nan))
+        result = np.zeros((pixel.size, 3), np.float32)
+        result[:, 0] = (u - camera.cx) / camera.fx * z
+        result[:, 1] = (v - camera.cy) / camera.fy * z
+        result[:, 2] = z
+        return result
+
+
+class Plane(Record):
+    """A horizontal supporting plane: the points with ``normal @ p == offset``.
+
+    Attributes
+    ----------
+    normal : (3,) unit vector, sensor frame, pointing up.
+    offset : metres; the height of a point above the plane is ``normal @ p - offset``.
+    outline : (k, 3) metres, sensor frame: corners of its convex outline, in order.
+    height_m : height above the lowest plane of the scene, along the up direction.
+    """
+
+    normal: F4 = array("3", "f4")
+    offset: float
+    outline: F4 = array("k 3", "f4")
+    area_m2: float
+    height_m: float
+
+
+class Box(Record):
+    """An oriented box: its z axis is up, its yaw follows the points.
+
+    ``center`` (3,) metres and ``orientation`` (x, y, z, w) of the box axes in the sensor frame;
+    ``size`` (3,) metres, full lengths along the box axes.
+    """
+
+    center: F4 = array("3", "f4")
+    size: F4 = array("3", "f4")
+    orientation: F4 = array("4", "f4")
+
+
+class Candidate(Record):
+    """Points that may be one object.
+
+    Attributes
+    ----------
+    indices : (n,) ascending indices into the frame, at full resolution.
+    plane : position of the plane it stands on in `Scene.planes`; None if on none.
+    on_candidate : position of the candidate it stands on in `Scene.candidates`, or None.
+    support_m : height of what it stands on above `plane`, metres (0 when it stands on the plane).
+    touches_border : it is cut by the border of the image.
+    occluded : something nearer hides a part of it.
+    """
+
+    indices: U4 = array("n", "u4")
+    box: Box
+    plane: int | None
+    on_candidate: int | None
+    support_m: float
+    touches_border: bool
+    occluded: bool
+
+
+class Scene(Record):
+    """What detection finds in one frame.
+
+    ``up`` is a (3,) unit vector in the sensor frame; ``planes`` ascend in height.
+    """
+
+    up: F4 = array("3", "f4")
+    planes: tuple[Plane, ...]
+    candidates: tuple[Candidate, ...]
+
+
+class NeuralGas(Record):
+    """A graph that has learned the surface of a point cloud (thesis ch. 5).
+
+    ``neurons`` (k, 3) metres, in the frame of the points; ``edges`` (m, 2) pairs of neurons with
+    ``i < j``, each once, in lexicographic order.
+    """
+
+    neurons: F4 = array("k 3", "f4")
+    edges: U2 = array("m 2", "u2")
+
+    @cached_property
+    def triangles(self) -> U2:
+        """(t, 3) the triangles of the graph, for display: each i < j < k once."""
+        neighbours: list[set[int]] = [set() for _ in self.neurons]
+        for i, j in self.edges.tolist():
+            neighbours[i].add(j)
+        found = [
+            (i, j, k) for i, j in self.edges.tolist() for k in sorted(neighbours[i] & neighbours[j])
+        ]
+        return np.array(found, np.uint16).reshape(-1, 3)
+
+
+class Detection(Record):
+    """One object in one frame: everything later phases need.
+
+    ``neurons`` of ``gas`` are in the sensor frame; ``posterior`` sums to 1 in the order of the
+    model's categories; ``novelty`` is 0 for a familiar shape and above 1 beyond the threshold.
+    """
+
+    candidate: Candidate
+    gas: NeuralGas
+    descriptor: F4 = array("d", "f4")
+    posterior: F4 = array("c", "f4")
+    novelty: float
+    seconds: float
+
+
+class Perception(Record):
+    """All that is known of one frame without looking at any other."""
+
+    topic: str
+    index: int
+    stamp_ns: int
+    frame_id: str
+    scene: Scene
+    detections: tuple[Detection, ...]
+    seconds: dict[str, float]
+
+
+class LabelledObject(Record):
+    """One object in one frame as the outputs show it: a detection with its track's label.
+
+    ``box`` is in the sensor frame, as are the ``neurons`` of ``gas``; ``posterior`` is this single
+    view's, ``causal`` the track's up to this frame; ``confidence`` and ``category`` are final.
+    """
+
+    track: int
+    category: str
+    confidence: float
+    box: Box
+    indices: U4 = array("n", "u4")
+    gas: NeuralGas
+    posterior: F4 = array("c", "f4")
+    causal: F4 = array("c", "f4")
+
+
+class LabelledFrame(Record):
+    """One frame as the outputs show it, without its points.
+
+    ``fixed_from_sensor`` is None where the recording has no fixed frame; ``ended`` names the
+    tracks shown in an earlier frame of the topic that are not seen again.
+    """
+
+    topic: str
+    index: int
+    stamp_ns: int
+    log_time_ns: int
+    frame_id: str
+    fixed_from_sensor: Pose | None
+    planes: tuple[Plane, ...]
+    objects: tuple[LabelledObject, ...]
+    ended: tuple[int, ...]
+    seconds: dict[str, float]
