@@ -1,1 +1,1 @@
-"""Commands."""
+"""The command line: one thin command a file over the library."""

@@ -42,6 +42,10 @@ class SurfaceSettings:
     """Neurons to grow to; fewer on small clouds."""
     signals: int = 6000
     """Signals fired in all."""
+    warm_signals: int = 400
+    """Signals fired when the gas starts from an earlier graph of the same track."""
+    component_share: float = 0.35
+    """Separate parts of the graph with a smaller share of the points are dropped."""
     voxel_m: float = 0.005
     """Edge of the voxels an object's points are averaged in before the gas."""
 

@@ -1,1 +1,22 @@
-"""tracking."""
+"""Objects over time: association, tracks, hindsight and fusion (thesis 7.5.2).
+
+`track_recording` is the whole of it: detections per frame in, tracks out.
+"""
+
+from shapecat.tracking.fusion import causal, fuse
+from shapecat.tracking.hindsight import Fragments, merge_fragments, scene_cuts
+from shapecat.tracking.records import FrameDetections, Track
+from shapecat.tracking.recording import track_recording
+from shapecat.tracking.tracker import Tracker
+
+__all__ = [
+    "FrameDetections",
+    "Fragments",
+    "Track",
+    "Tracker",
+    "causal",
+    "fuse",
+    "merge_fragments",
+    "scene_cuts",
+    "track_recording",
+]

@@ -1,0 +1,62 @@
+# Everything a developer does, by name. `make` alone lists the targets.
+
+PYTHON ?= python3
+BIN := .venv/bin
+OPEN3D_LIBRARIES := libegl1 libgl1 libx11-6 libusb-1.0-0
+DEMO := demo
+
+.DEFAULT_GOAL := help
+.PHONY: help setup demo test lint format bench model lock clean
+
+help: ## list the targets
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
+
+setup: .venv/ready ## make the virtual environment .venv from the lock file
+
+.venv/ready: pyproject.toml requirements.lock
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' \
+	    || { echo "shapecat needs Python 3.11 or newer: make PYTHON=python3.12 ..." >&2; exit 1; }
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || $(call apt,python3-venv)
+	$(PYTHON) -m venv .venv
+	@echo "installing the locked packages, about two minutes and 2.5 GB"
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@$(BIN)/python -c 'import open3d' >/dev/null 2>&1 || $(call apt,$(OPEN3D_LIBRARIES)) \
+	    || echo "(only reading .pcd/.ply data sets and smoothing need them)" >&2
+	@touch $@
+
+demo: setup ## simulate a recording, process it, and say where the results lie
+	$(BIN)/shapecat simulate $(DEMO)/tabletop.mcap --scene tabletop --frames 60 --seed 7
+	$(BIN)/shapecat process $(DEMO)/tabletop.mcap --out $(DEMO)/out --overwrite
+
+test: setup ## run all tests
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+
+lint: setup ## check style and types
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+	$(BIN)/mypy
+	$(BIN)/codespell shapecat cli schemas tests benchmarks docs *.md
+
+format: setup ## format the code
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix-only .
+
+bench: setup ## measure the speed of the stages, print a table
+	$(BIN)/python -m benchmarks
+
+model: setup ## train the default model anew from the simulator
+	$(BIN)/python -m shapecat.models.training
+
+lock: setup ## renew requirements.lock from pyproject.toml
+	$(BIN)/pip install --quiet uv
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --group dev --generate-hashes \
+	    --no-emit-index-url --no-header pyproject.toml --output-file requirements.lock
+
+clean: ## remove the environment and everything made
+	rm -rf .venv build dist $(DEMO) *.egg-info
+
+# Install Debian packages where that is allowed, otherwise name the command.
+apt = { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null \
+    && apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null; } \
+    || { echo "missing system libraries: sudo apt-get install -y $(1)" >&2; false; }

@@ -1,0 +1,52 @@
+"""The entry point: the group of commands, and the one place where known errors become one line."""
+
+import logging
+import sys
+from typing import Any
+
+import click
+
+from shapecat import __version__
+from shapecat.errors import ShapecatError
+
+from .annotate import annotate
+from .evaluate import evaluate
+from .info import info
+from .process import process
+from .simulate import simulate
+from .train import train
+from .view import view
+
+
+class _Commands(click.Group):
+    """Known errors end as one line and their own exit code; anything else is a bug."""
+
+    def invoke(self, ctx: click.Context) -> Any:
+        try:
+            return super().invoke(ctx)
+        except ShapecatError as error:
+            problem = click.ClickException(str(error))
+            problem.exit_code = error.exit_code
+            raise problem from error
+
+    def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  click's signature
+        return list(self.commands)  # in the order of use, not of the alphabet
+
+
+@click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
+@click.version_option(__version__)
+@click.option("-v", "--verbose", is_flag=True, help="Log what is done, on stderr.")
+def main(*, verbose: bool) -> None:
+    """Turn robot recordings into reviewed, labelled 3D objects.
+
+    \b
+    shapecat simulate demo.mcap                 make a recording to try things on
+    shapecat process demo.mcap --out results    find, categorize and follow objects
+    shapecat view results/demo                  look at them in Rerun
+    """  # noqa: D301  \b keeps click from wrapping
+    level = logging.INFO if verbose else logging.ERROR
+    logging.basicConfig(level=level, stream=sys.stderr, format="%(levelname)s %(message)s")
+
+
+for _command in (info, process, annotate, view, simulate, train, evaluate):
+    main.add_command(_command)

@@ -1,0 +1,86 @@
+"""What the commands show: progress on stderr, results on stdout."""
+
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import click
+from rich.console import Console
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    TaskID,
+    TextColumn,
+    TimeRemainingColumn,
+)
+from rich.table import Table
+
+_PHASES = {
+    "simulate": "simulating",
+    "perceive": "finding and categorizing objects",
+    "annotate": "writing annotated.mcap",
+    "review": "writing review.rrd",
+    "train": "learning",
+    "evaluate": "evaluating",
+}
+
+
+class Bars:
+    """One progress bar per phase; silent when stderr is not a terminal."""
+
+    def __init__(self, progress: Progress) -> None:
+        self._progress = progress
+        self._tasks: dict[str, TaskID] = {}
+
+    def __call__(self, phase: str, done: int, total: int | None) -> None:
+        """Show how far a phase has come."""
+        if phase not in self._tasks:
+            name = _PHASES.get(phase, phase)
+            self._tasks[phase] = self._progress.add_task(name, total=total)
+        self._progress.update(self._tasks[phase], completed=done, total=total)
+
+    def restart(self) -> None:
+        """Forget the bars: the next recording begins."""
+        for task in self._tasks.values():
+            self._progress.remove_task(task)
+        self._tasks.clear()
+
+
+@contextmanager
+def progress_bars() -> Iterator[Bars]:
+    """Show progress bars on stderr while the block runs."""
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+        yield Bars(progress)
+
+
+def print_json(value: Any) -> None:
+    """Print one JSON value."""
+    click.echo(json.dumps(value, indent=1, ensure_ascii=False))
+
+
+def print_table(
+    columns: Sequence[str], rows: Sequence[Sequence[Any]], *, title: str | None = None
+) -> None:
+    """Print a table; columns of numbers are set flush right."""
+    table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
+    for k, name in enumerate(columns):
+        numeric = bool(rows) and all(isinstance(row[k], int | float) for row in rows)
+        table.add_column(name, justify="right" if numeric else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*map(str, row))
+    Console(width=None if Console().is_terminal else 120).print(table)
+
+
+def count_words(counts: Mapping[str, int]) -> str:
+    """Return counts as words, the most frequent first: ``3 cup, 2 can``."""
+    ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    return ", ".join(f"{count} {name}" for name, count in ordered) or "none"

@@ -1,0 +1,111 @@
+"""A job is one recording and how to process it; a run is what run.json says became of it."""
+
+import dataclasses
+import platform
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from shapecat import __version__
+from shapecat.config import Settings
+from shapecat.learning import Categorizer
+from shapecat.run_folder import digest, input_size
+
+__all__ = ["Job", "Summary", "describe_run", "same_work", "summarize"]
+
+_LIBRARIES = ("numpy", "numba", "mcap", "rosbags", "rerun-sdk", "pyarrow")
+
+
+@dataclass(frozen=True)
+class Job:
+    """One recording to process, and how.
+
+    ``folder`` is where the results go, ``DIR/NAME``; ``start_s`` and ``end_s`` count from the
+    start of the recording; ``up`` is ``auto``, ``tf``, or a vector ``X,Y,Z`` in the sensor frame.
+    """
+
+    source: Path
+    folder: Path
+    settings: Settings = field(default_factory=Settings)
+    topics: tuple[str, ...] = ()
+    up: str = "auto"
+    fixed_frame: str | None = None
+    start_s: float | None = None
+    end_s: float | None = None
+    every: int = 1
+    model: Path | None = None
+    mcap: bool = True
+    rrd: bool = True
+    overwrite: bool = False
+
+    def selection(self) -> dict[str, Any]:
+        """Return the options that decide what the tables hold, as stored in run.json."""
+        names = ("topics", "up", "fixed_frame", "start_s", "end_s", "every", "mcap", "rrd")
+        values = {name: getattr(self, name) for name in names}
+        return {**values, "topics": list(self.topics)}
+
+
+@dataclass(frozen=True)
+class Summary:
+    """What a run came to; not ``fresh`` when it was complete before."""
+
+    source: Path
+    folder: Path
+    counts: Mapping[str, Any]
+    seconds: float
+    warnings: tuple[str, ...]
+    fresh: bool = True
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for ``--json``."""
+        return {
+            **dataclasses.asdict(self),
+            "source": str(self.source),
+            "folder": str(self.folder),
+            "warnings": list(self.warnings),
+        }
+
+
+def describe_run(job: Job, categorizer: Categorizer) -> dict[str, Any]:
+    """Return what run.json says before the work begins."""
+    return {
+        "input": {
+            "path": str(job.source.resolve()),
+            "bytes": input_size(job.source),
+            "sha256": digest(job.source),
+        },
+        "versions": {
+            "shapecat": __version__,
+            "python": platform.python_version(),
+            **{name: version(name) for name in _LIBRARIES},
+        },
+        "settings": job.settings.as_dict(),
+        "options": job.selection(),
+        "model": {"id": categorizer.model_id, "categories": list(categorizer.categories)},
+        "fixed_frame": None,
+        "up": None,
+        "counts": {},
+        "seconds": {},
+        "warnings": [],
+    }
+
+
+def same_work(run: Mapping[str, Any], planned: Mapping[str, Any]) -> bool:
+    """Return whether a finished run was made from the same input, settings and model."""
+    return all(run.get(key) == planned[key] for key in ("settings", "options", "model")) and (
+        run.get("input", {}).get("sha256") == planned["input"]["sha256"]
+    )
+
+
+def summarize(job: Job, run: Mapping[str, Any], *, fresh: bool = True) -> Summary:
+    """Return the summary of a run."""
+    return Summary(
+        source=job.source,
+        folder=job.folder,
+        counts=run["counts"],
+        seconds=run["seconds"].get("total", 0.0),
+        warnings=tuple(run["warnings"]),
+        fresh=fresh,
+    )

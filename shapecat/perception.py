@@ -1,0 +1,116 @@
+"""One frame, without looking at any other: detect, reconstruct, describe, categorize."""
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4
+from shapecat.config import Settings
+from shapecat.description import DESCRIPTOR_NAMES, describe
+from shapecat.detection import detect
+from shapecat.geometry import inverse, level_from_sensor, transform
+from shapecat.learning import Categorizer
+from shapecat.surface import reconstruct, voxelize
+from shapecat.types import Candidate, Detection, Frame, NeuralGas, Perception, Scene
+
+__all__ = ["perceive"]
+
+
+class _Shape(NamedTuple):
+    gas: NeuralGas
+    descriptor: F4
+    seconds: float
+
+
+def perceive(
+    frame: Frame, *, up: F4 | None, categorizer: Categorizer, settings: Settings
+) -> Perception:
+    """Find, reconstruct, describe and categorize the objects of one frame (thesis ch. 4 to 7).
+
+    Pure: the result depends on the arguments alone, whichever worker computes it.
+
+    Parameters
+    ----------
+    up : (3,) unit vector in the sensor frame, or None to estimate it from the planes.
+    """
+    begun = time.perf_counter()
+    scene = detect(frame, up=up, settings=settings.detection, rng=_rng(settings, frame, 0))
+    detected = time.perf_counter()
+    shapes = [
+        _describe_candidate(frame, scene, candidate, settings, _rng(settings, frame, k))
+        for k, candidate in enumerate(scene.candidates, start=1)
+    ]
+    described = time.perf_counter()
+    detections = _categorize(scene, shapes, categorizer)
+    return Perception(
+        topic=frame.topic,
+        index=frame.index,
+        stamp_ns=frame.stamp_ns,
+        frame_id=frame.frame_id,
+        scene=scene,
+        detections=detections,
+        seconds={
+            "detect": detected - begun,
+            "describe": described - detected,
+            "categorize": time.perf_counter() - described,
+        },
+    )
+
+
+def _rng(settings: Settings, frame: Frame, item: int) -> np.random.Generator:
+    """Seed by (seed, stamp, object): the same whatever the order and the number of workers."""
+    return np.random.default_rng((settings.seed, abs(frame.stamp_ns), item))
+
+
+def _describe_candidate(
+    frame: Frame, scene: Scene, candidate: Candidate, settings: Settings, rng: np.random.Generator
+) -> _Shape:
+    """Stand the candidate upright on z = 0, learn its surface, and describe it."""
+    begun = time.perf_counter()
+    points = frame.xyz(candidate.indices)
+    level = level_from_sensor(scene.up, _support_offset(scene, candidate), points)
+    cloud = voxelize(transform(level, points).astype(np.float32), voxel_m=settings.surface.voxel_m)
+    gas = reconstruct(cloud, settings=settings.surface, rng=rng)
+    if gas is None:
+        nothing = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+        empty = np.zeros(len(DESCRIPTOR_NAMES), np.float32)
+        return _Shape(nothing, empty, time.perf_counter() - begun)
+    descriptor = describe(cloud, gas, eye=level.translation)
+    in_sensor = NeuralGas(transform(inverse(level), gas.neurons), gas.edges)
+    return _Shape(in_sensor, descriptor, time.perf_counter() - begun)
+
+
+def _support_offset(scene: Scene, candidate: Candidate) -> float:
+    """Return how far along ``up`` the support of a candidate lies, in metres."""
+    if candidate.plane is None:
+        return float(scene.up @ candidate.box.center - candidate.box.size[2] / 2)
+    return scene.planes[candidate.plane].offset + candidate.support_m
+
+
+def _categorize(
+    scene: Scene, shapes: list[_Shape], categorizer: Categorizer
+) -> tuple[Detection, ...]:
+    """Categorize all candidates of a frame in one call; one without a surface is undecided."""
+    if not shapes:
+        return ()
+    begun = time.perf_counter()
+    prediction = categorizer.predict(np.stack([shape.descriptor for shape in shapes]))
+    each = (time.perf_counter() - begun) / len(shapes)
+    known = [len(shape.gas.neurons) > 0 for shape in shapes]
+    uniform = np.full(len(categorizer.categories), 1 / len(categorizer.categories))
+    return tuple(
+        Detection(
+            candidate=candidate,
+            gas=shape.gas,
+            descriptor=shape.descriptor,
+            posterior=prediction.posteriors[k] if known[k] else uniform,
+            novelty=float(prediction.novelty[k]) if known[k] else _UNDECIDED,
+            seconds=shape.seconds + each,
+        )
+        for k, (candidate, shape) in enumerate(zip(scene.candidates, shapes, strict=True))
+    )
+
+
+_UNDECIDED = 2.0
+"""Novelty of an object with too few points for a surface: beyond the threshold, so unknown."""

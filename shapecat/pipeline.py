@@ -1,0 +1,194 @@
+"""The story: a recording becomes detections, detections become tracks, tracks become annotations.
+
+Three phases, joined only by the tables of the run folder. Perceive is the expensive one and knows
+nothing of time; track is cheap and knows nothing of points; annotate knows nothing of perception.
+Each can be run again alone.
+"""
+
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from shapecat.errors import NoStreamError, OutputError
+from shapecat.jobs import Job, Summary, describe_run, same_work, summarize
+from shapecat.labels import adopt_labels, read_labelled_frames, read_labels
+from shapecat.learning import Categorizer, load_model
+from shapecat.perception import perceive
+from shapecat.recordings import Recording, choose_streams, frames, open_recording
+from shapecat.recordings.gravity import Upright
+from shapecat.run_folder import read_run, staged, write_run
+from shapecat.tables import FrameRow, PerceptionTables
+from shapecat.tracks import track_run
+from shapecat.types import Frame, LabelledFrame
+
+__all__ = ["Observer", "annotate", "annotate_again", "perceive_all", "process", "track"]
+
+Observer = Callable[[str, int, int | None], None]
+"""Called with the name of the phase, the frames done, and how many there are, if known."""
+
+
+def _ignore(_phase: str, _done: int, _total: int | None) -> None:
+    """Observe nothing."""
+
+
+def process(job: Job, observe: Observer = _ignore) -> Summary:
+    """Process one recording into its run folder: perceive, track, annotate.
+
+    A complete folder made from the same input, settings and model is left as it is. Nothing
+    appears under the final name before all of it is complete.
+
+    Raises
+    ------
+    RecordingError, NoStreamError, ModelError, OutputError : with nothing left behind.
+    """
+    begun = time.perf_counter()
+    with open_recording(job.source) as recording:
+        categorizer = load_model(job.model)
+        run = describe_run(job, categorizer)
+        run["options"]["topics"] = [s.topic for s in choose_streams(recording, job.topics)]
+        if job.folder.exists() and not job.overwrite:
+            return _finished(job, run)
+        with staged(job.folder) as folder:
+            perceive_all(recording, folder, run, job, categorizer, observe)
+            track(folder, run, job)
+            annotate(folder, recording, run, observe)
+            run["seconds"]["total"] = time.perf_counter() - begun
+            write_run(folder, run)
+    return summarize(job, run)
+
+
+def _finished(job: Job, planned: dict[str, Any]) -> Summary:
+    run = read_run(job.folder)
+    if not same_work(run, planned):
+        msg = (
+            f"{job.folder}: holds the results of another input, model or settings; "
+            "choose another --out, or --overwrite it"
+        )
+        raise OutputError(msg)
+    return summarize(job, run, fresh=False)
+
+
+def perceive_all(
+    recording: Recording,
+    folder: Path,
+    run: dict[str, Any],
+    job: Job,
+    categorizer: Categorizer,
+    observe: Observer = _ignore,
+) -> None:
+    """Write frames, detections and planes, frame by frame in flat memory."""
+    begun = time.perf_counter()
+    upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame)
+    skipped: Counter[str] = Counter()
+    source, total = _select(recording, run["options"], skipped)
+    count = found = 0
+    names = {"categories": categorizer.categories, "model_id": categorizer.model_id}
+    with PerceptionTables(folder, **names) as tables:
+        for count, frame in enumerate(source, start=1):
+            up = upright.up(frame)
+            perception = perceive(frame, up=up, categorizer=categorizer, settings=job.settings)
+            tables.write(perception, FrameRow(frame.log_time_ns, upright.fixed_from_sensor(frame)))
+            found += len(perception.detections)
+            observe("perceive", count, total)
+    if not count:
+        reasons = ", ".join(f"{n} {reason}" for reason, n in skipped.items()) or "none in range"
+        msg = f"{job.source}: no usable frame on {', '.join(run['options']['topics'])} ({reasons})"
+        raise NoStreamError(msg)
+    run["counts"] = {"frames": count, "skipped": dict(skipped), "detections": found}
+    run["fixed_frame"], run["up"] = upright.fixed_frame, upright.report()
+    run["warnings"] = [*recording.warnings, *upright.warnings]
+    run["seconds"]["perceive"] = time.perf_counter() - begun
+
+
+def track(folder: Path, run: dict[str, Any], job: Job) -> None:
+    """Follow the detections over time and fuse their posteriors: tracks.parquet, tracks.csv."""
+    begun = time.perf_counter()
+    run["counts"]["tracks"] = track_run(folder, job.settings.tracking)
+    run["seconds"]["track"] = time.perf_counter() - begun
+
+
+def annotate(
+    folder: Path, recording: Recording, run: dict[str, Any], observe: Observer = _ignore
+) -> None:
+    """Write annotated.mcap and review.rrd from the tables, tracks.csv and the recording."""
+    # Heavy libraries are loaded when first used.
+    from shapecat.outputs.annotated_mcap import write_annotated  # noqa: PLC0415
+    from shapecat.outputs.review import write_review  # noqa: PLC0415
+
+    labels = read_labels(folder / "tracks.csv")
+    labelled = read_labelled_frames(folder, labels)
+    settings, total = run["settings"]["outputs"], run["counts"]["frames"]
+    begun = time.perf_counter()
+    if run["options"]["mcap"]:
+        write_annotated(
+            recording,
+            folder / "annotated.mcap",
+            _observed(labelled, "annotate", total, observe),
+            run=run,
+            markers=settings["markers"],
+        )
+        run["seconds"]["annotated.mcap"] = time.perf_counter() - begun
+    begun = time.perf_counter()
+    if run["options"]["rrd"]:
+        labelled = read_labelled_frames(folder, labels)
+        write_review(
+            folder / "review.rrd",
+            _with_clouds(_observed(labelled, "review", total, observe), recording, run),
+            name=recording.path.name,
+            run=run,
+            categories=run["model"]["categories"],
+            cloud_points=settings["cloud_points"],
+            fixed_frame=run["fixed_frame"],
+        )
+        run["seconds"]["review.rrd"] = time.perf_counter() - begun
+
+
+def annotate_again(folder: Path, labels: Path | None, observe: Observer = _ignore) -> None:
+    """Write the outputs of a finished run again, with the labels a person has corrected.
+
+    Raises
+    ------
+    OutputError : the folder is not a finished run, or the table of labels does not fit it.
+    RecordingError : the recording is no longer there.
+    """
+    run = read_run(folder)
+    source = Path(run["input"]["path"])
+    if labels is not None:
+        adopt_labels(labels, folder)
+    with open_recording(source) as recording:
+        annotate(folder, recording, run, observe)
+    write_run(folder, run)
+
+
+def _select(
+    recording: Recording, options: dict[str, Any], skipped: Counter[str]
+) -> tuple[Iterator[Frame], int | None]:
+    """Return the frames that the options select, and about how many there are."""
+    streams = choose_streams(recording, options["topics"])
+    chosen = {name: options[name] for name in ("start_s", "end_s", "every")}
+    whole = options["start_s"] is None and options["end_s"] is None
+    counts = [stream.count for stream in streams]
+    total = sum(-(-(n or 0) // options["every"]) for n in counts) if whole else 0
+    return frames(recording, streams, skipped=skipped, **chosen), total or None
+
+
+def _observed(
+    items: Iterator[LabelledFrame], phase: str, total: int, observe: Observer
+) -> Iterator[LabelledFrame]:
+    for done, item in enumerate(items, start=1):
+        yield item
+        observe(phase, done, total)
+
+
+def _with_clouds(
+    labelled: Iterator[LabelledFrame], recording: Recording, run: dict[str, Any]
+) -> Iterator[tuple[LabelledFrame, Frame]]:
+    """Read the clouds again beside their labels."""
+    clouds, _ = _select(recording, run["options"], Counter())
+    for label, frame in zip(labelled, clouds, strict=True):
+        if (label.topic, label.index) != (frame.topic, frame.index):
+            msg = f"{recording.path}: has changed since it was processed; process it again"
+            raise OutputError(msg)
+        yield label, frame

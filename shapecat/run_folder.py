@@ -1,0 +1,117 @@
+"""The folder of one run: built under a hidden name, renamed when complete."""
+
+import hashlib
+import json
+import shutil
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from shapecat.errors import OutputError
+
+__all__ = ["digest", "input_size", "read_run", "replacing", "staged", "write_run"]
+
+_SAMPLE = 1 << 20
+
+
+@contextmanager
+def staged(folder: Path) -> Iterator[Path]:
+    """Give a hidden folder beside ``folder`` that takes its name when the block succeeds.
+
+    An older ``folder`` is replaced only then; on an error nothing is left behind.
+
+    Raises
+    ------
+    OutputError : the disk is full or the place is not writable.
+    """
+    hidden = folder.with_name(f".{folder.name}.partial")
+    created = _missing_parents(folder)
+    try:
+        shutil.rmtree(hidden, ignore_errors=True)
+        hidden.mkdir(parents=True)
+        yield hidden
+        _swap(hidden, folder)
+    except OSError as error:
+        msg = f"{folder}: cannot write the results: {error.strerror or error}"
+        raise OutputError(msg) from error
+    finally:
+        shutil.rmtree(hidden, ignore_errors=True)
+        for parent in created:
+            with suppress(OSError):  # not empty: something was written there
+                parent.rmdir()
+
+
+def _missing_parents(folder: Path) -> list[Path]:
+    return [parent for parent in folder.parents if not parent.exists()]
+
+
+def _swap(new: Path, folder: Path) -> None:
+    old = folder.with_name(f".{folder.name}.old")
+    shutil.rmtree(old, ignore_errors=True)
+    if folder.exists():
+        folder.rename(old)
+    new.rename(folder)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[Path]:
+    """Give a hidden path beside ``path`` that takes its name when the block succeeds."""
+    hidden = path.with_name(f".{path.name}.partial")
+    try:
+        yield hidden
+        hidden.replace(path)
+    except OSError as error:
+        msg = f"{path}: cannot be written: {error.strerror or error}"
+        raise OutputError(msg) from error
+    finally:
+        hidden.unlink(missing_ok=True)
+
+
+def input_size(path: Path) -> int:
+    """Return the bytes of a file, or of the files of a folder."""
+    files = path.iterdir() if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+def digest(path: Path) -> str:
+    """Return a hash that tells one recording from another without reading all of it.
+
+    SHA-256 over size, first and last MiB of the file, or of each file of a folder in name order.
+    """
+    total = hashlib.sha256()
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if not file.is_file():
+            continue
+        size = file.stat().st_size
+        total.update(f"{size}".encode())
+        with file.open("rb") as stream:
+            total.update(stream.read(_SAMPLE))
+            stream.seek(max(0, size - _SAMPLE))
+            total.update(stream.read(_SAMPLE))
+    return total.hexdigest()
+
+
+def write_run(folder: Path, run: Mapping[str, Any]) -> None:
+    """Write run.json."""
+    with replacing(folder / "run.json") as path:
+        path.write_text(json.dumps(run, indent=1) + "\n", "utf-8")
+
+
+def read_run(folder: Path) -> dict[str, Any]:
+    """Read run.json.
+
+    Raises
+    ------
+    OutputError : the folder is not the result of a run.
+    """
+    try:
+        run = json.loads((folder / "run.json").read_text("utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
+        raise OutputError(msg) from error
+    if not isinstance(run, dict):
+        msg = f"{folder / 'run.json'}: not a description of a run"
+        raise OutputError(msg)
+    return run

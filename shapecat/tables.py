@@ -1,0 +1,308 @@
+"""The Parquet tables between the phases: their columns, and how records become rows.
+
+A run folder holds ``frames``, ``detections`` and ``planes`` (written by perceive), and ``tracks``
+(written by track). Row groups of the first three cover the same frames, so that they can be read
+side by side in flat memory. Adding a column is allowed within a schema version; changing the
+meaning of one is not.
+"""
+
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from shapecat.errors import OutputError
+from shapecat.types import Perception, Pose
+
+__all__ = [
+    "DETECTIONS",
+    "FRAMES",
+    "PLANES",
+    "SCHEMA_VERSION",
+    "TRACKS",
+    "FrameRow",
+    "PerceptionTables",
+    "read_row_groups",
+    "write_table",
+]
+
+SCHEMA_VERSION = "1"
+
+_VEC3 = pa.list_(pa.float32(), 3)
+_QUATERNION = pa.list_(pa.float32(), 4)
+_FLOATS = pa.list_(pa.float32())
+
+FRAMES = pa.schema(
+    [
+        ("topic", pa.string()),
+        ("frame", pa.int32()),
+        ("stamp_ns", pa.int64()),
+        ("log_time_ns", pa.int64()),
+        ("frame_id", pa.string()),
+        ("up", _VEC3),
+        ("fixed_translation", pa.list_(pa.float64(), 3)),
+        ("fixed_rotation", pa.list_(pa.float64(), 9)),
+        ("stages", pa.list_(pa.string())),
+        ("seconds", _FLOATS),
+    ]
+)
+"""One row per frame read, also those without a detection. ``fixed_*`` is ``fixed_from_sensor``
+(rotation row by row), null without a fixed frame; ``seconds`` per entry of ``stages``."""
+
+DETECTIONS = pa.schema(
+    [
+        ("topic", pa.string()),
+        ("frame", pa.int32()),
+        ("stamp_ns", pa.int64()),
+        ("frame_id", pa.string()),
+        ("detection", pa.int32()),
+        ("plane", pa.int16()),
+        ("on_detection", pa.int32()),
+        ("touches_border", pa.bool_()),
+        ("occluded", pa.bool_()),
+        ("center", _VEC3),
+        ("size", _VEC3),
+        ("orientation", _QUATERNION),
+        ("center_fixed", _VEC3),
+        ("height_m", pa.float32()),
+        ("points", pa.int32()),
+        ("indices", pa.list_(pa.uint32())),
+        ("posterior", _FLOATS),
+        ("category", pa.string()),
+        ("confidence", pa.float32()),
+        ("novelty", pa.float32()),
+        ("descriptor", _FLOATS),
+        ("neurons", _FLOATS),
+        ("edges", pa.list_(pa.uint16())),
+        ("seconds", pa.float32()),
+    ]
+)
+"""One row per object per frame; lengths in metres, ``center`` and ``neurons`` in ``frame_id``."""
+
+PLANES = pa.schema(
+    [
+        ("topic", pa.string()),
+        ("frame", pa.int32()),
+        ("stamp_ns", pa.int64()),
+        ("plane", pa.int16()),
+        ("normal", _VEC3),
+        ("offset", pa.float32()),
+        ("height_m", pa.float32()),
+        ("area_m2", pa.float32()),
+        ("outline", _FLOATS),
+    ]
+)
+"""One row per supporting plane per frame; ``outline`` is x, y, z of each corner in turn."""
+
+TRACKS = pa.schema(
+    [
+        ("track", pa.int32()),
+        ("topic", pa.string()),
+        ("frame", pa.int32()),
+        ("stamp_ns", pa.int64()),
+        ("detection", pa.int32()),
+        ("center_fixed", _VEC3),
+        ("posterior", _FLOATS),
+    ]
+)
+"""One row per track per frame; ``detection`` is null while the track coasts, ``posterior`` is the
+causal one. Without a fixed frame ``center_fixed`` is in the sensor frame."""
+
+_GROUP_FRAMES = 64
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """What the frames table adds to a `Perception`."""
+
+    log_time_ns: int
+    fixed_from_sensor: Pose | None
+
+
+class PerceptionTables:
+    """Writes frames, detections and planes side by side, a row group every 64 frames."""
+
+    def __init__(self, folder: Path, *, categories: Sequence[str], model_id: str) -> None:
+        """Open the three files in ``folder``, which must exist."""
+        metadata = {
+            "schema_version": SCHEMA_VERSION,
+            "categories": ",".join(categories),
+            "model": model_id,
+        }
+        self._categories = tuple(categories)
+        self._pending: list[tuple[Perception, FrameRow]] = []
+        self._writers = {
+            name: _open_writer(folder / f"{name}.parquet", schema.with_metadata(metadata))
+            for name, schema in (("frames", FRAMES), ("detections", DETECTIONS), ("planes", PLANES))
+        }
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Write what is pending, and close the files."""
+        try:
+            if kind is None:
+                self._flush()
+        finally:
+            for writer in self._writers.values():
+                writer.close()
+
+    def write(self, perception: Perception, row: FrameRow) -> None:
+        """Append one frame."""
+        self._pending.append((perception, row))
+        if len(self._pending) >= _GROUP_FRAMES:
+            self._flush()
+
+    def _flush(self) -> None:
+        if not self._pending:
+            return
+        rows = {
+            "frames": _frame_columns(self._pending),
+            "detections": _detection_columns(self._pending, self._categories),
+            "planes": _plane_columns([perception for perception, _ in self._pending]),
+        }
+        for name, writer in self._writers.items():
+            writer.write_table(_table(rows[name], writer.schema))
+        self._pending.clear()
+
+
+def write_table(path: Path, columns: dict[str, Any], schema: pa.Schema) -> None:
+    """Write a whole table at once."""
+    writer = _open_writer(path, schema)
+    with writer:
+        writer.write_table(_table(columns, schema))
+
+
+def read_row_groups(path: Path, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
+    """Yield the row groups of a table of a run folder, one at a time."""
+    try:
+        with pq.ParquetFile(path) as file:
+            for group in range(file.num_row_groups):
+                yield file.read_row_group(group, columns=columns)
+    except (OSError, pa.ArrowException) as error:
+        msg = f"{path}: not a readable table of a run folder ({error}); process the recording again"
+        raise OutputError(msg) from error
+
+
+def _open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
+    # Ascending pixel indices shrink tenfold as differences; floats do not gain from a dictionary.
+    texts = [f.name for f in schema if f.type == pa.string()]
+    deltas = {f"{n}.list.element": "DELTA_BINARY_PACKED" for n in ("indices",) if n in schema.names}
+    return pq.ParquetWriter(
+        path, schema, compression="zstd", use_dictionary=texts, column_encoding=deltas or None
+    )
+
+
+def _table(columns: dict[str, Any], schema: pa.Schema) -> pa.Table:
+    arrays = [
+        column if isinstance(column, pa.Array) else pa.array(column, field.type)
+        for field, column in ((field, columns[field.name]) for field in schema)
+    ]
+    return pa.Table.from_arrays(arrays, schema=schema)
+
+
+def lists(rows: Sequence[Any], kind: pa.DataType) -> pa.Array:
+    """Return ragged rows of numbers as one list column without a Python object per number."""
+    flat = [np.ravel(row) for row in rows]
+    offsets = np.concatenate([[0], np.cumsum([row.size for row in flat])]).astype(np.int32)
+    values = np.concatenate(flat) if flat else np.zeros(0)
+    return pa.ListArray.from_arrays(offsets, pa.array(values.astype(kind.to_pandas_dtype())))
+
+
+def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]]) -> dict[str, Any]:
+    return {
+        "topic": [p.topic for p, _ in rows],
+        "frame": [p.index for p, _ in rows],
+        "stamp_ns": [p.stamp_ns for p, _ in rows],
+        "log_time_ns": [row.log_time_ns for _, row in rows],
+        "frame_id": [p.frame_id for p, _ in rows],
+        "up": [p.scene.up for p, _ in rows],
+        "fixed_translation": [
+            row.fixed_from_sensor and row.fixed_from_sensor.translation for _, row in rows
+        ],
+        "fixed_rotation": [
+            row.fixed_from_sensor and row.fixed_from_sensor.rotation.ravel() for _, row in rows
+        ],
+        "stages": [list(p.seconds) for p, _ in rows],
+        "seconds": [list(p.seconds.values()) for p, _ in rows],
+    }
+
+
+def _detection_columns(
+    rows: Sequence[tuple[Perception, FrameRow]], categories: Sequence[str]
+) -> dict[str, Any]:
+    objects = [(p, row, k, d) for p, row in rows for k, d in enumerate(p.detections)]
+    found = [d for _, _, _, d in objects]
+    candidates = [d.candidate for d in found]
+    best = [int(np.argmax(d.posterior)) for d in found]
+    return {
+        "topic": [p.topic for p, *_ in objects],
+        "frame": [p.index for p, *_ in objects],
+        "stamp_ns": [p.stamp_ns for p, *_ in objects],
+        "frame_id": [p.frame_id for p, *_ in objects],
+        "detection": [k for _, _, k, _ in objects],
+        "plane": [c.plane for c in candidates],
+        "on_detection": [c.on_candidate for c in candidates],
+        "touches_border": [c.touches_border for c in candidates],
+        "occluded": [c.occluded for c in candidates],
+        "center": [c.box.center for c in candidates],
+        "size": [c.box.size for c in candidates],
+        "orientation": [c.box.orientation for c in candidates],
+        "center_fixed": [_center_fixed(row, d.candidate.box.center) for _, row, _, d in objects],
+        "height_m": [
+            _height(p, c.plane, c.support_m, c.box.center)
+            for (p, *_), c in zip(objects, candidates, strict=True)
+        ],
+        "points": [c.indices.size for c in candidates],
+        "indices": lists([c.indices for c in candidates], pa.uint32()),
+        "posterior": lists([d.posterior for d in found], pa.float32()),
+        "category": [
+            "unknown" if d.novelty > 1 else categories[k] for d, k in zip(found, best, strict=True)
+        ],
+        "confidence": [float(d.posterior[k]) for d, k in zip(found, best, strict=True)],
+        "novelty": [d.novelty for d in found],
+        "descriptor": lists([d.descriptor for d in found], pa.float32()),
+        "neurons": lists([d.gas.neurons for d in found], pa.float32()),
+        "edges": lists([d.gas.edges for d in found], pa.uint16()),
+        "seconds": [d.seconds for d in found],
+    }
+
+
+def _center_fixed(row: FrameRow, center: Any) -> Any:
+    pose = row.fixed_from_sensor
+    return None if pose is None else pose.rotation @ center + pose.translation
+
+
+def _height(perception: Perception, plane: int | None, support_m: float, center: Any) -> float:
+    """Return the height of a centre above what its object stands on, in metres."""
+    if plane is None:
+        return float("nan")
+    support = perception.scene.planes[plane]
+    return float(support.normal @ center) - support.offset - support_m
+
+
+def _plane_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
+    planes = [(p, k, plane) for p in perceptions for k, plane in enumerate(p.scene.planes)]
+    return {
+        "topic": [p.topic for p, *_ in planes],
+        "frame": [p.index for p, *_ in planes],
+        "stamp_ns": [p.stamp_ns for p, *_ in planes],
+        "plane": [k for _, k, _ in planes],
+        "normal": [plane.normal for *_, plane in planes],
+        "offset": [plane.offset for *_, plane in planes],
+        "height_m": [plane.height_m for *_, plane in planes],
+        "area_m2": [plane.area_m2 for *_, plane in planes],
+        "outline": lists([plane.outline for *_, plane in planes], pa.float32()),
+    }

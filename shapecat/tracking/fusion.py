@@ -1,0 +1,75 @@
+"""One posterior from the views of one object (thesis 7.5.2)."""
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shapecat.arrays import F8, Bool
+
+__all__ = ["PARTIAL_WEIGHT", "Method", "causal", "fuse", "view_weights"]
+
+Method = Literal["mean", "product", "vote"]
+
+PARTIAL_WEIGHT = 0.25
+"""Weight of a view that is cut by the image border or an occluder, relative to a whole one."""
+
+_FLOOR = 1e-6
+"""Smallest probability a single view can give in a product: none may veto all others."""
+
+
+def view_weights(partial: Bool) -> F8:
+    """Return the weights (k,) of views of which some are ``partial`` (k,)."""
+    return np.where(np.asarray(partial, np.bool_), PARTIAL_WEIGHT, 1.0)
+
+
+def fuse(posteriors: ArrayLike, method: Method = "mean", weights: ArrayLike | None = None) -> F8:
+    """Fuse the posteriors (k, c) of k views into one (c,) that sums to 1.
+
+    Views of one object share their error (an upside-down cup looks like a can from everywhere),
+    so no method grows more certain with the mere number of views.
+
+    Parameters
+    ----------
+    posteriors : rows that sum to 1.
+    method : ``mean``; ``product``, tempered by the number of views, which is the geometric mean;
+        ``vote``, the share of views won by each category, the first one on ties.
+    weights : (k,) positive weights of the views, equal by default.
+
+    Raises
+    ------
+    ValueError : there is no view, or an unknown method.
+
+    Examples
+    --------
+    >>> fuse([[0.5, 0.5], [0.9, 0.1]])
+    array([0.7, 0.3])
+    >>> fuse([[0.5, 0.5], [0.9, 0.1], [0.2, 0.8]], "vote").round(2)
+    array([0.67, 0.33])
+    """
+    return np.asarray(causal(posteriors, method, weights)[-1])
+
+
+def causal(posteriors: ArrayLike, method: Method = "mean", weights: ArrayLike | None = None) -> F8:
+    """Return (k, c): row i is `fuse` of the first i + 1 views, in O(1) per view."""
+    views = np.asarray(posteriors, np.float64)
+    if views.ndim != 2 or len(views) == 0:
+        msg = f"fusion needs (k, c) posteriors of at least one view, got shape {views.shape}"
+        raise ValueError(msg)
+    weight = np.ones(len(views)) if weights is None else np.asarray(weights, np.float64)
+    evidence = _evidence(views, method)
+    running = np.cumsum(evidence * weight[:, None], axis=0) / np.cumsum(weight)[:, None]
+    if method == "product":
+        running = np.exp(running - running.max(axis=1, keepdims=True))
+    return np.asarray(running / running.sum(axis=1, keepdims=True))
+
+
+def _evidence(views: F8, method: Method) -> F8:
+    if method == "mean":
+        return views
+    if method == "product":
+        return np.asarray(np.log(np.maximum(views, _FLOOR)))
+    if method == "vote":
+        return np.asarray(np.eye(views.shape[1])[views.argmax(axis=1)])
+    msg = f"unknown fusion method {method!r}: mean, product or vote"
+    raise ValueError(msg)

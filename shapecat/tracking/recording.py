@@ -1,0 +1,199 @@
+"""From the detections of a recording to its tracks, with the future known."""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapecat.arrays import F8, I4, Bool
+from shapecat.config import TrackingSettings
+from shapecat.tracking.fusion import causal, view_weights
+from shapecat.tracking.hindsight import Fragments, merge_fragments, scene_cuts
+from shapecat.tracking.records import FrameDetections, Track
+from shapecat.tracking.tracker import Tracker
+
+__all__ = ["track_recording"]
+
+_BURST_NS = 500_000_000
+"""A track proves itself by its hits among the frames this near its first one."""
+
+
+@dataclass(frozen=True)
+class _Hits:
+    """All detections of a stream, in columns: ``rows`` (n,) are positions in its frames."""
+
+    frames: Sequence[FrameDetections]
+    rows: I4
+    numbers: I4
+    centers: F8
+    sizes: F8
+    posteriors: F8
+    partial: Bool
+    novelties: F8
+
+    def stamps(self, hits: I4) -> I4:
+        """Return the times of some hits."""
+        return np.array([self.frames[r].stamp_ns for r in self.rows[hits]], np.int64)
+
+
+def track_recording(
+    frames: Iterable[FrameDetections], settings: TrackingSettings
+) -> tuple[Track, ...]:
+    """Track the objects of a recording, stream by stream.
+
+    Parameters
+    ----------
+    frames : all frames, also those without detections, each stream in its order of recording.
+
+    Returns
+    -------
+    Confirmed tracks, numbered from 1 in order of birth (time, then stream, then position). A
+    track is confirmed by ``settings.min_hits`` detections, or by as many as there are frames of
+    the same scene within half a second of its first; so a recording of single pictures, one per
+    second, keeps every detection. Detections of no confirmed track are taken for false.
+
+    Notes
+    -----
+    Time and memory grow linearly with the number of detections.
+    """
+    streams: dict[str, list[FrameDetections]] = {}
+    for frame in frames:
+        streams.setdefault(frame.topic, []).append(frame)
+    found = [track for stream in streams.values() for track in _track_stream(stream, settings)]
+    found.sort(key=lambda track: int(track.stamps_ns[0]))  # stable: then stream, then birth
+    return tuple(_renumbered(track, k + 1) for k, track in enumerate(found))
+
+
+def _track_stream(
+    frames: Sequence[FrameDetections], settings: TrackingSettings
+) -> list[Track]:
+    cuts = scene_cuts(frames, settings)
+    ids = _associate(frames, cuts, settings)
+    hits = _columns(frames)
+    fragments = [group for group in _groups(ids) if len(group)]
+    scenes = np.cumsum(cuts)
+    chain = merge_fragments(_describe(hits, fragments, scenes), settings)
+    members = [np.sort(np.concatenate([fragments[k] for k in g])) for g in _groups(chain) if len(g)]
+    return [
+        _build_track(hits, member, settings)
+        for member in members
+        if len(member) >= _needed(frames, scenes, int(hits.rows[member[0]]), settings.min_hits)
+    ]
+
+
+def _associate(frames: Sequence[FrameDetections], cuts: Bool, settings: TrackingSettings) -> I4:
+    """Return the tracker's number of every detection, frame after frame."""
+    tracker, ids = Tracker(settings), [np.zeros(0, np.int32)]
+    for frame, cut in zip(frames, cuts, strict=True):
+        if cut:
+            tracker.reset()
+        ids.append(
+            tracker.step(
+                frame.stamp_ns, frame.centers, frame.sizes, frame.posteriors, partial=frame.partial
+            )
+        )
+    return np.concatenate(ids)
+
+
+def _columns(frames: Sequence[FrameDetections]) -> _Hits:
+    filled = [frame for frame in frames if len(frame.centers)] or frames[:1]
+    counts = [len(frame.centers) for frame in frames]
+    return _Hits(
+        frames,
+        np.repeat(np.arange(len(frames)), counts),
+        np.concatenate([frame.detections for frame in filled]),
+        np.concatenate([frame.centers for frame in filled]),
+        np.concatenate([frame.sizes for frame in filled]).astype(np.float64),
+        np.concatenate([frame.posteriors for frame in filled]).astype(np.float64),
+        np.concatenate([frame.partial for frame in filled]),
+        np.concatenate([frame.novelties for frame in filled]).astype(np.float64),
+    )
+
+
+def _groups(labels: I4) -> list[I4]:
+    """Return the positions of each label, ascending, by ascending label."""
+    order = np.argsort(labels, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
+
+
+def _describe(hits: _Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
+    """Summarise fragments by medians, which a few odd views do not move."""
+    n = len(fragments)
+    first = np.array([hits.rows[f[0]] for f in fragments], np.int64)
+    stamps = np.array([frame.stamp_ns for frame in hits.frames], np.int64)
+    return Fragments(
+        stamps[first],
+        stamps[[hits.rows[f[-1]] for f in fragments]] if n else np.zeros(0),
+        np.reshape([np.median(hits.centers[f[:5]], axis=0) for f in fragments], (n, 3)),
+        np.reshape([np.median(hits.centers[f[-5:]], axis=0) for f in fragments], (n, 3)),
+        np.reshape([np.median(hits.sizes[f], axis=0) for f in fragments], (n, 3)),
+        np.reshape([hits.posteriors[f].mean(axis=0) for f in fragments], (n, -1 if n else 0)),
+        scenes[first],
+    )
+
+
+def _needed(
+    frames: Sequence[FrameDetections], scenes: I4, row: int, min_hits: int
+) -> int:
+    """Return how many detections confirm a track that was born in frame ``row``."""
+    near = 0
+    for k, step in ((row, 1), (row - 1, -1)):
+        while (
+            0 <= k < len(frames)
+            and near < min_hits
+            and scenes[k] == scenes[row]
+            and abs(frames[k].stamp_ns - frames[row].stamp_ns) <= _BURST_NS
+        ):
+            near += 1
+            k += step
+    return min(min_hits, near)
+
+
+def _build_track(hits: _Hits, member: I4, settings: TrackingSettings) -> Track:
+    rows, source = _rows_with_gaps(hits, member, settings.max_missed_s)
+    seen = hits.rows[member]
+    weights = view_weights(hits.partial[member])
+    so_far = causal(hits.posteriors[member], settings.fusion, weights)
+    stamps = np.array([hits.frames[r].stamp_ns for r in rows], np.int64)
+    at = np.searchsorted(seen, rows, side="right") - 1  # the last detection up to each row
+    return Track(
+        0,
+        hits.frames[0].topic,
+        len(member),
+        np.array([hits.frames[r].frame for r in rows]),
+        stamps,
+        np.where(source, hits.numbers[member][at], -1),
+        np.column_stack([np.interp(rows, seen, hits.centers[member, axis]) for axis in range(3)]),
+        so_far[at],
+        so_far[-1],
+        float(so_far[-1].max()),
+        float(np.average(hits.novelties[member], weights=weights)),
+    )
+
+
+def _rows_with_gaps(hits: _Hits, member: I4, max_gap_s: float) -> tuple[I4, Bool]:
+    """Return the frames of a track, and in which of them it is detected."""
+    seen = hits.rows[member]
+    gap_s = np.diff(hits.stamps(member)) * 1e-9
+    pieces = [
+        np.arange(a, b if gap <= max_gap_s else a + 1)
+        for a, b, gap in zip(seen[:-1], seen[1:], gap_s, strict=True)
+    ]
+    rows = np.concatenate([*pieces, seen[-1:]])
+    return rows, np.isin(rows, seen)
+
+
+def _renumbered(track: Track, number: int) -> Track:
+    return Track(
+        number,
+        track.topic,
+        track.hits,
+        track.frames,
+        track.stamps_ns,
+        track.detections,
+        track.centers,
+        track.causal,
+        track.posterior,
+        track.confidence,
+        track.novelty,
+    )

@@ -1,0 +1,67 @@
+"""What the tracker reads and what it returns."""
+
+from shapecat.arrays import F4, F8, I4, Bool, Record, array
+
+__all__ = ["FrameDetections", "Track"]
+
+
+class FrameDetections(Record):
+    """The detections of one frame as the tracker sees them; a frame may have none.
+
+    Attributes
+    ----------
+    topic : the stream; streams are tracked apart from each other.
+    frame : number of the frame in its stream.
+    stamp_ns : time of the measurement.
+    detections : (n,) the numbers by which the detections are known.
+    centers : (n, 3) metres: centres of the boxes, in the fixed frame; in the sensor frame where
+        the recording has no fixed one. The frame must be the same over the whole stream.
+    sizes : (n, 3) metres: lengths of the boxes, the third one along the up direction.
+    posteriors : (n, c) posteriors of the single views, each sums to 1.
+    partial : (n,) whether the border of the image or something nearer cuts the object.
+    novelties : (n,) novelty of the single views.
+    """
+
+    topic: str
+    frame: int
+    stamp_ns: int
+    detections: I4 = array("n", "i4")
+    centers: F8 = array("n 3", "f8")
+    sizes: F4 = array("n 3", "f4")
+    posteriors: F4 = array("n c", "f4")
+    partial: Bool = array("n", "?")
+    novelties: F4 = array("n", "f4")
+
+
+class Track(Record):
+    """One object over the frames of its stream, from its first to its last detection.
+
+    Between detections it *coasts*: such a row has no detection, its centre lies on the line
+    between its neighbours. A gap longer than `TrackingSettings.max_missed_s` has no rows.
+
+    Attributes
+    ----------
+    id : number of the track in the recording, from 1, in order of birth.
+    topic : the stream.
+    hits : number of rows with a detection.
+    frames : (k,) numbers of the frames, ascending.
+    stamps_ns : (k,) times of the frames.
+    detections : (k,) numbers of the detections, -1 where it coasts.
+    centers : (k, 3) metres, in the frame of `FrameDetections.centers`.
+    causal : (k, c) fused posterior of the views up to each row.
+    posterior : (c,) fused posterior of all views.
+    confidence : the largest entry of `posterior`.
+    novelty : weighted mean novelty of the views.
+    """
+
+    id: int
+    topic: str
+    hits: int
+    frames: I4 = array("k", "i4")
+    stamps_ns: I4 = array("k", "i8")
+    detections: I4 = array("k", "i4")
+    centers: F8 = array("k 3", "f8")
+    causal: F4 = array("k c", "f4")
+    posterior: F4 = array("c", "f4")
+    confidence: float
+    novelty: float

@@ -1,0 +1,243 @@
+"""The nearest-centroid tracker (thesis 7.5.2): one of the two places that hold state."""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shapecat.arrays import F8, I4, Bool, freeze
+from shapecat.config import TrackingSettings
+from shapecat.tracking.association import assign, posterior_difference, size_difference, size_key
+
+__all__ = ["Tracker", "reach"]
+
+_SPEED_M_S = 0.15  # standard deviation of an object's velocity: most stand still
+_SPEED_MEMORY_S = 1.0  # how long a velocity lasts
+_NOISE_M = 0.012  # standard deviation of a centre: points, segmentation, viewpoint
+_SURPRISE_M_S = 0.3  # speed at which a hand sets an object in motion between two frames
+_LIMIT = 1.3  # cost from which on a birth is likelier than a pair
+_SIZE_WEIGHT, _POSTERIOR_WEIGHT, _TENTATIVE_COST = 0.5, 0.3, 0.2
+_MEMORY_HITS = 10  # a track's size and posterior are means over about so many detections
+
+
+def reach(size_keys: F8, gate_m: float) -> F8:
+    """Return (m,) metres a centre may jump for an object of a given `size_key` (m, 3).
+
+    Another view or an occluder moves the centre of the visible part by up to half the object.
+    """
+    return np.asarray(np.minimum(gate_m, 0.03 + 0.5 * np.exp(size_keys.max(axis=1))))
+
+
+@dataclass
+class _Active:
+    """The tracks that have not ended, one per row, in order of birth."""
+
+    ids: I4
+    position: F8
+    velocity: F8
+    variance: F8  # of position, both, velocity; the same along x, y and z
+    size: F8
+    posterior: F8
+    hits: I4
+    seen_ns: I4
+    missed: I4
+
+    def rows(self, which: Bool) -> Self:
+        """Return the tracks at ``which``."""
+        columns = {f.name: getattr(self, f.name)[which] for f in dataclasses.fields(self)}
+        return dataclasses.replace(self, **columns)
+
+    def joined(self, other: Self) -> Self:
+        """Return these tracks followed by those of ``other``."""
+        columns = {
+            f.name: np.concatenate([getattr(self, f.name), getattr(other, f.name)])
+            for f in dataclasses.fields(self)
+        }
+        return dataclasses.replace(self, **columns)
+
+
+class Tracker:
+    """Gives every detection of a stream of frames the number of its track.
+
+    A detection continues the track whose predicted centre is near, whose size and posterior are
+    alike, and which has proved itself before; all pairs of a frame are chosen together. Positions
+    are predicted by a Kalman filter whose velocity fades (an Ornstein-Uhlenbeck process), so a
+    rolling object is followed through an occlusion while a standing one stays where it is.
+
+    The result does not depend on the order of the detections in a frame: detections are taken in
+    the lexicographic order of centre, size and posterior, which also orders births within a
+    frame. Detections equal in all of these are interchangeable.
+    """
+
+    def __init__(self, settings: TrackingSettings) -> None:
+        """Start without tracks."""
+        self._settings = settings
+        self._born = 0
+        self._stamp_ns: int | None = None
+        self._clock_ns = 0
+        self._active: _Active | None = None
+
+    @property
+    def active(self) -> int:
+        """Number of tracks that have not ended; only they cost time."""
+        return 0 if self._active is None else len(self._active.ids)
+
+    def reset(self) -> None:
+        """End all tracks; numbers are not used again."""
+        self._active = None
+
+    def step(
+        self,
+        stamp_ns: int,
+        centers: ArrayLike,
+        sizes: ArrayLike,
+        posteriors: ArrayLike,
+        *,
+        partial: ArrayLike | None = None,
+    ) -> I4:
+        """Associate the detections of the next frame.
+
+        Parameters
+        ----------
+        stamp_ns : time of the frame. A stamp before the last one counts as no time passed; one
+            that is earlier by more than ``max_missed_s`` ends all tracks.
+        centers : (n, 3) metres, always in the same frame.
+        sizes : (n, 3) metres, the third one along the up direction.
+        posteriors : (n, c) single-view posteriors.
+        partial : (n,) whether a view is cut by the image border or an occluder; none by default.
+
+        Returns
+        -------
+        (n,) track of each detection, from 1, ascending in order of birth.
+
+        Raises
+        ------
+        ValueError : shapes do not fit, or a centre or size is not finite.
+        """
+        shape_sizes: dict[str, int] = {}
+        points = freeze(centers, "n 3", "f8", shape_sizes)
+        lengths = freeze(sizes, "n 3", "f8", shape_sizes)
+        beliefs = freeze(posteriors, "n c", "f8", shape_sizes)
+        cut = freeze(np.zeros(len(points)) if partial is None else partial, "n", "?", shape_sizes)
+        if not (np.isfinite(points).all() and np.isfinite(lengths).all()):
+            msg = f"centres and sizes must be finite, got {centers!r} and {sizes!r}"
+            raise ValueError(msg)
+        if len(points) == 0 and self._active is not None:
+            beliefs = self._active.posterior[:0]  # an empty frame may not know the categories
+        order = np.lexsort(np.column_stack([points, lengths, beliefs, cut]).T[::-1])
+        found = _seed(points[order], size_key(lengths[order]), beliefs[order])
+        result = np.zeros(len(points), np.int32)
+        result[order] = self._advance(stamp_ns, found, cut[order])
+        return result
+
+    def _advance(self, stamp_ns: int, found: _Active, partial: Bool) -> I4:
+        elapsed_s = self._tick(stamp_ns)
+        found.seen_ns[:] = self._clock_ns
+        if self._active is None or not self.active:
+            self._active = found.rows(np.zeros(len(found.ids), bool))
+        active = _predict(self._active, elapsed_s)
+        pairs = assign(
+            _costs(active, found, self._clock_ns, self._settings), _LIMIT, self._settings.association
+        )
+        _correct(active, found, pairs, partial)
+        new = np.ones(len(found.ids), bool)
+        new[pairs[:, 1]] = False
+        found.ids[new] = self._born + 1 + np.arange(int(new.sum()))
+        self._born += int(new.sum())
+        found.ids[pairs[:, 1]] = active.ids[pairs[:, 0]]
+        self._active = self._survivors(active).joined(found.rows(new))
+        return found.ids
+
+    def _tick(self, stamp_ns: int) -> float:
+        """Advance the clock, which never runs backwards; return the seconds passed."""
+        elapsed = 0 if self._stamp_ns is None else stamp_ns - self._stamp_ns
+        self._stamp_ns = stamp_ns
+        if elapsed < -self._settings.max_missed_s * 1e9:
+            self.reset()
+        self._clock_ns += max(elapsed, 0)
+        return max(elapsed, 0) * 1e-9
+
+    def _survivors(self, active: _Active) -> _Active:
+        """Drop tracks that were missed in a frame and not seen for too long.
+
+        A frame that comes late does not end a track by itself: nobody looked.
+        """
+        unseen_s = (self._clock_ns - active.seen_ns) * 1e-9
+        return active.rows((active.missed == 0) | (unseen_s <= self._settings.max_missed_s))
+
+
+def _seed(centers: F8, size_keys: F8, posteriors: F8) -> _Active:
+    """Return the tracks that detections would begin, still without numbers."""
+    n = len(centers)
+    variance = np.tile([_NOISE_M**2, 0.0, _SPEED_M_S**2], (n, 1))
+    return _Active(
+        ids=np.zeros(n, np.int32),
+        position=centers,
+        velocity=np.zeros((n, 3)),
+        variance=variance,
+        size=size_keys,
+        posterior=posteriors,
+        hits=np.ones(n, np.int64),
+        seen_ns=np.zeros(n, np.int64),
+        missed=np.zeros(n, np.int64),
+    )
+
+
+def _predict(tracks: _Active, elapsed_s: float) -> _Active:
+    """Move the tracks by their fading velocity; the variance is that of the process, exact."""
+    tau = _SPEED_MEMORY_S
+    keep = np.exp(-elapsed_s / tau)
+    horizon = tau * (1 - keep)
+    pp, pv, vv = tracks.variance.T
+    drift = tau**2 * max(2 * elapsed_s / tau - 3 + 4 * keep - keep**2, 0.0)
+    speed2 = _SPEED_M_S**2
+    variance = [
+        pp + 2 * horizon * pv + horizon**2 * vv + speed2 * drift,
+        keep * (pv + horizon * vv) + speed2 * tau * (1 - keep) ** 2,
+        keep**2 * vv + speed2 * (1 - keep**2),
+    ]
+    return dataclasses.replace(
+        tracks,
+        position=tracks.position + horizon * tracks.velocity,
+        velocity=keep * tracks.velocity,
+        variance=np.column_stack(variance),
+    )
+
+
+def _costs(tracks: _Active, found: _Active, clock_ns: int, settings: TrackingSettings) -> F8:
+    """Return (m, n) costs: distance relative to the gate, plus size, posterior and standing."""
+    distance = np.linalg.norm(tracks.position[:, None] - found.position[None], axis=2)
+    unseen_s = np.minimum((clock_ns - tracks.seen_ns) * 1e-9, 0.2)
+    gate = np.minimum(
+        reach(tracks.size, settings.gate_m) + _SURPRISE_M_S * unseen_s, settings.gate_m
+    )[:, None]
+    costs = (
+        distance / np.maximum(gate, 1e-9)
+        + _SIZE_WEIGHT * size_difference(tracks.size, found.size)
+        + _POSTERIOR_WEIGHT * posterior_difference(tracks.posterior, found.posterior)
+        + _TENTATIVE_COST * (tracks.hits < settings.min_hits)[:, None]
+    )
+    return np.where(distance <= gate, costs, np.inf)
+
+
+def _correct(tracks: _Active, found: _Active, pairs: I4, partial: Bool) -> None:
+    """Update the tracks in place by their detections; the others have missed one more frame."""
+    i, j = pairs.T
+    tracks.missed += 1
+    tracks.missed[i] = 0
+    tracks.seen_ns[i] = found.seen_ns[j]
+    tracks.hits[i] += 1
+    # A view of another size shows another part of the object: its centre says less.
+    odd = np.abs(tracks.size[i] - found.size[j]).mean(axis=1)
+    noise = _NOISE_M**2 * (1 + 10 * odd + 3 * partial[j])
+    pp, pv, vv = tracks.variance[i].T
+    gain_p, gain_v = pp / (pp + noise), pv / (pp + noise)
+    surprise = found.position[j] - tracks.position[i]
+    tracks.position[i] += gain_p[:, None] * surprise
+    tracks.velocity[i] += gain_v[:, None] * surprise
+    tracks.variance[i] = np.column_stack([(1 - gain_p) * pp, (1 - gain_p) * pv, vv - gain_v * pv])
+    rate = np.where(partial[j], 0.25, 1.0) / np.minimum(tracks.hits[i], _MEMORY_HITS)
+    tracks.size[i] += rate[:, None] * (found.size[j] - tracks.size[i])
+    tracks.posterior[i] += rate[:, None] * (found.posterior[j] - tracks.posterior[i])

@@ -1,0 +1,101 @@
+"""The layout is enforced: layers, import cost, no forbidden constructs."""
+
+import ast
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+STAGES = {"detection", "surface", "description", "learning", "tracking"}
+BASE = {"arrays", "errors", "jit", "types"}
+FLOOR = {
+    **dict.fromkeys(BASE | {"__init__", "py"}, 0),
+    **dict.fromkeys(("config", "geometry", "run_folder"), 1),
+    **dict.fromkeys((*STAGES, "recordings", "simulation", "schemas", "tables", "labels"), 2),
+    **dict.fromkeys(("outputs", "evaluation", "models", "perception", "jobs", "tracks"), 3),
+    "pipeline": 4,
+    "batch": 5,
+    "cli": 6,
+    "__main__": 6,
+}
+FILES = sorted([*ROOT.glob("shapecat/**/*.py"), *ROOT.glob("cli/*.py")])
+
+
+def room(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return "cli" if parts[0] == "cli" else parts[1]
+
+
+def imported_rooms(path: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.level == 0:
+            names = [node.module or ""]
+            if node.module == "shapecat":
+                names = [f"shapecat.{alias.name}" for alias in node.names]
+        else:
+            continue
+        found |= {name.split(".")[1] for name in names if name.startswith("shapecat.")}
+    return {name for name in found if not name.startswith("__")}
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_no_import_goes_up_or_across_stages(path: Path) -> None:
+    here = room(path)
+    for other in imported_rooms(path) - {here}:
+        assert other in FLOOR, f"{other} has no floor: add it to the table above"
+        assert FLOOR[other] <= FLOOR[here], f"{path} imports {other}, which is above it"
+        assert not (here in STAGES and other in STAGES), f"stage {here} imports stage {other}"
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda p: str(p.relative_to(ROOT)))
+def test_no_print_eval_or_bare_except(path: Path) -> None:
+    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            assert node.func.id not in {"print", "eval", "exec"}, f"{path}:{node.lineno}"
+        if isinstance(node, ast.ExceptHandler):
+            assert node.type is not None, f"{path}:{node.lineno}: bare except"
+
+
+def test_help_answers_at_once() -> None:
+    """A shell completion that takes a second makes people avoid a tool."""
+    command = [sys.executable, "-m", "shapecat", "--help"]
+    subprocess.run(command, check=True, capture_output=True)  # write the byte code
+    seconds = []
+    for _ in range(5):
+        begun = time.perf_counter()
+        subprocess.run(command, check=True, capture_output=True)
+        seconds.append(time.perf_counter() - begun)
+
+    assert min(seconds) < 0.3
+
+
+def test_help_loads_no_heavy_library() -> None:
+    code = (
+        "import sys, importlib; importlib.import_module('shapecat.cli.main');"
+        "heavy = {'numba', 'rerun', 'open3d', 'sklearn', 'scipy', 'pyarrow', 'rosbags', 'numpy'};"
+        "sys.exit(', '.join(sorted(heavy & set(sys.modules))))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+
+    assert done.returncode == 0, done.stderr
+
+
+def test_processing_loads_no_display_library() -> None:
+    """Open3D needs libEGL and libX11, which a server or a container does not have."""
+    code = (
+        "import sys, shapecat.batch, shapecat.outputs.annotated_mcap, shapecat.outputs.review;"
+        "sys.exit(', '.join(sorted({'open3d', 'matplotlib', 'sklearn'} & set(sys.modules))))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+
+    assert done.returncode == 0, done.stderr
+
+
+def test_architecture_page_is_short() -> None:
+    assert (ROOT / "ARCHITECTURE.md").read_text("utf-8").count("\n") <= 150

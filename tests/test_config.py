@@ -1,0 +1,57 @@
+import dataclasses
+from pathlib import Path
+
+import pytest
+
+from shapecat.config import Settings, load_settings, with_overrides
+from shapecat.errors import ConfigError
+
+
+def test_file_then_overrides(tmp_path: Path) -> None:
+    """The command line wins over the file, the file over the defaults."""
+    path = tmp_path / "s.toml"
+    path.write_text("seed = 3\n[tracking]\ngate_m = 1\nfusion = 'vote'\n")
+
+    settings = load_settings(path, ["tracking.gate_m=0.5"])
+
+    assert settings.seed == 3
+    assert settings.tracking.gate_m == 0.5
+    assert settings.tracking.fusion == "vote"
+    assert settings.surface == Settings().surface
+
+
+@pytest.mark.parametrize(
+    ("override", "message"),
+    [
+        ("tracking.gat_m=1", "did you mean tracking.gate_m"),
+        ("nonsense=1", "known: seed"),
+        ("tracking.gate_m=wide", "must be float"),
+        ("tracking.gate_m=-1", "must not be negative"),
+        ("tracking.gate_m=NaN", "must be finite"),
+        ("tracking.gate_m=true", "must be float"),
+        ("tracking.fusion=median", "must be one of mean"),
+        ("tracking=1", "group of settings"),
+        ("tracking.gate_m", "expected name=value"),
+    ],
+)
+def test_a_wrong_setting_is_named(override: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        with_overrides(Settings(), [override])
+
+
+@pytest.mark.parametrize("content", [b"a = ", b"\xff\xfe", None])
+def test_unreadable_file_is_a_config_error(tmp_path: Path, content: bytes | None) -> None:
+    path = tmp_path / "s.toml"
+    if content is not None:
+        path.write_bytes(content)
+
+    with pytest.raises(ConfigError, match=r"s\.toml"):
+        load_settings(path)
+
+
+def test_as_dict_holds_every_setting() -> None:
+    """The stored tree must be enough to repeat a run."""
+    tree = Settings().as_dict()
+
+    assert set(tree) == {field.name for field in dataclasses.fields(Settings)}
+    assert tree["tracking"]["fusion"] == "mean"

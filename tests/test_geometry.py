@@ -1,0 +1,123 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose
+
+from shapecat.arrays import F8
+from shapecat.geometry import (
+    compose,
+    gravity_rotation,
+    inverse,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    transform,
+    upright_box,
+)
+from shapecat.types import Camera, Frame, NeuralGas, Pose
+
+number = st.floats(-1, 1, allow_subnormal=False)
+quaternion = st.lists(number, min_size=4, max_size=4).filter(lambda q: sum(x * x for x in q) > 0.01)
+vector = st.lists(number, min_size=3, max_size=3)
+direction = vector.filter(lambda v: sum(x * x for x in v) > 0.01)
+
+
+def pose(q: list[float], t: list[float]) -> Pose:
+    return Pose(rotation_from_quaternion(q), np.array(t))
+
+
+@settings(deadline=None)
+@given(quaternion)
+def test_quaternion_round_trip_also_near_half_turns(q: list[float]) -> None:
+    rotation = rotation_from_quaternion(q)
+
+    assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+    assert_allclose(
+        rotation_from_quaternion(quaternion_from_rotation(rotation)), rotation, atol=1e-9
+    )
+
+
+@settings(deadline=None)
+@given(quaternion, vector, vector)
+def test_inverse_undoes(q: list[float], t: list[float], p: list[float]) -> None:
+    a_from_b = pose(q, t)
+
+    assert_allclose(transform(inverse(a_from_b), transform(a_from_b, p)), p, atol=1e-9)
+    assert_allclose(compose(a_from_b, inverse(a_from_b)).rotation, np.eye(3), atol=1e-9)
+
+
+@pytest.mark.parametrize("bad", [[0, 0, 0, 0], [np.nan, 0, 0, 1]])
+def test_a_zero_quaternion_is_refused(bad: list[float]) -> None:
+    """TF messages of broken drivers hold them."""
+    with pytest.raises(ValueError, match="not a rotation"):
+        rotation_from_quaternion(bad)
+
+
+@settings(deadline=None)
+@given(direction)
+def test_gravity_rotation_turns_up_to_z(up: list[float]) -> None:
+    rotation = gravity_rotation(up)
+
+    assert_allclose(rotation @ up, [0, 0, np.linalg.norm(up)], atol=1e-9)
+    assert_allclose(np.linalg.det(rotation), 1)
+
+
+@settings(deadline=None, max_examples=30)
+@given(direction, st.floats(0, 3), st.integers(0, 100))
+def test_box_of_a_turned_box_is_that_box(up: list[float], yaw: float, seed: int) -> None:
+    size = np.array([0.3, 0.12, 0.2])
+    corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T * size
+    inside = np.random.default_rng(seed).uniform(-0.5, 0.5, (300, 3)) * size
+    c, s = np.cos(yaw), np.sin(yaw)
+    turned = np.vstack([corners, inside]) @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    points: F8 = turned @ gravity_rotation(up) + [1, 2, 3]
+
+    box = upright_box(points.astype(np.float32), up)
+
+    assert_allclose(box.center, [1, 2, 3], atol=1e-4)
+    assert_allclose(np.sort(box.size), np.sort(size), atol=0.006)
+    local = (points - box.center) @ rotation_from_quaternion(box.orientation)
+    assert np.all(np.abs(local) <= box.size / 2 + 1e-5)
+
+
+def test_box_of_one_point_and_of_none() -> None:
+    """Open3D's boxes raise on flat input."""
+    box = upright_box(np.array([[1, 2, 3]], np.float32), [0, 0, 1])
+
+    assert_allclose(box.center, [1, 2, 3])
+    assert_allclose(box.size, 0)
+    with pytest.raises(ValueError, match="at least one point"):
+        upright_box(np.zeros((0, 3), np.float32), [0, 0, 1])
+
+
+def test_records_refuse_shapes_that_do_not_fit() -> None:
+    with pytest.raises(ValueError, match="translation"):
+        Pose(np.eye(3), np.zeros(2))
+    with pytest.raises(ValueError, match="either depth or points"):
+        Frame("t", 0, 0, 0, "f")
+    with pytest.raises(ValueError, match="same size"):
+        Frame("t", 0, 0, 0, "f", depth=np.zeros((2, 2)), camera=Camera(3, 2, 1, 1, 1, 1))
+
+
+def test_records_cannot_be_written_to() -> None:
+    """Shared arrays that change under a reader are the bugs nobody finds."""
+    made = Pose(np.eye(3), np.zeros(3))
+
+    with pytest.raises(ValueError, match="read-only"):
+        made.translation[0] = 1
+
+
+def test_points_without_a_reading_are_nan() -> None:
+    camera = Camera(2, 1, 100.0, 100.0, 0.5, 0.0)
+    frame = Frame("t", 0, 0, 0, "f", depth=np.array([[0, 2]]), camera=camera)
+
+    points = frame.xyz()
+
+    assert np.isnan(points[0]).all()
+    assert_allclose(points[1], [0.01, 0, 2])
+
+
+def test_triangles_of_a_graph() -> None:
+    gas = NeuralGas(np.zeros((4, 3)), np.array([[0, 1], [0, 2], [1, 2], [2, 3]]))
+
+    assert gas.triangles.tolist() == [[0, 1, 2]]
