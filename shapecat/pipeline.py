@@ -105,7 +105,7 @@ def perceive_all(
 def track(folder: Path, run: dict[str, Any], job: Job) -> None:
     """Follow the detections over time and fuse their posteriors: tracks.parquet, tracks.csv."""
     begun = time.perf_counter()
-    run["counts"]["tracks"] = track_run(folder, job.settings.tracking)
+    run["counts"]["tracks"] = track_run(folder, job.settings.tracking, run["model"]["categories"])
     run["seconds"]["track"] = time.perf_counter() - begun
 
 

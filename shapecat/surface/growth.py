@@ -25,19 +25,28 @@ _NO_KEY = np.int32(0x7FFFFFFF)
 
 @kernel(fast=True)
 def _two_nearest(
-    x: F4, y: F4, z: F4, padded: int, sx: float, sy: float, sz: float, keys: I4, low: int
+    x: F4,
+    y: F4,
+    z: F4,
+    lane: I4,
+    padded: int,
+    sx: float,
+    sy: float,
+    sz: float,
+    keys: I4,
+    mask: int,
 ) -> tuple[int, int]:
     """Return the neurons nearest and second nearest to a signal.
 
-    A key is a squared distance whose lowest bits, masked by ``low``, are replaced by the index:
+    A key is a squared distance whose lowest bits, those in ``mask``, are replaced by the index:
     positive floats order as integers do, so two minima find the neurons; ties go to the lower.
     """
-    mask = np.int32(low)
     best = _NO_KEY
+    keep = np.int32(~mask)
     for i in range(padded):
         dx, dy, dz = x[i] - sx, y[i] - sy, z[i] - sz
         bits = np.float32(dx * dx + dy * dy + dz * dz).view(np.int32)
-        key = np.int32((bits & ~mask) | np.int32(i))
+        key = np.int32((bits & keep) | lane[i])
         keys[i] = key
         best = key if key < best else best
     second = _NO_KEY
@@ -52,9 +61,10 @@ def _adapt(
     x: F4,
     y: F4,
     z: F4,
+    lane: I4,
     born: I4,
-    wins: I4,
     row: int,
+    wins: I4,
     padded: int,
     winner: int,
     sx: float,
@@ -65,11 +75,11 @@ def _adapt(
 ) -> int:
     """Move the winner and its neighbours to the signal; return the age of its oldest edge."""
     oldest = np.int32(-0x40000000)
-    lane = np.int32(winner)
+    place = np.int32(winner)
     for j in range(padded):
-        edge = born[row + j]
+        edge = born[np.uint64(row) + np.uint64(j)]
         rate = rate_neighbour if edge < ABSENT else np.float32(0)
-        rate = rate_winner if np.int32(j) == lane else rate
+        rate = rate_winner if lane[j] == place else rate
         x[j] += rate * (sx - x[j])
         y[j] += rate * (sy - y[j])
         z[j] += rate * (sz - z[j])
@@ -177,10 +187,11 @@ def grow_fritzke(
     """
     capacity = x.size
     stride = capacity
-    low = 1
-    while low < capacity:
-        low <<= 1
-    low -= 1
+    mask = np.int32(1)
+    while mask < capacity:
+        mask = np.int32(mask << 1)
+    mask = np.int32(mask - 1)
+    lane = np.arange(capacity).astype(np.int32)
     keys = np.zeros(capacity, np.int32)
     wins = np.zeros(capacity, np.int32)
     error = np.zeros(capacity, np.float32)
@@ -200,7 +211,7 @@ def grow_fritzke(
         sx, sy, sz = px[k], py[k], pz[k]
         # 5. the nearest and the second nearest neuron
         padded = (count + LANES - 1) // LANES * LANES
-        a, b = _two_nearest(x, y, z, padded, sx, sy, sz, keys, low)
+        a, b = _two_nearest(x, y, z, lane, padded, sx, sy, sz, keys, mask)
         # 6. the edges of the nearest get older
         wins[a] += 1
         # 7. error
@@ -211,9 +222,9 @@ def grow_fritzke(
             x,
             y,
             z,
-            born,
+            lane,
+            born, a * stride,
             wins,
-            a * stride,
             padded,
             a,
             sx,
@@ -280,10 +291,11 @@ def grow_thesis(
     """
     capacity = x.size
     stride = capacity
-    low = 1
-    while low < capacity:
-        low <<= 1
-    low -= 1
+    mask = np.int32(1)
+    while mask < capacity:
+        mask = np.int32(mask << 1)
+    mask = np.int32(mask - 1)
+    lane = np.arange(capacity).astype(np.int32)
     keys = np.zeros(capacity, np.int32)
     wins = np.zeros(capacity, np.int32)
     error = np.zeros(capacity, np.float32)
@@ -301,7 +313,7 @@ def grow_thesis(
         for k in order:
             sx, sy, sz = px[k], py[k], pz[k]
             padded = (count + LANES - 1) // LANES * LANES
-            a, b = _two_nearest(x, y, z, padded, sx, sy, sz, keys, low)
+            a, b = _two_nearest(x, y, z, lane, padded, sx, sy, sz, keys, mask)
             wins[a] += 1
             dx, dy, dz = x[a] - sx, y[a] - sy, z[a] - sz
             error[a] += dx * dx + dy * dy + dz * dz
@@ -309,9 +321,9 @@ def grow_thesis(
                 x,
                 y,
                 z,
-                born,
+                lane,
+                born, a * stride,
                 wins,
-                a * stride,
                 padded,
                 a,
                 sx,

@@ -68,16 +68,18 @@ def _track_stream(
     frames: Sequence[FrameDetections], settings: TrackingSettings
 ) -> list[Track]:
     cuts = scene_cuts(frames, settings)
-    ids = _associate(frames, cuts, settings)
-    hits = _columns(frames)
-    fragments = [group for group in _groups(ids) if len(group)]
-    scenes = np.cumsum(cuts)
-    chain = merge_fragments(_describe(hits, fragments, scenes), settings)
-    members = [np.sort(np.concatenate([fragments[k] for k in g])) for g in _groups(chain) if len(g)]
+    hits, scenes = _columns(frames), np.cumsum(cuts)
+    fragments = [
+        group
+        for group in _groups(_associate(frames, cuts, settings))
+        if len(group)
+        and len(group) >= _needed(frames, scenes, int(hits.rows[group[0]]), settings.min_hits)
+    ]
+    chains = _groups(merge_fragments(_describe(hits, fragments, scenes), settings))
     return [
-        _build_track(hits, member, settings)
-        for member in members
-        if len(member) >= _needed(frames, scenes, int(hits.rows[member[0]]), settings.min_hits)
+        _build_track(hits, np.sort(np.concatenate([fragments[k] for k in chain])), settings)
+        for chain in chains
+        if len(chain)
     ]
 
 

@@ -17,8 +17,9 @@ _SPEED_M_S = 0.15  # standard deviation of an object's velocity: most stand stil
 _SPEED_MEMORY_S = 1.0  # how long a velocity lasts
 _NOISE_M = 0.012  # standard deviation of a centre: points, segmentation, viewpoint
 _SURPRISE_M_S = 0.3  # speed at which a hand sets an object in motion between two frames
-_LIMIT = 1.3  # cost from which on a birth is likelier than a pair
+_LIMIT = 0.8  # cost from which on a birth is likelier than a pair
 _SIZE_WEIGHT, _POSTERIOR_WEIGHT, _TENTATIVE_COST = 0.5, 0.3, 0.2
+_TENTATIVE_S = 0.5  # a track without its hits ends when not seen for longer
 _MEMORY_HITS = 10  # a track's size and posterior are means over about so many detections
 
 
@@ -160,12 +161,14 @@ class Tracker:
         return max(elapsed, 0) * 1e-9
 
     def _survivors(self, active: _Active) -> _Active:
-        """Drop tracks that were missed in a frame and not seen for too long.
+        """Drop tracks that were missed and not seen for too long: new ones sooner.
 
         A frame that comes late does not end a track by itself: nobody looked.
         """
+        proved = active.hits >= self._settings.min_hits
+        patience_s = np.where(proved, self._settings.max_missed_s, _TENTATIVE_S)
         unseen_s = (self._clock_ns - active.seen_ns) * 1e-9
-        return active.rows((active.missed == 0) | (unseen_s <= self._settings.max_missed_s))
+        return active.rows((active.missed < np.where(proved, 1, 2)) | (unseen_s <= patience_s))
 
 
 def _seed(centers: F8, size_keys: F8, posteriors: F8) -> _Active:
@@ -214,7 +217,7 @@ def _costs(tracks: _Active, found: _Active, clock_ns: int, settings: TrackingSet
         reach(tracks.size, settings.gate_m) + _SURPRISE_M_S * unseen_s, settings.gate_m
     )[:, None]
     costs = (
-        distance / np.maximum(gate, 1e-9)
+        (distance / np.maximum(gate, 1e-9)) ** 2
         + _SIZE_WEIGHT * size_difference(tracks.size, found.size)
         + _POSTERIOR_WEIGHT * posterior_difference(tracks.posterior, found.posterior)
         + _TENTATIVE_COST * (tracks.hits < settings.min_hits)[:, None]

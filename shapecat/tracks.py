@@ -1,0 +1,150 @@
+"""From the table of detections to the tables of tracks."""
+
+import csv
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from shapecat.arrays import F4
+from shapecat.config import TrackingSettings
+from shapecat.run_folder import replacing
+from shapecat.tables import TRACKS, lists, read_row_groups, write_table
+from shapecat.tracking import FrameDetections, Track, track_recording
+
+__all__ = ["track_run"]
+
+_COLUMNS = (
+    "topic",
+    "frame",
+    "detection",
+    "center",
+    "size",
+    "center_fixed",
+    "posterior",
+    "novelty",
+    "touches_border",
+    "occluded",
+)
+
+
+def track_run(
+    folder: Path, settings: TrackingSettings, categories: Sequence[str]
+) -> dict[str, int]:
+    """Track the detections of a run; write tracks.parquet and tracks.csv.
+
+    Returns
+    -------
+    The number of tracks per category.
+    """
+    tracks = track_recording(_read_frames(folder, len(categories)), settings)
+    with replacing(folder / "tracks.parquet") as path:
+        write_table(path, _columns(tracks), TRACKS)
+    labels = [_label(track, categories) for track in tracks]
+    with replacing(folder / "tracks.csv") as path:
+        _write_csv(path, tracks, labels, _start_ns(folder))
+    return dict(Counter(labels))
+
+
+def _read_frames(folder: Path, categories: int) -> Iterator[FrameDetections]:
+    groups = zip(
+        read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns"]),
+        read_row_groups(folder / "detections.parquet", _COLUMNS),
+        strict=True,
+    )
+    for frames, detections in groups:
+        by_frame: dict[tuple[str, int], list[dict[str, Any]]] = {}
+        for row in detections.to_pylist():
+            by_frame.setdefault((row["topic"], row["frame"]), []).append(row)
+        for frame in frames.to_pylist():
+            rows = by_frame.get((frame["topic"], frame["frame"]), [])
+            yield FrameDetections(
+                topic=frame["topic"],
+                frame=frame["frame"],
+                stamp_ns=frame["stamp_ns"],
+                detections=np.array([row["detection"] for row in rows], np.int32),
+                centers=_stack([row["center_fixed"] or row["center"] for row in rows], 3),
+                sizes=_stack([row["size"] for row in rows], 3),
+                posteriors=_stack([row["posterior"] for row in rows], categories),
+                partial=np.array(
+                    [row["touches_border"] or row["occluded"] for row in rows], np.bool_
+                ),
+                novelties=np.array([row["novelty"] for row in rows], np.float32),
+            )
+
+
+def _stack(rows: list[Any], width: int) -> F4:
+    return np.array(rows, np.float32).reshape(-1, width)
+
+
+def _label(track: Track, categories: Sequence[str]) -> str:
+    return "unknown" if track.novelty > 1 else categories[int(np.argmax(track.posterior))]
+
+
+def _columns(tracks: Sequence[Track]) -> dict[str, Any]:
+    """Return the rows of all tracks, track after track, each in time."""
+    counts = [len(track.frames) for track in tracks]
+    detections = [int(d) for track in tracks for d in track.detections]
+    return {
+        "track": np.repeat([track.id for track in tracks], counts).tolist(),
+        "topic": [track.topic for track, n in zip(tracks, counts, strict=True) for _ in range(n)],
+        "frame": [int(f) for track in tracks for f in track.frames],
+        "stamp_ns": [int(s) for track in tracks for s in track.stamps_ns],
+        "detection": [d if d >= 0 else None for d in detections],
+        "center_fixed": [center for track in tracks for center in track.centers],
+        "posterior": lists([p for track in tracks for p in track.causal], pa.float32()),
+    }
+
+
+_CSV = (
+    "track",
+    "first_s",
+    "last_s",
+    "frames",
+    "category",
+    "confidence",
+    "label",
+    "x",
+    "y",
+    "z",
+    "novelty",
+    "topic",
+)
+
+
+def _write_csv(path: Path, tracks: Sequence[Track], labels: Sequence[str], start_ns: int) -> None:
+    """Write a line per track, those most worth a look first: unknown, then unsure."""
+    rows = sorted(
+        zip(tracks, labels, strict=True),
+        key=lambda item: (item[1] != "unknown", item[0].confidence, item[0].track),
+    )
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(_CSV)
+        for track, label in rows:
+            first, last = ((int(track.stamps_ns[k]) - start_ns) * 1e-9 for k in (0, -1))
+            x, y, z = np.median(track.centers, axis=0)
+            writer.writerow(
+                (
+                    track.id,
+                    f"{first:.3f}",
+                    f"{last:.3f}",
+                    track.hits,
+                    label,
+                    f"{track.confidence:.3f}",
+                    "",
+                    f"{x:.3f}",
+                    f"{y:.3f}",
+                    f"{z:.3f}",
+                    f"{track.novelty:.2f}",
+                    track.topic,
+                )
+            )
+
+
+def _start_ns(folder: Path) -> int:
+    first = next(read_row_groups(folder / "frames.parquet", ["stamp_ns"]))
+    return int(first["stamp_ns"][0].as_py())

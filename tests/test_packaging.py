@@ -1,0 +1,108 @@
+"""The package as users get it: a wheel, in an environment with the runtime dependencies alone."""
+
+import os
+import re
+import subprocess
+import sys
+import zipfile
+from importlib.metadata import distribution, requires
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+def run(*command: object, **options: object) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(  # type: ignore[call-overload]  # the options are passed through
+        list(map(str, command)), capture_output=True, text=True, check=False, **options
+    )
+    assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+    return done  # type: ignore[no-any-return]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Build the wheel from a copy of what is under version control, or of the folders it needs."""
+    out = tmp_path_factory.mktemp("wheel")
+    source = out / "source"
+    source.mkdir()
+    for name in ("shapecat", "cli", "schemas", "pyproject.toml", "README.md", "LICENSE"):
+        run("cp", "-r", ROOT / name, source)
+    run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", out, source)
+    return next(out.glob("*.whl"))
+
+
+def runtime_modules() -> set[str]:
+    """Return the names of the distributions that shapecat needs, directly or not."""
+    found: set[str] = set()
+    queue = ["shapecat"]
+    while queue:
+        name = re.sub(r"[-_.]+", "-", queue.pop()).lower()
+        if name in found:
+            continue
+        found.add(name)
+        try:
+            needed = requires(name) or []
+        except ImportError:
+            continue
+        # Extras are left out: what they bring is not there for users.
+        queue += [re.split(r"[\s;<>=!~\[(]", n)[0] for n in needed if "extra ==" not in n]
+    return found
+
+
+@pytest.fixture(scope="module")
+def bare(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make an environment with the wheel, and links to the runtime dependencies alone."""
+    env = tmp_path_factory.mktemp("bare") / "env"
+    run(sys.executable, "-m", "venv", "--without-pip", env)
+    site = next(env.glob("lib/python3*/site-packages"))
+    for name in runtime_modules() - {"shapecat"}:
+        try:
+            files = distribution(name).files or []
+        except ImportError:
+            continue
+        for top in {Path(f).parts[0] for f in files if not str(f).startswith("..")}:
+            target = Path(str(distribution(name).locate_file(top)))
+            if target.exists() and not (site / top).exists():
+                (site / top).symlink_to(target)
+    run(sys.executable, "-m", "pip", "--python", env, "install", "-q", "--no-deps", wheel)
+    return env
+
+
+def test_wheel_installs_one_top_level_package(wheel: Path) -> None:
+    """Folders cli and schemas must not shadow other people's packages."""
+    with zipfile.ZipFile(wheel) as archive:
+        names = archive.namelist()
+
+    tops = {name.split("/")[0] for name in names}
+    assert {top for top in tops if not top.endswith(".dist-info")} == {"shapecat"}
+    assert "shapecat/cli/main.py" in names
+    assert "shapecat/models/default.npz" in names
+    assert "shapecat/py.typed" in names
+    assert any(name.startswith("shapecat/schemas/") and name.endswith(".msg") for name in names)
+
+
+def test_main_job_runs_from_the_wheel(bare: Path, tmp_path: Path) -> None:
+    """A development-only import in the package works for everyone but the users."""
+    command = bare / "bin" / "shapecat"
+    environment = {**os.environ, "PYTHONPATH": "", "NUMBA_CACHE_DIR": str(tmp_path / "jit")}
+    options = {"cwd": tmp_path, "env": environment}
+    run(command, "simulate", "s.mcap", "--frames", "2", **options)
+    run(command, "process", "s.mcap", "--out", "out", **options)
+
+    names = {path.name for path in (tmp_path / "out" / "s").iterdir()}
+    assert {"run.json", "tracks.csv", "annotated.mcap", "review.rrd"} <= names
+
+    code = "import sys\ntry:\n import pytest\nexcept ImportError: sys.exit(0)\nsys.exit(1)"
+    run(bare / "bin" / "python", "-c", code, **options)
+
+
+def test_lock_file_covers_every_dependency() -> None:
+    """`make setup` installs the lock file alone."""
+    locked = set(
+        re.findall(r"^([a-z0-9-]+)==", (ROOT / "requirements.lock").read_text(), re.MULTILINE)
+    )
+    needed = {re.split(r"[\s;<>=!~\[(]", n)[0].lower() for n in requires("shapecat") or []}
+
+    assert needed <= locked

@@ -1,0 +1,175 @@
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from numpy.testing import assert_allclose
+
+from shapecat.errors import OutputError
+from shapecat.labels import adopt_labels, read_labelled_frames, read_labels
+from shapecat.tables import (
+    DETECTIONS,
+    FRAMES,
+    PLANES,
+    TRACKS,
+    FrameRow,
+    PerceptionTables,
+    lists,
+    read_row_groups,
+    write_table,
+)
+from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Pose, Scene
+
+CATEGORIES = ("cup", "can")
+HEADER = "track,category,confidence,label\n"
+
+
+def plane(height: float) -> Plane:
+    outline = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1]])
+    return Plane(np.array([0, -1, 0]), -0.5 + height, outline, 0.5, height)
+
+
+def detection(k: int, *, points: int = 4) -> Detection:
+    candidate = Candidate(
+        indices=np.arange(k, k + points),
+        box=Box(np.array([0.1 * k, 0, 1]), np.array([0.1, 0.1, 0.2]), np.array([0, 0, 0, 1])),
+        plane=None if k == 2 else 1,
+        on_candidate=0 if k == 1 else None,
+        support_m=0.1 if k == 1 else 0.0,
+        touches_border=k == 0,
+        occluded=k == 1,
+    )
+    gas = NeuralGas(np.full((k + 2, 3), k), np.array([[0, 1]]))
+    posterior = np.array([0.9, 0.1] if k % 2 else [0.2, 0.8])
+    return Detection(candidate, gas, np.arange(5.0) + k, posterior, 0.5 + k, 0.001)
+
+
+def perception(index: int, count: int) -> Perception:
+    scene = Scene(np.array([0, -1, 0]), (plane(0), plane(0.3)), ())
+    found = tuple(detection(k) for k in range(count))
+    seconds = {"detect": 0.01, "describe": 0.002}
+    return Perception("/depth", index, 1000 + index, "cam", scene, found, seconds)
+
+
+def write_run_tables(folder: Path, counts: list[int], pose: Pose | None = None) -> None:
+    with PerceptionTables(folder, categories=CATEGORIES, model_id="m1") as tables:
+        for index, count in enumerate(counts):
+            tables.write(perception(index, count), FrameRow(2000 + index, pose))
+
+
+def write_tracks(folder: Path, rows: list[tuple[int, int, int | None]]) -> None:
+    columns = {
+        "track": [t for t, _, _ in rows],
+        "topic": ["/depth"] * len(rows),
+        "frame": [f for _, f, _ in rows],
+        "stamp_ns": [1000 + f for _, f, _ in rows],
+        "detection": [d for _, _, d in rows],
+        "center_fixed": [[0, 0, 0]] * len(rows),
+        "posterior": [[0.5, 0.5]] * len(rows),
+    }
+    write_table(folder / "tracks.parquet", columns, TRACKS)
+
+
+def test_columns_are_those_of_the_contract(tmp_path: Path) -> None:
+    """People's programs read these files."""
+    write_run_tables(tmp_path, [3, 0, 2], Pose(np.eye(3), np.array([0, 0, 10])))
+
+    table = pq.read_table(tmp_path / "detections.parquet")
+    row = table.to_pylist()[1]
+
+    assert table.schema.equals(DETECTIONS)
+    assert table.num_rows == 5
+    assert table.schema.metadata[b"categories"] == b"cup,can"
+    assert table.schema.metadata[b"model"] == b"m1"
+    assert (row["plane"], row["on_detection"], row["touches_border"]) == (1, 0, False)
+    assert row["indices"] == [1, 2, 3, 4]
+    assert row["category"] == "unknown"
+    assert_allclose(row["center_fixed"], [0.1, 0, 11])
+    assert_allclose(row["height_m"], 0.1, atol=1e-6)
+    assert pq.read_table(tmp_path / "planes.parquet").schema.equals(PLANES)
+    assert pq.read_table(tmp_path / "frames.parquet").schema.equals(FRAMES)
+    assert pq.read_table(tmp_path / "frames.parquet")["frame"].to_pylist() == [0, 1, 2]
+
+
+def test_row_groups_cover_the_same_frames(tmp_path: Path) -> None:
+    """They are read side by side; a frame without planes or detections must not shift them."""
+    counts = [k % 3 for k in range(150)]
+    write_run_tables(tmp_path, counts)
+    names = ("frames", "detections", "planes")
+    groups = [list(read_row_groups(tmp_path / f"{name}.parquet")) for name in names]
+
+    assert [len(g) for g in groups] == [3, 3, 3]
+    for frames, detections, planes in zip(*groups, strict=True):
+        known = set(frames["frame"].to_pylist())
+        assert set(detections["frame"].to_pylist()) <= known
+        assert set(planes["frame"].to_pylist()) <= known
+
+
+def test_labelled_frames_join_tracks_and_labels(tmp_path: Path) -> None:
+    pose = Pose(np.eye(3), np.array([1, 2, 3]))
+    write_run_tables(tmp_path, [2, 1, 0, 2], pose)
+    write_tracks(tmp_path, [(5, 0, 0), (6, 0, 1), (5, 1, 0), (6, 1, None), (6, 3, 1), (9, 3, 0)])
+    labels = {5: ("cup", 0.7), 6: ("vase", 1.0)}
+
+    frames = list(read_labelled_frames(tmp_path, labels))
+
+    assert [[o.track for o in f.objects] for f in frames] == [[5, 6], [5], [], [6]]
+    assert [f.ended for f in frames] == [(), (), (5,), ()]
+    assert frames[0].objects[1].category == "vase"
+    assert frames[0].objects[1].gas.neurons.shape == (3, 3)
+    assert frames[0].objects[1].indices.tolist() == [1, 2, 3, 4]
+    assert frames[3].objects[0].box.center[0] == pytest.approx(0.1)
+    assert frames[1].log_time_ns == 2001
+    assert len(frames[2].planes) == 2
+    assert frames[0].fixed_from_sensor is not None
+    assert_allclose(frames[0].fixed_from_sensor.translation, [1, 2, 3])
+
+
+def test_a_person_s_label_wins(tmp_path: Path) -> None:
+    path = tmp_path / "tracks.csv"
+    path.write_text(f"{HEADER}1,cup,0.5,\n2,can,0.6, bowl \n")
+
+    assert read_labels(path) == {1: ("cup", 0.5), 2: ("bowl", 1.0)}
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (f"{HEADER}x,cup,0.5,\n", "line 2"),
+        (f"{HEADER}1,cup,high,\n", "line 2"),
+        ("id;category\n1;cup\n", "line 2"),
+    ],
+)
+def test_a_damaged_table_of_labels_is_named_by_line(
+    tmp_path: Path, content: str, message: str
+) -> None:
+    path = tmp_path / "tracks.csv"
+    path.write_text(content)
+
+    with pytest.raises(OutputError, match=message):
+        read_labels(path)
+
+
+def test_corrected_labels_keep_the_original(tmp_path: Path) -> None:
+    (tmp_path / "tracks.csv").write_text(f"{HEADER}1,cup,0.5,\n")
+    corrected = tmp_path / "mine.csv"
+    corrected.write_text(f"{HEADER}1,cup,0.5,bowl\n")
+
+    adopt_labels(corrected, tmp_path)
+
+    assert read_labels(tmp_path / "tracks.csv") == {1: ("bowl", 1.0)}
+    assert read_labels(tmp_path / "tracks.original.csv") == {1: ("cup", 0.5)}
+
+    corrected.write_text(f"{HEADER}7,cup,0.5,bowl\n")
+    with pytest.raises(OutputError, match="does not have: 7"):
+        adopt_labels(corrected, tmp_path)
+
+
+def test_lists_of_nothing() -> None:
+    assert lists([], DETECTIONS.field("indices").type.value_type).to_pylist() == []
+
+
+def test_a_foreign_file_is_not_a_table(tmp_path: Path) -> None:
+    (tmp_path / "frames.parquet").write_bytes(b"hello")
+    with pytest.raises(OutputError, match="process the recording again"):
+        list(read_row_groups(tmp_path / "frames.parquet"))
