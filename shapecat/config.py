@@ -28,8 +28,14 @@ class DetectionSettings:
 
     max_range_m: float = 2.0
     """Points farther from the sensor are ignored (thesis 4.2)."""
+    max_height_m: float = 0.6
+    """Points higher above a plane do not belong to an object on it."""
+    max_size_m: float = 0.6
+    """Larger things are walls or furniture."""
     min_points: int = 60
     """Candidates with fewer points at full resolution are dropped."""
+    rules: str = "concave small occluder rim float enclosed fill"
+    """Rules beyond the thesis that separate and join objects, by name; any may be left out."""
 
 
 @dataclass(frozen=True)
@@ -56,12 +62,16 @@ class TrackingSettings:
 
     association: Literal["hungarian", "greedy"] = "hungarian"
     gate_m: float = 0.12
-    """Largest distance between a track and the centroid of its next detection."""
-    min_hits: int = 2
-    """Detections a track needs to be confirmed; fewer only if the recording is that short."""
+    """Largest distance between a track and the centroid of its next detection; smaller for
+    small objects."""
+    min_hits: int = 3
+    """Detections a track needs to be confirmed; fewer if fewer frames lie within half a second
+    of its first one."""
     max_missed_s: float = 5.0
-    """A track that was not seen for longer has ended."""
+    """A track that was not seen for longer has ended; sooner while it is young. In hindsight an
+    object that comes back to its place gets its old track all the same."""
     fusion: Literal["mean", "product", "vote"] = "mean"
+    """How the posteriors of the views become one; none grows surer by the number of views."""
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ __all__ = [
     "compose",
     "gravity_rotation",
     "inverse",
+    "level_from_sensor",
     "quaternion_from_rotation",
     "rotation_from_quaternion",
     "transform",
@@ -103,6 +104,31 @@ def gravity_rotation(up: ArrayLike) -> F8:
     x = axis - (axis @ z) * z
     x /= np.linalg.norm(x)
     return np.stack([x, np.cross(z, x), z])
+
+
+def level_from_sensor(up: ArrayLike, offset: float, points: ArrayLike) -> Pose:
+    """Return the pose that stands an object upright on z = 0.
+
+    In the level frame z is the height above the support and the points are centred on the z axis;
+    the translation of the pose is the place of the sensor.
+
+    Parameters
+    ----------
+    up : (3,) vector, sensor frame.
+    offset : distance of the support from the sensor along ``up``, metres: ``up @ p`` of its points.
+    points : (n, 3) points of the object, metres, sensor frame, finite, at least one.
+
+    Raises
+    ------
+    ValueError : there is no point.
+    """
+    points = np.asarray(points, np.float64)
+    if len(points) == 0:
+        msg = "an object needs at least one point"
+        raise ValueError(msg)
+    rotation = gravity_rotation(up)
+    x, y, _ = rotation @ points.mean(axis=0)
+    return Pose(rotation, np.array([-x, -y, -offset]))
 
 
 def upright_box(points: F4, up: ArrayLike) -> Box:

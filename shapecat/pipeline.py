@@ -113,15 +113,13 @@ def annotate(
     folder: Path, recording: Recording, run: dict[str, Any], observe: Observer = _ignore
 ) -> None:
     """Write annotated.mcap and review.rrd from the tables, tracks.csv and the recording."""
-    # Heavy libraries are loaded when first used.
-    from shapecat.outputs.annotated_mcap import write_annotated  # noqa: PLC0415
-    from shapecat.outputs.review import write_review  # noqa: PLC0415
-
     labels = read_labels(folder / "tracks.csv")
     labelled = read_labelled_frames(folder, labels)
     settings, total = run["settings"]["outputs"], run["counts"]["frames"]
     begun = time.perf_counter()
     if run["options"]["mcap"]:
+        from shapecat.outputs.annotated_mcap import write_annotated  # noqa: PLC0415  on first use
+
         write_annotated(
             recording,
             folder / "annotated.mcap",
@@ -132,6 +130,8 @@ def annotate(
         run["seconds"]["annotated.mcap"] = time.perf_counter() - begun
     begun = time.perf_counter()
     if run["options"]["rrd"]:
+        from shapecat.outputs.review import write_review  # noqa: PLC0415  loads Rerun on first use
+
         labelled = read_labelled_frames(folder, labels)
         write_review(
             folder / "review.rrd",

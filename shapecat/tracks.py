@@ -119,7 +119,7 @@ def _write_csv(path: Path, tracks: Sequence[Track], labels: Sequence[str], start
     """Write a line per track, those most worth a look first: unknown, then unsure."""
     rows = sorted(
         zip(tracks, labels, strict=True),
-        key=lambda item: (item[1] != "unknown", item[0].confidence, item[0].track),
+        key=lambda item: (item[1] != "unknown", item[0].confidence, item[0].id),
     )
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

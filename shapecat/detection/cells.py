@@ -18,6 +18,8 @@ JUMP = 0.012
 """Step in inverse depth that separates surfaces, 1/m: four steps of a Kinect, 1 cm at 0.9 m."""
 CELL_M = 0.0035
 """Size of a cell on the objects: small against the smallest object, larger than the noise."""
+NEAREST_M = 0.05
+"""Nothing measures nearer; keeps inverse depth within bounds."""
 LARGEST_FACTOR = 16
 
 
@@ -51,7 +53,7 @@ def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_
     Readings beyond ``range_m`` are left out (thesis 4.2, pass-through filter).
     """
     sample = depth[2::5, 2::5] if min(depth.shape) > 50 else depth
-    sample = sample[(sample > 0) & (sample <= range_m)]
+    sample = sample[(sample >= NEAREST_M) & (sample <= range_m)]
     if sample.size == 0:
         return None
     pixel_m = float(np.median(sample)) / max(abs(camera.fx), 1e-6)
@@ -76,6 +78,7 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, w: F4) -> None
     far = np.float32(1e9)
     zero = np.float32(0)
     one = np.float32(1)
+    least = np.float32(NEAREST_M)
     nearest = np.zeros(columns, np.float32)
     total = np.zeros(columns, np.float32)
     count = np.zeros(columns, np.float32)
@@ -88,7 +91,7 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, w: F4) -> None
                 line = depth[i * factor + a, b:]
                 for j in range(columns):
                     z = line[j * factor]
-                    z = z if (z > zero) & (z <= range_m) else far
+                    z = z if (z >= least) & (z <= range_m) else far
                     nearest[j] = z if z < nearest[j] else nearest[j]
         for j in range(columns):
             # The depth that is one jump behind the nearest, in inverse depth.
@@ -98,7 +101,7 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, w: F4) -> None
                 line = depth[i * factor + a, b:]
                 for j in range(columns):
                     z = line[j * factor]
-                    use = (z > zero) & (z <= range_m) & (z <= nearest[j])
+                    use = (z >= least) & (z <= range_m) & (z <= nearest[j])
                     total[j] += z if use else zero
                     count[j] += one if use else zero
         for j in range(columns):

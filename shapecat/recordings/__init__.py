@@ -1,1 +1,30 @@
-"""recordings."""
+"""Robot recordings become frames: containers, clouds, depth images, transforms."""
+
+from shapecat.recordings.frames import frames
+from shapecat.recordings.messages import Channel, Message, MessageError, Topic
+from shapecat.recordings.opening import open_recording
+from shapecat.recordings.recording import Recording
+from shapecat.recordings.streams import Stream, choose_streams, cloud_streams
+from shapecat.recordings.transforms import (
+    TransformBuffer,
+    TransformError,
+    fixed_frame,
+    read_transforms,
+)
+
+__all__ = [
+    "Channel",
+    "Message",
+    "MessageError",
+    "Recording",
+    "Stream",
+    "Topic",
+    "TransformBuffer",
+    "TransformError",
+    "choose_streams",
+    "cloud_streams",
+    "fixed_frame",
+    "frames",
+    "open_recording",
+    "read_transforms",
+]

@@ -2,18 +2,18 @@
 
 import numpy as np
 
-from shapecat.arrays import F4, U2
+from shapecat.arrays import F4, I4, U2
 from shapecat.config import SurfaceSettings
 from shapecat.jit import kernel
 from shapecat.surface.graph import link
 from shapecat.surface.growth import (
     ABSENT,
     FAR,
-    LANES,
     grow_fritzke,
     grow_thesis,
     nearest_spacing,
 )
+from shapecat.surface.lanes import LANES
 from shapecat.types import NeuralGas
 
 __all__ = ["MIN_POINTS", "reconstruct"]
@@ -160,8 +160,22 @@ def _reconstruct(
         missing = max(1, wanted - count)
         interval = max(1, min(60, int(0.6 * signals) // missing))
         count = grow_fritzke(
-            px, py, pz, state, x, y, z, born, degree, count, wanted, signals, interval,
-            0.15, 0.15 * _RATE_NEIGHBOUR, 50,
+            px,
+            py,
+            pz,
+            state,
+            x,
+            y,
+            z,
+            born,
+            degree,
+            count,
+            wanted,
+            signals,
+            interval,
+            0.15,
+            0.15 * _RATE_NEIGHBOUR,
+            50,
         )
     else:
         count = 2
@@ -178,14 +192,43 @@ def _reconstruct(
             spacing = nearest_spacing(px, py, pz, 64)
             h2 = size * (1.15 * spacing) ** 2 / wanted
             count = grow_thesis(
-                px, py, pz, state, x, y, z, born, degree, count, most, _EPOCHS,
-                3.0 * (size / wanted) * h2 / 6.0, 0.7 * spacing, 0.1, 0.1 * _RATE_NEIGHBOUR, 30,
+                px,
+                py,
+                pz,
+                state,
+                x,
+                y,
+                z,
+                born,
+                degree,
+                count,
+                most,
+                _EPOCHS,
+                3.0 * (size / wanted) * h2 / 6.0,
+                0.7 * spacing,
+                0.1,
+                0.1 * _RATE_NEIGHBOUR,
+                30,
             )
         else:
             interval = max(1, int(0.6 * signals) // wanted)
             count = grow_fritzke(
-                px, py, pz, state, x, y, z, born, degree, count, wanted, signals, interval,
-                0.1, 0.1 * _RATE_NEIGHBOUR, 30,
+                px,
+                py,
+                pz,
+                state,
+                x,
+                y,
+                z,
+                born,
+                degree,
+                count,
+                wanted,
+                signals,
+                interval,
+                0.1,
+                0.1 * _RATE_NEIGHBOUR,
+                30,
             )
     count, adjacent = link(px, py, pz, x, y, z, born, count, share)
     result = np.zeros((count, 3), np.float32)
@@ -205,6 +248,59 @@ def _reconstruct(
 
 
 @kernel
-def _adopt(px, py, pz, x, y, z, born, degree, count, edges):
-    """Take over an earlier graph without the neurons that are nearest to no point."""
-    return 0
+def _adopt(
+    px: F4,
+    py: F4,
+    pz: F4,
+    x: F4,
+    y: F4,
+    z: F4,
+    born: I4,
+    degree: I4,
+    count: int,
+    edges: U2,
+) -> int:
+    """Take over an earlier graph without the neurons that are nearest to no point.
+
+    Returns the number of neurons that stay, 0 where fewer than 3 do. A neuron that loses its last
+    neighbour is linked to the one before it.
+    """
+    members = np.zeros(count, np.int64)
+    for k in range(px.size):
+        best = np.inf
+        nearest = 0
+        for i in range(count):
+            squared = (x[i] - px[k]) ** 2 + (y[i] - py[k]) ** 2 + (z[i] - pz[k]) ** 2
+            if squared < best:
+                best, nearest = squared, i
+        members[nearest] += 1
+    stride = x.size
+    place = np.full(count, -1, np.int64)
+    kept = 0
+    for i in range(count):
+        if members[i] > 0:
+            place[i] = kept
+            x[kept], y[kept], z[kept] = x[i], y[i], z[i]
+            kept += 1
+    x[kept:count] = FAR
+    y[kept:count] = FAR
+    z[kept:count] = FAR
+    if kept < 3:
+        return 0
+    for e in range(edges.shape[0]):
+        i, j = np.int64(edges[e, 0]), np.int64(edges[e, 1])
+        if i < count and j < count and place[i] >= 0 and place[j] >= 0 and i != j:
+            _link_fresh(born, degree, stride, place[i], place[j])
+    for i in range(kept):
+        if degree[i] == 0:
+            _link_fresh(born, degree, stride, i, i - 1 if i > 0 else 1)
+    return kept
+
+
+@kernel
+def _link_fresh(born: I4, degree: I4, stride: int, i: int, j: int) -> None:
+    if born[i * stride + j] == ABSENT:
+        degree[i] += 1
+        degree[j] += 1
+    born[i * stride + j] = 0
+    born[j * stride + i] = 0

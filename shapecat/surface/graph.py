@@ -4,43 +4,20 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, Bool
 from shapecat.jit import kernel
-from shapecat.surface.growth import ABSENT
+from shapecat.surface.growth import ABSENT, FAR, index_mask
+from shapecat.surface.lanes import LANES, three_nearest
 
 __all__ = ["link"]
 
-_NO_KEY = np.int32(0x7FFFFFFF)
 
-
-@kernel(fast=True)
-def _three_nearest(
-    px: F4, py: F4, pz: F4, x: F4, y: F4, z: F4, count: int, nearest: I4
-) -> None:
-    """Write the three neurons nearest to each point, by keys as in `growth._two_nearest`."""
-    low = 1
-    while low < count:
-        low <<= 1
-    low -= 1
-    mask = np.int32(low)
-    keys = np.zeros(count, np.int32)
+@kernel
+def _three_nearest(px: F4, py: F4, pz: F4, x: F4, y: F4, z: F4, count: int, nearest: I4) -> None:
+    """Write the three neurons nearest to each point."""
+    padded = (count + LANES - 1) // LANES * LANES
+    mask = index_mask(padded)
     for k in range(px.size):
-        best = _NO_KEY
-        for i in range(count):
-            dx, dy, dz = x[i] - px[k], y[i] - py[k], z[i] - pz[k]
-            bits = np.float32(dx * dx + dy * dy + dz * dz).view(np.int32)
-            key = np.int32((bits & ~mask) | np.int32(i))
-            keys[i] = key
-            best = key if key < best else best
-        nearest[k, 0] = best & mask
-        second = _NO_KEY
-        for i in range(count):
-            key = keys[i] if keys[i] > best else _NO_KEY
-            second = key if key < second else second
-        nearest[k, 1] = second & mask
-        third = _NO_KEY
-        for i in range(count):
-            key = keys[i] if keys[i] > second else _NO_KEY
-            third = key if key < third else third
-        nearest[k, 2] = third & mask
+        a, b, c = three_nearest(x, y, z, padded, px[k], py[k], pz[k], mask)
+        nearest[k, 0], nearest[k, 1], nearest[k, 2] = a, b, c
 
 
 @kernel(fast=True)
@@ -134,9 +111,7 @@ def _squared(x: F4, y: F4, z: F4, i: int, j: int) -> float:
 
 
 @kernel
-def _keep(
-    x: F4, y: F4, z: F4, adjacent: Bool, members: I4, stays: Bool, count: int
-) -> int:
+def _keep(x: F4, y: F4, z: F4, adjacent: Bool, members: I4, stays: Bool, count: int) -> int:
     """Move the neurons that stay to the front; return their number."""
     kept = 0
     for i in range(count):
@@ -150,6 +125,9 @@ def _keep(
             for j in range(count):
                 adjacent[j, kept] = adjacent[j, i]
         kept += 1
+    x[kept:count] = FAR
+    y[kept:count] = FAR
+    z[kept:count] = FAR
     return kept
 
 

@@ -14,78 +14,21 @@ import numpy as np
 
 from shapecat.arrays import F4, I4
 from shapecat.jit import kernel
+from shapecat.surface.lanes import LANES, adapt, two_nearest
 
-__all__ = ["ABSENT", "FAR", "LANES", "grow_fritzke", "grow_thesis", "nearest_spacing"]
+__all__ = ["ABSENT", "FAR", "grow_fritzke", "grow_thesis", "index_mask", "nearest_spacing"]
 
 ABSENT = np.int32(1 << 29)
 FAR = np.float32(1e18)
-LANES = 16
-_NO_KEY = np.int32(0x7FFFFFFF)
 
 
-@kernel(fast=True)
-def _two_nearest(
-    x: F4,
-    y: F4,
-    z: F4,
-    lane: I4,
-    padded: int,
-    sx: float,
-    sy: float,
-    sz: float,
-    keys: I4,
-    mask: int,
-) -> tuple[int, int]:
-    """Return the neurons nearest and second nearest to a signal.
-
-    A key is a squared distance whose lowest bits, those in ``mask``, are replaced by the index:
-    positive floats order as integers do, so two minima find the neurons; ties go to the lower.
-    """
-    best = _NO_KEY
-    keep = np.int32(~mask)
-    for i in range(padded):
-        dx, dy, dz = x[i] - sx, y[i] - sy, z[i] - sz
-        bits = np.float32(dx * dx + dy * dy + dz * dz).view(np.int32)
-        key = np.int32((bits & keep) | lane[i])
-        keys[i] = key
-        best = key if key < best else best
-    second = _NO_KEY
-    for i in range(padded):
-        key = keys[i] if keys[i] != best else _NO_KEY
-        second = key if key < second else second
-    return np.int64(best & mask), np.int64(second & mask)
-
-
-@kernel(fast=True)
-def _adapt(
-    x: F4,
-    y: F4,
-    z: F4,
-    lane: I4,
-    born: I4,
-    row: int,
-    wins: I4,
-    padded: int,
-    winner: int,
-    sx: float,
-    sy: float,
-    sz: float,
-    rate_winner: float,
-    rate_neighbour: float,
-) -> int:
-    """Move the winner and its neighbours to the signal; return the age of its oldest edge."""
-    oldest = np.int32(-0x40000000)
-    place = np.int32(winner)
-    for j in range(padded):
-        edge = born[np.uint64(row) + np.uint64(j)]
-        rate = rate_neighbour if edge < ABSENT else np.float32(0)
-        rate = rate_winner if lane[j] == place else rate
-        x[j] += rate * (sx - x[j])
-        y[j] += rate * (sy - y[j])
-        z[j] += rate * (sz - z[j])
-        age = np.int32(wins[j] - edge)
-        oldest = age if age > oldest else oldest
-    return np.int64(oldest) + wins[winner]
+@kernel
+def index_mask(count: int) -> int:
+    """Return the least 2**k - 1 that is at least ``count - 1``."""
+    mask = 1
+    while mask < count:
+        mask <<= 1
+    return mask - 1
 
 
 @kernel
@@ -114,12 +57,7 @@ def _drop_old_edges(
         edge = born[a * stride + j]
         # differs: an edge stays when it is the last of either end, so that no neuron is ever
         # isolated and none has to be removed.
-        if (
-            edge < ABSENT
-            and wins[a] + wins[j] - edge > oldest
-            and degree[a] > 1
-            and degree[j] > 1
-        ):
+        if edge < ABSENT and wins[a] + wins[j] - edge > oldest and degree[a] > 1 and degree[j] > 1:
             _disconnect(born, degree, stride, a, j)
 
 
@@ -187,12 +125,7 @@ def grow_fritzke(
     """
     capacity = x.size
     stride = capacity
-    mask = np.int32(1)
-    while mask < capacity:
-        mask = np.int32(mask << 1)
-    mask = np.int32(mask - 1)
-    lane = np.arange(capacity).astype(np.int32)
-    keys = np.zeros(capacity, np.int32)
+    mask = index_mask(capacity)
     wins = np.zeros(capacity, np.int32)
     error = np.zeros(capacity, np.float32)
     order = np.arange(px.size)
@@ -211,27 +144,28 @@ def grow_fritzke(
         sx, sy, sz = px[k], py[k], pz[k]
         # 5. the nearest and the second nearest neuron
         padded = (count + LANES - 1) // LANES * LANES
-        a, b = _two_nearest(x, y, z, lane, padded, sx, sy, sz, keys, mask)
+        a, b = two_nearest(x, y, z, padded, sx, sy, sz, mask)
         # 6. the edges of the nearest get older
         wins[a] += 1
         # 7. error
         dx, dy, dz = x[a] - sx, y[a] - sy, z[a] - sz
         error[a] += np.float32(gain) * (dx * dx + dy * dy + dz * dz)
         # 8. adapt. differs: the rates fall, so that the gas comes to rest.
-        age = _adapt(
+        age = wins[a] + adapt(
             x,
             y,
             z,
-            lane,
-            born, a * stride,
-            wins,
             padded,
-            a,
             sx,
             sy,
             sz,
-            np.float32(rate_winner) * anneal,
-            np.float32(rate_neighbour) * anneal,
+            born,
+            a * stride,
+            ABSENT,
+            wins,
+            a,
+            rate_winner * anneal,
+            rate_neighbour * anneal,
         )
         anneal -= fall
         # 9. connect the two, or refresh their edge
@@ -291,12 +225,7 @@ def grow_thesis(
     """
     capacity = x.size
     stride = capacity
-    mask = np.int32(1)
-    while mask < capacity:
-        mask = np.int32(mask << 1)
-    mask = np.int32(mask - 1)
-    lane = np.arange(capacity).astype(np.int32)
-    keys = np.zeros(capacity, np.int32)
+    mask = index_mask(capacity)
     wins = np.zeros(capacity, np.int32)
     error = np.zeros(capacity, np.float32)
     order = np.arange(px.size)
@@ -313,24 +242,25 @@ def grow_thesis(
         for k in order:
             sx, sy, sz = px[k], py[k], pz[k]
             padded = (count + LANES - 1) // LANES * LANES
-            a, b = _two_nearest(x, y, z, lane, padded, sx, sy, sz, keys, mask)
+            a, b = two_nearest(x, y, z, padded, sx, sy, sz, mask)
             wins[a] += 1
             dx, dy, dz = x[a] - sx, y[a] - sy, z[a] - sz
             error[a] += dx * dx + dy * dy + dz * dz
-            age = _adapt(
+            age = wins[a] + adapt(
                 x,
                 y,
                 z,
-                lane,
-                born, a * stride,
-                wins,
                 padded,
-                a,
                 sx,
                 sy,
                 sz,
-                np.float32(rate_winner) * anneal,
-                np.float32(rate_neighbour) * anneal,
+                born,
+                a * stride,
+                ABSENT,
+                wins,
+                a,
+                rate_winner * anneal,
+                rate_neighbour * anneal,
             )
             anneal -= fall
             _connect(born, wins, degree, stride, a, b)

@@ -5,13 +5,13 @@
 
 from shapecat.tracking.fusion import causal, fuse
 from shapecat.tracking.hindsight import Fragments, merge_fragments, scene_cuts
-from shapecat.tracking.records import FrameDetections, Track
 from shapecat.tracking.recording import track_recording
+from shapecat.tracking.records import FrameDetections, Track
 from shapecat.tracking.tracker import Tracker
 
 __all__ = [
-    "FrameDetections",
     "Fragments",
+    "FrameDetections",
     "Track",
     "Tracker",
     "causal",

@@ -20,7 +20,8 @@ def size_key(sizes: F4) -> F8:
     """
     sizes = np.asarray(sizes, np.float64)
     sides = np.sort(sizes[:, :2], axis=1)[:, ::-1]
-    return np.log(np.maximum(np.column_stack([sides, sizes[:, 2]]), 0.0) + _SIZE_SLACK_M)
+    lengths = np.maximum(np.column_stack([sides, sizes[:, 2]]), 0.0)
+    return np.asarray(np.log(lengths + _SIZE_SLACK_M))
 
 
 def size_difference(keys_a: F8, keys_b: F8) -> F8:
@@ -57,7 +58,7 @@ def assign(costs: F8, limit: float, method: Literal["hungarian", "greedy"]) -> I
         pairs = np.column_stack([rows, columns])[gain[rows, columns] < 0]
     else:
         pairs = _greedy(gain)
-    return pairs.astype(np.int32)
+    return np.asarray(pairs, np.int32)
 
 
 def _greedy(gain: F8) -> I4:

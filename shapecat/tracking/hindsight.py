@@ -1,6 +1,6 @@
 """What only a recording tells: where the scene was exchanged, and which tracks are one object."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -24,14 +24,17 @@ class Fragments(Record):
     """Tracks as they were found without knowing the future, one per row, in order of birth.
 
     ``first_ns`` and ``last_ns`` (f,) times of the first and last detection; ``start`` and ``end``
-    (f, 3) metres, where it was then; ``sizes`` (f, 3) typical box lengths, metres; ``posteriors``
-    (f, c); ``scenes`` (f,) number of the scene, counted by `scene_cuts`.
+    (f, 3) metres, where it was then, and ``start_velocity``, ``end_velocity`` (f, 3) m/s;
+    ``sizes`` (f, 3) typical box lengths, metres; ``posteriors`` (f, c); ``scenes`` (f,) number of
+    the scene, counted by `scene_cuts`.
     """
 
     first_ns: I4 = array("f", "i8")
     last_ns: I4 = array("f", "i8")
     start: F8 = array("f 3", "f8")
     end: F8 = array("f 3", "f8")
+    start_velocity: F8 = array("f 3", "f8")
+    end_velocity: F8 = array("f 3", "f8")
     sizes: F8 = array("f 3", "f8")
     posteriors: F8 = array("f c", "f8")
     scenes: I4 = array("f", "i4")
@@ -67,25 +70,51 @@ def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, 
     """Return possible joins (earlier, later), the most likely first."""
     keys = size_key(fragments.sizes)
     limit = reach(keys, settings.gate_m)
-    near = cKDTree(fragments.start).query_ball_point(fragments.end, limit) if len(keys) else []
     found = []
-    for i, candidates in enumerate(near):
-        after = np.array(candidates, np.int64)
-        after = after[
-            (fragments.first_ns[after] > fragments.last_ns[i])
-            & (fragments.scenes[after] == fragments.scenes[i])
-        ]
-        after = after[np.argsort(fragments.first_ns[after], kind="stable")[:_LOOKAHEAD]]
-        distance = np.linalg.norm(fragments.start[after] - fragments.end[i], axis=1) / limit[i]
+    for i, after in enumerate(_successors(fragments, limit, settings)):
+        distance = _distances(fragments, i, after, settings) / max(limit[i], 1e-9)
         size = size_difference(keys[i : i + 1], keys[after])[0]
         posterior = posterior_difference(
             fragments.posteriors[i : i + 1], fragments.posteriors[after]
         )[0]
         gap_s = (fragments.first_ns[after] - fragments.last_ns[i]) * 1e-9
         cost = distance + size / _SAME_SIZE + posterior + gap_s / (gap_s + 10)
-        alike = (size <= _SAME_SIZE) & (posterior <= _SAME_POSTERIOR)
+        alike = (distance <= 1) & (size <= _SAME_SIZE) & (posterior <= _SAME_POSTERIOR)
         found += [(float(c), i, int(j)) for c, j in zip(cost[alike], after[alike], strict=True)]
     return [(i, j) for _, i, j in sorted(found)]
+
+
+def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> Iterator[I4]:
+    """Yield, for each fragment, the later ones that start at the place or soon after its end."""
+    if len(limit) == 0:
+        return
+    near = cKDTree(fragments.start).query_ball_point(fragments.end, limit)
+    order = np.argsort(fragments.first_ns, kind="stable")
+    first = fragments.first_ns[order]
+    window = int(settings.max_missed_s * 1e9)
+    for i, place in enumerate(near):
+        end = fragments.last_ns[i]
+        low, high = np.searchsorted(first, [end, end + window], side="right")
+        for_place = np.array(place, np.int64)
+        for_place = for_place[fragments.first_ns[for_place] > end]
+        for_place = for_place[np.argsort(fragments.first_ns[for_place], kind="stable")]
+        after = np.union1d(for_place[:_LOOKAHEAD], order[low:high][: 4 * _LOOKAHEAD])
+        yield after[fragments.scenes[after] == fragments.scenes[i]]
+
+
+def _distances(fragments: Fragments, i: int, after: I4, settings: TrackingSettings) -> F8:
+    """Return how far the starts of ``after`` (k,) are from the end of fragment i, in metres.
+
+    Over a short gap a moving object may have gone on: both ends are continued to the middle of
+    the gap, and the smaller distance counts.
+    """
+    resting = np.linalg.norm(fragments.start[after] - fragments.end[i], axis=1)
+    gap_s = (fragments.first_ns[after] - fragments.last_ns[i])[:, None] * 1e-9
+    meeting = (fragments.start[after] - 0.5 * gap_s * fragments.start_velocity[after]) - (
+        fragments.end[i] + 0.5 * gap_s * fragments.end_velocity[i]
+    )
+    moving = np.where(gap_s[:, 0] <= settings.max_missed_s, np.linalg.norm(meeting, axis=1), np.inf)
+    return np.asarray(np.minimum(resting, moving))
 
 
 def scene_cuts(frames: Sequence[FrameDetections], settings: TrackingSettings) -> Bool:
@@ -94,31 +123,40 @@ def scene_cuts(frames: Sequence[FrameDetections], settings: TrackingSettings) ->
     Recordings made of single pictures put different objects at the same place from one frame to
     the next. Two frames speak for a cut when fewer than half of the objects that have any
     neighbour in the other frame are found again. A single odd frame is no cut: the frames on
-    both sides of it must disagree too. Frames without detections say nothing.
+    both sides of it must disagree too. Frames without detections say nothing. A clock that
+    jumps back by more than ``max_missed_s`` is a cut as well.
     """
-    result = np.zeros(len(frames), bool)
+    stamps = np.array([frame.stamp_ns for frame in frames], np.int64)
+    result = np.diff(stamps, prepend=stamps[:1]) < -settings.max_missed_s * 1e9
     filled = [k for k, frame in enumerate(frames) if len(frame.centers)]
     for n in range(1, len(filled)):
-        before, now = frames[filled[n - 1]], frames[filled[n]]
-        if _continues(before, now, settings):
-            continue
-        skips = []
+        last, k = filled[n - 1], filled[n]
+        slow = stamps[k] - stamps[k - 1] > _SLOW_S * 1e9
+        if k - last > 1 and not slow:
+            continue  # unseen for some frames, an object may have moved anywhere
+        pairs = [(last, k)]
         if n + 1 < len(filled):
-            skips.append((before, frames[filled[n + 1]]))
-        if n > 1 and not result[filled[n - 1]]:
-            skips.append((frames[filled[n - 2]], now))
-        result[filled[n]] |= not any(_continues(a, b, settings) for a, b in skips)
-    return result
+            pairs.append((last, filled[n + 1]))
+        if n > 1 and not result[last]:
+            pairs.append((filled[n - 2], k))
+        result[k] |= not any(
+            _continues(frames[i], frames[j], slow=slow, settings=settings) for i, j in pairs
+        )
+    return np.asarray(result)
 
 
-def _continues(a: FrameDetections, b: FrameDetections, settings: TrackingSettings) -> bool:
-    """Whether b may show the scene of a: objects in the same area are mostly the same."""
+def _continues(
+    a: FrameDetections, b: FrameDetections, *, slow: bool, settings: TrackingSettings
+) -> bool:
+    """Whether b may show the scene of a: objects in the same area are mostly the same.
+
+    Where frames are ``slow`` to follow each other, a motion is no excuse for a distance.
+    """
     distance = np.linalg.norm(a.centers[:, None] - b.centers[None], axis=2)
     near = distance < _NEIGHBOURHOOD_M
     comparable = min(int(near.any(axis=1).sum()), int(near.any(axis=0).sum()))
     if comparable == 0:
         return True
-    slow = abs(b.stamp_ns - a.stamp_ns) > _SLOW_S * 1e9
     keys_a, keys_b = size_key(a.sizes), size_key(b.sizes)
     limit = 0.5 * reach(keys_a, settings.gate_m) if slow else np.full(len(keys_a), settings.gate_m)
     same = (

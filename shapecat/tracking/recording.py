@@ -17,6 +17,9 @@ __all__ = ["track_recording"]
 _BURST_NS = 500_000_000
 """A track proves itself by its hits among the frames this near its first one."""
 
+_SHADOW = 5  # a track this many times longer may have another one as its shadow
+_LINE = 10  # detections at either end of a track that tell its motion
+
 
 @dataclass(frozen=True)
 class _Hits:
@@ -64,9 +67,7 @@ def track_recording(
     return tuple(_renumbered(track, k + 1) for k, track in enumerate(found))
 
 
-def _track_stream(
-    frames: Sequence[FrameDetections], settings: TrackingSettings
-) -> list[Track]:
+def _track_stream(frames: Sequence[FrameDetections], settings: TrackingSettings) -> list[Track]:
     cuts = scene_cuts(frames, settings)
     hits, scenes = _columns(frames), np.cumsum(cuts)
     fragments = [
@@ -76,11 +77,8 @@ def _track_stream(
         and len(group) >= _needed(frames, scenes, int(hits.rows[group[0]]), settings.min_hits)
     ]
     chains = _groups(merge_fragments(_describe(hits, fragments, scenes), settings))
-    return [
-        _build_track(hits, np.sort(np.concatenate([fragments[k] for k in chain])), settings)
-        for chain in chains
-        if len(chain)
-    ]
+    members = [np.sort(np.concatenate([fragments[k] for k in c])) for c in chains if len(c)]
+    return [_build_track(hits, member, settings) for member in _without_shadows(hits, members)]
 
 
 def _associate(frames: Sequence[FrameDetections], cuts: Bool, settings: TrackingSettings) -> I4:
@@ -119,36 +117,70 @@ def _groups(labels: I4) -> list[I4]:
 
 
 def _describe(hits: _Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
-    """Summarise fragments by medians, which a few odd views do not move."""
+    """Summarise fragments: sizes by medians, which a few odd views do not move."""
     n = len(fragments)
-    first = np.array([hits.rows[f[0]] for f in fragments], np.int64)
     stamps = np.array([frame.stamp_ns for frame in hits.frames], np.int64)
+    at = stamps[hits.rows]
+    starts = [_line(at[f[:_LINE]], hits.centers[f[:_LINE]], 0) for f in fragments]
+    ends = [_line(at[f[-_LINE:]], hits.centers[f[-_LINE:]], -1) for f in fragments]
     return Fragments(
-        stamps[first],
-        stamps[[hits.rows[f[-1]] for f in fragments]] if n else np.zeros(0),
-        np.reshape([np.median(hits.centers[f[:5]], axis=0) for f in fragments], (n, 3)),
-        np.reshape([np.median(hits.centers[f[-5:]], axis=0) for f in fragments], (n, 3)),
+        np.array([at[f[0]] for f in fragments], np.int64),
+        np.array([at[f[-1]] for f in fragments], np.int64),
+        np.reshape([place for place, _ in starts], (n, 3)),
+        np.reshape([place for place, _ in ends], (n, 3)),
+        np.reshape([velocity for _, velocity in starts], (n, 3)),
+        np.reshape([velocity for _, velocity in ends], (n, 3)),
         np.reshape([np.median(hits.sizes[f], axis=0) for f in fragments], (n, 3)),
         np.reshape([hits.posteriors[f].mean(axis=0) for f in fragments], (n, -1 if n else 0)),
-        scenes[first],
+        np.array([scenes[hits.rows[f[0]]] for f in fragments], np.int32),
     )
 
 
-def _needed(
-    frames: Sequence[FrameDetections], scenes: I4, row: int, min_hits: int
-) -> int:
+def _line(stamps: I4, centers: F8, at: int) -> tuple[F8, F8]:
+    """Fit a uniform motion; return the place at one of the stamps, and the velocity in m/s.
+
+    A prior of standing still keeps the velocity of a few noisy points small.
+    """
+    t = (stamps - stamps[at]) * 1e-9
+    middle, mean = t.mean(), centers.mean(axis=0)
+    velocity = (t - middle) @ (centers - mean) / (((t - middle) ** 2).sum() + 0.1)
+    return mean - middle * velocity, velocity
+
+
+def _needed(frames: Sequence[FrameDetections], scenes: I4, row: int, min_hits: int) -> int:
     """Return how many detections confirm a track that was born in frame ``row``."""
-    near = 0
-    for k, step in ((row, 1), (row - 1, -1)):
-        while (
-            0 <= k < len(frames)
-            and near < min_hits
-            and scenes[k] == scenes[row]
-            and abs(frames[k].stamp_ns - frames[row].stamp_ns) <= _BURST_NS
-        ):
-            near += 1
-            k += step
+    near = 1
+    for direction in (1, -1):
+        for k in range(row + direction, row + direction * min_hits, direction):
+            if not (0 <= k < len(frames)) or scenes[k] != scenes[row]:
+                break
+            near += abs(frames[k].stamp_ns - frames[row].stamp_ns) <= _BURST_NS
     return min(min_hits, near)
+
+
+def _without_shadows(hits: _Hits, members: Sequence[I4]) -> list[I4]:
+    """Drop short tracks inside longer ones: pieces of an object that was split for a moment.
+
+    No object has its centre in the inner half of another one's for all the time it is seen.
+    """
+    lengths = np.array([len(member) for member in members])
+    first = np.array([hits.rows[member[0]] for member in members])
+    last = np.array([hits.rows[member[-1]] for member in members])
+    kept = []
+    for member in members:
+        low, high = hits.rows[member[0]], hits.rows[member[-1]]
+        hosts = (_SHADOW * len(member) <= lengths) & (first <= high) & (last >= low)
+        if not any(_inside(hits, member, members[k]) for k in np.flatnonzero(hosts).tolist()):
+            kept.append(member)
+    return kept
+
+
+def _inside(hits: _Hits, member: I4, host: I4) -> bool:
+    rows, seen = hits.rows[member], hits.rows[host]
+    place = np.column_stack([np.interp(rows, seen, hits.centers[host, k]) for k in range(3)])
+    radius = 0.6 * np.median(hits.sizes[host], axis=0).min()
+    distance = np.linalg.norm(hits.centers[member] - place, axis=1)
+    return bool(np.median(distance) <= radius)
 
 
 def _build_track(hits: _Hits, member: I4, settings: TrackingSettings) -> Track:

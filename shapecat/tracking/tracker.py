@@ -17,9 +17,9 @@ _SPEED_M_S = 0.15  # standard deviation of an object's velocity: most stand stil
 _SPEED_MEMORY_S = 1.0  # how long a velocity lasts
 _NOISE_M = 0.012  # standard deviation of a centre: points, segmentation, viewpoint
 _SURPRISE_M_S = 0.3  # speed at which a hand sets an object in motion between two frames
-_LIMIT = 0.8  # cost from which on a birth is likelier than a pair
-_SIZE_WEIGHT, _POSTERIOR_WEIGHT, _TENTATIVE_COST = 0.5, 0.3, 0.2
-_TENTATIVE_S = 0.5  # a track without its hits ends when not seen for longer
+_LIMIT = 1.0  # cost from which on a birth is likelier than a pair
+_SIZE_WEIGHT, _POSTERIOR_WEIGHT, _TENTATIVE_COST = 0.8, 0.5, 0.2
+_PATIENCE_S = 0.5  # even a track born just now is waited for so long
 _MEMORY_HITS = 10  # a track's size and posterior are means over about so many detections
 
 
@@ -42,6 +42,7 @@ class _Active:
     size: F8
     posterior: F8
     hits: I4
+    born_ns: I4
     seen_ns: I4
     missed: I4
 
@@ -135,12 +136,14 @@ class Tracker:
 
     def _advance(self, stamp_ns: int, found: _Active, partial: Bool) -> I4:
         elapsed_s = self._tick(stamp_ns)
-        found.seen_ns[:] = self._clock_ns
+        found.born_ns[:] = found.seen_ns[:] = self._clock_ns
         if self._active is None or not self.active:
             self._active = found.rows(np.zeros(len(found.ids), bool))
         active = _predict(self._active, elapsed_s)
         pairs = assign(
-            _costs(active, found, self._clock_ns, self._settings), _LIMIT, self._settings.association
+            _costs(active, found, self._clock_ns, self._settings),
+            _LIMIT,
+            self._settings.association,
         )
         _correct(active, found, pairs, partial)
         new = np.ones(len(found.ids), bool)
@@ -161,12 +164,13 @@ class Tracker:
         return max(elapsed, 0) * 1e-9
 
     def _survivors(self, active: _Active) -> _Active:
-        """Drop tracks that were missed and not seen for too long: new ones sooner.
+        """Drop tracks that were missed for too long: for longer than they were there before.
 
         A frame that comes late does not end a track by itself: nobody looked.
         """
         proved = active.hits >= self._settings.min_hits
-        patience_s = np.where(proved, self._settings.max_missed_s, _TENTATIVE_S)
+        longest_s = max(self._settings.max_missed_s, _PATIENCE_S)
+        patience_s = np.clip((active.seen_ns - active.born_ns) * 1e-9, _PATIENCE_S, longest_s)
         unseen_s = (self._clock_ns - active.seen_ns) * 1e-9
         return active.rows((active.missed < np.where(proved, 1, 2)) | (unseen_s <= patience_s))
 
@@ -183,6 +187,7 @@ def _seed(centers: F8, size_keys: F8, posteriors: F8) -> _Active:
         size=size_keys,
         posterior=posteriors,
         hits=np.ones(n, np.int64),
+        born_ns=np.zeros(n, np.int64),
         seen_ns=np.zeros(n, np.int64),
         missed=np.zeros(n, np.int64),
     )

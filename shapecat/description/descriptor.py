@@ -1,0 +1,341 @@
+"""The descriptor: what the shape of an object looks like, as a fixed list of numbers."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from shapecat.arrays import F4, U2
+from shapecat.description.context import (
+    CONTEXT_NAMES,
+    PROFILE_NAMES,
+    context,
+    profile,
+)
+from shapecat.description.curvature import assign, fit_surfaces
+from shapecat.description.distances import euclidean, geodesic, mean_gap
+from shapecat.description.revolution import REVOLUTION_NAMES, revolution
+from shapecat.jit import kernel
+from shapecat.types import NeuralGas
+
+__all__ = ["BLOCKS", "DESCRIPTOR_NAMES", "describe"]
+
+_RINGS, _BANDS = 3, 4
+_DISTANCE_BINS = 12
+_DISTANCE_RANGE = 2.6
+"""Distances between neurons are counted up to this many times their mean."""
+_SHAPE_BINS, _CURVED_BINS, _MEAN_BINS = 8, 6, 6
+_CURVATURE = _SHAPE_BINS + _CURVED_BINS + _MEAN_BINS
+_UP_BINS = 8
+_MAX_POINTS = 1200
+_RADIUS = 2.2 * 1.15
+"""Radius of the neighbourhoods in which curvature is fitted, in spacings of the neurons."""
+_REACH = 3 * 1.15
+
+
+def _bins(name: str, count: int) -> Iterator[str]:
+    return (f"{name}_{k}" for k in range(count))
+
+
+def _parts(kind: str, parts: int, names: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(f"{kind}{part}_{name}" for part in range(parts) for name in names)
+
+
+_CURVATURE_NAMES = (
+    *_bins("shape", _SHAPE_BINS),
+    *_bins("curvedness", _CURVED_BINS),
+    *_bins("mean", _MEAN_BINS),
+)
+_DISTANCE_NAMES = tuple(_bins("bin", _DISTANCE_BINS))
+_BLOCK_NAMES: dict[str, tuple[str, ...]] = {
+    "context": CONTEXT_NAMES,
+    "curvature": _CURVATURE_NAMES,
+    "up": tuple(_bins("bin", _UP_BINS)),
+    "ring_geodesic": _parts("ring", _RINGS, _DISTANCE_NAMES),
+    "ring_euclid": _parts("ring", _RINGS, _DISTANCE_NAMES),
+    "ring_curvature": _parts("ring", _RINGS, ("share", *_CURVATURE_NAMES)),
+    "band_geodesic": _parts("band", _BANDS, _DISTANCE_NAMES),
+    "band_euclid": _parts("band", _BANDS, _DISTANCE_NAMES),
+    "band_curvature": _parts("band", _BANDS, ("share", *_CURVATURE_NAMES)),
+    "profile": PROFILE_NAMES,
+    "revolution": REVOLUTION_NAMES,
+    "metric": ("height", "low", "wide", "across", "along", "spacing"),
+    "view": ("elevation", "distance"),
+}
+
+
+def _slices() -> dict[str, slice]:
+    ends = np.cumsum([len(names) for names in _BLOCK_NAMES.values()]).tolist()
+    return {
+        block: slice(end - len(names), end)
+        for (block, names), end in zip(_BLOCK_NAMES.items(), ends, strict=True)
+    }
+
+
+BLOCKS: dict[str, slice] = _slices()
+"""Where each block of the descriptor is. ``metric`` and ``view`` depend on the scale."""
+
+DESCRIPTOR_NAMES: tuple[str, ...] = tuple(
+    f"{block}.{name}" for block, names in _BLOCK_NAMES.items() for name in names
+)
+"""The name of each number, ``block.name``."""
+_STARTS = tuple(part.start for part in BLOCKS.values())
+
+
+def describe(points: F4, gas: NeuralGas, eye: F4) -> F4:
+    """Describe the shape of one object seen from one side.
+
+    Parameters
+    ----------
+    points : (m, 3) metres, finite, level frame: z up, the support at z = 0; where x and y are 0
+        does not matter. Of more than 1200 every k-th is used.
+    gas : the graph of the points, in the same frame, with at least 2 neurons.
+    eye : (3,) metres, the place of the sensor in the same frame.
+
+    Returns
+    -------
+    (d,) finite numbers named by `DESCRIPTOR_NAMES`, in the blocks `BLOCKS`. They do not change
+    when everything turns about z or moves along x and y; nor, but for the blocks ``metric`` and
+    ``view``, when everything grows about the origin.
+
+    Raises
+    ------
+    ValueError : an array has the wrong shape or is not finite, or the graph has fewer than 2
+        neurons.
+
+    Notes
+    -----
+    Sources: thesis ch. 6; shape distributions: Osada et al. 2002; shape index and curvedness:
+    Koenderink and van Doorn 1992.
+    """
+    points = np.ascontiguousarray(points, np.float32)
+    eye = np.ascontiguousarray(eye, np.float32)
+    if points.ndim != 2 or points.shape[1] != 3 or len(points) == 0 or eye.shape != (3,):
+        msg = f"expected points (m, 3) and eye (3,), got {points.shape} and {eye.shape}"
+        raise ValueError(msg)
+    if len(gas.neurons) < 2:
+        msg = f"a descriptor needs at least 2 neurons, got {len(gas.neurons)}"
+        raise ValueError(msg)
+    result = np.zeros(len(DESCRIPTOR_NAMES), np.float32)
+    if not _describe(points, gas.neurons, gas.edges, eye, result):
+        msg = "points, neurons and eye must be finite"
+        raise ValueError(msg)
+    return result
+
+
+@kernel
+def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
+    """Write the descriptor; return whether the input was finite."""
+    count = neurons.shape[0]
+    x = np.zeros(count, np.float32)
+    y = np.zeros(count, np.float32)
+    z = np.zeros(count, np.float32)
+    middle = np.zeros(3)
+    for i in range(count):
+        for axis in range(3):
+            middle[axis] += neurons[i, axis] / count
+    size = 0.0
+    for i in range(count):
+        for axis in range(3):
+            size = max(size, abs(neurons[i, axis] - middle[axis]))
+    if not size < np.inf:
+        return False
+    # Unit: the mean distance between neurons. `size` first, so that squares stay in range.
+    unit = size if size > 0 else 1.0
+    for _ in range(2):
+        for i in range(count):
+            x[i] = (neurons[i, 0] - middle[0]) / unit
+            y[i] = (neurons[i, 1] - middle[1]) / unit
+            z[i] = (neurons[i, 2] - middle[2]) / unit
+        straight = euclidean(x, y, z)
+        mean = straight.sum() / (count * (count - 1))
+        if mean > 0:
+            unit *= mean
+    step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
+    total = (points.shape[0] + step - 1) // step
+    cloud = np.zeros((3, total), np.float32)
+    largest = 0.0
+    for k in range(total):
+        for axis in range(3):
+            value = (points[k * step, axis] - middle[axis]) / unit
+            cloud[axis, k] = value
+            largest = max(largest, abs(value))
+    place = np.zeros(3, np.float32)
+    for axis in range(3):
+        place[axis] = (eye[axis] - middle[axis]) / unit
+        largest = max(largest, abs(place[axis]))
+    if not largest < np.inf:
+        return False
+    gap = max(mean_gap(straight), 1e-3)
+    paths = geodesic(straight, edges)
+    cloud, starts = assign(cloud, x, y, z, np.float32(_REACH * gap))
+    if cloud.shape[1] == 0:
+        # none is near: describe the neurons themselves
+        cloud = np.zeros((3, count), np.float32)
+        cloud[0], cloud[1], cloud[2] = x, y, z
+        starts = np.arange(count + 1)
+    weight = np.zeros(count, np.float32)
+    for i in range(count):
+        weight[i] = (starts[i + 1] - starts[i]) / cloud.shape[1]
+    normals, curvatures = fit_surfaces(
+        cloud, starts, x, y, z, straight, np.float32(_RADIUS * gap), place
+    )
+    low, high = _height_range(cloud[2])
+    context(
+        cloud,
+        x,
+        y,
+        z,
+        -middle[2] / unit,
+        weight,
+        normals,
+        curvatures,
+        straight,
+        paths,
+        place,
+        low,
+        high,
+        out[_STARTS[0] : _STARTS[1]],
+    )
+    _distributions(z, straight, paths, weight, normals, curvatures, out)
+    profile(x, y, z, weight, normals, curvatures, low, high, out[_STARTS[9] : _STARTS[10]])
+    revolution(x, y, z, weight, normals, out[_STARTS[10] : _STARTS[11]])
+    at = _STARTS[11]
+    out[at] = (high - low) * unit
+    out[at + 1] = low * unit + middle[2]
+    out[at + 5] = gap * unit
+    away = np.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2)
+    out[_STARTS[12]] = place[2] / max(away, 1e-6)
+    out[_STARTS[12] + 1] = away * unit
+    return True
+
+
+@kernel
+def _height_range(z: F4) -> tuple[float, float]:
+    """Return the 2 % and 98 % quantile of ``z``, by a histogram of 256 bins."""
+    low, high = z.min(), z.max()
+    if not high > low:
+        return low, high
+    scale = 256 / (high - low)
+    bins = np.zeros(256, np.int64)
+    for k in range(z.size):
+        bins[min(int((z[k] - low) * scale), 255)] += 1
+    limit = z.size * 0.02
+    first, last = 0, 255
+    seen = bins[0]
+    while seen <= limit:
+        first += 1
+        seen += bins[first]
+    seen = bins[255]
+    while seen <= limit:
+        last -= 1
+        seen += bins[last]
+    return low + first / scale, low + (last + 1) / scale
+
+
+@kernel
+def _count(row: F4, start: int, bins: int, place: float, weight: float) -> None:
+    """Add ``weight`` at ``place`` (0 to 1) of a histogram, shared between the two nearest bins."""
+    at = min(max(place * bins - 0.5, 0.0), bins - 1.0)
+    k = min(int(at), bins - 2)
+    row[start + k] += weight * (k + 1 - at)
+    row[start + k + 1] += weight * (at - k)
+
+
+@kernel
+def _distributions(
+    z: F4, straight: F4, paths: F4, weight: F4, normals: F4, curvatures: F4, out: F4
+) -> None:
+    """Write the histograms over the whole object, its rings and its bands."""
+    count = z.size
+    width = 1 + _CURVATURE + 2 * _DISTANCE_BINS
+    rows = np.zeros((count, width), np.float32)
+    mean_path = np.zeros(count)
+    for i in range(count):
+        mean_path[i] = paths[i].sum()
+    pairs = count * (count - 1)
+    scale = np.float32(_DISTANCE_BINS / _DISTANCE_RANGE)
+    per_path = scale * np.float32(pairs / max(mean_path.sum(), 1e-9))
+    per_straight = scale  # the mean is the unit
+    one = np.float32(1.0 / (count - 1))
+    last = np.float32(_DISTANCE_BINS - 1)
+    for i in range(count):
+        row = rows[i]
+        for j in range(count):
+            if i == j:
+                continue
+            a = paths[i, j] * per_path - np.float32(0.5)
+            a = a if a > 0 else np.float32(0)
+            a = a if a < last else last
+            k = min(int(a), _DISTANCE_BINS - 2)
+            f = (a - np.float32(k)) * one
+            row[1 + _CURVATURE + k] += one - f
+            row[2 + _CURVATURE + k] += f
+            a = straight[i, j] * per_straight - np.float32(0.5)
+            a = a if a > 0 else np.float32(0)
+            a = a if a < last else last
+            k = min(int(a), _DISTANCE_BINS - 2)
+            f = (a - np.float32(k)) * one
+            row[1 + _CURVATURE + _DISTANCE_BINS + k] += one - f
+            row[2 + _CURVATURE + _DISTANCE_BINS + k] += f
+        first, second = curvatures[0, i], curvatures[1, i]
+        _curvature_row(row, first, second)
+    curvature = out[_STARTS[1] : _STARTS[2]]
+    up = out[_STARTS[2] : _STARTS[3]]
+    for i in range(count):
+        for k in range(_CURVATURE):
+            curvature[k] += weight[i] * rows[i, 1 + k]
+        _count(up, 0, _UP_BINS, (normals[2, i] + 1) / 2, weight[i])
+    _partition(rows, mean_path, weight, _RINGS, out, _STARTS[3], _STARTS[4], _STARTS[5])
+    _partition(rows, z.astype(np.float64), weight, _BANDS, out, _STARTS[6], _STARTS[7], _STARTS[8])
+
+
+@kernel
+def _curvature_row(row: F4, first: float, second: float) -> None:
+    row[0] = 1
+    spread = first - second
+    index = 2 / np.pi * np.arctan2(first + second, spread)
+    _count(row, 1, _SHAPE_BINS, (index + 1) / 2, 1.0)
+    curved = np.sqrt((first * first + second * second) / 2)
+    _count(row, 1 + _SHAPE_BINS, _CURVED_BINS, (np.log2(curved + 1e-6) + 3) / 7, 1.0)
+    mean = (first + second) / 2
+    _count(row, 1 + _SHAPE_BINS + _CURVED_BINS, _MEAN_BINS, (mean / (1 + abs(mean)) + 1) / 2, 1.0)
+
+
+@kernel
+def _partition(
+    rows: F4,
+    order: F4,
+    weight: F4,
+    parts: int,
+    out: F4,
+    at_paths: int,
+    at_straight: int,
+    at_curvature: int,
+) -> None:
+    """Average ``rows`` over the parts in which ``order`` is cut at equal distances.
+
+    A neuron counts in the two parts whose middles it lies between, so that a small change of the
+    graph changes the descriptor little.
+    """
+    low, high = order.min(), order.max()
+    sums = np.zeros((parts, rows.shape[1]))
+    for i in range(rows.shape[0]):
+        place = (order[i] - low) / (high - low) if high > low else 0.5
+        at = min(max(place * parts - 0.5, 0.0), parts - 1.0)
+        first = min(int(at), parts - 2)
+        for side in range(2):
+            share = weight[i] * (at - first if side == 1 else first + 1 - at)
+            for k in range(rows.shape[1]):
+                sums[first + side, k] += share * rows[i, k]
+    for part in range(parts):
+        share = sums[part, 0]
+        norm = 1.0 / (share + 1e-3)
+        base = at_curvature + part * (1 + _CURVATURE)
+        out[base] = share
+        for k in range(_CURVATURE):
+            out[base + 1 + k] = sums[part, 1 + k] * norm
+        for k in range(_DISTANCE_BINS):
+            out[at_paths + part * _DISTANCE_BINS + k] = sums[part, 1 + _CURVATURE + k] * norm
+            out[at_straight + part * _DISTANCE_BINS + k] = (
+                sums[part, 1 + _CURVATURE + _DISTANCE_BINS + k] * norm
+            )

@@ -1,0 +1,174 @@
+"""Candidates: labelled cells become records, with boxes, supports and flags."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4
+from shapecat.detection.cells import Cells, Lens
+from shapecat.detection.pieces import (
+    BOTTOM,
+    CONTACT,
+    COUNT,
+    FRONT,
+    HIDDEN,
+    LEFT,
+    NEAR,
+    ONTO,
+    ONTO_HEIGHT,
+    RIGHTMOST,
+    TABLE,
+    TOP,
+    Pieces,
+)
+from shapecat.detection.segmentation import Segmentation
+from shapecat.geometry import gravity_rotation, quaternion_from_rotation
+from shapecat.jit import kernel
+
+__all__ = ["Stand", "boxes_of", "occluded", "stands_of"]
+
+OCCLUDED = 0.12
+"""Share of the boundary behind something nearer that makes an object occluded."""
+YAWS = 60
+GAP_M = 0.025
+LIFTED_M = 0.03
+
+
+class Stand(NamedTuple):
+    """What a label stands on: another label or 0, at a height above its plane in metres."""
+
+    label: int
+    height_m: float
+
+
+def stands_of(found: Segmentation) -> list[Stand]:
+    """Return what each of the labels 1, 2, ... stands on (index 0 is label 1).
+
+    An object stands on another when it touches surface of it that faces up, more than it touches
+    the plane; or, where that contact is hidden, when it ends where the other begins.
+    """
+    pieces, leaders = found.pieces, found.leaders
+    result = []
+    for p in leaders[1:]:
+        best, height = 0, 0.0
+        onto = pieces.pairs[ONTO, p, leaders]
+        k = int(np.argmax(onto))
+        if onto[k] >= 3 and onto[k] > pieces.single[p, TABLE]:
+            best, height = k, float(pieces.pairs[ONTO_HEIGHT, p, leaders[k]] / onto[k])
+            if pieces.shape[p, TOP] < height:
+                best = 0
+        elif pieces.shape[p, BOTTOM] > LIFTED_M and pieces.single[p, TABLE] <= 2:
+            best = _hidden_stand(pieces, leaders, int(p))
+            height = float(pieces.shape[leaders[best], TOP]) if best else 0.0
+        result.append(Stand(best, height))
+    return _without_cycles(result)
+
+
+def _hidden_stand(pieces: Pieces, leaders: I4, p: int) -> int:
+    shape = pieces.shape
+    met = (pieces.pairs[CONTACT] + pieces.pairs[NEAR] + pieces.pairs[FRONT] + pieces.pairs[FRONT].T)[
+        p, leaders
+    ]
+    below = abs(shape[leaders, TOP] - shape[p, BOTTOM]) < GAP_M
+    middle = (shape[p, LEFT] + shape[p, RIGHTMOST]) / 2
+    beside = (shape[leaders, LEFT] < middle) & (middle < shape[leaders, RIGHTMOST])
+    fits = met * (below & beside & (leaders != p) & (leaders > 0))
+    return int(np.argmax(fits)) if fits.max() >= 3 else 0
+
+
+def _without_cycles(stands: list[Stand]) -> list[Stand]:
+    result = list(stands)
+    for k in range(len(result)):
+        seen = {k + 1}
+        at = result[k].label
+        while at and at not in seen:
+            seen.add(at)
+            at = result[at - 1].label
+        if at:
+            result[k] = Stand(0, 0.0)
+    return result
+
+
+def occluded(found: Segmentation) -> list[bool]:
+    """Return for each label whether something nearer hides a part of it."""
+    pieces, leaders = found.pieces, found.leaders[1:]
+    hidden = pieces.pairs[FRONT][:, leaders].sum(axis=0) + pieces.single[leaders, HIDDEN]
+    return [bool(flag) for flag in hidden > OCCLUDED * np.maximum(pieces.boundary[leaders], 1)]
+
+
+def boxes_of(cells: Cells, found: Segmentation) -> tuple[F8, F8, F8]:
+    """Return centres (n, 3), sizes (n, 3) and orientations (n, 4) of the labels' upright boxes.
+
+    The smallest box over 60 yaws, as `shapecat.geometry.upright_box`, on the outermost cells.
+    """
+    count = found.leaders.size - 1
+    level = gravity_rotation(found.up)
+    extent = np.zeros((count + 1, 7))
+    _extents(cells.w, cells.lens, found.labels, level, extent)
+    extent = extent[1:]
+    low, high, yaw = extent[:, 0:3], extent[:, 3:6], extent[:, 6]
+    middle = (low + high) / 2
+    c, s = np.cos(yaw), np.sin(yaw)
+    flat = np.stack([c * middle[:, 0] - s * middle[:, 1], s * middle[:, 0] + c * middle[:, 1]], 1)
+    center = np.concatenate([flat, middle[:, 2:]], axis=1) @ level
+    # The box axes are the level axes turned by yaw: q = q_level * q_yaw.
+    x, y, z, w = quaternion_from_rotation(level.T)
+    hc, hs = np.cos(yaw / 2), np.sin(yaw / 2)
+    turned = np.stack([x * hc + y * hs, y * hc - x * hs, z * hc + w * hs, w * hc - z * hs], 1)
+    turned *= np.where(turned[:, 3:] < 0, -1.0, 1.0)
+    return center, high - low, turned
+
+
+@kernel(fast=True)
+def _extents(w: F4, lens: Lens, labels: I4, level: F8, extent: F8) -> None:
+    rows, columns = labels.shape
+    count = extent.shape[0]
+    # Outermost cells, and every 4th inside (a ball's nearest point is inside its outline).
+    number = np.zeros(count + 1, np.int64)
+    chosen = np.zeros(labels.shape, np.uint8)
+    for i in range(rows):
+        for j in range(columns):
+            p = labels[i, j]
+            if p == 0:
+                continue
+            inside = (i > 0) & (j > 0) & (i + 1 < rows) & (j + 1 < columns)
+            if inside:
+                inside = (labels[i - 1, j] == p) & (labels[i + 1, j] == p)
+                inside &= (labels[i, j - 1] == p) & (labels[i, j + 1] == p)
+            if not inside or (i % 4 == 0 and j % 4 == 0):
+                chosen[i, j] = 1
+                number[p + 1] += 1
+    place = np.cumsum(number)
+    start = place.copy()
+    local = np.zeros((3, place[-1]), np.float32)
+    for i in range(rows):
+        for j in range(columns):
+            if chosen[i, j]:
+                k = place[labels[i, j]]
+                place[labels[i, j]] += 1
+                z = 1 / w[i, j]
+                x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
+                for d in range(3):
+                    local[d, k] = level[d, 0] * x + level[d, 1] * y + level[d, 2] * z
+    for p in range(1, count):
+        a, b = start[p], start[p + 1]
+        if a == b:
+            continue
+        xs, ys = local[0, a:b], local[1, a:b]
+        best = np.inf
+        for t in range(YAWS):
+            yaw = t * (np.pi / 2 / YAWS)
+            c, s = np.float32(np.cos(yaw)), np.float32(np.sin(yaw))
+            x0 = x1 = c * xs[0] + s * ys[0]
+            y0 = y1 = c * ys[0] - s * xs[0]
+            for k in range(xs.size):
+                u, v = c * xs[k] + s * ys[k], c * ys[k] - s * xs[k]
+                x0 = u if u < x0 else x0
+                x1 = u if u > x1 else x1
+                y0 = v if v < y0 else y0
+                y1 = v if v > y1 else y1
+            if (x1 - x0) * (y1 - y0) < best:
+                best = (x1 - x0) * (y1 - y0)
+                extent[p, 0], extent[p, 1], extent[p, 3], extent[p, 4] = x0, y0, x1, y1
+                extent[p, 6] = yaw
+        extent[p, 2], extent[p, 5] = np.min(local[2, a:b]), np.max(local[2, a:b])

@@ -1,0 +1,91 @@
+"""Heights: which plane every cell stands above, and how far (thesis Alg. 2, step 2)."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4
+from shapecat.detection.cells import Cells, Lens
+from shapecat.detection.planes import DIRECTIONS, Support
+from shapecat.geometry import gravity_rotation
+from shapecat.jit import kernel
+
+__all__ = ["LEAST_M", "NOISE", "Heights", "heights_of", "table_of"]
+
+LEAST_M = 0.006
+"""Lowest height of an object cell, to which `NOISE` times the squared range is added."""
+NOISE = 0.004
+
+
+class Heights(NamedTuple):
+    """What every cell stands on.
+
+    Attributes
+    ----------
+    owner : (rows, columns) int8: k + 1 above plane k and inside its outline, -(k + 1) on its
+        surface, 0 elsewhere.
+    height : (rows, columns) float32, metres above the plane of `owner`.
+    """
+
+    owner: I4
+    height: F4
+
+
+def table_of(supports: list[Support], lens: Lens) -> F8:
+    """Return one row of numbers per plane, for the kernels."""
+    rows = np.zeros((len(supports), 10 + DIRECTIONS))
+    for row, s in zip(rows, supports, strict=True):
+        n = (s.a * lens.fx, s.b * lens.fy, s.a * lens.cx + s.b * lens.cy + s.c)
+        level = gravity_rotation(s.up)
+        row[:4] = s.a, s.b, s.c, 1.0 / math.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
+        row[4:10] = level[:2].ravel()
+        row[10:] = s.reach
+    return rows
+
+
+def heights_of(cells: Cells, supports: list[Support], *, highest_m: float) -> Heights:
+    """Give every cell to the highest plane it is above."""
+    owner = np.zeros(cells.w.shape, np.int8)
+    height = np.zeros(cells.w.shape, np.float32)
+    for k, row in reversed(list(enumerate(table_of(supports, cells.lens)))):
+        _stand(cells.w, cells.lens, row, k + 1, highest_m, owner, height)
+    return Heights(owner, height)
+
+
+@kernel
+def _stand(
+    w: F4, lens: Lens, plane: F8, number: int, highest: float, owner: I4, height: F4
+) -> None:
+    rows, columns = w.shape
+    a, scale = np.float32(plane[0]), np.float32(plane[3])
+    least, noise = np.float32(LEAST_M), np.float32(NOISE)
+    line = np.zeros(columns, np.float32)
+    # A plane seen edge on has heights between the steps of the sensor; so no division is unsafe.
+    for i in range(rows):
+        base = np.float32(plane[1] * i + plane[2])
+        for j in range(columns):
+            v = w[i, j]
+            inverse = np.float32(1) / v if v > 0 else np.float32(0)
+            h = (v - (a * np.float32(j) + base)) * inverse * scale
+            gate = least + noise * inverse * inverse
+            line[j] = h if (v > 0) & (h > -gate) & (h < highest) else np.float32(-9)
+        for j in range(columns):
+            if line[j] == np.float32(-9) or owner[i, j] != 0:
+                continue
+            z = 1.0 / w[i, j]
+            x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
+            if _inside(plane, x, y, z):
+                owner[i, j] = number if line[j] > least + noise * z * z else -number
+                height[i, j] = line[j]
+
+
+@kernel
+def _inside(plane: F8, x: float, y: float, z: float) -> bool:
+    p = plane[4] * x + plane[5] * y + plane[6] * z
+    q = plane[7] * x + plane[8] * y + plane[9] * z
+    for k in range(DIRECTIONS):
+        angle = k * (2 * math.pi / DIRECTIONS)
+        if math.cos(angle) * p + math.sin(angle) * q > plane[10 + k]:
+            return False
+    return True

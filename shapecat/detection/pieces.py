@@ -1,0 +1,289 @@
+"""Pieces: what is known of each region and of each pair of regions."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4, U1
+from shapecat.detection.cells import JUMP, Cells, Lens
+from shapecat.detection.heights import Heights
+from shapecat.detection.surfaces import DOWN, RIGHT, Surfaces
+from shapecat.geometry import gravity_rotation
+from shapecat.jit import kernel
+
+__all__ = [
+    "AREA",
+    "BAND_M",
+    "BOTTOM",
+    "CONTACT",
+    "COUNT",
+    "FRONT",
+    "HIDDEN",
+    "LEFT",
+    "NEAR",
+    "ONTO",
+    "ONTO_HEIGHT",
+    "RIGHTMOST",
+    "RIM",
+    "SAMPLES",
+    "SIDE",
+    "SIDE2",
+    "SIDETURN",
+    "TABLE",
+    "TOP",
+    "TURN",
+    "Pieces",
+    "merge",
+    "pieces_of",
+]
+
+CONTACT, FRONT, NEAR, ONTO, ONTO_HEIGHT = range(5)
+"""Pair statistics [p, q]: linked neighbours; places where p is in front of q; neighbours of equal
+depth over a gap; links whose far side on q faces up, and the sum of its heights."""
+TABLE, HIDDEN, RIM = range(3)
+"""Statistics of one piece: links with its plane; boundary behind things that are no piece; links
+with a higher plane, from below."""
+COUNT, LEFT, RIGHTMOST, SIDE, SIDE2, TURN, SIDETURN, TOP, BOTTOM, AREA = range(10)
+SAMPLES = 48
+BANDS = 128
+BAND_M = 0.005
+GAP, SHADOW = 3, 15
+INWARD = 3
+UPWARD = 0.8
+
+
+class Pieces(NamedTuple):
+    """Statistics of n pieces; row 0 is no piece. All but the samples add up when pieces merge.
+
+    Attributes
+    ----------
+    pairs : (5, n + 1, n + 1) float32, see `CONTACT` and the following.
+    single : (n + 1, 3) float32, see `TABLE` and `HIDDEN`.
+    boundary : (n + 1,) float32 sides of cells on the boundary.
+    shape : (n + 1, 10) float32: cells, lateral range, sums for the regression of the lateral
+        normal on the lateral position, height range, area.
+    lid : (n + 1, BANDS) float32 m2 of surface that faces up, by height.
+    samples : (n + 1, SAMPLES) int32 cells away from edges, -1 beyond the last.
+    owner : (n + 1,) int8 the plane it is above, as in `Heights.owner`.
+    group : (n + 1,) int16 the piece it has been merged into.
+    """
+
+    pairs: F4
+    single: F4
+    boundary: F4
+    shape: F4
+    lid: F4
+    samples: I4
+    owner: I4
+    group: I4
+
+
+def pieces_of(
+    cells: Cells, heights: Heights, surfaces: Surfaces, labels: I4, n: int, up: F8
+) -> Pieces:
+    """Collect the statistics of regions 1..n and of their pairs."""
+    size = n + 1
+    pieces = Pieces(
+        np.zeros((5, size, size), np.float32),
+        np.zeros((size, 3), np.float32),
+        np.zeros(size, np.float32),
+        np.zeros((size, 10), np.float32),
+        np.zeros((size, BANDS), np.float32),
+        np.full((size, SAMPLES), -1, np.int32),
+        np.zeros(size, np.int8),
+        np.arange(size).astype(np.int16),
+    )
+    _meet(cells.w, heights.owner, heights.height, surfaces.links, surfaces.normal, labels, up, pieces)
+    side = np.cross(up, [0.0, 0.0, 1.0])
+    if np.linalg.norm(side) < 0.2:  # the camera looks straight down
+        side = gravity_rotation(up)[0]
+    side /= np.linalg.norm(side)
+    _measure(
+        cells.w, cells.lens, heights.owner, heights.height, surfaces, labels, up, side, pieces
+    )
+    return pieces
+
+
+@kernel
+def _meet(
+    w: F4, owner: I4, height: F4, links: U1, normal: F4, labels: I4, up: F8, pieces: Pieces
+) -> None:
+    rows, columns = w.shape
+    for i in range(rows):
+        for j in range(columns):
+            p = labels[i, j]
+            if w[i, j] <= 0 or (p == 0 and owner[i, j] > 0):
+                continue
+            for d in range(2):
+                di, dj = (0, 1) if d == 0 else (1, 0)
+                bit = RIGHT if d == 0 else DOWN
+                y, x = i + di, j + dj
+                if y >= rows or x >= columns:
+                    continue
+                q = labels[y, x]
+                if p == q and (p == 0 or links[i, j] & bit):
+                    continue
+                # Go on over cells without a reading: the shadow of the projector.
+                gap = 0
+                while (w[y, x] <= 0 or (q == 0 and owner[y, x] > 0)) and gap <= SHADOW:
+                    gap += 1
+                    y += di
+                    x += dj
+                    if y >= rows or x >= columns:
+                        break
+                    q = labels[y, x]
+                if p > 0 and (gap == 0 or p != q):
+                    pieces.boundary[p] += 1
+                if y >= rows or x >= columns or gap > SHADOW:
+                    continue
+                q = labels[y, x]
+                if q > 0 and (gap == 0 or p != q):
+                    pieces.boundary[q] += 1
+                if p == q:
+                    continue
+                step = w[i, j] - w[y, x]
+                if p > 0 and q > 0:
+                    if gap == 0 and links[i, j] & bit:
+                        pieces.pairs[CONTACT, p, q] += 1
+                        pieces.pairs[CONTACT, q, p] += 1
+                        _onto(i, j, di, dj, p, q, labels, normal, height, up, pieces)
+                        _onto(y, x, -di, -dj, q, p, labels, normal, height, up, pieces)
+                    elif abs(step) < JUMP:
+                        if gap <= GAP:
+                            pieces.pairs[NEAR, p, q] += 1
+                            pieces.pairs[NEAR, q, p] += 1
+                    elif step > 0:
+                        pieces.pairs[FRONT, p, q] += 1
+                    else:
+                        pieces.pairs[FRONT, q, p] += 1
+                elif p > 0:
+                    if step < -JUMP:
+                        pieces.single[p, HIDDEN] += 1
+                    elif step < JUMP and owner[y, x] < 0 and gap <= GAP:
+                        pieces.single[p, TABLE if owner[y, x] == -owner[i, j] else RIM] += 1
+                elif q > 0:
+                    if step > JUMP:
+                        pieces.single[q, HIDDEN] += 1
+                    elif step > -JUMP and owner[i, j] < 0 and gap <= GAP:
+                        pieces.single[q, TABLE if owner[y, x] == -owner[i, j] else RIM] += 1
+
+
+@kernel
+def _onto(
+    i: int,
+    j: int,
+    di: int,
+    dj: int,
+    p: int,
+    q: int,
+    labels: I4,
+    normal: F4,
+    height: F4,
+    up: F8,
+    pieces: Pieces,
+) -> None:
+    """Count the link from cell (i, j) of ``p`` to ``q`` if ``q`` faces up beyond it."""
+    y = min(max(i + INWARD * di, 0), labels.shape[0] - 1)
+    x = min(max(j + INWARD * dj, 0), labels.shape[1] - 1)
+    if labels[y, x] != q:
+        return
+    m = normal[y, x]
+    if m[0] * up[0] + m[1] * up[1] + m[2] * up[2] > UPWARD:
+        pieces.pairs[ONTO, p, q] += 1
+        pieces.pairs[ONTO_HEIGHT, p, q] += height[y, x]
+
+
+@kernel
+def _measure(
+    w: F4,
+    lens: Lens,
+    owner: I4,
+    height: F4,
+    surfaces: Surfaces,
+    labels: I4,
+    up: F8,
+    side: F8,
+    pieces: Pieces,
+) -> None:
+    rows, columns = w.shape
+    shape = pieces.shape
+    shape[:, LEFT] = 1e9
+    shape[:, RIGHTMOST] = -1e9
+    shape[:, TOP] = -1e9
+    shape[:, BOTTOM] = 1e9
+    for i in range(rows):
+        for j in range(columns):
+            p = labels[i, j]
+            if p == 0:
+                continue
+            z = 1 / w[i, j]
+            x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
+            along = x * side[0] + y * side[1] + z * side[2]
+            row = shape[p]
+            pieces.owner[p] = owner[i, j]
+            row[COUNT] += 1
+            row[LEFT] = min(row[LEFT], along)
+            row[RIGHTMOST] = max(row[RIGHTMOST], along)
+            h = height[i, j]
+            row[TOP] = max(row[TOP], h)
+            row[BOTTOM] = min(row[BOTTOM], h)
+            if not surfaces.tangent[i, j, 0] > 0:
+                continue
+            m = surfaces.normal[i, j]
+            turn = m[0] * side[0] + m[1] * side[1] + m[2] * side[2]
+            row[SIDE] += along
+            row[SIDE2] += along * along
+            row[TURN] += turn
+            row[SIDETURN] += along * turn
+            facing = -(m[0] * x + m[1] * y + m[2] * z) / math.sqrt(x * x + y * y + z * z)
+            area = z * z / (lens.fx * lens.fy) / max(facing, 0.2)
+            row[AREA] += area
+            if m[0] * up[0] + m[1] * up[1] + m[2] * up[2] > UPWARD:
+                band = min(max(int(h / BAND_M), 0), BANDS - 1)
+                pieces.lid[p, band] += area
+    seen = np.zeros(shape.shape[0], np.int32)
+    taken = np.zeros(shape.shape[0], np.int32)
+    for i in range(rows):
+        for j in range(columns):
+            p = labels[i, j]
+            if p == 0 or surfaces.edge[i, j] > 20 or not surfaces.tangent[i, j, 0] > 0:
+                continue
+            seen[p] += 1
+            stride = max(1, int(shape[p, COUNT]) // SAMPLES)
+            if seen[p] % stride == 0 and taken[p] < SAMPLES:
+                pieces.samples[p, taken[p]] = i * columns + j
+                taken[p] += 1
+
+
+@kernel
+def merge(pieces: Pieces, p: int, q: int) -> None:
+    """Add piece ``q`` to piece ``p``; both are groups of their own before."""
+    n = pieces.group.size
+    for r in range(pieces.pairs.shape[0]):
+        for k in range(n):
+            pieces.pairs[r, p, k] += pieces.pairs[r, q, k]
+            pieces.pairs[r, q, k] = 0
+        for k in range(n):
+            pieces.pairs[r, k, p] += pieces.pairs[r, k, q]
+            pieces.pairs[r, k, q] = 0
+        pieces.pairs[r, p, p] = 0
+    pieces.boundary[p] += pieces.boundary[q]
+    pieces.single[p] += pieces.single[q]
+    pieces.lid[p] += pieces.lid[q]
+    a, b = pieces.shape[p], pieces.shape[q]
+    for k in (COUNT, SIDE, SIDE2, TURN, SIDETURN, AREA):
+        a[k] += b[k]
+    a[LEFT], a[RIGHTMOST] = min(a[LEFT], b[LEFT]), max(a[RIGHTMOST], b[RIGHTMOST])
+    a[TOP], a[BOTTOM] = max(a[TOP], b[TOP]), min(a[BOTTOM], b[BOTTOM])
+    # Half of the samples from each side.
+    first, second = pieces.samples[p].copy(), pieces.samples[q].copy()
+    mixed = 0
+    for k in range(SAMPLES):
+        for source in (first, second):
+            if source[k] >= 0 and mixed < SAMPLES:
+                pieces.samples[p, mixed] = source[k]
+                mixed += 1
+    for k in range(n):
+        if pieces.group[k] == q:
+            pieces.group[k] = p

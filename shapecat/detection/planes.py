@@ -1,0 +1,383 @@
+"""Supporting planes: the up direction, horizontal levels, and their outlines (thesis 4.3)."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4
+from shapecat.detection.cells import Cells, Lens
+from shapecat.geometry import gravity_rotation
+from shapecat.jit import kernel
+
+__all__ = ["DIRECTIONS", "Support", "corners_of", "estimate_up", "find_supports"]
+
+TOLERANCE = 0.01
+"""Distance of an inlier from a plane in inverse depth, 1/m: three steps of a Kinect."""
+TRIALS = 120
+MOST_PLANES = 5
+LEAST_SHARE = 0.04
+"""A plane that tells the up direction covers at least this share of the readings."""
+HINT_COS = math.cos(math.radians(15))
+PARALLEL_COS = math.cos(math.radians(12))
+DIRECTIONS = 16
+MARGIN_M = 0.01
+BIN_M = 0.01
+LEAST_AREA_M2 = 0.03
+SURE_AREA_M2 = 0.25
+LEAST_CELLS = 100
+ARM = 3
+"""Cells to each side over which a surface is seen to be level."""
+STEADY_COS = math.cos(math.radians(4))
+LEAST_DROP_M = 0.06
+
+
+class Support(NamedTuple):
+    """A horizontal plane that objects may stand on, in units of cells.
+
+    ``a * j + b * i + c`` is its inverse depth at cell (i, j); ``up`` (3,) its unit normal in the
+    sensor frame and ``offset`` its height along ``up``; ``reach`` (DIRECTIONS,) how far it extends
+    along evenly spaced directions of the level frame, metres; ``area_m2`` its visible area.
+    """
+
+    a: float
+    b: float
+    c: float
+    up: F8
+    offset: float
+    reach: F8
+    area_m2: float
+
+
+def estimate_up(
+    cells: Cells, hint: F8 | None, *, upright: bool, rng: np.random.Generator
+) -> F8 | None:
+    """Return the normal of the dominant supporting plane, (3,) unit, or None if there is none.
+
+    With a ``hint`` only planes within 15 degrees of being perpendicular to it count. Without, the
+    largest group of parallel planes wins; where the camera is thought ``upright``, planes that
+    would look down count less, so that a table beats the wall behind it.
+    """
+    sample, stride = _sample(cells.w)
+    least = max(LEAST_SHARE * np.count_nonzero(sample), 30)
+    guide = np.zeros(3) if hint is None else np.asarray(hint, np.float64)
+    normals: list[F8] = []
+    weights: list[float] = []
+    for _ in range(MOST_PLANES):
+        plane = np.zeros(3)
+        triples = _triples(sample.shape, rng)
+        count = _consensus(sample, stride, triples, TOLERANCE, cells.lens, guide, HINT_COS, plane)
+        if count < least:
+            break
+        normals.append(_normal(plane, cells.lens))
+        # Cameras look down at tables: +y is down in the optical frame.
+        tilt = min(max(-normals[-1][1] / 0.2, -1.0), 1.0) if upright else 0.0
+        weights.append(count * (1.0 + 0.6 * tilt))
+        if hint is not None:
+            break
+        _clear(sample, stride, plane, 2 * TOLERANCE)
+    if not normals:
+        return None
+    parallel = np.array(normals) @ np.array(normals).T > PARALLEL_COS
+    return normals[int(np.argmax(parallel @ np.array(weights)))]
+
+
+def _sample(w: F4) -> tuple[F4, int]:
+    stride = max(1, round(math.sqrt(w.size / 4800)))
+    return np.ascontiguousarray(w[stride // 2 :: stride, stride // 2 :: stride]), stride
+
+
+def _triples(shape: tuple[int, ...], rng: np.random.Generator) -> I4:
+    """Return (TRIALS, 3, 2) positions: one anywhere, two more at a random distance from it."""
+    size = np.array(shape)
+    first = rng.integers(0, size, (TRIALS, 1, 2))
+    radius = rng.uniform(0.08, 0.5, (TRIALS, 1, 1)) * size.max()
+    others = first + np.rint(rng.uniform(-1, 1, (TRIALS, 2, 2)) * radius).astype(np.int64)
+    return np.concatenate([first, np.clip(others, 0, size - 1)], axis=1)
+
+
+def _normal(plane: F8, lens: Lens) -> F8:
+    a, b, c = plane
+    n = -np.array([a * lens.fx, b * lens.fy, a * lens.cx + b * lens.cy + c])
+    return n / np.linalg.norm(n)
+
+
+@kernel(fast=True)
+def _count(sample: F4, stride: int, a: float, b: float, c: float, tolerance: float) -> int:
+    rows, columns = sample.shape
+    total = 0
+    shift = stride // 2
+    step = np.float32(a * stride)
+    gate = np.float32(tolerance)
+    for i in range(rows):
+        base = np.float32(b * (i * stride + shift) + a * shift + c)
+        line = sample[i]
+        number = np.int32(0)
+        for j in range(columns):
+            w = line[j]
+            number += np.int32((abs(w - (step * np.float32(j) + base)) < gate) & (w > 0))
+        total += number
+    return total
+
+
+@kernel
+def _consensus(
+    sample: F4,
+    stride: int,
+    triples: I4,
+    tolerance: float,
+    lens: Lens,
+    guide: F8,
+    least_cos: float,
+    best: F8,
+) -> int:
+    """Write the plane (a, b, c) with most inliers to ``best``; return how many there are.
+
+    RANSAC (Fischler and Bolles 1981): three readings propose, all vote, inliers refit.
+    """
+    most = 0
+    shift = stride // 2
+    guided = abs(guide[0]) + abs(guide[1]) + abs(guide[2]) > 0
+    for t in range(triples.shape[0]):
+        i0, j0 = triples[t, 0, 0], triples[t, 0, 1]
+        w0 = sample[i0, j0]
+        w1 = sample[triples[t, 1, 0], triples[t, 1, 1]]
+        w2 = sample[triples[t, 2, 0], triples[t, 2, 1]]
+        if not ((w0 > 0) & (w1 > 0) & (w2 > 0)):
+            continue
+        i1, j1 = triples[t, 1, 0] - i0, triples[t, 1, 1] - j0
+        i2, j2 = triples[t, 2, 0] - i0, triples[t, 2, 1] - j0
+        double = i1 * j2 - i2 * j1
+        if abs(double) < 4:
+            continue
+        a = (i1 * (w2 - w0) - i2 * (w1 - w0)) / (double * stride)
+        b = (j2 * (w1 - w0) - j1 * (w2 - w0)) / (double * stride)
+        c = w0 - a * (j0 * stride + shift) - b * (i0 * stride + shift)
+        if guided:
+            nx, ny, nz = a * lens.fx, b * lens.fy, a * lens.cx + b * lens.cy + c
+            along = -(nx * guide[0] + ny * guide[1] + nz * guide[2])
+            if not along > least_cos * math.sqrt(nx * nx + ny * ny + nz * nz):
+                continue
+        votes = _count(sample, stride, a, b, c, tolerance)
+        if votes > most:
+            most = votes
+            best[0], best[1], best[2] = a, b, c
+    if most < 3:
+        return 0
+    for _ in range(4):
+        _refit(sample, stride, tolerance, best)
+    return _count(sample, stride, best[0], best[1], best[2], tolerance)
+
+
+@kernel
+def _refit(sample: F4, stride: int, tolerance: float, plane: F8) -> None:
+    """Fit the plane to its inliers by least squares; leave it alone if they do not span one."""
+    rows, columns = sample.shape
+    shift = stride // 2
+    a, b, c = plane[0], plane[1], plane[2]
+    m = np.zeros(9)
+    j0, i0 = columns * stride * 0.5, rows * stride * 0.5
+    for i in range(rows):
+        y = i * stride + shift
+        for j in range(columns):
+            w = sample[i, j]
+            x = j * stride + shift
+            if w > 0 and abs(w - (a * x + b * y + c)) < tolerance:
+                dx, dy = x - j0, y - i0
+                m[0] += 1
+                m[1] += dx
+                m[2] += dy
+                m[3] += dx * dx
+                m[4] += dx * dy
+                m[5] += dy * dy
+                m[6] += w
+                m[7] += dx * w
+                m[8] += dy * w
+    if m[0] < 3:
+        return
+    n, mx, my, mw = m[0], m[1] / m[0], m[2] / m[0], m[6] / m[0]
+    xx, xy, yy = m[3] / n - mx * mx, m[4] / n - mx * my, m[5] / n - my * my
+    xw, yw = m[7] / n - mx * mw, m[8] / n - my * mw
+    determinant = xx * yy - xy * xy
+    if not determinant > 1e-6 * (xx + yy) ** 2:
+        return
+    a = (xw * yy - yw * xy) / determinant
+    b = (yw * xx - xw * xy) / determinant
+    plane[0], plane[1] = a, b
+    plane[2] = mw - a * (mx + j0) - b * (my + i0)
+
+
+@kernel
+def _clear(sample: F4, stride: int, plane: F8, tolerance: float) -> None:
+    """Remove the readings near a plane from the sample."""
+    shift = stride // 2
+    for i in range(sample.shape[0]):
+        for j in range(sample.shape[1]):
+            w = plane[0] * (j * stride + shift) + plane[1] * (i * stride + shift) + plane[2]
+            if abs(sample[i, j] - w) < tolerance:
+                sample[i, j] = 0
+
+
+def find_supports(cells: Cells, up: F8) -> list[Support]:
+    """Return the horizontal planes of the scene, lowest first (thesis Alg. 1)."""
+    # (1), (2) readings whose surface is level
+    level = np.zeros(cells.w.shape[0] * cells.w.shape[1] // 4 + 1, np.int32)
+    height = np.zeros(level.size, np.float32)
+    n = _level_readings(cells.w, cells.lens, up, level, height)
+    level, height = level[:n], height[:n]
+    # (3) one plane candidate for each accumulation in height
+    supports: list[Support] = []
+    while len(supports) < 8 and level.size:
+        base = float(height.min())
+        count = np.bincount(((height - base) / BIN_M).astype(np.int64))
+        count = np.convolve(count, [1, 2, 1], "same")
+        peak = base + (int(np.argmax(count)) + 0.5) * BIN_M
+        # (4) refine, and keep what lies in the plane
+        near = abs(height - peak) < 2.5 * BIN_M
+        support = _refined(cells, level[near], height[near], up)
+        if support is None:
+            if count.max() < 200:
+                break
+        else:
+            supports.append(support)
+            near = abs(height - peak) < 3.5 * BIN_M
+        level, height = level[~near], height[~near]
+    # (5) ascending
+    return sorted(supports, key=lambda s: s.offset)
+
+
+@kernel
+def _level_readings(w: F4, lens: Lens, up: F8, index: I4, height: F4) -> int:
+    """Collect every second cell whose surface is level within 25 degrees: its index and height."""
+    rows, columns = w.shape
+    r = ARM
+    n = 0
+    bend = np.float32(0.024)
+    for i in range(r, rows - r, 2):
+        y = (i - lens.cy) / lens.fy
+        for j in range(r, columns - r, 2):
+            center = w[i, j]
+            left, right, top, bottom = w[i, j - r], w[i, j + r], w[i - r, j], w[i + r, j]
+            if not ((center > 0) & (left > 0) & (right > 0) & (top > 0) & (bottom > 0)):
+                continue
+            if (abs(left + right - 2 * center) > bend) | (abs(top + bottom - 2 * center) > bend):
+                continue
+            wu, wv = (right - left) / (2 * r), (bottom - top) / (2 * r)
+            nx, ny = lens.fx * wu, lens.fy * wv
+            nz = center - wu * (j - lens.cx) - wv * (i - lens.cy)
+            along = -(nx * up[0] + ny * up[1] + nz * up[2])
+            if along > 0 and along * along > 0.82 * (nx * nx + ny * ny + nz * nz):
+                index[n] = i * columns + j
+                x = (j - lens.cx) / lens.fx
+                height[n] = (x * up[0] + y * up[1] + up[2]) / center
+                n += 1
+    return n
+
+
+def _refined(cells: Cells, index: I4, height: F4, up: F8) -> Support | None:
+    if index.size < LEAST_CELLS:
+        return None
+    lens, offset = cells.lens, float(np.median(height))
+    # The level plane at that height, as inverse depth.
+    level = np.array([up[0] / lens.fx, up[1] / lens.fy, 0.0])
+    level[2] = up[2] - level[0] * lens.cx - level[1] * lens.cy
+    level /= offset
+    plane = level.copy()
+    for _ in range(3):
+        count = _refit_cells(cells.w, index, 1.5 * TOLERANCE, plane)
+        if count < LEAST_CELLS:
+            return None
+        if _normal(plane, lens) @ up < STEADY_COS:
+            plane = level
+            break
+    normal = _normal(plane, lens)
+    reach = np.full(DIRECTIONS, -np.inf)
+    axes = gravity_rotation(normal)
+    area = _spread(cells.w, lens, index, plane, normal, axes, TOLERANCE, reach)
+    if area < LEAST_AREA_M2:
+        return None
+    n = (plane[0] * lens.fx, plane[1] * lens.fy, plane[0] * lens.cx + plane[1] * lens.cy + plane[2])
+    offset = -1 / math.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
+    a, b, c = (float(v) for v in plane)
+    return Support(a, b, c, normal, offset, reach + MARGIN_M, area)
+
+
+@kernel
+def _refit_cells(w: F4, index: I4, tolerance: float, plane: F8) -> int:
+    """Fit the plane to the listed cells near it by least squares; return how many they are."""
+    columns = w.shape[1]
+    a, b, c = plane[0], plane[1], plane[2]
+    j0, i0 = columns * 0.5, w.shape[0] * 0.5
+    n = 0
+    mx = my = mw = xx = xy = yy = xw = yw = 0.0
+    for p in index:
+        i, j = p // columns, p % columns
+        v = w[i, j]
+        if abs(v - (a * j + b * i + c)) < tolerance:
+            x, y = j - j0, i - i0
+            n += 1
+            mx += x
+            my += y
+            mw += v
+            xx += x * x
+            xy += x * y
+            yy += y * y
+            xw += x * v
+            yw += y * v
+    if n < 3:
+        return 0
+    mx, my, mw = mx / n, my / n, mw / n
+    xx, xy, yy = xx / n - mx * mx, xy / n - mx * my, yy / n - my * my
+    xw, yw = xw / n - mx * mw, yw / n - my * mw
+    determinant = xx * yy - xy * xy
+    if determinant > 1e-6 * (xx + yy) ** 2:
+        a = (xw * yy - yw * xy) / determinant
+        b = (yw * xx - xw * xy) / determinant
+        plane[0], plane[1] = a, b
+        plane[2] = mw - a * (mx + j0) - b * (my + i0)
+    return n
+
+
+@kernel
+def _spread(
+    w: F4, lens: Lens, index: I4, plane: F8, normal: F8, axes: F8, tolerance: float, reach: F8
+) -> float:
+    """Measure how far the plane reaches along `DIRECTIONS`; return its visible area in m2."""
+    columns = w.shape[1]
+    area = 0.0
+    step = 2 * math.pi / DIRECTIONS
+    for p in index:
+        i0, j0 = p // columns, p % columns
+        if abs(w[i0, j0] - (plane[0] * j0 + plane[1] * i0 + plane[2])) >= tolerance:
+            continue
+        # The surface was seen to go on to all four sides.
+        for d in range(5):
+            i = i0 + (ARM if d == 1 else -ARM if d == 2 else 0)
+            j = j0 + (ARM if d == 3 else -ARM if d == 4 else 0)
+            level = plane[0] * j + plane[1] * i + plane[2]
+            if level <= 0 or abs(w[i, j] - level) >= tolerance:
+                continue
+            z = 1 / level
+            x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
+            if d == 0:
+                facing = -(x * normal[0] + y * normal[1] + z * normal[2]) / z
+                area += 4 * z * z / (lens.fx * lens.fy) / max(facing, 0.05)
+            u = axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z
+            v = axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z
+            for k in range(DIRECTIONS):
+                far = math.cos(k * step) * u + math.sin(k * step) * v
+                reach[k] = max(reach[k], far)
+    return area
+
+
+def corners_of(support: Support) -> F8:
+    """Return the corners (k, 3) of the convex outline, sensor frame, in order, without repeats."""
+    angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+    # Neighbouring sides x cos + y sin = reach meet at a corner.
+    step = 2 * np.pi / DIRECTIONS
+    here, there = support.reach, np.roll(support.reach, -1)
+    along = (there - here * np.cos(step)) / np.sin(step)
+    flat = np.stack([here * np.cos(angle) - along * np.sin(angle), here * np.sin(angle) + along * np.cos(angle)], 1)
+    level = gravity_rotation(support.up)
+    corners = flat @ level[:2] + support.offset * level[2]
+    return corners

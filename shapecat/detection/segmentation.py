@@ -1,0 +1,77 @@
+"""Segmentation: the rules from cells to labelled cells, on one page.
+
+The thesis stops at objects that do not touch. Beyond it, and without learning: concave edges part
+touching and stacked objects (`regions`), and a few rules bring the pieces of one object together
+again (`joins`).
+"""
+
+from collections.abc import Collection
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F8, I4, U1
+from shapecat.detection.cells import Cells
+from shapecat.detection.fill import fill_enclosed
+from shapecat.detection.furniture import is_furniture
+from shapecat.detection.heights import heights_of
+from shapecat.detection.joins import join_pieces
+from shapecat.detection.pieces import Pieces, pieces_of
+from shapecat.detection.planes import Support, estimate_up, find_supports
+from shapecat.detection.regions import regions_of
+from shapecat.detection.surfaces import surfaces_of
+
+__all__ = ["RULES", "Segmentation", "segment"]
+
+RULES = ("concave", "small", "occluder", "rim", "float", "enclosed", "fill")
+"""The rules beyond the thesis, in their order. Without any of them what remains is the plane, the
+height above it, and depth jumps."""
+
+
+class Segmentation(NamedTuple):
+    """Labelled cells.
+
+    Attributes
+    ----------
+    up : (3,) unit vector.
+    supports : the planes, lowest first.
+    labels : (rows, columns) int16, 1..count, 0 elsewhere.
+    filled : (rows, columns) uint8, 1 where a label lies at the level of the plane.
+    pieces : statistics of the regions the objects were joined from.
+    leaders : (count + 1,) the piece that holds the sums of each label.
+    """
+
+    up: F8
+    supports: list[Support]
+    labels: I4
+    filled: U1
+    pieces: Pieces
+    leaders: I4
+
+
+def segment(
+    cells: Cells,
+    hint: F8 | None,
+    *,
+    upright: bool,
+    highest_m: float,
+    largest_m: float,
+    rules: Collection[str],
+    rng: np.random.Generator,
+) -> Segmentation | None:
+    """Find planes and objects among ``cells``; None if there is no supporting plane."""
+    up = estimate_up(cells, hint, upright=upright, rng=rng)
+    supports = [] if up is None else find_supports(cells, up)
+    if up is None or not supports:
+        return None
+    heights = heights_of(cells, supports, highest_m=highest_m)
+    surfaces = surfaces_of(cells, heights)
+    regions, n = regions_of(heights, surfaces, concave="concave" in rules)
+    pieces = pieces_of(cells, heights, surfaces, regions, n, up)
+    join_pieces(pieces, cells, surfaces, regions, rules)
+    furniture = is_furniture(pieces, largest_m=largest_m)
+    pieces.group[furniture[pieces.group]] = 0
+    leaders, number = np.unique(pieces.group, return_inverse=True)
+    labels = number.astype(np.int16)[regions]
+    filled = fill_enclosed(cells.w, labels, leaders.size - 1, active="fill" in rules)
+    return Segmentation(up, supports, labels, filled, pieces, leaders)

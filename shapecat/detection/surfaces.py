@@ -1,0 +1,189 @@
+"""Surfaces: a tangent plane for every object cell, the links between cells, and concave edges."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, I4, U1
+from shapecat.detection.cells import JUMP, Cells, Lens
+from shapecat.detection.heights import Heights
+from shapecat.jit import kernel
+
+__all__ = ["DOWN", "RIGHT", "Surfaces", "surfaces_of"]
+
+RIGHT, DOWN = 1, 2
+"""Bits of `Surfaces.links`."""
+WINDOW = 3
+"""Half the edge of the window a tangent plane is fitted to, in cells."""
+GATE, GATE_SLOPE = 0.008, 0.008
+"""A sample of the fit lies within this of the centre, plus the slope times its distance."""
+BASE, BASE_DIAGONAL = 3, 2
+"""Cells between an edge and the surfaces on its two sides."""
+
+
+class Surfaces(NamedTuple):
+    """What every object cell knows of its surface.
+
+    Attributes
+    ----------
+    tangent : (rows, columns, 3) float32: inverse depth of the fitted plane at the cell, and its
+        change per column and per row. The first is 0 where there is no fit.
+    normal : (rows, columns, 3) float32 unit normal towards the camera, sensor frame.
+    links : (rows, columns) uint8: `RIGHT` and `DOWN` where the surface goes on to that neighbour.
+    edge : (rows, columns) uint8: the largest concave angle across the cell, degrees.
+    """
+
+    tangent: F4
+    normal: F4
+    links: U1
+    edge: U1
+
+
+def surfaces_of(cells: Cells, heights: Heights) -> Surfaces:
+    """Fit tangent planes to the object cells, link them and measure concave angles."""
+    shape = cells.w.shape
+    tangent = np.zeros((*shape, 3), np.float32)
+    normal = np.zeros((*shape, 3), np.float32)
+    _fit(cells.w, cells.lens, heights.owner, tangent, normal)
+    links = np.zeros(shape, np.uint8)
+    _link(cells.w, heights.owner, tangent, links)
+    edge = np.zeros(shape, np.uint8)
+    _bend(cells.w, cells.lens, tangent, normal, edge)
+    return Surfaces(tangent, normal, links, edge)
+
+
+@kernel(fast=True)
+def _fit(w: F4, lens: Lens, owner: I4, tangent: F4, normal: F4) -> None:
+    """Fit planes by least squares to a checkerboard of 25 cells; weights are 0 or 1."""
+    rows, columns = w.shape
+    zero, one = np.float32(0), np.float32(1)
+    for i in range(rows):
+        for j in range(columns):
+            me = owner[i, j]
+            if me <= 0:
+                continue
+            center = w[i, j]
+            n = sx = sy = sxx = sxy = syy = sw = sxw = syw = zero
+            for di in range(-WINDOW, WINDOW + 1):
+                y = i + di
+                if y < 0 or y >= rows:
+                    continue
+                for dj in range(-WINDOW + ((di + WINDOW) & 1), WINDOW + 1, 2):
+                    x = j + dj
+                    if x < 0 or x >= columns or owner[y, x] != me:
+                        continue
+                    v = w[y, x] - center
+                    far = abs(di) if abs(di) > abs(dj) else abs(dj)
+                    if abs(v) < np.float32(GATE + GATE_SLOPE * far):
+                        fx, fy = np.float32(dj), np.float32(di)
+                        n += one
+                        sx += fx
+                        sy += fy
+                        sxx += fx * fx
+                        sxy += fx * fy
+                        syy += fy * fy
+                        sw += v
+                        sxw += fx * v
+                        syw += fy * v
+            if n < 5:
+                continue
+            mx, my, mw = sx / n, sy / n, sw / n
+            xx, xy, yy = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
+            xw, yw = sxw / n - mx * mw, syw / n - my * mw
+            determinant = xx * yy - xy * xy
+            if determinant < np.float32(0.2):
+                continue
+            gx = (xw * yy - yw * xy) / determinant
+            gy = (yw * xx - xw * xy) / determinant
+            level = center + mw - gx * mx - gy * my
+            if not level > zero:
+                continue
+            tangent[i, j, 0] = level
+            tangent[i, j, 1] = gx
+            tangent[i, j, 2] = gy
+            nx = -np.float32(lens.fx) * gx
+            ny = -np.float32(lens.fy) * gy
+            nz = gx * np.float32(j - lens.cx) + gy * np.float32(i - lens.cy) - level
+            scale = one / np.sqrt(nx * nx + ny * ny + nz * nz)
+            normal[i, j, 0] = nx * scale
+            normal[i, j, 1] = ny * scale
+            normal[i, j, 2] = nz * scale
+
+
+@kernel(fast=True)
+def _link(w: F4, owner: I4, tangent: F4, links: U1) -> None:
+    """Link neighbours where either tangent plane, or the step itself, meets within one jump."""
+    rows, columns = w.shape
+    jump = np.float32(JUMP)
+    for i in range(rows):
+        for j in range(columns):
+            me = owner[i, j]
+            if me <= 0:
+                continue
+            here = tangent[i, j]
+            bits = 0
+            if j + 1 < columns and owner[i, j + 1] == me:
+                step = abs(w[i, j] - w[i, j + 1])
+                there = tangent[i, j + 1]
+                if here[0] > 0:
+                    step = min(step, abs(here[0] + here[1] - w[i, j + 1]))
+                if there[0] > 0:
+                    step = min(step, abs(there[0] - there[1] - w[i, j]))
+                bits |= RIGHT if step < jump else 0
+            if i + 1 < rows and owner[i + 1, j] == me:
+                step = abs(w[i, j] - w[i + 1, j])
+                there = tangent[i + 1, j]
+                if here[0] > 0:
+                    step = min(step, abs(here[0] + here[2] - w[i + 1, j]))
+                if there[0] > 0:
+                    step = min(step, abs(there[0] - there[2] - w[i, j]))
+                bits |= DOWN if step < jump else 0
+            links[i, j] = bits
+
+
+@kernel(fast=True)
+def _bend(w: F4, lens: Lens, tangent: F4, normal: F4, edge: U1) -> None:
+    """Measure the largest concave angle between the surfaces on two sides of each cell."""
+    rows, columns = w.shape
+    gate = np.float32(2 * JUMP)
+    one = np.float32(1)
+    degrees = np.float32(180 / math.pi)
+    for i in range(rows):
+        for j in range(columns):
+            if not tangent[i, j, 0] > 0:
+                continue
+            here = w[i, j]
+            worst = np.float32(0)
+            for d in range(4):
+                r = BASE if d < 2 else BASE_DIAGONAL
+                di = 0 if d == 0 else r
+                dj = r if d == 0 else (0 if d == 1 else (r if d == 2 else -r))
+                i1, j1, i2, j2 = i - di, j - dj, i + di, j + dj
+                if i1 < 0 or i2 >= rows or min(j1, j2) < 0 or max(j1, j2) >= columns:
+                    continue
+                w1, w2 = tangent[i1, j1, 0], tangent[i2, j2, 0]
+                if not ((w1 > 0) & (w2 > 0)):
+                    continue
+                x, y = np.float32(dj), np.float32(di)
+                meet1 = w1 + tangent[i1, j1, 1] * x + tangent[i1, j1, 2] * y
+                meet2 = w2 - tangent[i2, j2, 1] * x - tangent[i2, j2, 2] * y
+                if (abs(meet1 - here) > gate) | (abs(meet2 - here) > gate):
+                    continue
+                nx = normal[i1, j1, 0] - normal[i2, j2, 0]
+                ny = normal[i1, j1, 1] - normal[i2, j2, 1]
+                nz = normal[i1, j1, 2] - normal[i2, j2, 2]
+                chord = nx * nx + ny * ny + nz * nz
+                if chord <= worst:
+                    continue
+                z1, z2 = one / w1, one / w2
+                px = np.float32((j1 - lens.cx) / lens.fx) * z1
+                px -= np.float32((j2 - lens.cx) / lens.fx) * z2
+                py = np.float32((i1 - lens.cy) / lens.fy) * z1
+                py -= np.float32((i2 - lens.cy) / lens.fy) * z2
+                if px * nx + py * ny + (z1 - z2) * nz < 0:
+                    worst = chord
+            half = np.sqrt(worst) * np.float32(0.5)
+            # arcsin by its series: 1 degree off at a right angle
+            angle = 2 * degrees * (half + half * half * half * np.float32(0.18))
+            edge[i, j] = np.uint8(min(angle, np.float32(120)))

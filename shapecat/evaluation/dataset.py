@@ -1,0 +1,164 @@
+"""Labelled object data sets: ``DATASET/<category>/<instance>/<view>.pcd`` (or .ply, .npz).
+
+One partial view a file, in metres, gravity aligned (+z up), standing on z = 0. The VIEWPOINT of a
+PCD file is the position of the sensor.
+"""
+
+import zipfile
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, Record, array
+from shapecat.errors import RecordingError
+from shapecat.evaluation.clouds import CloudFile, read_pcd, read_ply
+
+__all__ = ["Dataset", "View", "find_viewpoint", "read_dataset", "read_view"]
+
+_FARTHEST_M = 100.0
+
+
+class View(Record):
+    """One partial view of one object, level: z is the height above the support.
+
+    ``points`` (n, 3) metres, finite; ``eye`` (3,) position of the sensor.
+    """
+
+    points: F4 = array("n 3", "f4")
+    eye: F8 = array("3", "f8")
+    category: str
+    instance: str
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """The files of a data set; views are read when they are asked for."""
+
+    root: Path
+    files: tuple[Path, ...]
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return len(self.files)
+
+    def __iter__(self) -> Iterator[View]:
+        """Read the views one by one, in the order of their paths."""
+        return (read_view(path) for path in self.files)
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """The names of the category folders, sorted."""
+        return tuple(sorted({path.parent.parent.name for path in self.files}))
+
+
+def read_dataset(root: Path) -> Dataset:
+    """Find the views of a data set.
+
+    Raises
+    ------
+    RecordingError : there is none.
+    """
+    files = tuple(sorted(path for path in root.glob("*/*/*") if path.suffix.lower() in _READERS))
+    if not files:
+        msg = (
+            f"{root}: no views found; expected files such as "
+            f"{root.name}/cup/red_mug/000.pcd (or .ply, .npz)"
+        )
+        raise RecordingError(msg)
+    return Dataset(root, files)
+
+
+def read_view(path: Path) -> View:
+    """Read one view; category and instance are the names of its folders.
+
+    Where a file does not tell the position of the sensor, it is found by `find_viewpoint`.
+
+    Raises
+    ------
+    RecordingError : the file is unreadable, or its points are not one object in metres.
+    """
+    points, said = _READERS[path.suffix.lower()](path)
+    if points.ndim != 2 or points.shape[1] != 3:
+        msg = f"{path}: points have shape {points.shape}, expected (n, 3)"
+        raise RecordingError(msg)
+    points = points[np.all(np.isfinite(points), axis=1)].astype(np.float32)
+    if len(points) == 0:
+        msg = f"{path}: no points could be read"
+        raise RecordingError(msg)
+    if np.abs(points).max() > _FARTHEST_M:
+        msg = f"{path}: a point is {np.abs(points).max():.0f} m away; points must be in metres"
+        raise RecordingError(msg)
+    eye = _valid_eye(said)
+    if eye is None:
+        eye = find_viewpoint(points)
+    return View(points, eye, path.parent.parent.name, path.parent.name)
+
+
+def _read_npz(path: Path) -> CloudFile:
+    try:
+        with np.load(path, allow_pickle=False) as content:
+            points = np.asarray(content["points"], np.float64)
+            eye = np.asarray(content["viewpoint"], np.float64) if "viewpoint" in content else None
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        msg = f"{path}: not an .npz file with an array `points`: {error}"
+        raise RecordingError(msg) from error
+    return CloudFile(points, eye)
+
+
+_READERS: dict[str, Callable[[Path], CloudFile]] = {
+    ".npz": _read_npz,
+    ".pcd": read_pcd,
+    ".ply": read_ply,
+}
+
+
+def _valid_eye(eye: F8 | None) -> F8 | None:
+    """Return a viewpoint if it is one: the origin is what files say that do not know it."""
+    if eye is None or eye.shape != (3,) or not np.all(np.isfinite(eye)) or not np.any(eye):
+        return None
+    return eye
+
+
+def find_viewpoint(points: F4, *, distance_m: float = 1.0) -> F8:
+    """Return the place from which most of a partial view's points can be seen apart.
+
+    Seen from where it was taken, every point of a view has a direction of its own. Of 48 places
+    around the points, at 15 to 60 degrees of elevation, the one is taken from which they cover
+    the most cells of a grid; the lowest and first on ties.
+
+    Parameters
+    ----------
+    points : (n, 3) metres, z up.
+    distance_m : distance of the place from the centre of the points.
+
+    Returns
+    -------
+    (3,) metres.
+    """
+    centre = points.mean(axis=0, dtype=np.float64)
+    azimuth, elevation = np.meshgrid(
+        np.arange(12) * np.pi / 6, np.radians([15.0, 30.0, 45.0, 60.0]), indexing="ij"
+    )
+    directions = np.stack(
+        [
+            np.cos(azimuth) * np.cos(elevation),
+            np.sin(azimuth) * np.cos(elevation),
+            np.sin(elevation),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    local = points - centre
+    cell = max(float(np.sqrt(np.ptp(local, axis=0).max() ** 2 / max(len(points), 1))), 1e-4)
+    covered = [_covered_cells(local, direction, cell) for direction in directions]
+    return np.asarray(centre + distance_m * directions[int(np.argmax(covered))])
+
+
+def _covered_cells(points: F8, direction: F8, cell: float) -> int:
+    """Return how many cells the points cover in the plane across a direction."""
+    right = np.array([-direction[1], direction[0], 0.0])
+    right /= np.linalg.norm(right)
+    across = points @ np.stack([right, np.cross(direction, right)], axis=1)
+    u, v = np.floor(across / cell).astype(np.int64).T
+    return int(np.unique((u << 32) + v).size)

@@ -1,0 +1,103 @@
+"""Figures of merit of posteriors against the truth, in plain numpy.
+
+Labels are columns of the posterior; every function takes the number of categories where it
+matters, so that a category without views has a place in the result.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4
+
+__all__ = [
+    "Bin",
+    "accuracy",
+    "auroc",
+    "balanced_accuracy",
+    "calibration_curve",
+    "confusion",
+    "expected_calibration_error",
+    "recall",
+]
+
+
+class Bin(NamedTuple):
+    """Views of similar confidence: how many, how confident, how often right."""
+
+    views: int
+    confidence: float
+    accuracy: float
+
+
+def accuracy(truth: I4, predicted: I4) -> float:
+    """Return the share of views that are right; NaN without views."""
+    return float(np.mean(truth == predicted)) if len(truth) else float("nan")
+
+
+def confusion(truth: I4, predicted: I4, categories: int) -> I4:
+    """Return how often each true category (row) was taken for each other (column).
+
+    Examples
+    --------
+    >>> confusion(np.array([0, 0, 1]), np.array([0, 1, 1]), 2)
+    array([[1, 1],
+           [0, 1]])
+    """
+    flat = np.asarray(truth) * categories + np.asarray(predicted)
+    return np.bincount(flat, minlength=categories**2).reshape(categories, categories)
+
+
+def recall(table: I4) -> F8:
+    """Return the share of each category that is right, from a confusion table; NaN if none."""
+    totals = table.sum(axis=1)
+    return np.where(totals > 0, np.diag(table) / np.maximum(totals, 1), np.nan)
+
+
+def balanced_accuracy(table: I4) -> float:
+    """Return the mean recall of the categories that have views, from a confusion table."""
+    shares = recall(table)
+    return float(np.nanmean(shares)) if np.any(table) else float("nan")
+
+
+def calibration_curve(truth: I4, posteriors: F4, *, bins: int = 15) -> tuple[Bin, ...]:
+    """Return the bins of equal width in confidence that hold views."""
+    confidence = np.asarray(posteriors, np.float64).max(axis=1, initial=0.0)
+    right = np.asarray(posteriors).argmax(axis=1) == truth if len(truth) else np.zeros(0, bool)
+    place = np.minimum((confidence * bins).astype(np.int64), bins - 1)
+    return tuple(
+        Bin(int(mine.sum()), float(confidence[mine].mean()), float(right[mine].mean()))
+        for mine in (place == k for k in range(bins))
+        if mine.any()
+    )
+
+
+def expected_calibration_error(truth: I4, posteriors: F4, *, bins: int = 15) -> float:
+    """Return the mean distance between confidence and accuracy, over bins of confidence.
+
+    Source: Naeini et al. 2015; Guo et al. 2017, eq. 3. NaN without views.
+    """
+    curve = calibration_curve(truth, posteriors, bins=bins)
+    if not curve:
+        return float("nan")
+    counts = np.array([item.views for item in curve])
+    gaps = np.array([abs(item.confidence - item.accuracy) for item in curve])
+    return float(counts @ gaps / counts.sum())
+
+
+def auroc(positive: F4, negative: F4) -> float:
+    """Return the probability that a positive scores above a negative, ties counting half.
+
+    NaN if either is empty. O(n log n).
+
+    Examples
+    --------
+    >>> auroc([2.0, 3.0], [1.0, 2.0])
+    0.875
+    """
+    positive, negative = np.asarray(positive, np.float64), np.sort(np.asarray(negative, np.float64))
+    if not (positive.size and negative.size):
+        return float("nan")
+    below = np.searchsorted(negative, positive, "left")
+    not_above = np.searchsorted(negative, positive, "right")
+    return float((below + not_above).mean() / (2 * negative.size))

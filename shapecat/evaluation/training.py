@@ -1,0 +1,165 @@
+"""Learning from a labelled data set: a whole model, or new categories for an existing one."""
+
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import Bool
+from shapecat.config import Settings
+from shapecat.description import BLOCKS, DESCRIPTOR_NAMES
+from shapecat.errors import ModelError, RecordingError
+from shapecat.evaluation.dataset import read_dataset
+from shapecat.evaluation.report import UNKNOWN, evaluate
+from shapecat.evaluation.views import DescribedViews, Observer, describe_views, ignore
+from shapecat.learning import Categorizer, load_model, save_model
+from shapecat.types import CATEGORIES
+
+__all__ = [
+    "fit_views",
+    "learn_on_folder",
+    "order_categories",
+    "split_instances",
+    "train_on_folder",
+]
+
+_HELD_OUT = 0.2
+"""Share of the instances of each category that judge the model."""
+
+
+def train_on_folder(
+    root: Path, out: Path, *, seed: int = 0, observe: Observer = ignore
+) -> dict[str, Any]:
+    """Learn a model from a data set and write it.
+
+    A fifth of the instances of each category judges a first model and fits its temperature and
+    novelty threshold; the model that is written has then learned from all views.
+
+    Returns
+    -------
+    Plain values: views, categories, model id, and the report on the held-out instances.
+
+    Raises
+    ------
+    RecordingError : no views, an unreadable one, or fewer than two categories.
+    ModelError : the model cannot be written.
+    """
+    views = _describe_folder(root, seed, observe)
+    categories = order_categories(views.labels)
+    if len(categories) < 2:
+        found = ", ".join(categories) or "none"
+        msg = f"{root}: a model needs at least two categories with usable views, found: {found}"
+        raise RecordingError(msg)
+    held_out = split_instances(views.labels, views.instances, np.random.default_rng(seed))
+    judges = views.where(held_out)
+    judged = fit_views(views.where(~held_out), judges, seed=seed)
+    report = evaluate(judges, judged)
+    model = replace(
+        fit_views(views, views.where(held_out & False), seed=seed),
+        temperature=judged.temperature,
+    )
+    model = replace(model, known=replace(model.known, threshold=judged.known.threshold))
+    save_model(out, model)
+    return _summary(views, model) | {"held_out": report.as_dict()}
+
+
+def learn_on_folder(
+    model: Path | None, root: Path, out: Path, *, seed: int = 0, observe: Observer = ignore
+) -> dict[str, Any]:
+    """Teach a model the categories of a data set that it does not know; write the result.
+
+    The dictionary and the learners of the categories it knows stay as they are.
+
+    Returns
+    -------
+    Plain values: views, categories, the added ones, model id.
+
+    Raises
+    ------
+    RecordingError : no views, or an unreadable one.
+    ModelError : no usable model, no new category, or the result cannot be written.
+    """
+    # Learning needs more of scipy than the rest of the program.
+    from shapecat.learning.incremental import add_categories  # noqa: PLC0415
+
+    categorizer = load_model(model)
+    categorizer.require_descriptor(DESCRIPTOR_NAMES)
+    views = _describe_folder(root, seed, observe)
+    views = views.where(views.labels != UNKNOWN)
+    if not set(views.labels.tolist()) - set(categorizer.categories):
+        msg = (
+            f"{root}: model {categorizer.model_id} knows all its categories already; "
+            "`shapecat train` learns a model anew"
+        )
+        raise ModelError(msg)
+    learned = add_categories(
+        categorizer, views.descriptors, views.labels.tolist(), rng=np.random.default_rng(seed)
+    )
+    save_model(out, learned)
+    added = learned.categories[len(categorizer.categories) :]
+    return _summary(views, learned) | {"added": list(added)}
+
+
+def fit_views(
+    train: DescribedViews, held_out: DescribedViews, *, seed: int, **choices: Any
+) -> Categorizer:
+    """Learn a model from described views; ``choices`` are fields of `LearningSettings`.
+
+    Raises
+    ------
+    ValueError : fewer than two categories.
+    """
+    # scikit-learn is only needed here.
+    from shapecat.learning.training import (  # noqa: PLC0415
+        Examples,
+        LearningSettings,
+        fit_categorizer,
+    )
+
+    return fit_categorizer(
+        Examples(train.descriptors, train.labels, train.instances),
+        Examples(held_out.descriptors, held_out.labels, held_out.instances),
+        descriptor_names=DESCRIPTOR_NAMES,
+        blocks=BLOCKS,
+        categories=order_categories(train.labels),
+        settings=LearningSettings(**choices),
+        seed=seed,
+    )
+
+
+def order_categories(labels: Iterable[str]) -> tuple[str, ...]:
+    """Return the categories among labels: those of the default model first, then by name."""
+    found = {str(label) for label in labels} - {UNKNOWN}
+    return (*(name for name in CATEGORIES if name in found), *sorted(found - set(CATEGORIES)))
+
+
+def split_instances(labels: np.ndarray, instances: np.ndarray, rng: np.random.Generator) -> Bool:
+    """Return which views are held out: all of a fifth of the instances of each label.
+
+    At least one instance of a label is held out and one is not; of a single one nothing is.
+    """
+    held_out = np.zeros(len(labels), bool)
+    for label in np.unique(labels):
+        names = np.unique(instances[labels == label])
+        count = min(max(round(_HELD_OUT * names.size), 1), names.size - 1)
+        held_out |= np.isin(instances, rng.permutation(names)[:count])
+    return held_out
+
+
+def _describe_folder(root: Path, seed: int, observe: Observer) -> DescribedViews:
+    dataset = read_dataset(root)
+    settings = replace(Settings(), seed=seed)
+    return describe_views(
+        dataset, settings=settings, total=len(dataset), phase="train", observe=observe
+    )
+
+
+def _summary(views: DescribedViews, model: Categorizer) -> dict[str, Any]:
+    return {
+        "views": len(views.labels),
+        "skipped": views.skipped,
+        "categories": list(model.categories),
+        "model": model.model_id,
+    }

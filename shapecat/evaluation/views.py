@@ -1,0 +1,97 @@
+"""From labelled views to descriptors: the chain of the product, without detection."""
+
+import time
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4
+from shapecat.config import Settings
+from shapecat.description import DESCRIPTOR_NAMES, describe
+from shapecat.evaluation.dataset import View
+from shapecat.surface import reconstruct, voxelize
+
+__all__ = ["DescribedViews", "Observer", "describe_view", "describe_views", "ignore"]
+
+Observer = Callable[[str, int, int | None], None]
+"""Called with the name of the phase, the views done, and how many there are, if known."""
+
+
+def ignore(_phase: str, _done: int, _total: int | None) -> None:
+    """Observe nothing."""
+
+
+class DescribedViews(NamedTuple):
+    """Views as the learners see them, and what the tables are broken down by.
+
+    ``descriptors`` (n, d); ``labels``, ``instances`` (n,) names; ``points`` (n,) voxels;
+    ``distances`` (n,) metres from the sensor; ``seconds`` (n,) from points to descriptor;
+    ``skipped`` views with too few points for a surface.
+    """
+
+    descriptors: F4
+    labels: np.ndarray
+    instances: np.ndarray
+    points: np.ndarray
+    distances: np.ndarray
+    seconds: np.ndarray
+    skipped: int = 0
+
+    def where(self, chosen: np.ndarray) -> "DescribedViews":
+        """Return the chosen views: a mask or indices."""
+        *arrays, skipped = self
+        return DescribedViews(*(values[chosen] for values in arrays), skipped=skipped)
+
+
+class DescribedView(NamedTuple):
+    """One view: its descriptor (d,), how many voxels it has, how long it took."""
+
+    descriptor: F4
+    points: int
+    seconds: float
+
+
+def describe_view(
+    view: View, *, settings: Settings, rng: np.random.Generator
+) -> DescribedView | None:
+    """Describe one view; None if it has too few points for a surface."""
+    begun = time.perf_counter()
+    cloud = voxelize(view.points, voxel_m=settings.surface.voxel_m)
+    gas = reconstruct(cloud, settings=settings.surface, rng=rng)
+    if gas is None:
+        return None
+    descriptor = describe(cloud, gas, view.eye)
+    return DescribedView(descriptor, len(cloud), time.perf_counter() - begun)
+
+
+def describe_views(
+    views: Iterable[View],
+    *,
+    settings: Settings,
+    total: int | None = None,
+    phase: str = "describe",
+    observe: Observer = ignore,
+) -> DescribedViews:
+    """Describe views one by one; the k-th draws from the seed (settings.seed, k)."""
+    found: list[tuple[DescribedView, str, str, float]] = []
+    count = 0
+    for count, view in enumerate(views, start=1):
+        described = describe_view(
+            view, settings=settings, rng=np.random.default_rng((settings.seed, count))
+        )
+        if described is not None:
+            distance = float(np.linalg.norm(view.points.mean(axis=0) - view.eye))
+            found.append((described, view.category, f"{view.category}/{view.instance}", distance))
+        observe(phase, count, total)
+    return DescribedViews(
+        descriptors=np.array([item[0].descriptor for item in found], np.float32).reshape(
+            len(found), len(DESCRIPTOR_NAMES)
+        ),
+        labels=np.array([item[1] for item in found], str),
+        instances=np.array([item[2] for item in found], str),
+        points=np.array([item[0].points for item in found], np.int64),
+        distances=np.array([item[3] for item in found]),
+        seconds=np.array([item[0].seconds for item in found]),
+        skipped=count - len(found),
+    )

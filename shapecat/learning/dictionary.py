@@ -1,0 +1,173 @@
+"""A random forest as a dictionary of words, and linear learners on the words (thesis 7.3, 7.4)."""
+
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import sparse
+from sklearn.base import BaseEstimator, ClassifierMixin, TransformerMixin
+from sklearn.ensemble import RandomForestClassifier
+from sklearn.linear_model import LogisticRegression
+from sklearn.utils.multiclass import check_classification_targets
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from shapecat.arrays import F8, I4
+from shapecat.learning.calibration import softmax
+from shapecat.learning.forest import flatten
+from shapecat.learning.pnn import known_labels
+from shapecat.learning.words import bag_of_words
+
+__all__ = ["ForestDictionary", "WordLearner"]
+
+
+class ForestDictionary(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # sklearn is untyped
+    """The leaf a view falls into in each tree of a random forest is a word.
+
+    Parameters
+    ----------
+    trees : words of a view.
+    min_leaf : training views a leaf needs.
+    jobs : trees grown at the same time; the result is the same.
+    random_state : seed of the forest.
+
+    Attributes
+    ----------
+    forest_ : the `FlatForest`.
+
+    Source: thesis 7.3; Moosmann et al. 2006 for forests as codebooks.
+    """
+
+    def __init__(
+        self,
+        *,
+        trees: int = 100,
+        min_leaf: int = 2,
+        jobs: int | None = None,
+        random_state: int | None = None,
+    ) -> None:
+        self.trees = trees
+        self.min_leaf = min_leaf
+        self.jobs = jobs
+        self.random_state = random_state
+
+    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+        """Grow the forest on features X (n, f) and labels y (n,), distractors included."""
+        x, y = validate_data(self, X, y, dtype=np.float32)
+        check_classification_targets(y)
+        forest = RandomForestClassifier(
+            self.trees,
+            min_samples_leaf=self.min_leaf,
+            class_weight="balanced",
+            n_jobs=self.jobs,
+            random_state=self.random_state,
+        )
+        forest.fit(x, y)
+        self.forest_ = flatten([tree.tree_ for tree in forest.estimators_])
+        return self
+
+    def words(self, X: ArrayLike) -> I4:
+        """Return the words of features (n, f): (n, trees)."""
+        check_is_fitted(self)
+        return self.forest_.fall(validate_data(self, X, dtype=np.float32, reset=False))
+
+    def transform(self, X: ArrayLike) -> sparse.csr_array:
+        """Return a row of zeros and ones per view (n, words)."""
+        words = self.words(X)  # first: it checks that the dictionary is learned
+        return bag_of_words(words, self.forest_.words)
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.transformer_tags.preserves_dtype = []
+        tags.target_tags.required = True
+        return tags
+
+
+class WordLearner(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # sklearn is untyped
+    """Linear learners on the words of a view.
+
+    Parameters
+    ----------
+    strategy : ``"multinomial"`` learns all categories against each other, ``"one_vs_rest"`` one
+        learner per category, as in the thesis.
+    C : inverse strength of the regularisation.
+    unknown : label of shapes of no category; those views are left out.
+
+    Attributes
+    ----------
+    classes_ : the categories, without ``unknown``.
+    coef_ : (c, words) in half precision: what each word adds to the logit of each category.
+    intercept_ : (c,).
+    temperature_ : divides the logits; 1 until calibrated.
+    """
+
+    def __init__(
+        self,
+        *,
+        strategy: Literal["multinomial", "one_vs_rest"] = "multinomial",
+        C: float = 0.01,
+        unknown: Any = None,
+    ) -> None:
+        self.strategy = strategy
+        self.C = C
+        self.unknown = unknown
+
+    def fit(self, X: Any, y: ArrayLike) -> Self:
+        """Learn from words X (n, w), dense or sparse, and labels y (n,)."""
+        x, y = validate_data(self, X, y, dtype=np.float64, accept_sparse="csr")
+        check_classification_targets(y)
+        self.classes_, labels = known_labels(y, self.unknown)
+        x, labels = x[labels >= 0], labels[labels >= 0]
+        coef, self.intercept_ = self._fit_logits(x, labels)
+        self.coef_ = coef.astype(np.float16).astype(np.float64)
+        self.temperature_ = 1.0
+        return self
+
+    def decision_function(self, X: Any) -> F8:
+        """Return the logits (n, c), in single column form (n,) for two categories."""
+        logits = self.logits(X)
+        return logits[:, 1] - logits[:, 0] if len(self.classes_) == 2 else logits
+
+    def logits(self, X: Any) -> F8:
+        """Return the logits (n, c)."""
+        check_is_fitted(self)
+        x = validate_data(self, X, dtype=np.float64, accept_sparse="csr", reset=False)
+        return np.asarray(x @ self.coef_.T) + self.intercept_
+
+    def predict_proba(self, X: Any) -> F8:
+        """Return posteriors (n, c)."""
+        logits = self.logits(X)
+        return softmax(logits / self.temperature_)
+
+    def predict(self, X: Any) -> Any:
+        """Return the most probable label of each view."""
+        logits = self.logits(X)
+        return self.classes_[logits.argmax(axis=1)]
+
+    def _fit_logits(self, x: Any, labels: I4) -> tuple[F8, F8]:
+        """Return coefficients (c, w) and intercepts (c,)."""
+        if self.strategy == "multinomial":
+            model = _linear(self.C).fit(x, labels)
+            coef, intercept = model.coef_, model.intercept_
+            if len(coef) == 1:  # two categories share one column
+                coef, intercept = (
+                    np.concatenate([-coef, coef]) / 2,
+                    np.array([-1, 1]) / 2 * intercept,
+                )
+            return coef, intercept
+        if self.strategy != "one_vs_rest":
+            msg = f"strategy must be multinomial or one_vs_rest, got {self.strategy!r}"
+            raise ValueError(msg)
+        models = [_linear(self.C).fit(x, labels == c) for c in range(labels.max() + 1)]
+        return (
+            np.concatenate([model.coef_ for model in models]),
+            np.concatenate([model.intercept_ for model in models]),
+        )
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.sparse = True
+        return tags
+
+
+def _linear(strength: float) -> LogisticRegression:
+    return LogisticRegression(C=strength, class_weight="balanced", max_iter=1000, tol=1e-4)

@@ -1,0 +1,135 @@
+"""A random forest as flat arrays: each leaf is a word of the dictionary (thesis 7.3)."""
+
+from collections.abc import Sequence
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import F4, I4, U2, U4, Record, array
+from shapecat.jit import kernel
+
+__all__ = ["FlatForest", "flatten"]
+
+
+class FlatForest(Record):
+    """Decision trees in four arrays, walked without scikit-learn.
+
+    The children of a node stand side by side, behind their parent; words are the leaves in the
+    order of the nodes.
+
+    Attributes
+    ----------
+    roots : (t,) first node of each tree.
+    feature : (n,) feature that a node compares; 0 in leaves.
+    threshold : (n,) a view goes left when its feature is <= this.
+    left : (n,) the left child, the right one is ``left + 1``; 0 in leaves.
+
+    Raises
+    ------
+    ValueError : a child is not behind its parent or beyond the end: a walk might not end.
+    """
+
+    roots: U4 = array("t", "u4")
+    feature: U2 = array("n", "u2")
+    threshold: F4 = array("n", "f4")
+    left: U4 = array("n", "u4")
+
+    def __post_init__(self) -> None:
+        """Check that every walk ends in a leaf."""
+        super().__post_init__()
+        left = self.left.astype(np.int64)
+        inner = left > 0
+        behind = left[inner] > np.flatnonzero(inner)
+        inside = left[inner] + 1 < left.size
+        if not (
+            self.roots.size and np.all(behind) and np.all(inside) and np.all(self.roots < left.size)
+        ):
+            msg = "the trees are damaged: a child lies before its parent or beyond the end"
+            raise ValueError(msg)
+
+    @cached_property
+    def word(self) -> I4:
+        """(n,) the word of each leaf; of no meaning in inner nodes."""
+        return np.cumsum(self.left == 0) - 1
+
+    @property
+    def words(self) -> int:
+        """Number of words."""
+        return int(np.count_nonzero(self.left == 0))
+
+    @property
+    def parameters(self) -> tuple[np.ndarray, ...]:
+        """The arrays of `fall`, in the types of the kernel."""
+        return (
+            self.roots.astype(np.int64),
+            self.feature.astype(np.int64),
+            self.threshold,
+            self.left.astype(np.int64),
+            self.word,
+        )
+
+    def fall(self, features: F4) -> I4:
+        """Return the word of each tree that features (n, f) fall into: (n, t).
+
+        Raises
+        ------
+        ValueError : there are fewer features than the trees ask for.
+        """
+        x = np.ascontiguousarray(features, np.float32)
+        if x.shape[1] <= self.feature.max(initial=0):
+            msg = f"the forest asks for feature {self.feature.max()}, got {x.shape[1]} features"
+            raise ValueError(msg)
+        result = np.zeros((len(x), len(self.roots)), np.int64)
+        for i, row in enumerate(x):
+            fall(row, *self.parameters, result[i])
+        return result
+
+
+@kernel
+def fall(x: F4, roots: I4, feature: I4, threshold: F4, left: I4, word: I4, result: I4) -> None:
+    """Write the word that x (f,) falls into in each tree into result (t,)."""
+    for t in range(roots.size):
+        node = roots[t]
+        while left[node] != 0:
+            node = left[node] + (0 if x[feature[node]] <= threshold[node] else 1)
+        result[t] = word[node]
+
+
+def flatten(trees: Sequence[Any]) -> FlatForest:
+    """Return fitted scikit-learn trees (the ``tree_`` of each) as a `FlatForest`.
+
+    Thresholds are rounded down to single precision: a single precision value is below the
+    rounded one exactly when it is below the double precision one.
+    """
+    roots, parts = [], []
+    base = 0
+    for tree in trees:
+        order, left = _siblings_together(tree.children_left, tree.children_right)
+        inner = tree.children_left[order] >= 0
+        roots.append(base)
+        parts.append(
+            (
+                np.where(inner, tree.feature[order], 0),
+                _round_down(np.where(inner, tree.threshold[order], 0.0)),
+                np.where(inner, left + base, 0),
+            )
+        )
+        base += order.size
+    feature, threshold, left = (np.concatenate(column) for column in zip(*parts, strict=True))
+    return FlatForest(np.array(roots), feature, threshold, left)
+
+
+def _siblings_together(left: I4, right: I4) -> tuple[I4, I4]:
+    """Return the nodes breadth first, and for each the new place of its left child."""
+    order, place = [0], np.zeros(left.size, np.int64)
+    for k, node in enumerate(order):  # grows while it is read: a queue
+        if left[node] >= 0:
+            place[k] = len(order)
+            order += [int(left[node]), int(right[node])]
+    return np.array(order), place
+
+
+def _round_down(values: np.ndarray) -> F4:
+    single = values.astype(np.float32)
+    return np.where(single > values, np.nextafter(single, np.float32(-np.inf)), single)

@@ -1,0 +1,187 @@
+"""Model files: plain arrays and a JSON header in one .npz. Loading one executes nothing."""
+
+import io
+import json
+import math
+import zipfile
+import zlib
+from collections.abc import Mapping
+from dataclasses import fields
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, get_type_hints
+
+import numpy as np
+
+from shapecat.arrays import Record
+from shapecat.errors import ModelError
+from shapecat.learning.categorizer import Categorizer, parts_of
+
+__all__ = ["load_model", "save_model"]
+
+_FORMAT = "shapecat-model"
+_VERSION = 1
+_LARGEST_FILE = 64 << 20
+_LARGEST_PART = 128 << 20
+_HEADER = "header.json"
+
+
+def save_model(path: Path, categorizer: Categorizer) -> None:
+    """Write a model; the same model gives the same bytes.
+
+    Raises
+    ------
+    ModelError : the file cannot be written.
+    """
+    parts = parts_of(categorizer)
+    header = {name: value for name, value in parts.items() if not isinstance(value, np.ndarray)}
+    text = json.dumps({"format": _FORMAT, "version": _VERSION, **header}, sort_keys=True, indent=1)
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w") as archive:
+        _write_member(archive, _HEADER, text.encode())
+        for name in sorted(parts.keys() - header.keys()):
+            content = io.BytesIO()
+            little = parts[name].astype(parts[name].dtype.newbyteorder("<"), copy=False)
+            np.lib.format.write_array(content, np.ascontiguousarray(little), allow_pickle=False)
+            _write_member(archive, f"{name}.npy", content.getvalue())
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(buffer.getvalue())
+    except OSError as error:
+        msg = f"{path}: cannot write the model: {error}"
+        raise ModelError(msg) from error
+
+
+def _write_member(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
+    member = zipfile.ZipInfo(name, date_time=(1980, 1, 1, 0, 0, 0))
+    member.compress_type = zipfile.ZIP_DEFLATED
+    archive.writestr(member, content, compresslevel=9)
+
+
+def load_model(path: Path | None = None) -> Categorizer:
+    """Read a model; without a path the default model shipped with the package.
+
+    A file can neither run code nor crash nor hang the reader: sizes are bounded by what the file
+    holds, every index is checked.
+
+    Raises
+    ------
+    ModelError : no such file, or it is damaged, not a model, or made by a newer version.
+    """
+    name = str(path) if path is not None else "the default model"
+    source = path if path is not None else files("shapecat.models") / "default.npz"
+    try:
+        content = source.read_bytes()
+    except OSError as error:
+        msg = f"{name}: cannot read the model: {error.strerror or error}"
+        raise ModelError(msg) from error
+    try:
+        return _parse(content)
+    except (_NotAModelError, ValueError, TypeError, OverflowError, RecursionError) as error:
+        reason = str(error).strip("'\"").partition("\n")[0]
+        msg = f"{name}: not a usable model file: {reason}; train one with `shapecat train`"
+        raise ModelError(msg) from error
+
+
+class _NotAModelError(Exception):
+    """What is wrong with the file."""
+
+
+def _parse(content: bytes) -> Categorizer:
+    members = _read_members(content)
+    if _HEADER not in members:
+        msg = f"it has no {_HEADER}"
+        raise _NotAModelError(msg)
+    header = json.loads(members.pop(_HEADER))
+    if not isinstance(header, dict) or header.pop("format", None) != _FORMAT:
+        msg = f"its header does not say {_FORMAT}"
+        raise _NotAModelError(msg)
+    version = header.pop("version", None)
+    if version != _VERSION:
+        msg = f"it has version {version}, this shapecat reads version {_VERSION}"
+        raise _NotAModelError(msg)
+    parts = {name.removesuffix(".npy"): _parse_array(data) for name, data in members.items()}
+    categorizer = _assemble(Categorizer, header | parts, "")
+    if not isinstance(categorizer, Categorizer):  # for the type checker
+        raise TypeError
+    return categorizer
+
+
+def _read_members(content: bytes) -> dict[str, bytes]:
+    """Unpack a small archive; what it claims about sizes is not believed."""
+    if len(content) > _LARGEST_FILE:
+        msg = f"it is larger than {_LARGEST_FILE >> 20} MB"
+        raise _NotAModelError(msg)
+    try:
+        with zipfile.ZipFile(io.BytesIO(content)) as archive:
+            return _unpack(archive)
+    except (zipfile.BadZipFile, EOFError, OSError, RuntimeError, zlib.error) as error:
+        # RuntimeError: encrypted, or an unknown compression.
+        msg = f"it is not an intact .npz archive ({error})"
+        raise _NotAModelError(msg) from error
+
+
+def _unpack(archive: zipfile.ZipFile) -> dict[str, bytes]:
+    members, left = {}, _LARGEST_PART
+    for item in archive.infolist():
+        if item.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
+            msg = f"{item.filename} is compressed in an unknown way"
+            raise _NotAModelError(msg)
+        with archive.open(item) as stream:
+            data = stream.read(left + 1)
+        left -= len(data)
+        if left < 0:
+            msg = f"it unpacks to more than {_LARGEST_PART >> 20} MB"
+            raise _NotAModelError(msg)
+        members[item.filename] = data
+    return members
+
+
+def _parse_array(data: bytes) -> np.ndarray:
+    """Read the .npy format without allocating what the header merely claims."""
+    stream = io.BytesIO(data)
+    if np.lib.format.read_magic(stream) != (1, 0):
+        msg = "an array is of an unknown version"
+        raise _NotAModelError(msg)
+    shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
+    rest = data[stream.tell() :]
+    if fortran or dtype.kind not in "fiu" or math.prod(shape) * dtype.itemsize != len(rest):
+        msg = "an array does not have the size its header says"
+        raise _NotAModelError(msg)
+    return np.frombuffer(rest, dtype).reshape(shape)
+
+
+def _assemble(kind: type[Record], parts: Mapping[str, Any], prefix: str) -> Record:
+    """Build nested records from fields by dotted name; the opposite of `parts_of`."""
+    values: dict[str, Any] = {}
+    hints = get_type_hints(kind)
+    for item in fields(kind):  # type: ignore[arg-type]  # every Record is a dataclass
+        key, hint = f"{prefix}{item.name}", hints[item.name]
+        if isinstance(hint, type) and issubclass(hint, Record):
+            values[item.name] = _assemble(hint, parts, f"{key}.")
+        elif key not in parts:
+            msg = f"it has no {key}"
+            raise _NotAModelError(msg)
+        else:
+            values[item.name] = _checked(key, parts[key], hint, item.metadata.get("dtype"))
+    return kind(**values)
+
+
+def _checked(key: str, value: Any, hint: Any, dtype: str | None) -> Any:
+    """Return a value if it is of the type of its field."""
+    if dtype is not None:
+        good = isinstance(value, np.ndarray) and value.dtype == np.dtype(f"<{dtype}")
+    elif hint == tuple[str, ...]:
+        good = isinstance(value, list) and all(isinstance(item, str) for item in value)
+        value = tuple(value) if good else value
+    elif hint is float:
+        good = isinstance(value, int | float) and not isinstance(value, bool)
+        value = float(value) if good else value
+    elif hint is int:
+        good = isinstance(value, int) and not isinstance(value, bool)
+    else:
+        good = isinstance(value, dict)
+    if not good:
+        msg = f"{key} is of the wrong kind"
+        raise _NotAModelError(msg)
+    return value

@@ -1,0 +1,133 @@
+"""From bytes to objects, by the definitions a recording holds."""
+
+import json
+import struct
+from collections.abc import Callable, Iterator
+from functools import cache
+from types import SimpleNamespace
+from typing import Any
+
+from rosbags.interfaces import Nodetype
+from rosbags.serde import SerdeError
+from rosbags.typesys import (
+    Stores,
+    TypesysError,
+    get_types_from_idl,
+    get_types_from_msg,
+    get_typestore,
+)
+from rosbags.typesys.store import Typestore
+
+from shapecat.recordings.messages import Channel, Message, MessageError
+
+__all__ = ["LIBRARY_ERRORS", "Decoder", "decode", "typestore_of"]
+
+Decoder = Callable[[bytes | memoryview], Any]
+
+LIBRARY_ERRORS = (
+    ArithmeticError,
+    AssertionError,
+    AttributeError,
+    LookupError,
+    MemoryError,
+    RecursionError,
+    SerdeError,
+    SyntaxError,
+    TypeError,
+    TypesysError,
+    ValueError,
+    struct.error,
+)
+"""What the type system raises on hostile definitions and data."""
+
+_MAX_DEFINITION = 1 << 20
+_MAX_UNROLLED = 4096
+_SEPARATOR = "=" * 80 + "\n"
+
+
+def decode(message: Message, known: dict[tuple[str, str, bytes], Decoder]) -> Any:
+    """Decode a message; decoders are made once per definition and kept in ``known``.
+
+    Raises
+    ------
+    MessageError : with topic, type and reason.
+    """
+    channel = message.channel
+    key = (channel.type, channel.encoding, channel.schema)
+    try:
+        if key not in known:
+            known[key] = _DECODERS[channel.encoding](channel)
+        return known[key](message.data)
+    except LIBRARY_ERRORS as error:
+        reason = " ".join(str(error).split())[:120] or type(error).__name__
+        if channel.encoding not in _DECODERS:
+            reason = f"encoding {channel.encoding!r} is not supported"
+        msg = f"{channel.topic}: cannot decode {channel.type}: {reason}"
+        raise MessageError(msg) from error
+
+
+def typestore_of(channel: Channel) -> Typestore:
+    """Build a store of the types that a channel's definition names.
+
+    Without a definition, that of the ROS distribution most recordings come from.
+    """
+    if not channel.schema:
+        return _builtin(channel.encoding)
+    if len(channel.schema) > _MAX_DEFINITION:
+        msg = f"definition of {len(channel.schema)} bytes"
+        raise ValueError(msg)
+    text = channel.schema.decode("utf-8")
+    types: dict[str, Any] = {}
+    if channel.schema_encoding in {"ros2idl", "omgidl"}:
+        for part in _idl_parts(text):
+            types.update(get_types_from_idl(part))
+    else:
+        types.update(get_types_from_msg(text.replace("\r\n", "\n"), channel.type))
+    _refuse_unrolling(types)
+    # A store for every definition: two topics may disagree on a type.
+    store = get_typestore(Stores.EMPTY)
+    store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
+    return store
+
+
+def _idl_parts(text: str) -> Iterator[str]:
+    if not text.startswith(f"{_SEPARATOR}IDL: "):
+        yield text
+        return
+    for part in text.split(_SEPARATOR)[1:]:
+        yield part.partition("\n")[2]
+
+
+def _refuse_unrolling(types: dict[str, Any]) -> None:
+    """Refuse fixed arrays of strings or messages for which the library would write code forever."""
+    for name, (_, fields) in types.items():
+        for field, description in fields:
+            if description[0] != Nodetype.ARRAY:
+                continue
+            (kind, base), length = description[1]
+            primitive = kind == Nodetype.BASE and base[0] != "string"
+            if length > _MAX_UNROLLED and not primitive:
+                msg = f"{name}.{field}: array of {length}"
+                raise ValueError(msg)
+
+
+@cache
+def _builtin(encoding: str) -> Typestore:
+    return get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.ROS2_HUMBLE)
+
+
+def _cdr(channel: Channel) -> Decoder:
+    store = typestore_of(channel)
+    return lambda data: store.deserialize_cdr(data, channel.type)
+
+
+def _ros1(channel: Channel) -> Decoder:
+    store = typestore_of(channel)
+    return lambda data: store.deserialize_ros1(data, channel.type)
+
+
+def _json(_channel: Channel) -> Decoder:
+    return lambda data: json.loads(bytes(data), object_hook=lambda item: SimpleNamespace(**item))
+
+
+_DECODERS: dict[str, Callable[[Channel], Decoder]] = {"cdr": _cdr, "ros1": _ros1, "json": _json}

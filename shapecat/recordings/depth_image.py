@@ -1,0 +1,52 @@
+"""Depth images become metres along the optical axis."""
+
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import F4
+from shapecat.recordings.messages import MessageError
+
+__all__ = ["DEPTH_ENCODINGS", "clean_depth", "depth_of_image"]
+
+DEPTH_ENCODINGS = {"16UC1": ("u2", 1000), "mono16": ("u2", 1000), "32FC1": ("f4", 1)}
+"""Type of a pixel and units in a metre (REP 118)."""
+
+
+def depth_of_image(message: Any) -> F4:
+    """Read a decoded sensor_msgs/Image as depth.
+
+    Returns
+    -------
+    (h, w) float32 metres, 0 where there is no reading.
+
+    Raises
+    ------
+    MessageError : another encoding, or less data than the sizes claim.
+    """
+    height, width = int(message.height), int(message.width)
+    if message.encoding not in DEPTH_ENCODINGS:
+        msg = f"image encoding {message.encoding!r} is not depth"
+        raise MessageError(msg)
+    kind, units = DEPTH_ENCODINGS[message.encoding]
+    pixel = np.dtype(("<" if not message.is_bigendian else ">") + kind)
+    row = int(message.step) or width * pixel.itemsize
+    data = np.frombuffer(message.data, np.uint8)
+    need = (height - 1) * row + width * pixel.itemsize
+    if height * width == 0 or row < width * pixel.itemsize or need > data.size:
+        msg = f"image of {width} x {height} pixels needs {need} bytes and has {data.size}"
+        raise MessageError(msg)
+    return clean_depth(np.ndarray((height, width), pixel, data, 0, (row, pixel.itemsize)), units)
+
+
+def clean_depth(values: F4, units: int = 1) -> F4:
+    """Convert to metres and set to 0 what is negative, infinite or not a number.
+
+    ``units`` make a metre.
+    """
+    if values.dtype.kind == "u":
+        # Dividing rounds to the nearest float; multiplying by 0.001 does not.
+        return np.divide(values, np.float32(units), dtype=np.float32)
+    depth = np.array(values, np.float32)
+    depth[~((depth > 0) & (depth < np.inf))] = 0
+    return depth

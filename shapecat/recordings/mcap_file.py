@@ -1,0 +1,363 @@
+"""MCAP files: indexed ones by time, all others in the order of the file.
+
+Damage never ends the reading: an unfinished file gives its whole chunks, a broken chunk is left
+out, and both are said in the warnings.
+"""
+
+from collections import Counter
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from pathlib import Path
+from typing import ClassVar
+
+from mcap import records
+
+from shapecat.errors import RecordingError
+from shapecat.recordings.mcap_records import (
+    MAGIC,
+    ChunkError,
+    Opcode,
+    RawMessage,
+    Record,
+    TruncatedError,
+    parse,
+    read_chunk,
+    read_content,
+    split_chunk,
+    split_message,
+    walk,
+)
+from shapecat.recordings.messages import Channel, Message, Topic, ros_type
+from shapecat.recordings.recording import Recording
+
+__all__ = ["McapRecording", "Summary"]
+
+_FOOTER = 9 + 20
+_PENDING = 512 << 20
+"""Bytes of messages held back to bring overlapping chunks in order."""
+_SMALL = 1 << 16
+"""Messages up to this size are copied, so that they do not keep their chunk in memory."""
+
+
+@dataclass
+class Summary:
+    """What the end of a file says about it, or what reading all of it showed."""
+
+    schemas: dict[int, records.Schema] = field(default_factory=dict)
+    channels: dict[int, records.Channel] = field(default_factory=dict)
+    chunks: list[records.ChunkIndex] = field(default_factory=list)
+    attachments: list[records.AttachmentIndex] = field(default_factory=list)
+    metadata: list[records.MetadataIndex] = field(default_factory=list)
+    statistics: records.Statistics | None = None
+    data_end: int = 0
+
+
+class McapRecording(Recording):
+    """An MCAP file.
+
+    Attributes
+    ----------
+    indexed : whether it is finished and its index covers it.
+    summary : its schemas, channels and indexes.
+    profile : ``ros2``, ``ros1`` or empty.
+    """
+
+    kind: ClassVar[str] = "mcap"
+
+    def __init__(self, path: Path) -> None:
+        """Open the file and read its summary, or all of it where there is none.
+
+        Raises
+        ------
+        RecordingError : it is not an MCAP file.
+        OSError : it cannot be read.
+        """
+        super().__init__(path)
+        self._file = path.open("rb")
+        try:
+            self._size = self._file.seek(0, 2)
+            self.profile = self._read_profile()
+            found = self._read_summary()
+            self.indexed = found is not None
+            self.summary = found or Summary()
+            self._counts: Counter[int] | None = None
+            self._times: list[int] = []
+            if found is None:
+                self._scan()
+            else:
+                self._describe()
+        except BaseException:
+            self._file.close()
+            raise
+        self._channels = {
+            number: self._channel(channel) for number, channel in self.summary.channels.items()
+        }
+        self.topics = self._list_topics()
+        if self._times:
+            self.start_ns, self.end_ns = min(self._times), max(self._times)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()
+
+    def channels(self) -> tuple[Channel, ...]:
+        """Return every channel."""
+        return tuple(self._channels.values())
+
+    def messages(
+        self,
+        topics: Collection[str] | None = None,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> Iterator[Message]:
+        """Yield undecoded messages; see `Recording.messages`."""
+        wanted = {
+            number
+            for number, channel in self._channels.items()
+            if topics is None or channel.topic in topics
+        }
+        raw = self._by_time(wanted, start_ns, stop_ns) if self.indexed else self._in_file(wanted)
+        for message in raw:
+            if start_ns is not None and message.log_time < start_ns:
+                continue
+            if stop_ns is not None and message.log_time >= stop_ns:
+                continue
+            yield Message(
+                self._channels[message.channel_id],
+                message.log_time,
+                message.publish_time,
+                message.sequence,
+                bytes(message.data) if len(message.data) <= _SMALL else message.data,
+            )
+
+    def top_level(self) -> Iterator[Record]:
+        """Yield the whole records of the data section, without their content."""
+        try:
+            for record in walk(self._file, len(MAGIC), self._size):
+                if record.opcode in {Opcode.DATA_END, Opcode.FOOTER}:
+                    return
+                yield record
+        except TruncatedError:
+            return
+
+    def content(self, record: Record) -> bytes:
+        """Read the content of a record of `top_level`."""
+        return read_content(self._file, record)
+
+    def _read_profile(self) -> str:
+        self._file.seek(0)
+        if self._file.read(len(MAGIC)) != MAGIC:
+            msg = "does not begin as an MCAP file"
+            raise RecordingError(msg)
+        try:
+            first = next(walk(self._file, len(MAGIC), self._size))
+            return str(parse(records.Header.read, self.content(first)).profile)
+        except (StopIteration, RecordingError):
+            self.warn("the header is damaged")
+            return ""
+
+    def _read_summary(self) -> Summary | None:
+        """Read the summary section; None where it is missing, damaged or does not cover all."""
+        footer_at = self._size - _FOOTER - len(MAGIC)
+        if footer_at < len(MAGIC):
+            return None
+        self._file.seek(footer_at)
+        tail = self._file.read()
+        if tail[-len(MAGIC) :] != MAGIC or tail[0] != Opcode.FOOTER:
+            return None
+        try:
+            start = parse(records.Footer.read, tail[9:_FOOTER]).summary_start
+            if not len(MAGIC) < start <= footer_at:
+                return None
+            summary = self._collect(start, footer_at)
+            summary.data_end = self._find_data_end(summary, start)
+        except RecordingError:
+            self.warn("the index is damaged: read from beginning to end instead")
+            return None
+        return summary if _is_complete(summary) else None
+
+    def _collect(self, start: int, end: int) -> Summary:
+        summary = Summary()
+        for record in walk(self._file, start, end):
+            content = self.content(record)
+            match record.opcode:
+                case Opcode.SCHEMA:
+                    schema = parse(records.Schema.read, content)
+                    summary.schemas[schema.id] = schema
+                case Opcode.CHANNEL:
+                    channel = parse(records.Channel.read, content)
+                    summary.channels[channel.id] = channel
+                case Opcode.CHUNK_INDEX:
+                    summary.chunks.append(parse(records.ChunkIndex.read, content))
+                case Opcode.ATTACHMENT_INDEX:
+                    summary.attachments.append(parse(records.AttachmentIndex.read, content))
+                case Opcode.METADATA_INDEX:
+                    summary.metadata.append(parse(records.MetadataIndex.read, content))
+                case Opcode.STATISTICS:
+                    summary.statistics = parse(records.Statistics.read, content)
+        return summary
+
+    def _find_data_end(self, summary: Summary, summary_start: int) -> int:
+        """Return where the data end record begins, walking from the last indexed record."""
+        ends = [c.chunk_start_offset + c.chunk_length for c in summary.chunks]
+        ends += [item.offset + item.length for item in (*summary.attachments, *summary.metadata)]
+        for record in walk(self._file, max(ends, default=len(MAGIC)), summary_start):
+            if record.opcode == Opcode.DATA_END:
+                return record.offset - 9
+        msg = "no data end record"
+        raise TruncatedError(msg)
+
+    def _describe(self) -> None:
+        """Take counts and times from the index."""
+        statistics = self.summary.statistics
+        if statistics is not None:
+            self._counts = Counter(statistics.channel_message_counts)
+        for chunk in self.summary.chunks:
+            self._times += [chunk.message_start_time, chunk.message_end_time]
+
+    def _scan(self) -> None:
+        """Read all of the file for its channels, counts and times."""
+        self._counts = Counter()
+        end, finished = len(MAGIC), False
+        low = high = None
+        try:
+            for record in walk(self._file, len(MAGIC), self._size):
+                finished = finished or record.opcode in {Opcode.DATA_END, Opcode.FOOTER}
+                if finished:
+                    break
+                for message in self._expand(record):
+                    self._counts[message.channel_id] += 1
+                    time = message.log_time
+                    low = time if low is None else min(low, time)
+                    high = time if high is None else max(high, time)
+                end = record.offset + record.length
+        except TruncatedError:
+            pass
+        if low is not None and high is not None:
+            self._times = [low, high]
+        if finished:
+            self.warn("no index: messages are read in the order of the file")
+        else:
+            lost = self._size - end
+            self.warn(
+                f"the recording was not finished: recovered {self._counts.total()} messages; "
+                f"the last {lost} bytes are lost"
+            )
+
+    def _in_file(self, wanted: set[int]) -> Iterator[RawMessage]:
+        for record in self.top_level():
+            yield from (m for m in self._expand(record) if m.channel_id in wanted)
+
+    def _expand(self, record: Record) -> Iterator[RawMessage]:
+        """Yield the messages of a top-level record; note its schemas and channels."""
+        if record.opcode == Opcode.CHUNK:
+            yield from self._chunk(record)
+        elif record.opcode in _DEFINING:
+            try:
+                yield from self._take(record.opcode, memoryview(self.content(record)))
+            except ChunkError as error:
+                self.warn(f"left out a record at byte {record.offset}: {error}")
+
+    def _chunk(self, record: Record) -> Iterator[RawMessage]:
+        """Yield the messages of a chunk; a damaged one gives what is before the damage."""
+        try:
+            for opcode, content in split_chunk(read_chunk(self.content(record))):
+                yield from self._take(opcode, content)
+        except ChunkError as error:
+            self.warn(f"left out the chunk at byte {record.offset - 9}: {error}")
+
+    def _take(self, opcode: int, content: memoryview) -> Iterator[RawMessage]:
+        if opcode == Opcode.MESSAGE:
+            message = split_message(content)
+            if message.channel_id in self.summary.channels:
+                yield message
+        elif self.indexed:
+            return
+        elif opcode == Opcode.SCHEMA:
+            schema = parse(records.Schema.read, content)
+            self.summary.schemas.setdefault(schema.id, schema)
+        elif opcode == Opcode.CHANNEL:
+            channel = parse(records.Channel.read, content)
+            self.summary.channels.setdefault(channel.id, channel)
+
+    def _by_time(
+        self, wanted: set[int], start_ns: int | None, stop_ns: int | None
+    ) -> Iterator[RawMessage]:
+        """Merge the chunks by log time; ties in the order of the file."""
+        chunks = [c for c in self.summary.chunks if _overlaps(c, wanted, start_ns, stop_ns)]
+        chunks.sort(key=lambda c: (c.message_start_time, c.chunk_start_offset), reverse=True)
+        heap: list[tuple[int, int, int, RawMessage]] = []
+        pending = 0
+        while chunks or heap:
+            due = chunks and (not heap or chunks[-1].message_start_time <= heap[0][0])
+            if due and (not heap or pending < _PENDING):
+                chunk = chunks.pop()
+                for position, message in enumerate(self._indexed_chunk(chunk)):
+                    if message.channel_id in wanted:
+                        key = (message.log_time, chunk.chunk_start_offset, position)
+                        heappush(heap, (*key, message))
+                        pending += len(message.data)
+                continue
+            message = heappop(heap)[3]
+            pending -= len(message.data)
+            yield message
+
+    def _indexed_chunk(self, chunk: records.ChunkIndex) -> Iterator[RawMessage]:
+        try:
+            record = next(walk(self._file, chunk.chunk_start_offset, self._size))
+        except (TruncatedError, StopIteration):
+            record = None
+        if record is None or record.opcode != Opcode.CHUNK:
+            self.warn(f"no chunk at byte {chunk.chunk_start_offset}, where the index has one")
+            return
+        yield from self._chunk(record)
+
+    def _channel(self, channel: records.Channel) -> Channel:
+        schema = self.summary.schemas.get(channel.schema_id)
+        name, encoding, text = (schema.name, schema.encoding, schema.data) if schema else _NONE
+        ros = channel.message_encoding in {"cdr", "ros1"}
+        return Channel(
+            channel.topic,
+            ros_type(name) if ros else name,
+            channel.message_encoding,
+            name,
+            encoding,
+            text,
+        )
+
+    def _list_topics(self) -> tuple[Topic, ...]:
+        totals: dict[tuple[str, str, str], int] = {}
+        known = self._counts is not None
+        counts = self._counts or Counter[int]()
+        for number, channel in self._channels.items():
+            key = (channel.topic, channel.type, channel.encoding)
+            totals[key] = totals.get(key, 0) + counts[number]
+        return tuple(Topic(*key, totals[key] if known else None) for key in sorted(totals))
+
+
+_NONE = ("", "", b"")
+_DEFINING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
+
+
+def _is_complete(summary: Summary) -> bool:
+    """Tell whether every message can be found and named from the summary alone."""
+    numbers = {number for c in summary.chunks for number in c.message_index_offsets}
+    statistics = summary.statistics
+    if statistics is not None:
+        numbers |= {n for n, count in statistics.channel_message_counts.items() if count}
+    schemas = {channel.schema_id for channel in summary.channels.values()} - {0}
+    named = numbers <= summary.channels.keys() and schemas <= summary.schemas.keys()
+    empty = statistics is not None and statistics.message_count == 0
+    return named and bool(summary.channels or empty) and bool(summary.chunks or empty)
+
+
+def _overlaps(
+    chunk: records.ChunkIndex, wanted: set[int], start_ns: int | None, stop_ns: int | None
+) -> bool:
+    if start_ns is not None and chunk.message_end_time < start_ns:
+        return False
+    if stop_ns is not None and chunk.message_start_time >= stop_ns:
+        return False
+    # Without message indexes any chunk may hold any channel.
+    return not chunk.message_index_offsets or not wanted.isdisjoint(chunk.message_index_offsets)

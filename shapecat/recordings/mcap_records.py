@@ -1,0 +1,213 @@
+"""Records of an MCAP file, read so that no length field is believed before it is checked.
+
+The layout is that of the MCAP specification: every record is an opcode, a 64-bit length, and its
+content. `mcap.records` parses the small records; messages are sliced without a copy.
+"""
+
+import struct
+import zlib
+from collections.abc import Callable, Iterator
+from io import BytesIO
+from typing import BinaryIO, NamedTuple, TypeVar
+
+import lz4.frame  # type: ignore[import-untyped]  # ships no types
+import zstandard
+from mcap.data_stream import ReadDataStream
+from mcap.exceptions import McapError
+from mcap.opcode import Opcode
+
+from shapecat.errors import RecordingError
+
+__all__ = [
+    "MAGIC",
+    "ChunkError",
+    "Opcode",
+    "RawMessage",
+    "Record",
+    "TruncatedError",
+    "parse",
+    "read_chunk",
+    "read_content",
+    "split_chunk",
+    "split_message",
+    "walk",
+]
+
+MAGIC = b"\x89MCAP0\r\n"
+
+_HEAD = struct.Struct("<BQ")
+_CHUNK = struct.Struct("<QQQII")
+_MESSAGE = struct.Struct("<HIQQ")
+_FREELY = 256 << 20
+"""Chunks up to this size are decompressed whatever they claim, bytes."""
+_RATIO = 1000
+"""Larger chunks must hold at least a byte for so many."""
+
+_T = TypeVar("_T")
+
+
+class TruncatedError(RecordingError):
+    """The file ends inside a record, or a record claims to be longer than the file."""
+
+
+class ChunkError(RecordingError):
+    """A chunk that is damaged or not believable."""
+
+
+class Record(NamedTuple):
+    """Where the content of a record is in the file."""
+
+    opcode: int
+    offset: int
+    length: int
+
+
+class RawMessage(NamedTuple):
+    """A message record, its data a view into its chunk."""
+
+    channel_id: int
+    sequence: int
+    log_time: int
+    publish_time: int
+    data: memoryview
+
+
+def walk(file: BinaryIO, offset: int, end: int) -> Iterator[Record]:
+    """Yield the records between two offsets, without their content.
+
+    Raises
+    ------
+    TruncatedError : a record reaches beyond ``end``.
+    """
+    while offset < end:
+        file.seek(offset)
+        head = file.read(_HEAD.size)
+        opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, end)
+        content = offset + _HEAD.size
+        if length > end - content:
+            msg = f"cut off in the record at byte {offset}"
+            raise TruncatedError(msg)
+        yield Record(opcode, content, length)
+        offset = content + length
+
+
+def read_content(file: BinaryIO, record: Record) -> bytes:
+    """Read the content of a record that `walk` has checked."""
+    file.seek(record.offset)
+    return file.read(record.length)
+
+
+def parse(read: Callable[[ReadDataStream], _T], content: bytes | memoryview) -> _T:
+    """Parse a small record with its class of `mcap.records`.
+
+    Raises
+    ------
+    ChunkError : the record is not what it claims to be.
+    """
+    try:
+        return read(ReadDataStream(BytesIO(content)))
+    except (McapError, struct.error, ValueError) as error:
+        msg = f"damaged record: {str(error) or type(error).__name__}"
+        raise ChunkError(msg) from error
+
+
+def read_chunk(content: bytes) -> memoryview:
+    """Return the decompressed records of a chunk, given the content of its record.
+
+    Raises
+    ------
+    ChunkError : sizes that do not fit, an unknown compression, damaged data, a wrong checksum.
+    """
+    try:
+        _, _, size, crc, name_length = _CHUNK.unpack_from(content)
+        name_end = _CHUNK.size + name_length
+        compression = bytes(content[_CHUNK.size : name_end]).decode("ascii")
+        (length,) = struct.unpack_from("<Q", content, name_end)
+        data = memoryview(content)[name_end + 8 : name_end + 8 + length]
+    except (struct.error, UnicodeDecodeError) as error:
+        msg = "damaged chunk header"
+        raise ChunkError(msg) from error
+    if len(data) != length:
+        msg = f"chunk claims {length} bytes and has {len(data)}"
+        raise ChunkError(msg)
+    if size > max(_FREELY, _RATIO * length):
+        msg = f"chunk of {length} bytes claims to hold {size}"
+        raise ChunkError(msg)
+    if compression not in _DECOMPRESS:
+        msg = f"chunk compression {compression!r} is not supported"
+        raise ChunkError(msg)
+    plain = _decompress(_DECOMPRESS[compression], data, size)
+    if len(plain) != size or (crc and zlib.crc32(plain) != crc):
+        msg = "damaged chunk: its checksum does not fit"
+        raise ChunkError(msg)
+    return plain
+
+
+def _decompress(
+    method: Callable[[memoryview, int], bytes | memoryview], data: memoryview, size: int
+) -> memoryview:
+    try:
+        return memoryview(method(data, size))
+    except (RuntimeError, ValueError, EOFError, MemoryError, zstandard.ZstdError) as error:
+        msg = f"damaged chunk: {error}"
+        raise ChunkError(msg) from error
+
+
+def _zstd(data: memoryview, size: int) -> bytes:
+    # The library allocates what the frame claims, so compare that first.
+    claimed = zstandard.frame_content_size(data)
+    if claimed not in {-1, size}:
+        msg = f"{claimed} bytes where the header says {size}"
+        raise ValueError(msg)
+    return zstandard.ZstdDecompressor().decompress(data, max_output_size=size) if size else b""
+
+
+def _lz4(data: memoryview, size: int) -> bytes:
+    return bytes(lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size or 1))
+
+
+def _plain(data: memoryview, _size: int) -> memoryview:
+    return data
+
+
+_DECOMPRESS: dict[str, Callable[[memoryview, int], bytes | memoryview]] = {
+    "": _plain,
+    "none": _plain,
+    "lz4": _lz4,
+    "zstd": _zstd,
+}
+
+
+def split_chunk(chunk: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """Yield opcode and content of each record in a chunk.
+
+    Raises
+    ------
+    ChunkError : a record reaches beyond the chunk.
+    """
+    offset, end = 0, len(chunk)
+    while offset < end:
+        if end - offset < _HEAD.size:
+            msg = "cut off record in a chunk"
+            raise ChunkError(msg)
+        opcode, length = _HEAD.unpack_from(chunk, offset)
+        offset += _HEAD.size
+        if length > end - offset:
+            msg = f"record of {length} bytes in a chunk of {end}"
+            raise ChunkError(msg)
+        yield opcode, chunk[offset : offset + length]
+        offset += length
+
+
+def split_message(content: memoryview) -> RawMessage:
+    """Split the content of a message record.
+
+    Raises
+    ------
+    ChunkError : it is too short.
+    """
+    if len(content) < _MESSAGE.size:
+        msg = f"message record of {len(content)} bytes"
+        raise ChunkError(msg)
+    number, sequence, log_time, publish_time = _MESSAGE.unpack_from(content)
+    return RawMessage(number, sequence, log_time, publish_time, content[_MESSAGE.size :])

@@ -1,0 +1,76 @@
+"""The small records of a log: channels, messages, topics."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from shapecat.errors import RecordingError
+
+__all__ = ["Channel", "Message", "MessageError", "Topic", "ros_type"]
+
+
+class MessageError(RecordingError):
+    """A single message that cannot be decoded; the rest of the recording is unaffected."""
+
+
+class Channel(NamedTuple):
+    """Where messages of one kind come from.
+
+    ``type`` is normalized to ``package/msg/Name`` for ROS types; ``schema_name`` is as recorded.
+    ``encoding`` is that of the messages: cdr, ros1, json, protobuf.
+    """
+
+    topic: str
+    type: str
+    encoding: str
+    schema_name: str = ""
+    schema_encoding: str = ""
+    schema: bytes = b""
+
+
+class Message(NamedTuple):
+    """One recorded message, undecoded. Times are nanoseconds."""
+
+    channel: Channel
+    log_time_ns: int
+    publish_time_ns: int
+    sequence: int
+    data: bytes | memoryview
+
+    @property
+    def topic(self) -> str:
+        """The topic it was recorded on."""
+        return self.channel.topic
+
+    @property
+    def type(self) -> str:
+        """Its normalized type."""
+        return self.channel.type
+
+    @property
+    def encoding(self) -> str:
+        """How ``data`` is encoded."""
+        return self.channel.encoding
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a recording with one type; ``count`` is None where it is not known."""
+
+    name: str
+    type: str
+    encoding: str
+    count: int | None
+
+
+def ros_type(name: str) -> str:
+    """Return a ROS type as ``package/msg/Name``, any other name unchanged.
+
+    Examples
+    --------
+    >>> ros_type("sensor_msgs/Image")
+    'sensor_msgs/msg/Image'
+    >>> ros_type("foxglove.PointCloud")
+    'foxglove.PointCloud'
+    """
+    package, slash, rest = name.partition("/")
+    return f"{package}/msg/{rest}" if slash and "/" not in rest else name

@@ -1,0 +1,75 @@
+"""From a path to the reader that understands it."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+from shapecat.errors import RecordingError
+from shapecat.recordings.mcap_file import McapRecording
+from shapecat.recordings.recording import Recording
+
+__all__ = ["open_recording"]
+
+
+def open_recording(path: Path) -> Recording:
+    """Open an MCAP file, a ROS 1 bag, or a ROS 2 bag (a .db3 file or a folder).
+
+    Files are told apart by what they begin with, not by their name.
+
+    Raises
+    ------
+    RecordingError : there is nothing, or nothing that can be read; one line with what was found.
+    """
+    path = Path(path)
+    try:
+        return _READERS[_sniff(path)](path)
+    except RecordingError as error:
+        msg = f"{path}: {error}"
+        raise RecordingError(msg) from error
+    except OSError as error:
+        msg = f"{path}: cannot be read: {error.strerror or error}"
+        raise RecordingError(msg) from error
+
+
+def _bag(path: Path) -> Recording:
+    from shapecat.recordings.ros1_bag import BagRecording  # noqa: PLC0415  # loads rosbags
+
+    return BagRecording(path)
+
+
+def _database(path: Path) -> Recording:
+    from shapecat.recordings.ros2_database import DatabaseRecording  # noqa: PLC0415  # the same
+
+    return DatabaseRecording(path)
+
+
+def _folder(path: Path) -> Recording:
+    from shapecat.recordings.ros2_folder import FolderRecording  # noqa: PLC0415  # the same
+
+    return FolderRecording(path)
+
+
+_READERS: dict[str, Callable[[Path], Recording]] = {
+    "\x89MCAP": McapRecording,
+    "#ROSBAG": _bag,
+    "SQLite format 3": _database,
+    "folder": _folder,
+}
+"""Readers by the first bytes of the file."""
+
+_EXPECTED = "expected an .mcap, .bag or .db3 file, or a ROS 2 bag folder"
+
+
+def _sniff(path: Path) -> str:
+    if path.is_dir():
+        return "folder"
+    if not path.exists():
+        msg = f"does not exist; {_EXPECTED}"
+        raise RecordingError(msg)
+    with path.open("rb") as file:
+        begin = file.read(16).decode("latin-1")
+    for magic in _READERS:
+        if begin.startswith(magic):
+            return magic
+    found = f"begins with {begin[:8]!r}" if begin else "is empty"
+    msg = f"not a recording: {found}; {_EXPECTED}"
+    raise RecordingError(msg)

@@ -1,0 +1,148 @@
+"""The pinhole camera behind an organized cloud or a camera calibration."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import F4, F8
+from shapecat.recordings.messages import MessageError
+from shapecat.types import Camera
+
+__all__ = ["LARGEST_ERROR_PX", "PinholeFit", "camera_of_info", "fit_pinhole", "still_fits"]
+
+LARGEST_ERROR_PX = 0.6
+"""Organized points farther from every pinhole camera than this are treated as unorganized."""
+
+_SAMPLES = 4096
+_FEWEST = 100
+_SPREAD = 0.1
+"""The readings must span this share of the image in both directions, else the fit is loose."""
+
+
+@dataclass(frozen=True)
+class PinholeFit:
+    """A camera and how well it explains the points it was fitted to, RMS in pixels."""
+
+    camera: Camera
+    error_px: float
+
+
+def fit_pinhole(points: F4) -> PinholeFit | None:
+    """Find the pinhole camera whose pixels see the points of an organized cloud.
+
+    Column u sees x / z = (u - cx) / fx, so u is linear in x / z with slope fx and offset cx, and
+    the same holds for rows: two least-squares lines through a few thousand points, in double
+    precision, refitted without outliers.
+
+    Parameters
+    ----------
+    points : (h, w, 3) metres, not finite where there is no reading.
+
+    Returns
+    -------
+    None if the points are few or in a narrow part of the image, or no camera explains 95 % of
+    them to `LARGEST_ERROR_PX`.
+    """
+    height, width = points.shape[:2]
+    sample = _sample(points)
+    if (
+        sample is None
+        or np.ptp(sample[0]) < _SPREAD * width
+        or np.ptp(sample[1]) < _SPREAD * height
+    ):
+        return None
+    u, v, x, y = sample
+    keep = np.ones(u.size, bool)
+    for _ in range(3):
+        fx, cx = _line(x[keep], u[keep])
+        fy, cy = _line(y[keep], v[keep])
+        error = np.hypot(fx * x + cx - u, fy * y + cy - v)
+        keep = error <= max(3.0 * float(np.median(error)), 1e-3)
+    if not (fx > 0 and fy > 0 and np.percentile(error, 95) < LARGEST_ERROR_PX):
+        return None
+    camera = Camera(width, height, fx, fy, cx, cy)
+    return PinholeFit(camera, float(np.sqrt(np.mean(error[keep] ** 2))))
+
+
+def still_fits(fit: PinholeFit, points: F4) -> bool:
+    """Tell whether a camera explains organized points about as well as those it was fitted to."""
+    camera, sample = fit.camera, _sample(points)
+    if sample is None:
+        return points.shape[:2] == (camera.height, camera.width)  # nothing speaks against it
+    u, v, x, y = sample
+    error = np.hypot(camera.fx * x + camera.cx - u, camera.fy * y + camera.cy - v)
+    keep = error <= max(3.0 * float(np.median(error)), 1e-3)
+    rms = float(np.sqrt(np.mean(error[keep] ** 2)))
+    return bool(np.percentile(error, 95) < LARGEST_ERROR_PX and rms < 2 * fit.error_px + 0.02)
+
+
+def _sample(points: F4) -> tuple[F8, F8, F8, F8] | None:
+    """Return u, v, x / z and y / z of readings spread over the image; None if there are few."""
+    height, width = points.shape[:2]
+    # A stride that shares no factor with the width visits all columns.
+    stride = max(1, height * width // (4 * _SAMPLES)) | 1
+    while np.gcd(stride, width) > 1:
+        stride += 2
+    flat = points.reshape(-1, 3)[::stride]
+    index = np.flatnonzero(np.isfinite(flat).all(1) & (flat[:, 2] > 0))
+    if index.size < _FEWEST:
+        return None
+    index = index[:: max(1, index.size // _SAMPLES)]
+    chosen = flat[index].astype(np.float64)
+    v, u = np.divmod(index * stride, width)
+    return (
+        u.astype(float),
+        v.astype(float),
+        chosen[:, 0] / chosen[:, 2],
+        chosen[:, 1] / chosen[:, 2],
+    )
+
+
+def _line(a: F8, b: F8) -> tuple[float, float]:
+    """Fit ``b = slope * a + offset``."""
+    mean_a, mean_b = a.mean(), b.mean()
+    spread = float(((a - mean_a) ** 2).sum())
+    slope = float(((a - mean_a) * (b - mean_b)).sum() / spread) if spread > 0 else 0.0
+    return slope, float(mean_b - slope * mean_a)
+
+
+def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
+    """Read a decoded CameraInfo.
+
+    Parameters
+    ----------
+    rectified : the image has been rectified, so P describes it; otherwise K and D do.
+
+    Returns
+    -------
+    The camera of the full image as binned and cropped, and whether lens distortion is left that
+    it does not describe.
+
+    Raises
+    ------
+    MessageError : the calibration is missing or not finite.
+    """
+    k, p, d = (_field(info, name) for name in "kpd")
+    use_p = rectified and p.size == 12 and p[0] > 0
+    fx, fy, cx, cy = (p[0], p[5], p[2], p[6]) if use_p else (k[0], k[4], k[2], k[5])
+    width, height = int(info.width), int(info.height)
+    bin_x, bin_y = max(1, int(info.binning_x)), max(1, int(info.binning_y))
+    roi = info.roi
+    if roi.width and roi.height:
+        width, height = int(roi.width), int(roi.height)
+        cx, cy = cx - int(roi.x_offset), cy - int(roi.y_offset)
+    values = (fx / bin_x, fy / bin_y, cx / bin_x, cy / bin_y)
+    if not (np.isfinite(values).all() and fx > 0 and fy > 0):
+        msg = "camera info without a calibration (focal length 0)"
+        raise MessageError(msg)
+    camera = Camera(width // bin_x, height // bin_y, *(float(value) for value in values))
+    return camera, bool(not rectified and np.any(d != 0))
+
+
+def _field(info: Any, name: str) -> F8:
+    """Return a matrix by its ROS 2 name (lower case) or its ROS 1 name (upper case)."""
+    value = getattr(info, name, None)
+    if value is None:
+        value = getattr(info, name.upper())
+    return np.asarray(value, np.float64)

@@ -1,0 +1,64 @@
+"""PointCloud2 messages of any layout become coordinates."""
+
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import F4
+from shapecat.recordings.messages import MessageError
+
+__all__ = ["cloud_points"]
+
+_FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+def cloud_points(message: Any) -> F4:
+    """Read the coordinates of a decoded PointCloud2.
+
+    Parameters
+    ----------
+    message : has ``height, width, fields, is_bigendian, point_step, row_step, data`` as in
+        sensor_msgs/PointCloud2. ``is_dense`` is not believed.
+
+    Returns
+    -------
+    (h, w, 3) float32 metres; a point without a reading has a coordinate that is not finite.
+
+    Raises
+    ------
+    MessageError : no coordinates, a layout that does not fit, or less data than the sizes claim.
+    """
+    height, width, step = int(message.height), int(message.width), int(message.point_step)
+    if height * width == 0:
+        return np.zeros((height and 1, 0, 3), np.float32)
+    row = int(message.row_step) or width * step
+    axes = _axes(message, step)
+    data = np.frombuffer(message.data, np.uint8)
+    # The last row may be cut after its last coordinate.
+    need = (height - 1) * row + (width - 1) * step + max(o + np.dtype(f).itemsize for o, f in axes)
+    if row < width * step or need > data.size:
+        msg = f"cloud of {width} x {height} points needs {need} bytes and has {data.size}"
+        raise MessageError(msg)
+    points = np.zeros((height, width, 3), np.float32)
+    with np.errstate(over="ignore", invalid="ignore"):  # hostile values become inf
+        for k, (offset, kind) in enumerate(axes):
+            points[..., k] = np.ndarray((height, width), kind, data, offset, (row, step))
+    return points
+
+
+def _axes(message: Any, step: int) -> list[tuple[int, str]]:
+    """Return offset and numpy type of x, y and z."""
+    order = ">" if message.is_bigendian else "<"
+    fields = {field.name: field for field in message.fields}
+    axes = []
+    for name in "xyz":
+        field = fields.get(name)
+        kind = _FORMATS.get(int(field.datatype)) if field is not None else None
+        if field is None or kind is None:
+            msg = f"cloud without a field {name} of a known type; fields: {', '.join(fields)[:80]}"
+            raise MessageError(msg)
+        if int(field.offset) + np.dtype(kind).itemsize > step:
+            msg = f"field {name} at byte {field.offset} is outside of the point of {step} bytes"
+            raise MessageError(msg)
+        axes.append((int(field.offset), order + kind))
+    return axes

@@ -1,0 +1,92 @@
+"""What every reader offers."""
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterator
+from pathlib import Path
+from types import TracebackType
+from typing import Any, ClassVar, Self
+
+from shapecat.recordings.messages import Channel, Message, Topic
+
+__all__ = ["Recording"]
+
+
+class Recording(ABC):
+    """An open log. Use it as a context manager, or `close` it.
+
+    Attributes
+    ----------
+    path : the file or folder.
+    topics : what was recorded, by name; a topic with two types appears twice.
+    start_ns, end_ns : log times of the first and last message; 0 when there is none.
+    warnings : what was odd about the recording, for the user.
+    """
+
+    kind: ClassVar[str]
+    """``mcap``, ``ros1`` or ``ros2``."""
+
+    def __init__(self, path: Path) -> None:
+        """Prepare the attributes; subclasses fill them."""
+        self.path = path
+        self.topics: tuple[Topic, ...] = ()
+        self.start_ns = 0
+        self.end_ns = 0
+        self.warnings: list[str] = []
+        self._decoders: dict[tuple[str, str, bytes], Callable[[bytes | memoryview], Any]] = {}
+
+    @abstractmethod
+    def channels(self) -> tuple[Channel, ...]:
+        """Return every channel, also those without messages."""
+
+    @abstractmethod
+    def messages(
+        self,
+        topics: Collection[str] | None = None,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> Iterator[Message]:
+        """Yield undecoded messages in flat memory.
+
+        Parameters
+        ----------
+        topics : names to read; all by default.
+        start_ns, stop_ns : log times of the first message and of the first one left out.
+
+        Yields
+        ------
+        Messages by log time; in the order of the file where it has no index. A part that cannot
+        be read is left out and noted in ``warnings``.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Release the file."""
+
+    def decode(self, message: Message) -> Any:
+        """Return a message as an object with the fields of its type as attributes.
+
+        The type is read from the definition that the recording itself holds.
+
+        Raises
+        ------
+        MessageError : the message, or the definition of its type, cannot be understood.
+        """
+        from shapecat.recordings.decoding import decode  # noqa: PLC0415  # loads rosbags
+
+        return decode(message, self._decoders)
+
+    def warn(self, text: str) -> None:
+        """Add to ``warnings``, once."""
+        if text not in self.warnings:
+            self.warnings.append(text)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()

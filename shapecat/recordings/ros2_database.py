@@ -1,0 +1,111 @@
+"""ROS 2 bags in one SQLite file (.db3)."""
+
+from collections.abc import Collection, Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import apsw
+import zstandard
+from rosbags.interfaces import MessageDefinitionFormat
+from rosbags.rosbag2 import Reader, ReaderError
+
+from shapecat.errors import RecordingError
+from shapecat.recordings.decoding import LIBRARY_ERRORS
+from shapecat.recordings.messages import Channel, Message, Topic, ros_type
+from shapecat.recordings.recording import Recording
+
+__all__ = ["DatabaseRecording"]
+
+_ZSTD = b"\x28\xb5\x2f\xfd"
+"""Begins a compressed message; a CDR message begins with a zero byte."""
+_LARGEST = 1 << 30
+"""Compressed messages that claim to hold more are left out, bytes."""
+_SCHEMAS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
+
+
+class DatabaseRecording(Recording):
+    """A ROS 2 bag in SQLite; messages by the time they were recorded."""
+
+    kind: ClassVar[str] = "ros2"
+
+    def __init__(self, path: Path) -> None:
+        """Open the database and read its topics.
+
+        Raises
+        ------
+        RecordingError : it is not a ROS 2 bag, or is damaged.
+        """
+        super().__init__(path)
+        self._reader = Reader(path)
+        try:
+            self._reader.open()
+        except (ReaderError, apsw.Error, *LIBRARY_ERRORS) as error:
+            msg = f"not a readable ROS 2 bag: {error or type(error).__name__}"
+            raise RecordingError(msg) from error
+        self._channels = {c.id: _channel(c) for c in self._reader.connections}
+        counts: dict[tuple[str, str, str], int] = {}
+        for connection in self._reader.connections:
+            channel = self._channels[connection.id]
+            key = (channel.topic, channel.type, channel.encoding)
+            counts[key] = counts.get(key, 0) + connection.msgcount
+        self.topics = tuple(Topic(*key, counts[key]) for key in sorted(counts))
+        if self._reader.message_count:
+            self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time - 1
+        if any(c.encoding == "cdr" and not c.schema for c in self._channels.values()):
+            self.warn("no message definitions: those of ROS 2 Humble are assumed")
+
+    def close(self) -> None:
+        """Close the database."""
+        self._reader.close()
+
+    def channels(self) -> tuple[Channel, ...]:
+        """Return every topic."""
+        return tuple(self._channels.values())
+
+    def messages(
+        self,
+        topics: Collection[str] | None = None,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> Iterator[Message]:
+        """Yield undecoded messages; see `Recording.messages`."""
+        wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
+        if not wanted:
+            return
+        raw = self._reader.messages(wanted, start_ns, stop_ns)
+        while True:
+            try:
+                connection, time, data = next(raw)
+            except StopIteration:
+                return
+            except (ReaderError, apsw.Error, OSError, *LIBRARY_ERRORS) as error:
+                self.warn(f"damaged: nothing read after this: {error or type(error).__name__}")
+                return
+            channel = self._channels[connection.id]
+            plain = self._plain(channel, bytes(data))
+            if plain is not None:
+                yield Message(channel, time, time, 0, plain)
+
+    def _plain(self, channel: Channel, data: bytes) -> bytes | None:
+        """Decompress a compressed message; None where that fails."""
+        if not data.startswith(_ZSTD):
+            return data
+        try:
+            if zstandard.frame_content_size(data) > _LARGEST:
+                self.warn(f"{channel.topic}: left out a message that claims to hold over 1 GiB")
+                return None
+            return zstandard.ZstdDecompressor().decompress(data, max_output_size=_LARGEST)
+        except (zstandard.ZstdError, MemoryError):
+            self.warn(f"{channel.topic}: left out a damaged compressed message")
+            return None
+
+
+def _channel(connection: Any) -> Channel:
+    return Channel(
+        connection.topic,
+        ros_type(connection.msgtype),
+        connection.ext.serialization_format,
+        connection.msgtype,
+        _SCHEMAS.get(connection.msgdef.format, ""),
+        connection.msgdef.data.encode(),
+    )

@@ -1,0 +1,170 @@
+"""ROS 2 bags in a folder: one or more parts in SQLite or MCAP, maybe compressed."""
+
+import re
+from collections.abc import Callable, Collection, Iterator
+from heapq import merge
+from itertools import pairwise
+from pathlib import Path
+from shutil import disk_usage
+from tempfile import TemporaryDirectory
+from typing import ClassVar
+
+import zstandard
+
+from shapecat.errors import RecordingError
+from shapecat.recordings.mcap_file import McapRecording
+from shapecat.recordings.messages import Channel, Message, Topic
+from shapecat.recordings.recording import Recording
+from shapecat.recordings.ros2_database import DatabaseRecording
+
+__all__ = ["FolderRecording"]
+
+_PARTS: dict[str, Callable[[Path], Recording]] = {
+    ".mcap": McapRecording,
+    ".db3": DatabaseRecording,
+}
+
+
+class FolderRecording(Recording):
+    """A folder as ``ros2 bag record`` makes it, with or without its metadata.yaml.
+
+    The metadata only say which files belong to the bag: topics, times and definitions are taken
+    from the files themselves.
+
+    Attributes
+    ----------
+    parts : the recordings in the folder, by time.
+    """
+
+    kind: ClassVar[str] = "ros2"
+
+    def __init__(self, path: Path) -> None:
+        """Open all parts.
+
+        Raises
+        ------
+        RecordingError : there is no part, or none that can be read.
+        """
+        super().__init__(path)
+        self._scratch: TemporaryDirectory[str] | None = None
+        self.parts: list[Recording] = []
+        try:
+            self._open_parts(self._list_files())
+        except BaseException:
+            self.close()
+            raise
+        # A part without messages says nothing about time.
+        self.parts.sort(key=lambda part: (part.end_ns == 0, part.start_ns, part.path.name))
+        filled = [part for part in self.parts if part.end_ns]
+        if filled:
+            self.start_ns = min(part.start_ns for part in filled)
+            self.end_ns = max(part.end_ns for part in filled)
+        self._overlap = any(a.end_ns > b.start_ns for a, b in pairwise(filled))
+        self.topics = _sum_topics(self.parts)
+        self._note()
+
+    def close(self) -> None:
+        """Close all parts and remove what was decompressed."""
+        for part in self.parts:
+            part.close()
+        if self._scratch is not None:
+            self._scratch.cleanup()
+
+    def channels(self) -> tuple[Channel, ...]:
+        """Return every channel of every part, each once."""
+        return tuple(dict.fromkeys(c for part in self.parts for c in part.channels()))
+
+    def messages(
+        self,
+        topics: Collection[str] | None = None,
+        start_ns: int | None = None,
+        stop_ns: int | None = None,
+    ) -> Iterator[Message]:
+        """Yield undecoded messages of all parts; see `Recording.messages`."""
+        streams = [part.messages(topics, start_ns, stop_ns) for part in self.parts]
+        if self._overlap:
+            yield from merge(*streams, key=lambda message: message.log_time_ns)
+        else:
+            for stream in streams:
+                yield from stream
+        self._note()
+
+    def _list_files(self) -> list[Path]:
+        """Return the files that belong to the bag."""
+        present = [file for file in sorted(self.path.iterdir()) if _suffix(file) in _PARTS]
+        listed = self._listed_names()
+        missing = sorted(listed - {file.name for file in present})
+        if missing:
+            self.warn(f"parts named in metadata.yaml are missing: {', '.join(missing)}")
+        chosen = [file for file in present if file.name in listed] or present
+        if not chosen:
+            msg = "a folder without .mcap or .db3 files"
+            raise RecordingError(msg)
+        if not listed:
+            self.warn("no metadata.yaml that names the parts: all files of the folder are read")
+        return chosen
+
+    def _listed_names(self) -> set[str]:
+        """Return the file names under ``relative_file_paths`` of metadata.yaml.
+
+        The file is always written by rosbag2 in block style, so a YAML parser is not needed.
+        """
+        file = self.path / "metadata.yaml"
+        try:
+            text = file.read_text("utf-8") if file.stat().st_size < 1 << 24 else ""
+        except (OSError, UnicodeDecodeError):
+            return set()
+        block = re.search(r"^ *relative_file_paths: *\n((?: *- .*\n?)+)", text, re.MULTILINE)
+        lines = block[1].splitlines() if block else []
+        return {Path(line.strip()[2:].strip().strip("'\"")).name for line in lines}
+
+    def _open_parts(self, files: list[Path]) -> None:
+        reasons = []
+        for file in files:
+            try:
+                plain = self._decompressed(file) if file.suffix == ".zstd" else file
+                self.parts.append(_PARTS[_suffix(file)](plain))
+            except RecordingError as error:
+                reasons.append(f"{file.name}: {error}")
+        if not self.parts:
+            raise RecordingError("; ".join(reasons))
+        for reason in reasons:
+            self.warn(f"left out {reason}")
+
+    def _decompressed(self, file: Path) -> Path:
+        """Decompress a part into a temporary folder, within the space that there is."""
+        if self._scratch is None:
+            self._scratch = TemporaryDirectory(prefix="shapecat-")
+        plain = Path(self._scratch.name, file.stem)
+        room = disk_usage(self._scratch.name).free // 2
+        reader = zstandard.ZstdDecompressor()
+        try:
+            with file.open("rb") as source, plain.open("wb") as target:
+                for block in reader.read_to_iter(source):
+                    room -= target.write(block)
+                    if room < 0:
+                        msg = "not enough room to decompress it in the temporary folder"
+                        raise RecordingError(msg)
+        except zstandard.ZstdError as error:
+            msg = f"damaged: {error}"
+            raise RecordingError(msg) from error
+        return plain
+
+    def _note(self) -> None:
+        for part in self.parts:
+            for text in part.warnings:
+                self.warn(f"{part.path.name}: {text}")
+
+
+def _suffix(file: Path) -> str:
+    """Return the kind of a part, compressed or not."""
+    return Path(file.stem).suffix if file.suffix == ".zstd" else file.suffix
+
+
+def _sum_topics(parts: list[Recording]) -> tuple[Topic, ...]:
+    counts: dict[tuple[str, str, str], int | None] = {}
+    for topic in (topic for part in parts for topic in part.topics):
+        key = (topic.name, topic.type, topic.encoding)
+        before, more = counts.get(key, 0), topic.count
+        counts[key] = None if before is None or more is None else before + more
+    return tuple(Topic(*key, counts[key]) for key in sorted(counts))

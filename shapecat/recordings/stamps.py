@@ -1,0 +1,54 @@
+"""Time stamps of messages, and clocks that cannot be trusted."""
+
+from typing import Any
+
+from shapecat.recordings.recording import Recording
+
+__all__ = ["Clock", "stamp_ns"]
+
+_EPOCH_NS = 946_684_800 * 10**9
+"""The year 2000: earlier stamps count from when the sensor was switched on."""
+_JUMP_NS = 10 * 10**9
+"""A change of stamp against log time that is called a jump."""
+
+
+def stamp_ns(header: Any) -> int:
+    """Return the stamp of a decoded std_msgs/Header in nanoseconds."""
+    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+
+
+class Clock:
+    """Watches the stamps of one stream."""
+
+    def __init__(self, topic: str) -> None:
+        """Watch a topic."""
+        self.topic = topic
+        self.last: int | None = None
+        self.delay: int | None = None
+        self.counts = dict.fromkeys(_TEXTS, 0)
+
+    def check(self, stamp: int, log_time: int) -> int:
+        """Return the stamp to use: the log time where the message has none."""
+        if stamp == 0:
+            self.counts["zero"] += 1
+            return log_time
+        self.counts["epoch"] += stamp < _EPOCH_NS <= log_time
+        self.counts["back"] += self.last is not None and stamp < self.last
+        delay = log_time - stamp
+        self.counts["jump"] += self.delay is not None and abs(delay - self.delay) > _JUMP_NS
+        self.last, self.delay = stamp, delay
+        return stamp
+
+    def report(self, recording: Recording) -> None:
+        """Add what was odd to the recording's warnings."""
+        for name, count in self.counts.items():
+            if count:
+                recording.warn(f"{self.topic}: {_TEXTS[name].format(count)}")
+
+
+_TEXTS = {
+    "zero": "header.stamp is 0 in {} messages: their log time is used",
+    "epoch": "header.stamp of {} messages does not count from 1970: transforms may not match",
+    "back": "header.stamp goes backwards {} times",
+    "jump": "header.stamp jumps against the log time {} times",
+}

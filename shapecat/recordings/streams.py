@@ -1,0 +1,203 @@
+"""Which topics of a recording can be processed, and which are chosen by default."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import PurePosixPath
+from typing import Any, Literal
+
+from shapecat.errors import NoStreamError
+from shapecat.recordings.depth_image import DEPTH_ENCODINGS
+from shapecat.recordings.messages import MessageError, Topic
+from shapecat.recordings.recording import Recording
+
+__all__ = ["CLOUD", "COMPRESSED", "IMAGE", "INFO", "Stream", "choose_streams", "cloud_streams"]
+
+CLOUD = "sensor_msgs/msg/PointCloud2"
+IMAGE = "sensor_msgs/msg/Image"
+COMPRESSED = "sensor_msgs/msg/CompressedImage"
+INFO = "sensor_msgs/msg/CameraInfo"
+
+_PEEK = 5
+"""Messages looked at to tell what a topic holds: the first may be damaged."""
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A topic that gives frames.
+
+    ``info_topic`` is the camera calibration of a depth image, None if there is none;
+    ``frame_id`` and ``encoding`` (of images) are those of the first message.
+    """
+
+    topic: str
+    type: str
+    kind: Literal["depth", "points"]
+    info_topic: str | None
+    count: int | None
+    frame_id: str
+    encoding: str
+
+    @property
+    def usable(self) -> bool:
+        """Whether it has what frames need."""
+        return self.kind == "points" or self.info_topic is not None
+
+
+def cloud_streams(recording: Recording) -> tuple[Stream, ...]:
+    """Find the clouds and depth images of a recording, by topic.
+
+    A depth image is told from a colour image by the encoding of its first message, and paired
+    with the calibration in its own namespace (``depth/image_raw`` with ``depth/camera_info``), or
+    with the only one there is.
+    """
+    infos = [topic.name for topic in recording.topics if topic.type == INFO and topic.count != 0]
+    streams = []
+    for topic in recording.topics:
+        if topic.count != 0 and topic.type in _PROBES:
+            first = _first(recording, topic)
+            stream = _PROBES[topic.type](topic, first, infos) if first is not None else None
+            if stream is not None:
+                streams.append(stream)
+    return tuple(streams)
+
+
+def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Stream, ...]:
+    """Choose the streams to process: the wanted ones, or those of the only sensor.
+
+    Streams belong to one sensor if they share a namespace (``/camera/depth/points`` and
+    ``/camera/aligned_depth_to_color/image_raw`` do) or a frame. Of one sensor's streams the first
+    is taken of: depth images before clouds, since they hold the same readings in an eighth of the
+    bytes; images as the sensor sees them before those aligned to another camera; more messages
+    before fewer; then by name.
+
+    Raises
+    ------
+    NoStreamError : there is none, a wanted one does not exist, or there are several sensors.
+    """
+    streams = cloud_streams(recording)
+    if wanted:
+        return _wanted(recording, streams, wanted)
+    usable = [stream for stream in streams if stream.usable]
+    if not usable:
+        raise NoStreamError(_why_none(recording, streams))
+    sensors = _by_sensor(usable)
+    if len(sensors) > 1:
+        names = ", ".join(f"{s.topic} ({s.kind})" for s in usable)
+        msg = f"{recording.path}: several sensors: {names}; choose with --topic"
+        raise NoStreamError(msg)
+    return (min(sensors[0], key=_rank),)
+
+
+def _wanted(
+    recording: Recording, streams: tuple[Stream, ...], wanted: Sequence[str]
+) -> tuple[Stream, ...]:
+    by_topic = {stream.topic: stream for stream in streams}
+    chosen = []
+    for name in dict.fromkeys(wanted):
+        stream = by_topic.get(name) or by_topic.get(f"/{name}")
+        if stream is None:
+            known = ", ".join(by_topic) or "none"
+            there = name in {topic.name for topic in recording.topics}
+            state = "holds no clouds or depth images" if there else "does not exist"
+            msg = f"{recording.path}: topic {name} {state}; usable topics: {known}"
+            raise NoStreamError(msg)
+        if not stream.usable:
+            msg = f"{recording.path}: no sensor_msgs/CameraInfo for the depth images on {name}"
+            raise NoStreamError(msg)
+        chosen.append(stream)
+    return tuple(chosen)
+
+
+def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
+    if streams:
+        names = ", ".join(stream.topic for stream in streams)
+        return f"{recording.path}: depth images without a sensor_msgs/CameraInfo: {names}"
+    found = [f"{t.name} ({t.type or t.encoding})" for t in recording.topics]
+    shown = ", ".join(found[:12]) + (", …" if len(found) > 12 else "")
+    return (
+        f"{recording.path}: no point clouds or depth images; "
+        f"topics found: {shown or 'none, the recording is empty'}"
+    )
+
+
+def _by_sensor(streams: list[Stream]) -> list[list[Stream]]:
+    groups: list[list[Stream]] = []
+    for stream in streams:
+        same = [group for group in groups if any(_same_sensor(stream, other) for other in group)]
+        groups = [group for group in groups if group not in same]
+        groups.append([*(other for group in same for other in group), stream])
+    return groups
+
+
+def _same_sensor(a: Stream, b: Stream) -> bool:
+    if a.frame_id and a.frame_id == b.frame_id:
+        return True
+    space = _sensor_namespace(a.topic)
+    return len(space) > 0 and space == _sensor_namespace(b.topic)
+
+
+def _sensor_namespace(topic: str) -> tuple[str, ...]:
+    """Return the parts of a topic before the one that says what is on it."""
+    parts = PurePosixPath(topic.strip("/")).parts[:-1]
+    for k, part in enumerate(parts):
+        if any(word in part for word in ("depth", "points", "cloud", "image", "aligned")):
+            return parts[:k]
+    return parts
+
+
+def _rank(stream: Stream) -> tuple[int, int, int, str]:
+    aligned = any(word in stream.topic for word in ("aligned", "registered"))
+    return (stream.kind != "depth", aligned, -(stream.count or 0), stream.topic)
+
+
+def _first(recording: Recording, topic: Topic) -> Any:
+    """Decode the first message of a topic that can be decoded; None if none can."""
+    same = (m for m in recording.messages([topic.name]) if m.type == topic.type)
+    for message in islice(same, _PEEK):
+        try:
+            return recording.decode(message)
+        except MessageError:
+            continue
+    return None
+
+
+def _probe_cloud(topic: Topic, first: Any, _infos: list[str]) -> Stream:
+    return Stream(topic.name, topic.type, "points", None, topic.count, first.header.frame_id, "")
+
+
+def _probe_image(topic: Topic, first: Any, infos: list[str]) -> Stream | None:
+    name, encoding = topic.name.lower(), str(first.encoding)
+    infrared = "infra" in name or "/ir/" in name
+    # Cameras publish infrared, and grey images of 16 bits, with the same encodings.
+    if (
+        encoding not in DEPTH_ENCODINGS
+        or infrared
+        or (encoding == "mono16" and "depth" not in name)
+    ):
+        return None
+    return _depth_stream(topic, first, infos, encoding)
+
+
+def _probe_compressed(topic: Topic, first: Any, infos: list[str]) -> Stream | None:
+    encoding = str(first.format)
+    return _depth_stream(topic, first, infos, encoding) if "compressedDepth" in encoding else None
+
+
+def _depth_stream(topic: Topic, first: Any, infos: list[str], encoding: str) -> Stream:
+    info = _info_topic(topic.name, infos)
+    frame_id = first.header.frame_id
+    return Stream(topic.name, topic.type, "depth", info, topic.count, frame_id, encoding)
+
+
+def _info_topic(image: str, infos: list[str]) -> str | None:
+    """Return the calibration nearest to an image: the one that shares most of its path."""
+    parts = image.split("/")[:-1]
+    for length in range(len(parts), 1, -1):
+        sibling = "/".join([*parts[:length], "camera_info"])
+        if sibling in infos:
+            return sibling
+    return infos[0] if len(infos) == 1 else None
+
+
+_PROBES = {CLOUD: _probe_cloud, IMAGE: _probe_image, COMPRESSED: _probe_compressed}

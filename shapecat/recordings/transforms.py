@@ -1,0 +1,307 @@
+"""Where frames are relative to each other, over time.
+
+Stamps are integer nanoseconds; floats in seconds resolve no better than 238 ns today.
+"""
+
+from bisect import bisect_right
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F8
+from shapecat.errors import ShapecatError
+from shapecat.geometry import IDENTITY, compose, inverse, rotation_from_quaternion
+from shapecat.recordings.messages import MessageError
+from shapecat.recordings.recording import Recording
+from shapecat.recordings.stamps import stamp_ns
+from shapecat.types import Pose
+
+__all__ = [
+    "DisconnectedError",
+    "ExtrapolationError",
+    "TransformBuffer",
+    "TransformError",
+    "TransformLoopError",
+    "UnknownFrameError",
+    "fixed_frame",
+    "read_transforms",
+]
+
+TF_TYPES = ("tf2_msgs/msg/TFMessage", "tf/msg/tfMessage")
+_DEEPEST = 200
+_FIXED = ("map", "odom", "world")
+
+
+class TransformError(ShapecatError):
+    """A transform that the recording does not give."""
+
+
+class UnknownFrameError(TransformError):
+    """A frame that no transform names."""
+
+
+class DisconnectedError(TransformError):
+    """Two frames that no chain of transforms connects."""
+
+
+class ExtrapolationError(TransformError):
+    """A time before the first or after the last transform of a frame."""
+
+
+class TransformLoopError(TransformError):
+    """Frames that are their own ancestors."""
+
+
+class _Sample(NamedTuple):
+    parent: str
+    translation: tuple[float, float, float]
+    quaternion: tuple[float, float, float, float]
+
+
+class _Track:
+    """The parent of one frame over time."""
+
+    def __init__(self) -> None:
+        self.stamps: list[int] = []
+        self.samples: list[_Sample] = []
+
+    def add(self, stamp: int, sample: _Sample) -> None:
+        """Keep a sample in order of time; of three equal ones in a row the middle is not needed."""
+        at = bisect_right(self.stamps, stamp)
+        if at and self.stamps[at - 1] == stamp:
+            self.samples[at - 1] = sample
+        elif at == len(self.stamps) >= 2 and self.samples[-1] == self.samples[-2] == sample:
+            self.stamps[-1] = stamp
+        else:
+            self.stamps.insert(at, stamp)
+            self.samples.insert(at, sample)
+
+
+class TransformBuffer:
+    """Transforms between frames, static ones valid for all time.
+
+    Parameters
+    ----------
+    tolerance_ns : so far outside of its recorded time a transform is held constant.
+    """
+
+    def __init__(self, *, tolerance_ns: int = 100_000_000) -> None:
+        """Make an empty buffer."""
+        self.tolerance_ns = tolerance_ns
+        self._static: dict[str, _Sample] = {}
+        self._moving: dict[str, _Track] = {}
+        self._frames: set[str] = set()
+
+    @property
+    def frames(self) -> tuple[str, ...]:
+        """Every frame named, sorted."""
+        return tuple(sorted(self._frames))
+
+    def add(
+        self,
+        parent: str,
+        child: str,
+        stamp_ns: int,
+        parent_from_child: tuple[Any, Any],
+        *,
+        static: bool,
+    ) -> bool:
+        """Add a transform; one that is no transform is refused.
+
+        Parameters
+        ----------
+        parent_from_child : translation (x, y, z) in metres and quaternion (x, y, z, w).
+
+        Returns
+        -------
+        Whether it was added: not if a frame has no name or is its own parent, or a number is not
+        finite or the quaternion is zero.
+        """
+        parent, child = parent.strip().lstrip("/"), child.strip().lstrip("/")
+        translation, quaternion = (np.asarray(part, np.float64) for part in parent_from_child)
+        norm = float(np.linalg.norm(quaternion))
+        fine = np.isfinite(translation).all() and np.isfinite(norm) and norm > 1e-6
+        if not (fine and parent and child and parent != child):
+            return False
+        sample = _Sample(parent, tuple(translation.tolist()), tuple((quaternion / norm).tolist()))
+        self._frames |= {parent, child}
+        if static:
+            self._static[child] = sample
+        else:
+            self._moving.setdefault(child, _Track()).add(stamp_ns, sample)
+        return True
+
+    def ancestors(self, frame_id: str) -> tuple[str, ...]:
+        """Return a frame and its ancestors, nearest first; empty if no transform names it.
+
+        Raises
+        ------
+        TransformLoopError
+        """
+        name = frame_id.lstrip("/")
+        return tuple(self._ancestors(name)) if name in self._frames else ()
+
+    def root_of(self, frame_id: str) -> str:
+        """Return the ancestor without a parent.
+
+        Raises
+        ------
+        UnknownFrameError, TransformLoopError
+        """
+        return self._ancestors(self._known(frame_id))[-1]
+
+    def lookup(self, target: str, source: str, stamp_ns: int) -> Pose:
+        """Return ``target_from_source`` at a time.
+
+        Between two samples translations are interpolated linearly, rotations spherically.
+
+        Raises
+        ------
+        UnknownFrameError, DisconnectedError, ExtrapolationError, TransformLoopError
+        """
+        target, source = self._known(target), self._known(source)
+        up, down = self._ancestors(source, stamp_ns), self._ancestors(target, stamp_ns)
+        shared = next((frame for frame in up if frame in set(down)), None)
+        if shared is None:
+            msg = (
+                f"no transform between {target} and {source}: they hang on {down[-1]} and {up[-1]}"
+            )
+            raise DisconnectedError(msg)
+        shared_from_source = self._chain(up[: up.index(shared)], stamp_ns)
+        shared_from_target = self._chain(down[: down.index(shared)], stamp_ns)
+        return compose(inverse(shared_from_target), shared_from_source)
+
+    def _known(self, frame_id: str) -> str:
+        name = frame_id.lstrip("/")
+        if name not in self._frames:
+            some = ", ".join(self.frames[:12]) or "none"
+            msg = f"no transform names the frame {name!r}; known frames: {some}"
+            raise UnknownFrameError(msg)
+        return name
+
+    def _ancestors(self, frame_id: str, stamp_ns: int | None = None) -> list[str]:
+        """Return a frame and its ancestors, at a time or at the last one."""
+        chain = [frame_id]
+        while (parent := self._parent(chain[-1], stamp_ns)) is not None:
+            if parent in chain or len(chain) > _DEEPEST:
+                msg = f"the frames {' < '.join([*chain[-5:], parent])} form a loop"
+                raise TransformLoopError(msg)
+            chain.append(parent)
+        return chain
+
+    def _parent(self, frame_id: str, stamp_ns: int | None) -> str | None:
+        if frame_id in self._static:
+            return self._static[frame_id].parent
+        track = self._moving.get(frame_id)
+        if track is None:
+            return None
+        at = len(track.stamps) if stamp_ns is None else bisect_right(track.stamps, stamp_ns)
+        return track.samples[max(0, at - 1)].parent
+
+    def _chain(self, frames: list[str], stamp_ns: int) -> Pose:
+        """Return the transform from the first frame to the parent of the last."""
+        pose = IDENTITY
+        for frame_id in frames:
+            pose = compose(self._to_parent(frame_id, stamp_ns), pose)
+        return pose
+
+    def _to_parent(self, frame_id: str, stamp_ns: int) -> Pose:
+        if frame_id in self._static:
+            return _pose(self._static[frame_id])
+        track = self._moving[frame_id]
+        stamps, samples = track.stamps, track.samples
+        late = stamp_ns - stamps[-1]
+        early = stamps[0] - stamp_ns
+        if max(late, early) > self.tolerance_ns:
+            side = (
+                f"{late * 1e-9:.3f} s after the last"
+                if late > 0
+                else f"{early * 1e-9:.3f} s before the first"
+            )
+            msg = f"no transform of {frame_id} at {stamp_ns} ns: that is {side} one"
+            raise ExtrapolationError(msg)
+        at = bisect_right(stamps, stamp_ns)
+        if at in {0, len(stamps)}:
+            return _pose(samples[max(0, at - 1)])
+        before, after = samples[at - 1], samples[at]
+        if before.parent != after.parent or before == after:
+            return _pose(before)
+        share = (stamp_ns - stamps[at - 1]) / (stamps[at] - stamps[at - 1])
+        return _between(before, after, share)
+
+
+def _pose(sample: _Sample) -> Pose:
+    return Pose(rotation_from_quaternion(sample.quaternion), np.array(sample.translation))
+
+
+def _between(a: _Sample, b: _Sample, share: float) -> Pose:
+    translation = (1 - share) * np.array(a.translation) + share * np.array(b.translation)
+    rotation = rotation_from_quaternion(
+        _slerp(np.array(a.quaternion), np.array(b.quaternion), share)
+    )
+    return Pose(rotation, translation)
+
+
+def _slerp(a: F8, b: F8, share: float) -> F8:
+    """Interpolate unit quaternions along the shorter arc (Shoemake 1985)."""
+    cosine = float(a @ b)
+    if cosine < 0:
+        b, cosine = -b, -cosine
+    if cosine > 0.9999:  # the arc is straight to 1e-9
+        return a + share * (b - a)
+    angle = np.arccos(cosine)
+    return np.asarray(np.sin((1 - share) * angle) * a + np.sin(share * angle) * b)
+
+
+def fixed_frame(buffer: TransformBuffer, frame_id: str) -> str | None:
+    """Choose a frame that does not move for a sensor frame: map, odom, world, or the root.
+
+    Returns
+    -------
+    None if no transform names ``frame_id``, or it is the root itself.
+    """
+    try:
+        root = buffer.root_of(frame_id)
+        connected = [name for name in buffer.frames if buffer.root_of(name) == root]
+    except TransformError:
+        return None
+    for wanted in _FIXED:
+        for name in connected:
+            if name.rsplit("/", 1)[-1] == wanted:
+                return name
+    return root if root != frame_id.lstrip("/") else None
+
+
+def read_transforms(recording: Recording, *, tolerance_ns: int = 100_000_000) -> TransformBuffer:
+    """Read every transform of a recording in one pass.
+
+    A topic whose name ends in ``tf_static`` holds static transforms.
+    """
+    buffer = TransformBuffer(tolerance_ns=tolerance_ns)
+    topics = {topic.name for topic in recording.topics if topic.type in TF_TYPES}
+    refused = 0
+    for topic, transform in _transforms(recording, topics):
+        move, turn = transform.transform.translation, transform.transform.rotation
+        refused += not buffer.add(
+            transform.header.frame_id,
+            transform.child_frame_id,
+            stamp_ns(transform.header),
+            ((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w)),
+            static=topic.endswith("tf_static"),
+        )
+    if refused:
+        recording.warn(f"{refused} transforms are no transforms (NaN, no name) and were left out")
+    return buffer
+
+
+def _transforms(recording: Recording, topics: set[str]) -> Iterator[tuple[str, Any]]:
+    for message in recording.messages(topics) if topics else ():
+        if message.type in TF_TYPES:
+            try:
+                decoded = recording.decode(message)
+            except MessageError as error:
+                recording.warn(str(error))
+                continue
+            for transform in decoded.transforms:
+                yield message.topic, transform

@@ -1,0 +1,413 @@
+"""Detection on scenes drawn by a small ray caster, each named by the hazard it holds."""
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from shapecat.config import DetectionSettings
+from shapecat.detection import Hierarchy, Node, detect, format_tree
+from shapecat.types import Camera, Frame, Scene
+
+Array = NDArray[np.float64]
+Shape = Callable[[Array, Array], Array]
+
+CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+DEFAULTS = DetectionSettings()
+
+
+def table(x: float = 0.5, y: float = 0.4, z: float = 0.0) -> Shape:
+    """A horizontal rectangle of half sizes x, y at height z."""
+
+    def hit(origin: Array, rays: Array) -> Array:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            t = (z - origin[2]) / rays[..., 2]
+            p = origin + t[..., None] * rays
+            inside = (abs(p[..., 0]) < x) & (abs(p[..., 1]) < y) & (t > 0)
+        return np.where(inside, t, np.inf)
+
+    return hit
+
+
+def box(center: tuple[float, float, float], size: tuple[float, float, float], yaw: float = 0) -> Shape:
+    """A box; ``center`` is the middle of its base."""
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+    half = np.array(size) / 2
+
+    def hit(origin: Array, rays: Array) -> Array:
+        o = turn @ (origin - np.array(center) - [0, 0, half[2]])
+        d = rays @ turn.T
+        with np.errstate(divide="ignore", invalid="ignore"):
+            a, b = (-half - o) / d, (half - o) / d
+        near, far = np.minimum(a, b).max(axis=-1), np.maximum(a, b).min(axis=-1)
+        return np.where((near < far) & (near > 0), near, np.inf)
+
+    return hit
+
+
+def ball(center: tuple[float, float, float], radius: float) -> Shape:
+    """A sphere around ``center``."""
+    return shell(center, radius, None)
+
+
+def shell(center: tuple[float, float, float], radius: float, rim: float | None) -> Shape:
+    """A thin sphere, open above the height ``rim``."""
+
+    def hit(origin: Array, rays: Array) -> Array:
+        o = origin - np.array(center)
+        a, b, c = (rays * rays).sum(-1), 2 * rays @ o, o @ o - radius**2
+        root = b * b - 4 * a * c
+        with np.errstate(invalid="ignore"):
+            first, second = ((-b + s * np.sqrt(root)) / (2 * a) for s in (-1, 1))
+        best = np.full(a.shape, np.inf)
+        for t in (first, second):
+            z = origin[2] + t * rays[..., 2]
+            ok = (root > 0) & (t > 0) & ((rim is None) | (z < (rim or 0)))
+            best = np.where(ok & (t < best), t, best)
+        return best
+
+    return hit
+
+
+def can(x: float, y: float, z: float, radius: float, height: float) -> Shape:
+    """An upright closed cylinder on height ``z``."""
+
+    def hit(origin: Array, rays: Array) -> Array:
+        o = origin - np.array([x, y, z])
+        d = rays
+        a, b = (d[..., :2] ** 2).sum(-1), 2 * d[..., :2] @ o[:2]
+        root = b * b - 4 * a * (o[:2] @ o[:2] - radius**2)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            t = (-b - np.sqrt(root)) / (2 * a)
+            h = o[2] + t * d[..., 2]
+            side = np.where((root > 0) & (t > 0) & (h > 0) & (h < height), t, np.inf)
+            u = (height - o[2]) / d[..., 2]
+            p = o[:2] + u[..., None] * d[..., :2]
+            lid = np.where((u > 0) & ((p**2).sum(-1) < radius**2), u, np.inf)
+        return np.minimum(side, lid)
+
+    return hit
+
+
+def render(
+    shapes: list[Shape],
+    *,
+    tilt_deg: float = 35,
+    distance: float = 0.9,
+    camera: Camera = CAMERA,
+    noise: float = 0.0015,
+    seed: int = 0,
+) -> tuple[Array, NDArray[np.int64]]:
+    """Return depth (h, w) of a camera looking at the world's origin, and which shape is seen."""
+    t = np.radians(tilt_deg)
+    right = np.array([1.0, 0, 0])
+    forward = np.array([0, np.cos(t), -np.sin(t)])
+    down = np.cross(forward, right)
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rays = (
+        ((u - camera.cx) / camera.fx)[..., None] * right
+        + ((v - camera.cy) / camera.fy)[..., None] * down
+        + forward
+    )
+    hits = np.stack([shape(-distance * forward, rays) for shape in shapes])
+    seen, z = hits.argmin(axis=0), hits.min(axis=0)
+    w = 1 / z + np.random.default_rng(seed).normal(0, noise, z.shape)
+    return np.where(np.isfinite(z), 1 / np.maximum(w, 1e-3), 0), np.where(np.isfinite(z), seen, -1)
+
+
+def frame_of(depth: Array, camera: Camera = CAMERA) -> Frame:
+    return Frame("depth", 0, 0, 0, "camera", depth=depth, camera=camera)
+
+
+def found(frame: Frame, up: tuple[float, float, float] | None = None) -> Scene:
+    return detect(frame, up=up, settings=DEFAULTS, rng=np.random.default_rng(0))
+
+
+def overlaps(scene: Scene, seen: NDArray[np.int64], objects: list[int]) -> list[float]:
+    """Return the largest IoU of each true object with any candidate."""
+    best = []
+    for k in objects:
+        truth = np.flatnonzero(seen.ravel() == k)
+        ious = [
+            np.intersect1d(truth, c.indices).size / np.union1d(truth, c.indices).size
+            for c in scene.candidates
+        ]
+        best.append(max(ious, default=0.0))
+    return best
+
+
+def check(shapes: list[Shape], objects: list[int], least: float = 0.85, **view: float) -> Scene:
+    """Every listed shape is one candidate, and there is no other candidate."""
+    depth, seen = render(shapes, **view)  # type: ignore[arg-type]  # floats only
+    scene = found(frame_of(depth))
+    assert len(scene.candidates) == len(objects)
+    assert min(overlaps(scene, seen, objects), default=1.0) > least
+    return scene
+
+
+def test_separate_objects_and_flat_height() -> None:
+    """The plain case: three shapes, one plane, sizes and centres in metres."""
+    scene = check(
+        [table(), box((-0.2, 0, 0), (0.1, 0.06, 0.15)), can(0, 0.05, 0, 0.035, 0.12),
+         ball((0.2, 0, 0.05), 0.05)],
+        [1, 2, 3],
+    )  # fmt: skip
+    assert len(scene.planes) == 1
+    assert scene.planes[0].height_m == 0
+    np.testing.assert_allclose(scene.up, [0, -np.cos(0.611), -np.sin(0.611)], atol=0.02)
+    left = min(scene.candidates, key=lambda c: c.box.center[0])
+    np.testing.assert_allclose(sorted(left.box.size), [0.06, 0.1, 0.15], atol=0.015)
+    assert not any(c.touches_border or c.occluded for c in scene.candidates)
+    assert all(c.plane == 0 and c.on_candidate is None for c in scene.candidates)
+
+
+@pytest.mark.parametrize("tilt_deg", [20, 60])
+def test_camera_tilt(tilt_deg: float) -> None:
+    """Shallow and steep views of the same table."""
+    shapes = [table(), box((-0.15, 0, 0), (0.1, 0.1, 0.1)), can(0.1, 0, 0, 0.04, 0.12)]
+    check(shapes, [1, 2], tilt_deg=tilt_deg)
+
+
+def test_no_reading_at_all() -> None:
+    """An empty image is an empty scene that keeps the hint."""
+    scene = found(frame_of(np.zeros((480, 640))), (0, 0, 2))
+    assert (scene.planes, scene.candidates) == ((), ())
+    np.testing.assert_allclose(scene.up, [0, 0, 1])
+
+
+def test_one_plane_fills_the_view() -> None:
+    """A table alone has no objects on it, at any of several noises."""
+    for seed in range(4):
+        depth, _ = render([table(3, 3)], seed=seed, noise=0.003)
+        scene = found(frame_of(depth))
+        assert len(scene.planes) == 1
+        assert scene.candidates == ()
+
+
+def test_empty_table_over_a_floor() -> None:
+    """The edge of the table and the floor below are no objects."""
+    depth, _ = render([table(0.4, 0.25), table(3, 3, -0.7)], distance=0.8, tilt_deg=45)
+    scene = found(frame_of(depth))
+    assert scene.candidates == ()
+    assert len(scene.planes) == 2
+    assert abs(scene.planes[1].height_m - 0.7) < 0.02
+
+
+def test_touching_boxes_are_two() -> None:
+    """Two boxes side by side at an angle meet in a concave edge."""
+    check([table(), box((-0.06, 0, 0), (0.12, 0.08, 0.12), 0.35),
+           box((0.055, -0.03, 0), (0.1, 0.1, 0.08), -0.3)], [1, 2])  # fmt: skip
+
+
+def test_stacked_box_is_split_and_stands_on_the_lower() -> None:
+    """A box on a box is a second object whose support is the first."""
+    scene = check(
+        [table(), box((0, 0, 0), (0.22, 0.18, 0.08)), box((0, 0.01, 0.08), (0.1, 0.08, 0.1))],
+        [1, 2],
+    )
+    upper = max(range(2), key=lambda k: scene.candidates[k].support_m)
+    candidate = scene.candidates[upper]
+    assert candidate.on_candidate == 1 - upper
+    assert abs(candidate.support_m - 0.08) < 0.01
+    assert Hierarchy(scene).objects_on_objects() == ((1 - upper, upper),)
+
+
+def test_far_wall_of_a_bowl_is_not_split() -> None:
+    """The inside of a bowl behind its rim belongs to the bowl."""
+    check([table(), shell((0, 0, 0.09), 0.09, 0.07)], [1], least=0.8)
+
+
+def test_parts_behind_an_occluder_are_joined() -> None:
+    """A long box behind a thin upright one is seen in two parts."""
+    scene = check(
+        [table(), box((0, 0.08, 0), (0.3, 0.06, 0.12)), box((0, -0.1, 0), (0.06, 0.04, 0.2))],
+        [1, 2],
+    )
+    assert sorted(c.occluded for c in scene.candidates) == [False, True]
+
+
+def test_two_boxes_behind_an_occluder_stay_two() -> None:
+    """Parts that do not continue each other are not joined across an occluder."""
+    check([table(), box((-0.12, 0.08, 0), (0.14, 0.06, 0.12), 0.6),
+           box((0.12, 0.1, 0), (0.14, 0.06, 0.1), -0.6),
+           box((0, -0.1, 0), (0.08, 0.04, 0.2))], [1, 2, 3])  # fmt: skip
+
+
+def test_object_cut_by_the_border_is_flagged() -> None:
+    """An object that leaves the image says so."""
+    shapes = [table(1, 1), box((-0.56, 0, 0), (0.1, 0.1, 0.1)), box((0.1, 0, 0), (0.1, 0.1, 0.1))]
+    scene = check(shapes, [1, 2])
+    left, right = sorted(scene.candidates, key=lambda c: c.box.center[0])
+    assert left.touches_border
+    assert not right.touches_border
+
+
+def test_shelf_boards_have_their_own_objects() -> None:
+    """Objects belong to the board they stand on, and boards are sorted by height."""
+    shapes = [table(0.45, 0.2), table(0.45, 0.12, 0.35), box((-0.1, -0.1, 0), (0.1, 0.1, 0.12)),
+              can(0.1, -0.02, 0.35, 0.04, 0.12)]  # fmt: skip
+    depth, seen = render(shapes, tilt_deg=35, distance=1.2)
+    scene = found(frame_of(depth))
+    np.testing.assert_allclose([p.height_m for p in scene.planes], [0, 0.35], atol=0.015)
+    assert min(overlaps(scene, seen, [2, 3])) > 0.8
+    assert [c.plane for c in sorted(scene.candidates, key=lambda c: c.box.center[0])] == [0, 1]
+
+
+SCENE = [table(), box((-0.06, 0, 0), (0.12, 0.08, 0.12), 0.35), can(0.12, -0.05, 0, 0.04, 0.14),
+         box((-0.2, -0.1, 0), (0.1, 0.08, 0.06)), shell((0.2, 0.12, 0.07), 0.07, 0.06)]  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda d: d[:, ::-1],
+        lambda d: d[::-1, ::-1],
+        lambda d: np.rot90(d),
+        lambda d: np.rot90(d, -1),
+    ],
+    ids=["mirrored", "upside down", "left", "right"],
+)
+def test_result_does_not_depend_on_the_roll(change: Callable[[Array], Array]) -> None:
+    """Mirroring and turning the image turns the answer with it."""
+    depth, seen = render(SCENE)
+    turned, truth = np.ascontiguousarray(change(depth)), np.ascontiguousarray(change(seen))
+    h, w = turned.shape
+    scene = found(frame_of(turned, Camera(w, h, 525, 525, (w - 1) / 2, (h - 1) / 2)))
+    assert len(scene.candidates) == 4
+    assert min(overlaps(scene, truth, [1, 2, 3, 4])) > 0.8
+
+
+def test_half_resolution_finds_the_same() -> None:
+    """Cells follow the size of things, not the size of pixels."""
+    depth, seen = render(SCENE)
+    camera = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
+    scene = found(frame_of(np.ascontiguousarray(depth[::2, ::2]), camera))
+    assert len(scene.candidates) == 4
+    assert min(overlaps(scene, seen[::2, ::2], [1, 2, 3, 4])) > 0.8
+
+
+def test_unorganized_cloud_agrees_with_the_image() -> None:
+    """The same readings as points, in any order and frame, give the same objects (F >= 0.97)."""
+    depth, _ = render(SCENE)
+    frame = frame_of(depth)
+    scene = found(frame)
+    order = np.random.default_rng(1).permutation(depth.size)
+    base_from_camera = np.array([[0, 0, 1.0], [-1, 0, 0], [0, -1, 0]])
+    points = (frame.xyz() @ base_from_camera.T)[order]
+    cloud = found(Frame("cloud", 0, 0, 0, "base", points=points))
+    np.testing.assert_allclose(cloud.up, base_from_camera @ scene.up, atol=0.01)
+    assert len(cloud.candidates) == len(scene.candidates) == 4
+    for candidate in scene.candidates:
+        scores = [
+            2 * np.intersect1d(order[c.indices], candidate.indices).size
+            / (c.indices.size + candidate.indices.size)
+            for c in cloud.candidates
+        ]  # fmt: skip
+        twin = cloud.candidates[int(np.argmax(scores))]
+        assert max(scores) > 0.97
+        np.testing.assert_allclose(
+            twin.box.center, base_from_camera @ candidate.box.center, atol=0.005
+        )
+        np.testing.assert_array_equal(twin.indices, np.sort(twin.indices))
+
+
+def test_hint_excludes_other_planes() -> None:
+    """With the direction of gravity known, a wall is no support."""
+    depth, _ = render([table(2, 2)], tilt_deg=5)
+    assert len(found(frame_of(depth), (0, -1, -0.1)).planes) == 1
+    assert found(frame_of(depth), (0, 0, -1)).planes == ()
+
+
+def test_same_seed_same_scene() -> None:
+    """Nothing depends on anything but the input and the generator."""
+    depth, _ = render(SCENE)
+    a, b = found(frame_of(depth)), found(frame_of(depth))
+    for x, y in zip(a.candidates, b.candidates, strict=True):
+        np.testing.assert_array_equal(x.indices, y.indices)
+        np.testing.assert_array_equal(x.box.orientation, y.box.orientation)
+
+
+def test_plain_rules_are_the_thesis() -> None:
+    """Without the rules beyond the thesis, touching boxes are one object."""
+    depth, _ = render([table(), box((0, 0, 0), (0.22, 0.18, 0.08)),
+                       box((0, 0.01, 0.08), (0.1, 0.08, 0.1))])  # fmt: skip
+    plain = DetectionSettings(rules="")
+    scene = detect(frame_of(depth), settings=plain, rng=np.random.default_rng(0))
+    assert len(scene.candidates) == 1
+
+
+@pytest.mark.parametrize("up", [(0, 0, 0), (np.nan, 0, 1), (0, 1)])
+def test_hint_that_is_no_direction(up: tuple[float, ...]) -> None:
+    """A wrong hint is the caller's mistake."""
+    frame = frame_of(np.zeros((480, 640)))
+    with pytest.raises(ValueError, match="direction"):
+        detect(frame, up=up, settings=DEFAULTS, rng=np.random.default_rng(0))
+
+
+@given(
+    st.integers(1, 40),
+    st.integers(1, 40),
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([0.0, 1e-30, 0.3, 1.0, 1e5, 1e30, np.inf, np.nan]),
+)
+@settings(deadline=None, max_examples=60)
+def test_any_image_gives_a_scene(h: int, w: int, seed: int, odd: float) -> None:
+    """Tiny images, garbage and values that are no depth never crash."""
+    rng = np.random.default_rng(seed)
+    depth = rng.uniform(0.2, 2, (h, w)) if seed % 2 else np.full((h, w), 1.0)
+    depth[rng.random((h, w)) < 0.3] = odd
+    scene = found(frame_of(depth, Camera(w, h, 30, 30, w / 2, h / 2)))
+    assert np.isfinite(scene.up).all()
+
+
+@given(
+    st.integers(0, 3000),
+    st.integers(0, 2**32 - 1),
+    st.sampled_from([0.0, 1e-30, 1.0, 1e5, 1e30, np.inf, np.nan]),
+    st.sampled_from([0.0, 1e-6, 1.0]),
+)
+@settings(deadline=None, max_examples=60)
+def test_any_cloud_gives_a_scene(n: int, seed: int, odd: float, spread: float) -> None:
+    """Empty clouds, points in one place and values that are no position never crash."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (n, 3)) * spread + [0, 0, 1]
+    points[rng.random((n, 3)) < 0.05] = odd
+    scene = found(Frame("cloud", 0, 0, 0, "base", points=points))
+    assert np.isfinite(scene.up).all()
+
+
+def test_hierarchy_answers_the_queries() -> None:
+    """Highest, lowest, nearest, farthest, on objects, and counts (thesis 4.5)."""
+    shapes = [table(), box((-0.2, 0, 0), (0.15, 0.15, 0.08)), box((-0.2, 0, 0.08), (0.07, 0.07, 0.1)),
+              can(0.15, 0.15, 0, 0.04, 0.14), box((0.1, -0.15, 0), (0.1, 0.08, 0.05))]  # fmt: skip
+    depth, seen = render(shapes)
+    scene = found(frame_of(depth))
+    name = {
+        int(np.bincount(seen.ravel()[c.indices]).argmax()): k for k, c in enumerate(scene.candidates)
+    }
+    assert len(scene.candidates) == len(name) == 4
+    hierarchy = Hierarchy(scene)
+    assert hierarchy.highest(0) == name[2]
+    assert hierarchy.lowest(0) == name[4]
+    assert hierarchy.nearest(0) == name[4]
+    assert hierarchy.farthest(0) == name[3]
+    assert hierarchy.objects_on_objects() == ((name[1], name[2]),)
+    assert hierarchy.count(0) == 4
+    assert hierarchy.count(0, direct=True) == 3
+    assert hierarchy.roots == (Node("plane", 0),)
+    assert len(set(hierarchy.nodes)) == 5
+    tree = format_tree(scene).splitlines()
+    assert [line.split(":")[0].count("  ") for line in tree].count(2) == 1
+
+
+def test_hierarchy_of_nothing() -> None:
+    """Queries on a plane without objects have no answer."""
+    depth, _ = render([table()])
+    hierarchy = Hierarchy(found(frame_of(depth)))
+    assert hierarchy.highest(0) is None
+    assert hierarchy.nearest(0) is None
+    assert hierarchy.count(0) == 0

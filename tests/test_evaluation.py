@@ -1,0 +1,197 @@
+"""Evaluation: the metrics against scikit-learn, and the way from a folder to a report."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn import metrics as reference
+
+from shapecat.arrays import F4
+from shapecat.errors import ModelError, RecordingError
+from shapecat.evaluation import evaluate_folder, format_report, metrics, read_dataset
+from shapecat.evaluation.training import (
+    learn_on_folder,
+    order_categories,
+    split_instances,
+    train_on_folder,
+)
+
+
+@settings(deadline=None, max_examples=30)
+@given(st.integers(1, 60), st.integers(2, 6), st.integers(0, 10_000))
+def test_metrics_agree_with_scikit_learn(n: int, categories: int, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth, predicted = rng.integers(0, categories, (2, n))
+    scores = rng.integers(0, 5, n).astype(np.float64)  # many ties
+    table = metrics.confusion(truth, predicted, categories)
+
+    assert metrics.accuracy(truth, predicted) == reference.accuracy_score(truth, predicted)
+    assert np.array_equal(
+        table, reference.confusion_matrix(truth, predicted, labels=range(categories))
+    )
+    expected = reference.recall_score(
+        truth, predicted, labels=np.unique(truth), average="macro", zero_division=0
+    )
+    assert metrics.balanced_accuracy(table) == pytest.approx(expected)
+    if 0 < np.sum(truth == 0) < n:
+        area = metrics.auroc(scores[truth == 0], scores[truth != 0])
+        assert area == pytest.approx(reference.roc_auc_score(truth == 0, scores))
+
+
+def test_calibration_error_of_known_cases() -> None:
+    """Over- and under-confidence count alike, and confidence 1 belongs to the last bin."""
+    sure = np.array([[1.0, 0.0]] * 10)
+    assert metrics.expected_calibration_error(np.zeros(10, int), sure) == 0
+    assert metrics.expected_calibration_error(np.ones(10, int), sure) == 1
+    unsure = np.array([[0.6, 0.4]] * 10)
+    assert metrics.expected_calibration_error(np.zeros(10, int), unsure) == pytest.approx(0.4)
+    half = np.repeat([0, 1], [6, 4])
+    assert metrics.expected_calibration_error(half, unsure) == pytest.approx(0)
+
+
+def test_metrics_of_nothing_are_undefined_not_errors() -> None:
+    nothing = np.zeros(0, np.int64)
+
+    assert np.isnan(metrics.accuracy(nothing, nothing))
+    assert np.isnan(metrics.balanced_accuracy(np.zeros((3, 3), int)))
+    assert np.isnan(metrics.expected_calibration_error(nothing, np.zeros((0, 3))))
+    assert np.isnan(metrics.auroc(np.zeros(0), np.ones(2)))
+
+
+def test_a_category_without_views_does_not_count() -> None:
+    """A mean over categories with 0 of 0 right would be NaN."""
+    table = np.array([[3, 1, 0], [0, 2, 0], [0, 0, 0]])
+
+    assert metrics.balanced_accuracy(table) == pytest.approx((0.75 + 1) / 2)
+
+
+# --- data sets ---------------------------------------------------------------------------------
+
+
+def half_of(shape: str, size: float, rng: np.random.Generator) -> F4:
+    """Return points on the side of a ball or box that is seen from +x, +y and above."""
+    points = rng.normal(size=(12_000, 3))
+    if shape == "ball":
+        points /= np.linalg.norm(points, axis=1, keepdims=True)
+    else:
+        points /= np.abs(points).max(axis=1, keepdims=True)
+        points[:, 2] *= {"box": 1.0, "plate": 0.1, "post": 2.5}[shape]
+    points = points * size + [0, 0, np.abs(points[:, 2]).max() * size]
+    seen = (points - points.mean(axis=0)) @ np.array([1, 1, 1.2]) > 0
+    noisy: F4 = points[seen] + rng.normal(size=(int(seen.sum()), 3)) * 5e-4
+    return noisy.astype(np.float32)
+
+
+def write_dataset(
+    root: Path, shapes: tuple[str, ...], *, instances: int = 5, seed: int = 0
+) -> Path:
+    """Write two views of each instance; `unknown` holds posts."""
+    rng = np.random.default_rng(seed)
+    for name in shapes:
+        for instance in range(instances):
+            folder = root / name / f"{name}_{instance}"
+            folder.mkdir(parents=True)
+            size = rng.uniform(0.03, 0.06)
+            for view in range(2):
+                points = half_of("post" if name == "unknown" else name, size, rng)
+                np.savez(folder / f"{view}.npz", points=points, viewpoint=[0.7, 0.7, 0.8])
+    return root
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("trained")
+    dataset = write_dataset(folder / "data", ("box", "ball", "unknown"))
+    train_on_folder(dataset, folder / "model.npz", seed=1)
+    return folder / "model.npz"
+
+
+def test_a_folder_is_learned_and_judged(trained: Path, tmp_path: Path) -> None:
+    """The loop a user closes with corrected crops, on instances never seen."""
+    dataset = write_dataset(tmp_path / "data", ("box", "ball", "unknown"), instances=3, seed=9)
+    report = evaluate_folder(dataset, trained)
+    values = json.loads(json.dumps(report.as_dict()))
+
+    assert values["n"] == 12
+    assert values["categories"] == ["box", "ball"]
+    assert values["accuracy"] == values["balanced_accuracy"] == 1.0
+    assert values["confusion"] == [[6, 0], [0, 6]]
+    assert values["recall"] == {"box": 1.0, "ball": 1.0}
+    assert values["novelty"]["auroc"] > 0.9
+    assert 0 < values["seconds_per_object"] < 0.1
+    assert 0 <= values["ece"] < 0.5
+    assert len(values["model"]) == 16
+    text = format_report(report)
+    assert "balanced accuracy" in text
+    assert max(map(len, text.splitlines())) <= 100
+
+
+def test_the_same_folder_gives_the_same_model(tmp_path: Path) -> None:
+    dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
+    first = train_on_folder(dataset, tmp_path / "a.npz")
+    second = train_on_folder(dataset, tmp_path / "b.npz")
+
+    assert first["model"] == second["model"]
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+
+
+def test_a_category_is_added(trained: Path, tmp_path: Path) -> None:
+    learn_on_folder(trained, write_dataset(tmp_path / "new", ("plate",)), tmp_path / "m.npz")
+    test = write_dataset(tmp_path / "test", ("box", "ball", "plate"), instances=3, seed=5)
+
+    report = evaluate_folder(test, tmp_path / "m.npz")
+
+    assert report.categories == ("box", "ball", "plate")
+    assert report.accuracy is not None
+    assert report.accuracy > 0.9
+
+
+def test_nothing_new_is_said(trained: Path, tmp_path: Path) -> None:
+    dataset = write_dataset(tmp_path / "data", ("box",), instances=1)
+
+    with pytest.raises(ModelError, match="knows all its categories already"):
+        learn_on_folder(trained, dataset, tmp_path / "m.npz")
+
+
+def test_a_strange_category_is_named(trained: Path, tmp_path: Path) -> None:
+    """Counted as wrong, it would spoil the figures in silence."""
+    dataset = write_dataset(tmp_path / "data", ("plate",), instances=1)
+
+    with pytest.raises(ModelError, match="does not know plate"):
+        evaluate_folder(dataset, trained)
+
+
+def test_one_category_is_no_model(tmp_path: Path) -> None:
+    dataset = write_dataset(tmp_path / "data", ("box", "unknown"), instances=1)
+
+    with pytest.raises(RecordingError, match=r"at least two categories .* found: box"):
+        train_on_folder(dataset, tmp_path / "m.npz")
+
+
+def test_an_empty_folder_shows_the_layout(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match=r"cup/red_mug/000\.pcd"):
+        read_dataset(tmp_path)
+
+
+def test_instances_never_straddle() -> None:
+    """Views of one object in training and test make any model look good."""
+    instances = np.array([f"{k // 3}" for k in range(60)])
+    labels = np.where(np.arange(60) < 45, "cup", "can")
+    labels[-3:] = "rare"
+    held_out = split_instances(labels, instances, np.random.default_rng(0))
+
+    assert not set(instances[held_out]) & set(instances[~held_out])
+    for label, count in (("cup", 9), ("can", 3), ("rare", 0)):
+        assert np.sum(held_out & (labels == label)) == count
+
+
+def test_own_categories_follow_the_usual_ones() -> None:
+    assert order_categories(["spoon", "can", "cup", "unknown", "fork"]) == (
+        "cup",
+        "can",
+        "fork",
+        "spoon",
+    )

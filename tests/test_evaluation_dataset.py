@@ -1,0 +1,196 @@
+"""Point cloud files of data sets: every encoding, and what strangers may send."""
+
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shapecat.arrays import F4
+from shapecat.errors import RecordingError
+from shapecat.evaluation.clouds import read_pcd, read_ply
+from shapecat.evaluation.dataset import find_viewpoint, read_dataset, read_view
+
+POINTS = np.array([[0.25, -1.5, 0.0], [np.nan] * 3, [1e-3, 2.0, 3.5]], np.float32)
+HEADER = (
+    "# .PCD v0.7\nVERSION 0.7\nFIELDS rgb x y z _\nSIZE 4 4 4 4 1\nTYPE U F F F U\n"
+    "COUNT 1 1 1 1 4\nWIDTH 3\nHEIGHT 1\nVIEWPOINT 0.5 -0.25 1.25 1 0 0 0\nPOINTS 3\nDATA "
+)
+
+
+def pcd(encoding: str) -> bytes:
+    """Write POINTS with a colour before and padding behind them."""
+    head = f"{HEADER}{encoding}\n".encode()
+    if encoding == "ascii":
+        return head + b"".join(b"7 %g %g %g 0 0 0 0\n" % tuple(row) for row in POINTS)
+    if encoding == "binary":
+        return head + b"".join(struct.pack("<I3f4x", 7, *row) for row in POINTS)
+    columns = struct.pack("<3I", 7, 7, 7) + POINTS.T.tobytes() + bytes(12)
+    packed = b"".join(
+        bytes([len(part) - 1]) + part for part in (columns[:32], columns[32:48])
+    ) + bytes([0, 0, 7 << 5, 2, 0])  # then a zero, and 11 times the byte before
+    return head + struct.pack("<II", len(packed), len(columns)) + packed
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "binary", "binary_compressed"])
+def test_every_encoding_of_pcd_is_read(tmp_path: Path, encoding: str) -> None:
+    path = tmp_path / "x.pcd"
+    path.write_bytes(pcd(encoding))
+
+    cloud = read_pcd(path)
+
+    np.testing.assert_array_equal(cloud.points.astype(np.float32), POINTS)
+    np.testing.assert_array_equal(cloud.viewpoint, [0.5, -0.25, 1.25])
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary_little_endian", "binary_big_endian"])
+def test_every_encoding_of_ply_is_read(tmp_path: Path, kind: str) -> None:
+    """Faces may follow the vertices."""
+    head = (
+        f"ply\nformat {kind} 1.0\ncomment VIEWPOINT 0.5 -0.25 1.25\nelement vertex 3\n"
+        "property uchar red\nproperty float x\nproperty float y\nproperty double z\n"
+        "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+    ).encode()
+    order = ">" if "big" in kind else "<"
+    body = b"".join(
+        b"9 %g %g %g\n" % tuple(row) if kind == "ascii" else struct.pack(f"{order}Bffd", 9, *row)
+        for row in POINTS
+    )
+    path = tmp_path / "x.ply"
+    path.write_bytes(head + body + b"3 0 1 2\n")
+
+    cloud = read_ply(path)
+
+    np.testing.assert_array_equal(cloud.points.astype(np.float32), POINTS)
+    np.testing.assert_array_equal(cloud.viewpoint, [0.5, -0.25, 1.25])
+
+
+def test_open3d_agrees(tmp_path: Path) -> None:
+    """Files as others write them: the library of the field is the judge."""
+    open3d = pytest.importorskip("open3d", exc_type=ImportError)
+    points = np.random.default_rng(0).normal(size=(500, 3)).astype(np.float32)
+    points[100:300] = points[0]  # something to compress
+    cloud = open3d.t.geometry.PointCloud(points)
+    for name, options in {
+        "ascii.pcd": {"write_ascii": True},
+        "binary.pcd": {},
+        "packed.pcd": {"compressed": True},
+        "ascii.ply": {"write_ascii": True},
+        "binary.ply": {},
+    }.items():
+        path = tmp_path / name
+        open3d.t.io.write_point_cloud(str(path), cloud, **options)
+        read = read_pcd(path) if name.endswith("pcd") else read_ply(path)
+        np.testing.assert_allclose(read.points, points, atol=1e-6, err_msg=name)
+
+
+@settings(deadline=None, max_examples=60)
+@given(st.data())
+def test_damaged_clouds_are_errors_or_clouds(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    """Neither a crash nor an allocation that the file cannot fill."""
+    encoding = data.draw(st.sampled_from(["ascii", "binary", "binary_compressed"]))
+    content = bytearray(pcd(encoding))
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path = tmp_path_factory.mktemp("damaged") / "x.pcd"
+    path.write_bytes(content[: data.draw(st.integers(0, len(content)))])
+    try:
+        assert len(read_pcd(path).points) <= len(content)
+    except RecordingError as error:
+        assert str(path) in str(error)  # noqa: PT017  either outcome is right
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (b"POINTS 3", b"POINTS 4000000000"),
+        (b"POINTS 3", b"POINTS -1"),
+        (b"COUNT 1 1 1 1 4", b"COUNT 1 1 1 1 99999999999"),
+        (b"FIELDS rgb x y z _", b"FIELDS rgb x y w _"),
+        (b"DATA binary", b"DATA zipped"),
+        (b"SIZE 4 4", b"SIZE 3 4"),
+    ],
+)
+def test_impossible_headers_are_refused(tmp_path: Path, old: bytes, new: bytes) -> None:
+    path = tmp_path / "x.pcd"
+    for encoding in ("binary", "binary_compressed"):
+        path.write_bytes(pcd(encoding).replace(old, new))
+        with pytest.raises(RecordingError, match="not a complete PCD"):
+            read_pcd(path)
+
+
+def save(root: Path, points: F4, **more: F4) -> Path:
+    path = root / "cup" / "mug" / "0.npz"
+    path.parent.mkdir(parents=True)
+    np.savez(path, allow_pickle=False, points=points, **more)
+    return path
+
+
+def test_a_view_keeps_its_sensor_and_loses_nan(tmp_path: Path) -> None:
+    view = read_view(save(tmp_path, POINTS, viewpoint=np.array([0.1, 0.2, 0.9])))
+
+    assert view.points.shape == (2, 3)
+    assert view.eye.tolist() == [0.1, 0.2, 0.9]
+    assert (view.category, view.instance) == ("cup", "mug")
+
+
+def test_views_come_in_the_order_of_their_paths(tmp_path: Path) -> None:
+    """Models made from the same folder must not depend on the file system."""
+    for name in ("b/2/1.pcd", "a/9/3.PCD", "a/10/0.pcd"):
+        (tmp_path / name).parent.mkdir(parents=True)
+        (tmp_path / name).write_bytes(pcd("binary"))
+    (tmp_path / "a" / "9" / "notes.txt").write_text("x")
+    dataset = read_dataset(tmp_path)
+
+    assert [view.instance for view in dataset] == ["10", "9", "2"]
+    assert len(dataset) == 3
+    assert dataset.categories == ("a", "b")
+
+
+@pytest.mark.parametrize(
+    ("points", "reason"),
+    [
+        (np.full((5, 3), np.nan), "no points"),
+        (np.zeros((0, 3)), "no points"),
+        (np.full((5, 3), 500.0), "must be in metres"),
+        (np.zeros((5, 2)), "shape"),
+        (np.zeros(5), "shape"),
+    ],
+)
+def test_views_that_are_none_are_named(tmp_path: Path, points: F4, reason: str) -> None:
+    path = save(tmp_path, points)
+
+    with pytest.raises(RecordingError, match=reason) as caught:
+        read_view(path)
+    assert str(path) in str(caught.value)
+
+
+def test_pickled_points_are_not_loaded(tmp_path: Path) -> None:
+    path = tmp_path / "cup" / "mug" / "0.npz"
+    path.parent.mkdir(parents=True)
+    np.savez(path, points=np.array([{}], object))
+
+    with pytest.raises(RecordingError, match=r"not an \.npz file"):
+        read_view(path)
+
+
+@pytest.mark.parametrize("azimuth_deg", [0, 45, 130, 250])
+def test_a_lost_sensor_is_found_again(azimuth_deg: float) -> None:
+    """A cloud without VIEWPOINT would otherwise be described inside out."""
+    azimuth = np.radians(azimuth_deg)
+    eye = np.array([0.8 * np.cos(azimuth), 0.8 * np.sin(azimuth), 0.6])
+    rng = np.random.default_rng(0)
+    angle, height = rng.uniform(0, 2 * np.pi, 4000), rng.uniform(0, 0.1, 4000)
+    side = np.stack([0.04 * np.cos(angle), 0.04 * np.sin(angle), height], axis=1)
+    radius = 0.04 * np.sqrt(rng.uniform(size=2000))
+    top = np.stack([radius * np.cos(angle[:2000]), radius * np.sin(angle[:2000])], axis=1)
+    points = np.concatenate([side[side[:, :2] @ eye[:2] > 0], np.insert(top, 2, 0.1, axis=1)])
+
+    found = find_viewpoint(points.astype(np.float32)) - points.mean(axis=0)
+
+    direction = (eye - points.mean(axis=0)) / np.linalg.norm(eye - points.mean(axis=0))
+    assert found @ direction > np.cos(np.radians(40))

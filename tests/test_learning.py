@@ -1,0 +1,297 @@
+"""Learning: the fitted chain, its prediction without scikit-learn, novelty, new categories."""
+
+import time
+from dataclasses import replace
+from typing import Literal
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sklearn.ensemble import RandomForestClassifier
+from sklearn.utils.estimator_checks import check_estimator
+
+from shapecat.arrays import F4
+from shapecat.learning import Categorizer
+from shapecat.learning.baselines import make_baselines
+from shapecat.learning.calibration import fit_temperature, softmax
+from shapecat.learning.dictionary import ForestDictionary, WordLearner
+from shapecat.learning.features import FeatureBank
+from shapecat.learning.forest import FlatForest, flatten
+from shapecat.learning.incremental import add_categories
+from shapecat.learning.novelty import LeafProximity
+from shapecat.learning.pnn import ProbabilisticNeuralNetwork
+from shapecat.learning.training import (
+    UNKNOWN,
+    Examples,
+    LearningSettings,
+    choose_evenly,
+    encode,
+    fit_categorizer,
+    make_chain,
+)
+
+NAMES = tuple(f"x{k}" for k in range(8))
+BLOCKS = {"first": slice(0, 3), "second": slice(3, 8)}
+SPANS = {"first": (0, 3), "second": (3, 8)}
+CATEGORIES = ("cup", "can", "ball")
+SMALL = LearningSettings(kernels=20, trees=20, known_views=200)
+
+
+def blobs(per_category: int, seed: int, categories: tuple[str, ...] = CATEGORIES) -> Examples:
+    """Return views of 8 numbers around the centre of each category; unknown ones lie far out."""
+    rng = np.random.default_rng(seed)
+    centres = {"cup": 0.0, "can": 2.0, "ball": 4.0, "cone": 6.0, UNKNOWN: -4.0}
+    labels = np.repeat(categories, per_category)
+    offsets = np.array([centres[label] for label in labels])[:, None]
+    signs = np.array([1, -1, 1, 1, -1, 1, -1, 1])
+    x = (offsets * signs + rng.normal(size=(labels.size, 8))).astype(np.float32)
+    return Examples(x, labels, np.arange(labels.size) // 2)
+
+
+def fit(settings: LearningSettings = SMALL, seed: int = 0) -> Categorizer:
+    return fit_categorizer(
+        blobs(60, 1, (*CATEGORIES, UNKNOWN)),
+        blobs(40, 2),
+        descriptor_names=NAMES,
+        blocks=BLOCKS,
+        categories=CATEGORIES,
+        settings=settings,
+        seed=seed,
+    )
+
+
+@pytest.fixture(scope="module")
+def categorizer() -> Categorizer:
+    return fit()
+
+
+@pytest.mark.parametrize(
+    "estimator",
+    [
+        ProbabilisticNeuralNetwork(kernels=50, random_state=0),
+        ForestDictionary(trees=5, random_state=0),
+        WordLearner(C=1.0),
+        WordLearner(strategy="one_vs_rest", C=1.0),
+    ],
+    ids=lambda e: f"{type(e).__name__}-{getattr(e, 'strategy', '')}",
+)
+def test_estimators_keep_the_contract_of_scikit_learn(estimator: object) -> None:
+    """A pipeline, a grid search or a clone would misuse an estimator that breaks it."""
+    check_estimator(estimator, on_skip=None)
+
+
+def test_flat_forest_falls_into_the_leaves_of_scikit_learn() -> None:
+    """Values exactly at a threshold, or between it and its rounding, must not change sides."""
+    data = blobs(50, 3)
+    forest = RandomForestClassifier(10, random_state=0).fit(data.descriptors, data.labels)
+    flat = flatten([tree.tree_ for tree in forest.estimators_])
+    at_thresholds = np.repeat(flat.threshold[flat.left > 0][:500, None], 8, axis=1)
+    x = np.concatenate([data.descriptors, at_thresholds, np.nextafter(at_thresholds, np.inf)])
+
+    words = flat.fall(x)
+
+    for tree, leaves in zip(words.T, forest.apply(x).T, strict=True):
+        assert len(set(zip(tree, leaves, strict=True))) == len(set(leaves)) == len(set(tree))
+
+
+@pytest.mark.parametrize("strategy", ["multinomial", "one_vs_rest"])
+@pytest.mark.parametrize("kernels", [0, 20])
+def test_prediction_agrees_with_scikit_learn(
+    strategy: Literal["multinomial", "one_vs_rest"], kernels: int
+) -> None:
+    """The compiled walk is a second implementation: it may not say anything else."""
+    chosen = replace(SMALL, strategy=strategy, kernels=kernels)
+    train, test = blobs(60, 1, (*CATEGORIES, UNKNOWN)), blobs(50, 9)
+    chain = make_chain(BLOCKS, chosen, seed=0).fit(
+        train.descriptors, encode(train.labels, CATEGORIES)
+    )
+    model = fit(chosen)
+    chain["learner"].temperature_ = model.temperature
+
+    posteriors = model.predict(test.descriptors).posteriors
+
+    np.testing.assert_allclose(posteriors, chain.predict_proba(test.descriptors), atol=1e-6)
+    assert np.mean(np.argmax(posteriors, axis=1) == encode(test.labels, CATEGORIES)) > 0.9
+
+
+def test_same_seed_same_model_bit_for_bit() -> None:
+    """A model that cannot be made again cannot be trusted; threads may not change it."""
+    assert fit(seed=0).model_id == fit(replace(SMALL, jobs=2), seed=0).model_id
+    assert fit(seed=0).model_id != fit(seed=1).model_id
+
+
+def test_prediction_of_one_object_is_fast(categorizer: Categorizer) -> None:
+    x = blobs(1, 4).descriptors[:1]
+    categorizer.predict(x)
+    seconds = []
+    for _ in range(200):
+        begun = time.perf_counter()
+        categorizer.predict(x)
+        seconds.append(time.perf_counter() - begun)
+
+    assert min(seconds) < 3e-4
+
+
+@pytest.mark.parametrize("x", [np.zeros((2, 7)), np.full((1, 8), np.nan), np.zeros(8)])
+def test_impossible_descriptors_are_refused(categorizer: Categorizer, x: F4) -> None:
+    with pytest.raises(ValueError, match="descriptors"):
+        categorizer.predict(x)
+
+
+def test_no_object_gives_no_prediction(categorizer: Categorizer) -> None:
+    prediction = categorizer.predict(np.zeros((0, 8), np.float32))
+
+    assert prediction.posteriors.shape == (0, 3)
+    assert prediction.novelty.shape == (0,)
+
+
+def test_strange_shapes_are_more_novel_than_known_ones(categorizer: Categorizer) -> None:
+    known = categorizer.predict(blobs(100, 6).descriptors).novelty
+    strange = categorizer.predict(blobs(100, 6, (UNKNOWN,)).descriptors).novelty
+
+    assert np.mean(known > 1) < 0.15  # 5 % on the held-out views by construction
+    assert np.mean(strange > 1) > 0.8
+
+
+def test_proximity_counts_shared_leaves() -> None:
+    """Against the definition, written out."""
+    rng = np.random.default_rng(0)
+    trees, leaves = 7, 5
+    words = rng.integers(0, leaves, (40, trees)) + np.arange(trees) * leaves
+    views = rng.integers(0, leaves, (9, trees)) + np.arange(trees) * leaves
+    index = LeafProximity.of(words, vocabulary=trees * leaves, neighbours=3)
+
+    shared = (views[:, None] == words).mean(axis=2)
+    expected = 1 - np.sort(shared, axis=1)[:, -3:].mean(axis=1)
+
+    np.testing.assert_allclose(index.novelty(views), expected, rtol=1e-6)
+    assert np.array_equal(index.words_of_views(trees), words)
+
+
+def test_densities_match_their_formula() -> None:
+    """Distances, blocks and categories are easily mixed up in flat arrays."""
+    rng = np.random.default_rng(1)
+    x, y = rng.normal(size=(30, 5)).astype(np.float32), np.arange(30) % 2
+    network = ProbabilisticNeuralNetwork({"a": (0, 2), "b": (2, 5)}, kernels=15, random_state=0)
+    bank: FeatureBank = network.fit(x, y).bank_
+    new = rng.normal(size=(4, 5)).astype(np.float32)
+    features = bank.features(new)
+    z, kernels = bank.standardise(new).astype(float), bank.kernels.astype(float)
+    for c in range(2):
+        mine = kernels[bank.starts[c] : bank.starts[c + 1]]
+        for b, (first, last) in enumerate(bank.spans):
+            squared = ((z[:, None, first:last] - mine[:, first:last]) ** 2).sum(axis=2)
+            density = np.exp(-squared / (2 * float(bank.bandwidth[b]) ** 2)).mean(axis=1)
+            expected = (np.log(density) - bank.level[b]) / bank.spread[b]
+            np.testing.assert_allclose(
+                features[:, 5 + c * 2 + b], np.clip(expected, -8, 8), atol=2e-3
+            )
+
+
+def test_a_training_view_does_not_testify_for_itself() -> None:
+    """Otherwise densities are far higher in training than they will ever be."""
+    data = blobs(60, 1)
+    network = ProbabilisticNeuralNetwork(SPANS, kernels=60, random_state=0)
+    own = network.fit(data.descriptors, data.labels).transform(data.descriptors)[:, 8:]
+    new = network.transform(blobs(60, 2).descriptors)[:, 8:]
+
+    assert abs(own.max(axis=1).mean() - new.max(axis=1).mean()) < 0.3
+
+
+def test_constant_components_do_no_harm() -> None:
+    """A bin of a histogram that is always empty has no deviation to divide by."""
+    data = blobs(30, 1)
+    x = data.descriptors.copy()
+    x[:, 2] = 7.0
+    features = ProbabilisticNeuralNetwork(SPANS, random_state=0).fit(x, data.labels).transform(x)
+
+    assert np.all(np.isfinite(features))
+    assert np.all(features[:, 2] == 0)
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.floats(0.2, 5.0), st.integers(0, 1000))
+def test_temperature_is_found_again(temperature: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    logits = rng.normal(size=(4000, 5)) * 2
+    labels = np.array([rng.choice(5, p=p) for p in softmax(logits)])
+
+    assert fit_temperature(logits * temperature, labels) == pytest.approx(temperature, rel=0.12)
+
+
+def test_unused_blocks_have_no_influence() -> None:
+    model = fit(replace(SMALL, blocks=("second",)))
+    x = blobs(20, 5).descriptors
+    other = x.copy()
+    other[:, :3] += 100
+
+    assert np.array_equal(model.predict(x).posteriors, model.predict(other).posteriors)
+
+
+def test_baselines_learn() -> None:
+    train, test = blobs(60, 1), blobs(40, 2)
+    for name, make in make_baselines(BLOCKS, seed=0).items():
+        score = make().fit(train.descriptors, train.labels).score(test.descriptors, test.labels)
+        assert score > 0.9, name
+
+
+def test_known_views_are_chosen_evenly() -> None:
+    """A category with many views must not push the others out of the model."""
+    codes = np.repeat([0, 1, -1], [1000, 10, 500])
+
+    chosen = choose_evenly(codes, 40, np.random.default_rng(0))
+
+    assert np.bincount(codes[chosen]).tolist() == [30, 10]
+
+
+def test_a_category_without_views_is_named() -> None:
+    with pytest.raises(ValueError, match="no training views of ball"):
+        fit_categorizer(
+            blobs(20, 1, ("cup", "can")),
+            blobs(5, 2),
+            descriptor_names=NAMES,
+            blocks=BLOCKS,
+            categories=CATEGORIES,
+            settings=SMALL,
+        )
+
+
+def test_a_new_category_is_learned_on_the_fixed_dictionary(categorizer: Categorizer) -> None:
+    """The old learners stay, bit for bit, and the old categories stay recognised."""
+    new = blobs(30, 7, ("cone",))
+    extended = add_categories(
+        categorizer, new.descriptors, new.labels.tolist(), rng=np.random.default_rng(0)
+    )
+    test = blobs(100, 8, (*CATEGORIES, "cone"))
+    prediction = extended.predict(test.descriptors)
+    right = prediction.posteriors.argmax(axis=1) == encode(test.labels, extended.categories)
+
+    assert extended.categories == (*CATEGORIES, "cone")
+    assert np.array_equal(extended.votes[:, :3], categorizer.votes)
+    assert np.array_equal(extended.forest.threshold, categorizer.forest.threshold)
+    assert right[test.labels == "cone"].mean() > 0.9
+    assert right[test.labels != "cone"].mean() > 0.9
+    assert np.mean(prediction.novelty[test.labels == "cone"] > 1) < 0.2
+
+
+def test_adding_twice_is_possible(categorizer: Categorizer) -> None:
+    """The model must keep what the next addition needs."""
+    rng = np.random.default_rng(0)
+    cone = blobs(20, 7, ("cone",))
+    once = add_categories(categorizer, cone.descriptors, ["cone"] * 20, rng=rng)
+    far = cone.descriptors + 5
+    twice = add_categories(once, far, ["spoon"] * 20, rng=rng)
+
+    assert twice.categories[-2:] == ("cone", "spoon")
+    assert np.mean(twice.predict(far).posteriors.argmax(axis=1) == 4) > 0.9
+    with pytest.raises(ValueError, match="no new category"):
+        add_categories(twice, far, ["spoon"] * 20, rng=rng)
+
+
+@pytest.mark.parametrize("left", [[1, 1, 0], [1, 0], [2, 0, 0]])
+def test_trees_that_would_not_end_are_refused(left: list[int]) -> None:
+    nothing = np.zeros(len(left))
+
+    with pytest.raises(ValueError, match="damaged"):
+        FlatForest(np.array([0]), nothing, nothing, np.array(left))

@@ -1,0 +1,249 @@
+"""Model files are data from strangers: they may neither run code, crash, hang nor fill memory."""
+
+import io
+import json
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shapecat.errors import ModelError
+from shapecat.learning import Categorizer, load_model, save_model
+from shapecat.learning.categorizer import parts_of
+from shapecat.learning.features import FeatureBank
+from shapecat.learning.forest import FlatForest
+from shapecat.learning.novelty import LeafProximity
+
+
+def tiny() -> Categorizer:
+    """Return a model of two trees over three components, written by hand."""
+    forest = FlatForest(
+        np.array([0, 3]),
+        np.array([1, 0, 0, 2, 0, 0]),
+        np.array([0.5, 0, 0, -1, 0, 0]),
+        np.array([1, 0, 0, 4, 0, 0]),
+    )
+    words = forest.fall(np.array([[0, 0, 0, 0, 0], [0, 1, 0, 0, 0]], np.float32))
+    bank = FeatureBank(
+        columns=np.arange(3),
+        mean=np.zeros(3),
+        inverse_scale=np.ones(3),
+        spans=np.array([[0, 3]]),
+        bandwidth=np.array([1.0]),
+        level=np.array([0.0]),
+        spread=np.array([1.0]),
+        starts=np.array([0, 1, 2]),
+        kernels=np.array([[0, 0, 0], [0, 1, 0]]),
+    )
+    return Categorizer(
+        categories=("cup", "can"),
+        descriptor_names=("a", "b", "c"),
+        bank=bank,
+        forest=forest,
+        votes=np.array([[1, 0], [0, 1], [0.5, 0], [0, 0.5]]),
+        linear=np.zeros((2, 5)),
+        bias=np.array([0.0, 0.1]),
+        temperature=0.7,
+        known=LeafProximity.of(words, vocabulary=4, neighbours=1, threshold=0.5),
+        known_descriptors=np.array([[0, 0, 0], [0, 1, 0]]),
+        known_category=np.array([0, 1]),
+        notes={"seed": 3},
+    )
+
+
+@pytest.fixture
+def saved(tmp_path: Path) -> Path:
+    path = tmp_path / "model.npz"
+    save_model(path, tiny())
+    return path
+
+
+def rewrite(path: Path, change: Callable[[dict[str, bytes]], object]) -> None:
+    """Change the members of a model file."""
+    with zipfile.ZipFile(path) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    change(members)
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in members.items():
+            archive.writestr(name, content)
+
+
+def npy(value: object, dtype: str) -> bytes:
+    stream = io.BytesIO()
+    np.lib.format.write_array(stream, np.asarray(value, dtype))
+    return stream.getvalue()
+
+
+def test_a_saved_model_comes_back_whole(saved: Path) -> None:
+    before, after = tiny(), load_model(saved)
+
+    for name, value in parts_of(before).items():
+        assert np.array_equal(parts_of(after)[name], value), name
+    assert after.model_id == before.model_id
+    x = np.array([[0.1, 0.7, -2.0]], np.float32)
+    assert np.array_equal(after.predict(x).posteriors, before.predict(x).posteriors)
+
+
+def test_the_same_model_gives_the_same_bytes(saved: Path, tmp_path: Path) -> None:
+    """Otherwise `make model` changes the repository each time."""
+    again = tmp_path / "again.npz"
+    save_model(again, load_model(saved))
+
+    assert again.read_bytes() == saved.read_bytes()
+
+
+def test_the_id_follows_the_content(saved: Path) -> None:
+    def warmer(members: dict[str, bytes]) -> None:
+        header = json.loads(members["header.json"])
+        header["temperature"] = 0.8
+        members["header.json"] = json.dumps(header).encode()
+
+    rewrite(saved, warmer)
+
+    assert load_model(saved).model_id != tiny().model_id
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (b"", "not an intact"),
+        (b"not a model at all" * 100, "not an intact"),
+        (b"PK\x03\x04" + bytes(60), "not an intact"),
+    ],
+)
+def test_other_files_are_named_as_such(tmp_path: Path, content: bytes, reason: str) -> None:
+    path = tmp_path / "x.npz"
+    path.write_bytes(content)
+
+    with pytest.raises(ModelError, match=reason) as caught:
+        load_model(path)
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ModelError, match="cannot read the model: No such file"):
+        load_model(tmp_path / "absent.npz")
+
+
+def test_another_npz_is_not_a_model(tmp_path: Path) -> None:
+    np.savez(tmp_path / "x.npz", points=np.zeros(3))
+
+    with pytest.raises(ModelError, match=r"no header\.json"):
+        load_model(tmp_path / "x.npz")
+
+
+def edit_header(**changes: object) -> Callable[[dict[str, bytes]], None]:
+    def change(members: dict[str, bytes]) -> None:
+        header = json.loads(members["header.json"]) | changes
+        members["header.json"] = json.dumps(header).encode()
+
+    return change
+
+
+def put(name: str, value: object, dtype: str) -> Callable[[dict[str, bytes]], None]:
+    return lambda members: members.update({f"{name}.npy": npy(value, dtype)})
+
+
+_HOSTILE = {
+    "newer": (edit_header(version=2), "version 2"),
+    "other format": (edit_header(format="x"), "does not say"),
+    "header is a list": (lambda m: m.update({"header.json": b"[]"}), "does not say"),
+    "header is deep": (lambda m: m.update({"header.json": b"[" * 10**6}), "not a usable"),
+    "header is no text": (lambda m: m.update({"header.json": b"\xff\xfe{}"}), "not a usable"),
+    "a huge number": (edit_header(temperature=10**400), "not a usable"),
+    "not a number": (edit_header(temperature=float("nan")), "numbers"),
+    "temperature near 0": (edit_header(temperature=1e-300), "numbers"),
+    "a category twice": (edit_header(categories=["cup", "cup"]), "category names"),
+    "a category missing": (edit_header(categories=["cup"]), "categories"),
+    "a name is no text": (edit_header(categories=["cup", 3]), "wrong kind"),
+    "an array missing": (lambda m: m.pop("votes.npy"), "no votes"),
+    "of another type": (put("votes", np.zeros((4, 2)), "f8"), "wrong kind"),
+    "of objects": (put("votes", np.zeros((4, 2)), "c8"), "size its header says"),
+    "a loop": (put("forest.left", [1, 0, 0, 3, 0, 0], "u4"), "damaged"),
+    "a child behind the end": (put("forest.left", [1, 0, 0, 4, 0, 5], "u4"), "damaged"),
+    "a root behind the end": (put("forest.roots", [0, 99], "u4"), "damaged"),
+    "no trees": (put("forest.roots", [], "u4"), "damaged"),
+    "a feature too many": (put("forest.feature", [9, 0, 0, 2, 0, 0], "u2"), "features"),
+    "a component too many": (put("bank.columns", [0, 1, 9], "u2"), "descriptor"),
+    "a block behind the end": (put("bank.spans", [[0, 4]], "u2"), "do not fit"),
+    "kernels behind the end": (put("bank.starts", [0, 1, 9], "i4"), "do not fit"),
+    "kernels backwards": (put("bank.starts", [0, 3, 2], "i4"), "do not fit"),
+    "no bandwidth": (put("bank.bandwidth", [0.0], "f4"), "do not fit"),
+    "an unknown view": (put("known.members", [0, 1, 0, 9], "u2"), "index of known"),
+    "words backwards": (put("known.starts", [0, 3, 2, 4, 4], "u4"), "index of known"),
+    "infinite votes": (put("votes", np.full((4, 2), np.inf), "f2"), "numbers"),
+    "an unknown category": (put("known_category", [0, 7], "u1"), "known views"),
+}
+
+
+@pytest.mark.parametrize("case", _HOSTILE)
+def test_hostile_models_are_refused(saved: Path, case: str) -> None:
+    """An index that is not checked here is a crash or an endless loop in the compiled walk."""
+    change, reason = _HOSTILE[case]
+    rewrite(saved, change)
+
+    with pytest.raises(ModelError, match=reason) as caught:
+        load_model(saved)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_claimed_size_is_not_believed(saved: Path) -> None:
+    """A header of 100 bytes may not make the reader allocate a terabyte."""
+    real = npy(np.zeros((4, 2)), "f2")
+    rewrite(
+        saved,
+        lambda m: m.update({"votes.npy": real.replace(b"(4, 2), }    ", b"(400000000, 2), }")}),
+    )
+
+    with pytest.raises(ModelError):
+        load_model(saved)
+
+
+def test_a_bomb_is_not_unpacked(saved: Path) -> None:
+    content = bytes(200 << 20)
+    with zipfile.ZipFile(saved, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("votes.npy", content)
+
+    with pytest.raises(ModelError, match="unpacks to more than"):
+        load_model(saved)
+
+
+def test_damage_anywhere_is_an_error_or_harmless(saved: Path) -> None:
+    """Flip bytes all over the file: a model error, or a model that still predicts."""
+    content = saved.read_bytes()
+    rng = np.random.default_rng(0)
+    x = np.zeros((1, 3), np.float32)
+    for position in rng.integers(0, len(content), 300):
+        damaged = bytearray(content)
+        damaged[position] ^= int(rng.integers(1, 256))
+        saved.write_bytes(damaged)
+        try:
+            model = load_model(saved)
+        except ModelError:
+            continue
+        assert model.predict(x).posteriors.shape == (1, 2)
+
+
+def test_pickles_are_never_loaded(saved: Path) -> None:
+    stream = io.BytesIO()
+    np.save(stream, np.array([{}], object), allow_pickle=True)
+    rewrite(saved, lambda m: m.update({"votes.npy": stream.getvalue()}))
+
+    with pytest.raises(ModelError, match="size its header says"):
+        load_model(saved)
+
+
+def test_a_descriptor_of_another_version_is_refused() -> None:
+    with pytest.raises(ModelError, match="another descriptor"):
+        tiny().require_descriptor(("a", "b", "d"))
+    tiny().require_descriptor(("a", "b", "c"))
+
+
+def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+
+    with pytest.raises(ModelError, match="cannot write the model"):
+        save_model(tmp_path / "file" / "model.npz", tiny())

@@ -1,0 +1,277 @@
+"""The main job from end to end, on recordings made here and on real data when present."""
+
+import json
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from click.testing import Result
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+from numpy.testing import assert_allclose
+
+Run = Callable[..., Result]
+FILES = {
+    "run.json",
+    "frames.parquet",
+    "detections.parquet",
+    "planes.parquet",
+    "tracks.parquet",
+    "tracks.csv",
+    "annotated.mcap",
+    "review.rrd",
+}
+
+
+@pytest.fixture(scope="module")
+def recording(shapecat: Run, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("simulated") / "table.mcap"
+    assert shapecat("simulate", path, "--frames", 20, "--seed", 7).exit_code == 0
+    return path
+
+
+@pytest.fixture(scope="module")
+def run_folder(shapecat: Run, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("out")
+    result = shapecat("process", recording, "--out", out)
+    assert result.exit_code == 0, result.output
+    return out / "table"
+
+
+def messages(path: Path) -> Counter[tuple[str, int, int, bytes]]:
+    with path.open("rb") as file:
+        return Counter(
+            (channel.topic, message.log_time, message.publish_time, message.data)
+            for _, channel, message in make_reader(file, validate_crcs=True).iter_messages()
+        )
+
+
+def rows(folder: Path, table: str, *columns: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = pq.read_table(
+        folder / f"{table}.parquet", columns=list(columns) or None
+    ).to_pylist()
+    return found
+
+
+def test_every_file_of_the_contract_and_no_other(run_folder: Path) -> None:
+    assert {path.name for path in run_folder.iterdir()} == FILES
+    assert [path.name for path in run_folder.parent.iterdir()] == ["table"]
+
+
+def test_originals_are_kept_and_annotations_decode(recording: Path, run_folder: Path) -> None:
+    """A tool that changes a recording is never used twice."""
+    assert not messages(recording) - messages(run_folder / "annotated.mcap")
+
+    topics = ["/shapecat/detections", "/shapecat/scene"]
+    with (run_folder / "annotated.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        decoded = [
+            (channel.topic, message)
+            for _, channel, _, message in reader.iter_decoded_messages(topics=topics)
+        ]
+    assert Counter(topic for topic, _ in decoded) == dict.fromkeys(topics, 20)
+    assert sum(len(m.detections) for t, m in decoded if t == topics[0]) > 100
+
+
+def test_objects_are_found_named_and_followed(recording: Path, run_folder: Path) -> None:
+    """Against the truth beside the recording: found in 9 of 10 frames, one track, right name."""
+    truth = json.loads(recording.with_suffix(".truth.json").read_text())
+    labels = np.load(recording.with_suffix(".labels.npz"))["labels"]
+    track_of = {
+        (row["frame"], row["detection"]): row["track"] for row in rows(run_folder, "tracks")
+    }
+    visible, found, tracks = Counter[int](), Counter[int](), dict[int, Counter[int]]()
+    names: dict[int, str] = {}
+    by_frame: dict[int, list[dict[str, Any]]] = {}
+    for row in rows(run_folder, "detections", "frame", "detection", "indices"):
+        by_frame.setdefault(row["frame"], []).append(row)
+    for frame in truth:
+        image = labels[frame["frame"]].ravel()
+        for item in frame["objects"]:
+            if item["pixels"] < 200:
+                continue
+            names[item["track"]] = item["category"]
+            visible[item["track"]] += 1
+            for row in by_frame.get(frame["frame"], []):
+                inside = int((image[row["indices"]] == item["label"]).sum())
+                if 2 * inside > len(row["indices"]) + item["pixels"] - inside:
+                    found[item["track"]] += 1
+                    track = track_of.get((frame["frame"], row["detection"]))
+                    tracks.setdefault(item["track"], Counter())[track or 0] += 1
+
+    assert set(names.values()) >= {"cup", "can", "box", "bottle", "bowl", "plate", "ball"}
+    assert all(found[k] >= 0.9 * visible[k] for k in visible), (found, visible, names)
+    assert all(len(seen) == 1 for seen in tracks.values()), "identity switch"
+    final = final_labels(run_folder)
+    right = [final[next(iter(seen))] == names[k] for k, seen in tracks.items()]
+    assert np.mean(right) >= 0.85
+
+
+def final_labels(folder: Path) -> dict[int, str]:
+    lines = (folder / "tracks.csv").read_text().splitlines()
+    header = lines[0].split(",")
+    table = [dict(zip(header, line.split(","), strict=True)) for line in lines[1:]]
+    return {int(row["track"]): row["category"] for row in table}
+
+
+def test_the_camera_s_own_motion_is_taken_out(run_folder: Path) -> None:
+    """With transforms, a thing that stands still has one place."""
+    run = json.loads((run_folder / "run.json").read_text())
+    assert run["fixed_frame"] == "map"
+    assert run["up"]["source"].startswith("transforms")
+    assert run["warnings"] == []
+    places: dict[int, list[Any]] = {}
+    for row in rows(run_folder, "tracks"):
+        places.setdefault(row["track"], []).append(row["center_fixed"])
+    spread = [np.ptp(np.array(place), axis=0).max() for place in places.values()]
+    assert np.median(spread) < 0.03
+
+
+@pytest.mark.parametrize(("container", "name"), [("ros1", "table.bag"), ("ros2", "table")])
+def test_other_containers_give_the_same(
+    shapecat: Run, tmp_path: Path, run_folder: Path, container: str, name: str
+) -> None:
+    path = tmp_path / name
+    options = ("--frames", 20, "--seed", 7, "--format", container)
+    assert shapecat("simulate", path, *options).exit_code == 0
+    assert shapecat("process", path, "--out", tmp_path / "out", "--end", 0.2).exit_code == 0
+
+    same_detections(run_folder, tmp_path / "out" / "table", atol=1e-6)
+
+
+def test_clouds_give_the_same_as_depth_images(
+    shapecat: Run, tmp_path: Path, run_folder: Path
+) -> None:
+    path = tmp_path / "table.mcap"
+    assert shapecat("simulate", path, "--frames", 20, "--seed", 7, "--clouds").exit_code == 0
+    result = shapecat("process", path, "--out", tmp_path / "out", "--end", 0.2)
+    assert result.exit_code == 0, result.output
+
+    same_detections(run_folder, tmp_path / "out" / "table", atol=2e-3)
+
+
+def same_detections(expected: Path, actual: Path, *, atol: float) -> None:
+    columns = ("frame", "detection", "center", "category")
+    want, have = (rows(folder, "detections", *columns) for folder in (expected, actual))
+    have_frames = {row["frame"] for row in have}
+    want = [row for row in want if row["frame"] in have_frames]
+    assert len(want) == len(have) > 0
+    assert_allclose([r["center"] for r in have], [r["center"] for r in want], atol=atol)
+
+
+def test_same_input_gives_the_same_tables(
+    shapecat: Run, recording: Path, run_folder: Path, tmp_path: Path
+) -> None:
+    assert shapecat("process", recording, "--out", tmp_path).exit_code == 0
+
+    for name in ("frames", "detections", "planes", "tracks"):
+        a, b = (pq.read_table(f / f"{name}.parquet") for f in (run_folder, tmp_path / "table"))
+        drop = [c for c in a.column_names if c == "seconds"]
+        assert a.drop_columns(drop).equals(b.drop_columns(drop)), name
+    assert (run_folder / "tracks.csv").read_text() == (tmp_path / "table/tracks.csv").read_text()
+
+
+def test_complete_results_are_not_made_again(
+    shapecat: Run, recording: Path, run_folder: Path
+) -> None:
+    before = (run_folder / "run.json").stat().st_mtime_ns
+    again = shapecat("process", recording, "--out", run_folder.parent)
+    assert again.exit_code == 0
+    assert "was complete" in again.stdout
+    assert (run_folder / "run.json").stat().st_mtime_ns == before
+
+    other = shapecat("process", recording, "--out", run_folder.parent, "--set", "seed=1")
+    assert other.exit_code == 1
+    assert "--overwrite" in other.stderr
+
+
+def test_a_corrected_label_goes_into_the_outputs(
+    shapecat: Run, recording: Path, tmp_path: Path
+) -> None:
+    assert shapecat("process", recording, "--out", tmp_path, "--end", 0.1).exit_code == 0
+    folder = tmp_path / "table"
+    lines = (folder / "tracks.csv").read_text().splitlines()
+    cells = lines[1].split(",")
+    cells[lines[0].split(",").index("label")] = "heirloom"
+    corrected = tmp_path / "corrected.csv"
+    corrected.write_text("\n".join([lines[0], ",".join(cells), *lines[2:]]) + "\n")
+
+    result = shapecat("annotate", folder, "--labels", corrected)
+
+    assert result.exit_code == 0, result.output
+    names = Counter[str]()
+    with (folder / "annotated.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for *_, message in reader.iter_decoded_messages(topics=["/shapecat/detections"]):
+            names.update(d.results[0].hypothesis.class_id for d in message.detections)
+    assert names["heirloom"] >= 1
+
+
+@pytest.mark.parametrize(
+    ("content", "code"), [(None, 3), (b"", 3), (b"hello, this is a text\n", 3)]
+)
+def test_what_is_not_a_recording(
+    shapecat: Run, tmp_path: Path, content: bytes | None, code: int
+) -> None:
+    """One clear line, the documented exit code, and nothing left behind."""
+    for name in ("x.mcap", "x.bag", "x.db3", "x.txt"):
+        path = tmp_path / name
+        if content is not None:
+            path.write_bytes(content)
+        result = shapecat("process", path, "--out", tmp_path / "out")
+        assert result.exit_code == code, (name, result.output)
+        assert result.stderr.count("\n") == 1, result.stderr
+        assert str(path) in result.stderr
+        assert not (tmp_path / "out").exists()
+
+
+def test_a_recording_without_clouds(shapecat: Run, tmp_path: Path, recording: Path) -> None:
+    result = shapecat("process", recording, "--out", tmp_path / "out", "--topic", "/none")
+    assert result.exit_code == 4
+    assert "/camera/depth/image_raw" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+    late = shapecat("process", recording, "--out", tmp_path / "out", "--start", 1000)
+    assert late.exit_code == 4
+    assert not (tmp_path / "out").exists()
+
+
+def test_one_bad_recording_does_not_stop_the_others(
+    shapecat: Run, recording: Path, tmp_path: Path
+) -> None:
+    bad = tmp_path / "bad.mcap"
+    bad.write_bytes(b"no")
+    result = shapecat("process", bad, recording, "--out", tmp_path / "out", "--end", 0.1, "--json")
+
+    assert result.exit_code == 1
+    (summary,) = json.loads(result.stdout)
+    assert summary["counts"]["frames"] > 0
+    assert [path.name for path in (tmp_path / "out").iterdir()] == ["table"]
+
+
+@pytest.mark.parametrize(
+    "name", ["osd_learn/clouds.mcap", "osd_learn/clouds.bag", "osd_learn/clouds_ros2"]
+)
+def test_real_clouds_give_what_their_depth_images_give(
+    shapecat: Run, real_data: Path, tmp_path: Path, name: str
+) -> None:
+    """Same objects, centres within 2 mm, in every wrapping of the same sensor data."""
+    for source in ("osd_learn/depth.mcap", name):
+        done = shapecat("process", real_data / source, "--out", tmp_path, "--no-rrd", "--no-mcap")
+        assert done.exit_code == 0, done.output
+    depth = {r["stamp_ns"]: r["frame"] for r in rows(tmp_path / "depth", "frames")}
+    want: dict[int, list[Any]] = {}
+    for row in rows(tmp_path / "depth", "detections"):
+        want.setdefault(row["stamp_ns"], []).append(row["center"])
+    have: dict[int, list[Any]] = {}
+    for row in rows(tmp_path / Path(name).stem, "detections"):
+        have.setdefault(row["stamp_ns"], []).append(row["center"])
+
+    assert have
+    assert set(have) <= set(depth)
+    for stamp, centers in have.items():
+        assert_allclose(centers, want[stamp], atol=2e-3)

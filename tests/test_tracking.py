@@ -1,0 +1,296 @@
+"""The tracker and the fusion, piece by piece."""
+
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import ArrayLike
+
+from shapecat.arrays import F8
+from shapecat.config import TrackingSettings
+from shapecat.tracking import (
+    Fragments,
+    FrameDetections,
+    Tracker,
+    causal,
+    fuse,
+    merge_fragments,
+    scene_cuts,
+    track_recording,
+)
+from shapecat.tracking.association import assign
+
+SETTINGS = TrackingSettings()
+SECOND = 1_000_000_000
+CUP, BOX = np.array([0.9, 0.1]), np.array([0.1, 0.9])
+
+
+def frame(
+    k: int,
+    centers: Any,
+    *,
+    stamp_ns: int | None = None,
+    size: ArrayLike = (0.1, 0.1, 0.1),
+    posterior: F8 = CUP,
+    topic: str = "/depth",
+) -> FrameDetections:
+    """Return a frame (ten per second by default) of like objects at some places."""
+    points = np.reshape(np.asarray(centers, float), (-1, 3))
+    n = len(points)
+    return FrameDetections(
+        topic,
+        k,
+        k * SECOND // 10 if stamp_ns is None else stamp_ns,
+        np.arange(n),
+        points,
+        np.broadcast_to(size, (n, 3)),
+        np.broadcast_to(posterior, (n, 2)),
+        np.zeros(n),
+        np.full(n, 0.5),
+    )
+
+
+def step(tracker: Tracker, k: int, centers: ArrayLike, **options: Any) -> list[int]:
+    one = frame(k, centers, **options)
+    ids = tracker.step(one.stamp_ns, one.centers, one.sizes, one.posteriors)
+    return [int(i) for i in ids]
+
+
+def test_ids_count_births_and_births_are_ordered_by_position() -> None:
+    """Guard against identities that depend on the order a detector happens to report."""
+    assert step(Tracker(SETTINGS), 0, [[0.5, 0, 0], [0.1, 0, 0], [0.3, 0, 0]]) == [3, 1, 2]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["hungarian", "greedy"]))
+def test_result_does_not_depend_on_the_order_of_detections(seed: int, method: str) -> None:
+    random = np.random.default_rng(seed)
+    options = replace(SETTINGS, association=method)  # type: ignore[arg-type]  # one of the two
+    plain, shuffled = Tracker(options), Tracker(options)
+    for k in range(6):
+        n = int(random.integers(0, 9))
+        centers, sizes = random.uniform(0, 0.4, (n, 3)), random.uniform(0.03, 0.2, (n, 3))
+        posteriors, order = random.dirichlet(np.ones(3), n), random.permutation(n)
+        ids = plain.step(k * SECOND // 5, centers, sizes, posteriors)
+        again = shuffled.step(k * SECOND // 5, centers[order], sizes[order], posteriors[order])
+        assert ids[order].tolist() == again.tolist()
+        assert len(set(ids.tolist())) == n
+
+
+def test_a_fragment_beside_the_object_does_not_steal_its_identity() -> None:
+    tracker = Tracker(SETTINGS)
+    for k in range(5):
+        assert step(tracker, k, [0, 0, 0]) == [1]
+    whole, piece = tracker.step(
+        SECOND // 2, [[0.005, 0, 0], [-0.02, 0, 0]], [[0.1] * 3, [0.03] * 3], [CUP, CUP]
+    )
+    assert (whole, piece) == (1, 2)
+    assert step(tracker, 6, [-0.01, 0, 0]) == [1]
+
+
+def test_a_new_object_next_to_a_missed_one_is_not_forced_into_its_track() -> None:
+    """A plain assignment would use up the free row at any price."""
+    tracker = Tracker(SETTINGS)
+    for k in range(5):
+        step(tracker, k, [[0, 0, 0], [1, 0, 0]])
+    other = {"size": (0.3, 0.02, 0.02), "posterior": BOX}
+    assert step(tracker, 5, [0.07, 0, 0], **other) == [3]
+
+
+def test_a_moving_object_is_followed_through_an_occlusion() -> None:
+    tracker = Tracker(SETTINGS)
+    for k in range(20):
+        step(tracker, k, [0.03 * k, 0, 0])
+    for k in range(20, 26):
+        step(tracker, k, [])
+    assert step(tracker, 26, [0.03 * 26, 0, 0]) == [1]
+
+
+def test_an_unseen_track_ends_and_ended_tracks_cost_nothing() -> None:
+    tracker = Tracker(SETTINGS)
+    for k in range(2000):
+        step(tracker, k, [k // 10, 0, 0])
+    assert tracker.active < 10
+    assert step(tracker, 3000, [5, 0, 0]) == [201]
+
+
+def test_a_late_frame_does_not_end_a_track() -> None:
+    """Time-lapse recordings have frames farther apart than any patience."""
+    tracker = Tracker(SETTINGS)
+    assert [step(tracker, k, [0, 0, 0], stamp_ns=k * 60 * SECOND) for k in range(4)] == [[1]] * 4
+
+
+def test_a_clock_that_jumps_back_starts_anew_and_jitter_does_not() -> None:
+    tracker = Tracker(SETTINGS)
+    stamps = [100 * SECOND, 101 * SECOND, 100 * SECOND, 50 * SECOND]
+    ids = [step(tracker, k, [0, 0, 0], stamp_ns=s)[0] for k, s in enumerate(stamps)]
+    assert ids == [1, 1, 1, 2]
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_a_centre_that_is_not_finite_is_refused(bad: float) -> None:
+    with pytest.raises(ValueError, match="finite"):
+        step(Tracker(SETTINGS), 0, [bad, 0, 0])
+
+
+def test_the_first_frames_may_be_empty_and_not_know_the_categories() -> None:
+    tracker = Tracker(SETTINGS)
+    assert tracker.step(0, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 0))).size == 0
+    assert step(tracker, 1, [0, 0, 0]) == [1]
+    assert tracker.step(SECOND, np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 0))).size == 0
+    assert step(tracker, 11, [0, 0, 0]) == [1]
+
+
+def test_hungarian_takes_the_best_whole_and_greedy_the_best_pair() -> None:
+    costs = np.array([[0.1, 0.2], [0.2, 0.9]])
+    assert assign(costs, 1.0, "hungarian").tolist() == [[0, 1], [1, 0]]
+    assert assign(costs, 1.0, "greedy").tolist() == [[0, 0], [1, 1]]
+    assert assign(costs, 0.5, "greedy").tolist() == [[0, 0]]
+    assert assign(np.full((2, 2), np.inf), 1.0, "hungarian").shape == (0, 2)
+
+
+def test_a_recording_of_single_pictures_keeps_every_detection() -> None:
+    """Stamps a second apart, other objects at the same places in every frame."""
+    random = np.random.default_rng(4)
+    frames = [
+        FrameDetections(
+            "/depth",
+            k,
+            k * SECOND,
+            np.arange(4),
+            np.column_stack([np.arange(4) * 0.12 + random.normal(0, 0.03, 4), np.zeros((4, 2))]),
+            random.uniform(0.03, 0.25, (4, 3)),
+            random.dirichlet(np.full(7, 0.2), 4),
+            np.zeros(4),
+            np.zeros(4),
+        )
+        for k in range(30)
+    ]
+    tracks = track_recording(frames, SETTINGS)
+    assert sum(track.hits for track in tracks) == 120
+    assert len(tracks) >= 115
+    assert scene_cuts(frames, SETTINGS)[1:].mean() > 0.9
+
+
+def test_one_frame_is_enough_and_none_is_no_error() -> None:
+    one = track_recording([frame(0, [[0, 0, 0], [1, 0, 0]])], SETTINGS)
+    assert [track.id for track in one] == [1, 2]
+    assert track_recording([], SETTINGS) == ()
+    assert track_recording([frame(0, []), frame(1, [])], SETTINGS) == ()
+
+
+def test_a_false_detection_gets_no_track() -> None:
+    frames = [frame(k, [[0, 0, 0], [0.5, 0, 0]] if k == 7 else [0, 0, 0]) for k in range(20)]
+    (track,) = track_recording(frames, SETTINGS)
+    assert track.hits == 20
+
+
+def test_one_odd_frame_is_no_cut() -> None:
+    """All objects missed and two invented in one frame must not break the tracks."""
+    seen = [[0, 0, 0], [0.3, 0, 0]]
+    frames = [frame(k, [[0.1, 0.1, 0], [0.2, 0.1, 0]] if k == 9 else seen) for k in range(20)]
+    assert not scene_cuts(frames, SETTINGS).any()
+    assert [track.hits for track in track_recording(frames, SETTINGS)] == [19, 19]
+
+
+def test_a_gap_is_filled_by_rows_on_the_line_and_a_long_one_is_left_out() -> None:
+    seen = {k: [0.01 * min(k, 14), 0, 0] for k in [*range(10), 14, *range(101, 110)]}
+    (track,) = track_recording([frame(k, seen.get(k, [])) for k in range(110)], SETTINGS)
+    assert track.detections[9:15].tolist() == [0, -1, -1, -1, -1, 0]
+    assert track.centers[12, 0] == pytest.approx(0.12)
+    assert track.frames[14:17].tolist() == [14, 101, 102]
+    assert track.hits == 20
+
+
+def test_an_object_that_comes_back_to_its_place_keeps_its_track() -> None:
+    """It left the view for longer than any patience: only hindsight knows."""
+    frames = [frame(k, [0, 0, 0] if k < 20 or k >= 200 else [2, 0, 0]) for k in range(220)]
+    tracks = track_recording(frames, SETTINGS)
+    assert [track.hits for track in tracks] == [40, 180]
+
+
+@pytest.mark.parametrize(
+    ("options", "joined"),
+    [
+        ({}, True),
+        ({"start": [[0, 0, 0], [0.3, 0, 0]]}, False),
+        ({"sizes": [[0.1, 0.1, 0.1], [0.3, 0.3, 0.3]]}, False),
+        ({"posteriors": [[1, 0], [0, 1]]}, False),
+        ({"scenes": [0, 1]}, False),
+        ({"first_ns": [0, SECOND]}, False),  # the first one lasts until 2 s: they overlap
+    ],
+)
+def test_fragments_are_joined_only_when_nothing_speaks_against_it(
+    options: dict[str, Any], joined: bool
+) -> None:
+    columns: dict[str, Any] = {
+        "first_ns": [0, 20 * SECOND],
+        "last_ns": [2 * SECOND, 30 * SECOND],
+        "start": np.zeros((2, 3)),
+        "end": np.zeros((2, 3)),
+        "start_velocity": np.zeros((2, 3)),
+        "end_velocity": np.zeros((2, 3)),
+        "sizes": np.full((2, 3), 0.1),
+        "posteriors": [[0.8, 0.2], [0.7, 0.3]],
+        "scenes": [0, 0],
+    }
+    fragments = Fragments(**(columns | options))
+    assert merge_fragments(fragments, SETTINGS).tolist() == ([0, 0] if joined else [0, 1])
+
+
+def test_streams_are_tracked_apart_and_numbered_together() -> None:
+    frames = [frame(k, [0, 0, 0], topic=topic) for k in range(5) for topic in ("/a", "/b")]
+    tracks = track_recording(frames, SETTINGS)
+    assert [(track.id, track.topic, track.hits) for track in tracks] == [(1, "/a", 5), (2, "/b", 5)]
+
+
+def test_ten_thousand_frames_take_seconds() -> None:
+    random = np.random.default_rng(0)
+    places = np.column_stack([np.arange(6) * 0.2, np.zeros((6, 2))])
+    frames = [frame(k, places + random.normal(0, 0.01, (6, 3))) for k in range(2000)]
+    begun = time.process_time()
+    tracks = track_recording(frames, SETTINGS)
+    assert [track.hits for track in tracks] == [2000] * 6
+    assert time.process_time() - begun < 4  # about 1 s; 10,000 frames five times that
+
+
+VIEWS = st.integers(0, 2**32 - 1).map(
+    lambda seed: np.random.default_rng(seed).dirichlet(np.full(4, 0.3), 1 + seed % 9)
+)
+
+
+@settings(max_examples=40, deadline=None)
+@given(VIEWS, st.sampled_from(["mean", "product", "vote"]))
+def test_fusion_is_a_distribution_and_every_prefix_is_a_fusion(views: F8, method: str) -> None:
+    running = causal(views, method)  # type: ignore[arg-type]  # one of the three
+    assert np.allclose(running.sum(axis=1), 1)
+    for k in range(len(views)):
+        assert np.allclose(running[k], fuse(views[: k + 1], method))  # type: ignore[arg-type]  # the same
+
+
+@pytest.mark.parametrize("method", ["mean", "product", "vote"])
+def test_more_views_of_the_same_kind_do_not_sharpen(method: str) -> None:
+    """Views of one placement share their error: thirty equal ones are worth one."""
+    one = fuse([[0.6, 0.4]], method)  # type: ignore[arg-type]  # one of the three
+    assert np.allclose(fuse([[0.6, 0.4]] * 30, method), one)  # type: ignore[arg-type]  # the same
+
+
+def test_fusion_weighs_and_no_view_has_a_veto() -> None:
+    assert fuse([[1, 0], [0, 1]], weights=[3, 1]).tolist() == [0.75, 0.25]
+    assert fuse([[0.0, 1.0], *[[0.95, 0.05]] * 9], "product")[0] > 0.5
+    with pytest.raises(ValueError, match="at least one view"):
+        fuse(np.zeros((0, 3)))
+    with pytest.raises(ValueError, match="unknown fusion method"):
+        fuse([[1.0]], "sum")  # type: ignore[arg-type]  # what is tested
+
+
+def test_a_clock_that_jumps_back_is_a_cut() -> None:
+    """Two sessions in one recording must not be joined by their equal time stamps."""
+    stamps = [*range(100, 105), *range(50, 55)]
+    frames = [frame(k, [0, 0, 0], stamp_ns=s * SECOND // 5) for k, s in enumerate(stamps)]
+    assert scene_cuts(frames, SETTINGS).tolist() == [k == 5 for k in range(10)]
+    assert [track.hits for track in track_recording(frames, SETTINGS)] == [5, 5]
