@@ -1,4 +1,4 @@
-"""What the commands show: progress on stderr, results on stdout."""
+"""What the commands show: progress on stderr, results on stdout. Rich is loaded when first used."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -6,16 +6,6 @@ from contextlib import contextmanager
 from typing import Any
 
 import click
-from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeRemainingColumn,
-)
-from rich.table import Table
 
 _PHASES = {
     "simulate": "simulating",
@@ -30,9 +20,9 @@ _PHASES = {
 class Bars:
     """One progress bar per phase; silent when stderr is not a terminal."""
 
-    def __init__(self, progress: Progress) -> None:
+    def __init__(self, progress: Any) -> None:
         self._progress = progress
-        self._tasks: dict[str, TaskID] = {}
+        self._tasks: dict[str, Any] = {}
 
     def __call__(self, phase: str, done: int, total: int | None) -> None:
         """Show how far a phase has come."""
@@ -51,14 +41,17 @@ class Bars:
 @contextmanager
 def progress_bars() -> Iterator[Bars]:
     """Show progress bars on stderr while the block runs."""
+    from rich import progress as rich
+    from rich.console import Console
+
     console = Console(stderr=True)
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeRemainingColumn(),
+        rich.TextColumn("{task.description}"),
+        rich.BarColumn(),
+        rich.MofNCompleteColumn(),
+        rich.TimeRemainingColumn(),
     )
-    with Progress(*columns, console=console, disable=not console.is_terminal) as progress:
+    with rich.Progress(*columns, console=console, disable=not console.is_terminal) as progress:
         yield Bars(progress)
 
 
@@ -71,6 +64,9 @@ def print_table(
     columns: Sequence[str], rows: Sequence[Sequence[Any]], *, title: str | None = None
 ) -> None:
     """Print a table; columns of numbers are set flush right."""
+    from rich.console import Console
+    from rich.table import Table
+
     table = Table(title=title, title_justify="left", box=None, pad_edge=False, padding=(0, 2, 0, 0))
     for k, name in enumerate(columns):
         numeric = bool(rows) and all(isinstance(row[k], int | float) for row in rows)

@@ -17,7 +17,7 @@ def view(*, run: Path, screenshot: Path | None) -> None:
     shapecat view results/lab
     shapecat view results/lab --screenshot lab.png
     """
-    from shapecat.outputs.review import open_viewer, take_screenshot
+    from shapecat.outputs.review_viewer import open_viewer, take_screenshot
 
     review = run / "review.rrd" if run.is_dir() else run
     if screenshot is None:

@@ -17,17 +17,22 @@ _FAST = {"reassoc", "contract", "arcp", "nsz", "nnan"}
 """Fast-math flags that keep infinities: sums and minima may be vectorised."""
 
 
-def kernel(function: _F | None = None, *, fast: bool = False) -> Any:
+def kernel(function: _F | None = None, *, fast: bool = False, inline: bool = False) -> Any:
     """Compile a function of numbers and arrays on its first call.
 
     Parameters
     ----------
     fast : let the compiler reorder sums. Only for kernels that never meet NaN.
+    inline : make it part of its callers, where the call would cost more than the work.
     """
 
     def compile_later(target: _F) -> Any:
-        return njit(cache=True, nogil=True, error_model="numpy", fastmath=_FAST if fast else False)(
-            target
-        )
+        return njit(
+            cache=True,
+            nogil=True,
+            error_model="numpy",
+            fastmath=_FAST if fast else False,
+            forceinline=inline,
+        )(target)
 
     return compile_later if function is None else compile_later(function)

@@ -32,7 +32,9 @@ def table(x: float = 0.5, y: float = 0.4, z: float = 0.0) -> Shape:
     return hit
 
 
-def box(center: tuple[float, float, float], size: tuple[float, float, float], yaw: float = 0) -> Shape:
+def box(
+    center: tuple[float, float, float], size: tuple[float, float, float], yaw: float = 0
+) -> Shape:
     """A box; ``center`` is the middle of its base."""
     c, s = np.cos(yaw), np.sin(yaw)
     turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
@@ -387,7 +389,8 @@ def test_hierarchy_answers_the_queries() -> None:
     depth, seen = render(shapes)
     scene = found(frame_of(depth))
     name = {
-        int(np.bincount(seen.ravel()[c.indices]).argmax()): k for k, c in enumerate(scene.candidates)
+        int(np.bincount(seen.ravel()[c.indices]).argmax()): k
+        for k, c in enumerate(scene.candidates)
     }
     assert len(scene.candidates) == len(name) == 4
     hierarchy = Hierarchy(scene)
@@ -411,3 +414,29 @@ def test_hierarchy_of_nothing() -> None:
     assert hierarchy.highest(0) is None
     assert hierarchy.nearest(0) is None
     assert hierarchy.count(0) == 0
+
+
+def test_can_on_a_microwave_oven() -> None:
+    """The top of a closed body is no furniture: the oven is an object that carries another."""
+    shapes = [
+        table(0.6, 0.5),
+        box((0, 0.1, 0), (0.45, 0.32, 0.26)),
+        can(0.05, 0.05, 0.26, 0.035, 0.12),
+    ]
+    scene = check(shapes, [1, 2], distance=1.2)
+    oven, on_oven = sorted(range(2), key=lambda k: scene.candidates[k].support_m)
+    assert scene.candidates[on_oven].on_candidate == oven
+    assert abs(scene.candidates[on_oven].support_m - 0.26) < 0.01
+
+
+def test_board_on_thin_legs_is_furniture() -> None:
+    """A small table has nothing under its edge; its legs are no objects."""
+    legs = [box((x, y, -0.5), (0.03, 0.03, 0.49)) for x in (-0.2, 0.2) for y in (-0.12, 0.12)]
+    shapes = [table(2, 2, -0.5), box((0, 0, -0.02), (0.44, 0.3, 0.02)), *legs,
+              box((0.05, 0, 0), (0.08, 0.08, 0.1))]  # fmt: skip
+    depth, seen = render(shapes, distance=1.1)
+    scene = found(frame_of(depth))
+    assert len(scene.planes) == 2
+    assert overlaps(scene, seen, [6])[0] > 0.85
+    on_table = [c for c in scene.candidates if c.plane == 1]
+    assert len(on_table) == 1

@@ -1,7 +1,10 @@
 """Evaluation: the metrics against scikit-learn, and the way from a folder to a report."""
 
 import json
+import re
+from dataclasses import replace
 from pathlib import Path
+from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from sklearn import metrics as reference
 from shapecat.arrays import F4
 from shapecat.errors import ModelError, RecordingError
 from shapecat.evaluation import evaluate_folder, format_report, metrics, read_dataset
+from shapecat.evaluation.page import write_page
 from shapecat.evaluation.training import (
     learn_on_folder,
     order_categories,
@@ -195,3 +199,17 @@ def test_own_categories_follow_the_usual_ones() -> None:
         "fork",
         "spoon",
     )
+
+
+def test_the_page_is_whole_and_escapes_names(trained: Path, tmp_path: Path) -> None:
+    """Folder names come from strangers; a page may not run what they contain."""
+    dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
+    report = replace(evaluate_folder(dataset, trained), categories=("<script>", "ball"))
+    write_page(tmp_path / "report.html", report, title="a & b")
+    page = (tmp_path / "report.html").read_text("utf-8")
+
+    assert "<script>" not in page
+    assert "a &amp; b" in page
+    for picture in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
+        ET.fromstring(picture)  # noqa: S314  we wrote it
+    assert page.count("<svg") == 2

@@ -150,8 +150,9 @@ def context(
     low: float,
     high: float,
     out: F4,
-) -> None:
-    """Write the numbers named by `CONTEXT_NAMES`.
+) -> tuple[float, float, float]:
+    """Write the numbers named by `CONTEXT_NAMES`; return the greatest width and the widths across
+    and along the line of sight.
 
     All lengths are in units of the mean distance between neurons, with the origin at their mean.
 
@@ -231,7 +232,7 @@ def context(
     # which way the surface looks, and where
     cx, cy, residual = vertical_axis(x, y, normals, weight)
     radius = radius2 = top = bottom = top_weight = bottom_weight = 0.0
-    slope_rz = slope_zz = mean_z = convex = 0.0
+    slope_rz = mean_z = convex = 0.0
     for i in range(count):
         w = weight[i]
         level = (z[i] - low) / height if height > 0 else 0.5
@@ -299,6 +300,7 @@ def context(
     out[n + 2] = _ratio(least, most)
     n += 3
     out[n] = _ratio(max(low - base, 0.0), height)
+    return wide, across, along
 
 
 @kernel

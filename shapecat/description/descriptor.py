@@ -180,7 +180,7 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
         cloud, starts, x, y, z, straight, np.float32(_RADIUS * gap), place
     )
     low, high = _height_range(cloud[2])
-    context(
+    wide, across, along = context(
         cloud,
         x,
         y,
@@ -202,6 +202,7 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
     at = _STARTS[11]
     out[at] = (high - low) * unit
     out[at + 1] = low * unit + middle[2]
+    out[at + 2], out[at + 3], out[at + 4] = wide * unit, across * unit, along * unit
     out[at + 5] = gap * unit
     away = np.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2)
     out[_STARTS[12]] = place[2] / max(away, 1e-6)

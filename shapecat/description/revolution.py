@@ -47,11 +47,44 @@ def rotation_axis(x: F4, y: F4, z: F4, weight: F4, normals: F4) -> tuple[F8, F8,
                 C[j, k] += weight[i] * m[j] * m[k]
     for j in range(3):
         N[j, j] += 1e-2  # where the normals do not tell, the axis passes near the middle
-    inner = np.linalg.solve(N, B)
-    values, vectors = np.linalg.eigh(C - B.T @ inner)
-    axis = vectors[:, 0].copy()
-    point = np.cross(axis, -(inner @ axis))
-    return axis, point, np.sqrt(np.maximum(values, 0.0))
+    _invert(N)
+    # b = -N^-1 B a leaves a . (C - B^T N^-1 B) a to minimise.
+    moment = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                moment[i, j] -= N[i, k] * B[k, j]
+    for i in range(3):
+        for j in range(3):
+            for k in range(3):
+                C[i, j] += B[k, i] * moment[k, j]
+    values, vectors = np.linalg.eigh(C)
+    axis, b = np.zeros(3), np.zeros(3)
+    for i in range(3):
+        axis[i] = vectors[i, 0]
+        for j in range(3):
+            b[i] += moment[i, j] * vectors[j, 0]
+        values[i] = np.sqrt(max(values[i], 0.0))
+    point = np.zeros(3)
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        point[i] = axis[j] * b[k] - axis[k] * b[j]
+    return axis, point, values
+
+
+@kernel
+def _invert(A: F8) -> None:
+    """Invert a symmetric positive definite (3, 3) matrix in place."""
+    xx, xy, xz = A[0, 0], A[0, 1], A[0, 2]
+    yy, yz, zz = A[1, 1], A[1, 2], A[2, 2]
+    a, b, c = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    det = xx * a + xy * b + xz * c
+    A[0, 0] = a / det
+    A[0, 1] = A[1, 0] = b / det
+    A[0, 2] = A[2, 0] = c / det
+    A[1, 1] = (xx * zz - xz * xz) / det
+    A[1, 2] = A[2, 1] = (xy * xz - xx * yz) / det
+    A[2, 2] = (xx * yy - xy * xy) / det
 
 
 @kernel

@@ -25,7 +25,7 @@ from shapecat.detection.segmentation import Segmentation
 from shapecat.geometry import gravity_rotation, quaternion_from_rotation
 from shapecat.jit import kernel
 
-__all__ = ["Stand", "boxes_of", "occluded", "stands_of"]
+__all__ = ["Extents", "Stand", "extents_of", "occluded", "stands_of"]
 
 OCCLUDED = 0.12
 """Share of the boundary behind something nearer that makes an object occluded."""
@@ -66,9 +66,9 @@ def stands_of(found: Segmentation) -> list[Stand]:
 
 def _hidden_stand(pieces: Pieces, leaders: I4, p: int) -> int:
     shape = pieces.shape
-    met = (pieces.pairs[CONTACT] + pieces.pairs[NEAR] + pieces.pairs[FRONT] + pieces.pairs[FRONT].T)[
-        p, leaders
-    ]
+    met = (
+        pieces.pairs[CONTACT] + pieces.pairs[NEAR] + pieces.pairs[FRONT] + pieces.pairs[FRONT].T
+    )[p, leaders]
     below = abs(shape[leaders, TOP] - shape[p, BOTTOM]) < GAP_M
     middle = (shape[p, LEFT] + shape[p, RIGHTMOST]) / 2
     beside = (shape[leaders, LEFT] < middle) & (middle < shape[leaders, RIGHTMOST])
@@ -96,15 +96,30 @@ def occluded(found: Segmentation) -> list[bool]:
     return [bool(flag) for flag in hidden > OCCLUDED * np.maximum(pieces.boundary[leaders], 1)]
 
 
-def boxes_of(cells: Cells, found: Segmentation) -> tuple[F8, F8, F8]:
-    """Return centres (n, 3), sizes (n, 3) and orientations (n, 4) of the labels' upright boxes.
+class Extents(NamedTuple):
+    """How far the labels 1, 2, ... reach, one row each.
+
+    ``center`` (n, 3), ``size`` (n, 3) and ``orientation`` (n, 4) of the upright box; ``low`` and
+    ``high`` (n, 2) the first and last row and column of cells.
+    """
+
+    center: F8
+    size: F8
+    orientation: F8
+    low: I4
+    high: I4
+
+
+def extents_of(cells: Cells, found: Segmentation) -> Extents:
+    """Measure the upright boxes of the labels.
 
     The smallest box over 60 yaws, as `shapecat.geometry.upright_box`, on the outermost cells.
     """
     count = found.leaders.size - 1
     level = gravity_rotation(found.up)
     extent = np.zeros((count + 1, 7))
-    _extents(cells.w, cells.lens, found.labels, level, extent)
+    corners = np.zeros((count + 1, 4), np.int64)
+    _extents(cells.w, cells.lens, found.labels, level, extent, corners)
     extent = extent[1:]
     low, high, yaw = extent[:, 0:3], extent[:, 3:6], extent[:, 6]
     middle = (low + high) / 2
@@ -116,11 +131,11 @@ def boxes_of(cells: Cells, found: Segmentation) -> tuple[F8, F8, F8]:
     hc, hs = np.cos(yaw / 2), np.sin(yaw / 2)
     turned = np.stack([x * hc + y * hs, y * hc - x * hs, z * hc + w * hs, w * hc - z * hs], 1)
     turned *= np.where(turned[:, 3:] < 0, -1.0, 1.0)
-    return center, high - low, turned
+    return Extents(center, high - low, turned, corners[1:, :2], corners[1:, 2:])
 
 
 @kernel(fast=True)
-def _extents(w: F4, lens: Lens, labels: I4, level: F8, extent: F8) -> None:
+def _extents(w: F4, lens: Lens, labels: I4, level: F8, extent: F8, corners: I4) -> None:
     rows, columns = labels.shape
     count = extent.shape[0]
     # Outermost cells, and every 4th inside (a ball's nearest point is inside its outline).
@@ -131,6 +146,11 @@ def _extents(w: F4, lens: Lens, labels: I4, level: F8, extent: F8) -> None:
             p = labels[i, j]
             if p == 0:
                 continue
+            if number[p + 1] == 0:
+                corners[p] = i, j, i, j
+            corners[p, 1] = min(corners[p, 1], j)
+            corners[p, 2] = i
+            corners[p, 3] = max(corners[p, 3], j)
             inside = (i > 0) & (j > 0) & (i + 1 < rows) & (j + 1 < columns)
             if inside:
                 inside = (labels[i - 1, j] == p) & (labels[i + 1, j] == p)

@@ -12,12 +12,14 @@ from shapecat.arrays import F4
 from shapecat.jit import kernel
 from shapecat.types import Camera
 
-__all__ = ["JUMP", "Cells", "Lens", "cells_of"]
+__all__ = ["JUMP", "NEAREST_M", "Cells", "Lens", "cells_of"]
 
 JUMP = 0.012
 """Step in inverse depth that separates surfaces, 1/m: four steps of a Kinect, 1 cm at 0.9 m."""
 CELL_M = 0.0035
 """Size of a cell on the objects: small against the smallest object, larger than the noise."""
+SMALL_M2 = 9e-4
+"""Surface of the smallest object."""
 NEAREST_M = 0.05
 """Nothing measures nearer; keeps inverse depth within bounds."""
 LARGEST_FACTOR = 16
@@ -40,11 +42,18 @@ class Cells(NamedTuple):
     w : (rows, columns) float32 inverse depth, 1/m; 0 where there is no reading.
     lens : the camera in units of cells.
     factor : pixels along the edge of a cell.
+    size_m : width of a cell at the median depth.
     """
 
     w: F4
     lens: Lens
     factor: int
+    size_m: float
+
+    @property
+    def small(self) -> int:
+        """Number of cells of `SMALL_M2`, within reason."""
+        return round(min(max(SMALL_M2 / max(self.size_m, 1e-6) ** 2, 20), 75))
 
 
 def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_M) -> Cells | None:
@@ -68,41 +77,60 @@ def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_
     rows, columns = depth.shape[0] // factor, depth.shape[1] // factor
     w = np.zeros((rows, columns), np.float32)
     _average(depth, factor, np.float32(range_m), np.float32(JUMP), w)
-    return Cells(w, lens, factor)
+    return Cells(w, lens, factor, factor * pixel_m)
 
 
 @kernel
 def _average(depth: F4, factor: int, range_m: float, jump: float, w: F4) -> None:
     """Write to ``w`` the inverse of the mean depth of the pixels near the nearest of each cell."""
+    if factor == 2:  # the usual case, in a form that vectorises
+        _average_two(depth, range_m, jump, w)
+        return
     rows, columns = w.shape
-    far = np.float32(1e9)
-    zero = np.float32(0)
-    one = np.float32(1)
-    least = np.float32(NEAREST_M)
-    nearest = np.zeros(columns, np.float32)
-    total = np.zeros(columns, np.float32)
-    count = np.zeros(columns, np.float32)
+    zero, one = np.float32(0), np.float32(1)
+    far, least = np.float32(1e9), np.float32(NEAREST_M)
     for i in range(rows):
-        nearest[:] = far
-        total[:] = zero
-        count[:] = zero
-        for a in range(factor):
-            for b in range(factor):
-                line = depth[i * factor + a, b:]
-                for j in range(columns):
-                    z = line[j * factor]
+        for j in range(columns):
+            nearest = far
+            for y in range(i * factor, (i + 1) * factor):
+                for x in range(j * factor, (j + 1) * factor):
+                    z = depth[y, x]
                     z = z if (z >= least) & (z <= range_m) else far
-                    nearest[j] = z if z < nearest[j] else nearest[j]
-        for j in range(columns):
+                    nearest = z if z < nearest else nearest
+            if nearest == far:
+                continue
             # The depth that is one jump behind the nearest, in inverse depth.
-            nearest[j] = nearest[j] / (one - min(jump * nearest[j], np.float32(0.5)))
-        for a in range(factor):
-            for b in range(factor):
-                line = depth[i * factor + a, b:]
-                for j in range(columns):
-                    z = line[j * factor]
-                    use = (z >= least) & (z <= range_m) & (z <= nearest[j])
-                    total[j] += z if use else zero
-                    count[j] += one if use else zero
+            limit = nearest / (one - min(jump * nearest, np.float32(0.5)))
+            total = count = zero
+            for y in range(i * factor, (i + 1) * factor):
+                for x in range(j * factor, (j + 1) * factor):
+                    z = depth[y, x]
+                    use = (z >= least) & (z <= range_m) & (z <= limit)
+                    total += z if use else zero
+                    count += one if use else zero
+            w[i, j] = count / total
+
+
+@kernel
+def _average_two(depth: F4, range_m: float, jump: float, w: F4) -> None:
+    rows, columns = w.shape
+    zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
+    far, least = np.float32(1e9), np.float32(NEAREST_M)
+    for i in range(rows):
+        top, bottom, out = depth[2 * i], depth[2 * i + 1], w[i]
         for j in range(columns):
-            w[i, j] = count[j] / total[j] if count[j] > zero else zero
+            a, b, c, d = top[2 * j], top[2 * j + 1], bottom[2 * j], bottom[2 * j + 1]
+            a = a if (a >= least) & (a <= range_m) else far
+            b = b if (b >= least) & (b <= range_m) else far
+            c = c if (c >= least) & (c <= range_m) else far
+            d = d if (d >= least) & (d <= range_m) else far
+            ab, cd = (a if a < b else b), (c if c < d else d)
+            nearest = ab if ab < cd else cd
+            slope = jump * nearest
+            limit = nearest / (one - (slope if slope < half else half))
+            limit = limit if nearest < far else zero
+            total = (a if a <= limit else zero) + (b if b <= limit else zero)
+            total += (c if c <= limit else zero) + (d if d <= limit else zero)
+            count = (one if a <= limit else zero) + (one if b <= limit else zero)
+            count += (one if c <= limit else zero) + (one if d <= limit else zero)
+            out[j] = count / total if nearest < far else zero

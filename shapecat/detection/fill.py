@@ -1,13 +1,17 @@
-"""Fill: cells at the level of the table that an object encloses (floors of plates and pots)."""
+"""Fill: cells near the level of the table that belong to objects: their feet and their floors."""
 
 import numpy as np
 
 from shapecat.arrays import F4, I4, U1
 from shapecat.detection.cells import JUMP
+from shapecat.detection.heights import LEAST_M, NOISE
 from shapecat.jit import kernel
 
-__all__ = ["fill_enclosed"]
+__all__ = ["FRINGE", "fill_enclosed", "grow_feet"]
 
+FRINGE = 0.45
+"""Share of the least height from which a reading next to an object belongs to it."""
+FEET_CELLS = 4
 MOST_CELLS = 4000
 SHARE = 0.6
 LEVEL = 0.15
@@ -26,6 +30,46 @@ def fill_enclosed(w: F4, labels: I4, count: int, *, active: bool) -> U1:
         i0, i1, j0, j1 = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
         _fill(w[i0:i1, j0:j1], labels[i0:i1, j0:j1], count, filled[i0:i1, j0:j1])
     return filled
+
+
+@kernel
+def grow_feet(w: F4, owner: I4, height: F4, labels: I4) -> None:
+    """Let the labels grow over up to four cells that are hardly above their plane.
+
+    The least height of an object cell is safe against the noise of the plane; next to an object
+    less is enough.
+    """
+    rows, columns = labels.shape
+    queue = np.zeros(labels.size, np.int32)
+    top = 0
+    for i in range(rows):
+        for j in range(columns):
+            if labels[i, j] > 0 and (
+                (i > 0 and owner[i - 1, j] < 0)
+                or (j > 0 and owner[i, j - 1] < 0)
+                or (i + 1 < rows and owner[i + 1, j] < 0)
+                or (j + 1 < columns and owner[i, j + 1] < 0)
+            ):
+                queue[top] = i * columns + j
+                top += 1
+    done = 0
+    for _ in range(FEET_CELLS):
+        end = top
+        while done < end:
+            i, j = queue[done] // columns, queue[done] % columns
+            done += 1
+            for d in range(4):
+                y = i + (1 if d == 0 else -1 if d == 1 else 0)
+                x = j + (1 if d == 2 else -1 if d == 3 else 0)
+                if y < 0 or x < 0 or y >= rows or x >= columns or labels[y, x] != 0:
+                    continue
+                if owner[y, x] != -abs(owner[i, j]) or abs(w[y, x] - w[i, j]) >= JUMP:
+                    continue
+                z = 1 / w[y, x]
+                if height[y, x] > FRINGE * (LEAST_M + NOISE * z * z):
+                    labels[y, x] = labels[i, j]
+                    queue[top] = y * columns + x
+                    top += 1
 
 
 @kernel

@@ -11,7 +11,7 @@ from shapecat.detection.planes import DIRECTIONS, Support
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 
-__all__ = ["LEAST_M", "NOISE", "Heights", "heights_of", "table_of"]
+__all__ = ["LEAST_M", "NOISE", "Heights", "heights_of", "inside", "table_of"]
 
 LEAST_M = 0.006
 """Lowest height of an object cell, to which `NOISE` times the squared range is added."""
@@ -34,13 +34,20 @@ class Heights(NamedTuple):
 
 def table_of(supports: list[Support], lens: Lens) -> F8:
     """Return one row of numbers per plane, for the kernels."""
-    rows = np.zeros((len(supports), 10 + DIRECTIONS))
+    rows = np.zeros((len(supports), 13 + DIRECTIONS))
+    angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+    quarter, half = DIRECTIONS // 4, DIRECTIONS // 2
     for row, s in zip(rows, supports, strict=True):
         n = (s.a * lens.fx, s.b * lens.fy, s.a * lens.cx + s.b * lens.cy + s.c)
         level = gravity_rotation(s.up)
         row[:4] = s.a, s.b, s.c, 1.0 / math.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
         row[4:10] = level[:2].ravel()
-        row[10:] = s.reach
+        # A circle inside the outline, for a quick answer.
+        middle = (s.reach[[0, quarter]] - s.reach[[half, half + quarter]]) / 2
+        row[10:12] = middle
+        room = s.reach - middle[0] * np.cos(angle) - middle[1] * np.sin(angle)
+        row[12] = max(float(room.min()), 0.0) ** 2
+        row[13:] = s.reach
     return rows
 
 
@@ -75,17 +82,20 @@ def _stand(
                 continue
             z = 1.0 / w[i, j]
             x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
-            if _inside(plane, x, y, z):
+            if inside(plane, x, y, z):
                 owner[i, j] = number if line[j] > least + noise * z * z else -number
                 height[i, j] = line[j]
 
 
 @kernel
-def _inside(plane: F8, x: float, y: float, z: float) -> bool:
+def inside(plane: F8, x: float, y: float, z: float) -> bool:
+    """Whether a point is within the outline of a row of `table_of`."""
     p = plane[4] * x + plane[5] * y + plane[6] * z
     q = plane[7] * x + plane[8] * y + plane[9] * z
+    if (p - plane[10]) ** 2 + (q - plane[11]) ** 2 < plane[12]:
+        return True
     for k in range(DIRECTIONS):
         angle = k * (2 * math.pi / DIRECTIONS)
-        if math.cos(angle) * p + math.sin(angle) * q > plane[10 + k]:
+        if math.cos(angle) * p + math.sin(angle) * q > plane[13 + k]:
             return False
     return True

@@ -120,7 +120,9 @@ class Hierarchy:
     def _parents_of_object(self, candidate: Candidate) -> Iterable[Node]:
         if candidate.on_candidate is not None:
             yield Node("object", candidate.on_candidate)
-        if candidate.plane is not None and (candidate.on_candidate is None or candidate.support_m == 0):
+        if candidate.plane is not None and (
+            candidate.on_candidate is None or candidate.support_m == 0
+        ):
             yield Node("plane", candidate.plane)
 
     def _below_plane(self, k: int) -> Node | None:
@@ -198,4 +200,6 @@ def _described(scene: Scene, node: Node) -> str:
         if flag
     ]
     note = f" ({', '.join(flags)})" if flags else ""
-    return f"object {node.index}: {x:.2f} x {y:.2f} x {z:.2f} m, {len(candidate.indices)} points{note}"
+    return (
+        f"object {node.index}: {x:.2f} x {y:.2f} x {z:.2f} m, {len(candidate.indices)} points{note}"
+    )

@@ -31,7 +31,6 @@ from shapecat.jit import kernel
 
 __all__ = ["join_pieces"]
 
-SMALL_CELLS = 75
 FEW = 3
 """Links between two pieces that are taken for a contact rather than for noise."""
 SAME_TOP_M = 0.015
@@ -50,7 +49,7 @@ def join_pieces(
 ) -> None:
     """Apply the rules named in ``rules``, in their order; `Pieces.group` holds the result."""
     if "small" in rules:
-        _join_small(pieces)
+        _join_small(pieces, cells.small)
     if "occluder" in rules:
         _join_behind(pieces, cells.w, cells.lens, surfaces.normal, labels)
     if "rim" in rules:
@@ -67,14 +66,14 @@ def _alive(pieces: Pieces, p: int) -> bool:
 
 
 @kernel
-def _join_small(pieces: Pieces) -> None:
+def _join_small(pieces: Pieces, small: int) -> None:
     """A piece smaller than about 9 cm2 belongs to what it touches most."""
     n = pieces.group.size
     again = True
     while again:
         again = False
         for p in range(1, n):
-            if not _alive(pieces, p) or pieces.shape[p, COUNT] >= SMALL_CELLS:
+            if not _alive(pieces, p) or pieces.shape[p, COUNT] >= small:
                 continue
             q = np.argmax(pieces.pairs[CONTACT, p])
             if pieces.pairs[CONTACT, p, q] > 0:
@@ -208,7 +207,7 @@ def _is_container(pieces: Pieces, inside: int, outside: int) -> bool:
     inner = x[RIGHTMOST] - x[LEFT]
     width = max(a[RIGHTMOST] - a[LEFT], inner)
     # An outside that something hides a part of may be wider than it looks.
-    cut = np.sum(pairs[FRONT, :, outside]) - pairs[FRONT, inside, outside] >= 3 * FEW
+    cut = np.sum(pairs[FRONT, :, outside]) - pairs[FRONT, inside, outside] >= 2 * FEW
     slack = max(SAME_SIDE_M, (CUT_SIDE if cut else SAME_SIDE) * width)
     if x[LEFT] < a[LEFT] - slack or x[RIGHTMOST] > a[RIGHTMOST] + slack:
         return False
@@ -266,7 +265,9 @@ def _join_enclosed(pieces: Pieces) -> None:
         for q in range(1, n):
             if q == p or not _alive(pieces, q):
                 continue
-            shared = pairs[CONTACT, p, q] + pairs[NEAR, p, q] + pairs[FRONT, p, q] + pairs[FRONT, q, p]
+            shared = (
+                pairs[CONTACT, p, q] + pairs[NEAR, p, q] + pairs[FRONT, p, q] + pairs[FRONT, q, p]
+            )
             if (
                 shared >= 0.8 * pieces.boundary[p]
                 and pairs[FRONT, q, p] >= 0.15 * pieces.boundary[p]

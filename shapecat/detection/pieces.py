@@ -94,14 +94,14 @@ def pieces_of(
         np.zeros(size, np.int8),
         np.arange(size).astype(np.int16),
     )
-    _meet(cells.w, heights.owner, heights.height, surfaces.links, surfaces.normal, labels, up, pieces)
+    _meet(
+        cells.w, heights.owner, heights.height, surfaces.links, surfaces.normal, labels, up, pieces
+    )
     side = np.cross(up, [0.0, 0.0, 1.0])
     if np.linalg.norm(side) < 0.2:  # the camera looks straight down
         side = gravity_rotation(up)[0]
     side /= np.linalg.norm(side)
-    _measure(
-        cells.w, cells.lens, heights.owner, heights.height, surfaces, labels, up, side, pieces
-    )
+    _measure(cells.w, cells.lens, heights.owner, heights.height, surfaces, labels, up, side, pieces)
     return pieces
 
 

@@ -5,8 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import Cells, Lens
+from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.detection.cells import NEAREST_M, Cells, Lens
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 
@@ -23,13 +23,17 @@ PARALLEL_COS = math.cos(math.radians(12))
 DIRECTIONS = 16
 MARGIN_M = 0.01
 BIN_M = 0.01
+MOST_LEVELS = 10
 LEAST_AREA_M2 = 0.03
 SURE_AREA_M2 = 0.25
 LEAST_CELLS = 100
 ARM = 3
 """Cells to each side over which a surface is seen to be level."""
 STEADY_COS = math.cos(math.radians(4))
+LIKELY_AREA_M2 = 0.1
 LEAST_DROP_M = 0.06
+LEAST_DROPS = 20
+CLOSED = 0.5
 
 
 class Support(NamedTuple):
@@ -84,7 +88,7 @@ def estimate_up(
 
 def _sample(w: F4) -> tuple[F4, int]:
     stride = max(1, round(math.sqrt(w.size / 4800)))
-    return np.ascontiguousarray(w[stride // 2 :: stride, stride // 2 :: stride]), stride
+    return w[stride // 2 :: stride, stride // 2 :: stride].copy(), stride
 
 
 def _triples(shape: tuple[int, ...], rng: np.random.Generator) -> I4:
@@ -221,29 +225,45 @@ def _clear(sample: F4, stride: int, plane: F8, tolerance: float) -> None:
 def find_supports(cells: Cells, up: F8) -> list[Support]:
     """Return the horizontal planes of the scene, lowest first (thesis Alg. 1)."""
     # (1), (2) readings whose surface is level
-    level = np.zeros(cells.w.shape[0] * cells.w.shape[1] // 4 + 1, np.int32)
-    height = np.zeros(level.size, np.float32)
-    n = _level_readings(cells.w, cells.lens, up, level, height)
-    level, height = level[:n], height[:n]
+    index = np.zeros(cells.w.shape[0] * cells.w.shape[1] // 4 + 1, np.int32)
+    height = np.zeros(index.size, np.float32)
+    n = _level_readings(cells.w, cells.lens, up, index, height)
+    if n < LEAST_CELLS:
+        return []
     # (3) one plane candidate for each accumulation in height
-    supports: list[Support] = []
-    while len(supports) < 8 and level.size:
-        base = float(height.min())
-        count = np.bincount(((height - base) / BIN_M).astype(np.int64))
-        count = np.convolve(count, [1, 2, 1], "same")
-        peak = base + (int(np.argmax(count)) + 0.5) * BIN_M
+    index, height = index[:n], height[:n]
+    base = float(height.min())
+    done = np.zeros(int((float(height.max()) - base) / BIN_M) + 1, bool)
+    supports: list[tuple[Support, I4]] = []
+    order, starts = _by_height(index, height, base, done.size)
+    for _ in range(MOST_LEVELS):
+        count = np.where(done, 0, np.diff(starts))
+        peak = int(np.argmax(np.convolve(count, [1, 2, 1], "same")))
+        low, high = max(peak - 2, 0), min(peak + 3, done.size)
+        near = order[starts[low] : starts[high]]
+        if near.size < LEAST_CELLS:
+            break
         # (4) refine, and keep what lies in the plane
-        near = abs(height - peak) < 2.5 * BIN_M
-        support = _refined(cells, level[near], height[near], up)
-        if support is None:
-            if count.max() < 200:
-                break
-        else:
-            supports.append(support)
-            near = abs(height - peak) < 3.5 * BIN_M
-        level, height = level[~near], height[~near]
+        support = _refined(cells, index[near], float(np.median(height[near])), up)
+        done[low:high] = True
+        if support is not None:
+            supports.append((support, index[near]))
+            rest = _off_plane(cells.w, index, support.a, support.b, support.c, 3 * TOLERANCE)
+            index, height = index[rest], height[rest]
+            order, starts = _by_height(index, height, base, done.size)
     # (5) ascending
-    return sorted(supports, key=lambda s: s.offset)
+    return _boards(cells, sorted(supports, key=lambda found: found[0].offset))
+
+
+@kernel
+def _off_plane(w: F4, index: I4, a: float, b: float, c: float, tolerance: float) -> Bool:
+    """Return which of the listed cells are not near a plane."""
+    columns = w.shape[1]
+    result = np.zeros(index.size, np.bool_)
+    for k in range(index.size):
+        i, j = index[k] // columns, index[k] % columns
+        result[k] = abs(w[i, j] - (a * j + b * i + c)) > tolerance
+    return result
 
 
 @kernel
@@ -274,13 +294,31 @@ def _level_readings(w: F4, lens: Lens, up: F8, index: I4, height: F4) -> int:
     return n
 
 
-def _refined(cells: Cells, index: I4, height: F4, up: F8) -> Support | None:
-    if index.size < LEAST_CELLS:
-        return None
-    lens, offset = cells.lens, float(np.median(height))
+@kernel
+def _by_height(index: I4, height: F4, base: float, bins: int) -> tuple[I4, I4]:
+    """Return the positions in ``index`` sorted by bins of height, and where each bin starts."""
+    starts = np.zeros(bins + 1, np.int64)
+    bin_of = np.zeros(index.size, np.int32)
+    for k in range(index.size):
+        bin_of[k] = min(int((height[k] - base) / BIN_M), bins - 1)
+        starts[bin_of[k] + 1] += 1
+    for k in range(bins):
+        starts[k + 1] += starts[k]
+    place = starts[:-1].copy()
+    order = np.zeros(index.size, np.int32)
+    for k in range(index.size):
+        order[place[bin_of[k]]] = k
+        place[bin_of[k]] += 1
+    return order, starts
+
+
+def _refined(cells: Cells, index: I4, offset: float, up: F8) -> Support | None:
+    lens = cells.lens
     # The level plane at that height, as inverse depth.
     level = np.array([up[0] / lens.fx, up[1] / lens.fy, 0.0])
     level[2] = up[2] - level[0] * lens.cx - level[1] * lens.cy
+    if abs(offset) < MARGIN_M:  # through the sensor: seen edge on
+        return None
     level /= offset
     plane = level.copy()
     for _ in range(3):
@@ -343,31 +381,116 @@ def _spread(
     w: F4, lens: Lens, index: I4, plane: F8, normal: F8, axes: F8, tolerance: float, reach: F8
 ) -> float:
     """Measure how far the plane reaches along `DIRECTIONS`; return its visible area in m2."""
-    columns = w.shape[1]
+    rows, columns = w.shape
     area = 0.0
-    step = 2 * math.pi / DIRECTIONS
+    # The outline is convex in the image too: the first and last cell of each row tell it.
+    first, last = np.full(rows, columns, np.int64), np.full(rows, -1, np.int64)
     for p in index:
         i0, j0 = p // columns, p % columns
-        if abs(w[i0, j0] - (plane[0] * j0 + plane[1] * i0 + plane[2])) >= tolerance:
+        level = plane[0] * j0 + plane[1] * i0 + plane[2]
+        if level <= 0 or abs(w[i0, j0] - level) >= tolerance:
             continue
+        x, y, z = (j0 - lens.cx) / lens.fx, (i0 - lens.cy) / lens.fy, 1 / level
+        facing = -(x * normal[0] + y * normal[1] + normal[2])
+        area += 4 * z * z / (lens.fx * lens.fy) / max(facing, 0.05)
         # The surface was seen to go on to all four sides.
-        for d in range(5):
-            i = i0 + (ARM if d == 1 else -ARM if d == 2 else 0)
-            j = j0 + (ARM if d == 3 else -ARM if d == 4 else 0)
+        for d in range(4):
+            i = i0 + (ARM if d == 0 else -ARM if d == 1 else 0)
+            j = j0 + (ARM if d == 2 else -ARM if d == 3 else 0)
             level = plane[0] * j + plane[1] * i + plane[2]
-            if level <= 0 or abs(w[i, j] - level) >= tolerance:
+            if level > 0 and abs(w[i, j] - level) < tolerance:
+                first[i] = min(first[i], j)
+                last[i] = max(last[i], j)
+    step = 2 * math.pi / DIRECTIONS
+    for i in range(rows):
+        for j in (first[i], last[i]):
+            if first[i] > last[i]:
                 continue
-            z = 1 / level
+            z = 1 / (plane[0] * j + plane[1] * i + plane[2])
             x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
-            if d == 0:
-                facing = -(x * normal[0] + y * normal[1] + z * normal[2]) / z
-                area += 4 * z * z / (lens.fx * lens.fy) / max(facing, 0.05)
             u = axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z
             v = axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z
             for k in range(DIRECTIONS):
-                far = math.cos(k * step) * u + math.sin(k * step) * v
-                reach[k] = max(reach[k], far)
+                reach[k] = max(reach[k], math.cos(k * step) * u + math.sin(k * step) * v)
     return area
+
+
+def _boards(cells: Cells, found: list[tuple[Support, I4]]) -> list[Support]:
+    """Leave out the tops of objects; ``found`` are planes, lowest first, and their cells.
+
+    Under the front edge of a table or shelf there is nothing; a box is closed down to what it
+    stands on. Things lower than 6 cm are never furniture, planes over a quarter of a square metre
+    always.
+    """
+    kept: list[Support] = []
+    for support, index in found:
+        below = [s for s in kept if _overlaps(s, support)]
+        drop = support.offset - below[-1].offset if below else math.inf
+        if drop < LEAST_DROP_M:
+            continue
+        if below and support.area_m2 < SURE_AREA_M2:
+            axes = gravity_rotation(support.up)
+            seen = np.zeros(2, np.int64)
+            plane = np.array([support.a, support.b, support.c])
+            _drop(cells.w, cells.lens, index, plane, support.up, axes, drop, seen)
+            if seen.sum() >= LEAST_DROPS:
+                if seen[0] > CLOSED * seen.sum():
+                    continue
+            elif support.area_m2 < LIKELY_AREA_M2:
+                continue
+        kept.append(support)
+    return kept
+
+
+def _overlaps(lower: Support, upper: Support) -> bool:
+    """Whether the middle of ``upper`` lies over the outline of ``lower``."""
+    middle = corners_of(upper).mean(axis=0)
+    flat = gravity_rotation(lower.up)[:2] @ middle
+    angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+    along = np.cos(angle) * flat[0] + np.sin(angle) * flat[1]
+    return bool((along < lower.reach).all())
+
+
+@kernel
+def _drop(w: F4, lens: Lens, index: I4, plane: F8, up: F8, axes: F8, drop: float, seen: I4) -> None:
+    """Look below the edge of a plane: count readings on a wall down from it, and beyond it."""
+    rows, columns = w.shape
+    for p in index[::3]:
+        i, j = p // columns, p % columns
+        level = plane[0] * j + plane[1] * i + plane[2]
+        if level <= 0 or abs(w[i, j] - level) >= TOLERANCE:
+            continue
+        z = 1 / level
+        x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
+        # Towards the camera, along the plane.
+        h = x * up[0] + y * up[1] + z * up[2]
+        tx, ty, tz = h * up[0] - x, h * up[1] - y, h * up[2] - z
+        length = math.sqrt(tx * tx + ty * ty + tz * tz)
+        if length < 0.05:
+            continue
+        step = 0.02 / length
+        ex, ey, ez = x + step * tx, y + step * ty, z + step * tz
+        if ez <= NEAREST_M:
+            continue
+        v, u = int(lens.cy + lens.fy * ey / ez + 0.5), int(lens.cx + lens.fx * ex / ez + 0.5)
+        if v < 0 or u < 0 or v >= rows or u >= columns or w[v, u] <= 0:
+            continue
+        if w[v, u] > 1 / ez - 2 * TOLERANCE:  # still the plane, or something in front of it
+            continue
+        for k in range(4, 20):
+            s = 0.01 * k
+            if s > drop - 0.01:
+                break
+            dx, dy, dz = x - s * up[0], y - s * up[1], z - s * up[2]
+            if dz <= NEAREST_M:
+                break
+            v, u = int(lens.cy + lens.fy * dy / dz + 0.5), int(lens.cx + lens.fx * dx / dz + 0.5)
+            if v < 0 or u < 0 or v >= rows or u >= columns:
+                break
+            if w[v, u] > 0:
+                behind = 1 / w[v, u] - dz
+                seen[0] += abs(behind) < 0.03
+                seen[1] += behind >= 0.03
 
 
 def corners_of(support: Support) -> F8:
@@ -377,7 +500,13 @@ def corners_of(support: Support) -> F8:
     step = 2 * np.pi / DIRECTIONS
     here, there = support.reach, np.roll(support.reach, -1)
     along = (there - here * np.cos(step)) / np.sin(step)
-    flat = np.stack([here * np.cos(angle) - along * np.sin(angle), here * np.sin(angle) + along * np.cos(angle)], 1)
+    flat = np.stack(
+        [
+            here * np.cos(angle) - along * np.sin(angle),
+            here * np.sin(angle) + along * np.cos(angle),
+        ],
+        1,
+    )
     level = gravity_rotation(support.up)
     corners = flat @ level[:2] + support.offset * level[2]
     return corners

@@ -5,14 +5,14 @@ touching and stacked objects (`regions`), and a few rules bring the pieces of on
 again (`joins`).
 """
 
-from collections.abc import Collection
 from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F8, I4, U1
+from shapecat.arrays import F4, F8, I4, U1
+from shapecat.config import DetectionSettings
 from shapecat.detection.cells import Cells
-from shapecat.detection.fill import fill_enclosed
+from shapecat.detection.fill import fill_enclosed, grow_feet
 from shapecat.detection.furniture import is_furniture
 from shapecat.detection.heights import heights_of
 from shapecat.detection.joins import join_pieces
@@ -23,7 +23,7 @@ from shapecat.detection.surfaces import surfaces_of
 
 __all__ = ["RULES", "Segmentation", "segment"]
 
-RULES = ("concave", "small", "occluder", "rim", "float", "enclosed", "fill")
+RULES = ("concave", "small", "occluder", "rim", "float", "enclosed", "feet", "fill")
 """The rules beyond the thesis, in their order. Without any of them what remains is the plane, the
 height above it, and depth jumps."""
 
@@ -36,6 +36,7 @@ class Segmentation(NamedTuple):
     up : (3,) unit vector.
     supports : the planes, lowest first.
     labels : (rows, columns) int16, 1..count, 0 elsewhere.
+    heights : (rows, columns) float32 metres above the plane.
     filled : (rows, columns) uint8, 1 where a label lies at the level of the plane.
     pieces : statistics of the regions the objects were joined from.
     leaders : (count + 1,) the piece that holds the sums of each label.
@@ -44,9 +45,15 @@ class Segmentation(NamedTuple):
     up: F8
     supports: list[Support]
     labels: I4
+    heights: F4
     filled: U1
     pieces: Pieces
     leaders: I4
+
+    @property
+    def owners(self) -> I4:
+        """The plane that each label stands above; 0 for label 0."""
+        return np.maximum(self.pieces.owner[self.leaders].astype(np.int64) - 1, 0)
 
 
 def segment(
@@ -54,24 +61,25 @@ def segment(
     hint: F8 | None,
     *,
     upright: bool,
-    highest_m: float,
-    largest_m: float,
-    rules: Collection[str],
+    settings: DetectionSettings,
     rng: np.random.Generator,
 ) -> Segmentation | None:
     """Find planes and objects among ``cells``; None if there is no supporting plane."""
+    rules = settings.rules.split()
     up = estimate_up(cells, hint, upright=upright, rng=rng)
     supports = [] if up is None else find_supports(cells, up)
     if up is None or not supports:
         return None
-    heights = heights_of(cells, supports, highest_m=highest_m)
+    heights = heights_of(cells, supports, highest_m=settings.max_height_m)
     surfaces = surfaces_of(cells, heights)
     regions, n = regions_of(heights, surfaces, concave="concave" in rules)
     pieces = pieces_of(cells, heights, surfaces, regions, n, up)
     join_pieces(pieces, cells, surfaces, regions, rules)
-    furniture = is_furniture(pieces, largest_m=largest_m)
+    furniture = is_furniture(pieces, largest_m=settings.max_size_m)
     pieces.group[furniture[pieces.group]] = 0
     leaders, number = np.unique(pieces.group, return_inverse=True)
     labels = number.astype(np.int16)[regions]
+    if "feet" in rules:
+        grow_feet(cells.w, heights.owner, heights.height, labels)
     filled = fill_enclosed(cells.w, labels, leaders.size - 1, active="fill" in rules)
-    return Segmentation(up, supports, labels, filled, pieces, leaders)
+    return Segmentation(up, supports, labels, heights.height, filled, pieces, leaders)

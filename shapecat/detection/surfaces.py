@@ -121,24 +121,19 @@ def _link(w: F4, owner: I4, tangent: F4, links: U1) -> None:
             me = owner[i, j]
             if me <= 0:
                 continue
-            here = tangent[i, j]
-            bits = 0
+            v, t, bits = w[i, j], tangent[i, j, 0], 0
             if j + 1 < columns and owner[i, j + 1] == me:
-                step = abs(w[i, j] - w[i, j + 1])
-                there = tangent[i, j + 1]
-                if here[0] > 0:
-                    step = min(step, abs(here[0] + here[1] - w[i, j + 1]))
-                if there[0] > 0:
-                    step = min(step, abs(there[0] - there[1] - w[i, j]))
-                bits |= RIGHT if step < jump else 0
+                v1, t1 = w[i, j + 1], tangent[i, j + 1, 0]
+                joined = abs(v - v1) < jump
+                joined |= (t > 0) & (abs(t + tangent[i, j, 1] - v1) < jump)
+                joined |= (t1 > 0) & (abs(t1 - tangent[i, j + 1, 1] - v) < jump)
+                bits |= RIGHT if joined else 0
             if i + 1 < rows and owner[i + 1, j] == me:
-                step = abs(w[i, j] - w[i + 1, j])
-                there = tangent[i + 1, j]
-                if here[0] > 0:
-                    step = min(step, abs(here[0] + here[2] - w[i + 1, j]))
-                if there[0] > 0:
-                    step = min(step, abs(there[0] - there[2] - w[i, j]))
-                bits |= DOWN if step < jump else 0
+                v1, t1 = w[i + 1, j], tangent[i + 1, j, 0]
+                joined = abs(v - v1) < jump
+                joined |= (t > 0) & (abs(t + tangent[i, j, 2] - v1) < jump)
+                joined |= (t1 > 0) & (abs(t1 - tangent[i + 1, j, 2] - v) < jump)
+                bits |= DOWN if joined else 0
             links[i, j] = bits
 
 

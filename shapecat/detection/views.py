@@ -7,14 +7,20 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import CELL_M, JUMP, NEAREST_M, Cells, Lens
+from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 from shapecat.types import Pose
 
-__all__ = ["View", "view_of"]
+__all__ = ["View", "overview_of", "view_of"]
 
 FIELD = 1.5
 """Largest tangent of the angle between a point and the optical axis."""
 MOST_CELLS = 400_000
+MOST_ROWS = 2000
+LEAST_POINTS = 100
+FARTHEST_M = 100.0
+LOAD = 1.8
+"""Points per occupied cell: with fewer, a surface has holes."""
 
 
 class View(NamedTuple):
@@ -42,26 +48,91 @@ def view_of(points: F4, *, range_m: float, origin: F8 | None = None) -> View | N
     The optical axis points at the middle of the cloud; the cells are as wide as the points are
     apart, and not narrower than those of depth images.
     """
-    used = np.isfinite(points).all(axis=1)
-    used &= np.abs(points, where=used[:, None], out=np.full(points.shape, np.inf, np.float32)).max(
-        axis=1, initial=0
-    ) <= 100 * range_m
-    if np.count_nonzero(used) < 100:
-        return None
     origin = np.zeros(3) if origin is None else origin
-    local = np.where(used[:, None], points - origin.astype(np.float32), np.float32(0))
-    distance = np.sqrt(np.einsum("ij,ij->i", local, local))
-    used &= (distance >= NEAREST_M) & (distance <= range_m * 1.5)
-    if np.count_nonzero(used) < 100:
+    axis, n = _middle(points, origin, range_m)
+    if n < LEAST_POINTS or np.linalg.norm(axis) < 0.3 * n:  # few, or all around the sensor
         return None
-    axis = (local[used] / distance[used, None]).mean(axis=0, dtype=np.float64)
-    if np.linalg.norm(axis) < 0.3:  # all around the sensor
+    rotation = _facing(axis)
+    pose = Pose(rotation, -rotation @ origin)
+    turned = np.zeros((len(points), 3), np.float32)
+    bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
+    n = _turn(points, pose.rotation, pose.translation, range_m, turned, bounds)
+    return _imaged(turned, bounds, n, pose) if n >= LEAST_POINTS else None
+
+
+def overview_of(
+    points: F4, hint: F8 | None, *, range_m: float, rng: np.random.Generator
+) -> View | None:
+    """Look at a cloud that was not taken from its origin, from above its dominant plane.
+
+    The plane is the one with most points within 1 cm of it, of 200 through three points (with a
+    ``hint``, of those within 15 degrees of level); its upper side is the one with more points.
+    The viewpoint is 1 m from the middle of the cloud, 45 degrees above the plane.
+    """
+    used = points[np.isfinite(points).all(axis=1) & (np.abs(points) < FARTHEST_M).all(axis=1)]
+    if len(used) < LEAST_POINTS:
         return None
-    pose = Pose(_facing(axis), -_facing(axis) @ origin)
-    turned = (local @ pose.rotation.T.astype(np.float32)).astype(np.float32)
-    used &= (turned[:, 2] >= NEAREST_M) & (turned[:, 2] <= range_m)
-    turned[~used] = 0
-    return _imaged(turned, used, pose)
+    sample = used[rng.choice(len(used), min(len(used), 4000), replace=False)].astype(np.float64)
+    a, b, c = sample[rng.integers(0, len(sample), (3, 200))]
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    normal = normal[length > 1e-9] / length[length > 1e-9, None]
+    a = a[length > 1e-9]
+    if hint is not None:
+        level = abs(normal @ hint) > 0.966
+        normal, a = normal[level], a[level]
+    if len(normal) == 0:
+        return None
+    height = sample @ normal.T - np.einsum("ij,ij->i", a, normal)
+    best = int(np.argmax(np.count_nonzero(abs(height) < 0.01, axis=0)))
+    up, above = normal[best], height[:, best]
+    if (
+        up @ hint
+        if hint is not None
+        else np.sum(abs(above) > 0.01, where=above > 0) * 2 - np.count_nonzero(abs(above) > 0.01)
+    ) < 0:
+        up = -up
+    middle = np.median(sample, axis=0)
+    side = gravity_rotation(up)[1]
+    origin = middle + math.sqrt(0.5) * (up - side)
+    return view_of(points, range_m=max(range_m, 2.0), origin=origin)
+
+
+@kernel
+def _middle(points: F4, origin: F8, range_m: float) -> tuple[F8, int]:
+    """Return the sum of the directions to the points within twice the range, and their number."""
+    axis = np.zeros(3)
+    n = 0
+    for k in range(points.shape[0]):
+        x, y, z = points[k, 0] - origin[0], points[k, 1] - origin[1], points[k, 2] - origin[2]
+        distance = math.sqrt(x * x + y * y + z * z)
+        if (distance >= NEAREST_M) & (distance <= 2 * range_m):  # never so for NaN
+            axis[0] += x / distance
+            axis[1] += y / distance
+            axis[2] += z / distance
+            n += 1
+    return axis, n
+
+
+@kernel
+def _turn(points: F4, rotation: F8, translation: F8, range_m: float, turned: F4, bounds: F8) -> int:
+    """Move the points in view to the virtual camera; return how many, and their image bounds."""
+    n = 0
+    for k in range(points.shape[0]):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
+        if not ((depth >= NEAREST_M) & (depth <= range_m)):
+            continue
+        across = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
+        down = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
+        u, v = across / depth, down / depth
+        if not ((abs(u) < FIELD) & (abs(v) < FIELD)):
+            continue
+        turned[k, 0], turned[k, 1], turned[k, 2] = across, down, depth
+        bounds[0], bounds[2] = min(bounds[0], u), max(bounds[2], u)
+        bounds[1], bounds[3] = min(bounds[1], v), max(bounds[3], v)
+        n += 1
+    return n
 
 
 def _facing(axis: F8) -> F8:
@@ -73,48 +144,56 @@ def _facing(axis: F8) -> F8:
     return np.stack([x, np.cross(z, x), z])
 
 
-def _imaged(turned: F4, used: I4, pose: Pose) -> View | None:
-    z = turned[used, 2]
-    if z.size < 100:
-        return None
-    x, y = turned[used, 0] / z, turned[used, 1] / z
-    inside = np.maximum(abs(x), abs(y)) < FIELD
-    x, y, z = x[inside], y[inside], z[inside]
-    if z.size < 100:
-        return None
-    pitch = max(CELL_M / float(np.median(z)), 1.2 * _spacing(x, y))
-    box = float(np.ptp(x)) * float(np.ptp(y))
-    pitch = max(pitch, math.sqrt(box / MOST_CELLS), 1e-6)
-    left, top = float(x.min()), float(y.min())
+def _imaged(turned: F4, bounds: F8, n: int, pose: Pose) -> View:
+    left, top, right, bottom = (float(v) for v in bounds)
+    width, height = right - left, bottom - top
+    z = turned[:: max(1, n // 20_000), 2]
+    depth = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
+    pitch = max(
+        CELL_M / depth,
+        _spacing(turned, bounds, n),
+        math.sqrt(width * height / MOST_CELLS),
+        max(width, height) / MOST_ROWS,
+        1e-6,
+    )
     lens = Lens(1 / pitch, 1 / pitch, -left / pitch, -top / pitch)
-    shape = (int(np.ptp(y) / pitch + 1.5), int(np.ptp(x) / pitch + 1.5))
-    w = np.zeros(shape, np.float32)
+    w = np.zeros((int(height / pitch + 1.5), int(width / pitch + 1.5)), np.float32)
     cell = np.full(len(turned), -1, np.int32)
-    behind = _project(turned, lens, FIELD, w, cell)
+    behind = _project(turned, lens, w, cell)
     _close_holes(w)
-    return View(Cells(w, lens, 1), turned, cell, pose, behind / z.size)
+    return View(Cells(w, lens, 1, pitch * depth), turned, cell, pose, behind / n)
 
 
-def _spacing(x: F4, y: F4) -> float:
-    """Return the typical distance of neighbours in the image plane.
+def _spacing(turned: F4, bounds: F8, n: int) -> float:
+    """Return the pitch of an image in which nearly every cell of a surface has a point.
 
-    Squares are halved until they hold one point or two on average.
+    On a grid that is fine against the points every point has a cell of its own; coarser grids
+    are tried until a cell holds ``LOAD`` points on average.
     """
-    span = max(float(np.ptp(x)), float(np.ptp(y)), 1e-6)
-    cut = span / 32
-    for _ in range(9):
-        key = ((x - x.min()) / cut).astype(np.int64) * 100_000 + ((y - y.min()) / cut).astype(
-            np.int64
-        )
-        load = x.size / np.unique(key).size
-        if load < 3:
+    span = max(bounds[2] - bounds[0], bounds[3] - bounds[1], 1e-6)
+    side = 1024
+    while side > 16:
+        if n >= LOAD * _occupied(turned, bounds[0], bounds[1], side / span * 0.999, side):
             break
-        cut /= 1.5
-    return cut * math.sqrt(1 / load)
+        side = int(side / 1.25)
+    return float(span / side)
 
 
 @kernel
-def _project(points: F4, lens: Lens, field: float, w: F4, cell: I4) -> int:
+def _occupied(turned: F4, left: float, top: float, scale: float, side: int) -> int:
+    seen = np.zeros((side, side), np.uint8)
+    n = 0
+    for k in range(turned.shape[0]):
+        z = turned[k, 2]
+        if z > 0:
+            j, i = int((turned[k, 0] / z - left) * scale), int((turned[k, 1] / z - top) * scale)
+            n += seen[i, j] == 0
+            seen[i, j] = 1
+    return n
+
+
+@kernel
+def _project(points: F4, lens: Lens, w: F4, cell: I4) -> int:
     """Average the nearest points of each cell; return how many lie well behind them."""
     rows, columns = w.shape
     nearest = np.zeros(w.shape, np.float32)
@@ -124,8 +203,6 @@ def _project(points: F4, lens: Lens, field: float, w: F4, cell: I4) -> int:
         if not z > 0:
             continue
         x, y = points[k, 0] / z, points[k, 1] / z
-        if not ((abs(x) < field) & (abs(y) < field)):
-            continue
         j, i = int(lens.fx * x + lens.cx + 0.5), int(lens.fy * y + lens.cy + 0.5)
         if i < 0 or j < 0 or i >= rows or j >= columns:
             continue

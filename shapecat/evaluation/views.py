@@ -40,8 +40,16 @@ class DescribedViews(NamedTuple):
 
     def where(self, chosen: np.ndarray) -> "DescribedViews":
         """Return the chosen views: a mask or indices."""
-        *arrays, skipped = self
-        return DescribedViews(*(values[chosen] for values in arrays), skipped=skipped)
+        descriptors, labels, instances, points, distances, seconds, skipped = self
+        return DescribedViews(
+            descriptors[chosen],
+            labels[chosen],
+            instances[chosen],
+            points[chosen],
+            distances[chosen],
+            seconds[chosen],
+            skipped,
+        )
 
 
 class DescribedView(NamedTuple):

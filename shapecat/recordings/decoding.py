@@ -20,7 +20,7 @@ from rosbags.typesys.store import Typestore
 
 from shapecat.recordings.messages import Channel, Message, MessageError
 
-__all__ = ["LIBRARY_ERRORS", "Decoder", "decode", "typestore_of"]
+__all__ = ["LIBRARY_ERRORS", "Decoder", "decode", "schema_of", "typestore_of"]
 
 Decoder = Callable[[bytes | memoryview], Any]
 
@@ -131,3 +131,14 @@ def _json(_channel: Channel) -> Decoder:
 
 
 _DECODERS: dict[str, Callable[[Channel], Decoder]] = {"cdr": _cdr, "ros1": _ros1, "json": _json}
+
+
+def schema_of(channel: Channel) -> tuple[str, str, bytes]:
+    """Return name, encoding and text of a channel's schema, from the store where it has none."""
+    if channel.schema or channel.encoding != "cdr":
+        return channel.schema_name, channel.schema_encoding, channel.schema
+    store = _builtin("cdr")
+    if channel.type not in store.fielddefs:
+        return channel.schema_name, "", b""
+    text, _ = store.generate_msgdef(channel.type, ros_version=2)
+    return channel.schema_name, "ros2msg", text.encode()

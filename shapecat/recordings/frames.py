@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -97,7 +98,7 @@ class _Source:
             index=index,
             stamp_ns=self.clock.check(stamp_ns(header), message.log_time_ns),
             log_time_ns=message.log_time_ns,
-            frame_id=str(header.frame_id).removeprefix("/"),
+            frame_id=str(header.frame_id),
             **content,
         )
 
@@ -177,6 +178,8 @@ class _Depth(_Source):
             return
         (message, index, image), self.waiting = self.waiting, None
         if self.info is None:
+            self.info = _first_info(self.recording, self.info_topic)
+        if self.info is None:
             skipped["depth image without camera info"] += 1
             return
         try:
@@ -196,6 +199,14 @@ class _Depth(_Source):
         if not distorted:
             return {"depth": depth, "camera": camera}
         return self.lens.content(self.recording, self.stream.topic, self.info, camera, depth)
+
+
+def _first_info(recording: Recording, topic: str) -> Any:
+    """Return the first calibration of the recording, which may lie before the chosen window."""
+    for message in recording.messages([topic]):
+        with suppress(MessageError):
+            return recording.decode(message)
+    return None
 
 
 class _Lens:

@@ -33,7 +33,7 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
 
     Column u sees x / z = (u - cx) / fx, so u is linear in x / z with slope fx and offset cx, and
     the same holds for rows: two least-squares lines through a few thousand points, in double
-    precision, refitted without outliers.
+    precision, first through medians, then refitted without outliers.
 
     Parameters
     ----------
@@ -53,16 +53,16 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
     ):
         return None
     u, v, x, y = sample
-    keep = np.ones(u.size, bool)
+    fx, cx = _line(*_medians(x, u))
+    fy, cy = _line(*_medians(y, v))
     for _ in range(3):
-        fx, cx = _line(x[keep], u[keep])
-        fy, cy = _line(y[keep], v[keep])
         error = np.hypot(fx * x + cx - u, fy * y + cy - v)
         keep = error <= max(3.0 * float(np.median(error)), 1e-3)
-    if not (fx > 0 and fy > 0 and np.percentile(error, 95) < LARGEST_ERROR_PX):
-        return None
+        fx, cx = _line(x[keep], u[keep])
+        fy, cy = _line(y[keep], v[keep])
     camera = Camera(width, height, fx, fy, cx, cy)
-    return PinholeFit(camera, float(np.sqrt(np.mean(error[keep] ** 2))))
+    largest, rms = _errors(camera, sample)
+    return PinholeFit(camera, rms) if fx > 0 and fy > 0 and largest < LARGEST_ERROR_PX else None
 
 
 def still_fits(fit: PinholeFit, points: F4) -> bool:
@@ -70,11 +70,16 @@ def still_fits(fit: PinholeFit, points: F4) -> bool:
     camera, sample = fit.camera, _sample(points)
     if sample is None:
         return points.shape[:2] == (camera.height, camera.width)  # nothing speaks against it
+    largest, rms = _errors(camera, sample)
+    return largest < LARGEST_ERROR_PX and rms < 2 * fit.error_px + 0.02
+
+
+def _errors(camera: Camera, sample: tuple[F8, F8, F8, F8]) -> tuple[float, float]:
+    """Return the distance in pixels that 95 % do not exceed, and the RMS without outliers."""
     u, v, x, y = sample
     error = np.hypot(camera.fx * x + camera.cx - u, camera.fy * y + camera.cy - v)
     keep = error <= max(3.0 * float(np.median(error)), 1e-3)
-    rms = float(np.sqrt(np.mean(error[keep] ** 2)))
-    return bool(np.percentile(error, 95) < LARGEST_ERROR_PX and rms < 2 * fit.error_px + 0.02)
+    return float(np.percentile(error, 95)), float(np.sqrt(np.mean(error[keep] ** 2)))
 
 
 def _sample(points: F4) -> tuple[F8, F8, F8, F8] | None:
@@ -96,6 +101,15 @@ def _sample(points: F4) -> tuple[F8, F8, F8, F8] | None:
         v.astype(float),
         chosen[:, 0] / chosen[:, 2],
         chosen[:, 1] / chosen[:, 2],
+    )
+
+
+def _medians(a: F8, b: F8) -> tuple[F8, F8]:
+    """Summarize points by their medians in 16 bins of ``b``, which outliers cannot move far."""
+    groups = np.array_split(np.argsort(b, kind="stable"), 16)
+    return (
+        np.array([np.median(a[group]) for group in groups]),
+        np.array([np.median(b[group]) for group in groups]),
     )
 
 

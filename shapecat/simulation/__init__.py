@@ -1,1 +1,26 @@
-"""simulation."""
+"""Simulated depth cameras looking at simulated scenes: fixtures, demos and training data.
+
+Everything comes from a seed and is the same on every machine.
+"""
+
+from shapecat.simulation.recorder import record, simulate
+from shapecat.simulation.scenes import make_scene, resting_thing
+from shapecat.simulation.sensors import IDEAL, KINECT, REALSENSE, Sensor, measure
+from shapecat.simulation.views import render_frame
+from shapecat.simulation.worlds import Support, Thing, World
+
+__all__ = [
+    "IDEAL",
+    "KINECT",
+    "REALSENSE",
+    "Sensor",
+    "Support",
+    "Thing",
+    "World",
+    "make_scene",
+    "measure",
+    "record",
+    "render_frame",
+    "resting_thing",
+    "simulate",
+]

@@ -2,34 +2,47 @@
 
 import numpy as np
 
-from shapecat.arrays import F4, I4, U2
+from shapecat.arrays import F4, F8, U2, Bool
 from shapecat.config import SurfaceSettings
 from shapecat.jit import kernel
-from shapecat.surface.graph import link
+from shapecat.surface.graph import edge_list, link
 from shapecat.surface.growth import (
-    ABSENT,
     FAR,
+    Cloud,
+    Gas,
+    connect,
+    empty_gas,
     grow_fritzke,
     grow_thesis,
-    nearest_spacing,
+    index_mask,
 )
-from shapecat.surface.lanes import LANES
+from shapecat.surface.lanes import LANES, two_nearest
 from shapecat.types import NeuralGas
 
-__all__ = ["MIN_POINTS", "reconstruct"]
+__all__ = ["MAX_NEURONS", "MIN_POINTS", "reconstruct"]
 
 MIN_POINTS = 24
 """Clouds with fewer points have no surface to speak of."""
 MAX_NEURONS = 512
-"""Most neurons that can be asked for: winner search keeps the index in 9 or 10 bits of a float."""
+"""Most neurons that can be asked for: distances are compared without their 10 lowest bits."""
 _MAX_POINTS = 1200
-"""Of more points every k-th is fired: the result does not get better, only slower."""
+"""Of more points every k-th is fired: the result does not get better with more, only slower."""
+_NEURONS_PER_POINT = 0.45
 _FEWEST_NEURONS = 12
-_POINTS_PER_NEURON = 1 / 0.45
+_RATE, _WARM_RATE = 0.1, 0.15
+"""Epsilon_b, the share of the way the nearest neuron moves, at the start."""
 _RATE_NEIGHBOUR = 0.06
-"""Learning rate of the neighbours as a share of the winner's."""
+"""Epsilon_n as a share of epsilon_b."""
+_OLDEST, _WARM_OLDEST = 30, 50
+"""Age beyond which an edge goes (a_max)."""
+_GROWTH = 0.6
+"""Share of the signals after which all neurons are there."""
 _EPOCHS = 8
-"""Most epochs of the thesis's rule."""
+"""Most epochs of the thesis's rule: it has hardly ever reached its distance limit before."""
+_ERROR_LIMIT = 3.0
+"""t_gamma, in errors a neuron with its share of the surface gathers in an epoch."""
+_DISTANCE_LIMIT = 0.7
+"""t_alpha, in spacings of the points: below it lies only their noise."""
 
 
 def reconstruct(
@@ -41,71 +54,77 @@ def reconstruct(
 ) -> NeuralGas | None:
     """Learn the surface of one object as a graph.
 
-    The gas is computed in units of the cloud's own size: scaling or moving the points does the
-    same to the neurons, up to rounding.
+    It is computed in units of the object's size: moving or scaling the points does the same to
+    the neurons, up to rounding.
 
     Parameters
     ----------
-    points : (m, 3) metres, finite, evenly spread (see `voxelize`). Of more than 1200 every k-th
-        is used.
+    points : (m, 3) metres, finite, evenly spread (see `voxelize`), in any frame. Of more than
+        1200 every k-th is used.
+    settings : ``method`` "fritzke" inserts a neuron every so many signals (thesis Algorithm 3),
+        "thesis" where the error is large (Algorithm 4).
     rng : draws one number; the same points, settings and generator give the same graph.
-    start : an earlier graph of the same object, near the points, in their frame. It is adapted
-        with ``settings.warm_signals`` signals instead of growing from two neurons; only with
-        ``method="fritzke"``.
+    start : an earlier graph of the same object, in the frame of the points. It is adapted with
+        ``settings.warm_signals`` signals instead of growing one from two neurons. Ignored by
+        ``method="thesis"``.
 
     Returns
     -------
-    A connected graph of 3 or more neurons, each the nearest of some point, without isolated
-    neurons; within the hull of the points, unless a warm start left some beside it. None for fewer
-    than `MIN_POINTS` points, or where they lie in fewer than three places.
+    A connected graph of at least 3 neurons, each the nearest of some point and within the hull of
+    the points. None for fewer than `MIN_POINTS` points, or where they lie in so few places that
+    no 3 neurons are left.
 
     Raises
     ------
-    ValueError : the points are not finite or not (m, 3), or the settings ask for more than 512
-        neurons.
+    ValueError : the points are not (m, 3) or not finite, or more than `MAX_NEURONS` neurons are
+        asked for.
 
     Notes
     -----
-    Sources: Fritzke, *A growing neural gas network learns topologies*, 1995; thesis ch. 5.
-    Time is proportional to signals times neurons and hardly depends on the number of points.
+    Time grows with signals times neurons and hardly depends on the number of points. Sources:
+    Fritzke, *A growing neural gas network learns topologies*, 1995; thesis ch. 5. Deviations are
+    marked ``differs:`` in the kernels.
     """
-    points = np.ascontiguousarray(points, np.float32)
+    points = np.ascontiguousarray(points, np.float32).view()
     if points.ndim != 2 or points.shape[1] != 3:
         msg = f"expected points of shape (m, 3), got {points.shape}"
         raise ValueError(msg)
-    if settings.neurons > MAX_NEURONS:
-        msg = f"at most {MAX_NEURONS} neurons, got {settings.neurons}"
+    most = max(settings.neurons, 0 if start is None else len(start.neurons))
+    if most > MAX_NEURONS:
+        msg = f"at most {MAX_NEURONS} neurons, got {most}"
         raise ValueError(msg)
     if len(points) < MIN_POINTS:
         return None
-    warm = start is not None and settings.method == "fritzke"
-    neurons, edges, finite = _reconstruct(
-        points,
-        int(rng.integers(1 << 62)),
-        settings.method == "thesis",
-        settings.neurons,
-        settings.warm_signals if warm else settings.signals,
-        settings.component_share,
-        start.neurons if start is not None and warm else _NO_NEURONS,
-        start.edges if start is not None and warm else _NO_EDGES,
-    )
+    points.flags.writeable = False  # one compiled version for read-only and other arrays
+    seed = int(rng.integers(1 << 62))
+    if settings.method == "thesis":
+        found = _by_thesis(points, seed, settings.neurons, settings.component_share)
+    else:
+        signals = settings.signals if start is None else settings.warm_signals
+        first = _NOTHING if start is None else start
+        found = _by_fritzke(
+            points,
+            seed,
+            settings.neurons,
+            signals,
+            settings.component_share,
+            first.neurons,
+            first.edges,
+        )
+    neurons, edges, finite = found
     if not finite:
         msg = "points must be finite"
         raise ValueError(msg)
     return NeuralGas(neurons, edges) if len(neurons) else None
 
 
-_NO_NEURONS = np.zeros((0, 3), np.float32)
-_NO_EDGES = np.zeros((0, 2), np.uint16)
-for _constant in (_NO_NEURONS, _NO_EDGES):
-    _constant.flags.writeable = False  # as the arrays of a NeuralGas: one compiled signature
+_NOTHING = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
 
 
 @kernel
-def _reconstruct(
+def _by_fritzke(
     points: F4,
     seed: int,
-    thesis: bool,
     neurons: int,
     signals: int,
     share: float,
@@ -113,194 +132,165 @@ def _reconstruct(
     start_edges: U2,
 ) -> tuple[F4, U2, bool]:
     """Return neurons, edges, and whether the points were finite."""
-    nothing = np.zeros((0, 3), np.float32), np.zeros((0, 2), np.uint16)
-    step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
-    size = (points.shape[0] + step - 1) // step
-    mean_x = mean_y = mean_z = 0.0
-    for i in range(0, points.shape[0], step):
-        mean_x += points[i, 0] / size
-        mean_y += points[i, 1] / size
-        mean_z += points[i, 2] / size
-    extent = 0.0
-    for i in range(0, points.shape[0], step):
-        extent = max(extent, abs(points[i, 0] - mean_x))
-        extent = max(extent, abs(points[i, 1] - mean_y))
-        extent = max(extent, abs(points[i, 2] - mean_z))
-    if not extent < np.inf:
-        return nothing[0], nothing[1], False
-    if extent == 0.0:
-        return nothing[0], nothing[1], True
-    px = np.zeros(size, np.float32)
-    py = np.zeros(size, np.float32)
-    pz = np.zeros(size, np.float32)
-    for i in range(size):
-        px[i] = (points[i * step, 0] - mean_x) / extent
-        py[i] = (points[i * step, 1] - mean_y) / extent
-        pz[i] = (points[i * step, 2] - mean_z) / extent
-
-    wanted = max(3, min(neurons, max(_FEWEST_NEURONS, int(size / _POINTS_PER_NEURON))))
-    most = 2 * wanted if thesis else wanted
-    capacity = (max(most, start_neurons.shape[0]) + LANES) // LANES * LANES
-    x = np.full(capacity, FAR, np.float32)
-    y = np.full(capacity, FAR, np.float32)
-    z = np.full(capacity, FAR, np.float32)
-    born = np.full(capacity * capacity, ABSENT, np.int32)
-    degree = np.zeros(capacity, np.int32)
+    cloud, frame = _normalise(points)
+    target = _wanted(cloud, neurons)
+    gas = empty_gas(max(target, start_neurons.shape[0]))
     state = np.uint64(seed)
-
     count = 0
-    if start_neurons.shape[0] > 2:
-        count = start_neurons.shape[0]
-        for i in range(count):
-            x[i] = (start_neurons[i, 0] - mean_x) / extent
-            y[i] = (start_neurons[i, 1] - mean_y) / extent
-            z[i] = (start_neurons[i, 2] - mean_z) / extent
-        count = _adopt(px, py, pz, x, y, z, born, degree, count, start_edges)
-    if count > 2:
-        missing = max(1, wanted - count)
-        interval = max(1, min(60, int(0.6 * signals) // missing))
-        count = grow_fritzke(
-            px,
-            py,
-            pz,
-            state,
-            x,
-            y,
-            z,
-            born,
-            degree,
-            count,
-            wanted,
-            signals,
-            interval,
-            0.15,
-            0.15 * _RATE_NEIGHBOUR,
-            50,
-        )
+    if not frame[3] < np.inf:
+        return _in_metres(gas, np.zeros((0, 0), np.bool_), frame)
+    if start_neurons.shape[0] >= 3:
+        count = _adopt(cloud, gas, start_neurons, start_edges, frame)
+    if count >= 3:
+        rate, oldest = _WARM_RATE, _WARM_OLDEST
+        interval = min(60, int(_GROWTH * signals) // max(target - count, 1))
     else:
-        count = 2
-        # 1. to 3. two of the points, linked
-        for i in range(2):
-            k = i * (size // 2) + np.int64((state >> np.uint64(20 * i)) % np.uint64(size // 2))
-            x[i], y[i], z[i] = px[k], py[k], pz[k]
-        born[1] = 0
-        born[capacity] = 0
-        degree[:2] = 1
-        if thesis:
-            # differs: thresholds are relative to the object. A neuron's share of the surface is
-            # a square of side h with mean squared distance h**2 / 6 to its centre.
-            spacing = nearest_spacing(px, py, pz, 64)
-            h2 = size * (1.15 * spacing) ** 2 / wanted
-            count = grow_thesis(
-                px,
-                py,
-                pz,
-                state,
-                x,
-                y,
-                z,
-                born,
-                degree,
-                count,
-                most,
-                _EPOCHS,
-                3.0 * (size / wanted) * h2 / 6.0,
-                0.7 * spacing,
-                0.1,
-                0.1 * _RATE_NEIGHBOUR,
-                30,
-            )
-        else:
-            interval = max(1, int(0.6 * signals) // wanted)
-            count = grow_fritzke(
-                px,
-                py,
-                pz,
-                state,
-                x,
-                y,
-                z,
-                born,
-                degree,
-                count,
-                wanted,
-                signals,
-                interval,
-                0.1,
-                0.1 * _RATE_NEIGHBOUR,
-                30,
-            )
-    count, adjacent = link(px, py, pz, x, y, z, born, count, share)
-    result = np.zeros((count, 3), np.float32)
-    for i in range(count):
-        result[i, 0] = x[i] * extent + mean_x
-        result[i, 1] = y[i] * extent + mean_y
-        result[i, 2] = z[i] * extent + mean_z
-    edges = np.zeros((count * count // 2, 2), np.uint16)
-    found = 0
-    for i in range(count):
-        for j in range(i + 1, count):
-            if adjacent[i, j]:
-                edges[found, 0] = i
-                edges[found, 1] = j
-                found += 1
-    return result, edges[:found].copy(), True
+        rate, oldest = _RATE, _OLDEST
+        interval = int(_GROWTH * signals) // target
+        count = _two_points(cloud, gas, state)
+    count = grow_fritzke(
+        cloud, state, gas, count, target, signals,
+        max(interval, 1), rate, rate * _RATE_NEIGHBOUR, oldest,
+    )  # fmt: skip
+    _, adjacent = link(cloud, gas, count, share)
+    return _in_metres(gas, adjacent, frame)
 
 
 @kernel
-def _adopt(
-    px: F4,
-    py: F4,
-    pz: F4,
-    x: F4,
-    y: F4,
-    z: F4,
-    born: I4,
-    degree: I4,
-    count: int,
-    edges: U2,
-) -> int:
+def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U2, bool]:
+    """Return neurons, edges, and whether the points were finite."""
+    cloud, frame = _normalise(points)
+    target = _wanted(cloud, neurons)
+    # differs: a bound on the neurons, for memory; and thresholds relative to the object. A neuron
+    # with its share of the surface, a square of side h, has a mean squared distance of h**2 / 6.
+    gas = empty_gas(2 * target)
+    if not frame[3] < np.inf:
+        return _in_metres(gas, np.zeros((0, 0), np.bool_), frame)
+    state = np.uint64(seed)
+    count = _two_points(cloud, gas, state)
+    spacing = _spacing(cloud, 64)
+    each = cloud.x.size / target
+    square = each * (1.15 * spacing) ** 2
+    count = grow_thesis(
+        cloud, state, gas, count, 2 * target, _EPOCHS,
+        _ERROR_LIMIT * each * square / 6, _DISTANCE_LIMIT * spacing,
+        _RATE, _RATE * _RATE_NEIGHBOUR, _OLDEST,
+    )  # fmt: skip
+    _, adjacent = link(cloud, gas, count, share)
+    return _in_metres(gas, adjacent, frame)
+
+
+@kernel
+def _normalise(points: F4) -> tuple[Cloud, F8]:
+    """Return at most `_MAX_POINTS` points within -1 to 1, and the frame to undo it.
+
+    The frame is (x, y, z of the mean, largest distance from it along an axis): infinite where a
+    point is.
+    """
+    step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
+    size = (points.shape[0] + step - 1) // step
+    frame = np.zeros(4)
+    for i in range(0, points.shape[0], step):
+        for axis in range(3):
+            frame[axis] += points[i, axis] / size
+    for i in range(points.shape[0]):
+        for axis in range(3):
+            distance = abs(points[i, axis] - frame[axis])
+            if not distance <= frame[3]:  # also for NaN
+                frame[3] = distance if distance < np.inf else np.inf
+    unit = frame[3] if frame[3] > 0 else 1.0
+    x = np.zeros(size, np.float32)
+    y = np.zeros(size, np.float32)
+    z = np.zeros(size, np.float32)
+    for i in range(size):
+        x[i] = (points[i * step, 0] - frame[0]) / unit
+        y[i] = (points[i * step, 1] - frame[1]) / unit
+        z[i] = (points[i * step, 2] - frame[2]) / unit
+    return Cloud(x, y, z), frame
+
+
+@kernel
+def _in_metres(gas: Gas, adjacent: Bool, frame: F8) -> tuple[F4, U2, bool]:
+    count = adjacent.shape[0]
+    neurons = np.zeros((count, 3), np.float32)
+    for i in range(count):
+        neurons[i, 0] = gas.x[i] * frame[3] + frame[0]
+        neurons[i, 1] = gas.y[i] * frame[3] + frame[1]
+        neurons[i, 2] = gas.z[i] * frame[3] + frame[2]
+    return neurons, edge_list(adjacent), frame[3] < np.inf
+
+
+@kernel
+def _wanted(cloud: Cloud, neurons: int) -> int:
+    most = max(_FEWEST_NEURONS, int(_NEURONS_PER_POINT * cloud.x.size))
+    return max(3, min(neurons, most))
+
+
+@kernel
+def _two_points(cloud: Cloud, gas: Gas, state: np.uint64) -> int:
+    """Do steps 1 to 3: two random points, one from each half of the cloud, linked."""
+    half = cloud.x.size // 2
+    for i in range(2):
+        k = i * half + np.int64((state >> np.uint64(20 * i)) % np.uint64(half))
+        gas.x[i], gas.y[i], gas.z[i] = cloud.x[k], cloud.y[k], cloud.z[k]
+    connect(gas, 0, 1)
+    return 2
+
+
+@kernel
+def _adopt(cloud: Cloud, gas: Gas, neurons: F4, edges: U2, frame: F8) -> int:
     """Take over an earlier graph without the neurons that are nearest to no point.
 
-    Returns the number of neurons that stay, 0 where fewer than 3 do. A neuron that loses its last
-    neighbour is linked to the one before it.
+    Returns the number of neurons that stay: 0 where fewer than 3 would.
     """
-    members = np.zeros(count, np.int64)
-    for k in range(px.size):
-        best = np.inf
-        nearest = 0
-        for i in range(count):
-            squared = (x[i] - px[k]) ** 2 + (y[i] - py[k]) ** 2 + (z[i] - pz[k]) ** 2
-            if squared < best:
-                best, nearest = squared, i
-        members[nearest] += 1
-    stride = x.size
+    count = neurons.shape[0]
+    unit = frame[3] if frame[3] > 0 else 1.0
+    for i in range(count):
+        x, y, z = (neurons[i] - frame[:3]) / unit
+        if abs(x) < 1e6 and abs(y) < 1e6 and abs(z) < 1e6:
+            gas.x[i], gas.y[i], gas.z[i] = x, y, z
+    padded = (count + LANES - 1) // LANES * LANES
+    mask = index_mask(padded)
+    used = np.zeros(padded, np.bool_)
+    for k in range(cloud.x.size):
+        a, _ = two_nearest(gas.x, gas.y, gas.z, padded, cloud.x[k], cloud.y[k], cloud.z[k], mask)
+        used[a] = True
     place = np.full(count, -1, np.int64)
     kept = 0
     for i in range(count):
-        if members[i] > 0:
+        if used[i]:
             place[i] = kept
-            x[kept], y[kept], z[kept] = x[i], y[i], z[i]
+            gas.x[kept], gas.y[kept], gas.z[kept] = gas.x[i], gas.y[i], gas.z[i]
             kept += 1
-    x[kept:count] = FAR
-    y[kept:count] = FAR
-    z[kept:count] = FAR
+    gas.x[kept:count] = FAR
+    gas.y[kept:count] = FAR
+    gas.z[kept:count] = FAR
     if kept < 3:
         return 0
     for e in range(edges.shape[0]):
         i, j = np.int64(edges[e, 0]), np.int64(edges[e, 1])
-        if i < count and j < count and place[i] >= 0 and place[j] >= 0 and i != j:
-            _link_fresh(born, degree, stride, place[i], place[j])
+        if i < j < count and place[i] >= 0 and place[j] >= 0:
+            connect(gas, place[i], place[j])
     for i in range(kept):
-        if degree[i] == 0:
-            _link_fresh(born, degree, stride, i, i - 1 if i > 0 else 1)
+        if gas.degree[i] == 0:  # its neighbours are gone
+            connect(gas, i, (i + 1) % kept)
     return kept
 
 
-@kernel
-def _link_fresh(born: I4, degree: I4, stride: int, i: int, j: int) -> None:
-    if born[i * stride + j] == ABSENT:
-        degree[i] += 1
-        degree[j] += 1
-    born[i * stride + j] = 0
-    born[j * stride + i] = 0
+@kernel(fast=True)
+def _spacing(cloud: Cloud, samples: int) -> float:
+    """Return the mean distance to the nearest other point, over a sample of the points."""
+    x, y, z = cloud.x, cloud.y, cloud.z
+    step = max(1, x.size // samples)
+    total = 0.0
+    taken = 0
+    for i in range(0, x.size, step):
+        best = FAR
+        for k in range(x.size):
+            dx, dy, dz = x[k] - x[i], y[k] - y[i], z[k] - z[i]
+            squared = dx * dx + dy * dy + dz * dz
+            squared = squared if k != i else FAR
+            best = squared if squared < best else best
+        total += np.sqrt(best)
+        taken += 1
+    return total / taken

@@ -2,27 +2,126 @@
 
 import numpy as np
 
-from shapecat.arrays import F4, I4, Bool
+from shapecat.arrays import F4, I4, U2, Bool
 from shapecat.jit import kernel
-from shapecat.surface.growth import ABSENT, FAR, index_mask
+from shapecat.surface.growth import FAR, Cloud, Gas, index_mask, is_edge
 from shapecat.surface.lanes import LANES, three_nearest
 
-__all__ = ["link"]
+__all__ = ["edge_list", "link"]
+
+_GAP = 1.15
+"""A square grid of the same density is this much wider than the mean nearest distance."""
+_LONGEST = 3.0
+"""Longest edge between neurons that are not the two nearest of a point, in spacings."""
 
 
 @kernel
-def _three_nearest(px: F4, py: F4, pz: F4, x: F4, y: F4, z: F4, count: int, nearest: I4) -> None:
-    """Write the three neurons nearest to each point."""
+def link(cloud: Cloud, gas: Gas, count: int, share: float) -> tuple[int, Bool]:
+    """Finish the graph of ``count`` neurons; return how many stay and their (n, n) adjacency.
+
+    1. Neurons nearest to no point are removed.
+    2. The others move to the mean of the points they are nearest to (one step of Lloyd 1982). It
+       takes out what the last signals left, and keeps neurons within the hull.
+    3. Two neurons are linked when the gas linked them, when they are the two nearest of some point
+       (competitive Hebbian learning, Martinetz and Schulten 1994), or when one of them is its
+       third nearest and they are not far apart: by the edges of the gas alone, a third of them
+       has no triangle.
+    4. Parts with less than ``share`` of the points are removed, never the largest.
+    5. The parts that stay are joined at their smallest gap.
+
+    The first neurons of ``gas`` are then those that stay, in their old order; fewer than 3 are
+    none.
+    """
+    adjacent = np.zeros((count, count), np.bool_)
+    for i in range(count):
+        for j in range(count):
+            adjacent[i, j] = is_edge(gas, i, j)
+    # 1.
+    nearest = np.zeros((cloud.x.size, 3), np.int32)
+    _three_nearest(cloud, gas, count, nearest)
+    members = np.zeros(count, np.int64)
+    for k in range(cloud.x.size):
+        members[nearest[k, 0]] += 1
+    kept = _keep(gas, adjacent, members, members > 0, count)
+    if kept < 3:
+        return 0, adjacent[:0, :0]
+    if kept < count:
+        _three_nearest(cloud, gas, kept, nearest)
+    # 2.
+    _settle(cloud, gas, kept, nearest)
+    # 3.
+    limit = (_LONGEST * _GAP * _mean_gap(gas, kept)) ** 2
+    for k in range(cloud.x.size):
+        a, b, c = nearest[k, 0], nearest[k, 1], nearest[k, 2]
+        adjacent[a, b] = adjacent[b, a] = True
+        if not adjacent[a, c] and _squared(gas, a, c) < limit:
+            adjacent[a, c] = adjacent[c, a] = True
+        if not adjacent[b, c] and _squared(gas, b, c) < limit:
+            adjacent[b, c] = adjacent[c, b] = True
+    # 4.
+    part = np.zeros(kept, np.int64)
+    parts = _components(adjacent, kept, part)
+    if parts > 1:
+        weight = np.zeros(parts, np.int64)
+        for i in range(kept):
+            weight[part[i]] += members[i]
+        stays = weight >= share * cloud.x.size
+        stays[np.argmax(weight)] = True
+        kept = _keep(gas, adjacent, members, stays[part], kept)
+        if kept < 3:
+            return 0, adjacent[:0, :0]
+        # 5.
+        while _components(adjacent, kept, part) > 1:
+            _bridge(gas, adjacent, kept, part)
+    return kept, adjacent[:kept, :kept]
+
+
+@kernel
+def edge_list(adjacent: Bool) -> U2:
+    """Return the (m, 2) pairs i < j that are adjacent, in lexicographic order."""
+    count = adjacent.shape[0]
+    edges = np.zeros((count * count // 2, 2), np.uint16)
+    found = 0
+    for i in range(count):
+        for j in range(i + 1, count):
+            if adjacent[i, j]:
+                edges[found, 0], edges[found, 1] = i, j
+                found += 1
+    return edges[:found].copy()
+
+
+@kernel
+def _three_nearest(cloud: Cloud, gas: Gas, count: int, nearest: I4) -> None:
+    """Write the three neurons nearest to each point, nearest first."""
     padded = (count + LANES - 1) // LANES * LANES
     mask = index_mask(padded)
-    for k in range(px.size):
-        a, b, c = three_nearest(x, y, z, padded, px[k], py[k], pz[k], mask)
-        nearest[k, 0], nearest[k, 1], nearest[k, 2] = a, b, c
+    for k in range(cloud.x.size):
+        nearest[k, 0], nearest[k, 1], nearest[k, 2] = three_nearest(
+            gas.x, gas.y, gas.z, padded, cloud.x[k], cloud.y[k], cloud.z[k], mask
+        )
+
+
+@kernel
+def _settle(cloud: Cloud, gas: Gas, count: int, nearest: I4) -> None:
+    """Move each neuron to the mean of the points it is nearest to."""
+    sums = np.zeros((count, 4))
+    for k in range(cloud.x.size):
+        i = nearest[k, 0]
+        sums[i, 0] += cloud.x[k]
+        sums[i, 1] += cloud.y[k]
+        sums[i, 2] += cloud.z[k]
+        sums[i, 3] += 1
+    for i in range(count):
+        if sums[i, 3] > 0:
+            gas.x[i] = sums[i, 0] / sums[i, 3]
+            gas.y[i] = sums[i, 1] / sums[i, 3]
+            gas.z[i] = sums[i, 2] / sums[i, 3]
 
 
 @kernel(fast=True)
-def _mean_gap(x: F4, y: F4, z: F4, count: int) -> float:
+def _mean_gap(gas: Gas, count: int) -> float:
     """Return the mean distance from a neuron to the nearest other one."""
+    x, y, z = gas.x, gas.y, gas.z
     total = 0.0
     for i in range(count):
         best = np.float32(np.inf)
@@ -36,98 +135,29 @@ def _mean_gap(x: F4, y: F4, z: F4, count: int) -> float:
 
 
 @kernel
-def link(
-    px: F4,
-    py: F4,
-    pz: F4,
-    x: F4,
-    y: F4,
-    z: F4,
-    born: I4,
-    count: int,
-    share: float,
-) -> tuple[int, Bool]:
-    """Finish the graph of ``count`` neurons; return how many stay and their (n, n) adjacency.
-
-    1. Neurons nearest to no point are removed.
-    2. Two neurons are linked when the gas linked them, when they are the two nearest of some point
-       (competitive Hebbian learning, Martinetz and Schulten 1994), or when one of them is its
-       third nearest and they are closer than three times the spacing of the neurons: the edges of
-       the gas alone leave a third of them without a triangle.
-    3. Parts with less than ``share`` of the points are removed, never the largest.
-    4. The remaining parts are joined at their smallest gap.
-
-    ``x, y, z`` are rearranged so that the first neurons are those that stay, in their old order.
-    """
-    stride = x.size
-    adjacent = np.zeros((count, count), np.bool_)
-    for i in range(count):
-        for j in range(count):
-            adjacent[i, j] = born[i * stride + j] < ABSENT
-    # 1.
-    nearest = np.zeros((px.size, 3), np.int32)
-    _three_nearest(px, py, pz, x, y, z, count, nearest)
-    members = np.zeros(count, np.int64)
-    for k in range(px.size):
-        members[nearest[k, 0]] += 1
-    used = members > 0
-    kept = _keep(x, y, z, adjacent, members, used, count)
-    if kept < 3:
-        return 0, adjacent[:0, :0]
-    if kept < count:
-        _three_nearest(px, py, pz, x, y, z, kept, nearest)
-    # 2.
-    limit = np.float32((3 * 1.15 * _mean_gap(x, y, z, kept)) ** 2)
-    for k in range(px.size):
-        a, b, c = nearest[k]
-        adjacent[a, b] = adjacent[b, a] = True
-        if not adjacent[a, c] and _squared(x, y, z, a, c) < limit:
-            adjacent[a, c] = adjacent[c, a] = True
-        if not adjacent[b, c] and _squared(x, y, z, b, c) < limit:
-            adjacent[b, c] = adjacent[c, b] = True
-    # 3.
-    part = np.zeros(kept, np.int64)
-    parts = _components(adjacent, kept, part)
-    if parts > 1:
-        weight = np.zeros(parts, np.int64)
-        for i in range(kept):
-            weight[part[i]] += members[i]
-        largest = np.argmax(weight)
-        stays = np.zeros(kept, np.bool_)
-        for i in range(kept):
-            stays[i] = part[i] == largest or weight[part[i]] >= share * px.size
-        kept = _keep(x, y, z, adjacent, members, stays, kept)
-        if kept < 3:
-            return 0, adjacent[:0, :0]
-        # 4.
-        while _components(adjacent, kept, part) > 1:
-            _bridge(x, y, z, adjacent, kept, part)
-    return kept, adjacent[:kept, :kept]
+def _squared(gas: Gas, i: int, j: int) -> float:
+    dx, dy, dz = gas.x[i] - gas.x[j], gas.y[i] - gas.y[j], gas.z[i] - gas.z[j]
+    return dx * dx + dy * dy + dz * dz
 
 
 @kernel
-def _squared(x: F4, y: F4, z: F4, i: int, j: int) -> float:
-    return (x[i] - x[j]) ** 2 + (y[i] - y[j]) ** 2 + (z[i] - z[j]) ** 2
-
-
-@kernel
-def _keep(x: F4, y: F4, z: F4, adjacent: Bool, members: I4, stays: Bool, count: int) -> int:
+def _keep(gas: Gas, adjacent: Bool, members: I4, stays: Bool, count: int) -> int:
     """Move the neurons that stay to the front; return their number."""
     kept = 0
     for i in range(count):
         if not stays[i]:
             continue
         if kept < i:
-            x[kept], y[kept], z[kept] = x[i], y[i], z[i]
+            gas.x[kept], gas.y[kept], gas.z[kept] = gas.x[i], gas.y[i], gas.z[i]
             members[kept] = members[i]
             for j in range(count):
                 adjacent[kept, j] = adjacent[i, j]
             for j in range(count):
                 adjacent[j, kept] = adjacent[j, i]
         kept += 1
-    x[kept:count] = FAR
-    y[kept:count] = FAR
-    z[kept:count] = FAR
+    gas.x[kept:count] = FAR
+    gas.y[kept:count] = FAR
+    gas.z[kept:count] = FAR
     return kept
 
 
@@ -156,14 +186,13 @@ def _components(adjacent: Bool, count: int, part: I4) -> int:
 
 
 @kernel
-def _bridge(x: F4, y: F4, z: F4, adjacent: Bool, count: int, part: I4) -> None:
+def _bridge(gas: Gas, adjacent: Bool, count: int, part: I4) -> None:
     """Link the two nearest neurons of different parts."""
     best = np.inf
     a, b = 0, 0
     for i in range(count):
         for j in range(i + 1, count):
-            if part[i] != part[j]:
-                gap = _squared(x, y, z, i, j)
-                if gap < best:
-                    best, a, b = gap, i, j
+            if part[i] != part[j] and _squared(gas, i, j) < best:
+                best = _squared(gas, i, j)
+                a, b = i, j
     adjacent[a, b] = adjacent[b, a] = True

@@ -1,14 +1,6 @@
-"""The kernels that grow a neural gas: Fritzke's rule and the thesis's.
+"""The kernels that grow a neural gas: Fritzke's rule and the thesis's."""
 
-State of the gas, in flat arrays padded to whole vectors of 16 numbers:
-
-- ``x, y, z`` positions; unused places are far away.
-- ``error`` accumulated squared distance.
-- ``wins`` how often a neuron was the nearest: the clock of its edges.
-- ``born[i * stride + j]`` is ``ABSENT``, or ``wins[i] + wins[j]`` when edge i-j was last refreshed,
-  so that its age is ``wins[i] + wins[j] - born``: ageing all edges of the winner (step 6) is one
-  increment, and adapting its neighbours (step 8) is one loop over a row without a branch.
-"""
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,10 +8,65 @@ from shapecat.arrays import F4, I4
 from shapecat.jit import kernel
 from shapecat.surface.lanes import LANES, adapt, two_nearest
 
-__all__ = ["ABSENT", "FAR", "grow_fritzke", "grow_thesis", "index_mask", "nearest_spacing"]
+__all__ = [
+    "FAR",
+    "Cloud",
+    "Gas",
+    "connect",
+    "empty_gas",
+    "grow_fritzke",
+    "grow_thesis",
+    "index_mask",
+    "is_edge",
+]
+
+
+class Cloud(NamedTuple):
+    """Points, as one array for each coordinate."""
+
+    x: F4
+    y: F4
+    z: F4
+
+
+class Gas(NamedTuple):
+    """A gas with room for more neurons than it has; its arrays are padded to whole vectors.
+
+    ``x, y, z`` are positions, `FAR` away where no neuron is; ``error`` the accumulated squared
+    distance; ``degree`` the number of edges. ``wins`` counts how often a neuron was the nearest:
+    it is the clock of its edges. ``born[i * x.size + j]`` is `ABSENT`, or ``wins[i] + wins[j]``
+    when edge i-j was last refreshed, so that its age is ``wins[i] + wins[j] - born``. So ageing
+    all edges of the winner is one increment, and adapting its neighbours is one loop over a row.
+    """
+
+    x: F4
+    y: F4
+    z: F4
+    error: F4
+    degree: I4
+    wins: I4
+    born: I4
+
 
 ABSENT = np.int32(1 << 29)
 FAR = np.float32(1e18)
+_GAIN = 1 / 0.9995
+"""What an error counts more than one a signal earlier."""
+
+
+@kernel
+def empty_gas(room: int) -> Gas:
+    """Return a gas without neurons that has room for at least ``room``."""
+    size = (room + LANES - 1) // LANES * LANES
+    return Gas(
+        np.full(size, FAR, np.float32),
+        np.full(size, FAR, np.float32),
+        np.full(size, FAR, np.float32),
+        np.zeros(size, np.float32),
+        np.zeros(size, np.int32),
+        np.zeros(size, np.int32),
+        np.full(size * size, ABSENT, np.int32),
+    )
 
 
 @kernel
@@ -32,65 +79,108 @@ def index_mask(count: int) -> int:
 
 
 @kernel
-def _connect(born: I4, wins: I4, degree: I4, stride: int, a: int, b: int) -> None:
-    if born[a * stride + b] == ABSENT:
-        degree[a] += 1
-        degree[b] += 1
-    age_zero = wins[a] + wins[b]
-    born[a * stride + b] = age_zero
-    born[b * stride + a] = age_zero
+def is_edge(gas: Gas, i: int, j: int) -> bool:
+    """Return whether two neurons are linked."""
+    return gas.born[i * gas.x.size + j] < ABSENT
 
 
 @kernel
-def _disconnect(born: I4, degree: I4, stride: int, a: int, b: int) -> None:
-    born[a * stride + b] = ABSENT
-    born[b * stride + a] = ABSENT
-    degree[a] -= 1
-    degree[b] -= 1
+def connect(gas: Gas, i: int, j: int) -> None:
+    """Link two neurons, or make their edge new."""
+    _connect(gas.degree, gas.wins, gas.born, i, j)
+
+
+@kernel(inline=True)
+def _connect(degree: I4, wins: I4, born: I4, i: int, j: int) -> None:
+    if born[i * degree.size + j] == ABSENT:
+        degree[i] += 1
+        degree[j] += 1
+    now = wins[i] + wins[j]
+    born[i * degree.size + j] = now
+    born[j * degree.size + i] = now
 
 
 @kernel
-def _drop_old_edges(
-    born: I4, wins: I4, degree: I4, stride: int, count: int, a: int, oldest: int
-) -> None:
+def _disconnect(degree: I4, born: I4, i: int, j: int) -> None:
+    born[i * degree.size + j] = ABSENT
+    born[j * degree.size + i] = ABSENT
+    degree[i] -= 1
+    degree[j] -= 1
+
+
+@kernel
+def _drop_old_edges(degree: I4, wins: I4, born: I4, count: int, a: int, oldest: int) -> None:
     for j in range(count):
-        edge = born[a * stride + j]
+        age = wins[a] + wins[j] - born[a * degree.size + j]
         # differs: an edge stays when it is the last of either end, so that no neuron is ever
         # isolated and none has to be removed.
-        if edge < ABSENT and wins[a] + wins[j] - edge > oldest and degree[a] > 1 and degree[j] > 1:
-            _disconnect(born, degree, stride, a, j)
+        if age > oldest and degree[a] > 1 and degree[j] > 1:
+            _disconnect(degree, born, a, j)
 
 
-@kernel
-def _insert(
+@kernel(inline=True)
+def _fire(
     x: F4,
     y: F4,
     z: F4,
     error: F4,
-    born: I4,
-    wins: I4,
     degree: I4,
-    stride: int,
+    wins: I4,
+    born: I4,
     count: int,
-    q: int,
+    mask: int,
+    sx: float,
+    sy: float,
+    sz: float,
+    gain: float,
+    rate_winner: float,
+    rate_neighbour: float,
+    oldest: int,
 ) -> int:
-    """Insert neuron ``count`` between q and its worst neighbour f; return f."""
+    """Do steps 5 to 10 of thesis Algorithm 3 for one signal; return the winner.
+
+    Takes the arrays of a `Gas` one by one: taking them out of it costs as much as a step.
+    """
+    padded = (count + LANES - 1) // LANES * LANES
+    # 5. the nearest and the second nearest neuron
+    a, b = two_nearest(x, y, z, padded, sx, sy, sz, mask)
+    # 6. the edges of the nearest get older
+    wins[a] += 1
+    # 7. its error grows by the squared distance
+    dx, dy, dz = x[a] - sx, y[a] - sy, z[a] - sz
+    error[a] += np.float32(gain) * (dx * dx + dy * dy + dz * dz)
+    # 8. it and its neighbours move towards the signal
+    age = wins[a] + adapt(
+        x, y, z, padded, sx, sy, sz, born, a * x.size, ABSENT, wins, a, rate_winner, rate_neighbour
+    )
+    # 9. the two are linked, or their edge is new again
+    _connect(degree, wins, born, a, b)
+    # 10. edges that are too old go
+    if age > oldest:
+        _drop_old_edges(degree, wins, born, count, a, oldest)
+    return a
+
+
+@kernel
+def _insert(gas: Gas, count: int, q: int) -> int:
+    """Insert neuron ``count`` between q and f, its neighbour with the largest error; return f."""
     f = -1
     for j in range(count):
-        if born[q * stride + j] < ABSENT and (f < 0 or error[j] > error[f]):
+        if is_edge(gas, q, j) and (f < 0 or gas.error[j] > gas.error[f]):
             f = j
-    x[count] = np.float32(0.5) * (x[q] + x[f])
-    y[count] = np.float32(0.5) * (y[q] + y[f])
-    z[count] = np.float32(0.5) * (z[q] + z[f])
-    _disconnect(born, degree, stride, q, f)
-    _connect(born, wins, degree, stride, q, count)
-    _connect(born, wins, degree, stride, f, count)
+    half = np.float32(0.5)
+    gas.x[count] = half * (gas.x[q] + gas.x[f])
+    gas.y[count] = half * (gas.y[q] + gas.y[f])
+    gas.z[count] = half * (gas.z[q] + gas.z[f])
+    _disconnect(gas.degree, gas.born, q, f)
+    connect(gas, q, count)
+    connect(gas, f, count)
     return f
 
 
 @kernel
-def _shuffle(order: I4, state: int) -> int:
-    """Shuffle in place (Fisher-Yates) with a 64-bit linear congruential generator."""
+def _shuffle(order: I4, state: np.uint64) -> np.uint64:
+    """Shuffle in place (Fisher-Yates) with a 64-bit linear congruential generator (Knuth)."""
     for i in range(order.size - 1, 0, -1):
         state = state * np.uint64(6364136223846793005) + np.uint64(1442695040888963407)
         j = np.int64(((state >> np.uint64(32)) * np.uint64(i + 1)) >> np.uint64(32))
@@ -98,17 +188,11 @@ def _shuffle(order: I4, state: int) -> int:
     return state
 
 
-@kernel(fast=True)
+@kernel
 def grow_fritzke(
-    px: F4,
-    py: F4,
-    pz: F4,
-    state: int,
-    x: F4,
-    y: F4,
-    z: F4,
-    born: I4,
-    degree: I4,
+    cloud: Cloud,
+    state: np.uint64,
+    gas: Gas,
     count: int,
     target: int,
     signals: int,
@@ -117,96 +201,57 @@ def grow_fritzke(
     rate_neighbour: float,
     oldest: int,
 ) -> int:
-    """Fire ``signals`` points into a gas of ``count`` >= 2 neurons; return the new count.
+    """Fire ``signals`` points into a gas of ``count`` >= 2 linked neurons; return the new count.
 
-    Source: Fritzke 1995, thesis Algorithm 3, whose steps are numbered below (steps 1 to 3 are the
-    caller's). A neuron is inserted every ``interval`` signals until there are ``target``. The two
-    learning rates fall linearly to a tenth; the error of all neurons decays by 0.0005 a signal.
+    Source: Fritzke 1995, thesis Algorithm 3, whose steps are numbered here and in `_fire` (steps
+    1 to 3 are the caller's). ``interval`` is lambda, ``oldest`` a_max.
     """
-    capacity = x.size
-    stride = capacity
-    mask = index_mask(capacity)
-    wins = np.zeros(capacity, np.int32)
-    error = np.zeros(capacity, np.float32)
-    order = np.arange(px.size)
-    cursor = px.size
-    gain = 1.0  # step 12 lazily: instead of all errors falling, each new one counts more
-    fall = np.float32(0.9 / signals)
-    anneal = np.float32(1)
+    points = cloud.x.size
+    px, py, pz = cloud
+    x, y, z, error, degree, wins, born = gas
+    mask = index_mask(gas.x.size)
+    order = np.arange(points)
+    cursor = points
+    gain = 1.0
+    fall = 0.9 / max(signals, 1)
     until = interval
-    for _ in range(signals):
-        if cursor == px.size:
+    for signal in range(signals):
+        # 4. differs: each point once an epoch, in random order, rather than independent draws.
+        if cursor == points:
             state = _shuffle(order, state)
             cursor = 0
-        # 4. differs: every point once an epoch, in random order, rather than independent draws.
         k = order[cursor]
         cursor += 1
-        sx, sy, sz = px[k], py[k], pz[k]
-        # 5. the nearest and the second nearest neuron
-        padded = (count + LANES - 1) // LANES * LANES
-        a, b = two_nearest(x, y, z, padded, sx, sy, sz, mask)
-        # 6. the edges of the nearest get older
-        wins[a] += 1
-        # 7. error
-        dx, dy, dz = x[a] - sx, y[a] - sy, z[a] - sz
-        error[a] += np.float32(gain) * (dx * dx + dy * dy + dz * dz)
-        # 8. adapt. differs: the rates fall, so that the gas comes to rest.
-        age = wins[a] + adapt(
-            x,
-            y,
-            z,
-            padded,
-            sx,
-            sy,
-            sz,
-            born,
-            a * stride,
-            ABSENT,
-            wins,
-            a,
-            rate_winner * anneal,
-            rate_neighbour * anneal,
-        )
-        anneal -= fall
-        # 9. connect the two, or refresh their edge
-        _connect(born, wins, degree, stride, a, b)
-        # 10. old edges
-        if age > oldest:
-            _drop_old_edges(born, wins, degree, stride, count, a, oldest)
-        # 11. insertion
+        # 5. to 10. differs: the rates fall to a tenth, so that the gas comes to rest.
+        rest = 1.0 - fall * signal
+        _fire(
+            x, y, z, error, degree, wins, born, count, mask, px[k], py[k], pz[k],
+            gain, rate_winner * rest, rate_neighbour * rest, oldest,
+        )  # fmt: skip
+        # 11. a neuron where the error is largest, every ``interval`` signals
         until -= 1
         if until == 0 and count < target:
             until = interval
-            q = 0
-            for i in range(count):
-                if error[i] > error[q]:
-                    q = i
-            f = _insert(x, y, z, error, born, wins, degree, stride, count, q)
-            error[q] *= np.float32(0.5)
-            error[f] *= np.float32(0.5)
-            error[count] = error[q]
+            q = int(np.argmax(gas.error[:count]))
+            f = _insert(gas, count, q)
+            gas.error[q] *= np.float32(0.5)
+            gas.error[f] *= np.float32(0.5)
+            gas.error[count] = gas.error[q]
             count += 1
-        # 12. all errors fall
-        gain *= 1.0 / 0.9995
+        # 12. all errors decay: here each new one counts more instead
+        gain *= _GAIN
         if gain > 1e6:
-            for i in range(count):
-                error[i] *= np.float32(1e-6)
+            gas.error[:] *= np.float32(1e-6)
             gain *= 1e-6
-    # 13. the number of signals is the stopping criterion
+    # 13. the number of signals ends it
     return count
 
 
-@kernel(fast=True)
+@kernel
 def grow_thesis(
-    px: F4,
-    py: F4,
-    pz: F4,
-    state: int,
-    x: F4,
-    y: F4,
-    z: F4,
-    born: I4,
-    degree: I4,
+    cloud: Cloud,
+    state: np.uint64,
+    gas: Gas,
     count: int,
     target: int,
     epochs: int,
@@ -216,173 +261,100 @@ def grow_thesis(
     rate_neighbour: float,
     oldest: int,
 ) -> int:
-    """Grow the gas epoch by epoch until it is close to the points; return the new count.
+    """Grow the gas until it is close to the points; return the new count.
 
-    Source: thesis 5.2, Algorithm 4: as Algorithm 3 (see `grow_fritzke` for steps 1 to 10), but
-    step 12 inserts a neuron where the error exceeds ``error_limit`` (t_gamma), and step 18 fires
-    the cloud again until the mean distance from neurons to their nearest point (psi) is below
-    ``distance_limit`` (t_alpha), or for at most ``epochs`` epochs.
+    Source: thesis 5.2, Algorithm 4: Algorithm 3 with step 12, a neuron is inserted where the error
+    exceeds ``error_limit`` (t_gamma), and step 18, the cloud is fired again until the mean
+    distance of the neurons to their nearest point (psi) is below ``distance_limit`` (t_alpha).
     """
-    capacity = x.size
-    stride = capacity
-    mask = index_mask(capacity)
-    wins = np.zeros(capacity, np.int32)
-    error = np.zeros(capacity, np.float32)
-    order = np.arange(px.size)
-    fall = np.float32(0.9 / (epochs * px.size))
-    anneal = np.float32(1)
+    points = cloud.x.size
+    px, py, pz = cloud
+    x, y, z, error, degree, wins, born = gas
+    mask = index_mask(gas.x.size)
+    order = np.arange(points)
+    before = np.zeros(gas.x.size, np.int32)
+    fall = 0.9 / (epochs * points)
+    rest = 1.0
     for epoch in range(epochs):
-        # differs: errors restart with each epoch; summed over epochs any limit is exceeded and the
-        # gas grows without bound.
-        error[:] = 0
-        before = wins.copy()
-        present = count
+        # differs: errors restart with each epoch; summed over all epochs they exceed any limit
+        # and the gas grows without bound.
+        gas.error[:] = 0
+        before[:] = gas.wins
         pause = 0
         state = _shuffle(order, state)
         for k in order:
-            sx, sy, sz = px[k], py[k], pz[k]
-            padded = (count + LANES - 1) // LANES * LANES
-            a, b = two_nearest(x, y, z, padded, sx, sy, sz, mask)
-            wins[a] += 1
-            dx, dy, dz = x[a] - sx, y[a] - sy, z[a] - sz
-            error[a] += dx * dx + dy * dy + dz * dz
-            age = wins[a] + adapt(
-                x,
-                y,
-                z,
-                padded,
-                sx,
-                sy,
-                sz,
-                born,
-                a * stride,
-                ABSENT,
-                wins,
-                a,
-                rate_winner * anneal,
-                rate_neighbour * anneal,
-            )
-            anneal -= fall
-            _connect(born, wins, degree, stride, a, b)
-            if age > oldest:
-                _drop_old_edges(born, wins, degree, stride, count, a, oldest)
-            # 12. insert where the error is too large. differs: at most once in four signals and
-            # with the errors of all three neurons set to zero; with the published halving the
-            # first epoch ends with as many neurons as fit.
+            a = _fire(
+                x, y, z, error, degree, wins, born, count, mask, px[k], py[k], pz[k],
+                1.0, rate_winner * rest, rate_neighbour * rest, oldest,
+            )  # fmt: skip
+            rest -= fall
+            # 12. differs: at most once in four signals, and the errors of all three neurons are
+            # reset; as published, the first epoch ends with as many neurons as there is room for.
             pause -= 1
-            if error[a] > error_limit and pause <= 0 and count < target:
+            if gas.error[a] > error_limit and pause <= 0 and count < target:
                 pause = 4
-                f = _insert(x, y, z, error, born, wins, degree, stride, count, a)
-                error[a] = 0
-                error[f] = 0
-                error[count] = 0
+                f = _insert(gas, count, a)
+                gas.error[a] = gas.error[f] = gas.error[count] = 0
                 before[count] = -1
                 count += 1
-        # differs: neurons that won no signal of an epoch they were there for lie between
-        # surfaces; they are removed.
-        if present > 2:
-            count = _prune(x, y, z, born, wins, degree, stride, count, before)
-        # 18. stop when the neurons are close to the points
-        if epoch + 1 >= 3 and _mean_distance(px, py, pz, x, y, z, count) < distance_limit:
+        # differs: neurons that won nothing since the epoch began lie between surfaces and go.
+        count = _prune(gas, count, before)
+        # 18.
+        if epoch >= 2 and _mean_distance(cloud, gas, count) < distance_limit:
             break
     return count
 
 
 @kernel
-def _prune(
-    x: F4, y: F4, z: F4, born: I4, wins: I4, degree: I4, stride: int, count: int, before: I4
-) -> int:
-    """Remove the neurons whose ``wins`` is still ``before``; return how many stay (>= 2)."""
+def _prune(gas: Gas, count: int, before: I4) -> int:
+    """Remove neurons with as many wins as ``before``, as long as 3 stay; return how many stay."""
     i = 0
-    while i < count and count > 2:
-        if wins[i] != before[i]:
+    while i < count:
+        if gas.wins[i] != before[i] or count <= 3:
             i += 1
             continue
-        neighbours = np.zeros(count, np.int64)
-        found = 0
+        heir = -1  # gets the edges, so that no neighbour is left alone
         for j in range(count):
-            if born[i * stride + j] < ABSENT:
-                neighbours[found] = j
-                found += 1
-        for k in range(found):
-            # Its neighbours are linked to the first of them, so that none is left alone.
-            if k > 0:
-                _connect(born, wins, degree, stride, neighbours[0], neighbours[k])
-        for k in range(found):
-            _disconnect(born, degree, stride, i, neighbours[k])
-        if found == 1 and degree[neighbours[0]] == 0:
-            other = 0
-            while other == i or other == neighbours[0]:
-                other += 1
-            _connect(born, wins, degree, stride, other, neighbours[0])
+            if is_edge(gas, i, j):
+                if heir >= 0:
+                    connect(gas, heir, j)
+                else:
+                    heir = j
+                _disconnect(gas.degree, gas.born, i, j)
+        if gas.degree[heir] == 0:
+            connect(gas, heir, (heir + 1) % count if (heir + 1) % count != i else (i + 1) % count)
         count -= 1
-        _move(x, y, z, born, wins, degree, before, stride, count, i)
+        _move(gas, count, i)
+        before[i] = before[count]
     return count
 
 
 @kernel
-def _move(
-    x: F4,
-    y: F4,
-    z: F4,
-    born: I4,
-    wins: I4,
-    degree: I4,
-    before: I4,
-    stride: int,
-    source: int,
-    place: int,
-) -> None:
-    """Give the last neuron, ``source``, the free ``place``."""
-    if source != place:
-        x[place], y[place], z[place] = x[source], y[source], z[source]
-        wins[place], before[place], degree[place] = wins[source], before[source], degree[source]
-        for j in range(source):
-            edge = born[source * stride + j]
-            if j != place:
-                born[place * stride + j] = edge
-                born[j * stride + place] = edge
-            born[source * stride + j] = ABSENT
-            born[j * stride + source] = ABSENT
-    x[source] = FAR
-    y[source] = FAR
-    z[source] = FAR
-    wins[source] = 0
-    degree[source] = 0
+def _move(gas: Gas, last: int, place: int) -> None:
+    """Give neuron ``last`` the free ``place``."""
+    size = gas.x.size
+    if last != place:
+        gas.x[place], gas.y[place], gas.z[place] = gas.x[last], gas.y[last], gas.z[last]
+        gas.wins[place], gas.degree[place] = gas.wins[last], gas.degree[last]
+        for j in range(last):
+            gas.born[place * size + j] = gas.born[j * size + place] = gas.born[last * size + j]
+        gas.born[place * size + place] = ABSENT
+    for j in range(size):
+        gas.born[last * size + j] = gas.born[j * size + last] = ABSENT
+    gas.x[last] = gas.y[last] = gas.z[last] = FAR
+    gas.wins[last] = gas.degree[last] = 0
 
 
 @kernel(fast=True)
-def _mean_distance(px: F4, py: F4, pz: F4, x: F4, y: F4, z: F4, count: int) -> float:
+def _mean_distance(cloud: Cloud, gas: Gas, count: int) -> float:
     """Return psi: the mean distance from the neurons to their nearest point."""
     total = 0.0
     for i in range(count):
-        total += np.sqrt(_nearest_squared(px, py, pz, x[i], y[i], z[i]))
-    return total / count
-
-
-@kernel(fast=True)
-def _nearest_squared(px: F4, py: F4, pz: F4, x: float, y: float, z: float) -> float:
-    best = FAR
-    for k in range(px.size):
-        dx, dy, dz = px[k] - x, py[k] - y, pz[k] - z
-        squared = dx * dx + dy * dy + dz * dz
-        best = squared if squared < best else best
-    return best
-
-
-@kernel(fast=True)
-def nearest_spacing(px: F4, py: F4, pz: F4, samples: int) -> float:
-    """Return the mean distance to the nearest other point, over a sample of the points."""
-    step = max(1, px.size // samples)
-    total = 0.0
-    taken = 0
-    for i in range(0, px.size, step):
         best = FAR
-        for k in range(px.size):
-            dx, dy, dz = px[k] - px[i], py[k] - py[i], pz[k] - pz[i]
+        x, y, z = gas.x[i], gas.y[i], gas.z[i]
+        for k in range(cloud.x.size):
+            dx, dy, dz = cloud.x[k] - x, cloud.y[k] - y, cloud.z[k] - z
             squared = dx * dx + dy * dy + dz * dz
-            squared = squared if k != i else FAR
             best = squared if squared < best else best
         total += np.sqrt(best)
-        taken += 1
-    return total / taken
+    return total / count

@@ -1,0 +1,115 @@
+"""Scenes: what segmentation found, as records in the sensor frame."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, U4, Bool
+from shapecat.config import DetectionSettings
+from shapecat.detection.candidates import Extents, extents_of, occluded, stands_of
+from shapecat.detection.cells import Cells
+from shapecat.detection.planes import Support, corners_of
+from shapecat.detection.segmentation import Segmentation
+from shapecat.geometry import (
+    IDENTITY,
+    quaternion_from_rotation,
+    rotation_from_quaternion,
+    transform,
+    upright_box,
+)
+from shapecat.types import Box, Candidate, Plane, Pose, Scene
+
+__all__ = ["scene_of"]
+
+BORDER = 0.05
+"""Readings that begin this near to the border of the image begin at the border."""
+
+
+def scene_of(
+    cells: Cells,
+    found: Segmentation,
+    indices: Sequence[U4],
+    sensor_from_view: Pose,
+    *,
+    settings: DetectionSettings,
+    points: F4 | None = None,
+) -> Scene:
+    """Return the scene of the labels whose points are ``indices``.
+
+    Lists beyond the labels are objects that the view does not show; their boxes are measured on
+    ``points`` (n, 3), view frame.
+    """
+    count = found.leaders.size - 1
+    least = max(settings.min_points, cells.small * cells.factor**2 if points is None else 0)
+    kept = sorted(
+        (k for k, index in enumerate(indices) if index.size >= least),
+        key=lambda k: int(indices[k][0]),
+    )
+    position = {k + 1: n for n, k in enumerate(kept)}
+    boxes = _boxes(cells, found, indices, points)
+    cut = _cut(cells, boxes) if points is None else np.zeros(count, bool)
+    stands, hidden, owners = stands_of(found), occluded(found), found.owners
+    candidates = []
+    for k in kept:
+        seen = k < count
+        on = position.get(stands[k].label) if seen else None
+        candidates.append(
+            Candidate(
+                indices=indices[k],
+                box=_moved(sensor_from_view, boxes.center[k], boxes.size[k], boxes.orientation[k]),
+                plane=int(owners[k + 1]) if seen else None,
+                on_candidate=on,
+                support_m=0.0 if on is None else stands[k].height_m,
+                touches_border=bool(seen and cut[k]),
+                occluded=bool(seen and hidden[k]),
+            )
+        )
+    lowest = found.supports[0].offset
+    planes = tuple(_plane(s, lowest, sensor_from_view) for s in found.supports)
+    return Scene(sensor_from_view.rotation @ found.up, planes, tuple(candidates))
+
+
+def _boxes(cells: Cells, found: Segmentation, indices: Sequence[U4], points: F4 | None) -> Extents:
+    """Measure on the cells what they show, and on the points what they do not."""
+    boxes = extents_of(cells, found)
+    extra = indices[found.leaders.size - 1 :]
+    if points is None or not extra:
+        return boxes
+    more = [upright_box(points[index], found.up) for index in extra]
+    return boxes._replace(
+        center=np.concatenate([boxes.center, [box.center for box in more]]),
+        size=np.concatenate([boxes.size, [box.size for box in more]]),
+        orientation=np.concatenate([boxes.orientation, [box.orientation for box in more]]),
+    )
+
+
+def _cut(cells: Cells, extents: Extents) -> Bool:
+    """Return whether each object reaches the border of the image, or of its readings near it."""
+    result = np.zeros(len(extents.low), bool)
+    for axis in range(2):
+        size = cells.w.shape[axis]
+        valid = np.flatnonzero(cells.w.any(axis=1 - axis))
+        first = valid[0] if valid[0] < BORDER * size else 0
+        last = valid[-1] if valid[-1] >= (1 - BORDER) * size else size - 1
+        reach = max(1, round(2 / cells.factor))
+        result |= extents.low[:, axis] < first + reach
+        result |= extents.high[:, axis] > last - reach
+    return result
+
+
+def _moved(sensor_from_view: Pose, center: F8, size: F8, orientation: F8) -> Box:
+    if sensor_from_view is IDENTITY:
+        return Box(center, size, orientation)
+    rotation = sensor_from_view.rotation @ rotation_from_quaternion(orientation)
+    return Box(transform(sensor_from_view, center), size, quaternion_from_rotation(rotation))
+
+
+def _plane(support: Support, lowest: float, sensor_from_view: Pose) -> Plane:
+    normal = sensor_from_view.rotation @ support.up
+    return Plane(
+        normal=normal,
+        offset=support.offset + float(normal @ sensor_from_view.translation),
+        outline=transform(sensor_from_view, corners_of(support)),
+        area_m2=support.area_m2,
+        height_m=support.offset - lowest,
+    )

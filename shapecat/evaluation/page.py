@@ -1,0 +1,140 @@
+"""An evaluation as one HTML page with its pictures inside: no script, nothing fetched."""
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+
+from shapecat.errors import OutputError
+from shapecat.evaluation.metrics import Bin
+from shapecat.evaluation.report import Report
+
+__all__ = ["calibration_svg", "confusion_svg", "format_page", "write_page"]
+
+_CELL = 46
+_MARGIN = 74
+_INK = (31, 78, 121)
+_STYLE = (
+    "body{font:15px/1.5 system-ui,sans-serif;max-width:52em;margin:2em auto;padding:0 1em}"
+    "table{border-collapse:collapse;margin:1em 0}td,th{padding:.15em .8em;text-align:right}"
+    "td:first-child,th:first-child{text-align:left}tr+tr{border-top:1px solid #ddd}"
+    "svg{max-width:100%}"
+)
+
+
+def write_page(path: Path, report: Report, *, title: str) -> None:
+    """Write an evaluation as an HTML page.
+
+    Raises
+    ------
+    OutputError : the file cannot be written.
+    """
+    try:
+        path.write_text(format_page(report, title=title), "utf-8")
+    except OSError as error:
+        msg = f"{path}: cannot write the report: {error.strerror or error}"
+        raise OutputError(msg) from error
+
+
+def format_page(report: Report, *, title: str) -> str:
+    """Return an evaluation as an HTML page."""
+    novelty = report.novelty or {}
+    figures = (
+        ("views", str(report.n)),
+        ("accuracy", _text(report.accuracy)),
+        ("balanced accuracy", _text(report.balanced_accuracy)),
+        ("calibration error", _text(report.ece)),
+        ("known shapes rejected", _text(report.rejected_known)),
+        ("unknown shapes rejected", _text(novelty.get("rejected"))),
+        ("novelty AUROC", _text(novelty.get("auroc"))),
+        ("model", report.model),
+    )
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        _table(("", ""), figures),
+        "<h2>Confusion</h2><p>True category (row) taken for (column).</p>",
+        confusion_svg(report.categories, report.confusion),
+        "<h2>Calibration</h2><p>Accuracy over confidence; the diagonal is honest.</p>",
+        calibration_svg(report.calibration),
+    ]
+    for name, rows in (("distance", report.by_distance), ("voxels", report.by_points)):
+        cells = [(label, str(count), _text(value)) for label, count, value in rows]
+        parts.append(f"<h2>Accuracy over {name}</h2>" + _table((name, "views", "accuracy"), cells))
+    return (
+        '<!DOCTYPE html><html lang="en"><meta charset="utf-8">'
+        f"<title>{escape(title)}</title><style>{_STYLE}</style><body>"
+        + "\n".join(parts)
+        + "</body></html>\n"
+    )
+
+
+def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> str:
+    """Return a confusion table as a picture: rows are shaded by the share of their views."""
+    size = _MARGIN + _CELL * len(categories)
+    parts: list[str] = []
+    for i, (name, row) in enumerate(zip(categories, table, strict=True)):
+        middle = _MARGIN + _CELL * (i + 0.5)
+        parts.extend(
+            (
+                f'<text x="{_MARGIN - 8}" y="{middle + 4}" text-anchor="end">{escape(name)}</text>',
+                f'<text x="{middle}" y="{_MARGIN - 8}" text-anchor="middle">{escape(name)}</text>',
+            )
+        )
+        total = max(sum(row), 1)
+        for j, count in enumerate(row):
+            x, y, share = _MARGIN + _CELL * j, _MARGIN + _CELL * i, count / total
+            ink = "white" if share > 0.5 else "black"
+            parts.append(
+                f'<rect x="{x}" y="{y}" width="{_CELL}" height="{_CELL}" fill="{_shade(share)}"/>'
+            )
+            if count:
+                parts.append(
+                    f'<text x="{x + _CELL / 2}" y="{y + _CELL / 2 + 4}" text-anchor="middle" '
+                    f'fill="{ink}">{count}</text>'
+                )
+    return _svg(size, size, parts)
+
+
+def calibration_svg(curve: Sequence[Bin], *, size: int = 280) -> str:
+    """Return accuracy over confidence; the area of a dot is its share of the views."""
+    margin, side = 34.0, size - 44.0
+    low, high = margin, margin + side
+    parts = [
+        f'<rect x="{low}" y="10" width="{side}" height="{side}" fill="none" stroke="#999"/>',
+        f'<line x1="{low}" y1="{10 + side}" x2="{high}" y2="10" stroke="#bbb"/>',
+        f'<text x="{margin + side / 2}" y="{size - 8}" text-anchor="middle">confidence</text>',
+        f'<text transform="translate(16 {10 + side / 2}) rotate(-90)">accuracy</text>',
+    ]
+    total = max(sum(item.views for item in curve), 1)
+    parts += [
+        f'<circle cx="{margin + side * item.confidence:.1f}" '
+        f'cy="{10 + side * (1 - item.accuracy):.1f}" '
+        f'r="{2 + 14 * (item.views / total) ** 0.5:.1f}" fill="rgb{_INK}" fill-opacity="0.7"/>'
+        for item in curve
+    ]
+    return _svg(size, size, parts)
+
+
+def _svg(width: float, height: float, parts: Sequence[str]) -> str:
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="{height}" '
+        f'viewBox="0 0 {width} {height}" font-family="system-ui,sans-serif" font-size="12">'
+        + "".join(parts)
+        + "</svg>"
+    )
+
+
+def _shade(share: float) -> str:
+    """Return white for 0 and ink for 1."""
+    return "rgb" + str(tuple(round(255 + (ink - 255) * share) for ink in _INK))
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = (
+        [f"<tr>{''.join(f'<th>{escape(cell)}</th>' for cell in head)}</tr>"] if any(head) else []
+    )
+    lines += [f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows]
+    return f"<table>{''.join(lines)}</table>"
+
+
+def _text(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"

@@ -1,0 +1,80 @@
+"""Pieces of views, as if something nearer hid the rest: what clutter does to real objects."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from shapecat.arrays import F8, Bool
+from shapecat.evaluation import View
+
+__all__ = ["cut_fragment", "cut_halo"]
+
+_FEWEST_POINTS = 60
+_KEPT = (0.3, 0.85)
+_LOW = 0.3
+"""A fragment must reach into this lowest part of the height: what floats is not on a table."""
+_TRIES = 8
+
+
+def cut_fragment(view: View, rng: np.random.Generator) -> View | None:
+    """Hide a part of a view behind a straight edge, a bar, or a corner.
+
+    Returns
+    -------
+    30 to 85 % of the points, some of them near the support; None if eight tries found no such
+    piece.
+    """
+    across = _image_plane(view)
+    height = view.points[:, 2]
+    low = height < height.min() + _LOW * np.ptp(height)
+    for _ in range(_TRIES):
+        kind = rng.choice(3, p=[0.55, 0.25, 0.2])
+        kept = (_beside_edge, _around_bar, _outside_corner)[kind](across, rng)
+        share = kept.mean()
+        if _KEPT[0] <= share <= _KEPT[1] and kept.sum() >= _FEWEST_POINTS and np.any(kept & low):
+            return replace(view, points=view.points[kept])
+    return None
+
+
+def cut_halo(view: View, rng: np.random.Generator) -> View:
+    """Cut away the lowest 5 to 12 mm, more of them far away: what plane removal takes along."""
+    distance = float(np.linalg.norm(view.eye - view.points.mean(axis=0)))
+    cut = rng.uniform(0.003, 0.006) + 0.003 * distance**2 * rng.uniform(0.3, 1.0)
+    kept = view.points[:, 2] > cut
+    return replace(view, points=view.points[kept]) if kept.any() else view
+
+
+def _image_plane(view: View) -> F8:
+    """Return the points (n, 2) in the plane across the line of sight."""
+    centre = view.points.mean(axis=0, dtype=np.float64)
+    sight = view.eye - centre
+    sight /= np.linalg.norm(sight)
+    right = np.cross([0.0, 0.0, 1.0], sight)
+    right = right / np.linalg.norm(right) if np.linalg.norm(right) > 1e-6 else np.array([1.0, 0, 0])
+    return np.asarray((view.points - centre) @ np.stack([right, np.cross(sight, right)], axis=1))
+
+
+def _direction(rng: np.random.Generator) -> F8:
+    angle = rng.uniform(0, 2 * np.pi)
+    return np.array([np.cos(angle), np.sin(angle)])
+
+
+def _beside_edge(across: F8, rng: np.random.Generator) -> Bool:
+    along = across @ _direction(rng)
+    return np.asarray(along <= np.quantile(along, rng.uniform(0.35, 0.8)))
+
+
+def _around_bar(across: F8, rng: np.random.Generator) -> Bool:
+    along = across @ _direction(rng)
+    width = rng.uniform(0.15, 0.4)
+    start = rng.uniform(0.15, 0.85 - width)
+    low, high = np.quantile(along, [start, start + width])
+    return np.asarray((along <= low) | (along >= high))
+
+
+def _outside_corner(across: F8, rng: np.random.Generator) -> Bool:
+    first = _direction(rng)
+    second = np.array([-first[1], first[0]])
+    a, b = across @ first, across @ second
+    at_a, at_b = np.quantile(a, rng.uniform(0.3, 0.7)), np.quantile(b, rng.uniform(0.3, 0.7))
+    return np.asarray((a <= at_a) | (b <= at_b))

@@ -1,0 +1,128 @@
+"""Views of real objects, cut out of recordings by hand-made labels: what a model is judged by.
+
+A folder holds ``depth.mcap`` and ``truth.json``, one entry a frame with its ``objects``: each a
+``category`` and either the ``parts`` it has in ``labels.npz`` (an image of numbers per frame; 1 to
+9 are tables) or its ``centroid_m`` and ``extent_m`` in the sensor frame.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import F4, F8
+from shapecat.config import DetectionSettings
+from shapecat.detection import detect
+from shapecat.evaluation import View
+from shapecat.geometry import level_from_sensor, transform
+from shapecat.recordings import choose_streams, frames, open_recording
+from shapecat.types import Frame, Scene
+
+__all__ = ["detected_views", "labelled_views"]
+
+_OVERLAP = 0.5
+"""A detection is an object if they share this much of what either covers."""
+_STACKED_M = 0.025
+"""An object whose lowest points are higher above the table stands on another."""
+
+
+def labelled_views(folder: Path) -> Iterator[View]:
+    """Yield the unambiguous objects of a folder with label images, cut by their labels."""
+    labels = np.load(folder / "labels.npz", allow_pickle=False)
+    images = labels[labels.files[0]]
+    for number, (frame, truth) in enumerate(_frames(folder)):
+        image = images[number].reshape(-1)
+        up, offset = _table(frame, image)
+        for item in truth["objects"]:
+            if item["ambiguous"]:
+                continue
+            points = _readings(frame, np.flatnonzero(np.isin(image, item["parts"])))
+            lowest = float(np.quantile(points @ up - offset, 0.02))
+            support = offset + (lowest if lowest > _STACKED_M else 0.0)
+            name = f"{truth['scene']}_{item['label']}"
+            yield _view(points, up, support, item["category"], name)
+
+
+def detected_views(folder: Path) -> Iterator[View]:
+    """Yield the unambiguous objects of a folder as our own detection cuts them.
+
+    Objects that are not found, or merged with others, are left out.
+    """
+    path = folder / "labels.npz"
+    labels = np.load(path, allow_pickle=False) if path.exists() else None
+    images = labels[labels.files[0]] if labels else None
+    for number, (frame, truth) in enumerate(_frames(folder)):
+        rng = np.random.default_rng((0, number))
+        scene = detect(frame, up=None, settings=DetectionSettings(), rng=rng)
+        image = None if images is None else images[number].reshape(-1)
+        for item in truth["objects"]:
+            if item.get("ambiguous", False):
+                continue
+            found = _by_label(scene, image, item) if image is not None else _by_place(scene, item)
+            if found is None:
+                continue
+            candidate = scene.candidates[found]
+            points = _readings(frame, candidate.indices)
+            support = scene.planes[candidate.plane or 0].offset + candidate.support_m
+            name = f"{truth['scene']}_{item.get('label', 0)}"
+            yield _view(points, scene.up, support, item["category"], name)
+
+
+def _frames(folder: Path) -> Iterator[tuple[Frame, dict[str, Any]]]:
+    truth = json.loads((folder / "truth.json").read_text("utf-8"))
+    by_stamp = {entry["stamp_ns"]: entry for entry in truth}
+    skipped: Counter[str] = Counter()
+    with open_recording(folder / "depth.mcap") as recording:
+        for frame in frames(recording, choose_streams(recording, ()), skipped=skipped):
+            yield frame, by_stamp[frame.stamp_ns]
+
+
+def _readings(frame: Frame, indices: np.ndarray) -> F4:
+    points = frame.xyz(indices)
+    return points[np.isfinite(points[:, 0])]
+
+
+def _view(points: F4, up: F8, support: float, category: str, instance: str) -> View:
+    level = level_from_sensor(up, support, points)
+    return View(transform(level, points), level.translation, category, instance)
+
+
+def _table(frame: Frame, image: np.ndarray) -> tuple[F8, float]:
+    """Return up and offset of the plane of the table: RANSAC, then least squares."""
+    counts = np.bincount(image[(image > 0) & (image < 10)], minlength=10)
+    points = _readings(frame, np.flatnonzero(image == counts.argmax())).astype(np.float64)
+    rng = np.random.default_rng(0)
+    sample = points[rng.integers(0, len(points), 4000)]
+    best, most = sample[:3], -1
+    for _ in range(200):
+        three = points[rng.integers(0, len(points), 3)]
+        normal = np.cross(three[1] - three[0], three[2] - three[0])
+        normal /= np.linalg.norm(normal) + 1e-12
+        near = np.abs((sample - three[0]) @ normal) < 0.006
+        if near.sum() > most:
+            best, most = sample[near], int(near.sum())
+    centre = best.mean(axis=0)
+    normal = np.linalg.svd(best - centre, full_matrices=False)[2][2]
+    normal = normal * -np.sign(normal @ centre)  # the sensor is above the table
+    return normal, float(normal @ centre)
+
+
+def _by_label(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int | None:
+    """Return the candidate that overlaps an object best, if enough."""
+    mine = np.isin(image, item["parts"])
+    shares = [
+        mine[c.indices].sum() / (mine.sum() + np.count_nonzero(~mine[c.indices]))
+        for c in scene.candidates
+    ]
+    return int(np.argmax(shares)) if shares and max(shares) >= _OVERLAP else None
+
+
+def _by_place(scene: Scene, item: dict[str, Any]) -> int | None:
+    """Return the candidate nearest to where an object is, if near enough."""
+    place = np.array(item["centroid_m"])
+    gaps = [float(np.linalg.norm(c.box.center - place)) for c in scene.candidates]
+    reach = 0.5 * max(item["extent_m"])
+    return int(np.argmin(gaps)) if gaps and min(gaps) < reach else None

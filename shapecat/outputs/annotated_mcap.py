@@ -1,0 +1,120 @@
+"""The recording with its annotations: every original message, and the labelled objects.
+
+A finished MCAP file is copied byte for byte and extended; everything else is written anew, as
+MCAP. Annotations use the encoding of the source.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import BinaryIO
+
+from shapecat.errors import OutputError
+from shapecat.outputs.annotations import ENCODERS, Annotation, encoder_for
+from shapecat.outputs.mcap_append import Appender, copy_bytes
+from shapecat.outputs.mcap_rewrite import Item, rewrite
+from shapecat.recordings import Recording
+from shapecat.recordings.mcap_file import McapRecording
+from shapecat.types import LabelledFrame
+
+__all__ = ["write_annotated"]
+
+_LIFETIME = 1.5
+"""Entities outlive the period of the frames by this factor."""
+_PERIOD_NS = 1_000_000_000
+"""Assumed where a stream has a single frame."""
+
+
+def write_annotated(
+    recording: Recording,
+    path: Path,
+    frames: Iterable[LabelledFrame],
+    *,
+    run: Mapping[str, object],
+    markers: bool = False,
+) -> None:
+    """Write a copy of a recording with annotation channels.
+
+    One message for each frame on ``/shapecat/detections`` and ``/shapecat/scene`` (also where it
+    has no object), with the stamp, frame id and log time of its source, and a metadata record
+    ``shapecat`` that holds ``run`` as JSON under ``run.json``. The file appears under its name
+    when it is complete.
+
+    Parameters
+    ----------
+    markers : also write ``/shapecat/markers`` for RViz.
+
+    Raises
+    ------
+    OutputError : it cannot be written.
+    """
+    annotations = _annotations(frames)
+    first = next(annotations, None)
+    encoding = _encoding(recording, first)
+    kinds = encoder_for(encoding, markers=markers)
+    items = (
+        Item(number, annotation.frame.log_time_ns, bytes(encode(annotation)))
+        for annotation in chain([first] if first else [], annotations)
+        for number, (_, encode) in enumerate(kinds)
+    )
+    channels = [channel for channel, _ in kinds]
+    metadata = {"run.json": json.dumps(run)}
+    with _replacing(path) as file:
+        if isinstance(recording, McapRecording) and recording.indexed:
+            summary = recording.summary
+            copy_bytes(recording.path, file, summary.data_end)
+            compression = summary.chunks[0].compression if summary.chunks else "zstd"
+            appender = Appender(file, summary, compression)
+            numbers = [appender.add_channel(channel) for channel in channels]
+            sequences: Counter[int] = Counter()
+            for number, log_time, data in items:
+                appender.add_message(numbers[number], log_time, sequences[number], data)
+                sequences[number] += 1
+            appender.add_metadata("shapecat", metadata)
+            appender.finish()
+        else:
+            rewrite(recording, file, channels, items, metadata)
+
+
+def _annotations(frames: Iterable[LabelledFrame]) -> Iterator[Annotation]:
+    """Look one frame ahead for the lifetime, and back for what is no longer shown."""
+    periods: dict[str, int] = {}
+    shown: dict[str, set[int]] = {}
+    for frame, following in pairwise(chain(frames, [None])):
+        if frame is None:
+            return
+        if following is not None and following.topic == frame.topic:
+            periods[frame.topic] = max(1, following.stamp_ns - frame.stamp_ns)
+        period = periods.get(frame.topic, _PERIOD_NS)
+        here = {item.track for item in frame.objects}
+        gone = (shown.get(frame.topic, set()) | set(frame.ended)) - here
+        shown[frame.topic] = here
+        yield Annotation(frame, round(_LIFETIME * period), tuple(sorted(gone)))
+
+
+def _encoding(recording: Recording, first: Annotation | None) -> str:
+    """Return the encoding to annotate in: that of the annotated topic, else the commonest."""
+    if not isinstance(recording, McapRecording):
+        return "cdr"
+    topics = [topic for topic in recording.topics if topic.encoding in ENCODERS]
+    own = [topic.encoding for topic in topics if first and topic.name == first.frame.topic]
+    common = Counter(topic.encoding for topic in topics).most_common(1)
+    return own[0] if own else common[0][0] if common else "json"
+
+
+@contextmanager
+def _replacing(path: Path) -> Iterator[BinaryIO]:
+    """Open a hidden file beside ``path`` that takes its name when the block succeeds."""
+    hidden = path.with_name(f".{path.name}.partial")
+    try:
+        with hidden.open("wb") as file:
+            yield file
+        hidden.replace(path)
+    except OSError as error:
+        msg = f"{path}: cannot be written: {error.strerror or error}"
+        raise OutputError(msg) from error
+    finally:
+        hidden.unlink(missing_ok=True)

@@ -1,0 +1,240 @@
+"""Annotations at the end of a copy: every byte of the original data section stays as it is."""
+
+import os
+import shutil
+import zlib
+from collections import Counter
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import BinaryIO
+
+import lz4.frame  # type: ignore[import-untyped]  # ships no types
+import zstandard
+from mcap import records
+from mcap.data_stream import RecordBuilder
+from mcap.opcode import Opcode
+
+from shapecat.outputs.annotations import AnnotationChannel
+from shapecat.recordings.mcap_file import Summary
+from shapecat.recordings.mcap_records import MAGIC
+
+__all__ = ["Appender", "copy_bytes"]
+
+_CHUNK_BYTES = 64 << 10
+"""Small chunks: a reader that sorts by time holds one of them for the whole recording."""
+_COMPRESS = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}
+
+
+def copy_bytes(source: Path, target: BinaryIO, length: int) -> None:
+    """Copy the first bytes of a file, inside the kernel where it can."""
+    with source.open("rb") as file:
+        target.flush()
+        done = 0
+        try:
+            while done < length:
+                copied = os.copy_file_range(file.fileno(), target.fileno(), length - done)
+                if copied == 0:
+                    break
+                done += copied
+        except OSError:
+            if done:
+                raise
+        if done == 0:
+            shutil.copyfileobj(_Limited(file, length), target, 1 << 20)
+
+
+class _Limited:
+    """The first bytes of a file."""
+
+    def __init__(self, file: BinaryIO, length: int) -> None:
+        self.file, self.left = file, length
+
+    def read(self, size: int = -1, /) -> bytes:
+        """Read up to ``size`` bytes."""
+        data = self.file.read(self.left if size < 0 else min(size, self.left))
+        self.left -= len(data)
+        return data
+
+
+@dataclass
+class _Chunk:
+    """A chunk being filled."""
+
+    builder: RecordBuilder = field(default_factory=RecordBuilder)
+    indexes: dict[int, records.MessageIndex] = field(default_factory=dict)
+    times: list[int] = field(default_factory=list)
+
+
+class Appender:
+    """Adds channels, messages and metadata to a data section, then writes a summary of all.
+
+    Parameters
+    ----------
+    file : open for writing; positioned after the copied data section.
+    summary : that of the original.
+    compression : of the new chunks: ``zstd``, ``lz4`` or empty.
+    """
+
+    def __init__(self, file: BinaryIO, summary: Summary, compression: str) -> None:
+        """Take over the file where the copy ended."""
+        self._file = file
+        self._schemas = dict(summary.schemas)
+        self._channels = dict(summary.channels)
+        self._chunks = list(summary.chunks)
+        self._attachments = list(summary.attachments)
+        self._metadata = list(summary.metadata)
+        self._original = summary.statistics
+        self._compression = compression if compression in _COMPRESS else ""
+        self._counts: Counter[int] = Counter()
+        self._new_chunks = 0
+        self._times: list[int] = []
+        self._chunk = _Chunk()
+
+    def add_channel(self, channel: AnnotationChannel) -> int:
+        """Add a channel with its schema; return its number."""
+        schema_id = max(self._schemas, default=0) + 1
+        schema = records.Schema(
+            id=schema_id,
+            data=channel.schema,
+            encoding=channel.schema_encoding,
+            name=channel.schema_name,
+        )
+        number = max(self._channels, default=0) + 1
+        added = records.Channel(
+            id=number,
+            topic=channel.topic,
+            message_encoding=channel.encoding,
+            metadata={},
+            schema_id=schema_id,
+        )
+        if max(schema_id, number) > 0xFFFF:
+            msg = "the recording has no free channel number"
+            raise OSError(msg)
+        self._schemas[schema_id], self._channels[number] = schema, added
+        schema.write(self._chunk.builder)
+        added.write(self._chunk.builder)
+        return number
+
+    def add_message(self, channel: int, log_time: int, sequence: int, data: bytes) -> None:
+        """Add a message."""
+        chunk = self._chunk
+        index = chunk.indexes.setdefault(channel, records.MessageIndex(channel, []))
+        index.records.append((log_time, chunk.builder.count))
+        chunk.times.append(log_time)
+        self._counts[channel] += 1
+        records.Message(
+            channel_id=channel,
+            log_time=log_time,
+            data=data,
+            publish_time=log_time,
+            sequence=sequence,
+        ).write(chunk.builder)
+        if chunk.builder.count >= _CHUNK_BYTES:
+            self._flush()
+
+    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+        """Add a metadata record."""
+        self._flush()
+        offset = self._file.tell()
+        length = self._write([records.Metadata(name=name, metadata=dict(values))])
+        self._metadata.append(records.MetadataIndex(offset=offset, length=length, name=name))
+
+    def finish(self) -> None:
+        """Write the summary of original and additions, the footer and the end."""
+        self._flush()
+        self._write([records.DataEnd(0)])
+        start = self._file.tell()
+        summary, groups = RecordBuilder(), []
+        for opcode, group in self._groups():
+            begun = summary.count
+            for record in group:
+                record.write(summary)
+            if summary.count > begun:
+                groups.append(
+                    records.SummaryOffset(
+                        group_opcode=opcode,
+                        group_start=start + begun,
+                        group_length=summary.count - begun,
+                    )
+                )
+        offsets = start + summary.count
+        for group_offset in groups:
+            group_offset.write(summary)
+        body = summary.end()
+        footer = RecordBuilder()
+        records.Footer(start, offsets, 0).write(footer)
+        # The checksum covers the summary and the footer up to the checksum itself.
+        crc = zlib.crc32(footer.end()[:-4], zlib.crc32(body))
+        self._file.write(body)
+        self._write([records.Footer(start, offsets, crc)])
+        self._file.write(MAGIC)
+
+    def _groups(self) -> list[tuple[Opcode, Iterable[records.McapRecord]]]:
+        return [
+            (Opcode.SCHEMA, self._schemas.values()),
+            (Opcode.CHANNEL, self._channels.values()),
+            (Opcode.STATISTICS, [self._statistics()] if self._original else []),
+            (Opcode.CHUNK_INDEX, self._chunks),
+            (Opcode.ATTACHMENT_INDEX, self._attachments),
+            (Opcode.METADATA_INDEX, self._metadata),
+        ]
+
+    def _statistics(self) -> records.Statistics:
+        old = self._original
+        if old is None:
+            msg = "the original has no statistics to extend"
+            raise ValueError(msg)
+        times = [*self._times]
+        if old.message_count:
+            times += [old.message_start_time, old.message_end_time]
+        return replace(
+            old,
+            schema_count=len(self._schemas),
+            channel_count=len(self._channels),
+            metadata_count=old.metadata_count + 1,
+            chunk_count=old.chunk_count + self._new_chunks,
+            message_count=old.message_count + self._counts.total(),
+            message_start_time=min(times, default=0),
+            message_end_time=max(times, default=0),
+            channel_message_counts={**old.channel_message_counts, **self._counts},
+        )
+
+    def _flush(self) -> None:
+        """Write the chunk, if it has messages, and its index."""
+        chunk, self._chunk = self._chunk, _Chunk()
+        if not chunk.times:
+            self._chunk = chunk
+            return
+        plain = chunk.builder.end()
+        data = _COMPRESS[self._compression](plain) if self._compression else plain
+        start, end = min(chunk.times), max(chunk.times)
+        self._times += [start, end]
+        offset = self._file.tell()
+        length = self._write(
+            [records.Chunk(self._compression, data, end, start, zlib.crc32(plain), len(plain))]
+        )
+        offsets, at = {}, self._file.tell()
+        for channel, index in chunk.indexes.items():
+            offsets[channel] = self._file.tell()
+            self._write([index])
+        self._new_chunks += 1
+        self._chunks.append(
+            records.ChunkIndex(
+                chunk_length=length,
+                chunk_start_offset=offset,
+                compression=self._compression,
+                compressed_size=len(data),
+                message_end_time=end,
+                message_index_length=self._file.tell() - at,
+                message_index_offsets=offsets,
+                message_start_time=start,
+                uncompressed_size=len(plain),
+            )
+        )
+
+    def _write(self, items: Iterable[records.McapRecord]) -> int:
+        builder = RecordBuilder()
+        for item in items:
+            item.write(builder)
+        return self._file.write(builder.end())

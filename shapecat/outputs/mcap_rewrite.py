@@ -1,0 +1,140 @@
+"""A recording written anew as MCAP, its annotations in between by time."""
+
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from heapq import merge
+from operator import attrgetter
+from typing import BinaryIO, NamedTuple
+
+from mcap import records
+from mcap.opcode import Opcode
+from mcap.writer import CompressionType, Writer
+
+from shapecat.outputs.annotations import AnnotationChannel
+from shapecat.outputs.ros1_conversion import convert_channel, raw_channel, wrap_raw
+from shapecat.recordings import Channel, Message, Recording
+from shapecat.recordings.decoding import LIBRARY_ERRORS, schema_of
+from shapecat.recordings.mcap_file import McapRecording
+from shapecat.recordings.mcap_records import ChunkError, parse
+
+__all__ = ["Item", "rewrite"]
+
+
+class Item(NamedTuple):
+    """An annotation to write: the position of its channel, its time, its bytes."""
+
+    channel: int
+    log_time_ns: int
+    data: bytes
+
+
+def rewrite(
+    recording: Recording,
+    file: BinaryIO,
+    channels: Sequence[AnnotationChannel],
+    items: Iterable[Item],
+    metadata: Mapping[str, str],
+) -> None:
+    """Write all messages of a recording, its attachments and metadata, and the annotations.
+
+    ROS 1 bags become CDR; a message that cannot be converted is wrapped (`wrap_raw`).
+    """
+    writer = Writer(file, compression=CompressionType.LZ4)
+    is_mcap = isinstance(recording, McapRecording)
+    writer.start(recording.profile if isinstance(recording, McapRecording) else "ros2", "shapecat")
+    numbers = [_register(writer, channel) for channel in channels]
+    sequences: Counter[int] = Counter()
+    source = _Source(writer, convert=not is_mcap)
+    streams: list[Iterable[Message | Item]] = [recording.messages(), items]
+    for item in merge(*streams, key=attrgetter("log_time_ns")):
+        if isinstance(item, Message):
+            source.write(item)
+            continue
+        position, time = item.channel, item.log_time_ns
+        writer.add_message(numbers[position], time, item.data, time, sequences[position])
+        sequences[position] += 1
+    if isinstance(recording, McapRecording):
+        _copy_extras(recording, writer)
+    writer.add_metadata("shapecat", dict(metadata))
+    writer.finish()
+
+
+class _Source:
+    """Writes original messages, registering their channels as they appear."""
+
+    def __init__(self, writer: Writer, *, convert: bool) -> None:
+        self.writer = writer
+        self.convert = convert
+        self.known: dict[
+            Channel, tuple[int, Callable[[bytes | memoryview], memoryview] | None]
+        ] = {}
+        self.schemas: dict[tuple[str, str, bytes], int] = {}
+        self.raw: dict[str, int] = {}
+
+    def write(self, message: Message) -> None:
+        """Write a message."""
+        channel = message.channel
+        if channel not in self.known:
+            self.known[channel] = self._register(channel)
+        number, convert = self.known[channel]
+        data: bytes | memoryview = message.data
+        try:
+            data = convert(data) if convert is not None else data
+        except LIBRARY_ERRORS:
+            number, data = self._raw_number(channel), wrap_raw(channel, data)
+        times = (message.log_time_ns, bytes(data), message.publish_time_ns)
+        self.writer.add_message(number, *times, message.sequence)
+
+    def _register(
+        self, channel: Channel
+    ) -> tuple[int, Callable[[bytes | memoryview], memoryview] | None]:
+        if not (self.convert and channel.encoding == "ros1"):
+            described = AnnotationChannel(channel.topic, channel.encoding, *schema_of(channel))
+            return _register(self.writer, described, self.schemas), None
+        converted = convert_channel(channel)
+        if converted is None:
+            return self._raw_number(channel), lambda data: wrap_raw(channel, data)
+        return _register(self.writer, converted[0], self.schemas), converted[1]
+
+    def _raw_number(self, channel: Channel) -> int:
+        if channel.topic not in self.raw:
+            described = raw_channel(channel.topic)
+            self.raw[channel.topic] = _register(self.writer, described, self.schemas)
+        return self.raw[channel.topic]
+
+
+def _register(
+    writer: Writer,
+    channel: AnnotationChannel,
+    schemas: dict[tuple[str, str, bytes], int] | None = None,
+) -> int:
+    key = (channel.schema_name, channel.schema_encoding, channel.schema)
+    schemas = {} if schemas is None else schemas
+    if key not in schemas:
+        schemas[key] = writer.register_schema(*key) if channel.schema_name else 0
+    return int(writer.register_channel(channel.topic, channel.encoding, schemas[key]))
+
+
+def _copy_extras(recording: McapRecording, writer: Writer) -> None:
+    """Copy attachments and metadata."""
+    for item in _extras(recording):
+        if isinstance(item, records.Attachment):
+            writer.add_attachment(
+                item.create_time, item.log_time, item.name, item.media_type, item.data
+            )
+        else:
+            writer.add_metadata(item.name, item.metadata)
+
+
+def _extras(recording: McapRecording) -> Iterator[records.Attachment | records.Metadata]:
+    readers = {
+        Opcode.ATTACHMENT: records.Attachment.read,
+        Opcode.METADATA: records.Metadata.read,
+    }
+    for record in recording.top_level():
+        read = readers.get(record.opcode)
+        if read is not None:
+            try:
+                yield parse(read, recording.content(record))
+            except ChunkError as error:
+                recording.warn(f"left out a record at byte {record.offset}: {error}")

@@ -1,0 +1,327 @@
+"""``review.rrd``: a run as a Rerun recording. This file and its siblings alone know Rerun.
+
+Entities
+--------
+::
+
+    world                      up and handedness; the fixed frame if there is one
+    ├── paths                  where the tracks have moved (under the topic without a fixed frame)
+    └── <topic>                the sensor: fixed_from_sensor
+        ├── camera             pinhole, for depth images
+        ├── scene              points of no object, muted
+        ├── planes             outlines;  planes/fill  translucent
+        └── objects
+            ├── points         in the colour of the category
+            ├── boxes          labelled "#track category confidence"
+            ├── captions       the same labels, drawn above the boxes
+            ├── graphs         edges of the growing neural gas
+            └── surfaces       its triangles
+    tracks/<n>/posterior       fused posterior up to each frame, a line per category
+    plots/objects/<category>   objects in view
+    plots/seconds/<stage>      time spent on each frame
+    log                        births and ends of tracks, warnings of the run
+    run                        run.json, to read
+
+Timelines: ``sensor_time`` (of the measurement) and ``frame``.
+"""
+
+import errno
+import json
+import os
+import shutil
+import uuid
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+
+from shapecat.arrays import F8
+from shapecat.errors import OutputError
+from shapecat.geometry import transform
+from shapecat.outputs.colours import colour_of
+from shapecat.outputs import review_shapes as shapes
+from shapecat.outputs.review_cloud import paint
+from shapecat.outputs.review_layout import Eye, TrackView, choose_eye, lay_out
+from shapecat.outputs.review_viewer import open_viewer, take_screenshot
+from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
+
+__all__ = ["open_viewer", "take_screenshot", "write_review"]
+
+_FLUSH_FRAMES = 32
+_RESERVE_BYTES = 64 << 20  # Rerun waits for ever on a full disk: stop before
+_PATH_STEP_M, _PATH_POINTS = 0.015, 500  # a path grows when its object moves so far
+
+
+def write_review(
+    path: Path,
+    frames: Iterable[tuple[LabelledFrame, Frame]],
+    *,
+    name: str,
+    run: Mapping[str, object],
+    categories: Sequence[str],
+    cloud_points: int,
+    fixed_frame: str | None,
+) -> None:
+    """Write a run as a Rerun recording with its layout embedded.
+
+    Parameters
+    ----------
+    path : the file; it appears when complete and replaces an older one.
+    frames : labelled frames with their points, in the order of the recording.
+    name : name of the recording in the viewer.
+    run : the contents of run.json; a list under ``warnings`` is also logged.
+    categories : in the order of the posteriors.
+    cloud_points : about how many points of each cloud to keep; 0 keeps all.
+    fixed_frame : name of the frame in which tracks are shown; None for the sensor's own.
+
+    Raises
+    ------
+    OutputError : the file cannot be written.
+
+    Notes
+    -----
+    The content depends on the arguments alone. Memory does not grow with the number of frames
+    but for some numbers per track.
+    """
+    with _recording(path, name, run) as stream:
+        review = _Review(stream, categories, cloud_points, fixed_frame)
+        review.begin(run)
+        for k, (labelled, frame) in enumerate(frames):
+            _require_space(path.parent)
+            review.add(labelled, frame)
+            if k % _FLUSH_FRAMES == _FLUSH_FRAMES - 1:
+                review.flush()
+        review.end()
+
+
+@contextmanager
+def _recording(
+    path: Path, name: str, run: Mapping[str, object]
+) -> Iterator[rr.RecordingStream]:
+    hidden = path.with_name(f".{path.name}.partial")
+    identity = uuid.uuid5(uuid.NAMESPACE_OID, name + json.dumps(run, sort_keys=True, default=str))
+    stream = rr.RecordingStream("shapecat", recording_id=identity, send_properties=False)
+    try:
+        _require_space(path.parent)
+        stream.save(hidden)
+        stream.set_log_time_enabled(False)
+        stream.send_recording_name(name)
+        try:
+            yield stream
+        finally:
+            stream.disconnect()
+        hidden.replace(path)
+    except (OSError, RuntimeError) as error:  # RuntimeError: how Rerun reports files
+        reason = error.strerror if isinstance(error, OSError) else str(error)
+        msg = f"{path}: cannot be written: {reason or error}"
+        raise OutputError(msg) from error
+    finally:
+        hidden.unlink(missing_ok=True)
+
+
+def _require_space(folder: Path) -> None:
+    if shutil.disk_usage(folder).free < _RESERVE_BYTES:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+
+class _Review:
+    """Writes frame after frame, and remembers what the layout and the paths need."""
+
+    def __init__(
+        self,
+        stream: rr.RecordingStream,
+        categories: Sequence[str],
+        cloud_points: int,
+        fixed_frame: str | None,
+    ) -> None:
+        self._stream = stream
+        self._categories = tuple(categories)
+        self._cloud_points = cloud_points
+        self._fixed_frame = fixed_frame
+        self._eyes: dict[str, Eye] = {}
+        self._cameras: dict[str, Camera] = {}
+        self._tracks: dict[int, TrackView] = {}
+        self._paths: dict[str, dict[int, list[F8]]] = {}
+        self._curves = _Curves(stream)
+        self._counted = dict.fromkeys(categories)
+        self._warnings: list[str] = []
+
+    def begin(self, run: Mapping[str, object]) -> None:
+        """Write what does not change."""
+        self._log("run", rr.TextDocument(shapes.markdown(run), media_type="text/markdown"), static=True)
+        warnings = run.get("warnings", ())
+        if isinstance(warnings, Sequence) and not isinstance(warnings, str):
+            self._warnings = [str(text) for text in warnings]
+        if self._fixed_frame is not None:
+            self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+
+    def add(self, labelled: LabelledFrame, frame: Frame) -> None:
+        """Write one frame."""
+        entity = rr.new_entity_path(["world", labelled.topic])
+        self._stream.set_time("sensor_time", timestamp=np.datetime64(labelled.stamp_ns, "ns"))
+        self._stream.set_time("frame", sequence=labelled.index)
+        self._place_sensor(entity, labelled, frame)
+        scene, points = paint(
+            frame, labelled.planes, labelled.objects, limit=self._cloud_points
+        )
+        self._log(f"{entity}/scene", shapes.points(scene))
+        self._log(f"{entity}/objects/points", shapes.points(points))
+        self._log(f"{entity}/planes", shapes.outlines(labelled.planes))
+        self._log(f"{entity}/planes/fill", shapes.fills(labelled.planes))
+        self._log(f"{entity}/objects/boxes", shapes.boxes(labelled.objects))
+        self._log(f"{entity}/objects/captions", shapes.captions(labelled.objects))
+        self._log(f"{entity}/objects/graphs", shapes.graphs(labelled.objects))
+        self._log(f"{entity}/objects/surfaces", shapes.surfaces(labelled.objects))
+        self._log_paths(entity, labelled)
+        self._log_events(labelled)
+        self._plot(labelled)
+
+    def flush(self) -> None:
+        """Write out what is held back."""
+        self._curves.send()
+        self._stream.flush(timeout_sec=60)
+
+    def end(self) -> None:
+        """Write the layout and all that is left."""
+        self._curves.send()
+        world = "/world"
+        scenes = [
+            (world if self._fixed_frame else entity, self._fixed_frame or topic, eye)
+            for topic, eye in self._eyes.items()
+            for entity in [rr.new_entity_path(["world", topic])]
+        ]
+        scenes = scenes[:1] if self._fixed_frame else scenes
+        nothing = (world, "no frame", Eye(np.ones(3), np.zeros(3), np.array([0.0, 0.0, 1.0])))
+        tracks = [self._tracks[number] for number in sorted(self._tracks)]
+        self._stream.send_blueprint(lay_out(scenes or [nothing], tracks))
+        self._stream.flush(timeout_sec=60)
+
+    def _log(self, entity: str, *what: rr.AsComponents, static: bool = False) -> None:
+        self._stream.log(entity, *what, static=static)
+
+    def _place_sensor(self, entity: str, labelled: LabelledFrame, frame: Frame) -> None:
+        """Write where the sensor is, and its axes and frustum when they are new."""
+        topic = labelled.topic
+        if topic not in self._eyes or (labelled.objects and topic not in self._paths):
+            self._eyes[topic] = choose_eye(labelled, frame, fixed=self._fixed_frame is not None)
+            self._log(entity, _axes(frame, self._eyes[topic]), static=True)
+        if labelled.objects:
+            self._paths.setdefault(topic, {})
+        pose = self._pose(labelled)
+        if pose is not None:
+            self._log(entity, shapes.transform3d(pose))
+        if frame.camera is not None and frame.camera != self._cameras.get(topic):
+            self._cameras[topic] = frame.camera
+            self._log(f"{entity}/camera", shapes.pinhole(frame.camera))
+
+    def _pose(self, labelled: LabelledFrame) -> Pose | None:
+        return None if self._fixed_frame is None else labelled.fixed_from_sensor
+
+    def _log_paths(self, entity: str, labelled: LabelledFrame) -> None:
+        """Extend the paths of the tracks that moved; write them only then."""
+        pose = self._pose(labelled)
+        if self._fixed_frame is not None:
+            if pose is None:
+                return
+            entity = "world"
+        paths = self._paths.get(labelled.topic, {})
+        changed = any([len(paths.pop(number, ())) > 1 for number in labelled.ended])
+        for item in labelled.objects:
+            place = np.asarray(item.box.center, np.float64)
+            place = place if pose is None else transform(pose, place)
+            path = paths.setdefault(item.track, [])
+            if not path or np.linalg.norm(place - path[-1]) > _PATH_STEP_M:
+                path.append(place)
+                del path[:-_PATH_POINTS]
+                changed = changed or len(path) > 1
+        if changed:
+            ways = [(self._tracks[n].category, path) for n, path in paths.items() if len(path) > 1]
+            where = rr.escape_entity_path_part(labelled.topic)
+            self._log(f"{entity}/paths/{where}", shapes.paths(ways))
+
+    def _log_events(self, labelled: LabelledFrame) -> None:
+        for text in self._warnings:
+            self._log("log", rr.TextLog(text, level="WARN"))
+        self._warnings = []
+        for item in labelled.objects:
+            if item.track not in self._tracks:
+                self._add_track(item)
+                self._log("log", rr.TextLog(f"{shapes.label(item)} appears", level="INFO"))
+        for number in labelled.ended:
+            title = self._tracks[number].title if number in self._tracks else f"#{number}"
+            self._log("log", rr.TextLog(f"{title} is not seen again", level="INFO"))
+
+    def _add_track(self, item: LabelledObject) -> None:
+        entity = f"/tracks/{item.track}"
+        self._tracks[item.track] = TrackView(entity, shapes.label(item), item.category)
+        lines = rr.SeriesLines(
+            names=list(self._categories),
+            colors=[colour_of(category) for category in self._categories],
+            widths=[1.5] * len(self._categories),
+        )
+        self._log(f"{entity}/posterior", lines, static=True)
+
+    def _plot(self, labelled: LabelledFrame) -> None:
+        at = (labelled.stamp_ns, labelled.index)
+        for item in labelled.objects:
+            self._tracks[item.track].frames += 1
+            self._curves.add(f"/tracks/{item.track}/posterior", at, item.causal)
+        counts = Counter(item.category for item in labelled.objects)
+        self._counted.update(dict.fromkeys(counts))
+        for category in self._counted:
+            self._plot_line("objects", category, at, counts[category], colour_of(category))
+        for stage, seconds in labelled.seconds.items():
+            self._plot_line("seconds", stage, at, seconds, None)
+
+    def _plot_line(
+        self,
+        group: str,
+        name: str,
+        at: tuple[int, int],
+        value: float,
+        colour: tuple[int, int, int] | None,
+    ) -> None:
+        entity = f"/plots/{group}/{rr.escape_entity_path_part(name)}"
+        if self._curves.add(entity, at, [value]):
+            self._log(entity, rr.SeriesLines(names=name, colors=colour, widths=2), static=True)
+
+
+class _Curves:
+    """Values over time, held back and sent as columns: a log call each would cost more."""
+
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self._stream = stream
+        self._pending: dict[str, list[tuple[tuple[int, int], Sequence[float]]]] = {}
+
+    def add(self, entity: str, at: tuple[int, int], values: Sequence[float]) -> bool:
+        """Hold back values at a stamp and a frame; return whether the entity is new."""
+        new = entity not in self._pending
+        self._pending.setdefault(entity, []).append((at, values))
+        return new
+
+    def send(self) -> None:
+        """Write what is held back."""
+        for entity, rows in self._pending.items():
+            if not rows:
+                continue
+            at = np.array([row[0] for row in rows], np.int64)
+            values = np.concatenate([np.asarray(row[1], np.float64) for row in rows])
+            width = len(rows[0][1])
+            self._stream.send_columns(
+                entity,
+                [
+                    rr.TimeColumn("sensor_time", timestamp=at[:, 0].astype("datetime64[ns]")),
+                    rr.TimeColumn("frame", sequence=at[:, 1]),
+                ],
+                rr.Scalars.columns(scalars=values).partition([width] * len(rows)),
+            )
+            rows.clear()
+
+
+def _axes(frame: Frame, eye: Eye) -> rr.ViewCoordinates:
+    """Return the axes of the sensor: optical for images, and where up is along -y."""
+    optical = frame.organized or eye.up[1] < -0.7
+    return rr.ViewCoordinates.RDF if optical else rr.ViewCoordinates.RIGHT_HAND_Z_UP

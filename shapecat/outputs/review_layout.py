@@ -1,0 +1,153 @@
+"""The layout of the review: which views it opens with, and where the eye stands."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import rerun.blueprint as rrb
+
+from shapecat.arrays import F8
+from shapecat.geometry import IDENTITY, transform
+from shapecat.types import Frame, LabelledFrame, Pose
+
+__all__ = ["Eye", "TrackView", "choose_eye", "lay_out"]
+
+_BACKGROUND = (16, 18, 23)
+_TRACKS_PER_TAB = 4
+_MOST_TRACKS = 48  # views; the tracks seen longest have one each, all are in the recording
+
+
+@dataclass(frozen=True)
+class Eye:
+    """Where a 3D view is looked at from, metres, in the frame of the view."""
+
+    position: F8
+    target: F8
+    up: F8
+
+
+@dataclass
+class TrackView:
+    """A track as the layout knows it."""
+
+    entity: str
+    title: str
+    category: str
+    frames: int = 0
+
+
+def choose_eye(labelled: LabelledFrame, frame: Frame, *, fixed: bool) -> Eye:
+    """Look at the objects from the sensor's side, a little above it."""
+    pose = labelled.fixed_from_sensor if fixed else None
+    pose = pose or IDENTITY
+    up = _up(labelled, frame, pose, fixed=fixed)
+    target, radius = _subject(labelled, frame, pose)
+    back = pose.translation - target
+    back = back - (back @ up) * up
+    norm = np.linalg.norm(back)
+    back = back / norm if norm > 1e-3 else np.zeros(3)
+    side = np.cross(up, back)  # from the side, so that the sensor does not stand in the way
+    distance = max(0.6, 2.2 * radius)
+    return Eye(target + distance * (0.7 * back + 0.3 * side + 0.6 * up), target, up)
+
+
+def _up(labelled: LabelledFrame, frame: Frame, pose: Pose, *, fixed: bool) -> F8:
+    if fixed:
+        return np.array([0.0, 0.0, 1.0])
+    if labelled.planes:
+        return np.asarray(pose.rotation @ labelled.planes[0].normal)
+    return np.array([0.0, -1.0, 0.0] if frame.organized else [0.0, 0.0, 1.0])
+
+
+def _subject(labelled: LabelledFrame, frame: Frame, pose: Pose) -> tuple[F8, float]:
+    """Return the middle and the radius of what is worth looking at."""
+    if labelled.objects:
+        half = [np.full(3, o.box.size.max() / 2) for o in labelled.objects]
+        centers = np.array([o.box.center for o in labelled.objects])
+        points = np.concatenate([centers - half, centers + half])
+    elif labelled.planes:
+        points = np.concatenate([plane.outline for plane in labelled.planes])
+    else:
+        points = frame.xyz()
+        points = points[np.isfinite(points).all(axis=1)]
+    if len(points) == 0:
+        points = np.zeros((1, 3))
+    low, high = points.min(axis=0), points.max(axis=0)
+    return transform(pose, (low + high) / 2), float(np.linalg.norm(high - low) / 2)
+
+
+def lay_out(
+    scenes: Sequence[tuple[str, str, Eye]], tracks: Sequence[TrackView]
+) -> rrb.Blueprint:
+    """Return the blueprint: 3D on the left; tracks, plots and texts on the right.
+
+    Parameters
+    ----------
+    scenes : entity, title and eye of each 3D view.
+    tracks : all tracks, in order of birth.
+    """
+    views = [_scene_view(*scene) for scene in scenes]
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            views[0] if len(views) == 1 else rrb.Tabs(*views),
+            rrb.Vertical(
+                _track_tabs(tracks),
+                rrb.Tabs(
+                    rrb.TimeSeriesView(origin="/plots/objects", name="Objects"),
+                    rrb.TimeSeriesView(origin="/plots/seconds", name="Seconds per frame"),
+                ),
+                rrb.Tabs(
+                    rrb.TextLogView(
+                        origin="/log",
+                        name="Events",
+                        columns=rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"]),
+                    ),
+                    rrb.TextDocumentView(origin="/run", name="Run"),
+                ),
+                row_shares=[5, 2, 2],
+            ),
+            column_shares=[5, 3],
+        ),
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline="sensor_time"),
+        auto_views=False,
+        auto_layout=False,
+    )
+
+
+def _scene_view(entity: str, title: str, eye: Eye) -> rrb.Spatial3DView:
+    return rrb.Spatial3DView(
+        origin=entity,
+        name=title,
+        background=_BACKGROUND,
+        line_grid=rrb.LineGrid3D(visible=False),
+        eye_controls=rrb.EyeControls3D(
+            position=eye.position, look_target=eye.target, eye_up=eye.up
+        ),
+    )
+
+
+def _track_tabs(tracks: Sequence[TrackView]) -> rrb.Tabs:
+    longest = sorted(tracks, key=lambda track: -track.frames)[:_MOST_TRACKS]
+    shown = [track for track in tracks if track in longest]
+    groups = [shown[k : k + _TRACKS_PER_TAB] for k in range(0, len(shown), _TRACKS_PER_TAB)]
+    tabs = [
+        rrb.Vertical(*(_track_view(track) for track in group), name=_span(group))
+        for group in groups
+    ]
+    return rrb.Tabs(*tabs, name="Posterior so far")
+
+
+def _span(group: Sequence[TrackView]) -> str:
+    first, last = (track.title.split()[0] for track in (group[0], group[-1]))
+    return first if first == last else f"{first} – {last}"
+
+
+def _track_view(track: TrackView) -> rrb.TimeSeriesView:
+    return rrb.TimeSeriesView(
+        origin=track.entity,
+        name=track.title,
+        axis_y=rrb.ScalarAxis(range=(0.0, 1.0), zoom_lock=True),
+        plot_legend=rrb.PlotLegend(visible=False),
+    )

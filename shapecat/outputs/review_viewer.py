@@ -1,0 +1,144 @@
+"""Opening a review in the Rerun viewer, with a window or without."""
+
+import shutil
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from shapecat.errors import OutputError
+
+__all__ = ["open_viewer", "take_screenshot"]
+
+_SETTLE_S = 7.0  # until the viewer's greetings have faded; all else is drawn by then
+_LOAD_S = 30.0
+
+
+def open_viewer(path: Path) -> None:
+    """Open a review in a window of its own, and return at once.
+
+    Raises
+    ------
+    OutputError : there is no such file, or no viewer.
+    """
+    _require_file(path)
+    subprocess.Popen([_viewer(), str(path.absolute())], start_new_session=True)
+
+
+def take_screenshot(
+    path: Path, png: Path, *, size: tuple[int, int] = (1280, 800), stamp_ns: int | None = None
+) -> None:
+    """Draw a review to a PNG file without a window; software rendering is enough.
+
+    Parameters
+    ----------
+    size : width and height in pixels.
+    stamp_ns : the time to show; the last one of the recording by default.
+
+    Raises
+    ------
+    OutputError : there is no such file, no viewer, or nothing that can draw.
+    """
+    from rerun.experimental import ViewerClient  # noqa: PLC0415  only a screenshot needs it
+
+    _require_file(path)
+    port = _free_port()
+    options = ["--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"]
+    window = ["--headless", "--window-size", f"{size[0]}x{size[1]}"]
+    with tempfile.TemporaryFile() as said:
+        viewer = subprocess.Popen([_viewer(), *options, *window], stdout=said, stderr=said)
+        try:
+            _wait_for(viewer, port, said)
+            client = ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy")
+            _show(client, path, stamp_ns)
+            client.save_screenshot(str(png.absolute()))
+            _wait_until(png.exists)
+        except (RuntimeError, OSError) as error:
+            msg = f"{path}: the viewer cannot draw it: {error}"
+            raise OutputError(msg) from error
+        finally:
+            viewer.kill()
+            viewer.wait()
+
+
+def _show(client: Any, path: Path, stamp_ns: int | None) -> None:
+    """Open the file at a time, and wait until it is drawn."""
+    client.open(str(path.absolute()))
+    _wait_until(lambda: not client.get_state().loading)
+    if stamp_ns is None:
+        stamp_ns = _last_stamp(client)
+    if stamp_ns is not None:
+        at = np.datetime64(stamp_ns, "ns")
+        client.set_time("sensor_time", timestamp=at, play_state="paused")
+    time.sleep(_SETTLE_S)
+
+
+def _last_stamp(client: Any) -> int | None:
+    ends = [
+        timeline.end
+        for recording in client.get_state().recordings
+        for timeline in recording.timelines
+        if timeline.name == "sensor_time" and timeline.end is not None
+    ]
+    return max(ends, default=None)
+
+
+def _require_file(path: Path) -> None:
+    if not path.is_file():
+        msg = f"{path}: there is no review here; process the recording without --no-rrd"
+        raise OutputError(msg)
+
+
+def _viewer() -> str:
+    """Return the path of the viewer: beside this Python first, then on the PATH."""
+    beside = shutil.which("rerun", path=str(Path(sys.executable).parent))
+    found = beside or shutil.which("rerun")
+    if found is None:
+        msg = "no program `rerun` beside Python or on the PATH; install the package rerun-sdk"
+        raise OutputError(msg)
+    return found
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def _wait_for(viewer: subprocess.Popen[bytes], port: int, said: IO[bytes]) -> None:
+    """Wait until the viewer answers; say why when it ends before."""
+
+    def answers() -> bool:
+        if viewer.poll() is not None:
+            raise OutputError(_why(said))
+        with socket.socket() as probe:
+            return probe.connect_ex(("127.0.0.1", port)) == 0
+
+    _wait_until(answers)
+
+
+def _why(said: IO[bytes]) -> str:
+    said.seek(0)
+    text = said.read().decode("utf-8", "replace")
+    if "adapter" in text or "Vulkan" in text:
+        return (
+            "the viewer finds nothing to draw with; without a graphics card install a software "
+            "renderer (Debian, Ubuntu: the package mesa-vulkan-drivers)"
+        )
+    lines = [line for line in text.splitlines() if line.strip()]
+    return f"the viewer ended: {lines[-1] if lines else 'it said nothing'}"
+
+
+def _wait_until(ready: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + _LOAD_S
+    while not ready():
+        if time.monotonic() > deadline:
+            msg = f"no answer within {_LOAD_S:.0f} s"
+            raise TimeoutError(msg)
+        time.sleep(0.05)

@@ -1,0 +1,173 @@
+"""The containers a simulated recording can be written in."""
+
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Protocol, Self
+
+from mcap.writer import CompressionType
+from mcap.writer import Writer as McapFile
+from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.rosbag1 import Writer as Ros1File
+from rosbags.rosbag2 import Writer as Ros2Folder
+
+from shapecat.simulation.messages import MessageFactory
+
+__all__ = ["CONTAINERS", "Container"]
+
+_STATIC = "/tf_static"
+_QOS = """- history: {history}
+  depth: {depth}
+  reliability: 1
+  durability: {durability}
+  deadline: {{sec: 2147483647, nsec: 4294967295}}
+  lifespan: {{sec: 2147483647, nsec: 4294967295}}
+  liveliness: 1
+  liveliness_lease_duration: {{sec: 2147483647, nsec: 4294967295}}
+  avoid_ros_namespace_conventions: false
+"""
+
+
+class Container(Protocol):
+    """A recording being written; leaving the block completes it."""
+
+    messages: MessageFactory
+
+    def __init__(self, path: Path) -> None: ...
+
+    def __enter__(self) -> Self: ...
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None: ...
+
+    def write(self, topic: str, message: Any, log_time_ns: int) -> None:
+        """Append a message."""
+
+
+class _Mcap:
+    """MCAP with ROS 2 messages, zstd."""
+
+    def __init__(self, path: Path) -> None:
+        self.messages = MessageFactory(2)
+        self._path = path
+        self._channels: dict[str, tuple[int, int]] = {}
+
+    def __enter__(self) -> Self:
+        self._stream = self._path.open("wb")
+        self._file = McapFile(self._stream, compression=CompressionType.ZSTD)
+        self._file.start(profile="ros2", library="shapecat")
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.finish()
+        self._stream.close()
+
+    def write(self, topic: str, message: Any, log_time_ns: int) -> None:
+        channel, sequence = self._channels.get(topic) or (self._channel(topic, message), 0)
+        self._channels[topic] = channel, sequence + 1
+        data = self.messages.serialize(message)
+        self._file.add_message(channel, log_time_ns, data, log_time_ns, sequence)
+
+    def _channel(self, topic: str, message: Any) -> int:
+        name = message.__msgtype__
+        text, _ = self.messages.typestore.generate_msgdef(name, ros_version=2)
+        schema = self._file.register_schema(name, "ros2msg", text.encode())
+        latched = topic == _STATIC
+        qos = _QOS.format(history=1, depth=1 if latched else 10, durability=1 if latched else 2)
+        return int(
+            self._file.register_channel(topic, "cdr", schema, {"offered_qos_profiles": qos})
+        )
+
+
+class _Ros1:
+    """A ROS 1 bag."""
+
+    def __init__(self, path: Path) -> None:
+        self.messages = MessageFactory(1)
+        self._file = Ros1File(path)
+        self._connections: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        self._file.open()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.close()
+
+    def write(self, topic: str, message: Any, log_time_ns: int) -> None:
+        if topic not in self._connections:
+            self._connections[topic] = self._file.add_connection(
+                topic,
+                message.__msgtype__,
+                typestore=self.messages.typestore,
+                latching=int(topic == _STATIC),
+            )
+        self._file.write(self._connections[topic], log_time_ns, self.messages.serialize(message))
+
+
+class _Ros2:
+    """A ROS 2 folder with an SQLite database."""
+
+    def __init__(self, path: Path) -> None:
+        self.messages = MessageFactory(2)
+        self._file = Ros2Folder(path, version=8)
+        self._connections: dict[str, Any] = {}
+
+    def __enter__(self) -> Self:
+        self._file.open()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.close()
+
+    def write(self, topic: str, message: Any, log_time_ns: int) -> None:
+        if topic not in self._connections:
+            self._connections[topic] = self._file.add_connection(
+                topic,
+                message.__msgtype__,
+                typestore=self.messages.typestore,
+                offered_qos_profiles=[_qos(latched=topic == _STATIC)],
+            )
+        self._file.write(self._connections[topic], log_time_ns, self.messages.serialize(message))
+
+
+def _qos(*, latched: bool) -> Qos:
+    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
+    ever = QosTime(2147483647, 4294967295)
+    return Qos(
+        QosHistory.KEEP_LAST,
+        1 if latched else 10,
+        QosReliability.RELIABLE,
+        durability,
+        ever,
+        ever,
+        QosLiveliness.AUTOMATIC,
+        ever,
+        avoid_ros_namespace_conventions=False,
+    )
+
+
+CONTAINERS: dict[str, tuple[str, type[Container]]] = {
+    "mcap": (".mcap", _Mcap),
+    "ros1": (".bag", _Ros1),
+    "ros2": ("", _Ros2),
+}
+"""Suffix and writer of each recording format."""

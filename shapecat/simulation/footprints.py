@@ -1,0 +1,85 @@
+"""Where there is room: flat outlines of things, and whether they overlap."""
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from shapecat.arrays import F8, Record, array
+from shapecat.geometry import transform
+from shapecat.simulation.mesh import Mesh
+from shapecat.types import Pose
+
+__all__ = ["Footprint", "footprint", "inside", "overlap"]
+
+
+class Footprint(Record):
+    """The space a thing takes up, seen from above.
+
+    Attributes
+    ----------
+    outline : (k, 2) convex, counter-clockwise, metres, world frame.
+    contact : (c, 2) convex outline of what touches the ground.
+    top : (t, 2) convex outline of its highest millimetre.
+    low, high : heights of its lowest and highest point, metres.
+    """
+
+    outline: F8 = array("k 2", "f8")
+    contact: F8 = array("c 2", "f8")
+    top: F8 = array("t 2", "f8")
+    low: float
+    high: float
+
+    def moved(self, shift: F8) -> "Footprint":
+        """Move by (3,) metres."""
+        flat = np.asarray(shift)[:2]
+        return Footprint(
+            self.outline + flat,
+            self.contact + flat,
+            self.top + flat,
+            self.low + shift[2],
+            self.high + shift[2],
+        )
+
+
+def footprint(mesh: Mesh, world_from_mesh: Pose) -> Footprint:
+    """Find the outlines of a thing."""
+    points = transform(world_from_mesh, mesh.vertices)
+    low, high = float(points[:, 2].min()), float(points[:, 2].max())
+    contact = points[points[:, 2] < low + 0.001, :2]
+    top = points[points[:, 2] > high - 0.001, :2]
+    return Footprint(_hull(points[:, :2]), _hull(contact), _hull(top), low, high)
+
+
+def overlap(a: F8, b: F8, gap: float) -> bool:
+    """Tell whether two convex outlines are nearer than ``gap`` (separating axes)."""
+    for one, other in ((a, b), (b, a)):
+        normals = _normals(one)
+        reach = (one @ normals.T).max(axis=0)
+        start = (other @ normals.T).min(axis=0)
+        if np.any(start - reach >= gap):
+            return False
+    return True
+
+
+def inside(points: F8, outline: F8, margin: float) -> bool:
+    """Tell whether all points are in a convex outline, ``margin`` away from its edge."""
+    if len(outline) < 3:
+        return False
+    normals = _normals(outline)
+    reach = (outline @ normals.T).max(axis=0)
+    return bool(np.all(points @ normals.T <= reach - margin))
+
+
+def _normals(outline: F8) -> F8:
+    edge = np.roll(outline, -1, axis=0) - outline
+    normals = np.stack([edge[:, 1], -edge[:, 0]], -1)
+    length = np.linalg.norm(normals, axis=1, keepdims=True)
+    keep = length[:, 0] > 1e-9
+    return np.asarray(normals[keep] / length[keep])
+
+
+def _hull(points: F8) -> F8:
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) > 2 else [0]
+    if len(points) < 3 or spread[-1] < 1e-6:  # a point or a line
+        along = np.argsort(points @ [0.8, 0.6])
+        return points[along[[0, -1]]]
+    return points[ConvexHull(points).vertices]

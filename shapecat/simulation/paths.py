@@ -1,0 +1,76 @@
+"""How the camera moves: world_from_camera with optical axes (x right, y down, z forward)."""
+
+import numpy as np
+from numpy.random import Generator
+
+from shapecat.arrays import F8
+from shapecat.geometry import quaternion_from_rotation, rotation_from_quaternion
+from shapecat.types import Pose
+
+__all__ = ["hold", "looking_at", "walk"]
+
+
+def looking_at(eye: F8, target: F8, *, roll: float = 0.0) -> Pose:
+    """Return the pose of a camera that looks at a point, level but for ``roll`` radians.
+
+    Entries are rounded, so that the pose is the same on every machine.
+    """
+    forward = np.asarray(target, np.float64) - eye
+    forward /= np.linalg.norm(forward)
+    right = np.array([forward[1], -forward[0], 0.0])
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    c, s = np.cos(roll), np.sin(roll)
+    rotation = np.stack([c * right + s * down, c * down - s * right, forward], axis=1)
+    quaternion = np.round(quaternion_from_rotation(rotation), 9)
+    return Pose(rotation_from_quaternion(quaternion), np.round(eye, 7))
+
+
+def walk(
+    rng: Generator,
+    target: F8,
+    frames: int,
+    rate_hz: float,
+    *,
+    distance: float,
+    elevation: float,
+    sweep: float,
+) -> tuple[Pose, ...]:
+    """Walk to and fro on an arc in front of a place, swaying a little, always looking at it.
+
+    Parameters
+    ----------
+    target : (3,) the place, metres; it is seen from the side of negative y.
+    distance : metres, at the start.
+    elevation : degrees by which the camera looks down, at the start.
+    sweep : degrees from the middle of the arc to its ends.
+    """
+    t = np.arange(frames) / rate_hz
+    speed = rng.uniform(0.25, 0.6) / distance  # walking speed, radians per second
+    width = np.radians(sweep)
+    phase = rng.uniform(-np.pi, np.pi)
+    azimuth = -np.pi / 2 + width * np.sin(speed / width * t + phase)
+    slow = rng.uniform(0.1, 0.35, 3) * 2 * np.pi
+    shift = rng.uniform(0, 2 * np.pi, 6)
+    far = distance * (1 + 0.1 * np.sin(slow[0] * t + shift[0]))
+    up = np.radians(elevation + 4 * np.sin(slow[1] * t + shift[1]))
+    flat = far * np.cos(up)
+    step = 2 * np.pi * 1.8  # steps per second
+    bob = 0.006 * np.sin(step * t + shift[2])
+    eye = np.stack(
+        [target[0] + flat * np.cos(azimuth), target[1] + flat * np.sin(azimuth), target[2] + far * np.sin(up) + bob], -1
+    )
+    gaze = target + 0.03 * np.stack(
+        [np.sin(slow[2] * t + shift[3]), np.cos(slow[0] * t + shift[4]), np.sin(slow[1] * t)], -1
+    )
+    roll = np.radians(rng.normal(0, 1.0) + 0.6 * np.sin(0.5 * step * t + shift[5]))
+    return tuple(looking_at(e, g, roll=float(r)) for e, g, r in zip(eye, gaze, roll, strict=True))
+
+
+def hold(
+    rng: Generator, target: F8, frames: int, *, distance: float, elevation: float
+) -> tuple[Pose, ...]:
+    """Keep the camera still."""
+    up = np.radians(elevation)
+    eye = target + distance * np.array([0, -np.cos(up), np.sin(up)])
+    return (looking_at(eye, target, roll=float(np.radians(rng.normal(0, 1.0)))),) * frames

@@ -1,0 +1,192 @@
+"""Simulated recordings, with the truth beside them."""
+
+import json
+import shutil
+import tempfile
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any, Literal, Self
+
+import numpy as np
+
+from shapecat.arrays import U1
+from shapecat.errors import OutputError
+from shapecat.simulation.containers import CONTAINERS, Container
+from shapecat.simulation.scenes import SceneKind, make_scene
+from shapecat.simulation.sensors import SENSORS, Sensor
+from shapecat.simulation.truth import LINK_FROM_OPTICAL, frame_truth, robot_links
+from shapecat.simulation.views import render_frame
+from shapecat.simulation.worlds import World
+from shapecat.types import Frame
+
+__all__ = ["EPOCH_NS", "record", "simulate"]
+
+EPOCH_NS = 1_700_200_000_000_000_000
+"""Stamp of the first frame."""
+
+_LATENCY_NS = 12_000_000
+_OPTICAL = "camera_depth_optical_frame"
+
+
+def _ignore(phase: str, done: int, total: int | None) -> None:
+    """Watch nothing."""
+
+
+def simulate(
+    out: Path,
+    *,
+    scene: SceneKind = "tabletop",
+    format: Literal["mcap", "ros1", "ros2"] = "mcap",  # noqa: A002  # the word users know
+    frames: int = 90,
+    seed: int = 0,
+    sensor: Literal["kinect", "realsense", "ideal"] = "kinect",
+    clouds: bool = False,
+    rate_hz: float = 30.0,
+    observe: Callable[[str, int, int | None], None] = _ignore,
+) -> Path:
+    """Write a recording of a random scene.
+
+    Topics: /camera/depth/image_raw (16UC1, mm) or /camera/depth/points, /camera/depth/camera_info,
+    /tf (map, base_link, camera_link) and /tf_static. Beside it, under the same name,
+    ``NAME.truth.json`` says what stands where in each frame and ``NAME.labels.npz`` whose each
+    pixel is. The same arguments give the same messages on every machine.
+
+    Parameters
+    ----------
+    out : path of the recording; the suffix of the format is added if it has none.
+    clouds : write organized point clouds instead of depth images.
+    observe : told the phase, the frames done, and how many there are.
+
+    Returns
+    -------
+    The path of the recording.
+
+    Raises
+    ------
+    ValueError : an unknown scene, format or sensor.
+    OutputError : the place is not writable.
+    """
+    if sensor not in SENSORS:
+        msg = f"no sensor {sensor!r}; known: {', '.join(SENSORS)}"
+        raise ValueError(msg)
+    world = make_scene(scene, np.random.default_rng(seed), frames=frames, rate_hz=rate_hz)
+    return record(
+        world,
+        out,
+        format=format,
+        seed=seed,
+        sensor=SENSORS[sensor],
+        clouds=clouds,
+        rate_hz=rate_hz,
+        observe=observe,
+    )
+
+
+def record(
+    world: World,
+    out: Path,
+    *,
+    seed: int,
+    sensor: Sensor,
+    format: Literal["mcap", "ros1", "ros2"] = "mcap",  # noqa: A002  # the word users know
+    clouds: bool = False,
+    rate_hz: float = 30.0,
+    observe: Callable[[str, int, int | None], None] = _ignore,
+) -> Path:
+    """Write a recording of a world; see `simulate`.
+
+    ``seed`` draws the sensor's noise and names the scene in the truth.
+    """
+    if format not in CONTAINERS:
+        msg = f"no recording format {format!r}; known: {', '.join(CONTAINERS)}"
+        raise ValueError(msg)
+    suffix, container = CONTAINERS[format]
+    out = out if out.suffix or not suffix else out.with_name(out.name + suffix)
+    names = [out.name, f"{out.stem}.truth.json", f"{out.stem}.labels.npz"]
+    try:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=out.parent, prefix=".simulated-") as hidden:
+            recording, truth, labels = (Path(hidden) / name for name in names)
+            with container(recording) as writer, _LabelFile(labels, len(world), sensor) as pixels:
+                found = []
+                for index in range(len(world)):
+                    rng = np.random.default_rng((seed, index))
+                    frame, image = render_frame(
+                        world, index, rng=rng, sensor=sensor, rate_hz=rate_hz, start_ns=EPOCH_NS
+                    )
+                    _write_frame(writer, world, frame, clouds=clouds)
+                    pixels.append(image)
+                    found.append(_truth(world, frame, image, sensor, seed))
+                    observe("simulate", index + 1, len(world))
+            truth.write_text("[" + ",\n".join(map(json.dumps, found)) + "]\n", "utf-8")
+            for name in names:
+                _move(Path(hidden) / name, out.with_name(name))
+    except OSError as error:
+        msg = f"{out}: cannot write the recording: {error.strerror or error}"
+        raise OutputError(msg) from error
+    return out
+
+
+def _write_frame(writer: Container, world: World, frame: Frame, *, clouds: bool) -> None:
+    make, stamp, depth, camera = writer.messages, frame.stamp_ns, frame.depth, frame.camera
+    if depth is None or camera is None:
+        msg = "a simulated frame is a depth image"
+        raise ValueError(msg)
+    if frame.index == 0:
+        still = [("camera_link", _OPTICAL, LINK_FROM_OPTICAL)]
+        writer.write("/tf_static", make.transforms(still, stamp), stamp)
+    links = robot_links(world.path[frame.index])
+    writer.write("/tf", make.transforms(links, stamp), stamp + _LATENCY_NS // 4)
+    logged = stamp + _LATENCY_NS
+    info = make.camera_info(camera, stamp, _OPTICAL)
+    writer.write("/camera/depth/camera_info", info, logged)
+    if clouds:
+        points = frame.xyz().reshape(camera.height, camera.width, 3)
+        writer.write("/camera/depth/points", make.cloud(points, stamp, _OPTICAL), logged)
+    else:
+        writer.write("/camera/depth/image_raw", make.image(depth, stamp, _OPTICAL), logged)
+
+
+def _truth(world: World, frame: Frame, labels: U1, sensor: Sensor, seed: int) -> dict[str, Any]:
+    truth = frame_truth(world, frame.index, labels, sensor)
+    return {
+        "frame": frame.index,
+        "scene": f"sim{seed}",
+        "kind": world.kind,
+        "stamp_ns": frame.stamp_ns,
+        "objects": truth.objects,
+        "hidden": truth.hidden,
+        "planes": truth.planes,
+    }
+
+
+class _LabelFile:
+    """``labels`` (t, h, w) uint8 in a compressed .npz, written frame by frame."""
+
+    def __init__(self, path: Path, frames: int, sensor: Sensor) -> None:
+        self._archive = zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=4)
+        # A fixed date: the same labels are the same bytes.
+        member = zipfile.ZipInfo("labels.npy")
+        member.compress_type = zipfile.ZIP_DEFLATED
+        self._file: IO[bytes] = self._archive.open(member, "w", force_zip64=True)
+        shape = (frames, sensor.camera.height, sensor.camera.width)
+        header = {"descr": "|u1", "fortran_order": False, "shape": shape}
+        np.lib.format.write_array_header_1_0(self._file, header)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._file.close()
+        self._archive.close()
+
+    def append(self, labels: U1) -> None:
+        """Add the labels of the next frame."""
+        self._file.write(np.ascontiguousarray(labels).tobytes())
+
+
+def _move(made: Path, path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    made.replace(path)

@@ -1,0 +1,130 @@
+"""What is true in a frame, for those who judge what was found in it."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import F8, U1
+from shapecat.geometry import compose, inverse, transform, upright_box
+from shapecat.simulation.render import Geometry, alone_pixels
+from shapecat.simulation.sensors import Sensor
+from shapecat.simulation.worlds import Thing, World
+from shapecat.types import Pose
+
+__all__ = ["AMBIGUOUS_PIXELS", "AMBIGUOUS_SHARE", "LISTED_PIXELS", "Truth", "frame_truth"]
+
+LISTED_PIXELS = 100
+"""Things with fewer readings are listed as hidden, not as objects."""
+AMBIGUOUS_PIXELS = 250
+"""With fewer readings the category cannot be told."""
+AMBIGUOUS_SHARE = 0.4
+"""Nor if a smaller share of the visible side is seen."""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """The truth of one frame as it is written: JSON values."""
+
+    objects: list[dict[str, Any]]
+    hidden: list[dict[str, Any]]
+    planes: list[dict[str, Any]]
+
+
+def frame_truth(world: World, frame: int, labels: U1, sensor: Sensor) -> Truth:
+    """Tell what is true in a frame.
+
+    Parameters
+    ----------
+    labels : (h, w) pixel labels of the frame.
+    """
+    seen = world.geometry(frame)
+    pose = world.path[frame]
+    counts = np.bincount(labels.reshape(-1), minlength=256)
+    objects, hidden = [], []
+    for owner, thing in enumerate(world.things, start=len(world.supports)):
+        pixels = int(counts[thing.label])
+        entry = _thing_truth(world, frame, thing, pixels, seen, owner, sensor)
+        (objects if pixels >= LISTED_PIXELS else hidden).append(entry)
+    camera_from_world = inverse(pose)
+    planes = []
+    for support in world.supports:
+        if support.level:
+            normal = camera_from_world.rotation[:, 2]
+            point = transform(camera_from_world, support.outline[0])
+            planes.append(
+                {
+                    "label": support.label,
+                    "name": support.name,
+                    "normal": _rounded(normal),
+                    "offset": round(float(normal @ point), 6),
+                    "height": round(support.height, 6),
+                    "pixels": int(counts[support.label]),
+                }
+            )
+    return Truth(objects, hidden, planes)
+
+
+def _thing_truth(
+    world: World,
+    frame: int,
+    thing: Thing,
+    pixels: int,
+    seen: Geometry,
+    owner: int,
+    sensor: Sensor,
+) -> dict[str, Any]:
+    camera_from_world = inverse(world.path[frame])
+    camera_from_mesh = compose(camera_from_world, world.pose_of(thing, frame))
+    points = transform(camera_from_mesh, thing.mesh.vertices).astype(np.float32)
+    box = upright_box(points, camera_from_world.rotation[:, 2])
+    total = alone_pixels(seen, owner, sensor.camera, world.path[frame])
+    share = min(1.0, pixels / total) if total else 0.0
+    few = pixels < AMBIGUOUS_PIXELS or share < AMBIGUOUS_SHARE
+    return {
+        "label": thing.label,
+        "parts": [thing.label],
+        "category": thing.category,
+        "ambiguous": bool(few or thing.indistinct),
+        "pixels": pixels,
+        "track": thing.track,
+        "kind": thing.kind,
+        "center": _rounded(transform(world.path[frame], box.center)),
+        "box": {
+            "center": _rounded(box.center),
+            "size": _rounded(box.size),
+            "orientation": _rounded(box.orientation),
+        },
+        "lying": thing.lying,
+        "upside_down": thing.upside_down,
+        "on_support": thing.on_support,
+        "on_track": thing.on_track,
+        "visible": round(share, 4),
+    }
+
+
+def _rounded(values: F8) -> list[float]:
+    return [round(float(value), 6) for value in values]
+
+
+def robot_links(world_from_camera: Pose) -> list[tuple[str, str, Pose]]:
+    """Split the camera's pose into those of a robot: its base on the floor, its camera on a mast.
+
+    Returns
+    -------
+    Parent, child, ``parent_from_child``: map to base_link, base_link to camera_link.
+    """
+    world_from_link = compose(world_from_camera, inverse(LINK_FROM_OPTICAL))
+    heading = world_from_link.rotation[:2, 0]
+    c, s = heading / np.linalg.norm(heading)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    place = world_from_camera.translation * [1, 1, 0]
+    base = Pose(turn, place)
+    return [
+        ("map", "base_link", base),
+        ("base_link", "camera_link", compose(inverse(base), world_from_link)),
+    ]
+
+
+LINK_FROM_OPTICAL = Pose(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
+"""camera_link (x forward, z up, REP 103) from the optical frame (z forward, y down)."""

@@ -1,0 +1,47 @@
+"""Frames with labels in memory: what training and evaluation on shapes are made of."""
+
+import numpy as np
+from numpy.random import Generator
+
+from shapecat.arrays import U1
+from shapecat.simulation.render import render
+from shapecat.simulation.sensors import KINECT, Sensor, measure
+from shapecat.simulation.worlds import World
+from shapecat.types import Frame, Pose
+
+__all__ = ["render_frame"]
+
+
+def render_frame(
+    world: World,
+    view: int | Pose,
+    *,
+    rng: Generator,
+    sensor: Sensor = KINECT,
+    rate_hz: float = 30.0,
+    start_ns: int = 0,
+    topic: str = "/camera/depth/image_raw",
+) -> tuple[Frame, U1]:
+    """Take one depth image of a world.
+
+    Parameters
+    ----------
+    view : a frame of the world's path, or ``world_from_camera`` to look from elsewhere at its
+        first frame.
+    rng : draws the sensor's noise.
+
+    Returns
+    -------
+    The frame, and (h, w) uint8 labels: 0 no reading, 1 to 9 supports, then
+    `Thing.label`.
+    """
+    index = view if isinstance(view, int) else 0
+    pose = world.path[view] if isinstance(view, int) else view
+    image = render(world.geometry(index), sensor.camera, pose)
+    depth, owners = measure(image, sensor, rng)
+    labels = np.where(owners >= 0, np.append(world.labels, np.uint8(0))[owners], np.uint8(0))
+    stamp = start_ns + round(index * 1e9 / rate_hz)
+    frame = Frame(
+        topic, index, stamp, stamp, "camera_depth_optical_frame", depth=depth, camera=sensor.camera
+    )
+    return frame, labels.astype(np.uint8)

@@ -1,0 +1,403 @@
+"""annotated.mcap: nothing of the original is lost, and every tool reads what is added."""
+
+import hashlib
+import json
+import os
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import NonSeekingReader, make_reader
+from mcap.writer import CompressionType, Writer
+from mcap_ros2.decoder import DecoderFactory
+from rosbags.highlevel import AnyReader
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as FolderWriter
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from shapecat.errors import OutputError
+from shapecat.outputs.annotated_mcap import write_annotated
+from shapecat.outputs.colours import CATEGORY_COLOURS, colour_of
+from shapecat.recordings import open_recording
+from shapecat.types import CATEGORIES, Box, LabelledFrame, LabelledObject, NeuralGas
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+STORE1 = get_typestore(Stores.ROS1_NOETIC)
+STRING = "std_msgs/msg/String"
+SECOND = 10**9
+EPOCH = 1_700_000_000 * SECOND
+RUN = {"version": "1", "counts": {"frames": 3}}
+
+
+def f4(*values: float) -> Any:
+    return np.array(values, np.float32)
+
+
+def labelled(index: int, tracks: list[int], *, ended: tuple[int, ...] = ()) -> LabelledFrame:
+    nothing = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+    objects = tuple(
+        LabelledObject(
+            track=track,
+            category="cup",
+            confidence=0.97,
+            box=Box(f4(0.1, 0.2, 1.0 + track), f4(0.1, 0.2, 0.3), f4(0, 0, 0.6, 0.8)),
+            indices=np.zeros(1, np.uint32),
+            gas=nothing,
+            posterior=f4(1),
+            causal=f4(1),
+        )
+        for track in tracks
+    )
+    return LabelledFrame(
+        topic="/points",
+        index=index,
+        stamp_ns=EPOCH + index * SECOND // 10,
+        log_time_ns=EPOCH + index * SECOND // 10 + 7,
+        frame_id="camera",
+        fixed_from_sensor=None,
+        planes=(),
+        objects=objects,
+        ended=ended,
+        seconds={},
+    )
+
+
+FRAMES = [labelled(0, [3, 4]), labelled(1, [4]), labelled(2, [], ended=(4,))]
+
+
+def string(value: str) -> bytes:
+    return bytes(STORE.serialize_cdr(STORE.types[STRING](data=value), STRING))
+
+
+def write_mcap(path: Path, *, unfinished: bool = False, **options: Any) -> Path:
+    with path.open("wb") as file:
+        writer = Writer(file, **({"chunk_size": 100} | options))
+        writer.start("ros2", "test")
+        text = STORE.generate_msgdef(STRING, ros_version=2)[0].encode()
+        schema = writer.register_schema(STRING, "ros2msg", text)
+        channel = writer.register_channel("/points", "cdr", schema)
+        for k in range(9):
+            writer.add_message(channel, EPOCH + k, string(f"message {k}"), EPOCH, k)
+            if k == 4:
+                writer.add_attachment(1, 2, "photo", "image/png", b"\x89PNG")
+                writer.add_metadata("robot", {"name": "r2"})
+        if unfinished:
+            writer.flush()
+        else:
+            writer.finish()
+    return path
+
+
+def annotate(source: Path, target: Path, **options: Any) -> None:
+    with open_recording(source) as recording:
+        write_annotated(recording, target, iter(FRAMES), run=RUN, **options)
+
+
+def digest(path: Path) -> Counter[tuple[Any, ...]]:
+    with path.open("rb") as file:
+        return Counter(
+            (c.topic, m.log_time, m.publish_time, m.sequence, hashlib.md5(m.data).hexdigest())  # noqa: S324  # compares
+            for _, c, m in make_reader(file, validate_crcs=True).iter_messages()
+        )
+
+
+def decoded(path: Path, topic: str) -> list[Any]:
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        return [(m.log_time, d) for *_, m, d in reader.iter_decoded_messages(topics=[topic])]
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_every_original_message_stays_byte_for_byte(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    source = write_mcap(tmp_path / "a.mcap", compression=compression)
+    target = tmp_path / "out.mcap"
+
+    annotate(source, target, markers=True)
+
+    assert not digest(source) - digest(target)
+    assert digest(target).total() == 9 + 3 * 3
+    with open_recording(source) as recording:
+        end = recording.summary.data_end  # type: ignore[attr-defined]  # it is an MCAP file
+    assert target.read_bytes()[:end] == source.read_bytes()[:end]
+
+
+def test_other_readers_accept_the_file(tmp_path: Path) -> None:
+    """The summary, its offsets and its checksums are ours: others must agree with them."""
+    target = tmp_path / "out.mcap"
+    annotate(write_mcap(tmp_path / "a.mcap"), target)
+
+    with target.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert summary.statistics is not None
+        assert summary.statistics.message_count == 9 + 6
+        assert summary.statistics.metadata_count == 2
+        assert [a.name for a in reader.iter_attachments()] == ["photo"]
+        metadata = {m.name: m.metadata for m in reader.iter_metadata()}
+    assert metadata["robot"] == {"name": "r2"}
+    assert json.loads(metadata["shapecat"]["run.json"]) == RUN
+    with target.open("rb") as file:
+        stream = NonSeekingReader(file, validate_crcs=True)
+        assert sum(1 for _ in stream.iter_messages(log_time_order=False)) == 15
+    with AnyReader([target]) as other:
+        assert other.message_count == sum(1 for _ in other.messages()) == 15
+    with open_recording(target) as again:
+        assert again.warnings == []
+        assert sum(1 for _ in again.messages()) == 15
+
+
+def test_summary_checksum_is_right(tmp_path: Path) -> None:
+    """Readers of other languages verify it; the Python library does not."""
+    import zlib  # noqa: PLC0415  # only here
+
+    target = tmp_path / "out.mcap"
+    annotate(write_mcap(tmp_path / "a.mcap"), target)
+    data = target.read_bytes()
+    footer = len(data) - 8 - 20
+    start = int.from_bytes(data[footer : footer + 8], "little")
+
+    assert int.from_bytes(data[-12:-8], "little") == zlib.crc32(data[start:-12])
+
+
+def test_detections_say_what_and_where(tmp_path: Path) -> None:
+    target = tmp_path / "out.mcap"
+    annotate(write_mcap(tmp_path / "a.mcap"), target)
+
+    (time, first), (_, second), (_, third) = decoded(target, "/shapecat/detections")
+
+    assert time == EPOCH + 7
+    assert (first.header.stamp.sec, first.header.stamp.nanosec) == (EPOCH // SECOND, 0)
+    assert first.header.frame_id == "camera"
+    assert [d.id for d in first.detections] == ["3", "4"]
+    item = first.detections[1]
+    assert item.results[0].hypothesis.class_id == "cup"
+    assert item.results[0].hypothesis.score == pytest.approx(0.97)
+    assert item.bbox.center.position.z == pytest.approx(5.0)
+    assert item.bbox.center.orientation.w == pytest.approx(0.8)
+    assert item.bbox.size.y == pytest.approx(0.2)
+    assert (len(second.detections), len(third.detections)) == (1, 0)
+
+
+def test_scene_shows_updates_and_removes_tracks(tmp_path: Path) -> None:
+    """Boxes that stay when an object is gone are the commonest complaint about viewers."""
+    target = tmp_path / "out.mcap"
+    annotate(write_mcap(tmp_path / "a.mcap"), target)
+
+    scenes = [scene for _, scene in decoded(target, "/shapecat/scene")]
+
+    assert [[e.id for e in scene.entities] for scene in scenes] == [
+        ["track-3", "track-4"],
+        ["track-4"],
+        [],
+    ]
+    assert [[d.id for d in scene.deletions] for scene in scenes] == [[], ["track-3"], ["track-4"]]
+    entity = scenes[0].entities[0]
+    assert (entity.frame_id, entity.lifetime.sec, entity.lifetime.nanosec) == (
+        "camera",
+        0,
+        150_000_000,
+    )
+    assert entity.texts[0].text == "track 3 cup 0.97"
+    assert entity.texts[0].pose.position.z > entity.cubes[0].pose.position.z + 0.15
+    assert {m.key: m.value for m in entity.metadata} == {
+        "category": "cup",
+        "confidence": "0.9700",
+        "track": "3",
+    }
+
+
+def test_markers_are_deleted_too(tmp_path: Path) -> None:
+    target = tmp_path / "out.mcap"
+    annotate(write_mcap(tmp_path / "a.mcap"), target, markers=True)
+
+    messages = [message for _, message in decoded(target, "/shapecat/markers")]
+
+    assert [[(m.id, m.type, m.action) for m in message.markers] for message in messages] == [
+        [(3, 1, 0), (3, 9, 0), (4, 1, 0), (4, 9, 0)],
+        [(3, 1, 2), (3, 9, 2), (4, 1, 0), (4, 9, 0)],
+        [(4, 1, 2), (4, 9, 2)],
+    ]
+
+
+def test_recovered_recording_is_written_anew(tmp_path: Path) -> None:
+    source = write_mcap(tmp_path / "a.mcap", unfinished=True)
+    source.write_bytes(source.read_bytes()[:-5])
+    target = tmp_path / "out.mcap"
+
+    annotate(source, target)
+
+    with open_recording(source) as recording:
+        kept = [bytes(message.data) for message in recording.messages()]
+    with open_recording(target) as recording:
+        read = [bytes(m.data) for m in recording.messages() if m.topic == "/points"]
+        assert recording.warnings == []
+    assert read == kept
+    assert len(kept) >= 5
+    with target.open("rb") as file:
+        assert {m.name for m in make_reader(file).iter_metadata()} == {"robot", "shapecat"}
+    assert len(decoded(target, "/shapecat/scene")) == 3
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+def test_ros2_folder_keeps_its_bytes(tmp_path: Path, plugin: StoragePlugin) -> None:
+    source, target = tmp_path / "bag", tmp_path / "out.mcap"
+    with FolderWriter(source, version=9, storage_plugin=plugin) as writer:
+        connection = writer.add_connection("/points", STRING, typestore=STORE)
+        for k in range(5):
+            writer.write(connection, EPOCH + k, string(f"message {k}"))
+
+    annotate(source, target)
+
+    with AnyReader([target]) as reader:
+        chosen = [c for c in reader.connections if c.topic == "/points"]
+        read = [bytes(data) for _, _, data in reader.messages(chosen)]
+    assert read == [string(f"message {k}") for k in range(5)]
+    assert [time for time, _ in decoded(target, "/points")] == [EPOCH + k for k in range(5)]
+
+
+def ros1_messages() -> Iterator[tuple[str, str, Any]]:
+    time = STORE1.types["builtin_interfaces/msg/Time"](1, 2)
+    header = STORE1.types["std_msgs/msg/Header"](7, time, "frame")
+    yield "/header", "std_msgs/msg/Header", header
+    size = (np.zeros(0), np.arange(9.0), np.zeros(9), np.zeros(12), 0, 0)
+    roi = STORE1.types["sensor_msgs/msg/RegionOfInterest"](0, 0, 0, 0, False)  # a message
+    info = STORE1.types["sensor_msgs/msg/CameraInfo"](header, 4, 3, "plumb_bob", *size, roi)
+    yield "/info", "sensor_msgs/msg/CameraInfo", info
+    STORE1.register(
+        get_types_from_msg("geometry_msgs/TransformStamped[] transforms", "tf/msg/tfMessage")
+        | get_types_from_msg("Header header\nstring[] words\nuint8 level", "lab/msg/Own")
+        if "tf/msg/tfMessage" not in STORE1.fielddefs
+        else {}
+    )
+    yield "/tf", "tf/msg/tfMessage", STORE1.types["tf/msg/tfMessage"]([])
+    yield "/own", "lab/msg/Own", STORE1.types["lab/msg/Own"](header, ["a", "bc"], 3)
+
+
+def test_ros1_bag_becomes_ros2(tmp_path: Path) -> None:
+    source, target = tmp_path / "a.bag", tmp_path / "out.mcap"
+    with BagWriter(source) as writer:
+        for k, (topic, kind, item) in enumerate(ros1_messages()):
+            connection = writer.add_connection(topic, kind, typestore=STORE1)
+            writer.write(connection, EPOCH + k, STORE1.serialize_ros1(item, kind))
+
+    annotate(source, target)
+
+    ((time, header),) = decoded(target, "/header")
+    ((_, info),) = decoded(target, "/info")
+    ((_, own),) = decoded(target, "/own")
+    assert time == EPOCH
+    assert (header.stamp.sec, header.frame_id) == (1, "frame")
+    assert list(info.k) == list(range(9))  # ROS 1 calls it K
+    assert (own.header.frame_id, own.words, own.level) == ("frame", ["a", "bc"], 3)
+    with target.open("rb") as file:
+        reader = make_reader(file)
+        summary = reader.get_summary()
+        assert summary is not None
+        assert reader.get_header().profile == "ros2"
+        assert {c.message_encoding for c in summary.channels.values()} == {"cdr"}
+        assert "tf2_msgs/msg/TFMessage" in {s.name for s in summary.schemas.values()}
+    with AnyReader([target]) as other:
+        assert other.message_count == 4 + 6
+
+
+def test_message_that_cannot_be_converted_is_wrapped_whole(tmp_path: Path) -> None:
+    """Two encodings in one file would make it unreadable for ROS tools."""
+    source, target = tmp_path / "a.bag", tmp_path / "out.mcap"
+    with BagWriter(source) as writer:
+        connection = writer.add_connection("/text", STRING, typestore=STORE1)
+        writer.write(connection, EPOCH, STORE1.serialize_ros1(STORE1.types[STRING]("fine"), STRING))
+        writer.write(connection, EPOCH + 1, b"\xff\xff\xff\x7fcut")
+
+    annotate(source, target)
+
+    with open_recording(target) as recording:
+        fine, wrapped = (m for m in recording.messages() if m.topic == "/text")
+        assert recording.decode(fine).data == "fine"
+        raw = recording.decode(wrapped)
+    assert (raw.type, raw.encoding, bytes(raw.data)) == (STRING, "ros1", b"\xff\xff\xff\x7fcut")
+
+
+@pytest.mark.parametrize(
+    ("profile", "encoding", "schema", "expected"),
+    [
+        ("ros1", "ros1", ("std_msgs/String", "ros1msg"), "ros1"),
+        ("", "json", ("foxglove.PointCloud", "jsonschema"), "json"),
+    ],
+)
+def test_annotations_use_the_encoding_of_the_source(
+    tmp_path: Path, profile: str, encoding: str, schema: tuple[str, str], expected: str
+) -> None:
+    source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
+    with source.open("wb") as file:
+        writer = Writer(file)
+        writer.start(profile, "test")
+        number = writer.register_schema(*schema, b"string data" if encoding == "ros1" else b"{}")
+        channel = writer.register_channel("/points", encoding, number)
+        writer.add_message(channel, EPOCH, b"\1\0\0\0a" if encoding == "ros1" else b"{}", EPOCH)
+        writer.finish()
+
+    annotate(source, target)
+
+    with open_recording(target) as recording:
+        assert {topic.encoding for topic in recording.topics} == {expected}
+        scenes = [recording.decode(m) for m in recording.messages(["/shapecat/scene"])]
+    assert [entity.id for entity in scenes[0].entities] == ["track-3", "track-4"]
+    assert [deletion.id for deletion in scenes[1].deletions] == ["track-3"]
+    assert scenes[0].entities[0].cubes[0].size.z == pytest.approx(0.3)
+
+
+def test_json_scene_fits_its_schema(tmp_path: Path) -> None:
+    jsonschema = pytest.importorskip("jsonschema")
+    source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
+    with source.open("wb") as file:
+        writer = Writer(file)
+        writer.start("", "test")
+        writer.register_channel("/points", "json", 0)
+        writer.finish()
+
+    annotate(source, target)
+
+    with target.open("rb") as file:
+        for schema, _, message in make_reader(file).iter_messages():
+            jsonschema.validate(json.loads(message.data), json.loads(schema.data))
+
+
+def test_nothing_is_left_behind_on_failure(tmp_path: Path) -> None:
+    source = write_mcap(tmp_path / "a.mcap")
+    target = tmp_path / "out.mcap"
+
+    def failing() -> Iterator[LabelledFrame]:
+        yield from FRAMES
+        raise OSError(28, os.strerror(28))
+
+    with (
+        open_recording(source) as recording,
+        pytest.raises(OutputError, match=r"out\.mcap: cannot be written: No space left"),
+    ):
+        write_annotated(recording, target, failing(), run=RUN)
+
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
+    with pytest.raises(OutputError, match="No such file"):
+        annotate(source, tmp_path / "no" / "out.mcap")
+
+
+def test_recording_without_frames_is_still_copied(tmp_path: Path) -> None:
+    source, target = write_mcap(tmp_path / "a.mcap"), tmp_path / "out.mcap"
+
+    with open_recording(source) as recording:
+        write_annotated(recording, target, [], run=RUN)
+
+    assert digest(target) == digest(source)
+
+
+def test_every_category_has_a_colour_of_its_own() -> None:
+    assert {*CATEGORIES, "unknown"} <= CATEGORY_COLOURS.keys()
+    assert len(set(CATEGORY_COLOURS.values())) == len(CATEGORY_COLOURS)
+    assert colour_of("teapot") == colour_of("teapot") != colour_of("kettle")

@@ -1,0 +1,380 @@
+"""Containers: what was recorded is what is read, and damage is said, never raised."""
+
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as FolderWriter
+from rosbags.typesys import Stores, get_typestore
+
+from shapecat.errors import RecordingError
+from shapecat.recordings import MessageError, Topic, open_recording
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+STORE1 = get_typestore(Stores.ROS1_NOETIC)
+STRING = "std_msgs/msg/String"
+SECOND = 10**9
+ODD = Path(__file__).parents[2] / "shared" / "data" / "odd"
+
+
+def text(value: str) -> bytes:
+    return bytes(STORE.serialize_cdr(STORE.types[STRING](data=value), STRING))
+
+
+def write_mcap(path: Path, times: list[int], *, unfinished: bool = False, **options: Any) -> Path:
+    """Write a text message at each time, /a and /b in turn."""
+    options = {"chunk_size": 200, "compression": CompressionType.NONE} | options
+    with path.open("wb") as file:
+        writer = Writer(file, **options)
+        writer.start("ros2", "test")
+        definition = STORE.generate_msgdef(STRING, ros_version=2)[0].encode()
+        schema = writer.register_schema(STRING, "ros2msg", definition)
+        channels = [writer.register_channel(topic, "cdr", schema) for topic in ("/a", "/b")]
+        for k, time in enumerate(times):
+            writer.add_message(channels[k % 2], time, text(f"message {k}"), time + 1, k)
+        if unfinished:
+            writer.flush()
+        else:
+            writer.finish()
+    return path
+
+
+def times_read(path: Path, **options: Any) -> list[int]:
+    with open_recording(path) as recording:
+        return [message.log_time_ns for message in recording.messages(**options)]
+
+
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_indexed_mcap_is_read_by_time(tmp_path: Path, compression: CompressionType) -> None:
+    times = [30, 10, 50, 20, 40, 0] * 5
+    path = write_mcap(tmp_path / "a.mcap", times, compression=compression)
+
+    with open_recording(path) as recording:
+        messages = list(recording.messages())
+        assert recording.kind == "mcap"
+        assert recording.topics == (
+            Topic("/a", STRING, "cdr", 15),
+            Topic("/b", STRING, "cdr", 15),
+        )
+        assert (recording.start_ns, recording.end_ns, recording.warnings) == (0, 50, [])
+        assert [m.log_time_ns for m in messages] == sorted(times)
+        assert sorted(recording.decode(m).data for m in messages) == sorted(
+            f"message {k}" for k in range(30)
+        )
+        first = messages[-1]
+        assert (first.publish_time_ns, first.sequence % 6) == (51, 2)
+
+
+def test_window_and_topics_are_selected(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", list(range(0, 100, 10)))
+
+    assert times_read(path, start_ns=20, stop_ns=60) == [20, 30, 40, 50]
+    assert times_read(path, topics=["/b"], stop_ns=60) == [10, 30, 50]
+    assert times_read(path, topics=["/none"]) == []
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"use_chunking": False},
+        {"index_types": IndexType.NONE},
+        {"repeat_channels": False},
+        {"repeat_schemas": False},
+        {"repeat_channels": False, "use_statistics": False, "use_summary_offsets": False},
+    ],
+)
+def test_mcap_without_an_index_is_read_in_the_order_of_the_file(
+    tmp_path: Path, options: dict[str, Any]
+) -> None:
+    """The library would sort everything in memory, or raise a bare KeyError."""
+    times = [30, 10, 20, 0]
+    path = write_mcap(tmp_path / "a.mcap", times, **options)
+
+    assert times_read(path) == times
+    with open_recording(path) as recording:
+        assert {topic.count for topic in recording.topics} == {2}
+        assert "no index" in recording.warnings[0]
+
+
+@pytest.mark.parametrize("index", [IndexType.CHUNK, IndexType.ALL])
+def test_message_indexes_are_not_needed(tmp_path: Path, index: IndexType) -> None:
+    path = write_mcap(tmp_path / "a.mcap", [30, 10, 20, 0], index_types=index)
+
+    assert times_read(path, topics=["/a"]) == [20, 30]
+
+
+def test_unfinished_mcap_is_recovered(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", list(range(20)), unfinished=True)
+    path.write_bytes(path.read_bytes()[:-10])
+
+    with open_recording(path) as recording:
+        read = [message.log_time_ns for message in recording.messages()]
+        assert read == list(range(len(read)))
+        assert len(read) >= 15
+        assert recording.end_ns == read[-1]
+        assert f"recovered {len(read)} messages" in recording.warnings[0]
+
+
+def test_every_truncation_ends_sensibly(tmp_path: Path) -> None:
+    """A power cut can happen at any byte."""
+    whole = write_mcap(tmp_path / "a.mcap", list(range(8))).read_bytes()
+    for size in range(0, len(whole), 7):
+        path = tmp_path / "cut.mcap"
+        path.write_bytes(whole[:size])
+        if size < 8:
+            with pytest.raises(RecordingError):
+                times_read(path)
+        else:
+            read = times_read(path)
+            assert read == list(range(len(read)))
+
+
+def test_every_flipped_byte_ends_sensibly(tmp_path: Path) -> None:
+    """Length fields that lie must not allocate, loop, or leave a traceback."""
+    whole = write_mcap(tmp_path / "a.mcap", list(range(6)), compression=CompressionType.LZ4)
+    data = whole.read_bytes()
+    path = tmp_path / "flipped.mcap"
+    for at in range(8, len(data), 3):
+        damaged = bytearray(data)
+        damaged[at] ^= 0xFF
+        path.write_bytes(damaged)
+        with open_recording(path) as recording:
+            for message in recording.messages():
+                try:
+                    recording.decode(message)
+                except MessageError:
+                    continue
+
+
+def test_damaged_chunk_is_left_out(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", list(range(20)))
+    data = bytearray(path.read_bytes())
+    at = data.index(b"message 9")
+    data[at : at + 9] = b"massage 9"
+    path.write_bytes(data)
+
+    with open_recording(path) as recording:
+        read = [message.log_time_ns for message in recording.messages()]
+        assert 0 < len(read) < 20
+        assert 9 not in read
+        assert "left out the chunk" in recording.warnings[0]
+
+
+@pytest.mark.parametrize("size", [10**9, 2**62])
+def test_chunk_that_claims_to_be_huge_is_refused(tmp_path: Path, size: int) -> None:
+    """Memory follows what the file holds, not what it says."""
+    path = write_mcap(tmp_path / "a.mcap", [1, 2], compression=CompressionType.ZSTD)
+    data = bytearray(path.read_bytes())
+    chunk = data.index(b"\x06", 8 + 9 + 16)
+    data[chunk + 9 + 16 : chunk + 9 + 24] = struct.pack("<Q", size)
+    path.write_bytes(data)
+
+    with open_recording(path) as recording:
+        assert list(recording.messages()) == []
+        assert "claims to hold" in recording.warnings[0]
+
+
+def test_memory_stays_flat(tmp_path: Path) -> None:
+    """Only the chunks that overlap in time are held."""
+    tracemalloc = pytest.importorskip("tracemalloc")
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE, chunk_size=1 << 20)
+        writer.start("", "test")
+        channel = writer.register_channel("/blob", "raw", 0)
+        for time in range(64):
+            writer.add_message(channel, time, bytes(1 << 20), time)
+        writer.finish()
+    with open_recording(path) as recording:
+        tracemalloc.start()
+        count = sum(1 for _ in recording.messages())
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+
+    assert count == 64
+    assert peak < 8 << 20
+
+
+def write_bag(path: Path, compression: Any = None) -> Path:
+    writer = BagWriter(path)
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer:
+        kinds = (STRING, "std_msgs/msg/Header")
+        connections = [writer.add_connection("/a", kind, typestore=STORE1) for kind in kinds]
+        time = STORE1.types["builtin_interfaces/msg/Time"](1, 2)
+        header = STORE1.types[kinds[1]](7, time, "frame")
+        string = STORE1.types[STRING]("hello")
+        for k, (connection, item) in enumerate(zip(connections, (string, header), strict=True)):
+            data = STORE1.serialize_ros1(item, connection.msgtype)
+            writer.write(connection, (k + 1) * SECOND, data)
+    return path
+
+
+@pytest.mark.parametrize("compression", [None, *BagWriter.CompressionFormat])
+def test_bag_with_two_types_on_a_topic(tmp_path: Path, compression: Any) -> None:
+    path = write_bag(tmp_path / "a.bag", compression)
+
+    with open_recording(path) as recording:
+        string, header = (recording.decode(message) for message in recording.messages())
+        assert recording.kind == "ros1"
+        assert [topic.type for topic in recording.topics] == ["std_msgs/msg/Header", STRING]
+        assert (recording.start_ns, recording.end_ns) == (SECOND, 2 * SECOND)
+        assert (string.data, header.seq, header.stamp.nanosec) == ("hello", 7, 2)
+
+
+def test_damaged_bag_is_an_error_or_ends_early(tmp_path: Path) -> None:
+    data = write_bag(tmp_path / "a.bag").read_bytes()
+    path = tmp_path / "cut.bag"
+    for size in range(1, len(data), 97):
+        path.write_bytes(data[:size])
+        with pytest.raises(RecordingError, match=r"cut\.bag: not a"):
+            open_recording(path)
+
+
+def write_folder(path: Path, plugin: StoragePlugin, mode: CompressionMode | None = None) -> Path:
+    writer = FolderWriter(path, version=9, storage_plugin=plugin)
+    if mode is not None:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/a", STRING, typestore=STORE)
+        for k in range(5):
+            writer.write(connection, k * SECOND, text(f"message {k}"))
+    return path
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+@pytest.mark.parametrize("mode", [None, CompressionMode.FILE, CompressionMode.MESSAGE])
+@pytest.mark.parametrize("metadata", [True, False])
+def test_ros2_folder(
+    tmp_path: Path, plugin: StoragePlugin, mode: CompressionMode | None, metadata: Any
+) -> None:
+    if plugin is StoragePlugin.MCAP and mode is CompressionMode.MESSAGE:
+        pytest.skip("rosbag2 does not write this")
+    path = write_folder(tmp_path / "bag", plugin, mode)
+    if not metadata:
+        (path / "metadata.yaml").unlink()
+
+    with open_recording(path) as recording:
+        read = [recording.decode(message).data for message in recording.messages()]
+        assert recording.kind == "ros2"
+        assert read == [f"message {k}" for k in range(5)]
+        assert recording.topics == (Topic("/a", STRING, "cdr", 5),)
+        assert bool(recording.warnings) is not metadata
+
+
+def test_splits_that_overlap_are_merged(tmp_path: Path) -> None:
+    write_mcap(tmp_path / "b_0.mcap", [0, 20, 40, 60])
+    write_mcap(tmp_path / "b_1.mcap", [30, 50, 70, 90])
+
+    assert times_read(tmp_path) == [0, 20, 30, 40, 50, 60, 70, 90]
+
+
+def test_missing_split_is_said(tmp_path: Path) -> None:
+    path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3)
+    file = path / "metadata.yaml"
+    listed = file.read_text().replace("  - bag.db3\n", "  - bag.db3\n  - gone.db3\n")
+    file.write_text(listed)
+
+    with open_recording(path) as recording:
+        assert recording.warnings == ["parts named in metadata.yaml are missing: gone.db3"]
+
+
+def test_database_without_definitions_uses_humble(tmp_path: Path) -> None:
+    """Bags from before ROS 2 Iron do not hold the definitions of their messages."""
+    import sqlite3  # noqa: PLC0415  # only here
+
+    path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3) / "bag.db3"
+    base = sqlite3.connect(path)
+    base.execute("DELETE FROM message_definitions")
+    base.commit()
+    base.close()
+
+    with open_recording(path) as recording:
+        read = [recording.decode(message).data for message in recording.messages()]
+        assert read[-1] == "message 4"
+        assert "Humble" in recording.warnings[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "said"),
+    [
+        ("none.mcap", None, "does not exist"),
+        ("empty.bag", b"", "is empty"),
+        ("text.mcap", b"hello world", "begins with 'hello wo'"),
+        ("bag.bag", b"#ROSBAG V1.2\n", "not a readable ROS 1 bag"),
+        ("base.db3", b"SQLite format 3\0" + bytes(200), "not a readable ROS 2 bag"),
+    ],
+)
+def test_what_is_no_recording_is_one_line(
+    tmp_path: Path, name: str, content: bytes | None, said: str
+) -> None:
+    path = tmp_path / name
+    if content is not None:
+        path.write_bytes(content)
+
+    with pytest.raises(RecordingError) as caught:
+        open_recording(path)
+
+    assert str(path) in str(caught.value)
+    assert said in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_suffix_is_not_believed(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.bag", [1])
+
+    assert times_read(path) == [1]
+
+
+@pytest.mark.parametrize(
+    "definition",
+    [
+        "float64[99999999] x\nstring[99999999] y",
+        "Self next\n================================================================\nMSG: a/Self",
+        "not a definition",
+        "string x=" + "a" * 100,
+        "uint8 class",
+    ],
+)
+def test_hostile_definition_is_an_error_of_the_message(tmp_path: Path, definition: str) -> None:
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("a/msg/Self", "ros2msg", definition.encode())
+        channel = writer.register_channel("/a", "cdr", schema)
+        writer.add_message(channel, 1, b"\0\1\0\0", 1)
+        writer.finish()
+    with open_recording(path) as recording, pytest.raises(MessageError, match="/a: cannot decode"):
+        recording.decode(next(iter(recording.messages())))
+
+
+def odd_files() -> Iterator[Path]:
+    if ODD.exists():
+        yield from sorted(path for path in ODD.rglob("*") if path.is_file() or path.parent == ODD)
+
+
+@pytest.mark.skipif(not ODD.exists(), reason="needs the collection of odd recordings")
+@pytest.mark.parametrize("path", list(odd_files()), ids=lambda path: str(path.name))
+def test_odd_file_is_read_or_refused(path: Path) -> None:
+    if path.name in {"asci-file.txt", "empty-file.bag", "metadata.yaml", "conformance"}:
+        if path.is_file():
+            with pytest.raises(RecordingError, match=path.name):
+                open_recording(path)
+        return
+    with open_recording(path) as recording:
+        counts = {(t.name, t.type): t.count for t in recording.topics if t.count is not None}
+        read: dict[tuple[str, str], int] = dict.fromkeys(counts, 0)
+        for message in recording.messages():
+            if (message.topic, message.type) in counts:
+                read[message.topic, message.type] += 1
+            assert np.frombuffer(message.data, np.uint8).size == len(message.data)
+
+        assert read == counts

@@ -1,0 +1,455 @@
+"""Frames: every layout of a cloud or depth image gives the same, right, coordinates."""
+
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_typestore
+
+from shapecat.errors import NoStreamError
+from shapecat.recordings import MessageError, choose_streams, cloud_streams, frames, open_recording
+from shapecat.recordings.pinhole import fit_pinhole, still_fits
+from shapecat.recordings.pointcloud2 import cloud_points
+from shapecat.types import Camera, Frame
+
+STORE = get_typestore(Stores.ROS2_HUMBLE)
+SECOND = 10**9
+EPOCH = 1_700_000_000 * SECOND
+CLOUD, IMAGE = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image"
+INFO, COMPRESSED = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/CompressedImage"
+CAMERA = Camera(64, 48, 60.0, 61.0, 31.2, 23.7)
+DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+def make(kind: str, *values: Any) -> Any:
+    return STORE.types[kind](*values)
+
+
+def header(stamp: int, frame_id: str = "camera") -> Any:
+    time = make("builtin_interfaces/msg/Time", *divmod(stamp, SECOND))
+    return make("std_msgs/msg/Header", time, frame_id)
+
+
+def image(stamp: int, depth: Any, encoding: str = "16UC1", frame_id: str = "camera") -> Any:
+    h, w = depth.shape
+    data = np.frombuffer(np.ascontiguousarray(depth).tobytes(), np.uint8)
+    return make(IMAGE, header(stamp, frame_id), h, w, encoding, 0, depth.itemsize * w, data)
+
+
+def info(stamp: int, camera: Camera = CAMERA, d: Iterable[float] = ()) -> Any:
+    k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1], np.float64)
+    p = np.insert(k, (3, 6, 9), 0.0)
+    roi = make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)  # a message
+    size = (camera.height, camera.width)
+    return make(
+        INFO,
+        header(stamp),
+        *size,
+        "plumb_bob",
+        np.array(list(d)),
+        k,
+        np.eye(3).ravel(),
+        p,
+        0,
+        0,
+        roi,
+    )
+
+
+def cloud(stamp: int, points: Any, **changes: Any) -> Any:
+    """Make a cloud of plain float32 coordinates from (h, w, 3)."""
+    h, w = points.shape[:2]
+    data = np.frombuffer(np.ascontiguousarray(points, "<f4").tobytes(), np.uint8)
+    fields = [make("sensor_msgs/msg/PointField", n, 4 * k, 7, 1) for k, n in enumerate("xyz")]
+    order, dense = False, True
+    message = make(CLOUD, header(stamp), h, w, fields, order, 12, 12 * w, data, dense)
+    for name, value in changes.items():
+        setattr(message, name, value)
+    return message
+
+
+def write(path: Path, items: Iterable[tuple[str, int, Any]]) -> Path:
+    """Write messages given as topic, log time, message or bytes."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        channels: dict[tuple[str, str], int] = {}
+        for topic, time, item in items:
+            kind = item[0] if isinstance(item, tuple) else item.__msgtype__
+            if (topic, kind) not in channels:
+                text = STORE.generate_msgdef(kind, ros_version=2)[0].encode()
+                schema = writer.register_schema(kind, "ros2msg", text)
+                channels[topic, kind] = writer.register_channel(topic, "cdr", schema)
+            raw = item[1] if isinstance(item, tuple) else bytes(STORE.serialize_cdr(item, kind))
+            writer.add_message(channels[topic, kind], time, raw, time)
+        writer.finish()
+    return path
+
+
+def read(path: Path, *topics: str, **options: Any) -> tuple[list[Frame], Counter[str], list[str]]:
+    skipped: Counter[str] = Counter()
+    with open_recording(path) as recording:
+        chosen = choose_streams(recording, topics)
+        result = list(frames(recording, chosen, skipped=skipped, **options))
+        return result, skipped, recording.warnings
+
+
+def wavy_depth(camera: Camera = CAMERA) -> Any:
+    """Make a depth image in millimetres with holes."""
+    v, u = np.mgrid[: camera.height, : camera.width]
+    depth = (900 + 200 * np.sin(u / 9) + 150 * np.cos(v / 7)).astype(np.uint16)
+    depth[(u + 2 * v) % 11 == 0] = 0
+    return depth
+
+
+def organized_points(depth: Any, camera: Camera = CAMERA) -> Any:
+    frame = Frame("", 0, 0, 0, "", depth=depth / np.float32(1000), camera=camera)
+    return frame.xyz().reshape(*depth.shape, 3)
+
+
+def test_depth_image_and_organized_cloud_give_the_same_frame(tmp_path: Path) -> None:
+    """Whatever a sensor's driver recorded, the objects must not change."""
+    depth = wavy_depth()
+    items = [
+        ("/cam/depth/camera_info", 0, info(EPOCH)),
+        ("/cam/depth/image_rect", 1, image(EPOCH, depth)),
+        ("/other/points", 2, cloud(EPOCH, organized_points(depth))),
+    ]
+    path = write(tmp_path / "a.mcap", items)
+
+    (first,), _, _ = read(path, "/cam/depth/image_rect")
+    (second,), _, _ = read(path, "/other/points")
+    assert first.camera == CAMERA
+    assert first.depth is not None
+    assert second.depth is not None
+    assert second.camera is not None
+    np.testing.assert_allclose(first.depth, second.depth, atol=2e-7)
+    for name in ("fx", "fy", "cx", "cy"):
+        assert abs(getattr(second.camera, name) - getattr(CAMERA, name)) < 0.01
+
+
+def test_intrinsics_stay_while_they_fit_and_follow_a_change(tmp_path: Path) -> None:
+    """Noise must not make the camera wander; another camera must not keep the old one."""
+    rng = np.random.default_rng(0)
+    clean = organized_points(wavy_depth())
+    noisy = [clean + rng.normal(0, 1e-5, clean.shape) for _ in range(4)]
+    other = Camera(64, 48, 62.0, 61.0, 31.2, 23.7)
+    noisy.append(organized_points(wavy_depth(), other))
+    items = [("/points", k, cloud(EPOCH + k, points)) for k, points in enumerate(noisy)]
+
+    read_frames, _, _ = read(write(tmp_path / "a.mcap", items))
+
+    cameras = [frame.camera for frame in read_frames]
+    assert cameras[0] == cameras[1] == cameras[2] == cameras[3]
+    assert cameras[4] is not None
+    assert abs(cameras[4].fx - 62.0) < 0.01
+
+
+@given(
+    fx=st.floats(20, 2000),
+    ratio=st.floats(0.8, 1.25),
+    cx=st.floats(10, 50),
+    cy=st.floats(10, 40),
+    outliers=st.integers(0, 60),
+    seed=st.integers(0, 99),
+)
+@settings(deadline=None, max_examples=25)
+def test_fit_finds_any_camera(
+    fx: float, ratio: float, cx: float, cy: float, outliers: int, seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    camera = Camera(64, 48, fx, fx * ratio, cx, cy)
+    points = organized_points(rng.integers(0, 3000, (48, 64)).astype(np.uint16), camera)
+    flat = points.reshape(-1, 3)
+    flat[rng.choice(len(flat), outliers, replace=False)] += 0.3
+
+    fit = fit_pinhole(points)
+
+    assert fit is not None
+    for name in ("fx", "fy", "cx", "cy"):
+        assert abs(getattr(fit.camera, name) - getattr(camera, name)) < 0.05
+    assert still_fits(fit, points)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        np.full((48, 64, 3), np.nan, np.float32),
+        np.random.default_rng(0).normal(0, 1, (48, 64, 3)).astype(np.float32),
+        np.ones((48, 64, 3), np.float32),
+        organized_points(wavy_depth()) * np.array([1, -1, -1], np.float32),  # y up, z backwards
+    ],
+    ids=["nothing", "noise", "one point", "another convention"],
+)
+def test_organized_points_without_a_camera_stay_points(points: Any, tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", [("/points", 0, cloud(EPOCH, points))])
+
+    (frame,), _, _ = read(path)
+
+    assert frame.points is not None
+    np.testing.assert_array_equal(frame.points, points.reshape(-1, 3))
+
+
+FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+
+
+@given(data=st.data())
+@settings(deadline=None, max_examples=60)
+def test_any_layout_of_a_cloud(data: st.DataObject) -> None:
+    """Padding, unaligned fields, byte order and row padding are all legal."""
+    h, w = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 5))
+    big = data.draw(st.booleans())
+    names = data.draw(st.permutations(["x", "y", "z", "intensity", "ring"]))
+    offset, fields, layout = 0, [], {}
+    for name in names:
+        offset += data.draw(st.integers(0, 3))
+        code = data.draw(st.sampled_from([7, 8] if name in "xyz" else list(FORMATS)))
+        layout[name] = (offset, (">" if big else "<") + FORMATS[code])
+        fields.append(make("sensor_msgs/msg/PointField", name, offset, code, 1))
+        offset += np.dtype(FORMATS[code]).itemsize
+    step = offset + data.draw(st.integers(0, 5))
+    row = w * step + data.draw(st.integers(0, 9))
+    buffer = np.frombuffer(data.draw(st.randoms()).randbytes(h * row), np.uint8).copy()
+    expected = np.random.default_rng(1).normal(size=(h, w, 3)).astype(np.float32)
+    for k, name in enumerate("xyz"):
+        at, kind = layout[name]
+        np.ndarray((h, w), kind, buffer, at, (row, step))[...] = expected[..., k]
+    message = make(CLOUD, header(1), h, w, fields, big, step, row, buffer, True)  # is_dense lies
+
+    np.testing.assert_array_equal(cloud_points(message), expected)
+    message.data = buffer[: (h - 1) * row]
+    with pytest.raises(MessageError, match=f"cloud of {w} x {h} points needs"):
+        cloud_points(message)
+
+
+@pytest.mark.parametrize(
+    ("changes", "reason"),
+    [
+        ({"width": 2**32 - 1, "height": 2**32 - 1}, "needs"),
+        ({"point_step": 4}, "outside"),
+        ({"row_step": 1}, "needs"),
+        ({"fields": []}, "without a field x"),
+    ],
+)
+def test_cloud_that_lies_is_refused_before_memory_is_taken(
+    changes: dict[str, Any], reason: str
+) -> None:
+    with pytest.raises(MessageError, match=reason):
+        cloud_points(cloud(0, np.zeros((2, 3, 3), np.float32), **changes))
+
+
+def test_bad_messages_are_counted_and_never_stop_the_stream(tmp_path: Path) -> None:
+    good = np.random.default_rng(0).normal(1, 0.1, (1, 50, 3)).astype(np.float32)
+    items = [
+        ("/points", 0, cloud(EPOCH, good)),
+        ("/points", 1, (CLOUD, b"\0\1\0\0rubbish")),
+        ("/points", 2, cloud(EPOCH + 2, good, width=2**31)),
+        ("/points", 3, cloud(EPOCH + 3, good[:, :0])),
+        ("/points", 4, cloud(EPOCH + 4, good)),
+    ]
+
+    read_frames, skipped, _ = read(write(tmp_path / "a.mcap", items))
+
+    assert [frame.index for frame in read_frames] == [0, 4]
+    assert skipped.total() == 3
+    assert skipped["empty cloud"] == 1
+
+
+def test_missing_readings_of_a_cloud_are_nan_rows(tmp_path: Path) -> None:
+    rows = [[1, 2, 3], [np.nan, 1, 1], [np.inf, 0, 1], [0, 0, 0], [0, 0, 1]]
+    points = np.array([rows], np.float32)
+
+    (frame,), _, _ = read(write(tmp_path / "a.mcap", [("/points", 0, cloud(EPOCH, points))]))
+
+    assert frame.points is not None
+    np.testing.assert_array_equal(np.isnan(frame.points).all(1), [False, True, True, True, False])
+    assert np.isfinite(frame.points[[0, 4]]).all()
+
+
+def test_missing_readings_of_a_depth_image_are_zero(tmp_path: Path) -> None:
+    depth = np.full((48, 64), 1.5, np.float32)
+    depth[0, :5] = [np.nan, np.inf, -np.inf, -1, 0]
+    items = [
+        ("/depth/camera_info", 0, info(EPOCH)),
+        ("/depth/image", 1, image(EPOCH, depth, "32FC1")),
+    ]
+
+    (frame,), _, _ = read(write(tmp_path / "a.mcap", items))
+
+    assert frame.depth is not None
+    np.testing.assert_array_equal(frame.depth[0, :6], [0, 0, 0, 0, 0, 1.5])
+
+
+def test_each_image_gets_the_calibration_of_its_own_time(tmp_path: Path) -> None:
+    """Zoom and dynamic reconfiguration change it; it may be recorded before or after."""
+    other = Camera(64, 48, 99.0, 99.0, 30.0, 20.0)
+    depth = wavy_depth()
+    items = [
+        ("/depth/image", 0, image(EPOCH, depth)),
+        ("/depth/camera_info", 1, info(EPOCH)),
+        ("/depth/camera_info", 2, info(EPOCH + 9, other)),
+        ("/depth/image", 3, image(EPOCH + 9, depth)),
+        ("/depth/image", 4, image(EPOCH + 20, depth)),
+    ]
+
+    read_frames, _, _ = read(write(tmp_path / "a.mcap", items))
+
+    assert [frame.camera for frame in read_frames] == [CAMERA, other, other]
+    assert [frame.index for frame in read_frames] == [0, 1, 2]
+
+
+def test_a_calibration_recorded_once_serves_all(tmp_path: Path) -> None:
+    depth = wavy_depth()
+    items: list[tuple[str, int, Any]] = [("/depth/camera_info", 0, info(EPOCH))]
+    items += [("/depth/image", k, image(EPOCH + k, depth)) for k in range(1, 4)]
+
+    read_frames, skipped, _ = read(write(tmp_path / "a.mcap", items), start_s=1e-9)
+
+    assert len(read_frames) == 3
+    assert not skipped
+
+
+def test_mismatched_calibration_is_counted(tmp_path: Path) -> None:
+    items = [
+        ("/depth/camera_info", 0, info(EPOCH)),
+        ("/depth/image", 1, image(EPOCH, np.ones((24, 32), np.uint16))),
+    ]
+
+    _, skipped, _ = read(write(tmp_path / "a.mcap", items))
+
+    assert skipped == {"depth image of 32 x 24 with camera info for 64 x 48": 1}
+
+
+def test_slight_distortion_is_absorbed_and_strong_distortion_gives_true_rays(
+    tmp_path: Path,
+) -> None:
+    """An unrectified image has no pinhole camera; its points must still be right."""
+    depth = np.full((48, 64), 1000, np.uint16)
+    slight = [("/depth/camera_info", 0, info(EPOCH, d=(1e-4, 0, 0, 0, 0)))]
+    strong = [("/depth/camera_info", 0, info(EPOCH, d=(-0.3, 0.1, 0.001, -0.002, 0)))]
+    shot = [("/depth/image", 1, image(EPOCH, depth))]
+
+    (first,), _, _ = read(write(tmp_path / "a.mcap", slight + shot))
+    (second,), _, warnings = read(write(tmp_path / "b.mcap", strong + shot))
+
+    assert first.organized
+    assert second.points is not None
+    assert "undistorted" in warnings[0]
+    # Distorting the ray of a pixel again must lead back to the pixel.
+    x, y, _ = second.points[5 * 64 + 7]
+    r = x * x + y * y
+    k1, k2, p1, p2 = -0.3, 0.1, 0.001, -0.002
+    radial = 1 + r * (k1 + r * k2)
+    u = (x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x)) * CAMERA.fx + CAMERA.cx
+    v = (y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y) * CAMERA.fy + CAMERA.cy
+    assert (u, v) == pytest.approx((7, 5), abs=0.01)
+
+
+def test_window_and_thinning(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).normal(1, 0.1, (1, 9, 3)).astype(np.float32)
+    items = [("/points", k * SECOND, cloud(EPOCH + k, points)) for k in range(10)]
+    path = write(tmp_path / "a.mcap", items)
+
+    read_frames, _, _ = read(path, start_s=2, end_s=9, every=3)
+
+    assert [(f.index, f.stamp_ns - EPOCH) for f in read_frames] == [(0, 2), (3, 5), (6, 8)]
+    with pytest.raises(ValueError, match="every"):
+        read(path, every=0)
+
+
+def test_stamps_that_cannot_be_trusted_are_said(tmp_path: Path) -> None:
+    points = np.random.default_rng(0).normal(1, 0.1, (1, 9, 3)).astype(np.float32)
+    stamps = [0, 5 * SECOND, EPOCH, EPOCH - SECOND]
+    items = [("/points", EPOCH + k, cloud(stamp, points)) for k, stamp in enumerate(stamps)]
+
+    read_frames, _, warnings = read(write(tmp_path / "a.mcap", items))
+
+    assert [f.stamp_ns for f in read_frames] == [EPOCH, *stamps[1:]]
+    assert len(warnings) == 4
+    for word in ("is 0 in 1", "1970", "backwards 1", "jumps"):
+        assert any(word in warning for warning in warnings)
+
+
+def test_streams_of_one_sensor_give_one_choice(tmp_path: Path) -> None:
+    depth = wavy_depth()
+    colour = np.zeros((48, 64), np.uint8)
+    items = [
+        ("/cam/aligned_depth_to_color/camera_info", 0, info(EPOCH)),
+        ("/cam/aligned_depth_to_color/image_raw", 0, image(EPOCH, depth, frame_id="colour")),
+        ("/cam/color/camera_info", 0, info(EPOCH)),
+        ("/cam/color/image_raw", 0, image(EPOCH, colour, "mono8")),
+        ("/cam/depth/camera_info", 0, info(EPOCH)),
+        ("/cam/depth/image_rect_raw", 0, image(EPOCH, depth)),
+        ("/cam/depth/points", 0, cloud(EPOCH, organized_points(depth))),
+        ("/cam/infra1/image_rect_raw", 0, image(EPOCH, depth, "mono16")),
+    ]
+    path = write(tmp_path / "a.mcap", items)
+
+    with open_recording(path) as recording:
+        found = {s.topic: (s.kind, s.info_topic) for s in cloud_streams(recording)}
+        (chosen,) = choose_streams(recording)
+        wanted = choose_streams(recording, ["cam/depth/points", "/cam/depth/points"])
+
+    assert found == {
+        "/cam/aligned_depth_to_color/image_raw": (
+            "depth",
+            "/cam/aligned_depth_to_color/camera_info",
+        ),
+        "/cam/depth/image_rect_raw": ("depth", "/cam/depth/camera_info"),
+        "/cam/depth/points": ("points", None),
+    }
+    assert chosen.topic == "/cam/depth/image_rect_raw"
+    assert {stream.topic for stream in wanted} == {"/cam/depth/points"}
+
+
+def test_several_sensors_must_be_chosen_from(tmp_path: Path) -> None:
+    points = np.ones((1, 3, 3), np.float32)
+    left, right = cloud(EPOCH, points), cloud(EPOCH, points)
+    left.header.frame_id, right.header.frame_id = "left", "right"
+    path = write(tmp_path / "a.mcap", [("/left/points", 0, left), ("/right/points", 0, right)])
+
+    with open_recording(path) as recording:
+        with pytest.raises(NoStreamError, match=r"/left/points.*/right/points.*--topic"):
+            choose_streams(recording)
+        assert len(choose_streams(recording, ["/right/points", "/left/points"])) == 2
+        with pytest.raises(NoStreamError, match="/front does not exist; usable topics: /left"):
+            choose_streams(recording, ["/front"])
+
+
+def test_no_stream_names_what_is_there(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.mcap", [("/depth/image", 0, image(EPOCH, wavy_depth()))])
+    bare = write(tmp_path / "b.mcap", [("/depth/camera_info", 0, info(EPOCH))])
+
+    with open_recording(path) as recording, pytest.raises(NoStreamError, match="without a sensor"):
+        choose_streams(recording)
+    with (
+        open_recording(bare) as recording,
+        pytest.raises(NoStreamError, match="/depth/camera_info"),
+    ):
+        choose_streams(recording)
+
+
+@pytest.mark.skipif(not DATA.exists(), reason="needs the recorded tabletop scenes")
+@pytest.mark.parametrize("name", ["clouds.mcap", "clouds.bag", "clouds_ros2"])
+def test_recorded_clouds_match_the_depth_images(name: str) -> None:
+    images, _, _ = read(DATA / "osd_learn" / "depth.mcap")
+    clouds, skipped, _ = read(DATA / "osd_learn" / name)
+    by_stamp = {frame.stamp_ns: frame for frame in images}
+
+    assert clouds
+    assert not skipped
+    for frame in clouds:
+        same = by_stamp[frame.stamp_ns]
+        assert frame.depth is not None
+        assert same.depth is not None
+        assert frame.camera is not None
+        assert same.camera is not None
+        np.testing.assert_allclose(frame.depth, same.depth, atol=2e-7)
+        for field in ("fx", "fy", "cx", "cy"):
+            assert abs(getattr(frame.camera, field) - getattr(same.camera, field)) < 0.05

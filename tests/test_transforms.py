@@ -1,0 +1,233 @@
+"""Transforms: the right pose, or an error that says what is missing."""
+
+from bisect import bisect_right
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+from pytransform3d.rotations import quaternion_slerp
+from pytransform3d.transform_manager import TransformManager
+from pytransform3d.transformations import transform_from_pq
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from shapecat.geometry import quaternion_from_rotation
+from shapecat.recordings import TransformBuffer, fixed_frame, open_recording, read_transforms
+from shapecat.recordings.transforms import (
+    DisconnectedError,
+    ExtrapolationError,
+    TransformLoopError,
+    UnknownFrameError,
+)
+
+IDENTITY = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.0))
+SECOND = 10**9
+EPOCH = 1_700_000_000 * SECOND
+
+
+def moved(x: float, turn: float = 0.0) -> Any:
+    return (x, 0.0, 0.0), (0.0, 0.0, np.sin(turn / 2), np.cos(turn / 2))
+
+
+@given(seed=st.integers(0, 1000), share=st.floats(0, 1))
+@settings(deadline=None, max_examples=20)
+def test_chain_over_time_agrees_with_pytransform3d(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    buffer, oracle = TransformBuffer(), TransformManager()
+    stamps = [0, 10, 25, 40]
+    time = round(share * 40)
+    at = min(bisect_right(stamps, time), 3)
+    part = (time - stamps[at - 1]) / (stamps[at] - stamps[at - 1])
+    for parent, child in (("map", "odom"), ("odom", "base"), ("base", "camera"), ("base", "arm")):
+        quaternions = rng.normal(size=(4, 4))
+        quaternions /= np.linalg.norm(quaternions, axis=1)[:, None]
+        translations = rng.normal(size=(4, 3))
+        for stamp, t, q in zip(stamps, translations, quaternions, strict=True):
+            buffer.add(parent, child, stamp, (t, q), static=False)
+        wxyz = quaternions[:, [3, 0, 1, 2]]
+        turn = quaternion_slerp(wxyz[at - 1], wxyz[at], part, shortest_path=True)
+        move = (1 - part) * translations[at - 1] + part * translations[at]
+        oracle.add_transform(child, parent, transform_from_pq(np.hstack([move, turn])))
+
+    pose = buffer.lookup("arm", "camera", time)
+
+    expected = oracle.get_transform("camera", "arm")
+    np.testing.assert_allclose(pose.rotation, expected[:3, :3], atol=1e-6)
+    np.testing.assert_allclose(pose.translation, expected[:3, 3], atol=1e-6)
+
+
+def test_order_of_arrival_and_repeated_poses_do_not_matter() -> None:
+    """Bags hold transforms out of order, and a standing robot says the same for hours."""
+    buffer = TransformBuffer()
+    for stamp, x in ((40, 4.0), (0, 1.0), (10, 1.0), (20, 1.0), (30, 1.0), (50, 4.0), (60, 4.0)):
+        buffer.add("map", "base", stamp, moved(x), static=False)
+
+    read = [buffer.lookup("map", "base", t).translation[0] for t in (0, 15, 30, 35, 40, 45, 60)]
+
+    assert read == pytest.approx([1, 1, 1, 2.5, 4, 4, 4])
+
+
+def test_stamps_keep_their_nanoseconds() -> None:
+    """Seconds in a double resolve 238 ns."""
+    buffer = TransformBuffer()
+    buffer.add("map", "base", EPOCH, moved(0.0), static=False)
+    buffer.add("map", "base", EPOCH + 100, moved(1.0), static=False)
+
+    assert buffer.lookup("map", "base", EPOCH + 25).translation[0] == pytest.approx(0.25)
+
+
+def test_quaternions_of_opposite_sign_turn_the_short_way() -> None:
+    buffer = TransformBuffer()
+    buffer.add("map", "base", 0, ((0, 0, 0), (0, 0, 0, 1)), static=False)
+    buffer.add("map", "base", 10, ((0, 0, 0), (0, 0, -np.sin(0.2), -np.cos(0.2))), static=False)
+
+    half = quaternion_from_rotation(buffer.lookup("map", "base", 5).rotation)
+
+    np.testing.assert_allclose(half, [0, 0, np.sin(0.1), np.cos(0.1)], atol=1e-9)
+
+
+def test_static_transforms_hold_for_all_time() -> None:
+    buffer = TransformBuffer()
+    buffer.add("base", "camera", EPOCH, moved(2.0), static=True)
+
+    assert buffer.lookup("/base", "/camera", 0).translation[0] == 2.0
+
+
+def test_extrapolation_is_tolerated_a_little_and_then_named() -> None:
+    buffer = TransformBuffer(tolerance_ns=10)
+    buffer.add("map", "base", 100, moved(1.0), static=False)
+    buffer.add("map", "base", 200, moved(2.0), static=False)
+
+    assert buffer.lookup("map", "base", 90).translation[0] == 1.0
+    assert buffer.lookup("map", "base", 210).translation[0] == 2.0
+    with pytest.raises(ExtrapolationError, match=r"base at 89 ns.* before the first"):
+        buffer.lookup("map", "base", 89)
+    with pytest.raises(ExtrapolationError, match="after the last"):
+        buffer.lookup("map", "base", 211)
+
+
+def test_what_is_missing_is_named() -> None:
+    buffer = TransformBuffer()
+    buffer.add("a", "b", 0, IDENTITY, static=True)
+    buffer.add("c", "d", 0, IDENTITY, static=True)
+    buffer.add("f", "e", 0, IDENTITY, static=True)
+    buffer.add("e", "f", 0, IDENTITY, static=True)
+
+    with pytest.raises(UnknownFrameError, match="'x'; known frames: a, b, c, d"):
+        buffer.lookup("a", "x", 0)
+    with pytest.raises(DisconnectedError, match="between b and d: they hang on a and c"):
+        buffer.lookup("b", "d", 0)
+    with pytest.raises(TransformLoopError, match="loop"):
+        buffer.lookup("e", "a", 0)
+    assert fixed_frame(buffer, "e") is None
+    assert buffer.ancestors("b") == ("b", "a")
+    assert buffer.ancestors("x") == ()
+
+
+def test_a_frame_may_change_its_parent() -> None:
+    """An object that a robot picks up moves from the table to the gripper."""
+    buffer = TransformBuffer()
+    buffer.add("world", "gripper", 0, moved(5.0), static=True)
+    buffer.add("world", "cup", 0, moved(1.0), static=False)
+    buffer.add("gripper", "cup", 100, moved(0.5), static=False)
+
+    assert buffer.lookup("world", "cup", 50).translation[0] == 1.0
+    assert buffer.lookup("world", "cup", 100).translation[0] == 5.5
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [((np.nan, 0, 0), (0, 0, 0, 1)), ((0, 0, 0), (0, 0, 0, 0)), ((0, 0, 0), (np.inf, 0, 0, 1))],
+)
+def test_what_is_no_transform_is_refused(bad: Any) -> None:
+    buffer = TransformBuffer()
+
+    assert not buffer.add("a", "b", 0, bad, static=False)
+    assert not buffer.add("a", "a", 0, IDENTITY, static=False)
+    assert not buffer.add("", "a", 0, IDENTITY, static=False)
+    assert buffer.frames == ()
+
+
+@pytest.mark.parametrize(
+    ("chain", "expected"),
+    [
+        (["earth", "map", "odom", "base", "camera"], "map"),
+        (["odom", "base", "camera"], "odom"),
+        (["world", "odom", "camera"], "odom"),
+        (["robot/map", "base", "camera"], "robot/map"),
+        (["base", "camera"], "base"),
+        (["camera", "lens"], None),
+    ],
+)
+def test_fixed_frame_follows_the_convention(chain: list[str], expected: str | None) -> None:
+    buffer = TransformBuffer()
+    for parent, child in pairwise(chain):
+        buffer.add(parent, child, 0, IDENTITY, static=True)
+
+    assert fixed_frame(buffer, "camera") == expected
+    assert fixed_frame(buffer, "stranger") is None
+
+
+def transform(store: Any, parent: str, child: str, stamp: int, x: float) -> Any:
+    types = store.types
+    time = types["builtin_interfaces/msg/Time"](*divmod(stamp, SECOND))
+    values = (
+        (0, time, parent)
+        if "seq" in types["std_msgs/msg/Header"].__annotations__
+        else (time, parent)
+    )
+    return types["geometry_msgs/msg/TransformStamped"](
+        types["std_msgs/msg/Header"](*values),
+        child,
+        types["geometry_msgs/msg/Transform"](
+            types["geometry_msgs/msg/Vector3"](x, 0, 0),
+            types["geometry_msgs/msg/Quaternion"](0, 0, 0, 1),
+        ),
+    )
+
+
+def test_transforms_of_a_ros2_recording(tmp_path: Path) -> None:
+    store, kind = get_typestore(Stores.ROS2_HUMBLE), "tf2_msgs/msg/TFMessage"
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        text = store.generate_msgdef(kind, ros_version=2)[0].encode()
+        schema = writer.register_schema(kind, "ros2msg", text)
+        fixed, moving = (writer.register_channel(t, "cdr", schema) for t in ("/tf_static", "/tf"))
+        for k in range(3):
+            item = transform(store, "odom", "base", EPOCH + k * SECOND, float(k))
+            data = store.serialize_cdr(store.types[kind]([item]), kind)
+            writer.add_message(moving, k, bytes(data), k)
+        item = transform(store, "base", "camera", 0, 10.0)
+        data = store.serialize_cdr(store.types[kind]([item]), kind)
+        writer.add_message(moving, 3, b"\0\1\0\0rubbish", 3)
+        writer.add_message(fixed, 4, bytes(data), 4)
+        writer.finish()
+
+    with open_recording(path) as recording:
+        buffer = read_transforms(recording)
+        assert recording.warnings[0].startswith("/tf: cannot decode")
+
+    assert buffer.lookup("odom", "camera", EPOCH + SECOND // 2).translation[0] == 10.5
+
+
+def test_transforms_of_an_old_ros1_recording(tmp_path: Path) -> None:
+    """tf/tfMessage is what ROS 1 recorded before tf2."""
+    store, kind = get_typestore(Stores.ROS1_NOETIC), "tf/msg/tfMessage"
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", kind))
+    path = tmp_path / "a.bag"
+    with BagWriter(path) as writer:
+        connection = writer.add_connection("/tf", kind, typestore=store)
+        item = transform(store, "/map", "/camera", EPOCH, 3.0)
+        writer.write(connection, EPOCH, store.serialize_ros1(store.types[kind]([item]), kind))
+
+    with open_recording(path) as recording:
+        buffer = read_transforms(recording)
+
+    assert buffer.lookup("map", "camera", EPOCH).translation[0] == 3.0
