@@ -25,9 +25,11 @@ class _Commands(click.Group):
         try:
             return super().invoke(ctx)
         except ShapecatError as error:
-            problem = click.ClickException(str(error))
-            problem.exit_code = error.exit_code
-            raise problem from error
+            click.echo(f"Error: {error}", err=True)
+            ctx.exit(error.exit_code)
+        except KeyboardInterrupt:
+            click.echo("interrupted; run the same command again to go on", err=True)
+            ctx.exit(130)
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  click's signature
         return list(self.commands)  # in the order of use, not of the alphabet

@@ -35,6 +35,7 @@ from .render import count_words, print_json, print_table, progress_bars
 @click.pass_context
 def process(
     ctx: click.Context,
+    /,
     *,
     recordings: tuple[Path, ...],
     out: Path,

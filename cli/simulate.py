@@ -1,6 +1,7 @@
 """``shapecat simulate``."""
 
 from pathlib import Path
+from typing import Any
 
 import click
 
@@ -29,9 +30,9 @@ from .render import progress_bars
 def simulate(
     *,
     out: Path,
-    scene: str,
-    container: str | None,
-    sensor: str,
+    scene: Any,
+    container: Any,
+    sensor: Any,
     frames: int,
     clouds: bool,
     seed: int,

@@ -84,8 +84,9 @@ def perceive_all(
     skipped: Counter[str] = Counter()
     source, total = _select(recording, run["options"], skipped)
     count = found = 0
-    names = {"categories": categorizer.categories, "model_id": categorizer.model_id}
-    with PerceptionTables(folder, **names) as tables:
+    with PerceptionTables(
+        folder, categories=categorizer.categories, model_id=categorizer.model_id
+    ) as tables:
         for count, frame in enumerate(source, start=1):
             up = upright.up(frame)
             perception = perceive(frame, up=up, categorizer=categorizer, settings=job.settings)

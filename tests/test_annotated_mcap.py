@@ -284,7 +284,8 @@ def test_ros1_bag_becomes_ros2(tmp_path: Path) -> None:
     source, target = tmp_path / "a.bag", tmp_path / "out.mcap"
     with BagWriter(source) as writer:
         for k, (topic, kind, item) in enumerate(ros1_messages()):
-            connection = writer.add_connection(topic, kind, typestore=STORE1)
+            latching = 1 if topic == "/tf" else None
+            connection = writer.add_connection(topic, kind, typestore=STORE1, latching=latching)
             writer.write(connection, EPOCH + k, STORE1.serialize_ros1(item, kind))
 
     annotate(source, target)
@@ -303,6 +304,8 @@ def test_ros1_bag_becomes_ros2(tmp_path: Path) -> None:
         assert reader.get_header().profile == "ros2"
         assert {c.message_encoding for c in summary.channels.values()} == {"cdr"}
         assert "tf2_msgs/msg/TFMessage" in {s.name for s in summary.schemas.values()}
+        (tf,) = (c for c in summary.channels.values() if c.topic == "/tf")
+        assert "durability: 1" in tf.metadata["offered_qos_profiles"]
     with AnyReader([target]) as other:
         assert other.message_count == 4 + 6
 

@@ -1,5 +1,7 @@
 """Frames: every layout of a cloud or depth image gives the same, right, coordinates."""
 
+import struct
+import zlib
 from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
@@ -13,7 +15,15 @@ from mcap.writer import Writer
 from rosbags.typesys import Stores, get_typestore
 
 from shapecat.errors import NoStreamError
-from shapecat.recordings import MessageError, choose_streams, cloud_streams, frames, open_recording
+from shapecat.recordings import (
+    MessageError,
+    choose_streams,
+    cloud_streams,
+    frames,
+    open_recording,
+    read_transforms,
+)
+from shapecat.recordings.compressed_depth import depth_of_compressed
 from shapecat.recordings.pinhole import fit_pinhole, still_fits
 from shapecat.recordings.pointcloud2 import cloud_points
 from shapecat.types import Camera, Frame
@@ -261,6 +271,41 @@ def test_bad_messages_are_counted_and_never_stop_the_stream(tmp_path: Path) -> N
     assert skipped["empty cloud"] == 1
 
 
+def test_definition_without_the_fields_of_its_type(tmp_path: Path) -> None:
+    """Anyone may call anything sensor_msgs/msg/Image."""
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        for kind in (CLOUD, IMAGE, INFO, "tf2_msgs/msg/TFMessage"):
+            schema = writer.register_schema(kind, "ros2msg", b"uint8 header")
+            channel = writer.register_channel(f"/{kind}", "cdr", schema)
+            writer.add_message(channel, 0, b"\0\1\0\0\0", 0)
+        writer.finish()
+
+    with open_recording(path) as recording:
+        assert cloud_streams(recording) == ()
+        assert read_transforms(recording).frames == ()
+        assert "left out transforms" in recording.warnings[0]
+
+
+def test_stamps_and_log_times_that_no_clock_gives_are_counted(tmp_path: Path) -> None:
+    """Tables hold 63 bits."""
+    points = np.ones((1, 3, 3), np.float32)
+    late, negative = cloud(EPOCH, points), cloud(EPOCH, points)
+    negative.header.stamp.sec = -5
+    items = [
+        ("/points", 0, cloud(EPOCH, points)),
+        ("/points", 1, negative),
+        ("/points", 2**63, late),
+    ]
+
+    read_frames, skipped, _ = read(write(tmp_path / "a.mcap", items))
+
+    assert len(read_frames) == 1
+    assert skipped.total() == 2
+
+
 def test_missing_readings_of_a_cloud_are_nan_rows(tmp_path: Path) -> None:
     rows = [[1, 2, 3], [np.nan, 1, 1], [np.inf, 0, 1], [0, 0, 0], [0, 0, 1]]
     points = np.array([rows], np.float32)
@@ -433,6 +478,124 @@ def test_no_stream_names_what_is_there(tmp_path: Path) -> None:
         pytest.raises(NoStreamError, match="/depth/camera_info"),
     ):
         choose_streams(recording)
+
+
+def png(values: Any) -> bytes:
+    """Write a 16-bit grey PNG that uses every row filter in turn."""
+    rows = values.astype(">u2").view(np.uint8).astype(int)
+    left, up = np.zeros_like(rows), np.zeros_like(rows)
+    left[:, 2:], up[1:] = rows[:, :-2], rows[:-1]
+    corner = np.zeros_like(rows)
+    corner[1:, 2:] = rows[:-1, :-2]
+    p = left + up - corner
+    dl, du, dc = abs(p - left), abs(p - up), abs(p - corner)
+    nearest = np.where((dl <= du) & (dl <= dc), left, np.where(du <= dc, up, corner))
+    guesses = [np.zeros_like(rows), left, up, (left + up) // 2, nearest]
+    data = b"".join(
+        bytes([y % 5]) + ((rows[y] - guesses[y % 5][y]) % 256).astype(np.uint8).tobytes()
+        for y in range(len(rows))
+    )
+    head = struct.pack(">IIBBBBB", values.shape[1], values.shape[0], 16, 0, 0, 0, 0)
+    packed = zlib.compress(data)
+    half = len(packed) // 2
+    chunks = [(b"IHDR", head), (b"IDAT", packed[:half]), (b"IDAT", packed[half:]), (b"IEND", b"")]
+    body = b"".join(struct.pack(">I", len(d)) + n + d + bytes(4) for n, d in chunks)
+    return b"\x89PNG\r\n\x1a\n" + body
+
+
+def rvl(values: Any) -> bytes:
+    """Write RVL as its paper describes."""
+    nibbles: list[int] = []
+
+    def put(number: int) -> None:
+        while True:
+            part, number = number & 7, number >> 3
+            nibbles.append(part | (8 if number else 0))
+            if not number:
+                return
+
+    flat, at, previous = values.ravel().tolist(), 0, 0
+    while at < len(flat):
+        zeros = at
+        while at < len(flat) and flat[at] == 0:
+            at += 1
+        put(at - zeros)
+        begin = at
+        while at < len(flat) and flat[at] != 0:
+            at += 1
+        put(at - begin)
+        for value in flat[begin:at]:
+            delta = value - previous
+            put((delta << 1) ^ (delta >> 63))
+            previous = value
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [
+        sum(nibble << (28 - 4 * k) for k, nibble in enumerate(nibbles[start : start + 8]))
+        for start in range(0, len(nibbles), 8)
+    ]
+    size = struct.pack("<II", values.shape[1], values.shape[0])
+    return size + np.array(words, "<u4").tobytes()
+
+
+def compressed(stamp: int, body: bytes, kind: str = "16UC1", ab: Any = (0.0, 0.0)) -> Any:
+    data = np.frombuffer(struct.pack("<iff", 0, *ab) + body, np.uint8)
+    return make(COMPRESSED, header(stamp), f"{kind}; compressedDepth", data)
+
+
+@pytest.mark.parametrize("pack", [png, rvl])
+def test_compressed_depth(tmp_path: Path, pack: Any) -> None:
+    depth = wavy_depth()
+    inverse = np.where(depth > 0, 4000, 0).astype(np.uint16)
+    items = [
+        ("/depth/camera_info", 0, info(EPOCH)),
+        ("/depth/image/compressedDepth", 0, compressed(EPOCH, pack(depth))),
+        (
+            "/depth/image/compressedDepth",
+            1,
+            compressed(EPOCH, pack(inverse), "32FC1", (8000, -4000)),
+        ),
+    ]
+
+    (first, second), skipped, _ = read(write(tmp_path / "a.mcap", items))
+
+    assert not skipped
+    assert first.depth is not None
+    assert second.depth is not None
+    np.testing.assert_array_equal(first.depth, depth / np.float32(1000))
+    np.testing.assert_allclose(second.depth, np.where(depth > 0, 1.0, 0.0))
+
+
+@given(data=st.binary(max_size=200), pack=st.sampled_from([png, rvl]), at=st.integers(0, 2000))
+@settings(deadline=None, max_examples=60)
+def test_damaged_compressed_depth_is_a_message_error(data: bytes, pack: Any, at: int) -> None:
+    body = bytearray(pack(wavy_depth()))
+    body[at : at + len(data)] = data
+    for damaged in (bytes(body), data):
+        try:
+            depth = depth_of_compressed(compressed(0, damaged))
+        except MessageError:
+            continue
+        assert np.isfinite(depth).all()
+
+
+def test_realsense_viewer_bag(tmp_path: Path) -> None:
+    """It has its own topic names, its depth is mono16, and it states the unit."""
+    depth = wavy_depth()
+    sensor = "/device_0/sensor_0"
+    unit = make("std_msgs/msg/Float32", 0.00025)
+    items = [
+        (f"{sensor}/option/Depth_Units/value", 0, unit),
+        (f"{sensor}/Depth_0/info/camera_info", 0, info(0)),
+        (f"{sensor}/Infrared_1/info/camera_info", 0, info(0)),
+        (f"{sensor}/Depth_0/image/data", 1, image(EPOCH, depth, "mono16")),
+        (f"{sensor}/Infrared_1/image/data", 1, image(EPOCH, depth, "mono16")),
+    ]
+
+    (frame,), _, _ = read(write(tmp_path / "a.mcap", items))
+
+    assert frame.depth is not None
+    assert frame.topic == f"{sensor}/Depth_0/image/data"
+    np.testing.assert_allclose(frame.depth, depth * 0.00025, rtol=1e-6)
 
 
 @pytest.mark.skipif(not DATA.exists(), reason="needs the recorded tabletop scenes")

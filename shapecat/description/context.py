@@ -68,7 +68,7 @@ def _width(px: F4, py: F4, c: float, s: float) -> float:
         value = c * px[k] + s * py[k]
         low = value if value < low else low
         high = value if value > high else high
-    return high - low
+    return float(high - low)
 
 
 @kernel
@@ -151,8 +151,7 @@ def context(
     high: float,
     out: F4,
 ) -> tuple[float, float, float]:
-    """Write the numbers named by `CONTEXT_NAMES`; return the greatest width and the widths across
-    and along the line of sight.
+    """Write the numbers named by `CONTEXT_NAMES`; return widths: greatest, across, along the view.
 
     All lengths are in units of the mean distance between neurons, with the origin at their mean.
 

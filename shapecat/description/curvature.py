@@ -45,11 +45,11 @@ def assign(points: F4, x: F4, y: F4, z: F4, reach: float) -> tuple[F4, I4]:
             bits = np.float32(dx * dx + dy * dy + dz * dz).view(np.int32)
             key = np.int32((bits & keep) | lane[i])
             best = key if key < best else best
-        i = np.int64(best & mask)
-        dx, dy, dz = x[i] - px, y[i] - py, z[i] - pz
+        winner = np.int64(best & mask)
+        dx, dy, dz = x[winner] - px, y[winner] - py, z[winner] - pz
         if dx * dx + dy * dy + dz * dz <= limit:
-            nearest[k] = i
-            starts[i + 1] += 1
+            nearest[k] = winner
+            starts[winner + 1] += 1
         else:
             nearest[k] = -1
     for i in range(count):

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from shapecat.arrays import F4, U2
+from shapecat.arrays import F4, F8, U2
 from shapecat.description.context import (
     CONTEXT_NAMES,
     PROFILE_NAMES,
@@ -30,6 +30,8 @@ _MAX_POINTS = 1200
 _RADIUS = 2.2 * 1.15
 """Radius of the neighbourhoods in which curvature is fitted, in spacings of the neurons."""
 _REACH = 3 * 1.15
+"""Points farther than this from every neuron are not described, in the same spacings."""
+_FAR = 1e6
 
 
 def _bins(name: str, count: int) -> Iterator[str]:
@@ -100,7 +102,7 @@ def describe(points: F4, gas: NeuralGas, eye: F4) -> F4:
     Raises
     ------
     ValueError : an array has the wrong shape or is not finite, or the graph has fewer than 2
-        neurons.
+        neurons or an edge to none of them.
 
     Notes
     -----
@@ -115,7 +117,12 @@ def describe(points: F4, gas: NeuralGas, eye: F4) -> F4:
     if len(gas.neurons) < 2:
         msg = f"a descriptor needs at least 2 neurons, got {len(gas.neurons)}"
         raise ValueError(msg)
+    points, eye = points.view(), eye.view()
+    points.flags.writeable = eye.flags.writeable = False  # one compiled version
     result = np.zeros(len(DESCRIPTOR_NAMES), np.float32)
+    if gas.edges.size and int(gas.edges.max()) >= len(gas.neurons):
+        msg = f"edge to neuron {gas.edges.max()} of {len(gas.neurons)}"
+        raise ValueError(msg)
     if not _describe(points, gas.neurons, gas.edges, eye, result):
         msg = "points, neurons and eye must be finite"
         raise ValueError(msg)
@@ -125,46 +132,25 @@ def describe(points: F4, gas: NeuralGas, eye: F4) -> F4:
 @kernel
 def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
     """Write the descriptor; return whether the input was finite."""
-    count = neurons.shape[0]
-    x = np.zeros(count, np.float32)
-    y = np.zeros(count, np.float32)
-    z = np.zeros(count, np.float32)
-    middle = np.zeros(3)
-    for i in range(count):
-        for axis in range(3):
-            middle[axis] += neurons[i, axis] / count
-    size = 0.0
-    for i in range(count):
-        for axis in range(3):
-            size = max(size, abs(neurons[i, axis] - middle[axis]))
-    if not size < np.inf:
+    if not (_finite(neurons) and _finite(points) and abs(eye).max() < np.inf):
         return False
-    # Unit: the mean distance between neurons. `size` first, so that squares stay in range.
-    unit = size if size > 0 else 1.0
-    for _ in range(2):
-        for i in range(count):
-            x[i] = (neurons[i, 0] - middle[0]) / unit
-            y[i] = (neurons[i, 1] - middle[1]) / unit
-            z[i] = (neurons[i, 2] - middle[2]) / unit
-        straight = euclidean(x, y, z)
-        mean = straight.sum() / (count * (count - 1))
-        if mean > 0:
-            unit *= mean
+    count = neurons.shape[0]
+    x, y, z, straight, middle, unit = _own_units(neurons)
     step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
     total = (points.shape[0] + step - 1) // step
     cloud = np.zeros((3, total), np.float32)
-    largest = 0.0
     for k in range(total):
         for axis in range(3):
+            # so far away only from neurons that do not belong to these points; squares stay finite
             value = (points[k * step, axis] - middle[axis]) / unit
-            cloud[axis, k] = value
-            largest = max(largest, abs(value))
+            cloud[axis, k] = min(max(value, -_FAR), _FAR)
+    away = 0.0
+    for axis in range(3):
+        away += (eye[axis] - middle[axis]) ** 2
+    away = np.sqrt(away)
     place = np.zeros(3, np.float32)
     for axis in range(3):
-        place[axis] = (eye[axis] - middle[axis]) / unit
-        largest = max(largest, abs(place[axis]))
-    if not largest < np.inf:
-        return False
+        place[axis] = (eye[axis] - middle[axis]) / max(unit, away / _FAR)
     gap = max(mean_gap(straight), 1e-3)
     paths = geodesic(straight, edges)
     cloud, starts = assign(cloud, x, y, z, np.float32(_REACH * gap))
@@ -204,10 +190,49 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
     out[at + 1] = low * unit + middle[2]
     out[at + 2], out[at + 3], out[at + 4] = wide * unit, across * unit, along * unit
     out[at + 5] = gap * unit
-    away = np.sqrt(place[0] ** 2 + place[1] ** 2 + place[2] ** 2)
-    out[_STARTS[12]] = place[2] / max(away, 1e-6)
-    out[_STARTS[12] + 1] = away * unit
+    out[_STARTS[12]] = (eye[2] - middle[2]) / away if away > 0 else 0.0
+    out[_STARTS[12] + 1] = away
     return True
+
+
+@kernel
+def _finite(rows: F4) -> bool:
+    for i in range(rows.shape[0]):
+        for axis in range(3):
+            if not abs(rows[i, axis]) < np.inf:
+                return False
+    return True
+
+
+@kernel
+def _own_units(neurons: F4) -> tuple[F4, F4, F4, F4, F8, float]:
+    """Return coordinates in the unit of the mean distance between neurons, about their mean.
+
+    Then the distances in these units, the mean, and the unit in metres (1 where all is one place).
+    """
+    count = neurons.shape[0]
+    middle = np.zeros(3)
+    for i in range(count):
+        for axis in range(3):
+            middle[axis] += neurons[i, axis] / count
+    unit = 0.0
+    for i in range(count):
+        for axis in range(3):
+            unit = max(unit, abs(neurons[i, axis] - middle[axis]))
+    unit = unit if unit > 0 else 1.0
+    x = np.zeros(count, np.float32)
+    y = np.zeros(count, np.float32)
+    z = np.zeros(count, np.float32)
+    straight = np.zeros((count, count), np.float32)
+    for _ in range(2):  # first by the greatest coordinate, so that squares stay finite
+        for i in range(count):
+            x[i] = (neurons[i, 0] - middle[0]) / unit
+            y[i] = (neurons[i, 1] - middle[1]) / unit
+            z[i] = (neurons[i, 2] - middle[2]) / unit
+        straight = euclidean(x, y, z)
+        mean = straight.sum() / (count * (count - 1))
+        unit *= mean if mean > 0 else 1.0
+    return x, y, z, straight, middle, unit
 
 
 @kernel

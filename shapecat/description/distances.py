@@ -37,9 +37,8 @@ def geodesic(straight: F4, edges: U2) -> F4:
     padded = (count + 15) // 16 * 16  # whole vectors: no remainder in the inner loop
     result = np.full((count, padded), np.float32(1e30))
     for e in range(edges.shape[0]):
-        i, j = np.int64(edges[e, 0]), np.int64(edges[e, 1])
-        result[i, j] = straight[i, j]
-        result[j, i] = straight[i, j]
+        a, b = np.int64(edges[e, 0]), np.int64(edges[e, 1])
+        result[a, b] = result[b, a] = straight[a, b]
     via = np.zeros(padded, np.float32)
     for k in range(count):
         result[k, k] = 0
@@ -70,7 +69,7 @@ def mean_gap(straight: F4) -> float:
     for i in range(count):
         best = np.float32(np.inf)
         for j in range(count):
-            gap = straight[i, j] if j != i else np.float32(np.inf)
+            gap = np.float32(straight[i, j]) if j != i else np.float32(np.inf)
             best = gap if gap < best else best
-        total += best
-    return total / count
+        total += float(best)
+    return float(total / count)

@@ -59,17 +59,17 @@ def rotation_axis(x: F4, y: F4, z: F4, weight: F4, normals: F4) -> tuple[F8, F8,
             for k in range(3):
                 C[i, j] += B[k, i] * moment[k, j]
     values, vectors = np.linalg.eigh(C)
-    axis, b = np.zeros(3), np.zeros(3)
+    axis, foot, rest = np.zeros(3), np.zeros(3), np.zeros(3)
     for i in range(3):
         axis[i] = vectors[i, 0]
         for j in range(3):
-            b[i] += moment[i, j] * vectors[j, 0]
-        values[i] = np.sqrt(max(values[i], 0.0))
+            foot[i] += moment[i, j] * vectors[j, 0]
+        rest[i] = np.sqrt(max(values[i], 0.0))
     point = np.zeros(3)
     for i in range(3):
         j, k = (i + 1) % 3, (i + 2) % 3
-        point[i] = axis[j] * b[k] - axis[k] * b[j]
-    return axis, point, values
+        point[i] = axis[j] * foot[k] - axis[k] * foot[j]
+    return axis, point, rest
 
 
 @kernel

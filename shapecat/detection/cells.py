@@ -4,6 +4,7 @@ Everything is done in inverse depth ``w = 1 / z`` (1/m): a plane is exactly line
 w), and the noise of disparity cameras is constant in w, so thresholds need no model of range.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -23,6 +24,8 @@ SMALL_M2 = 9e-4
 NEAREST_M = 0.05
 """Nothing measures nearer; keeps inverse depth within bounds."""
 LARGEST_FACTOR = 16
+MOST_CELLS = 100_000
+"""Bounds the time of a frame: images that look far have larger cells."""
 
 
 class Lens(NamedTuple):
@@ -66,7 +69,8 @@ def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_
     if sample.size == 0:
         return None
     pixel_m = float(np.median(sample)) / max(abs(camera.fx), 1e-6)
-    factor = round(min(max(cell_m / max(pixel_m, 1e-9), 1.0), LARGEST_FACTOR, *depth.shape))
+    least = math.sqrt(depth.size / MOST_CELLS)
+    factor = round(min(max(cell_m / max(pixel_m, 1e-9), least, 1.0), LARGEST_FACTOR, *depth.shape))
     shift = (factor - 1) / 2
     lens = Lens(
         camera.fx / factor,

@@ -11,11 +11,13 @@ from shapecat.detection.planes import DIRECTIONS, Support
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 
-__all__ = ["LEAST_M", "NOISE", "Heights", "heights_of", "inside", "table_of"]
+__all__ = ["LEAST_M", "NOISE", "Heights", "clear_walls", "heights_of", "inside", "table_of"]
 
 LEAST_M = 0.006
 """Lowest height of an object cell, to which `NOISE` times the squared range is added."""
 NOISE = 0.004
+WALL_JUMP = 0.012
+"""Cells this far in front of a wall, in inverse depth, are still the wall."""
 
 
 class Heights(NamedTuple):
@@ -58,6 +60,17 @@ def heights_of(cells: Cells, supports: list[Support], *, highest_m: float) -> He
     for k, row in reversed(list(enumerate(table_of(supports, cells.lens)))):
         _stand(cells.w, cells.lens, row, k + 1, highest_m, owner, height)
     return Heights(owner, height)
+
+
+@kernel
+def clear_walls(w: F4, owner: I4, walls: F8) -> None:
+    """Take the cells on and behind walls, rows (a, b, c) of ``walls``, from the object cells."""
+    for i in range(w.shape[0]):
+        for j in range(w.shape[1]):
+            if owner[i, j] > 0:
+                for wall in walls:
+                    if w[i, j] < wall[0] * j + wall[1] * i + wall[2] + WALL_JUMP:
+                        owner[i, j] = 0
 
 
 @kernel

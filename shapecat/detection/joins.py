@@ -1,5 +1,6 @@
 """Joins: the rules that bring the pieces of one object together."""
 
+import math
 from collections.abc import Collection
 
 import numpy as np
@@ -125,42 +126,45 @@ def _continuation(
     if na < 4 or nb < 4:
         return 0.0
     in_a, in_b = np.zeros(SAMPLES, np.uint8), np.zeros(SAMPLES, np.uint8)
-    free = hidden = looked = 0
+    partners = np.zeros((SAMPLES * SAMPLES, 2), np.uint8)
+    n = 0
     for s in range(na):
         for t in range(nb):
-            dx, dy, dz = b[t, 0] - a[s, 0], b[t, 1] - a[s, 1], b[t, 2] - a[s, 2]
             if a[s, 3] * b[t, 3] + a[s, 4] * b[t, 4] + a[s, 5] * b[t, 5] < COPLANAR_COS:
                 continue
-            limit = COPLANAR_M + COPLANAR * np.sqrt(dx * dx + dy * dy + dz * dz)
+            dx, dy, dz = b[t, 0] - a[s, 0], b[t, 1] - a[s, 1], b[t, 2] - a[s, 2]
+            limit = COPLANAR_M + COPLANAR * math.sqrt(dx * dx + dy * dy + dz * dz)
             if abs(dx * a[s, 3] + dy * a[s, 4] + dz * a[s, 5]) > limit:
                 continue
             if abs(dx * b[t, 3] + dy * b[t, 4] + dz * b[t, 5]) > limit:
                 continue
             in_a[s] = 1
             in_b[t] = 1
-            # (c) between them nothing else is seen, and something hides them
-            for step in range(1, 8):
-                u = step / 8
-                z = a[s, 2] + u * dz
-                j = int(lens.cx + lens.fx * (a[s, 0] + u * dx) / z + 0.5)
-                i = int(lens.cy + lens.fy * (a[s, 1] + u * dy) / z + 0.5)
-                if i < 0 or j < 0 or i >= w.shape[0] or j >= columns or w[i, j] <= 0:
-                    continue
-                looked += 1
-                ahead = w[i, j] - 1 / z
-                mine = labels[i, j] > 0 and (
-                    pieces.group[labels[i, j]] == p or pieces.group[labels[i, j]] == q
-                )
-                if mine:
-                    continue
-                if ahead > JUMP:
-                    hidden += 1
-                else:
-                    free += 1
+            partners[n, 0], partners[n, 1] = s, t
+            n += 1
     share = min(np.sum(in_a) / na, np.sum(in_b) / nb)
-    if share < PARTNERS or free > 0.12 * looked or hidden < 0.05 * looked:
+    if share < PARTNERS:
         return 0.0
-    return share
+    # (c) between them nothing else is seen, and something hides them
+    free = hidden = looked = 0
+    for k in range(0, n, max(1, n // 300)):
+        first, second = a[partners[k, 0]], b[partners[k, 1]]
+        for step in range(1, 8):
+            u = step / 8
+            z = first[2] + u * (second[2] - first[2])
+            x, y = first[0] + u * (second[0] - first[0]), first[1] + u * (second[1] - first[1])
+            j, i = int(lens.cx + lens.fx * x / z + 0.5), int(lens.cy + lens.fy * y / z + 0.5)
+            if i < 0 or j < 0 or i >= w.shape[0] or j >= columns or w[i, j] <= 0:
+                continue
+            looked += 1
+            label = labels[i, j]
+            if label > 0 and (pieces.group[label] == p or pieces.group[label] == q):
+                continue
+            if w[i, j] - 1 / z > JUMP:
+                hidden += 1
+            else:
+                free += 1
+    return share if free <= 0.12 * looked and hidden >= 0.05 * looked else 0.0
 
 
 @kernel

@@ -10,7 +10,7 @@ from shapecat.detection.cells import NEAREST_M, Cells, Lens
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 
-__all__ = ["DIRECTIONS", "Support", "corners_of", "estimate_up", "find_supports"]
+__all__ = ["DIRECTIONS", "Support", "corners_of", "estimate_up", "find_supports", "find_walls"]
 
 TOLERANCE = 0.01
 """Distance of an inlier from a plane in inverse depth, 1/m: three steps of a Kinect."""
@@ -19,7 +19,9 @@ MOST_PLANES = 5
 LEAST_SHARE = 0.04
 """A plane that tells the up direction covers at least this share of the readings."""
 HINT_COS = math.cos(math.radians(15))
-PARALLEL_COS = math.cos(math.radians(12))
+CORNER_COS = 0.3
+WALL_COS = 0.2
+WALL_AREA_M2 = 0.05
 DIRECTIONS = 16
 MARGIN_M = 0.01
 BIN_M = 0.01
@@ -29,7 +31,7 @@ SURE_AREA_M2 = 0.25
 LEAST_CELLS = 100
 ARM = 3
 """Cells to each side over which a surface is seen to be level."""
-STEADY_COS = math.cos(math.radians(4))
+STEADY_COS = math.cos(math.radians(6))
 LIKELY_AREA_M2 = 0.1
 LEAST_DROP_M = 0.06
 LEAST_DROPS = 20
@@ -59,31 +61,121 @@ def estimate_up(
     """Return the normal of the dominant supporting plane, (3,) unit, or None if there is none.
 
     With a ``hint`` only planes within 15 degrees of being perpendicular to it count. Without, the
-    largest group of parallel planes wins; where the camera is thought ``upright``, planes that
-    would look down count less, so that a table beats the wall behind it.
+    direction wins that most of the surface faces: the normal of one of the largest planes, or the
+    direction that two walls leave. Where the camera is thought ``upright``, directions that look
+    down count less, so that the boards of a shelf beat its back.
     """
     sample, stride = _sample(cells.w)
     least = max(LEAST_SHARE * np.count_nonzero(sample), 30)
-    guide = np.zeros(3) if hint is None else np.asarray(hint, np.float64)
+    if hint is not None:
+        plane, count = _best_plane(sample, stride, cells.lens, hint, (HINT_COS, 1.0), rng)
+        return _normal(plane, cells.lens) if count >= least else None
     normals: list[F8] = []
-    weights: list[float] = []
     for _ in range(MOST_PLANES):
-        plane = np.zeros(3)
-        triples = _triples(sample.shape, rng)
-        count = _consensus(sample, stride, triples, TOLERANCE, cells.lens, guide, HINT_COS, plane)
+        plane, count = _best_plane(sample, stride, cells.lens, np.zeros(3), (0.0, 0.0), rng)
         if count < least:
             break
         normals.append(_normal(plane, cells.lens))
-        # Cameras look down at tables: +y is down in the optical frame.
-        tilt = min(max(-normals[-1][1] / 0.2, -1.0), 1.0) if upright else 0.0
-        weights.append(count * (1.0 + 0.6 * tilt))
-        if hint is not None:
-            break
         _clear(sample, stride, plane, 2 * TOLERANCE)
     if not normals:
         return None
-    parallel = np.array(normals) @ np.array(normals).T > PARALLEL_COS
-    return normals[int(np.argmax(parallel @ np.array(weights)))]
+    choices = normals + [
+        sign * np.cross(a, b) / np.linalg.norm(np.cross(a, b))
+        for k, a in enumerate(normals)
+        for b in normals[:k]
+        if abs(a @ b) < CORNER_COS
+        for sign in (1, -1)
+    ]
+    facing = np.zeros(len(choices), np.int64)
+    _count_facing(cells.w, cells.lens, np.array(choices), facing)
+    # Cameras look down at tables: +y is down in the optical frame.
+    down = [min(max(-c[1] / 0.2, -1.0), 1.0) if upright else 0.0 for c in choices]
+    return choices[int(np.argmax(facing * (1.0 + 0.6 * np.array(down))))]
+
+
+def find_walls(
+    cells: Cells, owner: I4, up: F8, *, largest_m: float, rng: np.random.Generator
+) -> list[F8]:
+    """Return the vertical planes among the object cells that are too large for an object.
+
+    Each is (a, b, c): the inverse depth of the plane at cell (i, j) is ``a * j + b * i + c``.
+    """
+    sample, stride = _sample(np.where(owner > 0, cells.w, np.float32(0)))
+    walls: list[F8] = []
+    for _ in range(MOST_PLANES):
+        plane, count = _best_plane(sample, stride, cells.lens, up, (-WALL_COS, WALL_COS), rng)
+        if count < 50:
+            break
+        normal = _normal(plane, cells.lens)
+        axes = np.stack([np.cross(normal, up), up])
+        reach = np.zeros(3)
+        _measure_wall(sample, stride, cells.lens, plane, normal, axes, reach)
+        if reach[0] > WALL_AREA_M2 and reach[1:].max() > largest_m:
+            walls.append(plane)
+        _clear(sample, stride, plane, 2 * TOLERANCE)
+    return walls
+
+
+@kernel
+def _measure_wall(
+    sample: F4, stride: int, lens: Lens, plane: F8, normal: F8, axes: F8, reach: F8
+) -> None:
+    """Write the area of the inliers of a plane, and how far they reach across and up."""
+    shift = stride // 2
+    bins = np.zeros((2, 400))
+    for i in range(sample.shape[0]):
+        for j in range(sample.shape[1]):
+            x, y = j * stride + shift, i * stride + shift
+            v = plane[0] * x + plane[1] * y + plane[2]
+            if not (sample[i, j] > 0 and abs(sample[i, j] - v) < TOLERANCE):
+                continue
+            z = 1 / sample[i, j]
+            px, py = (x - lens.cx) / lens.fx * z, (y - lens.cy) / lens.fy * z
+            facing = -(px * normal[0] + py * normal[1] + z * normal[2]) / z
+            area = stride * stride * z * z / (lens.fx * lens.fy) / max(facing, 0.1)
+            reach[0] += area
+            for d in range(2):
+                along = axes[d, 0] * px + axes[d, 1] * py + axes[d, 2] * z
+                bins[d, min(max(int(math.floor(along * 20)) + 200, 0), 399)] += area
+    # A strip of 5 cm counts that holds 5 cm of wall.
+    for d in range(2):
+        for k in range(400):
+            reach[1 + d] += 0.05 if bins[d, k] > 0.0025 else 0.0
+
+
+@kernel
+def _count_facing(w: F4, lens: Lens, directions: F8, facing: I4) -> None:
+    """Count for each direction the cells, of every fourth, that face it within 15 degrees."""
+    rows, columns = w.shape
+    bend = np.float32(0.024)
+    for i in range(ARM, rows - ARM, 4):
+        for j in range(ARM, columns - ARM, 4):
+            center = w[i, j]
+            left, right, top, bottom = w[i, j - ARM], w[i, j + ARM], w[i - ARM, j], w[i + ARM, j]
+            if not ((center > 0) & (left > 0) & (right > 0) & (top > 0) & (bottom > 0)):
+                continue
+            if (abs(left + right - 2 * center) > bend) | (abs(top + bottom - 2 * center) > bend):
+                continue
+            wu, wv = (right - left) / (2 * ARM), (bottom - top) / (2 * ARM)
+            nx, ny = lens.fx * wu, lens.fy * wv
+            nz = center - wu * (j - lens.cx) - wv * (i - lens.cy)
+            norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+            for k in range(directions.shape[0]):
+                d = directions[k]
+                facing[k] += -(nx * d[0] + ny * d[1] + nz * d[2]) > 0.966 * norm
+
+
+def _best_plane(
+    sample: F4,
+    stride: int,
+    lens: Lens,
+    guide: F8,
+    cosines: tuple[float, float],
+    rng: np.random.Generator,
+) -> tuple[F8, int]:
+    plane = np.zeros(3)
+    triples = _triples(sample, rng)
+    return plane, _consensus(sample, stride, triples, TOLERANCE, lens, guide, cosines, plane)
 
 
 def _sample(w: F4) -> tuple[F4, int]:
@@ -91,11 +183,15 @@ def _sample(w: F4) -> tuple[F4, int]:
     return w[stride // 2 :: stride, stride // 2 :: stride].copy(), stride
 
 
-def _triples(shape: tuple[int, ...], rng: np.random.Generator) -> I4:
-    """Return (TRIALS, 3, 2) positions: one anywhere, two more at a random distance from it."""
-    size = np.array(shape)
-    first = rng.integers(0, size, (TRIALS, 1, 2))
-    radius = rng.uniform(0.08, 0.5, (TRIALS, 1, 1)) * size.max()
+def _triples(sample: F4, rng: np.random.Generator) -> I4:
+    """Return (TRIALS, 3, 2) positions: a reading, and two places at a random distance from it."""
+    readings = np.flatnonzero(sample)
+    if readings.size == 0:
+        return np.zeros((0, 3, 2), np.int64)
+    size = np.array(sample.shape)
+    chosen = readings[rng.integers(0, readings.size, (TRIALS, 1))]
+    first = np.stack(np.divmod(chosen, size[1]), axis=-1)
+    radius = rng.uniform(0.05, 0.5, (TRIALS, 1, 1)) * size.max()
     others = first + np.rint(rng.uniform(-1, 1, (TRIALS, 2, 2)) * radius).astype(np.int64)
     return np.concatenate([first, np.clip(others, 0, size - 1)], axis=1)
 
@@ -132,7 +228,7 @@ def _consensus(
     tolerance: float,
     lens: Lens,
     guide: F8,
-    least_cos: float,
+    cosines: tuple[float, float],
     best: F8,
 ) -> int:
     """Write the plane (a, b, c) with most inliers to ``best``; return how many there are.
@@ -160,7 +256,8 @@ def _consensus(
         if guided:
             nx, ny, nz = a * lens.fx, b * lens.fy, a * lens.cx + b * lens.cy + c
             along = -(nx * guide[0] + ny * guide[1] + nz * guide[2])
-            if not along > least_cos * math.sqrt(nx * nx + ny * ny + nz * nz):
+            norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+            if not ((along >= cosines[0] * norm) & (along <= cosines[1] * norm)):
                 continue
         votes = _count(sample, stride, a, b, c, tolerance)
         if votes > most:

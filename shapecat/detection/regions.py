@@ -11,6 +11,8 @@ __all__ = ["regions_of"]
 
 EDGE_DEG = 34
 """Concave angle that may part two objects; a bowl of 7 cm turns 16 degrees over the same cells."""
+WEAK_DEG = 34
+RIDGE, RIDGE_CELLS = 0.5, 5
 LEAST_CELLS = 12
 MOST_REGIONS = 250
 BUCKET_DEG = 4
@@ -23,25 +25,66 @@ def regions_of(heights: Heights, surfaces: Surfaces, *, concave: bool = True) ->
     the cells of an edge to its sides (Meyer 1991). With ``concave`` off only jumps part regions.
     """
     labels = np.zeros(heights.owner.shape, np.int16)
-    limit = EDGE_DEG if concave else 255
-    n = _flat_parts(heights.owner, surfaces.links, surfaces.edge, limit, labels, 0)
+    barrier = np.zeros(labels.shape, np.uint8)
+    if concave:
+        _creases(surfaces.edge, barrier)
+    n = _flat_parts(heights.owner, surfaces.links, barrier, labels, 0)
     _flood(surfaces.links, surfaces.edge, labels)
-    n = _flat_parts(heights.owner, surfaces.links, surfaces.edge, 255, labels, n)
+    barrier[:] = 0
+    n = _flat_parts(heights.owner, surfaces.links, barrier, labels, n)
     np.maximum(labels, 0, out=labels)
     return labels, n
 
 
 @kernel
-def _flat_parts(owner: I4, links: U1, edge: U1, limit: int, labels: I4, n: int) -> int:
-    """Label linked unlabelled cells with an edge below ``limit``; small parts get -1."""
+def _creases(edge: U1, barrier: U1) -> None:
+    """Mark strong concave edges, and weaker ones that continue them (hysteresis, Canny 1986)."""
+    rows, columns = edge.shape
+    stack = np.zeros(edge.size, np.int32)
+    top = 0
+    for i in range(rows):
+        for j in range(columns):
+            if edge[i, j] >= EDGE_DEG:
+                barrier[i, j] = 1
+                stack[top] = i * columns + j
+                top += 1
+    while top > 0:
+        top -= 1
+        i, j = stack[top] // columns, stack[top] % columns
+        for y in range(max(i - 1, 0), min(i + 2, rows)):
+            for x in range(max(j - 1, 0), min(j + 2, columns)):
+                if barrier[y, x] == 0 and edge[y, x] >= WEAK_DEG and _is_ridge(edge, y, x):
+                    barrier[y, x] = 1
+                    stack[top] = y * columns + x
+                    top += 1
+
+
+@kernel
+def _is_ridge(edge: U1, i: int, j: int) -> bool:
+    """Whether an edge falls off on two opposite sides; inside a bowl it does not."""
+    rows, columns = edge.shape
+    least = RIDGE * edge[i, j]
+    for d in range(4):
+        di = 0 if d == 0 else RIDGE_CELLS
+        dj = RIDGE_CELLS if d == 0 else (0 if d == 1 else (RIDGE_CELLS if d == 2 else -RIDGE_CELLS))
+        if i - di < 0 or i + di >= rows or min(j - dj, j + dj) < 0 or max(j - dj, j + dj) >= columns:
+            continue
+        if edge[i - di, j - dj] < least and edge[i + di, j + dj] < least:
+            return True
+    return False
+
+
+@kernel
+def _flat_parts(owner: I4, links: U1, barrier: U1, labels: I4, n: int) -> int:
+    """Label linked unlabelled cells that are no barrier; small parts get -1."""
     rows, columns = owner.shape
     stack = np.zeros(owner.size, np.int32)
     flat_owner, flat_links = owner.reshape(-1), links.reshape(-1)
-    flat_edge, flat = edge.reshape(-1), labels.reshape(-1)
+    closed, flat = barrier.reshape(-1), labels.reshape(-1)
     for k in range(flat.size):
         flat[k] = 0 if flat[k] < 0 else flat[k]
     for s in range(flat.size):
-        if flat_owner[s] <= 0 or flat[s] != 0 or flat_edge[s] >= limit or n >= MOST_REGIONS:
+        if flat_owner[s] <= 0 or flat[s] != 0 or closed[s] or n >= MOST_REGIONS:
             continue
         n += 1
         stack[0] = s
@@ -52,7 +95,7 @@ def _flat_parts(owner: I4, links: U1, edge: U1, limit: int, labels: I4, n: int) 
             done += 1
             for d in range(4):
                 q = _neighbour(p, d, rows, columns, flat_links)
-                if q >= 0 and flat[q] == 0 and flat_edge[q] < limit:
+                if q >= 0 and flat[q] == 0 and closed[q] == 0:
                     flat[q] = n
                     stack[top] = q
                     top += 1

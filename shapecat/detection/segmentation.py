@@ -14,10 +14,10 @@ from shapecat.config import DetectionSettings
 from shapecat.detection.cells import Cells
 from shapecat.detection.fill import fill_enclosed, grow_feet
 from shapecat.detection.furniture import is_furniture
-from shapecat.detection.heights import heights_of
+from shapecat.detection.heights import clear_walls, heights_of
 from shapecat.detection.joins import join_pieces
 from shapecat.detection.pieces import Pieces, pieces_of
-from shapecat.detection.planes import Support, estimate_up, find_supports
+from shapecat.detection.planes import Support, estimate_up, find_supports, find_walls
 from shapecat.detection.regions import regions_of
 from shapecat.detection.surfaces import surfaces_of
 
@@ -70,7 +70,11 @@ def segment(
     supports = [] if up is None else find_supports(cells, up)
     if up is None or not supports:
         return None
+    up = max(supports, key=lambda s: s.area_m2).up
     heights = heights_of(cells, supports, highest_m=settings.max_height_m)
+    walls = find_walls(cells, heights.owner, up, largest_m=settings.max_size_m, rng=rng)
+    if walls:
+        clear_walls(cells.w, heights.owner, np.array(walls))
     surfaces = surfaces_of(cells, heights)
     regions, n = regions_of(heights, surfaces, concave="concave" in rules)
     pieces = pieces_of(cells, heights, surfaces, regions, n, up)

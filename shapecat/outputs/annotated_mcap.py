@@ -97,7 +97,7 @@ def _annotations(frames: Iterable[LabelledFrame]) -> Iterator[Annotation]:
 
 def _encoding(recording: Recording, first: Annotation | None) -> str:
     """Return the encoding to annotate in: that of the annotated topic, else the commonest."""
-    if not isinstance(recording, McapRecording):
+    if recording.kind == "ros1":
         return "cdr"
     topics = [topic for topic in recording.topics if topic.encoding in ENCODERS]
     own = [topic.encoding for topic in topics if first and topic.name == first.frame.topic]

@@ -13,6 +13,7 @@ from rosbags.typesys.store import Typestore
 
 from shapecat.geometry import rotation_from_quaternion
 from shapecat.outputs.colours import colour_of
+from shapecat.outputs.scene_protobuf import encode_scene, scene_descriptors
 from shapecat.types import LabelledFrame, LabelledObject
 
 __all__ = ["ENCODERS", "Annotation", "AnnotationChannel", "encoder_for"]
@@ -30,6 +31,7 @@ class AnnotationChannel(NamedTuple):
     schema_name: str
     schema_encoding: str
     schema: bytes
+    metadata: tuple[tuple[str, str], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -90,13 +92,20 @@ def _ros(
 def _json(_markers: bool) -> list[tuple[AnnotationChannel, Encode]]:  # noqa: FBT001  # the same
     schema = files("shapecat.schemas").joinpath("SceneUpdate.json").read_bytes()
     channel = AnnotationChannel(SCENE, "json", "foxglove.SceneUpdate", "jsonschema", schema)
-    return [(channel, lambda annotation: json.dumps(_plain_scene(annotation)).encode())]
+    return [(channel, lambda annotation: json.dumps(_plain_scene(annotation, _JSON)).encode())]
+
+
+def _protobuf(_markers: bool) -> list[tuple[AnnotationChannel, Encode]]:  # noqa: FBT001  # the same
+    name, schema = "foxglove.SceneUpdate", scene_descriptors()
+    channel = AnnotationChannel(SCENE, "protobuf", name, "protobuf", schema)
+    return [(channel, lambda annotation: encode_scene(_plain_scene(annotation, _PROTOBUF)))]
 
 
 ENCODERS: dict[str, Callable[[bool], list[tuple[AnnotationChannel, Encode]]]] = {
     "cdr": _cdr,
     "ros1": _ros1,
     "json": _json,
+    "protobuf": _protobuf,
 }
 """Annotations by the encoding of the source: files of mixed encodings break ROS tools."""
 
@@ -285,10 +294,18 @@ def _typestore(ros1: bool) -> Typestore:  # noqa: FBT001  # a cache key
     return store
 
 
-def _plain_scene(annotation: Annotation) -> dict[str, Any]:
+_JSON = ("sec", "nsec")
+_PROTOBUF = ("seconds", "nanos")
+"""What the parts of a time are called."""
+
+
+def _plain_scene(annotation: Annotation, parts: tuple[str, str]) -> dict[str, Any]:
     """Make a foxglove.SceneUpdate of plain values."""
     frame = annotation.frame
-    time, lifetime = _plain_time(frame.stamp_ns), _plain_time(annotation.lifetime_ns)
+    time, lifetime = (
+        dict(zip(parts, divmod(value, 10**9), strict=True))
+        for value in (frame.stamp_ns, annotation.lifetime_ns)
+    )
     return {
         "deletions": [
             {"timestamp": time, "type": 0, "id": _entity_id(track)} for track in annotation.gone
@@ -344,8 +361,3 @@ def _plain_entity(
 
 def _plain(names: str, values: Sequence[float]) -> dict[str, float]:
     return dict(zip(names, values, strict=True))
-
-
-def _plain_time(nanoseconds: int) -> dict[str, int]:
-    seconds, rest = divmod(nanoseconds, 10**9)
-    return {"sec": seconds, "nsec": rest}

@@ -105,7 +105,7 @@ class Appender:
             id=number,
             topic=channel.topic,
             message_encoding=channel.encoding,
-            metadata={},
+            metadata=dict(channel.metadata),
             schema_id=schema_id,
         )
         if max(schema_id, number) > 0xFFFF:

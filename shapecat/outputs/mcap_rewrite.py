@@ -40,11 +40,13 @@ def rewrite(
     ROS 1 bags become CDR; a message that cannot be converted is wrapped (`wrap_raw`).
     """
     writer = Writer(file, compression=CompressionType.LZ4)
-    is_mcap = isinstance(recording, McapRecording)
-    writer.start(recording.profile if isinstance(recording, McapRecording) else "ros2", "shapecat")
+    parts = [part for part in recording.parts() if isinstance(part, McapRecording)]
+    writer.start(parts[0].profile if parts else "ros2", "shapecat")
+    source = _Source(writer, convert=recording.kind == "ros1")
+    for channel in recording.channels():
+        source.number(channel)
     numbers = [_register(writer, channel) for channel in channels]
     sequences: Counter[int] = Counter()
-    source = _Source(writer, convert=not is_mcap)
     streams: list[Iterable[Message | Item]] = [recording.messages(), items]
     for item in merge(*streams, key=attrgetter("log_time_ns")):
         if isinstance(item, Message):
@@ -53,8 +55,8 @@ def rewrite(
         position, time = item.channel, item.log_time_ns
         writer.add_message(numbers[position], time, item.data, time, sequences[position])
         sequences[position] += 1
-    if isinstance(recording, McapRecording):
-        _copy_extras(recording, writer)
+    for part in parts:
+        _copy_extras(part, writer)
     writer.add_metadata("shapecat", dict(metadata))
     writer.finish()
 
@@ -74,9 +76,7 @@ class _Source:
     def write(self, message: Message) -> None:
         """Write a message."""
         channel = message.channel
-        if channel not in self.known:
-            self.known[channel] = self._register(channel)
-        number, convert = self.known[channel]
+        number, convert = self.number(channel)
         data: bytes | memoryview = message.data
         try:
             data = convert(data) if convert is not None else data
@@ -85,11 +85,21 @@ class _Source:
         times = (message.log_time_ns, bytes(data), message.publish_time_ns)
         self.writer.add_message(number, *times, message.sequence)
 
+    def number(
+        self, channel: Channel
+    ) -> tuple[int, Callable[[bytes | memoryview], memoryview] | None]:
+        """Return the number of a channel and how its messages are converted."""
+        if channel not in self.known:
+            self.known[channel] = self._register(channel)
+        return self.known[channel]
+
     def _register(
         self, channel: Channel
     ) -> tuple[int, Callable[[bytes | memoryview], memoryview] | None]:
         if not (self.convert and channel.encoding == "ros1"):
-            described = AnnotationChannel(channel.topic, channel.encoding, *schema_of(channel))
+            described = AnnotationChannel(
+                channel.topic, channel.encoding, *schema_of(channel), channel.metadata
+            )
             return _register(self.writer, described, self.schemas), None
         converted = convert_channel(channel)
         if converted is None:
@@ -112,7 +122,8 @@ def _register(
     schemas = {} if schemas is None else schemas
     if key not in schemas:
         schemas[key] = writer.register_schema(*key) if channel.schema_name else 0
-    return int(writer.register_channel(channel.topic, channel.encoding, schemas[key]))
+    metadata = dict(channel.metadata)
+    return int(writer.register_channel(channel.topic, channel.encoding, schemas[key], metadata))
 
 
 def _copy_extras(recording: McapRecording, writer: Writer) -> None:

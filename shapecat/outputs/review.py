@@ -5,7 +5,7 @@ Entities
 ::
 
     world                      up and handedness; the fixed frame if there is one
-    ├── paths                  where the tracks have moved (under the topic without a fixed frame)
+    ├── paths/<topic>          where the tracks have moved (below <topic> without a fixed frame)
     └── <topic>                the sensor: fixed_from_sensor
         ├── camera             pinhole, for depth images
         ├── scene              points of no object, muted
@@ -41,8 +41,8 @@ import rerun as rr
 from shapecat.arrays import F8
 from shapecat.errors import OutputError
 from shapecat.geometry import transform
-from shapecat.outputs.colours import colour_of
 from shapecat.outputs import review_shapes as shapes
+from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import paint
 from shapecat.outputs.review_layout import Eye, TrackView, choose_eye, lay_out
 from shapecat.outputs.review_viewer import open_viewer, take_screenshot
@@ -98,9 +98,7 @@ def write_review(
 
 
 @contextmanager
-def _recording(
-    path: Path, name: str, run: Mapping[str, object]
-) -> Iterator[rr.RecordingStream]:
+def _recording(path: Path, name: str, run: Mapping[str, object]) -> Iterator[rr.RecordingStream]:
     hidden = path.with_name(f".{path.name}.partial")
     identity = uuid.uuid5(uuid.NAMESPACE_OID, name + json.dumps(run, sort_keys=True, default=str))
     stream = rr.RecordingStream("shapecat", recording_id=identity, send_properties=False)
@@ -146,12 +144,14 @@ class _Review:
         self._tracks: dict[int, TrackView] = {}
         self._paths: dict[str, dict[int, list[F8]]] = {}
         self._curves = _Curves(stream)
-        self._counted = dict.fromkeys(categories)
+        self._counted: dict[str, None] = {}  # categories met, in order
         self._warnings: list[str] = []
 
     def begin(self, run: Mapping[str, object]) -> None:
         """Write what does not change."""
-        self._log("run", rr.TextDocument(shapes.markdown(run), media_type="text/markdown"), static=True)
+        self._log(
+            "run", rr.TextDocument(shapes.markdown(run), media_type="text/markdown"), static=True
+        )
         warnings = run.get("warnings", ())
         if isinstance(warnings, Sequence) and not isinstance(warnings, str):
             self._warnings = [str(text) for text in warnings]
@@ -164,9 +164,7 @@ class _Review:
         self._stream.set_time("sensor_time", timestamp=np.datetime64(labelled.stamp_ns, "ns"))
         self._stream.set_time("frame", sequence=labelled.index)
         self._place_sensor(entity, labelled, frame)
-        scene, points = paint(
-            frame, labelled.planes, labelled.objects, limit=self._cloud_points
-        )
+        scene, points = paint(frame, labelled.planes, labelled.objects, limit=self._cloud_points)
         self._log(f"{entity}/scene", shapes.points(scene))
         self._log(f"{entity}/objects/points", shapes.points(points))
         self._log(f"{entity}/planes", shapes.outlines(labelled.planes))
@@ -196,6 +194,9 @@ class _Review:
         scenes = scenes[:1] if self._fixed_frame else scenes
         nothing = (world, "no frame", Eye(np.ones(3), np.zeros(3), np.array([0.0, 0.0, 1.0])))
         tracks = [self._tracks[number] for number in sorted(self._tracks)]
+        for track in tracks:
+            if track.frames == 1:  # a line of one point is not seen
+                self._log(f"{track.entity}/posterior", self._dots(), static=True)
         self._stream.send_blueprint(lay_out(scenes or [nothing], tracks))
         self._stream.flush(timeout_sec=60)
 
@@ -228,7 +229,8 @@ class _Review:
                 return
             entity = "world"
         paths = self._paths.get(labelled.topic, {})
-        changed = any([len(paths.pop(number, ())) > 1 for number in labelled.ended])
+        gone = [paths.pop(number, []) for number in labelled.ended]
+        changed = any(len(path) > 1 for path in gone)
         for item in labelled.objects:
             place = np.asarray(item.box.center, np.float64)
             place = place if pose is None else transform(pose, place)
@@ -264,11 +266,18 @@ class _Review:
         )
         self._log(f"{entity}/posterior", lines, static=True)
 
+    def _dots(self) -> rr.SeriesPoints:
+        return rr.SeriesPoints(
+            names=list(self._categories),
+            colors=[colour_of(category) for category in self._categories],
+            marker_sizes=[4.0] * len(self._categories),
+        )
+
     def _plot(self, labelled: LabelledFrame) -> None:
         at = (labelled.stamp_ns, labelled.index)
         for item in labelled.objects:
             self._tracks[item.track].frames += 1
-            self._curves.add(f"/tracks/{item.track}/posterior", at, item.causal)
+            self._curves.add(f"/tracks/{item.track}/posterior", at, item.causal.tolist())
         counts = Counter(item.category for item in labelled.objects)
         self._counted.update(dict.fromkeys(counts))
         for category in self._counted:

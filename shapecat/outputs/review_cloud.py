@@ -39,21 +39,27 @@ def paint(
     camera.
     """
     owner = _owners(frame, objects)
-    fine, near = _thin(frame, np.flatnonzero(owner != 0), limit // 2)
+    fine, near = _thin(frame, owner, limit // 2)
     coarse, far = _grid(frame, max(limit - near.size, 1) if limit else 0)
-    palette = np.array([(0, 0, 0), *(colour_of(o.category) for o in objects)], np.uint8)
-    near, points = _measured(frame, near)
-    labelled = _painted(frame, near, points, palette[owner[near]], fine)
-    far, points = _measured(frame, far[owner[far] == 0])
-    return _painted(frame, far, points, _scene_colours(points, planes), coarse), labelled
+    near, far = _measured(frame, near), _measured(frame, far[owner[far] == 0])
+    own = np.array([colour_of(o.category) for o in objects], np.uint8).reshape(-1, 3)
+    palette = np.concatenate([_GROUND[None], own, _PLANES])
+    labelled = _painted(frame, near, owner[near], palette, (), fine)
+    return _painted(frame, far, owner[far], palette, planes, coarse), labelled
 
 
-def _painted(frame: Frame, pixels: I4, points: F4, colours: U1, step: int) -> PaintedCloud:
-    if frame.depth is None or frame.camera is None:
-        return PaintedCloud(points, _pack(colours, np.ones(len(points), np.float32)), _RADIUS_M)
-    light = _light(frame.depth, pixels, frame.camera.fx, frame.camera.fy)
-    pitch = step * float(np.median(points[:, 2])) / frame.camera.fx if len(points) else 0.0
-    return PaintedCloud(points, _pack(colours, light), 0.55 * pitch)
+def _painted(
+    frame: Frame, pixels: I4, tones: U2, palette: U1, planes: Sequence[Plane], step: int
+) -> PaintedCloud:
+    """Return the points at ``pixels``, coloured by entries of the palette or by their plane."""
+    points = frame.xyz(pixels)
+    light, radius = np.ones(pixels.size, np.float32), _RADIUS_M
+    if frame.depth is not None and frame.camera is not None:
+        light = _light(frame.depth, pixels, frame.camera.fx, frame.camera.fy)
+        middle = float(np.median(points[:, 2])) if len(points) else 0.0
+        radius = 0.55 * step * middle / frame.camera.fx
+    colours = _colours(points, light, tones, palette, _plane_rows(planes), len(_PLANES))
+    return PaintedCloud(points, colours, radius)
 
 
 def _owners(frame: Frame, objects: Sequence[LabelledObject]) -> U2:
@@ -73,46 +79,67 @@ def _grid(frame: Frame, limit: int) -> tuple[int, I4]:
         step = -(-n // limit) if limit and n else 1
         return step, np.arange(0, n, step)
     height, width = frame.depth.shape
-    step = _step(height * width, limit)
+    readings = 64 * int(np.count_nonzero(frame.depth[::8, ::8]))  # an estimate is enough
+    step = _step(readings, limit)
     rows, columns = np.arange(step // 2, height, step), np.arange(step // 2, width, step)
     return step, (rows[:, None] * width + columns).ravel()
 
 
-def _thin(frame: Frame, pixels: I4, limit: int) -> tuple[int, I4]:
-    """Return the pitch of a grid and those of ``pixels`` on it, about ``limit``; all if 0."""
+def _thin(frame: Frame, owner: U2, limit: int) -> tuple[int, I4]:
+    """Return the pitch of a grid and the owned pixels on it, about ``limit``; all if 0."""
     if frame.depth is None:
+        pixels = np.flatnonzero(owner != 0)
         step = -(-pixels.size // limit) if limit and pixels.size else 1
         return step, pixels[::step]
-    step, width = _step(pixels.size, limit), frame.depth.shape[1]
-    return step, pixels[(pixels % width % step == 0) & (pixels // width % step == 0)]
+    width = frame.depth.shape[1]
+    step = _step(int(np.count_nonzero(owner)), limit)
+    rows, columns = np.nonzero(owner.reshape(frame.depth.shape)[::step, ::step] != 0)
+    return step, (rows * width + columns) * step
 
 
 def _step(size: int, limit: int) -> int:
     return int(np.ceil(np.sqrt(size / limit))) if limit and size > limit else 1
 
 
-def _measured(frame: Frame, pixels: I4) -> tuple[I4, F4]:
-    """Return the pixels that have a reading, and their points."""
-    points = frame.xyz(pixels)
-    valid = np.isfinite(points[:, 2])
-    return pixels[valid], points[valid]
+def _measured(frame: Frame, pixels: I4) -> I4:
+    """Return the pixels or points that have a reading."""
+    if frame.depth is not None:
+        return np.asarray(pixels[frame.depth.reshape(-1)[pixels] > 0])
+    return np.asarray(pixels[np.isfinite(frame.xyz(pixels)).all(axis=1)])
 
 
-def _scene_colours(points: F4, planes: Sequence[Plane]) -> U1:
-    colours = np.tile(_GROUND, (len(points), 1))
-    for k, plane in enumerate(planes):
-        height = points @ plane.normal - np.float32(plane.offset)
-        near = np.flatnonzero(np.abs(height) < _PLANE_M)
-        middle = plane.outline.mean(axis=0)
-        reach = np.linalg.norm(plane.outline - middle, axis=1).max(initial=0.0)
-        inside = ((points[near] - middle) ** 2).sum(axis=1) <= reach**2
-        colours[near[inside]] = _PLANES[k % len(_PLANES)]
-    return colours
+def _plane_rows(planes: Sequence[Plane]) -> F4:
+    """Return (p, 8) normal, offset, middle of the outline, and its squared radius."""
+    rows = []
+    for plane in planes:
+        middle = plane.outline.mean(axis=0) if len(plane.outline) else np.zeros(3)
+        reach = ((plane.outline - middle) ** 2).sum(axis=1).max(initial=0.0)
+        rows.append([*plane.normal, plane.offset, *middle, reach])
+    return np.array(rows, np.float32).reshape(-1, 8)
 
 
-def _pack(colours: U1, light: F4) -> U4:
-    scaled = np.minimum(colours * light[:, None], 255).astype(np.uint32)
-    return np.asarray((scaled[:, 0] << 24) | (scaled[:, 1] << 16) | (scaled[:, 2] << 8) | 0xFF)
+@kernel
+def _colours(points: F4, light: F4, tones: U2, palette: U1, planes: F4, plane_tones: int) -> U4:
+    """Return (n,) colours 0xRRGGBBAA: of the palette, of a near plane for tone 0, times light.
+
+    The last ``plane_tones`` entries of the palette (k, 3) are those of the planes in turn.
+    """
+    result = np.zeros(len(points), np.uint32)
+    for i in range(len(points)):
+        tone = int(tones[i])
+        if tone == 0:
+            x, y, z = points[i, 0], points[i, 1], points[i, 2]
+            for k in range(len(planes)):
+                a, b, c, offset, u, v, w, reach = planes[k]
+                inside = (x - u) ** 2 + (y - v) ** 2 + (z - w) ** 2 <= reach
+                if inside and abs(a * x + b * y + c * z - offset) < _PLANE_M:
+                    tone = len(palette) - plane_tones + k % plane_tones
+        packed = np.uint32(0)
+        for channel in range(3):
+            value = np.uint32(min(palette[tone, channel] * light[i], np.float32(255)))
+            packed = (packed << np.uint32(8)) | value
+        result[i] = (packed << np.uint32(8)) | np.uint32(255)
+    return result
 
 
 @kernel

@@ -76,9 +76,7 @@ def _subject(labelled: LabelledFrame, frame: Frame, pose: Pose) -> tuple[F8, flo
     return transform(pose, (low + high) / 2), float(np.linalg.norm(high - low) / 2)
 
 
-def lay_out(
-    scenes: Sequence[tuple[str, str, Eye]], tracks: Sequence[TrackView]
-) -> rrb.Blueprint:
+def lay_out(scenes: Sequence[tuple[str, str, Eye]], tracks: Sequence[TrackView]) -> rrb.Blueprint:
     """Return the blueprint: 3D on the left; tracks, plots and texts on the right.
 
     Parameters

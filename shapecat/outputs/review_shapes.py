@@ -3,9 +3,10 @@
 from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
+import pyarrow as pa
 import rerun as rr
 
-from shapecat.arrays import F8
+from shapecat.arrays import F4, F8
 from shapecat.geometry import quaternion_from_rotation, rotation_from_quaternion
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import PaintedCloud
@@ -73,9 +74,20 @@ def graphs(objects: Sequence[LabelledObject]) -> rr.LineStrips3D:
     """Return the edges of the graphs of a frame."""
     strips = [o.gas.neurons[o.gas.edges] for o in objects]
     counts = [len(o.gas.edges) for o in objects]
-    colours = np.repeat(np.array([_packed(o.category, 255, 0.65) for o in objects], np.uint32), counts)
+    colours = np.repeat(
+        np.array([_packed(o.category, 255, 0.65) for o in objects], np.uint32), counts
+    )
     pairs = np.concatenate(strips) if strips else np.zeros((0, 2, 3), np.float32)
-    return rr.LineStrips3D(pairs, colors=colours, radii=0.0008)
+    return rr.LineStrips3D(_segments(pairs), colors=colours, radii=0.0008)
+
+
+def _segments(pairs: F4) -> pa.Array:
+    """Return lines (n, 2, 3) as Rerun stores them: its own conversion goes one by one."""
+    kind = rr.components.LineStrip3DBatch._ARROW_DATATYPE  # noqa: SLF001  not told otherwise
+    flat = pa.array(np.ascontiguousarray(pairs, np.float32).ravel())
+    corners = pa.FixedSizeListArray.from_arrays(flat, type=kind.value_type)
+    offsets = pa.array(np.arange(0, 2 * len(pairs) + 1, 2, dtype=np.int32))
+    return pa.ListArray.from_arrays(offsets, corners, type=kind)
 
 
 def surfaces(objects: Sequence[LabelledObject]) -> rr.Mesh3D:
@@ -143,7 +155,9 @@ def pinhole(camera: Camera) -> rr.Pinhole:
 
 def markdown(values: Mapping[str, object], level: int = 1) -> str:
     """Return nested values as headings and lists."""
-    lines = [f"- **{key}**: {_inline(v)}" for key, v in values.items() if not isinstance(v, Mapping)]
+    lines = [
+        f"- **{key}**: {_inline(v)}" for key, v in values.items() if not isinstance(v, Mapping)
+    ]
     parts = ["\n".join(lines)] if lines else []
     for key, value in values.items():
         if isinstance(value, Mapping):

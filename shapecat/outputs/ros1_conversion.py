@@ -5,7 +5,16 @@ from importlib.resources import files
 from typing import Any
 
 import numpy as np
-from rosbags.interfaces import Nodetype
+from rosbags.interfaces import (
+    Nodetype,
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
+from rosbags.rosbag2.metadata import dump_qos_v8
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
@@ -17,6 +26,19 @@ __all__ = ["RAW_TYPE", "ConvertedChannel", "convert_channel", "raw_channel", "wr
 
 RAW_TYPE = "shapecat_msgs/msg/RawMessage"
 _RENAMED = {"tf/msg/tfMessage": "tf2_msgs/msg/TFMessage"}
+_FOREVER = QosTime(2147483647, 4294967295)
+_LATCHED = Qos(
+    QosHistory.KEEP_LAST,
+    1,
+    QosReliability.RELIABLE,
+    QosDurability.TRANSIENT_LOCAL,
+    _FOREVER,
+    _FOREVER,
+    QosLiveliness.AUTOMATIC,
+    _FOREVER,
+    avoid_ros_namespace_conventions=False,
+)
+"""What ROS 2 calls a latched topic."""
 _HEADER = "std_msgs/msg/Header"
 
 ConvertedChannel = tuple[AnnotationChannel, Callable[[bytes | memoryview], memoryview]]
@@ -48,7 +70,9 @@ def convert_channel(channel: Channel) -> ConvertedChannel | None:
         store.get_msgdef(name)
     except LIBRARY_ERRORS:
         return None
-    described = AnnotationChannel(channel.topic, "cdr", name, "ros2msg", text.encode())
+    latched = dict(channel.metadata).get("latching") == "1"
+    quality = (("offered_qos_profiles", dump_qos_v8([_LATCHED])),) if latched else ()
+    described = AnnotationChannel(channel.topic, "cdr", name, "ros2msg", text.encode(), quality)
     return described, lambda data: store.ros1_to_cdr(data, name)
 
 

@@ -18,7 +18,9 @@ from rosbags.typesys import (
 )
 from rosbags.typesys.store import Typestore
 
+from shapecat.recordings.foxglove import as_ros
 from shapecat.recordings.messages import Channel, Message, MessageError
+from shapecat.recordings.protobuf import message_decoder
 
 __all__ = ["LIBRARY_ERRORS", "Decoder", "decode", "schema_of", "typestore_of"]
 
@@ -57,7 +59,7 @@ def decode(message: Message, known: dict[tuple[str, str, bytes], Decoder]) -> An
     try:
         if key not in known:
             known[key] = _DECODERS[channel.encoding](channel)
-        return known[key](message.data)
+        return as_ros(channel.type, known[key](message.data))
     except LIBRARY_ERRORS as error:
         reason = " ".join(str(error).split())[:120] or type(error).__name__
         if channel.encoding not in _DECODERS:
@@ -130,7 +132,16 @@ def _json(_channel: Channel) -> Decoder:
     return lambda data: json.loads(bytes(data), object_hook=lambda item: SimpleNamespace(**item))
 
 
-_DECODERS: dict[str, Callable[[Channel], Decoder]] = {"cdr": _cdr, "ros1": _ros1, "json": _json}
+def _protobuf(channel: Channel) -> Decoder:
+    return message_decoder(channel.schema, channel.schema_name)
+
+
+_DECODERS: dict[str, Callable[[Channel], Decoder]] = {
+    "cdr": _cdr,
+    "ros1": _ros1,
+    "json": _json,
+    "protobuf": _protobuf,
+}
 
 
 def schema_of(channel: Channel) -> tuple[str, str, bytes]:

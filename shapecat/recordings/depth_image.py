@@ -13,8 +13,12 @@ DEPTH_ENCODINGS = {"16UC1": ("u2", 1000), "mono16": ("u2", 1000), "32FC1": ("f4"
 """Type of a pixel and units in a metre (REP 118)."""
 
 
-def depth_of_image(message: Any) -> F4:
+def depth_of_image(message: Any, units: float | None = None) -> F4:
     """Read a decoded sensor_msgs/Image as depth.
+
+    Parameters
+    ----------
+    units : integer units in a metre where they are not millimetres.
 
     Returns
     -------
@@ -28,7 +32,7 @@ def depth_of_image(message: Any) -> F4:
     if message.encoding not in DEPTH_ENCODINGS:
         msg = f"image encoding {message.encoding!r} is not depth"
         raise MessageError(msg)
-    kind, units = DEPTH_ENCODINGS[message.encoding]
+    kind, default = DEPTH_ENCODINGS[message.encoding]
     pixel = np.dtype(("<" if not message.is_bigendian else ">") + kind)
     row = int(message.step) or width * pixel.itemsize
     data = np.frombuffer(message.data, np.uint8)
@@ -36,10 +40,11 @@ def depth_of_image(message: Any) -> F4:
     if height * width == 0 or row < width * pixel.itemsize or need > data.size:
         msg = f"image of {width} x {height} pixels needs {need} bytes and has {data.size}"
         raise MessageError(msg)
-    return clean_depth(np.ndarray((height, width), pixel, data, 0, (row, pixel.itemsize)), units)
+    values = np.ndarray((height, width), pixel, data, 0, (row, pixel.itemsize))
+    return clean_depth(values, units or default)
 
 
-def clean_depth(values: F4, units: int = 1) -> F4:
+def clean_depth(values: F4, units: float = 1) -> F4:
     """Convert to metres and set to 0 what is negative, infinite or not a number.
 
     ``units`` make a metre.

@@ -1,15 +1,16 @@
 """Foxglove's messages in the shape of the ROS messages they correspond to."""
 
 import base64
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 
-from shapecat.geometry import IDENTITY, rotation_from_quaternion
+from shapecat.geometry import rotation_from_quaternion
+from shapecat.types import Pose
 
-__all__ = ["FOXGLOVE_TYPES", "as_ros"]
+__all__ = ["FOXGLOVE_TYPES", "as_ros", "ros_counterpart"]
 
 FOXGLOVE_TYPES = {
     "foxglove.PointCloud": "sensor_msgs/msg/PointCloud2",
@@ -29,18 +30,37 @@ def as_ros(kind: str, message: Any) -> Any:
 
     Messages of other types are returned as they are. Bytes may be base64 text, as in JSON.
     """
-    return _CONVERSIONS[kind](message) if kind in _CONVERSIONS else message
+    convert = _CONVERSIONS.get(_plain(kind))
+    return message if convert is None else convert(message)
+
+
+def ros_counterpart(kind: str) -> str:
+    """Return the ROS type that a type corresponds to: itself if it is not Foxglove's."""
+    return FOXGLOVE_TYPES.get(_plain(kind), kind)
+
+
+def _plain(kind: str) -> str:
+    """Return the name in JSON and protobuf of a type that may come from its ROS package."""
+    return kind.replace("foxglove_msgs/msg/", "foxglove.")
 
 
 def _header(message: Any) -> Any:
-    return SimpleNamespace(stamp=_stamp(message.timestamp), frame_id=message.frame_id)
+    return SimpleNamespace(stamp=_stamp(message.timestamp), frame_id=str(message.frame_id))
 
 
 def _stamp(time: Any) -> Any:
-    seconds = getattr(time, "sec", None)
-    if seconds is None:
-        return SimpleNamespace(sec=time.seconds, nanosec=time.nanos)
-    return SimpleNamespace(sec=seconds, nanosec=getattr(time, "nsec", 0))
+    """Read a time: of JSON, of ROS, or of protobuf, where it may be absent."""
+    seconds, rest = 0, 0
+    for names in (("sec", "nsec"), ("sec", "nanosec"), ("seconds", "nanos")):
+        seconds = int(getattr(time, names[0], seconds))
+        rest = int(getattr(time, names[1], rest))
+    return SimpleNamespace(sec=seconds, nanosec=rest)
+
+
+def _vector(value: Any, names: str, default: Sequence[float]) -> Any:
+    """Read coordinates, those of a message that is absent by default."""
+    values = default if value is None else [float(getattr(value, name)) for name in names]
+    return SimpleNamespace(**dict(zip(names, values, strict=True)))
 
 
 def _bytes(data: Any) -> Any:
@@ -50,8 +70,12 @@ def _bytes(data: Any) -> Any:
 def _cloud(message: Any) -> Any:
     data, step = _bytes(message.data), int(message.point_stride)
     fields = [
-        SimpleNamespace(name=f.name, offset=f.offset, datatype=_POINT_FIELDS.get(int(f.type), 0))
-        for f in message.fields
+        SimpleNamespace(
+            name=str(field.name),
+            offset=int(field.offset),
+            datatype=_POINT_FIELDS.get(int(field.type), 0),
+        )
+        for field in message.fields
     ]
     return SimpleNamespace(
         header=_header(message),
@@ -66,42 +90,40 @@ def _cloud(message: Any) -> Any:
     )
 
 
-def _pose(pose: Any) -> Any:
-    """Return rotation and translation of a cloud's own pose, None where it is the identity."""
-    if pose is None or pose.orientation is None or pose.position is None:
+def _pose(pose: Any) -> Pose | None:
+    """Return a cloud's own pose, None where it is the identity."""
+    if pose is None:
         return None
-    q, p = pose.orientation, pose.position
-    quaternion = np.array([q.x, q.y, q.z, q.w], np.float64)
-    turned = quaternion.any()
-    rotation = rotation_from_quaternion(quaternion) if turned else IDENTITY.rotation
-    translation = np.array([p.x, p.y, p.z], np.float64)
-    if not translation.any() and np.array_equal(rotation, IDENTITY.rotation):
-        return None
-    return rotation, translation
+    p = _vector(pose.position, "xyz", (0, 0, 0))
+    q = _vector(pose.orientation, "xyzw", (0, 0, 0, 1))
+    quaternion = (q.x, q.y, q.z, q.w) if any((q.x, q.y, q.z, q.w)) else (0, 0, 0, 1)
+    own = Pose(rotation_from_quaternion(quaternion), np.array([p.x, p.y, p.z]))
+    return own if own.translation.any() or not np.array_equal(own.rotation, np.eye(3)) else None
 
 
 def _image(message: Any) -> Any:
     return SimpleNamespace(
         header=_header(message),
-        height=message.height,
-        width=message.width,
-        encoding=message.encoding,
+        height=int(message.height),
+        width=int(message.width),
+        encoding=str(message.encoding),
         is_bigendian=False,
-        step=message.step,
+        step=int(message.step),
         data=_bytes(message.data),
     )
 
 
 def _calibration(message: Any) -> Any:
+    matrices = {
+        name: np.array(getattr(message, name, getattr(message, name.upper(), ())), np.float64)
+        for name in "dkrp"
+    }
     return SimpleNamespace(
         header=_header(message),
-        height=message.height,
-        width=message.width,
-        distortion_model=message.distortion_model,
-        d=message.D,
-        k=message.K,
-        r=message.R,
-        p=message.P,
+        height=int(message.height),
+        width=int(message.width),
+        distortion_model=str(message.distortion_model),
+        **matrices,
         binning_x=0,
         binning_y=0,
         roi=SimpleNamespace(x_offset=0, y_offset=0, width=0, height=0),
@@ -112,9 +134,14 @@ def _transforms(message: Any) -> Any:
     return SimpleNamespace(
         transforms=[
             SimpleNamespace(
-                header=SimpleNamespace(stamp=_stamp(item.timestamp), frame_id=item.parent_frame_id),
-                child_frame_id=item.child_frame_id,
-                transform=SimpleNamespace(translation=item.translation, rotation=item.rotation),
+                header=SimpleNamespace(
+                    stamp=_stamp(item.timestamp), frame_id=str(item.parent_frame_id)
+                ),
+                child_frame_id=str(item.child_frame_id),
+                transform=SimpleNamespace(
+                    translation=_vector(item.translation, "xyz", (0, 0, 0)),
+                    rotation=_vector(item.rotation, "xyzw", (0, 0, 0, 1)),
+                ),
             )
             for item in getattr(message, "transforms", [message])
         ]

@@ -103,10 +103,10 @@ class Upright:
 def _parse_vector(text: str) -> F4:
     try:
         vector = np.array([float(part) for part in text.split(",")], np.float64)
-        length = float(np.linalg.norm(vector))
-        if vector.shape != (3,) or not 1e-6 < length < np.inf:
-            raise ValueError
     except ValueError:
+        vector = np.zeros(0)
+    length = float(np.linalg.norm(vector))
+    if vector.shape != (3,) or not 1e-6 < length < np.inf:
         msg = f"--up {text}: expected auto, tf, or a vector such as 0,-1,0"
-        raise ConfigError(msg) from None
+        raise ConfigError(msg)
     return np.asarray(vector / length, np.float32)

@@ -324,6 +324,7 @@ class McapRecording(Recording):
             name,
             encoding,
             text,
+            tuple(channel.metadata.items()),
         )
 
     def _list_topics(self) -> tuple[Topic, ...]:

@@ -16,7 +16,8 @@ class Channel(NamedTuple):
     """Where messages of one kind come from.
 
     ``type`` is normalized to ``package/msg/Name`` for ROS types; ``schema_name`` is as recorded.
-    ``encoding`` is that of the messages: cdr, ros1, json, protobuf.
+    ``encoding`` is that of the messages: cdr, ros1, json, protobuf. ``metadata`` is what recorders
+    keep with a channel, such as ``offered_qos_profiles``.
     """
 
     topic: str
@@ -25,6 +26,7 @@ class Channel(NamedTuple):
     schema_name: str = ""
     schema_encoding: str = ""
     schema: bytes = b""
+    metadata: tuple[tuple[str, str], ...] = ()
 
 
 class Message(NamedTuple):

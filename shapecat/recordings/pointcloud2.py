@@ -6,8 +6,9 @@ import numpy as np
 
 from shapecat.arrays import F4
 from shapecat.recordings.messages import MessageError
+from shapecat.types import Camera
 
-__all__ = ["cloud_points"]
+__all__ = ["cloud_points", "organized", "unorganized"]
 
 _FORMATS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 
@@ -62,3 +63,22 @@ def _axes(message: Any, step: int) -> list[tuple[int, str]]:
             raise MessageError(msg)
         axes.append((int(field.offset), order + kind))
     return axes
+
+
+def organized(points: F4, camera: Camera) -> dict[str, Any]:
+    """Return depth and camera of an organized cloud (h, w, 3)."""
+    x, y, z = (points[..., k] for k in range(3))
+    with np.errstate(over="ignore", invalid="ignore"):
+        valid = np.isfinite(x + y + z) & (z > 0)
+    return {"depth": np.where(valid, z, np.float32(0)), "camera": camera}
+
+
+def unorganized(points: F4) -> dict[str, Any]:
+    """Return the points of a cloud (h, w, 3) row by row, NaN where there is no reading.
+
+    Drivers mark missing readings by NaN, by infinity, or by the sensor's own position.
+    """
+    flat = np.array(points.reshape(-1, 3), np.float32)
+    valid = np.isfinite(flat).all(1) & flat.any(1)
+    flat[~valid] = np.nan
+    return {"points": flat}

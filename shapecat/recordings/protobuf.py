@@ -61,7 +61,8 @@ _DESCRIPTOR: Messages = {
 def message_decoder(descriptors: bytes, name: str) -> Callable[[bytes | memoryview], Any]:
     """Return a decoder for a message, given a serialized FileDescriptorSet.
 
-    Decoded messages have their fields as attributes, defaults where they are absent.
+    Decoded messages have their fields as attributes, defaults where they are absent; an absent
+    message is None.
 
     Raises
     ------
@@ -115,17 +116,16 @@ def _decode(data: memoryview, name: str, known: Messages, depth: int) -> Any:
             values[field.name] = _value(value, field, known, depth)
     for field in fields.values():
         if field.name not in values:
-            values[field.name] = _default(field, known, depth)
+            values[field.name] = _default(field)
     return SimpleNamespace(**values)
 
 
-def _default(field: ProtobufField, known: Messages, depth: int) -> Any:
+def _default(field: ProtobufField) -> Any:
     if field.repeated:
         return []
-    if field.kind == _MESSAGE:
-        # An absent message reads as one of defaults; a type that holds itself ends here.
-        return _decode(memoryview(b""), field.message, known, depth + 1) if depth < 4 else None
-    return {_STRING: "", _RAW: b"", _DOUBLE: 0.0, _FLOAT: 0.0, _BOOL: False}.get(field.kind, 0)
+    return {_MESSAGE: None, _STRING: "", _RAW: b"", _DOUBLE: 0.0, _FLOAT: 0.0, _BOOL: False}.get(
+        field.kind, 0
+    )
 
 
 def _value(value: Any, field: ProtobufField, known: Messages, depth: int) -> Any:
@@ -206,9 +206,8 @@ def encode_message(values: dict[str, Any], name: str, known: Messages) -> bytes:
     parts = []
     for number, field in known[name].items():
         value = values.get(field.name)
-        for item in value if field.repeated and value is not None else [value]:
-            if item or (item is not None and field.repeated):
-                parts.append(_encode_field(number, field, item, known))
+        items = [value] if value and not field.repeated else value or []
+        parts += [_encode_field(number, field, item, known) for item in items]
     return b"".join(parts)
 
 

@@ -38,6 +38,10 @@ class Recording(ABC):
     def channels(self) -> tuple[Channel, ...]:
         """Return every channel, also those without messages."""
 
+    def parts(self) -> list["Recording"]:
+        """Return the files it is made of: itself, where it is one."""
+        return [self]
+
     @abstractmethod
     def messages(
         self,

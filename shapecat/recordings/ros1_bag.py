@@ -96,7 +96,8 @@ class BagRecording(Recording):
 def _channel(connection: Any) -> Channel:
     kind = ros_type(connection.msgtype)
     text = connection.msgdef.data.encode()
-    return Channel(connection.topic, kind, "ros1", connection.msgtype, "ros1msg", text)
+    latched = (("latching", "1"),) if connection.ext.latching else ()
+    return Channel(connection.topic, kind, "ros1", connection.msgtype, "ros1msg", text, latched)
 
 
 def _bounded(make: Callable[[], Any]) -> Callable[[bytes], bytes]:

@@ -8,6 +8,7 @@ import apsw
 import zstandard
 from rosbags.interfaces import MessageDefinitionFormat
 from rosbags.rosbag2 import Reader, ReaderError
+from rosbags.rosbag2.metadata import dump_qos_v8
 
 from shapecat.errors import RecordingError
 from shapecat.recordings.decoding import LIBRARY_ERRORS
@@ -108,4 +109,5 @@ def _channel(connection: Any) -> Channel:
         connection.msgtype,
         _SCHEMAS.get(connection.msgdef.format, ""),
         connection.msgdef.data.encode(),
+        (("offered_qos_profiles", dump_qos_v8(connection.ext.offered_qos_profiles)),),
     )

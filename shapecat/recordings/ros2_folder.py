@@ -30,10 +30,6 @@ class FolderRecording(Recording):
 
     The metadata only say which files belong to the bag: topics, times and definitions are taken
     from the files themselves.
-
-    Attributes
-    ----------
-    parts : the recordings in the folder, by time.
     """
 
     kind: ClassVar[str] = "ros2"
@@ -47,32 +43,36 @@ class FolderRecording(Recording):
         """
         super().__init__(path)
         self._scratch: TemporaryDirectory[str] | None = None
-        self.parts: list[Recording] = []
+        self._parts: list[Recording] = []
         try:
             self._open_parts(self._list_files())
         except BaseException:
             self.close()
             raise
         # A part without messages says nothing about time.
-        self.parts.sort(key=lambda part: (part.end_ns == 0, part.start_ns, part.path.name))
-        filled = [part for part in self.parts if part.end_ns]
+        self._parts.sort(key=lambda part: (part.end_ns == 0, part.start_ns, part.path.name))
+        filled = [part for part in self._parts if part.end_ns]
         if filled:
             self.start_ns = min(part.start_ns for part in filled)
             self.end_ns = max(part.end_ns for part in filled)
         self._overlap = any(a.end_ns > b.start_ns for a, b in pairwise(filled))
-        self.topics = _sum_topics(self.parts)
+        self.topics = _sum_topics(self._parts)
         self._note()
 
     def close(self) -> None:
         """Close all parts and remove what was decompressed."""
-        for part in self.parts:
+        for part in self._parts:
             part.close()
         if self._scratch is not None:
             self._scratch.cleanup()
 
+    def parts(self) -> list[Recording]:
+        """Return the recordings in the folder, by time."""
+        return list(self._parts)
+
     def channels(self) -> tuple[Channel, ...]:
         """Return every channel of every part, each once."""
-        return tuple(dict.fromkeys(c for part in self.parts for c in part.channels()))
+        return tuple(dict.fromkeys(c for part in self._parts for c in part.channels()))
 
     def messages(
         self,
@@ -81,7 +81,7 @@ class FolderRecording(Recording):
         stop_ns: int | None = None,
     ) -> Iterator[Message]:
         """Yield undecoded messages of all parts; see `Recording.messages`."""
-        streams = [part.messages(topics, start_ns, stop_ns) for part in self.parts]
+        streams = [part.messages(topics, start_ns, stop_ns) for part in self._parts]
         if self._overlap:
             yield from merge(*streams, key=lambda message: message.log_time_ns)
         else:
@@ -123,10 +123,10 @@ class FolderRecording(Recording):
         for file in files:
             try:
                 plain = self._decompressed(file) if file.suffix == ".zstd" else file
-                self.parts.append(_PARTS[_suffix(file)](plain))
+                self._parts.append(_PARTS[_suffix(file)](plain))
             except RecordingError as error:
                 reasons.append(f"{file.name}: {error}")
-        if not self.parts:
+        if not self._parts:
             raise RecordingError("; ".join(reasons))
         for reason in reasons:
             self.warn(f"left out {reason}")
@@ -151,7 +151,7 @@ class FolderRecording(Recording):
         return plain
 
     def _note(self) -> None:
-        for part in self.parts:
+        for part in self._parts:
             for text in part.warnings:
                 self.warn(f"{part.path.name}: {text}")
 

@@ -2,6 +2,7 @@
 
 from typing import Any
 
+from shapecat.recordings.messages import MessageError
 from shapecat.recordings.recording import Recording
 
 __all__ = ["Clock", "stamp_ns"]
@@ -13,8 +14,17 @@ _JUMP_NS = 10 * 10**9
 
 
 def stamp_ns(header: Any) -> int:
-    """Return the stamp of a decoded std_msgs/Header in nanoseconds."""
-    return int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+    """Return the stamp of a decoded std_msgs/Header in nanoseconds.
+
+    Raises
+    ------
+    MessageError : it is negative, or does not fit in 63 bits.
+    """
+    stamp = int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
+    if not 0 <= stamp < 2**63:
+        msg = f"header.stamp of {stamp:.3g} ns"
+        raise MessageError(msg)
+    return stamp
 
 
 class Clock:

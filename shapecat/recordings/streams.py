@@ -1,6 +1,7 @@
 """Which topics of a recording can be processed, and which are chosen by default."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import PurePosixPath
@@ -8,6 +9,7 @@ from typing import Any, Literal
 
 from shapecat.errors import NoStreamError
 from shapecat.recordings.depth_image import DEPTH_ENCODINGS
+from shapecat.recordings.foxglove import ros_counterpart
 from shapecat.recordings.messages import MessageError, Topic
 from shapecat.recordings.recording import Recording
 
@@ -51,15 +53,19 @@ def cloud_streams(recording: Recording) -> tuple[Stream, ...]:
     with the calibration in its own namespace (``depth/image_raw`` with ``depth/camera_info``), or
     with the only one there is.
     """
-    infos = [topic.name for topic in recording.topics if topic.type == INFO and topic.count != 0]
+    infos = [
+        topic.name
+        for topic in recording.topics
+        if ros_counterpart(topic.type) == INFO and topic.count != 0
+    ]
     streams = []
     for topic in recording.topics:
-        if topic.count != 0 and topic.type in _PROBES:
+        probe = _PROBES.get(ros_counterpart(topic.type))
+        if probe is not None and topic.count != 0:
             first = _first(recording, topic)
-            stream = _PROBES[topic.type](topic, first, infos) if first is not None else None
-            if stream is not None:
-                streams.append(stream)
-    return tuple(streams)
+            with suppress(AttributeError):  # a definition without the fields of its type
+                streams.append(probe(topic, first, infos))
+    return tuple(stream for stream in streams if stream is not None)
 
 
 def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Stream, ...]:
@@ -194,10 +200,14 @@ def _info_topic(image: str, infos: list[str]) -> str | None:
     """Return the calibration nearest to an image: the one that shares most of its path."""
     parts = image.split("/")[:-1]
     for length in range(len(parts), 1, -1):
-        sibling = "/".join([*parts[:length], "camera_info"])
-        if sibling in infos:
-            return sibling
+        for name in _INFO_NAMES:
+            sibling = "/".join([*parts[:length], name])
+            if sibling in infos:
+                return sibling
     return infos[0] if len(infos) == 1 else None
 
+
+_INFO_NAMES = ("camera_info", "info/camera_info", "calibration")
+"""What calibrations are called: by ROS, by the RealSense viewer, by Foxglove."""
 
 _PROBES = {CLOUD: _probe_cloud, IMAGE: _probe_image, COMPRESSED: _probe_compressed}

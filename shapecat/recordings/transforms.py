@@ -4,15 +4,14 @@ Stamps are integer nanoseconds; floats in seconds resolve no better than 238 ns 
 """
 
 from bisect import bisect_right
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from shapecat.arrays import F8
-from shapecat.errors import ShapecatError
+from shapecat.errors import RecordingError, ShapecatError
 from shapecat.geometry import IDENTITY, compose, inverse, rotation_from_quaternion
-from shapecat.recordings.messages import MessageError
+from shapecat.recordings.foxglove import ros_counterpart
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.stamps import stamp_ns
 from shapecat.types import Pose
@@ -279,29 +278,28 @@ def read_transforms(recording: Recording, *, tolerance_ns: int = 100_000_000) ->
     A topic whose name ends in ``tf_static`` holds static transforms.
     """
     buffer = TransformBuffer(tolerance_ns=tolerance_ns)
-    topics = {topic.name for topic in recording.topics if topic.type in TF_TYPES}
+    topics = {topic.name for topic in recording.topics if ros_counterpart(topic.type) in TF_TYPES}
     refused = 0
-    for topic, transform in _transforms(recording, topics):
-        move, turn = transform.transform.translation, transform.transform.rotation
-        refused += not buffer.add(
-            transform.header.frame_id,
-            transform.child_frame_id,
-            stamp_ns(transform.header),
-            ((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w)),
-            static=topic.endswith("tf_static"),
-        )
+    for message in recording.messages(topics) if topics else ():
+        if ros_counterpart(message.type) not in TF_TYPES:
+            continue
+        try:
+            for transform in recording.decode(message).transforms:
+                refused += not _add(buffer, transform, static=message.topic.endswith("tf_static"))
+        except (AttributeError, TypeError, ValueError, RecordingError) as error:
+            recording.warn(f"left out transforms: {error}")
     if refused:
         recording.warn(f"{refused} transforms are no transforms (NaN, no name) and were left out")
     return buffer
 
 
-def _transforms(recording: Recording, topics: set[str]) -> Iterator[tuple[str, Any]]:
-    for message in recording.messages(topics) if topics else ():
-        if message.type in TF_TYPES:
-            try:
-                decoded = recording.decode(message)
-            except MessageError as error:
-                recording.warn(str(error))
-                continue
-            for transform in decoded.transforms:
-                yield message.topic, transform
+def _add(buffer: TransformBuffer, transform: Any, *, static: bool) -> bool:
+    """Add a decoded geometry_msgs/TransformStamped."""
+    move, turn = transform.transform.translation, transform.transform.rotation
+    return buffer.add(
+        transform.header.frame_id,
+        transform.child_frame_id,
+        stamp_ns(transform.header),
+        ((move.x, move.y, move.z), (turn.x, turn.y, turn.z, turn.w)),
+        static=static,
+    )

@@ -92,7 +92,15 @@ def _tin(rng: Generator, r: float, h: float) -> F8:
 def _tube_can(rng: Generator, r: float, h: float) -> F8:
     lid, over = h * rng.uniform(0.03, 0.12), r * rng.uniform(0.98, 1.06)
     return np.array(
-        [[0, 0], [r, 0], [r, h - lid], [over, h - lid], [over, h - 0.002], [over - 0.002, h], [0, h]]
+        [
+            [0, 0],
+            [r, 0],
+            [r, h - lid],
+            [over, h - lid],
+            [over, h - 0.002],
+            [over - 0.002, h],
+            [0, h],
+        ]
     )
 
 
@@ -171,7 +179,9 @@ def _bottle(rng: Generator, side: F8, shoulder: float, neck: float, *, tip: bool
     start, width = side[-1, 1], side[-1, 0]
     t = np.linspace(0, 1, 9)[1:]
     shape = rng.choice(["round", "cone", "bell"])
-    fall = {"round": 1 - np.sqrt(1 - t**2 * 0.999), "cone": t, "bell": t * t * (3 - 2 * t)}[str(shape)]
+    fall = {"round": 1 - np.sqrt(1 - t**2 * 0.999), "cone": t, "bell": t * t * (3 - 2 * t)}[
+        str(shape)
+    ]
     slope = np.stack([width + (neck - width) * fall, start + shoulder * t], -1)
     low = start + shoulder
     cap = rng.uniform(0.02, min(0.12, 0.6 * (1 - low)))
@@ -190,7 +200,10 @@ def _flattened(mesh: Mesh, stretch: float, low: float, high: float, neck: float)
     points = np.asarray(mesh.vertices, np.float64)
     at_neck = np.interp(points[:, 2], [low, high], [0.0, 1.0])
     factor = stretch + (max(stretch, min(1.0, stretch / neck)) - stretch) * at_neck
-    return Mesh(points * np.column_stack([np.ones_like(factor), factor, np.ones_like(factor)]), mesh.triangles)
+    return Mesh(
+        points * np.column_stack([np.ones_like(factor), factor, np.ones_like(factor)]),
+        mesh.triangles,
+    )
 
 
 def _pump(rng: Generator, radius: float, height: float) -> list[Mesh]:
@@ -253,14 +266,20 @@ def make_box(rng: Generator) -> Mesh:
 def _gable_carton(rng: Generator) -> Mesh:
     """Return a milk carton with a roof."""
     width, tall, roof = log_uniform(rng, 0.055, 0.1), rng.uniform(1.3, 2.2), rng.uniform(0.25, 0.45)
-    low, high = tall * width, (tall + roof) * width
-    outline = [(-0.5, 0), (0.5, 0), (0.5, tall), (0.03, tall + roof), (-0.03, tall + roof), (-0.5, tall)]
+    high = (tall + roof) * width
+    outline = [
+        (-0.5, 0),
+        (0.5, 0),
+        (0.5, tall),
+        (0.03, tall + roof),
+        (-0.03, tall + roof),
+        (-0.5, tall),
+    ]
     side = extrude(np.array(outline) * width, width)
     stand = moved(side, Pose(np.array([[1.0, 0, 0], [0, 0, -1.0], [0, 1.0, 0]]), np.zeros(3)))
-    fin = moved(
-        rounded_box([width, 0.004, 0.015], fine=1), Pose(np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]), [0, -width / 2, high - 0.002])
-    )
-    return standing(join([stand, fin])) if low else stand
+    ridge = rounded_box([0.004, width, 0.015], fine=1)
+    fin = moved(ridge, Pose(np.eye(3), np.array([0, -width / 2, high - 0.002])))
+    return standing(join([stand, fin]))
 
 
 def make_ball(rng: Generator) -> Mesh:
@@ -275,4 +294,6 @@ def make_ball(rng: Generator) -> Mesh:
 
 def _spun(mesh: Mesh, rng: Generator) -> Mesh:
     angle = rng.uniform(0, np.pi)
-    return moved(mesh, Pose(rotation_from_quaternion([0, 0, np.sin(angle), np.cos(angle)]), np.zeros(3)))
+    return moved(
+        mesh, Pose(rotation_from_quaternion([0, 0, np.sin(angle), np.cos(angle)]), np.zeros(3))
+    )

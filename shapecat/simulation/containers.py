@@ -6,7 +6,14 @@ from typing import Any, Protocol, Self
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapFile
-from rosbags.interfaces import Qos, QosDurability, QosHistory, QosLiveliness, QosReliability, QosTime
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag1 import Writer as Ros1File
 from rosbags.rosbag2 import Writer as Ros2Folder
 
@@ -82,9 +89,7 @@ class _Mcap:
         schema = self._file.register_schema(name, "ros2msg", text.encode())
         latched = topic == _STATIC
         qos = _QOS.format(history=1, depth=1 if latched else 10, durability=1 if latched else 2)
-        return int(
-            self._file.register_channel(topic, "cdr", schema, {"offered_qos_profiles": qos})
-        )
+        return int(self._file.register_channel(topic, "cdr", schema, {"offered_qos_profiles": qos}))
 
 
 class _Ros1:

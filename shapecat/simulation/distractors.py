@@ -1,6 +1,6 @@
 """Things that are none of the seven categories, to learn what *unknown* looks like."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.random import Generator
@@ -60,10 +60,12 @@ def _rod(length: float, radius: float) -> Mesh:
 
 def _ellipsoid(axes: ArrayLike) -> Mesh:
     t = np.linspace(-np.pi / 2, np.pi / 2, 17)
-    return scaled(lathe(np.stack([np.cos(t), np.sin(t)], -1) * 0.1, segments=24), np.asarray(axes) * 10)
+    return scaled(
+        lathe(np.stack([np.cos(t), np.sin(t)], -1) * 0.1, segments=24), np.asarray(axes) * 10
+    )
 
 
-def _turned(knots: ArrayLike, count: int = 26) -> Mesh:
+def _turned(knots: Sequence[tuple[float, float]], count: int = 26) -> Mesh:
     path = smooth_path(knots, count)
     path[:, 0] = np.maximum(path[:, 0], 0)
     return lathe(path, segments=36)
@@ -79,9 +81,30 @@ def _pan(rng: Generator) -> Mesh:
 
 def _pot(rng: Generator) -> Mesh:
     r, h = rng.uniform(0.08, 0.13), rng.uniform(0.08, 0.15)
-    body = lathe([[0, 0], [r, 0], [r, h], [1.04 * r, h], [0.8 * r, h + 0.02], [0.02, h + 0.03], [0, h + 0.03]])
+    body = lathe(
+        [
+            [0, 0],
+            [r, 0],
+            [r, h],
+            [1.04 * r, h],
+            [0.8 * r, h + 0.02],
+            [0.02, h + 0.03],
+            [0, h + 0.03],
+        ]
+    )
     ears = [
-        tube(smooth_path([[s * r, -0.03, 0.8 * h], [s * (r + 0.035), -0.025, 0.8 * h], [s * (r + 0.035), 0.025, 0.8 * h], [s * r, 0.03, 0.8 * h]], 10), 0.006)
+        tube(
+            smooth_path(
+                [
+                    [s * r, -0.03, 0.8 * h],
+                    [s * (r + 0.035), -0.025, 0.8 * h],
+                    [s * (r + 0.035), 0.025, 0.8 * h],
+                    [s * r, 0.03, 0.8 * h],
+                ],
+                10,
+            ),
+            0.006,
+        )
         for s in (-1, 1)
     ]
     return join([body, *ears, _at(_ellipsoid([0.018, 0.018, 0.014]), [0, 0, h + 0.045])])
@@ -89,25 +112,60 @@ def _pot(rng: Generator) -> Mesh:
 
 def _kettle(rng: Generator) -> Mesh:
     r, h = rng.uniform(0.075, 0.1), rng.uniform(0.11, 0.18)
-    body = _turned([(0, 0), (r, 0), (1.03 * r, 0.3 * h), (0.75 * r, 0.85 * h), (0.3 * r, h), (0, 1.02 * h)])
-    spout = tube(smooth_path([[0.8 * r, 0, 0.45 * h], [1.35 * r, 0, 0.7 * h], [1.6 * r, 0, 0.95 * h]], 10), np.linspace(0.018, 0.009, 10))
-    arch = [[-0.75 * r, 0, 0.8 * h], [-0.6 * r, 0, 1.35 * h], [0.6 * r, 0, 1.35 * h], [0.7 * r, 0, 0.85 * h]]
+    body = _turned(
+        [(0, 0), (r, 0), (1.03 * r, 0.3 * h), (0.75 * r, 0.85 * h), (0.3 * r, h), (0, 1.02 * h)]
+    )
+    spout = tube(
+        smooth_path([[0.8 * r, 0, 0.45 * h], [1.35 * r, 0, 0.7 * h], [1.6 * r, 0, 0.95 * h]], 10),
+        np.linspace(0.018, 0.009, 10),
+    )
+    arch = [
+        [-0.75 * r, 0, 0.8 * h],
+        [-0.6 * r, 0, 1.35 * h],
+        [0.6 * r, 0, 1.35 * h],
+        [0.7 * r, 0, 0.85 * h],
+    ]
     return join([body, spout, tube(smooth_path(arch, 16), 0.008)])
 
 
 def _teapot(rng: Generator) -> Mesh:
     r = rng.uniform(0.06, 0.09)
     h = r * rng.uniform(1.1, 1.6)
-    body = _turned([(0, 0), (0.55 * r, 0), (r, 0.45 * h), (0.5 * r, 0.95 * h), (0.15 * r, h), (0, 1.02 * h)])
-    spout = tube(smooth_path([[0.85 * r, 0, 0.35 * h], [1.35 * r, 0, 0.5 * h], [1.6 * r, 0, 0.95 * h]], 10), np.linspace(0.016, 0.007, 10))
-    ear = [[-0.8 * r, 0, 0.8 * h], [-1.55 * r, 0, 0.8 * h], [-1.5 * r, 0, 0.35 * h], [-0.9 * r, 0, 0.25 * h]]
-    return join([body, spout, tube(smooth_path(ear, 12), 0.007), _at(_ellipsoid([0.013] * 3), [0, 0, 1.08 * h])])
+    body = _turned(
+        [(0, 0), (0.55 * r, 0), (r, 0.45 * h), (0.5 * r, 0.95 * h), (0.15 * r, h), (0, 1.02 * h)]
+    )
+    spout = tube(
+        smooth_path([[0.85 * r, 0, 0.35 * h], [1.35 * r, 0, 0.5 * h], [1.6 * r, 0, 0.95 * h]], 10),
+        np.linspace(0.016, 0.007, 10),
+    )
+    ear = [
+        [-0.8 * r, 0, 0.8 * h],
+        [-1.55 * r, 0, 0.8 * h],
+        [-1.5 * r, 0, 0.35 * h],
+        [-0.9 * r, 0, 0.25 * h],
+    ]
+    return join(
+        [
+            body,
+            spout,
+            tube(smooth_path(ear, 12), 0.007),
+            _at(_ellipsoid([0.013] * 3), [0, 0, 1.08 * h]),
+        ]
+    )
 
 
 def _wine_glass(rng: Generator) -> Mesh:
     r, h, stem = rng.uniform(0.03, 0.05), rng.uniform(0.15, 0.22), rng.uniform(0.35, 0.5)
     low = stem * h
-    cup = smooth_path([(0.006, low), (0.9 * r, low + 0.25 * (h - low)), (r, low + 0.55 * (h - low)), (0.8 * r, h)], 14)
+    cup = smooth_path(
+        [
+            (0.006, low),
+            (0.9 * r, low + 0.25 * (h - low)),
+            (r, low + 0.55 * (h - low)),
+            (0.8 * r, h),
+        ],
+        14,
+    )
     inner = cup[::-1] - [0.002, 0]
     foot = [[0, 0], [0.9 * r, 0], [0.9 * r, 0.003], [0.005, 0.01], [0.004, 0.9 * low]]
     return lathe(np.concatenate([foot, cup, inner[:-1], [[0, low + 0.006]]]), segments=32)
@@ -129,9 +187,13 @@ def _banana(rng: Generator) -> Mesh:
 
 def _lamp(rng: Generator) -> Mesh:
     h = rng.uniform(0.25, 0.38)
-    foot = lathe([[0, 0], [0.07, 0], [0.065, 0.015], [0.009, 0.02], [0.008, h], [0, h]], segments=28)
+    foot = lathe(
+        [[0, 0], [0.07, 0], [0.065, 0.015], [0.009, 0.02], [0.008, h], [0, h]], segments=28
+    )
     r = rng.uniform(0.07, 0.11)
-    shade = lathe([[r, 0.65 * h], [0.6 * r, 1.05 * h], [0.6 * r - 0.002, 1.05 * h], [r - 0.003, 0.65 * h]])
+    shade = lathe(
+        [[r, 0.65 * h], [0.6 * r, 1.05 * h], [0.6 * r - 0.002, 1.05 * h], [r - 0.003, 0.65 * h]]
+    )
     return join([foot, shade])
 
 
@@ -158,7 +220,9 @@ def _blocks(rng: Generator) -> Mesh:
         [(0, 0, 0), (1, 0, 0), (2, 0, 0), (0, 0, 1), (2, 0, 1)],
     )
     places = shapes[int(rng.integers(len(shapes)))]
-    return join([_at(rounded_box([e, e, e], radius=0.002, fine=1), np.array(p) * e) for p in places])
+    return join(
+        [_at(rounded_box([e, e, e], radius=0.002, fine=1), np.array(p) * e) for p in places]
+    )
 
 
 def _coil(rng: Generator) -> Mesh:
@@ -172,7 +236,12 @@ def _coil(rng: Generator) -> Mesh:
 def _stapler(rng: Generator) -> Mesh:
     long = rng.uniform(0.11, 0.16)
     base = rounded_box([long, 0.035, 0.012], radius=0.003, fine=2)
-    top = _at(rounded_box([0.95 * long, 0.03, 0.022], radius=0.006, fine=3), [0, 0, 0.02], about="y", degrees=rng.uniform(5, 12))
+    top = _at(
+        rounded_box([0.95 * long, 0.03, 0.022], radius=0.006, fine=3),
+        [0, 0, 0.02],
+        about="y",
+        degrees=rng.uniform(5, 12),
+    )
     hinge = _at(rounded_box([0.03, 0.03, 0.03], fine=1), [-0.42 * long, 0, 0.008])
     return join([base, top, hinge])
 
@@ -182,11 +251,17 @@ def _hand(rng: Generator) -> Mesh:
     curl = rng.uniform(0.0, 0.03)
     for k, y in enumerate(np.linspace(-0.032, 0.032, 4)):
         reach = rng.uniform(0.06, 0.085) * (1 - 0.1 * abs(k - 1.5))
-        path = [[0.03, y, 0.03], [0.035 + 0.5 * reach, 1.15 * y, 0.04 + 0.3 * curl], [0.035 + reach, 1.2 * y, 0.03 - curl]]
+        path = [
+            [0.03, y, 0.03],
+            [0.035 + 0.5 * reach, 1.15 * y, 0.04 + 0.3 * curl],
+            [0.035 + reach, 1.2 * y, 0.03 - curl],
+        ]
         parts.append(tube(smooth_path(path, 7), 0.009, segments=8))
     thumb = [[-0.01, 0.035, 0.03], [0.02, 0.065, 0.03], [0.05, 0.075, 0.028]]
     arm = [[-0.03, 0, 0.03], [-0.1, 0, 0.035], [-0.22, 0, 0.05]]
-    return join([*parts, tube(smooth_path(thumb, 6), 0.011, segments=8), tube(smooth_path(arm, 8), 0.029)])
+    return join(
+        [*parts, tube(smooth_path(thumb, 6), 0.011, segments=8), tube(smooth_path(arm, 8), 0.029)]
+    )
 
 
 def _wedge(rng: Generator) -> Mesh:
@@ -197,7 +272,14 @@ def _wedge(rng: Generator) -> Mesh:
 
 def _pear(rng: Generator) -> Mesh:
     r, neck = rng.uniform(0.032, 0.045), rng.uniform(0.45, 0.62)
-    knots = [(0, 0), (0.6 * r, 0.05 * r), (r, 0.9 * r), (neck * r, 1.9 * r), (0.35 * r, 2.5 * r), (0, 2.55 * r)]
+    knots = [
+        (0, 0),
+        (0.6 * r, 0.05 * r),
+        (r, 0.9 * r),
+        (neck * r, 1.9 * r),
+        (0.35 * r, 2.5 * r),
+        (0, 2.55 * r),
+    ]
     return _turned(knots)
 
 
@@ -219,17 +301,39 @@ def _scissors(rng: Generator) -> Mesh:
     parts = []
     spread = rng.uniform(8, 35)
     for side in (-1, 1):
-        blade = _at(rounded_box([0.11, 0.012, 0.004], fine=1), [0.05, 0, 0])
+        blade = _at(rounded_box([0.11, 0.012, 0.004], fine=1), [0.02, 0, 0])
         t = np.arange(20) * (2 * np.pi / 20)
-        loop = tube(np.stack([0.022 * np.cos(t) - 0.055, 0.016 * np.sin(t) + side * 0.006, 0 * t + 0.006], -1), 0.005, closed=True, segments=6)
-        parts.append(_at(join([blade, loop]), [0, 0, 0.004 * (side > 0)], about="z", degrees=side * spread / 2))
+        loop = tube(
+            np.stack(
+                [0.022 * np.cos(t) - 0.055, 0.016 * np.sin(t) + side * 0.006, 0 * t + 0.006], -1
+            ),
+            0.005,
+            closed=True,
+            segments=6,
+        )
+        parts.append(
+            _at(
+                join([blade, loop]),
+                [0, 0, 0.004 * (side > 0)],
+                about="z",
+                degrees=side * spread / 2,
+            )
+        )
     return join(parts)
 
 
 def _tap(rng: Generator) -> Mesh:
     h, reach = rng.uniform(0.15, 0.25), rng.uniform(0.08, 0.15)
-    neck = [[0, 0, 0], [0, 0, 0.8 * h], [0.3 * reach, 0, h], [0.85 * reach, 0, 0.95 * h], [reach, 0, 0.75 * h]]
-    return join([lathe([[0, 0], [0.035, 0], [0.03, 0.02], [0, 0.025]]), tube(smooth_path(neck, 18), 0.011)])
+    neck = [
+        [0.0, 0, 0],
+        [0, 0, 0.8 * h],
+        [0.3 * reach, 0, h],
+        [0.85 * reach, 0, 0.95 * h],
+        [reach, 0, 0.75 * h],
+    ]
+    return join(
+        [lathe([[0, 0], [0.035, 0], [0.03, 0.02], [0, 0.025]]), tube(smooth_path(neck, 18), 0.011)]
+    )
 
 
 def _duck(rng: Generator) -> Mesh:
@@ -237,13 +341,19 @@ def _duck(rng: Generator) -> Mesh:
     body = _at(_ellipsoid([1.3 * e, e, 0.85 * e]), [0, 0, 0.8 * e])
     head = _at(_ellipsoid([0.62 * e] * 3), [0.75 * e, 0, 1.9 * e])
     beak = _at(_ellipsoid([0.4 * e, 0.25 * e, 0.12 * e]), [1.4 * e, 0, 1.8 * e])
-    tail = _at(_ellipsoid([0.5 * e, 0.4 * e, 0.2 * e]), [-1.2 * e, 0, 1.2 * e], about="y", degrees=40)
+    tail = _at(
+        _ellipsoid([0.5 * e, 0.4 * e, 0.2 * e]), [-1.2 * e, 0, 1.2 * e], about="y", degrees=40
+    )
     return join([body, head, beak, tail])
 
 
 def _chair(rng: Generator) -> Mesh:
     e, tall = rng.uniform(0.05, 0.09), rng.uniform(0.8, 1.2)
-    legs = [_at(_rod(tall * e, 0.005), [x * 0.42 * e, y * 0.42 * e, 0]) for x in (-1, 1) for y in (-1, 1)]
+    legs = [
+        _at(_rod(tall * e, 0.005), [x * 0.42 * e, y * 0.42 * e, 0])
+        for x in (-1, 1)
+        for y in (-1, 1)
+    ]
     seat = _at(rounded_box([e, e, 0.008], fine=2), [0, 0, tall * e])
     back = _at(rounded_box([0.006, e, 1.1 * e], fine=2), [-0.48 * e, 0, tall * e])
     return join([*legs, seat, back])
@@ -251,7 +361,9 @@ def _chair(rng: Generator) -> Mesh:
 
 def _basket(rng: Generator) -> Mesh:
     r, h = rng.uniform(0.06, 0.1), rng.uniform(0.06, 0.1)
-    body = lathe([[0, 0], [0.8 * r, 0], [r, h], [r - 0.004, h], [0.8 * r - 0.004, 0.004], [0, 0.004]])
+    body = lathe(
+        [[0, 0], [0.8 * r, 0], [r, h], [r - 0.004, h], [0.8 * r - 0.004, 0.004], [0, 0.004]]
+    )
     t = np.linspace(0, np.pi, 16)
     arch = np.stack([(r - 0.003) * np.cos(t), 0 * t, h - 0.005 + 1.3 * h * np.sin(t)], -1)
     return join([body, tube(arch, 0.006)])
@@ -260,9 +372,17 @@ def _basket(rng: Generator) -> Mesh:
 def _watering_can(rng: Generator) -> Mesh:
     r, h = rng.uniform(0.05, 0.08), rng.uniform(0.1, 0.15)
     body = lathe([[0, 0], [r, 0], [0.9 * r, h], [0.88 * r, h], [r - 0.004, 0.005], [0, 0.005]])
-    spout = tube(smooth_path([[0.9 * r, 0, 0.15 * h], [1.8 * r, 0, 0.7 * h], [2.5 * r, 0, 1.15 * h]], 10), np.linspace(0.014, 0.009, 10))
+    spout = tube(
+        smooth_path([[0.9 * r, 0, 0.15 * h], [1.8 * r, 0, 0.7 * h], [2.5 * r, 0, 1.15 * h]], 10),
+        np.linspace(0.014, 0.009, 10),
+    )
     rose = tube([[2.4 * r, 0, 1.1 * h], [2.7 * r, 0, 1.28 * h]], [0.01, 0.024])
-    ear = [[-0.9 * r, 0, 0.95 * h], [-1.9 * r, 0, 0.9 * h], [-1.6 * r, 0, 0.2 * h], [-0.95 * r, 0, 0.15 * h]]
+    ear = [
+        [-0.9 * r, 0, 0.95 * h],
+        [-1.9 * r, 0, 0.9 * h],
+        [-1.6 * r, 0, 0.2 * h],
+        [-0.95 * r, 0, 0.15 * h],
+    ]
     return join([body, spout, rose, tube(smooth_path(ear, 14), 0.006)])
 
 
@@ -275,7 +395,13 @@ def _mouse(rng: Generator) -> Mesh:
 
 def _phone(rng: Generator) -> Mesh:
     """Return a desk telephone: a wedge with a receiver on top."""
-    wedge = _at(extrude([[0, 0], [0.18, 0], [0.18, 0.03], [0, 0.07]], 0.15), [-0.09, 0.075, 0], about="x", degrees=90)
+    deep = rng.uniform(0.15, 0.2)
+    wedge = _at(
+        extrude([[0, 0], [deep, 0], [deep, 0.03], [0, 0.07]], 0.15),
+        [-0.09, 0.075, 0],
+        about="x",
+        degrees=90,
+    )
     bar = [[-0.02, -0.1, 0.07], [-0.02, -0.08, 0.085], [-0.02, 0.08, 0.085], [-0.02, 0.1, 0.07]]
     return join([wedge, tube(smooth_path(bar, 12), [0.022, *[0.016] * 10, 0.022])])
 
@@ -284,7 +410,9 @@ def _stool(rng: Generator) -> Mesh:
     """Return a trivet or spool: discs around an axle."""
     r, h = rng.uniform(0.04, 0.07), rng.uniform(0.05, 0.12)
     core, disc = r * rng.uniform(0.25, 0.5), 0.008
-    return lathe([[0, 0], [r, 0], [r, disc], [core, disc], [core, h - disc], [r, h - disc], [r, h], [0, h]])
+    return lathe(
+        [[0, 0], [r, 0], [r, disc], [core, disc], [core, h - disc], [r, h - disc], [r, h], [0, h]]
+    )
 
 
 def _star(rng: Generator) -> Mesh:
@@ -303,17 +431,35 @@ def _mushroom(rng: Generator) -> Mesh:
 def _screwdriver(rng: Generator) -> Mesh:
     grip, shaft = rng.uniform(0.08, 0.11), rng.uniform(0.08, 0.15)
     r = rng.uniform(0.012, 0.017)
-    profile = [[0, 0], [0.8 * r, 0], [r, 0.2 * grip], [0.8 * r, 0.7 * grip], [r, 0.9 * grip], [0.35 * r, grip]]
+    profile = [
+        [0.0, 0],
+        [0.8 * r, 0],
+        [r, 0.2 * grip],
+        [0.8 * r, 0.7 * grip],
+        [r, 0.9 * grip],
+        [0.35 * r, grip],
+    ]
     profile += [[0.25 * r, grip + 0.005], [0.25 * r, grip + shaft], [0, grip + shaft]]
     return _at(lathe(profile, segments=18), [0, 0, 0], about="y", degrees=90)
 
 
 def _plush(rng: Generator) -> Mesh:
     e = rng.uniform(0.04, 0.065)
-    limbs = [([0.5, 0.7, 0.3], 0.42), ([0.5, -0.7, 0.3], 0.42), ([0.2, 0.9, 1.3], 0.36), ([0.2, -0.9, 1.3], 0.36)]
+    limbs = [
+        ([0.5, 0.7, 0.3], 0.42),
+        ([0.5, -0.7, 0.3], 0.42),
+        ([0.2, 0.9, 1.3], 0.36),
+        ([0.2, -0.9, 1.3], 0.36),
+    ]
     ears = [([0, 0.5, 2.95], 0.25), ([0, -0.5, 2.95], 0.25)]
     parts = [_at(_ellipsoid([e * s] * 3), np.array(p) * e) for p, s in limbs + ears]
-    return join([_at(_ellipsoid([0.8 * e, 0.9 * e, e]), [0, 0, e]), _at(_ellipsoid([0.75 * e] * 3), [0.1 * e, 0, 2.35 * e]), *parts])
+    return join(
+        [
+            _at(_ellipsoid([0.8 * e, 0.9 * e, e]), [0, 0, e]),
+            _at(_ellipsoid([0.75 * e] * 3), [0.1 * e, 0, 2.35 * e]),
+            *parts,
+        ]
+    )
 
 
 def _blob(rng: Generator) -> Mesh:

@@ -78,8 +78,10 @@ def _normals(outline: F8) -> F8:
 
 
 def _hull(points: F8) -> F8:
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) > 2 else [0]
+    spread = (
+        np.linalg.svd(points - points.mean(axis=0), compute_uv=False) if len(points) > 2 else [0]
+    )
     if len(points) < 3 or spread[-1] < 1e-6:  # a point or a line
         along = np.argsort(points @ [0.8, 0.6])
         return points[along[[0, -1]]]
-    return points[ConvexHull(points).vertices]
+    return np.asarray(points[ConvexHull(points).vertices])

@@ -1,6 +1,7 @@
 """Triangle meshes and the few ways to make them: turned, swept, boxed, joined."""
 
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -10,6 +11,7 @@ from shapecat.types import Pose
 
 __all__ = [
     "Mesh",
+    "Points",
     "extrude",
     "join",
     "lathe",
@@ -20,6 +22,10 @@ __all__ = [
     "standing",
     "tube",
 ]
+
+
+Points: TypeAlias = F8 | Sequence[Sequence[float]]
+"""Rows of coordinates, metres."""
 
 
 class Mesh(Record):
@@ -87,7 +93,7 @@ def _grid(rows: int, columns: int, *, closed: bool) -> I4:
 
 
 def lathe(
-    profile: ArrayLike,
+    profile: Points,
     *,
     segments: int = 40,
     stretch: float = 1.0,
@@ -118,7 +124,7 @@ def lathe(
 
 
 def tube(
-    path: ArrayLike,
+    path: Points,
     radius: ArrayLike,
     *,
     segments: int = 10,
@@ -137,16 +143,19 @@ def tube(
     path = np.asarray(path, np.float64)
     k = len(path)
     along = (
-        np.roll(path, -1, axis=0) - np.roll(path, 1, axis=0) if closed else np.gradient(path, axis=0)
+        np.roll(path, -1, axis=0) - np.roll(path, 1, axis=0)
+        if closed
+        else np.gradient(path, axis=0)
     )
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     across = _across(path, along)
     inward = np.cross(across, along)
     angle = np.arange(segments) * (2 * np.pi / segments)
     wide = np.broadcast_to(np.asarray(radius, np.float64), (k,))[:, None, None]
-    offsets = np.cos(angle)[:, None] * inward[:, None] + flatness * np.sin(angle)[
-        :, None
-    ] * across[:, None]
+    offsets = (
+        np.cos(angle)[:, None] * inward[:, None]
+        + flatness * np.sin(angle)[:, None] * across[:, None]
+    )
     rings = path[:, None] + wide * offsets
     if closed:
         rings = np.concatenate([rings, rings[:1]])
@@ -170,7 +179,7 @@ def _across(path: F8, along: F8) -> F8:
     return result
 
 
-def smooth_path(points: ArrayLike, count: int = 16) -> F8:
+def smooth_path(points: Points, count: int = 16) -> F8:
     """Return ``count`` points of a smooth curve (Catmull-Rom) through the given (k, d) points."""
     p = np.asarray(points, np.float64)
     p = np.concatenate([[2 * p[0] - p[1]], p, [2 * p[-1] - p[-2]]])
@@ -180,13 +189,16 @@ def smooth_path(points: ArrayLike, count: int = 16) -> F8:
     a, b, c, d = p[i], p[i + 1], p[i + 2], p[i + 3]
     return np.asarray(
         0.5
-        * (2 * b + (c - a) * t + (2 * a - 5 * b + 4 * c - d) * t**2 + (3 * b - a - 3 * c + d) * t**3)
+        * (
+            2 * b
+            + (c - a) * t
+            + (2 * a - 5 * b + 4 * c - d) * t**2
+            + (3 * b - a - 3 * c + d) * t**3
+        )
     )
 
 
-def rounded_box(
-    size: ArrayLike, *, radius: float = 0.0, bulge: float = 0.0, fine: int = 4
-) -> Mesh:
+def rounded_box(size: ArrayLike, *, radius: float = 0.0, bulge: float = 0.0, fine: int = 4) -> Mesh:
     """Make a box with round edges that stands on z = 0.
 
     Parameters
@@ -232,7 +244,7 @@ def _box_lines(half: float, radius: float, fine: int) -> F8:
     return np.concatenate([-(half - radius) - edge, flat, (half - radius + edge)[::-1]])
 
 
-def extrude(outline: ArrayLike, height: float) -> Mesh:
+def extrude(outline: Points, height: float) -> Mesh:
     """Raise a flat outline, star-shaped about its mean, to a solid that stands on z = 0.
 
     Parameters

@@ -132,5 +132,5 @@ class MessageFactory:
         sequence = {"seq": 0} if self.ros_version == 1 else {}
         return self._make("std_msgs/msg/Header", **sequence, stamp=stamp, frame_id=frame_id)
 
-    def _make(self, name: str, **values: Any) -> Any:
-        return self.typestore.types[name](**values)
+    def _make(self, type_name: str, /, **values: Any) -> Any:
+        return self.typestore.types[type_name](**values)

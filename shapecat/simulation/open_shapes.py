@@ -34,14 +34,23 @@ def make_cup(rng: Generator) -> Mesh:
         "barrel": (rng.uniform(0.8, 1.4), [rng.uniform(0.7, 0.9), 1.0, rng.uniform(0.82, 0.98)]),
         "espresso": (rng.uniform(0.76, 1.1), [rng.uniform(0.6, 0.95), rng.uniform(0.85, 1), 1.0]),
     }[str(family)]
-    diameter = log_uniform(rng, 0.045, 0.07) if family == "espresso" else log_uniform(rng, 0.06, 0.115)
+    diameter = (
+        log_uniform(rng, 0.045, 0.07) if family == "espresso" else log_uniform(rng, 0.06, 0.115)
+    )
     height = ratio * diameter
     wall = rng.uniform(0.0015, 0.006)
     outer = _wall(shares, diameter / 2, height, power=rng.uniform(0.8, 1.2))
     profile = _hollow(outer, wall, floor=wall * rng.uniform(1, 2.5), foot=_foot(rng, 0.3, 0.004))
     section = _section(rng, oval=0.03, square=0.05, facets=0.06)
     body = lathe(profile, **section)
-    handle = {"mug": 0.85, "glass": 0.08, "beaker": 0.1, "teacup": 0.85, "barrel": 0.75, "espresso": 0.8}
+    handle = {
+        "mug": 0.85,
+        "glass": 0.08,
+        "beaker": 0.1,
+        "teacup": 0.85,
+        "barrel": 0.75,
+        "espresso": 0.8,
+    }
     if rng.random() < handle[str(family)]:
         sides = [0.0, np.pi] if rng.random() < 0.04 else [0.0]
         shape = _handle_shape(rng, diameter, height)
@@ -120,8 +129,10 @@ def _wall(shares: ArrayLike, radius: float, height: float, *, power: float) -> F
     heights = np.linspace(0, 1, len(shares)) ** power
     path = smooth_path(np.stack([shares, heights], -1), 14)
     path[:, 0] = path[:, 0] / path[:, 0].max() * radius
-    path[:, 1] = np.linspace(0, height, len(path)) if np.any(np.diff(path[:, 1]) <= 0) else (
-        path[:, 1] * height
+    path[:, 1] = (
+        np.linspace(0, height, len(path))
+        if np.any(np.diff(path[:, 1]) <= 0)
+        else (path[:, 1] * height)
     )
     return path
 
@@ -155,7 +166,7 @@ def _hollow(
     top = [[rim[0] - 0.5 * wall, rim[1] + 0.3 * wall]]
     end = [[low, tall + floor + corner], [low - corner, tall + floor], [0.0, tall + floor]]
     inside = inside[inside[:, 1] > tall + floor + corner]
-    parts = [start, outside, edge[::-1], top, inside[::-1], end]
+    parts: list[Any] = [start, outside, edge[::-1], top, inside[::-1], end]
     return np.concatenate([np.reshape(part, (-1, 2)) for part in parts])
 
 
@@ -181,8 +192,9 @@ def _handle_shape(rng: Generator, diameter: float, height: float) -> tuple[F8, f
         [(-0.1, 0.9), (0.95, 0.98), (1.0, -0.95), (-0.1, -0.9)],  # square
     )
     curve = np.array(curves[int(rng.integers(len(curves)))]) * [reach, tall]
-    curve[:, 1] += height * rng.uniform(-0.02, 0.08)
     radius = float(np.clip(diameter * rng.uniform(0.045, 0.085), 0.003, 0.01))
+    lifted = height * rng.uniform(-0.02, 0.08)
+    curve[:, 1] += min(lifted, 0.47 * height - radius - curve[:, 1].max())
     return smooth_path(curve, 16), radius, rng.uniform(0.8, 1.8)
 
 
@@ -201,5 +213,7 @@ def _turned(mesh: Mesh, rng: Generator) -> Mesh:
     angle = rng.uniform(0, 2 * np.pi)
     c, s = np.cos(angle), np.sin(angle)
     points = np.asarray(mesh.vertices, np.float64)
-    turned = np.stack([c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]], -1)
+    turned = np.stack(
+        [c * points[:, 0] - s * points[:, 1], s * points[:, 0] + c * points[:, 1]], -1
+    )
     return standing(Mesh(np.column_stack([turned, points[:, 2]]), mesh.triangles))

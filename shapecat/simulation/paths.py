@@ -58,7 +58,12 @@ def walk(
     step = 2 * np.pi * 1.8  # steps per second
     bob = 0.006 * np.sin(step * t + shift[2])
     eye = np.stack(
-        [target[0] + flat * np.cos(azimuth), target[1] + flat * np.sin(azimuth), target[2] + far * np.sin(up) + bob], -1
+        [
+            target[0] + flat * np.cos(azimuth),
+            target[1] + flat * np.sin(azimuth),
+            target[2] + far * np.sin(up) + bob,
+        ],
+        -1,
     )
     gaze = target + 0.03 * np.stack(
         [np.sin(slow[2] * t + shift[3]), np.cos(slow[0] * t + shift[4]), np.sin(slow[1] * t)], -1

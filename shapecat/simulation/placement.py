@@ -4,7 +4,7 @@ import numpy as np
 from numpy.random import Generator
 from scipy.spatial import ConvexHull
 
-from shapecat.arrays import F8, Record, array
+from shapecat.arrays import F8, Record
 from shapecat.geometry import gravity_rotation
 from shapecat.simulation.mesh import Mesh
 from shapecat.types import Pose

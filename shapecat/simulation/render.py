@@ -6,6 +6,7 @@ Plain double arithmetic in a fixed order, so that an image is the same on every 
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Record, array
+from shapecat.geometry import inverse
 from shapecat.jit import kernel
 from shapecat.simulation.mesh import Mesh
 from shapecat.types import Camera, Pose
@@ -32,14 +33,20 @@ class Image(Record):
 
     Attributes
     ----------
-    depth : (h, w) metres along the optical axis, 0 where there is nothing.
+    inverse : (h, w) 1 / metres along the optical axis, 0 where there is nothing.
     owners : (h, w) the thing seen, -1 where there is nothing.
     cosine : (h, w) of the angle between the ray and the surface normal, 0 where there is nothing.
     """
 
-    depth: F8 = array("h w", "f8")
+    inverse: F8 = array("h w", "f8")
     owners: I4 = array("h w", "i2")
     cosine: F4 = array("h w", "f4")
+
+    @property
+    def depth(self) -> F8:
+        """(h, w) metres along the optical axis, 0 where there is nothing."""
+        with np.errstate(divide="ignore"):
+            return np.where(self.inverse > 0, 1.0 / self.inverse, 0.0)
 
 
 def geometry(things: list[tuple[Mesh, Pose]]) -> Geometry:
@@ -71,18 +78,17 @@ def render(seen: Geometry, camera: Camera, frame_from_camera: Pose) -> Image:
     O(triangles + their pixels). Of two surfaces at the same depth the first one shows.
     """
     shape = (camera.height, camera.width)
-    inverse, owners = np.zeros(shape), np.full(shape, -1, np.int16)
-    cosine = np.zeros(shape, np.float32)
     local = np.zeros_like(seen.vertices)
-    rotation = np.ascontiguousarray(frame_from_camera.rotation.T)
-    t = frame_from_camera.translation
-    back = [-(r[0] * t[0] + r[1] * t[1] + r[2] * t[2]) for r in rotation]
-    _place(seen.vertices, rotation, np.array(back), local)
+    camera_from_frame = inverse(frame_from_camera)
+    rotation = np.ascontiguousarray(camera_from_frame.rotation)
+    _place(seen.vertices, rotation, camera_from_frame.translation, local)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    _draw(local, seen.triangles, seen.owners, intrinsics, inverse, owners, cosine)
-    with np.errstate(divide="ignore"):
-        depth = np.where(inverse > 0, 1.0 / inverse, 0.0)
-    return Image(depth, owners, cosine)
+    nearest, hits = np.zeros(shape), np.full(shape, -1, np.int32)
+    normals = np.zeros((len(seen.triangles), 3))
+    _draw(local, seen.triangles, intrinsics, nearest, hits, normals)
+    owners, cosine = np.zeros(shape, np.int16), np.zeros(shape, np.float32)
+    _shade(hits, normals, seen.owners, intrinsics, owners, cosine)
+    return Image(nearest, owners, cosine)
 
 
 def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
@@ -96,9 +102,7 @@ def alone_pixels(seen: Geometry, owner: int, camera: Camera, frame_from_camera: 
     if len(mine) == 0:
         return 0
     used, corners = np.unique(mine, return_inverse=True)
-    alone = Geometry(
-        seen.vertices[used], corners.reshape(-1, 3), np.zeros(len(mine), np.int32)
-    )
+    alone = Geometry(seen.vertices[used], corners.reshape(-1, 3), np.zeros(len(mine), np.int32))
     r, t = frame_from_camera.rotation, frame_from_camera.translation
     local = (alone.vertices - t) @ r
     if local[:, 2].min() <= NEAR_M:
@@ -127,13 +131,13 @@ def _place(points: F8, rotation: F8, translation: F8, out: F8) -> None:
 def _draw(
     points: F8,
     triangles: I4,
-    ids: I4,
     intrinsics: F8,
-    inverse: F8,
-    owners: I4,
-    cosine: F4,
+    nearest: F8,
+    hits: I4,
+    normals: F8,
 ) -> None:
-    height, width = inverse.shape
+    """Find for each pixel the greatest inverse depth and the triangle that has it."""
+    height, width = nearest.shape
     fx, fy, cx, cy = intrinsics
     edge = np.zeros((3, 3))
     slope = np.zeros(3)
@@ -173,8 +177,10 @@ def _draw(
         nx = edge[0, 0] + edge[1, 0] + edge[2, 0]
         ny = edge[0, 1] + edge[1, 1] + edge[2, 1]
         nz = edge[0, 2] + edge[1, 2] + edge[2, 2]
-        normal = np.sqrt(nx * nx + ny * ny + nz * nz)
-        det = abs(det)
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        normals[m, 0], normals[m, 1], normals[m, 2] = nx / length, ny / length, nz / length
+        scale = 1.0 / abs(det)
+        per_pixel = nx / fx * scale
         for v in range(top, bottom + 1):
             y = (v - cy) / fy
             low, high = float(left), float(right)
@@ -188,12 +194,24 @@ def _draw(
                     high = -1.0
             if not low <= high:
                 continue
-            rest = ny * y + nz
+            rest = (ny * y + nz) * scale - per_pixel * cx
             for u in range(int(np.ceil(low)), int(np.floor(high)) + 1):
+                w = per_pixel * u + rest
+                if w > nearest[v, u]:
+                    nearest[v, u] = w
+                    hits[v, u] = m
+
+
+@kernel
+def _shade(hits: I4, normals: F8, ids: I4, intrinsics: F8, owners: I4, cosine: F4) -> None:
+    fx, fy, cx, cy = intrinsics
+    for v in range(hits.shape[0]):
+        y = (v - cy) / fy
+        for u in range(hits.shape[1]):
+            m = hits[v, u]
+            owners[v, u] = -1
+            if m >= 0:
                 x = (u - cx) / fx
-                facing = nx * x + rest
-                w = facing / det
-                if w > inverse[v, u]:
-                    inverse[v, u] = w
-                    owners[v, u] = ids[m]
-                    cosine[v, u] = facing / (normal * np.sqrt(x * x + y * y + 1.0))
+                facing = normals[m, 0] * x + normals[m, 1] * y + normals[m, 2]
+                cosine[v, u] = facing / np.sqrt(x * x + y * y + 1.0)
+                owners[v, u] = ids[m]

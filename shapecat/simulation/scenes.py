@@ -62,9 +62,13 @@ def resting_thing(
     category : ``unknown`` is a distractor.
     manner : ``upright``, ``lying`` or ``upside_down``; drawn by default.
     """
-    kind, mesh = make_distractor(rng) if category == "unknown" else (
-        category,
-        make_object(category, rng),
+    kind, mesh = (
+        make_distractor(rng)
+        if category == "unknown"
+        else (
+            category,
+            make_object(category, rng),
+        )
     )
     upright = Rest(Pose(np.eye(3), np.zeros(3)), "upright")
     if category in {"ball", "unknown"}:
@@ -100,11 +104,13 @@ class _Layout:
         gap: float,
         headroom: float = 1.0,
         stack: float = 0.0,
+        enclosed: bool = False,
         tries: int = 60,
     ) -> bool:
         """Try to place a new thing: on another one with chance ``stack``, else in ``area``.
 
-        ``area`` is (2, 2): low and high corner on the support, metres, world frame.
+        ``area`` is (2, 2): low and high corner on the support, metres, world frame. Between walls
+        (``enclosed``) nothing may stick out over the edge.
         """
         kind, mesh, rest = resting_thing(category, self.rng)
         print_ = footprint(mesh, rest.pose)
@@ -116,7 +122,8 @@ class _Layout:
             place = np.array([*self.rng.uniform(area[0], area[1]), support.height])
             pose = turn_about_z(rest.pose, self.rng.uniform(0, 2 * np.pi), np.round(place, 6))
             here = footprint(mesh, pose)
-            fits = inside(here.contact, support.outline[:, :2], 0.01)
+            reach = here.outline if enclosed else here.contact
+            fits = inside(reach, support.outline[:, :2], 0.01)
             if fits and self._is_free(here, gap):
                 self._add(kind, category, mesh, rest, pose, here, support.name, None)
                 return True
@@ -126,7 +133,9 @@ class _Layout:
         self, kind: str, category: str, mesh: Mesh, rest: Rest, headroom: float, gap: float
     ) -> bool:
         bearers = [
-            k for k, t in enumerate(self.things) if t.category in {"box", "can"} and _flat_top(self.places[k])
+            k
+            for k, t in enumerate(self.things)
+            if t.category in {"box", "can"} and _flat_top(self.places[k])
         ]
         if not bearers or category == "ball":
             return False
@@ -297,7 +306,8 @@ def _shelf(
     width, depth = rng.uniform(0.85, 1.15), rng.uniform(0.3, 0.42)
     low, step, thick = rng.uniform(0.25, 0.4), rng.uniform(0.33, 0.42), 0.02
     boards = [
-        _slab(f"board_{k + 1}", 2 + k, (width, depth, thick), (0, 0, low + k * step)) for k in range(3)
+        _slab(f"board_{k + 1}", 2 + k, (width, depth, thick), (0, 0, low + k * step))
+        for k in range(3)
     ]
     top = low + 3 * step
     sides = [
@@ -328,7 +338,9 @@ def _shelf(
         sweep=rng.uniform(12, 28),
     )
     floor = _room(rng, wall_chance=0.0)
-    return World("shelf", (*floor, *boards, *sides, back), tuple(layout.things), path, np.zeros(frames))
+    return World(
+        "shelf", (*floor, *boards, *sides, back), tuple(layout.things), path, np.zeros(frames)
+    )
 
 
 def _turntable(

@@ -5,12 +5,13 @@ table with objects, and an Intel D435.
 """
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 from numpy.random import Generator
 
-from shapecat.arrays import F4, F8
+from shapecat.arrays import F4, F8, I4, U1, Bool
 from shapecat.jit import kernel
 from shapecat.simulation.render import Image
 from shapecat.types import Camera
@@ -29,8 +30,9 @@ class Sensor:
     step : quantum of the inverse depth; 0 is none.
     noise : standard deviation of the inverse depth.
     grain : (across, down) width of the window over which the noise is alike.
-    wave : standard deviation of a slow error over `wave_px` pixels.
+    wave : standard deviation of a fixed error of the device, over `wave_px` pixels.
     ragged_px : how far the outlines of things are displaced, standard deviation.
+    ragged_window : (across, down) width over which they are displaced alike.
     shadow_m : places, along x, of the light source and the other cameras: what one of them does
         not see has no reading.
     filled_px : shadows are this much narrower than geometry says, on average.
@@ -47,8 +49,9 @@ class Sensor:
     noise: float = 0.0
     grain: tuple[int, int] = (1, 1)
     wave: float = 0.0
-    wave_px: int = 40
+    wave_px: int = 80
     ragged_px: float = 0.0
+    ragged_window: tuple[int, int] = (1, 1)
     shadow_m: tuple[float, ...] = ()
     filled_px: float = 0.0
     grazing: float = 0.0
@@ -64,14 +67,15 @@ KINECT = Sensor(
     Camera(640, 480, 525.0, 525.0, 319.5, 239.5),
     nearest_m=0.45,
     step=0.0029,  # 1/8 px of a 580 px infrared camera, 7.5 cm from its projector
-    noise=0.0019,
-    grain=(5, 3),
-    wave=0.0012,
-    ragged_px=1.1,
+    noise=0.0018,
+    grain=(8, 4),
+    wave=0.0024,
+    ragged_px=0.55,
+    ragged_window=(5, 4),
     shadow_m=(0.05, -0.025),  # projector and infrared camera, seen from the colour camera
     filled_px=2.0,
-    grazing=0.1,
-    holes=0.0004,
+    grazing=0.06,
+    holes=0.0003,
     border_px=(4, 40, 4, 6),
 )
 """Kinect v1 (structured light), depth registered to the colour camera."""
@@ -79,20 +83,20 @@ KINECT = Sensor(
 REALSENSE = Sensor(
     Camera(640, 480, 610.0, 610.0, 319.5, 239.5),
     nearest_m=0.2,
-    step=0.0006,
-    noise=0.0035,
-    grain=(9, 9),
-    wave=0.003,
-    wave_px=48,
-    ragged_px=1.8,
+    step=0.0005,
+    noise=0.0023,
+    grain=(17, 7),
+    wave=0.0024,
+    ragged_px=0.7,
+    ragged_window=(7, 5),
     shadow_m=(0.05,),
-    filled_px=1.5,
+    filled_px=1.0,
     grazing=0.12,
-    holes=0.002,
+    holes=0.0006,
     blend_px=3,
     border_px=(8, 0, 0, 0),
 )
-"""Intel D435 (active stereo, the left infrared camera)."""
+"""Intel D435 (active stereo, the left infrared camera), its spatial filter switched on."""
 
 SENSORS: dict[Literal["ideal", "kinect", "realsense"], Sensor] = {
     "ideal": IDEAL,
@@ -102,7 +106,7 @@ SENSORS: dict[Literal["ideal", "kinect", "realsense"], Sensor] = {
 """The sensors by name."""
 
 
-def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, F4]:
+def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
     """Report a rendered image as a depth camera does.
 
     Parameters
@@ -115,97 +119,125 @@ def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, F4]:
     owners : (h, w) int16, the thing each reading belongs to, -1 where there is none.
     """
     inverse, owners, cosine = _displaced(image, sensor, rng)
-    shadow = np.zeros(inverse.shape, np.bool_)
+    lost = np.zeros(image.inverse.shape, np.bool_)
     for place in sensor.shadow_m:
-        _cast_shadow(inverse, place * sensor.camera.fx, shadow)
+        _cast_shadow(inverse, place * sensor.camera.fx, lost)
     if sensor.filled_px > 0:
-        eaten = rng.integers(0, round(2 * sensor.filled_px) + 1, (inverse.shape[0] // 3 + 1, 16))
-        _fill_shadow(inverse, owners, shadow, eaten)
+        middle = round(sensor.filled_px)
+        eaten = rng.integers(middle - 1, middle + 2, (inverse.shape[0] // 3 + 1, 16), np.int8)
+        _fill_shadow(inverse, owners, lost, eaten)
+    _lose_grazing(cosine, sensor, rng, lost)
+    _punch_holes(sensor, rng, lost)
+    _lose_border(sensor, lost)
     if sensor.blend_px:
-        inverse = _blended(inverse, owners, sensor.blend_px)
-    inverse += _noise(inverse.shape, sensor, rng)
-    lost = shadow | (inverse <= 0) | _dropouts(cosine, sensor, rng)
-    if sensor.step > 0:
-        inverse = np.round(inverse / sensor.step) * sensor.step
-    with np.errstate(divide="ignore"):
-        depth = 1.0 / inverse
-    lost |= ~((depth >= sensor.nearest_m) & (depth <= sensor.farthest_m)) | (owners < 0)
-    left, right, top, bottom = sensor.border_px
-    height, width = lost.shape
-    lost[:top] = lost[height - bottom :] = True
-    lost[:, :left] = lost[:, width - right :] = True
-    return np.where(lost, 0.0, depth).astype(np.float32), np.where(lost, -1, owners).astype(np.int16)
+        inverse = _blended(inverse, sensor.blend_px)
+    depth = np.zeros(inverse.shape, np.float32)
+    error = _error(inverse.shape, sensor, rng)
+    limits = np.array([sensor.step, sensor.nearest_m, sensor.farthest_m])
+    _read_out(inverse, error, lost, limits, depth, owners)
+    return depth, owners
 
 
-def _displaced(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, F4, F4]:
+def _displaced(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4]:
     """Look up the true image at places a little beside: ragged outlines (Barron and Malik 2013)."""
-    with np.errstate(divide="ignore"):
-        inverse = np.where(image.depth > 0, 1.0 / image.depth, 0.0)
-    if sensor.ragged_px <= 0:
-        return inverse, np.array(image.owners), np.array(image.cosine)
-    shape = inverse.shape
-    across = _smooth_normal(shape, (3, 3), rng) * sensor.ragged_px
-    down = _smooth_normal(shape, (3, 3), rng) * sensor.ragged_px
-    owners = np.zeros(shape, np.int16)
-    cosine = np.zeros(shape, np.float32)
-    result = np.zeros(shape)
-    _look_beside(inverse, image.owners, image.cosine, across, down, result, owners, cosine)
-    return result, owners, cosine
+    inverse = np.array(image.inverse)
+    owners, cosine = np.array(image.owners), np.array(image.cosine)
+    if sensor.ragged_px > 0:
+        across = _grain(inverse.shape, sensor.ragged_window, sensor.ragged_px, rng)
+        down = _grain(inverse.shape, sensor.ragged_window, sensor.ragged_px, rng)
+        _look_beside(
+            image.inverse, image.owners, image.cosine, across, down, inverse, owners, cosine
+        )
+    return inverse, owners, cosine
 
 
-def _smooth_normal(shape: tuple[int, int], window: tuple[int, int], rng: Generator) -> F4:
-    """Return normal noise of variance 1 averaged over a window (across, down)."""
+def _grain(shape: tuple[int, int], window: tuple[int, int], deviation: float, rng: Generator) -> F4:
+    """Return nearly normal noise that is alike in a window (across, down).
+
+    Sums of bytes: many times faster than normal numbers.
+    """
     wide, tall = window
-    raw = rng.standard_normal((shape[0] + tall - 1, shape[1] + wide - 1), np.float32)
+    raw = rng.integers(0, 256, (shape[0] + tall - 1, shape[1] + wide - 1), np.uint8)
     result = np.zeros(shape, np.float32)
     _box_sum(raw, wide, tall, result)
-    result *= np.float32(1.0 / np.sqrt(wide * tall))
+    byte = np.sqrt((256**2 - 1) / 12)
+    result -= np.float32(127.5 * wide * tall)
+    result *= np.float32(deviation / (byte * np.sqrt(wide * tall)))
     return result
 
 
-def _noise(shape: tuple[int, int], sensor: Sensor, rng: Generator) -> F8:
-    """Return the error of the inverse depth: half of it alike in windows, half in their cores."""
-    result = np.zeros(shape)
-    if sensor.noise > 0:
-        wide, tall = sensor.grain
-        share = sensor.noise * np.sqrt(0.5)
-        result += _smooth_normal(shape, sensor.grain, rng) * share
-        core = (max(1, wide // 2), max(1, tall // 2))
-        result += _smooth_normal(shape, core, rng) * share
+def _error(shape: tuple[int, int], sensor: Sensor, rng: Generator) -> F4:
+    """Return the error of the inverse depth before it is quantised."""
+    if sensor.noise <= 0:
+        return np.zeros(shape, np.float32)
+    error = _grain(shape, sensor.grain, sensor.noise, rng)
     if sensor.wave > 0:
-        _add_wave(rng.normal(0, sensor.wave, _knots(shape, sensor.wave_px)), sensor.wave_px, result)
+        error += _wave(shape, sensor.wave, sensor.wave_px)
+    return error
+
+
+@lru_cache(maxsize=8)
+def _wave(shape: tuple[int, int], deviation: float, spacing: int) -> F4:
+    """Return the fixed error of a device: smooth, the same in every image."""
+    knots = (shape[0] // spacing + 2, shape[1] // spacing + 2)
+    heights = np.random.default_rng(1).normal(0, 1.5 * deviation, knots)
+    result = np.zeros(shape, np.float32)
+    _interpolate(heights, spacing, result)
     return result
 
 
-def _knots(shape: tuple[int, int], spacing: int) -> tuple[int, int]:
-    return shape[0] // spacing + 2, shape[1] // spacing + 2
-
-
-def _dropouts(cosine: F4, sensor: Sensor, rng: Generator) -> F4:
-    """Tell where readings fail: at grazing angles, and in small holes anywhere."""
-    lost = np.zeros(cosine.shape, np.bool_)
+def _lose_grazing(cosine: F4, sensor: Sensor, rng: Generator, lost: Bool) -> None:
+    """Lose readings where the ray grazes the surface."""
     if sensor.grazing > 0:
-        luck = _smooth_normal(cosine.shape, (3, 3), rng)
-        lost |= cosine < sensor.grazing * (1 + 0.5 * luck)
-    if sensor.holes > 0:
-        count = rng.poisson(sensor.holes * cosine.size / 12)
-        rows, columns = rng.integers(0, cosine.shape[0], count), rng.integers(0, cosine.shape[1], count)
-        sizes = rng.integers(1, 4, (count, 2))
-        for v, u, (a, b) in zip(rows, columns, sizes, strict=True):
-            lost[v : v + 2 * a, u : u + 2 * b] = True
-    return lost
+        luck = _grain(cosine.shape, (3, 3), 0.5 * sensor.grazing, rng)
+        lost |= cosine < luck + np.float32(sensor.grazing)
 
 
-def _blended(inverse: F8, owners: F4, width: int) -> F8:
+def _lose_border(sensor: Sensor, lost: Bool) -> None:
+    left, right, top, bottom = sensor.border_px
+    lost[:top] = True
+    lost[len(lost) - bottom :] = True
+    lost[:, :left] = True
+    lost[:, lost.shape[1] - right :] = True
+
+
+def _punch_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
+    """Lose readings in small holes anywhere."""
+    count = rng.poisson(sensor.holes * lost.size / 8) if sensor.holes > 0 else 0
+    rows = rng.integers(0, lost.shape[0], count)
+    columns = rng.integers(0, lost.shape[1], count)
+    sizes = rng.integers(1, 5, (count, 2))
+    for v, u, (tall, wide) in zip(rows, columns, sizes, strict=True):
+        lost[v : v + tall, u : u + wide] = True
+
+
+def _blended(inverse: F8, width: int) -> F8:
     """Mix near and far across outlines, as stereo windows and smoothing filters do."""
     result = np.zeros_like(inverse)
-    _blend(inverse, owners, width // 2, result)
+    _blend(inverse, width // 2, result)
     return result
 
 
 @kernel
+def _read_out(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, owners: I4) -> None:
+    step, nearest, farthest = limits
+    for v in range(inverse.shape[0]):
+        for u in range(inverse.shape[1]):
+            if not lost[v, u] and inverse[v, u] > 0:
+                w = inverse[v, u] + error[v, u]
+                if step > 0:
+                    w = np.floor(w / step + 0.5) * step
+                if w > 0:
+                    z = 1.0 / w
+                    if nearest <= z <= farthest:
+                        depth[v, u] = z
+            if depth[v, u] == 0:
+                owners[v, u] = -1
+
+
+@kernel
 def _look_beside(
-    inverse: F8, owners: F4, cosine: F4, across: F4, down: F4, out: F8, who: F4, angle: F4
+    inverse: F8, owners: I4, cosine: F4, across: F4, down: F4, out: F8, who: I4, angle: F4
 ) -> None:
     height, width = inverse.shape
     for v in range(height):
@@ -222,7 +254,7 @@ def _look_beside(
 
 
 @kernel
-def _box_sum(raw: F4, wide: int, tall: int, out: F4) -> None:
+def _box_sum(raw: U1, wide: int, tall: int, out: F4) -> None:
     height, width = out.shape
     column = np.zeros(raw.shape[1], np.float32)
     for v in range(height):
@@ -239,7 +271,7 @@ def _box_sum(raw: F4, wide: int, tall: int, out: F4) -> None:
 
 
 @kernel
-def _add_wave(knots: F8, spacing: int, out: F8) -> None:
+def _interpolate(knots: F8, spacing: int, out: F4) -> None:
     height, width = out.shape
     for v in range(height):
         i = v // spacing
@@ -249,11 +281,11 @@ def _add_wave(knots: F8, spacing: int, out: F8) -> None:
             s = (u - j * spacing) / spacing
             low = knots[i, j] + s * (knots[i, j + 1] - knots[i, j])
             high = knots[i + 1, j] + s * (knots[i + 1, j + 1] - knots[i + 1, j])
-            out[v, u] += low + t * (high - low)
+            out[v, u] = low + t * (high - low)
 
 
 @kernel
-def _cast_shadow(inverse: F8, shift: float, shadow: F4) -> None:
+def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
     """Mark what is hidden from a place beside the camera, at ``shift`` / focal length metres."""
     height, width = inverse.shape
     margin = int(abs(shift) * 5) + 2
@@ -279,7 +311,7 @@ def _cast_shadow(inverse: F8, shift: float, shadow: F4) -> None:
 
 
 @kernel
-def _fill_shadow(inverse: F8, owners: F4, shadow: F4, eaten: F4) -> None:
+def _fill_shadow(inverse: F8, owners: I4, shadow: Bool, eaten: I4) -> None:
     """Let the nearer side of each shadow grow into it: windows see the outline too early."""
     height, width = inverse.shape
     for v in range(height):
@@ -306,7 +338,7 @@ def _fill_shadow(inverse: F8, owners: F4, shadow: F4, eaten: F4) -> None:
 
 
 @kernel
-def _blend(inverse: F8, owners: F4, reach: int, out: F8) -> None:
+def _blend(inverse: F8, reach: int, out: F8) -> None:
     height, width = inverse.shape
     for v in range(height):
         for u in range(width):

@@ -41,7 +41,8 @@ def frame_truth(world: World, frame: int, labels: U1, sensor: Sensor) -> Truth:
     seen = world.geometry(frame)
     pose = world.path[frame]
     counts = np.bincount(labels.reshape(-1), minlength=256)
-    objects, hidden = [], []
+    objects: list[dict[str, Any]] = []
+    hidden: list[dict[str, Any]] = []
     for owner, thing in enumerate(world.things, start=len(world.supports)):
         pixels = int(counts[thing.label])
         entry = _thing_truth(world, frame, thing, pixels, seen, owner, sensor)

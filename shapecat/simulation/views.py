@@ -39,9 +39,9 @@ def render_frame(
     pose = world.path[view] if isinstance(view, int) else view
     image = render(world.geometry(index), sensor.camera, pose)
     depth, owners = measure(image, sensor, rng)
-    labels = np.where(owners >= 0, np.append(world.labels, np.uint8(0))[owners], np.uint8(0))
+    labels = np.take(np.append(world.labels, np.uint8(0)), owners, mode="wrap")  # -1 is the last
     stamp = start_ns + round(index * 1e9 / rate_hz)
     frame = Frame(
         topic, index, stamp, stamp, "camera_depth_optical_frame", depth=depth, camera=sensor.camera
     )
-    return frame, labels.astype(np.uint8)
+    return frame, labels

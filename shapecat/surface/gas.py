@@ -1,8 +1,10 @@
 """Surface reconstruction: from the points of an object to a graph of neurons."""
 
+from typing import TypeAlias
+
 import numpy as np
 
-from shapecat.arrays import F4, F8, U2, Bool
+from shapecat.arrays import F4, F8, U2
 from shapecat.config import SurfaceSettings
 from shapecat.jit import kernel
 from shapecat.surface.graph import edge_list, link
@@ -118,6 +120,8 @@ def reconstruct(
     return NeuralGas(neurons, edges) if len(neurons) else None
 
 
+_Found: TypeAlias = tuple[F4, U2, bool]
+"""Neurons, edges, and whether the points were finite."""
 _NOTHING = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
 
 
@@ -130,15 +134,15 @@ def _by_fritzke(
     share: float,
     start_neurons: F4,
     start_edges: U2,
-) -> tuple[F4, U2, bool]:
-    """Return neurons, edges, and whether the points were finite."""
+) -> _Found:
+    """Grow by Algorithm 3, or adapt an earlier graph."""
     cloud, frame = _normalise(points)
     target = _wanted(cloud, neurons)
     gas = empty_gas(max(target, start_neurons.shape[0]))
     state = np.uint64(seed)
     count = 0
     if not frame[3] < np.inf:
-        return _in_metres(gas, np.zeros((0, 0), np.bool_), frame)
+        return np.zeros((0, 3), np.float32), np.zeros((0, 2), np.uint16), False
     if start_neurons.shape[0] >= 3:
         count = _adopt(cloud, gas, start_neurons, start_edges, frame)
     if count >= 3:
@@ -152,20 +156,20 @@ def _by_fritzke(
         cloud, state, gas, count, target, signals,
         max(interval, 1), rate, rate * _RATE_NEIGHBOUR, oldest,
     )  # fmt: skip
-    _, adjacent = link(cloud, gas, count, share)
-    return _in_metres(gas, adjacent, frame)
+    adjacent = link(cloud, gas, count, share)
+    return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent), True
 
 
 @kernel
-def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U2, bool]:
-    """Return neurons, edges, and whether the points were finite."""
+def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> _Found:
+    """Grow by Algorithm 4."""
     cloud, frame = _normalise(points)
     target = _wanted(cloud, neurons)
     # differs: a bound on the neurons, for memory; and thresholds relative to the object. A neuron
     # with its share of the surface, a square of side h, has a mean squared distance of h**2 / 6.
     gas = empty_gas(2 * target)
     if not frame[3] < np.inf:
-        return _in_metres(gas, np.zeros((0, 0), np.bool_), frame)
+        return np.zeros((0, 3), np.float32), np.zeros((0, 2), np.uint16), False
     state = np.uint64(seed)
     count = _two_points(cloud, gas, state)
     spacing = _spacing(cloud, 64)
@@ -176,8 +180,8 @@ def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> tuple[F4, U
         _ERROR_LIMIT * each * square / 6, _DISTANCE_LIMIT * spacing,
         _RATE, _RATE * _RATE_NEIGHBOUR, _OLDEST,
     )  # fmt: skip
-    _, adjacent = link(cloud, gas, count, share)
-    return _in_metres(gas, adjacent, frame)
+    adjacent = link(cloud, gas, count, share)
+    return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent), True
 
 
 @kernel
@@ -210,14 +214,13 @@ def _normalise(points: F4) -> tuple[Cloud, F8]:
 
 
 @kernel
-def _in_metres(gas: Gas, adjacent: Bool, frame: F8) -> tuple[F4, U2, bool]:
-    count = adjacent.shape[0]
+def _in_metres(gas: Gas, count: int, frame: F8) -> F4:
     neurons = np.zeros((count, 3), np.float32)
     for i in range(count):
         neurons[i, 0] = gas.x[i] * frame[3] + frame[0]
         neurons[i, 1] = gas.y[i] * frame[3] + frame[1]
         neurons[i, 2] = gas.z[i] * frame[3] + frame[2]
-    return neurons, edge_list(adjacent), frame[3] < np.inf
+    return neurons
 
 
 @kernel
@@ -253,8 +256,10 @@ def _adopt(cloud: Cloud, gas: Gas, neurons: F4, edges: U2, frame: F8) -> int:
     mask = index_mask(padded)
     used = np.zeros(padded, np.bool_)
     for k in range(cloud.x.size):
-        a, _ = two_nearest(gas.x, gas.y, gas.z, padded, cloud.x[k], cloud.y[k], cloud.z[k], mask)
-        used[a] = True
+        first, _ = two_nearest(
+            gas.x, gas.y, gas.z, padded, cloud.x[k], cloud.y[k], cloud.z[k], mask
+        )
+        used[first] = True
     place = np.full(count, -1, np.int64)
     kept = 0
     for i in range(count):
@@ -268,9 +273,9 @@ def _adopt(cloud: Cloud, gas: Gas, neurons: F4, edges: U2, frame: F8) -> int:
     if kept < 3:
         return 0
     for e in range(edges.shape[0]):
-        i, j = np.int64(edges[e, 0]), np.int64(edges[e, 1])
-        if i < j < count and place[i] >= 0 and place[j] >= 0:
-            connect(gas, place[i], place[j])
+        a, b = int(edges[e, 0]), int(edges[e, 1])
+        if a < b < count and place[a] >= 0 and place[b] >= 0:
+            connect(gas, place[a], place[b])
     for i in range(kept):
         if gas.degree[i] == 0:  # its neighbours are gone
             connect(gas, i, (i + 1) % kept)

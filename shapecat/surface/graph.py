@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shapecat.arrays import F4, I4, U2, Bool
+from shapecat.arrays import I4, U2, Bool
 from shapecat.jit import kernel
 from shapecat.surface.growth import FAR, Cloud, Gas, index_mask, is_edge
 from shapecat.surface.lanes import LANES, three_nearest
@@ -16,8 +16,8 @@ _LONGEST = 3.0
 
 
 @kernel
-def link(cloud: Cloud, gas: Gas, count: int, share: float) -> tuple[int, Bool]:
-    """Finish the graph of ``count`` neurons; return how many stay and their (n, n) adjacency.
+def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
+    """Finish the graph of ``count`` neurons; return the (n, n) adjacency of those that stay.
 
     1. Neurons nearest to no point are removed.
     2. The others move to the mean of the points they are nearest to (one step of Lloyd 1982). It
@@ -44,7 +44,7 @@ def link(cloud: Cloud, gas: Gas, count: int, share: float) -> tuple[int, Bool]:
         members[nearest[k, 0]] += 1
     kept = _keep(gas, adjacent, members, members > 0, count)
     if kept < 3:
-        return 0, adjacent[:0, :0]
+        return adjacent[:0, :0]
     if kept < count:
         _three_nearest(cloud, gas, kept, nearest)
     # 2.
@@ -69,11 +69,11 @@ def link(cloud: Cloud, gas: Gas, count: int, share: float) -> tuple[int, Bool]:
         stays[np.argmax(weight)] = True
         kept = _keep(gas, adjacent, members, stays[part], kept)
         if kept < 3:
-            return 0, adjacent[:0, :0]
+            return adjacent[:0, :0]
         # 5.
         while _components(adjacent, kept, part) > 1:
             _bridge(gas, adjacent, kept, part)
-    return kept, adjacent[:kept, :kept]
+    return adjacent[:kept, :kept]
 
 
 @kernel
@@ -137,7 +137,7 @@ def _mean_gap(gas: Gas, count: int) -> float:
 @kernel
 def _squared(gas: Gas, i: int, j: int) -> float:
     dx, dy, dz = gas.x[i] - gas.x[j], gas.y[i] - gas.y[j], gas.z[i] - gas.z[j]
-    return dx * dx + dy * dy + dz * dz
+    return float(dx * dx + dy * dy + dz * dz)
 
 
 @kernel

@@ -81,7 +81,7 @@ def index_mask(count: int) -> int:
 @kernel
 def is_edge(gas: Gas, i: int, j: int) -> bool:
     """Return whether two neurons are linked."""
-    return gas.born[i * gas.x.size + j] < ABSENT
+    return bool(gas.born[i * gas.x.size + j] < ABSENT)
 
 
 @kernel
@@ -158,7 +158,7 @@ def _fire(
     # 10. edges that are too old go
     if age > oldest:
         _drop_old_edges(degree, wins, born, count, a, oldest)
-    return a
+    return int(a)
 
 
 @kernel

@@ -5,6 +5,8 @@ costs more than the work itself when the loops have five rounds; written as vect
 LLVM they are two to three times faster. LLVM splits the vectors on machines with narrower ones.
 """
 
+# ruff: noqa: ARG001  # numba calls an intrinsic with the types of all its arguments
+
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -148,7 +150,7 @@ two_nearest = _nearest(2)
 three_nearest = _nearest(3)
 
 
-@intrinsic  # type: ignore[misc]  # numba has no types
+@intrinsic
 def adapt(
     _typing: Any,
     x: Any,

@@ -45,6 +45,9 @@ def voxelize(points: F4, *, voxel_m: float) -> F4:
     if not voxel_m > 0:
         msg = f"voxel_m must be positive, got {voxel_m}"
         raise ValueError(msg)
+    points = points.view()
+    points.flags.writeable = False  # one compiled version for read-only and other arrays
+    centroids: F4
     centroids, valid = _voxelize(points, float(voxel_m))
     if not valid:
         msg = f"points must be finite and within 2**19 voxels of {voxel_m} m from the origin"

@@ -1,16 +1,56 @@
 """What a pixel of a lens with distortion sees."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
 from shapecat.arrays import F4, F8
+from shapecat.recordings.pinhole import PinholeFit, fit_pinhole
+from shapecat.recordings.pointcloud2 import unorganized
+from shapecat.recordings.recording import Recording
 from shapecat.types import Camera
 
-__all__ = ["points_along", "undistorted_rays"]
+__all__ = ["Lens", "undistorted_rays"]
 
 _ROUNDS = 20
 _MODELS = ("plumb_bob", "rational_polynomial", "equidistant", "fisheye")
+
+
+class Lens:
+    """The lens of images that were not rectified; computed anew when the calibration changes."""
+
+    def __init__(self, recording: Recording, topic: str) -> None:
+        """Begin without a calibration."""
+        self._recording = recording
+        self._topic = topic
+        self._key: tuple[Camera, str, tuple[float, ...]] | None = None
+        self._rays: F8 | None = None
+        self._fit: PinholeFit | None = None
+
+    def content(self, info: Any, camera: Camera, depth: F4) -> dict[str, Any]:
+        """Give depth with the pinhole nearest to the lens, or points where none is near."""
+        model = str(info.distortion_model)
+        coefficients = tuple(float(c) for c in (info.d if hasattr(info, "d") else info.D))
+        self._calibrate((camera, model, coefficients), depth)
+        if self._rays is None:
+            self._warn(f"lens distortion {model!r} is not known and left as it is")
+            return {"depth": depth, "camera": camera}
+        if self._fit is not None:
+            return {"depth": depth, "camera": self._fit.camera}
+        self._warn("not rectified: read as points along the undistorted rays")
+        return unorganized(_points_along(self._rays, depth))
+
+    def _calibrate(self, key: tuple[Camera, str, tuple[float, ...]], depth: F4) -> None:
+        if key == self._key:
+            return
+        self._key, self._fit = key, None
+        self._rays = undistorted_rays(*key)
+        if self._rays is not None:
+            self._fit = fit_pinhole(_points_along(self._rays, np.ones(depth.shape, np.float32)))
+
+    def _warn(self, text: str) -> None:
+        self._recording.warn(f"{self._topic}: {text}")
 
 
 def undistorted_rays(camera: Camera, model: str, coefficients: Sequence[float]) -> F8 | None:
@@ -62,7 +102,7 @@ def _fisheye(rays: F8, d: F8) -> F8:
     return np.asarray(rays * (bent / radius)[..., None])
 
 
-def points_along(rays: F8, depth: F4) -> F4:
+def _points_along(rays: F8, depth: F4) -> F4:
     """Return (h, w, 3) points at ``depth`` along the rays; NaN where there is no reading."""
     z = np.where(depth > 0, depth, np.float32(np.nan))
     return np.stack([rays[..., 0] * z, rays[..., 1] * z, z], axis=-1).astype(np.float32)

@@ -1,0 +1,208 @@
+"""One stream being read: from messages to frames."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import F4
+from shapecat.geometry import transform
+from shapecat.recordings.compressed_depth import depth_of_compressed
+from shapecat.recordings.depth_image import depth_of_image
+from shapecat.recordings.lens import Lens
+from shapecat.recordings.messages import Message, MessageError
+from shapecat.recordings.pinhole import PinholeFit, camera_of_info, fit_pinhole, still_fits
+from shapecat.recordings.pointcloud2 import cloud_points, organized, unorganized
+from shapecat.recordings.recording import Recording
+from shapecat.recordings.stamps import Clock, stamp_ns
+from shapecat.recordings.streams import COMPRESSED, Stream
+from shapecat.types import Camera, Frame, Pose
+
+__all__ = ["SOURCES", "DepthSource", "PointsSource", "Source"]
+
+_MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
+"""Raised where a definition gives a message other fields than its type should have."""
+
+
+@contextmanager
+def _counting(skipped: Counter[str]) -> Iterator[None]:
+    """Count what cannot be read, by reason."""
+    try:
+        yield
+    except MessageError as error:
+        skipped[str(error).split(": ", 1)[-1][:160]] += 1
+    except _MALFORMED:
+        skipped["message is not laid out as its type says"] += 1
+
+
+class Source:
+    """A stream and what is remembered from frame to frame; ``index`` counts its messages."""
+
+    def __init__(self, recording: Recording, stream: Stream) -> None:
+        """Begin reading a stream."""
+        self.recording = recording
+        self.stream = stream
+        self.index = 0
+        self.clock = Clock(stream.topic)
+
+    def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
+        """Yield the frame of a message, or a frame held back before it, or none."""
+        raise NotImplementedError
+
+    def finish(self, _skipped: Counter[str]) -> Iterator[Frame]:
+        """Yield what was held back."""
+        yield from ()
+
+    def frame(self, message: Message, index: int, header: Any, content: dict[str, Any]) -> Frame:
+        """Make a frame."""
+        if not 0 <= message.log_time_ns < 2**63:
+            msg = "log time out of range"
+            raise MessageError(msg)
+        return Frame(
+            topic=self.stream.topic,
+            index=index,
+            stamp_ns=self.clock.check(stamp_ns(header), message.log_time_ns),
+            log_time_ns=message.log_time_ns,
+            frame_id=str(header.frame_id),
+            **content,
+        )
+
+
+class PointsSource(Source):
+    """A stream of clouds; organized ones become depth images where a camera explains them."""
+
+    def __init__(self, recording: Recording, stream: Stream) -> None:
+        """Begin without a camera."""
+        super().__init__(recording, stream)
+        self.fit: PinholeFit | None = None
+
+    def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
+        """Yield the frame of a cloud."""
+        frame = None
+        with _counting(skipped):
+            cloud = self.recording.decode(message)
+            points = _placed(cloud_points(cloud), getattr(cloud, "pose", None))
+            frame = self.frame(message, self.index - 1, cloud.header, self._content(points))
+        if frame is not None:
+            yield frame
+
+    def _content(self, points: F4) -> dict[str, Any]:
+        if points.size == 0:
+            msg = "empty cloud"
+            raise MessageError(msg)
+        camera = self._camera(points) if min(points.shape[:2]) > 1 else None
+        return unorganized(points) if camera is None else organized(points, camera)
+
+    def _camera(self, points: F4) -> Camera | None:
+        """Keep the camera of earlier frames while it explains the points as well as then."""
+        if self.fit is not None and still_fits(self.fit, points):
+            return self.fit.camera
+        fit = fit_pinhole(points)
+        self.fit = fit or self.fit
+        return fit.camera if fit is not None else None
+
+
+def _placed(points: F4, pose: Pose | None) -> F4:
+    """Move a cloud that has a pose of its own into the sensor frame."""
+    return points if pose is None else transform(pose, points).astype(np.float32)
+
+
+class DepthSource(Source):
+    """A stream of depth images, each waiting for the calibration of its own time."""
+
+    def __init__(self, recording: Recording, stream: Stream) -> None:
+        """Begin without a calibration."""
+        super().__init__(recording, stream)
+        self.info_topic = stream.info_topic or ""
+        # "image_rect", "image_rect_raw", "image_rect/compressedDepth"
+        self.rectified = any("rect" in part for part in stream.topic.split("/")[-2:])
+        self.units = _depth_units(recording, stream.topic)
+        self.lens = Lens(recording, stream.topic)
+        self._waiting: tuple[Message, int, Any] | None = None
+        self._info: Any = None
+
+    def calibrate(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
+        """Take a calibration; yield the image that waited for it."""
+        try:
+            info = self.recording.decode(message)
+            stamp = stamp_ns(info.header)
+        except (MessageError, *_MALFORMED) as error:
+            self.recording.warn(f"left out a calibration: {error}")
+            return
+        if self._waiting is None:
+            self._info = info
+            return
+        wanted = stamp_ns(self._waiting[2].header)
+        # A later calibration means that the image's own is missing: the last one has to do.
+        if stamp <= wanted or self._info is None:
+            self._info = info
+        if stamp >= wanted:
+            yield from self.finish(skipped)
+            self._info = info
+
+    def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
+        """Hold an image back until its calibration is there; yield the one before it."""
+        yield from self.finish(skipped)
+        with _counting(skipped):
+            image = self.recording.decode(message)
+            stamp = stamp_ns(image.header)
+            self._waiting = (message, self.index - 1, image)
+        if self._waiting and self._info is not None and stamp_ns(self._info.header) == stamp:
+            yield from self.finish(skipped)
+
+    def finish(self, skipped: Counter[str]) -> Iterator[Frame]:
+        """Yield the image that waits, with the best calibration there is."""
+        if self._waiting is None:
+            return
+        (message, index, image), self._waiting = self._waiting, None
+        frame = None
+        with _counting(skipped):
+            frame = self.frame(message, index, image.header, self._content(image))
+        if frame is not None:
+            yield frame
+
+    def _content(self, image: Any) -> dict[str, Any]:
+        if self._info is None:
+            self._info = _first(self.recording, self.info_topic)
+        if self._info is None:
+            msg = "depth image without camera info"
+            raise MessageError(msg)
+        camera, distorted = camera_of_info(self._info, rectified=self.rectified)
+        compressed = self.stream.type == COMPRESSED
+        depth = depth_of_compressed(image) if compressed else depth_of_image(image, self.units)
+        if depth.shape != (camera.height, camera.width):
+            shape = f"{depth.shape[1]} x {depth.shape[0]}"
+            msg = f"depth image of {shape} with camera info for {camera.width} x {camera.height}"
+            raise MessageError(msg)
+        if distorted:
+            return self.lens.content(self._info, camera, depth)
+        return {"depth": depth, "camera": camera}
+
+
+def _depth_units(recording: Recording, topic: str) -> float | None:
+    """Return how many units make a metre, if the RealSense viewer recorded it."""
+    sensor = "/".join(topic.split("/")[:3])
+    for other in recording.topics:
+        name = other.name.replace(" ", "_")
+        if name.startswith(f"{sensor}/") and name.endswith("/option/Depth_Units/value"):
+            with suppress(*_MALFORMED):
+                metres = float(_first(recording, other.name).data)
+                return 1 / metres if 1e-6 < metres < 1 else None
+    return None
+
+
+def _first(recording: Recording, topic: str) -> Any:
+    """Return the first message of a topic; it may lie before the chosen window."""
+    for message in recording.messages([topic]):
+        with suppress(MessageError):
+            return recording.decode(message)
+    return None
+
+
+SOURCES: dict[str, Callable[[Recording, Stream], Source]] = {
+    "points": PointsSource,
+    "depth": DepthSource,
+}
+"""By the kind of a stream."""

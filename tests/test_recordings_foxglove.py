@@ -1,0 +1,266 @@
+"""Recordings made for Foxglove: JSON and Protocol Buffers instead of ROS messages."""
+
+import base64
+import json
+from collections import Counter
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from mcap.writer import Writer
+
+from shapecat.outputs.annotated_mcap import write_annotated
+from shapecat.outputs.scene_protobuf import encode_scene, scene_descriptors
+from shapecat.recordings import choose_streams, frames, open_recording, read_transforms
+from shapecat.recordings.decoding import LIBRARY_ERRORS
+from shapecat.recordings.protobuf import ProtobufField, encode_message, message_decoder
+from shapecat.types import Camera, Frame, LabelledFrame
+
+SECOND = 10**9
+EPOCH = 1_700_000_000 * SECOND
+DOUBLE, STRING, MESSAGE, RAW, ENUM, FIXED, INT64 = 1, 9, 11, 12, 14, 7, 3
+CAMERA = Camera(4, 3, 60.0, 61.0, 1.5, 1.0)
+
+
+def field(name: str, kind: int, message: str = "", *, repeated: bool = False) -> ProtobufField:
+    return ProtobufField(name, kind, repeated, message)
+
+
+TIME = field("timestamp", MESSAGE, "google.protobuf.Timestamp")
+VECTOR = {k + 1: field(name, DOUBLE) for k, name in enumerate("xyz")}
+LAYOUT = {
+    "google.protobuf.Timestamp": {1: field("seconds", INT64), 2: field("nanos", 5)},
+    "foxglove.Vector3": VECTOR,
+    "foxglove.Quaternion": VECTOR | {4: field("w", DOUBLE)},
+    "foxglove.Pose": {
+        1: field("position", MESSAGE, "foxglove.Vector3"),
+        2: field("orientation", MESSAGE, "foxglove.Quaternion"),
+    },
+    "foxglove.PackedElementField": {
+        1: field("name", STRING),
+        2: field("offset", FIXED),
+        3: field("type", ENUM),
+    },
+    "foxglove.PointCloud": {
+        1: TIME,
+        2: field("frame_id", STRING),
+        3: field("pose", MESSAGE, "foxglove.Pose"),
+        4: field("point_stride", FIXED),
+        5: field("fields", MESSAGE, "foxglove.PackedElementField", repeated=True),
+        6: field("data", RAW),
+    },
+    "foxglove.RawImage": {
+        1: TIME,
+        7: field("frame_id", STRING),
+        2: field("width", FIXED),
+        3: field("height", FIXED),
+        4: field("encoding", STRING),
+        5: field("step", FIXED),
+        6: field("data", RAW),
+    },
+    "foxglove.CameraCalibration": {
+        1: TIME,
+        9: field("frame_id", STRING),
+        2: field("width", FIXED),
+        3: field("height", FIXED),
+        4: field("distortion_model", STRING),
+        **{5 + k: field(name, DOUBLE, repeated=True) for k, name in enumerate("DKRP")},
+    },
+    "foxglove.FrameTransform": {
+        1: TIME,
+        2: field("parent_frame_id", STRING),
+        3: field("child_frame_id", STRING),
+        4: field("translation", MESSAGE, "foxglove.Vector3"),
+        5: field("rotation", MESSAGE, "foxglove.Quaternion"),
+    },
+}
+DESCRIPTOR = {
+    "set": {1: field("file", MESSAGE, "file", repeated=True)},
+    "file": {2: field("package", STRING), 4: field("message_type", MESSAGE, "type", repeated=True)},
+    "type": {1: field("name", STRING), 2: field("field", MESSAGE, "field", repeated=True)},
+    "field": {
+        1: field("name", STRING),
+        3: field("number", 5),
+        4: field("label", 5),
+        5: field("type", 5),
+        6: field("type_name", STRING),
+    },
+}
+
+
+def descriptors(layout: dict[str, dict[int, ProtobufField]] = LAYOUT) -> bytes:
+    files = [
+        {
+            "package": name.rpartition(".")[0],
+            "message_type": [
+                {
+                    "name": name.rpartition(".")[2],
+                    "field": [
+                        {
+                            "name": f.name,
+                            "number": number,
+                            "label": 3 if f.repeated else 1,
+                            "type": f.kind,
+                            "type_name": f".{f.message}" if f.message else "",
+                        }
+                        for number, f in fields.items()
+                    ],
+                }
+            ],
+        }
+        for name, fields in layout.items()
+    ]
+    return encode_message({"file": files}, "set", DESCRIPTOR)
+
+
+def time(stamp: int, encoding: str) -> dict[str, int]:
+    names = ("seconds", "nanos") if encoding == "protobuf" else ("sec", "nsec")
+    return dict(zip(names, divmod(stamp, SECOND), strict=True))
+
+
+def content(data: bytes, encoding: str) -> Any:
+    return data if encoding == "protobuf" else base64.b64encode(data).decode()
+
+
+def write(path: Path, encoding: str, items: list[tuple[str, str, dict[str, Any]]]) -> Path:
+    schema_encoding = "protobuf" if encoding == "protobuf" else "jsonschema"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("", "test")
+        for k, (topic, kind, values) in enumerate(items):
+            text = descriptors() if encoding == "protobuf" else b"{}"
+            schema = writer.register_schema(kind, schema_encoding, text)
+            channel = writer.register_channel(topic, encoding, schema)
+            filled = {"timestamp": time(EPOCH, encoding), "frame_id": "camera"} | values
+            data = (
+                encode_message(filled, kind, LAYOUT)
+                if encoding == "protobuf"
+                else json.dumps(filled).encode()
+            )
+            writer.add_message(channel, EPOCH + k, data, EPOCH + k)
+        writer.finish()
+    return path
+
+
+def read(path: Path) -> list[Frame]:
+    skipped: Counter[str] = Counter()
+    with open_recording(path) as recording:
+        result = list(frames(recording, choose_streams(recording), skipped=skipped))
+    assert not skipped
+    return result
+
+
+both = pytest.mark.parametrize("encoding", ["json", "protobuf"])
+
+
+@both
+def test_point_cloud_with_a_pose(tmp_path: Path, encoding: str) -> None:
+    points = np.arange(12, dtype="<f4").reshape(4, 3) + 1
+    fields = [{"name": name, "offset": 4 * k, "type": 7} for k, name in enumerate("xyz")]
+    turn = {
+        "position": {"x": 10.0, "y": 0.0, "z": 0.0},
+        "orientation": {"x": 0.0, "y": 0.0, "z": 1.0, "w": 0.0},
+    }
+    values = {"pose": turn, "point_stride": 12, "fields": fields}
+    values["data"] = content(points.tobytes(), encoding)
+
+    (frame,) = read(write(tmp_path / "a.mcap", encoding, [("/p", "foxglove.PointCloud", values)]))
+
+    assert (frame.stamp_ns, frame.frame_id) == (EPOCH, "camera")
+    assert frame.points is not None
+    np.testing.assert_allclose(frame.points, points * [-1, -1, 1] + [10, 0, 0], atol=1e-5)
+
+
+@both
+def test_depth_image(tmp_path: Path, encoding: str) -> None:
+    depth = np.arange(12, dtype="<u2").reshape(3, 4) * 100
+    k = [60.0, 0.0, 1.5, 0.0, 61.0, 1.0, 0.0, 0.0, 1.0]
+    size = {"width": 4, "height": 3}
+    info = {**size, "distortion_model": "", "D": [], "K": k, "R": [], "P": []}
+    image = {**size, "encoding": "16UC1", "step": 8, "data": content(depth.tobytes(), encoding)}
+    items = [
+        ("/depth/calibration", "foxglove.CameraCalibration", info),
+        ("/depth/image", "foxglove.RawImage", image),
+    ]
+
+    (frame,) = read(write(tmp_path / "a.mcap", encoding, items))
+
+    assert frame.camera == CAMERA
+    np.testing.assert_array_equal(frame.depth, depth / np.float32(1000))
+
+
+@both
+def test_transforms(tmp_path: Path, encoding: str) -> None:
+    values = {
+        "parent_frame_id": "map",
+        "child_frame_id": "camera",
+        "translation": {"x": 1.0, "y": 2.0, "z": 3.0},
+        "rotation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+    }
+    path = write(tmp_path / "a.mcap", encoding, [("/tf", "foxglove.FrameTransform", values)])
+
+    with open_recording(path) as recording:
+        pose = read_transforms(recording).lookup("map", "camera", EPOCH)
+
+    np.testing.assert_array_equal(pose.translation, [1, 2, 3])
+
+
+def test_protobuf_scene_is_read_by_its_own_descriptors() -> None:
+    """A viewer has nothing else to go by."""
+    scene = {
+        "deletions": [{"timestamp": {"seconds": 5}, "type": 1, "id": "a"}],
+        "entities": [{"id": "track-3", "frame_locked": True, "metadata": [{"key": "k"}]}],
+    }
+
+    read_back = message_decoder(scene_descriptors(), "foxglove.SceneUpdate")(encode_scene(scene))
+
+    assert read_back.deletions[0].timestamp.seconds == 5
+    assert (read_back.deletions[0].type, read_back.deletions[0].id) == (1, "a")
+    entity = read_back.entities[0]
+    assert (entity.id, entity.frame_locked, entity.metadata[0].key) == ("track-3", True, "k")
+    assert entity.arrows == entity.models == []
+
+
+def test_protobuf_source_gets_protobuf_annotations(tmp_path: Path) -> None:
+    source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
+    write(source, "protobuf", [("/p", "foxglove.PointCloud", {})])
+    frame = LabelledFrame("/p", 0, EPOCH, EPOCH, "camera", None, (), (), (7,), {})
+
+    with open_recording(source) as recording:
+        write_annotated(recording, target, [frame], run={})
+
+    with open_recording(target) as recording:
+        assert {topic.encoding for topic in recording.topics} == {"protobuf"}
+        (message,) = recording.messages(["/shapecat/scene"])
+        assert recording.decode(message).deletions[0].id == "track-7"
+
+
+@given(
+    values=st.fixed_dictionaries(
+        {
+            "seconds": st.integers(-(2**63), 2**63 - 1),
+            "nanos": st.integers(-(2**31), 2**31 - 1),
+        }
+    )
+)
+@settings(deadline=None, max_examples=50)
+def test_integers_survive(values: dict[str, int]) -> None:
+    name = "google.protobuf.Timestamp"
+    data = encode_message(values, name, LAYOUT)
+
+    assert message_decoder(descriptors(), name)(data) == SimpleNamespace(**values)
+
+
+@given(data=st.binary(max_size=60))
+@settings(deadline=None, max_examples=100)
+def test_hostile_bytes_are_a_known_error(data: bytes) -> None:
+    decode = message_decoder(descriptors(), "foxglove.PointCloud")
+    for run in (lambda: decode(data), lambda: message_decoder(data, "a.B")):
+        try:
+            run()
+        except LIBRARY_ERRORS:
+            continue

@@ -1,0 +1,315 @@
+"""review.rrd, read back with Rerun's own reader."""
+
+import dataclasses
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shapecat.errors import OutputError
+from shapecat.outputs import review, review_viewer
+from shapecat.outputs.colours import colour_of
+from shapecat.outputs.review_cloud import paint
+from shapecat.outputs.review_shapes import markdown
+from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
+
+CATEGORIES = ("cup", "can")
+TOPIC = "/camera/depth"
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+GAS = NeuralGas(
+    np.array([[0, 0, 1], [0.1, 0, 1], [0, 0.1, 1], [0.1, 0.1, 1]]),
+    np.array([[0, 1], [0, 2], [1, 2], [1, 3]]),
+)
+OUTLINE = np.array([[-1, 0.4, 0.5], [1, 0.4, 0.5], [1, 0.4, 2], [-1, 0.4, 2]])
+FLOOR = Plane(np.array([0, -1, 0]), -0.4, OUTLINE, 3.0, 0.0)
+RERUN = Path(sys.executable).with_name("rerun")
+
+
+def labelled_object(track: int, category: str = "cup", x: float = 0.0) -> LabelledObject:
+    box = Box(np.array([x, 0.1, 1.0]), np.array([0.1, 0.2, 0.3]), np.array([0, 0, 0, 1]))
+    first = 64 * 20 + 10 * track
+    pixels = np.arange(first, first + 8)
+    view, so_far = np.array([0.9, 0.1]), np.array([0.8, 0.2])
+    return LabelledObject(track, category, 0.97, box, pixels, GAS, view, so_far)
+
+
+def image(k: int = 0) -> Frame:
+    depth = np.full((48, 64), 1.0, np.float32)
+    depth[:, :4] = 0
+    return Frame(TOPIC, k, stamp(k), stamp(k), "optical", depth, CAMERA)
+
+
+def stamp(k: int) -> int:
+    return 1_700_000_000_123_456_789 + k * 100_000_001
+
+
+def scene(
+    k: int,
+    objects: Iterable[LabelledObject] = (),
+    *,
+    pose: Pose | None = None,
+    ended: tuple[int, ...] = (),
+) -> tuple[LabelledFrame, Frame]:
+    frame = image(k)
+    seconds = {"detect": 0.01 * k}
+    return (
+        LabelledFrame(
+            TOPIC, k, stamp(k), stamp(k), "optical", pose, (FLOOR,), tuple(objects), ended, seconds
+        ),
+        frame,
+    )
+
+
+def write(path: Path, scenes: Iterable[tuple[LabelledFrame, Frame]], **options: Any) -> Path:
+    settings: dict[str, Any] = {
+        "name": "lab",
+        "run": {"warnings": ["no transforms"], "counts": {"frames": 3}},
+        "categories": CATEGORIES,
+        "cloud_points": 1000,
+        "fixed_frame": None,
+    }
+    review.write_review(path, scenes, **(settings | options))
+    return path
+
+
+def as_rows(batch: Any) -> list[dict[str, Any]]:
+    """Return the rows of a batch, times as nanoseconds: Python's have only microseconds."""
+    names = batch.schema.names
+    if "sensor_time" in names:
+        k = names.index("sensor_time")
+        batch = batch.set_column(k, "sensor_time", batch.column(k).cast("int64"))
+    return list(batch.to_pylist())
+
+
+def rows(path: Path, entity: str) -> list[dict[str, Any]]:
+    """Return the rows of an entity of a recording, in the order of frames."""
+    from rerun.chunk import RrdReader  # noqa: PLC0415  heavy
+
+    chunks = RrdReader(str(path)).stream().to_chunks()
+    found = [
+        row
+        for chunk in chunks
+        if str(chunk.entity_path).replace("\\", "") == entity
+        for row in as_rows(chunk.to_record_batch())
+    ]
+    return sorted(found, key=lambda row: row.get("frame", -1))
+
+
+def scalars(path: Path, entity: str) -> list[list[float]]:
+    """Return the values of a curve; its style is a row without any."""
+    values = [row.get("Scalars:scalars") for row in rows(path, entity)]
+    return [value for value in values if value]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Three frames: two objects, one, none."""
+    path = tmp_path_factory.mktemp("review") / "review.rrd"
+    scenes = [
+        scene(0, [labelled_object(1), labelled_object(2, "can", 0.3)]),
+        scene(1, [labelled_object(1, x=0.05)], ended=(2,)),
+        scene(2, ended=(1,)),
+    ]
+    return write(path, scenes)
+
+
+def test_boxes_are_what_was_written_and_none_is_left_stale(recording: Path) -> None:
+    """A box must vanish in the frame where its object is gone."""
+    boxes = rows(recording, f"/world/{TOPIC}/objects/boxes")
+    assert [row["Boxes3D:labels"] for row in boxes] == [
+        ["#1 cup 0.97", "#2 can 0.97"],
+        ["#1 cup 0.97"],
+        [],
+    ]
+    assert np.allclose(boxes[1]["Boxes3D:centers"], [[0.05, 0.1, 1.0]])
+    assert np.allclose(boxes[1]["Boxes3D:half_sizes"], [[0.05, 0.1, 0.15]])
+    assert np.allclose(boxes[1]["Boxes3D:quaternions"], [[0, 0, 0, 1]])
+
+
+def test_times_are_those_of_the_sensor_to_the_nanosecond(recording: Path) -> None:
+    """Wall-clock time would make two runs differ; seconds as floats would lose the nanoseconds."""
+    boxes = rows(recording, f"/world/{TOPIC}/objects/boxes")
+    assert [row["frame"] for row in boxes] == [0, 1, 2]
+    assert [row["sensor_time"] for row in boxes] == [stamp(k) for k in range(3)]
+    assert "log_time" not in boxes[0]
+
+
+def test_graphs_have_their_edges_and_triangles(recording: Path) -> None:
+    graph = rows(recording, f"/world/{TOPIC}/objects/graphs")[1]["LineStrips3D:strips"]
+    assert np.allclose(graph, GAS.neurons[GAS.edges])
+    mesh = rows(recording, f"/world/{TOPIC}/objects/surfaces")[0]
+    assert mesh["Mesh3D:triangle_indices"] == [[0, 1, 2], [4, 5, 6]]
+
+
+def test_posterior_counts_and_times_are_plotted_for_every_frame(recording: Path) -> None:
+    assert np.allclose(scalars(recording, "/tracks/1/posterior"), [[0.8, 0.2], [0.8, 0.2]])
+    assert scalars(recording, "/plots/objects/cup") == [[1], [1], [0]]
+    assert scalars(recording, "/plots/seconds/detect") == [[0], [0.01], [0.02]]
+
+
+def test_events_tell_births_ends_and_warnings(recording: Path) -> None:
+    texts = [row["TextLog:text"][0] for row in rows(recording, "/log")]
+    assert texts == [
+        "no transforms",
+        "#1 cup 0.97 appears",
+        "#2 can 0.97 appears",
+        "#2 can 0.97 is not seen again",
+        "#1 cup 0.97 is not seen again",
+    ]
+
+
+def test_the_layout_is_embedded_and_the_footer_is_whole(recording: Path) -> None:
+    """A file without a footer opens slowly, one without a layout opens as a heap of views."""
+    from rerun.chunk import RrdReader  # noqa: PLC0415  heavy
+
+    assert len(RrdReader(str(recording)).blueprints()) == 1
+    verified = subprocess.run([RERUN, "rrd", "verify", recording], check=False, capture_output=True)
+    assert verified.returncode == 0, verified.stderr
+
+
+def test_the_same_run_gives_the_same_content(tmp_path: Path) -> None:
+    scenes = [scene(k, [labelled_object(1)]) for k in range(3)]
+    one, two = write(tmp_path / "1.rrd", scenes), write(tmp_path / "2.rrd", scenes)
+    compared = subprocess.run([RERUN, "rrd", "compare", one, two], check=False, capture_output=True)
+    assert compared.returncode == 0, compared.stderr
+
+
+def test_a_fixed_frame_moves_the_sensor_and_holds_the_paths(tmp_path: Path) -> None:
+    poses = [Pose(np.eye(3), np.array([0.1 * k, 0, 0])) for k in range(3)]
+    scenes = [scene(k, [labelled_object(1)], pose=pose) for k, pose in enumerate(poses)]
+    path = write(tmp_path / "r.rrd", scenes, fixed_frame="map")
+    moved = [
+        row["Transform3D:translation"]
+        for row in rows(path, f"/world/{TOPIC}")
+        if row.get("Transform3D:translation")
+    ]
+    assert np.allclose(np.array(moved)[:, 0, 0], [0, 0.1, 0.2])
+    way = rows(path, f"/world/paths/{TOPIC}")[-1]["LineStrips3D:strips"]
+    assert np.allclose(way, [[[0, 0.1, 1], [0.1, 0.1, 1], [0.2, 0.1, 1]]])
+
+
+def test_a_frame_without_a_pose_does_not_end_the_review(tmp_path: Path) -> None:
+    """Transforms may be missing at either end of a recording."""
+    scenes = [scene(k, [labelled_object(1)]) for k in range(2)]
+    path = write(tmp_path / "r.rrd", scenes, fixed_frame="map")
+    assert len(rows(path, f"/world/{TOPIC}/objects/boxes")) == 2
+
+
+def test_a_run_without_frames_or_objects_is_still_a_review(tmp_path: Path) -> None:
+    assert write(tmp_path / "0.rrd", []).stat().st_size > 0
+    assert rows(write(tmp_path / "1.rrd", [scene(0)]), f"/world/{TOPIC}/scene")
+
+
+def test_clouds_keep_to_the_limit_and_objects_to_their_colour() -> None:
+    labelled, frame = scene(0, [labelled_object(1), labelled_object(2, "can")])
+    rest, mine = paint(frame, labelled.planes, labelled.objects, limit=600)
+    assert 300 < len(rest.points) <= 600
+    assert np.isfinite(rest.points).all()
+    everything = [*paint(frame, labelled.planes, labelled.objects, limit=0)]
+    assert sum(len(cloud.points) for cloud in everything) == 48 * 60
+    assert len(everything[1].points) == 16
+    shades = {tuple(c) for c in mine.colours.view(np.uint8).reshape(-1, 4)[:, :0:-1].tolist()}
+    ratios = {tuple(np.round(np.array(shade) / max(shade), 1)) for shade in shades}
+    expected = [np.array(colour_of(category)) for category in CATEGORIES]
+    assert ratios == {tuple(np.round(c / c.max(), 1)) for c in expected}
+
+
+def test_unorganized_clouds_and_points_near_a_plane_are_painted() -> None:
+    points = np.random.default_rng(0).uniform(-0.3, 0.3, (500, 3)) + np.array([0, 0, 1])
+    points[:200, 1], points[200] = 0.4, np.nan
+    frame = Frame("/lidar", 0, 0, 0, "lidar", points=points)
+    item = dataclasses.replace(labelled_object(1), indices=np.arange(300, 310))
+    rest, mine = paint(frame, (FLOOR,), (item,), limit=0)
+    assert (len(rest.points), len(mine.points)) == (489, 10)
+    on_floor = np.abs(rest.points[:, 1] - 0.4) < 0.01
+    assert len(set(rest.colours[on_floor].tolist())) == 1
+    assert not set(rest.colours[on_floor].tolist()) & set(rest.colours[~on_floor].tolist())
+
+
+def test_a_failure_leaves_no_file_behind(tmp_path: Path) -> None:
+    """Neither half a file under the final name nor a hidden one; an older review survives."""
+    (tmp_path / "r.rrd").write_bytes(b"old")
+
+    def broken() -> Iterator[tuple[LabelledFrame, Frame]]:
+        yield scene(0, [labelled_object(1)])
+        msg = "the recording ends here"
+        raise ValueError(msg)
+
+    with pytest.raises(ValueError, match="ends here"):
+        write(tmp_path / "r.rrd", broken())
+    assert [p.name for p in tmp_path.iterdir()] == ["r.rrd"]
+    assert (tmp_path / "r.rrd").read_bytes() == b"old"
+
+
+def test_a_full_disk_is_noticed_before_the_writer_blocks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Rerun's own writer waits for ever when a write fails."""
+    full = SimpleNamespace(free=1 << 20)
+    monkeypatch.setattr("shutil.disk_usage", lambda _: full)
+    with pytest.raises(OutputError, match="No space left"):
+        write(tmp_path / "r.rrd", [scene(0)])
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_missing_folder_is_an_output_error(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="cannot be written"):
+        write(tmp_path / "nowhere" / "r.rrd", [scene(0)])
+
+
+def test_the_run_is_readable_as_text() -> None:
+    text = markdown({"version": "1", "counts": {"frames": 3}, "warnings": [], "seconds": 0.123456})
+    assert text.splitlines() == [
+        "- **version**: 1",
+        "- **warnings**: none",
+        "- **seconds**: 0.1235",
+        "",
+        "## counts",
+        "",
+        "- **frames**: 3",
+    ]
+
+
+def test_a_missing_review_or_viewer_is_said_in_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with pytest.raises(OutputError, match="there is no review here"):
+        review.open_viewer(tmp_path / "none.rrd")
+    (tmp_path / "r.rrd").touch()
+    monkeypatch.setattr("shutil.which", lambda *_, **__: None)
+    with pytest.raises(OutputError, match="rerun-sdk"):
+        review.take_screenshot(tmp_path / "r.rrd", tmp_path / "r.png")
+
+
+def test_a_viewer_without_graphics_names_the_package(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A container has no graphics card: the message must say what to install."""
+    fake = tmp_path / "rerun"
+    fake.write_text("#!/bin/sh\necho 'No graphics adapter was found' >&2\nexit 1\n")
+    fake.chmod(0o755)
+    monkeypatch.setattr(review_viewer, "_viewer", lambda: str(fake))
+    with pytest.raises(OutputError, match="mesa-vulkan-drivers"):
+        review.take_screenshot(fake, tmp_path / "r.png")
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    not any(Path("/usr/share/vulkan").glob("icd.d/*.json")), reason="nothing to draw with"
+)
+def test_a_screenshot_shows_the_scene(recording: Path, tmp_path: Path) -> None:
+    """Views that fail to draw, or an eye that looks away, would give an empty picture."""
+    png = tmp_path / "r.png"
+    review.take_screenshot(recording, png, size=(640, 480), stamp_ns=stamp(0))
+    image_module = pytest.importorskip("PIL.Image")
+    with image_module.open(png) as picture:
+        assert picture.size == (640, 480)
+        pixels = np.asarray(picture.convert("RGB"), float)[:, :400].reshape(-1, 3)
+    green = np.array(colour_of("can"), float)  # nothing of the viewer's own is so green
+    alike = pixels @ green / np.linalg.norm(green) / np.linalg.norm(pixels + 1, axis=1)
+    assert np.count_nonzero((alike > 0.98) & (pixels.max(axis=1) > 90)) > 100

@@ -1,0 +1,227 @@
+"""The rasterizer against geometry and rays; the sensor models against what real ones do."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from shapecat.arrays import F8
+from shapecat.simulation.mesh import Mesh, lathe, rounded_box
+from shapecat.simulation.paths import looking_at
+from shapecat.simulation.render import Geometry, Image, alone_pixels, cropped, geometry, render
+from shapecat.simulation.scenes import make_scene
+from shapecat.simulation.sensors import IDEAL, KINECT, REALSENSE, Sensor, measure
+from shapecat.types import Camera, Pose
+
+HERE = Pose(np.eye(3), np.zeros(3))
+CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
+
+
+def rays(camera: Camera) -> F8:
+    v, u = np.mgrid[: camera.height, : camera.width]
+    across, down = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    return np.stack([across, down, np.ones(across.shape)], -1)
+
+
+def big_quad(z: float) -> Mesh:
+    corners = np.array([[-90, -90, z], [90, -90, z], [90, 90, z], [-90, 90, z]])
+    return Mesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def test_plane_is_exact_everywhere_even_behind_the_camera() -> None:
+    """A floor reaches behind the camera: nothing may be clipped wrongly."""
+    pose = looking_at(np.array([0, 0, 1.3]), np.array([0.2, 1.0, 0.9]))
+    image = render(geometry([(big_quad(0.0), HERE)]), CAMERA, pose)
+    fall = (rays(CAMERA) @ pose.rotation.T)[..., 2]
+    expected = np.where(fall < 0, -1.3 / np.where(fall < 0, fall, -1.0), 0.0)
+    near = expected < 60
+
+    np.testing.assert_allclose(image.depth[near], expected[near], rtol=1e-9)
+    assert np.array_equal(image.owners[near] == 0, expected[near] > 0)
+
+
+def test_sphere_is_where_it_should_be() -> None:
+    t = np.linspace(-np.pi / 2, np.pi / 2, 200)
+    ball = lathe(np.stack([0.2 * np.cos(t), 0.2 * np.sin(t)], -1), segments=300)
+    image = render(geometry([(ball, Pose(np.eye(3), np.array([0.05, 0, 1.0])))]), CAMERA, HERE)
+    d = rays(CAMERA)
+    a, b = (d * d).sum(-1), d @ [0.05, 0, 1.0]
+    inside = b * b - a * (1.0025 - 0.04)
+    depth = (b - np.sqrt(np.maximum(inside, 0))) / a
+    sure = inside > 0.01
+
+    assert (image.owners[sure] == 0).all()
+    np.testing.assert_allclose(image.depth[sure], depth[sure], atol=2e-4)
+    assert (image.owners[inside < -1e-4] == -1).all()
+
+
+def test_shared_edges_leave_no_gap() -> None:
+    """A wall of many small triangles must hide what is behind it, at every pixel."""
+    rng = np.random.default_rng(0)
+    n = 60
+    grid = np.stack(np.meshgrid(np.linspace(-1, 1, n), np.linspace(-1, 1, n)), -1).reshape(-1, 2)
+    wall = np.column_stack([grid, 1 + 0.1 * rng.random(n * n)])
+    k = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).ravel()
+    triangles = np.concatenate(
+        [np.stack([k, k + 1, k + n], 1), np.stack([k + 1, k + n + 1, k + n], 1)]
+    )
+    image = render(geometry([(big_quad(5.0), HERE), (Mesh(wall, triangles), HERE)]), CAMERA, HERE)
+
+    assert (image.owners == 1).all()
+
+
+def test_both_sides_of_a_triangle_are_seen() -> None:
+    """Cups have thin walls: culling back faces would open them."""
+    quad = big_quad(1.0)
+    back = Mesh(quad.vertices, quad.triangles[:, ::-1])
+
+    for mesh in (quad, back):
+        image = render(geometry([(mesh, HERE)]), CAMERA, HERE)
+        assert (image.owners == 0).all()
+        assert float(image.cosine.max()) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_the_nearer_thing_shows() -> None:
+    image = render(
+        geometry([(big_quad(2.0), HERE), (big_quad(1.0), HERE), (big_quad(3.0), HERE)]),
+        CAMERA,
+        HERE,
+    )
+
+    assert (image.owners == 1).all()
+
+
+def test_a_crop_is_a_part_of_the_image() -> None:
+    world = make_scene("clutter", np.random.default_rng(4), frames=1)
+    seen = world.geometry(0)
+    whole = render(seen, CAMERA, world.path[0])
+    part = render(seen, cropped(CAMERA, 50, 30, 60, 40), world.path[0])
+
+    np.testing.assert_allclose(part.inverse, whole.inverse[30:70, 50:110], rtol=1e-12)
+    assert (part.owners == whole.owners[30:70, 50:110]).mean() > 0.999
+
+
+def test_agrees_with_open3d_rays() -> None:
+    o3d = pytest.importorskip("open3d")
+    world = make_scene("shelf", np.random.default_rng(2), frames=1)
+    seen, pose = world.geometry(0), world.path[0]
+    image = render(seen, CAMERA, pose)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(
+        np.asarray(seen.vertices, np.float32), np.asarray(seen.triangles, np.uint32)
+    )
+    d = rays(CAMERA) @ pose.rotation.T
+    cast = np.concatenate([np.broadcast_to(pose.translation, d.shape), d], -1).astype(np.float32)
+    hit = scene.cast_rays(o3d.core.Tensor(cast))["t_hit"].numpy()
+    difference = np.abs(np.where(np.isfinite(hit), hit, 0.0) - image.depth)
+
+    assert np.percentile(difference, 99.8) < 1e-4  # a few rays pass an edge on its other side
+    assert (difference > 1e-3).mean() < 0.002
+
+
+def test_alone_pixels_counts_what_others_hide() -> None:
+    cube = rounded_box([0.2, 0.2, 0.2])
+    behind = (cube, Pose(np.eye(3), np.array([0, 0, 1.5])))
+    before = (cube, Pose(np.eye(3), np.array([0.1, 0, 1.0])))
+    seen = geometry([behind, before])
+    visible = int((render(seen, CAMERA, HERE).owners == 0).sum())
+    alone = int((render(geometry([behind]), CAMERA, HERE).owners == 0).sum())
+
+    assert alone_pixels(seen, 0, CAMERA, HERE) == alone
+    assert 0 < visible < 0.7 * alone
+
+
+def test_nothing_to_draw() -> None:
+    nothing = Geometry(np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0))
+
+    assert (render(nothing, CAMERA, HERE).owners == -1).all()
+
+
+# --- sensors -----------------------------------------------------------------------------------
+
+
+def wall_image(sensor: Sensor, z: float) -> Image:
+    return render(geometry([(big_quad(z), HERE)]), sensor.camera, HERE)
+
+
+def step_image(sensor: Sensor) -> Image:
+    post = rounded_box([0.2, 0.2, 2.0])
+    things = [(big_quad(1.2), HERE), (post, Pose(np.eye(3)[[0, 2, 1]], np.array([0, -1.0, 0.8])))]
+    return render(geometry(things), sensor.camera, HERE)
+
+
+def test_ideal_sensor_changes_nothing() -> None:
+    image = step_image(IDEAL)
+    depth, owners = measure(image, IDEAL, np.random.default_rng(0))
+
+    np.testing.assert_allclose(depth, image.depth, rtol=1e-6)
+    assert np.array_equal(owners, image.owners)
+
+
+@pytest.mark.parametrize("sensor", [KINECT, REALSENSE], ids=["kinect", "realsense"])
+def test_same_seed_same_noise(sensor: Sensor) -> None:
+    image = step_image(sensor)
+    first = measure(image, sensor, np.random.default_rng(5))
+    again = measure(image, sensor, np.random.default_rng(5))
+    other = measure(image, sensor, np.random.default_rng(6))
+
+    assert np.array_equal(first[0], again[0])
+    assert np.array_equal(first[1], again[1])
+    assert not np.array_equal(first[0], other[0])
+
+
+def test_kinect_disparity_comes_in_steps() -> None:
+    depth, _ = measure(wall_image(KINECT, 1.0), KINECT, np.random.default_rng(0))
+    levels = np.unique(1 / depth[depth > 0].astype(np.float64))
+
+    assert np.diff(levels) == pytest.approx(0.0029, rel=1e-3)
+
+
+@pytest.mark.parametrize("distance", [0.8, 1.6])
+def test_kinect_noise_grows_with_the_square_of_the_distance(distance: float) -> None:
+    """Real frames have 0.0020 1/m in a window of 40 pixels, at every distance."""
+    sensor = dataclasses.replace(KINECT, wave=0.0)
+    depth, _ = measure(wall_image(sensor, distance), sensor, np.random.default_rng(0))
+    inverse = 1 / depth[depth > 0].astype(np.float64)
+
+    assert inverse.std() == pytest.approx(0.0020, abs=0.0002)
+    assert inverse.mean() == pytest.approx(1 / distance, abs=0.0005)
+
+
+def test_kinect_noise_is_alike_among_neighbours() -> None:
+    """Independent pixels would be averaged away by any smoothing: too easy to be real."""
+    sensor = dataclasses.replace(KINECT, wave=0.0, holes=0.0)
+    depth, _ = measure(wall_image(sensor, 1.0), sensor, np.random.default_rng(0))
+    error = 1 / depth[20:460, 20:580].astype(np.float64) - 1.0
+    error -= error.mean()
+    across = (error[:, 1:] * error[:, :-1]).mean() / error.var()
+    down = (error[1:] * error[:-1]).mean() / error.var()
+
+    assert 0.6 < across < 0.85
+    assert 0.45 < down < 0.75
+
+
+@pytest.mark.parametrize(("sensor", "right"), [(KINECT, 6.0), (REALSENSE, 0.0)])
+def test_shadow_lies_beside_nearer_things(sensor: Sensor, right: float) -> None:
+    """The projector stands to the right of the camera: the shadow falls to the left."""
+    sensor = dataclasses.replace(sensor, holes=0.0, grazing=0.0)
+    image = step_image(sensor)
+    depth, owners = measure(image, sensor, np.random.default_rng(0))
+    row_runs = []
+    for v in range(100, 380, 4):
+        post = np.flatnonzero(owners[v] == 1)
+        left = np.flatnonzero(depth[v, : post[0]] > 0)[-1]
+        after = post[-1] + 1 + np.flatnonzero(depth[v, post[-1] + 1 :] > 0)[0]
+        row_runs.append((post[0] - left - 1, after - post[-1] - 1))
+    left_run, right_run = np.mean(row_runs, axis=0)
+    full = sensor.camera.fx * 0.05 * (1 / 0.7 - 1 / 1.2)
+
+    assert 0.6 * full < left_run < full + 1
+    assert abs(right_run - right) < 2.0
+
+
+def test_what_is_out_of_range_has_no_reading() -> None:
+    for z in (0.3, 5.0):
+        depth, owners = measure(wall_image(KINECT, z), KINECT, np.random.default_rng(0))
+        assert (depth == 0).all()
+        assert (owners == -1).all()

@@ -1,0 +1,165 @@
+"""Simulated shapes: the borders between categories, watertight sizes, how things rest."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shapecat.arrays import F8
+from shapecat.simulation.distractors import DISTRACTORS, make_distractor
+from shapecat.simulation.footprints import overlap
+from shapecat.simulation.mesh import Mesh, lathe, moved, rounded_box, tube
+from shapecat.simulation.placement import choose_rest, rests, turn_about_z
+from shapecat.simulation.render import geometry, render
+from shapecat.simulation.shapes import make_object
+from shapecat.types import CATEGORIES, Camera, Pose
+
+HERE = Pose(np.eye(3), np.zeros(3))
+MANY = 40
+
+
+def made(category: str) -> list[Mesh]:
+    return [make_object(category, np.random.default_rng((3, seed))) for seed in range(MANY)]
+
+
+def width_at(mesh: Mesh, low: float, high: float) -> float:
+    """Return the greatest width between two heights, given as shares of the whole."""
+    z = mesh.vertices[:, 2] / mesh.extents[2]
+    flat = mesh.vertices[(z >= low) & (z <= high), :2]
+    angle = np.arange(24) * (np.pi / 24)
+    return float(np.ptp(flat @ [np.cos(angle), np.sin(angle)], axis=0).max())
+
+
+def openness(mesh: Mesh) -> tuple[float, float]:
+    """Return depth and diameter of an open thing: seen from above, and measured at its rim."""
+    top = float(mesh.vertices[:, 2].max())
+    rim = mesh.vertices[mesh.vertices[:, 2] > top - 0.03 * mesh.extents[2] - 1e-4, :2]
+    far = 20.0
+    camera = Camera(3, 3, 4000.0, 4000.0, 1.0, 1.0)  # the middle, a few millimetres
+    middle = (rim.min(axis=0) + rim.max(axis=0)) / 2
+    above = Pose(np.diag([1.0, -1.0, -1.0]), np.array([*middle, far]))
+    floor = far - float(np.median(render(geometry([(mesh, HERE)]), camera, above).depth))
+    return top - floor, float(np.ptp(rim, axis=0).max())
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_things_are_of_human_size_and_stand_on_the_ground(category: str) -> None:
+    for mesh in made(category):
+        assert abs(float(mesh.vertices[:, 2].min())) < 1e-6
+        assert mesh.extents.min() > 0.005
+        assert mesh.extents.max() < 0.4
+        assert 100 <= len(mesh.triangles) <= 6000
+        assert np.isfinite(mesh.vertices).all()
+
+
+@pytest.mark.parametrize(
+    ("category", "least", "most"), [("cup", 0.65, 2.6), ("bowl", 0.2, 0.65), ("plate", 0.02, 0.2)]
+)
+def test_open_categories_keep_to_their_depth(category: str, least: float, most: float) -> None:
+    """A generator that blurs the definitional borders teaches the model to guess."""
+    ratios = []
+    for mesh in made(category):
+        depth, diameter = openness(mesh)
+        ratios.append(depth / diameter)
+
+    assert min(ratios) > least
+    assert max(ratios) < most
+    assert max(ratios) > 1.3 * min(ratios)  # and they differ among themselves
+
+
+def test_bottles_are_clearly_narrower_at_the_top() -> None:
+    shares = [width_at(mesh, 0.93, 1.0) / width_at(mesh, 0.0, 1.0) for mesh in made("bottle")]
+
+    # Pumps and triggers have a beak at the top; by far most are plain.
+    assert np.mean(np.array(shares) < 0.72) > 0.85
+
+
+def test_cans_are_not() -> None:
+    assert min(width_at(m, 0.93, 1.0) / width_at(m, 0.0, 1.0) for m in made("can")) > 0.75
+
+
+def test_balls_are_round() -> None:
+    for mesh in made("ball"):
+        assert mesh.extents.min() / mesh.extents.max() > 0.9
+
+
+@pytest.mark.parametrize("category", CATEGORIES)
+def test_no_two_things_are_alike(category: str) -> None:
+    extents = np.array([np.sort(mesh.extents) for mesh in made(category)])
+
+    assert len(np.unique(np.round(extents, 4), axis=0)) == MANY
+    assert extents[:, 2].max() > 1.8 * extents[:, 2].min()
+
+
+def test_an_unknown_category_is_named() -> None:
+    with pytest.raises(ValueError, match="spoon"):
+        make_object("spoon", np.random.default_rng(0))
+    with pytest.raises(ValueError, match="spoon"):
+        make_distractor(np.random.default_rng(0), "spoon")
+
+
+@pytest.mark.parametrize("kind", DISTRACTORS)
+def test_every_distractor_can_be_made(kind: str) -> None:
+    name, mesh = make_distractor(np.random.default_rng(1), kind)
+
+    assert name == kind
+    assert abs(float(mesh.vertices[:, 2].min())) < 1e-6
+    assert 0.01 < mesh.extents.max() < 0.7
+
+
+def test_there_are_many_kinds_of_distractors() -> None:
+    assert len(DISTRACTORS) >= 24
+
+
+def test_box_is_as_large_as_asked() -> None:
+    """Rounding the edges must not shrink the faces."""
+    mesh = rounded_box([0.1, 0.2, 0.05], radius=0.006)
+
+    np.testing.assert_allclose(mesh.extents, [0.1, 0.2, 0.05], atol=2e-6)
+
+
+def test_ring_has_no_seam() -> None:
+    angle = np.arange(24) * (2 * np.pi / 24)
+    path = np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)
+    mesh = tube(path, 0.2, closed=True)
+    corners = mesh.vertices[mesh.triangles].astype(float)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+
+    assert np.linalg.norm(normal, axis=1).sum() / 2 == pytest.approx(4 * np.pi**2 * 0.2, rel=0.05)
+
+
+def test_standing_cylinder_rests_on_its_ends_and_side() -> None:
+    found = rests(lathe([[0, 0], [0.03, 0], [0.03, 0.1], [0, 0.1]], segments=24))
+
+    assert [rest.manner for rest in found].count("upright") == 1
+    assert [rest.manner for rest in found].count("upside_down") == 1
+    assert [rest.manner for rest in found].count("lying") == 24
+
+
+@settings(max_examples=15, deadline=None)
+@given(st.sampled_from(["cup", "can", "box", "bottle"]), st.integers(0, 999), st.floats(0, 6.28))
+def test_what_lies_touches_the_ground_and_does_not_roll(
+    category: str, seed: int, angle: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    mesh = make_object(category, rng)
+    rest = choose_rest(rests(mesh), "lying", rng)
+    if rest is None:
+        return
+    points = moved(mesh, turn_about_z(rest.pose, angle, np.array([0.3, -0.2, 0.7]))).vertices
+
+    assert float(points[:, 2].min()) == pytest.approx(0.7, abs=2e-5)
+    contact = points[points[:, 2] < 0.7 + 2e-4, :2]
+    assert len(contact) >= 3
+    assert np.all(contact.min(axis=0) <= [0.3 + 1e-4, -0.2 + 1e-4])
+    assert np.all(contact.max(axis=0) >= [0.3 - 1e-4, -0.2 - 1e-4])
+
+
+@given(st.floats(-0.3, 0.3), st.floats(-0.3, 0.3))
+@settings(deadline=None)
+def test_footprints_overlap_as_rectangles_do(x: float, y: float) -> None:
+    square: F8 = np.array([[0, 0], [0.1, 0], [0.1, 0.1], [0, 0.1]], np.float64)
+    apart = max(abs(x), abs(y)) >= 0.1
+
+    if abs(max(abs(x), abs(y)) - 0.1) > 1e-9:
+        assert overlap(square, square + np.array([x, y]), 0.0) is not apart

@@ -1,0 +1,327 @@
+"""Scenes: nothing floats or interpenetrates, truth agrees with depth, recordings read back."""
+
+import hashlib
+import json
+from itertools import pairwise
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from shapecat.arrays import Bool
+from shapecat.errors import OutputError
+from shapecat.geometry import compose, inverse, rotation_from_quaternion, transform
+from shapecat.simulation import World, make_scene, render_frame, simulate
+from shapecat.simulation.mesh import Mesh
+from shapecat.simulation.recorder import EPOCH_NS
+from shapecat.simulation.render import geometry, render
+from shapecat.simulation.scans import fill_ratio, load_mesh, upright_poses, uprighted
+from shapecat.simulation.scenes import SceneKind
+from shapecat.simulation.sensors import IDEAL, KINECT
+from shapecat.simulation.truth import robot_links
+from shapecat.types import CATEGORIES, Camera, Pose
+
+KINDS: tuple[SceneKind, ...] = get_args(SceneKind)
+
+
+@pytest.fixture(scope="module", params=[(kind, seed) for kind in KINDS for seed in (1, 2)], ids=str)
+def world(request: pytest.FixtureRequest) -> World:
+    kind, seed = request.param
+    return make_scene(kind, np.random.default_rng(seed), frames=40)
+
+
+def seen_from_above(mesh: Mesh, pose: Pose) -> Bool:
+    """Return which millimetres of a place a thing covers, drawn from far above."""
+    far = 500.0
+    camera = Camera(500, 500, far / 0.003, far / 0.003, 249.5, 249.5)
+    above = Pose(np.diag([1.0, -1.0, -1.0]), np.array([0, 0, far]))
+    return np.asarray(render(geometry([(mesh, pose)]), camera, above).owners >= 0)
+
+
+def test_things_do_not_interpenetrate(world: World) -> None:
+    """Where two things are at the same height, no vertical line meets both."""
+    here = Pose(np.eye(3), np.zeros(3))
+    solids = [(thing.mesh, thing.pose) for thing in world.things]
+    solids += [(s.mesh, here) for s in world.supports if s.name != "floor"]
+    heights = [transform(pose, mesh.vertices)[:, 2] for mesh, pose in solids]
+    covers = [seen_from_above(*solid) for solid in solids]
+    for i in range(len(world.things)):
+        for j in range(i + 1, len(solids)):
+            apart = min(heights[i].max(), heights[j].max()) - max(heights[i].min(), heights[j].min())
+            if apart > 1e-4:
+                assert not np.any(covers[i] & covers[j]), (world.kind, i, j)
+
+
+def test_things_stand_on_what_the_truth_says(world: World) -> None:
+    boards = {support.name: support for support in world.supports}
+    for thing in world.things:
+        points = transform(thing.pose, thing.mesh.vertices)
+        bottom = float(points[:, 2].min())
+        if thing.on_support is not None:
+            assert thing.on_track is None
+            assert bottom == pytest.approx(boards[thing.on_support].height, abs=3e-5)
+        else:
+            assert thing.on_track is not None
+            below = world.things[thing.on_track]
+            top = float(transform(below.pose, below.mesh.vertices)[:, 2].max())
+            assert bottom == pytest.approx(top, abs=3e-5)
+
+
+def test_the_camera_sees_most_things(world: World) -> None:
+    rng = np.random.default_rng(0)
+    for index in (0, 20, 39):
+        _, labels = render_frame(world, index, rng=rng, sensor=KINECT)
+        seen = {thing.track for thing in world.things if (labels == thing.label).sum() > 60}
+        assert len(seen) >= 0.6 * len(world.things)
+
+
+def test_the_camera_moves_smoothly(world: World) -> None:
+    places = np.array([pose.translation for pose in world.path])
+    step = np.linalg.norm(np.diff(places, axis=0), axis=1)
+
+    assert step.max() < 0.04  # 1.2 m/s
+    turned = [(a.rotation.T @ b.rotation).trace() for a, b in pairwise(world.path)]
+    assert min(turned) > 1 + 2 * np.cos(np.radians(3))
+
+
+def test_tabletop_shows_all_categories() -> None:
+    for seed in range(5):
+        world = make_scene("tabletop", np.random.default_rng(seed), frames=2)
+        assert {thing.category for thing in world.things} == set(CATEGORIES)
+        assert 6 <= len(world.things) <= 10
+
+
+def test_stacks_occur_in_clutter_and_on_shelves() -> None:
+    stacked = [
+        sum(t.on_track is not None for t in make_scene(kind, np.random.default_rng(s)).things)
+        for kind in ("clutter", "shelf")
+        for s in range(6)
+    ]
+
+    assert sum(stacked) >= 8
+
+
+def test_frames_of_a_turntable_turn_the_things_not_the_table() -> None:
+    world = make_scene("turntable", np.random.default_rng(0), frames=30)
+    thing = world.things[0]
+    first, last = world.pose_of(thing, 0), world.pose_of(thing, 29)
+
+    assert np.linalg.norm(first.translation - last.translation) > 0.005
+    assert first.translation[2] == last.translation[2]
+    assert np.array_equal(world.path[0].translation, world.path[29].translation)
+
+
+def test_scene_does_not_depend_on_the_number_of_frames() -> None:
+    """A longer demo of the same seed must show the same table."""
+    short = make_scene("tabletop", np.random.default_rng(5), frames=3)
+    long = make_scene("tabletop", np.random.default_rng(5), frames=50)
+
+    assert len(short.things) == len(long.things)
+    for a, b in zip(short.path, long.path, strict=False):
+        assert np.array_equal(a.translation, b.translation)
+
+
+def test_unknown_scene_is_named() -> None:
+    with pytest.raises(ValueError, match="kitchen"):
+        make_scene("kitchen", np.random.default_rng(0))  # type: ignore[arg-type]  # the mistake
+
+
+def test_labels_are_where_the_depth_is(world: World) -> None:
+    frame, labels = render_frame(world, 0, rng=np.random.default_rng(0))
+    assert frame.depth is not None
+
+    assert np.array_equal(labels == 0, frame.depth == 0)
+
+
+def test_labelled_points_lie_on_their_thing(world: World) -> None:
+    """Truth and depth must not slip: every labelled point is on that thing's mesh."""
+    frame, labels = render_frame(world, 7, rng=np.random.default_rng(0), sensor=IDEAL)
+    points = transform(world.path[7], frame.xyz())
+    for thing in world.things:
+        mine = points[labels.reshape(-1) == thing.label]
+        if len(mine) == 0:
+            continue
+        local = transform(inverse(world.pose_of(thing, 7)), mine)
+        low, high = thing.mesh.vertices.min(axis=0), thing.mesh.vertices.max(axis=0)
+        assert np.all(local > low - 1e-4)
+        assert np.all(local < high + 1e-4)
+
+
+def test_robot_links_chain_to_the_camera(world: World) -> None:
+    optical = Pose(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
+    for pose in world.path[::13]:
+        (_, _, base), (_, _, mast) = robot_links(pose)
+        whole = compose(compose(base, mast), optical)
+        np.testing.assert_allclose(whole.rotation, pose.rotation, atol=1e-9)
+        np.testing.assert_allclose(whole.translation, pose.translation, atol=1e-9)
+        assert base.translation[2] == 0
+
+
+# --- recordings ----------------------------------------------------------------------------------
+
+Format = Literal["mcap", "ros1", "ros2"]
+
+
+@pytest.fixture(scope="module", params=["mcap", "ros1", "ros2"])
+def recording(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    container: Format = request.param
+    out = tmp_path_factory.mktemp("sim") / "demo"
+    return simulate(out, format=container, frames=3, seed=11)
+
+
+def read(path: Path) -> dict[str, list[Any]]:
+    found: dict[str, list[Any]] = {}
+    with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        for connection, _, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            found.setdefault(connection.topic, []).append(message)
+    return found
+
+
+def test_recordings_are_what_was_rendered(recording: Path) -> None:
+    found = read(recording)
+    world = make_scene("tabletop", np.random.default_rng(11), frames=3)
+
+    assert len(found["/tf_static"]) == 1
+    for index, image in enumerate(found["/camera/depth/image_raw"]):
+        frame, _ = render_frame(world, index, rng=np.random.default_rng((11, index)))
+        assert frame.depth is not None
+        depth = np.frombuffer(image.data, "<u2").reshape(480, 640)
+        np.testing.assert_allclose(depth / 1000, frame.depth, atol=0.00051)
+        assert image.header.frame_id == "camera_depth_optical_frame"
+    for info in found["/camera/depth/camera_info"]:
+        k = info.k if hasattr(info, "k") else info.K
+        assert k[0] == 525.0
+
+
+def test_stamps_are_those_of_the_epoch(recording: Path) -> None:
+    images = read(recording)["/camera/depth/image_raw"]
+    stamps = [m.header.stamp.sec * 1_000_000_000 + m.header.stamp.nanosec for m in images]
+
+    assert stamps == [EPOCH_NS, EPOCH_NS + 33_333_333, EPOCH_NS + 66_666_667]
+
+
+def test_transforms_lead_from_map_to_the_camera(recording: Path) -> None:
+    found = read(recording)
+    world = make_scene("tabletop", np.random.default_rng(11), frames=3)
+    links = [found["/tf"][2].transforms[0], found["/tf"][2].transforms[1]]
+    links.append(found["/tf_static"][0].transforms[0])
+    pose = Pose(np.eye(3), np.zeros(3))
+    for link in links:
+        q, t = link.transform.rotation, link.transform.translation
+        step = Pose(rotation_from_quaternion([q.x, q.y, q.z, q.w]), np.array([t.x, t.y, t.z]))
+        pose = compose(pose, step)
+
+    names = [links[0].header.frame_id, *(link.child_frame_id for link in links)]
+    assert names == ["map", "base_link", "camera_link", "camera_depth_optical_frame"]
+    np.testing.assert_allclose(pose.translation, world.path[2].translation, atol=1e-7)
+    np.testing.assert_allclose(pose.rotation, world.path[2].rotation, atol=1e-7)
+
+
+def test_truth_counts_the_labelled_pixels(recording: Path) -> None:
+    truth = json.loads(recording.with_name("demo.truth.json").read_text("utf-8"))
+    labels = np.load(recording.with_name("demo.labels.npz"))["labels"]
+
+    assert labels.shape == (3, 480, 640)
+    assert [t["scene"] for t in truth] == ["sim11"] * 3
+    for frame, image in zip(truth, labels, strict=True):
+        counts = np.bincount(image.ravel(), minlength=256)
+        assert all(o["pixels"] == counts[o["label"]] for o in frame["objects"])
+        assert all(counts[p["label"]] == p["pixels"] for p in frame["planes"])
+        assert {o["category"] for o in frame["objects"]} <= set(CATEGORIES)
+        assert all(0 < o["visible"] <= 1 for o in frame["objects"])
+
+
+def test_true_boxes_hold_the_points_of_their_object(recording: Path) -> None:
+    truth = json.loads(recording.with_name("demo.truth.json").read_text("utf-8"))[1]
+    world = make_scene("tabletop", np.random.default_rng(11), frames=3)
+    frame, labels = render_frame(world, 1, rng=np.random.default_rng(0), sensor=IDEAL)
+    for entry in truth["objects"]:
+        box = entry["box"]
+        mine = frame.xyz()[labels.reshape(-1) == entry["label"]] - box["center"]
+        local = mine @ rotation_from_quaternion(box["orientation"])
+        assert np.all(np.abs(local) < np.array(box["size"]) / 2 + 1e-3)
+        center = transform(world.path[1], np.array(box["center"]))
+        np.testing.assert_allclose(center, entry["center"], atol=1e-4)
+
+
+def digest(path: Path) -> str:
+    total = hashlib.sha256()
+    with path.open("rb") as stream:
+        for _, channel, message in make_reader(stream, validate_crcs=True).iter_messages():
+            total.update(channel.topic.encode() + message.data)
+            total.update(message.log_time.to_bytes(8, "little"))
+    return total.hexdigest()
+
+
+def test_same_seed_same_messages(tmp_path: Path) -> None:
+    """Fixtures are made anew on every machine: they must not drift."""
+    paths = [
+        simulate(tmp_path / name, scene="clutter", frames=2, seed=seed)
+        for name, seed in (("a", 3), ("b", 3), ("c", 4))
+    ]
+    first, again, other = (digest(path) for path in paths)
+
+    assert first == again
+    assert first != other
+    labels = [path.with_name(f"{path.stem}.labels.npz").read_bytes() for path in paths]
+    assert labels[0] == labels[1]
+
+
+def test_clouds_are_the_depth_image_in_space(tmp_path: Path) -> None:
+    image = simulate(tmp_path / "d", frames=1, seed=1)
+    cloud = simulate(tmp_path / "c", frames=1, seed=1, clouds=True)
+    depth = np.frombuffer(read(image)["/camera/depth/image_raw"][0].data, "<u2") / 1000
+    message = read(cloud)["/camera/depth/points"][0]
+    points = np.frombuffer(message.data, "<f4").reshape(-1, 4)
+
+    assert (message.height, message.width) == (480, 640)
+    assert np.array_equal(np.isnan(points[:, 2]), depth == 0)
+    np.testing.assert_allclose(np.nan_to_num(points[:, 2]), depth, atol=0.00051)
+
+
+def test_an_older_recording_is_replaced(tmp_path: Path) -> None:
+    for seed in (1, 2):
+        simulate(tmp_path / "bag", format="ros2", scene="empty", frames=1, seed=seed)
+
+    truth = json.loads((tmp_path / "bag.truth.json").read_text("utf-8"))
+    assert truth[0]["scene"] == "sim2"
+    assert not [p for p in tmp_path.iterdir() if p.name.startswith(".")]
+
+
+def test_a_place_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+
+    with pytest.raises(OutputError, match="cannot write"):
+        simulate(tmp_path / "file" / "demo.mcap", frames=1)
+
+
+# --- scanned meshes ------------------------------------------------------------------------------
+
+
+def test_real_meshes_stand_upright(real_data: Path) -> None:
+    """Wrongly stood meshes look like a weakness of the model."""
+    pytest.importorskip("open3d")
+    folder = real_data / "meshes"
+    for entry in json.loads((folder / "catalogue.json").read_text("utf-8")):
+        category = entry["category"]
+        mesh = uprighted(load_mesh(folder / entry["file"]), category)
+        x, y, z = (float(e) for e in mesh.extents)
+        fill = fill_ratio(mesh)
+        where = entry["file"]
+        assert upright_poses(mesh, category)[0].manner == "upright", where
+        if category == "plate":
+            assert z < 0.25 * min(x, y), where
+        if category == "bowl":
+            assert z < 0.65 * min(x, y), where
+        if category == "bottle":
+            assert z > 1.3 * max(x, y), where
+            assert fill < 0.75, where
+        if category == "can":
+            assert 0.7 < fill < 0.8, where
+        if category == "box":
+            assert fill > 0.8, where
