@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute
 
 from shapecat.arrays import F4
 from shapecat.config import TrackingSettings
@@ -50,6 +51,8 @@ def track_run(
 
 
 def _read_frames(folder: Path, categories: int) -> Iterator[FrameDetections]:
+    """Yield the detections of each frame, all of a stream in one and the same frame."""
+    fixed = _streams_with_poses(folder)
     groups = zip(
         read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns"]),
         read_row_groups(folder / "detections.parquet", _COLUMNS),
@@ -61,12 +64,14 @@ def _read_frames(folder: Path, categories: int) -> Iterator[FrameDetections]:
             by_frame.setdefault((row["topic"], row["frame"]), []).append(row)
         for frame in frames.to_pylist():
             rows = by_frame.get((frame["topic"], frame["frame"]), [])
+            column = "center_fixed" if frame["topic"] in fixed else "center"
+            rows = [row for row in rows if row[column] is not None]
             yield FrameDetections(
                 topic=frame["topic"],
                 frame=frame["frame"],
                 stamp_ns=frame["stamp_ns"],
                 detections=np.array([row["detection"] for row in rows], np.int32),
-                centers=_stack([row["center_fixed"] or row["center"] for row in rows], 3),
+                centers=_stack([row[column] for row in rows], 3),
                 sizes=_stack([row["size"] for row in rows], 3),
                 posteriors=_stack([row["posterior"] for row in rows], categories),
                 partial=np.array(
@@ -74,6 +79,19 @@ def _read_frames(folder: Path, categories: int) -> Iterator[FrameDetections]:
                 ),
                 novelties=np.array([row["novelty"] for row in rows], np.float32),
             )
+
+
+def _streams_with_poses(folder: Path) -> set[str]:
+    """Return the topics whose sensor has a pose in the fixed frame most of the time.
+
+    Their detections in frames without one cannot be placed, and are not tracked.
+    """
+    balance: Counter[str] = Counter()
+    for group in read_row_groups(folder / "frames.parquet", ["topic", "fixed_translation"]):
+        known = pa.compute.is_valid(group["fixed_translation"]).to_pylist()
+        for topic, has_pose in zip(group["topic"].to_pylist(), known, strict=True):
+            balance[topic] += 1 if has_pose else -1
+    return {topic for topic, count in balance.items() if count > 0}
 
 
 def _stack(rows: list[Any], width: int) -> F4:

@@ -1,3 +1,5 @@
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -28,7 +30,7 @@ class View(Record):
 
 
 def visible(points: F8, normals: F8, seed: int = 0, count: int = 900) -> View:
-    """The points whose surface faces the eye, thinned to ``count``, with 0.5 mm noise."""
+    """Return the points that face the eye, thinned to ``count``, with 0.5 mm noise."""
     rng = np.random.default_rng(seed)
     seen = np.flatnonzero(np.sum(normals * (EYE - points), axis=1) > 0)
     seen = rng.choice(seen, min(count, len(seen)), replace=False)
@@ -82,7 +84,7 @@ def box(seed: int = 0) -> View:
     return visible(np.concatenate(points), np.concatenate(normals), seed)
 
 
-SHAPES = {"ball": ball, "can": can, "box": box}
+SHAPES: dict[str, Callable[[int], View]] = {"ball": ball, "can": can, "box": box}
 
 
 def describe_view(view: View, eye: F4 = EYE) -> F4:
@@ -126,12 +128,12 @@ def test_every_number_can_change() -> None:
 def test_turning_about_z_and_moving_aside_change_nothing(
     shape: str, yaw: float, shift: tuple[float, float]
 ) -> None:
-    view = SHAPES[shape]()
+    view = SHAPES[shape](0)
     c, s = np.cos(yaw), np.sin(yaw)
     turn, move = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.array([*shift, 0])
 
     def moved(points: F4) -> F4:
-        return (points @ turn.T + move).astype(np.float32)
+        return np.asarray(points @ turn.T + move, np.float32)
 
     gas = NeuralGas(moved(view.gas.neurons), view.gas.edges)
     found = describe(moved(view.points), gas, moved(EYE))
@@ -142,7 +144,7 @@ def test_turning_about_z_and_moving_aside_change_nothing(
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("scale", [0.01, 4.0, 1000.0])
 def test_growing_about_the_origin_changes_the_metric_blocks_alone(shape: str, scale: float) -> None:
-    view = SHAPES[shape]()
+    view = SHAPES[shape](0)
     gas = NeuralGas(view.gas.neurons * np.float32(scale), view.gas.edges)
     found = describe(view.points * np.float32(scale), gas, EYE * np.float32(scale))
     expected = describe_view(view)
@@ -183,12 +185,12 @@ def flat(count: int) -> F4:
     return np.stack([u.ravel(), v.ravel(), 0 * u.ravel()], axis=1).astype(np.float32)
 
 
-LINE = np.linspace(0, 1, 50, dtype=np.float32)[:, None] * np.float32([1, 2, 3])
+LINE = np.linspace(0, 1, 50, dtype=np.float32)[:, None] * np.array([1, 2, 3], np.float32)
 ODD = {
     "level": flat(10),
     "upright": flat(10)[:, [0, 2, 1]],
     "line": LINE,
-    "vertical line": LINE * np.float32([0, 0, 1]),
+    "vertical line": LINE * np.array([0, 0, 1], np.float32),
     "one place": np.zeros((40, 3), np.float32),
     "one point": np.zeros((1, 3), np.float32),
     "two places": np.repeat(np.eye(2, 3, dtype=np.float32), 20, axis=0),
@@ -204,7 +206,7 @@ def test_every_number_is_finite(name: str, eye: tuple[float, float, float]) -> N
     points = ODD[name]
     chosen = points[:: max(1, len(points) // 12)]
     chosen = np.concatenate([chosen, chosen])[: max(2, len(chosen))]
-    chain = [[i, i + 1] for i in range(len(chosen) - 1)]
+    chain = np.array([[i, i + 1] for i in range(len(chosen) - 1)])
     for edges in (chain, chain[:1], np.zeros((0, 2))):
         found = describe(points, NeuralGas(chosen, edges), np.array(eye, np.float32))
         assert np.isfinite(found).all()
@@ -228,7 +230,7 @@ def test_every_number_is_finite_for_scattered_points(
 def test_points_the_graph_does_not_cover_are_left_out() -> None:
     """A dropped part of the object must not stretch its extents."""
     view = can()
-    crumbs = view.points[:20] + np.float32([1, 0, 0])
+    crumbs = view.points[:20] + np.array([1, 0, 0], np.float32)
     found = describe(np.concatenate([view.points, crumbs]), view.gas, EYE)
     np.testing.assert_allclose(found, describe_view(view), atol=0.02)
 
@@ -275,7 +277,10 @@ def test_geodesics_are_shortest_paths() -> None:
 def local_fit(view: View, radius: float) -> tuple[F4, F4]:
     x, y, z = (np.ascontiguousarray(axis) for axis in view.gas.neurons.T)
     points, starts = assign(np.ascontiguousarray(view.points.T), x, y, z, np.float32(1.0))
-    return fit_surfaces(points, starts, x, y, z, euclidean(x, y, z), np.float32(radius), EYE)
+    normals, curvatures = fit_surfaces(
+        points, starts, x, y, z, euclidean(x, y, z), np.float32(radius), EYE
+    )
+    return normals, curvatures
 
 
 def test_curvature_of_a_ball_and_of_the_inside_of_a_bowl() -> None:

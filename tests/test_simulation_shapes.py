@@ -33,13 +33,14 @@ def width_at(mesh: Mesh, low: float, high: float) -> float:
 def openness(mesh: Mesh) -> tuple[float, float]:
     """Return depth and diameter of an open thing: seen from above, and measured at its rim."""
     top = float(mesh.vertices[:, 2].max())
-    rim = mesh.vertices[mesh.vertices[:, 2] > top - 0.03 * mesh.extents[2] - 1e-4, :2]
+    rim = mesh.vertices[mesh.vertices[:, 2] > top - 0.01 * mesh.extents[2] - 1e-4, :2]
     far = 20.0
     camera = Camera(3, 3, 4000.0, 4000.0, 1.0, 1.0)  # the middle, a few millimetres
     middle = (rim.min(axis=0) + rim.max(axis=0)) / 2
     above = Pose(np.diag([1.0, -1.0, -1.0]), np.array([*middle, far]))
     floor = far - float(np.median(render(geometry([(mesh, HERE)]), camera, above).depth))
-    return top - floor, float(np.ptp(rim, axis=0).max())
+    angle = np.arange(24) * (np.pi / 24)
+    return top - floor, float(np.ptp(rim @ [np.cos(angle), np.sin(angle)], axis=0).max())
 
 
 @pytest.mark.parametrize("category", CATEGORIES)
@@ -48,7 +49,7 @@ def test_things_are_of_human_size_and_stand_on_the_ground(category: str) -> None
         assert abs(float(mesh.vertices[:, 2].min())) < 1e-6
         assert mesh.extents.min() > 0.005
         assert mesh.extents.max() < 0.4
-        assert 100 <= len(mesh.triangles) <= 6000
+        assert 20 <= len(mesh.triangles) <= 6000
         assert np.isfinite(mesh.vertices).all()
 
 

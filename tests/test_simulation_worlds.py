@@ -51,7 +51,9 @@ def test_things_do_not_interpenetrate(world: World) -> None:
     covers = [seen_from_above(*solid) for solid in solids]
     for i in range(len(world.things)):
         for j in range(i + 1, len(solids)):
-            apart = min(heights[i].max(), heights[j].max()) - max(heights[i].min(), heights[j].min())
+            apart = min(heights[i].max(), heights[j].max()) - max(
+                heights[i].min(), heights[j].min()
+            )
             if apart > 1e-4:
                 assert not np.any(covers[i] & covers[j]), (world.kind, i, j)
 

@@ -1,3 +1,5 @@
+from typing import Any, Literal, get_args
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -6,22 +8,22 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull
 
-from shapecat.arrays import F4
+from shapecat.arrays import F4, F8, I4
 from shapecat.config import SurfaceSettings
+from shapecat.jit import kernel
 from shapecat.surface import MIN_POINTS, reconstruct, voxelize
 from shapecat.surface.gas import MAX_NEURONS
-from shapecat.surface.growth import connect, empty_gas, grow_fritzke, index_mask
-from shapecat.surface.growth import Cloud as _Cloud
+from shapecat.surface.growth import Cloud, connect, empty_gas, grow_fritzke, index_mask
 from shapecat.surface.lanes import adapt, three_nearest, two_nearest
-from shapecat.jit import kernel
 from shapecat.types import NeuralGas
 
-METHODS = ("fritzke", "thesis")
+Method = Literal["fritzke", "thesis"]
+METHODS = get_args(Method)
 SMALL = SurfaceSettings(neurons=40, signals=2000)
 
 
 def half_sphere(count: int = 500, radius: float = 0.05, seed: int = 0) -> F4:
-    """The upper half of a sphere, evenly spread."""
+    """Return points on the upper half of a sphere."""
     rng = np.random.default_rng(seed)
     points = rng.normal(size=(count, 3))
     points[:, 2] = np.abs(points[:, 2])
@@ -29,15 +31,15 @@ def half_sphere(count: int = 500, radius: float = 0.05, seed: int = 0) -> F4:
     return points.astype(np.float32)
 
 
-def surface(method: str, **changes: int) -> SurfaceSettings:
-    return SurfaceSettings(**{"neurons": 40, "signals": 2000, "method": method, **changes})
+def surface(method: Method) -> SurfaceSettings:
+    return SurfaceSettings(neurons=40, signals=2000, method=method)
 
 
 def rng(seed: int = 0) -> np.random.Generator:
     return np.random.default_rng(seed)
 
 
-def gas_of(points: F4, method: str = "fritzke", seed: int = 0) -> NeuralGas:
+def gas_of(points: F4, method: Method = "fritzke", seed: int = 0) -> NeuralGas:
     gas = reconstruct(points, settings=surface(method), rng=rng(seed))
     assert gas is not None
     return gas
@@ -59,7 +61,7 @@ def test_voxels_average_their_points(
     cells: dict[tuple[int, ...], list[F4]] = {}
     for point in cloud:
         # the same arithmetic as the grid's: a point on a border may fall on either side
-        key = tuple(np.floor(np.float64(point) * (65536 / voxel_m)).astype(np.int64) >> 16)
+        key = tuple(np.rint(np.float64(point) * (65536 / voxel_m)).astype(np.int64) >> 16)
         cells.setdefault(key, []).append(point)
     expected = [np.mean(cells[key], 0) for key in sorted(cells)]
     found = voxelize(cloud, voxel_m=voxel_m)
@@ -106,7 +108,7 @@ def test_voxels_refuse_what_they_cannot_count(points: list[list[float]], voxel_m
 )
 @settings(deadline=None, max_examples=15)
 def test_every_graph_is_connected_and_within_the_points(
-    method: str, count: int, stretch: tuple[float, float, float], seed: int
+    method: Method, count: int, stretch: tuple[float, float, float], seed: int
 ) -> None:
     """Isolated neurons, separate parts, edges twice or reversed, neurons beside the object."""
     points = (rng(seed).uniform(-1, 1, (count, 3)) * stretch).astype(np.float32)
@@ -126,7 +128,7 @@ def test_every_graph_is_connected_and_within_the_points(
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_same_seed_same_graph(method: str) -> None:
+def test_same_seed_same_graph(method: Method) -> None:
     points = half_sphere()
     first, again, other = (gas_of(points, method, seed) for seed in (1, 1, 2))
     np.testing.assert_array_equal(first.neurons, again.neurons)
@@ -136,7 +138,7 @@ def test_same_seed_same_graph(method: str) -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("scale", [1e-3, 1e3])
-def test_thresholds_follow_the_scale_of_the_object(method: str, scale: float) -> None:
+def test_thresholds_follow_the_scale_of_the_object(method: Method, scale: float) -> None:
     """Thresholds in metres: a big object would get more neurons than a small one."""
     points = half_sphere()
     gas = gas_of(points, method)
@@ -147,7 +149,7 @@ def test_thresholds_follow_the_scale_of_the_object(method: str, scale: float) ->
 
 
 @pytest.mark.parametrize("method", METHODS)
-def test_neurons_lie_on_the_surface_evenly(method: str) -> None:
+def test_neurons_lie_on_the_surface_evenly(method: Method) -> None:
     gas = gas_of(half_sphere(1000), method)
     assert np.linalg.norm(gas.neurons, axis=1) == pytest.approx(0.05, rel=0.05)
     gaps = np.linalg.norm(gas.neurons[:, None] - gas.neurons, axis=2)
@@ -175,7 +177,7 @@ def test_no_surface_is_none() -> None:
 
 @pytest.mark.parametrize("method", METHODS)
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_point_that_is_not_finite_is_refused(method: str, value: float) -> None:
+def test_a_point_that_is_not_finite_is_refused(method: Method, value: float) -> None:
     """Kernels that reorder sums must never meet NaN; also not at a point that would be skipped."""
     points = half_sphere(3000)
     points[1, 2] = value
@@ -195,7 +197,7 @@ def test_a_small_separate_part_is_dropped_and_a_large_one_joined() -> None:
     body = half_sphere(600)
     crumb = half_sphere(60, 0.01, seed=1) + np.float32(0.5)
     assert np.ptp(gas_of(np.concatenate([body, crumb])).neurons[:, 0]) < 0.2
-    twin = half_sphere(600, seed=1) + np.float32([0.5, 0, 0])
+    twin = half_sphere(600, seed=1) + np.array([0.5, 0, 0], np.float32)
     assert np.ptp(gas_of(np.concatenate([body, twin])).neurons[:, 0]) > 0.4
 
 
@@ -211,7 +213,7 @@ def test_warm_start_follows_the_object() -> None:
     cold = gas_of(moved)
     assert after is not None
     assert len(after.neurons) == 40
-    out = np.linalg.norm(after.neurons - np.float32([0.004, 0, 0]), axis=1)
+    out = np.linalg.norm(after.neurons - np.array([0.004, 0, 0]), axis=1)
     assert out == pytest.approx(0.05, rel=0.06)
 
     def step(gas: NeuralGas) -> float:
@@ -224,7 +226,7 @@ def test_a_start_that_does_not_fit_is_replaced() -> None:
     points = half_sphere()
     cold = gas_of(points)
     nowhere = NeuralGas(cold.neurons + 50, cold.edges)
-    broken = NeuralGas(np.full((5, 3), np.nan), [[0, 9], [3, 3]])
+    broken = NeuralGas(np.full((5, 3), np.nan), np.array([[0, 9], [3, 3]]))
     for start in (nowhere, broken):
         gas = reconstruct(points, settings=SMALL, rng=rng(), start=start)
         assert gas is not None
@@ -245,7 +247,7 @@ def test_a_start_with_edges_to_nowhere_is_read_within_bounds() -> None:
 
 
 @kernel
-def _search(x: F4, y: F4, z: F4, sx: float, sy: float, sz: float):
+def _search(x: F4, y: F4, z: F4, sx: float, sy: float, sz: float) -> Any:
     mask = index_mask(x.size)
     return (
         two_nearest(x, y, z, x.size, sx, sy, sz, mask),
@@ -268,7 +270,7 @@ def test_vector_search_finds_the_nearest(size: int) -> None:
 
 
 @kernel
-def _adapt(x: F4, y: F4, z: F4, born, wins, row, winner, rates):
+def _adapt(x: F4, y: F4, z: F4, born: I4, wins: I4, row: int, winner: int, rates: F8) -> Any:
     return adapt(
         x, y, z, x.size, 1.0, 2.0, 3.0, born, row, 1 << 29, wins, winner, rates[0], rates[1]
     )
@@ -327,7 +329,7 @@ def _fritzke(points: F4, state: int, target: int, signals: int, interval: int) -
             error[f] /= 2
             error.append(error[q])
         error = [value * 0.9995 for value in error]
-    return NeuralGas(places, sorted(sorted(edge) for edge in age))
+    return NeuralGas(np.array(places), np.array(sorted(sorted(edge) for edge in age)))
 
 
 def test_the_kernel_is_the_published_algorithm() -> None:
@@ -337,7 +339,7 @@ def test_the_kernel_is_the_published_algorithm() -> None:
     gas.x[:2], gas.y[:2], gas.z[:2] = points[:2].T
     connect(gas, 0, 1)
     count = grow_fritzke(
-        _Cloud(*(np.ascontiguousarray(axis) for axis in points.T)),
+        Cloud(*(np.ascontiguousarray(axis) for axis in points.T)),
         np.uint64(7), gas, 2, 20, 600, 18, 0.1, 0.006, 10,
     )  # fmt: skip
     expected = _fritzke(points, 7, 20, 600, 18)

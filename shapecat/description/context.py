@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from shapecat.arrays import F4
+from shapecat.arrays import F4, F8
 from shapecat.jit import kernel
 
 __all__ = ["CONTEXT_NAMES", "PROFILE_NAMES", "PROFILE_SLICES", "context", "profile"]
@@ -163,18 +163,34 @@ def context(
     straight, paths : (k, k) distances between the neurons.
     eye : (3,) the sensor.
     """
-    count = x.size
-    n = 0
-    height = high - low
-    # extents; directions are counted from the line of sight, so that yaw does not matter
+    wide, across, along = _extents(points, high - low, eye, out[:5])
+    _spreads(x, y, z, weight, normals, out[5:12])
+    _harmonics(weight, normals, out[12:15])
+    level = np.zeros(x.size)
+    for i in range(x.size):
+        level[i] = (z[i] - low) / (high - low) if high > low else 0.5
+    _facing(level, weight, normals, out[15:20])
+    _axis(x, y, level, high - low, weight, normals, out[20:29])
+    residual, size, middle = _sphere(x, y, z, weight)
+    out[29] = min(residual, 1.0)
+    out[30] = 1.0 / (1.0 + size)
+    out[31] = min(max((middle - low) / max(high - low, 1e-3), -2.0), 3.0)
+    _heights(level, weight, curvatures, out[32:36])
+    _around(straight, paths, out[36:39])
+    out[39] = _ratio(max(low - base, 0.0), high - low)
+    return wide, across, along
+
+
+@kernel
+def _extents(points: F4, height: float, eye: F4, out: F4) -> tuple[float, float, float]:
+    """Compare height and widths; directions are counted from the line of sight, whatever the yaw."""
     ex, ey = eye[0], eye[1]
     length = np.sqrt(ex * ex + ey * ey)
     ex, ey = (ex / length, ey / length) if length > 1e-6 else (1.0, 0.0)
-    along = across = wide = mean_width = 0.0
+    along = across = wide = mean = 0.0
     narrow = np.inf
     for d in range(_DIRECTIONS):
-        angle = d * np.pi / _DIRECTIONS
-        c, s = np.cos(angle), np.sin(angle)
+        c, s = np.cos(d * np.pi / _DIRECTIONS), np.sin(d * np.pi / _DIRECTIONS)
         width = _width(
             points[0], points[1], np.float32(c * ex - s * ey), np.float32(s * ex + c * ey)
         )
@@ -182,124 +198,136 @@ def context(
         across = width if d == _DIRECTIONS // 2 else across
         wide = max(wide, width)
         narrow = min(narrow, width)
-        mean_width += width / _DIRECTIONS
-    out[n] = _ratio(height, across)
-    out[n + 1] = _ratio(along, across)
-    out[n + 2] = _ratio(height, wide)
-    out[n + 3] = _ratio(narrow, wide)
-    out[n + 4] = _ratio(mean_width, wide)
-    n += 5
-    # spread of the neurons and of the normals
-    spread = np.zeros((3, 3))
-    bend = np.zeros((3, 3))
-    for i in range(count):
+        mean += width / _DIRECTIONS
+    out[0] = _ratio(height, across)
+    out[1] = _ratio(along, across)
+    out[2] = _ratio(height, wide)
+    out[3] = _ratio(narrow, wide)
+    out[4] = _ratio(mean, wide)
+    return wide, across, along
+
+
+@kernel
+def _spreads(x: F4, y: F4, z: F4, weight: F4, normals: F4, out: F4) -> None:
+    """Compare the principal variances of the neurons and of the normals."""
+    spread, bend = np.zeros((3, 3)), np.zeros((3, 3))
+    for i in range(x.size):
         p = (x[i], y[i], z[i])
         for a in range(3):
             for b in range(3):
                 spread[a, b] += weight[i] * p[a] * p[b]
                 bend[a, b] += weight[i] * normals[a, i] * normals[b, i]
     values, vectors = np.linalg.eigh(spread)
-    out[n] = values[1] / max(values[2], 1e-9)
-    out[n + 1] = values[0] / max(values[2], 1e-9)
-    out[n + 2] = abs(vectors[2, 2])
-    out[n + 3] = abs(vectors[2, 0])
+    out[0] = values[1] / max(values[2], 1e-9)
+    out[1] = values[0] / max(values[2], 1e-9)
+    out[2] = abs(vectors[2, 2])
+    out[3] = abs(vectors[2, 0])
     values, vectors = np.linalg.eigh(bend)
-    out[n + 4] = values[1]
-    out[n + 5] = values[0]
-    out[n + 6] = abs(vectors[2, 0])
-    n += 7
-    # how the horizontal normals are spread over yaw: 4 is for boxes
+    out[4] = values[1]
+    out[5] = values[0]
+    out[6] = abs(vectors[2, 0])
+
+
+@kernel
+def _harmonics(weight: F4, normals: F4, out: F4) -> None:
+    """Tell how the horizontal normals spread over yaw: the fourth harmonic is for boxes."""
     total = 1e-6
-    harmonics = np.zeros((3, 2))
-    for i in range(count):
-        a, b = normals[0, i], normals[1, i]
-        flat = a * a + b * b
+    c, s = np.zeros(3), np.zeros(3)
+    for i in range(weight.size):
+        flat = normals[0, i] ** 2 + normals[1, i] ** 2
         if flat > 1e-6:
-            w = weight[i]
-            total += w * flat
-            c1, s1 = a / np.sqrt(flat), b / np.sqrt(flat)
+            w = weight[i] * flat
+            total += w
+            c1, s1 = normals[0, i] / np.sqrt(flat), normals[1, i] / np.sqrt(flat)
             c2, s2 = c1 * c1 - s1 * s1, 2 * s1 * c1
-            harmonics[0, 0] += w * flat * c1
-            harmonics[0, 1] += w * flat * s1
-            harmonics[1, 0] += w * flat * c2
-            harmonics[1, 1] += w * flat * s2
-            harmonics[2, 0] += w * flat * (c2 * c2 - s2 * s2)
-            harmonics[2, 1] += w * flat * 2 * s2 * c2
-    for a in range(3):
-        out[n + a] = np.sqrt(harmonics[a, 0] ** 2 + harmonics[a, 1] ** 2) / total
-    n += 3
-    # which way the surface looks, and where
+            c[0] += w * c1
+            s[0] += w * s1
+            c[1] += w * c2
+            s[1] += w * s2
+            c[2] += w * (c2 * c2 - s2 * s2)
+            s[2] += w * 2 * s2 * c2
+    for k in range(3):
+        out[k] = np.sqrt(c[k] * c[k] + s[k] * s[k]) / total
+
+
+@kernel
+def _facing(level: F8, weight: F4, normals: F4, out: F4) -> None:
+    """Tell how much of the surface looks up, sideways and down."""
+    for i in range(level.size):
+        w, up = weight[i], normals[2, i]
+        out[0] += w * (up > 0.8)
+        out[1] += w * (abs(up) < 0.4)
+        out[2] += w * (up < -0.25)
+        out[3] += w * (up > 0.7 and level[i] > 0.75)
+        out[4] += w * (up > 0.7 and level[i] < 0.3)
+
+
+@kernel
+def _axis(x: F4, y: F4, level: F8, height: float, weight: F4, normals: F4, out: F4) -> None:
+    """Compare the surface with one that turns about the vertical axis fitted to its normals."""
     cx, cy, residual = vertical_axis(x, y, normals, weight)
-    radius = radius2 = top = bottom = top_weight = bottom_weight = 0.0
-    slope_rz = mean_z = convex = 0.0
-    for i in range(count):
+    radius = radius2 = middle = 0.0
+    parts = np.zeros((2, 2))  # below and above half of the height: weight, radius
+    for i in range(x.size):
         w = weight[i]
-        level = (z[i] - low) / height if height > 0 else 0.5
-        up = normals[2, i]
-        out[n] += w * (up > 0.8)
-        out[n + 1] += w * (abs(up) < 0.4)
-        out[n + 2] += w * (up < -0.25)
-        out[n + 3] += w * (up > 0.7 and level > 0.75)
-        out[n + 4] += w * (up > 0.7 and level < 0.3)
         rx, ry = x[i] - cx, y[i] - cy
         r = np.sqrt(rx * rx + ry * ry)
         flat = np.sqrt(normals[0, i] ** 2 + normals[1, i] ** 2)
-        inward = w if rx * normals[0, i] + ry * normals[1, i] < 0 and flat > 0.3 else 0.0
-        out[n + 8] += inward
-        if level > 0.5:
-            out[n + 9] += inward
-            top += w * r
-            top_weight += w
-        else:
-            out[n + 10] += inward
-            bottom += w * r
-            bottom_weight += w
+        half = 1 if level[i] > 0.5 else 0
+        parts[half, 0] += w
+        parts[half, 1] += w * r
+        if flat > 0.3 and rx * normals[0, i] + ry * normals[1, i] < 0:
+            out[3] += w
+            out[5 - half] += w
         radius += w * r
         radius2 += w * r * r
-        mean_z += w * level
-        convex += w * (curvatures[0, i] + curvatures[1, i] > 0)
-    second = third = 0.0
-    for i in range(count):
-        level = (z[i] - low) / height if height > 0 else 0.5
+        middle += w * level[i]
+    slope = spread = 0.0
+    for i in range(x.size):
         r = np.sqrt((x[i] - cx) ** 2 + (y[i] - cy) ** 2)
-        slope_rz += weight[i] * (level - mean_z) * (r - radius)
-        second += weight[i] * (level - mean_z) ** 2
-        third += weight[i] * (level - mean_z) ** 3
-    out[n + 5] = _ratio(radius, height)
-    out[n + 6] = np.sqrt(max(radius2 - radius * radius, 0.0)) / max(radius, 1e-6)
-    out[n + 7] = min(residual / max(radius, 1e-6), 2.0)
-    out[n + 11] = _ratio(top / max(top_weight, 1e-6), radius)
-    out[n + 12] = _ratio(bottom / max(bottom_weight, 1e-6), radius)
-    out[n + 13] = slope_rz / max(second, 1e-4) / max(radius, 1e-6)
-    n += 14
-    residual, size, middle = _sphere(x, y, z, weight)
-    out[n] = min(residual, 1.0)
-    out[n + 1] = 1.0 / (1.0 + size)
-    out[n + 2] = min(max((middle - low) / max(height, 1e-3), -2.0), 3.0)
-    n += 3
-    out[n] = mean_z
-    out[n + 1] = np.sqrt(second)
-    out[n + 2] = third / max(second**1.5, 1e-6)
-    out[n + 3] = convex
-    n += 4
-    # how far it is around the surface
-    sum_paths = sum_straight = longest = 0.0
-    least, most = np.inf, 0.0
+        slope += weight[i] * (level[i] - middle) * (r - radius)
+        spread += weight[i] * (level[i] - middle) ** 2
+    out[0] = _ratio(radius, height)
+    out[1] = np.sqrt(max(radius2 - radius * radius, 0.0)) / max(radius, 1e-6)
+    out[2] = min(residual / max(radius, 1e-6), 2.0)
+    out[6] = _ratio(parts[1, 1] / max(parts[1, 0], 1e-6), radius)
+    out[7] = _ratio(parts[0, 1] / max(parts[0, 0], 1e-6), radius)
+    out[8] = slope / max(spread, 1e-4) / max(radius, 1e-6)
+
+
+@kernel
+def _heights(level: F8, weight: F4, curvatures: F4, out: F4) -> None:
+    """Write mean, deviation and skew of the height, and the share that bulges."""
+    mean = second = third = 0.0
+    for i in range(level.size):
+        mean += weight[i] * level[i]
+        out[3] += weight[i] * (curvatures[0, i] + curvatures[1, i] > 0)
+    for i in range(level.size):
+        off = level[i] - mean
+        second += weight[i] * off * off
+        third += weight[i] * off * off * off
+    out[0] = mean
+    out[1] = np.sqrt(second)
+    out[2] = third / max(second**1.5, 1e-6)
+
+
+@kernel
+def _around(straight: F4, paths: F4, out: F4) -> None:
+    """Compare distances along the surface with straight ones."""
+    count = paths.shape[0]
+    total = direct = longest = most = 0.0
+    least = np.inf
     for i in range(count):
         row = 0.0
         for j in range(count):
             row += paths[i, j]
-            sum_straight += straight[i, j]
+            direct += straight[i, j]
             longest = max(longest, paths[i, j])
-        sum_paths += row
+        total += row
         least, most = min(least, row), max(most, row)
-    pairs = max(count * (count - 1), 1)
-    out[n] = min(sum_paths / max(sum_straight, 1e-9), 4.0)
-    out[n + 1] = longest / max(sum_paths / pairs, 1e-9)
-    out[n + 2] = _ratio(least, most)
-    n += 3
-    out[n] = _ratio(max(low - base, 0.0), height)
-    return wide, across, along
+    out[0] = min(total / max(direct, 1e-9), 4.0)
+    out[1] = longest / max(total / (count * (count - 1)), 1e-9)
+    out[2] = _ratio(least, most)
 
 
 @kernel

@@ -80,7 +80,16 @@ DESCRIPTOR_NAMES: tuple[str, ...] = tuple(
     f"{block}.{name}" for block, names in _BLOCK_NAMES.items() for name in names
 )
 """The name of each number, ``block.name``."""
-_STARTS = tuple(part.start for part in BLOCKS.values())
+# kernels read numbers, not dictionaries
+_CONTEXT, _CURVED, _UP = (BLOCKS[name].start for name in ("context", "curvature", "up"))
+_RING_PATHS, _RING_STRAIGHT, _RING_CURVED = (
+    BLOCKS[f"ring_{name}"].start for name in ("geodesic", "euclid", "curvature")
+)
+_BAND_PATHS, _BAND_STRAIGHT, _BAND_CURVED = (
+    BLOCKS[f"band_{name}"].start for name in ("geodesic", "euclid", "curvature")
+)
+_PROFILE, _REVOLUTION = BLOCKS["profile"].start, BLOCKS["revolution"].start
+_METRIC, _VIEW = BLOCKS["metric"].start, BLOCKS["view"].start
 
 
 def describe(points: F4, gas: NeuralGas, eye: F4) -> F4:
@@ -132,7 +141,7 @@ def describe(points: F4, gas: NeuralGas, eye: F4) -> F4:
 @kernel
 def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
     """Write the descriptor; return whether the input was finite."""
-    if not (_finite(neurons) and _finite(points) and abs(eye).max() < np.inf):
+    if not (_finite(neurons) and _finite(points) and _finite(eye.reshape(1, 3))):
         return False
     count = neurons.shape[0]
     x, y, z, straight, middle, unit = _own_units(neurons)
@@ -167,31 +176,18 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
     )
     low, high = _height_range(cloud[2])
     wide, across, along = context(
-        cloud,
-        x,
-        y,
-        z,
-        -middle[2] / unit,
-        weight,
-        normals,
-        curvatures,
-        straight,
-        paths,
-        place,
-        low,
-        high,
-        out[_STARTS[0] : _STARTS[1]],
-    )
+        cloud, x, y, z, -middle[2] / unit, weight, normals, curvatures, straight, paths, place,
+        low, high, out[_CONTEXT:_CURVED],
+    )  # fmt: skip
     _distributions(z, straight, paths, weight, normals, curvatures, out)
-    profile(x, y, z, weight, normals, curvatures, low, high, out[_STARTS[9] : _STARTS[10]])
-    revolution(x, y, z, weight, normals, out[_STARTS[10] : _STARTS[11]])
-    at = _STARTS[11]
-    out[at] = (high - low) * unit
-    out[at + 1] = low * unit + middle[2]
-    out[at + 2], out[at + 3], out[at + 4] = wide * unit, across * unit, along * unit
-    out[at + 5] = gap * unit
-    out[_STARTS[12]] = (eye[2] - middle[2]) / away if away > 0 else 0.0
-    out[_STARTS[12] + 1] = away
+    profile(x, y, z, weight, normals, curvatures, low, high, out[_PROFILE:_REVOLUTION])
+    revolution(x, y, z, weight, normals, out[_REVOLUTION:_METRIC])
+    out[_METRIC] = (high - low) * unit
+    out[_METRIC + 1] = low * unit + middle[2]
+    out[_METRIC + 2], out[_METRIC + 3], out[_METRIC + 4] = wide * unit, across * unit, along * unit
+    out[_METRIC + 5] = gap * unit
+    out[_VIEW] = (eye[2] - middle[2]) / away if away > 0 else 0.0
+    out[_VIEW + 1] = away
     return True
 
 
@@ -305,14 +301,16 @@ def _distributions(
             row[2 + _CURVATURE + _DISTANCE_BINS + k] += f
         first, second = curvatures[0, i], curvatures[1, i]
         _curvature_row(row, first, second)
-    curvature = out[_STARTS[1] : _STARTS[2]]
-    up = out[_STARTS[2] : _STARTS[3]]
+    curvature = out[_CURVED:_UP]
+    up = out[_UP:_RING_PATHS]
     for i in range(count):
         for k in range(_CURVATURE):
             curvature[k] += weight[i] * rows[i, 1 + k]
         _count(up, 0, _UP_BINS, (normals[2, i] + 1) / 2, weight[i])
-    _partition(rows, mean_path, weight, _RINGS, out, _STARTS[3], _STARTS[4], _STARTS[5])
-    _partition(rows, z.astype(np.float64), weight, _BANDS, out, _STARTS[6], _STARTS[7], _STARTS[8])
+    _partition(rows, mean_path, weight, _RINGS, out, _RING_PATHS, _RING_STRAIGHT, _RING_CURVED)
+    _partition(
+        rows, z.astype(np.float64), weight, _BANDS, out, _BAND_PATHS, _BAND_STRAIGHT, _BAND_CURVED
+    )
 
 
 @kernel

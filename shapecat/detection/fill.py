@@ -9,7 +9,7 @@ from shapecat.jit import kernel
 
 __all__ = ["FRINGE", "fill_enclosed", "grow_feet"]
 
-FRINGE = 0.45
+FRINGE = 0.6
 """Share of the least height from which a reading next to an object belongs to it."""
 FEET_CELLS = 4
 MOST_CELLS = 4000

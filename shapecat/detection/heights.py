@@ -13,9 +13,9 @@ from shapecat.jit import kernel
 
 __all__ = ["LEAST_M", "NOISE", "Heights", "clear_walls", "heights_of", "inside", "table_of"]
 
-LEAST_M = 0.006
+LEAST_M = 0.004
 """Lowest height of an object cell, to which `NOISE` times the squared range is added."""
-NOISE = 0.004
+NOISE = 0.003
 WALL_JUMP = 0.012
 """Cells this far in front of a wall, in inverse depth, are still the wall."""
 

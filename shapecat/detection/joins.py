@@ -37,6 +37,8 @@ FEW = 3
 SAME_TOP_M = 0.015
 SAME_SIDE_M, SAME_SIDE = 0.012, 0.25
 HOLLOW = -0.25
+BENT, INSIDE, INSIDE_SHARE = -0.15, -0.4, 0.12
+FLOOR_SHARE = 0.6
 CUT_SIDE = 0.6
 LID_M, LID = 0.02, 0.25
 COPLANAR_M, COPLANAR = 0.006, 0.05
@@ -53,6 +55,8 @@ def join_pieces(
         _join_small(pieces, cells.small)
     if "occluder" in rules:
         _join_behind(pieces, cells.w, cells.lens, surfaces.normal, labels)
+    if "hollow" in rules:
+        _join_hollow(pieces)
     if "rim" in rules:
         _join_rims(pieces)
     if "float" in rules:
@@ -184,6 +188,60 @@ def _positions(samples: I4, w: F4, lens: Lens, normal: F4, columns: int, out: F4
 
 
 @kernel
+def _slope(row: F4) -> float:
+    """Return by how much the lateral normal changes across a piece: 2 for a whole cylinder seen
+    from outside, -2 from inside, 0 for a plane."""
+    spread = row[SIDE2] - row[SIDE] * row[SIDE] / row[COUNT]
+    slope = (row[SIDETURN] - row[SIDE] * row[TURN] / row[COUNT]) / max(spread, 1e-9)
+    return slope * (row[RIGHTMOST] - row[LEFT])
+
+
+@kernel
+def _join_hollow(pieces: Pieces) -> None:
+    """The walls and the floor inside a container meet in concave edges and are one."""
+    n = pieces.group.size
+    again = True
+    while again:
+        again = False
+        for p in range(1, n):
+            for q in range(1, n):
+                if (
+                    p != q
+                    and _alive(pieces, p)
+                    and _alive(pieces, q)
+                    and pieces.owner[p] == pieces.owner[q]
+                    and (_is_inside(pieces, p, q) or _is_floor(pieces, p, q))
+                ):
+                    merge(pieces, p, q)
+                    again = True
+
+
+@kernel
+def _is_inside(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether two pieces that touch are walls facing each other."""
+    if pieces.shape[p, COUNT] < pieces.shape[q, COUNT]:
+        return False
+    contact = pieces.pairs[CONTACT, p, q]
+    if contact < max(FEW, INSIDE_SHARE * min(pieces.boundary[p], pieces.boundary[q])):
+        return False
+    a, b = pieces.shape[p], pieces.shape[q]
+    if _slope(a) > BENT or _slope(b) > BENT:
+        return False
+    both = a + b
+    both[LEFT], both[RIGHTMOST] = min(a[LEFT], b[LEFT]), max(a[RIGHTMOST], b[RIGHTMOST])
+    return _slope(both) < INSIDE
+
+
+@kernel
+def _is_floor(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether ``q`` lies within the hollow piece ``p`` and lower."""
+    if pieces.shape[q, TOP] > pieces.shape[p, TOP] or _slope(pieces.shape[p]) > HOLLOW:
+        return False
+    shared = pieces.pairs[CONTACT, p, q] + pieces.pairs[FRONT, p, q]
+    return shared > FLOOR_SHARE * pieces.boundary[q] and pieces.pairs[CONTACT, p, q] >= FEW
+
+
+@kernel
 def _join_rims(pieces: Pieces) -> None:
     """The far inside wall of a container belongs to its outside."""
     n = pieces.group.size
@@ -215,9 +273,7 @@ def _is_container(pieces: Pieces, inside: int, outside: int) -> bool:
     slack = max(SAME_SIDE_M, (CUT_SIDE if cut else SAME_SIDE) * width)
     if x[LEFT] < a[LEFT] - slack or x[RIGHTMOST] > a[RIGHTMOST] + slack:
         return False
-    spread = x[SIDE2] - x[SIDE] * x[SIDE] / x[COUNT]
-    slope = (x[SIDETURN] - x[SIDE] * x[TURN] / x[COUNT]) / max(spread, 1e-9)
-    if slope * inner > HOLLOW:
+    if _slope(x) > HOLLOW:
         return False
     return not (_has_lid(pieces, outside) or _has_lid(pieces, inside))
 

@@ -184,16 +184,17 @@ def _sample(w: F4) -> tuple[F4, int]:
 
 
 def _triples(sample: F4, rng: np.random.Generator) -> I4:
-    """Return (TRIALS, 3, 2) positions: a reading, and two places at a random distance from it."""
+    """Return (2 TRIALS, 3, 2) positions: a reading and two places near it, or three readings."""
     readings = np.flatnonzero(sample)
     if readings.size == 0:
         return np.zeros((0, 3, 2), np.int64)
     size = np.array(sample.shape)
-    chosen = readings[rng.integers(0, readings.size, (TRIALS, 1))]
-    first = np.stack(np.divmod(chosen, size[1]), axis=-1)
-    radius = rng.uniform(0.05, 0.5, (TRIALS, 1, 1)) * size.max()
-    others = first + np.rint(rng.uniform(-1, 1, (TRIALS, 2, 2)) * radius).astype(np.int64)
-    return np.concatenate([first, np.clip(others, 0, size - 1)], axis=1)
+    chosen = readings[rng.integers(0, readings.size, (2 * TRIALS, 3))]
+    triples = np.stack(np.divmod(chosen, size[1]), axis=-1)
+    radius = rng.uniform(0.05, 0.3, (TRIALS, 1, 1)) * size.max()
+    near = np.rint(rng.uniform(-1, 1, (TRIALS, 2, 2)) * radius).astype(np.int64)
+    triples[:TRIALS, 1:] = np.clip(triples[:TRIALS, :1] + near, 0, size - 1)
+    return triples
 
 
 def _normal(plane: F8, lens: Lens) -> F8:

@@ -11,7 +11,7 @@ __all__ = ["regions_of"]
 
 EDGE_DEG = 34
 """Concave angle that may part two objects; a bowl of 7 cm turns 16 degrees over the same cells."""
-WEAK_DEG = 34
+WEAK_DEG = 20
 RIDGE, RIDGE_CELLS = 0.5, 5
 LEAST_CELLS = 12
 MOST_REGIONS = 250

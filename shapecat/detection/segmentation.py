@@ -23,7 +23,7 @@ from shapecat.detection.surfaces import surfaces_of
 
 __all__ = ["RULES", "Segmentation", "segment"]
 
-RULES = ("concave", "small", "occluder", "rim", "float", "enclosed", "feet", "fill")
+RULES = ("concave", "small", "occluder", "hollow", "rim", "float", "enclosed", "feet", "fill")
 """The rules beyond the thesis, in their order. Without any of them what remains is the plane, the
 height above it, and depth jumps."""
 

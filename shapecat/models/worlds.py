@@ -20,13 +20,13 @@ from shapecat.models.fragments import cut_fragment, cut_halo
 from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.mesh import Mesh, moved, rounded_box, standing
 from shapecat.simulation.paths import looking_at
-from shapecat.simulation.placement import choose_rest, rests, turn_about_z
+from shapecat.simulation.placement import Rest, choose_rest, rests, turn_about_z
 from shapecat.simulation.render import Geometry, geometry, render
 from shapecat.simulation.sensors import KINECT, REALSENSE, measure
 from shapecat.simulation.shapes import make_object
 from shapecat.types import CATEGORIES, Camera, Frame, Pose, Scene
 
-__all__ = ["World", "WorldView", "simulate_views", "simulate_world"]
+__all__ = ["World", "WorldView", "simulate_mesh", "simulate_views", "simulate_world"]
 
 _FEWEST_PIXELS = 80
 _LEAST_VISIBLE = 0.3
@@ -76,6 +76,7 @@ class WorldView(NamedTuple):
     manner: str
     source: str
     visible: float
+    sensor: str
 
 
 class _Actor(NamedTuple):
@@ -94,6 +95,7 @@ class _Shot(NamedTuple):
     owners: I4
     visible: F8
     table_from_camera: Pose
+    sensor: str
 
 
 def simulate_views(world: World, numbers: Sequence[int], *, jobs: int = 1) -> Iterator[WorldView]:
@@ -111,17 +113,31 @@ def simulate_views(world: World, numbers: Sequence[int], *, jobs: int = 1) -> It
 def simulate_world(world: World, number: int) -> list[WorldView]:
     """Simulate one table, look at it from several places, and describe what is seen."""
     rng = np.random.default_rng((world.seed, number))
-    actors = _populate(world, rng)
+    return look(_populate(world, rng), f"{world.seed}/{number}", cameras=world.cameras, rng=rng)
+
+
+def simulate_mesh(
+    mesh: Mesh, label: str, name: str, rest: Rest, *, cameras: int, rng: np.random.Generator
+) -> list[WorldView]:
+    """Look at one given object, alone on the table, from several places."""
+    actor = _Actor(moved(mesh, rest.pose), label, rest.manner, 0.0)
+    return look([_placed(actor, (0.0, 0.0), 0.0, rng)], name, cameras=cameras, rng=rng)
+
+
+def look(
+    actors: Sequence[_Actor], name: str, *, cameras: int, rng: np.random.Generator
+) -> list[WorldView]:
+    """Describe the objects on a table as seen from several places."""
     table = rounded_box(_TABLE_M)
     below = Pose(np.eye(3), np.array([0.0, 0.0, -_TABLE_M[2]]))
     seen = geometry([*((actor.mesh, IDENTITY) for actor in actors), (table, below)])
     views: list[WorldView] = []
-    for _ in range(world.cameras):
+    for _ in range(cameras):
         shot = _shoot(seen, actors, rng)
-        scene = _detect(shot.frame, rng)
+        scene = detect(shot.frame, up=None, settings=_SETTINGS.detection, rng=rng)
         for k, actor in enumerate(actors):
             if shot.visible[k] >= _LEAST_VISIBLE:
-                views += _views_of(shot, scene, k, actor, f"{world.seed}/{number}/{k}", rng)
+                views += _views_of(shot, scene, k, actor, f"{name}/{k}", rng)
     return views
 
 
@@ -190,7 +206,7 @@ def _free_spot(
 
 def _shoot(seen: Geometry, actors: Sequence[_Actor], rng: np.random.Generator) -> _Shot:
     """Look at the table from somewhere with one of the sensors, better or worse than usual."""
-    sensor = (KINECT, REALSENSE)[rng.integers(2)]
+    name, sensor = (("kinect", KINECT), ("realsense", REALSENSE))[rng.integers(2)]
     worse = float(rng.uniform(0.5, 1.3))
     sensor = replace(sensor, noise=sensor.noise * worse, wave=sensor.wave * worse)
     camera, pose = sensor.camera, _viewpoint(actors, rng)
@@ -198,7 +214,7 @@ def _shoot(seen: Geometry, actors: Sequence[_Actor], rng: np.random.Generator) -
     depth, owners = measure(image, sensor, rng)
     visible = _visible_shares(seen, owners, camera, pose, len(actors))
     frame = Frame("/camera", 0, 0, 0, "camera", depth=depth, camera=camera)
-    return _Shot(frame, owners, visible, pose)
+    return _Shot(frame, owners, visible, pose, name)
 
 
 def _viewpoint(actors: Sequence[_Actor], rng: np.random.Generator) -> Pose:
@@ -239,10 +255,6 @@ def _visible_shares(seen: Geometry, owners: I4, camera: Camera, pose: Pose, coun
     return result
 
 
-def _detect(frame: Frame, rng: np.random.Generator) -> Scene:
-    return detect(frame, up=None, settings=_SETTINGS.detection, rng=rng)
-
-
 # --- the views ---------------------------------------------------------------------------------
 
 
@@ -256,11 +268,11 @@ def _views_of(
     else:
         view, source = cut_halo(_cut_by_truth(shot, k, actor, rng), rng), "truth"
     view = View(view.points, view.eye, actor.label, instance)
-    described = [_described(view, source, actor, shot.visible[k], rng)]
+    described = [_described(view, source, actor, shot, k, rng)]
     if rng.random() < _FRAGMENTS:
         piece = cut_fragment(view, rng)
         if piece is not None:
-            described.append(_described(piece, "fragment", actor, shot.visible[k], rng))
+            described.append(_described(piece, "fragment", actor, shot, k, rng))
     return [item for item in described if item is not None]
 
 
@@ -299,7 +311,7 @@ def _centre(actor: _Actor) -> F8:
 
 
 def _described(
-    view: View, source: str, actor: _Actor, visible: float, rng: np.random.Generator
+    view: View, source: str, actor: _Actor, shot: _Shot, k: int, rng: np.random.Generator
 ) -> WorldView | None:
     described = describe_view(view, settings=_SETTINGS, rng=rng)
     if described is None:
@@ -313,5 +325,6 @@ def _described(
         seconds=described.seconds,
         manner=actor.manner,
         source=source,
-        visible=float(visible),
+        visible=float(shot.visible[k]),
+        sensor=shot.sensor,
     )

@@ -3,8 +3,9 @@
 Everything comes from a seed and is the same on every machine.
 """
 
+from shapecat.simulation.layout import make_piece
 from shapecat.simulation.recorder import record, simulate
-from shapecat.simulation.scenes import make_scene, resting_thing
+from shapecat.simulation.scenes import make_scene
 from shapecat.simulation.sensors import IDEAL, KINECT, REALSENSE, Sensor, measure
 from shapecat.simulation.views import render_frame
 from shapecat.simulation.worlds import Support, Thing, World
@@ -17,10 +18,10 @@ __all__ = [
     "Support",
     "Thing",
     "World",
+    "make_piece",
     "make_scene",
     "measure",
     "record",
     "render_frame",
-    "resting_thing",
     "simulate",
 ]

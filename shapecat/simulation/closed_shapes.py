@@ -135,7 +135,7 @@ def make_bottle(rng: Generator) -> Mesh:
         "spray": (log_uniform(rng, 0.12, 0.26), rng.uniform(0.2, 0.36), 1.0),
         "cleanser": (log_uniform(rng, 0.17, 0.32), rng.uniform(0.26, 0.42), rng.uniform(0.55, 1)),
         "squeeze": (log_uniform(rng, 0.12, 0.24), rng.uniform(0.26, 0.42), rng.uniform(0.6, 1.0)),
-        "slim": (log_uniform(rng, 0.07, 0.16), rng.uniform(0.17, 0.32), rng.uniform(0.6, 1.0)),
+        "slim": (log_uniform(rng, 0.07, 0.18), rng.uniform(0.15, 0.32), rng.uniform(0.6, 1.0)),
         "pump": (log_uniform(rng, 0.13, 0.2), rng.uniform(0.4, 0.6), rng.uniform(0.6, 1.0)),
         "trigger": (log_uniform(rng, 0.16, 0.24), rng.uniform(0.4, 0.55), rng.uniform(0.5, 0.9)),
     }[str(family)]
@@ -156,6 +156,8 @@ def make_bottle(rng: Generator) -> Mesh:
     square = rng.uniform(3, 6) if rng.random() < 0.15 else rng.uniform(2.0, 2.6)
     mesh = lathe(profile * [radius, height], segments=40, squareness=square if stretch < 1 else 2.0)
     mesh = _flattened(mesh, stretch, height * body, height * (body + shoulder), neck)
+    if family in {"shampoo", "cleanser", "squeeze"} and rng.random() < 0.3:
+        mesh = _bent(mesh, rng.uniform(0.3, 0.7) * radius, 0.7 * height * body, height)
     if family == "pump":
         mesh = join([mesh, *_pump(rng, radius * neck, height)])
     if family == "trigger":
@@ -182,9 +184,10 @@ def _bottle(rng: Generator, side: F8, shoulder: float, neck: float, *, tip: bool
     fall = {"round": 1 - np.sqrt(1 - t**2 * 0.999), "cone": t, "bell": t * t * (3 - 2 * t)}[
         str(shape)
     ]
+    shoulder = min(shoulder, 0.94 - start)
     slope = np.stack([width + (neck - width) * fall, start + shoulder * t], -1)
     low = start + shoulder
-    cap = rng.uniform(0.02, min(0.12, 0.6 * (1 - low)))
+    cap = rng.uniform(0.02, max(0.025, min(0.12, 0.6 * (1 - low))))
     wide = min(neck * rng.uniform(1.0, 1.25), 0.62)
     top = wide * (rng.uniform(0.25, 0.6) if tip else rng.uniform(0.9, 1.0))
     step = 1 - low if tip or rng.random() < 0.3 else cap
@@ -204,6 +207,14 @@ def _flattened(mesh: Mesh, stretch: float, low: float, high: float, neck: float)
         points * np.column_stack([np.ones_like(factor), factor, np.ones_like(factor)]),
         mesh.triangles,
     )
+
+
+def _bent(mesh: Mesh, shift: float, low: float, high: float) -> Mesh:
+    """Move the neck to one side, as on bottles one pours from."""
+    points = np.array(mesh.vertices, np.float64)
+    t = np.clip((points[:, 2] - low) / (high - low), 0, 1)
+    points[:, 0] += shift * t * t * (3 - 2 * t)
+    return Mesh(points, mesh.triangles)
 
 
 def _pump(rng: Generator, radius: float, height: float) -> list[Mesh]:

@@ -210,6 +210,7 @@ def rounded_box(size: ArrayLike, *, radius: float = 0.0, bulge: float = 0.0, fin
     """
     half = np.asarray(size, np.float64) / 2
     radius = min(radius, 0.45 * float(half.min()))
+    radius = radius if radius > 2e-4 else 0.0  # sharp
     sides = []
     for axis in range(3):
         a, b = (axis + 1) % 3, (axis + 2) % 3

@@ -37,10 +37,12 @@ def make_cup(rng: Generator) -> Mesh:
     diameter = (
         log_uniform(rng, 0.045, 0.07) if family == "espresso" else log_uniform(rng, 0.06, 0.115)
     )
-    height = ratio * diameter
-    wall = rng.uniform(0.0015, 0.006)
+    diameter = min(diameter, 0.2 / ratio)
+    wall = rng.uniform(0.0015, 0.006) * min(1.0, diameter / 0.06)
+    floor, foot = wall * rng.uniform(1, 2.5), _foot(rng, 0.3, 0.004)
+    height = ratio * diameter + floor + foot[1]
     outer = _wall(shares, diameter / 2, height, power=rng.uniform(0.8, 1.2))
-    profile = _hollow(outer, wall, floor=wall * rng.uniform(1, 2.5), foot=_foot(rng, 0.3, 0.004))
+    profile = _hollow(outer, wall, floor=floor, foot=foot)
     section = _section(rng, oval=0.03, square=0.05, facets=0.06)
     body = lathe(profile, **section)
     handle = {
@@ -194,7 +196,7 @@ def _handle_shape(rng: Generator, diameter: float, height: float) -> tuple[F8, f
     curve = np.array(curves[int(rng.integers(len(curves)))]) * [reach, tall]
     radius = float(np.clip(diameter * rng.uniform(0.045, 0.085), 0.003, 0.01))
     lifted = height * rng.uniform(-0.02, 0.08)
-    curve[:, 1] += min(lifted, 0.47 * height - radius - curve[:, 1].max())
+    curve[:, 1] += min(lifted, 0.43 * height - radius - curve[:, 1].max())
     return smooth_path(curve, 16), radius, rng.uniform(0.8, 1.8)
 
 

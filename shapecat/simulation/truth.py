@@ -105,7 +105,7 @@ def _thing_truth(
 
 
 def _rounded(values: F8) -> list[float]:
-    return [round(float(value), 6) for value in values]
+    return [round(float(value), 5) for value in values]
 
 
 def robot_links(world_from_camera: Pose) -> list[tuple[str, str, Pose]]:

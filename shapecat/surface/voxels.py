@@ -66,7 +66,7 @@ def _voxelize(points: F4, voxel: float) -> tuple[F4, bool]:
     fixed = np.zeros((count, 3), np.int64)
     for i in range(count):
         for axis in range(3):
-            value = np.floor(points[i, axis] * scale)
+            value = np.rint(points[i, axis] * scale)
             if not abs(value) < limit:  # also true for NaN
                 return np.zeros((0, 3), np.float32), False
             fixed[i, axis] = np.int64(value)
@@ -105,10 +105,9 @@ def _voxelize(points: F4, voxel: float) -> tuple[F4, bool]:
             total_z += sums[run, 2]
             members += sums[run, 3]
             i += 1
-        # Half a unit makes up for rounding down.
-        result[found, 0] = (total_x / members + 0.5) / scale
-        result[found, 1] = (total_y / members + 0.5) / scale
-        result[found, 2] = (total_z / members + 0.5) / scale
+        result[found, 0] = total_x / members / scale
+        result[found, 1] = total_y / members / scale
+        result[found, 2] = total_z / members / scale
         found += 1
     return result[:found].copy(), True
 

@@ -1,0 +1,74 @@
+"""What things stand on: floors, tables, shelves, walls."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.random import Generator
+
+from shapecat.simulation.mesh import extrude, moved, rounded_box
+from shapecat.simulation.worlds import Support
+from shapecat.types import Pose
+
+__all__ = ["make_room", "make_shelf", "make_table", "round_table"]
+
+FLOOR, TABLE, BOARD, SIDE, BACK, WALL = 1, 2, 2, 7, 8, 9
+"""Pixel labels; the boards of a shelf count up from `BOARD`."""
+
+
+def make_room(rng: Generator, *, wall_chance: float) -> list[Support]:
+    """Return a floor, perhaps with a wall behind the table."""
+    floor = _slab("floor", FLOOR, (8.0, 8.0, 0.05), (0, 0, 0))
+    if rng.random() >= wall_chance:
+        return [floor]
+    return [floor, _wall("wall", WALL, (8.0, 0.1, 2.6), (0, rng.uniform(0.8, 1.6)))]
+
+
+def make_table(rng: Generator) -> Support:
+    """Return a rectangular or, now and then, a round table top."""
+    height, thick = rng.uniform(0.6, 0.9), rng.uniform(0.018, 0.04)
+    if rng.random() < 0.2:
+        return round_table(rng.uniform(0.5, 0.7), height, thick)
+    size = (rng.uniform(1.1, 1.8), rng.uniform(0.75, 1.0), thick)
+    return _slab("table", TABLE, size, (0, 0, height))
+
+
+def round_table(radius: float, height: float, thick: float) -> Support:
+    """Return a disc about the z axis of the world."""
+    t = np.arange(48) * (2 * np.pi / 48)
+    ring = np.stack([radius * np.cos(t), radius * np.sin(t)], -1)
+    mesh = moved(extrude(ring, thick), Pose(np.eye(3), np.array([0, 0, height - thick])))
+    return Support("table", TABLE, mesh, np.column_stack([ring, np.full(48, height)]))
+
+
+def make_shelf(
+    width: float, depth: float, low: float, step: float
+) -> tuple[list[Support], list[Support]]:
+    """Return three boards, the lowest at ``low``, ``step`` apart; and the sides and back."""
+    thick = 0.02
+    top = low + 3 * step
+    boards = [
+        _slab(f"board_{k + 1}", BOARD + k, (width, depth, thick), (0, 0, low + k * step))
+        for k in range(3)
+    ]
+    beside, behind = (width + thick) / 2, (depth + thick) / 2
+    sides = [
+        _wall("left_side", SIDE, (thick, depth, top), (-beside, 0)),
+        _wall("right_side", SIDE, (thick, depth, top), (beside, 0)),
+        _wall("back", BACK, (width + 2 * thick, thick, top), (0, behind)),
+    ]
+    return boards, sides
+
+
+def _slab(name: str, label: int, size: Sequence[float], top_middle: Sequence[float]) -> Support:
+    """Return a level board; ``top_middle`` is the centre of its upper face."""
+    x, y, z = top_middle
+    mesh = moved(rounded_box(size, fine=1), Pose(np.eye(3), np.array([x, y, z - size[2]])))
+    a, b = size[0] / 2, size[1] / 2
+    corners = [[x - a, y - b, z], [x + a, y - b, z], [x + a, y + b, z], [x - a, y + b, z]]
+    return Support(name, label, mesh, np.array(corners))
+
+
+def _wall(name: str, label: int, size: Sequence[float], place: Sequence[float]) -> Support:
+    """Return an upright board that stands on the floor."""
+    shift = Pose(np.eye(3), np.array([*place, 0.0]))
+    return Support(name, label, moved(rounded_box(size, fine=1), shift), np.zeros((0, 3)))

@@ -1,0 +1,180 @@
+"""Placing things on supports and on each other, none in another."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.random import Generator
+
+from shapecat.arrays import F8
+from shapecat.simulation.distractors import make_distractor
+from shapecat.simulation.footprints import Footprint, footprint, inside, overlap
+from shapecat.simulation.mesh import Mesh
+from shapecat.simulation.placement import Rest, choose_rest, rests, turn_about_z
+from shapecat.simulation.shapes import make_object
+from shapecat.simulation.worlds import Support, Thing
+from shapecat.types import Pose
+
+__all__ = ["Layout", "Piece", "make_piece"]
+
+_LYING = {"can": 0.2, "bottle": 0.22, "cup": 0.12, "box": 0.7}
+"""How often things of a category lie; a box lies on any of its faces."""
+_UPSIDE_DOWN = {"cup": 0.06, "bowl": 0.06, "plate": 0.03}
+"""How often open things stand on their rim."""
+_WIDEST_M = 0.42
+_BEARERS = {"box", "can"}
+_SMALLEST_TOP_M = 0.035
+_EDGE_M = 0.01
+
+
+class Piece(NamedTuple):
+    """A thing that has no place yet, and how it is going to rest."""
+
+    category: str
+    kind: str
+    mesh: Mesh
+    rest: Rest
+
+
+def make_piece(category: str, rng: Generator, *, manner: str | None = None) -> Piece:
+    """Make a random thing and choose how it rests.
+
+    Parameters
+    ----------
+    category : one of the shape categories; ``unknown`` is a distractor, which stands as made.
+    manner : ``upright``, ``lying`` or ``upside_down``; drawn by default. A thing that cannot rest
+        in that manner stands upright.
+    """
+    if category == "unknown":
+        kind, mesh = make_distractor(rng)
+    else:
+        kind, mesh = category, make_object(category, rng)
+    wanted = manner or _draw_manner(category, rng)
+    rest = Rest(Pose(np.eye(3), np.zeros(3)), "upright")
+    if wanted != "upright" and category not in {"ball", "unknown"}:
+        rest = choose_rest(rests(mesh), wanted, rng) or rest
+    return Piece(category, kind, mesh, rest)
+
+
+def _draw_manner(category: str, rng: Generator) -> str:
+    luck = rng.random()
+    over = _UPSIDE_DOWN.get(category, 0.0)
+    if luck < over:
+        return "upside_down"
+    return "lying" if luck < over + _LYING.get(category, 0.0) else "upright"
+
+
+class Layout:
+    """Things on supports, filled one by one.
+
+    Parameters
+    ----------
+    gap : least distance between footprints, metres.
+    headroom : nothing may rise higher above its support, metres.
+    enclosed : nothing may stick out over the edge of its support.
+    """
+
+    def __init__(
+        self, rng: Generator, *, gap: float, headroom: float = 1.0, enclosed: bool = False
+    ) -> None:
+        self.things: list[Thing] = []
+        self.gap = gap
+        self._rng = rng
+        self._headroom = headroom
+        self._enclosed = enclosed
+        self._places: list[Footprint] = []
+        self._roots: list[Support] = []
+
+    def put(
+        self, category: str, support: Support, half: F8, *, stack: float = 0.0, attempts: int = 6
+    ) -> bool:
+        """Place a new thing; tells whether there was room for it.
+
+        Parameters
+        ----------
+        half : (2,) half the size, along x and y, of the area about the support's middle.
+        stack : chance of standing on another thing.
+        attempts : things to make before giving up.
+        """
+        for _ in range(attempts):
+            piece = make_piece(category, self._rng)
+            size = footprint(piece.mesh, piece.rest.pose)
+            if size.high > self._headroom or np.ptp(size.outline, axis=0).max() > _WIDEST_M:
+                continue
+            if self._rng.random() < stack and self._put_on_thing(piece):
+                return True
+            if self._put_on_support(piece, support, half):
+                return True
+        return False
+
+    def _put_on_support(self, piece: Piece, support: Support, half: F8, tries: int = 40) -> bool:
+        middle = support.outline[:, :2].mean(axis=0)
+        for _ in range(tries):
+            spot = middle + self._rng.uniform(-half, half)
+            pose = self._posed(piece, np.array([*spot, support.height]))
+            here = footprint(piece.mesh, pose)
+            if self._fits(here, support):
+                self._add(piece, pose, here, support, None)
+                return True
+        return False
+
+    def _put_on_thing(self, piece: Piece, tries: int = 8) -> bool:
+        bearers = [k for k in range(len(self.things)) if self._can_bear(k)]
+        if not bearers or piece.category == "ball":
+            return False
+        for _ in range(tries):
+            k = bearers[int(self._rng.integers(len(bearers)))]
+            below = self._places[k]
+            slack = 0.25 * np.ptp(below.top, axis=0)
+            spot = [*below.top.mean(axis=0) + self._rng.uniform(-slack, slack), below.high]
+            pose = self._posed(piece, np.array(spot))
+            here = footprint(piece.mesh, pose)
+            if _bears(below, here) and self._fits(here, self._roots[k]):
+                self._add(piece, pose, here, self._roots[k], self.things[k].track)
+                return True
+        return False
+
+    def _posed(self, piece: Piece, place: F8) -> Pose:
+        angle = self._rng.uniform(0, 2 * np.pi)
+        return turn_about_z(piece.rest.pose, angle, np.round(place, 6))
+
+    def _fits(self, here: Footprint, support: Support) -> bool:
+        on_board = here.low < support.height + 1e-4
+        edge = support.outline[:, :2]
+        if on_board and not inside(here.contact, edge, _EDGE_M):
+            return False
+        if self._enclosed and not inside(here.outline, edge, 0.003):
+            return False
+        if here.high > support.height + self._headroom:
+            return False
+        beside = [p for p in self._places if p.low < here.high and p.high > here.low + 1e-6]
+        return not any(overlap(here.outline, p.outline, self.gap) for p in beside)
+
+    def _can_bear(self, k: int) -> bool:
+        top = self._places[k].top
+        flat = len(top) > 2 and float(np.ptp(top, axis=0).min()) > _SMALLEST_TOP_M
+        return flat and self.things[k].category in _BEARERS
+
+    def _add(
+        self, piece: Piece, pose: Pose, here: Footprint, support: Support, bearer: int | None
+    ) -> None:
+        manner = "upright" if piece.category == "box" else piece.rest.manner  # a box has no upright
+        thing = Thing(
+            len(self.things),
+            piece.category,
+            piece.kind,
+            piece.mesh,
+            pose,
+            support.name if bearer is None else None,
+            bearer,
+            lying=manner == "lying",
+            upside_down=manner == "upside_down",
+        )
+        self.things.append(thing)
+        self._places.append(here)
+        self._roots.append(support)
+
+
+def _bears(below: Footprint, above: Footprint) -> bool:
+    """Tell whether the middle of a thing's contact, and most of it, lies on the top below."""
+    middle = above.contact.mean(axis=0)
+    return inside(middle + 0.6 * (above.contact - middle), below.top, 0.002)
