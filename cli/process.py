@@ -17,8 +17,8 @@ from .render import count_words, print_json, print_table, progress_bars
     "--up",
     default="auto",
     show_default=True,
-    metavar="auto|tf|X,Y,Z",
-    help="Where up is: from transforms, or a vector in the sensor frame.",
+    metavar="auto|tf|imu|X,Y,Z",
+    help="Where up is: from transforms, an IMU, or a vector in the sensor frame.",
 )
 @click.option("--fixed-frame", metavar="F", help="Frame in which things stand still.")
 @click.option("--start", "start_s", type=float, help="Seconds after the start of the recording.")

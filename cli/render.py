@@ -26,6 +26,9 @@ class Bars:
 
     def __call__(self, phase: str, done: int, total: int | None) -> None:
         """Show how far a phase has come."""
+        if phase == "compile":
+            click.echo("compiling kernels, once per installation: about a minute", err=True)
+            return
         if phase not in self._tasks:
             name = _PHASES.get(phase, phase)
             self._tasks[phase] = self._progress.add_task(name, total=total)

@@ -4,12 +4,15 @@
 the interpreter lock is released, and division by zero follows IEEE 754 as in numpy.
 """
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Any, TypeVar
 
 from numba import njit
+from numba.core.event import Event, Listener, install_listener
 
-__all__ = ["kernel"]
+__all__ = ["CompileClock", "compile_clock", "kernel"]
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -36,3 +39,36 @@ def kernel(function: _F | None = None, *, fast: bool = False, inline: bool = Fal
         )(target)
 
     return compile_later if function is None else compile_later(function)
+
+
+class CompileClock(Listener):
+    """Counts the seconds spent compiling while it listens; none when all kernels are cached."""
+
+    def __init__(self, on_first: Callable[[], None]) -> None:
+        """Call ``on_first`` when the first kernel is compiled."""
+        self.seconds = 0.0
+        self._on_first = on_first
+        self._depth = 0
+        self._begun = 0.0
+
+    def on_start(self, event: Event) -> None:  # noqa: ARG002  numba's signature
+        """Start the clock at the outermost kernel; the kernels it calls are compiled within."""
+        if self._depth == 0:
+            self._begun = time.perf_counter()
+            if self.seconds == 0:
+                self._on_first()
+        self._depth += 1
+
+    def on_end(self, event: Event) -> None:  # noqa: ARG002  numba's signature
+        """Stop the clock."""
+        self._depth -= 1
+        if self._depth == 0:
+            self.seconds += time.perf_counter() - self._begun
+
+
+@contextmanager
+def compile_clock(on_first: Callable[[], None]) -> Iterator[CompileClock]:
+    """Measure the compilation that happens in the block."""
+    clock = CompileClock(on_first)
+    with install_listener("numba:compile", clock):
+        yield clock

@@ -3,6 +3,7 @@
 import dataclasses
 import platform
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
@@ -10,10 +11,11 @@ from typing import Any
 
 from shapecat import __version__
 from shapecat.config import Settings
+from shapecat.errors import OutputError
 from shapecat.learning import Categorizer
-from shapecat.run_folder import digest, input_size
+from shapecat.run_folder import digest, empty, input_size, read_run, write_run
 
-__all__ = ["Job", "Summary", "describe_run", "same_work", "summarize"]
+__all__ = ["Job", "Summary", "describe_run", "resume", "same_work", "summarize"]
 
 _LIBRARIES = ("numpy", "numba", "mcap", "rosbags", "rerun-sdk", "pyarrow")
 
@@ -23,7 +25,8 @@ class Job:
     """One recording to process, and how.
 
     ``folder`` is where the results go, ``DIR/NAME``; ``start_s`` and ``end_s`` count from the
-    start of the recording; ``up`` is ``auto``, ``tf``, or a vector ``X,Y,Z`` in the sensor frame.
+    start of the recording; ``up`` is ``auto``, ``tf``, ``imu``, or a vector ``X,Y,Z`` in
+    the sensor frame.
     """
 
     source: Path
@@ -97,6 +100,20 @@ def same_work(run: Mapping[str, Any], planned: Mapping[str, Any]) -> bool:
     return all(run.get(key) == planned[key] for key in ("settings", "options", "model")) and (
         run.get("input", {}).get("sha256") == planned["input"]["sha256"]
     )
+
+
+def resume(folder: Path, planned: dict[str, Any]) -> dict[str, Any]:
+    """Return the run that was killed in a folder; the planned one, if that was other work.
+
+    What is left of other work is removed.
+    """
+    with suppress(OutputError):
+        run = read_run(folder)
+        if same_work(run, planned) and run["versions"] == planned["versions"]:
+            return {**run, "input": planned["input"]}
+    empty(folder)
+    write_run(folder, planned)
+    return planned
 
 
 def summarize(job: Job, run: Mapping[str, Any], *, fresh: bool = True) -> Summary:

@@ -1,7 +1,7 @@
 """From the tables of a run to labelled frames: what the outputs show."""
 
-import csv
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -10,68 +10,20 @@ import pyarrow as pa
 import pyarrow.compute
 import pyarrow.parquet as pq
 
-from shapecat.errors import OutputError
-from shapecat.run_folder import replacing
+from shapecat.arrays import F4, F8
+from shapecat.corrections import TrackLabel
+from shapecat.geometry import rotation_from_quaternion, upright_box
 from shapecat.tables import read_row_groups
 from shapecat.types import Box, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 
-__all__ = ["TrackLabel", "adopt_labels", "read_labelled_frames", "read_labels"]
-
-TrackLabel = tuple[str, float]
-"""Final category and confidence of a track."""
-
-
-def read_labels(path: Path) -> dict[int, TrackLabel]:
-    """Read tracks.csv: the label a person filled in wins over the category, at confidence 1.
-
-    Raises
-    ------
-    OutputError : lines that cannot be understood, each named.
-    """
-    labels: dict[int, TrackLabel] = {}
-    problems = []
-    try:
-        with path.open(newline="", encoding="utf-8-sig") as file:
-            for line, row in enumerate(csv.DictReader(file), start=2):
-                try:
-                    track = int(row["track"])
-                    label = (row["label"] or "").strip()
-                    labels[track] = (
-                        (label, 1.0) if label else (row["category"], float(row["confidence"]))
-                    )
-                except (KeyError, TypeError, ValueError):
-                    problems.append(f"line {line} needs track, category, confidence, label")
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        problems.append(str(error))
-    if problems:
-        msg = f"{path}: {'; '.join(problems[:5])}"
-        raise OutputError(msg)
-    return labels
-
-
-def adopt_labels(corrected: Path, folder: Path) -> None:
-    """Make a corrected table the tracks.csv of a run; the first original is kept beside it.
-
-    Raises
-    ------
-    OutputError : the table is unreadable or names a track that the run does not have.
-    """
-    original = folder / "tracks.csv"
-    unknown = sorted(read_labels(corrected).keys() - read_labels(original).keys())
-    if unknown:
-        msg = f"{corrected}: tracks that {folder} does not have: {', '.join(map(str, unknown))}"
-        raise OutputError(msg)
-    kept = folder / "tracks.original.csv"
-    if not kept.exists():
-        kept.write_bytes(original.read_bytes())
-    with replacing(original) as path:
-        path.write_bytes(corrected.read_bytes())
+__all__ = ["box_corners", "read_labelled_frames"]
 
 
 def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[LabelledFrame]:
     """Yield the frames of a run in the order they were read, with the final labels.
 
-    Tracks missing from ``labels`` (deleted by a person) are left out.
+    Tracks missing from ``labels`` (deleted by a person) are left out. Tracks that were merged have
+    one number; where several are seen in one frame, they are the parts of one object.
     """
     shown = _shown_tracks(folder, labels)
     groups = (
@@ -106,9 +58,9 @@ def _shown_tracks(folder: Path, labels: Mapping[int, TrackLabel]) -> dict[tuple[
     for row in sorted(rows, key=lambda r: r["stamp_ns"]):
         if row["track"] not in labels:
             continue
-        key = (row["topic"], row["frame"])
-        shown[key][0][row["detection"]] = (row["track"], np.array(row["posterior"], np.float32))
-        last[row["track"]] = key
+        key, track = (row["topic"], row["frame"]), labels[row["track"]].track
+        shown[key][0][row["detection"]] = (track, np.array(row["posterior"], np.float32))
+        last[track] = key
     following = _next_of_topic(order)
     for track, key in sorted(last.items()):
         if key in following:
@@ -163,6 +115,11 @@ def _labelled_frame(
     pose = None
     if row["fixed_translation"] is not None:
         pose = Pose(np.reshape(row["fixed_rotation"], (3, 3)), row["fixed_translation"])
+    parts: dict[int, list[LabelledObject]] = {}
+    for found in objects:
+        if found["detection"] in tracks:
+            track, causal = tracks[found["detection"]]
+            parts.setdefault(track, []).append(_labelled_object(found, causal, labels[track]))
     return LabelledFrame(
         topic=row["topic"],
         index=row["frame"],
@@ -171,13 +128,10 @@ def _labelled_frame(
         frame_id=row["frame_id"],
         fixed_from_sensor=pose,
         planes=tuple(_plane(plane) for plane in planes),
-        objects=tuple(
-            _labelled_object(found, *tracks[found["detection"]], labels)
-            for found in objects
-            if found["detection"] in tracks
-        ),
+        objects=tuple(_join(found, row["up"]) for found in parts.values()),
         ended=ended,
         seconds=dict(zip(row["stages"], row["seconds"], strict=True)),
+        up=row["up"],
     )
 
 
@@ -191,17 +145,47 @@ def _plane(row: Mapping[str, Any]) -> Plane:
     )
 
 
-def _labelled_object(
-    row: Mapping[str, Any], track: int, causal: Any, labels: Mapping[int, TrackLabel]
-) -> LabelledObject:
-    category, confidence = labels[track]
+def _labelled_object(row: Mapping[str, Any], causal: F4, label: TrackLabel) -> LabelledObject:
     return LabelledObject(
-        track=track,
-        category=category,
-        confidence=confidence,
+        track=label.track,
+        category=label.category,
+        confidence=label.confidence,
         box=Box(row["center"], row["size"], row["orientation"]),
         indices=row["indices"],
         gas=NeuralGas(row["neurons"].reshape(-1, 3), row["edges"].reshape(-1, 2)),
         posterior=row["posterior"],
         causal=causal,
+        height_m=row["height_m"],
+        touches_border=row["touches_border"],
+        occluded=row["occluded"],
     )
+
+
+def _join(parts: Sequence[LabelledObject], up: Sequence[float]) -> LabelledObject:
+    """Make one object of the parts of a merged track that are seen in the same frame."""
+    if len(parts) == 1:
+        return parts[0]
+    corners = np.concatenate([box_corners(part.box) for part in parts])
+    box = upright_box(corners.astype(np.float32), up)
+    bottoms = [float(np.dot(up, part.box.center)) - part.height_m for part in parts]
+    starts = np.cumsum([0, *(len(part.gas.neurons) for part in parts)])
+    edges = [part.gas.edges + start for part, start in zip(parts, starts[:-1], strict=True)]
+    return replace(
+        parts[0],
+        box=box,
+        indices=np.unique(np.concatenate([part.indices for part in parts])),
+        gas=NeuralGas(np.concatenate([part.gas.neurons for part in parts]), np.concatenate(edges)),
+        posterior=np.mean([part.posterior for part in parts], axis=0),
+        causal=np.mean([part.causal for part in parts], axis=0),
+        height_m=float(np.dot(up, box.center)) - min(bottoms),
+        touches_border=any(part.touches_border for part in parts),
+        occluded=any(part.occluded for part in parts),
+    )
+
+
+def box_corners(box: Box) -> F8:
+    """Return (8, 3) the corners of a box, sensor frame: the lower four around, then the upper."""
+    signs = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
+    unit = np.array([[x, y, z] for z in (-1, 1) for x, y in signs.tolist()], np.float64)
+    rotation = rotation_from_quaternion(box.orientation)
+    return np.asarray(box.center + (unit * box.size / 2) @ rotation.T)

@@ -8,18 +8,21 @@ Each can be run again alone.
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
+from shapecat.corrections import adopt_labels, read_labels
 from shapecat.errors import NoStreamError, OutputError
-from shapecat.jobs import Job, Summary, describe_run, same_work, summarize
-from shapecat.labels import adopt_labels, read_labelled_frames, read_labels
+from shapecat.jit import CompileClock, compile_clock
+from shapecat.jobs import Job, Summary, describe_run, resume, same_work, summarize
+from shapecat.labels import read_labelled_frames
 from shapecat.learning import Categorizer, load_model
 from shapecat.perception import perceive
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
 from shapecat.recordings.gravity import Upright
-from shapecat.run_folder import read_run, staged, write_run
-from shapecat.tables import FrameRow, PerceptionTables
+from shapecat.run_folder import read_run, staged, sweep, write_run
+from shapecat.tables import FrameRow, PerceptionTables, count_rows, discard_segments
 from shapecat.tracks import track_run
 from shapecat.types import Frame, LabelledFrame
 
@@ -37,29 +40,57 @@ def process(job: Job, observe: Observer = _ignore) -> Summary:
     """Process one recording into its run folder: perceive, track, annotate.
 
     A complete folder made from the same input, settings and model is left as it is. Nothing
-    appears under the final name before all of it is complete.
+    appears under the final name before all of it is complete; a run that was killed goes on
+    where it stopped.
 
     Raises
     ------
     RecordingError, NoStreamError, ModelError, OutputError : with nothing left behind.
     """
     begun = time.perf_counter()
-    with open_recording(job.source) as recording:
+    with open_recording(job.source) as recording, _compile_clock(observe) as compiled:
         categorizer = load_model(job.model)
         run = describe_run(job, categorizer)
         run["options"]["topics"] = [s.topic for s in choose_streams(recording, job.topics)]
         if job.folder.exists() and not job.overwrite:
-            return _finished(job, run)
+            return _finished(job, recording, run, observe)
         with staged(job.folder) as folder:
-            perceive_all(recording, folder, run, job, categorizer, observe)
-            track(folder, run, job)
+            run = resume(folder, run)
+            earlier = sum(run["seconds"].values())
+            _once(
+                "perceive",
+                folder,
+                run,
+                lambda: perceive_all(recording, folder, run, job, categorizer, observe),
+            )
+            discard_segments(folder)
+            _once("track", folder, run, lambda: track(folder, run, job))
             annotate(folder, recording, run, observe)
-            run["seconds"]["total"] = time.perf_counter() - begun
+            run["seconds"]["compile"] = compiled.seconds
+            run["seconds"]["total"] = earlier + time.perf_counter() - begun
             write_run(folder, run)
     return summarize(job, run)
 
 
-def _finished(job: Job, planned: dict[str, Any]) -> Summary:
+def _once(phase: str, folder: Path, run: dict[str, Any], work: Callable[[], None]) -> None:
+    """Do a phase unless it is done, and note in run.json that it is, and how long it took."""
+    if phase in run["seconds"]:
+        return
+    begun = time.perf_counter()
+    work()
+    run["seconds"][phase] = time.perf_counter() - begun
+    write_run(folder, run)
+
+
+def _compile_clock(observe: Observer) -> AbstractContextManager[CompileClock]:
+    """Measure compilation, which happens once per installation, and let the user know of it."""
+    return compile_clock(lambda: observe("compile", 0, None))
+
+
+def _finished(
+    job: Job, recording: Recording, planned: dict[str, Any], observe: Observer
+) -> Summary:
+    """Return what a complete folder holds, after removing or finishing what a kill left of it."""
     run = read_run(job.folder)
     if not same_work(run, planned):
         msg = (
@@ -67,6 +98,8 @@ def _finished(job: Job, planned: dict[str, Any]) -> Summary:
             "choose another --out, or --overwrite it"
         )
         raise OutputError(msg)
+    sweep(job.folder)
+    annotate(job.folder, recording, run, observe)
     return summarize(job, run, fresh=False)
 
 
@@ -79,71 +112,74 @@ def perceive_all(
     observe: Observer = _ignore,
 ) -> None:
     """Write frames, detections and planes, frame by frame in flat memory."""
-    begun = time.perf_counter()
     upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame)
     skipped: Counter[str] = Counter()
     source, total = _select(recording, run["options"], skipped)
-    count = found = 0
+    count = 0
     with PerceptionTables(
         folder, categories=categorizer.categories, model_id=categorizer.model_id
     ) as tables:
         for count, frame in enumerate(source, start=1):
-            up = upright.up(frame)
-            perception = perceive(frame, up=up, categorizer=categorizer, settings=job.settings)
-            tables.write(perception, FrameRow(frame.log_time_ns, upright.fixed_from_sensor(frame)))
-            found += len(perception.detections)
+            up, pose = upright.up(frame), upright.fixed_from_sensor(frame)
+            if count > tables.done:
+                perception = perceive(frame, up=up, categorizer=categorizer, settings=job.settings)
+                tables.write(perception, FrameRow(frame.log_time_ns, pose, up))
             observe("perceive", count, total)
     if not count:
         reasons = ", ".join(f"{n} {reason}" for reason, n in skipped.items()) or "none in range"
         msg = f"{job.source}: no usable frame on {', '.join(run['options']['topics'])} ({reasons})"
         raise NoStreamError(msg)
+    found = count_rows(folder, "detections")
     run["counts"] = {"frames": count, "skipped": dict(skipped), "detections": found}
-    run["fixed_frame"], run["up"] = upright.fixed_frame, upright.report()
+    if tables.done:
+        run["counts"]["resumed"] = tables.done
+    run["fixed_frame"], run["up"] = upright.fixed_frame, upright.report(folder)
     run["warnings"] = [*recording.warnings, *upright.warnings]
-    run["seconds"]["perceive"] = time.perf_counter() - begun
 
 
 def track(folder: Path, run: dict[str, Any], job: Job) -> None:
     """Follow the detections over time and fuse their posteriors: tracks.parquet, tracks.csv."""
-    begun = time.perf_counter()
     run["counts"]["tracks"] = track_run(folder, job.settings.tracking, run["model"]["categories"])
-    run["seconds"]["track"] = time.perf_counter() - begun
 
 
 def annotate(
     folder: Path, recording: Recording, run: dict[str, Any], observe: Observer = _ignore
 ) -> None:
     """Write annotated.mcap and review.rrd from the tables, tracks.csv and the recording."""
-    labels = read_labels(folder / "tracks.csv")
-    labelled = read_labelled_frames(folder, labels)
     settings, total = run["settings"]["outputs"], run["counts"]["frames"]
-    begun = time.perf_counter()
-    if run["options"]["mcap"]:
+
+    def labelled(phase: str) -> Iterator[LabelledFrame]:
+        labels = read_labels(folder / "tracks.csv", run["model"]["categories"])
+        return _observed(read_labelled_frames(folder, labels), phase, total, observe)
+
+    def write_mcap() -> None:
         from shapecat.outputs.annotated_mcap import write_annotated  # noqa: PLC0415  on first use
 
         write_annotated(
             recording,
             folder / "annotated.mcap",
-            _observed(labelled, "annotate", total, observe),
+            labelled("annotate"),
             run=run,
             markers=settings["markers"],
         )
-        run["seconds"]["annotated.mcap"] = time.perf_counter() - begun
-    begun = time.perf_counter()
-    if run["options"]["rrd"]:
+
+    def write_rrd() -> None:
         from shapecat.outputs.review import write_review  # noqa: PLC0415  loads Rerun on first use
 
-        labelled = read_labelled_frames(folder, labels)
         write_review(
             folder / "review.rrd",
-            _with_clouds(_observed(labelled, "review", total, observe), recording, run),
+            _with_clouds(labelled("review"), recording, run),
             name=recording.path.name,
             run=run,
             categories=run["model"]["categories"],
             cloud_points=settings["cloud_points"],
             fixed_frame=run["fixed_frame"],
         )
-        run["seconds"]["review.rrd"] = time.perf_counter() - begun
+
+    if run["options"]["mcap"]:
+        _once("annotated.mcap", folder, run, write_mcap)
+    if run["options"]["rrd"]:
+        _once("review.rrd", folder, run, write_rrd)
 
 
 def annotate_again(folder: Path, labels: Path | None, observe: Observer = _ignore) -> None:
@@ -156,8 +192,10 @@ def annotate_again(folder: Path, labels: Path | None, observe: Observer = _ignor
     """
     run = read_run(folder)
     source = Path(run["input"]["path"])
-    if labels is not None:
-        adopt_labels(labels, folder)
+    adopt_labels(labels or folder / "tracks.csv", folder)
+    for output in ("annotated.mcap", "review.rrd"):
+        run["seconds"].pop(output, None)
+    write_run(folder, run)  # after a kill, the next run writes what is missing
     with open_recording(source) as recording:
         annotate(folder, recording, run, observe)
     write_run(folder, run)

@@ -1,7 +1,9 @@
 """The folder of one run: built under a hidden name, renamed when complete."""
 
+import fcntl
 import hashlib
 import json
+import os
 import shutil
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -10,7 +12,18 @@ from typing import Any
 
 from shapecat.errors import OutputError
 
-__all__ = ["digest", "input_size", "read_run", "replacing", "staged", "write_run"]
+__all__ = [
+    "complete_folder",
+    "digest",
+    "empty",
+    "input_size",
+    "lock",
+    "read_run",
+    "replacing",
+    "staged",
+    "sweep",
+    "write_run",
+]
 
 _SAMPLE = 1 << 20
 
@@ -19,27 +32,111 @@ _SAMPLE = 1 << 20
 def staged(folder: Path) -> Iterator[Path]:
     """Give a hidden folder beside ``folder`` that takes its name when the block succeeds.
 
-    An older ``folder`` is replaced only then; on an error nothing is left behind.
+    An older ``folder`` is replaced only then. On an error nothing is left behind; after an
+    interruption or a kill the hidden folder stays, and the next run finds in it what was done.
 
     Raises
     ------
-    OutputError : the disk is full or the place is not writable.
+    OutputError : the disk is full, the place is not writable, or another run is writing there.
     """
-    hidden = folder.with_name(f".{folder.name}.partial")
+    hidden = _hidden(folder)
     created = _missing_parents(folder)
     try:
-        shutil.rmtree(hidden, ignore_errors=True)
-        hidden.mkdir(parents=True)
-        yield hidden
-        _swap(hidden, folder)
+        hidden.mkdir(parents=True, exist_ok=True)
+        with _locked(hidden):
+            yield hidden
+            _swap(hidden, folder)
     except OSError as error:
+        _discard(hidden, created)
         msg = f"{folder}: cannot write the results: {error.strerror or error}"
         raise OutputError(msg) from error
+    except _BusyError as error:
+        msg = f"{folder}: another run is writing there"
+        raise OutputError(msg) from error
+    except Exception:
+        _discard(hidden, created)
+        raise
+
+
+def empty(folder: Path) -> None:
+    """Remove everything in a folder."""
+    for item in folder.iterdir():
+        if item.is_dir() and not item.is_symlink():
+            shutil.rmtree(item)
+        else:
+            item.unlink()
+
+
+def sweep(folder: Path) -> None:
+    """Remove what killed runs left in and beside a complete folder."""
+    with suppress(OSError, _BusyError):
+        shutil.rmtree(_old(folder), ignore_errors=True)
+        for file in folder.glob(".*.partial"):
+            file.unlink()
+        if _hidden(folder).exists():
+            with _locked(_hidden(folder)):
+                shutil.rmtree(_hidden(folder), ignore_errors=True)
+
+
+@contextmanager
+def complete_folder(folder: Path) -> Iterator[Path]:
+    """Give a hidden folder that takes the name ``folder`` when the block succeeds.
+
+    Whatever a kill left half-made of it is discarded first.
+    """
+    hidden = _hidden(folder)
+    shutil.rmtree(hidden, ignore_errors=True)
+    hidden.mkdir(parents=True)
+    yield hidden
+    hidden.rename(folder)
+
+
+class _BusyError(Exception):
+    """Another process holds the folder."""
+
+
+def lock(folder: Path) -> int | None:
+    """Lock a folder for as long as this process lives, or until the number given is closed.
+
+    Returns
+    -------
+    None if another process holds it. A file system without locks never says so.
+    """
+    held = os.open(folder, os.O_RDONLY)
+    try:
+        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(held)
+        return None
+    except OSError:
+        pass
+    return held
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    held = lock(folder)
+    if held is None:
+        raise _BusyError
+    try:
+        yield
     finally:
-        shutil.rmtree(hidden, ignore_errors=True)
-        for parent in created:
-            with suppress(OSError):  # not empty: something was written there
-                parent.rmdir()
+        os.close(held)
+
+
+def _hidden(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}.partial")
+
+
+def _old(folder: Path) -> Path:
+    return folder.with_name(f".{folder.name}.old")
+
+
+def _discard(hidden: Path, created: list[Path]) -> None:
+    shutil.rmtree(hidden, ignore_errors=True)
+    for parent in created:
+        with suppress(OSError):  # not empty: something was written there
+            parent.rmdir()
 
 
 def _missing_parents(folder: Path) -> list[Path]:
@@ -47,7 +144,7 @@ def _missing_parents(folder: Path) -> list[Path]:
 
 
 def _swap(new: Path, folder: Path) -> None:
-    old = folder.with_name(f".{folder.name}.old")
+    old = _old(folder)
     shutil.rmtree(old, ignore_errors=True)
     if folder.exists():
         folder.rename(old)

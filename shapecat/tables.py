@@ -6,7 +6,9 @@ side by side in flat memory. Adding a column is allowed within a schema version;
 meaning of one is not.
 """
 
+import shutil
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -16,7 +18,9 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from shapecat.arrays import F4
 from shapecat.errors import OutputError
+from shapecat.run_folder import complete_folder, replacing
 from shapecat.types import Perception, Pose
 
 __all__ = [
@@ -27,6 +31,8 @@ __all__ = [
     "TRACKS",
     "FrameRow",
     "PerceptionTables",
+    "count_rows",
+    "discard_segments",
     "read_row_groups",
     "write_table",
 ]
@@ -45,14 +51,17 @@ FRAMES = pa.schema(
         ("log_time_ns", pa.int64()),
         ("frame_id", pa.string()),
         ("up", _VEC3),
+        ("up_given", _VEC3),
         ("fixed_translation", pa.list_(pa.float64(), 3)),
         ("fixed_rotation", pa.list_(pa.float64(), 9)),
         ("stages", pa.list_(pa.string())),
         ("seconds", _FLOATS),
     ]
 )
-"""One row per frame read, also those without a detection. ``fixed_*`` is ``fixed_from_sensor``
-(rotation row by row), null without a fixed frame; ``seconds`` per entry of ``stages``."""
+"""One row per frame read, also those without a detection. ``up`` is what detection went by,
+``up_given`` where transforms, an IMU or an option said it is, null where nothing did. ``fixed_*``
+is ``fixed_from_sensor`` (rotation row by row), null without a fixed frame; ``seconds`` per entry
+of ``stages``."""
 
 DETECTIONS = pa.schema(
     [
@@ -113,7 +122,8 @@ TRACKS = pa.schema(
 """One row per track per frame; ``detection`` is null while the track coasts, ``posterior`` is the
 causal one. Without a fixed frame ``center_fixed`` is in the sensor frame."""
 
-_GROUP_FRAMES = 64
+_SEGMENT_FRAMES = 32
+_PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES}
 
 
 @dataclass(frozen=True)
@@ -122,24 +132,33 @@ class FrameRow:
 
     log_time_ns: int
     fixed_from_sensor: Pose | None
+    up_given: F4 | None = None
 
 
 class PerceptionTables:
-    """Writes frames, detections and planes side by side, a row group every 64 frames."""
+    """Writes frames, detections and planes side by side, a row group every 32 frames.
+
+    The row groups are first written as *segments*, folders that appear when complete, so that a
+    run that was killed goes on after its last one; leaving the block joins them into the tables.
+
+    Attributes
+    ----------
+    done : frames in the segments that an earlier run has left.
+    """
 
     def __init__(self, folder: Path, *, categories: Sequence[str], model_id: str) -> None:
-        """Open the three files in ``folder``, which must exist."""
+        """Look for segments in ``folder``, which must exist."""
         metadata = {
             "schema_version": SCHEMA_VERSION,
             "categories": ",".join(categories),
             "model": model_id,
         }
+        self._folder = folder
+        self._schemas = {name: s.with_metadata(metadata) for name, s in _PERCEIVED.items()}
         self._categories = tuple(categories)
         self._pending: list[tuple[Perception, FrameRow]] = []
-        self._writers = {
-            name: _open_writer(folder / f"{name}.parquet", schema.with_metadata(metadata))
-            for name, schema in (("frames", FRAMES), ("detections", DETECTIONS), ("planes", PLANES))
-        }
+        self._segments = _segments(folder)
+        self.done = sum(count_rows(segment, "frames") for segment in self._segments)
 
     def __enter__(self) -> Self:
         """Return itself."""
@@ -151,18 +170,16 @@ class PerceptionTables:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Write what is pending, and close the files."""
-        try:
-            if kind is None:
-                self._flush()
-        finally:
-            for writer in self._writers.values():
-                writer.close()
+        """Write what is pending, and join the segments."""
+        if kind is None:
+            self._flush()
+            for name, schema in self._schemas.items():
+                _join(self._segments, self._folder / f"{name}.parquet", schema)
 
     def write(self, perception: Perception, row: FrameRow) -> None:
         """Append one frame."""
         self._pending.append((perception, row))
-        if len(self._pending) >= _GROUP_FRAMES:
+        if len(self._pending) >= _SEGMENT_FRAMES:
             self._flush()
 
     def _flush(self) -> None:
@@ -173,9 +190,39 @@ class PerceptionTables:
             "detections": _detection_columns(self._pending, self._categories),
             "planes": _plane_columns([perception for perception, _ in self._pending]),
         }
-        for name, writer in self._writers.items():
-            writer.write_table(_table(rows[name], writer.schema))
+        segment = self._folder / _SEGMENTS / f"{len(self._segments):06d}"
+        with complete_folder(segment) as hidden:
+            for name, schema in self._schemas.items():
+                write_table(hidden / f"{name}.parquet", rows[name], schema)
+        self._segments.append(segment)
         self._pending.clear()
+
+
+_SEGMENTS = "segments"
+
+
+def discard_segments(folder: Path) -> None:
+    """Remove what the tables were joined from."""
+    shutil.rmtree(folder / _SEGMENTS, ignore_errors=True)
+
+
+def _segments(folder: Path) -> list[Path]:
+    """Return the complete segments, in order."""
+    return sorted((folder / _SEGMENTS).glob("[0-9]*"))
+
+
+def _join(segments: Iterable[Path], path: Path, schema: pa.Schema) -> None:
+    """Write a table of a row group per segment."""
+    with replacing(path) as hidden, _open_writer(hidden, schema) as writer:
+        for segment in segments:
+            for group in read_row_groups(segment / path.name):
+                writer.write_table(group)
+
+
+def count_rows(folder: Path, table: str) -> int:
+    """Return the number of rows of a table of a run folder."""
+    with _reading(folder / f"{table}.parquet") as file:
+        return int(file.metadata.num_rows)
 
 
 def write_table(path: Path, columns: dict[str, Any], schema: pa.Schema) -> None:
@@ -187,10 +234,16 @@ def write_table(path: Path, columns: dict[str, Any], schema: pa.Schema) -> None:
 
 def read_row_groups(path: Path, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
     """Yield the row groups of a table of a run folder, one at a time."""
+    with _reading(path) as file:
+        for group in range(file.num_row_groups):
+            yield file.read_row_group(group, columns=columns)
+
+
+@contextmanager
+def _reading(path: Path) -> Iterator[pq.ParquetFile]:
     try:
         with pq.ParquetFile(path) as file:
-            for group in range(file.num_row_groups):
-                yield file.read_row_group(group, columns=columns)
+            yield file
     except (OSError, pa.ArrowException) as error:
         msg = f"{path}: not a readable table of a run folder ({error}); process the recording again"
         raise OutputError(msg) from error
@@ -229,6 +282,7 @@ def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]]) -> dict[str, Any
         "log_time_ns": [row.log_time_ns for _, row in rows],
         "frame_id": [p.frame_id for p, _ in rows],
         "up": [p.scene.up for p, _ in rows],
+        "up_given": [row.up_given for _, row in rows],
         "fixed_translation": [
             row.fixed_from_sensor and row.fixed_from_sensor.translation for _, row in rows
         ],

@@ -231,6 +231,7 @@ class LabelledObject(Record):
 
     ``box`` is in the sensor frame, as are the ``neurons`` of ``gas``; ``posterior`` is this single
     view's, ``causal`` the track's up to this frame; ``confidence`` and ``category`` are final.
+    ``height_m`` is the height of the centre above what it stands on, NaN if on nothing.
     """
 
     track: int
@@ -241,13 +242,17 @@ class LabelledObject(Record):
     gas: NeuralGas
     posterior: F4 = array("c", "f4")
     causal: F4 = array("c", "f4")
+    height_m: float = float("nan")
+    touches_border: bool = False
+    occluded: bool = False
 
 
 class LabelledFrame(Record):
     """One frame as the outputs show it, without its points.
 
     ``fixed_from_sensor`` is None where the recording has no fixed frame; ``ended`` names the
-    tracks shown in an earlier frame of the topic that are not seen again.
+    tracks shown in an earlier frame of the topic that are not seen again; ``up`` (3,) is the unit
+    vector up in the sensor frame.
     """
 
     topic: str
@@ -260,3 +265,4 @@ class LabelledFrame(Record):
     objects: tuple[LabelledObject, ...]
     ended: tuple[int, ...]
     seconds: dict[str, float]
+    up: F4 | None = array("3", "f4", default=None)

@@ -10,9 +10,9 @@ from scipy.sparse.csgraph import shortest_path
 from shapecat.arrays import F4, F8, Record, array
 from shapecat.config import SurfaceSettings
 from shapecat.description import BLOCKS, DESCRIPTOR_NAMES, describe
-from shapecat.description.context import vertical_axis
 from shapecat.description.curvature import assign, fit_surfaces
 from shapecat.description.distances import euclidean, geodesic
+from shapecat.description.profile import vertical_axis
 from shapecat.description.revolution import rotation_axis
 from shapecat.surface import reconstruct
 from shapecat.types import NeuralGas

@@ -1,9 +1,6 @@
 """Frames: every layout of a cloud or depth image gives the same, right, coordinates."""
 
-import struct
-import zlib
 from collections import Counter
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +9,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.writer import Writer
-from rosbags.typesys import Stores, get_typestore
 
 from shapecat.errors import NoStreamError
 from shapecat.recordings import (
@@ -27,79 +23,27 @@ from shapecat.recordings.compressed_depth import depth_of_compressed
 from shapecat.recordings.pinhole import fit_pinhole, still_fits
 from shapecat.recordings.pointcloud2 import cloud_points
 from shapecat.types import Camera, Frame
+from tests.messages import (
+    CAMERA,
+    CLOUD,
+    EPOCH,
+    IMAGE,
+    INFO,
+    SECOND,
+    cloud,
+    compressed,
+    header,
+    image,
+    info,
+    make,
+    organized_points,
+    png,
+    rvl,
+    wavy_depth,
+    write,
+)
 
-STORE = get_typestore(Stores.ROS2_HUMBLE)
-SECOND = 10**9
-EPOCH = 1_700_000_000 * SECOND
-CLOUD, IMAGE = "sensor_msgs/msg/PointCloud2", "sensor_msgs/msg/Image"
-INFO, COMPRESSED = "sensor_msgs/msg/CameraInfo", "sensor_msgs/msg/CompressedImage"
-CAMERA = Camera(64, 48, 60.0, 61.0, 31.2, 23.7)
 DATA = Path(__file__).parents[2] / "shared" / "data"
-
-
-def make(kind: str, *values: Any) -> Any:
-    return STORE.types[kind](*values)
-
-
-def header(stamp: int, frame_id: str = "camera") -> Any:
-    time = make("builtin_interfaces/msg/Time", *divmod(stamp, SECOND))
-    return make("std_msgs/msg/Header", time, frame_id)
-
-
-def image(stamp: int, depth: Any, encoding: str = "16UC1", frame_id: str = "camera") -> Any:
-    h, w = depth.shape
-    data = np.frombuffer(np.ascontiguousarray(depth).tobytes(), np.uint8)
-    return make(IMAGE, header(stamp, frame_id), h, w, encoding, 0, depth.itemsize * w, data)
-
-
-def info(stamp: int, camera: Camera = CAMERA, d: Iterable[float] = ()) -> Any:
-    k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1], np.float64)
-    p = np.insert(k, (3, 6, 9), 0.0)
-    roi = make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)  # a message
-    size = (camera.height, camera.width)
-    return make(
-        INFO,
-        header(stamp),
-        *size,
-        "plumb_bob",
-        np.array(list(d)),
-        k,
-        np.eye(3).ravel(),
-        p,
-        0,
-        0,
-        roi,
-    )
-
-
-def cloud(stamp: int, points: Any, **changes: Any) -> Any:
-    """Make a cloud of plain float32 coordinates from (h, w, 3)."""
-    h, w = points.shape[:2]
-    data = np.frombuffer(np.ascontiguousarray(points, "<f4").tobytes(), np.uint8)
-    fields = [make("sensor_msgs/msg/PointField", n, 4 * k, 7, 1) for k, n in enumerate("xyz")]
-    order, dense = False, True
-    message = make(CLOUD, header(stamp), h, w, fields, order, 12, 12 * w, data, dense)
-    for name, value in changes.items():
-        setattr(message, name, value)
-    return message
-
-
-def write(path: Path, items: Iterable[tuple[str, int, Any]]) -> Path:
-    """Write messages given as topic, log time, message or bytes."""
-    with path.open("wb") as file:
-        writer = Writer(file)
-        writer.start("ros2", "test")
-        channels: dict[tuple[str, str], int] = {}
-        for topic, time, item in items:
-            kind = item[0] if isinstance(item, tuple) else item.__msgtype__
-            if (topic, kind) not in channels:
-                text = STORE.generate_msgdef(kind, ros_version=2)[0].encode()
-                schema = writer.register_schema(kind, "ros2msg", text)
-                channels[topic, kind] = writer.register_channel(topic, "cdr", schema)
-            raw = item[1] if isinstance(item, tuple) else bytes(STORE.serialize_cdr(item, kind))
-            writer.add_message(channels[topic, kind], time, raw, time)
-        writer.finish()
-    return path
 
 
 def read(path: Path, *topics: str, **options: Any) -> tuple[list[Frame], Counter[str], list[str]]:
@@ -108,19 +52,6 @@ def read(path: Path, *topics: str, **options: Any) -> tuple[list[Frame], Counter
         chosen = choose_streams(recording, topics)
         result = list(frames(recording, chosen, skipped=skipped, **options))
         return result, skipped, recording.warnings
-
-
-def wavy_depth(camera: Camera = CAMERA) -> Any:
-    """Make a depth image in millimetres with holes."""
-    v, u = np.mgrid[: camera.height, : camera.width]
-    depth = (900 + 200 * np.sin(u / 9) + 150 * np.cos(v / 7)).astype(np.uint16)
-    depth[(u + 2 * v) % 11 == 0] = 0
-    return depth
-
-
-def organized_points(depth: Any, camera: Camera = CAMERA) -> Any:
-    frame = Frame("", 0, 0, 0, "", depth=depth / np.float32(1000), camera=camera)
-    return frame.xyz().reshape(*depth.shape, 3)
 
 
 def test_depth_image_and_organized_cloud_give_the_same_frame(tmp_path: Path) -> None:
@@ -478,68 +409,6 @@ def test_no_stream_names_what_is_there(tmp_path: Path) -> None:
         pytest.raises(NoStreamError, match="/depth/camera_info"),
     ):
         choose_streams(recording)
-
-
-def png(values: Any) -> bytes:
-    """Write a 16-bit grey PNG that uses every row filter in turn."""
-    rows = values.astype(">u2").view(np.uint8).astype(int)
-    left, up = np.zeros_like(rows), np.zeros_like(rows)
-    left[:, 2:], up[1:] = rows[:, :-2], rows[:-1]
-    corner = np.zeros_like(rows)
-    corner[1:, 2:] = rows[:-1, :-2]
-    p = left + up - corner
-    dl, du, dc = abs(p - left), abs(p - up), abs(p - corner)
-    nearest = np.where((dl <= du) & (dl <= dc), left, np.where(du <= dc, up, corner))
-    guesses = [np.zeros_like(rows), left, up, (left + up) // 2, nearest]
-    data = b"".join(
-        bytes([y % 5]) + ((rows[y] - guesses[y % 5][y]) % 256).astype(np.uint8).tobytes()
-        for y in range(len(rows))
-    )
-    head = struct.pack(">IIBBBBB", values.shape[1], values.shape[0], 16, 0, 0, 0, 0)
-    packed = zlib.compress(data)
-    half = len(packed) // 2
-    chunks = [(b"IHDR", head), (b"IDAT", packed[:half]), (b"IDAT", packed[half:]), (b"IEND", b"")]
-    body = b"".join(struct.pack(">I", len(d)) + n + d + bytes(4) for n, d in chunks)
-    return b"\x89PNG\r\n\x1a\n" + body
-
-
-def rvl(values: Any) -> bytes:
-    """Write RVL as its paper describes."""
-    nibbles: list[int] = []
-
-    def put(number: int) -> None:
-        while True:
-            part, number = number & 7, number >> 3
-            nibbles.append(part | (8 if number else 0))
-            if not number:
-                return
-
-    flat, at, previous = values.ravel().tolist(), 0, 0
-    while at < len(flat):
-        zeros = at
-        while at < len(flat) and flat[at] == 0:
-            at += 1
-        put(at - zeros)
-        begin = at
-        while at < len(flat) and flat[at] != 0:
-            at += 1
-        put(at - begin)
-        for value in flat[begin:at]:
-            delta = value - previous
-            put((delta << 1) ^ (delta >> 63))
-            previous = value
-    nibbles += [0] * (-len(nibbles) % 8)
-    words = [
-        sum(nibble << (28 - 4 * k) for k, nibble in enumerate(nibbles[start : start + 8]))
-        for start in range(0, len(nibbles), 8)
-    ]
-    size = struct.pack("<II", values.shape[1], values.shape[0])
-    return size + np.array(words, "<u4").tobytes()
-
-
-def compressed(stamp: int, body: bytes, kind: str = "16UC1", ab: Any = (0.0, 0.0)) -> Any:
-    data = np.frombuffer(struct.pack("<iff", 0, *ab) + body, np.uint8)
-    return make(COMPRESSED, header(stamp), f"{kind}; compressedDepth", data)
 
 
 @pytest.mark.parametrize("pack", [png, rvl])

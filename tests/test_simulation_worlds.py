@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from shapecat.arrays import Bool
 from shapecat.errors import OutputError
 from shapecat.geometry import compose, inverse, rotation_from_quaternion, transform
-from shapecat.simulation import World, make_scene, render_frame, simulate
+from shapecat.simulation import World, make_piece, make_scene, make_stage, render_frame, simulate
 from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.recorder import EPOCH_NS
 from shapecat.simulation.render import geometry, render
@@ -125,6 +125,19 @@ def test_scene_does_not_depend_on_the_number_of_frames() -> None:
     assert len(short.things) == len(long.things)
     for a, b in zip(short.path, long.path, strict=False):
         assert np.array_equal(a.translation, b.translation)
+
+
+def test_a_stage_shows_its_thing_from_all_sides() -> None:
+    rng = np.random.default_rng(3)
+    world = make_stage([make_piece("cup", rng, manner="lying")], rng, views=6)
+    (thing,) = world.things
+    sides = {round(np.arctan2(*pose.translation[1::-1])) for pose in world.path}
+
+    assert thing.lying
+    assert len(sides) >= 3
+    for view in range(6):
+        _, labels = render_frame(world, view, rng=rng)
+        assert (labels == thing.label).sum() > 100
 
 
 def test_unknown_scene_is_named() -> None:

@@ -5,8 +5,9 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_allclose
 
+from shapecat.corrections import TrackLabel
 from shapecat.errors import OutputError
-from shapecat.labels import adopt_labels, read_labelled_frames, read_labels
+from shapecat.labels import read_labelled_frames
 from shapecat.tables import (
     DETECTIONS,
     FRAMES,
@@ -21,7 +22,6 @@ from shapecat.tables import (
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Pose, Scene
 
 CATEGORIES = ("cup", "can")
-HEADER = "track,category,confidence,label\n"
 
 
 def plane(height: float) -> Plane:
@@ -98,7 +98,7 @@ def test_row_groups_cover_the_same_frames(tmp_path: Path) -> None:
     names = ("frames", "detections", "planes")
     groups = [list(read_row_groups(tmp_path / f"{name}.parquet")) for name in names]
 
-    assert [len(g) for g in groups] == [3, 3, 3]
+    assert [len(g) for g in groups] == [5, 5, 5]
     for frames, detections, planes in zip(*groups, strict=True):
         known = set(frames["frame"].to_pylist())
         assert set(detections["frame"].to_pylist()) <= known
@@ -109,7 +109,7 @@ def test_labelled_frames_join_tracks_and_labels(tmp_path: Path) -> None:
     pose = Pose(np.eye(3), np.array([1, 2, 3]))
     write_run_tables(tmp_path, [2, 1, 0, 2], pose)
     write_tracks(tmp_path, [(5, 0, 0), (6, 0, 1), (5, 1, 0), (6, 1, None), (6, 3, 1), (9, 3, 0)])
-    labels = {5: ("cup", 0.7), 6: ("vase", 1.0)}
+    labels = {5: TrackLabel(5, "cup", 0.7), 6: TrackLabel(6, "vase", 1.0)}
 
     frames = list(read_labelled_frames(tmp_path, labels))
 
@@ -123,46 +123,6 @@ def test_labelled_frames_join_tracks_and_labels(tmp_path: Path) -> None:
     assert len(frames[2].planes) == 2
     assert frames[0].fixed_from_sensor is not None
     assert_allclose(frames[0].fixed_from_sensor.translation, [1, 2, 3])
-
-
-def test_a_person_s_label_wins(tmp_path: Path) -> None:
-    path = tmp_path / "tracks.csv"
-    path.write_text(f"{HEADER}1,cup,0.5,\n2,can,0.6, bowl \n")
-
-    assert read_labels(path) == {1: ("cup", 0.5), 2: ("bowl", 1.0)}
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (f"{HEADER}x,cup,0.5,\n", "line 2"),
-        (f"{HEADER}1,cup,high,\n", "line 2"),
-        ("id;category\n1;cup\n", "line 2"),
-    ],
-)
-def test_a_damaged_table_of_labels_is_named_by_line(
-    tmp_path: Path, content: str, message: str
-) -> None:
-    path = tmp_path / "tracks.csv"
-    path.write_text(content)
-
-    with pytest.raises(OutputError, match=message):
-        read_labels(path)
-
-
-def test_corrected_labels_keep_the_original(tmp_path: Path) -> None:
-    (tmp_path / "tracks.csv").write_text(f"{HEADER}1,cup,0.5,\n")
-    corrected = tmp_path / "mine.csv"
-    corrected.write_text(f"{HEADER}1,cup,0.5,bowl\n")
-
-    adopt_labels(corrected, tmp_path)
-
-    assert read_labels(tmp_path / "tracks.csv") == {1: ("bowl", 1.0)}
-    assert read_labels(tmp_path / "tracks.original.csv") == {1: ("cup", 0.5)}
-
-    corrected.write_text(f"{HEADER}7,cup,0.5,bowl\n")
-    with pytest.raises(OutputError, match="does not have: 7"):
-        adopt_labels(corrected, tmp_path)
 
 
 def test_lists_of_nothing() -> None:

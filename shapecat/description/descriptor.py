@@ -5,14 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from shapecat.arrays import F4, F8, U2
-from shapecat.description.context import (
-    CONTEXT_NAMES,
-    PROFILE_NAMES,
-    context,
-    profile,
-)
+from shapecat.description.context import CONTEXT_NAMES, context
 from shapecat.description.curvature import assign, fit_surfaces
 from shapecat.description.distances import euclidean, geodesic, mean_gap
+from shapecat.description.profile import PROFILE_NAMES, profile
 from shapecat.description.revolution import REVOLUTION_NAMES, revolution
 from shapecat.jit import kernel
 from shapecat.types import NeuralGas

@@ -7,18 +7,20 @@ from shapecat.detection.cells import JUMP
 from shapecat.detection.heights import LEAST_M, NOISE
 from shapecat.jit import kernel
 
-__all__ = ["FRINGE", "fill_enclosed", "grow_feet"]
+__all__ = ["FRINGE", "fill_enclosed", "flood_hole", "grow_feet", "is_raised"]
 
 FRINGE = 0.6
 """Share of the least height from which a reading next to an object belongs to it."""
 FEET_CELLS = 4
 MOST_CELLS = 4000
 SHARE = 0.6
+RAISED_M, RAISED_NOISE = 0.0012, 0.0008
+RAISED_SHARE, LABELLED = 0.35, 0.5
 LEVEL = 0.15
 """Share of the boundary where the surface goes on: not so through the hole of a handle."""
 
 
-def fill_enclosed(w: F4, labels: I4, count: int, *, active: bool) -> U1:
+def fill_enclosed(w: F4, height: F4, labels: I4, count: int, *, active: bool) -> U1:
     """Give enclosed unlabelled cells to what encloses them; return (rows, columns) what was filled.
 
     Cells are enclosed when 60 % of their boundary is one label and every other label on it is in
@@ -28,7 +30,8 @@ def fill_enclosed(w: F4, labels: I4, count: int, *, active: bool) -> U1:
     rows, columns = np.flatnonzero(labels.any(axis=1)), np.flatnonzero(labels.any(axis=0))
     if active and rows.size:
         i0, i1, j0, j1 = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
-        _fill(w[i0:i1, j0:j1], labels[i0:i1, j0:j1], count, filled[i0:i1, j0:j1])
+        box = slice(i0, i1), slice(j0, j1)
+        _fill(w[box], height[box], labels[box], count, filled[box])
     return filled
 
 
@@ -73,54 +76,82 @@ def grow_feet(w: F4, owner: I4, height: F4, labels: I4) -> None:
 
 
 @kernel
-def _fill(w: F4, labels: I4, count: int, filled: U1) -> None:
+def flood_hole(
+    w: F4, labels: I4, seen: U1, stack: I4, sides: I4, ahead: I4, level: I4
+) -> tuple[int, int]:
+    """Collect the unlabelled cells connected to the first of ``stack``.
+
+    Counts, for each label, the sides of cells where it bounds the hole, where it is in front of
+    it, and where the surface goes on. Returns how many cells the hole has, 0 if it reaches the
+    border, and how many sides, those to cells without a reading included.
+    """
     rows, columns = labels.shape
+    sides[:] = 0
+    ahead[:] = 0
+    level[:] = 0
+    outside = False
+    total = 0
+    done, top = 0, 1
+    seen[stack[0, 0], stack[0, 1]] = 1
+    while done < top:
+        i, j = stack[done, 0], stack[done, 1]
+        done += 1
+        for d in range(4):
+            y = i + (1 if d == 0 else -1 if d == 1 else 0)
+            x = j + (1 if d == 2 else -1 if d == 3 else 0)
+            if y < 0 or x < 0 or y >= rows or x >= columns:
+                outside = True
+                continue
+            label = labels[y, x]
+            if label > 0:
+                total += 1
+                sides[label] += 1
+                ahead[label] += w[y, x] > w[i, j] + JUMP
+                level[label] += abs(w[y, x] - w[i, j]) < JUMP
+            elif w[y, x] <= 0:
+                total += 1
+            elif not seen[y, x]:
+                seen[y, x] = 1
+                stack[top, 0], stack[top, 1] = y, x
+                top += 1
+    return (0 if outside or top >= MOST_CELLS else top), total
+
+
+@kernel
+def is_raised(w: F4, height: F4, stack: I4, cells: int) -> bool:
+    """Whether a hole lies a little above the plane, as the floor of a plate does."""
+    raised = far = 0.0
+    for t in range(cells):
+        i, j = stack[t, 0], stack[t, 1]
+        raised += height[i, j]
+        far += 1 / w[i, j]
+    return raised > cells * (RAISED_M + RAISED_NOISE * (far / cells) ** 2)
+
+
+@kernel
+def _fill(w: F4, height: F4, labels: I4, count: int, filled: U1) -> None:
     seen = np.zeros(labels.shape, np.uint8)
     stack = np.zeros((labels.size, 2), np.int16)
     sides = np.zeros(count + 1, np.int32)
     ahead = np.zeros(count + 1, np.int32)
     level = np.zeros(count + 1, np.int32)
-    for si in range(rows):
-        for sj in range(columns):
+    for si in range(labels.shape[0]):
+        for sj in range(labels.shape[1]):
             if labels[si, sj] != 0 or seen[si, sj] or w[si, sj] <= 0:
                 continue
-            sides[:] = 0
-            ahead[:] = 0
-            level[:] = 0
-            outside = False
-            total = 0
             stack[0, 0], stack[0, 1] = si, sj
-            seen[si, sj] = 1
-            done, top = 0, 1
-            while done < top:
-                i, j = stack[done, 0], stack[done, 1]
-                done += 1
-                for d in range(4):
-                    y = i + (1 if d == 0 else -1 if d == 1 else 0)
-                    x = j + (1 if d == 2 else -1 if d == 3 else 0)
-                    if y < 0 or x < 0 or y >= rows or x >= columns:
-                        outside = True
-                        continue
-                    label = labels[y, x]
-                    if label > 0:
-                        total += 1
-                        sides[label] += 1
-                        ahead[label] += w[y, x] > w[i, j] + JUMP
-                        level[label] += abs(w[y, x] - w[i, j]) < JUMP
-                    elif w[y, x] <= 0:
-                        total += 1
-                    elif not seen[y, x]:
-                        seen[y, x] = 1
-                        stack[top, 0], stack[top, 1] = y, x
-                        top += 1
-            if outside or top >= MOST_CELLS:
+            cells, total = flood_hole(w, labels, seen, stack, sides, ahead, level)
+            if cells == 0:
                 continue
             best = np.argmax(sides)
-            fits = sides[best] > max(0, SHARE * total) and level[best] > LEVEL * total
+            share = SHARE
+            if np.sum(sides) > LABELLED * total and is_raised(w, height, stack, cells):
+                share = RAISED_SHARE
+            fits = sides[best] > max(0, share * total) and level[best] > LEVEL * total
             for k in range(1, count + 1):
                 if k != best and ahead[k] < sides[k]:
                     fits = False
             if fits:
-                for t in range(top):
+                for t in range(cells):
                     labels[stack[t, 0], stack[t, 1]] = best
                     filled[stack[t, 0], stack[t, 1]] = 1

@@ -15,9 +15,9 @@ __all__ = ["LEAST_M", "NOISE", "Heights", "clear_walls", "heights_of", "inside",
 
 LEAST_M = 0.004
 """Lowest height of an object cell, to which `NOISE` times the squared range is added."""
-NOISE = 0.003
+NOISE = 0.0025
 WALL_JUMP = 0.012
-"""Cells this far in front of a wall, in inverse depth, are still the wall."""
+"""Cells this near to a wall, in inverse depth, are the wall."""
 
 
 class Heights(NamedTuple):
@@ -64,12 +64,12 @@ def heights_of(cells: Cells, supports: list[Support], *, highest_m: float) -> He
 
 @kernel
 def clear_walls(w: F4, owner: I4, walls: F8) -> None:
-    """Take the cells on and behind walls, rows (a, b, c) of ``walls``, from the object cells."""
+    """Take the cells on walls, rows (a, b, c) of ``walls``, from the object cells."""
     for i in range(w.shape[0]):
         for j in range(w.shape[1]):
             if owner[i, j] > 0:
                 for wall in walls:
-                    if w[i, j] < wall[0] * j + wall[1] * i + wall[2] + WALL_JUMP:
+                    if abs(w[i, j] - (wall[0] * j + wall[1] * i + wall[2])) < WALL_JUMP:
                         owner[i, j] = 0
 
 

@@ -9,6 +9,7 @@ from shapecat.arrays import F4, I4
 from shapecat.detection.cells import JUMP, Cells, Lens
 from shapecat.detection.pieces import (
     BAND_M,
+    BOTTOM,
     CONTACT,
     COUNT,
     FRONT,
@@ -45,6 +46,8 @@ COPLANAR_M, COPLANAR = 0.006, 0.05
 COPLANAR_COS = 0.966
 PARTNERS = 0.45
 PART = 0.35
+NECK_WIDTH, NECK_OVERLAP_M, NECK_APART, ROUND = 0.55, 0.03, 0.12, 0.8
+NECK_LEDGE = 0.1
 
 
 def join_pieces(
@@ -59,6 +62,8 @@ def join_pieces(
         _join_hollow(pieces)
     if "rim" in rules:
         _join_rims(pieces)
+    if "neck" in rules:
+        _join_necks(pieces)
     if "float" in rules:
         _join_floating(pieces)
     if "enclosed" in rules:
@@ -287,6 +292,33 @@ def _has_lid(pieces: Pieces, p: int) -> bool:
     for band in range(max(top - int(LID_M / BAND_M), 0), top + 1):
         area += pieces.lid[p, band]
     return area > LID * (row[RIGHTMOST] - row[LEFT]) ** 2
+
+
+@kernel
+def _join_necks(pieces: Pieces) -> None:
+    """A narrow round piece over the middle of a round one without a lid is its neck."""
+    n = pieces.group.size
+    for p in range(1, n):
+        for q in range(1, n):
+            if p != q and _alive(pieces, p) and _alive(pieces, q) and _is_neck(pieces, p, q):
+                merge(pieces, q, p)
+                break
+
+
+@kernel
+def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
+    a, b = pieces.shape[p], pieces.shape[q]
+    met = pieces.pairs[CONTACT, p, q] + pieces.pairs[NEAR, p, q] + pieces.pairs[FRONT, p, q]
+    if met < FEW or pieces.owner[p] != pieces.owner[q] or pieces.single[p, TABLE] > 2:
+        return False
+    narrow, wide = a[RIGHTMOST] - a[LEFT], b[RIGHTMOST] - b[LEFT]
+    ledge = pieces.pairs[ONTO, p, q] > NECK_LEDGE * pieces.pairs[CONTACT, p, q]
+    if narrow > (NECK_WIDTH if ledge else 1.0) * wide or a[TOP] < b[TOP] or a[BOTTOM] < b[TOP] - NECK_OVERLAP_M:
+        return False
+    apart = abs(a[LEFT] + a[RIGHTMOST] - b[LEFT] - b[RIGHTMOST]) / 2
+    if apart > NECK_APART * wide or _slope(a) < ROUND / 2 or _slope(b) < ROUND:
+        return False
+    return not _has_lid(pieces, q)
 
 
 @kernel

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.cells import NEAREST_M, Cells, Lens
+from shapecat.detection.cells import JUMP, NEAREST_M, Cells, Lens
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 
@@ -20,8 +20,14 @@ LEAST_SHARE = 0.04
 """A plane that tells the up direction covers at least this share of the readings."""
 HINT_COS = math.cos(math.radians(15))
 CORNER_COS = 0.3
+SAME_COS = math.cos(math.radians(12))
+FACING_COS = 0.94
+HEIGHT_BINS, LEVEL_BIN_M = 80, 0.04
+MOST_DIRECTIONS = 4
+LEAST_FACETS = 12
 WALL_COS = 0.2
 WALL_AREA_M2 = 0.05
+WALL_FILL = 0.3
 DIRECTIONS = 16
 MARGIN_M = 0.01
 BIN_M = 0.01
@@ -34,6 +40,7 @@ ARM = 3
 STEADY_COS = math.cos(math.radians(6))
 LIKELY_AREA_M2 = 0.1
 LEAST_DROP_M = 0.06
+EDGE_STEPS = 5
 LEAST_DROPS = 20
 CLOSED = 0.5
 
@@ -65,32 +72,155 @@ def estimate_up(
     direction that two walls leave. Where the camera is thought ``upright``, directions that look
     down count less, so that the boards of a shelf beat its back.
     """
-    sample, stride = _sample(cells.w)
-    least = max(LEAST_SHARE * np.count_nonzero(sample), 30)
-    if hint is not None:
-        plane, count = _best_plane(sample, stride, cells.lens, hint, (HINT_COS, 1.0), rng)
-        return _normal(plane, cells.lens) if count >= least else None
-    normals: list[F8] = []
-    for _ in range(MOST_PLANES):
-        plane, count = _best_plane(sample, stride, cells.lens, np.zeros(3), (0.0, 0.0), rng)
-        if count < least:
-            break
-        normals.append(_normal(plane, cells.lens))
-        _clear(sample, stride, plane, 2 * TOLERANCE)
-    if not normals:
+    facets = np.zeros((cells.w.size // 16 + cells.w.shape[0] + cells.w.shape[1], 6), np.float32)
+    facets = facets[: _facets(cells.w, cells.lens, facets)]
+    least = max(LEAST_SHARE * len(facets), LEAST_FACETS)
+    directions = _directions(facets, hint, least, rng)
+    if not directions:
         return None
-    choices = normals + [
-        sign * np.cross(a, b) / np.linalg.norm(np.cross(a, b))
-        for k, a in enumerate(normals)
-        for b in normals[:k]
-        if abs(a @ b) < CORNER_COS
-        for sign in (1, -1)
-    ]
-    facing = np.zeros(len(choices), np.int64)
-    _count_facing(cells.w, cells.lens, np.array(choices), facing)
+    if hint is None:
+        # Two walls leave one direction, up or down.
+        directions += [
+            sign * np.cross(a, b) / np.linalg.norm(np.cross(a, b))
+            for k, a in enumerate(directions)
+            for b in directions[:k]
+            if abs(a @ b) < CORNER_COS
+            for sign in (1, -1)
+        ]
+    best = max(directions, key=lambda d: _merit(facets, d, least, upright=upright))
+    return _settled(cells, facets, best)
+
+
+def _directions(
+    facets: F4, hint: F8 | None, least: float, rng: np.random.Generator
+) -> list[F8]:
+    """Return directions that many surfaces face, most first: RANSAC on one normal at a time."""
+    free = np.ones(len(facets), np.bool_)
+    if hint is not None:
+        free &= _facing(facets, hint, HINT_COS)
+    found: list[F8] = []
+    while len(found) < MOST_DIRECTIONS and np.count_nonzero(free) >= least:
+        trials = np.flatnonzero(free)[rng.integers(0, np.count_nonzero(free), TRIALS)]
+        best = np.zeros(3)
+        if _most_faced(facets, free, trials, best) < least:
+            break
+        found.append(best)
+        free &= ~_facing(facets, best, FACING_COS)
+    return found
+
+
+@kernel
+def _facing(facets: F4, direction: F8, least_cos: float) -> Bool:
+    """Return which facets face a direction."""
+    result = np.zeros(len(facets), np.bool_)
+    for k in range(len(facets)):
+        f = facets[k]
+        cos = f[0] * direction[0] + f[1] * direction[1] + f[2] * direction[2]
+        result[k] = cos > least_cos
+    return result
+
+
+@kernel
+def _most_faced(facets: F4, free: Bool, trials: I4, best: F8) -> int:
+    """Write the direction most free facets face; return how many."""
+    chosen = np.zeros((np.count_nonzero(free), 3), np.float32)
+    n = 0
+    for k in range(len(facets)):
+        if free[k]:
+            chosen[n] = facets[k, :3]
+            n += 1
+    most = -1
+    for t in trials:
+        x, y, z = facets[t, 0], facets[t, 1], facets[t, 2]
+        votes = 0
+        for k in range(n):
+            votes += chosen[k, 0] * x + chosen[k, 1] * y + chosen[k, 2] * z > FACING_COS
+        if votes > most:
+            most = votes
+            best[0], best[1], best[2] = x, y, z
+    for _ in range(3):
+        x, y, z = best
+        sx = sy = sz = 0.0
+        most = 0
+        for k in range(n):
+            if chosen[k, 0] * x + chosen[k, 1] * y + chosen[k, 2] * z > FACING_COS:
+                most += 1
+                sx += chosen[k, 0]
+                sy += chosen[k, 1]
+                sz += chosen[k, 2]
+        norm = math.sqrt(sx * sx + sy * sy + sz * sz)
+        best[0], best[1], best[2] = sx / norm, sy / norm, sz / norm
+    return most
+
+
+def _merit(facets: F4, direction: F8, least: float, *, upright: bool) -> float:
+    count = np.zeros(HEIGHT_BINS, np.int64)
+    facing = _count_levels(facets, direction, count)
+    # The boards of a shelf are several, its back is one.
+    levels = max(np.count_nonzero((count[1:] + count[:-1])[::2] > least), 1)
     # Cameras look down at tables: +y is down in the optical frame.
-    down = [min(max(-c[1] / 0.2, -1.0), 1.0) if upright else 0.0 for c in choices]
-    return choices[int(np.argmax(facing * (1.0 + 0.6 * np.array(down))))]
+    tilt = min(max(-direction[1] / 0.2, -1.0), 1.0) if upright else 0.0
+    return float(facing * math.sqrt(levels) * (1.0 + 0.6 * tilt))
+
+
+@kernel
+def _count_levels(facets: F4, direction: F8, count: I4) -> int:
+    """Count the facets that face a direction, in all and by their height below the sensor."""
+    facing = 0
+    for k in range(len(facets)):
+        f = facets[k]
+        if f[0] * direction[0] + f[1] * direction[1] + f[2] * direction[2] > FACING_COS:
+            facing += 1
+            height = f[3] * direction[0] + f[4] * direction[1] + f[5] * direction[2]
+            level = int(math.floor(-height / LEVEL_BIN_M))
+            if 0 <= level < count.size:
+                count[level] += 1
+    return facing
+
+
+def _settled(cells: Cells, facets: F4, direction: F8) -> F8:
+    """Return the exact normal of the largest plane that faces ``direction``."""
+    count = np.zeros(HEIGHT_BINS, np.int64)
+    _count_levels(facets, direction, count)
+    offset = -(int(np.argmax(count)) + 0.5) * LEVEL_BIN_M
+    sample, stride = _sample(cells.w)
+    plane = _level_plane(cells.lens, direction, offset)
+    for tolerance in (4, 3, 2, 1, 1):
+        _refit(sample, stride, tolerance * TOLERANCE, plane)
+    normal = _normal(plane, cells.lens)
+    return normal if normal @ direction > SAME_COS else direction
+
+
+def _level_plane(lens: Lens, up: F8, offset: float) -> F8:
+    """Return the plane ``up @ p == offset`` as inverse depth (a, b, c)."""
+    a, b = up[0] / lens.fx, up[1] / lens.fy
+    return np.array([a, b, up[2] - a * lens.cx - b * lens.cy]) / offset
+
+
+@kernel
+def _facets(w: F4, lens: Lens, facets: F4) -> int:
+    """Collect the normal and the position of every fourth cell on a smooth surface."""
+    rows, columns = w.shape
+    bend = np.float32(2 * JUMP)
+    n = 0
+    for i in range(ARM, rows - ARM, 4):
+        for j in range(ARM, columns - ARM, 4):
+            center = w[i, j]
+            left, right, top, bottom = w[i, j - ARM], w[i, j + ARM], w[i - ARM, j], w[i + ARM, j]
+            if not ((center > 0) & (left > 0) & (right > 0) & (top > 0) & (bottom > 0)):
+                continue
+            if (abs(left + right - 2 * center) > bend) | (abs(top + bottom - 2 * center) > bend):
+                continue
+            wu, wv = (right - left) / (2 * ARM), (bottom - top) / (2 * ARM)
+            nx, ny = -lens.fx * wu, -lens.fy * wv
+            nz = wu * (j - lens.cx) + wv * (i - lens.cy) - center
+            norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+            facets[n, 0], facets[n, 1], facets[n, 2] = nx / norm, ny / norm, nz / norm
+            facets[n, 3] = (j - lens.cx) / lens.fx / center
+            facets[n, 4] = (i - lens.cy) / lens.fy / center
+            facets[n, 5] = 1 / center
+            n += 1
+    return n
 
 
 def find_walls(
@@ -110,7 +240,8 @@ def find_walls(
         axes = np.stack([np.cross(normal, up), up])
         reach = np.zeros(3)
         _measure_wall(sample, stride, cells.lens, plane, normal, axes, reach)
-        if reach[0] > WALL_AREA_M2 and reach[1:].max() > largest_m:
+        dense = reach[0] > WALL_FILL * reach[1] * reach[2]
+        if reach[0] > WALL_AREA_M2 and dense and reach[1:].max() > largest_m:
             walls.append(plane)
         _clear(sample, stride, plane, 2 * TOLERANCE)
     return walls
@@ -141,28 +272,6 @@ def _measure_wall(
     for d in range(2):
         for k in range(400):
             reach[1 + d] += 0.05 if bins[d, k] > 0.0025 else 0.0
-
-
-@kernel
-def _count_facing(w: F4, lens: Lens, directions: F8, facing: I4) -> None:
-    """Count for each direction the cells, of every fourth, that face it within 15 degrees."""
-    rows, columns = w.shape
-    bend = np.float32(0.024)
-    for i in range(ARM, rows - ARM, 4):
-        for j in range(ARM, columns - ARM, 4):
-            center = w[i, j]
-            left, right, top, bottom = w[i, j - ARM], w[i, j + ARM], w[i - ARM, j], w[i + ARM, j]
-            if not ((center > 0) & (left > 0) & (right > 0) & (top > 0) & (bottom > 0)):
-                continue
-            if (abs(left + right - 2 * center) > bend) | (abs(top + bottom - 2 * center) > bend):
-                continue
-            wu, wv = (right - left) / (2 * ARM), (bottom - top) / (2 * ARM)
-            nx, ny = lens.fx * wu, lens.fy * wv
-            nz = center - wu * (j - lens.cx) - wv * (i - lens.cy)
-            norm = math.sqrt(nx * nx + ny * ny + nz * nz)
-            for k in range(directions.shape[0]):
-                d = directions[k]
-                facing[k] += -(nx * d[0] + ny * d[1] + nz * d[2]) > 0.966 * norm
 
 
 def _best_plane(
@@ -412,12 +521,9 @@ def _by_height(index: I4, height: F4, base: float, bins: int) -> tuple[I4, I4]:
 
 def _refined(cells: Cells, index: I4, offset: float, up: F8) -> Support | None:
     lens = cells.lens
-    # The level plane at that height, as inverse depth.
-    level = np.array([up[0] / lens.fx, up[1] / lens.fy, 0.0])
-    level[2] = up[2] - level[0] * lens.cx - level[1] * lens.cy
-    if abs(offset) < MARGIN_M:  # through the sensor: seen edge on
+    if offset > -MARGIN_M:  # not seen from above
         return None
-    level /= offset
+    level = _level_plane(lens, up, offset)
     plane = level.copy()
     for _ in range(3):
         count = _refit_cells(cells.w, index, 1.5 * TOLERANCE, plane)
@@ -564,16 +670,21 @@ def _drop(w: F4, lens: Lens, index: I4, plane: F8, up: F8, axes: F8, drop: float
         h = x * up[0] + y * up[1] + z * up[2]
         tx, ty, tz = h * up[0] - x, h * up[1] - y, h * up[2] - z
         length = math.sqrt(tx * tx + ty * ty + tz * tz)
-        if length < 0.05:
+        if length < 0.1 or z < 0.2:
             continue
-        step = 0.02 / length
-        ex, ey, ez = x + step * tx, y + step * ty, z + step * tz
-        if ez <= NEAREST_M:
-            continue
-        v, u = int(lens.cy + lens.fy * ey / ez + 0.5), int(lens.cx + lens.fx * ex / ez + 0.5)
-        if v < 0 or u < 0 or v >= rows or u >= columns or w[v, u] <= 0:
-            continue
-        if w[v, u] > 1 / ez - 2 * TOLERANCE:  # still the plane, or something in front of it
+        tx, ty, tz = 0.01 * tx / length, 0.01 * ty / length, 0.01 * tz / length
+        edge = False
+        for _ in range(EDGE_STEPS):
+            v = int(lens.cy + lens.fy * (y + ty) / (z + tz) + 0.5)
+            u = int(lens.cx + lens.fx * (x + tx) / (z + tz) + 0.5)
+            if v < 0 or u < 0 or v >= rows or u >= columns or w[v, u] <= 0:
+                break
+            ahead = w[v, u] - 1 / (z + tz)
+            edge = ahead < -2 * TOLERANCE
+            if edge or ahead > 2 * TOLERANCE:  # the end of the plane, or something on it
+                break
+            x, y, z = x + tx, y + ty, z + tz
+        if not edge:
             continue
         for k in range(4, 20):
             s = 0.01 * k

@@ -19,11 +19,24 @@ from shapecat.detection.joins import join_pieces
 from shapecat.detection.pieces import Pieces, pieces_of
 from shapecat.detection.planes import Support, estimate_up, find_supports, find_walls
 from shapecat.detection.regions import regions_of
+from shapecat.detection.rings import join_rings
 from shapecat.detection.surfaces import surfaces_of
 
 __all__ = ["RULES", "Segmentation", "segment"]
 
-RULES = ("concave", "small", "occluder", "hollow", "rim", "float", "enclosed", "feet", "fill")
+RULES = (
+    "concave",
+    "small",
+    "occluder",
+    "hollow",
+    "rim",
+    "neck",
+    "float",
+    "enclosed",
+    "ring",
+    "feet",
+    "fill",
+)
 """The rules beyond the thesis, in their order. Without any of them what remains is the plane, the
 height above it, and depth jumps."""
 
@@ -79,11 +92,13 @@ def segment(
     regions, n = regions_of(heights, surfaces, concave="concave" in rules)
     pieces = pieces_of(cells, heights, surfaces, regions, n, up)
     join_pieces(pieces, cells, surfaces, regions, rules)
+    if "ring" in rules:
+        join_rings(pieces, cells.w, heights.height, regions)
     furniture = is_furniture(pieces, largest_m=settings.max_size_m)
     pieces.group[furniture[pieces.group]] = 0
     leaders, number = np.unique(pieces.group, return_inverse=True)
     labels = number.astype(np.int16)[regions]
     if "feet" in rules:
         grow_feet(cells.w, heights.owner, heights.height, labels)
-    filled = fill_enclosed(cells.w, labels, leaders.size - 1, active="fill" in rules)
+    filled = fill_enclosed(cells.w, heights.height, labels, leaders.size - 1, active="fill" in rules)
     return Segmentation(up, supports, labels, heights.height, filled, pieces, leaders)

@@ -36,7 +36,7 @@ class LearningSettings:
 
     blocks: tuple[str, ...] = ()
     """Blocks of the descriptor that are used; all if empty."""
-    kernels: int = 0
+    kernels: int = 50
     """Parzen kernels per category in the probabilistic neural network; 0 leaves it out."""
     trees: int = 100
     """Trees of the dictionary: words per object."""
@@ -44,9 +44,9 @@ class LearningSettings:
     """Training views a leaf needs."""
     strategy: Literal["multinomial", "one_vs_rest"] = "multinomial"
     """Learners on the words: against each other, or one versus the rest."""
-    strength: float = 0.01
+    strength: float = 0.03
     """Inverse regularisation of the learners."""
-    known_views: int = 2500
+    known_views: int = 1500
     """Known views kept in the model, for novelty and for learning new categories."""
     neighbours: int = 10
     """Nearest known views that novelty asks."""

@@ -16,6 +16,7 @@ from shapecat.evaluation import View
 from shapecat.evaluation.report import UNKNOWN
 from shapecat.evaluation.views import describe_view
 from shapecat.geometry import IDENTITY, inverse, level_from_sensor, transform
+from shapecat.learning.baselines import distance_histogram
 from shapecat.models.fragments import cut_fragment, cut_halo
 from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.mesh import Mesh, moved, rounded_box, standing
@@ -64,7 +65,7 @@ class WorldView(NamedTuple):
     """One described view and its circumstances.
 
     ``manner`` is upright, lying or upside_down; ``source`` truth, detected or fragment; ``visible``
-    the share of its pixels that has readings.
+    the share of its pixels that has readings; ``d2`` the plain shape distribution.
     """
 
     descriptor: F4
@@ -77,6 +78,7 @@ class WorldView(NamedTuple):
     source: str
     visible: float
     sensor: str
+    d2: F4
 
 
 class _Actor(NamedTuple):
@@ -327,4 +329,5 @@ def _described(
         source=source,
         visible=float(shot.visible[k]),
         sensor=shot.sensor,
+        d2=distance_histogram(view.points, rng),
     )

@@ -1,12 +1,14 @@
 """Where up is, and where the sensor is, in each frame of a recording."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from shapecat.arrays import F4
 from shapecat.errors import ConfigError
+from shapecat.recordings.imu import Accelerometer, read_accelerometers
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.transforms import (
     TransformBuffer,
@@ -14,12 +16,15 @@ from shapecat.recordings.transforms import (
     fixed_frame,
     read_transforms,
 )
+from shapecat.tables import read_row_groups
 from shapecat.types import Frame, Pose
 
 __all__ = ["Upright"]
 
 _LEVEL_FRAMES = ("map", "odom", "world", "earth", "base_footprint", "base_link")
 """Frames whose z axis is up by convention (REP 105, REP 103)."""
+_SOURCES = {"auto": ("tf", "imu"), "tf": ("tf",), "imu": ("imu",)}
+_DISAGREE_DEG = 10
 
 
 @dataclass
@@ -32,10 +37,12 @@ class Upright:
     transforms: TransformBuffer
     fixed_frame: str | None
     vector: F4 | None
-    use_transforms: bool
+    sources: tuple[str, ...]
+    accelerometers: tuple[Accelerometer, ...] = ()
+    warnings: list[str] = field(default_factory=list)
     _failed: int = 0
     _first_failure: str = ""
-    _source: str = "planes"
+    _given: dict[str, int] = field(default_factory=dict)
 
     @classmethod
     def of(cls, recording: Recording, *, up: str, fixed_frame: str | None) -> "Upright":
@@ -43,20 +50,31 @@ class Upright:
 
         Parameters
         ----------
-        up : ``auto``, ``tf``, or a vector ``X,Y,Z`` in the sensor frame.
+        up : ``tf``, ``imu``, ``auto`` for the first of these that there is, or a vector ``X,Y,Z``
+            in the sensor frame.
         fixed_frame : name of the frame in which things stand still; None to choose one.
 
         Raises
         ------
-        ConfigError : ``up`` is none of these.
+        ConfigError : ``up`` is none of these, or the recording does not hold what it names.
         """
-        vector = None if up in {"auto", "tf"} else _parse_vector(up)
+        sources = _SOURCES.get(up, ())
+        vector = None if sources else _parse_vector(up)
         transforms = read_transforms(recording)
         if fixed_frame is not None and fixed_frame not in transforms.frames:
             known = ", ".join(sorted(transforms.frames)) or "none, it has no transforms"
             msg = f"--fixed-frame {fixed_frame}: not in {recording.path}; its frames: {known}"
             raise ConfigError(msg)
-        return cls(transforms, fixed_frame, vector, use_transforms=vector is None)
+        if up == "tf" and not set(_LEVEL_FRAMES) & set(transforms.frames):
+            msg = (
+                f"--up tf: {recording.path} has no transforms to any of {', '.join(_LEVEL_FRAMES)}"
+            )
+            raise ConfigError(msg)
+        found = read_accelerometers(recording) if "imu" in sources else ()
+        if up == "imu" and not found:
+            msg = f"--up imu: {recording.path} has no sensor_msgs/Imu with accelerations"
+            raise ConfigError(msg)
+        return cls(transforms, fixed_frame, vector, sources, found)
 
     def fixed_from_sensor(self, frame: Frame) -> Pose | None:
         """Return the pose of the sensor in the fixed frame, or None if it is not known."""
@@ -68,17 +86,32 @@ class Upright:
 
     def up(self, frame: Frame) -> F4 | None:
         """Return the unit vector (3,) that points up in the sensor frame, or None to estimate."""
-        if self.vector is not None:
-            self._source = "option"
-            return self.vector
-        if not self.use_transforms:
-            return None
+        source, vector = "option", self.vector
+        if "tf" in self.sources:
+            source, vector = self._from_transforms(frame)
+        if "imu" in self.sources and vector is None:
+            source, vector = self._from_accelerometer(frame)
+        source = "planes" if vector is None else source
+        self._given[source] = self._given.get(source, 0) + 1
+        return vector
+
+    def _from_transforms(self, frame: Frame) -> tuple[str, F4 | None]:
         for level in (name for name in _LEVEL_FRAMES if name in self.transforms.frames):
             pose = self._lookup(level, frame)
             if pose is not None:
-                self._source = f"transforms, z of {level}"
-                return np.asarray(pose.rotation[2], np.float32)
-        return None
+                return f"transforms, z of {level}", np.asarray(pose.rotation[2], np.float32)
+        return "", None
+
+    def _from_accelerometer(self, frame: Frame) -> tuple[str, F4 | None]:
+        for sensor in self.accelerometers:
+            up = sensor.up(frame.stamp_ns)
+            pose = None
+            if sensor.frame_id != frame.frame_id:
+                pose = self._lookup(sensor.frame_id, frame)
+                up = None if pose is None or up is None else up @ pose.rotation
+            if up is not None:
+                return f"imu, {sensor.topic}", np.asarray(up, np.float32)
+        return "", None
 
     def _lookup(self, target: str, frame: Frame) -> Pose | None:
         try:
@@ -88,16 +121,56 @@ class Upright:
             self._first_failure = self._first_failure or str(error)
             return None
 
-    @property
-    def warnings(self) -> list[str]:
-        """One line if transforms were missed."""
-        if not self._failed:
-            return []
-        return [f"{self._failed} transform look-ups failed, the first: {self._first_failure}"]
+    def report(self, folder: Path) -> dict[str, Any]:
+        """Return where up came from and how well the planes found agree, for run.json.
 
-    def report(self) -> dict[str, Any]:
-        """Return where up came from, for run.json."""
-        return {"source": self._source}
+        Adds to ``warnings`` what a person should know.
+
+        Parameters
+        ----------
+        folder : of the run, with its tables of frames and planes.
+        """
+        if self._failed:
+            self.warnings.append(
+                f"{self._failed} transform look-ups failed, the first: {self._first_failure}"
+            )
+        source = max(self._given, key=lambda name: self._given[name], default="planes")
+        report: dict[str, Any] = {"source": source}
+        if len(self._given) > 1:
+            report["frames"] = dict(self._given)
+        if set(self._given) - {"planes"}:
+            report |= self._agreement(folder)
+        return report
+
+    def _agreement(self, folder: Path) -> dict[str, Any]:
+        angles, bare = _angles_to_planes(folder)
+        typical = round(float(np.median(angles)), 1) if angles else None
+        if typical is not None and typical > _DISAGREE_DEG:
+            self.warnings.append(f"up and the planes found differ by {typical} degrees")
+        elif bare > len(angles):
+            self.warnings.append(f"no level plane in {bare} frames: is up right? Try --up")
+        return {"planes_differ_deg": typical, "frames_without_plane": bare}
+
+
+def _angles_to_planes(folder: Path) -> tuple[list[float], int]:
+    """Return the angle, in degrees, from the given up to that of the planes for each frame.
+
+    Also the number of frames with a given up and without a plane.
+    """
+    angles, bare = [], 0
+    names = ("frames", ["topic", "frame", "up", "up_given"]), ("planes", ["topic", "frame"])
+    groups = (read_row_groups(folder / f"{name}.parquet", columns) for name, columns in names)
+    for frames, planes in zip(*groups, strict=True):
+        level = {(row["topic"], row["frame"]) for row in planes.to_pylist()}
+        for row in frames.to_pylist():
+            if row["up_given"] is None:
+                continue
+            if (row["topic"], row["frame"]) in level:
+                cosine = np.clip(np.dot(row["up"], row["up_given"]), -1, 1)
+                angles.append(float(np.degrees(np.arccos(cosine))))
+            else:
+                bare += 1
+    return angles, bare
 
 
 def _parse_vector(text: str) -> F4:
@@ -107,6 +180,6 @@ def _parse_vector(text: str) -> F4:
         vector = np.zeros(0)
     length = float(np.linalg.norm(vector))
     if vector.shape != (3,) or not 1e-6 < length < np.inf:
-        msg = f"--up {text}: expected auto, tf, or a vector such as 0,-1,0"
+        msg = f"--up {text}: expected auto, tf, imu, or a vector such as 0,-1,0"
         raise ConfigError(msg)
     return np.asarray(vector / length, np.float32)

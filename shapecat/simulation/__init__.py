@@ -3,9 +3,9 @@
 Everything comes from a seed and is the same on every machine.
 """
 
-from shapecat.simulation.layout import make_piece
+from shapecat.simulation.layout import Piece, make_piece
 from shapecat.simulation.recorder import record, simulate
-from shapecat.simulation.scenes import make_scene
+from shapecat.simulation.scenes import make_scene, make_stage
 from shapecat.simulation.sensors import IDEAL, KINECT, REALSENSE, Sensor, measure
 from shapecat.simulation.views import render_frame
 from shapecat.simulation.worlds import Support, Thing, World
@@ -14,12 +14,14 @@ __all__ = [
     "IDEAL",
     "KINECT",
     "REALSENSE",
+    "Piece",
     "Sensor",
     "Support",
     "Thing",
     "World",
     "make_piece",
     "make_scene",
+    "make_stage",
     "measure",
     "record",
     "render_frame",

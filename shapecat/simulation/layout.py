@@ -102,11 +102,12 @@ class Layout:
                 continue
             if self._rng.random() < stack and self._put_on_thing(piece):
                 return True
-            if self._put_on_support(piece, support, half):
+            if self.put_piece(piece, support, half):
                 return True
         return False
 
-    def _put_on_support(self, piece: Piece, support: Support, half: F8, tries: int = 40) -> bool:
+    def put_piece(self, piece: Piece, support: Support, half: F8, *, tries: int = 40) -> bool:
+        """Place a given thing on a support; tells whether there was room for it."""
         middle = support.outline[:, :2].mean(axis=0)
         for _ in range(tries):
             spot = middle + self._rng.uniform(-half, half)

@@ -7,7 +7,7 @@ from shapecat.arrays import F8
 from shapecat.geometry import quaternion_from_rotation, rotation_from_quaternion
 from shapecat.types import Pose
 
-__all__ = ["hold", "looking_at", "walk"]
+__all__ = ["hold", "looking_at", "scattered", "walk"]
 
 
 def looking_at(eye: F8, target: F8, *, roll: float = 0.0) -> Pose:
@@ -79,3 +79,23 @@ def hold(
     up = np.radians(elevation)
     eye = target + distance * np.array([0, -np.cos(up), np.sin(up)])
     return (looking_at(eye, target, roll=float(np.radians(rng.normal(0, 1.0)))),) * frames
+
+
+def scattered(
+    rng: Generator,
+    target: F8,
+    count: int,
+    *,
+    distance: tuple[float, float] = (0.5, 2.0),
+    elevation: tuple[float, float] = (15.0, 60.0),
+) -> tuple[Pose, ...]:
+    """Look at a place from random sides; ranges in metres and degrees."""
+    poses = []
+    for _ in range(count):
+        up, side = np.radians(rng.uniform(*elevation)), rng.uniform(0, 2 * np.pi)
+        far = rng.uniform(*distance)
+        direction = np.array([np.cos(up) * np.cos(side), np.cos(up) * np.sin(side), np.sin(up)])
+        gaze = target + rng.uniform(-0.05, 0.05, 3) * far
+        roll = float(np.radians(rng.normal(0, 2.0)))
+        poses.append(looking_at(target + far * direction, gaze, roll=roll))
+    return tuple(poses)

@@ -10,7 +10,8 @@ from shapecat.arrays import F8, I4
 from shapecat.errors import RecordingError
 from shapecat.simulation.mesh import Mesh, moved, standing
 from shapecat.simulation.placement import Rest, rests
-from shapecat.types import Pose
+from shapecat.simulation.render import geometry, render
+from shapecat.types import Camera, Pose
 
 __all__ = ["fill_ratio", "load_mesh", "upright_poses", "uprighted"]
 
@@ -120,9 +121,6 @@ def _slice_area(corners: F8, z: float) -> float:
 
 def _hollow(points: F8, mesh: Mesh) -> float:
     """Return how far, on average, the surface seen from above lies below the top: its opening."""
-    from shapecat.simulation.render import geometry, render  # noqa: PLC0415  # avoids a cycle
-    from shapecat.types import Camera  # noqa: PLC0415
-
     turned = Mesh(points, mesh.triangles)
     far = 40 * float(np.abs(points).max())
     span = float(np.abs(points[:, :2]).max())

@@ -8,12 +8,12 @@ import numpy as np
 from numpy.random import Generator
 
 from shapecat.simulation.furniture import make_room, make_shelf, make_table, round_table
-from shapecat.simulation.layout import Layout
-from shapecat.simulation.paths import hold, walk
+from shapecat.simulation.layout import Layout, Piece
+from shapecat.simulation.paths import hold, scattered, walk
 from shapecat.simulation.worlds import World
 from shapecat.types import CATEGORIES
 
-__all__ = ["SCENES", "SceneKind", "make_scene"]
+__all__ = ["SCENES", "SceneKind", "make_scene", "make_stage"]
 
 SceneKind = Literal["tabletop", "shelf", "clutter", "turntable", "empty"]
 
@@ -60,6 +60,25 @@ def make_scene(
         msg = f"no scene {kind!r}; known: {', '.join(SCENES)}"
         raise ValueError(msg)
     return SCENES[kind](rng, _Wish(frames, rate_hz, tuple(categories), distractors))
+
+
+def make_stage(pieces: Sequence[Piece], rng: Generator, *, views: int = 8) -> World:
+    """Put given things on a table, and look at them from scattered places: no path, no hurry.
+
+    Each frame is another view, from any side, 0.5 to 2 m away, 15 to 60 degrees above. Things that
+    find no room are left out; one alone always stands in the middle.
+
+    Parameters
+    ----------
+    pieces : from `make_piece`, or made of a scanned mesh and one of its `upright_poses`.
+    """
+    room, table = make_room(rng, wall_chance=0.2), make_table(rng)
+    layout = Layout(rng, gap=rng.uniform(0.005, 0.04))
+    half = np.array([0.3, 0.25]) if len(pieces) > 1 else np.zeros(2)
+    for piece in pieces:
+        layout.put_piece(piece, table, half)
+    path = scattered(rng, np.array([0, 0, table.height + 0.04]), views)
+    return World("stage", (*room, table), tuple(layout.things), path, np.zeros(views))
 
 
 def _tabletop(rng: Generator, wish: _Wish) -> World:
@@ -113,7 +132,7 @@ def _shelf(rng: Generator, wish: _Wish) -> World:
     layout = Layout(rng, gap=0.015, headroom=step - 0.05, enclosed=True)
     half = np.array([width / 2 - 0.06, depth / 2 - 0.03])
     for k, category in enumerate(wish.draw(rng, 12, usual=int(rng.integers(0, 2)))):
-        layout.put(category, boards[k % 3], half, stack=0.3 if k > 5 else 0.0, attempts=8)
+        layout.put(category, boards[k % 3], half, stack=0.5 if k > 5 else 0.0, attempts=8)
     path = walk(
         rng,
         np.array([0, 0, low + 1.15 * step]),

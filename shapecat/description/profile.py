@@ -1,0 +1,90 @@
+"""The upright axis of an object, and its radial profile."""
+
+import numpy as np
+
+from shapecat.arrays import F4
+from shapecat.jit import kernel
+
+__all__ = ["PROFILE_NAMES", "PROFILE_SLICES", "profile", "vertical_axis"]
+
+PROFILE_SLICES = 8
+_PROFILE = ("share", "radius", "spread", "inward", "up", "curvature")
+PROFILE_NAMES = tuple(f"{i}_{name}" for i in range(PROFILE_SLICES) for name in _PROFILE)
+
+
+@kernel
+def vertical_axis(x: F4, y: F4, normals: F4, weight: F4) -> tuple[float, float, float]:
+    """Return the vertical line nearest to the horizontal lines along the normals.
+
+    Its x and y, and the root mean square distance of the lines to it. A weak pull to the centre of
+    the neurons makes the answer unique where all normals are parallel or vertical.
+    """
+    axx = axy = ayy = bx = by = total = 0.0
+    for i in range(x.size):
+        tx, ty = -normals[1, i], normals[0, i]
+        w = weight[i]
+        along = tx * x[i] + ty * y[i]
+        axx += w * tx * tx
+        axy += w * tx * ty
+        ayy += w * ty * ty
+        bx += w * tx * along
+        by += w * ty * along
+        total += w * (tx * tx + ty * ty)
+    pull = 1e-2 * total + 1e-6
+    axx += pull
+    ayy += pull
+    det = axx * ayy - axy * axy
+    cx, cy = (ayy * bx - axy * by) / det, (axx * by - axy * bx) / det
+    residual = 0.0
+    for i in range(x.size):
+        off = -normals[1, i] * (x[i] - cx) + normals[0, i] * (y[i] - cy)
+        residual += weight[i] * off * off
+    return cx, cy, np.sqrt(residual / max(total, 1e-6))
+
+
+@kernel
+def profile(
+    x: F4,
+    y: F4,
+    z: F4,
+    weight: F4,
+    normals: F4,
+    curvatures: F4,
+    low: float,
+    high: float,
+    out: F4,
+) -> None:
+    """Write the radial profile about the vertical axis, named by `PROFILE_NAMES`.
+
+    For each of 8 slices of the height: share of the points, mean and deviation of the radius over
+    the largest slice's, shares facing the axis and facing up, mean curvature.
+    """
+    cx, cy, _ = vertical_axis(x, y, normals, weight)
+    widest = 1e-6
+    for i in range(x.size):
+        level = (z[i] - low) / (high - low) if high > low else 0.5
+        place = min(max(level * PROFILE_SLICES - 0.5, 0.0), PROFILE_SLICES - 1.0)
+        first = min(int(place), PROFILE_SLICES - 2)
+        rx, ry = x[i] - cx, y[i] - cy
+        r = np.sqrt(rx * rx + ry * ry)
+        inward = rx * normals[0, i] + ry * normals[1, i] < 0
+        curvature = curvatures[0, i] + curvatures[1, i]
+        for k in range(2):
+            share = weight[i] * (place - first if k == 1 else first + 1 - place)
+            at = (first + k) * 6
+            out[at] += share
+            out[at + 1] += share * r
+            out[at + 2] += share * r * r
+            out[at + 3] += share * (1.0 - abs(normals[2, i])) * inward
+            out[at + 4] += share * normals[2, i]
+            out[at + 5] += share * curvature / (1 + abs(curvature))
+    for k in range(PROFILE_SLICES):
+        at = k * 6
+        share = out[at]
+        for m in range(1, 6):
+            out[at + m] = out[at + m] / share if share > 1e-4 else 0.0
+        out[at + 2] = np.sqrt(max(out[at + 2] - out[at + 1] ** 2, 0.0))
+        widest = max(widest, out[at + 1])
+    for k in range(PROFILE_SLICES):
+        out[k * 6 + 1] /= widest
+        out[k * 6 + 2] /= widest

@@ -1,0 +1,64 @@
+"""Crops: each view of each object as a point cloud, in the layout of data sets.
+
+``DATASET/<category>/<instance>/<view>.pcd``: metres, z up, the support at z = 0; the VIEWPOINT is
+the place of the sensor.
+"""
+
+import glob
+import shutil
+from collections.abc import Iterable
+from pathlib import Path
+
+from shapecat.errors import OutputError
+from shapecat.outputs.exports_files import safe_name, upright_cloud, write_pcd
+from shapecat.outputs.rereading import FinishedRun
+from shapecat.types import Frame, LabelledFrame
+
+__all__ = ["write_crops"]
+
+
+def write_crops(
+    out: Path, frames: Iterable[tuple[LabelledFrame, Frame]], finished: FinishedRun
+) -> int:
+    """Add the views of a run to a data set; return how many.
+
+    A run written before is replaced, so that no view keeps an earlier label. Deleted tracks are
+    left out; ``unknown`` is a folder like any other.
+
+    Raises
+    ------
+    OutputError : the place is not writable.
+    """
+    # Recordings of the same name from different days are not taken for each other.
+    prefix = f"{safe_name(finished.name)}.{finished.run['input']['sha256'][:8]}"
+    hidden = out / f".{prefix}.partial"
+    count = 0
+    try:
+        shutil.rmtree(hidden, ignore_errors=True)
+        for labelled, frame in frames:
+            for item in labelled.objects:
+                cloud = upright_cloud(labelled, frame, item)
+                if cloud is None:
+                    continue
+                instance = hidden / safe_name(item.category) / f"{prefix}.track-{item.track}"
+                instance.mkdir(parents=True, exist_ok=True)
+                write_pcd(instance / f"{labelled.index:06d}.pcd", cloud[0], viewpoint=cloud[1])
+                count += 1
+        _replace(out, prefix, hidden)
+    except OSError as error:
+        msg = f"{out}: cannot be written: {error.strerror or error}"
+        raise OutputError(msg) from error
+    finally:
+        shutil.rmtree(hidden, ignore_errors=True)
+    return count
+
+
+def _replace(out: Path, prefix: str, hidden: Path) -> None:
+    for old in out.glob(f"*/{glob.escape(prefix)}.track-*"):
+        shutil.rmtree(old)
+        if not any(old.parent.iterdir()):
+            old.parent.rmdir()
+    for instance in sorted(hidden.glob("*/*")):
+        place = out / instance.parent.name / instance.name
+        place.parent.mkdir(parents=True, exist_ok=True)
+        instance.rename(place)

@@ -1,0 +1,116 @@
+"""The files that exports are made of: PCD clouds, 16-bit PNG images, level frames."""
+
+import re
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+from shapecat.arrays import F4, U1, U2
+from shapecat.geometry import IDENTITY, level_from_sensor, quaternion_from_rotation, transform
+from shapecat.types import Frame, LabelledFrame, LabelledObject, Pose
+
+__all__ = [
+    "finite_points",
+    "png",
+    "safe_name",
+    "support_offset",
+    "upright_cloud",
+    "upward",
+    "write_pcd",
+]
+
+_COLOUR_TYPES = {"grey": 0, "palette": 3}
+
+
+def write_pcd(path: Path, points: F4, *, viewpoint: Pose = IDENTITY) -> None:
+    """Write points (n, 3) as a binary PCD file, version 0.7.
+
+    ``viewpoint`` is the pose of the sensor in the frame of the points.
+    """
+    x, y, z, w = quaternion_from_rotation(viewpoint.rotation)
+    place = " ".join(f"{value:.6f}" for value in (*viewpoint.translation, w, x, y, z))
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\n"
+        f"TYPE F F F\nCOUNT 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT {place}\n"
+        f"POINTS {len(points)}\nDATA binary\n"
+    )
+    path.write_bytes(header.encode("ascii") + np.ascontiguousarray(points, "<f4").tobytes())
+
+
+def png(image: U1 | U2, palette: U1 | None = None, alpha: U1 | None = None) -> bytes:
+    """Encode an image (h, w), uint16 grey or uint8 entries of a palette (k, 3), as PNG.
+
+    ``alpha`` (k,) is the opacity of the first entries of the palette.
+    """
+    height, width = image.shape
+    wide = image.dtype == np.uint16
+    rows = np.ascontiguousarray(image, ">u2" if wide else "u1").view(np.uint8).reshape(height, -1)
+    unfiltered = np.zeros((height, 1), np.uint8)  # each row begins with its filter: none
+    kind = _COLOUR_TYPES["grey" if palette is None else "palette"]
+    header = struct.pack(">IIBBBBB", width, height, 16 if wide else 8, kind, 0, 0, 0)
+    parts = [(b"IHDR", header)]
+    if palette is not None:
+        parts.append((b"PLTE", np.ascontiguousarray(palette, np.uint8).tobytes()))
+    if alpha is not None:
+        parts.append((b"tRNS", np.ascontiguousarray(alpha, np.uint8).tobytes()))
+    pixels = np.concatenate([unfiltered, rows], axis=1).tobytes()
+    parts += [(b"IDAT", zlib.compress(pixels, 9)), (b"IEND", b"")]
+    return b"\x89PNG\r\n\x1a\n" + b"".join(
+        struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
+        for name, body in parts
+    )
+
+
+def safe_name(text: str) -> str:
+    """Return a text as the name of a file or folder: no separators, not hidden.
+
+    Examples
+    --------
+    >>> safe_name("../wine glass")
+    '_wine glass'
+    """
+    return re.sub(r"[^\w .+&'()-]", "_", text).strip(". ")[:120] or "_"
+
+
+def finite_points(frame: Frame) -> F4:
+    """Return (n, 3) the points of a frame that have a reading, in their order."""
+    points = frame.xyz()
+    return np.asarray(points[np.isfinite(points).all(axis=1)])
+
+
+def support_offset(item: LabelledObject, up: F4) -> float:
+    """Return how far along ``up`` the support of an object lies, metres, sensor frame."""
+    middle = float(np.dot(np.asarray(up, np.float64), item.box.center))
+    half = float(item.box.size[2]) / 2
+    return middle - (item.height_m if np.isfinite(item.height_m) else half)
+
+
+def upward(labelled: LabelledFrame) -> F4:
+    """Return the unit vector up of a frame.
+
+    Raises
+    ------
+    ValueError : it is not known.
+    """
+    if labelled.up is None:
+        msg = f"frame {labelled.index} of {labelled.topic} does not tell where up is"
+        raise ValueError(msg)
+    return labelled.up
+
+
+def upright_cloud(
+    labelled: LabelledFrame, frame: Frame, item: LabelledObject
+) -> tuple[F4, Pose] | None:
+    """Return the points (n, 3) of an object, standing on z = 0, and the pose of the sensor.
+
+    None if it has no point with a reading.
+    """
+    points = frame.xyz(item.indices)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points):
+        return None
+    up = upward(labelled)
+    level = level_from_sensor(up, support_offset(item, up), points)
+    return transform(level, points).astype(np.float32), level

@@ -1,0 +1,113 @@
+"""KITTI 3D object detection: label_2, calib and velodyne of each frame.
+
+KITTI boxes turn about the vertical alone, so the rectified camera is a level one: it looks where
+the sensor looks, but along the horizon. ``P2`` turns back to the real camera, so that it maps
+rectified points to the pixels of the depth image. Source: the readme of the KITTI object
+development kit (Geiger 2012).
+"""
+
+import csv
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from shapecat.arrays import F8
+from shapecat.geometry import rotation_from_quaternion
+from shapecat.outputs.exports_files import finite_points, upward
+from shapecat.outputs.rereading import FinishedRun
+from shapecat.types import Frame, LabelledFrame, LabelledObject
+
+__all__ = ["rectified_from_sensor", "write_kitti"]
+
+_VELO_FROM_RECTIFIED = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+
+
+def write_kitti(
+    out: Path, frames: Iterable[tuple[LabelledFrame, Frame]], _finished: FinishedRun
+) -> int:
+    """Write label_2/, calib/ and velodyne/ with six digits per frame; return how many objects.
+
+    ``frames.csv`` tells which frame a number is. Points are in the level frame of the sensor (x
+    forward, y left, z up), intensity 0. The type is the category, blanks replaced by ``_``.
+    """
+    for name in ("label_2", "calib", "velodyne"):
+        (out / name).mkdir()
+    count = 0
+    with (out / "frames.csv").open("w", newline="", encoding="utf-8") as file:
+        index = csv.writer(file, lineterminator="\n")
+        index.writerow(("number", "topic", "frame", "stamp_ns"))
+        for number, (labelled, frame) in enumerate(frames):
+            index.writerow((f"{number:06d}", labelled.topic, labelled.index, labelled.stamp_ns))
+            turn = rectified_from_sensor(upward(labelled), optical=_optical(labelled, frame))
+            lines = [_label(item, frame, turn) for item in labelled.objects]
+            (out / "label_2" / f"{number:06d}.txt").write_text("".join(lines), "utf-8")
+            (out / "calib" / f"{number:06d}.txt").write_text(_calibration(frame, turn), "utf-8")
+            points = finite_points(frame) @ (_VELO_FROM_RECTIFIED @ turn).T
+            rows = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
+            rows.astype("<f4").tofile(out / "velodyne" / f"{number:06d}.bin")
+            count += len(lines)
+    return count
+
+
+def _optical(labelled: LabelledFrame, frame: Frame) -> bool:
+    """Tell whether the sensor looks along its z axis (images), not along x."""
+    return frame.organized or bool(upward(labelled)[1] < -0.7)
+
+
+def rectified_from_sensor(up: F8, *, optical: bool) -> F8:
+    """Return the (3, 3) rotation into a level camera: x right, y down, z forward.
+
+    Where the sensor looks straight down or up, its own upper side is forward.
+    """
+    up = np.asarray(up, np.float64) / np.linalg.norm(up)
+    axes = np.array([[0, 0, 1], [0, -1, 0]] if optical else [[1, 0, 0], [0, 0, 1]], np.float64)
+    level = axes - np.outer(axes @ up, up)
+    forward = level[0] if np.linalg.norm(level[0]) > 0.1 else level[1]
+    forward /= np.linalg.norm(forward)
+    return np.stack([np.cross(-up, forward), -up, forward])
+
+
+def _label(item: LabelledObject, frame: Frame, turn: F8) -> str:
+    """Return a line of 15 values: type truncated occluded alpha bbox h w l x y z rotation_y."""
+    length, width, height = map(float, item.box.size)
+    x, y, z = turn @ item.box.center
+    heading = turn @ rotation_from_quaternion(item.box.orientation)[:, 0]
+    yaw = float(np.arctan2(-heading[2], heading[0]))
+    alpha = (yaw - float(np.arctan2(x, z)) + np.pi) % (2 * np.pi) - np.pi
+    numbers = (
+        float(item.touches_border),
+        int(item.occluded),
+        *(f"{value:.5f}" for value in (alpha, *_pixels(item, frame))),
+        *(f"{value:.5f}" for value in (height, width, length, x, y + height / 2, z, yaw)),
+    )
+    return " ".join([item.category.replace(" ", "_"), *map(str, numbers)]) + "\n"
+
+
+def _pixels(item: LabelledObject, frame: Frame) -> tuple[float, ...]:
+    """Return left, top, right, bottom in the image; -1 where there is none."""
+    if frame.camera is None or not item.indices.size:
+        return (-1.0, -1.0, -1.0, -1.0)
+    v, u = np.divmod(item.indices.astype(np.int64), frame.camera.width)
+    return (float(u.min()), float(v.min()), float(u.max()), float(v.max()))
+
+
+def _calibration(frame: Frame, turn: F8) -> str:
+    camera = frame.camera
+    intrinsic = np.eye(3)
+    if camera is not None:
+        intrinsic = np.array(
+            [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], np.float64
+        )
+    projection = np.concatenate([intrinsic @ turn.T, np.zeros((3, 1))], axis=1)
+    still = np.zeros((3, 1))
+    rows = {
+        **{f"P{k}": projection for k in range(4)},
+        "R0_rect": np.eye(3),
+        "Tr_velo_to_cam": np.concatenate([_VELO_FROM_RECTIFIED.T, still], axis=1),
+        "Tr_imu_to_velo": np.concatenate([np.eye(3), still], axis=1),
+    }
+    return "".join(
+        f"{name}: {' '.join(f'{value:.12e}' for value in matrix.ravel())}\n"
+        for name, matrix in rows.items()
+    )

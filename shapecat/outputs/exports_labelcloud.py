@@ -1,0 +1,85 @@
+"""labelCloud projects: clouds, and boxes in each of its three JSON formats.
+
+Clouds and boxes are in the level frame of the sensor (z up), as labelCloud turns boxes about z.
+Source: labelCloud 1.1, its label formats ``centroid_rel``, ``centroid_abs`` and ``vertices``.
+"""
+
+import json
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import F8
+from shapecat.geometry import gravity_rotation, rotation_from_quaternion
+from shapecat.labels import box_corners
+from shapecat.outputs.colours import colour_of
+from shapecat.outputs.exports_files import finite_points, upward, write_pcd
+from shapecat.outputs.rereading import FinishedRun
+from shapecat.types import Frame, LabelledFrame, LabelledObject, Pose
+
+__all__ = ["write_labelcloud"]
+
+_FORMATS = ("centroid_rel", "centroid_abs", "vertices")
+
+
+def write_labelcloud(
+    out: Path, frames: Iterable[tuple[LabelledFrame, Frame]], finished: FinishedRun
+) -> int:
+    """Write pointclouds/ and labels/ of a labelCloud project; return how many objects.
+
+    labels/ are in the format ``centroid_rel``; labels_centroid_abs/ and labels_vertices/ hold the
+    same boxes in the other two.
+    """
+    (out / "pointclouds").mkdir()
+    for kind in _FORMATS:
+        _folder(out, kind).mkdir()
+        (_folder(out, kind) / "_classes.json").write_text(_classes(finished, kind), "utf-8")
+    count = 0
+    for number, (labelled, frame) in enumerate(frames):
+        level = gravity_rotation(upward(labelled))
+        cloud = out / "pointclouds" / f"{number:06d}.pcd"
+        points = finite_points(frame) @ level.T
+        write_pcd(cloud, points.astype(np.float32), viewpoint=Pose(level, np.zeros(3)))
+        for kind in _FORMATS:
+            objects = [_described(item, level, kind) for item in labelled.objects]
+            content = {"folder": "pointclouds", "filename": cloud.name}
+            text = json.dumps({**content, "path": f"pointclouds/{cloud.name}", "objects": objects})
+            (_folder(out, kind) / f"{number:06d}.json").write_text(text, "utf-8")
+        count += len(labelled.objects)
+    return count
+
+
+def _folder(out: Path, kind: str) -> Path:
+    return out / ("labels" if kind == _FORMATS[0] else f"labels_{kind}")
+
+
+def _classes(finished: FinishedRun, kind: str) -> str:
+    names = ("unknown", *finished.categories)
+    classes = [
+        {"name": name, "id": k, "color": "#" + "".join(f"{part:02x}" for part in colour_of(name))}
+        for k, name in enumerate(names)
+    ]
+    made_by = {"name": "shapecat", "version": finished.run["versions"]["shapecat"]}
+    content = {"classes": classes, "default": 0, "type": "object_detection", "format": kind}
+    return json.dumps({**content, "created_with": made_by}, indent=1)
+
+
+def _described(item: LabelledObject, level: F8, kind: str) -> dict[str, Any]:
+    if kind == "vertices":
+        return {"name": item.category, "vertices": _rounded(box_corners(item.box) @ level.T)}
+    heading = level @ rotation_from_quaternion(item.box.orientation)[:, 0]
+    yaw = float(np.arctan2(heading[1], heading[0]))
+    turn = yaw if kind == "centroid_rel" else float(np.degrees(yaw) % 360)
+    sizes = _rounded(item.box.size)
+    return {
+        "name": item.category,
+        "centroid": dict(zip("xyz", _rounded(level @ item.box.center), strict=True)),
+        "dimensions": dict(zip(("length", "width", "height"), sizes, strict=True)),
+        "rotations": {"x": 0.0, "y": 0.0, "z": round(turn, 8)},
+    }
+
+
+def _rounded(values: F8) -> Any:
+    return np.round(np.asarray(values, np.float64), 8).tolist()

@@ -1,0 +1,138 @@
+"""``report.html`` of each run, and ``index.html`` over many."""
+
+import os
+from collections import Counter
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from urllib.parse import quote
+
+from shapecat.corrections import TrackTable, read_track_table
+from shapecat.errors import OutputError
+from shapecat.outputs.colours import colour_of
+from shapecat.outputs.report_drawing import Snapshot, draw
+from shapecat.outputs.report_page import Card, Listed, index_page, run_page
+from shapecat.outputs.report_tracks import read_courses, read_portraits, read_stage_seconds
+from shapecat.outputs.rereading import read_finished
+from shapecat.run_folder import replacing
+
+__all__ = ["find_runs", "write_report", "write_reports"]
+
+Observer = Callable[[str, int, int | None], None]
+
+_PAGE = "report.html"
+_FACES = 6
+
+
+def _ignore(_phase: str, _done: int, _total: int | None) -> None:
+    """Observe nothing."""
+
+
+def write_reports(folders: Sequence[Path], observe: Observer = _ignore) -> list[Path]:
+    """Write report.html into each run, and an index.html above them.
+
+    Parameters
+    ----------
+    folders : runs, or folders of runs. The index lies in the first folder of runs, or beside the
+        first run; a single run gets none.
+
+    Returns
+    -------
+    The pages, the index last.
+
+    Raises
+    ------
+    OutputError : a folder holds no run, or a page cannot be written.
+    """
+    runs = [run for folder in folders for run in find_runs(folder)]
+    unique = list({run.resolve(): run for run in runs}.values())
+    many = len(unique) > 1 or any(folder not in runs for folder in folders)
+    first = next((folder for folder in folders if folder not in runs), folders[0].parent)
+    index = first / "index.html" if many else None
+    pages, listed = [], []
+    for done, run in enumerate(unique, start=1):
+        item = write_report(run, index=index)
+        pages.append(run / _PAGE)
+        listed.append(item)
+        observe("report", done, len(unique))
+    if index:
+        title = first.resolve().name
+        with replacing(index) as path:
+            path.write_text(index_page(title, listed), "utf-8")
+        pages.append(index)
+    return pages
+
+
+def find_runs(folder: Path) -> list[Path]:
+    """Return a folder if it is a run, else the runs in it, by name.
+
+    Raises
+    ------
+    OutputError : there is none.
+    """
+    if (folder / "run.json").is_file():
+        return [folder]
+    runs = sorted(path.parent for path in folder.glob("*/run.json"))
+    runs = [run for run in runs if not run.name.startswith(".")]
+    if not runs:
+        msg = f"{folder}: no run.json there or one level below; expected results of a process"
+        raise OutputError(msg)
+    return runs
+
+
+def write_report(folder: Path, *, index: Path | None = None) -> Listed:
+    """Write the report.html of one run; return how an index lists it.
+
+    Clouds come from the recording; where that is gone, objects are drawn from their graphs.
+
+    Raises
+    ------
+    OutputError : not a finished run, a tracks.csv that cannot be understood, or a full disk.
+    """
+    finished = read_finished(folder)
+    table = _first_table(folder)
+    courses = read_courses(folder)
+    rows = [row for row in table.rows if row.track in courses]
+    portraits, reason = read_portraits(finished, courses, rows)
+    cards = []
+    for row in rows:
+        portrait = portraits.get(row.track)
+        pictures = draw(portrait.shot, colour_of(row.category)) if portrait else ()
+        cards.append(Card(row, courses[row.track], pictures, portrait.size if portrait else None))
+    notes = [f"objects are drawn from their graphs, without points: {reason}"] if reason else []
+    page = run_page(
+        finished,
+        table,
+        cards,
+        read_stage_seconds(folder),
+        notes=notes,
+        index=_link(folder, index) if index else None,
+    )
+    with replacing(folder / _PAGE) as path:
+        path.write_text(page, "utf-8")
+    return Listed(
+        link=_link(index.parent if index else folder, folder / _PAGE),
+        name=finished.name,
+        run=finished.run,
+        categories=Counter(label.category for label in finished.labels.values()),
+        unsure=sum(
+            row.label == "" and (row.category == "unknown" or row.confidence < 0.8) for row in rows
+        ),
+        checked=sum(row.label != "" for row in rows),
+        faces=_faces(cards),
+    )
+
+
+def _first_table(folder: Path) -> TrackTable:
+    return read_track_table(folder / "tracks.csv")
+
+
+def _link(start: Path, target: Path) -> str:
+    return quote(Path(os.path.relpath(target.resolve(), start.resolve())).as_posix())
+
+
+def _faces(cards: Sequence[Card]) -> tuple[str, ...]:
+    """Return a picture of the surest track of each category, then of others."""
+    sure = sorted(cards, key=lambda card: -card.row.confidence)
+    first = {card.row.category: card for card in reversed(sure)}
+    chosen = [*first.values(), *(card for card in sure if card not in first.values())]
+    return tuple(card.pictures[0].image for card in chosen[:_FACES] if card.pictures)

@@ -1,0 +1,166 @@
+"""Pictures of objects for the report: shaded points from three sides, and the graph over them."""
+
+import base64
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, U1, U2, Record, array
+from shapecat.outputs.exports_files import png
+from shapecat.types import NeuralGas
+
+__all__ = ["SIDE", "Picture", "Snapshot", "draw", "graph_points"]
+
+SIDE = 160
+"""Width and height of a picture in pixels."""
+
+_SHADES = 14
+_MOST_POINTS = 8000
+_LIGHT = np.array([-0.4, 0.65, 0.65]) / np.linalg.norm([-0.4, 0.65, 0.65])
+
+
+class Snapshot(Record):
+    """An object at rest, seen once: z up, the support at z = 0.
+
+    ``points`` (n, 3), the neurons of ``gas``, and ``eye`` (3,), the place of the sensor, in metres.
+    """
+
+    points: F4 = array("n 3", "f4")
+    gas: NeuralGas
+    eye: F8 = array("3", "f8")
+
+
+class Picture(NamedTuple):
+    """A picture as a data URI, and the graph over it as SVG path data in the same pixels."""
+
+    title: str
+    image: str
+    edges: str
+    neurons: str
+
+
+def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[Picture, ...]:
+    """Draw an object as the sensor sees it, from a quarter turn beside, and from above.
+
+    All three have one scale: that of the sphere around the points and neurons.
+    """
+    points = np.asarray(shot.points[:: 1 + len(shot.points) // _MOST_POINTS], np.float64)
+    points = points if len(points) else np.asarray(graph_points(shot.gas), np.float64)
+    everything = np.concatenate([points, shot.gas.neurons])
+    if not len(everything):
+        everything = points = np.zeros((1, 3))
+    low, high = np.percentile(everything, [0.5, 99.5], axis=0)
+    middle = (low + high) / 2
+    reach = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    x, y, z = shot.eye - middle
+    azimuth = float(np.arctan2(y, x))
+    elevation = float(np.clip(np.arctan2(z, np.hypot(x, y)), np.radians(12), np.radians(65)))
+    palette, alpha = _palette(colour)
+    pictures = []
+    for title, turn, rise in (
+        ("as seen", 0.0, elevation),
+        ("from beside", np.pi / 2, np.radians(14)),
+        ("from above", 0.0, np.pi / 2),
+    ):
+        view = _view(azimuth + turn, rise)
+        scale = 0.48 * SIDE / reach
+        spots = _project(points - middle, view, scale)
+        image = png(_shade(spots), palette, alpha)
+        encoded = base64.b64encode(image).decode("ascii")
+        nodes = np.round(_project(shot.gas.neurons - middle, view, scale)[:, :2]).astype(int)
+        pictures.append(
+            Picture(
+                title,
+                f"data:image/png;base64,{encoded}",
+                "".join(f"M{a} {b}L{c} {d}" for (a, b), (c, d) in nodes[shot.gas.edges].tolist()),
+                "".join(f"M{a} {b}h0" for a, b in nodes.tolist()),
+            )
+        )
+    return tuple(pictures)
+
+
+def graph_points(gas: NeuralGas) -> F4:
+    """Return points spread over the triangles and edges of a graph, where its cloud is gone."""
+    corners = gas.neurons[gas.triangles]
+    weights = np.array([[a, b, 8 - a - b] for a in range(9) for b in range(9 - a)]) / 8
+    faces = np.einsum("kc,tcd->tkd", weights, corners).reshape(-1, 3)
+    ends = gas.neurons[gas.edges]
+    steps = np.linspace(0, 1, 9)[None, :, None]
+    lines = (ends[:, None, 0] * (1 - steps) + ends[:, None, 1] * steps).reshape(-1, 3)
+    return np.concatenate([gas.neurons, faces, lines]).astype(np.float32)
+
+
+def _view(azimuth: float, elevation: float) -> F8:
+    """Return the (3, 3) right, up and towards the viewer, of a viewer in a direction."""
+    c, s, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
+    return np.array([[-s, c, 0], [-c * se, -s * se, ce], [c * ce, s * ce, se]])
+
+
+def _project(points: F8, view: F8, scale: float) -> F8:
+    """Return (n, 3) column, row and nearness in pixels."""
+    right, up, near = (np.asarray(points, np.float64) @ view.T * scale).T
+    return np.stack([SIDE / 2 + right, SIDE / 2 - up, near], axis=1)
+
+
+def _shade(spots: F8) -> U1:
+    """Return (h, w) shades, 1 to `_SHADES`, of points drawn as discs that hide each other; 0 bare.
+
+    The surface is lit from above and left by the slopes of its smoothed nearness.
+    """
+    near = _nearest(spots)
+    bare = ~np.isfinite(near)
+    smooth = _smoothed(near, bare)
+    down, right = np.gradient(smooth)
+    normal = np.stack([-right, down, np.ones_like(right)], axis=-1)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    light = 0.25 + 0.75 * np.clip(normal @ _LIGHT, 0, 1)
+    light *= np.clip(1.0 - 0.05 * np.clip(_smoothed(smooth, bare) - smooth, 0, 8), 0.5, 1)
+    shades = 1 + np.round(light * (_SHADES - 1))
+    return np.where(bare, 0, np.clip(shades, 1, _SHADES)).astype(np.uint8)
+
+
+def _nearest(spots: F8) -> F8:
+    """Return (h, w) the nearness of the nearest disc at each pixel, -inf where there is none."""
+    near = np.full((SIDE, SIDE), -np.inf)
+    area = float(np.prod(np.ptp(spots[:, :2], axis=0) + 1))
+    radius = float(np.clip(0.8 * np.sqrt(area / len(spots)), 1.0, 4.5))
+    reach = int(np.ceil(radius))
+    columns, rows = np.round(spots[:, :2].T).astype(int)
+    for dy in range(-reach, reach + 1):
+        for dx in range(-reach, reach + 1):
+            if dx * dx + dy * dy > radius * radius:
+                continue
+            u, v = columns + dx, rows + dy
+            inside = (u >= 0) & (u < SIDE) & (v >= 0) & (v < SIDE)
+            np.maximum.at(near, (v[inside], u[inside]), spots[inside, 2])
+    return near
+
+
+def _smoothed(near: F8, bare: U1, passes: int = 3) -> F8:
+    """Average each pixel with its neighbours on the object; bare pixels take theirs."""
+    weight, value = (~bare).astype(np.float64), np.where(bare, 0.0, near)
+    for _ in range(passes):
+        value, weight = _blurred(value * weight), _blurred(weight)
+        value = np.divide(value, weight, out=np.zeros_like(value), where=weight > 0)
+        weight = np.minimum(weight, 1.0)
+    return value
+
+
+def _blurred(image: F8) -> F8:
+    padded = np.pad(image, 1)
+    rows = padded[:-2] + padded[1:-1] + padded[2:]
+    return np.asarray((rows[:, :-2] + rows[:, 1:-1] + rows[:, 2:]) / 9)
+
+
+def _palette(colour: tuple[int, int, int]) -> tuple[U1, U2]:
+    """Return the shades of a colour, from dark to light, behind one transparent entry."""
+    light = np.linspace(0, 1, _SHADES)[:, None]
+    base = np.array(colour, np.float64)
+    dark, bright = 0.32 * base, base + 0.45 * (255 - base)
+    shades = np.where(
+        light < 0.75,
+        dark + (base - dark) * light / 0.75,
+        base + (bright - base) * (light - 0.75) * 4,
+    )
+    palette = np.concatenate([np.zeros((1, 3)), shades])
+    return np.round(palette).astype(np.uint8), np.zeros(1, np.uint8)

@@ -1,0 +1,98 @@
+"""A finished run beside its recording: labelled frames, and the clouds they were made from."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from shapecat.corrections import TrackLabel, read_labels
+from shapecat.errors import OutputError
+from shapecat.labels import read_labelled_frames
+from shapecat.recordings import Recording, choose_streams, frames, open_recording
+from shapecat.run_folder import digest, read_run
+from shapecat.types import Frame, LabelledFrame
+
+__all__ = ["FinishedRun", "clouds_again", "open_source", "read_finished", "with_clouds"]
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """A run folder: run.json, and what each of its tracks is shown as."""
+
+    folder: Path
+    run: Mapping[str, Any]
+    labels: Mapping[int, TrackLabel]
+
+    @property
+    def name(self) -> str:
+        """The name of the recording."""
+        return self.folder.resolve().name
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """Those of the model, and behind them those that a person has added."""
+        known = tuple(self.run["model"]["categories"])
+        added = {label.category for label in self.labels.values()} - {*known, "unknown"}
+        return (*known, *sorted(added))
+
+    def frames(self) -> Iterator[LabelledFrame]:
+        """Read the labelled frames."""
+        return read_labelled_frames(self.folder, self.labels)
+
+
+def read_finished(folder: Path) -> FinishedRun:
+    """Read what a run folder says about itself.
+
+    Raises
+    ------
+    OutputError : it is not a finished run, or its tracks.csv cannot be understood.
+    """
+    run = read_run(folder)
+    return FinishedRun(folder, run, read_labels(folder / "tracks.csv", run["model"]["categories"]))
+
+
+@contextmanager
+def open_source(finished: FinishedRun) -> Iterator[Recording]:
+    """Open the recording that a run was made from.
+
+    Raises
+    ------
+    RecordingError : it is not there.
+    OutputError : it is another one than it was.
+    """
+    path = Path(finished.run["input"]["path"])
+    with open_recording(path) as recording:
+        if digest(path) != finished.run["input"]["sha256"]:
+            msg = f"{path}: has changed since it was processed; process it again"
+            raise OutputError(msg)
+        yield recording
+
+
+def clouds_again(recording: Recording, run: Mapping[str, Any]) -> Iterator[Frame]:
+    """Read the frames that a run was made from once more."""
+    options = run["options"]
+    chosen = {name: options[name] for name in ("start_s", "end_s", "every")}
+    streams = choose_streams(recording, options["topics"])
+    return frames(recording, streams, skipped=Counter(), **chosen)
+
+
+def with_clouds(
+    labelled: Iterable[LabelledFrame], recording: Recording, run: Mapping[str, Any]
+) -> Iterator[tuple[LabelledFrame, Frame]]:
+    """Pair labelled frames, in the order they were read, with their clouds.
+
+    Raises
+    ------
+    OutputError : the recording does not hold one of them any more.
+    """
+    clouds = clouds_again(recording, run)
+    for label in labelled:
+        for frame in clouds:
+            if (label.topic, label.index) == (frame.topic, frame.index):
+                yield label, frame
+                break
+        else:
+            msg = f"{recording.path}: has changed since it was processed; process it again"
+            raise OutputError(msg)

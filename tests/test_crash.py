@@ -1,0 +1,236 @@
+"""A run that is killed at any moment leaves nothing or all of it, and the next run goes on."""
+
+import resource
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from click.testing import Result
+
+from shapecat.config import Settings
+from shapecat.errors import OutputError
+from shapecat.jobs import Job
+from shapecat.pipeline import process
+from shapecat.run_folder import read_run
+from tests.scenes import record
+
+FRAMES = 70
+TABLES = ("frames", "detections", "planes", "tracks")
+
+
+def command(recording: Path, out: Path, *options: str) -> list[str]:
+    return [
+        *(sys.executable, "-m", "shapecat", "process", str(recording), "--out", str(out)),
+        *("--no-rrd", *options),
+    ]
+
+
+def assert_same_tables(a: Path, b: Path) -> None:
+    for name in TABLES:
+        one, other = (pq.read_table(folder / f"{name}.parquet") for folder in (a, b))
+        timed = [column for column in one.column_names if column == "seconds"]
+        assert one.drop_columns(timed).equals(other.drop_columns(timed)), name
+    assert (a / "tracks.csv").read_bytes() == (b / "tracks.csv").read_bytes()
+
+
+def contents(folder: Path) -> set[str]:
+    return {str(path.relative_to(folder)) for path in folder.rglob("*")}
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("crash") / "table.mcap", FRAMES)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("undisturbed")
+    begun = time.perf_counter()
+    subprocess.run(command(recording, out), capture_output=True, check=True)
+    DURATION.append(time.perf_counter() - begun)
+    return out
+
+
+DURATION: list[float] = []
+"""Seconds that a run takes, once it is known."""
+
+
+def kill_after(arguments: list[str], seconds: float) -> bool:
+    """Start a run and kill it; tell whether it was still alive."""
+    running = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        running.communicate(timeout=seconds)
+    except subprocess.TimeoutExpired:
+        running.kill()
+        running.communicate()
+        return True
+    return False
+
+
+def survive_kills(recording: Path, out: Path, undisturbed: Path, moments: list[float]) -> int:
+    """Kill runs at some moments after their start; check the place after each; then finish."""
+    killed = 0
+    for moment in moments:
+        killed += kill_after(command(recording, out), moment)
+        if (out / "table").exists():
+            assert contents(out / "table") == contents(undisturbed / "table")
+    done = subprocess.run(command(recording, out), capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert contents(out) == contents(undisturbed)
+    assert_same_tables(out / "table", undisturbed / "table")
+    return killed
+
+
+def test_killed_run_goes_on_where_it_stopped(
+    recording: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    """Killed once while it perceives: only frames of the unfinished segment are seen twice."""
+    running = subprocess.Popen(command(recording, tmp_path), stderr=subprocess.PIPE)
+    segments = tmp_path / ".table.partial" / "segments"
+    while running.poll() is None and not (segments / "000000").exists():
+        time.sleep(0.01)
+    running.send_signal(signal.SIGKILL)
+    running.communicate()
+    assert not (tmp_path / "table").exists()
+
+    seen: list[int] = []
+    process(
+        Job(recording, tmp_path / "table", rrd=False),
+        lambda phase, done, _total: seen.append(done) if phase == "perceive" else None,
+    )
+
+    assert contents(tmp_path) == contents(undisturbed)
+    assert_same_tables(tmp_path / "table", undisturbed / "table")
+    assert read_run(tmp_path / "table")["counts"]["resumed"] >= 32
+    assert seen[-1] == FRAMES
+
+
+def test_kills_at_random_moments(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
+    moments = np.random.default_rng(1).uniform(0.4 * DURATION[0], DURATION[0], 2).tolist()
+
+    survive_kills(recording, tmp_path, undisturbed, moments)
+
+
+@pytest.mark.slow
+def test_fifty_kills(recording: Path, undisturbed: Path, duration: float, tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    killed = rounds = 0
+    while killed < 50:
+        rounds += 1
+        moments = rng.uniform(0, DURATION[0], rng.integers(1, 5)).tolist()
+        killed += survive_kills(recording, tmp_path / str(rounds), undisturbed, moments)
+
+
+def test_what_other_settings_left_is_discarded(
+    recording: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    def stop(_phase: str, done: int, _total: int | None) -> None:
+        if done == 40:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        process(Job(recording, tmp_path / "table", settings=Settings(seed=5), rrd=False), stop)
+    assert (tmp_path / ".table.partial" / "segments" / "000000").exists()
+
+    process(Job(recording, tmp_path / "table", rrd=False))
+
+    assert "resumed" not in read_run(tmp_path / "table")["counts"]
+    assert contents(tmp_path) == contents(undisturbed)
+    assert_same_tables(tmp_path / "table", undisturbed / "table")
+
+
+@pytest.mark.parametrize("phase", ["track", "annotated.mcap"])
+def test_phases_that_are_done_are_not_repeated(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, phase: str
+) -> None:
+    """Interrupted by the keyboard in a later phase, the next run begins with that phase."""
+    job = Job(recording, tmp_path / "table", end_s=0.3, rrd=False)
+    target = {
+        "track": "shapecat.pipeline.track_run",
+        "annotated.mcap": "shapecat.outputs.annotated_mcap.write_annotated",
+    }[phase]
+    with monkeypatch.context() as patch:
+        patch.setattr(target, interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            process(job)
+    assert [path.name for path in tmp_path.iterdir()] == [".table.partial"]
+    monkeypatch.setattr("shapecat.pipeline.perceive", interrupt)
+
+    process(job)
+
+    assert [path.name for path in tmp_path.iterdir()] == ["table"]
+
+
+def interrupt(*_args: object, **_options: object) -> None:
+    raise KeyboardInterrupt
+
+
+def test_an_interrupted_correction_is_finished(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise the outputs would show labels that the table no longer has."""
+    from shapecat.pipeline import annotate_again  # noqa: PLC0415  # beside its only use
+
+    folder = tmp_path / "table"
+    job = Job(recording, folder, end_s=0.3, rrd=False)
+    process(job)
+    before = contents(folder)
+    with monkeypatch.context() as patch:
+        patch.setattr("shapecat.outputs.annotated_mcap.write_annotated", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            annotate_again(folder, None)
+    (folder / "annotated.mcap").unlink()
+    (folder / ".annotated.mcap.partial").write_bytes(b"half")
+
+    process(job)
+
+    assert contents(folder) - {"tracks.original.csv"} == before
+
+
+def test_two_runs_do_not_write_one_folder(recording: Path, tmp_path: Path) -> None:
+    job = Job(recording, tmp_path / "table", end_s=0.3, rrd=False)
+
+    def second(phase: str, done: int, _total: int | None) -> None:
+        if (phase, done) == ("perceive", 1):
+            with pytest.raises(OutputError, match="another run is writing"):
+                process(job)
+
+    process(job, second)
+
+    assert [path.name for path in tmp_path.iterdir()] == ["table"]
+
+
+def test_unwritable_folder_is_one_line(
+    shapecat: Callable[..., Result], recording: Path, tmp_path: Path
+) -> None:
+    """Root may write anywhere, but not below a file."""
+    (tmp_path / "file").write_text("")
+    result = shapecat("process", recording, "--out", tmp_path / "file")
+
+    assert result.exit_code == 1
+    assert result.stderr.count("\n") == 1
+    assert "cannot write the results" in result.stderr
+
+
+@pytest.mark.parametrize("limit", [20_000, 400_000])
+def test_full_disk_is_one_line_and_nothing_is_left(
+    shapecat: Callable[..., Result], recording: Path, tmp_path: Path, limit: int
+) -> None:
+    """A limit on the size of files stands for a disk that is full; it stops tables, or the MCAP."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, hard))
+    try:
+        done = shapecat("process", recording, "--out", tmp_path / "out", "--no-rrd", "--end", 1.2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    assert done.exit_code == 1, done.stderr
+    assert done.stderr.count("\n") == 1, done.stderr
+    assert "cannot" in done.stderr
+    assert not (tmp_path / "out").exists()

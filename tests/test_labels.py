@@ -1,0 +1,301 @@
+"""Corrections of tracks.csv: what a person writes, and what spreadsheets make of it."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shapecat.corrections import TrackLabel, adopt_labels, read_labels, read_track_table
+from shapecat.errors import OutputError
+from shapecat.labels import read_labelled_frames
+from shapecat.tables import TRACKS, FrameRow, PerceptionTables, write_table
+from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
+
+HEADER = "track,first_s,category,confidence,label,topic\n"
+ORIGINAL = HEADER + "".join(
+    f"{track},0.000,{category},0.500,,/depth\n"
+    for track, category in [(4, "unknown"), (2, "can"), (1, "cup"), (3, "cup")]
+)
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    folder = tmp_path / "run"
+    folder.mkdir()
+    (folder / "tracks.csv").write_text(ORIGINAL)
+    (folder / "run.json").write_text(
+        json.dumps({"model": {"categories": ["cup", "can", "cactus"]}})
+    )
+    return folder
+
+
+def labelled(**labels: str) -> str:
+    """Return the table with labels by track, ``t4="bowl"``."""
+    text = ORIGINAL
+    for track, label in labels.items():
+        at = text.index(f"\n{track[1:]},") + 1
+        end = text.index("\n", at)
+        text = text[:at] + text[at:end].replace(",,", f",{label},") + text[end:]
+    return text
+
+
+def test_every_kind_of_label(run: Path) -> None:
+    (run / "tracks.csv").write_text(labelled(t4="teapot", t2="merge with 1", t3="delete"))
+
+    assert read_labels(run / "tracks.csv") == {
+        4: TrackLabel(4, "teapot", 1.0),
+        2: TrackLabel(1, "cup", 0.5),
+        1: TrackLabel(1, "cup", 0.5),
+    }
+
+
+@pytest.mark.parametrize(
+    ("label", "meant"),
+    [
+        ("Bowl", "bowl"),
+        ("  bowl ", "bowl"),
+        ("unknown", "unknown"),
+        ("cactus", "cactus"),
+        ("wine  glass", "wine glass"),
+        ("new pan", "pan"),
+        ("vase (blue)", "vase (blue)"),
+        ("Öllampe", "Öllampe"),
+    ],
+)
+def test_names_of_categories(run: Path, label: str, meant: str) -> None:
+    (run / "tracks.csv").write_text(labelled(t4=label))
+
+    assert read_labels(run / "tracks.csv", ["cactus"])[4] == TrackLabel(4, meant, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("label", "message"),
+    [
+        ("botle", "line 2: 'botle': did you mean bottle?"),
+        ("cpu", "did you mean cup?"),
+        ("catcus", "did you mean cactus?"),
+        ("delte", "did you mean delete?"),
+        ("pan", "For a category of its own write `new pan`"),
+        ("merge with", "is not a category, `delete` or `merge with N`"),
+        ("merge 2", "is not a category"),
+        ("merge with 77", "there is no track 77"),
+        ("merge with 4", "leads in a circle: 4 -> 4"),
+        ("7", "is not a category"),
+        ("../../etc", "is not a category"),
+        ("a/b", "is not a category"),
+        (".", "is not a category"),
+        ("x" * 61, "is not a category"),
+    ],
+)
+def test_what_is_not_understood_is_named(run: Path, label: str, message: str) -> None:
+    """Exports make folders of labels; a typo would become a category of its own."""
+    (run / "tracks.csv").write_text(labelled(t4=label))
+
+    with pytest.raises(OutputError) as raised:
+        read_labels(run / "tracks.csv", ["cactus"])
+    assert message in str(raised.value)
+
+
+def test_chains_of_merges_end_in_one_track(run: Path) -> None:
+    corrected = labelled(t4="merge with 2", t2="merged into #3", t3="bowl")
+    (run / "tracks.csv").write_text(corrected)
+    labels = read_labels(run / "tracks.csv")
+
+    assert {labels[k] for k in (2, 3, 4)} == {TrackLabel(3, "bowl", 1.0)}
+
+    for wrong, message in [
+        ({"t4": "merge with 2", "t2": "merge with 4"}, "circle"),
+        ({"t4": "merge with 2", "t2": "delete"}, "track 2 is deleted"),
+    ]:
+        (run / "tracks.csv").write_text(labelled(**wrong))
+        with pytest.raises(OutputError, match=message):
+            read_labels(run / "tracks.csv")
+
+
+def test_tracks_of_two_sensors_are_not_merged(run: Path) -> None:
+    """One number on two topics would make one annotation delete the other."""
+    text = labelled(t4="merge with 1").replace("merge with 1,/depth", "merge with 1,/other")
+    (run / "tracks.csv").write_text(text)
+
+    with pytest.raises(OutputError, match="another topic"):
+        read_labels(run / "tracks.csv")
+
+
+def test_all_problems_are_named_at_once_and_nothing_is_written(run: Path) -> None:
+    """Fixing one line per attempt is how people stop correcting."""
+    corrected = run.parent / "mine.csv"
+    corrected.write_text(
+        labelled(t4="botle", t2="merge with 9", t1="bowl") + "77,0,cup,0.5,bowl,/depth\n"
+        "1,0,cup,0.5,can,/depth\nx,0,cup,0.5,can,/depth\n"
+    )
+
+    with pytest.raises(OutputError) as raised:
+        adopt_labels(corrected, run)
+
+    lines = [line.split(":")[0].strip() for line in str(raised.value).splitlines()[1:]]
+    assert lines == ["line 2", "line 3", "line 6", "line 7", "line 8"]
+    assert (run / "tracks.csv").read_text() == ORIGINAL
+    assert {path.name for path in run.iterdir()} == {"run.json", "tracks.csv"}
+
+
+def test_corrections_are_adopted_and_the_first_table_stays(run: Path) -> None:
+    corrected = run.parent / "mine.csv"
+    for label in ("bowl", "plate"):
+        corrected.write_text(labelled(t4=label))
+        adopt_labels(corrected, run)
+
+        assert read_labels(run / "tracks.csv")[4] == TrackLabel(4, label, 1.0)
+        assert (run / "tracks.original.csv").read_text() == ORIGINAL
+
+
+def test_a_table_corrected_in_place_keeps_its_original(run: Path) -> None:
+    (run / "tracks.csv").write_text(labelled(t4="bowl"))
+    adopt_labels(run / "tracks.csv", run)
+
+    assert (run / "tracks.original.csv").read_text() == ORIGINAL
+    assert read_labels(run / "tracks.csv")[4].category == "bowl"
+
+
+def test_lines_left_out_keep_their_label(run: Path) -> None:
+    """A filtered spreadsheet saved as it is seen must not delete what was hidden."""
+    corrected = run.parent / "mine.csv"
+    corrected.write_text(labelled(t4="bowl"))
+    adopt_labels(corrected, run)
+    corrected.write_text("track,category,confidence,label\n2,can,0.5,box\n")
+    adopt_labels(corrected, run)
+
+    labels = read_labels(run / "tracks.csv")
+    assert [labels[k].category for k in (4, 2, 1, 3)] == ["bowl", "box", "cup", "cup"]
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"\xef\xbb\xbftrack;category;confidence;label\r\n4;unknown;0,5;bowl\r\n",
+        b"sep=;\r\ntrack;category;confidence;label\r\n4;unknown;0,5;bowl\r\n",
+        b'"label","track","note","confidence","category"\n"bowl","4.0","a, ""b""\nc","0.5","unknown"\n',
+        b"Track,Category,Confidence,Label,\r\n4.0,unknown,.5, Bowl ,\r\n,,,,\r\n\r\n",
+        "track\tcategory\tconfidence\tlabel\n4\tunknown\t0.5\tbowl\n".encode("utf-16"),
+        "track,category,confidence,label,größe\n4,unknown,0.5,bowl,ü\n".encode("cp1252"),
+        b"track,category,confidence,label\r4,unknown,0.5,bowl\r",
+    ],
+    ids=["excel", "sep", "quoted", "numbers", "utf16", "cp1252", "mac"],
+)
+def test_spreadsheet_habits(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "tracks.csv"
+    path.write_bytes(content)
+
+    assert read_labels(path) == {4: TrackLabel(4, "bowl", 1.0)}
+
+
+@pytest.mark.parametrize(
+    "content", [b"", b"hello", b"id,label\n1,cup\n", b"\xff\xfe\x00", b"\x00" * 9]
+)
+def test_what_is_no_table_is_refused(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "tracks.csv"
+    path.write_bytes(content)
+
+    with pytest.raises(OutputError):
+        read_labels(path)
+
+
+def test_a_missing_table_is_named(run: Path) -> None:
+    with pytest.raises(OutputError, match=r"gone\.csv: cannot be read"):
+        adopt_labels(run / "gone.csv", run)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.text(max_size=200)
+    | st.text("track,category;confidence\tlabel\n\r\"'1.0 merge with", max_size=300)
+)
+def test_any_text_is_read_or_refused(tmp_path_factory: pytest.TempPathFactory, text: str) -> None:
+    path = tmp_path_factory.mktemp("fuzz") / "tracks.csv"
+    path.write_text("track,category,confidence,label\n" + text, "utf-8", newline="")
+    try:
+        labels = read_labels(path)
+    except OutputError:
+        return
+    assert len(labels) <= len(read_track_table(path).rows)
+
+
+def write_run(folder: Path) -> None:
+    """Write three frames with two objects side by side, tracks 1 and 2; track 3 takes over 2."""
+    plane = Plane(np.array([0, -1, 0]), -0.5, np.zeros((3, 3)), 1.0, 0.0)
+    gas = NeuralGas(np.zeros((3, 3)), np.array([[0, 1], [1, 2]]))
+    with PerceptionTables(folder, categories=("cup", "can"), model_id="m") as tables:
+        for index in range(3):
+            found = tuple(
+                Detection(
+                    Candidate(
+                        indices=np.arange(4) + 3 * k,
+                        box=Box([0.2 * k, 0.4, 1], [0.1, 0.1, 0.2], [-(0.5**0.5), 0, 0, 0.5**0.5]),
+                        plane=0,
+                        on_candidate=None,
+                        support_m=0.0,
+                        touches_border=k == 1,
+                        occluded=False,
+                    ),
+                    gas,
+                    np.zeros(2),
+                    np.array([1.0 - k, k]),
+                    0.5,
+                    0.0,
+                )
+                for k in range(2)
+            )
+            scene = Scene(np.array([0, -1, 0]), (plane,), ())
+            tables.write(Perception("/d", index, index, "cam", scene, found, {}), FrameRow(0, None))
+    rows = [(1, 0, 0), (1, 1, 0), (1, 2, 0), (2, 0, 1), (3, 1, 1), (3, 2, 1)]
+    columns = {
+        "track": [t for t, _, _ in rows],
+        "topic": ["/d"] * len(rows),
+        "frame": [f for _, f, _ in rows],
+        "stamp_ns": [f for _, f, _ in rows],
+        "detection": [d for _, _, d in rows],
+        "center_fixed": [[0, 0, 0]] * len(rows),
+        "posterior": [[0.5, 0.5]] * len(rows),
+    }
+    write_table(folder / "tracks.parquet", columns, TRACKS)
+
+
+def test_merged_fragments_follow_each_other_as_one_track(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    labels = {
+        1: TrackLabel(1, "cup", 0.9),
+        2: TrackLabel(2, "can", 1.0),
+        3: TrackLabel(2, "can", 1.0),
+    }
+
+    frames = list(read_labelled_frames(tmp_path, labels))
+
+    assert [[o.track for o in f.objects] for f in frames] == [[1, 2]] * 3
+    assert [f.ended for f in frames] == [()] * 3
+
+
+def test_merged_parts_of_one_frame_become_one_object(tmp_path: Path) -> None:
+    """Two entities of one number in one message would overwrite each other."""
+    write_run(tmp_path)
+    labels = dict.fromkeys((1, 2, 3), TrackLabel(1, "box", 1.0))
+
+    (item,) = next(read_labelled_frames(tmp_path, labels)).objects
+
+    assert item.indices.tolist() == [0, 1, 2, 3, 4, 5, 6]
+    assert np.allclose(item.box.center, [0.1, 0.4, 1], atol=1e-5)
+    assert np.allclose(np.sort(item.box.size), [0.1, 0.2, 0.3], atol=1e-5)
+    assert item.height_m == pytest.approx(0.1, abs=1e-5)
+    assert item.gas.edges.tolist() == [[0, 1], [1, 2], [3, 4], [4, 5]]
+    assert item.touches_border
+
+
+def test_a_deleted_track_ends_where_it_would_have_been_seen(tmp_path: Path) -> None:
+    write_run(tmp_path)
+    labels = {1: TrackLabel(1, "cup", 0.9), 2: TrackLabel(2, "can", 1.0)}
+
+    frames = list(read_labelled_frames(tmp_path, labels))
+
+    assert [[o.track for o in f.objects] for f in frames] == [[1, 2], [1], [1]]
+    assert [f.ended for f in frames] == [(), (2,), ()]
