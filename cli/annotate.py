@@ -12,7 +12,7 @@ from .render import progress_bars
 @click.argument("run", type=ANY_PATH)
 @click.option("--labels", type=ANY_PATH, help="The corrected table; RUN/tracks.csv by default.")
 def annotate(*, run: Path, labels: Path | None) -> None:
-    r"""Write annotated.mcap and review.rrd again after tracks.csv was corrected.
+    """Write annotated.mcap and review.rrd again after tracks.csv was corrected.
 
     Fill the column `label` of RUN/tracks.csv in a spreadsheet: a category, or a name of your own.
     The recording must be where it was when it was processed.

@@ -13,7 +13,7 @@ from .render import print_json, progress_bars
 @model_option
 @json_option
 def evaluate(*, dataset: Path, model: Path | None, as_json: bool) -> None:
-    r"""Measure a model on labelled views: accuracy, confusion, calibration, novelty.
+    """Measure a model on labelled views: accuracy, confusion, calibration, novelty.
 
     DATASET is laid out as for `shapecat train`.
 

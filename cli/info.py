@@ -13,7 +13,7 @@ from .render import print_json, print_table
 @click.argument("recordings", nargs=-1, required=True, type=ANY_PATH)
 @json_option
 def info(*, recordings: tuple[Path, ...], as_json: bool) -> None:
-    r"""Show what a recording holds, and which cloud streams can be processed.
+    """Show what a recording holds, and which cloud streams can be processed.
 
     \b
     shapecat info lab.mcap

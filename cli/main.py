@@ -45,7 +45,7 @@ def main(*, verbose: bool) -> None:
     shapecat simulate demo.mcap                 make a recording to try things on
     shapecat process demo.mcap --out results    find, categorize and follow objects
     shapecat view results/demo                  look at them in Rerun
-    """  # noqa: D301  \b keeps click from wrapping
+    """
     level = logging.INFO if verbose else logging.ERROR
     logging.basicConfig(level=level, stream=sys.stderr, format="%(levelname)s %(message)s")
 

@@ -47,7 +47,7 @@ def process(
     as_json: bool,
     **choices: Any,
 ) -> None:
-    r"""Find, categorize and follow the objects in recordings.
+    """Find, categorize and follow the objects in recordings.
 
     Each RECORDING is an MCAP file, a ROS 1 bag, or a ROS 2 bag (file or folder). The results are
     tables, annotated.mcap for Foxglove, and review.rrd for Rerun.

@@ -24,7 +24,9 @@ from .render import progress_bars
     help="Recording format; by default what the suffix of OUT says, else mcap.",
 )
 @click.option("--sensor", type=click.Choice(["kinect", "realsense"]), default="kinect")
-@click.option("--frames", type=click.IntRange(1), default=90, show_default=True)
+@click.option(
+    "--frames", type=click.IntRange(1), default=90, show_default=True, help="30 per second."
+)
 @click.option("--clouds", is_flag=True, help="Write PointCloud2 instead of depth images.")
 @seed_option
 def simulate(
@@ -37,7 +39,7 @@ def simulate(
     clouds: bool,
     seed: int,
 ) -> None:
-    r"""Make a recording of simulated objects, with the truth beside it.
+    """Make a recording of simulated objects, with the truth beside it.
 
     OUT.truth.json says what stands where in each frame; OUT.labels.npz which pixel is whose.
 

@@ -14,7 +14,7 @@ from .render import print_json, progress_bars
 @seed_option
 @json_option
 def train(*, dataset: Path, out: Path, seed: int, as_json: bool) -> None:
-    r"""Learn a model from labelled views of objects.
+    """Learn a model from labelled views of objects.
 
     DATASET/<category>/<instance>/<view>.pcd (or .ply, .npz): one partial view each, in metres, z
     up, standing on z = 0. A folder named `unknown` holds shapes of no category.

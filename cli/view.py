@@ -11,7 +11,7 @@ from .options import ANY_PATH
 @click.argument("run", type=ANY_PATH)
 @click.option("--screenshot", type=ANY_PATH, metavar="PNG", help="Draw it to a file, no window.")
 def view(*, run: Path, screenshot: Path | None) -> None:
-    r"""Open the review of a run in the Rerun viewer.
+    """Open the review of a run in the Rerun viewer.
 
     \b
     shapecat view results/lab

@@ -118,7 +118,7 @@ def test_kills_at_random_moments(recording: Path, undisturbed: Path, tmp_path: P
 
 
 @pytest.mark.slow
-def test_fifty_kills(recording: Path, undisturbed: Path, duration: float, tmp_path: Path) -> None:
+def test_fifty_kills(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     killed = rounds = 0
     while killed < 50:

@@ -11,13 +11,11 @@ from shapecat.detection.planes import DIRECTIONS, Support
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 
-__all__ = ["LEAST_M", "NOISE", "Heights", "clear_walls", "heights_of", "inside", "table_of"]
+__all__ = ["LEAST_M", "NOISE", "Heights", "heights_of", "inside", "table_of"]
 
 LEAST_M = 0.004
 """Lowest height of an object cell, to which `NOISE` times the squared range is added."""
 NOISE = 0.0025
-WALL_JUMP = 0.012
-"""Cells this near to a wall, in inverse depth, are the wall."""
 
 
 class Heights(NamedTuple):
@@ -60,17 +58,6 @@ def heights_of(cells: Cells, supports: list[Support], *, highest_m: float) -> He
     for k, row in reversed(list(enumerate(table_of(supports, cells.lens)))):
         _stand(cells.w, cells.lens, row, k + 1, highest_m, owner, height)
     return Heights(owner, height)
-
-
-@kernel
-def clear_walls(w: F4, owner: I4, walls: F8) -> None:
-    """Take the cells on walls, rows (a, b, c) of ``walls``, from the object cells."""
-    for i in range(w.shape[0]):
-        for j in range(w.shape[1]):
-            if owner[i, j] > 0:
-                for wall in walls:
-                    if abs(w[i, j] - (wall[0] * j + wall[1] * i + wall[2])) < WALL_JUMP:
-                        owner[i, j] = 0
 
 
 @kernel

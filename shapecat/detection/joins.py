@@ -313,7 +313,11 @@ def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
         return False
     narrow, wide = a[RIGHTMOST] - a[LEFT], b[RIGHTMOST] - b[LEFT]
     ledge = pieces.pairs[ONTO, p, q] > NECK_LEDGE * pieces.pairs[CONTACT, p, q]
-    if narrow > (NECK_WIDTH if ledge else 1.0) * wide or a[TOP] < b[TOP] or a[BOTTOM] < b[TOP] - NECK_OVERLAP_M:
+    if (
+        narrow > (NECK_WIDTH if ledge else 1.0) * wide
+        or a[TOP] < b[TOP]
+        or a[BOTTOM] < b[TOP] - NECK_OVERLAP_M
+    ):
         return False
     apart = abs(a[LEFT] + a[RIGHTMOST] - b[LEFT] - b[RIGHTMOST]) / 2
     if apart > NECK_APART * wide or _slope(a) < ROUND / 2 or _slope(b) < ROUND:

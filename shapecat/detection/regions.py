@@ -67,7 +67,12 @@ def _is_ridge(edge: U1, i: int, j: int) -> bool:
     for d in range(4):
         di = 0 if d == 0 else RIDGE_CELLS
         dj = RIDGE_CELLS if d == 0 else (0 if d == 1 else (RIDGE_CELLS if d == 2 else -RIDGE_CELLS))
-        if i - di < 0 or i + di >= rows or min(j - dj, j + dj) < 0 or max(j - dj, j + dj) >= columns:
+        if (
+            i - di < 0
+            or i + di >= rows
+            or min(j - dj, j + dj) < 0
+            or max(j - dj, j + dj) >= columns
+        ):
             continue
         if edge[i - di, j - dj] < least and edge[i + di, j + dj] < least:
             return True

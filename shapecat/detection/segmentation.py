@@ -11,16 +11,19 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
 from shapecat.config import DetectionSettings
+from shapecat.detection.boards import boards_of
 from shapecat.detection.cells import Cells
+from shapecat.detection.directions import estimate_up
 from shapecat.detection.fill import fill_enclosed, grow_feet
 from shapecat.detection.furniture import is_furniture
-from shapecat.detection.heights import clear_walls, heights_of
+from shapecat.detection.heights import heights_of
 from shapecat.detection.joins import join_pieces
 from shapecat.detection.pieces import Pieces, pieces_of
-from shapecat.detection.planes import Support, estimate_up, find_supports, find_walls
+from shapecat.detection.planes import Support, find_planes
 from shapecat.detection.regions import regions_of
 from shapecat.detection.rings import join_rings
 from shapecat.detection.surfaces import surfaces_of
+from shapecat.detection.walls import clear_walls
 
 __all__ = ["RULES", "Segmentation", "segment"]
 
@@ -80,14 +83,12 @@ def segment(
     """Find planes and objects among ``cells``; None if there is no supporting plane."""
     rules = settings.rules.split()
     up = estimate_up(cells, hint, upright=upright, rng=rng)
-    supports = [] if up is None else find_supports(cells, up)
+    supports = [] if up is None else boards_of(cells, find_planes(cells, up))
     if up is None or not supports:
         return None
     up = max(supports, key=lambda s: s.area_m2).up
     heights = heights_of(cells, supports, highest_m=settings.max_height_m)
-    walls = find_walls(cells, heights.owner, up, largest_m=settings.max_size_m, rng=rng)
-    if walls:
-        clear_walls(cells.w, heights.owner, np.array(walls))
+    clear_walls(cells, heights.owner, up, largest_m=settings.max_size_m, rng=rng)
     surfaces = surfaces_of(cells, heights)
     regions, n = regions_of(heights, surfaces, concave="concave" in rules)
     pieces = pieces_of(cells, heights, surfaces, regions, n, up)
@@ -100,5 +101,7 @@ def segment(
     labels = number.astype(np.int16)[regions]
     if "feet" in rules:
         grow_feet(cells.w, heights.owner, heights.height, labels)
-    filled = fill_enclosed(cells.w, heights.height, labels, leaders.size - 1, active="fill" in rules)
+    filled = fill_enclosed(
+        cells.w, heights.height, labels, leaders.size - 1, active="fill" in rules
+    )
     return Segmentation(up, supports, labels, heights.height, filled, pieces, leaders)

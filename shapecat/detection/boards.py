@@ -1,0 +1,107 @@
+"""Boards: planes that are furniture, told from the tops of objects."""
+
+import math
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4
+from shapecat.detection.cells import NEAREST_M, Cells, Lens
+from shapecat.detection.consensus import TOLERANCE
+from shapecat.detection.planes import DIRECTIONS, Support, corners_of
+from shapecat.geometry import gravity_rotation
+from shapecat.jit import kernel
+
+__all__ = ["boards_of"]
+
+SURE_AREA_M2 = 0.25
+"""Planes larger than this are furniture, whatever is under their edge."""
+LIKELY_AREA_M2 = 0.1
+"""Planes larger than this are furniture if nothing is seen of what is under their edge."""
+LEAST_DROP_M = 0.06
+"""Lower things are objects."""
+EDGE_STEPS = 5
+LEAST_DROPS = 20
+CLOSED = 0.5
+
+
+def boards_of(cells: Cells, found: list[tuple[Support, I4]]) -> list[Support]:
+    """Leave out the tops of objects; ``found`` are planes, lowest first, and their cells.
+
+    Under the front edge of a table or shelf there is nothing; a box is closed down to what it
+    stands on. Things lower than 6 cm are never furniture, planes over a quarter of a square metre
+    always.
+    """
+    kept: list[Support] = []
+    for support, index in found:
+        below = [s for s in kept if _overlaps(s, support)]
+        drop = support.offset - below[-1].offset if below else math.inf
+        if drop < LEAST_DROP_M:
+            continue
+        if below and support.area_m2 < SURE_AREA_M2:
+            axes = gravity_rotation(support.up)
+            seen = np.zeros(2, np.int64)
+            plane = np.array([support.a, support.b, support.c])
+            _drop(cells.w, cells.lens, index, plane, support.up, axes, drop, seen)
+            if seen.sum() >= LEAST_DROPS:
+                if seen[0] > CLOSED * seen.sum():
+                    continue
+            elif support.area_m2 < LIKELY_AREA_M2:
+                continue
+        kept.append(support)
+    return kept
+
+
+def _overlaps(lower: Support, upper: Support) -> bool:
+    """Whether the middle of ``upper`` lies over the outline of ``lower``."""
+    middle = corners_of(upper).mean(axis=0)
+    flat = gravity_rotation(lower.up)[:2] @ middle
+    angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+    along = np.cos(angle) * flat[0] + np.sin(angle) * flat[1]
+    return bool((along < lower.reach).all())
+
+
+@kernel
+def _drop(w: F4, lens: Lens, index: I4, plane: F8, up: F8, axes: F8, drop: float, seen: I4) -> None:
+    """Look below the edge of a plane: count readings on a wall down from it, and beyond it."""
+    rows, columns = w.shape
+    for p in index[::3]:
+        i, j = p // columns, p % columns
+        level = plane[0] * j + plane[1] * i + plane[2]
+        if level <= 0 or abs(w[i, j] - level) >= TOLERANCE:
+            continue
+        z = 1 / level
+        x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
+        # Towards the camera, along the plane.
+        h = x * up[0] + y * up[1] + z * up[2]
+        tx, ty, tz = h * up[0] - x, h * up[1] - y, h * up[2] - z
+        length = math.sqrt(tx * tx + ty * ty + tz * tz)
+        if length < 0.1 or z < 0.2:
+            continue
+        tx, ty, tz = 0.01 * tx / length, 0.01 * ty / length, 0.01 * tz / length
+        edge = False
+        for _ in range(EDGE_STEPS):
+            v = int(lens.cy + lens.fy * (y + ty) / (z + tz) + 0.5)
+            u = int(lens.cx + lens.fx * (x + tx) / (z + tz) + 0.5)
+            if v < 0 or u < 0 or v >= rows or u >= columns or w[v, u] <= 0:
+                break
+            ahead = w[v, u] - 1 / (z + tz)
+            edge = ahead < -2 * TOLERANCE
+            if edge or ahead > 2 * TOLERANCE:  # the end of the plane, or something on it
+                break
+            x, y, z = x + tx, y + ty, z + tz
+        if not edge:
+            continue
+        for k in range(4, 20):
+            s = 0.01 * k
+            if s > drop - 0.01:
+                break
+            dx, dy, dz = x - s * up[0], y - s * up[1], z - s * up[2]
+            if dz <= NEAREST_M:
+                break
+            v, u = int(lens.cy + lens.fy * dy / dz + 0.5), int(lens.cx + lens.fx * dx / dz + 0.5)
+            if v < 0 or u < 0 or v >= rows or u >= columns:
+                break
+            if w[v, u] > 0:
+                behind = 1 / w[v, u] - dz
+                seen[0] += abs(behind) < 0.03
+                seen[1] += behind >= 0.03

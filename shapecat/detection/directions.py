@@ -1,0 +1,176 @@
+"""Directions: which way is up, as the surfaces of the scene tell it."""
+
+import math
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.detection.cells import JUMP, Cells, Lens
+from shapecat.detection.consensus import TOLERANCE, level_plane, normal_of, readings_of, refit
+from shapecat.jit import kernel
+
+__all__ = ["estimate_up"]
+
+ARM = 3
+"""Cells to each side over which a surface is seen to be smooth."""
+LEAST_SHARE, LEAST_FACETS = 0.04, 12
+"""A direction that may be up is faced by this share of the surface, and so many facets."""
+HINT_COS = math.cos(math.radians(15))
+FACING_COS = math.cos(math.radians(20))
+SAME_COS = math.cos(math.radians(12))
+CORNER_COS = 0.3
+TRIALS = 120
+MOST_DIRECTIONS = 4
+HEIGHT_BINS, LEVEL_BIN_M = 80, 0.04
+
+
+def estimate_up(
+    cells: Cells, hint: F8 | None, *, upright: bool, rng: np.random.Generator
+) -> F8 | None:
+    """Return the normal of the dominant supporting plane, (3,) unit, or None if there is none.
+
+    With a ``hint`` only planes within 15 degrees of being perpendicular to it count. Without, the
+    direction wins that most of the surface faces: the normal of one of the largest planes, or the
+    direction that two walls leave. Where the camera is thought ``upright``, directions that look
+    down count less, so that the boards of a shelf beat its back.
+    """
+    facets = np.zeros((cells.w.size // 16 + cells.w.shape[0] + cells.w.shape[1], 6), np.float32)
+    facets = facets[: _facets(cells.w, cells.lens, facets)]
+    least = max(LEAST_SHARE * len(facets), LEAST_FACETS)
+    directions = _directions(facets, hint, least, rng)
+    if not directions:
+        return None
+    if hint is None:
+        # Two walls leave one direction, up or down.
+        directions += [
+            sign * np.cross(a, b) / np.linalg.norm(np.cross(a, b))
+            for k, a in enumerate(directions)
+            for b in directions[:k]
+            if abs(a @ b) < CORNER_COS
+            for sign in (1, -1)
+        ]
+    best = max(directions, key=lambda d: _merit(facets, d, least, upright=upright))
+    return _settled(cells, facets, best)
+
+
+def _directions(facets: F4, hint: F8 | None, least: float, rng: np.random.Generator) -> list[F8]:
+    """Return directions that many surfaces face, most first: RANSAC on one normal at a time."""
+    free = np.ones(len(facets), np.bool_)
+    if hint is not None:
+        free &= _facing(facets, hint, HINT_COS)
+    found: list[F8] = []
+    while len(found) < MOST_DIRECTIONS and np.count_nonzero(free) >= least:
+        trials = np.flatnonzero(free)[rng.integers(0, np.count_nonzero(free), TRIALS)]
+        best = np.zeros(3)
+        if _most_faced(facets, free, trials, best) < least:
+            break
+        found.append(best)
+        free &= ~_facing(facets, best, FACING_COS)
+    return found
+
+
+@kernel
+def _facing(facets: F4, direction: F8, least_cos: float) -> Bool:
+    """Return which facets face a direction."""
+    result = np.zeros(len(facets), np.bool_)
+    for k in range(len(facets)):
+        f = facets[k]
+        cos = f[0] * direction[0] + f[1] * direction[1] + f[2] * direction[2]
+        result[k] = cos > least_cos
+    return result
+
+
+@kernel
+def _most_faced(facets: F4, free: Bool, trials: I4, best: F8) -> int:
+    """Write the direction most free facets face; return how many."""
+    chosen = np.zeros((np.count_nonzero(free), 3), np.float32)
+    n = 0
+    for k in range(len(facets)):
+        if free[k]:
+            chosen[n] = facets[k, :3]
+            n += 1
+    most = -1
+    for t in trials:
+        x, y, z = facets[t, 0], facets[t, 1], facets[t, 2]
+        votes = 0
+        for k in range(n):
+            votes += chosen[k, 0] * x + chosen[k, 1] * y + chosen[k, 2] * z > FACING_COS
+        if votes > most:
+            most = votes
+            best[0], best[1], best[2] = x, y, z
+    for _ in range(3):
+        x, y, z = best
+        sx = sy = sz = 0.0
+        most = 0
+        for k in range(n):
+            if chosen[k, 0] * x + chosen[k, 1] * y + chosen[k, 2] * z > FACING_COS:
+                most += 1
+                sx += chosen[k, 0]
+                sy += chosen[k, 1]
+                sz += chosen[k, 2]
+        norm = math.sqrt(sx * sx + sy * sy + sz * sz)
+        best[0], best[1], best[2] = sx / norm, sy / norm, sz / norm
+    return most
+
+
+def _merit(facets: F4, direction: F8, least: float, *, upright: bool) -> float:
+    count = np.zeros(HEIGHT_BINS, np.int64)
+    facing = _count_levels(facets, direction, count)
+    # The boards of a shelf are several, its back is one.
+    levels = max(np.count_nonzero((count[1:] + count[:-1])[::2] > least), 1)
+    # Cameras look down at tables: +y is down in the optical frame.
+    tilt = min(max(-direction[1] / 0.2, -1.0), 1.0) if upright else 0.0
+    return float(facing * math.sqrt(levels) * (1.0 + 0.6 * tilt))
+
+
+@kernel
+def _count_levels(facets: F4, direction: F8, count: I4) -> int:
+    """Count the facets that face a direction, in all and by their height below the sensor."""
+    facing = 0
+    for k in range(len(facets)):
+        f = facets[k]
+        if f[0] * direction[0] + f[1] * direction[1] + f[2] * direction[2] > FACING_COS:
+            facing += 1
+            height = f[3] * direction[0] + f[4] * direction[1] + f[5] * direction[2]
+            level = int(math.floor(-height / LEVEL_BIN_M))
+            if 0 <= level < count.size:
+                count[level] += 1
+    return facing
+
+
+def _settled(cells: Cells, facets: F4, direction: F8) -> F8:
+    """Return the exact normal of the largest plane that faces ``direction``."""
+    count = np.zeros(HEIGHT_BINS, np.int64)
+    _count_levels(facets, direction, count)
+    plane = level_plane(cells.lens, direction, -(int(np.argmax(count)) + 0.5) * LEVEL_BIN_M)
+    readings = readings_of(cells)
+    for tolerance in (4, 3, 2, 1, 1):
+        refit(readings.j, readings.i, readings.w, tolerance * TOLERANCE, plane)
+    normal = normal_of(plane, cells.lens)
+    return normal if normal @ direction > SAME_COS else direction
+
+
+@kernel
+def _facets(w: F4, lens: Lens, facets: F4) -> int:
+    """Collect the normal and the position of every fourth cell on a smooth surface."""
+    rows, columns = w.shape
+    bend = np.float32(2 * JUMP)
+    n = 0
+    for i in range(ARM, rows - ARM, 4):
+        for j in range(ARM, columns - ARM, 4):
+            center = w[i, j]
+            left, right, top, bottom = w[i, j - ARM], w[i, j + ARM], w[i - ARM, j], w[i + ARM, j]
+            if not ((center > 0) & (left > 0) & (right > 0) & (top > 0) & (bottom > 0)):
+                continue
+            if (abs(left + right - 2 * center) > bend) | (abs(top + bottom - 2 * center) > bend):
+                continue
+            wu, wv = (right - left) / (2 * ARM), (bottom - top) / (2 * ARM)
+            nx, ny = -lens.fx * wu, -lens.fy * wv
+            nz = wu * (j - lens.cx) + wv * (i - lens.cy) - center
+            norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+            facets[n, 0], facets[n, 1], facets[n, 2] = nx / norm, ny / norm, nz / norm
+            facets[n, 3] = (j - lens.cx) / lens.fx / center
+            facets[n, 4] = (i - lens.cy) / lens.fy / center
+            facets[n, 5] = 1 / center
+            n += 1
+    return n

@@ -1,0 +1,67 @@
+"""The documentation is held to the commands: each is explained, each printed line works."""
+
+import re
+from collections.abc import Callable
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+import click
+import pytest
+from click.testing import Result
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def commands() -> dict[str, click.Command]:
+    (script,) = entry_points(group="console_scripts", name="shapecat")
+    group: Any = script.load()
+    found: dict[str, click.Command] = group.commands
+    return found
+
+
+@pytest.mark.parametrize("name", sorted(commands()))
+def test_every_command_explains_itself_with_an_example(
+    shapecat: Callable[..., Result], name: str
+) -> None:
+    result = shapecat(name, "--help")
+
+    assert result.exit_code == 0
+    assert re.search(rf"^ *shapecat {name} \S", result.stdout, re.MULTILINE), "no example"
+    for parameter in commands()[name].params:
+        if isinstance(parameter, click.Option):
+            assert parameter.help or parameter.name in {"seed", "scene", "sensor"}, parameter.name
+
+
+def written_commands() -> list[tuple[str, str]]:
+    return [
+        (page.name, line.split("#")[0].strip())
+        for page in PAGES
+        for line in page.read_text("utf-8").splitlines()
+        if re.match(r"^ *shapecat [a-z]", line)
+    ]
+
+
+@pytest.mark.parametrize(("page", "line"), written_commands())
+def test_commands_in_the_documentation_exist_with_their_options(page: str, line: str) -> None:
+    """A renamed option makes documentation lie."""
+    words = [word for word in line.split() if word not in {"\\", "…", "..."}]
+    command = commands()[words[1]]
+    known = {name for parameter in command.params for name in parameter.opts}
+    options = {word.split("=")[0] for word in words[2:] if word.startswith("--")}
+
+    assert options <= known, f"{page}: {line}"
+
+
+def test_links_between_pages_lead_somewhere() -> None:
+    for page in [*PAGES, ROOT / "ARCHITECTURE.md", ROOT / "CONTRIBUTING.md"]:
+        for target in re.findall(r"\]\((?!http)([^)#]+)\)", page.read_text("utf-8")):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_make_targets_named_in_the_documentation_exist() -> None:
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE))
+    for page in [*PAGES, ROOT / "CONTRIBUTING.md"]:
+        for target in re.findall(r"`make ([a-z-]+)`", page.read_text("utf-8")):
+            assert target in targets, f"{page.name}: make {target}"

@@ -1,0 +1,125 @@
+"""The model that is shipped, and the simulated views it is made from."""
+
+import time
+from importlib.resources import files
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from shapecat.config import Settings
+from shapecat.description import DESCRIPTOR_NAMES
+from shapecat.evaluation import View, evaluate
+from shapecat.evaluation.views import describe_views
+from shapecat.learning import Categorizer, load_model
+from shapecat.models.fragments import cut_fragment, cut_halo
+from shapecat.models.training import collect
+from shapecat.models.worlds import World, simulate_views, simulate_world
+from shapecat.types import CATEGORIES
+
+DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+@pytest.fixture(scope="module")
+def model() -> Categorizer:
+    return load_model()
+
+
+def test_the_shipped_model_fits_this_version(model: Categorizer) -> None:
+    """A changed descriptor without a new model would categorize nonsense."""
+    model.require_descriptor(DESCRIPTOR_NAMES)
+
+    assert model.categories == CATEGORIES
+
+
+def test_the_shipped_model_is_small_and_has_its_card() -> None:
+    folder = files("shapecat.models")
+
+    assert len((folder / "default.npz").read_bytes()) <= 5_000_000
+    assert load_model().model_id in (folder / "MODEL_CARD.md").read_text("utf-8")
+
+
+def test_the_shipped_model_answers_fast(model: Categorizer) -> None:
+    x = np.zeros((1, len(DESCRIPTOR_NAMES)), np.float32)
+    model.predict(x)
+    seconds = []
+    for _ in range(200):
+        begun = time.perf_counter()
+        model.predict(x)
+        seconds.append(time.perf_counter() - begun)
+
+    assert min(seconds) < 3e-4
+
+
+def test_unseen_simulated_objects_are_recognised(model: Categorizer) -> None:
+    """A few tables of a seed that nothing was made with; the card has the real figures."""
+    kinds = ("pan", "hammer", "shoe", "chair")
+    seen = collect(view for k in range(4) for view in simulate_world(World(99, kinds), k))
+    whole = (seen.source != "fragment") & (seen.visible > 0.7) & (seen.manner == "upright")
+    report = evaluate(seen.views.where(whole), model)
+
+    assert report.n > 40
+    assert report.accuracy is not None
+    assert report.accuracy > 0.85
+
+
+def test_worlds_do_not_depend_on_the_number_of_jobs() -> None:
+    """The same seed must give the same model on any machine."""
+    world = World(5, ("pan", "hammer"), cameras=1)
+    alone = list(simulate_views(world, range(2)))
+    shared = list(simulate_views(world, range(2), jobs=2))
+
+    assert [(v.instance, v.source, v.points) for v in alone] == [
+        (v.instance, v.source, v.points) for v in shared
+    ]
+    for a, b in zip(alone, shared, strict=True):
+        assert np.array_equal(a.descriptor, b.descriptor)
+
+
+def half_ball() -> View:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(4000, 3))
+    points /= np.linalg.norm(points, axis=1, keepdims=True)
+    points = points[points @ np.array([1.0, 0.0, 0.5]) > 0] * 0.05 + [0, 0, 0.05]
+    return View(points, np.array([1.0, 0.0, 0.6]), "ball", "b")
+
+
+def test_fragments_are_true_pieces() -> None:
+    """30 to 85 % of the points, not floating above the support."""
+    view = half_ball()
+    for seed in range(20):
+        piece = cut_fragment(view, np.random.default_rng(seed))
+        assert piece is not None
+        assert 0.3 <= len(piece.points) / len(view.points) <= 0.85
+        assert piece.points[:, 2].min() < 0.03
+        assert np.all(np.isin(piece.points[:, 0], view.points[:, 0]))
+
+
+def test_a_view_too_small_has_no_fragment() -> None:
+    view = half_ball()
+    few = View(view.points[:50], view.eye, "ball", "b")
+
+    assert cut_fragment(few, np.random.default_rng(0)) is None
+
+
+def test_the_halo_is_cut_from_below_only() -> None:
+    view = half_ball()
+    cut = cut_halo(view, np.random.default_rng(0))
+
+    assert 0.003 < cut.points[:, 2].min() < 0.012
+    assert cut.points[:, 2].max() == view.points[:, 2].max()
+
+
+@pytest.mark.skipif(not (DATA / "osd_learn").exists(), reason="no shared data")
+def test_real_objects_are_recognised(model: Categorizer) -> None:
+    """Kinect and RealSense readings, which nothing was learned from or chosen by."""
+    from shapecat.models.recorded import detected_views, labelled_views  # noqa: PLC0415
+
+    by_hand = describe_views(labelled_views(DATA / "osd_learn"), settings=Settings())
+    detected = describe_views(detected_views(DATA / "realsense_single"), settings=Settings())
+    kinect, realsense = evaluate(by_hand, model), evaluate(detected, model)
+
+    assert kinect.n == 89
+    assert kinect.accuracy is not None
+    assert kinect.accuracy >= 0.95
+    assert (realsense.n, realsense.accuracy) == (10, 1.0)
