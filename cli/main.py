@@ -11,8 +11,12 @@ from shapecat.errors import ShapecatError
 
 from .annotate import annotate
 from .evaluate import evaluate
+from .export import export
 from .info import info
+from .learn import learn
 from .process import process
+from .report import report
+from .scene import scene
 from .simulate import simulate
 from .train import train
 from .view import view
@@ -50,5 +54,17 @@ def main(*, verbose: bool) -> None:
     logging.basicConfig(level=level, stream=sys.stderr, format="%(levelname)s %(message)s")
 
 
-for _command in (info, process, annotate, view, simulate, train, evaluate):
+for _command in (
+    info,
+    process,
+    report,
+    annotate,
+    view,
+    scene,
+    export,
+    learn,
+    train,
+    evaluate,
+    simulate,
+):
     main.add_command(_command)

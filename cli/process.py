@@ -88,11 +88,10 @@ def process(
 
 def _row(summary: Any) -> tuple[Any, ...]:
     counts = summary.counts
-    state = "" if summary.fresh else " (was complete)"
     return (
         summary.source.name,
         counts["frames"],
-        round(summary.seconds, 1),
+        round(summary.seconds, 1) if summary.fresh else "was complete",
         count_words(counts["tracks"]),
-        f"{summary.folder}{state}",
+        summary.folder,
     )

@@ -12,6 +12,8 @@ _PHASES = {
     "perceive": "finding and categorizing objects",
     "annotate": "writing annotated.mcap",
     "review": "writing review.rrd",
+    "report": "drawing reports",
+    "export": "exporting",
     "train": "learning",
     "evaluate": "evaluating",
 }
@@ -76,7 +78,7 @@ def print_table(
         table.add_column(name, justify="right" if numeric else "left", overflow="fold")
     for row in rows:
         table.add_row(*map(str, row))
-    Console(width=None if Console().is_terminal else 120).print(table)
+    Console(width=None if Console().is_terminal else 200).print(table)
 
 
 def count_words(counts: Mapping[str, int]) -> str:

@@ -41,7 +41,7 @@ def kernel(function: _F | None = None, *, fast: bool = False, inline: bool = Fal
     return compile_later if function is None else compile_later(function)
 
 
-class CompileClock(Listener):
+class CompileClock(Listener):  # type: ignore[misc]  # numba has no types
     """Counts the seconds spent compiling while it listens; none when all kernels are cached."""
 
     def __init__(self, on_first: Callable[[], None]) -> None:

@@ -3,8 +3,10 @@
 from collections.abc import Callable
 from importlib.metadata import entry_points
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
@@ -32,3 +34,32 @@ def shapecat() -> Callable[..., Result]:
         return result
 
     return run
+
+
+class Guesser:
+    """Stands in for a model where a test is not about one: guesses from the descriptor."""
+
+    categories = ("cup", "can", "box", "bottle", "bowl", "plate", "ball")
+    model_id = "guesser"
+
+    def predict(self, descriptors: Any) -> Any:
+        x = np.nan_to_num(np.asarray(descriptors, np.float64))
+        logits = x @ np.random.default_rng(0).normal(0, 0.3, (x.shape[1], len(self.categories)))
+        logits -= logits.max(axis=1, keepdims=True)
+        share = np.exp(logits) / np.exp(logits).sum(axis=1, keepdims=True)
+        return SimpleNamespace(posteriors=share.astype(np.float32), novelty=0.5 + 0 * share[:, 0])
+
+
+@pytest.fixture(scope="session")
+def guessed_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Process a short simulated recording; its categories are guesses. Copy it to change it."""
+    import shapecat.pipeline  # noqa: PLC0415  only the tests that ask for it pay for it
+    from shapecat.jobs import Job  # noqa: PLC0415  the same
+    from shapecat.simulation import simulate  # noqa: PLC0415  the same
+
+    folder = tmp_path_factory.mktemp("guessed")
+    source = simulate(folder / "table.mcap", frames=12, seed=7)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
+        shapecat.pipeline.process(Job(source=source, folder=folder / "out" / "table", rrd=False))
+    return folder / "out" / "table"

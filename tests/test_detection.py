@@ -1,6 +1,7 @@
 """Detection on scenes drawn by a small ray caster, each named by the hazard it holds."""
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from shapecat.config import DetectionSettings
 from shapecat.detection import Hierarchy, Node, detect, format_tree
 from shapecat.types import Camera, Frame, Scene
 
-Array = NDArray[np.float64]
+Array = NDArray[Any]
 Shape = Callable[[Array, Array], Array]
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -20,7 +21,7 @@ DEFAULTS = DetectionSettings()
 
 
 def table(x: float = 0.5, y: float = 0.4, z: float = 0.0) -> Shape:
-    """A horizontal rectangle of half sizes x, y at height z."""
+    """Return a horizontal rectangle of half sizes x, y at height z."""
 
     def hit(origin: Array, rays: Array) -> Array:
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -35,7 +36,7 @@ def table(x: float = 0.5, y: float = 0.4, z: float = 0.0) -> Shape:
 def box(
     center: tuple[float, float, float], size: tuple[float, float, float], yaw: float = 0
 ) -> Shape:
-    """A box; ``center`` is the middle of its base."""
+    """Return a box; ``center`` is the middle of its base."""
     c, s = np.cos(yaw), np.sin(yaw)
     turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
     half = np.array(size) / 2
@@ -52,12 +53,12 @@ def box(
 
 
 def ball(center: tuple[float, float, float], radius: float) -> Shape:
-    """A sphere around ``center``."""
+    """Return a sphere around ``center``."""
     return shell(center, radius, None)
 
 
 def shell(center: tuple[float, float, float], radius: float, rim: float | None) -> Shape:
-    """A thin sphere, open above the height ``rim``."""
+    """Return a thin sphere, open above the height ``rim``."""
 
     def hit(origin: Array, rays: Array) -> Array:
         o = origin - np.array(center)
@@ -76,7 +77,7 @@ def shell(center: tuple[float, float, float], radius: float, rim: float | None) 
 
 
 def can(x: float, y: float, z: float, radius: float, height: float) -> Shape:
-    """An upright closed cylinder on height ``z``."""
+    """Return an upright closed cylinder on height ``z``."""
 
     def hit(origin: Array, rays: Array) -> Array:
         o = origin - np.array([x, y, z])
@@ -268,7 +269,7 @@ SCENE = [table(), box((-0.06, 0, 0), (0.12, 0.08, 0.12), 0.35), can(0.12, -0.05,
     [
         lambda d: d[:, ::-1],
         lambda d: d[::-1, ::-1],
-        lambda d: np.rot90(d),
+        np.rot90,
         lambda d: np.rot90(d, -1),
     ],
     ids=["mirrored", "upside down", "left", "right"],
@@ -384,8 +385,8 @@ def test_any_cloud_gives_a_scene(n: int, seed: int, odd: float, spread: float) -
 
 def test_hierarchy_answers_the_queries() -> None:
     """Highest, lowest, nearest, farthest, on objects, and counts (thesis 4.5)."""
-    shapes = [table(), box((-0.2, 0, 0), (0.15, 0.15, 0.08)), box((-0.2, 0, 0.08), (0.07, 0.07, 0.1)),
-              can(0.15, 0.15, 0, 0.04, 0.14), box((0.1, -0.15, 0), (0.1, 0.08, 0.05))]  # fmt: skip
+    shapes = [table(), box((-0.2, 0, 0), (0.15, 0.15, 0.08)),
+              box((-0.2, 0, 0.08), (0.07, 0.07, 0.1)), can(0.15, 0.15, 0, 0.04, 0.14), box((0.1, -0.15, 0), (0.1, 0.08, 0.05))]  # fmt: skip
     depth, seen = render(shapes)
     scene = found(frame_of(depth))
     name = {

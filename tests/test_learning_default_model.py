@@ -54,11 +54,11 @@ def test_the_shipped_model_answers_fast(model: Categorizer) -> None:
 def test_unseen_simulated_objects_are_recognised(model: Categorizer) -> None:
     """A few tables of a seed that nothing was made with; the card has the real figures."""
     kinds = ("pan", "hammer", "shoe", "chair")
-    seen = collect(view for k in range(4) for view in simulate_world(World(99, kinds), k))
+    seen = collect(view for k in range(6) for view in simulate_world(World(99, kinds), k))
     whole = (seen.source != "fragment") & (seen.visible > 0.7) & (seen.manner == "upright")
     report = evaluate(seen.views.where(whole), model)
 
-    assert report.n > 40
+    assert report.n > 30
     assert report.accuracy is not None
     assert report.accuracy > 0.85
 

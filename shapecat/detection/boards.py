@@ -38,10 +38,9 @@ def boards_of(cells: Cells, found: list[tuple[Support, I4]]) -> list[Support]:
         if drop < LEAST_DROP_M:
             continue
         if below and support.area_m2 < SURE_AREA_M2:
-            axes = gravity_rotation(support.up)
             seen = np.zeros(2, np.int64)
             plane = np.array([support.a, support.b, support.c])
-            _drop(cells.w, cells.lens, index, plane, support.up, axes, drop, seen)
+            _drop(cells.w, cells.lens, index, plane, support.up, drop, seen)
             if seen.sum() >= LEAST_DROPS:
                 if seen[0] > CLOSED * seen.sum():
                     continue
@@ -61,7 +60,7 @@ def _overlaps(lower: Support, upper: Support) -> bool:
 
 
 @kernel
-def _drop(w: F4, lens: Lens, index: I4, plane: F8, up: F8, axes: F8, drop: float, seen: I4) -> None:
+def _drop(w: F4, lens: Lens, index: I4, plane: F8, up: F8, drop: float, seen: I4) -> None:
     """Look below the edge of a plane: count readings on a wall down from it, and beyond it."""
     rows, columns = w.shape
     for p in index[::3]:

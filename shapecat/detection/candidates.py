@@ -9,7 +9,6 @@ from shapecat.detection.cells import Cells, Lens
 from shapecat.detection.pieces import (
     BOTTOM,
     CONTACT,
-    COUNT,
     FRONT,
     HIDDEN,
     LEFT,

@@ -58,7 +58,7 @@ def normal_of(plane: F8, lens: Lens) -> F8:
     """Return the unit normal towards the camera of a plane (a, b, c) of inverse depth."""
     a, b, c = plane
     n = -np.array([a * lens.fx, b * lens.fy, a * lens.cx + b * lens.cy + c])
-    return n / np.linalg.norm(n)
+    return np.asarray(n / np.linalg.norm(n))
 
 
 def level_plane(lens: Lens, up: F8, offset: float) -> F8:
@@ -130,7 +130,7 @@ def _count(readings: Readings, a: float, b: float, c: float) -> int:
     for k in range(readings.w.size):
         level = a4 * readings.j[k] + b4 * readings.i[k] + c4
         total += np.int32(abs(readings.w[k] - level) < gate)
-    return total
+    return int(total)
 
 
 @kernel

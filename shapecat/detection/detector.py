@@ -60,7 +60,7 @@ def detect(
         scene = _in_image(frame.depth, frame.camera, hint, settings, rng)
     else:
         scene = _in_cloud(frame.xyz(), hint, settings, rng)
-    return scene or Scene(DEFAULT_UP if hint is None else hint, (), ())
+    return scene or Scene(np.array(DEFAULT_UP) if hint is None else hint, (), ())
 
 
 def _unit(up: ArrayLike) -> F8:

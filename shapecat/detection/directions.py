@@ -117,7 +117,7 @@ def _merit(facets: F4, direction: F8, least: float, *, upright: bool) -> float:
     count = np.zeros(HEIGHT_BINS, np.int64)
     facing = _count_levels(facets, direction, count)
     # The boards of a shelf are several, its back is one.
-    levels = max(np.count_nonzero((count[1:] + count[:-1])[::2] > least), 1)
+    levels = max(int(np.count_nonzero((count[1:] + count[:-1])[::2] > least)), 1)
     # Cameras look down at tables: +y is down in the optical frame.
     tilt = min(max(-direction[1] / 0.2, -1.0), 1.0) if upright else 0.0
     return float(facing * math.sqrt(levels) * (1.0 + 0.6 * tilt))
@@ -132,7 +132,7 @@ def _count_levels(facets: F4, direction: F8, count: I4) -> int:
         if f[0] * direction[0] + f[1] * direction[1] + f[2] * direction[2] > FACING_COS:
             facing += 1
             height = f[3] * direction[0] + f[4] * direction[1] + f[5] * direction[2]
-            level = int(math.floor(-height / LEVEL_BIN_M))
+            level = math.floor(-height / LEVEL_BIN_M)
             if 0 <= level < count.size:
                 count[level] += 1
     return facing

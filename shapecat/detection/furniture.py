@@ -1,9 +1,7 @@
 """Furniture: pieces that are parts of tables and shelves, walls, or too large for an object."""
 
-import numpy as np
-
-from shapecat.arrays import Bool, F4, F8, I4
-from shapecat.detection.pieces import COUNT, LEFT, RIGHTMOST, RIM, TABLE, TOP, Pieces
+from shapecat.arrays import Bool
+from shapecat.detection.pieces import LEFT, RIGHTMOST, RIM, Pieces
 
 __all__ = ["is_furniture"]
 

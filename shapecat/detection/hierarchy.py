@@ -1,9 +1,9 @@
 """The hierarchy of a scene: which planes and objects stand on which (thesis 4.5)."""
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -17,7 +17,8 @@ ON_TOP_M = 0.04
 """A plane this near to the top of an object is that object's top."""
 
 
-class Node(NamedTuple):
+@dataclass(frozen=True, order=True)
+class Node:
     """A plane or an object: ``index`` counts `Scene.planes` or `Scene.candidates`."""
 
     kind: Literal["plane", "object"]
@@ -160,8 +161,8 @@ def _covers(plane: Plane, point: F8) -> bool:
     return len(outline) > 2 and bool((turns >= 0).all() or (turns <= 0).all())
 
 
-def format_tree(scene: Scene) -> str:
-    """Return the hierarchy as an indented text, one node per line.
+def format_tree(scene: Scene, describe: Callable[[Scene, Node], str] | None = None) -> str:
+    """Return the hierarchy as an indented text, one node per line as ``describe`` puts it.
 
     A node that stands on several others is printed under each and marked ``=`` from its second
     time on.
@@ -174,10 +175,11 @@ def format_tree(scene: Scene) -> str:
     hierarchy = Hierarchy(scene)
     lines: list[str] = []
     printed: set[Node] = set()
+    describe = describe or _described
 
     def add(node: Node, depth: int) -> None:
         again = "= " if node in printed else ""
-        lines.append("  " * depth + again + _described(scene, node))
+        lines.append("  " * depth + again + describe(scene, node))
         if node not in printed:
             printed.add(node)
             for child in hierarchy.children(node):

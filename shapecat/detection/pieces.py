@@ -18,6 +18,7 @@ __all__ = [
     "BOTTOM",
     "CONTACT",
     "COUNT",
+    "FEW",
     "FRONT",
     "HIDDEN",
     "LEFT",
@@ -34,8 +35,11 @@ __all__ = [
     "TOP",
     "TURN",
     "Pieces",
+    "has_lid",
+    "is_group",
     "merge",
     "pieces_of",
+    "slope_of",
 ]
 
 CONTACT, FRONT, NEAR, ONTO, ONTO_HEIGHT = range(5)
@@ -45,8 +49,12 @@ TABLE, HIDDEN, RIM = range(3)
 """Statistics of one piece: links with its plane; boundary behind things that are no piece; links
 with a higher plane, from below."""
 COUNT, LEFT, RIGHTMOST, SIDE, SIDE2, TURN, SIDETURN, TOP, BOTTOM, AREA = range(10)
+FEW = 3
+"""Links between two pieces that are taken for a contact rather than for noise."""
 SAMPLES = 48
 BANDS = 128
+LID_M, LID = 0.02, 0.25
+"""A top is closed if this share of its width squared faces up within this depth of it."""
 BAND_M = 0.005
 GAP, SHADOW = 3, 15
 INWARD = 3
@@ -287,3 +295,31 @@ def merge(pieces: Pieces, p: int, q: int) -> None:
     for k in range(n):
         if pieces.group[k] == q:
             pieces.group[k] = p
+
+
+@kernel
+def is_group(pieces: Pieces, p: int) -> bool:
+    """Whether a piece has not been merged into another."""
+    return bool(pieces.group[p] == p)
+
+
+@kernel
+def slope_of(row: F4) -> float:
+    """Return by how much the lateral normal changes across a piece.
+
+    2 for a whole cylinder seen from outside, -2 from inside, 0 for a plane.
+    """
+    spread = row[SIDE2] - row[SIDE] * row[SIDE] / row[COUNT]
+    slope = (row[SIDETURN] - row[SIDE] * row[TURN] / row[COUNT]) / max(spread, 1e-9)
+    return float(slope * (row[RIGHTMOST] - row[LEFT]))
+
+
+@kernel
+def has_lid(pieces: Pieces, p: int) -> bool:
+    """Whether the top of a piece is closed by a surface that faces up."""
+    row = pieces.shape[p]
+    top = min(int(row[TOP] / BAND_M), pieces.lid.shape[1] - 1)
+    area = 0.0
+    for band in range(max(top - int(LID_M / BAND_M), 0), top + 1):
+        area += pieces.lid[p, band]
+    return bool(area > LID * (row[RIGHTMOST] - row[LEFT]) ** 2)

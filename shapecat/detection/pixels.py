@@ -1,5 +1,7 @@
 """Pixels: labels of cells brought back to full resolution."""
 
+from itertools import pairwise
+
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U4, Bool
@@ -68,10 +70,10 @@ def points_of(view: View, found: Segmentation, planes: F8, *, fused: bool) -> li
         sizes,
     )
     if fused:
-        loose = marks > 0
+        above = marks > 0
         for plane in planes:
-            loose |= _above(points, view.cell, cells.lens, plane)
-        loose = np.flatnonzero(loose)
+            above |= _above(points, view.cell, cells.lens, plane)
+        loose = np.flatnonzero(above)
         if loose.size:
             labels = spread_labels(points[loose], marks[loose].astype(np.int64), first_new)
             marks[loose] = np.where(labels <= MOST_LABELS, labels, 0)
@@ -97,7 +99,7 @@ def _sorted(marks: I4, sizes: I4) -> list[U4]:
     # Label 0 has a list of size 0.
     order = np.zeros(int(starts[-1]), np.uint32)
     _sort(marks, starts[:-1].copy(), order)
-    return [order[a:b] for a, b in zip(starts[1:-1], starts[2:], strict=True)]
+    return [order[a:b] for a, b in pairwise(starts[1:])]
 
 
 @kernel
@@ -207,7 +209,7 @@ def _choose(
                     nearest, bi, bj = gap, ii, jj
         if nearest >= 2 * JUMP:
             return 0
-    label = labels[bi, bj]
+    label = int(labels[bi, bj])
     if label == 0 or filled[bi, bj]:
         return label
     plane = planes[owners[label]]

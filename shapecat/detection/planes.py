@@ -216,5 +216,4 @@ def corners_of(support: Support) -> F8:
         1,
     )
     level = gravity_rotation(support.up)
-    corners = flat @ level[:2] + support.offset * level[2]
-    return corners
+    return np.asarray(flat @ level[:2] + support.offset * level[2])

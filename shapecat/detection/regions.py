@@ -82,7 +82,7 @@ def _is_ridge(edge: U1, i: int, j: int) -> bool:
 @kernel
 def _flat_parts(owner: I4, links: U1, barrier: U1, labels: I4, n: int) -> int:
     """Label linked unlabelled cells that are no barrier; small parts get -1."""
-    rows, columns = owner.shape
+    columns = owner.shape[1]
     stack = np.zeros(owner.size, np.int32)
     flat_owner, flat_links = owner.reshape(-1), links.reshape(-1)
     closed, flat = barrier.reshape(-1), labels.reshape(-1)
@@ -99,7 +99,7 @@ def _flat_parts(owner: I4, links: U1, barrier: U1, labels: I4, n: int) -> int:
             p = stack[done]
             done += 1
             for d in range(4):
-                q = _neighbour(p, d, rows, columns, flat_links)
+                q = _neighbour(p, d, columns, flat_links)
                 if q >= 0 and flat[q] == 0 and closed[q] == 0:
                     flat[q] = n
                     stack[top] = q
@@ -112,7 +112,7 @@ def _flat_parts(owner: I4, links: U1, barrier: U1, labels: I4, n: int) -> int:
 
 
 @kernel
-def _neighbour(p: int, d: int, rows: int, columns: int, links: U1) -> int:
+def _neighbour(p: int, d: int, columns: int, links: U1) -> int:
     """Return the linked neighbour of cell ``p`` in direction ``d``, or -1."""
     if d == 0:
         return p + 1 if links[p] & RIGHT else -1
@@ -126,7 +126,7 @@ def _neighbour(p: int, d: int, rows: int, columns: int, links: U1) -> int:
 @kernel
 def _flood(links: U1, edge: U1, labels: I4) -> None:
     """Grow the labels over links, cells with small concave angles first."""
-    rows, columns = labels.shape
+    columns = labels.shape[1]
     flat_links, flat_edge, flat = links.reshape(-1), edge.reshape(-1), labels.reshape(-1)
     buckets = 256 // BUCKET_DEG
     head = np.full(buckets, -1, np.int32)
@@ -136,7 +136,7 @@ def _flood(links: U1, edge: U1, labels: I4) -> None:
         if flat[p] <= 0:
             continue
         for d in range(4):
-            q = _neighbour(p, d, rows, columns, flat_links)
+            q = _neighbour(p, d, columns, flat_links)
             if q >= 0 and flat[q] <= 0:
                 if head[0] < 0:
                     head[0] = p
@@ -153,7 +153,7 @@ def _flood(links: U1, edge: U1, labels: I4) -> None:
         head[now] = following[p]
         following[p] = -1
         for d in range(4):
-            q = _neighbour(p, d, rows, columns, flat_links)
+            q = _neighbour(p, d, columns, flat_links)
             if q < 0 or flat[q] > 0:
                 continue
             flat[q] = flat[p]

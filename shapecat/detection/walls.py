@@ -72,7 +72,7 @@ def _measure(
         total += area
         for d, axis in enumerate((across, up)):
             along = (axis[0] * x + axis[1] * y + axis[2]) * z
-            strip = int(math.floor(along / STRIP_M)) + STRIPS // 2
+            strip = math.floor(along / STRIP_M) + STRIPS // 2
             strips[d, min(max(strip, 0), STRIPS - 1)] += area
     return total
 

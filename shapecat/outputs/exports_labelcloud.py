@@ -68,7 +68,10 @@ def _classes(finished: FinishedRun, kind: str) -> str:
 
 def _described(item: LabelledObject, level: F8, kind: str) -> dict[str, Any]:
     if kind == "vertices":
-        return {"name": item.category, "vertices": _rounded(box_corners(item.box) @ level.T)}
+        corners = box_corners(item.box) @ level.T
+        for face in (corners[:4], corners[4:]):
+            face[:, 2] = face[:, 2].mean()  # else labelCloud takes rounding for a tilt
+        return {"name": item.category, "vertices": _rounded(corners)}
     heading = level @ rotation_from_quaternion(item.box.orientation)[:, 0]
     yaw = float(np.arctan2(heading[1], heading[0]))
     turn = yaw if kind == "centroid_rel" else float(np.degrees(yaw) % 360)

@@ -6,11 +6,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from shapecat.corrections import TrackTable, read_track_table
+from shapecat.corrections import read_track_table
 from shapecat.errors import OutputError
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.report_drawing import Snapshot, draw
-from shapecat.outputs.report_page import Card, Listed, index_page, run_page
+from shapecat.outputs.report_drawing import draw
+from shapecat.outputs.report_page import Card, Listed, index_page, is_unsure, run_page
 from shapecat.outputs.report_tracks import read_courses, read_portraits, read_stage_seconds
 from shapecat.outputs.rereading import read_finished
 from shapecat.run_folder import replacing
@@ -89,7 +89,7 @@ def write_report(folder: Path, *, index: Path | None = None) -> Listed:
     OutputError : not a finished run, a tracks.csv that cannot be understood, or a full disk.
     """
     finished = read_finished(folder)
-    table = _first_table(folder)
+    table = read_track_table(folder / "tracks.csv")
     courses = read_courses(folder)
     rows = [row for row in table.rows if row.track in courses]
     portraits, reason = read_portraits(finished, courses, rows)
@@ -114,16 +114,10 @@ def write_report(folder: Path, *, index: Path | None = None) -> Listed:
         name=finished.name,
         run=finished.run,
         categories=Counter(label.category for label in finished.labels.values()),
-        unsure=sum(
-            row.label == "" and (row.category == "unknown" or row.confidence < 0.8) for row in rows
-        ),
+        unsure=sum(row.label == "" and is_unsure(row) for row in rows),
         checked=sum(row.label != "" for row in rows),
         faces=_faces(cards),
     )
-
-
-def _first_table(folder: Path) -> TrackTable:
-    return read_track_table(folder / "tracks.csv")
 
 
 def _link(start: Path, target: Path) -> str:

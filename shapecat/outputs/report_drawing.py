@@ -40,7 +40,7 @@ class Picture(NamedTuple):
 
 
 def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[Picture, ...]:
-    """Draw an object as the sensor sees it, from a quarter turn beside, and from above.
+    """Draw an object as the sensor sees it, from beside, and from above.
 
     All three have one scale: that of the sphere around the points and neurons.
     """
@@ -59,7 +59,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[Picture, ...]:
     pictures = []
     for title, turn, rise in (
         ("as seen", 0.0, elevation),
-        ("from beside", np.pi / 2, np.radians(14)),
+        ("from beside", np.radians(70), np.radians(16)),
         ("from above", 0.0, np.pi / 2),
     ):
         view = _view(azimuth + turn, rise)

@@ -21,7 +21,7 @@ from shapecat.outputs.report_drawing import SIDE, Picture
 from shapecat.outputs.report_tracks import Course
 from shapecat.outputs.rereading import FinishedRun
 
-__all__ = ["Card", "Listed", "index_page", "run_page"]
+__all__ = ["Card", "Listed", "index_page", "is_unsure", "run_page"]
 
 _LINES = 3  # categories in a time line
 _MOST_STEPS = 80
@@ -80,7 +80,7 @@ def run_page(
         script=_text("report.js"),
         back=f'<a href="{escape(index)}">all runs</a> ·' if index else "",
         subtitle=escape(_subtitle(run)),
-        tiles=_tiles(_run_tiles(run, len(cards), sum(_unsure(c.row) for c in cards), end)),
+        tiles=_tiles(_run_tiles(run, len(cards), sum(is_unsure(c.row) for c in cards), end)),
         warnings=_warnings([*run["warnings"], *notes]),
         chips="".join(_chip(name, counts[name]) for name in _ordered(counts, names)),
         cards="".join(_card(card, run["model"]["categories"], end) for card in cards),
@@ -128,7 +128,8 @@ def _ordered(counts: Mapping[str, int], names: Sequence[str]) -> list[str]:
     return [name for name in names if name in counts] + sorted(set(counts) - set(names))
 
 
-def _unsure(row: TrackRow) -> bool:
+def is_unsure(row: TrackRow) -> bool:
+    """Return whether a track is worth a look before others."""
     return row.category == "unknown" or row.confidence < 0.8
 
 
@@ -196,9 +197,9 @@ def _track_facts(card: Card) -> list[str]:
     seen = course.seconds[course.seen]
     facts = [f"{int(course.seen.sum())} views"]
     if len(seen):
-        facts.append(f"{seen[0]:.1f} to {seen[-1]:.1f} s")
+        facts.append(f"{seen[0]:.1f}–{seen[-1]:.1f} s")
     if card.size:
-        facts.append(" × ".join(f"{100 * side:.0f}" for side in card.size) + " cm")
+        facts.append("×".join(f"{100 * side:.0f}" for side in card.size) + " cm")
     if cells.get("novelty"):
         facts.append(f"novelty {cells['novelty']}")
     return facts

@@ -7,7 +7,6 @@ out, and both are said in the warnings.
 from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
-from heapq import heappop, heappush
 from pathlib import Path
 from typing import ClassVar
 
@@ -24,18 +23,18 @@ from shapecat.recordings.mcap_records import (
     parse,
     read_chunk,
     read_content,
+    read_cut_chunk,
     split_chunk,
     split_message,
     walk,
 )
 from shapecat.recordings.messages import Channel, Message, Topic, ros_type
 from shapecat.recordings.recording import Recording
+from shapecat.recordings.time_order import Timed, in_time_order
 
 __all__ = ["McapRecording", "Summary"]
 
 _FOOTER = 9 + 20
-_PENDING = 512 << 20
-"""Bytes of messages held back to bring overlapping chunks in order."""
 _SMALL = 1 << 16
 """Messages up to this size are copied, so that they do not keep their chunk in memory."""
 
@@ -221,19 +220,16 @@ class McapRecording(Recording):
         self._counts = Counter()
         end, finished = len(MAGIC), False
         low = high = None
-        try:
-            for record in walk(self._file, len(MAGIC), self._size):
-                finished = finished or record.opcode in {Opcode.DATA_END, Opcode.FOOTER}
-                if finished:
-                    break
-                for message in self._expand(record):
-                    self._counts[message.channel_id] += 1
-                    time = message.log_time
-                    low = time if low is None else min(low, time)
-                    high = time if high is None else max(high, time)
-                end = record.offset + record.length
-        except TruncatedError:
-            pass
+        for record in self._records():
+            finished = record.opcode in {Opcode.DATA_END, Opcode.FOOTER}
+            if finished:
+                break
+            for message in self._expand(record):
+                self._counts[message.channel_id] += 1
+                time = message.log_time
+                low = time if low is None else min(low, time)
+                high = time if high is None else max(high, time)
+            end = record.offset + record.length if record.whole else end
         if low is not None and high is not None:
             self._times = [low, high]
         if finished:
@@ -242,12 +238,22 @@ class McapRecording(Recording):
             lost = self._size - end
             self.warn(
                 f"the recording was not finished: recovered {self._counts.total()} messages; "
-                f"the last {lost} bytes are lost"
+                f"of the last {lost} bytes what could be read"
             )
 
     def _in_file(self, wanted: set[int]) -> Iterator[RawMessage]:
-        for record in self.top_level():
+        for record in self._records():
+            if record.opcode in {Opcode.DATA_END, Opcode.FOOTER}:
+                return
             yield from (m for m in self._expand(record) if m.channel_id in wanted)
+
+    def _records(self) -> Iterator[Record]:
+        """Yield the records of the file, and the part of the last chunk that is there."""
+        try:
+            yield from walk(self._file, len(MAGIC), self._size)
+        except TruncatedError as error:
+            if error.record is not None and error.record.opcode == Opcode.CHUNK:
+                yield error.record
 
     def _expand(self, record: Record) -> Iterator[RawMessage]:
         """Yield the messages of a top-level record; note its schemas and channels."""
@@ -260,12 +266,14 @@ class McapRecording(Recording):
                 self.warn(f"left out a record at byte {record.offset}: {error}")
 
     def _chunk(self, record: Record) -> Iterator[RawMessage]:
-        """Yield the messages of a chunk; a damaged one gives what is before the damage."""
+        """Yield the messages of a chunk; one that is cut off gives what is before the cut."""
         try:
-            for opcode, content in split_chunk(read_chunk(self.content(record))):
+            read = read_chunk if record.whole else read_cut_chunk
+            for opcode, content in split_chunk(read(self.content(record))):
                 yield from self._take(opcode, content)
         except ChunkError as error:
-            self.warn(f"left out the chunk at byte {record.offset - 9}: {error}")
+            part = "" if record.whole else "the rest of "
+            self.warn(f"left out {part}the chunk at byte {record.offset - 9}: {error}")
 
     def _take(self, opcode: int, content: memoryview) -> Iterator[RawMessage]:
         if opcode == Opcode.MESSAGE:
@@ -285,23 +293,18 @@ class McapRecording(Recording):
         self, wanted: set[int], start_ns: int | None, stop_ns: int | None
     ) -> Iterator[RawMessage]:
         """Merge the chunks by log time; ties in the order of the file."""
-        chunks = [c for c in self.summary.chunks if _overlaps(c, wanted, start_ns, stop_ns)]
-        chunks.sort(key=lambda c: (c.message_start_time, c.chunk_start_offset), reverse=True)
-        heap: list[tuple[int, int, int, RawMessage]] = []
-        pending = 0
-        while chunks or heap:
-            due = chunks and (not heap or chunks[-1].message_start_time <= heap[0][0])
-            if due and (not heap or pending < _PENDING):
-                chunk = chunks.pop()
-                for position, message in enumerate(self._indexed_chunk(chunk)):
-                    if message.channel_id in wanted:
-                        key = (message.log_time, chunk.chunk_start_offset, position)
-                        heappush(heap, (*key, message))
-                        pending += len(message.data)
-                continue
-            message = heappop(heap)[3]
-            pending -= len(message.data)
-            yield message
+        chunks = [
+            (c.message_start_time, c.chunk_start_offset, c)
+            for c in self.summary.chunks
+            if _overlaps(c, wanted, start_ns, stop_ns)
+        ]
+
+        def read(chunk: records.ChunkIndex) -> Iterator[tuple[Timed, RawMessage]]:
+            for message in self._indexed_chunk(chunk):
+                if message.channel_id in wanted:
+                    yield Timed(message.log_time, len(message.data)), message
+
+        yield from in_time_order(chunks, read)
 
     def _indexed_chunk(self, chunk: records.ChunkIndex) -> Iterator[RawMessage]:
         try:

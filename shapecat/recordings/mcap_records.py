@@ -28,6 +28,7 @@ __all__ = [
     "parse",
     "read_chunk",
     "read_content",
+    "read_cut_chunk",
     "split_chunk",
     "split_message",
     "walk",
@@ -47,7 +48,15 @@ _T = TypeVar("_T")
 
 
 class TruncatedError(RecordingError):
-    """The file ends inside a record, or a record claims to be longer than the file."""
+    """The file ends inside a record, or a record claims to be longer than the file.
+
+    ``record`` is the part of it that is there, if its head is whole.
+    """
+
+    def __init__(self, message: str, record: "Record | None" = None) -> None:
+        """Keep what there is."""
+        super().__init__(message)
+        self.record = record
 
 
 class ChunkError(RecordingError):
@@ -60,6 +69,7 @@ class Record(NamedTuple):
     opcode: int
     offset: int
     length: int
+    whole: bool = True
 
 
 class RawMessage(NamedTuple):
@@ -86,7 +96,8 @@ def walk(file: BinaryIO, offset: int, end: int) -> Iterator[Record]:
         content = offset + _HEAD.size
         if length > end - content:
             msg = f"cut off in the record at byte {offset}"
-            raise TruncatedError(msg)
+            there = Record(opcode, content, end - content, whole=False)
+            raise TruncatedError(msg, there if len(head) == _HEAD.size else None)
         yield Record(opcode, content, length)
         offset = content + length
 
@@ -118,29 +129,46 @@ def read_chunk(content: bytes) -> memoryview:
     ------
     ChunkError : sizes that do not fit, an unknown compression, damaged data, a wrong checksum.
     """
-    try:
-        _, _, size, crc, name_length = _CHUNK.unpack_from(content)
-        name_end = _CHUNK.size + name_length
-        compression = bytes(content[_CHUNK.size : name_end]).decode("ascii")
-        (length,) = struct.unpack_from("<Q", content, name_end)
-        data = memoryview(content)[name_end + 8 : name_end + 8 + length]
-    except (struct.error, UnicodeDecodeError) as error:
-        msg = "damaged chunk header"
-        raise ChunkError(msg) from error
+    compression, size, crc, length, data = _open_chunk(content)
     if len(data) != length:
         msg = f"chunk claims {length} bytes and has {len(data)}"
-        raise ChunkError(msg)
-    if size > max(_FREELY, _RATIO * length):
-        msg = f"chunk of {length} bytes claims to hold {size}"
-        raise ChunkError(msg)
-    if compression not in _DECOMPRESS:
-        msg = f"chunk compression {compression!r} is not supported"
         raise ChunkError(msg)
     plain = _decompress(_DECOMPRESS[compression], data, size)
     if len(plain) != size or (crc and zlib.crc32(plain) != crc):
         msg = "damaged chunk: its checksum does not fit"
         raise ChunkError(msg)
     return plain
+
+
+def read_cut_chunk(content: bytes) -> memoryview:
+    """Return what can be decompressed of a chunk whose end is missing.
+
+    Raises
+    ------
+    ChunkError : not even its header is there, or it is damaged.
+    """
+    compression, size, _, _, data = _open_chunk(content)
+    return _decompress(_DECOMPRESS_PART[compression], data, size)
+
+
+def _open_chunk(content: bytes) -> tuple[str, int, int, int, memoryview]:
+    """Return compression, decompressed size, checksum, claimed length and data of a chunk."""
+    try:
+        _, _, size, crc, name_length = _CHUNK.unpack_from(content)
+        name_end = _CHUNK.size + name_length
+        compression = bytes(content[_CHUNK.size : name_end]).decode("ascii")
+        (length,) = struct.unpack_from("<Q", content, name_end)
+    except (struct.error, UnicodeDecodeError) as error:
+        msg = "damaged chunk header"
+        raise ChunkError(msg) from error
+    data = memoryview(content)[name_end + 8 :][:length]
+    if size > max(_FREELY, _RATIO * len(data)):
+        msg = f"chunk of {len(data)} bytes claims to hold {size}"
+        raise ChunkError(msg)
+    if compression not in _DECOMPRESS:
+        msg = f"chunk compression {compression!r} is not supported"
+        raise ChunkError(msg)
+    return compression, size, crc, length, data
 
 
 def _decompress(
@@ -176,6 +204,14 @@ _DECOMPRESS: dict[str, Callable[[memoryview, int], bytes | memoryview]] = {
     "lz4": _lz4,
     "zstd": _zstd,
 }
+
+
+def _zstd_part(data: memoryview, size: int) -> bytes:
+    return zstandard.ZstdDecompressor().stream_reader(data).read(size) if size else b""
+
+
+_DECOMPRESS_PART = _DECOMPRESS | {"zstd": _zstd_part}
+"""LZ4 gives what it can in any case."""
 
 
 def split_chunk(chunk: memoryview) -> Iterator[tuple[int, memoryview]]:

@@ -1,22 +1,48 @@
-"""ROS 1 bags (format 2.0)."""
+"""ROS 1 bags (format 2.0): indexed ones by time, all others in the order of the file.
 
-import bz2
-from collections.abc import Callable, Collection, Iterator
+Read by our own code because libraries refuse what a robot leaves when its power is cut: bags
+without an index (``.bag.active``), or cut off. Damage never ends the reading.
+"""
+
+import struct
+from collections import Counter
+from collections.abc import Collection, Iterator
 from pathlib import Path
-from typing import Any, ClassVar
-
-import lz4.frame  # type: ignore[import-untyped]  # ships no types
-from rosbags.rosbag1 import Reader, ReaderError
+from typing import ClassVar, NamedTuple
 
 from shapecat.errors import RecordingError
-from shapecat.recordings.decoding import LIBRARY_ERRORS
 from shapecat.recordings.messages import Channel, Message, Topic, ros_type
 from shapecat.recordings.recording import Recording
+from shapecat.recordings.ros1_records import (
+    BAG_HEADER,
+    CHUNK,
+    CHUNK_INFO,
+    CONNECTION,
+    MAGIC,
+    MESSAGE,
+    BagError,
+    Record,
+    expand,
+    fields_of,
+    split,
+    time_of,
+    u4,
+    u8,
+    walk,
+)
+from shapecat.recordings.time_order import Timed, in_time_order
 
 __all__ = ["BagRecording"]
 
-_FREELY = 256 << 20
-_RATIO = 1000
+_SMALL = 1 << 16
+"""Messages up to this size are copied, so that they do not keep their chunk in memory."""
+
+
+class _ChunkInfo(NamedTuple):
+    position: int
+    start: int
+    end: int
+    counts: dict[int, int]
 
 
 class BagRecording(Recording):
@@ -25,35 +51,31 @@ class BagRecording(Recording):
     kind: ClassVar[str] = "ros1"
 
     def __init__(self, path: Path) -> None:
-        """Open the bag and read its index.
+        """Open the bag and read its index, or all of it where there is none.
 
         Raises
         ------
-        RecordingError : it is not a bag, is damaged, or has no index.
+        RecordingError : it is not a bag of version 2.0, or is encrypted.
         OSError : it cannot be read.
         """
         super().__init__(path)
-        self._reader = Reader(path)
+        self._channels: dict[int, Channel] = {}
+        self._chunks: list[_ChunkInfo] | None = None
+        self._file = path.open("rb")
         try:
-            self._reader.open()
-        except (ReaderError, EOFError, *LIBRARY_ERRORS) as error:
-            hint = "; `rosbag reindex` may repair it" if "index" in str(error) else ""
-            msg = f"not a readable ROS 1 bag: {error}{hint}"
-            raise RecordingError(msg) from error
-        self._bound_chunks()
-        self._channels = {c.id: _channel(c) for c in self._reader.connections}
-        counts: dict[tuple[str, str, str], int] = {}
-        for connection in self._reader.connections:
-            channel = self._channels[connection.id]
-            key = (channel.topic, channel.type, channel.encoding)
-            counts[key] = counts.get(key, 0) + connection.msgcount
-        self.topics = tuple(Topic(*key, counts[key]) for key in sorted(counts))
-        if self._reader.message_count:
-            self.start_ns, self.end_ns = self._reader.start_time, self._reader.end_time - 1
+            self._size = self._file.seek(0, 2)
+            self._first = len(MAGIC)
+            counts = self._read_index(self._read_header())
+            if counts is None:
+                counts = self._scan()
+        except BaseException:
+            self._file.close()
+            raise
+        self.topics = _topics(self._channels, counts)
 
     def close(self) -> None:
         """Close the bag."""
-        self._reader.close()
+        self._file.close()
 
     def channels(self) -> tuple[Channel, ...]:
         """Return every connection."""
@@ -66,55 +88,179 @@ class BagRecording(Recording):
         stop_ns: int | None = None,
     ) -> Iterator[Message]:
         """Yield undecoded messages; see `Recording.messages`."""
-        wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
-        if not wanted:
+        wanted = {n for n, c in self._channels.items() if topics is None or c.topic in topics}
+        for number, time, data in self._raw(wanted, start_ns, stop_ns):
+            early = start_ns is not None and time < start_ns
+            if not early and (stop_ns is None or time < stop_ns):
+                plain = bytes(data) if len(data) <= _SMALL else data
+                yield Message(self._channels[number], time, time, 0, plain)
+
+    def _raw(
+        self, wanted: set[int], start_ns: int | None, stop_ns: int | None
+    ) -> Iterator[tuple[int, int, memoryview]]:
+        if self._chunks is None:
+            for record in self._records():
+                yield from (m for m in self._expand(record) if m[0] in wanted)
             return
-        raw = self._reader.messages(wanted, start_ns, stop_ns)
-        while True:
-            try:
-                connection, time, data = next(raw)
-            except StopIteration:
-                return
-            except (ReaderError, OSError, EOFError, RuntimeError, *LIBRARY_ERRORS) as error:
-                self.warn(f"damaged: nothing read after this: {error or type(error).__name__}")
-                return
-            yield Message(self._channels[connection.id], time, time, 0, data)
+        due = [
+            (chunk.start, chunk.position, chunk.position)
+            for chunk in self._chunks
+            if not wanted.isdisjoint(chunk.counts)
+            and (start_ns is None or chunk.end >= start_ns)
+            and (stop_ns is None or chunk.start < stop_ns)
+        ]
 
-    def _bound_chunks(self) -> None:
-        """Let no chunk decompress to more than it can honestly hold."""
-        size = self.path.stat().st_size
-        for position, chunk in self._reader.chunks.items():
-            if chunk.datapos + chunk.datasize > size:
-                self.close()
-                msg = f"not a readable ROS 1 bag: the chunk at byte {position} is cut off"
-                raise RecordingError(msg)
-            method = _DECOMPRESS.get(chunk.decompressor)
-            if method is not None:
-                self._reader.chunks[position] = chunk._replace(decompressor=method)
+        def read(position: int) -> Iterator[tuple[Timed, tuple[int, int, memoryview]]]:
+            for message in self._expand(next(walk(self._file, position, self._size))):
+                if message[0] in wanted:
+                    yield Timed(message[1], len(message[2])), message
+
+        yield from in_time_order(due, read)
+
+    def _read_header(self) -> dict[str, bytes]:
+        """Return the header of the bag; empty if it is damaged."""
+        self._file.seek(0)
+        if self._file.read(len(MAGIC)) != MAGIC:
+            msg = "not a readable ROS 1 bag: not of version 2.0"
+            raise RecordingError(msg)
+        try:
+            record = next(walk(self._file, len(MAGIC), self._size))
+        except (StopIteration, BagError):
+            return {}
+        if record.op == BAG_HEADER:
+            self._first = record.end
+        if record.fields.get("encryptor"):
+            msg = f"encrypted with {record.fields['encryptor'].decode('latin-1')!r}"
+            raise RecordingError(msg)
+        return record.fields
+
+    def _read_index(self, header: dict[str, bytes]) -> Counter[int] | None:
+        """Read connections and chunks from the end; None where that is missing or damaged."""
+        counts: Counter[int] = Counter()
+        chunks = []
+        try:
+            connections, number = u4(header, "conn_count"), u4(header, "chunk_count")
+            position = u8(header, "index_pos")
+            if position == 0:
+                return None
+            for record in walk(self._file, position, self._size):
+                if record.op == CONNECTION:
+                    self._connect(record.fields, self._data(record))
+                elif record.op == CHUNK_INFO:
+                    chunks.append(self._chunk_info(record))
+                    counts.update(chunks[-1].counts)
+            for chunk in chunks:
+                if next(walk(self._file, chunk.position, self._size)).op != CHUNK:
+                    return None
+        except (BagError, StopIteration, struct.error):
+            return None
+        if (len(self._channels), len(chunks)) != (connections, number):
+            return None
+        if not counts.keys() <= self._channels.keys():
+            return None
+        self._chunks = chunks
+        filled = [chunk for chunk in chunks if chunk.counts]
+        if filled:
+            self.start_ns = min(chunk.start for chunk in filled)
+            self.end_ns = max(chunk.end for chunk in filled)
+        return counts
+
+    def _chunk_info(self, record: Record) -> _ChunkInfo:
+        pairs = struct.iter_unpack("<II", self._data(record))
+        start, end = (time_of(record.fields, name) for name in ("start_time", "end_time"))
+        return _ChunkInfo(u8(record.fields, "chunk_pos"), start, end, dict(pairs))
+
+    def _scan(self) -> Counter[int]:
+        """Read all of the bag for its connections, counts and times."""
+        self._channels.clear()
+        counts: Counter[int] = Counter()
+        low = high = None
+        for record in self._records():
+            for number, time, _ in self._expand(record):
+                counts[number] += 1
+                low = time if low is None else min(low, time)
+                high = time if high is None else max(high, time)
+        self.start_ns, self.end_ns = low or 0, high or 0
+        self.warn(f"no index, or a damaged one: recovered {counts.total()} messages")
+        if not self._channels:
+            msg = "not a readable ROS 1 bag: no index and no messages in it"
+            raise RecordingError(msg)
+        return counts
+
+    def _records(self) -> Iterator[Record]:
+        """Yield the chunks in the order of the file, and the part that is there of the last."""
+        try:
+            yield from walk(self._file, self._first, self._size)
+        except BagError as error:
+            self.warn(f"{error}: what follows is lost")
+            if error.record is not None:
+                yield error.record
+
+    def _expand(self, record: Record) -> Iterator[tuple[int, int, memoryview]]:
+        """Yield connection, time and data of the messages of a record; note new connections.
+
+        A damaged chunk gives what is before the damage.
+        """
+        if record.op == CONNECTION and self._chunks is None:
+            self._take(record.fields, memoryview(self._data(record)))
+        if record.op != CHUNK:
+            return
+        plain, problem = expand(record, self._data(record))
+        try:
+            for fields, data in split(plain):
+                found = self._take(fields, data)
+                if found is not None:
+                    yield found
+        except BagError as error:
+            problem = problem or str(error)
+        if problem:
+            self.warn(f"left out the rest of the chunk at byte {record.start}: {problem}")
+
+    def _take(
+        self, fields: dict[str, bytes], data: memoryview
+    ) -> tuple[int, int, memoryview] | None:
+        kind = fields.get("op", b"")
+        if kind == bytes([MESSAGE]):
+            number, time = u4(fields, "conn"), time_of(fields)
+            if number in self._channels:
+                return number, time, data
+            self.warn(f"left out messages of connection {number}, which is not described")
+        elif kind == bytes([CONNECTION]) and self._chunks is None:
+            self._connect(fields, data)
+        return None
+
+    def _connect(self, fields: dict[str, bytes], data: bytes | memoryview) -> None:
+        """Note a connection."""
+        described = {
+            name: value.decode("utf-8", "replace") for name, value in fields_of(data).items()
+        }
+        recorded = described.get("type", "")
+        topic = "/".join(
+            part for part in fields.get("topic", b"").decode("utf-8", "replace").split("/") if part
+        )
+        if fields.get("topic", b"").startswith(b"/"):
+            topic = f"/{topic}"
+        latched = (("latching", "1"),) if described.get("latching") == "1" else ()
+        self._channels.setdefault(
+            u4(fields, "conn"),
+            Channel(
+                topic,
+                ros_type(recorded),
+                "ros1",
+                ros_type(recorded),
+                "ros1msg",
+                described.get("message_definition", "").encode(),
+                latched,
+            ),
+        )
+
+    def _data(self, record: Record) -> bytes:
+        self._file.seek(record.begin)
+        return self._file.read(record.end - record.begin)
 
 
-def _channel(connection: Any) -> Channel:
-    kind = ros_type(connection.msgtype)
-    text = connection.msgdef.data.encode()
-    latched = (("latching", "1"),) if connection.ext.latching else ()
-    return Channel(connection.topic, kind, "ros1", connection.msgtype, "ros1msg", text, latched)
-
-
-def _bounded(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
-    def decompress(data: bytes) -> bytes:
-        limit = max(_FREELY, _RATIO * len(data))
-        worker = make()
-        plain = worker.decompress(data, max_length=limit)
-        if not worker.eof:
-            msg = f"chunk of {len(data)} bytes is cut off or holds more than {limit}"
-            raise ReaderError(msg)
-        return bytes(plain)
-
-    return decompress
-
-
-_DECOMPRESS: dict[Callable[[bytes], bytes], Callable[[bytes], bytes]] = {
-    bz2.decompress: _bounded(bz2.BZ2Decompressor),
-    lz4.frame.decompress: _bounded(lz4.frame.LZ4FrameDecompressor),
-}
-"""The library's unbounded method, and ours."""
+def _topics(channels: dict[int, Channel], counts: Counter[int]) -> tuple[Topic, ...]:
+    totals: Counter[tuple[str, str, str]] = Counter()
+    for number, channel in channels.items():
+        totals[channel.topic, channel.type, channel.encoding] += counts[number]
+    return tuple(Topic(*key, totals[key]) for key in sorted(totals))

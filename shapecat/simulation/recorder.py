@@ -5,6 +5,7 @@ import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, Literal, Self
 
@@ -142,7 +143,9 @@ def _write_frame(writer: Container, world: World, frame: Frame, *, clouds: bool)
     info = make.camera_info(camera, stamp, _OPTICAL)
     writer.write("/camera/depth/camera_info", info, logged)
     if clouds:
-        points = frame.xyz().reshape(camera.height, camera.width, 3)
+        # As drivers do, from the depth image in whole millimetres.
+        image = np.round(depth * 1000) * np.float32(0.001)
+        points = replace(frame, depth=image).xyz().reshape(camera.height, camera.width, 3)
         writer.write("/camera/depth/points", make.cloud(points, stamp, _OPTICAL), logged)
     else:
         writer.write("/camera/depth/image_raw", make.image(depth, stamp, _OPTICAL), logged)

@@ -1,0 +1,36 @@
+"""``shapecat learn``."""
+
+from pathlib import Path
+
+import click
+
+from .options import ANY_PATH, json_option, seed_option
+from .render import print_json, progress_bars
+
+
+@click.command()
+@click.argument("model", type=ANY_PATH)
+@click.argument("dataset", type=ANY_PATH)
+@click.option("--out", type=ANY_PATH, required=True, help="Model file to write.")
+@seed_option
+@json_option
+def learn(*, model: Path, dataset: Path, out: Path, seed: int, as_json: bool) -> None:
+    r"""Teach a model the categories of a data set that it does not know.
+
+    MODEL is a model file, or `default` for the one shipped with the package. What it knows stays
+    as it is. DATASET is laid out as for `shapecat train`, for example by `shapecat export --format
+    crops`.
+
+    \b
+    shapecat learn default crops --out mine.npz
+    shapecat process lab.mcap --out again --model mine.npz
+    """
+    from shapecat.evaluation.training import learn_on_folder
+
+    source = None if str(model) == "default" else model
+    with progress_bars() as bars:
+        result = learn_on_folder(source, dataset, out, seed=seed, observe=bars)
+    if as_json:
+        print_json(result)
+    else:
+        click.echo(f"{out}: learned {', '.join(result['added'])} from {result['views']} views")

@@ -1,0 +1,22 @@
+"""``shapecat scene``."""
+
+from pathlib import Path
+
+import click
+
+from .options import ANY_PATH
+
+
+@click.command()
+@click.argument("run", type=ANY_PATH)
+@click.option("--frame", type=click.IntRange(0), required=True, help="Number of the frame.")
+@click.option("--topic", help="Its cloud stream; needed if there are several.")
+def scene(*, run: Path, frame: int, topic: str | None) -> None:
+    r"""Print what stands on what in one frame of a run.
+
+    \b
+    shapecat scene results/lab --frame 12
+    """
+    from shapecat.outputs.scene_tree import describe_scene
+
+    click.echo(describe_scene(run, frame, topic=topic))

@@ -1,0 +1,115 @@
+"""Containers: the inside and the outside of bowls, cups and pots."""
+
+import numpy as np
+
+from shapecat.detection.pieces import (
+    CONTACT,
+    COUNT,
+    FEW,
+    FRONT,
+    LEFT,
+    NEAR,
+    RIGHTMOST,
+    TOP,
+    Pieces,
+    has_lid,
+    is_group,
+    merge,
+    slope_of,
+)
+from shapecat.jit import kernel
+
+__all__ = ["join_hollow", "join_rims"]
+
+SAME_TOP_M = 0.015
+SAME_SIDE_M, SAME_SIDE, CUT_SIDE = 0.012, 0.25, 0.6
+"""How far an inside may reach beyond the outside: metres, share of the width, and the share if
+something hides a part of the outside."""
+HOLLOW = -0.25
+"""`slope_of` from which a piece is concave; planes are within a tenth of 0."""
+BENT, INSIDE, INSIDE_SHARE = -0.15, -0.4, 0.12
+"""Walls inside one container: slope of each, of both together, share of a boundary in contact."""
+FLOOR_SHARE = 0.6
+
+
+@kernel
+def join_hollow(pieces: Pieces) -> None:
+    """Join the walls and the floor inside a container, which meet in concave edges."""
+    n = pieces.group.size
+    again = True
+    while again:
+        again = False
+        for p in range(1, n):
+            for q in range(1, n):
+                if (
+                    p != q
+                    and is_group(pieces, p)
+                    and is_group(pieces, q)
+                    and pieces.owner[p] == pieces.owner[q]
+                    and (_is_inside(pieces, p, q) or _is_floor(pieces, p, q))
+                ):
+                    merge(pieces, p, q)
+                    again = True
+
+
+@kernel
+def _is_inside(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether two pieces that touch are walls facing each other."""
+    if pieces.shape[p, COUNT] < pieces.shape[q, COUNT]:
+        return False
+    contact = pieces.pairs[CONTACT, p, q]
+    if contact < max(FEW, INSIDE_SHARE * min(pieces.boundary[p], pieces.boundary[q])):
+        return False
+    a, b = pieces.shape[p], pieces.shape[q]
+    if slope_of(a) > BENT or slope_of(b) > BENT:
+        return False
+    both = a + b
+    both[LEFT], both[RIGHTMOST] = min(a[LEFT], b[LEFT]), max(a[RIGHTMOST], b[RIGHTMOST])
+    return slope_of(both) < INSIDE
+
+
+@kernel
+def _is_floor(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether ``q`` lies within the hollow piece ``p`` and lower."""
+    if pieces.shape[q, TOP] > pieces.shape[p, TOP] or slope_of(pieces.shape[p]) > HOLLOW:
+        return False
+    shared = pieces.pairs[CONTACT, p, q] + pieces.pairs[FRONT, p, q]
+    enclosed = shared > FLOOR_SHARE * pieces.boundary[q]
+    return bool(enclosed and pieces.pairs[CONTACT, p, q] >= FEW)
+
+
+@kernel
+def join_rims(pieces: Pieces) -> None:
+    """Join the far inside wall of a container to its outside."""
+    n = pieces.group.size
+    again = True
+    while again:
+        again = False
+        for inside in range(1, n):
+            for outside in range(1, n):
+                if inside != outside and _is_container(pieces, inside, outside):
+                    merge(pieces, outside, inside)
+                    again = True
+
+
+@kernel
+def _is_container(pieces: Pieces, inside: int, outside: int) -> bool:
+    if not (is_group(pieces, inside) and is_group(pieces, outside)):
+        return False
+    pairs = pieces.pairs
+    touch = pairs[CONTACT, inside, outside] + pairs[NEAR, inside, outside]
+    if max(touch, pairs[FRONT, outside, inside]) < FEW:
+        return False
+    a, x = pieces.shape[outside], pieces.shape[inside]
+    if pieces.owner[outside] != pieces.owner[inside] or abs(a[TOP] - x[TOP]) > SAME_TOP_M:
+        return False
+    inner = x[RIGHTMOST] - x[LEFT]
+    width = max(a[RIGHTMOST] - a[LEFT], inner)
+    # An outside that something hides a part of may be wider than it looks.
+    cut = np.sum(pairs[FRONT, :, outside]) - pairs[FRONT, inside, outside] >= 2 * FEW
+    slack = max(SAME_SIDE_M, (CUT_SIDE if cut else SAME_SIDE) * width)
+    if x[LEFT] < a[LEFT] - slack or x[RIGHTMOST] > a[RIGHTMOST] + slack:
+        return False
+    if slope_of(x) > HOLLOW:
+        return False
+    return not (has_lid(pieces, outside) or has_lid(pieces, inside))

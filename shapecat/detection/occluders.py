@@ -1,0 +1,121 @@
+"""Occluders: parts of one object on two sides of something in front of it."""
+
+import math
+
+import numpy as np
+
+from shapecat.arrays import F4, I4
+from shapecat.detection.cells import JUMP, Lens
+from shapecat.detection.pieces import FEW, FRONT, SAMPLES, Pieces, is_group, merge
+from shapecat.jit import kernel
+
+__all__ = ["join_behind"]
+
+COPLANAR_M, COPLANAR = 0.006, 0.05
+"""How far a sample may lie off the tangent plane of another: metres, and per metre between them."""
+COPLANAR_COS = math.cos(math.radians(15))
+PARTNERS = 0.45
+"""Share of the samples of either piece that continue the other."""
+FREE, BEHIND = 0.12, 0.05
+"""Between them, largest share in free space or on others, least share behind something."""
+
+
+@kernel
+def join_behind(pieces: Pieces, w: F4, lens: Lens, normal: F4, labels: I4) -> None:
+    """Join pieces behind the same occluder that continue each other, the best pair first."""
+    n = pieces.group.size
+    scores = np.zeros((n, n), np.float32)
+    for p in range(1, n):
+        for q in range(p + 1, n):
+            scores[p, q] = _continuation(pieces, p, q, w, lens, normal, labels)
+    while True:
+        best = np.argmax(scores)
+        p, q = int(best // n), int(best % n)
+        if scores[p, q] <= 0:
+            return
+        merge(pieces, p, q)
+        scores[q, :] = 0
+        scores[:, q] = 0
+        for k in range(1, n):
+            if k != p:
+                a, b = min(k, p), max(k, p)
+                scores[a, b] = _continuation(pieces, a, b, w, lens, normal, labels)
+
+
+@kernel
+def _continuation(
+    pieces: Pieces, p: int, q: int, w: F4, lens: Lens, normal: F4, labels: I4
+) -> float:
+    """Return how well piece q continues piece p behind an occluder, 0..1; 0 if it does not."""
+    if not (is_group(pieces, p) and is_group(pieces, q)) or pieces.owner[p] != pieces.owner[q]:
+        return 0.0
+    # (a) one thing is in front of both
+    front = pieces.pairs[FRONT]
+    between = False
+    for k in range(1, pieces.group.size):
+        between |= (k != p) & (k != q) & (front[k, p] >= FEW) & (front[k, q] >= FEW)
+    if not between:
+        return 0.0
+    # (b) many samples of each lie in tangent planes of the other
+    columns = w.shape[1]
+    a, b = np.zeros((SAMPLES, 6)), np.zeros((SAMPLES, 6))
+    na = _positions(pieces.samples[p], w, lens, normal, columns, a)
+    nb = _positions(pieces.samples[q], w, lens, normal, columns, b)
+    if na < 4 or nb < 4:
+        return 0.0
+    in_a, in_b = np.zeros(SAMPLES, np.uint8), np.zeros(SAMPLES, np.uint8)
+    partners = np.zeros((SAMPLES * SAMPLES, 2), np.uint8)
+    n = 0
+    for s in range(na):
+        for t in range(nb):
+            if a[s, 3] * b[t, 3] + a[s, 4] * b[t, 4] + a[s, 5] * b[t, 5] < COPLANAR_COS:
+                continue
+            dx, dy, dz = b[t, 0] - a[s, 0], b[t, 1] - a[s, 1], b[t, 2] - a[s, 2]
+            limit = COPLANAR_M + COPLANAR * math.sqrt(dx * dx + dy * dy + dz * dz)
+            if abs(dx * a[s, 3] + dy * a[s, 4] + dz * a[s, 5]) > limit:
+                continue
+            if abs(dx * b[t, 3] + dy * b[t, 4] + dz * b[t, 5]) > limit:
+                continue
+            in_a[s] = 1
+            in_b[t] = 1
+            partners[n, 0], partners[n, 1] = s, t
+            n += 1
+    share = min(np.sum(in_a) / na, np.sum(in_b) / nb)
+    if share < PARTNERS:
+        return 0.0
+    # (c) between them nothing else is seen, and something hides them
+    free = hidden = looked = 0
+    for k in range(0, n, max(1, n // 300)):
+        first, second = a[partners[k, 0]], b[partners[k, 1]]
+        for step in range(1, 8):
+            u = step / 8
+            z = first[2] + u * (second[2] - first[2])
+            x, y = first[0] + u * (second[0] - first[0]), first[1] + u * (second[1] - first[1])
+            j, i = int(lens.cx + lens.fx * x / z + 0.5), int(lens.cy + lens.fy * y / z + 0.5)
+            if i < 0 or j < 0 or i >= w.shape[0] or j >= columns or w[i, j] <= 0:
+                continue
+            looked += 1
+            label = labels[i, j]
+            if label > 0 and (pieces.group[label] == p or pieces.group[label] == q):
+                continue
+            if w[i, j] - 1 / z > JUMP:
+                hidden += 1
+            else:
+                free += 1
+    return share if free <= FREE * looked and hidden >= BEHIND * looked else 0.0
+
+
+@kernel
+def _positions(samples: I4, w: F4, lens: Lens, normal: F4, columns: int, out: F4) -> int:
+    n = 0
+    for s in samples:
+        if s < 0:
+            break
+        i, j = s // columns, s % columns
+        z = 1 / w[i, j]
+        out[n, 0] = (j - lens.cx) / lens.fx * z
+        out[n, 1] = (i - lens.cy) / lens.fy * z
+        out[n, 2] = z
+        out[n, 3], out[n, 4], out[n, 5] = normal[i, j, 0], normal[i, j, 1], normal[i, j, 2]
+        n += 1
+    return n

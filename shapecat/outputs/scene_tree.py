@@ -1,0 +1,127 @@
+"""The hierarchy of one frame of a run, from its tables, as text."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shapecat.detection.hierarchy import Node, format_tree
+from shapecat.errors import OutputError
+from shapecat.labels import read_labelled_frames
+from shapecat.outputs.rereading import FinishedRun, read_finished
+from shapecat.tables import read_row_groups
+from shapecat.types import Box, Candidate, Plane, Scene
+
+__all__ = ["describe_scene", "read_scene"]
+
+
+def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str:
+    """Return what stands on what in a frame, one plane or object a line, indented.
+
+    Raises
+    ------
+    OutputError : the run has no such frame, or has it on several topics.
+    """
+    finished = read_finished(folder)
+    topic = _topic(folder, frame, topic)
+    names = _names(finished, topic, frame)
+    return format_tree(
+        read_scene(folder, topic, frame), lambda scene, node: _described(scene, node, names)
+    )
+
+
+def read_scene(folder: Path, topic: str, frame: int) -> Scene:
+    """Return the planes and objects of a frame as detection found them."""
+    up = _rows(folder, "frames", topic, frame, ["topic", "frame", "up"])[0]["up"]
+    planes = [
+        Plane(
+            normal=row["normal"],
+            offset=row["offset"],
+            outline=np.reshape(row["outline"], (-1, 3)),
+            area_m2=row["area_m2"],
+            height_m=row["height_m"],
+        )
+        for row in _rows(folder, "planes", topic, frame)
+    ]
+    rows = _rows(folder, "detections", topic, frame)
+    objects = [_candidate(row, planes) for row in rows]
+    return Scene(up, tuple(planes), tuple(objects))
+
+
+def _candidate(row: dict[str, Any], planes: Sequence[Plane]) -> Candidate:
+    support = 0.0
+    if row["plane"] is not None:
+        plane = planes[row["plane"]]
+        support = float(plane.normal @ row["center"]) - plane.offset - row["height_m"]
+    return Candidate(
+        indices=row["indices"],
+        box=Box(row["center"], row["size"], row["orientation"]),
+        plane=row["plane"],
+        on_candidate=row["on_detection"],
+        support_m=support if abs(support) > 1e-5 else 0.0,  # rounded to float32 in the table
+        touches_border=row["touches_border"],
+        occluded=row["occluded"],
+    )
+
+
+def _rows(
+    folder: Path, table: str, topic: str, frame: int, columns: Sequence[str] | None = None
+) -> list[dict[str, Any]]:
+    found = []
+    for group in read_row_groups(folder / f"{table}.parquet", columns):
+        numbers, topics = group["frame"].to_pylist(), group["topic"].to_pylist()
+        keys = enumerate(zip(topics, numbers, strict=True))
+        found += group.take([k for k, key in keys if key == (topic, frame)]).to_pylist()
+    return found
+
+
+def _topic(folder: Path, frame: int, topic: str | None) -> str:
+    """Return the topic that has the frame.
+
+    Raises
+    ------
+    OutputError : none has it, or several.
+    """
+    frames: dict[str, list[int]] = {}
+    for group in read_row_groups(folder / "frames.parquet", ["topic", "frame"]):
+        for row in group.to_pylist():
+            frames.setdefault(row["topic"], []).append(row["frame"])
+    if topic is not None:
+        frames = {name: numbers for name, numbers in frames.items() if name == topic}
+    having = [name for name, numbers in frames.items() if frame in numbers]
+    if len(having) == 1:
+        return having[0]
+    if having:
+        msg = f"{folder}: frame {frame} is on {', '.join(having)}; choose one with --topic"
+        raise OutputError(msg)
+    there = "; ".join(f"{name}: {n[0]} to {n[-1]}" for name, n in frames.items()) or "none"
+    msg = f"{folder}: no frame {frame}{f' on {topic}' if topic else ''}; there are {there}"
+    raise OutputError(msg)
+
+
+def _names(finished: FinishedRun, topic: str, frame: int) -> dict[int, str]:
+    """Return what each detection of a frame is shown as, by the first of its points."""
+    frames = read_labelled_frames(finished.folder, finished.labels)
+    shown = next(item for item in frames if (item.topic, item.index) == (topic, frame))
+    return {
+        int(index): f"{item.category} #{item.track}"
+        for item in shown.objects
+        for index in item.indices
+    }
+
+
+def _described(scene: Scene, node: Node, names: dict[int, str]) -> str:
+    if node.kind == "plane":
+        plane = scene.planes[node.index]
+        return f"plane {node.index}: {plane.height_m:.2f} m high, {plane.area_m2:.2f} m2"
+    item = scene.candidates[node.index]
+    name = names.get(int(item.indices[0]), "object in no track") if item.indices.size else "object"
+    flags = [
+        text
+        for text, flag in (("cut by the border", item.touches_border), ("occluded", item.occluded))
+        if flag
+    ]
+    x, y, z = (100 * float(side) for side in item.box.size)
+    note = f", {', '.join(flags)}" if flags else ""
+    return f"{name}: {x:.0f} x {y:.0f} x {z:.0f} cm{note}"

@@ -1,0 +1,198 @@
+"""Records of a ROS 1 bag, read so that no length field is believed before it is checked.
+
+The layout is that of the bag format 2.0: every record is a header of named fields and data, each
+after its 32-bit length. https://wiki.ros.org/Bags/Format/2.0
+"""
+
+import bz2
+import struct
+from collections.abc import Callable, Iterator
+from typing import Any, BinaryIO, NamedTuple
+
+import lz4.frame  # type: ignore[import-untyped]  # ships no types
+
+from shapecat.errors import RecordingError
+
+__all__ = [
+    "BAG_HEADER",
+    "CHUNK",
+    "CHUNK_INFO",
+    "CONNECTION",
+    "MAGIC",
+    "MESSAGE",
+    "BagError",
+    "Record",
+    "expand",
+    "fields_of",
+    "split",
+    "time_of",
+    "u4",
+    "u8",
+    "walk",
+]
+
+MAGIC = b"#ROSBAG V2.0\n"
+MESSAGE, BAG_HEADER, CHUNK, CHUNK_INFO, CONNECTION = 2, 3, 5, 6, 7
+
+_LENGTH = struct.Struct("<I")
+_LONG = struct.Struct("<Q")
+_TIME = struct.Struct("<II")
+_LONGEST_HEADER = 1 << 20
+_STEP = 1 << 16
+_FREELY = 256 << 20
+"""Chunks up to this size are decompressed whatever they claim, bytes."""
+_RATIO = 1000
+"""Larger chunks must hold at least a byte for so many."""
+
+
+class BagError(RecordingError):
+    """A record that is damaged, or reaches beyond the end.
+
+    ``record`` is its part that is there, if its header is whole.
+    """
+
+    def __init__(self, message: str, record: "Record | None" = None) -> None:
+        """Keep what there is."""
+        super().__init__(message)
+        self.record = record
+
+
+class Record(NamedTuple):
+    """The header of a record, and where it begins, and its data begin and end."""
+
+    fields: dict[str, bytes]
+    start: int
+    begin: int
+    end: int
+
+    @property
+    def op(self) -> int:
+        """What kind of record it is; 0 if it does not say."""
+        return self.fields.get("op", b"\0")[0] if self.fields.get("op") else 0
+
+
+def fields_of(header: bytes | memoryview) -> dict[str, bytes]:
+    """Read the named fields of a header.
+
+    Raises
+    ------
+    BagError : they do not fit.
+    """
+    fields, at, data = {}, 0, bytes(header)
+    while at < len(data):
+        size = _LENGTH.unpack_from(data, at)[0] if at + 4 <= len(data) else len(data)
+        name, equals, value = data[at + 4 : at + 4 + size].partition(b"=")
+        at += 4 + size
+        if not equals or at > len(data):
+            msg = "damaged record header"
+            raise BagError(msg)
+        fields[name.decode("latin-1")] = value
+    return fields
+
+
+def u4(fields: dict[str, bytes], name: str) -> int:
+    """Return an unsigned field of four bytes.
+
+    Raises
+    ------
+    BagError : it is not there.
+    """
+    return int(_unpack(_LENGTH, fields, name)[0])
+
+
+def u8(fields: dict[str, bytes], name: str) -> int:
+    """Return an unsigned field of eight bytes."""
+    return int(_unpack(_LONG, fields, name)[0])
+
+
+def time_of(fields: dict[str, bytes], name: str = "time") -> int:
+    """Return a time in nanoseconds."""
+    seconds, rest = _unpack(_TIME, fields, name)
+    return int(seconds) * 10**9 + int(rest)
+
+
+def _unpack(layout: struct.Struct, fields: dict[str, bytes], name: str) -> tuple[Any, ...]:
+    value = fields.get(name, b"")
+    if len(value) != layout.size:
+        msg = f"record without a field {name}"
+        raise BagError(msg)
+    return layout.unpack(value)
+
+
+def walk(file: BinaryIO, start: int, end: int) -> Iterator[Record]:
+    """Yield the records of a file between two offsets, without their data.
+
+    Raises
+    ------
+    BagError : a record is damaged or reaches beyond ``end``.
+    """
+    while start < end:
+        file.seek(start)
+        size = _length(file.read(4))
+        header = file.read(size) if size is not None and size <= _LONGEST_HEADER else b""
+        length = _length(file.read(4))
+        if size is None or len(header) != size or length is None:
+            msg = f"cut off or damaged at byte {start}"
+            raise BagError(msg)
+        begin = start + 8 + size
+        record = Record(fields_of(header), start, begin, begin + length)
+        if record.end > end:
+            msg = f"cut off in the record at byte {start}"
+            raise BagError(msg, record._replace(end=end))
+        yield record
+        start = record.end
+
+
+def _length(data: bytes) -> int | None:
+    return int(_LENGTH.unpack(data)[0]) if len(data) == 4 else None
+
+
+def split(chunk: memoryview) -> Iterator[tuple[dict[str, bytes], memoryview]]:
+    """Yield header and data of each record in a chunk.
+
+    Raises
+    ------
+    BagError : a record is damaged or reaches beyond the chunk.
+    """
+    at, end = 0, len(chunk)
+    while at < end:
+        size = _length(bytes(chunk[at : at + 4]))
+        length = None if size is None else _length(bytes(chunk[at + 4 + size : at + 8 + size]))
+        if size is None or length is None or at + 8 + size + length > end:
+            msg = "cut off or damaged record in a chunk"
+            raise BagError(msg)
+        begin = at + 8 + size
+        yield fields_of(chunk[at + 4 : at + 4 + size]), chunk[begin : begin + length]
+        at = begin + length
+
+
+def expand(record: Record, data: bytes) -> tuple[memoryview, str]:
+    """Decompress a chunk as far as that goes.
+
+    Returns
+    -------
+    What it holds, and what is wrong with the rest; empty if nothing is.
+    """
+    method = record.fields.get("compression", b"").decode("latin-1")
+    if method == "none":
+        return memoryview(data), ""
+    if method not in _DECOMPRESSORS:
+        return memoryview(b""), f"compression {method!r} is not supported"
+    worker, plain = _DECOMPRESSORS[method](), bytearray()
+    limit = max(_FREELY, _RATIO * len(data))
+    try:
+        for at in range(0, len(data), _STEP):
+            if worker.eof:
+                break
+            plain += worker.decompress(data[at : at + _STEP], max_length=limit - len(plain))
+            if len(plain) >= limit:
+                return memoryview(b""), f"{len(data)} bytes hold more than {limit}"
+    except (OSError, RuntimeError, ValueError, EOFError) as error:
+        return memoryview(bytes(plain)), f"damaged: {error}"
+    return memoryview(bytes(plain)), "" if worker.eof else "cut off"
+
+
+_DECOMPRESSORS: dict[str, Callable[[], Any]] = {
+    "bz2": bz2.BZ2Decompressor,
+    "lz4": lz4.frame.LZ4FrameDecompressor,
+}

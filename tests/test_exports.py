@@ -1,0 +1,378 @@
+"""Exports, read back by parsers that are written from the descriptions of their formats."""
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from click.testing import Result
+from numpy.testing import assert_allclose
+
+from shapecat.corrections import TrackLabel, adopt_labels, read_track_table
+from shapecat.errors import OutputError, RecordingError
+from shapecat.evaluation.dataset import read_dataset
+from shapecat.geometry import rotation_from_quaternion
+from shapecat.outputs.exports import export_run
+from shapecat.outputs.exports_kitti import rectified_from_sensor
+from shapecat.outputs.exports_points import write_point_labels
+from shapecat.outputs.rereading import FinishedRun, read_finished
+from shapecat.types import Box, Frame, LabelledFrame, LabelledObject, NeuralGas
+
+Run = Callable[..., Result]
+
+
+@pytest.fixture(scope="module")
+def run(guessed_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Correct a run: one track deleted, one a new category with a blank, one unknown."""
+    folder = tmp_path_factory.mktemp("corrected") / "table"
+    shutil.copytree(guessed_run, folder)
+    relabel(folder, {1: "delete", 2: "wine glass", 3: "unknown"})
+    return folder
+
+
+def relabel(folder: Path, labels: dict[int, str]) -> None:
+    corrected = folder.parent / "corrected.csv"
+    with corrected.open("w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(("track", "category", "confidence", "label"))
+        writer.writerows((track, "cup", 0, label) for track, label in labels.items())
+    adopt_labels(corrected, folder)
+
+
+def rows(folder: Path, table: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = pq.read_table(folder / f"{table}.parquet").to_pylist()
+    return found
+
+
+def boxes(folder: Path) -> dict[int, list[tuple[int, np.ndarray]]]:
+    """Return for each frame the track and the corners (8, 3) of its boxes, from the tables."""
+    owner = {
+        (row["frame"], row["detection"]): row["track"]
+        for row in rows(folder, "tracks")
+        if row["detection"] is not None
+    }
+    shown = read_finished(folder).labels
+    found: dict[int, list[tuple[int, np.ndarray]]] = {}
+    for row in rows(folder, "detections"):
+        track = owner.get((row["frame"], row["detection"]))
+        if track in shown:
+            half = np.array(row["size"]) / 2
+            unit = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+            corners = (unit * half) @ rotation_from_quaternion(row["orientation"]).T
+            found.setdefault(row["frame"], []).append((track, corners + row["center"]))
+    return found
+
+
+def farthest(a: np.ndarray, b: np.ndarray) -> float:
+    """Return how far corners (8, 3) are from the nearest of other corners."""
+    apart = np.linalg.norm(a[:, None] - b[None], axis=-1)
+    return float(max(apart.min(axis=0).max(), apart.min(axis=1).max()))
+
+
+def test_crops_are_a_data_set_with_corrected_labels(run: Path, tmp_path: Path) -> None:
+    count = export_run(run, "crops", tmp_path)
+
+    views = list(read_dataset(tmp_path))
+    by_track = {}
+    for view in views:
+        by_track.setdefault(int(view.instance.rsplit("-", 1)[1]), []).append(view)
+    labels = read_finished(run).labels
+    assert len(views) == count > 80
+    assert set(by_track) == set(labels)
+    assert 1 not in by_track
+    assert {view.category for view in by_track[2]} == {"wine glass"}
+    assert {view.category for view in by_track[3]} == {"unknown"}
+    for track, found in by_track.items():
+        assert {view.category for view in found} == {labels[track].category}
+
+
+def test_crops_stand_upright_on_zero_and_know_the_sensor(run: Path, tmp_path: Path) -> None:
+    """A view in another frame than the chain's own gives another descriptor."""
+    export_run(run, "crops", tmp_path)
+    truth = json.loads(
+        (Path(read_finished(run).run["input"]["path"]).with_suffix(".truth.json")).read_text()
+    )
+    camera_height = {}
+    for frame in truth:
+        table = next(plane for plane in frame["planes"] if plane["name"] != "floor")
+        camera_height[frame["frame"]] = -table["offset"]
+    for path in tmp_path.glob("*/*/*.pcd"):
+        header = path.read_bytes()[:400].decode("ascii", "replace").splitlines()
+        viewpoint = next(line.split()[1:] for line in header if line.startswith("VIEWPOINT"))
+        eye = np.array(list(map(float, viewpoint[:3])))
+        up = rotation_from_quaternion(np.array(list(map(float, viewpoint[3:])))[[1, 2, 3, 0]])
+        assert eye[2] == pytest.approx(camera_height[int(path.stem)], abs=0.02)
+        assert (up @ [0, -1, 0])[2] > 0  # the upper side of the image is up
+    for view in read_dataset(tmp_path):
+        assert -0.02 < np.percentile(view.points[:, 2], 1) < 0.05
+        assert_allclose(view.points[:, :2].mean(axis=0), 0, atol=1e-4)
+
+
+def test_exporting_again_leaves_no_view_under_an_earlier_label(run: Path, tmp_path: Path) -> None:
+    """A stale view teaches the model the mistake that was corrected."""
+    folder = tmp_path / "table"
+    shutil.copytree(run, folder)
+    own = tmp_path / "crops" / "cup" / "mine"
+    own.mkdir(parents=True)
+    (own / "view.pcd").write_text("of another data set")
+    export_run(folder, "crops", tmp_path / "crops", every=4)
+    relabel(folder, {2: "vase", 3: "delete"})
+    export_run(folder, "crops", tmp_path / "crops", every=4)
+
+    places = {path.name: path.parent.name for path in (tmp_path / "crops").glob("*/*.track-*")}
+    assert sum(name.endswith("track-2") for name in places) == 1
+    assert not any(name.endswith("track-3") for name in places)
+    assert next(c for name, c in places.items() if name.endswith("track-2")) == "vase"
+    assert not (tmp_path / "crops" / "wine glass").exists()
+    assert (own / "view.pcd").exists()
+
+
+def read_kitti(path: Path) -> list[tuple[str, np.ndarray, np.ndarray]]:
+    """Return type, 2D box and corners (8, 3) in the rectified camera of each line of label_2."""
+    found = []
+    for line in path.read_text().splitlines():
+        kind, *words = line.split(" ")
+        assert len(words) == 14
+        values = list(map(float, words))
+        h, w, l, x, y, z, ry = values[7:]
+        xs = np.array([l, l, -l, -l, l, l, -l, -l]) / 2
+        ys = np.array([0, 0, 0, 0, -h, -h, -h, -h])
+        zs = np.array([w, -w, -w, w, w, -w, -w, w]) / 2
+        c, s = np.cos(ry), np.sin(ry)
+        turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        found.append((kind, np.array(values[3:7]), (turn @ [xs, ys, zs]).T + [x, y, z]))
+        assert -np.pi <= values[2] <= np.pi
+    return found
+
+
+def read_calibration(path: Path) -> dict[str, np.ndarray]:
+    lines = (line.split(":") for line in path.read_text().splitlines() if line)
+    matrices = {name: np.array(list(map(float, text.split()))) for name, text in lines}
+    return {name: values.reshape(3, -1) for name, values in matrices.items()}
+
+
+def test_kitti_boxes_are_ours_within_a_millimetre(run: Path, tmp_path: Path) -> None:
+    export_run(run, "kitti", tmp_path)
+    out = tmp_path / "table"
+    camera = intrinsics(run)
+    worst = 0.0
+    with (out / "frames.csv").open() as file:
+        index = list(csv.DictReader(file))
+    ours = boxes(run)
+    for entry in index:
+        calibration = read_calibration(out / "calib" / f"{entry['number']}.txt")
+        sensor_from_rectified = np.linalg.inv(camera) @ calibration["P2"][:, :3]
+        assert_allclose(sensor_from_rectified @ sensor_from_rectified.T, np.eye(3), atol=1e-6)
+        labels = read_kitti(out / "label_2" / f"{entry['number']}.txt")
+        expected = ours[int(entry["frame"])]
+        assert len(labels) == len(expected)
+        for (_, _, corners), (_, meant) in zip(labels, expected, strict=True):
+            worst = max(worst, farthest(corners @ sensor_from_rectified.T, meant))
+    assert len(index) == 12
+    assert worst < 0.001
+    kinds = {label[0] for path in (out / "label_2").iterdir() for label in read_kitti(path)}
+    assert {"wine_glass", "unknown"} <= kinds
+
+
+def test_kitti_points_fall_on_their_pixels(run: Path, tmp_path: Path) -> None:
+    """Boxes, points and image are tied by calib alone."""
+    export_run(run, "kitti", tmp_path, every=6)
+    out = tmp_path / "table"
+    for number in ("000000", "000001"):
+        calibration = read_calibration(out / "calib" / f"{number}.txt")
+        points = np.fromfile(out / "velodyne" / f"{number}.bin", "<f4").reshape(-1, 4)[:, :3]
+        rectified = points @ calibration["Tr_velo_to_cam"][:, :3].T @ calibration["R0_rect"].T
+        pixels = rectified @ calibration["P2"][:, :3].T
+        pixels = pixels[:, :2] / pixels[:, 2:]
+        assert_allclose(pixels, np.round(pixels), atol=0.02)
+        assert pixels.min() > -0.5
+        assert points[:, 0].min() > 0  # in front of the sensor
+        for _, (left, top, right, bottom), corners in read_kitti(out / "label_2" / f"{number}.txt"):
+            low, high = corners.min(axis=0) - 1e-3, corners.max(axis=0) + 1e-3
+            box = ((rectified > low) & (rectified < high)).all(axis=1)
+            inside = pixels[box]
+            seen = (inside > [left - 1, top - 1]) & (inside < [right + 1, bottom + 1])
+            assert seen.all(axis=1).mean() > 0.5
+
+
+def intrinsics(run: Path) -> np.ndarray:
+    from shapecat.outputs.rereading import clouds_again, open_source  # noqa: PLC0415  here alone
+
+    finished = read_finished(run)
+    with open_source(finished) as recording:
+        camera = next(iter(clouds_again(recording, finished.run))).camera
+    assert camera is not None
+    return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
+
+
+@pytest.mark.parametrize("up", [(0, -1, 0), (0, -0.8, -0.6), (0, -0.02, -1), (0.1, -0.7, 0.7)])
+def test_the_rectified_camera_is_level(up: tuple[float, ...]) -> None:
+    turn = rectified_from_sensor(np.array(up), optical=True)
+
+    assert_allclose(turn @ turn.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(turn) == pytest.approx(1)
+    assert_allclose(turn @ up / np.linalg.norm(up), [0, -1, 0], atol=1e-12)
+
+
+def test_labelcloud_formats_say_the_same(run: Path, tmp_path: Path) -> None:
+    """Read as labelCloud 1.1 does: centroid and size, or what its loader takes from vertices."""
+    export_run(run, "labelcloud", tmp_path, every=3)
+    out = tmp_path / "table"
+    worst, count = 0.0, 0
+    for cloud in sorted((out / "pointclouds").iterdir()):
+        name = f"{cloud.stem}.json"
+        kinds = [
+            json.loads((out / folder / name).read_text())["objects"]
+            for folder in ("labels", "labels_centroid_abs", "labels_vertices")
+        ]
+        ours = boxes(run)[3 * int(cloud.stem)]
+        assert [len(kind) for kind in kinds] == [len(ours)] * 3
+        for relative, absolute, vertices, (_, meant) in zip(*kinds, ours, strict=True):
+            radians, degrees = relative["rotations"]["z"], absolute["rotations"]["z"]
+            assert 0 <= degrees < 360
+            assert_allclose(np.exp(1j * radians), np.exp(1j * np.radians(degrees)), atol=1e-6)
+            v = np.array(vertices["vertices"])
+            assert_allclose(
+                (v[4] - v[2]) / 2 + v[2], list(relative["centroid"].values()), atol=1e-6
+            )
+            sizes = [np.linalg.norm(v[0] - v[k]) for k in (3, 1, 4)]
+            assert_allclose(sizes, list(relative["dimensions"].values()), atol=1e-6)
+            x, y, _ = v[3] - v[0]
+            assert_allclose(np.arctan2(y, x), radians, atol=1e-5)
+            assert len(set(v[:4, 2])) == 1
+            edges = np.linalg.norm(meant[0] - meant[1:], axis=1).min()
+            worst = max(worst, abs(edges - min(sizes)))
+            count += 1
+    classes = json.loads((out / "labels" / "_classes.json").read_text())
+    assert {"unknown", "wine glass", "cup"} <= {entry["name"] for entry in classes["classes"]}
+    assert len({entry["id"] for entry in classes["classes"]}) == len(classes["classes"])
+    assert count > 20
+    assert worst < 1e-5
+
+
+def test_masks_label_the_pixels_of_each_object(run: Path, tmp_path: Path) -> None:
+    image = pytest.importorskip("PIL.Image")
+    export_run(run, "point-labels", tmp_path)
+    out = tmp_path / "table"
+    legend = json.loads((out / "labels.json").read_text())
+    owner = {
+        (row["frame"], row["detection"]): row["track"]
+        for row in rows(run, "tracks")
+        if row["detection"] is not None
+    }
+    labels = read_finished(run).labels
+    for row in rows(run, "detections"):
+        track = owner.get((row["frame"], row["detection"]))
+        name = f"{row['frame']:06d}.png"
+        instance = np.asarray(image.open(out / "instance" / name)).ravel()
+        semantic = np.asarray(image.open(out / "semantic" / name)).ravel()
+        depth = np.asarray(image.open(out / "depth" / name)).ravel()
+        if track not in labels:
+            assert not instance[row["indices"]].any()
+            continue
+        assert instance.dtype == np.uint16
+        assert (instance[row["indices"]] == track).all()
+        (value,) = set(semantic[row["indices"]].tolist())
+        assert legend["classes"][str(value)] == labels[track].category
+        assert legend["instances"][str(track)] == labels[track].category
+        assert 300 < np.median(depth[row["indices"]]) < 2500
+        assert ((instance > 0) == (semantic > 0)).all()
+
+
+def test_loose_clouds_get_semantic_kitti_labels(tmp_path: Path) -> None:
+    points = np.array([[1, 0, 0], [np.nan] * 3, [2, 0, 0], [3, 0, 0]], np.float32)
+    item = LabelledObject(
+        track=513,
+        category="can",
+        confidence=1.0,
+        box=Box(np.zeros(3), np.ones(3), np.array([0, 0, 0, 1])),
+        indices=np.array([1, 2]),
+        gas=NeuralGas(np.zeros((0, 3)), np.zeros((0, 2))),
+        posterior=np.ones(1),
+        causal=np.ones(1),
+    )
+    frame = Frame("/scan", 0, 5, 5, "laser", points=points)
+    labelled = LabelledFrame("/scan", 0, 5, 5, "laser", None, (), (item,), (), {})
+    finished = FinishedRun(
+        tmp_path, {"model": {"categories": ["cup", "can"]}}, {513: TrackLabel(513, "can", 1.0)}
+    )
+
+    assert write_point_labels(tmp_path, [(labelled, frame)], finished) == 1
+
+    cloud = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
+    label = np.fromfile(tmp_path / "labels" / "000000.label", "<u4")
+    legend = json.loads((tmp_path / "labels.json").read_text())
+    assert cloud[:, 0].tolist() == [1, 2, 3]
+    assert (label >> 16).tolist() == [0, 513, 0]
+    assert [legend["classes"][str(k)] for k in (label & 0xFFFF)] == ["none", "can", "none"]
+    assert '3: "can"' in (tmp_path / "semantic-kitti.yaml").read_text()
+
+    many = FinishedRun(tmp_path, finished.run, {70000: TrackLabel(70000, "can", 1.0)})
+    with pytest.raises(OutputError, match="65535"):
+        write_point_labels(tmp_path, [], many)
+
+
+def test_a_run_is_never_replaced_by_its_export(run: Path) -> None:
+    """`--out results` names the folder in which the run itself lies."""
+    before = sorted(path.name for path in run.iterdir())
+
+    with pytest.raises(OutputError, match="choose another --out"):
+        export_run(run, "kitti", run.parent)
+
+    assert sorted(path.name for path in run.iterdir()) == before
+
+
+def test_exports_of_one_format_replace_each_other(run: Path, tmp_path: Path) -> None:
+    for _ in range(2):
+        export_run(run, "point-labels", tmp_path, every=6)
+    assert len(list((tmp_path / "table" / "semantic").iterdir())) == 2
+
+    with pytest.raises(OutputError, match="holds point-labels"):
+        export_run(run, "kitti", tmp_path)
+
+
+def test_a_recording_that_is_gone_or_changed_is_refused(run: Path, tmp_path: Path) -> None:
+    folder = tmp_path / "table"
+    shutil.copytree(run, folder)
+    about = json.loads((folder / "run.json").read_text())
+    source = Path(about["input"]["path"])
+    copy = tmp_path / "copy.mcap"
+    about["input"]["path"] = str(copy)
+    (folder / "run.json").write_text(json.dumps(about))
+
+    with pytest.raises(RecordingError):
+        export_run(folder, "crops", tmp_path / "crops")
+    changed = bytearray(source.read_bytes())
+    changed[len(changed) // 3] ^= 1
+    copy.write_bytes(changed)
+    with pytest.raises(OutputError, match="has changed"):
+        export_run(folder, "crops", tmp_path / "crops")
+    assert not (tmp_path / "crops").exists() or not any((tmp_path / "crops").iterdir())
+
+
+def test_the_command_names_what_it_wrote(shapecat: Run, run: Path, tmp_path: Path) -> None:
+    result = shapecat("export", run, "--format", "crops", "--out", tmp_path / "c", "--every", 6)
+
+    assert result.exit_code == 0
+    assert "objects in" in result.stdout
+    assert shapecat("export", run, "--format", "coco", "--out", tmp_path).exit_code == 2
+    missing = shapecat("export", tmp_path / "none", "--format", "crops", "--out", tmp_path)
+    assert missing.exit_code == 1
+    assert "no run.json" in missing.output
+
+
+def test_scene_prints_what_stands_on_what(shapecat: Run, run: Path) -> None:
+    result = shapecat("scene", run, "--frame", 5)
+
+    assert result.exit_code == 0, result.output
+    assert result.stdout.startswith("plane 0")
+    known = {str(row.track) for row in read_track_table(run / "tracks.csv").rows}
+    named = {line.split("#")[1].split(":")[0] for line in result.stdout.splitlines() if "#" in line}
+    assert len(named) > 4
+    assert named <= known - {"1"}
+    assert shapecat("scene", run, "--frame", 99).exit_code == 1

@@ -1,0 +1,187 @@
+"""Damage anywhere in a recording: what is whole is read, what is not is said, nothing crashes."""
+
+import resource
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.rosbag2 import StoragePlugin
+from rosbags.rosbag2 import Writer as FolderWriter
+
+from shapecat.errors import NoStreamError, RecordingError
+from shapecat.geometry import IDENTITY
+from shapecat.recordings import choose_streams, frames, open_recording
+from shapecat.recordings.gravity import Upright
+from shapecat.recordings.ros1_bag import BagRecording
+from shapecat.simulation.messages import MessageFactory
+from shapecat.types import Camera
+from tests.messages import EPOCH, SECOND
+
+CAMERA = Camera(16, 12, 20.0, 20.0, 7.5, 5.5)
+FRAMES = 24
+
+
+class Outcome(NamedTuple):
+    """Exit code, stamps of the frames read, and what was said."""
+
+    code: int
+    stamps: frozenset[int]
+    said: str
+
+
+def items(make: MessageFactory) -> Any:
+    depth = np.random.default_rng(0).integers(500, 900, (12, 16)) / np.float32(1000)
+    for k in range(FRAMES):
+        stamp = EPOCH + k * SECOND
+        yield "/tf", stamp, make.transforms([("map", "optical", IDENTITY)], stamp)
+        yield "/depth/camera_info", stamp, make.camera_info(CAMERA, stamp, "optical")
+        yield "/depth/image_raw", stamp, make.image(depth.astype(np.float32), stamp, "optical")
+
+
+def mcap(path: Path, **options: Any) -> Path:
+    make = MessageFactory(2)
+    with path.open("wb") as file:
+        writer = Writer(file, **({"chunk_size": 4000} | options))
+        writer.start("ros2", "test")
+        channels: dict[str, int] = {}
+        for topic, time, message in items(make):
+            kind = message.__msgtype__
+            if topic not in channels:
+                text = make.typestore.generate_msgdef(kind, ros_version=2)[0].encode()
+                schema = writer.register_schema(kind, "ros2msg", text)
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channels[topic], time, make.serialize(message), time)
+        writer.finish()
+    return path
+
+
+def bag(path: Path, compression: Any = None) -> Path:
+    make = MessageFactory(1)
+    writer = BagWriter(path)
+    writer.chunk_threshold = 4000
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer:
+        known: dict[str, Any] = {}
+        for topic, time, message in items(make):
+            if topic not in known:
+                known[topic] = writer.add_connection(
+                    topic, message.__msgtype__, typestore=make.typestore
+                )
+            writer.write(known[topic], time, make.serialize(message))
+    return path
+
+
+def folder(path: Path, plugin: StoragePlugin) -> Path:
+    make = MessageFactory(2)
+    with FolderWriter(path, version=9, storage_plugin=plugin) as writer:
+        known: dict[str, Any] = {}
+        for topic, time, message in items(make):
+            if topic not in known:
+                known[topic] = writer.add_connection(
+                    topic, message.__msgtype__, typestore=make.typestore
+                )
+            writer.write(known[topic], time, make.serialize(message))
+    (part,) = (file for file in path.iterdir() if file.suffix in {".db3", ".mcap"})
+    return part
+
+
+WRITERS: dict[str, Callable[[Path], Path]] = {
+    **{
+        f"mcap-{kind.name.lower()}": lambda p, kind=kind: mcap(p / "a.mcap", compression=kind)  # type: ignore[misc]  # mypy cannot type a default
+        for kind in CompressionType
+    },
+    "mcap-unchunked": lambda p: mcap(p / "a.mcap", use_chunking=False),
+    "ros1-none": lambda p: bag(p / "a.bag"),
+    **{
+        f"ros1-{kind.name.lower()}": lambda p, kind=kind: bag(p / "a.bag", kind)  # type: ignore[misc]  # the same
+        for kind in BagWriter.CompressionFormat
+    },
+    "ros2-sqlite": lambda p: folder(p / "a", StoragePlugin.SQLITE3),
+    "ros2-mcap": lambda p: folder(p / "a", StoragePlugin.MCAP),
+}
+
+
+def read(path: Path) -> Outcome:
+    """Read a recording as `process` does, up to the frames."""
+    skipped: Counter[str] = Counter()
+    try:
+        with open_recording(path) as recording:
+            streams = choose_streams(recording)
+            upright = Upright.of(recording, up="auto", fixed_frame=None)
+            stamps = []
+            for frame in frames(recording, streams, skipped=skipped):
+                upright.up(frame)
+                upright.fixed_from_sensor(frame)
+                stamps.append(frame.stamp_ns)
+            said = " ".join([*recording.warnings, *skipped])
+            return Outcome(0 if stamps else 4, frozenset(stamps), said)
+    except (RecordingError, NoStreamError) as error:
+        return Outcome(error.exit_code, frozenset(), str(error))
+
+
+def chunk_ends(path: Path) -> list[tuple[int, int]]:
+    """Return the end of each chunk and the number of frames that are whole before it."""
+    with path.open("rb") as file:
+        if path.suffix == ".mcap":
+            summary = make_reader(file).get_summary()
+            chunks = summary.chunk_indexes if summary else []
+            ends = [(c.chunk_start_offset + c.chunk_length, c.message_end_time) for c in chunks]
+        elif path.suffix == ".bag":
+            with BagRecording(path) as recording:
+                ends = [
+                    (record.end, max(time for _, time, _ in recording._expand(record)))
+                    for record in recording._records()
+                    if record.op == 5
+                ]
+        else:
+            return []
+    # The last frame of a chunk may continue in the next one.
+    return [(end, (time - EPOCH) // SECOND) for end, time in ends]
+
+
+def check(path: Path, outcome: Outcome, at: int, ends: list[tuple[int, int]]) -> None:
+    assert outcome.code in {0, 3, 4}, outcome
+    sure = max((count for end, count in ends if end <= at), default=0)
+    stamps = {EPOCH + k * SECOND for k in range(sure)}
+    assert stamps <= outcome.stamps, (path, at, len(outcome.stamps), sure, outcome.said)
+    everything = {EPOCH + k * SECOND for k in range(FRAMES)}
+    if outcome.code or not everything <= outcome.stamps:
+        assert outcome.said, (path, at)
+
+
+def damage(name: str, tmp_path: Path, *, cuts: int, flips: int) -> None:
+    rng = np.random.default_rng(sum(name.encode()))
+    whole = WRITERS[name](tmp_path)
+    data, ends = whole.read_bytes(), chunk_ends(whole)
+    target = tmp_path / f"damaged{whole.suffix}"
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    target.write_bytes(data)
+    check(target, read(target), len(data), ends)
+    for at in rng.integers(0, len(data), cuts).tolist():
+        target.write_bytes(data[:at])
+        check(target, read(target), at, ends)
+    for at in rng.integers(0, len(data), flips).tolist():
+        broken = bytearray(data)
+        broken[at] ^= int(rng.integers(1, 256))
+        target.write_bytes(broken)
+        check(target, read(target), at, ends)
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    assert grown < 500 << 10, f"{grown} KiB more memory"
+
+
+@pytest.mark.parametrize("name", WRITERS)
+def test_damage(name: str, tmp_path: Path) -> None:
+    damage(name, tmp_path, cuts=12, flips=30)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WRITERS)
+def test_much_damage(name: str, tmp_path: Path) -> None:
+    damage(name, tmp_path, cuts=200, flips=2000)
