@@ -1,12 +1,13 @@
 // Planes and object clusters with PCL, timed: the pipelines of PCL's own tutorials.
 //
-// usage: pcl_detection CLOUDS REPEATS [MLS_RADIUS]
-// CLOUDS holds frames: int32 width, int32 height, then width * height * 3 float32 (NaN: no reading).
+// usage: pcl_detection CLOUDS REPEATS
+// CLOUDS holds frames: int32 width, int32 height, float32 up[3], then width * height * 3 float32
+// (NaN: no reading).
 // Prints a line per frame and method: method, frame, milliseconds of CPU time (the best of REPEATS),
 // number of clusters.
 #include <pcl/ModelCoefficients.h>
 #include <pcl/features/integral_image_normal.h>
-#include <pcl/filters/extract_indices.h>
+#include <pcl/features/normal_3d.h>
 #include <pcl/filters/passthrough.h>
 #include <pcl/filters/voxel_grid.h>
 #include <pcl/point_cloud.h>
@@ -36,9 +37,10 @@ static double cpu_ms() {
   return t.tv_sec * 1e3 + t.tv_nsec * 1e-6;
 }
 
-// Pass-through at 2 m, 1 cm voxels, RANSAC plane, Euclidean clusters of what lies above it.
-static int unorganized(const Cloud::Ptr& input) {
-  Cloud::Ptr near(new Cloud), voxels(new Cloud), rest(new Cloud);
+// Thesis ch. 4: pass-through at 2 m, 1 cm voxels, normals, horizontal points, plane candidates by
+// Euclidean clustering, RANSAC for each, Euclidean clusters of what lies above the largest.
+static int unorganized(const Cloud::Ptr& input, const Eigen::Vector3f& up) {
+  Cloud::Ptr near(new Cloud), voxels(new Cloud), flat(new Cloud), rest(new Cloud);
   pcl::PassThrough<Point> pass;
   pass.setInputCloud(input);
   pass.setFilterFieldName("z");
@@ -48,31 +50,56 @@ static int unorganized(const Cloud::Ptr& input) {
   grid.setInputCloud(near);
   grid.setLeafSize(.01f, .01f, .01f);
   grid.filter(*voxels);
-  pcl::SACSegmentation<Point> plane;
-  pcl::PointIndices::Ptr inliers(new pcl::PointIndices);
-  pcl::ModelCoefficients::Ptr model(new pcl::ModelCoefficients);
-  plane.setOptimizeCoefficients(true);
-  plane.setModelType(pcl::SACMODEL_PLANE);
-  plane.setMethodType(pcl::SAC_RANSAC);
-  plane.setMaxIterations(200);
-  plane.setDistanceThreshold(.01);
-  plane.setInputCloud(voxels);
-  plane.segment(*inliers, *model);
-  if (inliers->indices.empty()) return 0;
-  const auto& c = model->values;
-  const float side = c[3] > 0 ? 1.f : -1.f;  // the sensor is above the plane
+  pcl::search::KdTree<Point>::Ptr tree(new pcl::search::KdTree<Point>);
+  pcl::PointCloud<pcl::Normal> normals;
+  pcl::NormalEstimation<Point, pcl::Normal> estimate;
+  estimate.setInputCloud(voxels);
+  estimate.setSearchMethod(tree);
+  estimate.setKSearch(20);
+  estimate.compute(normals);
+  for (std::size_t i = 0; i < voxels->size(); ++i)
+    if (std::abs(normals[i].getNormalVector3fMap().dot(up)) > .95f) flat->push_back((*voxels)[i]);
+  if (flat->empty()) return 0;
+  std::vector<pcl::PointIndices> candidates;
+  pcl::search::KdTree<Point>::Ptr flat_tree(new pcl::search::KdTree<Point>);
+  flat_tree->setInputCloud(flat);
+  pcl::EuclideanClusterExtraction<Point> cluster;
+  cluster.setClusterTolerance(.03);
+  cluster.setMinClusterSize(200);
+  cluster.setSearchMethod(flat_tree);
+  cluster.setInputCloud(flat);
+  cluster.extract(candidates);
+  std::size_t largest = 0;
+  Eigen::Vector4f best(0, 0, 0, 0);
+  for (const auto& candidate : candidates) {
+    pcl::SACSegmentation<Point> plane;
+    pcl::PointIndices inliers;
+    pcl::ModelCoefficients model;
+    plane.setOptimizeCoefficients(true);
+    plane.setModelType(pcl::SACMODEL_PLANE);
+    plane.setMethodType(pcl::SAC_RANSAC);
+    plane.setMaxIterations(200);
+    plane.setDistanceThreshold(.01);
+    plane.setInputCloud(flat);
+    plane.setIndices(pcl::make_shared<pcl::PointIndices>(candidate));
+    plane.segment(inliers, model);
+    if (inliers.indices.size() <= largest) continue;
+    largest = inliers.indices.size();
+    best = Eigen::Vector4f(model.values[0], model.values[1], model.values[2], model.values[3]);
+  }
+  if (largest == 0) return 0;
+  const float side = best[3] > 0 ? 1.f : -1.f;  // the sensor is above the plane
   for (const auto& p : *voxels) {
-    const float height = side * (c[0] * p.x + c[1] * p.y + c[2] * p.z + c[3]);
+    const float height = side * (best[0] * p.x + best[1] * p.y + best[2] * p.z + best[3]);
     if (height > .01f && height < .6f) rest->push_back(p);
   }
   if (rest->empty()) return 0;
-  pcl::search::KdTree<Point>::Ptr tree(new pcl::search::KdTree<Point>);
-  tree->setInputCloud(rest);
+  pcl::search::KdTree<Point>::Ptr rest_tree(new pcl::search::KdTree<Point>);
+  rest_tree->setInputCloud(rest);
   std::vector<pcl::PointIndices> clusters;
-  pcl::EuclideanClusterExtraction<Point> cluster;
   cluster.setClusterTolerance(.02);
   cluster.setMinClusterSize(30);
-  cluster.setSearchMethod(tree);
+  cluster.setSearchMethod(rest_tree);
   cluster.setInputCloud(rest);
   cluster.extract(clusters);
   return static_cast<int>(clusters.size());
@@ -122,13 +149,15 @@ int main(int argc, char** argv) {
   if (argc < 3) return 2;
   const int repeats = std::atoi(argv[2]);
   std::ifstream file(argv[1], std::ios::binary);
-  const std::vector<std::pair<const char*, std::function<int(const Cloud::Ptr&)>>> methods = {
-      {"unorganized", [](const Cloud::Ptr& c) { return unorganized(c); }},
-      {"organized_covariance", [](const Cloud::Ptr& c) { return organized(c, true); }},
-      {"organized_gradient", [](const Cloud::Ptr& c) { return organized(c, false); }},
+  const std::vector<std::pair<const char*, std::function<int(const Cloud::Ptr&, const Eigen::Vector3f&)>>> methods = {
+      {"unorganized", unorganized},
+      {"organized_covariance", [](const auto& c, const auto&) { return organized(c, true); }},
+      {"organized_gradient", [](const auto& c, const auto&) { return organized(c, false); }},
   };
   std::int32_t size[2];
   for (int frame = 0; file.read(reinterpret_cast<char*>(size), sizeof size); ++frame) {
+    Eigen::Vector3f up;
+    file.read(reinterpret_cast<char*>(up.data()), sizeof(float) * 3);
     std::vector<float> raw(3u * size[0] * size[1]);
     file.read(reinterpret_cast<char*>(raw.data()), raw.size() * sizeof(float));
     Cloud::Ptr cloud(new Cloud(size[0], size[1]));
@@ -141,7 +170,7 @@ int main(int argc, char** argv) {
       int objects = 0;
       for (int k = 0; k < repeats; ++k) {
         const double begun = cpu_ms();
-        objects = run(cloud);
+        objects = run(cloud, up);
         best = std::min(best, cpu_ms() - begun);
       }
       std::printf("%s %d %.3f %d\n", name, frame, best, objects);

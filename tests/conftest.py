@@ -43,6 +43,7 @@ class Guesser:
     model_id = "guesser"
 
     def predict(self, descriptors: Any) -> Any:
+        """Return posteriors that are always the same, and no novelty."""
         x = np.nan_to_num(np.asarray(descriptors, np.float64))
         logits = x @ np.random.default_rng(0).normal(0, 0.3, (x.shape[1], len(self.categories)))
         logits -= logits.max(axis=1, keepdims=True)

@@ -385,8 +385,13 @@ def test_any_cloud_gives_a_scene(n: int, seed: int, odd: float, spread: float) -
 
 def test_hierarchy_answers_the_queries() -> None:
     """Highest, lowest, nearest, farthest, on objects, and counts (thesis 4.5)."""
-    shapes = [table(), box((-0.2, 0, 0), (0.15, 0.15, 0.08)),
-              box((-0.2, 0, 0.08), (0.07, 0.07, 0.1)), can(0.15, 0.15, 0, 0.04, 0.14), box((0.1, -0.15, 0), (0.1, 0.08, 0.05))]  # fmt: skip
+    shapes = [
+        table(),
+        box((-0.2, 0, 0), (0.15, 0.15, 0.08)),
+        box((-0.2, 0, 0.08), (0.07, 0.07, 0.1)),
+        can(0.15, 0.15, 0, 0.04, 0.14),
+        box((0.1, -0.15, 0), (0.1, 0.08, 0.05)),
+    ]
     depth, seen = render(shapes)
     scene = found(frame_of(depth))
     name = {

@@ -15,6 +15,7 @@ from shapecat.tables import TRACKS, FrameRow, PerceptionTables, write_table
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
 
 HEADER = "track,first_s,category,confidence,label,topic\n"
+QUARTER = np.array([-(0.5**0.5), 0, 0, 0.5**0.5])  # the box stands along -y
 ORIGINAL = HEADER + "".join(
     f"{track},0.000,{category},0.500,,/depth\n"
     for track, category in [(4, "unknown"), (2, "can"), (1, "cup"), (3, "cup")]
@@ -176,7 +177,7 @@ def test_lines_left_out_keep_their_label(run: Path) -> None:
     [
         b"\xef\xbb\xbftrack;category;confidence;label\r\n4;unknown;0,5;bowl\r\n",
         b"sep=;\r\ntrack;category;confidence;label\r\n4;unknown;0,5;bowl\r\n",
-        b'"label","track","note","confidence","category"\n"bowl","4.0","a, ""b""\nc","0.5","unknown"\n',
+        b'"label","track","note","confidence","category"\n"bowl","4.0","a, ""b""\nc",".5","unknown"\n',
         b"Track,Category,Confidence,Label,\r\n4.0,unknown,.5, Bowl ,\r\n,,,,\r\n\r\n",
         "track\tcategory\tconfidence\tlabel\n4\tunknown\t0.5\tbowl\n".encode("utf-16"),
         "track,category,confidence,label,größe\n4,unknown,0.5,bowl,ü\n".encode("cp1252"),
@@ -232,7 +233,7 @@ def write_run(folder: Path) -> None:
                 Detection(
                     Candidate(
                         indices=np.arange(4) + 3 * k,
-                        box=Box([0.2 * k, 0.4, 1], [0.1, 0.1, 0.2], [-(0.5**0.5), 0, 0, 0.5**0.5]),
+                        box=Box(np.array([0.2 * k, 0.4, 1]), np.array([0.1, 0.1, 0.2]), QUARTER),
                         plane=0,
                         on_candidate=None,
                         support_m=0.0,

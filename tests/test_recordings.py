@@ -252,7 +252,8 @@ def test_bag_cut_anywhere_gives_what_is_there(tmp_path: Path) -> None:
 @pytest.mark.parametrize("compression", list(BagWriter.CompressionFormat))
 def test_damaged_chunk_of_a_bag_does_not_stop_the_others(tmp_path: Path, compression: Any) -> None:
     path = tmp_path / "a.bag"
-    writer = BagWriter(path, chunk_threshold=100)
+    writer = BagWriter(path)
+    writer.chunk_threshold = 100
     writer.set_compression(compression)
     with writer:
         connection = writer.add_connection("/a", STRING, typestore=STORE1)
@@ -269,7 +270,7 @@ def test_damaged_chunk_of_a_bag_does_not_stop_the_others(tmp_path: Path, compres
     with open_recording(path) as recording:
         read = [message.log_time_ns // SECOND for message in recording.messages()]
         assert read == [1, 2, 4, 5]
-        assert "the rest of the chunk" in recording.warnings[0]
+        assert "the rest of the record" in recording.warnings[0]
 
 
 def write_folder(path: Path, plugin: StoragePlugin, mode: CompressionMode | None = None) -> Path:

@@ -65,7 +65,7 @@ def _is_inside(pieces: Pieces, p: int, q: int) -> bool:
         return False
     both = a + b
     both[LEFT], both[RIGHTMOST] = min(a[LEFT], b[LEFT]), max(a[RIGHTMOST], b[RIGHTMOST])
-    return slope_of(both) < INSIDE
+    return bool(slope_of(both) < INSIDE)
 
 
 @kernel

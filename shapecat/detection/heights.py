@@ -15,7 +15,7 @@ __all__ = ["LEAST_M", "NOISE", "Heights", "heights_of", "inside", "table_of"]
 
 LEAST_M = 0.004
 """Lowest height of an object cell, to which `NOISE` times the squared range is added."""
-NOISE = 0.0025
+NOISE = 0.002
 
 
 class Heights(NamedTuple):

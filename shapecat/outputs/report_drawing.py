@@ -51,7 +51,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[Picture, ...]:
         everything = points = np.zeros((1, 3))
     low, high = np.percentile(everything, [0.5, 99.5], axis=0)
     middle = (low + high) / 2
-    reach = max(float(np.linalg.norm(high - low)) / 2, 1e-3)
+    reach = max(float(np.percentile(np.linalg.norm(everything - middle, axis=1), 99.5)), 1e-3)
     x, y, z = shot.eye - middle
     azimuth = float(np.arctan2(y, x))
     elevation = float(np.clip(np.arctan2(z, np.hypot(x, y)), np.radians(12), np.radians(65)))
@@ -63,7 +63,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[Picture, ...]:
         ("from above", 0.0, np.pi / 2),
     ):
         view = _view(azimuth + turn, rise)
-        scale = 0.48 * SIDE / reach
+        scale = 0.46 * SIDE / reach
         spots = _project(points - middle, view, scale)
         image = png(_shade(spots), palette, alpha)
         encoded = base64.b64encode(image).decode("ascii")

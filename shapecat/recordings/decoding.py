@@ -3,7 +3,7 @@
 import json
 import struct
 from collections.abc import Callable, Iterator
-from functools import cache
+from functools import cache, lru_cache
 from types import SimpleNamespace
 from typing import Any
 
@@ -78,13 +78,18 @@ def typestore_of(channel: Channel) -> Typestore:
     if len(channel.schema) > _MAX_DEFINITION:
         msg = f"definition of {len(channel.schema)} bytes"
         raise ValueError(msg)
-    text = channel.schema.decode("utf-8")
+    return _defined(channel.type, channel.schema_encoding, channel.schema)
+
+
+@lru_cache(maxsize=32)  # recordings of one robot hold the same definitions
+def _defined(kind: str, encoding: str, schema: bytes) -> Typestore:
+    text = schema.decode("utf-8")
     types: dict[str, Any] = {}
-    if channel.schema_encoding in {"ros2idl", "omgidl"}:
+    if encoding in {"ros2idl", "omgidl"}:
         for part in _idl_parts(text):
             types.update(get_types_from_idl(part))
     else:
-        types.update(get_types_from_msg(text.replace("\r\n", "\n"), channel.type))
+        types.update(get_types_from_msg(text.replace("\r\n", "\n"), kind))
     _refuse_unrolling(types)
     # A store for every definition: two topics may disagree on a type.
     store = get_typestore(Stores.EMPTY)

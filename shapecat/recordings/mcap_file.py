@@ -4,6 +4,7 @@ Damage never ends the reading: an unfinished file gives its whole chunks, a brok
 out, and both are said in the warnings.
 """
 
+import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
@@ -166,8 +167,12 @@ class McapRecording(Recording):
         if tail[-len(MAGIC) :] != MAGIC or tail[0] != Opcode.FOOTER:
             return None
         try:
-            start = parse(records.Footer.read, tail[9:_FOOTER]).summary_start
+            footer = parse(records.Footer.read, tail[9:_FOOTER])
+            start = footer.summary_start
             if not len(MAGIC) < start <= footer_at:
+                return None
+            if footer.summary_crc and footer.summary_crc != self._checksum(start):
+                self.warn("the index is damaged: read from beginning to end instead")
                 return None
             summary = self._collect(start, footer_at)
             summary.data_end = self._find_data_end(summary, start)
@@ -175,6 +180,15 @@ class McapRecording(Recording):
             self.warn("the index is damaged: read from beginning to end instead")
             return None
         return summary if _is_complete(summary) else None
+
+    def _checksum(self, start: int) -> int:
+        """Return the checksum of the summary, and of the footer up to its own checksum."""
+        crc, left = 0, self._size - len(MAGIC) - 4 - start
+        self._file.seek(start)
+        while left > 0:
+            block = self._file.read(min(left, 1 << 20))
+            crc, left = zlib.crc32(block, crc), left - max(1, len(block))
+        return crc
 
     def _collect(self, start: int, end: int) -> Summary:
         summary = Summary()
@@ -259,7 +273,7 @@ class McapRecording(Recording):
         """Yield the messages of a top-level record; note its schemas and channels."""
         if record.opcode == Opcode.CHUNK:
             yield from self._chunk(record)
-        elif record.opcode in _DEFINING:
+        elif record.opcode in _DEFINING or record.opcode not in _KNOWN:
             try:
                 yield from self._take(record.opcode, memoryview(self.content(record)))
             except ChunkError as error:
@@ -280,6 +294,10 @@ class McapRecording(Recording):
             message = split_message(content)
             if message.channel_id in self.summary.channels:
                 yield message
+            else:
+                self.warn(f"left out messages of channel {message.channel_id}: not described")
+        elif opcode not in _DEFINING and opcode not in _KNOWN:
+            self.warn(f"left out what is no message: records of kind {opcode}")
         elif self.indexed:
             return
         elif opcode == Opcode.SCHEMA:
@@ -341,6 +359,8 @@ class McapRecording(Recording):
 
 
 _NONE = ("", "", b"")
+_KNOWN = {int(opcode) for opcode in Opcode} | set(range(128, 256))
+"""Opcodes from 128 on are for private use."""
 _DEFINING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 
 

@@ -7,6 +7,7 @@ without an index (``.bag.active``), or cut off. Damage never ends the reading.
 import struct
 from collections import Counter
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
@@ -111,7 +112,8 @@ class BagRecording(Recording):
         ]
 
         def read(position: int) -> Iterator[tuple[Timed, tuple[int, int, memoryview]]]:
-            for message in self._expand(next(walk(self._file, position, self._size))):
+            chunk = next(walk(self._file, position, self._size))
+            for message in self._expand(chunk):
                 if message[0] in wanted:
                     yield Timed(message[1], len(message[2])), message
 
@@ -158,12 +160,30 @@ class BagRecording(Recording):
             return None
         if not counts.keys() <= self._channels.keys():
             return None
+        if not self._agrees(chunks):
+            return None
         self._chunks = chunks
         filled = [chunk for chunk in chunks if chunk.counts]
         if filled:
             self.start_ns = min(chunk.start for chunk in filled)
             self.end_ns = max(chunk.end for chunk in filled)
         return counts
+
+    def _agrees(self, chunks: list[_ChunkInfo]) -> bool:
+        """Tell whether the connections are those that the chunks describe, which come first."""
+        unseen = set(self._channels)
+        for chunk in sorted(chunks):
+            if unseen.isdisjoint(chunk.counts):
+                continue
+            unseen -= chunk.counts.keys()
+            record = next(walk(self._file, chunk.position, self._size))
+            with suppress(BagError):  # damaged: found out when it is read
+                for fields, data in split(expand(record, self._data(record))[0]):
+                    if fields.get("op") == bytes([CONNECTION]):
+                        number = u4(fields, "conn")
+                        if self._channels.get(number) != _channel(fields, data):
+                            return False
+        return True
 
     def _chunk_info(self, record: Record) -> _ChunkInfo:
         pairs = struct.iter_unpack("<II", self._data(record))
@@ -201,20 +221,22 @@ class BagRecording(Recording):
 
         A damaged chunk gives what is before the damage.
         """
-        if record.op == CONNECTION and self._chunks is None:
-            self._take(record.fields, memoryview(self._data(record)))
-        if record.op != CHUNK:
+        if record.op not in {CHUNK, CONNECTION}:
             return
-        plain, problem = expand(record, self._data(record))
+        problem, data = "", self._data(record)
         try:
-            for fields, data in split(plain):
-                found = self._take(fields, data)
+            if record.op == CONNECTION:
+                self._take(record.fields, memoryview(data))
+                return
+            plain, problem = expand(record, data)
+            for fields, content in split(plain):
+                found = self._take(fields, content)
                 if found is not None:
                     yield found
         except BagError as error:
             problem = problem or str(error)
         if problem:
-            self.warn(f"left out the rest of the chunk at byte {record.start}: {problem}")
+            self.warn(f"left out the rest of the record at byte {record.start}: {problem}")
 
     def _take(
         self, fields: dict[str, bytes], data: memoryview
@@ -231,32 +253,33 @@ class BagRecording(Recording):
 
     def _connect(self, fields: dict[str, bytes], data: bytes | memoryview) -> None:
         """Note a connection."""
-        described = {
-            name: value.decode("utf-8", "replace") for name, value in fields_of(data).items()
-        }
-        recorded = described.get("type", "")
-        topic = "/".join(
-            part for part in fields.get("topic", b"").decode("utf-8", "replace").split("/") if part
-        )
-        if fields.get("topic", b"").startswith(b"/"):
-            topic = f"/{topic}"
-        latched = (("latching", "1"),) if described.get("latching") == "1" else ()
-        self._channels.setdefault(
-            u4(fields, "conn"),
-            Channel(
-                topic,
-                ros_type(recorded),
-                "ros1",
-                ros_type(recorded),
-                "ros1msg",
-                described.get("message_definition", "").encode(),
-                latched,
-            ),
-        )
+        self._channels.setdefault(u4(fields, "conn"), _channel(fields, data))
 
     def _data(self, record: Record) -> bytes:
         self._file.seek(record.begin)
         return self._file.read(record.end - record.begin)
+
+
+def _channel(fields: dict[str, bytes], data: bytes | memoryview) -> Channel:
+    """Return the channel that a connection record describes."""
+    described = {name: _text(value) for name, value in fields_of(data).items()}
+    topic = _text(fields.get("topic", b""))
+    parts = [part for part in topic.split("/") if part]
+    recorded = described.get("type", "")
+    latched = (("latching", "1"),) if described.get("latching") == "1" else ()
+    return Channel(
+        "/" * topic.startswith("/") + "/".join(parts),
+        ros_type(recorded),
+        "ros1",
+        ros_type(recorded),
+        "ros1msg",
+        described.get("message_definition", "").encode(),
+        latched,
+    )
+
+
+def _text(value: bytes) -> str:
+    return value.decode("utf-8", "replace")
 
 
 def _topics(channels: dict[int, Channel], counts: Counter[int]) -> tuple[Topic, ...]:

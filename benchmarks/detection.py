@@ -1,0 +1,129 @@
+"""Detection against Open3D and PCL, on the same frames in one run."""
+
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.measure import cpu_ms, markdown, summary
+from benchmarks.scenes import real_tables, simulated_clutter
+from shapecat.config import Settings
+from shapecat.detection import detect
+from shapecat.types import Frame
+
+PCL = ("segmentation", "features", "filters", "sample_consensus", "search", "kdtree", "common")
+
+
+def run(count: int) -> tuple[str, dict[str, Any]]:
+    """Time every method on every frame; return a Markdown table and the figures."""
+    sets = {
+        "simulated clutter": list(simulated_clutter(count)),
+        "real tables": list(real_tables(every=max(1, 45 // count))),
+    }
+    rows, figures = [], {}
+    for name, frames in sets.items():
+        if not frames:
+            continue
+        timed = _time_all(frames)
+        own = timed["shapecat"]["median"]
+        figures[name] = timed
+        rows += [
+            (name, method, len(frames), t["median"], t["p95"], f"{t['median'] / own:.1f}")
+            for method, t in timed.items()
+        ]
+    columns = ("frames", "method", "n", "ms, median", "ms, p95", "ratio")
+    return markdown("Detection, CPU time per 640×480 frame", columns, rows), figures
+
+
+def _time_all(frames: list[Frame]) -> dict[str, dict[str, float]]:
+    settings = Settings().detection
+    ups = [detect(f, settings=settings, rng=np.random.default_rng(0)).up for f in frames]
+
+    def own(frame: Frame) -> Any:
+        return lambda: detect(frame, settings=settings, rng=np.random.default_rng(0))
+
+    loose = [_unorganized(frame) for frame in frames]
+    timed = {
+        "shapecat": summary([cpu_ms(own(frame)) for frame in frames]),
+        "shapecat, unorganized": summary([cpu_ms(own(frame), 2) for frame in loose]),
+    }
+    opened = _time_open3d(frames, ups)
+    if opened:
+        timed["Open3D"] = summary(opened)
+    for method, values in _time_pcl(frames, ups).items():
+        timed[f"PCL {method}"] = summary(values)
+    return timed
+
+
+def _unorganized(frame: Frame) -> Frame:
+    points = frame.xyz()
+    points = points[np.isfinite(points[:, 2])]
+    return Frame(frame.topic, 0, frame.stamp_ns, 0, frame.frame_id, points=points)
+
+
+def _time_open3d(frames: list[Frame], ups: list[Any]) -> list[float]:
+    """Time pass-through, 1 cm voxels, RANSAC plane, DBSCAN above it, on one thread."""
+    try:
+        import open3d as o3d  # noqa: PLC0415  may lack its system libraries
+    except (ImportError, OSError):
+        return []
+
+    def work(points: Any, up: Any) -> int:
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[points[:, 2] < 2]))
+        cloud = cloud.voxel_down_sample(0.01)
+        cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(20))
+        o3d.utility.random.seed(0)
+        flat = np.abs(np.asarray(cloud.normals) @ up) > 0.95
+        (a, b, c, d), _ = cloud.select_by_index(np.flatnonzero(flat)).segment_plane(0.01, 3, 200)
+        side = 1.0 if d > 0 else -1.0
+        height = side * (np.asarray(cloud.points) @ [a, b, c] + d)
+        above = cloud.select_by_index(np.flatnonzero((height > 0.01) & (height < 0.6)))
+        return int(np.max(above.cluster_dbscan(0.02, 10), initial=-1)) + 1
+
+    result = []
+    for frame, up in zip(frames, ups, strict=True):
+        points = frame.xyz().astype(np.float64)
+        points = points[np.isfinite(points[:, 2])]
+        result.append(cpu_ms(lambda p=points, u=up: work(p, u), 2))
+    return result
+
+
+def _time_pcl(frames: list[Frame], ups: list[Any]) -> dict[str, list[float]]:
+    """Build the PCL program where PCL is installed, and run it on one core."""
+    compiler = shutil.which("g++")
+    flags = subprocess.run(
+        ["pkg-config", "--cflags-only-I", "pcl_segmentation"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if compiler is None or flags.returncode != 0:
+        sys.stderr.write("PCL is not installed (apt-get install libpcl-dev): left out\n")
+        return {}
+    with tempfile.TemporaryDirectory() as folder:
+        program, clouds = Path(folder) / "pcl_detection", Path(folder) / "clouds"
+        source = Path(__file__).with_name("pcl_detection.cpp")
+        libraries = [f"-lpcl_{name}" for name in PCL]
+        # Not -march=native: it changes the alignment of Eigen's types against the packaged PCL.
+        command = [compiler, "-O3", "-mtune=native", "-std=c++17", "-w", str(source)]
+        subprocess.run(
+            [*command, "-o", str(program), *flags.stdout.split(), *libraries, "-llz4"], check=True
+        )
+        with clouds.open("wb") as file:
+            for frame, up in zip(frames, ups, strict=True):
+                height, width = frame.depth.shape if frame.depth is not None else (1, 0)
+                file.write(np.array([width, height], np.int32).tobytes())
+                file.write(np.asarray(up, np.float32).tobytes())
+                file.write(frame.xyz().tobytes())
+        done = subprocess.run(
+            [str(program), str(clouds), "2"], capture_output=True, text=True, check=True
+        )
+    result: dict[str, list[float]] = {}
+    for line in done.stdout.splitlines():
+        method, _, milliseconds, _ = line.split()
+        result.setdefault(method.replace("_", ", "), []).append(float(milliseconds))
+    return result
