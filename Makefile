@@ -6,7 +6,7 @@ OPEN3D_LIBRARIES := libegl1 libgl1 libx11-6 libusb-1.0-0
 DEMO := demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test lint format bench model lock clean
+.PHONY: help setup demo test odd lint format bench model lock clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -30,7 +30,10 @@ demo: setup ## simulate a recording, process it, and say where the results lie
 	$(BIN)/shapecat process $(DEMO)/tabletop.mcap --out $(DEMO)/out --overwrite
 
 test: setup ## run all tests
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not slow'
+
+odd: setup ## process damaged and odd recordings, print what became of each
+	$(BIN)/python -m tests.odd
 
 lint: setup ## check style and types
 	$(BIN)/ruff format --check .

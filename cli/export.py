@@ -12,11 +12,11 @@ _FORMATS = ("crops", "kitti", "labelcloud", "point-labels")
 
 @click.command()
 @click.argument("runs", nargs=-1, required=True, type=ANY_PATH, metavar="RUN...")
-@click.option("--format", "kind", type=click.Choice(_FORMATS), required=True)
+@click.option("--format", "kind", type=click.Choice(_FORMATS), required=True, help="See above.")
 @click.option("--out", type=ANY_PATH, required=True, help="Crops go to OUT, others to OUT/NAME.")
 @click.option("--every", type=click.IntRange(1), default=1, help="Keep only every Nth frame.")
 def export(*, runs: tuple[Path, ...], kind: str, out: Path, every: int) -> None:
-    r"""Write the labels of runs, with their points, for other tools.
+    """Write the labels of runs, with their points, for other tools.
 
     \b
     crops         views of objects, laid out as for `shapecat train` and `learn`

@@ -15,7 +15,7 @@ from .render import print_json, progress_bars
 @seed_option
 @json_option
 def learn(*, model: Path, dataset: Path, out: Path, seed: int, as_json: bool) -> None:
-    r"""Teach a model the categories of a data set that it does not know.
+    """Teach a model the categories of a data set that it does not know.
 
     MODEL is a model file, or `default` for the one shipped with the package. What it knows stays
     as it is. DATASET is laid out as for `shapecat train`, for example by `shapecat export --format

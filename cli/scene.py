@@ -12,7 +12,7 @@ from .options import ANY_PATH
 @click.option("--frame", type=click.IntRange(0), required=True, help="Number of the frame.")
 @click.option("--topic", help="Its cloud stream; needed if there are several.")
 def scene(*, run: Path, frame: int, topic: str | None) -> None:
-    r"""Print what stands on what in one frame of a run.
+    """Print what stands on what in one frame of a run.
 
     \b
     shapecat scene results/lab --frame 12

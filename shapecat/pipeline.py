@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from shapecat.corrections import adopt_labels, read_labels
+from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import NoStreamError, OutputError
 from shapecat.jit import CompileClock, compile_clock
 from shapecat.jobs import Job, Summary, describe_run, resume, same_work, summarize
@@ -50,6 +51,7 @@ def process(job: Job, observe: Observer = _ignore) -> Summary:
     begun = time.perf_counter()
     with open_recording(job.source) as recording, _compile_clock(observe) as compiled:
         categorizer = load_model(job.model)
+        categorizer.require_descriptor(DESCRIPTOR_NAMES)
         run = describe_run(job, categorizer)
         run["options"]["topics"] = [s.topic for s in choose_streams(recording, job.topics)]
         if job.folder.exists() and not job.overwrite:

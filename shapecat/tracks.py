@@ -41,7 +41,9 @@ def track_run(
     -------
     The number of tracks per category.
     """
-    tracks = track_recording(_read_frames(folder, len(categories)), settings)
+    placed = _streams_with_poses(folder)
+    frames = _read_frames(folder, len(categories), placed)
+    tracks = track_recording(frames, settings, together=placed)
     with replacing(folder / "tracks.parquet") as path:
         write_table(path, _columns(tracks), TRACKS)
     labels = [_label(track, categories) for track in tracks]
@@ -50,9 +52,11 @@ def track_run(
     return dict(Counter(labels))
 
 
-def _read_frames(folder: Path, categories: int) -> Iterator[FrameDetections]:
-    """Yield the detections of each frame, all of a stream in one and the same frame."""
-    fixed = _streams_with_poses(folder)
+def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[FrameDetections]:
+    """Yield the detections of each frame, all of a stream in one and the same frame.
+
+    ``fixed`` are the topics whose detections are taken in the fixed frame.
+    """
     groups = zip(
         read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns"]),
         read_row_groups(folder / "detections.parquet", _COLUMNS),
@@ -108,7 +112,7 @@ def _columns(tracks: Sequence[Track]) -> dict[str, Any]:
     detections = [int(d) for track in tracks for d in track.detections]
     return {
         "track": np.repeat([track.id for track in tracks], counts).tolist(),
-        "topic": [track.topic for track, n in zip(tracks, counts, strict=True) for _ in range(n)],
+        "topic": [topic for track in tracks for topic in track.topics],
         "frame": [int(f) for track in tracks for f in track.frames],
         "stamp_ns": [int(s) for track in tracks for s in track.stamps_ns],
         "detection": [d if d >= 0 else None for d in detections],

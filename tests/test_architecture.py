@@ -1,9 +1,9 @@
 """The layout is enforced: layers, import cost, no forbidden constructs."""
 
 import ast
+import resource
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -65,16 +65,17 @@ def test_no_print_eval_or_bare_except(path: Path) -> None:
 
 
 def test_help_answers_at_once() -> None:
-    """A shell completion that takes a second makes people avoid a tool."""
+    """A command that takes a second to explain itself makes people avoid it."""
     command = [sys.executable, "-m", "shapecat", "--help"]
     subprocess.run(command, check=True, capture_output=True)  # write the byte code
     seconds = []
     for _ in range(5):
-        begun = time.perf_counter()
+        begun = resource.getrusage(resource.RUSAGE_CHILDREN)
         subprocess.run(command, check=True, capture_output=True)
-        seconds.append(time.perf_counter() - begun)
+        ended = resource.getrusage(resource.RUSAGE_CHILDREN)
+        seconds.append(ended.ru_utime + ended.ru_stime - begun.ru_utime - begun.ru_stime)
 
-    assert min(seconds) < 0.3
+    assert min(seconds) < 0.3  # processor time: other tests run beside this one
 
 
 def test_help_loads_no_heavy_library() -> None:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from shapecat.config import DetectionSettings
 from shapecat.detection import Hierarchy, Node, detect, format_tree
+from shapecat.errors import ConfigError
 from shapecat.types import Camera, Frame, Scene
 
 Array = NDArray[Any]
@@ -343,6 +344,17 @@ def test_plain_rules_are_the_thesis() -> None:
     assert len(scene.candidates) == 1
 
 
+def test_unknown_rule_is_refused() -> None:
+    """A misspelt rule is not silently switched off."""
+    depth, _ = render([table()])
+    with pytest.raises(ConfigError, match="known: concave"):
+        detect(
+            frame_of(depth),
+            settings=DetectionSettings(rules="concav"),
+            rng=np.random.default_rng(0),
+        )
+
+
 @pytest.mark.parametrize("up", [(0, 0, 0), (np.nan, 0, 1), (0, 1)])
 def test_hint_that_is_no_direction(up: tuple[float, ...]) -> None:
     """A wrong hint is the caller's mistake."""
@@ -446,3 +458,42 @@ def test_board_on_thin_legs_is_furniture() -> None:
     assert overlaps(scene, seen, [6])[0] > 0.85
     on_table = [c for c in scene.candidates if c.plane == 1]
     assert len(on_table) == 1
+
+
+def world_points(shapes: list[Shape], turn_deg: float, seed: int) -> Array:
+    """Return what a camera sees from one side, as points in the world frame."""
+    c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+    def turned(shape: Shape) -> Shape:
+        return lambda origin, rays: shape(turn @ origin, rays @ turn.T)
+
+    depth, _ = render([turned(shape) for shape in shapes], tilt_deg=45, seed=seed)
+    points = frame_of(depth).xyz()
+    t = np.radians(45)
+    forward = np.array([0, np.cos(t), -np.sin(t)])
+    world_from_camera = np.stack([[1.0, 0, 0], np.cross(forward, [1.0, 0, 0]), forward], axis=1)
+    seen = points[np.isfinite(points[:, 0])] @ world_from_camera.T - 0.9 * forward
+    return np.asarray(seen @ turn.T)
+
+
+def test_cloud_fused_from_two_sides_in_the_frame_of_the_table() -> None:
+    """Its origin is no viewpoint, and half of its points are hidden from any one."""
+    shapes = [table(), box((-0.12, 0, 0), (0.1, 0.1, 0.12)), can(0.12, 0.05, 0, 0.04, 0.14)]
+    points = np.concatenate([world_points(shapes, 0, 0), world_points(shapes, 180, 1)])
+    scene = found(Frame("cloud", 0, 0, 0, "table", points=points))
+    np.testing.assert_allclose(scene.up, [0, 0, 1], atol=0.02)
+    assert len(scene.planes) == 1
+    assert abs(scene.planes[0].offset) < 0.005
+    assert len(scene.candidates) == 2
+    for x, candidate in zip((-0.12, 0.12), sorted(scene.candidates, key=lambda c: c.box.center[0]),
+                            strict=True):  # fmt: skip
+        mine = points[candidate.indices]
+        assert (abs(mine[:, 0] - x) < 0.075).all()
+        assert mine[:, 1].max() - mine[:, 1].min() > 0.07  # both sides
+
+
+def test_directly_overhead_camera() -> None:
+    """A camera that looks straight down has no horizontal viewing direction."""
+    check([table(), box((-0.1, 0, 0), (0.1, 0.1, 0.1)), can(0.12, 0, 0, 0.04, 0.1)], [1, 2],
+          tilt_deg=89.9)  # fmt: skip

@@ -59,7 +59,7 @@ def boxes(folder: Path) -> dict[int, list[tuple[int, np.ndarray]]]:
     shown = read_finished(folder).labels
     found: dict[int, list[tuple[int, np.ndarray]]] = {}
     for row in rows(folder, "detections"):
-        track = owner.get((row["frame"], row["detection"]))
+        track = owner.get((row["frame"], row["detection"]), 0)
         if track in shown:
             half = np.array(row["size"]) / 2
             unit = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
@@ -78,7 +78,7 @@ def test_crops_are_a_data_set_with_corrected_labels(run: Path, tmp_path: Path) -
     count = export_run(run, "crops", tmp_path)
 
     views = list(read_dataset(tmp_path))
-    by_track = {}
+    by_track: dict[int, list[Any]] = {}
     for view in views:
         by_track.setdefault(int(view.instance.rsplit("-", 1)[1]), []).append(view)
     labels = read_finished(run).labels
@@ -270,7 +270,7 @@ def test_masks_label_the_pixels_of_each_object(run: Path, tmp_path: Path) -> Non
     }
     labels = read_finished(run).labels
     for row in rows(run, "detections"):
-        track = owner.get((row["frame"], row["detection"]))
+        track = owner.get((row["frame"], row["detection"]), 0)
         name = f"{row['frame']:06d}.png"
         instance = np.asarray(image.open(out / "instance" / name)).ravel()
         semantic = np.asarray(image.open(out / "semantic" / name)).ravel()

@@ -1,16 +1,20 @@
 """Corrections of tracks.csv: what a person writes, and what spreadsheets make of it."""
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
 
 from shapecat.corrections import TrackLabel, adopt_labels, read_labels, read_track_table
 from shapecat.errors import OutputError
 from shapecat.labels import read_labelled_frames
+from shapecat.pipeline import annotate_again
 from shapecat.tables import TRACKS, FrameRow, PerceptionTables, write_table
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
 
@@ -177,7 +181,7 @@ def test_lines_left_out_keep_their_label(run: Path) -> None:
     [
         b"\xef\xbb\xbftrack;category;confidence;label\r\n4;unknown;0,5;bowl\r\n",
         b"sep=;\r\ntrack;category;confidence;label\r\n4;unknown;0,5;bowl\r\n",
-        b'"label","track","note","confidence","category"\n"bowl","4.0","a, ""b""\nc",".5","unknown"\n',
+        b'"label","track","note","confidence","category"\n"bowl","4.0","a, ""b""\nc",".5","cup"\n',
         b"Track,Category,Confidence,Label,\r\n4.0,unknown,.5, Bowl ,\r\n,,,,\r\n\r\n",
         "track\tcategory\tconfidence\tlabel\n4\tunknown\t0.5\tbowl\n".encode("utf-16"),
         "track,category,confidence,label,größe\n4,unknown,0.5,bowl,ü\n".encode("cp1252"),
@@ -300,3 +304,47 @@ def test_a_deleted_track_ends_where_it_would_have_been_seen(tmp_path: Path) -> N
 
     assert [[o.track for o in f.objects] for f in frames] == [[1, 2], [1], [1]]
     assert [f.ended for f in frames] == [(), (2,), ()]
+
+
+def replayed(path: Path) -> list[tuple[int, set[str]]]:
+    """Replay the scene of a recording; return what is shown after each message, and its time."""
+    alive: dict[str, float] = {}
+    shown = []
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        messages = reader.iter_decoded_messages(topics=["/shapecat/scene"])
+        for _, _, message, scene in messages:
+            now = message.log_time
+            for deletion in scene.deletions:
+                alive.pop(deletion.id, None)
+            alive = {name: end for name, end in alive.items() if end > now}
+            for entity in scene.entities:
+                lifetime = entity.lifetime.sec * 10**9 + entity.lifetime.nanosec
+                assert lifetime > 0
+                alive[entity.id] = now + lifetime
+            assert len({entity.id for entity in scene.entities}) == len(scene.entities)
+            shown.append((now, set(alive)))
+    return shown
+
+
+def test_no_stale_box_is_shown_after_corrections(guessed_run: Path, tmp_path: Path) -> None:
+    """A box that was deleted or merged away, or outlives its object, misleads the viewer."""
+    folder = tmp_path / "table"
+    shutil.copytree(guessed_run, folder)
+    tracks = sorted(row.track for row in read_track_table(folder / "tracks.csv").rows)
+    a, b, c = tracks[:3]
+    corrected = tmp_path / "mine.csv"
+    corrected.write_text(
+        f"track,category,confidence,label\n{a},cup,0,delete\n{b},cup,0,merge with {c}\n"
+    )
+
+    annotate_again(folder, corrected)
+
+    labels = read_labels(folder / "tracks.csv")
+    frames = list(read_labelled_frames(folder, labels))
+    shown = replayed(folder / "annotated.mcap")
+    assert [time for time, _ in shown] == [frame.log_time_ns for frame in frames]
+    for (_, names), frame in zip(shown, frames, strict=True):
+        wanted = {str(item.track) for item in frame.objects}
+        assert {"".join(filter(str.isdigit, name)) for name in names} == wanted
+        assert not {str(a), str(b)} & wanted

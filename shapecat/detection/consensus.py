@@ -30,11 +30,15 @@ SAMPLE = 4800
 
 
 class Readings(NamedTuple):
-    """Cells in a list: ``j`` (n,) columns, ``i`` (n,) rows, ``w`` (n,) inverse depth, float32."""
+    """Cells in a list: ``j`` (n,) columns, ``i`` (n,) rows, ``w`` (n,) inverse depth, float32.
+
+    ``share`` is how many cells each stands for.
+    """
 
     j: F4
     i: F4
     w: F4
+    share: int
 
 
 def readings_of(cells: Cells, w: F4 | None = None) -> Readings:
@@ -44,14 +48,14 @@ def readings_of(cells: Cells, w: F4 | None = None) -> Readings:
     sample = image[stride // 2 :: stride, stride // 2 :: stride]
     i, j = np.nonzero(sample)
     place = [(k * stride + stride // 2).astype(np.float32) for k in (j, i)]
-    return Readings(place[0], place[1], sample[i, j])
+    return Readings(place[0], place[1], sample[i, j], stride * stride)
 
 
 def without(readings: Readings, plane: F8, tolerance: float) -> Readings:
     """Return the readings that are not near a plane."""
     a, b, c = plane.astype(np.float32)
     far = abs(readings.w - (a * readings.j + b * readings.i + c)) > tolerance
-    return Readings(readings.j[far], readings.i[far], readings.w[far])
+    return Readings(readings.j[far], readings.i[far], readings.w[far], readings.share)
 
 
 def normal_of(plane: F8, lens: Lens) -> F8:

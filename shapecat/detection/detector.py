@@ -6,7 +6,6 @@ from numpy.typing import ArrayLike
 from shapecat.arrays import F4, F8
 from shapecat.config import DetectionSettings
 from shapecat.detection.cells import cells_of
-from shapecat.detection.heights import table_of
 from shapecat.detection.pixels import pixels_of, points_of
 from shapecat.detection.scenes import scene_of
 from shapecat.detection.segmentation import Segmentation, segment
@@ -47,6 +46,7 @@ def detect(
     Raises
     ------
     ValueError : ``up`` is not a direction.
+    ConfigError : ``settings.rules`` names an unknown rule.
 
     Notes
     -----
@@ -85,8 +85,7 @@ def _in_image(
     )
     if cells is None or found is None:
         return None
-    planes = table_of(found.supports, cells.lens)
-    indices = pixels_of(depth, cells, found, planes, range_m=settings.max_range_m)
+    indices = pixels_of(depth, cells, found, range_m=settings.max_range_m)
     return scene_of(cells, found, indices, IDENTITY, settings=settings)
 
 
@@ -100,8 +99,7 @@ def _in_cloud(
         found = None if view is None else _seen(view, hint, settings, rng)
     if view is None or found is None:
         return None
-    planes = table_of(found.supports, view.cells.lens)
-    indices = points_of(view, found, planes, fused=view.crowded > CROWDED)
+    indices = points_of(view, found, fused=view.crowded > CROWDED)
     return scene_of(
         view.cells, found, indices, inverse(view.view_from_sensor), settings=settings,
         points=view.points,

@@ -13,9 +13,13 @@ from shapecat.jit import kernel
 
 __all__ = ["LEAST_M", "NOISE", "Heights", "heights_of", "inside", "table_of"]
 
+ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+COS, SIN = np.cos(ANGLES), np.sin(ANGLES)
 LEAST_M = 0.004
 """Lowest height of an object cell, to which `NOISE` times the squared range is added."""
-NOISE = 0.002
+NOISE = 0.0025
+BEYOND_M = 0.1
+"""What is level with a plane and this near to its outline is the plane, not an object below."""
 
 
 class Heights(NamedTuple):
@@ -35,7 +39,6 @@ class Heights(NamedTuple):
 def table_of(supports: list[Support], lens: Lens) -> F8:
     """Return one row of numbers per plane, for the kernels."""
     rows = np.zeros((len(supports), 13 + DIRECTIONS))
-    angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
     quarter, half = DIRECTIONS // 4, DIRECTIONS // 2
     for row, s in zip(rows, supports, strict=True):
         n = (s.a * lens.fx, s.b * lens.fy, s.a * lens.cx + s.b * lens.cy + s.c)
@@ -45,17 +48,17 @@ def table_of(supports: list[Support], lens: Lens) -> F8:
         # A circle inside the outline, for a quick answer.
         middle = (s.reach[[0, quarter]] - s.reach[[half, half + quarter]]) / 2
         row[10:12] = middle
-        room = s.reach - middle[0] * np.cos(angle) - middle[1] * np.sin(angle)
+        room = s.reach - middle[0] * COS - middle[1] * SIN
         row[12] = max(float(room.min()), 0.0) ** 2
         row[13:] = s.reach
     return rows
 
 
-def heights_of(cells: Cells, supports: list[Support], *, highest_m: float) -> Heights:
-    """Give every cell to the highest plane it is above."""
+def heights_of(cells: Cells, planes: F8, *, highest_m: float) -> Heights:
+    """Give every cell to the highest plane it is above; ``planes`` are the rows of `table_of`."""
     owner = np.zeros(cells.w.shape, np.int8)
     height = np.zeros(cells.w.shape, np.float32)
-    for k, row in reversed(list(enumerate(table_of(supports, cells.lens)))):
+    for k, row in reversed(list(enumerate(planes))):
         _stand(cells.w, cells.lens, row, k + 1, highest_m, owner, height)
     return Heights(owner, height)
 
@@ -82,20 +85,20 @@ def _stand(
                 continue
             z = 1.0 / w[i, j]
             x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
-            if inside(plane, x, y, z):
-                owner[i, j] = number if line[j] > least + noise * z * z else -number
+            above = line[j] > least + noise * z * z
+            if inside(plane, x, y, z, 0.0 if above else BEYOND_M):
+                owner[i, j] = number if above else -number
                 height[i, j] = line[j]
 
 
 @kernel
-def inside(plane: F8, x: float, y: float, z: float) -> bool:
-    """Whether a point is within the outline of a row of `table_of`."""
+def inside(plane: F8, x: float, y: float, z: float, slack: float) -> bool:
+    """Whether a point is within the outline of a row of `table_of`, or ``slack`` beyond it."""
     p = plane[4] * x + plane[5] * y + plane[6] * z
     q = plane[7] * x + plane[8] * y + plane[9] * z
     if (p - plane[10]) ** 2 + (q - plane[11]) ** 2 < plane[12]:
         return True
-    for k in range(DIRECTIONS):
-        angle = k * (2 * math.pi / DIRECTIONS)
-        if math.cos(angle) * p + math.sin(angle) * q > plane[13 + k]:
+    for k in range(DIRECTIONS):  # noqa: SIM110  kernels have no generators
+        if COS[k] * p + SIN[k] * q > plane[13 + k] + slack:
             return False
     return True

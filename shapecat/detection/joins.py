@@ -57,8 +57,6 @@ def join_pieces(
         _join_necks(pieces)
     if "float" in rules:
         _join_floating(pieces)
-    if "enclosed" in rules:
-        _join_enclosed(pieces)
 
 
 @kernel
@@ -131,27 +129,3 @@ def _join_floating(pieces: Pieces) -> None:
             ):
                 merge(pieces, q, p)
                 again = True
-
-
-@kernel
-def _join_enclosed(pieces: Pieces) -> None:
-    """Join a piece almost surrounded by one taller piece: it lies inside it."""
-    n = pieces.group.size
-    pairs = pieces.pairs
-    for p in range(1, n):
-        if not is_group(pieces, p):
-            continue
-        for q in range(1, n):
-            if q == p or not is_group(pieces, q):
-                continue
-            shared = (
-                pairs[CONTACT, p, q] + pairs[NEAR, p, q] + pairs[FRONT, p, q] + pairs[FRONT, q, p]
-            )
-            if (
-                shared >= 0.8 * pieces.boundary[p]
-                and pairs[FRONT, q, p] >= 0.15 * pieces.boundary[p]
-                and pairs[FRONT, p, q] < 0.1 * pieces.boundary[p]
-                and pieces.shape[q, TOP] > pieces.shape[p, TOP]
-            ):
-                merge(pieces, q, p)
-                break

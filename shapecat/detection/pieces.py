@@ -18,6 +18,7 @@ __all__ = [
     "BOTTOM",
     "CONTACT",
     "COUNT",
+    "FAR",
     "FEW",
     "FRONT",
     "HIDDEN",
@@ -48,7 +49,7 @@ depth over a gap; links whose far side on q faces up, and the sum of its heights
 TABLE, HIDDEN, RIM = range(3)
 """Statistics of one piece: links with its plane; boundary behind things that are no piece; links
 with a higher plane, from below."""
-COUNT, LEFT, RIGHTMOST, SIDE, SIDE2, TURN, SIDETURN, TOP, BOTTOM, AREA = range(10)
+COUNT, LEFT, RIGHTMOST, SIDE, SIDE2, TURN, SIDETURN, TOP, BOTTOM, AREA, FAR = range(11)
 FEW = 3
 """Links between two pieces that are taken for a contact rather than for noise."""
 SAMPLES = 48
@@ -69,8 +70,8 @@ class Pieces(NamedTuple):
     pairs : (5, n + 1, n + 1) float32, see `CONTACT` and the following.
     single : (n + 1, 3) float32, see `TABLE` and `HIDDEN`.
     boundary : (n + 1,) float32 sides of cells on the boundary.
-    shape : (n + 1, 10) float32: cells, lateral range, sums for the regression of the lateral
-        normal on the lateral position, height range, area.
+    shape : (n + 1, 11) float32: cells, lateral range, sums for the regression of the lateral
+        normal on the lateral position, height range, area, sum of the depths.
     lid : (n + 1, BANDS) float32 m2 of surface that faces up, by height.
     samples : (n + 1, SAMPLES) int32 cells away from edges, -1 beyond the last.
     owner : (n + 1,) int8 the plane it is above, as in `Heights.owner`.
@@ -96,7 +97,7 @@ def pieces_of(
         np.zeros((5, size, size), np.float32),
         np.zeros((size, 3), np.float32),
         np.zeros(size, np.float32),
-        np.zeros((size, 10), np.float32),
+        np.zeros((size, 11), np.float32),
         np.zeros((size, BANDS), np.float32),
         np.full((size, SAMPLES), -1, np.int32),
         np.zeros(size, np.int8),
@@ -231,6 +232,7 @@ def _measure(
             row = shape[p]
             pieces.owner[p] = owner[i, j]
             row[COUNT] += 1
+            row[FAR] += z
             row[LEFT] = min(row[LEFT], along)
             row[RIGHTMOST] = max(row[RIGHTMOST], along)
             h = height[i, j]
@@ -280,7 +282,7 @@ def merge(pieces: Pieces, p: int, q: int) -> None:
     pieces.single[p] += pieces.single[q]
     pieces.lid[p] += pieces.lid[q]
     a, b = pieces.shape[p], pieces.shape[q]
-    for k in (COUNT, SIDE, SIDE2, TURN, SIDETURN, AREA):
+    for k in (COUNT, SIDE, SIDE2, TURN, SIDETURN, AREA, FAR):
         a[k] += b[k]
     a[LEFT], a[RIGHTMOST] = min(a[LEFT], b[LEFT]), max(a[RIGHTMOST], b[RIGHTMOST])
     a[TOP], a[BOTTOM] = max(a[TOP], b[TOP]), min(a[BOTTOM], b[BOTTOM])

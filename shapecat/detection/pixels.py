@@ -21,14 +21,11 @@ SURE_M = 0.03
 """A reading within one jump of a cell this high is above the plane itself."""
 
 
-def pixels_of(
-    depth: F4, cells: Cells, found: Segmentation, planes: F8, *, range_m: float
-) -> list[U4]:
+def pixels_of(depth: F4, cells: Cells, found: Segmentation, *, range_m: float) -> list[U4]:
     """Return the ascending pixel indices of the labels 1, 2, ...
 
     A pixel takes the label of its cell, or else of the neighbour whose depth fits best; it keeps
-    it only where it is above the plane itself, except in filled cells. ``planes`` are the rows of
-    `table_of`.
+    it only where it is above the plane itself, except in filled cells.
     """
     marks = np.zeros(depth.shape, np.int16)
     sizes = np.zeros(found.leaders.size, np.int64)
@@ -37,7 +34,7 @@ def pixels_of(
         cells.w,
         found.labels,
         found.heights,
-        planes,
+        found.planes,
         found.owners,
         found.filled,
         cells.factor,
@@ -48,7 +45,7 @@ def pixels_of(
     return _sorted(marks.reshape(-1), sizes)
 
 
-def points_of(view: View, found: Segmentation, planes: F8, *, fused: bool) -> list[U4]:
+def points_of(view: View, found: Segmentation, *, fused: bool) -> list[U4]:
     """Return the ascending point indices of the labels, as `pixels_of`.
 
     With ``fused`` points behind the visible surface are given to what they touch; lists beyond
@@ -63,7 +60,7 @@ def points_of(view: View, found: Segmentation, planes: F8, *, fused: bool) -> li
         cells.w,
         cells.lens,
         found.labels,
-        planes,
+        found.planes,
         found.owners,
         found.filled,
         marks,
@@ -71,7 +68,7 @@ def points_of(view: View, found: Segmentation, planes: F8, *, fused: bool) -> li
     )
     if fused:
         above = marks > 0
-        for plane in planes:
+        for plane in found.planes:
             above |= _above(points, view.cell, cells.lens, plane)
         loose = np.flatnonzero(above)
         if loose.size:
@@ -90,7 +87,9 @@ def _above(points: F4, cell: I4, lens: Lens, plane: F8) -> Bool:
             x, y, z = points[k, 0], points[k, 1], points[k, 2]
             level = plane[0] * (lens.fx * x / z + lens.cx) + plane[1] * (lens.fy * y / z + lens.cy)
             h = (1 / z - level - plane[2]) * z * plane[3]
-            result[k] = h > LEAST_M + NOISE * z * z and h < HIGHEST_M and inside(plane, x, y, z)
+            result[k] = (
+                h > LEAST_M + NOISE * z * z and h < HIGHEST_M and inside(plane, x, y, z, 0.0)
+            )
     return result
 
 

@@ -15,8 +15,8 @@ from shapecat.detection.boards import boards_of
 from shapecat.detection.cells import Cells
 from shapecat.detection.directions import estimate_up
 from shapecat.detection.fill import fill_enclosed, grow_feet
-from shapecat.detection.furniture import is_furniture
-from shapecat.detection.heights import heights_of
+from shapecat.detection.furniture import is_no_object
+from shapecat.detection.heights import heights_of, table_of
 from shapecat.detection.joins import join_pieces
 from shapecat.detection.pieces import Pieces, pieces_of
 from shapecat.detection.planes import Support, find_planes
@@ -24,6 +24,7 @@ from shapecat.detection.regions import regions_of
 from shapecat.detection.rings import join_rings
 from shapecat.detection.surfaces import surfaces_of
 from shapecat.detection.walls import clear_walls
+from shapecat.errors import ConfigError
 
 __all__ = ["RULES", "Segmentation", "segment"]
 
@@ -35,7 +36,6 @@ RULES = (
     "rim",
     "neck",
     "float",
-    "enclosed",
     "ring",
     "feet",
     "fill",
@@ -51,6 +51,7 @@ class Segmentation(NamedTuple):
     ----------
     up : (3,) unit vector.
     supports : the planes, lowest first.
+    planes : their rows of `table_of`.
     labels : (rows, columns) int16, 1..count, 0 elsewhere.
     heights : (rows, columns) float32 metres above the plane.
     filled : (rows, columns) uint8, 1 where a label lies at the level of the plane.
@@ -60,6 +61,7 @@ class Segmentation(NamedTuple):
 
     up: F8
     supports: list[Support]
+    planes: F8
     labels: I4
     heights: F4
     filled: U1
@@ -72,6 +74,15 @@ class Segmentation(NamedTuple):
         return np.maximum(self.pieces.owner[self.leaders].astype(np.int64) - 1, 0)
 
 
+def _checked(text: str) -> list[str]:
+    rules = text.split()
+    unknown = [rule for rule in rules if rule not in RULES]
+    if unknown:
+        msg = f"detection.rules: unknown {', '.join(unknown)}; known: {' '.join(RULES)}"
+        raise ConfigError(msg)
+    return rules
+
+
 def segment(
     cells: Cells,
     hint: F8 | None,
@@ -81,13 +92,14 @@ def segment(
     rng: np.random.Generator,
 ) -> Segmentation | None:
     """Find planes and objects among ``cells``; None if there is no supporting plane."""
-    rules = settings.rules.split()
+    rules = _checked(settings.rules)
     up = estimate_up(cells, hint, upright=upright, rng=rng)
     supports = [] if up is None else boards_of(cells, find_planes(cells, up))
     if up is None or not supports:
         return None
     up = max(supports, key=lambda s: s.area_m2).up
-    heights = heights_of(cells, supports, highest_m=settings.max_height_m)
+    planes = table_of(supports, cells.lens)
+    heights = heights_of(cells, planes, highest_m=settings.max_height_m)
     clear_walls(cells, heights.owner, up, largest_m=settings.max_size_m, rng=rng)
     surfaces = surfaces_of(cells, heights)
     regions, n = regions_of(heights, surfaces, concave="concave" in rules)
@@ -95,8 +107,8 @@ def segment(
     join_pieces(pieces, cells, surfaces, regions, rules)
     if "ring" in rules:
         join_rings(pieces, cells.w, heights.height, regions)
-    furniture = is_furniture(pieces, largest_m=settings.max_size_m)
-    pieces.group[furniture[pieces.group]] = 0
+    refused = is_no_object(pieces, largest_m=settings.max_size_m)
+    pieces.group[refused[pieces.group]] = 0
     leaders, number = np.unique(pieces.group, return_inverse=True)
     labels = number.astype(np.int16)[regions]
     if "feet" in rules:
@@ -104,4 +116,4 @@ def segment(
     filled = fill_enclosed(
         cells.w, heights.height, labels, leaders.size - 1, active="fill" in rules
     )
-    return Segmentation(up, supports, labels, heights.height, filled, pieces, leaders)
+    return Segmentation(up, supports, planes, labels, heights.height, filled, pieces, leaders)

@@ -45,12 +45,10 @@ def clear_walls(
 def _is_wall(readings: Readings, cells: Cells, plane: F8, up: F8, largest_m: float) -> bool:
     normal = normal_of(plane, cells.lens)
     across = np.cross(normal, up)
-    # Each reading stands for as many cells as the sampling skips.
-    share = np.count_nonzero(cells.w) / max(readings_of(cells).w.size, 1)
     strips = np.zeros((2, STRIPS))
-    area = share * _measure(readings, cells.lens, plane, normal, across, up, strips)
+    area = readings.share * _measure(readings, cells.lens, plane, normal, across, up, strips)
     # A strip of 5 cm counts that holds 5 cm of wall.
-    reach = STRIP_M * np.count_nonzero(share * strips > STRIP_M**2, axis=1)
+    reach = STRIP_M * np.count_nonzero(readings.share * strips > STRIP_M**2, axis=1)
     dense = area > FILLED * reach[0] * reach[1]
     return bool(area > LEAST_AREA_M2 and dense and reach.max() > largest_m)
 

@@ -58,7 +58,7 @@ class Simulated(NamedTuple):
 
 
 @click.command()
-@click.option("--worlds", default=1500, show_default=True, help="Tables to learn from.")
+@click.option("--worlds", default=700, show_default=True, help="Tables to learn from.")
 @click.option("--seed", default=0, show_default=True, help="Seed of the learners.")
 @click.option("--jobs", default=2, show_default=True, help="Processes.")
 @click.option("--out", default=_HERE, type=click.Path(path_type=Path), help="Folder to write to.")

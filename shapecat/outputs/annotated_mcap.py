@@ -82,16 +82,21 @@ def write_annotated(
 def _annotations(frames: Iterable[LabelledFrame]) -> Iterator[Annotation]:
     """Look one frame ahead for the lifetime, and back for what is no longer shown."""
     periods: dict[str, int] = {}
+    last: dict[str, int] = {}
     shown: dict[str, set[int]] = {}
     for frame, following in pairwise(chain(frames, [None])):
         if frame is None:
             return
         if following is not None and following.topic == frame.topic:
             periods[frame.topic] = max(1, following.stamp_ns - frame.stamp_ns)
+        elif frame.topic in last:
+            periods[frame.topic] = max(1, frame.stamp_ns - last[frame.topic])
+        last[frame.topic] = frame.stamp_ns
         period = periods.get(frame.topic, _PERIOD_NS)
         here = {item.track for item in frame.objects}
         gone = (shown.get(frame.topic, set()) | set(frame.ended)) - here
         shown[frame.topic] = here
+        gone -= set().union(*shown.values())  # another sensor still sees it
         yield Annotation(frame, round(_LIFETIME * period), tuple(sorted(gone)))
 
 

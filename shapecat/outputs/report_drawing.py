@@ -107,7 +107,7 @@ def _shade(spots: F8) -> U1:
 
     The surface is lit from above and left by the slopes of its smoothed nearness.
     """
-    near = _nearest(spots)
+    near = _closed(_nearest(spots))
     bare = ~np.isfinite(near)
     smooth = _smoothed(near, bare)
     down, right = np.gradient(smooth)
@@ -123,7 +123,7 @@ def _nearest(spots: F8) -> F8:
     """Return (h, w) the nearness of the nearest disc at each pixel, -inf where there is none."""
     near = np.full((SIDE, SIDE), -np.inf)
     area = float(np.prod(np.ptp(spots[:, :2], axis=0) + 1))
-    radius = float(np.clip(0.8 * np.sqrt(area / len(spots)), 1.0, 4.5))
+    radius = float(np.clip(0.9 * np.sqrt(area / len(spots)), 1.0, 4.5))
     reach = int(np.ceil(radius))
     columns, rows = np.round(spots[:, :2].T).astype(int)
     for dy in range(-reach, reach + 1):
@@ -133,6 +133,16 @@ def _nearest(spots: F8) -> F8:
             u, v = columns + dx, rows + dy
             inside = (u >= 0) & (u < SIDE) & (v >= 0) & (v < SIDE)
             np.maximum.at(near, (v[inside], u[inside]), spots[inside, 2])
+    return near
+
+
+def _closed(near: F8, passes: int = 3) -> F8:
+    """Fill bare pixels that are mostly surrounded by the object."""
+    for _ in range(passes):
+        solid = np.isfinite(near)
+        share = _blurred(solid.astype(np.float64))
+        mean = _blurred(np.where(solid, near, 0.0)) / np.maximum(share, 1e-9)
+        near = np.where(~solid & (share > 0.5), mean, near)
     return near
 
 

@@ -3,6 +3,7 @@
 import hashlib
 import json
 import re
+import shlex
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -84,7 +85,9 @@ def run_page(
         warnings=_warnings([*run["warnings"], *notes]),
         chips="".join(_chip(name, counts[name]) for name in _ordered(counts, names)),
         cards="".join(_card(card, run["model"]["categories"], end) for card in cards),
-        command=escape(f"shapecat annotate {finished.folder} --labels tracks.csv"),
+        command=escape(
+            f"shapecat annotate {shlex.quote(str(finished.folder))} --labels tracks.csv"
+        ),
         timings=_timings(run["seconds"], stages),
         facts=_facts(run),
         names="".join(f'<option value="{escape(name)}">' for name in names),

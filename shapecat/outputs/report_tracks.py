@@ -133,7 +133,7 @@ def _read_views(folder: Path, wanted: Mapping[_Key, int]) -> dict[int, dict[str,
             *(detections[name].to_pylist() for name in ("topic", "frame", "detection")), strict=True
         )
         chosen = [k for k, key in enumerate(names) if key in wanted]
-        for row in detections.take(chosen).to_pylist():
+        for row in detections.take(pa.array(chosen, pa.int64())).to_pylist():
             track = wanted[row["topic"], row["frame"], row["detection"]]
             views[track] = row | {"up": ups[row["topic"], row["frame"]]}
     return views

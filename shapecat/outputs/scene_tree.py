@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from shapecat.detection.hierarchy import Node, format_tree
 from shapecat.errors import OutputError
@@ -72,7 +73,8 @@ def _rows(
     for group in read_row_groups(folder / f"{table}.parquet", columns):
         numbers, topics = group["frame"].to_pylist(), group["topic"].to_pylist()
         keys = enumerate(zip(topics, numbers, strict=True))
-        found += group.take([k for k, key in keys if key == (topic, frame)]).to_pylist()
+        chosen = pa.array([k for k, key in keys if key == (topic, frame)], pa.int64())
+        found += group.take(chosen).to_pylist()
     return found
 
 

@@ -7,6 +7,7 @@ out, and both are said in the warnings.
 import zlib
 from collections import Counter
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
@@ -176,10 +177,34 @@ class McapRecording(Recording):
                 return None
             summary = self._collect(start, footer_at)
             summary.data_end = self._find_data_end(summary, start)
+            if not footer.summary_crc and not self._agrees(summary):
+                return None
         except RecordingError:
             self.warn("the index is damaged: read from beginning to end instead")
             return None
         return summary if _is_complete(summary) else None
+
+    def _agrees(self, summary: Summary) -> bool:
+        """Tell whether the channels are those that the chunks describe, which come first."""
+        unseen = set(summary.channels)
+        for chunk in sorted(summary.chunks, key=lambda chunk: chunk.chunk_start_offset):
+            if unseen.isdisjoint(chunk.message_index_offsets):
+                continue
+            unseen -= chunk.message_index_offsets.keys()
+            record = next(walk(self._file, chunk.chunk_start_offset, self._size))
+            with suppress(ChunkError):  # damaged: found out when it is read
+                for opcode, content in split_chunk(read_chunk(self.content(record))):
+                    if opcode == Opcode.SCHEMA:
+                        schema = parse(records.Schema.read, content)
+                        same = summary.schemas.get(schema.id) == schema
+                    elif opcode == Opcode.CHANNEL:
+                        channel = parse(records.Channel.read, content)
+                        same = summary.channels.get(channel.id) == channel
+                    else:
+                        same = True
+                    if not same:
+                        return False
+        return True
 
     def _checksum(self, start: int) -> int:
         """Return the checksum of the summary, and of the footer up to its own checksum."""
@@ -251,8 +276,8 @@ class McapRecording(Recording):
         else:
             lost = self._size - end
             self.warn(
-                f"the recording was not finished: recovered {self._counts.total()} messages; "
-                f"of the last {lost} bytes what could be read"
+                f"the recording was not finished: recovered {self._counts.total()} messages"
+                + (f", of the last {lost} bytes what could be read" if lost else "")
             )
 
     def _in_file(self, wanted: set[int]) -> Iterator[RawMessage]:

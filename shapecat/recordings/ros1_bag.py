@@ -62,6 +62,7 @@ class BagRecording(Recording):
         super().__init__(path)
         self._channels: dict[int, Channel] = {}
         self._chunks: list[_ChunkInfo] | None = None
+        self._promised: dict[int, int] = {}
         self._file = path.open("rb")
         try:
             self._size = self._file.seek(0, 2)
@@ -163,6 +164,7 @@ class BagRecording(Recording):
         if not self._agrees(chunks):
             return None
         self._chunks = chunks
+        self._promised = {chunk.position: sum(chunk.counts.values()) for chunk in chunks}
         filled = [chunk for chunk in chunks if chunk.counts]
         if filled:
             self.start_ns = min(chunk.start for chunk in filled)
@@ -229,10 +231,14 @@ class BagRecording(Recording):
                 self._take(record.fields, memoryview(data))
                 return
             plain, problem = expand(record, data)
+            count = 0
             for fields, content in split(plain):
                 found = self._take(fields, content)
                 if found is not None:
+                    count += 1
                     yield found
+            if self._chunks is not None and count != self._promised[record.start]:
+                problem = problem or f"{count} messages where the index has more or fewer"
         except BagError as error:
             problem = problem or str(error)
         if problem:

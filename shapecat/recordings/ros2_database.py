@@ -83,6 +83,9 @@ class DatabaseRecording(Recording):
                 self.warn(f"damaged: nothing read after this: {error or type(error).__name__}")
                 return
             channel = self._channels[connection.id]
+            if not isinstance(data, bytes | memoryview):  # SQLite has no types: maybe a number
+                self.warn(f"{channel.topic}: left out a message that holds no bytes")
+                continue
             plain = self._plain(channel, bytes(data))
             if plain is not None:
                 yield Message(channel, time, time, 0, plain)

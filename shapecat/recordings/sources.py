@@ -122,6 +122,7 @@ class DepthSource(Source):
         self.lens = Lens(recording, stream.topic)
         self._waiting: tuple[Message, int, Any] | None = None
         self._info: Any = None
+        self._info_stamp: int | None = None
 
     def calibrate(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
         """Take a calibration; yield the image that waited for it."""
@@ -132,24 +133,24 @@ class DepthSource(Source):
             self.recording.warn(f"left out a calibration: {error}")
             return
         if self._waiting is None:
-            self._info = info
+            self._info, self._info_stamp = info, stamp
             return
         wanted = stamp_ns(self._waiting[2].header)
         # A later calibration means that the image's own is missing: the last one has to do.
         if stamp <= wanted or self._info is None:
-            self._info = info
+            self._info, self._info_stamp = info, stamp
         if stamp >= wanted:
             yield from self.finish(skipped)
-            self._info = info
+            self._info, self._info_stamp = info, stamp
 
     def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
         """Hold an image back until its calibration is there; yield the one before it."""
         yield from self.finish(skipped)
         with _counting(skipped):
             image = self.recording.decode(message)
-            stamp = stamp_ns(image.header)
+            stamp_ns(image.header)
             self._waiting = (message, self.index - 1, image)
-        if self._waiting and self._info is not None and stamp_ns(self._info.header) == stamp:
+        if self._waiting and stamp_ns(self._waiting[2].header) == self._info_stamp:
             yield from self.finish(skipped)
 
     def finish(self, skipped: Counter[str]) -> Iterator[Frame]:

@@ -119,7 +119,8 @@ class TransformBuffer:
         """
         parent, child = parent.strip().lstrip("/"), child.strip().lstrip("/")
         translation, quaternion = (np.asarray(part, np.float64) for part in parent_from_child)
-        norm = float(np.linalg.norm(quaternion))
+        with np.errstate(over="ignore", invalid="ignore"):
+            norm = float(np.linalg.norm(quaternion))
         fine = np.isfinite(translation).all() and np.isfinite(norm) and norm > 1e-6
         if not (fine and parent and child and parent != child):
             return False

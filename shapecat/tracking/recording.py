@@ -1,7 +1,8 @@
 """From the detections of a recording to its tracks, with the future known."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
+from heapq import merge
 
 import numpy as np
 
@@ -40,13 +41,18 @@ class _Hits:
 
 
 def track_recording(
-    frames: Iterable[FrameDetections], settings: TrackingSettings
+    frames: Iterable[FrameDetections],
+    settings: TrackingSettings,
+    *,
+    together: Collection[str] = (),
 ) -> tuple[Track, ...]:
     """Track the objects of a recording, stream by stream.
 
     Parameters
     ----------
     frames : all frames, also those without detections, each stream in its order of recording.
+    together : topics whose centres are in one and the same frame: an object that several of
+        these sensors see is one track.
 
     Returns
     -------
@@ -61,10 +67,20 @@ def track_recording(
     """
     streams: dict[str, list[FrameDetections]] = {}
     for frame in frames:
-        streams.setdefault(frame.topic, []).append(frame)
+        streams.setdefault("" if frame.topic in together else frame.topic, []).append(frame)
+    if len(together) > 1 and "" in streams:
+        streams[""] = _interleaved(streams[""])
     found = [track for stream in streams.values() for track in _track_stream(stream, settings)]
     found.sort(key=lambda track: int(track.stamps_ns[0]))  # stable: then stream, then birth
     return tuple(_renumbered(track, k + 1) for k, track in enumerate(found))
+
+
+def _interleaved(frames: Iterable[FrameDetections]) -> list[FrameDetections]:
+    """Merge streams by time, each kept in its order of recording."""
+    streams: dict[str, list[FrameDetections]] = {}
+    for frame in frames:
+        streams.setdefault(frame.topic, []).append(frame)
+    return list(merge(*streams.values(), key=lambda frame: frame.stamp_ns))
 
 
 def _track_stream(frames: Sequence[FrameDetections], settings: TrackingSettings) -> list[Track]:
@@ -186,13 +202,16 @@ def _inside(hits: _Hits, member: I4, host: I4) -> bool:
 def _build_track(hits: _Hits, member: I4, settings: TrackingSettings) -> Track:
     rows, source = _rows_with_gaps(hits, member, settings.max_missed_s)
     seen = hits.rows[member]
+    sensors = {hits.frames[r].topic for r in seen}
+    own = np.array([hits.frames[r].topic in sensors for r in rows])
+    rows, source = rows[own], source[own]
     weights = view_weights(hits.partial[member])
     so_far = causal(hits.posteriors[member], settings.fusion, weights)
     stamps = np.array([hits.frames[r].stamp_ns for r in rows], np.int64)
     at = np.searchsorted(seen, rows, side="right") - 1  # the last detection up to each row
     return Track(
         0,
-        hits.frames[0].topic,
+        tuple(hits.frames[r].topic for r in rows),
         len(member),
         np.array([hits.frames[r].frame for r in rows]),
         stamps,
@@ -220,7 +239,7 @@ def _rows_with_gaps(hits: _Hits, member: I4, max_gap_s: float) -> tuple[I4, Bool
 def _renumbered(track: Track, number: int) -> Track:
     return Track(
         number,
-        track.topic,
+        track.topics,
         track.hits,
         track.frames,
         track.stamps_ns,

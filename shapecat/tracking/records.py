@@ -10,7 +10,7 @@ class FrameDetections(Record):
 
     Attributes
     ----------
-    topic : the stream; streams are tracked apart from each other.
+    topic : the stream.
     frame : number of the frame in its stream.
     stamp_ns : time of the measurement.
     detections : (n,) the numbers by which the detections are known.
@@ -34,7 +34,7 @@ class FrameDetections(Record):
 
 
 class Track(Record):
-    """One object over the frames of its stream, from its first to its last detection.
+    """One object over the frames of its streams, from its first to its last detection.
 
     Between detections it *coasts*: such a row has no detection, its centre lies on the line
     between its neighbours. A gap longer than `TrackingSettings.max_missed_s` has no rows.
@@ -42,9 +42,9 @@ class Track(Record):
     Attributes
     ----------
     id : number of the track in the recording, from 1, in order of birth.
-    topic : the stream.
+    topics : (k,) the stream of each frame: one, or several that were tracked together.
     hits : number of rows with a detection.
-    frames : (k,) numbers of the frames, ascending.
+    frames : (k,) numbers of the frames in their streams, in the order of time.
     stamps_ns : (k,) times of the frames.
     detections : (k,) numbers of the detections, -1 where it coasts.
     centers : (k, 3) metres, in the frame of `FrameDetections.centers`.
@@ -55,7 +55,7 @@ class Track(Record):
     """
 
     id: int
-    topic: str
+    topics: tuple[str, ...]
     hits: int
     frames: I4 = array("k", "i4")
     stamps_ns: I4 = array("k", "i8")
@@ -65,3 +65,8 @@ class Track(Record):
     posterior: F4 = array("c", "f4")
     confidence: float
     novelty: float
+
+    @property
+    def topic(self) -> str:
+        """Its stream; several are joined by a space."""
+        return " ".join(sorted(set(self.topics)))

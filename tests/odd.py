@@ -1,0 +1,79 @@
+"""Processes odd recordings and prints what became of each: ``python -m tests.odd [FOLDER]...``."""
+
+import json
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+from click.testing import CliRunner
+from shapecat.cli.main import main as shapecat
+
+from tests.zoo import ZOO
+
+COLLECTION = Path(__file__).parents[2] / "shared" / "data" / "odd"
+CODES = {0, 3, 4}
+
+
+class Verdict(NamedTuple):
+    """What became of one recording."""
+
+    code: int
+    frames: int
+    skipped: int
+    message: str
+
+
+def examine(path: Path, out: Path, *options: str) -> Verdict:
+    """Process a recording as a user would; an unknown error is a bug and is raised."""
+    arguments = ["process", str(path), "--out", str(out), "--no-rrd", *options]
+    result = CliRunner().invoke(shapecat, arguments)
+    if result.exception is not None and not isinstance(result.exception, SystemExit):
+        raise result.exception
+    if result.exit_code:
+        return Verdict(result.exit_code, 0, 0, result.stderr.strip().removeprefix("Error: "))
+    (folder,) = out.iterdir()
+    run = json.loads((folder / "run.json").read_text())
+    skipped = run["counts"]["skipped"]
+    said = [*run["warnings"], *(f"{count} frames: {reason}" for reason, count in skipped.items())]
+    return Verdict(0, run["counts"]["frames"], sum(skipped.values()), "; ".join(said))
+
+
+def recordings(folder: Path) -> Iterator[Path]:
+    """Yield the files of a folder, and the folders that are one recording."""
+    for path in sorted(folder.iterdir()):
+        parts = (
+            [p for p in path.iterdir() if p.suffix in {".db3", ".zstd"}] if path.is_dir() else []
+        )
+        if path.is_dir() and not parts and path.name != "split_without_metadata":
+            yield from recordings(path)
+        else:
+            yield path
+
+
+def main(folders: list[Path]) -> int:
+    """Print the table; return 1 if an exit code is not one of the documented ones."""
+    wrong = 0
+    for name, verdict in _verdicts(folders):
+        wrong += verdict.code not in CODES
+        line = f"{name:40.40} {verdict.code:4} {verdict.frames:6} {verdict.skipped:7}"
+        sys.stdout.write(f"{line}  {verdict.message[:150]}\n")
+    return int(wrong > 0)
+
+
+def _verdicts(folders: list[Path]) -> Iterator[tuple[str, Verdict]]:
+    sys.stdout.write(f"{'file':40} code frames skipped  message\n")
+    with tempfile.TemporaryDirectory() as scratch:
+        for number, (name, exhibit) in enumerate(ZOO.items()):
+            place = Path(scratch, str(number))
+            place.mkdir()
+            yield name, examine(exhibit.write(place), place / "out")
+        for folder in folders:
+            for number, path in enumerate(recordings(folder)):
+                out = Path(scratch, f"{folder.name}-{number}")
+                yield str(path.relative_to(folder)), examine(path, out)
+
+
+if __name__ == "__main__":
+    sys.exit(main([Path(a) for a in sys.argv[1:]] or [COLLECTION] * COLLECTION.exists()))

@@ -1,0 +1,113 @@
+"""Where up is: from whom, and how sure."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from shapecat.errors import ConfigError
+from shapecat.geometry import IDENTITY
+from shapecat.jobs import Job
+from shapecat.pipeline import process
+from shapecat.recordings import open_recording
+from shapecat.recordings.gravity import Upright
+from shapecat.run_folder import read_run
+from shapecat.simulation.messages import MessageFactory
+from shapecat.types import Frame, Pose
+from tests.messages import CAMERA, EPOCH, SECOND, header, make, write
+from tests.scenes import OPTICAL, stream
+
+MAKE = MessageFactory(2)
+TURN = np.array([[0.0, 0, 1], [1, 0, 0], [0, 1, 0]])
+
+
+def imu(stamp: int, acceleration: Any, frame_id: str = "imu", *, absent: bool = False) -> Any:
+    covariance = np.zeros(9)
+    covariance[0] = -1.0 if absent else 0.0
+    vector = make("geometry_msgs/msg/Vector3", *map(float, acceleration))
+    still = make("geometry_msgs/msg/Vector3", 0.0, 0.0, 0.0)
+    return make(
+        "sensor_msgs/msg/Imu",
+        header(stamp, frame_id),
+        make("geometry_msgs/msg/Quaternion", 0.0, 0.0, 0.0, 1.0),
+        *(np.zeros(9), still, np.zeros(9), vector, covariance),
+    )
+
+
+def frame(stamp: int) -> Frame:
+    depth = np.ones((CAMERA.height, CAMERA.width), np.float32)
+    return Frame("/d", 0, stamp, stamp, "camera", depth=depth, camera=CAMERA)
+
+
+def test_up_from_an_imu_is_smoothed_and_turned_into_the_sensor_frame(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    still = [("imu", "camera", Pose(TURN, np.zeros(3)))]
+    items: list[tuple[str, int, Any]] = [("/tf_static", EPOCH, MAKE.transforms(still, EPOCH))]
+    for k in range(400):
+        stamp = EPOCH + k * SECOND // 200
+        items.append(("/imu", stamp, imu(stamp, rng.normal((0, 0, 9.8), 2))))
+        items.append(("/gyro", stamp, imu(stamp, [0, 0, 0])))
+        items.append(("/fake", stamp, imu(stamp, [9, 9, 9], absent=True)))
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        upright = Upright.of(recording, up="imu", fixed_frame=None)
+        up = upright.up(frame(EPOCH + SECOND))
+        late = upright.up(frame(EPOCH + 60 * SECOND))
+
+    assert up is not None
+    assert np.degrees(np.arccos(up @ (TURN.T @ [0, 0, 1]))) < 3
+    assert late is None
+
+
+@pytest.mark.parametrize(("up", "said"), [("imu", "no sensor_msgs/Imu"), ("tf", "no transforms")])
+def test_a_source_that_is_not_there_is_said(tmp_path: Path, up: str, said: str) -> None:
+    path = write(tmp_path / "a.mcap", [("/x", 1, make("std_msgs/msg/String", "x"))])
+    with open_recording(path) as recording, pytest.raises(ConfigError, match=said):
+        Upright.of(recording, up=up, fixed_frame=None)
+
+
+@pytest.mark.parametrize(("tilt_deg", "warns"), [(0.0, False), (13.0, True), (50.0, True)])
+def test_run_says_how_far_the_planes_found_disagree(
+    tmp_path: Path, tilt_deg: float, warns: bool
+) -> None:
+    """A wrong mounting angle in the transforms silently spoils every height."""
+    angle = np.radians(tilt_deg)
+    c, s = np.cos(angle), np.sin(angle)
+    tilt = Pose(np.array([[1, 0, 0], [0, c, -s], [0, s, c]]), np.zeros(3))
+    items = []
+    for topic, time, message in stream(MAKE, 3):
+        if topic == "/tf_static":
+            message.transforms[0].child_frame_id = "mount"
+            items.append((topic, time, message))
+            bad = MAKE.transforms([("mount", OPTICAL, tilt)], time)
+            items.append((topic, time, bad))
+        else:
+            items.append((topic, time, message))
+    process(Job(write(tmp_path / "a.mcap", items), tmp_path / "out", mcap=False, rrd=False))
+    run = read_run(tmp_path / "out")
+
+    assert run["up"]["source"] == "transforms, z of map"
+    assert any("up" in text for text in run["warnings"]) is warns
+    if tilt_deg < 15:
+        assert run["up"]["planes_differ_deg"] == pytest.approx(tilt_deg, abs=2)
+    else:
+        assert run["up"]["frames_without_plane"] == 3
+
+
+def test_without_any_source_up_is_that_of_the_planes(tmp_path: Path) -> None:
+    items = [item for item in stream(MAKE, 1) if "tf" not in item[0]]
+    process(Job(write(tmp_path / "a.mcap", items), tmp_path / "out", mcap=False, rrd=False))
+
+    assert read_run(tmp_path / "out")["up"] == {"source": "planes"}
+
+
+def test_the_imu_stands_in_where_transforms_do_not_reach(tmp_path: Path) -> None:
+    items: list[tuple[str, int, Any]] = [
+        ("/tf", EPOCH, MAKE.transforms([("map", "elsewhere", IDENTITY)], EPOCH)),
+        ("/imu", EPOCH, imu(EPOCH, [0, -9.8, 0], "camera")),
+    ]
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        up = Upright.of(recording, up="auto", fixed_frame=None).up(frame(EPOCH))
+
+    assert up is not None
+    np.testing.assert_allclose(up, [0, -1, 0], atol=1e-6)

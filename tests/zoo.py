@@ -1,0 +1,476 @@
+"""A zoo of recordings: each way in which robots write, break and misuse the formats."""
+
+import json
+import shutil
+import sqlite3
+import struct
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import zstandard
+from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
+from rosbags.rosbag2 import Writer as FolderWriter
+
+from shapecat.geometry import IDENTITY
+from shapecat.simulation.messages import MessageFactory
+from tests import foxglove_messages as foxglove
+from tests import messages as ros
+from tests.messages import EPOCH, SECOND
+from tests.scenes import OPTICAL, PERIOD, back_and_forth, record, serialized, stream, views
+
+FRAMES = 4
+FACTORY, FACTORY1 = MessageFactory(2), MessageFactory(1)
+
+
+class Exhibit(NamedTuple):
+    """How to write it, the exit code and frames expected, and what must be said about it."""
+
+    write: Callable[[Path], Path]
+    code: int = 0
+    frames: int = FRAMES
+    said: str = ""
+
+
+def mcap(path: Path, *, finish: bool = True, cut: int = 0, last: Any = (), **options: Any) -> Path:
+    """Write the table, and then some bytes that are cut off, with some options of the writer."""
+    path /= "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, **({"chunk_size": 60_000} | options))
+        writer.start("ros2", "zoo")
+        channels: dict[str, int] = {}
+        for topic, kind, time, data in [*serialized(stream(FACTORY, FRAMES), FACTORY), *last]:
+            if topic not in channels:
+                text = FACTORY.typestore.generate_msgdef(kind, ros_version=2)[0].encode()
+                schema = writer.register_schema(kind, "ros2msg", text)
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(channels[topic], time, data, time)
+        if finish:
+            writer.finish()
+        else:
+            writer.flush()
+    if cut:
+        path.write_bytes(path.read_bytes()[:-cut])
+    return path
+
+
+def bag(path: Path, compression: Any = None, *, threshold: int = 60_000) -> Path:
+    writer = BagWriter(path / "a.bag")
+    writer.chunk_threshold = threshold
+    if compression is not None:
+        writer.set_compression(compression)
+    with writer:
+        known: dict[str, Any] = {}
+        for topic, kind, time, data in serialized(stream(FACTORY1, FRAMES), FACTORY1):
+            if topic not in known:
+                known[topic] = writer.add_connection(topic, kind, typestore=FACTORY1.typestore)
+            writer.write(known[topic], time, data)
+    return path / "a.bag"
+
+
+def active_bag(path: Path) -> Path:
+    """Write what rosbag leaves when it is killed: no index, the header says so."""
+    found = bag(path)
+    data = found.read_bytes().replace(b"index_pos=", b"index_pos=\0\0\0\0\0\0\0\0*", 1)
+    at = data.index(b"index_pos=") + 10
+    data = data[: at + 8] + data[at + 17 :]
+    # The connections and chunk information after the last chunk are not there.
+    found.write_bytes(data[: data.rindex(b"op=\x05") + 60_000])
+    return found.rename(path / "a.bag.active")
+
+
+def unsorted_bag(path: Path) -> Path:
+    """Chunks in another order than their messages."""
+    writer = BagWriter(path / "a.bag")
+    writer.chunk_threshold = 1
+    items = list(serialized(stream(FACTORY1, FRAMES), FACTORY1))
+    with writer:
+        known: dict[str, Any] = {}
+        for topic, kind, time, data in [*items[:1], *items[:0:-1]]:
+            if topic not in known:
+                known[topic] = writer.add_connection(topic, kind, typestore=FACTORY1.typestore)
+            writer.write(known[topic], time, data)
+    return path / "a.bag"
+
+
+def folder(
+    path: Path, plugin: StoragePlugin, mode: CompressionMode | None = None, *, metadata: bool = True
+) -> Path:
+    writer = FolderWriter(path / "a", version=9, storage_plugin=plugin)
+    if mode is not None:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        known: dict[str, Any] = {}
+        for topic, kind, time, data in serialized(stream(FACTORY, FRAMES), FACTORY):
+            if topic not in known:
+                known[topic] = writer.add_connection(topic, kind, typestore=FACTORY.typestore)
+            writer.write(known[topic], time, data)
+    if not metadata:
+        (path / "a" / "metadata.yaml").unlink()
+    return path / "a"
+
+
+def database(path: Path, *, definitions: bool) -> Path:
+    found = folder(path, StoragePlugin.SQLITE3) / "a.db3"
+    if not definitions:
+        base = sqlite3.connect(found)
+        base.execute("DELETE FROM message_definitions")
+        base.commit()
+        base.close()
+    return found
+
+
+def splits(path: Path) -> Path:
+    """Two parts, the second one compressed, and no metadata."""
+    (path / "a").mkdir()
+    for name, begin in (("a_0.mcap", 0), ("a_1.mcap", FRAMES * PERIOD)):
+        part = mcap(path)
+        data = part.read_bytes()
+        part.unlink()
+        if begin:
+            data = zstandard.compress(data)
+        (path / "a" / (name + ".zstd" * bool(begin))).write_bytes(data)
+    return path / "a"
+
+
+def ros1_mcap(path: Path) -> Path:
+    """MCAP with ROS 1 messages, as `mcap convert` makes it from a bag."""
+    path /= "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros1", "zoo")
+        channels: dict[str, int] = {}
+        for topic, kind, time, data in serialized(stream(FACTORY1, FRAMES), FACTORY1):
+            if topic not in channels:
+                text = FACTORY1.typestore.generate_msgdef(kind, ros_version=1)[0].encode()
+                name = kind.replace("/msg/", "/")
+                schema = writer.register_schema(name, "ros1msg", text)
+                channels[topic] = writer.register_channel(topic, "ros1", schema)
+            writer.add_message(channels[topic], time, data, time)
+        writer.finish()
+    return path
+
+
+def plain(path: Path, items: Any) -> Path:
+    return ros.write(path / "a.mcap", items)
+
+
+def changed(path: Path, change: Callable[[str, Any], Any], *, clouds: bool = False) -> Path:
+    """Write the table with changed messages."""
+    items = ((t, time, change(t, m)) for t, time, m in stream(FACTORY, FRAMES, clouds=clouds))
+    return plain(path, items)
+
+
+def compressed_depth(path: Path, pack: Callable[[Any], bytes]) -> Path:
+    def change(topic: str, message: Any) -> Any:
+        if not topic.endswith("image_raw"):
+            return message
+        depth = message.data.view("<u2").reshape(message.height, message.width)
+        stamp = message.header.stamp
+        packed = ros.compressed(stamp.sec * SECOND + stamp.nanosec, pack(depth))
+        packed.header.frame_id = OPTICAL
+        return packed
+
+    return changed(path, change)
+
+
+def realsense(path: Path) -> Path:
+    sensor = "/device_0/sensor_0"
+    camera = views()[0].camera
+    items: list[tuple[str, int, Any]] = [
+        (f"{sensor}/option/Depth_Units/value", 0, ros.make("std_msgs/msg/Float32", 0.0005)),
+        (f"{sensor}/Depth_0/info/camera_info", 0, ros.info(0, camera)),
+    ]
+    for k, view in enumerate(back_and_forth(FRAMES)):
+        depth = np.round(view.depth * 2000).astype(np.uint16)
+        image = ros.image(EPOCH + k * PERIOD, depth, "mono16")
+        items.append((f"{sensor}/Depth_0/image/data", k + 1, image))
+    return plain(path, items)
+
+
+def layout(kind: str) -> Callable[[Path], Path]:
+    """Return a writer of clouds with another layout of a point."""
+    order = ">" if kind == "big-endian" else "<"
+    step = {"padded": 32, "unaligned": 15, "f8": 24, "extra": 20}.get(kind, 12)
+    offset = {"unaligned": 3, "extra": 4}.get(kind, 0)
+    number, code = ("f8", 8) if kind == "f8" else ("f4", 7)
+
+    def change(topic: str, message: Any) -> Any:
+        if not topic.endswith("points"):
+            return message
+        h, w = message.height, message.width
+        points = message.data.view("<f4").reshape(h, w, 4)[..., :3]
+        size = np.dtype(number).itemsize
+        gap = 7 if kind == "row-padded" else 0
+        rows = np.zeros((h, w * step + gap), np.uint8)
+        cells = rows[:, : w * step].reshape(h, w, step)
+        packed = np.ascontiguousarray(points, order + number).view(np.uint8)
+        cells[..., offset : offset + 3 * size] = packed.reshape(h, w, 3 * size)
+        field = "sensor_msgs/msg/PointField"
+        message.fields = [
+            ros.make(field, name, offset + size * k, code, 1) for k, name in enumerate("xyz")
+        ]
+        if kind == "extra":
+            message.fields += [ros.make(field, "ring", 0, 4, 1), ros.make(field, "rgb", 16, 6, 1)]
+        message.is_bigendian = order == ">"
+        message.is_dense = kind == "dense-lie"
+        message.point_step, message.row_step = step, rows.shape[1]
+        message.data = rows.reshape(-1)
+        return message
+
+    return lambda path: changed(path, change, clouds=True)
+
+
+def hostile_cloud(path: Path) -> Path:
+    """Let the first claim 2^32 points; the others are fine."""
+
+    def change(topic: str, message: Any) -> Any:
+        if topic.endswith("points") and message.header.stamp.nanosec == 0:
+            message.height = message.width = 65535
+            message.row_step = 0
+        return message
+
+    return changed(path, change, clouds=True)
+
+
+def empty_cloud(path: Path) -> Path:
+    def change(topic: str, message: Any) -> Any:
+        if topic.endswith("points") and message.header.stamp.nanosec == 0:
+            message.height, message.width, message.row_step = 1, 0, 0
+            message.data = np.zeros(0, np.uint8)
+        return message
+
+    return changed(path, change, clouds=True)
+
+
+def flat_cloud(path: Path) -> Path:
+    """Unorganized, without the points that have no reading."""
+
+    def change(topic: str, message: Any) -> Any:
+        if topic.endswith("points"):
+            points = message.data.view("<f4").reshape(-1, 4)
+            points = points[np.isfinite(points).all(axis=1)]
+            message.height, message.width = 1, len(points)
+            message.row_step = 16 * len(points)
+            message.data = np.ascontiguousarray(points).view(np.uint8).reshape(-1)
+        return message
+
+    return changed(path, change, clouds=True)
+
+
+def distorted(path: Path, *, strong: bool) -> Path:
+    coefficients = (0.3, -0.2, 0.01, 0.01, 0.0) if strong else (0.001, 0.0, 0.0, 0.0, 0.0)
+
+    def change(topic: str, message: Any) -> Any:
+        if topic.endswith("camera_info"):
+            message.d = np.array(coefficients)
+        return message
+
+    return changed(path, change)
+
+
+def foreign(path: Path) -> Path:
+    """Channels of other programs: a service event, encodings and schemas nobody knows."""
+    found = path / "a.mcap"
+    with found.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "zoo")
+        broken = writer.register_schema("my/srv/Do_Event", "ros2msg", b"service_msgs/Nothing info")
+        channels = [
+            writer.register_channel("/do/_service_event", "cdr", broken),
+            writer.register_channel("/proprietary", "capnproto", 0),
+            writer.register_channel("/no_schema", "cdr", 0),
+            writer.register_channel("/tf", "cdr", broken),
+        ]
+        known: dict[str, int] = {}
+        for topic, kind, time, data in serialized(stream(FACTORY, FRAMES), FACTORY):
+            for channel in channels:
+                writer.add_message(channel, time, b"\x00\x01\x00\x00\xff\xff\xff\xff", time)
+            if topic not in known:
+                text = FACTORY.typestore.generate_msgdef(kind, ros_version=2)[0].encode()
+                schema = writer.register_schema(kind, "ros2msg", text)
+                known[topic] = writer.register_channel(topic, "cdr", schema)
+            writer.add_message(known[topic], time, data, time)
+        writer.finish()
+    return found
+
+
+def clocks(path: Path, kind: str) -> Path:
+    """Stamps that count from power-on, are missing, or jump."""
+
+    def stamps() -> Iterator[tuple[str, int, Any]]:
+        for number, (topic, time, message) in enumerate(stream(FACTORY, FRAMES)):
+            if hasattr(message, "header"):
+                stamp = time - EPOCH + SECOND if kind == "uptime" else 0
+                if kind == "jump":
+                    stamp = time + (3600 * SECOND if number > 6 else 0)
+                stamp_of = message.header.stamp
+                stamp_of.sec, stamp_of.nanosec = divmod(stamp, SECOND)
+            yield topic, time, message
+
+    return plain(path, stamps())
+
+
+def late_transforms(path: Path) -> Path:
+    """Write the static transforms last, and a loop of frames."""
+    first, *others = stream(FACTORY, FRAMES)
+    links = [(f"f{k}", f"f{(k + 1) % 300}", IDENTITY) for k in range(300)]
+    loop = ("/tf", EPOCH, FACTORY.transforms(links, EPOCH))
+    return plain(path, [*others, loop, (first[0], others[-1][1] + 1, first[2])])
+
+
+def hostile_chunk(path: Path) -> Path:
+    """Let the first chunk claim to hold 10^9 bytes."""
+    found = mcap(path, compression=CompressionType.ZSTD, chunk_size=1)
+    data = bytearray(found.read_bytes())
+    at = 8 + 9 + struct.unpack_from("<Q", data, 9)[0]
+    data[at + 9 + 16 : at + 9 + 24] = struct.pack("<Q", 10**9)
+    found.write_bytes(data)
+    return found
+
+
+def bad_frames(path: Path) -> Path:
+    """Every image is shorter than it says."""
+
+    def change(topic: str, message: Any) -> Any:
+        if topic.endswith("image_raw"):
+            message.data = message.data[:100]
+        return message
+
+    return changed(path, change)
+
+
+def fox(path: Path, encoding: str) -> Path:
+    items = []
+    for k, view in enumerate(back_and_forth(FRAMES)):
+        names = [{"name": n, "offset": 4 * j, "type": 7} for j, n in enumerate("xyz")]
+        points = view.points().reshape(-1, 3)
+        data = points[np.isfinite(points).all(axis=1)].astype("<f4").tobytes()
+        values = {
+            "timestamp": foxglove.time(EPOCH + k * PERIOD, encoding),
+            "point_stride": 12,
+            "fields": names,
+            "data": foxglove.content(data, encoding),
+            "pose": {
+                "position": {"x": 0.0, "y": 0.0, "z": 0.0},
+                "orientation": {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0},
+            },
+        }
+        items.append(("/points", "foxglove.PointCloud", values))
+    return foxglove.write(path / "a.mcap", encoding, items)
+
+
+def file(path: Path, name: str, content: bytes) -> Path:
+    (path / name).write_bytes(content)
+    return path / name
+
+
+def empty_folder(path: Path) -> Path:
+    (path / "a").mkdir()
+    return path / "a"
+
+
+def text_only(path: Path) -> Path:
+    return plain(path, [("/log", EPOCH, ros.make("std_msgs/msg/String", "hello"))])
+
+
+def locked_part(path: Path) -> Path:
+    """Write a folder of which one part is damaged."""
+    found = folder(path, StoragePlugin.SQLITE3, metadata=False)
+    (found / "b.db3").write_bytes(b"SQLite format 3\0" + bytes(500))
+    return found
+
+
+def copy_of(path: Path, *, note: str) -> Path:
+    """Write a recording beside files that do not belong to it."""
+    found = folder(path, StoragePlugin.MCAP)
+    (found / "notes.txt").write_text(json.dumps(note))
+    shutil.copy(found / "a.mcap", found / "old.mcap")
+    return found
+
+
+_SQL, _MCAP = StoragePlugin.SQLITE3, StoragePlugin.MCAP
+_PACKED = CompressionMode
+_CUT = "not finished: recovered"
+
+ZOO: dict[str, Exhibit] = {
+    **{
+        f"mcap {c.name.lower()}": Exhibit(lambda p, c=c: mcap(p, compression=c))
+        for c in CompressionType
+    },  # type: ignore[misc]  # mypy cannot type a default
+    "mcap without chunks": Exhibit(lambda p: mcap(p, use_chunking=False), said="no index"),
+    "mcap without index": Exhibit(lambda p: mcap(p, index_types=IndexType.NONE), said="no index"),
+    "mcap without message index": Exhibit(lambda p: mcap(p, index_types=IndexType.CHUNK)),
+    "mcap without channels in summary": Exhibit(
+        lambda p: mcap(p, repeat_channels=False, repeat_schemas=False), said="no index"
+    ),
+    "mcap without statistics": Exhibit(
+        lambda p: mcap(p, use_statistics=False, use_summary_offsets=False)
+    ),
+    "mcap unfinished": Exhibit(lambda p: mcap(p, finish=False), said=_CUT),
+    "mcap cut": Exhibit(
+        lambda p: mcap(p, compression=CompressionType.NONE, finish=False, cut=30_000),
+        frames=FRAMES - 1,
+        said=_CUT,
+    ),
+    "mcap cut in its only chunk": Exhibit(
+        lambda p: mcap(
+            p, compression=CompressionType.LZ4, chunk_size=1 << 30, finish=False, cut=1000
+        ),
+        frames=FRAMES - 1,
+        said="the rest of the chunk",
+    ),
+    "mcap of ros 1": Exhibit(ros1_mcap),
+    "mcap with a hostile chunk": Exhibit(hostile_chunk, said="claims to hold"),
+    "foxglove json": Exhibit(lambda p: fox(p, "json")),
+    "foxglove protobuf": Exhibit(lambda p: fox(p, "protobuf")),
+    "ros 1": Exhibit(bag),
+    **{
+        f"ros 1 {c.name.lower()}": Exhibit(lambda p, c=c: bag(p, c))
+        for c in BagWriter.CompressionFormat
+    },  # type: ignore[misc]  # the same
+    "ros 1 unsorted": Exhibit(unsorted_bag),
+    "ros 1 active": Exhibit(active_bag, frames=FRAMES - 1, said="no index"),
+    "ros 2 sqlite": Exhibit(lambda p: folder(p, _SQL)),
+    "ros 2 mcap": Exhibit(lambda p: folder(p, _MCAP)),
+    "ros 2 without metadata": Exhibit(lambda p: folder(p, _SQL, metadata=False), said="metadata"),
+    "ros 2 file-compressed": Exhibit(lambda p: folder(p, _SQL, _PACKED.FILE)),
+    "ros 2 message-compressed": Exhibit(lambda p: folder(p, _SQL, _PACKED.MESSAGE)),
+    "ros 2 mcap file-compressed": Exhibit(lambda p: folder(p, _MCAP, _PACKED.FILE)),
+    "ros 2 splits": Exhibit(splits, frames=2 * FRAMES, said="metadata"),
+    "ros 2 with a damaged part": Exhibit(locked_part, said="left out b.db3"),
+    "ros 2 beside other files": Exhibit(lambda p: copy_of(p, note="mine")),
+    "db3": Exhibit(lambda p: database(p, definitions=True)),
+    "db3 without definitions": Exhibit(lambda p: database(p, definitions=False), said="Humble"),
+    "compressed depth png": Exhibit(lambda p: compressed_depth(p, ros.png)),
+    "compressed depth rvl": Exhibit(lambda p: compressed_depth(p, ros.rvl)),
+    "realsense viewer": Exhibit(realsense),
+    "organized cloud": Exhibit(lambda p: record(p / "a.mcap", FRAMES, clouds=True)),
+    **{
+        f"cloud {kind}": Exhibit(layout(kind))
+        for kind in ("padded", "unaligned", "big-endian", "f8", "row-padded", "extra", "dense-lie")
+    },
+    "cloud unorganized": Exhibit(flat_cloud),
+    "cloud of 2^32 points": Exhibit(hostile_cloud, frames=FRAMES - 1, said="needs"),
+    "cloud of no points": Exhibit(empty_cloud, frames=FRAMES - 1, said="empty cloud"),
+    "slight distortion": Exhibit(lambda p: distorted(p, strong=False)),
+    "strong distortion": Exhibit(lambda p: distorted(p, strong=True), said="undistorted rays"),
+    "foreign channels": Exhibit(foreign),
+    "clock from power-on": Exhibit(lambda p: clocks(p, "uptime"), said="does not count from 1970"),
+    "clock missing": Exhibit(lambda p: clocks(p, "zero"), said="stamp is 0"),
+    "clock jump": Exhibit(lambda p: clocks(p, "jump"), said="jumps"),
+    "static transforms last": Exhibit(late_transforms),
+    "every image too short": Exhibit(bad_frames, 4, 0, "no usable frame"),
+    "no clouds": Exhibit(text_only, 4, 0, "no point clouds"),
+    "empty file": Exhibit(lambda p: file(p, "a.bag", b""), 3, 0, "is empty"),
+    "text": Exhibit(lambda p: file(p, "a.mcap", b"hello world\n"), 3, 0, "not a recording"),
+    "magic alone": Exhibit(lambda p: file(p, "a.mcap", b"\x89MCAP0\r\n"), 4, 0, "empty"),
+    "zeros": Exhibit(lambda p: file(p, "a.db3", b"SQLite format 3\0" + bytes(999)), 3, 0, "not a"),
+    "old bag": Exhibit(lambda p: file(p, "a.bag", b"#ROSBAG V1.2\n"), 3, 0, "version 2.0"),
+    "empty folder": Exhibit(empty_folder, 3, 0, "without .mcap"),
+    "missing": Exhibit(lambda p: p / "a.mcap", 3, 0, "does not exist"),
+}
+"""By name. A recording that is not damaged is read in full; nothing else is said about it."""
