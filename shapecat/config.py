@@ -34,7 +34,7 @@ class DetectionSettings:
     """Larger things are walls or furniture."""
     min_points: int = 60
     """Candidates with fewer points at full resolution are dropped."""
-    rules: str = "concave small occluder hollow rim neck float ring feet fill"
+    rules: str = "concave small occluder hollow rim overhang neck float ring feet fill"
     """Rules beyond the thesis that separate and join objects, by name; any may be left out."""
 
 

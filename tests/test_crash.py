@@ -117,7 +117,7 @@ def test_kills_at_random_moments(recording: Path, undisturbed: Path, tmp_path: P
     survive_kills(recording, tmp_path, undisturbed, moments)
 
 
-@pytest.mark.slow
+@pytest.mark.many
 def test_fifty_kills(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(2)
     killed = rounds = 0

@@ -180,7 +180,7 @@ def test_damage(name: str, tmp_path: Path) -> None:
     damage(name, tmp_path, cuts=12, flips=30)
 
 
-@pytest.mark.slow
+@pytest.mark.many
 @pytest.mark.parametrize("name", WRITERS)
 def test_much_damage(name: str, tmp_path: Path) -> None:
     damage(name, tmp_path, cuts=200, flips=2000)

@@ -3,8 +3,10 @@
 import numpy as np
 
 from shapecat.detection.pieces import (
+    BOTTOM,
     CONTACT,
     COUNT,
+    FAR,
     FEW,
     FRONT,
     LEFT,
@@ -19,7 +21,7 @@ from shapecat.detection.pieces import (
 )
 from shapecat.jit import kernel
 
-__all__ = ["join_hollow", "join_rims"]
+__all__ = ["join_hollow", "join_overhangs", "join_rims"]
 
 SAME_TOP_M = 0.015
 SAME_SIDE_M, SAME_SIDE, CUT_SIDE = 0.012, 0.25, 0.6
@@ -30,6 +32,11 @@ HOLLOW = -0.25
 BENT, INSIDE, INSIDE_SHARE = -0.15, -0.4, 0.12
 """Walls inside one container: slope of each, of both together, share of a boundary in contact."""
 FLOOR_SHARE = 0.6
+BEFORE, FLAT = 0.25, 0.35
+"""A near wall: share of its boundary before the rest, height over width of it and of the rest."""
+UNDER, COVERED, COVERING = 0.35, 0.15, 0.2
+"""What is under a rim: cells as a share of those above, share of its boundary behind the rim, and
+how much of the above it may hide in turn, as a share of that."""
 
 
 @kernel
@@ -113,3 +120,54 @@ def _is_container(pieces: Pieces, inside: int, outside: int) -> bool:
     if slope_of(x) > HOLLOW:
         return False
     return not (has_lid(pieces, outside) or has_lid(pieces, inside))
+
+
+@kernel
+def join_overhangs(pieces: Pieces) -> None:
+    """Join the near outside wall of a plate or bowl, seen below its own rim or before its floor.
+
+    Contents behind the near rim hide a part of the inside; what is under the rim hides nothing.
+    """
+    n = pieces.group.size
+    for near in range(1, n):
+        for whole in range(1, n):
+            if near != whole and (_is_under(pieces, near, whole) or _is_strip(pieces, near, whole)):
+                merge(pieces, whole, near)
+                break
+
+
+@kernel
+def _is_under(pieces: Pieces, under: int, above: int) -> bool:
+    if not (is_group(pieces, under) and is_group(pieces, above)):
+        return False
+    a, u = pieces.shape[above], pieces.shape[under]
+    if pieces.owner[above] != pieces.owner[under] or u[COUNT] > UNDER * a[COUNT]:
+        return False
+    covered = pieces.pairs[FRONT, above, under]
+    if covered < max(FEW, COVERED * pieces.boundary[under]):
+        return False
+    if pieces.pairs[FRONT, under, above] > COVERING * covered:
+        return False
+    if u[LEFT] < a[LEFT] - SAME_SIDE_M or u[RIGHTMOST] > a[RIGHTMOST] + SAME_SIDE_M:
+        return False
+    return bool(u[TOP] <= a[TOP] and u[FAR] / u[COUNT] < a[FAR] / a[COUNT])
+
+
+@kernel
+def _is_strip(pieces: Pieces, strip: int, whole: int) -> bool:
+    """Whether a long low piece without a lid stands before the floor of a flat container."""
+    if not (is_group(pieces, strip) and is_group(pieces, whole)):
+        return False
+    a, s = pieces.shape[whole], pieces.shape[strip]
+    if pieces.owner[whole] != pieces.owner[strip] or s[COUNT] > UNDER * a[COUNT]:
+        return False
+    if pieces.pairs[FRONT, strip, whole] < BEFORE * pieces.boundary[strip]:
+        return False
+    if s[LEFT] < a[LEFT] - SAME_SIDE_M or s[RIGHTMOST] > a[RIGHTMOST] + SAME_SIDE_M:
+        return False
+    long, wide = s[RIGHTMOST] - s[LEFT], a[RIGHTMOST] - a[LEFT]
+    if s[TOP] - s[BOTTOM] > FLAT * long or a[TOP] > FLAT * wide:
+        return False
+    if abs(a[TOP] - s[TOP]) > SAME_TOP_M or a[FAR] / a[COUNT] - s[FAR] / s[COUNT] > 0.5 * wide:
+        return False
+    return not has_lid(pieces, strip)

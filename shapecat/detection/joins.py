@@ -6,7 +6,7 @@ import numpy as np
 
 from shapecat.arrays import I4
 from shapecat.detection.cells import Cells
-from shapecat.detection.containers import join_hollow, join_rims
+from shapecat.detection.containers import join_hollow, join_overhangs, join_rims
 from shapecat.detection.occluders import join_behind
 from shapecat.detection.pieces import (
     BOTTOM,
@@ -53,6 +53,8 @@ def join_pieces(
         join_hollow(pieces)
     if "rim" in rules:
         join_rims(pieces)
+    if "overhang" in rules:
+        join_overhangs(pieces)
     if "neck" in rules:
         _join_necks(pieces)
     if "float" in rules:

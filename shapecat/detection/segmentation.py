@@ -33,7 +33,7 @@ RULES = (
     "small",
     "occluder",
     "hollow",
-    "rim",
+    "rim", "overhang",
     "neck",
     "float",
     "ring",

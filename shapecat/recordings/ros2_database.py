@@ -40,10 +40,10 @@ class DatabaseRecording(Recording):
         self._reader = Reader(path)
         try:
             self._reader.open()
+            self._channels = {c.id: _channel(c) for c in self._reader.connections}
         except (ReaderError, apsw.Error, *LIBRARY_ERRORS) as error:
             msg = f"not a readable ROS 2 bag: {error or type(error).__name__}"
             raise RecordingError(msg) from error
-        self._channels = {c.id: _channel(c) for c in self._reader.connections}
         counts: dict[tuple[str, str, str], int] = {}
         for connection in self._reader.connections:
             channel = self._channels[connection.id]
