@@ -48,11 +48,13 @@ def simulate(
     """
     from shapecat.simulation import simulate as write_simulation
 
+    if container is None:
+        container = {".bag": "ros1", "": "ros2"}.get(out.suffix, "mcap")
     with progress_bars() as bars:
         path = write_simulation(
             out,
             scene=scene,
-            format=container or {".bag": "ros1", "": "ros2"}.get(out.suffix, "mcap"),
+            format=container,
             sensor=sensor,
             frames=frames,
             clouds=clouds,

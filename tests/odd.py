@@ -4,11 +4,11 @@ import json
 import sys
 import tempfile
 from collections.abc import Iterator
+from importlib.metadata import entry_points
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from click.testing import CliRunner
-from shapecat.cli.main import main as shapecat
 
 from tests.zoo import ZOO
 
@@ -28,7 +28,9 @@ class Verdict(NamedTuple):
 def examine(path: Path, out: Path, *options: str) -> Verdict:
     """Process a recording as a user would; an unknown error is a bug and is raised."""
     arguments = ["process", str(path), "--out", str(out), "--no-rrd", *options]
-    result = CliRunner().invoke(shapecat, arguments)
+    (script,) = entry_points(group="console_scripts", name="shapecat")
+    command: Any = script.load()
+    result = CliRunner().invoke(command, arguments)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception
     if result.exit_code:

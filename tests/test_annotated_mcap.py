@@ -3,6 +3,8 @@
 import hashlib
 import json
 import os
+import subprocess
+import sys
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -151,6 +153,10 @@ def test_other_readers_accept_the_file(tmp_path: Path) -> None:
     with open_recording(target) as again:
         assert again.warnings == []
         assert sum(1 for _ in again.messages()) == 15
+    rerun = Path(sys.executable).with_name("rerun")
+    checked = subprocess.run([rerun, "mcap", "check", target], capture_output=True, check=False)
+    assert checked.returncode == 0, checked.stderr
+    assert b"/shapecat/scene" in checked.stdout
 
 
 def test_summary_checksum_is_right(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 import resource
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -32,7 +33,7 @@ class Outcome(NamedTuple):
 
     code: int
     stamps: frozenset[int]
-    count: int
+    frames: int
     said: str
 
 
@@ -45,8 +46,8 @@ def items(make: MessageFactory) -> Any:
         yield "/depth/image_raw", stamp, make.image(depth.astype(np.float32), stamp, "optical")
 
 
-def mcap(path: Path, **options: Any) -> Path:
-    make = MessageFactory(2)
+def mcap(place: Path, **options: Any) -> Path:
+    make, path = MessageFactory(2), place / "a.mcap"
     with path.open("wb") as file:
         writer = Writer(file, **({"chunk_size": 4000} | options))
         writer.start("ros2", "test")
@@ -62,8 +63,8 @@ def mcap(path: Path, **options: Any) -> Path:
     return path
 
 
-def bag(path: Path, compression: Any = None) -> Path:
-    make = MessageFactory(1)
+def bag(place: Path, compression: Any = None) -> Path:
+    make, path = MessageFactory(1), place / "a.bag"
     writer = BagWriter(path)
     writer.chunk_threshold = 4000
     if compression is not None:
@@ -79,8 +80,8 @@ def bag(path: Path, compression: Any = None) -> Path:
     return path
 
 
-def folder(path: Path, plugin: StoragePlugin) -> Path:
-    make = MessageFactory(2)
+def folder(place: Path, plugin: StoragePlugin) -> Path:
+    make, path = MessageFactory(2), place / "a"
     with FolderWriter(path, version=9, storage_plugin=plugin) as writer:
         known: dict[str, Any] = {}
         for topic, time, message in items(make):
@@ -94,18 +95,12 @@ def folder(path: Path, plugin: StoragePlugin) -> Path:
 
 
 WRITERS: dict[str, Callable[[Path], Path]] = {
-    **{
-        f"mcap-{kind.name.lower()}": lambda p, kind=kind: mcap(p / "a.mcap", compression=kind)  # type: ignore[misc]  # mypy cannot type a default
-        for kind in CompressionType
-    },
-    "mcap-unchunked": lambda p: mcap(p / "a.mcap", use_chunking=False),
-    "ros1-none": lambda p: bag(p / "a.bag"),
-    **{
-        f"ros1-{kind.name.lower()}": lambda p, kind=kind: bag(p / "a.bag", kind)  # type: ignore[misc]  # the same
-        for kind in BagWriter.CompressionFormat
-    },
-    "ros2-sqlite": lambda p: folder(p / "a", StoragePlugin.SQLITE3),
-    "ros2-mcap": lambda p: folder(p / "a", StoragePlugin.MCAP),
+    **{f"mcap-{c.name.lower()}": partial(mcap, compression=c) for c in CompressionType},
+    "mcap-unchunked": partial(mcap, use_chunking=False),
+    "ros1-none": bag,
+    **{f"ros1-{c.name.lower()}": partial(bag, compression=c) for c in BagWriter.CompressionFormat},
+    "ros2-sqlite": partial(folder, plugin=StoragePlugin.SQLITE3),
+    "ros2-mcap": partial(folder, plugin=StoragePlugin.MCAP),
 }
 
 
@@ -152,7 +147,7 @@ def check(path: Path, outcome: Outcome, at: int, ends: list[tuple[int, int]]) ->
     sure = max((count for end, count in ends if end <= at), default=0)
     stamps = {EPOCH + k * SECOND for k in range(sure)}
     assert stamps <= outcome.stamps, (path, at, len(outcome.stamps), sure, outcome.said)
-    assert outcome.count >= FRAMES or outcome.said, (path, at, outcome.count)
+    assert outcome.frames >= FRAMES or outcome.said, (path, at, outcome.frames)
 
 
 def damage(name: str, tmp_path: Path, *, cuts: int, flips: int) -> None:

@@ -57,8 +57,9 @@ def test_a_zero_quaternion_is_refused(bad: list[float]) -> None:
 @given(direction)
 def test_gravity_rotation_turns_up_to_z(up: list[float]) -> None:
     rotation = gravity_rotation(up)
+    length = float(np.linalg.norm(up))
 
-    assert_allclose(rotation @ up, [0, 0, np.linalg.norm(up)], atol=1e-9)
+    assert_allclose(rotation @ np.array(up), [0.0, 0.0, length], atol=1e-9)
     assert_allclose(np.linalg.det(rotation), 1)
 
 

@@ -259,8 +259,7 @@ def test_damaged_chunk_of_a_bag_does_not_stop_the_others(tmp_path: Path, compres
         connection = writer.add_connection("/a", STRING, typestore=STORE1)
         item = STORE1.types[STRING]("x" * 200)
         for k in range(5):
-            data = STORE1.serialize_ros1(item, STRING)
-            writer.write(connection, (k + 1) * SECOND, data)
+            writer.write(connection, (k + 1) * SECOND, STORE1.serialize_ros1(item, STRING))
     data = bytearray(path.read_bytes())
     chunk = [at for at in range(len(data)) if data[at : at + 4] == b"op=\x05"][2]
     for at in range(chunk + 70, chunk + 110):

@@ -27,8 +27,8 @@ def two_cameras(path: Path, frames: int = 6, *, transforms: bool = True) -> Path
 
 def test_an_object_that_two_sensors_see_is_one_track(shapecat: Run, tmp_path: Path) -> None:
     recording = two_cameras(tmp_path / "a.mcap")
-    for out, topics in (("both", (DEPTH, POINTS)), ("one", (DEPTH,))):
-        options = [part for topic in topics for part in ("--topic", topic)]
+    for out, names in {"both": [DEPTH, POINTS], "one": [DEPTH]}.items():
+        options = [part for name in names for part in ("--topic", name)]
         result = shapecat("process", recording, "--out", tmp_path / out, "--no-rrd", *options)
         assert result.exit_code == 0, result.output
     both, one = (json.loads((tmp_path / o / "a" / "run.json").read_text()) for o in ("both", "one"))

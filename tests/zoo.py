@@ -5,6 +5,7 @@ import shutil
 import sqlite3
 import struct
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -397,10 +398,7 @@ _PACKED = CompressionMode
 _CUT = "not finished: recovered"
 
 ZOO: dict[str, Exhibit] = {
-    **{
-        f"mcap {c.name.lower()}": Exhibit(lambda p, c=c: mcap(p, compression=c))
-        for c in CompressionType
-    },  # type: ignore[misc]  # mypy cannot type a default
+    **{f"mcap {c.name.lower()}": Exhibit(partial(mcap, compression=c)) for c in CompressionType},
     "mcap without chunks": Exhibit(lambda p: mcap(p, use_chunking=False), said="no index"),
     "mcap without index": Exhibit(lambda p: mcap(p, index_types=IndexType.NONE), said="no index"),
     "mcap without message index": Exhibit(lambda p: mcap(p, index_types=IndexType.CHUNK)),
@@ -429,9 +427,9 @@ ZOO: dict[str, Exhibit] = {
     "foxglove protobuf": Exhibit(lambda p: fox(p, "protobuf")),
     "ros 1": Exhibit(bag),
     **{
-        f"ros 1 {c.name.lower()}": Exhibit(lambda p, c=c: bag(p, c))
+        f"ros 1 {c.name.lower()}": Exhibit(partial(bag, compression=c))
         for c in BagWriter.CompressionFormat
-    },  # type: ignore[misc]  # the same
+    },
     "ros 1 unsorted": Exhibit(unsorted_bag),
     "ros 1 active": Exhibit(active_bag, frames=FRAMES - 1, said="no index"),
     "ros 2 sqlite": Exhibit(lambda p: folder(p, _SQL)),

@@ -34,6 +34,8 @@ BENT, INSIDE, INSIDE_SHARE = -0.15, -0.4, 0.12
 FLOOR_SHARE = 0.6
 BEFORE, FLAT = 0.25, 0.35
 """A near wall: share of its boundary before the rest, height over width of it and of the rest."""
+DISH_M, SAME_LEVEL_M = 0.05, 0.007
+"""Height of a dish, and how far the parts of its rim may differ."""
 UNDER, COVERED, COVERING = 0.35, 0.15, 0.2
 """What is under a rim: cells as a share of those above, share of its boundary behind the rim, and
 how much of the above it may hide in turn, as a share of that."""
@@ -131,7 +133,11 @@ def join_overhangs(pieces: Pieces) -> None:
     n = pieces.group.size
     for near in range(1, n):
         for whole in range(1, n):
-            if near != whole and (_is_under(pieces, near, whole) or _is_strip(pieces, near, whole)):
+            if near != whole and (
+                _is_under(pieces, near, whole)
+                or _is_strip(pieces, near, whole)
+                or _is_dish_rim(pieces, near, whole)
+            ):
                 merge(pieces, whole, near)
                 break
 
@@ -171,3 +177,22 @@ def _is_strip(pieces: Pieces, strip: int, whole: int) -> bool:
     if abs(a[TOP] - s[TOP]) > SAME_TOP_M or a[FAR] / a[COUNT] - s[FAR] / s[COUNT] > 0.5 * wide:
         return False
     return not has_lid(pieces, strip)
+
+
+@kernel
+def _is_dish_rim(pieces: Pieces, rim: int, whole: int) -> bool:
+    """Whether a piece is a stretch of the rim of a dish, which meets the floor in a concave edge.
+
+    Low objects side by side show the concave edge only where their tops differ.
+    """
+    if not (is_group(pieces, rim) and is_group(pieces, whole)):
+        return False
+    a, r = pieces.shape[whole], pieces.shape[rim]
+    if pieces.owner[whole] != pieces.owner[rim] or r[COUNT] > UNDER * a[COUNT]:
+        return False
+    if max(a[TOP], r[TOP]) > DISH_M or abs(a[TOP] - r[TOP]) > SAME_LEVEL_M:
+        return False
+    slack = SAME_SIDE * (a[RIGHTMOST] - a[LEFT])
+    if r[LEFT] < a[LEFT] - slack or r[RIGHTMOST] > a[RIGHTMOST] + slack:
+        return False
+    return bool(pieces.pairs[CONTACT, rim, whole] >= BEFORE * pieces.boundary[rim])

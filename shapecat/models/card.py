@@ -12,7 +12,8 @@ _HEAD = """# The default model
 
 Model `{model}`, made by `make model` (`python -m shapecat.models.training`) from the simulator
 alone: no real reading was used to learn or to calibrate it. Settings were chosen on
-simulated objects; the figures on real readings below were seen while choosing, so they flatter it a little.
+simulated objects; the figures on real readings below were seen while choosing, so they flatter
+it a little.
 
 It tells {categories} by shape, seen from one side by a depth camera 0.4 to 2 m away, standing or
 lying on a level support; anything else should come out as *unknown* (novelty above 1).

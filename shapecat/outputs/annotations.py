@@ -11,7 +11,6 @@ import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from shapecat.geometry import rotation_from_quaternion
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.scene_protobuf import encode_scene, scene_descriptors
 from shapecat.types import LabelledFrame, LabelledObject
@@ -128,9 +127,12 @@ def _properties(item: LabelledObject) -> dict[str, str]:
 
 def _above(item: LabelledObject) -> tuple[float, float, float]:
     """Return where the text goes: a little above the top of the box."""
-    up = rotation_from_quaternion(item.box.orientation)[:, 2]
-    x, y, z = (item.box.center + up * (item.box.size[2] / 2 + 0.03)).tolist()
-    return x, y, z
+    qx, qy, qz, qw = item.box.orientation.tolist()
+    x, y, z = item.box.center.tolist()
+    rise = float(item.box.size[2]) / 2 + 0.03
+    # The third column of the rotation, in plain numbers: this runs for every object.
+    up = (2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy))
+    return x + rise * up[0], y + rise * up[1], z + rise * up[2]
 
 
 class _RosMessages:
@@ -140,6 +142,7 @@ class _RosMessages:
         self.ros1 = ros1
         self.store = _typestore(ros1)
         self.types = {name.rsplit("/", 1)[1]: kind for name, kind in self.store.types.items()}
+        self.colours: dict[tuple[str, str, float], Any] = {}
         self.no_covariance = np.zeros(36)
         self.no_indices = np.zeros(0, np.uint32)
         self.no_bytes = np.zeros(0, np.uint8)
@@ -264,10 +267,17 @@ class _RosMessages:
         return self.types["Vector3"](*item.box.size.tolist())
 
     def _colour(self, item: LabelledObject, alpha: float) -> Any:
-        return self.types["Color"](*(part / 255 for part in colour_of(item.category)), alpha)
+        return self._colour_as("Color", item.category, alpha)
 
     def _rgba(self, item: LabelledObject, alpha: float) -> Any:
-        return self.types["ColorRGBA"](*(part / 255 for part in colour_of(item.category)), alpha)
+        return self._colour_as("ColorRGBA", item.category, alpha)
+
+    def _colour_as(self, kind: str, category: str, alpha: float) -> Any:
+        key = (kind, category, alpha)
+        if key not in self.colours:
+            parts = (part / 255 for part in colour_of(category))
+            self.colours[key] = self.types[kind](*parts, alpha)
+        return self.colours[key]
 
     def _text(self, item: LabelledObject) -> Any:
         t = self.types

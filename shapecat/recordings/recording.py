@@ -10,6 +10,8 @@ from shapecat.recordings.messages import Channel, Message, Topic
 
 __all__ = ["Recording"]
 
+_MOST_WARNINGS = 100
+
 
 class Recording(ABC):
     """An open log. Use it as a context manager, or `close` it.
@@ -80,9 +82,10 @@ class Recording(ABC):
         return decode(message, self._decoders)
 
     def warn(self, text: str) -> None:
-        """Add to ``warnings``, once."""
-        if text not in self.warnings:
-            self.warnings.append(text)
+        """Add to ``warnings``, once; a badly damaged recording has no end of them."""
+        if text not in self.warnings and len(self.warnings) <= _MOST_WARNINGS:
+            enough = len(self.warnings) == _MOST_WARNINGS
+            self.warnings.append("and more of this kind" if enough else text)
 
     def __enter__(self) -> Self:
         return self

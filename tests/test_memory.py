@@ -1,0 +1,27 @@
+"""Memory stays flat with the length of a recording."""
+
+from pathlib import Path
+
+from shapecat.jobs import Job
+from shapecat.pipeline import process
+from tests.scenes import record
+
+PAGE = 4096
+
+
+def resident_bytes() -> int:
+    return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
+
+
+def test_memory_does_not_grow_with_the_frames(tmp_path: Path) -> None:
+    """A detection kept by mistake costs 20 kB: two thousand of them more than is allowed."""
+    recording = record(tmp_path / "a.mcap", 420)
+    seen: dict[int, int] = {}
+
+    def watch(phase: str, done: int, _total: int | None) -> None:
+        if phase == "perceive" and done % 32 == 1:
+            seen[done] = resident_bytes()
+
+    process(Job(recording, tmp_path / "out", rrd=False), watch)
+
+    assert seen[417] - seen[129] < 16 << 20
