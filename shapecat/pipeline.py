@@ -150,9 +150,11 @@ def annotate(
     """Write annotated.mcap and review.rrd from the tables, tracks.csv and the recording."""
     settings, total = run["settings"]["outputs"], run["counts"]["frames"]
 
-    def labelled(phase: str) -> Iterator[LabelledFrame]:
+    def labelled(phase: str, *, surfaces: bool) -> Iterator[LabelledFrame]:
         labels = read_labels(folder / "tracks.csv", run["model"]["categories"])
-        return _observed(read_labelled_frames(folder, labels), phase, total, observe)
+        return _observed(
+            read_labelled_frames(folder, labels, surfaces=surfaces), phase, total, observe
+        )
 
     def write_mcap() -> None:
         from shapecat.outputs.annotated_mcap import write_annotated  # noqa: PLC0415  on first use
@@ -160,7 +162,7 @@ def annotate(
         write_annotated(
             recording,
             folder / "annotated.mcap",
-            labelled("annotate"),
+            labelled("annotate", surfaces=False),
             run=run,
             markers=settings["markers"],
         )
@@ -170,7 +172,7 @@ def annotate(
 
         write_review(
             folder / "review.rrd",
-            _with_clouds(labelled("review"), recording, run),
+            _with_clouds(labelled("review", surfaces=True), recording, run),
             name=recording.path.name,
             run=run,
             categories=run["model"]["categories"],

@@ -1,5 +1,6 @@
 """Containers: what was recorded is what is read, and damage is said, never raised."""
 
+import os
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,6 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from shapecat.errors import RecordingError
 from shapecat.recordings import MessageError, Topic, open_recording
+from shapecat.run_folder import lock
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE1 = get_typestore(Stores.ROS1_NOETIC)
@@ -301,6 +303,28 @@ def test_ros2_folder(
         assert read == [f"message {k}" for k in range(5)]
         assert recording.topics == (Topic("/a", STRING, "cdr", 5),)
         assert bool(recording.warnings) is not metadata
+
+
+def test_parts_unpacked_by_a_killed_process_are_removed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_folder(tmp_path / "bag", StoragePlugin.SQLITE3, CompressionMode.FILE)
+    place = tmp_path / "tmp"
+    old, other = place / "shapecat-parts-old", place / "shapecat-parts-other"
+    for folder in (old, other):
+        folder.mkdir(parents=True)
+        os.utime(folder, (0, 0))
+    monkeypatch.setattr("tempfile.tempdir", str(place))
+    held = lock(other)
+    assert held is not None
+
+    with open_recording(path) as recording:
+        assert not old.exists()
+        assert len(list(place.iterdir())) == 2
+        assert sum(1 for _ in recording.messages()) == 5
+
+    assert list(place.iterdir()) == [other]
+    os.close(held)
 
 
 def test_splits_that_overlap_are_merged(tmp_path: Path) -> None:

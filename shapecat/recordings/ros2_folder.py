@@ -1,12 +1,15 @@
 """ROS 2 bags in a folder: one or more parts in SQLite or MCAP, maybe compressed."""
 
+import os
 import re
+import shutil
+import time
 from collections.abc import Callable, Collection, Iterator
+from contextlib import suppress
 from heapq import merge
 from itertools import pairwise
 from pathlib import Path
-from shutil import disk_usage
-from tempfile import TemporaryDirectory
+from tempfile import TemporaryDirectory, gettempdir
 from typing import ClassVar
 
 import zstandard
@@ -16,6 +19,7 @@ from shapecat.recordings.mcap_file import McapRecording
 from shapecat.recordings.messages import Channel, Message, Topic
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.ros2_database import DatabaseRecording
+from shapecat.run_folder import lock
 
 __all__ = ["FolderRecording"]
 
@@ -23,6 +27,10 @@ _PARTS: dict[str, Callable[[Path], Recording]] = {
     ".mcap": McapRecording,
     ".db3": DatabaseRecording,
 }
+
+
+_SCRATCH = "shapecat-parts-"
+_NEW_S = 60
 
 
 class FolderRecording(Recording):
@@ -43,6 +51,7 @@ class FolderRecording(Recording):
         """
         super().__init__(path)
         self._scratch: TemporaryDirectory[str] | None = None
+        self._lock: int | None = None
         self._parts: list[Recording] = []
         try:
             self._open_parts(self._list_files())
@@ -65,6 +74,9 @@ class FolderRecording(Recording):
             part.close()
         if self._scratch is not None:
             self._scratch.cleanup()
+        if self._lock is not None:
+            os.close(self._lock)
+            self._lock = None
 
     def parts(self) -> list[Recording]:
         """Return the recordings in the folder, by time."""
@@ -134,9 +146,11 @@ class FolderRecording(Recording):
     def _decompressed(self, file: Path) -> Path:
         """Decompress a part into a temporary folder, within the space that there is."""
         if self._scratch is None:
-            self._scratch = TemporaryDirectory(prefix="shapecat-")
+            _remove_abandoned()
+            self._scratch = TemporaryDirectory(prefix=_SCRATCH)
+            self._lock = lock(Path(self._scratch.name))
         plain = Path(self._scratch.name, file.stem)
-        room = disk_usage(self._scratch.name).free // 2
+        room = shutil.disk_usage(self._scratch.name).free // 2
         reader = zstandard.ZstdDecompressor()
         try:
             with file.open("rb") as source, plain.open("wb") as target:
@@ -154,6 +168,17 @@ class FolderRecording(Recording):
         for part in self._parts:
             for text in part.warnings:
                 self.warn(f"{part.path.name}: {text}")
+
+
+def _remove_abandoned() -> None:
+    """Remove the temporary folders of processes that were killed."""
+    for folder in Path(gettempdir()).glob(f"{_SCRATCH}*"):
+        with suppress(OSError):
+            # A new one may not be locked yet.
+            if time.time() - folder.stat().st_mtime < _NEW_S or (held := lock(folder)) is None:
+                continue
+            shutil.rmtree(folder, ignore_errors=True)
+            os.close(held)
 
 
 def _suffix(file: Path) -> str:
