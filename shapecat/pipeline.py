@@ -19,6 +19,7 @@ from shapecat.jit import CompileClock, compile_clock
 from shapecat.jobs import Job, Summary, describe_run, resume, same_work, summarize
 from shapecat.labels import read_labelled_frames
 from shapecat.learning import Categorizer, load_model
+from shapecat.outputs.rereading import with_clouds
 from shapecat.perception import perceive
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
 from shapecat.recordings.gravity import Upright
@@ -172,7 +173,7 @@ def annotate(
 
         write_review(
             folder / "review.rrd",
-            _with_clouds(labelled("review", surfaces=True), recording, run),
+            with_clouds(labelled("review", surfaces=True), recording, run),
             name=recording.path.name,
             run=run,
             categories=run["model"]["categories"],
@@ -223,15 +224,3 @@ def _observed(
     for done, item in enumerate(items, start=1):
         yield item
         observe(phase, done, total)
-
-
-def _with_clouds(
-    labelled: Iterator[LabelledFrame], recording: Recording, run: dict[str, Any]
-) -> Iterator[tuple[LabelledFrame, Frame]]:
-    """Read the clouds again beside their labels."""
-    clouds, _ = _select(recording, run["options"], Counter())
-    for label, frame in zip(labelled, clouds, strict=True):
-        if (label.topic, label.index) != (frame.topic, frame.index):
-            msg = f"{recording.path}: has changed since it was processed; process it again"
-            raise OutputError(msg)
-        yield label, frame
