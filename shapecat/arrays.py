@@ -1,7 +1,7 @@
 """Shape-checked, read-only arrays for the records."""
 
 from dataclasses import dataclass, field, fields
-from typing import Any, TypeAlias, dataclass_transform
+from typing import Any, ClassVar, TypeAlias, dataclass_transform
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike, NDArray
@@ -48,18 +48,32 @@ def freeze(
     ...
     ValueError: expected shape (3), got (2,)
     """
-    sizes = {} if sizes is None else sizes
-    result = np.asarray(value, dtype=dtype).view()
-    axes = shape.split()
-    fits = len(axes) == result.ndim and all(
-        size == (int(axis) if axis.isdigit() else sizes.setdefault(axis, size))
+    return _freeze(value, _axes(shape), np.dtype(dtype), {} if sizes is None else sizes)
+
+
+Axes = tuple[int | str, ...]
+
+
+def _axes(shape: str) -> Axes:
+    return tuple(int(axis) if axis.isdigit() else axis for axis in shape.split())
+
+
+def _freeze(
+    value: ArrayLike, axes: Axes, dtype: np.dtype[Any], sizes: dict[str, int]
+) -> NDArray[Any]:
+    """Do the work of `freeze`: records are made by the thousand."""
+    result = np.asarray(value, dtype)
+    if len(axes) != result.ndim or not all(
+        size == (axis if isinstance(axis, int) else sizes.setdefault(axis, size))
         for axis, size in zip(axes, result.shape, strict=True)
-    )
-    if not fits:
+    ):
         known = f" with {sizes}" if sizes else ""
-        msg = f"expected shape ({', '.join(axes)}){known}, got {result.shape}"
+        names = ", ".join(map(str, axes))
+        msg = f"expected shape ({names}){known}, got {result.shape}"
         raise ValueError(msg)
-    result.flags.writeable = False
+    if result.flags.writeable:
+        result = result.view()
+        result.flags.writeable = False
     return result
 
 
@@ -77,20 +91,27 @@ class Record:
     ``None`` is left alone.
     """
 
+    _arrays: ClassVar[tuple[tuple[str, Axes, np.dtype[Any]], ...]] = ()
+
     def __init_subclass__(cls) -> None:
         """Make the subclass a frozen dataclass."""
-        dataclass(frozen=True, eq=False)(cls)
+        made = dataclass(frozen=True, eq=False)(cls)
+        cls._arrays = tuple(
+            (item.name, _axes(item.metadata["shape"]), np.dtype(item.metadata["dtype"]))
+            for item in fields(made)  # type: ignore[arg-type]  # every subclass is a dataclass
+            if "shape" in item.metadata
+        )
 
     def __post_init__(self) -> None:
         """Freeze the array fields."""
         sizes: dict[str, int] = {}
-        for item in fields(self):  # type: ignore[arg-type]  # every subclass is a dataclass
-            value = getattr(self, item.name)
-            if "shape" not in item.metadata or value is None:
+        for name, axes, dtype in self._arrays:
+            value = getattr(self, name)
+            if value is None:
                 continue
             try:
-                frozen = freeze(value, item.metadata["shape"], item.metadata["dtype"], sizes)
+                frozen = _freeze(value, axes, dtype, sizes)
             except ValueError as error:
-                msg = f"{type(self).__name__}.{item.name}: {error}"
+                msg = f"{type(self).__name__}.{name}: {error}"
                 raise ValueError(msg) from None
-            object.__setattr__(self, item.name, frozen)
+            object.__setattr__(self, name, frozen)

@@ -9,6 +9,7 @@ from shapecat.types import Box, Pose
 
 __all__ = [
     "IDENTITY",
+    "box_corners",
     "compose",
     "gravity_rotation",
     "inverse",
@@ -158,6 +159,14 @@ def upright_box(points: F4, up: ArrayLike) -> Box:
     return Box(
         sensor_from_box @ ((low + high) / 2), high - low, quaternion_from_rotation(sensor_from_box)
     )
+
+
+def box_corners(box: Box) -> F8:
+    """Return (8, 3) the corners of a box, sensor frame: the lower four around, then the upper."""
+    signs = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
+    unit = np.array([[x, y, z] for z in (-1, 1) for x, y in signs.tolist()], np.float64)
+    rotation = rotation_from_quaternion(box.orientation)
+    return np.asarray(box.center + (unit * box.size / 2) @ rotation.T)
 
 
 @kernel(fast=True)

@@ -10,9 +10,9 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from shapecat.corrections import adopt_labels, read_labels
+from shapecat.corrections import TrackLabel, adopt_labels, read_labels
 from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import NoStreamError, OutputError
 from shapecat.jit import CompileClock, compile_clock
@@ -24,12 +24,14 @@ from shapecat.perception import perceive
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
 from shapecat.recordings.gravity import Upright
 from shapecat.run_folder import read_run, staged, sweep, write_run
+from shapecat.shown import read_shown_frames
 from shapecat.tables import FrameRow, PerceptionTables, count_rows, discard_segments
 from shapecat.tracks import track_run
-from shapecat.types import Frame, LabelledFrame
+from shapecat.types import Frame, LabelledFrame, ShownFrame
 
 __all__ = ["Observer", "annotate", "annotate_again", "perceive_all", "process", "track"]
 
+_Shown = TypeVar("_Shown", LabelledFrame, ShownFrame)
 Observer = Callable[[str, int, int | None], None]
 """Called with the name of the phase, the frames done, and how many there are, if known."""
 
@@ -151,19 +153,17 @@ def annotate(
     """Write annotated.mcap and review.rrd from the tables, tracks.csv and the recording."""
     settings, total = run["settings"]["outputs"], run["counts"]["frames"]
 
-    def labelled(phase: str, *, surfaces: bool) -> Iterator[LabelledFrame]:
-        labels = read_labels(folder / "tracks.csv", run["model"]["categories"])
-        return _observed(
-            read_labelled_frames(folder, labels, surfaces=surfaces), phase, total, observe
-        )
+    def labels() -> dict[int, TrackLabel]:
+        return read_labels(folder / "tracks.csv", run["model"]["categories"])
 
     def write_mcap() -> None:
         from shapecat.outputs.annotated_mcap import write_annotated  # noqa: PLC0415  on first use
 
+        shown = read_shown_frames(folder, labels())
         write_annotated(
             recording,
             folder / "annotated.mcap",
-            labelled("annotate", surfaces=False),
+            _observed(shown, "annotate", total, observe),
             run=run,
             markers=settings["markers"],
         )
@@ -171,9 +171,10 @@ def annotate(
     def write_rrd() -> None:
         from shapecat.outputs.review import write_review  # noqa: PLC0415  loads Rerun on first use
 
+        labelled = read_labelled_frames(folder, labels())
         write_review(
             folder / "review.rrd",
-            with_clouds(labelled("review", surfaces=True), recording, run),
+            with_clouds(_observed(labelled, "review", total, observe), recording, run),
             name=recording.path.name,
             run=run,
             categories=run["model"]["categories"],
@@ -219,8 +220,8 @@ def _select(
 
 
 def _observed(
-    items: Iterator[LabelledFrame], phase: str, total: int, observe: Observer
-) -> Iterator[LabelledFrame]:
+    items: Iterator[_Shown], phase: str, total: int, observe: Observer
+) -> Iterator[_Shown]:
     for done, item in enumerate(items, start=1):
         yield item
         observe(phase, done, total)

@@ -7,6 +7,7 @@ camera's is the optical frame (x right, y down, z forward).
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -26,6 +27,8 @@ __all__ = [
     "Plane",
     "Pose",
     "Scene",
+    "ShownBox",
+    "ShownFrame",
 ]
 
 CATEGORIES = ("cup", "can", "box", "bottle", "bowl", "plate", "ball")
@@ -266,3 +269,30 @@ class LabelledFrame(Record):
     ended: tuple[int, ...]
     seconds: dict[str, float]
     up: F4 | None = array("3", "f4", default=None)
+
+
+class ShownBox(NamedTuple):
+    """What annotation messages say of one object, in plain numbers.
+
+    ``center`` and ``size`` in metres, ``orientation`` x, y, z, w, as in `Box`; sensor frame.
+    """
+
+    track: int
+    category: str
+    confidence: float
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    orientation: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class ShownFrame:
+    """What annotation messages say of one frame; the fields are those of `LabelledFrame`."""
+
+    topic: str
+    index: int
+    stamp_ns: int
+    log_time_ns: int
+    frame_id: str
+    objects: tuple[ShownBox, ...]
+    ended: tuple[int, ...]

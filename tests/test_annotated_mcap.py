@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
@@ -23,9 +25,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from shapecat.errors import OutputError
 from shapecat.outputs.annotated_mcap import write_annotated
+from shapecat.outputs.annotation import Annotation
 from shapecat.outputs.colours import CATEGORY_COLOURS, colour_of
+from shapecat.outputs.ros_annotations import RosMessages
+from shapecat.outputs.ros_stencils import StencilEncoder
 from shapecat.recordings import open_recording
-from shapecat.types import CATEGORIES, Box, LabelledFrame, LabelledObject, NeuralGas
+from shapecat.types import CATEGORIES, ShownBox, ShownFrame
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE1 = get_typestore(Stores.ROS1_NOETIC)
@@ -35,40 +40,30 @@ EPOCH = 1_700_000_000 * SECOND
 RUN = {"version": "1", "counts": {"frames": 3}}
 
 
-def f4(*values: float) -> Any:
-    return np.array(values, np.float32)
-
-
-def labelled(index: int, tracks: list[int], *, ended: tuple[int, ...] = ()) -> LabelledFrame:
-    nothing = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+def shown(index: int, tracks: list[int], *, ended: tuple[int, ...] = ()) -> ShownFrame:
     objects = tuple(
-        LabelledObject(
+        ShownBox(
             track=track,
             category="cup",
             confidence=0.97,
-            box=Box(f4(0.1, 0.2, 1.0 + track), f4(0.1, 0.2, 0.3), f4(0, 0, 0.6, 0.8)),
-            indices=np.zeros(1, np.uint32),
-            gas=nothing,
-            posterior=f4(1),
-            causal=f4(1),
+            center=(0.1, 0.2, 1.0 + track),
+            size=(0.1, 0.2, 0.3),
+            orientation=(0, 0, 0.6, 0.8),
         )
         for track in tracks
     )
-    return LabelledFrame(
+    return ShownFrame(
         topic="/points",
         index=index,
         stamp_ns=EPOCH + index * SECOND // 10,
         log_time_ns=EPOCH + index * SECOND // 10 + 7,
         frame_id="camera",
-        fixed_from_sensor=None,
-        planes=(),
         objects=objects,
         ended=ended,
-        seconds={},
     )
 
 
-FRAMES = [labelled(0, [3, 4]), labelled(1, [4]), labelled(2, [], ended=(4,))]
+FRAMES = [shown(0, [3, 4]), shown(1, [4]), shown(2, [], ended=(4,))]
 
 
 def string(value: str) -> bytes:
@@ -382,7 +377,7 @@ def test_nothing_is_left_behind_on_failure(tmp_path: Path) -> None:
     source = write_mcap(tmp_path / "a.mcap")
     target = tmp_path / "out.mcap"
 
-    def failing() -> Iterator[LabelledFrame]:
+    def failing() -> Iterator[ShownFrame]:
         yield from FRAMES
         raise OSError(28, os.strerror(28))
 
@@ -410,3 +405,42 @@ def test_every_category_has_a_colour_of_its_own() -> None:
     assert {*CATEGORIES, "unknown"} <= CATEGORY_COLOURS.keys()
     assert len(set(CATEGORY_COLOURS.values())) == len(CATEGORY_COLOURS)
     assert colour_of("teapot") == colour_of("teapot") != colour_of("kettle")
+
+
+NUMBER = st.floats(-1e3, 1e3, width=32)
+BOX = st.builds(
+    ShownBox,
+    track=st.integers(0, 12_000),
+    category=st.sampled_from(["cup", "bowl", "unknown", "Ölkanne"]),
+    confidence=st.sampled_from([0.25, 1.0]),
+    center=st.tuples(NUMBER, NUMBER, NUMBER),
+    size=st.tuples(NUMBER, NUMBER, NUMBER),
+    orientation=st.tuples(NUMBER, NUMBER, NUMBER, NUMBER),
+)
+ANNOTATION = st.builds(
+    Annotation,
+    frame=st.builds(
+        ShownFrame,
+        topic=st.just("/points"),
+        index=st.just(0),
+        stamp_ns=st.integers(0, 2**62),
+        log_time_ns=st.just(0),
+        frame_id=st.sampled_from(["", "cam", "camera"]),
+        objects=st.lists(BOX, max_size=4).map(tuple),
+        ended=st.just(()),
+    ),
+    lifetime_ns=st.integers(1, 2**60),
+    gone=st.lists(st.integers(0, 12_000), max_size=2).map(tuple),
+)
+
+
+@pytest.mark.parametrize("ros1", [False, True])
+@settings(max_examples=40, deadline=None)
+@given(annotations=st.lists(ANNOTATION, min_size=1, max_size=3))
+def test_fast_messages_are_those_of_the_library(ros1: bool, annotations: list[Annotation]) -> None:
+    """Filled-in bytes that are one off would be read as other numbers, without an error."""
+    ros = RosMessages(ros1=ros1)
+    for message in (ros.detections, ros.scene, ros.markers):
+        fast = StencilEncoder(ros, message)
+        for annotation in annotations * 2:
+            assert fast(annotation) == ros.serialize(message.whole(annotation), message.name)

@@ -15,7 +15,17 @@ FLOOR = {
     **dict.fromkeys(BASE | {"__init__", "py"}, 0),
     **dict.fromkeys(("config", "geometry", "run_folder"), 1),
     **dict.fromkeys(
-        (*STAGES, "recordings", "simulation", "schemas", "tables", "corrections", "labels"), 2
+        (
+            *STAGES,
+            "recordings",
+            "simulation",
+            "schemas",
+            "tables",
+            "corrections",
+            "labels",
+            "shown",
+        ),
+        2,
     ),
     **dict.fromkeys(("outputs", "evaluation", "models", "perception", "jobs", "tracks"), 3),
     "pipeline": 4,

@@ -13,12 +13,13 @@ from pathlib import Path
 from typing import BinaryIO
 
 from shapecat.errors import OutputError
-from shapecat.outputs.annotations import ENCODERS, Annotation, encoder_for
+from shapecat.outputs.annotation import Annotation
+from shapecat.outputs.annotations import ENCODERS, encoder_for
 from shapecat.outputs.mcap_append import Appender, copy_bytes
 from shapecat.outputs.mcap_rewrite import Item, rewrite
 from shapecat.recordings import Recording
 from shapecat.recordings.mcap_file import McapRecording
-from shapecat.types import LabelledFrame
+from shapecat.types import ShownFrame
 
 __all__ = ["write_annotated"]
 
@@ -31,7 +32,7 @@ _PERIOD_NS = 1_000_000_000
 def write_annotated(
     recording: Recording,
     path: Path,
-    frames: Iterable[LabelledFrame],
+    frames: Iterable[ShownFrame],
     *,
     run: Mapping[str, object],
     markers: bool = False,
@@ -56,7 +57,7 @@ def write_annotated(
     encoding = _encoding(recording, first)
     kinds = encoder_for(encoding, markers=markers)
     items = (
-        Item(number, annotation.frame.log_time_ns, bytes(encode(annotation)))
+        Item(number, annotation.frame.log_time_ns, encode(annotation))
         for annotation in chain([first] if first else [], annotations)
         for number, (_, encode) in enumerate(kinds)
     )
@@ -79,7 +80,7 @@ def write_annotated(
             rewrite(recording, file, channels, items, metadata)
 
 
-def _annotations(frames: Iterable[LabelledFrame]) -> Iterator[Annotation]:
+def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
     """Look one frame ahead for the lifetime, and back for what is no longer shown."""
     periods: dict[str, int] = {}
     last: dict[str, int] = {}

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from shapecat.arrays import F8
-from shapecat.geometry import gravity_rotation, rotation_from_quaternion
-from shapecat.labels import box_corners
+from shapecat.geometry import box_corners, gravity_rotation, rotation_from_quaternion
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.exports_files import finite_points, upward, write_pcd
 from shapecat.outputs.rereading import FinishedRun

@@ -15,7 +15,7 @@ from mcap import records
 from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
-from shapecat.outputs.annotations import AnnotationChannel
+from shapecat.outputs.annotation import AnnotationChannel
 from shapecat.recordings.mcap_file import Summary
 from shapecat.recordings.mcap_records import MAGIC
 

@@ -10,7 +10,7 @@ from mcap import records
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
-from shapecat.outputs.annotations import AnnotationChannel
+from shapecat.outputs.annotation import AnnotationChannel
 from shapecat.outputs.ros1_conversion import convert_channel, raw_channel, wrap_raw
 from shapecat.recordings import Channel, Message, Recording
 from shapecat.recordings.decoding import LIBRARY_ERRORS, schema_of

@@ -18,7 +18,7 @@ from rosbags.rosbag2.metadata import dump_qos_v8
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
-from shapecat.outputs.annotations import AnnotationChannel
+from shapecat.outputs.annotation import AnnotationChannel
 from shapecat.recordings.decoding import LIBRARY_ERRORS, typestore_of
 from shapecat.recordings.messages import Channel
 

@@ -1,0 +1,64 @@
+"""What annotations say, whatever their encoding."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from shapecat.types import ShownBox, ShownFrame
+
+__all__ = [
+    "Annotation",
+    "AnnotationChannel",
+    "entity_id",
+    "properties",
+    "text",
+    "text_position",
+]
+
+
+class AnnotationChannel(NamedTuple):
+    """A channel to write: its topic, the encoding of its messages, and its schema."""
+
+    topic: str
+    encoding: str
+    schema_name: str
+    schema_encoding: str
+    schema: bytes
+    metadata: tuple[tuple[str, str], ...] = ()
+
+
+@dataclass(frozen=True)
+class Annotation:
+    """A frame to write, how long its entities live, and which tracks it no longer shows."""
+
+    frame: ShownFrame
+    lifetime_ns: int
+    gone: tuple[int, ...]
+
+
+def entity_id(track: int) -> str:
+    """Return what a track's entity is called."""
+    return f"track-{track}"
+
+
+def text(box: ShownBox) -> str:
+    """Return what is written above a box."""
+    return f"track {box.track} {box.category} {box.confidence:.2f}"
+
+
+def properties(box: ShownBox) -> dict[str, str]:
+    """Return what a viewer lists of a box."""
+    return {
+        "category": box.category,
+        "confidence": f"{box.confidence:.4f}",
+        "track": str(box.track),
+    }
+
+
+def text_position(box: ShownBox) -> tuple[float, float, float]:
+    """Return where the text goes: a little above the top of the box; metres, sensor frame."""
+    x, y, z = box.center
+    qx, qy, qz, qw = box.orientation
+    rise = box.size[2] / 2 + 0.03
+    # The third column of the rotation, in plain numbers: this runs for every object.
+    up = (2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy))
+    return x + rise * up[0], y + rise * up[1], z + rise * up[2]

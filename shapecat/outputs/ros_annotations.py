@@ -1,0 +1,220 @@
+"""Annotations as ROS messages, with the definitions in `shapecat.schemas`."""
+
+from collections.abc import Callable
+from functools import cache
+from importlib.resources import files
+from typing import Any, NamedTuple
+
+import numpy as np
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys.store import Typestore
+
+from shapecat.outputs.annotation import (
+    Annotation,
+    entity_id,
+    properties,
+    text,
+    text_position,
+)
+from shapecat.outputs.colours import colour_of
+from shapecat.types import ShownBox, ShownFrame
+
+__all__ = ["ArrayMessage", "RosMessages"]
+
+
+class ArrayMessage(NamedTuple):
+    """A message whose last field is an array with the same number of elements for each object.
+
+    Where ``gone_inside``, that array also holds what takes earlier tracks away.
+    """
+
+    name: str
+    whole: Callable[[Annotation], Any]
+    element: str
+    elements: tuple[Callable[[Annotation, ShownBox], Any], ...]
+    gone_inside: bool = False
+
+
+class RosMessages:
+    """Builds and serializes the messages, of ROS 1 or ROS 2."""
+
+    def __init__(self, *, ros1: bool) -> None:
+        """Prepare the types."""
+        self.ros1 = ros1
+        self._store = _typestore(ros1)
+        self._types = {name.rsplit("/", 1)[1]: kind for name, kind in self._store.types.items()}
+        self._no_covariance = np.zeros(36)
+        self._no_bytes = np.zeros(0, np.uint8)
+        self._upright = self._types["Quaternion"](0.0, 0.0, 0.0, 1.0)
+        self.detections = ArrayMessage(
+            "vision_msgs/msg/Detection3DArray",
+            self._detections,
+            "vision_msgs/msg/Detection3D",
+            (self._detection,),
+        )
+        self.scene = ArrayMessage(
+            "foxglove_msgs/msg/SceneUpdate",
+            self._scene,
+            "foxglove_msgs/msg/SceneEntity",
+            (self._entity,),
+        )
+        self.markers = ArrayMessage(
+            "visualization_msgs/msg/MarkerArray",
+            self._markers,
+            "visualization_msgs/msg/Marker",
+            (self._cube_marker, self._text_marker),
+            gone_inside=True,
+        )
+
+    def definition(self, name: str) -> bytes:
+        """Return the definition to embed: that of the store that encodes."""
+        definition, _ = self._store.generate_msgdef(name, ros_version=1 if self.ros1 else 2)
+        return definition.encode()
+
+    def serialize(self, message: Any, name: str) -> bytes:
+        """Encode a message."""
+        if self.ros1:
+            return bytes(self._store.serialize_ros1(message, name))
+        return bytes(self._store.serialize_cdr(message, name))
+
+    def shifted(self, message: Any, name: str) -> bytes:
+        """Encode a message as CDR that begins 4 bytes after a multiple of 8."""
+        outer = f"shapecat_msgs/msg/Shifted{name.rsplit('/', 1)[1]}"
+        if outer not in self._store.fielddefs:
+            definition = f"uint32 shift\n{name.replace('/msg/', '/')} message\n"
+            self._store.register(get_types_from_msg(definition, outer))
+        return self.serialize(self._store.types[outer](0, message), outer)[4:]
+
+    def _detections(self, annotation: Annotation) -> Any:
+        found = [self._detection(annotation, box) for box in annotation.frame.objects]
+        return self._types["Detection3DArray"](self._header(annotation.frame), found)
+
+    def _detection(self, annotation: Annotation, box: ShownBox) -> Any:
+        t, pose = self._types, self._pose(box)
+        result = t["ObjectHypothesisWithPose"](
+            t["ObjectHypothesis"](box.category, float(box.confidence)),
+            t["PoseWithCovariance"](pose, self._no_covariance),
+        )
+        bounds = t["BoundingBox3D"](pose, self._size(box))
+        return t["Detection3D"](self._header(annotation.frame), [result], bounds, str(box.track))
+
+    def _scene(self, annotation: Annotation) -> Any:
+        t, time = self._types, self._time(annotation.frame.stamp_ns)
+        deletions = [
+            t["SceneEntityDeletion"](time, 0, entity_id(track)) for track in annotation.gone
+        ]
+        entities = [self._entity(annotation, box) for box in annotation.frame.objects]
+        return t["SceneUpdate"](deletions, entities)
+
+    def _entity(self, annotation: Annotation, box: ShownBox) -> Any:
+        t, frame = self._types, annotation.frame
+        cube = t["CubePrimitive"](self._pose(box), self._size(box), self._colour("Color", box, 0.5))
+        return t["SceneEntity"](
+            self._time(frame.stamp_ns),
+            frame.frame_id,
+            entity_id(box.track),
+            self._duration(annotation.lifetime_ns),
+            False,  # noqa: FBT003  # frame_locked: it stays where it was seen
+            [t["KeyValuePair"](key, value) for key, value in properties(box).items()],
+            [],
+            [cube],
+            *([] for _ in range(4)),
+            [self._text(box)],
+            [],
+        )
+
+    def _text(self, box: ShownBox) -> Any:
+        pose, colour = self._text_pose(box), self._colour("Color", box, 1.0)
+        return self._types["TextPrimitive"](pose, True, 0.03, False, colour, text(box))  # noqa: FBT003  # the order of the definition
+
+    def _markers(self, annotation: Annotation) -> Any:
+        """Make a MarkerArray: a cube and a text for each object."""
+        gone = [
+            self._marker(annotation, kind, track, action=2)
+            for track in annotation.gone
+            for kind in ("box", "text")
+        ]
+        shown = [
+            make(annotation, box)
+            for box in annotation.frame.objects
+            for make in (self._cube_marker, self._text_marker)
+        ]
+        return self._types["MarkerArray"](gone + shown)
+
+    def _cube_marker(self, annotation: Annotation, box: ShownBox) -> Any:
+        given = {"pose": self._pose(box), "scale": self._size(box)}
+        colour = self._colour("ColorRGBA", box, 0.5)
+        return self._marker(annotation, "box", box.track, color=colour, **given)
+
+    def _text_marker(self, annotation: Annotation, box: ShownBox) -> Any:
+        given = {"pose": self._text_pose(box), "scale": self._types["Vector3"](0.0, 0.0, 0.03)}
+        colour = self._colour("ColorRGBA", box, 1.0)
+        return self._marker(annotation, "text", box.track, color=colour, text=text(box), **given)
+
+    def _marker(self, annotation: Annotation, kind: str, number: int, **given: Any) -> Any:
+        t, header = self._types, self._header(annotation.frame)
+        values = {
+            "header": header,
+            "ns": f"shapecat/{kind}",
+            "id": number,
+            "type": 1 if kind == "box" else 9,
+            "action": 0,
+            "pose": t["Pose"](t["Point"](0.0, 0.0, 0.0), self._upright),
+            "scale": t["Vector3"](0.0, 0.0, 0.0),
+            "color": t["ColorRGBA"](0.0, 0.0, 0.0, 0.0),
+            "lifetime": self._duration(annotation.lifetime_ns),
+            "frame_locked": False,
+            "points": [],
+            "colors": [],
+            "text": "",
+            "mesh_resource": "",
+            "mesh_use_embedded_materials": False,
+        }
+        if not self.ros1:
+            empty = t["CompressedImage"](header, "", self._no_bytes)
+            mesh = t["MeshFile"]("", self._no_bytes)
+            values |= {"texture_resource": "", "texture": empty, "uv_coordinates": []}
+            values |= {"mesh_file": mesh}
+        return t["Marker"](**values | given)
+
+    def _time(self, stamp_ns: int) -> Any:
+        seconds, nanoseconds = divmod(stamp_ns, 10**9)
+        return self._types["Time"](min(seconds, 2**31 - 1), nanoseconds)
+
+    def _duration(self, lifetime_ns: int) -> Any:
+        return self._types["Duration"](*divmod(lifetime_ns, 10**9))
+
+    def _header(self, frame: ShownFrame) -> Any:
+        values = (self._time(frame.stamp_ns), frame.frame_id)
+        return self._types["Header"](*((0, *values) if self.ros1 else values))
+
+    def _pose(self, box: ShownBox) -> Any:
+        t = self._types
+        return t["Pose"](t["Point"](*box.center), t["Quaternion"](*box.orientation))
+
+    def _text_pose(self, box: ShownBox) -> Any:
+        return self._types["Pose"](self._types["Point"](*text_position(box)), self._upright)
+
+    def _size(self, box: ShownBox) -> Any:
+        return self._types["Vector3"](*box.size)
+
+    def _colour(self, kind: str, box: ShownBox, alpha: float) -> Any:
+        return self._types[kind](*(part / 255 for part in colour_of(box.category)), alpha)
+
+
+@cache
+def _typestore(ros1: bool) -> Typestore:  # noqa: FBT001  # a cache key
+    store = get_typestore(Stores.EMPTY)
+    names = {
+        "Detection3DArray": "vision_msgs/msg/Detection3DArray",
+        "SceneUpdate": "foxglove_msgs/msg/SceneUpdate",
+        "MarkerArray": "visualization_msgs/msg/MarkerArray",
+    }
+    known = dict(get_typestore(Stores.ROS1_NOETIC).fielddefs) if ros1 else {}
+    for file, name in names.items():
+        definition = files("shapecat.schemas").joinpath(f"{file}.msg").read_text("utf-8")
+        types = get_types_from_msg(definition, name)
+        # ROS 1 has a sequence number in its headers, and simpler markers.
+        types = {key: known.get(key, value) for key, value in types.items()}
+        store.register({key: value for key, value in types.items() if key not in store.fielddefs})
+    return store
