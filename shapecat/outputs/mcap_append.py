@@ -2,6 +2,7 @@
 
 import os
 import shutil
+import struct
 import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
@@ -23,6 +24,9 @@ __all__ = ["Appender", "copy_bytes"]
 
 _CHUNK_BYTES = 64 << 10
 """Small chunks: a reader that sorts by time holds one of them for the whole recording."""
+_RECORD = struct.Struct("<BQ")
+_MESSAGE = struct.Struct("<BQHIQQ")
+"""A record's opcode and length; a message's channel, sequence, log time and publish time."""
 _COMPRESS = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}
 
 
@@ -61,7 +65,7 @@ class _Limited:
 class _Chunk:
     """A chunk being filled."""
 
-    builder: RecordBuilder = field(default_factory=RecordBuilder)
+    data: bytearray = field(default_factory=bytearray)
     indexes: dict[int, records.MessageIndex] = field(default_factory=dict)
     times: list[int] = field(default_factory=list)
 
@@ -112,25 +116,20 @@ class Appender:
             msg = "the recording has no free channel number"
             raise OSError(msg)
         self._schemas[schema_id], self._channels[number] = schema, added
-        schema.write(self._chunk.builder)
-        added.write(self._chunk.builder)
+        self._chunk.data += _encoded([schema, added])
         return number
 
     def add_message(self, channel: int, log_time: int, sequence: int, data: bytes) -> None:
         """Add a message."""
         chunk = self._chunk
         index = chunk.indexes.setdefault(channel, records.MessageIndex(channel, []))
-        index.records.append((log_time, chunk.builder.count))
+        index.records.append((log_time, len(chunk.data)))
         chunk.times.append(log_time)
         self._counts[channel] += 1
-        records.Message(
-            channel_id=channel,
-            log_time=log_time,
-            data=data,
-            publish_time=log_time,
-            sequence=sequence,
-        ).write(chunk.builder)
-        if chunk.builder.count >= _CHUNK_BYTES:
+        length = _MESSAGE.size - _RECORD.size + len(data)
+        chunk.data += _MESSAGE.pack(Opcode.MESSAGE, length, channel, sequence, log_time, log_time)
+        chunk.data += data
+        if len(chunk.data) >= _CHUNK_BYTES:
             self._flush()
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
@@ -206,7 +205,7 @@ class Appender:
         if not chunk.times:
             self._chunk = chunk
             return
-        plain = chunk.builder.end()
+        plain = bytes(chunk.data)
         data = _COMPRESS[self._compression](plain) if self._compression else plain
         start, end = min(chunk.times), max(chunk.times)
         self._times += [start, end]
@@ -234,7 +233,11 @@ class Appender:
         )
 
     def _write(self, items: Iterable[records.McapRecord]) -> int:
-        builder = RecordBuilder()
-        for item in items:
-            item.write(builder)
-        return self._file.write(builder.end())
+        return self._file.write(_encoded(items))
+
+
+def _encoded(items: Iterable[records.McapRecord]) -> bytes:
+    builder = RecordBuilder()
+    for item in items:
+        item.write(builder)
+    return bytes(builder.end())
