@@ -7,18 +7,16 @@ MCAP. Annotations use the encoding of the source.
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from contextlib import contextmanager
 from itertools import chain, pairwise
 from pathlib import Path
-from typing import BinaryIO
 
-from shapecat.errors import OutputError
 from shapecat.outputs.annotation import Annotation
 from shapecat.outputs.annotations import ENCODERS, encoder_for
 from shapecat.outputs.mcap_append import Appender, copy_bytes
 from shapecat.outputs.mcap_rewrite import Item, rewrite
 from shapecat.recordings import Recording
 from shapecat.recordings.mcap_file import McapRecording
+from shapecat.run_folder import replacing
 from shapecat.types import ShownFrame
 
 __all__ = ["write_annotated"]
@@ -63,7 +61,7 @@ def write_annotated(
     )
     channels = [channel for channel, _ in kinds]
     metadata = {"run.json": json.dumps(run)}
-    with _replacing(path) as file:
+    with replacing(path) as hidden, hidden.open("wb") as file:
         if isinstance(recording, McapRecording) and recording.indexed:
             summary = recording.summary
             copy_bytes(recording.path, file, summary.data_end)
@@ -109,18 +107,3 @@ def _encoding(recording: Recording, first: Annotation | None) -> str:
     own = [topic.encoding for topic in topics if first and topic.name == first.frame.topic]
     common = Counter(topic.encoding for topic in topics).most_common(1)
     return own[0] if own else common[0][0] if common else "json"
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[BinaryIO]:
-    """Open a hidden file beside ``path`` that takes its name when the block succeeds."""
-    hidden = path.with_name(f".{path.name}.partial")
-    try:
-        with hidden.open("wb") as file:
-            yield file
-        hidden.replace(path)
-    except OSError as error:
-        msg = f"{path}: cannot be written: {error.strerror or error}"
-        raise OutputError(msg) from error
-    finally:
-        hidden.unlink(missing_ok=True)
