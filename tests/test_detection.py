@@ -347,7 +347,7 @@ def test_plain_rules_are_the_thesis() -> None:
 def test_unknown_rule_is_refused() -> None:
     """A misspelt rule is not silently switched off."""
     depth, _ = render([table()])
-    with pytest.raises(ConfigError, match="known: concave"):
+    with pytest.raises(ConfigError, match="known: low concave"):
         detect(
             frame_of(depth),
             settings=DetectionSettings(rules="concav"),
@@ -497,3 +497,51 @@ def test_directly_overhead_camera() -> None:
     """A camera that looks straight down has no horizontal viewing direction."""
     check([table(), box((-0.1, 0, 0), (0.1, 0.1, 0.1)), can(0.12, 0, 0, 0.04, 0.1)], [1, 2],
           tilt_deg=89.9)  # fmt: skip
+
+
+def test_flush_stack_is_two_objects() -> None:
+    """The front of a can lies in the front of the box below: the ledge beside it parts them."""
+    shapes = [table(), box((0, 0, 0), (0.2, 0.1, 0.1)), can(0, -0.005, 0.1, 0.045, 0.09)]
+    scene = check(shapes, [1, 2], 0.8)
+    on = [c.on_candidate for c in scene.candidates]
+    assert sum(o is not None for o in on) == 1
+
+
+def test_bottle_with_a_wide_neck_is_one_object() -> None:
+    """A shoulder that slopes is no ledge to stand on."""
+
+    def cone(origin: Array, rays: Array) -> Array:
+        best = np.full(rays.shape[:2], np.inf)
+        for k in range(24):
+            radius = 0.045 - 0.018 * k / 23
+            hit = can(0, 0, 0.14 + 0.03 * k / 24, radius, 0.03 / 24 + 1e-4)(origin, rays)
+            best = np.minimum(best, hit)
+        return best
+
+    def bottle(origin: Array, rays: Array) -> Array:
+        parts = [can(0, 0, 0, 0.045, 0.14), cone, can(0, 0, 0.17, 0.027, 0.05)]
+        return np.asarray(np.minimum.reduce([part(origin, rays) for part in parts]))
+
+    check([table(), bottle], [1])
+
+
+def test_posts_of_a_rack_are_no_objects() -> None:
+    """Posts go on through the level of a board; a tall box that stops below it does not."""
+    rack = [table(0.4, 0.2), table(0.4, 0.2, 0.32)]
+    posts = [box((x, -0.19, 0), (0.03, 0.03, 0.6)) for x in (-0.38, 0.38)]
+    check([*rack, *posts, box((0, 0, 0.32), (0.1, 0.1, 0.1))], [4], tilt_deg=25, distance=1.3)
+
+
+def test_cut_objects_are_flagged_in_clouds_too() -> None:
+    """What the image border cuts is cut in the cloud of the same view; what it does not, is not."""
+    shapes = [table(), box((0.43, 0, 0), (0.12, 0.1, 0.1)), box((-0.1, 0, 0), (0.1, 0.1, 0.1))]
+    depth, seen = render(shapes)
+    frame = frame_of(depth)
+    points = frame.xyz()
+    points = points[np.isfinite(points[:, 2]) & (points[:, 2] > 0)]
+    cloud = found(Frame("points", 0, 0, 0, "camera", points=points))
+    flags = {round(float(c.box.center[0]), 1): c.touches_border for c in cloud.candidates}
+    assert sorted(flags.values()) == [False, True]
+    assert flags[max(flags)]
+    assert sum(c.touches_border for c in found(frame).candidates) == 1
+    assert seen.max() == 2

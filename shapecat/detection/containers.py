@@ -31,7 +31,7 @@ HOLLOW = -0.25
 """`slope_of` from which a piece is concave; planes are within a tenth of 0."""
 BENT, INSIDE, INSIDE_SHARE = -0.15, -0.4, 0.12
 """Walls inside one container: slope of each, of both together, share of a boundary in contact."""
-FLOOR_SHARE = 0.6
+FLOOR_SHARE, WITHIN = 0.6, 0.85
 BEFORE, FLAT = 0.25, 0.35
 """A near wall: share of its boundary before the rest, height over width of it and of the rest."""
 DISH_M, SAME_LEVEL_M = 0.05, 0.007
@@ -80,10 +80,11 @@ def _is_inside(pieces: Pieces, p: int, q: int) -> bool:
 @kernel
 def _is_floor(pieces: Pieces, p: int, q: int) -> bool:
     """Whether ``q`` lies within the hollow piece ``p`` and lower."""
-    if pieces.shape[q, TOP] > pieces.shape[p, TOP] or slope_of(pieces.shape[p]) > HOLLOW:
+    if pieces.shape[q, TOP] > pieces.shape[p, TOP]:
         return False
     shared = pieces.pairs[CONTACT, p, q] + pieces.pairs[FRONT, p, q]
-    enclosed = shared > FLOOR_SHARE * pieces.boundary[q]
+    share = FLOOR_SHARE if slope_of(pieces.shape[p]) <= HOLLOW else WITHIN
+    enclosed = shared > share * pieces.boundary[q]
     return bool(enclosed and pieces.pairs[CONTACT, p, q] >= FEW)
 
 

@@ -24,6 +24,7 @@ from shapecat.detection.pieces import (
     Pieces,
     has_lid,
     is_group,
+    lid_share,
     merge,
     slope_of,
 )
@@ -39,6 +40,10 @@ STANDS = 0.25
 NECK_WIDTH, NECK_OVERLAP_M, NECK_APART, ROUND = 0.55, 0.03, 0.12, 0.8
 """A neck: width, metres below the top of the body, offset of its middle; slope of the body."""
 NECK_LEDGE = 0.1
+AXIAL, WIDEST_NECK, NECK_HEIGHT = 0.055, 0.78, 0.62
+"""A wide neck on a shoulder: offset of its middle, width, height, all by those of the body."""
+SHOULDER_M, SHOULDER = 0.01, 0.17
+"""A shoulder slopes: within this depth of its top less faces up than this, by width squared."""
 
 
 def join_pieces(
@@ -95,17 +100,19 @@ def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
     if met < FEW or pieces.owner[p] != pieces.owner[q] or pieces.single[p, TABLE] > 2:
         return False
     narrow, wide = a[RIGHTMOST] - a[LEFT], b[RIGHTMOST] - b[LEFT]
-    ledge = pieces.pairs[ONTO, p, q] > NECK_LEDGE * pieces.pairs[CONTACT, p, q]
-    if (
-        narrow > (NECK_WIDTH if ledge else 1.0) * wide
-        or a[TOP] < b[TOP]
-        or a[BOTTOM] < b[TOP] - NECK_OVERLAP_M
-    ):
+    if a[TOP] < b[TOP] or a[BOTTOM] < b[TOP] - NECK_OVERLAP_M or slope_of(b) < ROUND:
         return False
     apart = abs(a[LEFT] + a[RIGHTMOST] - b[LEFT] - b[RIGHTMOST]) / 2
-    if apart > NECK_APART * wide or slope_of(a) < ROUND / 2 or slope_of(b) < ROUND:
+    if apart > NECK_APART * wide or slope_of(a) < ROUND / 2:
         return False
-    return not has_lid(pieces, q)
+    if pieces.pairs[ONTO, p, q] <= NECK_LEDGE * pieces.pairs[CONTACT, p, q]:
+        return bool(narrow <= wide and not has_lid(pieces, q))
+    if narrow <= NECK_WIDTH * wide and not has_lid(pieces, q):
+        return True
+    # A wide neck on a shoulder: turned about one axis, and the shoulder slopes.
+    axial = apart <= AXIAL * wide and slope_of(a) >= ROUND and narrow <= WIDEST_NECK * wide
+    axial = axial and a[TOP] - a[BOTTOM] <= NECK_HEIGHT * (b[TOP] - b[BOTTOM])
+    return bool(axial and lid_share(pieces, q, SHOULDER_M) < SHOULDER)
 
 
 @kernel

@@ -38,8 +38,10 @@ __all__ = [
     "Pieces",
     "has_lid",
     "is_group",
+    "lid_share",
     "merge",
     "pieces_of",
+    "side_of",
     "slope_of",
 ]
 
@@ -106,12 +108,17 @@ def pieces_of(
     _meet(
         cells.w, heights.owner, heights.height, surfaces.links, surfaces.normal, labels, up, pieces
     )
+    side = side_of(up)
+    _measure(cells.w, cells.lens, heights.owner, heights.height, surfaces, labels, up, side, pieces)
+    return pieces
+
+
+def side_of(up: F8) -> F8:
+    """Return the horizontal direction across the view, (3,) unit."""
     side = np.cross(up, [0.0, 0.0, 1.0])
     if np.linalg.norm(side) < 0.2:  # the camera looks straight down
         side = gravity_rotation(up)[0]
-    side /= np.linalg.norm(side)
-    _measure(cells.w, cells.lens, heights.owner, heights.height, surfaces, labels, up, side, pieces)
-    return pieces
+    return np.asarray(side / np.linalg.norm(side))
 
 
 @kernel
@@ -319,9 +326,15 @@ def slope_of(row: F4) -> float:
 @kernel
 def has_lid(pieces: Pieces, p: int) -> bool:
     """Whether the top of a piece is closed by a surface that faces up."""
+    return bool(lid_share(pieces, p, LID_M) > LID)
+
+
+@kernel
+def lid_share(pieces: Pieces, p: int, depth: float) -> float:
+    """Return what faces up within ``depth`` of the top of a piece, by its width squared."""
     row = pieces.shape[p]
     top = min(int(row[TOP] / BAND_M), pieces.lid.shape[1] - 1)
     area = 0.0
-    for band in range(max(top - int(LID_M / BAND_M), 0), top + 1):
+    for band in range(max(top - int(depth / BAND_M), 0), top + 1):
         area += pieces.lid[p, band]
-    return bool(area > LID * (row[RIGHTMOST] - row[LEFT]) ** 2)
+    return float(area / max((row[RIGHTMOST] - row[LEFT]) ** 2, 1e-9))

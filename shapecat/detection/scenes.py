@@ -4,10 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, U4, Bool
+from shapecat.arrays import F4, F8, I4, U4, Bool
 from shapecat.config import DetectionSettings
 from shapecat.detection.candidates import Extents, extents_of, occluded, stands_of
-from shapecat.detection.cells import Cells
+from shapecat.detection.cells import NEAREST_M, Cells
 from shapecat.detection.planes import Support, corners_of
 from shapecat.detection.segmentation import Segmentation
 from shapecat.geometry import (
@@ -23,6 +23,9 @@ __all__ = ["scene_of"]
 
 BORDER = 0.05
 """Readings that begin this near to the border of the image begin at the border."""
+BORDER_CELLS, STRAIGHT, LEAST_FORWARD = 2.5, 0.3, 0.2
+"""The border of a cloud: its width, and the least share of a side that it is straight along; the
+least cosine, about, of what is in front of a camera."""
 
 
 def scene_of(
@@ -47,7 +50,7 @@ def scene_of(
     )
     position = {k + 1: n for n, k in enumerate(kept)}
     boxes = _boxes(cells, found, indices, points)
-    cut = _cut(cells, boxes) if points is None else np.zeros(count, bool)
+    cut = _cut(cells, boxes) if points is None else _cut_cloud(cells, found, sensor_from_view)
     stands, hidden, owners = stands_of(found), occluded(found), found.owners
     candidates = []
     for k in kept:
@@ -95,6 +98,39 @@ def _cut(cells: Cells, extents: Extents) -> Bool:
         result |= extents.low[:, axis] < first + reach
         result |= extents.high[:, axis] > last - reach
     return result
+
+
+def _cut_cloud(cells: Cells, found: Segmentation, sensor_from_view: Pose) -> Bool:
+    """Return whether each object reaches a border of what the sensor of a cloud saw.
+
+    Such a border is a straight side of the cloud as seen from the sensor's place, with more than
+    one thing along it. A cloud fused from several views has none.
+    """
+    result = np.zeros(found.leaders.size, bool)
+    valid = cells.w > 0
+    if np.linalg.norm(sensor_from_view.translation) > NEAREST_M or not valid.any():
+        return result[1:]
+    rows, columns = np.flatnonzero(valid.any(axis=1)), np.flatnonzero(valid.any(axis=0))
+    last_row, last_column = valid.shape[0] - 1, valid.shape[1] - 1
+    i = np.concatenate([rows, rows, *_ends(valid[:, columns], last_row)])
+    j = np.concatenate([*_ends(valid[rows].T, last_column), columns, columns])
+    lens = cells.lens
+    ray = np.stack([(j - lens.cx) / lens.fx, (i - lens.cy) / lens.fy, np.ones(i.size)], 1)
+    seen = ray @ sensor_from_view.rotation.T
+    ray = seen if (seen[:, 2] > LEAST_FORWARD).all() else ray  # else no optical frame
+    place = ray[:, :2] / ray[:, 2:]
+    spans = np.ptp(place, axis=0)
+    for axis in range(2):
+        for along in (place[:, axis], -place[:, axis]):
+            near = along > along.max() - BORDER_CELLS / lens.fx
+            if np.ptp(place[near, 1 - axis]) > STRAIGHT * spans[1 - axis]:
+                result[found.labels[i[near], j[near]]] = True
+    return result[1:]
+
+
+def _ends(valid: Bool, last: int) -> tuple[I4, I4]:
+    """Return the first and the last row with a reading of every column; each has one."""
+    return np.argmax(valid, axis=0), last - np.argmax(valid[::-1], axis=0)
 
 
 def _moved(sensor_from_view: Pose, center: F8, size: F8, orientation: F8) -> Box:

@@ -15,12 +15,14 @@ from shapecat.detection.boards import boards_of
 from shapecat.detection.cells import Cells
 from shapecat.detection.directions import estimate_up
 from shapecat.detection.fill import fill_enclosed, grow_feet
-from shapecat.detection.furniture import is_no_object
+from shapecat.detection.furniture import is_no_object, posts_of
 from shapecat.detection.heights import heights_of, table_of
 from shapecat.detection.joins import join_pieces
+from shapecat.detection.ledges import cut_at_ledges
 from shapecat.detection.pieces import Pieces, pieces_of
 from shapecat.detection.planes import Support, find_planes
 from shapecat.detection.regions import regions_of
+from shapecat.detection.relief import raise_low
 from shapecat.detection.rings import join_rings
 from shapecat.detection.surfaces import surfaces_of
 from shapecat.detection.walls import clear_walls
@@ -29,7 +31,9 @@ from shapecat.errors import ConfigError
 __all__ = ["RULES", "Segmentation", "segment"]
 
 RULES = (
+    "low",
     "concave",
+    "ledge",
     "small",
     "occluder",
     "hollow",
@@ -101,14 +105,22 @@ def segment(
     up = max(supports, key=lambda s: s.area_m2).up
     planes = table_of(supports, cells.lens)
     heights = heights_of(cells, planes, highest_m=settings.max_height_m)
+    raised = np.zeros(cells.w.shape, np.uint8)
+    if "low" in rules:
+        raise_low(cells, heights, planes, raised)
     clear_walls(cells, heights.owner, up, largest_m=settings.max_size_m, rng=rng)
     surfaces = surfaces_of(cells, heights)
     regions, n = regions_of(heights, surfaces, concave="concave" in rules)
     pieces = pieces_of(cells, heights, surfaces, regions, n, up)
+    if "ledge" in rules:
+        more = cut_at_ledges(cells, heights, surfaces, pieces, regions, up)
+        if more > n:
+            pieces = pieces_of(cells, heights, surfaces, regions, more, up)
     join_pieces(pieces, cells, surfaces, regions, rules)
     if "ring" in rules:
         join_rings(pieces, cells.w, heights.height, regions)
-    refused = is_no_object(pieces, largest_m=settings.max_size_m)
+    posts = posts_of(cells, heights.owner, regions, pieces, up)
+    refused = is_no_object(pieces, posts, largest_m=settings.max_size_m)
     pieces.group[refused[pieces.group]] = 0
     leaders, number = np.unique(pieces.group, return_inverse=True)
     labels = number.astype(np.int16)[regions]
@@ -117,4 +129,5 @@ def segment(
     filled = fill_enclosed(
         cells.w, heights.height, labels, leaders.size - 1, active="fill" in rules
     )
+    filled |= raised & (labels > 0)
     return Segmentation(up, supports, planes, labels, heights.height, filled, pieces, leaders)

@@ -1,0 +1,100 @@
+"""Ledges: stacked objects whose fronts are flush, parted where the top of the lower one shows.
+
+Where the fronts of two stacked objects lie in one surface no edge parts them. What shows of the
+top of the lower one is level, at one height, and the upper one rises from there.
+"""
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4
+from shapecat.detection.cells import Cells
+from shapecat.detection.heights import Heights
+from shapecat.detection.pieces import BAND_M, BANDS, BOTTOM, TOP, Pieces, side_of
+from shapecat.detection.surfaces import Surfaces
+from shapecat.jit import kernel
+
+__all__ = ["cut_at_ledges"]
+
+LEDGE_M2 = 4e-4
+"""Least visible area of a ledge."""
+FLAT = 0.75
+"""Share of what faces up near a ledge that is level with it: the shoulder of a bottle slopes."""
+NEAR = 5
+"""Bands of height about a ledge."""
+RISE_M = 0.025
+"""What stands on a ledge is higher than this."""
+LEAST_ABOVE, LEAST_BELOW, CLEARANCE = 60, 40, 2
+"""Cells of the upper and the lower object, so many bands away from the ledge."""
+HOLLOW = -0.1
+"""`slope_of` from which what rises is the inside of a container."""
+
+
+def cut_at_ledges(
+    cells: Cells, heights: Heights, surfaces: Surfaces, pieces: Pieces, labels: I4, up: F8
+) -> int:
+    """Give what stands on ledges labels of its own, in place; return the number of labels."""
+    n = pieces.group.size - 1
+    side = side_of(up)
+    cut = np.full(n + 1, -1, np.int64)
+    _find(pieces, cut)
+    for p in np.flatnonzero(cut >= 0):
+        if _is_stack(cells, heights.height, surfaces.normal, labels, int(p), int(cut[p]), side):
+            n += 1
+            level = (cut[p] + 1 + CLEARANCE / 2) * BAND_M
+            labels[(labels == p) & (heights.height > level)] = n
+    return n
+
+
+@kernel
+def _find(pieces: Pieces, cut: I4) -> None:
+    """Write the band of the best ledge of each piece."""
+    for p in range(1, pieces.group.size):
+        top = int(pieces.shape[p, TOP] / BAND_M)
+        bottom = int(pieces.shape[p, BOTTOM] / BAND_M)
+        lid = pieces.lid[p]
+        best = LEDGE_M2
+        for band in range(max(bottom, 1) + 2, min(top - int(RISE_M / BAND_M), BANDS - 1)):
+            level = lid[band - 1] + lid[band] + lid[band + 1]
+            around = 0.0
+            for k in range(max(band - NEAR, 0), min(band + NEAR + 1, BANDS)):
+                around += lid[k]
+            if level > best and level > FLAT * around:
+                best = level
+                cut[p] = band
+
+
+@kernel
+def _is_stack(
+    cells: Cells, height: F4, normal: F4, labels: I4, p: int, band: int, side: F8
+) -> bool:
+    """Whether enough of a piece lies above and below a ledge, and the above is not hollow."""
+    w, lens = cells.w, cells.lens
+    n = above = below = 0
+    sx = sxx = st = sxt = 0.0
+    left, right = np.inf, -np.inf
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            if labels[i, j] != p:
+                continue
+            k = int(height[i, j] / BAND_M)
+            below += k <= band - CLEARANCE
+            if k < band + CLEARANCE:
+                continue
+            above += 1
+            m = normal[i, j]
+            if m[0] == 0 and m[1] == 0 and m[2] == 0:
+                continue
+            z = 1 / w[i, j]
+            x = (j - lens.cx) / lens.fx * z * side[0] + (i - lens.cy) / lens.fy * z * side[1]
+            x += z * side[2]
+            turn = m[0] * side[0] + m[1] * side[1] + m[2] * side[2]
+            n += 1
+            sx += x
+            sxx += x * x
+            st += turn
+            sxt += x * turn
+            left, right = min(left, x), max(right, x)
+    if above < LEAST_ABOVE or below < LEAST_BELOW or n < LEAST_ABOVE // 2:
+        return False
+    slope = (sxt - sx * st / n) / max(sxx - sx * sx / n, 1e-9) * (right - left)
+    return bool(slope > HOLLOW)

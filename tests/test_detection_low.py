@@ -1,0 +1,90 @@
+"""Low and flush things: plates thinner than the swells of a table, stacks, shoulders, posts."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from shapecat.config import DetectionSettings
+from shapecat.detection import detect
+from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
+from shapecat.types import Camera, Frame, Scene
+
+Array = NDArray[Any]
+CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+TILT = np.radians(40)
+UP = np.array([0.0, -np.cos(TILT), -np.sin(TILT)])
+DISTANCE = 0.9
+
+
+def rays() -> Array:
+    """Return the directions of the pixels, (480, 640, 3), optical frame."""
+    v, u = np.mgrid[:480, :640]
+    return np.stack([(u - 319.5) / 525, (v - 239.5) / 525, np.ones(u.shape)], -1)
+
+
+def depth_of(height: Array) -> Array:
+    """Return the depth of a table whose surface lies ``height`` (480, 640) metres above it."""
+    offset = -DISTANCE * np.sin(TILT)
+    return np.asarray((offset + height) / (rays() @ UP))
+
+
+def measured(depth: Array, seed: int = 0) -> Frame:
+    """Return what a Kinect reads: noise and steps of inverse depth."""
+    w = 1 / depth + np.random.default_rng(seed).normal(0, 0.0015, depth.shape)
+    depth = 1 / (np.round(w / 0.0029) * 0.0029)
+    return Frame("t", 0, 0, 0, "c", depth=depth.astype(np.float32), camera=CAMERA)
+
+
+def found(frame: Frame, rules: str | None = None) -> Scene:
+    settings = DetectionSettings() if rules is None else DetectionSettings(rules=rules)
+    return detect(frame, settings=settings, rng=np.random.default_rng(0))
+
+
+def without(rule: str) -> str:
+    """Return the default rules but one."""
+    return " ".join(r for r in DetectionSettings().rules.split() if r != rule)
+
+
+def bump(radius: float, edge: float) -> Array:
+    """Return 1 within ``radius`` pixels of the middle, falling to 0 over ``edge`` pixels."""
+    v, u = np.mgrid[:480, :640]
+    r = np.hypot(u - 320, (v - 250) / np.sin(TILT))
+    return np.asarray(np.clip((radius + edge / 2 - r) / edge, 0, 1))
+
+
+def test_a_swell_of_the_table_is_no_object() -> None:
+    """A wave of the sensor's error that is higher than the least height of an object."""
+    frame = measured(depth_of(0.009 * bump(50, 90)))
+    assert len(found(frame).candidates) == 0
+    assert len(found(frame, without("low")).candidates) > 0, "the test shows nothing"
+
+
+def test_a_thin_plate_is_an_object() -> None:
+    """A disc of 5 mm is lower than the least height, but has an edge."""
+    disc = bump(60, 4)
+    frame = measured(depth_of(0.005 * disc))
+    (one,) = found(frame).candidates
+    inside = (disc.reshape(-1) > 0.5)[one.indices]
+    assert inside.mean() > 0.93
+    assert inside.sum() > 0.9 * np.count_nonzero(disc > 0.5)
+
+
+def test_a_swell_beside_a_plate_stays_out() -> None:
+    """The plate must not grow over a swell that touches it."""
+    v, u = np.mgrid[:480, :640]
+    side = np.exp(-(((u - 400) / 45) ** 2) - ((v - 250) / 35) ** 2)
+    disc = bump(60, 4)
+    frame = measured(depth_of(0.007 * disc + 0.006 * side * (disc < 0.5)))
+    best = max(found(frame).candidates, key=lambda c: len(c.indices))
+    assert (disc.reshape(-1) > 0.5)[best.indices].mean() > 0.85
+
+
+@pytest.mark.parametrize("sensor", [KINECT, REALSENSE])
+def test_empty_tables(sensor: Any) -> None:
+    """Nothing is found on an empty table, whatever the waves of the sensor."""
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        frame, _ = render_frame(make_scene("empty", rng, frames=1), 0, rng=rng, sensor=sensor)
+        assert found(frame).candidates == ()
