@@ -45,8 +45,10 @@ format: setup ## format the code
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix-only .
 
-bench: setup ## measure the speed of the stages, print a table
+bench: setup ## measure the speed of stages and whole recordings, print tables
 	$(BIN)/python -m benchmarks
+	$(BIN)/python -m benchmarks.whole
+	$(BIN)/python -m benchmarks.cluster
 
 model: setup ## train the default model anew from the simulator
 	$(BIN)/python -m shapecat.models.training

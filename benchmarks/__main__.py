@@ -1,13 +1,15 @@
-"""Measure the stages, print Markdown tables, write ``build/benchmarks.json``."""
+"""Measure the stages, print Markdown tables, write ``build/benchmarks.json`` and a plot."""
 
 import os
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
     os.environ[_name] = "1"  # before the libraries read it: everything is measured on one thread
 
-from pathlib import Path  # noqa: E402  the environment comes first
+from collections.abc import Callable  # noqa: E402  the environment comes first
+from pathlib import Path  # noqa: E402
+from typing import Any  # noqa: E402
 
-from benchmarks import detection, stages  # noqa: E402
+from benchmarks import ablation, density, detection, stages  # noqa: E402
 from benchmarks.measure import machine, save  # noqa: E402
 
 
@@ -15,7 +17,14 @@ def main() -> None:
     """Run all benchmarks."""
     print("# Benchmarks\n\n" + ", ".join(machine().values()) + "\n")
     results = {}
-    for name, (table, figures) in (("detection", detection.run(15)), ("stages", stages.run(8))):
+    works: dict[str, Callable[[], tuple[str, dict[str, Any]]]] = {
+        "detection": lambda: detection.run(15),
+        "density": lambda: density.run(5, Path("build/density.png")),
+        "ablation": lambda: ablation.run(30),
+        "stages": lambda: stages.run(8),
+    }
+    for name, work in works.items():
+        table, figures = work()
         print(table)
         results[name] = figures
     save(Path("build/benchmarks.json"), results)

@@ -11,19 +11,29 @@ from .render import print_json, progress_bars
 @click.command()
 @click.argument("dataset", type=ANY_PATH)
 @model_option
+@click.option(
+    "--report",
+    "page",
+    type=ANY_PATH,
+    help="Also write the tables with their pictures, as .html or .md.",
+)
 @json_option
-def evaluate(*, dataset: Path, model: Path | None, as_json: bool) -> None:
+def evaluate(*, dataset: Path, model: Path | None, page: Path | None, as_json: bool) -> None:
     """Measure a model on labelled views: accuracy, confusion, calibration, novelty.
 
-    DATASET is laid out as for `shapecat train`.
+    DATASET is laid out as for `shapecat train`. Several views of one instance are also judged
+    together, 3, 10 and 30 at a time.
 
     \b
-    shapecat evaluate crops --model mine.npz
+    shapecat evaluate crops --model mine.npz --report crops.html
     """
     from shapecat.evaluation import evaluate_folder, format_report
+    from shapecat.evaluation.page import write_page
 
     with progress_bars() as bars:
         report = evaluate_folder(dataset, model, observe=bars)
+    if page is not None:
+        write_page(page, report, title=f"{dataset.name}: {report.n} views")
     if as_json:
         print_json(report.as_dict())
     else:

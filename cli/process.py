@@ -1,17 +1,22 @@
 """``shapecat process``."""
 
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import click
 
-from .options import ANY_PATH, config_option, json_option, model_option, set_option
-from .render import count_words, print_json, print_table, progress_bars
+from .options import config_option, json_option, model_option, set_option
+from .progress import KINDS, Progress, describe_plan, open_progress
+from .render import count_words, print_json, print_table
+
+_MOST_ROWS = 100
 
 
 @click.command()
-@click.argument("recordings", nargs=-1, required=True, type=ANY_PATH)
-@click.option("--out", type=ANY_PATH, required=True, help="Results go to OUT/NAME per recording.")
+@click.argument("recordings", nargs=-1, required=True)
+@click.option("--out", required=True, help="Results go to OUT/NAME per recording; may be a URL.")
 @click.option("--topic", "topics", multiple=True, help="Cloud stream to read. Repeatable.")
 @click.option(
     "--up",
@@ -24,7 +29,28 @@ from .render import count_words, print_json, print_table, progress_bars
 @click.option("--start", "start_s", type=float, help="Seconds after the start of the recording.")
 @click.option("--end", "end_s", type=float, help="Seconds after the start of the recording.")
 @click.option("--every", type=click.IntRange(1), default=1, help="Read only every Nth frame.")
-@click.option("--jobs", type=click.IntRange(1), default=1, help="Recordings at the same time.")
+@click.option(
+    "--jobs",
+    type=click.IntRange(1),
+    help="Cores to use: recordings at the same time, or frames where there are fewer. "
+    "All by default.",
+)
+@click.option(
+    "--executor",
+    type=click.Choice(["local", "dask", "ray"]),
+    default="local",
+    show_default=True,
+    help="Where recordings are processed.",
+)
+@click.option("--scheduler", metavar="ADDRESS", help="Running Dask scheduler or Ray cluster.")
+@click.option("--shard", metavar="I/N", help="Only part I of N, for job arrays.")
+@click.option(
+    "--progress",
+    type=click.Choice(["auto", *KINDS]),
+    default="auto",
+    show_default=True,
+    help="How progress is shown on stderr.",
+)
 @click.option("--no-mcap", is_flag=True, help="Do not write annotated.mcap.")
 @click.option("--no-rrd", is_flag=True, help="Do not write review.rrd.")
 @click.option("--overwrite", is_flag=True, help="Replace results that are there.")
@@ -37,61 +63,114 @@ def process(
     ctx: click.Context,
     /,
     *,
-    recordings: tuple[Path, ...],
-    out: Path,
+    recordings: tuple[str, ...],
+    out: str,
     no_mcap: bool,
     no_rrd: bool,
     config: Path | None,
     overrides: tuple[str, ...],
-    jobs: int,
+    jobs: int | None,
+    executor: str,
+    scheduler: str | None,
+    shard: str | None,
+    progress: str,
     as_json: bool,
     **choices: Any,
 ) -> None:
     """Find, categorize and follow the objects in recordings.
 
-    Each RECORDING is an MCAP file, a ROS 1 bag, or a ROS 2 bag (file or folder). The results are
-    tables, annotated.mcap for Foxglove, and review.rrd for Rerun.
+    Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a folder to search
+    for them, or a URL. The results are tables, annotated.mcap for Foxglove, and review.rrd for
+    Rerun; with several recordings OUT/manifest.jsonl says what became of each. The same command
+    again goes on with what is missing.
 
     \b
     shapecat process lab.mcap kitchen.bag --out results
     shapecat process log.mcap --out results --topic /head/points --end 30
+    shapecat process /data/recordings --out results --jobs 8
+    shapecat process /data/recordings --out results --shard 2/16
     """
     # The libraries behind take a second to load: only when there is work.
-    from shapecat.batch import exit_code, process_many, with_same
+    from shapecat.batch import exit_code
+    from shapecat.batch.plans import plan_batch
     from shapecat.config import load_settings
     from shapecat.jobs import Job
 
     job = Job(
         source=Path(),
-        folder=out,
+        folder=Path(),
         settings=load_settings(config, overrides),
         mcap=not no_mcap,
         rrd=not no_rrd,
         **choices,
     )
-    outcomes = []
-    with progress_bars() as bars:
-        for outcome in process_many(with_same(job, recordings, out), workers=jobs, observe=bars):
-            bars.restart()
-            outcomes.append(outcome)
-            if outcome.message:
-                click.echo(f"Error: {outcome.message}", err=True)
-    summaries = [outcome.summary for outcome in outcomes if outcome.summary]
+    with plan_batch(job, recordings, out, shard=shard) as batch:
+        watcher = open_progress(progress, batch.tasks)
+        outcomes = _run(batch, watcher, jobs, executor, scheduler)
     if as_json:
-        print_json([summary.as_dict() for summary in summaries])
-    elif summaries:
-        print_table(
-            ("recording", "frames", "seconds", "tracks", "results"), [_row(s) for s in summaries]
-        )
+        print_json([outcome.summary.as_dict() for outcome in outcomes if outcome.summary])
+    else:
+        _print_closing(batch.tasks, outcomes)
     ctx.exit(exit_code(outcomes))
 
 
-def _row(summary: Any) -> tuple[Any, ...]:
+def _run(
+    batch: Any, watcher: Progress, jobs: int | None, name: str, scheduler: str | None
+) -> list[Any]:
+    """Process the tasks of a batch here where one process is enough, else on an executor."""
+    from shapecat.batch import process_here, process_on
+    from shapecat.executors import open_executor, share_cores
+
+    workers, threads = share_cores(jobs, sum(task.status != "complete" for task in batch.tasks))
+    if len(batch.tasks) > 1:
+        watcher.plan(describe_plan(batch.tasks, batch.left_out, workers, threads))
+    if name == "local" and scheduler is None and workers <= 1:
+        with watcher:
+            tasks = batch.tasks
+            return list(process_here(tasks, watcher, threads=threads, manifest=batch.manifest))
+    started = open_executor(name, workers=workers, threads=1, address=scheduler)
+    with _closing(started) as executor, watcher:
+        return list(
+            process_on(executor, batch.tasks, watcher, threads=threads, manifest=batch.manifest)
+        )
+
+
+@contextmanager
+def _closing(executor: Any) -> Iterator[Any]:
+    """Let the workers end when all is done; kill them when it is not, as after Ctrl-C."""
+    try:
+        yield executor
+    except BaseException:
+        executor.terminate()
+        raise
+    executor.shutdown()
+
+
+def _print_closing(tasks: Sequence[Any], outcomes: Sequence[Any]) -> None:
+    """Print what became of each recording, in the order of the plan."""
+    ended = {outcome.job.folder: outcome for outcome in outcomes}
+    ordered = [ended[task.job.folder] for task in tasks if task.job.folder in ended]
+    complete = [outcome for outcome in ordered if outcome.summary]
+    shown = ordered if len(ordered) <= _MOST_ROWS else [o for o in ordered if not o.summary]
+    if complete or len(tasks) > 1:
+        columns = ("recording", "frames", "seconds", "tracks", "results")
+        print_table(columns, [_row(outcome) for outcome in shown])
+    if len(tasks) > 1:
+        frames = sum(o.summary.counts["frames"] for o in complete)
+        failed = len(ordered) - len(complete)
+        click.echo(f"{len(complete)} complete, {failed} failed, {frames:,} frames")
+
+
+def _row(outcome: Any) -> tuple[Any, ...]:
+    summary = outcome.summary
+    name = outcome.job.name.rpartition("/")[2]
+    if summary is None:
+        return (name, "", "failed", outcome.message, "")
     counts = summary.counts
     return (
-        summary.source.name,
+        name,
         counts["frames"],
         round(summary.seconds, 1) if summary.fresh else "was complete",
         count_words(counts["tracks"]),
-        summary.folder,
+        outcome.job.target or summary.folder,
     )

@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-_PHASES = {
+PHASES = {
     "simulate": "simulating",
     "perceive": "finding and categorizing objects",
     "annotate": "writing annotated.mcap",
@@ -17,6 +17,7 @@ _PHASES = {
     "train": "learning",
     "evaluate": "evaluating",
 }
+COMPILING = "compiling kernels, once per installation: about a minute"
 
 
 class Bars:
@@ -29,10 +30,10 @@ class Bars:
     def __call__(self, phase: str, done: int, total: int | None) -> None:
         """Show how far a phase has come."""
         if phase == "compile":
-            click.echo("compiling kernels, once per installation: about a minute", err=True)
+            click.echo(COMPILING, err=True)
             return
         if phase not in self._tasks:
-            name = _PHASES.get(phase, phase)
+            name = PHASES.get(phase, phase)
             self._tasks[phase] = self._progress.add_task(name, total=total)
         self._progress.update(self._tasks[phase], completed=done, total=total)
 

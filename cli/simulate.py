@@ -13,7 +13,9 @@ from .render import progress_bars
 @click.argument("out", type=ANY_PATH)
 @click.option(
     "--scene",
-    type=click.Choice(["tabletop", "shelf", "clutter", "turntable"]),
+    type=click.Choice(
+        ["tabletop", "shelf", "clutter", "turntable", "walking", "crossing", "rearranged"]
+    ),
     default="tabletop",
     show_default=True,
 )

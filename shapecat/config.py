@@ -34,7 +34,7 @@ class DetectionSettings:
     """Larger things are walls or furniture."""
     min_points: int = 60
     """Candidates with fewer points at full resolution are dropped."""
-    rules: str = "concave small occluder hollow rim overhang neck float ring feet fill"
+    rules: str = "low concave ledge small occluder hollow rim overhang neck float ring feet fill"
     """Rules beyond the thesis that separate and join objects, by name; any may be left out."""
 
 
@@ -70,8 +70,9 @@ class TrackingSettings:
     max_missed_s: float = 5.0
     """A track that was not seen for longer has ended; sooner while it is young. In hindsight an
     object that comes back to its place gets its old track all the same."""
-    fusion: Literal["mean", "product", "vote"] = "mean"
-    """How the posteriors of the views become one; none grows surer by the number of views."""
+    fusion: Literal["mean", "product", "vote"] = "product"
+    """How the posteriors of the views become one; none grows surer by the number of views: the
+    product is tempered by it."""
 
 
 @dataclass(frozen=True)

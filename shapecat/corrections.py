@@ -73,7 +73,9 @@ class TrackTable:
 def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLabel]:
     """Read what each track is shown as; deleted tracks are missing.
 
-    A label a person filled in wins over the category, at confidence 1.
+    A label a person filled in wins over the category, at confidence 1. Tracks of different topics
+    can be merged if a sensor has seen both, or if the run.json beside the table tells of a fixed
+    frame that they share.
 
     Parameters
     ----------
@@ -84,7 +86,7 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
     OutputError : the table is unreadable, or lines of it cannot be understood: each is named.
     """
     table = read_track_table(path)
-    labels, problems = _resolve(table.rows, categories)
+    labels, problems = _resolve(table.rows, categories, one_frame=_one_frame(path.parent))
     _refuse(path, [*table.problems, *problems])
     return labels
 
@@ -117,7 +119,8 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
         ),
     ]
     result = _relabelled(base, table.rows)
-    _, misread = _resolve(result.rows, read_run(folder)["model"]["categories"])
+    known_categories = read_run(folder)["model"]["categories"]
+    _, misread = _resolve(result.rows, known_categories, one_frame=_one_frame(folder))
     _refuse(corrected, problems + misread)
     if not original.exists():
         with replacing(original) as path:
@@ -256,8 +259,13 @@ _Verdict = str | int | None
 """A category, the number of the track to merge with, or None to delete."""
 
 
+def _one_frame(folder: Path) -> bool:
+    """Return whether the sensors of a run have places in one frame."""
+    return (folder / "run.json").exists() and read_run(folder).get("fixed_frame") is not None
+
+
 def _resolve(
-    rows: Sequence[TrackRow], categories: Iterable[str]
+    rows: Sequence[TrackRow], categories: Iterable[str], *, one_frame: bool
 ) -> tuple[dict[int, TrackLabel], list[str]]:
     """Return what each track is shown as, and which lines cannot be understood."""
     known = {n.lower(): n for n in (UNKNOWN, *CATEGORIES, *categories, *(r.category for r in rows))}
@@ -274,8 +282,8 @@ def _resolve(
     for row in rows:
         try:
             shown = by_track[_follow(row.track, verdicts)]
-            if shown.topic != row.topic:
-                msg = f"track {shown.track} is of another topic, {shown.topic}"
+            if not (one_frame or _share_a_topic(shown, row)):
+                msg = f"track {shown.track} is of another topic, {shown.topic or 'none'}"
                 raise ValueError(msg)  # noqa: TRY301  collected with those of the calls
         except ValueError as error:
             problems.append(f"line {row.line}: {row.label!r}: {error}")
@@ -285,6 +293,10 @@ def _resolve(
             confidence = 1.0 if shown.label else shown.confidence
             labels[row.track] = TrackLabel(shown.track, category, confidence)
     return labels, problems
+
+
+def _share_a_topic(a: TrackRow, b: TrackRow) -> bool:
+    return a.topic == b.topic or bool(set(a.topic.split()) & set(b.topic.split()))
 
 
 def _follow(track: int, verdicts: Mapping[int, _Verdict]) -> int:

@@ -104,7 +104,8 @@ def gravity_rotation(up: ArrayLike) -> F8:
     axis = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.7 else np.array([0.0, 1.0, 0.0])
     x = axis - (axis @ z) * z
     x /= np.linalg.norm(x)
-    return np.stack([x, np.cross(z, x), z])
+    (a, b, c), (d, e, f) = z.tolist(), x.tolist()
+    return np.array([[d, e, f], [b * f - c * e, c * d - a * f, a * e - b * d], [a, b, c]])
 
 
 def level_from_sensor(up: ArrayLike, offset: float, points: ArrayLike) -> Pose:

@@ -24,9 +24,10 @@ _LIBRARIES = ("numpy", "numba", "mcap", "rosbags", "rerun-sdk", "pyarrow")
 class Job:
     """One recording to process, and how.
 
-    ``folder`` is where the results go, ``DIR/NAME``; ``start_s`` and ``end_s`` count from the
-    start of the recording; ``up`` is ``auto``, ``tf``, ``imu``, or a vector ``X,Y,Z`` in
-    the sensor frame.
+    ``folder`` is where the results go, ``DIR/NAME``; ``origin`` the URL that ``source`` was
+    downloaded from, ``target`` the one that the results are uploaded to, if any; ``start_s``
+    and ``end_s`` count from the start of the recording; ``up`` is ``auto``, ``tf``, ``imu``, or a
+    vector ``X,Y,Z`` in the sensor frame.
     """
 
     source: Path
@@ -42,6 +43,13 @@ class Job:
     mcap: bool = True
     rrd: bool = True
     overwrite: bool = False
+    origin: str = ""
+    target: str = ""
+
+    @property
+    def name(self) -> str:
+        """What the user calls the recording: its path, or URL."""
+        return self.origin or str(self.source)
 
     def selection(self) -> dict[str, Any]:
         """Return the options that decide what the tables hold, as stored in run.json."""
@@ -54,7 +62,7 @@ class Job:
 class Summary:
     """What a run came to; not ``fresh`` when it was complete before."""
 
-    source: Path
+    source: str
     folder: Path
     counts: Mapping[str, Any]
     seconds: float
@@ -65,7 +73,6 @@ class Summary:
         """Return plain values for ``--json``."""
         return {
             **dataclasses.asdict(self),
-            "source": str(self.source),
             "folder": str(self.folder),
             "warnings": list(self.warnings),
         }
@@ -75,7 +82,7 @@ def describe_run(job: Job, categorizer: Categorizer) -> dict[str, Any]:
     """Return what run.json says before the work begins."""
     return {
         "input": {
-            "path": str(job.source.resolve()),
+            "path": job.origin or str(job.source.resolve()),
             "bytes": input_size(job.source),
             "sha256": digest(job.source),
         },
@@ -119,7 +126,7 @@ def resume(folder: Path, planned: dict[str, Any]) -> dict[str, Any]:
 def summarize(job: Job, run: Mapping[str, Any], *, fresh: bool = True) -> Summary:
     """Return the summary of a run."""
     return Summary(
-        source=job.source,
+        source=job.name,
         folder=job.folder,
         counts=run["counts"],
         seconds=run["seconds"].get("total", 0.0),

@@ -9,12 +9,15 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
+from itertools import islice
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
+from shapecat.arrays import F4
 from shapecat.corrections import TrackLabel, adopt_labels, read_labels
 from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import NoStreamError, OutputError
+from shapecat.executors.threads import in_order, read_ahead
 from shapecat.jit import CompileClock, compile_clock
 from shapecat.jobs import Job, Summary, describe_run, resume, same_work, summarize
 from shapecat.labels import read_labelled_frames
@@ -27,7 +30,7 @@ from shapecat.run_folder import read_run, staged, sweep, write_run
 from shapecat.shown import read_shown_frames
 from shapecat.tables import FrameRow, PerceptionTables, count_rows, discard_segments
 from shapecat.tracks import track_run
-from shapecat.types import Frame, LabelledFrame, ShownFrame
+from shapecat.types import Frame, LabelledFrame, Perception, Pose, ShownFrame
 
 __all__ = ["Observer", "annotate", "annotate_again", "perceive_all", "process", "track"]
 
@@ -35,17 +38,24 @@ _Shown = TypeVar("_Shown", LabelledFrame, ShownFrame)
 Observer = Callable[[str, int, int | None], None]
 """Called with the name of the phase, the frames done, and how many there are, if known."""
 
+_AHEAD = 4
+"""Frames read while one is written."""
+
 
 def _ignore(_phase: str, _done: int, _total: int | None) -> None:
     """Observe nothing."""
 
 
-def process(job: Job, observe: Observer = _ignore) -> Summary:
+def process(job: Job, observe: Observer = _ignore, *, threads: int = 1) -> Summary:
     """Process one recording into its run folder: perceive, track, annotate.
 
     A complete folder made from the same input, settings and model is left as it is. Nothing
     appears under the final name before all of it is complete; a run that was killed goes on
     where it stopped.
+
+    Parameters
+    ----------
+    threads : frames perceived at once. The tables do not depend on it.
 
     Raises
     ------
@@ -66,11 +76,13 @@ def process(job: Job, observe: Observer = _ignore) -> Summary:
                 "perceive",
                 folder,
                 run,
-                lambda: perceive_all(recording, folder, run, job, categorizer, observe),
+                lambda: perceive_all(
+                    recording, folder, run, job, categorizer, observe, threads=threads
+                ),
             )
             discard_segments(folder)
             _once("track", folder, run, lambda: track(folder, run, job))
-            annotate(folder, recording, run, observe)
+            annotate(folder, recording, run, observe, threads=threads)
             run["seconds"]["compile"] = compiled.seconds
             run["seconds"]["total"] = earlier + time.perf_counter() - begun
             write_run(folder, run)
@@ -108,6 +120,14 @@ def _finished(
     return summarize(job, run, fresh=False)
 
 
+class _View(NamedTuple):
+    """A frame, where up is, and where the sensor was."""
+
+    frame: Frame
+    up: F4 | None
+    fixed_from_sensor: Pose | None
+
+
 def perceive_all(
     recording: Recording,
     folder: Path,
@@ -115,20 +135,29 @@ def perceive_all(
     job: Job,
     categorizer: Categorizer,
     observe: Observer = _ignore,
+    *,
+    threads: int = 1,
 ) -> None:
     """Write frames, detections and planes, frame by frame in flat memory."""
     upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame)
     skipped: Counter[str] = Counter()
     source, total = _select(recording, run["options"], skipped)
     count = 0
+
+    def see(view: _View) -> Perception:
+        return perceive(view.frame, up=view.up, categorizer=categorizer, settings=job.settings)
+
     with PerceptionTables(
         folder, categories=categorizer.categories, model_id=categorizer.model_id
     ) as tables:
-        for count, frame in enumerate(source, start=1):
-            up, pose = upright.up(frame), upright.fixed_from_sensor(frame)
-            if count > tables.done:
-                perception = perceive(frame, up=up, categorizer=categorizer, settings=job.settings)
-                tables.write(perception, FrameRow(frame.log_time_ns, pose, up))
+        views = (_View(f, upright.up(f), upright.fixed_from_sensor(f)) for f in source)
+        for count, _ in enumerate(islice(views, tables.done), start=1):
+            observe("perceive", count, total)
+        for view, perception in in_order(see, views, threads=threads):
+            count += 1
+            tables.write(
+                perception, FrameRow(view.frame.log_time_ns, view.fixed_from_sensor, view.up)
+            )
             observe("perceive", count, total)
     if not count:
         reasons = ", ".join(f"{n} {reason}" for reason, n in skipped.items()) or "none in range"
@@ -148,9 +177,17 @@ def track(folder: Path, run: dict[str, Any], job: Job) -> None:
 
 
 def annotate(
-    folder: Path, recording: Recording, run: dict[str, Any], observe: Observer = _ignore
+    folder: Path,
+    recording: Recording,
+    run: dict[str, Any],
+    observe: Observer = _ignore,
+    *,
+    threads: int = 1,
 ) -> None:
-    """Write annotated.mcap and review.rrd from the tables, tracks.csv and the recording."""
+    """Write annotated.mcap and review.rrd from the tables, tracks.csv and the recording.
+
+    With several threads one of them reads while another writes.
+    """
     settings, total = run["settings"]["outputs"], run["counts"]["frames"]
 
     def labels() -> dict[int, TrackLabel]:
@@ -172,9 +209,10 @@ def annotate(
         from shapecat.outputs.review import write_review  # noqa: PLC0415  loads Rerun on first use
 
         labelled = read_labelled_frames(folder, labels())
+        pairs = with_clouds(_observed(labelled, "review", total, observe), recording, run)
         write_review(
             folder / "review.rrd",
-            with_clouds(_observed(labelled, "review", total, observe), recording, run),
+            read_ahead(pairs, count=_AHEAD) if threads > 1 else pairs,
             name=recording.path.name,
             run=run,
             categories=run["model"]["categories"],

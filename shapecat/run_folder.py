@@ -18,6 +18,7 @@ __all__ = [
     "empty",
     "input_size",
     "lock",
+    "partial_folder",
     "read_run",
     "replacing",
     "staged",
@@ -39,7 +40,7 @@ def staged(folder: Path) -> Iterator[Path]:
     ------
     OutputError : the disk is full, the place is not writable, or another run is writing there.
     """
-    hidden = _hidden(folder)
+    hidden = partial_folder(folder)
     created = _missing_parents(folder)
     try:
         hidden.mkdir(parents=True, exist_ok=True)
@@ -73,9 +74,9 @@ def sweep(folder: Path) -> None:
         shutil.rmtree(_old(folder), ignore_errors=True)
         for file in folder.glob(".*.partial"):
             file.unlink()
-        if _hidden(folder).exists():
-            with _locked(_hidden(folder)):
-                shutil.rmtree(_hidden(folder), ignore_errors=True)
+        if partial_folder(folder).exists():
+            with _locked(partial_folder(folder)):
+                shutil.rmtree(partial_folder(folder), ignore_errors=True)
 
 
 @contextmanager
@@ -84,7 +85,7 @@ def complete_folder(folder: Path) -> Iterator[Path]:
 
     Whatever a kill left half-made of it is discarded first.
     """
-    hidden = _hidden(folder)
+    hidden = partial_folder(folder)
     shutil.rmtree(hidden, ignore_errors=True)
     hidden.mkdir(parents=True)
     yield hidden
@@ -124,7 +125,8 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(held)
 
 
-def _hidden(folder: Path) -> Path:
+def partial_folder(folder: Path) -> Path:
+    """Return the hidden folder that a run works in before it takes its name."""
     return folder.with_name(f".{folder.name}.partial")
 
 

@@ -158,7 +158,7 @@ class PerceptionTables:
         self._categories = tuple(categories)
         self._pending: list[tuple[Perception, FrameRow]] = []
         self._segments = _segments(folder)
-        self.done = sum(count_rows(segment, "frames") for segment in self._segments)
+        self.done = sum(_read_segment(s / "frames.arrow").num_rows for s in self._segments)
 
     def __enter__(self) -> Self:
         """Return itself."""
@@ -193,7 +193,7 @@ class PerceptionTables:
         segment = self._folder / _SEGMENTS / f"{len(self._segments):06d}"
         with complete_folder(segment) as hidden:
             for name, schema in self._schemas.items():
-                write_table(hidden / f"{name}.parquet", rows[name], schema)
+                _write_segment(hidden / f"{name}.arrow", _table(rows[name], schema))
         self._segments.append(segment)
         self._pending.clear()
 
@@ -215,8 +215,22 @@ def _join(segments: Iterable[Path], path: Path, schema: pa.Schema) -> None:
     """Write a table of a row group per segment."""
     with replacing(path) as hidden, _open_writer(hidden, schema) as writer:
         for segment in segments:
-            for group in read_row_groups(segment / path.name):
-                writer.write_table(group)
+            writer.write_table(_read_segment(segment / f"{path.stem}.arrow"))
+
+
+def _write_segment(path: Path, table: pa.Table) -> None:
+    """Write a part of a table as it lies in memory: it is soon read again, once."""
+    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
+        writer.write_table(table)
+
+
+def _read_segment(path: Path) -> pa.Table:
+    try:
+        with pa.OSFile(str(path), "rb") as source, pa.ipc.open_file(source) as reader:
+            return reader.read_all()
+    except (OSError, pa.ArrowException) as error:
+        msg = f"{path}: what a killed run left there cannot be read ({error}); use --overwrite"
+        raise OutputError(msg) from error
 
 
 def count_rows(folder: Path, table: str) -> int:

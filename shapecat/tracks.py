@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute
+from scipy.spatial.transform import Rotation
 
-from shapecat.arrays import F4
+from shapecat.arrays import F4, F8
 from shapecat.config import TrackingSettings
 from shapecat.run_folder import replacing
 from shapecat.tables import TRACKS, lists, read_row_groups, write_table
@@ -24,6 +25,7 @@ _COLUMNS = (
     "detection",
     "center",
     "size",
+    "orientation",
     "center_fixed",
     "posterior",
     "novelty",
@@ -48,7 +50,7 @@ def track_run(
         write_table(path, _columns(tracks), TRACKS)
     labels = [_label(track, categories) for track in tracks]
     with replacing(folder / "tracks.csv") as path:
-        _write_csv(path, tracks, labels, _start_ns(folder))
+        _write_csv(path, tracks, labels, categories, _start_ns(folder))
     return dict(Counter(labels))
 
 
@@ -58,7 +60,9 @@ def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[Fra
     ``fixed`` are the topics whose detections are taken in the fixed frame.
     """
     groups = zip(
-        read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns"]),
+        read_row_groups(
+            folder / "frames.parquet", ["topic", "frame", "stamp_ns", "fixed_rotation"]
+        ),
         read_row_groups(folder / "detections.parquet", _COLUMNS),
         strict=True,
     )
@@ -82,7 +86,18 @@ def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[Fra
                     [row["touches_border"] or row["occluded"] for row in rows], np.bool_
                 ),
                 novelties=np.array([row["novelty"] for row in rows], np.float32),
+                axes=_axes(rows, frame["fixed_rotation"] if frame["topic"] in fixed else None),
             )
+
+
+def _axes(rows: list[dict[str, Any]], fixed_from_sensor: list[float] | None) -> F8:
+    """Return (n, 3, 3) the axes of boxes, in the frame that their centres are in."""
+    if not rows:
+        return np.zeros((0, 3, 3))
+    in_sensor = np.asarray(Rotation.from_quat([row["orientation"] for row in rows]).as_matrix())
+    if fixed_from_sensor is None:
+        return in_sensor
+    return np.asarray(np.reshape(fixed_from_sensor, (3, 3)) @ in_sensor)
 
 
 def _streams_with_poses(folder: Path) -> set[str]:
@@ -103,7 +118,11 @@ def _stack(rows: list[Any], width: int) -> F4:
 
 
 def _label(track: Track, categories: Sequence[str]) -> str:
-    return "unknown" if track.novelty > 1 else categories[int(np.argmax(track.posterior))]
+    return "unknown" if track.novelty > 1 else _guess(track, categories)
+
+
+def _guess(track: Track, categories: Sequence[str]) -> str:
+    return categories[int(np.argmax(track.posterior))]
 
 
 def _columns(tracks: Sequence[Track]) -> dict[str, Any]:
@@ -133,11 +152,18 @@ _CSV = (
     "y",
     "z",
     "novelty",
+    "guess",
     "topic",
 )
 
 
-def _write_csv(path: Path, tracks: Sequence[Track], labels: Sequence[str], start_ns: int) -> None:
+def _write_csv(
+    path: Path,
+    tracks: Sequence[Track],
+    labels: Sequence[str],
+    categories: Sequence[str],
+    start_ns: int,
+) -> None:
     """Write a line per track, those most worth a look first: unknown, then unsure."""
     rows = sorted(
         zip(tracks, labels, strict=True),
@@ -162,6 +188,7 @@ def _write_csv(path: Path, tracks: Sequence[Track], labels: Sequence[str], start
                     f"{y:.3f}",
                     f"{z:.3f}",
                     f"{track.novelty:.2f}",
+                    _guess(track, categories),
                     track.topic,
                 )
             )

@@ -193,13 +193,9 @@ class NeuralGas(Record):
     @cached_property
     def triangles(self) -> U2:
         """(t, 3) the triangles of the graph, for display: each i < j < k once."""
-        neighbours: list[set[int]] = [set() for _ in self.neurons]
-        for i, j in self.edges.tolist():
-            neighbours[i].add(j)
-        found = [
-            (i, j, k) for i, j in self.edges.tolist() for k in sorted(neighbours[i] & neighbours[j])
-        ]
-        return np.array(found, np.uint16).reshape(-1, 3)
+        from shapecat.triangles import triangles_of  # noqa: PLC0415  # loads numba
+
+        return np.asarray(triangles_of(self.edges, len(self.neurons)))
 
 
 class Detection(Record):

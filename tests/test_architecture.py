@@ -10,10 +10,10 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 STAGES = {"detection", "surface", "description", "learning", "tracking"}
-BASE = {"arrays", "errors", "jit", "types"}
+BASE = {"arrays", "errors", "jit", "triangles", "types"}
 FLOOR = {
     **dict.fromkeys(BASE | {"__init__", "py"}, 0),
-    **dict.fromkeys(("config", "geometry", "run_folder"), 1),
+    **dict.fromkeys(("config", "geometry", "run_folder", "executors"), 1),
     **dict.fromkeys(
         (
             *STAGES,

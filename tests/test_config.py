@@ -54,4 +54,4 @@ def test_as_dict_holds_every_setting() -> None:
     tree = Settings().as_dict()
 
     assert set(tree) == {field.name for field in dataclasses.fields(Settings)}
-    assert tree["tracking"]["fusion"] == "mean"
+    assert tree["tracking"]["fusion"] == "product"

@@ -3,11 +3,13 @@
 import json
 import re
 from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from xml.etree import ElementTree as ET
 
 import numpy as np
 import pytest
+from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn import metrics as reference
@@ -15,6 +17,7 @@ from sklearn import metrics as reference
 from shapecat.arrays import F4
 from shapecat.errors import ModelError, RecordingError
 from shapecat.evaluation import evaluate_folder, format_report, metrics, read_dataset
+from shapecat.evaluation.fused import Fused, fuse_views
 from shapecat.evaluation.page import write_page
 from shapecat.evaluation.training import (
     learn_on_folder,
@@ -213,3 +216,45 @@ def test_the_page_is_whole_and_escapes_names(trained: Path, tmp_path: Path) -> N
     for picture in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
         ET.fromstring(picture)  # noqa: S314  we wrote it
     assert page.count("<svg") == 2
+
+
+def test_the_markdown_page_has_its_pictures_beside_it(trained: Path, tmp_path: Path) -> None:
+    """A name with a bar would break the table, a missing file the picture."""
+    dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
+    report = evaluate_folder(dataset, trained)
+    strange = replace(report, recall={"a|b": 1.0}, fused=(Fused(3, 4, 1.0, 0.25),))
+    write_page(tmp_path / "out" / "all.md", strange, title="all")
+    page = (tmp_path / "out" / "all.md").read_text("utf-8")
+
+    for name in re.findall(r"!\[\w+\]\((.*?)\)", page):
+        ET.parse(tmp_path / "out" / name)  # noqa: S314  we wrote it
+    assert page.count("![") == 2
+    assert "recall of a\\|b" in page
+    assert "| 3 | 4 | 1.000 | 0.250 |" in page
+
+
+def test_the_command_writes_the_page(trained: Path, tmp_path: Path) -> None:
+    """A page that no command calls is of no use."""
+    dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=2)
+    page = tmp_path / "page.html"
+    command = import_module("shapecat.cli.evaluate").evaluate
+    result = CliRunner().invoke(
+        command, [str(dataset), "--model", str(trained), "--report", str(page), "--json"]
+    )
+
+    assert result.exit_code == 0, result.output
+    assert "data: 8 views" in page.read_text("utf-8")
+
+
+def test_views_of_an_object_are_fused() -> None:
+    """Leftovers and views of other objects may not mix in; two of three wrong can be right."""
+    truth = np.zeros(8, np.int64)
+    posteriors = np.array([[0.9, 0.1], [0.45, 0.55], [0.45, 0.55]] * 2 + [[0, 1], [0, 1]], "f4")
+    names = np.array(["a", "a", "a", "b", "b", "b", "c", "c"])
+
+    fused = fuse_views(truth, posteriors, names, counts=(3, 10))
+
+    assert [item.views for item in fused] == [3]
+    assert fused[0].groups == 2
+    assert fused[0].accuracy == 1.0
+    assert fused[0].ece == pytest.approx(0.355, abs=1e-3)

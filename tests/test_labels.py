@@ -129,6 +129,26 @@ def test_tracks_of_two_sensors_are_not_merged(run: Path) -> None:
         read_labels(run / "tracks.csv")
 
 
+def test_tracks_are_merged_that_a_sensor_has_both_seen(run: Path) -> None:
+    """Which of several sensors see an object changes while the robot moves."""
+    text = labelled(t4="merge with 1").replace("merge with 1,/depth", "merge with 1,/depth /other")
+    (run / "tracks.csv").write_text(text)
+    assert read_labels(run / "tracks.csv")[4].track == 1
+
+
+def test_tracks_of_two_sensors_are_merged_where_both_have_a_place(run: Path) -> None:
+    text = labelled(t4="merge with 1").replace("merge with 1,/depth", "merge with 1,/other")
+    described = json.loads((run / "run.json").read_text()) | {"fixed_frame": "map"}
+    (run / "run.json").write_text(json.dumps(described))
+    (run / "tracks.csv").write_text(
+        ORIGINAL.replace("4,0.000,unknown,0.500,,/depth", "4,0.000,unknown,0.500,,/other")
+    )
+    corrected = run.parent / "mine.csv"
+    corrected.write_text(text)
+    adopt_labels(corrected, run)
+    assert read_labels(run / "tracks.csv")[4] == TrackLabel(1, "cup", 0.5)
+
+
 def test_all_problems_are_named_at_once_and_nothing_is_written(run: Path) -> None:
     """Fixing one line per attempt is how people stop correcting."""
     corrected = run.parent / "mine.csv"

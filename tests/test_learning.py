@@ -1,8 +1,8 @@
 """Learning: the fitted chain, its prediction without scikit-learn, novelty, new categories."""
 
+import itertools
 import time
 from dataclasses import replace
-from typing import Literal
 
 import numpy as np
 import pytest
@@ -13,13 +13,13 @@ from sklearn.utils.estimator_checks import check_estimator
 
 from shapecat.arrays import F4
 from shapecat.learning import Categorizer
-from shapecat.learning.baselines import make_baselines
+from shapecat.learning.baselines import make_baselines, shape_functions
+from shapecat.learning.boosted import BoostedDictionary
 from shapecat.learning.calibration import fit_temperature, softmax
 from shapecat.learning.dictionary import ForestDictionary, WordLearner
 from shapecat.learning.features import FeatureBank
 from shapecat.learning.forest import FlatForest, flatten
 from shapecat.learning.incremental import add_categories
-from shapecat.learning.novelty import LeafProximity
 from shapecat.learning.pnn import ProbabilisticNeuralNetwork
 from shapecat.learning.training import (
     UNKNOWN,
@@ -35,7 +35,7 @@ NAMES = tuple(f"x{k}" for k in range(8))
 BLOCKS = {"first": slice(0, 3), "second": slice(3, 8)}
 SPANS = {"first": (0, 3), "second": (3, 8)}
 CATEGORIES = ("cup", "can", "ball")
-SMALL = LearningSettings(kernels=20, trees=20, known_views=200)
+SMALL = LearningSettings(rounds=20, leaves=6, known_views=200)
 
 
 def blobs(per_category: int, seed: int, categories: tuple[str, ...] = CATEGORIES) -> Examples:
@@ -70,6 +70,7 @@ def categorizer() -> Categorizer:
     "estimator",
     [
         ProbabilisticNeuralNetwork(kernels=50, random_state=0),
+        BoostedDictionary(rounds=20, leaves=4, random_state=0),
         ForestDictionary(trees=5, random_state=0),
         WordLearner(C=1.0),
         WordLearner(strategy="one_vs_rest", C=1.0),
@@ -95,24 +96,61 @@ def test_flat_forest_falls_into_the_leaves_of_scikit_learn() -> None:
         assert len(set(zip(tree, leaves, strict=True))) == len(set(leaves)) == len(set(tree))
 
 
-@pytest.mark.parametrize("strategy", ["multinomial", "one_vs_rest"])
 @pytest.mark.parametrize("kernels", [0, 20])
-def test_prediction_agrees_with_scikit_learn(
-    strategy: Literal["multinomial", "one_vs_rest"], kernels: int
-) -> None:
+def test_prediction_agrees_with_scikit_learn(kernels: int) -> None:
     """The compiled walk is a second implementation: it may not say anything else."""
-    chosen = replace(SMALL, strategy=strategy, kernels=kernels)
+    chosen = replace(SMALL, kernels=kernels)
     train, test = blobs(60, 1, (*CATEGORIES, UNKNOWN)), blobs(50, 9)
     chain = make_chain(BLOCKS, chosen, seed=0).fit(
         train.descriptors, encode(train.labels, CATEGORIES)
     )
     model = fit(chosen)
-    chain["learner"].temperature_ = model.temperature
+    logits = chain["dictionary"].logits(chain["densities"].transform(test.descriptors))
 
-    posteriors = model.predict(test.descriptors).posteriors
+    prediction = model.predict(test.descriptors)
 
-    np.testing.assert_allclose(posteriors, chain.predict_proba(test.descriptors), atol=1e-6)
-    assert np.mean(np.argmax(posteriors, axis=1) == encode(test.labels, CATEGORIES)) > 0.9
+    expected = softmax(logits[:, :3] / model.temperature)
+    np.testing.assert_allclose(prediction.posteriors, expected, atol=1e-6)
+    doubt = softmax(logits / model.temperature)[:, 3]
+    odds = np.log(doubt / (1 - doubt)) - model.threshold
+    np.testing.assert_allclose(prediction.novelty, 2 / (1 + np.exp(-odds)), atol=1e-6)
+    assert (
+        np.mean(np.argmax(prediction.posteriors, axis=1) == encode(test.labels, CATEGORIES)) > 0.9
+    )
+
+
+def test_the_first_tree_makes_the_best_split() -> None:
+    """Against every split of every feature, by the formula, written out."""
+    data = blobs(40, 3, ("cup", "can"))
+    x, y = data.descriptors, (data.labels == "can").astype(int)
+    model = BoostedDictionary(rounds=1, leaves=2, columns=1.0, rows=1.0, random_state=0).fit(x, y)
+    slope, bend = 0.5 - (y == 0), np.full(len(y), 0.5)  # both categories have half of the views
+    gains = {}
+    for feature in range(8):
+        for cut in np.quantile(x[:, feature], np.linspace(0, 1, 65)[1:-1]).astype(np.float32):
+            low = x[:, feature] <= cut
+            gains[feature, cut] = sum(
+                slope[part].sum() ** 2 / (bend[part].sum() + 2) for part in (low, ~low)
+            )
+    feature, cut = max(gains, key=lambda key: gains[key])
+    left = x[:, feature] <= cut
+    step = [-0.1 * slope[part].sum() / (bend[part].sum() + 2) for part in (left, ~left)]
+
+    assert (int(model.forest_.feature[0]), float(model.forest_.threshold[0])) == (feature, cut)
+    np.testing.assert_allclose(model.votes_[:2, 0], step, rtol=2e-3)
+
+
+def test_rounds_lessen_the_training_loss() -> None:
+    """A sign or a factor wrong in slope or bend still learns a little, but overshoots or stalls."""
+    data = blobs(50, 1)
+    codes = encode(data.labels, CATEGORIES)
+    losses = []
+    for rounds in (1, 5, 20, 60):
+        model = BoostedDictionary(rounds=rounds, leaves=4, random_state=0)
+        posteriors = model.fit(data.descriptors, codes).predict_proba(data.descriptors)
+        losses.append(-np.log(posteriors[np.arange(len(codes)), codes]).mean())
+
+    assert all(later < 0.8 * earlier for earlier, later in itertools.pairwise(losses))
 
 
 def test_same_seed_same_model_bit_for_bit() -> None:
@@ -154,19 +192,32 @@ def test_strange_shapes_are_more_novel_than_known_ones(categorizer: Categorizer)
     assert np.mean(strange > 1) > 0.8
 
 
-def test_proximity_counts_shared_leaves() -> None:
-    """Against the definition, written out."""
+def test_without_strange_examples_the_unsure_are_novel() -> None:
+    """A model of a data set without `unknown` has no learner to ask."""
+    model = fit_categorizer(
+        blobs(60, 1), blobs(40, 2), descriptor_names=NAMES, blocks=BLOCKS, categories=CATEGORIES,
+        settings=SMALL,
+    )  # fmt: skip
+    prediction = model.predict(blobs(100, 6).descriptors)
+    order = np.argsort(prediction.novelty)
+
+    assert not model.knows_unknown
+    assert 0.01 < np.mean(prediction.novelty > 1) < 0.15
+    assert np.all(np.diff(prediction.posteriors.max(axis=1)[order]) <= 1e-6)
+
+
+def test_plain_shape_functions_of_a_known_shape() -> None:
+    """Three blocks of sum 1, the same at any scale; on a line all triangles are flat."""
     rng = np.random.default_rng(0)
-    trees, leaves = 7, 5
-    words = rng.integers(0, leaves, (40, trees)) + np.arange(trees) * leaves
-    views = rng.integers(0, leaves, (9, trees)) + np.arange(trees) * leaves
-    index = LeafProximity.of(words, vocabulary=trees * leaves, neighbours=3)
+    line = np.outer(rng.uniform(size=500), [1.0, 2.0, 0.0]).astype(np.float32)
+    functions = shape_functions(line, np.random.default_rng(1))
 
-    shared = (views[:, None] == words).mean(axis=2)
-    expected = 1 - np.sort(shared, axis=1)[:, -3:].mean(axis=1)
-
-    np.testing.assert_allclose(index.novelty(views), expected, rtol=1e-6)
-    assert np.array_equal(index.words_of_views(trees), words)
+    assert functions.shape == (96,)
+    np.testing.assert_allclose(functions.reshape(3, 32).sum(axis=1), 1, atol=0.05)
+    np.testing.assert_allclose(
+        functions, shape_functions(line * 7, np.random.default_rng(1)), atol=2e-3
+    )
+    assert functions[[64, 95]].sum() > 0.95
 
 
 def test_densities_match_their_formula() -> None:
@@ -268,11 +319,14 @@ def test_a_new_category_is_learned_on_the_fixed_dictionary(categorizer: Categori
     right = prediction.posteriors.argmax(axis=1) == encode(test.labels, extended.categories)
 
     assert extended.categories == (*CATEGORIES, "cone")
-    assert np.array_equal(extended.votes[:, :3], categorizer.votes)
+    assert np.array_equal(extended.votes[:, [0, 1, 2, 4]], categorizer.votes)  # unknown stays last
+    assert np.array_equal(extended.bias[[0, 1, 2, 4]], categorizer.bias)
     assert np.array_equal(extended.forest.threshold, categorizer.forest.threshold)
     assert right[test.labels == "cone"].mean() > 0.9
     assert right[test.labels != "cone"].mean() > 0.9
     assert np.mean(prediction.novelty[test.labels == "cone"] > 1) < 0.2
+    strange = extended.predict(blobs(100, 6, (UNKNOWN,)).descriptors).novelty
+    assert np.mean(strange > 1) > 0.8
 
 
 def test_adding_twice_is_possible(categorizer: Categorizer) -> None:

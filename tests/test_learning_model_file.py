@@ -14,7 +14,6 @@ from shapecat.learning import Categorizer, load_model, save_model
 from shapecat.learning.categorizer import parts_of
 from shapecat.learning.features import FeatureBank
 from shapecat.learning.forest import FlatForest
-from shapecat.learning.novelty import LeafProximity
 
 
 def tiny() -> Categorizer:
@@ -25,7 +24,6 @@ def tiny() -> Categorizer:
         np.array([0.5, 0, 0, -1, 0, 0]),
         np.array([1, 0, 0, 4, 0, 0]),
     )
-    words = forest.fall(np.array([[0, 0, 0, 0, 0], [0, 1, 0, 0, 0]], np.float32))
     bank = FeatureBank(
         columns=np.arange(3),
         mean=np.zeros(3),
@@ -46,7 +44,7 @@ def tiny() -> Categorizer:
         linear=np.zeros((2, 5)),
         bias=np.array([0.0, 0.1]),
         temperature=0.7,
-        known=LeafProximity.of(words, vocabulary=4, neighbours=1, threshold=0.5),
+        threshold=-1.5,
         known_descriptors=np.array([[0, 0, 0], [0, 1, 0]]),
         known_category=np.array([0, 1]),
         notes={"seed": 3},
@@ -148,7 +146,7 @@ def put(name: str, value: object, dtype: str) -> Callable[[dict[str, bytes]], No
 
 
 _HOSTILE = {
-    "newer": (edit_header(version=2), "version 2"),
+    "newer": (edit_header(version=3), "version 3"),
     "other format": (edit_header(format="x"), "does not say"),
     "header is a list": (lambda m: m.update({"header.json": b"[]"}), "does not say"),
     "header is deep": (lambda m: m.update({"header.json": b"[" * 10**6}), "not a usable"),
@@ -172,8 +170,8 @@ _HOSTILE = {
     "kernels behind the end": (put("bank.starts", [0, 1, 9], "i4"), "do not fit"),
     "kernels backwards": (put("bank.starts", [0, 3, 2], "i4"), "do not fit"),
     "no bandwidth": (put("bank.bandwidth", [0.0], "f4"), "do not fit"),
-    "an unknown view": (put("known.members", [0, 1, 0, 9], "u2"), "index of known"),
-    "words backwards": (put("known.starts", [0, 3, 2, 4, 4], "u4"), "index of known"),
+    "no threshold": (edit_header(threshold=float("inf")), "numbers"),
+    "two learners too many": (put("bias", [0.0, 0.1, 0.2, 0.3], "f8"), "not a usable"),
     "infinite votes": (put("votes", np.full((4, 2), np.inf), "f2"), "numbers"),
     "an unknown category": (put("known_category", [0, 7], "u1"), "known views"),
 }

@@ -15,6 +15,7 @@ from shapecat.errors import OutputError
 from shapecat.outputs import review, review_viewer
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import paint
+from shapecat.outputs.review_layout import Eye, stepped_back
 from shapecat.outputs.review_shapes import markdown
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 
@@ -313,3 +314,18 @@ def test_a_screenshot_shows_the_scene(recording: Path, tmp_path: Path) -> None:
     green = np.array(colour_of("can"), float)  # nothing of the viewer's own is so green
     alike = pixels @ green / np.linalg.norm(green) / np.linalg.norm(pixels + 1, axis=1)
     assert np.count_nonzero((alike > 0.98) & (pixels.max(axis=1) > 90)) > 100
+
+
+def test_the_eye_steps_back_until_all_is_in_view_but_not_out_of_the_house() -> None:
+    """A walking camera leaves what it saw first; a robot that drives about sees too much."""
+    eye = Eye(np.array([0.0, -1.0, 1.0]), np.zeros(3), np.array([0.0, 0.0, 1.0]))
+    low, high = np.array([-1.0, -0.2, 0.0]), np.array([1.0, 0.2, 0.2])
+
+    seen = stepped_back(eye, low, high)
+
+    assert np.allclose(seen.target, (low + high) / 2)
+    away = seen.position - seen.target
+    assert np.allclose(np.cross(away, eye.position), 0, atol=1e-9)
+    assert np.linalg.norm(away) > np.linalg.norm(high - low)
+    assert stepped_back(eye, low * 10, high * 10) is eye
+    assert stepped_back(eye, np.full(3, np.inf), np.full(3, -np.inf)) is eye  # nothing was seen

@@ -7,6 +7,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 from click.testing import Result
 
+from shapecat.outputs.exports import export_run
 from shapecat.simulation.messages import MessageFactory
 from tests.messages import write
 from tests.scenes import stream
@@ -44,6 +45,9 @@ def test_an_object_that_two_sensors_see_is_one_track(shapecat: Run, tmp_path: Pa
     }
     assert sum(both["counts"]["tracks"].values()) == sum(one["counts"]["tracks"].values()) > 3
     assert all(seen == {DEPTH, POINTS} for seen in topics.values())
+    # Frames of both sensors have the same numbers: no view may take another one's file.
+    crops = export_run(tmp_path / "both" / "a", "crops", tmp_path / "crops")
+    assert len(list((tmp_path / "crops").glob("*/*/*.pcd"))) == crops > 12
 
 
 def test_without_a_fixed_frame_each_sensor_has_its_own_tracks(

@@ -78,7 +78,8 @@ def test_the_camera_sees_most_things(world: World) -> None:
     for index in (0, 20, 39):
         _, labels = render_frame(world, index, rng=rng, sensor=KINECT)
         seen = {thing.track for thing in world.things if (labels == thing.label).sum() > 60}
-        assert len(seen) >= 0.6 * len(world.things)
+        share = 0.3 if world.kind == "walking" else 0.6  # that counter is longer than the view
+        assert len(seen) >= share * len(world.things)
 
 
 def test_the_camera_moves_smoothly(world: World) -> None:
@@ -138,6 +139,42 @@ def test_a_stage_shows_its_thing_from_all_sides() -> None:
     for view in range(6):
         _, labels = render_frame(world, view, rng=rng)
         assert (labels == thing.label).sum() > 100
+
+
+def test_what_moves_stays_on_the_table_and_touches_nothing() -> None:
+    """Truth would lie about objects that pass through each other or through the table."""
+    kinds: tuple[SceneKind, ...] = ("crossing", "rearranged")
+    for kind, seed in ((kind, seed) for kind in kinds for seed in (3, 4)):
+        moving = make_scene(kind, np.random.default_rng(seed), frames=24, rate_hz=4)
+        assert moving.motions
+        table = next(s for s in moving.supports if s.name == "table")
+        for k in range(24):
+            there = [thing for thing in moving.things if moving.present(thing, k)]
+            solids = [(thing.mesh, moving.pose_of(thing, k)) for thing in there]
+            z = [transform(pose, mesh.vertices)[:, 2] for mesh, pose in solids]
+            covers = [seen_from_above(*solid) for solid in solids]
+            assert min(low.min() for low in z) > table.height - 1e-4
+            for i in range(len(solids)):
+                for j in range(i):
+                    apart = min(z[i].max(), z[j].max()) - max(z[i].min(), z[j].min())
+                    # What is carried may pass over others, 15 cm high, or brush past them.
+                    lifted = max(z[i].min(), z[j].min()) > table.height + 0.001
+                    assert apart < 1e-4 or lifted or not np.any(covers[i] & covers[j])
+
+
+def test_truth_lists_only_what_is_there(tmp_path: Path) -> None:
+    path = simulate(tmp_path / "a.mcap", scene="rearranged", frames=12, rate_hz=2, seed=5)
+    truth = json.loads(path.with_name("a.truth.json").read_text())
+    labels = np.load(path.with_name("a.labels.npz"))["labels"]
+    world = make_scene("rearranged", np.random.default_rng(5), frames=12, rate_hz=2)
+    counts = []
+    for k, frame in enumerate(truth):
+        listed = {o["track"]: o["pixels"] for o in frame["objects"] + frame["hidden"]}
+        assert set(listed) == {t.track for t in world.things if world.present(t, k)}
+        gone = {t.label for t in world.things} - {20 + track for track in listed}
+        assert not np.isin(labels[k], list(gone)).any()
+        counts.append(len(listed))
+    assert min(counts) < max(counts) <= len(world.things)
 
 
 def test_unknown_scene_is_named() -> None:

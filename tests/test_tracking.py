@@ -51,6 +51,7 @@ def frame(
         np.broadcast_to(posterior, (n, 2)),
         np.zeros(n),
         np.full(n, 0.5),
+        np.broadcast_to(np.eye(3), (n, 3, 3)),
     )
 
 
@@ -280,12 +281,60 @@ def test_more_views_of_the_same_kind_do_not_sharpen(method: str) -> None:
 
 
 def test_fusion_weighs_and_no_view_has_a_veto() -> None:
-    assert fuse([[1, 0], [0, 1]], weights=[3, 1]).tolist() == [0.75, 0.25]
+    assert fuse([[1, 0], [0, 1]], "mean", weights=[3, 1]).tolist() == [0.75, 0.25]
     assert fuse([[0.0, 1.0], *[[0.95, 0.05]] * 9], "product")[0] > 0.5
     with pytest.raises(ValueError, match="at least one view"):
         fuse(np.zeros((0, 3)))
     with pytest.raises(ValueError, match="unknown fusion method"):
         fuse([[1.0]], "sum")  # type: ignore[arg-type]  # what is tested
+
+
+def boxed(frames: list[list[tuple[float, float]]]) -> list[FrameDetections]:
+    """Return frames of upright boxes 0.1 m deep and high, each from one x to another."""
+    found = []
+    for k, spans in enumerate(frames):
+        middle = [[(a + b) / 2, 0, 0] for a, b in spans]
+        size = [[b - a, 0.1, 0.1] for a, b in spans]
+        found.append(frame(k, middle, size=size))
+    return found
+
+
+def test_pieces_of_an_object_that_is_split_now_and_then_are_no_tracks() -> None:
+    whole, split = [(0.0, 0.2)], [(0.0, 0.12), (0.12, 0.2)]
+    tracks = track_recording(boxed(([whole] * 3 + [split] * 3) * 6), SETTINGS)
+    assert [track.hits for track in tracks] == [36]
+
+
+def test_a_burst_of_splits_is_no_track() -> None:
+    """Nothing is missed in its life: what was there before and after it tells."""
+    whole, split = [(0.0, 0.2)], [(0.0, 0.12), (0.12, 0.2)]
+    tracks = track_recording(boxed([whole] * 20 + [split] * 6 + [whole] * 20), SETTINGS)
+    assert [track.hits for track in tracks] == [46]
+
+
+def test_neighbours_that_are_taken_for_one_now_and_then_stay_two() -> None:
+    one, two = [(0.0, 0.2)], [(0.0, 0.1), (0.1, 0.2)]
+    tracks = track_recording(boxed(([two] * 9 + [one]) * 4), SETTINGS)
+    assert [track.hits for track in tracks][1] >= 36
+    assert len(tracks) == 2
+
+
+def test_a_sensor_that_sees_two_objects_as_one_does_not_make_one_a_piece() -> None:
+    one, two = boxed([[(0.0, 0.2)]])[0], boxed([[(0.0, 0.1), (0.1, 0.2)]])[0]
+    frames = [
+        replace(what, topic=topic, frame=k, stamp_ns=k * SECOND // 10 + late)
+        for k in range(20)
+        for topic, what, late in (("/a", two, 0), ("/b", one, 5))
+    ]
+    tracks = track_recording(frames, SETTINGS, together={"/a", "/b"})
+    assert len(tracks) == 2
+    assert min(track.hits for track in tracks) >= 20
+
+
+def test_what_is_put_into_a_bowl_is_not_a_piece_of_the_bowl() -> None:
+    bowl, filled = [(0.0, 0.2)], [(0.0, 0.2), (0.1, 0.16)]
+    tracks = track_recording(boxed([bowl] * 30 + [filled] * 8), SETTINGS)
+    assert sorted(track.hits for track in tracks) == [8, 38]
 
 
 def test_a_clock_that_jumps_back_is_a_cut() -> None:

@@ -4,12 +4,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, U2
+from shapecat.arrays import F4, F8, I4, U2
 from shapecat.description.context import CONTEXT_NAMES, context
 from shapecat.description.curvature import assign, fit_surfaces
 from shapecat.description.distances import euclidean, geodesic, mean_gap
-from shapecat.description.profile import PROFILE_NAMES, profile
-from shapecat.description.revolution import REVOLUTION_NAMES, revolution
+from shapecat.description.outline import OUTLINE_NAMES, outline
+from shapecat.description.profile import PROFILE_NAMES, profile, vertical_axis
+from shapecat.description.revolution import REVOLUTION_NAMES, revolution, rotation_axis
+from shapecat.description.solids import SOLID_NAMES, solids
 from shapecat.jit import kernel
 from shapecat.types import NeuralGas
 
@@ -56,6 +58,8 @@ _BLOCK_NAMES: dict[str, tuple[str, ...]] = {
     "band_curvature": _parts("band", _BANDS, ("share", *_CURVATURE_NAMES)),
     "profile": PROFILE_NAMES,
     "revolution": REVOLUTION_NAMES,
+    "solids": SOLID_NAMES,
+    "outline": OUTLINE_NAMES,
     "metric": ("height", "low", "wide", "across", "along", "spacing"),
     "view": ("elevation", "distance"),
 }
@@ -84,7 +88,9 @@ _RING_PATHS, _RING_STRAIGHT, _RING_CURVED = (
 _BAND_PATHS, _BAND_STRAIGHT, _BAND_CURVED = (
     BLOCKS[f"band_{name}"].start for name in ("geodesic", "euclid", "curvature")
 )
-_PROFILE, _REVOLUTION = BLOCKS["profile"].start, BLOCKS["revolution"].start
+_PROFILE, _REVOLUTION, _SOLIDS, _OUTLINE = (
+    BLOCKS[name].start for name in ("profile", "revolution", "solids", "outline")
+)
 _METRIC, _VIEW = BLOCKS["metric"].start, BLOCKS["view"].start
 
 
@@ -177,14 +183,37 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
     )  # fmt: skip
     _distributions(z, straight, paths, weight, normals, curvatures, out)
     profile(x, y, z, weight, normals, curvatures, low, high, out[_PROFILE:_REVOLUTION])
-    revolution(x, y, z, weight, normals, out[_REVOLUTION:_METRIC])
+    owner = _owners(starts)
+    cx, cy, _ = vertical_axis(x, y, normals, weight)
+    axis, point, _ = rotation_axis(x, y, z, weight, normals)
+    turned = out[_REVOLUTION:_SOLIDS]
+    neurons_in_units = np.stack((x, y, z))
+    revolution(
+        cloud, owner, neurons_in_units, weight, normals, place, axis, point,
+        np.array([cx, cy, 0.0]), turned,
+    )  # fmt: skip
+    solids(cloud, owner, x, y, normals, place, low, high, turned, out[_SOLIDS:_OUTLINE])
+    outline(cloud, place, out[_OUTLINE:_METRIC])
     out[_METRIC] = (high - low) * unit
     out[_METRIC + 1] = low * unit + middle[2]
-    out[_METRIC + 2], out[_METRIC + 3], out[_METRIC + 4] = wide * unit, across * unit, along * unit
+    out[_METRIC + 2], out[_METRIC + 3], out[_METRIC + 4] = (
+        wide * unit,
+        across * unit,
+        along * unit,
+    )
     out[_METRIC + 5] = gap * unit
     out[_VIEW] = (eye[2] - middle[2]) / away if away > 0 else 0.0
     out[_VIEW + 1] = away
     return True
+
+
+@kernel
+def _owners(starts: I4) -> I4:
+    """Return the neuron of each point, of points that are sorted by neuron."""
+    owner = np.zeros(starts[-1], np.int64)
+    for k in range(starts.size - 1):
+        owner[starts[k] : starts[k + 1]] = k
+    return owner
 
 
 @kernel

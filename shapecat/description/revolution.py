@@ -1,25 +1,31 @@
-"""The axis about which the surface turns best, upright or not, and the profile along it."""
+"""The axis about which the points turn best, upright or not, and the profile along it."""
 
 import numpy as np
 
-from shapecat.arrays import F4, F8
+from shapecat.arrays import F4, F8, I4
+from shapecat.description.linear import solve
 from shapecat.jit import kernel
 
-__all__ = ["REVOLUTION_NAMES", "REVOLUTION_SLICES", "revolution", "rotation_axis"]
+__all__ = ["REVOLUTION_NAMES", "REVOLUTION_SLICES", "fit_axis", "revolution", "rotation_axis"]
 
-REVOLUTION_SLICES = 6
-_SLICE = ("share", "radius", "inward", "along")
+REVOLUTION_SLICES = 8
+_SLICE = ("share", "radius", "residual", "inward")
 REVOLUTION_NAMES = (
-    "residual_1",
-    "residual_2",
-    "residual_3",
+    "upright_residual",
+    "upright_radius",
+    "residual",
+    "length",
     "axis_vertical",
-    "radius_to_length",
-    "radius_spread",
-    "radius_slope",
-    "inward",
+    "axis_moved",
+    "axis_to_eye",
     *(f"{i}_{name}" for i in range(REVOLUTION_SLICES) for name in _SLICE),
 )
+_ROUNDS = 4
+_OUTLIER = 3.0
+"""Residuals beyond this many root mean squares pull no harder."""
+_DAMPING = 0.02
+_INWARD = -0.3
+_UPRIGHT, _MAY_TILT = False, True
 
 
 @kernel
@@ -37,7 +43,7 @@ def rotation_axis(x: F4, y: F4, z: F4, weight: F4, normals: F4) -> tuple[F8, F8,
     """
     N, B, C = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(x.size):
-        a, b, c = np.float64(normals[0, i]), np.float64(normals[1, i]), np.float64(normals[2, i])
+        a, b, c = (np.float64(normals[0, i]), np.float64(normals[1, i]), np.float64(normals[2, i]))
         n = (a, b, c)
         m = (y[i] * c - z[i] * b, z[i] * a - x[i] * c, x[i] * b - y[i] * a)
         for j in range(3):
@@ -88,58 +94,227 @@ def _invert(A: F8) -> None:
 
 
 @kernel
-def revolution(x: F4, y: F4, z: F4, weight: F4, normals: F4, out: F4) -> None:
-    """Write the numbers named by `REVOLUTION_NAMES`; lengths in units of the object's size.
+def revolution(
+    cloud: F4,
+    owner: I4,
+    neurons: F4,
+    weight: F4,
+    normals: F4,
+    eye: F4,
+    axis: F8,
+    point: F8,
+    foot: F8,
+    out: F4,
+) -> None:
+    """Write the numbers named by `REVOLUTION_NAMES`.
 
-    The axis points to the narrow end: of each slice along it the share of the points, the mean
-    radius over the largest, the share facing the axis, and the mean of normal times axis.
+    Two solids of revolution are fitted to the neurons (3, k) and measured on the points (3, n): one
+    whose axis is vertical through ``foot``, one whose axis begins as (``axis``, ``point``) and may
+    tilt. The axis of the second points to the narrow end: of each slice along it the share of the
+    points, the mean radius over the largest, the deviation from it, and the share of points facing
+    the axis.
     """
-    axis, point, residual = rotation_axis(x, y, z, weight, normals)
-    out[0], out[1], out[2] = residual[0], residual[1], residual[2]
-    out[3] = abs(axis[2])
-    count = x.size
-    t = np.zeros(count)
-    r = np.zeros(count)
-    inward = np.zeros(count)
-    mean_t = mean_r = 0.0
-    for i in range(count):
-        dx, dy, dz = x[i] - point[0], y[i] - point[1], z[i] - point[2]
-        t[i] = dx * axis[0] + dy * axis[1] + dz * axis[2]
-        dx, dy, dz = dx - t[i] * axis[0], dy - t[i] * axis[1], dz - t[i] * axis[2]
-        r[i] = np.sqrt(dx * dx + dy * dy + dz * dz)
-        if dx * normals[0, i] + dy * normals[1, i] + dz * normals[2, i] < -0.3 * r[i]:
-            inward[i] = 1.0
-        mean_t += weight[i] * t[i]
-        mean_r += weight[i] * r[i]
-    slope = spread_t = spread_r = 0.0
-    for i in range(count):
-        slope += weight[i] * (t[i] - mean_t) * (r[i] - mean_r)
-        spread_t += weight[i] * (t[i] - mean_t) ** 2
-        spread_r += weight[i] * (r[i] - mean_r) ** 2
-        out[7] += weight[i] * inward[i]
-    low, high = t.min(), t.max()
-    out[4] = mean_r / (mean_r + high - low) if mean_r + high - low > 0 else 0.5
-    out[5] = np.sqrt(spread_r) / max(mean_r, 1e-6)
-    out[6] = -abs(slope) / max(spread_t, 1e-4)
-    turn = 1.0 if slope <= 0 else -1.0
-    for i in range(count):
-        level = (t[i] - low) / (high - low) if high > low else 0.5
-        level = level if turn > 0 else 1.0 - level
-        place = min(max(level * REVOLUTION_SLICES - 0.5, 0.0), REVOLUTION_SLICES - 1.0)
-        first = min(int(place), REVOLUTION_SLICES - 2)
-        up = normals[0, i] * axis[0] + normals[1, i] * axis[1] + normals[2, i] * axis[2]
-        for k in range(2):
-            share = weight[i] * (place - first if k == 1 else first + 1 - place)
-            at = 8 + (first + k) * 4
-            out[at] += share
-            out[at + 1] += share * r[i]
-            out[at + 2] += share * inward[i]
-            out[at + 3] += share * up * turn
+    slices = np.zeros((REVOLUTION_SLICES, 4))
+    upright = np.array([0.0, 0.0, 1.0])
+    fit_axis(neurons, weight, normals, upright, foot, _UPRIGHT)
+    rms, length, radius = _measure(cloud, owner, normals, upright, foot, slices)
+    out[0] = min(rms / radius, 2.0)
+    out[1] = radius / (radius + length)
+    before = axis.copy()
+    fit_axis(neurons, weight, normals, axis, point, _MAY_TILT)
+    rms, length, radius = _measure(cloud, owner, normals, axis, point, slices)
+    out[2] = min(rms / radius, 2.0)
+    out[3] = length / (length + radius)
+    out[4] = abs(axis[2])
+    out[5] = abs(axis[0] * before[0] + axis[1] * before[1] + axis[2] * before[2])
+    lean = 0.0
     widest = 1e-6
     for k in range(REVOLUTION_SLICES):
-        at = 8 + k * 4
-        for m in range(1, 4):
-            out[at + m] = out[at + m] / out[at] if out[at] > 1e-4 else 0.0
-        widest = max(widest, out[at + 1])
+        lean += slices[k, 0] * (k - 0.5 * (REVOLUTION_SLICES - 1)) * (slices[k, 1] - radius)
+        widest = max(widest, slices[k, 1])
+    distance = np.sqrt(eye[0] * eye[0] + eye[1] * eye[1] + eye[2] * eye[2])
+    facing = (axis[0] * eye[0] + axis[1] * eye[1] + axis[2] * eye[2]) / max(distance, 1e-6)
+    out[6] = -facing if lean > 0 else facing
     for k in range(REVOLUTION_SLICES):
-        out[8 + k * 4 + 1] /= widest
+        share, mean, residual, inward = slices[REVOLUTION_SLICES - 1 - k if lean > 0 else k]
+        at = 7 + 4 * k
+        out[at], out[at + 1] = share, mean / widest
+        out[at + 2], out[at + 3] = min(residual / widest, 2.0), inward
+
+
+@kernel
+def fit_axis(
+    neurons: F4,
+    weight: F4,
+    normals: F4,
+    axis: F8,
+    point: F8,
+    may_tilt: bool,  # noqa: FBT001  compiled kernels take their arguments by position
+) -> None:
+    """Move an axis so that the radius of the neurons is constant in each slice along it.
+
+    Gauss-Newton steps on the residuals of the radius, of which the mean of the slice is eliminated
+    (Golub and Pereyra 1973); neurons that face along the axis have no say about the radius.
+
+    Parameters
+    ----------
+    neurons, normals : (3, k); weight : (k,) share of the points.
+    axis, point : (3,) the first guess, overwritten by the result.
+    """
+    limit = np.inf
+    for _ in range(_ROUNDS):
+        limit = _OUTLIER * _improve(neurons, weight, normals, axis, point, may_tilt, limit)
+
+
+@kernel
+def _across(axis: F8) -> tuple[F8, F8]:
+    """Return two unit vectors that make a right-handed frame with the axis."""
+    small = 0
+    for j in range(1, 3):
+        small = j if abs(axis[j]) < abs(axis[small]) else small
+    first = -axis[small] * axis
+    first[small] += 1.0
+    first /= np.sqrt((first**2).sum())
+    return first, np.cross(axis, first)
+
+
+@kernel
+def _place(
+    cloud: F4, owner: I4, normals: F4, axis: F8, point: F8, first: F8, second: F8
+) -> tuple[F8, F8]:
+    """Return rows along the axis, radius, direction across (2), weight; and the range along it.
+
+    The weight is the fourth power of the sine between normal and axis.
+    """
+    rows = np.zeros((5, cloud.shape[1]))
+    reach = np.array([np.inf, -np.inf])
+    for i in range(cloud.shape[1]):
+        x, y, z = cloud[0, i] - point[0], cloud[1, i] - point[1], cloud[2, i] - point[2]
+        along = x * axis[0] + y * axis[1] + z * axis[2]
+        u = x * first[0] + y * first[1] + z * first[2]
+        v = x * second[0] + y * second[1] + z * second[2]
+        radius = np.sqrt(u * u + v * v)
+        rows[0, i], rows[1, i] = along, radius
+        rows[2, i], rows[3, i] = u / max(radius, 1e-6), v / max(radius, 1e-6)
+        o = owner[i]
+        cosine = normals[0, o] * axis[0] + normals[1, o] * axis[1] + normals[2, o] * axis[2]
+        rows[4, i] = max(1.0 - cosine * cosine, 0.0) ** 2
+        reach[0], reach[1] = min(reach[0], along), max(reach[1], along)
+    return rows, reach
+
+
+@kernel
+def _slice(along: float, reach: F8) -> int:
+    share = (along - reach[0]) / max(reach[1] - reach[0], 1e-6)
+    return min(int(share * REVOLUTION_SLICES), REVOLUTION_SLICES - 1)
+
+
+@kernel
+def _improve(
+    neurons: F4,
+    weight: F4,
+    normals: F4,
+    axis: F8,
+    point: F8,
+    may_tilt: bool,  # noqa: FBT001  compiled kernels take their arguments by position
+    limit: float,
+) -> float:
+    """Move the axis by one Gauss-Newton step; return the root mean square residual before it."""
+    first, second = _across(axis)
+    owner = np.arange(neurons.shape[1])
+    rows, reach = _place(neurons, owner, normals, axis, point, first, second)
+    rows[4] *= weight
+    free = 4 if may_tilt else 2
+    means = np.zeros((REVOLUTION_SLICES, 6))  # weight, radius, derivatives
+    row = np.zeros(6)
+    for i in range(rows.shape[1]):
+        _derivatives(rows[:, i], row)
+        mean = means[_slice(rows[0, i], reach)]
+        for j in range(6):
+            mean[j] += rows[4, i] * row[j]
+    for k in range(REVOLUTION_SLICES):
+        for j in range(1, 6):
+            means[k, j] /= max(means[k, 0], 1e-9)
+    A, b = np.zeros((free, free)), np.zeros(free)
+    total = cost = size = 0.0
+    for i in range(rows.shape[1]):
+        _derivatives(rows[:, i], row)
+        mean = means[_slice(rows[0, i], reach)]
+        residual = row[1] - mean[1]
+        heed = rows[4, i]
+        if abs(residual) > limit:
+            heed *= limit / abs(residual)
+        total += rows[4, i]
+        size += rows[4, i] * row[1]
+        cost += heed * residual * residual
+        for j in range(free):
+            slope = row[2 + j] - mean[2 + j]
+            b[j] -= heed * slope * residual
+            for k in range(free):
+                A[j, k] += heed * slope * (row[2 + k] - mean[2 + k])
+    pull = 0.5 * _DAMPING * (A[0, 0] + A[1, 1]) + 1e-6
+    for j in range(free):
+        A[j, j] += pull if j < 2 else pull * (reach[1] - reach[0]) ** 2 / 12
+    solve(A, b)
+    _move(axis, point, first, second, b, 0.5 * size / max(total, 1e-6))
+    return float(np.sqrt(cost / max(total, 1e-6)))
+
+
+@kernel
+def _derivatives(row: F8, out: F8) -> None:
+    """Write 1, the radius, and its derivatives by two shifts and two tilts of the axis."""
+    out[0], out[1] = 1.0, row[1]
+    out[2], out[3] = -row[2], -row[3]
+    out[4], out[5] = -row[2] * row[0], -row[3] * row[0]
+
+
+@kernel
+def _move(axis: F8, point: F8, first: F8, second: F8, move: F8, farthest: float) -> None:
+    """Shift and tilt the axis, by at most ``farthest`` and 0.3 rad."""
+    length = np.sqrt(move[0] ** 2 + move[1] ** 2)
+    share = min(1.0, farthest / max(length, 1e-9))
+    point += share * (move[0] * first + move[1] * second)
+    if move.size == 4:
+        tilt = np.sqrt(move[2] ** 2 + move[3] ** 2)
+        share = min(1.0, 0.3 / max(tilt, 1e-9))
+        axis += share * (move[2] * first + move[3] * second)
+        axis /= np.sqrt((axis**2).sum())
+
+
+@kernel
+def _measure(
+    cloud: F4, owner: I4, normals: F4, axis: F8, point: F8, slices: F8
+) -> tuple[float, float, float]:
+    """Write the slices of `fit_axis` on all points; return its result."""
+    first, second = _across(axis)
+    rows, reach = _place(cloud, owner, normals, axis, point, first, second)
+    count = rows.shape[1]
+    slices[:] = 0.0
+    weights = np.zeros(REVOLUTION_SLICES)
+    for i in range(count):
+        k = _slice(rows[0, i], reach)
+        weights[k] += rows[4, i]
+        slices[k, 0] += 1.0
+        slices[k, 1] += rows[4, i] * rows[1, i]
+    total = weights.sum()
+    radius = slices[:, 1].sum() / max(total, 1e-9)
+    enough = 1e-3 * count
+    for k in range(REVOLUTION_SLICES):
+        slices[k, 1] = slices[k, 1] / weights[k] if weights[k] > enough else 0.0
+    cost = 0.0
+    for i in range(count):
+        k = _slice(rows[0, i], reach)
+        off = (rows[1, i] - slices[k, 1]) ** 2 * rows[4, i]
+        if weights[k] > enough:
+            slices[k, 2] += off / weights[k]
+            cost += off / total
+        o = owner[i]
+        outward = 0.0
+        for j in range(3):
+            outward += normals[j, o] * (rows[2, i] * first[j] + rows[3, i] * second[j])
+        slices[k, 3] += outward < _INWARD
+    for k in range(REVOLUTION_SLICES):
+        slices[k, 2] = np.sqrt(slices[k, 2])
+        slices[k, 3] /= max(slices[k, 0], 1.0)
+        slices[k, 0] /= count
+    return np.sqrt(cost), reach[1] - reach[0], max(radius, 1e-3)

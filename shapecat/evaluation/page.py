@@ -1,14 +1,15 @@
-"""An evaluation as one HTML page with its pictures inside: no script, nothing fetched."""
+"""An evaluation to show around: an HTML page with its pictures inside, or Markdown beside them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from html import escape
 from pathlib import Path
+from typing import TypeAlias
 
 from shapecat.errors import OutputError
 from shapecat.evaluation.metrics import Bin
 from shapecat.evaluation.report import Report
 
-__all__ = ["calibration_svg", "confusion_svg", "format_page", "write_page"]
+__all__ = ["calibration_svg", "confusion_svg", "format_markdown", "format_page", "write_page"]
 
 _CELL = 46
 _MARGIN = 74
@@ -22,14 +23,28 @@ _STYLE = (
 
 
 def write_page(path: Path, report: Report, *, title: str) -> None:
-    """Write an evaluation as an HTML page.
+    """Write an evaluation as an HTML page, or as Markdown if the file is called so.
+
+    The pictures of ``NAME.md`` are ``NAME_confusion.svg`` and ``NAME_calibration.svg``.
 
     Raises
     ------
-    OutputError : the file cannot be written.
+    OutputError : a file cannot be written.
     """
+    files = {path: format_page(report, title=title)}
+    if path.suffix.lower() == ".md":
+        pictures = {name: f"{path.stem}_{name}.svg" for name in ("confusion", "calibration")}
+        files = {
+            path: format_markdown(report, title=title, pictures=pictures),
+            path.with_name(pictures["confusion"]): confusion_svg(
+                report.categories, report.confusion
+            ),
+            path.with_name(pictures["calibration"]): calibration_svg(report.calibration),
+        }
     try:
-        path.write_text(format_page(report, title=title), "utf-8")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        for place, content in files.items():
+            place.write_text(content, "utf-8")
     except OSError as error:
         msg = f"{path}: cannot write the report: {error.strerror or error}"
         raise OutputError(msg) from error
@@ -37,8 +52,43 @@ def write_page(path: Path, report: Report, *, title: str) -> None:
 
 def format_page(report: Report, *, title: str) -> str:
     """Return an evaluation as an HTML page."""
+    parts = [
+        f"<h1>{escape(title)}</h1>",
+        _table(("", ""), _figures(report)),
+        "<h2>Confusion</h2><p>True category (row) taken for (column).</p>",
+        confusion_svg(report.categories, report.confusion),
+        "<h2>Calibration</h2><p>Accuracy over confidence; the diagonal is honest.</p>",
+        calibration_svg(report.calibration),
+    ]
+    parts += [f"<h2>{name}</h2>" + _table(head, rows) for name, head, rows in _breakdowns(report)]
+    return (
+        '<!DOCTYPE html><html lang="en"><meta charset="utf-8">'
+        f"<title>{escape(title)}</title><style>{_STYLE}</style><body>"
+        + "\n".join(parts)
+        + "</body></html>\n"
+    )
+
+
+def format_markdown(report: Report, *, title: str, pictures: Mapping[str, str]) -> str:
+    """Return an evaluation as Markdown; ``pictures`` are the files of the two pictures."""
+    parts = [
+        f"# {_plain(title)}",
+        _markdown(("", ""), _figures(report)),
+        "## Confusion\n\nTrue category (row) taken for (column).",
+        f"![Confusion]({pictures['confusion']})",
+        "## Calibration\n\nAccuracy over confidence; the diagonal is honest.",
+        f"![Calibration]({pictures['calibration']})",
+    ]
+    parts += [f"## {name}\n\n" + _markdown(head, rows) for name, head, rows in _breakdowns(report)]
+    return "\n\n".join(parts) + "\n"
+
+
+_Rows: TypeAlias = list[tuple[str, ...]]
+
+
+def _figures(report: Report) -> _Rows:
     novelty = report.novelty or {}
-    figures = (
+    return [
         ("views", str(report.n)),
         ("accuracy", _text(report.accuracy)),
         ("balanced accuracy", _text(report.balanced_accuracy)),
@@ -47,24 +97,29 @@ def format_page(report: Report, *, title: str) -> str:
         ("unknown shapes rejected", _text(novelty.get("rejected"))),
         ("novelty AUROC", _text(novelty.get("auroc"))),
         ("model", report.model),
-    )
-    parts = [
-        f"<h1>{escape(title)}</h1>",
-        _table(("", ""), figures),
-        "<h2>Confusion</h2><p>True category (row) taken for (column).</p>",
-        confusion_svg(report.categories, report.confusion),
-        "<h2>Calibration</h2><p>Accuracy over confidence; the diagonal is honest.</p>",
-        calibration_svg(report.calibration),
+        *((f"recall of {name}", _text(value)) for name, value in report.recall.items()),
     ]
-    for name, rows in (("distance", report.by_distance), ("voxels", report.by_points)):
-        cells = [(label, str(count), _text(value)) for label, count, value in rows]
-        parts.append(f"<h2>Accuracy over {name}</h2>" + _table((name, "views", "accuracy"), cells))
-    return (
-        '<!DOCTYPE html><html lang="en"><meta charset="utf-8">'
-        f"<title>{escape(title)}</title><style>{_STYLE}</style><body>"
-        + "\n".join(parts)
-        + "</body></html>\n"
-    )
+
+
+def _breakdowns(report: Report) -> list[tuple[str, tuple[str, ...], _Rows]]:
+    """Return title, head and rows of each table behind the pictures."""
+    parts = [("distance", report.by_distance), ("voxels", report.by_points)]
+    tables: list[tuple[str, tuple[str, ...], _Rows]] = [
+        (
+            f"Accuracy over {name}",
+            (name, "views", "accuracy"),
+            [(label, str(count), _text(value)) for label, count, value in rows],
+        )
+        for name, rows in parts
+    ]
+    if report.fused:
+        rows = [
+            (str(item.views), str(item.groups), _text(item.accuracy), _text(item.ece))
+            for item in report.fused
+        ]
+        head = ("views fused", "objects", "accuracy", "calibration error")
+        tables.append(("Several views of one object", head, list(rows)))
+    return tables
 
 
 def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> str:
@@ -134,6 +189,16 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     )
     lines += [f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>" for row in rows]
     return f"<table>{''.join(lines)}</table>"
+
+
+def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [head, ["---"] * len(head), *rows]
+    return "\n".join("| " + " | ".join(map(_plain, line)) + " |" for line in lines)
+
+
+def _plain(text: str) -> str:
+    """Return text without what Markdown or HTML would take for marks."""
+    return escape(text).replace("|", "\\|").replace("\n", " ")
 
 
 def _text(value: float | None) -> str:

@@ -19,6 +19,7 @@ from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import ModelError
 from shapecat.evaluation import metrics
 from shapecat.evaluation.dataset import read_dataset
+from shapecat.evaluation.fused import Fused, fuse_views
 from shapecat.evaluation.views import DescribedViews, Observer, describe_views, ignore
 from shapecat.learning import Categorizer, load_model
 
@@ -35,7 +36,8 @@ class Report:
     """What an evaluation came to; undefined figures are None.
 
     ``confusion`` counts true categories (rows) taken for others (columns), in the order of
-    ``categories``; ``by_distance`` and ``by_points`` give (range, views, accuracy).
+    ``categories``; ``by_distance`` and ``by_points`` give (range, views, accuracy); ``fused`` is
+    empty where no object has three views.
     """
 
     model: str
@@ -53,6 +55,7 @@ class Report:
     calibration: tuple[metrics.Bin, ...] = ()
     by_distance: tuple[tuple[str, int, float], ...] = field(default=())
     by_points: tuple[tuple[str, int, float], ...] = field(default=())
+    fused: tuple[Fused, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -63,6 +66,7 @@ class Report:
             "calibration": [item._asdict() for item in self.calibration],
             "by_distance": _as_dicts(self.by_distance),
             "by_points": _as_dicts(self.by_points),
+            "fused": [item._asdict() for item in self.fused],
         }
 
 
@@ -123,6 +127,7 @@ def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
         calibration=metrics.calibration_curve(truth, posteriors),
         by_distance=_accuracy_over(views.distances[known], truth == predicted, _DISTANCES_M, " m"),
         by_points=_accuracy_over(views.points[known], truth == predicted, _POINTS, ""),
+        fused=fuse_views(truth, posteriors, views.instances[known]),
     )
 
 
@@ -181,6 +186,8 @@ def format_report(report: Report) -> str:
     for title, rows in (("distance", report.by_distance), ("voxels", report.by_points)):
         if rows:
             console.print(_breakdown(title, rows))
+    if report.fused:
+        console.print(_fused(report))
     return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
 
 
@@ -220,4 +227,11 @@ def _breakdown(title: str, rows: Sequence[tuple[str, int, float]]) -> Table:
     table = _grid(None, f"\n{title}", "\nviews", "\naccuracy")
     for name, count, value in rows:
         table.add_row(name, str(count), _text(value))
+    return table
+
+
+def _fused(report: Report) -> Table:
+    table = _grid(None, "\nviews fused", "\nobjects", "\naccuracy", "\ncalibration error")
+    for item in report.fused:
+        table.add_row(str(item.views), str(item.groups), _text(item.accuracy), _text(item.ece))
     return table

@@ -60,7 +60,7 @@ def train_on_folder(
         fit_views(views, views.where(held_out & False), seed=seed),
         temperature=judged.temperature,
     )
-    model = replace(model, known=replace(model.known, threshold=judged.known.threshold))
+    model = replace(model, threshold=judged.threshold)
     save_model(out, model)
     return _summary(views, model) | {"held_out": report.as_dict()}
 

@@ -14,7 +14,6 @@ from shapecat.errors import ModelError
 from shapecat.jit import kernel
 from shapecat.learning.features import FeatureBank, write_features
 from shapecat.learning.forest import FlatForest, fall
-from shapecat.learning.novelty import LeafProximity, share_leaves
 
 __all__ = ["Categorizer", "Prediction", "parts_of"]
 
@@ -26,7 +25,7 @@ class Prediction(NamedTuple):
     """What a model says of n objects.
 
     ``posteriors`` (n, c) sum to 1 in the order of the model's categories; ``novelty`` (n,) is 0
-    for a familiar shape and above 1 beyond the threshold.
+    for a familiar shape, above 1 beyond the threshold, and at most 2.
     """
 
     posteriors: F4
@@ -34,7 +33,7 @@ class Prediction(NamedTuple):
 
 
 class Categorizer(Record):
-    """The fitted chain: densities, forest dictionary, linear learners on the words, novelty.
+    """The fitted chain: densities, dictionary, a learner per category on the words, novelty.
 
     Attributes
     ----------
@@ -42,13 +41,14 @@ class Categorizer(Record):
     descriptor_names : the components it expects, in order.
     bank : what the learners see of a descriptor.
     forest : the dictionary; each leaf is a word.
-    votes : (w, c) what each word adds to the logit of each category.
-    linear : (c, f) weights of the features in the logits; mostly zero.
-    bias : (c,) constants of the logits.
+    votes : (w, k) what each word adds to the logit of each category, and then, where the model was
+        shown shapes of no category, to that of *unknown*: k is c or c + 1.
+    linear : (k, f) weights of the features in the logits; mostly zero.
+    bias : (k,) constants of the logits.
     temperature : posteriors are ``softmax(logits / temperature)``.
-    known : known views by their words, for novelty.
-    known_descriptors : (v, d) their standardised descriptors, and
-    known_category : (v,) their categories: examples against which a new category is learned.
+    threshold : log odds of being unknown above which a shape is called so.
+    known_descriptors : (v, d) standardised descriptors of views the model has learned from, and
+    known_category : (v,) their columns of the logits: what a new category is learned against.
     notes : how it was made; plain JSON values.
 
     Raises
@@ -60,11 +60,11 @@ class Categorizer(Record):
     descriptor_names: tuple[str, ...]
     bank: FeatureBank
     forest: FlatForest
-    votes: F4 = array("w c", "f2")
-    linear: F4 = array("c f", "f4")
-    bias: F8 = array("c", "f8")
+    votes: F4 = array("w k", "f2")
+    linear: F4 = array("k f", "f4")
+    bias: F8 = array("k", "f8")
     temperature: float
-    known: LeafProximity
+    threshold: float
     known_descriptors: F4 = array("v d", "f2")
     known_category: U1 = array("v", "u1")
     notes: Mapping[str, Any]
@@ -74,21 +74,22 @@ class Categorizer(Record):
         super().__post_init__()
         sizes = {
             "descriptor": len(self.descriptor_names) > self.bank.columns.max(initial=0),
-            "categories": len(self.categories) == self.bias.size == self.bank.categories,
+            "categories": self.bias.size - len(self.categories) in {0, 1}
+            and self.bank.categories == len(self.categories),
             "category names": len(set(self.categories)) == len(self.categories)
-            and 0 < len(self.categories) <= 255,
-            "words": self.forest.words == len(self.votes) == self.known.starts.size - 1,
+            and 0 < len(self.categories) <= 254,
+            "words": self.forest.words == len(self.votes),
             "features": self.linear.shape[1]
             == self.bank.width
             > self.forest.feature.max(initial=0),
-            "known views": self.known.views == len(self.known_category)
-            and self.known_descriptors.shape[1] == self.bank.mean.size
-            and bool(np.all(self.known_category < len(self.categories))),
+            "known views": self.known_descriptors.shape[1] == self.bank.mean.size
+            and bool(np.all(self.known_category < self.bias.size)),
             "numbers": all(
                 bool(np.all(np.abs(values.astype(np.float64)) <= _LARGEST))
                 for values in (self.votes, self.linear, self.bias)
             )
-            and 1e-3 <= self.temperature <= 1e3,
+            and 1e-3 <= self.temperature <= 1e3
+            and abs(self.threshold) <= _LARGEST,
         }
         wrong = [name for name, fits in sizes.items() if not fits]
         if wrong:
@@ -107,6 +108,11 @@ class Categorizer(Record):
             else:
                 digest.update(json.dumps(value, sort_keys=True).encode())
         return digest.hexdigest()[:16]
+
+    @property
+    def knows_unknown(self) -> bool:
+        """Whether there is a learner of shapes of no category."""
+        return self.bias.size > len(self.categories)
 
     def require_descriptor(self, names: Sequence[str]) -> None:
         """Check that descriptors have the components this model was trained on.
@@ -146,7 +152,6 @@ class Categorizer(Record):
 
     @cached_property
     def _parameters(self) -> tuple[Any, ...]:
-        known = self.known
         return (
             self.bank.parameters,
             self.forest.parameters,
@@ -155,10 +160,7 @@ class Categorizer(Record):
             bool(np.any(self.linear)),
             self.bias,
             float(self.temperature),
-            *known.parameters,
-            known.views,
-            known.neighbours,
-            float(known.threshold),
+            float(self.threshold),
         )
 
 
@@ -182,10 +184,6 @@ def _predict(
     use_linear: bool,  # noqa: FBT001  compiled kernels take their arguments by position
     bias: F8,
     temperature: float,
-    known_starts: Any,
-    known_members: Any,
-    known_views: int,
-    neighbours: int,
     threshold: float,
     posteriors: F4,
     novelty: F4,
@@ -193,29 +191,34 @@ def _predict(
     """Write posteriors (n, c) and novelty (n,) of descriptors x (n, d)."""
     columns, mean, scale, spans, bandwidth, level, spread, kernel_starts, kernels = bank
     roots, feature, split, left, word = forest
+    categories = posteriors.shape[1]
     features = np.zeros((x.shape[0], linear.shape[1]), np.float32)
     # (1) the probabilistic neural networks, one density per block and category
     write_features(
         x, columns, mean, scale, spans, bandwidth, level, spread, kernel_starts, kernels, features
     )
     words = np.zeros(roots.size, np.int64)
-    counts = np.zeros(known_views, np.int64)
     logits = np.zeros(bias.size)
     for i in range(x.shape[0]):
         # (2) the dictionary: the leaf of each tree
         fall(features[i], roots, feature, split, left, word, words)
         # (3) the learners on the words
-        for c in range(bias.size):
-            total = bias[c]
-            for w in words:
-                total += votes[w, c]
-            if use_linear:
+        logits[:] = bias
+        for w in words:
+            for c in range(bias.size):
+                logits[c] += votes[w, c]
+        if use_linear:
+            for c in range(bias.size):
                 for j in range(linear.shape[1]):
-                    total += linear[c, j] * features[i, j]
-            logits[c] = total / temperature
-        largest = logits.max()
-        exponentials = np.exp(logits - largest)
-        posteriors[i] = exponentials / exponentials.sum()
-        # (4) novelty
-        score = share_leaves(words, known_starts, known_members, counts, neighbours)
-        novelty[i] = score / threshold
+                    logits[c] += linear[c, j] * features[i, j]
+        logits /= temperature
+        known = logits[:categories]
+        exponentials = np.exp(known - known.max())
+        total = exponentials.sum()
+        posteriors[i] = exponentials / total
+        # (4) novelty: the odds that it is none of them, or else that it is not the best of them
+        if bias.size > categories:
+            odds = logits[categories] - known.max() - np.log(total)
+        else:
+            odds = np.log(max(total - 1.0, 1e-30))
+        novelty[i] = 2.0 / (1.0 + np.exp(min(threshold - odds, 80.0)))

@@ -1,4 +1,4 @@
-"""A random forest as flat arrays: each leaf is a word of the dictionary (thesis 7.3)."""
+"""Trees as flat arrays: each leaf is a word of the dictionary (thesis 7.3)."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -51,7 +51,7 @@ class FlatForest(Record):
     @cached_property
     def word(self) -> I4:
         """(n,) the word of each leaf; of no meaning in inner nodes."""
-        return np.cumsum(self.left == 0) - 1
+        return (np.cumsum(self.left == 0) - 1).astype(np.int32)
 
     @property
     def words(self) -> int:
@@ -60,14 +60,8 @@ class FlatForest(Record):
 
     @property
     def parameters(self) -> tuple[np.ndarray, ...]:
-        """The arrays of `fall`, in the types of the kernel."""
-        return (
-            self.roots.astype(np.int64),
-            self.feature.astype(np.int64),
-            self.threshold,
-            self.left.astype(np.int64),
-            self.word,
-        )
+        """The arrays of `fall`; small types keep a large forest in the cache."""
+        return self.roots, self.feature, self.threshold, self.left, self.word
 
     def fall(self, features: F4) -> I4:
         """Return the word of each tree that features (n, f) fall into: (n, t).
@@ -90,9 +84,9 @@ class FlatForest(Record):
 def fall(x: F4, roots: I4, feature: I4, threshold: F4, left: I4, word: I4, result: I4) -> None:
     """Write the word that x (f,) falls into in each tree into result (t,)."""
     for t in range(roots.size):
-        node = roots[t]
+        node = np.int64(roots[t])
         while left[node] != 0:
-            node = left[node] + (0 if x[feature[node]] <= threshold[node] else 1)
+            node = np.int64(left[node]) + (0 if x[feature[node]] <= threshold[node] else 1)
         result[t] = word[node]
 
 

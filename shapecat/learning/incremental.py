@@ -11,7 +11,6 @@ from shapecat.arrays import F4, F8, I4
 from shapecat.errors import ModelError
 from shapecat.learning.categorizer import Categorizer
 from shapecat.learning.features import FeatureBank
-from shapecat.learning.novelty import LeafProximity
 from shapecat.learning.words import bag_of_words
 
 __all__ = ["add_categories"]
@@ -26,7 +25,7 @@ def add_categories(
     labels: Sequence[str],
     *,
     rng: np.random.Generator,
-    ridge: float = 3e-4,
+    ridge: float = 3e-3,
 ) -> Categorizer:
     """Learn categories a model does not have from a few views of each.
 
@@ -64,36 +63,40 @@ def add_categories(
     codes = np.array([categories.index(name) for name in names])
     bank = _extend_bank(categorizer.bank, descriptors, codes, rng)
     z = np.concatenate([known, bank.standardise(descriptors)])
-    truth = np.concatenate([categorizer.known_category.astype(np.int64), codes])
+    # while the new learners are fitted they stand last, behind the one of unknown shapes
+    count, old_count = len(added), len(categorizer.categories)
+    order = _order(old_count, count, unknown=categorizer.knows_unknown)
+    truth = np.concatenate([categorizer.known_category.astype(np.int64), order[codes]])
     features = _features_of_standardised(bank, z)
     words = categorizer.forest.fall(features)
     inputs = sparse.hstack(
         [bag_of_words(words, categorizer.forest.words), sparse.csr_array(features)], format="csr"
     )
     old = _old_logits(categorizer, words, features)
-    weights, bias = _fit_new(inputs, old / categorizer.temperature, truth, len(added), ridge)
+    weights, bias = _fit_new(inputs, old / categorizer.temperature, truth, count, ridge)
     weights, bias = weights * categorizer.temperature, bias * categorizer.temperature
     vocabulary = categorizer.forest.words
-    linear = np.zeros((len(categories), bank.width), np.float32)
-    linear[: len(categorizer.categories), : categorizer.linear.shape[1]] = categorizer.linear
-    linear[len(categorizer.categories) :] = weights[:, vocabulary:]
+    linear = np.zeros((old.shape[1] + count, bank.width), np.float32)
+    linear[: old.shape[1], : categorizer.linear.shape[1]] = categorizer.linear
+    linear[old.shape[1] :] = weights[:, vocabulary:]
+    votes = np.concatenate([categorizer.votes, weights[:, :vocabulary].T], axis=1)
     return replace(
         categorizer,
         categories=categories,
         bank=bank,
-        votes=np.concatenate([categorizer.votes, weights[:, :vocabulary].T], axis=1),
-        linear=linear,
-        bias=np.concatenate([categorizer.bias, bias]),
-        known=LeafProximity.of(
-            words,
-            vocabulary=vocabulary,
-            neighbours=categorizer.known.neighbours,
-            threshold=categorizer.known.threshold,
-        ),
+        votes=votes[:, order],
+        linear=linear[order],
+        bias=np.concatenate([categorizer.bias, bias])[order],
         known_descriptors=z,
-        known_category=truth,
+        known_category=np.argsort(order)[truth],
         notes={**categorizer.notes, "added": [*categorizer.notes.get("added", []), *added]},
     )
+
+
+def _order(old: int, new: int, *, unknown: bool) -> I4:
+    """Return where each column of the final logits stands while the new learners are fitted."""
+    first = old + unknown
+    return np.concatenate([np.arange(old), np.arange(first, first + new), np.arange(old, first)])
 
 
 def _known_views(categorizer: Categorizer) -> F4:

@@ -20,7 +20,7 @@ from shapecat.learning.categorizer import Categorizer, parts_of
 __all__ = ["load_model", "save_model"]
 
 _FORMAT = "shapecat-model"
-_VERSION = 1
+_VERSION = 2
 _LARGEST_FILE = 64 << 20
 _LARGEST_PART = 128 << 20
 _HEADER = "header.json"

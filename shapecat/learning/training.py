@@ -2,16 +2,15 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from sklearn.pipeline import Pipeline
 
 from shapecat.arrays import F4, I4
+from shapecat.learning.boosted import BoostedDictionary
 from shapecat.learning.calibration import fit_temperature
 from shapecat.learning.categorizer import Categorizer
-from shapecat.learning.dictionary import ForestDictionary, WordLearner
-from shapecat.learning.novelty import LeafProximity
 from shapecat.learning.pnn import ProbabilisticNeuralNetwork
 
 __all__ = [
@@ -36,24 +35,20 @@ class LearningSettings:
 
     blocks: tuple[str, ...] = ()
     """Blocks of the descriptor that are used; all if empty."""
-    kernels: int = 50
+    kernels: int = 0
     """Parzen kernels per category in the probabilistic neural network; 0 leaves it out."""
-    trees: int = 100
-    """Trees of the dictionary: words per object."""
-    min_leaf: int = 2
-    """Training views a leaf needs."""
-    strategy: Literal["multinomial", "one_vs_rest"] = "multinomial"
-    """Learners on the words: against each other, or one versus the rest."""
-    strength: float = 0.03
-    """Inverse regularisation of the learners."""
+    rounds: int = 300
+    """Rounds in which the dictionary grows one tree per category."""
+    leaves: int = 16
+    """Words of a tree, at most."""
+    rate: float = 0.09
+    """Share of what is lacking that a tree corrects."""
     known_views: int = 1500
-    """Known views kept in the model, for novelty and for learning new categories."""
-    neighbours: int = 10
-    """Nearest known views that novelty asks."""
+    """Views kept in the model, to learn new categories against."""
     rejected: float = 0.05
     """Share of held-out views of known categories that the novelty threshold rejects."""
     jobs: int | None = None
-    """Processes that grow trees at the same time."""
+    """Trees grown at the same time."""
 
 
 class Examples(NamedTuple):
@@ -73,7 +68,7 @@ class Examples(NamedTuple):
 
 
 def make_chain(blocks: Mapping[str, slice], settings: LearningSettings, *, seed: int) -> Pipeline:
-    """Return the unfitted chain: densities, dictionary, learners.
+    """Return the unfitted chain: densities, then the dictionary with its learners.
 
     It is fitted to `encode`d labels: -1 is a shape of no category.
     """
@@ -82,11 +77,15 @@ def make_chain(blocks: Mapping[str, slice], settings: LearningSettings, *, seed:
     densities = ProbabilisticNeuralNetwork(
         used, kernels=settings.kernels, unknown=-1, random_state=seed
     )
-    dictionary = ForestDictionary(
-        trees=settings.trees, min_leaf=settings.min_leaf, jobs=settings.jobs, random_state=seed
+    dictionary = BoostedDictionary(
+        rounds=settings.rounds,
+        leaves=settings.leaves,
+        rate=settings.rate,
+        unknown=-1,
+        jobs=settings.jobs,
+        random_state=seed,
     )
-    learner = WordLearner(strategy=settings.strategy, C=settings.strength, unknown=-1)
-    return Pipeline([("densities", densities), ("dictionary", dictionary), ("learner", learner)])
+    return Pipeline([("densities", densities), ("dictionary", dictionary)])
 
 
 def fit_categorizer(
@@ -148,23 +147,22 @@ def collapse(
     notes: Mapping[str, Any],
 ) -> Categorizer:
     """Turn a chain, fitted to `encode`d labels, into plain arrays: votes per leaf."""
-    bank, forest = chain["densities"].bank_, chain["dictionary"].forest_
-    learner = chain["learner"]
+    bank, dictionary = chain["densities"].bank_, chain["dictionary"]
+    columns = dictionary.bias_.size
     codes = encode(train.labels, categories)
+    codes = np.where((codes < 0) & (columns > len(categories)), len(categories), codes)
     chosen = choose_evenly(codes, settings.known_views, np.random.default_rng(seed))
-    known = train.descriptors[chosen]
-    words = forest.fall(bank.features(known))
     return Categorizer(
         categories=tuple(categories),
         descriptor_names=tuple(descriptor_names),
         bank=bank,
-        forest=forest,
-        votes=learner.coef_.T,
-        linear=np.zeros((len(categories), bank.width)),
-        bias=learner.intercept_,
-        temperature=float(learner.temperature_),
-        known=LeafProximity.of(words, vocabulary=forest.words, neighbours=settings.neighbours),
-        known_descriptors=bank.standardise(known),
+        forest=dictionary.forest_,
+        votes=dictionary.votes_,
+        linear=np.zeros((columns, bank.width)),
+        bias=dictionary.bias_,
+        temperature=1.0,
+        threshold=0.0,
+        known_descriptors=bank.standardise(train.descriptors[chosen]),
         known_category=codes[chosen],
         notes=notes,
     )
@@ -190,16 +188,12 @@ def calibrate(categorizer: Categorizer, held_out: Examples, *, rejected: float) 
     views, codes = held_out.descriptors[codes >= 0], codes[codes >= 0]
     if codes.size == 0:
         return categorizer
-    plain = replace(
-        categorizer, temperature=1.0, known=replace(categorizer.known, threshold=1.0)
-    ).predict(views)
+    plain = replace(categorizer, temperature=1.0).predict(views)
     logits = np.log(np.maximum(plain.posteriors.astype(np.float64), 1e-30))
-    threshold = float(np.quantile(plain.novelty, 1.0 - rejected))
-    return replace(
-        categorizer,
-        temperature=fit_temperature(logits, codes),
-        known=replace(categorizer.known, threshold=max(threshold, 1e-3)),
-    )
+    fitted = replace(categorizer, temperature=fit_temperature(logits, codes), threshold=0.0)
+    doubt = fitted.predict(views).novelty.astype(np.float64) / 2
+    limit = np.clip(np.quantile(doubt, 1.0 - rejected), 1e-6, 1 - 1e-6)
+    return replace(fitted, threshold=float(np.log(limit / (1 - limit))))
 
 
 def encode(labels: np.ndarray, categories: Sequence[str]) -> I4:

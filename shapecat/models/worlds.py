@@ -15,8 +15,14 @@ from shapecat.detection import detect
 from shapecat.evaluation import View
 from shapecat.evaluation.report import UNKNOWN
 from shapecat.evaluation.views import describe_view
-from shapecat.geometry import IDENTITY, inverse, level_from_sensor, transform
-from shapecat.learning.baselines import distance_histogram
+from shapecat.geometry import (
+    IDENTITY,
+    inverse,
+    level_from_sensor,
+    rotation_from_quaternion,
+    transform,
+)
+from shapecat.learning.baselines import shape_functions
 from shapecat.models.fragments import cut_fragment, cut_halo
 from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.mesh import Mesh, moved, rounded_box, standing
@@ -25,6 +31,7 @@ from shapecat.simulation.placement import Rest, choose_rest, rests, turn_about_z
 from shapecat.simulation.render import Geometry, geometry, render
 from shapecat.simulation.sensors import KINECT, REALSENSE, measure
 from shapecat.simulation.shapes import make_object
+from shapecat.surface import voxelize
 from shapecat.types import CATEGORIES, Camera, Frame, Pose, Scene
 
 __all__ = ["World", "WorldView", "simulate_mesh", "simulate_views", "simulate_world"]
@@ -45,6 +52,7 @@ _MANNERS = {
     "box": {"upright": 0.5, "lying": 0.5},
     UNKNOWN: {"upright": 0.7, "lying": 0.3},
 }
+_ROUND = {"cup", "can", "bottle"}
 _SETTINGS = Settings()
 
 
@@ -52,20 +60,28 @@ _SETTINGS = Settings()
 class World:
     """What kind of tables are simulated.
 
-    ``kinds`` are the distractors to choose from, ``unknown`` their share of the objects.
+    ``kinds`` are the distractors to choose from, ``unknown`` their share of the objects;
+    ``lying`` the share of cups, cans and bottles that lie, if not the usual one: they are harder
+    than others, so one learns from more of them; ``leaning`` the share of objects that lean on
+    something unseen. ``keep`` keeps the clouds of the views.
     """
 
     seed: int
     kinds: tuple[str, ...]
     unknown: float = 0.17
+    lying: float | None = None
+    leaning: float = 0.0
     cameras: int = 4
+    keep: bool = False
 
 
 class WorldView(NamedTuple):
     """One described view and its circumstances.
 
     ``manner`` is upright, lying or upside_down; ``source`` truth, detected or fragment; ``visible``
-    the share of its pixels that has readings; ``d2`` the plain shape distribution.
+    the share of its pixels that has readings, ``overlap`` how well it was cut: what its points and
+    those readings share of what either covers; ``functions`` plain shape functions; ``view`` the
+    voxels, where they are kept.
     """
 
     descriptor: F4
@@ -77,8 +93,10 @@ class WorldView(NamedTuple):
     manner: str
     source: str
     visible: float
+    overlap: float
     sensor: str
-    d2: F4
+    functions: F4
+    view: View | None
 
 
 class _Actor(NamedTuple):
@@ -100,6 +118,15 @@ class _Shot(NamedTuple):
     sensor: str
 
 
+class _Seen(NamedTuple):
+    """An object in an image: by which sensor, how much of it, how well it was cut."""
+
+    actor: _Actor
+    sensor: str
+    visible: float
+    overlap: float
+
+
 def simulate_views(world: World, numbers: Sequence[int], *, jobs: int = 1) -> Iterator[WorldView]:
     """Yield the views of some worlds, in order, whatever the number of jobs."""
     one = partial(simulate_world, world)
@@ -115,7 +142,8 @@ def simulate_views(world: World, numbers: Sequence[int], *, jobs: int = 1) -> It
 def simulate_world(world: World, number: int) -> list[WorldView]:
     """Simulate one table, look at it from several places, and describe what is seen."""
     rng = np.random.default_rng((world.seed, number))
-    return look(_populate(world, rng), f"{world.seed}/{number}", cameras=world.cameras, rng=rng)
+    actors, name = _populate(world, rng), f"{world.seed}/{number}"
+    return look(actors, name, cameras=world.cameras, rng=rng, keep=world.keep)
 
 
 def simulate_mesh(
@@ -127,7 +155,12 @@ def simulate_mesh(
 
 
 def look(
-    actors: Sequence[_Actor], name: str, *, cameras: int, rng: np.random.Generator
+    actors: Sequence[_Actor],
+    name: str,
+    *,
+    cameras: int,
+    rng: np.random.Generator,
+    keep: bool = False,
 ) -> list[WorldView]:
     """Describe the objects on a table as seen from several places."""
     table = rounded_box(_TABLE_M)
@@ -140,7 +173,7 @@ def look(
         for k, actor in enumerate(actors):
             if shot.visible[k] >= _LEAST_VISIBLE:
                 views += _views_of(shot, scene, k, actor, f"{name}/{k}", rng)
-    return views
+    return views if keep else [view._replace(view=None) for view in views]
 
 
 # --- the table ---------------------------------------------------------------------------------
@@ -153,6 +186,8 @@ def _populate(world: World, rng: np.random.Generator) -> list[_Actor]:
     gap = float(rng.choice([0.003, 0.02, 0.08]))
     for _ in range(int(rng.integers(3, 10))):
         actor = _make(world, rng)
+        if world.leaning > 0 and rng.random() < world.leaning:
+            actor = _leant(actor, rng)
         radius = float(np.hypot(actor.mesh.vertices[:, 0], actor.mesh.vertices[:, 1]).max())
         spot = _free_spot(spots, radius + gap / 2, rng)
         if spot is None:
@@ -170,19 +205,30 @@ def _populate(world: World, rng: np.random.Generator) -> list[_Actor]:
 def _make(world: World, rng: np.random.Generator) -> _Actor:
     if rng.random() < world.unknown:
         _, mesh = make_distractor(rng, str(rng.choice(list(world.kinds))))
-        return _rested(mesh, UNKNOWN, rng)
+        return _rested(mesh, UNKNOWN, world, rng)
     label = str(rng.choice(list(CATEGORIES)))
-    return _rested(make_object(label, rng), label, rng)
+    return _rested(make_object(label, rng), label, world, rng)
 
 
-def _rested(mesh: Mesh, label: str, rng: np.random.Generator) -> _Actor:
+def _rested(mesh: Mesh, label: str, world: World, rng: np.random.Generator) -> _Actor:
     """Let an object lie as such objects do; upright where it cannot."""
-    chances = _MANNERS.get(label, {"upright": 1.0})
+    chances = dict(_MANNERS.get(label, {"upright": 1.0}))
+    if world.lying is not None and label in _ROUND:
+        chances["upright"] += chances["lying"] - world.lying
+        chances["lying"] = world.lying
     manner = str(rng.choice(list(chances), p=list(chances.values())))
     rest = choose_rest(rests(mesh), manner, rng) if manner != "upright" else None
     if rest is None:
         return _Actor(standing(mesh), label, "upright", 0.0)
     return _Actor(moved(mesh, rest.pose), label, manner, 0.0)
+
+
+def _leant(actor: _Actor, rng: np.random.Generator) -> _Actor:
+    """Tilt an object by up to 25 degrees, as if it leant on something."""
+    azimuth, half = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(5, 25)) / 2
+    axis = np.sin(half) * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    turn = Pose(rotation_from_quaternion(np.round([*axis, np.cos(half)], 9)), np.zeros(3))
+    return actor._replace(mesh=standing(moved(actor.mesh, turn)), manner="leaning")
 
 
 def _placed(
@@ -266,31 +312,34 @@ def _views_of(
     """Return one view of an object, cut by the truth or as detected, and maybe a piece of it."""
     found = _cut_by_detection(shot, scene, k)
     if found is not None and rng.random() < 0.6:
-        view, source = found, "detected"
+        (view, overlap), source = found, "detected"
     else:
-        view, source = cut_halo(_cut_by_truth(shot, k, actor, rng), rng), "truth"
+        view, overlap = cut_halo(_cut_by_truth(shot, k, actor, rng), rng), 1.0
+        source = "truth"
     view = View(view.points, view.eye, actor.label, instance)
-    described = [_described(view, source, actor, shot, k, rng)]
+    seen = _Seen(actor, shot.sensor, float(shot.visible[k]), overlap)
+    described = [_described(view, source, seen, rng)]
     if rng.random() < _FRAGMENTS:
         piece = cut_fragment(view, rng)
         if piece is not None:
-            described.append(_described(piece, "fragment", actor, shot, k, rng))
+            described.append(_described(piece, "fragment", seen, rng))
     return [item for item in described if item is not None]
 
 
-def _cut_by_detection(shot: _Shot, scene: Scene, k: int) -> View | None:
-    """Return the object as detection cuts it; None where it was not found by itself."""
+def _cut_by_detection(shot: _Shot, scene: Scene, k: int) -> tuple[View, float] | None:
+    """Return the object as detection cuts it, and how well; None where it was not found."""
     owners = shot.owners.reshape(-1)
     valid = np.asarray(shot.frame.depth).reshape(-1) > 0
     total = int(np.count_nonzero((owners == k) & valid))
     for candidate in scene.candidates:
         hits = int(np.count_nonzero(owners[candidate.indices] == k))
-        if hits / (total + candidate.indices.size - hits) >= _OVERLAP:
+        overlap = hits / (total + candidate.indices.size - hits)
+        if overlap >= _OVERLAP:
             plane = scene.planes[candidate.plane or 0]
             points = shot.frame.xyz(candidate.indices)
             points = points[np.isfinite(points[:, 0])]
             level = level_from_sensor(scene.up, plane.offset + candidate.support_m, points)
-            return View(transform(level, points), level.translation, "", "")
+            return View(transform(level, points), level.translation, "", ""), overlap
     return None
 
 
@@ -312,22 +361,22 @@ def _centre(actor: _Actor) -> F8:
     return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
-def _described(
-    view: View, source: str, actor: _Actor, shot: _Shot, k: int, rng: np.random.Generator
-) -> WorldView | None:
+def _described(view: View, source: str, seen: _Seen, rng: np.random.Generator) -> WorldView | None:
     described = describe_view(view, settings=_SETTINGS, rng=rng)
     if described is None:
         return None
     return WorldView(
         descriptor=described.descriptor,
-        label=actor.label,
+        label=seen.actor.label,
         instance=view.instance,
         points=described.points,
         distance=float(np.linalg.norm(view.points.mean(axis=0) - view.eye)),
         seconds=described.seconds,
-        manner=actor.manner,
+        manner=seen.actor.manner,
         source=source,
-        visible=float(shot.visible[k]),
-        sensor=shot.sensor,
-        d2=distance_histogram(view.points, rng),
+        visible=seen.visible,
+        overlap=seen.overlap,
+        sensor=seen.sensor,
+        functions=shape_functions(view.points, rng),
+        view=replace(view, points=voxelize(view.points, voxel_m=_SETTINGS.surface.voxel_m)),
     )

@@ -32,6 +32,7 @@ def write_crops(
     # Recordings of the same name from different days are not taken for each other.
     prefix = f"{safe_name(finished.name)}.{finished.run['input']['sha256'][:8]}"
     hidden = out / f".{prefix}.partial"
+    several = len(finished.run["options"]["topics"]) > 1
     count = 0
     try:
         shutil.rmtree(hidden, ignore_errors=True)
@@ -42,7 +43,9 @@ def write_crops(
                     continue
                 instance = hidden / safe_name(item.category) / f"{prefix}.track-{item.track}"
                 instance.mkdir(parents=True, exist_ok=True)
-                write_pcd(instance / f"{labelled.index:06d}.pcd", cloud[0], viewpoint=cloud[1])
+                stem = f"{safe_name(labelled.topic)}." if several else ""
+                view = instance / f"{stem}{labelled.index:06d}.pcd"
+                write_pcd(view, cloud[0], viewpoint=cloud[1])
                 count += 1
         _replace(out, prefix, hidden)
     except OSError as error:

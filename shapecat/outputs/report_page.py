@@ -176,6 +176,7 @@ def _card(card: Card, categories: Sequence[str], end: float) -> str:
     return _template("report_card.html").substitute(
         track=row.track,
         category=escape(row.category),
+        guess=_guess(row),
         confidence=f"{row.confidence:.4g}",
         first=f"{first:.4g}",
         colour=_css(row.category),
@@ -185,6 +186,14 @@ def _card(card: Card, categories: Sequence[str], end: float) -> str:
         bars=_bars(course, categories, row),
         facts=escape(" · ".join(_track_facts(card))),
     )
+
+
+def _guess(row: TrackRow) -> str:
+    """Return what an unknown object might be; nothing for the others."""
+    guess = row.cells.get("guess", "")
+    if row.category != "unknown" or not guess:
+        return ""
+    return f'<span class="guess">perhaps {escape(guess)}</span>'
 
 
 def _side(picture: Picture) -> str:

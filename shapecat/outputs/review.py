@@ -44,7 +44,7 @@ from shapecat.geometry import transform
 from shapecat.outputs import review_shapes as shapes
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import paint
-from shapecat.outputs.review_layout import Eye, TrackView, choose_eye, lay_out
+from shapecat.outputs.review_layout import Eye, TrackView, choose_eye, lay_out, stepped_back
 from shapecat.outputs.review_viewer import open_viewer, take_screenshot
 from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
 
@@ -140,6 +140,7 @@ class _Review:
         self._cloud_points = cloud_points
         self._fixed_frame = fixed_frame
         self._eyes: dict[str, Eye] = {}
+        self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)  # of what has a fixed place
         self._cameras: dict[str, Camera] = {}
         self._tracks: dict[int, TrackView] = {}
         self._paths: dict[str, dict[int, list[F8]]] = {}
@@ -191,7 +192,11 @@ class _Review:
             for topic, eye in self._eyes.items()
             for entity in [rr.new_entity_path(["world", topic])]
         ]
-        scenes = scenes[:1] if self._fixed_frame else scenes
+        if self._fixed_frame:
+            scenes = [
+                (entity, title, stepped_back(eye, self._low, self._high))
+                for entity, title, eye in scenes[:1]
+            ]
         nothing = (world, "no frame", Eye(np.ones(3), np.zeros(3), np.array([0.0, 0.0, 1.0])))
         tracks = [self._tracks[number] for number in sorted(self._tracks)]
         for track in tracks:
@@ -233,7 +238,10 @@ class _Review:
         changed = any(len(path) > 1 for path in gone)
         for item in labelled.objects:
             place = np.asarray(item.box.center, np.float64)
-            place = place if pose is None else transform(pose, place)
+            if pose is not None:
+                place = transform(pose, place)
+                self._low = np.minimum(self._low, place)
+                self._high = np.maximum(self._high, place)
             path = paths.setdefault(item.track, [])
             if not path or np.linalg.norm(place - path[-1]) > _PATH_STEP_M:
                 path.append(place)

@@ -10,10 +10,11 @@ from shapecat.arrays import F8
 from shapecat.geometry import IDENTITY, transform
 from shapecat.types import Frame, LabelledFrame, Pose
 
-__all__ = ["Eye", "TrackView", "choose_eye", "lay_out"]
+__all__ = ["Eye", "TrackView", "choose_eye", "lay_out", "stepped_back"]
 
 _BACKGROUND = (16, 18, 23)
 _TRACKS_PER_TAB = 4
+_WIDEST_M = 1.5  # radius of what can be overlooked at once
 _MOST_TRACKS = 48  # views; the tracks seen longest have one each, all are in the recording
 
 
@@ -49,6 +50,17 @@ def choose_eye(labelled: LabelledFrame, frame: Frame, *, fixed: bool) -> Eye:
     side = np.cross(up, back)  # from the side, so that the sensor does not stand in the way
     distance = max(0.6, 2.2 * radius)
     return Eye(target + distance * (0.7 * back + 0.3 * side + 0.6 * up), target, up)
+
+
+def stepped_back(eye: Eye, low: F8, high: F8) -> Eye:
+    """Look from so far away that all is in view between two corners, unless that is too much."""
+    radius = float(np.linalg.norm(high - low) / 2) + 0.1
+    if not radius <= _WIDEST_M:
+        return eye
+    away = eye.position - eye.target
+    distance = max(float(np.linalg.norm(away)), 2.2 * radius)
+    middle = (low + high) / 2
+    return Eye(middle + away / np.linalg.norm(away) * distance, middle, eye.up)
 
 
 def _up(labelled: LabelledFrame, frame: Frame, pose: Pose, *, fixed: bool) -> F8:

@@ -35,7 +35,7 @@ def make_can(rng: Generator) -> Mesh:
         "soda": (log_uniform(rng, 0.052, 0.072), rng.uniform(1.35, 2.6)),
         "tin": (log_uniform(rng, 0.05, 0.11), rng.uniform(0.75, 1.7)),
         "flat": (log_uniform(rng, 0.055, 0.15), rng.uniform(0.25, 0.65)),
-        "tube": (log_uniform(rng, 0.035, 0.09), rng.uniform(2.2, 4.2)),
+        "tube": (log_uniform(rng, 0.035, 0.09), rng.uniform(2.2, 4.7)),
         "jar": (log_uniform(rng, 0.05, 0.11), rng.uniform(0.7, 1.9)),
         "plain": (log_uniform(rng, 0.035, 0.14), log_uniform(rng, 0.4, 2.6)),
         "drum": (log_uniform(rng, 0.11, 0.22), rng.uniform(0.35, 1.2)),

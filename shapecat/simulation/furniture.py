@@ -9,7 +9,7 @@ from shapecat.simulation.mesh import extrude, moved, rounded_box
 from shapecat.simulation.worlds import Support
 from shapecat.types import Pose
 
-__all__ = ["make_room", "make_shelf", "make_table", "round_table"]
+__all__ = ["make_counter", "make_room", "make_shelf", "make_table", "round_table"]
 
 FLOOR, TABLE, BOARD, SIDE, BACK, WALL = 1, 2, 2, 7, 8, 9
 """Pixel labels; the boards of a shelf count up from `BOARD`."""
@@ -23,9 +23,21 @@ def make_room(rng: Generator, *, wall_chance: float) -> list[Support]:
     return [floor, _wall("wall", WALL, (8.0, 0.1, 2.6), (0, rng.uniform(0.8, 1.6)))]
 
 
-def make_table(rng: Generator) -> Support:
-    """Return a rectangular or, now and then, a round table top."""
+def make_counter(rng: Generator) -> Support:
+    """Return a table top that is longer than a camera sees."""
+    height, depth = rng.uniform(0.75, 0.95), rng.uniform(0.55, 0.65)
+    return _slab("table", TABLE, (2.4, depth, 0.04), (0, 0, height))
+
+
+def make_table(rng: Generator, least: tuple[float, float] | None = None) -> Support:
+    """Return a rectangular or, now and then, a round table top.
+
+    ``least`` are lengths, metres; a table that has to have them is rectangular.
+    """
     height, thick = rng.uniform(0.6, 0.9), rng.uniform(0.018, 0.04)
+    if least is not None:
+        size = (rng.uniform(1, 1.2) * least[0], rng.uniform(1, 1.2) * least[1], thick)
+        return _slab("table", TABLE, size, (0, 0, height))
     if rng.random() < 0.2:
         return round_table(rng.uniform(0.5, 0.7), height, thick)
     size = (rng.uniform(1.1, 1.8), rng.uniform(0.75, 1.0), thick)

@@ -118,6 +118,23 @@ class Layout:
                 return True
         return False
 
+    def room_for(self, k: int, support: Support, half: F8, *, tries: int = 200) -> F8 | None:
+        """Find another place for a thing that is there; it keeps its own, and takes the new one.
+
+        Returns
+        -------
+        (3,) the translation of its pose there, or None if there is no room.
+        """
+        thing, middle = self.things[k], support.outline[:, :2].mean(axis=0)
+        for _ in range(tries):
+            spot = np.round(middle + self._rng.uniform(-half, half), 6)
+            place = np.array([*spot, thing.pose.translation[2]])
+            here = footprint(thing.mesh, Pose(thing.pose.rotation, place))
+            if self._fits(here, support):
+                self._places.append(here)
+                return place
+        return None
+
     def _put_on_thing(self, piece: Piece, tries: int = 8) -> bool:
         bearers = [k for k in range(len(self.things)) if self._can_bear(k)]
         if not bearers or piece.category == "ball":

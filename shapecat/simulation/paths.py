@@ -7,7 +7,7 @@ from shapecat.arrays import F8
 from shapecat.geometry import quaternion_from_rotation, rotation_from_quaternion
 from shapecat.types import Pose
 
-__all__ = ["hold", "looking_at", "scattered", "walk"]
+__all__ = ["hold", "looking_at", "scattered", "stroll", "walk"]
 
 
 def looking_at(eye: F8, target: F8, *, roll: float = 0.0) -> Pose:
@@ -69,6 +69,37 @@ def walk(
         [np.sin(slow[2] * t + shift[3]), np.cos(slow[0] * t + shift[4]), np.sin(slow[1] * t)], -1
     )
     roll = np.radians(rng.normal(0, 1.0) + 0.6 * np.sin(0.5 * step * t + shift[5]))
+    return tuple(looking_at(e, g, roll=float(r)) for e, g, r in zip(eye, gaze, roll, strict=True))
+
+
+def stroll(
+    rng: Generator,
+    target: F8,
+    frames: int,
+    rate_hz: float,
+    *,
+    distance: float,
+    elevation: float,
+    reach: float,
+) -> tuple[Pose, ...]:
+    """Walk sideways to and fro along a counter, swaying a little, looking at what is in front.
+
+    Parameters
+    ----------
+    target : (3,) middle of the counter, metres; it is seen from the side of negative y.
+    distance, reach : metres to the counter, and from its middle to where the way turns.
+    elevation : degrees by which the camera looks down.
+    """
+    t = np.arange(frames) / rate_hz
+    speed = rng.uniform(0.4, 0.55)
+    side = reach * np.sin(speed / reach * t + rng.uniform(-np.pi, np.pi))
+    up, shift = np.radians(elevation), rng.uniform(0, 2 * np.pi, 4)
+    bob = 0.006 * np.sin(2 * np.pi * 1.8 * t + shift[0])
+    sway = 0.02 * np.sin(2 * np.pi * 0.4 * t + shift[1])
+    gaze = target + np.column_stack([side + 0.03 * np.sin(t + shift[2]), sway, 0 * t])
+    eye = target + distance * np.array([0, -np.cos(up), np.sin(up)])
+    eye = eye + np.column_stack([side, sway, bob])
+    roll = np.radians(0.6 * np.sin(np.pi * 1.8 * t + shift[3]))
     return tuple(looking_at(e, g, roll=float(r)) for e, g, r in zip(eye, gaze, roll, strict=True))
 
 

@@ -9,13 +9,16 @@ from numpy.random import Generator
 
 from shapecat.simulation.furniture import make_room, make_shelf, make_table, round_table
 from shapecat.simulation.layout import Layout, Piece
+from shapecat.simulation.moving import crossing, rearranged, walking
 from shapecat.simulation.paths import hold, scattered, walk
 from shapecat.simulation.worlds import World
 from shapecat.types import CATEGORIES
 
 __all__ = ["SCENES", "SceneKind", "make_scene", "make_stage"]
 
-SceneKind = Literal["tabletop", "shelf", "clutter", "turntable", "empty"]
+SceneKind = Literal[
+    "tabletop", "shelf", "clutter", "turntable", "walking", "crossing", "rearranged", "empty"
+]
 
 
 @dataclass(frozen=True)
@@ -181,6 +184,9 @@ SCENES: dict[str, Callable[[Generator, _Wish], World]] = {
     "shelf": _shelf,
     "clutter": _clutter,
     "turntable": _turntable,
+    "walking": lambda rng, wish: walking(rng, wish.draw(rng, 11), wish.frames, wish.rate_hz),
+    "crossing": lambda rng, wish: crossing(rng, wish.draw(rng, 7), wish.frames, wish.rate_hz),
+    "rearranged": lambda rng, wish: rearranged(rng, wish.draw(rng, 8), wish.frames, wish.rate_hz),
     "empty": _empty,
 }
 """The kinds of scenes."""

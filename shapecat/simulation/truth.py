@@ -44,6 +44,8 @@ def frame_truth(world: World, frame: int, labels: U1, sensor: Sensor) -> Truth:
     objects: list[dict[str, Any]] = []
     hidden: list[dict[str, Any]] = []
     for owner, thing in enumerate(world.things, start=len(world.supports)):
+        if not world.present(thing, frame):
+            continue
         pixels = int(counts[thing.label])
         entry = _thing_truth(world, frame, thing, pixels, seen, owner, sensor)
         (objects if pixels >= LISTED_PIXELS else hidden).append(entry)

@@ -10,7 +10,7 @@ from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.render import Geometry, geometry
 from shapecat.types import Pose
 
-__all__ = ["FIRST_THING_LABEL", "Support", "Thing", "World", "turned_about_z"]
+__all__ = ["FIRST_THING_LABEL", "Motion", "Support", "Thing", "World", "turned_about_z"]
 
 FIRST_THING_LABEL = 20
 """Pixel label of the thing with track 0; supports have 1 to 9, no reading is 0."""
@@ -78,6 +78,19 @@ class Thing(Record):
         return self.category == "cup" and self.upside_down and not _one_sided(self.mesh)
 
 
+class Motion(Record):
+    """How a thing moves, comes and goes.
+
+    Attributes
+    ----------
+    track : the thing.
+    shifts : (t, 3) metres, for each frame, from its pose at the start; NaN where it is not there.
+    """
+
+    track: int
+    shifts: F8 = array("t 3", "f8")
+
+
 class World(Record):
     """A scene over time. The world frame is fixed, z up, the floor at z = 0.
 
@@ -85,6 +98,7 @@ class World(Record):
     ----------
     path : ``world_from_camera`` for each frame, optical axes.
     turns : (t,) angle, for each frame, by which the things have turned about the world's z axis.
+    motions : of the things that do more than that.
     """
 
     kind: str
@@ -92,19 +106,29 @@ class World(Record):
     things: tuple[Thing, ...]
     path: tuple[Pose, ...]
     turns: F8 = array("t", "f8")
+    motions: tuple[Motion, ...] = ()
 
     def __len__(self) -> int:
         """Return the number of frames."""
         return len(self.path)
 
     def pose_of(self, thing: Thing, frame: int) -> Pose:
-        """Return ``world_from_mesh`` of a thing in a frame."""
+        """Return ``world_from_mesh`` of a thing in a frame; where it would be if it is absent."""
+        shift = self._shifts.get(thing.track)
+        pose = thing.pose
+        if shift is not None and np.isfinite(shift[frame]).all():
+            pose = Pose(pose.rotation, pose.translation + shift[frame])
         turn = float(self.turns[frame])
-        return compose(turned_about_z(turn), thing.pose) if turn else thing.pose
+        return compose(turned_about_z(turn), pose) if turn else pose
+
+    def present(self, thing: Thing, frame: int) -> bool:
+        """Return whether a thing is there in a frame."""
+        shift = self._shifts.get(thing.track)
+        return shift is None or bool(np.isfinite(shift[frame]).all())
 
     def geometry(self, frame: int) -> Geometry:
         """Return the triangles in the world frame; owners as in `labels`."""
-        return self._still if not self.turns[frame] else self._gather(frame)
+        return self._gather(frame) if self.motions or self.turns[frame] else self._still
 
     @cached_property
     def labels(self) -> F8:
@@ -113,13 +137,23 @@ class World(Record):
         return np.array(found, np.uint8)
 
     @cached_property
+    def _shifts(self) -> dict[int, F8]:
+        return {motion.track: motion.shifts for motion in self.motions}
+
+    @cached_property
     def _still(self) -> Geometry:
         return self._gather(0)
 
     def _gather(self, frame: int) -> Geometry:
         here = Pose(np.eye(3), np.zeros(3))
-        things = [(thing.mesh, self.pose_of(thing, frame)) for thing in self.things]
+        things = [
+            (thing.mesh if self.present(thing, frame) else _NOTHING, self.pose_of(thing, frame))
+            for thing in self.things
+        ]
         return geometry([(support.mesh, here) for support in self.supports] + things)
+
+
+_NOTHING = Mesh(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 def turned_about_z(angle: float) -> Pose:

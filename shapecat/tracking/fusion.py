@@ -23,7 +23,7 @@ def view_weights(partial: Bool) -> F8:
     return np.where(np.asarray(partial, np.bool_), PARTIAL_WEIGHT, 1.0)
 
 
-def fuse(posteriors: ArrayLike, method: Method = "mean", weights: ArrayLike | None = None) -> F8:
+def fuse(posteriors: ArrayLike, method: Method = "product", weights: ArrayLike | None = None) -> F8:
     """Fuse the posteriors (k, c) of k views into one (c,) that sums to 1.
 
     Views of one object share their error (an upside-down cup looks like a can from everywhere),
@@ -32,7 +32,7 @@ def fuse(posteriors: ArrayLike, method: Method = "mean", weights: ArrayLike | No
     Parameters
     ----------
     posteriors : rows that sum to 1.
-    method : ``mean``; ``product``, tempered by the number of views, which is the geometric mean;
+    method : ``product``, tempered by the number of views, which is the geometric mean; ``mean``;
         ``vote``, the share of views won by each category, the first one on ties.
     weights : (k,) positive weights of the views, equal by default.
 
@@ -42,7 +42,7 @@ def fuse(posteriors: ArrayLike, method: Method = "mean", weights: ArrayLike | No
 
     Examples
     --------
-    >>> fuse([[0.5, 0.5], [0.9, 0.1]])
+    >>> fuse([[0.5, 0.5], [0.9, 0.1]], "mean")
     array([0.7, 0.3])
     >>> fuse([[0.5, 0.5], [0.9, 0.1], [0.2, 0.8]], "vote").round(2)
     array([0.67, 0.33])
@@ -50,7 +50,9 @@ def fuse(posteriors: ArrayLike, method: Method = "mean", weights: ArrayLike | No
     return np.asarray(causal(posteriors, method, weights)[-1])
 
 
-def causal(posteriors: ArrayLike, method: Method = "mean", weights: ArrayLike | None = None) -> F8:
+def causal(
+    posteriors: ArrayLike, method: Method = "product", weights: ArrayLike | None = None
+) -> F8:
     """Return (k, c): row i is `fuse` of the first i + 1 views, in O(1) per view."""
     views = np.asarray(posteriors, np.float64)
     if views.ndim != 2 or len(views) == 0:

@@ -1,7 +1,6 @@
 """From the detections of a recording to its tracks, with the future known."""
 
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import dataclass
 from heapq import merge
 
 import numpy as np
@@ -10,7 +9,9 @@ from shapecat.arrays import F8, I4, Bool
 from shapecat.config import TrackingSettings
 from shapecat.tracking.fusion import causal, view_weights
 from shapecat.tracking.hindsight import Fragments, merge_fragments, scene_cuts
+from shapecat.tracking.hits import Hits
 from shapecat.tracking.records import FrameDetections, Track
+from shapecat.tracking.surplus import without_pieces, without_shadows
 from shapecat.tracking.tracker import Tracker
 
 __all__ = ["track_recording"]
@@ -18,26 +19,7 @@ __all__ = ["track_recording"]
 _BURST_NS = 500_000_000
 """A track proves itself by its hits among the frames this near its first one."""
 
-_SHADOW = 5  # a track this many times longer may have another one as its shadow
 _LINE = 10  # detections at either end of a track that tell its motion
-
-
-@dataclass(frozen=True)
-class _Hits:
-    """All detections of a stream, in columns: ``rows`` (n,) are positions in its frames."""
-
-    frames: Sequence[FrameDetections]
-    rows: I4
-    numbers: I4
-    centers: F8
-    sizes: F8
-    posteriors: F8
-    partial: Bool
-    novelties: F8
-
-    def stamps(self, hits: I4) -> I4:
-        """Return the times of some hits."""
-        return np.array([self.frames[r].stamp_ns for r in self.rows[hits]], np.int64)
 
 
 def track_recording(
@@ -85,7 +67,7 @@ def _interleaved(frames: Iterable[FrameDetections]) -> list[FrameDetections]:
 
 def _track_stream(frames: Sequence[FrameDetections], settings: TrackingSettings) -> list[Track]:
     cuts = scene_cuts(frames, settings)
-    hits, scenes = _columns(frames), np.cumsum(cuts)
+    hits, scenes = Hits.of(frames), np.cumsum(cuts)
     fragments = [
         group
         for group in _groups(_associate(frames, cuts, settings))
@@ -94,7 +76,8 @@ def _track_stream(frames: Sequence[FrameDetections], settings: TrackingSettings)
     ]
     chains = _groups(merge_fragments(_describe(hits, fragments, scenes), settings))
     members = [np.sort(np.concatenate([fragments[k] for k in c])) for c in chains if len(c)]
-    return [_build_track(hits, member, settings) for member in _without_shadows(hits, members)]
+    members = without_pieces(hits, without_shadows(hits, members), settings.max_missed_s)
+    return [_build_track(hits, member, settings) for member in members]
 
 
 def _associate(frames: Sequence[FrameDetections], cuts: Bool, settings: TrackingSettings) -> I4:
@@ -111,28 +94,13 @@ def _associate(frames: Sequence[FrameDetections], cuts: Bool, settings: Tracking
     return np.concatenate(ids)
 
 
-def _columns(frames: Sequence[FrameDetections]) -> _Hits:
-    filled = [frame for frame in frames if len(frame.centers)] or frames[:1]
-    counts = [len(frame.centers) for frame in frames]
-    return _Hits(
-        frames,
-        np.repeat(np.arange(len(frames)), counts),
-        np.concatenate([frame.detections for frame in filled]),
-        np.concatenate([frame.centers for frame in filled]),
-        np.concatenate([frame.sizes for frame in filled]).astype(np.float64),
-        np.concatenate([frame.posteriors for frame in filled]).astype(np.float64),
-        np.concatenate([frame.partial for frame in filled]),
-        np.concatenate([frame.novelties for frame in filled]).astype(np.float64),
-    )
-
-
 def _groups(labels: I4) -> list[I4]:
     """Return the positions of each label, ascending, by ascending label."""
     order = np.argsort(labels, kind="stable")
     return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
 
 
-def _describe(hits: _Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
+def _describe(hits: Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
     """Summarise fragments: sizes by medians, which a few odd views do not move."""
     n = len(fragments)
     stamps = np.array([frame.stamp_ns for frame in hits.frames], np.int64)
@@ -174,37 +142,9 @@ def _needed(frames: Sequence[FrameDetections], scenes: I4, row: int, min_hits: i
     return min(min_hits, near)
 
 
-def _without_shadows(hits: _Hits, members: Sequence[I4]) -> list[I4]:
-    """Drop short tracks inside longer ones: pieces of an object that was split for a moment.
-
-    No object has its centre in the inner half of another one's for all the time it is seen.
-    """
-    lengths = np.array([len(member) for member in members])
-    first = np.array([hits.rows[member[0]] for member in members])
-    last = np.array([hits.rows[member[-1]] for member in members])
-    kept = []
-    for member in members:
-        low, high = hits.rows[member[0]], hits.rows[member[-1]]
-        hosts = (_SHADOW * len(member) <= lengths) & (first <= high) & (last >= low)
-        if not any(_inside(hits, member, members[k]) for k in np.flatnonzero(hosts).tolist()):
-            kept.append(member)
-    return kept
-
-
-def _inside(hits: _Hits, member: I4, host: I4) -> bool:
-    rows, seen = hits.rows[member], hits.rows[host]
-    place = np.column_stack([np.interp(rows, seen, hits.centers[host, k]) for k in range(3)])
-    radius = 0.6 * np.median(hits.sizes[host], axis=0).min()
-    distance = np.linalg.norm(hits.centers[member] - place, axis=1)
-    return bool(np.median(distance) <= radius)
-
-
-def _build_track(hits: _Hits, member: I4, settings: TrackingSettings) -> Track:
-    rows, source = _rows_with_gaps(hits, member, settings.max_missed_s)
+def _build_track(hits: Hits, member: I4, settings: TrackingSettings) -> Track:
+    rows, source = hits.life(member, settings.max_missed_s)
     seen = hits.rows[member]
-    sensors = {hits.frames[r].topic for r in seen}
-    own = np.array([hits.frames[r].topic in sensors for r in rows])
-    rows, source = rows[own], source[own]
     weights = view_weights(hits.partial[member])
     so_far = causal(hits.posteriors[member], settings.fusion, weights)
     stamps = np.array([hits.frames[r].stamp_ns for r in rows], np.int64)
@@ -216,24 +156,12 @@ def _build_track(hits: _Hits, member: I4, settings: TrackingSettings) -> Track:
         np.array([hits.frames[r].frame for r in rows]),
         stamps,
         np.where(source, hits.numbers[member][at], -1),
-        np.column_stack([np.interp(rows, seen, hits.centers[member, axis]) for axis in range(3)]),
+        hits.places(member, rows),
         so_far[at],
         so_far[-1],
         float(so_far[-1].max()),
         float(np.average(hits.novelties[member], weights=weights)),
     )
-
-
-def _rows_with_gaps(hits: _Hits, member: I4, max_gap_s: float) -> tuple[I4, Bool]:
-    """Return the frames of a track, and in which of them it is detected."""
-    seen = hits.rows[member]
-    gap_s = np.diff(hits.stamps(member)) * 1e-9
-    pieces = [
-        np.arange(a, b if gap <= max_gap_s else a + 1)
-        for a, b, gap in zip(seen[:-1], seen[1:], gap_s, strict=True)
-    ]
-    rows = np.concatenate([*pieces, seen[-1:]])
-    return rows, np.isin(rows, seen)
 
 
 def _renumbered(track: Track, number: int) -> Track:

@@ -20,6 +20,8 @@ class FrameDetections(Record):
     posteriors : (n, c) posteriors of the single views, each sums to 1.
     partial : (n,) whether the border of the image or something nearer cuts the object.
     novelties : (n,) novelty of the single views.
+    axes : (n, 3, 3) the columns are the axes of the boxes, in the frame of the centres; None where
+        only sizes are known.
     """
 
     topic: str
@@ -31,6 +33,7 @@ class FrameDetections(Record):
     posteriors: F4 = array("n c", "f4")
     partial: Bool = array("n", "?")
     novelties: F4 = array("n", "f4")
+    axes: F8 | None = array("n 3 3", "f8", default=None)
 
 
 class Track(Record):

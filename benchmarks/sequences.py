@@ -1,0 +1,288 @@
+"""Whole sequences, from simulated recordings to tracks: identities, labels, calibration.
+
+    python -m benchmarks.sequences --seeds 10 --json
+
+Each sequence is written as an ordinary recording and processed as `shapecat process` does; its
+tables are judged against the truth, identities by motmetrics.
+"""
+
+import json
+import tempfile
+import warnings
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import click
+import motmetrics
+import numpy as np
+import pyarrow.parquet as pq
+from scipy.optimize import linear_sum_assignment
+
+from benchmarks.measure import markdown
+from shapecat.arrays import F8, U1
+from shapecat.corrections import read_track_table
+from shapecat.evaluation.metrics import expected_calibration_error
+from shapecat.jobs import Job
+from shapecat.pipeline import process
+from shapecat.simulation import simulate
+from shapecat.simulation.scenes import SceneKind
+from shapecat.tracking.fusion import fuse, view_weights
+from shapecat.types import CATEGORIES
+
+KINDS: tuple[SceneKind, ...] = ("turntable", "walking", "crossing", "rearranged")
+FRAMES, RATE_HZ = 60, 10.0
+NEAR_M = 0.1
+"""A track is at an object if its centre is this near the true one, or within half its length."""
+RANGE_M = 2.0
+"""What is farther from the sensor, an object or a track, counts neither for nor against."""
+SAME = 0.5
+"""A detection is of an object if their pixels overlap so much (intersection over union)."""
+VIEWS = (1, 3, 10, 30)
+
+
+@dataclass(frozen=True)
+class Object:
+    """An object in a frame: ``spared`` if too little of it is seen to ask for it."""
+
+    track: int
+    category: str
+    center: F8
+    reach: float
+    undecidable: bool
+    spared: bool
+
+
+@dataclass(frozen=True)
+class View:
+    """A detection of a known object; ``single`` is the label of the view, ``final`` the track's."""
+
+    track: tuple[str, int, int]
+    truth: str
+    undecidable: bool
+    partial: bool
+    posterior: F8
+    single: str
+    final: str
+
+
+def make_sequence(folder: Path, kind: SceneKind, seed: int) -> None:
+    """Write a recording, its truth, and the tables of its run, unless they are there."""
+    if not (folder / "run").exists():
+        source = simulate(
+            folder / "recording.mcap", scene=kind, frames=FRAMES, seed=seed, rate_hz=RATE_HZ
+        )
+        process(Job(source, folder / "run", mcap=False, rrd=False))
+
+
+def read_truth(folder: Path) -> list[list[Object]]:
+    """Return the objects of each frame, also those that are hidden."""
+    frames = json.loads((folder / "recording.truth.json").read_text("utf-8"))
+    return [
+        [_object(item, listed=True) for item in frame["objects"]]
+        + [_object(item, listed=False) for item in frame["hidden"]]
+        for frame in frames
+    ]
+
+
+def _object(item: dict[str, Any], *, listed: bool) -> Object:
+    few = not listed or item["pixels"] < 250 or item["visible"] < 0.4
+    return Object(
+        item["track"],
+        item["category"],
+        np.array(item["center"]),
+        max(NEAR_M, 0.5 * max(item["box"]["size"][:2])),
+        undecidable=bool(item["ambiguous"] and not few),
+        spared=bool(few or np.linalg.norm(item["box"]["center"]) > RANGE_M),
+    )
+
+
+def count_identities(folder: Path, truth: Sequence[Sequence[Object]]) -> motmetrics.MOTAccumulator:
+    """Compare where the tracks are with where the objects are, frame by frame.
+
+    A track at an object that is spared counts neither for nor against.
+    """
+    table = _within_range(folder / "run")
+    accumulator = motmetrics.MOTAccumulator(auto_id=True)
+    for k, objects in enumerate(truth):
+        rows = [row for row in table if row["frame"] == k]
+        gaps = np.array(
+            [[np.linalg.norm(o.center - row["center_fixed"]) for row in rows] for o in objects]
+        ).reshape(len(objects), len(rows))
+        spared = np.array([o.spared for o in objects], bool)
+        reach = np.array([o.reach for o in objects])[:, None]
+        gaps = np.where(gaps <= reach, gaps, np.nan)
+        cost = np.where(np.isfinite(gaps), gaps - 1, 0)
+        pairs = zip(*linear_sum_assignment(cost), strict=True)
+        drop = {int(j) for i, j in pairs if spared[i] and cost[i, j] < 0}
+        keep = [j for j in range(len(rows)) if j not in drop]
+        asked = np.flatnonzero(~spared).tolist()
+        accumulator.update(
+            [objects[i].track for i in asked],
+            [rows[j]["track"] for j in keep],
+            gaps[asked][:, keep],
+        )
+    return accumulator
+
+
+def _within_range(run: Path) -> list[dict[str, Any]]:
+    """Return the rows of tracks.parquet that are near the sensor."""
+    columns = ["frame", "fixed_translation"]
+    frames = pq.read_table(run / "frames.parquet", columns=columns).to_pylist()
+    sensor = {row["frame"]: row["fixed_translation"] for row in frames}
+    return [
+        row
+        for row in pq.read_table(run / "tracks.parquet").to_pylist()
+        if np.linalg.norm(np.subtract(row["center_fixed"], sensor[row["frame"]])) <= RANGE_M
+    ]
+
+
+def read_views(folder: Path, kind: str, seed: int) -> list[View]:
+    """Return the tracked detections that are of an object, whose pixels they have."""
+    frames = json.loads((folder / "recording.truth.json").read_text("utf-8"))
+    with np.load(folder / "recording.labels.npz") as archive:
+        labels: U1 = archive["labels"]
+    final = {r.track: r.category for r in read_track_table(folder / "run" / "tracks.csv").rows}
+    tracks = pq.read_table(folder / "run" / "tracks.parquet").to_pylist()
+    track_of = {(row["frame"], row["detection"]): row["track"] for row in tracks}
+    columns = ["frame", "detection", "indices", "posterior", "category", "touches_border"]
+    found = []
+    table = pq.read_table(folder / "run" / "detections.parquet", columns=[*columns, "occluded"])
+    for row in table.to_pylist():
+        track = track_of.get((row["frame"], row["detection"]))
+        thing = _seen(row["indices"], labels[row["frame"]], frames[row["frame"]]["objects"])
+        if track is None or thing is None:
+            continue
+        found.append(
+            View(
+                (kind, seed, track),
+                thing["category"],
+                _object(thing, listed=True).undecidable,
+                row["touches_border"] or row["occluded"],
+                np.array(row["posterior"]),
+                row["category"],
+                final[track],
+            )
+        )
+    return found
+
+
+def _seen(
+    indices: Sequence[int], labels: U1, objects: Sequence[dict[str, Any]]
+) -> dict[str, Any] | None:
+    """Return the object that a detection is of."""
+    own = np.bincount(labels.reshape(-1)[indices], minlength=256)
+    label = int(own.argmax())
+    union = len(indices) + int((labels == label).sum()) - own[label]
+    thing = next((item for item in objects if item["label"] == label), None)
+    return thing if own[label] >= SAME * union else None
+
+
+def identities(counted: dict[str, list[motmetrics.MOTAccumulator]]) -> dict[str, dict[str, float]]:
+    """Return the figures of each kind of sequence, over all its frames."""
+    names = ["idf1", "mota", "num_switches", "num_misses", "num_false_positives", "num_objects"]
+    host, result = motmetrics.metrics.create(), {}
+    for kind, accumulators in counted.items():
+        with warnings.catch_warnings():  # of pandas, about its own future
+            warnings.simplefilter("ignore")
+            table = host.compute_many(accumulators, metrics=names, generate_overall=True)
+        result[kind] = {name: round(float(table.loc["OVERALL"][name]), 4) for name in names}
+    return result
+
+
+def label_errors(views: Iterable[View]) -> dict[str, float]:
+    """Return how often single views and their tracks' final labels are wrong."""
+    pairs = np.array([(v.single != v.truth, v.final != v.truth) for v in views]).reshape(-1, 2)
+    single, final = pairs.sum(axis=0).tolist()
+    return {
+        "views": len(pairs),
+        "single": round(single / max(len(pairs), 1), 4),
+        "final": round(final / max(len(pairs), 1), 4),
+        "ratio": round(final / single, 3) if single else 0.0,
+    }
+
+
+def calibration(views: Iterable[View]) -> dict[int, dict[str, float]]:
+    """Return accuracy and calibration error of the fusion of so many views in a row."""
+    tracks: dict[tuple[str, int, int], list[View]] = {}
+    for view in views:
+        tracks.setdefault(view.track, []).append(view)
+    result = {}
+    for count in VIEWS:
+        truth, posteriors = [], []
+        for seen in tracks.values():
+            for i in range(0, len(seen) - count + 1, max(1, count // 2)):
+                some = seen[i : i + count]
+                weights = view_weights(np.array([v.partial for v in some]))
+                posteriors.append(fuse([v.posterior for v in some], weights=weights))
+                truth.append(CATEGORIES.index(some[0].truth))
+        if not truth:
+            continue
+        right = np.argmax(posteriors, axis=1) == truth
+        error = expected_calibration_error(np.array(truth), np.array(posteriors))
+        result[count] = {
+            "n": len(truth),
+            "accuracy": round(float(right.mean()), 4),
+            "ece": round(error, 4),
+        }
+    return result
+
+
+def evaluate(folder: Path, seeds: Iterable[int]) -> dict[str, Any]:
+    """Make, process and judge the sequences of all kinds."""
+    counted: dict[str, list[motmetrics.MOTAccumulator]] = {}
+    views: list[View] = []
+    for seed in seeds:
+        for kind in KINDS:
+            place = folder / kind / str(seed)
+            make_sequence(place, kind, seed)
+            counted.setdefault(kind, []).append(count_identities(place, read_truth(place)))
+            views += read_views(place, kind, seed)
+            click.echo(f"{kind} {seed}", err=True)
+    decidable = [view for view in views if not view.undecidable]
+    per_kind = {
+        kind: label_errors(v for v in decidable if v.track[0] == kind) for kind in sorted(counted)
+    }
+    final = {view.track: (view.truth, view.final) for view in views}
+    wrong = Counter(f"{t} taken for {f}" for t, f in final.values() if t != f)
+    return {
+        "identities": identities(counted),
+        "labels": {
+            **per_kind,
+            "all": label_errors(decidable),
+            "undecidable": label_errors(view for view in views if view.undecidable),
+        },
+        "tracks": {"n": len(final), "wrong": dict(wrong.most_common())},
+        "calibration": calibration(decidable),
+    }
+
+
+def format_tables(figures: dict[str, Any]) -> str:
+    """Return the figures as Markdown tables."""
+    return "\n".join(
+        markdown(title, [first, *next(iter(figures[key].values()))], rows)
+        for title, key, first in (
+            ("Identities", "identities", "sequences"),
+            ("Share of wrong labels", "labels", "sequences"),
+            ("Fusion of so many views", "calibration", "views"),
+        )
+        if (rows := [(name, *values.values()) for name, values in figures[key].items()])
+    )
+
+
+@click.command()
+@click.option("--seeds", default=10, show_default=True, help="Sequences of each kind.")
+@click.option("--first", default=100, show_default=True, help="The first seed.")
+@click.option("--keep", type=click.Path(path_type=Path), help="Keep recordings and runs here.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def main(*, seeds: int, first: int, keep: Path | None, as_json: bool) -> None:
+    """Judge the tracking of simulated sequences: a turntable, a walking camera, and so on."""
+    with tempfile.TemporaryDirectory() as temporary:
+        figures = evaluate(keep or Path(temporary), range(first, first + seeds))
+    click.echo(json.dumps(figures, indent=1) if as_json else format_tables(figures))
+
+
+if __name__ == "__main__":
+    main()

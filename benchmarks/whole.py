@@ -1,0 +1,174 @@
+"""Whole recordings: frames per second on one and two cores, and cost over the number of frames.
+
+    python -m benchmarks.whole            a minute
+    python -m benchmarks.whole --full     recordings of up to 10,000 frames: hours, gigabytes
+
+The command is run as a user runs it, on the cores that taskset leaves it. Start-up is the time of
+a run over the first frames alone; it is taken off and reported.
+"""
+
+import json
+import os
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+import numpy as np
+
+from benchmarks.measure import markdown, save
+from shapecat.simulation import KINECT, make_scene, render_frame
+from shapecat.simulation.containers import CONTAINERS
+from shapecat.simulation.truth import LINK_FROM_OPTICAL, robot_links
+from shapecat.types import Frame, Pose
+
+OPTICAL = "camera_depth_optical_frame"
+EPOCH_NS, PERIOD_NS = 1_700_000_000_000_000_000, 33_333_333
+SEED = 11
+FEW_S = 0.1  # of the run that measures start-up
+THESIS = "thesis (2012): 0.2 s to find planes and objects, up to 2 s for each of 8 objects"
+STAGES = ("detect", "describe", "categorize")
+
+
+class View(NamedTuple):
+    """A frame and where it was taken from."""
+
+    frame: Frame
+    pose: Pose
+
+
+def tabletop(frames: int, *, objects: int = 8) -> tuple[list[View], int]:
+    """Render a table with at least so many objects; return the views and the number."""
+    for seed in range(SEED, SEED + 100):
+        world = make_scene("tabletop", np.random.default_rng(seed), frames=frames)
+        if len(world.things) == objects:
+            break
+    views = []
+    for k in range(frames):
+        frame, _ = render_frame(world, k, rng=np.random.default_rng(k), sensor=KINECT)
+        views.append(View(frame, world.path[k]))
+    return views, len(world.things)
+
+
+def to_and_fro(views: list[View], frames: int) -> Iterator[View]:
+    """Yield so many views of a camera that moves to and fro."""
+    cycle = [*views, *views[-2:0:-1]]
+    for k in range(frames):
+        yield cycle[k % len(cycle)]
+
+
+def write(path: Path, views: list[View], frames: int) -> Path:
+    """Write a recording of so many frames."""
+    with CONTAINERS["mcap"][1](path) as writer:
+        make = writer.messages
+        still = [("camera_link", OPTICAL, LINK_FROM_OPTICAL)]
+        writer.write("/tf_static", make.transforms(still, EPOCH_NS), EPOCH_NS)
+        for k, (frame, pose) in enumerate(to_and_fro(views, frames)):
+            now = EPOCH_NS + k * PERIOD_NS
+            depth = np.round(np.asarray(frame.depth) * 1000) / np.float32(1000)
+            camera = frame.camera
+            if camera is None:
+                raise ValueError
+            writer.write("/tf", make.transforms(robot_links(pose), now), now)
+            info = make.camera_info(camera, now, OPTICAL)
+            writer.write("/camera/depth/camera_info", info, now)
+            writer.write("/camera/depth/image_raw", make.image(depth, now, OPTICAL), now)
+    return path
+
+
+class Spent(NamedTuple):
+    """What a run has cost."""
+
+    wall_s: float
+    cpu_s: float
+    peak_mb: float
+    run: dict[str, Any]
+
+
+def spend(recording: Path, out: Path, cores: set[int], *options: str) -> Spent:
+    """Run ``shapecat process`` on some cores alone."""
+    command = [sys.executable, "-m", "shapecat", "process", str(recording), "--out", str(out)]
+    begun = time.perf_counter()
+    child = os.fork()
+    if child == 0:
+        os.sched_setaffinity(0, cores)
+        quiet = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(quiet, 1)
+        os.dup2(quiet, 2)
+        os.execv(sys.executable, [*command, "--overwrite", *options])  # noqa: S606  no shell
+    _, status, usage = os.wait4(child, 0)
+    if status != 0:
+        raise RuntimeError(command)
+    run = json.loads((out / recording.stem / "run.json").read_text("utf-8"))
+    wall_s, cpu_s = time.perf_counter() - begun, usage.ru_utime + usage.ru_stime
+    compiling = run["seconds"]["compile"]  # once per installation
+    return Spent(wall_s - compiling, cpu_s - compiling, usage.ru_maxrss / 1024, run)
+
+
+def speed(folder: Path, frames: int, repeats: int) -> tuple[str, dict[str, Any]]:
+    """Measure frames per second, all outputs on, on one core and on two."""
+    views, objects = tabletop(60)
+    recording = write(folder / "tabletop.mcap", views, frames)
+    rows, figures = [], {"objects": objects, "frames": frames}
+    for count in (1, 2):
+        cores = set(sorted(os.sched_getaffinity(0))[:count])
+        if len(cores) < count:
+            break
+        few = min(spend(recording, folder, cores, "--end", str(FEW_S)) for _ in range(repeats))
+        whole = min(spend(recording, folder, cores) for _ in range(repeats))
+        done = frames - few.run["counts"]["frames"]
+        wall_s, cpu_s = whole.wall_s - few.wall_s, whole.cpu_s - few.cpu_s
+        seconds = {k: v for k, v in whole.run["seconds"].items() if k not in {"total", "compile"}}
+        shares = {name: round(s / sum(seconds.values()), 3) for name, s in seconds.items()}
+        figures[f"{count} cores"] = {
+            "fps": round(done / wall_s, 1),
+            "cpu_ms": round(1e3 * cpu_s / done, 2),
+            "startup_s": round(few.wall_s, 2),
+            "peak_mb": round(whole.peak_mb),
+            "shares": shares,
+        }
+        words = ", ".join(f"{name} {100 * share:.0f} %" for name, share in shares.items())
+        fps, cpu = done / wall_s, 1e3 * cpu_s / done
+        rows.append((count, f"{fps:.1f}", f"{cpu:.1f}", f"{few.wall_s:.1f}", words))
+    columns = ("cores", "frames/s", "CPU ms/frame", "start-up s", "share of each step")
+    title = f"End to end, {objects} objects, 640×480, all outputs, {frames} frames"
+    return markdown(title, columns, rows) + f"\n{THESIS}.\n", figures
+
+
+def growth(folder: Path, counts: list[int]) -> tuple[str, dict[str, Any]]:
+    """Measure cost per frame and peak memory over the number of frames, on one core."""
+    views, _ = tabletop(60)
+    cores = set(sorted(os.sched_getaffinity(0))[:1])
+    rows, figures = [], {}
+    few = None
+    for frames in counts:
+        recording = write(folder / "long.mcap", views, frames)
+        few = few or spend(recording, folder, cores, "--end", str(FEW_S))
+        whole = spend(recording, folder, cores)
+        each = 1e3 * (whole.cpu_s - few.cpu_s) / (frames - few.run["counts"]["frames"])
+        figures[str(frames)] = {"cpu_ms": round(each, 2), "peak_mb": round(whole.peak_mb)}
+        rows.append((frames, f"{each:.1f}", round(whole.peak_mb)))
+        recording.unlink()
+    return markdown("Growth", ("frames", "CPU ms/frame", "peak MB"), rows), figures
+
+
+@click.command()
+@click.option("--full", is_flag=True, help="Recordings of up to 10,000 frames.")
+@click.option("--frames", default=300, help="Frames of the recording that speed is measured on.")
+@click.option("--repeats", default=2, help="The best of so many runs counts.")
+def main(*, full: bool, frames: int, repeats: int) -> None:
+    """Measure whole recordings, print tables, write ``build/benchmarks_whole.json``."""
+    with tempfile.TemporaryDirectory() as folder:
+        table, figures = speed(Path(folder), frames, repeats)
+        print(table)
+        counts = [100, 1000, 10_000] if full else [50, 200]
+        grown, by_count = growth(Path(folder), counts)
+        print(grown)
+    save(Path("build/benchmarks_whole.json"), {"speed": figures, "growth": by_count})
+
+
+if __name__ == "__main__":
+    main()

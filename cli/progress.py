@@ -1,0 +1,272 @@
+"""What ``process`` shows while it works, on stderr: bars, plain lines, or JSON lines."""
+
+import json
+import sys
+import time
+from collections import Counter
+from collections.abc import Sequence
+from contextlib import ExitStack
+from threading import Lock
+from types import TracebackType
+from typing import Any, Self
+
+import click
+
+from .render import COMPILING, PHASES
+
+_LINE_S = 5.0
+_EVENT_S = 0.5
+WORDS = {
+    "complete": "complete already",
+    "resume": "to go on with",
+    "retry": "to try again",
+    "check": "with results to check",
+    "new": "new",
+}
+
+
+def describe_plan(tasks: Sequence[Any], left_out: int, workers: int, threads: int) -> str:
+    """Return what will be done, in one line."""
+    counts = Counter(task.status for task in tasks)
+    parts = [f"{counts[status]} {words}" for status, words in WORDS.items() if counts[status]]
+    todo = sum(task.bytes for task in tasks if task.status != "complete")
+    hands = f"{workers} at a time" if workers > 1 else "one at a time"
+    frames = f", {threads} frames of each at once" if threads > 1 else ""
+    aside = f"; {left_out} files left out that are no recordings" if left_out else ""
+    many = f"{len(tasks)} recordings: {', '.join(parts)}; {todo / 1e6:,.1f} MB to read"
+    return f"{many}, {hands}{frames}{aside}"
+
+
+class Progress:
+    """Counts what has ended; the kinds below say how it is shown."""
+
+    def __init__(self, tasks: Sequence[Any]) -> None:
+        """Begin with the plan."""
+        self.lock = Lock()
+        self.begun = time.monotonic()
+        self.names = {task.job.folder.name: task.job.name for task in tasks}
+        self.sizes: dict[str, int] = {task.job.folder.name: task.bytes for task in tasks}
+        self.todo: int = sum(task.bytes for task in tasks if task.status != "complete")
+        self.read = 0
+        self.running: dict[str, tuple[str, int, int | None]] = {}
+        self.complete = self.failed = 0
+        self._told = False
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Show nothing more."""
+
+    def plan(self, text: str) -> None:
+        """Show the plan, where progress is shown at all."""
+
+    def progress(self, folder: str, phase: str, done: int, total: int | None) -> None:
+        """Hear how far a recording is."""
+        with self.lock:
+            if phase == "compile":
+                if not self._told:
+                    self._told = True
+                    self.note(COMPILING)
+                return
+            if folder in self.names:
+                self.running[folder] = (phase, done, total)
+                self.show(folder)
+
+    def ended(self, outcome: Any) -> None:
+        """Hear that a recording is complete or has failed."""
+        with self.lock:
+            name = outcome.job.folder.name
+            self.running.pop(name, None)
+            if outcome.summary is None:
+                self.failed += 1
+            else:
+                self.complete += 1
+            if outcome.summary is None or outcome.summary.fresh:
+                self.read += self.sizes.get(name, 0)
+            self.show_ended(outcome)
+
+    def remaining_s(self) -> float | None:
+        """Return about how long it will take, by the bytes read so far."""
+        if not self.read:
+            return None
+        rate = self.read / (time.monotonic() - self.begun)
+        return (self.todo - self.read) / rate
+
+    def note(self, text: str) -> None:
+        """Show a line."""
+        click.echo(text, err=True)
+
+    def show(self, folder: str) -> None:
+        """Show how far a recording is."""
+
+    def show_ended(self, outcome: Any) -> None:
+        """Show what became of a recording."""
+        if outcome.message:
+            self.note(f"Error: {outcome.message}")
+
+
+class PlainProgress(Progress):
+    """A line every few seconds."""
+
+    _last = 0.0
+
+    def plan(self, text: str) -> None:
+        """Write the plan."""
+        self.note(text)
+
+    def show(self, folder: str) -> None:  # noqa: ARG002  the line is about all
+        """Write a line, if the last one is some seconds old."""
+        now = time.monotonic()
+        if now - max(self._last, self.begun) < _LINE_S:
+            return
+        self._last = now
+        running = ", ".join(_words(name, *state) for name, state in sorted(self.running.items()))
+        if len(self.names) == 1:
+            self.note(running)
+            return
+        left = self.remaining_s()
+        eta = "" if left is None else f", about {_duration(left)} left"
+        failed = f", {self.failed} failed" if self.failed else ""
+        done = f"{self.complete + self.failed}/{len(self.names)} recordings{failed}{eta}"
+        self.note(f"{done}; {running}")
+
+
+def _words(name: str, phase: str, done: int, total: int | None) -> str:
+    share = f" {done}/{total}" if total else f" {done}"
+    return f"{name}: {PHASES.get(phase, phase)}{share}"
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(max(0, round(seconds)), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"
+
+
+class JsonProgress(Progress):
+    """One JSON object per line, for programs."""
+
+    def __init__(self, tasks: Sequence[Any]) -> None:
+        """Begin with the plan."""
+        super().__init__(tasks)
+        self._last: dict[str, tuple[str, float]] = {}
+        statuses = Counter(task.status for task in tasks)
+        _event("plan", recordings=len(tasks), bytes=self.todo, status=dict(statuses))
+
+    def note(self, text: str) -> None:
+        """Write a line of text as an event."""
+        _event("note", text=text)
+
+    def show(self, folder: str) -> None:
+        """Write how far a recording is, a few times a second at most."""
+        phase, done, total = self.running[folder]
+        before, now = self._last.get(folder, ("", 0.0)), time.monotonic()
+        if phase != before[0] or now - before[1] >= _EVENT_S or done == total:
+            self._last[folder] = (phase, now)
+            recording = self.names[folder]
+            _event("progress", recording=recording, phase=phase, done=done, total=total)
+
+    def show_ended(self, outcome: Any) -> None:
+        """Write what became of a recording."""
+        known = outcome.summary
+        _event(
+            "ended",
+            recording=outcome.job.name,
+            folder=str(outcome.job.folder),
+            state="failed" if known is None else "complete",
+            seconds=None if known is None else round(known.seconds, 3),
+            fresh=None if known is None else known.fresh,
+            exit_code=outcome.code,
+            message=outcome.message or None,
+            complete=self.complete,
+            failed=self.failed,
+            of=len(self.names),
+        )
+
+
+def _event(event: str, **values: Any) -> None:
+    known = {name: value for name, value in values.items() if value is not None}
+    click.echo(json.dumps({"event": event, **known}), err=True)
+
+
+class LiveProgress(Progress):
+    """Bars on a terminal: one for the whole, one for each running recording."""
+
+    def __init__(self, tasks: Sequence[Any]) -> None:
+        """Prepare the bars."""
+        from rich import progress as rich
+        from rich.console import Console
+
+        super().__init__(tasks)
+        self._bars: dict[str, Any] = {}
+        self._rich = rich.Progress(
+            rich.TextColumn("{task.description}"),
+            rich.BarColumn(),
+            rich.MofNCompleteColumn(),
+            rich.TimeRemainingColumn(),
+            console=Console(stderr=True),
+        )
+        self._stack = ExitStack()
+        self._whole = (
+            self._rich.add_task("recordings", total=len(tasks)) if len(tasks) > 1 else None
+        )
+
+    def __enter__(self) -> Self:
+        self._stack.enter_context(self._rich)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Take the bars away."""
+        self._stack.__exit__(kind, error, trace)
+
+    def plan(self, text: str) -> None:
+        """Show the plan above the bars."""
+        self.note(text)
+
+    def note(self, text: str) -> None:
+        """Show a line above the bars."""
+        self._rich.console.print(text, markup=False, highlight=False, soft_wrap=True)
+
+    def show(self, folder: str) -> None:
+        """Move the bar of a recording; each phase has its own length."""
+        phase, done, total = self.running[folder]
+        words = PHASES.get(phase, phase)
+        text = words if self._whole is None else f"{folder}: {words}"
+        bar = self._bars.get(folder)
+        if bar is None:
+            bar = self._bars[folder] = self._rich.add_task(text, total=total)
+        self._rich.update(bar, description=text, completed=done, total=total)
+
+    def show_ended(self, outcome: Any) -> None:
+        """Take the bar of a recording away, and name it if it failed."""
+        bar = self._bars.pop(outcome.job.folder.name, None)
+        if bar is not None:
+            self._rich.remove_task(bar)
+        if self._whole is not None:
+            self._rich.update(self._whole, completed=self.complete + self.failed)
+        super().show_ended(outcome)
+
+
+KINDS: dict[str, type[Progress]] = {
+    "rich": LiveProgress,
+    "plain": PlainProgress,
+    "jsonl": JsonProgress,
+    "none": Progress,
+}
+
+
+def open_progress(kind: str, tasks: Sequence[Any]) -> Progress:
+    """Return a progress of a kind; ``auto`` is bars on a terminal and plain lines elsewhere."""
+    if kind == "auto":
+        kind = "rich" if sys.stderr.isatty() else "plain"
+    return KINDS[kind](tasks)

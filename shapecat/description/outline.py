@@ -1,0 +1,98 @@
+"""The outline: how wide an object is in the image, slice by slice.
+
+Depth cameras err along the line of sight, hardly across it; what widths tell is the surest part of
+a view from afar.
+"""
+
+import numpy as np
+
+from shapecat.arrays import F4
+from shapecat.description.ranges import inner_range
+from shapecat.jit import kernel
+
+__all__ = ["OUTLINE_NAMES", "OUTLINE_SLICES", "outline"]
+
+OUTLINE_SLICES = 10
+_SLICE = ("width", "aside")
+OUTLINE_NAMES = (
+    *(f"upright_{i}_{name}" for i in range(OUTLINE_SLICES) for name in _SLICE),
+    *(f"long_{i}_{name}" for i in range(OUTLINE_SLICES) for name in _SLICE),
+    "upright_length",
+    "long_length",
+    "long_level",
+    "upright_fill",
+    "long_fill",
+)
+_UPRIGHT, _TO_NARROW = False, True
+_LONG, _END = 2 * OUTLINE_SLICES, 4 * OUTLINE_SLICES
+
+
+@kernel
+def outline(cloud: F4, eye: F4, out: F4) -> None:
+    """Write the numbers named by `OUTLINE_NAMES` of points (3, n) seen from ``eye``.
+
+    Widths are measured twice: upwards, and along the longest direction of the outline, from its
+    wide to its narrow end. ``aside`` is how far the middle of a slice is from that of all.
+    """
+    across, upward = _image(cloud, eye)
+    out[_END], out[_END + 3] = _widths(upward, across, _UPRIGHT, out[:_LONG])
+    mean_a, mean_u = across.mean(), upward.mean()
+    aa = au = uu = 0.0
+    for i in range(across.size):
+        a, u = across[i] - mean_a, upward[i] - mean_u
+        aa, au, uu = aa + a * a, au + a * u, uu + u * u
+    angle = 0.5 * np.arctan2(2 * au, aa - uu)
+    c, s = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+    out[_END + 1], out[_END + 4] = _widths(
+        c * across + s * upward, c * upward - s * across, _TO_NARROW, out[_LONG:_END]
+    )
+    out[_END + 2] = abs(c)
+
+
+@kernel
+def _image(cloud: F4, eye: F4) -> tuple[F4, F4]:
+    """Return the places of the points in an image: to the right, and upwards."""
+    count = cloud.shape[1]
+    across, upward = np.zeros(count, np.float32), np.zeros(count, np.float32)
+    distance = max(np.sqrt(np.float64(eye[0]) ** 2 + eye[1] ** 2 + eye[2] ** 2), 1e-6)
+    sx, sy, sz = eye[0] / distance, eye[1] / distance, eye[2] / distance
+    flat = np.sqrt(sx * sx + sy * sy)
+    rx, ry = (-sy / flat, sx / flat) if flat > 1e-6 else (1.0, 0.0)
+    ux, uy, uz = -sz * ry, sz * rx, sx * ry - sy * rx
+    for i in range(count):
+        x, y, z = cloud[0, i], cloud[1, i], cloud[2, i]
+        depth = max(1.0 - (x * sx + y * sy + z * sz) / distance, 0.1)
+        across[i] = (x * rx + y * ry) / depth
+        upward[i] = (x * ux + y * uy + z * uz) / depth
+    return across, upward
+
+
+@kernel
+def _widths(
+    along: F4,
+    across: F4,
+    to_narrow: bool,  # noqa: FBT001  compiled kernels take their arguments by position
+    out: F4,
+) -> tuple[float, float]:
+    """Write width and offset of each slice; return the length and how much of its box is filled."""
+    low, high = inner_range(along)
+    length = max(high - low, 1e-6)
+    least, most = np.full(OUTLINE_SLICES, np.inf), np.full(OUTLINE_SLICES, -np.inf)
+    for i in range(along.size):
+        k = min(max(int((along[i] - low) / length * OUTLINE_SLICES), 0), OUTLINE_SLICES - 1)
+        least[k], most[k] = min(least[k], across[i]), max(most[k], across[i])
+    widest, middle, total, lean = 1e-6, 0.0, 0.0, 0.0
+    for k in range(OUTLINE_SLICES):
+        width = max(most[k] - least[k], 0.0)
+        if width > 0:
+            widest = max(widest, width)
+            middle += width * (most[k] + least[k]) / 2
+            total += width
+            lean += width * (k - 0.5 * (OUTLINE_SLICES - 1))
+    middle /= max(total, 1e-6)
+    for k in range(OUTLINE_SLICES):
+        source = OUTLINE_SLICES - 1 - k if to_narrow and lean > 0 else k
+        if most[source] > least[source]:
+            out[2 * k] = (most[source] - least[source]) / widest
+            out[2 * k + 1] = abs((most[source] + least[source]) / 2 - middle) / widest
+    return length / (length + widest), total / OUTLINE_SLICES / widest

@@ -1,0 +1,162 @@
+"""A box and a ball fitted to the points: how well they fit, and where not."""
+
+import numpy as np
+
+from shapecat.arrays import F4, I4
+from shapecat.description.linear import solve
+from shapecat.description.ranges import inner_range
+from shapecat.jit import kernel
+
+__all__ = ["SOLID_NAMES", "solids"]
+
+SOLID_NAMES = (
+    "box_sides",
+    "box_faces",
+    "box_narrow_to_wide",
+    "box_height",
+    "corner_upright",
+    "corner_level_1",
+    "corner_level_2",
+    "share_side_1",
+    "share_side_2",
+    "share_top",
+    "off_side_1",
+    "off_side_2",
+    "off_top",
+    "box_to_revolution",
+    "box_to_upright",
+    "ball_residual",
+    "ball_radius",
+    "ball_height",
+    "ball_to_box",
+)
+_YAWS = 36
+
+
+@kernel
+def solids(
+    cloud: F4,
+    owner: I4,
+    x: F4,
+    y: F4,
+    normals: F4,
+    eye: F4,
+    low: float,
+    high: float,
+    turned: F4,
+    out: F4,
+) -> None:
+    """Write the numbers named by `SOLID_NAMES`.
+
+    ``cloud`` (3, n) points in units of the object's size, ``owner`` (n,) their neurons, which are
+    at ``x``, ``y`` with ``normals``; ``turned`` the block about solids of revolution.
+    """
+    u, v = _box_frame(cloud, x, y, normals, eye)
+    _box(u, v, cloud[2], owner, normals, low, high, out[:13])
+    out[13] = _log_ratio(out[1], turned[2])
+    out[14] = _log_ratio(out[0], turned[0])
+    _ball(cloud, low, high, out[15:18])
+    out[18] = _log_ratio(out[15], out[1])
+
+
+@kernel
+def _log_ratio(a: float, b: float) -> float:
+    return float(np.log((a + 1e-3) / (b + 1e-3)))
+
+
+@kernel
+def _box_frame(cloud: F4, x: F4, y: F4, normals: F4, eye: F4) -> tuple[F4, F4]:
+    """Return the points along the two sides of the upright box that fits the neurons best.
+
+    Both axes point to the sensor's side. The box is the one whose two visible walls the upright
+    surface is nearest to (Zhang et al. 2017, "L-shape fitting", by closeness).
+    """
+    u, v = np.zeros(x.size, np.float32), np.zeros(x.size, np.float32)
+    start = np.arctan2(eye[1], eye[0])  # so the answer turns with the scene
+    one, zero = np.float32(1.0), np.float32(0.0)
+    best, turn = np.inf, (one, zero, one, one)
+    for k in range(_YAWS):
+        angle = start + k * (0.5 * np.pi / _YAWS)
+        c, s = np.float32(np.cos(angle)), np.float32(np.sin(angle))
+        toward_u = np.float32(1.0 if c * eye[0] + s * eye[1] >= 0 else -1.0)
+        toward_v = np.float32(1.0 if c * eye[1] - s * eye[0] >= 0 else -1.0)
+        for i in range(x.size):
+            u[i] = toward_u * (c * x[i] + s * y[i])
+            v[i] = toward_v * (c * y[i] - s * x[i])
+        wall_u, wall_v = inner_range(u)[1], inner_range(v)[1]
+        cost = 0.0
+        for i in range(x.size):
+            side = 1.0 - normals[2, i] * normals[2, i]
+            cost += side * min(abs(wall_u - u[i]), abs(wall_v - v[i]))
+        if cost < best:
+            best, turn = cost, (c, s, toward_u, toward_v)
+    c, s, toward_u, toward_v = turn
+    return toward_u * (c * cloud[0] + s * cloud[1]), toward_v * (c * cloud[1] - s * cloud[0])
+
+
+@kernel
+def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, out: F4) -> None:
+    """Compare points with the three faces of a box that the sensor may see."""
+    count = u.size
+    low_u, high_u = inner_range(u)
+    low_v, high_v = inner_range(v)
+    long_u, long_v = max(high_u - low_u, 1e-3), max(high_v - low_v, 1e-3)
+    tall = max(high - low, 1e-3)
+    flat = np.sqrt((long_u * long_u + long_v * long_v) / 2)
+    size = np.sqrt((long_u * long_u + long_v * long_v + tall * tall) / 3)
+    corners = np.zeros((3, count), np.float32)
+    share, off = np.zeros(3), np.zeros(3)
+    sides = total = 0.0
+    for i in range(count):
+        du, dv, dz = abs(high_u - u[i]), abs(high_v - v[i]), abs(high - z[i])
+        up = normals[2, owner[i]]
+        total += 1.0 - up * up
+        sides += (1.0 - up * up) * min(du, dv)
+        face = 2 if dz <= du and dz <= dv else (0 if du <= dv else 1)
+        share[face] += 1
+        off[face] += min(du, dv, dz)
+        # 0 at the edge where two faces meet, 1 where a point is as far from it as can be
+        corners[0, i] = max(du / long_u, dv / long_v)
+        corners[1, i] = max(du / long_u, dz / tall)
+        corners[2, i] = max(dv / long_v, dz / tall)
+    out[0] = sides / max(total, 1e-6) / flat
+    out[1] = off.sum() / count / size
+    out[2] = min(long_u, long_v) / max(long_u, long_v)
+    out[3] = tall / (tall + flat)
+    out[4] = inner_range(corners[0])[0]
+    first, second = inner_range(corners[1])[0], inner_range(corners[2])[0]
+    out[5], out[6] = min(first, second), max(first, second)
+    a = 0 if share[0] >= share[1] else 1
+    for k, face in enumerate((a, 1 - a, 2)):
+        out[7 + k] = share[face] / count
+        out[10 + k] = off[face] / max(share[face], 1.0) / size
+
+
+@kernel
+def _ball(cloud: F4, low: float, high: float, out: F4) -> None:
+    """Compare the points with the ball that fits them by least squares."""
+    A, b = np.zeros((4, 4)), np.zeros(4)
+    row = np.ones(4)
+    for i in range(cloud.shape[1]):
+        square = 0.0
+        for j in range(3):
+            row[j] = cloud[j, i]
+            square += row[j] * row[j]
+        for j in range(4):
+            b[j] += row[j] * square
+            for k in range(4):
+                A[j, k] += row[j] * row[k]
+    for j in range(4):
+        A[j, j] += 1e-3 * cloud.shape[1]
+    solve(A, b)
+    middle = b[:3] / 2
+    radius = np.sqrt(max(b[3] + (middle**2).sum(), 1e-6))
+    cost = 0.0
+    for i in range(cloud.shape[1]):
+        square = 0.0
+        for j in range(3):
+            square += (cloud[j, i] - middle[j]) ** 2
+        cost += min(abs(np.sqrt(square) - radius), radius)
+    out[0] = min(cost / cloud.shape[1] / radius, 2.0)
+    out[1] = radius / (radius + high - low)
+    out[2] = min(max((middle[2] - low) / max(high - low, 1e-3), -3.0), 3.0)

@@ -1,0 +1,81 @@
+"""Where tasks run: every executor has the interface of `concurrent.futures.Executor`.
+
+Nothing here knows what a task does. `local` needs no other package; `dask` and `ray` are thin
+adapters of libraries that the extras ``cluster`` and ``ray`` bring.
+"""
+
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Executor
+from concurrent.futures.process import BrokenProcessPool
+from typing import Literal, get_args
+
+from shapecat.errors import ConfigError
+from shapecat.executors.cores import limited_threads, share_cores, usable_cores
+from shapecat.executors.local import LocalExecutor, WorkerLostError
+from shapecat.executors.mailbox import Mailbox, post
+
+__all__ = [
+    "EXECUTORS",
+    "LocalExecutor",
+    "Mailbox",
+    "WorkerLostError",
+    "is_lost",
+    "limited_threads",
+    "open_executor",
+    "post",
+    "share_cores",
+    "usable_cores",
+]
+
+Name = Literal["local", "dask", "ray"]
+EXECUTORS: tuple[str, ...] = get_args(Name)
+
+_LOST = (WorkerLostError, BrokenProcessPool, CancelledError)
+_LOST_ELSEWHERE = {"KilledWorker", "WorkerCrashedError", "FutureCancelledError", "CommClosedError"}
+"""Errors of Dask and Ray that mean the same; by name, as neither need be installed."""
+
+
+def open_executor(
+    name: str, *, workers: int, threads: int = 1, address: str | None = None
+) -> Executor:
+    """Start, or connect to, the workers.
+
+    Parameters
+    ----------
+    name : ``local``, ``dask`` or ``ray``.
+    workers : processes to start on this machine, where no ``address`` is given.
+    threads : threads that the numeric libraries of each may use.
+    address : of a running Dask scheduler or Ray cluster.
+
+    Raises
+    ------
+    ConfigError : the library is not installed, or nothing answers at the address.
+    """
+    if name == "local" and address is not None:
+        msg = "--scheduler needs --executor dask or ray"
+        raise ConfigError(msg)
+    return _OPENERS[name](workers, threads, address)
+
+
+def _dask(workers: int, threads: int, address: str | None) -> Executor:
+    from shapecat.executors.dask import open_dask  # noqa: PLC0415  an extra
+
+    return open_dask(workers, threads, address)
+
+
+def _ray(workers: int, threads: int, address: str | None) -> Executor:
+    from shapecat.executors.ray import RayExecutor  # noqa: PLC0415  an extra
+
+    return RayExecutor(workers, threads, address)
+
+
+_OPENERS: dict[str, Callable[[int, int, str | None], Executor]] = {
+    "local": lambda workers, threads, _: LocalExecutor(workers, threads=threads),
+    "dask": _dask,
+    "ray": _ray,
+}
+
+
+def is_lost(error: BaseException) -> bool:
+    """Return whether an error means that the worker died, not that the task failed."""
+    return isinstance(error, _LOST) or type(error).__name__ in _LOST_ELSEWHERE

@@ -1,0 +1,71 @@
+"""Dask: its client already speaks the interface of `concurrent.futures`."""
+
+from concurrent.futures import Executor, Future
+from contextlib import suppress
+from typing import Any
+
+from shapecat.errors import ConfigError
+from shapecat.executors.cores import limited_threads
+
+__all__ = ["open_dask"]
+
+_ANSWER_S = 30
+_CLOSE_S = 10
+
+
+class _DaskExecutor(Executor):
+    """The executor of a client, that also closes the client and the cluster it started."""
+
+    def __init__(self, client: Any, cluster: Any) -> None:
+        self._client, self._cluster = client, cluster
+        # Not pure: a recording tried again is not the first try's result.
+        self._executor = client.get_executor(pure=False)
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        future: Future[Any] = self._executor.submit(fn, *args, **kwargs)
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
+        self._executor.shutdown(wait=wait and not cancel_futures)  # without waiting it cancels
+        self._close(_CLOSE_S)
+
+    def terminate(self) -> None:
+        """Cancel what waits; end the workers that were started here."""
+        self._executor.shutdown(wait=False)
+        self._close(1)
+
+    def _close(self, timeout_s: float) -> None:
+        for each in (self._client, self._cluster):
+            if each is not None:
+                with suppress(TimeoutError):
+                    each.close(timeout=timeout_s)
+
+
+def open_dask(workers: int, threads: int, address: str | None) -> Executor:
+    """Connect to a scheduler, or start one with processes on this machine.
+
+    Raises
+    ------
+    ConfigError : Dask is not installed, or the scheduler does not answer.
+    """
+    try:
+        from distributed import Client, LocalCluster  # noqa: PLC0415  an extra
+    except ImportError as error:
+        msg = "--executor dask needs Dask: pip install 'shapecat[cluster]'"
+        raise ConfigError(msg) from error
+    if address is None:
+        with limited_threads(threads):
+            cluster = LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                processes=True,
+                host="127.0.0.1",
+                dashboard_address=None,
+                memory_limit=0,
+            )
+        return _DaskExecutor(Client(cluster), cluster)
+    try:
+        return _DaskExecutor(Client(address, timeout=_ANSWER_S), None)
+    except (OSError, TimeoutError, ValueError) as error:
+        msg = f"--scheduler {address}: no Dask scheduler answers: {error}"
+        raise ConfigError(msg) from error

@@ -1,0 +1,199 @@
+"""Processes on this machine that outlive neither their parent nor spoil each other's work."""
+
+import os
+import signal
+import threading
+from collections.abc import Callable
+from concurrent.futures import Executor, Future
+from contextlib import suppress
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection, wait
+from queue import Empty, SimpleQueue
+from typing import Any, NamedTuple
+
+from shapecat.executors.cores import limited_threads
+
+__all__ = ["LocalExecutor", "WorkerLostError"]
+
+# Spawned, not forked: the threads of numeric and Rerun libraries do not survive a fork.
+_SPAWN = get_context("spawn")
+
+
+class WorkerLostError(RuntimeError):
+    """The process that worked on a task has died: killed, out of memory, or crashed."""
+
+
+class _Task(NamedTuple):
+    future: Future[Any]
+    call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
+
+
+class LocalExecutor(Executor):
+    """Runs tasks in spawned processes, as `concurrent.futures.ProcessPoolExecutor` does.
+
+    It differs where a disk of recordings needs it to: a worker that dies fails its own task alone
+    and is replaced, workers end when their parent does, however it ended, and `terminate` does
+    not wait for tasks.
+    """
+
+    def __init__(self, workers: int, *, threads: int = 1) -> None:
+        """Prepare ``workers`` processes; each starts with its first task.
+
+        Parameters
+        ----------
+        threads : that numeric libraries may use in each process.
+
+        Raises
+        ------
+        ValueError : there is not at least one worker.
+        """
+        if workers < 1:
+            msg = f"workers must be at least 1, got {workers}"
+            raise ValueError(msg)
+        self._tasks: SimpleQueue[_Task | None] = SimpleQueue()
+        self._threads = threads
+        self._closed = False
+        self._workers: dict[int, _Worker] = {}
+        self._lock = threading.Lock()
+        self._attendants = [
+            threading.Thread(target=self._attend, args=(k,), daemon=True) for k in range(workers)
+        ]
+        for attendant in self._attendants:
+            attendant.start()
+
+    def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Queue a call; its future raises `WorkerLostError` if the worker dies.
+
+        Raises
+        ------
+        RuntimeError : the executor was shut down.
+        """
+        if self._closed:
+            msg = "cannot submit after shutdown"
+            raise RuntimeError(msg)
+        task = _Task(Future(), (fn, args, kwargs))
+        self._tasks.put(task)
+        return task.future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
+        """Let the workers end when their tasks are done."""
+        self._closed = True
+        if cancel_futures:
+            self._cancel_waiting()
+        for _ in self._attendants:
+            self._tasks.put(None)
+        if wait:
+            for attendant in self._attendants:
+                attendant.join()
+
+    def terminate(self) -> None:
+        """Kill the workers in the middle of their tasks."""
+        self.shutdown(wait=False, cancel_futures=True)
+        with self._lock:
+            for worker in self._workers.values():
+                worker.process.kill()
+        for attendant in self._attendants:
+            attendant.join(timeout=1)
+
+    def _cancel_waiting(self) -> None:
+        with suppress(Empty):
+            while True:
+                if task := self._tasks.get_nowait():
+                    task.future.cancel()
+
+    def _attend(self, seat: int) -> None:
+        """Give tasks to one worker after the other, for as long as there are any."""
+        while task := self._tasks.get():
+            if not task.future.set_running_or_notify_cancel():
+                continue
+            try:
+                self._answer(task, self._worker(seat).call(task.call))
+            except (EOFError, OSError):
+                self._discard(seat, task)
+            except Exception as error:  # noqa: BLE001  a call that cannot be sent fails alone
+                task.future.set_exception(error)
+        with self._lock:
+            worker = self._workers.pop(seat, None)
+        if worker is not None:
+            worker.pipe.close()
+            worker.process.join()
+
+    def _answer(self, task: _Task, answer: tuple[bool, Any]) -> None:
+        done, value = answer
+        if done:
+            task.future.set_result(value)
+        else:
+            task.future.set_exception(value)
+
+    def _worker(self, seat: int) -> "_Worker":
+        with self._lock:
+            if seat not in self._workers:
+                if self._closed:
+                    raise EOFError
+                self._workers[seat] = _Worker(self._threads)
+            return self._workers[seat]
+
+    def _discard(self, seat: int, task: _Task) -> None:
+        """Fail the task of a worker that is gone; another takes its seat with the next task."""
+        with self._lock:
+            worker = self._workers.pop(seat, None)
+        code = None
+        if worker is not None:
+            worker.pipe.close()
+            worker.process.join(timeout=5)
+            code = worker.process.exitcode
+        task.future.set_exception(WorkerLostError(f"the worker process died ({_words(code)})"))
+
+
+def _words(code: int | None) -> str:
+    if code is not None and code < 0:
+        return f"signal {signal.Signals(-code).name}"
+    return f"exit code {code}"
+
+
+class _Worker:
+    """A process and the pipe to it."""
+
+    def __init__(self, threads: int) -> None:
+        self.pipe, far = _SPAWN.Pipe()
+        self.process = _SPAWN.Process(target=_serve, args=(far,), daemon=True)
+        with limited_threads(threads):
+            self.process.start()
+        far.close()
+
+    def call(self, call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> Any:
+        """Send a call and wait for its answer.
+
+        Raises
+        ------
+        EOFError, OSError : the process is gone.
+        """
+        self.pipe.send(call)
+        return self.pipe.recv()
+
+
+def _serve(pipe: Connection) -> None:
+    """Answer calls until the parent closes the pipe or dies."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt means
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+    with suppress(EOFError, OSError):
+        while True:
+            function, arguments, options = pipe.recv()
+            pipe.send(_answer(function, arguments, options))
+
+
+def _answer(
+    function: Callable[..., Any], arguments: tuple[Any, ...], options: dict[str, Any]
+) -> tuple[bool, Any]:
+    try:
+        return True, function(*arguments, **options)
+    except Exception as error:  # noqa: BLE001  it is raised by the future
+        return False, error
+
+
+def _end_with_parent() -> None:
+    """End this process, whatever it does, when its parent is gone."""
+    parent = parent_process()
+    if parent is not None:
+        wait([parent.sentinel])
+        os._exit(1)

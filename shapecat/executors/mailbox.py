@@ -1,0 +1,66 @@
+"""How workers on this machine tell how far they are: datagrams, lost rather than waited for."""
+
+import json
+import socket
+import tempfile
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from threading import Thread
+from types import TracebackType
+from typing import Any, Self
+
+__all__ = ["Mailbox", "post"]
+
+_MOST_BYTES = 4096
+
+
+class Mailbox:
+    """Hands what workers `post` to a function, in a thread of its own.
+
+    A worker that dies while it posts harms nobody: there is no lock and no stream. The socket lies
+    in a folder that only this user may enter.
+
+    Attributes
+    ----------
+    address : what workers post to.
+    """
+
+    def __init__(self, receive: Callable[[Any], None]) -> None:
+        """Call ``receive`` with each report."""
+        self._receive = receive
+        self._folder = tempfile.TemporaryDirectory(prefix="shapecat-", ignore_cleanup_errors=True)
+        self.address = str(Path(self._folder.name) / "mailbox")
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(self.address)
+        self._thread = Thread(target=self._listen, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Stop listening."""
+        with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as end:
+            end.sendto(b"", self.address)
+        self._thread.join(timeout=1)
+        self._socket.close()
+        self._folder.cleanup()
+
+    def _listen(self) -> None:
+        with suppress(OSError):  # the socket was closed
+            while content := self._socket.recv(_MOST_BYTES):
+                with suppress(ValueError):
+                    self._receive(json.loads(content))
+
+
+def post(address: str, report: Any) -> None:
+    """Send a report, if it can be sent at once; from another machine it cannot."""
+    with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
+        sender.setblocking(False)  # noqa: FBT003  positional by definition
+        sender.sendto(json.dumps(report).encode(), address)

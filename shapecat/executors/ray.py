@@ -1,0 +1,56 @@
+"""Ray: its remote functions behind the interface of `concurrent.futures`."""
+
+from concurrent.futures import Executor, Future
+from typing import Any
+
+from shapecat.errors import ConfigError
+from shapecat.executors.cores import THREAD_LIMITS
+
+__all__ = ["RayExecutor"]
+
+
+class RayExecutor(Executor):
+    """Runs each call as a Ray task of one core."""
+
+    def __init__(self, workers: int, threads: int, address: str | None) -> None:
+        """Connect to a cluster, or start one with ``workers`` cores on this machine.
+
+        Raises
+        ------
+        ConfigError : Ray is not installed, or no cluster answers.
+        """
+        try:
+            import ray  # noqa: PLC0415  an extra
+        except ImportError as error:
+            msg = "--executor ray needs Ray: pip install 'shapecat[ray]'"
+            raise ConfigError(msg) from error
+        self._ray = ray
+        variables = dict.fromkeys(THREAD_LIMITS, str(threads))
+        started = {"address": address} if address else {"num_cpus": workers}
+        try:
+            ray.init(**started, runtime_env={"env_vars": variables}, log_to_driver=False)
+        except (ConnectionError, RuntimeError, ValueError) as error:
+            msg = f"--scheduler {address}: no Ray cluster answers: {error}"
+            raise ConfigError(msg) from error
+        self._running: set[Any] = set()
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Queue a call on the cluster; a worker that dies is reported, not tried again here."""
+        reference = self._ray.remote(max_retries=0)(fn).remote(*args, **kwargs)
+        self._running.add(reference)
+        future: Future[Any] = reference.future()
+        future.add_done_callback(lambda _: self._running.discard(reference))
+        return future
+
+    def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
+        """Wait for what runs, or cancel it, and disconnect."""
+        if cancel_futures:
+            for reference in list(self._running):
+                self._ray.cancel(reference, force=True)
+        elif wait and self._running:
+            self._ray.wait(list(self._running), num_returns=len(self._running))
+        self._ray.shutdown()
+
+    def terminate(self) -> None:
+        """Cancel what runs."""
+        self.shutdown(wait=False, cancel_futures=True)

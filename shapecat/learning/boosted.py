@@ -1,0 +1,180 @@
+"""Boosted trees as a dictionary of words, with one learner per category (thesis 7.3, 7.4)."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy import sparse
+from sklearn.base import BaseEstimator, ClassifierMixin, TransformerMixin
+from sklearn.utils import check_random_state
+from sklearn.utils.multiclass import check_classification_targets
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from shapecat.arrays import F4, F8, I4
+from shapecat.learning.boosting import Bins, Tree, TreeSettings, grow_tree, make_bins
+from shapecat.learning.calibration import softmax
+from shapecat.learning.forest import FlatForest
+from shapecat.learning.pnn import known_labels
+from shapecat.learning.words import bag_of_words
+
+__all__ = ["BoostedDictionary"]
+
+_RIDGE = 2.0
+_LEAST = 1.0
+_FEWEST_COLUMNS = 10
+
+
+class BoostedDictionary(
+    ClassifierMixin,  # type: ignore[misc]  # sklearn is untyped
+    TransformerMixin,  # type: ignore[misc]
+    BaseEstimator,  # type: ignore[misc]
+):
+    """The leaf a view falls into in each tree is a word; the words of a category's trees add up.
+
+    Each round grows one tree for each category against the rest, on what its posterior still
+    lacks. So the dictionary and the learners on its words are learned together.
+
+    Parameters
+    ----------
+    rounds : trees per category.
+    leaves : words per tree, at most.
+    rate : each tree corrects this share of what is lacking.
+    columns, rows : share of the features and of the views a tree may use, drawn anew for each.
+    unknown : label of shapes of no category. They get trees and a learner of their own, behind
+        those of the categories.
+    jobs : trees grown at the same time; the result is the same.
+    random_state : seed of the draws.
+
+    Attributes
+    ----------
+    classes_ : the categories, without ``unknown``.
+    forest_ : the `FlatForest` of all trees.
+    votes_ : (words, k) what each word adds to each logit, in half precision; k is one more than
+        the categories if there were unknown shapes.
+    bias_ : (k,).
+
+    Source: thesis 7.3, 7.4; differs: trees are boosted instead of a random forest with linear
+    learners on top, see docs/decisions/0008-boosted-dictionary.md.
+    """
+
+    def __init__(
+        self,
+        *,
+        rounds: int = 100,
+        leaves: int = 16,
+        rate: float = 0.1,
+        columns: float = 0.15,
+        rows: float = 0.6,
+        unknown: Any = None,
+        jobs: int | None = None,
+        random_state: int | None = None,
+    ) -> None:
+        self.rounds = rounds
+        self.leaves = leaves
+        self.rate = rate
+        self.columns = columns
+        self.rows = rows
+        self.unknown = unknown
+        self.jobs = jobs
+        self.random_state = random_state
+
+    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+        """Grow the trees on features X (n, f) and labels y (n,), unknown ones included."""
+        x, y = validate_data(self, X, y, dtype=np.float32)
+        check_classification_targets(y)
+        self.classes_, labels = known_labels(y, self.unknown)
+        labels = np.where(labels < 0, len(self.classes_), labels)
+        trees, self.bias_ = self._boost(make_bins(x), labels)
+        self.forest_, self.votes_ = _join(trees, self.bias_.size)
+        return self
+
+    def logits(self, X: ArrayLike) -> F8:
+        """Return the logits (n, k)."""
+        words = self.words(X)
+        return np.asarray(self.votes_[words].sum(axis=1) + self.bias_)
+
+    def decision_function(self, X: ArrayLike) -> F8:
+        """Return the logits (n, c), in single column form (n,) for two categories."""
+        logits = self.logits(X)[:, : len(self.classes_)]
+        return logits[:, 1] - logits[:, 0] if len(self.classes_) == 2 else logits
+
+    def predict_proba(self, X: ArrayLike) -> F8:
+        """Return the posteriors of the categories (n, c)."""
+        return softmax(self.logits(X)[:, : len(self.classes_)])
+
+    def predict(self, X: ArrayLike) -> Any:
+        """Return the most probable label of each view."""
+        logits = self.logits(X)[:, : len(self.classes_)]
+        return self.classes_[logits.argmax(axis=1)]
+
+    def words(self, X: ArrayLike) -> I4:
+        """Return the words of features (n, f): (n, trees)."""
+        check_is_fitted(self)
+        return self.forest_.fall(validate_data(self, X, dtype=np.float32, reset=False))
+
+    def transform(self, X: ArrayLike) -> sparse.csr_array:
+        """Return a row of zeros and ones per view (n, words)."""
+        words = self.words(X)  # first: it checks that the dictionary is learned
+        return bag_of_words(words, self.forest_.words)
+
+    def _boost(self, bins: Bins, labels: I4) -> tuple[list[Tree], F8]:
+        """Return the trees, round by round, those of a round in the order of the categories."""
+        rng = np.random.default_rng(check_random_state(self.random_state).randint(2**31))
+        share = np.bincount(labels) / labels.size
+        bias = np.log(share)
+        scores = np.repeat(bias[:, None], labels.size, axis=1).astype(np.float32)
+        truth = labels == np.arange(share.size)[:, None]
+        # K logits of which one is free: each moves (K - 1) / K of the way (Friedman 2001, eq. 36)
+        freedom = np.float32(share.size / (share.size - 1))
+        trees: list[Tree] = []
+        with ThreadPoolExecutor(self.jobs or 1) as pool:
+            for _ in range(self.rounds):
+                posterior = np.exp(scores - scores.max(axis=0))
+                posterior /= posterior.sum(axis=0)
+                draws = [self._draw(bins, rng) for _ in share]
+                grow = [
+                    pool.submit(self._grow, bins, draw, p - t, freedom * p * (1 - p), score)
+                    for draw, p, t, score in zip(draws, posterior, truth, scores, strict=True)
+                ]
+                trees += [tree.result() for tree in grow]
+        return trees, bias
+
+    def _draw(self, bins: Bins, rng: np.random.Generator) -> tuple[I4, I4]:
+        """Return the columns and the rows of one tree."""
+        features, views = bins.binned.shape
+        width = max(round(self.columns * features), min(features, _FEWEST_COLUMNS))
+        height = max(round(self.rows * views), 1)
+        columns = np.sort(rng.permutation(features)[:width])
+        return columns, np.sort(rng.permutation(views)[:height]).astype(np.int32)
+
+    def _grow(self, bins: Bins, draw: tuple[I4, I4], slope: F4, bend: F4, score: F4) -> Tree:
+        columns, rows = draw
+        settings = TreeSettings(self.leaves, self.rate, _RIDGE, _LEAST)
+        return grow_tree(bins, columns, rows, slope, np.maximum(bend, 1e-6), settings, score)
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.transformer_tags.preserves_dtype = []
+        return tags
+
+
+def _join(trees: Sequence[Tree], categories: int) -> tuple[FlatForest, F4]:
+    """Return the trees as one forest, and the votes (words, categories) of their leaves."""
+    sizes = np.array([tree.left.size for tree in trees])
+    roots = np.cumsum(sizes) - sizes
+    base = np.repeat(roots, sizes)
+    left = np.concatenate([tree.left for tree in trees])
+    leaf = left == 0
+    forest = FlatForest(
+        roots,
+        np.where(leaf, 0, np.concatenate([tree.feature for tree in trees])),
+        np.where(leaf, 0, np.concatenate([tree.threshold for tree in trees])),
+        np.where(leaf, 0, left + base),
+    )
+    owner = np.repeat(np.arange(len(trees)) % categories, sizes)[leaf]
+    value = np.concatenate([tree.value for tree in trees])[leaf]
+    votes = np.zeros((forest.words, categories), np.float16)
+    votes[np.arange(forest.words), owner] = value
+    return forest, votes.astype(np.float32)

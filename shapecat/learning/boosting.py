@@ -1,0 +1,199 @@
+"""Growing boosted trees on binned features: gradient boosting with the cross entropy.
+
+Source: Friedman 2001, algorithm 6 (one tree per category and round, each on what the posterior of
+its category still lacks); leaves and gains by second derivatives: Chen and Guestrin 2016, eq. 5, 7.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4, U1
+from shapecat.jit import kernel
+
+__all__ = ["BINS", "Bins", "Tree", "TreeSettings", "grow_tree", "make_bins"]
+
+BINS = 64
+"""Values of a feature are told apart by the quantiles they lie between."""
+_LEAST_GAIN = 1e-6
+
+
+class TreeSettings(NamedTuple):
+    """How one tree grows.
+
+    ``leaves`` at most; ``rate`` every leaf is shrunk by; ``ridge`` added to the second derivative
+    of a leaf; ``least`` second derivative a leaf needs.
+    """
+
+    leaves: int
+    rate: float
+    ridge: float
+    least: float
+
+
+class Bins(NamedTuple):
+    """``edges`` (f, BINS - 1) ascending; ``binned`` (f, n): value <= edges[f, k] if bin <= k."""
+
+    edges: F4
+    binned: U1
+
+
+class Tree(NamedTuple):
+    """Nodes of a tree, the root first: ``feature``, ``threshold``, ``left`` and ``value`` (m,).
+
+    A view goes left where its feature is <= threshold; the right child stands behind the left one.
+    Leaves have left 0 and add their value.
+    """
+
+    feature: I4
+    threshold: F4
+    left: I4
+    value: F4
+
+
+def make_bins(features: F4) -> Bins:
+    """Sort the values of features (n, f) into bins of about equal numbers of views."""
+    edges = np.quantile(features, np.linspace(0, 1, BINS + 1)[1:-1], axis=0).T
+    edges = np.ascontiguousarray(edges, np.float32)
+    binned = np.zeros(features.shape[::-1], np.uint8)
+    for row, column, limits in zip(binned, features.T, edges, strict=True):
+        row[:] = np.searchsorted(limits, column)
+    return Bins(edges, binned)
+
+
+def grow_tree(
+    bins: Bins, columns: I4, rows: I4, slope: F4, bend: F4, settings: TreeSettings, score: F4
+) -> Tree:
+    """Grow one tree, best leaf first, and add its values to the ``score`` (n,) of all views.
+
+    Parameters
+    ----------
+    columns : features it may use.
+    rows : views it learns from; put into another order.
+    slope, bend : (n,) first and second derivative of the loss by the score of each view.
+    """
+    room = 2 * settings.leaves - 1
+    feature, cut, left = (np.zeros(room, np.int64) for _ in range(3))
+    value = np.zeros(room, np.float32)
+    count = _grow(
+        bins.binned, columns, rows, slope, bend, settings.leaves, settings.rate, settings.ridge,
+        settings.least, feature, cut, left, value,
+    )  # fmt: skip
+    feature, cut, left, value = (feature[:count], cut[:count], left[:count], value[:count])
+    _add_values(bins.binned, feature, cut, left, value, score)
+    return Tree(feature, bins.edges[feature, cut], left, value)
+
+
+@kernel
+def _grow(
+    binned: U1,
+    columns: I4,
+    rows: I4,
+    slope: F4,
+    bend: F4,
+    leaves: int,
+    rate: float,
+    ridge: float,
+    least: float,
+    feature: I4,
+    cut: I4,
+    left: I4,
+    value: F4,
+) -> int:
+    """Write the nodes; return how many."""
+    room = feature.size
+    first, last = np.zeros(room, np.int64), np.zeros(room, np.int64)
+    best = np.zeros((room, 3))  # gain, which column, bin
+    sums = np.zeros((room, columns.size, BINS, 2), np.float32)
+    spare = np.empty_like(rows)
+    last[0] = rows.size
+    _collect(binned, columns, rows, slope, bend, sums[0])
+    value[0] = -rate * _best_cut(sums[0], ridge, least, best[0])
+    count = 1
+    for _ in range(leaves - 1):
+        # (1) the leaf that gains most is split
+        node = np.argmax(best[:count, 0])
+        if best[node, 0] <= _LEAST_GAIN:
+            break
+        column = columns[int(best[node, 1])]
+        feature[node], cut[node], left[node] = column, int(best[node, 2]), count
+        middle = _divide(binned[column], rows, first[node], last[node], cut[node], spare)
+        # (2) its views are shared out, in their order
+        first[count], last[count] = first[node], middle
+        first[count + 1], last[count + 1] = middle, last[node]
+        # (3) the smaller child is summed up, the larger one is what is left of the parent
+        small = count if middle - first[node] <= last[node] - middle else count + 1
+        large = 2 * count + 1 - small
+        _collect(binned, columns, rows[first[small] : last[small]], slope, bend, sums[small])
+        sums[large] = sums[node] - sums[small]
+        # (4) and where each would be split next
+        for child in (count, count + 1):
+            value[child] = -rate * _best_cut(sums[child], ridge, least, best[child])
+        best[node, 0] = 0.0
+        count += 2
+    return count
+
+
+@kernel
+def _collect(binned: U1, columns: I4, rows: I4, slope: F4, bend: F4, sums: F4) -> None:
+    """Sum slope and bend of some views by column and bin into sums (columns, BINS, 2)."""
+    g, h = slope[rows], bend[rows]
+    for c in range(columns.size):
+        bins, out = binned[columns[c]], sums[c]
+        for i in range(rows.size):
+            k = bins[rows[i]]
+            out[k, 0] += g[i]
+            out[k, 1] += h[i]
+
+
+@kernel
+def _best_cut(sums: F4, ridge: float, least: float, best: F8) -> float:
+    """Write gain, column and bin of the best split of a leaf; return its own step, unsplit."""
+    slope = bend = 0.0
+    for k in range(BINS):
+        slope += sums[0, k, 0]
+        bend += sums[0, k, 1]
+    alone = slope * slope / (bend + ridge)
+    best[0] = 0.0
+    for c in range(sums.shape[0]):
+        low_slope = low_bend = 0.0
+        for k in range(BINS - 1):
+            low_slope += sums[c, k, 0]
+            low_bend += sums[c, k, 1]
+            if low_bend < least:
+                continue
+            if bend - low_bend < least:
+                break
+            high_slope, high_bend = slope - low_slope, bend - low_bend
+            gain = (
+                low_slope * low_slope / (low_bend + ridge)
+                + high_slope * high_slope / (high_bend + ridge)
+                - alone
+            )
+            if gain > best[0]:
+                best[0], best[1], best[2] = gain, c, k
+    return slope / (bend + ridge)
+
+
+@kernel
+def _divide(bins: U1, rows: I4, first: int, last: int, cut: int, spare: I4) -> int:
+    """Put views up to ``cut`` before the others, in their order; return where these begin."""
+    low, high = first, 0
+    for i in range(first, last):
+        if bins[rows[i]] <= cut:
+            rows[low] = rows[i]
+            low += 1
+        else:
+            spare[high] = rows[i]
+            high += 1
+    rows[low:last] = spare[:high]
+    return low
+
+
+@kernel
+def _add_values(binned: U1, feature: I4, cut: I4, left: I4, value: F4, score: F4) -> None:
+    for i in range(score.size):
+        node = 0
+        while left[node] != 0:
+            node = left[node] + (0 if binned[feature[node], i] <= cut[node] else 1)
+        score[i] += value[node]

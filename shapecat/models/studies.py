@@ -1,0 +1,273 @@
+"""Studies printed in the model card: what each part of the method is worth."""
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, I4
+from shapecat.config import Settings, SurfaceSettings
+from shapecat.description import BLOCKS, DESCRIPTOR_NAMES, describe
+from shapecat.evaluation import View, metrics
+from shapecat.evaluation.report import UNKNOWN
+from shapecat.evaluation.training import fit_views
+from shapecat.evaluation.views import DescribedViews
+from shapecat.learning import Categorizer
+from shapecat.learning.baselines import make_baselines
+from shapecat.learning.incremental import add_categories
+from shapecat.learning.training import encode
+from shapecat.surface import reconstruct, voxelize
+from shapecat.types import NeuralGas
+
+__all__ = [
+    "Views",
+    "add_two_categories",
+    "compare_learners",
+    "compare_surfaces",
+    "next_frames",
+    "sampled",
+    "spread",
+    "subsample",
+]
+
+_MOST = 16_000
+"""Views that plain learners learn from: enough for them, and they take long."""
+_PAIRS = (("bottle", "plate"), ("bowl", "ball"), ("cup", "box"))
+_FEW = (20, 100)
+_ROUNDS = 150
+_NEIGHBOURS = 6
+
+
+class Views(NamedTuple):
+    """Described views (n) of known categories, and their plain ``functions`` (n, f)."""
+
+    views: DescribedViews
+    functions: F4
+
+
+# --- learners ------------------------------------------------------------------------------------
+
+
+def compare_learners(
+    train: Views, test: Views, model: Categorizer, *, blocks: Sequence[str], seed: int, jobs: int
+) -> list[tuple[str, ...]]:
+    """Judge the chain beside plain learners: name, views learned from, accuracy, balanced."""
+    few = np.sort(np.random.default_rng(seed).permutation(len(train.views.labels))[:_MOST])
+    part = train.views.where(few)
+    truth, labels = (encode(v.labels, model.categories) for v in (test.views, part))
+    shown = test.views.descriptors
+    chain = fit_views(part, part.where(few < 0), seed=seed, blocks=tuple(blocks), jobs=jobs)
+    rows = [
+        _scores("the model", len(train.views.labels), truth, _best(model, shown)),
+        _scores("the chain on fewer views", few.size, truth, _best(chain, shown)),
+    ]
+    makers = make_baselines({name: BLOCKS[name] for name in blocks}, seed=seed, jobs=jobs)
+    for name, make in makers.items():
+        learner = make().fit(part.descriptors, labels)
+        rows.append(_scores(name, few.size, truth, learner.predict(shown)))
+    bins = train.functions.shape[1]
+    for name, width in (("forest on D2", bins // 3), ("forest on D2, D3, A3 (ESF-like)", bins)):
+        learner = makers["forest"]().fit(train.functions[few, :width], labels)
+        rows.append(_scores(name, few.size, truth, learner.predict(test.functions[:, :width])))
+    return rows
+
+
+def _best(model: Categorizer, descriptors: F4) -> I4:
+    return np.asarray(model.predict(descriptors).posteriors.argmax(axis=1))
+
+
+def _scores(name: str, learned: int, truth: I4, predicted: I4) -> tuple[str, ...]:
+    table = metrics.confusion(truth, predicted, int(max(truth.max(), predicted.max())) + 1)
+    return (
+        name,
+        str(learned),
+        f"{metrics.accuracy(truth, predicted):.3f}",
+        f"{metrics.balanced_accuracy(table):.3f}",
+    )
+
+
+# --- surfaces ------------------------------------------------------------------------------------
+
+_Reconstruct = Callable[[F4, np.random.Generator], NeuralGas | None]
+
+
+def compare_surfaces(
+    train: Sequence[View], test: Sequence[View], *, blocks: Sequence[str], seed: int, jobs: int
+) -> list[tuple[str, ...]]:
+    """Judge ways to a graph: name, accuracy, instability, milliseconds from points to descriptor.
+
+    Each gets a model of its own. Instability is how far the descriptor moves between two frames,
+    as a share of the mean distance between views of different categories.
+    """
+    surface = Settings().surface
+    ways: dict[str, _Reconstruct] = {
+        "GNG (Fritzke)": lambda p, rng: reconstruct(p, settings=surface, rng=rng),
+        "GNG (thesis, Algorithm 4)": lambda p, rng: reconstruct(
+            p, settings=replace(surface, method="thesis"), rng=rng
+        ),
+        "farthest-point sampling": lambda p, rng: sampled(p, spread, surface, rng),
+        "random subsampling": lambda p, rng: sampled(p, subsample, surface, rng),
+    }
+    return [_judge(name, way, train, test, blocks, seed, jobs) for name, way in ways.items()]
+
+
+def _judge(
+    name: str,
+    way: _Reconstruct,
+    train: Sequence[View],
+    test: Sequence[View],
+    blocks: Sequence[str],
+    seed: int,
+    jobs: int,
+) -> tuple[str, ...]:
+    learned, judged, later = (
+        _described(views, way, seed + k)
+        for k, views in enumerate((train, test, list(next_frames(test, seed))))
+    )
+    model = fit_views(
+        learned,
+        learned.where(np.zeros(0, np.int64)),
+        seed=seed,
+        rounds=_ROUNDS,
+        blocks=tuple(blocks),
+        jobs=jobs,
+    )
+    truth = encode(judged.labels, model.categories)
+    right = metrics.accuracy(truth, _best(model, judged.descriptors))
+    used = np.concatenate([np.arange(BLOCKS[b].start, BLOCKS[b].stop) for b in blocks])
+    scale = learned.descriptors[:, used].std(axis=0) + 1e-6
+    now, then = (views.descriptors[:, used] / scale for views in (judged, later))
+    other = np.random.default_rng(seed).permutation(len(now))
+    apart = truth != truth[other]
+    moved = np.abs(now - then).mean() / np.abs(now - now[other])[apart].mean()
+    return (name, f"{right:.3f}", f"{moved:.2f}", f"{1e3 * float(np.median(judged.seconds)):.2f}")
+
+
+def _described(views: Sequence[View], way: _Reconstruct, seed: int) -> DescribedViews:
+    """Describe views; where a way finds no graph the descriptor is zero."""
+    descriptors = np.zeros((len(views), len(DESCRIPTOR_NAMES)), np.float32)
+    seconds = np.zeros(len(views))
+    for k, view in enumerate(views):
+        rng = np.random.default_rng((seed, k))
+        begun = time.process_time()
+        gas = way(view.points, rng)
+        if gas is not None:
+            descriptors[k] = describe(view.points, gas, view.eye)
+        seconds[k] = time.process_time() - begun
+    return DescribedViews(
+        descriptors,
+        np.array([view.category for view in views]),
+        np.array([view.instance for view in views]),
+        np.array([len(view.points) for view in views]),
+        np.array([float(np.linalg.norm(view.points.mean(axis=0) - view.eye)) for view in views]),
+        seconds,
+    )
+
+
+def next_frames(views: Sequence[View], seed: int) -> Iterator[View]:
+    """Yield what a slowly moving camera sees next: turned 2 degrees, shifted, with new noise."""
+    c, s = np.cos(np.radians(2)), np.sin(np.radians(2))
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    for k, view in enumerate(views):
+        rng = np.random.default_rng((seed, 1, k))
+        points = view.points @ turn.T + [0.002, 0.001, 0] + rng.normal(0, 0.001, view.points.shape)
+        cloud = voxelize(points.astype(np.float32), voxel_m=Settings().surface.voxel_m)
+        yield replace(view, points=cloud, eye=turn @ view.eye)
+
+
+def spread(points: F4, count: int, rng: np.random.Generator) -> I4:
+    """Return points of which each was the farthest from those before it (Gonzalez 1985)."""
+    chosen = [int(rng.integers(len(points)))]
+    nearest = np.full(len(points), np.inf, np.float32)
+    for _ in range(count - 1):
+        nearest = np.minimum(nearest, ((points - points[chosen[-1]]) ** 2).sum(axis=1))
+        chosen.append(int(nearest.argmax()))
+    return np.array(chosen)
+
+
+def subsample(points: F4, count: int, rng: np.random.Generator) -> I4:
+    """Return ``count`` of the points, drawn at random."""
+    return rng.permutation(len(points))[:count]
+
+
+def sampled(
+    points: F4,
+    choose: Callable[[F4, int, np.random.Generator], I4],
+    surface: SurfaceSettings,
+    rng: np.random.Generator,
+) -> NeuralGas:
+    """Link chosen points as the gas's neurons are linked, without moving them."""
+    chosen = points[np.unique(choose(points, min(surface.neurons, len(points)), rng))]
+    gaps = ((chosen[:, None] - chosen) ** 2).sum(axis=2)
+    near = np.argsort(gaps, axis=1)[:, 1 : _NEIGHBOURS + 1]
+    first = np.repeat(np.arange(len(chosen)), near.shape[1])
+    pairs = np.sort(np.stack([first, near.reshape(-1)], axis=1), axis=1)
+    return NeuralGas(chosen, np.unique(pairs, axis=0))
+
+
+# --- new categories ------------------------------------------------------------------------------
+
+
+def add_two_categories(
+    train: DescribedViews, test: dict[str, DescribedViews], *, blocks: Sequence[str], seed: int
+) -> list[tuple[str, ...]]:
+    """Add two categories to a model of the others, from few views, beside learning all anew.
+
+    Returns
+    -------
+    Rows: data, views of each new category, way, accuracy on the new, on the old ones, what the old
+    ones lost, seconds. Means over three pairs of categories.
+    """
+    few = np.sort(np.random.default_rng(seed).permutation(len(train.labels))[:_MOST])
+    train = train.where(few)
+    found: dict[tuple[str, ...], list[tuple[float, ...]]] = {}
+    for pair in _PAIRS:
+        for key, figures in _add(pair, train, test, tuple(blocks), seed):
+            found.setdefault(key, []).append(figures)
+    return [(*key, *_means(rows)) for key, rows in found.items()]
+
+
+def _means(rows: list[tuple[float, ...]]) -> tuple[str, ...]:
+    new, old, lost, seconds = np.mean(rows, axis=0)
+    return f"{new:.3f}", f"{old:.3f}", f"{lost:.3f}", f"{seconds:.1f}"
+
+
+def _add(
+    pair: tuple[str, str],
+    train: DescribedViews,
+    test: dict[str, DescribedViews],
+    blocks: tuple[str, ...],
+    seed: int,
+) -> Iterator[tuple[tuple[str, ...], tuple[float, ...]]]:
+    choices: dict[str, Any] = {"seed": seed, "blocks": blocks, "rounds": _ROUNDS}
+    nothing = train.where(np.zeros(0, np.int64))
+    is_new = np.isin(train.labels, pair)
+    base = fit_views(train.where(~is_new), nothing, **choices)
+    before = {name: _right(base, views, pair)[1] for name, views in test.items()}
+    for count in _FEW:
+        rng = np.random.default_rng((seed, count))
+        chosen = np.concatenate(
+            [rng.permutation(np.flatnonzero(train.labels == name))[:count] for name in pair]
+        )
+        few = train.where(chosen)
+        begun = time.perf_counter()
+        added = add_categories(base, few.descriptors, few.labels.tolist(), rng=rng)
+        took = time.perf_counter() - begun
+        begun = time.perf_counter()
+        mixed = train.where(np.sort(np.concatenate([np.flatnonzero(~is_new), chosen])))
+        anew = fit_views(mixed, nothing, **choices)
+        again = time.perf_counter() - begun
+        for name, views in test.items():
+            for way, model, seconds in (("added", added, took), ("all anew", anew, again)):
+                new, old = _right(model, views, pair)
+                yield (name, str(count), way), (new, old, before[name] - old, seconds)
+
+
+def _right(model: Categorizer, views: DescribedViews, pair: tuple[str, str]) -> tuple[float, float]:
+    """Return the accuracies on the new and on the old categories."""
+    known = views.where(views.labels != UNKNOWN)
+    right = _best(model, known.descriptors) == encode(known.labels, model.categories)
+    new = np.isin(known.labels, pair)
+    return float(right[new].mean()), float(right[~new].mean())

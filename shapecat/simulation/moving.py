@@ -1,0 +1,129 @@
+"""Scenes in which things move, come and go, or the camera walks past more than it sees."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.random import Generator
+
+from shapecat.arrays import F8
+from shapecat.simulation.furniture import make_counter, make_room, make_table
+from shapecat.simulation.layout import Layout
+from shapecat.simulation.paths import stroll, walk
+from shapecat.simulation.worlds import Motion, Support, World
+
+__all__ = ["crossing", "rearranged", "walking"]
+
+
+def walking(rng: Generator, categories: Sequence[str], frames: int, rate_hz: float) -> World:
+    """Walk along a counter and back: things leave the view and come back into it."""
+    room, counter = make_room(rng, wall_chance=0.0), make_counter(rng)
+    layout = Layout(rng, gap=rng.uniform(0.02, 0.05))
+    for k, category in enumerate(categories):
+        middle = -0.85 + 1.7 * (k + 0.5) / len(categories)  # all along it, not all in one heap
+        layout.put(
+            category, _strip(counter, (middle - 0.3, middle + 0.3), (-0.22, 0.22)), _ANYWHERE
+        )
+    path = stroll(
+        rng,
+        np.array([0, 0, counter.height + 0.05]),
+        frames,
+        rate_hz,
+        distance=rng.uniform(0.95, 1.2),
+        elevation=rng.uniform(30, 48),
+        reach=rng.uniform(0.6, 0.75),
+    )
+    return World("walking", (*room, counter), tuple(layout.things), path, np.zeros(frames))
+
+
+def crossing(rng: Generator, categories: Sequence[str], frames: int, rate_hz: float) -> World:
+    """Slide two things to and fro on lanes between two rows: they hide others, and each other."""
+    room, table = make_room(rng, wall_chance=0.3), make_table(rng, (1.3, 0.85))
+    layout = Layout(rng, gap=0.02, enclosed=True)
+    t = np.arange(frames) / rate_hz
+    motions = []
+    for side, low in ((1.0, -0.13), (-1.0, 0.01)):
+        lane = _strip(table, (-0.45, 0.45), (low, low + 0.12))
+        if not layout.put(str(rng.choice(_MOVERS)), lane, _ANYWHERE, attempts=40):
+            continue
+        x = float(layout.things[-1].pose.translation[0])
+        reach, speed = rng.uniform(0.3, 0.4), side * rng.uniform(0.14, 0.25)
+        phase = np.arcsin(np.clip(x / reach, -1, 1))
+        along = reach * np.sin(speed / reach * t + phase) - reach * np.sin(phase)
+        motions.append(_shifted(len(layout.things) - 1, along))
+    rows = [_strip(table, (-0.5, 0.5), y) for y in ((-0.32, -0.15), (0.15, 0.37))]
+    for k, category in enumerate(categories):
+        layout.put(category, rows[k % 2], _ANYWHERE, attempts=20)
+    path = walk(
+        rng,
+        np.array([0, 0, table.height + 0.05]),
+        frames,
+        rate_hz,
+        distance=rng.uniform(1.0, 1.3),
+        elevation=rng.uniform(25, 40),
+        sweep=8,
+    )
+    things = tuple(layout.things)
+    return World("crossing", (*room, table), things, path, np.zeros(frames), tuple(motions))
+
+
+def rearranged(rng: Generator, categories: Sequence[str], frames: int, rate_hz: float) -> World:
+    """Add a thing to a table, take one away, carry one elsewhere and push another one."""
+    room, table = make_room(rng, wall_chance=0.3), make_table(rng, (1.3, 0.85))
+    layout = Layout(rng, gap=0.04)
+    lane = _strip(table, (-0.4, 0.4), (-0.32, -0.2))  # kept free for what is pushed
+    layout.put(str(rng.choice(_MOVERS)), lane, _ANYWHERE, attempts=40)
+    back = _strip(table, (-0.45, 0.45), (-0.12, 0.36))
+    for category in categories:
+        layout.put(category, back, _ANYWHERE)
+    duration, t = frames / rate_hz, np.arange(frames) / rate_hz
+    begun = rng.uniform([0.15, 0.15, 0.5, 0.15], 0.5 + np.array([0, 0, 0.3, 0])) * duration
+    motions = [_pushed(0, layout.things[0].pose.translation, t - begun[0])]
+    for k in range(1, len(layout.things)):
+        goal = layout.room_for(k, back, _ANYWHERE)
+        if goal is not None:
+            motions.append(_carried(k, goal - layout.things[k].pose.translation, t - begun[1]))
+            break
+    others = [k for k in range(1, len(layout.things)) if k != motions[-1].track]
+    there = t[:, None] < begun[2], t[:, None] >= begun[3]  # one goes, one comes
+    for k, when in zip(others, there, strict=False):
+        motions.append(Motion(k, np.where(when, np.zeros(3), np.nan)))
+    path = walk(
+        rng,
+        np.array([0, 0, table.height + 0.05]),
+        frames,
+        rate_hz,
+        distance=rng.uniform(1.0, 1.3),
+        elevation=rng.uniform(30, 48),
+        sweep=12,
+    )
+    things = tuple(layout.things)
+    return World("rearranged", (*room, table), things, path, np.zeros(frames), tuple(motions))
+
+
+_ANYWHERE = np.array([0.6, 0.3])
+_MOVERS = ("ball", "can", "cup", "bottle", "box")
+"""Things that fit on a lane, mostly."""
+
+
+def _strip(support: Support, x: tuple[float, float], y: tuple[float, float]) -> Support:
+    """Return a part of a support to place things on."""
+    corners = [[x[0], y[0]], [x[1], y[0]], [x[1], y[1]], [x[0], y[1]]]
+    return replace(support, outline=np.column_stack([corners, np.full(4, support.height)]))
+
+
+def _shifted(track: int, along: F8) -> Motion:
+    return Motion(track, np.round(np.outer(along, [1.0, 0, 0]), 6))
+
+
+def _pushed(track: int, start: F8, t: F8) -> Motion:
+    """Push a thing to the other side of its lane at 0.2 m/s."""
+    way = -np.sign(start[0] or 1.0) * 0.4
+    return _shifted(track, way * np.clip(t * 0.2 / abs(way), 0, 1))
+
+
+def _carried(track: int, way: F8, t: F8) -> Motion:
+    """Lift a thing, carry it elsewhere and set it down: half a metre a second, 15 cm high."""
+    share = np.clip(t * 0.5 / max(float(np.linalg.norm(way)), 0.1), 0, 1)
+    height = 0.6 * share * (1 - share)
+    return Motion(track, np.round(np.outer(share, way) + np.outer(height, [0, 0, 1.0]), 6))

@@ -1,0 +1,95 @@
+"""Tracks that are no objects: pieces of objects that were split for some frames."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from shapecat.arrays import F8, I4, Bool
+from shapecat.tracking.hits import Hits
+
+__all__ = ["without_pieces", "without_shadows"]
+
+_SHADOW = 5  # a track this many times longer may have another one as its shadow
+_COVERED = 0.5  # covered frames for each seen one from which on a track is a piece
+
+
+def without_shadows(hits: Hits, members: Sequence[I4]) -> list[I4]:
+    """Drop short tracks inside longer ones: pieces of an object that was split for a moment.
+
+    No object has its centre in the inner half of another one's for all the time it is seen.
+    """
+    lengths = np.array([len(member) for member in members])
+    first = np.array([hits.rows[member[0]] for member in members])
+    last = np.array([hits.rows[member[-1]] for member in members])
+    kept = []
+    for member in members:
+        low, high = hits.rows[member[0]], hits.rows[member[-1]]
+        hosts = (_SHADOW * len(member) <= lengths) & (first <= high) & (last >= low)
+        if not any(_inside(hits, member, members[k]) for k in np.flatnonzero(hosts).tolist()):
+            kept.append(member)
+    return kept
+
+
+def _inside(hits: Hits, member: I4, host: I4) -> bool:
+    place = hits.places(host, hits.rows[member])
+    radius = 0.6 * np.median(hits.sizes[host], axis=0).min()
+    distance = np.linalg.norm(hits.centers[member] - place, axis=1)
+    return bool(np.median(distance) <= radius)
+
+
+def without_pieces(hits: Hits, members: Sequence[I4], max_gap_s: float) -> list[I4]:
+    """Drop tracks that are too often a part of another object.
+
+    An object that is split in some frames leaves a track whose place lies, in the other frames,
+    in the box of the whole object. What only stands close to another object, or is hidden by it,
+    has its centre outside that box, whether it is seen or not. Frames without a view of the place
+    tell nothing.
+    """
+    if hits.axes is None:
+        return list(members)
+    owner = np.full(len(hits.rows), -1)
+    for k, member in enumerate(members):
+        owner[member] = k
+    covered = [
+        _covered(hits, member, max_gap_s) + _covered_beside(hits, k, members, owner)
+        for k, member in enumerate(members)
+    ]
+    return [m for m, count in zip(members, covered, strict=True) if count <= _COVERED * len(m)]
+
+
+def _covered(hits: Hits, member: I4, max_gap_s: float) -> int:
+    """Count the frames of its life in which a track is not seen, but in another one's box."""
+    rows, seen = hits.life(member, max_gap_s)
+    others, which = hits.at(rows[~seen])
+    place = hits.places(member, rows[~seen])[which]
+    return len(np.unique(which[_in_box(hits, others, place)]))
+
+
+def _covered_beside(hits: Hits, k: int, members: Sequence[I4], owner: I4) -> int:
+    """Count the frames before and after its life in which a track lies in a neighbour's box.
+
+    The track is thought to move along with the neighbour. On either side half as many frames are
+    looked at as it has: one side alone does not make it a piece, as something may be put into a
+    bowl, or be pushed against another thing and be taken for a part of it from then on.
+    """
+    member, count = members[k], 0
+    most = len(member) // 2
+    for end, way in ((0, -1), (-1, 1)):
+        beside, _ = hits.at(hits.rows[member[[end]]])
+        found = [0]
+        for hit in beside[(owner[beside] >= 0) & (owner[beside] != k)].tolist():
+            host = members[owner[hit]]
+            host = host[hits.sees(member, hits.rows[host])]
+            i = int(np.searchsorted(host, hit))
+            then = host[max(i - most, 0) : i] if way < 0 else host[i + 1 : i + 1 + most]
+            place = hits.centers[member[end]] + hits.centers[then] - hits.centers[hit]
+            found.append(int(_in_box(hits, then, place).sum()))
+        count += max(found)
+    return count
+
+
+def _in_box(hits: Hits, which: I4, places: F8) -> Bool:
+    """Tell which places (n, 3) are in the boxes of detections (n,)."""
+    axes = np.zeros((0, 3, 3)) if hits.axes is None else hits.axes
+    local = np.einsum("nji,nj->ni", axes[which], places - hits.centers[which])
+    return np.asarray((np.abs(local) <= 0.5 * hits.sizes[which]).all(axis=1))

@@ -1,0 +1,46 @@
+"""Triangles of a graph."""
+
+import numpy as np
+
+from shapecat.arrays import I4, U2
+from shapecat.jit import kernel
+
+__all__ = ["triangles_of"]
+
+
+@kernel
+def triangles_of(edges: U2, nodes: int) -> U2:
+    """Return (t, 3) the triangles i < j < k of a graph, in lexicographic order.
+
+    Parameters
+    ----------
+    edges : (m, 2) pairs i < j of ``nodes`` nodes, each once, in lexicographic order.
+    """
+    begin = np.zeros(nodes + 1, np.int32)
+    for edge in range(len(edges)):
+        if max(edges[edge, 0], edges[edge, 1]) >= nodes:
+            raise ValueError("an edge to a node that there is none of")  # noqa: EM101, TRY003  compiled
+        begin[edges[edge, 0] + 1] += 1
+    for node in range(nodes):
+        begin[node + 1] += begin[node]
+    result = np.zeros((_walk(edges, begin, np.zeros((0, 3), np.uint16)), 3), np.uint16)
+    _walk(edges, begin, result)
+    return result
+
+
+@kernel
+def _walk(edges: U2, begin: I4, result: U2) -> int:
+    """Write the triangles while there is room, and return how many there are."""
+    found = 0
+    for edge in range(len(edges)):
+        i, j = edges[edge, 0], edges[edge, 1]
+        a, b = edge + 1, begin[j]  # what is joined to i beyond j, and to j
+        while a < begin[i + 1] and b < begin[j + 1]:
+            u, v = edges[a, 1], edges[b, 1]
+            if u == v:
+                if found < len(result):
+                    result[found, 0], result[found, 1], result[found, 2] = i, j, u
+                found += 1
+            a += u <= v
+            b += v <= u
+    return found

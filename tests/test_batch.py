@@ -1,0 +1,371 @@
+"""Many recordings: the same tables on every executor, and nothing lost, doubled or left behind."""
+
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future
+from pathlib import Path
+from typing import Any
+
+import pyarrow.parquet as pq
+import pytest
+from click.testing import Result
+
+from shapecat.batch import Batch, Outcome, exit_code, plan_batch, process_on
+from shapecat.batch.finding import find_recordings
+from shapecat.batch.manifest import Manifest
+from shapecat.errors import RecordingError
+from shapecat.executors import LocalExecutor, WorkerLostError, open_executor
+from shapecat.jobs import Job
+from tests.scenes import record
+from tests.test_executors import alive, wait_for
+
+Run = Callable[..., Result]
+TABLES = ("frames", "detections", "planes", "tracks")
+NAMES = ("bag", "folder", "log")
+FRAMES = 40
+
+
+class Watcher:
+    """Remembers what it was told, and may do something about it."""
+
+    def __init__(self, act: Callable[[str, str], None] | None = None) -> None:
+        self.heard: set[str] = set()
+        self.outcomes: list[Outcome] = []
+        self._act = act
+
+    def progress(self, folder: str, phase: str, done: int, total: int | None) -> None:
+        """Hear how far a recording is."""
+        assert total is None or done <= total
+        self.heard.add(folder)
+        if self._act is not None:
+            self._act(folder, phase)
+
+    def ended(self, outcome: Outcome) -> None:
+        """Hear what became of one."""
+        self.outcomes.append(outcome)
+
+
+@pytest.fixture(scope="module")
+def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Make a folder as a lab has it: three formats, a broken file, sidecars, old results."""
+    folder = tmp_path_factory.mktemp("recordings")
+    (folder / "monday").mkdir()
+    record(folder / "monday" / "log.mcap", FRAMES)
+    record(folder / "monday" / "bag.bag", FRAMES, container="ros1")
+    record(folder / "folder", FRAMES, container="ros2")
+    (folder / "broken.mcap").write_bytes(b"no recording")
+    (folder / "monday" / "log.truth.json").write_text("{}")
+    (folder / "old" / "log").mkdir(parents=True)
+    (folder / "old" / "log" / "run.json").write_text("{}")
+    (folder / "old" / "log" / "annotated.mcap").write_bytes(b"")
+    return folder
+
+
+def planned(recordings: Path, out: Path) -> Any:
+    return plan_batch(Job(Path(), Path(), rrd=False), [str(recordings)], str(out))
+
+
+@pytest.fixture(scope="module")
+def one_by_one(shapecat: Run, recordings: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("one") / "out"
+    done = shapecat("process", recordings, "--out", out, "--jobs", 1, "--no-rrd")
+    assert done.exit_code == 1, done.output
+    return out
+
+
+def assert_same(expected: Path, actual: Path, names: Sequence[str] = NAMES) -> None:
+    found = {path.name for path in actual.iterdir()}
+    assert found == {*names, "manifest.jsonl"}
+    for folder in names:
+        for name in TABLES:
+            a, b = (pq.read_table(out / folder / f"{name}.parquet") for out in (expected, actual))
+            timed = [column for column in a.column_names if column == "seconds"]
+            assert a.drop_columns(timed).equals(b.drop_columns(timed)), (folder, name)
+        tracks = [(out / folder / "tracks.csv").read_bytes() for out in (expected, actual)]
+        assert tracks[0] == tracks[1]
+
+
+def states(out: Path) -> dict[str, str]:
+    return {name: e.state for name, e in Manifest(out / "manifest.jsonl").entries.items()}
+
+
+ALL_DONE = {**dict.fromkeys(NAMES, "complete"), "broken": "failed"}
+
+
+def test_bad_recordings_are_named_and_the_others_complete(
+    recordings: Path, one_by_one: Path
+) -> None:
+    assert states(one_by_one) == ALL_DONE
+    entries = Manifest(one_by_one / "manifest.jsonl").entries
+    assert entries["broken"].exit_code == 3
+    assert str(recordings / "broken.mcap") in entries["broken"].message
+    assert entries["log"].frames == FRAMES
+    assert {path.name for path in one_by_one.iterdir()} == {*NAMES, "manifest.jsonl"}
+
+
+def test_plan_progress_and_closing_table(shapecat: Run, recordings: Path, tmp_path: Path) -> None:
+    options = ("--out", tmp_path, "--end", 0.1, "--no-rrd", "--jobs", 1)
+    first = shapecat("process", recordings, *options, "--progress", "jsonl")
+    again = shapecat("process", recordings, *options, "--progress", "plain")
+
+    events = [json.loads(line) for line in first.stderr.splitlines()]
+    assert events[0]["event"] == "plan"
+    assert events[0]["recordings"] == 4
+    ended = [event for event in events if event["event"] == "ended"]
+    assert sorted(event["state"] for event in ended) == ["complete"] * 3 + ["failed"]
+    assert {e["recording"] for e in events if e["event"] == "progress"} <= {
+        e["recording"] for e in ended
+    }
+    assert "3 complete, 1 failed" in first.stdout
+    assert "1 to try again" in again.stderr
+    assert "3 complete already" in again.stderr
+    assert again.stdout.count("was complete") == 3
+
+
+def test_complete_recordings_are_not_opened_again(
+    shapecat: Run, recordings: Path, one_by_one: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError
+
+    before = (one_by_one / "log" / "run.json").stat().st_mtime_ns
+    monkeypatch.setattr("shapecat.batch.runs.process", refuse)
+    done = shapecat(
+        *("process", recordings / "monday", recordings / "folder", "--out", one_by_one),
+        *("--jobs", 1, "--no-rrd"),
+    )
+
+    assert done.exit_code == 0, done.output
+    assert done.stdout.count("was complete") == 3
+    assert (one_by_one / "log" / "run.json").stat().st_mtime_ns == before
+
+
+def test_changed_work_is_not_taken_for_done(recordings: Path, one_by_one: Path) -> None:
+    """Content, settings, a model, a missing output: each must be noticed without opening files."""
+
+    def status(job: Job) -> str:
+        with plan_batch(job, [str(recordings)], str(one_by_one)) as batch:
+            return next(task.status for task in batch.tasks if task.job.folder.name == "log")
+
+    same = Job(Path(), Path(), rrd=False)
+    assert status(same) == "complete"
+    assert status(Job(Path(), Path(), rrd=False, every=2)) == "check"
+    assert status(Job(Path(), Path(), rrd=False, overwrite=True)) == "new"
+    log = recordings / "monday" / "log.mcap"
+    stamp = log.stat()
+    os.utime(log, ns=(stamp.st_atime_ns, stamp.st_mtime_ns + 1))
+    assert status(same) == "check"
+    os.utime(log, ns=(stamp.st_atime_ns, stamp.st_mtime_ns))
+    mcap = one_by_one / "log" / "annotated.mcap"
+    mcap.rename(mcap.with_name("aside"))
+    assert status(same) == "check"
+    mcap.with_name("aside").rename(mcap)
+
+
+def test_two_processes_give_the_same_tables(
+    shapecat: Run, recordings: Path, one_by_one: Path, tmp_path: Path
+) -> None:
+    done = shapecat("process", recordings, "--out", tmp_path, "--jobs", 2, "--no-rrd")
+
+    assert done.exit_code == 1
+    assert_same(one_by_one, tmp_path)
+    assert states(tmp_path) == ALL_DONE
+
+
+def test_two_threads_give_the_same_tables(
+    recordings: Path, one_by_one: Path, tmp_path: Path
+) -> None:
+    from shapecat.pipeline import process  # noqa: PLC0415  beside its only use
+
+    process(Job(recordings / "monday/log.mcap", tmp_path / "log", rrd=False), threads=3)
+    (tmp_path / "manifest.jsonl").touch()
+
+    assert_same(one_by_one, tmp_path, ["log"])
+
+
+def test_shards_give_the_same_tables(
+    shapecat: Run, recordings: Path, one_by_one: Path, tmp_path: Path
+) -> None:
+    """Together the shards do everything, and nothing twice."""
+    codes = []
+    for k in range(4):
+        options = ("--out", tmp_path, "--shard", f"{k}/4", "--jobs", 1, "--no-rrd")
+        codes.append(shapecat("process", recordings, *options).exit_code)
+
+    assert sorted(codes) == [0, 0, 0, 3]
+    assert_same(one_by_one, tmp_path)
+    assert states(tmp_path) == ALL_DONE
+    lines = (tmp_path / "manifest.jsonl").read_text().splitlines()
+    assert sum('"complete"' in line for line in lines) == 3
+    wrong = shapecat("process", recordings, "--out", tmp_path, "--shard", "5/4")
+    assert wrong.exit_code == 2
+
+
+def test_folders_are_searched_and_bags_are_not_taken_apart(tmp_path: Path) -> None:
+    """As the shell expands folder/** : folders, what is in them, and what belongs to others."""
+    for name in ("x.mcap", "y.db3", "bag/bag_0.db3", "bag/metadata.yaml", "old/x_0.db3", "d/z.bag"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    for name in ("x.truth.json", "notes.txt", "d/.z.bag.partial"):
+        (tmp_path / name).write_text("{}")
+    expected = {"x.mcap", "y.db3", "bag", "old", "d/z.bag"}
+
+    for sources in ([tmp_path], sorted(tmp_path.rglob("[!.]*")), [tmp_path, *tmp_path.iterdir()]):
+        found = find_recordings([str(path) for path in sources])
+        kept = [str(Path(s.path).relative_to(tmp_path)) for s in found.kept]
+        assert sorted(kept) == sorted(expected)
+    alone = find_recordings([str(tmp_path / "notes.txt")])
+    assert [source.stem for source in alone.kept] == ["notes"]
+    (tmp_path / "none").mkdir()
+    with pytest.raises(RecordingError, match="no recording there"):
+        find_recordings([str(tmp_path / "none")])
+
+
+def drain(batch: Batch, executor: Executor, watcher: Watcher) -> list[Outcome]:
+    return list(process_on(executor, batch.tasks, watcher, manifest=batch.manifest))
+
+
+def test_killed_local_worker_is_replaced(
+    recordings: Path, one_by_one: Path, tmp_path: Path
+) -> None:
+    killed: list[str] = []
+    executor = LocalExecutor(1)
+
+    def kill_once(folder: str, phase: str) -> None:
+        if phase == "perceive" and not killed:
+            killed.append(folder)
+            executor._workers[0].process.kill()
+
+    with executor, planned(recordings, tmp_path) as batch:
+        drain(batch, executor, Watcher(kill_once))
+
+    assert killed
+    assert_same(one_by_one, tmp_path)
+    entries = Manifest(tmp_path / "manifest.jsonl").entries
+    assert {entry.folder: entry.tries for entry in entries.values()} == {
+        **dict.fromkeys([*NAMES, "broken"], 1),
+        killed[0]: 2,
+    }
+
+
+class Fragile(Executor):
+    """Loses its worker with every job of one folder."""
+
+    def __init__(self, folder: str) -> None:
+        self.begun: list[str] = []
+        self._folder = folder
+
+    def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+        """Do it here and now."""
+        future: Future[Any] = Future()
+        name = args[0].folder.name
+        self.begun.append(name)
+        if name == self._folder:
+            future.set_exception(WorkerLostError("the worker process died"))
+        else:
+            future.set_result(fn(*args, **kwargs))
+        return future
+
+
+def test_recording_that_kills_its_workers_is_given_up(recordings: Path, tmp_path: Path) -> None:
+    fragile, watcher = Fragile("bag"), Watcher()
+    with planned(recordings, tmp_path) as batch:
+        drain(batch, fragile, watcher)
+
+    assert fragile.begun.count("bag") == 3
+    (failed,) = [o for o in watcher.outcomes if o.job.folder.name == "bag"]
+    assert "gave up after 3 tries" in failed.message
+    assert states(tmp_path) == {**ALL_DONE, "bag": "failed"}
+
+
+def test_interrupted_batch_ends_at_once_and_goes_on(
+    recordings: Path, one_by_one: Path, tmp_path: Path
+) -> None:
+    """Ctrl-C: exit code 130 within 5 seconds, no process left, a second run completes the rest."""
+    command = [
+        *(sys.executable, "-m", "shapecat", "process", str(recordings), "--out", str(tmp_path)),
+        *("--jobs", "2", "--no-rrd"),
+    ]
+    running = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+    wait_for(lambda: "running" in states(tmp_path).values(), 60)
+    children = Path(f"/proc/{running.pid}/task").glob("*/children")
+    workers = {int(pid) for thread in children for pid in thread.read_text().split()}
+
+    begun = time.monotonic()
+    running.send_signal(signal.SIGINT)
+    _, errors = running.communicate(timeout=30)
+
+    assert running.returncode == 130, errors
+    assert time.monotonic() - begun < 5
+    assert b"Traceback" not in errors
+    assert workers
+    wait_for(lambda: not any(map(alive, workers)), 5)
+    assert subprocess.run(command, check=False, capture_output=True).returncode == 1
+    assert_same(one_by_one, tmp_path)
+
+
+def test_dask_gives_the_same_tables_though_a_worker_is_killed(
+    recordings: Path, one_by_one: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("distributed")
+    killed: list[str] = []
+    with open_executor("dask", workers=2) as executor, planned(recordings, tmp_path) as batch:
+        cluster: Any = executor
+        pids = list(cluster._client.run(os.getpid).values())
+
+        def kill_once(folder: str, phase: str) -> None:
+            if phase == "perceive" and not killed:
+                killed.append(folder)
+                os.kill(pids[0], signal.SIGKILL)
+
+        outcomes = drain(batch, executor, Watcher(kill_once))
+
+    assert killed
+    assert exit_code(outcomes) == 1
+    assert len(outcomes) == 4
+    assert_same(one_by_one, tmp_path)
+
+
+@pytest.mark.ray
+def test_ray_gives_the_same_tables(
+    shapecat: Run, recordings: Path, one_by_one: Path, tmp_path: Path
+) -> None:
+    pytest.importorskip("ray")
+    options = ("--out", tmp_path, "--executor", "ray", "--jobs", 2, "--no-rrd")
+
+    assert shapecat("process", recordings, *options).exit_code == 1
+    assert_same(one_by_one, tmp_path)
+
+
+def test_manifest_survives_what_a_crash_left(tmp_path: Path, one_by_one: Path) -> None:
+    """A line cut short, or of another program, must not hide or swallow its neighbours."""
+    path = tmp_path / "manifest.jsonl"
+    shutil.copy(one_by_one / "manifest.jsonl", path)
+    before = Manifest(path).entries
+    with path.open("ab") as file:
+        file.write(b'{"folder": 3}\n[]\n\xff\n{"folder": "log", "recor')
+
+    manifest = Manifest(path)
+    assert manifest.entries == before
+    manifest.record([before["log"]])
+
+    assert Manifest(path).entries["log"].state == "complete"
+    assert len(Manifest(path).entries) == len(before)
+
+
+def test_batch_goes_on_when_its_manifest_cannot_be_written(
+    shapecat: Run, recordings: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "manifest.jsonl").mkdir()
+    done = shapecat(
+        "process", recordings / "monday", "--out", tmp_path, "--jobs", 1, "--end", 0.1, "--no-rrd"
+    )
+
+    assert done.exit_code == 0, done.output
+    assert "2 complete" in done.stdout

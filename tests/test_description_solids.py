@@ -1,0 +1,143 @@
+"""The blocks of fitted solids and of the outline."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shapecat.arrays import F4, F8
+from shapecat.description.outline import OUTLINE_NAMES, OUTLINE_SLICES, outline
+from shapecat.description.ranges import inner_range
+from shapecat.description.revolution import fit_axis
+from shapecat.description.solids import SOLID_NAMES, solids
+
+EYE = np.array([8.0, 0.0, 6.0], np.float32)
+BOX = {name: k for k, name in enumerate(SOLID_NAMES)}
+
+
+def tilted(angle: float) -> F8:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
+
+
+def half_cone(rng: np.random.Generator, *, slope: float) -> tuple[F8, F8]:
+    """Return points (600, 3) and normals of the side of a frustum that is seen from +x."""
+    height, angle = rng.uniform(-1, 1, 600), rng.uniform(-1.2, 1.2, 600)
+    radius = 0.5 + slope * height
+    outward = np.stack([np.cos(angle), np.sin(angle), np.full(600, -slope)], axis=1)
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=1)
+    return points, outward / np.linalg.norm(outward, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("slope", [0.0, 0.2])
+@given(tilt=st.floats(-1.5, 1.5), off=st.floats(-0.2, 0.2), seed=st.integers(0, 100))
+@settings(deadline=None, max_examples=15)
+def test_the_axis_is_found_from_a_bad_guess(
+    slope: float, tilt: float, off: float, seed: int
+) -> None:
+    """Only a third of the surface is seen, with noise; a frustum must not bend the axis."""
+    rng = np.random.default_rng(seed)
+    points, normals = half_cone(rng, slope=slope)
+    turn = tilted(tilt)
+    cloud = ((points + rng.normal(0, 0.01, points.shape)) @ turn.T).T.astype(np.float32)
+    axis, point = turn @ [0.1, off, 1.0], turn @ [0.1, off, 0.0]
+    axis /= np.linalg.norm(axis)
+    weight = np.full(600, 1 / 600, np.float32)
+
+    fit_axis(cloud, weight, (normals @ turn.T).T.astype(np.float32), axis, point, True)
+
+    assert abs(axis @ turn[:, 2]) > (0.998 if slope == 0 else 0.995)  # steps in place of a cone
+    assert np.linalg.norm(point - (point @ turn[:, 2]) * turn[:, 2]) < 0.05
+
+
+def seen_box(rng: np.random.Generator, yaw: float) -> tuple[F4, F4]:
+    """Return points and normals (3, n) of the three faces of a box that are seen."""
+    half = np.array([0.6, 0.9, 0.7])
+    points, normals = [], []
+    for axis, sign in ((0, 1), (1, 1), (2, 1)):
+        face = rng.uniform(-1, 1, (300, 3))
+        face[:, axis] = sign
+        points.append(face * half)
+        normals.append(np.tile(np.eye(3)[axis] * sign, (300, 1)))
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    cloud, directions = np.concatenate(points) @ turn.T, np.concatenate(normals) @ turn.T
+    return cloud.T.astype(np.float32), directions.T.astype(np.float32)
+
+
+def solid_numbers(cloud: F4, normals: F4) -> F4:
+    out = np.zeros(len(SOLID_NAMES), np.float32)
+    low, high = float(cloud[2].min()), float(cloud[2].max())
+    turned = np.full(8, 0.1, np.float32)
+    owner = np.arange(cloud.shape[1])
+    solids(cloud, owner, cloud[0], cloud[1], normals, EYE, low, high, turned, out)
+    return out
+
+
+@pytest.mark.parametrize("yaw", [-0.6, -0.3, 0.0])
+def test_a_box_fits_a_box_and_a_can_does_not(yaw: float) -> None:
+    """The pair that was mixed up most: their corners tell them apart even with noise."""
+    rng = np.random.default_rng(0)
+    cloud, normals = seen_box(rng, yaw)
+    box = solid_numbers(cloud + rng.normal(0, 0.01, cloud.shape).astype(np.float32), normals)
+    side, directions = half_cone(rng, slope=0.0)
+    can = solid_numbers(side.T.astype(np.float32), directions.T.astype(np.float32))
+
+    assert box[BOX["box_faces"]] < 0.03
+    assert box[BOX["corner_upright"]] < 0.08 < can[BOX["corner_upright"]]
+    assert 2 * box[BOX["box_sides"]] < can[BOX["box_sides"]]
+
+
+def test_a_ball_is_recognised_by_its_residual() -> None:
+    rng = np.random.default_rng(0)
+    normals = rng.normal(size=(900, 3))
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = np.ascontiguousarray(normals[normals @ EYE > 0])
+    ball = solid_numbers(
+        (normals + np.array([0.0, 0.0, 1.0])).T.astype(np.float32), normals.T.astype(np.float32)
+    )
+    cloud, directions = seen_box(rng, 0.0)
+
+    assert ball[BOX["ball_residual"]] < 0.01
+    assert ball[BOX["ball_height"]] == pytest.approx(1.0 / np.ptp(normals[:, 2]), abs=0.2)
+    assert solid_numbers(cloud, directions)[BOX["ball_residual"]] > 0.05
+
+
+def outline_of(cloud: F8, eye: F4 = EYE) -> F4:
+    out = np.zeros(len(OUTLINE_NAMES), np.float32)
+    outline(np.ascontiguousarray(cloud.T, np.float32), eye, out)
+    return out
+
+
+def test_errors_along_the_line_of_sight_leave_the_outline() -> None:
+    """It is there because depth is noisy: it may not depend on it."""
+    rng = np.random.default_rng(0)
+    points, _ = half_cone(rng, slope=0.2)
+    rays = points - EYE
+    noisy = EYE + rays * (1 + rng.normal(0, 0.02, (600, 1)))
+
+    np.testing.assert_allclose(outline_of(noisy), outline_of(points), atol=0.02)
+
+
+def test_the_long_outline_ends_at_the_narrow_end() -> None:
+    """A lying bottle pointing left or right is the same bottle."""
+    rng = np.random.default_rng(0)
+    points, _ = half_cone(rng, slope=0.35)
+    lying = points[:, [0, 2, 1]] * [1, 1.5, 1]
+    left, right = outline_of(lying), outline_of(lying * [1, -1, 1])
+    widths = left[2 * OUTLINE_SLICES : 4 * OUTLINE_SLICES : 2]
+
+    assert widths[0] > 2 * widths[-1] > 0
+    np.testing.assert_allclose(left, right, atol=0.05)
+
+
+@given(st.lists(st.floats(-100, 100, width=32), min_size=60, max_size=300), st.floats(0.01, 10))
+@settings(deadline=None, max_examples=30)
+def test_inner_ranges_are_quantiles(values: list[float], scale: float) -> None:
+    row = (np.array(values) * scale).astype(np.float32)
+    low, high = inner_range(row)
+    bin_width = float(np.ptp(row)) / 64
+
+    assert np.quantile(row, 0.0) <= low <= high <= np.quantile(row, 1.0) + 1e-3 * bin_width + 1e-6
+    assert np.mean(row < low - bin_width) <= 0.03
+    assert np.mean(row > high + bin_width) <= 0.03

@@ -1,0 +1,49 @@
+"""The commands of the pages work as printed, in order, in an empty folder."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = {
+    "tutorial.md": {"results/kitchen/report.html", "crops", "results/manifest.jsonl"},
+    "howto-bag.md": {"results/robot/tracks.csv", "far/robot/run.json"},
+    "howto-cluster.md": {
+        "results/monday/run.json",
+        "results/tuesday/run.json",
+        "shards/monday/run.json",  # the first of four
+        "dask/monday/run.json",
+        "dask/tuesday/run.json",
+        "stored/monday/run.json",
+    },
+}
+
+
+def script(page: str) -> str:
+    """Return what a reader would type: the shell blocks, without installing packages."""
+    text = (DOCS / page).read_text("utf-8")
+    blocks = re.findall(r"^```sh\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    lines = [line for line in "".join(blocks).splitlines() if not line.startswith("pip ")]
+    return "\n".join(["set -eu", "trap 'kill $(jobs -p) 2>/dev/null || true' EXIT", *lines])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES)
+def test_page_works_as_printed(page: str, tmp_path: Path) -> None:
+    programs = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    done = subprocess.run(
+        ["bash", "-c", script(page)],
+        cwd=tmp_path,
+        env={**os.environ, "PATH": programs},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert [name for name in PAGES[page] if not (tmp_path / name).exists()] == []

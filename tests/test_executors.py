@@ -1,0 +1,206 @@
+"""Workers fail alone, end with their parent, and speak the interface of concurrent.futures."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from concurrent.futures import Executor
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+import pytest
+
+from shapecat.errors import ConfigError
+from shapecat.executors import (
+    LocalExecutor,
+    Mailbox,
+    WorkerLostError,
+    is_lost,
+    limited_threads,
+    open_executor,
+    post,
+    share_cores,
+    usable_cores,
+)
+from shapecat.executors.threads import in_order, read_ahead
+
+
+def kill_self(_: object = None) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def raise_error() -> None:
+    msg = "as told"
+    raise ValueError(msg)
+
+
+def write_and_sleep(path: str) -> None:
+    Path(path).write_text(str(os.getpid()), "utf-8")
+    time.sleep(60)
+
+
+def alive(process: int) -> bool:
+    try:
+        state = Path(f"/proc/{process}/stat").read_text("utf-8").rpartition(")")[2].split()[0]
+    except FileNotFoundError:
+        return False
+    return state != "Z"
+
+
+def wait_for(condition: Any, seconds: float = 20) -> None:
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.02)
+
+
+@pytest.fixture(scope="module")
+def executor() -> Iterator[Executor]:
+    with LocalExecutor(2) as made:
+        yield made
+
+
+def test_results_errors_and_deaths_reach_their_own_futures(executor: Executor) -> None:
+    """A worker that dies fails the one task it held; a broken pool would fail them all."""
+    dead = [executor.submit(kill_self) for _ in range(3)]
+    powers = list(executor.map(pow, range(6), [2] * 6))
+    wrong = executor.submit(raise_error)
+
+    assert powers == [0, 1, 4, 9, 16, 25]
+    assert isinstance(wrong.exception(), ValueError)
+    for future in dead:
+        error = future.exception()
+        assert isinstance(error, WorkerLostError)
+        assert is_lost(error)
+        assert "SIGKILL" in str(error)
+
+
+def test_what_cannot_be_sent_fails_alone(executor: Executor) -> None:
+    assert executor.submit(lambda: 1).exception() is not None
+    assert executor.submit(abs, -1).result() == 1
+
+
+def test_workers_use_the_threads_they_are_given() -> None:
+    """Two workers with two threads each on two cores take turns at being slow."""
+    before = os.environ.get("OMP_NUM_THREADS")
+    with LocalExecutor(1, threads=3) as one:
+        assert one.submit(os.getenv, "OMP_NUM_THREADS").result() == "3"
+    assert os.environ.get("OMP_NUM_THREADS") == before
+    with limited_threads(5):
+        assert os.environ["OMP_NUM_THREADS"] == "5"
+
+
+def test_terminate_kills_running_tasks(tmp_path: Path) -> None:
+    one = LocalExecutor(1)
+    running = one.submit(write_and_sleep, str(tmp_path / "pid"))
+    waiting = one.submit(abs, -1)
+    wait_for(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
+
+    begun = time.monotonic()
+    one.terminate()
+
+    assert time.monotonic() - begun < 3
+    assert isinstance(running.exception(timeout=5), WorkerLostError)
+    assert waiting.cancelled()
+    assert not alive(int((tmp_path / "pid").read_text()))
+    with pytest.raises(RuntimeError):
+        one.submit(abs, -1)
+
+
+def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:
+    """Left behind, they would go on for hours, and the next run would find its folders locked."""
+    code = (
+        "from tests.test_executors import write_and_sleep\n"
+        "from shapecat.executors import LocalExecutor\n"
+        "if __name__ == '__main__':\n"
+        f"    LocalExecutor(1).submit(write_and_sleep, {str(tmp_path / 'pid')!r}).result()\n"
+    )
+    (tmp_path / "main.py").write_text(code)
+    environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[1])}
+    parent = subprocess.Popen([sys.executable, str(tmp_path / "main.py")], env=environment)
+    wait_for(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
+    worker = int((tmp_path / "pid").read_text())
+    assert alive(worker)
+
+    parent.kill()
+    parent.wait()
+
+    wait_for(lambda: not alive(worker), 5)
+
+
+def test_mailbox_hands_on_what_is_posted_and_never_waits(tmp_path: Path) -> None:
+    received: SimpleQueue[Any] = SimpleQueue()
+    with Mailbox(received.put) as mailbox:
+        post(mailbox.address, ["kitchen", 3])
+        assert received.get(timeout=5) == ["kitchen", 3]
+    post(mailbox.address, "nobody listens")
+    post(str(tmp_path / "no such place"), "nor here")
+
+
+def test_cores_are_shared_between_recordings_and_their_frames() -> None:
+    cores = usable_cores()
+    assert share_cores(1, 40) == (1, 1)
+    assert share_cores(cores, 1) == (1, cores)
+    assert share_cores(None, 0) == (1, cores)
+    for jobs in range(1, 2 * cores):
+        workers, threads = share_cores(jobs, 3)
+        assert workers * threads <= max(jobs, 1)
+        assert threads == 1 or workers * threads <= cores
+
+
+def test_executors_that_are_not_there_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ray", None)
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ConfigError, match=r"shapecat\[ray\]"):
+        open_executor("ray", workers=1)
+    with pytest.raises(ConfigError, match=r"shapecat\[cluster\]"):
+        open_executor("dask", workers=1)
+    with pytest.raises(ConfigError, match="--executor"):
+        open_executor("local", workers=1, address="tcp://127.0.0.1:1")
+    with pytest.raises(ValueError, match="at least 1"):
+        LocalExecutor(0)
+
+
+def test_threads_keep_the_order_and_hold_few_items() -> None:
+    """A recording does not fit into memory; its tables must not depend on who was faster."""
+    made: list[int] = []
+    used: list[tuple[int, int]] = []
+
+    def items() -> Iterator[int]:
+        for k in range(200):
+            made.append(k)
+            assert len(made) - len(used) <= 9
+            yield k
+
+    def slow_at_times(k: int) -> int:
+        time.sleep(0.002 * (k % 7 == 0))
+        return -k
+
+    for item, result in in_order(slow_at_times, items(), threads=4):
+        used.append((item, result))
+    assert used == [(k, -k) for k in range(200)]
+
+    made.clear()
+    used.clear()
+    for item in read_ahead(items(), count=3):
+        used.append((item, item))  # noqa: PERF401  the source looks at it meanwhile
+    assert [k for k, _ in used] == list(range(200))
+
+
+def test_errors_of_threads_come_at_their_turn() -> None:
+    results = in_order(lambda k: 1 // (3 - k), range(9), threads=3)
+    assert [next(results)[1] for _ in range(3)] == [0, 0, 1]
+    with pytest.raises(ZeroDivisionError):
+        next(results)
+
+    def broken() -> Iterator[int]:
+        yield 1
+        raise EOFError
+
+    ahead = read_ahead(broken(), count=3)
+    assert next(ahead) == 1
+    with pytest.raises(EOFError):
+        next(ahead)

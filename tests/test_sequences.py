@@ -1,0 +1,97 @@
+"""The yardstick of whole sequences: what it asks for, what it spares, what it counts."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+pytest.importorskip("motmetrics")
+
+from benchmarks import sequences
+
+
+def item(track: int, x: float, *, visible: float = 1.0, size: float = 0.1) -> dict[str, Any]:
+    """Return the truth of a cup in a frame."""
+    box = {"center": [x, 0.0, 1.0], "size": [size, size, size]}
+    return {
+        "track": track,
+        "label": 20 + track,
+        "category": "cup",
+        "center": [x, 0.0, 0.8],
+        "box": box,
+        "pixels": 900,
+        "visible": visible,
+        "ambiguous": visible < 0.4,
+    }
+
+
+def judged(folder: Path, objects: list[dict[str, Any]], tracks: list[list[float]]) -> Any:
+    """Return the figures of ten equal frames; tracks are given by their x, row by row."""
+    truth = [{"objects": objects, "hidden": []}] * 10
+    (folder / "recording.truth.json").write_text(json.dumps(truth))
+    rows = [
+        {"frame": k, "track": track, "center_fixed": [x, 0.0, 0.8]}
+        for k in range(10)
+        for track, x in enumerate(tracks[k % len(tracks)])
+    ]
+    (folder / "run").mkdir()
+    pq.write_table(pa.Table.from_pylist(rows), folder / "run" / "tracks.parquet")
+    places = [{"frame": k, "fixed_translation": [0.0, 0.0, 0.0]} for k in range(10)]
+    pq.write_table(pa.Table.from_pylist(places), folder / "run" / "frames.parquet")
+    counted = sequences.count_identities(folder, sequences.read_truth(folder))
+    return sequences.identities({"a": [counted]})["a"]
+
+
+def test_all_found_is_one_and_an_invented_track_costs(tmp_path: Path) -> None:
+    objects = [item(0, 0.0), item(1, 0.5)]
+    for name, tracks, mota in (("good", [[0.02, 0.5]], 1.0), ("more", [[0.0, 0.5, 0.9]], 0.5)):
+        (tmp_path / name).mkdir()
+        assert judged(tmp_path / name, objects, tracks)["mota"] == mota
+
+
+def test_hidden_objects_count_neither_for_nor_against(tmp_path: Path) -> None:
+    objects = [item(0, 0.0), item(1, 0.5, visible=0.2)]
+    for name, tracks in (("kept", [[0.0, 0.5]]), ("left", [[0.0]])):
+        (tmp_path / name).mkdir()
+        figures = judged(tmp_path / name, objects, tracks)
+        assert (figures["mota"], figures["idf1"], figures["num_objects"]) == (1.0, 1.0, 10)
+
+
+def test_what_is_out_of_range_counts_neither_for_nor_against(tmp_path: Path) -> None:
+    objects = [item(0, 0.0), item(1, 2.5)]
+    for name, tracks in (("found", [[0.0, 2.5]]), ("left", [[0.0]]), ("invented", [[0.0, 3.5]])):
+        (tmp_path / name).mkdir()
+        assert judged(tmp_path / name, objects, tracks)["mota"] == 1.0
+
+
+def test_a_large_object_may_be_met_at_its_rim(tmp_path: Path) -> None:
+    """Of a tray only the near part may be seen."""
+    for name, size, mota in (("tray", 0.4, 1.0), ("cup", 0.1, -1.0)):
+        (tmp_path / name).mkdir()
+        assert judged(tmp_path / name, [item(0, 0.0, size=size)], [[0.18]])["mota"] == mota
+
+
+def test_exchanged_identities_are_switches(tmp_path: Path) -> None:
+    figures = judged(tmp_path, [item(0, 0.0), item(1, 0.5)], [[0.0, 0.5], [0.5, 0.0]])
+    assert figures["num_switches"] == 18
+    assert figures["idf1"] == 0.5
+
+
+def test_a_short_sequence_is_judged_from_recording_to_figures(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sequences, "FRAMES", 8)
+    monkeypatch.setattr(sequences, "KINDS", ("rearranged",))
+
+    figures = sequences.evaluate(tmp_path, [4])
+
+    assert figures["identities"]["rearranged"]["idf1"] > 0.8
+    assert figures["labels"]["all"]["views"] > 40
+    assert figures["labels"]["all"]["final"] < 0.4
+    assert np.isfinite([row["ece"] for row in figures["calibration"].values()]).any()
+    assert "| rearranged |" in sequences.format_tables(figures)
+    json.dumps(figures)
