@@ -209,12 +209,20 @@ def test_shards_give_the_same_tables(
 
 def test_folders_are_searched_and_bags_are_not_taken_apart(tmp_path: Path) -> None:
     """As the shell expands folder/** : folders, what is in them, and what belongs to others."""
-    for name in ("x.mcap", "y.db3", "bag/bag_0.db3", "bag/metadata.yaml", "old/x_0.db3", "d/z.bag"):
+    bags = (
+        "bag/bag_0.db3",
+        "bag/metadata.yaml",
+        "old/x_0.db3",
+        "two/a_0.mcap",
+        "two/a_1.mcap.zstd",
+    )
+    for name in ("x.mcap", "y.db3", "d/z.bag", "runs/run_1.mcap", "runs/run_2.mcap", *bags):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         (tmp_path / name).touch()
     for name in ("x.truth.json", "notes.txt", "d/.z.bag.partial"):
         (tmp_path / name).write_text("{}")
-    expected = {"x.mcap", "y.db3", "bag", "old", "d/z.bag"}
+    runs = {"runs/run_1.mcap", "runs/run_2.mcap"}
+    expected = {"x.mcap", "y.db3", "bag", "old", "two", "d/z.bag", *runs}
 
     for sources in ([tmp_path], sorted(tmp_path.rglob("[!.]*")), [tmp_path, *tmp_path.iterdir()]):
         found = find_recordings([str(path) for path in sources])

@@ -468,7 +468,7 @@ ZOO: dict[str, Exhibit] = {
     "magic alone": Exhibit(lambda p: file(p, "a.mcap", b"\x89MCAP0\r\n"), 4, 0, "empty"),
     "zeros": Exhibit(lambda p: file(p, "a.db3", b"SQLite format 3\0" + bytes(999)), 3, 0, "not a"),
     "old bag": Exhibit(lambda p: file(p, "a.bag", b"#ROSBAG V1.2\n"), 3, 0, "version 2.0"),
-    "empty folder": Exhibit(empty_folder, 3, 0, "without .mcap"),
+    "empty folder": Exhibit(empty_folder, 3, 0, "no recording there"),
     "missing": Exhibit(lambda p: p / "a.mcap", 3, 0, "does not exist"),
 }
 """By name. A recording that is not damaged is read in full; nothing else is said about it."""

@@ -10,7 +10,7 @@ from shapecat.errors import RecordingError
 __all__ = ["Found", "Source", "find_recordings"]
 
 SUFFIXES = {".mcap", ".bag", ".db3"}
-_OTHERS = {".mcap", ".bag"}
+_OTHERS = (".mcap", ".bag")
 _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
 
 
@@ -83,12 +83,21 @@ def _searchable(path: Path) -> bool:
 
 
 def _is_bag(folder: Path) -> bool:
-    """Return whether a folder is a ROS 2 bag: it says so, or holds nothing but databases."""
+    """Return whether a folder is a ROS 2 bag: it says so, or holds databases or splits alone."""
     if (folder / "metadata.yaml").exists():
         return True
-    databases = list(folder.glob("*.db3"))
-    others = [path for path in folder.iterdir() if path.is_dir() or path.suffix in _OTHERS]
-    return bool(databases) and not others
+    paths = list(folder.iterdir())
+    names = {path.name.removesuffix(".zstd") for path in paths if path.is_file()}
+    if any(path.is_dir() for path in paths):
+        return False
+    others = {name for name in names if name.endswith(_OTHERS)}
+    return _are_splits(others) or (any(n.endswith(".db3") for n in names) and not others)
+
+
+def _are_splits(names: set[str]) -> bool:
+    """Return whether files are the numbered parts of one recording: a_0.mcap, a_1.mcap, ..."""
+    base = min(names, default="").rpartition("_")[0]
+    return len(names) > 1 and names == {f"{base}_{k}.mcap" for k in range(len(names))}
 
 
 def _search(folder: Path) -> Iterator[Path]:
