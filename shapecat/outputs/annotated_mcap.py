@@ -7,15 +7,17 @@ MCAP. Annotations use the encoding of the source.
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from itertools import chain, pairwise
 from pathlib import Path
+from typing import BinaryIO
 
-from shapecat.outputs.annotation import Annotation
+from shapecat.outputs.annotation import Annotation, AnnotationChannel
 from shapecat.outputs.annotations import ENCODERS, encoder_for
 from shapecat.outputs.mcap_append import Appender, copy_bytes
 from shapecat.outputs.mcap_rewrite import Item, rewrite
 from shapecat.recordings import Recording
-from shapecat.recordings.mcap_file import McapRecording
+from shapecat.recordings.mcap_file import McapRecording, Summary
 from shapecat.run_folder import replacing
 from shapecat.types import ShownFrame
 
@@ -63,19 +65,34 @@ def write_annotated(
     metadata = {"run.json": json.dumps(run)}
     with replacing(path) as hidden, hidden.open("wb") as file:
         if isinstance(recording, McapRecording) and recording.indexed:
-            summary = recording.summary
-            copy_bytes(recording.path, file, summary.data_end)
-            compression = summary.chunks[0].compression if summary.chunks else "zstd"
-            appender = Appender(file, summary, compression)
-            numbers = [appender.add_channel(channel) for channel in channels]
-            sequences: Counter[int] = Counter()
-            for number, log_time, data in items:
-                appender.add_message(numbers[number], log_time, sequences[number], data)
-                sequences[number] += 1
-            appender.add_metadata("shapecat", metadata)
-            appender.finish()
+            with ThreadPoolExecutor(1) as pool:  # the copy does not hold the interpreter lock
+                copying = pool.submit(
+                    copy_bytes, recording.path, hidden, recording.summary.data_end
+                )
+                _append(recording.summary, file, channels, items, metadata)
+                copying.result()
         else:
             rewrite(recording, file, channels, items, metadata)
+
+
+def _append(
+    summary: Summary,
+    file: BinaryIO,
+    channels: Iterable[AnnotationChannel],
+    items: Iterable[Item],
+    metadata: Mapping[str, str],
+) -> None:
+    """Write the annotations behind where the original data section ends."""
+    file.seek(summary.data_end)
+    compression = summary.chunks[0].compression if summary.chunks else "zstd"
+    appender = Appender(file, summary, compression)
+    numbers = [appender.add_channel(channel) for channel in channels]
+    sequences: Counter[int] = Counter()
+    for number, log_time, data in items:
+        appender.add_message(numbers[number], log_time, sequences[number], data)
+        sequences[number] += 1
+    appender.add_metadata("shapecat", metadata)
+    appender.finish()
 
 
 def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:

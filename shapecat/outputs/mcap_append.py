@@ -30,14 +30,13 @@ _MESSAGE = struct.Struct("<BQHIQQ")
 _COMPRESS = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}
 
 
-def copy_bytes(source: Path, target: BinaryIO, length: int) -> None:
-    """Copy the first bytes of a file, inside the kernel where it can."""
-    with source.open("rb") as file:
-        target.flush()
+def copy_bytes(source: Path, target: Path, length: int) -> None:
+    """Copy the first bytes of a file over those of another, inside the kernel where it can."""
+    with source.open("rb") as file, target.open("r+b") as copy:
         done = 0
         try:
             while done < length:
-                copied = os.copy_file_range(file.fileno(), target.fileno(), length - done)
+                copied = os.copy_file_range(file.fileno(), copy.fileno(), length - done)
                 if copied == 0:
                     break
                 done += copied
@@ -45,7 +44,7 @@ def copy_bytes(source: Path, target: BinaryIO, length: int) -> None:
             if done:
                 raise
         if done == 0:
-            shutil.copyfileobj(_Limited(file, length), target, 1 << 20)
+            shutil.copyfileobj(_Limited(file, length), copy, 1 << 20)
 
 
 class _Limited:
@@ -75,13 +74,13 @@ class Appender:
 
     Parameters
     ----------
-    file : open for writing; positioned after the copied data section.
+    file : open for writing; positioned where the original data section ends.
     summary : that of the original.
     compression : of the new chunks: ``zstd``, ``lz4`` or empty.
     """
 
     def __init__(self, file: BinaryIO, summary: Summary, compression: str) -> None:
-        """Take over the file where the copy ended."""
+        """Take over the file."""
         self._file = file
         self._schemas = dict(summary.schemas)
         self._channels = dict(summary.channels)
