@@ -7,7 +7,6 @@ from collections import Counter
 from collections.abc import Sequence
 from contextlib import ExitStack
 from threading import Lock
-from types import TracebackType
 from typing import Any, Self
 
 import click
@@ -55,12 +54,7 @@ class Progress:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Show nothing more."""
 
     def plan(self, text: str) -> None:
@@ -220,14 +214,9 @@ class LiveProgress(Progress):
         self._stack.enter_context(self._rich)
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         """Take the bars away."""
-        self._stack.__exit__(kind, error, trace)
+        self._stack.close()
 
     def plan(self, text: str) -> None:
         """Show the plan above the bars."""

@@ -6,18 +6,17 @@ from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import sparse
-from sklearn.base import BaseEstimator, ClassifierMixin, TransformerMixin
+from sklearn.base import ClassifierMixin
 from sklearn.utils import check_random_state
 from sklearn.utils.multiclass import check_classification_targets
-from sklearn.utils.validation import check_is_fitted, validate_data
+from sklearn.utils.validation import validate_data
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.learning.boosting import Bins, Tree, TreeSettings, grow_tree, make_bins
 from shapecat.learning.calibration import softmax
 from shapecat.learning.forest import FlatForest
 from shapecat.learning.pnn import known_labels
-from shapecat.learning.words import bag_of_words
+from shapecat.learning.words import TreeDictionary
 
 __all__ = ["BoostedDictionary"]
 
@@ -26,11 +25,7 @@ _LEAST = 1.0
 _FEWEST_COLUMNS = 10
 
 
-class BoostedDictionary(
-    ClassifierMixin,  # type: ignore[misc]  # sklearn is untyped
-    TransformerMixin,  # type: ignore[misc]
-    BaseEstimator,  # type: ignore[misc]
-):
+class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc]  # sklearn is untyped
     """The leaf a view falls into in each tree is a word; the words of a category's trees add up.
 
     Each round grows one tree for each category against the rest, on what its posterior still
@@ -109,16 +104,6 @@ class BoostedDictionary(
         logits = self.logits(X)[:, : len(self.classes_)]
         return self.classes_[logits.argmax(axis=1)]
 
-    def words(self, X: ArrayLike) -> I4:
-        """Return the words of features (n, f): (n, trees)."""
-        check_is_fitted(self)
-        return self.forest_.fall(validate_data(self, X, dtype=np.float32, reset=False))
-
-    def transform(self, X: ArrayLike) -> sparse.csr_array:
-        """Return a row of zeros and ones per view (n, words)."""
-        words = self.words(X)  # first: it checks that the dictionary is learned
-        return bag_of_words(words, self.forest_.words)
-
     def _boost(self, bins: Bins, labels: I4) -> tuple[list[Tree], F8]:
         """Return the trees, round by round, those of a round in the order of the categories."""
         rng = np.random.default_rng(check_random_state(self.random_state).randint(2**31))
@@ -153,11 +138,6 @@ class BoostedDictionary(
         columns, rows = draw
         settings = TreeSettings(self.leaves, self.rate, _RIDGE, _LEAST)
         return grow_tree(bins, columns, rows, slope, np.maximum(bend, 1e-6), settings, score)
-
-    def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()
-        tags.transformer_tags.preserves_dtype = []
-        return tags
 
 
 def _join(trees: Sequence[Tree], categories: int) -> tuple[FlatForest, F4]:

@@ -4,8 +4,7 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import sparse
-from sklearn.base import BaseEstimator, ClassifierMixin, TransformerMixin
+from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.linear_model import LogisticRegression
 from sklearn.utils.multiclass import check_classification_targets
@@ -15,12 +14,12 @@ from shapecat.arrays import F8, I4
 from shapecat.learning.calibration import softmax
 from shapecat.learning.forest import flatten
 from shapecat.learning.pnn import known_labels
-from shapecat.learning.words import bag_of_words
+from shapecat.learning.words import TreeDictionary
 
 __all__ = ["ForestDictionary", "WordLearner"]
 
 
-class ForestDictionary(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # sklearn is untyped
+class ForestDictionary(TreeDictionary):
     """The leaf a view falls into in each tree of a random forest is a word.
 
     Parameters
@@ -64,22 +63,6 @@ class ForestDictionary(TransformerMixin, BaseEstimator):  # type: ignore[misc]  
         forest.fit(x, y)
         self.forest_ = flatten([tree.tree_ for tree in forest.estimators_])
         return self
-
-    def words(self, X: ArrayLike) -> I4:
-        """Return the words of features (n, f): (n, trees)."""
-        check_is_fitted(self)
-        return self.forest_.fall(validate_data(self, X, dtype=np.float32, reset=False))
-
-    def transform(self, X: ArrayLike) -> sparse.csr_array:
-        """Return a row of zeros and ones per view (n, words)."""
-        words = self.words(X)  # first: it checks that the dictionary is learned
-        return bag_of_words(words, self.forest_.words)
-
-    def __sklearn_tags__(self) -> Any:
-        tags = super().__sklearn_tags__()
-        tags.transformer_tags.preserves_dtype = []
-        tags.target_tags.required = True
-        return tags
 
 
 class WordLearner(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # sklearn is untyped

@@ -1,11 +1,44 @@
-"""Words of views as sparse rows, for the learners."""
+"""Words of views: what dictionaries have in common, and sparse rows for the learners."""
+
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import sparse
+from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.utils.validation import check_is_fitted, validate_data
 
 from shapecat.arrays import I4
+from shapecat.learning.forest import FlatForest
 
-__all__ = ["bag_of_words"]
+__all__ = ["TreeDictionary", "bag_of_words"]
+
+
+class TreeDictionary(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # sklearn is untyped
+    """The leaf a view falls into in each tree is a word (thesis 7.3).
+
+    Attributes
+    ----------
+    forest_ : the `FlatForest` of all trees, set when it is fitted.
+    """
+
+    forest_: FlatForest
+
+    def words(self, X: ArrayLike) -> I4:
+        """Return the words of features (n, f): (n, trees)."""
+        check_is_fitted(self)
+        return self.forest_.fall(validate_data(self, X, dtype=np.float32, reset=False))
+
+    def transform(self, X: ArrayLike) -> sparse.csr_array:
+        """Return a row of zeros and ones per view (n, words)."""
+        words = self.words(X)  # first: it checks that the dictionary is learned
+        return bag_of_words(words, self.forest_.words)
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.transformer_tags.preserves_dtype = []
+        tags.target_tags.required = True
+        return tags
 
 
 def bag_of_words(words: I4, vocabulary: int) -> sparse.csr_array:
