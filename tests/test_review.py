@@ -88,7 +88,7 @@ def as_rows(batch: Any) -> list[dict[str, Any]]:
 
 
 def rows(path: Path, entity: str) -> list[dict[str, Any]]:
-    """Return the rows of an entity of a recording, in the order of frames."""
+    """Return the rows of an entity of a recording, in the order of frames; no style."""
     from rerun.chunk import RrdReader  # noqa: PLC0415  heavy
 
     chunks = RrdReader(str(path)).stream().to_chunks()
@@ -97,8 +97,9 @@ def rows(path: Path, entity: str) -> list[dict[str, Any]]:
         for chunk in chunks
         if str(chunk.entity_path).replace("\\", "") == entity
         for row in as_rows(chunk.to_record_batch())
+        if "frame" in row
     ]
-    return sorted(found, key=lambda row: row.get("frame", -1))
+    return sorted(found, key=lambda row: row["frame"])
 
 
 def scalars(path: Path, entity: str) -> list[list[float]]:

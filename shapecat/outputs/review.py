@@ -44,13 +44,16 @@ from shapecat.geometry import transform
 from shapecat.outputs import review_shapes as shapes
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import paint
+from shapecat.outputs.review_curves import At, Curves, times_of
 from shapecat.outputs.review_layout import Eye, TrackView, choose_eye, lay_out, stepped_back
+from shapecat.outputs.review_shapes import DRAWINGS, Moment, Way
 from shapecat.outputs.review_viewer import open_viewer, take_screenshot
 from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
 
 __all__ = ["open_viewer", "take_screenshot", "write_review"]
 
 _FLUSH_FRAMES = 32
+_DRAWN_AT_ONCE, _POINTS_AT_ONCE = 16, 1 << 19  # frames and points held back of a sensor
 _RESERVE_BYTES = 64 << 20  # Rerun waits for ever on a full disk: stop before
 _PATH_STEP_M, _PATH_POINTS = 0.015, 500  # a path grows when its object moves so far
 
@@ -136,6 +139,7 @@ class _Review:
         fixed_frame: str | None,
     ) -> None:
         self._stream = stream
+        self._pending: dict[str, list[Moment]] = {}  # by entity of the sensor
         self._categories = tuple(categories)
         self._cloud_points = cloud_points
         self._fixed_frame = fixed_frame
@@ -144,7 +148,8 @@ class _Review:
         self._cameras: dict[str, Camera] = {}
         self._tracks: dict[int, TrackView] = {}
         self._paths: dict[str, dict[int, list[F8]]] = {}
-        self._curves = _Curves(stream)
+        self._ways: dict[str, list[tuple[At, list[Way]]]] = {}  # those held back, by entity
+        self._curves = Curves(stream)
         self._counted: dict[str, None] = {}  # categories met, in order
         self._warnings: list[str] = []
 
@@ -165,27 +170,26 @@ class _Review:
         self._stream.set_time("sensor_time", timestamp=np.datetime64(labelled.stamp_ns, "ns"))
         self._stream.set_time("frame", sequence=labelled.index)
         self._place_sensor(entity, labelled, frame)
-        scene, points = paint(frame, labelled.planes, labelled.objects, limit=self._cloud_points)
-        self._log(f"{entity}/scene", shapes.points(scene))
-        self._log(f"{entity}/objects/points", shapes.points(points))
-        self._log(f"{entity}/planes", shapes.outlines(labelled.planes))
-        self._log(f"{entity}/planes/fill", shapes.fills(labelled.planes))
-        self._log(f"{entity}/objects/boxes", shapes.boxes(labelled.objects))
-        self._log(f"{entity}/objects/captions", shapes.captions(labelled.objects))
-        self._log(f"{entity}/objects/graphs", shapes.graphs(labelled.objects))
-        self._log(f"{entity}/objects/surfaces", shapes.surfaces(labelled.objects))
+        self._draw(entity, labelled, frame)
         self._log_paths(entity, labelled)
         self._log_events(labelled)
         self._plot(labelled)
 
     def flush(self) -> None:
         """Write out what is held back."""
+        for entity in self._pending:
+            self._send(entity)
+        for entity, rows in self._ways.items():
+            if rows:
+                at, ways = zip(*rows, strict=True)
+                self._stream.send_columns(entity, times_of(at), shapes.paths(ways))
+                rows.clear()
         self._curves.send()
         self._stream.flush(timeout_sec=60)
 
     def end(self) -> None:
         """Write the layout and all that is left."""
-        self._curves.send()
+        self.flush()
         world = "/world"
         scenes = [
             (world if self._fixed_frame else entity, self._fixed_frame or topic, eye)
@@ -205,6 +209,32 @@ class _Review:
         self._stream.send_blueprint(lay_out(scenes or [nothing], tracks))
         self._stream.flush(timeout_sec=60)
 
+    def _draw(self, entity: str, labelled: LabelledFrame, frame: Frame) -> None:
+        """Paint the frame, and hold it back until there are enough of them."""
+        if entity not in self._pending:
+            for name, drawing in DRAWINGS.items():
+                if drawing.style is not None:
+                    self._log(f"{entity}/{name}", drawing.style, static=True)
+        pending = self._pending.setdefault(entity, [])
+        clouds = paint(frame, labelled.planes, labelled.objects, limit=self._cloud_points)
+        pending.append(Moment(labelled, *clouds))
+        if len(pending) == _DRAWN_AT_ONCE or sum(m.size for m in pending) > _POINTS_AT_ONCE:
+            self._send(entity)
+
+    def _send(self, entity: str) -> None:
+        """Write the frames of a sensor that are held back."""
+        moments = self._pending[entity]
+        if not moments:
+            return
+        at = [(m.labelled.stamp_ns, m.labelled.index) for m in moments]
+        for name, drawing in DRAWINGS.items():
+            self._stream.send_columns(f"{entity}/{name}", times_of(at), drawing.columns(moments))
+        posed = [(at[k], pose) for k, m in enumerate(moments) if (pose := self._pose(m.labelled))]
+        if posed:
+            when, poses = zip(*posed, strict=True)
+            self._stream.send_columns(entity, times_of(when), shapes.places(poses))
+        moments.clear()
+
     def _log(self, entity: str, *what: rr.AsComponents, static: bool = False) -> None:
         self._stream.log(entity, *what, static=static)
 
@@ -216,9 +246,6 @@ class _Review:
             self._log(entity, _axes(frame, self._eyes[topic]), static=True)
         if labelled.objects:
             self._paths.setdefault(topic, {})
-        pose = self._pose(labelled)
-        if pose is not None:
-            self._log(entity, shapes.transform3d(pose))
         if frame.camera is not None and frame.camera != self._cameras.get(topic):
             self._cameras[topic] = frame.camera
             self._log(f"{entity}/camera", shapes.pinhole(frame.camera))
@@ -248,9 +275,13 @@ class _Review:
                 del path[:-_PATH_POINTS]
                 changed = changed or len(path) > 1
         if changed:
-            ways = [(self._tracks[n].category, path) for n, path in paths.items() if len(path) > 1]
-            where = rr.escape_entity_path_part(labelled.topic)
-            self._log(f"{entity}/paths/{where}", shapes.paths(ways))
+            where = f"{entity}/paths/{rr.escape_entity_path_part(labelled.topic)}"
+            ways = [
+                (self._tracks[n].category, np.array(path))
+                for n, path in paths.items()
+                if len(path) > 1
+            ]
+            self._ways.setdefault(where, []).append(((labelled.stamp_ns, labelled.index), ways))
 
     def _log_events(self, labelled: LabelledFrame) -> None:
         for text in self._warnings:
@@ -297,45 +328,13 @@ class _Review:
         self,
         group: str,
         name: str,
-        at: tuple[int, int],
+        at: At,
         value: float,
         colour: tuple[int, int, int] | None,
     ) -> None:
         entity = f"/plots/{group}/{rr.escape_entity_path_part(name)}"
         if self._curves.add(entity, at, [value]):
             self._log(entity, rr.SeriesLines(names=name, colors=colour, widths=2), static=True)
-
-
-class _Curves:
-    """Values over time, held back and sent as columns: a log call each would cost more."""
-
-    def __init__(self, stream: rr.RecordingStream) -> None:
-        self._stream = stream
-        self._pending: dict[str, list[tuple[tuple[int, int], Sequence[float]]]] = {}
-
-    def add(self, entity: str, at: tuple[int, int], values: Sequence[float]) -> bool:
-        """Hold back values at a stamp and a frame; return whether the entity is new."""
-        new = entity not in self._pending
-        self._pending.setdefault(entity, []).append((at, values))
-        return new
-
-    def send(self) -> None:
-        """Write what is held back."""
-        for entity, rows in self._pending.items():
-            if not rows:
-                continue
-            at = np.array([row[0] for row in rows], np.int64)
-            values = np.concatenate([np.asarray(row[1], np.float64) for row in rows])
-            width = len(rows[0][1])
-            self._stream.send_columns(
-                entity,
-                [
-                    rr.TimeColumn("sensor_time", timestamp=at[:, 0].astype("datetime64[ns]")),
-                    rr.TimeColumn("frame", sequence=at[:, 1]),
-                ],
-                rr.Scalars.columns(scalars=values).partition([width] * len(rows)),
-            )
-            rows.clear()
 
 
 def _axes(frame: Frame, eye: Eye) -> rr.ViewCoordinates:

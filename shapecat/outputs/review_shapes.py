@@ -1,34 +1,60 @@
-"""What the review draws: records of the house as archetypes of Rerun."""
+"""What the review draws: records of the house as archetypes of Rerun.
 
-from collections.abc import Iterable, Mapping, Sequence
+What frames show goes by the column, some frames at once: a call for each costs ten times as much.
+"""
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import chain
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import rerun as rr
 
-from shapecat.arrays import F4, F8
+from shapecat.arrays import F4, F8, U4
 from shapecat.geometry import quaternion_from_rotation, rotation_from_quaternion
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import PaintedCloud
-from shapecat.types import Box, Camera, LabelledObject, Plane, Pose
+from shapecat.types import Box, Camera, LabelledFrame, LabelledObject, Pose
 
 __all__ = [
-    "boxes",
-    "captions",
-    "fills",
-    "graphs",
+    "DRAWINGS",
+    "Drawing",
+    "Moment",
+    "Way",
     "label",
     "markdown",
-    "outlines",
     "paths",
     "pinhole",
-    "points",
-    "surfaces",
-    "transform3d",
+    "places",
 ]
 
 _PLANE = (190, 205, 220)
 _CAPTION_M = 0.02  # from the top of a box to its label
+
+_Columns = Iterable[rr.ComponentColumn]
+Way = tuple[str, F8]
+"""Category, and places (n, 3) in metres."""
+
+
+class Moment(NamedTuple):
+    """A frame as it is drawn: its labels, the points of no object, and those on objects."""
+
+    labelled: LabelledFrame
+    scene: PaintedCloud
+    points: PaintedCloud
+
+    @property
+    def size(self) -> int:
+        """The number of its points."""
+        return len(self.scene.points) + len(self.points.points)
+
+
+class Drawing(NamedTuple):
+    """How an entity is drawn: what never changes, and what each of some frames shows."""
+
+    style: rr.AsComponents | None
+    columns: Callable[[Sequence[Moment]], _Columns]
 
 
 def label(item: LabelledObject) -> str:
@@ -36,49 +62,55 @@ def label(item: LabelledObject) -> str:
     return f"#{item.track} {item.category} {item.confidence:.2f}"
 
 
-def points(cloud: PaintedCloud) -> rr.Points3D:
-    """Return the points of a cloud."""
-    return rr.Points3D(
-        cloud.points,
-        colors=cloud.colours,
-        radii=cloud.radius_m,
-        point_shading=rr.components.PointShading.Flat,  # their colours are shaded already
+def _points(clouds: Sequence[PaintedCloud]) -> _Columns:
+    shown = rr.Points3D.columns(
+        positions=np.concatenate([cloud.points for cloud in clouds]),
+        colors=np.concatenate([cloud.colours for cloud in clouds]),
     )
+    yield from shown.partition([len(cloud.points) for cloud in clouds])
+    yield from rr.Points3D.columns(radii=[cloud.radius_m for cloud in clouds])
 
 
-def boxes(objects: Sequence[LabelledObject]) -> rr.Boxes3D:
-    """Return the labelled boxes of a frame."""
-    return rr.Boxes3D(
-        centers=np.reshape([o.box.center for o in objects], (-1, 3)),
-        half_sizes=np.reshape([o.box.size for o in objects], (-1, 3)) / 2,
-        quaternions=np.reshape([o.box.orientation for o in objects], (-1, 4)),
-        colors=[_tint(o.category, 0.25) for o in objects],
+def _scene(moments: Sequence[Moment]) -> _Columns:
+    """Return the points of no object."""
+    return _points([moment.scene for moment in moments])
+
+
+def _objects(moments: Sequence[Moment]) -> _Columns:
+    """Return the points on objects."""
+    return _points([moment.points for moment in moments])
+
+
+def _boxes(moments: Sequence[Moment]) -> _Columns:
+    """Return the labelled boxes."""
+    objects, counts = _objects_of(moments)
+    yield from rr.Boxes3D.columns(
+        centers=_stacked([o.box.center for o in objects], 3),
+        half_sizes=_stacked([o.box.size for o in objects], 3) / 2,
+        quaternions=_stacked([o.box.orientation for o in objects], 4),
+        colors=_packed(objects, white=0.25),
         labels=[label(o) for o in objects],
-        radii=0.001,
-        show_labels=False,  # they would cover the objects
-    )
+    ).partition(counts)
 
 
-def captions(objects: Sequence[LabelledObject]) -> rr.Points3D:
-    """Return the labels of a frame, each a little above its box."""
-    return rr.Points3D(
-        np.reshape([_above(o.box) for o in objects], (-1, 3)),
-        colors=[_tint(o.category, 0.6) for o in objects],
+def _captions(moments: Sequence[Moment]) -> _Columns:
+    """Return the labels, each a little above its box."""
+    objects, counts = _objects_of(moments)
+    yield from rr.Points3D.columns(
+        positions=_stacked([_above(o.box) for o in objects], 3),
+        colors=_packed(objects, white=0.6),
         labels=[label(o) for o in objects],
-        radii=0.0005,
-        show_labels=True,
-    )
+    ).partition(counts)
 
 
-def graphs(objects: Sequence[LabelledObject]) -> rr.LineStrips3D:
-    """Return the edges of the graphs of a frame."""
-    strips = [o.gas.neurons[o.gas.edges] for o in objects]
-    counts = [len(o.gas.edges) for o in objects]
-    colours = np.repeat(
-        np.array([_packed(o.category, 255, 0.65) for o in objects], np.uint32), counts
-    )
-    pairs = np.concatenate(strips) if strips else np.zeros((0, 2, 3), np.float32)
-    return rr.LineStrips3D(_segments(pairs), colors=colours, radii=0.0008)
+def _graphs(moments: Sequence[Moment]) -> _Columns:
+    """Return the edges of the graphs."""
+    objects, _ = _objects_of(moments)
+    lines = [o.gas.neurons[o.gas.edges] for o in objects]
+    pairs = np.concatenate(lines) if lines else np.zeros((0, 2, 3), np.float32)
+    colours = np.repeat(_packed(objects, white=0.65), [len(each) for each in lines])
+    counts = [sum(len(o.gas.edges) for o in m.labelled.objects) for m in moments]
+    yield from rr.LineStrips3D.columns(strips=_segments(pairs), colors=colours).partition(counts)
 
 
 def _segments(pairs: F4) -> pa.Array:
@@ -90,55 +122,83 @@ def _segments(pairs: F4) -> pa.Array:
     return pa.ListArray.from_arrays(offsets, corners, type=kind)
 
 
-def surfaces(objects: Sequence[LabelledObject]) -> rr.Mesh3D:
-    """Return the triangles of the graphs of a frame, as one translucent mesh."""
-    shown = [o for o in objects if len(o.gas.triangles)]
-    starts = np.cumsum([0, *(len(o.gas.neurons) for o in shown)])
-    faces = [o.gas.triangles.astype(np.uint32) + n for o, n in zip(shown, starts, strict=False)]
-    colours = [np.full(len(o.gas.neurons), _packed(o.category, 70), np.uint32) for o in shown]
-    return rr.Mesh3D(
-        vertex_positions=_stacked([o.gas.neurons for o in shown]),
-        triangle_indices=np.concatenate(faces) if faces else np.zeros((0, 3), np.uint32),
-        vertex_colors=np.concatenate(colours) if colours else np.zeros(0, np.uint32),
-    )
+def _surfaces(moments: Sequence[Moment]) -> _Columns:
+    """Return the triangles of the graphs, one translucent mesh a frame."""
+    shown = [[o for o in m.labelled.objects if len(o.gas.triangles)] for m in moments]
+    objects = list(chain.from_iterable(shown))
+    sizes = [len(o.gas.neurons) for o in objects]
+    colours = np.repeat(_packed(objects, alpha=70), sizes)
+    yield from rr.Mesh3D.columns(
+        vertex_positions=_stacked([o.gas.neurons for o in objects], 3), vertex_colors=colours
+    ).partition([sum(len(o.gas.neurons) for o in each) for each in shown])
+    meshes = [_mesh([(len(o.gas.neurons), o.gas.triangles) for o in each]) for each in shown]
+    yield _faces(meshes)
 
 
-def outlines(planes: Sequence[Plane]) -> rr.LineStrips3D:
+def _outlines(moments: Sequence[Moment]) -> _Columns:
     """Return the closed outlines of the planes."""
-    strips = [np.concatenate([p.outline, p.outline[:1]]) for p in planes if len(p.outline)]
-    return rr.LineStrips3D(strips, colors=_PLANE, radii=0.001)
+    shown = [[p.outline for p in m.labelled.planes if len(p.outline)] for m in moments]
+    strips = [np.concatenate([o, o[:1]]) for o in chain.from_iterable(shown)]
+    yield from rr.LineStrips3D.columns(strips=strips).partition([len(each) for each in shown])
 
 
-def fills(planes: Sequence[Plane]) -> rr.Mesh3D:
-    """Return the planes as translucent polygons: fans, as outlines are convex."""
-    shown = [plane.outline for plane in planes if len(plane.outline) >= 3]
-    starts = np.cumsum([0, *(len(outline) for outline in shown)])
-    faces = [
-        (start, start + k, start + k + 1)
-        for outline, start in zip(shown, starts.tolist(), strict=False)
-        for k in range(1, len(outline) - 1)
-    ]
-    return rr.Mesh3D(
-        vertex_positions=_stacked(shown),
-        triangle_indices=np.reshape(faces, (-1, 3)).astype(np.uint32),
-        albedo_factor=(*_PLANE, 28),
-    )
+def _fills(moments: Sequence[Moment]) -> _Columns:
+    """Return the planes as polygons: fans, as outlines are convex."""
+    shown = [[p.outline for p in m.labelled.planes if len(p.outline) >= 3] for m in moments]
+    corners = _stacked(list(chain.from_iterable(shown)), 3)
+    counts = [sum(map(len, outlines)) for outlines in shown]
+    yield from rr.Mesh3D.columns(vertex_positions=corners).partition(counts)
+    yield _faces([_mesh([(len(o), _fan(len(o))) for o in outlines]) for outlines in shown])
 
 
-def paths(ways: Iterable[tuple[str, Sequence[F8]]]) -> rr.LineStrips3D:
-    """Return lines (category, places) in metres."""
-    kept = list(ways)
-    return rr.LineStrips3D(
-        [np.array(places) for _, places in kept],
-        colors=[_tint(category, 0.2) for category, _ in kept],
-        radii=0.0015,
-    )
+def _fan(corners: int) -> U4:
+    inner = np.arange(1, corners - 1)
+    return np.stack([np.zeros_like(inner), inner, inner + 1], axis=1).astype(np.uint32)
 
 
-def transform3d(pose: Pose) -> rr.Transform3D:
-    """Return the pose ``parent_from_child``."""
-    return rr.Transform3D(
-        translation=pose.translation, quaternion=quaternion_from_rotation(pose.rotation)
+def _mesh(parts: Sequence[tuple[int, U4]]) -> U4:
+    """Return the triangles of one mesh of parts, each so many vertices and its triangles."""
+    starts = np.cumsum([0, *(vertices for vertices, _ in parts)])
+    faces = [triangles + start for (_, triangles), start in zip(parts, starts, strict=False)]
+    return np.concatenate(faces).astype(np.uint32) if faces else np.zeros((0, 3), np.uint32)
+
+
+def _faces(meshes: Sequence[U4]) -> rr.ComponentColumn:
+    (column,) = rr.Mesh3D.columns(triangle_indices=np.concatenate(meshes))
+    return column.partition([len(mesh) for mesh in meshes])
+
+
+DRAWINGS: Mapping[str, Drawing] = {
+    # The colours of points are shaded already; labels of boxes would cover the objects.
+    "scene": Drawing(
+        rr.Points3D.from_fields(point_shading=rr.components.PointShading.Flat), _scene
+    ),
+    "objects/points": Drawing(
+        rr.Points3D.from_fields(point_shading=rr.components.PointShading.Flat), _objects
+    ),
+    "planes": Drawing(rr.LineStrips3D.from_fields(colors=_PLANE, radii=0.001), _outlines),
+    "planes/fill": Drawing(rr.Mesh3D.from_fields(albedo_factor=(*_PLANE, 28)), _fills),
+    "objects/boxes": Drawing(rr.Boxes3D.from_fields(radii=0.001, show_labels=False), _boxes),
+    "objects/captions": Drawing(rr.Points3D.from_fields(radii=0.0005, show_labels=True), _captions),
+    "objects/graphs": Drawing(rr.LineStrips3D.from_fields(radii=0.0008), _graphs),
+    "objects/surfaces": Drawing(None, _surfaces),
+}
+"""What is drawn of a frame, by entity below the sensor's."""
+
+
+def paths(snapshots: Sequence[Sequence[Way]]) -> _Columns:
+    """Return the ways of some frames."""
+    ways = [way for snapshot in snapshots for way in snapshot]
+    yield from rr.LineStrips3D.columns(
+        strips=[places for _, places in ways], colors=[_tint(category, 0.2) for category, _ in ways]
+    ).partition([len(snapshot) for snapshot in snapshots])
+
+
+def places(poses: Sequence[Pose]) -> _Columns:
+    """Return poses ``parent_from_child``."""
+    yield from rr.Transform3D.columns(
+        translation=[pose.translation for pose in poses],
+        quaternion=[quaternion_from_rotation(pose.rotation) for pose in poses],
     )
 
 
@@ -176,8 +236,14 @@ def _above(box: Box) -> F8:
     return np.asarray(box.center + (0.5 * box.size[2] + _CAPTION_M) * up)
 
 
-def _stacked(rows: Sequence[F8]) -> F8:
-    return np.concatenate(rows) if len(rows) else np.zeros((0, 3), np.float32)
+def _objects_of(moments: Sequence[Moment]) -> tuple[list[LabelledObject], list[int]]:
+    """Return the objects of all frames, and how many each has."""
+    objects = [item for moment in moments for item in moment.labelled.objects]
+    return objects, [len(moment.labelled.objects) for moment in moments]
+
+
+def _stacked(rows: Sequence[F8], width: int) -> F8:
+    return np.concatenate([np.reshape(row, (-1, width)) for row in rows] or [np.zeros((0, width))])
 
 
 def _tint(category: str, white: float) -> tuple[int, int, int]:
@@ -186,6 +252,11 @@ def _tint(category: str, white: float) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _packed(category: str, alpha: int, white: float = 0.0) -> int:
-    red, green, blue = _tint(category, white)
-    return int((red << 24) | (green << 16) | (blue << 8) | alpha)
+def _packed(objects: Sequence[LabelledObject], *, alpha: int = 255, white: float = 0.0) -> U4:
+    """Return (n,) colours 0xRRGGBBAA of the categories of objects."""
+    tints = {category: _tint(category, white) for category in {o.category for o in objects}}
+    numbers = {
+        category: (red << 24) | (green << 16) | (blue << 8) | alpha
+        for category, (red, green, blue) in tints.items()
+    }
+    return np.array([numbers[o.category] for o in objects], np.uint32)
