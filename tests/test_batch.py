@@ -2,8 +2,10 @@
 
 import json
 import os
+import resource
 import shutil
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -29,6 +31,7 @@ Run = Callable[..., Result]
 TABLES = ("frames", "detections", "planes", "tracks")
 NAMES = ("bag", "folder", "log")
 FRAMES = 40
+QUIET: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 
 
 class Watcher:
@@ -286,10 +289,56 @@ def test_recording_that_kills_its_workers_is_given_up(recordings: Path, tmp_path
     with planned(recordings, tmp_path) as batch:
         drain(batch, fragile, watcher)
 
-    assert fragile.begun.count("bag") == 3
+    assert fragile.begun.count("bag") == 2
     (failed,) = [o for o in watcher.outcomes if o.job.folder.name == "bag"]
-    assert "gave up after 3 tries" in failed.message
+    assert "gave up after 2 tries" in failed.message
     assert states(tmp_path) == {**ALL_DONE, "bag": "failed"}
+
+
+def test_recording_that_only_waited_is_not_blamed(recordings: Path, tmp_path: Path) -> None:
+    """A scheduler that restarts drops all that wait, again and again."""
+
+    class Forgetful(Fragile):
+        def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
+            future: Future[Any] = Future()
+            if self.begun.count("bag") < 5 and args[0].folder.name == "bag":
+                self.begun.append("bag")
+                future.cancel()
+                future.set_running_or_notify_cancel()
+                return future
+            return super().submit(fn, *args, **kwargs)
+
+    with planned(recordings, tmp_path) as batch:
+        drain(batch, Forgetful(""), Watcher())
+
+    assert states(tmp_path) == ALL_DONE
+    assert Manifest(tmp_path / "manifest.jsonl").entries["bag"].tries == 1
+
+
+def test_full_disk_stops_the_large_and_not_the_small(shapecat: Run, tmp_path: Path) -> None:
+    """A limit on the size of files stands for the disk."""
+    (tmp_path / "in").mkdir()
+    record(tmp_path / "in" / "long.mcap", FRAMES)
+    record(tmp_path / "in" / "short.mcap", 4)
+    command = ("process", tmp_path / "in", "--jobs", 2, "--no-rrd", "--out", tmp_path / "out")
+    assert shapecat(*command[:-1], tmp_path / "free").exit_code == 0
+    largest = [
+        max(path.stat().st_size for path in (tmp_path / "free" / name).iterdir())
+        for name in ("short", "long")
+    ]
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (sum(largest) // 2, hard))
+    try:
+        full = shapecat(*command)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+
+    assert full.exit_code == 1, full.output
+    assert "cannot" in full.output
+    assert states(tmp_path / "out") == {"long": "failed", "short": "complete"}
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["manifest.jsonl", "short"]
+    assert shapecat(*command).exit_code == 0
+    assert set(states(tmp_path / "out").values()) == {"complete"}
 
 
 def test_interrupted_batch_ends_at_once_and_goes_on(
@@ -338,6 +387,55 @@ def test_dask_gives_the_same_tables_though_a_worker_is_killed(
     assert exit_code(outcomes) == 1
     assert len(outcomes) == 4
     assert_same(one_by_one, tmp_path)
+
+
+@pytest.mark.many
+def test_dask_goes_on_when_its_scheduler_is_restarted(
+    recordings: Path, one_by_one: Path, tmp_path: Path
+) -> None:
+    """What a scheduler knew is gone with it, and its workers end: both are started anew."""
+    pytest.importorskip("distributed")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+    first = DaskCluster(address)
+    command = [
+        *(sys.executable, "-m", "shapecat", "process", str(recordings), "--out", str(tmp_path)),
+        *("--executor", "dask", "--scheduler", address, "--no-rrd"),
+    ]
+    running = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+    wait_for(lambda: "running" in states(tmp_path).values(), 60)
+    first.kill()
+    second = DaskCluster(address)
+    try:
+        _, errors = running.communicate(timeout=120)
+    finally:
+        running.kill()
+        second.kill()
+
+    assert running.returncode == 1, errors
+    assert_same(one_by_one, tmp_path)
+    assert states(tmp_path) == ALL_DONE
+
+
+class DaskCluster:
+    """A scheduler and two workers, each of its own processes."""
+
+    def __init__(self, address: str) -> None:
+        dask = (sys.executable, "-m", "dask")
+        host = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
+        self._processes = [
+            subprocess.Popen([*dask, *arguments, *host], start_new_session=True, **QUIET)
+            for arguments in (
+                ("scheduler", "--port", address.rpartition(":")[2]),
+                ("worker", address, "--nworkers", "2", "--nthreads", "1"),
+            )
+        ]
+
+    def kill(self) -> None:
+        """Kill all of it."""
+        for process in self._processes:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
 
 
 @pytest.mark.ray

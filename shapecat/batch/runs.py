@@ -15,7 +15,7 @@ from shapecat.batch.manifest import Entry, Manifest
 from shapecat.batch.plans import Task
 from shapecat.batch.remote import download, fetch, look_at, scratch, upload
 from shapecat.errors import OutputError, ShapecatError
-from shapecat.executors import Mailbox, is_lost, post
+from shapecat.executors import Mailbox, is_dropped, is_lost, post
 from shapecat.jobs import Job, Summary, summarize
 from shapecat.pipeline import Observer, process
 from shapecat.run_folder import read_run
@@ -24,7 +24,7 @@ __all__ = ["Outcome", "Watcher", "attempt", "exit_code", "process_here", "proces
 
 _log = logging.getLogger(__name__)
 
-_TRIES = 3
+_TRIES = 2
 """Times a recording is begun before it is held to kill its workers."""
 _AHEAD = 1000
 """Recordings handed to an executor at a time: a scheduler need not hold a hundred thousand."""
@@ -81,7 +81,8 @@ def process_on(
 ) -> Iterator[Outcome]:
     """Process the tasks on an executor, the largest first; yield what became of each.
 
-    A recording whose worker dies is tried again twice, then reported; the others go on.
+    A recording whose worker dies is tried once more, then reported; the others go on. One that
+    only waited when the scheduler was lost has not been tried.
     """
     ledger = _Ledger(tasks, manifest)
 
@@ -116,7 +117,7 @@ def _outcomes(
             running += 1
         job, future = ended.get()
         error = _error(future)
-        if error is not None and is_lost(error) and ledger.lost(job) < _TRIES:
+        if error is not None and is_lost(error) and ledger.lost(job, error) < _TRIES:
             begin(job)
             continue
         running -= 1
@@ -231,11 +232,15 @@ class _Ledger:
                     return
                 self._note(entry, state="running")
 
-    def lost(self, job: Job) -> int:
+    def lost(self, job: Job, error: BaseException) -> int:
         """Note that a worker died; return how many have died of this recording."""
+        name = job.folder.name
         with self._lock:
-            self._tries[job.folder.name] += 1
-            return self._tries[job.folder.name] - 1
+            waited = self._entries[name].state != "running"
+            if not (is_dropped(error) and waited):
+                self._tries[name] += 1
+                self._note(self._entries[name], state="planned")
+            return self._tries[name] - 1
 
     def ended(self, outcome: Outcome) -> None:
         """Note what became of a recording."""

@@ -5,8 +5,7 @@ adapters of libraries that the extras ``cluster`` and ``ray`` bring.
 """
 
 from collections.abc import Callable
-from concurrent.futures import CancelledError, Executor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Executor
 from typing import Literal, get_args
 
 from shapecat.errors import ConfigError
@@ -19,6 +18,7 @@ __all__ = [
     "LocalExecutor",
     "Mailbox",
     "WorkerLostError",
+    "is_dropped",
     "is_lost",
     "limited_threads",
     "open_executor",
@@ -30,9 +30,9 @@ __all__ = [
 Name = Literal["local", "dask", "ray"]
 EXECUTORS: tuple[str, ...] = get_args(Name)
 
-_LOST = (WorkerLostError, BrokenProcessPool, CancelledError)
-_LOST_ELSEWHERE = {"KilledWorker", "WorkerCrashedError", "FutureCancelledError", "CommClosedError"}
-"""Errors of Dask and Ray that mean the same; by name, as neither need be installed."""
+_LOST = {"WorkerLostError", "BrokenProcessPool", "KilledWorker", "WorkerCrashedError"}
+_DROPPED = {"CancelledError", "FutureCancelledError", "CommClosedError"}
+"""Errors by name, as neither Dask nor Ray need be installed."""
 
 
 def open_executor(
@@ -78,4 +78,9 @@ _OPENERS: dict[str, Callable[[int, int, str | None], Executor]] = {
 
 def is_lost(error: BaseException) -> bool:
     """Return whether an error means that the worker died, not that the task failed."""
-    return isinstance(error, _LOST) or type(error).__name__ in _LOST_ELSEWHERE
+    return type(error).__name__ in _LOST | _DROPPED
+
+
+def is_dropped(error: BaseException) -> bool:
+    """Return whether the task may not have been begun: its scheduler has gone."""
+    return type(error).__name__ in _DROPPED
