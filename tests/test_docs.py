@@ -1,14 +1,19 @@
 """The documentation is held to the commands: each is explained, each printed line works."""
 
+import ast
 import re
 from collections.abc import Callable
 from importlib.metadata import entry_points
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import click
 import pytest
 from click.testing import Result
+
+from shapecat import config
+from shapecat.config import Settings
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -52,6 +57,36 @@ def test_commands_in_the_documentation_exist_with_their_options(page: str, line:
     options = {word.split("=")[0] for word in words[2:] if word.startswith("--")}
 
     assert options <= known, f"{page}: {line}"
+
+
+def setting_rows() -> list[str]:
+    """Return the table of settings as the reference should have it, from the source."""
+    defaults = Settings().as_dict()
+    rows = [f"| `seed` | `{defaults['seed']}` | fixes every random choice |"]
+    source = ast.parse(Path(config.__file__).read_text("utf-8"))
+    classes = {node.name: node for node in source.body if isinstance(node, ast.ClassDef)}
+    for group, values in defaults.items():
+        if not isinstance(values, dict):
+            continue
+        body = classes[f"{group.capitalize().removesuffix('s')}Settings"].body
+        for line, text in pairwise(body):
+            if isinstance(line, ast.AnnAssign) and isinstance(text, ast.Expr):
+                name, meaning = (
+                    ast.unparse(line.target),
+                    " ".join(ast.literal_eval(text.value).split()),
+                )
+                rows.append(f"| `{group}.{name}` | `{values[name]}` | {meaning} |")
+    return rows
+
+
+def test_the_reference_has_every_setting_with_its_default() -> None:
+    reference = (ROOT / "docs" / "reference.md").read_text("utf-8").splitlines()
+    expected = setting_rows()
+    named = 1 + sum(
+        len(group) for group in Settings().as_dict().values() if isinstance(group, dict)
+    )
+    assert len(expected) == named, "a setting without a docstring"
+    assert [row for row in expected if row not in reference] == []
 
 
 def test_links_between_pages_lead_somewhere() -> None:
