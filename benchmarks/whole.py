@@ -60,9 +60,11 @@ def to_and_fro(views: list[View], frames: int) -> Iterator[View]:
         yield cycle[k % len(cycle)]
 
 
-def write(path: Path, views: list[View], frames: int) -> Path:
-    """Write a recording of so many frames."""
-    with CONTAINERS["mcap"][1](path) as writer:
+def write(path: Path, views: list[View], frames: int, *, container: str = "mcap") -> Path:
+    """Write a recording of so many frames; ``path`` gets the suffix of the format."""
+    suffix, kind = CONTAINERS[container]
+    path = path.with_name(path.name.removesuffix(suffix) + suffix)
+    with kind(path) as writer:
         make = writer.messages
         still = [("camera_link", OPTICAL, LINK_FROM_OPTICAL)]
         writer.write("/tf_static", make.transforms(still, EPOCH_NS), EPOCH_NS)

@@ -1,0 +1,116 @@
+"""Many recordings: the same tables whoever works on them, and how much faster two cores are.
+
+    python -m benchmarks.batch            some minutes; prints a table
+
+Recordings of three formats, some broken, are processed one at a time, two at a time, on Dask, on
+Ray where it is installed, and in shards. Anything but the same tables is an error.
+"""
+
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from importlib.util import find_spec
+from pathlib import Path
+
+import click
+import pyarrow.parquet as pq
+
+from benchmarks.measure import markdown, save
+from benchmarks.whole import tabletop, write
+from shapecat.batch.manifest import Manifest
+
+FORMATS = ("mcap", "ros1", "ros2")
+TABLES = ("frames", "detections", "planes", "tracks")
+SHARDS = 4
+
+
+def make(folder: Path, *, recordings: int, broken: int, frames: int) -> Path:
+    """Write recordings of all formats, and some that cannot be read."""
+    folder.mkdir()
+    views, _ = tabletop(60)
+    for k in range(recordings - broken):
+        start = (7 * k) % 60
+        turned = [*views[start:], *views[:start]]
+        write(folder / f"r{k:02}", turned, frames, container=FORMATS[k % len(FORMATS)])
+    for k in range(broken):
+        (folder / f"broken{k}{('.mcap', '.bag')[k % 2]}").write_bytes(b"no recording" * k)
+    return folder
+
+
+def process(recordings: Path, out: Path, *options: str) -> tuple[int, float]:
+    """Run ``shapecat process``; return the exit code and the wall time."""
+    command = [sys.executable, "-m", "shapecat", "process", str(recordings), "--out", str(out)]
+    begun = time.perf_counter()
+    done = subprocess.run([*command, *options], check=False, capture_output=True)
+    return done.returncode, time.perf_counter() - begun
+
+
+def same(one: Path, two: Path) -> bool:
+    """Tell whether two folders of results have the same tables; times may differ."""
+    names = [sorted(path.name for path in folder.glob("*/")) for folder in (one, two)]
+    if names[0] != names[1]:
+        return False
+    for name in names[0]:
+        for table in TABLES:
+            a, b = (pq.read_table(folder / name / f"{table}.parquet") for folder in (one, two))
+            timed = [column for column in a.column_names if column == "seconds"]
+            if not a.drop_columns(timed).equals(b.drop_columns(timed)):
+                return False
+        if (one / name / "tracks.csv").read_bytes() != (two / name / "tracks.csv").read_bytes():
+            return False
+    return True
+
+
+def ways() -> dict[str, Sequence[Sequence[str]]]:
+    """Return the options of each way to process, a run for each item."""
+    every: dict[str, Sequence[Sequence[str]]] = {
+        "--jobs 1": [["--jobs", "1"]],
+        "--jobs 2": [["--jobs", "2"]],
+        "--executor dask": [["--jobs", "2", "--executor", "dask"]],
+        "--executor ray": [["--jobs", "2", "--executor", "ray"]],
+        f"{SHARDS} shards": [["--jobs", "1", "--shard", f"{k}/{SHARDS}"] for k in range(SHARDS)],
+    }
+    if find_spec("ray") is None:
+        del every["--executor ray"]
+    return every
+
+
+@click.command()
+@click.option("--recordings", default=40)
+@click.option("--broken", default=4)
+@click.option("--frames", default=60, help="Of each recording.")
+def main(*, recordings: int, broken: int, frames: int) -> None:
+    """Process a batch in every way, print a table, write ``build/benchmarks_batch.json``."""
+    os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    rows, figures = [], {}
+    with tempfile.TemporaryDirectory() as folder:
+        root = Path(folder)
+        made = make(root / "in", recordings=recordings, broken=broken, frames=frames)
+        first = 0.0
+        for way, runs in ways().items():
+            out = root / way.strip("-").replace(" ", "_")
+            spent = [process(made, out, *options) for options in runs]
+            wall_s = sum(seconds for _, seconds in spent)
+            first = first or wall_s
+            entries = Manifest(out / "manifest.jsonl").entries.values()
+            states = [entry.state for entry in entries]
+            agree = same(root / "jobs_1", out)
+            counts = {state: states.count(state) for state in ("complete", "failed")}
+            codes = sorted({code for code, _ in spent})
+            rows.append((way, *counts.values(), codes, f"{wall_s:.0f}", f"{wall_s / first:.2f}",
+                         "yes" if agree else "NO"))  # fmt: skip
+            figures[way] = {"seconds": round(wall_s, 1), "same": agree, **counts}
+            if not agree or counts != {"complete": recordings - broken, "failed": broken}:
+                for entry in entries:
+                    print(entry.state, entry.folder, entry.message)
+                raise SystemExit(1)
+    columns = ("", "complete", "failed", "exit code", "s", "of --jobs 1", "same tables")
+    print(markdown(f"{recordings} recordings of {frames} frames", columns, rows))
+    save(Path("build/benchmarks_batch.json"), figures)
+
+
+if __name__ == "__main__":
+    main()
