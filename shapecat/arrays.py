@@ -63,9 +63,12 @@ def _freeze(
 ) -> NDArray[Any]:
     """Do the work of `freeze`: records are made by the thousand."""
     result = np.asarray(value, dtype)
-    if len(axes) != result.ndim or not all(
-        size == (axis if isinstance(axis, int) else sizes.setdefault(axis, size))
-        for axis, size in zip(axes, result.shape, strict=True)
+    if result.shape != axes and not (  # numbers alone are compared at once
+        len(axes) == result.ndim
+        and all(
+            size == (axis if isinstance(axis, int) else sizes.setdefault(axis, size))
+            for axis, size in zip(axes, result.shape, strict=True)
+        )
     ):
         known = f" with {sizes}" if sizes else ""
         names = ", ".join(map(str, axes))
@@ -73,7 +76,7 @@ def _freeze(
         raise ValueError(msg)
     if result.flags.writeable:
         result = result.view()
-        result.flags.writeable = False
+        result.setflags(write=False)
     return result
 
 

@@ -545,3 +545,30 @@ def test_cut_objects_are_flagged_in_clouds_too() -> None:
     assert flags[max(flags)]
     assert sum(c.touches_border for c in found(frame).candidates) == 1
     assert seen.max() == 2
+
+
+def test_board_at_a_grazing_angle() -> None:
+    """A board 9 cm below the camera is a few rows high in the image; what stands on it counts."""
+    board = 0.42
+    shapes = [table(0.45, 0.3), table(0.4, 0.2, board), box((0, -0.05, board), (0.1, 0.1, 0.08))]
+    depth, seen = render(shapes, tilt_deg=20, distance=1.5)
+    scene = found(frame_of(depth))
+    np.testing.assert_allclose([p.height_m for p in scene.planes], [0, board], atol=0.02)
+    assert min(overlaps(scene, seen, [2])) > 0.8
+
+
+def test_what_rises_beyond_the_greatest_height_is_no_object() -> None:
+    """Of a tall post only the lower part is looked at, and it stands on the table; it is none."""
+    post, tall_box = box((-0.25, 0.1, 0), (0.04, 0.04, 0.9)), box((0.1, 0, 0), (0.1, 0.1, 0.45))
+    check([table(0.6, 0.4), post, tall_box], [2], tilt_deg=25, distance=1.5)
+
+
+def test_box_over_the_edge_of_the_table() -> None:
+    """What sticks out over the near edge belongs to the object, down to the last reading."""
+    check([table(0.5, 0.3), box((0, -0.28, 0), (0.1, 0.12, 0.1))], [1], least=0.93)
+
+
+def test_a_row_of_boxes_is_no_wall() -> None:
+    """The fronts of boxes in line lie in one upright plane, 0.75 m wide."""
+    row = [box((0.16 * k - 0.32, 0, 0), (0.11, 0.08, 0.16)) for k in range(5)]
+    check([table(0.6, 0.4), *row], [1, 2, 3, 4, 5], tilt_deg=25, distance=1.2)

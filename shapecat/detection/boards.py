@@ -7,7 +7,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import NEAREST_M, Cells, Lens
 from shapecat.detection.consensus import TOLERANCE
-from shapecat.detection.planes import DIRECTIONS, Support, corners_of
+from shapecat.detection.planes import COS, SIN, Support, corners_of
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 
@@ -54,8 +54,7 @@ def _overlaps(lower: Support, upper: Support) -> bool:
     """Whether the middle of ``upper`` lies over the outline of ``lower``."""
     middle = corners_of(upper).mean(axis=0)
     flat = gravity_rotation(lower.up)[:2] @ middle
-    angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
-    along = np.cos(angle) * flat[0] + np.sin(angle) * flat[1]
+    along = COS * flat[0] + SIN * flat[1]
     return bool((along < lower.reach).all())
 
 

@@ -65,13 +65,12 @@ def stands_of(found: Segmentation) -> list[Stand]:
 
 def _hidden_stand(pieces: Pieces, leaders: I4, p: int) -> int:
     shape = pieces.shape
-    met = (
-        pieces.pairs[CONTACT] + pieces.pairs[NEAR] + pieces.pairs[FRONT] + pieces.pairs[FRONT].T
-    )[p, leaders]
+    pairs = pieces.pairs
+    met = pairs[CONTACT, p] + pairs[NEAR, p] + pairs[FRONT, p] + pairs[FRONT, :, p]
     below = abs(shape[leaders, TOP] - shape[p, BOTTOM]) < GAP_M
     middle = (shape[p, LEFT] + shape[p, RIGHTMOST]) / 2
     beside = (shape[leaders, LEFT] < middle) & (middle < shape[leaders, RIGHTMOST])
-    fits = met * (below & beside & (leaders != p) & (leaders > 0))
+    fits = met[leaders] * (below & beside & (leaders != p) & (leaders > 0))
     return int(np.argmax(fits)) if fits.max() >= 3 else 0
 
 

@@ -13,7 +13,7 @@ from shapecat.arrays import F4
 from shapecat.jit import kernel
 from shapecat.types import Camera
 
-__all__ = ["JUMP", "NEAREST_M", "Cells", "Lens", "cells_of"]
+__all__ = ["JUMP", "NEAREST_M", "Cells", "Lens", "cells_of", "middle_of"]
 
 JUMP = 0.012
 """Step in inverse depth that separates surfaces, 1/m: four steps of a Kinect, 1 cm at 0.9 m."""
@@ -68,7 +68,7 @@ def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_
     sample = sample[(sample >= NEAREST_M) & (sample <= range_m)]
     if sample.size == 0:
         return None
-    pixel_m = float(np.median(sample)) / max(abs(camera.fx), 1e-6)
+    pixel_m = middle_of(sample) / max(abs(camera.fx), 1e-6)
     least = math.sqrt(depth.size / MOST_CELLS)
     factor = round(min(max(cell_m / max(pixel_m, 1e-9), least, 1.0), LARGEST_FACTOR, *depth.shape))
     shift = (factor - 1) / 2
@@ -82,6 +82,11 @@ def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_
     w = np.zeros((rows, columns), np.float32)
     _average(depth, factor, np.float32(range_m), np.float32(JUMP), w)
     return Cells(w, lens, factor, factor * pixel_m)
+
+
+def middle_of(values: F4) -> float:
+    """Return the upper median of at least one value; `numpy.median` takes twice as long."""
+    return float(np.partition(values, values.size // 2)[values.size // 2])
 
 
 @kernel

@@ -41,14 +41,29 @@ class Readings(NamedTuple):
     share: int
 
 
-def readings_of(cells: Cells, w: F4 | None = None) -> Readings:
-    """Return evenly spaced cells with a reading; ``w`` replaces the image of the cells."""
-    image = cells.w if w is None else w
-    stride = max(1, round(math.sqrt(image.size / SAMPLE)))
-    sample = image[stride // 2 :: stride, stride // 2 :: stride]
-    i, j = np.nonzero(sample)
-    place = [(k * stride + stride // 2).astype(np.float32) for k in (j, i)]
-    return Readings(place[0], place[1], sample[i, j], stride * stride)
+def readings_of(cells: Cells, owner: I4 | None = None) -> Readings:
+    """Return evenly spaced cells with a reading, those of objects if there is an ``owner``."""
+    stride = max(1, round(math.sqrt(cells.w.size / SAMPLE)))
+    grid = (slice(stride // 2, None, stride),) * 2
+    sample = cells.w[grid]
+    if owner is not None:
+        sample = np.where(owner[grid] > 0, sample, np.float32(0))
+    j, i, w = _listed(np.ascontiguousarray(sample), stride)
+    return Readings(j, i, w, stride * stride)
+
+
+@kernel
+def _listed(sample: F4, stride: int) -> tuple[F4, F4, F4]:
+    """Return the columns, rows and values of what is not 0 among every so many cells."""
+    result = np.zeros((3, sample.size), np.float32)
+    n = 0
+    for i in range(sample.shape[0]):
+        for j in range(sample.shape[1]):
+            if sample[i, j] > 0:
+                result[0, n], result[1, n] = j * stride + stride // 2, i * stride + stride // 2
+                result[2, n] = sample[i, j]
+                n += 1
+    return result[0, :n], result[1, :n], result[2, :n]
 
 
 def without(readings: Readings, plane: F8, tolerance: float) -> Readings:
@@ -60,9 +75,10 @@ def without(readings: Readings, plane: F8, tolerance: float) -> Readings:
 
 def normal_of(plane: F8, lens: Lens) -> F8:
     """Return the unit normal towards the camera of a plane (a, b, c) of inverse depth."""
-    a, b, c = plane
-    n = -np.array([a * lens.fx, b * lens.fy, a * lens.cx + b * lens.cy + c])
-    return np.asarray(n / np.linalg.norm(n))
+    a, b, c = plane.tolist()
+    x, y, z = -a * lens.fx, -b * lens.fy, -(a * lens.cx + b * lens.cy + c)
+    norm = math.sqrt(x * x + y * y + z * z)
+    return np.array([x / norm, y / norm, z / norm])
 
 
 def level_plane(lens: Lens, up: F8, offset: float) -> F8:
@@ -137,7 +153,7 @@ def _count(readings: Readings, a: float, b: float, c: float) -> int:
     return int(total)
 
 
-@kernel
+@kernel(fast=True)
 def refit(j: F4, i: F4, w: F4, tolerance: float, plane: F8) -> int:
     """Fit a plane (a, b, c) to its inliers by least squares; return how many they are.
 
@@ -146,23 +162,23 @@ def refit(j: F4, i: F4, w: F4, tolerance: float, plane: F8) -> int:
     if w.size == 0:
         return 0
     a, b, c = plane[0], plane[1], plane[2]
-    j0, i0, w0 = j[0], i[0], w[0]
-    n = 0
-    mx = my = mw = xx = xy = yy = xw = yw = 0.0
+    j0, i0, w0 = float(j[0]), float(i[0]), float(w[0])
+    n = mx = my = mw = xx = xy = yy = xw = yw = 0.0
     for k in range(w.size):
-        if abs(w[k] - (a * j[k] + b * i[k] + c)) < tolerance:
-            x, y, v = float(j[k] - j0), float(i[k] - i0), float(w[k] - w0)
-            n += 1
-            mx += x
-            my += y
-            mw += v
-            xx += x * x
-            xy += x * y
-            yy += y * y
-            xw += x * v
-            yw += y * v
+        # A sum of products with 0 or 1 vectorises.
+        near = 1.0 if abs(w[k] - (a * j[k] + b * i[k] + c)) < tolerance else 0.0
+        x, y, v = near * (j[k] - j0), near * (i[k] - i0), near * (w[k] - w0)
+        n += near
+        mx += x
+        my += y
+        mw += v
+        xx += x * x
+        xy += x * y
+        yy += y * y
+        xw += x * v
+        yw += y * v
     if n < 3:
-        return n
+        return int(n)
     mx, my, mw = mx / n, my / n, mw / n
     xx, xy, yy = xx / n - mx * mx, xy / n - mx * my, yy / n - my * my
     xw, yw = xw / n - mx * mw, yw / n - my * mw
@@ -172,4 +188,4 @@ def refit(j: F4, i: F4, w: F4, tolerance: float, plane: F8) -> int:
         b = (yw * xx - xw * xy) / determinant
         plane[0], plane[1] = a, b
         plane[2] = w0 + mw - a * (mx + j0) - b * (my + i0)
-    return n
+    return int(n)

@@ -7,6 +7,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.cells import JUMP, Cells, Lens
 from shapecat.detection.consensus import TOLERANCE, level_plane, normal_of, readings_of, refit
+from shapecat.geometry import cross
 from shapecat.jit import kernel
 
 __all__ = ["estimate_up"]
@@ -43,7 +44,7 @@ def estimate_up(
     if hint is None:
         # Two walls leave one direction, up or down.
         directions += [
-            sign * np.cross(a, b) / np.linalg.norm(np.cross(a, b))
+            sign * cross(a, b) / np.linalg.norm(cross(a, b))
             for k, a in enumerate(directions)
             for b in directions[:k]
             if abs(a @ b) < CORNER_COS
@@ -80,34 +81,37 @@ def _facing(facets: F4, direction: F8, least_cos: float) -> Bool:
     return result
 
 
-@kernel
+@kernel(fast=True)
 def _most_faced(facets: F4, free: Bool, trials: I4, best: F8) -> int:
     """Write the direction most free facets face; return how many."""
-    chosen = np.zeros((np.count_nonzero(free), 3), np.float32)
     n = 0
+    chosen = np.zeros((3, np.count_nonzero(free)), np.float32)
     for k in range(len(facets)):
         if free[k]:
-            chosen[n] = facets[k, :3]
+            chosen[0, n], chosen[1, n], chosen[2, n] = facets[k, 0], facets[k, 1], facets[k, 2]
             n += 1
+    xs, ys, zs = chosen
+    least = np.float32(FACING_COS)
     most = -1
     for t in trials:
         x, y, z = facets[t, 0], facets[t, 1], facets[t, 2]
-        votes = 0
+        votes = np.int32(0)
         for k in range(n):
-            votes += chosen[k, 0] * x + chosen[k, 1] * y + chosen[k, 2] * z > FACING_COS
+            votes += np.int32(xs[k] * x + ys[k] * y + zs[k] * z > least)
         if votes > most:
-            most = votes
+            most = int(votes)
             best[0], best[1], best[2] = x, y, z
     for _ in range(3):
-        x, y, z = best
-        sx = sy = sz = 0.0
-        most = 0
+        x, y, z = np.float32(best[0]), np.float32(best[1]), np.float32(best[2])
+        sx = sy = sz = np.float64(0)
+        votes = np.int32(0)
         for k in range(n):
-            if chosen[k, 0] * x + chosen[k, 1] * y + chosen[k, 2] * z > FACING_COS:
-                most += 1
-                sx += chosen[k, 0]
-                sy += chosen[k, 1]
-                sz += chosen[k, 2]
+            near = xs[k] * x + ys[k] * y + zs[k] * z > least
+            votes += np.int32(near)
+            sx += xs[k] if near else np.float32(0)
+            sy += ys[k] if near else np.float32(0)
+            sz += zs[k] if near else np.float32(0)
+        most = int(votes)
         norm = math.sqrt(sx * sx + sy * sy + sz * sz)
         best[0], best[1], best[2] = sx / norm, sy / norm, sz / norm
     return most

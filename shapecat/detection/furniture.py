@@ -2,23 +2,44 @@
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.arrays import F4, F8, I4, U1, Bool
 from shapecat.detection.cells import JUMP, NEAREST_M, Cells, Lens
 from shapecat.detection.heights import LEAST_M, NOISE
-from shapecat.detection.pieces import AREA, COUNT, FAR, FEW, LEFT, RIGHTMOST, RIM, TOP, Pieces
+from shapecat.detection.pieces import (
+    AREA,
+    COUNT,
+    FAR,
+    FEW,
+    LEFT,
+    RIGHTMOST,
+    RIM,
+    SAMPLES,
+    TOP,
+    Pieces,
+    is_group,
+)
+from shapecat.detection.walls import ON_WALL
 from shapecat.jit import kernel
 
-__all__ = ["is_no_object", "posts_of"]
+__all__ = ["is_no_object", "posts_of", "remains_of", "towers_of"]
 
 RIM_LINKS, RIM_SHARE = 8, 0.1
-FAINT, FAINT_M2, FAINT_CELLS = 2.5, 3e-3, 120
-"""A piece this small must rise so many times above the least height of an object cell."""
+FAINT, FAINT_NOISE, FAINT_M2, FAINT_CELLS = 2.5, 3.5, 3e-3, 120
+"""A piece this small must rise so many times above the least height of an object cell, and of the
+noise in it: spots of noise gather where there is much of a plane far away."""
 POST_M = 0.06
 """A post goes on for so far above and below the level of a board."""
+REMAINS = 0.8
+"""Share of the cells of a piece on a wall."""
+STEP_M, STEPS, MISSES = 0.02, 64, 2.0
+"""A surface is followed upwards in at most so many steps, until it was not seen in more than two;
+where something hides it, half a step counts."""
+TOWERING = 0.5
+"""Share of a piece below surface that goes on beyond the greatest height."""
 
 
-def is_no_object(pieces: Pieces, posts: Bool, *, largest_m: float) -> Bool:
-    """Return for each piece whether it is no object, (n + 1,) bool.
+def is_no_object(pieces: Pieces, furniture: Bool, *, largest_m: float) -> Bool:
+    """Return for each piece whether it is no object, (n + 1,) bool, ``furniture`` included.
 
     The edge of a board and the legs below it meet the board from below; walls and the sides of
     shelves are larger than ``largest_m``; noise of the plane is small and low.
@@ -28,9 +49,9 @@ def is_no_object(pieces: Pieces, posts: Bool, *, largest_m: float) -> Bool:
     edge = (rim >= RIM_LINKS) & (rim >= RIM_SHARE * pieces.boundary)
     large = shape[:, RIGHTMOST] - shape[:, LEFT] > largest_m
     depth = shape[:, FAR] / shape[:, COUNT].clip(1)
-    low = shape[:, TOP] < FAINT * (LEAST_M + NOISE * depth**2)
+    low = shape[:, TOP] < FAINT * LEAST_M + FAINT_NOISE * NOISE * depth**2
     faint = low & ((shape[:, AREA] < FAINT_M2) | (shape[:, COUNT] < FAINT_CELLS))
-    return np.asarray(edge | large | faint | posts)
+    return np.asarray(edge | large | faint | furniture)
 
 
 def posts_of(cells: Cells, owner: I4, regions: I4, pieces: Pieces, up: F8) -> Bool:
@@ -39,6 +60,72 @@ def posts_of(cells: Cells, owner: I4, regions: I4, pieces: Pieces, up: F8) -> Bo
     if owner.max() > 1:
         _through(cells.w, cells.lens, owner, regions, pieces.group, up, through)
     return np.asarray(through >= FEW)
+
+
+def remains_of(walls: U1, regions: I4, pieces: Pieces) -> Bool:
+    """Return for each piece whether it is a small part of a wall, between the objects before it."""
+    size = pieces.group.size
+    on = np.bincount(pieces.group[regions[walls == ON_WALL]], minlength=size)
+    return np.asarray(on > REMAINS * pieces.shape[:, COUNT])
+
+
+def towers_of(cells: Cells, planes: F8, pieces: Pieces, up: F8, *, highest_m: float) -> Bool:
+    """Return for each piece whether its surface goes on upwards beyond ``highest_m``.
+
+    The sides of shelves, door frames and whatever stands before the table reach higher above a
+    plane than objects on it, also where only pieces of them are seen.
+    """
+    share = np.zeros(pieces.group.size)
+    _tower(cells.w, cells.lens, planes, pieces, up, highest_m, share)
+    return np.asarray(share > TOWERING)
+
+
+@kernel
+def _tower(
+    w: F4, lens: Lens, planes: F8, pieces: Pieces, up: F8, highest: float, share: F8
+) -> None:
+    """Write the share of the samples of each piece from which the surface goes on so high."""
+    columns = w.shape[1]
+    for p in range(1, share.size):
+        if not is_group(pieces, p) or pieces.owner[p] <= 0:
+            continue
+        plane = planes[pieces.owner[p] - 1]
+        n = high = 0
+        for t in range(SAMPLES):
+            s = pieces.samples[p, t]
+            if s < 0:
+                break
+            i, j = s // columns, s % columns
+            z = 1 / w[i, j]
+            h = (w[i, j] - (plane[0] * j + plane[1] * i + plane[2])) * z * plane[3]
+            n += 1
+            high += h + _rise(w, lens, i, j, up, highest - h) > highest - STEP_M
+        share[p] = high / max(n, 1)
+
+
+@kernel
+def _rise(w: F4, lens: Lens, i: int, j: int, up: F8, most: float) -> float:
+    """Return how far the surface of a cell goes straight on upwards, up to about ``most``."""
+    z = 1 / w[i, j]
+    x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
+    reach = misses = 0.0
+    for k in range(1, STEPS):
+        d = STEP_M * k
+        depth = z + d * up[2]
+        if d > most + STEP_M or depth <= NEAREST_M:
+            break
+        v = int(lens.cy + lens.fy * (y + d * up[1]) / depth + 0.5)
+        u = int(lens.cx + lens.fx * (x + d * up[0]) / depth + 0.5)
+        if v < 0 or u < 0 or v >= w.shape[0] or u >= w.shape[1]:
+            break
+        ahead = w[v, u] - 1 / depth
+        if abs(ahead) < JUMP:
+            reach, misses = d, 0.0
+            continue
+        misses += 0.5 if ahead > 0 else 1.0  # something in front of it hides it
+        if misses > MISSES:
+            break
+    return reach
 
 
 @kernel

@@ -7,14 +7,12 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import Cells, Lens
-from shapecat.detection.planes import DIRECTIONS, Support
+from shapecat.detection.planes import COS, DIRECTIONS, SIN, Support
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 
 __all__ = ["LEAST_M", "NOISE", "Heights", "heights_of", "inside", "table_of"]
 
-ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
-COS, SIN = np.cos(ANGLES), np.sin(ANGLES)
 LEAST_M = 0.004
 """Lowest height of an object cell, to which `NOISE` times the squared range is added."""
 NOISE = 0.0025
@@ -63,32 +61,51 @@ def heights_of(cells: Cells, planes: F8, *, highest_m: float) -> Heights:
     return Heights(owner, height)
 
 
-@kernel
+@kernel(fast=True)
 def _stand(
     w: F4, lens: Lens, plane: F8, number: int, highest: float, owner: I4, height: F4
 ) -> None:
+    """Give the free cells inside the outline of a plane to it; the loops over a row vectorise."""
     rows, columns = w.shape
-    a, scale = np.float32(plane[0]), np.float32(plane[3])
-    least, noise = np.float32(LEAST_M), np.float32(NOISE)
-    line = np.zeros(columns, np.float32)
+    a, scale, zero, one = np.float32(plane[0]), np.float32(plane[3]), np.float32(0), np.float32(1)
+    least, noise, below = np.float32(LEAST_M), np.float32(NOISE), np.float32(-9)
+    beyond, high = np.float32(BEYOND_M), np.float32(highest)
+    above, surface = np.int8(number), np.int8(-number)
+    x = np.arange(columns).astype(np.float32)
+    line, slack = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
+    # Level coordinates times inverse depth are linear in the image: (per column, per row, rest).
+    sides = np.zeros((DIRECTIONS // 2, 3))
+    for d in range(2):
+        p, q = plane[4 + 3 * d] / lens.fx, plane[5 + 3 * d] / lens.fy
+        for k in range(DIRECTIONS // 2):
+            part = SIN[k] if d else COS[k]
+            sides[k, 0] += part * p
+            sides[k, 1] += part * q
+            sides[k, 2] += part * (plane[6 + 3 * d] - p * lens.cx - q * lens.cy)
     # A plane seen edge on has heights between the steps of the sensor; so no division is unsafe.
     for i in range(rows):
         base = np.float32(plane[1] * i + plane[2])
+        values, owners, heights = w[i], owner[i], height[i]
         for j in range(columns):
-            v = w[i, j]
-            inverse = np.float32(1) / v if v > 0 else np.float32(0)
-            h = (v - (a * np.float32(j) + base)) * inverse * scale
-            gate = least + noise * inverse * inverse
-            line[j] = h if (v > 0) & (h > -gate) & (h < highest) else np.float32(-9)
+            v = values[j]
+            z = one / v if v > zero else zero
+            h = (v - (a * x[j] + base)) * z * scale
+            gate = least + noise * z * z
+            use = (v > zero) & (h > -gate) & (h < high) & (owners[j] == 0)
+            line[j] = h if use else below
+            slack[j] = zero if h > gate else beyond * v
+        for k in range(DIRECTIONS // 2):
+            step, first = np.float32(sides[k, 0]), np.float32(sides[k, 1] * i + sides[k, 2])
+            far, near = np.float32(plane[13 + k]), np.float32(plane[13 + k + DIRECTIONS // 2])
+            for j in range(columns):
+                t, v, room = step * x[j] + first, values[j], slack[j]
+                within = (t <= far * v + room) & (-t <= near * v + room)
+                line[j] = line[j] if within else below
         for j in range(columns):
-            if line[j] == np.float32(-9) or owner[i, j] != 0:
-                continue
-            z = 1.0 / w[i, j]
-            x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
-            above = line[j] > least + noise * z * z
-            if inside(plane, x, y, z, 0.0 if above else BEYOND_M):
-                owner[i, j] = number if above else -number
-                height[i, j] = line[j]
+            mine = above if slack[j] == zero else surface
+            owners[j] = mine if line[j] > below else owners[j]
+        for j in range(columns):
+            heights[j] = line[j] if line[j] > below else heights[j]
 
 
 @kernel

@@ -33,13 +33,14 @@ from shapecat.jit import kernel
 
 __all__ = ["join_pieces"]
 
-PART = 0.35
+PART = 0.48
 """A part that stands on nothing is smaller than this share of what it hangs on."""
-SEEN_WHOLE = 0.1
+SEEN_WHOLE = 0.25
+"""Largest share of its boundary that is behind other things."""
 STANDS = 0.25
 NECK_WIDTH, NECK_OVERLAP_M, NECK_APART, ROUND = 0.55, 0.03, 0.12, 0.8
 """A neck: width, metres below the top of the body, offset of its middle; slope of the body."""
-NECK_LEDGE = 0.1
+NECK_LEDGE, NECK_TALL = 0.1, 1.1
 AXIAL, WIDEST_NECK, NECK_HEIGHT = 0.055, 0.78, 0.62
 """A wide neck on a shoulder: offset of its middle, width, height, all by those of the body."""
 SHOULDER_M, SHOULDER = 0.01, 0.17
@@ -105,6 +106,8 @@ def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
     apart = abs(a[LEFT] + a[RIGHTMOST] - b[LEFT] - b[RIGHTMOST]) / 2
     if apart > NECK_APART * wide or slope_of(a) < ROUND / 2:
         return False
+    if a[TOP] - a[BOTTOM] > NECK_TALL * (b[TOP] - b[BOTTOM]):
+        return False
     if pieces.pairs[ONTO, p, q] <= NECK_LEDGE * pieces.pairs[CONTACT, p, q]:
         return bool(narrow <= wide and not has_lid(pieces, q))
     if narrow <= NECK_WIDTH * wide and not has_lid(pieces, q):
@@ -129,6 +132,7 @@ def _join_floating(pieces: Pieces) -> None:
             total = np.sum(contact)
             q = np.argmax(contact)
             hidden = np.sum(pieces.pairs[FRONT, :, p]) + pieces.single[p, HIDDEN]
+            hidden -= pieces.pairs[FRONT, q, p]  # that would be its own body
             if (
                 total >= FEW
                 and pieces.single[p, TABLE] <= 2

@@ -115,10 +115,10 @@ def pieces_of(
 
 def side_of(up: F8) -> F8:
     """Return the horizontal direction across the view, (3,) unit."""
-    side = np.cross(up, [0.0, 0.0, 1.0])
-    if np.linalg.norm(side) < 0.2:  # the camera looks straight down
-        side = gravity_rotation(up)[0]
-    return np.asarray(side / np.linalg.norm(side))
+    across = math.hypot(up[0], up[1])
+    if across < 0.2:  # the camera looks straight down
+        return np.asarray(gravity_rotation(up)[0])
+    return np.array([up[1] / across, -up[0] / across, 0.0])
 
 
 @kernel
@@ -126,10 +126,12 @@ def _meet(
     w: F4, owner: I4, height: F4, links: U1, normal: F4, labels: I4, up: F8, pieces: Pieces
 ) -> None:
     rows, columns = w.shape
+    change = np.zeros(columns, np.uint8)
     for i in range(rows):
+        _find_changes(links[i], labels[i], labels[min(i + 1, rows - 1)], change)
         for j in range(columns):
             p = labels[i, j]
-            if w[i, j] <= 0 or (p == 0 and owner[i, j] > 0):
+            if change[j] == 0 or w[i, j] <= 0 or (p == 0 and owner[i, j] > 0):
                 continue
             for d in range(2):
                 di, dj = (0, 1) if d == 0 else (1, 0)
@@ -186,6 +188,15 @@ def _meet(
 
 
 @kernel
+def _find_changes(links: U1, here: I4, below: I4, change: U1) -> None:
+    """Mark the cells of a row from which a piece does not just go on to the right and down."""
+    for j in range(here.size):
+        change[j] = (here[j] != below[j]) | ((here[j] > 0) & (links[j] != RIGHT | DOWN))
+    for j in range(here.size - 1):
+        change[j] |= here[j] != here[j + 1]
+
+
+@kernel
 def _onto(
     i: int,
     j: int,
@@ -228,13 +239,14 @@ def _measure(
     shape[:, RIGHTMOST] = -1e9
     shape[:, TOP] = -1e9
     shape[:, BOTTOM] = 1e9
+    per_x, per_y = 1 / lens.fx, 1 / lens.fy
     for i in range(rows):
         for j in range(columns):
             p = labels[i, j]
             if p == 0:
                 continue
             z = 1 / w[i, j]
-            x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
+            x, y = (j - lens.cx) * per_x * z, (i - lens.cy) * per_y * z
             along = x * side[0] + y * side[1] + z * side[2]
             row = shape[p]
             pieces.owner[p] = owner[i, j]
@@ -254,7 +266,7 @@ def _measure(
             row[TURN] += turn
             row[SIDETURN] += along * turn
             facing = -(m[0] * x + m[1] * y + m[2] * z) / math.sqrt(x * x + y * y + z * z)
-            area = z * z / (lens.fx * lens.fy) / max(facing, 0.2)
+            area = z * z * per_x * per_y / max(facing, 0.2)
             row[AREA] += area
             if m[0] * up[0] + m[1] * up[1] + m[2] * up[2] > UPWARD:
                 band = min(max(int(h / BAND_M), 0), BANDS - 1)

@@ -4,7 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U4, Bool
+from shapecat.arrays import F4, F8, I4, U1, U4, Bool
 from shapecat.detection.cells import JUMP, NEAREST_M, Cells, Lens
 from shapecat.detection.fill import FRINGE
 from shapecat.detection.heights import LEAST_M, NOISE, inside
@@ -17,8 +17,6 @@ __all__ = ["pixels_of", "points_of"]
 
 MOST_LABELS = 1000
 HIGHEST_M = 0.6
-SURE_M = 0.03
-"""A reading within one jump of a cell this high is above the plane itself."""
 
 
 def pixels_of(depth: F4, cells: Cells, found: Segmentation, *, range_m: float) -> list[U4]:
@@ -33,7 +31,6 @@ def pixels_of(depth: F4, cells: Cells, found: Segmentation, *, range_m: float) -
         depth,
         cells.w,
         found.labels,
-        found.heights,
         found.planes,
         found.owners,
         found.filled,
@@ -102,61 +99,58 @@ def _sorted(marks: I4, sizes: I4) -> list[U4]:
 
 
 @kernel
+def _near(labels: I4) -> U1:
+    """Return 1 for the cells that have a label or are next to one that has."""
+    rows, columns = labels.shape
+    near = np.zeros(labels.shape, np.uint8)
+    line = np.zeros(columns + 2, np.int16)
+    for i in range(rows):
+        above, here, below = labels[max(i - 1, 0)], labels[i], labels[min(i + 1, rows - 1)]
+        for j in range(columns):
+            line[j + 1] = above[j] | here[j] | below[j]
+        out = near[i]
+        for j in range(columns):
+            out[j] = (line[j] | line[j + 1] | line[j + 2]) != 0
+    return near
+
+
+@kernel
 def _mark(
     depth: F4,
     w: F4,
     labels: I4,
-    heights: F4,
     planes: F8,
     owners: I4,
-    filled: I4,
+    filled: U1,
     factor: int,
     range_m: float,
     marks: I4,
     sizes: I4,
 ) -> None:
     rows, columns = w.shape
-    shift = (factor - 1) * 0.5
-    jump = np.float32(JUMP)
+    shift, scale = (factor - 1) * 0.5, 1.0 / factor
+    low, high = np.float32(NEAREST_M), np.float32(range_m)
+    near = _near(labels)
     for i in range(rows):
-        above, below = max(i - 1, 0), min(i + 1, rows - 1)
         y1 = (i + 1) * factor if i + 1 < rows else depth.shape[0]
         for j in range(columns):
-            left, right = max(j - 1, 0), min(j + 1, columns - 1)
-            label = labels[i, j]
-            nearby = label | labels[above, j] | labels[below, j] | labels[i, left]
-            nearby |= labels[i, right] | labels[above, left] | labels[above, right]
-            nearby |= labels[below, left] | labels[below, right]
-            if nearby == 0:
+            if near[i, j] == 0:
                 continue
-            v0 = w[i, j]
-            sure = label > 0 and (heights[i, j] > SURE_M or filled[i, j] > 0)
-            # Depths within one jump of the cell.
-            z0 = np.float32(1) / (v0 + jump)
-            z1 = np.float32(1) / (v0 - jump) if v0 > jump else np.float32(np.inf)
             x1 = (j + 1) * factor if j + 1 < columns else depth.shape[1]
             for y in range(i * factor, y1):
                 for x in range(j * factor, x1):
                     z = depth[y, x]
-                    if sure & (z > z0) & (z < z1) & (z <= range_m):
+                    if not ((z >= low) & (z <= high)):
+                        continue
+                    p = i * columns + j if _fits(w[i, j], z) else _best_beside(w, i, j, z)
+                    if p < 0:
+                        continue
+                    ii, jj = p // columns, p % columns
+                    label = labels[ii, jj]
+                    u, v = (x - shift) * scale, (y - shift) * scale
+                    if label > 0 and (filled[ii, jj] or _rises(planes, owners[label], u, v, z)):
                         marks[y, x] = label
                         sizes[label] += 1
-                    elif (z >= NEAREST_M) & (z <= range_m):
-                        chosen = _choose(
-                            w,
-                            labels,
-                            planes,
-                            owners,
-                            filled,
-                            i,
-                            j,
-                            1.0 / z,
-                            (x - shift) / factor,
-                            (y - shift) / factor,
-                        )
-                        if chosen > 0:
-                            marks[y, x] = chosen
-                            sizes[chosen] += 1
 
 
 @kernel
@@ -168,53 +162,52 @@ def _mark_points(
     labels: I4,
     planes: F8,
     owners: I4,
-    filled: I4,
+    filled: U1,
     marks: I4,
     sizes: I4,
 ) -> None:
     columns = w.shape[1]
+    near = _near(labels).reshape(-1)
     for k in range(points.shape[0]):
-        if cell[k] < 0:
+        p = cell[k]
+        if p < 0 or near[p] == 0:
             continue
-        i, j, v = cell[k] // columns, cell[k] % columns, 1.0 / points[k, 2]
-        x, y = lens.fx * points[k, 0] * v + lens.cx, lens.fy * points[k, 1] * v + lens.cy
-        label = _choose(w, labels, planes, owners, filled, i, j, v, x, y)
-        if label > 0:
+        i, j, z = p // columns, p % columns, points[k, 2]
+        if not _fits(w[i, j], z):
+            p = _best_beside(w, i, j, z)
+            if p < 0:
+                continue
+            i, j = p // columns, p % columns
+        label = labels[i, j]
+        u, v = lens.fx * points[k, 0] / z + lens.cx, lens.fy * points[k, 1] / z + lens.cy
+        if label > 0 and (filled[i, j] or _rises(planes, owners[label], u, v, z)):
             marks[k] = label
             sizes[label] += 1
 
 
 @kernel
-def _choose(
-    w: F4,
-    labels: I4,
-    planes: F8,
-    owners: I4,
-    filled: I4,
-    i: int,
-    j: int,
-    v: float,
-    x: float,
-    y: float,
-) -> int:
-    """Return the label of a reading ``v`` at column x, row y of cell (i, j), or 0."""
-    bi, bj = i, j
-    if not ((abs(w[i, j] - v) < JUMP) & (w[i, j] > 0)):
-        nearest = 2 * JUMP
-        for ii in range(max(i - 1, 0), min(i + 2, w.shape[0])):
-            for jj in range(max(j - 1, 0), min(j + 2, w.shape[1])):
-                gap = abs(w[ii, jj] - v)
-                if gap < nearest:
-                    nearest, bi, bj = gap, ii, jj
-        if nearest >= 2 * JUMP:
-            return 0
-    label = int(labels[bi, bj])
-    if label == 0 or filled[bi, bj]:
-        return label
-    plane = planes[owners[label]]
-    z = 1.0 / v
-    h = (v - plane[0] * x - plane[1] * y - plane[2]) * z * plane[3]
-    return label if h > FRINGE * (LEAST_M + NOISE * z * z) else 0
+def _fits(w: float, z: float) -> bool:
+    """Whether a depth is within one jump of a cell; both sides are multiplied by the depth."""
+    return bool(abs(w * z - np.float32(1)) < np.float32(JUMP) * z)
+
+
+@kernel
+def _best_beside(w: F4, i: int, j: int, z: float) -> int:
+    """Return the flat neighbour of a cell whose depth fits best, -1 if none is within two jumps."""
+    best, nearest = -1, np.float32(2 * JUMP) * z
+    for ii in range(max(i - 1, 0), min(i + 2, w.shape[0])):
+        for jj in range(max(j - 1, 0), min(j + 2, w.shape[1])):
+            gap = abs(w[ii, jj] * z - np.float32(1))
+            if gap < nearest:
+                nearest, best = gap, ii * w.shape[1] + jj
+    return best
+
+
+@kernel
+def _rises(planes: F8, k: int, u: float, v: float, z: float) -> bool:
+    """Whether a depth at column u, row v is above plane k, if only as a foot is."""
+    h = (1 - (planes[k, 0] * u + planes[k, 1] * v + planes[k, 2]) * z) * planes[k, 3]
+    return bool(h > FRINGE * (LEAST_M + NOISE * z * z))
 
 
 @kernel

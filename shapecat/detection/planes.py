@@ -6,20 +6,24 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.cells import Cells, Lens
+from shapecat.detection.cells import Cells, Lens, middle_of
 from shapecat.detection.consensus import TOLERANCE, level_plane, normal_of, refit
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 
-__all__ = ["DIRECTIONS", "Support", "corners_of", "find_planes"]
+__all__ = ["COS", "DIRECTIONS", "SIN", "Support", "corners_of", "find_planes", "support_of"]
 
 DIRECTIONS = 16
 """Sides of the convex outline of a plane."""
+ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+COS, SIN = np.cos(ANGLES), np.sin(ANGLES)
 MARGIN_M = 0.01
 """An outline reaches this far beyond the readings."""
 BIN_M = 0.01
 MOST_LEVELS = 10
 LEAST_CELLS = 100
+MOST_HEIGHTS = 500
+"""About as many readings tell the height of a level to begin with."""
 LEAST_AREA_M2 = 0.03
 LEVEL_COS2 = 0.82
 """Squared cosine of the largest angle, 25 degrees, of a level reading to the horizontal."""
@@ -27,6 +31,8 @@ STEADY_COS = math.cos(math.radians(6))
 ARM = 3
 """Cells to each side over which a surface is seen to be level."""
 BEND = 0.024
+GRAZING_SIN2 = 0.04
+"""Squared sine of the angle, 11.5 degrees, below which a surface is seen at a grazing angle."""
 
 
 class Support(NamedTuple):
@@ -61,33 +67,36 @@ def find_planes(cells: Cells, up: F8) -> list[tuple[Support, I4]]:
     supports: list[tuple[Support, I4]] = []
     order, starts = _by_height(index, height, base, done.size)
     for _ in range(MOST_LEVELS):
-        count = np.where(done, 0, np.diff(starts))
-        peak = int(np.argmax(np.convolve(count, [1, 2, 1], "same")))
+        peak = _fullest(starts, done)
         low, high = max(peak - 2, 0), min(peak + 3, done.size)
         near = order[starts[low] : starts[high]]
         if near.size < LEAST_CELLS:
             break
         # (4) refine, and keep what lies in the plane
-        support = _refined(cells, index[near], float(np.median(height[near])), up)
+        middle = middle_of(height[near[:: 1 + near.size // MOST_HEIGHTS]])
+        near = index[near]
+        support = _refined(cells, near, middle, up)
         done[low:high] = True
         if support is not None:
-            supports.append((support, index[near]))
-            rest = _off_plane(cells.w, index, support.a, support.b, support.c, 3 * TOLERANCE)
-            index, height = index[rest], height[rest]
+            supports.append((support, near))
+            n = _keep_off(cells.w, support.a, support.b, support.c, index, height)
+            index, height = index[:n], height[:n]
             order, starts = _by_height(index, height, base, done.size)
     # (5) ascending
     return sorted(supports, key=lambda found: found[0].offset)
 
 
 @kernel
-def _off_plane(w: F4, index: I4, a: float, b: float, c: float, tolerance: float) -> Bool:
-    """Return which of the listed cells are not near a plane."""
+def _keep_off(w: F4, a: float, b: float, c: float, index: I4, height: F4) -> int:
+    """Move the listed cells that are not near a plane to the front; return how many they are."""
     columns = w.shape[1]
-    result = np.zeros(index.size, np.bool_)
+    n = 0
     for k in range(index.size):
         i, j = index[k] // columns, index[k] % columns
-        result[k] = abs(w[i, j] - (a * j + b * i + c)) > tolerance
-    return result
+        if abs(w[i, j] - (a * j + b * i + c)) > 3 * TOLERANCE:
+            index[n], height[n] = index[k], height[k]
+            n += 1
+    return n
 
 
 @kernel
@@ -101,21 +110,36 @@ def _level_readings(w: F4, lens: Lens, up: F8, index: I4, height: F4) -> int:
         y = (i - lens.cy) / lens.fy
         for j in range(r, columns - r, 2):
             center = w[i, j]
-            left, right, top, bottom = w[i, j - r], w[i, j + r], w[i - r, j], w[i + r, j]
-            if not ((center > 0) & (left > 0) & (right > 0) & (top > 0) & (bottom > 0)):
+            left, right = w[i, j - r], w[i, j + r]
+            if not ((center > 0) & (left > 0) & (right > 0)):
+                continue
+            # A level surface near the height of the camera is narrow in the image.
+            x = (j - lens.cx) / lens.fx
+            rise = x * up[0] + y * up[1] + up[2]
+            s = 1 if rise * rise < GRAZING_SIN2 * (x * x + y * y + 1) else r
+            top, bottom = w[i - s, j], w[i + s, j]
+            if not ((top > 0) & (bottom > 0)):
                 continue
             if (abs(left + right - 2 * center) > bend) | (abs(top + bottom - 2 * center) > bend):
                 continue
-            wu, wv = (right - left) / (2 * r), (bottom - top) / (2 * r)
+            wu, wv = (right - left) / (2 * r), (bottom - top) / (2 * s)
             nx, ny = lens.fx * wu, lens.fy * wv
             nz = center - wu * (j - lens.cx) - wv * (i - lens.cy)
             along = -(nx * up[0] + ny * up[1] + nz * up[2])
             if along > 0 and along * along > LEVEL_COS2 * (nx * nx + ny * ny + nz * nz):
                 index[n] = i * columns + j
-                x = (j - lens.cx) / lens.fx
-                height[n] = (x * up[0] + y * up[1] + up[2]) / center
+                height[n] = rise / center
                 n += 1
     return n
+
+
+@kernel
+def _fullest(starts: I4, done: Bool) -> int:
+    """Return the bin that with its neighbours holds most readings; those done count as empty."""
+    count = np.zeros(done.size + 2, np.int64)
+    for k in range(done.size):
+        count[k + 1] = 0 if done[k] else starts[k + 1] - starts[k]
+    return int(np.argmax(count[:-2] + 2 * count[1:-1] + count[2:]))
 
 
 @kernel
@@ -141,15 +165,20 @@ def _refined(cells: Cells, index: I4, offset: float, up: F8) -> Support | None:
     if offset > -MARGIN_M:  # not seen from above
         return None
     level = level_plane(lens, up, offset)
-    place = np.divmod(index, cells.w.shape[1])
-    rows, columns = place[0].astype(np.float32), place[1].astype(np.float32)
-    w, plane = cells.w[place], level.copy()
+    j, i, w = _listed(cells.w, index)
+    plane = level.copy()
     for _ in range(3):
-        if refit(columns, rows, w, 1.5 * TOLERANCE, plane) < LEAST_CELLS:
+        if refit(j, i, w, 1.5 * TOLERANCE, plane) < LEAST_CELLS:
             return None
         if normal_of(plane, lens) @ up < STEADY_COS:
             plane = level
             break
+    return support_of(cells, index, plane)
+
+
+def support_of(cells: Cells, index: I4, plane: F8) -> Support | None:
+    """Measure a plane (a, b, c) on its cells (flat); None if little of it is seen."""
+    lens = cells.lens
     normal = normal_of(plane, lens)
     reach = np.full(DIRECTIONS, -np.inf)
     axes = gravity_rotation(normal)
@@ -160,6 +189,17 @@ def _refined(cells: Cells, index: I4, offset: float, up: F8) -> Support | None:
     offset = -1 / math.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
     a, b, c = (float(v) for v in plane)
     return Support(a, b, c, normal, offset, reach + MARGIN_M, area)
+
+
+@kernel
+def _listed(w: F4, index: I4) -> tuple[F4, F4, F4]:
+    """Return the columns, rows and values of the listed cells."""
+    columns = w.shape[1]
+    result = np.zeros((3, index.size), np.float32)
+    for k in range(index.size):
+        i, j = index[k] // columns, index[k] % columns
+        result[0, k], result[1, k], result[2, k] = j, i, w[i, j]
+    return result[0], result[1], result[2]
 
 
 @kernel
@@ -183,37 +223,31 @@ def _spread(
         for d in range(4):
             i = i0 + (ARM if d == 0 else -ARM if d == 1 else 0)
             j = j0 + (ARM if d == 2 else -ARM if d == 3 else 0)
+            if first[i] <= j <= last[i]:
+                continue
             level = plane[0] * j + plane[1] * i + plane[2]
             if level > 0 and abs(w[i, j] - level) < tolerance:
                 first[i] = min(first[i], j)
                 last[i] = max(last[i], j)
-    step = 2 * math.pi / DIRECTIONS
     for i in range(rows):
+        if first[i] > last[i]:
+            continue
         for j in (first[i], last[i]):
-            if first[i] > last[i]:
-                continue
             z = 1 / (plane[0] * j + plane[1] * i + plane[2])
             x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
             u = axes[0, 0] * x + axes[0, 1] * y + axes[0, 2] * z
             v = axes[1, 0] * x + axes[1, 1] * y + axes[1, 2] * z
             for k in range(DIRECTIONS):
-                reach[k] = max(reach[k], math.cos(k * step) * u + math.sin(k * step) * v)
+                reach[k] = max(reach[k], COS[k] * u + SIN[k] * v)
     return area
 
 
 def corners_of(support: Support) -> F8:
     """Return the corners (k, 3) of the convex outline, sensor frame, in order, without repeats."""
-    angle = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
     # Neighbouring sides x cos + y sin = reach meet at a corner.
     step = 2 * np.pi / DIRECTIONS
     here, there = support.reach, np.roll(support.reach, -1)
     along = (there - here * np.cos(step)) / np.sin(step)
-    flat = np.stack(
-        [
-            here * np.cos(angle) - along * np.sin(angle),
-            here * np.sin(angle) + along * np.cos(angle),
-        ],
-        1,
-    )
+    flat = np.stack([here * COS - along * SIN, here * SIN + along * COS], 1)
     level = gravity_rotation(support.up)
     return np.asarray(flat @ level[:2] + support.offset * level[2])

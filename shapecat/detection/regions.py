@@ -7,7 +7,7 @@ from shapecat.detection.heights import Heights
 from shapecat.detection.surfaces import DOWN, RIGHT, Surfaces
 from shapecat.jit import kernel
 
-__all__ = ["regions_of"]
+__all__ = ["regions_of", "renamed"]
 
 EDGE_DEG = 34
 """Concave angle that may part two objects; a bowl of 7 cm turns 16 degrees over the same cells."""
@@ -32,7 +32,6 @@ def regions_of(heights: Heights, surfaces: Surfaces, *, concave: bool = True) ->
     _flood(surfaces.links, surfaces.edge, labels)
     barrier[:] = 0
     n = _flat_parts(heights.owner, surfaces.links, barrier, labels, n)
-    np.maximum(labels, 0, out=labels)
     return labels, n
 
 
@@ -81,45 +80,67 @@ def _is_ridge(edge: U1, i: int, j: int) -> bool:
 
 @kernel
 def _flat_parts(owner: I4, links: U1, barrier: U1, labels: I4, n: int) -> int:
-    """Label linked unlabelled cells that are no barrier; small parts get -1."""
-    columns = owner.shape[1]
-    stack = np.zeros(owner.size, np.int32)
-    flat_owner, flat_links = owner.reshape(-1), links.reshape(-1)
-    closed, flat = barrier.reshape(-1), labels.reshape(-1)
-    for k in range(flat.size):
-        flat[k] = 0 if flat[k] < 0 else flat[k]
-    for s in range(flat.size):
-        if flat_owner[s] <= 0 or flat[s] != 0 or closed[s] or n >= MOST_REGIONS:
-            continue
-        n += 1
-        stack[0] = s
-        flat[s] = n
-        done, top = 0, 1
-        while done < top:
-            p = stack[done]
-            done += 1
-            for d in range(4):
-                q = _neighbour(p, d, columns, flat_links)
-                if q >= 0 and flat[q] == 0 and closed[q] == 0:
-                    flat[q] = n
-                    stack[top] = q
-                    top += 1
-        if top < LEAST_CELLS:
-            for t in range(top):
-                flat[stack[t]] = -1
-            n -= 1
+    """Label linked unlabelled cells that are no barrier, from ``n`` + 1 on; return the last label.
+
+    Two passes with a table of equivalent labels (Rosenfeld and Pfaltz 1966). Small parts get none.
+    """
+    rows, columns = owner.shape
+    part = np.zeros(labels.shape, np.int32)
+    parent, size = np.zeros((2, owner.size // 2 + 2), np.int32)
+    count = 0
+    # (1) first labels, and which of them meet
+    for i in range(rows):
+        for j in range(columns):
+            if owner[i, j] <= 0 or labels[i, j] > 0 or barrier[i, j]:
+                continue
+            me = part[i, j - 1] if j > 0 and links[i, j - 1] & RIGHT else 0
+            above = part[i - 1, j] if i > 0 and links[i - 1, j] & DOWN else 0
+            if me == 0 and above == 0:
+                count += 1
+                parent[count] = me = count
+            elif me == 0:
+                me = above
+            elif above > 0 and above != me:
+                a, b = _root(parent, me), _root(parent, above)
+                parent[max(a, b)] = me = min(a, b)
+            part[i, j] = me
+            size[me] += 1
+    # (2) final labels, in the order of their first cells
+    for k in range(count, 0, -1):
+        size[parent[k]] += size[k] if parent[k] != k else 0
+    name = np.zeros(count + 1, np.int16)
+    for k in range(1, count + 1):
+        if parent[k] != k:
+            name[k] = name[parent[k]]
+        elif size[k] >= LEAST_CELLS and n < MOST_REGIONS:
+            n += 1
+            name[k] = n
+    for i in range(rows):
+        for j in range(columns):
+            if part[i, j] > 0:
+                labels[i, j] = name[part[i, j]]
     return n
 
 
 @kernel
+def _root(parent: I4, k: int) -> int:
+    while parent[k] != k:
+        k = parent[k]
+    return k
+
+
+@kernel
 def _neighbour(p: int, d: int, columns: int, links: U1) -> int:
-    """Return the linked neighbour of cell ``p`` in direction ``d``, or -1."""
+    """Return the linked neighbour of cell ``p`` in direction ``d``, or -1.
+
+    No link leads over the border of the image.
+    """
     if d == 0:
         return p + 1 if links[p] & RIGHT else -1
     if d == 1:
         return p + columns if links[p] & DOWN else -1
     if d == 2:
-        return p - 1 if p % columns > 0 and links[p - 1] & RIGHT else -1
+        return p - 1 if p > 0 and links[p - 1] & RIGHT else -1
     return p - columns if p >= columns and links[p - columns] & DOWN else -1
 
 
@@ -163,3 +184,14 @@ def _flood(links: U1, edge: U1, labels: I4) -> None:
             else:
                 following[tail[level]] = q
             tail[level] = q
+
+
+@kernel
+def renamed(labels: I4, names: I4) -> I4:
+    """Return labels (rows, columns) under their new names (n,)."""
+    result = np.zeros_like(labels)
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            if labels[i, j] > 0:
+                result[i, j] = names[labels[i, j]]
+    return result

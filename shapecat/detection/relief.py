@@ -26,7 +26,7 @@ FRAGMENT, GROWTH, STEEP_GROWTH = 0.4, 1.3, 0.88
 object by this factor must have a steeper outline than a new one."""
 INWARD, OUTWARD = 2, 3
 """Cells from the outline to where its rise is measured."""
-LEAST_CELLS, LEAST_SIDES, SMALL_PART = 200, 30, 12
+LEAST_CELLS, LEAST_SIDES, SMALL_PART = 120, 30, 12
 ALONE, FOOT, BESIDE = 0.65, 0.04, 0.3
 """Shares of an outline: of an object, least along the plane and most in touch with something
 that is not low, whose foot it would be; of a swell, least along the plane."""
@@ -83,12 +83,9 @@ def _excess(w: F4, owner: I4, height: F4, plane: F8, number: int, out: F4) -> in
 def _raise(w: F4, excess: F4, owner: I4, number: int, levels: F4, raised: U1) -> None:
     """Mark the parts above each level, holes included, whose outline is that of an object."""
     flat, marks, owners = excess.reshape(-1), raised.reshape(-1), owner.reshape(-1)
-    seeds = np.zeros(excess.size, np.int32)
-    n = 0
-    for s in range(flat.size):
-        if flat[s] > levels[-1]:
-            seeds[n] = s
-            n += 1
+    if np.count_nonzero(flat > levels[-1]) < LEAST_CELLS:
+        return
+    seeds = np.flatnonzero(flat > levels[-1])
     stack = np.zeros(excess.size, np.int32)
     part = np.zeros(excess.shape, np.int32)
     parts = part.reshape(-1)
@@ -96,7 +93,7 @@ def _raise(w: F4, excess: F4, owner: I4, number: int, levels: F4, raised: U1) ->
     number_of_parts = looks = 0
     for level in levels:
         first = number_of_parts
-        for s in seeds[:n]:
+        for s in seeds:
             if parts[s] > first or not flat[s] > level:
                 continue
             number_of_parts += 1
@@ -284,6 +281,8 @@ def _lower(w: F4, excess: F4, owner: I4, number: int, raised: U1) -> None:
                 above[i, j] = 1
                 seeds[n] = i * columns + j
                 n += 1
+    if n < SMALL_PART:
+        return
     stack = np.zeros(n, np.int32)
     part = np.zeros(excess.shape, np.int32)
     parts, owners = part.reshape(-1), owner.reshape(-1)

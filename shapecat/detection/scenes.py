@@ -1,5 +1,6 @@
 """Scenes: what segmentation found, as records in the sensor frame."""
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -91,9 +92,10 @@ def _cut(cells: Cells, extents: Extents) -> Bool:
     result = np.zeros(len(extents.low), bool)
     for axis in range(2):
         size = cells.w.shape[axis]
-        valid = np.flatnonzero(cells.w.any(axis=1 - axis))
-        first = valid[0] if valid[0] < BORDER * size else 0
-        last = valid[-1] if valid[-1] >= (1 - BORDER) * size else size - 1
+        lines = cells.w if axis == 0 else cells.w.T
+        near = range(math.ceil(BORDER * size))
+        first = next((k for k in near if lines[k].any()), 0)
+        last = size - 1 - next((k for k in near if lines[size - 1 - k].any()), 0)
         reach = max(1, round(2 / cells.factor))
         result |= extents.low[:, axis] < first + reach
         result |= extents.high[:, axis] > last - reach

@@ -15,13 +15,15 @@ from shapecat.detection.boards import boards_of
 from shapecat.detection.cells import Cells
 from shapecat.detection.directions import estimate_up
 from shapecat.detection.fill import fill_enclosed, grow_feet
-from shapecat.detection.furniture import is_no_object, posts_of
+from shapecat.detection.furniture import is_no_object, posts_of, remains_of, towers_of
 from shapecat.detection.heights import heights_of, table_of
 from shapecat.detection.joins import join_pieces
 from shapecat.detection.ledges import cut_at_ledges
+from shapecat.detection.levels import find_levels
 from shapecat.detection.pieces import Pieces, pieces_of
-from shapecat.detection.planes import Support, find_planes
-from shapecat.detection.regions import regions_of
+from shapecat.detection.planes import Support
+from shapecat.detection.reach import reach_over
+from shapecat.detection.regions import regions_of, renamed
 from shapecat.detection.relief import raise_low
 from shapecat.detection.rings import join_rings
 from shapecat.detection.surfaces import surfaces_of
@@ -99,7 +101,7 @@ def segment(
     """Find planes and objects among ``cells``; None if there is no supporting plane."""
     rules = _checked(settings.rules)
     up = estimate_up(cells, hint, upright=upright, rng=rng)
-    supports = [] if up is None else boards_of(cells, find_planes(cells, up))
+    supports = [] if up is None else boards_of(cells, find_levels(cells, up))
     if up is None or not supports:
         return None
     up = max(supports, key=lambda s: s.area_m2).up
@@ -108,7 +110,8 @@ def segment(
     raised = np.zeros(cells.w.shape, np.uint8)
     if "low" in rules:
         raise_low(cells, heights, planes, raised)
-    clear_walls(cells, heights.owner, up, largest_m=settings.max_size_m, rng=rng)
+    walls = clear_walls(cells, heights.owner, up, largest_m=settings.max_size_m, rng=rng)
+    reach_over(cells, heights, planes, walls, highest_m=settings.max_height_m)
     surfaces = surfaces_of(cells, heights)
     regions, n = regions_of(heights, surfaces, concave="concave" in rules)
     pieces = pieces_of(cells, heights, surfaces, regions, n, up)
@@ -119,11 +122,15 @@ def segment(
     join_pieces(pieces, cells, surfaces, regions, rules)
     if "ring" in rules:
         join_rings(pieces, cells.w, heights.height, regions)
-    posts = posts_of(cells, heights.owner, regions, pieces, up)
-    refused = is_no_object(pieces, posts, largest_m=settings.max_size_m)
+    furniture = posts_of(cells, heights.owner, regions, pieces, up)
+    furniture |= towers_of(cells, planes, pieces, up, highest_m=settings.max_height_m)
+    furniture |= remains_of(walls, regions, pieces)
+    refused = is_no_object(pieces, furniture, largest_m=settings.max_size_m)
     pieces.group[refused[pieces.group]] = 0
-    leaders, number = np.unique(pieces.group, return_inverse=True)
-    labels = number.astype(np.int16)[regions]
+    leaders = np.flatnonzero(np.bincount(pieces.group))
+    number = np.zeros(pieces.group.size, np.int16)
+    number[leaders] = np.arange(leaders.size)
+    labels = renamed(regions, number[pieces.group])
     if "feet" in rules:
         grow_feet(cells.w, heights.owner, heights.height, labels)
     filled = fill_enclosed(

@@ -8,18 +8,17 @@ import numpy as np
 from shapecat.arrays import F4, I4, U1
 from shapecat.detection.cells import JUMP, Cells, Lens
 from shapecat.detection.heights import Heights
+from shapecat.detection.tangents import fit_tangents
 from shapecat.jit import kernel
 
 __all__ = ["DOWN", "RIGHT", "Surfaces", "surfaces_of"]
 
 RIGHT, DOWN = 1, 2
 """Bits of `Surfaces.links`."""
-WINDOW = 3
-"""Half the edge of the window a tangent plane is fitted to, in cells."""
-GATE, GATE_SLOPE = 0.008, 0.008
-"""A sample of the fit lies within this of the centre, plus the slope times its distance."""
 BASE, BASE_DIAGONAL = 3, 2
 """Cells between an edge and the surfaces on its two sides."""
+LEAST_CHORD = 3e-4
+"""Squared distance of two normals from which their angle is a degree."""
 
 
 class Surfaces(NamedTuple):
@@ -43,72 +42,13 @@ class Surfaces(NamedTuple):
 def surfaces_of(cells: Cells, heights: Heights) -> Surfaces:
     """Fit tangent planes to the object cells, link them and measure concave angles."""
     shape = cells.w.shape
-    tangent = np.zeros((*shape, 3), np.float32)
-    normal = np.zeros((*shape, 3), np.float32)
-    _fit(cells.w, cells.lens, heights.owner, tangent, normal)
+    tangent, normal = np.zeros((2, *shape, 3), np.float32)
+    fit_tangents(cells.w, cells.lens, heights.owner, tangent, normal)
     links = np.zeros(shape, np.uint8)
     _link(cells.w, heights.owner, tangent, links)
     edge = np.zeros(shape, np.uint8)
     _bend(cells.w, cells.lens, tangent, normal, edge)
     return Surfaces(tangent, normal, links, edge)
-
-
-@kernel(fast=True)
-def _fit(w: F4, lens: Lens, owner: I4, tangent: F4, normal: F4) -> None:
-    """Fit planes by least squares to a checkerboard of 25 cells; weights are 0 or 1."""
-    rows, columns = w.shape
-    zero, one = np.float32(0), np.float32(1)
-    for i in range(rows):
-        for j in range(columns):
-            me = owner[i, j]
-            if me <= 0:
-                continue
-            center = w[i, j]
-            n = sx = sy = sxx = sxy = syy = sw = sxw = syw = zero
-            for di in range(-WINDOW, WINDOW + 1):
-                y = i + di
-                if y < 0 or y >= rows:
-                    continue
-                for dj in range(-WINDOW + ((di + WINDOW) & 1), WINDOW + 1, 2):
-                    x = j + dj
-                    if x < 0 or x >= columns or owner[y, x] != me:
-                        continue
-                    v = w[y, x] - center
-                    far = abs(di) if abs(di) > abs(dj) else abs(dj)
-                    if abs(v) < np.float32(GATE + GATE_SLOPE * far):
-                        fx, fy = np.float32(dj), np.float32(di)
-                        n += one
-                        sx += fx
-                        sy += fy
-                        sxx += fx * fx
-                        sxy += fx * fy
-                        syy += fy * fy
-                        sw += v
-                        sxw += fx * v
-                        syw += fy * v
-            if n < 5:
-                continue
-            mx, my, mw = sx / n, sy / n, sw / n
-            xx, xy, yy = sxx / n - mx * mx, sxy / n - mx * my, syy / n - my * my
-            xw, yw = sxw / n - mx * mw, syw / n - my * mw
-            determinant = xx * yy - xy * xy
-            if determinant < np.float32(0.2):
-                continue
-            gx = (xw * yy - yw * xy) / determinant
-            gy = (yw * xx - xw * xy) / determinant
-            level = center + mw - gx * mx - gy * my
-            if not level > zero:
-                continue
-            tangent[i, j, 0] = level
-            tangent[i, j, 1] = gx
-            tangent[i, j, 2] = gy
-            nx = -np.float32(lens.fx) * gx
-            ny = -np.float32(lens.fy) * gy
-            nz = gx * np.float32(j - lens.cx) + gy * np.float32(i - lens.cy) - level
-            scale = one / np.sqrt(nx * nx + ny * ny + nz * nz)
-            normal[i, j, 0] = nx * scale
-            normal[i, j, 1] = ny * scale
-            normal[i, j, 2] = nz * scale
 
 
 @kernel(fast=True)
@@ -144,12 +84,14 @@ def _bend(w: F4, lens: Lens, tangent: F4, normal: F4, edge: U1) -> None:
     gate = np.float32(2 * JUMP)
     one = np.float32(1)
     degrees = np.float32(180 / math.pi)
+    per_x, per_y = np.float32(1 / lens.fx), np.float32(1 / lens.fy)
+    cx, cy = np.float32(lens.cx), np.float32(lens.cy)
     for i in range(rows):
         for j in range(columns):
             if not tangent[i, j, 0] > 0:
                 continue
             here = w[i, j]
-            worst = np.float32(0)
+            worst = np.float32(LEAST_CHORD)
             for d in range(4):
                 r = BASE if d < 2 else BASE_DIAGONAL
                 di = 0 if d == 0 else r
@@ -172,10 +114,8 @@ def _bend(w: F4, lens: Lens, tangent: F4, normal: F4, edge: U1) -> None:
                 if chord <= worst:
                     continue
                 z1, z2 = one / w1, one / w2
-                px = np.float32((j1 - lens.cx) / lens.fx) * z1
-                px -= np.float32((j2 - lens.cx) / lens.fx) * z2
-                py = np.float32((i1 - lens.cy) / lens.fy) * z1
-                py -= np.float32((i2 - lens.cy) / lens.fy) * z2
+                px = per_x * ((np.float32(j1) - cx) * z1 - (np.float32(j2) - cx) * z2)
+                py = per_y * ((np.float32(i1) - cy) * z1 - (np.float32(i2) - cy) * z2)
                 if px * nx + py * ny + (z1 - z2) * nz < 0:
                     worst = chord
             half = np.sqrt(worst) * np.float32(0.5)

@@ -15,6 +15,8 @@ __all__ = ["View", "overview_of", "view_of"]
 
 FIELD = 1.5
 """Largest tangent of the angle between a point and the optical axis."""
+OUTSIDE = 9.0
+"""In place of the tangent of a point that is not in view."""
 MOST_CELLS = 400_000
 MOST_ROWS = 2000
 LEAST_POINTS = 100
@@ -55,9 +57,10 @@ def view_of(points: F4, *, range_m: float, origin: F8 | None = None) -> View | N
     rotation = _facing(axis)
     pose = Pose(rotation, -rotation @ origin)
     turned = np.zeros((len(points), 3), np.float32)
+    place = np.zeros((len(points), 2), np.float32)
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
-    n = _turn(points, pose.rotation, pose.translation, range_m, turned, bounds)
-    return _imaged(turned, bounds, n, pose) if n >= LEAST_POINTS else None
+    n = _turn(points, pose.rotation, pose.translation, range_m, turned, place, bounds)
+    return _imaged(turned, place, bounds, n, pose) if n >= LEAST_POINTS else None
 
 
 def overview_of(
@@ -101,37 +104,56 @@ def overview_of(
 @kernel
 def _middle(points: F4, origin: F8, range_m: float) -> tuple[F8, int]:
     """Return the sum of the directions to the points within twice the range, and their number."""
-    axis = np.zeros(3)
+    ax = ay = az = 0.0
     n = 0
     for k in range(points.shape[0]):
         x, y, z = points[k, 0] - origin[0], points[k, 1] - origin[1], points[k, 2] - origin[2]
         distance = math.sqrt(x * x + y * y + z * z)
         if (distance >= NEAREST_M) & (distance <= 2 * range_m):  # never so for NaN
-            axis[0] += x / distance
-            axis[1] += y / distance
-            axis[2] += z / distance
+            scale = 1 / distance
+            ax += x * scale
+            ay += y * scale
+            az += z * scale
             n += 1
-    return axis, n
+    return np.array([ax, ay, az]), n
 
 
 @kernel
-def _turn(points: F4, rotation: F8, translation: F8, range_m: float, turned: F4, bounds: F8) -> int:
-    """Move the points in view to the virtual camera; return how many, and their image bounds."""
+def _turn(
+    points: F4,
+    rotation: F8,
+    translation: F8,
+    range_m: float,
+    turned: F4,
+    place: F4,
+    bounds: F8,
+) -> int:
+    """Move the points in view to the virtual camera; return how many they are.
+
+    Their places (x / z, y / z), `OUTSIDE` for other points, and the bounds of these are written.
+    """
+    r, s = rotation, translation
     n = 0
+    left = top = np.inf
+    right = bottom = -np.inf
     for k in range(points.shape[0]):
+        place[k, 0] = OUTSIDE
         x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        depth = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + translation[2]
+        depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + s[2]
         if not ((depth >= NEAREST_M) & (depth <= range_m)):
             continue
-        across = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + translation[0]
-        down = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + translation[1]
-        u, v = across / depth, down / depth
+        across = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + s[0]
+        down = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + s[1]
+        inverse = 1 / depth
+        u, v = across * inverse, down * inverse
         if not ((abs(u) < FIELD) & (abs(v) < FIELD)):
             continue
         turned[k, 0], turned[k, 1], turned[k, 2] = across, down, depth
-        bounds[0], bounds[2] = min(bounds[0], u), max(bounds[2], u)
-        bounds[1], bounds[3] = min(bounds[1], v), max(bounds[3], v)
+        place[k, 0], place[k, 1] = u, v
+        left, right = min(left, u), max(right, u)
+        top, bottom = min(top, v), max(bottom, v)
         n += 1
+    bounds[0], bounds[1], bounds[2], bounds[3] = left, top, right, bottom
     return n
 
 
@@ -144,14 +166,14 @@ def _facing(axis: F8) -> F8:
     return np.stack([x, np.cross(z, x), z])
 
 
-def _imaged(turned: F4, bounds: F8, n: int, pose: Pose) -> View:
+def _imaged(turned: F4, place: F4, bounds: F8, n: int, pose: Pose) -> View:
     left, top, right, bottom = (float(v) for v in bounds)
     width, height = right - left, bottom - top
     z = turned[:: max(1, n // 20_000), 2]
     depth = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
     pitch = max(
         CELL_M / depth,
-        _spacing(turned, bounds, n),
+        _spacing(place, bounds, n),
         math.sqrt(width * height / MOST_CELLS),
         max(width, height) / MOST_ROWS,
         1e-6,
@@ -159,12 +181,12 @@ def _imaged(turned: F4, bounds: F8, n: int, pose: Pose) -> View:
     lens = Lens(1 / pitch, 1 / pitch, -left / pitch, -top / pitch)
     w = np.zeros((int(height / pitch + 1.5), int(width / pitch + 1.5)), np.float32)
     cell = np.full(len(turned), -1, np.int32)
-    behind = _project(turned, lens, w, cell)
+    behind = _project(turned, place, lens, w, cell)
     _close_holes(w)
     return View(Cells(w, lens, 1, pitch * depth), turned, cell, pose, behind / n)
 
 
-def _spacing(turned: F4, bounds: F8, n: int) -> float:
+def _spacing(place: F4, bounds: F8, n: int) -> float:
     """Return the pitch of an image in which nearly every cell of a surface has a point.
 
     On a grid that is fine against the points every point has a cell of its own; coarser grids
@@ -173,41 +195,39 @@ def _spacing(turned: F4, bounds: F8, n: int) -> float:
     span = max(bounds[2] - bounds[0], bounds[3] - bounds[1], 1e-6)
     side = 1024
     while side > 16:
-        if n >= LOAD * _occupied(turned, bounds[0], bounds[1], side / span * 0.999, side):
+        if n >= LOAD * _occupied(place, bounds[0], bounds[1], side / span * 0.999, side):
             break
         side = int(side / 1.25)
     return float(span / side)
 
 
 @kernel
-def _occupied(turned: F4, left: float, top: float, scale: float, side: int) -> int:
+def _occupied(place: F4, left: float, top: float, scale: float, side: int) -> int:
     seen = np.zeros((side, side), np.uint8)
     n = 0
-    for k in range(turned.shape[0]):
-        z = turned[k, 2]
-        if z > 0:
-            j, i = int((turned[k, 0] / z - left) * scale), int((turned[k, 1] / z - top) * scale)
-            n += seen[i, j] == 0
+    for k in range(place.shape[0]):
+        if place[k, 0] < OUTSIDE:
+            j, i = int((place[k, 0] - left) * scale), int((place[k, 1] - top) * scale)
+            n += 1 - seen[i, j]
             seen[i, j] = 1
     return n
 
 
 @kernel
-def _project(points: F4, lens: Lens, w: F4, cell: I4) -> int:
+def _project(points: F4, place: F4, lens: Lens, w: F4, cell: I4) -> int:
     """Average the nearest points of each cell; return how many lie well behind them."""
     rows, columns = w.shape
     nearest = np.zeros(w.shape, np.float32)
     count = np.zeros(w.shape, np.float32)
     for k in range(points.shape[0]):
-        z = points[k, 2]
-        if not z > 0:
+        if place[k, 0] == OUTSIDE:
             continue
-        x, y = points[k, 0] / z, points[k, 1] / z
-        j, i = int(lens.fx * x + lens.cx + 0.5), int(lens.fy * y + lens.cy + 0.5)
+        j = int(lens.fx * place[k, 0] + lens.cx + 0.5)
+        i = int(lens.fy * place[k, 1] + lens.cy + 0.5)
         if i < 0 or j < 0 or i >= rows or j >= columns:
             continue
         cell[k] = i * columns + j
-        nearest[i, j] = max(nearest[i, j], np.float32(1) / z)
+        nearest[i, j] = max(nearest[i, j], np.float32(1) / points[k, 2])
     behind = 0
     for k in range(points.shape[0]):
         if cell[k] < 0:

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F4, F8, I4, U1
 from shapecat.detection.cells import JUMP, Cells, Lens
 from shapecat.detection.consensus import (
     TOLERANCE,
@@ -14,14 +14,19 @@ from shapecat.detection.consensus import (
     readings_of,
     without,
 )
+from shapecat.geometry import cross
 from shapecat.jit import kernel
 
-__all__ = ["clear_walls"]
+__all__ = ["CLEARED", "ON_WALL", "clear_walls"]
+
+ON_WALL, CLEARED = 1, 2
+"""Cells on a wall; the former are of a small part, which may be an object the wall goes through."""
 
 MOST_WALLS = 5
 LEAST_READINGS = 50
 VERTICAL_COS = 0.2
-LEAST_AREA_M2 = 0.05
+LEAST_AREA_M2, LEAST_PART_M2, LEAST_WALL_M2 = 0.05, 0.04, 0.1
+"""Least area of a wall, of a connected part of it that is cleared, and of these parts together."""
 FILLED = 0.3
 """Share of its extent that a wall fills: the front edges of a shelf lie in a plane too."""
 STRIP_M, STRIPS = 0.05, 400
@@ -29,22 +34,30 @@ STRIP_M, STRIPS = 0.05, 400
 
 def clear_walls(
     cells: Cells, owner: I4, up: F8, *, largest_m: float, rng: np.random.Generator
-) -> None:
-    """Take the cells on walls from the object cells of ``owner`` (rows, columns), in place."""
-    readings = readings_of(cells, np.where(owner > 0, cells.w, np.float32(0)))
+) -> U1:
+    """Take the cells on walls from the object cells of ``owner`` (rows, columns), in place.
+
+    Returns
+    -------
+    (rows, columns) uint8 `CLEARED` or `ON_WALL` on walls, 0 elsewhere. A plane through the fronts
+    of many objects looks like a wall too, but all its parts are small.
+    """
+    walls = np.zeros(owner.shape, np.uint8)
+    readings = readings_of(cells, owner)
     for _ in range(MOST_WALLS):
         vertical = (-VERTICAL_COS, VERTICAL_COS)
         plane, count = best_plane(readings, cells.lens, up, vertical, rng)
         if count < LEAST_READINGS:
             break
         if _is_wall(readings, cells, plane, up, largest_m):
-            _clear(cells.w, owner, plane)
+            _clear(cells.w, cells.lens, owner, plane, normal_of(plane, cells.lens), walls)
         readings = without(readings, plane, 2 * TOLERANCE)
+    return walls
 
 
 def _is_wall(readings: Readings, cells: Cells, plane: F8, up: F8, largest_m: float) -> bool:
     normal = normal_of(plane, cells.lens)
-    across = np.cross(normal, up)
+    across = cross(normal, up)
     strips = np.zeros((2, STRIPS))
     area = readings.share * _measure(readings, cells.lens, plane, normal, across, up, strips)
     # A strip of 5 cm counts that holds 5 cm of wall.
@@ -76,9 +89,51 @@ def _measure(
 
 
 @kernel
-def _clear(w: F4, owner: I4, plane: F8) -> None:
-    for i in range(w.shape[0]):
-        for j in range(w.shape[1]):
-            level = plane[0] * j + plane[1] * i + plane[2]
-            if owner[i, j] > 0 and abs(w[i, j] - level) < JUMP:
-                owner[i, j] = 0
+def _clear(w: F4, lens: Lens, owner: I4, plane: F8, normal: F8, walls: U1) -> None:
+    """Take the connected parts of a wall that are large; others may be objects before it."""
+    rows, columns = w.shape
+    stack = np.zeros(w.size, np.int32)
+    found = np.zeros(w.shape, np.uint8)
+    total = 0.0
+    for si in range(rows):
+        for sj in range(columns):
+            if found[si, sj] or not _is_on(w, owner, plane, si, sj):
+                continue
+            stack[0] = si * columns + sj
+            found[si, sj] = ON_WALL
+            done, top, area = 0, 1, 0.0
+            while done < top:
+                i, j = stack[done] // columns, stack[done] % columns
+                done += 1
+                x, y = (j - lens.cx) / lens.fx, (i - lens.cy) / lens.fy
+                facing = -(x * normal[0] + y * normal[1] + normal[2])
+                area += 1 / (w[i, j] * w[i, j] * lens.fx * lens.fy * max(facing, 0.1))
+                for d in range(4):
+                    v = i + (1 if d == 0 else -1 if d == 1 else 0)
+                    u = j + (1 if d == 2 else -1 if d == 3 else 0)
+                    if v < 0 or u < 0 or v >= rows or u >= columns or found[v, u]:
+                        continue
+                    if _is_on(w, owner, plane, v, u):
+                        found[v, u] = ON_WALL
+                        stack[top] = v * columns + u
+                        top += 1
+            if area >= LEAST_PART_M2:
+                total += area
+                for t in range(top):
+                    found[stack[t] // columns, stack[t] % columns] = CLEARED
+    if total < LEAST_WALL_M2:
+        return
+    np.maximum(walls, found, walls)
+    for i in range(rows):
+        for j in range(columns):
+            owner[i, j] = 0 if found[i, j] == CLEARED else owner[i, j]
+
+
+@kernel
+def _is_on(w: F4, owner: I4, plane: F8, i: int, j: int) -> bool:
+    """Whether a cell that is no part of a level plane lies on a wall."""
+    return bool(
+        owner[i, j] >= 0
+        and w[i, j] > 0
+        and abs(w[i, j] - (plane[0] * j + plane[1] * i + plane[2])) < JUMP
+    )

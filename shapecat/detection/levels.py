@@ -1,0 +1,54 @@
+"""Levels: the planes of a scene are parallel, so the larger ones tell how the others lie."""
+
+import math
+
+import numpy as np
+
+from shapecat.arrays import F8, I4
+from shapecat.detection.cells import Cells
+from shapecat.detection.consensus import TOLERANCE, level_plane
+from shapecat.detection.planes import DIRECTIONS, Support, find_planes, support_of
+
+__all__ = ["find_levels"]
+
+TURNED_COS = math.cos(math.radians(1))
+"""Readings are collected again where up turns out to be off by more."""
+
+
+def find_levels(cells: Cells, up: F8) -> list[tuple[Support, I4]]:
+    """Return the planes of `find_planes` with one normal in common, lowest first.
+
+    A board seen at a grazing angle, or only a strip of one, does not tell its tilt well: half a
+    degree is a centimetre of height a metre away.
+    """
+    found = find_planes(cells, up)
+    if len(found) < 2:
+        return found
+    better = _common_up([support for support, _ in found])
+    if better @ up < TURNED_COS:
+        found = find_planes(cells, better)
+        better = _common_up([support for support, _ in found]) if found else better
+    return [(_levelled(cells, support, index, better), index) for support, index in found]
+
+
+def _common_up(supports: list[Support]) -> F8:
+    """Return the mean normal, weighted by how well each plane tells it: area and width squared."""
+    half = DIRECTIONS // 2
+    widths = [float((s.reach[:half] + s.reach[half:]).min()) for s in supports]
+    total = np.array([s.area_m2 * w * w for s, w in zip(supports, widths, strict=True)]) @ [
+        s.up for s in supports
+    ]
+    return np.asarray(total / np.linalg.norm(total))
+
+
+def _levelled(cells: Cells, support: Support, index: I4, up: F8) -> Support:
+    """Fit the plane with the normal ``up`` to the readings of a support, by least squares."""
+    lens = cells.lens
+    i, j = np.divmod(index, cells.w.shape[1])
+    w = cells.w[i, j]
+    near = abs(w - (support.a * j + support.b * i + support.c)) < TOLERANCE
+    along = up[0] * (j - lens.cx) / lens.fx + up[1] * (i - lens.cy) / lens.fy + up[2]
+    # The inverse depth of the plane up @ p == offset is along / offset.
+    along, w = along[near], w[near]
+    offset = float(along @ along) / float(along @ w)
+    return support_of(cells, index, level_plane(lens, up, offset)) or support

@@ -1,0 +1,158 @@
+"""Reach: what stands on a plane and reaches over its outline.
+
+The outline is that of the readings: it ends before the far edge of a table where that is hidden,
+and at the front edge, over which things may stick out.
+"""
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4, U1
+from shapecat.detection.cells import JUMP, Cells, Lens
+from shapecat.detection.heights import LEAST_M, NOISE, Heights, inside
+from shapecat.detection.walls import CLEARED
+from shapecat.jit import kernel
+
+__all__ = ["reach_over"]
+
+REACH_M = 0.15
+"""How far objects reach over an outline."""
+BEYOND = 5
+"""So many times as much of an object may be seen outside as inside."""
+
+
+def reach_over(cells: Cells, heights: Heights, planes: F8, walls: U1, *, highest_m: float) -> None:
+    """Give the parts of objects outside the outline of their plane to it, in place.
+
+    A part is what is connected to object cells inside, and not many times larger than what is
+    inside: a wall behind a table does not stand on it.
+
+    Parameters
+    ----------
+    planes : the rows of `table_of`.
+    walls : from `clear_walls`; what is cleared stays so.
+    """
+    stacks = np.zeros((2, heights.owner.size), np.int32)
+    outside = np.full(heights.owner.shape, np.nan, np.float32)
+    seen = np.zeros(heights.owner.shape, np.int32)
+    for k, plane in reversed(list(enumerate(planes))):
+        _reach(cells.w, cells.lens, heights, k + 1, plane, walls, highest_m, outside, seen, stacks)
+        outside[:] = np.nan
+
+
+@kernel
+def _reach(
+    w: F4,
+    lens: Lens,
+    heights: Heights,
+    me: int,
+    plane: F8,
+    walls: U1,
+    highest: float,
+    outside: F4,
+    seen: I4,
+    stacks: I4,
+) -> None:
+    """Add the parts outside one plane; heights above it are kept in ``outside`` once looked at."""
+    rows, columns = w.shape
+    owner = heights.owner
+    looks = np.max(seen)
+    for i in range(rows):
+        for j in range(columns):
+            if owner[i, j] != me:
+                continue
+            for d in range(4):
+                y = i + (1 if d == 0 else -1 if d == 1 else 0)
+                x = j + (1 if d == 2 else -1 if d == 3 else 0)
+                if y < 0 or x < 0 or y >= rows or x >= columns:
+                    continue
+                if not (0 <= owner[y, x] < me) or abs(w[y, x] - w[i, j]) >= JUMP:
+                    continue
+                if not _is_above(w, lens, plane, walls, highest, outside, y, x):
+                    continue
+                looks += 1
+                n = _part_outside(
+                    w, lens, owner, me, plane, walls, highest, outside, y, x, stacks[0]
+                )
+                enough = max(n // BEYOND, 1)
+                if _part_inside(w, owner, me, seen, looks, i, j, enough, stacks[1]) < enough:
+                    continue
+                for t in range(n):
+                    v, u = stacks[0, t] // columns, stacks[0, t] % columns
+                    owner[v, u] = me
+                    heights.height[v, u] = outside[v, u]
+
+
+@kernel
+def _is_above(
+    w: F4, lens: Lens, plane: F8, walls: U1, highest: float, outside: F4, i: int, j: int
+) -> bool:
+    """Whether a cell is new and may belong to an object on a plane; notes its height if so."""
+    if w[i, j] <= 0 or walls[i, j] == CLEARED or outside[i, j] == outside[i, j]:
+        return False
+    z = 1 / w[i, j]
+    h = (w[i, j] - (plane[0] * j + plane[1] * i + plane[2])) * z * plane[3]
+    if not (LEAST_M + NOISE * z * z < h < highest):
+        return False
+    x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
+    if not inside(plane, x, y, z, REACH_M):
+        return False
+    outside[i, j] = h
+    return True
+
+
+@kernel
+def _part_outside(
+    w: F4,
+    lens: Lens,
+    owner: I4,
+    me: int,
+    plane: F8,
+    walls: U1,
+    highest: float,
+    outside: F4,
+    i: int,
+    j: int,
+    stack: I4,
+) -> int:
+    """Collect the connected cells outside, from one that is above the plane; return how many."""
+    rows, columns = w.shape
+    stack[0] = i * columns + j
+    done, top = 0, 1
+    while done < top:
+        i, j = stack[done] // columns, stack[done] % columns
+        done += 1
+        for d in range(4):
+            y = i + (1 if d == 0 else -1 if d == 1 else 0)
+            x = j + (1 if d == 2 else -1 if d == 3 else 0)
+            if y < 0 or x < 0 or y >= rows or x >= columns:
+                continue
+            if not (0 <= owner[y, x] < me) or abs(w[y, x] - w[i, j]) >= JUMP:
+                continue
+            if _is_above(w, lens, plane, walls, highest, outside, y, x):
+                stack[top] = y * columns + x
+                top += 1
+    return top
+
+
+@kernel
+def _part_inside(
+    w: F4, owner: I4, me: int, seen: I4, look: int, i: int, j: int, most: int, stack: I4
+) -> int:
+    """Count the connected object cells inside, up to ``most``."""
+    rows, columns = w.shape
+    stack[0] = i * columns + j
+    seen[i, j] = look
+    done, top = 0, 1
+    while done < top < most:
+        i, j = stack[done] // columns, stack[done] % columns
+        done += 1
+        for d in range(4):
+            y = i + (1 if d == 0 else -1 if d == 1 else 0)
+            x = j + (1 if d == 2 else -1 if d == 3 else 0)
+            if y < 0 or x < 0 or y >= rows or x >= columns or owner[y, x] != me:
+                continue
+            if seen[y, x] != look and abs(w[y, x] - w[i, j]) < JUMP:
+                seen[y, x] = look
+                stack[top] = y * columns + x
+                top += 1
+    return top

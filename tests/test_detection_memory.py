@@ -1,0 +1,35 @@
+"""Detection of one frame needs little memory beyond the frame."""
+
+import numpy as np
+import pytest
+
+from shapecat.config import DetectionSettings
+from shapecat.detection import detect
+from shapecat.simulation import KINECT, make_scene, render_frame
+from shapecat.types import Frame
+
+CLOUDS = 8
+"""The peak may be so many times the size of the cloud."""
+
+
+@pytest.mark.parametrize("organized", [True, False])
+def test_peak_allocation(*, organized: bool) -> None:
+    """A worker holds several frames at a time; temporary images must not multiply each of them."""
+    tracemalloc = pytest.importorskip("tracemalloc")
+    rng = np.random.default_rng(500)
+    frame = render_frame(make_scene("clutter", rng, frames=1), 0, rng=rng, sensor=KINECT)[0]
+    points = frame.xyz()
+    if not organized:
+        points = points[np.isfinite(points[:, 2])]
+        frame = Frame("t", 0, 0, 0, "c", points=points)
+    settings = DetectionSettings()
+    assert detect(frame, settings=settings, rng=rng).candidates  # and kernels are compiled
+
+    tracemalloc.start()
+    try:
+        detect(frame, settings=settings, rng=rng)
+        peak = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+    assert 0 < peak < CLOUDS * points.nbytes
