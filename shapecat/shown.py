@@ -3,21 +3,23 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute
 import pyarrow.parquet as pq
 
-from shapecat.arrays import F4, I4
+from shapecat.arrays import F4, F8, I4
 from shapecat.corrections import TrackLabel
 from shapecat.geometry import box_corners, upright_box
 from shapecat.tables import read_row_groups
-from shapecat.types import Box, ShownBox, ShownFrame
+from shapecat.types import Box, ShownBox, ShownBoxes, ShownFrame
 
 __all__ = ["ShownTracks", "numbers", "read_shown_frames"]
 
+_AT_ONCE = 8  # row groups of boxes in memory
+_NO_ROWS = slice(0, 0)
 _NONE = np.zeros((0, 0), np.float32)
 
 Key = tuple[str, int]
@@ -58,9 +60,9 @@ class ShownTracks:
     ) -> "ShownTracks":
         """Read the tracks of a run; those missing from ``labels`` are not shown."""
         columns = ["track", "topic", "frame", "stamp_ns", "detection"]
-        table = pq.read_table(
-            folder / "tracks.parquet", columns=[*columns, *(["posterior"] if causal else [])]
-        )
+        wanted = [*columns, *(["posterior"] if causal else [])]
+        with pq.ParquetFile(folder / "tracks.parquet") as file:
+            table = file.read(columns=wanted)
         known = pa.compute.is_in(table["track"], pa.array(sorted(labels), pa.int32()))
         table = table.filter(pa.compute.and_(pa.compute.is_valid(table["detection"]), known))
         table = table.sort_by([(name, "ascending") for name in ("topic", "frame", "detection")])
@@ -78,7 +80,7 @@ class ShownTracks:
 
     def of(self, key: Key) -> Iterator[ShownDetection]:
         """Yield the detections shown in a frame, in their order."""
-        rows = self.frames.get(key, slice(0, 0))
+        rows = self.frames.get(key, _NO_ROWS)
         for row in range(rows.start, rows.stop):
             yield ShownDetection(self.detections[row], self.labels[self.tracks[row]], row)
 
@@ -92,24 +94,25 @@ def read_shown_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterato
     shown = ShownTracks.read(folder, labels)
     wanted = ("topic", "frame", "stamp_ns", "log_time_ns", "frame_id", "up")
     found = ("topic", "frame", "detection", "center", "size", "orientation")
+    merged = len({label.track for label in labels.values()}) < len(labels)
     groups = zip(
-        read_row_groups(folder / "frames.parquet", wanted),
-        read_row_groups(folder / "detections.parquet", found),
+        read_row_groups(folder / "frames.parquet", wanted, at_once=_AT_ONCE),
+        read_row_groups(folder / "detections.parquet", found, at_once=_AT_ONCE),
         strict=True,
     )
     for frames, detections in groups:
-        boxes = _boxes(detections)
+        first, places = _places(detections)
         ups = numbers(frames["up"]).reshape(-1, 3)
         rows = zip(*(frames[name].to_pylist() for name in wanted[:-1]), strict=True)
         for (topic, index, stamp_ns, log_time_ns, frame_id), up in zip(rows, ups, strict=True):
             key = (topic, index)
-            parts: dict[int, list[ShownBox]] = {}
-            for detection, label, _ in shown.of(key):
-                box = ShownBox(*label, *boxes[topic, index, detection])
-                parts.setdefault(label.track, []).append(box)
-            objects = tuple(_joined(found, up) for found in parts.values())
+            of_frame = shown.frames.get(key, _NO_ROWS)
+            here = [first[key] + detection for detection in shown.detections[of_frame]]
+            labelled = tuple(map(labels.__getitem__, shown.tracks[of_frame]))
+            boxes = ShownBoxes(labelled, places[here])
+            boxes = _joined(boxes, up) if merged else boxes
             ended = shown.ended.get(key, ())
-            yield ShownFrame(topic, index, stamp_ns, log_time_ns, frame_id, objects, ended)
+            yield ShownFrame(topic, index, stamp_ns, log_time_ns, frame_id, boxes, ended)
 
 
 def numbers(column: pa.ChunkedArray) -> F4:
@@ -117,15 +120,28 @@ def numbers(column: pa.ChunkedArray) -> F4:
     return np.asarray(column.combine_chunks().flatten().to_numpy())
 
 
-def _boxes(table: pa.Table) -> dict[tuple[str, int, int], Any]:
-    """Map each detection to the centre, size and orientation of its box."""
-    keys = zip(*(table[name].to_pylist() for name in ("topic", "frame", "detection")), strict=True)
+def _places(table: pa.Table) -> tuple[dict[Key, int], F8]:
+    """Return the row of the first detection of each frame, and (n, 10) the boxes of all.
+
+    The detections of a frame are numbered in the order of their rows.
+    """
+    begins = np.flatnonzero(table["detection"].to_numpy() == 0)
+    topics, frames = (table[name].take(begins).to_pylist() for name in ("topic", "frame"))
+    first = dict(zip(zip(topics, frames, strict=True), begins.tolist(), strict=True))
     widths = {"center": 3, "size": 3, "orientation": 4}
-    rows = zip(*(numbers(table[n]).reshape(-1, w).tolist() for n, w in widths.items()), strict=True)
-    return dict(zip(keys, rows, strict=True))
+    columns = [numbers(table[name]).reshape(-1, width) for name, width in widths.items()]
+    return first, np.hstack(columns).astype(np.float64)
 
 
-def _joined(parts: Sequence[ShownBox], up: F4) -> ShownBox:
+def _joined(boxes: ShownBoxes, up: F4) -> ShownBoxes:
+    """Make one box of the parts of each merged track."""
+    parts: dict[int, list[ShownBox]] = {}
+    for box in boxes:
+        parts.setdefault(box.track, []).append(box)
+    return ShownBoxes.of(_join(some, up) for some in parts.values())
+
+
+def _join(parts: Sequence[ShownBox], up: F4) -> ShownBox:
     """Make one box of the parts of a merged track that are seen in the same frame."""
     if len(parts) == 1:
         return parts[0]
@@ -166,7 +182,7 @@ def _ended(
 def _next_of_topic(folder: Path) -> dict[Key, Key]:
     following: dict[Key, Key] = {}
     latest: dict[str, Key] = {}
-    for group in read_row_groups(folder / "frames.parquet", ["topic", "frame"]):
+    for group in read_row_groups(folder / "frames.parquet", ["topic", "frame"], at_once=64):
         for key in zip(group["topic"].to_pylist(), group["frame"].to_pylist(), strict=True):
             if key[0] in latest:
                 following[latest[key[0]]] = key

@@ -246,11 +246,14 @@ def write_table(path: Path, columns: dict[str, Any], schema: pa.Schema) -> None:
         writer.write_table(_table(columns, schema))
 
 
-def read_row_groups(path: Path, columns: Sequence[str] | None = None) -> Iterator[pa.Table]:
-    """Yield the row groups of a table of a run folder, one at a time."""
+def read_row_groups(
+    path: Path, columns: Sequence[str] | None = None, *, at_once: int = 1
+) -> Iterator[pa.Table]:
+    """Yield the row groups of a table of a run folder, ``at_once`` at a time."""
     with _reading(path) as file:
-        for group in range(file.num_row_groups):
-            yield file.read_row_group(group, columns=columns)
+        count = file.num_row_groups
+        for first in range(0, count, at_once):
+            yield file.read_row_groups(range(first, min(first + at_once, count)), columns=columns)
 
 
 @contextmanager

@@ -30,7 +30,7 @@ from shapecat.outputs.colours import CATEGORY_COLOURS, colour_of
 from shapecat.outputs.ros_annotations import RosMessages
 from shapecat.outputs.ros_stencils import StencilEncoder
 from shapecat.recordings import open_recording
-from shapecat.types import CATEGORIES, ShownBox, ShownFrame
+from shapecat.types import CATEGORIES, ShownBox, ShownBoxes, ShownFrame
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE1 = get_typestore(Stores.ROS1_NOETIC)
@@ -41,7 +41,7 @@ RUN = {"version": "1", "counts": {"frames": 3}}
 
 
 def shown(index: int, tracks: list[int], *, ended: tuple[int, ...] = ()) -> ShownFrame:
-    objects = tuple(
+    objects = ShownBoxes.of(
         ShownBox(
             track=track,
             category="cup",
@@ -426,7 +426,7 @@ ANNOTATION = st.builds(
         stamp_ns=st.integers(0, 2**62),
         log_time_ns=st.just(0),
         frame_id=st.sampled_from(["", "cam", "camera"]),
-        objects=st.lists(BOX, max_size=4).map(tuple),
+        objects=st.lists(BOX, max_size=4).map(ShownBoxes.of),
         ended=st.just(()),
     ),
     lifetime_ns=st.integers(1, 2**60),
@@ -442,5 +442,6 @@ def test_fast_messages_are_those_of_the_library(ros1: bool, annotations: list[An
     ros = RosMessages(ros1=ros1)
     for message in (ros.detections, ros.scene, ros.markers):
         fast = StencilEncoder(ros, message)
-        for annotation in annotations * 2:
-            assert fast(annotation) == ros.serialize(message.whole(annotation), message.name)
+        again = annotations * 2
+        whole = [ros.serialize(message.whole(one), message.name) for one in again]
+        assert fast(again) == whole

@@ -23,6 +23,9 @@ from shapecat.tracking import (
     track_recording,
 )
 from shapecat.tracking.association import assign
+from shapecat.tracking.common_motion import find_common_motion
+from shapecat.tracking.fusion import fuse_novelty, view_weights
+from shapecat.tracking.hits import Hits
 
 SETTINGS = TrackingSettings()
 SECOND = 1_000_000_000
@@ -222,6 +225,10 @@ def test_an_object_that_comes_back_to_its_place_keeps_its_track() -> None:
         ({"sizes": [[0.1, 0.1, 0.1], [0.3, 0.3, 0.3]]}, False),
         ({"posteriors": [[1, 0], [0, 1]]}, False),
         ({"scenes": [0, 1]}, False),
+        ({"sizes": [[0.1, 0.1, 0.1], [0.2, 0.2, 0.1]], "whole": [3, 20]}, True),  # seen in part
+        ({"sizes": [[0.2, 0.2, 0.1], [0.1, 0.1, 0.1]], "whole": [3, 20]}, False),  # larger than it
+        ({"posteriors": [[1, 0], [0, 1]], "whole": [0, 20]}, True),  # cut, it looks like anything
+        ({"start": [[0, 0, 0], [0.3, 0, 0]], "rest": [[0.3, 0, 0], [np.nan] * 3]}, True),
         ({"first_ns": [0, SECOND]}, False),  # the first one lasts until 2 s: they overlap
     ],
 )
@@ -236,6 +243,8 @@ def test_fragments_are_joined_only_when_nothing_speaks_against_it(
         "start_velocity": np.zeros((2, 3)),
         "end_velocity": np.zeros((2, 3)),
         "sizes": np.full((2, 3), 0.1),
+        "whole": [20, 20],
+        "rest": np.full((2, 3), np.nan),
         "posteriors": [[0.8, 0.2], [0.7, 0.3]],
         "scenes": [0, 0],
     }
@@ -289,6 +298,13 @@ def test_fusion_weighs_and_no_view_has_a_veto() -> None:
         fuse([[1.0]], "sum")  # type: ignore[arg-type]  # what is tested
 
 
+def test_many_views_reject_less_and_a_cut_view_counts_less() -> None:
+    """Known objects whose novelty strays about the limit must not become unknown by their mean."""
+    assert fuse_novelty([1.05], [1.0]) == pytest.approx(1.05)
+    assert fuse_novelty([1.05] * 9, [1.0] * 9) < 1 < fuse_novelty([1.1] * 9, [1.0] * 9)
+    assert fuse_novelty([0.5, 2.0], view_weights(np.array([False, True]))) < 1
+
+
 def boxed(frames: list[list[tuple[float, float]]]) -> list[FrameDetections]:
     """Return frames of upright boxes 0.1 m deep and high, each from one x to another."""
     found = []
@@ -335,6 +351,58 @@ def test_what_is_put_into_a_bowl_is_not_a_piece_of_the_bowl() -> None:
     bowl, filled = [(0.0, 0.2)], [(0.0, 0.2), (0.1, 0.16)]
     tracks = track_recording(boxed([bowl] * 30 + [filled] * 8), SETTINGS)
     assert sorted(track.hits for track in tracks) == [8, 38]
+
+
+def test_an_object_that_comes_into_view_in_pieces_is_one_track() -> None:
+    """Before it was ever whole, nothing but its later size tells that they are pieces."""
+    whole, split = [(0.0, 0.2)], [(0.0, 0.08), (0.08, 0.2)]
+    tracks = track_recording(boxed([split] * 12 + [whole] * 30), SETTINGS)
+    assert [track.hits for track in tracks] == [42]
+
+
+def turning(*, speed: float, hidden: range, frames: int = 80) -> list[FrameDetections]:
+    """Return a table that turns by ``speed`` radians a second; of one thing nothing is seen."""
+    random = np.random.default_rng(1)
+    angle, radius = np.array([0.0, 1.3, 2.4, 3.9, 5.2]), np.array([0.3, 0.2, 0.35, 0.25, 0.3])
+    found = []
+    for k in range(frames):
+        turned = angle + speed * k / 10
+        places = np.column_stack([radius * np.cos(turned), radius * np.sin(turned), 0 * angle])
+        places += random.normal(0, 0.004, places.shape)
+        seen = [i for i in range(5) if i != 0 or k not in hidden]
+        found.append(frame(k, places[seen]))
+    return found
+
+
+def test_an_object_hidden_on_a_turning_table_is_known_where_it_comes_back() -> None:
+    """The others tell how far the table has turned: by 1.2 radians, 35 cm of its way."""
+    frames = turning(speed=0.4, hidden=range(25, 55))
+    tracks = track_recording(frames, SETTINGS)
+    assert sorted(track.hits for track in tracks) == [50, 80, 80, 80, 80]
+    whole = next(track for track in tracks if track.hits == 50)
+    radius = np.linalg.norm(whole.centers[:, :2], axis=1)
+    assert radius == pytest.approx(0.3, abs=0.02)  # coasting, it goes round with the table
+
+
+@pytest.mark.parametrize("speed", [-0.4, 0.4])
+def test_a_common_motion_brings_the_detections_to_rest_and_back(speed: float) -> None:
+    frames = turning(speed=speed, hidden=range(0))
+    hits = Hits.of(frames)
+    motion = find_common_motion(hits, [np.arange(k, 400, 5) for k in range(5)])
+    assert motion is not None
+    still = np.array([one.centers for one in motion.still(frames)])
+    assert still.std(axis=0).max() < 0.01
+    back = motion.moved(hits.rows, still.reshape(-1, 3))
+    assert back == pytest.approx(hits.centers, abs=1e-9)
+
+
+def test_what_stands_still_or_goes_its_own_way_has_no_common_motion() -> None:
+    members = [np.arange(k, 400, 5) for k in range(5)]
+    assert find_common_motion(Hits.of(turning(speed=0.0, hidden=range(0))), members) is None
+    random = np.random.default_rng(2)
+    ways = random.normal(0, 0.1, (5, 3)) * [1, 1, 0]
+    apart = [frame(k, np.arange(5)[:, None] * 0.5 + ways * k / 10) for k in range(80)]
+    assert find_common_motion(Hits.of(apart), members) is None
 
 
 def test_a_clock_that_jumps_back_is_a_cut() -> None:

@@ -6,14 +6,14 @@ MCAP. Annotations use the encoding of the source.
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from itertools import chain, pairwise
+from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import BinaryIO
 
 from shapecat.outputs.annotation import Annotation, AnnotationChannel
-from shapecat.outputs.annotations import ENCODERS, encoder_for
+from shapecat.outputs.annotations import ENCODERS, Encode, encoder_for
 from shapecat.outputs.mcap_append import Appender, copy_bytes
 from shapecat.outputs.mcap_rewrite import Item, rewrite
 from shapecat.recordings import Recording
@@ -25,6 +25,10 @@ __all__ = ["write_annotated"]
 
 _LIFETIME = 1.5
 """Entities outlive the period of the frames by this factor."""
+_BUFFER = 4 << 20
+"""Two threads that write the same file wait for each other: seldom is better."""
+_AT_ONCE = 128
+"""Frames encoded together."""
 _PERIOD_NS = 1_000_000_000
 """Assumed where a stream has a single frame."""
 
@@ -56,14 +60,10 @@ def write_annotated(
     first = next(annotations, None)
     encoding = _encoding(recording, first)
     kinds = encoder_for(encoding, markers=markers)
-    items = (
-        Item(number, annotation.frame.log_time_ns, encode(annotation))
-        for annotation in chain([first] if first else [], annotations)
-        for number, (_, encode) in enumerate(kinds)
-    )
+    items = _items(chain([first] if first else [], annotations), [encode for _, encode in kinds])
     channels = [channel for channel, _ in kinds]
     metadata = {"run.json": json.dumps(run)}
-    with replacing(path) as hidden, hidden.open("wb") as file:
+    with replacing(path) as hidden, hidden.open("wb", buffering=_BUFFER) as file:
         if isinstance(recording, McapRecording) and recording.indexed:
             with ThreadPoolExecutor(1) as pool:  # the copy does not hold the interpreter lock
                 copying = pool.submit(
@@ -73,6 +73,16 @@ def write_annotated(
                 copying.result()
         else:
             rewrite(recording, file, channels, items, metadata)
+
+
+def _items(annotations: Iterable[Annotation], encoders: Sequence[Encode]) -> Iterator[Item]:
+    """Encode annotations, frame by frame."""
+    rest = iter(annotations)
+    while some := list(islice(rest, _AT_ONCE)):
+        encoded = zip(*(encode(some) for encode in encoders), strict=True)
+        for annotation, messages in zip(some, encoded, strict=True):
+            for number, data in enumerate(messages):
+                yield Item(number, annotation.frame.log_time_ns, data)
 
 
 def _append(
@@ -109,7 +119,7 @@ def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
             periods[frame.topic] = max(1, frame.stamp_ns - last[frame.topic])
         last[frame.topic] = frame.stamp_ns
         period = periods.get(frame.topic, _PERIOD_NS)
-        here = {item.track for item in frame.objects}
+        here = {track for track, _, _ in frame.objects.labels}
         gone = (shown.get(frame.topic, set()) | set(frame.ended)) - here
         shown[frame.topic] = here
         gone -= set().union(*shown.values())  # another sensor still sees it

@@ -1,7 +1,7 @@
 """What annotations say, whatever their encoding."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from shapecat.types import ShownBox, ShownFrame
 
@@ -54,11 +54,14 @@ def properties(box: ShownBox) -> dict[str, str]:
     }
 
 
-def text_position(box: ShownBox) -> tuple[float, float, float]:
-    """Return where the text goes: a little above the top of the box; metres, sensor frame."""
-    x, y, z = box.center
-    qx, qy, qz, qw = box.orientation
-    rise = box.size[2] / 2 + 0.03
-    # The third column of the rotation, in plain numbers: this runs for every object.
+def text_position(center: Any, size: Any, orientation: Any) -> tuple[Any, Any, Any]:
+    """Return where the text goes: a little above the top of the box; metres, sensor frame.
+
+    The parts of the box are numbers, or columns of as many boxes.
+    """
+    x, y, z = center
+    qx, qy, qz, qw = orientation
+    rise = size[2] / 2 + 0.03
+    # The third column of the rotation.
     up = (2 * (qx * qz + qw * qy), 2 * (qy * qz - qw * qx), 1 - 2 * (qx * qx + qy * qy))
     return x + rise * up[0], y + rise * up[1], z + rise * up[2]

@@ -1,7 +1,7 @@
 """The annotation channels, in the encodings of recordings."""
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from importlib.resources import files
 from typing import Any
 
@@ -19,17 +19,18 @@ from shapecat.outputs.ros_stencils import StencilEncoder
 from shapecat.outputs.scene_protobuf import encode_scene, scene_descriptors
 from shapecat.types import ShownBox, ShownFrame
 
-__all__ = ["ENCODERS", "encoder_for"]
+__all__ = ["ENCODERS", "Encode", "encoder_for"]
 
 DETECTIONS = "/shapecat/detections"
 SCENE = "/shapecat/scene"
 MARKERS = "/shapecat/markers"
 
-Encode = Callable[[Annotation], bytes]
+Encode = Callable[[Sequence[Annotation]], Iterable[bytes]]
+"""Encodes some frames, in their order."""
 
 
 def encoder_for(encoding: str, *, markers: bool) -> list[tuple[AnnotationChannel, Encode]]:
-    """Return the annotation channels in an encoding, and how each encodes a frame.
+    """Return the annotation channels in an encoding, and how each encodes frames.
 
     An encoding that is not known gets JSON.
     """
@@ -71,13 +72,17 @@ def _ros(
 def _json(_markers: bool) -> list[tuple[AnnotationChannel, Encode]]:  # noqa: FBT001  # the same
     schema = files("shapecat.schemas").joinpath("SceneUpdate.json").read_bytes()
     channel = AnnotationChannel(SCENE, "json", "foxglove.SceneUpdate", "jsonschema", schema)
-    return [(channel, lambda annotation: json.dumps(_plain_scene(annotation, _JSON)).encode())]
+    return [
+        (channel, lambda some: (json.dumps(_plain_scene(a, _JSON)).encode() for a in some)),
+    ]
 
 
 def _protobuf(_markers: bool) -> list[tuple[AnnotationChannel, Encode]]:  # noqa: FBT001  # the same
     name, schema = "foxglove.SceneUpdate", scene_descriptors()
     channel = AnnotationChannel(SCENE, "protobuf", name, "protobuf", schema)
-    return [(channel, lambda annotation: encode_scene(_plain_scene(annotation, _PROTOBUF)))]
+    return [
+        (channel, lambda some: (encode_scene(_plain_scene(a, _PROTOBUF)) for a in some)),
+    ]
 
 
 ENCODERS: dict[str, Callable[[bool], list[tuple[AnnotationChannel, Encode]]]] = {
@@ -115,7 +120,7 @@ def _plain_entity(box: ShownBox, frame: ShownFrame, time: Any, lifetime: Any) ->
         "orientation": _plain("xyzw", box.orientation),
     }
     text_pose = {
-        "position": _plain("xyz", text_position(box)),
+        "position": _plain("xyz", text_position(*box[3:])),
         "orientation": _plain("xyzw", (0.0, 0.0, 0.0, 1.0)),
     }
     colour = [part / 255 for part in colour_of(box.category)]

@@ -4,8 +4,8 @@ import os
 import shutil
 import struct
 import zlib
-from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO
@@ -27,6 +27,8 @@ _CHUNK_BYTES = 64 << 10
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")
 """A record's opcode and length; a message's channel, sequence, log time and publish time."""
+_INDEX = struct.Struct("<BQHI")
+"""A message index up to its entries: opcode and length, channel, bytes of the entries."""
 _COMPRESS = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}
 
 
@@ -65,8 +67,8 @@ class _Chunk:
     """A chunk being filled."""
 
     data: bytearray = field(default_factory=bytearray)
-    indexes: dict[int, records.MessageIndex] = field(default_factory=dict)
-    times: list[int] = field(default_factory=list)
+    entries: dict[int, list[int]] = field(default_factory=lambda: defaultdict(list))
+    """By channel, the log time and the offset of each message in turn."""
 
 
 class Appender:
@@ -121,10 +123,7 @@ class Appender:
     def add_message(self, channel: int, log_time: int, sequence: int, data: bytes) -> None:
         """Add a message."""
         chunk = self._chunk
-        index = chunk.indexes.setdefault(channel, records.MessageIndex(channel, []))
-        index.records.append((log_time, len(chunk.data)))
-        chunk.times.append(log_time)
-        self._counts[channel] += 1
+        chunk.entries[channel] += (log_time, len(chunk.data))
         length = _MESSAGE.size - _RECORD.size + len(data)
         chunk.data += _MESSAGE.pack(Opcode.MESSAGE, length, channel, sequence, log_time, log_time)
         chunk.data += data
@@ -201,21 +200,23 @@ class Appender:
     def _flush(self) -> None:
         """Write the chunk, if it has messages, and its index."""
         chunk, self._chunk = self._chunk, _Chunk()
-        if not chunk.times:
+        if not chunk.entries:
             self._chunk = chunk
             return
         plain = bytes(chunk.data)
         data = _COMPRESS[self._compression](plain) if self._compression else plain
-        start, end = min(chunk.times), max(chunk.times)
+        times = [time for entries in chunk.entries.values() for time in entries[::2]]
+        start, end = min(times), max(times)
         self._times += [start, end]
         offset = self._file.tell()
         length = self._write(
             [records.Chunk(self._compression, data, end, start, zlib.crc32(plain), len(plain))]
         )
         offsets, at = {}, self._file.tell()
-        for channel, index in chunk.indexes.items():
+        for channel, entries in chunk.entries.items():
             offsets[channel] = self._file.tell()
-            self._write([index])
+            self._file.write(_message_index(channel, entries))
+            self._counts[channel] += len(entries) // 2
         self._new_chunks += 1
         self._chunks.append(
             records.ChunkIndex(
@@ -233,6 +234,13 @@ class Appender:
 
     def _write(self, items: Iterable[records.McapRecord]) -> int:
         return self._file.write(_encoded(items))
+
+
+def _message_index(channel: int, entries: Sequence[int]) -> bytes:
+    """Encode a message index record: the library takes a microsecond for each number."""
+    size = 8 * len(entries)
+    numbers = struct.pack(f"<{len(entries)}Q", *entries)
+    return _INDEX.pack(Opcode.MESSAGE_INDEX, 2 + 4 + size, channel, size) + numbers
 
 
 def _encoded(items: Iterable[records.McapRecord]) -> bytes:

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import cache
 from importlib.resources import files
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -25,14 +25,14 @@ __all__ = ["ArrayMessage", "RosMessages"]
 class ArrayMessage(NamedTuple):
     """A message whose last field is an array with the same number of elements for each object.
 
-    Where ``gone_inside``, that array also holds what takes earlier tracks away.
+    ``gone`` tells where it takes earlier tracks away, if it does: inside that array or before it.
     """
 
     name: str
     whole: Callable[[Annotation], Any]
     element: str
     elements: tuple[Callable[[Annotation, ShownBox], Any], ...]
-    gone_inside: bool = False
+    gone: Literal["", "before", "inside"] = ""
 
 
 class RosMessages:
@@ -57,13 +57,14 @@ class RosMessages:
             self._scene,
             "foxglove_msgs/msg/SceneEntity",
             (self._entity,),
+            gone="before",
         )
         self.markers = ArrayMessage(
             "visualization_msgs/msg/MarkerArray",
             self._markers,
             "visualization_msgs/msg/Marker",
             (self._cube_marker, self._text_marker),
-            gone_inside=True,
+            gone="inside",
         )
 
     def definition(self, name: str) -> bytes:
@@ -193,7 +194,7 @@ class RosMessages:
         return t["Pose"](t["Point"](*box.center), t["Quaternion"](*box.orientation))
 
     def _text_pose(self, box: ShownBox) -> Any:
-        return self._types["Pose"](self._types["Point"](*text_position(box)), self._upright)
+        return self._types["Pose"](self._types["Point"](*text_position(*box[3:])), self._upright)
 
     def _size(self, box: ShownBox) -> Any:
         return self._types["Vector3"](*box.size)

@@ -15,6 +15,7 @@ __all__ = ["Fragments", "merge_fragments", "scene_cuts"]
 
 _NEIGHBOURHOOD_M = 0.3  # objects that far apart say nothing about each other
 _SLOW_S = 0.3  # frames this far apart are not expected to show a motion
+_KNOWN = 8  # whole views that tell a size; some that seem whole are not
 _SAME_SIZE = 0.25  # mean absolute logarithm of the ratio of sizes
 _SAME_POSTERIOR = 0.5  # total variation
 _LOOKAHEAD = 8  # later fragments at the same place that are considered
@@ -25,8 +26,9 @@ class Fragments(Record):
 
     ``first_ns`` and ``last_ns`` (f,) times of the first and last detection; ``start`` and ``end``
     (f, 3) metres, where it was then, and ``start_velocity``, ``end_velocity`` (f, 3) m/s;
-    ``sizes`` (f, 3) typical box lengths, metres; ``posteriors`` (f, c); ``scenes`` (f,) number of
-    the scene, counted by `scene_cuts`.
+    ``sizes`` (f, 3) typical box lengths, metres, ``whole`` (f,) how many views seem to show all
+    of it, and ``rest`` (f, 3) where it is then, nan if it moves; ``posteriors`` (f, c);
+    ``scenes`` (f,) number of the scene, counted by `scene_cuts`.
     """
 
     first_ns: I4 = array("f", "i8")
@@ -36,6 +38,8 @@ class Fragments(Record):
     start_velocity: F8 = array("f 3", "f8")
     end_velocity: F8 = array("f 3", "f8")
     sizes: F8 = array("f 3", "f8")
+    whole: I4 = array("f", "i4")
+    rest: F8 = array("f 3", "f8")
     posteriors: F8 = array("f c", "f8")
     scenes: I4 = array("f", "i4")
 
@@ -70,32 +74,48 @@ def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, 
     """Return possible joins (earlier, later), the most likely first."""
     keys = size_key(fragments.sizes)
     limit = reach(keys, settings.gate_m)
+    known = fragments.whole >= _KNOWN
     found = []
     for i, after in enumerate(_successors(fragments, limit, settings)):
         distance = _distances(fragments, i, after, settings) / max(limit[i], 1e-9)
-        size = size_difference(keys[i : i + 1], keys[after])[0]
+        size = _contradiction(keys[i], keys[after], known[i], known[after])
         posterior = posterior_difference(
             fragments.posteriors[i : i + 1], fragments.posteriors[after]
         )[0]
         gap_s = (fragments.first_ns[after] - fragments.last_ns[i]) * 1e-9
         cost = distance + size / _SAME_SIZE + posterior + gap_s / (gap_s + 10)
-        alike = (distance <= 1) & (size <= _SAME_SIZE) & (posterior <= _SAME_POSTERIOR)
+        cut = (fragments.whole[i] == 0) | (fragments.whole[after] == 0)  # looks like anything
+        similar = cut | (posterior <= _SAME_POSTERIOR)
+        alike = (distance <= 1) & (size <= _SAME_SIZE) & similar
         found += [(float(c), i, int(j)) for c, j in zip(cost[alike], after[alike], strict=True)]
     return [(i, j) for _, i, j in sorted(found)]
+
+
+def _contradiction(key: F8, others: F8, known: Bool, others_known: Bool) -> F8:
+    """Return (k,) differences of a `size_key` to others (k, 3), as far as they contradict.
+
+    An object whose size is not known may be larger than it was seen.
+    """
+    excess = key - others
+    counts = np.where(excess > 0, others_known[:, None], known)
+    return np.asarray((np.abs(excess) * counts).mean(axis=1))
 
 
 def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> Iterator[I4]:
     """Yield, for each fragment, the later ones that start at the place or soon after its end."""
     if len(limit) == 0:
         return
-    near = cKDTree(fragments.start).query_ball_point(fragments.end, limit)
+    rests = np.isfinite(fragments.rest)
+    starts = (fragments.start, np.where(rests, fragments.rest, fragments.start))
+    ends = (fragments.end, np.where(rests, fragments.rest, fragments.end))
+    near = [cKDTree(a).query_ball_point(b, limit) for a in starts for b in ends]
     order = np.argsort(fragments.first_ns, kind="stable")
     first = fragments.first_ns[order]
     window = int(settings.max_missed_s * 1e9)
-    for i, place in enumerate(near):
+    for i, places in enumerate(zip(*near, strict=True)):
         end = fragments.last_ns[i]
         low, high = np.searchsorted(first, [end, end + window], side="right")
-        for_place = np.array(place, np.int64)
+        for_place = np.unique(np.concatenate([np.array(p, np.int64) for p in places]))
         for_place = for_place[fragments.first_ns[for_place] > end]
         for_place = for_place[np.argsort(fragments.first_ns[for_place], kind="stable")]
         after = np.union1d(for_place[:_LOOKAHEAD], order[low:high][: 4 * _LOOKAHEAD])
@@ -105,10 +125,17 @@ def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> 
 def _distances(fragments: Fragments, i: int, after: I4, settings: TrackingSettings) -> F8:
     """Return how far the starts of ``after`` (k,) are from the end of fragment i, in metres.
 
-    Over a short gap a moving object may have gone on: both ends are continued to the middle of
-    the gap, and the smaller distance counts.
+    Where one stood still, that place counts as well: where it comes into view or goes out of it,
+    only a part of it was seen. Over a short gap a moving object may have gone on: both ends are
+    continued to the middle of the gap. The smallest distance counts.
     """
-    resting = np.linalg.norm(fragments.start[after] - fragments.end[i], axis=1)
+    ways = (
+        fragments.start[after] - fragments.end[i],
+        fragments.start[after] - fragments.rest[i],
+        fragments.rest[after] - fragments.end[i],
+        fragments.rest[after] - fragments.rest[i],
+    )
+    resting = np.min(np.nan_to_num(np.linalg.norm(ways, axis=2), nan=np.inf), axis=0)
     gap_s = (fragments.first_ns[after] - fragments.last_ns[i])[:, None] * 1e-9
     meeting = (fragments.start[after] - 0.5 * gap_s * fragments.start_velocity[after]) - (
         fragments.end[i] + 0.5 * gap_s * fragments.end_velocity[i]

@@ -7,9 +7,11 @@ import numpy as np
 
 from shapecat.arrays import F8, I4, Bool
 from shapecat.config import TrackingSettings
-from shapecat.tracking.fusion import causal, view_weights
+from shapecat.tracking.common_motion import CommonMotion, find_common_motion
+from shapecat.tracking.fusion import causal, fuse_novelty, view_weights
 from shapecat.tracking.hindsight import Fragments, merge_fragments, scene_cuts
 from shapecat.tracking.hits import Hits
+from shapecat.tracking.pieces import join_pieces
 from shapecat.tracking.records import FrameDetections, Track
 from shapecat.tracking.surplus import without_pieces, without_shadows
 from shapecat.tracking.tracker import Tracker
@@ -19,6 +21,8 @@ __all__ = ["track_recording"]
 _BURST_NS = 500_000_000
 """A track proves itself by its hits among the frames this near its first one."""
 
+_STILL_M = 0.05  # a centre strays less while its object stands still
+_GAP_S, _GAP_FRAMES = 1.0, 5  # unseen for longer, another detection begins a fragment
 _LINE = 10  # detections at either end of a track that tell its motion
 
 
@@ -66,18 +70,29 @@ def _interleaved(frames: Iterable[FrameDetections]) -> list[FrameDetections]:
 
 
 def _track_stream(frames: Sequence[FrameDetections], settings: TrackingSettings) -> list[Track]:
+    """Track a stream; where its objects move as one, as if they stood still."""
+    hits, members = _follow(frames, settings)
+    motion = find_common_motion(hits, members)
+    if motion is not None:
+        hits, members = _follow(motion.still(frames), settings)
+    return [_build_track(hits, member, settings, motion) for member in members]
+
+
+def _follow(frames: Sequence[FrameDetections], settings: TrackingSettings) -> tuple[Hits, list[I4]]:
+    """Return all detections of a stream, and which of them are of the same object."""
     cuts = scene_cuts(frames, settings)
     hits, scenes = Hits.of(frames), np.cumsum(cuts)
     fragments = [
         group
-        for group in _groups(_associate(frames, cuts, settings))
+        for track in _groups(_associate(frames, cuts, settings))
+        for group in _without_gaps(hits, track)
         if len(group)
         and len(group) >= _needed(frames, scenes, int(hits.rows[group[0]]), settings.min_hits)
     ]
     chains = _groups(merge_fragments(_describe(hits, fragments, scenes), settings))
     members = [np.sort(np.concatenate([fragments[k] for k in c])) for c in chains if len(c)]
-    members = without_pieces(hits, without_shadows(hits, members), settings.max_missed_s)
-    return [_build_track(hits, member, settings) for member in members]
+    members = join_pieces(hits, members)
+    return hits, without_pieces(hits, without_shadows(hits, members), settings.max_missed_s)
 
 
 def _associate(frames: Sequence[FrameDetections], cuts: Bool, settings: TrackingSettings) -> I4:
@@ -100,6 +115,15 @@ def _groups(labels: I4) -> list[I4]:
     return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
 
 
+def _without_gaps(hits: Hits, track: I4) -> list[I4]:
+    """Split a track where it was not seen for long: hindsight knows better what it is then."""
+    if len(track) == 0:
+        return []
+    gap_s = np.diff(hits.stamps(track)) * 1e-9
+    long = (gap_s > _GAP_S) & (np.diff(hits.rows[track]) > _GAP_FRAMES)
+    return np.split(track, np.flatnonzero(long) + 1)
+
+
 def _describe(hits: Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
     """Summarise fragments: sizes by medians, which a few odd views do not move."""
     n = len(fragments)
@@ -114,10 +138,36 @@ def _describe(hits: Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
         np.reshape([place for place, _ in ends], (n, 3)),
         np.reshape([velocity for _, velocity in starts], (n, 3)),
         np.reshape([velocity for _, velocity in ends], (n, 3)),
-        np.reshape([np.median(hits.sizes[f], axis=0) for f in fragments], (n, 3)),
-        np.reshape([hits.posteriors[f].mean(axis=0) for f in fragments], (n, -1 if n else 0)),
+        np.reshape([_extent(hits, f) for f in fragments], (n, 3)),
+        np.array([np.sum(~hits.partial[f]) for f in fragments], np.int32),
+        np.reshape([_rest(hits, f) for f in fragments], (n, 3)),
+        np.reshape([_mean_posterior(hits, f) for f in fragments], (n, -1 if n else 0)),
         np.array([scenes[hits.rows[f[0]]] for f in fragments], np.int32),
     )
+
+
+def _extent(hits: Hits, member: I4) -> F8:
+    """Return the typical lengths of the whole views, or else the largest ones of the cut views."""
+    whole = member[~hits.partial[member]]
+    if len(whole):
+        return np.asarray(np.median(hits.sizes[whole], axis=0))
+    return np.asarray(hits.sizes[member].max(axis=0))
+
+
+def _rest(hits: Hits, member: I4) -> F8:
+    """Return where the whole views are if they are in one place, else nan."""
+    whole = hits.centers[member[~hits.partial[member]]]
+    if (
+        len(whole) < _LINE
+        or np.ptp(np.quantile(whole, [0.1, 0.9], axis=0), axis=0).max() > _STILL_M
+    ):
+        return np.full(3, np.nan)
+    return np.asarray(np.median(whole, axis=0))
+
+
+def _mean_posterior(hits: Hits, member: I4) -> F8:
+    weights = view_weights(hits.partial[member])
+    return np.asarray(np.average(hits.posteriors[member], axis=0, weights=weights))
 
 
 def _line(stamps: I4, centers: F8, at: int) -> tuple[F8, F8]:
@@ -142,13 +192,16 @@ def _needed(frames: Sequence[FrameDetections], scenes: I4, row: int, min_hits: i
     return min(min_hits, near)
 
 
-def _build_track(hits: Hits, member: I4, settings: TrackingSettings) -> Track:
+def _build_track(
+    hits: Hits, member: I4, settings: TrackingSettings, motion: CommonMotion | None
+) -> Track:
     rows, source = hits.life(member, settings.max_missed_s)
     seen = hits.rows[member]
     weights = view_weights(hits.partial[member])
     so_far = causal(hits.posteriors[member], settings.fusion, weights)
     stamps = np.array([hits.frames[r].stamp_ns for r in rows], np.int64)
     at = np.searchsorted(seen, rows, side="right") - 1  # the last detection up to each row
+    places = hits.places(member, rows)
     return Track(
         0,
         tuple(hits.frames[r].topic for r in rows),
@@ -156,11 +209,11 @@ def _build_track(hits: Hits, member: I4, settings: TrackingSettings) -> Track:
         np.array([hits.frames[r].frame for r in rows]),
         stamps,
         np.where(source, hits.numbers[member][at], -1),
-        hits.places(member, rows),
+        places if motion is None else motion.moved(rows, places),
         so_far[at],
         so_far[-1],
         float(so_far[-1].max()),
-        float(np.average(hits.novelties[member], weights=weights)),
+        fuse_novelty(hits.novelties[member], weights),
     )
 
 

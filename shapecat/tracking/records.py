@@ -54,7 +54,7 @@ class Track(Record):
     causal : (k, c) fused posterior of the views up to each row.
     posterior : (c,) fused posterior of all views.
     confidence : the largest entry of `posterior`.
-    novelty : weighted mean novelty of the views.
+    novelty : fused novelty of the views; above 1 the object is none of the known.
     """
 
     id: int

@@ -1,0 +1,161 @@
+"""A motion that the objects share: of the table that turns, or of a sensor without a pose."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapecat.arrays import F8, I4
+from shapecat.tracking.hits import Hits
+from shapecat.tracking.records import FrameDetections
+
+__all__ = ["CommonMotion", "find_common_motion"]
+
+_LONG = 5  # detections of a track that tells a motion
+_MOVED_M = 0.06  # a centre strays less while its object stands still
+_MOST = 0.7  # share of the detections that must be of what moves, and move as one
+_TOGETHER_M = 0.03  # so near a detection is to where the common motion takes its object
+_NOISE_M = 0.01  # a detection that is so far off weighs half
+_ROUNDS = 10
+
+C16 = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class CommonMotion:
+    """For each frame, the transform into the frame in which the objects stand still.
+
+    ``rotations`` (f, 3, 3) about the up direction, ``translations`` (f, 3) metres.
+    """
+
+    rotations: F8
+    translations: F8
+
+    def still(self, frames: Sequence[FrameDetections]) -> list[FrameDetections]:
+        """Return the detections as if nothing had moved."""
+        return [
+            replace(
+                frame,
+                centers=frame.centers @ rotation.T + translation,
+                axes=None if frame.axes is None else rotation @ frame.axes,
+            )
+            for frame, rotation, translation in zip(
+                frames, self.rotations, self.translations, strict=True
+            )
+        ]
+
+    def moved(self, rows: I4, places: F8) -> F8:
+        """Return where places (k, 3) of the still scene are in frames (k,)."""
+        return np.asarray(
+            np.einsum("kji,kj->ki", self.rotations[rows], places - self.translations[rows])
+        )
+
+
+def find_common_motion(hits: Hits, members: Sequence[I4]) -> CommonMotion | None:
+    """Find the turn about the up direction and the level shift in each frame, if there are any.
+
+    Parameters
+    ----------
+    members : the hits of each track, ascending; tracks may be pieces of the same object.
+
+    Returns
+    -------
+    None if fewer than three objects, or not most of them, move, or not as one.
+
+    Notes
+    -----
+    Where each object is in the still scene, and how the scene lies in each frame, are found by
+    turns (generalized Procrustes analysis, Gower 1975), starting from the motion between
+    neighbouring frames. Detections that do not fit weigh less (Cauchy).
+    """
+    long = [member for member in members if len(member) >= _LONG]
+    if hits.axes is None or len(long) < 3:
+        return None
+    which = np.concatenate(long)
+    owner = np.repeat(np.arange(len(long)), [len(member) for member in long])
+    strays = np.concatenate([np.full(len(m), _extent(hits.centers[m])) for m in long])
+    if np.mean(strays > _MOVED_M) < _MOST:
+        return None
+    level = _level(hits.axes)
+    local = hits.centers[which] @ level.T
+    plane = local[:, 0] + 1j * local[:, 1]
+    rows, count = hits.rows[which], len(hits.frames)
+    turn, shift = _between_neighbours(plane, rows, owner, count)
+    weights = np.ones(len(which))
+    for _ in range(_ROUNDS):
+        still = turn[rows] * plane + shift[rows]
+        place = _means(still, owner, weights, len(long))[owner]
+        weights = 1 / (1 + (np.abs(still - place) / _NOISE_M) ** 2)
+        turn, shift = _fit(plane, place, rows, weights, turn, shift)
+    still = turn[rows] * plane + shift[rows]
+    place = _means(still, owner, weights, len(long))[owner]
+    if np.mean(np.abs(still - place) <= _TOGETHER_M) < _MOST:
+        return None
+    return _in_space(level, turn, shift)
+
+
+def _extent(centers: F8) -> float:
+    """Return how far a track got, without its farthest detections."""
+    low, high = np.quantile(centers, [0.1, 0.9], axis=0)
+    return float(np.linalg.norm(high - low))
+
+
+def _level(axes: F8) -> F8:
+    """Return the rotation into a frame whose third axis is up."""
+    up = axes[:, :, 2].mean(axis=0)
+    first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    first /= np.linalg.norm(first)
+    up /= np.linalg.norm(up)
+    return np.array([first, np.cross(up, first), up])
+
+
+def _between_neighbours(plane: C16, rows: I4, owner: I4, count: int) -> tuple[C16, C16]:
+    """Chain the motions between neighbouring frames, of which each is fitted alone."""
+    order = np.lexsort([rows, owner])
+    a, b = order[:-1], order[1:]
+    pair = (owner[a] == owner[b]) & (rows[b] - rows[a] == 1)
+    a, b = a[pair], b[pair]
+    weights = np.ones(len(a))
+    turn, shift = np.ones(count, complex), np.zeros(count, complex)
+    for _ in range(3):
+        turn, shift = _fit(plane[b], plane[a], rows[b], weights, turn, shift)
+        gap = np.abs(turn[rows[b]] * plane[b] + shift[rows[b]] - plane[a])
+        weights = 1 / (1 + (gap / _NOISE_M) ** 2)
+    total = np.cumprod(turn)
+    before = np.concatenate([[1.0], total[:-1]])
+    return total / np.abs(total), np.cumsum(before * shift)
+
+
+def _fit(seen: C16, still: C16, rows: I4, weights: F8, turn: C16, shift: C16) -> tuple[C16, C16]:
+    """Fit a turn and a shift to the points of each frame; of fewer than two they are kept."""
+    count = len(turn)
+    mean_seen = _means(seen, rows, weights, count)
+    mean_still = _means(still, rows, weights, count)
+    cross = (still - mean_still[rows]) * np.conj(seen - mean_seen[rows]) * weights
+    total = _sums(cross, rows, count)
+    enough = (np.bincount(rows, minlength=count) >= 2) & (np.abs(total) > 0)
+    turn = np.where(enough, total / np.maximum(np.abs(total), 1e-300), turn)
+    shift = np.where(enough, mean_still - turn * mean_seen, shift)
+    return turn, shift
+
+
+def _sums(values: C16, groups: I4, count: int) -> C16:
+    real = np.bincount(groups, values.real, count)
+    return np.asarray(real + 1j * np.bincount(groups, values.imag, count))
+
+
+def _means(values: C16, groups: I4, weights: F8, count: int) -> C16:
+    total = np.bincount(groups, weights, count)
+    return _sums(values * weights, groups, count) / np.maximum(total, 1e-300)
+
+
+def _in_space(level: F8, turn: C16, shift: C16) -> CommonMotion:
+    """Make turns and shifts in the plane those of space."""
+    zero, one = np.zeros(len(turn)), np.ones(len(turn))
+    flat = np.array(
+        [[turn.real, -turn.imag, zero], [turn.imag, turn.real, zero], [zero, zero, one]]
+    )
+    rotations = np.einsum("ji,jkf,kl->fil", level, flat, level)
+    return CommonMotion(rotations, np.column_stack([shift.real, shift.imag, zero]) @ level)

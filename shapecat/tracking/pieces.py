@@ -1,0 +1,115 @@
+"""Tracks that are one object: it was split into pieces for some frames."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from shapecat.arrays import F8, I4, Bool
+from shapecat.tracking.hits import Hits
+
+__all__ = ["join_pieces"]
+
+_NEAR_M = 0.35  # centres of pieces are nearer than that
+_SLACK, _SLACK_M = 1.1, 0.01  # pieces together may be so much longer than the whole
+_LACKING = 0.95  # a piece is shorter, on some side, than so much of the whole
+_MOSTLY = 0.34  # share of the frames with both in which they must be pieces
+
+
+def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
+    """Join tracks that together, while both are seen, are no larger than one of them is alone.
+
+    Two objects side by side are larger than either of them. Of two pieces in the same frame the
+    larger one stays in the track.
+
+    Returns
+    -------
+    The hits of each object, ascending, in the order of their first track.
+    """
+    if hits.axes is None or len(members) < 2:
+        return list(members)
+    axes, owner = hits.axes, np.full(len(hits.rows), -1)
+    for k, member in enumerate(members):
+        owner[member] = k
+    wholes = np.array([_wholes(hits, member) for member in members])
+    pairs = _neighbours(hits, owner)
+    topics = hits.topics[hits.rows[pairs]]
+    fits = _fit(hits, axes, pairs, wholes[owner[pairs], topics])
+    together, fitting = np.unique(np.sort(owner[pairs[fits]], axis=1), axis=0, return_counts=True)
+    root = np.arange(len(members))
+    for (a, b), count in sorted(
+        zip(together.tolist(), fitting.tolist(), strict=True), key=lambda item: -item[1]
+    ):
+        common = np.intersect1d(hits.rows[members[a]], hits.rows[members[b]]).size
+        if count > _MOSTLY * common:
+            root[root == max(root[a], root[b])] = min(root[a], root[b])
+    volume = hits.sizes.prod(axis=1)
+    return [
+        _largest(hits, np.concatenate([members[k] for k in _where(root == r)]), volume)
+        for r in np.unique(root)
+    ]
+
+
+def _where(mask: Bool) -> list[int]:
+    return [int(k) for k in np.flatnonzero(mask)]
+
+
+def _sorted_sides(sizes: F8) -> F8:
+    """Return sizes (n, 3) as longer side, shorter side, height."""
+    return np.column_stack([sizes[:, :2].max(axis=1), sizes[:, :2].min(axis=1), sizes[:, 2]])
+
+
+def _wholes(hits: Hits, member: I4) -> F8:
+    """Return (topics, 3) lengths of the whole object as each topic sees it, 0 if it does not."""
+    topics = hits.topics[hits.rows[member]]
+    result = np.zeros((hits.topics.max() + 1, 3))
+    for topic in _where(np.bincount(topics) > 0):
+        result[topic] = _whole(hits, member[topics == topic])
+    return result
+
+
+def _whole(hits: Hits, member: I4) -> F8:
+    """Return the lengths of the whole object: they are seen now and then."""
+    uncut = member[~hits.partial[member]]
+    lengths = _sorted_sides(hits.sizes[member if len(uncut) == 0 else uncut])
+    return np.asarray(np.quantile(lengths, 0.75, axis=0))
+
+
+def _neighbours(hits: Hits, owner: I4) -> I4:
+    """Return (p, 2) tracked detections of the same frame that are near each other."""
+    tracked = np.flatnonzero(owner >= 0)
+    places = np.column_stack([hits.centers[tracked], hits.rows[tracked]])
+    found = cKDTree(places).query_pairs(_NEAR_M, output_type="ndarray")
+    pairs = tracked[found]
+    return np.asarray(pairs[np.lexsort(pairs.T)])
+
+
+def _fit(hits: Hits, axes: F8, pairs: I4, wholes: F8) -> Bool:
+    """Tell which pairs (p, 2) are pieces of either one's whole (p, 2, 3) object.
+
+    Their common box is no larger than it, and neither shows all of it: in a bowl there may be
+    something.
+    """
+    joint = np.minimum(_joint(hits, axes, pairs), _joint(hits, axes, pairs[:, ::-1]))
+    lengths = _sorted_sides(hits.sizes[pairs.ravel()]).reshape(-1, 2, 3)
+    room = wholes * _SLACK + _SLACK_M
+    lacking = np.any(lengths.max(axis=1)[:, None] < _LACKING * wholes, axis=2)
+    fitting = np.all(joint[:, None] <= room, axis=2)
+    return np.asarray(np.any(fitting & lacking, axis=1))
+
+
+def _joint(hits: Hits, axes: F8, pairs: I4) -> F8:
+    """Return (p, 3) the lengths of the boxes of both, along the axes of the first."""
+    i, j = pairs.T
+    offset = np.einsum("pji,pj->pi", axes[i], hits.centers[j] - hits.centers[i])
+    turned = np.abs(np.einsum("pji,pjk->pik", axes[i], axes[j]))
+    reach = 0.5 * np.einsum("pik,pk->pi", turned, hits.sizes[j])
+    own = 0.5 * hits.sizes[i]
+    return _sorted_sides(np.maximum(own, offset + reach) - np.minimum(-own, offset - reach))
+
+
+def _largest(hits: Hits, member: I4, volume: F8) -> I4:
+    """Return the largest of the hits of each frame."""
+    order = member[np.lexsort([-volume[member], hits.rows[member]])]
+    first = np.concatenate([[True], np.diff(hits.rows[order]) > 0])
+    return np.asarray(order[first])
