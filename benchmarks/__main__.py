@@ -9,7 +9,7 @@ from collections.abc import Callable  # noqa: E402  the environment comes first
 from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
 
-from benchmarks import ablation, density, detection, stages  # noqa: E402
+from benchmarks import ablation, density, detection, neural_gas, stages  # noqa: E402
 from benchmarks.measure import machine, save  # noqa: E402
 
 
@@ -22,6 +22,7 @@ def main() -> None:
         "density": lambda: density.run(5, Path("build/density.png")),
         "ablation": lambda: ablation.run(30),
         "stages": lambda: stages.run(8),
+        "neural gas": lambda: neural_gas.run(3),
     }
     for name, work in works.items():
         table, figures = work()

@@ -17,8 +17,17 @@ from .render import print_json, progress_bars
     type=ANY_PATH,
     help="Also write the tables with their pictures, as .html or .md.",
 )
+@click.option(
+    "--baselines",
+    type=ANY_PATH,
+    metavar="TRAINING_SET",
+    help="Also train the chain and plain learners (forest, linear, PNN, D2, ESF-like) on these "
+    "views and judge them on DATASET. DATASET itself: in five folds by instance.",
+)
 @json_option
-def evaluate(*, dataset: Path, model: Path | None, page: Path | None, as_json: bool) -> None:
+def evaluate(
+    *, dataset: Path, model: Path | None, page: Path | None, baselines: Path | None, as_json: bool
+) -> None:
     """Measure a model on labelled views: accuracy, confusion, calibration, novelty.
 
     DATASET is laid out as for `shapecat train`. Several views of one instance are also judged
@@ -26,12 +35,13 @@ def evaluate(*, dataset: Path, model: Path | None, page: Path | None, as_json: b
 
     \b
     shapecat evaluate crops --model mine.npz --report crops.html
+    shapecat evaluate crops --baselines crops
     """
     from shapecat.evaluation import evaluate_folder, format_report
     from shapecat.evaluation.page import write_page
 
     with progress_bars() as bars:
-        report = evaluate_folder(dataset, model, observe=bars)
+        report = evaluate_folder(dataset, model, baselines=baselines, observe=bars)
     if page is not None:
         write_page(page, report, title=f"{dataset.name}: {report.n} views")
     if as_json:

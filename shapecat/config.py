@@ -54,6 +54,9 @@ class SurfaceSettings:
     """Separate parts of the graph with a smaller share of the points are dropped."""
     voxel_m: float = 0.005
     """Edge of the voxels an object's points are averaged in before the gas."""
+    smooth_radius_m: float = 0.0
+    """Then moving least squares smooth them within this radius, 0.015 for example (thesis 4.2);
+    0 leaves them as they are."""
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ from shapecat.description import DESCRIPTOR_NAMES, describe
 from shapecat.detection import detect
 from shapecat.geometry import inverse, level_from_sensor, transform
 from shapecat.learning import Categorizer
-from shapecat.surface import reconstruct, voxelize
+from shapecat.surface import reconstruct, thin
 from shapecat.types import Candidate, Detection, Frame, NeuralGas, Perception, Scene
 
 __all__ = ["perceive"]
@@ -70,7 +70,7 @@ def _describe_candidate(
     begun = time.perf_counter()
     points = frame.xyz(candidate.indices)
     level = level_from_sensor(scene.up, _support_offset(scene, candidate), points)
-    cloud = voxelize(transform(level, points).astype(np.float32), voxel_m=settings.surface.voxel_m)
+    cloud = thin(transform(level, points).astype(np.float32), settings=settings.surface)
     gas = reconstruct(cloud, settings=settings.surface, rng=rng)
     if gas is None:
         nothing = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))

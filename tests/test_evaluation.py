@@ -16,7 +16,7 @@ from sklearn import metrics as reference
 
 from shapecat.arrays import F4
 from shapecat.errors import ModelError, RecordingError
-from shapecat.evaluation import evaluate_folder, format_report, metrics, read_dataset
+from shapecat.evaluation import Report, evaluate_folder, format_report, metrics, read_dataset
 from shapecat.evaluation.fused import Fused, fuse_views
 from shapecat.evaluation.page import write_page
 from shapecat.evaluation.training import (
@@ -215,7 +215,7 @@ def test_the_page_is_whole_and_escapes_names(trained: Path, tmp_path: Path) -> N
     assert "a &amp; b" in page
     for picture in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
         ET.fromstring(picture)  # noqa: S314  we wrote it
-    assert page.count("<svg") == 2
+    assert page.count("<svg") == 2 + len(report.breakdowns) == 5
 
 
 def test_the_markdown_page_has_its_pictures_beside_it(trained: Path, tmp_path: Path) -> None:
@@ -226,9 +226,10 @@ def test_the_markdown_page_has_its_pictures_beside_it(trained: Path, tmp_path: P
     write_page(tmp_path / "out" / "all.md", strange, title="all")
     page = (tmp_path / "out" / "all.md").read_text("utf-8")
 
-    for name in re.findall(r"!\[\w+\]\((.*?)\)", page):
+    pictures = re.findall(r"!\[[\w ]+\]\((.*?)\)", page)
+    for name in pictures:
         ET.parse(tmp_path / "out" / name)  # noqa: S314  we wrote it
-    assert page.count("![") == 2
+    assert page.count("![") == len(pictures) == 5
     assert "recall of a\\|b" in page
     assert "| 3 | 4 | 1.000 | 0.250 |" in page
 
@@ -244,6 +245,53 @@ def test_the_command_writes_the_page(trained: Path, tmp_path: Path) -> None:
 
     assert result.exit_code == 0, result.output
     assert "data: 8 views" in page.read_text("utf-8")
+
+
+@pytest.fixture(scope="module")
+def compared(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Report:
+    folder = tmp_path_factory.mktemp("compared")
+    dataset = write_dataset(folder / "data", ("box", "ball", "unknown"), instances=3, seed=9)
+    return evaluate_folder(dataset, trained, baselines=dataset)
+
+
+def test_plain_learners_are_judged_beside_the_chain(compared: Report, tmp_path: Path) -> None:
+    """All see the same views: a chain that a plain learner beats has to show it."""
+    names = [item.learner for item in compared.baselines]
+
+    assert names[:4] == ["the chain", "forest", "linear", "pnn"]
+    assert names[-2:] == ["forest on D2", "forest on D2, D3, A3"]
+    assert all(item.accuracy == item.balanced_accuracy for item in compared.baselines)
+    assert min(item.accuracy or 0 for item in compared.baselines) >= 0.75
+    assert {item.learned for item in compared.baselines} == {12}
+    assert len(compared.as_dict()["baselines"]) == len(names)
+    assert "forest on D2" in format_report(compared)
+    write_page(tmp_path / "page.md", compared, title="compared")
+    assert "| forest on D2 | 12 |" in (tmp_path / "page.md").read_text("utf-8")
+
+
+def test_learners_may_have_a_training_set_of_their_own(trained: Path, tmp_path: Path) -> None:
+    """It may hold other categories in another order: each learner's columns are its own."""
+    train = write_dataset(tmp_path / "train", ("ball", "box", "plate"), instances=3, seed=3)
+    test = write_dataset(tmp_path / "test", ("box", "ball"), instances=2, seed=4)
+    report = evaluate_folder(test, trained, baselines=train)
+
+    assert all((item.accuracy or 0) >= 0.75 for item in report.baselines)
+    assert {item.learned for item in report.baselines} == {18}
+
+
+def test_a_category_of_one_object_has_no_folds(trained: Path, tmp_path: Path) -> None:
+    """Its views would be in training and test alike."""
+    dataset = write_dataset(tmp_path / "data", ("box", "ball"), instances=1)
+
+    with pytest.raises(RecordingError, match="two objects each"):
+        evaluate_folder(dataset, trained, baselines=dataset)
+
+
+def test_accuracy_is_told_by_the_pose_of_the_sensor(compared: Report) -> None:
+    """From above a can is a plate: one figure for all poses hides it."""
+    assert [name for name, _ in compared.breakdowns] == ["distance", "elevation", "voxels"]
+    assert sum(count for _, count, _ in compared.by_elevation) == compared.n
+    assert compared.by_elevation[0][0] == "30-45°"
 
 
 def test_views_of_an_object_are_fused() -> None:

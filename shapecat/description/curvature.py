@@ -105,17 +105,20 @@ def fit_surfaces(
     v = np.zeros(total, np.float32)
     w = np.zeros(total, np.float32)
     scale = np.float32(1.0 / radius)
+    zero, one = np.uint64(0), np.uint64(1)
     for i in range(count):
-        near = 0
+        px, py, pz = x[i], y[i], z[i]
+        found = zero  # unsigned: no index is checked for counting from the end
         for j in range(count):
             if straight[i, j] >= radius + reach[j]:
                 continue
-            for k in range(starts[j], starts[j + 1]):
-                du = (points[0, k] - x[i]) * scale
-                dv = (points[1, k] - y[i]) * scale
-                dw = (points[2, k] - z[i]) * scale
-                u[near], v[near], w[near] = du, dv, dw
-                near += 1 if du * du + dv * dv + dw * dw < np.float32(1) else 0
+            for k in range(np.uint64(starts[j]), np.uint64(starts[j + 1])):
+                du = (points[0, k] - px) * scale
+                dv = (points[1, k] - py) * scale
+                dw = (points[2, k] - pz) * scale
+                u[found], v[found], w[found] = du, dv, dw
+                found += one if du * du + dv * dv + dw * dw < np.float32(1) else zero
+        near = np.int64(found)
         ex, ey, ez = eye[0] - x[i], eye[1] - y[i], eye[2] - z[i]
         a, b, c = _normal(u, v, w, near, ex, ey, ez)
         first, second = np.float32(0), np.float32(0)

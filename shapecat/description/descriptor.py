@@ -289,6 +289,24 @@ def _count(row: F4, start: int, bins: int, place: float, weight: float) -> None:
 
 
 @kernel
+def _find_bins(
+    lengths: F4, i: int, scale: float, one: float, bins: I4, shares: F4, kind: int
+) -> None:
+    """Write for row i of ``lengths`` the first of the two bins a length is shared between.
+
+    And the share of the second, of a count of ``one``.
+    """
+    last = np.float32(_DISTANCE_BINS - 1)
+    for j in range(lengths.shape[1]):
+        place = lengths[i, j] * scale - np.float32(0.5)
+        place = place if place > 0 else np.float32(0)
+        place = place if place < last else last
+        k = min(np.int32(place), np.int32(_DISTANCE_BINS - 2))
+        bins[kind, j] = k
+        shares[kind, j] = (place - np.float32(k)) * one
+
+
+@kernel
 def _distributions(
     z: F4, straight: F4, paths: F4, weight: F4, normals: F4, curvatures: F4, out: F4
 ) -> None:
@@ -296,34 +314,30 @@ def _distributions(
     count = z.size
     width = 1 + _CURVATURE + 2 * _DISTANCE_BINS
     rows = np.zeros((count, width), np.float32)
-    mean_path = np.zeros(count)
-    for i in range(count):
-        mean_path[i] = paths[i].sum()
+    sums = np.zeros(count, np.float32)
+    for j in range(count):
+        for i in range(count):  # column by column: the sums of all rows grow side by side
+            sums[i] += paths[j, i]
+    mean_path = sums.astype(np.float64)
     pairs = count * (count - 1)
     scale = np.float32(_DISTANCE_BINS / _DISTANCE_RANGE)
     per_path = scale * np.float32(pairs / max(mean_path.sum(), 1e-9))
     per_straight = scale  # the mean is the unit
     one = np.float32(1.0 / (count - 1))
-    last = np.float32(_DISTANCE_BINS - 1)
+    bins, shares = np.zeros((2, count), np.int32), np.zeros((2, count), np.float32)
     for i in range(count):
         row = rows[i]
+        _find_bins(paths, i, per_path, one, bins, shares, 0)
+        _find_bins(straight, i, per_straight, one, bins, shares, 1)
         for j in range(count):
             if i == j:
                 continue
-            a = paths[i, j] * per_path - np.float32(0.5)
-            a = a if a > 0 else np.float32(0)
-            a = a if a < last else last
-            k = min(int(a), _DISTANCE_BINS - 2)
-            f = (a - np.float32(k)) * one
-            row[1 + _CURVATURE + k] += one - f
-            row[2 + _CURVATURE + k] += f
-            a = straight[i, j] * per_straight - np.float32(0.5)
-            a = a if a > 0 else np.float32(0)
-            a = a if a < last else last
-            k = min(int(a), _DISTANCE_BINS - 2)
-            f = (a - np.float32(k)) * one
-            row[1 + _CURVATURE + _DISTANCE_BINS + k] += one - f
-            row[2 + _CURVATURE + _DISTANCE_BINS + k] += f
+            k, share = 1 + _CURVATURE + bins[0, j], shares[0, j]
+            row[k] += one - share
+            row[k + 1] += share
+            k, share = 1 + _CURVATURE + _DISTANCE_BINS + bins[1, j], shares[1, j]
+            row[k] += one - share
+            row[k + 1] += share
         first, second = curvatures[0, i], curvatures[1, i]
         _curvature_row(row, first, second)
     curvature = out[_CURVED:_UP]

@@ -12,18 +12,19 @@ _OUTSIDE = 0.02
 _LEAST = 1e-30
 
 
-@kernel
+@kernel(fast=True)
 def inner_range(values: F4) -> tuple[float, float]:
     """Return the 2 % and the 98 % quantile of values (n,), interpolated in a histogram."""
-    low, high = values[0], values[0]
-    for value in values:
-        low, high = min(low, value), max(high, value)
+    low = high = values[0]
+    for k in range(values.size):
+        low = values[k] if values[k] < low else low
+        high = values[k] if values[k] > high else high
     if not high - low > _LEAST:
         return low, high
-    bins = np.zeros(_BINS)
+    bins = np.zeros(_BINS, np.int32)
     scale = np.float32(_BINS * 0.9999) / (high - low)
-    for value in values:
-        bins[int((value - low) * scale)] += 1
+    for k in range(values.size):
+        bins[int((values[k] - low) * scale)] += 1
     limit = _OUTSIDE * values.size
     first, last = 0, _BINS - 1
     seen = bins[0]

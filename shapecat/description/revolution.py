@@ -228,19 +228,19 @@ def _improve(
     means = np.zeros((REVOLUTION_SLICES, 6))  # weight, radius, derivatives
     row = np.zeros(6)
     for i in range(rows.shape[1]):
-        _derivatives(rows[:, i], row)
-        mean = means[_slice(rows[0, i], reach)]
+        _derivatives(rows, i, row)
+        k = _slice(rows[0, i], reach)
         for j in range(6):
-            mean[j] += rows[4, i] * row[j]
+            means[k, j] += rows[4, i] * row[j]
     for k in range(REVOLUTION_SLICES):
         for j in range(1, 6):
             means[k, j] /= max(means[k, 0], 1e-9)
     A, b = np.zeros((free, free)), np.zeros(free)
     total = cost = size = 0.0
     for i in range(rows.shape[1]):
-        _derivatives(rows[:, i], row)
-        mean = means[_slice(rows[0, i], reach)]
-        residual = row[1] - mean[1]
+        _derivatives(rows, i, row)
+        own = _slice(rows[0, i], reach)
+        residual = row[1] - means[own, 1]
         heed = rows[4, i]
         if abs(residual) > limit:
             heed *= limit / abs(residual)
@@ -248,10 +248,10 @@ def _improve(
         size += rows[4, i] * row[1]
         cost += heed * residual * residual
         for j in range(free):
-            slope = row[2 + j] - mean[2 + j]
+            slope = row[2 + j] - means[own, 2 + j]
             b[j] -= heed * slope * residual
             for k in range(free):
-                A[j, k] += heed * slope * (row[2 + k] - mean[2 + k])
+                A[j, k] += heed * slope * (row[2 + k] - means[own, 2 + k])
     pull = 0.5 * _DAMPING * (A[0, 0] + A[1, 1]) + 1e-6
     for j in range(free):
         A[j, j] += pull if j < 2 else pull * (reach[1] - reach[0]) ** 2 / 12
@@ -261,11 +261,11 @@ def _improve(
 
 
 @kernel
-def _derivatives(row: F8, out: F8) -> None:
+def _derivatives(rows: F8, i: int, out: F8) -> None:
     """Write 1, the radius, and its derivatives by two shifts and two tilts of the axis."""
-    out[0], out[1] = 1.0, row[1]
-    out[2], out[3] = -row[2], -row[3]
-    out[4], out[5] = -row[2] * row[0], -row[3] * row[0]
+    out[0], out[1] = 1.0, rows[1, i]
+    out[2], out[3] = -rows[2, i], -rows[3, i]
+    out[4], out[5] = -rows[2, i] * rows[0, i], -rows[3, i] * rows[0, i]
 
 
 @kernel

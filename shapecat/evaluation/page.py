@@ -9,7 +9,14 @@ from shapecat.errors import OutputError
 from shapecat.evaluation.metrics import Bin
 from shapecat.evaluation.report import Report
 
-__all__ = ["calibration_svg", "confusion_svg", "format_markdown", "format_page", "write_page"]
+__all__ = [
+    "accuracy_svg",
+    "calibration_svg",
+    "confusion_svg",
+    "format_markdown",
+    "format_page",
+    "write_page",
+]
 
 _CELL = 46
 _MARGIN = 74
@@ -25,7 +32,8 @@ _STYLE = (
 def write_page(path: Path, report: Report, *, title: str) -> None:
     """Write an evaluation as an HTML page, or as Markdown if the file is called so.
 
-    The pictures of ``NAME.md`` are ``NAME_confusion.svg`` and ``NAME_calibration.svg``.
+    The pictures of ``NAME.md`` are ``NAME_confusion.svg``, ``NAME_calibration.svg``, and one for
+    each breakdown, such as ``NAME_distance.svg``.
 
     Raises
     ------
@@ -33,13 +41,11 @@ def write_page(path: Path, report: Report, *, title: str) -> None:
     """
     files = {path: format_page(report, title=title)}
     if path.suffix.lower() == ".md":
-        pictures = {name: f"{path.stem}_{name}.svg" for name in ("confusion", "calibration")}
+        drawn = _pictures(report)
+        pictures = {name: f"{path.stem}_{name}.svg" for name in drawn}
         files = {
             path: format_markdown(report, title=title, pictures=pictures),
-            path.with_name(pictures["confusion"]): confusion_svg(
-                report.categories, report.confusion
-            ),
-            path.with_name(pictures["calibration"]): calibration_svg(report.calibration),
+            **{path.with_name(pictures[name]): picture for name, picture in drawn.items()},
         }
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -48,6 +54,15 @@ def write_page(path: Path, report: Report, *, title: str) -> None:
     except OSError as error:
         msg = f"{path}: cannot write the report: {error.strerror or error}"
         raise OutputError(msg) from error
+
+
+def _pictures(report: Report) -> dict[str, str]:
+    """Return the pictures by the name of what they show."""
+    return {
+        "confusion": confusion_svg(report.categories, report.confusion),
+        "calibration": calibration_svg(report.calibration),
+        **{name: accuracy_svg(rows) for name, rows in report.breakdowns},
+    }
 
 
 def format_page(report: Report, *, title: str) -> str:
@@ -60,7 +75,10 @@ def format_page(report: Report, *, title: str) -> str:
         "<h2>Calibration</h2><p>Accuracy over confidence; the diagonal is honest.</p>",
         calibration_svg(report.calibration),
     ]
-    parts += [f"<h2>{name}</h2>" + _table(head, rows) for name, head, rows in _breakdowns(report)]
+    for name, rows in report.breakdowns:
+        parts += [f"<h2>Accuracy over {name}</h2>", accuracy_svg(rows)]
+        parts.append(_table(*_breakdown(name, rows)))
+    parts += [f"<h2>{name}</h2>" + _table(head, rows) for name, head, rows in _comparisons(report)]
     return (
         '<!DOCTYPE html><html lang="en"><meta charset="utf-8">'
         f"<title>{escape(title)}</title><style>{_STYLE}</style><body>"
@@ -70,7 +88,7 @@ def format_page(report: Report, *, title: str) -> str:
 
 
 def format_markdown(report: Report, *, title: str, pictures: Mapping[str, str]) -> str:
-    """Return an evaluation as Markdown; ``pictures`` are the files of the two pictures."""
+    """Return an evaluation as Markdown; ``pictures`` are the files of the pictures."""
     parts = [
         f"# {_plain(title)}",
         _markdown(("", ""), _figures(report)),
@@ -79,7 +97,10 @@ def format_markdown(report: Report, *, title: str, pictures: Mapping[str, str]) 
         "## Calibration\n\nAccuracy over confidence; the diagonal is honest.",
         f"![Calibration]({pictures['calibration']})",
     ]
-    parts += [f"## {name}\n\n" + _markdown(head, rows) for name, head, rows in _breakdowns(report)]
+    for name, rows in report.breakdowns:
+        picture = f"![Accuracy over {name}]({pictures[name]})"
+        parts += [f"## Accuracy over {name}", picture, _markdown(*_breakdown(name, rows))]
+    parts += [f"## {name}\n\n" + _markdown(head, rows) for name, head, rows in _comparisons(report)]
     return "\n\n".join(parts) + "\n"
 
 
@@ -101,17 +122,18 @@ def _figures(report: Report) -> _Rows:
     ]
 
 
-def _breakdowns(report: Report) -> list[tuple[str, tuple[str, ...], _Rows]]:
-    """Return title, head and rows of each table behind the pictures."""
-    parts = [("distance", report.by_distance), ("voxels", report.by_points)]
-    tables: list[tuple[str, tuple[str, ...], _Rows]] = [
-        (
-            f"Accuracy over {name}",
-            (name, "views", "accuracy"),
-            [(label, str(count), _text(value)) for label, count, value in rows],
-        )
-        for name, rows in parts
-    ]
+_Ranges: TypeAlias = Sequence[tuple[str, int, float]]
+
+
+def _breakdown(name: str, ranges: _Ranges) -> tuple[tuple[str, ...], _Rows]:
+    """Return head and rows of a table of accuracies."""
+    rows = [(label, str(count), _text(value)) for label, count, value in ranges]
+    return (name, "views", "accuracy"), list(rows)
+
+
+def _comparisons(report: Report) -> list[tuple[str, tuple[str, ...], _Rows]]:
+    """Return title, head and rows of each table without a picture."""
+    tables: list[tuple[str, tuple[str, ...], _Rows]] = []
     if report.fused:
         rows = [
             (str(item.views), str(item.groups), _text(item.accuracy), _text(item.ece))
@@ -119,6 +141,19 @@ def _breakdowns(report: Report) -> list[tuple[str, tuple[str, ...], _Rows]]:
         ]
         head = ("views fused", "objects", "accuracy", "calibration error")
         tables.append(("Several views of one object", head, list(rows)))
+    if report.baselines:
+        learners = [
+            (
+                item.learner,
+                str(item.learned),
+                _text(item.accuracy),
+                _text(item.balanced_accuracy),
+                _text(item.ece),
+            )
+            for item in report.baselines
+        ]
+        columns = ("learner", "views learned", "accuracy", "balanced", "calibration error")
+        tables.append(("The chain beside plain learners", columns, list(learners)))
     return tables
 
 
@@ -167,6 +202,29 @@ def calibration_svg(curve: Sequence[Bin], *, size: int = 280) -> str:
         for item in curve
     ]
     return _svg(size, size, parts)
+
+
+def accuracy_svg(ranges: _Ranges, *, width: int = 480) -> str:
+    """Return accuracies as bars; the thickness of a bar is its share of the views."""
+    side, step = width - 2 * _MARGIN, 34
+    most = max((count for _, count, _ in ranges), default=1)
+    parts: list[str] = []
+    for k, (label, count, value) in enumerate(ranges):
+        middle, thick = step * (k + 0.5), 4 + 22 * count / most
+        text, end = middle + 4, _MARGIN + side + 8
+        bar = f'y="{middle - thick / 2:.1f}" width="{side * value:.1f}" height="{thick:.1f}"'
+        parts.extend(
+            (
+                f'<text x="{_MARGIN - 8}" y="{text}" text-anchor="end">{escape(label)}</text>',
+                f'<rect x="{_MARGIN}" {bar} fill="rgb{_INK}" fill-opacity="0.7"/>',
+                f'<text x="{end}" y="{text}">{value:.3f}</text>',
+            )
+        )
+    height = step * len(ranges)
+    parts.append(
+        f'<rect x="{_MARGIN}" y="0" width="{side}" height="{height}" fill="none" stroke="#999"/>'
+    )
+    return _svg(width, height, parts)
 
 
 def _svg(width: float, height: float, parts: Sequence[str]) -> str:

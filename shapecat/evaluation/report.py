@@ -5,9 +5,9 @@ import itertools
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -18,17 +18,28 @@ from shapecat.config import Settings
 from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import ModelError
 from shapecat.evaluation import metrics
-from shapecat.evaluation.dataset import read_dataset
+from shapecat.evaluation.dataset import Dataset, read_dataset
 from shapecat.evaluation.fused import Fused, fuse_views
 from shapecat.evaluation.views import DescribedViews, Observer, describe_views, ignore
 from shapecat.learning import Categorizer, load_model
 
-__all__ = ["Report", "evaluate", "evaluate_folder", "format_report"]
+__all__ = ["Compared", "Report", "evaluate", "evaluate_folder", "format_report"]
 
 UNKNOWN = "unknown"
 """Folder and label of shapes of no category."""
+_ELEVATIONS = (-math.inf, 15.0, 30.0, 45.0, 60.0, math.inf)
 _DISTANCES_M = (0.0, 0.8, 1.1, 1.4, 1.7, math.inf)
 _POINTS = (0, 60, 120, 250, 500, 1000, math.inf)
+
+
+class Compared(NamedTuple):
+    """A learner, how many views it learned from, and how it did; undefined figures are None."""
+
+    learner: str
+    learned: int
+    accuracy: float | None
+    balanced_accuracy: float | None
+    ece: float | None
 
 
 @dataclass(frozen=True)
@@ -36,8 +47,9 @@ class Report:
     """What an evaluation came to; undefined figures are None.
 
     ``confusion`` counts true categories (rows) taken for others (columns), in the order of
-    ``categories``; ``by_distance`` and ``by_points`` give (range, views, accuracy); ``fused`` is
-    empty where no object has three views.
+    ``categories``; ``by_distance``, ``by_elevation`` (how far the sensor looks down) and
+    ``by_points`` give (range, views, accuracy); ``fused`` is empty where no object has three
+    views; ``baselines`` are there where they were asked for.
     """
 
     model: str
@@ -56,6 +68,18 @@ class Report:
     by_distance: tuple[tuple[str, int, float], ...] = field(default=())
     by_points: tuple[tuple[str, int, float], ...] = field(default=())
     fused: tuple[Fused, ...] = ()
+    by_elevation: tuple[tuple[str, int, float], ...] = field(default=())
+    baselines: tuple[Compared, ...] = ()
+
+    @property
+    def breakdowns(self) -> tuple[tuple[str, tuple[tuple[str, int, float], ...]], ...]:
+        """The accuracies over ranges that have views, with what they are broken down by."""
+        parts = (
+            ("distance", self.by_distance),
+            ("elevation", self.by_elevation),
+            ("voxels", self.by_points),
+        )
+        return tuple((name, rows) for name, rows in parts if rows)
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain JSON values."""
@@ -66,26 +90,62 @@ class Report:
             "calibration": [item._asdict() for item in self.calibration],
             "by_distance": _as_dicts(self.by_distance),
             "by_points": _as_dicts(self.by_points),
+            "by_elevation": _as_dicts(self.by_elevation),
             "fused": [item._asdict() for item in self.fused],
+            "baselines": [item._asdict() for item in self.baselines],
         }
 
 
-def evaluate_folder(root: Path, model: Path | None = None, *, observe: Observer = ignore) -> Report:
+def evaluate_folder(
+    root: Path,
+    model: Path | None = None,
+    *,
+    baselines: Path | None = None,
+    observe: Observer = ignore,
+) -> Report:
     """Evaluate a model (by default the shipped one) on a labelled data set.
+
+    Parameters
+    ----------
+    baselines : a data set to train the chain and plain learners on, which are then judged on
+        ``root`` too. It may be ``root`` itself: five folds by instance.
 
     Raises
     ------
-    RecordingError : there are no views, or one cannot be read.
+    RecordingError : there are no views, or one cannot be read, or too few to train on.
     ModelError : no usable model, or one that does not know a category of the data set.
     """
     categorizer = load_model(model)
     categorizer.require_descriptor(DESCRIPTOR_NAMES)
     dataset = read_dataset(root)
     _require_categories(dataset.categories, categorizer)
-    views = describe_views(
-        dataset, settings=Settings(), total=len(dataset), phase="evaluate", observe=observe
+    wanted = baselines is not None
+    views = _described(dataset, "evaluate", observe, with_functions=wanted)
+    report = evaluate(views, categorizer)
+    if baselines is None:
+        return report
+    train = None
+    if baselines.resolve() != root.resolve():
+        train = _described(read_dataset(baselines), "train", observe, with_functions=True)
+    from shapecat.evaluation.baselines import compare_learners  # noqa: PLC0415  scikit-learn
+
+    rows = compare_learners(
+        views, train, categories=categorizer.categories, root=baselines, observe=observe
     )
-    return evaluate(views, categorizer)
+    return replace(report, baselines=rows)
+
+
+def _described(
+    dataset: Dataset, phase: str, observe: Observer, *, with_functions: bool
+) -> DescribedViews:
+    return describe_views(
+        dataset,
+        settings=Settings(),
+        total=len(dataset),
+        phase=phase,
+        observe=observe,
+        with_functions=with_functions,
+    )
 
 
 def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
@@ -127,6 +187,12 @@ def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
         calibration=metrics.calibration_curve(truth, posteriors),
         by_distance=_accuracy_over(views.distances[known], truth == predicted, _DISTANCES_M, " m"),
         by_points=_accuracy_over(views.points[known], truth == predicted, _POINTS, ""),
+        by_elevation=_accuracy_over(
+            views.elevations[known] if len(views.elevations) else np.zeros(0),
+            truth == predicted if len(views.elevations) else np.zeros(0, bool),
+            _ELEVATIONS,
+            "°",
+        ),
         fused=fuse_views(truth, posteriors, views.instances[known]),
     )
 
@@ -159,6 +225,7 @@ def _accuracy_over(
         mine = (values >= low) & (values < high)
         if mine.any():
             name = f"{low:g}-{high:g}{unit}" if math.isfinite(high) else f"{low:g}{unit} or more"
+            name = name if math.isfinite(low) else f"below {high:g}{unit}"
             rows.append((name, int(mine.sum()), float(right[mine].mean())))
     return tuple(rows)
 
@@ -183,11 +250,12 @@ def format_report(report: Report) -> str:
     console.print(f"{report.n} views, model {report.model}{skipped}\n")
     console.print(_figures(report))
     console.print(_confusion(report))
-    for title, rows in (("distance", report.by_distance), ("voxels", report.by_points)):
-        if rows:
-            console.print(_breakdown(title, rows))
+    for title, rows in report.breakdowns:
+        console.print(_breakdown(title, rows))
     if report.fused:
         console.print(_fused(report))
+    if report.baselines:
+        console.print(_baselines(report))
     return "\n".join(line.rstrip() for line in stream.getvalue().splitlines())
 
 
@@ -234,4 +302,13 @@ def _fused(report: Report) -> Table:
     table = _grid(None, "\nviews fused", "\nobjects", "\naccuracy", "\ncalibration error")
     for item in report.fused:
         table.add_row(str(item.views), str(item.groups), _text(item.accuracy), _text(item.ece))
+    return table
+
+
+def _baselines(report: Report) -> Table:
+    columns = ("learner", "views learned", "accuracy", "balanced", "calibration error")
+    table = _grid(None, *(f"\n{name}" for name in columns))
+    for item in report.baselines:
+        figures = (item.accuracy, item.balanced_accuracy, item.ece)
+        table.add_row(item.learner, str(item.learned), *map(_text, figures))
     return table

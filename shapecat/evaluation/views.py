@@ -1,5 +1,6 @@
 """From labelled views to descriptors: the chain of the product, without detection."""
 
+import math
 import time
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
@@ -10,7 +11,7 @@ from shapecat.arrays import F4
 from shapecat.config import Settings
 from shapecat.description import DESCRIPTOR_NAMES, describe
 from shapecat.evaluation.dataset import View
-from shapecat.surface import reconstruct, voxelize
+from shapecat.surface import reconstruct, thin
 
 __all__ = ["DescribedViews", "Observer", "describe_view", "describe_views", "ignore"]
 
@@ -22,12 +23,17 @@ def ignore(_phase: str, _done: int, _total: int | None) -> None:
     """Observe nothing."""
 
 
+_NOT_ASKED = np.zeros(0)
+
+
 class DescribedViews(NamedTuple):
     """Views as the learners see them, and what the tables are broken down by.
 
     ``descriptors`` (n, d); ``labels``, ``instances`` (n,) names; ``points`` (n,) voxels;
     ``distances`` (n,) metres from the sensor; ``seconds`` (n,) from points to descriptor;
-    ``skipped`` views with too few points for a surface.
+    ``skipped`` views with too few points for a surface; ``elevations`` (n,) degrees by which the
+    sensor looks down, empty where nobody asked; so ``functions`` (n, f), what
+    `shapecat.learning.baselines.shape_functions` returns.
     """
 
     descriptors: F4
@@ -37,19 +43,17 @@ class DescribedViews(NamedTuple):
     distances: np.ndarray
     seconds: np.ndarray
     skipped: int = 0
+    elevations: np.ndarray = _NOT_ASKED
+    functions: F4 = _NOT_ASKED
 
     def where(self, chosen: np.ndarray) -> "DescribedViews":
         """Return the chosen views: a mask or indices."""
-        descriptors, labels, instances, points, distances, seconds, skipped = self
-        return DescribedViews(
-            descriptors[chosen],
-            labels[chosen],
-            instances[chosen],
-            points[chosen],
-            distances[chosen],
-            seconds[chosen],
-            skipped,
-        )
+        columns = {
+            name: value[chosen]
+            for name, value in self._asdict().items()
+            if name != "skipped" and len(value) == len(self.labels)
+        }
+        return self._replace(**columns)
 
 
 class DescribedView(NamedTuple):
@@ -65,7 +69,7 @@ def describe_view(
 ) -> DescribedView | None:
     """Describe one view; None if it has too few points for a surface."""
     begun = time.perf_counter()
-    cloud = voxelize(view.points, voxel_m=settings.surface.voxel_m)
+    cloud = thin(view.points, settings=settings.surface)
     gas = reconstruct(cloud, settings=settings.surface, rng=rng)
     if gas is None:
         return None
@@ -80,17 +84,23 @@ def describe_views(
     total: int | None = None,
     phase: str = "describe",
     observe: Observer = ignore,
+    with_functions: bool = False,
 ) -> DescribedViews:
     """Describe views one by one; the k-th draws from the seed (settings.seed, k)."""
-    found: list[tuple[DescribedView, str, str, float]] = []
+    found: list[tuple[DescribedView, str, str, float, float]] = []
+    functions: list[F4] = []
     count = 0
     for count, view in enumerate(views, start=1):
         described = describe_view(
             view, settings=settings, rng=np.random.default_rng((settings.seed, count))
         )
         if described is not None:
-            distance = float(np.linalg.norm(view.points.mean(axis=0) - view.eye))
-            found.append((described, view.category, f"{view.category}/{view.instance}", distance))
+            x, y, z = (view.eye - view.points.mean(axis=0)).tolist()
+            distance, elevation = math.hypot(x, y, z), math.degrees(math.atan2(z, math.hypot(x, y)))
+            name = f"{view.category}/{view.instance}"
+            found.append((described, view.category, name, distance, elevation))
+            if with_functions:
+                functions.append(_functions(view, (settings.seed, count, 1)))
         observe(phase, count, total)
     return DescribedViews(
         descriptors=np.array([item[0].descriptor for item in found], np.float32).reshape(
@@ -102,4 +112,12 @@ def describe_views(
         distances=np.array([item[3] for item in found]),
         seconds=np.array([item[0].seconds for item in found]),
         skipped=count - len(found),
+        elevations=np.array([item[4] for item in found]),
+        functions=np.array(functions, np.float32) if with_functions else _NOT_ASKED,
     )
+
+
+def _functions(view: View, seed: tuple[int, ...]) -> F4:
+    from shapecat.learning.baselines import shape_functions  # noqa: PLC0415  loads scikit-learn
+
+    return shape_functions(view.points, np.random.default_rng(seed))

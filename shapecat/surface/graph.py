@@ -80,13 +80,12 @@ def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
 def edge_list(adjacent: Bool) -> U2:
     """Return the (m, 2) pairs i < j that are adjacent, in lexicographic order."""
     count = adjacent.shape[0]
-    edges = np.zeros((count * count // 2, 2), np.uint16)
+    edges = np.zeros((count * count // 2 + 1, 2), np.uint16)
     found = 0
     for i in range(count):
         for j in range(i + 1, count):
-            if adjacent[i, j]:
-                edges[found, 0], edges[found, 1] = i, j
-                found += 1
+            edges[found, 0], edges[found, 1] = i, j  # stays if it is one: no branch to guess
+            found += adjacent[i, j]
     return edges[:found].copy()
 
 
@@ -124,12 +123,14 @@ def _mean_gap(gas: Gas, count: int) -> float:
     x, y, z = gas.x, gas.y, gas.z
     total = 0.0
     for i in range(count):
-        best = np.float32(np.inf)
-        for j in range(count):
-            dx, dy, dz = x[j] - x[i], y[j] - y[i], z[j] - z[i]
+        px, py, pz = x[i], y[i], z[i]
+        x[i] = FAR  # out of its own way, so that the loop has no branch
+        best = FAR
+        for j in range(x.size):
+            dx, dy, dz = x[j] - px, y[j] - py, z[j] - pz
             squared = dx * dx + dy * dy + dz * dz
-            squared = squared if j != i else np.float32(np.inf)
             best = squared if squared < best else best
+        x[i] = px
         total += np.sqrt(best)
     return total / count
 
@@ -165,6 +166,8 @@ def _keep(gas: Gas, adjacent: Bool, members: I4, stays: Bool, count: int) -> int
 def _components(adjacent: Bool, count: int, part: I4) -> int:
     """Label the connected parts from 0 in the order of their first neuron; return their number."""
     part[:count] = -1
+    others = np.arange(count)  # those that may have no part yet
+    left = count
     stack = np.zeros(count, np.int64)
     parts = 0
     for first in range(count):
@@ -176,11 +179,17 @@ def _components(adjacent: Bool, count: int, part: I4) -> int:
         while size > 0:
             size -= 1
             i = stack[size]
-            for j in range(count):
+            stay = 0
+            for k in range(left):
+                j = others[k]
                 if adjacent[i, j] and part[j] < 0:
                     part[j] = parts
                     stack[size] = j
                     size += 1
+                elif part[j] < 0:
+                    others[stay] = j
+                    stay += 1
+            left = stay
         parts += 1
     return parts
 

@@ -135,11 +135,12 @@ def _fire(
     gain: float,
     rate_winner: float,
     rate_neighbour: float,
-    oldest: int,
-) -> int:
-    """Do steps 5 to 10 of thesis Algorithm 3 for one signal; return the winner.
+) -> tuple[int, int]:
+    """Do steps 5 to 9 of thesis Algorithm 3 for one signal; return winner and its oldest edge.
 
-    Takes the arrays of a `Gas` one by one: taking them out of it costs as much as a step.
+    Takes the arrays of a `Gas` one by one: taking them out of it costs as much as a step. Step 10
+    is the caller's: with a call behind a branch in here, references to the arrays are counted up
+    and down for each signal, which costs more than all steps together.
     """
     padded = (count + LANES - 1) // LANES * LANES
     # 5. the nearest and the second nearest neuron
@@ -155,10 +156,7 @@ def _fire(
     )
     # 9. the two are linked, or their edge is new again
     _connect(degree, wins, born, a, b)
-    # 10. edges that are too old go
-    if age > oldest:
-        _drop_old_edges(degree, wins, born, count, a, oldest)
-    return int(a)
+    return a, age
 
 
 @kernel
@@ -224,10 +222,13 @@ def grow_fritzke(
         cursor += 1
         # 5. to 10. differs: the rates fall to a tenth, so that the gas comes to rest.
         rest = 1.0 - fall * signal
-        _fire(
+        a, age = _fire(
             x, y, z, error, degree, wins, born, count, mask, px[k], py[k], pz[k],
-            gain, rate_winner * rest, rate_neighbour * rest, oldest,
+            gain, rate_winner * rest, rate_neighbour * rest,
         )  # fmt: skip
+        # 10. edges that are too old go
+        if age > oldest:
+            _drop_old_edges(degree, wins, born, count, a, oldest)
         # 11. a neuron where the error is largest, every ``interval`` signals
         until -= 1
         if until == 0 and count < target:
@@ -283,10 +284,13 @@ def grow_thesis(
         pause = 0
         state = _shuffle(order, state)
         for k in order:
-            a = _fire(
+            a, age = _fire(
                 x, y, z, error, degree, wins, born, count, mask, px[k], py[k], pz[k],
-                1.0, rate_winner * rest, rate_neighbour * rest, oldest,
+                1.0, rate_winner * rest, rate_neighbour * rest,
             )  # fmt: skip
+            # 10. edges that are too old go
+            if age > oldest:
+                _drop_old_edges(degree, wins, born, count, a, oldest)
             rest -= fall
             # 12. differs: at most once in four signals, and the errors of all three neurons are
             # reset; as published, the first epoch ends with as many neurons as there is room for.

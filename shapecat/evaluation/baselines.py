@@ -1,0 +1,160 @@
+"""Plain learners beside the chain, on the same views: the chain has to earn its place."""
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4
+from shapecat.description import BLOCKS
+from shapecat.errors import RecordingError
+from shapecat.evaluation import metrics
+from shapecat.evaluation.report import UNKNOWN, Compared
+from shapecat.evaluation.training import fit_views
+from shapecat.evaluation.views import DescribedViews, Observer, ignore
+
+__all__ = ["compare_learners"]
+
+_FOLDS = 5
+
+
+_Learner = Callable[[DescribedViews, DescribedViews, tuple[str, ...]], F8]
+"""Learns from views and returns posteriors of others in the order of the categories."""
+
+
+def compare_learners(
+    test: DescribedViews,
+    train: DescribedViews | None,
+    *,
+    categories: tuple[str, ...],
+    root: Path,
+    seed: int = 0,
+    observe: Observer = ignore,
+) -> tuple[Compared, ...]:
+    """Train the chain and each plain learner on the same views, and judge them on the same views.
+
+    Parameters
+    ----------
+    test : views to judge on; those labelled ``unknown`` are left out.
+    train : views to learn from. None is learning from ``test`` itself, in five folds: each learner
+        is judged on views of instances it has not seen, in as many turns.
+    categories : order of the posteriors; one that a learner has not seen counts as missed.
+    root : the folder that errors name.
+
+    Returns
+    -------
+    The chain, then the baselines of `shapecat.learning.baselines`, and forests on plain shape
+    distributions (D2, and D2, D3 and A3 together).
+
+    Raises
+    ------
+    RecordingError : fewer than two categories to learn from.
+    """
+    splits = list(_folds(test, seed)) if train is None else [(train, test)]
+    if not splits or any(len(_known(part.labels)) < 2 for part, _ in splits):
+        msg = f"{root}: learners need at least two categories, with two objects each or more"
+        raise RecordingError(msg)
+    learners = _learners(seed)
+    rows = []
+    for k, (name, learner) in enumerate(learners.items(), start=1):
+        truth, posteriors = _judged(learner, splits, categories)
+        rows.append(_compared(name, len(splits[0][0].labels), truth, posteriors))
+        observe("baselines", k, len(learners))
+    return tuple(rows)
+
+
+def _folds(views: DescribedViews, seed: int) -> Iterator[tuple[DescribedViews, DescribedViews]]:
+    """Yield what to learn from and what to judge on; all views of an instance are on one side."""
+    from sklearn.model_selection import StratifiedGroupKFold  # noqa: PLC0415  only needed here
+
+    fewest = min(
+        (np.unique(views.instances[views.labels == name]).size for name in _known(views.labels)),
+        default=0,
+    )
+    if fewest < 2:
+        return
+    folds = StratifiedGroupKFold(min(_FOLDS, fewest), shuffle=True, random_state=seed)
+    for train, test in folds.split(views.descriptors, views.labels, views.instances):
+        yield views.where(train), views.where(test)
+
+
+def _known(labels: np.ndarray) -> list[str]:
+    return sorted(set(labels.tolist()) - {UNKNOWN})
+
+
+def _judged(
+    learner: _Learner,
+    splits: list[tuple[DescribedViews, DescribedViews]],
+    categories: tuple[str, ...],
+) -> tuple[I4, F8]:
+    """Return the truth and the posteriors of all judged views."""
+    truths, posteriors = [], []
+    for train, test in splits:
+        known = test.where(test.labels != UNKNOWN)
+        truths.append([categories.index(label) for label in known.labels.tolist()])
+        posteriors.append(learner(train, known, categories))
+    return np.concatenate(truths).astype(np.int64), np.concatenate(posteriors)
+
+
+def _compared(name: str, learned: int, truth: I4, posteriors: F8) -> Compared:
+    predicted = posteriors.argmax(axis=1)
+    table = metrics.confusion(truth, predicted, posteriors.shape[1])
+    figures = (
+        metrics.accuracy(truth, predicted),
+        metrics.balanced_accuracy(table),
+        metrics.expected_calibration_error(truth, posteriors),
+    )
+    return Compared(name, learned, *(None if np.isnan(value) else value for value in figures))
+
+
+def _learners(seed: int) -> dict[str, _Learner]:
+    from shapecat.learning.baselines import make_baselines  # noqa: PLC0415  scikit-learn
+
+    makers = make_baselines(BLOCKS, seed=seed)
+    learners: dict[str, _Learner] = {"the chain": _chain(seed)}
+    learners |= {name: _plain(make, _descriptors) for name, make in makers.items()}
+    learners["forest on D2"] = _plain(makers["forest"], _d2)
+    learners["forest on D2, D3, A3"] = _plain(makers["forest"], _functions)
+    return learners
+
+
+def _chain(seed: int) -> _Learner:
+    """Return the whole chain: also shown the views of no category, as `shapecat train` is."""
+
+    def learn(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
+        model = fit_views(train, train.where(np.zeros(0, np.int64)), seed=seed)
+        return _in_order(model.predict(test.descriptors).posteriors, model.categories, categories)
+
+    return learn
+
+
+def _plain(make: Callable[[], Any], features: Callable[[DescribedViews], F4]) -> _Learner:
+    def learn(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
+        known = train.where(train.labels != UNKNOWN)
+        fitted = make().fit(features(known), known.labels)
+        return _in_order(fitted.predict_proba(features(test)), fitted.classes_, categories)
+
+    return learn
+
+
+def _in_order(posteriors: F4, found: Any, categories: tuple[str, ...]) -> F8:
+    """Return columns in the order of ``categories``: 0 where the learner does not know one."""
+    names = [str(name) for name in found]
+    result = np.zeros((len(posteriors), len(categories)))
+    for column, name in enumerate(categories):
+        if name in names:
+            result[:, column] = posteriors[:, names.index(name)]
+    return result
+
+
+def _descriptors(views: DescribedViews) -> F4:
+    return views.descriptors
+
+
+def _functions(views: DescribedViews) -> F4:
+    return views.functions
+
+
+def _d2(views: DescribedViews) -> F4:
+    return views.functions[:, : views.functions.shape[1] // 3]
