@@ -23,6 +23,7 @@ __all__ = ["BoostedDictionary"]
 _RIDGE = 2.0
 _LEAST = 1.0
 _FEWEST_COLUMNS = 10
+_FEWEST_ROWS = 100
 
 
 class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc]  # sklearn is untyped
@@ -60,8 +61,8 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
         rounds: int = 100,
         leaves: int = 16,
         rate: float = 0.1,
-        columns: float = 0.15,
-        rows: float = 0.6,
+        columns: float = 0.08,
+        rows: float = 0.5,
         unknown: Any = None,
         jobs: int | None = None,
         random_state: int | None = None,
@@ -130,7 +131,7 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
         """Return the columns and the rows of one tree."""
         features, views = bins.binned.shape
         width = max(round(self.columns * features), min(features, _FEWEST_COLUMNS))
-        height = max(round(self.rows * views), 1)
+        height = max(round(self.rows * views), min(views, _FEWEST_ROWS))
         columns = np.sort(rng.permutation(features)[:width])
         return columns, np.sort(rng.permutation(views)[:height]).astype(np.int32)
 

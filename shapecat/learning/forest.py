@@ -80,14 +80,28 @@ class FlatForest(Record):
         return result
 
 
+_LANES = 8
+"""Trees that are walked at the same time: one waits for memory while the others go on."""
+
+
 @kernel
 def fall(x: F4, roots: I4, feature: I4, threshold: F4, left: I4, word: I4, result: I4) -> None:
     """Write the word that x (f,) falls into in each tree into result (t,)."""
-    for t in range(roots.size):
-        node = np.int64(roots[t])
-        while left[node] != 0:
-            node = np.int64(left[node]) + (0 if x[feature[node]] <= threshold[node] else 1)
-        result[t] = word[node]
+    node = np.zeros(_LANES, np.int64)
+    for first in range(0, roots.size, _LANES):
+        lanes = min(_LANES, roots.size - first)
+        node[:lanes] = roots[first : first + lanes]
+        inner = True
+        while inner:
+            inner = False
+            for k in range(lanes):
+                here = node[k]
+                child = np.int64(left[here])
+                if child != 0:
+                    node[k] = child + (0 if x[feature[here]] <= threshold[here] else 1)
+                    inner = True
+        for k in range(lanes):
+            result[first + k] = word[node[k]]
 
 
 def flatten(trees: Sequence[Any]) -> FlatForest:

@@ -22,6 +22,7 @@ __all__ = [
     "collapse",
     "encode",
     "fit_categorizer",
+    "fit_threshold",
     "make_chain",
 ]
 
@@ -37,13 +38,13 @@ class LearningSettings:
     """Blocks of the descriptor that are used; all if empty."""
     kernels: int = 0
     """Parzen kernels per category in the probabilistic neural network; 0 leaves it out."""
-    rounds: int = 300
+    rounds: int = 500
     """Rounds in which the dictionary grows one tree per category."""
     leaves: int = 16
     """Words of a tree, at most."""
-    rate: float = 0.09
+    rate: float = 0.06
     """Share of what is lacking that a tree corrects."""
-    known_views: int = 1500
+    known_views: int = 3000
     """Views kept in the model, to learn new categories against."""
     rejected: float = 0.05
     """Share of held-out views of known categories that the novelty threshold rejects."""
@@ -190,10 +191,21 @@ def calibrate(categorizer: Categorizer, held_out: Examples, *, rejected: float) 
         return categorizer
     plain = replace(categorizer, temperature=1.0).predict(views)
     logits = np.log(np.maximum(plain.posteriors.astype(np.float64), 1e-30))
-    fitted = replace(categorizer, temperature=fit_temperature(logits, codes), threshold=0.0)
-    doubt = fitted.predict(views).novelty.astype(np.float64) / 2
+    fitted = replace(categorizer, temperature=fit_temperature(logits, codes))
+    return fit_threshold(fitted, held_out, rejected=rejected)
+
+
+def fit_threshold(categorizer: Categorizer, held_out: Examples, *, rejected: float) -> Categorizer:
+    """Choose the novelty threshold that rejects this share of held-out views of known categories.
+
+    Views labelled `UNKNOWN` are left out. Without any view left the model stays as it is.
+    """
+    views = held_out.descriptors[encode(held_out.labels, categorizer.categories) >= 0]
+    if not len(views):
+        return categorizer
+    doubt = replace(categorizer, threshold=0.0).predict(views).novelty.astype(np.float64) / 2
     limit = np.clip(np.quantile(doubt, 1.0 - rejected), 1e-6, 1 - 1e-6)
-    return replace(fitted, threshold=float(np.log(limit / (1 - limit))))
+    return replace(categorizer, threshold=float(np.log(limit / (1 - limit))))
 
 
 def encode(labels: np.ndarray, categories: Sequence[str]) -> I4:

@@ -36,7 +36,7 @@ _MOST = 16_000
 """Views that plain learners learn from: enough for them, and they take long."""
 _PAIRS = (("bottle", "plate"), ("bowl", "ball"), ("cup", "box"))
 _FEW = (20, 100)
-_ROUNDS = 150
+_ROUNDS = 250
 _NEIGHBOURS = 6
 
 
