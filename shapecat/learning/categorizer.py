@@ -190,7 +190,7 @@ def _predict(
 ) -> None:
     """Write posteriors (n, c) and novelty (n,) of descriptors x (n, d)."""
     columns, mean, scale, spans, bandwidth, level, spread, kernel_starts, kernels = bank
-    roots, feature, split, left, word = forest
+    roots, feature, split, left, word, rounds = forest
     categories = posteriors.shape[1]
     features = np.zeros((x.shape[0], linear.shape[1]), np.float32)
     # (1) the probabilistic neural networks, one density per block and category
@@ -201,7 +201,7 @@ def _predict(
     logits = np.zeros(bias.size)
     for i in range(x.shape[0]):
         # (2) the dictionary: the leaf of each tree
-        fall(features[i], roots, feature, split, left, word, words)
+        fall(features[i], roots, feature, split, left, word, rounds, words)
         # (3) the learners on the words
         logits[:] = bias
         for w in words:

@@ -58,10 +58,29 @@ class FlatForest(Record):
         """Number of words."""
         return int(np.count_nonzero(self.left == 0))
 
-    @property
+    @cached_property
     def parameters(self) -> tuple[np.ndarray, ...]:
-        """The arrays of `fall`; small types keep a large forest in the cache."""
-        return self.roots, self.feature, self.threshold, self.left, self.word
+        """The arrays of `fall`; small types keep a large forest in the cache.
+
+        A leaf is its own child, so that trees of different depth are walked side by side.
+        """
+        leaf = self.left == 0
+        left = np.where(leaf, np.arange(self.left.size), self.left).astype(np.int32)
+        threshold = np.where(leaf, np.float32(np.inf), self.threshold).astype(np.float32)
+        groups = np.arange(0, self.roots.size, _LANES)
+        rounds = np.maximum.reduceat(self._depths(), groups)
+        return self.roots, self.feature, threshold, left, self.word, rounds
+
+    def _depths(self) -> I4:
+        """Return (t,) how many comparisons the deepest leaf of each tree needs."""
+        depths, tree = np.zeros(self.roots.size, np.int64), np.arange(self.roots.size)
+        nodes = self.roots.astype(np.int64)
+        while nodes.size:
+            inner = self.left[nodes] > 0
+            nodes, tree = self.left[nodes[inner]].astype(np.int64), tree[inner]
+            depths[tree] += 1
+            nodes, tree = np.concatenate([nodes, nodes + 1]), np.concatenate([tree, tree])
+        return depths
 
     def fall(self, features: F4) -> I4:
         """Return the word of each tree that features (n, f) fall into: (n, t).
@@ -80,26 +99,32 @@ class FlatForest(Record):
         return result
 
 
-_LANES = 8
+_LANES = 16
 """Trees that are walked at the same time: one waits for memory while the others go on."""
 
 
 @kernel
-def fall(x: F4, roots: I4, feature: I4, threshold: F4, left: I4, word: I4, result: I4) -> None:
+def fall(
+    x: F4,
+    roots: I4,
+    feature: I4,
+    threshold: F4,
+    left: I4,
+    word: I4,
+    rounds: I4,
+    result: I4,
+) -> None:
     """Write the word that x (f,) falls into in each tree into result (t,)."""
-    node = np.zeros(_LANES, np.int64)
-    for first in range(0, roots.size, _LANES):
+    node = np.zeros(_LANES, np.int32)
+    for group in range(rounds.size):
+        first = group * _LANES
         lanes = min(_LANES, roots.size - first)
-        node[:lanes] = roots[first : first + lanes]
-        inner = True
-        while inner:
-            inner = False
+        for k in range(lanes):
+            node[k] = roots[first + k]
+        for _ in range(rounds[group]):
             for k in range(lanes):
                 here = node[k]
-                child = np.int64(left[here])
-                if child != 0:
-                    node[k] = child + (0 if x[feature[here]] <= threshold[here] else 1)
-                    inner = True
+                node[k] = left[here] + (1 if x[feature[here]] > threshold[here] else 0)
         for k in range(lanes):
             result[first + k] = word[node[k]]
 
