@@ -1,8 +1,10 @@
 """Threads that leave the order as it is, and hold a few items at a time."""
 
+import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from itertools import islice
 from typing import TypeVar
 
@@ -11,14 +13,19 @@ __all__ = ["in_order", "read_ahead"]
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
+_HELD = 4
+"""Items held for each thread: they go on while the results of a batch are written."""
+_SWITCH_S = 5e-4
+"""A thread back from a kernel waits no longer than this for the interpreter lock."""
+
 
 def in_order(
     work: Callable[[_Item], _Result], items: Iterable[_Item], *, threads: int
 ) -> Iterator[tuple[_Item, _Result]]:
     """Yield each item with what ``work`` makes of it, in the order of the items.
 
-    With several threads some items are worked on at once, and twice as many as threads at most
-    are held, however many there are. Threads pay because the kernels release the interpreter
+    With several threads some items are worked on at once, and four times as many as threads at
+    most are held, however many there are. Threads pay because the kernels release the interpreter
     lock.
 
     Examples
@@ -31,11 +38,11 @@ def in_order(
             yield item, work(item)
         return
     pending: deque[tuple[_Item, Future[_Result]]] = deque()
-    with ThreadPoolExecutor(threads) as pool:
+    with _switching(), ThreadPoolExecutor(threads) as pool:
         try:
             for item in items:
                 pending.append((item, pool.submit(work, item)))
-                if len(pending) >= 2 * threads:
+                if len(pending) >= _HELD * threads:
                     first, future = pending.popleft()
                     yield first, future.result()
             while pending:
@@ -59,8 +66,19 @@ def read_ahead(items: Iterable[_Item], *, count: int) -> Iterator[_Item]:
     def take() -> tuple[_Item, ...]:
         return tuple(islice(source, 1))
 
-    with ThreadPoolExecutor(1) as pool:
+    with _switching(), ThreadPoolExecutor(1) as pool:
         pending = deque(pool.submit(take) for _ in range(count))
         while taken := pending.popleft().result():
             pending.append(pool.submit(take))
             yield taken[0]
+
+
+@contextmanager
+def _switching() -> Iterator[None]:
+    """Let threads take turns more often than every 5 ms, longer than most kernels take."""
+    before = sys.getswitchinterval()
+    sys.setswitchinterval(_SWITCH_S)
+    try:
+        yield
+    finally:
+        sys.setswitchinterval(before)
