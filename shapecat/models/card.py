@@ -33,11 +33,12 @@ threshold rejects 4 % of simulated views that show an object of these in part.
 
 @dataclass(frozen=True)
 class Table:
-    """A titled table of the card."""
+    """A titled table of the card, and what to read from it."""
 
     title: str
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
+    note: str = ""
 
 
 def format_table(table: Table) -> str:
@@ -48,6 +49,7 @@ def format_table(table: Table) -> str:
         "| " + " | ".join(table.head) + " |",
         "|---" * len(table.head) + "|",
         *("| " + " | ".join(row) + " |" for row in table.rows),
+        *(["", table.note] if table.note else []),
     ]
     return "\n".join(lines) + "\n"
 
