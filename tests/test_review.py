@@ -18,6 +18,7 @@ from shapecat.outputs.review_cloud import paint
 from shapecat.outputs.review_layout import Eye, stepped_back
 from shapecat.outputs.review_shapes import markdown
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
+from tests.test_executors import alive
 
 CATEGORIES = ("cup", "can")
 TOPIC = "/camera/depth"
@@ -298,6 +299,18 @@ def test_a_viewer_without_graphics_names_the_package(
     monkeypatch.setattr(review_viewer, "_viewer", lambda: str(fake))
     with pytest.raises(OutputError, match="mesa-vulkan-drivers"):
         review.take_screenshot(fake, tmp_path / "r.png")
+
+
+def test_no_viewer_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The program `rerun` is a script; killed alone it would leave what it has started."""
+    fake = tmp_path / "rerun"
+    fake.write_text(f"#!/bin/sh\nsleep 60 &\necho $! > {tmp_path / 'pid'}\nwait\n")
+    fake.chmod(0o755)
+    monkeypatch.setattr(review_viewer, "_viewer", lambda: str(fake))
+    monkeypatch.setattr(review_viewer, "_LOAD_S", 1.0)
+    with pytest.raises(OutputError, match="no answer"):
+        review.take_screenshot(fake, tmp_path / "r.png")
+    assert not alive(int((tmp_path / "pid").read_text()))
 
 
 @pytest.mark.slow

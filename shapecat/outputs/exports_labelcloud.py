@@ -73,13 +73,14 @@ def _described(item: LabelledObject, level: F8, kind: str) -> dict[str, Any]:
         return {"name": item.category, "vertices": _rounded(corners)}
     heading = level @ rotation_from_quaternion(item.box.orientation)[:, 0]
     yaw = float(np.arctan2(heading[1], heading[0]))
-    turn = yaw if kind == "centroid_rel" else float(np.degrees(yaw) % 360)
+    # Rounded first: the remainder of a tiny negative angle is 360 itself.
+    turn = round(yaw, 8) if kind == "centroid_rel" else round(float(np.degrees(yaw)), 8) % 360
     sizes = _rounded(item.box.size)
     return {
         "name": item.category,
         "centroid": dict(zip("xyz", _rounded(level @ item.box.center), strict=True)),
         "dimensions": dict(zip(("length", "width", "height"), sizes, strict=True)),
-        "rotations": {"x": 0.0, "y": 0.0, "z": round(turn, 8)},
+        "rotations": {"x": 0.0, "y": 0.0, "z": turn},
     }
 
 

@@ -1,12 +1,15 @@
 """Opening a review in the Rerun viewer, with a window or without."""
 
+import os
 import shutil
+import signal
 import socket
 import subprocess
 import sys
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import IO, Any
 
@@ -52,7 +55,9 @@ def take_screenshot(
     options = ["--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"]
     window = ["--headless", "--window-size", f"{size[0]}x{size[1]}"]
     with tempfile.TemporaryFile() as said:
-        viewer = subprocess.Popen([_viewer(), *options, *window], stdout=said, stderr=said)
+        viewer = subprocess.Popen(
+            [_viewer(), *options, *window], stdout=said, stderr=said, start_new_session=True
+        )
         try:
             _wait_for(viewer, port, said)
             client = ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy")
@@ -63,7 +68,8 @@ def take_screenshot(
             msg = f"{path}: the viewer cannot draw it: {error}"
             raise OutputError(msg) from error
         finally:
-            viewer.kill()
+            with suppress(ProcessLookupError):
+                os.killpg(viewer.pid, signal.SIGKILL)  # `rerun` is a script that starts the viewer
             viewer.wait()
 
 
