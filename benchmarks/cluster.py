@@ -175,7 +175,7 @@ def draw(path: Path, results: dict[str, list[dict[str, float]]]) -> None:
 
 
 @click.command()
-@click.option("--frame-ms", default=33.6, help="CPU time per frame, all outputs on.")
+@click.option("--frame-ms", default=25.8, help="CPU time per frame, all outputs on.")
 @click.option("--recordings", default=100_000)
 @click.option("--plot", type=click.Path(path_type=Path), default=ROOT / "docs/images/scaling.png")
 def main(*, frame_ms: float, recordings: int, plot: Path) -> None:
