@@ -197,14 +197,14 @@ def _predict(
     write_features(
         x, columns, mean, scale, spans, bandwidth, level, spread, kernel_starts, kernels, features
     )
-    # (2) the dictionary: the leaf of each tree
-    words = np.zeros((x.shape[0], roots.size), np.int32)
-    fall(features, roots, feature, split, left, word, rounds, words)
+    words = np.zeros(roots.size, np.int64)
     logits = np.zeros(bias.size)
     for i in range(x.shape[0]):
+        # (2) the dictionary: the leaf of each tree
+        fall(features[i], roots, feature, split, left, word, rounds, words)
         # (3) the learners on the words
         logits[:] = bias
-        for w in words[i]:
+        for w in words:
             for c in range(bias.size):
                 logits[c] += votes[w, c]
         if use_linear:

@@ -94,7 +94,8 @@ class FlatForest(Record):
             msg = f"the forest asks for feature {self.feature.max()}, got {x.shape[1]} features"
             raise ValueError(msg)
         result = np.zeros((len(x), len(self.roots)), np.int64)
-        fall(x, *self.parameters, result)
+        for i, row in enumerate(x):
+            fall(row, *self.parameters, result[i])
         return result
 
 
@@ -113,23 +114,19 @@ def fall(
     rounds: I4,
     result: I4,
 ) -> None:
-    """Write the words that features x (n, f) fall into in each tree into result (n, t).
-
-    All views go through a few trees before the next ones, so that each tree is loaded once.
-    """
+    """Write the word that x (f,) falls into in each tree into result (t,)."""
     node = np.zeros(_LANES, np.int32)
     for group in range(rounds.size):
         first = group * _LANES
         lanes = min(_LANES, roots.size - first)
-        for i in range(x.shape[0]):
+        for k in range(lanes):
+            node[k] = roots[first + k]
+        for _ in range(rounds[group]):
             for k in range(lanes):
-                node[k] = roots[first + k]
-            for _ in range(rounds[group]):
-                for k in range(lanes):
-                    here = node[k]
-                    node[k] = left[here] + (1 if x[i, feature[here]] > threshold[here] else 0)
-            for k in range(lanes):
-                result[i, first + k] = word[node[k]]
+                here = node[k]
+                node[k] = left[here] + (1 if x[feature[here]] > threshold[here] else 0)
+        for k in range(lanes):
+            result[first + k] = word[node[k]]
 
 
 def flatten(trees: Sequence[Any]) -> FlatForest:
