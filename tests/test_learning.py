@@ -343,8 +343,9 @@ def test_adding_twice_is_possible(categorizer: Categorizer) -> None:
         add_categories(twice, far, ["spoon"] * 20, rng=rng)
 
 
-@pytest.mark.parametrize("left", [[1, 1, 0], [1, 0], [2, 0, 0]])
+@pytest.mark.parametrize("left", [[1, 1, 0], [1, 0], [2, 0, 0], [1, 2, 3, 0, 0]])
 def test_trees_that_would_not_end_are_refused(left: list[int]) -> None:
+    """Or that branch and meet again: their ways double with every level."""
     nothing = np.zeros(len(left))
 
     with pytest.raises(ValueError, match="damaged"):

@@ -27,7 +27,8 @@ class FlatForest(Record):
 
     Raises
     ------
-    ValueError : a child is not behind its parent or beyond the end: a walk might not end.
+    ValueError : a child is not behind its parent or beyond the end: a walk might not end; or it
+        has two parents: there might be more ways than can be counted.
     """
 
     roots: U4 = array("t", "u4")
@@ -36,16 +37,17 @@ class FlatForest(Record):
     left: U4 = array("n", "u4")
 
     def __post_init__(self) -> None:
-        """Check that every walk ends in a leaf."""
+        """Check that every walk ends in a leaf, and that there are no more walks than nodes."""
         super().__post_init__()
         left = self.left.astype(np.int64)
-        inner = left > 0
-        behind = left[inner] > np.flatnonzero(inner)
-        inside = left[inner] + 1 < left.size
-        if not (
-            self.roots.size and np.all(behind) and np.all(inside) and np.all(self.roots < left.size)
-        ):
+        inner = np.flatnonzero(left)
+        reached = np.concatenate([self.roots.astype(np.int64), left[inner], left[inner] + 1])
+        behind = bool(np.all(left[inner] > inner))
+        if not (self.roots.size and behind and reached.max() < left.size):
             msg = "the trees are damaged: a child lies before its parent or beyond the end"
+            raise ValueError(msg)
+        if np.bincount(reached).max() > 1:
+            msg = "the trees are damaged: two parents share a child"
             raise ValueError(msg)
 
     @cached_property
