@@ -1,7 +1,7 @@
 """Whole recordings: frames per second on one and two cores, and cost over the number of frames.
 
     python -m benchmarks.whole            a minute
-    python -m benchmarks.whole --full     recordings of up to 10,000 frames: hours, gigabytes
+    python -m benchmarks.whole --full     recordings of up to 10,000 frames: ten minutes, a gigabyte
 
 The command is run as a user runs it, on the cores that taskset leaves it. Start-up is the time of
 a run over the first frames alone; it is taken off and reported.

@@ -63,9 +63,7 @@ def _reach(
             for d in range(4):
                 y = i + (1 if d == 0 else -1 if d == 1 else 0)
                 x = j + (1 if d == 2 else -1 if d == 3 else 0)
-                if y < 0 or x < 0 or y >= rows or x >= columns:
-                    continue
-                if not (0 <= owner[y, x] < me) or abs(w[y, x] - w[i, j]) >= JUMP:
+                if not _leads_out(w, owner, me, i, j, y, x):
                     continue
                 if not _is_above(w, lens, plane, walls, highest, outside, y, x):
                     continue
@@ -80,6 +78,14 @@ def _reach(
                     v, u = stacks[0, t] // columns, stacks[0, t] % columns
                     owner[v, u] = me
                     heights.height[v, u] = outside[v, u]
+
+
+@kernel
+def _leads_out(w: F4, owner: I4, me: int, i: int, j: int, y: int, x: int) -> bool:
+    """Whether (y, x) is of a lower plane or of none, without a jump from its neighbour (i, j)."""
+    if y < 0 or x < 0 or y >= w.shape[0] or x >= w.shape[1]:
+        return False
+    return bool(0 <= owner[y, x] < me and abs(w[y, x] - w[i, j]) < JUMP)
 
 
 @kernel
@@ -115,7 +121,7 @@ def _part_outside(
     stack: I4,
 ) -> int:
     """Collect the connected cells outside, from one that is above the plane; return how many."""
-    rows, columns = w.shape
+    columns = w.shape[1]
     stack[0] = i * columns + j
     done, top = 0, 1
     while done < top:
@@ -124,9 +130,7 @@ def _part_outside(
         for d in range(4):
             y = i + (1 if d == 0 else -1 if d == 1 else 0)
             x = j + (1 if d == 2 else -1 if d == 3 else 0)
-            if y < 0 or x < 0 or y >= rows or x >= columns:
-                continue
-            if not (0 <= owner[y, x] < me) or abs(w[y, x] - w[i, j]) >= JUMP:
+            if not _leads_out(w, owner, me, i, j, y, x):
                 continue
             if _is_above(w, lens, plane, walls, highest, outside, y, x):
                 stack[top] = y * columns + x

@@ -11,6 +11,7 @@ from shapecat.simulation.furniture import make_counter, make_room, make_table
 from shapecat.simulation.layout import Layout
 from shapecat.simulation.paths import stroll, walk
 from shapecat.simulation.worlds import Motion, Support, World
+from shapecat.types import Pose
 
 __all__ = ["crossing", "rearranged", "walking"]
 
@@ -54,15 +55,7 @@ def crossing(rng: Generator, categories: Sequence[str], frames: int, rate_hz: fl
     rows = [_strip(table, (-0.5, 0.5), y) for y in ((-0.32, -0.15), (0.15, 0.37))]
     for k, category in enumerate(categories):
         layout.put(category, rows[k % 2], _ANYWHERE, attempts=20)
-    path = walk(
-        rng,
-        np.array([0, 0, table.height + 0.05]),
-        frames,
-        rate_hz,
-        distance=rng.uniform(1.0, 1.3),
-        elevation=rng.uniform(25, 40),
-        sweep=8,
-    )
+    path = _walk_past(rng, table, frames, rate_hz, elevation=(25, 40), sweep=8)
     things = tuple(layout.things)
     return World("crossing", (*room, table), things, path, np.zeros(frames), tuple(motions))
 
@@ -88,17 +81,25 @@ def rearranged(rng: Generator, categories: Sequence[str], frames: int, rate_hz: 
     there = t[:, None] < begun[2], t[:, None] >= begun[3]  # one goes, one comes
     for k, when in zip(others, there, strict=False):
         motions.append(Motion(k, np.where(when, np.zeros(3), np.nan)))
-    path = walk(
-        rng,
-        np.array([0, 0, table.height + 0.05]),
-        frames,
-        rate_hz,
-        distance=rng.uniform(1.0, 1.3),
-        elevation=rng.uniform(30, 48),
-        sweep=12,
-    )
+    path = _walk_past(rng, table, frames, rate_hz, elevation=(30, 48), sweep=12)
     things = tuple(layout.things)
     return World("rearranged", (*room, table), things, path, np.zeros(frames), tuple(motions))
+
+
+def _walk_past(
+    rng: Generator,
+    table: Support,
+    frames: int,
+    rate_hz: float,
+    *,
+    elevation: tuple[float, float],
+    sweep: float,
+) -> tuple[Pose, ...]:
+    """Walk on an arc in front of a table, looking down by degrees from a range."""
+    middle = np.array([0, 0, table.height + 0.05])
+    distance = rng.uniform(1.0, 1.3)
+    down = rng.uniform(*elevation)
+    return walk(rng, middle, frames, rate_hz, distance=distance, elevation=down, sweep=sweep)
 
 
 _ANYWHERE = np.array([0.6, 0.3])

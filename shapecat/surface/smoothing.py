@@ -5,7 +5,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.config import SurfaceSettings
 from shapecat.jit import kernel
-from shapecat.surface.voxels import voxelize
+from shapecat.surface.voxels import read_only, voxelize
 
 __all__ = ["smooth", "thin"]
 
@@ -66,10 +66,7 @@ def smooth(points: F4, *, radius_m: float) -> F4:
     Time grows with the points times their neighbours. Sources: Levin 2003; Alexa et al. 2003,
     section 3; thesis 4.2.
     """
-    points = np.ascontiguousarray(points, np.float32)
-    if points.ndim != 2 or points.shape[1] != 3:
-        msg = f"expected points of shape (n, 3), got {points.shape}"
-        raise ValueError(msg)
+    points = read_only(points)
     if not radius_m > 0:
         msg = f"radius_m must be positive, got {radius_m}"
         raise ValueError(msg)
@@ -79,8 +76,6 @@ def smooth(points: F4, *, radius_m: float) -> F4:
     if not cells < _MOST_CELLS:
         msg = f"points must be finite and within 2**20 times {radius_m} m of each other"
         raise ValueError(msg)
-    points = points.view()
-    points.flags.writeable = False  # one compiled version for read-only and other arrays
     moved: F4 = _smooth(points, float(radius_m))
     return moved
 

@@ -5,7 +5,7 @@ import numpy as np
 from shapecat.arrays import F4
 from shapecat.jit import kernel
 
-__all__ = ["voxelize"]
+__all__ = ["read_only", "voxelize"]
 
 _FRACTION_BITS = 16
 """Coordinates are summed as integers of a 2**16th voxel: sums do not depend on the order."""
@@ -38,21 +38,31 @@ def voxelize(points: F4, *, voxel_m: float) -> F4:
     array([[0.5, 0. , 0. ],
            [1.5, 0. , 0. ]], dtype=float32)
     """
-    points = np.ascontiguousarray(points, np.float32)
-    if points.ndim != 2 or points.shape[1] != 3:
-        msg = f"expected points of shape (n, 3), got {points.shape}"
-        raise ValueError(msg)
+    points = read_only(points)
     if not voxel_m > 0:
         msg = f"voxel_m must be positive, got {voxel_m}"
         raise ValueError(msg)
-    points = points.view()
-    points.flags.writeable = False  # one compiled version for read-only and other arrays
     centroids: F4
     centroids, valid = _voxelize(points, float(voxel_m))
     if not valid:
         msg = f"points must be finite and within 2**19 voxels of {voxel_m} m from the origin"
         raise ValueError(msg)
     return centroids
+
+
+def read_only(points: F4) -> F4:
+    """Return points (n, 3) as kernels take them: one version is compiled, for read-only arrays.
+
+    Raises
+    ------
+    ValueError : another shape.
+    """
+    points = np.ascontiguousarray(points, np.float32).view()
+    if points.ndim != 2 or points.shape[1] != 3:
+        msg = f"expected points of shape (n, 3), got {points.shape}"
+        raise ValueError(msg)
+    points.flags.writeable = False
+    return points
 
 
 @kernel
