@@ -121,17 +121,17 @@ def _run(
     from shapecat.batch import process_here, process_on
     from shapecat.executors import open_executor, share_cores
 
-    workers, threads = share_cores(jobs, sum(task.status != "complete" for task in batch.tasks))
+    workers, cores = share_cores(jobs, sum(task.status != "complete" for task in batch.tasks))
     if len(batch.tasks) > 1:
-        watcher.plan(describe_plan(batch.tasks, batch.left_out, workers, threads))
+        watcher.plan(describe_plan(batch.tasks, batch.left_out, workers, cores))
     if name == "local" and scheduler is None and workers <= 1:
         with watcher:
             tasks = batch.tasks
-            return list(process_here(tasks, watcher, threads=threads, manifest=batch.manifest))
+            return list(process_here(tasks, watcher, cores=cores, manifest=batch.manifest))
     started = open_executor(name, workers=workers, threads=1, address=scheduler)
     with _closing(started) as executor, watcher:
         return list(
-            process_on(executor, batch.tasks, watcher, threads=threads, manifest=batch.manifest)
+            process_on(executor, batch.tasks, watcher, cores=cores, manifest=batch.manifest)
         )
 
 

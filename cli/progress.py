@@ -24,13 +24,13 @@ WORDS = {
 }
 
 
-def describe_plan(tasks: Sequence[Any], left_out: int, workers: int, threads: int) -> str:
+def describe_plan(tasks: Sequence[Any], left_out: int, workers: int, cores: int) -> str:
     """Return what will be done, in one line."""
     counts = Counter(task.status for task in tasks)
     parts = [f"{counts[status]} {words}" for status, words in WORDS.items() if counts[status]]
     todo = sum(task.bytes for task in tasks if task.status != "complete")
     hands = f"{workers} at a time" if workers > 1 else "one at a time"
-    frames = f", {threads} frames of each at once" if threads > 1 else ""
+    frames = f", {cores} frames of each at once" if cores > 1 else ""
     aside = f"; {left_out} files left out that are no recordings" if left_out else ""
     many = f"{len(tasks)} recordings: {', '.join(parts)}; {todo / 1e6:,.1f} MB to read"
     return f"{many}, {hands}{frames}{aside}"

@@ -1,6 +1,9 @@
 """One frame, without looking at any other: detect, reconstruct, describe, categorize."""
 
 import time
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -9,12 +12,48 @@ from shapecat.arrays import F4
 from shapecat.config import Settings
 from shapecat.description import DESCRIPTOR_NAMES, describe
 from shapecat.detection import detect
+from shapecat.errors import ModelError
 from shapecat.geometry import inverse, level_from_sensor, transform
-from shapecat.learning import Categorizer
+from shapecat.learning import Categorizer, load_model
 from shapecat.surface import reconstruct, thin
 from shapecat.types import Candidate, Detection, Frame, NeuralGas, Perception, Scene
 
-__all__ = ["perceive"]
+__all__ = ["Perceiver", "perceive"]
+
+
+@dataclass(frozen=True)
+class Perceiver:
+    """Perceives frames, here or in another process, to which only the name of the model is sent.
+
+    Attributes
+    ----------
+    model : its file, None for the default one.
+    model_id : what the file must hold.
+    """
+
+    model: Path | None
+    model_id: str
+    settings: Settings
+
+    def __call__(self, view: tuple[Frame, F4 | None]) -> Perception:
+        """Perceive a frame, given where up is.
+
+        Raises
+        ------
+        ModelError : the file has changed.
+        """
+        frame, up = view
+        categorizer = _load(self.model, self.model_id)
+        return perceive(frame, up=up, categorizer=categorizer, settings=self.settings)
+
+
+@lru_cache(maxsize=1)
+def _load(model: Path | None, model_id: str) -> Categorizer:
+    categorizer = load_model(model)
+    if categorizer.model_id != model_id:
+        msg = f"{model}: has changed since the run began"
+        raise ModelError(msg)
+    return categorizer
 
 
 class _Shape(NamedTuple):

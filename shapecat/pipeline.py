@@ -11,26 +11,26 @@ from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager
 from itertools import islice
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 from shapecat.arrays import F4
 from shapecat.corrections import TrackLabel, adopt_labels, read_labels
 from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import NoStreamError, OutputError
-from shapecat.executors.threads import in_order, read_ahead
+from shapecat.executors.order import in_order, read_ahead
 from shapecat.jit import CompileClock, compile_clock
 from shapecat.jobs import Job, Summary, describe_run, resume, same_work, summarize
 from shapecat.labels import read_labelled_frames
 from shapecat.learning import Categorizer, load_model
 from shapecat.outputs.rereading import with_clouds
-from shapecat.perception import perceive
+from shapecat.perception import Perceiver
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
 from shapecat.recordings.gravity import Upright
 from shapecat.run_folder import read_run, staged, sweep, write_run
 from shapecat.shown import read_shown_frames
 from shapecat.tables import FrameRow, PerceptionTables, count_rows, discard_segments
 from shapecat.tracks import track_run
-from shapecat.types import Frame, LabelledFrame, Perception, Pose, ShownFrame
+from shapecat.types import Frame, LabelledFrame, ShownFrame
 
 __all__ = ["Observer", "annotate", "annotate_again", "perceive_all", "process", "track"]
 
@@ -46,7 +46,7 @@ def _ignore(_phase: str, _done: int, _total: int | None) -> None:
     """Observe nothing."""
 
 
-def process(job: Job, observe: Observer = _ignore, *, threads: int = 1) -> Summary:
+def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary:
     """Process one recording into its run folder: perceive, track, annotate.
 
     A complete folder made from the same input, settings and model is left as it is. Nothing
@@ -55,7 +55,7 @@ def process(job: Job, observe: Observer = _ignore, *, threads: int = 1) -> Summa
 
     Parameters
     ----------
-    threads : frames perceived at once. The tables do not depend on it.
+    cores : frames are perceived in so many processes. The tables do not depend on it.
 
     Raises
     ------
@@ -77,12 +77,12 @@ def process(job: Job, observe: Observer = _ignore, *, threads: int = 1) -> Summa
                 folder,
                 run,
                 lambda: perceive_all(
-                    recording, folder, run, job, categorizer, observe, threads=threads
+                    recording, folder, run, job, categorizer, observe, cores=cores
                 ),
             )
             discard_segments(folder)
             _once("track", folder, run, lambda: track(folder, run, job))
-            annotate(folder, recording, run, observe, threads=threads)
+            annotate(folder, recording, run, observe, cores=cores)
             run["seconds"]["compile"] = compiled.seconds
             run["seconds"]["total"] = earlier + time.perf_counter() - begun
             write_run(folder, run)
@@ -120,14 +120,6 @@ def _finished(
     return summarize(job, run, fresh=False)
 
 
-class _View(NamedTuple):
-    """A frame, where up is, and where the sensor was."""
-
-    frame: Frame
-    up: F4 | None
-    fixed_from_sensor: Pose | None
-
-
 def perceive_all(
     recording: Recording,
     folder: Path,
@@ -136,7 +128,7 @@ def perceive_all(
     categorizer: Categorizer,
     observe: Observer = _ignore,
     *,
-    threads: int = 1,
+    cores: int = 1,
 ) -> None:
     """Write frames, detections and planes, frame by frame in flat memory."""
     upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame)
@@ -144,20 +136,21 @@ def perceive_all(
     source, total = _select(recording, run["options"], skipped)
     count = 0
 
-    def see(view: _View) -> Perception:
-        return perceive(view.frame, up=view.up, categorizer=categorizer, settings=job.settings)
+    perceiver = Perceiver(job.model, categorizer.model_id, job.settings)
+
+    def view(frame: Frame) -> tuple[FrameRow, tuple[Frame, F4 | None]]:
+        up = upright.up(frame)
+        return FrameRow(frame.log_time_ns, upright.fixed_from_sensor(frame), up), (frame, up)
 
     with PerceptionTables(
         folder, categories=categorizer.categories, model_id=categorizer.model_id
     ) as tables:
-        views = (_View(f, upright.up(f), upright.fixed_from_sensor(f)) for f in source)
+        views = map(view, source)
         for count, _ in enumerate(islice(views, tables.done), start=1):
             observe("perceive", count, total)
-        for view, perception in in_order(see, views, threads=threads):
+        for row, perception in in_order(perceiver, views, processes=cores):
             count += 1
-            tables.write(
-                perception, FrameRow(view.frame.log_time_ns, view.fixed_from_sensor, view.up)
-            )
+            tables.write(perception, row)
             observe("perceive", count, total)
     if not count:
         reasons = ", ".join(f"{n} {reason}" for reason, n in skipped.items()) or "none in range"
@@ -182,11 +175,11 @@ def annotate(
     run: dict[str, Any],
     observe: Observer = _ignore,
     *,
-    threads: int = 1,
+    cores: int = 1,
 ) -> None:
     """Write annotated.mcap and review.rrd from the tables, tracks.csv and the recording.
 
-    With several threads one of them reads while another writes.
+    With several cores a thread reads while another writes.
     """
     settings, total = run["settings"]["outputs"], run["counts"]["frames"]
 
@@ -212,7 +205,7 @@ def annotate(
         pairs = with_clouds(_observed(labelled, "review", total, observe), recording, run)
         write_review(
             folder / "review.rrd",
-            read_ahead(pairs, count=_AHEAD) if threads > 1 else pairs,
+            read_ahead(pairs, count=_AHEAD) if cores > 1 else pairs,
             name=recording.path.name,
             run=run,
             categories=run["model"]["categories"],

@@ -181,12 +181,13 @@ def test_two_processes_give_the_same_tables(
     assert states(tmp_path) == ALL_DONE
 
 
-def test_two_threads_give_the_same_tables(
-    recordings: Path, one_by_one: Path, tmp_path: Path
+def test_processes_that_share_frames_give_the_same_tables(
+    recordings: Path, one_by_one: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from shapecat.pipeline import process  # noqa: PLC0415  beside its only use
 
-    process(Job(recordings / "monday/log.mcap", tmp_path / "log", rrd=False), threads=3)
+    monkeypatch.setattr("shapecat.executors.order._ALONE", 0)
+    process(Job(recordings / "monday/log.mcap", tmp_path / "log", rrd=False), cores=3)
     (tmp_path / "manifest.jsonl").touch()
 
     assert_same(one_by_one, tmp_path, ["log"])

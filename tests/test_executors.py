@@ -7,6 +7,7 @@ import sys
 import time
 from collections.abc import Iterator
 from concurrent.futures import Executor
+from multiprocessing import parent_process
 from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
@@ -25,7 +26,7 @@ from shapecat.executors import (
     share_cores,
     usable_cores,
 )
-from shapecat.executors.threads import in_order, read_ahead
+from shapecat.executors.order import in_order, read_ahead
 
 
 def kill_self(_: object = None) -> None:
@@ -164,35 +165,65 @@ def test_executors_that_are_not_there_are_named(monkeypatch: pytest.MonkeyPatch)
         LocalExecutor(0)
 
 
-def test_threads_keep_the_order_and_hold_few_items() -> None:
+def slow_at_times(k: int) -> tuple[int, int]:
+    time.sleep(0.02 * (k % 7 == 0))
+    return -k, os.getpid()
+
+
+def frail(k: int) -> int:
+    if parent_process() is not None and k % 50 == 20:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return slow_at_times(k)[0]
+
+
+def test_processes_keep_the_order_and_hold_few_items() -> None:
     """A recording does not fit into memory; its tables must not depend on who was faster."""
     made: list[int] = []
     used: list[tuple[int, int]] = []
+    workers = set()
+
+    def items() -> Iterator[tuple[int, int]]:
+        for k in range(600):
+            made.append(k)
+            assert len(made) - len(used) <= 258
+            yield k, k
+
+    for kept, (result, worker) in in_order(slow_at_times, items(), processes=3):
+        used.append((kept, result))
+        workers.add(worker)
+    assert used == [(k, -k) for k in range(600)]
+    assert os.getpid() in workers
+    assert len(workers) == 3
+
+
+def test_a_killed_process_loses_no_item() -> None:
+    """The kernel kills the largest process when memory is short; its frame must not be missing."""
+    results = in_order(frail, ((k, k) for k in range(300)), processes=2)
+    assert list(results) == [(k, -k) for k in range(300)]
+
+
+def test_reading_ahead_holds_few_items() -> None:
+    made: list[int] = []
+    used: list[int] = []
 
     def items() -> Iterator[int]:
         for k in range(200):
             made.append(k)
-            assert len(made) - len(used) <= 17
+            assert len(made) - len(used) <= 5
             yield k
 
-    def slow_at_times(k: int) -> int:
-        time.sleep(0.002 * (k % 7 == 0))
-        return -k
-
-    for item, result in in_order(slow_at_times, items(), threads=4):
-        used.append((item, result))
-    assert used == [(k, -k) for k in range(200)]
-
-    made.clear()
-    used.clear()
     for item in read_ahead(items(), count=3):
-        used.append((item, item))  # noqa: PERF401  the source looks at it meanwhile
-    assert [k for k, _ in used] == list(range(200))
+        used.append(item)  # noqa: PERF402  the source looks at it meanwhile
+    assert used == list(range(200))
 
 
-def test_errors_of_threads_come_at_their_turn() -> None:
-    results = in_order(lambda k: 1 // (3 - k), range(9), threads=3)
-    assert [next(results)[1] for _ in range(3)] == [0, 0, 1]
+def inverse_of_rest(k: int) -> int:
+    return 1 // (12 - k)
+
+
+def test_errors_come_at_their_turn() -> None:
+    results = in_order(inverse_of_rest, ((k, k) for k in range(20)), processes=2)
+    assert [next(results)[1] for _ in range(12)] == [0] * 11 + [1]
     with pytest.raises(ZeroDivisionError):
         next(results)
 

@@ -53,7 +53,7 @@ class Watcher(Protocol):
 
 
 def process_here(
-    tasks: Sequence[Task], watcher: Watcher, *, threads: int = 1, manifest: Manifest | None = None
+    tasks: Sequence[Task], watcher: Watcher, *, cores: int = 1, manifest: Manifest | None = None
 ) -> Iterator[Outcome]:
     """Process the tasks one after the other in this process; yield what became of each."""
     ledger = _Ledger(tasks, manifest)
@@ -65,7 +65,7 @@ def process_here(
 
         if task.status != "complete":
             ledger.running(name)
-        outcome = _already(task) or attempt(task.job, observe, threads=threads)
+        outcome = _already(task) or attempt(task.job, observe, cores=cores)
         ledger.ended(outcome)
         watcher.ended(outcome)
         yield outcome
@@ -76,7 +76,7 @@ def process_on(
     tasks: Sequence[Task],
     watcher: Watcher,
     *,
-    threads: int = 1,
+    cores: int = 1,
     manifest: Manifest | None = None,
 ) -> Iterator[Outcome]:
     """Process the tasks on an executor, the largest first; yield what became of each.
@@ -92,19 +92,19 @@ def process_on(
         watcher.progress(name, phase, done, total)
 
     with Mailbox(receive) as mailbox:
-        for outcome in _outcomes(executor, tasks, ledger, mailbox.address, threads):
+        for outcome in _outcomes(executor, tasks, ledger, mailbox.address, cores):
             ledger.ended(outcome)
             watcher.ended(outcome)
             yield outcome
 
 
 def _outcomes(
-    executor: Executor, tasks: Sequence[Task], ledger: "_Ledger", address: str, threads: int
+    executor: Executor, tasks: Sequence[Task], ledger: "_Ledger", address: str, cores: int
 ) -> Iterator[Outcome]:
     ended: SimpleQueue[tuple[Job, Future[Outcome]]] = SimpleQueue()
 
     def begin(job: Job) -> None:
-        future = executor.submit(_attempt_elsewhere, job, address, threads)
+        future = executor.submit(_attempt_elsewhere, job, address, cores)
         future.add_done_callback(lambda done: ended.put((job, done)))
 
     yield from filter(None, map(_already, tasks))
@@ -151,10 +151,10 @@ def _run_of(job: Job) -> Mapping[str, Any]:
     return run
 
 
-def _attempt_elsewhere(job: Job, address: str, threads: int) -> Outcome:
+def _attempt_elsewhere(job: Job, address: str, cores: int) -> Outcome:
     """Process one job in a worker."""
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s %(message)s")
-    return attempt(job, _reporter(job.folder.name, address), threads=threads)
+    return attempt(job, _reporter(job.folder.name, address), cores=cores)
 
 
 def _reporter(name: str, address: str) -> Observer:
@@ -170,12 +170,12 @@ def _reporter(name: str, address: str) -> Observer:
     return observe
 
 
-def attempt(job: Job, observe: Observer, *, threads: int = 1) -> Outcome:
+def attempt(job: Job, observe: Observer, *, cores: int = 1) -> Outcome:
     """Process one job; a known error is an outcome, an unknown one too, but logged in full."""
     try:
         if job.origin or job.target:
-            return Outcome(job, _process_remote(job, observe, threads))
-        return Outcome(job, process(job, observe, threads=threads))
+            return Outcome(job, _process_remote(job, observe, cores))
+        return Outcome(job, process(job, observe, cores=cores))
     except ShapecatError as error:
         return Outcome(job, message=str(error), code=error.exit_code)
     except Exception as error:  # noqa: BLE001  one bad recording must not stop the others
@@ -183,7 +183,7 @@ def attempt(job: Job, observe: Observer, *, threads: int = 1) -> Outcome:
         return Outcome(job, message=f"{job.name}: {type(error).__name__}: {error}", code=1)
 
 
-def _process_remote(job: Job, observe: Observer, threads: int) -> Summary:
+def _process_remote(job: Job, observe: Observer, cores: int) -> Summary:
     """Process a job between downloading its recording and uploading its results."""
     with scratch() as folder:
         local = job
@@ -194,7 +194,7 @@ def _process_remote(job: Job, observe: Observer, threads: int) -> Summary:
             local = dataclasses.replace(local, folder=folder / "output" / job.folder.name)
             _look_for_results(local)
         try:
-            summary = process(local, observe, threads=threads)
+            summary = process(local, observe, cores=cores)
         except ShapecatError as error:
             text = str(error).replace(str(local.source), job.name)
             text = text.replace(str(local.folder), job.target or str(local.folder))

@@ -1,5 +1,6 @@
 """Processes on this machine that outlive neither their parent nor spoil each other's work."""
 
+import atexit
 import os
 import signal
 import threading
@@ -60,6 +61,7 @@ class LocalExecutor(Executor):
         ]
         for attendant in self._attendants:
             attendant.start()
+        atexit.register(self.terminate)
 
     def submit(self, fn: Callable[..., Any], /, *args: Any, **kwargs: Any) -> Future[Any]:
         """Queue a call; its future raises `WorkerLostError` if the worker dies.
@@ -78,6 +80,7 @@ class LocalExecutor(Executor):
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
         """Let the workers end when their tasks are done."""
         self._closed = True
+        atexit.unregister(self.terminate)
         if cancel_futures:
             self._cancel_waiting()
         for _ in self._attendants:
@@ -156,7 +159,8 @@ class _Worker:
 
     def __init__(self, threads: int) -> None:
         self.pipe, far = _SPAWN.Pipe()
-        self.process = _SPAWN.Process(target=_serve, args=(far,), daemon=True)
+        # Daemonic ones may not start processes of their own; `_end_with_parent` ends these.
+        self.process = _SPAWN.Process(target=_serve, args=(far,), daemon=False)
         with limited_threads(threads):
             self.process.start()
         far.close()
