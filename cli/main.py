@@ -1,6 +1,7 @@
 """The entry point: the group of commands, and the one place where known errors become one line."""
 
 import logging
+import os
 import sys
 from typing import Any
 
@@ -50,6 +51,8 @@ def main(*, verbose: bool) -> None:
     shapecat process demo.mcap --out results    find, categorize and follow objects
     shapecat view results/demo                  look at them in Rerun
     """
+    # The system's allocator gives memory back that long recordings no longer need.
+    os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     level = logging.INFO if verbose else logging.ERROR
     logging.basicConfig(level=level, stream=sys.stderr, format="%(levelname)s %(message)s")
 

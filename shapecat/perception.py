@@ -4,7 +4,7 @@ import time
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -23,37 +23,33 @@ __all__ = ["Perceiver", "perceive"]
 
 @dataclass(frozen=True)
 class Perceiver:
-    """Perceives frames, here or in another process, to which only the name of the model is sent.
+    """Perceives frames, here or in another process, which reads the model's file itself.
 
     Attributes
     ----------
-    model : its file, None for the default one.
-    model_id : what the file must hold.
+    model : the file of the categorizer, None for the default one.
     """
 
-    model: Path | None
-    model_id: str
+    categorizer: Categorizer
     settings: Settings
+    model: Path | None
 
     def __call__(self, view: tuple[Frame, F4 | None]) -> Perception:
-        """Perceive a frame, given where up is.
-
-        Raises
-        ------
-        ModelError : the file has changed.
-        """
+        """Perceive a frame, given where up is."""
         frame, up = view
-        categorizer = _load(self.model, self.model_id)
-        return perceive(frame, up=up, categorizer=categorizer, settings=self.settings)
+        return perceive(frame, up=up, categorizer=self.categorizer, settings=self.settings)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return _read_perceiver, (self.model, self.categorizer.model_id, self.settings)
 
 
 @lru_cache(maxsize=1)
-def _load(model: Path | None, model_id: str) -> Categorizer:
+def _read_perceiver(model: Path | None, model_id: str, settings: Settings) -> Perceiver:
     categorizer = load_model(model)
     if categorizer.model_id != model_id:
         msg = f"{model}: has changed since the run began"
         raise ModelError(msg)
-    return categorizer
+    return Perceiver(categorizer, settings, model)
 
 
 class _Shape(NamedTuple):

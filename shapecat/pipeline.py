@@ -136,7 +136,7 @@ def perceive_all(
     source, total = _select(recording, run["options"], skipped)
     count = 0
 
-    perceiver = Perceiver(job.model, categorizer.model_id, job.settings)
+    perceiver = Perceiver(categorizer, job.settings, job.model)
 
     def view(frame: Frame) -> tuple[FrameRow, tuple[Frame, F4 | None]]:
         up = upright.up(frame)

@@ -127,15 +127,20 @@ def _guess(track: Track, categories: Sequence[str]) -> str:
 
 def _columns(tracks: Sequence[Track]) -> dict[str, Any]:
     """Return the rows of all tracks, track after track, each in time."""
-    counts = [len(track.frames) for track in tracks]
-    detections = [int(d) for track in tracks for d in track.detections]
+
+    def column(name: str) -> Any:
+        return np.concatenate([getattr(track, name) for track in tracks]) if tracks else []
+
+    detections = np.asarray(column("detections"), np.int32)
     return {
-        "track": np.repeat([track.id for track in tracks], counts).tolist(),
+        "track": np.repeat([track.id for track in tracks], [len(track.frames) for track in tracks]),
         "topic": [topic for track in tracks for topic in track.topics],
-        "frame": [int(f) for track in tracks for f in track.frames],
-        "stamp_ns": [int(s) for track in tracks for s in track.stamps_ns],
-        "detection": [d if d >= 0 else None for d in detections],
-        "center_fixed": [center for track in tracks for center in track.centers],
+        "frame": column("frames"),
+        "stamp_ns": column("stamps_ns"),
+        "detection": pa.array(detections, pa.int32(), mask=detections < 0),
+        "center_fixed": pa.FixedSizeListArray.from_arrays(
+            np.ravel(column("centers")).astype(np.float32), 3
+        ),
         "posterior": lists([p for track in tracks for p in track.causal], pa.float32()),
     }
 

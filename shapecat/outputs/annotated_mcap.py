@@ -14,7 +14,7 @@ from typing import BinaryIO
 
 from shapecat.outputs.annotation import Annotation, AnnotationChannel
 from shapecat.outputs.annotations import ENCODERS, Encode, encoder_for
-from shapecat.outputs.mcap_append import Appender, copy_bytes
+from shapecat.outputs.mcap_append import Appender, copy_bytes, reserve
 from shapecat.outputs.mcap_rewrite import Item, rewrite
 from shapecat.recordings import Recording
 from shapecat.recordings.mcap_file import McapRecording, Summary
@@ -65,12 +65,14 @@ def write_annotated(
     metadata = {"run.json": json.dumps(run)}
     with replacing(path) as hidden, hidden.open("wb", buffering=_BUFFER) as file:
         if isinstance(recording, McapRecording) and recording.indexed:
+            reserve(file, recording.summary.data_end)
             with ThreadPoolExecutor(1) as pool:  # the copy does not hold the interpreter lock
                 copying = pool.submit(
                     copy_bytes, recording.path, hidden, recording.summary.data_end
                 )
                 _append(recording.summary, file, channels, items, metadata)
                 copying.result()
+            file.truncate()
         else:
             rewrite(recording, file, channels, items, metadata)
 

@@ -1,11 +1,13 @@
 """Annotations at the end of a copy: every byte of the original data section stays as it is."""
 
+import errno
 import os
 import shutil
 import struct
 import zlib
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import BinaryIO
@@ -20,7 +22,7 @@ from shapecat.outputs.annotation import AnnotationChannel
 from shapecat.recordings.mcap_file import Summary
 from shapecat.recordings.mcap_records import MAGIC
 
-__all__ = ["Appender", "copy_bytes"]
+__all__ = ["Appender", "copy_bytes", "reserve"]
 
 _CHUNK_BYTES = 64 << 10
 """Small chunks: a reader that sorts by time holds one of them for the whole recording."""
@@ -30,6 +32,23 @@ _MESSAGE = struct.Struct("<BQHIQQ")
 _INDEX = struct.Struct("<BQHI")
 """A message index up to its entries: opcode and length, channel, bytes of the entries."""
 _COMPRESS = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}
+
+
+def reserve(file: BinaryIO, length: int) -> None:
+    """Reserve disk space for so many bytes, and some for annotations; truncate the file when done.
+
+    A full disk shows at once. And ext4 writes a whole file out when one with space not yet
+    reserved is renamed over an older one, which takes as long as the copy.
+    """
+    if not hasattr(os, "posix_fallocate"):
+        return
+    try:
+        os.posix_fallocate(file.fileno(), 0, length)
+        with suppress(OSError):
+            os.posix_fallocate(file.fileno(), length, length // 8)
+    except OSError as error:
+        if error.errno not in {errno.EINVAL, errno.EOPNOTSUPP}:  # not every file system can
+            raise
 
 
 def copy_bytes(source: Path, target: Path, length: int) -> None:
