@@ -1,11 +1,17 @@
 """What the studies of the model card compare: it has to be what their rows are called."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
 from shapecat.config import SurfaceSettings
+from shapecat.description import BLOCKS, DESCRIPTOR_NAMES
 from shapecat.evaluation import View
-from shapecat.models.studies import next_frames, sampled, spread, subsample
+from shapecat.evaluation.training import fit_views
+from shapecat.evaluation.views import DescribedViews
+from shapecat.learning.baselines import shape_functions
+from shapecat.models.studies import compare_with_plain, next_frames, sampled, spread, subsample
 from shapecat.models.worlds import World, simulate_world
 
 
@@ -62,3 +68,36 @@ def test_training_tables_hold_what_they_are_asked_for() -> None:
     assert manners.count("upright") < len(manners) / 3
     assert all(view.view is not None and len(view.view.points) == view.points for view in views)
     assert all(0.5 <= view.overlap <= 1 for view in views)
+
+
+def described(seed: int) -> DescribedViews:
+    """Make views of two categories that differ in every component, and slightly in shape."""
+    rng = np.random.default_rng(seed)
+    labels = np.repeat(["ball", "box"], 30)
+    descriptors = rng.normal(0, 1, (60, len(DESCRIPTOR_NAMES))) + 3.0 * (labels == "box")[:, None]
+    functions = [shape_functions(sheet(k) * (1 + k // 30), rng) for k in range(60)]
+    numbers = np.arange(60)
+    return DescribedViews(
+        descriptors.astype(np.float32),
+        labels,
+        np.array([f"{seed} {k}" for k in numbers]),
+        numbers + 100,
+        np.ones(60),
+        np.zeros(60),
+        functions=np.array(functions, np.float32),
+    )
+
+
+def test_the_model_stands_beside_plain_learners_on_the_same_views() -> None:
+    train, test = described(1), described(2)
+    nothing = train.where(np.zeros(0, np.int64))
+    choices: dict[str, Any] = {"blocks": tuple(BLOCKS), "seed": 0, "jobs": 1}
+    model = fit_views(train, nothing, rounds=20, **choices)
+
+    rows = compare_with_plain(train, test, model, **choices)
+
+    names = [name for name, *_ in rows]
+    assert names[:3] == ["the model", "the chain", "forest"]
+    assert names[-2:] == ["forest on D2", "forest on D2, D3, A3 (ESF-like)"]
+    assert {learned for _, learned, *_ in rows} == {"60"}
+    assert rows[0][2:] == ("1.000", "1.000")

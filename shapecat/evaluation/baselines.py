@@ -1,6 +1,6 @@
 """Plain learners beside the chain, on the same views: the chain has to earn its place."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +29,9 @@ def compare_learners(
     *,
     categories: tuple[str, ...],
     root: Path,
+    blocks: Sequence[str] = tuple(BLOCKS),
     seed: int = 0,
+    jobs: int | None = None,
     observe: Observer = ignore,
 ) -> tuple[Compared, ...]:
     """Train the chain and each plain learner on the same views, and judge them on the same views.
@@ -41,6 +43,8 @@ def compare_learners(
         is judged on views of instances it has not seen, in as many turns.
     categories : order of the posteriors; one that a learner has not seen counts as missed.
     root : the folder that errors name.
+    blocks : the blocks of the descriptor to learn from.
+    jobs : processes.
 
     Returns
     -------
@@ -55,7 +59,7 @@ def compare_learners(
     if not splits or any(len(_known(part.labels)) < 2 for part, _ in splits):
         msg = f"{root}: learners need at least two categories, with two objects each or more"
         raise RecordingError(msg)
-    learners = _learners(seed)
+    learners = _learners(tuple(blocks), seed, jobs)
     rows = []
     for k, (name, learner) in enumerate(learners.items(), start=1):
         truth, posteriors = _judged(learner, splits, categories)
@@ -108,22 +112,23 @@ def _compared(name: str, learned: int, truth: I4, posteriors: F8) -> Compared:
     return Compared(name, learned, *(None if np.isnan(value) else value for value in figures))
 
 
-def _learners(seed: int) -> dict[str, _Learner]:
+def _learners(blocks: tuple[str, ...], seed: int, jobs: int | None) -> dict[str, _Learner]:
     from shapecat.learning.baselines import make_baselines  # noqa: PLC0415  scikit-learn
 
-    makers = make_baselines(BLOCKS, seed=seed)
-    learners: dict[str, _Learner] = {"the chain": _chain(seed)}
+    makers = make_baselines({name: BLOCKS[name] for name in blocks}, seed=seed, jobs=jobs)
+    learners: dict[str, _Learner] = {"the chain": _chain(blocks, seed, jobs)}
     learners |= {name: _plain(make, _descriptors) for name, make in makers.items()}
     learners["forest on D2"] = _plain(makers["forest"], _d2)
-    learners["forest on D2, D3, A3"] = _plain(makers["forest"], _functions)
+    learners["forest on D2, D3, A3 (ESF-like)"] = _plain(makers["forest"], _functions)
     return learners
 
 
-def _chain(seed: int) -> _Learner:
+def _chain(blocks: tuple[str, ...], seed: int, jobs: int | None) -> _Learner:
     """Return the whole chain: also shown the views of no category, as `shapecat train` is."""
 
     def learn(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
-        model = fit_views(train, train.where(np.zeros(0, np.int64)), seed=seed)
+        nothing = train.where(np.zeros(0, np.int64))
+        model = fit_views(train, nothing, seed=seed, blocks=blocks, jobs=jobs)
         return _in_order(model.predict(test.descriptors).posteriors, model.categories, categories)
 
     return learn

@@ -3,7 +3,8 @@
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -11,21 +12,20 @@ from shapecat.arrays import F4, I4
 from shapecat.config import Settings, SurfaceSettings
 from shapecat.description import BLOCKS, DESCRIPTOR_NAMES, describe
 from shapecat.evaluation import View, metrics
+from shapecat.evaluation.baselines import compare_learners
 from shapecat.evaluation.report import UNKNOWN
 from shapecat.evaluation.training import fit_views
 from shapecat.evaluation.views import DescribedViews
 from shapecat.learning import Categorizer
-from shapecat.learning.baselines import make_baselines
 from shapecat.learning.incremental import add_categories
 from shapecat.learning.training import encode
 from shapecat.surface import reconstruct, voxelize
 from shapecat.types import NeuralGas
 
 __all__ = [
-    "Views",
     "add_two_categories",
-    "compare_learners",
     "compare_surfaces",
+    "compare_with_plain",
     "next_frames",
     "sampled",
     "spread",
@@ -40,52 +40,48 @@ _ROUNDS = 250
 _NEIGHBOURS = 6
 
 
-class Views(NamedTuple):
-    """Described views (n) of known categories, and their plain ``functions`` (n, f)."""
-
-    views: DescribedViews
-    functions: F4
-
-
 # --- learners ------------------------------------------------------------------------------------
 
 
-def compare_learners(
-    train: Views, test: Views, model: Categorizer, *, blocks: Sequence[str], seed: int, jobs: int
+def compare_with_plain(
+    train: DescribedViews,
+    test: DescribedViews,
+    model: Categorizer,
+    *,
+    blocks: Sequence[str],
+    seed: int,
+    jobs: int,
 ) -> list[tuple[str, ...]]:
-    """Judge the chain beside plain learners: name, views learned from, accuracy, balanced."""
-    few = np.sort(np.random.default_rng(seed).permutation(len(train.views.labels))[:_MOST])
-    part = train.views.where(few)
-    truth, labels = (encode(v.labels, model.categories) for v in (test.views, part))
-    shown = test.views.descriptors
-    chain = fit_views(part, part.where(few < 0), seed=seed, blocks=tuple(blocks), jobs=jobs)
-    rows = [
-        _scores("the model", len(train.views.labels), truth, _best(model, shown)),
-        _scores("the chain on fewer views", few.size, truth, _best(chain, shown)),
+    """Judge the model beside plain learners: name, views learned from, accuracy, balanced."""
+    part = train.where(_some(len(train.labels), seed))
+    truth, predicted = encode(test.labels, model.categories), _best(model, test.descriptors)
+    table = metrics.confusion(truth, predicted, len(model.categories))
+    figures = metrics.accuracy(truth, predicted), metrics.balanced_accuracy(table)
+    rows = compare_learners(
+        test,
+        part,
+        categories=model.categories,
+        root=Path("simulated"),
+        blocks=blocks,
+        seed=seed,
+        jobs=jobs,
+    )
+    return [
+        ("the model", str(len(train.labels)), *(f"{value:.3f}" for value in figures)),
+        *(
+            (row.learner, str(row.learned), f"{row.accuracy:.3f}", f"{row.balanced_accuracy:.3f}")
+            for row in rows
+        ),
     ]
-    makers = make_baselines({name: BLOCKS[name] for name in blocks}, seed=seed, jobs=jobs)
-    for name, make in makers.items():
-        learner = make().fit(part.descriptors, labels)
-        rows.append(_scores(name, few.size, truth, learner.predict(shown)))
-    bins = train.functions.shape[1]
-    for name, width in (("forest on D2", bins // 3), ("forest on D2, D3, A3 (ESF-like)", bins)):
-        learner = makers["forest"]().fit(train.functions[few, :width], labels)
-        rows.append(_scores(name, few.size, truth, learner.predict(test.functions[:, :width])))
-    return rows
+
+
+def _some(count: int, seed: int) -> I4:
+    """Choose the views that plain learners learn from."""
+    return np.sort(np.random.default_rng(seed).permutation(count)[:_MOST])
 
 
 def _best(model: Categorizer, descriptors: F4) -> I4:
     return np.asarray(model.predict(descriptors).posteriors.argmax(axis=1))
-
-
-def _scores(name: str, learned: int, truth: I4, predicted: I4) -> tuple[str, ...]:
-    table = metrics.confusion(truth, predicted, int(max(truth.max(), predicted.max())) + 1)
-    return (
-        name,
-        str(learned),
-        f"{metrics.accuracy(truth, predicted):.3f}",
-        f"{metrics.balanced_accuracy(table):.3f}",
-    )
 
 
 # --- surfaces ------------------------------------------------------------------------------------
@@ -220,8 +216,7 @@ def add_two_categories(
     Rows: data, views of each new category, way, accuracy on the new, on the old ones, what the old
     ones lost, seconds. Means over three pairs of categories.
     """
-    few = np.sort(np.random.default_rng(seed).permutation(len(train.labels))[:_MOST])
-    train = train.where(few)
+    train = train.where(_some(len(train.labels), seed))
     found: dict[tuple[str, ...], list[tuple[float, ...]]] = {}
     for pair in _PAIRS:
         for key, figures in _add(pair, train, test, tuple(blocks), seed):

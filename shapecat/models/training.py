@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import click
 import numpy as np
 
-from shapecat.arrays import F4, Bool
+from shapecat.arrays import Bool
 from shapecat.config import Settings
 from shapecat.description import BLOCKS
 from shapecat.evaluation import Report, View, evaluate, format_report
@@ -24,7 +24,7 @@ from shapecat.learning.training import Examples, fit_threshold
 from shapecat.models.card import Table, format_table, write_card
 from shapecat.models.meshes import mesh_views
 from shapecat.models.recorded import detected_views, labelled_views
-from shapecat.models.studies import Views, add_two_categories, compare_learners, compare_surfaces
+from shapecat.models.studies import add_two_categories, compare_surfaces, compare_with_plain
 from shapecat.models.worlds import World, WorldView, simulate_views
 from shapecat.simulation.distractors import DISTRACTORS
 
@@ -66,7 +66,6 @@ class Simulated(NamedTuple):
     source: np.ndarray
     visible: np.ndarray
     overlap: np.ndarray
-    functions: F4
 
     def where(self, chosen: Bool) -> "Simulated":
         """Return the chosen views."""
@@ -76,7 +75,6 @@ class Simulated(NamedTuple):
             self.source[chosen],
             self.visible[chosen],
             self.overlap[chosen],
-            self.functions[chosen],
         )
 
 
@@ -160,6 +158,7 @@ def collect(views: Iterable[WorldView]) -> Simulated:
         points=columns["points"],
         distances=columns["distance"],
         seconds=columns["seconds"],
+        functions=columns["functions"],
     )
     circumstances = {name: columns[name] for name in Simulated._fields[1:]}
     return Simulated(described, **circumstances)
@@ -280,17 +279,9 @@ def _studies(
     """Return what each part of the method is worth."""
     known = {name: s.where(_clear(s) & (s.views.labels != UNKNOWN)) for name, s in judged.items()}
     learned = train.where(train.views.labels != UNKNOWN)
-    plain = compare_learners(
-        Views(learned.views, learned.functions),
-        Views(known["test"].views, known["test"].functions),
-        model,
-        blocks=_BLOCKS,
-        seed=seed,
-        jobs=jobs,
-    )
-    surfaces = compare_surfaces(
-        *map(_kept_views, _SURFACE_SEEDS, _SURFACE_TABLES), blocks=_BLOCKS, seed=seed, jobs=jobs
-    )
+    choices: dict[str, Any] = {"blocks": _BLOCKS, "seed": seed, "jobs": jobs}
+    plain = compare_with_plain(learned.views, known["test"].views, model, **choices)
+    surfaces = compare_surfaces(*map(_kept_views, _SURFACE_SEEDS, _SURFACE_TABLES), **choices)
     shown = {name: seen.views for name, seen in known.items()}
     added = add_two_categories(learned.views, shown, blocks=_BLOCKS, seed=seed)
     return [
