@@ -66,7 +66,7 @@ class ShownTracks:
         known = pa.compute.is_in(table["track"], pa.array(sorted(labels), pa.int32()))
         table = table.filter(pa.compute.and_(pa.compute.is_valid(table["detection"]), known))
         table = table.sort_by([(name, "ascending") for name in ("topic", "frame", "detection")])
-        frames = _runs(table["topic"].to_pylist(), table["frame"].to_pylist())
+        frames = _runs(table["topic"], table["frame"].to_numpy())
         tracks = table["track"].to_pylist()
         shown = np.array([labels[track].track for track in tracks], np.int64)
         return cls(
@@ -154,13 +154,14 @@ def _join(parts: Sequence[ShownBox], up: F4) -> ShownBox:
     )
 
 
-def _runs(topics: Sequence[str], frames: Sequence[int]) -> dict[Key, slice]:
+def _runs(topics: pa.ChunkedArray, frames: I4) -> dict[Key, slice]:
     """Return which of the sorted rows belong to each frame."""
-    begun: dict[Key, int] = {}
-    for row, key in enumerate(zip(topics, frames, strict=True)):
-        begun.setdefault(key, row)
-    stops = [*begun.values(), len(frames)][1:]
-    return {key: slice(a, b) for (key, a), b in zip(begun.items(), stops, strict=True)}
+    codes = topics.combine_chunks().dictionary_encode()
+    changes = (np.diff(codes.indices.to_numpy()) != 0) | (np.diff(frames) != 0)
+    starts = np.flatnonzero(np.concatenate([np.ones(min(1, len(frames)), np.bool_), changes]))
+    names = topics.take(starts).to_pylist()
+    slices = map(slice, starts.tolist(), [*starts[1:].tolist(), len(frames)])
+    return dict(zip(zip(names, frames[starts].tolist(), strict=True), slices, strict=False))
 
 
 def _ended(

@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap import records
+from mcap.data_stream import RecordBuilder
 from mcap.reader import NonSeekingReader, make_reader
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
@@ -30,6 +32,7 @@ from shapecat.outputs.colours import CATEGORY_COLOURS, colour_of
 from shapecat.outputs.ros_annotations import RosMessages
 from shapecat.outputs.ros_stencils import StencilEncoder
 from shapecat.recordings import open_recording
+from shapecat.recordings.mcap_records import ChunkError, read_chunk_index, write_chunk_index
 from shapecat.types import CATEGORIES, ShownBox, ShownBoxes, ShownFrame
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -445,3 +448,31 @@ def test_fast_messages_are_those_of_the_library(ros1: bool, annotations: list[An
         again = annotations * 2
         whole = [ros.serialize(message.whole(one), message.name) for one in again]
         assert fast(again) == whole
+
+
+_U64 = st.integers(0, 2**64 - 1)
+
+
+@given(
+    numbers=st.lists(_U64, min_size=7, max_size=7),
+    offsets=st.dictionaries(st.integers(0, 2**16 - 1), _U64, max_size=5),
+    compression=st.sampled_from(["", "lz4", "zstd", "größer"]),
+)
+@settings(max_examples=40, deadline=None)
+def test_chunk_indexes_are_those_of_the_library(
+    numbers: list[int], offsets: dict[int, int], compression: str
+) -> None:
+    """A reader that trusts a wrong offset finds no message."""
+    length, start, size, end, index_length, begin, plain = numbers
+    index = records.ChunkIndex(
+        length, start, compression, size, end, index_length, offsets, begin, plain
+    )
+    builder = RecordBuilder()
+    index.write(builder)
+    encoded = builder.end()
+
+    assert write_chunk_index(index) == encoded
+    assert read_chunk_index(encoded[9:]) == index
+    for cut in range(len(encoded) - 9):
+        with pytest.raises(ChunkError):
+            read_chunk_index(encoded[9 : 9 + cut])

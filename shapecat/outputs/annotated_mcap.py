@@ -4,10 +4,12 @@ A finished MCAP file is copied byte for byte and extended; everything else is wr
 MCAP. Annotations use the encoding of the source.
 """
 
+import gc
 import json
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import BinaryIO
@@ -56,25 +58,50 @@ def write_annotated(
     ------
     OutputError : it cannot be written.
     """
+    metadata = {"run.json": json.dumps(run)}
+    with _uncollected(), replacing(path) as hidden, hidden.open("wb", buffering=_BUFFER) as file:
+        if isinstance(recording, McapRecording) and recording.indexed:
+            with _copying(recording, hidden, file):
+                channels, items = _encoded(recording, frames, markers=markers)
+                _append(recording.summary, file, channels, items, metadata)
+        else:
+            channels, items = _encoded(recording, frames, markers=markers)
+            rewrite(recording, file, channels, items, metadata)
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """Keep the collector from looking for cycles, of which there are none, among all that lives."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+@contextmanager
+def _copying(recording: McapRecording, path: Path, file: BinaryIO) -> Iterator[None]:
+    """Copy the data section of a recording while the block writes what comes behind it."""
+    length = recording.summary.data_end
+    reserve(file, length)
+    with ThreadPoolExecutor(1) as pool:  # the copy does not hold the interpreter lock
+        copying = pool.submit(copy_bytes, recording.path, path, length)
+        yield
+        copying.result()
+    file.truncate()
+
+
+def _encoded(
+    recording: Recording, frames: Iterable[ShownFrame], *, markers: bool
+) -> tuple[list[AnnotationChannel], Iterator[Item]]:
+    """Return the annotation channels and their messages, which are made as they are read."""
     annotations = _annotations(frames)
     first = next(annotations, None)
-    encoding = _encoding(recording, first)
-    kinds = encoder_for(encoding, markers=markers)
+    kinds = encoder_for(_encoding(recording, first), markers=markers)
     items = _items(chain([first] if first else [], annotations), [encode for _, encode in kinds])
-    channels = [channel for channel, _ in kinds]
-    metadata = {"run.json": json.dumps(run)}
-    with replacing(path) as hidden, hidden.open("wb", buffering=_BUFFER) as file:
-        if isinstance(recording, McapRecording) and recording.indexed:
-            reserve(file, recording.summary.data_end)
-            with ThreadPoolExecutor(1) as pool:  # the copy does not hold the interpreter lock
-                copying = pool.submit(
-                    copy_bytes, recording.path, hidden, recording.summary.data_end
-                )
-                _append(recording.summary, file, channels, items, metadata)
-                copying.result()
-            file.truncate()
-        else:
-            rewrite(recording, file, channels, items, metadata)
+    return [channel for channel, _ in kinds], items
 
 
 def _items(annotations: Iterable[Annotation], encoders: Sequence[Encode]) -> Iterator[Item]:

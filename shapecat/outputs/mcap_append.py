@@ -20,11 +20,11 @@ from mcap.opcode import Opcode
 
 from shapecat.outputs.annotation import AnnotationChannel
 from shapecat.recordings.mcap_file import Summary
-from shapecat.recordings.mcap_records import MAGIC
+from shapecat.recordings.mcap_records import MAGIC, write_chunk_index
 
 __all__ = ["Appender", "copy_bytes", "reserve"]
 
-_CHUNK_BYTES = 64 << 10
+_CHUNK_BYTES = 256 << 10
 """Small chunks: a reader that sorts by time holds one of them for the whole recording."""
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")
@@ -161,23 +161,13 @@ class Appender:
         self._flush()
         self._write([records.DataEnd(0)])
         start = self._file.tell()
-        summary, groups = RecordBuilder(), []
-        for opcode, group in self._groups():
-            begun = summary.count
-            for record in group:
-                record.write(summary)
-            if summary.count > begun:
-                groups.append(
-                    records.SummaryOffset(
-                        group_opcode=opcode,
-                        group_start=start + begun,
-                        group_length=summary.count - begun,
-                    )
-                )
-        offsets = start + summary.count
-        for group_offset in groups:
-            group_offset.write(summary)
-        body = summary.end()
+        body, groups = bytearray(), []
+        for opcode, encoded in self._groups():
+            if encoded:
+                groups.append(records.SummaryOffset(opcode, start + len(body), len(encoded)))
+                body += encoded
+        offsets = start + len(body)
+        body += _encoded(groups)
         footer = RecordBuilder()
         records.Footer(start, offsets, 0).write(footer)
         # The checksum covers the summary and the footer up to the checksum itself.
@@ -186,14 +176,14 @@ class Appender:
         self._write([records.Footer(start, offsets, crc)])
         self._file.write(MAGIC)
 
-    def _groups(self) -> list[tuple[Opcode, Iterable[records.McapRecord]]]:
+    def _groups(self) -> list[tuple[Opcode, bytes]]:
         return [
-            (Opcode.SCHEMA, self._schemas.values()),
-            (Opcode.CHANNEL, self._channels.values()),
-            (Opcode.STATISTICS, [self._statistics()] if self._original else []),
-            (Opcode.CHUNK_INDEX, self._chunks),
-            (Opcode.ATTACHMENT_INDEX, self._attachments),
-            (Opcode.METADATA_INDEX, self._metadata),
+            (Opcode.SCHEMA, _encoded(self._schemas.values())),
+            (Opcode.CHANNEL, _encoded(self._channels.values())),
+            (Opcode.STATISTICS, _encoded([self._statistics()] if self._original else [])),
+            (Opcode.CHUNK_INDEX, b"".join(map(write_chunk_index, self._chunks))),
+            (Opcode.ATTACHMENT_INDEX, _encoded(self._attachments)),
+            (Opcode.METADATA_INDEX, _encoded(self._metadata)),
         ]
 
     def _statistics(self) -> records.Statistics:

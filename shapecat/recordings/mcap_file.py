@@ -24,6 +24,7 @@ from shapecat.recordings.mcap_records import (
     TruncatedError,
     parse,
     read_chunk,
+    read_chunk_index,
     read_content,
     read_cut_chunk,
     split_chunk,
@@ -227,7 +228,7 @@ class McapRecording(Recording):
                     channel = parse(records.Channel.read, content)
                     summary.channels[channel.id] = channel
                 case Opcode.CHUNK_INDEX:
-                    summary.chunks.append(parse(records.ChunkIndex.read, content))
+                    summary.chunks.append(read_chunk_index(content))
                 case Opcode.ATTACHMENT_INDEX:
                     summary.attachments.append(parse(records.AttachmentIndex.read, content))
                 case Opcode.METADATA_INDEX:

@@ -1,0 +1,74 @@
+"""Writing a corrected run's annotated.mcap again, beside a plain copy of the recording.
+
+    python -m benchmarks.annotating
+
+Recording and copy lie in the page cache; the median of several turns counts.
+"""
+
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+import click
+
+from benchmarks.measure import markdown, save
+from benchmarks.whole import tabletop, write
+from shapecat.jobs import Job
+from shapecat.pipeline import annotate, process
+from shapecat.recordings import open_recording
+from shapecat.run_folder import read_run
+
+
+def timed(work: Callable[[], object]) -> float:
+    """Return the seconds that some work takes."""
+    begun = time.perf_counter()
+    work()
+    return time.perf_counter() - begun
+
+
+def again(folder: Path, recording: Path) -> None:
+    """Write annotated.mcap, and nothing else, from the tables."""
+    run = read_run(folder)
+    run["options"]["rrd"] = False
+    run["seconds"].pop("annotated.mcap")
+    with open_recording(recording) as opened:
+        annotate(folder, opened, run)
+
+
+def measure(folder: Path, frames: int, turns: int) -> dict[str, Any]:
+    """Time annotations and copies of a recording of so many frames in turns."""
+    recording = write(folder / f"frames{frames}.mcap", tabletop(min(frames, 60))[0], frames)
+    run = folder / f"run{frames}"
+    process(Job(recording, run, rrd=False))
+    copy = ["cp", str(recording), str(folder / "copy")]
+    seconds: dict[str, list[float]] = {"annotate": [], "cp": []}
+    for _ in range(turns):
+        seconds["annotate"].append(timed(lambda: again(run, recording)))
+        seconds["cp"].append(timed(lambda: subprocess.run(copy, check=True)))
+    figures = {name: round(median(values), 4) for name, values in seconds.items()}
+    return {"mb": round(recording.stat().st_size / 1e6), **figures}
+
+
+@click.command()
+@click.option("--frames", type=int, multiple=True, default=(300, 1000), help="Repeatable.")
+@click.option("--turns", default=9, help="The median of so many counts.")
+def main(*, frames: tuple[int, ...], turns: int) -> None:
+    """Print a table, write ``build/benchmarks_annotating.json``."""
+    figures = {}
+    with tempfile.TemporaryDirectory() as folder:
+        for count in frames:
+            figures[str(count)] = measure(Path(folder), count, turns)
+    rows = [
+        (count, f["mb"], f["annotate"], f["cp"], f"{f['annotate'] / f['cp']:.2f}")
+        for count, f in figures.items()
+    ]
+    print(markdown("Annotating again", ("frames", "MB", "annotate s", "cp s", "ratio"), rows))
+    save(Path("build/benchmarks_annotating.json"), figures)
+
+
+if __name__ == "__main__":
+    main()
