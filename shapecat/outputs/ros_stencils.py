@@ -8,54 +8,41 @@ these bytes.
 import struct
 from collections.abc import Sequence
 from functools import lru_cache
-from itertools import chain, count
-from operator import itemgetter
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F8
+from shapecat.arrays import U1
 from shapecat.outputs.annotation import Annotation, text_position
 from shapecat.outputs.ros_annotations import ArrayMessage, RosMessages
 from shapecat.types import ShownBox, ShownBoxes, ShownFrame
 
 __all__ = ["StencilEncoder"]
 
-_TIME = struct.Struct("<iI")
 _COUNT = struct.Struct("<I")
-_BOX = struct.Struct("<56s24s24s")
 _CDR_HEADER = 4
 _PLANS = 1024
 """Plans kept: some 10 kB each, for as many sets of tracks seen together."""
 
-Values = tuple[bytes, ...]
-"""What changes, encoded: the lifetime, the time; for each box its pose, its size, its text."""
-_OF_FRAME, _OF_BOX = 2, 3
+_FRAME_BYTES, _BOX_BYTES = 16, 104
+_PARTS = (
+    slice(0, 8),  # the lifetime
+    slice(8, 16),  # the time
+    slice(16, 72),  # the pose of a box
+    slice(72, 96),  # its size
+    slice(96, 120),  # the place of its text
+)
+"""Where values that change are among the bytes of a frame, those of its first box included."""
+_OF_FRAME = 2
 
 Labels = tuple[tuple[int, str, float], ...]
 
 
 class _Stencil(NamedTuple):
-    """Encoded bytes in pieces, and the numbers of the values that go in between."""
+    """Encoded bytes, and which of them change: their place, and where the values are taken from."""
 
-    pieces: tuple[bytes, ...]
-    holes: tuple[int, ...]
-    length: int
-
-
-class _Plan:
-    """How to join values and what never changes."""
-
-    def __init__(self, pieces: Sequence[bytes], holes: Sequence[int], values: int) -> None:
-        """Plan a value between any two pieces; so many values will be given."""
-        between = chain.from_iterable(zip(count(values), holes))
-        # An empty piece more, as a single one would be picked bare.
-        self._pieces = (*pieces, b"")
-        self._pick = itemgetter(*between, values + len(pieces) - 1, values + len(pieces))
-
-    def fill(self, values: Values) -> bytes:
-        """Join the values with the pieces."""
-        return b"".join(self._pick(values + self._pieces))
+    data: bytes
+    holes: tuple[tuple[int, slice], ...]
 
 
 class StencilEncoder:
@@ -65,63 +52,56 @@ class StencilEncoder:
         """Begin without a stencil."""
         self._ros = ros
         self._message = message
-        self._head = lru_cache(_PLANS)(self._cut_head)
         self._element = lru_cache(None)(self._cut_element)
         self._plan = lru_cache(_PLANS)(self._make_plan)
 
     def __call__(self, annotations: Sequence[Annotation]) -> list[bytes]:
-        """Encode frames."""
-        values = _box_values([annotation.frame.objects for annotation in annotations])
-        result, at = [], 0
-        for annotation in annotations:
-            stop = at + _OF_BOX * len(annotation.frame.objects)
-            result.append(self._encode(annotation, values[at:stop]))
-            at = stop
+        """Encode frames; those that show the same tracks together."""
+        result = [b""] * len(annotations)
+        alike: dict[tuple[Labels, str, tuple[int, ...]], list[int]] = {}
+        for k, annotation in enumerate(annotations):
+            if annotation.gone and self._message.gone == "inside":  # seldom
+                result[k] = self._whole(annotation)
+                continue
+            gone = annotation.gone if self._message.gone else ()
+            key = (annotation.frame.objects.labels, annotation.frame.frame_id, gone)
+            alike.setdefault(key, []).append(k)
+        for key, members in alike.items():
+            plan = self._plan(*key)
+            rows = _fill(plan, _values([annotations[k] for k in members]))
+            for k, row in zip(members, rows, strict=True):
+                result[k] = row.tobytes()
         return result
 
-    def _encode(self, annotation: Annotation, of_boxes: Values) -> bytes:
-        if annotation.gone and self._message.gone == "inside":  # seldom
-            return self._whole(annotation)
-        frame = annotation.frame
-        gone = annotation.gone if self._message.gone else ()
-        plan = self._plan(frame.objects.labels, frame.frame_id, gone)
-        return plan.fill(_frame_values(annotation) + of_boxes)
-
-    def _make_plan(self, labels: Labels, frame_id: str, gone: tuple[int, ...]) -> _Plan:
-        """Put the stencils of a frame together."""
+    def _make_plan(self, labels: Labels, frame_id: str, gone: tuple[int, ...]) -> _Stencil:
+        """Put the stencils of a frame together: values of the frame, then box by box."""
         makers = range(len(self._message.elements))
-        head = self._head(frame_id, gone)
-        pieces, holes = [*head.pieces], [*head.holes]
-        pieces[-1] += _COUNT.pack(len(labels) * len(makers))
-        length = head.length + _COUNT.size
+        head = _sample(frame_id, gone)
+        data, holes = _stencil(self._whole(head)[: -_COUNT.size], head)
+        data += _COUNT.pack(len(labels) * len(makers))
         for k, label in enumerate(labels):
             for maker in makers:
-                padding, shift = (0, 0) if self._ros.ros1 else _align(length)
+                padding, shift = (0, 0) if self._ros.ros1 else _align(len(data))
+                data += bytes(padding)
                 element = self._element(maker, label, frame_id, shift)
-                pieces[-1] += bytes(padding) + element.pieces[0]
-                pieces += element.pieces[1:]
-                holes += (h + _OF_BOX * k if h >= _OF_FRAME else h for h in element.holes)
-                length += padding + element.length
-        return _Plan(pieces, holes, _OF_FRAME + _OF_BOX * len(labels))
+                holes += tuple((len(data) + at, _of_box(k, part)) for at, part in element.holes)
+                data += element.data
+        return _Stencil(data, holes)
 
     def _whole(self, annotation: Annotation) -> bytes:
         return self._ros.serialize(self._message.whole(annotation), self._message.name)
-
-    def _cut_head(self, frame_id: str, gone: tuple[int, ...]) -> _Stencil:
-        """Make the stencil of a message up to the number of its elements."""
-        sample = _sample(frame_id, gone)
-        return _stencil(self._whole(sample)[: -_COUNT.size], _frame_values(sample))
 
     def _cut_element(
         self, maker: int, label: tuple[int, str, float], frame_id: str, shift: int
     ) -> _Stencil:
         """Make the stencil of an element of a track."""
-        sample, box = _sample(frame_id), ShownBox(*label, *_SAMPLE)
+        box = ShownBox(*label, *_SAMPLE)
+        sample = _sample(frame_id, boxes=[box])
         element = self._message.elements[maker](sample, box)
         encode = self._ros.shifted if shift else self._ros.serialize
         data = encode(element, self._message.element)
         start = 0 if self._ros.ros1 else _CDR_HEADER
-        return _stencil(data[start:], _SAMPLE_VALUES)
+        return _stencil(data[start:], sample)
 
 
 def _align(length: int) -> tuple[int, int]:
@@ -143,42 +123,49 @@ _STAMP_NS = 0x7FFEFDFC * 10**9 + 0x1FFEFDFC
 _LIFETIME_NS = 0x7EFEFDFC * 10**9 + 0x1EFEFDFC
 
 
-def _sample(frame_id: str, gone: tuple[int, ...] = ()) -> Annotation:
-    frame = ShownFrame("", 0, _STAMP_NS, 0, frame_id, ShownBoxes.of([]), ())
+def _sample(
+    frame_id: str, gone: tuple[int, ...] = (), boxes: Sequence[ShownBox] = ()
+) -> Annotation:
+    frame = ShownFrame("", 0, _STAMP_NS, 0, frame_id, ShownBoxes.of(boxes), ())
     return Annotation(frame, _LIFETIME_NS, gone)
 
 
-def _frame_values(annotation: Annotation) -> Values:
-    seconds, nanoseconds = divmod(annotation.frame.stamp_ns, 10**9)
-    return (
-        _TIME.pack(*divmod(annotation.lifetime_ns, 10**9)),
-        _TIME.pack(min(seconds, 2**31 - 1), nanoseconds),
-    )
-
-
-def _box_values(frames: Sequence[ShownBoxes]) -> Values:
-    """Return the values of all boxes of some frames, one box after another."""
-    places: F8 = np.concatenate([boxes.places for boxes in frames])
+def _values(annotations: Sequence[Annotation]) -> U1:
+    """Return (frames, bytes) what changes, of frames with the same number of boxes."""
+    times = np.array([(a.lifetime_ns, a.frame.stamp_ns) for a in annotations], np.int64)
+    seconds, nanoseconds = np.divmod(times, 10**9)
+    whole = np.stack([np.minimum(seconds, 2**31 - 1), nanoseconds], axis=2).astype("<u4")
+    places = np.concatenate([a.frame.objects.places for a in annotations])
     center, size, orientation = places[:, :3], places[:, 3:6], places[:, 6:]
     above = np.column_stack(text_position(center.T, size.T, orientation.T))
-    rows = np.hstack([center, orientation, size, above]).astype("<f8")
-    return tuple(chain.from_iterable(_BOX.iter_unpack(rows.tobytes())))
+    boxes = np.hstack([center, orientation, size, above]).astype("<f8")
+    n = len(annotations)
+    return np.hstack([whole.view(np.uint8).reshape(n, -1), boxes.view(np.uint8).reshape(n, -1)])
 
 
-_SAMPLE_VALUES = _frame_values(_sample("")) + _box_values(
-    [ShownBoxes.of([ShownBox(0, "", 0.0, *_SAMPLE)])]
-)
+def _of_box(number: int, part: slice) -> slice:
+    """Return where values of the first box, or of the frame, are for another box."""
+    if part.start < _FRAME_BYTES:
+        return part
+    shift = number * _BOX_BYTES
+    return slice(part.start + shift, part.stop + shift)
 
 
-def _stencil(data: bytes, values: Values) -> _Stencil:
+def _fill(plan: _Stencil, values: U1) -> U1:
+    """Return (frames, bytes) the messages with their values."""
+    rows: U1 = np.tile(np.frombuffer(plan.data, np.uint8), (len(values), 1))
+    for at, part in plan.holes:
+        rows[:, at : at + part.stop - part.start] = values[:, part]
+    return rows
+
+
+def _stencil(data: bytes, sample: Annotation) -> _Stencil:
     """Find the values of a sample in what it was encoded to."""
-    found = []
-    for which, value in enumerate(values):
+    values, holes = _values([sample])[0], []
+    for part in _PARTS if sample.frame.objects else _PARTS[:_OF_FRAME]:
+        value = values[part].tobytes()
         at = data.find(value)
         while at >= 0:
-            found.append((at, at + len(value), which))
+            holes.append((at, part))
             at = data.find(value, at + len(value))
-    found.sort()
-    starts, stops = [*(start for start, _, _ in found), len(data)], (stop for _, stop, _ in found)
-    pieces = (data[a:b] for a, b in zip([0, *stops], starts, strict=True))
-    return _Stencil(tuple(pieces), tuple(which for *_, which in found), len(data))
+    return _Stencil(data, tuple(holes))
