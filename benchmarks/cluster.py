@@ -137,12 +137,12 @@ def measure(frame_s: float) -> dict[str, Measured]:
         for _ in range(1000):
             manifest.record([entry])
         line_s = (time.perf_counter() - begun) / 1000
-        names = [Path(folder) / f"{k}.mcap" for k in range(2000)]
-        for name in names:
-            name.touch()
+        files = [Path(folder) / f"{k}.mcap" for k in range(2000)]
+        for file in files:
+            file.touch()
         begun = time.perf_counter()
-        with plan_batch(Job(Path(), Path()), list(map(str, names)), f"{folder}/out"):
-            plan_s = (time.perf_counter() - begun) / len(names)
+        with plan_batch(Job(Path(), Path()), list(map(str, files)), f"{folder}/out"):
+            plan_s = (time.perf_counter() - begun) / len(files)
     found = {}
     for name in ("local", "dask"):
         with open_executor(name, workers=1) as executor:

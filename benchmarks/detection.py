@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -78,17 +79,18 @@ def _time_open3d(frames: list[Frame], ups: list[Any]) -> list[float]:
         cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(20))
         o3d.utility.random.seed(0)
         flat = np.abs(np.asarray(cloud.normals) @ up) > 0.95
-        (a, b, c, d), _ = cloud.select_by_index(np.flatnonzero(flat)).segment_plane(0.01, 3, 200)
+        level = cloud.select_by_index(np.flatnonzero(flat).tolist())
+        (a, b, c, d), _ = level.segment_plane(0.01, 3, 200)
         side = 1.0 if d > 0 else -1.0
         height = side * (np.asarray(cloud.points) @ [a, b, c] + d)
-        above = cloud.select_by_index(np.flatnonzero((height > 0.01) & (height < 0.6)))
-        return int(np.max(above.cluster_dbscan(0.02, 10), initial=-1)) + 1
+        above = cloud.select_by_index(np.flatnonzero((height > 0.01) & (height < 0.6)).tolist())
+        return int(np.max(np.asarray(above.cluster_dbscan(0.02, 10)), initial=-1)) + 1
 
     result = []
     for frame, up in zip(frames, ups, strict=True):
         points = frame.xyz().astype(np.float64)
         points = points[np.isfinite(points[:, 2])]
-        result.append(cpu_ms(lambda p=points, u=up: work(p, u), 2))
+        result.append(cpu_ms(partial(work, points, up), 2))
     return result
 
 

@@ -116,7 +116,8 @@ def speed(folder: Path, frames: int, repeats: int) -> tuple[str, dict[str, Any]]
     """Measure frames per second, all outputs on, on one core and on two."""
     views, objects = tabletop(60)
     recording = write(folder / "tabletop.mcap", views, frames)
-    rows, figures = [], {"objects": objects, "frames": frames}
+    rows: list[tuple[Any, ...]] = []
+    figures: dict[str, Any] = {"objects": objects, "frames": frames}
     for count in (1, 2):
         cores = set(sorted(os.sched_getaffinity(0))[:count])
         if len(cores) < count:
