@@ -186,18 +186,18 @@ def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> 
 
 def calibration_svg(curve: Sequence[Bin], *, size: int = 280) -> str:
     """Return accuracy over confidence; the area of a dot is its share of the views."""
-    margin, side = 34.0, size - 44.0
-    low, high = margin, margin + side
+    low, top, side = 34.0, 18.0, size - 56.0  # room for the largest dot in a corner
+    high, bottom = low + side, top + side
     parts = [
-        f'<rect x="{low}" y="10" width="{side}" height="{side}" fill="none" stroke="#999"/>',
-        f'<line x1="{low}" y1="{10 + side}" x2="{high}" y2="10" stroke="#bbb"/>',
-        f'<text x="{margin + side / 2}" y="{size - 8}" text-anchor="middle">confidence</text>',
-        f'<text transform="translate(16 {10 + side / 2}) rotate(-90)">accuracy</text>',
+        f'<rect x="{low}" y="{top}" width="{side}" height="{side}" fill="none" stroke="#999"/>',
+        f'<line x1="{low}" y1="{bottom}" x2="{high}" y2="{top}" stroke="#bbb"/>',
+        f'<text x="{low + side / 2}" y="{size - 8}" text-anchor="middle">confidence</text>',
+        f'<text transform="translate(16 {top + side / 2}) rotate(-90)">accuracy</text>',
     ]
     total = max(sum(item.views for item in curve), 1)
     parts += [
-        f'<circle cx="{margin + side * item.confidence:.1f}" '
-        f'cy="{10 + side * (1 - item.accuracy):.1f}" '
+        f'<circle cx="{low + side * item.confidence:.1f}" '
+        f'cy="{top + side * (1 - item.accuracy):.1f}" '
         f'r="{2 + 14 * (item.views / total) ** 0.5:.1f}" fill="rgb{_INK}" fill-opacity="0.7"/>'
         for item in curve
     ]
@@ -206,23 +206,24 @@ def calibration_svg(curve: Sequence[Bin], *, size: int = 280) -> str:
 
 def accuracy_svg(ranges: _Ranges, *, width: int = 480) -> str:
     """Return accuracies as bars; the thickness of a bar is its share of the views."""
-    side, step = width - 2 * _MARGIN, 34
+    low, step = 96, 34  # room for the longest label
+    side = width - low - 56
     most = max((count for _, count, _ in ranges), default=1)
     parts: list[str] = []
     for k, (label, count, value) in enumerate(ranges):
         middle, thick = step * (k + 0.5), 4 + 22 * count / most
-        text, end = middle + 4, _MARGIN + side + 8
+        text, end = middle + 4, low + side + 8
         bar = f'y="{middle - thick / 2:.1f}" width="{side * value:.1f}" height="{thick:.1f}"'
         parts.extend(
             (
-                f'<text x="{_MARGIN - 8}" y="{text}" text-anchor="end">{escape(label)}</text>',
-                f'<rect x="{_MARGIN}" {bar} fill="rgb{_INK}" fill-opacity="0.7"/>',
+                f'<text x="{low - 8}" y="{text}" text-anchor="end">{escape(label)}</text>',
+                f'<rect x="{low}" {bar} fill="rgb{_INK}" fill-opacity="0.7"/>',
                 f'<text x="{end}" y="{text}">{value:.3f}</text>',
             )
         )
     height = step * len(ranges)
     parts.append(
-        f'<rect x="{_MARGIN}" y="0" width="{side}" height="{height}" fill="none" stroke="#999"/>'
+        f'<rect x="{low}" y="0" width="{side}" height="{height}" fill="none" stroke="#999"/>'
     )
     return _svg(width, height, parts)
 

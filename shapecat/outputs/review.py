@@ -52,7 +52,7 @@ from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
 
 __all__ = ["open_viewer", "take_screenshot", "write_review"]
 
-_FLUSH_FRAMES = 32
+_FLUSH_FRAMES, _PLOT_FRAMES = 32, 256  # curves make few columns: Rerun remembers each it wrote
 _DRAWN_AT_ONCE, _POINTS_AT_ONCE = 16, 1 << 19  # frames and points held back of a sensor
 _RESERVE_BYTES = 64 << 20  # Rerun waits for ever on a full disk: stop before
 _PATH_STEP_M, _PATH_POINTS = 0.015, 500  # a path grows when its object moves so far
@@ -95,6 +95,8 @@ def write_review(
         for k, (labelled, frame) in enumerate(frames):
             _require_space(path.parent)
             review.add(labelled, frame)
+            if k % _PLOT_FRAMES == _PLOT_FRAMES - 1:
+                review.plot()
             if k % _FLUSH_FRAMES == _FLUSH_FRAMES - 1:
                 review.flush()
         review.end()
@@ -179,16 +181,20 @@ class _Review:
         """Write out what is held back."""
         for entity in self._pending:
             self._send(entity)
+        self._stream.flush(timeout_sec=60)
+
+    def plot(self) -> None:
+        """Send what is held back of curves and paths."""
         for entity, rows in self._ways.items():
             if rows:
                 at, ways = zip(*rows, strict=True)
                 self._stream.send_columns(entity, times_of(at), shapes.paths(ways))
                 rows.clear()
         self._curves.send()
-        self._stream.flush(timeout_sec=60)
 
     def end(self) -> None:
         """Write the layout and all that is left."""
+        self.plot()
         self.flush()
         world = "/world"
         scenes = [
