@@ -21,6 +21,8 @@ __all__ = [
     "with_overrides",
 ]
 
+_MOST_FUSED = 30
+
 
 @dataclass(frozen=True)
 class DetectionSettings:
@@ -28,6 +30,9 @@ class DetectionSettings:
 
     max_range_m: float = 2.0
     """Points farther from the sensor are ignored (thesis 4.2)."""
+    fuse_frames: int = 1
+    """Consecutive depth images fused into one before detection, itself included (thesis 4.2);
+    1 fuses none."""
     max_height_m: float = 0.6
     """Points higher above a plane do not belong to an object on it."""
     max_size_m: float = 0.6
@@ -36,6 +41,12 @@ class DetectionSettings:
     """Candidates with fewer points at full resolution are dropped."""
     rules: str = "low concave ledge small occluder hollow rim overhang neck float ring feet fill"
     """Rules beyond the thesis that separate and join objects, by name; any may be left out."""
+
+    def __post_init__(self) -> None:
+        """Refuse to hold more images in memory than help."""
+        if not 1 <= self.fuse_frames <= _MOST_FUSED:
+            msg = f"detection.fuse_frames must be from 1 to {_MOST_FUSED}, got {self.fuse_frames}"
+            raise ConfigError(msg)
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
-"""One frame, without looking at any other: detect, reconstruct, describe, categorize."""
+"""One frame, and those to fuse with it: detect, reconstruct, describe, categorize."""
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -11,14 +12,22 @@ import numpy as np
 from shapecat.arrays import F4
 from shapecat.config import Settings
 from shapecat.description import DESCRIPTOR_NAMES, describe
-from shapecat.detection import detect
+from shapecat.detection import Earlier, detect, fuse, with_own_readings
 from shapecat.errors import ModelError
 from shapecat.geometry import inverse, level_from_sensor, transform
 from shapecat.learning import Categorizer, load_model
 from shapecat.surface import reconstruct, thin
 from shapecat.types import Candidate, Detection, Frame, NeuralGas, Perception, Scene
 
-__all__ = ["Perceiver", "perceive"]
+__all__ = ["Perceiver", "View", "perceive"]
+
+
+class View(NamedTuple):
+    """A frame, where up is in it (None to estimate it), and the frames to fuse with it."""
+
+    frame: Frame
+    up: F4 | None
+    earlier: tuple[Earlier, ...]
 
 
 @dataclass(frozen=True)
@@ -34,10 +43,15 @@ class Perceiver:
     settings: Settings
     model: Path | None
 
-    def __call__(self, view: tuple[Frame, F4 | None]) -> Perception:
-        """Perceive a frame, given where up is."""
-        frame, up = view
-        return perceive(frame, up=up, categorizer=self.categorizer, settings=self.settings)
+    def __call__(self, view: View) -> Perception:
+        """Perceive a frame."""
+        return perceive(
+            view.frame,
+            up=view.up,
+            categorizer=self.categorizer,
+            settings=self.settings,
+            earlier=view.earlier,
+        )
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _read_perceiver, (self.model, self.categorizer.model_id, self.settings)
@@ -59,7 +73,12 @@ class _Shape(NamedTuple):
 
 
 def perceive(
-    frame: Frame, *, up: F4 | None, categorizer: Categorizer, settings: Settings
+    frame: Frame,
+    *,
+    up: F4 | None,
+    categorizer: Categorizer,
+    settings: Settings,
+    earlier: Sequence[Earlier] = (),
 ) -> Perception:
     """Find, reconstruct, describe and categorize the objects of one frame (thesis ch. 4 to 7).
 
@@ -68,15 +87,19 @@ def perceive(
     Parameters
     ----------
     up : (3,) unit vector in the sensor frame, or None to estimate it from the planes.
+    earlier : frames to fuse with this one; indices are those of the frame's own readings.
     """
     begun = time.perf_counter()
-    scene = detect(frame, up=up, settings=settings.detection, rng=_rng(settings, frame, 0))
+    fused = fuse(frame, earlier, range_m=settings.detection.max_range_m)
+    scene = detect(fused, up=up, settings=settings.detection, rng=_rng(settings, frame, 0))
     detected = time.perf_counter()
     shapes = [
-        _describe_candidate(frame, scene, candidate, settings, _rng(settings, frame, k))
+        _describe_candidate(fused, scene, candidate, settings, _rng(settings, frame, k))
         for k, candidate in enumerate(scene.candidates, start=1)
     ]
     described = time.perf_counter()
+    if fused is not frame:
+        scene = with_own_readings(scene, frame)
     detections = _categorize(scene, shapes, categorizer)
     return Perception(
         topic=frame.topic,

@@ -13,9 +13,9 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
-from shapecat.arrays import F4
 from shapecat.corrections import TrackLabel, adopt_labels, read_labels
 from shapecat.description import DESCRIPTOR_NAMES
+from shapecat.detection import RecentFrames
 from shapecat.errors import NoStreamError, OutputError
 from shapecat.executors.order import in_order, read_ahead
 from shapecat.jit import CompileClock, compile_clock
@@ -23,7 +23,7 @@ from shapecat.jobs import Job, Summary, describe_run, resume, same_work, summari
 from shapecat.labels import read_labelled_frames
 from shapecat.learning import Categorizer, load_model
 from shapecat.outputs.rereading import with_clouds
-from shapecat.perception import Perceiver
+from shapecat.perception import Perceiver, View
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
 from shapecat.recordings.gravity import Upright
 from shapecat.run_folder import read_run, staged, sweep, write_run
@@ -131,6 +131,7 @@ def perceive_all(
     cores: int = 1,
 ) -> None:
     """Write frames, detections and planes, frame by frame in flat memory."""
+    recent = RecentFrames(job.settings.detection.fuse_frames)
     upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame)
     skipped: Counter[str] = Counter()
     source, total = _select(recording, run["options"], skipped)
@@ -138,9 +139,10 @@ def perceive_all(
 
     perceiver = Perceiver(categorizer, job.settings, job.model)
 
-    def view(frame: Frame) -> tuple[FrameRow, tuple[Frame, F4 | None]]:
-        up = upright.up(frame)
-        return FrameRow(frame.log_time_ns, upright.fixed_from_sensor(frame), up), (frame, up)
+    def view(frame: Frame) -> tuple[FrameRow, View]:
+        up, pose = upright.up(frame), upright.fixed_from_sensor(frame)
+        row = FrameRow(frame.log_time_ns, pose, up)
+        return row, View(frame, up, recent.before(frame, pose))
 
     with PerceptionTables(
         folder, categories=categorizer.categories, model_id=categorizer.model_id
@@ -161,7 +163,7 @@ def perceive_all(
     if tables.done:
         run["counts"]["resumed"] = tables.done
     run["fixed_frame"], run["up"] = upright.fixed_frame, upright.report(folder)
-    run["warnings"] = [*recording.warnings, *upright.warnings]
+    run["warnings"] = [*recording.warnings, *upright.warnings, *recent.warnings()]
 
 
 def track(folder: Path, run: dict[str, Any], job: Job) -> None:

@@ -1,0 +1,316 @@
+"""Fusing consecutive depth images: what moves, jumps or is not known must not smear."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from shapecat.arrays import F4
+from shapecat.config import Settings, with_overrides
+from shapecat.detection import Earlier, RecentFrames, fuse
+from shapecat.detection.fusing import AGREE, REACH
+from shapecat.errors import ConfigError
+from shapecat.geometry import IDENTITY
+from shapecat.jobs import Job
+from shapecat.perception import perceive
+from shapecat.pipeline import process
+from shapecat.run_folder import read_run
+from shapecat.simulation import KINECT, make_scene, render_frame
+from shapecat.simulation.messages import MessageFactory
+from shapecat.simulation.paths import looking_at
+from shapecat.types import Camera, Frame, Pose
+from tests.conftest import Guesser
+from tests.messages import SECOND, write
+from tests.scenes import record, stream
+from tests.test_crash import assert_same_tables
+
+CAMERA = Camera(160, 120, 131.0, 131.0, 79.5, 59.5)
+EYE = (0.0, -0.8, 0.6)
+BOX = ((-0.08, 0.08), (-0.05, 0.05), (0.0, 0.15))
+RANGE_M = 2.0
+TICK = SECOND // 30
+
+
+def see(pose: Pose, box: Any = BOX) -> F4:
+    """Return the true depth (h w,) of a box on a floor, by the geometry of rays and slabs."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    rays = np.stack(
+        [(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1
+    )
+    way, eye = rays @ pose.rotation.T, pose.translation
+    with np.errstate(divide="ignore"):
+        floor = np.where(way[..., 2] < 0, -eye[2] / way[..., 2], 0)
+        if box is None:
+            return floor.astype(np.float32)
+        limits = np.sort((np.array(box).T[:, None, None] - eye) / way, axis=0)
+    near, far = limits[0].max(axis=-1), limits[1].min(axis=-1)
+    return np.where((near < far) & (near > 0), near, floor).astype(np.float32)
+
+
+def frame(depth: F4, stamp_ns: int = 0, **changes: Any) -> Frame:
+    made = Frame("depth", 0, stamp_ns, 0, "camera", depth=depth, camera=CAMERA)
+    return replace(made, **changes)
+
+
+def noisy(depth: F4, rng: np.random.Generator, deviation: float = 0.0015) -> F4:
+    """Disturb the inverse depth as a depth camera does."""
+    with np.errstate(divide="ignore"):
+        inverse = 1 / depth + rng.normal(0, deviation, depth.shape)
+    return np.where(depth > 0, 1 / inverse, 0).astype(np.float32)
+
+
+def error(depth: F4, truth: F4) -> F4:
+    """Return the error of the inverse depth where there is a reading, and it is used."""
+    used = (depth > 0) & (truth < RANGE_M - 0.1)
+    return np.asarray(1 / depth[used] - 1 / truth[used])
+
+
+def fused(now: F4, *earlier: tuple[F4, Pose | None]) -> F4:
+    others = [Earlier(frame(depth), pose) for depth, pose in earlier]
+    result = fuse(frame(now), others, range_m=RANGE_M).depth
+    if result is None:
+        raise ValueError
+    return result
+
+
+def moved(pose: Pose, other: Pose) -> Pose:
+    """Return other_from_pose."""
+    turn = other.rotation.T
+    return Pose(turn @ pose.rotation, turn @ (pose.translation - other.translation))
+
+
+def home(*shift: float, gaze: tuple[float, ...] = (0.0, 0.0, 0.0), roll: float = 0.0) -> Pose:
+    """Return a pose of the camera, moved away from the usual place by metres."""
+    return looking_at(np.add(EYE, shift), np.array(gaze), roll=roll)
+
+
+HOME = home(0.0, 0.0, 0.0)
+
+
+def test_one_frame_is_the_frame_itself() -> None:
+    """The default must not change a bit."""
+    alone = frame(see(HOME))
+    recent = RecentFrames(Settings().detection.fuse_frames)
+    for stamp in (0, TICK):
+        assert recent.before(replace(alone, stamp_ns=stamp), IDENTITY) == ()
+    assert fuse(alone, (), range_m=RANGE_M) is alone
+
+
+@pytest.mark.parametrize("pose", [IDENTITY, None])
+@pytest.mark.parametrize("count", [2, 4])
+def test_noise_falls_by_the_root_of_the_number(pose: Pose | None, count: int) -> None:
+    rng = np.random.default_rng(1)
+    truth = see(HOME)
+    now, *others = (noisy(truth, rng) for _ in range(count))
+
+    result = fused(now, *((depth, pose) for depth in others))
+
+    ratio = error(result, truth).std() / error(now, truth).std()
+    assert ratio == pytest.approx(1 / np.sqrt(count), rel=0.1)
+
+
+shifts = st.floats(-0.03, 0.03)
+turns = st.floats(-0.05, 0.05)
+
+
+@settings(deadline=None, max_examples=20)
+@given(shifts, shifts, shifts, turns, turns, turns)
+def test_the_place_of_a_camera_that_moves_is_taken_into_account(
+    x: float, y: float, z: float, right: float, up: float, roll: float
+) -> None:
+    """A wrong direction or order of the transforms displaces every surface."""
+    other = home(x, y, z, gaze=(right, 0.0, up), roll=roll)
+    now, before = see(HOME), see(other)
+
+    result = fused(now, (before, moved(HOME, other)))
+
+    # Between pixels, the edge of the box may be taken for a slope of less than AGREE.
+    assert np.abs(error(result, now)).max() <= 0.55 * AGREE
+    assert np.percentile(np.abs(error(result, now)), 95) < 2e-4
+
+
+def test_noise_falls_also_while_the_camera_moves() -> None:
+    """Nothing wrong is easy where nothing is fused."""
+    rng = np.random.default_rng(2)
+    truth = see(HOME)
+    others = [home(0.02 * k, 0.01, -0.01 * k, roll=0.01) for k in (1, 2)]
+    now = noisy(truth, rng)
+
+    result = fused(now, *((noisy(see(o), rng), moved(HOME, o)) for o in others))
+
+    assert error(result, truth).std() < 0.67 * error(now, truth).std()
+
+
+def test_an_image_that_its_pose_does_not_explain_is_left_out() -> None:
+    """Without poses, or with wrong ones, a camera that moved would smear all there is."""
+    other = home(0.05, 0.0, -0.04)
+    now = see(HOME)
+
+    for pose in (None, IDENTITY, moved(other, HOME)):
+        assert np.array_equal(fused(now, (see(other), pose)), now)
+    assert not np.array_equal(fused(now, (see(other), moved(HOME, other))), now)
+
+
+def slid(x: float) -> Any:
+    (left, right), *others = BOX
+    return ((left + x, right + x), *others)
+
+
+@pytest.mark.parametrize("box", [slid(0.03), slid(-0.06), slid(0.2), None])
+def test_what_has_moved_does_not_smear(box: Any) -> None:
+    """Neither at its new place nor at the one it left; also what has just come."""
+    now, before = see(HOME), see(HOME, box)
+
+    for depth, others in ((now, before), (before, now)):
+        result = fused(depth, (others, IDENTITY), (others, IDENTITY))
+        same = np.abs(1 / now - 1 / before) < 1e-6
+        assert np.allclose(result[same], depth[same], rtol=1e-6)
+        assert np.abs(error(result, depth)).max() <= AGREE
+        assert np.count_nonzero(np.abs(error(result, depth)) > 1e-6) < 0.005 * depth.size
+
+
+def test_holes_are_filled_with_what_was_seen_there() -> None:
+    rng = np.random.default_rng(3)
+    truth = see(HOME)
+    now, *others = (np.where(rng.random(truth.shape) < 0.3, 0, truth) for _ in range(3))
+
+    result = fused(now, *((depth, IDENTITY) for depth in others))
+
+    near = truth < RANGE_M
+    assert np.mean(now[near] == 0) > 0.25
+    assert np.mean(result[near] == 0) < 0.04
+    assert np.abs(error(result, truth)).max() < 1e-5
+
+
+def test_a_thing_that_was_taken_away_does_not_fill_the_hole_it_left() -> None:
+    """Where it stood the sensor may see nothing for a moment; it must not come back there."""
+    empty = see(HOME, None)
+    gone = np.abs(empty - see(HOME)) > 1e-6
+    now = np.where(gone, 0, empty)
+
+    result = fused(now, (see(HOME), IDENTITY), (see(HOME), IDENTITY))
+
+    ghost = gone & (result > 0)
+    edge = np.argwhere(~gone)
+    far = [np.abs(edge - pixel).sum(axis=1).min() > REACH for pixel in np.argwhere(ghost)]
+    assert not any(far)
+    assert np.abs(error(np.where(ghost, result, 0), empty)).max(initial=0) < 0.05
+
+
+def lengths(frames: Sequence[tuple[Frame, Pose | None]], count: int = 3) -> list[int]:
+    recent = RecentFrames(count)
+    return [len(recent.before(*item)) for item in frames]
+
+
+def test_the_newest_frames_come_first_and_old_ones_are_let_go() -> None:
+    """Memory must not grow with the recording."""
+    recent, depth = RecentFrames(4), see(HOME)
+    for k in range(9):
+        found = recent.before(frame(depth, k * TICK, index=k), IDENTITY)
+        assert [f.index for f, _ in found] == list(range(k - 1, max(k - 3, 0) - 1, -1))
+
+
+SMALL = Camera(80, 60, 65.0, 65.0, 39.5, 29.5)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"stamp_ns": TICK},
+        {"stamp_ns": 0},
+        {"stamp_ns": 3 * SECOND},
+        {"frame_id": "other"},
+        {"depth": np.ones((60, 80), np.float32), "camera": SMALL},
+        {"camera": replace(CAMERA, fx=140.0)},
+        {"depth": None, "camera": None, "points": np.ones((5, 3), np.float32)},
+    ],
+    ids=["same stamp", "clock back", "gap", "frame", "resolution", "lens", "cloud"],
+)
+def test_a_break_begins_anew(change: Any) -> None:
+    """Frames before a jump of the clock or another camera show something else."""
+    *two, third = (frame(see(HOME), k * TICK) for k in range(3))
+
+    assert lengths([(f, IDENTITY) for f in (*two, third)]) == [0, 1, 2]
+    assert lengths([(f, IDENTITY) for f in (*two, replace(third, **change))]) == [0, 1, 0]
+
+
+def test_topics_are_kept_apart_and_a_lost_pose_is_a_break() -> None:
+    depth = see(HOME)
+    ticks = [frame(depth, k * TICK) for k in range(4)]
+    turns = [(replace(f, topic=t), IDENTITY) for f in ticks for t in ("left", "right")]
+
+    assert lengths(turns) == [0, 0, 1, 1, 2, 2, 2, 2]
+    assert lengths(list(zip(ticks, (IDENTITY, None, None, IDENTITY), strict=True))) == [0, 0, 1, 0]
+
+
+@pytest.mark.parametrize("count", [0, 31])
+def test_a_senseless_number_is_refused(count: int) -> None:
+    with pytest.raises(ConfigError, match=r"detection\.fuse_frames must be from 1 to 30"):
+        with_overrides(Settings(), [f"detection.fuse_frames={count}"])
+
+
+def dropped(count: int) -> Iterator[Frame]:
+    """Yield frames of a table of which a fifth of the readings fails."""
+    world = make_scene("tabletop", np.random.default_rng(4), frames=1)
+    for k in range(count):
+        rng = np.random.default_rng(k)
+        full, _ = render_frame(world, world.path[0], rng=rng, sensor=KINECT)
+        if full.depth is not None:
+            depth = np.where(rng.random(full.depth.shape) < 0.2, 0, full.depth)
+            yield replace(full, depth=depth, stamp_ns=k * TICK)
+
+
+def test_indices_are_those_of_the_frames_own_readings() -> None:
+    """Exports look them up in the recording, where a filled hole is still a hole."""
+    *others, now = dropped(3)
+    earlier = [Earlier(other, IDENTITY) for other in others]
+    guesser: Any = Guesser()
+
+    seen = perceive(now, up=None, categorizer=guesser, settings=Settings(), earlier=earlier)
+
+    assert len(seen.detections) >= 5
+    for found, candidate in zip(seen.detections, seen.scene.candidates, strict=True):
+        assert found.candidate is candidate
+        assert candidate.indices.size >= 60
+        assert np.isfinite(now.xyz(candidate.indices)).all()
+
+
+@pytest.fixture
+def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Job:
+    """Return a job that fuses three frames, in other processes from the first one on."""
+    monkeypatch.setattr("shapecat.executors.order._ALONE", 0)
+    settings = with_overrides(Settings(), ["detection.fuse_frames=3"])
+    source = record(tmp_path / "table.mcap", 40)
+    return Job(source, tmp_path / "one", settings=settings, mcap=False, rrd=False)
+
+
+def test_tables_do_not_depend_on_processes_or_interruptions(job: Job) -> None:
+    """Frames are fused with those before them, also where another process or run had them."""
+
+    def stop(phase: str, done: int, _total: int | None) -> None:
+        if (phase, done) == ("perceive", 36):
+            raise KeyboardInterrupt
+
+    other = replace(job, folder=job.folder.with_name("other"))
+    process(job)
+    with pytest.raises(KeyboardInterrupt):
+        process(other, stop)
+    process(other, cores=2)
+
+    assert read_run(other.folder)["counts"]["resumed"] >= 32
+    assert_same_tables(job.folder, other.folder)
+
+
+def test_what_could_not_be_fused_is_said(job: Job, tmp_path: Path) -> None:
+    make = MessageFactory(2)
+    items = [item for item in stream(make, 4) if "tf" not in item[0]]
+    source = write(tmp_path / "still.mcap", items)
+    process(replace(job, source=source))
+
+    (warning,) = read_run(job.folder)["warnings"]
+    assert "nothing tells where the sensor was in 4 frames" in warning
