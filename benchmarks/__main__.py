@@ -9,7 +9,7 @@ from collections.abc import Callable  # noqa: E402  the environment comes first
 from pathlib import Path  # noqa: E402
 from typing import Any  # noqa: E402
 
-from benchmarks import ablation, density, detection, neural_gas, stages  # noqa: E402
+from benchmarks import ablation, density, detection, fusing, neural_gas, stages  # noqa: E402
 from benchmarks.measure import machine, save  # noqa: E402
 
 
@@ -21,6 +21,7 @@ def main() -> None:
         "detection": lambda: detection.run(15),
         "density": lambda: density.run(5, Path("build/density.png")),
         "ablation": lambda: ablation.run(30),
+        "fusing": lambda: fusing.run(15),
         "stages": lambda: stages.run(8),
         "neural gas": lambda: neural_gas.run(3),
     }

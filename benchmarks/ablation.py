@@ -95,7 +95,9 @@ def score(frames: Sequence[Labelled], finder: Finder) -> dict[str, float]:
     for frame, labels, things in frames:
         masks = [np.isin(labels, parts) for parts in things]
         lists = [index[labels[index] > 0] for index in finder(frame)]
-        common = np.array([[m[p].sum() for m in masks] for p in lists]).reshape(len(lists), -1)
+        common = np.array([[m[p].sum() for m in masks] for p in lists]).reshape(
+            len(lists), len(masks)
+        )
         sizes = np.array([p.size for p in lists]), np.array([m.sum() for m in masks])
         overlap = 2 * common / np.maximum(sizes[0][:, None] + sizes[1], 1) if lists else common
         rows, columns = linear_sum_assignment(-overlap)

@@ -216,7 +216,7 @@ class Detection(Record):
 
 
 class Perception(Record):
-    """All that is known of one frame without looking at any other."""
+    """All that is known of one frame before anything is followed over time."""
 
     topic: str
     index: int

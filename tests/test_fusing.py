@@ -137,12 +137,16 @@ def test_the_place_of_a_camera_that_moves_is_taken_into_account(
 def test_noise_falls_also_while_the_camera_moves() -> None:
     """Nothing wrong is easy where nothing is fused."""
     rng = np.random.default_rng(2)
-    truth = see(HOME)
-    others = [home(0.02 * k, 0.01, -0.01 * k, roll=0.01) for k in (1, 2)]
-    now = noisy(truth, rng)
+    recent = RecentFrames(3)
+    for k in range(3):
+        pose = home(0.02 * k, 0.01, -0.01 * k, roll=0.01 * k)
+        truth = see(pose)
+        now = noisy(truth, rng)
+        earlier = recent.before(frame(now, k * TICK), pose)
 
-    result = fused(now, *((noisy(see(o), rng), moved(HOME, o)) for o in others))
+    result = fused(now, *((other.depth, p) for other, p in earlier if other.depth is not None))
 
+    assert len(earlier) == 2
     assert error(result, truth).std() < 0.67 * error(now, truth).std()
 
 
