@@ -112,6 +112,7 @@ def test_noise_falls_by_the_root_of_the_number(pose: Pose | None, count: int) ->
 
     ratio = error(result, truth).std() / error(now, truth).std()
     assert ratio == pytest.approx(1 / np.sqrt(count), rel=0.1)
+    assert np.array_equal(result[now > RANGE_M], now[now > RANGE_M])
 
 
 shifts = st.floats(-0.03, 0.03)
@@ -203,6 +204,7 @@ def test_a_thing_that_was_taken_away_does_not_fill_the_hole_it_left() -> None:
     edge = np.argwhere(~gone)
     far = [np.abs(edge - pixel).sum(axis=1).min() > REACH for pixel in np.argwhere(ghost)]
     assert not any(far)
+    assert np.count_nonzero(ghost) < 0.1 * np.count_nonzero(gone)
     assert np.abs(error(np.where(ghost, result, 0), empty)).max(initial=0) < 0.05
 
 
@@ -308,6 +310,9 @@ def test_tables_do_not_depend_on_processes_or_interruptions(job: Job) -> None:
 
     assert read_run(other.folder)["counts"]["resumed"] >= 32
     assert_same_tables(job.folder, other.folder)
+    process(replace(job, folder=job.folder.with_name("single"), settings=Settings()))
+    with pytest.raises(AssertionError, match="frames"):  # or nothing was fused
+        assert_same_tables(job.folder, job.folder.with_name("single"))
 
 
 def test_what_could_not_be_fused_is_said(job: Job, tmp_path: Path) -> None:
