@@ -80,7 +80,7 @@ def _without(frame: Frame, share: float, width: int, rng: np.random.Generator) -
 
 def run(count: int) -> tuple[str, dict[str, Any]]:
     """Measure all on ``count`` scenes of each kind; return Markdown tables and the figures."""
-    noise, found, times = _noise(count // 4), _found(count), _times(count // 4)
+    noise, found, times = _noise(count // 3), _found(count), _times(count // 4)
     title = tuple(f"{k} frames" if k > 1 else "1 frame" for k in FUSED)
     tables = [
         markdown("Noise of tables, mm", ("sensor", *title), [(n, *v) for n, v in noise.items()]),
