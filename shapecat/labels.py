@@ -12,8 +12,8 @@ import pyarrow.compute
 from shapecat.arrays import F4
 from shapecat.corrections import TrackLabel
 from shapecat.geometry import box_corners, upright_box
-from shapecat.shown import ShownTracks, numbers
-from shapecat.tables import read_row_groups
+from shapecat.shown import ShownTracks
+from shapecat.tables import numbers, read_row_groups
 from shapecat.types import Box, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 
 __all__ = ["read_labelled_frames"]

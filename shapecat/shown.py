@@ -13,17 +13,14 @@ import pyarrow.parquet as pq
 from shapecat.arrays import F4, F8, I4
 from shapecat.corrections import TrackLabel
 from shapecat.geometry import box_corners, upright_box
-from shapecat.tables import read_row_groups
+from shapecat.tables import Key, frame_rows, numbers, read_row_groups
 from shapecat.types import Box, ShownBox, ShownBoxes, ShownFrame
 
-__all__ = ["ShownTracks", "numbers", "read_shown_frames"]
+__all__ = ["ShownTracks", "read_shown_frames"]
 
 _AT_ONCE = 8  # row groups of boxes in memory
 _NO_ROWS = slice(0, 0)
 _NONE = np.zeros((0, 0), np.float32)
-
-Key = tuple[str, int]
-"""A frame: its topic, and its number there."""
 
 
 class ShownDetection(NamedTuple):
@@ -66,7 +63,7 @@ class ShownTracks:
         known = pa.compute.is_in(table["track"], pa.array(sorted(labels), pa.int32()))
         table = table.filter(pa.compute.and_(pa.compute.is_valid(table["detection"]), known))
         table = table.sort_by([(name, "ascending") for name in ("topic", "frame", "detection")])
-        frames = _runs(table["topic"], table["frame"].to_numpy())
+        frames = frame_rows(table)
         tracks = table["track"].to_pylist()
         shown = np.array([labels[track].track for track in tracks], np.int64)
         return cls(
@@ -93,7 +90,7 @@ def read_shown_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterato
     """
     shown = ShownTracks.read(folder, labels)
     wanted = ("topic", "frame", "stamp_ns", "log_time_ns", "frame_id", "up")
-    found = ("topic", "frame", "detection", "center", "size", "orientation")
+    found = ("topic", "frame", "center", "size", "orientation")
     merged = len({label.track for label in labels.values()}) < len(labels)
     groups = zip(
         read_row_groups(folder / "frames.parquet", wanted, at_once=_AT_ONCE),
@@ -101,13 +98,14 @@ def read_shown_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterato
         strict=True,
     )
     for frames, detections in groups:
-        first, places = _places(detections)
+        rows_of, places = frame_rows(detections), _places(detections)
         ups = numbers(frames["up"]).reshape(-1, 3)
         rows = zip(*(frames[name].to_pylist() for name in wanted[:-1]), strict=True)
         for (topic, index, stamp_ns, log_time_ns, frame_id), up in zip(rows, ups, strict=True):
             key = (topic, index)
             of_frame = shown.frames.get(key, _NO_ROWS)
-            here = [first[key] + detection for detection in shown.detections[of_frame]]
+            first = rows_of.get(key, _NO_ROWS).start  # detections are numbered by their rows
+            here = [first + detection for detection in shown.detections[of_frame]]
             labelled = tuple(map(labels.__getitem__, shown.tracks[of_frame]))
             boxes = ShownBoxes(labelled, places[here])
             boxes = _joined(boxes, up) if merged else boxes
@@ -115,22 +113,11 @@ def read_shown_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterato
             yield ShownFrame(topic, index, stamp_ns, log_time_ns, frame_id, boxes, ended)
 
 
-def numbers(column: pa.ChunkedArray) -> F4:
-    """Return the numbers of a list column, row after row, without a detour over Python."""
-    return np.asarray(column.combine_chunks().flatten().to_numpy())
-
-
-def _places(table: pa.Table) -> tuple[dict[Key, int], F8]:
-    """Return the row of the first detection of each frame, and (n, 10) the boxes of all.
-
-    The detections of a frame are numbered in the order of their rows.
-    """
-    begins = np.flatnonzero(table["detection"].to_numpy() == 0)
-    topics, frames = (table[name].take(begins).to_pylist() for name in ("topic", "frame"))
-    first = dict(zip(zip(topics, frames, strict=True), begins.tolist(), strict=True))
+def _places(table: pa.Table) -> F8:
+    """Return (n, 10) the boxes of detections."""
     widths = {"center": 3, "size": 3, "orientation": 4}
     columns = [numbers(table[name]).reshape(-1, width) for name, width in widths.items()]
-    return first, np.hstack(columns).astype(np.float64)
+    return np.hstack(columns).astype(np.float64)
 
 
 def _joined(boxes: ShownBoxes, up: F4) -> ShownBoxes:
@@ -152,16 +139,6 @@ def _join(parts: Sequence[ShownBox], up: F4) -> ShownBox:
         size=tuple(box.size.tolist()),
         orientation=tuple(box.orientation.tolist()),
     )
-
-
-def _runs(topics: pa.ChunkedArray, frames: I4) -> dict[Key, slice]:
-    """Return which of the sorted rows belong to each frame."""
-    codes = topics.combine_chunks().dictionary_encode()
-    changes = (np.diff(codes.indices.to_numpy()) != 0) | (np.diff(frames) != 0)
-    starts = np.flatnonzero(np.concatenate([np.ones(min(1, len(frames)), np.bool_), changes]))
-    names = topics.take(starts).to_pylist()
-    slices = map(slice, starts.tolist(), [*starts[1:].tolist(), len(frames)])
-    return dict(zip(zip(names, frames[starts].tolist(), strict=True), slices, strict=False))
 
 
 def _ended(

@@ -30,9 +30,12 @@ __all__ = [
     "SCHEMA_VERSION",
     "TRACKS",
     "FrameRow",
+    "Key",
     "PerceptionTables",
     "count_rows",
     "discard_segments",
+    "frame_rows",
+    "numbers",
     "read_row_groups",
     "write_table",
 ]
@@ -121,6 +124,9 @@ TRACKS = pa.schema(
 )
 """One row per track per frame; ``detection`` is null while the track coasts, ``posterior`` is the
 causal one. Without a fixed frame ``center_fixed`` is in the sensor frame."""
+
+Key = tuple[str, int]
+"""A frame: its topic, and its number there."""
 
 _SEGMENT_FRAMES = 32
 _PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES}
@@ -254,6 +260,22 @@ def read_row_groups(
         count = file.num_row_groups
         for first in range(0, count, at_once):
             yield file.read_row_groups(range(first, min(first + at_once, count)), columns=columns)
+
+
+def frame_rows(table: pa.Table) -> dict[Key, slice]:
+    """Return the rows of each frame, which follow each other in every table."""
+    topics, frames = table["topic"], table["frame"].to_numpy()
+    codes = topics.combine_chunks().dictionary_encode().indices.to_numpy()
+    changes = (np.diff(codes) != 0) | (np.diff(frames) != 0)
+    starts = np.flatnonzero(np.concatenate([np.ones(min(1, len(frames)), np.bool_), changes]))
+    keys = zip(topics.take(starts).to_pylist(), frames[starts].tolist(), strict=True)
+    stops = [*starts[1:].tolist(), len(frames)]
+    return dict(zip(keys, map(slice, starts.tolist(), stops), strict=True))
+
+
+def numbers(column: pa.ChunkedArray) -> F4:
+    """Return the numbers of a list column, row after row, without a detour over Python."""
+    return np.asarray(column.combine_chunks().flatten().to_numpy())
 
 
 @contextmanager

@@ -11,14 +11,14 @@ import pyarrow as pa
 import pyarrow.compute
 from scipy.spatial.transform import Rotation
 
-from shapecat.arrays import F4, F8
 from shapecat.config import TrackingSettings
 from shapecat.run_folder import replacing
-from shapecat.tables import TRACKS, lists, read_row_groups, write_table
+from shapecat.tables import TRACKS, frame_rows, lists, numbers, read_row_groups, write_table
 from shapecat.tracking import FrameDetections, Track, track_recording
 
 __all__ = ["track_run"]
 
+_NO_TURN = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _COLUMNS = (
     "topic",
     "frame",
@@ -67,37 +67,43 @@ def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[Fra
         strict=True,
     )
     for frames, detections in groups:
-        by_frame: dict[tuple[str, int], list[dict[str, Any]]] = {}
-        for row in detections.to_pylist():
-            by_frame.setdefault((row["topic"], row["frame"]), []).append(row)
+        rows, columns = frame_rows(detections), _columns_of(detections, categories)
         for frame in frames.to_pylist():
-            rows = by_frame.get((frame["topic"], frame["frame"]), [])
-            column = "center_fixed" if frame["topic"] in fixed else "center"
-            rows = [row for row in rows if row[column] is not None]
+            of_frame = rows.get((frame["topic"], frame["frame"]), slice(0, 0))
+            here = {name: values[of_frame] for name, values in columns.items()}
+            if frame["topic"] in fixed:
+                placed = ~np.isnan(here["center_fixed"][:, 0])
+                here = {name: values[placed] for name, values in here.items()}
+            turn = frame["fixed_rotation"] if frame["topic"] in fixed else None
             yield FrameDetections(
                 topic=frame["topic"],
                 frame=frame["frame"],
                 stamp_ns=frame["stamp_ns"],
-                detections=np.array([row["detection"] for row in rows], np.int32),
-                centers=_stack([row[column] for row in rows], 3),
-                sizes=_stack([row["size"] for row in rows], 3),
-                posteriors=_stack([row["posterior"] for row in rows], categories),
-                partial=np.array(
-                    [row["touches_border"] or row["occluded"] for row in rows], np.bool_
-                ),
-                novelties=np.array([row["novelty"] for row in rows], np.float32),
-                axes=_axes(rows, frame["fixed_rotation"] if frame["topic"] in fixed else None),
+                detections=here["detection"],
+                centers=here["center_fixed" if frame["topic"] in fixed else "center"],
+                sizes=here["size"],
+                posteriors=here["posterior"],
+                partial=here["partial"],
+                novelties=here["novelty"],
+                axes=np.reshape(turn or _NO_TURN, (3, 3)) @ here["axes"],
             )
 
 
-def _axes(rows: list[dict[str, Any]], fixed_from_sensor: list[float] | None) -> F8:
-    """Return (n, 3, 3) the axes of boxes, in the frame that their centres are in."""
-    if not rows:
-        return np.zeros((0, 3, 3))
-    in_sensor = np.asarray(Rotation.from_quat([row["orientation"] for row in rows]).as_matrix())
-    if fixed_from_sensor is None:
-        return in_sensor
-    return np.asarray(np.reshape(fixed_from_sensor, (3, 3)) @ in_sensor)
+def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
+    """Return what the tracker reads of detections, as arrays; NaN where there is no fixed frame."""
+    columns = {name: table[name].to_numpy() for name in ("detection", "novelty")}
+    widths = {"center": 3, "size": 3, "orientation": 4, "posterior": categories}
+    for name, width in widths.items():
+        columns[name] = numbers(table[name]).reshape(-1, width)
+    turns = columns.pop("orientation")
+    columns["axes"] = Rotation.from_quat(turns).as_matrix() if len(turns) else np.zeros((0, 3, 3))
+    known = pa.compute.is_valid(table["center_fixed"]).to_numpy()
+    columns["center_fixed"] = np.full((table.num_rows, 3), np.nan)
+    columns["center_fixed"][known] = numbers(table["center_fixed"]).reshape(-1, 3)
+    columns["partial"] = np.logical_or(
+        *(table[n].to_numpy() for n in ("touches_border", "occluded"))
+    )
+    return columns
 
 
 def _streams_with_poses(folder: Path) -> set[str]:
@@ -111,10 +117,6 @@ def _streams_with_poses(folder: Path) -> set[str]:
         for topic, has_pose in zip(group["topic"].to_pylist(), known, strict=True):
             balance[topic] += 1 if has_pose else -1
     return {topic for topic, count in balance.items() if count > 0}
-
-
-def _stack(rows: list[Any], width: int) -> F4:
-    return np.array(rows, np.float32).reshape(-1, width)
 
 
 def _label(track: Track, categories: Sequence[str]) -> str:
