@@ -77,7 +77,7 @@ def _is_inside(pieces: Pieces, p: int, q: int) -> bool:
     return bool(slope_of(both) < INSIDE)
 
 
-@kernel
+@kernel(leaf=True)
 def _is_floor(pieces: Pieces, p: int, q: int) -> bool:
     """Whether ``q`` lies within the hollow piece ``p`` and lower."""
     if pieces.shape[q, TOP] > pieces.shape[p, TOP]:
@@ -102,7 +102,7 @@ def join_rims(pieces: Pieces) -> None:
                     again = True
 
 
-@kernel
+@kernel(leaf=True)
 def _is_container(pieces: Pieces, inside: int, outside: int) -> bool:
     if not (is_group(pieces, inside) and is_group(pieces, outside)):
         return False
@@ -143,7 +143,7 @@ def join_overhangs(pieces: Pieces) -> None:
                 break
 
 
-@kernel
+@kernel(leaf=True)
 def _is_under(pieces: Pieces, under: int, above: int) -> bool:
     if not (is_group(pieces, under) and is_group(pieces, above)):
         return False
@@ -160,7 +160,7 @@ def _is_under(pieces: Pieces, under: int, above: int) -> bool:
     return bool(u[TOP] <= a[TOP] and u[FAR] / u[COUNT] < a[FAR] / a[COUNT])
 
 
-@kernel
+@kernel(leaf=True)
 def _is_strip(pieces: Pieces, strip: int, whole: int) -> bool:
     """Whether a long low piece without a lid stands before the floor of a flat container."""
     if not (is_group(pieces, strip) and is_group(pieces, whole)):
@@ -180,7 +180,7 @@ def _is_strip(pieces: Pieces, strip: int, whole: int) -> bool:
     return not has_lid(pieces, strip)
 
 
-@kernel
+@kernel(leaf=True)
 def _is_dish_rim(pieces: Pieces, rim: int, whole: int) -> bool:
     """Whether a piece is a stretch of the rim of a dish, which meets the floor in a concave edge.
 

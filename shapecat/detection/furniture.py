@@ -103,7 +103,7 @@ def _tower(
         share[p] = high / max(n, 1)
 
 
-@kernel
+@kernel(leaf=True)
 def _rise(w: F4, lens: Lens, i: int, j: int, up: F8, most: float) -> float:
     """Return how far the surface of a cell goes straight on upwards, up to about ``most``."""
     z = 1 / w[i, j]
@@ -147,7 +147,7 @@ def _through(w: F4, lens: Lens, owner: I4, labels: I4, group: I4, up: F8, throug
                 through[group[labels[y, x]]] += 1
 
 
-@kernel
+@kernel(leaf=True)
 def _followed(w: F4, lens: Lens, i: int, j: int, up: F8, rise: float) -> int:
     """Return the flat cell ``rise`` metres above a cell if the surface is seen there, else -1."""
     z = 1 / w[i, j]

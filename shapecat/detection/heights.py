@@ -108,7 +108,7 @@ def _stand(
             heights[j] = line[j] if line[j] > below else heights[j]
 
 
-@kernel
+@kernel(leaf=True)
 def inside(plane: F8, x: float, y: float, z: float, slack: float) -> bool:
     """Whether a point is within the outline of a row of `table_of`, or ``slack`` beyond it."""
     p = plane[4] * x + plane[5] * y + plane[6] * z

@@ -94,7 +94,7 @@ def _join_necks(pieces: Pieces) -> None:
                 break
 
 
-@kernel
+@kernel(leaf=True)
 def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
     a, b = pieces.shape[p], pieces.shape[q]
     met = pieces.pairs[CONTACT, p, q] + pieces.pairs[NEAR, p, q] + pieces.pairs[FRONT, p, q]

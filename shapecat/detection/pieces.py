@@ -196,7 +196,7 @@ def _find_changes(links: U1, here: I4, below: I4, change: U1) -> None:
         change[j] |= here[j] != here[j + 1]
 
 
-@kernel
+@kernel(leaf=True)
 def _onto(
     i: int,
     j: int,
@@ -318,13 +318,13 @@ def merge(pieces: Pieces, p: int, q: int) -> None:
             pieces.group[k] = p
 
 
-@kernel
+@kernel(leaf=True)
 def is_group(pieces: Pieces, p: int) -> bool:
     """Whether a piece has not been merged into another."""
     return bool(pieces.group[p] == p)
 
 
-@kernel
+@kernel(leaf=True)
 def slope_of(row: F4) -> float:
     """Return by how much the lateral normal changes across a piece.
 
@@ -335,13 +335,13 @@ def slope_of(row: F4) -> float:
     return float(slope * (row[RIGHTMOST] - row[LEFT]))
 
 
-@kernel
+@kernel(leaf=True)
 def has_lid(pieces: Pieces, p: int) -> bool:
     """Whether the top of a piece is closed by a surface that faces up."""
     return bool(lid_share(pieces, p, LID_M) > LID)
 
 
-@kernel
+@kernel(leaf=True)
 def lid_share(pieces: Pieces, p: int, depth: float) -> float:
     """Return what faces up within ``depth`` of the top of a piece, by its width squared."""
     row = pieces.shape[p]

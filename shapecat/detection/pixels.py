@@ -191,7 +191,7 @@ def _fits(w: float, z: float) -> bool:
     return bool(abs(w * z - np.float32(1)) < np.float32(JUMP) * z)
 
 
-@kernel
+@kernel(leaf=True)
 def _best_beside(w: F4, i: int, j: int, z: float) -> int:
     """Return the flat neighbour of a cell whose depth fits best, -1 if none is within two jumps."""
     best, nearest = -1, np.float32(2 * JUMP) * z
@@ -203,7 +203,7 @@ def _best_beside(w: F4, i: int, j: int, z: float) -> int:
     return best
 
 
-@kernel
+@kernel(leaf=True)
 def _rises(planes: F8, k: int, u: float, v: float, z: float) -> bool:
     """Whether a depth at column u, row v is above plane k, if only as a foot is."""
     h = (1 - (planes[k, 0] * u + planes[k, 1] * v + planes[k, 2]) * z) * planes[k, 3]

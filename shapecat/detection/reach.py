@@ -80,7 +80,7 @@ def _reach(
                     heights.height[v, u] = outside[v, u]
 
 
-@kernel
+@kernel(leaf=True)
 def _leads_out(w: F4, owner: I4, me: int, i: int, j: int, y: int, x: int) -> bool:
     """Whether (y, x) is of a lower plane or of none, without a jump from its neighbour (i, j)."""
     if y < 0 or x < 0 or y >= w.shape[0] or x >= w.shape[1]:
@@ -88,7 +88,7 @@ def _leads_out(w: F4, owner: I4, me: int, i: int, j: int, y: int, x: int) -> boo
     return bool(0 <= owner[y, x] < me and abs(w[y, x] - w[i, j]) < JUMP)
 
 
-@kernel
+@kernel(leaf=True)
 def _is_above(
     w: F4, lens: Lens, plane: F8, walls: U1, highest: float, outside: F4, i: int, j: int
 ) -> bool:

@@ -58,7 +58,7 @@ def _creases(edge: U1, barrier: U1) -> None:
                     top += 1
 
 
-@kernel
+@kernel(leaf=True)
 def _is_ridge(edge: U1, i: int, j: int) -> bool:
     """Whether an edge falls off on two opposite sides; inside a bowl it does not."""
     rows, columns = edge.shape
@@ -122,14 +122,14 @@ def _flat_parts(owner: I4, links: U1, barrier: U1, labels: I4, n: int) -> int:
     return n
 
 
-@kernel
+@kernel(leaf=True)
 def _root(parent: I4, k: int) -> int:
     while parent[k] != k:
         k = parent[k]
     return k
 
 
-@kernel
+@kernel(leaf=True)
 def _neighbour(p: int, d: int, columns: int, links: U1) -> int:
     """Return the linked neighbour of cell ``p`` in direction ``d``, or -1.
 

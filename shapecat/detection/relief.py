@@ -300,7 +300,7 @@ def _lower(w: F4, excess: F4, owner: I4, number: int, raised: U1) -> None:
                 owners[stack[t]] = -number
 
 
-@kernel
+@kernel(leaf=True)
 def _is_flat(excess: F4, i: int, j: int) -> bool:
     """Whether a low cell is no part of the side of something."""
     rows, columns = excess.shape

@@ -129,7 +129,7 @@ def _clear(w: F4, lens: Lens, owner: I4, plane: F8, normal: F8, walls: U1) -> No
             owner[i, j] = 0 if found[i, j] == CLEARED else owner[i, j]
 
 
-@kernel
+@kernel(leaf=True)
 def _is_on(w: F4, owner: I4, plane: F8, i: int, j: int) -> bool:
     """Whether a cell that is no part of a level plane lies on a wall."""
     return bool(
