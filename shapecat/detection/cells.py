@@ -96,28 +96,35 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, w: F4) -> None
         _average_two(depth, range_m, jump, w)
         return
     rows, columns = w.shape
-    zero, one = np.float32(0), np.float32(1)
+    zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
     far, least = np.float32(1e9), np.float32(NEAREST_M)
+    # The pixels of a row of cells, sorted by their place in the cell: loops over these vectorise.
+    parts = np.zeros((factor * factor, columns), np.float32)
+    nearest, limit, total, count = np.zeros((4, columns), np.float32)
     for i in range(rows):
+        nearest[:] = far
+        for k in range(factor * factor):
+            x, part = k % factor, parts[k]
+            part[:] = depth[i * factor + k // factor, x : x + factor * columns : factor]
+            for j in range(columns):
+                z = part[j]
+                part[j] = z if (z >= least) & (z <= range_m) else far
+                nearest[j] = part[j] if part[j] < nearest[j] else nearest[j]
         for j in range(columns):
-            nearest = far
-            for y in range(i * factor, (i + 1) * factor):
-                for x in range(j * factor, (j + 1) * factor):
-                    z = depth[y, x]
-                    z = z if (z >= least) & (z <= range_m) else far
-                    nearest = z if z < nearest else nearest
-            if nearest == far:
-                continue
             # The depth that is one jump behind the nearest, in inverse depth.
-            limit = nearest / (one - min(jump * nearest, np.float32(0.5)))
-            total = count = zero
-            for y in range(i * factor, (i + 1) * factor):
-                for x in range(j * factor, (j + 1) * factor):
-                    z = depth[y, x]
-                    use = (z >= least) & (z <= range_m) & (z <= limit)
-                    total += z if use else zero
-                    count += one if use else zero
-            w[i, j] = count / total
+            slope = jump * nearest[j]
+            behind = nearest[j] / (one - (slope if slope < half else half))
+            limit[j] = behind if nearest[j] < far else zero
+        total[:], count[:] = zero, zero
+        for k in range(factor * factor):
+            part = parts[k]
+            for j in range(columns):
+                use = part[j] <= limit[j]
+                total[j] += part[j] if use else zero
+                count[j] += one if use else zero
+        out = w[i]
+        for j in range(columns):
+            out[j] = count[j] / total[j] if count[j] > zero else zero
 
 
 @kernel

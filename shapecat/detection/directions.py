@@ -74,9 +74,9 @@ def _directions(facets: F4, hint: F8 | None, least: float, rng: np.random.Genera
 def _facing(facets: F4, direction: F8, least_cos: float) -> Bool:
     """Return which facets face a direction."""
     result = np.zeros(len(facets), np.bool_)
+    x, y, z = direction
     for k in range(len(facets)):
-        f = facets[k]
-        cos = f[0] * direction[0] + f[1] * direction[1] + f[2] * direction[2]
+        cos = facets[k, 0] * x + facets[k, 1] * y + facets[k, 2] * z
         result[k] = cos > least_cos
     return result
 
@@ -131,11 +131,11 @@ def _merit(facets: F4, direction: F8, least: float, *, upright: bool) -> float:
 def _count_levels(facets: F4, direction: F8, count: I4) -> int:
     """Count the facets that face a direction, in all and by their height below the sensor."""
     facing = 0
+    x, y, z = direction
     for k in range(len(facets)):
-        f = facets[k]
-        if f[0] * direction[0] + f[1] * direction[1] + f[2] * direction[2] > FACING_COS:
+        if facets[k, 0] * x + facets[k, 1] * y + facets[k, 2] * z > FACING_COS:
             facing += 1
-            height = f[3] * direction[0] + f[4] * direction[1] + f[5] * direction[2]
+            height = facets[k, 3] * x + facets[k, 4] * y + facets[k, 5] * z
             level = math.floor(-height / LEVEL_BIN_M)
             if 0 <= level < count.size:
                 count[level] += 1

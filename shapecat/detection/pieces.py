@@ -240,6 +240,7 @@ def _measure(
     shape[:, TOP] = -1e9
     shape[:, BOTTOM] = 1e9
     per_x, per_y = 1 / lens.fx, 1 / lens.fy
+    tangent, normal = surfaces.tangent, surfaces.normal
     for i in range(rows):
         for j in range(columns):
             p = labels[i, j]
@@ -248,27 +249,26 @@ def _measure(
             z = 1 / w[i, j]
             x, y = (j - lens.cx) * per_x * z, (i - lens.cy) * per_y * z
             along = x * side[0] + y * side[1] + z * side[2]
-            row = shape[p]
             pieces.owner[p] = owner[i, j]
-            row[COUNT] += 1
-            row[FAR] += z
-            row[LEFT] = min(row[LEFT], along)
-            row[RIGHTMOST] = max(row[RIGHTMOST], along)
+            shape[p, COUNT] += 1
+            shape[p, FAR] += z
+            shape[p, LEFT] = min(shape[p, LEFT], along)
+            shape[p, RIGHTMOST] = max(shape[p, RIGHTMOST], along)
             h = height[i, j]
-            row[TOP] = max(row[TOP], h)
-            row[BOTTOM] = min(row[BOTTOM], h)
-            if not surfaces.tangent[i, j, 0] > 0:
+            shape[p, TOP] = max(shape[p, TOP], h)
+            shape[p, BOTTOM] = min(shape[p, BOTTOM], h)
+            if not tangent[i, j, 0] > 0:
                 continue
-            m = surfaces.normal[i, j]
-            turn = m[0] * side[0] + m[1] * side[1] + m[2] * side[2]
-            row[SIDE] += along
-            row[SIDE2] += along * along
-            row[TURN] += turn
-            row[SIDETURN] += along * turn
-            facing = -(m[0] * x + m[1] * y + m[2] * z) / math.sqrt(x * x + y * y + z * z)
+            nx, ny, nz = normal[i, j, 0], normal[i, j, 1], normal[i, j, 2]
+            turn = nx * side[0] + ny * side[1] + nz * side[2]
+            shape[p, SIDE] += along
+            shape[p, SIDE2] += along * along
+            shape[p, TURN] += turn
+            shape[p, SIDETURN] += along * turn
+            facing = -(nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
             area = z * z * per_x * per_y / max(facing, 0.2)
-            row[AREA] += area
-            if m[0] * up[0] + m[1] * up[1] + m[2] * up[2] > UPWARD:
+            shape[p, AREA] += area
+            if nx * up[0] + ny * up[1] + nz * up[2] > UPWARD:
                 band = min(max(int(h / BAND_M), 0), BANDS - 1)
                 pieces.lid[p, band] += area
     seen = np.zeros(shape.shape[0], np.int32)
