@@ -1,5 +1,6 @@
 """Candidates: labelled cells become records, with boxes, supports and flags."""
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -115,47 +116,43 @@ def extents_of(cells: Cells, found: Segmentation) -> Extents:
     """
     count = found.leaders.size - 1
     level = gravity_rotation(found.up)
-    extent = np.zeros((count + 1, 7))
-    corners = np.zeros((count + 1, 4), np.int64)
-    _extents(cells.w, cells.lens, found.labels, level, extent, corners)
-    extent = extent[1:]
-    low, high, yaw = extent[:, 0:3], extent[:, 3:6], extent[:, 6]
-    middle = (low + high) / 2
-    c, s = np.cos(yaw), np.sin(yaw)
-    flat = np.stack([c * middle[:, 0] - s * middle[:, 1], s * middle[:, 0] + c * middle[:, 1]], 1)
-    center = np.concatenate([flat, middle[:, 2:]], axis=1) @ level
-    # The box axes are the level axes turned by yaw: q = q_level * q_yaw.
-    x, y, z, w = quaternion_from_rotation(level.T)
-    hc, hs = np.cos(yaw / 2), np.sin(yaw / 2)
-    turned = np.stack([x * hc + y * hs, y * hc - x * hs, z * hc + w * hs, w * hc - z * hs], 1)
-    turned *= np.where(turned[:, 3:] < 0, -1.0, 1.0)
-    return Extents(center, high - low, turned, corners[1:, :2], corners[1:, 2:])
+    extents = Extents(
+        np.zeros((count, 3)),
+        np.zeros((count, 3)),
+        np.zeros((count, 4)),
+        np.zeros((count, 2), np.int64),
+        np.zeros((count, 2), np.int64),
+    )
+    turned = quaternion_from_rotation(level.T)
+    _extents(cells.w, cells.lens, found.labels, level, turned, extents)
+    return extents
 
 
 @kernel(fast=True)
-def _extents(w: F4, lens: Lens, labels: I4, level: F8, extent: F8, corners: I4) -> None:
+def _extents(w: F4, lens: Lens, labels: I4, level: F8, turned: F8, extents: Extents) -> None:
     rows, columns = labels.shape
-    count = extent.shape[0]
+    count = extents.center.shape[0]
+    low, high = extents.low, extents.high
     # Outermost cells, and every 4th inside (a ball's nearest point is inside its outline).
-    number = np.zeros(count + 1, np.int64)
+    number = np.zeros(count + 2, np.int64)
     chosen = np.zeros(labels.shape, np.uint8)
     for i in range(rows):
         for j in range(columns):
             p = labels[i, j]
             if p == 0:
                 continue
-            if number[p + 1] == 0:
-                corners[p] = i, j, i, j
-            corners[p, 1] = min(corners[p, 1], j)
-            corners[p, 2] = i
-            corners[p, 3] = max(corners[p, 3], j)
             inside = (i > 0) & (j > 0) & (i + 1 < rows) & (j + 1 < columns)
             if inside:
                 inside = (labels[i - 1, j] == p) & (labels[i + 1, j] == p)
                 inside &= (labels[i, j - 1] == p) & (labels[i, j + 1] == p)
-            if not inside or (i % 4 == 0 and j % 4 == 0):
-                chosen[i, j] = 1
-                number[p + 1] += 1
+            if inside and (i % 4 != 0 or j % 4 != 0):
+                continue
+            chosen[i, j] = 1
+            if number[p + 1] == 0:
+                low[p - 1, 0], low[p - 1, 1] = i, j
+            number[p + 1] += 1
+            low[p - 1, 1] = min(low[p - 1, 1], j)
+            high[p - 1, 0], high[p - 1, 1] = i, max(high[p - 1, 1], j)
     place = np.cumsum(number)
     start = place.copy()
     local = np.zeros((3, place[-1]), np.float32)
@@ -168,25 +165,46 @@ def _extents(w: F4, lens: Lens, labels: I4, level: F8, extent: F8, corners: I4) 
                 x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
                 for d in range(3):
                     local[d, k] = level[d, 0] * x + level[d, 1] * y + level[d, 2] * z
-    for p in range(1, count):
-        a, b = start[p], start[p + 1]
-        if a == b:
-            continue
-        xs, ys = local[0, a:b], local[1, a:b]
-        best = np.inf
-        for t in range(YAWS):
-            yaw = t * (np.pi / 2 / YAWS)
-            c, s = np.float32(np.cos(yaw)), np.float32(np.sin(yaw))
-            x0 = x1 = c * xs[0] + s * ys[0]
-            y0 = y1 = c * ys[0] - s * xs[0]
-            for k in range(xs.size):
-                u, v = c * xs[k] + s * ys[k], c * ys[k] - s * xs[k]
-                x0 = u if u < x0 else x0
-                x1 = u if u > x1 else x1
-                y0 = v if v < y0 else y0
-                y1 = v if v > y1 else y1
-            if (x1 - x0) * (y1 - y0) < best:
-                best = (x1 - x0) * (y1 - y0)
-                extent[p, 0], extent[p, 1], extent[p, 3], extent[p, 4] = x0, y0, x1, y1
-                extent[p, 6] = yaw
-        extent[p, 2], extent[p, 5] = np.min(local[2, a:b]), np.max(local[2, a:b])
+    for k in range(count):
+        if start[k + 1] < start[k + 2]:
+            _measure_box(local, start[k + 1], start[k + 2], level, turned, extents, k)
+
+
+@kernel(fast=True)
+def _measure_box(
+    local: F4, first: int, end: int, level: F8, turned: F8, extents: Extents, k: int
+) -> None:
+    """Write the box of least area around some of the points (3, n), level frame."""
+    xs, ys, zs = local[0, first:end], local[1, first:end], local[2, first:end]
+    least = np.inf
+    left = right = back = front = yaw = 0.0
+    for t in range(YAWS):
+        turn = t * (np.pi / 2 / YAWS)
+        c, s = np.float32(np.cos(turn)), np.float32(np.sin(turn))
+        x0 = x1 = c * xs[0] + s * ys[0]
+        y0 = y1 = c * ys[0] - s * xs[0]
+        for n in range(xs.size):
+            u, v = c * xs[n] + s * ys[n], c * ys[n] - s * xs[n]
+            x0 = u if u < x0 else x0
+            x1 = u if u > x1 else x1
+            y0 = v if v < y0 else y0
+            y1 = v if v > y1 else y1
+        if (x1 - x0) * (y1 - y0) < least:
+            least = (x1 - x0) * (y1 - y0)
+            left, right, back, front, yaw = float(x0), float(x1), float(y0), float(y1), turn
+    bottom, top = np.float64(np.min(zs)), np.float64(np.max(zs))
+    extents.size[k] = right - left, front - back, top - bottom
+    u, v, h = (left + right) / 2, (back + front) / 2, (bottom + top) / 2
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    x, y = cos * u - sin * v, sin * u + cos * v
+    for d in range(3):
+        extents.center[k, d] = x * level[0, d] + y * level[1, d] + h * level[2, d]
+    # The axes of the box are the level axes turned by yaw: q = q_level * q_yaw.
+    x, y, z, w = turned
+    cos, sin = math.cos(yaw / 2), math.sin(yaw / 2)
+    if w * cos < z * sin:
+        cos, sin = -cos, -sin
+    extents.orientation[k, 0] = x * cos + y * sin
+    extents.orientation[k, 1] = y * cos - x * sin
+    extents.orientation[k, 2] = z * cos + w * sin
+    extents.orientation[k, 3] = w * cos - z * sin

@@ -17,6 +17,7 @@ DIRECTIONS = 16
 """Sides of the convex outline of a plane."""
 ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 COS, SIN = np.cos(ANGLES), np.sin(ANGLES)
+NEXT = np.roll(np.arange(DIRECTIONS), -1)
 MARGIN_M = 0.01
 """An outline reaches this far beyond the readings."""
 BIN_M = 0.01
@@ -245,9 +246,8 @@ def _spread(
 def corners_of(support: Support) -> F8:
     """Return the corners (k, 3) of the convex outline, sensor frame, in order, without repeats."""
     # Neighbouring sides x cos + y sin = reach meet at a corner.
-    step = 2 * np.pi / DIRECTIONS
-    here, there = support.reach, np.roll(support.reach, -1)
-    along = (there - here * np.cos(step)) / np.sin(step)
-    flat = np.stack([here * COS - along * SIN, here * SIN + along * COS], 1)
+    here, there = support.reach, support.reach[NEXT]
+    along = (there - here * COS[1]) / SIN[1]
+    flat = np.array([here * COS - along * SIN, here * SIN + along * COS]).T
     level = gravity_rotation(support.up)
     return np.asarray(flat @ level[:2] + support.offset * level[2])
