@@ -7,12 +7,25 @@ from shapecat.detection.cells import JUMP
 from shapecat.detection.heights import LEAST_M, NOISE
 from shapecat.jit import kernel
 
-__all__ = ["FRINGE", "fill_enclosed", "flood_hole", "grow_feet", "is_raised"]
+__all__ = [
+    "FRINGE",
+    "STACK",
+    "extent_of",
+    "fill_enclosed",
+    "flood_hole",
+    "grow_feet",
+    "is_raised",
+    "may_be_hole",
+]
 
 FRINGE = 0.6
 """Share of the least height from which a reading next to an object belongs to it."""
 FEET_CELLS = 4
 MOST_CELLS = 4000
+STACK = MOST_CELLS + 4
+"""Room for a hole that is found to be too large."""
+OPEN = 2
+"""Mark of cells seen that are no part of a hole."""
 SHARE = 0.6
 RAISED_M, RAISED_NOISE = 0.0012, 0.0008
 RAISED_SHARE, LABELLED = 0.35, 0.5
@@ -27,11 +40,8 @@ def fill_enclosed(w: F4, height: F4, labels: I4, count: int, *, active: bool) ->
     front of them.
     """
     filled = np.zeros(labels.shape, np.uint8)
-    rows, columns = np.flatnonzero(labels.any(axis=1)), np.flatnonzero(labels.any(axis=0))
-    if active and rows.size:
-        i0, i1, j0, j1 = rows[0], rows[-1] + 1, columns[0], columns[-1] + 1
-        box = slice(i0, i1), slice(j0, j1)
-        _fill(w[box], height[box], labels[box], count, filled[box])
+    if active:
+        _fill(w, height, labels, count, filled)
     return filled
 
 
@@ -75,33 +85,61 @@ def grow_feet(w: F4, owner: I4, height: F4, labels: I4) -> None:
                     top += 1
 
 
-@kernel
+@kernel(leaf=True)
+def extent_of(labels: I4) -> tuple[int, int, int, int]:
+    """Return the first row and column with a label, and those after the last."""
+    i0, j0 = labels.shape
+    i1 = j1 = 0
+    for i in range(labels.shape[0]):
+        some = 0
+        for j in range(labels.shape[1]):
+            some |= labels[i, j]
+        if some == 0:
+            continue
+        i0, i1 = min(i0, i), i + 1
+        j = 0
+        while j < j0 and labels[i, j] == 0:
+            j += 1
+        j0, j = j, labels.shape[1]
+        while j > j1 and labels[i, j - 1] == 0:
+            j -= 1
+        j1 = j
+    return i0, j0, i1, j1
+
+
+@kernel(leaf=True)
 def flood_hole(
-    w: F4, labels: I4, seen: U1, stack: I4, sides: I4, ahead: I4, level: I4
+    w: F4,
+    labels: I4,
+    extent: tuple[int, int, int, int],
+    seen: U1,
+    stack: I4,
+    sides: I4,
+    ahead: I4,
+    level: I4,
 ) -> tuple[int, int]:
-    """Collect the unlabelled cells connected to the first of ``stack``.
+    """Collect the unlabelled cells connected to the first of ``stack``, which `may_be_hole`.
 
     Counts, for each label, the sides of cells where it bounds the hole, where it is in front of
-    it, and where the surface goes on. Returns how many cells the hole has, 0 if it reaches the
-    border, and how many sides, those to cells without a reading included.
+    it, and where the surface goes on. Returns how many cells the hole has, 0 if it is large or
+    reaches the border of the extent, and how many sides, those to cells without a reading included.
     """
-    rows, columns = labels.shape
     sides[:] = 0
     ahead[:] = 0
     level[:] = 0
-    outside = False
     total = 0
     done, top = 0, 1
     seen[stack[0, 0], stack[0, 1]] = 1
     while done < top:
         i, j = stack[done, 0], stack[done, 1]
         done += 1
+        if top >= MOST_CELLS or _is_open(seen, extent, i, j):
+            for t in range(top):
+                seen[stack[t, 0], stack[t, 1]] = OPEN
+            return 0, 0
         for d in range(4):
             y = i + (1 if d == 0 else -1 if d == 1 else 0)
             x = j + (1 if d == 2 else -1 if d == 3 else 0)
-            if y < 0 or x < 0 or y >= rows or x >= columns:
-                outside = True
-                continue
             label = labels[y, x]
             if label > 0:
                 total += 1
@@ -114,7 +152,29 @@ def flood_hole(
                 seen[y, x] = 1
                 stack[top, 0], stack[top, 1] = y, x
                 top += 1
-    return (0 if outside or top >= MOST_CELLS else top), total
+    return top, total
+
+
+@kernel(inline=True, leaf=True)
+def may_be_hole(
+    w: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1, i: int, j: int
+) -> bool:
+    """Whether an unlabelled cell is new and not known to be open."""
+    if labels[i, j] != 0 or seen[i, j] or w[i, j] <= 0:
+        return False
+    if _is_open(seen, extent, i, j):
+        seen[i, j] = OPEN
+    return bool(seen[i, j] == 0)
+
+
+@kernel(inline=True, leaf=True)
+def _is_open(seen: U1, extent: tuple[int, int, int, int], i: int, j: int) -> bool:
+    """Whether a cell is on the border of the extent or next to what is known to be open."""
+    i0, j0, i1, j1 = extent
+    if i == i0 or j == j0 or i == i1 - 1 or j == j1 - 1:
+        return True
+    above, below = seen[i - 1, j] == OPEN, seen[i + 1, j] == OPEN
+    return bool(above | below | (seen[i, j - 1] == OPEN) | (seen[i, j + 1] == OPEN))
 
 
 @kernel
@@ -131,16 +191,15 @@ def is_raised(w: F4, height: F4, stack: I4, cells: int) -> bool:
 @kernel
 def _fill(w: F4, height: F4, labels: I4, count: int, filled: U1) -> None:
     seen = np.zeros(labels.shape, np.uint8)
-    stack = np.zeros((labels.size, 2), np.int16)
-    sides = np.zeros(count + 1, np.int32)
-    ahead = np.zeros(count + 1, np.int32)
-    level = np.zeros(count + 1, np.int32)
-    for si in range(labels.shape[0]):
-        for sj in range(labels.shape[1]):
-            if labels[si, sj] != 0 or seen[si, sj] or w[si, sj] <= 0:
+    stack = np.zeros((STACK, 2), np.int16)
+    sides, ahead, level = np.zeros((3, count + 1), np.int32)
+    extent = extent_of(labels)
+    for si in range(extent[0], extent[2]):
+        for sj in range(extent[1], extent[3]):
+            if not may_be_hole(w, labels, extent, seen, si, sj):
                 continue
             stack[0, 0], stack[0, 1] = si, sj
-            cells, total = flood_hole(w, labels, seen, stack, sides, ahead, level)
+            cells, total = flood_hole(w, labels, extent, seen, stack, sides, ahead, level)
             if cells == 0:
                 continue
             best = np.argmax(sides)

@@ -3,7 +3,7 @@
 import numpy as np
 
 from shapecat.arrays import F4, I4
-from shapecat.detection.fill import flood_hole, is_raised
+from shapecat.detection.fill import STACK, extent_of, flood_hole, is_raised, may_be_hole
 from shapecat.detection.pieces import COUNT, TOP, Pieces, merge
 from shapecat.jit import kernel
 
@@ -15,27 +15,20 @@ RING_SHARE = 0.5
 PART_SHARE = 0.08
 
 
+@kernel
 def join_rings(pieces: Pieces, w: F4, height: F4, labels: I4) -> None:
     """Join the low pieces around each hole that lies a little above the plane."""
-    rows, columns = np.flatnonzero(labels.any(axis=1)), np.flatnonzero(labels.any(axis=0))
-    if rows.size:
-        box = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        _join(pieces, w[box], height[box], labels[box])
-
-
-@kernel
-def _join(pieces: Pieces, w: F4, height: F4, labels: I4) -> None:
     n = pieces.group.size
     seen = np.zeros(labels.shape, np.uint8)
-    stack = np.zeros((labels.size, 2), np.int16)
-    sides, ahead, level = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
-    shares = np.zeros(n, np.int32)
-    for si in range(labels.shape[0]):
-        for sj in range(labels.shape[1]):
-            if labels[si, sj] != 0 or seen[si, sj] or w[si, sj] <= 0:
+    stack = np.zeros((STACK, 2), np.int16)
+    sides, ahead, level, shares = np.zeros((4, n), np.int32)
+    extent = extent_of(labels)
+    for si in range(extent[0], extent[2]):
+        for sj in range(extent[1], extent[3]):
+            if not may_be_hole(w, labels, extent, seen, si, sj):
                 continue
             stack[0, 0], stack[0, 1] = si, sj
-            cells, total = flood_hole(w, labels, seen, stack, sides, ahead, level)
+            cells, total = flood_hole(w, labels, extent, seen, stack, sides, ahead, level)
             if cells < 12 or not is_raised(w, height, stack, cells):
                 continue
             shares[:] = 0
