@@ -271,18 +271,18 @@ def _measure(
             if nx * up[0] + ny * up[1] + nz * up[2] > UPWARD:
                 band = min(max(int(h / BAND_M), 0), BANDS - 1)
                 pieces.lid[p, band] += area
-    seen = np.zeros(shape.shape[0], np.int32)
-    taken = np.zeros(shape.shape[0], np.int32)
+    stride = np.maximum(shape[:, COUNT].astype(np.int32) // SAMPLES, 1)
+    wait, taken = stride.copy(), np.zeros_like(stride)
     for i in range(rows):
         for j in range(columns):
             p = labels[i, j]
             if p == 0 or surfaces.edge[i, j] > 20 or not surfaces.tangent[i, j, 0] > 0:
                 continue
-            seen[p] += 1
-            stride = max(1, int(shape[p, COUNT]) // SAMPLES)
-            if seen[p] % stride == 0 and taken[p] < SAMPLES:
+            wait[p] -= 1
+            if wait[p] == 0 and taken[p] < SAMPLES:
                 pieces.samples[p, taken[p]] = i * columns + j
                 taken[p] += 1
+                wait[p] = stride[p]
 
 
 @kernel
