@@ -137,15 +137,18 @@ def _mark(
             if near[i, j] == 0:
                 continue
             x1 = (j + 1) * factor if j + 1 < columns else depth.shape[1]
+            here = w[i, j]
             for y in range(i * factor, y1):
                 for x in range(j * factor, x1):
                     z = depth[y, x]
                     if not ((z >= low) & (z <= high)):
                         continue
-                    p = i * columns + j if _fits(w[i, j], z) else _best_beside(w, i, j, z)
-                    if p < 0:
-                        continue
-                    ii, jj = p // columns, p % columns
+                    ii, jj = i, j
+                    if not _fits(here, z):
+                        p = _best_beside(w, i, j, z)
+                        if p < 0:
+                            continue
+                        ii, jj = p // columns, p % columns
                     label = labels[ii, jj]
                     u, v = (x - shift) * scale, (y - shift) * scale
                     if label > 0 and (filled[ii, jj] or _rises(planes, owners[label], u, v, z)):
