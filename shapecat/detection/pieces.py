@@ -105,12 +105,24 @@ def pieces_of(
         np.zeros(size, np.int8),
         np.arange(size).astype(np.int16),
     )
-    _meet(
-        cells.w, heights.owner, heights.height, surfaces.links, surfaces.normal, labels, up, pieces
-    )
-    side = side_of(up)
-    _measure(cells.w, cells.lens, heights.owner, heights.height, surfaces, labels, up, side, pieces)
+    _collect(cells.w, cells.lens, heights, surfaces, labels, up, side_of(up), pieces)
     return pieces
+
+
+@kernel
+def _collect(
+    w: F4,
+    lens: Lens,
+    heights: Heights,
+    surfaces: Surfaces,
+    labels: I4,
+    up: F8,
+    side: F8,
+    pieces: Pieces,
+) -> None:
+    owner, height = heights.owner, heights.height
+    _meet(w, owner, height, surfaces.links, surfaces.normal, labels, up, pieces)
+    _measure(w, lens, owner, height, surfaces, labels, up, side, pieces)
 
 
 def side_of(up: F8) -> F8:

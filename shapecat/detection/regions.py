@@ -11,7 +11,7 @@ __all__ = ["regions_of", "renamed"]
 
 EDGE_DEG = 34
 """Concave angle that may part two objects; a bowl of 7 cm turns 16 degrees over the same cells."""
-WEAK_DEG = 20
+WEAK_DEG, NO_EDGE_DEG = 20, 256
 RIDGE, RIDGE_CELLS = 0.5, 5
 LEAST_CELLS = 12
 MOST_REGIONS = 250
@@ -25,25 +25,29 @@ def regions_of(heights: Heights, surfaces: Surfaces, *, concave: bool = True) ->
     the cells of an edge to its sides (Meyer 1991). With ``concave`` off only jumps part regions.
     """
     labels = np.zeros(heights.owner.shape, np.int16)
-    barrier = np.zeros(labels.shape, np.uint8)
-    if concave:
-        _creases(surfaces.edge, barrier)
-    n = _flat_parts(heights.owner, surfaces.links, barrier, labels, 0)
-    _flood(surfaces.links, surfaces.edge, labels)
-    barrier[:] = 0
-    n = _flat_parts(heights.owner, surfaces.links, barrier, labels, n)
-    return labels, n
+    strong = EDGE_DEG if concave else NO_EDGE_DEG
+    return labels, _find(heights.owner, surfaces.links, surfaces.edge, strong, labels)
 
 
 @kernel
-def _creases(edge: U1, barrier: U1) -> None:
+def _find(owner: I4, links: U1, edge: U1, strong: int, labels: I4) -> int:
+    barrier = np.zeros(labels.shape, np.uint8)
+    _creases(edge, strong, barrier)
+    n = _flat_parts(owner, links, barrier, labels, 0)
+    _flood(links, edge, labels)
+    barrier[:] = 0
+    return int(_flat_parts(owner, links, barrier, labels, n))
+
+
+@kernel
+def _creases(edge: U1, strong: int, barrier: U1) -> None:
     """Mark strong concave edges, and weaker ones that continue them (hysteresis, Canny 1986)."""
     rows, columns = edge.shape
     stack = np.zeros(edge.size, np.int32)
     top = 0
     for i in range(rows):
         for j in range(columns):
-            if edge[i, j] >= EDGE_DEG:
+            if edge[i, j] >= strong:
                 barrier[i, j] = 1
                 stack[top] = i * columns + j
                 top += 1

@@ -43,12 +43,17 @@ def surfaces_of(cells: Cells, heights: Heights) -> Surfaces:
     """Fit tangent planes to the object cells, link them and measure concave angles."""
     shape = cells.w.shape
     tangent, normal = np.zeros((2, *shape, 3), np.float32)
-    fit_tangents(cells.w, cells.lens, heights.owner, tangent, normal)
-    links = np.zeros(shape, np.uint8)
-    _link(cells.w, heights.owner, tangent, links)
-    edge = np.zeros(shape, np.uint8)
-    _bend(cells.w, cells.lens, tangent, normal, edge)
-    return Surfaces(tangent, normal, links, edge)
+    links, edge = np.zeros((2, *shape), np.uint8)
+    surfaces = Surfaces(tangent, normal, links, edge)
+    _survey(cells.w, cells.lens, heights.owner, surfaces)
+    return surfaces
+
+
+@kernel
+def _survey(w: F4, lens: Lens, owner: I4, surfaces: Surfaces) -> None:
+    fit_tangents(w, lens, owner, surfaces.tangent, surfaces.normal)
+    _link(w, owner, surfaces.tangent, surfaces.links)
+    _bend(w, lens, surfaces.tangent, surfaces.normal, surfaces.edge)
 
 
 @kernel(fast=True)
