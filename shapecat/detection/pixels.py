@@ -17,6 +17,8 @@ __all__ = ["pixels_of", "points_of"]
 
 MOST_LABELS = 1000
 HIGHEST_M = 0.6
+BLOCK = 64
+"""Pixels that are looked at together: most have no label."""
 
 
 def pixels_of(depth: F4, cells: Cells, found: Segmentation, *, range_m: float) -> list[U4]:
@@ -215,8 +217,15 @@ def _rises(planes: F8, k: int, u: float, v: float, z: float) -> bool:
 
 @kernel
 def _sort(marks: I4, next_place: I4, order: U4) -> None:
-    for p in range(marks.size):
-        label = marks[p]
-        if label > 0:
-            order[next_place[label]] = p
-            next_place[label] += 1
+    for start in range(0, marks.size, BLOCK):
+        block = marks[start : start + BLOCK]
+        some = np.int16(0)
+        for k in range(block.size):
+            some |= block[k]
+        if some == 0:
+            continue
+        for k in range(block.size):
+            label = block[k]
+            if label > 0:
+                order[next_place[label]] = start + k
+                next_place[label] += 1

@@ -92,11 +92,11 @@ def _cut(cells: Cells, extents: Extents) -> Bool:
     result = np.zeros(len(extents.low), bool)
     for axis in range(2):
         size = cells.w.shape[axis]
+        lines = cells.w if axis == 0 else cells.w.T
         near = math.ceil(BORDER * size)
-        seen = (cells.w if axis == 0 else cells.w.T) > 0
         # The first that is seen, the very first if none is.
-        first = np.argmax(seen[:near].any(axis=1))
-        last = size - 1 - np.argmax(seen[: -near - 1 : -1].any(axis=1))
+        first = np.argmax(lines[:near].any(axis=1))
+        last = size - 1 - np.argmax(lines[: -near - 1 : -1].any(axis=1))
         reach = max(1, round(2 / cells.factor))
         result |= extents.low[:, axis] < first + reach
         result |= extents.high[:, axis] > last - reach
