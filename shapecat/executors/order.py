@@ -24,8 +24,8 @@ _ALONE = 8
 """Items worked on before other processes are started, which a short run can do without."""
 _AWAY = 2
 """Items sent to each other process: one to work on, one to go on with."""
-_HELD = 256
-"""Results held at most: as many as become ready while the other processes come up."""
+_HELD = 64
+"""Results held at most, which wait for one that another process works on."""
 _SWITCH_S = 5e-4
 """A thread back from a kernel waits no longer than this for the interpreter lock."""
 
@@ -59,9 +59,10 @@ def in_order(
     pending: deque[tuple[_Kept, Future[_Result]]] = deque()
     away: list[Future[_Result]] = []
     with _other_processes(processes - 1) as executor:
+        waking = [executor.submit(_wake, work) for _ in range(processes - 1)]
         for kept, item in source:
             away = [future for future in away if not future.done()]
-            if len(away) < _AWAY * (processes - 1):
+            if len(away) < _AWAY * sum(future.done() for future in waking):
                 future = _sent(executor, work, item)
                 away.append(future)
             else:
@@ -83,6 +84,10 @@ def _other_processes(count: int) -> Iterator[Executor]:
             yield executor
     finally:
         executor.terminate()
+
+
+def _wake(_work: object) -> None:
+    """Do nothing: to have received ``work`` is to have loaded what it needs."""
 
 
 def _done(work: Callable[[_Item], _Result], item: _Item) -> Future[_Result]:
