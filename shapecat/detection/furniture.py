@@ -38,11 +38,12 @@ TOWERING = 0.5
 """Share of a piece below surface that goes on beyond the greatest height."""
 
 
-def is_no_object(pieces: Pieces, furniture: Bool, *, largest_m: float) -> Bool:
+def is_no_object(pieces: Pieces, furniture: Bool, raised: Bool, *, largest_m: float) -> Bool:
     """Return for each piece whether it is no object, (n + 1,) bool, ``furniture`` included.
 
     The edge of a board and the legs below it meet the board from below; walls and the sides of
-    shelves are larger than ``largest_m``; noise of the plane is small and low.
+    shelves are larger than ``largest_m``; noise of the plane is small and low, and was not
+    ``raised``.
     """
     shape = pieces.shape
     rim = pieces.single[:, RIM]
@@ -51,7 +52,7 @@ def is_no_object(pieces: Pieces, furniture: Bool, *, largest_m: float) -> Bool:
     depth = shape[:, FAR] / shape[:, COUNT].clip(1)
     low = shape[:, TOP] < FAINT * LEAST_M + FAINT_NOISE * NOISE * depth**2
     faint = low & ((shape[:, AREA] < FAINT_M2) | (shape[:, COUNT] < FAINT_CELLS))
-    return np.asarray(edge | large | faint | furniture)
+    return np.asarray(edge | large | (faint & ~raised) | furniture)
 
 
 def posts_of(cells: Cells, owner: I4, regions: I4, pieces: Pieces, up: F8) -> Bool:

@@ -4,9 +4,12 @@ Sensors see a flat table in slow waves, higher than a plate is thick; but only a
 edge. So what is low is judged by its outline rather than by its height.
 """
 
+import math
+from typing import NamedTuple
+
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U1
+from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import JUMP, Cells
 from shapecat.detection.heights import Heights
 from shapecat.jit import kernel
@@ -16,36 +19,48 @@ __all__ = ["raise_low"]
 LOW_M = 0.03
 """Higher things are objects anyway."""
 LEVELS = np.array([0.009, 0.0065, 0.005, 0.004, 0.0032], np.float32)
-"""Inverse depth above the plane at which outlines are looked for, 1/m."""
-STEP = 0.0045
-"""Mean rise across the outline of an object, 1/m: one and a half steps of a Kinect."""
-STEEP, STEEP_SHARE = 0.0027, 0.75
-"""A rise that is more than noise, and the share of the outline that has it."""
-FRAGMENT, GROWTH, STEEP_GROWTH = 0.4, 1.3, 0.88
-"""A known object that is a smaller share of a part is a fragment of it; a part larger than the
-object by this factor must have a steeper outline than a new one."""
+FAINT_LEVELS = np.array([0.0024, 0.0016, 0.0008], np.float32)
+"""Inverse depth above the plane at which outlines are looked for, 1/m; the latter, less than a step
+of a Kinect, in a mean over `BLUR` cells to each side."""
+BLUR = 2
+STEP, STEP_M = 0.004, 0.004
+"""Mean rise across the outline of an object: 1/m, more than a step of a Kinect, and metres: where a
+plane is seen at a grazing angle noise rises by many steps, but not by much."""
+STEEP, STEEP_SHARE = 0.65, 0.67
+"""A rise that is more than noise, as a share of the mean, and the share of the outline that has
+it."""
+MOST_STEPS = 3
+FRAGMENT, GROWTH, STEEP_GROWTH = 0.3, 1.3, 0.88
+"""A known object that spans a smaller share of a part is a fragment of it; a part that spans more
+than the object by this factor must have a steeper outline than a new one."""
+SLOPE = 0.0016
+"""Fall per cell of the side of something, 1/m."""
 INWARD, OUTWARD = 2, 3
 """Cells from the outline to where its rise is measured."""
-LEAST_CELLS, LEAST_SIDES, SMALL_PART = 120, 30, 12
-ALONE, FOOT, BESIDE = 0.65, 0.04, 0.3
-"""Shares of an outline: of an object, least along the plane and most in touch with something
-that is not low, whose foot it would be; of a swell, least along the plane."""
-FLOOR = 0.4
-"""Mean of a hole in an outline that belongs to the object, as a share of the level."""
+LEAST_CELLS, LEAST_SIDES, SMALL_PART = 80, 30, 12
+ALONG, KNOWN, BESIDE = 0.4, 0.7, 0.3
+"""Shares of an outline: of an object, least along the plane, and least along the plane or in touch
+with what is not low; of a swell, least along the plane."""
+FLOOR = 0.0006
+"""Least mean height of what a rim encloses above the plane around it, 1/m: not of a wreath."""
 
 
-def raise_low(cells: Cells, heights: Heights, planes: F8, raised: U1) -> None:
+def raise_low(cells: Cells, heights: Heights, planes: F8, raised: I4) -> None:
     """Give low objects the owners of objects, and swells those of the plane, in place.
 
     Parameters
     ----------
-    raised : (rows, columns) set to 1 on low objects.
+    raised : (rows, columns) set to 1, 2, ... on low objects.
     """
     for k, plane in enumerate(planes):
         excess = np.zeros(cells.w.shape, np.float32)
         if _excess(cells.w, heights.owner, heights.height, plane, k + 1, excess) >= LEAST_CELLS:
-            _raise(cells.w, excess, heights.owner, k + 1, LEVELS, raised)
-            _lower(cells.w, excess, heights.owner, k + 1, raised)
+            _cut_feet(cells.w, heights.owner, heights.height, k + 1, excess)
+            _raise(cells.w, excess, excess, heights.owner, k + 1, plane[3], LEVELS, raised, False)
+            blurred = np.zeros_like(excess)
+            _blur(excess, blurred)
+            _raise(cells.w, excess, blurred, heights.owner, k + 1, plane[3], FAINT_LEVELS, raised, True)
+            _lower(cells.w, excess, heights.owner, k + 1, plane[3], raised)
 
 
 @kernel
@@ -80,52 +95,190 @@ def _excess(w: F4, owner: I4, height: F4, plane: F8, number: int, out: F4) -> in
 
 
 @kernel
-def _raise(w: F4, excess: F4, owner: I4, number: int, levels: F4, raised: U1) -> None:
-    """Mark the parts above each level, holes included, whose outline is that of an object."""
-    flat, marks, owners = excess.reshape(-1), raised.reshape(-1), owner.reshape(-1)
+def _cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4) -> None:
+    """Clear the excess of the feet of what is not low: steep cells below it, down to the plane."""
+    rows, columns = excess.shape
+    stack = np.zeros(excess.size, np.int32)
+    drop = np.zeros(excess.size, np.float32)
+    top = 0
+    for i in range(1, rows - 1):
+        for j in range(1, columns - 1):
+            if owner[i, j] == number and height[i, j] >= LOW_M:
+                for d in range(4):
+                    y = i + (1 if d == 0 else -1 if d == 1 else 0)
+                    x = j + (1 if d == 2 else -1 if d == 3 else 0)
+                    if excess[y, x] != 0 and abs(w[y, x] - w[i, j]) < JUMP:
+                        stack[top], drop[top] = y * columns + x, excess[y, x]
+                        excess[y, x] = 0
+                        top += 1
+    done = 0
+    while done < top:
+        i, j = stack[done] // columns, stack[done] % columns
+        here = drop[done]
+        done += 1
+        for d in range(4):
+            y = i + (1 if d == 0 else -1 if d == 1 else 0)
+            x = j + (1 if d == 2 else -1 if d == 3 else 0)
+            if excess[y, x] != 0 and here - excess[y, x] > SLOPE and abs(w[y, x] - w[i, j]) < JUMP:
+                stack[top], drop[top] = y * columns + x, excess[y, x]
+                excess[y, x] = 0
+                top += 1
+
+
+@kernel
+def _blur(excess: F4, out: F4) -> None:
+    """Write the mean of the low cells within `BLUR` cells; 0 elsewhere."""
+    rows, columns = excess.shape
+    total, count = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
+    most = np.float32(STEP)
+    for i in range(rows):
+        total[:] = 0
+        count[:] = 0
+        for y in range(max(i - BLUR, 0), min(i + BLUR + 1, rows)):
+            for j in range(columns):
+                total[j] += min(excess[y, j], most)
+                count[j] += excess[y, j] != 0
+        for j in range(BLUR, columns - BLUR):
+            if excess[i, j] != 0:
+                s = n = np.float32(0)
+                for x in range(j - BLUR, j + BLUR + 1):
+                    s += total[x]
+                    n += count[x]
+                out[i, j] = s / n
+
+
+@kernel
+def _raise(
+    w: F4,
+    excess: F4,
+    field: F4,
+    owner: I4,
+    number: int,
+    scale: float,
+    levels: F4,
+    raised: I4,
+    new_only: bool,
+) -> None:
+    """Number the parts of ``field`` above each level, filled, whose outline is that of an object."""
+    flat, marks, owners = field.reshape(-1), raised.reshape(-1), owner.reshape(-1)
     if np.count_nonzero(flat > levels[-1]) < LEAST_CELLS:
         return
     seeds = np.flatnonzero(flat > levels[-1])
-    stack = np.zeros(excess.size, np.int32)
+    stack, before = np.zeros((2, excess.size), np.int32)
     part = np.zeros(excess.shape, np.int32)
     parts = part.reshape(-1)
-    around = np.zeros(excess.shape, np.int32)
-    number_of_parts = looks = 0
+    number_of_parts = 0
+    objects = np.max(marks)
     for level in levels:
         first = number_of_parts
         for s in seeds:
             if parts[s] > first or not flat[s] > level:
                 continue
             number_of_parts += 1
-            me = number_of_parts
-            count = _flood(excess, level, s, me, part, stack)
+            count = _flood(field, level, s, number_of_parts, part, stack)
             if count < LEAST_CELLS:
                 continue
-            count, looks = _fill_part(excess, level, me, part, around, looks, stack, count)
-            if _is_object(w, excess, owner, part, stack, count, number, raised):
-                for t in range(count):
-                    marks[stack[t]] = 1
+            filled = _fill_hull(excess, part, stack, count, before)
+            outline = _outline(w, excess, owner, part, stack, filled, number, scale, count)
+            if filled > count and outline.floor < FLOOR:
+                for t in range(count, filled):
+                    parts[stack[t]] = before[t]
+                filled = count
+                outline = _outline(w, excess, owner, part, stack, filled, number, scale, count)
+            known = 0
+            for t in range(filled):
+                known += marks[stack[t]] > 0
+            if _is_object(outline, filled, known, new_only):
+                objects += 1
+                for t in range(filled):
+                    marks[stack[t]] = objects
                     owners[stack[t]] = number
 
 
+class Outline(NamedTuple):
+    """What is known of an outline.
+
+    Attributes
+    ----------
+    sides : sides of cells; ``table`` of them look at the plane, ``foot`` touch what is not low.
+    rise : sum of the rises of the former, as multiples of the least mean rise.
+    steep : how many of them are steep.
+    floor : mean height of the cells that were filled in, above the plane around, 1/m.
+    """
+
+    sides: int
+    table: int
+    foot: int
+    rise: float
+    steep: int
+    floor: float
+
+
 @kernel
-def _is_object(
-    w: F4, excess: F4, owner: I4, part: I4, stack: I4, count: int, number: int, raised: U1
-) -> bool:
-    """Whether the outline of a part is that of an object.
+def _is_object(outline: Outline, count: int, known: int, new_only: bool) -> bool:
+    """Whether an outline is that of an object.
 
     A part that is more than a known object, but not by far, is that object and a swell beside it.
     """
-    known = 0
-    marks = raised.reshape(-1)
-    for t in range(count):
-        known += marks[stack[t]]
-    sides, table, foot, steep, rise = _outline(w, excess, owner, part, stack, count, number)
     share = STEEP_SHARE
+    if new_only and 2 * known > count:
+        return False
     if FRAGMENT * count <= known and GROWTH * known <= count:
         share = STEEP_GROWTH
-    enough = table >= max(LEAST_SIDES, ALONE * sides) and foot <= FOOT * sides
-    return bool(enough and rise > STEP * table and steep > share * table)
+    table, sides = outline.table, outline.sides
+    enough = table >= max(LEAST_SIDES, ALONG * sides) and table + outline.foot >= KNOWN * sides
+    return bool(enough and outline.rise > table and outline.steep > share * table)
+
+
+@kernel
+def _fill_hull(excess: F4, part: I4, stack: I4, count: int, before: I4) -> int:
+    """Add the low cells within the convex hull of a part to it; return how many cells it has.
+
+    What ``part`` was there goes to ``before``, in the order of the stack.
+    """
+    rows, columns = excess.shape
+    parts = part.reshape(-1)
+    me = parts[stack[0]]
+    left, right = np.full(rows, columns, np.float64), np.full(rows, -1.0)
+    for t in range(count):
+        i = stack[t] // columns
+        j = stack[t] - i * columns
+        left[i], right[i] = min(left[i], j), max(right[i], j)
+    first, last = 0, rows - 1
+    while right[first] < 0:
+        first += 1
+    while right[last] < 0:
+        last -= 1
+    right[:] = -right
+    _straighten(left, first, last)
+    _straighten(right, first, last)
+    top = count
+    for i in range(first, last + 1):
+        for j in range(int(math.ceil(left[i] - 1e-6)), int(1e-6 - right[i]) + 1):
+            if part[i, j] != me and excess[i, j] != 0:
+                stack[top], before[top] = i * columns + j, part[i, j]
+                part[i, j] = me
+                top += 1
+    return top
+
+
+@kernel
+def _straighten(side: F8, first: int, last: int) -> None:
+    """Replace a side of an outline, by rows, with that of its hull, the largest convex one."""
+    corners = np.zeros(side.size, np.int32)
+    n = 0
+    for i in range(first, last + 1):
+        while n > 1:
+            a, b = corners[n - 2], corners[n - 1]
+            if (side[b] - side[a]) * (i - a) < (side[i] - side[a]) * (b - a):
+                break
+            n -= 1
+        corners[n] = i
+        n += 1
+    for k in range(1, n):
+        a, b = corners[k - 1], corners[k]
+        for i in range(a + 1, b):
+            side[i] = side[a] + (side[b] - side[a]) * (i - a) / (b - a)
 
 
 @kernel
@@ -152,97 +305,27 @@ def _flood(excess: F4, level: float, start: int, n: int, part: I4, stack: I4) ->
 
 
 @kernel
-def _fill_part(
-    excess: F4, level: float, me: int, part: I4, around: I4, looks: int, stack: I4, count: int
-) -> tuple[int, int]:
-    """Add the holes in a part that are raised; return its cells, and the number of looks so far."""
-    columns = excess.shape[1]
-    flat, parts, seen = excess.reshape(-1), part.reshape(-1), around.reshape(-1)
-    i0, i1, j0, j1 = excess.shape[0], 0, columns, 0
-    for t in range(count):
-        i = stack[t] // columns
-        j = stack[t] - i * columns
-        i0, i1, j0, j1 = min(i0, i), max(i1, i), min(j0, j), max(j1, j)
-    since = looks
-    for t in range(count):
-        for step in (1, -1, columns, -columns):
-            q = stack[t] + step
-            if flat[q] == 0 or parts[q] == me or seen[q] > since:
-                continue
-            looks += 1
-            top, total = _hole(
-                flat, q, columns, parts, me, seen, looks, since, stack, count, (i0, i1, j0, j1)
-            )
-            if total > FLOOR * level * (top - count):
-                for k in range(count, top):
-                    parts[stack[k]] = me
-                count = top
-    return count, looks
-
-
-@kernel
-def _hole(
-    excess: F4,
-    start: int,
-    columns: int,
-    part: I4,
-    me: int,
-    around: I4,
-    n: int,
-    since: int,
-    stack: I4,
-    first: int,
-    box: tuple[int, int, int, int],
-) -> tuple[int, float]:
-    """Put the hole around a cell on the stack: where it ends, and its sum; none if it is open.
-
-    The cells of look ``n`` get that number in ``around``; looks after ``since`` are of this part.
-    """
-    around[start] = n
-    stack[first] = start
-    # Both ends of the stack are used: visited cells gather at the front, last in first.
-    done, top = first, first + 1
-    total = 0.0
-    while done < top:
-        p = stack[top - 1]
-        stack[top - 1] = stack[done]
-        stack[done] = p
-        done += 1
-        total += excess[p]
-        i = p // columns
-        j = p - i * columns
-        if i < box[0] or i > box[1] or j < box[2] or j > box[3]:
-            return first, 0.0
-        for step in (1, -1, columns, -columns):
-            q = p + step
-            if part[q] == me or excess[q] == 0 or around[q] == n:
-                continue
-            if around[q] > since:  # known to be open
-                return first, 0.0
-            around[q] = n
-            stack[top] = q
-            top += 1
-    return top, total
-
-
-@kernel
 def _outline(
-    w: F4, excess: F4, owner: I4, part: I4, stack: I4, count: int, number: int
-) -> tuple[int, int, int, int, float]:
-    """Measure an outline.
-
-    Returns
-    -------
-    How many sides of cells it has; how many of these look at the plane, how many touch what is
-    not low; how many of the former are steep, and the sum of their rises.
-    """
+    w: F4,
+    excess: F4,
+    owner: I4,
+    part: I4,
+    stack: I4,
+    count: int,
+    number: int,
+    scale: float,
+    flooded: int,
+) -> Outline:
+    """Measure the outline of a part; the cells from ``flooded`` on were filled in."""
     rows, columns = excess.shape
     parts = part.reshape(-1)
+    flat = excess.reshape(-1)
     sides = table = foot = steep = 0
-    rise = 0.0
+    rise = around = floor = 0.0
     me = parts[stack[0]]
     for t in range(count):
         p = stack[t]
+        floor += flat[p] if t >= flooded else 0.0
         for d in range(4):
             di = 1 if d == 0 else -1 if d == 1 else 0
             dj = 1 if d == 2 else -1 if d == 3 else 0
@@ -252,7 +335,7 @@ def _outline(
             j = p - i * columns
             sides += 1
             y, x = i + di, j + dj
-            foot += excess[y, x] == 0 and owner[y, x] == number and abs(w[y, x] - w[i, j]) < JUMP
+            foot += excess[y, x] == 0 and w[y, x] > 0 and abs(w[y, x] - w[i, j]) < JUMP
             y, x = i + OUTWARD * di, j + OUTWARD * dj
             v, u = i - INWARD * di, j - INWARD * dj
             if min(y, x) < 0 or min(v, u) < 0 or max(y, v) >= rows or max(x, u) >= columns:
@@ -260,15 +343,18 @@ def _outline(
             if owner[y, x] != -number or excess[y, x] == 0 or abs(owner[v, u]) != number:
                 continue
             table += 1
-            most = np.float32(3 * STEP)  # also where the inside is not low
-            step = min(excess[v, u] - excess[y, x], most) if excess[v, u] != 0 else most
-            rise += float(step)
+            around += excess[y, x]
+            step = (excess[v, u] - excess[y, x]) / max(STEP, STEP_M * w[i, j] / scale)
+            if excess[v, u] == 0:  # the inside is not low
+                step = MOST_STEPS
+            rise += min(step, MOST_STEPS)
             steep += int(step > STEEP)
-    return sides, table, foot, steep, rise
+    base = around / max(table, 1)
+    return Outline(sides, table, foot, rise, steep, floor / max(count - flooded, 1) - base)
 
 
 @kernel
-def _lower(w: F4, excess: F4, owner: I4, number: int, raised: U1) -> None:
+def _lower(w: F4, excess: F4, owner: I4, number: int, scale: float, raised: I4) -> None:
     """Give level parts of low object cells whose outline is that of a swell back to the plane."""
     rows, columns = excess.shape
     seeds = np.zeros(excess.size, np.int32)
@@ -294,8 +380,8 @@ def _lower(w: F4, excess: F4, owner: I4, number: int, raised: U1) -> None:
         count = _flood(above, np.float32(0.5), s, number_of_parts, part, stack)
         if count < SMALL_PART:
             continue
-        sides, table, _, _, rise = _outline(w, excess, owner, part, stack, count, number)
-        if table >= BESIDE * sides and rise < STEP * table:
+        line = _outline(w, excess, owner, part, stack, count, number, scale, count)
+        if line.table >= BESIDE * line.sides and line.rise < line.table:
             for t in range(count):
                 owners[stack[t]] = -number
 

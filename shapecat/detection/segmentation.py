@@ -25,7 +25,7 @@ from shapecat.detection.planes import Support
 from shapecat.detection.reach import reach_over
 from shapecat.detection.regions import regions_of, renamed
 from shapecat.detection.relief import raise_low
-from shapecat.detection.rings import join_rings
+from shapecat.detection.rings import join_raised, join_rings
 from shapecat.detection.surfaces import surfaces_of
 from shapecat.detection.walls import clear_walls
 from shapecat.errors import ConfigError
@@ -107,7 +107,7 @@ def segment(
     up = max(supports, key=lambda s: s.area_m2).up
     planes = table_of(supports, cells.lens)
     heights = heights_of(cells, planes, highest_m=settings.max_height_m)
-    raised = np.zeros(cells.w.shape, np.uint8)
+    raised = np.zeros(cells.w.shape, np.int16)
     if "low" in rules:
         raise_low(cells, heights, planes, raised)
     walls = clear_walls(cells, heights.owner, up, largest_m=settings.max_size_m, rng=rng)
@@ -119,13 +119,14 @@ def segment(
         more = cut_at_ledges(cells, heights, surfaces, pieces, regions, up)
         if more > n:
             pieces = pieces_of(cells, heights, surfaces, regions, more, up)
+    known = join_raised(pieces, raised, regions)
     join_pieces(pieces, cells, surfaces, regions, rules)
     if "ring" in rules:
         join_rings(pieces, cells.w, heights.height, regions)
     furniture = posts_of(cells, heights.owner, regions, pieces, up)
     furniture |= towers_of(cells, planes, pieces, up, highest_m=settings.max_height_m)
     furniture |= remains_of(walls, regions, pieces)
-    refused = is_no_object(pieces, furniture, largest_m=settings.max_size_m)
+    refused = is_no_object(pieces, furniture, known, largest_m=settings.max_size_m)
     pieces.group[refused[pieces.group]] = 0
     leaders = np.flatnonzero(np.bincount(pieces.group))
     number = np.zeros(pieces.group.size, np.int16)
@@ -136,5 +137,5 @@ def segment(
     filled = fill_enclosed(
         cells.w, heights.height, labels, leaders.size - 1, active="fill" in rules
     )
-    filled |= raised & (labels > 0)
+    filled |= ((raised > 0) & (labels > 0)).astype(np.uint8)
     return Segmentation(up, supports, planes, labels, heights.height, filled, pieces, leaders)
