@@ -26,19 +26,21 @@ BLUR = 2
 STEP, STEP_M = 0.004, 0.004
 """Mean rise across the outline of an object: 1/m, more than a step of a Kinect, and metres: where a
 plane is seen at a grazing angle noise rises by many steps, but not by much."""
-STEEP, STEEP_SHARE = 0.65, 0.67
+STEEP, STEEP_SHARE = 0.65, 0.7
 """A rise that is more than noise, as a share of the mean, and the share of the outline that has
 it."""
 MOST_STEPS = 3
-FRAGMENT, GROWTH, STEEP_GROWTH = 0.3, 1.3, 0.88
-"""A known object that spans a smaller share of a part is a fragment of it; a part that spans more
-than the object by this factor must have a steeper outline than a new one."""
+ALL_AROUND = 0.75
+"""Least sum of the rises for each side of the outline, whether it looks at the plane or not."""
+GROWN = 0.8
+"""Rise per side of a part that replaces known objects within it, as a share of the greatest of
+theirs: an object and a swell beside it rise less."""
 SLOPE = 0.0016
 """Fall per cell of the side of something, 1/m."""
 INWARD, OUTWARD = 2, 3
 """Cells from the outline to where its rise is measured."""
 LEAST_CELLS, LEAST_SIDES, SMALL_PART = 80, 30, 12
-ALONG, KNOWN, BESIDE = 0.4, 0.7, 0.3
+ALONG, KNOWN, BESIDE = 0.4, 0.65, 0.3
 """Shares of an outline: of an object, least along the plane, and least along the plane or in touch
 with what is not low; of a swell, least along the plane."""
 FLOOR = 0.0006
@@ -56,10 +58,13 @@ def raise_low(cells: Cells, heights: Heights, planes: F8, raised: I4) -> None:
         excess = np.zeros(cells.w.shape, np.float32)
         if _excess(cells.w, heights.owner, heights.height, plane, k + 1, excess) >= LEAST_CELLS:
             _cut_feet(cells.w, heights.owner, heights.height, k + 1, excess)
-            _raise(cells.w, excess, excess, heights.owner, k + 1, plane[3], LEVELS, raised, False)
-            blurred = np.zeros_like(excess)
+            blurred, merit = np.zeros((2, *excess.shape), np.float32)
             _blur(excess, blurred)
-            _raise(cells.w, excess, blurred, heights.owner, k + 1, plane[3], FAINT_LEVELS, raised, True)
+            for field, levels in ((excess, LEVELS), (blurred, FAINT_LEVELS)):
+                _raise(
+                    cells.w, excess, field, heights.owner, k + 1, plane[3], levels, raised, merit,
+                    field is blurred,
+                )  # fmt: skip
             _lower(cells.w, excess, heights.owner, k + 1, plane[3], raised)
 
 
@@ -157,10 +162,12 @@ def _raise(
     scale: float,
     levels: F4,
     raised: I4,
+    merit_of: F4,
     new_only: bool,
 ) -> None:
     """Number the parts of ``field`` above each level, filled, whose outline is that of an object."""
     flat, marks, owners = field.reshape(-1), raised.reshape(-1), owner.reshape(-1)
+    merits = merit_of.reshape(-1)
     if np.count_nonzero(flat > levels[-1]) < LEAST_CELLS:
         return
     seeds = np.flatnonzero(flat > levels[-1])
@@ -185,13 +192,18 @@ def _raise(
                     parts[stack[t]] = before[t]
                 filled = count
                 outline = _outline(w, excess, owner, part, stack, filled, number, scale, count)
-            known = 0
+            known, best = 0, 0.0
             for t in range(filled):
-                known += marks[stack[t]] > 0
-            if _is_object(outline, filled, known, new_only):
+                known += merits[stack[t]] > 0
+                best = max(best, merits[stack[t]])
+            merit = outline.rise / outline.sides
+            if new_only and 2 * known > filled:
+                continue
+            if merit > GROWN * best and _is_object(outline):
                 objects += 1
                 for t in range(filled):
                     marks[stack[t]] = objects
+                    merits[stack[t]] = merit
                     owners[stack[t]] = number
 
 
@@ -215,19 +227,14 @@ class Outline(NamedTuple):
 
 
 @kernel
-def _is_object(outline: Outline, count: int, known: int, new_only: bool) -> bool:
-    """Whether an outline is that of an object.
-
-    A part that is more than a known object, but not by far, is that object and a swell beside it.
-    """
-    share = STEEP_SHARE
-    if new_only and 2 * known > count:
-        return False
-    if FRAGMENT * count <= known and GROWTH * known <= count:
-        share = STEEP_GROWTH
+def _is_object(outline: Outline) -> bool:
+    """Whether an outline is that of an object."""
     table, sides = outline.table, outline.sides
-    enough = table >= max(LEAST_SIDES, ALONG * sides) and table + outline.foot >= KNOWN * sides
-    return bool(enough and outline.rise > table and outline.steep > share * table)
+    if table < max(LEAST_SIDES, ALONG * sides) or table + outline.foot < KNOWN * sides:
+        return False
+    return bool(
+        outline.rise > max(table, ALL_AROUND * sides) and outline.steep > STEEP_SHARE * table
+    )
 
 
 @kernel
