@@ -13,6 +13,8 @@ __all__ = ["find_levels"]
 
 TURNED_COS = math.cos(math.radians(1))
 """Readings are collected again where up turns out to be off by more."""
+DISAGREEING, REWEIGHTED = math.radians(0.5), 5
+"""From which angle to the mean, radians, a plane counts less than half; how often this is done."""
 
 
 def find_levels(cells: Cells, up: F8) -> list[tuple[Support, I4]]:
@@ -32,13 +34,20 @@ def find_levels(cells: Cells, up: F8) -> list[tuple[Support, I4]]:
 
 
 def _common_up(supports: list[Support]) -> F8:
-    """Return the mean normal, weighted by how well each plane tells it: area and width squared."""
+    """Return the mean normal, weighted by how well each plane tells it: area and width squared.
+
+    A plane that disagrees counts less (iteratively reweighted least squares, Cauchy's weights).
+    """
     half = DIRECTIONS // 2
     widths = [float((s.reach[:half] + s.reach[half:]).min()) for s in supports]
-    total = np.array([s.area_m2 * w * w for s, w in zip(supports, widths, strict=True)]) @ [
-        s.up for s in supports
-    ]
-    return np.asarray(total / np.linalg.norm(total))
+    weights = np.array([s.area_m2 * w * w for s, w in zip(supports, widths, strict=True)])
+    ups = np.array([s.up for s in supports])
+    mean = weights @ ups
+    for _ in range(REWEIGHTED):
+        mean /= np.linalg.norm(mean)
+        apart = ((ups - mean) ** 2).sum(axis=1) / DISAGREEING**2
+        mean = (weights / (1 + apart)) @ ups
+    return np.asarray(mean / np.linalg.norm(mean))
 
 
 def _levelled(cells: Cells, support: Support, index: I4, up: F8) -> Support:
