@@ -30,8 +30,12 @@ __all__ = ["Extents", "Stand", "extents_of", "occluded", "stands_of"]
 OCCLUDED = 0.12
 """Share of the boundary behind something nearer that makes an object occluded."""
 YAWS = 60
-GAP_M = 0.025
-LIFTED_M = 0.03
+GAP_M, OVERLAP_M = 0.025, 0.04
+"""How far the bottom of an object may seem to be above and below the top of what it stands on: what
+is below is hidden, and a strip of it may go with the object."""
+LIFTED_M, SUNK_M = 0.03, 0.015
+"""What reaches no lower does not stand on the plane; what reaches this much lower than a surface
+does not stand on that."""
 
 
 class Stand(NamedTuple):
@@ -55,8 +59,8 @@ def stands_of(found: Segmentation) -> list[Stand]:
         k = int(np.argmax(onto))
         if onto[k] >= 3 and onto[k] > pieces.single[p, TABLE]:
             best, height = k, float(pieces.pairs[ONTO_HEIGHT, p, leaders[k]] / onto[k])
-            if pieces.shape[p, TOP] < height:
-                best = 0
+            if pieces.shape[p, BOTTOM] < height - SUNK_M:
+                best, height = 0, 0.0
         elif pieces.shape[p, BOTTOM] > LIFTED_M and pieces.single[p, TABLE] <= 2:
             best = _hidden_stand(pieces, leaders, int(p))
             height = float(pieces.shape[leaders[best], TOP]) if best else 0.0
@@ -68,7 +72,8 @@ def _hidden_stand(pieces: Pieces, leaders: I4, p: int) -> int:
     shape = pieces.shape
     pairs = pieces.pairs
     met = pairs[CONTACT, p] + pairs[NEAR, p] + pairs[FRONT, p] + pairs[FRONT, :, p]
-    below = abs(shape[leaders, TOP] - shape[p, BOTTOM]) < GAP_M
+    overlap = shape[leaders, TOP] - shape[p, BOTTOM]
+    below = (overlap > -GAP_M) & (overlap < OVERLAP_M)
     middle = (shape[p, LEFT] + shape[p, RIGHTMOST]) / 2
     beside = (shape[leaders, LEFT] < middle) & (middle < shape[leaders, RIGHTMOST])
     fits = met[leaders] * (below & beside & (leaders != p) & (leaders > 0))
