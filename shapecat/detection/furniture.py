@@ -32,7 +32,7 @@ POST_M = 0.06
 REMAINS = 0.8
 """Share of the cells of a piece on a wall."""
 STEP_M, STEPS, MISSES = 0.02, 64, 2.0
-"""A surface is followed upwards in at most so many steps, until it was not seen in more than two;
+"""A surface is followed up and down in at most so many steps, until it was not seen in more than two;
 where something hides it, half a step counts."""
 TOWERING = 0.5
 """Share of a piece below surface that goes on beyond the greatest height."""
@@ -71,10 +71,10 @@ def remains_of(walls: U1, regions: I4, pieces: Pieces) -> Bool:
 
 
 def towers_of(cells: Cells, planes: F8, pieces: Pieces, up: F8, *, highest_m: float) -> Bool:
-    """Return for each piece whether its surface goes on upwards beyond ``highest_m``.
+    """Return for each piece whether its surface goes straight up and down for ``highest_m``.
 
     The sides of shelves, door frames and whatever stands before the table reach higher above a
-    plane than objects on it, also where only pieces of them are seen.
+    plane than objects on it, or down below it, also where only pieces of them are seen.
     """
     share = np.zeros(pieces.group.size)
     _tower(cells.w, cells.lens, planes, pieces, up, highest_m, share)
@@ -100,23 +100,31 @@ def _tower(
             z = 1 / w[i, j]
             h = (w[i, j] - (plane[0] * j + plane[1] * i + plane[2])) * z * plane[3]
             n += 1
-            high += h + _rise(w, lens, i, j, up, highest - h) > highest - STEP_M
+            rise = _rise(w, lens, i, j, up, 1, highest)
+            if h + rise > highest - STEP_M:
+                high += 1
+            else:
+                high += rise + _rise(w, lens, i, j, up, -1, highest - rise) > highest - STEP_M
         share[p] = high / max(n, 1)
 
 
 @kernel(leaf=True)
-def _rise(w: F4, lens: Lens, i: int, j: int, up: F8, most: float) -> float:
-    """Return how far the surface of a cell goes straight on upwards, up to about ``most``."""
+def _rise(w: F4, lens: Lens, i: int, j: int, up: F8, sign: int, most: float) -> float:
+    """Return how far the surface of a cell goes straight on upwards, up to about ``most``.
+
+    With ``sign`` -1 downwards.
+    """
     z = 1 / w[i, j]
     x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
     reach = misses = 0.0
     for k in range(1, STEPS):
         d = STEP_M * k
-        depth = z + d * up[2]
+        along = sign * d
+        depth = z + along * up[2]
         if d > most + STEP_M or depth <= NEAREST_M:
             break
-        v = int(lens.cy + lens.fy * (y + d * up[1]) / depth + 0.5)
-        u = int(lens.cx + lens.fx * (x + d * up[0]) / depth + 0.5)
+        v = int(lens.cy + lens.fy * (y + along * up[1]) / depth + 0.5)
+        u = int(lens.cx + lens.fx * (x + along * up[0]) / depth + 0.5)
         if v < 0 or u < 0 or v >= w.shape[0] or u >= w.shape[1]:
             break
         ahead = w[v, u] - 1 / depth
