@@ -38,6 +38,8 @@ PART = 0.48
 SEEN_WHOLE = 0.25
 """Largest share of its boundary that is behind other things."""
 STANDS = 0.25
+HANGS = 0.4
+"""Links with the plane, as a share of those with pieces, of a handle that reaches down to it."""
 NECK_WIDTH, NECK_OVERLAP_M, NECK_APART, ROUND = 0.55, 0.03, 0.12, 0.8
 """A neck: width, metres below the top of the body, offset of its middle; slope of the body."""
 NECK_LEDGE, NECK_TALL = 0.1, 1.1
@@ -135,7 +137,7 @@ def _join_floating(pieces: Pieces) -> None:
             hidden -= pieces.pairs[FRONT, q, p]  # that would be its own body
             if (
                 total >= FEW
-                and pieces.single[p, TABLE] <= 2
+                and pieces.single[p, TABLE] <= max(2.0, HANGS * total)
                 and hidden < SEEN_WHOLE * pieces.boundary[p]
                 and np.sum(pieces.pairs[ONTO, p]) < STANDS * total
                 and pieces.shape[p, COUNT] < PART * pieces.shape[q, COUNT]
