@@ -18,11 +18,11 @@ __all__ = ["raise_low"]
 
 LOW_M = 0.03
 """Higher things are objects anyway."""
-LEVELS = np.array([0.009, 0.0065, 0.005, 0.004, 0.0032], np.float32)
-FAINT_LEVELS = np.array([0.0024, 0.0016, 0.0008], np.float32)
+LEVELS = np.array([0.009, 0.0065, 0.0045, 0.0032], np.float32)
+FAINT_LEVELS = np.array([0.0022, 0.0012], np.float32)
 """Inverse depth above the plane at which outlines are looked for, 1/m; the latter, less than a step
-of a Kinect, in a mean over `BLUR` cells to each side."""
-BLUR = 2
+of a Kinect, in the mean of a block of `BLOCK` cells and `BLUR` cells around it."""
+BLOCK, BLUR = 2, 2
 STEP, STEP_M = 0.004, 0.004
 """Mean rise across the outline of an object: 1/m, more than a step of a Kinect, and metres: where a
 plane is seen at a grazing angle noise rises by many steps, but not by much."""
@@ -47,23 +47,27 @@ FLOOR = 0.0006
 """Least mean height of what a rim encloses above the plane around it, 1/m: not of a wreath."""
 
 
-def raise_low(cells: Cells, heights: Heights, planes: F8, raised: I4) -> None:
+def raise_low(
+    cells: Cells, heights: Heights, planes: F8, raised: I4, *, largest_m: float
+) -> None:
     """Give low objects the owners of objects, and swells those of the plane, in place.
 
     Parameters
     ----------
     raised : (rows, columns) set to 1, 2, ... on low objects.
+    largest_m : wider things are swells or furniture.
     """
     for k, plane in enumerate(planes):
         excess = np.zeros(cells.w.shape, np.float32)
         if _excess(cells.w, heights.owner, heights.height, plane, k + 1, excess) >= LEAST_CELLS:
             _cut_feet(cells.w, heights.owner, heights.height, k + 1, excess)
-            blurred, merit = np.zeros((2, *excess.shape), np.float32)
-            _blur(excess, blurred)
-            for field, levels in ((excess, LEVELS), (blurred, FAINT_LEVELS)):
+            merit = np.zeros_like(excess)
+            faint = np.zeros([n // BLOCK for n in excess.shape], np.float32)
+            _blur(excess, faint)
+            for field, levels in ((excess, LEVELS), (faint, FAINT_LEVELS)):
                 _raise(
                     cells.w, excess, field, heights.owner, k + 1, plane[3], levels, raised, merit,
-                    field is blurred,
+                    largest_m * cells.lens.fx,
                 )  # fmt: skip
             _lower(cells.w, excess, heights.owner, k + 1, plane[3], raised)
 
@@ -132,24 +136,24 @@ def _cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4) -> None:
 
 @kernel
 def _blur(excess: F4, out: F4) -> None:
-    """Write the mean of the low cells within `BLUR` cells; 0 elsewhere."""
+    """Write the mean of the low cells in and around each block; 0 where it has none."""
     rows, columns = excess.shape
-    total, count = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
+    total, count = np.zeros((2, columns), np.float32)
     most = np.float32(STEP)
-    for i in range(rows):
+    for i in range(1, out.shape[0] - 1):
         total[:] = 0
         count[:] = 0
-        for y in range(max(i - BLUR, 0), min(i + BLUR + 1, rows)):
+        for y in range(max(i * BLOCK - BLUR, 0), min((i + 1) * BLOCK + BLUR, rows)):
             for j in range(columns):
                 total[j] += min(excess[y, j], most)
                 count[j] += excess[y, j] != 0
-        for j in range(BLUR, columns - BLUR):
-            if excess[i, j] != 0:
-                s = n = np.float32(0)
-                for x in range(j - BLUR, j + BLUR + 1):
-                    s += total[x]
-                    n += count[x]
-                out[i, j] = s / n
+        for j in range(1, out.shape[1] - 1):
+            s = n = np.float32(0)
+            for x in range(max(j * BLOCK - BLUR, 0), min((j + 1) * BLOCK + BLUR, columns)):
+                s += total[x]
+                n += count[x]
+            low = excess[i * BLOCK, j * BLOCK] != 0 or excess[i * BLOCK + 1, j * BLOCK + 1] != 0
+            out[i, j] = s / n if low else np.float32(0)
 
 
 @kernel
@@ -163,33 +167,39 @@ def _raise(
     levels: F4,
     raised: I4,
     merit_of: F4,
-    new_only: bool,
+    widest: float,
 ) -> None:
-    """Number the parts of ``field`` above each level, filled, whose outline is that of an object."""
+    """Number the parts of ``field`` above each level, filled, whose outline is that of an object.
+
+    ``field`` has a value for each cell or for each block; the latter only tells of new objects.
+    """
     flat, marks, owners = field.reshape(-1), raised.reshape(-1), owner.reshape(-1)
     merits = merit_of.reshape(-1)
-    if np.count_nonzero(flat > levels[-1]) < LEAST_CELLS:
+    block = excess.shape[0] // field.shape[0]
+    if np.count_nonzero(flat > levels[-1]) * block * block < LEAST_CELLS:
         return
     seeds = np.flatnonzero(flat > levels[-1])
-    stack, before = np.zeros((2, excess.size), np.int32)
-    part = np.zeros(excess.shape, np.int32)
-    parts = part.reshape(-1)
-    number_of_parts = 0
+    stack = np.zeros(excess.size, np.int32)
+    seen = np.zeros(field.shape, np.int32)
+    part = np.zeros(excess.shape, np.int32) if block > 1 else seen.copy()
+    visited, parts = seen.reshape(-1), part.reshape(-1)
+    me = 0
     objects = np.max(marks)
     for level in levels:
-        first = number_of_parts
+        first = me
         for s in seeds:
-            if parts[s] > first or not flat[s] > level:
+            if visited[s] > first or not flat[s] > level:
                 continue
-            number_of_parts += 1
-            count = _flood(field, level, s, number_of_parts, part, stack)
-            if count < LEAST_CELLS:
+            me += 1
+            count = _flood(field, level, s, me, seen, stack)
+            if count * block * block < LEAST_CELLS or _width(field, w, stack, count) > widest:
                 continue
-            filled = _fill_hull(excess, part, stack, count, before)
+            count = _cells_of(excess, field, stack, count, me, part)
+            filled = _fill_hull(excess, part, stack, count)
             outline = _outline(w, excess, owner, part, stack, filled, number, scale, count)
             if filled > count and outline.floor < FLOOR:
                 for t in range(count, filled):
-                    parts[stack[t]] = before[t]
+                    parts[stack[t]] = 0
                 filled = count
                 outline = _outline(w, excess, owner, part, stack, filled, number, scale, count)
             known, best = 0, 0.0
@@ -197,7 +207,7 @@ def _raise(
                 known += merits[stack[t]] > 0
                 best = max(best, merits[stack[t]])
             merit = outline.rise / outline.sides
-            if new_only and 2 * known > filled:
+            if block > 1 and 2 * known > filled:
                 continue
             if merit > GROWN * best and _is_object(outline):
                 objects += 1
@@ -205,6 +215,22 @@ def _raise(
                     marks[stack[t]] = objects
                     merits[stack[t]] = merit
                     owners[stack[t]] = number
+
+
+@kernel
+def _cells_of(excess: F4, field: F4, stack: I4, count: int, me: int, part: I4) -> int:
+    """Replace the blocks of a part on the stack by their low cells; return how many they are."""
+    block = excess.shape[0] // field.shape[0]
+    top = 0
+    for p in stack[:count].copy():
+        i, j = block * (p // field.shape[1]), block * (p % field.shape[1])
+        for y in range(i, i + block):
+            for x in range(j, j + block):
+                if excess[y, x] != 0 and y > 0 and x > 0:
+                    stack[top] = y * excess.shape[1] + x
+                    part[y, x] = me
+                    top += 1
+    return top
 
 
 class Outline(NamedTuple):
@@ -227,6 +253,18 @@ class Outline(NamedTuple):
 
 
 @kernel
+def _width(field: F4, w: F4, stack: I4, count: int) -> float:
+    """Return the extent of a part along the rows, in cells a metre away."""
+    block, columns = w.shape[0] // field.shape[0], field.shape[1]
+    first, last = columns, 0
+    for t in range(count):
+        j = stack[t] % columns
+        first, last = min(first, j), max(last, j)
+    i, j = block * (stack[0] // columns), block * (stack[0] % columns)
+    return float(block * (last - first) / max(w[i, j], w[i + block - 1, j + block - 1]))
+
+
+@kernel
 def _is_object(outline: Outline) -> bool:
     """Whether an outline is that of an object."""
     table, sides = outline.table, outline.sides
@@ -238,11 +276,8 @@ def _is_object(outline: Outline) -> bool:
 
 
 @kernel
-def _fill_hull(excess: F4, part: I4, stack: I4, count: int, before: I4) -> int:
-    """Add the low cells within the convex hull of a part to it; return how many cells it has.
-
-    What ``part`` was there goes to ``before``, in the order of the stack.
-    """
+def _fill_hull(excess: F4, part: I4, stack: I4, count: int) -> int:
+    """Add the low cells within the convex hull of a part to it; return how many cells it has."""
     rows, columns = excess.shape
     parts = part.reshape(-1)
     me = parts[stack[0]]
@@ -263,7 +298,7 @@ def _fill_hull(excess: F4, part: I4, stack: I4, count: int, before: I4) -> int:
     for i in range(first, last + 1):
         for j in range(int(math.ceil(left[i] - 1e-6)), int(1e-6 - right[i]) + 1):
             if part[i, j] != me and excess[i, j] != 0:
-                stack[top], before[top] = i * columns + j, part[i, j]
+                stack[top] = i * columns + j
                 part[i, j] = me
                 top += 1
     return top

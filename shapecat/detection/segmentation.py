@@ -109,7 +109,7 @@ def segment(
     heights = heights_of(cells, planes, highest_m=settings.max_height_m)
     raised = np.zeros(cells.w.shape, np.int16)
     if "low" in rules:
-        raise_low(cells, heights, planes, raised)
+        raise_low(cells, heights, planes, raised, largest_m=settings.max_size_m)
     walls = clear_walls(cells, heights.owner, up, largest_m=settings.max_size_m, rng=rng)
     reach_over(cells, heights, planes, walls, highest_m=settings.max_height_m)
     surfaces = surfaces_of(cells, heights)
