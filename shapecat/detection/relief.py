@@ -37,6 +37,9 @@ GROWN = 0.8
 theirs: an object and a swell beside it rise less."""
 SLOPE = 0.0016
 """Fall per cell of the side of something, 1/m."""
+SAME, NEW = 0.97, 0.5
+"""Share of the cells of a part from which it is a known object: on cells, and on blocks, which are
+not as exact."""
 INWARD, OUTWARD = 2, 3
 """Cells from the outline to where its rise is measured."""
 LEAST_CELLS, LEAST_SIDES, SMALL_PART = 80, 30, 12
@@ -57,6 +60,7 @@ def raise_low(
     raised : (rows, columns) set to 1, 2, ... on low objects.
     largest_m : wider things are swells or furniture.
     """
+    objects = 0
     for k, plane in enumerate(planes):
         excess = np.zeros(cells.w.shape, np.float32)
         if _excess(cells.w, heights.owner, heights.height, plane, k + 1, excess) >= LEAST_CELLS:
@@ -65,9 +69,9 @@ def raise_low(
             faint = np.zeros([n // BLOCK for n in excess.shape], np.float32)
             _blur(excess, faint)
             for field, levels in ((excess, LEVELS), (faint, FAINT_LEVELS)):
-                _raise(
+                objects = _raise(
                     cells.w, excess, field, heights.owner, k + 1, plane[3], levels, raised, merit,
-                    largest_m * cells.lens.fx,
+                    largest_m * cells.lens.fx, objects,
                 )  # fmt: skip
             _lower(cells.w, excess, heights.owner, k + 1, plane[3], raised)
 
@@ -138,22 +142,24 @@ def _cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4) -> None:
 def _blur(excess: F4, out: F4) -> None:
     """Write the mean of the low cells in and around each block; 0 where it has none."""
     rows, columns = excess.shape
-    total, count = np.zeros((2, columns), np.float32)
-    most = np.float32(STEP)
+    sums = np.zeros((4, columns), np.float32)
+    total, count, wide, wide_count = sums
+    most, zero, one = np.float32(STEP), np.float32(0), np.float32(1)
     for i in range(1, out.shape[0] - 1):
-        total[:] = 0
-        count[:] = 0
-        for y in range(max(i * BLOCK - BLUR, 0), min((i + 1) * BLOCK + BLUR, rows)):
+        sums[:] = zero
+        for y in range(i * BLOCK - BLUR, min((i + 1) * BLOCK + BLUR, rows)):
             for j in range(columns):
-                total[j] += min(excess[y, j], most)
-                count[j] += excess[y, j] != 0
-        for j in range(1, out.shape[1] - 1):
-            s = n = np.float32(0)
-            for x in range(max(j * BLOCK - BLUR, 0), min((j + 1) * BLOCK + BLUR, columns)):
-                s += total[x]
-                n += count[x]
-            low = excess[i * BLOCK, j * BLOCK] != 0 or excess[i * BLOCK + 1, j * BLOCK + 1] != 0
-            out[i, j] = s / n if low else np.float32(0)
+                v = excess[y, j]
+                total[j] += v if v < most else most
+                count[j] += one if v != zero else zero
+        for d in range(BLOCK + 2 * BLUR):
+            for j in range(columns - BLOCK - 2 * BLUR):
+                wide[j] += total[j + d]
+                wide_count[j] += count[j + d]
+        for j in range(1, out.shape[1] - 2):
+            y, x = i * BLOCK, j * BLOCK
+            if excess[y, x] != 0 or excess[y + 1, x + 1] != 0:
+                out[i, j] = wide[x - BLUR] / wide_count[x - BLUR]
 
 
 @kernel
@@ -168,23 +174,29 @@ def _raise(
     raised: I4,
     merit_of: F4,
     widest: float,
-) -> None:
+    objects: int,
+) -> int:
     """Number the parts of ``field`` above each level, filled, whose outline is that of an object.
 
     ``field`` has a value for each cell or for each block; the latter only tells of new objects.
+    Returns the last number; ``objects`` was the last one before.
     """
     flat, marks, owners = field.reshape(-1), raised.reshape(-1), owner.reshape(-1)
     merits = merit_of.reshape(-1)
     block = excess.shape[0] // field.shape[0]
-    if np.count_nonzero(flat > levels[-1]) * block * block < LEAST_CELLS:
-        return
-    seeds = np.flatnonzero(flat > levels[-1])
+    seeds = np.zeros(flat.size, np.int32)
+    n = 0
+    for p in range(flat.size):
+        seeds[n] = p
+        n += int(flat[p] > levels[-1])
+    if n * block * block < LEAST_CELLS:
+        return objects
+    seeds = seeds[:n]
     stack = np.zeros(excess.size, np.int32)
     seen = np.zeros(field.shape, np.int32)
     part = np.zeros(excess.shape, np.int32) if block > 1 else seen.copy()
     visited, parts = seen.reshape(-1), part.reshape(-1)
     me = 0
-    objects = np.max(marks)
     for level in levels:
         first = me
         for s in seeds:
@@ -195,26 +207,27 @@ def _raise(
             if count * block * block < LEAST_CELLS or _width(field, w, stack, count) > widest:
                 continue
             count = _cells_of(excess, field, stack, count, me, part)
+            known, best = 0, 0.0
+            for p in stack[:count]:
+                known += merits[p] > 0
+                best = max(best, merits[p])
+            if known > (SAME if block == 1 else NEW) * count:
+                continue
             filled = _fill_hull(excess, part, stack, count)
             outline = _outline(w, excess, owner, part, stack, filled, number, scale, count)
             if filled > count and outline.floor < FLOOR:
-                for t in range(count, filled):
-                    parts[stack[t]] = 0
+                for p in stack[count:filled]:
+                    parts[p] = 0
                 filled = count
                 outline = _outline(w, excess, owner, part, stack, filled, number, scale, count)
-            known, best = 0, 0.0
-            for t in range(filled):
-                known += merits[stack[t]] > 0
-                best = max(best, merits[stack[t]])
+            for p in stack[count:filled]:
+                best = max(best, merits[p])
             merit = outline.rise / outline.sides
-            if block > 1 and 2 * known > filled:
-                continue
             if merit > GROWN * best and _is_object(outline):
                 objects += 1
-                for t in range(filled):
-                    marks[stack[t]] = objects
-                    merits[stack[t]] = merit
-                    owners[stack[t]] = number
+                for p in stack[:filled]:
+                    marks[p], merits[p], owners[p] = objects, merit, number
+    return objects
 
 
 @kernel
