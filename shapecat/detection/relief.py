@@ -37,7 +37,7 @@ GROWN = 0.8
 theirs: an object and a swell beside it rise less."""
 SLOPE = 0.0016
 """Fall per cell of the side of something, 1/m."""
-SAME, NEW = 0.97, 0.5
+SAME, NEW = 0.9, 0.5
 """Share of the cells of a part from which it is a known object: on cells, and on blocks, which are
 not as exact."""
 INWARD, OUTWARD = 2, 3
