@@ -21,7 +21,7 @@ from shapecat.detection.pieces import (
 from shapecat.detection.walls import ON_WALL
 from shapecat.jit import kernel
 
-__all__ = ["is_no_object", "posts_of", "remains_of", "towers_of"]
+__all__ = ["cut_by_range", "is_no_object", "posts_of", "remains_of", "towers_of"]
 
 RIM_LINKS, RIM_SHARE = 8, 0.1
 FAINT, FAINT_NOISE, FAINT_M2, FAINT_CELLS = 2.5, 3.5, 3e-3, 120
@@ -31,6 +31,8 @@ POST_M = 0.06
 """A post goes on for so far above and below the level of a board."""
 REMAINS = 0.8
 """Share of the cells of a piece on a wall."""
+CUT = 0.2
+"""Share of the cells of a piece that are the last before the end of the range."""
 STEP_M, STEPS, MISSES = 0.02, 64, 2.0
 """A surface is followed up and down in at most so many steps, until it was not seen in more than two;
 where something hides it, half a step counts."""
@@ -68,6 +70,17 @@ def remains_of(walls: U1, regions: I4, pieces: Pieces) -> Bool:
     size = pieces.group.size
     on = np.bincount(pieces.group[regions[walls == ON_WALL]], minlength=size)
     return np.asarray(on > REMAINS * pieces.shape[:, COUNT])
+
+
+def cut_by_range(cells: Cells, regions: I4, pieces: Pieces, *, range_m: float) -> Bool:
+    """Return for each piece whether it ends where the range of the readings does.
+
+    What is left of a wall or a floor there has an outline that is not its own.
+    """
+    size = pieces.group.size
+    last = (cells.w > 0) & (cells.w < 1 / range_m + JUMP / 2)
+    cut = np.bincount(pieces.group[regions[last]], minlength=size)
+    return np.asarray(cut > CUT * pieces.shape[:, COUNT])
 
 
 def towers_of(cells: Cells, planes: F8, pieces: Pieces, up: F8, *, highest_m: float) -> Bool:

@@ -15,7 +15,13 @@ from shapecat.detection.boards import boards_of
 from shapecat.detection.cells import Cells
 from shapecat.detection.directions import estimate_up
 from shapecat.detection.fill import fill_enclosed, grow_feet
-from shapecat.detection.furniture import is_no_object, posts_of, remains_of, towers_of
+from shapecat.detection.furniture import (
+    cut_by_range,
+    is_no_object,
+    posts_of,
+    remains_of,
+    towers_of,
+)
 from shapecat.detection.heights import heights_of, table_of
 from shapecat.detection.joins import join_pieces
 from shapecat.detection.ledges import cut_at_ledges
@@ -126,6 +132,7 @@ def segment(
     furniture = posts_of(cells, heights.owner, regions, pieces, up)
     furniture |= towers_of(cells, planes, pieces, up, highest_m=settings.max_height_m)
     furniture |= remains_of(walls, regions, pieces)
+    furniture |= cut_by_range(cells, regions, pieces, range_m=settings.max_range_m)
     refused = is_no_object(pieces, furniture, known, largest_m=settings.max_size_m)
     pieces.group[refused[pieces.group]] = 0
     leaders = np.flatnonzero(np.bincount(pieces.group))
