@@ -34,8 +34,8 @@ REMAINS = 0.8
 CUT = 0.2
 """Share of the cells of a piece that are the last before the end of the range."""
 STEP_M, STEPS, MISSES = 0.02, 64, 2.0
-"""A surface is followed up and down in at most so many steps, until it was not seen in more than two;
-where something hides it, half a step counts."""
+"""A surface is followed up or down in at most so many steps, until it was not seen in more than
+two; where something hides it, half a step counts."""
 TOWERING = 0.5
 """Share of a piece below surface that goes on beyond the greatest height."""
 

@@ -18,7 +18,7 @@ __all__ = ["raise_low"]
 
 LOW_M = 0.03
 """Higher things are objects anyway."""
-LEVELS = np.array([0.009, 0.0065, 0.0045, 0.0032], np.float32)
+LEVELS = np.array([0.012, 0.0085, 0.006, 0.0045, 0.0032], np.float32)
 FAINT_LEVELS = np.array([0.0022, 0.0012], np.float32)
 """Inverse depth above the plane at which outlines are looked for, 1/m; the latter, less than a step
 of a Kinect, in the mean of a block of `BLOCK` cells and `BLUR` cells around it."""
@@ -26,7 +26,7 @@ BLOCK, BLUR = 2, 2
 STEP, STEP_M = 0.004, 0.004
 """Mean rise across the outline of an object: 1/m, more than a step of a Kinect, and metres: where a
 plane is seen at a grazing angle noise rises by many steps, but not by much."""
-STEEP, STEEP_SHARE = 0.65, 0.7
+STEEP, STEEP_SHARE = 0.5, 0.7
 """A rise that is more than noise, as a share of the mean, and the share of the outline that has
 it."""
 MOST_STEPS = 3
@@ -50,9 +50,7 @@ FLOOR = 0.0006
 """Least mean height of what a rim encloses above the plane around it, 1/m: not of a wreath."""
 
 
-def raise_low(
-    cells: Cells, heights: Heights, planes: F8, raised: I4, *, largest_m: float
-) -> None:
+def raise_low(cells: Cells, heights: Heights, planes: F8, raised: I4, *, largest_m: float) -> None:
     """Give low objects the owners of objects, and swells those of the plane, in place.
 
     Parameters
@@ -61,12 +59,13 @@ def raise_low(
     largest_m : wider things are swells or furniture.
     """
     objects = 0
+    rows, columns = cells.w.shape
     for k, plane in enumerate(planes):
         excess = np.zeros(cells.w.shape, np.float32)
         if _excess(cells.w, heights.owner, heights.height, plane, k + 1, excess) >= LEAST_CELLS:
             _cut_feet(cells.w, heights.owner, heights.height, k + 1, excess)
             merit = np.zeros_like(excess)
-            faint = np.zeros([n // BLOCK for n in excess.shape], np.float32)
+            faint = np.zeros((rows // BLOCK, columns // BLOCK), np.float32)
             _blur(excess, faint)
             for field, levels in ((excess, LEVELS), (faint, FAINT_LEVELS)):
                 objects = _raise(
@@ -176,10 +175,10 @@ def _raise(
     widest: float,
     objects: int,
 ) -> int:
-    """Number the parts of ``field`` above each level, filled, whose outline is that of an object.
+    """Mark the parts of ``field`` above each level, filled, whose outline is that of an object.
 
     ``field`` has a value for each cell or for each block; the latter only tells of new objects.
-    Returns the last number; ``objects`` was the last one before.
+    They are numbered from ``objects`` + 1 on. Returns the last number.
     """
     flat, marks, owners = field.reshape(-1), raised.reshape(-1), owner.reshape(-1)
     merits = merit_of.reshape(-1)
@@ -309,7 +308,7 @@ def _fill_hull(excess: F4, part: I4, stack: I4, count: int) -> int:
     _straighten(right, first, last)
     top = count
     for i in range(first, last + 1):
-        for j in range(int(math.ceil(left[i] - 1e-6)), int(1e-6 - right[i]) + 1):
+        for j in range(math.ceil(left[i] - 1e-6), math.floor(1e-6 - right[i]) + 1):
             if part[i, j] != me and excess[i, j] != 0:
                 stack[top] = i * columns + j
                 part[i, j] = me

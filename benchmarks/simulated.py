@@ -1,0 +1,170 @@
+"""Detection on simulated scenes against their truth: objects, planes, what stands on what.
+
+    python -m benchmarks.simulated shelf empty --first 0 --count 24 [--json]
+
+One Kinect frame of each scene. Only things with at least `SEEN_PIXELS` readings are expected to be
+found; what is found of others counts neither for nor against.
+"""
+
+import json
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any, NamedTuple, get_args
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from benchmarks.measure import markdown
+from benchmarks.scenes import SEEN_PIXELS
+from shapecat.config import DetectionSettings
+from shapecat.detection import detect
+from shapecat.geometry import inverse
+from shapecat.simulation import KINECT, make_scene, render_frame
+from shapecat.simulation.scenes import SceneKind
+from shapecat.simulation.worlds import Thing, World
+from shapecat.types import Frame, Scene
+
+Array = NDArray[Any]
+HIT_IOU = 0.5
+SEEN_PLANE_PIXELS = 3000
+"""Planes with fewer readings of their upper face are not expected to be found."""
+SAME_HEIGHT_M = 0.03
+FACE_M = 0.004
+"""Readings of the upper face of a board lie this near to its height; those of its front seldom."""
+COLUMNS = (
+    "objects", "recall", "precision", "planes, scenes", "relations", "empty scenes with objects"
+)  # fmt: skip
+
+
+class View(NamedTuple):
+    """A scene, its frame, the pixel labels (h w,), and what was found."""
+
+    world: World
+    frame: Frame
+    labels: Array
+    found: Scene
+
+
+@click.command(help=__doc__)
+@click.argument("kinds", nargs=-1, required=True, type=click.Choice(get_args(SceneKind)))
+@click.option("--first", default=0, show_default=True, help="Seed of the first scene.")
+@click.option("--count", default=24, show_default=True, help="Scenes of each kind.")
+@click.option("--json", "as_json", is_flag=True, help="Print the counts as JSON.")
+def main(*, kinds: tuple[SceneKind, ...], first: int, count: int, as_json: bool) -> None:
+    """Score scenes of each kind and print a table, or the counts."""
+    counts = {kind: score(kind, first, count) for kind in kinds}
+    if as_json:
+        print(json.dumps(counts))
+        return
+    rows = [(kind, *_figures(c)) for kind, c in counts.items()]
+    title = f"Detection, simulated scenes {first} to {first + count - 1}"
+    print(markdown(title, ("scenes", *COLUMNS), rows))
+
+
+def score(kind: SceneKind, first: int, count: int) -> Counter[str]:
+    """Return what was found, missed and surplus in all scenes."""
+    total: Counter[str] = Counter()
+    for view in _views(kind, first, count):
+        matches = _matches(view, total)
+        _judge_planes(view, total)
+        _judge_relations(view, matches, total)
+        total["scenes"] += 1
+        total["empty scenes with objects"] += not view.world.things and bool(view.found.candidates)
+    return total
+
+
+def _figures(c: Counter[str]) -> Iterator[str]:
+    yield str(c["objects"])
+    for part, whole in (("hits", "objects"), ("hits", "detections")):
+        yield f"{c[part] / c[whole]:.3f}" if c[whole] else "-"
+    yield f"{c['scenes with all planes']} of {c['scenes']}"
+    yield f"{c['right relations'] / c['relations']:.3f}" if c["relations"] else "-"
+    yield str(c["empty scenes with objects"])
+
+
+def _views(kind: SceneKind, first: int, count: int) -> Iterator[View]:
+    for seed in range(first, first + count):
+        rng = np.random.default_rng(seed)
+        world = make_scene(kind, rng, frames=1)
+        frame, labels = render_frame(world, 0, rng=rng, sensor=KINECT)
+        found = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0))
+        yield View(world, frame, labels.reshape(-1), found)
+
+
+def _matches(view: View, total: Counter[str]) -> dict[int, int]:
+    """Match candidates to things one to one; return {label: candidate} of the hits."""
+    labels, candidates = view.labels, view.found.candidates
+    seen = np.bincount(labels, minlength=256)
+    things = [t.label for t in view.world.things if seen[t.label] >= SEEN_PIXELS]
+    small = [t.label for t in view.world.things if 0 < seen[t.label] < SEEN_PIXELS]
+    # Pixels without a label are mixtures of two surfaces.
+    inside = np.array([np.bincount(labels[c.indices], minlength=256) for c in candidates])
+    inside = inside.reshape(-1, 256)
+    inside[:, 0] = 0
+    common, sizes = inside[:, things], inside.sum(axis=1)
+    iou = common / np.maximum(sizes[:, None] + seen[things] - common, 1)
+    rows, columns = linear_sum_assignment(-iou)
+    matches = {
+        things[k]: int(c) for c, k in zip(rows, columns, strict=True) if iou[c, k] >= HIT_IOU
+    }
+    ignored = inside[:, small].max(axis=1, initial=0) > sizes / 2
+    ignored[list(matches.values())] = False
+    total["objects"] += len(things)
+    total["hits"] += len(matches)
+    total["detections"] += int(np.count_nonzero(~ignored))
+    return matches
+
+
+def _heights(view: View) -> Array:
+    """Return the heights of the planes found, in the world."""
+    camera = view.world.path[0].translation[2]
+    return np.array([plane.offset + camera for plane in view.found.planes])
+
+
+def _judge_planes(view: View, total: Counter[str]) -> None:
+    """Count the scene if all planes that are well seen were found, and none that is not there."""
+    up = inverse(view.world.path[0]).rotation[:, 2]
+    points = view.frame.xyz()
+    height = points @ up + view.world.path[0].translation[2]
+    near = points[:, 2] <= DetectionSettings().max_range_m
+    found = _heights(view)
+    level = [s for s in view.world.supports if s.level]
+    for support in level:
+        face = near & (view.labels == support.label) & (abs(height - support.height) < FACE_M)
+        missed = not (abs(found - support.height) < SAME_HEIGHT_M).any()
+        if missed and np.count_nonzero(face) >= SEEN_PLANE_PIXELS:
+            return
+    true = np.array([s.height for s in level])
+    if all((abs(true - h) < SAME_HEIGHT_M).any() for h in found):
+        total["scenes with all planes"] += 1
+
+
+def _judge_relations(view: View, matches: dict[int, int], total: Counter[str]) -> None:
+    """Count the things that stand on what they truly stand on, where both were found."""
+    by_track = {t.track: t for t in view.world.things}
+    heights = {s.name: s.height for s in view.world.supports if s.level}
+    found = _heights(view)
+    for thing in view.world.things:
+        if thing.label not in matches:
+            continue
+        candidate = view.found.candidates[matches[thing.label]]
+        if thing.on_support is not None:
+            apart = abs(found[candidate.plane] - heights[thing.on_support])
+            right = candidate.on_candidate is None and bool(apart < SAME_HEIGHT_M)
+        else:
+            below = _label_of(by_track, thing)
+            if below not in matches:
+                continue
+            right = candidate.on_candidate == matches[below]
+        total["relations"] += 1
+        total["right relations"] += right
+
+
+def _label_of(by_track: dict[int, Thing], thing: Thing) -> int:
+    return by_track[thing.on_track].label if thing.on_track is not None else 0
+
+
+if __name__ == "__main__":
+    main()
