@@ -32,6 +32,8 @@ it."""
 MOST_STEPS = 3
 ALL_AROUND = 0.75
 """Least sum of the rises for each side of the outline, whether it looks at the plane or not."""
+CHANCE = 16
+"""A short outline must rise more, by this over its sides: few waves of the sensor rise all around."""
 GROWN = 0.8
 """Rise per side of a part that replaces known objects within it, as a share of the greatest of
 theirs: an object and a swell beside it rise less."""
@@ -282,9 +284,8 @@ def _is_object(outline: Outline) -> bool:
     table, sides = outline.table, outline.sides
     if table < max(LEAST_SIDES, ALONG * sides) or table + outline.foot < KNOWN * sides:
         return False
-    return bool(
-        outline.rise > max(table, ALL_AROUND * sides) and outline.steep > STEEP_SHARE * table
-    )
+    least = max(table * (1 + CHANCE / sides), ALL_AROUND * sides)
+    return bool(outline.rise > least and outline.steep > STEEP_SHARE * table)
 
 
 @kernel
