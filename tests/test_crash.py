@@ -148,7 +148,7 @@ def test_phases_that_are_done_are_not_repeated(
         with pytest.raises(KeyboardInterrupt):
             process(job)
     assert [path.name for path in tmp_path.iterdir()] == [".table.partial"]
-    monkeypatch.setattr("shapecat.pipeline.perceive", interrupt)
+    monkeypatch.setattr("shapecat.perception.perceive", interrupt)
 
     process(job)
 
