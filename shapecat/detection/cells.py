@@ -53,10 +53,9 @@ class Cells(NamedTuple):
     factor: int
     size_m: float
 
-    @property
-    def small(self) -> int:
-        """Number of cells of `SMALL_M2`, within reason."""
-        return round(min(max(SMALL_M2 / max(self.size_m, 1e-6) ** 2, 20), 75))
+    def small(self, depth_m: F4) -> F4:
+        """Return the number of cells of `SMALL_M2` at each depth, within reason."""
+        return np.clip(SMALL_M2 * self.lens.fx**2 / depth_m**2, 20, 75)
 
 
 def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_M) -> Cells | None:

@@ -157,7 +157,9 @@ def _is_under(pieces: Pieces, under: int, above: int) -> bool:
         return False
     if u[LEFT] < a[LEFT] - SAME_SIDE_M or u[RIGHTMOST] > a[RIGHTMOST] + SAME_SIDE_M:
         return False
-    return bool(u[TOP] <= a[TOP] and u[FAR] / u[COUNT] < a[FAR] / a[COUNT])
+    if not a[BOTTOM] < u[TOP] <= a[TOP]:  # what ends below it bears it
+        return False
+    return bool(u[FAR] / u[COUNT] < a[FAR] / a[COUNT])
 
 
 @kernel(leaf=True)

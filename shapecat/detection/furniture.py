@@ -8,7 +8,6 @@ from shapecat.detection.heights import LEAST_M, NOISE
 from shapecat.detection.pieces import (
     AREA,
     COUNT,
-    FAR,
     FEW,
     LEFT,
     RIGHTMOST,
@@ -16,6 +15,7 @@ from shapecat.detection.pieces import (
     SAMPLES,
     TOP,
     Pieces,
+    depths_of,
     is_group,
 )
 from shapecat.detection.walls import ON_WALL
@@ -51,7 +51,7 @@ def is_no_object(pieces: Pieces, furniture: Bool, raised: Bool, *, largest_m: fl
     rim = pieces.single[:, RIM]
     edge = (rim >= RIM_LINKS) & (rim >= RIM_SHARE * pieces.boundary)
     large = shape[:, RIGHTMOST] - shape[:, LEFT] > largest_m
-    depth = shape[:, FAR] / shape[:, COUNT].clip(1)
+    depth = depths_of(pieces)
     low = shape[:, TOP] < FAINT * LEAST_M + FAINT_NOISE * NOISE * depth**2
     faint = low & ((shape[:, AREA] < FAINT_M2) | (shape[:, COUNT] < FAINT_CELLS))
     return np.asarray(edge | large | (faint & ~raised) | furniture)

@@ -4,7 +4,7 @@ from collections.abc import Collection
 
 import numpy as np
 
-from shapecat.arrays import I4
+from shapecat.arrays import F4, I4
 from shapecat.detection.cells import Cells
 from shapecat.detection.containers import join_hollow, join_overhangs, join_rims
 from shapecat.detection.occluders import join_behind
@@ -22,10 +22,12 @@ from shapecat.detection.pieces import (
     TABLE,
     TOP,
     Pieces,
+    depths_of,
     has_lid,
     is_group,
     lid_share,
     merge,
+    rests_on,
     slope_of,
 )
 from shapecat.detection.surfaces import Surfaces
@@ -54,7 +56,7 @@ def join_pieces(
 ) -> None:
     """Apply the rules named in ``rules``, in their order; `Pieces.group` holds the result."""
     if "small" in rules:
-        _join_small(pieces, cells.small)
+        _join_small(pieces, cells.small(depths_of(pieces)))
     if "occluder" in rules:
         join_behind(pieces, cells.w, cells.lens, surfaces.normal, labels)
     if "hollow" in rules:
@@ -70,14 +72,14 @@ def join_pieces(
 
 
 @kernel
-def _join_small(pieces: Pieces, small: int) -> None:
+def _join_small(pieces: Pieces, small: F4) -> None:
     """Join a piece smaller than about 9 cm2 to what it touches most."""
     n = pieces.group.size
     again = True
     while again:
         again = False
         for p in range(1, n):
-            if not is_group(pieces, p) or pieces.shape[p, COUNT] >= small:
+            if not is_group(pieces, p) or pieces.shape[p, COUNT] >= small[p]:
                 continue
             q = np.argmax(pieces.pairs[CONTACT, p])
             if pieces.pairs[CONTACT, p, q] > 0:
@@ -108,7 +110,7 @@ def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
     apart = abs(a[LEFT] + a[RIGHTMOST] - b[LEFT] - b[RIGHTMOST]) / 2
     if apart > NECK_APART * wide or slope_of(a) < ROUND / 2:
         return False
-    if a[TOP] - a[BOTTOM] > NECK_TALL * (b[TOP] - b[BOTTOM]):
+    if a[TOP] - a[BOTTOM] > NECK_TALL * (b[TOP] - b[BOTTOM]) or rests_on(pieces, p, q):
         return False
     if pieces.pairs[ONTO, p, q] <= NECK_LEDGE * pieces.pairs[CONTACT, p, q]:
         return bool(narrow <= wide and not has_lid(pieces, q))
@@ -141,6 +143,7 @@ def _join_floating(pieces: Pieces) -> None:
                 and hidden < SEEN_WHOLE * pieces.boundary[p]
                 and np.sum(pieces.pairs[ONTO, p]) < STANDS * total
                 and pieces.shape[p, COUNT] < PART * pieces.shape[q, COUNT]
+                and not rests_on(pieces, p, q)
             ):
                 merge(pieces, q, p)
                 again = True

@@ -36,11 +36,13 @@ __all__ = [
     "TOP",
     "TURN",
     "Pieces",
+    "depths_of",
     "has_lid",
     "is_group",
     "lid_share",
     "merge",
     "pieces_of",
+    "rests_on",
     "side_of",
     "slope_of",
 ]
@@ -59,6 +61,10 @@ BANDS = 128
 LID_M, LID = 0.02, 0.25
 """A top is closed if this share of its width squared faces up within this depth of it."""
 BAND_M = 0.005
+LEDGE_M2, FLAT, MEETS_M = 4e-4, 0.9, 0.0075
+LEVEL, SLOPING = 3, 8
+"""A level top: least visible area, and share of what faces up in the upper `SLOPING` bands that is
+in the upper `LEVEL` ones; how far what stands on it may seem to begin above or below it."""
 GAP, SHADOW = 3, 15
 INWARD = 3
 UPWARD = 0.8
@@ -330,6 +336,12 @@ def merge(pieces: Pieces, p: int, q: int) -> None:
             pieces.group[k] = p
 
 
+def depths_of(pieces: Pieces) -> F4:
+    """Return the mean depth of each piece, metres; 1 where it has no cell."""
+    shape = pieces.shape
+    return np.asarray(np.where(shape[:, COUNT] > 0, shape[:, FAR] / shape[:, COUNT].clip(1), 1))
+
+
 @kernel(leaf=True)
 def is_group(pieces: Pieces, p: int) -> bool:
     """Whether a piece has not been merged into another."""
@@ -351,6 +363,19 @@ def slope_of(row: F4) -> float:
 def has_lid(pieces: Pieces, p: int) -> bool:
     """Whether the top of a piece is closed by a surface that faces up."""
     return bool(lid_share(pieces, p, LID_M) > LID)
+
+
+@kernel(leaf=True)
+def rests_on(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether piece ``p`` begins where ``q`` ends in a level top; a shoulder slopes."""
+    if abs(pieces.shape[p, BOTTOM] - pieces.shape[q, TOP]) > MEETS_M:
+        return False
+    top = min(int(pieces.shape[q, TOP] / BAND_M), BANDS - 1)
+    level = near = 0.0
+    for band in range(max(top - SLOPING, 0), top + 1):
+        near += pieces.lid[q, band]
+        level += pieces.lid[q, band] if band > top - LEVEL else 0.0
+    return bool(level > LEDGE_M2 and level > FLAT * near)
 
 
 @kernel(leaf=True)

@@ -9,6 +9,7 @@ from shapecat.arrays import F4, F8, I4, U4, Bool
 from shapecat.config import DetectionSettings
 from shapecat.detection.candidates import Extents, extents_of, occluded, stands_of
 from shapecat.detection.cells import NEAREST_M, Cells
+from shapecat.detection.pieces import depths_of
 from shapecat.detection.planes import Support, corners_of
 from shapecat.detection.segmentation import Segmentation
 from shapecat.geometry import (
@@ -44,9 +45,12 @@ def scene_of(
     ``points`` (n, 3), view frame.
     """
     count = found.leaders.size - 1
-    least = max(settings.min_points, cells.small * cells.factor**2 if points is None else 0)
+    least = np.full(len(indices), settings.min_points)
+    if points is None:
+        small = cells.small(depths_of(found.pieces)[found.leaders[1:]])
+        least = np.maximum(least, small * cells.factor**2)
     kept = sorted(
-        (k for k, index in enumerate(indices) if index.size >= least),
+        (k for k, index in enumerate(indices) if index.size >= least[k]),
         key=lambda k: int(indices[k][0]),
     )
     position = {k + 1: n for n, k in enumerate(kept)}
