@@ -29,6 +29,8 @@ SAME_SIDE_M, SAME_SIDE, CUT_SIDE = 0.012, 0.25, 0.6
 something hides a part of the outside."""
 HOLLOW = -0.25
 """`slope_of` from which a piece is concave; planes are within a tenth of 0."""
+STRAIGHT = 0.2
+"""`slope_of` up to which a piece without a lid that touches the outside is no outside itself."""
 BENT, INSIDE, INSIDE_SHARE = -0.15, -0.4, 0.12
 """Walls inside one container: slope of each, of both together, share of a boundary in contact."""
 FLOOR_SHARE, WITHIN = 0.6, 0.85
@@ -120,7 +122,7 @@ def _is_container(pieces: Pieces, inside: int, outside: int) -> bool:
     slack = max(SAME_SIDE_M, (CUT_SIDE if cut else SAME_SIDE) * width)
     if x[LEFT] < a[LEFT] - slack or x[RIGHTMOST] > a[RIGHTMOST] + slack:
         return False
-    if slope_of(x) > HOLLOW:
+    if slope_of(x) > (STRAIGHT if touch >= FEW else HOLLOW):
         return False
     return not (has_lid(pieces, outside) or has_lid(pieces, inside))
 
