@@ -11,6 +11,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
 from shapecat.config import DetectionSettings
+from shapecat.detection.axes import cut_at_axes
 from shapecat.detection.boards import boards_of
 from shapecat.detection.cells import Cells
 from shapecat.detection.directions import estimate_up
@@ -42,6 +43,7 @@ RULES = (
     "low",
     "concave",
     "ledge",
+    "axis",
     "small",
     "occluder",
     "hollow",
@@ -121,10 +123,13 @@ def segment(
     surfaces = surfaces_of(cells, heights)
     regions, n = regions_of(heights, surfaces, concave="concave" in rules)
     pieces = pieces_of(cells, heights, surfaces, regions, n, up)
+    more = n
     if "ledge" in rules:
         more = cut_at_ledges(cells, heights, surfaces, pieces, regions, up)
-        if more > n:
-            pieces = pieces_of(cells, heights, surfaces, regions, more, up)
+    if "axis" in rules:
+        more = cut_at_axes(cells, heights, surfaces, regions, up, more)
+    if more > n:
+        pieces = pieces_of(cells, heights, surfaces, regions, more, up)
     known = join_raised(pieces, raised, regions)
     join_pieces(pieces, cells, surfaces, regions, rules)
     if "ring" in rules:
