@@ -12,6 +12,7 @@ from shapecat.detection.pieces import (
     LEFT,
     NEAR,
     RIGHTMOST,
+    TABLE,
     TOP,
     Pieces,
     has_lid,
@@ -24,7 +25,7 @@ from shapecat.jit import kernel
 __all__ = ["join_hollow", "join_overhangs", "join_rims"]
 
 SAME_TOP_M = 0.015
-SAME_SIDE_M, SAME_SIDE, CUT_SIDE = 0.012, 0.25, 0.6
+SAME_SIDE_M, SAME_SIDE, CUT_SIDE = 0.012, 0.25, 0.4
 """How far an inside may reach beyond the outside: metres, share of the width, and the share if
 something hides a part of the outside."""
 HOLLOW = -0.25
@@ -159,9 +160,15 @@ def _is_under(pieces: Pieces, under: int, above: int) -> bool:
         return False
     if u[LEFT] < a[LEFT] - SAME_SIDE_M or u[RIGHTMOST] > a[RIGHTMOST] + SAME_SIDE_M:
         return False
-    if not a[BOTTOM] < u[TOP] <= a[TOP]:  # what ends below it bears it
+    if not a[BOTTOM] < u[TOP] <= a[TOP] or _bears(pieces, under, above):
         return False
     return bool(u[FAR] / u[COUNT] < a[FAR] / a[COUNT])
+
+
+@kernel(leaf=True)
+def _bears(pieces: Pieces, under: int, above: int) -> bool:
+    """Whether one piece stands on the plane, and the other on it."""
+    return bool(pieces.single[under, TABLE] >= FEW and pieces.single[above, TABLE] < FEW)
 
 
 @kernel(leaf=True)

@@ -101,7 +101,7 @@ def _join_necks(pieces: Pieces) -> None:
 @kernel(leaf=True)
 def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
     a, b = pieces.shape[p], pieces.shape[q]
-    met = pieces.pairs[CONTACT, p, q] + pieces.pairs[NEAR, p, q] + pieces.pairs[FRONT, p, q]
+    met = pieces.pairs[CONTACT, p, q] + pieces.pairs[NEAR, p, q]
     if met < FEW or pieces.owner[p] != pieces.owner[q] or pieces.single[p, TABLE] > 2:
         return False
     narrow, wide = a[RIGHTMOST] - a[LEFT], b[RIGHTMOST] - b[LEFT]
