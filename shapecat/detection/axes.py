@@ -19,12 +19,13 @@ from shapecat.jit import kernel
 
 __all__ = ["cut_at_axes"]
 
-STEEP = 0.6
-"""Largest cosine between up and the normals of a side."""
+STEEP = 0.35
+"""Largest cosine between up and the normals of a side; on shoulders only a part would be below."""
 LEAST_CELLS, LEAST_BANDS = 60, 3
 """Of either part; an axis fitted to less is not sure."""
-APART_M, BETTER = 0.004, 0.3
-"""Lateral distance of the axes, a cell; by how much two explain the sides better than one."""
+APART_M, BEHIND_M, BETTER = 0.004, 0.01, 0.4
+"""Distance of the axes, across the view a cell, along it more, for only one half of a circle is
+seen; by how much two axes explain the sides better than one."""
 OFF_M = 0.0035
 """Standard deviation of the sides of a round object from their circles: a cell."""
 SLIM, STOUT = 0.35, 0.85
@@ -128,7 +129,7 @@ def _best_cut(bands: F8) -> int:
             better = 1 - (lower[3] + upper[3]) / max(one[3], 1e-12)
             if (
                 better > most
-                and abs(lower[0] - upper[0]) > APART_M
+                and (abs(lower[0] - upper[0]) > APART_M or abs(lower[1] - upper[1]) > BEHIND_M)
                 and above[WIDTH] / above[N] > NARROW * below[WIDTH] / below[N]
                 and _is_round(below, lower)
                 and _is_round(above, upper)
