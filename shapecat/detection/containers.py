@@ -25,9 +25,8 @@ from shapecat.jit import kernel
 __all__ = ["join_hollow", "join_overhangs", "join_rims"]
 
 SAME_TOP_M = 0.015
-SAME_SIDE_M, SAME_SIDE, CUT_SIDE = 0.012, 0.25, 0.4
-"""How far an inside may reach beyond the outside: metres, share of the width, and the share if
-something hides a part of the outside."""
+SAME_SIDE_M, SAME_SIDE = 0.012, 0.4
+"""How far an inside may reach beyond what is seen of the outside: metres, share of the width."""
 HOLLOW = -0.25
 """`slope_of` from which a piece is concave; planes are within a tenth of 0."""
 STRAIGHT = 0.2
@@ -118,9 +117,7 @@ def _is_container(pieces: Pieces, inside: int, outside: int) -> bool:
         return False
     inner = x[RIGHTMOST] - x[LEFT]
     width = max(a[RIGHTMOST] - a[LEFT], inner)
-    # An outside that something hides a part of may be wider than it looks.
-    cut = np.sum(pairs[FRONT, :, outside]) - pairs[FRONT, inside, outside] >= 2 * FEW
-    slack = max(SAME_SIDE_M, (CUT_SIDE if cut else SAME_SIDE) * width)
+    slack = max(SAME_SIDE_M, SAME_SIDE * width)
     if x[LEFT] < a[LEFT] - slack or x[RIGHTMOST] > a[RIGHTMOST] + slack:
         return False
     if slope_of(x) > (STRAIGHT if touch >= FEW else HOLLOW):
