@@ -72,11 +72,19 @@ def _is_inside(pieces: Pieces, p: int, q: int) -> bool:
     if contact < max(FEW, INSIDE_SHARE * min(pieces.boundary[p], pieces.boundary[q])):
         return False
     a, b = pieces.shape[p], pieces.shape[q]
-    if slope_of(a) > BENT or slope_of(b) > BENT:
+    if (slope_of(a) > BENT or slope_of(b) > BENT) and not _are_walls(pieces, p, q):
         return False
     both = a + b
     both[LEFT], both[RIGHTMOST] = min(a[LEFT], b[LEFT]), max(a[RIGHTMOST], b[RIGHTMOST])
     return bool(slope_of(both) < INSIDE)
+
+
+@kernel(leaf=True)
+def _are_walls(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether two pieces end at one height, and neither in a lid: the flat walls of a square bowl."""
+    if abs(pieces.shape[p, TOP] - pieces.shape[q, TOP]) > SAME_TOP_M:
+        return False
+    return not (has_lid(pieces, p) or has_lid(pieces, q))
 
 
 @kernel(leaf=True)
