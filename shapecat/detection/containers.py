@@ -1,7 +1,5 @@
 """Containers: the inside and the outside of bowls, cups and pots."""
 
-import numpy as np
-
 from shapecat.detection.pieces import (
     BOTTOM,
     CONTACT,
@@ -81,7 +79,7 @@ def _is_inside(pieces: Pieces, p: int, q: int) -> bool:
 
 @kernel(leaf=True)
 def _are_walls(pieces: Pieces, p: int, q: int) -> bool:
-    """Whether two pieces end at one height, and neither in a lid: the flat walls of a square bowl."""
+    """Whether two pieces end at one height without a lid, as the walls of a square bowl do."""
     if abs(pieces.shape[p, TOP] - pieces.shape[q, TOP]) > SAME_TOP_M:
         return False
     return not (has_lid(pieces, p) or has_lid(pieces, q))

@@ -1,0 +1,75 @@
+"""Stacks and containers: where one object ends, told without an edge."""
+
+import numpy as np
+import pytest
+
+from tests.test_detection import (
+    Array,
+    Shape,
+    ball,
+    box,
+    can,
+    check,
+    found,
+    frame_of,
+    overlaps,
+    render,
+    shell,
+    table,
+)
+
+
+def union(*parts: Shape) -> Shape:
+    """Return several shapes that are one object."""
+
+    def hit(origin: Array, rays: Array) -> Array:
+        return np.asarray(np.minimum.reduce([part(origin, rays) for part in parts]))
+
+    return hit
+
+
+def test_can_on_the_corner_of_a_box_is_no_neck() -> None:
+    """Two faces of a box seen at once turn as the side of a bottle does; but its top is level."""
+    shapes = [table(), box((0, 0, 0), (0.14, 0.14, 0.13), np.pi / 4), can(0, 0, 0.13, 0.045, 0.05)]
+    check(shapes, [1, 2], tilt_deg=28)
+
+
+def test_cans_of_one_radius_are_parted_by_their_axes() -> None:
+    """No edge parts their sides, and the ledge between them is thin."""
+    shapes = [table(), can(0, 0, 0, 0.04, 0.1), can(0.012, 0, 0.1, 0.038, 0.1)]
+    check(shapes, [1, 2], 0.8, tilt_deg=28)
+
+
+def test_round_object_with_one_axis_stays_whole() -> None:
+    """A waist changes the radius, not the axis."""
+    slices = [can(0, 0, 0.01 * k, 0.04 + 0.006 * np.cos(k / 2.5), 0.0101) for k in range(20)]
+    check([table(), union(*slices)], [1])
+
+
+def test_small_ball_behind_the_middle_of_the_scene() -> None:
+    """It has fewer cells than the smallest object would have at the median depth."""
+    shapes = [
+        table(0.5, 0.9),
+        box((-0.2, -0.25, 0), (0.15, 0.15, 0.1)),
+        ball((0.15, 0.45, 0.02), 0.02),
+    ]
+    check(shapes, [1, 2])
+
+
+def test_can_that_bears_a_bowl_is_no_part_of_it() -> None:
+    """What is seen below a rim is the outside of a bowl, or what the bowl stands on."""
+    shapes = [table(), can(0, -0.01, 0, 0.05, 0.08), shell((0, 0, 0.18), 0.12, 0.15)]
+    depth, seen = render(shapes, tilt_deg=40)
+    under, above = overlaps(found(frame_of(depth)), seen, [1, 2])
+    assert under > 0.5
+    assert above > 0.9
+
+
+@pytest.mark.parametrize("yaw", [0.3, 0.6])
+def test_square_bowl_is_one_object(yaw: float) -> None:
+    """Its walls are flat, meet inside in concave edges, and end at one height."""
+    along, across = (0.16, 0.006, 0.07), (0.006, 0.16, 0.07)
+    c, s = 0.077 * np.cos(yaw), 0.077 * np.sin(yaw)
+    walls = [box((k * c, k * s, 0), across, yaw) for k in (-1, 1)]
+    walls += [box((-k * s, k * c, 0), along, yaw) for k in (-1, 1)]
+    check([table(), union(*walls, box((0, 0, 0), (0.16, 0.16, 0.006), yaw))], [1])
