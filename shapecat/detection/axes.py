@@ -9,10 +9,10 @@ import math
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.cells import Cells, Lens
 from shapecat.detection.heights import Heights
-from shapecat.detection.pieces import BAND_M, BANDS, side_of
+from shapecat.detection.pieces import BAND_M, BANDS, COUNT, Pieces, side_of, slope_of
 from shapecat.detection.surfaces import Surfaces
 from shapecat.geometry import cross
 from shapecat.jit import kernel
@@ -21,6 +21,8 @@ __all__ = ["cut_at_axes"]
 
 STEEP = 0.35
 """Largest cosine between up and the normals of a side; on shoulders only a part would be below."""
+ROUND = 0.8
+"""`slope_of` from which a piece may be round."""
 LEAST_CELLS, LEAST_BANDS = 60, 3
 """Of either part; an axis fitted to less is not sure."""
 APART_M, BEHIND_M, BETTER = 0.004, 0.01, 0.4
@@ -38,7 +40,7 @@ the mean of each band of height, and widths of bands."""
 
 
 def cut_at_axes(
-    cells: Cells, heights: Heights, surfaces: Surfaces, labels: I4, up: F8, n: int
+    cells: Cells, heights: Heights, surfaces: Surfaces, pieces: Pieces, labels: I4, up: F8, n: int
 ) -> int:
     """Give what turns about another axis a label of its own, in place; return how many there are.
 
@@ -49,7 +51,8 @@ def cut_at_axes(
     side = side_of(up)
     forward = cross(up, side)
     sums = np.zeros((n + 1, BANDS, 11))
-    _add(cells.w, cells.lens, heights.height, surfaces, labels, up, side, forward, sums)
+    rounded = _are_rounded(pieces, n)
+    _add(cells.w, cells.lens, heights.height, surfaces, labels, rounded, up, side, forward, sums)
     for p in range(1, n + 1):
         band = _best_cut(sums[p])
         if band > 0:
@@ -59,12 +62,24 @@ def cut_at_axes(
 
 
 @kernel
+def _are_rounded(pieces: Pieces, n: int) -> Bool:
+    """Return for the labels 0..n whether they may be round things; what has just been cut may."""
+    result = np.ones(n + 1, np.bool_)
+    result[0] = False
+    for p in range(1, pieces.group.size):
+        row = pieces.shape[p]
+        result[p] = row[COUNT] >= 2 * LEAST_CELLS and slope_of(row) > ROUND
+    return result
+
+
+@kernel
 def _add(
     w: F4,
     lens: Lens,
     height: F4,
     surfaces: Surfaces,
     labels: I4,
+    rounded: Bool,
     up: F8,
     side: F8,
     forward: F8,
@@ -76,7 +91,7 @@ def _add(
     for i in range(labels.shape[0]):
         for j in range(labels.shape[1]):
             p = labels[i, j]
-            if p == 0 or not surfaces.tangent[i, j, 0] > 0:
+            if not (rounded[p] and surfaces.tangent[i, j, 0] > 0):
                 continue
             m = surfaces.normal[i, j]
             if m[0] * up[0] + m[1] * up[1] + m[2] * up[2] > STEEP:

@@ -127,7 +127,7 @@ def segment(
     if "ledge" in rules:
         more = cut_at_ledges(cells, heights, surfaces, pieces, regions, up)
     if "axis" in rules:
-        more = cut_at_axes(cells, heights, surfaces, regions, up, more)
+        more = cut_at_axes(cells, heights, surfaces, pieces, regions, up, more)
     if more > n:
         pieces = pieces_of(cells, heights, surfaces, regions, more, up)
     known = join_raised(pieces, raised, regions)
