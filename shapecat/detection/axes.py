@@ -49,22 +49,50 @@ def cut_at_axes(
     labels : (rows, columns) 1..n, 0 elsewhere.
     """
     side = side_of(up)
-    forward = cross(up, side)
-    sums = np.zeros((n + 1, BANDS, 11))
-    rounded = _are_rounded(pieces, n)
-    _add(cells.w, cells.lens, heights.height, surfaces, labels, rounded, up, side, forward, sums)
-    for p in range(1, n + 1):
-        band = _best_cut(sums[p])
-        if band > 0:
-            n += 1
-            labels[(labels == p) & (heights.height > (band + 0.5) * BAND_M)] = n
+    cut = np.zeros(n + 1, np.int64)
+    _find(
+        cells.w,
+        cells.lens,
+        heights.height,
+        surfaces,
+        pieces,
+        labels,
+        up,
+        side,
+        cross(up, side),
+        cut,
+    )
+    for p in np.flatnonzero(cut):
+        n += 1
+        labels[(labels == p) & (heights.height > (cut[p] + 0.5) * BAND_M)] = n
     return n
 
 
 @kernel
-def _are_rounded(pieces: Pieces, n: int) -> Bool:
-    """Return for the labels 0..n whether they may be round things; what has just been cut may."""
-    result = np.ones(n + 1, np.bool_)
+def _find(
+    w: F4,
+    lens: Lens,
+    height: F4,
+    surfaces: Surfaces,
+    pieces: Pieces,
+    labels: I4,
+    up: F8,
+    side: F8,
+    forward: F8,
+    cut: I4,
+) -> None:
+    """Write the band of the best cut of each label."""
+    sums = np.zeros((cut.size, BANDS, 11))
+    rounded = _are_rounded(pieces, cut.size)
+    _add(w, lens, height, surfaces, labels, rounded, up, side, forward, sums)
+    for p in range(1, cut.size):
+        cut[p] = _best_cut(sums[p])
+
+
+@kernel
+def _are_rounded(pieces: Pieces, labels: int) -> Bool:
+    """Return for each label whether it may be a round thing; what has just been cut may."""
+    result = np.ones(labels, np.bool_)
     result[0] = False
     for p in range(1, pieces.group.size):
         row = pieces.shape[p]
