@@ -40,6 +40,12 @@ def test_cans_of_one_radius_are_parted_by_their_axes() -> None:
     check(shapes, [1, 2], 0.8, tilt_deg=28)
 
 
+def test_tower_of_three_cans() -> None:
+    """What is above a cut may hold another."""
+    tower = [can(x, 0, z, 0.04, 0.09) for x, z in ((0, 0), (0.014, 0.09), (0, 0.18))]
+    check([table(), *tower], [1, 2, 3], 0.75, tilt_deg=28)
+
+
 def test_round_object_with_one_axis_stays_whole() -> None:
     """A waist changes the radius, not the axis."""
     slices = [can(0, 0, 0.01 * k, 0.04 + 0.006 * np.cos(k / 2.5), 0.0101) for k in range(20)]

@@ -49,7 +49,7 @@ def cut_at_axes(
     labels : (rows, columns) 1..n, 0 elsewhere.
     """
     side = side_of(up)
-    cut = np.zeros(n + 1, np.int64)
+    cut = np.zeros((n + 1, BANDS), np.bool_)
     _find(
         cells.w,
         cells.lens,
@@ -62,9 +62,11 @@ def cut_at_axes(
         cross(up, side),
         cut,
     )
-    for p in np.flatnonzero(cut):
-        n += 1
-        labels[(labels == p) & (heights.height > (cut[p] + 0.5) * BAND_M)] = n
+    last = 0
+    for p, band in np.argwhere(cut):
+        rest = n if p == last else p  # what the cut below has left
+        n, last = n + 1, p
+        labels[(labels == rest) & (heights.height > (band + 0.5) * BAND_M)] = n
     return n
 
 
@@ -79,14 +81,25 @@ def _find(
     up: F8,
     side: F8,
     forward: F8,
-    cut: I4,
+    cut: Bool,
 ) -> None:
-    """Write the band of the best cut of each label."""
-    sums = np.zeros((cut.size, BANDS, 11))
-    rounded = _are_rounded(pieces, cut.size)
+    """Mark the bands at which each label is to be cut."""
+    sums = np.zeros((*cut.shape, 11))
+    rounded = _are_rounded(pieces, len(cut))
     _add(w, lens, height, surfaces, labels, rounded, up, side, forward, sums)
-    for p in range(1, cut.size):
-        cut[p] = _best_cut(sums[p])
+    parts = np.zeros((BANDS, 2), np.int64)
+    for p in range(1, len(cut)):
+        parts[0] = 0, BANDS
+        top = 1
+        while top > 0:
+            top -= 1
+            low, high = parts[top]
+            band = low + _best_cut(sums[p, low:high])
+            if band > low:
+                cut[p, band] = True
+                parts[top] = low, band
+                parts[top + 1] = band + 1, high
+                top += 2
 
 
 @kernel
