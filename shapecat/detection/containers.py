@@ -22,13 +22,11 @@ from shapecat.jit import kernel
 
 __all__ = ["join_hollow", "join_overhangs", "join_rims"]
 
-SAME_TOP_M = 0.015
+SAME_TOP_M = 0.01
 SAME_SIDE_M, SAME_SIDE = 0.012, 0.4
 """How far an inside may reach beyond what is seen of the outside: metres, share of the width."""
 HOLLOW = -0.25
 """`slope_of` from which a piece is concave; planes are within a tenth of 0."""
-STRAIGHT = 0.2
-"""`slope_of` up to which a piece without a lid that touches the outside is no outside itself."""
 BENT, INSIDE, INSIDE_SHARE = -0.15, -0.4, 0.12
 """Walls inside one container: slope of each, of both together, share of a boundary in contact."""
 FLOOR_SHARE, WITHIN = 0.6, 0.85
@@ -126,7 +124,9 @@ def _is_container(pieces: Pieces, inside: int, outside: int) -> bool:
     slack = max(SAME_SIDE_M, SAME_SIDE * width)
     if x[LEFT] < a[LEFT] - slack or x[RIGHTMOST] > a[RIGHTMOST] + slack:
         return False
-    if slope_of(x) > (STRAIGHT if touch >= FEW else HOLLOW):
+    # Where they touch, ending at one height without a lid says enough: within small cups the
+    # windows of the tangents smear the curvature.
+    if touch < FEW and slope_of(x) > HOLLOW:
         return False
     return not (has_lid(pieces, outside) or has_lid(pieces, inside))
 
