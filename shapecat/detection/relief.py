@@ -18,11 +18,8 @@ __all__ = ["raise_low"]
 
 LOW_M = 0.03
 """Higher things are objects anyway."""
-LEVELS = np.array([0.012, 0.0085, 0.006, 0.0045, 0.0032], np.float32)
-FAINT_LEVELS = np.array([0.0022, 0.0012], np.float32)
-"""Inverse depth above the plane at which outlines are looked for, 1/m; the latter, less than a step
-of a Kinect, in the mean of a block of `BLOCK` cells and `BLUR` cells around it."""
-BLOCK, BLUR = 2, 2
+LEVELS = np.array([0.012, 0.008, 0.0055, 0.0038, 0.0025], np.float32)
+"""Inverse depth above the plane at which outlines are looked for, 1/m."""
 STEP, STEP_M = 0.004, 0.004
 """Mean rise across the outline of an object: 1/m, more than a step of a Kinect, and metres: where a
 plane is seen at a grazing angle noise rises by many steps, but not by much."""
@@ -33,15 +30,14 @@ MOST_STEPS = 3
 ALL_AROUND = 0.75
 """Least sum of the rises for each side of the outline, whether it looks at the plane or not."""
 CHANCE = 16
-"""A short outline must rise more, by this over its sides: few waves of the sensor rise all around."""
+"""A short outline must rise more, by this over its sides: few waves rise all around."""
 GROWN = 0.8
 """Rise per side of a part that replaces known objects within it, as a share of the greatest of
 theirs: an object and a swell beside it rise less."""
 SLOPE = 0.0016
 """Fall per cell of the side of something, 1/m."""
-SAME, NEW = 0.9, 0.5
-"""Share of the cells of a part from which it is a known object: on cells, and on blocks, which are
-not as exact."""
+SAME = 0.9
+"""Share of the cells of a part from which it is a known object."""
 INWARD, OUTWARD = 2, 3
 """Cells from the outline to where its rise is measured."""
 LEAST_CELLS, LEAST_SIDES, SMALL_PART = 80, 30, 12
@@ -61,19 +57,14 @@ def raise_low(cells: Cells, heights: Heights, planes: F8, raised: I4, *, largest
     largest_m : wider things are swells or furniture.
     """
     objects = 0
-    rows, columns = cells.w.shape
     for k, plane in enumerate(planes):
         excess = np.zeros(cells.w.shape, np.float32)
         if _excess(cells.w, heights.owner, heights.height, plane, k + 1, excess) >= LEAST_CELLS:
             _cut_feet(cells.w, heights.owner, heights.height, k + 1, excess)
-            merit = np.zeros_like(excess)
-            faint = np.zeros((rows // BLOCK, columns // BLOCK), np.float32)
-            _blur(excess, faint)
-            for field, levels in ((excess, LEVELS), (faint, FAINT_LEVELS)):
-                objects = _raise(
-                    cells.w, excess, field, heights.owner, k + 1, plane[3], levels, raised, merit,
-                    largest_m * cells.lens.fx, objects,
-                )  # fmt: skip
+            widest = largest_m * cells.lens.fx
+            objects = _raise(
+                cells.w, excess, heights.owner, k + 1, plane[3], raised, widest, objects
+            )
             _lower(cells.w, excess, heights.owner, k + 1, plane[3], raised)
 
 
@@ -140,79 +131,48 @@ def _cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4) -> None:
 
 
 @kernel
-def _blur(excess: F4, out: F4) -> None:
-    """Write the mean of the low cells in and around each block; 0 where it has none."""
-    rows, columns = excess.shape
-    sums = np.zeros((4, columns), np.float32)
-    total, count, wide, wide_count = sums
-    most, zero, one = np.float32(STEP), np.float32(0), np.float32(1)
-    for i in range(1, out.shape[0] - 1):
-        sums[:] = zero
-        for y in range(i * BLOCK - BLUR, min((i + 1) * BLOCK + BLUR, rows)):
-            for j in range(columns):
-                v = excess[y, j]
-                total[j] += v if v < most else most
-                count[j] += one if v != zero else zero
-        for d in range(BLOCK + 2 * BLUR):
-            for j in range(columns - BLOCK - 2 * BLUR):
-                wide[j] += total[j + d]
-                wide_count[j] += count[j + d]
-        for j in range(1, out.shape[1] - 2):
-            y, x = i * BLOCK, j * BLOCK
-            if excess[y, x] != 0 or excess[y + 1, x + 1] != 0:
-                out[i, j] = wide[x - BLUR] / wide_count[x - BLUR]
-
-
-@kernel
 def _raise(
     w: F4,
     excess: F4,
-    field: F4,
     owner: I4,
     number: int,
     scale: float,
-    levels: F4,
     raised: I4,
-    merit_of: F4,
     widest: float,
     objects: int,
 ) -> int:
-    """Mark the parts of ``field`` above each level, filled, whose outline is that of an object.
+    """Mark the parts above each level, filled, whose outline is that of an object.
 
-    ``field`` has a value for each cell or for each block; the latter only tells of new objects.
     They are numbered from ``objects`` + 1 on. Returns the last number.
     """
-    flat, marks, owners = field.reshape(-1), raised.reshape(-1), owner.reshape(-1)
-    merits = merit_of.reshape(-1)
-    block = excess.shape[0] // field.shape[0]
+    flat, marks, owners = excess.reshape(-1), raised.reshape(-1), owner.reshape(-1)
     seeds = np.zeros(flat.size, np.int32)
     n = 0
     for p in range(flat.size):
         seeds[n] = p
-        n += int(flat[p] > levels[-1])
-    if n * block * block < LEAST_CELLS:
+        n += int(flat[p] > LEVELS[-1])
+    if n < LEAST_CELLS:
         return objects
-    seeds = seeds[:n]
-    stack = np.zeros(excess.size, np.int32)
-    seen = np.zeros(field.shape, np.int32)
-    part = np.zeros(excess.shape, np.int32) if block > 1 else seen.copy()
+    stack = np.zeros(flat.size, np.int32)
+    seen, part = np.zeros(excess.shape, np.int32), np.zeros(excess.shape, np.int32)
     visited, parts = seen.reshape(-1), part.reshape(-1)
+    merits = np.zeros(flat.size, np.float32)
     me = 0
-    for level in levels:
+    for level in LEVELS:
         first = me
-        for s in seeds:
+        for s in seeds[:n]:
             if visited[s] > first or not flat[s] > level:
                 continue
             me += 1
-            count = _flood(field, level, s, me, seen, stack)
-            if count * block * block < LEAST_CELLS or _width(field, w, stack, count) > widest:
+            count = _flood(excess, level, s, me, seen, stack)
+            if count < LEAST_CELLS or _width(w, stack, count) > widest:
                 continue
-            count = _cells_of(excess, field, stack, count, me, part)
             known, best = 0, 0.0
             for p in stack[:count]:
+                parts[p] = me
                 known += merits[p] > 0
                 best = max(best, merits[p])
-            if known > (SAME if block == 1 else NEW) * count:
+            if known > SAME * count:
                 continue
             filled = _fill_hull(excess, part, stack, count)
             outline = _outline(w, excess, owner, part, stack, filled, number, scale, count)
@@ -229,22 +189,6 @@ def _raise(
                 for p in stack[:filled]:
                     marks[p], merits[p], owners[p] = objects, merit, number
     return objects
-
-
-@kernel
-def _cells_of(excess: F4, field: F4, stack: I4, count: int, me: int, part: I4) -> int:
-    """Replace the blocks of a part on the stack by their low cells; return how many they are."""
-    block = excess.shape[0] // field.shape[0]
-    top = 0
-    for p in stack[:count].copy():
-        i, j = block * (p // field.shape[1]), block * (p % field.shape[1])
-        for y in range(i, i + block):
-            for x in range(j, j + block):
-                if excess[y, x] != 0 and y > 0 and x > 0:
-                    stack[top] = y * excess.shape[1] + x
-                    part[y, x] = me
-                    top += 1
-    return top
 
 
 class Outline(NamedTuple):
@@ -267,15 +211,14 @@ class Outline(NamedTuple):
 
 
 @kernel
-def _width(field: F4, w: F4, stack: I4, count: int) -> float:
+def _width(w: F4, stack: I4, count: int) -> float:
     """Return the extent of a part along the rows, in cells a metre away."""
-    block, columns = w.shape[0] // field.shape[0], field.shape[1]
+    columns = w.shape[1]
     first, last = columns, 0
-    for t in range(count):
-        j = stack[t] % columns
+    for p in stack[:count]:
+        j = p % columns
         first, last = min(first, j), max(last, j)
-    i, j = block * (stack[0] // columns), block * (stack[0] % columns)
-    return float(block * (last - first) / max(w[i, j], w[i + block - 1, j + block - 1]))
+    return float((last - first) / w[stack[0] // columns, stack[0] % columns])
 
 
 @kernel
