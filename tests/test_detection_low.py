@@ -88,3 +88,24 @@ def test_empty_tables(sensor: Any) -> None:
         rng = np.random.default_rng(seed)
         frame, _ = render_frame(make_scene("empty", rng, frames=1), 0, rng=rng, sensor=sensor)
         assert found(frame).candidates == ()
+
+
+def test_a_plate_with_a_floor_thinner_than_a_step_is_found_whole() -> None:
+    """Only its rim rises clearly; what it encloses belongs to it."""
+    disc = bump(60, 4)
+    frame = measured(depth_of(0.01 * (disc - bump(50, 4)) + 0.002 * disc))
+    (one,) = found(frame).candidates
+    assert np.isin(np.flatnonzero(disc.reshape(-1) > 0.5), one.indices).mean() > 0.9
+
+
+def test_a_plate_against_a_box_is_not_its_foot() -> None:
+    """Low cells below something tall are its foot, unless they are level."""
+    v, u = np.mgrid[:480, :640]
+    disc = bump(60, 4)
+    box = (u > 379) & (u < 480) & (v > 150) & (v < 330)
+    frame = measured(depth_of(np.where(box, 0.1, 0.008 * disc)))
+    best = max(
+        np.isin(np.flatnonzero(disc.reshape(-1) > 0.5), c.indices).mean()
+        for c in found(frame).candidates
+    )
+    assert best > 0.8

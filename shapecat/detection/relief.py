@@ -45,7 +45,7 @@ ALONG, KNOWN, BESIDE = 0.4, 0.65, 0.3
 """Shares of an outline: of an object, least along the plane, and least along the plane or in touch
 with what is not low; of a swell, least along the plane."""
 FLOOR = 0.0006
-"""Least mean height of what a rim encloses above the plane around it, 1/m: not of a wreath."""
+"""Least mean height of what a rim encloses above the plane around it, 1/m."""
 
 
 def raise_low(cells: Cells, heights: Heights, planes: F8, raised: I4, *, largest_m: float) -> None:
