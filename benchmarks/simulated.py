@@ -78,7 +78,7 @@ def score(kind: SceneKind, first: int, count: int) -> Counter[str]:
 def _figures(c: Counter[str]) -> Iterator[str]:
     yield str(c["objects"])
     for part, whole in (("hits", "objects"), ("hits", "detections")):
-        yield f"{c[part] / c[whole]:.3f}" if c[whole] else "-"
+        yield f"{c[part] / c[whole]:.3f}" if c["objects"] and c[whole] else "-"
     yield f"{c['scenes with all planes']} of {c['scenes']}"
     yield f"{c['right relations'] / c['relations']:.3f}" if c["relations"] else "-"
     yield str(c["empty scenes with objects"])
