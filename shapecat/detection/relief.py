@@ -4,7 +4,6 @@ Sensors see a flat table in slow waves, higher than a plate is thick; but only a
 edge. So what is low is judged by its outline rather than by its height.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +11,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import JUMP, Cells
 from shapecat.detection.heights import Heights
+from shapecat.detection.hulls import fill_hull
 from shapecat.jit import kernel
 
 __all__ = ["raise_low"]
@@ -27,6 +27,7 @@ STEEP, STEEP_SHARE = 0.5, 0.7
 """A rise that is more than noise, as a share of the mean, and the share of the outline that has
 it."""
 MOST_STEPS = 3
+"""A place counts for at most so many times the mean rise."""
 ALL_AROUND = 0.75
 """Least sum of the rises for each side of the outline, whether it looks at the plane or not."""
 CHANCE = 16
@@ -174,7 +175,7 @@ def _raise(
                 best = max(best, merits[p])
             if known > SAME * count:
                 continue
-            filled = _fill_hull(excess, part, stack, count)
+            filled = fill_hull(excess, part, stack, count)
             outline = _outline(w, excess, owner, part, stack, filled, number, scale, count)
             if filled > count and outline.floor < FLOOR:
                 for p in stack[count:filled]:
@@ -229,54 +230,6 @@ def _is_object(outline: Outline) -> bool:
         return False
     least = max(table * (1 + CHANCE / sides), ALL_AROUND * sides)
     return bool(outline.rise > least and outline.steep > STEEP_SHARE * table)
-
-
-@kernel
-def _fill_hull(excess: F4, part: I4, stack: I4, count: int) -> int:
-    """Add the low cells within the convex hull of a part to it; return how many cells it has."""
-    rows, columns = excess.shape
-    parts = part.reshape(-1)
-    me = parts[stack[0]]
-    left, right = np.full(rows, columns, np.float64), np.full(rows, -1.0)
-    for t in range(count):
-        i = stack[t] // columns
-        j = stack[t] - i * columns
-        left[i], right[i] = min(left[i], j), max(right[i], j)
-    first, last = 0, rows - 1
-    while right[first] < 0:
-        first += 1
-    while right[last] < 0:
-        last -= 1
-    right[:] = -right
-    _straighten(left, first, last)
-    _straighten(right, first, last)
-    top = count
-    for i in range(first, last + 1):
-        for j in range(math.ceil(left[i] - 1e-6), math.floor(1e-6 - right[i]) + 1):
-            if part[i, j] != me and excess[i, j] != 0:
-                stack[top] = i * columns + j
-                part[i, j] = me
-                top += 1
-    return top
-
-
-@kernel
-def _straighten(side: F8, first: int, last: int) -> None:
-    """Replace a side of an outline, by rows, with that of its hull, the largest convex one."""
-    corners = np.zeros(side.size, np.int32)
-    n = 0
-    for i in range(first, last + 1):
-        while n > 1:
-            a, b = corners[n - 2], corners[n - 1]
-            if (side[b] - side[a]) * (i - a) < (side[i] - side[a]) * (b - a):
-                break
-            n -= 1
-        corners[n] = i
-        n += 1
-    for k in range(1, n):
-        a, b = corners[k - 1], corners[k]
-        for i in range(a + 1, b):
-            side[i] = side[a] + (side[b] - side[a]) * (i - a) / (b - a)
 
 
 @kernel
