@@ -342,6 +342,11 @@ def test_full_disk_stops_the_large_and_not_the_small(shapecat: Run, tmp_path: Pa
     assert set(states(tmp_path / "out").values()) == {"complete"}
 
 
+def heed_interrupts() -> None:
+    """Do not inherit that a shell lets its background jobs ignore them."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 def test_interrupted_batch_ends_at_once_and_goes_on(
     recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:
@@ -350,7 +355,12 @@ def test_interrupted_batch_ends_at_once_and_goes_on(
         *(sys.executable, "-m", "shapecat", "process", str(recordings), "--out", str(tmp_path)),
         *("--jobs", "2", "--no-rrd"),
     ]
-    running = subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL)
+    running = subprocess.Popen(
+        command,
+        stderr=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
+        preexec_fn=heed_interrupts,  # noqa: PLW1509  there is no other way
+    )
     wait_for(lambda: "running" in states(tmp_path).values(), 60)
     children = Path(f"/proc/{running.pid}/task").glob("*/children")
     workers = {int(pid) for thread in children for pid in thread.read_text().split()}
