@@ -17,7 +17,7 @@ from shapecat.corrections import TrackLabel, adopt_labels, read_labels
 from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.detection import RecentFrames
 from shapecat.errors import NoStreamError, OutputError
-from shapecat.executors.order import in_order, read_ahead
+from shapecat.executors.order import Processes, read_ahead
 from shapecat.jit import CompileClock, compile_clock
 from shapecat.jobs import Job, Summary, describe_run, resume, same_work, summarize
 from shapecat.labels import read_labelled_frames
@@ -40,6 +40,8 @@ Observer = Callable[[str, int, int | None], None]
 
 _AHEAD = 4
 """Frames read while one is written."""
+_MANY = 100
+"""With so many frames other processes are started before anything is read."""
 
 
 def _ignore(_phase: str, _done: int, _total: int | None) -> None:
@@ -131,26 +133,29 @@ def perceive_all(
     cores: int = 1,
 ) -> None:
     """Write frames, detections and planes, frame by frame in flat memory."""
-    recent = RecentFrames(job.settings.detection.fuse_frames)
-    upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame)
     skipped: Counter[str] = Counter()
     source, total = _select(recording, run["options"], skipped)
+    recent = RecentFrames(job.settings.detection.fuse_frames)
     count = 0
+    with (
+        Processes(Perceiver(categorizer, job.settings, job.model), cores) as processes,
+        PerceptionTables(
+            folder, categories=categorizer.categories, model_id=categorizer.model_id
+        ) as tables,
+    ):
+        if (total or 0) - tables.done >= _MANY:
+            processes.start()
+        upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame)
 
-    perceiver = Perceiver(categorizer, job.settings, job.model)
+        def view(frame: Frame) -> tuple[FrameRow, View]:
+            up, pose = upright.up(frame), upright.fixed_from_sensor(frame)
+            row = FrameRow(frame.log_time_ns, pose, up)
+            return row, View(frame, up, recent.before(frame, pose))
 
-    def view(frame: Frame) -> tuple[FrameRow, View]:
-        up, pose = upright.up(frame), upright.fixed_from_sensor(frame)
-        row = FrameRow(frame.log_time_ns, pose, up)
-        return row, View(frame, up, recent.before(frame, pose))
-
-    with PerceptionTables(
-        folder, categories=categorizer.categories, model_id=categorizer.model_id
-    ) as tables:
         views = map(view, source)
         for count, _ in enumerate(islice(views, tables.done), start=1):
             observe("perceive", count, total)
-        for row, perception in in_order(perceiver, views, processes=cores):
+        for row, perception in processes.in_order(views):
             count += 1
             tables.write(perception, row)
             observe("perceive", count, total)

@@ -27,7 +27,7 @@ from shapecat.executors import (
     share_cores,
     usable_cores,
 )
-from shapecat.executors.order import in_order, read_ahead
+from shapecat.executors.order import Processes, read_ahead
 
 
 def kill_self(_: object = None) -> None:
@@ -192,9 +192,10 @@ def test_processes_keep_the_order_and_hold_few_items() -> None:
             if more == 0 or time.monotonic() > deadline:
                 return
 
-    for kept, (result, worker) in in_order(slow_at_times, items(), processes=3):
-        used.append((kept, result))
-        workers.add(worker)
+    with Processes(slow_at_times, 3) as processes:
+        for kept, (result, worker) in processes.in_order(items()):
+            used.append((kept, result))
+            workers.add(worker)
     assert used == [(k, -k) for k in range(len(used))]
     assert os.getpid() in workers
     assert len(workers) == 3
@@ -202,8 +203,9 @@ def test_processes_keep_the_order_and_hold_few_items() -> None:
 
 def test_a_killed_process_loses_no_item() -> None:
     """The kernel kills the largest process when memory is short; its frame must not be missing."""
-    results = in_order(frail, ((k, k) for k in range(900)), processes=2)
-    assert list(results) == [(k, -k) for k in range(900)]
+    with Processes(frail, 2) as processes:
+        results = list(processes.in_order((k, k) for k in range(900)))
+    assert results == [(k, -k) for k in range(900)]
 
 
 def test_reading_ahead_holds_few_items() -> None:
@@ -226,10 +228,11 @@ def inverse_of_rest(k: int) -> int:
 
 
 def test_errors_come_at_their_turn() -> None:
-    results = in_order(inverse_of_rest, ((k, k) for k in range(20)), processes=2)
-    assert [next(results)[1] for _ in range(12)] == [0] * 11 + [1]
-    with pytest.raises(ZeroDivisionError):
-        next(results)
+    with Processes(inverse_of_rest, 2) as processes:
+        results = processes.in_order((k, k) for k in range(20))
+        assert [next(results)[1] for _ in range(12)] == [0] * 11 + [1]
+        with pytest.raises(ZeroDivisionError):
+            next(results)
 
     def broken() -> Iterator[int]:
         yield 1

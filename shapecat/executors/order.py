@@ -8,11 +8,11 @@ from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import islice
 from multiprocessing import current_process
-from typing import TypeVar
+from typing import Generic, Self, TypeVar
 
 from shapecat.executors.local import LocalExecutor
 
-__all__ = ["in_order", "read_ahead"]
+__all__ = ["Processes", "read_ahead"]
 
 _log = logging.getLogger(__name__)
 
@@ -30,60 +30,79 @@ _SWITCH_S = 5e-4
 """A thread back from a kernel waits no longer than this for the interpreter lock."""
 
 
-def in_order(
-    work: Callable[[_Item], _Result], items: Iterable[tuple[_Kept, _Item]], *, processes: int
-) -> Iterator[tuple[_Kept, _Result]]:
-    """Yield what ``work`` makes of each item, in the order of the items, with what is kept of it.
+class Processes(Generic[_Item, _Result]):
+    """Several processes, of which this is one, that share the items of one piece of work.
 
-    This process works along: on the first items, and whenever all others are busy. What another
-    fails at, because it was killed or ran out of memory, is done here. ``work`` and the items are
-    sent to spawned processes, so they must be picklable, and a script needs the usual
-    ``if __name__ == "__main__"``. A daemonic process may have no others and works alone.
-
-    Parameters
-    ----------
-    items : pairs of what is kept here and what is worked on; held only until it is done.
-    processes : this one included.
+    This one works along: while the others come up, and whenever all are busy. What another fails
+    at, because it was killed or ran out of memory, is done here.
 
     Examples
     --------
-    >>> list(in_order(abs, [("a", -2), ("b", 1)], processes=1))
+    >>> with Processes(abs, 1) as processes:
+    ...     list(processes.in_order([("a", -2), ("b", 1)]))
     [('a', 2), ('b', 1)]
     """
-    source = iter(items)
-    alone = processes <= 1 or current_process().daemon
-    for kept, item in source if alone else islice(source, _ALONE):
-        yield kept, work(item)
-    if alone:
-        return
-    pending: deque[tuple[_Kept, Future[_Result]]] = deque()
-    away: list[Future[_Result]] = []
-    with _other_processes(processes - 1) as executor:
-        waking = [executor.submit(_wake, work) for _ in range(processes - 1)]
-        for kept, item in source:
-            away = [future for future in away if not future.done()]
-            if len(away) < _AWAY * sum(future.done() for future in waking):
-                future = _sent(executor, work, item)
-                away.append(future)
-            else:
-                future = _done(work, item)
-            pending.append((kept, future))
-            while pending and (pending[0][1].done() or len(pending) > _HELD):
-                first, future = pending.popleft()
-                yield first, future.result()
-        for first, future in pending:
-            yield first, future.result()
 
+    def __init__(self, work: Callable[[_Item], _Result], count: int) -> None:
+        """Prepare ``count`` processes; the others end with the block.
 
-@contextmanager
-def _other_processes(count: int) -> Iterator[Executor]:
-    """Start as many processes as there is work for, and end them whatever they do."""
-    executor = LocalExecutor(count)
-    try:
+        Parameters
+        ----------
+        work : is sent to spawned processes, as the items are: picklable, and a script needs the
+            usual ``if __name__ == "__main__"``. A daemonic process may have no others.
+        """
+        self._work = work
+        self._others = 0 if current_process().daemon else max(0, count - 1)
+        self._executor: LocalExecutor | None = None
+        self._waking: list[Future[None]] = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """End the others, whatever they do."""
+        if self._executor is not None:
+            self._executor.terminate()
+
+    def start(self) -> None:
+        """Start the others now, not with the first items: they take seconds to come up."""
+        if self._others and self._executor is None:
+            self._executor = LocalExecutor(self._others)
+            for _ in range(self._others):
+                self._waking.append(self._executor.submit(_wake, self._work))
+
+    def in_order(self, items: Iterable[tuple[_Kept, _Item]]) -> Iterator[tuple[_Kept, _Result]]:
+        """Yield what the work makes of each item, in the order of the items, with what is kept.
+
+        Parameters
+        ----------
+        items : pairs of what is kept here and what is worked on; held only until it is done.
+        """
+        source = iter(items)
+        for kept, item in islice(source, _ALONE if self._others else None):
+            yield kept, self._work(item)
+        self.start()
+        pending: deque[tuple[_Kept, Future[_Result]]] = deque()
+        away: list[Future[_Result]] = []
         with _switching():
-            yield executor
-    finally:
-        executor.terminate()
+            for kept, item in source:
+                away = [future for future in away if not future.done()]
+                future = self._submit(item, len(away))
+                if not future.done():
+                    away.append(future)
+                pending.append((kept, future))
+                while pending and (pending[0][1].done() or len(pending) > _HELD):
+                    first, future = pending.popleft()
+                    yield first, future.result()
+            for first, future in pending:
+                yield first, future.result()
+
+    def _submit(self, item: _Item, away: int) -> Future[_Result]:
+        """Send an item to another process if one has come up and is free, else work on it."""
+        awake = sum(future.done() for future in self._waking)
+        if self._executor is None or away >= _AWAY * awake:
+            return _done(self._work, item)
+        return _sent(self._executor, self._work, item)
 
 
 def _wake(_work: object) -> None:
