@@ -28,7 +28,13 @@ from shapecat.recordings import Recording, choose_streams, frames, open_recordin
 from shapecat.recordings.gravity import Upright
 from shapecat.run_folder import read_run, staged, sweep, write_run
 from shapecat.shown import read_shown_frames
-from shapecat.tables import FrameRow, PerceptionTables, count_rows, discard_segments
+from shapecat.tables import (
+    FrameRow,
+    PerceptionTables,
+    count_rows,
+    discard_segments,
+    release_memory,
+)
 from shapecat.tracks import track_run
 from shapecat.types import Frame, LabelledFrame, ShownFrame
 
@@ -97,6 +103,7 @@ def _once(phase: str, folder: Path, run: dict[str, Any], work: Callable[[], None
         return
     begun = time.perf_counter()
     work()
+    release_memory()
     run["seconds"][phase] = time.perf_counter() - begun
     write_run(folder, run)
 

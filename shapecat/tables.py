@@ -37,6 +37,7 @@ __all__ = [
     "frame_rows",
     "numbers",
     "read_row_groups",
+    "release_memory",
     "write_table",
 ]
 
@@ -278,6 +279,12 @@ def numbers(column: pa.ChunkedArray) -> F4:
     return np.asarray(column.combine_chunks().flatten().to_numpy())
 
 
+def release_memory() -> None:
+    """Give the system back what was freed: the next phase has other needs."""
+    for pool in (pa.default_memory_pool(), pa.system_memory_pool()):
+        pool.release_unused()
+
+
 @contextmanager
 def _reading(path: Path) -> Iterator[pq.ParquetFile]:
     try:
@@ -293,7 +300,13 @@ def _open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
     texts = [f.name for f in schema if f.type == pa.string()]
     deltas = {f"{n}.list.element": "DELTA_BINARY_PACKED" for n in ("indices",) if n in schema.names}
     return pq.ParquetWriter(
-        path, schema, compression="zstd", use_dictionary=texts, column_encoding=deltas or None
+        path,
+        schema,
+        compression="zstd",
+        use_dictionary=texts,
+        column_encoding=deltas or None,
+        # Of long recordings the statistics of all columns would fill tens of megabytes.
+        write_statistics=[n for n in ("topic", "frame", "stamp_ns", "track") if n in schema.names],
     )
 
 

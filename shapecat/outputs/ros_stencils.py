@@ -21,8 +21,8 @@ __all__ = ["StencilEncoder"]
 
 _COUNT = struct.Struct("<I")
 _CDR_HEADER = 4
-_PLANS = 1024
-"""Plans kept: some 10 kB each, for as many sets of tracks seen together."""
+_PLANS = 64
+"""Plans kept: some 10 kB each, for as many sets of tracks seen together lately."""
 
 _FRAME_BYTES, _BOX_BYTES = 16, 104
 _PARTS = (
