@@ -305,7 +305,7 @@ def _open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
         compression="zstd",
         use_dictionary=texts,
         column_encoding=deltas or None,
-        # Of long recordings the statistics of all columns would fill tens of megabytes.
+        # The statistics of all columns of a long recording take ten megabytes to read.
         write_statistics=[n for n in ("topic", "frame", "stamp_ns", "track") if n in schema.names],
     )
 
