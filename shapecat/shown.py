@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,8 +13,16 @@ import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.corrections import TrackLabel
+from shapecat.executors.order import read_ahead
 from shapecat.geometry import box_corners, upright_box
-from shapecat.tables import Key, frame_rows, numbers, read_row_groups
+from shapecat.tables import (
+    Key,
+    frame_rows,
+    numbers,
+    read_row_groups,
+    rows_of,
+    topic_codes,
+)
 from shapecat.types import Box, ShownBox, ShownBoxes, ShownFrame
 
 __all__ = ["ShownTracks", "read_shown_frames"]
@@ -45,7 +54,7 @@ class ShownTracks:
     """
 
     frames: dict[Key, slice]
-    detections: list[int]
+    detections: I4
     tracks: list[int]
     labels: Mapping[int, TrackLabel]
     ended: dict[Key, tuple[int, ...]]
@@ -60,26 +69,29 @@ class ShownTracks:
         wanted = [*columns, *(["posterior"] if causal else [])]
         with pq.ParquetFile(folder / "tracks.parquet") as file:
             table = file.read(columns=wanted)
-        known = pa.compute.is_in(table["track"], pa.array(sorted(labels), pa.int32()))
-        table = table.filter(pa.compute.and_(pa.compute.is_valid(table["detection"]), known))
-        table = table.sort_by([(name, "ascending") for name in ("topic", "frame", "detection")])
-        frames = frame_rows(table)
-        tracks = table["track"].to_pylist()
+        topics, codes = topic_codes(table)
+        seen = pa.compute.indices_nonzero(table["detection"].is_valid())
+        rows, detections = np.from_dlpack(seen), numbers(table["detection"].drop_null())
+        frames, tracks = numbers(table["frame"])[rows], numbers(table["track"])[rows]
+        order = np.lexsort((detections, frames, codes[rows]))
+        order = order[np.isin(tracks[order], list(labels))]
+        rows, tracks = rows[order], tracks[order].tolist()
+        of_frames = rows_of(topics, codes[rows], frames[order])
         shown = np.array([labels[track].track for track in tracks], np.int64)
         return cls(
-            frames,
-            table["detection"].to_pylist(),
+            of_frames,
+            detections[order],
             tracks,
             labels,
-            _ended(folder, frames, shown, table["stamp_ns"].to_numpy()),
-            numbers(table["posterior"]).reshape(len(tracks), -1) if causal and tracks else _NONE,
+            _ended(folder, of_frames, shown, numbers(table["stamp_ns"])[rows]),
+            numbers(table["posterior"]).reshape(table.num_rows, -1)[rows] if causal else _NONE,
         )
 
     def of(self, key: Key) -> Iterator[ShownDetection]:
         """Yield the detections shown in a frame, in their order."""
         rows = self.frames.get(key, _NO_ROWS)
         for row in range(rows.start, rows.stop):
-            yield ShownDetection(self.detections[row], self.labels[self.tracks[row]], row)
+            yield ShownDetection(int(self.detections[row]), self.labels[self.tracks[row]], row)
 
 
 def read_shown_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[ShownFrame]:
@@ -97,20 +109,28 @@ def read_shown_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterato
         read_row_groups(folder / "detections.parquet", found, at_once=_AT_ONCE),
         strict=True,
     )
-    for frames, detections in groups:
-        rows_of, places = frame_rows(detections), _places(detections)
-        ups = numbers(frames["up"]).reshape(-1, 3)
-        rows = zip(*(frames[name].to_pylist() for name in wanted[:-1]), strict=True)
-        for (topic, index, stamp_ns, log_time_ns, frame_id), up in zip(rows, ups, strict=True):
-            key = (topic, index)
-            of_frame = shown.frames.get(key, _NO_ROWS)
-            first = rows_of.get(key, _NO_ROWS).start  # detections are numbered by their rows
-            here = [first + detection for detection in shown.detections[of_frame]]
-            labelled = tuple(map(labels.__getitem__, shown.tracks[of_frame]))
-            boxes = ShownBoxes(labelled, places[here])
-            boxes = _joined(boxes, up) if merged else boxes
-            ended = shown.ended.get(key, ())
-            yield ShownFrame(topic, index, stamp_ns, log_time_ns, frame_id, boxes, ended)
+    for frames, detections in read_ahead(groups, count=1):
+        plain = [frames[name].to_pylist() for name in wanted[:-1]]
+        keys = list(zip(*plain[:2], strict=True))
+        boxes = _boxes(keys, shown, detections)
+        if merged:
+            ups = numbers(frames["up"]).reshape(-1, 3)
+            boxes = map(_joined, boxes, ups)
+        ended = (shown.ended.get(key, ()) for key in keys)
+        yield from map(ShownFrame, *plain, boxes, ended)
+
+
+def _boxes(keys: Sequence[Key], shown: ShownTracks, detections: pa.Table) -> Iterator[ShownBoxes]:
+    """Yield what is shown in each of some frames, whose detections are given."""
+    all_rows, places = frame_rows(detections), _places(detections)
+    spans = [shown.frames.get(key, _NO_ROWS) for key in keys]
+    firsts = [all_rows.get(key, _NO_ROWS).start for key in keys]
+    counts = [span.stop - span.start for span in spans]
+    numbered = np.concatenate([shown.detections[span] for span in spans])
+    places = places[np.repeat(firsts, counts) + numbered]  # detections are numbered by their rows
+    for span, stop in zip(spans, accumulate(counts), strict=True):
+        labels = tuple(map(shown.labels.__getitem__, shown.tracks[span]))
+        yield ShownBoxes(labels, places[stop - len(labels) : stop])
 
 
 def _places(table: pa.Table) -> F8:

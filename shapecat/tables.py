@@ -18,7 +18,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shapecat.arrays import F4
+from shapecat.arrays import F4, I4
 from shapecat.errors import OutputError
 from shapecat.run_folder import complete_folder, replacing
 from shapecat.types import Perception, Pose
@@ -38,6 +38,8 @@ __all__ = [
     "numbers",
     "read_row_groups",
     "release_memory",
+    "rows_of",
+    "topic_codes",
     "write_table",
 ]
 
@@ -265,18 +267,33 @@ def read_row_groups(
 
 def frame_rows(table: pa.Table) -> dict[Key, slice]:
     """Return the rows of each frame, which follow each other in every table."""
-    topics, frames = table["topic"], table["frame"].to_numpy()
-    codes = topics.combine_chunks().dictionary_encode().indices.to_numpy()
+    return rows_of(*topic_codes(table), numbers(table["frame"]))
+
+
+def topic_codes(table: pa.Table) -> tuple[list[str], I4]:
+    """Return the topics of a table, and which of them each row has."""
+    column = table["topic"].combine_chunks().dictionary_encode()
+    return column.dictionary.to_pylist(), np.from_dlpack(column.indices)
+
+
+def rows_of(topics: Sequence[str], codes: I4, frames: I4) -> dict[Key, slice]:
+    """Return the rows of each frame, which follow each other."""
     changes = (np.diff(codes) != 0) | (np.diff(frames) != 0)
     starts = np.flatnonzero(np.concatenate([np.ones(min(1, len(frames)), np.bool_), changes]))
-    keys = zip(topics.take(starts).to_pylist(), frames[starts].tolist(), strict=True)
+    names = map(topics.__getitem__, codes[starts].tolist())
     stops = [*starts[1:].tolist(), len(frames)]
-    return dict(zip(keys, map(slice, starts.tolist(), stops), strict=True))
+    rows = map(slice, starts.tolist(), stops)
+    return dict(zip(zip(names, frames[starts].tolist(), strict=True), rows, strict=True))
 
 
-def numbers(column: pa.ChunkedArray) -> F4:
-    """Return the numbers of a list column, row after row, without a detour over Python."""
-    return np.asarray(column.combine_chunks().flatten().to_numpy())
+def numbers(column: pa.ChunkedArray) -> Any:
+    """Return the numbers of a column without nulls; those of lists row after row.
+
+    Arrow's own way, and any scalar or array made by it, loads Pandas, which takes a third of a
+    second.
+    """
+    array = column.combine_chunks()
+    return np.from_dlpack(array if pa.types.is_primitive(array.type) else array.flatten())
 
 
 def release_memory() -> None:

@@ -14,10 +14,9 @@ from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import BinaryIO
 
-from shapecat.outputs.annotation import Annotation, AnnotationChannel
+from shapecat.outputs.annotation import Annotation, AnnotationChannel, Item
 from shapecat.outputs.annotations import ENCODERS, Encode, encoder_for
-from shapecat.outputs.mcap_append import Appender, copy_bytes, reserve
-from shapecat.outputs.mcap_rewrite import Item, rewrite
+from shapecat.outputs.mcap_append import Appender, copy_bytes
 from shapecat.recordings import Recording
 from shapecat.recordings.mcap_file import McapRecording, Summary
 from shapecat.run_folder import replacing
@@ -29,7 +28,7 @@ _LIFETIME = 1.5
 """Entities outlive the period of the frames by this factor."""
 _BUFFER = 4 << 20
 """Two threads that write the same file wait for each other: seldom is better."""
-_AT_ONCE = 128
+_AT_ONCE = 256
 """Frames encoded together."""
 _PERIOD_NS = 1_000_000_000
 """Assumed where a stream has a single frame."""
@@ -65,6 +64,8 @@ def write_annotated(
                 channels, items = _encoded(recording, frames, markers=markers)
                 _append(recording.summary, file, channels, items, metadata)
         else:
+            from shapecat.outputs.mcap_rewrite import rewrite  # noqa: PLC0415  loads YAML for ROS 1
+
             channels, items = _encoded(recording, frames, markers=markers)
             rewrite(recording, file, channels, items, metadata)
 
@@ -85,7 +86,6 @@ def _uncollected() -> Iterator[None]:
 def _copying(recording: McapRecording, path: Path, file: BinaryIO) -> Iterator[None]:
     """Copy the data section of a recording while the block writes what comes behind it."""
     length = recording.summary.data_end
-    reserve(file, length)
     with ThreadPoolExecutor(1) as pool:  # the copy does not hold the interpreter lock
         copying = pool.submit(copy_bytes, recording.path, path, length)
         yield
@@ -124,14 +124,14 @@ def _append(
     """Write the annotations behind where the original data section ends."""
     file.seek(summary.data_end)
     compression = summary.chunks[0].compression if summary.chunks else "zstd"
-    appender = Appender(file, summary, compression)
-    numbers = [appender.add_channel(channel) for channel in channels]
-    sequences: Counter[int] = Counter()
-    for number, log_time, data in items:
-        appender.add_message(numbers[number], log_time, sequences[number], data)
-        sequences[number] += 1
-    appender.add_metadata("shapecat", metadata)
-    appender.finish()
+    with Appender(file, summary, compression) as appender:
+        numbers = [appender.add_channel(channel) for channel in channels]
+        sequences: Counter[int] = Counter()
+        for number, log_time, data in items:
+            appender.add_message(numbers[number], log_time, sequences[number], data)
+            sequences[number] += 1
+        appender.add_metadata("shapecat", metadata)
+        appender.finish()
 
 
 def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:

@@ -1,6 +1,5 @@
 """What annotations say, whatever their encoding."""
 
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from shapecat.types import ShownBox, ShownFrame
@@ -8,6 +7,7 @@ from shapecat.types import ShownBox, ShownFrame
 __all__ = [
     "Annotation",
     "AnnotationChannel",
+    "Item",
     "entity_id",
     "properties",
     "text",
@@ -26,13 +26,20 @@ class AnnotationChannel(NamedTuple):
     metadata: tuple[tuple[str, str], ...] = ()
 
 
-@dataclass(frozen=True)
-class Annotation:
+class Annotation(NamedTuple):
     """A frame to write, how long its entities live, and which tracks it no longer shows."""
 
     frame: ShownFrame
     lifetime_ns: int
     gone: tuple[int, ...]
+
+
+class Item(NamedTuple):
+    """An annotation to write: the position of its channel, its time, its bytes."""
+
+    channel: int
+    log_time_ns: int
+    data: bytes
 
 
 def entity_id(track: int) -> str:

@@ -5,12 +5,14 @@ import os
 import shutil
 import struct
 import zlib
-from collections import Counter, defaultdict
+from collections import Counter, defaultdict, deque
 from collections.abc import Iterable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
-from typing import BinaryIO
+from typing import BinaryIO, Self
 
 import lz4.frame  # type: ignore[import-untyped]  # ships no types
 import zstandard
@@ -22,7 +24,7 @@ from shapecat.outputs.annotation import AnnotationChannel
 from shapecat.recordings.mcap_file import Summary
 from shapecat.recordings.mcap_records import MAGIC, write_chunk_index
 
-__all__ = ["Appender", "copy_bytes", "reserve"]
+__all__ = ["Appender", "copy_bytes"]
 
 _CHUNK_BYTES = 256 << 10
 """Small chunks: a reader that sorts by time holds one of them for the whole recording."""
@@ -31,11 +33,13 @@ _MESSAGE = struct.Struct("<BQHIQQ")
 """A record's opcode and length; a message's channel, sequence, log time and publish time."""
 _INDEX = struct.Struct("<BQHI")
 """A message index up to its entries: opcode and length, channel, bytes of the entries."""
-_COMPRESS = {"zstd": zstandard.compress, "lz4": lz4.frame.compress}
+_COMPRESS = {"zstd": partial(zstandard.compress, level=1), "lz4": lz4.frame.compress}
+_WAITING = 8
+"""Filled chunks in memory."""
 
 
-def reserve(file: BinaryIO, length: int) -> None:
-    """Reserve disk space for so many bytes, and some for annotations; truncate the file when done.
+def _reserve(file: BinaryIO, length: int) -> None:
+    """Reserve disk space for so many bytes, and some for annotations.
 
     A full disk shows at once. And ext4 writes a whole file out when one with space not yet
     reserved is renamed over an older one, which takes as long as the copy.
@@ -52,8 +56,12 @@ def reserve(file: BinaryIO, length: int) -> None:
 
 
 def copy_bytes(source: Path, target: Path, length: int) -> None:
-    """Copy the first bytes of a file over those of another, inside the kernel where it can."""
+    """Copy the first bytes of a file over those of another, inside the kernel where it can.
+
+    The other may be longer afterwards than what is written to it: truncate it when all is.
+    """
     with source.open("rb") as file, target.open("r+b") as copy:
+        _reserve(copy, length)
         done = 0
         try:
             while done < length:
@@ -93,6 +101,8 @@ class _Chunk:
 class Appender:
     """Adds channels, messages and metadata to a data section, then writes a summary of all.
 
+    A context manager: filled chunks are compressed and written by a thread.
+
     Parameters
     ----------
     file : open for writing; positioned where the original data section ends.
@@ -114,6 +124,16 @@ class Appender:
         self._new_chunks = 0
         self._times: list[int] = []
         self._chunk = _Chunk()
+        self._writer = ThreadPoolExecutor(1)
+        self._waiting: deque[Future[None]] = deque()
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End the thread."""
+        self._writer.shutdown(cancel_futures=True)
 
     def add_channel(self, channel: AnnotationChannel) -> int:
         """Add a channel with its schema; return its number."""
@@ -147,18 +167,18 @@ class Appender:
         chunk.data += _MESSAGE.pack(Opcode.MESSAGE, length, channel, sequence, log_time, log_time)
         chunk.data += data
         if len(chunk.data) >= _CHUNK_BYTES:
-            self._flush()
+            self._flush(_WAITING)
 
     def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
         """Add a metadata record."""
-        self._flush()
+        self._flush(0)
         offset = self._file.tell()
         length = self._write([records.Metadata(name=name, metadata=dict(values))])
         self._metadata.append(records.MetadataIndex(offset=offset, length=length, name=name))
 
     def finish(self) -> None:
         """Write the summary of original and additions, the footer and the end."""
-        self._flush()
+        self._flush(0)
         self._write([records.DataEnd(0)])
         start = self._file.tell()
         body, groups = bytearray(), []
@@ -206,12 +226,16 @@ class Appender:
             channel_message_counts={**old.channel_message_counts, **self._counts},
         )
 
-    def _flush(self) -> None:
-        """Write the chunk, if it has messages, and its index."""
-        chunk, self._chunk = self._chunk, _Chunk()
-        if not chunk.entries:
-            self._chunk = chunk
-            return
+    def _flush(self, waiting: int) -> None:
+        """Let the chunk be written, if it has messages, until no more than so many are not."""
+        if self._chunk.entries:
+            self._waiting.append(self._writer.submit(self._write_chunk, self._chunk))
+            self._chunk = _Chunk()
+        while len(self._waiting) > waiting:
+            self._waiting.popleft().result()
+
+    def _write_chunk(self, chunk: _Chunk) -> None:
+        """Write a chunk and its index."""
         plain = bytes(chunk.data)
         data = _COMPRESS[self._compression](plain) if self._compression else plain
         times = [time for entries in chunk.entries.values() for time in entries[::2]]

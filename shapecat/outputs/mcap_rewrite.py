@@ -4,28 +4,20 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from heapq import merge
 from operator import attrgetter
-from typing import BinaryIO, NamedTuple
+from typing import BinaryIO
 
 from mcap import records
 from mcap.opcode import Opcode
 from mcap.writer import CompressionType, Writer
 
-from shapecat.outputs.annotation import AnnotationChannel
+from shapecat.outputs.annotation import AnnotationChannel, Item
 from shapecat.outputs.ros1_conversion import convert_channel, raw_channel, wrap_raw
 from shapecat.recordings import Channel, Message, Recording
 from shapecat.recordings.decoding import LIBRARY_ERRORS, schema_of
 from shapecat.recordings.mcap_file import McapRecording
 from shapecat.recordings.mcap_records import ChunkError, parse
 
-__all__ = ["Item", "rewrite"]
-
-
-class Item(NamedTuple):
-    """An annotation to write: the position of its channel, its time, its bytes."""
-
-    channel: int
-    log_time_ns: int
-    data: bytes
+__all__ = ["rewrite"]
 
 
 def rewrite(
