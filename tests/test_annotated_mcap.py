@@ -29,6 +29,7 @@ from shapecat.errors import OutputError
 from shapecat.outputs.annotated_mcap import write_annotated
 from shapecat.outputs.annotation import Annotation
 from shapecat.outputs.colours import CATEGORY_COLOURS, colour_of
+from shapecat.outputs.mcap_append import Appender
 from shapecat.outputs.ros_annotations import RosMessages
 from shapecat.outputs.ros_stencils import StencilEncoder
 from shapecat.recordings import open_recording
@@ -393,6 +394,20 @@ def test_nothing_is_left_behind_on_failure(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
     with pytest.raises(OutputError, match="No such file"):
         annotate(source, tmp_path / "no" / "out.mcap")
+
+
+def test_a_disk_that_fills_up_under_the_writing_thread_is_an_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    source = write_mcap(tmp_path / "a.mcap")
+
+    def full(*_: object) -> None:
+        raise OSError(28, os.strerror(28))
+
+    monkeypatch.setattr(Appender, "_write_chunk", full)
+    with pytest.raises(OutputError, match=r"out\.mcap: cannot be written: No space left"):
+        annotate(source, tmp_path / "out.mcap")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.mcap"]
 
 
 def test_recording_without_frames_is_still_copied(tmp_path: Path) -> None:
