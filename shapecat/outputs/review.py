@@ -38,7 +38,6 @@ from pathlib import Path
 import numpy as np
 import rerun as rr
 
-from shapecat.arrays import F8
 from shapecat.errors import OutputError
 from shapecat.geometry import transform
 from shapecat.outputs import review_shapes as shapes
@@ -46,7 +45,8 @@ from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import paint
 from shapecat.outputs.review_curves import At, Curves, times_of
 from shapecat.outputs.review_layout import Eye, TrackView, choose_eye, lay_out, stepped_back
-from shapecat.outputs.review_shapes import DRAWINGS, Moment, Way
+from shapecat.outputs.review_paths import Paths
+from shapecat.outputs.review_shapes import DRAWINGS, Moment
 from shapecat.outputs.review_viewer import open_viewer, take_screenshot
 from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
 
@@ -55,7 +55,6 @@ __all__ = ["open_viewer", "take_screenshot", "write_review"]
 _FLUSH_FRAMES, _PLOT_FRAMES = 32, 256  # curves make few columns: Rerun remembers each it wrote
 _DRAWN_AT_ONCE, _POINTS_AT_ONCE = 16, 1 << 19  # frames and points held back of a sensor
 _RESERVE_BYTES = 64 << 20  # Rerun waits for ever on a full disk: stop before
-_PATH_STEP_M, _PATH_POINTS = 0.015, 500  # a path grows when its object moves so far
 
 
 def write_review(
@@ -149,8 +148,8 @@ class _Review:
         self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)  # of what has a fixed place
         self._cameras: dict[str, Camera] = {}
         self._tracks: dict[int, TrackView] = {}
-        self._paths: dict[str, dict[int, list[F8]]] = {}
-        self._ways: dict[str, list[tuple[At, list[Way]]]] = {}  # those held back, by entity
+        self._aimed: set[str] = set()  # topics whose eye has seen an object
+        self._paths = Paths(stream)
         self._curves = Curves(stream)
         self._counted: dict[str, None] = {}  # categories met, in order
         self._warnings: list[str] = []
@@ -173,7 +172,7 @@ class _Review:
         self._stream.set_time("frame", sequence=labelled.index)
         self._place_sensor(entity, labelled, frame)
         self._draw(entity, labelled, frame)
-        self._log_paths(entity, labelled)
+        self._trace(entity, labelled)
         self._log_events(labelled)
         self._plot(labelled)
 
@@ -185,11 +184,7 @@ class _Review:
 
     def plot(self) -> None:
         """Send what is held back of curves and paths."""
-        for entity, rows in self._ways.items():
-            if rows:
-                at, ways = zip(*rows, strict=True)
-                self._stream.send_columns(entity, times_of(at), shapes.paths(ways))
-                rows.clear()
+        self._paths.send()
         self._curves.send()
 
     def end(self) -> None:
@@ -247,11 +242,11 @@ class _Review:
     def _place_sensor(self, entity: str, labelled: LabelledFrame, frame: Frame) -> None:
         """Write where the sensor is, and its axes and frustum when they are new."""
         topic = labelled.topic
-        if topic not in self._eyes or (labelled.objects and topic not in self._paths):
+        if topic not in self._eyes or (labelled.objects and topic not in self._aimed):
             self._eyes[topic] = choose_eye(labelled, frame, fixed=self._fixed_frame is not None)
             self._log(entity, _axes(frame, self._eyes[topic]), static=True)
         if labelled.objects:
-            self._paths.setdefault(topic, {})
+            self._aimed.add(topic)
         if frame.camera is not None and frame.camera != self._cameras.get(topic):
             self._cameras[topic] = frame.camera
             self._log(f"{entity}/camera", shapes.pinhole(frame.camera))
@@ -259,35 +254,21 @@ class _Review:
     def _pose(self, labelled: LabelledFrame) -> Pose | None:
         return None if self._fixed_frame is None else labelled.fixed_from_sensor
 
-    def _log_paths(self, entity: str, labelled: LabelledFrame) -> None:
-        """Extend the paths of the tracks that moved; write them only then."""
+    def _trace(self, entity: str, labelled: LabelledFrame) -> None:
+        """Extend the paths of the tracks; without a pose in the fixed frame none is seen."""
         pose = self._pose(labelled)
+        seen = {}
+        if pose is not None or self._fixed_frame is None:
+            for item in labelled.objects:
+                place = np.asarray(item.box.center, np.float64)
+                seen[item.track] = item.category, place if pose is None else transform(pose, place)
         if self._fixed_frame is not None:
-            if pose is None:
-                return
             entity = "world"
-        paths = self._paths.get(labelled.topic, {})
-        gone = [paths.pop(number, []) for number in labelled.ended]
-        changed = any(len(path) > 1 for path in gone)
-        for item in labelled.objects:
-            place = np.asarray(item.box.center, np.float64)
-            if pose is not None:
-                place = transform(pose, place)
+            for _, place in seen.values():
                 self._low = np.minimum(self._low, place)
                 self._high = np.maximum(self._high, place)
-            path = paths.setdefault(item.track, [])
-            if not path or np.linalg.norm(place - path[-1]) > _PATH_STEP_M:
-                path.append(place)
-                del path[:-_PATH_POINTS]
-                changed = changed or len(path) > 1
-        if changed:
-            where = f"{entity}/paths/{rr.escape_entity_path_part(labelled.topic)}"
-            ways = [
-                (self._tracks[n].category, np.array(path))
-                for n, path in paths.items()
-                if len(path) > 1
-            ]
-            self._ways.setdefault(where, []).append(((labelled.stamp_ns, labelled.index), ways))
+        where = f"{entity}/paths/{rr.escape_entity_path_part(labelled.topic)}"
+        self._paths.add(where, (labelled.stamp_ns, labelled.index), seen, labelled.ended)
 
     def _log_events(self, labelled: LabelledFrame) -> None:
         for text in self._warnings:

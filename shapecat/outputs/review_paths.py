@@ -1,0 +1,68 @@
+"""The paths of tracks in the review: held back, and sent by the column."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import rerun as rr
+
+from shapecat.arrays import F8
+from shapecat.outputs.review_curves import At, times_of
+from shapecat.outputs.review_shapes import Way, paths
+
+__all__ = ["Paths"]
+
+_STEP_M, _POINTS = 0.015, 500
+"""A path grows when its object has moved so far; places it keeps."""
+
+
+@dataclass
+class _Path:
+    """Where a track has been."""
+
+    category: str
+    places: list[F8] = field(default_factory=list)
+
+    @property
+    def drawn(self) -> bool:
+        """Whether there is a line to draw."""
+        return len(self.places) > 1
+
+    def grow(self, place: F8) -> bool:
+        """Add a place; return whether there is more to draw."""
+        if self.places and np.linalg.norm(place - self.places[-1]) <= _STEP_M:
+            return False
+        self.places.append(place)
+        del self.places[:-_POINTS]
+        return self.drawn
+
+
+class Paths:
+    """Paths of tracks by entity, sent as columns: all of an entity when one grows or ends."""
+
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self._stream = stream
+        self._paths: dict[str, dict[int, _Path]] = {}
+        self._pending: dict[str, list[tuple[At, list[Way]]]] = {}
+
+    def add(
+        self, entity: str, at: At, seen: Mapping[int, tuple[str, F8]], ended: Iterable[int]
+    ) -> None:
+        """Take the category and the place of each track that a frame shows."""
+        known = self._paths.setdefault(entity, {})
+        gone = [known.pop(number) for number in ended if number in known]
+        grown = [
+            known.setdefault(number, _Path(category)).grow(place)
+            for number, (category, place) in seen.items()
+        ]
+        if any(grown) or any(path.drawn for path in gone):
+            ways = [(path.category, np.array(path.places)) for path in known.values() if path.drawn]
+            self._pending.setdefault(entity, []).append((at, ways))
+
+    def send(self) -> None:
+        """Write what is held back."""
+        for entity, rows in self._pending.items():
+            if rows:
+                at, ways = zip(*rows, strict=True)
+                self._stream.send_columns(entity, times_of(at), paths(ways))
+                rows.clear()
