@@ -73,7 +73,8 @@ def _plot(figures: dict[str, list[tuple[float, float]]], path: Path) -> None:
     figure, axes = plt.subplots(figsize=(6, 4))
     for kind, line in figures.items():
         axes.plot(*zip(*line, strict=True), marker="o", label=kind)
-    axes.set(xscale="log", xlabel="points", ylabel="CPU time, ms", ylim=0)
+    axes.set(xscale="log", xlabel="points of a frame", ylabel="CPU time, ms", ylim=0)
+    axes.set_title("Detection, one core")
     axes.grid(visible=True, alpha=0.3)
     axes.legend()
     path.parent.mkdir(parents=True, exist_ok=True)
