@@ -1,39 +1,25 @@
-"""What each rule of the detection gains: overlap with the truth, the rules added one by one."""
+"""What each rule of the detection gains: overlap with the truth, the rules added one by one.
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+python -m benchmarks.ablation --first 500 --count 30
+"""
 
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import click
 import numpy as np
-from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
-from benchmarks.measure import markdown
-from benchmarks.scenes import labelled_clutter, labelled_tables
+from benchmarks.measure import markdown, save
+from benchmarks.overlap import Array, Finder, labelled_sets, score, with_rules
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.types import Frame
 
-Array = NDArray[Any]
-Finder = Callable[[Frame], list[Array]]
-MATCHED = 0.75
-"""Overlap F from which an object counts as found."""
 
-
-class Labelled(NamedTuple):
-    """A frame, the pixel labels (h w,) of its things, 0 where unknown, and which are objects."""
-
-    frame: Frame
-    labels: Array
-    objects: list[list[int]]
-
-
-def run(count: int) -> tuple[str, dict[str, Any]]:
+def run(count: int, first_seed: int = 500) -> tuple[str, dict[str, Any]]:
     """Score every set of rules on the same frames; return a Markdown table and the figures."""
-    sets = {
-        "simulated clutter": [Labelled(*f) for f in labelled_clutter(count)],
-        "real tables": [Labelled(*f) for f in labelled_tables()],
-    }
-    sets = {name: frames for name, frames in sets.items() if frames}
+    sets = labelled_sets(count, first_seed)
     figures: dict[str, Any] = {}
     rows = []
     for method, finder in _methods():
@@ -47,21 +33,11 @@ def run(count: int) -> tuple[str, dict[str, Any]]:
 def _methods() -> Iterator[tuple[str, Finder]]:
     rules = DetectionSettings().rules.split()
     yield "voxels, plane, DBSCAN (Open3D)", _clusters
-    yield "plane, height, depth jumps", _with_rules([])
+    yield "plane, height, depth jumps", with_rules([])
     for k in range(1, len(rules) + 1):
-        yield f"+ {rules[k - 1]}", _with_rules(rules[:k])
+        yield f"+ {rules[k - 1]}", with_rules(rules[:k])
     for rule in rules:
-        yield f"all but {rule}", _with_rules([r for r in rules if r != rule])
-
-
-def _with_rules(rules: Sequence[str]) -> Finder:
-    settings = DetectionSettings(rules=" ".join(rules))
-
-    def find(frame: Frame) -> list[Array]:
-        scene = detect(frame, settings=settings, rng=np.random.default_rng(0))
-        return [candidate.indices for candidate in scene.candidates]
-
-    return find
+        yield f"all but {rule}", with_rules([r for r in rules if r != rule])
 
 
 def _clusters(frame: Frame) -> list[Array]:
@@ -89,24 +65,15 @@ def _clusters(frame: Frame) -> list[Array]:
     ]
 
 
-def score(frames: Sequence[Labelled], finder: Finder) -> dict[str, float]:
-    """Match found and true objects one to one; return the overlap F and the share matched."""
-    shared = found = true = hits = objects = 0.0
-    for frame, labels, things in frames:
-        masks = [np.isin(labels, parts) for parts in things]
-        lists = [index[labels[index] > 0] for index in finder(frame)]
-        common = np.array([[m[p].sum() for m in masks] for p in lists]).reshape(
-            len(lists), len(masks)
-        )
-        sizes = np.array([p.size for p in lists]), np.array([m.sum() for m in masks])
-        overlap = 2 * common / np.maximum(sizes[0][:, None] + sizes[1], 1) if lists else common
-        rows, columns = linear_sum_assignment(-overlap)
-        shared += common[rows, columns].sum()
-        found, true = found + sizes[0].sum(), true + sizes[1].sum()
-        hits += np.count_nonzero(overlap[rows, columns] >= MATCHED)
-        objects += len(masks)
-    return {
-        "F": round(2 * shared / max(found + true, 1), 4),
-        "obj75": round(hits / max(objects, 1), 4),
-        "objects": objects,
-    }
+@click.command(help=__doc__)
+@click.option("--first", default=500, show_default=True, help="Seed of the first scene.")
+@click.option("--count", default=30, show_default=True, help="Simulated scenes.")
+def main(*, first: int, count: int) -> None:
+    """Print a table, write ``build/benchmarks_ablation.json``."""
+    table, figures = run(count, first)
+    print(table)
+    save(Path("build/benchmarks_ablation.json"), figures)
+
+
+if __name__ == "__main__":
+    main()

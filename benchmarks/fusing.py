@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.ablation import Labelled, score
 from benchmarks.measure import cpu_ms, markdown
+from benchmarks.overlap import Labelled, score
 from benchmarks.scenes import SEEN_PIXELS
 from shapecat.config import DetectionSettings
 from shapecat.detection import Earlier, RecentFrames, detect, fuse

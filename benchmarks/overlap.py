@@ -1,0 +1,70 @@
+"""How well found objects cover true ones, on simulated clutter and on real frames of tables."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from benchmarks.scenes import labelled_clutter, labelled_tables
+from shapecat.config import DetectionSettings
+from shapecat.detection import detect
+from shapecat.types import Frame
+
+Array = NDArray[Any]
+Finder = Callable[[Frame], list[Array]]
+"""Returns the points of each object it finds."""
+MATCHED = 0.75
+"""Overlap F from which an object counts as found."""
+
+
+class Labelled(NamedTuple):
+    """A frame, the pixel labels (h w,) of its things, 0 where unknown, and which are objects."""
+
+    frame: Frame
+    labels: Array
+    objects: list[list[int]]
+
+
+def labelled_sets(count: int, first_seed: int) -> dict[str, list[Labelled]]:
+    """Return frames of so many simulated cluttered tables, and real ones where there are any."""
+    sets = {
+        "simulated clutter": [Labelled(*f) for f in labelled_clutter(count, first_seed)],
+        "real tables": [Labelled(*f) for f in labelled_tables()],
+    }
+    return {name: frames for name, frames in sets.items() if frames}
+
+
+def with_rules(rules: Sequence[str]) -> Finder:
+    """Return the detection with some of its rules."""
+    settings = DetectionSettings(rules=" ".join(rules))
+
+    def find(frame: Frame) -> list[Array]:
+        scene = detect(frame, settings=settings, rng=np.random.default_rng(0))
+        return [candidate.indices for candidate in scene.candidates]
+
+    return find
+
+
+def score(frames: Sequence[Labelled], finder: Finder) -> dict[str, float]:
+    """Match found and true objects one to one; return the overlap F and the share matched."""
+    shared = found = true = hits = objects = 0.0
+    for frame, labels, things in frames:
+        masks = [np.isin(labels, parts) for parts in things]
+        lists = [index[labels[index] > 0] for index in finder(frame)]
+        common = np.array([[m[p].sum() for m in masks] for p in lists]).reshape(
+            len(lists), len(masks)
+        )
+        sizes = np.array([p.size for p in lists]), np.array([m.sum() for m in masks])
+        overlap = 2 * common / np.maximum(sizes[0][:, None] + sizes[1], 1) if lists else common
+        rows, columns = linear_sum_assignment(-overlap)
+        shared += common[rows, columns].sum()
+        found, true = found + sizes[0].sum(), true + sizes[1].sum()
+        hits += np.count_nonzero(overlap[rows, columns] >= MATCHED)
+        objects += len(masks)
+    return {
+        "F": round(2 * shared / max(found + true, 1), 4),
+        "obj75": round(hits / max(objects, 1), 4),
+        "objects": objects,
+    }
