@@ -285,6 +285,14 @@ def test_result_does_not_depend_on_the_roll(change: Callable[[Array], Array]) ->
     assert min(overlaps(scene, truth, [1, 2, 3, 4])) > 0.8
 
 
+def test_upside_down_the_front_of_a_large_box_is_no_support() -> None:
+    """Which way the camera is held tells less than how much of the scene is level."""
+    depth, seen = render([table(), box((0, 0, 0), (0.44, 0.1, 0.26)), can(0.32, 0, 0, 0.04, 0.14)])
+    camera = Camera(640, 480, 525, 525, 319.5, 239.5)
+    scene = found(frame_of(np.ascontiguousarray(depth[::-1, ::-1]), camera))
+    assert min(overlaps(scene, np.ascontiguousarray(seen[::-1, ::-1]), [1, 2])) > 0.8
+
+
 def test_half_resolution_finds_the_same() -> None:
     """Cells follow the size of things, not the size of pixels."""
     depth, seen = render(SCENE)

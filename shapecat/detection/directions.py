@@ -23,6 +23,8 @@ CORNER_COS = 0.3
 TRIALS = 120
 MOST_DIRECTIONS = 4
 HEIGHT_BINS, LEVEL_BIN_M = 80, 0.04
+SEVERAL, UPRIGHT = 0.75, 0.2
+"""How much several levels count, by the power of their number, and an upright camera."""
 
 
 def estimate_up(
@@ -31,9 +33,9 @@ def estimate_up(
     """Return the normal of the dominant supporting plane, (3,) unit, or None if there is none.
 
     With a ``hint`` only planes within 15 degrees of being perpendicular to it count. Without, the
-    direction wins that most of the surface faces: the normal of one of the largest planes, or the
+    direction wins that faces most large levels: the normal of one of the largest planes, or the
     direction that two walls leave. Where the camera is thought ``upright``, directions that look
-    down count less, so that the boards of a shelf beat its back.
+    down count a little less, so that the boards of a shelf beat its back.
     """
     facets = np.zeros((cells.w.size // 16 + cells.w.shape[0] + cells.w.shape[1], 6), np.float32)
     facets = facets[: _facets(cells.w, cells.lens, facets)]
@@ -118,28 +120,27 @@ def _most_faced(facets: F4, free: Bool, trials: I4, best: F8) -> int:
 
 
 def _merit(facets: F4, direction: F8, least: float, *, upright: bool) -> float:
+    """Return how well a direction explains the surface: what of it lies in large levels."""
     count = np.zeros(HEIGHT_BINS, np.int64)
-    facing = _count_levels(facets, direction, count)
-    # The boards of a shelf are several, its back is one.
-    levels = max(int(np.count_nonzero((count[1:] + count[:-1])[::2] > least)), 1)
+    _count_levels(facets, direction, count)
+    levels = (count[1:] + count[:-1])[::2]
+    levels = levels[levels > least]
     # Cameras look down at tables: +y is down in the optical frame.
     tilt = min(max(-direction[1] / 0.2, -1.0), 1.0) if upright else 0.0
-    return float(facing * math.sqrt(levels) * (1.0 + 0.6 * tilt))
+    # The boards of a shelf are several, its back is one.
+    return float(levels.sum() * levels.size**SEVERAL * (1.0 + UPRIGHT * tilt))
 
 
 @kernel
-def _count_levels(facets: F4, direction: F8, count: I4) -> int:
-    """Count the facets that face a direction, in all and by their height below the sensor."""
-    facing = 0
+def _count_levels(facets: F4, direction: F8, count: I4) -> None:
+    """Count the facets that face a direction by their height below the sensor."""
     x, y, z = direction
     for k in range(len(facets)):
         if facets[k, 0] * x + facets[k, 1] * y + facets[k, 2] * z > FACING_COS:
-            facing += 1
             height = facets[k, 3] * x + facets[k, 4] * y + facets[k, 5] * z
             level = math.floor(-height / LEVEL_BIN_M)
             if 0 <= level < count.size:
                 count[level] += 1
-    return facing
 
 
 def _settled(cells: Cells, facets: F4, direction: F8) -> F8:
