@@ -13,6 +13,7 @@ __all__ = [
     "TOLERANCE",
     "Readings",
     "best_plane",
+    "count_near",
     "level_plane",
     "normal_of",
     "readings_of",
@@ -93,6 +94,8 @@ def best_plane(
     guide: F8,
     cosines: tuple[float, float],
     rng: np.random.Generator,
+    *,
+    tolerance: float = TOLERANCE,
 ) -> tuple[F8, int]:
     """Return the plane (a, b, c) with most inliers, and how many readings these are.
 
@@ -102,7 +105,7 @@ def best_plane(
     plane = np.zeros(3)
     n = readings.w.size
     triples = rng.integers(0, max(n, 1), (TRIALS if n >= 3 else 0, 3))
-    return plane, _consensus(readings, triples, lens, guide, cosines, plane)
+    return plane, _consensus(readings, triples, lens, guide, cosines, tolerance, plane)
 
 
 @kernel
@@ -112,6 +115,7 @@ def _consensus(
     lens: Lens,
     guide: F8,
     cosines: tuple[float, float],
+    tolerance: float,
     best: F8,
 ) -> int:
     most = 0
@@ -133,19 +137,20 @@ def _consensus(
         if not ((along >= cosines[0] * norm) & (along <= cosines[1] * norm)):
             continue
         # (2) all vote
-        votes = _count(readings, a, b, c)
+        votes = count_near(readings, a, b, c, tolerance)
         if votes > most:
             most = votes
             best[0], best[1], best[2] = a, b, c
     # (3) the inliers refit
     for _ in range(4):
-        refit(readings.j, readings.i, readings.w, TOLERANCE, best)
-    return _count(readings, best[0], best[1], best[2]) if most >= 3 else 0
+        refit(readings.j, readings.i, readings.w, tolerance, best)
+    return count_near(readings, best[0], best[1], best[2], tolerance) if most >= 3 else 0
 
 
 @kernel(fast=True)
-def _count(readings: Readings, a: float, b: float, c: float) -> int:
-    a4, b4, c4, gate = np.float32(a), np.float32(b), np.float32(c), np.float32(TOLERANCE)
+def count_near(readings: Readings, a: float, b: float, c: float, tolerance: float) -> int:
+    """Count the readings near a plane."""
+    a4, b4, c4, gate = np.float32(a), np.float32(b), np.float32(c), np.float32(tolerance)
     total = np.int32(0)
     for k in range(readings.w.size):
         level = a4 * readings.j[k] + b4 * readings.i[k] + c4

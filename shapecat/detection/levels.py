@@ -17,19 +17,21 @@ DISAGREEING, REWEIGHTED = math.radians(0.5), 5
 """From which angle to the mean, radians, a plane counts less than half; how often this is done."""
 
 
-def find_levels(cells: Cells, up: F8) -> list[tuple[Support, I4]]:
+def find_levels(cells: Cells, up: F8, rng: np.random.Generator) -> list[tuple[Support, I4]]:
     """Return the planes of `find_planes` with one normal in common, lowest first.
 
     A board seen at a grazing angle, or only a strip of one, does not tell its tilt well: half a
     degree is a centimetre of height a metre away.
     """
-    found = find_planes(cells, up)
-    if len(found) < 2:
+    found = find_planes(cells, up, rng)
+    if not found:
         return found
     better = _common_up([support for support, _ in found])
     if better @ up < TURNED_COS:
-        found = find_planes(cells, better)
+        found = find_planes(cells, better, rng)
         better = _common_up([support for support, _ in found]) if found else better
+    if len(found) < 2:
+        return found
     return [(_levelled(cells, support, index, better), index) for support, index in found]
 
 

@@ -7,7 +7,15 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.cells import Cells, Lens, middle_of
-from shapecat.detection.consensus import TOLERANCE, level_plane, normal_of, refit
+from shapecat.detection.consensus import (
+    TOLERANCE,
+    Readings,
+    best_plane,
+    count_near,
+    level_plane,
+    normal_of,
+    refit,
+)
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 
@@ -29,6 +37,9 @@ LEAST_AREA_M2 = 0.03
 LEVEL_COS2 = 0.82
 """Squared cosine of the largest angle, 25 degrees, of a level reading to the horizontal."""
 STEADY_COS = math.cos(math.radians(6))
+CLOSE, CLOSE_SHARE = 0.5, 0.75
+"""Of the readings near a plane, less than this share is so close to one that is tilted between
+two: a table and the plates on it."""
 ARM = 3
 """Cells to each side over which a surface is seen to be level."""
 BEND = 0.024
@@ -53,7 +64,7 @@ class Support(NamedTuple):
     area_m2: float
 
 
-def find_planes(cells: Cells, up: F8) -> list[tuple[Support, I4]]:
+def find_planes(cells: Cells, up: F8, rng: np.random.Generator) -> list[tuple[Support, I4]]:
     """Return the horizontal planes of the scene, lowest first, each with its cells (flat)."""
     # (1), (2) readings whose surface is level
     index = np.zeros(cells.w.shape[0] * cells.w.shape[1] // 4 + 1, np.int32)
@@ -76,7 +87,7 @@ def find_planes(cells: Cells, up: F8) -> list[tuple[Support, I4]]:
         # (4) refine, and keep what lies in the plane
         middle = middle_of(height[near[:: 1 + near.size // MOST_HEIGHTS]])
         near = index[near]
-        support = _refined(cells, near, middle, up)
+        support = _refined(cells, near, middle, up, rng)
         done[low:high] = True
         if support is not None:
             supports.append((support, near))
@@ -161,19 +172,28 @@ def _by_height(index: I4, height: F4, base: float, bins: int) -> tuple[I4, I4]:
     return order, starts
 
 
-def _refined(cells: Cells, index: I4, offset: float, up: F8) -> Support | None:
+def _refined(
+    cells: Cells, index: I4, offset: float, up: F8, rng: np.random.Generator
+) -> Support | None:
     lens = cells.lens
     if offset > -MARGIN_M:  # not seen from above
         return None
     level = level_plane(lens, up, offset)
-    j, i, w = _listed(cells.w, index)
+    readings = Readings(*_listed(cells.w, index), 1)
     plane = level.copy()
     for _ in range(3):
-        if refit(j, i, w, 1.5 * TOLERANCE, plane) < LEAST_CELLS:
+        near = refit(readings.j, readings.i, readings.w, 1.5 * TOLERANCE, plane)
+        if near < LEAST_CELLS:
             return None
         if normal_of(plane, lens) @ up < STEADY_COS:
             plane = level
             break
+    close = count_near(readings, *plane, CLOSE * TOLERANCE)
+    if close < CLOSE_SHARE * near:
+        other, votes = best_plane(
+            readings, lens, up, (STEADY_COS, 1.0), rng, tolerance=CLOSE * TOLERANCE
+        )
+        plane = other if votes > close else plane
     return support_of(cells, index, plane)
 
 

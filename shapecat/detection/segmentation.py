@@ -109,7 +109,7 @@ def segment(
     """Find planes and objects among ``cells``; None if there is no supporting plane."""
     rules = _checked(settings.rules)
     up = estimate_up(cells, hint, upright=upright, rng=rng)
-    supports = [] if up is None else boards_of(cells, find_levels(cells, up))
+    supports = [] if up is None else boards_of(cells, find_levels(cells, up, rng))
     if up is None or not supports:
         return None
     up = max(supports, key=lambda s: s.area_m2).up
