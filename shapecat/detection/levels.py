@@ -32,7 +32,8 @@ def find_levels(cells: Cells, up: F8, rng: np.random.Generator) -> list[tuple[Su
         better = _common_up([support for support, _ in found]) if found else better
     if len(found) < 2:
         return found
-    return [(_levelled(cells, support, index, better), index) for support, index in found]
+    levelled = [(_levelled(cells, support, index, better), index) for support, index in found]
+    return sorted(levelled, key=lambda level: level[0].offset)
 
 
 def _common_up(supports: list[Support]) -> F8:
