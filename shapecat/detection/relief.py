@@ -43,8 +43,11 @@ INWARD, OUTWARD = 2, 3
 """Cells from the outline to where its rise is measured."""
 LEAST_CELLS, LEAST_SIDES, SMALL_PART = 80, 30, 12
 ALONG, KNOWN, BESIDE = 0.4, 0.65, 0.3
-"""Shares of an outline: of an object, least along the plane, and least along the plane or in touch
-with what is not low; of a swell, least along the plane."""
+"""Shares of an outline: of an object, least along the plane, and, of what nothing hides, least
+along the plane or in touch with what is not low; of a swell, least along the plane."""
+BROAD = 1.5
+"""Cells for each side of the outline of what may be partly hidden: strips beside something else
+are narrower."""
 FLOOR = 0.0006
 """Least mean height of what a rim encloses above the plane around it, 1/m."""
 
@@ -185,7 +188,7 @@ def _raise(
             for p in stack[count:filled]:
                 best = max(best, merits[p])
             merit = outline.rise / outline.sides
-            if merit > GROWN * best and _is_object(outline):
+            if merit > GROWN * best and _is_object(outline, filled):
                 objects += 1
                 for p in stack[:filled]:
                     marks[p], merits[p], owners[p] = objects, merit, number
@@ -197,7 +200,8 @@ class Outline(NamedTuple):
 
     Attributes
     ----------
-    sides : sides of cells; ``table`` of them look at the plane, ``foot`` touch what is not low.
+    sides : sides of cells; ``table`` of them look at the plane, ``foot`` touch what is not low,
+        ``hidden`` end at something nearer or where nothing is seen.
     rise : sum of the rises of the former, as multiples of the least mean rise.
     steep : how many of them are steep.
     floor : mean height of the cells that were filled in, above the plane around, 1/m.
@@ -206,6 +210,7 @@ class Outline(NamedTuple):
     sides: int
     table: int
     foot: int
+    hidden: int
     rise: float
     steep: int
     floor: float
@@ -223,10 +228,11 @@ def _width(w: F4, stack: I4, count: int) -> float:
 
 
 @kernel
-def _is_object(outline: Outline) -> bool:
-    """Whether an outline is that of an object."""
+def _is_object(outline: Outline, count: int) -> bool:
+    """Whether an outline of so many cells is that of an object."""
     table, sides = outline.table, outline.sides
-    if table < max(LEAST_SIDES, ALONG * sides) or table + outline.foot < KNOWN * sides:
+    seen = sides - (outline.hidden if count > BROAD * sides else 0)
+    if table < max(LEAST_SIDES, ALONG * sides) or table + outline.foot < KNOWN * seen:
         return False
     least = max(table * (1 + CHANCE / sides), ALL_AROUND * sides)
     return bool(outline.rise > least and outline.steep > STEEP_SHARE * table)
@@ -271,7 +277,7 @@ def _outline(
     rows, columns = excess.shape
     parts = part.reshape(-1)
     flat = excess.reshape(-1)
-    sides = table = foot = steep = 0
+    sides = table = foot = hidden = steep = 0
     rise = around = floor = 0.0
     me = parts[stack[0]]
     for t in range(count):
@@ -287,6 +293,7 @@ def _outline(
             sides += 1
             y, x = i + di, j + dj
             foot += excess[y, x] == 0 and w[y, x] > 0 and abs(w[y, x] - w[i, j]) < JUMP
+            hidden += w[y, x] <= 0 or w[y, x] > w[i, j] + JUMP
             y, x = i + OUTWARD * di, j + OUTWARD * dj
             v, u = i - INWARD * di, j - INWARD * dj
             if min(y, x) < 0 or min(v, u) < 0 or max(y, v) >= rows or max(x, u) >= columns:
@@ -301,7 +308,8 @@ def _outline(
             rise += min(step, MOST_STEPS)
             steep += int(step > STEEP)
     base = around / max(table, 1)
-    return Outline(sides, table, foot, rise, steep, floor / max(count - flooded, 1) - base)
+    floor = floor / max(count - flooded, 1) - base
+    return Outline(sides, table, foot, hidden, rise, steep, floor)
 
 
 @kernel
