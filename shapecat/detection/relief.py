@@ -4,6 +4,7 @@ Sensors see a flat table in slow waves, higher than a plate is thick; but only a
 edge. So what is low is judged by its outline rather than by its height.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -20,9 +21,10 @@ LOW_M = 0.03
 """Higher things are objects anyway."""
 LEVELS = np.array([0.012, 0.008, 0.0055, 0.0038, 0.0025], np.float32)
 """Inverse depth above the plane at which outlines are looked for, 1/m."""
-STEP, STEP_M = 0.004, 0.004
-"""Mean rise across the outline of an object: 1/m, more than a step of a Kinect, and metres: where a
-plane is seen at a grazing angle noise rises by many steps, but not by much."""
+STEP, SLIP = 0.004, 1.0
+"""Mean rise across the outline of an object, 1/m: more than a step of a Kinect, and than the plane
+itself rises over so many cells, for where it is seen at a grazing angle readings that are a little
+beside their place seem to rise."""
 STEEP, STEEP_SHARE = 0.5, 0.7
 """A rise that is more than noise, as a share of the mean, and the share of the outline that has
 it."""
@@ -64,12 +66,13 @@ def raise_low(cells: Cells, heights: Heights, planes: F8, raised: I4, *, largest
     for k, plane in enumerate(planes):
         excess = np.zeros(cells.w.shape, np.float32)
         if _excess(cells.w, heights.owner, heights.height, plane, k + 1, excess) >= LEAST_CELLS:
+            step = max(STEP, SLIP * math.hypot(plane[0], plane[1]))
             _cut_feet(cells.w, heights.owner, heights.height, k + 1, excess)
             widest = largest_m * cells.lens.fx
             objects = _raise(
-                cells.w, excess, heights.owner, k + 1, plane[3], raised, widest, objects
+                cells.w, excess, heights.owner, k + 1, step, raised, widest, objects
             )
-            _lower(cells.w, excess, heights.owner, k + 1, plane[3], raised)
+            _lower(cells.w, excess, heights.owner, k + 1, step, raised)
 
 
 @kernel
@@ -140,7 +143,7 @@ def _raise(
     excess: F4,
     owner: I4,
     number: int,
-    scale: float,
+    rise_least: float,
     raised: I4,
     widest: float,
     objects: int,
@@ -179,12 +182,12 @@ def _raise(
             if known > SAME * count:
                 continue
             filled = fill_hull(excess, part, stack, count)
-            outline = _outline(w, excess, owner, part, stack, filled, number, scale, count)
+            outline = _outline(w, excess, owner, part, stack, filled, number, rise_least, count)
             if filled > count and outline.floor < FLOOR:
                 for p in stack[count:filled]:
                     parts[p] = 0
                 filled = count
-                outline = _outline(w, excess, owner, part, stack, filled, number, scale, count)
+                outline = _outline(w, excess, owner, part, stack, filled, number, rise_least, count)
             for p in stack[count:filled]:
                 best = max(best, merits[p])
             merit = outline.rise / outline.sides
@@ -270,7 +273,7 @@ def _outline(
     stack: I4,
     count: int,
     number: int,
-    scale: float,
+    rise_least: float,
     flooded: int,
 ) -> Outline:
     """Measure the outline of a part; the cells from ``flooded`` on were filled in."""
@@ -302,7 +305,7 @@ def _outline(
                 continue
             table += 1
             around += excess[y, x]
-            step = (excess[v, u] - excess[y, x]) / max(STEP, STEP_M * w[i, j] / scale)
+            step = (excess[v, u] - excess[y, x]) / rise_least
             if excess[v, u] == 0:  # the inside is not low
                 step = MOST_STEPS
             rise += min(step, MOST_STEPS)
@@ -313,7 +316,7 @@ def _outline(
 
 
 @kernel
-def _lower(w: F4, excess: F4, owner: I4, number: int, scale: float, raised: I4) -> None:
+def _lower(w: F4, excess: F4, owner: I4, number: int, rise_least: float, raised: I4) -> None:
     """Give level parts of low object cells whose outline is that of a swell back to the plane."""
     rows, columns = excess.shape
     seeds = np.zeros(excess.size, np.int32)
@@ -339,7 +342,7 @@ def _lower(w: F4, excess: F4, owner: I4, number: int, scale: float, raised: I4) 
         count = _flood(above, np.float32(0.5), s, number_of_parts, part, stack)
         if count < SMALL_PART:
             continue
-        line = _outline(w, excess, owner, part, stack, count, number, scale, count)
+        line = _outline(w, excess, owner, part, stack, count, number, rise_least, count)
         if line.table >= BESIDE * line.sides and line.rise < line.table:
             for t in range(count):
                 owners[stack[t]] = -number
