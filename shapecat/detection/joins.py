@@ -25,9 +25,9 @@ from shapecat.detection.pieces import (
     depths_of,
     has_lid,
     is_group,
-    lid_share,
     merge,
     rests_on,
+    roundness_of,
     slope_of,
 )
 from shapecat.detection.surfaces import Surfaces
@@ -42,13 +42,14 @@ SEEN_WHOLE = 0.25
 STANDS = 0.25
 HANGS = 0.4
 """Links with the plane, as a share of those with pieces, of a handle that reaches down to it."""
-NECK_WIDTH, NECK_OVERLAP_M, NECK_APART, ROUND = 0.55, 0.03, 0.12, 0.8
-"""A neck: width, metres below the top of the body, offset of its middle; slope of the body."""
-NECK_LEDGE, NECK_TALL = 0.1, 1.1
-AXIAL, WIDEST_NECK, NECK_HEIGHT = 0.055, 0.78, 0.62
-"""A wide neck on a shoulder: offset of its middle, width, height, all by those of the body."""
-SHOULDER_M, SHOULDER = 0.01, 0.17
-"""A shoulder slopes: within this depth of its top less faces up than this, by width squared."""
+NECK_WIDTH, NECK_LEDGE = 0.7, 0.1
+"""A neck on what faces up along more than this share of its border is narrower, by the width of the
+body."""
+NECK_APART, NECK_TALL, NECK_OVERLAP_M = 0.2, 1.1, 0.03
+"""Offset of its middle, by the width of the body, its height, by that of the body, and how far it
+may begin below the top of the body, metres."""
+BULGING, ROUND = 0.8, 0.9
+"""`slope_of` and `roundness_of` from which a body is round; what shows a level top is less."""
 
 
 def join_pieces(
@@ -89,7 +90,7 @@ def _join_small(pieces: Pieces, small: F4) -> None:
 
 @kernel
 def _join_necks(pieces: Pieces) -> None:
-    """Join a narrow round piece to the round one without a lid it is over the middle of."""
+    """Join a narrower piece to the round one without a lid that it is over the middle of."""
     n = pieces.group.size
     for p in range(1, n):
         for q in range(1, n):
@@ -105,21 +106,15 @@ def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
     if met < FEW or pieces.owner[p] != pieces.owner[q] or pieces.single[p, TABLE] > 2:
         return False
     narrow, wide = a[RIGHTMOST] - a[LEFT], b[RIGHTMOST] - b[LEFT]
-    if a[TOP] < b[TOP] or a[BOTTOM] < b[TOP] - NECK_OVERLAP_M or slope_of(b) < ROUND:
+    ledge = pieces.pairs[ONTO, p, q] > NECK_LEDGE * pieces.pairs[CONTACT, p, q]
+    if narrow > (NECK_WIDTH if ledge or rests_on(pieces, p, q) else 1.0) * wide:
+        return False
+    if a[TOP] < b[TOP] or a[BOTTOM] < b[TOP] - NECK_OVERLAP_M:
         return False
     apart = abs(a[LEFT] + a[RIGHTMOST] - b[LEFT] - b[RIGHTMOST]) / 2
-    if apart > NECK_APART * wide or slope_of(a) < ROUND / 2:
+    if apart > NECK_APART * wide or a[TOP] - a[BOTTOM] > NECK_TALL * (b[TOP] - b[BOTTOM]):
         return False
-    if a[TOP] - a[BOTTOM] > NECK_TALL * (b[TOP] - b[BOTTOM]) or rests_on(pieces, p, q):
-        return False
-    if pieces.pairs[ONTO, p, q] <= NECK_LEDGE * pieces.pairs[CONTACT, p, q]:
-        return bool(narrow <= wide and not has_lid(pieces, q))
-    if narrow <= NECK_WIDTH * wide and not has_lid(pieces, q):
-        return True
-    # A wide neck on a shoulder: turned about one axis, and the shoulder slopes.
-    axial = apart <= AXIAL * wide and slope_of(a) >= ROUND and narrow <= WIDEST_NECK * wide
-    axial = axial and a[TOP] - a[BOTTOM] <= NECK_HEIGHT * (b[TOP] - b[BOTTOM])
-    return bool(axial and lid_share(pieces, q, SHOULDER_M) < SHOULDER)
+    return bool(slope_of(b) > BULGING and roundness_of(b) > ROUND and not has_lid(pieces, q))
 
 
 @kernel

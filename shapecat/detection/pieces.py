@@ -20,6 +20,7 @@ __all__ = [
     "COUNT",
     "FAR",
     "FEW",
+    "FITTED",
     "FRONT",
     "HIDDEN",
     "LEFT",
@@ -35,6 +36,7 @@ __all__ = [
     "TABLE",
     "TOP",
     "TURN",
+    "TURN2",
     "Pieces",
     "depths_of",
     "has_lid",
@@ -43,6 +45,7 @@ __all__ = [
     "merge",
     "pieces_of",
     "rests_on",
+    "roundness_of",
     "side_of",
     "slope_of",
 ]
@@ -53,7 +56,9 @@ depth over a gap; links whose far side on q faces up, and the sum of its heights
 TABLE, HIDDEN, RIM = range(3)
 """Statistics of one piece: links with its plane; boundary behind things that are no piece; links
 with a higher plane, from below."""
-COUNT, LEFT, RIGHTMOST, SIDE, SIDE2, TURN, SIDETURN, TOP, BOTTOM, AREA, FAR = range(11)
+COUNT, LEFT, RIGHTMOST, FITTED, SIDE, SIDE2, TURN, TURN2, SIDETURN, TOP, BOTTOM, AREA, FAR = range(
+    13
+)
 FEW = 3
 """Links between two pieces that are taken for a contact rather than for noise."""
 SAMPLES = 48
@@ -78,7 +83,7 @@ class Pieces(NamedTuple):
     pairs : (5, n + 1, n + 1) float32, see `CONTACT` and the following.
     single : (n + 1, 3) float32, see `TABLE` and `HIDDEN`.
     boundary : (n + 1,) float32 sides of cells on the boundary.
-    shape : (n + 1, 11) float32: cells, lateral range, sums for the regression of the lateral
+    shape : (n + 1, 13) float32: cells, lateral range, cells with a tangent, sums for the regression of the lateral
         normal on the lateral position, height range, area, sum of the depths.
     lid : (n + 1, BANDS) float32 m2 of surface that faces up, by height.
     samples : (n + 1, SAMPLES) int32 cells away from edges, -1 beyond the last.
@@ -105,7 +110,7 @@ def pieces_of(
         np.zeros((5, size, size), np.float32),
         np.zeros((size, 3), np.float32),
         np.zeros(size, np.float32),
-        np.zeros((size, 11), np.float32),
+        np.zeros((size, 13), np.float32),
         np.zeros((size, BANDS), np.float32),
         np.full((size, SAMPLES), -1, np.int32),
         np.zeros(size, np.int8),
@@ -279,9 +284,11 @@ def _measure(
                 continue
             nx, ny, nz = normal[i, j, 0], normal[i, j, 1], normal[i, j, 2]
             turn = nx * side[0] + ny * side[1] + nz * side[2]
+            shape[p, FITTED] += 1
             shape[p, SIDE] += along
             shape[p, SIDE2] += along * along
             shape[p, TURN] += turn
+            shape[p, TURN2] += turn * turn
             shape[p, SIDETURN] += along * turn
             facing = -(nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
             area = z * z * per_x * per_y / max(facing, 0.2)
@@ -319,7 +326,7 @@ def merge(pieces: Pieces, p: int, q: int) -> None:
     pieces.single[p] += pieces.single[q]
     pieces.lid[p] += pieces.lid[q]
     a, b = pieces.shape[p], pieces.shape[q]
-    for k in (COUNT, SIDE, SIDE2, TURN, SIDETURN, AREA, FAR):
+    for k in (COUNT, FITTED, SIDE, SIDE2, TURN, TURN2, SIDETURN, AREA, FAR):
         a[k] += b[k]
     a[LEFT], a[RIGHTMOST] = min(a[LEFT], b[LEFT]), max(a[RIGHTMOST], b[RIGHTMOST])
     a[TOP], a[BOTTOM] = max(a[TOP], b[TOP]), min(a[BOTTOM], b[BOTTOM])
@@ -354,9 +361,28 @@ def slope_of(row: F4) -> float:
 
     2 for a whole cylinder seen from outside, -2 from inside, 0 for a plane.
     """
-    spread = row[SIDE2] - row[SIDE] * row[SIDE] / row[COUNT]
-    slope = (row[SIDETURN] - row[SIDE] * row[TURN] / row[COUNT]) / max(spread, 1e-9)
-    return float(slope * (row[RIGHTMOST] - row[LEFT]))
+    spread, _, both = _moments(row)
+    return float(both / max(spread, 1e-9) * (row[RIGHTMOST] - row[LEFT]))
+
+
+@kernel(leaf=True)
+def roundness_of(row: F4) -> float:
+    """Return the correlation of the lateral normal with the lateral position.
+
+    1 for what is turned about an upright axis; the faces of a box, and tops that are level, do not
+    turn steadily.
+    """
+    spread, turning, both = _moments(row)
+    return float(both / math.sqrt(max(spread * turning, 1e-12)))
+
+
+@kernel(leaf=True)
+def _moments(row: F4) -> tuple[float, float, float]:
+    """Return the sums of squares of the lateral position and normal, and of products of both."""
+    n = max(row[FITTED], np.float32(1))
+    spread = row[SIDE2] - row[SIDE] * row[SIDE] / n
+    turning = row[TURN2] - row[TURN] * row[TURN] / n
+    return spread, turning, row[SIDETURN] - row[SIDE] * row[TURN] / n
 
 
 @kernel(leaf=True)
