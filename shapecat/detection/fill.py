@@ -20,7 +20,6 @@ __all__ = [
 
 FRINGE = 0.6
 """Share of the least height from which a reading next to an object belongs to it."""
-FEET_CELLS = 4
 MOST_CELLS = 4000
 STACK = MOST_CELLS + 4
 """Room for a hole that is found to be too large."""
@@ -47,14 +46,14 @@ def fill_enclosed(w: F4, height: F4, labels: I4, count: int, *, active: bool) ->
 
 @kernel
 def grow_feet(w: F4, owner: I4, height: F4, labels: I4) -> None:
-    """Let the labels grow over up to four cells that are hardly above their plane.
+    """Let the labels grow over the cells beside them that are hardly above their plane.
 
     The least height of an object cell is safe against the noise of the plane; next to an object
-    less is enough.
+    less is enough. Further away what is so low is as often the plane.
     """
     rows, columns = labels.shape
-    queue = np.zeros(labels.size, np.int32)
-    top = 0
+    edge = np.zeros(labels.size, np.int32)
+    count = 0
     for i in range(rows):
         for j in range(columns):
             if labels[i, j] > 0 and (
@@ -63,26 +62,20 @@ def grow_feet(w: F4, owner: I4, height: F4, labels: I4) -> None:
                 or (i + 1 < rows and owner[i + 1, j] < 0)
                 or (j + 1 < columns and owner[i, j + 1] < 0)
             ):
-                queue[top] = i * columns + j
-                top += 1
-    done = 0
-    for _ in range(FEET_CELLS):
-        end = top
-        while done < end:
-            i, j = queue[done] // columns, queue[done] % columns
-            done += 1
-            for d in range(4):
-                y = i + (1 if d == 0 else -1 if d == 1 else 0)
-                x = j + (1 if d == 2 else -1 if d == 3 else 0)
-                if y < 0 or x < 0 or y >= rows or x >= columns or labels[y, x] != 0:
-                    continue
-                if owner[y, x] != -abs(owner[i, j]) or abs(w[y, x] - w[i, j]) >= JUMP:
-                    continue
-                z = 1 / w[y, x]
-                if height[y, x] > FRINGE * (LEAST_M + NOISE * z * z):
-                    labels[y, x] = labels[i, j]
-                    queue[top] = y * columns + x
-                    top += 1
+                edge[count] = i * columns + j
+                count += 1
+    for p in edge[:count]:
+        i, j = p // columns, p % columns
+        for d in range(4):
+            y = i + (1 if d == 0 else -1 if d == 1 else 0)
+            x = j + (1 if d == 2 else -1 if d == 3 else 0)
+            if y < 0 or x < 0 or y >= rows or x >= columns or labels[y, x] != 0:
+                continue
+            if owner[y, x] != -abs(owner[i, j]) or abs(w[y, x] - w[i, j]) >= JUMP:
+                continue
+            z = 1 / w[y, x]
+            if height[y, x] > FRINGE * (LEAST_M + NOISE * z * z):
+                labels[y, x] = labels[i, j]
 
 
 @kernel(leaf=True)
