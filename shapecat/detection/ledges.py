@@ -9,7 +9,15 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import Cells
 from shapecat.detection.heights import Heights
-from shapecat.detection.pieces import BAND_M, BANDS, BOTTOM, TOP, Pieces, side_of
+from shapecat.detection.pieces import (
+    BAND_M,
+    BANDS,
+    BOTTOM,
+    TOP,
+    Pieces,
+    roundness_of,
+    side_of,
+)
 from shapecat.detection.surfaces import Surfaces
 from shapecat.jit import kernel
 
@@ -25,6 +33,8 @@ RISE_M = 0.025
 """What stands on a ledge is higher than this."""
 LEAST_ABOVE, LEAST_BELOW, CLEARANCE = 60, 40, 2
 """Cells of the upper and the lower object, so many bands away from the ledge."""
+TURNED = 0.93
+"""`roundness_of` of what is one thing turned about an axis: the top of a can makes it less."""
 HOLLOW = -0.1
 """`slope_of` from which what rises is the inside of a container."""
 
@@ -49,6 +59,8 @@ def cut_at_ledges(
 def _find(pieces: Pieces, cut: I4) -> None:
     """Write the band of the best ledge of each piece."""
     for p in range(1, pieces.group.size):
+        if roundness_of(pieces.shape[p]) > TURNED:
+            continue
         top = int(pieces.shape[p, TOP] / BAND_M)
         bottom = int(pieces.shape[p, BOTTOM] / BAND_M)
         lid = pieces.lid[p]
