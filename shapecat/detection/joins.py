@@ -39,6 +39,8 @@ PART = 0.48
 """A part that stands on nothing is smaller than this share of what it hangs on."""
 SEEN_WHOLE = 0.25
 """Largest share of its boundary that is behind other things."""
+WHOLE = 1.6
+"""`slope_of` what is seen all the way round: a ball or can that leans, but no handle."""
 STANDS = 0.25
 HANGS = 0.4
 """Links with the plane, as a share of those with pieces, of a handle that reaches down to it."""
@@ -138,6 +140,7 @@ def _join_floating(pieces: Pieces) -> None:
                 and hidden < SEEN_WHOLE * pieces.boundary[p]
                 and np.sum(pieces.pairs[ONTO, p]) < STANDS * total
                 and pieces.shape[p, COUNT] < PART * pieces.shape[q, COUNT]
+                and slope_of(pieces.shape[p]) < WHOLE
                 and not rests_on(pieces, p, q)
             ):
                 merge(pieces, q, p)
