@@ -24,9 +24,9 @@ def rays() -> Array:
     return np.stack([(u - 319.5) / 525, (v - 239.5) / 525, np.ones(u.shape)], -1)
 
 
-def depth_of(height: Array) -> Array:
+def depth_of(height: Array, distance: float = DISTANCE) -> Array:
     """Return the depth of a table whose surface lies ``height`` (480, 640) metres above it."""
-    offset = -DISTANCE * np.sin(TILT)
+    offset = -distance * np.sin(TILT)
     return np.asarray((offset + height) / (rays() @ UP))
 
 
@@ -109,3 +109,37 @@ def test_a_plate_against_a_box_is_not_its_foot() -> None:
         for c in found(frame).candidates
     )
     assert best > 0.8
+
+
+def test_a_plate_half_hidden_is_an_object() -> None:
+    """What something nearer hides of an outline says nothing about it."""
+    u = np.mgrid[:480, :640][1]
+    disc = bump(45, 4) > 0.5
+    near = (u > 320) & (u < 410)
+    depth = np.where(near, 0.55, depth_of(0.005 * disc))
+    plate = np.flatnonzero(disc & ~near)
+    best = max(np.isin(plate, c.indices).mean() for c in found(measured(depth)).candidates)
+    assert best > 0.9
+
+
+def test_a_plate_thinner_than_noise_further_away() -> None:
+    """Near the camera 3 mm are many steps of the sensor."""
+    disc = bump(60, 4)
+    (one,) = found(measured(depth_of(0.003 * disc, 0.55))).candidates
+    assert np.isin(np.flatnonzero(disc.reshape(-1) > 0.5), one.indices).mean() > 0.9
+
+
+def test_a_large_plate_does_not_tilt_the_table() -> None:
+    """Least squares may stay at a plane between the plate and the table beyond it."""
+    v, u = np.mgrid[:480, :640]
+    scene = found(measured(depth_of(0.008 * ((v > 300) & (u < 360)))))
+    assert scene.up @ UP > np.cos(np.radians(0.1))
+    assert abs(scene.planes[0].offset + DISTANCE * np.sin(TILT)) < 1e-3
+
+
+def test_an_object_does_not_grow_over_a_swell_around_it() -> None:
+    """The swell is lower than any object, but not than a foot."""
+    v, u = np.mgrid[:480, :640]
+    box = (abs(u - 320) < 30) & (abs(v - 240) < 30)
+    (one,) = found(measured(depth_of(np.where(box, 0.08, 0.0048 * bump(90, 60))))).candidates
+    assert len(one.indices) < 1.25 * np.count_nonzero(box)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from shapecat.simulation import KINECT, make_scene, render_frame
 from tests.test_detection import (
     Array,
     Shape,
@@ -32,6 +33,27 @@ def test_can_on_the_corner_of_a_box_is_no_neck() -> None:
     """Two faces of a box seen at once turn as the side of a bottle does; but its top is level."""
     shapes = [table(), box((0, 0, 0), (0.14, 0.14, 0.13), np.pi / 4), can(0, 0, 0.13, 0.045, 0.05)]
     check(shapes, [1, 2], tilt_deg=28)
+
+
+def test_neck_beside_the_axis_is_part_of_the_bottle() -> None:
+    """The head of a spray bottle; no level top shows between neck and body."""
+    shoulder = [can(0, 0, 0.14 + 0.0006 * k, 0.04 - 0.0009 * k, 0.0007) for k in range(20)]
+    bottle = union(can(0, 0, 0, 0.04, 0.14), *shoulder, can(0.006, 0, 0.152, 0.022, 0.04))
+    check([table(), bottle], [1], tilt_deg=25)
+
+
+def test_level_shoulder_of_a_bottle_is_no_ledge() -> None:
+    """Little of it shows beside the neck, and all turns about one axis."""
+    shoulder = [can(0, 0, 0.12 + 0.0004 * k, 0.045 - 0.001 * k, 0.0005) for k in range(20)]
+    bottle = union(can(0, 0, 0, 0.045, 0.12), *shoulder, can(0, 0, 0.128, 0.025, 0.05))
+    check([table(), bottle], [1], tilt_deg=25)
+
+
+def test_ball_that_touches_a_box_is_no_handle() -> None:
+    """It hides where it stands; but handles are not round all about."""
+    rng = np.random.default_rng(690)
+    frame, seen = render_frame(make_scene("clutter", rng, frames=1), 0, rng=rng, sensor=KINECT)
+    assert min(overlaps(found(frame), seen, [27])) > 0.8
 
 
 def test_cans_of_one_radius_are_parted_by_their_axes() -> None:

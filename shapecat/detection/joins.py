@@ -47,9 +47,10 @@ HANGS = 0.4
 NECK_WIDTH, NECK_LEDGE = 0.7, 0.1
 """A neck on what faces up along more than this share of its border is narrower, by the width of the
 body."""
-NECK_APART, NECK_TALL, NECK_OVERLAP_M = 0.2, 1.1, 0.03
-"""Offset of its middle, by the width of the body, its height, by that of the body, and how far it
-may begin below the top of the body, metres."""
+NECK_APART, NECK_OUT, NECK_TALL, NECK_OVERLAP_M = 0.2, 0.05, 1.1, 0.03
+"""How far its middle is off that of the body, and its side beyond that of the body, by the width of
+the body; its height, by that of the body; how far it may begin below the top of the body, metres.
+"""
 BULGING, ROUND = 0.8, 0.9
 """`slope_of` and `roundness_of` from which a body is round; what shows a level top is less."""
 
@@ -111,10 +112,12 @@ def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
     ledge = pieces.pairs[ONTO, p, q] > NECK_LEDGE * pieces.pairs[CONTACT, p, q]
     if narrow > (NECK_WIDTH if ledge or rests_on(pieces, p, q) else 1.0) * wide:
         return False
+    apart = abs(a[LEFT] + a[RIGHTMOST] - b[LEFT] - b[RIGHTMOST]) / 2
+    if apart > min(NECK_APART * wide, (wide - narrow) / 2 + NECK_OUT * wide):
+        return False
     if a[TOP] < b[TOP] or a[BOTTOM] < b[TOP] - NECK_OVERLAP_M:
         return False
-    apart = abs(a[LEFT] + a[RIGHTMOST] - b[LEFT] - b[RIGHTMOST]) / 2
-    if apart > NECK_APART * wide or a[TOP] - a[BOTTOM] > NECK_TALL * (b[TOP] - b[BOTTOM]):
+    if a[TOP] - a[BOTTOM] > NECK_TALL * (b[TOP] - b[BOTTOM]):
         return False
     return bool(slope_of(b) > BULGING and roundness_of(b) > ROUND and not has_lid(pieces, q))
 

@@ -33,7 +33,7 @@ RISE_M = 0.025
 """What stands on a ledge is higher than this."""
 LEAST_ABOVE, LEAST_BELOW, CLEARANCE = 60, 40, 2
 """Cells of the upper and the lower object, so many bands away from the ledge."""
-TURNED = 0.93
+TURNED = 0.95
 """`roundness_of` of what is one thing turned about an axis: the top of a can makes it less."""
 HOLLOW = -0.1
 """`slope_of` from which what rises is the inside of a container."""

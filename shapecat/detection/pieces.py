@@ -83,8 +83,8 @@ class Pieces(NamedTuple):
     pairs : (5, n + 1, n + 1) float32, see `CONTACT` and the following.
     single : (n + 1, 3) float32, see `TABLE` and `HIDDEN`.
     boundary : (n + 1,) float32 sides of cells on the boundary.
-    shape : (n + 1, 13) float32: cells, lateral range, cells with a tangent, sums for the regression of the lateral
-        normal on the lateral position, height range, area, sum of the depths.
+    shape : (n + 1, 13) float32: cells, lateral range, cells with a tangent, sums for the regression
+        of their lateral normal on the lateral position, height range, area, sum of the depths.
     lid : (n + 1, BANDS) float32 m2 of surface that faces up, by height.
     samples : (n + 1, SAMPLES) int32 cells away from edges, -1 beyond the last.
     owner : (n + 1,) int8 the plane it is above, as in `Heights.owner`.

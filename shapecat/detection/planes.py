@@ -179,10 +179,11 @@ def _refined(
     if offset > -MARGIN_M:  # not seen from above
         return None
     level = level_plane(lens, up, offset)
-    readings = Readings(*_listed(cells.w, index), 1)
+    j, i, w = _listed(cells.w, index)
+    readings = Readings(j, i, w, 1)
     plane = level.copy()
     for _ in range(3):
-        near = refit(readings.j, readings.i, readings.w, 1.5 * TOLERANCE, plane)
+        near = refit(j, i, w, 1.5 * TOLERANCE, plane)
         if near < LEAST_CELLS:
             return None
         if normal_of(plane, lens) @ up < STEADY_COS:

@@ -21,10 +21,10 @@ LOW_M = 0.03
 """Higher things are objects anyway."""
 LEVELS = np.array([0.012, 0.008, 0.0055, 0.0038, 0.0025], np.float32)
 """Inverse depth above the plane at which outlines are looked for, 1/m."""
-STEP, SLIP = 0.004, 1.0
-"""Mean rise across the outline of an object, 1/m: more than a step of a Kinect, and than the plane
-itself rises over so many cells, for where it is seen at a grazing angle readings that are a little
-beside their place seem to rise."""
+STEP, SLIP = 0.004, 0.7
+"""Mean rise across the outline of an object: 1/m, more than a step of a Kinect; and as a share of
+what the plane itself rises in a cell, for where it is seen at a grazing angle readings that are a
+little beside their place seem to rise."""
 STEEP, STEEP_SHARE = 0.5, 0.7
 """A rise that is more than noise, as a share of the mean, and the share of the outline that has
 it."""
@@ -34,7 +34,7 @@ ALL_AROUND = 0.75
 """Least sum of the rises for each side of the outline, whether it looks at the plane or not."""
 CHANCE = 16
 """A short outline must rise more, by this over its sides: few waves rise all around."""
-GROWN = 0.8
+GROWN = 0.95
 """Rise per side of a part that replaces known objects within it, as a share of the greatest of
 theirs: an object and a swell beside it rise less."""
 SLOPE = 0.0016
@@ -69,9 +69,7 @@ def raise_low(cells: Cells, heights: Heights, planes: F8, raised: I4, *, largest
             step = max(STEP, SLIP * math.hypot(plane[0], plane[1]))
             _cut_feet(cells.w, heights.owner, heights.height, k + 1, excess)
             widest = largest_m * cells.lens.fx
-            objects = _raise(
-                cells.w, excess, heights.owner, k + 1, step, raised, widest, objects
-            )
+            objects = _raise(cells.w, excess, heights.owner, k + 1, step, raised, widest, objects)
             _lower(cells.w, excess, heights.owner, k + 1, step, raised)
 
 
