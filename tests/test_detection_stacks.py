@@ -37,7 +37,7 @@ def test_can_on_the_corner_of_a_box_is_no_neck() -> None:
 
 def test_neck_beside_the_axis_is_part_of_the_bottle() -> None:
     """The head of a spray bottle; no level top shows between neck and body."""
-    shoulder = [can(0, 0, 0.14 + 0.0006 * k, 0.04 - 0.0009 * k, 0.0007) for k in range(20)]
+    shoulder = [can(0.0003 * k, 0, 0.14 + 0.0006 * k, 0.04 - 0.0009 * k, 7e-4) for k in range(20)]
     bottle = union(can(0, 0, 0, 0.04, 0.14), *shoulder, can(0.006, 0, 0.152, 0.022, 0.04))
     check([table(), bottle], [1], tilt_deg=25)
 
