@@ -23,7 +23,9 @@ CORNER_COS = 0.3
 TRIALS = 120
 MOST_DIRECTIONS = 4
 HEIGHT_BINS, LEVEL_BIN_M = 80, 0.04
-SEVERAL, UPRIGHT = 0.75, 0.2
+LEVELS_APART = 2
+"""Bins between two levels."""
+SEVERAL, UPRIGHT = 0.75, 0.3
 """How much several levels count, by the power of their number, and an upright camera."""
 
 
@@ -123,12 +125,31 @@ def _merit(facets: F4, direction: F8, least: float, *, upright: bool) -> float:
     """Return how well a direction explains the surface: what of it lies in large levels."""
     count = np.zeros(HEIGHT_BINS, np.int64)
     _count_levels(facets, direction, count)
-    levels = (count[1:] + count[:-1])[::2]
-    levels = levels[levels > least]
+    level, levels = _large_levels(count, least)
     # Cameras look down at tables: +y is down in the optical frame.
     tilt = min(max(-direction[1] / 0.2, -1.0), 1.0) if upright else 0.0
     # The boards of a shelf are several, its back is one.
-    return float(levels.sum() * levels.size**SEVERAL * (1.0 + UPRIGHT * tilt))
+    return float(level * levels**SEVERAL * (1.0 + UPRIGHT * tilt))
+
+
+@kernel
+def _large_levels(count: I4, least: float) -> tuple[int, int]:
+    """Return how many facets lie in levels of more than ``least``, and how many levels these are.
+
+    A level fills two bins and stands out from the next ones: a slanted surface has many heights.
+    """
+    facets = levels = 0
+    last = count.size - 1
+    for k in range(last):
+        here = count[k] + count[k + 1]
+        stands_out = here > least
+        for m in range(max(0, k - LEVELS_APART), min(last, k + LEVELS_APART + 1)):
+            there = count[m] + count[m + 1]
+            stands_out &= here > there if m < k else here >= there
+        if stands_out:
+            facets += here
+            levels += 1
+    return facets, levels
 
 
 @kernel
