@@ -41,7 +41,8 @@ SEEN_WHOLE = 0.25
 """Largest share of its boundary that is behind other things."""
 WHOLE = 1.6
 """`slope_of` what is seen all the way round: a ball or can that leans, but no handle."""
-STANDS = 0.25
+STANDS, RISES_M = 0.25, 0.005
+"""What stands on something is linked to surface that faces up, and reaches so far above it."""
 HANGS = 0.4
 """Links with the plane, as a share of those with pieces, of a handle that reaches down to it."""
 NECK_WIDTH, NECK_LEDGE = 0.7, 0.1
@@ -141,10 +142,23 @@ def _join_floating(pieces: Pieces) -> None:
                 total >= FEW
                 and pieces.single[p, TABLE] <= max(2.0, HANGS * total)
                 and hidden < SEEN_WHOLE * pieces.boundary[p]
-                and np.sum(pieces.pairs[ONTO, p]) < STANDS * total
+                and _links_onto_lower(pieces, p) < STANDS * total
                 and pieces.shape[p, COUNT] < PART * pieces.shape[q, COUNT]
                 and slope_of(pieces.shape[p]) < WHOLE
                 and not rests_on(pieces, p, q)
             ):
                 merge(pieces, q, p)
                 again = True
+
+
+@kernel(leaf=True)
+def _links_onto_lower(pieces: Pieces, p: int) -> float:
+    """Count the links of a piece with surface that faces up, of pieces that it rises above.
+
+    The upper side of a lying bottle faces up beside its neck too.
+    """
+    total = 0.0
+    for q in range(1, pieces.group.size):
+        if pieces.shape[p, TOP] > pieces.shape[q, TOP] + RISES_M:
+            total += pieces.pairs[ONTO, p, q]
+    return total
