@@ -30,10 +30,16 @@ HOLLOW = -0.25
 BENT, INSIDE, INSIDE_SHARE = -0.15, -0.4, 0.12
 """Walls inside one container: slope of each, of both together, share of a boundary in contact."""
 FLOOR_SHARE, WITHIN = 0.6, 0.85
-BEFORE, FLAT = 0.25, 0.35
-"""A near wall: share of its boundary before the rest, height over width of it and of the rest."""
+BEFORE, FLAT, AHEAD = 0.25, 0.35, 0.65
+"""A near wall: share of its boundary before the rest, height over width of it and of the rest, and
+how far it is before the middle of the rest, by the width of that."""
+FAR_LONG, FAR_APART, FAR_BEHIND, FAR_FLAT = 0.6, 0.12, 0.35, 0.25
+"""A far rim: length and offset of its middle by the width of what is before it; share of its
+boundary behind that; height over length."""
 DISH_M, SAME_LEVEL_M = 0.05, 0.007
 """Height of a dish, and how far the parts of its rim may differ."""
+BORNE_M = 0.07
+"""Lower plates are borne by nothing but their own foot."""
 UNDER, COVERED, COVERING = 0.35, 0.15, 0.2
 """What is under a rim: cells as a share of those above, share of its boundary behind the rim, and
 how much of the above it may hide in turn, as a share of that."""
@@ -126,9 +132,23 @@ def _is_container(pieces: Pieces, inside: int, outside: int) -> bool:
         return False
     # Where they touch, ending at one height without a lid says enough: within small cups the
     # windows of the tangents smear the curvature.
-    if touch < FEW and slope_of(x) > HOLLOW:
+    if touch < FEW and slope_of(x) > HOLLOW and not _is_far_rim(pieces, inside, outside):
         return False
     return not (has_lid(pieces, outside) or has_lid(pieces, inside))
+
+
+@kernel(leaf=True)
+def _is_far_rim(pieces: Pieces, far: int, near: int) -> bool:
+    """Whether a narrow strip, too flat to show its curvature, shows behind the middle of a piece.
+
+    Of a container at the level of the camera little else is seen of the inside.
+    """
+    a, x = pieces.shape[near], pieces.shape[far]
+    long, wide = x[RIGHTMOST] - x[LEFT], a[RIGHTMOST] - a[LEFT]
+    apart = abs(x[LEFT] + x[RIGHTMOST] - a[LEFT] - a[RIGHTMOST]) / 2
+    along = long > FAR_LONG * wide and apart < FAR_APART * wide
+    behind = pieces.pairs[FRONT, near, far] > FAR_BEHIND * pieces.boundary[far]
+    return bool(along and behind and x[TOP] - x[BOTTOM] < FAR_FLAT * long)
 
 
 @kernel
@@ -170,7 +190,9 @@ def _is_under(pieces: Pieces, under: int, above: int) -> bool:
 
 @kernel(leaf=True)
 def _bears(pieces: Pieces, under: int, above: int) -> bool:
-    """Whether one piece stands on the plane, and the other on it."""
+    """Whether one piece stands on the plane, and the other, which is high enough, on it."""
+    if pieces.shape[above, TOP] < BORNE_M:
+        return False
     return bool(pieces.single[under, TABLE] >= FEW and pieces.single[above, TABLE] < FEW)
 
 
@@ -180,7 +202,7 @@ def _is_strip(pieces: Pieces, strip: int, whole: int) -> bool:
     if not (is_group(pieces, strip) and is_group(pieces, whole)):
         return False
     a, s = pieces.shape[whole], pieces.shape[strip]
-    if pieces.owner[whole] != pieces.owner[strip] or s[COUNT] > UNDER * a[COUNT]:
+    if pieces.owner[whole] != pieces.owner[strip] or s[COUNT] > a[COUNT]:
         return False
     if pieces.pairs[FRONT, strip, whole] < BEFORE * pieces.boundary[strip]:
         return False
@@ -189,7 +211,7 @@ def _is_strip(pieces: Pieces, strip: int, whole: int) -> bool:
     long, wide = s[RIGHTMOST] - s[LEFT], a[RIGHTMOST] - a[LEFT]
     if s[TOP] - s[BOTTOM] > FLAT * long or a[TOP] > FLAT * wide:
         return False
-    if abs(a[TOP] - s[TOP]) > SAME_TOP_M or a[FAR] / a[COUNT] - s[FAR] / s[COUNT] > 0.5 * wide:
+    if abs(a[TOP] - s[TOP]) > SAME_TOP_M or a[FAR] / a[COUNT] - s[FAR] / s[COUNT] > AHEAD * wide:
         return False
     return not has_lid(pieces, strip)
 

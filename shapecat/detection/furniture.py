@@ -7,8 +7,12 @@ from shapecat.detection.cells import JUMP, NEAREST_M, Cells, Lens
 from shapecat.detection.heights import LEAST_M, NOISE
 from shapecat.detection.pieces import (
     AREA,
+    BOTTOM,
+    CONTACT,
     COUNT,
     FEW,
+    FRONT,
+    HIDDEN,
     LEFT,
     RIGHTMOST,
     RIM,
@@ -21,7 +25,7 @@ from shapecat.detection.pieces import (
 from shapecat.detection.walls import ON_WALL
 from shapecat.jit import kernel
 
-__all__ = ["cut_by_range", "is_no_object", "posts_of", "remains_of", "towers_of"]
+__all__ = ["cut_by_range", "is_no_object", "posts_of", "remains_of", "sides_of", "towers_of"]
 
 RIM_LINKS, RIM_SHARE = 8, 0.1
 FAINT, FAINT_NOISE, FAINT_M2, FAINT_CELLS = 2.5, 3.5, 3e-3, 120
@@ -38,6 +42,10 @@ STEP_M, STEPS, MISSES = 0.02, 64, 2.0
 two; where something hides it, half a step counts."""
 TOWERING = 0.5
 """Share of a piece below surface that goes on beyond the greatest height."""
+
+EDGE_ON, UPRIGHT, SLENDER, COVERED = 3.0, 0.12, 0.5, 0.5
+"""What is seen edge on: surface by what it covers of the view; share of it that faces up; width by
+height; and the share of its boundary behind other things from which they may hide the rest."""
 
 
 def is_no_object(pieces: Pieces, furniture: Bool, raised: Bool, *, largest_m: float) -> Bool:
@@ -81,6 +89,21 @@ def cut_by_range(cells: Cells, regions: I4, pieces: Pieces, *, range_m: float) -
     last = (cells.w > 0) & (cells.w < 1 / range_m + JUMP / 2)
     cut = np.bincount(pieces.group[regions[last]], minlength=size)
     return np.asarray(cut > CUT * pieces.shape[:, COUNT])
+
+
+def sides_of(cells: Cells, pieces: Pieces) -> Bool:
+    """Return for each piece whether it is upright and seen only edge on, as sides of shelves are.
+
+    An object has a front too, unless something hides it.
+    """
+    shape, lens = pieces.shape, cells.lens
+    covered = shape[:, COUNT] * depths_of(pieces) ** 2 / (lens.fx * lens.fy)
+    edge_on = shape[:, AREA] > EDGE_ON * covered
+    upright = pieces.lid.sum(axis=1) < UPRIGHT * shape[:, AREA]
+    upright &= shape[:, RIGHTMOST] - shape[:, LEFT] < SLENDER * (shape[:, TOP] - shape[:, BOTTOM])
+    hidden = pieces.pairs[FRONT].sum(axis=0) + pieces.single[:, HIDDEN]
+    alone = pieces.pairs[CONTACT].sum(axis=1) < FEW
+    return np.asarray(edge_on & upright & alone & (hidden < COVERED * pieces.boundary))
 
 
 def towers_of(cells: Cells, planes: F8, pieces: Pieces, up: F8, *, highest_m: float) -> Bool:

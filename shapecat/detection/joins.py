@@ -16,6 +16,7 @@ from shapecat.detection.pieces import (
     FRONT,
     HIDDEN,
     LEFT,
+    LID_M,
     NEAR,
     ONTO,
     RIGHTMOST,
@@ -54,6 +55,13 @@ the body; its height, by that of the body; how far it may begin below the top of
 """
 BULGING, ROUND = 0.8, 0.9
 """`slope_of` and `roundness_of` from which a body is round; what shows a level top is less."""
+
+WAIST, COAXIAL = (0.95, 1.3), 0.035
+"""Width of a round body by that of what it is turned in one piece with below, and the offset of
+their middles by its width."""
+FOOT_M, FOOT, FOOT_APART, BARE = 0.06, 0.6, 0.06, 0.05
+"""A foot: its height; its width and the offset of its middle, by the width of the dish; how much
+of its top may be seen, by its own width squared."""
 
 
 def join_pieces(
@@ -94,11 +102,16 @@ def _join_small(pieces: Pieces, small: F4) -> None:
 
 @kernel
 def _join_necks(pieces: Pieces) -> None:
-    """Join a narrower piece to the round one without a lid that it is over the middle of."""
+    """Join a piece to the round one without a lid that it is over the middle of."""
     n = pieces.group.size
     for p in range(1, n):
         for q in range(1, n):
-            if p != q and is_group(pieces, p) and is_group(pieces, q) and _is_neck(pieces, p, q):
+            if (
+                p != q
+                and is_group(pieces, p)
+                and is_group(pieces, q)
+                and (_is_neck(pieces, p, q) or _has_foot(pieces, p, q))
+            ):
                 merge(pieces, q, p)
                 break
 
@@ -121,6 +134,27 @@ def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
     if a[TOP] - a[BOTTOM] > NECK_TALL * (b[TOP] - b[BOTTOM]):
         return False
     return bool(slope_of(b) > BULGING and roundness_of(b) > ROUND and not has_lid(pieces, q))
+
+
+@kernel(leaf=True)
+def _has_foot(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether piece ``q`` is the lower half of a body with a waist, or the foot of a dish.
+
+    Nothing of its top is seen, and what stands on it hardly ever stands so exactly in the middle.
+    """
+    a, b = pieces.shape[p], pieces.shape[q]
+    contact = pieces.pairs[CONTACT, p, q]
+    if contact < FEW or pieces.owner[p] != pieces.owner[q] or pieces.single[p, TABLE] > 2:
+        return False
+    if a[TOP] < b[TOP] or a[BOTTOM] < b[TOP] - NECK_OVERLAP_M or slope_of(b) < BULGING:
+        return False
+    if pieces.pairs[ONTO, p, q] > NECK_LEDGE * contact or lid_share(pieces, q, LID_M) > BARE:
+        return False
+    width, foot = a[RIGHTMOST] - a[LEFT], b[RIGHTMOST] - b[LEFT]
+    apart = abs(a[LEFT] + a[RIGHTMOST] - b[LEFT] - b[RIGHTMOST]) / 2
+    if slope_of(a) > BULGING and WAIST[0] * foot < width < WAIST[1] * foot:
+        return bool(apart < COAXIAL * width)
+    return bool(b[TOP] < FOOT_M and FOOT * width < foot < width and apart < FOOT_APART * width)
 
 
 @kernel

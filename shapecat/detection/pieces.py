@@ -24,6 +24,7 @@ __all__ = [
     "FRONT",
     "HIDDEN",
     "LEFT",
+    "LID_M",
     "NEAR",
     "ONTO",
     "ONTO_HEIGHT",

@@ -21,6 +21,7 @@ from shapecat.detection.furniture import (
     is_no_object,
     posts_of,
     remains_of,
+    sides_of,
     towers_of,
 )
 from shapecat.detection.heights import heights_of, table_of
@@ -136,6 +137,7 @@ def segment(
         join_rings(pieces, cells.w, heights.height, regions)
     furniture = posts_of(cells, heights.owner, regions, pieces, up)
     furniture |= towers_of(cells, planes, pieces, up, highest_m=settings.max_height_m)
+    furniture |= sides_of(cells, pieces)
     furniture |= remains_of(walls, regions, pieces)
     furniture |= cut_by_range(cells, regions, pieces, range_m=settings.max_range_m)
     refused = is_no_object(pieces, furniture, known, largest_m=settings.max_size_m)
