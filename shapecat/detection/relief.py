@@ -46,10 +46,13 @@ INWARD, OUTWARD = 2, 3
 LEAST_CELLS, LEAST_SIDES, SMALL_PART = 80, 30, 12
 ALONG, KNOWN, BESIDE = 0.4, 0.65, 0.3
 """Shares of an outline: of an object, least along the plane, and, of what nothing hides, least
-along the plane or in touch with what is not low; of a swell, least along the plane."""
+along the plane, in touch with what is not low, or before something farther; of a swell, least along
+the plane."""
 BROAD = 1.5
 """Cells for each side of the outline of what may be partly hidden: strips beside something else
 are narrower."""
+RAGGED = 80
+"""Square of the sides by the cells of what only fills a gap: 16 of a square, 50 of a crescent."""
 FLOOR = 0.0006
 """Least mean height of what a rim encloses above the plane around it, 1/m."""
 
@@ -201,8 +204,9 @@ class Outline(NamedTuple):
 
     Attributes
     ----------
-    sides : sides of cells; ``table`` of them look at the plane, ``foot`` touch what is not low,
-        ``hidden`` end at something nearer or where nothing is seen.
+    sides : sides of cells; ``table`` of them look at the plane; ``known`` are these, those that
+        touch what is not low, and those before something farther; ``hidden`` end at something
+        nearer or where nothing is seen.
     rise : sum of the rises of the former, as multiples of the least mean rise.
     steep : how many of them are steep.
     floor : mean height of the cells that were filled in, above the plane around, 1/m.
@@ -210,7 +214,7 @@ class Outline(NamedTuple):
 
     sides: int
     table: int
-    foot: int
+    known: int
     hidden: int
     rise: float
     steep: int
@@ -230,10 +234,12 @@ def _width(w: F4, stack: I4, count: int) -> float:
 
 @kernel
 def _is_object(outline: Outline, count: int) -> bool:
-    """Whether an outline of so many cells is that of an object."""
+    """Whether an outline around so many cells is that of an object."""
     table, sides = outline.table, outline.sides
+    if table < KNOWN * sides and sides * sides > RAGGED * count:
+        return False
     seen = sides - (outline.hidden if count > BROAD * sides else 0)
-    if table < max(LEAST_SIDES, ALONG * sides) or table + outline.foot < KNOWN * seen:
+    if table < max(LEAST_SIDES, ALONG * sides) or outline.known < KNOWN * seen:
         return False
     least = max(table * (1 + CHANCE / sides), ALL_AROUND * sides)
     return bool(outline.rise > least and outline.steep > STEEP_SHARE * table)
@@ -278,7 +284,7 @@ def _outline(
     rows, columns = excess.shape
     parts = part.reshape(-1)
     flat = excess.reshape(-1)
-    sides = table = foot = hidden = steep = 0
+    sides = table = known = hidden = steep = 0
     rise = around = floor = 0.0
     me = parts[stack[0]]
     for t in range(count):
@@ -293,15 +299,17 @@ def _outline(
             j = p - i * columns
             sides += 1
             y, x = i + di, j + dj
-            foot += excess[y, x] == 0 and w[y, x] > 0 and abs(w[y, x] - w[i, j]) < JUMP
+            known += excess[y, x] == 0 and w[y, x] > 0 and abs(w[y, x] - w[i, j]) < JUMP
             hidden += w[y, x] <= 0 or w[y, x] > w[i, j] + JUMP
             y, x = i + OUTWARD * di, j + OUTWARD * dj
             v, u = i - INWARD * di, j - INWARD * dj
             if min(y, x) < 0 or min(v, u) < 0 or max(y, v) >= rows or max(x, u) >= columns:
                 continue
+            known += 0 < w[y, x] < w[i, j] - JUMP
             if owner[y, x] != -number or excess[y, x] == 0 or abs(owner[v, u]) != number:
                 continue
             table += 1
+            known += 1
             around += excess[y, x]
             step = (excess[v, u] - excess[y, x]) / rise_least
             if excess[v, u] == 0:  # the inside is not low
@@ -310,7 +318,7 @@ def _outline(
             steep += int(step > STEEP)
     base = around / max(table, 1)
     floor = floor / max(count - flooded, 1) - base
-    return Outline(sides, table, foot, hidden, rise, steep, floor)
+    return Outline(sides, table, known, hidden, rise, steep, floor)
 
 
 @kernel
