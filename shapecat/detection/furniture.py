@@ -22,10 +22,10 @@ from shapecat.detection.pieces import (
     depths_of,
     is_group,
 )
-from shapecat.detection.walls import ON_WALL
+from shapecat.detection.walls import CLEARED, ON_WALL
 from shapecat.jit import kernel
 
-__all__ = ["cut_by_range", "is_no_object", "posts_of", "remains_of", "sides_of", "towers_of"]
+__all__ = ["cut_by_range", "is_no_object", "posts_of", "remains_of", "sides_of", "towers_of", "unbounded"]
 
 RIM_LINKS, RIM_SHARE = 8, 0.1
 FAINT, FAINT_NOISE, FAINT_M2, FAINT_CELLS = 2.5, 3.5, 3e-3, 120
@@ -35,6 +35,8 @@ POST_M = 0.06
 """A post goes on for so far above and below the level of a board."""
 REMAINS = 0.8
 """Share of the cells of a piece on a wall."""
+UNBOUNDED = 0.1
+"""Share of the boundary of a piece across which its surface goes on to where no plane reaches."""
 CUT = 0.2
 """Share of the cells of a piece that are the last before the end of the range."""
 STEP_M, STEPS, MISSES = 0.02, 64, 2.0
@@ -106,6 +108,17 @@ def sides_of(cells: Cells, pieces: Pieces) -> Bool:
     return np.asarray(edge_on & upright & alone & (hidden < COVERED * pieces.boundary))
 
 
+def unbounded(cells: Cells, owner: I4, walls: U1, regions: I4, pieces: Pieces) -> Bool:
+    """Return for each piece whether its surface goes on to where no plane reaches.
+
+    Walls and floors are cut off there; an object ends where it ends.
+    """
+    leaving = np.zeros(pieces.group.size, np.int64)
+    _leave(cells.w, owner, walls, regions, leaving)
+    total = np.bincount(pieces.group, leaving, pieces.group.size)
+    return np.asarray(total > UNBOUNDED * pieces.boundary)
+
+
 def towers_of(cells: Cells, planes: F8, pieces: Pieces, up: F8, *, highest_m: float) -> Bool:
     """Return for each piece whether its surface goes straight up and down for ``highest_m``.
 
@@ -115,6 +128,24 @@ def towers_of(cells: Cells, planes: F8, pieces: Pieces, up: F8, *, highest_m: fl
     share = np.zeros(pieces.group.size)
     _tower(cells.w, cells.lens, planes, pieces, up, highest_m, share)
     return np.asarray(share > TOWERING)
+
+
+@kernel
+def _leave(w: F4, owner: I4, walls: U1, regions: I4, leaving: I4) -> None:
+    """Count the neighbours of each region on the same surface that are above no plane."""
+    rows, columns = w.shape
+    for i in range(1, rows - 1):
+        for j in range(1, columns - 1):
+            if regions[i, j] == 0:
+                continue
+            for y, x in ((i, j - 1), (i, j + 1), (i - 1, j), (i + 1, j)):
+                if (
+                    owner[y, x] == 0
+                    and w[y, x] > 0
+                    and walls[y, x] != CLEARED
+                    and abs(w[y, x] - w[i, j]) < JUMP
+                ):
+                    leaving[regions[i, j]] += 1
 
 
 @kernel

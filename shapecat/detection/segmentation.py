@@ -23,6 +23,7 @@ from shapecat.detection.furniture import (
     remains_of,
     sides_of,
     towers_of,
+    unbounded,
 )
 from shapecat.detection.heights import heights_of, table_of
 from shapecat.detection.joins import join_pieces
@@ -138,6 +139,7 @@ def segment(
     furniture = posts_of(cells, heights.owner, regions, pieces, up)
     furniture |= towers_of(cells, planes, pieces, up, highest_m=settings.max_height_m)
     furniture |= sides_of(cells, pieces)
+    furniture |= unbounded(cells, heights.owner, walls, regions, pieces)
     furniture |= remains_of(walls, regions, pieces)
     furniture |= cut_by_range(cells, regions, pieces, range_m=settings.max_range_m)
     refused = is_no_object(pieces, furniture, known, largest_m=settings.max_size_m)
