@@ -25,7 +25,15 @@ from shapecat.detection.pieces import (
 from shapecat.detection.walls import CLEARED, ON_WALL
 from shapecat.jit import kernel
 
-__all__ = ["cut_by_range", "is_no_object", "posts_of", "remains_of", "sides_of", "towers_of", "unbounded"]
+__all__ = [
+    "cut_by_range",
+    "is_no_object",
+    "posts_of",
+    "remains_of",
+    "sides_of",
+    "towers_of",
+    "unbounded",
+]
 
 RIM_LINKS, RIM_SHARE = 8, 0.1
 FAINT, FAINT_NOISE, FAINT_M2, FAINT_CELLS = 2.5, 3.5, 3e-3, 120
@@ -108,13 +116,13 @@ def sides_of(cells: Cells, pieces: Pieces) -> Bool:
     return np.asarray(edge_on & upright & alone & (hidden < COVERED * pieces.boundary))
 
 
-def unbounded(cells: Cells, owner: I4, walls: U1, regions: I4, pieces: Pieces) -> Bool:
+def unbounded(cells: Cells, planes: F8, owner: I4, walls: U1, regions: I4, pieces: Pieces) -> Bool:
     """Return for each piece whether its surface goes on to where no plane reaches.
 
     Walls and floors are cut off there; an object ends where it ends.
     """
     leaving = np.zeros(pieces.group.size, np.int64)
-    _leave(cells.w, owner, walls, regions, leaving)
+    _leave(cells.w, planes, owner, walls, regions, leaving)
     total = np.bincount(pieces.group, leaving, pieces.group.size)
     return np.asarray(total > UNBOUNDED * pieces.boundary)
 
@@ -131,17 +139,18 @@ def towers_of(cells: Cells, planes: F8, pieces: Pieces, up: F8, *, highest_m: fl
 
 
 @kernel
-def _leave(w: F4, owner: I4, walls: U1, regions: I4, leaving: I4) -> None:
-    """Count the neighbours of each region on the same surface that are above no plane."""
+def _leave(w: F4, planes: F8, owner: I4, walls: U1, regions: I4, leaving: I4) -> None:
+    """Count the neighbours of each region on the same surface that are beyond its plane."""
     rows, columns = w.shape
     for i in range(1, rows - 1):
         for j in range(1, columns - 1):
             if regions[i, j] == 0:
                 continue
+            plane = planes[owner[i, j] - 1]
             for y, x in ((i, j - 1), (i, j + 1), (i - 1, j), (i + 1, j)):
                 if (
                     owner[y, x] == 0
-                    and w[y, x] > 0
+                    and w[y, x] > max(plane[0] * x + plane[1] * y + plane[2], 0)
                     and walls[y, x] != CLEARED
                     and abs(w[y, x] - w[i, j]) < JUMP
                 ):

@@ -139,7 +139,7 @@ def segment(
     furniture = posts_of(cells, heights.owner, regions, pieces, up)
     furniture |= towers_of(cells, planes, pieces, up, highest_m=settings.max_height_m)
     furniture |= sides_of(cells, pieces)
-    furniture |= unbounded(cells, heights.owner, walls, regions, pieces)
+    furniture |= unbounded(cells, planes, heights.owner, walls, regions, pieces)
     furniture |= remains_of(walls, regions, pieces)
     furniture |= cut_by_range(cells, regions, pieces, range_m=settings.max_range_m)
     refused = is_no_object(pieces, furniture, known, largest_m=settings.max_size_m)
