@@ -1,0 +1,65 @@
+"""Shelves: pieces of furniture that are no objects, and objects that are not in pieces."""
+
+from functools import cache
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from shapecat.config import DetectionSettings
+from shapecat.detection import detect
+from shapecat.simulation import KINECT, make_scene, render_frame
+from shapecat.simulation.scenes import SceneKind
+
+FIRST_THING = 20
+"""Lower pixel labels are those of furniture."""
+
+
+@cache
+def seen(kind: SceneKind, seed: int) -> tuple[NDArray[Any], list[NDArray[Any]]]:
+    """Return the pixel labels of a scene, and those of each object found."""
+    rng = np.random.default_rng(seed)
+    frame, labels = render_frame(make_scene(kind, rng, frames=1), 0, rng=rng, sensor=KINECT)
+    scene = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0))
+    flat = labels.reshape(-1)
+    return flat, [flat[c.indices] for c in scene.candidates]
+
+
+@pytest.mark.parametrize("seed", [377, 507])
+def test_wall_beyond_the_floor_is_no_object(seed: int) -> None:
+    """Of a wall at the end of the range only a corner is above what is seen of the floor."""
+    assert seen("empty", seed)[1] == []
+
+
+@pytest.mark.parametrize("seed", [313, 336, 581])
+def test_side_of_a_shelf_seen_edge_on_is_no_object(seed: int) -> None:
+    """Too narrow in the image to be fitted as a wall, and cut off by a board or the border."""
+    assert all(np.median(part) >= FIRST_THING for part in seen("shelf", seed)[1])
+
+
+@pytest.mark.parametrize("seed", [653, 683])
+def test_sliver_beside_the_side_of_a_shelf_is_no_object(seed: int) -> None:
+    """The noise of an upright side smears into its foot, which rises from the board."""
+    assert all(np.median(part) >= FIRST_THING for part in seen("shelf", seed)[1])
+
+
+@pytest.mark.parametrize(("seed", "label"), [(430, 31), (434, 28), (651, 22)])
+def test_plate_at_the_level_of_the_camera_is_found(seed: int, label: int) -> None:
+    """Its far side stands out against the wall behind, not against its board."""
+    labels, parts = seen("shelf", seed)
+    best = max(parts, key=lambda part: np.count_nonzero(part == label))
+    common = np.count_nonzero(best == label)
+    assert common > 0.5 * (len(best) + np.count_nonzero(labels == label) - common)
+
+
+@pytest.mark.parametrize(
+    ("seed", "label"),
+    [(330, 26), (9, 24), (639, 24), (600, 22), (673, 31), (663, 21), (126, 30)],
+    ids=["lying bottle", "handle", "waist", "foot", "far rim", "near wall", "foot under a rim"],
+)
+def test_object_is_in_one_piece(seed: int, label: int) -> None:
+    """What hangs on an object or bears it, and what is seen of its other side, is part of it."""
+    labels, parts = seen("shelf", seed)
+    (one,) = (part for part in parts if np.median(part) == label)
+    assert np.count_nonzero(one == label) > 0.75 * np.count_nonzero(labels == label)
