@@ -38,6 +38,26 @@ def test_side_of_a_shelf_seen_edge_on_is_no_object(seed: int) -> None:
     assert all(np.median(part) >= FIRST_THING for part in seen("shelf", seed)[1])
 
 
+@pytest.mark.parametrize("seed", [556, 567])
+def test_front_of_the_side_of_a_shelf_is_no_object(seed: int) -> None:
+    """Cut off by the border of the image; the side that it goes on in is known as a wall."""
+    assert all(np.median(part) >= FIRST_THING for part in seen("shelf", seed)[1])
+
+
+def test_speckled_side_of_a_shelf_is_no_object() -> None:
+    """Where a surface is seen edge on many readings fail, and those left are not so steep."""
+    assert all(np.median(part) >= FIRST_THING for part in seen("shelf", 335)[1])
+
+
+@pytest.mark.parametrize(("seed", "label"), [(419, 20), (547, 23)])
+def test_patch_of_the_back_between_objects_is_no_part_of_them(seed: int, label: int) -> None:
+    """It is smaller than a part of a wall usually is, but lies in it exactly."""
+    labels, parts = seen("shelf", seed)
+    best = max(parts, key=lambda part: np.count_nonzero(part == label))
+    assert np.mean(best == label) > 0.8
+    assert np.count_nonzero(best == label) > 0.5 * np.count_nonzero(labels == label)
+
+
 @pytest.mark.parametrize("seed", [653, 683])
 def test_sliver_beside_the_side_of_a_shelf_is_no_object(seed: int) -> None:
     """The noise of an upright side smears into its foot, which rises from the board."""

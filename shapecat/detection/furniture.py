@@ -43,8 +43,9 @@ POST_M = 0.06
 """A post goes on for so far above and below the level of a board."""
 REMAINS = 0.8
 """Share of the cells of a piece on a wall."""
-UNBOUNDED = 0.1
-"""Share of the boundary of a piece across which its surface goes on to where no plane reaches."""
+UNBOUNDED, WALLED = 0.1, 0.45
+"""Share of the boundary of a piece across which its surface goes on to where no plane reaches, and
+in a wall: of the front of the side of a shelf half does, of a bowl that stands against one less."""
 CUT = 0.2
 """Share of the cells of a piece that are the last before the end of the range."""
 STEP_M, STEPS, MISSES = 0.02, 64, 2.0
@@ -53,9 +54,12 @@ two; where something hides it, half a step counts."""
 TOWERING = 0.5
 """Share of a piece below surface that goes on beyond the greatest height."""
 
-EDGE_ON, UPRIGHT, SLENDER, COVERED = 3.0, 0.12, 0.5, 0.5
-"""What is seen edge on: surface by what it covers of the view; share of it that faces up; width by
-height; and the share of its boundary behind other things from which they may hide the rest."""
+EDGE_ON, SPECKLED, SPECKS = 3.0, 2.3, 100
+"""Surface by what it covers of the view from which it is seen edge on, whether or not many readings
+fail there: the square of its boundary by its cells is 16 for a square."""
+UPRIGHT, SLENDER, COVERED = 0.12, 0.65, 0.5
+"""What is seen edge on: share that faces up; width by height; and the share of its boundary behind
+other things from which they may hide the rest."""
 
 
 def is_no_object(pieces: Pieces, furniture: Bool, raised: Bool, *, largest_m: float) -> Bool:
@@ -108,7 +112,8 @@ def sides_of(cells: Cells, pieces: Pieces) -> Bool:
     """
     shape, lens = pieces.shape, cells.lens
     covered = shape[:, COUNT] * depths_of(pieces) ** 2 / (lens.fx * lens.fy)
-    edge_on = shape[:, AREA] > EDGE_ON * covered
+    speckled = pieces.boundary**2 > SPECKS * shape[:, COUNT]
+    edge_on = shape[:, AREA] > np.where(speckled, SPECKLED, EDGE_ON) * covered
     upright = pieces.lid.sum(axis=1) < UPRIGHT * shape[:, AREA]
     upright &= shape[:, RIGHTMOST] - shape[:, LEFT] < SLENDER * (shape[:, TOP] - shape[:, BOTTOM])
     hidden = pieces.pairs[FRONT].sum(axis=0) + pieces.single[:, HIDDEN]
@@ -117,14 +122,16 @@ def sides_of(cells: Cells, pieces: Pieces) -> Bool:
 
 
 def unbounded(cells: Cells, planes: F8, owner: I4, walls: U1, regions: I4, pieces: Pieces) -> Bool:
-    """Return for each piece whether its surface goes on to where no plane reaches.
+    """Return for each piece whether its surface goes on to where no plane reaches, or in a wall.
 
     Walls and floors are cut off there; an object ends where it ends.
     """
-    leaving = np.zeros(pieces.group.size, np.int64)
+    size = pieces.group.size
+    leaving = np.zeros((2, size), np.int64)
     _leave(cells.w, planes, owner, walls, regions, leaving)
-    total = np.bincount(pieces.group, leaving, pieces.group.size)
-    return np.asarray(total > UNBOUNDED * pieces.boundary)
+    beyond, to_wall = (np.bincount(pieces.group, count, size) for count in leaving)
+    limit = pieces.boundary
+    return np.asarray((beyond > UNBOUNDED * limit) | (to_wall > WALLED * limit))
 
 
 def towers_of(cells: Cells, planes: F8, pieces: Pieces, up: F8, *, highest_m: float) -> Bool:
@@ -140,7 +147,7 @@ def towers_of(cells: Cells, planes: F8, pieces: Pieces, up: F8, *, highest_m: fl
 
 @kernel
 def _leave(w: F4, planes: F8, owner: I4, walls: U1, regions: I4, leaving: I4) -> None:
-    """Count the neighbours of each region on the same surface that are beyond its plane."""
+    """Count the neighbours of each region on the same surface beyond its plane and on walls."""
     rows, columns = w.shape
     for i in range(1, rows - 1):
         for j in range(1, columns - 1):
@@ -151,10 +158,9 @@ def _leave(w: F4, planes: F8, owner: I4, walls: U1, regions: I4, leaving: I4) ->
                 if (
                     owner[y, x] == 0
                     and w[y, x] > max(plane[0] * x + plane[1] * y + plane[2], 0)
-                    and walls[y, x] != CLEARED
                     and abs(w[y, x] - w[i, j]) < JUMP
                 ):
-                    leaving[regions[i, j]] += 1
+                    leaving[int(walls[y, x] == CLEARED), regions[i, j]] += 1
 
 
 @kernel

@@ -27,6 +27,9 @@ LEAST_READINGS = 50
 VERTICAL_COS = 0.2
 LEAST_AREA_M2, LEAST_PART_M2, LEAST_WALL_M2 = 0.05, 0.04, 0.1
 """Least area of a wall, of a connected part of it that is cleared, and of these parts together."""
+LEAST_PATCH_M2, EXACT = 0.008, 0.0045
+"""Smaller parts are cleared that lie in the wall as exactly as its readings do: standard deviation
+in inverse depth."""
 FILLED = 0.3
 """Share of its extent that a wall fills: the front edges of a shelf lie in a plane too."""
 STRIP_M, STRIPS = 0.05, 400
@@ -101,13 +104,14 @@ def _clear(w: F4, lens: Lens, owner: I4, plane: F8, normal: F8, walls: U1) -> No
                 continue
             stack[0] = si * columns + sj
             found[si, sj] = ON_WALL
-            done, top, area = 0, 1, 0.0
+            done, top, area, off = 0, 1, 0.0, 0.0
             while done < top:
                 i, j = stack[done] // columns, stack[done] % columns
                 done += 1
                 x, y = (j - lens.cx) / lens.fx, (i - lens.cy) / lens.fy
                 facing = -(x * normal[0] + y * normal[1] + normal[2])
                 area += 1 / (w[i, j] * w[i, j] * lens.fx * lens.fy * max(facing, 0.1))
+                off += (w[i, j] - (plane[0] * j + plane[1] * i + plane[2])) ** 2
                 for d in range(4):
                     v = i + (1 if d == 0 else -1 if d == 1 else 0)
                     u = j + (1 if d == 2 else -1 if d == 3 else 0)
@@ -117,7 +121,7 @@ def _clear(w: F4, lens: Lens, owner: I4, plane: F8, normal: F8, walls: U1) -> No
                         found[v, u] = ON_WALL
                         stack[top] = v * columns + u
                         top += 1
-            if area >= LEAST_PART_M2:
+            if area >= LEAST_PART_M2 or (area >= LEAST_PATCH_M2 and off < top * EXACT**2):
                 total += area
                 for t in range(top):
                     found[stack[t] // columns, stack[t] % columns] = CLEARED
