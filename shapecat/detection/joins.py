@@ -26,6 +26,7 @@ from shapecat.detection.pieces import (
     depths_of,
     has_lid,
     is_group,
+    lid_share,
     merge,
     rests_on,
     roundness_of,
