@@ -85,8 +85,9 @@ def _find(
 ) -> None:
     """Mark the bands at which each label is to be cut."""
     sums = np.zeros((*cut.shape, 11))
+    reach = np.zeros((2, *cut.shape))
     rounded = _are_rounded(pieces, len(cut))
-    _add(w, lens, height, surfaces, labels, rounded, up, side, forward, sums)
+    _add(w, lens, height, surfaces, labels, rounded, up, side, forward, sums, reach)
     parts = np.zeros((BANDS, 2), np.int64)
     for p in range(1, len(cut)):
         parts[0] = 0, BANDS
@@ -113,7 +114,7 @@ def _are_rounded(pieces: Pieces, labels: int) -> Bool:
     return result
 
 
-@kernel
+@kernel(leaf=True)
 def _add(
     w: F4,
     lens: Lens,
@@ -125,17 +126,18 @@ def _add(
     side: F8,
     forward: F8,
     sums: F8,
+    reach: F8,
 ) -> None:
-    """Collect the sums over the bands of each label."""
-    left = np.full(sums.shape[:2], np.inf)
-    right = np.full(sums.shape[:2], -np.inf)
+    """Collect the sums over the bands of each label; ``reach`` (2, labels, bands) is room."""
+    left, right = reach[0], reach[1]
+    left[:], right[:] = np.inf, -np.inf
+    tangent, normal = surfaces.tangent, surfaces.normal
     for i in range(labels.shape[0]):
         for j in range(labels.shape[1]):
             p = labels[i, j]
-            if not (rounded[p] and surfaces.tangent[i, j, 0] > 0):
+            if not (rounded[p] and tangent[i, 0, j] > 0):
                 continue
-            m = surfaces.normal[i, j]
-            if m[0] * up[0] + m[1] * up[1] + m[2] * up[2] > STEEP:
+            if normal[i, 0, j] * up[0] + normal[i, 1, j] * up[1] + normal[i, 2, j] * up[2] > STEEP:
                 continue
             depth = 1 / w[i, j]
             x, y = (j - lens.cx) / lens.fx * depth, (i - lens.cy) / lens.fy * depth
@@ -195,7 +197,7 @@ def _best_cut(bands: F8) -> int:
     return best
 
 
-@kernel
+@kernel(leaf=True)
 def _axis(s: F8) -> tuple[float, float, float, float]:
     """Fit a vertical axis to a side by least squares (Kasa 1976), with a radius for each band.
 
@@ -213,7 +215,7 @@ def _axis(s: F8) -> tuple[float, float, float, float]:
     return u, f, math.sqrt(max(square, 0.0)), max(rest, 0.0)
 
 
-@kernel
+@kernel(leaf=True)
 def _is_round(s: F8, axis: tuple[float, float, float, float]) -> bool:
     radius, width = axis[2], s[WIDTH] / s[N]
     if not SLIM * width < radius < STOUT * width:

@@ -58,7 +58,7 @@ def _overlaps(lower: Support, upper: Support) -> bool:
     return bool((along < lower.reach).all())
 
 
-@kernel
+@kernel(leaf=True)
 def _drop(w: F4, lens: Lens, index: I4, plane: F8, up: F8, drop: float, seen: I4) -> None:
     """Look below the edge of a plane: count readings on a wall down from it, and beyond it."""
     rows, columns = w.shape

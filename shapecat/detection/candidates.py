@@ -175,7 +175,7 @@ def _extents(w: F4, lens: Lens, labels: I4, level: F8, turned: F8, extents: Exte
             _measure_box(local, start[k + 1], start[k + 2], level, turned, extents, k)
 
 
-@kernel(fast=True)
+@kernel(fast=True, leaf=True)
 def _measure_box(
     local: F4, first: int, end: int, level: F8, turned: F8, extents: Extents, k: int
 ) -> None:
@@ -197,7 +197,11 @@ def _measure_box(
         if (x1 - x0) * (y1 - y0) < least:
             least = (x1 - x0) * (y1 - y0)
             left, right, back, front, yaw = float(x0), float(x1), float(y0), float(y1), turn
-    bottom, top = np.float64(np.min(zs)), np.float64(np.max(zs))
+    z0 = z1 = zs[0]
+    for n in range(zs.size):
+        z0 = zs[n] if zs[n] < z0 else z0
+        z1 = zs[n] if zs[n] > z1 else z1
+    bottom, top = np.float64(z0), np.float64(z1)
     extents.size[k] = right - left, front - back, top - bottom
     u, v, h = (left + right) / 2, (back + front) / 2, (bottom + top) / 2
     cos, sin = math.cos(yaw), math.sin(yaw)

@@ -158,7 +158,7 @@ def count_near(readings: Readings, a: float, b: float, c: float, tolerance: floa
     return int(total)
 
 
-@kernel(fast=True)
+@kernel(fast=True, leaf=True)
 def refit(j: F4, i: F4, w: F4, tolerance: float, plane: F8) -> int:
     """Fit a plane (a, b, c) to its inliers by least squares; return how many they are.
 

@@ -49,13 +49,14 @@ how much of the above it may hide in turn, as a share of that."""
 def join_hollow(pieces: Pieces) -> None:
     """Join the walls and the floor inside a container, which meet in concave edges."""
     n = pieces.group.size
+    contact = pieces.pairs[CONTACT]
     again = True
     while again:
         again = False
         for p in range(1, n):
             for q in range(1, n):
                 if (
-                    p != q
+                    contact[p, q] >= FEW
                     and is_group(pieces, p)
                     and is_group(pieces, q)
                     and pieces.owner[p] == pieces.owner[q]

@@ -94,7 +94,7 @@ def _most_faced(facets: F4, free: Bool, trials: I4, best: F8) -> int:
         if free[k]:
             chosen[0, n], chosen[1, n], chosen[2, n] = facets[k, 0], facets[k, 1], facets[k, 2]
             n += 1
-    xs, ys, zs = chosen
+    xs, ys, zs = chosen[0], chosen[1], chosen[2]  # unpacked they would not be contiguous
     least = np.float32(FACING_COS)
     most = -1
     for t in trials:
@@ -176,7 +176,7 @@ def _settled(cells: Cells, facets: F4, direction: F8) -> F8:
     return normal if normal @ direction > SAME_COS else direction
 
 
-@kernel
+@kernel(leaf=True)
 def _facets(w: F4, lens: Lens, facets: F4) -> int:
     """Collect the normal and the position of every fourth cell on a smooth surface."""
     rows, columns = w.shape

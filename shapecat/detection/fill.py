@@ -170,7 +170,7 @@ def _is_open(seen: U1, extent: tuple[int, int, int, int], i: int, j: int) -> boo
     return bool(above | below | (seen[i, j - 1] == OPEN) | (seen[i, j + 1] == OPEN))
 
 
-@kernel
+@kernel(leaf=True)
 def is_raised(w: F4, height: F4, stack: I4, cells: int) -> bool:
     """Whether a hole lies a little above the plane, as the floor of a plate does."""
     raised = far = 0.0

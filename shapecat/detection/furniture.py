@@ -163,7 +163,7 @@ def _leave(w: F4, planes: F8, owner: I4, walls: U1, regions: I4, leaving: I4) ->
                     leaving[int(walls[y, x] == CLEARED), regions[i, j]] += 1
 
 
-@kernel
+@kernel(leaf=True)
 def _tower(
     w: F4, lens: Lens, planes: F8, pieces: Pieces, up: F8, highest: float, share: F8
 ) -> None:
@@ -219,7 +219,7 @@ def _rise(w: F4, lens: Lens, i: int, j: int, up: F8, sign: int, most: float) -> 
     return reach
 
 
-@kernel
+@kernel(leaf=True)
 def _through(w: F4, lens: Lens, owner: I4, labels: I4, group: I4, up: F8, through: I4) -> None:
     """Count where what is above and below the level of a board is one upright surface."""
     columns = w.shape[1]

@@ -55,7 +55,7 @@ def cut_at_ledges(
     return n
 
 
-@kernel
+@kernel(leaf=True)
 def _find(pieces: Pieces, cut: I4) -> None:
     """Write the band of the best ledge of each piece."""
     for p in range(1, pieces.group.size):
@@ -75,7 +75,7 @@ def _find(pieces: Pieces, cut: I4) -> None:
                 cut[p] = band
 
 
-@kernel
+@kernel(leaf=True)
 def _is_stack(
     cells: Cells, height: F4, normal: F4, labels: I4, p: int, band: int, side: F8
 ) -> bool:
@@ -93,13 +93,13 @@ def _is_stack(
             if k < band + CLEARANCE:
                 continue
             above += 1
-            m = normal[i, j]
-            if m[0] == 0 and m[1] == 0 and m[2] == 0:
+            nx, ny, nz = normal[i, 0, j], normal[i, 1, j], normal[i, 2, j]
+            if nx == 0 and ny == 0 and nz == 0:
                 continue
             z = 1 / w[i, j]
             x = (j - lens.cx) / lens.fx * z * side[0] + (i - lens.cy) / lens.fy * z * side[1]
             x += z * side[2]
-            turn = m[0] * side[0] + m[1] * side[1] + m[2] * side[2]
+            turn = nx * side[0] + ny * side[1] + nz * side[2]
             n += 1
             sx += x
             sxx += x * x

@@ -116,6 +116,6 @@ def _positions(samples: I4, w: F4, lens: Lens, normal: F4, columns: int, out: F4
         out[n, 0] = (j - lens.cx) / lens.fx * z
         out[n, 1] = (i - lens.cy) / lens.fy * z
         out[n, 2] = z
-        out[n, 3], out[n, 4], out[n, 5] = normal[i, j, 0], normal[i, j, 1], normal[i, j, 2]
+        out[n, 3], out[n, 4], out[n, 5] = normal[i, 0, j], normal[i, 1, j], normal[i, 2, j]
         n += 1
     return n

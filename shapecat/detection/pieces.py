@@ -43,6 +43,7 @@ __all__ = [
     "has_lid",
     "is_group",
     "lid_share",
+    "meet",
     "merge",
     "pieces_of",
     "rests_on",
@@ -105,7 +106,7 @@ class Pieces(NamedTuple):
 def pieces_of(
     cells: Cells, heights: Heights, surfaces: Surfaces, labels: I4, n: int, up: F8
 ) -> Pieces:
-    """Collect the statistics of regions 1..n and of their pairs."""
+    """Collect the statistics of regions 1..n; those of their pairs are up to `meet`."""
     size = n + 1
     pieces = Pieces(
         np.zeros((5, size, size), np.float32),
@@ -117,24 +118,17 @@ def pieces_of(
         np.zeros(size, np.int8),
         np.arange(size).astype(np.int16),
     )
-    _collect(cells.w, cells.lens, heights, surfaces, labels, up, side_of(up), pieces)
+    _measure(cells.w, cells.lens, heights, surfaces, labels, up, side_of(up), pieces)
     return pieces
 
 
 @kernel
-def _collect(
-    w: F4,
-    lens: Lens,
-    heights: Heights,
-    surfaces: Surfaces,
-    labels: I4,
-    up: F8,
-    side: F8,
-    pieces: Pieces,
-) -> None:
+def meet(w: F4, heights: Heights, surfaces: Surfaces, labels: I4, up: F8, pieces: Pieces) -> None:
+    """Collect the statistics of pairs of pieces, and their samples."""
     owner, height = heights.owner, heights.height
-    _meet(w, owner, height, surfaces.links, surfaces.normal, labels, up, pieces)
-    _measure(w, lens, owner, height, surfaces, labels, up, side, pieces)
+    change = np.zeros(w.shape[1], np.uint8)
+    _meet(w, owner, height, surfaces.links, surfaces.normal, labels, up, change, pieces)
+    _choose_samples(surfaces, labels, pieces)
 
 
 def side_of(up: F8) -> F8:
@@ -145,12 +139,19 @@ def side_of(up: F8) -> F8:
     return np.array([up[1] / across, -up[0] / across, 0.0])
 
 
-@kernel
+@kernel(leaf=True)
 def _meet(
-    w: F4, owner: I4, height: F4, links: U1, normal: F4, labels: I4, up: F8, pieces: Pieces
+    w: F4,
+    owner: I4,
+    height: F4,
+    links: U1,
+    normal: F4,
+    labels: I4,
+    up: F8,
+    change: U1,
+    pieces: Pieces,
 ) -> None:
     rows, columns = w.shape
-    change = np.zeros(columns, np.uint8)
     for i in range(rows):
         _find_changes(links[i], labels[i], labels[min(i + 1, rows - 1)], change)
         for j in range(columns):
@@ -211,7 +212,7 @@ def _meet(
                         pieces.single[q, TABLE if owner[y, x] == -owner[i, j] else RIM] += 1
 
 
-@kernel
+@kernel(leaf=True)
 def _find_changes(links: U1, here: I4, below: I4, change: U1) -> None:
     """Mark the cells of a row from which a piece does not just go on to the right and down."""
     for j in range(here.size):
@@ -239,18 +240,16 @@ def _onto(
     x = min(max(j + INWARD * dj, 0), labels.shape[1] - 1)
     if labels[y, x] != q:
         return
-    m = normal[y, x]
-    if m[0] * up[0] + m[1] * up[1] + m[2] * up[2] > UPWARD:
+    if normal[y, 0, x] * up[0] + normal[y, 1, x] * up[1] + normal[y, 2, x] * up[2] > UPWARD:
         pieces.pairs[ONTO, p, q] += 1
         pieces.pairs[ONTO_HEIGHT, p, q] += height[y, x]
 
 
-@kernel
+@kernel(leaf=True)
 def _measure(
     w: F4,
     lens: Lens,
-    owner: I4,
-    height: F4,
+    heights: Heights,
     surfaces: Surfaces,
     labels: I4,
     up: F8,
@@ -258,7 +257,8 @@ def _measure(
     pieces: Pieces,
 ) -> None:
     rows, columns = w.shape
-    shape = pieces.shape
+    shape, owners, lid = pieces.shape, pieces.owner, pieces.lid
+    owner, height = heights.owner, heights.height
     shape[:, LEFT] = 1e9
     shape[:, RIGHTMOST] = -1e9
     shape[:, TOP] = -1e9
@@ -273,7 +273,7 @@ def _measure(
             z = 1 / w[i, j]
             x, y = (j - lens.cx) * per_x * z, (i - lens.cy) * per_y * z
             along = x * side[0] + y * side[1] + z * side[2]
-            pieces.owner[p] = owner[i, j]
+            owners[p] = owner[i, j]
             shape[p, COUNT] += 1
             shape[p, FAR] += z
             shape[p, LEFT] = min(shape[p, LEFT], along)
@@ -281,9 +281,9 @@ def _measure(
             h = height[i, j]
             shape[p, TOP] = max(shape[p, TOP], h)
             shape[p, BOTTOM] = min(shape[p, BOTTOM], h)
-            if not tangent[i, j, 0] > 0:
+            if not tangent[i, 0, j] > 0:
                 continue
-            nx, ny, nz = normal[i, j, 0], normal[i, j, 1], normal[i, j, 2]
+            nx, ny, nz = normal[i, 0, j], normal[i, 1, j], normal[i, 2, j]
             turn = nx * side[0] + ny * side[1] + nz * side[2]
             shape[p, FITTED] += 1
             shape[p, SIDE] += along
@@ -296,17 +296,24 @@ def _measure(
             shape[p, AREA] += area
             if nx * up[0] + ny * up[1] + nz * up[2] > UPWARD:
                 band = min(max(int(h / BAND_M), 0), BANDS - 1)
-                pieces.lid[p, band] += area
-    stride = np.maximum(shape[:, COUNT].astype(np.int32) // SAMPLES, 1)
+                lid[p, band] += area
+
+
+@kernel
+def _choose_samples(surfaces: Surfaces, labels: I4, pieces: Pieces) -> None:
+    """Choose evenly spaced cells of each piece away from edges."""
+    rows, columns = labels.shape
+    tangent, edge, samples = surfaces.tangent, surfaces.edge, pieces.samples
+    stride = np.maximum(pieces.shape[:, COUNT].astype(np.int32) // SAMPLES, 1)
     wait, taken = stride.copy(), np.zeros_like(stride)
     for i in range(rows):
         for j in range(columns):
             p = labels[i, j]
-            if p == 0 or surfaces.edge[i, j] > 20 or not surfaces.tangent[i, j, 0] > 0:
+            if p == 0 or edge[i, j] > 20 or not tangent[i, 0, j] > 0:
                 continue
             wait[p] -= 1
             if wait[p] == 0 and taken[p] < SAMPLES:
-                pieces.samples[p, taken[p]] = i * columns + j
+                samples[p, taken[p]] = i * columns + j
                 taken[p] += 1
                 wait[p] = stride[p]
 

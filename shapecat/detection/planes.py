@@ -98,7 +98,7 @@ def find_planes(cells: Cells, up: F8, rng: np.random.Generator) -> list[tuple[Su
     return sorted(supports, key=lambda found: found[0].offset)
 
 
-@kernel
+@kernel(leaf=True)
 def _keep_off(w: F4, a: float, b: float, c: float, index: I4, height: F4) -> int:
     """Move the listed cells that are not near a plane to the front; return how many they are."""
     columns = w.shape[1]
@@ -111,7 +111,7 @@ def _keep_off(w: F4, a: float, b: float, c: float, index: I4, height: F4) -> int
     return n
 
 
-@kernel
+@kernel(leaf=True)
 def _level_readings(w: F4, lens: Lens, up: F8, index: I4, height: F4) -> int:
     """Collect every second cell whose surface is level within 25 degrees: its index and height."""
     rows, columns = w.shape

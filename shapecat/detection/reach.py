@@ -106,7 +106,7 @@ def _is_above(
     return True
 
 
-@kernel
+@kernel(leaf=True)
 def _part_outside(
     w: F4,
     lens: Lens,
@@ -138,7 +138,7 @@ def _part_outside(
     return top
 
 
-@kernel
+@kernel(leaf=True)
 def _part_inside(
     w: F4, owner: I4, me: int, seen: I4, look: int, i: int, j: int, most: int, stack: I4
 ) -> int:

@@ -221,7 +221,7 @@ class Outline(NamedTuple):
     floor: float
 
 
-@kernel
+@kernel(leaf=True)
 def _width(w: F4, stack: I4, count: int) -> float:
     """Return the extent of a part along the rows, in cells a metre away."""
     columns = w.shape[1]
@@ -245,7 +245,7 @@ def _is_object(outline: Outline, count: int) -> bool:
     return bool(outline.rise > least and outline.steep > STEEP_SHARE * table)
 
 
-@kernel
+@kernel(leaf=True)
 def _flood(excess: F4, level: float, start: int, n: int, part: I4, stack: I4) -> int:
     """Give the connected cells above ``level`` the number ``n``; return how many.
 
@@ -268,7 +268,7 @@ def _flood(excess: F4, level: float, start: int, n: int, part: I4, stack: I4) ->
     return top
 
 
-@kernel
+@kernel(leaf=True)
 def _outline(
     w: F4,
     excess: F4,

@@ -29,7 +29,7 @@ from shapecat.detection.heights import heights_of, table_of
 from shapecat.detection.joins import join_pieces
 from shapecat.detection.ledges import cut_at_ledges
 from shapecat.detection.levels import find_levels
-from shapecat.detection.pieces import Pieces, pieces_of
+from shapecat.detection.pieces import Pieces, meet, pieces_of
 from shapecat.detection.planes import Support
 from shapecat.detection.reach import reach_over
 from shapecat.detection.regions import regions_of, renamed
@@ -132,6 +132,7 @@ def segment(
         more = cut_at_axes(cells, heights, surfaces, pieces, regions, up, more)
     if more > n:
         pieces = pieces_of(cells, heights, surfaces, regions, more, up)
+    meet(cells.w, heights, surfaces, regions, up, pieces)
     known = join_raised(pieces, raised, regions)
     join_pieces(pieces, cells, surfaces, regions, rules)
     if "ring" in rules:

@@ -26,9 +26,9 @@ class Surfaces(NamedTuple):
 
     Attributes
     ----------
-    tangent : (rows, columns, 3) float32: inverse depth of the fitted plane at the cell, and its
-        change per column and per row. The first is 0 where there is no fit.
-    normal : (rows, columns, 3) float32 unit normal towards the camera, sensor frame.
+    tangent : (rows, 3, columns) float32: inverse depth of the fitted plane at the cell, and its
+        change per column and per row; 0 where there is no fit.
+    normal : (rows, 3, columns) float32 unit normal towards the camera, sensor frame, or 0.
     links : (rows, columns) uint8: `RIGHT` and `DOWN` where the surface goes on to that neighbour.
     edge : (rows, columns) uint8: the largest concave angle across the cell, degrees.
     """
@@ -42,7 +42,7 @@ class Surfaces(NamedTuple):
 def surfaces_of(cells: Cells, heights: Heights) -> Surfaces:
     """Fit tangent planes to the object cells, link them and measure concave angles."""
     shape = cells.w.shape
-    tangent, normal = np.zeros((2, *shape, 3), np.float32)
+    tangent, normal = np.zeros((2, shape[0], 3, shape[1]), np.float32)
     links, edge = np.zeros((2, *shape), np.uint8)
     surfaces = Surfaces(tangent, normal, links, edge)
     _survey(cells.w, cells.lens, heights.owner, surfaces)
@@ -53,10 +53,10 @@ def surfaces_of(cells: Cells, heights: Heights) -> Surfaces:
 def _survey(w: F4, lens: Lens, owner: I4, surfaces: Surfaces) -> None:
     fit_tangents(w, lens, owner, surfaces.tangent, surfaces.normal)
     _link(w, owner, surfaces.tangent, surfaces.links)
-    _bend(w, lens, surfaces.tangent, surfaces.normal, surfaces.edge)
+    _bend(w, lens, owner, surfaces)
 
 
-@kernel(fast=True)
+@kernel(fast=True, leaf=True)
 def _link(w: F4, owner: I4, tangent: F4, links: U1) -> None:
     """Link neighbours where either tangent plane, or the step itself, meets within one jump."""
     rows, columns = w.shape
@@ -66,64 +66,111 @@ def _link(w: F4, owner: I4, tangent: F4, links: U1) -> None:
             me = owner[i, j]
             if me <= 0:
                 continue
-            v, t, bits = w[i, j], tangent[i, j, 0], 0
+            v, t, bits = w[i, j], tangent[i, 0, j], 0
             if j + 1 < columns and owner[i, j + 1] == me:
-                v1, t1 = w[i, j + 1], tangent[i, j + 1, 0]
+                v1, t1 = w[i, j + 1], tangent[i, 0, j + 1]
                 joined = abs(v - v1) < jump
-                joined |= (t > 0) & (abs(t + tangent[i, j, 1] - v1) < jump)
-                joined |= (t1 > 0) & (abs(t1 - tangent[i, j + 1, 1] - v) < jump)
+                joined |= (t > 0) & (abs(t + tangent[i, 1, j] - v1) < jump)
+                joined |= (t1 > 0) & (abs(t1 - tangent[i, 1, j + 1] - v) < jump)
                 bits |= RIGHT if joined else 0
             if i + 1 < rows and owner[i + 1, j] == me:
-                v1, t1 = w[i + 1, j], tangent[i + 1, j, 0]
+                v1, t1 = w[i + 1, j], tangent[i + 1, 0, j]
                 joined = abs(v - v1) < jump
-                joined |= (t > 0) & (abs(t + tangent[i, j, 2] - v1) < jump)
-                joined |= (t1 > 0) & (abs(t1 - tangent[i + 1, j, 2] - v) < jump)
+                joined |= (t > 0) & (abs(t + tangent[i, 2, j] - v1) < jump)
+                joined |= (t1 > 0) & (abs(t1 - tangent[i + 1, 2, j] - v) < jump)
                 bits |= DOWN if joined else 0
             links[i, j] = bits
 
 
-@kernel(fast=True)
-def _bend(w: F4, lens: Lens, tangent: F4, normal: F4, edge: U1) -> None:
+@kernel
+def _bend(w: F4, lens: Lens, owner: I4, surfaces: Surfaces) -> None:
     """Measure the largest concave angle between the surfaces on two sides of each cell."""
     rows, columns = w.shape
-    gate = np.float32(2 * JUMP)
-    one = np.float32(1)
-    degrees = np.float32(180 / math.pi)
-    per_x, per_y = np.float32(1 / lens.fx), np.float32(1 / lens.fy)
-    cx, cy = np.float32(lens.cx), np.float32(lens.cy)
+    tangent, normal, edge = surfaces.tangent, surfaces.normal, surfaces.edge
+    room = np.zeros((3, columns), np.float32)
+    gaps, chords, worst = room[0], room[1], room[2]  # unpacked they would not be contiguous
     for i in range(rows):
-        for j in range(columns):
-            if not tangent[i, j, 0] > 0:
-                continue
-            here = w[i, j]
-            worst = np.float32(LEAST_CHORD)
-            for d in range(4):
-                r = BASE if d < 2 else BASE_DIAGONAL
-                di = 0 if d == 0 else r
-                dj = r if d == 0 else (0 if d == 1 else (r if d == 2 else -r))
-                i1, j1, i2, j2 = i - di, j - dj, i + di, j + dj
-                if i1 < 0 or i2 >= rows or min(j1, j2) < 0 or max(j1, j2) >= columns:
-                    continue
-                w1, w2 = tangent[i1, j1, 0], tangent[i2, j2, 0]
-                if not ((w1 > 0) & (w2 > 0)):
-                    continue
-                x, y = np.float32(dj), np.float32(di)
-                meet1 = w1 + tangent[i1, j1, 1] * x + tangent[i1, j1, 2] * y
-                meet2 = w2 - tangent[i2, j2, 1] * x - tangent[i2, j2, 2] * y
-                if (abs(meet1 - here) > gate) | (abs(meet2 - here) > gate):
-                    continue
-                nx = normal[i1, j1, 0] - normal[i2, j2, 0]
-                ny = normal[i1, j1, 1] - normal[i2, j2, 1]
-                nz = normal[i1, j1, 2] - normal[i2, j2, 2]
-                chord = nx * nx + ny * ny + nz * nz
-                if chord <= worst:
-                    continue
-                z1, z2 = one / w1, one / w2
-                px = per_x * ((np.float32(j1) - cx) * z1 - (np.float32(j2) - cx) * z2)
-                py = per_y * ((np.float32(i1) - cy) * z1 - (np.float32(i2) - cy) * z2)
-                if px * nx + py * ny + (z1 - z2) * nz < 0:
-                    worst = chord
-            half = np.sqrt(worst) * np.float32(0.5)
-            # arcsin by its series: 1 degree off at a right angle
-            angle = 2 * degrees * (half + half * half * half * np.float32(0.18))
-            edge[i, j] = np.uint8(min(angle, np.float32(120)))
+        start, end = _span(owner[i])
+        worst[:] = LEAST_CHORD
+        for d in range(4):
+            r = BASE if d < 2 else BASE_DIAGONAL
+            di = 0 if d == 0 else r
+            dj = r if d == 0 else (0 if d == 1 else (r if d == 2 else -r))
+            first, last = max(start, abs(dj)), min(end, columns - abs(dj))
+            if i - di >= 0 and i + di < rows and first < last:
+                _compare(w, lens, tangent, normal, i, first, last, di, dj, gaps, chords, worst)
+        _write_angles(tangent[i, 0, start:end], worst[start:end], edge[i, start:end])
+
+
+@kernel(leaf=True)
+def _span(owner: I4) -> tuple[int, int]:
+    """Return the columns of the first object cell of a row and after the last."""
+    start, end = 0, owner.size
+    while start < end and owner[start] <= 0:
+        start += 1
+    while end > start and owner[end - 1] <= 0:
+        end -= 1
+    return start, end
+
+
+@kernel(fast=True, leaf=True)
+def _compare(
+    w: F4,
+    lens: Lens,
+    tangent: F4,
+    normal: F4,
+    i: int,
+    first: int,
+    last: int,
+    di: int,
+    dj: int,
+    gaps: F4,
+    chords: F4,
+    worst: F4,
+) -> None:
+    """Raise ``worst`` to the chord of the normals on two sides of some cells, where concave.
+
+    Three loops, for the compiler vectorises only those over few arrays.
+    """
+    zero, one, gate = np.float32(0), np.float32(1), np.float32(2 * JUMP)
+    per_x, per_y = np.float32(1 / lens.fx), np.float32(1 / lens.fy)
+    y1, y2 = np.float32(i - di - lens.cy) * per_y, np.float32(i + di - lens.cy) * per_y
+    x1, x2 = np.float32(first - dj - lens.cx) * per_x, np.float32(first + dj - lens.cx) * per_x
+    x, y = np.float32(dj), np.float32(di)
+    a, b, left, right = i - di, i + di, first - dj, last - dj
+    here, worst = w[i, first:last], worst[first:last]
+    # (1) how far both planes are from the cell
+    v1, gx1, gy1 = tangent[a, 0, left:right], tangent[a, 1, left:right], tangent[a, 2, left:right]
+    nx1, ny1, nz1 = normal[a, 0, left:right], normal[a, 1, left:right], normal[a, 2, left:right]
+    left, right = first + dj, last + dj
+    v2, gx2, gy2 = tangent[b, 0, left:right], tangent[b, 1, left:right], tangent[b, 2, left:right]
+    nx2, ny2, nz2 = normal[b, 0, left:right], normal[b, 1, left:right], normal[b, 2, left:right]
+    for k in range(here.size):
+        gap1 = abs(v1[k] + gx1[k] * x + gy1[k] * y - here[k])
+        gap2 = abs(v2[k] - gx2[k] * x - gy2[k] * y - here[k])
+        gap = gap1 if gap1 > gap2 else gap2
+        gaps[k] = gap if (v1[k] > zero) & (v2[k] > zero) else one
+    # (2) the angle, 0 where convex
+    for k in range(here.size):
+        nx, ny, nz = nx1[k] - nx2[k], ny1[k] - ny2[k], nz1[k] - nz2[k]
+        # The ray from one place to the other, times both inverse depths: no division.
+        step = np.float32(k) * per_x
+        along = ((x1 + step) * v2[k] - (x2 + step) * v1[k]) * nx + (v2[k] - v1[k]) * nz
+        along += (y1 * v2[k] - y2 * v1[k]) * ny
+        chords[k] = nx * nx + ny * ny + nz * nz if along < zero else zero
+    # (3) the largest
+    for k in range(here.size):
+        chord = chords[k] if gaps[k] <= gate else zero
+        worst[k] = chord if chord > worst[k] else worst[k]
+
+
+@kernel(fast=True, leaf=True)
+def _write_angles(level: F4, worst: F4, edge: U1) -> None:
+    """Write the angles, in degrees, of the chords of cells with a tangent plane."""
+    degrees, most = np.float32(180 / math.pi), np.float32(120)
+    for k in range(edge.size):
+        half = np.sqrt(worst[k]) * np.float32(0.5)
+        # arcsin by its series: 1 degree off at a right angle
+        angle = 2 * degrees * (half + half * half * half * np.float32(0.18))
+        angle = angle if angle < most else most
+        edge[k] = np.uint8(angle) if level[k] > np.float32(0) else np.uint8(0)

@@ -39,27 +39,31 @@ def fit_tangents(w: F4, lens: Lens, owner: I4, tangent: F4, normal: F4) -> None:
     for i in range(owner.shape[0]):
         end = 0
         while True:
-            start, end = _next_run(owner[i], end)
+            start, end = _next_run(owner, i, end)
             if start == end:
                 break
             _copy_windows(w, owner, i, start, end, values, owners)
             _fit_run(values, owners, lens, i, start, end - start, fits)
-            for k in range(end - start):
-                if fits[k] > 0:
-                    for d in range(3):
-                        tangent[i, start + k, d] = fits[d * PITCH + k]
-                        normal[i, start + k, d] = fits[(3 + d) * PITCH + k]
+            _write(fits, tangent, normal, i, start, end)
 
 
-@kernel
-def _next_run(owner: I4, j: int) -> tuple[int, int]:
+@kernel(leaf=True)
+def _write(fits: F4, tangent: F4, normal: F4, i: int, start: int, end: int) -> None:
+    for d in range(3):
+        one, other = tangent[i, d, start:end], normal[i, d, start:end]
+        for k in range(one.size):
+            one[k], other[k] = fits[d * PITCH + k], fits[(3 + d) * PITCH + k]
+
+
+@kernel(leaf=True)
+def _next_run(owner: I4, i: int, j: int) -> tuple[int, int]:
     """Return the columns from and before which the next object cells of a row lie."""
-    columns = owner.size
-    while j < columns and owner[j] <= 0:
+    columns = owner.shape[1]
+    while j < columns and owner[i, j] <= 0:
         j += 1
     start = end = j
     while j < min(columns, start + RUN) and j < end + BRIDGED:
-        if owner[j] > 0:
+        if owner[i, j] > 0:
             end = j + 1
         j += 1
     return start, end
@@ -79,11 +83,11 @@ def _copy_windows(w: F4, owner: I4, i: int, start: int, end: int, values: F4, ow
             owners[first : first + right - left] = owner[y, left:right]
 
 
-@kernel(fast=True)
+@kernel(fast=True, leaf=True)
 def _fit_run(values: F4, owners: I4, lens: Lens, i: int, start: int, n: int, fits: F4) -> None:
     """Fit planes to the windows of ``n`` cells from (i, ``start``) on.
 
-    Rows of ``fits``: inverse depth, 0 where there is no fit, its two slopes, and the normal.
+    Rows of ``fits``: inverse depth, its two slopes, and the normal; 0 where there is no fit.
     """
     zero, one = np.float32(0), np.float32(1)
     least, spread = np.float32(LEAST_SAMPLES), np.float32(LEAST_SPREAD)
@@ -118,10 +122,12 @@ def _fit_run(values: F4, owners: I4, lens: Lens, i: int, start: int, n: int, fit
         level = center + mv - gx * mx - gy * my
         nx, ny = -fx * gx, -fy * gy
         nz = gx * np.float32(start + k - lens.cx) + gy * y - level
+        sound &= level > zero
         length = np.sqrt(nx * nx + ny * ny + nz * nz)
         unit = one / (length if length > zero else one)
-        fits[k] = level if sound & (level > zero) else zero
-        fits[PITCH + k], fits[2 * PITCH + k] = gx, gy
+        fits[k] = level if sound else zero
+        fits[PITCH + k], fits[2 * PITCH + k] = gx if sound else zero, gy if sound else zero
+        unit = unit if sound else zero
         fits[3 * PITCH + k], fits[4 * PITCH + k] = nx * unit, ny * unit
         fits[5 * PITCH + k] = nz * unit
 

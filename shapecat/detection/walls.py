@@ -69,7 +69,7 @@ def _is_wall(readings: Readings, cells: Cells, plane: F8, up: F8, largest_m: flo
     return bool(area > LEAST_AREA_M2 and dense and reach.max() > largest_m)
 
 
-@kernel
+@kernel(leaf=True)
 def _measure(
     readings: Readings, lens: Lens, plane: F8, normal: F8, across: F8, up: F8, strips: F8
 ) -> float:
