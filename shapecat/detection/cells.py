@@ -63,8 +63,7 @@ def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_
 
     Readings beyond ``range_m`` are left out (thesis 4.2, pass-through filter).
     """
-    sample = depth[2::5, 2::5] if min(depth.shape) > 50 else depth
-    sample = sample[(sample >= NEAREST_M) & (sample <= range_m)]
+    sample = _sampled(depth, 5 if min(depth.shape) > 50 else 1, np.float32(range_m))
     if sample.size == 0:
         return None
     pixel_m = middle_of(sample) / max(abs(camera.fx), 1e-6)
@@ -89,6 +88,19 @@ def middle_of(values: F4) -> float:
 
 
 @kernel
+def _sampled(depth: F4, step: int, range_m: float) -> F4:
+    """Return the readings in range among every so many pixels."""
+    rows, columns = depth.shape
+    result = np.zeros((rows // step + 1) * (columns // step + 1), np.float32)
+    n = 0
+    for i in range(step // 2, rows, step):
+        for j in range(step // 2, columns, step):
+            result[n] = depth[i, j]
+            n += (depth[i, j] >= np.float32(NEAREST_M)) & (depth[i, j] <= range_m)
+    return result[:n]
+
+
+@kernel
 def _average(depth: F4, factor: int, range_m: float, jump: float, w: F4) -> None:
     """Write to ``w`` the inverse of the mean depth of the pixels near the nearest of each cell."""
     if factor == 2:  # the usual case, in a form that vectorises
@@ -99,7 +111,8 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, w: F4) -> None
     far, least = np.float32(1e9), np.float32(NEAREST_M)
     # The pixels of a row of cells, sorted by their place in the cell: loops over these vectorise.
     parts = np.zeros((factor * factor, columns), np.float32)
-    nearest, limit, total, count = np.zeros((4, columns), np.float32)
+    room = np.zeros((4, columns), np.float32)
+    nearest, limit, total, count = room[0], room[1], room[2], room[3]
     for i in range(rows):
         nearest[:] = far
         for k in range(factor * factor):
@@ -126,7 +139,7 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, w: F4) -> None
             out[j] = count[j] / total[j] if count[j] > zero else zero
 
 
-@kernel
+@kernel(leaf=True)
 def _average_two(depth: F4, range_m: float, jump: float, w: F4) -> None:
     rows, columns = w.shape
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)

@@ -4,10 +4,11 @@ import math
 
 import numpy as np
 
-from shapecat.arrays import F8, I4
-from shapecat.detection.cells import Cells
+from shapecat.arrays import F4, F8, I4
+from shapecat.detection.cells import Cells, Lens
 from shapecat.detection.consensus import TOLERANCE, level_plane
 from shapecat.detection.planes import DIRECTIONS, Support, find_planes, support_of
+from shapecat.jit import kernel
 
 __all__ = ["find_levels"]
 
@@ -55,12 +56,19 @@ def _common_up(supports: list[Support]) -> F8:
 
 def _levelled(cells: Cells, support: Support, index: I4, up: F8) -> Support:
     """Fit the plane with the normal ``up`` to the readings of a support, by least squares."""
-    lens = cells.lens
-    i, j = np.divmod(index, cells.w.shape[1])
-    w = cells.w[i, j]
-    near = abs(w - (support.a * j + support.b * i + support.c)) < TOLERANCE
-    along = up[0] * (j - lens.cx) / lens.fx + up[1] * (i - lens.cy) / lens.fy + up[2]
+    offset = _offset(cells.w, cells.lens, index, support.a, support.b, support.c, up)
+    return support_of(cells, index, level_plane(cells.lens, up, offset)) or support
+
+
+@kernel
+def _offset(w: F4, lens: Lens, index: I4, a: float, b: float, c: float, up: F8) -> float:
+    columns = w.shape[1]
     # The inverse depth of the plane up @ p == offset is along / offset.
-    along, w = along[near], w[near]
-    offset = float(along @ along) / float(along @ w)
-    return support_of(cells, index, level_plane(lens, up, offset)) or support
+    squares = products = 0.0
+    for p in index:
+        i, j = p // columns, p % columns
+        if abs(w[i, j] - (a * j + b * i + c)) < TOLERANCE:
+            along = up[0] * (j - lens.cx) / lens.fx + up[1] * (i - lens.cy) / lens.fy + up[2]
+            squares += along * along
+            products += along * w[i, j]
+    return float(squares / products)

@@ -139,23 +139,37 @@ def _mark(
             if near[i, j] == 0:
                 continue
             x1 = (j + 1) * factor if j + 1 < columns else depth.shape[1]
-            here = w[i, j]
+            here, mine, count = w[i, j], labels[i, j], 0
+            sure = mine > 0 and (filled[i, j] or _is_high(planes, owners[mine], i, j, here))
             for y in range(i * factor, y1):
                 for x in range(j * factor, x1):
                     z = depth[y, x]
                     if not ((z >= low) & (z <= high)):
                         continue
-                    ii, jj = i, j
-                    if not _fits(here, z):
-                        p = _best_beside(w, i, j, z)
-                        if p < 0:
-                            continue
-                        ii, jj = p // columns, p % columns
-                    label = labels[ii, jj]
                     u, v = (x - shift) * scale, (y - shift) * scale
+                    if _fits(here, z):
+                        if sure or (mine > 0 and _rises(planes, owners[mine], u, v, z)):
+                            marks[y, x] = mine
+                            count += 1
+                        continue
+                    p = _best_beside(w, i, j, z)
+                    if p < 0:
+                        continue
+                    ii, jj = p // columns, p % columns
+                    label = labels[ii, jj]
                     if label > 0 and (filled[ii, jj] or _rises(planes, owners[label], u, v, z)):
                         marks[y, x] = label
                         sizes[label] += 1
+            sizes[mine] += count
+
+
+@kernel(leaf=True)
+def _is_high(planes: F8, k: int, i: int, j: int, w: float) -> bool:
+    """Whether every pixel that fits a cell is above plane k."""
+    z = 1 / max(w - JUMP, 1e-3)
+    level = planes[k, 0] * j + planes[k, 1] * i + planes[k, 2]
+    level += 1.5 * (abs(planes[k, 0]) + abs(planes[k, 1]))  # the farthest pixel of a cell
+    return bool((1 - max(level, 0.0) * z) * planes[k, 3] > LEAST_M + NOISE * z * z)
 
 
 @kernel
@@ -190,7 +204,7 @@ def _mark_points(
             sizes[label] += 1
 
 
-@kernel
+@kernel(leaf=True)
 def _fits(w: float, z: float) -> bool:
     """Whether a depth is within one jump of a cell; both sides are multiplied by the depth."""
     return bool(abs(w * z - np.float32(1)) < np.float32(JUMP) * z)
