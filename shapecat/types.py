@@ -158,7 +158,7 @@ class Candidate(Record):
     plane : position of the plane it stands on in `Scene.planes`; None if on none.
     on_candidate : position of the candidate it stands on in `Scene.candidates`, or None.
     support_m : height of what it stands on above `plane`, metres (0 when it stands on the plane).
-    touches_border : it is cut by the border of the image.
+    touches_border : it is cut by the border of the image, or where the range of readings ends.
     occluded : something nearer hides a part of it.
     """
 

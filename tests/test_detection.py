@@ -285,6 +285,17 @@ def test_result_does_not_depend_on_the_roll(change: Callable[[Array], Array]) ->
     assert min(overlaps(scene, truth, [1, 2, 3, 4])) > 0.8
 
 
+def test_what_reaches_the_range_is_cut() -> None:
+    """Readings beyond it are left out: the size of what is there is not its own."""
+    depth, seen = render([table(), box((0.2, 0, 0), (0.08, 0.3, 0.1)), can(-0.2, 0, 0, 0.04, 0.14)])
+    whole = found(frame_of(depth))
+    assert not any(candidate.touches_border for candidate in whole.candidates)
+    settings = DetectionSettings(max_range_m=float(np.median(depth[seen == 1])))
+    rest = detect(frame_of(depth), settings=settings, rng=np.random.default_rng(0))
+    cut = [c for c in rest.candidates if (seen.reshape(-1)[c.indices] == 1).all()]
+    assert [candidate.touches_border for candidate in cut] == [True]
+
+
 def test_upside_down_the_front_of_a_large_box_is_no_support() -> None:
     """Which way the camera is held tells less than how much of the scene is level."""
     depth, seen = render([table(), box((0, 0, 0), (0.44, 0.1, 0.26)), can(0.32, 0, 0, 0.04, 0.14)])

@@ -8,8 +8,8 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4, U4, Bool
 from shapecat.config import DetectionSettings
 from shapecat.detection.candidates import Extents, extents_of, occluded, stands_of
-from shapecat.detection.cells import NEAREST_M, Cells
-from shapecat.detection.pieces import depths_of
+from shapecat.detection.cells import JUMP, NEAREST_M, Cells
+from shapecat.detection.pieces import FEW, depths_of
 from shapecat.detection.planes import Support, corners_of
 from shapecat.detection.segmentation import Segmentation
 from shapecat.geometry import (
@@ -56,6 +56,7 @@ def scene_of(
     position = {k + 1: n for n, k in enumerate(kept)}
     boxes = _boxes(cells, found, indices, points)
     cut = _cut(cells, boxes) if points is None else _cut_cloud(cells, found, sensor_from_view)
+    cut |= _out_of_range(cells, found, settings.max_range_m)
     stands, hidden, owners = stands_of(found), occluded(found), found.owners
     candidates = []
     for k in kept:
@@ -105,6 +106,13 @@ def _cut(cells: Cells, extents: Extents) -> Bool:
         result |= extents.low[:, axis] < first + reach
         result |= extents.high[:, axis] > last - reach
     return result
+
+
+def _out_of_range(cells: Cells, found: Segmentation, range_m: float) -> Bool:
+    """Return whether each object reaches the range, beyond which readings are left out."""
+    last = (cells.w > 0) & (cells.w < 1 / range_m + JUMP / 2)
+    count = np.bincount(found.labels[last], minlength=found.leaders.size)
+    return np.asarray(count[1:] >= FEW)
 
 
 def _cut_cloud(cells: Cells, found: Segmentation, sensor_from_view: Pose) -> Bool:

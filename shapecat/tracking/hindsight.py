@@ -27,8 +27,9 @@ class Fragments(Record):
     ``first_ns`` and ``last_ns`` (f,) times of the first and last detection; ``start`` and ``end``
     (f, 3) metres, where it was then, and ``start_velocity``, ``end_velocity`` (f, 3) m/s;
     ``sizes`` (f, 3) typical box lengths, metres, ``whole`` (f,) how many views seem to show all
-    of it, and ``rest`` (f, 3) where it is then, nan if it moves; ``posteriors`` (f, c);
-    ``scenes`` (f,) number of the scene, counted by `scene_cuts`.
+    of it, and ``rest`` (f, 3) where it is then, nan if it moves; ``posteriors`` (f, c), and
+    ``novelties`` (f,), above 1 where they say nothing; ``scenes`` (f,) number of the scene, counted
+    by `scene_cuts`.
     """
 
     first_ns: I4 = array("f", "i8")
@@ -41,6 +42,7 @@ class Fragments(Record):
     whole: I4 = array("f", "i4")
     rest: F8 = array("f 3", "f8")
     posteriors: F8 = array("f c", "f8")
+    novelties: F8 = array("f", "f8")
     scenes: I4 = array("f", "i4")
 
 
@@ -75,6 +77,7 @@ def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, 
     keys = size_key(fragments.sizes)
     limit = reach(keys, settings.gate_m)
     known = fragments.whole >= _KNOWN
+    vague = (fragments.whole == 0) | (fragments.novelties > 1)  # looks like anything
     found = []
     for i, after in enumerate(_successors(fragments, limit, settings)):
         distance = _distances(fragments, i, after, settings) / max(limit[i], 1e-9)
@@ -84,8 +87,7 @@ def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, 
         )[0]
         gap_s = (fragments.first_ns[after] - fragments.last_ns[i]) * 1e-9
         cost = distance + size / _SAME_SIZE + posterior + gap_s / (gap_s + 10)
-        cut = (fragments.whole[i] == 0) | (fragments.whole[after] == 0)  # looks like anything
-        similar = cut | (posterior <= _SAME_POSTERIOR)
+        similar = vague[i] | vague[after] | (posterior <= _SAME_POSTERIOR)
         alike = (distance <= 1) & (size <= _SAME_SIZE) & similar
         found += [(float(c), i, int(j)) for c, j in zip(cost[alike], after[alike], strict=True)]
     return [(i, j) for _, i, j in sorted(found)]

@@ -142,6 +142,9 @@ def _describe(hits: Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
         np.array([np.sum(~hits.partial[f]) for f in fragments], np.int32),
         np.reshape([_rest(hits, f) for f in fragments], (n, 3)),
         np.reshape([_mean_posterior(hits, f) for f in fragments], (n, -1 if n else 0)),
+        np.array(
+            [fuse_novelty(hits.novelties[f], view_weights(hits.partial[f])) for f in fragments]
+        ),
         np.array([scenes[hits.rows[f[0]]] for f in fragments], np.int32),
     )
 
