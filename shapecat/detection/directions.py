@@ -64,8 +64,8 @@ def _directions(facets: F4, hint: F8 | None, least: float, rng: np.random.Genera
     if hint is not None:
         free &= _facing(facets, hint, HINT_COS)
     found: list[F8] = []
-    while len(found) < MOST_DIRECTIONS and np.count_nonzero(free) >= least:
-        trials = np.flatnonzero(free)[rng.integers(0, np.count_nonzero(free), TRIALS)]
+    while len(found) < MOST_DIRECTIONS and (left := np.flatnonzero(free)).size >= least:
+        trials = left[rng.integers(0, left.size, TRIALS)]
         best = np.zeros(3)
         if _most_faced(facets, free, trials, best) < least:
             break

@@ -42,6 +42,8 @@ def _common_up(supports: list[Support]) -> F8:
 
     A plane that disagrees counts less (iteratively reweighted least squares, Cauchy's weights).
     """
+    if len(supports) == 1:
+        return supports[0].up
     half = DIRECTIONS // 2
     widths = [float((s.reach[:half] + s.reach[half:]).min()) for s in supports]
     weights = np.array([s.area_m2 * w * w for s, w in zip(supports, widths, strict=True)])

@@ -32,11 +32,11 @@ def reach_over(cells: Cells, heights: Heights, planes: F8, walls: U1, *, highest
     walls : from `clear_walls`; what is cleared stays so.
     """
     stacks = np.zeros((2, heights.owner.size), np.int32)
-    outside = np.full(heights.owner.shape, np.nan, np.float32)
+    outside = np.zeros(heights.owner.shape, np.float32)
     seen = np.zeros(heights.owner.shape, np.int32)
     for k, plane in reversed(list(enumerate(planes))):
-        _reach(cells.w, cells.lens, heights, k + 1, plane, walls, highest_m, outside, seen, stacks)
         outside[:] = np.nan
+        _reach(cells.w, cells.lens, heights, k + 1, plane, walls, highest_m, outside, seen, stacks)
 
 
 @kernel

@@ -66,14 +66,17 @@ def raise_low(cells: Cells, heights: Heights, planes: F8, raised: I4, *, largest
     largest_m : wider things are swells or furniture.
     """
     objects = 0
+    stacks = np.zeros((2, cells.w.size), np.int32)
     for k, plane in enumerate(planes):
         excess = np.zeros(cells.w.shape, np.float32)
         if _excess(cells.w, heights.owner, heights.height, plane, k + 1, excess) >= LEAST_CELLS:
             step = max(STEP, SLIP * math.hypot(plane[0], plane[1]))
-            _cut_feet(cells.w, heights.owner, heights.height, k + 1, excess)
+            _cut_feet(cells.w, heights.owner, heights.height, k + 1, excess, stacks[0])
             widest = largest_m * cells.lens.fx
-            objects = _raise(cells.w, excess, heights.owner, k + 1, step, raised, widest, objects)
-            _lower(cells.w, excess, heights.owner, k + 1, step, raised)
+            objects = _raise(
+                cells.w, excess, heights.owner, k + 1, step, raised, widest, objects, stacks
+            )
+            _lower(cells.w, excess, heights.owner, k + 1, step, raised, stacks)
 
 
 @kernel
@@ -108,10 +111,9 @@ def _excess(w: F4, owner: I4, height: F4, plane: F8, number: int, out: F4) -> in
 
 
 @kernel
-def _cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4) -> None:
+def _cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4, stack: I4) -> None:
     """Clear the excess of the feet of what is not low: steep cells below it, down to the plane."""
     rows, columns = excess.shape
-    stack = np.zeros(excess.size, np.int32)
     drop = np.zeros(excess.size, np.float32)
     top = 0
     for i in range(1, rows - 1):
@@ -148,23 +150,21 @@ def _raise(
     raised: I4,
     widest: float,
     objects: int,
+    stacks: I4,
 ) -> int:
     """Mark the parts above each level, filled, whose outline is that of an object.
 
     They are numbered from ``objects`` + 1 on. Returns the last number.
     """
     flat, marks, owners = excess.reshape(-1), raised.reshape(-1), owner.reshape(-1)
-    seeds = np.zeros(flat.size, np.int32)
+    seeds, stack = stacks[0], stacks[1]
     n = 0
-    for p in range(flat.size):
-        seeds[n] = p
-        n += int(flat[p] > LEVELS[-1])
-    if n < LEAST_CELLS:
-        return objects
-    stack = np.zeros(flat.size, np.int32)
+    for p in range(1, flat.size):
+        seeds[n] = p  # the first cell of a part above any level is higher than the one before it
+        n += int((flat[p] > LEVELS[-1]) & (flat[p] > flat[p - 1]))
     seen, part = np.zeros(excess.shape, np.int32), np.zeros(excess.shape, np.int32)
     visited, parts = seen.reshape(-1), part.reshape(-1)
-    merits = np.zeros(flat.size, np.float32)
+    merits = np.zeros(1 + objects + LEVELS.size * (flat.size // LEAST_CELLS), np.float32)
     me = 0
     for level in LEVELS:
         first = me
@@ -173,14 +173,14 @@ def _raise(
                 continue
             me += 1
             count = _flood(excess, level, s, me, seen, stack)
-            if count < LEAST_CELLS or _width(w, stack, count) > widest:
+            if count < LEAST_CELLS:
                 continue
             known, best = 0, 0.0
             for p in stack[:count]:
                 parts[p] = me
-                known += merits[p] > 0
-                best = max(best, merits[p])
-            if known > SAME * count:
+                known += marks[p] > 0
+                best = max(best, merits[marks[p]])
+            if known > SAME * count or _width(w, stack, count) > widest:
                 continue
             filled = fill_hull(excess, part, stack, count)
             outline = _outline(w, excess, owner, part, stack, filled, number, rise_least, count)
@@ -190,12 +190,13 @@ def _raise(
                 filled = count
                 outline = _outline(w, excess, owner, part, stack, filled, number, rise_least, count)
             for p in stack[count:filled]:
-                best = max(best, merits[p])
+                best = max(best, merits[marks[p]])
             merit = outline.rise / outline.sides
             if merit > GROWN * best and _is_object(outline, filled):
                 objects += 1
+                merits[objects] = merit
                 for p in stack[:filled]:
-                    marks[p], merits[p], owners[p] = objects, merit, number
+                    marks[p], owners[p] = objects, number
     return objects
 
 
@@ -261,10 +262,10 @@ def _flood(excess: F4, level: float, start: int, n: int, part: I4, stack: I4) ->
         done += 1
         for step in (1, -1, columns, -columns):
             q = p + step
-            if parts[q] != n and flat[q] > level:
-                parts[q] = n
-                stack[top] = q
-                top += 1
+            new = (parts[q] != n) & (flat[q] > level)
+            parts[q] = n if new else parts[q]  # branches here are hard to foresee
+            stack[top] = q
+            top += int(new)
     return top
 
 
@@ -290,6 +291,9 @@ def _outline(
     for t in range(count):
         p = stack[t]
         floor += flat[p] if t >= flooded else 0.0
+        beside = (parts[p - 1] == me) & (parts[p + 1] == me)
+        if beside & (parts[p - columns] == me) & (parts[p + columns] == me):
+            continue
         for d in range(4):
             di = 1 if d == 0 else -1 if d == 1 else 0
             dj = 1 if d == 2 else -1 if d == 3 else 0
@@ -322,10 +326,12 @@ def _outline(
 
 
 @kernel
-def _lower(w: F4, excess: F4, owner: I4, number: int, rise_least: float, raised: I4) -> None:
+def _lower(
+    w: F4, excess: F4, owner: I4, number: int, rise_least: float, raised: I4, stacks: I4
+) -> None:
     """Give level parts of low object cells whose outline is that of a swell back to the plane."""
     rows, columns = excess.shape
-    seeds = np.zeros(excess.size, np.int32)
+    seeds, stack = stacks[0], stacks[1]
     above = np.zeros(excess.shape, np.float32)
     n = 0
     for i in range(rows):
@@ -337,7 +343,6 @@ def _lower(w: F4, excess: F4, owner: I4, number: int, rise_least: float, raised:
                 n += 1
     if n < SMALL_PART:
         return
-    stack = np.zeros(n, np.int32)
     part = np.zeros(excess.shape, np.int32)
     parts, owners = part.reshape(-1), owner.reshape(-1)
     number_of_parts = 0
