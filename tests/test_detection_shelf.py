@@ -75,8 +75,18 @@ def test_plate_at_the_level_of_the_camera_is_found(seed: int, label: int) -> Non
 
 @pytest.mark.parametrize(
     ("seed", "label"),
-    [(330, 26), (9, 24), (639, 24), (600, 22), (673, 31), (663, 21), (126, 30)],
-    ids=["lying bottle", "handle", "waist", "foot", "far rim", "near wall", "foot under a rim"],
+    [
+        pytest.param(330, 26, id="lying bottle"),
+        pytest.param(9, 24, id="handle"),
+        pytest.param(639, 24, id="waist"),
+        pytest.param(600, 22, id="foot"),
+        pytest.param(673, 31, id="far rim"),
+        pytest.param(663, 21, id="near wall"),
+        pytest.param(126, 30, id="foot under a rim"),
+        pytest.param(683, 24, id="neck on the board"),
+        pytest.param(301, 20, id="handle on the board"),
+        pytest.param(29, 23, id="handle half hidden"),
+    ],
 )
 def test_object_is_in_one_piece(seed: int, label: int) -> None:
     """What hangs on an object or bears it, and what is seen of its other side, is part of it."""

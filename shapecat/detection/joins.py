@@ -47,6 +47,8 @@ STANDS, RISES_M = 0.25, 0.005
 """What stands on something is linked to surface that faces up, and reaches so far above it."""
 HANGS = 0.4
 """Links with the plane, as a share of those with pieces, of a handle that reaches down to it."""
+SCRAP, TURNED = 100, 1.3
+"""Cells of a scrap, and `slope_of` below which it is no small ball or can."""
 NECK_WIDTH, NECK_LEDGE = 0.7, 0.1
 """A neck on what faces up along more than this share of its border is narrower, by the width of the
 body."""
@@ -160,7 +162,7 @@ def _has_foot(pieces: Pieces, p: int, q: int) -> bool:
 
 @kernel
 def _join_floating(pieces: Pieces) -> None:
-    """Join a piece that stands on nothing and is seen whole to what it touches."""
+    """Join a piece that is no object of its own to what it touches: what floats, and scraps."""
     n = pieces.group.size
     again = True
     while again:
@@ -169,21 +171,38 @@ def _join_floating(pieces: Pieces) -> None:
             if not is_group(pieces, p):
                 continue
             contact = pieces.pairs[CONTACT, p]
-            total = np.sum(contact)
             q = np.argmax(contact)
-            hidden = np.sum(pieces.pairs[FRONT, :, p]) + pieces.single[p, HIDDEN]
-            hidden -= pieces.pairs[FRONT, q, p]  # that would be its own body
             if (
-                total >= FEW
-                and pieces.single[p, TABLE] <= max(2.0, HANGS * total)
-                and hidden < SEEN_WHOLE * pieces.boundary[p]
-                and _links_onto_lower(pieces, p) < STANDS * total
+                np.sum(contact) >= FEW
                 and pieces.shape[p, COUNT] < PART * pieces.shape[q, COUNT]
-                and slope_of(pieces.shape[p]) < WHOLE
                 and not rests_on(pieces, p, q)
+                and (_is_scrap(pieces.shape[p]) or _floats(pieces, p, q))
             ):
                 merge(pieces, q, p)
                 again = True
+
+
+@kernel(leaf=True)
+def _is_scrap(row: F4) -> bool:
+    """Whether too little is seen of a piece to be an object that touches another, unless round.
+
+    The neck of a lying bottle and the handle of a cup reach the plane, as small objects do.
+    """
+    return bool(row[COUNT] < SCRAP and slope_of(row) < TURNED)
+
+
+@kernel(leaf=True)
+def _floats(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether piece ``p`` stands on nothing and is seen whole but for what ``q`` hides."""
+    total = np.sum(pieces.pairs[CONTACT, p])
+    hidden = np.sum(pieces.pairs[FRONT, :, p]) + pieces.single[p, HIDDEN]
+    hidden -= pieces.pairs[FRONT, q, p]
+    return bool(
+        pieces.single[p, TABLE] <= max(2.0, HANGS * total)
+        and hidden < SEEN_WHOLE * pieces.boundary[p]
+        and _links_onto_lower(pieces, p) < STANDS * total
+        and slope_of(pieces.shape[p]) < WHOLE
+    )
 
 
 @kernel(leaf=True)
