@@ -101,3 +101,15 @@ def test_square_bowl_is_one_object(yaw: float) -> None:
     walls = [box((k * c, k * s, 0), across, yaw) for k in (-1, 1)]
     walls += [box((-k * s, k * c, 0), along, yaw) for k in (-1, 1)]
     check([table(), union(*walls, box((0, 0, 0), (0.16, 0.16, 0.006), yaw))], [1])
+
+
+def test_head_as_large_as_the_body_is_part_of_it() -> None:
+    """A plush animal beside whose axis the head is; its body touches the table nowhere seen."""
+    animal = union(ball((0, 0, 0.055), 0.055), ball((0.03, 0, 0.13), 0.05))
+    check([table(), animal], [1], tilt_deg=20)
+
+
+def test_ball_on_a_can_whose_foot_is_hidden() -> None:
+    """What the can stands on is not seen, so that nothing tells it from a body without a foot."""
+    shapes = [table(), can(0, 0, 0, 0.045, 0.1), ball((0, 0, 0.159), 0.06)]
+    check([*shapes, box((0, -0.1, 0), (0.2, 0.03, 0.05))], [1, 2, 3], tilt_deg=20)

@@ -41,10 +41,13 @@ PART = 0.48
 """A part that stands on nothing is smaller than this share of what it hangs on."""
 SEEN_WHOLE = 0.25
 """Largest share of its boundary that is behind other things."""
+SEEN_BARE = 0.1
+"""The same of what it may stand on: what that stands on must not be hidden."""
 WHOLE = 1.6
 """`slope_of` what is seen all the way round: a ball or can that leans, but no handle."""
-STANDS, RISES_M = 0.25, 0.005
-"""What stands on something is linked to surface that faces up, and reaches so far above it."""
+STANDS, ON_TOP, RISES_M = 0.25, 0.5, 0.005
+"""What stands on something is linked to surface that faces up, and reaches so far above it; where
+all else says that it does not, along the second share of its contacts."""
 HANGS = 0.4
 """Links with the plane, as a share of those with pieces, of a handle that reaches down to it."""
 SCRAP, TURNED = 100, 1.3
@@ -172,36 +175,67 @@ def _join_floating(pieces: Pieces) -> None:
                 continue
             contact = pieces.pairs[CONTACT, p]
             q = np.argmax(contact)
-            if (
-                np.sum(contact) >= FEW
-                and pieces.shape[p, COUNT] < PART * pieces.shape[q, COUNT]
-                and not rests_on(pieces, p, q)
-                and (_is_scrap(pieces.shape[p]) or _floats(pieces, p, q))
+            if np.sum(contact) >= FEW and (
+                _is_scrap(pieces, p, q)
+                or (
+                    _floats(pieces, p, q)
+                    and (_is_part(pieces, p, q) or _is_upper_half(pieces, p, q))
+                )
             ):
                 merge(pieces, q, p)
                 again = True
 
 
 @kernel(leaf=True)
-def _is_scrap(row: F4) -> bool:
+def _is_smaller(pieces: Pieces, p: int, q: int) -> bool:
+    return bool(
+        pieces.shape[p, COUNT] < PART * pieces.shape[q, COUNT] and not rests_on(pieces, p, q)
+    )
+
+
+@kernel(leaf=True)
+def _is_scrap(pieces: Pieces, p: int, q: int) -> bool:
     """Whether too little is seen of a piece to be an object that touches another, unless round.
 
     The neck of a lying bottle and the handle of a cup reach the plane, as small objects do.
     """
-    return bool(row[COUNT] < SCRAP and slope_of(row) < TURNED)
+    row = pieces.shape[p]
+    return bool(row[COUNT] < SCRAP and slope_of(row) < TURNED and _is_smaller(pieces, p, q))
 
 
 @kernel(leaf=True)
 def _floats(pieces: Pieces, p: int, q: int) -> bool:
-    """Whether piece ``p`` stands on nothing and is seen whole but for what ``q`` hides."""
-    total = np.sum(pieces.pairs[CONTACT, p])
+    """Whether piece ``p`` is not on the plane and is seen whole but for what ``q`` hides."""
     hidden = np.sum(pieces.pairs[FRONT, :, p]) + pieces.single[p, HIDDEN]
     hidden -= pieces.pairs[FRONT, q, p]
     return bool(
-        pieces.single[p, TABLE] <= max(2.0, HANGS * total)
+        pieces.single[p, TABLE] <= max(2.0, HANGS * np.sum(pieces.pairs[CONTACT, p]))
         and hidden < SEEN_WHOLE * pieces.boundary[p]
-        and _links_onto_lower(pieces, p) < STANDS * total
-        and slope_of(pieces.shape[p]) < WHOLE
+    )
+
+
+@kernel(leaf=True)
+def _is_part(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether piece ``p`` stands on nothing, and is small beside ``q``."""
+    stands = _links_onto_lower(pieces, p) >= STANDS * np.sum(pieces.pairs[CONTACT, p])
+    return bool(not stands and slope_of(pieces.shape[p]) < WHOLE and _is_smaller(pieces, p, q))
+
+
+@kernel(leaf=True)
+def _is_upper_half(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether piece ``q`` below is seen to stand on nothing either: what bears something does."""
+    a, b = pieces.shape[p], pieces.shape[q]
+    contact = pieces.pairs[CONTACT, p, q]
+    others = np.sum(pieces.pairs[CONTACT, q]) - contact
+    hidden = np.sum(pieces.pairs[FRONT, :, q]) - pieces.pairs[FRONT, p, q]
+    hidden += pieces.single[q, HIDDEN]
+    return bool(
+        a[TOP] > b[TOP]
+        and a[BOTTOM] > b[BOTTOM]
+        and others < FEW
+        and _links_onto_lower(pieces, p) < ON_TOP * np.sum(pieces.pairs[CONTACT, p])
+        and pieces.single[q, TABLE] <= max(2.0, HANGS * contact)
+        and hidden < SEEN_BARE * pieces.boundary[q]
     )
 
 
