@@ -229,6 +229,15 @@ def test_an_object_that_comes_back_to_its_place_keeps_its_track() -> None:
         ({"sizes": [[0.2, 0.2, 0.1], [0.1, 0.1, 0.1]], "whole": [3, 20]}, False),  # larger than it
         ({"posteriors": [[1, 0], [0, 1]], "whole": [0, 20]}, True),  # cut, it looks like anything
         ({"posteriors": [[1, 0], [0, 1]], "novelties": [0.5, 1.2]}, True),  # as an unknown does
+        ({"start": [[0, 0, 0], [0.15, 0, 0]], "first_ns": [0, 3 * SECOND]}, False),  # too far
+        (  # behind something on one side, and out on the other
+            {
+                "start": [[0, 0, 0], [0.15, 0, 0]],
+                "first_ns": [0, 3 * SECOND],
+                "cut": [[False, True], [True, False]],
+            },
+            True,
+        ),
         ({"start": [[0, 0, 0], [0.3, 0, 0]], "rest": [[0.3, 0, 0], [np.nan] * 3]}, True),
         ({"first_ns": [0, SECOND]}, False),  # the first one lasts until 2 s: they overlap
     ],
@@ -247,6 +256,7 @@ def test_fragments_are_joined_only_when_nothing_speaks_against_it(
         "whole": [20, 20],
         "rest": np.full((2, 3), np.nan),
         "posteriors": [[0.8, 0.2], [0.7, 0.3]],
+        "cut": [[False, False], [False, False]],
         "novelties": [0.5, 0.5],
         "scenes": [0, 0],
     }

@@ -27,7 +27,8 @@ class Fragments(Record):
     ``first_ns`` and ``last_ns`` (f,) times of the first and last detection; ``start`` and ``end``
     (f, 3) metres, where it was then, and ``start_velocity``, ``end_velocity`` (f, 3) m/s;
     ``sizes`` (f, 3) typical box lengths, metres, ``whole`` (f,) how many views seem to show all
-    of it, and ``rest`` (f, 3) where it is then, nan if it moves; ``posteriors`` (f, c), and
+    of it, and ``rest`` (f, 3) where it is then, nan if it moves; ``cut`` (f, 2) whether the first
+    and the last view show only a part of it; ``posteriors`` (f, c), and
     ``novelties`` (f,), above 1 where they say nothing; ``scenes`` (f,) number of the scene, counted
     by `scene_cuts`.
     """
@@ -41,6 +42,7 @@ class Fragments(Record):
     sizes: F8 = array("f 3", "f8")
     whole: I4 = array("f", "i4")
     rest: F8 = array("f 3", "f8")
+    cut: Bool = array("f 2", "?")
     posteriors: F8 = array("f c", "f8")
     novelties: F8 = array("f", "f8")
     scenes: I4 = array("f", "i4")
@@ -76,11 +78,13 @@ def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, 
     """Return possible joins (earlier, later), the most likely first."""
     keys = size_key(fragments.sizes)
     limit = reach(keys, settings.gate_m)
+    hidden = 2 * reach(keys, np.inf)  # one side goes behind something, the other comes out
     known = fragments.whole >= _KNOWN
     vague = (fragments.whole == 0) | (fragments.novelties > 1)  # looks like anything
     found = []
     for i, after in enumerate(_successors(fragments, limit, settings)):
-        distance = _distances(fragments, i, after, settings) / max(limit[i], 1e-9)
+        within = np.where(fragments.cut[i, 1] & fragments.cut[after, 0], hidden[i], limit[i])
+        distance = _distances(fragments, i, after, settings) / np.maximum(within, 1e-9)
         size = _contradiction(keys[i], keys[after], known[i], known[after])
         posterior = posterior_difference(
             fragments.posteriors[i : i + 1], fragments.posteriors[after]

@@ -141,6 +141,7 @@ def _describe(hits: Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
         np.reshape([_extent(hits, f) for f in fragments], (n, 3)),
         np.array([np.sum(~hits.partial[f]) for f in fragments], np.int32),
         np.reshape([_rest(hits, f) for f in fragments], (n, 3)),
+        np.reshape([hits.partial[f[[0, -1]]] for f in fragments], (n, 2)),
         np.reshape([_mean_posterior(hits, f) for f in fragments], (n, -1 if n else 0)),
         np.array(
             [fuse_novelty(hits.novelties[f], view_weights(hits.partial[f])) for f in fragments]
