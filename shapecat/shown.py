@@ -84,7 +84,7 @@ class ShownTracks:
             tracks,
             labels,
             _ended(folder, of_frames, shown, numbers(table["stamp_ns"])[rows]),
-            numbers(table["posterior"]).reshape(table.num_rows, -1)[rows] if causal else _NONE,
+            _rows_of_lists(table["posterior"])[rows] if causal else _NONE,
         )
 
     def of(self, key: Key) -> Iterator[ShownDetection]:
@@ -131,6 +131,12 @@ def _boxes(keys: Sequence[Key], shown: ShownTracks, detections: pa.Table) -> Ite
     for span, stop in zip(spans, accumulate(counts), strict=True):
         labels = tuple(map(shown.labels.__getitem__, shown.tracks[span]))
         yield ShownBoxes(labels, places[stop - len(labels) : stop])
+
+
+def _rows_of_lists(column: pa.ChunkedArray) -> F4:
+    """Return (n, k) the numbers of lists of the same length."""
+    values = numbers(column)
+    return np.reshape(values, (len(column), values.size // max(len(column), 1)))
 
 
 def _places(table: pa.Table) -> F8:

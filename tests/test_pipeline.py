@@ -14,6 +14,8 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from numpy.testing import assert_allclose
 
+from shapecat.simulation import simulate
+
 Run = Callable[..., Result]
 FILES = {
     "run.json",
@@ -251,6 +253,28 @@ def test_one_bad_recording_does_not_stop_the_others(
     (summary,) = json.loads(result.stdout)
     assert summary["counts"]["frames"] > 0
     assert {path.name for path in (tmp_path / "out").iterdir()} == {"table", "manifest.jsonl"}
+
+
+def test_a_recording_in_which_nothing_is_found(shapecat: Run, tmp_path: Path) -> None:
+    """Tables without a row have been shaped as if they had one."""
+    path = simulate(tmp_path / "bare.mcap", scene="empty", frames=3, seed=1)
+    result = shapecat("process", path, "--out", tmp_path)
+    assert result.exit_code == 0, result.output
+
+    folder = tmp_path / "bare"
+    assert {file.name for file in folder.iterdir()} == FILES
+    assert len(rows(folder, "frames")) == 3
+    assert not rows(folder, "detections")
+    assert not rows(folder, "tracks")
+    for command in (
+        ("annotate", folder, "--labels", folder / "tracks.csv"),
+        ("report", folder),
+        ("scene", folder, "--frame", 0),
+        ("export", folder, "--format", "kitti", "--out", tmp_path / "kitti"),
+        ("export", folder, "--format", "crops", "--out", tmp_path / "crops"),
+    ):
+        again = shapecat(*command)
+        assert again.exit_code == 0, (command, again.output)
 
 
 @pytest.mark.parametrize(
