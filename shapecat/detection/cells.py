@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4
+from shapecat.arrays import F4, Bool
 from shapecat.jit import kernel
 from shapecat.types import Camera
 
@@ -56,6 +56,10 @@ class Cells(NamedTuple):
     def small(self, depth_m: F4) -> F4:
         """Return the number of cells of `SMALL_M2` at each depth, within reason."""
         return np.clip(SMALL_M2 * self.lens.fx**2 / depth_m**2, 20, 75)
+
+    def last_in(self, range_m: float) -> Bool:
+        """Return (rows, columns) whether each reading is one of the last before ``range_m``."""
+        return (self.w > 0) & (self.w < 1 / range_m + JUMP / 2)
 
 
 def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_M) -> Cells | None:

@@ -100,8 +100,7 @@ def cut_by_range(cells: Cells, regions: I4, pieces: Pieces, *, range_m: float) -
     What is left of a wall or a floor there has an outline that is not its own.
     """
     size = pieces.group.size
-    last = (cells.w > 0) & (cells.w < 1 / range_m + JUMP / 2)
-    cut = np.bincount(pieces.group[regions[last]], minlength=size)
+    cut = np.bincount(pieces.group[regions[cells.last_in(range_m)]], minlength=size)
     return np.asarray(cut > CUT * pieces.shape[:, COUNT])
 
 

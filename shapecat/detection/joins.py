@@ -188,6 +188,7 @@ def _join_floating(pieces: Pieces) -> None:
 
 @kernel(leaf=True)
 def _is_smaller(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether piece ``p`` is much smaller than ``q`` and does not rest on it."""
     return bool(
         pieces.shape[p, COUNT] < PART * pieces.shape[q, COUNT] and not rests_on(pieces, p, q)
     )

@@ -208,7 +208,7 @@ class Outline(NamedTuple):
     sides : sides of cells; ``table`` of them look at the plane; ``known`` are these, those that
         touch what is not low, and those before something farther; ``hidden`` end at something
         nearer or where nothing is seen.
-    rise : sum of the rises of the former, as multiples of the least mean rise.
+    rise : sum of the rises of the ``table`` sides, as multiples of the least mean rise.
     steep : how many of them are steep.
     floor : mean height of the cells that were filled in, above the plane around, 1/m.
     """

@@ -8,7 +8,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4, U4, Bool
 from shapecat.config import DetectionSettings
 from shapecat.detection.candidates import Extents, extents_of, occluded, stands_of
-from shapecat.detection.cells import JUMP, NEAREST_M, Cells
+from shapecat.detection.cells import NEAREST_M, Cells
 from shapecat.detection.pieces import FEW, depths_of
 from shapecat.detection.planes import Support, corners_of
 from shapecat.detection.segmentation import Segmentation
@@ -110,8 +110,7 @@ def _cut(cells: Cells, extents: Extents) -> Bool:
 
 def _out_of_range(cells: Cells, found: Segmentation, range_m: float) -> Bool:
     """Return whether each object reaches the range, beyond which readings are left out."""
-    last = (cells.w > 0) & (cells.w < 1 / range_m + JUMP / 2)
-    count = np.bincount(found.labels[last], minlength=found.leaders.size)
+    count = np.bincount(found.labels[cells.last_in(range_m)], minlength=found.leaders.size)
     return np.asarray(count[1:] >= FEW)
 
 

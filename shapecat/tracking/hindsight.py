@@ -28,9 +28,8 @@ class Fragments(Record):
     (f, 3) metres, where it was then, and ``start_velocity``, ``end_velocity`` (f, 3) m/s;
     ``sizes`` (f, 3) typical box lengths, metres, ``whole`` (f,) how many views seem to show all
     of it, and ``rest`` (f, 3) where it is then, nan if it moves; ``cut`` (f, 2) whether the first
-    and the last view show only a part of it; ``posteriors`` (f, c), and
-    ``novelties`` (f,), above 1 where they say nothing; ``scenes`` (f,) number of the scene, counted
-    by `scene_cuts`.
+    and the last view show only a part of it; ``posteriors`` (f, c), and ``novelties`` (f,), above
+    1 where they say nothing; ``scenes`` (f,) number of the scene, counted by `scene_cuts`.
     """
 
     first_ns: I4 = array("f", "i8")
