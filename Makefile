@@ -30,6 +30,7 @@ demo: setup ## simulate a recording, process it, and say where the results lie
 	$(BIN)/shapecat process $(DEMO)/tabletop.mcap --out $(DEMO)/out --overwrite
 
 test: setup ## run all tests
+	@$(BIN)/python -m shapecat.rehearsal
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not many'
 
 odd: setup ## process damaged and odd recordings, print what became of each

@@ -17,7 +17,7 @@ PHASES = {
     "train": "learning",
     "evaluate": "evaluating",
 }
-COMPILING = "compiling kernels, once per installation: about a minute"
+COMPILING = "compiling kernels, once per installation: a few minutes"
 
 
 class Bars:

@@ -8,7 +8,7 @@ Each can be run again alone.
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
+from contextlib import ExitStack, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -70,7 +70,7 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
     RecordingError, NoStreamError, ModelError, OutputError : with nothing left behind.
     """
     begun = time.perf_counter()
-    with open_recording(job.source) as recording, _compile_clock(observe) as compiled:
+    with open_recording(job.source) as recording, _compile_clock(observe, cores) as compiled:
         categorizer = load_model(job.model)
         categorizer.require_descriptor(DESCRIPTOR_NAMES)
         run = describe_run(job, categorizer)
@@ -108,9 +108,22 @@ def _once(phase: str, folder: Path, run: dict[str, Any], work: Callable[[], None
     write_run(folder, run)
 
 
-def _compile_clock(observe: Observer) -> AbstractContextManager[CompileClock]:
-    """Measure compilation, which happens once per installation, and let the user know of it."""
-    return compile_clock(lambda: observe("compile", 0, None))
+@contextmanager
+def _compile_clock(observe: Observer, cores: int) -> Iterator[CompileClock]:
+    """Measure compilation, which happens once per installation, and let the user know of it.
+
+    With several cores another process takes a share of it.
+    """
+    with ExitStack() as stack:
+
+        def begin() -> None:
+            observe("compile", 0, None)
+            if cores > 1:
+                from shapecat.rehearsal import compile_ahead  # noqa: PLC0415  once per installation
+
+                stack.enter_context(compile_ahead())
+
+        yield stack.enter_context(compile_clock(begin))
 
 
 def _finished(

@@ -27,7 +27,9 @@ FLOOR = {
         ),
         2,
     ),
-    **dict.fromkeys(("outputs", "evaluation", "models", "perception", "jobs", "tracks"), 3),
+    **dict.fromkeys(
+        ("outputs", "evaluation", "models", "perception", "rehearsal", "jobs", "tracks"), 3
+    ),
     "pipeline": 4,
     "batch": 5,
     "cli": 6,
