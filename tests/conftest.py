@@ -13,6 +13,11 @@ from click.testing import CliRunner, Result
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with the file that takes longest: at the end all workers but one would wait for it."""
+    items.sort(key=lambda item: item.path.name != "test_packaging.py")
+
+
 @pytest.fixture(scope="session")
 def real_data() -> Path:
     """Return the folder of real sensor data, which is not part of the repository."""
