@@ -30,6 +30,8 @@ demo: setup ## simulate a recording, process it, and say where the results lie
 	$(BIN)/shapecat process $(DEMO)/tabletop.mcap --out $(DEMO)/out --overwrite
 
 test: setup ## run all tests
+	@command -v chromedriver >/dev/null || $(call apt,chromium chromium-driver) \
+	    || echo "(only the tests of the report in a browser need them)" >&2
 	@$(BIN)/python -m shapecat.rehearsal
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not many'
 
@@ -65,4 +67,4 @@ clean: ## remove the environment and everything made
 # Install Debian packages where that is allowed, otherwise name the command.
 apt = { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null \
     && apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null; } \
-    || { echo "missing system libraries: sudo apt-get install -y $(1)" >&2; false; }
+    || { echo "missing system packages: sudo apt-get install -y $(1)" >&2; false; }
