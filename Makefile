@@ -3,6 +3,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 OPEN3D_LIBRARIES := libegl1 libgl1 libx11-6 libusb-1.0-0
+SCREENS := chromium chromium-driver mesa-vulkan-drivers
 DEMO := demo
 
 .DEFAULT_GOAL := help
@@ -30,8 +31,8 @@ demo: setup ## simulate a recording, process it, and say where the results lie
 	$(BIN)/shapecat process $(DEMO)/tabletop.mcap --out $(DEMO)/out --overwrite
 
 test: setup ## run all tests
-	@command -v chromedriver >/dev/null || $(call apt,chromium chromium-driver) \
-	    || echo "(only the tests of the report in a browser need them)" >&2
+	@{ command -v chromedriver && ls /usr/share/vulkan/icd.d/*; } >/dev/null 2>&1 || $(call apt,$(SCREENS)) \
+	    || echo "(only tests of the report in a browser and of screenshots need them)" >&2
 	@$(BIN)/python -m shapecat.rehearsal
 	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not many'
 

@@ -289,12 +289,23 @@ def test_a_missing_review_or_viewer_is_said_in_one_line(
         review.take_screenshot(tmp_path / "r.rrd", tmp_path / "r.png")
 
 
+_ANSWERS = "import socket, time; s = socket.create_server(('127.0.0.1', PORT)); time.sleep(2)"
+
+
+@pytest.mark.parametrize(
+    ("begins", "says"),
+    [("exit", "No graphics adapter was found"), ("answers", "Failed to get render context")],
+    ids=["no graphics", "OpenGL without Vulkan"],
+)
 def test_a_viewer_without_graphics_names_the_package(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, begins: str, says: str
 ) -> None:
     """A container has no graphics card: the message must say what to install."""
     fake = tmp_path / "rerun"
-    fake.write_text("#!/bin/sh\necho 'No graphics adapter was found' >&2\nexit 1\n")
+    answer = (
+        f'{sys.executable} -c "{_ANSWERS}"'.replace("PORT", "$4") if begins == "answers" else ""
+    )
+    fake.write_text(f"#!/bin/sh\n{answer}\necho '{says}' >&2\nexit 1\n")
     fake.chmod(0o755)
     monkeypatch.setattr(review_viewer, "_viewer", lambda: str(fake))
     with pytest.raises(OutputError, match="mesa-vulkan-drivers"):

@@ -65,7 +65,8 @@ def take_screenshot(
             client.save_screenshot(str(png.absolute()))
             _wait_until(png.exists)
         except (RuntimeError, OSError) as error:
-            msg = f"{path}: the viewer cannot draw it: {error}"
+            ended = _has_ended(viewer)
+            msg = _why(said) if ended else f"{path}: the viewer cannot draw it: {error}"
             raise OutputError(msg) from error
         finally:
             with suppress(ProcessLookupError):
@@ -129,10 +130,17 @@ def _wait_for(viewer: subprocess.Popen[bytes], port: int, said: IO[bytes]) -> No
     _wait_until(answers)
 
 
+def _has_ended(viewer: subprocess.Popen[bytes]) -> bool:
+    """Whether the viewer is gone, or about to go: its connection ends before it does."""
+    with suppress(subprocess.TimeoutExpired):
+        viewer.wait(_SETTLE_S)
+    return viewer.poll() is not None
+
+
 def _why(said: IO[bytes]) -> str:
     said.seek(0)
     text = said.read().decode("utf-8", "replace")
-    if "adapter" in text or "Vulkan" in text:
+    if any(word in text for word in ("adapter", "Vulkan", "render context")):
         return (
             "the viewer finds nothing to draw with; without a graphics card install a software "
             "renderer (Debian, Ubuntu: the package mesa-vulkan-drivers)"
