@@ -48,8 +48,9 @@ WHOLE = 1.6
 STANDS, ON_TOP, RISES_M = 0.25, 0.5, 0.005
 """What stands on something is linked to surface that faces up, and reaches so far above it; where
 all else says that it does not, along the second share of its contacts."""
-HANGS = 0.4
-"""Links with the plane, as a share of those with pieces, of a handle that reaches down to it."""
+HANGS, ALONG = 0.4, 0.15
+"""Of a handle that reaches down to the plane: most links with that, as a share of those with
+pieces; least share of its boundary along what it hangs on."""
 SCRAP, TURNED = 100, 1.3
 """Cells of a scrap, and `slope_of` below which it is no small ball or can."""
 NECK_WIDTH, NECK_LEDGE = 0.7, 0.1
@@ -217,7 +218,12 @@ def _floats(pieces: Pieces, p: int, q: int) -> bool:
 
 @kernel(leaf=True)
 def _is_part(pieces: Pieces, p: int, q: int) -> bool:
-    """Whether piece ``p`` stands on nothing, and is small beside ``q``."""
+    """Whether piece ``p`` stands on nothing, and is small beside ``q``.
+
+    A neighbour whose foot is hidden but for a little meets ``q`` along a short line.
+    """
+    if pieces.single[p, TABLE] > 0 and pieces.pairs[CONTACT, p, q] < ALONG * pieces.boundary[p]:
+        return False
     stands = _links_onto_lower(pieces, p) >= STANDS * np.sum(pieces.pairs[CONTACT, p])
     return bool(not stands and slope_of(pieces.shape[p]) < WHOLE and _is_smaller(pieces, p, q))
 
