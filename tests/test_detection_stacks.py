@@ -67,6 +67,14 @@ def test_neighbour_that_hides_where_it_stands_is_no_handle(seed: int, label: int
     assert overlap_in_clutter(seed, [label]) > 0.8
 
 
+@pytest.mark.parametrize(
+    ("seed", "labels"), [(140, [21, 23]), (426, [22, 24]), (437, [21, 28]), (582, [21, 22])]
+)
+def test_what_bears_something_of_its_width_is_no_lower_half(seed: int, labels: list[int]) -> None:
+    """Bottles stand on cans and boxes that show no top; they meet at one height."""
+    assert overlap_in_clutter(seed, labels) > 0.8
+
+
 def test_cans_of_one_radius_are_parted_by_their_axes() -> None:
     """No edge parts their sides, and the ledge between them is thin."""
     shapes = [table(), can(0, 0, 0, 0.04, 0.1), can(0.012, 0, 0.1, 0.038, 0.1)]

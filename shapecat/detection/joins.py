@@ -17,6 +17,7 @@ from shapecat.detection.pieces import (
     HIDDEN,
     LEFT,
     LID_M,
+    MEETS_M,
     NEAR,
     ONTO,
     RIGHTMOST,
@@ -147,13 +148,16 @@ def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
 def _has_foot(pieces: Pieces, p: int, q: int) -> bool:
     """Whether piece ``q`` is the lower half of a body with a waist, or the foot of a dish.
 
-    Nothing of its top is seen, and what stands on it hardly ever stands so exactly in the middle.
+    Nothing of its top is seen, and their border is not level; what stands on it meets it at one
+    height, and hardly ever stands so exactly in the middle.
     """
     a, b = pieces.shape[p], pieces.shape[q]
     contact = pieces.pairs[CONTACT, p, q]
     if contact < FEW or pieces.owner[p] != pieces.owner[q] or pieces.single[p, TABLE] > 2:
         return False
-    if a[TOP] < b[TOP] or a[BOTTOM] < b[TOP] - NECK_OVERLAP_M or slope_of(b) < BULGING:
+    if a[TOP] < b[TOP] or not -NECK_OVERLAP_M < a[BOTTOM] - b[TOP] < -MEETS_M:
+        return False
+    if slope_of(b) < BULGING or roundness_of(b) < ROUND:
         return False
     if pieces.pairs[ONTO, p, q] > NECK_LEDGE * contact or lid_share(pieces, q, LID_M) > BARE:
         return False

@@ -25,6 +25,7 @@ __all__ = [
     "HIDDEN",
     "LEFT",
     "LID_M",
+    "MEETS_M",
     "NEAR",
     "ONTO",
     "ONTO_HEIGHT",
