@@ -122,6 +122,11 @@ def test_square_bowl_is_one_object(yaw: float) -> None:
     check([table(), union(*walls, box((0, 0, 0), (0.16, 0.16, 0.006), yaw))], [1])
 
 
+def test_ball_near_the_camera_that_shows_little_is_found() -> None:
+    """What is noise among so few readings farther away is a thing half hidden here."""
+    assert overlap_in_clutter(103, [29]) > 0.8
+
+
 def test_head_as_large_as_the_body_is_part_of_it() -> None:
     """A plush animal beside whose axis the head is; its body touches the table nowhere seen."""
     animal = union(ball((0, 0, 0.055), 0.055), ball((0.03, 0, 0.13), 0.05))

@@ -25,6 +25,8 @@ __all__ = ["scene_of"]
 
 BORDER = 0.05
 """Readings that begin this near to the border of the image begin at the border."""
+ENOUGH = 60
+"""Cells of what is no noise, however near and therefore small it is."""
 BORDER_CELLS, STRAIGHT, LEAST_FORWARD = 2.5, 0.3, 0.2
 """The border of a cloud: its width, and the least share of a side that it is straight along; the
 least cosine, about, of what is in front of a camera."""
@@ -48,7 +50,7 @@ def scene_of(
     least = np.full(len(indices), settings.min_points)
     if points is None:
         small = cells.small(depths_of(found.pieces)[found.leaders[1:]])
-        least = np.maximum(least, small * cells.factor**2)
+        least = np.maximum(least, np.minimum(small, ENOUGH) * cells.factor**2)
     kept = sorted(
         (k for k, index in enumerate(indices) if index.size >= least[k]),
         key=lambda k: int(indices[k][0]),
