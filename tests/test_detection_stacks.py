@@ -67,6 +67,18 @@ def test_neighbour_that_hides_where_it_stands_is_no_handle(seed: int, label: int
     assert overlap_in_clutter(seed, [label]) > 0.8
 
 
+@pytest.mark.parametrize(("seed", "label"), [(316, 20), (329, 29), (433, 27)])
+def test_two_sides_of_one_object(seed: int, label: int) -> None:
+    """What is in front of its middle hides where they meet: a box, a plate and a bowl."""
+    assert overlap_in_clutter(seed, [label]) > 0.8
+
+
+def test_two_cans_beside_a_third_are_no_sides_of_one() -> None:
+    """They are of one height, and each turns about an axis of its own."""
+    shapes = [table(), can(-0.05, 0.08, 0, 0.04, 0.1), can(0.05, 0.08, 0, 0.04, 0.1)]
+    check([*shapes, can(0, -0.02, 0, 0.035, 0.12)], [1, 2, 3], tilt_deg=25)
+
+
 @pytest.mark.parametrize(
     ("seed", "labels"), [(140, [21, 23]), (426, [22, 24]), (437, [21, 28]), (582, [21, 22])]
 )

@@ -7,7 +7,7 @@ import numpy as np
 from shapecat.arrays import F4, I4
 from shapecat.detection.cells import Cells
 from shapecat.detection.containers import join_hollow, join_overhangs, join_rims
-from shapecat.detection.occluders import join_behind
+from shapecat.detection.occluders import join_around, join_behind
 from shapecat.detection.pieces import (
     BOTTOM,
     CONTACT,
@@ -90,6 +90,8 @@ def join_pieces(
         _join_necks(pieces)
     if "float" in rules:
         _join_floating(pieces)
+    if "occluder" in rules:
+        join_around(pieces)
 
 
 @kernel

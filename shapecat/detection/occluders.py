@@ -6,10 +6,22 @@ import numpy as np
 
 from shapecat.arrays import F4, I4
 from shapecat.detection.cells import JUMP, Lens
-from shapecat.detection.pieces import FEW, FRONT, SAMPLES, Pieces, is_group, merge
+from shapecat.detection.pieces import (
+    FEW,
+    FRONT,
+    LEFT,
+    RIGHTMOST,
+    SAMPLES,
+    TOP,
+    Pieces,
+    is_group,
+    merge,
+    roundness_of,
+    slope_of,
+)
 from shapecat.jit import kernel
 
-__all__ = ["join_behind"]
+__all__ = ["join_around", "join_behind"]
 
 COPLANAR_M, COPLANAR = 0.006, 0.05
 """How far a sample may lie off the tangent plane of another: metres, and per metre between them."""
@@ -18,6 +30,10 @@ PARTNERS = 0.45
 """Share of the samples of either piece that continue the other."""
 FREE, BEHIND = 0.12, 0.05
 """Between them, largest share in free space or on others, least share behind something."""
+SAME_TOP_M, FLANKED, TURNING, STEADY = 0.007, 0.12, 0.7, 1.75
+"""Two sides of one object: how far their tops differ; least share of the boundary of each behind
+what is between them; least `roundness_of` both together, or of a hollow the negative; and how much
+faster than both together either may turn, as two cans side by side do."""
 
 
 @kernel
@@ -40,6 +56,54 @@ def join_behind(pieces: Pieces, w: F4, lens: Lens, normal: F4, labels: I4) -> No
             if k != p:
                 a, b = min(k, p), max(k, p)
                 scores[a, b] = _continuation(pieces, a, b, w, lens, normal, labels)
+
+
+@kernel
+def join_around(pieces: Pieces) -> None:
+    """Join what is seen of one object on the left and on the right of something in front of it.
+
+    Neither side goes on in the other where the surface bends, but both end at one height, and
+    together they turn as one round thing does, one hollow, or the faces of one box.
+    """
+    n = pieces.group.size
+    for p in range(1, n):
+        for q in range(1, n):
+            if is_group(pieces, p) and is_group(pieces, q) and _flank(pieces, p, q):
+                merge(pieces, p, q)
+
+
+@kernel
+def _flank(pieces: Pieces, left: int, right: int) -> bool:
+    a, b = pieces.shape[left], pieces.shape[right]
+    if pieces.owner[left] != pieces.owner[right] or abs(a[TOP] - b[TOP]) > SAME_TOP_M:
+        return False
+    if a[RIGHTMOST] > b[LEFT]:
+        return False
+    front, boundary = pieces.pairs[FRONT], pieces.boundary
+    between = False
+    for k in range(1, pieces.group.size):
+        x = pieces.shape[k]
+        between |= (
+            front[k, left] > FLANKED * boundary[left]
+            and front[k, right] > FLANKED * boundary[right]
+            and x[LEFT] < b[LEFT]
+            and x[RIGHTMOST] > a[RIGHTMOST]
+            and x[RIGHTMOST] - x[LEFT] > b[LEFT] - a[RIGHTMOST]
+        )
+    if not between:
+        return False
+    both = a + b
+    both[LEFT], both[RIGHTMOST] = a[LEFT], b[RIGHTMOST]
+    if abs(roundness_of(both)) < TURNING:
+        return False
+    most = STEADY * _bend(both)
+    return bool(_bend(a) / most < 1 and _bend(b) / most < 1)
+
+
+@kernel(leaf=True)
+def _bend(row: F4) -> float:
+    """Return by how much the lateral normal of a piece changes per metre."""
+    return float(slope_of(row) / max(row[RIGHTMOST] - row[LEFT], 1e-3))
 
 
 @kernel
