@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
+from shapecat.geometry import inverse
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.scenes import SceneKind
+from shapecat.types import Camera, Frame
 
 FIRST_THING = 20
 """Lower pixel labels are those of furniture."""
@@ -93,3 +95,23 @@ def test_object_is_in_one_piece(seed: int, label: int) -> None:
     labels, parts = seen("shelf", seed)
     (one,) = (part for part in parts if np.median(part) == label)
     assert np.count_nonzero(one == label) > 0.75 * np.count_nonzero(labels == label)
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed", "quarters"),
+    [("shelf", 9, 2), ("shelf", 35, 2), ("clutter", 111, 2), ("clutter", 624, 1)],
+)
+def test_wall_is_no_ground_in_a_turned_image(kind: SceneKind, seed: int, quarters: int) -> None:
+    """More of the back of a shelf is seen than of its boards; what hides a wall divides it."""
+    rng = np.random.default_rng(seed)
+    world = make_scene(kind, rng, frames=1)
+    frame, _ = render_frame(world, 0, rng=rng, sensor=KINECT)
+    assert frame.depth is not None
+    depth = np.ascontiguousarray(np.rot90(frame.depth, quarters))
+    h, w = depth.shape
+    camera = Camera(w, h, 525.0, 525.0, (w - 1) / 2, (h - 1) / 2)
+    turned = Frame("t", 0, 0, 0, "c", depth=depth, camera=camera)
+    scene = detect(turned, settings=DetectionSettings(), rng=np.random.default_rng(0))
+    x, y, z = inverse(world.path[0]).rotation[:, 2]
+    up = np.array([y, -x, z]) if quarters == 1 else np.array([-x, -y, z])
+    assert scene.up @ up > np.cos(np.radians(5))

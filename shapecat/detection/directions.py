@@ -25,8 +25,9 @@ MOST_DIRECTIONS = 4
 HEIGHT_BINS, LEVEL_BIN_M = 80, 0.04
 LEVELS_APART = 2
 """Bins between two levels."""
-SEVERAL, UPRIGHT = 0.75, 0.3
-"""How much several levels count, by the power of their number, and an upright camera."""
+SEVERAL, CLEAR, UPRIGHT = 1.5, 2, 0.25
+"""How much it counts that levels are several, by the power of their number; that what faces a
+direction lies in them, by the power of the share; and an upright camera."""
 
 
 def estimate_up(
@@ -125,20 +126,24 @@ def _merit(facets: F4, direction: F8, least: float, *, upright: bool) -> float:
     """Return how well a direction explains the surface: what of it lies in large levels."""
     count = np.zeros(HEIGHT_BINS, np.int64)
     _count_levels(facets, direction, count)
-    level, levels = _large_levels(count, least)
+    level, squares = _large_levels(count, least)
+    if level == 0:
+        return 0.0
+    # The boards of a shelf are several, its back is one; what stands before a wall makes it several
+    # as well, but these are unlike in size, and much of what faces as it does lies in none.
+    levels, clear = level**2 / squares, level / int(count.sum())
     # Cameras look down at tables: +y is down in the optical frame.
     tilt = min(max(-direction[1] / 0.2, -1.0), 1.0) if upright else 0.0
-    # The boards of a shelf are several, its back is one.
-    return float(level * levels**SEVERAL * (1.0 + UPRIGHT * tilt))
+    return float(level * levels**SEVERAL * clear**CLEAR * (1.0 + UPRIGHT * tilt))
 
 
 @kernel
 def _large_levels(count: I4, least: float) -> tuple[int, int]:
-    """Return how many facets lie in levels of more than ``least``, and how many levels these are.
+    """Return how many facets lie in levels of more than ``least``, and the sum of their squares.
 
     A level fills two bins and stands out from the next ones: a slanted surface has many heights.
     """
-    facets = levels = 0
+    facets = squares = 0
     last = count.size - 1
     for k in range(last):
         here = count[k] + count[k + 1]
@@ -148,8 +153,8 @@ def _large_levels(count: I4, least: float) -> tuple[int, int]:
             stands_out &= here > there if m < k else here >= there
         if stands_out:
             facets += here
-            levels += 1
-    return facets, levels
+            squares += here * here
+    return facets, squares
 
 
 @kernel
