@@ -69,8 +69,7 @@ class RosMessages:
 
     def definition(self, name: str) -> bytes:
         """Return the definition to embed: that of the store that encodes."""
-        definition, _ = self._store.generate_msgdef(name, ros_version=1 if self.ros1 else 2)
-        return definition.encode()
+        return _definition(self.ros1, name)
 
     def serialize(self, message: Any, name: str) -> bytes:
         """Encode a message."""
@@ -219,3 +218,9 @@ def _typestore(ros1: bool) -> Typestore:  # noqa: FBT001  # a cache key
         types = {key: known.get(key, value) for key, value in types.items()}
         store.register({key: value for key, value in types.items() if key not in store.fielddefs})
     return store
+
+
+@cache
+def _definition(ros1: bool, name: str) -> bytes:  # noqa: FBT001  # the same
+    definition, _ = _typestore(ros1).generate_msgdef(name, ros_version=1 if ros1 else 2)
+    return definition.encode()
