@@ -264,6 +264,18 @@ def test_fragments_are_joined_only_when_nothing_speaks_against_it(
     assert merge_fragments(fragments, SETTINGS).tolist() == ([0, 0] if joined else [0, 1])
 
 
+def test_one_wrong_view_does_not_keep_what_comes_back_apart() -> None:
+    """What comes into view is cut at first, and may be found in two pieces when it is whole."""
+    cup, other = np.array([0.999, 0.001]), np.array([0.05, 0.95])
+    before = [frame(k, [0, 0, 0], posterior=cup) for k in range(20)]
+    away = [frame(k, []) for k in range(20, 100)]
+    cut = [frame(k, [0, 0, 0], posterior=cup) for k in range(100, 103)]
+    back = [replace(seen, partial=np.ones(1, bool)) for seen in cut]
+    whole = frame(103, [0, 0, 0], posterior=other)
+    tracks = track_recording([*before, *away, *back, whole], SETTINGS)
+    assert [track.hits for track in tracks] == [24]
+
+
 def test_streams_are_tracked_apart_and_numbered_together() -> None:
     frames = [frame(k, [0, 0, 0], topic=topic) for k in range(5) for topic in ("/a", "/b")]
     tracks = track_recording(frames, SETTINGS)
@@ -277,7 +289,7 @@ def test_ten_thousand_frames_take_seconds() -> None:
     begun = time.process_time()
     tracks = track_recording(frames, SETTINGS)
     assert [track.hits for track in tracks] == [2000] * 6
-    assert time.process_time() - begun < 4  # about 1 s; 10,000 frames five times that
+    assert time.process_time() - begun < 10  # 1 to 3 s; 10,000 frames five times that
 
 
 VIEWS = st.integers(0, 2**32 - 1).map(

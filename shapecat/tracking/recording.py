@@ -8,7 +8,7 @@ import numpy as np
 from shapecat.arrays import F8, I4, Bool
 from shapecat.config import TrackingSettings
 from shapecat.tracking.common_motion import CommonMotion, find_common_motion
-from shapecat.tracking.fusion import causal, fuse_novelty, view_weights
+from shapecat.tracking.fusion import causal, fuse, fuse_novelty, view_weights
 from shapecat.tracking.hindsight import Fragments, merge_fragments, scene_cuts
 from shapecat.tracking.hits import Hits
 from shapecat.tracking.pieces import join_pieces
@@ -131,6 +131,7 @@ def _describe(hits: Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
     at = stamps[hits.rows]
     starts = [_line(at[f[:_LINE]], hits.centers[f[:_LINE]], 0) for f in fragments]
     ends = [_line(at[f[-_LINE:]], hits.centers[f[-_LINE:]], -1) for f in fragments]
+    views = [(f, view_weights(hits.partial[f])) for f in fragments]
     return Fragments(
         np.array([at[f[0]] for f in fragments], np.int64),
         np.array([at[f[-1]] for f in fragments], np.int64),
@@ -142,10 +143,8 @@ def _describe(hits: Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
         np.array([np.sum(~hits.partial[f]) for f in fragments], np.int32),
         np.reshape([_rest(hits, f) for f in fragments], (n, 3)),
         np.reshape([hits.partial[f[[0, -1]]] for f in fragments], (n, 2)),
-        np.reshape([_mean_posterior(hits, f) for f in fragments], (n, -1 if n else 0)),
-        np.array(
-            [fuse_novelty(hits.novelties[f], view_weights(hits.partial[f])) for f in fragments]
-        ),
+        np.reshape([fuse(hits.posteriors[f], weights=w) for f, w in views], (n, -1 if n else 0)),
+        np.array([fuse_novelty(hits.novelties[f], w) for f, w in views]),
         np.array([scenes[hits.rows[f[0]]] for f in fragments], np.int32),
     )
 
@@ -167,11 +166,6 @@ def _rest(hits: Hits, member: I4) -> F8:
     ):
         return np.full(3, np.nan)
     return np.asarray(np.median(whole, axis=0))
-
-
-def _mean_posterior(hits: Hits, member: I4) -> F8:
-    weights = view_weights(hits.partial[member])
-    return np.asarray(np.average(hits.posteriors[member], axis=0, weights=weights))
 
 
 def _line(stamps: I4, centers: F8, at: int) -> tuple[F8, F8]:
