@@ -34,7 +34,7 @@ test: setup ## run all tests
 	@{ command -v chromedriver && ls /usr/share/vulkan/icd.d/*; } >/dev/null 2>&1 || $(call apt,$(SCREENS)) \
 	    || echo "(only tests of the report in a browser and of screenshots need them)" >&2
 	@$(BIN)/python -m shapecat.rehearsal
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile -m 'not many'
+	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m 'not many'
 
 odd: setup ## process damaged and odd recordings, print what became of each
 	$(BIN)/python -m tests.odd

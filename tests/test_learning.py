@@ -1,7 +1,6 @@
 """Learning: the fitted chain, its prediction without scikit-learn, novelty, new categories."""
 
 import itertools
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -157,18 +156,6 @@ def test_same_seed_same_model_bit_for_bit() -> None:
     """A model that cannot be made again cannot be trusted; threads may not change it."""
     assert fit(seed=0).model_id == fit(replace(SMALL, jobs=2), seed=0).model_id
     assert fit(seed=0).model_id != fit(seed=1).model_id
-
-
-def test_prediction_of_one_object_is_fast(categorizer: Categorizer) -> None:
-    x = blobs(1, 4).descriptors[:1]
-    categorizer.predict(x)
-    seconds = []
-    for _ in range(200):
-        begun = time.perf_counter()
-        categorizer.predict(x)
-        seconds.append(time.perf_counter() - begun)
-
-    assert min(seconds) < 3e-4
 
 
 @pytest.mark.parametrize("x", [np.zeros((2, 7)), np.full((1, 8), np.nan), np.zeros(8)])
