@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import U1
+from shapecat.arrays import I4, U1
 from shapecat.outputs.annotation import Annotation, text_position
 from shapecat.outputs.ros_annotations import ArrayMessage, RosMessages
 from shapecat.types import ShownBox, ShownBoxes, ShownFrame
@@ -33,7 +33,6 @@ _PARTS = (
     slice(96, 120),  # the place of its text
 )
 """Where values that change are among the bytes of a frame, those of its first box included."""
-_OF_FRAME = 2
 
 Labels = tuple[tuple[int, str, float], ...]
 
@@ -66,9 +65,9 @@ class StencilEncoder:
             gone = annotation.gone if self._message.gone else ()
             key = (annotation.frame.objects.labels, annotation.frame.frame_id, gone)
             alike.setdefault(key, []).append(k)
+        values = _values(annotations)
         for key, members in alike.items():
-            plan = self._plan(*key)
-            rows = _fill(plan, _values([annotations[k] for k in members]))
+            rows = _fill(self._plan(*key), values.of(members, len(key[0])))
             for k, row in zip(members, rows, strict=True):
                 result[k] = row.tobytes()
         return result
@@ -77,7 +76,7 @@ class StencilEncoder:
         """Put the stencils of a frame together: values of the frame, then box by box."""
         makers = range(len(self._message.elements))
         head = _sample(frame_id, gone)
-        data, holes = _stencil(self._whole(head)[: -_COUNT.size], head)
+        data, holes = _stencil(self._whole(head)[: -_COUNT.size])
         data += _COUNT.pack(len(labels) * len(makers))
         for k, label in enumerate(labels):
             for maker in makers:
@@ -101,7 +100,7 @@ class StencilEncoder:
         encode = self._ros.shifted if shift else self._ros.serialize
         data = encode(element, self._message.element)
         start = 0 if self._ros.ros1 else _CDR_HEADER
-        return _stencil(data[start:], sample)
+        return _stencil(data[start:])
 
 
 def _align(length: int) -> tuple[int, int]:
@@ -130,8 +129,22 @@ def _sample(
     return Annotation(frame, _LIFETIME_NS, gone)
 
 
-def _values(annotations: Sequence[Annotation]) -> U1:
-    """Return (frames, bytes) what changes, of frames with the same number of boxes."""
+class _Values(NamedTuple):
+    """What changes: (frames, 16) bytes of frames, (boxes, 104) of boxes, and each frame's first."""
+
+    frames: U1
+    boxes: U1
+    firsts: I4
+
+    def of(self, members: Sequence[int], count: int) -> U1:
+        """Return (members, bytes) the values of frames with so many boxes."""
+        rows = self.firsts[members][:, None] + np.arange(count)
+        boxes = self.boxes[rows].reshape(len(members), count * _BOX_BYTES)
+        return np.hstack([self.frames[members], boxes])
+
+
+def _values(annotations: Sequence[Annotation]) -> _Values:
+    """Gather what changes: for all frames together, as each operation costs more than a frame."""
     times = np.array([(a.lifetime_ns, a.frame.stamp_ns) for a in annotations], np.int64)
     seconds, nanoseconds = np.divmod(times, 10**9)
     whole = np.stack([np.minimum(seconds, 2**31 - 1), nanoseconds], axis=2).astype("<u4")
@@ -139,8 +152,20 @@ def _values(annotations: Sequence[Annotation]) -> U1:
     center, size, orientation = places[:, :3], places[:, 3:6], places[:, 6:]
     above = np.column_stack(text_position(center.T, size.T, orientation.T))
     boxes = np.hstack([center, orientation, size, above]).astype("<f8")
-    n = len(annotations)
-    return np.hstack([whole.view(np.uint8).reshape(n, -1), boxes.view(np.uint8).reshape(n, -1)])
+    counts = [len(a.frame.objects.places) for a in annotations]
+    return _Values(
+        whole.view(np.uint8).reshape(-1, _FRAME_BYTES),
+        boxes.view(np.uint8).reshape(-1, _BOX_BYTES),
+        np.cumsum([0, *counts[:-1]]),
+    )
+
+
+@lru_cache(1)
+def _sample_parts() -> tuple[bytes, ...]:
+    """Return the values of a sample as they stand in what it is encoded to."""
+    frame, box, _ = _values([_sample("", boxes=[ShownBox(0, "", 0.0, *_SAMPLE)])])
+    whole = np.concatenate([frame[0], box[0]])
+    return tuple(whole[part].tobytes() for part in _PARTS)
 
 
 def _of_box(number: int, part: slice) -> slice:
@@ -159,11 +184,10 @@ def _fill(plan: _Stencil, values: U1) -> U1:
     return rows
 
 
-def _stencil(data: bytes, sample: Annotation) -> _Stencil:
+def _stencil(data: bytes) -> _Stencil:
     """Find the values of a sample in what it was encoded to."""
-    values, holes = _values([sample])[0], []
-    for part in _PARTS if sample.frame.objects else _PARTS[:_OF_FRAME]:
-        value = values[part].tobytes()
+    holes = []
+    for part, value in zip(_PARTS, _sample_parts(), strict=True):
         at = data.find(value)
         while at >= 0:
             holes.append((at, part))
