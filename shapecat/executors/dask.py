@@ -60,7 +60,7 @@ def open_dask(workers: int, threads: int, address: str | None) -> Executor:
                 threads_per_worker=1,
                 processes=True,
                 host="127.0.0.1",
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",  # None is port 8787, which may be taken
                 memory_limit=0,
             )
         return _DaskExecutor(Client(cluster), cluster)
