@@ -3,6 +3,7 @@
 import dataclasses
 import subprocess
 import sys
+import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -321,7 +322,11 @@ def test_no_viewer_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(review_viewer, "_LOAD_S", 1.0)
     with pytest.raises(OutputError, match="no answer"):
         review.take_screenshot(fake, tmp_path / "r.png")
-    assert not alive(int((tmp_path / "pid").read_text()))
+    pid = int((tmp_path / "pid").read_text())
+    deadline = time.monotonic() + 10  # it is dead at once, and gone when its new parent looks
+    while alive(pid) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not alive(pid)
 
 
 @pytest.mark.slow
