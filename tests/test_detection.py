@@ -250,6 +250,21 @@ def test_object_cut_by_the_border_is_flagged() -> None:
     assert not right.touches_border
 
 
+def test_the_border_is_where_readings_begin() -> None:
+    """A registered Kinect is blind in a tenth of the image; the top of a bottle is no border."""
+    shapes = [table(1, 1), box((-0.63, 0, 0), (0.08, 0.08, 0.1)), can(0.1, 0.45, 0, 0.04, 0.4)]
+    depth, seen = render(shapes, distance=1.2, tilt_deg=20)
+    assert not any(candidate.touches_border for candidate in found(frame_of(depth)).candidates)
+    middle = int(np.flatnonzero((seen == 1).any(axis=0)).mean())
+    top = np.flatnonzero((depth > 0).any(axis=1))[0]
+    assert seen[top].max() == 2
+    assert middle / 640 < 0.12
+    assert 0.05 < top / 480 < 0.12
+    depth[:, :middle] = 0
+    flags = [candidate.touches_border for candidate in found(frame_of(depth)).candidates]
+    assert sorted(flags) == [False, True]
+
+
 def test_shelf_boards_have_their_own_objects() -> None:
     """Objects belong to the board they stand on, and boards are sorted by height."""
     shapes = [table(0.45, 0.2), table(0.45, 0.12, 0.35), box((-0.1, -0.1, 0), (0.1, 0.1, 0.12)),

@@ -384,6 +384,22 @@ def test_an_object_that_comes_into_view_in_pieces_is_one_track() -> None:
     assert [track.hits for track in tracks] == [42]
 
 
+@pytest.mark.parametrize("partial", [True, False])
+def test_what_passes_behind_a_narrow_thing_is_one_track(partial: bool) -> None:
+    """For some frames both of its sides are seen, and never its whole depth."""
+    left, right = (0.0, 0.0, 0.0), (0.15, 0.0, 0.0)
+    sides = [[left]] * 20 + [[left, right]] * 4 + [[right]] * 20
+    frames = [
+        replace(
+            frame(k, places, size=(0.04, 0.18, 0.02)),
+            partial=np.full(len(places), partial),
+        )
+        for k, places in enumerate(sides)
+    ]
+    tracks = track_recording(frames, SETTINGS)
+    assert [track.hits for track in tracks] == ([44] if partial else [24, 24])
+
+
 def turning(*, speed: float, hidden: range, frames: int = 80) -> list[FrameDetections]:
     """Return a table that turns by ``speed`` radians a second; of one thing nothing is seen."""
     random = np.random.default_rng(1)

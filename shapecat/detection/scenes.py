@@ -23,8 +23,8 @@ from shapecat.types import Box, Candidate, Plane, Pose, Scene
 
 __all__ = ["scene_of"]
 
-BORDER = 0.05
-"""Readings that begin this near to the border of the image begin at the border."""
+BORDER = 0.12
+"""Share of the image in which its readings may begin: a registered Kinect is blind in a tenth."""
 ENOUGH = 60
 """Cells of what is no noise, however near and therefore small it is."""
 BORDER_CELLS, STRAIGHT, LEAST_FORWARD = 2.5, 0.3, 0.2
@@ -97,17 +97,23 @@ def _boxes(cells: Cells, found: Segmentation, indices: Sequence[U4], points: F4 
 def _cut(cells: Cells, extents: Extents) -> Bool:
     """Return whether each object reaches the border of the image, or of its readings near it."""
     result = np.zeros(len(extents.low), bool)
+    reach = max(1, round(2 / cells.factor))
     for axis in range(2):
-        size = cells.w.shape[axis]
         lines = cells.w if axis == 0 else cells.w.T
-        near = math.ceil(BORDER * size)
-        # The first that is seen, the very first if none is.
-        first = np.argmax(lines[:near].any(axis=1))
-        last = size - 1 - np.argmax(lines[: -near - 1 : -1].any(axis=1))
-        reach = max(1, round(2 / cells.factor))
-        result |= extents.low[:, axis] < first + reach
-        result |= extents.high[:, axis] > last - reach
+        last = len(lines) - 1
+        result |= extents.low[:, axis] < _begin(lines, reach) + reach
+        result |= extents.high[:, axis] > last - _begin(lines[::-1], reach) - reach
     return result
+
+
+def _begin(lines: F4, reach: int) -> int:
+    """Return the line at which the readings begin: the first with any, if more than one thing is.
+
+    The top of a tall thing with nothing behind it is no border.
+    """
+    first = int(np.argmax(lines[: math.ceil(BORDER * len(lines))].any(axis=1)))
+    seen = np.flatnonzero(lines[first : first + reach].any(axis=0))
+    return first if seen.size and np.ptp(seen) > STRAIGHT * lines.shape[1] else 0
 
 
 def _out_of_range(cells: Cells, found: Segmentation, range_m: float) -> Bool:

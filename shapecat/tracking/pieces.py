@@ -14,6 +14,7 @@ _NEAR_M = 0.35  # centres of pieces are nearer than that
 _SLACK, _SLACK_M = 1.1, 0.01  # pieces together may be so much longer than the whole
 _LACKING = 0.95  # a piece is shorter, on some side, than so much of the whole
 _MOSTLY = 0.34  # share of the frames with both in which they must be pieces
+_PASSING = 0.25  # share of either track's frames with both, at most, while it passes an occluder
 
 
 def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
@@ -21,6 +22,10 @@ def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
 
     Two objects side by side are larger than either of them. Of two pieces in the same frame the
     larger one stays in the track.
+
+    An object that goes behind a narrow thing comes out on its other side before it is gone on the
+    first: one track ends soon after the other one began. Whatever has been seen of it until then
+    is what stuck out to a side, so it may be as deep as it is long.
 
     Returns
     -------
@@ -34,7 +39,10 @@ def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
     wholes = np.array([_wholes(hits, member) for member in members])
     pairs = _neighbours(hits, owner)
     topics = hits.topics[hits.rows[pairs]]
-    fits = _fit(hits, axes, pairs, wholes[owner[pairs], topics])
+    rooms = wholes[owner[pairs], topics]
+    passing = _passing(hits, members, owner[pairs]) & hits.partial[pairs].all(axis=1)
+    rooms[passing, :, 1] = rooms[passing, :, 0]
+    fits = _fit(hits, axes, pairs, rooms)
     together, fitting = np.unique(np.sort(owner[pairs[fits]], axis=1), axis=0, return_counts=True)
     root = np.arange(len(members))
     for (a, b), count in sorted(
@@ -82,6 +90,15 @@ def _neighbours(hits: Hits, owner: I4) -> I4:
     found = cKDTree(places).query_pairs(_NEAR_M, output_type="ndarray")
     pairs = tracked[found]
     return np.asarray(pairs[np.lexsort(pairs.T)])
+
+
+def _passing(hits: Hits, members: Sequence[I4], pairs: I4) -> Bool:
+    """Tell of pairs (p, 2) of tracks whether one ends soon after the other one began."""
+    first = np.array([hits.rows[member[0]] for member in members])[pairs]
+    last = np.array([hits.rows[member[-1]] for member in members])[pairs]
+    both = last.min(axis=1) - first.max(axis=1) + 1
+    brief = both <= _PASSING * (last - first + 1).min(axis=1)
+    return np.asarray(brief & (np.argmin(first, axis=1) == np.argmin(last, axis=1)))
 
 
 def _fit(hits: Hits, axes: F8, pairs: I4, wholes: F8) -> Bool:
