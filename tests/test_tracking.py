@@ -229,6 +229,16 @@ def test_an_object_that_comes_back_to_its_place_keeps_its_track() -> None:
         ({"sizes": [[0.2, 0.2, 0.1], [0.1, 0.1, 0.1]], "whole": [3, 20]}, False),  # larger than it
         ({"posteriors": [[1, 0], [0, 1]], "whole": [0, 20]}, True),  # cut, it looks like anything
         ({"posteriors": [[1, 0], [0, 1]], "novelties": [0.5, 1.2]}, True),  # as an unknown does
+        ({"posteriors": [[1, 0], [0.3, 0.7]], "whole": [20, 3]}, True),  # at the very place
+        ({"posteriors": [[1, 0], [0.3, 0.7]]}, False),
+        (
+            {
+                "posteriors": [[1, 0], [0.3, 0.7]],
+                "whole": [20, 3],
+                "start": [[0, 0, 0], [0.05, 0, 0]],
+            },
+            False,
+        ),
         ({"start": [[0, 0, 0], [0.15, 0, 0]], "first_ns": [0, 3 * SECOND]}, False),  # too far
         (  # behind something on one side, and out on the other
             {

@@ -18,6 +18,7 @@ _SLOW_S = 0.3  # frames this far apart are not expected to show a motion
 _KNOWN = 8  # whole views that tell a size; some that seem whole are not
 _SAME_SIZE = 0.25  # mean absolute logarithm of the ratio of sizes
 _SAME_POSTERIOR = 0.5  # total variation
+_TRUSTED = 0.4  # so much more where few views are whole, at the very place and in the very size
 _LOOKAHEAD = 8  # later fragments at the same place that are considered
 
 
@@ -90,8 +91,10 @@ def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, 
         )[0]
         gap_s = (fragments.first_ns[after] - fragments.last_ns[i]) * 1e-9
         cost = distance + size / _SAME_SIZE + posterior + gap_s / (gap_s + 10)
-        similar = vague[i] | vague[after] | (posterior <= _SAME_POSTERIOR)
-        alike = (distance <= 1) & (size <= _SAME_SIZE) & similar
+        alike = (distance <= 1) & (size <= _SAME_SIZE)
+        agreement = (1 - distance) * (1 - size / _SAME_SIZE) * ~(known[i] & known[after])
+        similar = posterior <= _SAME_POSTERIOR + _TRUSTED * agreement
+        alike &= vague[i] | vague[after] | similar
         found += [(float(c), i, int(j)) for c, j in zip(cost[alike], after[alike], strict=True)]
     return [(i, j) for _, i, j in sorted(found)]
 
