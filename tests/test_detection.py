@@ -559,6 +559,19 @@ def test_bottle_with_a_wide_neck_is_one_object() -> None:
     check([table(), bottle], [1])
 
 
+def test_a_tilted_top_does_not_take_the_place_of_the_table() -> None:
+    """Continued to below the camera it is the lower one, and what is just above it is a top."""
+
+    def wedge(origin: Array, rays: Array) -> Array:
+        """Rise by 4 degrees from 3 cm above the table."""
+        t = (0.037 + 0.07 * origin[1] - origin[2]) / (rays[..., 2] - 0.07 * rays[..., 1])
+        point = origin + t[..., None] * rays
+        return np.where((abs(point[..., :2]) < 0.11).all(axis=-1), t, np.inf)
+
+    scene = check([table(), wedge, can(0.25, 0, 0, 0.04, 0.12)], [1, 2])
+    assert [plane.area_m2 > 0.3 for plane in scene.planes] == [True]
+
+
 def test_posts_of_a_rack_are_no_objects() -> None:
     """Posts go on through the level of a board; a tall box that stops below it does not."""
     rack = [table(0.4, 0.2), table(0.4, 0.2, 0.32)]

@@ -22,7 +22,8 @@ def find_levels(cells: Cells, up: F8, rng: np.random.Generator) -> list[tuple[Su
     """Return the planes of `find_planes` with one normal in common, lowest first.
 
     A board seen at a grazing angle, or only a strip of one, does not tell its tilt well: half a
-    degree is a centimetre of height a metre away.
+    degree is a centimetre of height a metre away. What is not level then, such as the top of a
+    tilted thing, is left out.
     """
     found = find_planes(cells, up, rng)
     if not found:
@@ -34,7 +35,8 @@ def find_levels(cells: Cells, up: F8, rng: np.random.Generator) -> list[tuple[Su
     if len(found) < 2:
         return found
     levelled = [(_levelled(cells, support, index, better), index) for support, index in found]
-    return sorted(levelled, key=lambda level: level[0].offset)
+    level = [(support, index) for support, index in levelled if support is not None]
+    return sorted(level, key=lambda one: one[0].offset)
 
 
 def _common_up(supports: list[Support]) -> F8:
@@ -56,10 +58,10 @@ def _common_up(supports: list[Support]) -> F8:
     return np.asarray(mean / np.linalg.norm(mean))
 
 
-def _levelled(cells: Cells, support: Support, index: I4, up: F8) -> Support:
+def _levelled(cells: Cells, support: Support, index: I4, up: F8) -> Support | None:
     """Fit the plane with the normal ``up`` to the readings of a support, by least squares."""
     offset = _offset(cells.w, cells.lens, index, support.a, support.b, support.c, up)
-    return support_of(cells, index, level_plane(cells.lens, up, offset)) or support
+    return support_of(cells, index, level_plane(cells.lens, up, offset))
 
 
 @kernel
