@@ -410,6 +410,14 @@ def test_what_passes_behind_a_narrow_thing_is_one_track(partial: bool) -> None:
     assert [track.hits for track in tracks] == ([44] if partial else [24, 24])
 
 
+def test_what_is_there_after_a_while_unseen_need_not_be_the_same() -> None:
+    """Unseen for 0.8 s, a track waits on; whether it came back is judged by all of its views."""
+    before = [frame(k, [0, 0, 0], posterior=CUP) for k in range(20)]
+    after = [frame(k, [0.02, 0, 0], posterior=BOX, size=(0.14, 0.14, 0.1)) for k in range(28, 50)]
+    tracks = track_recording([*before, *(frame(k, []) for k in range(20, 28)), *after], SETTINGS)
+    assert [track.hits for track in tracks] == [20, 22]
+
+
 def turning(*, speed: float, hidden: range, frames: int = 80) -> list[FrameDetections]:
     """Return a table that turns by ``speed`` radians a second; of one thing nothing is seen."""
     random = np.random.default_rng(1)

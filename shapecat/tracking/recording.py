@@ -22,7 +22,7 @@ _BURST_NS = 500_000_000
 """A track proves itself by its hits among the frames this near its first one."""
 
 _STILL_M = 0.05  # a centre strays less while its object stands still
-_GAP_S, _GAP_FRAMES = 1.0, 5  # unseen for longer, another detection begins a fragment
+_GAP_S, _GAP_FRAMES = 0.7, 5  # unseen for longer, another detection begins a fragment
 _LINE = 10  # detections at either end of a track that tell its motion
 
 
