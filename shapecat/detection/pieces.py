@@ -66,7 +66,7 @@ FEW = 3
 """Links between two pieces that are taken for a contact rather than for noise."""
 SAMPLES = 48
 BANDS = 128
-LID_M, LID = 0.02, 0.25
+LID_M, LID = 0.02, 0.3
 """A top is closed if this share of its width squared faces up within this depth of it."""
 BAND_M = 0.005
 LEDGE_M2, FLAT, MEETS_M = 4e-4, 0.9, 0.0075
