@@ -149,3 +149,10 @@ def test_ball_on_a_can_whose_foot_is_hidden() -> None:
     """What the can stands on is not seen, so that nothing tells it from a body without a foot."""
     shapes = [table(), can(0, 0, 0, 0.045, 0.1), ball((0, 0, 0.159), 0.06)]
     check([*shapes, box((0, -0.1, 0), (0.2, 0.03, 0.05))], [1, 2, 3], tilt_deg=20)
+
+
+@pytest.mark.parametrize("tilt_deg", [30, 40])
+def test_plate_that_juts_out_over_a_can_is_parted_from_it(tilt_deg: float) -> None:
+    """The tangent planes about its edge take the step for a slope."""
+    shapes = [table(), can(0, 0, 0, 0.038, 0.06), can(0, 0, 0.06, 0.05, 0.012)]
+    check(shapes, [1, 2], 0.8, tilt_deg=tilt_deg)

@@ -17,6 +17,9 @@ RIGHT, DOWN = 1, 2
 """Bits of `Surfaces.links`."""
 BASE, BASE_DIAGONAL = 3, 2
 """Cells between an edge and the surfaces on its two sides."""
+REACH, SURE = 2, 0.5
+"""Cells over which the slope beside a step is measured; how well one of two slopes that differ must
+explain the step, as a share of a jump."""
 LEAST_CHORD = 3e-4
 """Squared distance of two normals from which their angle is a degree."""
 
@@ -58,7 +61,7 @@ def _survey(w: F4, lens: Lens, owner: I4, surfaces: Surfaces) -> None:
 
 @kernel(fast=True, leaf=True)
 def _link(w: F4, owner: I4, tangent: F4, links: U1) -> None:
-    """Link neighbours where either tangent plane, or the step itself, meets within one jump."""
+    """Link neighbours that differ by less than a jump, or as either tangent plane tells."""
     rows, columns = w.shape
     jump = np.float32(JUMP)
     for i in range(rows):
@@ -69,17 +72,37 @@ def _link(w: F4, owner: I4, tangent: F4, links: U1) -> None:
             v, t, bits = w[i, j], tangent[i, 0, j], 0
             if j + 1 < columns and owner[i, j + 1] == me:
                 v1, t1 = w[i, j + 1], tangent[i, 0, j + 1]
-                joined = abs(v - v1) < jump
-                joined |= (t > 0) & (abs(t + tangent[i, 1, j] - v1) < jump)
+                joined = (t > 0) & (abs(t + tangent[i, 1, j] - v1) < jump)
                 joined |= (t1 > 0) & (abs(t1 - tangent[i, 1, j + 1] - v) < jump)
-                bits |= RIGHT if joined else 0
+                if abs(v - v1) < jump or (joined and not _is_step(w, owner, i, j, 0, 1)):
+                    bits |= RIGHT
             if i + 1 < rows and owner[i + 1, j] == me:
                 v1, t1 = w[i + 1, j], tangent[i + 1, 0, j]
-                joined = abs(v - v1) < jump
-                joined |= (t > 0) & (abs(t + tangent[i, 2, j] - v1) < jump)
+                joined = (t > 0) & (abs(t + tangent[i, 2, j] - v1) < jump)
                 joined |= (t1 > 0) & (abs(t1 - tangent[i + 1, 2, j] - v) < jump)
-                bits |= DOWN if joined else 0
+                if abs(v - v1) < jump or (joined and not _is_step(w, owner, i, j, 1, 0)):
+                    bits |= DOWN
             links[i, j] = bits
+
+
+@kernel(leaf=True)
+def _is_step(w: F4, owner: I4, i: int, j: int, di: int, dj: int) -> bool:
+    """Whether the readings change more from a cell to the next than they do before and after.
+
+    The window of a tangent plane reaches over a step and takes it for a slope, so that a plate
+    would be linked with the can it stands on. At the edge of a surface that is seen at a grazing
+    angle only one side has the slope.
+    """
+    i0, j0, i1, j1 = i - REACH * di, j - REACH * dj, i + di, j + dj
+    i2, j2 = i1 + REACH * di, j1 + REACH * dj
+    if i0 < 0 or j0 < 0 or i2 >= w.shape[0] or j2 >= w.shape[1]:
+        return False
+    if owner[i0, j0] != owner[i, j] or owner[i2, j2] != owner[i, j]:
+        return False
+    step = w[i1, j1] - w[i, j]
+    before = abs(step - (w[i, j] - w[i0, j0]) / REACH)
+    after = abs(step - (w[i2, j2] - w[i1, j1]) / REACH)
+    return bool(min(before, after) >= SURE * JUMP and max(before, after) >= JUMP)
 
 
 @kernel
