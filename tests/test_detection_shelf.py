@@ -115,3 +115,23 @@ def test_wall_is_no_ground_in_a_turned_image(kind: SceneKind, seed: int, quarter
     x, y, z = inverse(world.path[0]).rotation[:, 2]
     up = np.array([y, -x, z]) if quarters == 1 else np.array([-x, -y, z])
     assert scene.up @ up > np.cos(np.radians(5))
+
+
+def overlap_in_shelf(seed: int, label: int) -> float:
+    """Return the IoU of a thing and of the candidate that holds most of it."""
+    labels, parts = seen("shelf", seed)
+    best = max(parts, key=lambda part: np.count_nonzero(part == label))
+    common = np.count_nonzero(best == label)
+    return common / (np.count_nonzero(labels == label) + best.size - common)
+
+
+@pytest.mark.parametrize(("seed", "label"), [(116, 29), (117, 20)])
+def test_halves_of_a_small_thing_are_no_objects(seed: int, label: int) -> None:
+    """A bottle that lies and a cup, far away: neither half is much smaller than the other."""
+    assert overlap_in_shelf(seed, label) > 0.8
+
+
+@pytest.mark.parametrize("label", [25, 28])
+def test_small_plate_on_a_small_box_is_no_half_of_it(label: int) -> None:
+    """They meet along much of their outlines; but the box stands, and the plate does not."""
+    assert overlap_in_shelf(53, label) > 0.7

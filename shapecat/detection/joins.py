@@ -54,6 +54,8 @@ HANGS, ALONG = 0.4, 0.15
 pieces; least share of its boundary along what it hangs on."""
 SCRAP, TURNED = 100, 1.3
 """Cells of a scrap, and `slope_of` below which it is no small ball or can."""
+FRAGMENT, BEARS = 160, 0.2
+"""Cells of a fragment; share of the boundary of what bears something along the plane."""
 NECK_WIDTH, NECK_LEDGE = 0.7, 0.1
 """A neck on what faces up along more than this share of its border is narrower, by the width of the
 body."""
@@ -184,6 +186,7 @@ def _join_floating(pieces: Pieces) -> None:
             q = np.argmax(contact)
             if np.sum(contact) >= FEW and (
                 _is_scrap(pieces, p, q)
+                or _is_fragment(pieces, p, q)
                 or (
                     _floats(pieces, p, q)
                     and (_is_part(pieces, p, q) or _is_upper_half(pieces, p, q))
@@ -209,6 +212,26 @@ def _is_scrap(pieces: Pieces, p: int, q: int) -> bool:
     """
     row = pieces.shape[p]
     return bool(row[COUNT] < SCRAP and slope_of(row) < TURNED and _is_smaller(pieces, p, q))
+
+
+@kernel(leaf=True)
+def _is_fragment(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether so little is seen of two pieces that both are of one object.
+
+    Of two objects one stands on the other, and that on the plane, or they touch at one place.
+    """
+    a, b = pieces.shape[p], pieces.shape[q]
+    if a[COUNT] >= FRAGMENT or a[COUNT] < PART * b[COUNT]:
+        return False
+    if slope_of(a) > TURNED or rests_on(pieces, p, q) or rests_on(pieces, q, p):
+        return False
+    on, under = pieces.single[p, TABLE], pieces.single[q, TABLE]
+    if on > 0 and pieces.pairs[CONTACT, p, q] < ALONG * pieces.boundary[p]:
+        return False
+    return not (
+        (on <= 2 and under > BEARS * pieces.boundary[q])
+        or (under <= 2 and on > BEARS * pieces.boundary[p])
+    )
 
 
 @kernel(leaf=True)
