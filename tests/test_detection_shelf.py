@@ -135,3 +135,9 @@ def test_halves_of_a_small_thing_are_no_objects(seed: int, label: int) -> None:
 def test_small_plate_on_a_small_box_is_no_half_of_it(label: int) -> None:
     """They meet along much of their outlines; but the box stands, and the plate does not."""
     assert overlap_in_shelf(53, label) > 0.7
+
+
+@pytest.mark.parametrize(("seed", "label"), [(280, 25), (290, 22)])
+def test_near_and_far_side_of_a_plate_are_one(seed: int, label: int) -> None:
+    """They hardly touch, and the floor is so near to the rim that it seems to be a lid."""
+    assert overlap_in_shelf(seed, label) > 0.8

@@ -36,10 +36,10 @@ how far it is before the middle of the rest, by the width of that."""
 FAR_LONG, FAR_APART, FAR_BEHIND, FAR_FLAT = 0.6, 0.12, 0.35, 0.25
 """A far rim: length and offset of its middle by the width of what is before it; share of its
 boundary behind that; height over length."""
-DISH_M, SAME_LEVEL_M = 0.05, 0.007
-"""Height of a dish, and how far the parts of its rim may differ."""
 BORNE_M = 0.07
 """Lower plates are borne by nothing but their own foot."""
+DISH_M, SAME_LEVEL_M, ROUND = 0.1, 0.007, 1.0
+"""Height of a dish; how far the tops of its parts differ; `slope_of` of a ball or can beside it."""
 UNDER, COVERED, COVERING = 0.35, 0.15, 0.2
 """What is under a rim: cells as a share of those above, share of its boundary behind the rim, and
 how much of the above it may hide in turn, as a share of that."""
@@ -164,7 +164,7 @@ def join_overhangs(pieces: Pieces) -> None:
             if near != whole and (
                 _is_under(pieces, near, whole)
                 or _is_strip(pieces, near, whole)
-                or _is_dish_rim(pieces, near, whole)
+                or _is_wall(pieces, near, whole)
             ):
                 merge(pieces, whole, near)
                 break
@@ -218,19 +218,17 @@ def _is_strip(pieces: Pieces, strip: int, whole: int) -> bool:
 
 
 @kernel(leaf=True)
-def _is_dish_rim(pieces: Pieces, rim: int, whole: int) -> bool:
-    """Whether a piece is a stretch of the rim of a dish, which meets the floor in a concave edge.
+def _is_wall(pieces: Pieces, wall: int, whole: int) -> bool:
+    """Whether two low pieces that touch end at one height, one is hollow and neither is round.
 
-    Low objects side by side show the concave edge only where their tops differ.
+    So do the parts of a dish. Its floor is so near to its top that it seems to have a lid.
     """
-    if not (is_group(pieces, rim) and is_group(pieces, whole)):
+    if not (is_group(pieces, wall) and is_group(pieces, whole)):
         return False
-    a, r = pieces.shape[whole], pieces.shape[rim]
-    if pieces.owner[whole] != pieces.owner[rim] or r[COUNT] > UNDER * a[COUNT]:
+    a, x = pieces.shape[whole], pieces.shape[wall]
+    if pieces.owner[whole] != pieces.owner[wall] or x[COUNT] > a[COUNT]:
         return False
-    if max(a[TOP], r[TOP]) > DISH_M or abs(a[TOP] - r[TOP]) > SAME_LEVEL_M:
+    if pieces.pairs[CONTACT, wall, whole] == 0 or abs(a[TOP] - x[TOP]) > SAME_LEVEL_M:
         return False
-    slack = SAME_SIDE * (a[RIGHTMOST] - a[LEFT])
-    if r[LEFT] < a[LEFT] - slack or r[RIGHTMOST] > a[RIGHTMOST] + slack:
-        return False
-    return bool(pieces.pairs[CONTACT, rim, whole] >= BEFORE * pieces.boundary[rim])
+    first, second = slope_of(a), slope_of(x)
+    return bool(a[TOP] < DISH_M and min(first, second) < BENT and max(first, second) < ROUND)
