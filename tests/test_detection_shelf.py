@@ -141,3 +141,8 @@ def test_small_plate_on_a_small_box_is_no_half_of_it(label: int) -> None:
 def test_near_and_far_side_of_a_plate_are_one(seed: int, label: int) -> None:
     """They hardly touch, and the floor is so near to the rim that it seems to be a lid."""
     assert overlap_in_shelf(seed, label) > 0.8
+
+
+def test_bottle_with_a_level_shoulder_is_no_can_under_its_neck() -> None:
+    """Much of a flat shoulder faces up; but things hardly ever stand axis on axis."""
+    assert overlap_in_shelf(346, 21) > 0.95

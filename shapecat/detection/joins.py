@@ -65,7 +65,9 @@ the body; its height, by that of the body; how far it may begin below the top of
 """
 BULGING, ROUND = 0.8, 0.9
 """`slope_of` and `roundness_of` from which a body is round; what shows a level top is less."""
-
+ON_AXIS, SHOULDER = 0.08, 0.4
+"""How far the middle of a neck is off that of a body whose shoulder is level, by the width of the
+body; how much of that faces up near its top, by its width squared: the top of a can is more."""
 WAIST, COAXIAL = (0.95, 1.3), 0.035
 """Width of a round body by that of what it is turned in one piece with below, and the offset of
 their middles by its width."""
@@ -145,7 +147,10 @@ def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
         return False
     if a[TOP] - a[BOTTOM] > NECK_TALL * (b[TOP] - b[BOTTOM]):
         return False
-    return bool(slope_of(b) > BULGING and roundness_of(b) > ROUND and not has_lid(pieces, q))
+    if slope_of(b) < BULGING or roundness_of(b) < ROUND:
+        return False
+    shoulder = apart < ON_AXIS * wide and lid_share(pieces, q, LID_M) < SHOULDER
+    return bool(shoulder or not has_lid(pieces, q))
 
 
 @kernel(leaf=True)
