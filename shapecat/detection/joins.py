@@ -68,6 +68,8 @@ BULGING, ROUND = 0.8, 0.9
 ON_AXIS, SHOULDER = 0.08, 0.4
 """How far the middle of a neck is off that of a body whose shoulder is level, by the width of the
 body; how much of that faces up near its top, by its width squared: the top of a can is more."""
+SEAM = 0.36
+"""Share of the outlines of a lid and of what is below it along their border."""
 WAIST, COAXIAL = (0.95, 1.3), 0.035
 """Width of a round body by that of what it is turned in one piece with below, and the offset of
 their middles by its width."""
@@ -124,7 +126,7 @@ def _join_necks(pieces: Pieces) -> None:
                 p != q
                 and is_group(pieces, p)
                 and is_group(pieces, q)
-                and (_is_neck(pieces, p, q) or _has_foot(pieces, p, q))
+                and (_is_neck(pieces, p, q) or _has_foot(pieces, p, q) or _is_lid(pieces, p, q))
             ):
                 merge(pieces, q, p)
                 break
@@ -175,6 +177,20 @@ def _has_foot(pieces: Pieces, p: int, q: int) -> bool:
     if slope_of(a) > BULGING and WAIST[0] * foot < width < WAIST[1] * foot:
         return bool(apart < COAXIAL * width)
     return bool(b[TOP] < FOOT_M and FOOT * width < foot < width and apart < FOOT_APART * width)
+
+
+@kernel(leaf=True)
+def _is_lid(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether the border of two pieces is a seam: much of both outlines, and no top shows there.
+
+    So flat things whose sides are so nearly flush all around hardly ever lie on each other.
+    """
+    seam = pieces.pairs[CONTACT, p, q]
+    return bool(
+        seam > SEAM * max(pieces.boundary[p], pieces.boundary[q])
+        and pieces.shape[p, TOP] > pieces.shape[q, TOP]
+        and pieces.pairs[ONTO, p, q] < ON_TOP * seam
+    )
 
 
 @kernel
