@@ -40,7 +40,7 @@ class DetectionSettings:
     min_points: int = 60
     """Candidates with fewer points at full resolution are dropped."""
     rules: str = (
-        "low concave ledge axis small occluder hollow rim overhang neck float ring feet fill"
+        "low concave ledge axis small hollow rim occluder overhang neck float ring feet fill"
     )
     """Rules beyond the thesis that separate and join objects, by name; any may be left out."""
 

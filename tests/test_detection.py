@@ -234,6 +234,50 @@ def test_parts_behind_an_occluder_are_joined() -> None:
     assert sorted(c.occluded for c in scene.candidates) == [False, True]
 
 
+def pot(x: float, y: float, radius: float, height: float, floor: float) -> Shape:
+    """Return an upright cylinder open above, with a level floor."""
+
+    def hit(origin: Array, rays: Array) -> Array:
+        o = origin - np.array([x, y, 0])
+        a, b = (rays[..., :2] ** 2).sum(-1), 2 * rays[..., :2] @ o[:2]
+        root = b * b - 4 * a * (o[:2] @ o[:2] - radius**2)
+        best = np.full(a.shape, np.inf)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            for sign in (-1, 1):
+                t = (-b + sign * np.sqrt(root)) / (2 * a)
+                h = o[2] + t * rays[..., 2]
+                best = np.where(
+                    (root > 0) & (t > 0) & (h > floor) & (h < height), np.minimum(t, best), best
+                )
+            u = (floor - o[2]) / rays[..., 2]
+            p = o[:2] + u[..., None] * rays[..., :2]
+        return np.where((u > 0) & ((p**2).sum(-1) < radius**2), np.minimum(best, u), best)
+
+    return hit
+
+
+@pytest.mark.parametrize(
+    ("tilt_deg", "radius", "height", "floor"),
+    [
+        (50, 0.12, 0.08, 0.006),
+        (60, 0.08, 0.08, 0.006),
+        (40, 0.12, 0.08, 0.015),
+        (60, 0.12, 0.08, 0.015),
+        (60, 0.12, 0.15, 0.015),
+    ],
+)
+def test_a_pot_is_one_object(tilt_deg: float, radius: float, height: float, floor: float) -> None:
+    """The near and the far half of its wall touch nowhere, and its floor may be a low object."""
+    check([table(1, 1), pot(0, -0.1, radius, height, floor)], [1], tilt_deg=tilt_deg)
+
+
+@pytest.mark.parametrize(("tilt_deg", "x", "y"), [(50, -0.12, 0.15), (60, 0.05, 0.15)])
+def test_the_floor_of_a_pot_does_not_go_on_behind_it(tilt_deg: float, x: float, y: float) -> None:
+    """A plate behind a pot may lie as high as its floor; the wall of the pot hides both."""
+    shapes = [table(1, 1), pot(0, -0.1, 0.12, 0.08, 0.015), can(x, y, 0, 0.09, 0.012)]
+    check(shapes, [1, 2], tilt_deg=tilt_deg)
+
+
 def test_two_boxes_behind_an_occluder_stay_two() -> None:
     """Parts that do not continue each other are not joined across an occluder."""
     check([table(), box((-0.12, 0.08, 0), (0.14, 0.06, 0.12), 0.6),

@@ -25,6 +25,9 @@ __all__ = ["join_hollow", "join_overhangs", "join_rims"]
 SAME_TOP_M = 0.01
 SAME_SIDE_M, SAME_SIDE = 0.012, 0.4
 """How far an inside may reach beyond what is seen of the outside: metres, share of the width."""
+ARC, ARC_APART, ARC_WIDTH, ARC_BEHIND = 1.0, 0.12, 0.75, (0.15, 1.0)
+"""The near and the far half of a wall: `slope_of` either, the offset of their middles, the narrower
+one, and how far the second is behind the first, by the width of the wider one."""
 HOLLOW = -0.25
 """`slope_of` from which a piece is concave; planes are within a tenth of 0."""
 BENT, INSIDE, INSIDE_SHARE = -0.15, -0.4, 0.12
@@ -103,7 +106,11 @@ def _is_floor(pieces: Pieces, p: int, q: int) -> bool:
 
 @kernel
 def join_rims(pieces: Pieces) -> None:
-    """Join the far inside wall of a container to its outside."""
+    """Join the far inside wall of a container to its outside, and then the floor to both.
+
+    Of a wide container with upright walls these touch nowhere; but then nothing else has the near
+    half of the same circle.
+    """
     n = pieces.group.size
     again = True
     while again:
@@ -113,6 +120,41 @@ def join_rims(pieces: Pieces) -> None:
                 if inside != outside and _is_container(pieces, inside, outside):
                     merge(pieces, outside, inside)
                     again = True
+    for inside in range(1, n):
+        for outside in range(1, n):
+            if inside != outside and _are_halves(pieces, inside, outside):
+                merge(pieces, outside, inside)
+    for whole in range(1, n):
+        for floor in range(1, n):
+            if (
+                whole != floor
+                and is_group(pieces, whole)
+                and is_group(pieces, floor)
+                and pieces.owner[whole] == pieces.owner[floor]
+                and _is_floor(pieces, whole, floor)
+            ):
+                merge(pieces, whole, floor)
+
+
+@kernel(leaf=True)
+def _are_halves(pieces: Pieces, inside: int, outside: int) -> bool:
+    """Whether two pieces are the far and the near half of one round wall."""
+    if not (is_group(pieces, inside) and is_group(pieces, outside)):
+        return False
+    a, x = pieces.shape[outside], pieces.shape[inside]
+    if pieces.owner[outside] != pieces.owner[inside] or abs(a[TOP] - x[TOP]) > SAME_TOP_M:
+        return False
+    if slope_of(a) < ARC or slope_of(x) > -ARC:
+        return False
+    near, far = a[RIGHTMOST] - a[LEFT], x[RIGHTMOST] - x[LEFT]
+    apart = abs(a[LEFT] + a[RIGHTMOST] - x[LEFT] - x[RIGHTMOST]) / 2
+    wide = max(near, far)
+    if min(near, far) < ARC_WIDTH * wide or apart > ARC_APART * wide:
+        return False
+    behind = x[FAR] / x[COUNT] - a[FAR] / a[COUNT]
+    if not ARC_BEHIND[0] * wide < behind < ARC_BEHIND[1] * wide:
+        return False
+    return not (has_lid(pieces, outside) or has_lid(pieces, inside))
 
 
 @kernel(leaf=True)

@@ -84,12 +84,12 @@ def join_pieces(
     """Apply the rules named in ``rules``, in their order; `Pieces.group` holds the result."""
     if "small" in rules:
         _join_small(pieces, cells.small(depths_of(pieces)))
-    if "occluder" in rules:
-        join_behind(pieces, cells.w, cells.lens, surfaces.normal, labels)
     if "hollow" in rules:
         join_hollow(pieces)
     if "rim" in rules:
         join_rims(pieces)
+    if "occluder" in rules:
+        join_behind(pieces, cells.w, cells.lens, surfaces.normal, labels)
     if "overhang" in rules:
         join_overhangs(pieces)
     if "neck" in rules:
