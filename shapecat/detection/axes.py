@@ -133,7 +133,7 @@ def _add(
     left[:], right[:] = np.inf, -np.inf
     tangent, normal = surfaces.tangent, surfaces.normal
     for i in range(labels.shape[0]):
-        for j in range(labels.shape[1]):
+        for j in range(surfaces.spans[i, 0], surfaces.spans[i, 1]):
             p = labels[i, j]
             if not (rounded[p] and tangent[i, 0, j] > 0):
                 continue

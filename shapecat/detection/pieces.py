@@ -154,7 +154,8 @@ def _meet(
 ) -> None:
     rows, columns = w.shape
     for i in range(rows):
-        _find_changes(links[i], labels[i], labels[min(i + 1, rows - 1)], change)
+        if not _find_changes(links[i], labels[i], labels[min(i + 1, rows - 1)], change):
+            continue
         for j in range(columns):
             p = labels[i, j]
             if change[j] == 0 or w[i, j] <= 0 or (p == 0 and owner[i, j] > 0):
@@ -214,12 +215,19 @@ def _meet(
 
 
 @kernel(leaf=True)
-def _find_changes(links: U1, here: I4, below: I4, change: U1) -> None:
-    """Mark the cells of a row from which a piece does not just go on to the right and down."""
+def _find_changes(links: U1, here: I4, below: I4, change: U1) -> bool:
+    """Mark the cells of a row from which a piece does not just go on to the right and down.
+
+    Returns whether there are any.
+    """
     for j in range(here.size):
         change[j] = (here[j] != below[j]) | ((here[j] > 0) & (links[j] != RIGHT | DOWN))
     for j in range(here.size - 1):
         change[j] |= here[j] != here[j + 1]
+    some = False
+    for j in range(here.size):
+        some |= change[j] != 0
+    return some
 
 
 @kernel(leaf=True)
@@ -257,7 +265,6 @@ def _measure(
     side: F8,
     pieces: Pieces,
 ) -> None:
-    rows, columns = w.shape
     shape, owners, lid = pieces.shape, pieces.owner, pieces.lid
     owner, height = heights.owner, heights.height
     shape[:, LEFT] = 1e9
@@ -265,50 +272,65 @@ def _measure(
     shape[:, TOP] = -1e9
     shape[:, BOTTOM] = 1e9
     per_x, per_y = 1 / lens.fx, 1 / lens.fy
-    tangent, normal = surfaces.tangent, surfaces.normal
-    for i in range(rows):
-        for j in range(columns):
-            p = labels[i, j]
+    tangent, normal, spans = surfaces.tangent, surfaces.normal, surfaces.spans
+    for i in range(w.shape[0]):
+        j, end = spans[i]
+        while j < end:
+            p, first = labels[i, j], j
             if p == 0:
+                j += 1
                 continue
-            z = 1 / w[i, j]
-            x, y = (j - lens.cx) * per_x * z, (i - lens.cy) * per_y * z
-            along = x * side[0] + y * side[1] + z * side[2]
-            owners[p] = owner[i, j]
-            shape[p, COUNT] += 1
-            shape[p, FAR] += z
-            shape[p, LEFT] = min(shape[p, LEFT], along)
-            shape[p, RIGHTMOST] = max(shape[p, RIGHTMOST], along)
-            h = height[i, j]
-            shape[p, TOP] = max(shape[p, TOP], h)
-            shape[p, BOTTOM] = min(shape[p, BOTTOM], h)
-            if not tangent[i, 0, j] > 0:
-                continue
-            nx, ny, nz = normal[i, 0, j], normal[i, 1, j], normal[i, 2, j]
-            turn = nx * side[0] + ny * side[1] + nz * side[2]
-            shape[p, FITTED] += 1
-            shape[p, SIDE] += along
-            shape[p, SIDE2] += along * along
-            shape[p, TURN] += turn
-            shape[p, TURN2] += turn * turn
-            shape[p, SIDETURN] += along * turn
-            facing = -(nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
-            area = z * z * per_x * per_y / max(facing, 0.2)
-            shape[p, AREA] += area
-            if nx * up[0] + ny * up[1] + nz * up[2] > UPWARD:
-                band = min(max(int(h / BAND_M), 0), BANDS - 1)
-                lid[p, band] += area
+            # Sums over the cells of one piece that follow each other.
+            far = fitted = sides = sides2 = turns = turns2 = both = areas = 0.0
+            left, right, bottom, top = np.inf, -np.inf, np.inf, -np.inf
+            while j < end and labels[i, j] == p:
+                z = 1 / w[i, j]
+                x, y = (j - lens.cx) * per_x * z, (i - lens.cy) * per_y * z
+                along = x * side[0] + y * side[1] + z * side[2]
+                h = height[i, j]
+                far += z
+                left, right = min(left, along), max(right, along)
+                bottom, top = min(bottom, h), max(top, h)
+                if tangent[i, 0, j] > 0:
+                    nx, ny, nz = normal[i, 0, j], normal[i, 1, j], normal[i, 2, j]
+                    turn = nx * side[0] + ny * side[1] + nz * side[2]
+                    fitted += 1
+                    sides += along
+                    sides2 += along * along
+                    turns += turn
+                    turns2 += turn * turn
+                    both += along * turn
+                    facing = -(nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
+                    area = z * z * per_x * per_y / max(facing, 0.2)
+                    areas += area
+                    if nx * up[0] + ny * up[1] + nz * up[2] > UPWARD:
+                        band = min(max(int(h / BAND_M), 0), BANDS - 1)
+                        lid[p, band] += area
+                j += 1
+            owners[p] = owner[i, first]
+            row = shape[p]
+            row[COUNT] += j - first
+            row[FAR] += far
+            row[LEFT], row[RIGHTMOST] = min(row[LEFT], left), max(row[RIGHTMOST], right)
+            row[TOP], row[BOTTOM] = max(row[TOP], top), min(row[BOTTOM], bottom)
+            row[FITTED] += fitted
+            row[SIDE] += sides
+            row[SIDE2] += sides2
+            row[TURN] += turns
+            row[TURN2] += turns2
+            row[SIDETURN] += both
+            row[AREA] += areas
 
 
 @kernel
 def _choose_samples(surfaces: Surfaces, labels: I4, pieces: Pieces) -> None:
     """Choose evenly spaced cells of each piece away from edges."""
     rows, columns = labels.shape
-    tangent, edge, samples = surfaces.tangent, surfaces.edge, pieces.samples
+    spans, tangent, edge, samples = surfaces.spans, surfaces.tangent, surfaces.edge, pieces.samples
     stride = np.maximum(pieces.shape[:, COUNT].astype(np.int32) // SAMPLES, 1)
     wait, taken = stride.copy(), np.zeros_like(stride)
     for i in range(rows):
-        for j in range(columns):
+        for j in range(spans[i, 0], spans[i, 1]):
             p = labels[i, j]
             if p == 0 or edge[i, j] > 20 or not tangent[i, 0, j] > 0:
                 continue
@@ -355,7 +377,8 @@ def merge(pieces: Pieces, p: int, q: int) -> None:
 def depths_of(pieces: Pieces) -> F4:
     """Return the mean depth of each piece, metres; 1 where it has no cell."""
     shape = pieces.shape
-    return np.asarray(np.where(shape[:, COUNT] > 0, shape[:, FAR] / shape[:, COUNT].clip(1), 1))
+    far, count = shape[:, FAR], shape[:, COUNT]
+    return np.asarray(np.divide(far, count, out=np.ones_like(far), where=count > 0))
 
 
 @kernel(leaf=True)

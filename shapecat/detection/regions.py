@@ -26,27 +26,28 @@ def regions_of(heights: Heights, surfaces: Surfaces, *, concave: bool = True) ->
     """
     labels = np.zeros(heights.owner.shape, np.int16)
     strong = EDGE_DEG if concave else NO_EDGE_DEG
-    return labels, _find(heights.owner, surfaces.links, surfaces.edge, strong, labels)
+    return labels, _find(heights.owner, surfaces, strong, labels)
 
 
 @kernel
-def _find(owner: I4, links: U1, edge: U1, strong: int, labels: I4) -> int:
+def _find(owner: I4, surfaces: Surfaces, strong: int, labels: I4) -> int:
+    links, edge, spans = surfaces.links, surfaces.edge, surfaces.spans
     barrier = np.zeros(labels.shape, np.uint8)
-    _creases(edge, strong, barrier)
-    n = _flat_parts(owner, links, barrier, labels, 0)
-    _flood(links, edge, labels)
+    _creases(edge, spans, strong, barrier)
+    n = _flat_parts(owner, spans, links, barrier, labels, 0)
+    _flood(links, edge, spans, labels)
     barrier[:] = 0
-    return int(_flat_parts(owner, links, barrier, labels, n))
+    return int(_flat_parts(owner, spans, links, barrier, labels, n))
 
 
 @kernel
-def _creases(edge: U1, strong: int, barrier: U1) -> None:
+def _creases(edge: U1, spans: I4, strong: int, barrier: U1) -> None:
     """Mark strong concave edges, and weaker ones that continue them (hysteresis, Canny 1986)."""
     rows, columns = edge.shape
     stack = np.zeros(edge.size, np.int32)
     top = 0
     for i in range(rows):
-        for j in range(columns):
+        for j in range(spans[i, 0], spans[i, 1]):
             if edge[i, j] >= strong:
                 barrier[i, j] = 1
                 stack[top] = i * columns + j
@@ -83,18 +84,21 @@ def _is_ridge(edge: U1, i: int, j: int) -> bool:
 
 
 @kernel
-def _flat_parts(owner: I4, links: U1, barrier: U1, labels: I4, n: int) -> int:
+def _flat_parts(owner: I4, spans: I4, links: U1, barrier: U1, labels: I4, n: int) -> int:
     """Label linked unlabelled cells that are no barrier, from ``n`` + 1 on; return the last label.
 
     Two passes with a table of equivalent labels (Rosenfeld and Pfaltz 1966). Small parts get none.
     """
-    rows, columns = owner.shape
+    rows = owner.shape[0]
     part = np.zeros(labels.shape, np.int32)
-    parent, size = np.zeros((2, owner.size // 2 + 2), np.int32)
+    room = rows + 2  # a row has at most one first label in two cells
+    for i in range(rows):
+        room += (spans[i, 1] - spans[i, 0]) // 2
+    parent, size = np.zeros((2, room), np.int32)
     count = 0
     # (1) first labels, and which of them meet
     for i in range(rows):
-        for j in range(columns):
+        for j in range(spans[i, 0], spans[i, 1]):
             if owner[i, j] <= 0 or labels[i, j] > 0 or barrier[i, j]:
                 continue
             me = part[i, j - 1] if j > 0 and links[i, j - 1] & RIGHT else 0
@@ -120,7 +124,7 @@ def _flat_parts(owner: I4, links: U1, barrier: U1, labels: I4, n: int) -> int:
             n += 1
             name[k] = n
     for i in range(rows):
-        for j in range(columns):
+        for j in range(spans[i, 0], spans[i, 1]):
             if part[i, j] > 0:
                 labels[i, j] = name[part[i, j]]
     return n
@@ -149,26 +153,27 @@ def _neighbour(p: int, d: int, columns: int, links: U1) -> int:
 
 
 @kernel
-def _flood(links: U1, edge: U1, labels: I4) -> None:
+def _flood(links: U1, edge: U1, spans: I4, labels: I4) -> None:
     """Grow the labels over links, cells with small concave angles first."""
     columns = labels.shape[1]
     flat_links, flat_edge, flat = links.reshape(-1), edge.reshape(-1), labels.reshape(-1)
     buckets = 256 // BUCKET_DEG
     head = np.full(buckets, -1, np.int32)
     tail = np.full(buckets, -1, np.int32)
-    following = np.full(flat.size, -1, np.int32)
-    for p in range(flat.size):
-        if flat[p] <= 0:
-            continue
-        for d in range(4):
-            q = _neighbour(p, d, columns, flat_links)
-            if q >= 0 and flat[q] <= 0:
-                if head[0] < 0:
-                    head[0] = p
-                else:
-                    following[tail[0]] = p
-                tail[0] = p
-                break
+    following = np.zeros(flat.size, np.int32)
+    for i in range(labels.shape[0]):
+        for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
+            if flat[p] <= 0:
+                continue
+            for d in range(4):
+                q = _neighbour(p, d, columns, flat_links)
+                if q >= 0 and flat[q] <= 0:
+                    if head[0] < 0:
+                        head[0] = p
+                    else:
+                        following[tail[0]] = p
+                    tail[0], following[p] = p, -1
+                    break
     now = 0
     while now < buckets:
         p = head[now]
@@ -176,7 +181,6 @@ def _flood(links: U1, edge: U1, labels: I4) -> None:
             now += 1
             continue
         head[now] = following[p]
-        following[p] = -1
         for d in range(4):
             q = _neighbour(p, d, columns, flat_links)
             if q < 0 or flat[q] > 0:
@@ -187,7 +191,7 @@ def _flood(links: U1, edge: U1, labels: I4) -> None:
                 head[level] = q
             else:
                 following[tail[level]] = q
-            tail[level] = q
+            tail[level], following[q] = q, -1
 
 
 @kernel

@@ -8,7 +8,7 @@ import numpy as np
 from shapecat.arrays import F4, I4, U1
 from shapecat.detection.cells import JUMP, Cells, Lens
 from shapecat.detection.heights import Heights
-from shapecat.detection.tangents import fit_tangents
+from shapecat.detection.tangents import fit_tangents, padded
 from shapecat.jit import kernel
 
 __all__ = ["DOWN", "RIGHT", "Surfaces", "surfaces_of"]
@@ -34,12 +34,15 @@ class Surfaces(NamedTuple):
     normal : (rows, 3, columns) float32 unit normal towards the camera, sensor frame, or 0.
     links : (rows, columns) uint8: `RIGHT` and `DOWN` where the surface goes on to that neighbour.
     edge : (rows, columns) uint8: the largest concave angle across the cell, degrees.
+    spans : (rows, 2) int32: columns of the first object cell of each row and after the last; 0, 0
+        where a row has none.
     """
 
     tangent: F4
     normal: F4
     links: U1
     edge: U1
+    spans: I4
 
 
 def surfaces_of(cells: Cells, heights: Heights) -> Surfaces:
@@ -47,42 +50,94 @@ def surfaces_of(cells: Cells, heights: Heights) -> Surfaces:
     shape = cells.w.shape
     tangent, normal = np.zeros((2, shape[0], 3, shape[1]), np.float32)
     links, edge = np.zeros((2, *shape), np.uint8)
-    surfaces = Surfaces(tangent, normal, links, edge)
+    surfaces = Surfaces(tangent, normal, links, edge, np.zeros((shape[0], 2), np.int32))
     _survey(cells.w, cells.lens, heights.owner, surfaces)
     return surfaces
 
 
 @kernel
 def _survey(w: F4, lens: Lens, owner: I4, surfaces: Surfaces) -> None:
-    fit_tangents(w, lens, owner, surfaces.tangent, surfaces.normal)
-    _link(w, owner, surfaces.tangent, surfaces.links)
-    _bend(w, lens, owner, surfaces)
+    spans = surfaces.spans
+    for i in range(owner.shape[0]):
+        spans[i, 0], spans[i, 1] = _span(owner[i])
+    fit_tangents(w, lens, owner, spans, surfaces.tangent, surfaces.normal)
+    _link(w, owner, spans, surfaces.tangent, surfaces.links)
+    _bend(w, lens, surfaces)
+
+
+@kernel(leaf=True)
+def _span(row: I4) -> tuple[int, int]:
+    """Return the columns of the first number above 0 of a row and after the last, or 0 and 0."""
+    some = False
+    for j in range(row.size):
+        some |= row[j] > 0  # many rows have none, and this vectorises
+    if not some:
+        return 0, 0
+    start, end = 0, row.size
+    while row[start] <= 0:
+        start += 1
+    while row[end - 1] <= 0:
+        end -= 1
+    return start, end
+
+
+@kernel(leaf=True)
+def _link(w: F4, owner: I4, spans: I4, tangent: F4, links: U1) -> None:
+    """Link neighbours that differ by less than a jump, or as either tangent plane tells."""
+    rows = w.shape[0]
+    for i in range(rows):
+        start, end = spans[i]
+        if start == end:
+            continue
+        here, there = slice(start, end - 1), slice(start + 1, end)
+        _link_some(
+            owner[i, here], owner[i, there], w[i, here], w[i, there], tangent[i, 0, here],
+            tangent[i, 0, there], tangent[i, 1, here], tangent[i, 1, there], RIGHT, links[i, here],
+        )  # fmt: skip
+        if i + 1 < rows:
+            here = slice(start, end)
+            _link_some(
+                owner[i, here], owner[i + 1, here], w[i, here], w[i + 1, here], tangent[i, 0, here],
+                tangent[i + 1, 0, here], tangent[i, 2, here], tangent[i + 1, 2, here], DOWN,
+                links[i, here],
+            )  # fmt: skip
+        _part_steps(w, owner, i, start, end, links[i])
+
+
+@kernel(leaf=True)
+def _part_steps(w: F4, owner: I4, i: int, start: int, end: int, links: U1) -> None:
+    """Take the links away that only a tangent plane tells, across a step."""
+    jump = np.float32(JUMP)
+    for j in range(start, end):
+        here = w[i, j]
+        if links[j] & RIGHT and abs(w[i, j + 1] - here) >= jump and _is_step(w, owner, i, j, 0, 1):
+            links[j] &= ~RIGHT
+        if links[j] & DOWN and abs(w[i + 1, j] - here) >= jump and _is_step(w, owner, i, j, 1, 0):
+            links[j] &= ~DOWN
 
 
 @kernel(fast=True, leaf=True)
-def _link(w: F4, owner: I4, tangent: F4, links: U1) -> None:
-    """Link neighbours that differ by less than a jump, or as either tangent plane tells."""
-    rows, columns = w.shape
-    jump = np.float32(JUMP)
-    for i in range(rows):
-        for j in range(columns):
-            me = owner[i, j]
-            if me <= 0:
-                continue
-            v, t, bits = w[i, j], tangent[i, 0, j], 0
-            if j + 1 < columns and owner[i, j + 1] == me:
-                v1, t1 = w[i, j + 1], tangent[i, 0, j + 1]
-                joined = (t > 0) & (abs(t + tangent[i, 1, j] - v1) < jump)
-                joined |= (t1 > 0) & (abs(t1 - tangent[i, 1, j + 1] - v) < jump)
-                if abs(v - v1) < jump or (joined and not _is_step(w, owner, i, j, 0, 1)):
-                    bits |= RIGHT
-            if i + 1 < rows and owner[i + 1, j] == me:
-                v1, t1 = w[i + 1, j], tangent[i + 1, 0, j]
-                joined = (t > 0) & (abs(t + tangent[i, 2, j] - v1) < jump)
-                joined |= (t1 > 0) & (abs(t1 - tangent[i + 1, 2, j] - v) < jump)
-                if abs(v - v1) < jump or (joined and not _is_step(w, owner, i, j, 1, 0)):
-                    bits |= DOWN
-            links[i, j] = bits
+def _link_some(
+    owner: I4,
+    owner1: I4,
+    w: F4,
+    w1: F4,
+    level: F4,
+    level1: F4,
+    slope: F4,
+    slope1: F4,
+    bit: int,
+    links: U1,
+) -> None:
+    """Link some cells of a row with their neighbours on one side."""
+    zero, jump = np.float32(0), np.float32(JUMP)
+    for k in range(links.size):
+        v, v1, t, t1 = w[k], w1[k], level[k], level1[k]
+        joined = abs(v - v1) < jump
+        joined |= (t > zero) & (abs(t + slope[k] - v1) < jump)
+        joined |= (t1 > zero) & (abs(t1 - slope1[k] - v) < jump)
+        joined &= (owner[k] > 0) & (owner[k] == owner1[k])
+        links[k] |= np.uint8(bit) if joined else np.uint8(0)
 
 
 @kernel(leaf=True)
@@ -106,34 +161,26 @@ def _is_step(w: F4, owner: I4, i: int, j: int, di: int, dj: int) -> bool:
 
 
 @kernel
-def _bend(w: F4, lens: Lens, owner: I4, surfaces: Surfaces) -> None:
+def _bend(w: F4, lens: Lens, surfaces: Surfaces) -> None:
     """Measure the largest concave angle between the surfaces on two sides of each cell."""
     rows, columns = w.shape
     tangent, normal, edge = surfaces.tangent, surfaces.normal, surfaces.edge
     room = np.zeros((3, columns), np.float32)
     gaps, chords, worst = room[0], room[1], room[2]  # unpacked they would not be contiguous
     for i in range(rows):
-        start, end = _span(owner[i])
-        worst[:] = LEAST_CHORD
+        start, end = surfaces.spans[i]
+        if start == end:
+            continue
+        worst[start:end] = LEAST_CHORD
         for d in range(4):
             r = BASE if d < 2 else BASE_DIAGONAL
             di = 0 if d == 0 else r
             dj = r if d == 0 else (0 if d == 1 else (r if d == 2 else -r))
             first, last = max(start, abs(dj)), min(end, columns - abs(dj))
+            last = min(padded(first, last), columns - abs(dj))
             if i - di >= 0 and i + di < rows and first < last:
                 _compare(w, lens, tangent, normal, i, first, last, di, dj, gaps, chords, worst)
         _write_angles(tangent[i, 0, start:end], worst[start:end], edge[i, start:end])
-
-
-@kernel(leaf=True)
-def _span(owner: I4) -> tuple[int, int]:
-    """Return the columns of the first object cell of a row and after the last."""
-    start, end = 0, owner.size
-    while start < end and owner[start] <= 0:
-        start += 1
-    while end > start and owner[end - 1] <= 0:
-        end -= 1
-    return start, end
 
 
 @kernel(fast=True, leaf=True)

@@ -13,7 +13,7 @@ from shapecat.arrays import F4, I4
 from shapecat.detection.cells import Lens
 from shapecat.jit import kernel
 
-__all__ = ["fit_tangents"]
+__all__ = ["fit_tangents", "padded"]
 
 WINDOW = 3
 """Half the edge of the window a tangent plane is fitted to, in cells."""
@@ -23,28 +23,35 @@ GATE, GATE_SLOPE = 0.008, 0.008
 LEAST_SAMPLES, LEAST_SPREAD = 5, 0.2
 RUN, BRIDGED = 128, 8
 """Most cells in a run, and gaps of other cells that are part of it."""
+LANES = 8
+"""Runs are fitted in multiples of this, for what remains is not vectorised."""
 PITCH = RUN + 2 * WINDOW
 """Width of a row of the buffers."""
 
 
 @kernel
-def fit_tangents(w: F4, lens: Lens, owner: I4, tangent: F4, normal: F4) -> None:
+def fit_tangents(w: F4, lens: Lens, owner: I4, spans: I4, tangent: F4, normal: F4) -> None:
     """Write the tangent planes and normals of the object cells, as in `Surfaces`.
 
-    A plane is fitted to a checkerboard of 25 cells of the same owner; weights are 0 or 1.
+    A plane is fitted to a checkerboard of 25 cells of the same owner; weights are 0 or 1. The
+    object cells of each row lie within ``spans``.
     """
     values = np.zeros(SIDE * PITCH, np.float32)
     owners = np.zeros(SIDE * PITCH, np.int8)
     fits = np.zeros(6 * PITCH, np.float32)
     for i in range(owner.shape[0]):
-        end = 0
-        while True:
-            start, end = _next_run(owner, i, end)
-            if start == end:
-                break
+        end, last = spans[i]
+        while end < last:
+            start, end = _next_run(owner[i], end, last)
             _copy_windows(w, owner, i, start, end, values, owners)
-            _fit_run(values, owners, lens, i, start, end - start, fits)
+            _fit_run(values, owners, lens, i, start, padded(start, end) - start, fits)
             _write(fits, tangent, normal, i, start, end)
+
+
+@kernel(inline=True, leaf=True)
+def padded(start: int, end: int) -> int:
+    """Return the end of the run from ``start`` on made a multiple of `LANES` long."""
+    return start + (end - start + LANES - 1) // LANES * LANES
 
 
 @kernel(leaf=True)
@@ -56,31 +63,35 @@ def _write(fits: F4, tangent: F4, normal: F4, i: int, start: int, end: int) -> N
 
 
 @kernel(leaf=True)
-def _next_run(owner: I4, i: int, j: int) -> tuple[int, int]:
-    """Return the columns from and before which the next object cells of a row lie."""
-    columns = owner.shape[1]
-    while j < columns and owner[i, j] <= 0:
+def _next_run(owner: I4, j: int, last: int) -> tuple[int, int]:
+    """Return the columns from and before which the next object cells of a row lie.
+
+    There are some before ``last``.
+    """
+    while owner[j] <= 0:
         j += 1
     start = end = j
-    while j < min(columns, start + RUN) and j < end + BRIDGED:
-        if owner[i, j] > 0:
-            end = j + 1
+    last = min(last, start + RUN)
+    while j < min(last, end + BRIDGED):
+        end = j + 1 if owner[j] > 0 else end
         j += 1
     return start, end
 
 
-@kernel
+@kernel(leaf=True)
 def _copy_windows(w: F4, owner: I4, i: int, start: int, end: int, values: F4, owners: I4) -> None:
     """Copy the rows around a run and `WINDOW` cells more at its ends; 0 beyond the image."""
     rows, columns = owner.shape
     left, right = max(start - WINDOW, 0), min(end + WINDOW, columns)
-    owners[:] = 0
     for d in range(SIDE):
-        y = i + d - WINDOW
+        y, first = i + d - WINDOW, d * PITCH
+        some = owners[first : first + end - start + 2 * WINDOW]
+        some[:] = 0
         if 0 <= y < rows:
-            first = d * PITCH + left - start + WINDOW
-            values[first : first + right - left] = w[y, left:right]
-            owners[first : first + right - left] = owner[y, left:right]
+            first += left - start + WINDOW
+            value, some = values[first : first + right - left], some[left - start + WINDOW :]
+            for k in range(value.size):
+                value[k], some[k] = w[y, left + k], owner[y, left + k]
 
 
 @kernel(fast=True, leaf=True)
