@@ -20,7 +20,9 @@ BEYOND = 5
 """So many times as much of an object may be seen outside as inside."""
 
 
-def reach_over(cells: Cells, heights: Heights, planes: F8, walls: U1, *, highest_m: float) -> None:
+def reach_over(
+    cells: Cells, heights: Heights, planes: F8, walls: U1, stacks: I4, *, highest_m: float
+) -> None:
     """Give the parts of objects outside the outline of their plane to it, in place.
 
     A part is what is connected to object cells inside, and not many times larger than what is
@@ -30,13 +32,16 @@ def reach_over(cells: Cells, heights: Heights, planes: F8, walls: U1, *, highest
     ----------
     planes : the rows of `table_of`.
     walls : from `clear_walls`; what is cleared stays so.
+    stacks : (2, cells) int32, room.
     """
-    stacks = np.zeros((2, heights.owner.size), np.int32)
     outside = np.zeros(heights.owner.shape, np.float32)
-    seen = np.zeros(heights.owner.shape, np.int32)
+    noted, seen = np.zeros((2, *heights.owner.shape), np.int32)
+    looks = 0
     for k, plane in reversed(list(enumerate(planes))):
-        outside[:] = np.nan
-        _reach(cells.w, cells.lens, heights, k + 1, plane, walls, highest_m, outside, seen, stacks)
+        looks = _reach(
+            cells.w, cells.lens, heights, k + 1, plane, walls, highest_m,
+            outside, noted, seen, looks, stacks,
+        )  # fmt: skip
 
 
 @kernel
@@ -49,27 +54,33 @@ def _reach(
     walls: U1,
     highest: float,
     outside: F4,
+    noted: I4,
     seen: I4,
+    looks: int,
     stacks: I4,
-) -> None:
-    """Add the parts outside one plane; heights above it are kept in ``outside`` once looked at."""
+) -> int:
+    """Add the parts outside one plane; return how many there were looked at, ``looks`` included.
+
+    Heights above the plane are kept in ``outside`` where ``noted`` has its number.
+    """
     rows, columns = w.shape
     owner = heights.owner
-    looks = np.max(seen)
+    border = np.zeros(columns, np.uint8)
     for i in range(rows):
+        _find_border(owner, me, i, border)
         for j in range(columns):
-            if owner[i, j] != me:
+            if border[j] == 0:
                 continue
             for d in range(4):
                 y = i + (1 if d == 0 else -1 if d == 1 else 0)
                 x = j + (1 if d == 2 else -1 if d == 3 else 0)
                 if not _leads_out(w, owner, me, i, j, y, x):
                     continue
-                if not _is_above(w, lens, plane, walls, highest, outside, y, x):
+                if not _is_above(w, lens, me, plane, walls, highest, outside, noted, y, x):
                     continue
                 looks += 1
                 n = _part_outside(
-                    w, lens, owner, me, plane, walls, highest, outside, y, x, stacks[0]
+                    w, lens, owner, me, plane, walls, highest, outside, noted, y, x, stacks[0]
                 )
                 enough = max(n // BEYOND, 1)
                 if _part_inside(w, owner, me, seen, looks, i, j, enough, stacks[1]) < enough:
@@ -78,6 +89,21 @@ def _reach(
                     v, u = stacks[0, t] // columns, stacks[0, t] % columns
                     owner[v, u] = me
                     heights.height[v, u] = outside[v, u]
+    return looks
+
+
+@kernel(leaf=True)
+def _find_border(owner: I4, me: int, i: int, border: U1) -> None:
+    """Mark the cells of a row above a plane that are beside cells of lower planes or of none."""
+    rows, columns = owner.shape
+    above, here, below = owner[max(i - 1, 0)], owner[i], owner[min(i + 1, rows - 1)]
+    for j in range(columns):
+        lower = ((above[j] >= 0) & (above[j] < me)) | ((below[j] >= 0) & (below[j] < me))
+        border[j] = lower & (here[j] == me)
+    for j in range(columns - 1):
+        border[j] |= (here[j] == me) & (here[j + 1] >= 0) & (here[j + 1] < me)
+    for j in range(columns - 1):
+        border[j + 1] |= (here[j + 1] == me) & (here[j] >= 0) & (here[j] < me)
 
 
 @kernel(leaf=True)
@@ -90,10 +116,19 @@ def _leads_out(w: F4, owner: I4, me: int, i: int, j: int, y: int, x: int) -> boo
 
 @kernel(leaf=True)
 def _is_above(
-    w: F4, lens: Lens, plane: F8, walls: U1, highest: float, outside: F4, i: int, j: int
+    w: F4,
+    lens: Lens,
+    me: int,
+    plane: F8,
+    walls: U1,
+    highest: float,
+    outside: F4,
+    noted: I4,
+    i: int,
+    j: int,
 ) -> bool:
     """Whether a cell is new and may belong to an object on a plane; notes its height if so."""
-    if w[i, j] <= 0 or walls[i, j] == CLEARED or outside[i, j] == outside[i, j]:
+    if w[i, j] <= 0 or walls[i, j] == CLEARED or noted[i, j] == me:
         return False
     z = 1 / w[i, j]
     h = (w[i, j] - (plane[0] * j + plane[1] * i + plane[2])) * z * plane[3]
@@ -102,7 +137,7 @@ def _is_above(
     x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
     if not inside(plane, x, y, z, REACH_M):
         return False
-    outside[i, j] = h
+    outside[i, j], noted[i, j] = h, me
     return True
 
 
@@ -116,6 +151,7 @@ def _part_outside(
     walls: U1,
     highest: float,
     outside: F4,
+    noted: I4,
     i: int,
     j: int,
     stack: I4,
@@ -132,7 +168,7 @@ def _part_outside(
             x = j + (1 if d == 2 else -1 if d == 3 else 0)
             if not _leads_out(w, owner, me, i, j, y, x):
                 continue
-            if _is_above(w, lens, plane, walls, highest, outside, y, x):
+            if _is_above(w, lens, me, plane, walls, highest, outside, noted, y, x):
                 stack[top] = y * columns + x
                 top += 1
     return top

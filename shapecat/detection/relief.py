@@ -57,21 +57,24 @@ FLOOR = 0.0006
 """Least mean height of what a rim encloses above the plane around it, 1/m."""
 
 
-def raise_low(cells: Cells, heights: Heights, planes: F8, raised: I4, *, largest_m: float) -> None:
+def raise_low(
+    cells: Cells, heights: Heights, planes: F8, raised: I4, stacks: I4, *, largest_m: float
+) -> None:
     """Give low objects the owners of objects, and swells those of the plane, in place.
 
     Parameters
     ----------
     raised : (rows, columns) set to 1, 2, ... on low objects.
+    stacks : (2, cells) int32, room.
     largest_m : wider things are swells or furniture.
     """
     objects = 0
-    stacks = np.zeros((2, cells.w.size), np.int32)
+    excess = np.zeros(cells.w.shape, np.float32)
     for k, plane in enumerate(planes):
-        excess = np.zeros(cells.w.shape, np.float32)
         if _excess(cells.w, heights.owner, heights.height, plane, k + 1, excess) >= LEAST_CELLS:
             step = max(STEP, SLIP * math.hypot(plane[0], plane[1]))
-            _cut_feet(cells.w, heights.owner, heights.height, k + 1, excess, stacks[0])
+            drop = stacks[1].view(np.float32)
+            _cut_feet(cells.w, heights.owner, heights.height, k + 1, excess, stacks[0], drop)
             widest = largest_m * cells.lens.fx
             objects = _raise(
                 cells.w, excess, heights.owner, k + 1, step, raised, widest, objects, stacks
@@ -88,17 +91,24 @@ def _excess(w: F4, owner: I4, height: F4, plane: F8, number: int, out: F4) -> in
     raw = np.zeros((3, columns), np.float32)
     mark = np.zeros((3, columns), np.float32)
     n = 0
+    some = False
+    out[0, :] = out[rows - 1, :] = zero
     for i in range(rows + 1):
-        now = i % 3
+        now, before, some = i % 3, some, False
         if i < rows:
             base = np.float32(plane[1] * i + plane[2])
             for j in range(columns):
                 mine = ((owner[i, j] == number) | (owner[i, j] == -number)) & (height[i, j] < low)
                 mark[now, j] = one if mine else zero
                 raw[now, j] = w[i, j] - (slope * np.float32(j) + base) if mine else zero
+                some |= mine
         if i < 2 or i == rows:
             continue
         middle = (i - 1) % 3
+        out[i - 1, 0] = out[i - 1, columns - 1] = zero
+        if not before:
+            out[i - 1, :] = zero
+            continue
         for j in range(1, columns - 1):
             total = count = zero
             for r in range(3):
@@ -111,14 +121,23 @@ def _excess(w: F4, owner: I4, height: F4, plane: F8, number: int, out: F4) -> in
 
 
 @kernel
-def _cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4, stack: I4) -> None:
+def _cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4, stack: I4, drop: F4) -> None:
     """Clear the excess of the feet of what is not low: steep cells below it, down to the plane."""
     rows, columns = excess.shape
-    drop = np.zeros(excess.size, np.float32)
     top = 0
+    high, edge = np.float32(LOW_M), np.zeros(columns, np.bool_)
     for i in range(1, rows - 1):
+        # Few cells are high and beside what is low, and this vectorises.
+        here, above, below = excess[i], excess[i - 1], excess[i + 1]
+        some = False
         for j in range(1, columns - 1):
-            if owner[i, j] == number and height[i, j] >= LOW_M:
+            beside = (above[j] != 0) | (below[j] != 0) | (here[j - 1] != 0) | (here[j + 1] != 0)
+            edge[j] = beside & (owner[i, j] == number) & (height[i, j] >= high)
+            some |= edge[j]
+        if not some:
+            continue
+        for j in range(1, columns - 1):
+            if edge[j]:
                 for d in range(4):
                     y = i + (1 if d == 0 else -1 if d == 1 else 0)
                     x = j + (1 if d == 2 else -1 if d == 3 else 0)
@@ -335,6 +354,11 @@ def _lower(
     above = np.zeros(excess.shape, np.float32)
     n = 0
     for i in range(rows):
+        some = False
+        for j in range(columns):
+            some |= (owner[i, j] == number) & (excess[i, j] != 0)
+        if not some:
+            continue
         for j in range(columns):
             low = (owner[i, j] == number) & (excess[i, j] != 0) & (raised[i, j] == 0)
             if low and _is_flat(excess, i, j):

@@ -118,10 +118,11 @@ def segment(
     planes = table_of(supports, cells.lens)
     heights = heights_of(cells, planes, highest_m=settings.max_height_m)
     raised = np.zeros(cells.w.shape, np.int16)
+    stacks = np.zeros((2, cells.w.size), np.int32)
     if "low" in rules:
-        raise_low(cells, heights, planes, raised, largest_m=settings.max_size_m)
+        raise_low(cells, heights, planes, raised, stacks, largest_m=settings.max_size_m)
     walls = clear_walls(cells, heights.owner, up, largest_m=settings.max_size_m, rng=rng)
-    reach_over(cells, heights, planes, walls, highest_m=settings.max_height_m)
+    reach_over(cells, heights, planes, walls, stacks, highest_m=settings.max_height_m)
     surfaces = surfaces_of(cells, heights)
     regions, n = regions_of(heights, surfaces, concave="concave" in rules)
     pieces = pieces_of(cells, heights, surfaces, regions, n, up)
@@ -154,5 +155,5 @@ def segment(
     filled = fill_enclosed(
         cells.w, heights.height, labels, leaders.size - 1, active="fill" in rules
     )
-    filled |= ((raised > 0) & (labels > 0)).astype(np.uint8)
+    filled |= np.minimum(raised, labels) > 0
     return Segmentation(up, supports, planes, labels, heights.height, filled, pieces, leaders)
