@@ -15,6 +15,7 @@ __all__ = [
     "flood_hole",
     "grow_feet",
     "is_raised",
+    "mark_open",
     "may_be_hole",
 ]
 
@@ -148,6 +149,21 @@ def flood_hole(
     return top, total
 
 
+@kernel(leaf=True)
+def mark_open(w: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1) -> None:
+    """Mark unlabelled cells from which others lead right and down to the border of the extent.
+
+    What leads left and up is found as the holes are looked for; the rest takes a flood.
+    """
+    i0, j0, i1, j1 = extent
+    for i in range(i1 - 1, i0 - 1, -1):
+        right = True
+        for j in range(j1 - 1, j0 - 1, -1):
+            right |= i == i1 - 1 or seen[i + 1, j] == OPEN
+            right &= labels[i, j] == 0 and w[i, j] > 0
+            seen[i, j] = OPEN if right else 0
+
+
 @kernel(inline=True, leaf=True)
 def may_be_hole(
     w: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1, i: int, j: int
@@ -187,6 +203,7 @@ def _fill(w: F4, height: F4, labels: I4, count: int, filled: U1) -> None:
     stack = np.zeros((STACK, 2), np.int16)
     sides, ahead, level = np.zeros((3, count + 1), np.int32)
     extent = extent_of(labels)
+    mark_open(w, labels, extent, seen)
     for si in range(extent[0], extent[2]):
         for sj in range(extent[1], extent[3]):
             if not may_be_hole(w, labels, extent, seen, si, sj):

@@ -3,7 +3,7 @@
 import numpy as np
 
 from shapecat.arrays import F4, I4, Bool
-from shapecat.detection.fill import STACK, extent_of, flood_hole, is_raised, may_be_hole
+from shapecat.detection.fill import STACK, extent_of, flood_hole, is_raised, mark_open, may_be_hole
 from shapecat.detection.pieces import COUNT, TOP, Pieces, merge
 from shapecat.jit import kernel
 
@@ -61,6 +61,7 @@ def join_rings(pieces: Pieces, w: F4, height: F4, labels: I4) -> None:
     stack = np.zeros((STACK, 2), np.int16)
     sides, ahead, level, shares = np.zeros((4, n), np.int32)
     extent = extent_of(labels)
+    mark_open(w, labels, extent, seen)
     for si in range(extent[0], extent[2]):
         for sj in range(extent[1], extent[3]):
             if not may_be_hole(w, labels, extent, seen, si, sj):
