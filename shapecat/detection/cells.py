@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, Bool
+from shapecat.arrays import F4, I4
 from shapecat.jit import kernel
 from shapecat.types import Camera
 
@@ -55,11 +55,16 @@ class Cells(NamedTuple):
 
     def small(self, depth_m: F4) -> F4:
         """Return the number of cells of `SMALL_M2` at each depth, within reason."""
-        return np.clip(SMALL_M2 * self.lens.fx**2 / depth_m**2, 20, 75)
+        return np.minimum(np.maximum(SMALL_M2 * self.lens.fx**2 / depth_m**2, 20), 75)
 
-    def last_in(self, range_m: float) -> Bool:
-        """Return (rows, columns) whether each reading is one of the last before ``range_m``."""
-        return (self.w > 0) & (self.w < 1 / range_m + JUMP / 2)
+    def count_last(self, labels: I4, size: int, *, range_m: float) -> I4:
+        """Return how many of the last readings before ``range_m`` the labels below ``size`` have.
+
+        Label 0 has none.
+        """
+        count = np.zeros(size, np.int64)
+        _count_far(self.w, np.float32(1 / range_m + JUMP / 2), labels, count)
+        return count
 
 
 def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_M) -> Cells | None:
@@ -102,6 +107,14 @@ def _sampled(depth: F4, step: int, range_m: float) -> F4:
             result[n] = depth[i, j]
             n += (depth[i, j] >= np.float32(NEAREST_M)) & (depth[i, j] <= range_m)
     return result[:n]
+
+
+@kernel(leaf=True)
+def _count_far(w: F4, most: float, labels: I4, count: I4) -> None:
+    for i in range(w.shape[0]):
+        for j in range(w.shape[1]):
+            if labels[i, j] > 0 and w[i, j] < most:
+                count[labels[i, j]] += 1
 
 
 @kernel

@@ -100,7 +100,7 @@ def cut_by_range(cells: Cells, regions: I4, pieces: Pieces, *, range_m: float) -
     What is left of a wall or a floor there has an outline that is not its own.
     """
     size = pieces.group.size
-    cut = np.bincount(pieces.group[regions[cells.last_in(range_m)]], minlength=size)
+    cut = np.bincount(pieces.group, cells.count_last(regions, size, range_m=range_m), size)
     return np.asarray(cut > CUT * pieces.shape[:, COUNT])
 
 

@@ -229,7 +229,7 @@ def _rises(planes: F8, k: int, u: float, v: float, z: float) -> bool:
     return bool(h > FRINGE * (LEAST_M + NOISE * z * z))
 
 
-@kernel
+@kernel(leaf=True)
 def _sort(marks: I4, next_place: I4, order: U4) -> None:
     for start in range(0, marks.size, BLOCK):
         block = marks[start : start + BLOCK]

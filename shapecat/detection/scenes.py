@@ -118,7 +118,7 @@ def _begin(lines: F4, reach: int) -> int:
 
 def _out_of_range(cells: Cells, found: Segmentation, range_m: float) -> Bool:
     """Return whether each object reaches the range, beyond which readings are left out."""
-    count = np.bincount(found.labels[cells.last_in(range_m)], minlength=found.leaders.size)
+    count = cells.count_last(found.labels, found.leaders.size, range_m=range_m)
     return np.asarray(count[1:] >= FEW)
 
 
