@@ -278,6 +278,45 @@ def test_the_floor_of_a_pot_does_not_go_on_behind_it(tilt_deg: float, x: float, 
     check(shapes, [1, 2], tilt_deg=tilt_deg)
 
 
+def union(*shapes: Shape) -> Shape:
+    """Return what shows one body of several shapes."""
+    return lambda origin, rays: np.min([shape(origin, rays) for shape in shapes], axis=0)
+
+
+def drawer(width: float, height: float, wall: float, floor: float, yaw: float) -> Shape:
+    """Return a square box open above about the origin, with thick upright walls."""
+    c, s, off = np.cos(yaw), np.sin(yaw), (width - wall) / 2
+    sides = [(off, 0.0, wall, width), (-off, 0.0, wall, width),
+             (0.0, off, width, wall), (0.0, -off, width, wall)]  # fmt: skip
+    walls = [box((c * x - s * y, s * x + c * y, 0), (a, b, height), yaw) for x, y, a, b in sides]
+    return union(box((0, 0, 0), (width, width, floor), yaw), *walls)
+
+
+@pytest.mark.parametrize(
+    ("tilt_deg", "distance", "floor", "yaw"),
+    [(25, 0.7, 0.006, 0.6), (60, 0.7, 0.006, 0.6), (60, 1.0, 0.008, 0)],
+)
+def test_a_drawer_is_one_object(tilt_deg: float, distance: float, floor: float, yaw: float) -> None:
+    """A floor a few millimetres high is ragged, and shadows hide a part of its outline."""
+    shapes = [table(1, 1), drawer(0.3, 0.08, 0.01, floor, yaw)]
+    check(shapes, [1], tilt_deg=tilt_deg, distance=distance)
+
+
+@pytest.mark.parametrize("tilt_deg", [25, 40, 60])
+@pytest.mark.parametrize("width", [0.03, 0.05])
+def test_a_spout_behind_its_pot_belongs_to_it(tilt_deg: float, width: float) -> None:
+    """What joins them is hidden, but the spout ends in the air, where nothing can stand."""
+    spout = box((0.07, 0.03, 0.04), (width, 0.02, 0.05))
+    check([table(1, 1), union(can(0, 0, 0, 0.065, 0.12), spout)], [1], tilt_deg=tilt_deg)
+
+
+@pytest.mark.parametrize("tilt_deg", [25, 40])
+def test_a_box_behind_a_pot_stays_one(tilt_deg: float) -> None:
+    """It shows as little, but ends behind the pot and not in the air."""
+    pair = [table(1, 1), can(0, 0, 0, 0.065, 0.12), box((0.06, 0.11, 0), (0.04, 0.04, 0.16))]
+    check(pair, [1, 2], tilt_deg=tilt_deg)
+
+
 def test_two_boxes_behind_an_occluder_stay_two() -> None:
     """Parts that do not continue each other are not joined across an occluder."""
     check([table(), box((-0.12, 0.08, 0), (0.14, 0.06, 0.12), 0.6),

@@ -1,5 +1,7 @@
 """Containers: the inside and the outside of bowls, cups and pots."""
 
+import numpy as np
+
 from shapecat.detection.pieces import (
     BOTTOM,
     CONTACT,
@@ -7,6 +9,7 @@ from shapecat.detection.pieces import (
     FAR,
     FEW,
     FRONT,
+    HIDDEN,
     LEFT,
     NEAR,
     RIGHTMOST,
@@ -33,6 +36,8 @@ HOLLOW = -0.25
 BENT, INSIDE, INSIDE_SHARE = -0.15, -0.4, 0.12
 """Walls inside one container: slope of each, of both together, share of a boundary in contact."""
 FLOOR_SHARE, WITHIN = 0.6, 0.85
+LOW_FLOOR, RAGGED_M = 0.5, 0.02
+"""Height of a low floor by that of its walls; up to where it may be full of holes, metres."""
 BEFORE, FLAT, AHEAD = 0.25, 0.35, 0.65
 """A near wall: share of its boundary before the rest, height over width of it and of the rest, and
 how far it is before the middle of the rest, by the width of that."""
@@ -100,8 +105,29 @@ def _is_floor(pieces: Pieces, p: int, q: int) -> bool:
         return False
     shared = pieces.pairs[CONTACT, p, q] + pieces.pairs[FRONT, p, q]
     share = FLOOR_SHARE if slope_of(pieces.shape[p]) <= HOLLOW else WITHIN
-    enclosed = shared > share * pieces.boundary[q]
+    enclosed = shared > share * pieces.boundary[q] or _is_low_floor(pieces, p, q)
     return bool(enclosed and pieces.pairs[CONTACT, p, q] >= FEW)
+
+
+@kernel(leaf=True)
+def _is_low_floor(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether ``q`` lies low between the near and the far wall of ``p``, and hardly at any other.
+
+    Shadows of the walls hide a part of its outline. A floor a few millimetres thick is full of
+    holes that are taken for the plane.
+    """
+    a, x, pairs = pieces.shape[p], pieces.shape[q], pieces.pairs
+    before, touching = pairs[FRONT, p, q], pairs[CONTACT, p, q]
+    if x[TOP] > LOW_FLOOR * a[TOP] or min(before, touching) < FEW or has_lid(pieces, p):
+        return False
+    if x[LEFT] < a[LEFT] - SAME_SIDE_M or x[RIGHTMOST] > a[RIGHTMOST] + SAME_SIDE_M:
+        return False
+    if a[BOTTOM] > x[BOTTOM] + SAME_TOP_M:  # what is under a body that begins higher is no floor
+        return False
+    known = np.sum(pairs[CONTACT, q]) + np.sum(pairs[FRONT, :, q]) + np.sum(pairs[FRONT, q])
+    known += pieces.single[q, HIDDEN]
+    known += pieces.single[q, TABLE] if x[TOP] > RAGGED_M else 0.0
+    return bool(before + touching > FLOOR_SHARE * known)
 
 
 @kernel

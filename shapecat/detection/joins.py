@@ -12,6 +12,7 @@ from shapecat.detection.pieces import (
     BOTTOM,
     CONTACT,
     COUNT,
+    FAR,
     FEW,
     FRONT,
     HIDDEN,
@@ -20,6 +21,7 @@ from shapecat.detection.pieces import (
     MEETS_M,
     NEAR,
     ONTO,
+    OVER,
     RIGHTMOST,
     TABLE,
     TOP,
@@ -52,6 +54,9 @@ all else says that it does not, along the second share of its contacts."""
 HANGS, ALONG = 0.4, 0.15
 """Of a handle that reaches down to the plane: most links with that, as a share of those with
 pieces; least share of its boundary along what it hangs on."""
+IN_AIR_M, IN_AIR, HANGING = 0.02, 0.08, 1.2
+"""Of what hangs: least height; least share of its boundary above what is farther away; width, by
+that of what it hangs on."""
 SCRAP, TURNED = 100, 1.3
 """Cells of a scrap, and `slope_of` below which it is no small ball or can."""
 FRAGMENT, BEARS = 160, 0.2
@@ -96,6 +101,9 @@ def join_pieces(
         _join_necks(pieces)
     if "float" in rules:
         _join_floating(pieces)
+        _join_hanging(pieces)
+    if "rim" in rules:  # what the scraps of a rim hold together only now
+        join_rims(pieces)
     if "occluder" in rules:
         join_around(pieces)
 
@@ -215,6 +223,51 @@ def _join_floating(pieces: Pieces) -> None:
             ):
                 merge(pieces, q, p)
                 again = True
+
+
+@kernel
+def _join_hanging(pieces: Pieces) -> None:
+    """Join what ends in the air and touches nothing to what it is beside: a handle or a spout."""
+    n = pieces.group.size
+    pairs = pieces.pairs
+    for p in range(1, n):
+        if not is_group(pieces, p) or not _hangs(pieces, p):
+            continue
+        best, most = 0, 0.0
+        for q in range(1, n):
+            beside = pairs[NEAR, p, q] + pairs[FRONT, p, q] + pairs[FRONT, q, p]
+            if beside > most and _is_within_reach(pieces, p, q):
+                best, most = q, beside
+        if most >= FEW:
+            merge(pieces, best, p)
+
+
+@kernel(leaf=True)
+def _hangs(pieces: Pieces, p: int) -> bool:
+    """Whether the lower end of a piece is seen above what is farther away, and never meets it.
+
+    So is the lower side of balls and bowls.
+    """
+    row, single = pieces.shape[p], pieces.single[p]
+    return bool(
+        row[COUNT] > 0
+        and row[BOTTOM] > IN_AIR_M
+        and abs(slope_of(row)) < BULGING
+        and single[TABLE] == 0
+        and single[OVER] > max(float(FEW), IN_AIR * pieces.boundary[p])
+        and np.sum(pieces.pairs[CONTACT, p]) < FEW
+    )
+
+
+@kernel(leaf=True)
+def _is_within_reach(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether piece ``p`` is small, and before or behind ``q`` by no more than half its width."""
+    if pieces.owner[p] != pieces.owner[q] or not _is_smaller(pieces, p, q):
+        return False
+    a, b = pieces.shape[p], pieces.shape[q]
+    wide = b[RIGHTMOST] - b[LEFT]
+    behind = a[FAR] / a[COUNT] - b[FAR] / b[COUNT]
+    return bool(a[RIGHTMOST] - a[LEFT] < HANGING * wide and abs(behind) < wide / 2)
 
 
 @kernel(leaf=True)

@@ -29,6 +29,7 @@ __all__ = [
     "NEAR",
     "ONTO",
     "ONTO_HEIGHT",
+    "OVER",
     "RIGHTMOST",
     "RIM",
     "SAMPLES",
@@ -56,9 +57,10 @@ __all__ = [
 CONTACT, FRONT, NEAR, ONTO, ONTO_HEIGHT = range(5)
 """Pair statistics [p, q]: linked neighbours; places where p is in front of q; neighbours of equal
 depth over a gap; links whose far side on q faces up, and the sum of its heights."""
-TABLE, HIDDEN, RIM = range(3)
+TABLE, HIDDEN, RIM, OVER = range(4)
 """Statistics of one piece: links with its plane; boundary behind things that are no piece; links
-with a higher plane, from below."""
+with a higher plane, from below; places where it ends above what is farther away: what stands on
+something meets that there."""
 COUNT, LEFT, RIGHTMOST, FITTED, SIDE, SIDE2, TURN, TURN2, SIDETURN, TOP, BOTTOM, AREA, FAR = range(
     13
 )
@@ -84,7 +86,7 @@ class Pieces(NamedTuple):
     Attributes
     ----------
     pairs : (5, n + 1, n + 1) float32, see `CONTACT` and the following.
-    single : (n + 1, 3) float32, see `TABLE` and `HIDDEN`.
+    single : (n + 1, 4) float32, see `TABLE` and the following.
     boundary : (n + 1,) float32 sides of cells on the boundary.
     shape : (n + 1, 13) float32: cells, lateral range, cells with a tangent, sums for the regression
         of their lateral normal on the lateral position, height range, area, sum of the depths.
@@ -111,7 +113,7 @@ def pieces_of(
     size = n + 1
     pieces = Pieces(
         np.zeros((5, size, size), np.float32),
-        np.zeros((size, 3), np.float32),
+        np.zeros((size, OVER + 1), np.float32),
         np.zeros(size, np.float32),
         np.zeros((size, 13), np.float32),
         np.zeros((size, BANDS), np.float32),
@@ -188,6 +190,8 @@ def _meet(
                 if p == q:
                     continue
                 step = w[i, j] - w[y, x]
+                if d == 1 and p > 0 and step > JUMP:
+                    pieces.single[p, OVER] += 1
                 if p > 0 and q > 0:
                     if gap == 0 and links[i, j] & bit:
                         pieces.pairs[CONTACT, p, q] += 1
