@@ -677,14 +677,21 @@ def test_cut_objects_are_flagged_in_clouds_too() -> None:
     assert seen.max() == 2
 
 
-def test_board_at_a_grazing_angle() -> None:
-    """A board 9 cm below the camera is a few rows high in the image; what stands on it counts."""
-    board = 0.42
+@pytest.mark.parametrize("board", [0.42, 0.45, 0.46])
+def test_board_at_a_grazing_angle(board: float) -> None:
+    """A board 5 to 9 cm below the camera is a few rows high; what stands on it counts."""
     shapes = [table(0.45, 0.3), table(0.4, 0.2, board), box((0, -0.05, board), (0.1, 0.1, 0.08))]
     depth, seen = render(shapes, tilt_deg=20, distance=1.5)
     scene = found(frame_of(depth))
     np.testing.assert_allclose([p.height_m for p in scene.planes], [0, board], atol=0.02)
     assert min(overlaps(scene, seen, [2])) > 0.8
+
+
+def test_top_of_a_box_at_a_grazing_angle_is_no_board() -> None:
+    """It is as level and as near to the height of the camera, but small and closed below."""
+    shapes = [table(0.6, 0.4), box((0, 0, 0), (0.3, 0.25, 0.46))]
+    depth, _ = render(shapes, tilt_deg=20, distance=1.5)
+    np.testing.assert_allclose([p.height_m for p in found(frame_of(depth)).planes], [0], atol=0.01)
 
 
 def test_what_rises_beyond_the_greatest_height_is_no_object() -> None:

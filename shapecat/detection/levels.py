@@ -7,6 +7,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import Cells, Lens
 from shapecat.detection.consensus import TOLERANCE, level_plane
+from shapecat.detection.grazing import grazing_board
 from shapecat.detection.planes import DIRECTIONS, Support, find_planes, support_of
 from shapecat.jit import kernel
 
@@ -32,11 +33,13 @@ def find_levels(cells: Cells, up: F8, rng: np.random.Generator) -> list[tuple[Su
     if better @ up < TURNED_COS:
         found = find_planes(cells, better, rng)
         better = _common_up([support for support, _ in found]) if found else better
-    if len(found) < 2:
-        return found
-    levelled = [(_levelled(cells, support, index, better), index) for support, index in found]
-    level = [(support, index) for support, index in levelled if support is not None]
-    return sorted(level, key=lambda one: one[0].offset)
+    if len(found) > 1:
+        levelled = [(_levelled(cells, support, index, better), index) for support, index in found]
+        found = [(support, index) for support, index in levelled if support is not None]
+    grazing = grazing_board(cells, [support for support, _ in found], better)
+    if grazing is not None:
+        found.append(grazing)
+    return sorted(found, key=lambda one: one[0].offset)
 
 
 def _common_up(supports: list[Support]) -> F8:

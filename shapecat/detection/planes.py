@@ -19,7 +19,19 @@ from shapecat.detection.consensus import (
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 
-__all__ = ["COS", "DIRECTIONS", "SIN", "Support", "corners_of", "find_planes", "support_of"]
+__all__ = [
+    "ARM",
+    "COS",
+    "DIRECTIONS",
+    "SIN",
+    "Support",
+    "by_height",
+    "corners_of",
+    "find_planes",
+    "fullest",
+    "listed",
+    "support_of",
+]
 
 DIRECTIONS = 16
 """Sides of the convex outline of a plane."""
@@ -77,9 +89,9 @@ def find_planes(cells: Cells, up: F8, rng: np.random.Generator) -> list[tuple[Su
     base = float(height.min())
     done = np.zeros(int((float(height.max()) - base) / BIN_M) + 1, bool)
     supports: list[tuple[Support, I4]] = []
-    order, starts = _by_height(index, height, base, done.size)
+    order, starts = by_height(index, height, base, done.size)
     for _ in range(MOST_LEVELS):
-        peak = _fullest(starts, done)
+        peak = fullest(starts, done)
         low, high = max(peak - 2, 0), min(peak + 3, done.size)
         near = order[starts[low] : starts[high]]
         if near.size < LEAST_CELLS:
@@ -93,7 +105,7 @@ def find_planes(cells: Cells, up: F8, rng: np.random.Generator) -> list[tuple[Su
             supports.append((support, near))
             n = _keep_off(cells.w, support.a, support.b, support.c, index, height)
             index, height = index[:n], height[:n]
-            order, starts = _by_height(index, height, base, done.size)
+            order, starts = by_height(index, height, base, done.size)
     # (5) ascending
     return sorted(supports, key=lambda found: found[0].offset)
 
@@ -146,7 +158,7 @@ def _level_readings(w: F4, lens: Lens, up: F8, index: I4, height: F4) -> int:
 
 
 @kernel
-def _fullest(starts: I4, done: Bool) -> int:
+def fullest(starts: I4, done: Bool) -> int:
     """Return the bin that with its neighbours holds most readings; those done count as empty."""
     count = np.zeros(done.size + 2, np.int64)
     for k in range(done.size):
@@ -155,7 +167,7 @@ def _fullest(starts: I4, done: Bool) -> int:
 
 
 @kernel
-def _by_height(index: I4, height: F4, base: float, bins: int) -> tuple[I4, I4]:
+def by_height(index: I4, height: F4, base: float, bins: int) -> tuple[I4, I4]:
     """Return the positions in ``index`` sorted by bins of height, and where each bin starts."""
     starts = np.zeros(bins + 1, np.int64)
     bin_of = np.zeros(index.size, np.int32)
@@ -179,7 +191,7 @@ def _refined(
     if offset > -MARGIN_M:  # not seen from above
         return None
     level = level_plane(lens, up, offset)
-    j, i, w = _listed(cells.w, index)
+    j, i, w = listed(cells.w, index)
     readings = Readings(j, i, w, 1)
     plane = level.copy()
     for _ in range(3):
@@ -214,7 +226,7 @@ def support_of(cells: Cells, index: I4, plane: F8) -> Support | None:
 
 
 @kernel
-def _listed(w: F4, index: I4) -> tuple[F4, F4, F4]:
+def listed(w: F4, index: I4) -> tuple[F4, F4, F4]:
     """Return the columns, rows and values of the listed cells."""
     columns = w.shape[1]
     result = np.zeros((3, index.size), np.float32)
