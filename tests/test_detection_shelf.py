@@ -152,3 +152,22 @@ def test_bottle_with_a_level_shoulder_is_no_can_under_its_neck() -> None:
 def test_lid_is_part_of_its_box(seed: int, label: int) -> None:
     """The seam around it shows as a ledge, along a third of the outlines of both and more."""
     assert overlap_in_shelf(seed, label) > 0.8
+
+
+@pytest.mark.parametrize(("seed", "label"), [(739, 20), (786, 25)])
+def test_small_top_of_an_object_is_no_board(seed: int, label: int) -> None:
+    """It is as large as what is seen of some floors, but lies above another plane."""
+    labels, parts = seen("shelf", seed)
+    most = max(np.count_nonzero(part == label) for part in parts)
+    assert most > 0.9 * np.count_nonzero(labels == label)
+
+
+@pytest.mark.parametrize("seed", [29, 121, 189])
+def test_strip_of_floor_beside_a_table_is_a_plane(seed: int) -> None:
+    """Less of it is seen than of most boards."""
+    rng = np.random.default_rng(seed)
+    world = make_scene("empty", rng, frames=1)
+    frame, _ = render_frame(world, 0, rng=rng, sensor=KINECT)
+    planes = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0)).planes
+    table = max(support.height for support in world.supports if support.level)
+    np.testing.assert_allclose([p.height_m for p in planes], [0, table], atol=0.02)

@@ -45,7 +45,7 @@ MOST_LEVELS = 10
 LEAST_CELLS = 100
 MOST_HEIGHTS = 500
 """About as many readings tell the height of a level to begin with."""
-LEAST_AREA_M2 = 0.03
+LEAST_AREA_M2 = 0.02
 LEVEL_COS2 = 0.82
 """Squared cosine of the largest angle, 25 degrees, of a level reading to the horizontal."""
 STEADY_COS = math.cos(math.radians(6))
