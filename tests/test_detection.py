@@ -310,6 +310,17 @@ def test_a_spout_behind_its_pot_belongs_to_it(tilt_deg: float, width: float) -> 
     check([table(1, 1), union(can(0, 0, 0, 0.065, 0.12), spout)], [1], tilt_deg=tilt_deg)
 
 
+@pytest.mark.parametrize("quarters", [0, 1, 2, 3])
+def test_a_spout_hangs_however_the_image_is_turned(quarters: int) -> None:
+    """Its lower end is the one nearer to the ground, not the one lower in the image."""
+    spout = box((0.07, 0.03, 0.04), (0.05, 0.02, 0.05))
+    depth, _ = render([table(1, 1), union(can(0, 0, 0, 0.065, 0.12), spout)], tilt_deg=40)
+    turned = np.ascontiguousarray(np.rot90(depth, quarters))
+    h, w = turned.shape
+    scene = found(frame_of(turned, Camera(w, h, 525, 525, (w - 1) / 2, (h - 1) / 2)))
+    assert len(scene.candidates) == 1
+
+
 @pytest.mark.parametrize("tilt_deg", [25, 40])
 def test_a_box_behind_a_pot_stays_one(tilt_deg: float) -> None:
     """It shows as little, but ends behind the pot and not in the air."""

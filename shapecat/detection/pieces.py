@@ -78,6 +78,8 @@ in the upper `LEVEL` ones; how far what stands on it may seem to begin above or 
 GAP, SHADOW = 3, 15
 INWARD = 3
 UPWARD = 0.8
+DOWNWARD = 0.7
+"""Cosine of the largest angle, in the image, of a neighbour below to straight down."""
 
 
 class Pieces(NamedTuple):
@@ -155,6 +157,7 @@ def _meet(
     pieces: Pieces,
 ) -> None:
     rows, columns = w.shape
+    steep = DOWNWARD * math.hypot(up[0], up[1])
     for i in range(rows):
         if not _find_changes(links[i], labels[i], labels[min(i + 1, rows - 1)], change):
             continue
@@ -190,8 +193,11 @@ def _meet(
                 if p == q:
                     continue
                 step = w[i, j] - w[y, x]
-                if d == 1 and p > 0 and step > JUMP:
+                fall = -up[d]  # how much lower the neighbour is seen, however the image is turned
+                if fall > steep and p > 0 and step > JUMP:
                     pieces.single[p, OVER] += 1
+                if fall < -steep and q > 0 and step < -JUMP:
+                    pieces.single[q, OVER] += 1
                 if p > 0 and q > 0:
                     if gap == 0 and links[i, j] & bit:
                         pieces.pairs[CONTACT, p, q] += 1
