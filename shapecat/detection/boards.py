@@ -17,7 +17,7 @@ SURE_AREA_M2 = 0.25
 """Planes larger than this are furniture, whatever is under their edge."""
 LIKELY_AREA_M2 = 0.1
 """Planes larger than this are furniture if nothing is seen of what is under their edge."""
-LEAST_AREA_M2 = 0.03
+BOARD_AREA_M2 = 0.03
 """Smaller planes are no furniture but for the lowest one, a floor that the table leaves to see."""
 LEAST_DROP_M = 0.06
 """Lower things are objects."""
@@ -37,7 +37,7 @@ def boards_of(cells: Cells, found: list[tuple[Support, I4]]) -> list[Support]:
     for support, index in found:
         below = [s for s in kept if _overlaps(s, support)]
         drop = support.offset - below[-1].offset if below else math.inf
-        if drop < LEAST_DROP_M or (kept and support.area_m2 < LEAST_AREA_M2):
+        if drop < LEAST_DROP_M or (kept and support.area_m2 < BOARD_AREA_M2):
             continue
         if below and support.area_m2 < SURE_AREA_M2:
             seen = np.zeros(2, np.int64)
