@@ -99,6 +99,16 @@ def test_a_plate_with_a_floor_thinner_than_a_step_is_found_whole() -> None:
     assert np.isin(np.flatnonzero(disc.reshape(-1) > 0.5), one.indices).mean() > 0.9
 
 
+@pytest.mark.parametrize("rim", [0.006, 0.008])
+def test_a_plate_upon_a_wave_is_found_whole(rim: float) -> None:
+    """No height parts its rim from the crest of the wave that it crosses."""
+    disc, wave = bump(60, 4), np.cos(2 * np.pi * (np.mgrid[:480, :640][1] - 250) / 250)
+    frame = measured(depth_of(0.004 * wave + rim * (disc - bump(50, 4)) + 0.001 * disc))
+    inside = np.flatnonzero(disc.reshape(-1) > 0.5)
+    best = max(np.isin(inside, c.indices).mean() for c in found(frame).candidates)
+    assert best > 0.9
+
+
 def test_a_plate_against_a_box_is_not_its_foot() -> None:
     """Low cells below something tall are its foot, unless they are level."""
     v, u = np.mgrid[:480, :640]

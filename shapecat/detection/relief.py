@@ -1,7 +1,8 @@
 """Relief: low things that rise from their plane in a step, told from swells of its surface.
 
 Sensors see a flat table in slow waves, higher than a plate is thick; but only an object has an
-edge. So what is low is judged by its outline rather than by its height.
+edge. So waves are levelled first, and what is low is judged by its outline rather than by its
+height.
 """
 
 import math
@@ -19,8 +20,12 @@ __all__ = ["raise_low"]
 
 LOW_M = 0.03
 """Higher things are objects anyway."""
-LEVELS = np.array([0.012, 0.008, 0.0055, 0.0038, 0.0025], np.float32)
-"""Inverse depth above the plane at which outlines are looked for, 1/m."""
+WINDOW = 20
+"""Cells to each side over which the mean is taken: more than a rim is wide, less than a wave."""
+MOST = 0.006
+"""Excess above which a cell counts no more in the mean, 1/m, lest it make a pit around it."""
+LEVELS = np.array([0.012, 0.008, 0.0055, 0.0038, 0.0025, 0.0018], np.float32)
+"""Inverse depth above the mean at which outlines are looked for, 1/m."""
 STEP, SLIP = 0.004, 0.7
 """Mean rise across the outline of an object: 1/m, more than a step of a Kinect; and as a share of
 what the plane itself rises in a cell, for where it is seen at a grazing angle readings that are a
@@ -53,8 +58,6 @@ BROAD = 1.5
 are narrower."""
 RAGGED = 80
 """Square of the sides by the cells of what only fills a gap: 16 of a square, 50 of a crescent."""
-FLOOR = 0.0006
-"""Least mean height of what a rim encloses above the plane around it, 1/m."""
 
 
 def raise_low(
@@ -69,15 +72,16 @@ def raise_low(
     largest_m : wider things are swells or furniture.
     """
     objects = 0
-    excess = np.zeros(cells.w.shape, np.float32)
+    excess, relief = np.zeros((2, *cells.w.shape), np.float32)
     for k, plane in enumerate(planes):
         if _excess(cells.w, heights.owner, heights.height, plane, k + 1, excess) >= LEAST_CELLS:
             step = max(STEP, SLIP * math.hypot(plane[0], plane[1]))
             drop = stacks[1].view(np.float32)
             _cut_feet(cells.w, heights.owner, heights.height, k + 1, excess, stacks[0], drop)
+            _level(excess, relief)
             widest = largest_m * cells.lens.fx
             objects = _raise(
-                cells.w, excess, heights.owner, k + 1, step, raised, widest, objects, stacks
+                cells.w, relief, heights.owner, k + 1, step, raised, widest, objects, stacks
             )
             _lower(cells.w, excess, heights.owner, k + 1, step, raised, stacks)
 
@@ -160,6 +164,30 @@ def _cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4, stack: I4, 
 
 
 @kernel
+def _level(excess: F4, out: F4) -> None:
+    """Write the excess over its mean in a window around each low cell; 0 elsewhere."""
+    rows, columns = excess.shape
+    sums, counts = np.zeros(columns, np.float64), np.zeros(columns, np.float64)
+    for i in range(-WINDOW, rows):
+        for sign, row in ((1, i + WINDOW), (-1, i - WINDOW - 1)):
+            if 0 <= row < rows:
+                for j in range(columns):
+                    sums[j] += sign * min(excess[row, j], MOST)
+                    counts[j] += sign * (excess[row, j] != 0)
+        total = count = 0.0
+        for j in range(-WINDOW, columns if i >= 0 else -WINDOW):
+            if j + WINDOW < columns:
+                total += sums[j + WINDOW]
+                count += counts[j + WINDOW]
+            if j > WINDOW:
+                total -= sums[j - WINDOW - 1]
+                count -= counts[j - WINDOW - 1]
+            if j >= 0:
+                here = excess[i, j]
+                out[i, j] = here - np.float32(total / count) if here != 0 else 0
+
+
+@kernel
 def _raise(
     w: F4,
     excess: F4,
@@ -202,12 +230,7 @@ def _raise(
             if known > SAME * count or _width(w, stack, count) > widest:
                 continue
             filled = fill_hull(excess, part, stack, count)
-            outline = _outline(w, excess, owner, part, stack, filled, number, rise_least, count)
-            if filled > count and outline.floor < FLOOR:
-                for p in stack[count:filled]:
-                    parts[p] = 0
-                filled = count
-                outline = _outline(w, excess, owner, part, stack, filled, number, rise_least, count)
+            outline = _outline(w, excess, owner, part, stack, filled, number, rise_least)
             for p in stack[count:filled]:
                 best = max(best, merits[marks[p]])
             merit = outline.rise / outline.sides
@@ -229,7 +252,6 @@ class Outline(NamedTuple):
         nearer or where nothing is seen.
     rise : sum of the rises of the ``table`` sides, as multiples of the least mean rise.
     steep : how many of them are steep.
-    floor : mean height of the cells that were filled in, above the plane around, 1/m.
     """
 
     sides: int
@@ -238,7 +260,6 @@ class Outline(NamedTuple):
     hidden: int
     rise: float
     steep: int
-    floor: float
 
 
 @kernel(leaf=True)
@@ -298,18 +319,15 @@ def _outline(
     count: int,
     number: int,
     rise_least: float,
-    flooded: int,
 ) -> Outline:
-    """Measure the outline of a part; the cells from ``flooded`` on were filled in."""
+    """Measure the outline of a part."""
     rows, columns = excess.shape
     parts = part.reshape(-1)
-    flat = excess.reshape(-1)
     sides = table = known = hidden = steep = 0
-    rise = around = floor = 0.0
+    rise = 0.0
     me = parts[stack[0]]
     for t in range(count):
         p = stack[t]
-        floor += flat[p] if t >= flooded else 0.0
         beside = (parts[p - 1] == me) & (parts[p + 1] == me)
         if beside & (parts[p - columns] == me) & (parts[p + columns] == me):
             continue
@@ -333,15 +351,12 @@ def _outline(
                 continue
             table += 1
             known += 1
-            around += excess[y, x]
             step = (excess[v, u] - excess[y, x]) / rise_least
             if excess[v, u] == 0:  # the inside is not low
                 step = MOST_STEPS
             rise += min(step, MOST_STEPS)
             steep += int(step > STEEP)
-    base = around / max(table, 1)
-    floor = floor / max(count - flooded, 1) - base
-    return Outline(sides, table, known, hidden, rise, steep, floor)
+    return Outline(sides, table, known, hidden, rise, steep)
 
 
 @kernel
@@ -377,7 +392,7 @@ def _lower(
         count = _flood(above, np.float32(0.5), s, number_of_parts, part, stack)
         if count < SMALL_PART:
             continue
-        line = _outline(w, excess, owner, part, stack, count, number, rise_least, count)
+        line = _outline(w, excess, owner, part, stack, count, number, rise_least)
         if line.table >= BESIDE * line.sides and line.rise < line.table:
             for t in range(count):
                 owners[stack[t]] = -number
