@@ -24,12 +24,15 @@ WINDOW = 20
 """Cells to each side over which the mean is taken: more than a rim is wide, less than a wave."""
 MOST = 0.006
 """Excess above which a cell counts no more in the mean, 1/m, lest it make a pit around it."""
-LEVELS = np.array([0.012, 0.008, 0.0055, 0.0038, 0.0025, 0.0018], np.float32)
-"""Inverse depth above the mean at which outlines are looked for, 1/m."""
-STEP, SLIP = 0.004, 0.7
-"""Mean rise across the outline of an object: 1/m, more than a step of a Kinect; and as a share of
-what the plane itself rises in a cell, for where it is seen at a grazing angle readings that are a
-little beside their place seem to rise."""
+LEVELS = np.array([3.0, 2.0, 1.3, 0.9, 0.6, 0.4], np.float32)
+"""Heights above the mean at which outlines are looked for, as multiples of the least rise."""
+STEP, STEADY, SLIP = 0.002, 3.5, 0.7
+"""Least mean rise across the outline of an object: 1/m; as a multiple of the median rise between
+cells of the plane that are as far apart; and as a share of what the plane itself rises in a cell,
+for where it is seen at a grazing angle readings that are a little beside their place seem to
+rise."""
+BIN, BINS, EVERY = 2e-5, 500, 3
+"""How rises are counted: width of a bin, 1/m, their number, and every so many cells."""
 STEEP, STEEP_SHARE = 0.5, 0.7
 """A rise that is more than noise, as a share of the mean, and the share of the outline that has
 it."""
@@ -44,6 +47,8 @@ GROWN = 0.95
 theirs: an object and a swell beside it rise less."""
 SLOPE = 0.0016
 """Fall per cell of the side of something, 1/m."""
+SIDE = 0.004
+"""Rise over two cells of the side of something, 1/m."""
 SAME = 0.9
 """Share of the cells of a part from which it is a known object."""
 INWARD, OUTWARD = 2, 3
@@ -75,13 +80,15 @@ def raise_low(
     excess, relief = np.zeros((2, *cells.w.shape), np.float32)
     for k, plane in enumerate(planes):
         if _excess(cells.w, heights.owner, heights.height, plane, k + 1, excess) >= LEAST_CELLS:
-            step = max(STEP, SLIP * math.hypot(plane[0], plane[1]))
             drop = stacks[1].view(np.float32)
             _cut_feet(cells.w, heights.owner, heights.height, k + 1, excess, stacks[0], drop)
             _level(excess, relief)
+            clear = max(STEP, STEADY * _noise(relief, heights.owner, k + 1))
+            step = max(clear, SLIP * math.hypot(plane[0], plane[1]))
+            levels = np.float32(clear) * LEVELS
             widest = largest_m * cells.lens.fx
             objects = _raise(
-                cells.w, relief, heights.owner, k + 1, step, raised, widest, objects, stacks
+                cells.w, relief, heights.owner, k + 1, step, levels, raised, widest, objects, stacks
             )
             _lower(cells.w, excess, heights.owner, k + 1, step, raised, stacks)
 
@@ -188,12 +195,37 @@ def _level(excess: F4, out: F4) -> None:
 
 
 @kernel
+def _noise(relief: F4, owner: I4, number: int) -> float:
+    """Return the median rise between cells of the plane as far apart as those of an outline."""
+    rows, columns = relief.shape
+    apart = INWARD + OUTWARD
+    count = np.zeros(BINS, np.int64)
+    n = 0
+    for i in range(0, rows - apart, EVERY):
+        for j in range(0, columns - apart, EVERY):
+            here = relief[i, j]
+            if owner[i, j] != -number or here == 0:
+                continue
+            for y, x in ((i + apart, j), (i, j + apart)):
+                if owner[y, x] == -number and relief[y, x] != 0:
+                    rise = abs(relief[y, x] - here)
+                    count[min(int(rise / BIN), BINS - 1)] += 1
+                    n += 1
+    below = k = 0
+    while 2 * below < n:
+        below += count[k]
+        k += 1
+    return k * BIN
+
+
+@kernel
 def _raise(
     w: F4,
     excess: F4,
     owner: I4,
     number: int,
     rise_least: float,
+    levels: F4,
     raised: I4,
     widest: float,
     objects: int,
@@ -208,12 +240,12 @@ def _raise(
     n = 0
     for p in range(1, flat.size):
         seeds[n] = p  # the first cell of a part above any level is higher than the one before it
-        n += int((flat[p] > LEVELS[-1]) & (flat[p] > flat[p - 1]))
+        n += int((flat[p] > levels[-1]) & (flat[p] > flat[p - 1]))
     seen, part = np.zeros(excess.shape, np.int32), np.zeros(excess.shape, np.int32)
     visited, parts = seen.reshape(-1), part.reshape(-1)
-    merits = np.zeros(1 + objects + LEVELS.size * (flat.size // LEAST_CELLS), np.float32)
+    merits = np.zeros(1 + objects + levels.size * (flat.size // LEAST_CELLS), np.float32)
     me = 0
-    for level in LEVELS:
+    for level in levels:
         first = me
         for s in seeds[:n]:
             if visited[s] > first or not flat[s] > level:
@@ -408,6 +440,6 @@ def _is_flat(excess: F4, i: int, j: int) -> bool:
         x = j + (2 if d == 2 else -2 if d == 3 else 0)
         if y < 0 or x < 0 or y >= rows or x >= columns:
             continue
-        if excess[y, x] == 0 or abs(excess[y, x] - here) > STEP:
+        if excess[y, x] == 0 or abs(excess[y, x] - here) > SIDE:
             return False
     return True
