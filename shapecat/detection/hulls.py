@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
+from shapecat.detection.cells import place_of
 from shapecat.jit import kernel
 
 __all__ = ["fill_hull"]
@@ -18,8 +19,7 @@ def fill_hull(excess: F4, part: I4, stack: I4, count: int) -> int:
     me = parts[stack[0]]
     left, right = np.full(rows, columns, np.float64), np.full(rows, -1.0)
     for t in range(count):
-        i = stack[t] // columns
-        j = stack[t] - i * columns
+        i, j = place_of(stack[t], columns)
         left[i], right[i] = min(left[i], j), max(right[i], j)
     first, last = 0, rows - 1
     while right[first] < 0:

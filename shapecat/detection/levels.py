@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import Cells, Lens
+from shapecat.detection.cells import Cells, Lens, place_of
 from shapecat.detection.consensus import TOLERANCE, level_plane
 from shapecat.detection.grazing import grazing_board
 from shapecat.detection.planes import DIRECTIONS, Support, find_planes, support_of
@@ -73,7 +73,7 @@ def _offset(w: F4, lens: Lens, index: I4, a: float, b: float, c: float, up: F8) 
     # The inverse depth of the plane up @ p == offset is along / offset.
     squares = products = 0.0
     for p in index:
-        i, j = p // columns, p % columns
+        i, j = place_of(p, columns)
         if abs(w[i, j] - (a * j + b * i + c)) < TOLERANCE:
             along = up[0] * (j - lens.cx) / lens.fx + up[1] * (i - lens.cy) / lens.fy + up[2]
             squares += along * along

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.cells import Cells, Lens, middle_of
+from shapecat.detection.cells import Cells, Lens, middle_of, place_of
 from shapecat.detection.consensus import (
     TOLERANCE,
     Readings,
@@ -79,7 +79,7 @@ class Support(NamedTuple):
 def find_planes(cells: Cells, up: F8, rng: np.random.Generator) -> list[tuple[Support, I4]]:
     """Return the horizontal planes of the scene, lowest first, each with its cells (flat)."""
     # (1), (2) readings whose surface is level
-    index = np.zeros(cells.w.shape[0] * cells.w.shape[1] // 4 + 1, np.int32)
+    index = np.zeros(cells.w.size // 4 + 1, np.int32)
     height = np.zeros(index.size, np.float32)
     n = _level_readings(cells.w, cells.lens, up, index, height)
     if n < LEAST_CELLS:
@@ -116,7 +116,7 @@ def _keep_off(w: F4, a: float, b: float, c: float, index: I4, height: F4) -> int
     columns = w.shape[1]
     n = 0
     for k in range(index.size):
-        i, j = index[k] // columns, index[k] % columns
+        i, j = place_of(index[k], columns)
         if abs(w[i, j] - (a * j + b * i + c)) > 3 * TOLERANCE:
             index[n], height[n] = index[k], height[k]
             n += 1
@@ -231,7 +231,7 @@ def listed(w: F4, index: I4) -> tuple[F4, F4, F4]:
     columns = w.shape[1]
     result = np.zeros((3, index.size), np.float32)
     for k in range(index.size):
-        i, j = index[k] // columns, index[k] % columns
+        i, j = place_of(index[k], columns)
         result[0, k], result[1, k], result[2, k] = j, i, w[i, j]
     return result[0], result[1], result[2]
 
@@ -246,7 +246,7 @@ def _spread(
     # The outline is convex in the image too: the first and last cell of each row tell it.
     first, last = np.full(rows, columns, np.int64), np.full(rows, -1, np.int64)
     for p in index:
-        i0, j0 = p // columns, p % columns
+        i0, j0 = place_of(p, columns)
         level = plane[0] * j0 + plane[1] * i0 + plane[2]
         if level <= 0 or abs(w[i0, j0] - level) >= tolerance:
             continue

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import JUMP, Cells
+from shapecat.detection.cells import JUMP, Cells, place_of
 from shapecat.detection.heights import Heights
 from shapecat.detection.hulls import fill_hull
 from shapecat.jit import kernel
@@ -63,6 +63,8 @@ BROAD = 1.5
 are narrower."""
 RAGGED = 80
 """Square of the sides by the cells of what only fills a gap: 16 of a square, 50 of a crescent."""
+BLOCK = 64
+"""Cells that are looked at together: most are not above any level."""
 
 
 def raise_low(
@@ -237,10 +239,7 @@ def _raise(
     """
     flat, marks, owners = excess.reshape(-1), raised.reshape(-1), owner.reshape(-1)
     seeds, stack = stacks[0], stacks[1]
-    n = 0
-    for p in range(1, flat.size):
-        seeds[n] = p  # the first cell of a part above any level is higher than the one before it
-        n += int((flat[p] > levels[-1]) & (flat[p] > flat[p - 1]))
+    n = _find_seeds(flat, levels[-1], seeds)
     seen, part = np.zeros(excess.shape, np.int32), np.zeros(excess.shape, np.int32)
     visited, parts = seen.reshape(-1), part.reshape(-1)
     merits = np.zeros(1 + objects + levels.size * (flat.size // LEAST_CELLS), np.float32)
@@ -274,6 +273,27 @@ def _raise(
     return objects
 
 
+@kernel(leaf=True)
+def _find_seeds(flat: F4, least: float, seeds: I4) -> int:
+    """List the cells above the lowest level that are higher than the one before; return how many.
+
+    The first cell of a part above any level is one. Most cells are lower, and to pass over many of
+    them at a time vectorises.
+    """
+    n = 0
+    for start in range(1, flat.size, BLOCK):
+        block, before = flat[start : start + BLOCK], flat[start - 1 :]
+        some = False
+        for k in range(block.size):
+            some |= block[k] > least
+        if not some:
+            continue
+        for k in range(block.size):
+            seeds[n] = start + k
+            n += int((block[k] > least) & (block[k] > before[k]))
+    return n
+
+
 class Outline(NamedTuple):
     """What is known of an outline.
 
@@ -300,7 +320,7 @@ def _width(w: F4, stack: I4, count: int) -> float:
     columns = w.shape[1]
     first, last = columns, 0
     for p in stack[:count]:
-        j = p % columns
+        _, j = place_of(p, columns)
         first, last = min(first, j), max(last, j)
     return float((last - first) / w[stack[0] // columns, stack[0] % columns])
 
@@ -333,7 +353,7 @@ def _flood(excess: F4, level: float, start: int, n: int, part: I4, stack: I4) ->
         p = stack[done]
         done += 1
         for step in (1, -1, columns, -columns):
-            q = p + step
+            q = np.uint64(p + step)  # saves to look whether an index counts from the end
             new = (parts[q] != n) & (flat[q] > level)
             parts[q] = n if new else parts[q]  # branches here are hard to foresee
             stack[top] = q
@@ -368,8 +388,7 @@ def _outline(
             dj = 1 if d == 2 else -1 if d == 3 else 0
             if parts[p + di * columns + dj] == me:
                 continue
-            i = p // columns
-            j = p - i * columns
+            i, j = place_of(p, columns)
             sides += 1
             y, x = i + di, j + dj
             known += excess[y, x] == 0 and w[y, x] > 0 and abs(w[y, x] - w[i, j]) < JUMP
@@ -398,7 +417,7 @@ def _lower(
     """Give level parts of low object cells whose outline is that of a swell back to the plane."""
     rows, columns = excess.shape
     seeds, stack = stacks[0], stacks[1]
-    above = np.zeros(excess.shape, np.float32)
+    above = np.zeros(excess.shape, np.uint8)
     n = 0
     for i in range(rows):
         some = False
@@ -421,7 +440,7 @@ def _lower(
         if parts[s] > 0:
             continue
         number_of_parts += 1
-        count = _flood(above, np.float32(0.5), s, number_of_parts, part, stack)
+        count = _flood(above, np.uint8(0), s, number_of_parts, part, stack)
         if count < SMALL_PART:
             continue
         line = _outline(w, excess, owner, part, stack, count, number, rise_least)
