@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from shapecat.arrays import F4, I4, U1
-from shapecat.detection.cells import JUMP
+from shapecat.arrays import F4, I4, U1, Bool
+from shapecat.detection.cells import JUMP, place_of
 from shapecat.detection.heights import LEAST_M, NOISE
 from shapecat.jit import kernel
 
@@ -46,27 +46,24 @@ def fill_enclosed(w: F4, height: F4, labels: I4, count: int, *, active: bool) ->
 
 
 @kernel
-def grow_feet(w: F4, owner: I4, height: F4, labels: I4) -> None:
+def grow_feet(w: F4, owner: I4, height: F4, labels: I4, edge: I4) -> None:
     """Let the labels grow over the cells beside them that are hardly above their plane.
 
     The least height of an object cell is safe against the noise of the plane; next to an object
-    less is enough. Further away what is so low is as often the plane.
+    less is enough. Further away what is so low is as often the plane. ``edge`` (cells,) is room.
     """
     rows, columns = labels.shape
-    edge = np.zeros(labels.size, np.int32)
+    beside = np.zeros(columns, np.bool_)
     count = 0
     for i in range(rows):
+        if not _find_beside(owner, labels[i], i, beside):
+            continue
         for j in range(columns):
-            if labels[i, j] > 0 and (
-                (i > 0 and owner[i - 1, j] < 0)
-                or (j > 0 and owner[i, j - 1] < 0)
-                or (i + 1 < rows and owner[i + 1, j] < 0)
-                or (j + 1 < columns and owner[i, j + 1] < 0)
-            ):
+            if beside[j]:
                 edge[count] = i * columns + j
                 count += 1
     for p in edge[:count]:
-        i, j = p // columns, p % columns
+        i, j = place_of(p, columns)
         for d in range(4):
             y = i + (1 if d == 0 else -1 if d == 1 else 0)
             x = j + (1 if d == 2 else -1 if d == 3 else 0)
@@ -77,6 +74,24 @@ def grow_feet(w: F4, owner: I4, height: F4, labels: I4) -> None:
             z = 1 / w[y, x]
             if height[y, x] > FRINGE * (LEAST_M + NOISE * z * z):
                 labels[y, x] = labels[i, j]
+
+
+@kernel(leaf=True)
+def _find_beside(owner: I4, labels: I4, i: int, beside: Bool) -> bool:
+    """Mark the labelled cells of a row that are beside cells of a plane; whether there are any."""
+    rows, columns = owner.shape
+    # Labelled cells are on no plane, so the row itself may stand for the one beyond the image.
+    above, here, below = owner[max(i - 1, 0)], owner[i], owner[min(i + 1, rows - 1)]
+    some = False
+    for j in range(columns):
+        beside[j] = (labels[j] > 0) & ((above[j] < 0) | (below[j] < 0))
+    for j in range(columns - 1):
+        beside[j] |= (labels[j] > 0) & (here[j + 1] < 0)
+    for j in range(columns - 1):
+        beside[j + 1] |= (labels[j + 1] > 0) & (here[j] < 0)
+    for j in range(columns):
+        some |= beside[j]
+    return some
 
 
 @kernel(leaf=True)
@@ -157,11 +172,15 @@ def mark_open(w: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1) ->
     """
     i0, j0, i1, j1 = extent
     for i in range(i1 - 1, i0 - 1, -1):
-        right = True
-        for j in range(j1 - 1, j0 - 1, -1):
-            right |= i == i1 - 1 or seen[i + 1, j] == OPEN
-            right &= labels[i, j] == 0 and w[i, j] > 0
-            seen[i, j] = OPEN if right else 0
+        here, label, value = seen[i, j0:j1], labels[i, j0:j1], w[i, j0:j1]
+        for j in range(here.size):
+            here[j] = OPEN if (label[j] == 0) & (value[j] > 0) else 0
+        if i == i1 - 1:
+            continue
+        below, right = seen[i + 1, j0:j1], np.uint8(OPEN)
+        for j in range(here.size - 1, -1, -1):
+            right = (right | below[j]) & here[j]
+            here[j] = right
 
 
 @kernel(inline=True, leaf=True)

@@ -79,11 +79,11 @@ def is_no_object(pieces: Pieces, furniture: Bool, raised: Bool, *, largest_m: fl
     return np.asarray(edge | large | (faint & ~raised) | furniture)
 
 
-def posts_of(cells: Cells, owner: I4, regions: I4, pieces: Pieces, up: F8) -> Bool:
+def posts_of(cells: Cells, owner: I4, regions: I4, spans: I4, pieces: Pieces, up: F8) -> Bool:
     """Return for each piece whether it goes on through the level of a board, as posts do."""
     through = np.zeros(pieces.group.size, np.int64)
     if owner.max() > 1:
-        _through(cells.w, cells.lens, owner, regions, pieces.group, up, through)
+        _through(cells.w, cells.lens, owner, regions, spans, pieces.group, up, through)
     return np.asarray(through >= FEW)
 
 
@@ -120,14 +120,16 @@ def sides_of(cells: Cells, pieces: Pieces) -> Bool:
     return np.asarray(edge_on & upright & alone & (hidden < COVERED * pieces.boundary))
 
 
-def unbounded(cells: Cells, planes: F8, owner: I4, walls: U1, regions: I4, pieces: Pieces) -> Bool:
+def unbounded(
+    cells: Cells, planes: F8, owner: I4, walls: U1, regions: I4, spans: I4, pieces: Pieces
+) -> Bool:
     """Return for each piece whether its surface goes on to where no plane reaches, or in a wall.
 
     Walls and floors are cut off there; an object ends where it ends.
     """
     size = pieces.group.size
     leaving = np.zeros((2, size), np.int64)
-    _leave(cells.w, planes, owner, walls, regions, leaving)
+    _leave(cells.w, planes, owner, walls, regions, spans, leaving)
     beyond, to_wall = (np.bincount(pieces.group, count, size) for count in leaving)
     limit = pieces.boundary
     return np.asarray((beyond > UNBOUNDED * limit) | (to_wall > WALLED * limit))
@@ -145,11 +147,11 @@ def towers_of(cells: Cells, planes: F8, pieces: Pieces, up: F8, *, highest_m: fl
 
 
 @kernel
-def _leave(w: F4, planes: F8, owner: I4, walls: U1, regions: I4, leaving: I4) -> None:
+def _leave(w: F4, planes: F8, owner: I4, walls: U1, regions: I4, spans: I4, leaving: I4) -> None:
     """Count the neighbours of each region on the same surface beyond its plane and on walls."""
     rows, columns = w.shape
     for i in range(1, rows - 1):
-        for j in range(1, columns - 1):
+        for j in range(max(spans[i, 0], 1), min(spans[i, 1], columns - 1)):
             if regions[i, j] == 0:
                 continue
             plane = planes[owner[i, j] - 1]
@@ -219,11 +221,13 @@ def _rise(w: F4, lens: Lens, i: int, j: int, up: F8, sign: int, most: float) -> 
 
 
 @kernel(leaf=True)
-def _through(w: F4, lens: Lens, owner: I4, labels: I4, group: I4, up: F8, through: I4) -> None:
+def _through(
+    w: F4, lens: Lens, owner: I4, labels: I4, spans: I4, group: I4, up: F8, through: I4
+) -> None:
     """Count where what is above and below the level of a board is one upright surface."""
     columns = w.shape[1]
     for i in range(w.shape[0]):
-        for j in range(columns):
+        for j in range(spans[i, 0], spans[i, 1]):
             if labels[i, j] == 0:
                 continue
             above = _followed(w, lens, i, j, up, POST_M)

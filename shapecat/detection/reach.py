@@ -7,7 +7,7 @@ and at the front edge, over which things may stick out.
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
-from shapecat.detection.cells import JUMP, Cells, Lens
+from shapecat.detection.cells import JUMP, Cells, Lens, place_of
 from shapecat.detection.heights import LEAST_M, NOISE, Heights, inside
 from shapecat.detection.walls import CLEARED
 from shapecat.jit import kernel
@@ -35,7 +35,8 @@ def reach_over(
     stacks : (2, cells) int32, room.
     """
     outside = np.zeros(heights.owner.shape, np.float32)
-    noted, seen = np.zeros((2, *heights.owner.shape), np.int32)
+    noted = np.zeros(heights.owner.shape, np.int8)
+    seen = np.zeros(heights.owner.shape, np.int32)
     looks = 0
     for k, plane in reversed(list(enumerate(planes))):
         looks = _reach(
@@ -86,7 +87,7 @@ def _reach(
                 if _part_inside(w, owner, me, seen, looks, i, j, enough, stacks[1]) < enough:
                     continue
                 for t in range(n):
-                    v, u = stacks[0, t] // columns, stacks[0, t] % columns
+                    v, u = place_of(stacks[0, t], columns)
                     owner[v, u] = me
                     heights.height[v, u] = outside[v, u]
     return looks
@@ -161,7 +162,7 @@ def _part_outside(
     stack[0] = i * columns + j
     done, top = 0, 1
     while done < top:
-        i, j = stack[done] // columns, stack[done] % columns
+        i, j = place_of(stack[done], columns)
         done += 1
         for d in range(4):
             y = i + (1 if d == 0 else -1 if d == 1 else 0)
@@ -184,7 +185,7 @@ def _part_inside(
     seen[i, j] = look
     done, top = 0, 1
     while done < top < most:
-        i, j = stack[done] // columns, stack[done] % columns
+        i, j = place_of(stack[done], columns)
         done += 1
         for d in range(4):
             y = i + (1 if d == 0 else -1 if d == 1 else 0)

@@ -7,7 +7,7 @@ from shapecat.detection.heights import Heights
 from shapecat.detection.surfaces import DOWN, RIGHT, Surfaces
 from shapecat.jit import kernel
 
-__all__ = ["regions_of", "renamed"]
+__all__ = ["regions_of", "rename"]
 
 EDGE_DEG = 34
 """Concave angle that may part two objects; a bowl of 7 cm turns 16 degrees over the same cells."""
@@ -18,33 +18,36 @@ MOST_REGIONS = 250
 BUCKET_DEG = 4
 
 
-def regions_of(heights: Heights, surfaces: Surfaces, *, concave: bool = True) -> tuple[I4, int]:
+def regions_of(
+    heights: Heights, surfaces: Surfaces, stacks: I4, *, concave: bool = True
+) -> tuple[I4, int]:
     """Label the object cells: (rows, columns) int16 labels 1..n, 0 elsewhere, and n.
 
     Flat cells that are linked make a seed; a flood from the seeds, flattest cells first, gives
     the cells of an edge to its sides (Meyer 1991). With ``concave`` off only jumps part regions.
+    ``stacks`` (2, cells) int32 is room.
     """
     labels = np.zeros(heights.owner.shape, np.int16)
     strong = EDGE_DEG if concave else NO_EDGE_DEG
-    return labels, _find(heights.owner, surfaces, strong, labels)
+    return labels, _find(heights.owner, surfaces, strong, labels, stacks)
 
 
 @kernel
-def _find(owner: I4, surfaces: Surfaces, strong: int, labels: I4) -> int:
+def _find(owner: I4, surfaces: Surfaces, strong: int, labels: I4, stacks: I4) -> int:
     links, edge, spans = surfaces.links, surfaces.edge, surfaces.spans
     barrier = np.zeros(labels.shape, np.uint8)
-    _creases(edge, spans, strong, barrier)
-    n = _flat_parts(owner, spans, links, barrier, labels, 0)
-    _flood(links, edge, spans, labels)
+    stack, part = stacks[0], stacks[1].reshape(labels.shape)
+    _creases(edge, spans, strong, barrier, stack)
+    n = _flat_parts(owner, spans, links, barrier, labels, 0, part)
+    _flood(links, edge, spans, labels, stack)
     barrier[:] = 0
-    return int(_flat_parts(owner, spans, links, barrier, labels, n))
+    return int(_flat_parts(owner, spans, links, barrier, labels, n, part))
 
 
-@kernel
-def _creases(edge: U1, spans: I4, strong: int, barrier: U1) -> None:
+@kernel(leaf=True)
+def _creases(edge: U1, spans: I4, strong: int, barrier: U1, stack: I4) -> None:
     """Mark strong concave edges, and weaker ones that continue them (hysteresis, Canny 1986)."""
     rows, columns = edge.shape
-    stack = np.zeros(edge.size, np.int32)
     top = 0
     for i in range(rows):
         for j in range(spans[i, 0], spans[i, 1]):
@@ -84,13 +87,13 @@ def _is_ridge(edge: U1, i: int, j: int) -> bool:
 
 
 @kernel
-def _flat_parts(owner: I4, spans: I4, links: U1, barrier: U1, labels: I4, n: int) -> int:
+def _flat_parts(owner: I4, spans: I4, links: U1, barrier: U1, labels: I4, n: int, part: I4) -> int:
     """Label linked unlabelled cells that are no barrier, from ``n`` + 1 on; return the last label.
 
     Two passes with a table of equivalent labels (Rosenfeld and Pfaltz 1966). Small parts get none.
+    ``part`` (rows, columns) is room: links do not lead out of the spans, all of which is written.
     """
     rows = owner.shape[0]
-    part = np.zeros(labels.shape, np.int32)
     room = rows + 2  # a row has at most one first label in two cells
     for i in range(rows):
         room += (spans[i, 1] - spans[i, 0]) // 2
@@ -99,6 +102,7 @@ def _flat_parts(owner: I4, spans: I4, links: U1, barrier: U1, labels: I4, n: int
     # (1) first labels, and which of them meet
     for i in range(rows):
         for j in range(spans[i, 0], spans[i, 1]):
+            part[i, j] = 0
             if owner[i, j] <= 0 or labels[i, j] > 0 or barrier[i, j]:
                 continue
             me = part[i, j - 1] if j > 0 and links[i, j - 1] & RIGHT else 0
@@ -153,14 +157,16 @@ def _neighbour(p: int, d: int, columns: int, links: U1) -> int:
 
 
 @kernel
-def _flood(links: U1, edge: U1, spans: I4, labels: I4) -> None:
-    """Grow the labels over links, cells with small concave angles first."""
+def _flood(links: U1, edge: U1, spans: I4, labels: I4, following: I4) -> None:
+    """Grow the labels over links, cells with small concave angles first.
+
+    ``following`` (cells,) is room for the next cell of the same queue.
+    """
     columns = labels.shape[1]
     flat_links, flat_edge, flat = links.reshape(-1), edge.reshape(-1), labels.reshape(-1)
     buckets = 256 // BUCKET_DEG
     head = np.full(buckets, -1, np.int32)
     tail = np.full(buckets, -1, np.int32)
-    following = np.zeros(flat.size, np.int32)
     for i in range(labels.shape[0]):
         for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
             if flat[p] <= 0:
@@ -194,12 +200,9 @@ def _flood(links: U1, edge: U1, spans: I4, labels: I4) -> None:
             tail[level], following[q] = q, -1
 
 
-@kernel
-def renamed(labels: I4, names: I4) -> I4:
-    """Return labels (rows, columns) under their new names (n,)."""
-    result = np.zeros_like(labels)
+@kernel(leaf=True)
+def rename(labels: I4, spans: I4, names: I4) -> None:
+    """Give labels (rows, columns) their new names (n,), in place; that of 0 is 0."""
     for i in range(labels.shape[0]):
-        for j in range(labels.shape[1]):
-            if labels[i, j] > 0:
-                result[i, j] = names[labels[i, j]]
-    return result
+        for j in range(spans[i, 0], spans[i, 1]):
+            labels[i, j] = names[labels[i, j]]

@@ -17,28 +17,29 @@ RAISED = 0.5
 """Share of the cells of a piece that belong to one low object."""
 
 
-def join_raised(pieces: Pieces, raised: I4, labels: I4) -> Bool:
+def join_raised(pieces: Pieces, raised: I4, labels: I4, spans: I4) -> Bool:
     """Join the pieces of each low object that is known by its outline; return which they are.
 
     Parameters
     ----------
     raised : (rows, columns) the numbers of the low objects, from `raise_low`.
+    spans : where there are ``labels``, as in `Surfaces`.
 
     Returns
     -------
     (n + 1,) whether most of a piece is low and known to be an object.
     """
     known = np.zeros(pieces.group.size, np.bool_)
-    _join_raised(pieces, raised, labels, known)
+    _join_raised(pieces, raised, labels, spans, known)
     return known
 
 
 @kernel
-def _join_raised(pieces: Pieces, raised: I4, labels: I4, known: Bool) -> None:
+def _join_raised(pieces: Pieces, raised: I4, labels: I4, spans: I4, known: Bool) -> None:
     n = pieces.group.size
     cells = np.zeros((n, np.max(raised) + 1), np.int32)
     for i in range(labels.shape[0]):
-        for j in range(labels.shape[1]):
+        for j in range(spans[i, 0], spans[i, 1]):
             if raised[i, j] > 0:
                 cells[labels[i, j], raised[i, j]] += 1
     leader = np.zeros(cells.shape[1], np.int32)

@@ -32,7 +32,7 @@ from shapecat.detection.levels import find_levels
 from shapecat.detection.pieces import Pieces, meet, pieces_of
 from shapecat.detection.planes import Support
 from shapecat.detection.reach import reach_over
-from shapecat.detection.regions import regions_of, renamed
+from shapecat.detection.regions import regions_of, rename
 from shapecat.detection.relief import raise_low
 from shapecat.detection.rings import join_raised, join_rings
 from shapecat.detection.surfaces import surfaces_of
@@ -124,7 +124,7 @@ def segment(
     walls = clear_walls(cells, heights.owner, up, largest_m=settings.max_size_m, rng=rng)
     reach_over(cells, heights, planes, walls, stacks, highest_m=settings.max_height_m)
     surfaces = surfaces_of(cells, heights)
-    regions, n = regions_of(heights, surfaces, concave="concave" in rules)
+    regions, n = regions_of(heights, surfaces, stacks, concave="concave" in rules)
     pieces = pieces_of(cells, heights, surfaces, regions, n, up)
     more = n
     if "ledge" in rules:
@@ -134,14 +134,14 @@ def segment(
     if more > n:
         pieces = pieces_of(cells, heights, surfaces, regions, more, up)
     meet(cells.w, heights, surfaces, regions, up, pieces)
-    known = join_raised(pieces, raised, regions)
+    known = join_raised(pieces, raised, regions, surfaces.spans)
     join_pieces(pieces, cells, surfaces, regions, rules)
     if "ring" in rules:
         join_rings(pieces, cells.w, heights.height, regions)
-    furniture = posts_of(cells, heights.owner, regions, pieces, up)
+    furniture = posts_of(cells, heights.owner, regions, surfaces.spans, pieces, up)
     furniture |= towers_of(cells, planes, pieces, up, highest_m=settings.max_height_m)
     furniture |= sides_of(cells, pieces)
-    furniture |= unbounded(cells, planes, heights.owner, walls, regions, pieces)
+    furniture |= unbounded(cells, planes, heights.owner, walls, regions, surfaces.spans, pieces)
     furniture |= remains_of(walls, regions, pieces)
     furniture |= cut_by_range(cells, regions, pieces, range_m=settings.max_range_m)
     refused = is_no_object(pieces, furniture, known, largest_m=settings.max_size_m)
@@ -149,9 +149,10 @@ def segment(
     leaders = np.flatnonzero(np.bincount(pieces.group))
     number = np.zeros(pieces.group.size, np.int16)
     number[leaders] = np.arange(leaders.size)
-    labels = renamed(regions, number[pieces.group])
+    labels = regions  # of pieces before, of objects from here on
+    rename(labels, surfaces.spans, number[pieces.group])
     if "feet" in rules:
-        grow_feet(cells.w, heights.owner, heights.height, labels)
+        grow_feet(cells.w, heights.owner, heights.height, labels, stacks[0])
     filled = fill_enclosed(
         cells.w, heights.height, labels, leaders.size - 1, active="fill" in rules
     )

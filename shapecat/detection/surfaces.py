@@ -11,7 +11,7 @@ from shapecat.detection.heights import Heights
 from shapecat.detection.tangents import fit_tangents, padded
 from shapecat.jit import kernel
 
-__all__ = ["DOWN", "RIGHT", "Surfaces", "surfaces_of"]
+__all__ = ["DOWN", "RIGHT", "Surfaces", "span_of", "surfaces_of"]
 
 RIGHT, DOWN = 1, 2
 """Bits of `Surfaces.links`."""
@@ -59,14 +59,14 @@ def surfaces_of(cells: Cells, heights: Heights) -> Surfaces:
 def _survey(w: F4, lens: Lens, owner: I4, surfaces: Surfaces) -> None:
     spans = surfaces.spans
     for i in range(owner.shape[0]):
-        spans[i, 0], spans[i, 1] = _span(owner[i])
+        spans[i, 0], spans[i, 1] = span_of(owner[i])
     fit_tangents(w, lens, owner, spans, surfaces.tangent, surfaces.normal)
     _link(w, owner, spans, surfaces.tangent, surfaces.links)
     _bend(w, lens, surfaces)
 
 
 @kernel(leaf=True)
-def _span(row: I4) -> tuple[int, int]:
+def span_of(row: I4) -> tuple[int, int]:
     """Return the columns of the first number above 0 of a row and after the last, or 0 and 0."""
     some = False
     for j in range(row.size):
