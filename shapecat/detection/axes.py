@@ -84,18 +84,20 @@ def _find(
     cut: Bool,
 ) -> None:
     """Mark the bands at which each label is to be cut."""
-    sums = np.zeros((*cut.shape, 11))
-    reach = np.zeros((2, *cut.shape))
-    rounded = _are_rounded(pieces, len(cut))
+    rounded = _number_rounded(pieces, len(cut))
+    most = np.max(rounded) + 1
+    sums, reach = np.zeros((most, BANDS, 11)), np.zeros((2, most, BANDS))
     _add(w, lens, height, surfaces, labels, rounded, up, side, forward, sums, reach)
     parts = np.zeros((BANDS, 2), np.int64)
     for p in range(1, len(cut)):
+        if rounded[p] == 0:
+            continue
         parts[0] = 0, BANDS
         top = 1
         while top > 0:
             top -= 1
             low, high = parts[top]
-            band = low + _best_cut(sums[p, low:high])
+            band = low + _best_cut(sums[rounded[p], low:high])
             if band > low:
                 cut[p, band] = True
                 parts[top] = low, band
@@ -104,13 +106,17 @@ def _find(
 
 
 @kernel
-def _are_rounded(pieces: Pieces, labels: int) -> Bool:
-    """Return for each label whether it may be a round thing; what has just been cut may."""
-    result = np.ones(labels, np.bool_)
-    result[0] = False
-    for p in range(1, pieces.group.size):
-        row = pieces.shape[p]
-        result[p] = row[COUNT] >= 2 * LEAST_CELLS and slope_of(row) > ROUND
+def _number_rounded(pieces: Pieces, labels: int) -> I4:
+    """Return 1, 2, ... for labels that may be round things, as what was just cut may, else 0."""
+    result = np.zeros(labels, np.int64)
+    n = 0
+    for p in range(1, labels):
+        row = pieces.shape[min(p, pieces.group.size - 1)]
+        whole = p < pieces.group.size
+        if whole and not (row[COUNT] >= 2 * LEAST_CELLS and slope_of(row) > ROUND):
+            continue
+        n += 1
+        result[p] = n
     return result
 
 
@@ -121,21 +127,21 @@ def _add(
     height: F4,
     surfaces: Surfaces,
     labels: I4,
-    rounded: Bool,
+    rounded: I4,
     up: F8,
     side: F8,
     forward: F8,
     sums: F8,
     reach: F8,
 ) -> None:
-    """Collect the sums over the bands of each label; ``reach`` (2, labels, bands) is room."""
+    """Collect the sums over the bands of each round thing; ``reach`` (2, things, bands) is room."""
     left, right = reach[0], reach[1]
     left[:], right[:] = np.inf, -np.inf
     tangent, normal = surfaces.tangent, surfaces.normal
     for i in range(labels.shape[0]):
         for j in range(surfaces.spans[i, 0], surfaces.spans[i, 1]):
-            p = labels[i, j]
-            if not (rounded[p] and tangent[i, 0, j] > 0):
+            p = rounded[labels[i, j]]
+            if not (p > 0 and tangent[i, 0, j] > 0):
                 continue
             if normal[i, 0, j] * up[0] + normal[i, 1, j] * up[1] + normal[i, 2, j] * up[2] > STEEP:
                 continue
