@@ -22,6 +22,7 @@ from shapecat.detection.pieces import (
     Pieces,
 )
 from shapecat.detection.segmentation import Segmentation
+from shapecat.detection.surfaces import span_of
 from shapecat.geometry import gravity_rotation, quaternion_from_rotation
 from shapecat.jit import kernel
 
@@ -53,12 +54,11 @@ def stands_of(found: Segmentation) -> list[Stand]:
     """
     pieces, leaders = found.pieces, found.leaders
     result = []
-    for p in leaders[1:]:
+    met = pieces.pairs[ONTO][leaders[1:, None], leaders]
+    for p, onto, k in zip(leaders[1:], met, met.argmax(axis=1), strict=True):
         best, height = 0, 0.0
-        onto = pieces.pairs[ONTO, p, leaders]
-        k = int(np.argmax(onto))
         if onto[k] >= 3 and onto[k] > pieces.single[p, TABLE]:
-            best, height = k, float(pieces.pairs[ONTO_HEIGHT, p, leaders[k]] / onto[k])
+            best, height = int(k), float(pieces.pairs[ONTO_HEIGHT, p, leaders[k]] / onto[k])
             if pieces.shape[p, BOTTOM] < height - SUNK_M:
                 best, height = 0, 0.0
         elif pieces.shape[p, BOTTOM] > LIFTED_M and pieces.single[p, TABLE] <= 2:
@@ -141,8 +141,10 @@ def _extents(w: F4, lens: Lens, labels: I4, level: F8, turned: F8, extents: Exte
     # Outermost cells, and every 4th inside (a ball's nearest point is inside its outline).
     number = np.zeros(count + 2, np.int64)
     chosen = np.zeros(labels.shape, np.uint8)
+    spans = np.zeros((rows, 2), np.int64)
     for i in range(rows):
-        for j in range(columns):
+        spans[i, 0], spans[i, 1] = span_of(labels[i])
+        for j in range(spans[i, 0], spans[i, 1]):
             p = labels[i, j]
             if p == 0:
                 continue
@@ -162,7 +164,7 @@ def _extents(w: F4, lens: Lens, labels: I4, level: F8, turned: F8, extents: Exte
     start = place.copy()
     local = np.zeros((3, place[-1]), np.float32)
     for i in range(rows):
-        for j in range(columns):
+        for j in range(spans[i, 0], spans[i, 1]):
             if chosen[i, j]:
                 k = place[labels[i, j]]
                 place[labels[i, j]] += 1

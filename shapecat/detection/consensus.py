@@ -45,24 +45,20 @@ class Readings(NamedTuple):
 def readings_of(cells: Cells, owner: I4 | None = None) -> Readings:
     """Return evenly spaced cells with a reading, those of objects if there is an ``owner``."""
     stride = max(1, round(math.sqrt(cells.w.size / SAMPLE)))
-    grid = (slice(stride // 2, None, stride),) * 2
-    sample = cells.w[grid]
-    if owner is not None:
-        sample = np.where(owner[grid] > 0, sample, np.float32(0))
-    j, i, w = _listed(np.ascontiguousarray(sample), stride)
+    j, i, w = _listed(cells.w, cells.w if owner is None else owner, stride)
     return Readings(j, i, w, stride * stride)
 
 
 @kernel
-def _listed(sample: F4, stride: int) -> tuple[F4, F4, F4]:
-    """Return the columns, rows and values of what is not 0 among every so many cells."""
-    result = np.zeros((3, sample.size), np.float32)
+def _listed(w: F4, wanted: F4, stride: int) -> tuple[F4, F4, F4]:
+    """Return the columns, rows and values above 0 of every so many cells, where ``wanted`` is."""
+    rows, columns = w.shape
+    result = np.zeros((3, (rows // stride + 1) * (columns // stride + 1)), np.float32)
     n = 0
-    for i in range(sample.shape[0]):
-        for j in range(sample.shape[1]):
-            if sample[i, j] > 0:
-                result[0, n], result[1, n] = j * stride + stride // 2, i * stride + stride // 2
-                result[2, n] = sample[i, j]
+    for i in range(stride // 2, rows, stride):
+        for j in range(stride // 2, columns, stride):
+            if w[i, j] > 0 and wanted[i, j] > 0:
+                result[0, n], result[1, n], result[2, n] = j, i, w[i, j]
                 n += 1
     return result[0, :n], result[1, :n], result[2, :n]
 

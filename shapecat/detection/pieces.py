@@ -387,8 +387,8 @@ def merge(pieces: Pieces, p: int, q: int) -> None:
 def depths_of(pieces: Pieces) -> F4:
     """Return the mean depth of each piece, metres; 1 where it has no cell."""
     shape = pieces.shape
-    far, count = shape[:, FAR], shape[:, COUNT]
-    return np.asarray(np.divide(far, count, out=np.ones_like(far), where=count > 0))
+    count = shape[:, COUNT]
+    return np.asarray((shape[:, FAR] + (count == 0)) / np.maximum(count, 1))
 
 
 @kernel(leaf=True)

@@ -93,7 +93,8 @@ def _above(points: F4, cell: I4, lens: Lens, plane: F8) -> Bool:
 
 
 def _sorted(marks: I4, sizes: I4) -> list[U4]:
-    starts = np.concatenate([[0, 0], np.cumsum(sizes[1:])])
+    starts = np.zeros(sizes.size + 1, np.int64)
+    np.cumsum(sizes[1:], out=starts[2:])
     # Label 0 has a list of size 0.
     order = np.zeros(int(starts[-1]), np.uint32)
     _sort(marks, starts[:-1].copy(), order)

@@ -19,6 +19,7 @@ from shapecat.geometry import (
     transform,
     upright_box,
 )
+from shapecat.jit import kernel
 from shapecat.types import Box, Candidate, Plane, Pose, Scene
 
 __all__ = ["scene_of"]
@@ -99,21 +100,30 @@ def _cut(cells: Cells, extents: Extents) -> Bool:
     result = np.zeros(len(extents.low), bool)
     reach = max(1, round(2 / cells.factor))
     for axis in range(2):
-        lines = cells.w if axis == 0 else cells.w.T
-        last = len(lines) - 1
-        result |= extents.low[:, axis] < _begin(lines, reach) + reach
-        result |= extents.high[:, axis] > last - _begin(lines[::-1], reach) - reach
+        last = cells.w.shape[axis] - 1
+        result |= extents.low[:, axis] < _begin(cells.w, axis, 1, reach) + reach
+        result |= extents.high[:, axis] > last - _begin(cells.w, axis, -1, reach) - reach
     return result
 
 
-def _begin(lines: F4, reach: int) -> int:
+@kernel(leaf=True)
+def _begin(w: F4, axis: int, step: int, reach: int) -> int:
     """Return the line at which the readings begin: the first with any, if more than one thing is.
 
-    The top of a tall thing with nothing behind it is no border.
+    The top of a tall thing with nothing behind it is no border. Lines are rows (``axis`` 0) or
+    columns, from the first on or, with ``step`` -1, from the last.
     """
-    first = int(np.argmax(lines[: math.ceil(BORDER * len(lines))].any(axis=1)))
-    seen = np.flatnonzero(lines[first : first + reach].any(axis=0))
-    return first if seen.size and np.ptp(seen) > STRAIGHT * lines.shape[1] else 0
+    lines, length = w.shape[axis], w.shape[1 - axis]
+    first, low, high = -1, length, -1
+    for k in range(math.ceil(BORDER * lines)):
+        if first >= 0 and k >= first + reach:
+            break
+        line = k if step > 0 else lines - 1 - k
+        for n in range(length):
+            if (w[line, n] if axis == 0 else w[n, line]) > 0:
+                first = k if first < 0 else first
+                low, high = min(low, n), max(high, n)
+    return first if first >= 0 and high - low > STRAIGHT * length else 0
 
 
 def _out_of_range(cells: Cells, found: Segmentation, range_m: float) -> Bool:
