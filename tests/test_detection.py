@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from shapecat.config import DetectionSettings
 from shapecat.detection import Hierarchy, Node, detect, format_tree
+from shapecat.detection.cells import place_of
 from shapecat.errors import ConfigError
 from shapecat.types import Camera, Frame, Scene
 
@@ -720,3 +721,11 @@ def test_a_row_of_boxes_is_no_wall() -> None:
     """The fronts of boxes in line lie in one upright plane, 0.75 m wide."""
     row = [box((0.16 * k - 0.32, 0, 0), (0.11, 0.08, 0.16)) for k in range(5)]
     check([table(0.6, 0.4), *row], [1, 2, 3, 4, 5], tilt_deg=25, distance=1.2)
+
+
+@pytest.mark.parametrize("columns", [1, 3, 213, 320, 641, 1999])
+def test_places_of_flat_cells_are_exact(columns: int) -> None:
+    """A product stands for a division: the first cell of a row must not fall into the one above."""
+    for i in (0, 1, 7, 199, 1999):
+        assert place_of(i * columns, columns) == (i, 0)
+        assert place_of(i * columns + columns - 1, columns) == (i, columns - 1)
