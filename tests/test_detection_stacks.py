@@ -67,6 +67,23 @@ def test_neighbour_that_hides_where_it_stands_is_no_handle(seed: int, label: int
     assert overlap_in_clutter(seed, [label]) > 0.8
 
 
+@pytest.mark.parametrize(("seed", "labels"), [(400, [20, 21]), (532, [21]), (708, [21])])
+def test_what_stands_on_a_top_seen_edge_on_is_no_part_of_it(seed: int, labels: list[int]) -> None:
+    """A can on a box shows nothing of the top that bears it, but a step at its foot."""
+    assert overlap_in_clutter(seed, labels) > 0.8
+
+
+@pytest.mark.parametrize(("seed", "labels"), [(541, [26]), (651, [23]), (944, [29])])
+def test_what_leans_above_another_does_not_hang_on_it(seed: int, labels: list[int]) -> None:
+    """It ends in the air, but is too wide for a handle or rises far above what it would be of."""
+    assert overlap_in_clutter(seed, labels) > 0.8
+
+
+def test_what_is_a_step_before_the_side_of_a_can_is_no_neck() -> None:
+    """A bowl of the width of the can that it stands on hides the top of that."""
+    assert overlap_in_clutter(464, [20, 27]) > 0.8
+
+
 @pytest.mark.parametrize(("seed", "label"), [(316, 20), (329, 29), (433, 27)])
 def test_two_sides_of_one_object(seed: int, label: int) -> None:
     """What is in front of its middle hides where they meet: a box, a plate and a bowl."""

@@ -51,19 +51,22 @@ WHOLE = 1.6
 STANDS, ON_TOP, RISES_M = 0.25, 0.5, 0.005
 """What stands on something is linked to surface that faces up, and reaches so far above it; where
 all else says that it does not, along the second share of its contacts."""
+RISES, STEPPED = 0.33, 0.2
+"""What stands on a top that is not seen: share of its height above that; places where depth jumps
+to it, by the links."""
 HANGS, ALONG = 0.4, 0.15
 """Of a handle that reaches down to the plane: most links with that, as a share of those with
 pieces; least share of its boundary along what it hangs on."""
-IN_AIR_M, IN_AIR, HANGING = 0.02, 0.08, 1.2
+IN_AIR_M, IN_AIR, HANGING, HIGHER_M = 0.02, 0.08, 0.4, 0.02
 """Of what hangs: least height; least share of its boundary above what is farther away; width, by
-that of what it hangs on."""
+that of what it hangs on, and how far it may rise above that, metres."""
 SCRAP, TURNED = 100, 1.3
 """Cells of a scrap, and `slope_of` below which it is no small ball or can."""
 FRAGMENT, BEARS = 160, 0.2
 """Cells of a fragment; share of the boundary of what bears something along the plane."""
-NECK_WIDTH, NECK_LEDGE = 0.7, 0.1
-"""A neck on what faces up along more than this share of its border is narrower, by the width of the
-body."""
+NECK_WIDTH, NECK_LEDGE, NECK_STEPPED = 0.7, 0.1, 0.1
+"""A neck is narrower, by the width of the body, on what faces up along more than this share of its
+border, or with a step along so much of it."""
 NECK_APART, NECK_OUT, NECK_TALL, NECK_OVERLAP_M = 0.2, 0.05, 1.1, 0.03
 """How far its middle is off that of the body, and its side beyond that of the body, by the width of
 the body; its height, by that of the body; how far it may begin below the top of the body, metres.
@@ -148,7 +151,8 @@ def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
         return False
     narrow, wide = a[RIGHTMOST] - a[LEFT], b[RIGHTMOST] - b[LEFT]
     ledge = pieces.pairs[ONTO, p, q] > NECK_LEDGE * pieces.pairs[CONTACT, p, q]
-    if narrow > (NECK_WIDTH if ledge or rests_on(pieces, p, q) else 1.0) * wide:
+    ledge |= rests_on(pieces, p, q) or _is_stepped(pieces, p, q, NECK_STEPPED)
+    if narrow > (NECK_WIDTH if ledge else 1.0) * wide:
         return False
     apart = abs(a[LEFT] + a[RIGHTMOST] - b[LEFT] - b[RIGHTMOST]) / 2
     if apart > min(NECK_APART * wide, (wide - narrow) / 2 + NECK_OUT * wide):
@@ -267,7 +271,9 @@ def _is_within_reach(pieces: Pieces, p: int, q: int) -> bool:
     a, b = pieces.shape[p], pieces.shape[q]
     wide = b[RIGHTMOST] - b[LEFT]
     behind = a[FAR] / a[COUNT] - b[FAR] / b[COUNT]
-    return bool(a[RIGHTMOST] - a[LEFT] < HANGING * wide and abs(behind) < wide / 2)
+    if a[RIGHTMOST] - a[LEFT] > HANGING * wide or a[TOP] > b[TOP] + HIGHER_M:
+        return False
+    return bool(abs(behind) < wide / 2)
 
 
 @kernel(leaf=True)
@@ -328,7 +334,26 @@ def _is_part(pieces: Pieces, p: int, q: int) -> bool:
     if pieces.single[p, TABLE] > 0 and pieces.pairs[CONTACT, p, q] < ALONG * pieces.boundary[p]:
         return False
     stands = _links_onto_lower(pieces, p) >= STANDS * np.sum(pieces.pairs[CONTACT, p])
+    stands |= _is_atop(pieces, p, q)
     return bool(not stands and slope_of(pieces.shape[p]) < WHOLE and _is_smaller(pieces, p, q))
+
+
+@kernel(leaf=True)
+def _is_atop(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether piece ``p`` rises above ``q``, and a part of their border is a step.
+
+    So does what stands on a top that is seen edge on; what grows out of a body does so smoothly.
+    """
+    a, b = pieces.shape[p], pieces.shape[q]
+    rises = a[TOP] - b[TOP] > RISES * (a[TOP] - a[BOTTOM])
+    return bool(rises and _is_stepped(pieces, p, q, STEPPED))
+
+
+@kernel(leaf=True)
+def _is_stepped(pieces: Pieces, p: int, q: int, share: float) -> bool:
+    """Whether depth jumps from one piece to the other in so many places, by their contact."""
+    steps = pieces.pairs[FRONT, p, q] + pieces.pairs[FRONT, q, p]
+    return bool(steps > share * pieces.pairs[CONTACT, p, q])
 
 
 @kernel(leaf=True)
