@@ -84,6 +84,12 @@ def test_what_is_a_step_before_the_side_of_a_can_is_no_neck() -> None:
     assert overlap_in_clutter(464, [20, 27]) > 0.8
 
 
+@pytest.mark.parametrize(("seed", "label"), [(703, 23), (938, 20)])
+def test_tall_box_with_little_top_is_no_side_of_a_shelf(seed: int, label: int) -> None:
+    """Its faces are seen at a grazing angle too; but something of it faces up."""
+    assert overlap_in_clutter(seed, [label]) > 0.8
+
+
 @pytest.mark.parametrize(("seed", "label"), [(316, 20), (329, 29), (433, 27)])
 def test_two_sides_of_one_object(seed: int, label: int) -> None:
     """What is in front of its middle hides where they meet: a box, a plate and a bowl."""

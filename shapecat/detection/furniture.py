@@ -57,7 +57,7 @@ TOWERING = 0.5
 EDGE_ON, SPECKLED, SPECKS = 3.0, 2.3, 100
 """Surface by what it covers of the view from which it is seen edge on, whether or not many readings
 fail there: the square of its boundary by its cells is 16 for a square."""
-UPRIGHT, SLENDER, COVERED = 0.12, 0.65, 0.5
+UPRIGHT, SLENDER, COVERED = 0.03, 0.65, 0.5
 """What is seen edge on: share that faces up; width by height; and the share of its boundary behind
 other things from which they may hide the rest."""
 
