@@ -26,6 +26,8 @@ MOST = 0.006
 """Excess above which a cell counts no more in the mean, 1/m, lest it make a pit around it."""
 LEVELS = np.array([3.0, 2.0, 1.3, 0.9, 0.6, 0.4], np.float32)
 """Heights above the mean at which outlines are looked for, as multiples of the least rise."""
+FINE = 0.006
+"""Most that they are multiples of, 1/m: more is not noise but a plane at a grazing angle."""
 STEP, STEADY, SLIP = 0.002, 3.5, 0.7
 """Least mean rise across the outline of an object: 1/m; as a multiple of the median rise between
 cells of the plane that are as far apart; and as a share of what the plane itself rises in a cell,
@@ -87,7 +89,7 @@ def raise_low(
             _level(excess, relief)
             clear = max(STEP, STEADY * _noise(relief, heights.owner, k + 1))
             step = max(clear, SLIP * math.hypot(plane[0], plane[1]))
-            levels = np.float32(clear) * LEVELS
+            levels = np.float32(min(clear, FINE)) * LEVELS
             widest = largest_m * cells.lens.fx
             objects = _raise(
                 cells.w, relief, heights.owner, k + 1, step, levels, raised, widest, objects, stacks
