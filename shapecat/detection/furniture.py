@@ -36,7 +36,7 @@ __all__ = [
 ]
 
 RIM_LINKS, RIM_SHARE = 8, 0.1
-FAINT, FAINT_NOISE, FAINT_M2, FAINT_CELLS = 2.5, 3.5, 3e-3, 120
+FAINT, FAINT_NOISE, FAINT_M2, FAINT_CELLS = 2.5, 3.5, 3e-3, 250
 """A piece this small must rise so many times above the least height of an object cell, and of the
 noise in it: spots of noise gather where there is much of a plane far away."""
 POST_M = 0.06
