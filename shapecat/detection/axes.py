@@ -12,8 +12,9 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.cells import Cells, Lens
 from shapecat.detection.heights import Heights
-from shapecat.detection.pieces import BAND_M, BANDS, COUNT, Pieces, side_of, slope_of
+from shapecat.detection.pieces import BAND_M, BANDS, COUNT, Pieces, side_of
 from shapecat.detection.surfaces import Surfaces
+from shapecat.detection.traits import slope_of
 from shapecat.geometry import cross
 from shapecat.jit import kernel
 

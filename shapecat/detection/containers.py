@@ -6,7 +6,6 @@ from shapecat.detection.pieces import (
     BOTTOM,
     CONTACT,
     COUNT,
-    FAR,
     FEW,
     FRONT,
     HIDDEN,
@@ -16,11 +15,10 @@ from shapecat.detection.pieces import (
     TABLE,
     TOP,
     Pieces,
-    has_lid,
-    is_group,
+    may_join,
     merge,
-    slope_of,
 )
+from shapecat.detection.traits import apart, behind, has_lid, is_within, slope_of, width_of
 from shapecat.jit import kernel
 
 __all__ = ["join_hollow", "join_overhangs", "join_rims"]
@@ -57,21 +55,19 @@ how much of the above it may hide in turn, as a share of that."""
 def join_hollow(pieces: Pieces) -> None:
     """Join the walls and the floor inside a container, which meet in concave edges."""
     n = pieces.group.size
-    contact = pieces.pairs[CONTACT]
     again = True
     while again:
         again = False
         for p in range(1, n):
             for q in range(1, n):
-                if (
-                    contact[p, q] >= FEW
-                    and is_group(pieces, p)
-                    and is_group(pieces, q)
-                    and pieces.owner[p] == pieces.owner[q]
-                    and (_is_inside(pieces, p, q) or _is_floor(pieces, p, q))
-                ):
+                if _touch(pieces, p, q) and (_is_inside(pieces, p, q) or _is_floor(pieces, p, q)):
                     merge(pieces, p, q)
                     again = True
+
+
+@kernel(leaf=True)
+def _touch(pieces: Pieces, p: int, q: int) -> bool:
+    return bool(pieces.pairs[CONTACT, p, q] >= FEW and may_join(pieces, p, q))
 
 
 @kernel
@@ -79,8 +75,7 @@ def _is_inside(pieces: Pieces, p: int, q: int) -> bool:
     """Whether two pieces that touch are walls facing each other."""
     if pieces.shape[p, COUNT] < pieces.shape[q, COUNT]:
         return False
-    contact = pieces.pairs[CONTACT, p, q]
-    if contact < max(FEW, INSIDE_SHARE * min(pieces.boundary[p], pieces.boundary[q])):
+    if pieces.pairs[CONTACT, p, q] < INSIDE_SHARE * min(pieces.boundary[p], pieces.boundary[q]):
         return False
     a, b = pieces.shape[p], pieces.shape[q]
     if (slope_of(a) > BENT or slope_of(b) > BENT) and not _are_walls(pieces, p, q):
@@ -100,13 +95,12 @@ def _are_walls(pieces: Pieces, p: int, q: int) -> bool:
 
 @kernel(leaf=True)
 def _is_floor(pieces: Pieces, p: int, q: int) -> bool:
-    """Whether ``q`` lies within the hollow piece ``p`` and lower."""
+    """Whether ``q``, which touches the hollow piece ``p``, lies within it and lower."""
     if pieces.shape[q, TOP] > pieces.shape[p, TOP]:
         return False
     shared = pieces.pairs[CONTACT, p, q] + pieces.pairs[FRONT, p, q]
     share = FLOOR_SHARE if slope_of(pieces.shape[p]) <= HOLLOW else WITHIN
-    enclosed = shared > share * pieces.boundary[q] or _is_low_floor(pieces, p, q)
-    return bool(enclosed and pieces.pairs[CONTACT, p, q] >= FEW)
+    return bool(shared > share * pieces.boundary[q] or _is_low_floor(pieces, p, q))
 
 
 @kernel(leaf=True)
@@ -118,9 +112,9 @@ def _is_low_floor(pieces: Pieces, p: int, q: int) -> bool:
     """
     a, x, pairs = pieces.shape[p], pieces.shape[q], pieces.pairs
     before, touching = pairs[FRONT, p, q], pairs[CONTACT, p, q]
-    if x[TOP] > LOW_FLOOR * a[TOP] or min(before, touching) < FEW or has_lid(pieces, p):
+    if x[TOP] > LOW_FLOOR * a[TOP] or before < FEW or has_lid(pieces, p):
         return False
-    if x[LEFT] < a[LEFT] - SAME_SIDE_M or x[RIGHTMOST] > a[RIGHTMOST] + SAME_SIDE_M:
+    if not is_within(x, a, SAME_SIDE_M):
         return False
     if a[BOTTOM] > x[BOTTOM] + SAME_TOP_M:  # what is under a body that begins higher is no floor
         return False
@@ -143,61 +137,47 @@ def join_rims(pieces: Pieces) -> None:
         again = False
         for inside in range(1, n):
             for outside in range(1, n):
-                if inside != outside and _is_container(pieces, inside, outside):
+                if may_join(pieces, inside, outside) and _is_container(pieces, inside, outside):
                     merge(pieces, outside, inside)
                     again = True
     for inside in range(1, n):
         for outside in range(1, n):
-            if inside != outside and _are_halves(pieces, inside, outside):
+            if may_join(pieces, inside, outside) and _are_halves(pieces, inside, outside):
                 merge(pieces, outside, inside)
     for whole in range(1, n):
         for floor in range(1, n):
-            if (
-                whole != floor
-                and is_group(pieces, whole)
-                and is_group(pieces, floor)
-                and pieces.owner[whole] == pieces.owner[floor]
-                and _is_floor(pieces, whole, floor)
-            ):
+            if _touch(pieces, whole, floor) and _is_floor(pieces, whole, floor):
                 merge(pieces, whole, floor)
 
 
 @kernel(leaf=True)
 def _are_halves(pieces: Pieces, inside: int, outside: int) -> bool:
     """Whether two pieces are the far and the near half of one round wall."""
-    if not (is_group(pieces, inside) and is_group(pieces, outside)):
-        return False
     a, x = pieces.shape[outside], pieces.shape[inside]
-    if pieces.owner[outside] != pieces.owner[inside] or abs(a[TOP] - x[TOP]) > SAME_TOP_M:
+    if abs(a[TOP] - x[TOP]) > SAME_TOP_M:
         return False
     if slope_of(a) < ARC or slope_of(x) > -ARC:
         return False
-    near, far = a[RIGHTMOST] - a[LEFT], x[RIGHTMOST] - x[LEFT]
-    apart = abs(a[LEFT] + a[RIGHTMOST] - x[LEFT] - x[RIGHTMOST]) / 2
+    near, far = width_of(a), width_of(x)
     wide = max(near, far)
-    if min(near, far) < ARC_WIDTH * wide or apart > ARC_APART * wide:
+    if min(near, far) < ARC_WIDTH * wide or apart(a, x) > ARC_APART * wide:
         return False
-    behind = x[FAR] / x[COUNT] - a[FAR] / a[COUNT]
-    if not ARC_BEHIND[0] * wide < behind < ARC_BEHIND[1] * wide:
+    if not ARC_BEHIND[0] * wide < behind(x, a) < ARC_BEHIND[1] * wide:
         return False
     return not (has_lid(pieces, outside) or has_lid(pieces, inside))
 
 
 @kernel(leaf=True)
 def _is_container(pieces: Pieces, inside: int, outside: int) -> bool:
-    if not (is_group(pieces, inside) and is_group(pieces, outside)):
-        return False
+    """Whether one piece is the far inside, seen over the near rim, of another as high and wide."""
     pairs = pieces.pairs
     touch = pairs[CONTACT, inside, outside] + pairs[NEAR, inside, outside]
     if max(touch, pairs[FRONT, outside, inside]) < FEW:
         return False
     a, x = pieces.shape[outside], pieces.shape[inside]
-    if pieces.owner[outside] != pieces.owner[inside] or abs(a[TOP] - x[TOP]) > SAME_TOP_M:
+    if abs(a[TOP] - x[TOP]) > SAME_TOP_M:
         return False
-    inner = x[RIGHTMOST] - x[LEFT]
-    width = max(a[RIGHTMOST] - a[LEFT], inner)
-    slack = max(SAME_SIDE_M, SAME_SIDE * width)
-    if x[LEFT] < a[LEFT] - slack or x[RIGHTMOST] > a[RIGHTMOST] + slack:
+    if not is_within(x, a, max(SAME_SIDE_M, SAME_SIDE * max(width_of(a), width_of(x)))):
         return False
     # Where they touch, ending at one height without a lid says enough: within small cups the
     # windows of the tangents smear the curvature.
@@ -213,11 +193,10 @@ def _is_far_rim(pieces: Pieces, far: int, near: int) -> bool:
     Of a container at the level of the camera little else is seen of the inside.
     """
     a, x = pieces.shape[near], pieces.shape[far]
-    long, wide = x[RIGHTMOST] - x[LEFT], a[RIGHTMOST] - a[LEFT]
-    apart = abs(x[LEFT] + x[RIGHTMOST] - a[LEFT] - a[RIGHTMOST]) / 2
-    along = long > FAR_LONG * wide and apart < FAR_APART * wide
-    behind = pieces.pairs[FRONT, near, far] > FAR_BEHIND * pieces.boundary[far]
-    return bool(along and behind and x[TOP] - x[BOTTOM] < FAR_FLAT * long)
+    long, wide = width_of(x), width_of(a)
+    along = long > FAR_LONG * wide and apart(x, a) < FAR_APART * wide
+    hidden = pieces.pairs[FRONT, near, far] > FAR_BEHIND * pieces.boundary[far]
+    return bool(along and hidden and x[TOP] - x[BOTTOM] < FAR_FLAT * long)
 
 
 @kernel
@@ -229,7 +208,7 @@ def join_overhangs(pieces: Pieces) -> None:
     n = pieces.group.size
     for near in range(1, n):
         for whole in range(1, n):
-            if near != whole and (
+            if may_join(pieces, near, whole) and (
                 _is_under(pieces, near, whole)
                 or _is_strip(pieces, near, whole)
                 or _is_wall(pieces, near, whole)
@@ -240,21 +219,20 @@ def join_overhangs(pieces: Pieces) -> None:
 
 @kernel(leaf=True)
 def _is_under(pieces: Pieces, under: int, above: int) -> bool:
-    if not (is_group(pieces, under) and is_group(pieces, above)):
-        return False
+    """Whether one piece is small and shows below the rim of another, nearer than its middle."""
     a, u = pieces.shape[above], pieces.shape[under]
-    if pieces.owner[above] != pieces.owner[under] or u[COUNT] > UNDER * a[COUNT]:
+    if u[COUNT] > UNDER * a[COUNT]:
         return False
     covered = pieces.pairs[FRONT, above, under]
     if covered < max(FEW, COVERED * pieces.boundary[under]):
         return False
     if pieces.pairs[FRONT, under, above] > COVERING * covered:
         return False
-    if u[LEFT] < a[LEFT] - SAME_SIDE_M or u[RIGHTMOST] > a[RIGHTMOST] + SAME_SIDE_M:
+    if not is_within(u, a, SAME_SIDE_M):
         return False
     if not a[BOTTOM] < u[TOP] <= a[TOP] or _bears(pieces, under, above):
         return False
-    return bool(u[FAR] / u[COUNT] < a[FAR] / a[COUNT])
+    return bool(behind(a, u) > 0)
 
 
 @kernel(leaf=True)
@@ -268,19 +246,17 @@ def _bears(pieces: Pieces, under: int, above: int) -> bool:
 @kernel(leaf=True)
 def _is_strip(pieces: Pieces, strip: int, whole: int) -> bool:
     """Whether a long low piece without a lid stands before the floor of a flat container."""
-    if not (is_group(pieces, strip) and is_group(pieces, whole)):
-        return False
     a, s = pieces.shape[whole], pieces.shape[strip]
-    if pieces.owner[whole] != pieces.owner[strip] or s[COUNT] > a[COUNT]:
+    if s[COUNT] > a[COUNT]:
         return False
     if pieces.pairs[FRONT, strip, whole] < BEFORE * pieces.boundary[strip]:
         return False
-    if s[LEFT] < a[LEFT] - SAME_SIDE_M or s[RIGHTMOST] > a[RIGHTMOST] + SAME_SIDE_M:
+    if not is_within(s, a, SAME_SIDE_M):
         return False
-    long, wide = s[RIGHTMOST] - s[LEFT], a[RIGHTMOST] - a[LEFT]
+    long, wide = width_of(s), width_of(a)
     if s[TOP] - s[BOTTOM] > FLAT * long or a[TOP] > FLAT * wide:
         return False
-    if abs(a[TOP] - s[TOP]) > SAME_TOP_M or a[FAR] / a[COUNT] - s[FAR] / s[COUNT] > AHEAD * wide:
+    if abs(a[TOP] - s[TOP]) > SAME_TOP_M or behind(a, s) > AHEAD * wide:
         return False
     return not has_lid(pieces, strip)
 
@@ -291,10 +267,8 @@ def _is_wall(pieces: Pieces, wall: int, whole: int) -> bool:
 
     So do the parts of a dish. Its floor is so near to its top that it seems to have a lid.
     """
-    if not (is_group(pieces, wall) and is_group(pieces, whole)):
-        return False
     a, x = pieces.shape[whole], pieces.shape[wall]
-    if pieces.owner[whole] != pieces.owner[wall] or x[COUNT] > a[COUNT]:
+    if x[COUNT] > a[COUNT]:
         return False
     if pieces.pairs[CONTACT, wall, whole] == 0 or abs(a[TOP] - x[TOP]) > SAME_LEVEL_M:
         return False

@@ -12,30 +12,33 @@ from shapecat.detection.pieces import (
     BOTTOM,
     CONTACT,
     COUNT,
-    FAR,
     FEW,
     FRONT,
     HIDDEN,
-    LEFT,
-    LID_M,
-    MEETS_M,
     NEAR,
     ONTO,
     OVER,
-    RIGHTMOST,
     TABLE,
     TOP,
     Pieces,
     depths_of,
-    has_lid,
     is_group,
-    lid_share,
+    may_join,
     merge,
+)
+from shapecat.detection.surfaces import Surfaces
+from shapecat.detection.traits import (
+    LID_M,
+    MEETS_M,
+    apart,
+    behind,
+    has_lid,
+    lid_share,
     rests_on,
     roundness_of,
     slope_of,
+    width_of,
 )
-from shapecat.detection.surfaces import Surfaces
 from shapecat.jit import kernel
 
 __all__ = ["join_pieces"]
@@ -133,11 +136,8 @@ def _join_necks(pieces: Pieces) -> None:
     n = pieces.group.size
     for p in range(1, n):
         for q in range(1, n):
-            if (
-                p != q
-                and is_group(pieces, p)
-                and is_group(pieces, q)
-                and (_is_neck(pieces, p, q) or _has_foot(pieces, p, q) or _is_lid(pieces, p, q))
+            if may_join(pieces, p, q) and (
+                _is_neck(pieces, p, q) or _has_foot(pieces, p, q) or _is_lid(pieces, p, q)
             ):
                 merge(pieces, q, p)
                 break
@@ -145,17 +145,21 @@ def _join_necks(pieces: Pieces) -> None:
 
 @kernel(leaf=True)
 def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether piece ``p`` is narrow and rises from the middle of ``q``, which is round and open.
+
+    What stands on something is linked to its top, rests on it, or is parted from it by a step.
+    """
     a, b = pieces.shape[p], pieces.shape[q]
     met = pieces.pairs[CONTACT, p, q] + pieces.pairs[NEAR, p, q]
-    if met < FEW or pieces.owner[p] != pieces.owner[q] or pieces.single[p, TABLE] > 2:
+    if met < FEW or pieces.single[p, TABLE] > 2:
         return False
-    narrow, wide = a[RIGHTMOST] - a[LEFT], b[RIGHTMOST] - b[LEFT]
+    narrow, wide = width_of(a), width_of(b)
     ledge = pieces.pairs[ONTO, p, q] > NECK_LEDGE * pieces.pairs[CONTACT, p, q]
     ledge |= rests_on(pieces, p, q) or _is_stepped(pieces, p, q, NECK_STEPPED)
     if narrow > (NECK_WIDTH if ledge else 1.0) * wide:
         return False
-    apart = abs(a[LEFT] + a[RIGHTMOST] - b[LEFT] - b[RIGHTMOST]) / 2
-    if apart > min(NECK_APART * wide, (wide - narrow) / 2 + NECK_OUT * wide):
+    off = apart(a, b)
+    if off > min(NECK_APART * wide, (wide - narrow) / 2 + NECK_OUT * wide):
         return False
     if a[TOP] < b[TOP] or a[BOTTOM] < b[TOP] - NECK_OVERLAP_M:
         return False
@@ -163,7 +167,7 @@ def _is_neck(pieces: Pieces, p: int, q: int) -> bool:
         return False
     if slope_of(b) < BULGING or roundness_of(b) < ROUND:
         return False
-    shoulder = apart < ON_AXIS * wide and lid_share(pieces, q, LID_M) < SHOULDER
+    shoulder = off < ON_AXIS * wide and lid_share(pieces, q, LID_M) < SHOULDER
     return bool(shoulder or not has_lid(pieces, q))
 
 
@@ -176,7 +180,7 @@ def _has_foot(pieces: Pieces, p: int, q: int) -> bool:
     """
     a, b = pieces.shape[p], pieces.shape[q]
     contact = pieces.pairs[CONTACT, p, q]
-    if contact < FEW or pieces.owner[p] != pieces.owner[q] or pieces.single[p, TABLE] > 2:
+    if contact < FEW or pieces.single[p, TABLE] > 2:
         return False
     if a[TOP] < b[TOP] or not -NECK_OVERLAP_M < a[BOTTOM] - b[TOP] < -MEETS_M:
         return False
@@ -184,11 +188,10 @@ def _has_foot(pieces: Pieces, p: int, q: int) -> bool:
         return False
     if pieces.pairs[ONTO, p, q] > NECK_LEDGE * contact or lid_share(pieces, q, LID_M) > BARE:
         return False
-    width, foot = a[RIGHTMOST] - a[LEFT], b[RIGHTMOST] - b[LEFT]
-    apart = abs(a[LEFT] + a[RIGHTMOST] - b[LEFT] - b[RIGHTMOST]) / 2
+    width, foot, off = width_of(a), width_of(b), apart(a, b)
     if slope_of(a) > BULGING and WAIST[0] * foot < width < WAIST[1] * foot:
-        return bool(apart < COAXIAL * width)
-    return bool(b[TOP] < FOOT_M and FOOT * width < foot < width and apart < FOOT_APART * width)
+        return bool(off < COAXIAL * width)
+    return bool(b[TOP] < FOOT_M and FOOT * width < foot < width and off < FOOT_APART * width)
 
 
 @kernel(leaf=True)
@@ -269,11 +272,10 @@ def _is_within_reach(pieces: Pieces, p: int, q: int) -> bool:
     if pieces.owner[p] != pieces.owner[q] or not _is_smaller(pieces, p, q):
         return False
     a, b = pieces.shape[p], pieces.shape[q]
-    wide = b[RIGHTMOST] - b[LEFT]
-    behind = a[FAR] / a[COUNT] - b[FAR] / b[COUNT]
-    if a[RIGHTMOST] - a[LEFT] > HANGING * wide or a[TOP] > b[TOP] + HIGHER_M:
+    wide = width_of(b)
+    if width_of(a) > HANGING * wide or a[TOP] > b[TOP] + HIGHER_M:
         return False
-    return bool(abs(behind) < wide / 2)
+    return bool(abs(behind(a, b)) < wide / 2)
 
 
 @kernel(leaf=True)
@@ -351,7 +353,7 @@ def _is_atop(pieces: Pieces, p: int, q: int) -> bool:
 
 @kernel(leaf=True)
 def _is_stepped(pieces: Pieces, p: int, q: int, share: float) -> bool:
-    """Whether depth jumps from one piece to the other in so many places, by their contact."""
+    """Whether depth jumps between two pieces in more than this share of their links."""
     steps = pieces.pairs[FRONT, p, q] + pieces.pairs[FRONT, q, p]
     return bool(steps > share * pieces.pairs[CONTACT, p, q])
 

@@ -9,16 +9,9 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import Cells
 from shapecat.detection.heights import Heights
-from shapecat.detection.pieces import (
-    BAND_M,
-    BANDS,
-    BOTTOM,
-    TOP,
-    Pieces,
-    roundness_of,
-    side_of,
-)
+from shapecat.detection.pieces import BAND_M, BANDS, BOTTOM, TOP, Pieces, side_of
 from shapecat.detection.surfaces import Surfaces
+from shapecat.detection.traits import roundness_of
 from shapecat.jit import kernel
 
 __all__ = ["cut_at_ledges"]

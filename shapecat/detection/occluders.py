@@ -14,11 +14,10 @@ from shapecat.detection.pieces import (
     SAMPLES,
     TOP,
     Pieces,
-    is_group,
+    may_join,
     merge,
-    roundness_of,
-    slope_of,
 )
+from shapecat.detection.traits import roundness_of, slope_of, width_of
 from shapecat.jit import kernel
 
 __all__ = ["join_around", "join_behind"]
@@ -68,16 +67,15 @@ def join_around(pieces: Pieces) -> None:
     n = pieces.group.size
     for p in range(1, n):
         for q in range(1, n):
-            if is_group(pieces, p) and is_group(pieces, q) and _flank(pieces, p, q):
+            if may_join(pieces, p, q) and _flank(pieces, p, q):
                 merge(pieces, p, q)
 
 
 @kernel
 def _flank(pieces: Pieces, left: int, right: int) -> bool:
+    """Whether two pieces are the left and the right side of one object behind something."""
     a, b = pieces.shape[left], pieces.shape[right]
-    if pieces.owner[left] != pieces.owner[right] or abs(a[TOP] - b[TOP]) > SAME_TOP_M:
-        return False
-    if a[RIGHTMOST] > b[LEFT]:
+    if abs(a[TOP] - b[TOP]) > SAME_TOP_M or a[RIGHTMOST] > b[LEFT]:
         return False
     front, boundary = pieces.pairs[FRONT], pieces.boundary
     between = False
@@ -88,7 +86,7 @@ def _flank(pieces: Pieces, left: int, right: int) -> bool:
             and front[k, right] > FLANKED * boundary[right]
             and x[LEFT] < b[LEFT]
             and x[RIGHTMOST] > a[RIGHTMOST]
-            and x[RIGHTMOST] - x[LEFT] > b[LEFT] - a[RIGHTMOST]
+            and width_of(x) > b[LEFT] - a[RIGHTMOST]
         )
     if not between:
         return False
@@ -103,7 +101,7 @@ def _flank(pieces: Pieces, left: int, right: int) -> bool:
 @kernel(leaf=True)
 def _bend(row: F4) -> float:
     """Return by how much the lateral normal of a piece changes per metre."""
-    return float(slope_of(row) / max(row[RIGHTMOST] - row[LEFT], 1e-3))
+    return float(slope_of(row) / max(width_of(row), 1e-3))
 
 
 @kernel
@@ -111,7 +109,7 @@ def _continuation(
     pieces: Pieces, p: int, q: int, w: F4, lens: Lens, normal: F4, labels: I4
 ) -> float:
     """Return how well piece q continues piece p behind an occluder, 0..1; 0 if it does not."""
-    if not (is_group(pieces, p) and is_group(pieces, q)) or pieces.owner[p] != pieces.owner[q]:
+    if not may_join(pieces, p, q):
         return 0.0
     # (a) one thing is in front of both
     front = pieces.pairs[FRONT]

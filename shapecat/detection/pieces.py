@@ -1,14 +1,14 @@
-"""Pieces: what is known of each region and of each pair of regions."""
+"""Pieces: what is known of each region, and of each pair of regions (from `borders`)."""
 
 import math
 from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U1
-from shapecat.detection.cells import JUMP, Cells, Lens
+from shapecat.arrays import F4, F8, I4
+from shapecat.detection.cells import Cells, Lens
 from shapecat.detection.heights import Heights
-from shapecat.detection.surfaces import DOWN, RIGHT, Surfaces
+from shapecat.detection.surfaces import Surfaces
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 
@@ -24,8 +24,6 @@ __all__ = [
     "FRONT",
     "HIDDEN",
     "LEFT",
-    "LID_M",
-    "MEETS_M",
     "NEAR",
     "ONTO",
     "ONTO_HEIGHT",
@@ -40,18 +38,15 @@ __all__ = [
     "TOP",
     "TURN",
     "TURN2",
+    "UPWARD",
     "Pieces",
+    "choose_samples",
     "depths_of",
-    "has_lid",
     "is_group",
-    "lid_share",
-    "meet",
+    "may_join",
     "merge",
     "pieces_of",
-    "rests_on",
-    "roundness_of",
     "side_of",
-    "slope_of",
 ]
 
 CONTACT, FRONT, NEAR, ONTO, ONTO_HEIGHT = range(5)
@@ -64,22 +59,15 @@ something meets that there."""
 COUNT, LEFT, RIGHTMOST, FITTED, SIDE, SIDE2, TURN, TURN2, SIDETURN, TOP, BOTTOM, AREA, FAR = range(
     13
 )
+"""The shape of one piece, in the order of `Pieces.shape`."""
 FEW = 3
 """Links between two pieces that are taken for a contact rather than for noise."""
 SAMPLES = 48
-BANDS = 128
-LID_M, LID = 0.02, 0.3
-"""A top is closed if this share of its width squared faces up within this depth of it."""
-BAND_M = 0.005
-LEDGE_M2, FLAT, MEETS_M = 4e-4, 0.9, 0.0075
-LEVEL, SLOPING = 3, 8
-"""A level top: least visible area, and share of what faces up in the upper `SLOPING` bands that is
-in the upper `LEVEL` ones; how far what stands on it may seem to begin above or below it."""
-GAP, SHADOW = 3, 15
-INWARD = 3
+"""Most cells, evenly spaced, that stand for a piece where to look at all would take too long."""
+BAND_M, BANDS = 0.005, 128
+"""Height of a band, and their number; what is higher counts in the last one."""
 UPWARD = 0.8
-DOWNWARD = 0.7
-"""Cosine of the largest angle, in the image, of a neighbour below to straight down."""
+"""Cosine of the largest angle to up of the normal of what faces up."""
 
 
 class Pieces(NamedTuple):
@@ -111,7 +99,7 @@ class Pieces(NamedTuple):
 def pieces_of(
     cells: Cells, heights: Heights, surfaces: Surfaces, labels: I4, n: int, up: F8
 ) -> Pieces:
-    """Collect the statistics of regions 1..n; those of their pairs are up to `meet`."""
+    """Collect the shapes of regions 1..n; what they meet, and samples, are up to `borders.meet`."""
     size = n + 1
     pieces = Pieces(
         np.zeros((5, size, size), np.float32),
@@ -127,141 +115,12 @@ def pieces_of(
     return pieces
 
 
-@kernel
-def meet(w: F4, heights: Heights, surfaces: Surfaces, labels: I4, up: F8, pieces: Pieces) -> None:
-    """Collect the statistics of pairs of pieces, and their samples."""
-    owner, height = heights.owner, heights.height
-    change = np.zeros(w.shape[1], np.uint8)
-    _meet(w, owner, height, surfaces.links, surfaces.normal, labels, up, change, pieces)
-    _choose_samples(surfaces, labels, pieces)
-
-
 def side_of(up: F8) -> F8:
     """Return the horizontal direction across the view, (3,) unit."""
     across = math.hypot(up[0], up[1])
     if across < 0.2:  # the camera looks straight down
         return np.asarray(gravity_rotation(up)[0])
     return np.array([up[1] / across, -up[0] / across, 0.0])
-
-
-@kernel(leaf=True)
-def _meet(
-    w: F4,
-    owner: I4,
-    height: F4,
-    links: U1,
-    normal: F4,
-    labels: I4,
-    up: F8,
-    change: U1,
-    pieces: Pieces,
-) -> None:
-    rows, columns = w.shape
-    steep = DOWNWARD * math.hypot(up[0], up[1])
-    for i in range(rows):
-        if not _find_changes(links[i], labels[i], labels[min(i + 1, rows - 1)], change):
-            continue
-        for j in range(columns):
-            p = labels[i, j]
-            if change[j] == 0 or w[i, j] <= 0 or (p == 0 and owner[i, j] > 0):
-                continue
-            for d in range(2):
-                di, dj = (0, 1) if d == 0 else (1, 0)
-                bit = RIGHT if d == 0 else DOWN
-                y, x = i + di, j + dj
-                if y >= rows or x >= columns:
-                    continue
-                q = labels[y, x]
-                if p == q and (p == 0 or links[i, j] & bit):
-                    continue
-                # Go on over cells without a reading: the shadow of the projector.
-                gap = 0
-                while (w[y, x] <= 0 or (q == 0 and owner[y, x] > 0)) and gap <= SHADOW:
-                    gap += 1
-                    y += di
-                    x += dj
-                    if y >= rows or x >= columns:
-                        break
-                    q = labels[y, x]
-                if p > 0 and (gap == 0 or p != q):
-                    pieces.boundary[p] += 1
-                if y >= rows or x >= columns or gap > SHADOW:
-                    continue
-                q = labels[y, x]
-                if q > 0 and (gap == 0 or p != q):
-                    pieces.boundary[q] += 1
-                if p == q:
-                    continue
-                step = w[i, j] - w[y, x]
-                fall = -up[d]  # how much lower the neighbour is seen, however the image is turned
-                if fall > steep and p > 0 and step > JUMP:
-                    pieces.single[p, OVER] += 1
-                if fall < -steep and q > 0 and step < -JUMP:
-                    pieces.single[q, OVER] += 1
-                if p > 0 and q > 0:
-                    if gap == 0 and links[i, j] & bit:
-                        pieces.pairs[CONTACT, p, q] += 1
-                        pieces.pairs[CONTACT, q, p] += 1
-                        _onto(i, j, di, dj, p, q, labels, normal, height, up, pieces)
-                        _onto(y, x, -di, -dj, q, p, labels, normal, height, up, pieces)
-                    elif abs(step) < JUMP:
-                        if gap <= GAP:
-                            pieces.pairs[NEAR, p, q] += 1
-                            pieces.pairs[NEAR, q, p] += 1
-                    elif step > 0:
-                        pieces.pairs[FRONT, p, q] += 1
-                    else:
-                        pieces.pairs[FRONT, q, p] += 1
-                elif p > 0:
-                    if step < -JUMP:
-                        pieces.single[p, HIDDEN] += 1
-                    elif step < JUMP and owner[y, x] < 0 and gap <= GAP:
-                        pieces.single[p, TABLE if owner[y, x] == -owner[i, j] else RIM] += 1
-                elif q > 0:
-                    if step > JUMP:
-                        pieces.single[q, HIDDEN] += 1
-                    elif step > -JUMP and owner[i, j] < 0 and gap <= GAP:
-                        pieces.single[q, TABLE if owner[y, x] == -owner[i, j] else RIM] += 1
-
-
-@kernel(leaf=True)
-def _find_changes(links: U1, here: I4, below: I4, change: U1) -> bool:
-    """Mark the cells of a row from which a piece does not just go on to the right and down.
-
-    Returns whether there are any.
-    """
-    for j in range(here.size):
-        change[j] = (here[j] != below[j]) | ((here[j] > 0) & (links[j] != RIGHT | DOWN))
-    for j in range(here.size - 1):
-        change[j] |= here[j] != here[j + 1]
-    some = False
-    for j in range(here.size):
-        some |= change[j] != 0
-    return some
-
-
-@kernel(leaf=True)
-def _onto(
-    i: int,
-    j: int,
-    di: int,
-    dj: int,
-    p: int,
-    q: int,
-    labels: I4,
-    normal: F4,
-    height: F4,
-    up: F8,
-    pieces: Pieces,
-) -> None:
-    """Count the link from cell (i, j) of ``p`` to ``q`` if ``q`` faces up beyond it."""
-    y = min(max(i + INWARD * di, 0), labels.shape[0] - 1)
-    x = min(max(j + INWARD * dj, 0), labels.shape[1] - 1)
-    if labels[y, x] != q:
-        return
-    if normal[y, 0, x] * up[0] + normal[y, 1, x] * up[1] + normal[y, 2, x] * up[2] > UPWARD:
-        pieces.pairs[ONTO, p, q] += 1
-        pieces.pairs[ONTO_HEIGHT, p, q] += height[y, x]
 
 
 @kernel(leaf=True)
@@ -333,7 +192,7 @@ def _measure(
 
 
 @kernel
-def _choose_samples(surfaces: Surfaces, labels: I4, pieces: Pieces) -> None:
+def choose_samples(surfaces: Surfaces, labels: I4, pieces: Pieces) -> None:
     """Choose evenly spaced cells of each piece away from edges."""
     rows, columns = labels.shape
     spans, tangent, edge, samples = surfaces.spans, surfaces.tangent, surfaces.edge, pieces.samples
@@ -398,60 +257,11 @@ def is_group(pieces: Pieces, p: int) -> bool:
 
 
 @kernel(leaf=True)
-def slope_of(row: F4) -> float:
-    """Return by how much the lateral normal changes across a piece.
-
-    2 for a whole cylinder seen from outside, -2 from inside, 0 for a plane.
-    """
-    spread, _, both = _moments(row)
-    return float(both / max(spread, 1e-9) * (row[RIGHTMOST] - row[LEFT]))
-
-
-@kernel(leaf=True)
-def roundness_of(row: F4) -> float:
-    """Return the correlation of the lateral normal with the lateral position.
-
-    1 for what is turned about an upright axis; the faces of a box, and tops that are level, do not
-    turn steadily.
-    """
-    spread, turning, both = _moments(row)
-    return float(both / math.sqrt(max(spread * turning, 1e-12)))
-
-
-@kernel(leaf=True)
-def _moments(row: F4) -> tuple[float, float, float]:
-    """Return the sums of squares of the lateral position and normal, and of products of both."""
-    n = max(row[FITTED], np.float32(1))
-    spread = row[SIDE2] - row[SIDE] * row[SIDE] / n
-    turning = row[TURN2] - row[TURN] * row[TURN] / n
-    return spread, turning, row[SIDETURN] - row[SIDE] * row[TURN] / n
-
-
-@kernel(leaf=True)
-def has_lid(pieces: Pieces, p: int) -> bool:
-    """Whether the top of a piece is closed by a surface that faces up."""
-    return bool(lid_share(pieces, p, LID_M) > LID)
-
-
-@kernel(leaf=True)
-def rests_on(pieces: Pieces, p: int, q: int) -> bool:
-    """Whether piece ``p`` begins where ``q`` ends in a level top; a shoulder slopes."""
-    if abs(pieces.shape[p, BOTTOM] - pieces.shape[q, TOP]) > MEETS_M:
-        return False
-    top = min(int(pieces.shape[q, TOP] / BAND_M), BANDS - 1)
-    level = near = 0.0
-    for band in range(max(top - SLOPING, 0), top + 1):
-        near += pieces.lid[q, band]
-        level += pieces.lid[q, band] if band > top - LEVEL else 0.0
-    return bool(level > LEDGE_M2 and level > FLAT * near)
-
-
-@kernel(leaf=True)
-def lid_share(pieces: Pieces, p: int, depth: float) -> float:
-    """Return what faces up within ``depth`` of the top of a piece, by its width squared."""
-    row = pieces.shape[p]
-    top = min(int(row[TOP] / BAND_M), pieces.lid.shape[1] - 1)
-    area = 0.0
-    for band in range(max(top - int(depth / BAND_M), 0), top + 1):
-        area += pieces.lid[p, band]
-    return float(area / max((row[RIGHTMOST] - row[LEFT]) ** 2, 1e-9))
+def may_join(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether two pieces stand above one plane, and neither has been merged into another."""
+    return bool(
+        p != q
+        and is_group(pieces, p)
+        and is_group(pieces, q)
+        and pieces.owner[p] == pieces.owner[q]
+    )

@@ -13,6 +13,7 @@ from shapecat.arrays import F4, F8, I4, U1
 from shapecat.config import DetectionSettings
 from shapecat.detection.axes import cut_at_axes
 from shapecat.detection.boards import boards_of
+from shapecat.detection.borders import meet
 from shapecat.detection.cells import Cells
 from shapecat.detection.directions import estimate_up
 from shapecat.detection.fill import fill_enclosed, grow_feet
@@ -29,7 +30,7 @@ from shapecat.detection.heights import heights_of, table_of
 from shapecat.detection.joins import join_pieces
 from shapecat.detection.ledges import cut_at_ledges
 from shapecat.detection.levels import find_levels
-from shapecat.detection.pieces import Pieces, meet, pieces_of
+from shapecat.detection.pieces import Pieces, pieces_of
 from shapecat.detection.planes import Support
 from shapecat.detection.reach import reach_over
 from shapecat.detection.regions import regions_of, rename
