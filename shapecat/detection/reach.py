@@ -75,9 +75,9 @@ def _reach(
             for d in range(4):
                 y = i + (1 if d == 0 else -1 if d == 1 else 0)
                 x = j + (1 if d == 2 else -1 if d == 3 else 0)
-                if not _leads_out(w, owner, me, i, j, y, x):
-                    continue
-                if not _is_above(w, lens, me, plane, walls, highest, outside, noted, y, x):
+                if not _leads_out(
+                    w, lens, owner, me, plane, walls, highest, outside, noted, i, j, y, x
+                ):
                     continue
                 looks += 1
                 n = _part_outside(
@@ -108,17 +108,10 @@ def _find_border(owner: I4, me: int, i: int, border: U1) -> None:
 
 
 @kernel(leaf=True)
-def _leads_out(w: F4, owner: I4, me: int, i: int, j: int, y: int, x: int) -> bool:
-    """Whether (y, x) is of a lower plane or of none, without a jump from its neighbour (i, j)."""
-    if y < 0 or x < 0 or y >= w.shape[0] or x >= w.shape[1]:
-        return False
-    return bool(0 <= owner[y, x] < me and abs(w[y, x] - w[i, j]) < JUMP)
-
-
-@kernel(leaf=True)
-def _is_above(
+def _leads_out(
     w: F4,
     lens: Lens,
+    owner: I4,
     me: int,
     plane: F8,
     walls: U1,
@@ -127,18 +120,26 @@ def _is_above(
     noted: I4,
     i: int,
     j: int,
+    y: int,
+    x: int,
 ) -> bool:
-    """Whether a cell is new and may belong to an object on a plane; notes its height if so."""
-    if w[i, j] <= 0 or walls[i, j] == CLEARED or noted[i, j] == me:
+    """Whether what stands on a plane goes on from (i, j) to (y, x) outside; notes its height if so.
+
+    There it is above a lower plane or none, and not noted before.
+    """
+    if y < 0 or x < 0 or y >= w.shape[0] or x >= w.shape[1]:
         return False
-    z = 1 / w[i, j]
-    h = (w[i, j] - (plane[0] * j + plane[1] * i + plane[2])) * z * plane[3]
+    if not 0 <= owner[y, x] < me or abs(w[y, x] - w[i, j]) >= JUMP:
+        return False
+    if w[y, x] <= 0 or walls[y, x] == CLEARED or noted[y, x] == me:
+        return False
+    z = 1 / w[y, x]
+    h = (w[y, x] - (plane[0] * x + plane[1] * y + plane[2])) * z * plane[3]
     if not (LEAST_M + NOISE * z * z < h < highest):
         return False
-    x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
-    if not inside(plane, x, y, z, REACH_M):
+    if not inside(plane, (x - lens.cx) / lens.fx * z, (y - lens.cy) / lens.fy * z, z, REACH_M):
         return False
-    outside[i, j], noted[i, j] = h, me
+    outside[y, x], noted[y, x] = h, me
     return True
 
 
@@ -167,9 +168,7 @@ def _part_outside(
         for d in range(4):
             y = i + (1 if d == 0 else -1 if d == 1 else 0)
             x = j + (1 if d == 2 else -1 if d == 3 else 0)
-            if not _leads_out(w, owner, me, i, j, y, x):
-                continue
-            if _is_above(w, lens, me, plane, walls, highest, outside, noted, y, x):
+            if _leads_out(w, lens, owner, me, plane, walls, highest, outside, noted, i, j, y, x):
                 stack[top] = y * columns + x
                 top += 1
     return top
