@@ -80,21 +80,20 @@ def raise_low(
     stacks : (2, cells) int32, room.
     largest_m : wider things are swells or furniture.
     """
+    w, (owner, height) = cells.w, heights
+    widest = largest_m * cells.lens.fx
     objects = 0
-    excess, relief = np.zeros((2, *cells.w.shape), np.float32)
-    for k, plane in enumerate(planes):
-        if _excess(cells.w, heights.owner, heights.height, plane, k + 1, excess) >= LEAST_CELLS:
-            drop = stacks[1].view(np.float32)
-            _cut_feet(cells.w, heights.owner, heights.height, k + 1, excess, stacks[0], drop)
-            _level(excess, relief)
-            clear = max(STEP, STEADY * _noise(relief, heights.owner, k + 1))
-            step = max(clear, SLIP * math.hypot(plane[0], plane[1]))
-            levels = np.float32(min(clear, FINE)) * LEVELS
-            widest = largest_m * cells.lens.fx
-            objects = _raise(
-                cells.w, relief, heights.owner, k + 1, step, levels, raised, widest, objects, stacks
-            )
-            _lower(cells.w, excess, heights.owner, k + 1, step, raised, stacks)
+    excess, relief = np.zeros((2, *w.shape), np.float32)
+    for number, plane in enumerate(planes, 1):
+        if _excess(w, owner, height, plane, number, excess) < LEAST_CELLS:
+            continue
+        _cut_feet(w, owner, height, number, excess, stacks[0], stacks[1].view(np.float32))
+        _level(excess, relief)
+        clear = max(STEP, STEADY * _noise(relief, owner, number))
+        step = max(clear, SLIP * math.hypot(plane[0], plane[1]))
+        levels = np.float32(min(clear, FINE)) * LEVELS
+        objects = _raise(w, relief, owner, number, step, levels, raised, widest, objects, stacks)
+        _lower(w, excess, owner, number, step, raised, stacks)
 
 
 @kernel
@@ -175,8 +174,12 @@ def _cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4, stack: I4, 
 
 
 @kernel
-def _level(excess: F4, out: F4) -> None:
-    """Write the excess over its mean in a window around each low cell; 0 elsewhere."""
+def _level(excess: F4, relief: F4) -> None:
+    """Write the excess over its mean in a window around each low cell; 0 elsewhere.
+
+    The window slides: what enters it is added, what leaves it is taken away. It does so down the
+    rows for ``sums`` and ``counts`` of each column, and along a row for those of all its cells.
+    """
     rows, columns = excess.shape
     sums, counts = np.zeros(columns, np.float64), np.zeros(columns, np.float64)
     for i in range(-WINDOW, rows):
@@ -185,8 +188,10 @@ def _level(excess: F4, out: F4) -> None:
                 for j in range(columns):
                     sums[j] += sign * min(excess[row, j], MOST)
                     counts[j] += sign * (excess[row, j] != 0)
+        if i < 0:
+            continue
         total = count = 0.0
-        for j in range(-WINDOW, columns if i >= 0 else -WINDOW):
+        for j in range(-WINDOW, columns):
             if j + WINDOW < columns:
                 total += sums[j + WINDOW]
                 count += counts[j + WINDOW]
@@ -195,15 +200,15 @@ def _level(excess: F4, out: F4) -> None:
                 count -= counts[j - WINDOW - 1]
             if j >= 0:
                 here = excess[i, j]
-                out[i, j] = here - np.float32(total / count) if here != 0 else 0
+                relief[i, j] = here - np.float32(total / count) if here != 0 else 0
 
 
 @kernel
 def _noise(relief: F4, owner: I4, number: int) -> float:
-    """Return the median rise between cells of the plane as far apart as those of an outline."""
+    """Return the median rise, 1/m, between cells of the plane as far apart as at an outline."""
     rows, columns = relief.shape
     apart = INWARD + OUTWARD
-    count = np.zeros(BINS, np.int64)
+    histogram = np.zeros(BINS, np.int64)
     n = 0
     for i in range(0, rows - apart, EVERY):
         for j in range(0, columns - apart, EVERY):
@@ -213,13 +218,13 @@ def _noise(relief: F4, owner: I4, number: int) -> float:
             for y, x in ((i + apart, j), (i, j + apart)):
                 if owner[y, x] == -number and relief[y, x] != 0:
                     rise = abs(relief[y, x] - here)
-                    count[min(int(rise / BIN), BINS - 1)] += 1
+                    histogram[min(int(rise / BIN), BINS - 1)] += 1
                     n += 1
-    below = k = 0
+    below = bins = 0
     while 2 * below < n:
-        below += count[k]
-        k += 1
-    return k * BIN
+        below += histogram[bins]
+        bins += 1
+    return bins * BIN
 
 
 @kernel
