@@ -52,17 +52,9 @@ def cut_at_axes(
     side = side_of(up)
     cut = np.zeros((n + 1, BANDS), np.bool_)
     _find(
-        cells.w,
-        cells.lens,
-        heights.height,
-        surfaces,
-        pieces,
-        labels,
-        up,
-        side,
-        cross(up, side),
-        cut,
-    )
+        cells.w, cells.lens, heights.height, surfaces, pieces, labels,
+        up, side, cross(up, side), cut,
+    )  # fmt: skip
     last = 0
     for p, band in np.argwhere(cut):
         rest = n if p == last else p  # what the cut below has left
@@ -108,17 +100,20 @@ def _find(
 
 @kernel
 def _number_rounded(pieces: Pieces, labels: int) -> I4:
-    """Return 1, 2, ... for labels that may be round things, as what was just cut may, else 0."""
-    result = np.zeros(labels, np.int64)
+    """Return a number from 1 on for each of the labels that may be round, 0 for the others.
+
+    What has just been cut off at a ledge has no statistics yet, and may be one.
+    """
+    numbers = np.zeros(labels, np.int64)
     n = 0
     for p in range(1, labels):
-        row = pieces.shape[min(p, pieces.group.size - 1)]
-        whole = p < pieces.group.size
-        if whole and not (row[COUNT] >= 2 * LEAST_CELLS and slope_of(row) > ROUND):
-            continue
+        if p < pieces.group.size:
+            row = pieces.shape[p]
+            if row[COUNT] < 2 * LEAST_CELLS or slope_of(row) <= ROUND:
+                continue
         n += 1
-        result[p] = n
-    return result
+        numbers[p] = n
+    return numbers
 
 
 @kernel(leaf=True)
