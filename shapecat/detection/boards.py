@@ -21,9 +21,12 @@ BOARD_AREA_M2 = 0.03
 """Smaller planes are no furniture but for the lowest one, a floor that the table leaves to see."""
 LEAST_DROP_M = 0.06
 """Lower things are objects."""
-EDGE_STEPS = 5
-LEAST_DROPS = 20
-CLOSED = 0.5
+STEP_M, EDGE_STEPS = 0.01, 5
+"""Length of a step, and how many of them from a cell towards the camera its plane may end after."""
+FIRST, LAST, WALL_M = 4, 20, 0.03
+"""Steps down from the edge between which it is looked for a wall; how far readings lie off one."""
+LEAST_DROPS, CLOSED = 20, 0.5
+"""Readings below the edge that say enough, and the share of them on a wall that closes a box."""
 
 
 def boards_of(cells: Cells, found: list[tuple[Support, I4]]) -> list[Support]:
@@ -77,7 +80,7 @@ def _drop(w: F4, lens: Lens, index: I4, plane: F8, up: F8, drop: float, seen: I4
         length = math.sqrt(tx * tx + ty * ty + tz * tz)
         if length < 0.1 or z < 0.2:
             continue
-        tx, ty, tz = 0.01 * tx / length, 0.01 * ty / length, 0.01 * tz / length
+        tx, ty, tz = STEP_M * tx / length, STEP_M * ty / length, STEP_M * tz / length
         edge = False
         for _ in range(EDGE_STEPS):
             v = int(lens.cy + lens.fy * (y + ty) / (z + tz) + 0.5)
@@ -91,9 +94,9 @@ def _drop(w: F4, lens: Lens, index: I4, plane: F8, up: F8, drop: float, seen: I4
             x, y, z = x + tx, y + ty, z + tz
         if not edge:
             continue
-        for k in range(4, 20):
-            s = 0.01 * k
-            if s > drop - 0.01:
+        for k in range(FIRST, LAST):
+            s = STEP_M * k
+            if s > drop - STEP_M:
                 break
             dx, dy, dz = x - s * up[0], y - s * up[1], z - s * up[2]
             if dz <= NEAREST_M:
@@ -103,5 +106,5 @@ def _drop(w: F4, lens: Lens, index: I4, plane: F8, up: F8, drop: float, seen: I4
                 break
             if w[v, u] > 0:
                 behind = 1 / w[v, u] - dz
-                seen[0] += abs(behind) < 0.03
-                seen[1] += behind >= 0.03
+                seen[0] += abs(behind) < WALL_M
+                seen[1] += behind >= WALL_M

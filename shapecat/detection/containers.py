@@ -24,6 +24,7 @@ from shapecat.jit import kernel
 __all__ = ["join_hollow", "join_overhangs", "join_rims"]
 
 SAME_TOP_M = 0.01
+"""How far the heights of the parts of one container may seem to differ."""
 SAME_SIDE_M, SAME_SIDE = 0.012, 0.4
 """How far an inside may reach beyond what is seen of the outside: metres, share of the width."""
 ARC, ARC_APART, ARC_WIDTH, ARC_BEHIND = 1.0, 0.12, 0.75, (0.15, 1.0)
@@ -34,6 +35,7 @@ HOLLOW = -0.25
 BENT, INSIDE, INSIDE_SHARE = -0.15, -0.4, 0.12
 """Walls inside one container: slope of each, of both together, share of a boundary in contact."""
 FLOOR_SHARE, WITHIN = 0.6, 0.85
+"""Share of the boundary of a floor along or behind what is seen to be hollow, and what is not."""
 LOW_FLOOR, RAGGED_M = 0.5, 0.02
 """Height of a low floor by that of its walls; up to where it may be full of holes, metres."""
 BEFORE, FLAT, AHEAD = 0.25, 0.35, 0.65

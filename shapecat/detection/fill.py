@@ -27,8 +27,11 @@ STACK = MOST_CELLS + 4
 OPEN = 2
 """Mark of cells seen that are no part of a hole."""
 SHARE = 0.6
+"""Least share of the boundary of a hole that is of what encloses it."""
 RAISED_M, RAISED_NOISE = 0.0012, 0.0008
+"""Mean height of a hole from which it is raised, metres, and by the square of its range, 1/m."""
 RAISED_SHARE, LABELLED = 0.35, 0.5
+"""Instead of `SHARE` where it is raised, and so much of its boundary is of any label."""
 LEVEL = 0.15
 """Share of the boundary where the surface goes on: not so through the hole of a handle."""
 

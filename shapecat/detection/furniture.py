@@ -36,6 +36,8 @@ __all__ = [
 ]
 
 RIM_LINKS, RIM_SHARE = 8, 0.1
+"""Links with a higher plane, from below, of the edge of a board or its legs; share of the boundary.
+"""
 FAINT, FAINT_NOISE, FAINT_M2, FAINT_CELLS = 2.5, 3.5, 3e-3, 250
 """A piece this small must rise so many times above the least height of an object cell, and of the
 noise in it: spots of noise gather where there is much of a plane far away."""
@@ -53,7 +55,6 @@ STEP_M, STEPS, MISSES = 0.02, 64, 2.0
 two; where something hides it, half a step counts."""
 TOWERING = 0.5
 """Share of a piece below surface that goes on beyond the greatest height."""
-
 EDGE_ON, SPECKLED, SPECKS = 3.0, 2.3, 100
 """Surface by what it covers of the view from which it is seen edge on, whether or not many readings
 fail there: the square of its boundary by its cells is 16 for a square."""

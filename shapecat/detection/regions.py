@@ -12,10 +12,13 @@ __all__ = ["regions_of", "rename"]
 EDGE_DEG = 34
 """Concave angle that may part two objects; a bowl of 7 cm turns 16 degrees over the same cells."""
 WEAK_DEG, NO_EDGE_DEG = 20, 256
+"""Concave angle that continues such an edge; one that no edge has, for angles are in 8 bits."""
 RIDGE, RIDGE_CELLS = 0.5, 5
-LEAST_CELLS = 12
-MOST_REGIONS = 250
+"""Share of its angle that is left of an edge so far to either side of it."""
+LEAST_CELLS, MOST_REGIONS = 12, 250
+"""Smaller parts are scraps, that belong to what is around them; the number bounds the time."""
 BUCKET_DEG = 4
+"""Angles that differ less are flooded in one go."""
 
 
 def regions_of(

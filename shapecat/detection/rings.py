@@ -11,8 +11,10 @@ __all__ = ["join_raised", "join_rings"]
 
 LOW_M = 0.06
 """Top of the pieces of a rim: higher things around a patch of table are several objects."""
-RING_SHARE = 0.5
-PART_SHARE = 0.08
+LEAST_CELLS = 12
+"""Smaller holes are noise."""
+RING_SHARE, PART_SHARE = 0.5, 0.08
+"""Shares of the boundary of a hole: along low pieces together, and along each that is joined."""
 RAISED = 0.5
 """Share of the cells of a piece that belong to one low object."""
 
@@ -69,7 +71,7 @@ def join_rings(pieces: Pieces, w: F4, height: F4, labels: I4) -> None:
                 continue
             stack[0, 0], stack[0, 1] = si, sj
             cells, total = flood_hole(w, labels, extent, seen, stack, sides, ahead, level)
-            if cells < 12 or not is_raised(w, height, stack, cells):
+            if cells < LEAST_CELLS or not is_raised(w, height, stack, cells):
                 continue
             shares[:] = 0
             low = 0

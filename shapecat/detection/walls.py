@@ -22,9 +22,10 @@ __all__ = ["CLEARED", "ON_WALL", "clear_walls"]
 ON_WALL, CLEARED = 1, 2
 """Cells on a wall; the former are of a small part, which may be an object the wall goes through."""
 
-MOST_WALLS = 5
-LEAST_READINGS = 50
+MOST_WALLS, LEAST_READINGS = 5, 50
+"""So many walls are looked for, as long as so many readings are left; this bounds the time."""
 VERTICAL_COS = 0.2
+"""Largest cosine between up and the normal of a wall."""
 LEAST_AREA_M2, LEAST_PART_M2, LEAST_WALL_M2 = 0.05, 0.04, 0.1
 """Least area of a wall, of a connected part of it that is cleared, and of these parts together."""
 LEAST_PATCH_M2, EXACT = 0.008, 0.0045
@@ -33,6 +34,7 @@ in inverse depth."""
 FILLED = 0.3
 """Share of its extent that a wall fills: the front edges of a shelf lie in a plane too."""
 STRIP_M, STRIPS = 0.05, 400
+"""Width of the strips whose area is summed to find the extent of a wall, and their number."""
 
 
 def clear_walls(
