@@ -230,7 +230,7 @@ def _noise(relief: F4, owner: I4, number: int) -> float:
 @kernel
 def _raise(
     w: F4,
-    excess: F4,
+    relief: F4,
     owner: I4,
     number: int,
     rise_least: float,
@@ -242,12 +242,13 @@ def _raise(
 ) -> int:
     """Mark the parts above each level, filled, whose outline is that of an object.
 
-    They are numbered from ``objects`` + 1 on. Returns the last number.
+    They are numbered from ``objects`` + 1 on. Returns the last number. ``relief`` (rows, columns)
+    is from `_level`, ``levels`` falls, both in 1/m.
     """
-    flat, marks, owners = excess.reshape(-1), raised.reshape(-1), owner.reshape(-1)
+    flat, marks, owners = relief.reshape(-1), raised.reshape(-1), owner.reshape(-1)
     seeds, stack = stacks[0], stacks[1]
     n = _find_seeds(flat, levels[-1], seeds)
-    seen, part = np.zeros(excess.shape, np.int32), np.zeros(excess.shape, np.int32)
+    seen, part = np.zeros(relief.shape, np.int32), np.zeros(relief.shape, np.int32)
     visited, parts = seen.reshape(-1), part.reshape(-1)
     merits = np.zeros(1 + objects + levels.size * (flat.size // LEAST_CELLS), np.float32)
     me = 0
@@ -257,7 +258,7 @@ def _raise(
             if visited[s] > first or not flat[s] > level:
                 continue
             me += 1
-            count = _flood(excess, level, s, me, seen, stack)
+            count = _flood(relief, level, s, me, seen, stack)
             if count < LEAST_CELLS:
                 continue
             known, best = 0, 0.0
@@ -267,8 +268,8 @@ def _raise(
                 best = max(best, merits[marks[p]])
             if known > SAME * count or _width(w, stack, count) > widest:
                 continue
-            filled = fill_hull(excess, part, stack, count)
-            outline = _outline(w, excess, owner, part, stack, filled, number, rise_least)
+            filled = fill_hull(relief, part, stack, count)
+            outline = _outline(w, relief, owner, part, stack, filled, number, rise_least)
             for p in stack[count:filled]:
                 best = max(best, merits[marks[p]])
             merit = outline.rise / outline.sides
