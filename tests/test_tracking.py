@@ -410,6 +410,16 @@ def test_what_passes_behind_a_narrow_thing_is_one_track(partial: bool) -> None:
     assert [track.hits for track in tracks] == ([44] if partial else [24, 24])
 
 
+@pytest.mark.parametrize("in_one", [True, False])
+def test_what_is_seen_in_one_between_its_two_sides_is_one_track(in_one: bool) -> None:
+    """Nothing else shows its whole length: two things may come and go like its two sides."""
+    left, right = (0.0, 0.05), (0.1, 0.15)
+    split, whole = [left, right], [(0.0, 0.15)]
+    change = [split, whole if in_one else split, split, split, split, split]
+    tracks = track_recording(boxed([[left]] * 18 + change + [[right]] * 14), SETTINGS)
+    assert [track.hits for track in tracks] == ([38] if in_one else [24, 20])
+
+
 def test_what_is_there_after_a_while_unseen_need_not_be_the_same() -> None:
     """Unseen for 0.8 s, a track waits on; whether it came back is judged by all of its views."""
     before = [frame(k, [0, 0, 0], posterior=CUP) for k in range(20)]

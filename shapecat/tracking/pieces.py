@@ -15,6 +15,7 @@ _SLACK, _SLACK_M = 1.1, 0.01  # pieces together may be so much longer than the w
 _LACKING = 0.95  # a piece is shorter, on some side, than so much of the whole
 _MOSTLY = 0.34  # share of the frames with both in which they must be pieces
 _PASSING = 0.25  # share of either track's frames with both, at most, while it passes an occluder
+_CHANGING = 0.5  # the same, if it is seen on both sides at once in one of them
 
 
 def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
@@ -25,7 +26,8 @@ def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
 
     An object that goes behind a narrow thing comes out on its other side before it is gone on the
     first: one track ends soon after the other one began. Whatever has been seen of it until then
-    is what stuck out to a side, so it may be as deep as it is long.
+    is what stuck out to a side, so it may be as deep as it is long; or it was seen on both sides
+    at once, now and then, as one detection.
 
     Returns
     -------
@@ -40,8 +42,13 @@ def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
     pairs = _neighbours(hits, owner)
     topics = hits.topics[hits.rows[pairs]]
     rooms = wholes[owner[pairs], topics]
-    passing = _passing(hits, members, owner[pairs]) & hits.partial[pairs].all(axis=1)
+    duos, which = np.unique(np.sort(owner[pairs], axis=1), axis=0, return_inverse=True)
+    start, stop, share = _changes(hits, members, duos)
+    passing = (share <= _PASSING)[which] & hits.partial[pairs].all(axis=1)
     rooms[passing, :, 1] = rooms[passing, :, 0]
+    for k in _where(share <= _CHANGING):
+        both = np.concatenate([members[m] for m in duos[k]])
+        rooms[which == k] = np.maximum(rooms[which == k], _in_one(hits, both, start[k], stop[k]))
     fits = _fit(hits, axes, pairs, rooms)
     together, fitting = np.unique(np.sort(owner[pairs[fits]], axis=1), axis=0, return_counts=True)
     root = np.arange(len(members))
@@ -92,13 +99,27 @@ def _neighbours(hits: Hits, owner: I4) -> I4:
     return np.asarray(pairs[np.lexsort(pairs.T)])
 
 
-def _passing(hits: Hits, members: Sequence[I4], pairs: I4) -> Bool:
-    """Tell of pairs (p, 2) of tracks whether one ends soon after the other one began."""
-    first = np.array([hits.rows[member[0]] for member in members])[pairs]
-    last = np.array([hits.rows[member[-1]] for member in members])[pairs]
-    both = last.min(axis=1) - first.max(axis=1) + 1
-    brief = both <= _PASSING * (last - first + 1).min(axis=1)
-    return np.asarray(brief & (np.argmin(first, axis=1) == np.argmin(last, axis=1)))
+def _changes(hits: Hits, members: Sequence[I4], duos: I4) -> tuple[I4, I4, F8]:
+    """Return when the later ones of pairs (q, 2) of tracks begin and the earlier ones end.
+
+    And how long that takes, as a share of the shorter one's life; inf if it lies in the other's.
+    """
+    first = np.array([hits.rows[member[0]] for member in members])[duos]
+    last = np.array([hits.rows[member[-1]] for member in members])[duos]
+    start, stop = first.max(axis=1), last.min(axis=1)
+    share = (stop - start + 1) / (last - first + 1).min(axis=1)
+    within = np.argmin(first, axis=1) != np.argmin(last, axis=1)
+    return start, stop, np.where(within, np.inf, share)
+
+
+def _in_one(hits: Hits, both: I4, start: int, stop: int) -> F8:
+    """Return the largest lengths of the hits of two tracks that are alone in their frames.
+
+    Only between two frames; 0 if there are none.
+    """
+    rows, at, counts = np.unique(hits.rows[both], return_index=True, return_counts=True)
+    alone = both[at[(counts == 1) & (rows > start) & (rows < stop)]]
+    return np.asarray(_sorted_sides(hits.sizes[alone]).max(axis=0, initial=0))
 
 
 def _fit(hits: Hits, axes: F8, pairs: I4, wholes: F8) -> Bool:
