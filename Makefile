@@ -7,7 +7,7 @@ SCREENS := chromium chromium-driver mesa-vulkan-drivers
 DEMO := demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test odd lint format bench model lock clean
+.PHONY: help setup demo test odd lint format bench model parts lock clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -56,6 +56,9 @@ bench: setup ## measure the speed of stages and whole recordings, print tables
 
 model: setup ## train the default model anew from the simulator
 	$(BIN)/python -m shapecat.models.training
+
+parts: setup ## grow the trees anew that join the pieces of an object, from the simulator
+	$(BIN)/python -m shapecat.models.parts
 
 lock: setup ## renew requirements.lock from pyproject.toml
 	$(BIN)/pip install --quiet uv

@@ -9,14 +9,8 @@ from shapecat.jit import kernel
 
 __all__ = [
     "FRINGE",
-    "STACK",
-    "extent_of",
     "fill_enclosed",
-    "flood_hole",
     "grow_feet",
-    "is_raised",
-    "mark_open",
-    "may_be_hole",
 ]
 
 FRINGE = 0.6
@@ -98,7 +92,7 @@ def _find_beside(owner: I4, labels: I4, i: int, beside: Bool) -> bool:
 
 
 @kernel(leaf=True)
-def extent_of(labels: I4) -> tuple[int, int, int, int]:
+def _extent_of(labels: I4) -> tuple[int, int, int, int]:
     """Return the first row and column with a label, and those after the last."""
     i0, j0 = labels.shape
     i1 = j1 = 0
@@ -120,7 +114,7 @@ def extent_of(labels: I4) -> tuple[int, int, int, int]:
 
 
 @kernel(leaf=True)
-def flood_hole(
+def _flood_hole(
     w: F4,
     labels: I4,
     extent: tuple[int, int, int, int],
@@ -130,7 +124,7 @@ def flood_hole(
     ahead: I4,
     level: I4,
 ) -> tuple[int, int]:
-    """Collect the unlabelled cells connected to the first of ``stack``, which `may_be_hole`.
+    """Collect the unlabelled cells connected to the first of ``stack``, which `_may_be_hole`.
 
     Counts, for each label, the sides of cells where it bounds the hole, where it is in front of
     it, and where the surface goes on. Returns how many cells the hole has, 0 if it is large or
@@ -168,7 +162,7 @@ def flood_hole(
 
 
 @kernel(leaf=True)
-def mark_open(w: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1) -> None:
+def _mark_open(w: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1) -> None:
     """Mark unlabelled cells from which others lead right and down to the border of the extent.
 
     What leads left and up is found as the holes are looked for; the rest takes a flood.
@@ -187,7 +181,7 @@ def mark_open(w: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1) ->
 
 
 @kernel(inline=True, leaf=True)
-def may_be_hole(
+def _may_be_hole(
     w: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1, i: int, j: int
 ) -> bool:
     """Whether an unlabelled cell is new and not known to be open."""
@@ -209,7 +203,7 @@ def _is_open(seen: U1, extent: tuple[int, int, int, int], i: int, j: int) -> boo
 
 
 @kernel(leaf=True)
-def is_raised(w: F4, height: F4, stack: I4, cells: int) -> bool:
+def _is_raised(w: F4, height: F4, stack: I4, cells: int) -> bool:
     """Whether a hole lies a little above the plane, as the floor of a plate does."""
     raised = far = 0.0
     for t in range(cells):
@@ -224,19 +218,19 @@ def _fill(w: F4, height: F4, labels: I4, count: int, filled: U1) -> None:
     seen = np.zeros(labels.shape, np.uint8)
     stack = np.zeros((STACK, 2), np.int16)
     sides, ahead, level = np.zeros((3, count + 1), np.int32)
-    extent = extent_of(labels)
-    mark_open(w, labels, extent, seen)
+    extent = _extent_of(labels)
+    _mark_open(w, labels, extent, seen)
     for si in range(extent[0], extent[2]):
         for sj in range(extent[1], extent[3]):
-            if not may_be_hole(w, labels, extent, seen, si, sj):
+            if not _may_be_hole(w, labels, extent, seen, si, sj):
                 continue
             stack[0, 0], stack[0, 1] = si, sj
-            cells, total = flood_hole(w, labels, extent, seen, stack, sides, ahead, level)
+            cells, total = _flood_hole(w, labels, extent, seen, stack, sides, ahead, level)
             if cells == 0:
                 continue
             best = np.argmax(sides)
             share = SHARE
-            if np.sum(sides) > LABELLED * total and is_raised(w, height, stack, cells):
+            if np.sum(sides) > LABELLED * total and _is_raised(w, height, stack, cells):
                 share = RAISED_SHARE
             fits = sides[best] > max(0, share * total) and level[best] > LEVEL * total
             for k in range(1, count + 1):

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from shapecat.arrays import F4, I4
+from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import JUMP, Lens
 from shapecat.detection.pieces import (
     FEW,
@@ -27,6 +27,8 @@ COPLANAR_M, COPLANAR = 0.006, 0.05
 COPLANAR_COS = math.cos(math.radians(15))
 PARTNERS = 0.45
 """Share of the samples of either piece that continue the other."""
+LEAST_SAMPLES, MOST_LINES, STEPS = 4, 300, 8
+"""Samples of a piece; lines between partners that are looked along, each in so many steps."""
 FREE, BEHIND = 0.12, 0.05
 """Between them, largest share in free space or on others, least share behind something."""
 SAME_TOP_M, FLANKED, TURNING, STEADY = 0.007, 0.12, 0.7, 1.75
@@ -109,27 +111,55 @@ def _continuation(
     pieces: Pieces, p: int, q: int, w: F4, lens: Lens, normal: F4, labels: I4
 ) -> float:
     """Return how well piece q continues piece p behind an occluder, 0..1; 0 if it does not."""
-    if not may_join(pieces, p, q):
+    if not may_join(pieces, p, q) or not _are_behind_one(pieces, p, q):
         return 0.0
-    # (a) one thing is in front of both
-    front = pieces.pairs[FRONT]
-    between = False
-    for k in range(1, pieces.group.size):
-        between |= (k != p) & (k != q) & (front[k, p] >= FEW) & (front[k, q] >= FEW)
-    if not between:
-        return 0.0
-    # (b) many samples of each lie in tangent planes of the other
-    columns = w.shape[1]
     a, b = np.zeros((SAMPLES, 6)), np.zeros((SAMPLES, 6))
-    na = _positions(pieces.samples[p], w, lens, normal, columns, a)
-    nb = _positions(pieces.samples[q], w, lens, normal, columns, b)
-    if na < 4 or nb < 4:
+    na = _positions(pieces.samples[p], w, lens, normal, a)
+    nb = _positions(pieces.samples[q], w, lens, normal, b)
+    if na < LEAST_SAMPLES or nb < LEAST_SAMPLES:
         return 0.0
-    in_a, in_b = np.zeros(SAMPLES, np.uint8), np.zeros(SAMPLES, np.uint8)
     partners = np.zeros((SAMPLES * SAMPLES, 2), np.uint8)
+    share, n = _find_partners(a[:na], b[:nb], partners)
+    if share < PARTNERS:
+        return 0.0
+    free = hidden = looked = 0
+    for k in range(0, n, max(1, n // MOST_LINES)):
+        first, second = a[partners[k, 0]], b[partners[k, 1]]
+        for step in range(1, STEPS):
+            x, y, z = _on_line(first, second, step / STEPS)
+            j, i = int(lens.cx + lens.fx * x / z + 0.5), int(lens.cy + lens.fy * y / z + 0.5)
+            if i < 0 or j < 0 or i >= w.shape[0] or j >= w.shape[1] or w[i, j] <= 0:
+                continue
+            looked += 1
+            label = labels[i, j]
+            if label == 0 or (pieces.group[label] != p and pieces.group[label] != q):
+                before = w[i, j] - 1 / z > JUMP
+                hidden += before
+                free += not before
+    return share if free <= FREE * looked and hidden >= BEHIND * looked else 0.0
+
+
+@kernel(leaf=True)
+def _are_behind_one(pieces: Pieces, p: int, q: int) -> bool:
+    """Whether one thing is in front of both pieces."""
+    front = pieces.pairs[FRONT]
+    some = False
+    for k in range(1, pieces.group.size):
+        some |= (k != p) & (k != q) & (front[k, p] >= FEW) & (front[k, q] >= FEW)
+    return some
+
+
+@kernel
+def _find_partners(a: F8, b: F8, partners: I4) -> tuple[float, int]:
+    """Write the pairs of samples that lie in each other's tangent plane.
+
+    Returns the share of the samples that have a partner, of the piece with the lower one, and the
+    number of pairs.
+    """
+    in_a, in_b = np.zeros(len(a), np.uint8), np.zeros(len(b), np.uint8)
     n = 0
-    for s in range(na):
-        for t in range(nb):
+    for s in range(len(a)):
+        for t in range(len(b)):
             if a[s, 3] * b[t, 3] + a[s, 4] * b[t, 4] + a[s, 5] * b[t, 5] < COPLANAR_COS:
                 continue
             dx, dy, dz = b[t, 0] - a[s, 0], b[t, 1] - a[s, 1], b[t, 2] - a[s, 2]
@@ -142,33 +172,23 @@ def _continuation(
             in_b[t] = 1
             partners[n, 0], partners[n, 1] = s, t
             n += 1
-    share = min(np.sum(in_a) / na, np.sum(in_b) / nb)
-    if share < PARTNERS:
-        return 0.0
-    # (c) between them nothing else is seen, and something hides them
-    free = hidden = looked = 0
-    for k in range(0, n, max(1, n // 300)):
-        first, second = a[partners[k, 0]], b[partners[k, 1]]
-        for step in range(1, 8):
-            u = step / 8
-            z = first[2] + u * (second[2] - first[2])
-            x, y = first[0] + u * (second[0] - first[0]), first[1] + u * (second[1] - first[1])
-            j, i = int(lens.cx + lens.fx * x / z + 0.5), int(lens.cy + lens.fy * y / z + 0.5)
-            if i < 0 or j < 0 or i >= w.shape[0] or j >= columns or w[i, j] <= 0:
-                continue
-            looked += 1
-            label = labels[i, j]
-            if label > 0 and (pieces.group[label] == p or pieces.group[label] == q):
-                continue
-            if w[i, j] - 1 / z > JUMP:
-                hidden += 1
-            else:
-                free += 1
-    return share if free <= FREE * looked and hidden >= BEHIND * looked else 0.0
+    return min(np.sum(in_a) / len(a), np.sum(in_b) / len(b)), n
+
+
+@kernel(leaf=True)
+def _on_line(first: F8, second: F8, u: float) -> tuple[float, float, float]:
+    """Return the point at the share ``u`` of the way between two samples."""
+    return (
+        first[0] + u * (second[0] - first[0]),
+        first[1] + u * (second[1] - first[1]),
+        first[2] + u * (second[2] - first[2]),
+    )
 
 
 @kernel
-def _positions(samples: I4, w: F4, lens: Lens, normal: F4, columns: int, out: F4) -> int:
+def _positions(samples: I4, w: F4, lens: Lens, normal: F4, out: F8) -> int:
+    """Write position and normal of the samples of a piece; return how many there are."""
+    columns = w.shape[1]
     n = 0
     for s in samples:
         if s < 0:

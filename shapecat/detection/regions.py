@@ -9,9 +9,9 @@ from shapecat.jit import kernel
 
 __all__ = ["regions_of", "rename"]
 
-EDGE_DEG = 34
+EDGE_DEG = 27
 """Concave angle that may part two objects; a bowl of 7 cm turns 16 degrees over the same cells."""
-WEAK_DEG, NO_EDGE_DEG = 20, 256
+WEAK_DEG, NO_EDGE_DEG = 17, 256
 """Concave angle that continues such an edge; one that no edge has, for angles are in 8 bits."""
 RIDGE, RIDGE_CELLS = 0.5, 5
 """Share of its angle that is left of an edge so far to either side of it."""

@@ -1,8 +1,7 @@
 """Segmentation: the rules from cells to labelled cells, on one page.
 
-The thesis stops at objects that do not touch. Beyond it, and without learning: concave edges part
-touching and stacked objects (`regions`), and a few rules bring the pieces of one object together
-again (`joins`).
+The thesis stops at objects that do not touch. Beyond it, concave edges part touching and stacked
+objects (`regions`), and a few rules bring the pieces of one object together again (`joins`).
 """
 
 from typing import NamedTuple
@@ -26,21 +25,21 @@ from shapecat.detection.furniture import (
     towers_of,
     unbounded,
 )
-from shapecat.detection.heights import heights_of, table_of
+from shapecat.detection.heights import Heights, heights_of, table_of
 from shapecat.detection.joins import join_pieces
 from shapecat.detection.ledges import cut_at_ledges
 from shapecat.detection.levels import find_levels
 from shapecat.detection.pieces import Pieces, pieces_of
 from shapecat.detection.planes import Support
+from shapecat.detection.raised import join_raised
 from shapecat.detection.reach import reach_over
 from shapecat.detection.regions import regions_of, rename
 from shapecat.detection.relief import raise_low
-from shapecat.detection.rings import join_raised, join_rings
-from shapecat.detection.surfaces import surfaces_of
+from shapecat.detection.surfaces import Surfaces, surfaces_of
 from shapecat.detection.walls import clear_walls
 from shapecat.errors import ConfigError
 
-__all__ = ["RULES", "Segmentation", "segment"]
+__all__ = ["RULES", "Parted", "Segmentation", "part", "segment"]
 
 RULES = (
     "low",
@@ -48,18 +47,38 @@ RULES = (
     "ledge",
     "axis",
     "small",
-    "hollow",
-    "rim",
+    "parts",
     "occluder",
-    "overhang",
-    "neck",
-    "float",
-    "ring",
     "feet",
     "fill",
 )
 """The rules beyond the thesis, in their order. Without any of them what remains is the plane, the
 height above it, and depth jumps."""
+
+
+class Parted(NamedTuple):
+    """What stands above the planes, parted where two objects may meet.
+
+    Attributes
+    ----------
+    up, supports, planes : as in `Segmentation`.
+    heights : of the cells, and the plane each is above.
+    raised : (rows, columns) int16, the numbers of the low objects that are known by their outline.
+    walls : (rows, columns) uint8, not 0 on walls.
+    surfaces : which cells go on in which, and which way they face.
+    regions : (rows, columns) int16, the pieces, 0 elsewhere.
+    pieces : their statistics.
+    """
+
+    up: F8
+    supports: list[Support]
+    planes: F8
+    heights: Heights
+    raised: I4
+    walls: U1
+    surfaces: Surfaces
+    regions: I4
+    pieces: Pieces
 
 
 class Segmentation(NamedTuple):
@@ -101,15 +120,15 @@ def _checked(text: str) -> list[str]:
     return rules
 
 
-def segment(
+def part(
     cells: Cells,
     hint: F8 | None,
     *,
     upright: bool,
     settings: DetectionSettings,
     rng: np.random.Generator,
-) -> Segmentation | None:
-    """Find planes and objects among ``cells``; None if there is no supporting plane."""
+) -> Parted | None:
+    """Find planes and the pieces of objects among ``cells``; None if no plane bears anything."""
     rules = _checked(settings.rules)
     up = estimate_up(cells, hint, upright=upright, rng=rng)
     supports = [] if up is None else boards_of(cells, find_levels(cells, up, rng))
@@ -135,10 +154,25 @@ def segment(
     if more > n:
         pieces = pieces_of(cells, heights, surfaces, regions, more, up)
     meet(cells.w, heights, surfaces, regions, up, pieces)
+    return Parted(up, supports, planes, heights, raised, walls, surfaces, regions, pieces)
+
+
+def segment(
+    cells: Cells,
+    hint: F8 | None,
+    *,
+    upright: bool,
+    settings: DetectionSettings,
+    rng: np.random.Generator,
+) -> Segmentation | None:
+    """Find planes and objects among ``cells``; None if there is no supporting plane."""
+    parted = part(cells, hint, upright=upright, settings=settings, rng=rng)
+    if parted is None:
+        return None
+    up, supports, planes, heights, raised, walls, surfaces, regions, pieces = parted
+    rules = settings.rules.split()
     known = join_raised(pieces, raised, regions, surfaces.spans)
-    join_pieces(pieces, cells, surfaces, regions, rules)
-    if "ring" in rules:
-        join_rings(pieces, cells.w, heights.height, regions)
+    join_pieces(pieces, cells, surfaces, regions, up, rules)
     furniture = posts_of(cells, heights.owner, regions, surfaces.spans, pieces, up)
     furniture |= towers_of(cells, planes, pieces, up, highest_m=settings.max_height_m)
     furniture |= sides_of(cells, pieces)
@@ -153,7 +187,7 @@ def segment(
     labels = regions  # of pieces before, of objects from here on
     rename(labels, surfaces.spans, number[pieces.group])
     if "feet" in rules:
-        grow_feet(cells.w, heights.owner, heights.height, labels, stacks[0])
+        grow_feet(cells.w, heights.owner, heights.height, labels, np.zeros(cells.w.size, np.int32))
     filled = fill_enclosed(
         cells.w, heights.height, labels, leaders.size - 1, active="fill" in rules
     )

@@ -8,7 +8,6 @@ from shapecat.arrays import F4
 from shapecat.detection.pieces import (
     BAND_M,
     BANDS,
-    BOTTOM,
     COUNT,
     FAR,
     FITTED,
@@ -26,24 +25,16 @@ from shapecat.jit import kernel
 
 __all__ = [
     "LID_M",
-    "MEETS_M",
     "apart",
     "behind",
-    "has_lid",
-    "is_within",
     "lid_share",
-    "rests_on",
     "roundness_of",
     "slope_of",
     "width_of",
 ]
 
-LID_M, LID = 0.02, 0.3
-"""A top is closed if this share of its width squared faces up within this depth of it."""
-LEDGE_M2, FLAT, MEETS_M = 4e-4, 0.9, 0.0075
-LEVEL, SLOPING = 3, 8
-"""A level top: least visible area, and share of what faces up in the upper `SLOPING` bands that is
-in the upper `LEVEL` ones; how far what stands on it may seem to begin above or below it."""
+LID_M = 0.02
+"""A top is closed by what faces up within this depth of it."""
 
 
 @kernel(leaf=True)
@@ -62,12 +53,6 @@ def apart(a: F4, b: F4) -> float:
 def behind(a: F4, b: F4) -> float:
     """Return how much farther away than piece ``b`` piece ``a`` is on average, metres."""
     return float(a[FAR] / a[COUNT] - b[FAR] / b[COUNT])
-
-
-@kernel(leaf=True)
-def is_within(a: F4, b: F4, slack: float) -> bool:
-    """Whether piece ``a`` reaches no more than ``slack`` metres beyond either side of ``b``."""
-    return bool(a[LEFT] >= b[LEFT] - slack and a[RIGHTMOST] <= b[RIGHTMOST] + slack)
 
 
 @kernel(leaf=True)
@@ -98,25 +83,6 @@ def _moments(row: F4) -> tuple[float, float, float]:
     spread = row[SIDE2] - row[SIDE] * row[SIDE] / n
     turning = row[TURN2] - row[TURN] * row[TURN] / n
     return spread, turning, row[SIDETURN] - row[SIDE] * row[TURN] / n
-
-
-@kernel(leaf=True)
-def has_lid(pieces: Pieces, p: int) -> bool:
-    """Whether the top of a piece is closed by a surface that faces up."""
-    return bool(lid_share(pieces, p, LID_M) > LID)
-
-
-@kernel(leaf=True)
-def rests_on(pieces: Pieces, p: int, q: int) -> bool:
-    """Whether piece ``p`` begins where ``q`` ends in a level top; a shoulder slopes."""
-    if abs(pieces.shape[p, BOTTOM] - pieces.shape[q, TOP]) > MEETS_M:
-        return False
-    top = min(int(pieces.shape[q, TOP] / BAND_M), BANDS - 1)
-    level = near = 0.0
-    for band in range(max(top - SLOPING, 0), top + 1):
-        near += pieces.lid[q, band]
-        level += pieces.lid[q, band] if band > top - LEVEL else 0.0
-    return bool(level > LEDGE_M2 and level > FLAT * near)
 
 
 @kernel(leaf=True)

@@ -1,0 +1,232 @@
+"""Grow the trees that tell parts of one object: ``python -m shapecat.models.parts``.
+
+Simulated scenes, as several sensors see them, give the pairs of pieces. The pieces of an object are
+joined in random order, and all pairs on the way are learned from: so the trees meet what they will
+have joined themselves.
+"""
+
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
+from multiprocessing import get_context
+from pathlib import Path
+from typing import NamedTuple
+
+import click
+import numpy as np
+
+from shapecat.arrays import F4, I4, U1, Bool
+from shapecat.config import DetectionSettings
+from shapecat.detection import parts
+from shapecat.detection.cells import Cells, cells_of
+from shapecat.detection.joins import join_pieces
+from shapecat.detection.parts import SIGNS, Sight, Trees, meet_at_all, signs_of
+from shapecat.detection.pieces import Pieces, merge
+from shapecat.detection.raised import join_raised
+from shapecat.detection.segmentation import RULES, part
+from shapecat.learning.boosting import Tree, TreeSettings, grow_tree, make_bins
+from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
+from shapecat.simulation.scenes import SceneKind
+from shapecat.simulation.sensors import IDEAL, Sensor
+from shapecat.types import CATEGORIES, Camera
+
+__all__ = ["collect", "grow", "main"]
+
+_OTHERS = " ".join(rule for rule in RULES if rule != "parts")
+_PURE = 0.6
+"""A piece belongs to the object that has more than this share of it."""
+_NOISY = replace(IDEAL, noise=0.0015, step=0.0029)
+_BLENDED = replace(IDEAL, noise=0.0015, blend_px=3)
+_ROUNDS, _LEAVES, _RATE, _RIDGE, _LEAST, _ROWS = 200, 64, 0.1, 1.0, 2.0, 0.7
+_CHUNK = 25
+
+
+class Series(NamedTuple):
+    """Scenes of one kind that one sensor sees: the first seed, how many, and what is in them."""
+
+    kind: SceneKind
+    sensor: Sensor
+    first: int
+    scenes: int
+    categories: tuple[str, ...] = CATEGORIES
+
+
+_SERIES = (
+    Series("clutter", KINECT, 2000, 2700),
+    Series("clutter", REALSENSE, 10_000, 1200),
+    Series("clutter", _NOISY, 20_000, 300),
+    Series("clutter", _BLENDED, 30_000, 300),
+    Series("clutter", IDEAL, 40_000, 300),
+    Series("shelf", KINECT, 2000, 720),
+    Series("shelf", REALSENSE, 10_000, 300),
+    Series("turntable", KINECT, 2000, 180),
+    Series("clutter", KINECT, 50_000, 400, ("box",)),
+    Series("clutter", REALSENSE, 60_000, 150, ("box",)),
+    Series("clutter", KINECT, 70_000, 150, ("box", "can", "plate")),
+)
+"""Seeds below 2000 are for development, those from 100000 on for judging alone."""
+
+
+class Pairs(NamedTuple):
+    """Pairs of pieces: ``signs`` (n, `SIGNS`), and whether both are of the ``same`` object (n,)."""
+
+    signs: F4
+    same: Bool
+
+
+@click.command()
+@click.option("--share", default=1.0, show_default=True, help="Share of the scenes to learn from.")
+@click.option("--seed", default=0, show_default=True, help="Seed of the draws.")
+@click.option("--jobs", default=2, show_default=True, help="Processes.")
+@click.option(
+    "--out",
+    default=Path(parts.__file__).with_name(parts.FILE),
+    type=click.Path(path_type=Path),
+    help="File to write.",
+)
+def main(*, share: float, seed: int, jobs: int, out: Path) -> None:
+    """Simulate, part, grow; write the trees."""
+    pairs = collect(share, jobs)
+    grown = grow(pairs, seed)
+    np.savez_compressed(out, **grown._asdict())
+    click.echo(f"{len(pairs.same)} pairs, {pairs.same.mean():.0%} of one object; {out}")
+
+
+def collect(share: float, jobs: int) -> Pairs:
+    """Return the pairs of pieces of a share of the scenes, whatever the number of jobs."""
+    chunks = [
+        (series, series.first + k, min(_CHUNK, count - k))
+        for series in _SERIES
+        for count in [round(series.scenes * share)]
+        for k in range(0, count, _CHUNK)
+    ]
+    with ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool:
+        found = pool.map(_collect, chunks)
+        with click.progressbar(found, length=len(chunks), label="scenes") as bar:
+            both = list(bar)
+    return Pairs(np.concatenate([p.signs for p in both]), np.concatenate([p.same for p in both]))
+
+
+def _collect(chunk: tuple[Series, int, int]) -> Pairs:
+    series, first, count = chunk
+    found: list[tuple[F4, bool]] = []
+    for seed in range(first, first + count):
+        rng = np.random.default_rng(seed)
+        world = make_scene(series.kind, rng, frames=1, categories=series.categories)
+        frame, owners = render_frame(world, 0, rng=rng, sensor=series.sensor)
+        things = np.array([thing.label for thing in world.things])
+        if frame.depth is not None and frame.camera is not None:
+            found += _pairs(frame.depth, frame.camera, owners, things, rng)
+    signs = np.array([signs for signs, _ in found], np.float32).reshape(-1, SIGNS)
+    return Pairs(signs, np.array([same for _, same in found], bool))
+
+
+def _pairs(
+    depth: F4, camera: Camera, owners: U1, things: I4, rng: np.random.Generator
+) -> Iterator[tuple[F4, bool]]:
+    """Yield the pairs of a frame: of its pieces, and of what they are joined to.
+
+    Parameters
+    ----------
+    owners : (h, w) the label of what each pixel shows.
+    things : the labels of objects.
+    """
+    settings = DetectionSettings(rules=_OTHERS)
+    cells = cells_of(depth, camera, range_m=settings.max_range_m)
+    if cells is None:
+        return
+    parted = part(cells, None, upright=True, settings=settings, rng=rng)
+    if parted is None:
+        return
+    pieces = parted.pieces
+    join_raised(pieces, parted.raised, parted.regions, parted.surfaces.spans)
+    join_pieces(pieces, cells, parted.surfaces, parted.regions, parted.up, _OTHERS.split())
+    counts = _count(owners.reshape(depth.shape), parted.regions, cells)
+    sight, seen = Sight.of(cells, parted.up), set()
+    while True:
+        rows, whose = _whose(pieces, counts, things)
+        todo = []
+        for p, q in _meeting(pieces, whose):
+            same = bool(whose[p] == whose[q] and whose[p] > 0)
+            if same:
+                todo.append((p, q))
+            if (p, q, rows[p], rows[q]) not in seen:
+                seen.add((p, q, rows[p], rows[q]))
+                signs = np.zeros(SIGNS, np.float32)
+                signs_of(pieces, p, q, sight, signs)
+                yield signs, same
+        if not todo:
+            return
+        merge(pieces, *todo[rng.integers(len(todo))])
+
+
+def _count(owners: U1, regions: I4, cells: Cells) -> I4:
+    """Return (pieces, labels) how many cells of each piece show each label."""
+    middle, (rows, columns) = cells.factor // 2, regions.shape
+    seen = owners[middle :: cells.factor, middle :: cells.factor][:rows, :columns]
+    counts = np.zeros((regions.max() + 1, owners.max() + 1), np.int64)
+    np.add.at(counts, (regions.ravel(), seen.ravel()), 1)
+    return counts
+
+
+def _whose(pieces: Pieces, counts: I4, things: I4) -> tuple[I4, I4]:
+    """Return of each piece how many cells it has, and whose it is.
+
+    That is 0 for what is no object, and -1 for what is of several.
+    """
+    joined = np.zeros_like(counts)
+    np.add.at(joined, pieces.group, counts)
+    cells = joined.sum(axis=1)
+    best = joined.argmax(axis=1)
+    pure = joined[np.arange(len(best)), best] > _PURE * cells
+    return cells, np.where(pure, np.where(np.isin(best, things), best, 0), -1)
+
+
+def _meeting(pieces: Pieces, whose: I4) -> Iterator[tuple[int, int]]:
+    """Yield the pairs of pieces that meet, but for mixed ones and those that are no objects."""
+    n = pieces.group.size
+    for p in range(1, n):
+        for q in range(p + 1, n):
+            known = min(whose[p], whose[q]) >= 0 and max(whose[p], whose[q]) > 0
+            if known and meet_at_all(pieces, p, q):
+                yield p, q
+
+
+def grow(pairs: Pairs, seed: int) -> Trees:
+    """Grow trees on pairs: gradient boosting with the cross entropy (Friedman 2001)."""
+    rng = np.random.default_rng(seed)
+    bins, n = make_bins(pairs.signs), len(pairs.same)
+    share = pairs.same.mean()
+    logit = np.full(n, np.log(share / (1 - share)), np.float32)
+    settings = TreeSettings(_LEAVES, _RATE, _RIDGE, _LEAST)
+    grown: list[Tree] = [_leaf(float(logit[0]))]
+    columns = np.arange(SIGNS)
+    for _ in range(_ROUNDS):
+        posterior = 1 / (1 + np.exp(-logit))
+        rows = np.sort(rng.permutation(n)[: round(_ROWS * n)]).astype(np.int32)
+        slope, bend = posterior - pairs.same, posterior * (1 - posterior)
+        grown.append(grow_tree(bins, columns, rows, slope, bend, settings, logit))
+    return _joined(grown)
+
+
+def _leaf(value: float) -> Tree:
+    return Tree(*(np.zeros(1, np.int64), np.zeros(1, np.float32)) * 2)._replace(
+        left=np.zeros(1, np.int64), value=np.array([value], np.float32)
+    )
+
+
+def _joined(grown: Sequence[Tree]) -> Trees:
+    """Put the nodes of all trees behind each other."""
+    roots = np.cumsum([0, *(len(tree.left) for tree in grown)])
+    left = [np.where(t.left > 0, t.left + root, 0) for t, root in zip(grown, roots, strict=False)]
+    return Trees(
+        roots[:-1].astype(np.int32),
+        np.concatenate([tree.feature for tree in grown]).astype(np.int16),
+        np.concatenate([tree.threshold for tree in grown]).astype(np.float32),
+        np.concatenate(left).astype(np.int32),
+        np.concatenate([tree.value for tree in grown]).astype(np.float32),
+    )
+
+
+if __name__ == "__main__":
+    main()

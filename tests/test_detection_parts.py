@@ -1,0 +1,78 @@
+"""Parts of one object: told by trees that must be sound, and learned the same way each time."""
+
+import numpy as np
+import pytest
+
+from shapecat.config import DetectionSettings
+from shapecat.detection import detect
+from shapecat.detection.cells import cells_of
+from shapecat.detection.parts import SIGNS, Sight, meet_at_all, signs_of, trees
+from shapecat.detection.segmentation import part
+from shapecat.models.parts import Pairs, collect, grow
+from shapecat.simulation import KINECT, make_scene, render_frame
+from tests.test_detection import overlaps
+
+
+def test_every_walk_through_the_trees_ends() -> None:
+    """A child before its parent would be a walk without end."""
+    grown = trees()
+    inner = np.flatnonzero(grown.left)
+    assert np.all(grown.left[inner] > inner)
+    assert grown.left.max() + 1 < grown.left.size
+    assert np.all(grown.left[grown.roots[1:] - 1] == 0)
+    assert 0 <= grown.feature.min() <= grown.feature.max() < SIGNS
+    assert np.isfinite(grown.value).all()
+
+
+def test_the_order_of_two_pieces_says_nothing() -> None:
+    rng = np.random.default_rng(3)
+    frame, _ = render_frame(make_scene("clutter", rng, frames=1), 0, rng=rng, sensor=KINECT)
+    assert frame.depth is not None
+    assert frame.camera is not None
+    cells = cells_of(frame.depth, frame.camera, range_m=2.0)
+    assert cells is not None
+    parted = part(cells, None, upright=True, settings=DetectionSettings(), rng=rng)
+    assert parted is not None
+    sight, pieces = Sight.of(cells, parted.up), parted.pieces
+    there, back = np.zeros((2, SIGNS), np.float32)
+    seen = 0
+    for p in range(1, pieces.group.size):
+        for q in range(1, p):
+            assert meet_at_all(pieces, p, q) == meet_at_all(pieces, q, p)
+            if meet_at_all(pieces, p, q):
+                signs_of(pieces, p, q, sight, there)
+                signs_of(pieces, q, p, sight, back)
+                assert np.array_equal(there, back)
+                assert np.isfinite(there).all()
+                seen += 1
+    assert seen > 10
+
+
+@pytest.mark.parametrize("seed", [1600, 1601])
+def test_without_the_trees_objects_stay_in_pieces(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    world = make_scene("clutter", rng, frames=1)
+    frame, seen = render_frame(world, 0, rng=rng, sensor=KINECT)
+    labels = [thing.label for thing in world.things if np.count_nonzero(seen == thing.label) > 400]
+    found = []
+    for rules in ("low concave ledge axis small", "low concave ledge axis small parts"):
+        settings = DetectionSettings(rules=rules)
+        scene = detect(frame, settings=settings, rng=np.random.default_rng(0))
+        found.append(np.mean(np.array(overlaps(scene, seen, labels)) > 0.75))
+    assert found[1] > found[0]
+
+
+def test_pairs_do_not_depend_on_the_number_of_processes() -> None:
+    one, two = collect(0.001, 1), collect(0.001, 2)
+    assert np.array_equal(one.signs, two.signs)
+    assert np.array_equal(one.same, two.same)
+    assert 0.05 < one.same.mean() < 0.95
+
+
+def test_grown_trees_tell_what_they_were_shown() -> None:
+    """And the same trees are grown each time."""
+    rng = np.random.default_rng(0)
+    signs = rng.normal(size=(2000, SIGNS)).astype(np.float32)
+    same = (signs[:, 4] > 0) ^ (signs[:, 40] > 0.3)
+    first, second = (grow(Pairs(signs, same), seed=1) for _ in range(2))
+    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
