@@ -6,7 +6,7 @@ import pytest
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.detection.cells import cells_of
-from shapecat.detection.parts import SIGNS, Sight, meet_at_all, signs_of, trees
+from shapecat.detection.parts import SIGNS, Sight, _sum_of, meet_at_all, signs_of, trees
 from shapecat.detection.segmentation import part
 from shapecat.models.parts import Pairs, collect, grow
 from shapecat.simulation import KINECT, make_scene, render_frame
@@ -76,3 +76,5 @@ def test_grown_trees_tell_what_they_were_shown() -> None:
     same = (signs[:, 4] > 0) ^ (signs[:, 40] > 0.3)
     first, second = (grow(Pairs(signs, same), seed=1) for _ in range(2))
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
+    told = np.array([_sum_of(first, row) > 0 for row in signs])
+    assert np.mean(told == same) > 0.95

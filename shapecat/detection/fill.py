@@ -7,11 +7,7 @@ from shapecat.detection.cells import JUMP, place_of
 from shapecat.detection.heights import LEAST_M, NOISE
 from shapecat.jit import kernel
 
-__all__ = [
-    "FRINGE",
-    "fill_enclosed",
-    "grow_feet",
-]
+__all__ = ["FRINGE", "fill_enclosed", "grow_feet"]
 
 FRINGE = 0.6
 """Share of the least height from which a reading next to an object belongs to it."""

@@ -1,7 +1,8 @@
 """Segmentation: the rules from cells to labelled cells, on one page.
 
 The thesis stops at objects that do not touch. Beyond it, concave edges part touching and stacked
-objects (`regions`), and a few rules bring the pieces of one object together again (`joins`).
+objects (`regions`), and learned trees (`parts`) between two rules bring the pieces of one object
+together again (`joins`). Nothing else is learned.
 """
 
 from typing import NamedTuple

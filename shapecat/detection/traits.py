@@ -23,15 +23,7 @@ from shapecat.detection.pieces import (
 )
 from shapecat.jit import kernel
 
-__all__ = [
-    "LID_M",
-    "apart",
-    "behind",
-    "lid_share",
-    "roundness_of",
-    "slope_of",
-    "width_of",
-]
+__all__ = ["LID_M", "apart", "behind", "lid_share", "roundness_of", "slope_of", "width_of"]
 
 LID_M = 0.02
 """A top is closed by what faces up within this depth of it."""

@@ -210,9 +210,9 @@ def grow(pairs: Pairs, seed: int) -> Trees:
 
 
 def _leaf(value: float) -> Tree:
-    return Tree(*(np.zeros(1, np.int64), np.zeros(1, np.float32)) * 2)._replace(
-        left=np.zeros(1, np.int64), value=np.array([value], np.float32)
-    )
+    """Return a tree that adds the same to all."""
+    none = np.zeros(1, np.int64)
+    return Tree(none, np.zeros(1, np.float32), none, np.array([value], np.float32))
 
 
 def _joined(grown: Sequence[Tree]) -> Trees:
