@@ -63,13 +63,8 @@ def _freeze(
 ) -> NDArray[Any]:
     """Do the work of `freeze`: records are made by the thousand."""
     result = np.asarray(value, dtype)
-    if result.shape != axes and not (  # numbers alone are compared at once
-        len(axes) == result.ndim
-        and all(
-            size == (axis if isinstance(axis, int) else sizes.setdefault(axis, size))
-            for axis, size in zip(axes, result.shape, strict=True)
-        )
-    ):
+    # A shape of numbers alone is compared at once.
+    if result.shape != axes and not _agree(axes, result.shape, sizes):
         known = f" with {sizes}" if sizes else ""
         names = ", ".join(map(str, axes))
         msg = f"expected shape ({names}){known}, got {result.shape}"
@@ -78,6 +73,16 @@ def _freeze(
         result = result.view()
         result.setflags(write=False)
     return result
+
+
+def _agree(axes: Axes, shape: tuple[int, ...], sizes: dict[str, int]) -> bool:
+    """Whether a shape is as stated; ``sizes`` of names met for the first time are added."""
+    if len(axes) != len(shape):
+        return False
+    for axis, size in zip(axes, shape, strict=True):
+        if size != (sizes.setdefault(axis, size) if isinstance(axis, str) else axis):
+            return False
+    return True
 
 
 def array(shape: str, dtype: str, **options: Any) -> Any:
@@ -117,4 +122,5 @@ class Record:
             except ValueError as error:
                 msg = f"{type(self).__name__}.{name}: {error}"
                 raise ValueError(msg) from None
-            object.__setattr__(self, name, frozen)
+            if frozen is not value:
+                object.__setattr__(self, name, frozen)

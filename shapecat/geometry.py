@@ -16,6 +16,7 @@ __all__ = [
     "cross",
     "gravity_rotation",
     "inverse",
+    "level_axes",
     "level_from_sensor",
     "quaternion_from_rotation",
     "rotation_from_quaternion",
@@ -100,19 +101,26 @@ def gravity_rotation(up: ArrayLike) -> F8:
     >>> gravity_rotation([0, -1, 0]) @ [0, -1, 0]
     array([0., 0., 1.])
     """
-    a, b, c = _unit(*np.asarray(up, np.float64).tolist())
-    d, e, f = _unit(1 - a * a, -a * b, -a * c) if abs(a) < 0.7 else _unit(-a * b, 1 - b * b, -b * c)
-    return np.array([[d, e, f], [b * f - c * e, c * d - a * f, a * e - b * d], [a, b, c]])
+    return np.array(_level_axes(*np.asarray(up, np.float64).tolist()))
 
 
-def _unit(x: float, y: float, z: float) -> tuple[float, float, float]:
+def _level_axes(x: float, y: float, z: float) -> tuple[tuple[float, float, float], ...]:
     norm = math.sqrt(x * x + y * y + z * z)
-    return x / norm, y / norm, z / norm
+    a, b, c = x / norm, y / norm, z / norm
+    d, e, f = (1 - a * a, -a * b, -a * c) if abs(a) < 0.7 else (-a * b, 1 - b * b, -b * c)
+    norm = math.sqrt(d * d + e * e + f * f)
+    d, e, f = d / norm, e / norm, f / norm
+    return (d, e, f), (b * f - c * e, c * d - a * f, a * e - b * d), (a, b, c)
 
 
+level_axes = kernel(_level_axes)
+"""`gravity_rotation` for kernels: (x, y, z) to its three rows."""
+
+
+@kernel
 def cross(a: F8, b: F8) -> F8:
-    """Return the cross product of two vectors (3,); `numpy.cross` takes 20 times as long."""
-    (ax, ay, az), (bx, by, bz) = a.tolist(), b.tolist()
+    """Return the cross product of two vectors (3,)."""
+    (ax, ay, az), (bx, by, bz) = a, b
     return np.array([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx])
 
 

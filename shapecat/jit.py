@@ -9,10 +9,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, TypeVar
 
+import numpy as np
 from numba import njit
 from numba.core.event import Event, Listener, install_listener
 
-__all__ = ["CompileClock", "compile_clock", "kernel"]
+__all__ = ["CompileClock", "compile_clock", "kernel", "unset"]
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
@@ -44,6 +45,12 @@ def kernel(
         )(target)
 
     return compile_later if function is None else compile_later(function)
+
+
+@kernel
+def unset(shape: Any, dtype: Any) -> Any:
+    """Return an array for kernels that write what they read: to clear an image takes 0.03 ms."""
+    return np.empty(shape, dtype)  # noqa: TID251  the only one
 
 
 class CompileClock(Listener):  # type: ignore[misc]  # numba has no types

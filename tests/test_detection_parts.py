@@ -31,9 +31,10 @@ def test_the_order_of_two_pieces_says_nothing() -> None:
     assert frame.camera is not None
     cells = cells_of(frame.depth, frame.camera, range_m=2.0)
     assert cells is not None
-    parted = part(cells, None, upright=True, settings=DetectionSettings(), rng=rng)
-    assert parted is not None
-    sight, pieces = Sight.of(cells, parted.up), parted.pieces
+    found = part(cells, settings=DetectionSettings(), rng=rng)
+    assert found is not None
+    ground, (_, _, pieces) = found
+    sight = Sight(cells.lens.fx, float(ground.up[2]))
     there, back = np.zeros((2, SIGNS), np.float32)
     seen = 0
     for p in range(1, pieces.group.size):

@@ -10,9 +10,10 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.cells import Cells, Lens
+from shapecat.detection.cells import Cells
 from shapecat.detection.heights import Heights
 from shapecat.detection.pieces import BAND_M, BANDS, COUNT, Pieces, side_of
+from shapecat.detection.regions import cut_above
 from shapecat.detection.surfaces import Surfaces
 from shapecat.detection.traits import slope_of
 from shapecat.geometry import cross
@@ -40,6 +41,7 @@ N, U, F, Z, UU, UF, FF, UZ, FZ, ZZ, WIDTH = range(11)
 the mean of each band of height, and widths of bands."""
 
 
+@kernel
 def cut_at_axes(
     cells: Cells, heights: Heights, surfaces: Surfaces, pieces: Pieces, labels: I4, up: F8, n: int
 ) -> int:
@@ -49,53 +51,39 @@ def cut_at_axes(
     ----------
     labels : (rows, columns) 1..n, 0 elsewhere.
     """
-    side = side_of(up)
-    cut = np.zeros((n + 1, BANDS), np.bool_)
-    _find(
-        cells.w, cells.lens, heights.height, surfaces, pieces, labels,
-        up, side, cross(up, side), cut,
-    )  # fmt: skip
-    last = 0
-    for p, band in np.argwhere(cut):
-        rest = n if p == last else p  # what the cut below has left
-        n, last = n + 1, p
-        labels[(labels == rest) & (heights.height > (band + 0.5) * BAND_M)] = n
+    rounded = _number_rounded(pieces, n + 1)
+    things = np.max(rounded) + 1
+    sums, reach = np.zeros((things, BANDS, 11)), np.zeros((2, things, BANDS))
+    _add(cells, heights.height, surfaces, labels, rounded, up, sums, reach)
+    for p in range(1, n + 1):
+        if rounded[p] == 0:
+            continue
+        rest = p
+        for band in np.flatnonzero(_cuts_of(sums[rounded[p]])):
+            n += 1
+            level = (band + 0.5) * BAND_M
+            cut_above(labels, surfaces.spans, heights.height, rest, level, n)
+            rest = n  # what this cut has left
     return n
 
 
 @kernel
-def _find(
-    w: F4,
-    lens: Lens,
-    height: F4,
-    surfaces: Surfaces,
-    pieces: Pieces,
-    labels: I4,
-    up: F8,
-    side: F8,
-    forward: F8,
-    cut: Bool,
-) -> None:
-    """Mark the bands at which each label is to be cut."""
-    rounded = _number_rounded(pieces, len(cut))
-    most = np.max(rounded) + 1
-    sums, reach = np.zeros((most, BANDS, 11)), np.zeros((2, most, BANDS))
-    _add(w, lens, height, surfaces, labels, rounded, up, side, forward, sums, reach)
+def _cuts_of(bands: F8) -> Bool:
+    """Return whether a side is to be cut at each of its bands."""
+    cut = np.zeros(BANDS, np.bool_)
     parts = np.zeros((BANDS, 2), np.int64)
-    for p in range(1, len(cut)):
-        if rounded[p] == 0:
-            continue
-        parts[0] = 0, BANDS
-        top = 1
-        while top > 0:
-            top -= 1
-            low, high = parts[top]
-            band = low + _best_cut(sums[rounded[p], low:high])
-            if band > low:
-                cut[p, band] = True
-                parts[top] = low, band
-                parts[top + 1] = band + 1, high
-                top += 2
+    parts[0] = 0, BANDS
+    top = 1
+    while top > 0:
+        top -= 1
+        low, high = parts[top]
+        band = low + _best_cut(bands[low:high])
+        if band > low:
+            cut[band] = True
+            parts[top] = low, band
+            parts[top + 1] = band + 1, high
+            top += 2
+    return cut
 
 
 @kernel
@@ -116,21 +104,20 @@ def _number_rounded(pieces: Pieces, labels: int) -> I4:
     return numbers
 
 
-@kernel(leaf=True)
+@kernel
 def _add(
-    w: F4,
-    lens: Lens,
+    cells: Cells,
     height: F4,
     surfaces: Surfaces,
     labels: I4,
     rounded: I4,
     up: F8,
-    side: F8,
-    forward: F8,
     sums: F8,
     reach: F8,
 ) -> None:
     """Collect the sums over the bands of each round thing; ``reach`` (2, things, bands) is room."""
+    w, lens, side = cells.w, cells.lens, side_of(up)
+    forward = cross(up, side)
     left, right = reach[0], reach[1]
     left[:], right[:] = np.inf, -np.inf
     tangent, normal = surfaces.tangent, surfaces.normal

@@ -6,7 +6,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import NEAREST_M, Cells, Lens
-from shapecat.detection.consensus import TOLERANCE
+from shapecat.detection.consensus import TOLERANCE, Readings
 from shapecat.detection.planes import COS, SIN, Support, corners_of
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
@@ -29,15 +29,15 @@ LEAST_DROPS, CLOSED = 20, 0.5
 """Readings below the edge that say enough, and the share of them on a wall that closes a box."""
 
 
-def boards_of(cells: Cells, found: list[tuple[Support, I4]]) -> list[Support]:
-    """Leave out the tops of objects; ``found`` are planes, lowest first, and their cells.
+def boards_of(cells: Cells, found: list[tuple[Support, Readings]]) -> list[Support]:
+    """Leave out the tops of objects; ``found`` are planes, lowest first, with their readings.
 
     Under the front edge of a table or shelf there is nothing; a box is closed down to what it
     stands on. Things lower than 6 cm are never furniture, planes over a quarter of a square metre
     always.
     """
     kept: list[Support] = []
-    for support, index in found:
+    for support, readings in found:
         below = [s for s in kept if _overlaps(s, support)]
         drop = support.offset - below[-1].offset if below else math.inf
         if drop < LEAST_DROP_M or (kept and support.area_m2 < BOARD_AREA_M2):
@@ -45,7 +45,7 @@ def boards_of(cells: Cells, found: list[tuple[Support, I4]]) -> list[Support]:
         if below and support.area_m2 < SURE_AREA_M2:
             seen = np.zeros(2, np.int64)
             plane = np.array([support.a, support.b, support.c])
-            _drop(cells.w, cells.lens, index, plane, support.up, drop, seen)
+            _drop(cells.w, cells.lens, readings, plane, support.up, drop, seen)
             if seen.sum() >= LEAST_DROPS:
                 if seen[0] > CLOSED * seen.sum():
                     continue
@@ -64,13 +64,13 @@ def _overlaps(lower: Support, upper: Support) -> bool:
 
 
 @kernel(leaf=True)
-def _drop(w: F4, lens: Lens, index: I4, plane: F8, up: F8, drop: float, seen: I4) -> None:
+def _drop(w: F4, lens: Lens, readings: Readings, plane: F8, up: F8, drop: float, seen: I4) -> None:
     """Look below the edge of a plane: count readings on a wall down from it, and beyond it."""
     rows, columns = w.shape
-    for p in index[::3]:
-        i, j = p // columns, p % columns
+    for k in range(0, readings.w.size, 3):
+        i, j = readings.i[k], readings.j[k]
         level = plane[0] * j + plane[1] * i + plane[2]
-        if level <= 0 or abs(w[i, j] - level) >= TOLERANCE:
+        if level <= 0 or abs(readings.w[k] - level) >= TOLERANCE:
             continue
         z = 1 / level
         x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
@@ -94,8 +94,8 @@ def _drop(w: F4, lens: Lens, index: I4, plane: F8, up: F8, drop: float, seen: I4
             x, y, z = x + tx, y + ty, z + tz
         if not edge:
             continue
-        for k in range(FIRST, LAST):
-            s = STEP_M * k
+        for step in range(FIRST, LAST):
+            s = STEP_M * step
             if s > drop - STEP_M:
                 break
             dx, dy, dz = x - s * up[0], y - s * up[1], z - s * up[2]

@@ -13,7 +13,17 @@ from shapecat.arrays import F4, I4
 from shapecat.jit import kernel
 from shapecat.types import Camera
 
-__all__ = ["JUMP", "NEAREST_M", "Cells", "Lens", "cells_of", "middle_of", "place_of"]
+__all__ = [
+    "JUMP",
+    "NEAREST_M",
+    "Cells",
+    "Lens",
+    "cells_of",
+    "count_last",
+    "middle_of",
+    "place_of",
+    "small_at",
+]
 
 JUMP = 0.012
 """Step in inverse depth that separates surfaces, 1/m: four steps of a Kinect, 1 cm at 0.9 m."""
@@ -52,19 +62,6 @@ class Cells(NamedTuple):
     lens: Lens
     factor: int
     size_m: float
-
-    def small(self, depth_m: F4) -> F4:
-        """Return the number of cells of `SMALL_M2` at each depth, within reason."""
-        return np.minimum(np.maximum(SMALL_M2 * self.lens.fx**2 / depth_m**2, 20), 75)
-
-    def count_last(self, labels: I4, size: int, *, range_m: float) -> I4:
-        """Return how many of the last readings before ``range_m`` the labels below ``size`` have.
-
-        Label 0 has none.
-        """
-        count = np.zeros(size, np.int64)
-        _count_far(self.w, np.float32(1 / range_m + JUMP / 2), labels, count)
-        return count
 
 
 def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_M) -> Cells | None:
@@ -117,7 +114,19 @@ def place_of(p: int, columns: int) -> tuple[int, int]:
 
 
 @kernel(leaf=True)
-def _count_far(w: F4, most: float, labels: I4, count: I4) -> None:
+def small_at(cells: Cells, depth_m: float) -> float:
+    """Return the number of cells of `SMALL_M2` at a depth, within reason."""
+    return float(min(max(SMALL_M2 * cells.lens.fx**2 / depth_m**2, 20.0), 75.0))
+
+
+@kernel
+def count_last(w: F4, labels: I4, size: int, range_m: float) -> I4:
+    """Return how many of the last readings before ``range_m`` the labels below ``size`` have.
+
+    Label 0 has none.
+    """
+    count = np.zeros(size, np.int64)
+    most = np.float32(1 / range_m + JUMP / 2)
     for i in range(w.shape[0]):
         some = False
         for j in range(w.shape[1]):
@@ -127,6 +136,7 @@ def _count_far(w: F4, most: float, labels: I4, count: I4) -> None:
         for j in range(w.shape[1]):
             if labels[i, j] > 0 and w[i, j] < most:
                 count[labels[i, j]] += 1
+    return count
 
 
 @kernel

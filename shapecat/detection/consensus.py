@@ -6,18 +6,22 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import Cells, Lens
+from shapecat.detection.cells import Lens
 from shapecat.jit import kernel
 
 __all__ = [
     "TOLERANCE",
     "Readings",
-    "best_plane",
+    "among",
+    "consensus",
+    "cosine",
     "count_near",
     "level_plane",
+    "middle_of",
     "normal_of",
     "readings_of",
     "refit",
+    "triples_of",
     "without",
 ]
 
@@ -42,78 +46,117 @@ class Readings(NamedTuple):
     share: int
 
 
-def readings_of(cells: Cells, owner: I4 | None = None) -> Readings:
-    """Return evenly spaced cells with a reading, those of objects if there is an ``owner``."""
-    stride = max(1, round(math.sqrt(cells.w.size / SAMPLE)))
-    j, i, w = _listed(cells.w, cells.w if owner is None else owner, stride)
-    return Readings(j, i, w, stride * stride)
-
-
 @kernel
-def _listed(w: F4, wanted: F4, stride: int) -> tuple[F4, F4, F4]:
-    """Return the columns, rows and values above 0 of every so many cells, where ``wanted`` is."""
+def readings_of(w: F4, wanted: F4) -> Readings:
+    """Return evenly spaced cells with a reading, where ``wanted`` (rows, columns) is above 0."""
     rows, columns = w.shape
+    stride = max(1, round(math.sqrt(w.size / SAMPLE)))
     result = np.zeros((3, (rows // stride + 1) * (columns // stride + 1)), np.float32)
     n = 0
     for i in range(stride // 2, rows, stride):
         for j in range(stride // 2, columns, stride):
-            if w[i, j] > 0 and wanted[i, j] > 0:
-                result[0, n], result[1, n], result[2, n] = j, i, w[i, j]
-                n += 1
-    return result[0, :n], result[1, :n], result[2, :n]
+            result[0, n], result[1, n], result[2, n] = j, i, w[i, j]
+            n += (w[i, j] > 0) & (wanted[i, j] > 0)
+    return Readings(result[0, :n], result[1, :n], result[2, :n], stride * stride)
 
 
+@kernel
+def among(readings: Readings, chosen: I4) -> Readings:
+    """Return the readings at the ``chosen`` (n,) places in the list."""
+    result = np.zeros((3, chosen.size), np.float32)
+    j, i, w = result[0], result[1], result[2]
+    for k in range(chosen.size):
+        j[k], i[k], w[k] = readings.j[chosen[k]], readings.i[chosen[k]], readings.w[chosen[k]]
+    return Readings(j, i, w, readings.share)
+
+
+@kernel
+def middle_of(values: F4, chosen: I4) -> float:
+    """Return the upper median of the values at the ``chosen`` places, at least one.
+
+    Source: Hoare 1961, Algorithm 65. `numpy.partition` in a kernel takes 15 ms to load.
+    """
+    sample = np.zeros(chosen.size, np.float32)
+    for k in range(chosen.size):
+        sample[k] = values[chosen[k]]
+    middle, low, high = sample.size // 2, 0, sample.size - 1
+    while low < high:
+        pivot, i, j = sample[middle], low, high
+        while i <= j:
+            while sample[i] < pivot:
+                i += 1
+            while sample[j] > pivot:
+                j -= 1
+            if i <= j:
+                sample[i], sample[j] = sample[j], sample[i]
+                i, j = i + 1, j - 1
+        if j < middle:
+            low = i
+        if i > middle:
+            high = j
+    return float(sample[middle])
+
+
+@kernel
 def without(readings: Readings, plane: F8, tolerance: float) -> Readings:
     """Return the readings that are not near a plane."""
-    a, b, c = plane.astype(np.float32)
-    far = abs(readings.w - (a * readings.j + b * readings.i + c)) > tolerance
-    return Readings(readings.j[far], readings.i[far], readings.w[far], readings.share)
+    a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
+    gate = np.float32(tolerance)
+    rest = np.zeros((3, readings.w.size), np.float32)
+    n = 0
+    for k in range(readings.w.size):
+        j, i, v = readings.j[k], readings.i[k], readings.w[k]
+        rest[0, n], rest[1, n], rest[2, n] = j, i, v
+        n += abs(v - (a * j + b * i + c)) > gate
+    return Readings(rest[0, :n], rest[1, :n], rest[2, :n], readings.share)
 
 
+@kernel
 def normal_of(plane: F8, lens: Lens) -> F8:
     """Return the unit normal towards the camera of a plane (a, b, c) of inverse depth."""
-    a, b, c = plane.tolist()
+    a, b, c = plane
     x, y, z = -a * lens.fx, -b * lens.fy, -(a * lens.cx + b * lens.cy + c)
     norm = math.sqrt(x * x + y * y + z * z)
     return np.array([x / norm, y / norm, z / norm])
 
 
-def level_plane(lens: Lens, up: F8, offset: float) -> F8:
-    """Return the plane ``up @ p == offset`` as inverse depth (a, b, c)."""
-    a, b = up[0] / lens.fx, up[1] / lens.fy
-    return np.array([a, b, up[2] - a * lens.cx - b * lens.cy]) / offset
-
-
-def best_plane(
-    readings: Readings,
-    lens: Lens,
-    guide: F8,
-    cosines: tuple[float, float],
-    rng: np.random.Generator,
-    *,
-    tolerance: float = TOLERANCE,
-) -> tuple[F8, int]:
-    """Return the plane (a, b, c) with most inliers, and how many readings these are.
-
-    Only planes count whose normal towards the camera has a cosine within ``cosines`` to
-    ``guide``. No readings agree on a plane: 0.
-    """
-    plane = np.zeros(3)
-    n = readings.w.size
-    triples = rng.integers(0, max(n, 1), (TRIALS if n >= 3 else 0, 3))
-    return plane, _consensus(readings, triples, lens, guide, cosines, tolerance, plane)
+@kernel(leaf=True)
+def cosine(a: F8, b: F8) -> float:
+    """Return the cosine of the angle between two unit vectors (3,)."""
+    return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
 
 
 @kernel
-def _consensus(
+def level_plane(lens: Lens, up: F8, offset: float) -> F8:
+    """Return the plane ``up @ p == offset`` as inverse depth (a, b, c)."""
+    a, b = up[0] / lens.fx, up[1] / lens.fy
+    return np.array([a / offset, b / offset, (up[2] - a * lens.cx - b * lens.cy) / offset])
+
+
+def triples_of(readings: int, rng: np.random.Generator) -> I4:
+    """Draw the readings (n, 3) that propose planes to `consensus`."""
+    return rng.integers(0, max(readings, 1), (TRIALS if readings >= 3 else 0, 3))
+
+
+@kernel
+def consensus(
     readings: Readings,
     triples: I4,
     lens: Lens,
     guide: F8,
     cosines: tuple[float, float],
     tolerance: float,
-    best: F8,
-) -> int:
+) -> tuple[F8, int]:
+    """Return the plane (a, b, c) with most inliers, and how many readings these are.
+
+    Only planes count whose normal towards the camera has a cosine within ``cosines`` to
+    ``guide``. No readings agree on a plane: 0.
+
+    Parameters
+    ----------
+    triples : (n, 3) readings that propose planes, of `triples_of`.
+    """
+    best = np.zeros(3)
     most = 0
     for t in range(triples.shape[0]):
         # (1) three readings propose a plane
@@ -140,7 +183,8 @@ def _consensus(
     # (3) the inliers refit
     for _ in range(4):
         refit(readings.j, readings.i, readings.w, tolerance, best)
-    return count_near(readings, best[0], best[1], best[2], tolerance) if most >= 3 else 0
+    votes = count_near(readings, best[0], best[1], best[2], tolerance) if most >= 3 else 0
+    return best, votes
 
 
 @kernel(fast=True)

@@ -4,9 +4,16 @@ import math
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import JUMP, Cells, Lens
-from shapecat.detection.consensus import TOLERANCE, level_plane, normal_of, readings_of, refit
+from shapecat.detection.consensus import (
+    TOLERANCE,
+    cosine,
+    level_plane,
+    normal_of,
+    readings_of,
+    refit,
+)
 from shapecat.geometry import cross
 from shapecat.jit import kernel
 
@@ -20,7 +27,8 @@ HINT_COS = math.cos(math.radians(15))
 FACING_COS = math.cos(math.radians(20))
 SAME_COS = math.cos(math.radians(12))
 CORNER_COS = 0.3
-TRIALS = 120
+TRIALS, BLOCK = 120, 512
+"""Directions that are tried, and after how many facets it is asked if one can still win."""
 MOST_DIRECTIONS = 4
 HEIGHT_BINS, LEVEL_BIN_M = 80, 0.04
 LEVELS_APART = 2
@@ -40,101 +48,149 @@ def estimate_up(
     direction that two walls leave. Where the camera is thought ``upright``, directions that look
     down count a little less, so that the boards of a shelf beat its back.
     """
-    facets = np.zeros((cells.w.size // 16 + cells.w.shape[0] + cells.w.shape[1], 6), np.float32)
-    facets = facets[: _facets(cells.w, cells.lens, facets)]
-    least = max(LEAST_SHARE * len(facets), LEAST_FACETS)
-    directions = _directions(facets, hint, least, rng)
-    if not directions:
+    facets = _facets(cells.w, cells.lens)
+    least = max(LEAST_SHARE * facets.shape[1], LEAST_FACETS)
+    found = _directions(facets, hint, least, rng)
+    if not found:
         return None
-    if hint is None:
-        # Two walls leave one direction, up or down.
-        directions += [
-            sign * cross(a, b) / np.linalg.norm(cross(a, b))
-            for k, a in enumerate(directions)
-            for b in directions[:k]
-            if abs(a @ b) < CORNER_COS
-            for sign in (1, -1)
-        ]
-    best = max(directions, key=lambda d: _merit(facets, d, least, upright=upright))
-    return _settled(cells, facets, best)
+    corner_cos = CORNER_COS if hint is None else 0.0
+    bias = UPRIGHT if upright else 0.0
+    up = _dominant(cells.w, cells.lens, facets, np.array(found), least, corner_cos, bias)
+    return np.asarray(up)
 
 
 def _directions(facets: F4, hint: F8 | None, least: float, rng: np.random.Generator) -> list[F8]:
     """Return directions that many surfaces face, most first: RANSAC on one normal at a time."""
-    free = np.ones(len(facets), np.bool_)
-    if hint is not None:
-        free &= _facing(facets, hint, HINT_COS)
+    normals = facets[:3] if hint is None else _facing(facets, hint)
     found: list[F8] = []
-    while len(found) < MOST_DIRECTIONS and (left := np.flatnonzero(free)).size >= least:
-        trials = left[rng.integers(0, left.size, TRIALS)]
-        best = np.zeros(3)
-        if _most_faced(facets, free, trials, best) < least:
+    while len(found) < MOST_DIRECTIONS and normals.shape[1] >= least:
+        trials = rng.integers(0, normals.shape[1], TRIALS)
+        best, votes, normals = _most_faced(normals, trials)
+        if votes < least:
             break
         found.append(best)
-        free &= ~_facing(facets, best, FACING_COS)
     return found
 
 
 @kernel
-def _facing(facets: F4, direction: F8, least_cos: float) -> Bool:
-    """Return which facets face a direction."""
-    result = np.zeros(len(facets), np.bool_)
-    x, y, z = direction
-    for k in range(len(facets)):
-        cos = facets[k, 0] * x + facets[k, 1] * y + facets[k, 2] * z
-        result[k] = cos > least_cos
-    return result
-
-
-@kernel(fast=True)
-def _most_faced(facets: F4, free: Bool, trials: I4, best: F8) -> int:
-    """Write the direction most free facets face; return how many."""
+def _facing(facets: F4, hint: F8) -> F4:
+    """Return the normals (3, n) of the facets that may be level."""
+    chosen = np.zeros((3, facets.shape[1]), np.float32)
     n = 0
-    chosen = np.zeros((3, np.count_nonzero(free)), np.float32)
-    for k in range(len(facets)):
-        if free[k]:
-            chosen[0, n], chosen[1, n], chosen[2, n] = facets[k, 0], facets[k, 1], facets[k, 2]
-            n += 1
-    xs, ys, zs = chosen[0], chosen[1], chosen[2]  # unpacked they would not be contiguous
-    least = np.float32(FACING_COS)
-    most = -1
+    for k in range(facets.shape[1]):
+        x, y, z = facets[0, k], facets[1, k], facets[2, k]
+        chosen[0, n], chosen[1, n], chosen[2, n] = x, y, z
+        n += x * hint[0] + y * hint[1] + z * hint[2] > HINT_COS
+    return chosen[:, :n].copy()
+
+
+@kernel
+def _most_faced(normals: F4, trials: I4) -> tuple[F8, int, F4]:
+    """Return the direction most normals (3, n) face, how many do, and the normals that do not."""
+    most, best = -1, np.zeros(3)
     for t in trials:
-        x, y, z = facets[t, 0], facets[t, 1], facets[t, 2]
-        votes = np.int32(0)
-        for k in range(n):
-            votes += np.int32(xs[k] * x + ys[k] * y + zs[k] * z > least)
+        votes = _votes(normals, t, most)
         if votes > most:
-            most = int(votes)
-            best[0], best[1], best[2] = x, y, z
+            most = votes
+            best[0], best[1], best[2] = normals[0, t], normals[1, t], normals[2, t]
     for _ in range(3):
-        x, y, z = np.float32(best[0]), np.float32(best[1]), np.float32(best[2])
-        sx = sy = sz = np.float64(0)
-        votes = np.int32(0)
-        for k in range(n):
-            near = xs[k] * x + ys[k] * y + zs[k] * z > least
-            votes += np.int32(near)
-            sx += xs[k] if near else np.float32(0)
-            sy += ys[k] if near else np.float32(0)
-            sz += zs[k] if near else np.float32(0)
-        most = int(votes)
-        norm = math.sqrt(sx * sx + sy * sy + sz * sz)
-        best[0], best[1], best[2] = sx / norm, sy / norm, sz / norm
-    return most
+        most = _mean_near(normals, best)
+    rest = np.zeros(normals.shape, np.float32)
+    n = 0
+    for k in range(normals.shape[1]):
+        x, y, z = normals[0, k], normals[1, k], normals[2, k]
+        rest[0, n], rest[1, n], rest[2, n] = x, y, z
+        n += not (x * best[0] + y * best[1] + z * best[2] > FACING_COS)
+    return best, most, rest[:, :n].copy()
 
 
-def _merit(facets: F4, direction: F8, least: float, *, upright: bool) -> float:
+@kernel(fast=True, leaf=True)
+def _votes(normals: F4, t: int, most: int) -> int:
+    """Count the normals that face as normal ``t`` does, as long as there may be over ``most``."""
+    xs, ys, zs = normals[0], normals[1], normals[2]  # unpacked they would not be contiguous
+    x, y, z = xs[t], ys[t], zs[t]
+    votes = 0
+    for start in range(0, xs.size, BLOCK):
+        if votes + xs.size - start <= most:
+            break
+        stop = start + BLOCK
+        votes += _count_facing(xs[start:stop], ys[start:stop], zs[start:stop], x, y, z)
+    return votes
+
+
+@kernel(fast=True, leaf=True)
+def _count_facing(xs: F4, ys: F4, zs: F4, x: float, y: float, z: float) -> int:
+    least = np.float32(FACING_COS)
+    votes = np.int32(0)
+    for k in range(xs.size):
+        votes += np.int32(xs[k] * x + ys[k] * y + zs[k] * z > least)
+    return int(votes)
+
+
+@kernel(fast=True, leaf=True)
+def _mean_near(normals: F4, direction: F8) -> int:
+    """Turn a direction to the mean of the normals that face it; return how many these are."""
+    xs, ys, zs = normals[0], normals[1], normals[2]
+    x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
+    least = np.float32(FACING_COS)
+    sx = sy = sz = np.float64(0)
+    votes = np.int32(0)
+    for k in range(xs.size):
+        near = xs[k] * x + ys[k] * y + zs[k] * z > least
+        votes += np.int32(near)
+        sx += xs[k] if near else np.float32(0)
+        sy += ys[k] if near else np.float32(0)
+        sz += zs[k] if near else np.float32(0)
+    norm = math.sqrt(sx * sx + sy * sy + sz * sz)
+    direction[0], direction[1], direction[2] = sx / norm, sy / norm, sz / norm
+    return int(votes)
+
+
+@kernel
+def _dominant(
+    w: F4, lens: Lens, facets: F4, found: F8, least: float, corner_cos: float, bias: float
+) -> F8:
+    """Return the exact normal of the largest plane that faces the best direction, (3,).
+
+    Parameters
+    ----------
+    found : (n, 3) directions that surfaces face, at least one.
+    corner_cos : two of them with a smaller cosine may be walls; 0 for none.
+    bias : how much an upright camera counts.
+    """
+    best, most = found[0], -1.0
+    for k in range(len(found)):
+        merit = _merit(facets, found[k], least, bias)
+        if merit > most:
+            best, most = found[k], merit
+    for k in range(len(found)):
+        for m in range(k):
+            if abs(cosine(found[k], found[m])) >= corner_cos:
+                continue
+            # Two walls leave one direction, up or down.
+            corner = cross(found[k], found[m])
+            corner /= math.sqrt(cosine(corner, corner))
+            for direction in (corner, -corner):
+                merit = _merit(facets, direction, least, bias)
+                if merit > most:
+                    best, most = direction, merit
+    up: F8 = _settled(w, lens, facets, best)
+    return up
+
+
+@kernel
+def _merit(facets: F4, direction: F8, least: float, bias: float) -> float:
     """Return how well a direction explains the surface: what of it lies in large levels."""
-    count = np.zeros(HEIGHT_BINS, np.int64)
-    _count_levels(facets, direction, count)
+    count = _count_levels(facets, direction)
     level, squares = _large_levels(count, least)
     if level == 0:
         return 0.0
     # The boards of a shelf are several, its back is one; what stands before a wall makes it several
     # as well, but these are unlike in size, and much of what faces as it does lies in none.
-    levels, clear = level**2 / squares, level / int(count.sum())
+    levels, clear = level**2 / squares, level / np.sum(count)
     # Cameras look down at tables: +y is down in the optical frame.
-    tilt = min(max(-direction[1] / 0.2, -1.0), 1.0) if upright else 0.0
-    return float(level * levels**SEVERAL * clear**CLEAR * (1.0 + UPRIGHT * tilt))
+    tilt = min(max(-direction[1] / 0.2, -1.0), 1.0)
+    return float(level * levels**SEVERAL * clear**CLEAR * (1.0 + bias * tilt))
 
 
 @kernel
@@ -158,50 +214,55 @@ def _large_levels(count: I4, least: float) -> tuple[int, int]:
 
 
 @kernel
-def _count_levels(facets: F4, direction: F8, count: I4) -> None:
+def _count_levels(facets: F4, direction: F8) -> I4:
     """Count the facets that face a direction by their height below the sensor."""
     x, y, z = direction
-    for k in range(len(facets)):
-        if facets[k, 0] * x + facets[k, 1] * y + facets[k, 2] * z > FACING_COS:
-            height = facets[k, 3] * x + facets[k, 4] * y + facets[k, 5] * z
-            level = math.floor(-height / LEVEL_BIN_M)
-            if 0 <= level < count.size:
-                count[level] += 1
+    count = np.zeros(HEIGHT_BINS + 1, np.int64)  # the last for what is out of bounds
+    nx, ny, nz, px, py, pz = facets[0], facets[1], facets[2], facets[3], facets[4], facets[5]
+    level = np.zeros(nx.size, np.int32)
+    for k in range(nx.size):
+        faces = nx[k] * x + ny[k] * y + nz[k] * z > FACING_COS
+        below = math.floor(-(px[k] * x + py[k] * y + pz[k] * z) / LEVEL_BIN_M)
+        level[k] = below if faces & (below >= 0) & (below < HEIGHT_BINS) else HEIGHT_BINS
+    for k in range(nx.size):
+        count[level[k]] += 1
+    return count[:-1]
 
 
-def _settled(cells: Cells, facets: F4, direction: F8) -> F8:
+@kernel
+def _settled(w: F4, lens: Lens, facets: F4, direction: F8) -> F8:
     """Return the exact normal of the largest plane that faces ``direction``."""
-    count = np.zeros(HEIGHT_BINS, np.int64)
-    _count_levels(facets, direction, count)
-    plane = level_plane(cells.lens, direction, -(int(np.argmax(count)) + 0.5) * LEVEL_BIN_M)
-    readings = readings_of(cells)
+    fullest = np.argmax(_count_levels(facets, direction))
+    plane = level_plane(lens, direction, -(fullest + 0.5) * LEVEL_BIN_M)
+    readings = readings_of(w, w)
     for tolerance in (4, 3, 2, 1, 1):
         refit(readings.j, readings.i, readings.w, tolerance * TOLERANCE, plane)
-    normal = normal_of(plane, cells.lens)
-    return normal if normal @ direction > SAME_COS else direction
+    normal = normal_of(plane, lens)
+    return normal if cosine(normal, direction) > SAME_COS else direction.copy()
 
 
-@kernel(leaf=True)
-def _facets(w: F4, lens: Lens, facets: F4) -> int:
-    """Collect the normal and the position of every fourth cell on a smooth surface."""
+@kernel
+def _facets(w: F4, lens: Lens) -> F4:
+    """Return the normals and the positions (6, n) of every fourth cell on a smooth surface."""
     rows, columns = w.shape
-    bend = np.float32(2 * JUMP)
+    facets = np.zeros((6, (rows // 4 + 1) * (columns // 4 + 1)), np.float32)
+    bend, two = np.float32(2 * JUMP), np.float32(2)
     n = 0
     for i in range(ARM, rows - ARM, 4):
+        y = (i - lens.cy) / lens.fy
         for j in range(ARM, columns - ARM, 4):
             center = w[i, j]
             left, right, top, bottom = w[i, j - ARM], w[i, j + ARM], w[i - ARM, j], w[i + ARM, j]
-            if not ((center > 0) & (left > 0) & (right > 0) & (top > 0) & (bottom > 0)):
+            smooth = (center > 0) & (left > 0) & (right > 0) & (top > 0) & (bottom > 0)
+            smooth &= abs(left + right - two * center) <= bend
+            smooth &= abs(top + bottom - two * center) <= bend
+            if not smooth:
                 continue
-            if (abs(left + right - 2 * center) > bend) | (abs(top + bottom - 2 * center) > bend):
-                continue
-            wu, wv = (right - left) / (2 * ARM), (bottom - top) / (2 * ARM)
-            nx, ny = -lens.fx * wu, -lens.fy * wv
-            nz = wu * (j - lens.cx) + wv * (i - lens.cy) - center
-            norm = math.sqrt(nx * nx + ny * ny + nz * nz)
-            facets[n, 0], facets[n, 1], facets[n, 2] = nx / norm, ny / norm, nz / norm
-            facets[n, 3] = (j - lens.cx) / lens.fx / center
-            facets[n, 4] = (i - lens.cy) / lens.fy / center
-            facets[n, 5] = 1 / center
+            x, z = (j - lens.cx) / lens.fx, 1 / float(center)
+            nx, ny = lens.fx / (2 * ARM) * (left - right), lens.fy / (2 * ARM) * (top - bottom)
+            nz = -nx * x - ny * y - center
+            scale = 1 / math.sqrt(nx * nx + ny * ny + nz * nz)
+            facets[0, n], facets[1, n], facets[2, n] = scale * nx, scale * ny, scale * nz
+            facets[3, n], facets[4, n], facets[5, n] = x * z, y * z, z
             n += 1
-    return n
+    return facets[:, :n].copy()

@@ -4,8 +4,8 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U1, Bool
 from shapecat.detection.cells import JUMP, place_of
-from shapecat.detection.heights import LEAST_M, NOISE
-from shapecat.jit import kernel
+from shapecat.detection.heights import LEAST_M, NOISE, Heights
+from shapecat.jit import kernel, unset
 
 __all__ = ["FRINGE", "fill_enclosed", "grow_feet"]
 
@@ -26,26 +26,16 @@ LEVEL = 0.15
 """Share of the boundary where the surface goes on: not so through the hole of a handle."""
 
 
-def fill_enclosed(w: F4, height: F4, labels: I4, count: int, *, active: bool) -> U1:
-    """Give enclosed unlabelled cells to what encloses them; return (rows, columns) what was filled.
-
-    Cells are enclosed when 60 % of their boundary is one label and every other label on it is in
-    front of them.
-    """
-    filled = np.zeros(labels.shape, np.uint8)
-    if active:
-        _fill(w, height, labels, count, filled)
-    return filled
-
-
 @kernel
-def grow_feet(w: F4, owner: I4, height: F4, labels: I4, edge: I4) -> None:
+def grow_feet(w: F4, heights: Heights, labels: I4) -> None:
     """Let the labels grow over the cells beside them that are hardly above their plane.
 
     The least height of an object cell is safe against the noise of the plane; next to an object
-    less is enough. Further away what is so low is as often the plane. ``edge`` (cells,) is room.
+    less is enough. Further away what is so low is as often the plane.
     """
+    owner, height = heights
     rows, columns = labels.shape
+    edge = unset(labels.size, np.int32)
     beside = np.zeros(columns, np.bool_)
     count = 0
     for i in range(rows):
@@ -210,7 +200,12 @@ def _is_raised(w: F4, height: F4, stack: I4, cells: int) -> bool:
 
 
 @kernel
-def _fill(w: F4, height: F4, labels: I4, count: int, filled: U1) -> None:
+def fill_enclosed(w: F4, height: F4, labels: I4, count: int, filled: U1) -> None:
+    """Give enclosed unlabelled cells to what encloses them, and mark them in ``filled``.
+
+    Cells are enclosed when 60 % of their boundary is one label and every other label on it is in
+    front of them.
+    """
     seen = np.zeros(labels.shape, np.uint8)
     stack = np.zeros((STACK, 2), np.int16)
     sides, ahead, level = np.zeros((3, count + 1), np.int32)

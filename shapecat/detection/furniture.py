@@ -1,40 +1,38 @@
 """Furniture: pieces that are no object but parts of tables and shelves, walls, or noise."""
 
+from typing import NamedTuple
+
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, Bool
-from shapecat.detection.cells import JUMP, NEAREST_M, Cells, Lens
+from shapecat.detection.cells import JUMP, NEAREST_M, Lens, count_last, place_of
 from shapecat.detection.heights import LEAST_M, NOISE
 from shapecat.detection.pieces import (
     AREA,
     BOTTOM,
     CONTACT,
     COUNT,
+    FAR,
     FEW,
     FRONT,
     HIDDEN,
     LEFT,
     RIGHTMOST,
     RIM,
-    SAMPLES,
     TOP,
     Pieces,
-    depths_of,
     is_group,
 )
+from shapecat.detection.traits import top_band
 from shapecat.detection.walls import CLEARED, ON_WALL
 from shapecat.jit import kernel
 
-__all__ = [
-    "cut_by_range",
-    "is_no_object",
-    "posts_of",
-    "remains_of",
-    "sides_of",
-    "towers_of",
-    "unbounded",
-]
+__all__ = ["Field", "Limits", "is_no_object"]
 
+THROUGH, BEYOND, TO_WALL, ON, LAST = range(5)
+"""Counts of cells of each region: from which it goes on through the level of a board; of their
+neighbours on the same surface beyond every plane and in walls; on walls; at the end of the range.
+"""
 RIM_LINKS, RIM_SHARE = 8, 0.1
 """Links with a higher plane, from below, of the edge of a board or its legs; share of the boundary.
 """
@@ -63,133 +61,176 @@ UPRIGHT, SLENDER, COVERED = 0.03, 0.65, 0.5
 other things from which they may hide the rest."""
 
 
-def is_no_object(pieces: Pieces, furniture: Bool, raised: Bool, *, largest_m: float) -> Bool:
-    """Return for each piece whether it is no object, (n + 1,) bool, ``furniture`` included.
+class Field(NamedTuple):
+    """What is known of the cells, as in `Cells`, `Heights`, `Parted` and `Surfaces`."""
 
-    The edge of a board and the legs below it meet the board from below; walls and the sides of
-    shelves are larger than ``largest_m``; noise of the plane is small and low, and was not
-    ``raised``.
-    """
-    shape = pieces.shape
-    rim = pieces.single[:, RIM]
-    edge = (rim >= RIM_LINKS) & (rim >= RIM_SHARE * pieces.boundary)
-    large = shape[:, RIGHTMOST] - shape[:, LEFT] > largest_m
-    depth = depths_of(pieces)
-    low = shape[:, TOP] < FAINT * LEAST_M + FAINT_NOISE * NOISE * depth**2
-    faint = low & ((shape[:, AREA] < FAINT_M2) | (shape[:, COUNT] < FAINT_CELLS))
-    return np.asarray(edge | large | (faint & ~raised) | furniture)
+    w: F4
+    lens: Lens
+    planes: F8
+    owner: I4
+    walls: U1
+    regions: I4
+    spans: I4
 
 
-def posts_of(cells: Cells, owner: I4, regions: I4, spans: I4, pieces: Pieces, up: F8) -> Bool:
-    """Return for each piece whether it goes on through the level of a board, as posts do."""
-    through = np.zeros(pieces.group.size, np.int64)
-    if owner.max() > 1:
-        _through(cells.w, cells.lens, owner, regions, spans, pieces.group, up, through)
-    return np.asarray(through >= FEW)
+class Limits(NamedTuple):
+    """Of objects, metres: how high above a plane, how wide, and how far away they are at most."""
 
-
-def remains_of(walls: U1, regions: I4, pieces: Pieces) -> Bool:
-    """Return for each piece whether it is a small part of a wall, between the objects before it."""
-    size = pieces.group.size
-    on = np.bincount(pieces.group[regions[walls == ON_WALL]], minlength=size)
-    return np.asarray(on > REMAINS * pieces.shape[:, COUNT])
-
-
-def cut_by_range(cells: Cells, regions: I4, pieces: Pieces, *, range_m: float) -> Bool:
-    """Return for each piece whether it ends where the range of the readings does.
-
-    What is left of a wall or a floor there has an outline that is not its own.
-    """
-    size = pieces.group.size
-    cut = np.bincount(pieces.group, cells.count_last(regions, size, range_m=range_m), size)
-    return np.asarray(cut > CUT * pieces.shape[:, COUNT])
-
-
-def sides_of(cells: Cells, pieces: Pieces) -> Bool:
-    """Return for each piece whether it is upright and seen only edge on, as sides of shelves are.
-
-    An object has a front too, unless something hides it.
-    """
-    shape, lens = pieces.shape, cells.lens
-    covered = shape[:, COUNT] * depths_of(pieces) ** 2 / (lens.fx * lens.fy)
-    speckled = pieces.boundary**2 > SPECKS * shape[:, COUNT]
-    edge_on = shape[:, AREA] > np.where(speckled, SPECKLED, EDGE_ON) * covered
-    upright = pieces.lid.sum(axis=1) < UPRIGHT * shape[:, AREA]
-    upright &= shape[:, RIGHTMOST] - shape[:, LEFT] < SLENDER * (shape[:, TOP] - shape[:, BOTTOM])
-    hidden = pieces.pairs[FRONT].sum(axis=0) + pieces.single[:, HIDDEN]
-    alone = pieces.pairs[CONTACT].sum(axis=1) < FEW
-    return np.asarray(edge_on & upright & alone & (hidden < COVERED * pieces.boundary))
-
-
-def unbounded(
-    cells: Cells, planes: F8, owner: I4, walls: U1, regions: I4, spans: I4, pieces: Pieces
-) -> Bool:
-    """Return for each piece whether its surface goes on to where no plane reaches, or in a wall.
-
-    Walls and floors are cut off there; an object ends where it ends.
-    """
-    size = pieces.group.size
-    leaving = np.zeros((2, size), np.int64)
-    _leave(cells.w, planes, owner, walls, regions, spans, leaving)
-    beyond, to_wall = (np.bincount(pieces.group, count, size) for count in leaving)
-    limit = pieces.boundary
-    return np.asarray((beyond > UNBOUNDED * limit) | (to_wall > WALLED * limit))
-
-
-def towers_of(cells: Cells, planes: F8, pieces: Pieces, up: F8, *, highest_m: float) -> Bool:
-    """Return for each piece whether its surface goes straight up and down for ``highest_m``.
-
-    The sides of shelves, door frames and whatever stands before the table reach higher above a
-    plane than objects on it, or down below it, also where only pieces of them are seen.
-    """
-    share = np.zeros(pieces.group.size)
-    _tower(cells.w, cells.lens, planes, pieces, up, highest_m, share)
-    return np.asarray(share > TOWERING)
+    highest_m: float
+    largest_m: float
+    range_m: float
 
 
 @kernel
-def _leave(w: F4, planes: F8, owner: I4, walls: U1, regions: I4, spans: I4, leaving: I4) -> None:
-    """Count the neighbours of each region on the same surface beyond its plane and on walls."""
+def is_no_object(field: Field, pieces: Pieces, up: F8, known: Bool, limits: Limits) -> Bool:
+    """Return for each piece whether it is no object, (n + 1,) bool.
+
+    What has been merged into another is left out. What is ``known`` to be an object is no noise.
+    """
+    n = pieces.group.size
+    counts, refused = np.zeros((5, n), np.int64), np.zeros(n, np.bool_)
+    counts[LAST] = count_last(field.w, field.regions, n, limits.range_m)
+    _count_through(field, up, counts[THROUGH])
+    _count_leaving(field, counts)
+    for p in range(n):
+        if not is_group(pieces, p):
+            counts[:, pieces.group[p]] += counts[:, p]
+    for p in range(1, n):
+        if not is_group(pieces, p):
+            continue
+        cells, boundary = pieces.shape[p, COUNT], pieces.boundary[p]
+        refused[p] = (
+            _is_rim(pieces, p)
+            or pieces.shape[p, RIGHTMOST] - pieces.shape[p, LEFT] > limits.largest_m
+            or (not known[p] and _is_faint(pieces, p))
+            or counts[THROUGH, p] >= FEW
+            or counts[ON, p] > REMAINS * cells
+            or counts[LAST, p] > CUT * cells
+            or counts[BEYOND, p] > UNBOUNDED * boundary
+            or counts[TO_WALL, p] > WALLED * boundary
+            or _is_side(pieces, p, field.lens)
+            or _is_tower(field, pieces, p, up, limits.highest_m)
+        )
+    return refused
+
+
+@kernel(leaf=True)
+def _is_rim(pieces: Pieces, p: int) -> bool:
+    """Whether a piece meets a board from below, as its edge and the legs below it do."""
+    rim = pieces.single[p, RIM]
+    return bool(rim >= RIM_LINKS and rim >= RIM_SHARE * pieces.boundary[p])
+
+
+@kernel(leaf=True)
+def _depth_of(pieces: Pieces, p: int) -> float:
+    """Return the mean depth of a piece, metres; 1 where it has no cell."""
+    count = pieces.shape[p, COUNT]
+    return float(pieces.shape[p, FAR] / count) if count > 0 else 1.0
+
+
+@kernel(leaf=True)
+def _is_faint(pieces: Pieces, p: int) -> bool:
+    """Whether a piece is as small and low as noise of the plane."""
+    shape = pieces.shape[p]
+    if shape[TOP] >= FAINT * LEAST_M + FAINT_NOISE * NOISE * _depth_of(pieces, p) ** 2:
+        return False
+    return bool(shape[AREA] < FAINT_M2 or shape[COUNT] < FAINT_CELLS)
+
+
+@kernel(leaf=True)
+def _is_side(pieces: Pieces, p: int, lens: Lens) -> bool:
+    """Whether a piece is upright and seen only edge on, as sides of shelves are.
+
+    An object has a front too, unless something hides it.
+    """
+    shape, boundary = pieces.shape[p], pieces.boundary[p]
+    covered = shape[COUNT] * _depth_of(pieces, p) ** 2 / (lens.fx * lens.fy)
+    speckled = boundary * boundary > SPECKS * shape[COUNT]
+    if shape[AREA] <= (SPECKLED if speckled else EDGE_ON) * covered:
+        return False
+    if shape[RIGHTMOST] - shape[LEFT] >= SLENDER * (shape[TOP] - shape[BOTTOM]):
+        return False
+    upward, touching, hidden = 0.0, 0.0, pieces.single[p, HIDDEN]
+    for band in range(top_band(shape) + 1):
+        upward += pieces.lid[p, band]
+    for q in range(pieces.group.size):
+        touching += pieces.pairs[CONTACT, p, q]
+        hidden += pieces.pairs[FRONT, q, p]
+    upright = upward < UPRIGHT * shape[AREA]
+    return bool(upright and touching < FEW and hidden < COVERED * boundary)
+
+
+@kernel
+def _count_leaving(field: Field, counts: I4) -> None:
+    """Count the cells of each region on walls, and the neighbours on the same surface beyond.
+
+    Walls and floors are cut off where no plane reaches, or go on in a wall; an object ends where
+    it ends.
+    """
+    w, owner, regions = field.w, field.owner, field.regions
     rows, columns = w.shape
-    for i in range(1, rows - 1):
-        for j in range(max(spans[i, 0], 1), min(spans[i, 1], columns - 1)):
-            if regions[i, j] == 0:
+    out = np.zeros(columns, np.bool_)
+    for i in range(rows):
+        first, end = field.spans[i]
+        for j in range(first, end):
+            if field.walls[i, j] == ON_WALL:
+                counts[ON, regions[i, j]] += 1
+        first, end = max(first, 1), min(end, columns - 1)
+        if i == 0 or i == rows - 1 or not _find_out(owner, regions, i, first, end, out):
+            continue
+        for j in range(first, end):
+            if not out[j]:
                 continue
-            plane = planes[owner[i, j] - 1]
+            plane = field.planes[owner[i, j] - 1]
             for y, x in ((i, j - 1), (i, j + 1), (i - 1, j), (i + 1, j)):
                 if (
                     owner[y, x] == 0
                     and w[y, x] > max(plane[0] * x + plane[1] * y + plane[2], 0)
                     and abs(w[y, x] - w[i, j]) < JUMP
                 ):
-                    leaving[int(walls[y, x] == CLEARED), regions[i, j]] += 1
+                    which = TO_WALL if field.walls[y, x] == CLEARED else BEYOND
+                    counts[which, regions[i, j]] += 1
 
 
 @kernel(leaf=True)
-def _tower(
-    w: F4, lens: Lens, planes: F8, pieces: Pieces, up: F8, highest: float, share: F8
-) -> None:
-    """Write the share of the samples of each piece from which the surface goes on so high."""
+def _find_out(owner: I4, regions: I4, i: int, first: int, end: int, out: Bool) -> bool:
+    """Mark the cells of a part of a row next to what no plane is below; whether there are any."""
+    above, below, mine = owner[i - 1, first:end], owner[i + 1, first:end], regions[i, first:end]
+    left, right = owner[i, first - 1 : end - 1], owner[i, first + 1 : end + 1]
+    part, some = out[first:end], False
+    for j in range(mine.size):
+        beside = (above[j] == 0) | (below[j] == 0) | (left[j] == 0) | (right[j] == 0)
+        part[j] = beside & (mine[j] > 0)
+    for j in range(mine.size):
+        some |= part[j]
+    return some
+
+
+@kernel(leaf=True)
+def _is_tower(field: Field, pieces: Pieces, p: int, up: F8, highest: float) -> bool:
+    """Whether the surface of a piece goes straight up and down for ``highest`` metres.
+
+    The sides of shelves, door frames and whatever stands before the table reach higher above a
+    plane than objects on it, or down below it, also where only pieces of them are seen.
+    """
+    w, lens = field.w, field.lens
     columns = w.shape[1]
-    for p in range(1, share.size):
-        if not is_group(pieces, p) or pieces.owner[p] <= 0:
-            continue
-        plane = planes[pieces.owner[p] - 1]
-        n = high = 0
-        for t in range(SAMPLES):
-            s = pieces.samples[p, t]
-            if s < 0:
-                break
-            i, j = s // columns, s % columns
-            z = 1 / w[i, j]
-            h = (w[i, j] - (plane[0] * j + plane[1] * i + plane[2])) * z * plane[3]
-            n += 1
-            rise = _rise(w, lens, i, j, up, 1, highest)
-            if h + rise > highest - STEP_M:
-                high += 1
-            else:
-                high += rise + _rise(w, lens, i, j, up, -1, highest - rise) > highest - STEP_M
-        share[p] = high / max(n, 1)
+    if pieces.owner[p] <= 0:
+        return False
+    plane = field.planes[pieces.owner[p] - 1]
+    n = high = 0
+    for s in pieces.samples[p]:
+        if s < 0:
+            break
+        i, j = place_of(s, columns)
+        h = (1 - (plane[0] * j + plane[1] * i + plane[2]) / w[i, j]) * plane[3]
+        n += 1
+        rise = _rise(w, lens, i, j, up, 1, highest)
+        if h + rise > highest - STEP_M:
+            high += 1
+        else:
+            high += rise + _rise(w, lens, i, j, up, -1, highest - rise) > highest - STEP_M
+    return bool(high > TOWERING * n)
 
 
 @kernel(leaf=True)
@@ -207,11 +248,12 @@ def _rise(w: F4, lens: Lens, i: int, j: int, up: F8, sign: int, most: float) -> 
         depth = z + along * up[2]
         if d > most + STEP_M or depth <= NEAREST_M:
             break
-        v = int(lens.cy + lens.fy * (y + along * up[1]) / depth + 0.5)
-        u = int(lens.cx + lens.fx * (x + along * up[0]) / depth + 0.5)
+        inverse = 1 / depth
+        v = int(lens.cy + lens.fy * (y + along * up[1]) * inverse + 0.5)
+        u = int(lens.cx + lens.fx * (x + along * up[0]) * inverse + 0.5)
         if v < 0 or u < 0 or v >= w.shape[0] or u >= w.shape[1]:
             break
-        ahead = w[v, u] - 1 / depth
+        ahead = w[v, u] - inverse
         if abs(ahead) < JUMP:
             reach, misses = d, 0.0
             continue
@@ -222,24 +264,28 @@ def _rise(w: F4, lens: Lens, i: int, j: int, up: F8, sign: int, most: float) -> 
 
 
 @kernel(leaf=True)
-def _through(
-    w: F4, lens: Lens, owner: I4, labels: I4, spans: I4, group: I4, up: F8, through: I4
-) -> None:
-    """Count where what is above and below the level of a board is one upright surface."""
+def _count_through(field: Field, up: F8, through: I4) -> None:
+    """Count where each region goes on through the level of a board, as posts do.
+
+    What is above and below the level is one upright surface there.
+    """
+    w, lens, owner, regions = field.w, field.lens, field.owner, field.regions
     columns = w.shape[1]
+    if len(field.planes) < 2:
+        return
     for i in range(w.shape[0]):
-        for j in range(spans[i, 0], spans[i, 1]):
-            if labels[i, j] == 0:
+        for j in range(field.spans[i, 0], field.spans[i, 1]):
+            if regions[i, j] == 0:
                 continue
             above = _followed(w, lens, i, j, up, POST_M)
             if above < 0:
                 continue
             y, x = above // columns, above % columns
-            if labels[y, x] == 0 or owner[y, x] == owner[i, j]:
+            if regions[y, x] == 0 or owner[y, x] == owner[i, j]:
                 continue
             if _followed(w, lens, i, j, up, -POST_M) >= 0:
-                through[group[labels[i, j]]] += 1
-                through[group[labels[y, x]]] += 1
+                through[regions[i, j]] += 1
+                through[regions[y, x]] += 1
 
 
 @kernel(leaf=True)

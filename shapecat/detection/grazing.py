@@ -7,10 +7,19 @@ planes is known, height alone is left to be found.
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import Cells, Lens, middle_of
-from shapecat.detection.consensus import TOLERANCE, level_plane, normal_of, refit
-from shapecat.detection.planes import ARM, Support, by_height, fullest, listed, support_of
+from shapecat.arrays import F4, F8
+from shapecat.detection.cells import Cells, Lens
+from shapecat.detection.consensus import (
+    TOLERANCE,
+    Readings,
+    among,
+    cosine,
+    level_plane,
+    middle_of,
+    normal_of,
+    refit,
+)
+from shapecat.detection.planes import ARM, Support, by_height, fullest, support_of
 from shapecat.jit import kernel
 
 __all__ = ["grazing_board"]
@@ -27,51 +36,60 @@ STEADY_COS = 0.9998
 """Cosine of the largest angle, 1.1 degrees, to the other planes."""
 
 
-def grazing_board(cells: Cells, supports: list[Support], up: F8) -> tuple[Support, I4] | None:
-    """Return the board seen at a grazing angle that is not among ``supports``, and its cells."""
-    lens = cells.lens
-    deepest = abs(float(up[1])) / (lens.fy * STEEP)
+def grazing_board(cells: Cells, supports: list[Support], up: F8) -> tuple[Support, Readings] | None:
+    """Return the board seen at a grazing angle not among ``supports``, and its readings."""
     known = np.array([support.offset for support in supports])
-    index = np.zeros(cells.w.size // 4 + cells.w.shape[0], np.int32)
-    height = np.zeros(index.size, np.float32)
-    n = _grazing_readings(cells.w, lens, up, deepest, known, index, height)
-    if n < LEAST_READINGS:
+    deepest = abs(float(up[1])) / (cells.lens.fy * STEEP)
+    found, height = _grazing_readings(cells.w, cells.lens, up, deepest, known)
+    if height.size < LEAST_READINGS:
         return None
-    index, height = index[:n], height[:n]
-    bins = int(deepest / BIN_M) + 1
-    order, starts = by_height(index, height, -deepest, bins)
-    peak = fullest(starts, np.zeros(bins, bool))
-    near = order[starts[max(peak - 1, 0)] : starts[min(peak + 2, bins)]]
-    if near.size < LEAST_READINGS:
-        return None
-    offset = middle_of(height[near])
-    index = index[near]
-    plane = level_plane(lens, up, offset)
+    near, plane, count = _fit(cells.lens, up, found, height, deepest)
+    support = support_of(cells, near, plane) if count >= LEAST_READINGS else None
+    return None if support is None else (support, near)
+
+
+@kernel
+def _fit(
+    lens: Lens, up: F8, found: Readings, height: F4, deepest: float
+) -> tuple[Readings, F8, int]:
+    """Return the readings at one height, a plane (a, b, c), and how many of them lie in it.
+
+    These are 0 if the plane is not level.
+    """
+    order, starts = by_height(height, -deepest, int(deepest / BIN_M) + 1)
+    bins = starts.size - 1
+    peak = fullest(starts, np.zeros(bins, np.bool_))
+    chosen = order[starts[max(peak - 1, 0)] : starts[min(peak + 2, bins)]]
+    near = among(found, chosen)
+    plane = level_plane(lens, up, middle_of(height, chosen))
     # The less the plane is known, the wider the gate: at first half the way to the next row.
-    gate = abs(float(plane[1])) / 2
-    j, i, w = listed(cells.w, index)
+    gate = abs(plane[1]) / 2
+    count = 0
     for _ in range(4):
-        count = refit(j, i, w, gate, plane)
+        count = refit(near.j, near.i, near.w, gate, plane)
         gate = max(gate / 2, 1.5 * TOLERANCE)
-    if count < LEAST_READINGS or normal_of(plane, lens) @ up < STEADY_COS:
-        return None
-    support = support_of(cells, index, plane)
-    return None if support is None else (support, index)
+    return near, plane, count if cosine(normal_of(plane, lens), up) >= STEADY_COS else 0
 
 
-@kernel(leaf=True)
-def _grazing_readings(
-    w: F4, lens: Lens, up: F8, deepest: float, known: F8, index: I4, height: F4
-) -> int:
-    """Collect the cells on every fourth column that are nearer to level than to upright.
+@kernel
+def _grazing_readings(w: F4, lens: Lens, up: F8, deepest: float, known: F8) -> tuple[Readings, F4]:
+    """Return the cells on every fourth column that are nearer to level than to upright.
 
-    Only those less than ``deepest`` below the camera, and off the ``known`` heights.
+    Only those less than ``deepest`` below the camera, and off the ``known`` heights, come with
+    their heights.
     """
     rows, columns = w.shape
     across, down = up[0] / lens.fx, up[1] / lens.fy
+    found = np.zeros((4, w.size // 4 + rows), np.float32)
     n = 0
     for i in range(1, rows - 1):
         start = across * -lens.cx + down * (i - lens.cy) + up[2]
+        some, here = False, w[i]
+        for j in range(columns):  # few rows have any; this vectorises
+            rise = start + across * j
+            some |= (rise < 0) & (rise > -deepest * here[j])
+        if not some:
+            continue
         for j in range(ARM, columns - ARM, 4):
             center, rise = w[i, j], start + across * j
             if rise >= 0 or rise <= -deepest * center:
@@ -89,6 +107,6 @@ def _grazing_readings(
             for k in range(known.size):
                 taken |= abs(h - known[k]) < APART_M
             if not taken:
-                index[n], height[n] = i * columns + j, h
+                found[0, n], found[1, n], found[2, n], found[3, n] = j, i, center, h
                 n += 1
-    return n
+    return Readings(found[0, :n], found[1, :n], found[2, :n], 4), found[3, :n]

@@ -8,7 +8,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import Cells, Lens
 from shapecat.detection.planes import COS, DIRECTIONS, SIN, Support
-from shapecat.geometry import gravity_rotation
+from shapecat.geometry import level_axes
 from shapecat.jit import kernel
 
 __all__ = ["LEAST_M", "NOISE", "Heights", "heights_of", "inside", "table_of"]
@@ -18,6 +18,10 @@ LEAST_M = 0.004
 NOISE = 0.0025
 BEYOND_M = 0.1
 """What is level with a plane and this near to its outline is the plane, not an object below."""
+OUT = -9.0
+"""Takes the place of the height of cells that do not stand on a plane."""
+FINE = 65536
+"""Steps to 1/m of inverse depth, where it is rounded."""
 
 
 class Heights(NamedTuple):
@@ -37,27 +41,34 @@ class Heights(NamedTuple):
 def table_of(supports: list[Support], lens: Lens) -> F8:
     """Return one row of numbers per plane, for the kernels."""
     rows = np.zeros((len(supports), 13 + DIRECTIONS))
-    quarter, half = DIRECTIONS // 4, DIRECTIONS // 2
     for row, s in zip(rows, supports, strict=True):
-        n = (s.a * lens.fx, s.b * lens.fy, s.a * lens.cx + s.b * lens.cy + s.c)
-        level = gravity_rotation(s.up)
-        row[:4] = s.a, s.b, s.c, 1.0 / math.sqrt(n[0] ** 2 + n[1] ** 2 + n[2] ** 2)
-        row[4:10] = level[:2].ravel()
-        # A circle inside the outline, for a quick answer.
-        middle = (s.reach[[0, quarter]] - s.reach[[half, half + quarter]]) / 2
-        row[10:12] = middle
-        room = s.reach - middle[0] * COS - middle[1] * SIN
-        row[12] = max(float(room.min()), 0.0) ** 2
-        row[13:] = s.reach
+        _fill(row, s.a, s.b, s.c, s.up, s.reach, lens)
     return rows
 
 
-def heights_of(cells: Cells, planes: F8, *, highest_m: float) -> Heights:
+@kernel
+def _fill(row: F8, a: float, b: float, c: float, up: F8, reach: F8, lens: Lens) -> None:
+    """Write the plane, its distance, two level axes, a circle inside the outline, the outline."""
+    x, y, z = a * lens.fx, b * lens.fy, a * lens.cx + b * lens.cy + c
+    row[0], row[1], row[2], row[3] = a, b, c, 1.0 / math.sqrt(x * x + y * y + z * z)
+    axes = level_axes(up[0], up[1], up[2])
+    for k in range(3):
+        row[4 + k], row[7 + k] = axes[0][k], axes[1][k]
+    # The circle is for a quick answer.
+    quarter, half = DIRECTIONS // 4, DIRECTIONS // 2
+    row[10] = (reach[0] - reach[half]) / 2
+    row[11] = (reach[quarter] - reach[half + quarter]) / 2
+    room = np.min(reach - row[10] * COS - row[11] * SIN)
+    row[12] = max(room, 0.0) ** 2
+    row[13:] = reach
+
+
+@kernel
+def heights_of(cells: Cells, planes: F8, highest_m: float) -> Heights:
     """Give every cell to the highest plane it is above; ``planes`` are the rows of `table_of`."""
-    owner = np.zeros(cells.w.shape, np.int8)
-    height = np.zeros(cells.w.shape, np.float32)
-    for k, row in reversed(list(enumerate(planes))):
-        _stand(cells.w, cells.lens, row, k + 1, highest_m, owner, height)
+    owner, height = np.zeros(cells.w.shape, np.int8), np.zeros(cells.w.shape, np.float32)
+    for number in range(len(planes), 0, -1):
+        _stand(cells.w, cells.lens, planes[number - 1], number, highest_m, owner, height)
     return Heights(owner, height)
 
 
@@ -68,7 +79,7 @@ def _stand(
     """Give the free cells inside the outline of a plane to it; the loops over a row vectorise."""
     rows, columns = w.shape
     a, scale, zero, one = np.float32(plane[0]), np.float32(plane[3]), np.float32(0), np.float32(1)
-    least, noise, below = np.float32(LEAST_M), np.float32(NOISE), np.float32(-9)
+    least, noise, below = np.float32(LEAST_M), np.float32(NOISE), np.float32(OUT)
     beyond, high = np.float32(BEYOND_M), np.float32(highest)
     above, surface = np.int8(number), np.int8(-number)
     x = np.arange(columns).astype(np.float32)
@@ -98,23 +109,44 @@ def _stand(
             some |= use
         if not some:
             continue
-        for k in range(0, DIRECTIONS // 2, 2):  # two at a time: less to load and to store
+        left, right, farthest, nearest = _bounds(line, values)
+        for k in range(DIRECTIONS // 2):
             step, first = np.float32(sides[k, 0]), np.float32(sides[k, 1] * i + sides[k, 2])
             far, near = np.float32(plane[13 + k]), np.float32(plane[13 + k + DIRECTIONS // 2])
-            m = k + 1
-            step1, first1 = np.float32(sides[m, 0]), np.float32(sides[m, 1] * i + sides[m, 2])
-            far1, near1 = np.float32(plane[13 + m]), np.float32(plane[13 + m + DIRECTIONS // 2])
+            # Few rows reach beyond a side, and their bounds tell most of the others.
+            ends = step * left + first, step * right + first
+            room = min(far * farthest, far * nearest), min(near * farthest, near * nearest)
+            if max(ends[0], ends[1]) <= room[0] and -min(ends[0], ends[1]) <= room[1]:
+                continue
             for j in range(columns):
-                v, room = values[j], slack[j]
-                t, t1 = step * x[j] + first, step1 * x[j] + first1
-                within = (t <= far * v + room) & (-t <= near * v + room)
-                within &= (t1 <= far1 * v + room) & (-t1 <= near1 * v + room)
+                v, more = values[j], slack[j]
+                t = step * x[j] + first
+                within = (t <= far * v + more) & (-t <= near * v + more)
                 line[j] = line[j] if within else below
         for j in range(columns):
             mine = above if slack[j] == zero else surface
             owners[j] = mine if line[j] > below else owners[j]
         for j in range(columns):
             heights[j] = line[j] if line[j] > below else heights[j]
+
+
+@kernel(leaf=True)
+def _bounds(line: F4, values: F4) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Return the first and last cell of a row that have a height, and bounds of their values."""
+    left, right = 0, line.size - 1
+    while line[left] <= OUT:
+        left += 1
+    while line[right] <= OUT:
+        right -= 1
+    out, fine, one = np.float32(OUT), np.float32(FINE), np.float32(1)
+    largest, smallest = np.int32(2**30), np.int32(0)
+    least, most = largest, smallest
+    for k in range(line.size):  # integers, whose bounds vectorise
+        v, use = np.int32(values[k] * fine), line[k] > out
+        low, high = (v if use else largest), (v if use else smallest)
+        least, most = (low if low < least else least), (high if high > most else most)
+    farthest, nearest = np.float32(least) / fine, (np.float32(most) + one) / fine
+    return np.float32(left), np.float32(right), farthest, nearest
 
 
 @kernel(leaf=True)

@@ -1,42 +1,61 @@
-"""Joins: the rules that bring the pieces of one object together, in their order."""
-
-from collections.abc import Collection
+"""Joins: small pieces and those of low objects, which need no learning."""
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import Cells
-from shapecat.detection.occluders import join_around, join_behind
-from shapecat.detection.parts import Sight, join_parts, trees
+from shapecat.arrays import I4, Bool
+from shapecat.detection.cells import Cells, small_at
 from shapecat.detection.pieces import CONTACT, COUNT, Pieces, depths_of, is_group, merge
-from shapecat.detection.surfaces import Surfaces
 from shapecat.jit import kernel
 
-__all__ = ["join_pieces"]
+__all__ = ["join_raised", "join_small"]
 
-
-def join_pieces(
-    pieces: Pieces, cells: Cells, surfaces: Surfaces, labels: I4, up: F8, rules: Collection[str]
-) -> None:
-    """Apply the rules named in ``rules``; `Pieces.group` holds the result."""
-    if "small" in rules:
-        _join_small(pieces, cells.small(depths_of(pieces)))
-    if "parts" in rules:
-        join_parts(pieces, Sight.of(cells, up), trees())
-    if "occluder" in rules:
-        join_behind(pieces, cells.w, cells.lens, surfaces.normal, labels)
-        join_around(pieces)
+RAISED = 0.5
+"""Share of the cells of a piece that belong to one low object."""
 
 
 @kernel
-def _join_small(pieces: Pieces, small: F4) -> None:
+def join_raised(pieces: Pieces, raised: I4, labels: I4, spans: I4) -> Bool:
+    """Join the pieces of each low object that is known by its outline; return which they are.
+
+    Parameters
+    ----------
+    raised : (rows, columns) the numbers of the low objects, from `raise_low`.
+    spans : where there are ``labels``, as in `Surfaces`.
+
+    Returns
+    -------
+    (n + 1,) whether most of a piece is low and known to be an object.
+    """
+    known = np.zeros(pieces.group.size, np.bool_)
+    n = pieces.group.size
+    cells = np.zeros((n, np.max(raised) + 1), np.int32)
+    for i in range(labels.shape[0]):
+        for j in range(spans[i, 0], spans[i, 1]):
+            if raised[i, j] > 0:
+                cells[labels[i, j], raised[i, j]] += 1
+    leader = np.zeros(cells.shape[1], np.int32)
+    for p in range(1, n):
+        best = np.argmax(cells[p])
+        if cells[p, best] <= RAISED * pieces.shape[p, COUNT]:
+            continue
+        if leader[best] == 0:
+            leader[best] = p
+            known[p] = True
+        else:
+            merge(pieces, leader[best], p)
+    return known
+
+
+@kernel
+def join_small(pieces: Pieces, cells: Cells) -> None:
     """Join a piece smaller than about 9 cm2 to what it touches most."""
     n = pieces.group.size
+    depth = depths_of(pieces)
     again = True
     while again:
         again = False
         for p in range(1, n):
-            if not is_group(pieces, p) or pieces.shape[p, COUNT] >= small[p]:
+            if not is_group(pieces, p) or pieces.shape[p, COUNT] >= small_at(cells, depth[p]):
                 continue
             q = np.argmax(pieces.pairs[CONTACT, p])
             if pieces.pairs[CONTACT, p, q] > 0:

@@ -10,6 +10,7 @@ from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import Cells
 from shapecat.detection.heights import Heights
 from shapecat.detection.pieces import BAND_M, BANDS, BOTTOM, TOP, Pieces, side_of
+from shapecat.detection.regions import cut_above
 from shapecat.detection.surfaces import Surfaces
 from shapecat.detection.traits import roundness_of
 from shapecat.jit import kernel
@@ -32,53 +33,51 @@ HOLLOW = -0.1
 """`slope_of` from which what rises is the inside of a container."""
 
 
+@kernel
 def cut_at_ledges(
     cells: Cells, heights: Heights, surfaces: Surfaces, pieces: Pieces, labels: I4, up: F8
 ) -> int:
     """Give what stands on ledges labels of its own, in place; return the number of labels."""
+    height, side = heights.height, side_of(up)
     n = pieces.group.size - 1
-    side = side_of(up)
-    cut = np.full(n + 1, -1, np.int64)
-    _find(pieces, cut)
-    for p in np.flatnonzero(cut >= 0):
-        if _is_stack(cells, heights.height, surfaces.normal, labels, int(p), int(cut[p]), side):
+    for p in range(1, pieces.group.size):
+        band = _ledge_of(pieces, p)
+        if band > 0 and _is_stack(cells, height, surfaces, labels, p, band, side):
             n += 1
-            level = (cut[p] + 1 + CLEARANCE / 2) * BAND_M
-            labels[(labels == p) & (heights.height > level)] = n
+            cut_above(labels, surfaces.spans, height, p, (band + 1 + CLEARANCE / 2) * BAND_M, n)
     return n
 
 
 @kernel(leaf=True)
-def _find(pieces: Pieces, cut: I4) -> None:
-    """Write the band of the best ledge of each piece."""
-    for p in range(1, pieces.group.size):
-        if roundness_of(pieces.shape[p]) > TURNED:
-            continue
-        top = int(pieces.shape[p, TOP] / BAND_M)
-        bottom = int(pieces.shape[p, BOTTOM] / BAND_M)
-        lid = pieces.lid[p]
-        best = LEDGE_M2
-        for band in range(max(bottom, 1) + 2, min(top - int(RISE_M / BAND_M), BANDS - 1)):
-            level = lid[band - 1] + lid[band] + lid[band + 1]
-            around = 0.0
-            for k in range(max(band - NEAR, 0), min(band + NEAR + 1, BANDS)):
-                around += lid[k]
-            if level > best and level > FLAT * around:
-                best = level
-                cut[p] = band
+def _ledge_of(pieces: Pieces, p: int) -> int:
+    """Return the band of the best ledge of a piece, 0 if it has none."""
+    if roundness_of(pieces.shape[p]) > TURNED:
+        return 0
+    top = int(pieces.shape[p, TOP] / BAND_M)
+    bottom = int(pieces.shape[p, BOTTOM] / BAND_M)
+    lid = pieces.lid[p]
+    ledge, best = 0, LEDGE_M2
+    for band in range(max(bottom, 1) + 2, min(top - int(RISE_M / BAND_M), BANDS - 1)):
+        level = lid[band - 1] + lid[band] + lid[band + 1]
+        around = 0.0
+        for k in range(max(band - NEAR, 0), min(band + NEAR + 1, BANDS)):
+            around += lid[k]
+        if level > best and level > FLAT * around:
+            ledge, best = band, level
+    return ledge
 
 
 @kernel(leaf=True)
 def _is_stack(
-    cells: Cells, height: F4, normal: F4, labels: I4, p: int, band: int, side: F8
+    cells: Cells, height: F4, surfaces: Surfaces, labels: I4, p: int, band: int, side: F8
 ) -> bool:
     """Whether enough of a piece lies above and below a ledge, and the above is not hollow."""
-    w, lens = cells.w, cells.lens
+    w, lens, normal, spans = cells.w, cells.lens, surfaces.normal, surfaces.spans
     n = above = below = 0
     sx = sxx = st = sxt = 0.0
     left, right = np.inf, -np.inf
     for i in range(labels.shape[0]):
-        for j in range(labels.shape[1]):
+        for j in range(spans[i, 0], spans[i, 1]):
             if labels[i, j] != p:
                 continue
             k = int(height[i, j] / BAND_M)

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.cells import JUMP, Lens
 from shapecat.detection.pieces import (
     FEW,
@@ -42,9 +42,11 @@ def join_behind(pieces: Pieces, w: F4, lens: Lens, normal: F4, labels: I4) -> No
     """Join pieces behind the same occluder that continue each other, the best pair first."""
     n = pieces.group.size
     scores = np.zeros((n, n), np.float32)
+    together = _behind_one(pieces)
     for p in range(1, n):
         for q in range(p + 1, n):
-            scores[p, q] = _continuation(pieces, p, q, w, lens, normal, labels)
+            if together[p, q]:
+                scores[p, q] = _continuation(pieces, p, q, w, lens, normal, labels)
     while True:
         best = np.argmax(scores)
         p, q = int(best // n), int(best % n)
@@ -147,6 +149,22 @@ def _are_behind_one(pieces: Pieces, p: int, q: int) -> bool:
     for k in range(1, pieces.group.size):
         some |= (k != p) & (k != q) & (front[k, p] >= FEW) & (front[k, q] >= FEW)
     return some
+
+
+@kernel
+def _behind_one(pieces: Pieces) -> Bool:
+    """Return for all pairs p < q of pieces (n + 1, n + 1) what `_are_behind_one` does."""
+    n = pieces.group.size
+    together, hidden = np.zeros((n, n), np.bool_), np.zeros(n, np.int64)
+    for k in range(1, n):
+        count = 0
+        for p in range(1, n):
+            hidden[count] = p
+            count += (p != k) & (pieces.pairs[FRONT, k, p] >= FEW)
+        for a in range(count):
+            for b in range(a + 1, count):
+                together[hidden[a], hidden[b]] = True
+    return together
 
 
 @kernel

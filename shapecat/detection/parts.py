@@ -7,15 +7,13 @@ signs together tell them from what only touches or stands on it, and no few of t
 from functools import cache
 from importlib.resources import files
 from io import BytesIO
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import Cells
+from shapecat.arrays import F4, I4
 from shapecat.detection.pieces import (
     AREA,
-    BANDS,
     BOTTOM,
     CONTACT,
     COUNT,
@@ -43,6 +41,7 @@ from shapecat.detection.traits import (
     lid_share,
     roundness_of,
     slope_of,
+    top_band,
     width_of,
 )
 from shapecat.jit import kernel
@@ -81,6 +80,8 @@ SIGNS = LAST + len(BOTH)
 FACING_M, FACING = 0.015, 0.5
 """What faces each other: difference of the tops, metres; least share of the narrower one's width
 that has the other one before or behind it."""
+LANES = 8
+"""Trees that are walked at the same time: one waits for memory while the others go on."""
 NOWHERE_M = -1.0
 """Height of what faces up across a border where nothing does, metres."""
 
@@ -106,16 +107,11 @@ class Trees(NamedTuple):
 class Sight(NamedTuple):
     """How things are seen.
 
-    ``focal`` length in cells; ``down`` the cosine between the optical axis and up.
+    ``focal`` length in cells; ``down`` the cosine between the optical axis and up, its third part.
     """
 
     focal: float
     down: float
-
-    @classmethod
-    def of(cls, cells: Cells, up: F8) -> Self:
-        """Return how ``cells`` are seen, with the unit vector ``up`` (3,)."""
-        return cls(float(cells.lens.fx), float(up[2]))
 
 
 @cache
@@ -169,18 +165,33 @@ def _face(a: F4, b: F4) -> bool:
     return bool(level and common > FACING * narrow and abs(behind(a, b)) < wide)
 
 
-@kernel(leaf=True)
+@kernel
 def _sum_of(grown: Trees, signs: F4) -> float:
+    nodes = np.zeros(LANES, np.int32)
     logit = 0.0
-    for tree in range(grown.roots.size):
-        node = int(grown.roots[tree])
-        while grown.left[node] > 0:
-            right = signs[grown.feature[node]] > grown.threshold[node]
-            node = int(grown.left[node]) + int(right)
-        logit += grown.value[node]
-        if logit < HOPELESS:
-            break
-    return logit
+    for first in range(0, grown.roots.size, LANES):
+        lanes = min(LANES, grown.roots.size - first)
+        nodes[:lanes] = grown.roots[first : first + lanes]
+        while _descend(grown, signs, nodes):
+            pass
+        for lane in range(lanes):
+            logit += grown.value[nodes[lane]]
+            if logit < HOPELESS:
+                return float(logit)
+    return float(logit)
+
+
+@kernel(leaf=True)
+def _descend(grown: Trees, signs: F4, nodes: I4) -> bool:
+    """Go down one level in each of `LANES` trees; whether any was not in a leaf."""
+    inner = False
+    for lane in range(LANES):
+        node = np.uint32(nodes[lane])  # unsigned numbers cannot count from the end: no test for it
+        left = grown.left[node]
+        right = signs[np.uint16(grown.feature[node])] > grown.threshold[node]
+        nodes[lane] = left + np.int32(right) if left > 0 else nodes[lane]
+        inner |= left > 0
+    return inner
 
 
 @kernel
@@ -240,7 +251,7 @@ def _traits(pieces: Pieces, p: int, signs: F4) -> None:
         front += pieces.pairs[FRONT, p, k]
         back += pieces.pairs[FRONT, k, p]
         touch += pieces.pairs[CONTACT, p, k]
-    for band in range(BANDS):
+    for band in range(top_band(row) + 1):
         up += pieces.lid[p, band]
     wide, tall = width_of(row), row[TOP] - row[BOTTOM]
     signs[0], signs[1], signs[2], signs[3] = wide, row[TOP], row[BOTTOM], tall

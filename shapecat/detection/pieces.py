@@ -9,7 +9,7 @@ from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import Cells, Lens
 from shapecat.detection.heights import Heights
 from shapecat.detection.surfaces import Surfaces
-from shapecat.geometry import gravity_rotation
+from shapecat.geometry import level_axes
 from shapecat.jit import kernel
 
 __all__ = [
@@ -96,6 +96,7 @@ class Pieces(NamedTuple):
     group: I4
 
 
+@kernel
 def pieces_of(
     cells: Cells, heights: Heights, surfaces: Surfaces, labels: I4, n: int, up: F8
 ) -> Pieces:
@@ -115,11 +116,12 @@ def pieces_of(
     return pieces
 
 
+@kernel
 def side_of(up: F8) -> F8:
     """Return the horizontal direction across the view, (3,) unit."""
     across = math.hypot(up[0], up[1])
     if across < 0.2:  # the camera looks straight down
-        return np.asarray(gravity_rotation(up)[0])
+        return np.array(level_axes(up[0], up[1], up[2])[0])
     return np.array([up[1] / across, -up[0] / across, 0.0])
 
 
@@ -243,11 +245,14 @@ def merge(pieces: Pieces, p: int, q: int) -> None:
             pieces.group[k] = p
 
 
+@kernel
 def depths_of(pieces: Pieces) -> F4:
     """Return the mean depth of each piece, metres; 1 where it has no cell."""
-    shape = pieces.shape
-    count = shape[:, COUNT]
-    return np.asarray((shape[:, FAR] + (count == 0)) / np.maximum(count, 1))
+    depth = np.ones(pieces.group.size, np.float32)
+    for p in range(depth.size):
+        if pieces.shape[p, COUNT] > 0:
+            depth[p] = pieces.shape[p, FAR] / pieces.shape[p, COUNT]
+    return depth
 
 
 @kernel(leaf=True)

@@ -10,7 +10,7 @@ from shapecat.arrays import F4, F8, I4, U1
 from shapecat.detection.cells import JUMP, Cells, Lens, place_of
 from shapecat.detection.heights import LEAST_M, NOISE, Heights, inside
 from shapecat.detection.walls import CLEARED
-from shapecat.jit import kernel
+from shapecat.jit import kernel, unset
 
 __all__ = ["reach_over"]
 
@@ -20,9 +20,8 @@ BEYOND = 5
 """So many times as much of an object may be seen outside as inside."""
 
 
-def reach_over(
-    cells: Cells, heights: Heights, planes: F8, walls: U1, stacks: I4, *, highest_m: float
-) -> None:
+@kernel
+def reach_over(cells: Cells, heights: Heights, planes: F8, walls: U1, highest_m: float) -> None:
     """Give the parts of objects outside the outline of their plane to it, in place.
 
     A part is what is connected to object cells inside, and not many times larger than what is
@@ -32,15 +31,15 @@ def reach_over(
     ----------
     planes : the rows of `table_of`.
     walls : from `clear_walls`; what is cleared stays so.
-    stacks : (2, cells) int32, room.
     """
-    outside = np.zeros(heights.owner.shape, np.float32)
+    outside = unset(heights.owner.shape, np.float32)
     noted = np.zeros(heights.owner.shape, np.int8)
     seen = np.zeros(heights.owner.shape, np.int32)
-    looks = 0
-    for k, plane in reversed(list(enumerate(planes))):
+    stacks = unset((2, cells.w.size), np.int32)
+    looks = np.int64(0)  # a literal would be compiled apart
+    for number in range(len(planes), 0, -1):
         looks = _reach(
-            cells.w, cells.lens, heights, k + 1, plane, walls, highest_m,
+            cells.w, cells.lens, heights, number, planes[number - 1], walls, highest_m,
             outside, noted, seen, looks, stacks,
         )  # fmt: skip
 
@@ -68,7 +67,8 @@ def _reach(
     owner = heights.owner
     border = np.zeros(columns, np.uint8)
     for i in range(rows):
-        _find_border(owner, me, i, border)
+        if not _find_border(owner, me, i, border):
+            continue
         for j in range(columns):
             if border[j] == 0:
                 continue
@@ -94,17 +94,27 @@ def _reach(
 
 
 @kernel(leaf=True)
-def _find_border(owner: I4, me: int, i: int, border: U1) -> None:
-    """Mark the cells of a row above a plane that are beside cells of lower planes or of none."""
+def _find_border(owner: I4, me: int, i: int, border: U1) -> bool:
+    """Mark the cells of a row above a plane that are beside cells of lower planes or of none.
+
+    Returns
+    -------
+    Whether there are any.
+    """
     rows, columns = owner.shape
     above, here, below = owner[max(i - 1, 0)], owner[i], owner[min(i + 1, rows - 1)]
+    mine = np.uint8(me)  # without a sign what lies on a surface is larger
     for j in range(columns):
-        lower = ((above[j] >= 0) & (above[j] < me)) | ((below[j] >= 0) & (below[j] < me))
-        border[j] = lower & (here[j] == me)
+        lower = (np.uint8(above[j]) < mine) | (np.uint8(below[j]) < mine)
+        border[j] = lower & (np.uint8(here[j]) == mine)
     for j in range(columns - 1):
-        border[j] |= (here[j] == me) & (here[j + 1] >= 0) & (here[j + 1] < me)
+        border[j] |= (np.uint8(here[j]) == mine) & (np.uint8(here[j + 1]) < mine)
     for j in range(columns - 1):
-        border[j + 1] |= (here[j + 1] == me) & (here[j] >= 0) & (here[j] < me)
+        border[j + 1] |= (np.uint8(here[j + 1]) == mine) & (np.uint8(here[j]) < mine)
+    some = np.uint8(0)
+    for j in range(columns):
+        some |= border[j]
+    return bool(some > 0)
 
 
 @kernel(leaf=True)

@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from shapecat.arrays import I4, U1
+from shapecat.arrays import F4, I4, U1
 from shapecat.detection.heights import Heights
 from shapecat.detection.surfaces import DOWN, RIGHT, Surfaces
-from shapecat.jit import kernel
+from shapecat.jit import kernel, unset
 
-__all__ = ["regions_of", "rename"]
+__all__ = ["cut_above", "regions_of", "rename"]
 
 EDGE_DEG = 27
 """Concave angle that may part two objects; a bowl of 7 cm turns 16 degrees over the same cells."""
@@ -21,30 +21,22 @@ BUCKET_DEG = 4
 """Angles that differ less are flooded in one go."""
 
 
-def regions_of(
-    heights: Heights, surfaces: Surfaces, stacks: I4, *, concave: bool = True
-) -> tuple[I4, int]:
+@kernel
+def regions_of(heights: Heights, surfaces: Surfaces, concave: bool) -> tuple[I4, int]:  # noqa: FBT001  compiled kernels take their arguments by position
     """Label the object cells: (rows, columns) int16 labels 1..n, 0 elsewhere, and n.
 
     Flat cells that are linked make a seed; a flood from the seeds, flattest cells first, gives
     the cells of an edge to its sides (Meyer 1991). With ``concave`` off only jumps part regions.
-    ``stacks`` (2, cells) int32 is room.
     """
-    labels = np.zeros(heights.owner.shape, np.int16)
-    strong = EDGE_DEG if concave else NO_EDGE_DEG
-    return labels, _find(heights.owner, surfaces, strong, labels, stacks)
-
-
-@kernel
-def _find(owner: I4, surfaces: Surfaces, strong: int, labels: I4, stacks: I4) -> int:
-    links, edge, spans = surfaces.links, surfaces.edge, surfaces.spans
-    barrier = np.zeros(labels.shape, np.uint8)
-    stack, part = stacks[0], stacks[1].reshape(labels.shape)
-    _creases(edge, spans, strong, barrier, stack)
-    n = _flat_parts(owner, spans, links, barrier, labels, 0, part)
+    owner, links, edge, spans = heights.owner, surfaces.links, surfaces.edge, surfaces.spans
+    labels = np.zeros(owner.shape, np.int16)
+    barrier = np.zeros(owner.shape, np.uint8)
+    stack, part = unset(owner.size, np.int32), unset(owner.shape, np.int32)
+    _creases(edge, spans, EDGE_DEG if concave else NO_EDGE_DEG, barrier, stack)
+    n = _flat_parts(owner, spans, links, barrier, labels, np.int64(0), part)
     _flood(links, edge, spans, labels, stack)
     barrier[:] = 0
-    return int(_flat_parts(owner, spans, links, barrier, labels, n, part))
+    return labels, _flat_parts(owner, spans, links, barrier, labels, n, part)
 
 
 @kernel(leaf=True)
@@ -100,7 +92,7 @@ def _flat_parts(owner: I4, spans: I4, links: U1, barrier: U1, labels: I4, n: int
     room = rows + 2  # a row has at most one first label in two cells
     for i in range(rows):
         room += (spans[i, 1] - spans[i, 0]) // 2
-    parent, size = np.zeros((2, room), np.int32)
+    parent, size = np.zeros(room, np.int32), np.zeros(room, np.int32)
     count = 0
     # (1) first labels, and which of them meet
     for i in range(rows):
@@ -209,3 +201,12 @@ def rename(labels: I4, spans: I4, names: I4) -> None:
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):
             labels[i, j] = names[labels[i, j]]
+
+
+@kernel(leaf=True)
+def cut_above(labels: I4, spans: I4, height: F4, label: int, level: float, name: int) -> None:
+    """Give the cells of a label that are higher than a level, metres, another name, in place."""
+    for i in range(labels.shape[0]):
+        for j in range(spans[i, 0], spans[i, 1]):
+            if labels[i, j] == label and height[i, j] > level:
+                labels[i, j] = name

@@ -1,8 +1,7 @@
 """Relief: low things that rise from their plane in a step, told from swells of its surface.
 
-Sensors see a flat table in slow waves, higher than a plate is thick; but only an object has an
-edge. So waves are levelled first, and what is low is judged by its outline rather than by its
-height.
+Only an object has an edge. So waves of the surface are levelled first (`waves`), and what is low
+is judged by its outline rather than by its height.
 """
 
 import math
@@ -14,16 +13,11 @@ from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import JUMP, Cells, place_of
 from shapecat.detection.heights import Heights
 from shapecat.detection.hulls import fill_hull
-from shapecat.jit import kernel
+from shapecat.detection.waves import APART, cut_feet, excess_of, noise_of, subtract_mean
+from shapecat.jit import kernel, unset
 
 __all__ = ["raise_low"]
 
-LOW_M = 0.03
-"""Higher things are objects anyway."""
-WINDOW = 20
-"""Cells to each side over which the mean is taken: more than a rim is wide, less than a wave."""
-MOST = 0.006
-"""Excess above which a cell counts no more in the mean, 1/m, lest it make a pit around it."""
 LEVELS = np.array([3.0, 2.0, 1.3, 0.9, 0.6, 0.4], np.float32)
 """Heights above the mean at which outlines are looked for, as multiples of the least rise."""
 FINE = 0.006
@@ -33,8 +27,6 @@ STEP, STEADY, SLIP = 0.002, 3.5, 0.7
 cells of the plane that are as far apart; and as a share of what the plane itself rises in a cell,
 for where it is seen at a grazing angle readings that are a little beside their place seem to
 rise."""
-BIN, BINS, EVERY = 2e-5, 500, 3
-"""How rises are counted: width of a bin, 1/m, their number, and every so many cells."""
 STEEP, STEEP_SHARE = 0.5, 0.7
 """A rise that is more than noise, as a share of the mean, and the share of the outline that has
 it."""
@@ -47,13 +39,12 @@ CHANCE = 16
 GROWN = 0.95
 """Rise per side of a part that replaces known objects within it, as a share of the greatest of
 theirs: an object and a swell beside it rise less."""
-SLOPE = 0.0016
-"""Fall per cell of the side of something, 1/m."""
 SIDE = 0.004
 """Rise over two cells of the side of something, 1/m."""
 SAME = 0.9
 """Share of the cells of a part from which it is a known object."""
-INWARD, OUTWARD = 2, 3
+INWARD = 2
+OUTWARD = APART - INWARD
 """Cells from the outline to where its rise is measured."""
 LEAST_CELLS, LEAST_SIDES, SMALL_PART = 80, 30, 12
 ALONG, KNOWN, BESIDE = 0.4, 0.65, 0.3
@@ -65,166 +56,55 @@ BROAD = 1.5
 are narrower."""
 RAGGED = 80
 """Square of the sides by the cells of what only fills a gap: 16 of a square, 50 of a crescent."""
-BLOCK = 64
+BLOCK = 16
 """Cells that are looked at together: most are not above any level."""
 
 
-def raise_low(
-    cells: Cells, heights: Heights, planes: F8, raised: I4, stacks: I4, *, largest_m: float
-) -> None:
+class Room(NamedTuple):
+    """Room for floods.
+
+    ``seen`` and ``part`` (rows, columns) int32 hold the number of the last part at each cell, as
+    flooded and as filled; ``seeds`` and ``stack`` (cells,) int32 are lists of cells.
+    """
+
+    seen: I4
+    part: I4
+    seeds: I4
+    stack: I4
+
+
+@kernel
+def raise_low(cells: Cells, heights: Heights, planes: F8, raised: I4, largest_m: float) -> None:
     """Give low objects the owners of objects, and swells those of the plane, in place.
 
     Parameters
     ----------
     raised : (rows, columns) set to 1, 2, ... on low objects.
-    stacks : (2, cells) int32, room.
     largest_m : wider things are swells or furniture.
     """
-    w, (owner, height) = cells.w, heights
+    w, owner, height = cells.w, heights.owner, heights.height
     widest = largest_m * cells.lens.fx
-    objects = 0
-    excess, relief = np.zeros((2, *w.shape), np.float32)
-    for number, plane in enumerate(planes, 1):
-        if _excess(w, owner, height, plane, number, excess) < LEAST_CELLS:
+    excess, relief = unset(w.shape, np.float32), unset(w.shape, np.float32)
+    room = Room(
+        np.zeros(w.shape, np.int32),
+        np.zeros(w.shape, np.int32),
+        unset(w.size, np.int32),
+        unset(w.size, np.int32),
+    )
+    objects = parts = np.int64(0)  # a literal would be compiled apart
+    for k in range(len(planes)):
+        number = k + 1
+        if excess_of(w, owner, height, planes[k], number, excess) < LEAST_CELLS:
             continue
-        _cut_feet(w, owner, height, number, excess, stacks[0], stacks[1].view(np.float32))
-        _level(excess, relief)
-        clear = max(STEP, STEADY * _noise(relief, owner, number))
-        step = max(clear, SLIP * math.hypot(plane[0], plane[1]))
-        levels = np.float32(min(clear, FINE)) * LEVELS
-        objects = _raise(w, relief, owner, number, step, levels, raised, widest, objects, stacks)
-        _lower(w, excess, owner, number, step, raised, stacks)
-
-
-@kernel
-def _excess(w: F4, owner: I4, height: F4, plane: F8, number: int, out: F4) -> int:
-    """Write the smoothed inverse depth above the plane of its low cells; 0 elsewhere."""
-    rows, columns = w.shape
-    zero, one, low = np.float32(0), np.float32(1), np.float32(LOW_M)
-    slope = np.float32(plane[0])
-    raw = np.zeros((3, columns), np.float32)
-    mark = np.zeros((3, columns), np.float32)
-    n = 0
-    some = False
-    out[0, :] = out[rows - 1, :] = zero
-    for i in range(rows + 1):
-        now, before, some = i % 3, some, False
-        if i < rows:
-            base = np.float32(plane[1] * i + plane[2])
-            for j in range(columns):
-                mine = ((owner[i, j] == number) | (owner[i, j] == -number)) & (height[i, j] < low)
-                mark[now, j] = one if mine else zero
-                raw[now, j] = w[i, j] - (slope * np.float32(j) + base) if mine else zero
-                some |= mine
-        if i < 2 or i == rows:
-            continue
-        middle = (i - 1) % 3
-        out[i - 1, 0] = out[i - 1, columns - 1] = zero
-        if not before:
-            out[i - 1, :] = zero
-            continue
-        for j in range(1, columns - 1):
-            total = count = zero
-            for r in range(3):
-                total += raw[r, j - 1] + raw[r, j] + raw[r, j + 1]
-                count += mark[r, j - 1] + mark[r, j] + mark[r, j + 1]
-            mine = mark[middle, j] > zero
-            out[i - 1, j] = total / count if mine else zero
-            n += mine
-    return n
-
-
-@kernel
-def _cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4, stack: I4, drop: F4) -> None:
-    """Clear the excess of the feet of what is not low: steep cells below it, down to the plane."""
-    rows, columns = excess.shape
-    top = 0
-    high, edge = np.float32(LOW_M), np.zeros(columns, np.bool_)
-    for i in range(1, rows - 1):
-        # Few cells are high and beside what is low, and this vectorises.
-        here, above, below = excess[i], excess[i - 1], excess[i + 1]
-        some = False
-        for j in range(1, columns - 1):
-            beside = (above[j] != 0) | (below[j] != 0) | (here[j - 1] != 0) | (here[j + 1] != 0)
-            edge[j] = beside & (owner[i, j] == number) & (height[i, j] >= high)
-            some |= edge[j]
-        if not some:
-            continue
-        for j in range(1, columns - 1):
-            if edge[j]:
-                for d in range(4):
-                    y = i + (1 if d == 0 else -1 if d == 1 else 0)
-                    x = j + (1 if d == 2 else -1 if d == 3 else 0)
-                    if excess[y, x] != 0 and abs(w[y, x] - w[i, j]) < JUMP:
-                        stack[top], drop[top] = y * columns + x, excess[y, x]
-                        excess[y, x] = 0
-                        top += 1
-    done = 0
-    while done < top:
-        i, j = stack[done] // columns, stack[done] % columns
-        here = drop[done]
-        done += 1
-        for d in range(4):
-            y = i + (1 if d == 0 else -1 if d == 1 else 0)
-            x = j + (1 if d == 2 else -1 if d == 3 else 0)
-            if excess[y, x] != 0 and here - excess[y, x] > SLOPE and abs(w[y, x] - w[i, j]) < JUMP:
-                stack[top], drop[top] = y * columns + x, excess[y, x]
-                excess[y, x] = 0
-                top += 1
-
-
-@kernel
-def _level(excess: F4, relief: F4) -> None:
-    """Write the excess over its mean in a window around each low cell; 0 elsewhere.
-
-    The window slides: what enters it is added, what leaves it is taken away. It does so down the
-    rows for ``sums`` and ``counts`` of each column, and along a row for those of all its cells.
-    """
-    rows, columns = excess.shape
-    sums, counts = np.zeros(columns, np.float64), np.zeros(columns, np.float64)
-    for i in range(-WINDOW, rows):
-        for sign, row in ((1, i + WINDOW), (-1, i - WINDOW - 1)):
-            if 0 <= row < rows:
-                for j in range(columns):
-                    sums[j] += sign * min(excess[row, j], MOST)
-                    counts[j] += sign * (excess[row, j] != 0)
-        if i < 0:
-            continue
-        total = count = 0.0
-        for j in range(-WINDOW, columns):
-            if j + WINDOW < columns:
-                total += sums[j + WINDOW]
-                count += counts[j + WINDOW]
-            if j > WINDOW:
-                total -= sums[j - WINDOW - 1]
-                count -= counts[j - WINDOW - 1]
-            if j >= 0:
-                here = excess[i, j]
-                relief[i, j] = here - np.float32(total / count) if here != 0 else 0
-
-
-@kernel
-def _noise(relief: F4, owner: I4, number: int) -> float:
-    """Return the median rise, 1/m, between cells of the plane as far apart as at an outline."""
-    rows, columns = relief.shape
-    apart = INWARD + OUTWARD
-    histogram = np.zeros(BINS, np.int64)
-    n = 0
-    for i in range(0, rows - apart, EVERY):
-        for j in range(0, columns - apart, EVERY):
-            here = relief[i, j]
-            if owner[i, j] != -number or here == 0:
-                continue
-            for y, x in ((i + apart, j), (i, j + apart)):
-                if owner[y, x] == -number and relief[y, x] != 0:
-                    rise = abs(relief[y, x] - here)
-                    histogram[min(int(rise / BIN), BINS - 1)] += 1
-                    n += 1
-    below = bins = 0
-    while 2 * below < n:
-        below += histogram[bins]
-        bins += 1
-    return bins * BIN
+        cut_feet(w, owner, height, number, excess, room.seeds, room.stack.view(np.float32))
+        subtract_mean(excess, relief)
+        clear = max(STEP, STEADY * noise_of(relief, owner, number))
+        step = max(clear, SLIP * math.hypot(planes[k, 0], planes[k, 1]))
+        least = np.float32(min(clear, FINE))
+        objects, parts = _raise(
+            w, relief, owner, number, step, least, raised, widest, objects, parts, room
+        )
+        parts = _lower(w, excess, owner, number, step, raised, parts, room)
 
 
 @kernel
@@ -234,25 +114,26 @@ def _raise(
     owner: I4,
     number: int,
     rise_least: float,
-    levels: F4,
+    level_least: float,
     raised: I4,
     widest: float,
     objects: int,
-    stacks: I4,
-) -> int:
+    me: int,
+    room: Room,
+) -> tuple[int, int]:
     """Mark the parts above each level, filled, whose outline is that of an object.
 
-    They are numbered from ``objects`` + 1 on. Returns the last number. ``relief`` (rows, columns)
-    is from `_level`, ``levels`` falls, both in 1/m.
+    They are numbered from ``objects`` + 1 on, the parts that are looked at from ``me`` + 1 on.
+    Returns the last numbers. ``relief`` (rows, columns) is from `subtract_mean`; ``level_least`` is
+    what `LEVELS` are multiples of, 1/m.
     """
     flat, marks, owners = relief.reshape(-1), raised.reshape(-1), owner.reshape(-1)
-    seeds, stack = stacks[0], stacks[1]
-    n = _find_seeds(flat, levels[-1], seeds)
-    seen, part = np.zeros(relief.shape, np.int32), np.zeros(relief.shape, np.int32)
+    seen, part, seeds, stack = room
     visited, parts = seen.reshape(-1), part.reshape(-1)
-    merits = np.zeros(1 + objects + levels.size * (flat.size // LEAST_CELLS), np.float32)
-    me = 0
-    for level in levels:
+    n = _find_seeds(relief, level_least * LEVELS[-1], seeds)
+    merits = np.zeros(1 + objects + LEVELS.size * (flat.size // LEAST_CELLS), np.float32)
+    for multiple in LEVELS:
+        level = level_least * multiple
         first = me
         for s in seeds[:n]:
             if visited[s] > first or not flat[s] > level:
@@ -278,27 +159,31 @@ def _raise(
                 merits[objects] = merit
                 for p in stack[:filled]:
                     marks[p], owners[p] = objects, number
-    return objects
+    return objects, me
 
 
 @kernel(leaf=True)
-def _find_seeds(flat: F4, least: float, seeds: I4) -> int:
-    """List the cells above the lowest level that are higher than the one before; return how many.
+def _find_seeds(relief: F4, least: float, seeds: I4) -> int:
+    """List cells above the lowest level that are higher than the ones before and above them.
 
-    The first cell of a part above any level is one. Most cells are lower, and to pass over many of
-    them at a time vectorises.
+    The first cell of a part above any level is one. Returns how many there are. Most cells are
+    lower, and to pass over many of them at a time vectorises.
     """
+    rows, columns = relief.shape
     n = 0
-    for start in range(1, flat.size, BLOCK):
-        block, before = flat[start : start + BLOCK], flat[start - 1 :]
-        some = False
-        for k in range(block.size):
-            some |= block[k] > least
-        if not some:
-            continue
-        for k in range(block.size):
-            seeds[n] = start + k
-            n += int((block[k] > least) & (block[k] > before[k]))
+    for i in range(1, rows):
+        for start in range(1, columns, BLOCK):
+            end = min(start + BLOCK, columns)
+            here = relief[i, start:end]
+            some = False
+            for k in range(here.size):
+                some |= here[k] > least
+            if not some:
+                continue
+            before, above = relief[i, start - 1 : end], relief[i - 1, start:end]
+            for k in range(here.size):
+                seeds[n] = i * columns + start + k
+                n += int((here[k] > least) & (here[k] > before[k]) & (here[k] > above[k]))
     return n
 
 
@@ -420,11 +305,21 @@ def _outline(
 
 @kernel
 def _lower(
-    w: F4, excess: F4, owner: I4, number: int, rise_least: float, raised: I4, stacks: I4
-) -> None:
-    """Give level parts of low object cells whose outline is that of a swell back to the plane."""
+    w: F4,
+    excess: F4,
+    owner: I4,
+    number: int,
+    rise_least: float,
+    raised: I4,
+    me: int,
+    room: Room,
+) -> int:
+    """Give level parts of low object cells whose outline is that of a swell back to the plane.
+
+    The parts are numbered from ``me`` + 1 on; returns the last number.
+    """
     rows, columns = excess.shape
-    seeds, stack = stacks[0], stacks[1]
+    _, part, seeds, stack = room
     above = np.zeros(excess.shape, np.uint8)
     n = 0
     for i in range(rows):
@@ -439,22 +334,20 @@ def _lower(
                 above[i, j] = 1
                 seeds[n] = i * columns + j
                 n += 1
-    if n < SMALL_PART:
-        return
-    part = np.zeros(excess.shape, np.int32)
     parts, owners = part.reshape(-1), owner.reshape(-1)
-    number_of_parts = 0
+    first = me
     for s in seeds[:n]:
-        if parts[s] > 0:
+        if parts[s] > first:
             continue
-        number_of_parts += 1
-        count = _flood(above, np.uint8(0), s, number_of_parts, part, stack)
+        me += 1
+        count = _flood(above, np.uint8(0), s, me, part, stack)
         if count < SMALL_PART:
             continue
         line = _outline(w, excess, owner, part, stack, count, number, rise_least)
         if line.table >= BESIDE * line.sides and line.rise < line.table:
             for t in range(count):
                 owners[stack[t]] = -number
+    return me
 
 
 @kernel(leaf=True)

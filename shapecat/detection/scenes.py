@@ -5,11 +5,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U4, Bool
+from shapecat.arrays import F4, I4, U4, Bool, freeze
 from shapecat.config import DetectionSettings
-from shapecat.detection.candidates import Extents, extents_of, occluded, stands_of
+from shapecat.detection.candidates import Things, things_of
 from shapecat.detection.cells import NEAREST_M, Cells
-from shapecat.detection.pieces import FEW, depths_of
 from shapecat.detection.planes import Support, corners_of
 from shapecat.detection.segmentation import Segmentation
 from shapecat.geometry import (
@@ -48,32 +47,26 @@ def scene_of(
     ``points`` (n, 3), view frame.
     """
     count = found.leaders.size - 1
-    least = np.full(len(indices), settings.min_points)
-    if points is None:
-        small = cells.small(depths_of(found.pieces)[found.leaders[1:]])
-        least = np.maximum(least, np.minimum(small, ENOUGH) * cells.factor**2)
-    kept = sorted(
-        (k for k, index in enumerate(indices) if index.size >= least[k]),
-        key=lambda k: int(indices[k][0]),
-    )
+    things = things_of(cells, found, range_m=settings.max_range_m)
+    kept = _kept(cells, things, indices, settings.min_points, image=points is None)
     position = {k + 1: n for n, k in enumerate(kept)}
-    boxes = _boxes(cells, found, indices, points)
-    cut = _cut(cells, boxes) if points is None else _cut_cloud(cells, found, sensor_from_view)
-    cut |= _out_of_range(cells, found, settings.max_range_m)
-    stands, hidden, owners = stands_of(found), occluded(found), found.owners
+    boxes = _boxes(found, things, indices, points, sensor_from_view)
+    cut = _cut(cells, things) if points is None else _cut_cloud(cells, found, sensor_from_view)
+    cut |= things.last
+    owner, stand, hidden = found.owners[1:].tolist(), things.stand.tolist(), things.hidden.tolist()
     candidates = []
     for k in kept:
         seen = k < count
-        on = position.get(stands[k].label) if seen else None
+        on = position.get(stand[k]) if seen else None
         candidates.append(
             Candidate(
                 indices=indices[k],
-                box=_moved(sensor_from_view, boxes.center[k], boxes.size[k], boxes.orientation[k]),
-                plane=int(owners[k + 1]) if seen else None,
+                box=boxes[k],
+                plane=owner[k] if seen else None,
                 on_candidate=on,
-                support_m=0.0 if on is None else stands[k].height_m,
-                touches_border=bool(seen and cut[k]),
-                occluded=bool(seen and hidden[k]),
+                support_m=0.0 if on is None else float(things.support_m[k]),
+                touches_border=seen and bool(cut[k]),
+                occluded=seen and hidden[k],
             )
         )
     lowest = found.supports[0].offset
@@ -81,29 +74,50 @@ def scene_of(
     return Scene(sensor_from_view.rotation @ found.up, planes, tuple(candidates))
 
 
-def _boxes(cells: Cells, found: Segmentation, indices: Sequence[U4], points: F4 | None) -> Extents:
-    """Measure on the cells what they show, and on the points what they do not."""
-    boxes = extents_of(cells, found)
-    extra = indices[found.leaders.size - 1 :]
-    if points is None or not extra:
-        return boxes
-    more = [upright_box(points[index], found.up) for index in extra]
-    return boxes._replace(
-        center=np.concatenate([boxes.center, [box.center for box in more]]),
-        size=np.concatenate([boxes.size, [box.size for box in more]]),
-        orientation=np.concatenate([boxes.orientation, [box.orientation for box in more]]),
-    )
+def _kept(
+    cells: Cells, things: Things, indices: Sequence[U4], least: int, *, image: bool
+) -> list[int]:
+    """Return which lists of points are objects, in the order of their first points."""
+    limits = np.full(len(indices), least)
+    if image:
+        limits = np.maximum(limits, np.minimum(things.least, ENOUGH) * cells.factor**2)
+    enough = (k for k, limit in enumerate(limits.tolist()) if indices[k].size >= limit)
+    return sorted(enough, key=lambda k: int(indices[k][0]))
 
 
-def _cut(cells: Cells, extents: Extents) -> Bool:
+def _boxes(
+    found: Segmentation,
+    things: Things,
+    indices: Sequence[U4],
+    points: F4 | None,
+    sensor_from_view: Pose,
+) -> list[Box]:
+    """Return the boxes of what the cells show, and on the points of what they do not."""
+    sizes = [things.center, things.size, things.orientation]
+    if sensor_from_view is IDENTITY:  # rows of frozen arrays need not be frozen one by one
+        sizes = [freeze(rows, "n k", "f4") for rows in sizes]
+    boxes = [Box(*row) for row in zip(*sizes, strict=True)]
+    if points is not None:
+        extra = indices[found.leaders.size - 1 :]
+        boxes += [upright_box(points[index], found.up) for index in extra]
+    return boxes if sensor_from_view is IDENTITY else [_moved(sensor_from_view, b) for b in boxes]
+
+
+def _cut(cells: Cells, things: Things) -> Bool:
     """Return whether each object reaches the border of the image, or of its readings near it."""
-    result = np.zeros(len(extents.low), bool)
-    reach = max(1, round(2 / cells.factor))
-    for axis in range(2):
-        last = cells.w.shape[axis] - 1
-        result |= extents.low[:, axis] < _begin(cells.w, axis, 1, reach) + reach
-        result |= extents.high[:, axis] > last - _begin(cells.w, axis, -1, reach) - reach
+    result = np.zeros(len(things.low), bool)
+    _find_cut(cells.w, things.low, things.high, max(1, round(2 / cells.factor)), result)
     return result
+
+
+@kernel
+def _find_cut(w: F4, low: I4, high: I4, reach: int, cut: Bool) -> None:
+    """Mark what is within ``reach`` of the lines of cells where the readings begin."""
+    for axis in range(2):
+        first = _begin(w, axis, 1, reach) + reach
+        last = w.shape[axis] - 1 - _begin(w, axis, -1, reach) - reach
+        for k in range(cut.size):
+            cut[k] |= (low[k, axis] < first) | (high[k, axis] > last)
 
 
 @kernel(leaf=True)
@@ -124,12 +138,6 @@ def _begin(w: F4, axis: int, step: int, reach: int) -> int:
                 first = k if first < 0 else first
                 low, high = min(low, n), max(high, n)
     return first if first >= 0 and high - low > STRAIGHT * length else 0
-
-
-def _out_of_range(cells: Cells, found: Segmentation, range_m: float) -> Bool:
-    """Return whether each object reaches the range, beyond which readings are left out."""
-    count = cells.count_last(found.labels, found.leaders.size, range_m=range_m)
-    return np.asarray(count[1:] >= FEW)
 
 
 def _cut_cloud(cells: Cells, found: Segmentation, sensor_from_view: Pose) -> Bool:
@@ -165,19 +173,16 @@ def _ends(valid: Bool, last: int) -> tuple[I4, I4]:
     return np.argmax(valid, axis=0), last - np.argmax(valid[::-1], axis=0)
 
 
-def _moved(sensor_from_view: Pose, center: F8, size: F8, orientation: F8) -> Box:
-    if sensor_from_view is IDENTITY:
-        return Box(center, size, orientation)
-    rotation = sensor_from_view.rotation @ rotation_from_quaternion(orientation)
-    return Box(transform(sensor_from_view, center), size, quaternion_from_rotation(rotation))
+def _moved(sensor_from_view: Pose, box: Box) -> Box:
+    rotation = sensor_from_view.rotation @ rotation_from_quaternion(box.orientation)
+    center = transform(sensor_from_view, box.center)
+    return Box(center, box.size, quaternion_from_rotation(rotation))
 
 
 def _plane(support: Support, lowest: float, sensor_from_view: Pose) -> Plane:
-    normal = sensor_from_view.rotation @ support.up
-    return Plane(
-        normal=normal,
-        offset=support.offset + float(normal @ sensor_from_view.translation),
-        outline=transform(sensor_from_view, corners_of(support)),
-        area_m2=support.area_m2,
-        height_m=support.offset - lowest,
-    )
+    normal, offset, outline = support.up, support.offset, corners_of(support)
+    if sensor_from_view is not IDENTITY:
+        normal = sensor_from_view.rotation @ normal
+        offset += float(normal @ sensor_from_view.translation)
+        outline = transform(sensor_from_view, outline)
+    return Plane(normal, offset, outline, support.area_m2, support.offset - lowest)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U1
+from shapecat.arrays import F8, I4, U1, Bool
 from shapecat.config import DetectionSettings
 from shapecat.detection.axes import cut_at_axes
 from shapecat.detection.boards import boards_of
@@ -17,44 +17,63 @@ from shapecat.detection.borders import meet
 from shapecat.detection.cells import Cells
 from shapecat.detection.directions import estimate_up
 from shapecat.detection.fill import fill_enclosed, grow_feet
-from shapecat.detection.furniture import (
-    cut_by_range,
-    is_no_object,
-    posts_of,
-    remains_of,
-    sides_of,
-    towers_of,
-    unbounded,
-)
+from shapecat.detection.furniture import Field, Limits, is_no_object
 from shapecat.detection.heights import Heights, heights_of, table_of
-from shapecat.detection.joins import join_pieces
+from shapecat.detection.joins import join_raised, join_small
 from shapecat.detection.ledges import cut_at_ledges
 from shapecat.detection.levels import find_levels
+from shapecat.detection.occluders import join_around, join_behind
+from shapecat.detection.parts import Sight, Trees, join_parts, trees
 from shapecat.detection.pieces import Pieces, pieces_of
 from shapecat.detection.planes import Support
-from shapecat.detection.raised import join_raised
 from shapecat.detection.reach import reach_over
 from shapecat.detection.regions import regions_of, rename
 from shapecat.detection.relief import raise_low
 from shapecat.detection.surfaces import Surfaces, surfaces_of
 from shapecat.detection.walls import clear_walls
 from shapecat.errors import ConfigError
+from shapecat.jit import kernel
 
-__all__ = ["RULES", "Parted", "Segmentation", "part", "segment"]
+__all__ = ["RULES", "Ground", "Parted", "Segmentation", "part", "segment"]
 
-RULES = (
-    "low",
-    "concave",
-    "ledge",
-    "axis",
-    "small",
-    "parts",
-    "occluder",
-    "feet",
-    "fill",
-)
-"""The rules beyond the thesis, in their order. Without any of them what remains is the plane, the
-height above it, and depth jumps."""
+
+class Rules(NamedTuple):
+    """Which of the rules beyond the thesis apply, in their order.
+
+    Without any of them what remains is the plane, the height above it, and depth jumps.
+    """
+
+    low: bool
+    concave: bool
+    ledge: bool
+    axis: bool
+    small: bool
+    parts: bool
+    occluder: bool
+    feet: bool
+    fill: bool
+
+
+RULES = Rules._fields
+
+
+class Ground(NamedTuple):
+    """What objects stand on and before.
+
+    Attributes
+    ----------
+    up : (3,) unit vector.
+    planes : rows of `table_of`, the lowest first.
+    heights : of the cells, and the plane each is above.
+    raised : (rows, columns) int16, the numbers of the low objects that are known by their outline.
+    walls : (rows, columns) uint8, not 0 on walls.
+    """
+
+    up: F8
+    planes: F8
+    heights: Heights
+    raised: I4
+    walls: U1
 
 
 class Parted(NamedTuple):
@@ -62,21 +81,11 @@ class Parted(NamedTuple):
 
     Attributes
     ----------
-    up, supports, planes : as in `Segmentation`.
-    heights : of the cells, and the plane each is above.
-    raised : (rows, columns) int16, the numbers of the low objects that are known by their outline.
-    walls : (rows, columns) uint8, not 0 on walls.
     surfaces : which cells go on in which, and which way they face.
     regions : (rows, columns) int16, the pieces, 0 elsewhere.
     pieces : their statistics.
     """
 
-    up: F8
-    supports: list[Support]
-    planes: F8
-    heights: Heights
-    raised: I4
-    walls: U1
     surfaces: Surfaces
     regions: I4
     pieces: Pieces
@@ -91,71 +100,20 @@ class Segmentation(NamedTuple):
     supports : the planes, lowest first.
     planes : their rows of `table_of`.
     labels : (rows, columns) int16, 1..count, 0 elsewhere.
-    heights : (rows, columns) float32 metres above the plane.
     filled : (rows, columns) uint8, 1 where a label lies at the level of the plane.
     pieces : statistics of the regions the objects were joined from.
     leaders : (count + 1,) the piece that holds the sums of each label.
+    owners : (count + 1,) the plane that each label stands above; 0 for label 0.
     """
 
     up: F8
     supports: list[Support]
     planes: F8
     labels: I4
-    heights: F4
     filled: U1
     pieces: Pieces
     leaders: I4
-
-    @property
-    def owners(self) -> I4:
-        """The plane that each label stands above; 0 for label 0."""
-        return np.maximum(self.pieces.owner[self.leaders].astype(np.int64) - 1, 0)
-
-
-def _checked(text: str) -> list[str]:
-    rules = text.split()
-    unknown = [rule for rule in rules if rule not in RULES]
-    if unknown:
-        msg = f"detection.rules: unknown {', '.join(unknown)}; known: {' '.join(RULES)}"
-        raise ConfigError(msg)
-    return rules
-
-
-def part(
-    cells: Cells,
-    hint: F8 | None,
-    *,
-    upright: bool,
-    settings: DetectionSettings,
-    rng: np.random.Generator,
-) -> Parted | None:
-    """Find planes and the pieces of objects among ``cells``; None if no plane bears anything."""
-    rules = _checked(settings.rules)
-    up = estimate_up(cells, hint, upright=upright, rng=rng)
-    supports = [] if up is None else boards_of(cells, find_levels(cells, up, rng))
-    if up is None or not supports:
-        return None
-    up = max(supports, key=lambda s: s.area_m2).up
-    planes = table_of(supports, cells.lens)
-    heights = heights_of(cells, planes, highest_m=settings.max_height_m)
-    raised = np.zeros(cells.w.shape, np.int16)
-    stacks = np.zeros((2, cells.w.size), np.int32)
-    if "low" in rules:
-        raise_low(cells, heights, planes, raised, stacks, largest_m=settings.max_size_m)
-    walls = clear_walls(cells, heights.owner, up, largest_m=settings.max_size_m, rng=rng)
-    reach_over(cells, heights, planes, walls, stacks, highest_m=settings.max_height_m)
-    surfaces = surfaces_of(cells, heights)
-    regions, n = regions_of(heights, surfaces, stacks, concave="concave" in rules)
-    pieces = pieces_of(cells, heights, surfaces, regions, n, up)
-    more = n
-    if "ledge" in rules:
-        more = cut_at_ledges(cells, heights, surfaces, pieces, regions, up)
-    if "axis" in rules:
-        more = cut_at_axes(cells, heights, surfaces, pieces, regions, up, more)
-    if more > n:
-        pieces = pieces_of(cells, heights, surfaces, regions, more, up)
-    meet(cells.w, heights, surfaces, regions, up, pieces)
-    return Parted(up, supports, planes, heights, raised, walls, surfaces, regions, pieces)
+    owners: I4
 
 
 def segment(
@@ -167,30 +125,137 @@ def segment(
     rng: np.random.Generator,
 ) -> Segmentation | None:
     """Find planes and objects among ``cells``; None if there is no supporting plane."""
-    parted = part(cells, hint, upright=upright, settings=settings, rng=rng)
-    if parted is None:
+    rules, limits = _rules_of(settings.rules), _limits_of(settings)
+    supports, ground = _ground(cells, hint, rules, limits, rng, upright=upright)
+    if ground is None:
         return None
-    up, supports, planes, heights, raised, walls, surfaces, regions, pieces = parted
-    rules = settings.rules.split()
+    labels, filled, pieces, leaders, owners = _objects(cells, ground, rules, limits, trees())
+    return Segmentation(ground.up, supports, ground.planes, labels, filled, pieces, leaders, owners)
+
+
+def part(
+    cells: Cells, *, settings: DetectionSettings, rng: np.random.Generator
+) -> tuple[Ground, Parted] | None:
+    """Find planes and the pieces of objects in an upright view; None if no plane bears anything."""
+    rules, limits = _rules_of(settings.rules), _limits_of(settings)
+    _, ground = _ground(cells, None, rules, limits, rng, upright=True)
+    return None if ground is None else (ground, _part(cells, ground, rules, limits))
+
+
+def _limits_of(settings: DetectionSettings) -> Limits:
+    return Limits(settings.max_height_m, settings.max_size_m, settings.max_range_m)
+
+
+def _rules_of(text: str) -> Rules:
+    rules = text.split()
+    unknown = [rule for rule in rules if rule not in RULES]
+    if unknown:
+        msg = f"detection.rules: unknown {', '.join(unknown)}; known: {' '.join(RULES)}"
+        raise ConfigError(msg)
+    return Rules(*(rule in rules for rule in RULES))
+
+
+def _ground(
+    cells: Cells,
+    hint: F8 | None,
+    rules: Rules,
+    limits: Limits,
+    rng: np.random.Generator,
+    *,
+    upright: bool,
+) -> tuple[list[Support], Ground | None]:
+    up = estimate_up(cells, hint, upright=upright, rng=rng)
+    supports = [] if up is None else boards_of(cells, find_levels(cells, up, rng))
+    if not supports:
+        return supports, None
+    up = max(supports, key=lambda s: s.area_m2).up
+    planes = table_of(supports, cells.lens)
+    heights, raised = _stand(cells, planes, rules, limits)
+    walls = clear_walls(cells, heights.owner, up, largest_m=limits.largest_m, rng=rng)
+    return supports, Ground(up, planes, heights, raised, walls)
+
+
+@kernel
+def _stand(cells: Cells, planes: F8, rules: Rules, limits: Limits) -> tuple[Heights, I4]:
+    """Return what every cell stands on, and the numbers of low objects."""
+    heights = heights_of(cells, planes, limits.highest_m)
+    raised = np.zeros(cells.w.shape, np.int16)
+    if rules.low:
+        raise_low(cells, heights, planes, raised, limits.largest_m)
+    return heights, raised
+
+
+@kernel
+def _part(cells: Cells, ground: Ground, rules: Rules, limits: Limits) -> Parted:
+    """Part what stands on the ground, after it was given what reaches over its edge."""
+    heights, up = ground.heights, ground.up
+    reach_over(cells, heights, ground.planes, ground.walls, limits.highest_m)
+    surfaces = surfaces_of(cells, heights)
+    regions, n = regions_of(heights, surfaces, rules.concave)
+    pieces = pieces_of(cells, heights, surfaces, regions, n, up)
+    more = n
+    if rules.ledge:
+        more = cut_at_ledges(cells, heights, surfaces, pieces, regions, up)
+    if rules.axis:
+        more = cut_at_axes(cells, heights, surfaces, pieces, regions, up, more)
+    if more > n:
+        pieces = pieces_of(cells, heights, surfaces, regions, more, up)
+    meet(cells.w, heights, surfaces, regions, up, pieces)
+    return Parted(surfaces, regions, pieces)
+
+
+@kernel
+def _objects(
+    cells: Cells, ground: Ground, rules: Rules, limits: Limits, grown: Trees
+) -> tuple[I4, U1, Pieces, I4, I4]:
+    """Return the last five parts of a `Segmentation`."""
+    surfaces, regions, pieces = _part(cells, ground, rules, limits)
+    up, planes, heights, raised, walls = ground
     known = join_raised(pieces, raised, regions, surfaces.spans)
-    join_pieces(pieces, cells, surfaces, regions, up, rules)
-    furniture = posts_of(cells, heights.owner, regions, surfaces.spans, pieces, up)
-    furniture |= towers_of(cells, planes, pieces, up, highest_m=settings.max_height_m)
-    furniture |= sides_of(cells, pieces)
-    furniture |= unbounded(cells, planes, heights.owner, walls, regions, surfaces.spans, pieces)
-    furniture |= remains_of(walls, regions, pieces)
-    furniture |= cut_by_range(cells, regions, pieces, range_m=settings.max_range_m)
-    refused = is_no_object(pieces, furniture, known, largest_m=settings.max_size_m)
-    pieces.group[refused[pieces.group]] = 0
-    leaders = np.flatnonzero(np.bincount(pieces.group))
-    number = np.zeros(pieces.group.size, np.int16)
-    number[leaders] = np.arange(leaders.size)
+    if rules.small:
+        join_small(pieces, cells)
+    if rules.parts:
+        join_parts(pieces, Sight(cells.lens.fx, up[2]), grown)
+    if rules.occluder:
+        join_behind(pieces, cells.w, cells.lens, surfaces.normal, regions)
+        join_around(pieces)
+    field = Field(cells.w, cells.lens, planes, heights.owner, walls, regions, surfaces.spans)
+    refused = is_no_object(field, pieces, up, known, limits)
+    leaders, numbers = _number(pieces, refused)
     labels = regions  # of pieces before, of objects from here on
-    rename(labels, surfaces.spans, number[pieces.group])
-    if "feet" in rules:
-        grow_feet(cells.w, heights.owner, heights.height, labels, np.zeros(cells.w.size, np.int32))
-    filled = fill_enclosed(
-        cells.w, heights.height, labels, leaders.size - 1, active="fill" in rules
-    )
-    filled |= np.minimum(raised, labels) > 0
-    return Segmentation(up, supports, planes, labels, heights.height, filled, pieces, leaders)
+    rename(labels, surfaces.spans, numbers)
+    if rules.feet:
+        grow_feet(cells.w, heights, labels)
+    filled = np.zeros(labels.shape, np.uint8)
+    if rules.fill:
+        fill_enclosed(cells.w, heights.height, labels, leaders.size - 1, filled)
+    _fill_raised(raised, labels, filled)
+    owners = np.zeros(leaders.size, np.int64)
+    for n in range(1, leaders.size):
+        owners[n] = pieces.owner[leaders[n]] - 1
+    return labels, filled, pieces, leaders, owners
+
+
+@kernel
+def _number(pieces: Pieces, refused: Bool) -> tuple[I4, I4]:
+    """Return the leading piece of each object, and the label of each piece; group 0 is none."""
+    numbers = np.zeros(pieces.group.size, np.int16)
+    leaders = np.zeros(pieces.group.size, np.int64)
+    n = 0
+    for p in range(1, numbers.size):
+        if pieces.group[p] == p and not refused[p]:
+            n += 1
+            leaders[n], numbers[p] = p, n
+    for p in range(1, numbers.size):
+        leader = pieces.group[p]
+        numbers[p] = numbers[leader]
+        pieces.group[p] = 0 if refused[leader] else leader
+    return leaders[: n + 1], numbers
+
+
+@kernel(leaf=True)
+def _fill_raised(raised: I4, labels: I4, filled: U1) -> None:
+    """Count what is known by its outline as filled: it may lie at the level of its plane."""
+    for i in range(labels.shape[0]):
+        for j in range(labels.shape[1]):
+            filled[i, j] |= (raised[i, j] > 0) & (labels[i, j] > 0)

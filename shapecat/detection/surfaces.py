@@ -9,12 +9,14 @@ from shapecat.arrays import F4, I4, U1
 from shapecat.detection.cells import JUMP, Cells, Lens
 from shapecat.detection.heights import Heights
 from shapecat.detection.tangents import fit_tangents, padded
-from shapecat.jit import kernel
+from shapecat.jit import kernel, unset
 
 __all__ = ["DOWN", "RIGHT", "Surfaces", "span_of", "surfaces_of"]
 
 RIGHT, DOWN = 1, 2
 """Bits of `Surfaces.links`."""
+BENT = 4
+"""The same bits times this mark, for a time, the links that only a tangent plane tells."""
 BASE, BASE_DIAGONAL = 3, 2
 """Cells between an edge and the surfaces on its two sides."""
 REACH, SURE = 2, 0.5
@@ -30,7 +32,8 @@ class Surfaces(NamedTuple):
     Attributes
     ----------
     tangent : (rows, 3, columns) float32: inverse depth of the fitted plane at the cell, and its
-        change per column and per row; 0 where there is no fit.
+        change per column and per row; 0 where there is no fit. Far from object cells nothing is
+        written.
     normal : (rows, 3, columns) float32 unit normal towards the camera, sensor frame, or 0.
     links : (rows, columns) uint8: `RIGHT` and `DOWN` where the surface goes on to that neighbour.
     edge : (rows, columns) uint8: the largest concave angle across the cell, degrees.
@@ -45,24 +48,21 @@ class Surfaces(NamedTuple):
     spans: I4
 
 
+@kernel
 def surfaces_of(cells: Cells, heights: Heights) -> Surfaces:
     """Fit tangent planes to the object cells, link them and measure concave angles."""
-    shape = cells.w.shape
-    tangent, normal = np.zeros((2, shape[0], 3, shape[1]), np.float32)
-    links, edge = np.zeros((2, *shape), np.uint8)
-    surfaces = Surfaces(tangent, normal, links, edge, np.zeros((shape[0], 2), np.int32))
-    _survey(cells.w, cells.lens, heights.owner, surfaces)
-    return surfaces
-
-
-@kernel
-def _survey(w: F4, lens: Lens, owner: I4, surfaces: Surfaces) -> None:
-    spans = surfaces.spans
-    for i in range(owner.shape[0]):
+    w, lens, owner = cells.w, cells.lens, heights.owner
+    rows, columns = w.shape
+    spans = np.zeros((rows, 2), np.int32)
+    for i in range(rows):
         spans[i, 0], spans[i, 1] = span_of(owner[i])
-    fit_tangents(w, lens, owner, spans, surfaces.tangent, surfaces.normal)
-    _link(w, owner, spans, surfaces.tangent, surfaces.links)
+    tangent, normal = _cleared(spans, columns), _cleared(spans, columns)
+    fit_tangents(w, lens, owner, spans, tangent, normal)
+    links = np.zeros(w.shape, np.uint8)
+    _link(w, owner, spans, tangent, links)
+    surfaces = Surfaces(tangent, normal, links, np.zeros(w.shape, np.uint8), spans)
     _bend(w, lens, surfaces)
+    return surfaces
 
 
 @kernel(leaf=True)
@@ -79,6 +79,24 @@ def span_of(row: I4) -> tuple[int, int]:
     while row[end - 1] <= 0:
         end -= 1
     return start, end
+
+
+@kernel
+def _cleared(spans: I4, columns: int) -> F4:
+    """Return an array (rows, 3, columns) that is 0 as far from object cells as is looked."""
+    rows = len(spans)
+    fits: F4 = unset((rows, 3, columns), np.float32)
+    for i in range(rows):
+        start, end = columns, 0
+        for y in range(max(i - BASE, 0), min(i + BASE + 1, rows)):
+            if spans[y, 0] < spans[y, 1]:
+                start, end = min(start, spans[y, 0]), max(end, spans[y, 1])
+        start, end = max(start - BASE, 0), min(padded(start, end) + BASE, columns)
+        for d in range(3):
+            row = fits[i, d]
+            for j in range(start, end):
+                row[j] = 0
+    return fits
 
 
 @kernel(leaf=True)
@@ -107,13 +125,17 @@ def _link(w: F4, owner: I4, spans: I4, tangent: F4, links: U1) -> None:
 @kernel(leaf=True)
 def _part_steps(w: F4, owner: I4, i: int, start: int, end: int, links: U1) -> None:
     """Take the links away that only a tangent plane tells, across a step."""
-    jump = np.float32(JUMP)
+    some = False
+    for j in range(links.size):
+        some |= links[j] > (RIGHT | DOWN)  # few rows have any; this vectorises
+    if not some:
+        return
     for j in range(start, end):
-        here = w[i, j]
-        if links[j] & RIGHT and abs(w[i, j + 1] - here) >= jump and _is_step(w, owner, i, j, 0, 1):
+        if links[j] & BENT * RIGHT and _is_step(w, owner, i, j, 0, 1):
             links[j] &= ~RIGHT
-        if links[j] & DOWN and abs(w[i + 1, j] - here) >= jump and _is_step(w, owner, i, j, 1, 0):
+        if links[j] & BENT * DOWN and _is_step(w, owner, i, j, 1, 0):
             links[j] &= ~DOWN
+        links[j] &= RIGHT | DOWN
 
 
 @kernel(fast=True, leaf=True)
@@ -133,11 +155,12 @@ def _link_some(
     zero, jump = np.float32(0), np.float32(JUMP)
     for k in range(links.size):
         v, v1, t, t1 = w[k], w1[k], level[k], level1[k]
-        joined = abs(v - v1) < jump
-        joined |= (t > zero) & (abs(t + slope[k] - v1) < jump)
-        joined |= (t1 > zero) & (abs(t1 - slope1[k] - v) < jump)
-        joined &= (owner[k] > 0) & (owner[k] == owner1[k])
-        links[k] |= np.uint8(bit) if joined else np.uint8(0)
+        level_on = abs(v - v1) < jump
+        bent = (t > zero) & (abs(t + slope[k] - v1) < jump)
+        bent |= (t1 > zero) & (abs(t1 - slope1[k] - v) < jump)
+        same = (owner[k] > 0) & (owner[k] == owner1[k])
+        link = np.uint8(bit) if level_on else np.uint8(bit + BENT * bit) if bent else np.uint8(0)
+        links[k] |= link if same else np.uint8(0)
 
 
 @kernel(leaf=True)

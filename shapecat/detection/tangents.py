@@ -25,6 +25,8 @@ RUN, BRIDGED = 128, 8
 """Most cells in a run, and gaps of other cells that are part of it."""
 LANES = 8
 """Runs are fitted in multiples of this, for what remains is not vectorised."""
+NONE = 1e9
+"""In place of the inverse depth of what is no sample."""
 PITCH = RUN + 2 * WINDOW
 """Width of a row of the buffers."""
 
@@ -37,14 +39,13 @@ def fit_tangents(w: F4, lens: Lens, owner: I4, spans: I4, tangent: F4, normal: F
     object cells of each row lie within ``spans``.
     """
     values = np.zeros(SIDE * PITCH, np.float32)
-    owners = np.zeros(SIDE * PITCH, np.int8)
     fits = np.zeros(6 * PITCH, np.float32)
     for i in range(owner.shape[0]):
         end, last = spans[i]
         while end < last:
             start, end = _next_run(owner[i], end, last)
-            _copy_windows(w, owner, i, start, end, values, owners)
-            _fit_run(values, owners, lens, i, start, padded(start, end) - start, fits)
+            _copy_windows(w, owner, i, start, end, values)
+            _fit_run(values, lens, i, start, padded(start, end) - start, fits)
             _write(fits, tangent, normal, i, start, end)
 
 
@@ -64,38 +65,39 @@ def _write(fits: F4, tangent: F4, normal: F4, i: int, start: int, end: int) -> N
 
 @kernel(leaf=True)
 def _next_run(owner: I4, j: int, last: int) -> tuple[int, int]:
-    """Return the columns from and before which the next object cells of a row lie.
+    """Return the columns from and before which the next object cells of one owner in a row lie.
 
     There are some before ``last``.
     """
     while owner[j] <= 0:
         j += 1
     start = end = j
-    last = min(last, start + RUN)
-    while j < min(last, end + BRIDGED):
-        end = j + 1 if owner[j] > 0 else end
+    me, last = owner[j], min(last, start + RUN)
+    while j < min(last, end + BRIDGED) and (owner[j] <= 0 or owner[j] == me):
+        end = j + 1 if owner[j] == me else end
         j += 1
     return start, end
 
 
 @kernel(leaf=True)
-def _copy_windows(w: F4, owner: I4, i: int, start: int, end: int, values: F4, owners: I4) -> None:
-    """Copy the rows around a run and `WINDOW` cells more at its ends; 0 beyond the image."""
+def _copy_windows(w: F4, owner: I4, i: int, start: int, end: int, values: F4) -> None:
+    """Copy the rows around a run and `WINDOW` cells more at its ends; `NONE` for other owners."""
     rows, columns = owner.shape
+    me, none = owner[i, start], np.float32(NONE)
     left, right = max(start - WINDOW, 0), min(end + WINDOW, columns)
     for d in range(SIDE):
         y, first = i + d - WINDOW, d * PITCH
-        some = owners[first : first + end - start + 2 * WINDOW]
-        some[:] = 0
+        some = values[first : first + end - start + 2 * WINDOW]
+        some[:] = none
         if 0 <= y < rows:
-            first += left - start + WINDOW
-            value, some = values[first : first + right - left], some[left - start + WINDOW :]
+            some = some[left - start + WINDOW :]
+            value, whose = w[y, left:right], owner[y, left:right]
             for k in range(value.size):
-                value[k], some[k] = w[y, left + k], owner[y, left + k]
+                some[k] = value[k] if whose[k] == me else none
 
 
 @kernel(fast=True, leaf=True)
-def _fit_run(values: F4, owners: I4, lens: Lens, i: int, start: int, n: int, fits: F4) -> None:
+def _fit_run(values: F4, lens: Lens, i: int, start: int, n: int, fits: F4) -> None:
     """Fit planes to the windows of ``n`` cells from (i, ``start``) on.
 
     Rows of ``fits``: inverse depth, its two slopes, and the normal; 0 where there is no fit.
@@ -105,15 +107,15 @@ def _fit_run(values: F4, owners: I4, lens: Lens, i: int, start: int, n: int, fit
     fx, fy, y = np.float32(lens.fx), np.float32(lens.fy), np.float32(i - lens.cy)
     for k in range(n):
         p = k + WINDOW
-        center, me = values[WINDOW * PITCH + p], owners[WINDOW * PITCH + p]
+        center = values[WINDOW * PITCH + p]
         # (1) sums over the rows of the window: 1, x, x x, v, x v
-        n0, x0, xx0, v0, xv0 = _four(values, owners, p, center, me, 3, 3)
-        n1, x1, xx1, v1, xv1 = _three(values, owners, PITCH + p, center, me, 2, 2)
-        n2, x2, xx2, v2, xv2 = _four(values, owners, 2 * PITCH + p, center, me, 3, 1)
-        n3, x3, xx3, v3, xv3 = _three(values, owners, 3 * PITCH + p, center, me, 2, 0)
-        n4, x4, xx4, v4, xv4 = _four(values, owners, 4 * PITCH + p, center, me, 3, 1)
-        n5, x5, xx5, v5, xv5 = _three(values, owners, 5 * PITCH + p, center, me, 2, 2)
-        n6, x6, xx6, v6, xv6 = _four(values, owners, 6 * PITCH + p, center, me, 3, 3)
+        n0, x0, xx0, v0, xv0 = _four(values, p, center, 3, 3)
+        n1, x1, xx1, v1, xv1 = _three(values, PITCH + p, center, 2, 2)
+        n2, x2, xx2, v2, xv2 = _four(values, 2 * PITCH + p, center, 3, 1)
+        n3, x3, xx3, v3, xv3 = _three(values, 3 * PITCH + p, center, 2, 0)
+        n4, x4, xx4, v4, xv4 = _four(values, 4 * PITCH + p, center, 3, 1)
+        n5, x5, xx5, v5, xv5 = _three(values, 5 * PITCH + p, center, 2, 2)
+        n6, x6, xx6, v6, xv6 = _four(values, 6 * PITCH + p, center, 3, 3)
         # (2) means and moments over the window
         count = n0 + n1 + n2 + n3 + n4 + n5 + n6
         share = one / max(count, one)
@@ -127,7 +129,7 @@ def _fit_run(values: F4, owners: I4, lens: Lens, i: int, start: int, n: int, fit
         yv = _times_row(v0, v1, v2, v4, v5, v6) * share - my * mv
         # (3) the plane, and its normal in the sensor frame
         determinant = xx * yy - xy * xy
-        sound = (me > 0) & (count >= least) & (determinant >= spread)
+        sound = (center < np.float32(NONE)) & (count >= least) & (determinant >= spread)
         scale = one / (determinant if sound else one)
         gx, gy = (xv * yy - yv * xy) * scale, (yv * xx - xv * xy) * scale
         level = center + mv - gx * mx - gy * my
@@ -151,13 +153,13 @@ def _times_row(a: float, b: float, c: float, e: float, f: float, g: float) -> An
 
 @kernel(fast=True, inline=True)
 def _four(
-    values: F4, owners: I4, p: int, center: float, me: int, far: int, near: int
+    values: F4, p: int, center: float, far: int, near: int
 ) -> tuple[float, float, float, float, float]:
     """Return the sums over a row of a window sampled at -3, -1, 1 and 3 columns from ``p``."""
-    a, va = _sample(values, owners, p - 3, center, me, far)
-    b, vb = _sample(values, owners, p - 1, center, me, near)
-    c, vc = _sample(values, owners, p + 1, center, me, near)
-    d, vd = _sample(values, owners, p + 3, center, me, far)
+    a, va = _sample(values, p - 3, center, far)
+    b, vb = _sample(values, p - 1, center, near)
+    c, vc = _sample(values, p + 1, center, near)
+    d, vd = _sample(values, p + 3, center, far)
     three, nine = np.float32(3), np.float32(9)
     x, xx = three * (d - a) + (c - b), nine * (a + d) + (b + c)
     return a + b + c + d, x, xx, va + vb + vc + vd, three * (vd - va) + (vc - vb)
@@ -165,22 +167,20 @@ def _four(
 
 @kernel(fast=True, inline=True)
 def _three(
-    values: F4, owners: I4, p: int, center: float, me: int, far: int, near: int
+    values: F4, p: int, center: float, far: int, near: int
 ) -> tuple[float, float, float, float, float]:
     """Return the sums over a row of a window sampled at -2, 0 and 2 columns from ``p``."""
-    a, va = _sample(values, owners, p - 2, center, me, far)
-    b, vb = _sample(values, owners, p, center, me, near)
-    c, vc = _sample(values, owners, p + 2, center, me, far)
+    a, va = _sample(values, p - 2, center, far)
+    b, vb = _sample(values, p, center, near)
+    c, vc = _sample(values, p + 2, center, far)
     two = np.float32(2)
     return a + b + c, two * (c - a), two * two * (a + c), va + vb + vc, two * (vc - va)
 
 
 @kernel(fast=True, inline=True)
-def _sample(
-    values: F4, owners: I4, p: int, center: float, me: int, distance: int
-) -> tuple[Any, Any]:
+def _sample(values: F4, p: int, center: float, distance: int) -> tuple[Any, Any]:
     """Return the weight of a sample, and by that how much it differs from the centre."""
     v = values[p] - center
-    use = (owners[p] == me) & (abs(v) < np.float32(GATE + GATE_SLOPE * distance))
+    use = abs(v) < np.float32(GATE + GATE_SLOPE * distance)
     weight = np.float32(1) if use else np.float32(0)
     return weight, weight * v

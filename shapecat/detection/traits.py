@@ -23,7 +23,16 @@ from shapecat.detection.pieces import (
 )
 from shapecat.jit import kernel
 
-__all__ = ["LID_M", "apart", "behind", "lid_share", "roundness_of", "slope_of", "width_of"]
+__all__ = [
+    "LID_M",
+    "apart",
+    "behind",
+    "lid_share",
+    "roundness_of",
+    "slope_of",
+    "top_band",
+    "width_of",
+]
 
 LID_M = 0.02
 """A top is closed by what faces up within this depth of it."""
@@ -81,8 +90,14 @@ def _moments(row: F4) -> tuple[float, float, float]:
 def lid_share(pieces: Pieces, p: int, depth: float) -> float:
     """Return what faces up within ``depth`` of the top of a piece, by its width squared."""
     row = pieces.shape[p]
-    top = min(int(row[TOP] / BAND_M), BANDS - 1)
+    top = top_band(row)
     area = 0.0
     for band in range(max(top - int(depth / BAND_M), 0), top + 1):
         area += pieces.lid[p, band]
     return float(area / max(width_of(row) ** 2, 1e-9))
+
+
+@kernel(leaf=True)
+def top_band(row: F4) -> int:
+    """Return the last band of height in which a piece has anything."""
+    return min(int(row[TOP] / BAND_M), BANDS - 1)

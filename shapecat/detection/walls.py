@@ -9,9 +9,10 @@ from shapecat.detection.cells import JUMP, Cells, Lens
 from shapecat.detection.consensus import (
     TOLERANCE,
     Readings,
-    best_plane,
+    consensus,
     normal_of,
     readings_of,
+    triples_of,
     without,
 )
 from shapecat.geometry import cross
@@ -48,27 +49,53 @@ def clear_walls(
     of many objects looks like a wall too, but all its parts are small.
     """
     walls = np.zeros(owner.shape, np.uint8)
-    readings = readings_of(cells, owner)
+    readings = readings_of(cells.w, owner)
     for _ in range(MOST_WALLS):
-        vertical = (-VERTICAL_COS, VERTICAL_COS)
-        plane, count = best_plane(readings, cells.lens, up, vertical, rng)
-        if count < LEAST_READINGS:
+        triples = triples_of(readings.w.size, rng)
+        readings = _take(cells.w, cells.lens, owner, readings, triples, up, largest_m, walls)
+        if readings.w.size < LEAST_READINGS:
             break
-        if _is_wall(readings, cells, plane, up, largest_m):
-            _clear(cells.w, cells.lens, owner, plane, normal_of(plane, cells.lens), walls)
-        readings = without(readings, plane, 2 * TOLERANCE)
     return walls
 
 
-def _is_wall(readings: Readings, cells: Cells, plane: F8, up: F8, largest_m: float) -> bool:
-    normal = normal_of(plane, cells.lens)
+@kernel
+def _take(
+    w: F4,
+    lens: Lens,
+    owner: I4,
+    readings: Readings,
+    triples: I4,
+    up: F8,
+    largest_m: float,
+    walls: U1,
+) -> Readings:
+    """Take the vertical plane with most readings, if it is a wall; return what is not near it.
+
+    No readings are returned if they agree on no plane.
+    """
+    vertical = (-VERTICAL_COS, VERTICAL_COS)
+    plane, count = consensus(readings, triples, lens, up, vertical, TOLERANCE)
+    if count < LEAST_READINGS:
+        return Readings(readings.j[:0], readings.i[:0], readings.w[:0], readings.share)
+    normal = normal_of(plane, lens)
+    if _is_wall(readings, lens, plane, normal, up, largest_m):
+        _clear(w, lens, owner, plane, normal, walls)
+    rest: Readings = without(readings, plane, 2 * TOLERANCE)
+    return rest
+
+
+@kernel
+def _is_wall(
+    readings: Readings, lens: Lens, plane: F8, normal: F8, up: F8, largest_m: float
+) -> bool:
     across = cross(normal, up)
     strips = np.zeros((2, STRIPS))
-    area = readings.share * _measure(readings, cells.lens, plane, normal, across, up, strips)
+    area = readings.share * _measure(readings, lens, plane, normal, across, up, strips)
     # A strip of 5 cm counts that holds 5 cm of wall.
-    reach = STRIP_M * np.count_nonzero(readings.share * strips > STRIP_M**2, axis=1)
-    dense = area > FILLED * reach[0] * reach[1]
-    return bool(area > LEAST_AREA_M2 and dense and reach.max() > largest_m)
+    full = readings.share * strips > STRIP_M**2
+    width, height = STRIP_M * np.sum(full[0]), STRIP_M * np.sum(full[1])
+    dense = area > FILLED * width * height
+    return bool(area > LEAST_AREA_M2 and dense and max(width, height) > largest_m)
 
 
 @kernel(leaf=True)

@@ -19,10 +19,10 @@ from shapecat.arrays import F4, I4, U1, Bool
 from shapecat.config import DetectionSettings
 from shapecat.detection import parts
 from shapecat.detection.cells import Cells, cells_of
-from shapecat.detection.joins import join_pieces
+from shapecat.detection.joins import join_raised, join_small
+from shapecat.detection.occluders import join_around, join_behind
 from shapecat.detection.parts import SIGNS, Sight, Trees, meet_at_all, signs_of
 from shapecat.detection.pieces import Pieces, merge
-from shapecat.detection.raised import join_raised
 from shapecat.detection.segmentation import RULES, part
 from shapecat.learning.boosting import Tree, TreeSettings, grow_tree, make_bins
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
@@ -135,14 +135,16 @@ def _pairs(
     cells = cells_of(depth, camera, range_m=settings.max_range_m)
     if cells is None:
         return
-    parted = part(cells, None, upright=True, settings=settings, rng=rng)
-    if parted is None:
+    found = part(cells, settings=settings, rng=rng)
+    if found is None:
         return
-    pieces = parted.pieces
-    join_raised(pieces, parted.raised, parted.regions, parted.surfaces.spans)
-    join_pieces(pieces, cells, parted.surfaces, parted.regions, parted.up, _OTHERS.split())
-    counts = _count(owners.reshape(depth.shape), parted.regions, cells)
-    sight, seen = Sight.of(cells, parted.up), set()
+    ground, (surfaces, regions, pieces) = found
+    join_raised(pieces, ground.raised, regions, surfaces.spans)
+    join_small(pieces, cells)
+    join_behind(pieces, cells.w, cells.lens, surfaces.normal, regions)
+    join_around(pieces)
+    counts = _count(owners.reshape(depth.shape), regions, cells)
+    sight, seen = Sight(cells.lens.fx, float(ground.up[2])), set()
     while True:
         rows, whose = _whose(pieces, counts, things)
         todo = []
