@@ -352,10 +352,8 @@ def _ends(w: F4, plane: F8, i: int, beside: U1) -> tuple[int, int]:
     none = np.int32(beside.size)
     first, last = none, np.int32(-1)
     for k in range(beside.size):  # no more than 32 bits, and this vectorises
-        low, high = (
-            (np.int32(k) if beside[k] else none),
-            (np.int32(k) if beside[k] else np.int32(-1)),
-        )
+        low = np.int32(k) if beside[k] else none
+        high = np.int32(k) if beside[k] else np.int32(-1)
         first, last = (low if low < first else first), (high if high > last else last)
     while first <= last and not (beside[first] and _is_in(w, plane, i, first)):
         first += 1

@@ -15,8 +15,8 @@ LOW_M = 0.03
 """Higher things are objects anyway."""
 WINDOW = 20
 """Cells to each side over which the mean is taken: more than a rim is wide, less than a wave."""
-COARSE = 4
-"""The mean is smooth: every so many rows are enough for it."""
+COARSE = 5
+"""The mean is smooth: every so many rows, an odd number that divides the window, are enough."""
 MOST = 0.006
 """Excess above which a cell counts no more in the mean, 1/m, lest it make a pit around it."""
 SLOPE = 0.0016
@@ -132,7 +132,7 @@ def cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4, stack: I4, d
 def subtract_mean(excess: F4, relief: F4) -> None:
     """Write the excess over its mean in a window around each low cell; 0 elsewhere.
 
-    The mean is that of every `COARSE`-th row, for as many rows at a time. The window slides: what
+    The mean is that of every `COARSE`-th row, for as many rows around one. The window slides: what
     enters it is added, what leaves it is taken away, down the rows for the sums of the columns, and
     along a row for those of all its cells.
     """
@@ -141,16 +141,16 @@ def subtract_mean(excess: F4, relief: F4) -> None:
     counts = np.zeros(sums.size, np.float32)
     inside = slice(WINDOW + 1, WINDOW + 1 + columns)
     total, count = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
-    for first in range(-WINDOW, rows, COARSE):
-        entering, leaving = first + WINDOW, first - WINDOW - COARSE
+    for middle in range(-WINDOW, rows + COARSE // 2, COARSE):
+        entering, leaving = middle + WINDOW, middle - WINDOW - COARSE
         if entering < rows:
             _slide(excess[entering], np.float32(1), sums[inside], counts[inside])
         if leaving >= 0:
             _slide(excess[leaving], np.float32(-1), sums[inside], counts[inside])
-        if first < 0:
+        if middle < 0:
             continue
         _add_windows(sums, counts, total, count)
-        for i in range(first, min(first + COARSE, rows)):
+        for i in range(max(middle - COARSE // 2, 0), min(middle + COARSE // 2 + 1, rows)):
             here, out = excess[i], relief[i]
             for j in range(columns):
                 level = here[j] - total[j] / count[j]
