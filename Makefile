@@ -7,7 +7,7 @@ SCREENS := chromium chromium-driver mesa-vulkan-drivers
 DEMO := demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test odd lint format fresh bench model parts lock clean
+.PHONY: help setup demo test odd lint format bench model parts lock clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -48,9 +48,6 @@ lint: setup ## check style and types
 format: setup ## format the code
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix-only .
-
-fresh: ## forget the compiled kernels: they are compiled anew when needed
-	find shapecat -name '*.nb[ci]' -delete
 
 bench: setup ## measure the speed of stages and whole recordings, print tables
 	$(BIN)/python -m benchmarks

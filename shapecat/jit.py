@@ -1,16 +1,20 @@
 """The one place where kernels are compiled.
 
-``@kernel`` is numba's ``njit`` with the settings of the house: the machine code is cached on disk,
-the interpreter lock is released, and division by zero follows IEEE 754 as in numpy.
+``@kernel`` is numba's ``njit`` with the settings of the house: the machine code is cached on disk
+as long as the files of the stage stay as they are, the interpreter lock is released, and division
+by zero follows IEEE 754 as in numpy.
 """
 
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
+from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
 from numba import njit
+from numba.core.caching import FunctionCache
 from numba.core.event import Event, Listener, install_listener
 
 __all__ = ["CompileClock", "compile_clock", "kernel", "unset"]
@@ -19,6 +23,8 @@ _F = TypeVar("_F", bound=Callable[..., Any])
 
 _FAST = {"reassoc", "contract", "arcp", "nsz", "nnan"}
 """Fast-math flags that keep infinities: sums and minima may be vectorised."""
+_SHARED = ("geometry.py", "jit.py", "triangles.py")
+"""Files beside this one whose kernels stages call."""
 
 
 def kernel(
@@ -35,16 +41,36 @@ def kernel(
     """
 
     def compile_later(target: _F) -> Any:
-        return njit(
-            cache=True,
+        compiled = njit(
             nogil=True,
             error_model="numpy",
             fastmath=_FAST if fast else False,
             forceinline=inline,
             _nrt=not leaf,
         )(target)
+        compiled._cache = _StageCache(target)  # noqa: SLF001  as `enable_caching` of numba does
+        return compiled
 
     return compile_later if function is None else compile_later(function)
+
+
+class _StageCache(FunctionCache):  # type: ignore[misc]  # numba has no types
+    """Numba's cache, out of date when any file that a kernel of the stage may be made of changed.
+
+    Numba looks at the file of the outermost kernel alone, but that holds the code of all it calls.
+    """
+
+    def __init__(self, target: Callable[..., Any]) -> None:
+        super().__init__(target)
+        stage = Path(target.__code__.co_filename).parent
+        self._cache_file._source_stamp = _stamp(stage)  # noqa: SLF001  it has no other place
+
+
+@cache
+def _stamp(stage: Path) -> tuple[tuple[str, float, int], ...]:
+    """Return the names, times and sizes of the files of a stage, and of those all may call."""
+    files = {*stage.glob("*.py"), *(Path(__file__).with_name(name) for name in _SHARED)}
+    return tuple((f.name, f.stat().st_mtime, f.stat().st_size) for f in sorted(files))
 
 
 @kernel
