@@ -15,8 +15,6 @@ LOW_M = 0.03
 """Higher things are objects anyway."""
 WINDOW = 20
 """Cells to each side over which the mean is taken: more than a rim is wide, less than a wave."""
-COARSE = 5
-"""The mean is smooth: every so many rows, an odd number that divides the window, are enough."""
 MOST = 0.006
 """Excess above which a cell counts no more in the mean, 1/m, lest it make a pit around it."""
 SLOPE = 0.0016
@@ -132,29 +130,27 @@ def cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4, stack: I4, d
 def subtract_mean(excess: F4, relief: F4) -> None:
     """Write the excess over its mean in a window around each low cell; 0 elsewhere.
 
-    The mean is that of every `COARSE`-th row, for as many rows around one. The window slides: what
-    enters it is added, what leaves it is taken away, down the rows for the sums of the columns, and
-    along a row for those of all its cells.
+    The window slides: what enters it is added, what leaves it is taken away, down the rows for the
+    sums of the columns, and along a row for those of all its cells.
     """
     rows, columns = excess.shape
     sums = np.zeros(columns + 2 * WINDOW + 1, np.float32)
     counts = np.zeros(sums.size, np.float32)
     inside = slice(WINDOW + 1, WINDOW + 1 + columns)
     total, count = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
-    for middle in range(-WINDOW, rows + COARSE // 2, COARSE):
-        entering, leaving = middle + WINDOW, middle - WINDOW - COARSE
+    for i in range(-WINDOW, rows):
+        entering, leaving = i + WINDOW, i - WINDOW - 1
         if entering < rows:
             _slide(excess[entering], np.float32(1), sums[inside], counts[inside])
         if leaving >= 0:
             _slide(excess[leaving], np.float32(-1), sums[inside], counts[inside])
-        if middle < 0:
+        if i < 0:
             continue
         _add_windows(sums, counts, total, count)
-        for i in range(max(middle - COARSE // 2, 0), min(middle + COARSE // 2 + 1, rows)):
-            here, out = excess[i], relief[i]
-            for j in range(columns):
-                level = here[j] - total[j] / count[j]
-                out[j] = level if here[j] != 0 else np.float32(0)
+        here, out = excess[i], relief[i]
+        for j in range(columns):
+            level = here[j] - total[j] / count[j]
+            out[j] = level if here[j] != 0 else np.float32(0)
 
 
 @kernel(leaf=True)
