@@ -43,7 +43,8 @@ def written_commands() -> list[tuple[str, str]]:
     return [
         (page.name, line.split("#")[0].strip())
         for page in PAGES
-        for line in page.read_text("utf-8").splitlines()
+        for block in re.findall(r"```.*?```", page.read_text("utf-8"), re.DOTALL)
+        for line in block.splitlines()
         if re.match(r"^ *shapecat [a-z]", line)
     ]
 
