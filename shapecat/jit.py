@@ -14,8 +14,11 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numba import njit
-from numba.core.caching import FunctionCache
+from numba.core.caching import CompileResultCacheImpl, FunctionCache
+from numba.core.codegen import ll as llvm
+from numba.core.compiler import CompileResult
 from numba.core.event import Event, Listener, install_listener
+from numba.core.runtime import rtsys
 
 __all__ = ["CompileClock", "compile_clock", "kernel", "unset"]
 
@@ -54,16 +57,45 @@ def kernel(
     return compile_later if function is None else compile_later(function)
 
 
-class _StageCache(FunctionCache):  # type: ignore[misc]  # numba has no types
-    """Numba's cache, out of date when any file that a kernel of the stage may be made of changed.
+class _MachineCode(CompileResultCacheImpl):  # type: ignore[misc]  # numba has no types
+    """What is kept of a kernel: machine code, and bitcode for kernels that call it."""
 
-    Numba looks at the file of the outermost kernel alone, but that holds the code of all it calls.
+    def rebuild(self, target_context: Any, payload: Any) -> CompileResult:
+        """Load the machine code, the bitcode when it is asked for: to read it takes far longer."""
+        (name, kind, (code, bitcode)), described, *rest = payload
+        names = {described.llvm_func_name, described.llvm_cpython_wrapper_name}
+        target_context.codegen()._engine._defined_symbols |= names  # noqa: SLF001
+        unread = (name, kind, (code, _no_bitcode()))
+        result = super().rebuild(target_context, (unread, described, *rest))
+        result.library._get_module_for_linking = cache(lambda: llvm.parse_bitcode(bitcode))  # noqa: SLF001
+        return result
+
+
+@cache
+def _no_bitcode() -> bytes:
+    module: bytes = llvm.parse_assembly("").as_bitcode()
+    return module
+
+
+class _StageCache(FunctionCache):  # type: ignore[misc]  # numba has no types
+    """Numba's cache, for stages whose kernels are made of several files, and quick to start.
+
+    It is out of date when any file that a kernel of the stage may be made of changed. Numba looks
+    at the file of the outermost kernel alone, but that holds the code of all it calls.
     """
+
+    _impl_class = _MachineCode
 
     def __init__(self, target: Callable[..., Any]) -> None:
         super().__init__(target)
         stage = Path(target.__code__.co_filename).parent
         self._cache_file._source_stamp = _stamp(stage)  # noqa: SLF001  it has no other place
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """Load machine code without all that compiling needs, which takes numba 0.3 s."""
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
 
 
 @cache

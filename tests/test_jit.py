@@ -36,3 +36,19 @@ def test_an_edit_of_a_called_kernel_counts(tmp_path: Path) -> None:
     assert _run(tmp_path) == "7 1", "nothing was kept"
     (tmp_path / "callee.py").write_text(CALLEE.replace("2 * x", "20 * x"))
     assert _run(tmp_path) == "61 0"
+
+
+def test_a_kernel_from_the_cache_is_compiled_into_another(tmp_path: Path) -> None:
+    """The cache gives machine code at once, but the code to inline only when it is asked for."""
+    stages = [tmp_path / name for name in ("callees", "callers")]
+    for stage in stages:
+        stage.mkdir()
+    (stages[0] / "callee.py").write_text(CALLEE)
+    (stages[0] / "caller.py").write_text(CALLER)
+    _run(stages[0])
+    path = f"import sys; sys.path.insert(0, {str(stages[0])!r})\n"
+    again = path + CALLER + "from callee import twice\nprint(len(twice.stats.cache_hits), twice(5))"
+    (stages[1] / "caller.py").write_text(again)
+
+    assert _run(stages[1]).split() == ["7", "0", "1", "10"]
+    assert _run(stages[1]).split() == ["7", "1", "0", "10"]
