@@ -16,12 +16,14 @@ from shapecat.detection.consensus import (
     without,
 )
 from shapecat.geometry import cross
-from shapecat.jit import kernel
+from shapecat.jit import kernel, unset
 
 __all__ = ["CLEARED", "ON_WALL", "clear_walls"]
 
 ON_WALL, CLEARED = 1, 2
 """Cells on a wall; the former are of a small part, which may be an object the wall goes through."""
+UNSEEN = 3
+"""Cells on a wall whose part is not known yet."""
 
 MOST_WALLS, LEAST_READINGS = 5, 50
 """So many walls are looked for, as long as so many readings are left; this bounds the time."""
@@ -49,12 +51,16 @@ def clear_walls(
     of many objects looks like a wall too, but all its parts are small.
     """
     walls = np.zeros(owner.shape, np.uint8)
-    readings = readings_of(cells.w, owner)
-    for _ in range(MOST_WALLS):
-        triples = triples_of(readings.w.size, rng)
-        readings = _take(cells.w, cells.lens, owner, readings, triples, up, largest_m, walls)
-        if readings.w.size < LEAST_READINGS:
-            break
+    wanted = owner
+    for looks in (MOST_WALLS, 1):
+        readings = readings_of(cells.w, wanted)
+        for _ in range(looks):
+            triples = triples_of(readings.w.size, rng)
+            readings = _take(cells.w, cells.lens, owner, readings, triples, up, largest_m, walls)
+            if readings.w.size < LEAST_READINGS:
+                break
+        # Of a wall behind a table most may be out of the reach of objects, and a corner in it.
+        wanted = ((owner == 0) & (walls == 0)).view(np.int8)
     return walls
 
 
@@ -124,12 +130,13 @@ def _measure(
 def _clear(w: F4, lens: Lens, owner: I4, plane: F8, normal: F8, walls: U1) -> None:
     """Take the connected parts of a wall that are large; others may be objects before it."""
     rows, columns = w.shape
-    stack = np.zeros(w.size, np.int32)
-    found = np.zeros(w.shape, np.uint8)
+    stack = unset(w.size, np.int32)
+    found = unset(w.shape, np.uint8)
+    _mark(w, owner, plane, found)
     total = 0.0
     for si in range(rows):
         for sj in range(columns):
-            if found[si, sj] or not _is_on(w, owner, plane, si, sj):
+            if found[si, sj] != UNSEEN:
                 continue
             stack[0] = si * columns + sj
             found[si, sj] = ON_WALL
@@ -144,12 +151,11 @@ def _clear(w: F4, lens: Lens, owner: I4, plane: F8, normal: F8, walls: U1) -> No
                 for d in range(4):
                     v = i + (1 if d == 0 else -1 if d == 1 else 0)
                     u = j + (1 if d == 2 else -1 if d == 3 else 0)
-                    if v < 0 or u < 0 or v >= rows or u >= columns or found[v, u]:
+                    if v < 0 or u < 0 or v >= rows or u >= columns or found[v, u] != UNSEEN:
                         continue
-                    if _is_on(w, owner, plane, v, u):
-                        found[v, u] = ON_WALL
-                        stack[top] = v * columns + u
-                        top += 1
+                    found[v, u] = ON_WALL
+                    stack[top] = v * columns + u
+                    top += 1
             if area >= LEAST_PART_M2 or (area >= LEAST_PATCH_M2 and off < top * EXACT**2):
                 total += area
                 for t in range(top):
@@ -158,15 +164,19 @@ def _clear(w: F4, lens: Lens, owner: I4, plane: F8, normal: F8, walls: U1) -> No
         return
     np.maximum(walls, found, walls)
     for i in range(rows):
+        owners, states = owner[i], found[i]
         for j in range(columns):
-            owner[i, j] = 0 if found[i, j] == CLEARED else owner[i, j]
+            owners[j] = 0 if states[j] == CLEARED else owners[j]
 
 
 @kernel(leaf=True)
-def _is_on(w: F4, owner: I4, plane: F8, i: int, j: int) -> bool:
-    """Whether a cell that is no part of a level plane lies on a wall."""
-    return bool(
-        owner[i, j] >= 0
-        and w[i, j] > 0
-        and abs(w[i, j] - (plane[0] * j + plane[1] * i + plane[2])) < JUMP
-    )
+def _mark(w: F4, owner: I4, plane: F8, found: U1) -> None:
+    """Mark as unseen the cells on a wall that are no part of a level plane, as 0 the others."""
+    a = np.float32(plane[0])
+    for i in range(w.shape[0]):
+        values, owners, states = w[i], owner[i], found[i]
+        at_row = np.float32(plane[1] * i + plane[2])
+        for j in range(w.shape[1]):
+            off = abs(values[j] - (a * np.float32(j) + at_row))
+            on = (owners[j] >= 0) & (values[j] > 0) & (off < np.float32(JUMP))
+            states[j] = UNSEEN if on else 0
