@@ -80,9 +80,7 @@ def _in_image(
     rng: np.random.Generator,
 ) -> Scene | None:
     cells = cells_of(depth, camera, range_m=settings.max_range_m)
-    found = (
-        None if cells is None else segment(cells, hint, upright=True, settings=settings, rng=rng)
-    )
+    found = None if cells is None else segment(cells, hint, settings=settings, rng=rng)
     if cells is None or found is None:
         return None
     indices = pixels_of(depth, cells, found, range_m=settings.max_range_m)
@@ -110,4 +108,4 @@ def _seen(
     view: View, hint: F8 | None, settings: DetectionSettings, rng: np.random.Generator
 ) -> Segmentation | None:
     turned = None if hint is None else view.view_from_sensor.rotation @ hint
-    return segment(view.cells, turned, upright=False, settings=settings, rng=rng)
+    return segment(view.cells, turned, settings=settings, rng=rng)

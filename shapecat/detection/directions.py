@@ -33,20 +33,18 @@ MOST_DIRECTIONS = 4
 HEIGHT_BINS, LEVEL_BIN_M = 80, 0.04
 LEVELS_APART = 2
 """Bins between two levels."""
-SEVERAL, CLEAR, UPRIGHT = 1.5, 2, 0.25
+SEVERAL, CLEAR, ASLANT = 1.5, 2, 0.55
 """How much it counts that levels are several, by the power of their number; that what faces a
-direction lies in them, by the power of the share; and an upright camera."""
+direction lies in them, by the power of the share; and that the camera looks at them aslant."""
 
 
-def estimate_up(
-    cells: Cells, hint: F8 | None, *, upright: bool, rng: np.random.Generator
-) -> F8 | None:
+def estimate_up(cells: Cells, hint: F8 | None, rng: np.random.Generator) -> F8 | None:
     """Return the normal of the dominant supporting plane, (3,) unit, or None if there is none.
 
     With a ``hint`` only planes within 15 degrees of being perpendicular to it count. Without, the
     direction wins that faces most large levels: the normal of one of the largest planes, or the
-    direction that two walls leave. Where the camera is thought ``upright``, directions that look
-    down count a little less, so that the boards of a shelf beat its back.
+    direction that two walls leave. What the camera looks at head-on counts less, so that the
+    boards of a shelf beat its back. How the camera is turned about its axis makes no difference.
     """
     facets = _facets(cells.w, cells.lens)
     least = max(LEAST_SHARE * facets.shape[1], LEAST_FACETS)
@@ -54,8 +52,7 @@ def estimate_up(
     if not found:
         return None
     corner_cos = CORNER_COS if hint is None else 0.0
-    bias = UPRIGHT if upright else 0.0
-    up = _dominant(cells.w, cells.lens, facets, np.array(found), least, corner_cos, bias)
+    up = _dominant(cells.w, cells.lens, facets, np.array(found), least, corner_cos)
     return np.asarray(up)
 
 
@@ -147,20 +144,17 @@ def _mean_near(normals: F4, direction: F8) -> int:
 
 
 @kernel
-def _dominant(
-    w: F4, lens: Lens, facets: F4, found: F8, least: float, corner_cos: float, bias: float
-) -> F8:
+def _dominant(w: F4, lens: Lens, facets: F4, found: F8, least: float, corner_cos: float) -> F8:
     """Return the exact normal of the largest plane that faces the best direction, (3,).
 
     Parameters
     ----------
     found : (n, 3) directions that surfaces face, at least one.
     corner_cos : two of them with a smaller cosine may be walls; 0 for none.
-    bias : how much an upright camera counts.
     """
     best, most = found[0], -1.0
     for k in range(len(found)):
-        merit = _merit(facets, found[k], least, bias)
+        merit = _merit(facets, found[k], least)
         if merit > most:
             best, most = found[k], merit
     for k in range(len(found)):
@@ -171,7 +165,7 @@ def _dominant(
             corner = cross(found[k], found[m])
             corner /= math.sqrt(cosine(corner, corner))
             for direction in (corner, -corner):
-                merit = _merit(facets, direction, least, bias)
+                merit = _merit(facets, direction, least)
                 if merit > most:
                     best, most = direction, merit
     up: F8 = _settled(w, lens, facets, best)
@@ -179,7 +173,7 @@ def _dominant(
 
 
 @kernel
-def _merit(facets: F4, direction: F8, least: float, bias: float) -> float:
+def _merit(facets: F4, direction: F8, least: float) -> float:
     """Return how well a direction explains the surface: what of it lies in large levels."""
     count = _count_levels(facets, direction)
     level, squares = _large_levels(count, least)
@@ -188,9 +182,9 @@ def _merit(facets: F4, direction: F8, least: float, bias: float) -> float:
     # The boards of a shelf are several, its back is one; what stands before a wall makes it several
     # as well, but these are unlike in size, and much of what faces as it does lies in none.
     levels, clear = level**2 / squares, level / np.sum(count)
-    # Cameras look down at tables: +y is down in the optical frame.
-    tilt = min(max(-direction[1] / 0.2, -1.0), 1.0)
-    return float(level * levels**SEVERAL * clear**CLEAR * (1.0 + bias * tilt))
+    # A camera that looks down at a board sees it aslant, and rather the wall behind it head-on.
+    aslant = 1 - ASLANT * direction[2] ** 2
+    return float(level * levels**SEVERAL * clear**CLEAR * aslant)
 
 
 @kernel

@@ -120,13 +120,12 @@ def segment(
     cells: Cells,
     hint: F8 | None,
     *,
-    upright: bool,
     settings: DetectionSettings,
     rng: np.random.Generator,
 ) -> Segmentation | None:
     """Find planes and objects among ``cells``; None if there is no supporting plane."""
     rules, limits = _rules_of(settings.rules), _limits_of(settings)
-    supports, ground = _ground(cells, hint, rules, limits, rng, upright=upright)
+    supports, ground = _ground(cells, hint, rules, limits, rng)
     if ground is None:
         return None
     labels, filled, pieces, leaders, owners = _objects(cells, ground, rules, limits, trees())
@@ -136,9 +135,9 @@ def segment(
 def part(
     cells: Cells, *, settings: DetectionSettings, rng: np.random.Generator
 ) -> tuple[Ground, Parted] | None:
-    """Find planes and the pieces of objects in an upright view; None if no plane bears anything."""
+    """Find planes and the pieces of objects; None if no plane bears anything."""
     rules, limits = _rules_of(settings.rules), _limits_of(settings)
-    _, ground = _ground(cells, None, rules, limits, rng, upright=True)
+    _, ground = _ground(cells, None, rules, limits, rng)
     return None if ground is None else (ground, _part(cells, ground, rules, limits))
 
 
@@ -161,10 +160,8 @@ def _ground(
     rules: Rules,
     limits: Limits,
     rng: np.random.Generator,
-    *,
-    upright: bool,
 ) -> tuple[list[Support], Ground | None]:
-    up = estimate_up(cells, hint, upright=upright, rng=rng)
+    up = estimate_up(cells, hint, rng)
     supports = [] if up is None else boards_of(cells, find_levels(cells, up, rng))
     if not supports:
         return supports, None
