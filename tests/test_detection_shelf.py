@@ -34,6 +34,11 @@ def test_wall_beyond_the_floor_is_no_object(seed: int) -> None:
     assert seen("empty", seed)[1] == []
 
 
+def test_corner_of_a_wall_beside_the_table_is_no_object() -> None:
+    """Most of the wall is behind the table, higher above the floor than objects are looked for."""
+    assert seen("empty", 410029)[1] == []
+
+
 @pytest.mark.parametrize("seed", [313, 336, 581])
 def test_side_of_a_shelf_seen_edge_on_is_no_object(seed: int) -> None:
     """Too narrow in the image to be fitted as a wall, and cut off by a board or the border."""
@@ -170,3 +175,30 @@ def test_strip_of_floor_beside_a_table_is_a_plane(seed: int) -> None:
     planes = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0)).planes
     table = max(support.height for support in world.supports if support.level)
     np.testing.assert_allclose([p.height_m for p in planes], [0, table], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed", "quarters"),
+    [("clutter", 25, 2), ("shelf", 135, 0), ("shelf", 135, 1), ("shelf", 1374, 2)],
+)
+def test_wall_is_no_table_however_the_camera_is_turned(
+    kind: SceneKind, seed: int, quarters: int
+) -> None:
+    """More is seen of the wall or of the back of the shelf than of what bears objects."""
+    rng = np.random.default_rng(seed)
+    world = make_scene(kind, rng, frames=1)
+    frame, _ = render_frame(world, 0, rng=rng, sensor=KINECT)
+    assert frame.depth is not None
+    assert frame.camera is not None
+    depth, camera = np.rot90(frame.depth, quarters), frame.camera
+    up = inverse(world.path[0]).rotation[:, 2]
+    for _ in range(quarters):
+        camera = Camera(
+            camera.height, camera.width, camera.fy, camera.fx,
+            camera.cy, camera.width - 1 - camera.cx,
+        )  # fmt: skip
+        up = np.array([up[1], -up[0], up[2]])
+    turned = Frame("turned", 0, 0, 0, "c", depth=np.ascontiguousarray(depth), camera=camera)
+    scene = detect(turned, settings=DetectionSettings(), rng=np.random.default_rng(0))
+
+    assert scene.planes[0].normal @ up > 0.99
