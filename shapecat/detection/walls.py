@@ -25,8 +25,9 @@ ON_WALL, CLEARED = 1, 2
 UNSEEN = 3
 """Cells on a wall whose part is not known yet."""
 
-MOST_WALLS, LEAST_READINGS = 5, 50
-"""So many walls are looked for, as long as so many readings are left; this bounds the time."""
+MOST_WALLS, MOST_BEYOND, LEAST_READINGS = 5, 1, 50
+"""So many walls are looked for where objects may be, and beyond, as long as so many readings are
+left; this bounds the time."""
 VERTICAL_COS = 0.2
 """Largest cosine between up and the normal of a wall."""
 LEAST_AREA_M2, LEAST_PART_M2, LEAST_WALL_M2 = 0.05, 0.04, 0.1
@@ -51,16 +52,18 @@ def clear_walls(
     of many objects looks like a wall too, but all its parts are small.
     """
     walls = np.zeros(owner.shape, np.uint8)
-    wanted = owner
-    for looks in (MOST_WALLS, 1):
+
+    def take(wanted: I4, most: int) -> None:
         readings = readings_of(cells.w, wanted)
-        for _ in range(looks):
+        for _ in range(most):
             triples = triples_of(readings.w.size, rng)
             readings = _take(cells.w, cells.lens, owner, readings, triples, up, largest_m, walls)
             if readings.w.size < LEAST_READINGS:
                 break
-        # Of a wall behind a table most may be out of the reach of objects, and a corner in it.
-        wanted = ((owner == 0) & (walls == 0)).view(np.int8)
+
+    take(owner, MOST_WALLS)
+    # Of a wall behind a table most may be out of the reach of objects, and a corner in it.
+    take(((owner == 0) & (walls == 0)).view(np.int8), MOST_BEYOND)
     return walls
 
 
