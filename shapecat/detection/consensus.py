@@ -27,7 +27,8 @@ __all__ = [
 
 TOLERANCE = 0.01
 """Distance of an inlier from a plane in inverse depth, 1/m: three steps of a Kinect."""
-TRIALS = 240
+TRIALS, BLOCK = 240, 256
+"""Planes that are tried, and after how many readings it is asked if one can still win."""
 LEAST_DOUBLE_AREA = 30.0
 """Of the triangle of three readings, in cells squared: smaller ones are mostly noise."""
 SAMPLE = 4800
@@ -176,7 +177,7 @@ def consensus(
         if not ((along >= cosines[0] * norm) & (along <= cosines[1] * norm)):
             continue
         # (2) all vote
-        votes = count_near(readings, a, b, c, tolerance)
+        votes = _votes(readings, a, b, c, tolerance, most)
         if votes > most:
             most = votes
             best[0], best[1], best[2] = a, b, c
@@ -185,6 +186,19 @@ def consensus(
         refit(readings.j, readings.i, readings.w, tolerance, best)
     votes = count_near(readings, best[0], best[1], best[2], tolerance) if most >= 3 else 0
     return best, votes
+
+
+@kernel
+def _votes(readings: Readings, a: float, b: float, c: float, tolerance: float, most: int) -> int:
+    """Count the readings near a plane as long as there may be over ``most``."""
+    j, i, w, share = readings
+    votes = 0
+    for start in range(0, w.size, BLOCK):
+        if votes + w.size - start <= most:
+            break
+        some = slice(start, start + BLOCK)
+        votes += count_near(Readings(j[some], i[some], w[some], share), a, b, c, tolerance)
+    return votes
 
 
 @kernel(fast=True)

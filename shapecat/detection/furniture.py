@@ -172,9 +172,13 @@ def _count_leaving(field: Field, counts: I4) -> None:
     out = np.zeros(columns, np.bool_)
     for i in range(rows):
         first, end = field.spans[i]
+        some = False
         for j in range(first, end):
-            if field.walls[i, j] == ON_WALL:
-                counts[ON, regions[i, j]] += 1
+            some |= field.walls[i, j] == ON_WALL  # few rows have any, and this vectorises
+        if some:
+            for j in range(first, end):
+                if field.walls[i, j] == ON_WALL:
+                    counts[ON, regions[i, j]] += 1
         first, end = max(first, 1), min(end, columns - 1)
         if i == 0 or i == rows - 1 or not _find_out(owner, regions, i, first, end, out):
             continue

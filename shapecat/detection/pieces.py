@@ -142,7 +142,11 @@ def _measure(
     shape[:, RIGHTMOST] = -1e9
     shape[:, TOP] = -1e9
     shape[:, BOTTOM] = 1e9
-    per_x, per_y = 1 / lens.fx, 1 / lens.fy
+    zero, one, far_off = np.float32(0), np.float32(1), np.float32(np.inf)
+    per_x, per_y = np.float32(1 / lens.fx), np.float32(1 / lens.fy)
+    cx, cy, edge_on = np.float32(lens.cx), np.float32(lens.cy), np.float32(0.2)
+    sx, sy, sz = np.float32(side[0]), np.float32(side[1]), np.float32(side[2])
+    ux, uy, uz = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])
     tangent, normal, spans = surfaces.tangent, surfaces.normal, surfaces.spans
     for i in range(w.shape[0]):
         j, end = spans[i]
@@ -152,30 +156,30 @@ def _measure(
                 j += 1
                 continue
             # Sums over the cells of one piece that follow each other.
-            far = fitted = sides = sides2 = turns = turns2 = both = areas = 0.0
-            left, right, bottom, top = np.inf, -np.inf, np.inf, -np.inf
+            far = fitted = sides = sides2 = turns = turns2 = both = areas = zero
+            left, right, bottom, top = far_off, -far_off, far_off, -far_off
             while j < end and labels[i, j] == p:
-                z = 1 / w[i, j]
-                x, y = (j - lens.cx) * per_x * z, (i - lens.cy) * per_y * z
-                along = x * side[0] + y * side[1] + z * side[2]
+                z = one / w[i, j]
+                x, y = (np.float32(j) - cx) * per_x * z, (np.float32(i) - cy) * per_y * z
+                along = x * sx + y * sy + z * sz
                 h = height[i, j]
                 far += z
                 left, right = min(left, along), max(right, along)
                 bottom, top = min(bottom, h), max(top, h)
                 if tangent[i, 0, j] > 0:
                     nx, ny, nz = normal[i, 0, j], normal[i, 1, j], normal[i, 2, j]
-                    turn = nx * side[0] + ny * side[1] + nz * side[2]
-                    fitted += 1
+                    turn = nx * sx + ny * sy + nz * sz
+                    fitted += one
                     sides += along
                     sides2 += along * along
                     turns += turn
                     turns2 += turn * turn
                     both += along * turn
                     facing = -(nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
-                    area = z * z * per_x * per_y / max(facing, 0.2)
+                    area = z * z * per_x * per_y / max(facing, edge_on)
                     areas += area
-                    if nx * up[0] + ny * up[1] + nz * up[2] > UPWARD:
-                        band = min(max(int(h / BAND_M), 0), BANDS - 1)
+                    if nx * ux + ny * uy + nz * uz > np.float32(UPWARD):
+                        band = min(max(int(h / np.float32(BAND_M)), 0), BANDS - 1)
                         lid[p, band] += area
                 j += 1
             owners[p] = owner[i, first]

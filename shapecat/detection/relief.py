@@ -13,7 +13,14 @@ from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import JUMP, Cells, place_of
 from shapecat.detection.heights import Heights
 from shapecat.detection.hulls import fill_hull
-from shapecat.detection.waves import APART, cut_feet, excess_of, noise_of, subtract_mean
+from shapecat.detection.waves import (
+    APART,
+    EVERY,
+    cut_feet,
+    excess_of,
+    noise_of,
+    subtract_mean,
+)
 from shapecat.jit import kernel, unset
 
 __all__ = ["raise_low"]
@@ -84,7 +91,7 @@ def raise_low(cells: Cells, heights: Heights, planes: F8, raised: I4, largest_m:
     """
     w, owner, height = cells.w, heights.owner, heights.height
     widest = largest_m * cells.lens.fx
-    excess, relief = unset(w.shape, np.float32), unset(w.shape, np.float32)
+    images = unset((2, *w.shape), np.float32)
     room = Room(
         np.zeros(w.shape, np.int32),
         np.zeros(w.shape, np.int32),
@@ -93,18 +100,46 @@ def raise_low(cells: Cells, heights: Heights, planes: F8, raised: I4, largest_m:
     )
     objects = parts = np.int64(0)  # a literal would be compiled apart
     for k in range(len(planes)):
-        number = k + 1
-        if excess_of(w, owner, height, planes[k], number, excess) < LEAST_CELLS:
+        number, plane = k + 1, planes[k].copy()
+        start, end = _rows_of(owner, number)
+        if start == end:
             continue
-        cut_feet(w, owner, height, number, excess, room.seeds, room.stack.view(np.float32))
+        plane[2] += start * plane[1]  # rows count from ``start`` from here on
+        rows = slice(start, end)
+        values, owners, above, marks = w[rows], owner[rows], height[rows], raised[rows]
+        excess, relief = images[0, rows], images[1, rows]
+        if excess_of(values, owners, above, plane, number, excess) < LEAST_CELLS:
+            continue
+        cut_feet(values, owners, above, number, excess, room.seeds, room.stack.view(np.float32))
         subtract_mean(excess, relief)
-        clear = max(STEP, STEADY * noise_of(relief, owner, number))
-        step = max(clear, SLIP * math.hypot(planes[k, 0], planes[k, 1]))
+        clear = max(STEP, STEADY * noise_of(relief, owners, number))
+        step = max(clear, SLIP * math.hypot(plane[0], plane[1]))
         least = np.float32(min(clear, FINE))
         objects, parts = _raise(
-            w, relief, owner, number, step, least, raised, widest, objects, parts, room
+            values, relief, owners, number, step, least, marks, widest, objects, parts, room
         )
-        parts = _lower(w, excess, owner, number, step, raised, parts, room)
+        parts = _lower(values, excess, owners, number, step, marks, parts, room)
+
+
+@kernel(leaf=True)
+def _rows_of(owner: I4, number: int) -> tuple[int, int]:
+    """Return the rows from which on and before which the cells of a plane are, with a margin.
+
+    They are the same if there is none. What is looked at around a cell lies within the margin.
+    """
+    rows = owner.shape[0]
+    above, on = np.int8(number), np.int8(-number)
+    start, end = rows, 0
+    for i in range(rows):
+        some = False
+        for j in range(owner.shape[1]):
+            some |= (owner[i, j] == above) | (owner[i, j] == on)
+        if some:
+            start, end = min(start, i), i + 1
+    if end == 0:
+        return 0, 0
+    start = max(start - APART, 0)
+    return start - start % EVERY, min(end + APART, rows)  # noise is measured on the same rows
 
 
 @kernel
@@ -174,13 +209,13 @@ def _find_seeds(relief: F4, least: float, seeds: I4) -> int:
     for i in range(1, rows):
         for start in range(1, columns, BLOCK):
             end = min(start + BLOCK, columns)
-            here = relief[i, start:end]
+            here, above = relief[i, start:end], relief[i - 1, start:end]
+            before = relief[i, start - 1 : end - 1]
             some = False
             for k in range(here.size):
-                some |= here[k] > least
+                some |= (here[k] > least) & (here[k] > before[k]) & (here[k] > above[k])
             if not some:
                 continue
-            before, above = relief[i, start - 1 : end], relief[i - 1, start:end]
             for k in range(here.size):
                 seeds[n] = i * columns + start + k
                 n += int((here[k] > least) & (here[k] > before[k]) & (here[k] > above[k]))

@@ -9,7 +9,7 @@ from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import JUMP
 from shapecat.jit import kernel
 
-__all__ = ["APART", "cut_feet", "excess_of", "noise_of", "subtract_mean"]
+__all__ = ["APART", "EVERY", "cut_feet", "excess_of", "noise_of", "subtract_mean"]
 
 LOW_M = 0.03
 """Higher things are objects anyway."""
@@ -17,6 +17,8 @@ WINDOW = 20
 """Cells to each side over which the mean is taken: more than a rim is wide, less than a wave."""
 MOST = 0.006
 """Excess above which a cell counts no more in the mean, 1/m, lest it make a pit around it."""
+STEPS = 2**20
+"""Steps to 1/m of the sums, no more for a window of readings 1/m below the plane to fit 32 bits."""
 SLOPE = 0.0016
 """Fall per cell of the side of something, 1/m."""
 APART = 5
@@ -131,50 +133,58 @@ def subtract_mean(excess: F4, relief: F4) -> None:
     """Write the excess over its mean in a window around each low cell; 0 elsewhere.
 
     The window slides: what enters it is added, what leaves it is taken away, down the rows for the
-    sums of the columns, and along a row for those of all its cells.
+    sums of the columns, and along a row for those of all its cells. Sums are of integers, which
+    take a quarter of the time of others in a row, and are exact.
     """
     rows, columns = excess.shape
-    sums = np.zeros(columns + 2 * WINDOW + 1, np.float32)
-    counts = np.zeros(sums.size, np.float32)
+    sums = np.zeros(columns + 2 * WINDOW + 1, np.int32)
+    counts = np.zeros(sums.size, np.int32)
     inside = slice(WINDOW + 1, WINDOW + 1 + columns)
-    total, count = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
+    total, count = np.zeros(columns, np.int32), np.zeros(columns, np.int32)
+    unit, zero = np.float32(1 / STEPS), np.float32(0)
     for i in range(-WINDOW, rows):
         entering, leaving = i + WINDOW, i - WINDOW - 1
         if entering < rows:
-            _slide(excess[entering], np.float32(1), sums[inside], counts[inside])
+            _slide(excess[entering], np.int32(1), sums[inside], counts[inside])
         if leaving >= 0:
-            _slide(excess[leaving], np.float32(-1), sums[inside], counts[inside])
+            _slide(excess[leaving], np.int32(-1), sums[inside], counts[inside])
         if i < 0:
             continue
-        _add_windows(sums, counts, total, count)
         here, out = excess[i], relief[i]
+        some = False
         for j in range(columns):
-            level = here[j] - total[j] / count[j]
-            out[j] = level if here[j] != 0 else np.float32(0)
+            some |= here[j] != zero
+        if not some:
+            out[:] = zero
+            continue
+        _add_windows(sums, counts, total, count)
+        for j in range(columns):
+            level = here[j] - unit * np.float32(total[j]) / np.float32(count[j])
+            out[j] = level if here[j] != zero else zero
 
 
 @kernel(leaf=True)
-def _slide(row: F4, sign: float, sums: F4, counts: F4) -> None:
+def _slide(row: F4, sign: int, sums: I4, counts: I4) -> None:
     """Add a row to the sums of the columns, or take it away."""
-    zero, one, most = np.float32(0), np.float32(1), np.float32(MOST)
+    steps, most, least = np.float32(STEPS), np.float32(MOST), np.float32(-1)
     for j in range(row.size):
-        value = row[j]
-        sums[j] += sign * (value if value < most else most)
-        counts[j] += sign * (one if value != zero else zero)
+        value = row[j] if row[j] < most else most
+        sums[j] += sign * np.int32(steps * (value if value > least else least))
+        counts[j] += sign * np.int32(row[j] != 0)
 
 
 @kernel(leaf=True)
-def _add_windows(sums: F4, counts: F4, total: F4, count: F4) -> None:
+def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
     """Write the sums over the window around each column, and the counts, at least 1."""
-    width, one = 2 * WINDOW + 1, np.float32(1)
-    window = number = np.float32(0)
+    width = 2 * WINDOW + 1
+    window = number = np.int32(0)
     for j in range(width):
         window += sums[j]
         number += counts[j]
     for j in range(total.size):
         window += sums[j + width] - sums[j]
         number += counts[j + width] - counts[j]
-        total[j], count[j] = window, number if number > one else one
+        total[j], count[j] = window, max(number, 1)
 
 
 @kernel
