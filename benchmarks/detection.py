@@ -16,6 +16,8 @@ from shapecat.config import Settings
 from shapecat.detection import detect
 from shapecat.types import Frame
 
+ROUNDS = 4
+"""The pace of a machine changes within seconds: every method takes its turn so often."""
 PCL = ("segmentation", "features", "filters", "sample_consensus", "search", "kdtree", "common")
 
 
@@ -26,38 +28,43 @@ def run(count: int) -> tuple[str, dict[str, Any]]:
         "real tables": list(real_tables(every=max(1, 45 // count))),
     }
     rows, figures = [], {}
-    for name, frames in sets.items():
-        if not frames:
-            continue
-        timed = _time_all(frames)
-        own = timed["shapecat"]["median"]
-        figures[name] = timed
-        rows += [
-            (name, method, len(frames), t["median"], t["p95"], f"{t['median'] / own:.1f}")
-            for method, t in timed.items()
-        ]
+    with tempfile.TemporaryDirectory() as folder:
+        program = _build_pcl(Path(folder))
+        for name, frames in sets.items():
+            if not frames:
+                continue
+            timed = _time_all(frames, program)
+            own = timed["shapecat"]["median"]
+            figures[name] = timed
+            rows += [
+                (name, method, len(frames), t["median"], t["p95"], f"{t['median'] / own:.1f}")
+                for method, t in timed.items()
+            ]
     columns = ("frames", "method", "n", "ms, median", "ms, p95", "ratio")
     return markdown("Detection, CPU time per 640×480 frame", columns, rows), figures
 
 
-def _time_all(frames: list[Frame]) -> dict[str, dict[str, float]]:
+def _time_all(frames: list[Frame], program: Path | None) -> dict[str, dict[str, float]]:
+    """Time every method on every frame in rounds; the best of each frame counts."""
     settings = Settings().detection
     ups = [detect(f, settings=settings, rng=np.random.default_rng(0)).up for f in frames]
+    loose = [_unorganized(frame) for frame in frames]
+    clouds = None if program is None else _write_clouds(program.with_name("clouds"), frames, ups)
 
     def own(frame: Frame) -> Any:
         return lambda: detect(frame, settings=settings, rng=np.random.default_rng(0))
 
-    loose = [_unorganized(frame) for frame in frames]
-    timed = {
-        "shapecat": summary([cpu_ms(own(frame)) for frame in frames]),
-        "shapecat, unorganized": summary([cpu_ms(own(frame), 2) for frame in loose]),
-    }
-    opened = _time_open3d(frames, ups)
-    if opened:
-        timed["Open3D"] = summary(opened)
-    for method, values in _time_pcl(frames, ups).items():
-        timed[f"PCL {method}"] = summary(values)
-    return timed
+    best: dict[str, list[float]] = {}
+    for _ in range(ROUNDS):
+        turn = {
+            "shapecat": [cpu_ms(own(frame), 2) for frame in frames],
+            "shapecat, unorganized": [cpu_ms(own(frame), 2) for frame in loose],
+            "Open3D": _time_open3d(frames, ups),
+            **(_time_pcl(program, clouds) if program and clouds else {}),
+        }
+        for method, values in turn.items():
+            best[method] = list(map(min, best.get(method, values), values))
+    return {method: summary(values) for method, values in best.items() if values}
 
 
 def _unorganized(frame: Frame) -> Frame:
@@ -90,12 +97,12 @@ def _time_open3d(frames: list[Frame], ups: list[Any]) -> list[float]:
     for frame, up in zip(frames, ups, strict=True):
         points = frame.xyz().astype(np.float64)
         points = points[np.isfinite(points[:, 2])]
-        result.append(cpu_ms(partial(work, points, up), 2))
+        result.append(cpu_ms(partial(work, points, up), 1))
     return result
 
 
-def _time_pcl(frames: list[Frame], ups: list[Any]) -> dict[str, list[float]]:
-    """Build the PCL program where PCL is installed, and run it on one core."""
+def _build_pcl(folder: Path) -> Path | None:
+    """Build the PCL program where PCL is installed."""
     compiler = shutil.which("g++")
     flags = subprocess.run(
         ["pkg-config", "--cflags-only-I", "pcl_segmentation"],
@@ -105,27 +112,36 @@ def _time_pcl(frames: list[Frame], ups: list[Any]) -> dict[str, list[float]]:
     )
     if compiler is None or flags.returncode != 0:
         sys.stderr.write("PCL is not installed (apt-get install libpcl-dev): left out\n")
-        return {}
-    with tempfile.TemporaryDirectory() as folder:
-        program, clouds = Path(folder) / "pcl_detection", Path(folder) / "clouds"
-        source = Path(__file__).with_name("pcl_detection.cpp")
-        libraries = [f"-lpcl_{name}" for name in PCL]
-        # Not -march=native: it changes the alignment of Eigen's types against the packaged PCL.
-        command = [compiler, "-O3", "-mtune=native", "-std=c++17", "-w", str(source)]
-        subprocess.run(
-            [*command, "-o", str(program), *flags.stdout.split(), *libraries, "-llz4"], check=True
-        )
-        with clouds.open("wb") as file:
-            for frame, up in zip(frames, ups, strict=True):
-                height, width = frame.depth.shape if frame.depth is not None else (1, 0)
-                file.write(np.array([width, height], np.int32).tobytes())
-                file.write(np.asarray(up, np.float32).tobytes())
-                file.write(frame.xyz().tobytes())
-        done = subprocess.run(
-            [str(program), str(clouds), "2"], capture_output=True, text=True, check=True
-        )
+        return None
+    program = folder / "pcl_detection"
+    source = Path(__file__).with_name("pcl_detection.cpp")
+    libraries = [f"-lpcl_{name}" for name in PCL]
+    # Not -march=native: it changes the alignment of Eigen's types against the packaged PCL.
+    command = [compiler, "-O3", "-mtune=native", "-std=c++17", "-w", str(source)]
+    subprocess.run(
+        [*command, "-o", str(program), *flags.stdout.split(), *libraries, "-llz4"], check=True
+    )
+    return program
+
+
+def _write_clouds(path: Path, frames: list[Frame], ups: list[Any]) -> Path:
+    """Write the frames as the PCL program reads them."""
+    with path.open("wb") as file:
+        for frame, up in zip(frames, ups, strict=True):
+            height, width = frame.depth.shape if frame.depth is not None else (1, 0)
+            file.write(np.array([width, height], np.int32).tobytes())
+            file.write(np.asarray(up, np.float32).tobytes())
+            file.write(frame.xyz().tobytes())
+    return path
+
+
+def _time_pcl(program: Path, clouds: Path) -> dict[str, list[float]]:
+    """Run the PCL program, on one core."""
+    done = subprocess.run(
+        [str(program), str(clouds), "2"], capture_output=True, text=True, check=True
+    )
     result: dict[str, list[float]] = {}
     for line in done.stdout.splitlines():
         method, _, milliseconds, _ = line.split()
-        result.setdefault(method.replace("_", ", "), []).append(float(milliseconds))
+        result.setdefault(f"PCL {method.replace('_', ', ')}", []).append(float(milliseconds))
     return result
