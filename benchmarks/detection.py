@@ -16,7 +16,7 @@ from shapecat.config import Settings
 from shapecat.detection import detect
 from shapecat.types import Frame
 
-ROUNDS = 4
+ROUNDS = 8
 """The pace of a machine changes within seconds: every method takes its turn so often."""
 PCL = ("segmentation", "features", "filters", "sample_consensus", "search", "kdtree", "common")
 
@@ -57,8 +57,8 @@ def _time_all(frames: list[Frame], program: Path | None) -> dict[str, dict[str, 
     best: dict[str, list[float]] = {}
     for _ in range(ROUNDS):
         turn = {
-            "shapecat": [cpu_ms(own(frame), 2) for frame in frames],
-            "shapecat, unorganized": [cpu_ms(own(frame), 2) for frame in loose],
+            "shapecat": [cpu_ms(own(frame), 1) for frame in frames],
+            "shapecat, unorganized": [cpu_ms(own(frame), 1) for frame in loose],
             "Open3D": _time_open3d(frames, ups),
             **(_time_pcl(program, clouds) if program and clouds else {}),
         }
@@ -138,7 +138,7 @@ def _write_clouds(path: Path, frames: list[Frame], ups: list[Any]) -> Path:
 def _time_pcl(program: Path, clouds: Path) -> dict[str, list[float]]:
     """Run the PCL program, on one core."""
     done = subprocess.run(
-        [str(program), str(clouds), "2"], capture_output=True, text=True, check=True
+        [str(program), str(clouds), "1"], capture_output=True, text=True, check=True
     )
     result: dict[str, list[float]] = {}
     for line in done.stdout.splitlines():
