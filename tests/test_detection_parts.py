@@ -56,7 +56,7 @@ def test_without_the_trees_objects_stay_in_pieces(seed: int) -> None:
     frame, seen = render_frame(world, 0, rng=rng, sensor=KINECT)
     labels = [thing.label for thing in world.things if np.count_nonzero(seen == thing.label) > 400]
     found = []
-    for rules in ("low concave ledge axis small", "low concave ledge axis small parts"):
+    for rules in ("low concave ledge axis step small", "low concave ledge axis step small parts"):
         settings = DetectionSettings(rules=rules)
         scene = detect(frame, settings=settings, rng=np.random.default_rng(0))
         found.append(np.mean(np.array(overlaps(scene, seen, labels)) > 0.75))

@@ -176,6 +176,44 @@ def test_ball_on_a_can_whose_foot_is_hidden() -> None:
     check([*shapes, box((0, -0.1, 0), (0.2, 0.03, 0.05))], [1, 2, 3], tilt_deg=20)
 
 
+UNJOINED = "low concave ledge axis step small"
+"""The rules that part objects, without those that join parts of one again."""
+
+
+def parted(shapes: list[Shape], rules: str) -> list[float]:
+    """Return how well all but the first shape are found with some of the rules."""
+    depth, seen = render(shapes)
+    scene = detect(
+        frame_of(depth), settings=DetectionSettings(rules=rules), rng=np.random.default_rng(0)
+    )
+    return overlaps(scene, seen, list(range(1, len(shapes))))
+
+
+@pytest.mark.parametrize("upper", [0.16, 0.05])
+def test_boxes_with_flush_fronts_are_parted_where_the_outline_steps(upper: float) -> None:
+    """No edge parts them; what is wider above shows no ledge either."""
+    boxes = [box((0, 0, 0), (0.1, 0.06, 0.1)), box((0, 0, 0.1), (upper, 0.06, 0.08))]
+    shapes = [table(), *boxes]
+    assert min(parted(shapes, UNJOINED)) > 0.85
+    assert min(parted(shapes, UNJOINED.replace("step ", "").replace("ledge ", ""))) < 0.8
+
+
+@pytest.mark.parametrize(("seed", "label"), [(1076, 20), (1086, 20), (1141, 21), (1310, 20)])
+def test_stack_without_an_edge_in_clutter(seed: int, label: int) -> None:
+    """Only the outline tells where one object ends."""
+    assert overlap_in_clutter(seed, [label]) > 0.6
+
+
+def test_outline_that_something_nearer_cuts_off_is_no_step() -> None:
+    """Of the box behind the lower half is hidden on one side."""
+    shapes = [
+        table(),
+        box((0, 0.1, 0), (0.16, 0.06, 0.2)),
+        box((-0.06, -0.05, 0), (0.1, 0.05, 0.07)),
+    ]
+    assert min(parted(shapes, UNJOINED)) > 0.85
+
+
 @pytest.mark.parametrize("tilt_deg", [30, 40])
 def test_plate_that_juts_out_over_a_can_is_parted_from_it(tilt_deg: float) -> None:
     """The tangent planes about its edge take the step for a slope.
@@ -184,7 +222,7 @@ def test_plate_that_juts_out_over_a_can_is_parted_from_it(tilt_deg: float) -> No
     """
     shapes = [table(), can(0, 0, 0, 0.038, 0.06), can(0, 0, 0.06, 0.05, 0.012)]
     depth, seen = render(shapes, tilt_deg=tilt_deg)
-    parted = DetectionSettings(rules="low concave ledge axis small occluder feet fill")
+    parted = DetectionSettings(rules="low concave ledge axis step small occluder feet fill")
     scene = detect(frame_of(depth), settings=parted, rng=np.random.default_rng(0))
     assert len(scene.candidates) == 2
     assert min(overlaps(scene, seen, [1, 2])) > 0.8

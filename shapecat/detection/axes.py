@@ -12,7 +12,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.cells import Cells
 from shapecat.detection.heights import Heights
-from shapecat.detection.pieces import BAND_M, BANDS, COUNT, Pieces, side_of
+from shapecat.detection.pieces import BAND_M, BANDS, COUNT, Pieces, is_cut, note_cut, side_of
 from shapecat.detection.regions import cut_above
 from shapecat.detection.surfaces import Surfaces
 from shapecat.detection.traits import slope_of
@@ -63,6 +63,7 @@ def cut_at_axes(
             n += 1
             level = (band + 0.5) * BAND_M
             cut_above(labels, surfaces.spans, heights.height, rest, level, n)
+            note_cut(pieces, p)
             rest = n  # what this cut has left
     return n
 
@@ -88,19 +89,15 @@ def _cuts_of(bands: F8) -> Bool:
 
 @kernel
 def _number_rounded(pieces: Pieces, labels: int) -> I4:
-    """Return a number from 1 on for each of the labels that may be round, 0 for the others.
-
-    What has just been cut off at a ledge has no statistics yet, and may be one.
-    """
+    """Return a number from 1 on for each of the labels that may be round, 0 for the others."""
     numbers = np.zeros(labels, np.int64)
     n = 0
     for p in range(1, labels):
-        if p < pieces.group.size:
-            row = pieces.shape[p]
-            if row[COUNT] < 2 * LEAST_CELLS or slope_of(row) <= ROUND:
-                continue
-        n += 1
-        numbers[p] = n
+        if is_cut(pieces, p) or (
+            pieces.shape[p, COUNT] >= 2 * LEAST_CELLS and slope_of(pieces.shape[p]) > ROUND
+        ):
+            n += 1
+            numbers[p] = n
     return numbers
 
 

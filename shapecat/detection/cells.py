@@ -20,7 +20,6 @@ __all__ = [
     "Lens",
     "cells_of",
     "count_last",
-    "middle_of",
     "place_of",
     "small_at",
 ]
@@ -72,7 +71,7 @@ def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_
     sample = _sampled(depth, 5 if min(depth.shape) > 50 else 1, np.float32(range_m))
     if sample.size == 0:
         return None
-    pixel_m = middle_of(sample) / max(abs(camera.fx), 1e-6)
+    pixel_m = _median_of(sample) / max(abs(camera.fx), 1e-6)
     least = math.sqrt(depth.size / MOST_CELLS)
     factor = round(min(max(cell_m / max(pixel_m, 1e-9), least, 1.0), LARGEST_FACTOR, *depth.shape))
     shift = (factor - 1) / 2
@@ -88,7 +87,7 @@ def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_
     return Cells(w, lens, factor, factor * pixel_m)
 
 
-def middle_of(values: F4) -> float:
+def _median_of(values: F4) -> float:
     """Return the upper median of at least one value; `numpy.median` takes twice as long."""
     return float(np.partition(values, values.size // 2)[values.size // 2])
 

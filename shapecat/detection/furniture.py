@@ -12,7 +12,6 @@ from shapecat.detection.pieces import (
     BOTTOM,
     CONTACT,
     COUNT,
-    FAR,
     FEW,
     FRONT,
     HIDDEN,
@@ -21,6 +20,7 @@ from shapecat.detection.pieces import (
     RIM,
     TOP,
     Pieces,
+    depth_of,
     is_group,
 )
 from shapecat.detection.traits import top_band
@@ -122,17 +122,10 @@ def _is_rim(pieces: Pieces, p: int) -> bool:
 
 
 @kernel(leaf=True)
-def _depth_of(pieces: Pieces, p: int) -> float:
-    """Return the mean depth of a piece, metres; 1 where it has no cell."""
-    count = pieces.shape[p, COUNT]
-    return float(pieces.shape[p, FAR] / count) if count > 0 else 1.0
-
-
-@kernel(leaf=True)
 def _is_faint(pieces: Pieces, p: int) -> bool:
     """Whether a piece is as small and low as noise of the plane."""
     shape = pieces.shape[p]
-    if shape[TOP] >= FAINT * LEAST_M + FAINT_NOISE * NOISE * _depth_of(pieces, p) ** 2:
+    if shape[TOP] >= FAINT * LEAST_M + FAINT_NOISE * NOISE * depth_of(pieces, p) ** 2:
         return False
     return bool(shape[AREA] < FAINT_M2 or shape[COUNT] < FAINT_CELLS)
 
@@ -144,7 +137,7 @@ def _is_side(pieces: Pieces, p: int, lens: Lens) -> bool:
     An object has a front too, unless something hides it.
     """
     shape, boundary = pieces.shape[p], pieces.boundary[p]
-    covered = shape[COUNT] * _depth_of(pieces, p) ** 2 / (lens.fx * lens.fy)
+    covered = shape[COUNT] * depth_of(pieces, p) ** 2 / (lens.fx * lens.fy)
     speckled = boundary * boundary > SPECKS * shape[COUNT]
     if shape[AREA] <= (SPECKLED if speckled else EDGE_ON) * covered:
         return False

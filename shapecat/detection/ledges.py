@@ -9,7 +9,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import Cells
 from shapecat.detection.heights import Heights
-from shapecat.detection.pieces import BAND_M, BANDS, BOTTOM, TOP, Pieces, side_of
+from shapecat.detection.pieces import BAND_M, BANDS, BOTTOM, TOP, Pieces, note_cut, side_of
 from shapecat.detection.regions import cut_above
 from shapecat.detection.surfaces import Surfaces
 from shapecat.detection.traits import roundness_of
@@ -45,6 +45,7 @@ def cut_at_ledges(
         if band > 0 and _is_stack(cells, height, surfaces, labels, p, band, side):
             n += 1
             cut_above(labels, surfaces.spans, height, p, (band + 1 + CLEARANCE / 2) * BAND_M, n)
+            note_cut(pieces, p)
     return n
 
 

@@ -49,9 +49,9 @@ from shapecat.jit import kernel
 __all__ = ["FILE", "SIGNS", "Sight", "Trees", "join_parts", "meet_at_all", "signs_of", "trees"]
 
 FILE = "parts.npz"
-LIKELY = 0.85
-"""Logit, of 0.7, from which on two pieces are taken for parts of one object: a wrong join loses two
-objects, a missing one seldom one."""
+LIKELY = 0.6
+"""Logit, of 0.65, from which on two pieces are taken for parts of one object: a wrong join loses
+two objects, a missing one seldom one."""
 HOPELESS = -4.0
 """Logit of the first trees that the others never made up for; half of the pairs end so early."""
 BORDER = (

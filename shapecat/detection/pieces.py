@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.cells import Cells, Lens
 from shapecat.detection.heights import Heights
 from shapecat.detection.surfaces import Surfaces
@@ -41,10 +41,14 @@ __all__ = [
     "UPWARD",
     "Pieces",
     "choose_samples",
+    "depth_of",
     "depths_of",
+    "is_cut",
     "is_group",
     "may_join",
     "merge",
+    "note_cut",
+    "pieces_after_cuts",
     "pieces_of",
     "side_of",
 ]
@@ -101,7 +105,33 @@ def pieces_of(
     cells: Cells, heights: Heights, surfaces: Surfaces, labels: I4, n: int, up: F8
 ) -> Pieces:
     """Collect the shapes of regions 1..n; what they meet, and samples, are up to `borders.meet`."""
-    size = n + 1
+    pieces: Pieces = pieces_after_cuts(cells, heights, surfaces, labels, n, up, _blank(1))
+    return pieces
+
+
+@kernel
+def pieces_after_cuts(
+    cells: Cells, heights: Heights, surfaces: Surfaces, labels: I4, n: int, up: F8, before: Pieces
+) -> Pieces:
+    """Collect the shapes as `pieces_of`, of cut regions alone; the others are as ``before``.
+
+    What `is_cut` is measured anew.
+    """
+    pieces: Pieces = _blank(n + 1)
+    wanted = np.ones(n + 1, np.bool_)
+    wanted[0] = False
+    for p in range(1, before.group.size):
+        if not is_cut(before, p):
+            wanted[p] = False
+            pieces.shape[p], pieces.lid[p] = before.shape[p], before.lid[p]
+            pieces.owner[p] = before.owner[p]
+    _measure(cells.w, cells.lens, heights, surfaces, labels, up, side_of(up), wanted, pieces)
+    return pieces
+
+
+@kernel
+def _blank(size: int) -> Pieces:
+    """Return pieces without any cell."""
     pieces = Pieces(
         np.zeros((5, size, size), np.float32),
         np.zeros((size, OVER + 1), np.float32),
@@ -112,7 +142,9 @@ def pieces_of(
         np.zeros(size, np.int8),
         np.arange(size).astype(np.int16),
     )
-    _measure(cells.w, cells.lens, heights, surfaces, labels, up, side_of(up), pieces)
+    shape = pieces.shape
+    shape[:, LEFT], shape[:, RIGHTMOST] = 1e9, -1e9
+    shape[:, BOTTOM], shape[:, TOP] = 1e9, -1e9
     return pieces
 
 
@@ -134,14 +166,12 @@ def _measure(
     labels: I4,
     up: F8,
     side: F8,
+    wanted: Bool,
     pieces: Pieces,
 ) -> None:
+    """Add up the cells of the wanted labels; label 0 is not one."""
     shape, owners, lid = pieces.shape, pieces.owner, pieces.lid
     owner, height = heights.owner, heights.height
-    shape[:, LEFT] = 1e9
-    shape[:, RIGHTMOST] = -1e9
-    shape[:, TOP] = -1e9
-    shape[:, BOTTOM] = 1e9
     zero, one, far_off = np.float32(0), np.float32(1), np.float32(np.inf)
     per_x, per_y = np.float32(1 / lens.fx), np.float32(1 / lens.fy)
     cx, cy, edge_on = np.float32(lens.cx), np.float32(lens.cy), np.float32(0.2)
@@ -152,7 +182,7 @@ def _measure(
         j, end = spans[i]
         while j < end:
             p, first = labels[i, j], j
-            if p == 0:
+            if not wanted[p]:
                 j += 1
                 continue
             # Sums over the cells of one piece that follow each other.
@@ -249,14 +279,33 @@ def merge(pieces: Pieces, p: int, q: int) -> None:
             pieces.group[k] = p
 
 
+@kernel(leaf=True)
+def depth_of(pieces: Pieces, p: int) -> float:
+    """Return the mean depth of a piece, metres; 1 where it has no cell."""
+    count = pieces.shape[p, COUNT]
+    return float(pieces.shape[p, FAR] / count) if count > 0 else 1.0
+
+
 @kernel
 def depths_of(pieces: Pieces) -> F4:
-    """Return the mean depth of each piece, metres; 1 where it has no cell."""
-    depth = np.ones(pieces.group.size, np.float32)
-    for p in range(depth.size):
-        if pieces.shape[p, COUNT] > 0:
-            depth[p] = pieces.shape[p, FAR] / pieces.shape[p, COUNT]
-    return depth
+    """Return `depth_of` all pieces."""
+    depths = np.zeros(pieces.group.size, np.float32)
+    for p in range(depths.size):
+        depths[p] = depth_of(pieces, p)
+    return depths
+
+
+@kernel(leaf=True)
+def note_cut(pieces: Pieces, p: int) -> None:
+    """Note that a region, which may have been cut off itself, was cut: its statistics are wrong."""
+    if p < pieces.group.size:
+        pieces.shape[p, COUNT] = 0
+
+
+@kernel(leaf=True)
+def is_cut(pieces: Pieces, p: int) -> bool:
+    """Whether region ``p`` was cut, or cut off, since its statistics were collected."""
+    return bool(p >= pieces.group.size or pieces.shape[p, COUNT] == 0)
 
 
 @kernel(leaf=True)

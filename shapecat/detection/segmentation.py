@@ -24,11 +24,12 @@ from shapecat.detection.ledges import cut_at_ledges
 from shapecat.detection.levels import find_levels
 from shapecat.detection.occluders import join_around, join_behind
 from shapecat.detection.parts import Sight, Trees, join_parts, trees
-from shapecat.detection.pieces import Pieces, pieces_of
+from shapecat.detection.pieces import Pieces, pieces_after_cuts, pieces_of
 from shapecat.detection.planes import Support
 from shapecat.detection.reach import reach_over
 from shapecat.detection.regions import regions_of, rename
 from shapecat.detection.relief import raise_low
+from shapecat.detection.steps import cut_at_steps
 from shapecat.detection.surfaces import Surfaces, surfaces_of
 from shapecat.detection.walls import clear_walls
 from shapecat.errors import ConfigError
@@ -47,6 +48,7 @@ class Rules(NamedTuple):
     concave: bool
     ledge: bool
     axis: bool
+    step: bool
     small: bool
     parts: bool
     occluder: bool
@@ -195,8 +197,10 @@ def _part(cells: Cells, ground: Ground, rules: Rules, limits: Limits) -> Parted:
         more = cut_at_ledges(cells, heights, surfaces, pieces, regions, up)
     if rules.axis:
         more = cut_at_axes(cells, heights, surfaces, pieces, regions, up, more)
+    if rules.step:
+        more = cut_at_steps(cells, heights, surfaces, pieces, regions, up, more)
     if more > n:
-        pieces = pieces_of(cells, heights, surfaces, regions, more, up)
+        pieces = pieces_after_cuts(cells, heights, surfaces, regions, more, up, pieces)
     meet(cells.w, heights, surfaces, regions, up, pieces)
     return Parted(surfaces, regions, pieces)
 

@@ -57,10 +57,10 @@ _SERIES = (
     Series("clutter", _NOISY, 20_000, 300),
     Series("clutter", _BLENDED, 30_000, 300),
     Series("clutter", IDEAL, 40_000, 300),
-    Series("shelf", KINECT, 2000, 720),
+    Series("shelf", KINECT, 2000, 1500),
     Series("shelf", REALSENSE, 10_000, 300),
     Series("turntable", KINECT, 2000, 180),
-    Series("clutter", KINECT, 50_000, 400, ("box",)),
+    Series("clutter", KINECT, 50_000, 600, ("box",)),
     Series("clutter", REALSENSE, 60_000, 150, ("box",)),
     Series("clutter", KINECT, 70_000, 150, ("box", "can", "plate")),
 )
