@@ -30,7 +30,7 @@ from shapecat.jit import kernel
 
 __all__ = ["cut_at_steps"]
 
-STEP_M, STEPS_M = 0.008, 0.014
+STEP_M, STEPS_M = 0.01, 0.02
 """How far one side of the outline steps aside at least, and both together."""
 BESIDE = 5
 """Bands of height below and above a step: as many as either part has at least. The nearest is left
