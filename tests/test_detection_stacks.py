@@ -198,10 +198,10 @@ def test_boxes_with_flush_fronts_are_parted_where_the_outline_steps(upper: float
     assert min(parted(shapes, UNJOINED.replace("step ", "").replace("ledge ", ""))) < 0.8
 
 
-@pytest.mark.parametrize(("seed", "label"), [(1076, 20), (1086, 20), (1141, 21), (1310, 20)])
+@pytest.mark.parametrize(("seed", "label"), [(1076, 20), (1132, 20), (1187, 21), (1395, 22)])
 def test_stack_without_an_edge_in_clutter(seed: int, label: int) -> None:
     """Only the outline tells where one object ends."""
-    assert overlap_in_clutter(seed, [label]) > 0.6
+    assert overlap_in_clutter(seed, [label]) > 0.75
 
 
 def test_outline_that_something_nearer_cuts_off_is_no_step() -> None:
