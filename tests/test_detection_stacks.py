@@ -180,7 +180,7 @@ UNJOINED = "low concave ledge axis step small"
 """The rules that part objects, without those that join parts of one again."""
 
 
-def parted(shapes: list[Shape], rules: str) -> list[float]:
+def overlaps_by(shapes: list[Shape], rules: str) -> list[float]:
     """Return how well all but the first shape are found with some of the rules."""
     depth, seen = render(shapes)
     scene = detect(
@@ -194,8 +194,8 @@ def test_boxes_with_flush_fronts_are_parted_where_the_outline_steps(upper: float
     """No edge parts them; what is wider above shows no ledge either."""
     boxes = [box((0, 0, 0), (0.1, 0.06, 0.1)), box((0, 0, 0.1), (upper, 0.06, 0.08))]
     shapes = [table(), *boxes]
-    assert min(parted(shapes, UNJOINED)) > 0.85
-    assert min(parted(shapes, UNJOINED.replace("step ", "").replace("ledge ", ""))) < 0.8
+    assert min(overlaps_by(shapes, UNJOINED)) > 0.85
+    assert min(overlaps_by(shapes, UNJOINED.replace("step ", "").replace("ledge ", ""))) < 0.8
 
 
 @pytest.mark.parametrize(("seed", "label"), [(1076, 20), (1132, 20), (1187, 21), (1395, 22)])
@@ -211,7 +211,7 @@ def test_outline_that_something_nearer_cuts_off_is_no_step() -> None:
         box((0, 0.1, 0), (0.16, 0.06, 0.2)),
         box((-0.06, -0.05, 0), (0.1, 0.05, 0.07)),
     ]
-    assert min(parted(shapes, UNJOINED)) > 0.85
+    assert min(overlaps_by(shapes, UNJOINED)) > 0.85
 
 
 @pytest.mark.parametrize("tilt_deg", [30, 40])
