@@ -1,6 +1,8 @@
 """Poses, quaternions, boxes and the gravity frame: small numeric pieces shared by the stages."""
 
 import math
+from collections.abc import Sequence
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,6 +22,7 @@ __all__ = [
     "level_from_sensor",
     "quaternion_from_rotation",
     "rotation_from_quaternion",
+    "row_quaternion",
     "transform",
     "upright_box",
 ]
@@ -74,20 +77,31 @@ def quaternion_from_rotation(rotation: ArrayLike) -> F8:
 
     Source: Shepperd 1978, by the largest of the four squared components.
     """
-    r = np.asarray(rotation, np.float64).tolist()
-    trace = r[0][0] + r[1][1] + r[2][2]
-    squared = [1 + 2 * r[k][k] - trace for k in range(3)] + [1 + trace]
-    largest = squared.index(max(squared))
-    if largest == 3:
-        q = [r[2][1] - r[1][2], r[0][2] - r[2][0], r[1][0] - r[0][1], squared[3]]
+    return np.array(_quaternion(*np.asarray(rotation, np.float64).tolist()))
+
+
+_Row: TypeAlias = Sequence[float]
+
+
+def _quaternion(first: _Row, second: _Row, third: _Row) -> tuple[float, float, float, float]:
+    xx, xy, xz = first
+    yx, yy, yz = second
+    zx, zy, zz = third
+    trace = xx + yy + zz
+    if trace > max(xx, yy, zz):
+        x, y, z, w = zy - yz, xz - zx, yx - xy, 1 + trace
+    elif xx >= max(yy, zz):
+        x, y, z, w = 1 + 2 * xx - trace, xy + yx, xz + zx, zy - yz
+    elif yy >= zz:
+        x, y, z, w = xy + yx, 1 + 2 * yy - trace, yz + zy, xz - zx
     else:
-        i, j, k = largest, (largest + 1) % 3, (largest + 2) % 3
-        q = [0.0] * 3 + [r[k][j] - r[j][k]]
-        q[i] = squared[i]
-        q[j] = r[i][j] + r[j][i]
-        q[k] = r[i][k] + r[k][i]
-    norm = math.sqrt(sum(v * v for v in q)) * (-1 if q[3] < 0 else 1)
-    return np.array([v / norm for v in q])
+        x, y, z, w = xz + zx, yz + zy, 1 + 2 * zz - trace, yx - xy
+    norm = math.sqrt(x * x + y * y + z * z + w * w) * (-1 if w < 0 else 1)
+    return x / norm, y / norm, z / norm, w / norm
+
+
+row_quaternion = kernel(_quaternion)
+"""`quaternion_from_rotation` for kernels: the three rows, as tuples, to (x, y, z, w)."""
 
 
 def gravity_rotation(up: ArrayLike) -> F8:

@@ -90,15 +90,12 @@ def _cuts_of(bands: F8) -> Bool:
 @kernel
 def _number_rounded(pieces: Pieces, labels: int) -> I4:
     """Return a number from 1 on for each of the labels that may be round, 0 for the others."""
-    numbers = np.zeros(labels, np.int64)
-    n = 0
+    rounded = np.zeros(labels, np.bool_)
     for p in range(1, labels):
-        if is_cut(pieces, p) or (
+        rounded[p] = is_cut(pieces, p) or (
             pieces.shape[p, COUNT] >= 2 * LEAST_CELLS and slope_of(pieces.shape[p]) > ROUND
-        ):
-            n += 1
-            numbers[p] = n
-    return numbers
+        )
+    return np.asarray(np.cumsum(rounded) * rounded)
 
 
 @kernel

@@ -7,8 +7,8 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import NEAREST_M, Cells, Lens
 from shapecat.detection.consensus import TOLERANCE, Readings
-from shapecat.detection.planes import COS, SIN, Support, corners_of
-from shapecat.geometry import gravity_rotation
+from shapecat.detection.supports import COS, DIRECTIONS, SIN, Support, corners_of
+from shapecat.geometry import level_axes
 from shapecat.jit import kernel
 
 __all__ = ["boards_of"]
@@ -29,6 +29,7 @@ LEAST_DROPS, CLOSED = 20, 0.5
 """Readings below the edge that say enough, and the share of them on a wall that closes a box."""
 
 
+@kernel
 def boards_of(cells: Cells, found: list[tuple[Support, Readings]]) -> list[Support]:
     """Leave out the tops of objects; ``found`` are planes, lowest first, with their readings.
 
@@ -38,16 +39,17 @@ def boards_of(cells: Cells, found: list[tuple[Support, Readings]]) -> list[Suppo
     """
     kept: list[Support] = []
     for support, readings in found:
-        below = [s for s in kept if _overlaps(s, support)]
-        drop = support.offset - below[-1].offset if below else math.inf
-        if drop < LEAST_DROP_M or (kept and support.area_m2 < BOARD_AREA_M2):
+        drop = math.inf
+        for lower in kept:
+            drop = support.offset - lower.offset if _overlaps(lower, support) else drop
+        if drop < LEAST_DROP_M or (len(kept) > 0 and support.area_m2 < BOARD_AREA_M2):
             continue
-        if below and support.area_m2 < SURE_AREA_M2:
+        if drop < math.inf and support.area_m2 < SURE_AREA_M2:
             seen = np.zeros(2, np.int64)
             plane = np.array([support.a, support.b, support.c])
             _drop(cells.w, cells.lens, readings, plane, support.up, drop, seen)
-            if seen.sum() >= LEAST_DROPS:
-                if seen[0] > CLOSED * seen.sum():
+            if seen[0] + seen[1] >= LEAST_DROPS:
+                if seen[0] > CLOSED * (seen[0] + seen[1]):
                     continue
             elif support.area_m2 < LIKELY_AREA_M2:
                 continue
@@ -55,12 +57,14 @@ def boards_of(cells: Cells, found: list[tuple[Support, Readings]]) -> list[Suppo
     return kept
 
 
+@kernel
 def _overlaps(lower: Support, upper: Support) -> bool:
     """Whether the middle of ``upper`` lies over the outline of ``lower``."""
-    middle = corners_of(upper).mean(axis=0)
-    flat = gravity_rotation(lower.up)[:2] @ middle
-    along = COS * flat[0] + SIN * flat[1]
-    return bool((along < lower.reach).all())
+    middle = np.sum(corners_of(upper), axis=0) / DIRECTIONS
+    axes = level_axes(lower.up[0], lower.up[1], lower.up[2])
+    x = axes[0][0] * middle[0] + axes[0][1] * middle[1] + axes[0][2] * middle[2]
+    y = axes[1][0] * middle[0] + axes[1][1] * middle[1] + axes[1][2] * middle[2]
+    return bool(np.all(COS * x + SIN * y < lower.reach))
 
 
 @kernel(leaf=True)

@@ -16,12 +16,12 @@ __all__ = [
     "consensus",
     "cosine",
     "count_near",
+    "draws_of",
     "level_plane",
     "middle_of",
     "normal_of",
     "readings_of",
     "refit",
-    "triples_of",
     "without",
 ]
 
@@ -134,15 +134,15 @@ def level_plane(lens: Lens, up: F8, offset: float) -> F8:
     return np.array([a / offset, b / offset, (up[2] - a * lens.cx - b * lens.cy) / offset])
 
 
-def triples_of(readings: int, rng: np.random.Generator) -> I4:
-    """Draw the readings (n, 3) that propose planes to `consensus`."""
-    return rng.integers(0, max(readings, 1), (TRIALS if readings >= 3 else 0, 3))
+def draws_of(rng: np.random.Generator) -> F8:
+    """Draw the numbers (n, 3) from 0 to 1 that tell all kernels of a frame which to try."""
+    return rng.random((TRIALS, 3))
 
 
 @kernel
 def consensus(
     readings: Readings,
-    triples: I4,
+    draws: F8,
     lens: Lens,
     guide: F8,
     cosines: tuple[float, float],
@@ -155,13 +155,13 @@ def consensus(
 
     Parameters
     ----------
-    triples : (n, 3) readings that propose planes, of `triples_of`.
+    draws : of `draws_of`; the readings at these shares of the list propose planes.
     """
     best = np.zeros(3)
-    most = 0
-    for t in range(triples.shape[0]):
+    most, n = 0, readings.w.size
+    for t in range(len(draws) if n >= 3 else 0):
         # (1) three readings propose a plane
-        p, q, r = triples[t]
+        p, q, r = int(draws[t, 0] * n), int(draws[t, 1] * n), int(draws[t, 2] * n)
         w0 = float(readings.w[p])
         j1, i1 = readings.j[q] - readings.j[p], readings.i[q] - readings.i[p]
         j2, i2 = readings.j[r] - readings.j[p], readings.i[r] - readings.i[p]

@@ -36,7 +36,7 @@ def detect(
     up : (3,) direction away from gravity, sensor frame, of any length but zero. With it only
         planes within 15 degrees of level count; without, it is estimated from the dominant plane.
     settings : see `DetectionSettings`.
-    rng : source of the random triples of RANSAC; the same state gives the same scene.
+    rng : source of what RANSAC tries; the same state gives the same scene.
 
     Returns
     -------

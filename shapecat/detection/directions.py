@@ -38,34 +38,36 @@ SEVERAL, CLEAR, ASLANT = 1.5, 2, 0.55
 direction lies in them, by the power of the share; and that the camera looks at them aslant."""
 
 
-def estimate_up(cells: Cells, hint: F8 | None, rng: np.random.Generator) -> F8 | None:
-    """Return the normal of the dominant supporting plane, (3,) unit, or None if there is none.
+@kernel
+def estimate_up(cells: Cells, hint: F8, draws: F8) -> F8:
+    """Return the normal of the dominant supporting plane, (3,) unit, or zeros if there is none.
 
-    With a ``hint`` only planes within 15 degrees of being perpendicular to it count. Without, the
-    direction wins that faces most large levels: the normal of one of the largest planes, or the
-    direction that two walls leave. What the camera looks at head-on counts less, so that the
-    boards of a shelf beat its back. How the camera is turned about its axis makes no difference.
+    With a ``hint`` only planes within 15 degrees of being perpendicular to it count. Without, if
+    it is zeros, the direction wins that faces most large levels: the normal of one of the largest
+    planes, or the direction that two walls leave. What the camera looks at head-on counts less, so
+    that the boards of a shelf beat its back. How the camera is turned about its axis makes no
+    difference. ``draws`` are of `draws_of`.
     """
     facets = _facets(cells.w, cells.lens)
-    least = max(LEAST_SHARE * facets.shape[1], LEAST_FACETS)
-    found = _directions(facets, hint, least, rng)
-    if not found:
-        return None
-    corner_cos = CORNER_COS if hint is None else 0.0
-    up = _dominant(cells.w, cells.lens, facets, np.array(found), least, corner_cos)
-    return np.asarray(up)
+    least = max(LEAST_SHARE * facets.shape[1], float(LEAST_FACETS))
+    free = not np.any(hint)
+    found = _directions(facets[:3] if free else _facing(facets, hint), least, draws)
+    if len(found) == 0:
+        return np.zeros(3)
+    up: F8 = _dominant(cells.w, cells.lens, facets, found, least, CORNER_COS if free else 0.0)
+    return up
 
 
-def _directions(facets: F4, hint: F8 | None, least: float, rng: np.random.Generator) -> list[F8]:
-    """Return directions that many surfaces face, most first: RANSAC on one normal at a time."""
-    normals = facets[:3] if hint is None else _facing(facets, hint)
-    found: list[F8] = []
-    while len(found) < MOST_DIRECTIONS and normals.shape[1] >= least:
-        trials = rng.integers(0, normals.shape[1], TRIALS)
-        best, votes, normals = _most_faced(normals, trials)
+@kernel
+def _directions(normals: F4, least: float, draws: F8) -> F8:
+    """Return directions (n, 3) that many normals face, most first: RANSAC on one at a time."""
+    found = np.zeros((MOST_DIRECTIONS, 3))
+    for k in range(MOST_DIRECTIONS):
+        if normals.shape[1] < least:
+            return found[:k]
+        votes, normals = _most_faced(normals, draws, found[k])
         if votes < least:
-            break
-        found.append(best)
+            return found[:k]
     return found
 
 
@@ -82,10 +84,11 @@ def _facing(facets: F4, hint: F8) -> F4:
 
 
 @kernel
-def _most_faced(normals: F4, trials: I4) -> tuple[F8, int, F4]:
-    """Return the direction most normals (3, n) face, how many do, and the normals that do not."""
-    most, best = -1, np.zeros(3)
-    for t in trials:
+def _most_faced(normals: F4, draws: F8, best: F8) -> tuple[int, F4]:
+    """Write the direction most normals (3, n) face; return how many do, and those that do not."""
+    most = -1
+    for draw in draws[:TRIALS, 0]:
+        t = int(draw * normals.shape[1])
         votes = _votes(normals, t, most)
         if votes > most:
             most = votes
@@ -98,7 +101,7 @@ def _most_faced(normals: F4, trials: I4) -> tuple[F8, int, F4]:
         x, y, z = normals[0, k], normals[1, k], normals[2, k]
         rest[0, n], rest[1, n], rest[2, n] = x, y, z
         n += not (x * best[0] + y * best[1] + z * best[2] > FACING_COS)
-    return best, most, rest[:, :n].copy()
+    return most, rest[:, :n].copy()
 
 
 @kernel(fast=True, leaf=True)

@@ -19,10 +19,11 @@ from shapecat.detection.consensus import (
     normal_of,
     refit,
 )
-from shapecat.detection.planes import ARM, Support, by_height, fullest, support_of
+from shapecat.detection.planes import by_height, fullest
+from shapecat.detection.supports import ARM, LEAST_AREA_M2, Support, support_of
 from shapecat.jit import kernel
 
-__all__ = ["grazing_board"]
+__all__ = ["add_grazing"]
 
 BIN_M = 0.01
 LEAST_READINGS = 25
@@ -36,16 +37,22 @@ STEADY_COS = 0.9998
 """Cosine of the largest angle, 1.1 degrees, to the other planes."""
 
 
-def grazing_board(cells: Cells, supports: list[Support], up: F8) -> tuple[Support, Readings] | None:
-    """Return the board seen at a grazing angle not among ``supports``, and its readings."""
-    known = np.array([support.offset for support in supports])
-    deepest = abs(float(up[1])) / (cells.lens.fy * STEEP)
-    found, height = _grazing_readings(cells.w, cells.lens, up, deepest, known)
+@kernel
+def add_grazing(cells: Cells, found: list[tuple[Support, Readings]], up: F8) -> None:
+    """Append the board seen at a grazing angle, if there is one at another height than others."""
+    known = np.zeros(len(found))
+    for k, (support, _) in enumerate(found):
+        known[k] = support.offset
+    deepest = abs(up[1]) / (cells.lens.fy * STEEP)
+    readings, height = _grazing_readings(cells.w, cells.lens, up, deepest, known)
     if height.size < LEAST_READINGS:
-        return None
-    near, plane, count = _fit(cells.lens, up, found, height, deepest)
-    support = support_of(cells, near, plane) if count >= LEAST_READINGS else None
-    return None if support is None else (support, near)
+        return
+    near, plane, count = _fit(cells.lens, up, readings, height, deepest)
+    if count < LEAST_READINGS:
+        return
+    board = support_of(cells, near, plane)
+    if board.area_m2 >= LEAST_AREA_M2:
+        found.append((board, near))
 
 
 @kernel

@@ -7,7 +7,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.cells import Cells, Lens
-from shapecat.detection.planes import COS, DIRECTIONS, SIN, Support
+from shapecat.detection.supports import COS, DIRECTIONS, SIN, Support
 from shapecat.geometry import level_axes
 from shapecat.jit import kernel
 
@@ -38,17 +38,19 @@ class Heights(NamedTuple):
     height: F4
 
 
+@kernel
 def table_of(supports: list[Support], lens: Lens) -> F8:
-    """Return one row of numbers per plane, for the kernels."""
+    """Return one row of numbers per plane."""
     rows = np.zeros((len(supports), 13 + DIRECTIONS))
-    for row, s in zip(rows, supports, strict=True):
-        _fill(row, s.a, s.b, s.c, s.up, s.reach, lens)
+    for k, support in enumerate(supports):
+        _fill(rows[k], support, lens)
     return rows
 
 
 @kernel
-def _fill(row: F8, a: float, b: float, c: float, up: F8, reach: F8, lens: Lens) -> None:
+def _fill(row: F8, support: Support, lens: Lens) -> None:
     """Write the plane, its distance, two level axes, a circle inside the outline, the outline."""
+    a, b, c, up, reach = support.a, support.b, support.c, support.up, support.reach
     x, y, z = a * lens.fx, b * lens.fy, a * lens.cx + b * lens.cy + c
     row[0], row[1], row[2], row[3] = a, b, c, 1.0 / math.sqrt(x * x + y * y + z * z)
     axes = level_axes(up[0], up[1], up[2])

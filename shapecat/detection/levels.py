@@ -6,9 +6,16 @@ import numpy as np
 
 from shapecat.arrays import F8
 from shapecat.detection.cells import Cells, Lens
-from shapecat.detection.consensus import TOLERANCE, Readings, level_plane
-from shapecat.detection.grazing import grazing_board
-from shapecat.detection.planes import DIRECTIONS, Support, find_planes, support_of
+from shapecat.detection.consensus import TOLERANCE, Readings, cosine, level_plane
+from shapecat.detection.grazing import add_grazing
+from shapecat.detection.planes import find_planes
+from shapecat.detection.supports import (
+    DIRECTIONS,
+    LEAST_AREA_M2,
+    Support,
+    sort_by_height,
+    support_of,
+)
 from shapecat.jit import kernel
 
 __all__ = ["find_levels"]
@@ -19,38 +26,40 @@ DISAGREEING, REWEIGHTED = math.radians(0.5), 5
 """From which angle to the mean, radians, a plane counts less than half; how often this is done."""
 
 
-def find_levels(cells: Cells, up: F8, rng: np.random.Generator) -> list[tuple[Support, Readings]]:
+@kernel
+def find_levels(cells: Cells, up: F8, draws: F8) -> list[tuple[Support, Readings]]:
     """Return the planes of `find_planes` with one normal in common, lowest first.
 
     A board seen at a grazing angle, or only a strip of one, does not tell its tilt well: half a
     degree is a centimetre of height a metre away. What is not level then, such as the top of a
     tilted thing, is left out.
     """
-    found = find_planes(cells, up, rng)
-    if not found:
+    found: list[tuple[Support, Readings]] = find_planes(cells, up, draws)
+    if len(found) == 0:
         return found
-    better = _common_up([support for support, _ in found])
-    if better @ up < TURNED_COS:
-        found = find_planes(cells, better, rng)
-        better = _common_up([support for support, _ in found]) if found else better
+    better = _common_up(found)
+    if cosine(better, up) < TURNED_COS:
+        found = find_planes(cells, better, draws)
+        better = _common_up(found) if len(found) > 0 else better
     if len(found) > 1:
-        levelled = [(_levelled(cells, *one, better), one[1]) for one in found]
-        found = [(support, readings) for support, readings in levelled if support is not None]
-    grazing = grazing_board(cells, [support for support, _ in found], better)
-    if grazing is not None:
-        found.append(grazing)
-    return sorted(found, key=lambda one: one[0].offset)
+        found = _levelled(cells, found, better)
+    add_grazing(cells, found, better)
+    sort_by_height(found)
+    return found
 
 
-def _common_up(supports: list[Support]) -> F8:
+@kernel
+def _common_up(found: list[tuple[Support, Readings]]) -> F8:
     """Return the mean normal, weighted by how well each plane tells it: area and width squared."""
-    if len(supports) == 1:
-        return supports[0].up
+    if len(found) == 1:
+        return found[0][0].up
     half = DIRECTIONS // 2
-    reach = np.array([s.reach for s in supports])
-    width = (reach[:, :half] + reach[:, half:]).min(axis=1)
-    area = np.array([s.area_m2 for s in supports])
-    return np.asarray(_robust_mean(np.array([s.up for s in supports]), area * width * width))
+    directions, weights = np.zeros((len(found), 3)), np.zeros(len(found))
+    for k, (support, _) in enumerate(found):
+        width = np.min(support.reach[:half] + support.reach[half:])
+        directions[k], weights[k] = support.up, support.area_m2 * width * width
+    mean: F8 = _robust_mean(directions, weights)
+    return mean
 
 
 @kernel
@@ -72,10 +81,18 @@ def _robust_mean(directions: F8, weights: F8) -> F8:
     return mean
 
 
-def _levelled(cells: Cells, support: Support, readings: Readings, up: F8) -> Support | None:
-    """Fit the plane with the normal ``up`` to the readings of a support, by least squares."""
-    plane = _level_fit(cells.lens, readings, support.a, support.b, support.c, up)
-    return support_of(cells, readings, plane)
+@kernel
+def _levelled(
+    cells: Cells, found: list[tuple[Support, Readings]], up: F8
+) -> list[tuple[Support, Readings]]:
+    """Fit planes with the normal ``up`` to the readings of others, by least squares."""
+    levelled: list[tuple[Support, Readings]] = []
+    for before, readings in found:
+        plane = _level_fit(cells.lens, readings, before.a, before.b, before.c, up)
+        support = support_of(cells, readings, plane)
+        if support.area_m2 >= LEAST_AREA_M2:
+            levelled.append((support, readings))
+    return levelled
 
 
 @kernel(fast=True)

@@ -40,7 +40,7 @@ def pixels_of(depth: F4, cells: Cells, found: Segmentation, *, range_m: float) -
     it only where it is above the plane itself, except in filled cells.
     """
     shown = _shown(cells, found)
-    return _split(*_list_pixels(depth, shown, cells.factor, range_m, found.leaders.size))
+    return _split(*_list_pixels(depth, shown, cells.factor, range_m, found.owners.size))
 
 
 def points_of(view: View, found: Segmentation, *, fused: bool) -> list[U4]:
@@ -49,7 +49,7 @@ def points_of(view: View, found: Segmentation, *, fused: bool) -> list[U4]:
     With ``fused`` points behind the visible surface are given to what they touch; lists beyond
     the labels are clusters that touch nothing visible.
     """
-    points, cells, labels = view.points, view.cells, found.leaders.size
+    points, cells, labels = view.points, view.cells, found.owners.size
     marks = np.zeros(len(points), np.int16)
     _mark_points(points, view.cell, cells.lens, _shown(cells, found), marks)
     if fused:

@@ -1,11 +1,10 @@
-"""Planes: the horizontal levels of the scene and their outlines (thesis 4.3, Alg. 1)."""
+"""Planes: the horizontal levels of the scene (thesis 4.3, Alg. 1)."""
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U1, Bool
+from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.cells import Cells, Lens
 from shapecat.detection.consensus import (
     TOLERANCE,
@@ -18,75 +17,44 @@ from shapecat.detection.consensus import (
     middle_of,
     normal_of,
     refit,
-    triples_of,
 )
-from shapecat.geometry import gravity_rotation, level_axes
+from shapecat.detection.supports import (
+    ARM,
+    LEAST_AREA_M2,
+    MARGIN_M,
+    Support,
+    sort_by_height,
+    support_of,
+)
 from shapecat.jit import kernel
 
-__all__ = [
-    "ARM",
-    "COS",
-    "DIRECTIONS",
-    "SIN",
-    "Support",
-    "by_height",
-    "corners_of",
-    "find_planes",
-    "fullest",
-    "support_of",
-]
+__all__ = ["by_height", "find_planes", "fullest"]
 
-DIRECTIONS = 16
-"""Sides of the convex outline of a plane."""
-ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
-COS, SIN = np.cos(ANGLES), np.sin(ANGLES)
-NEXT = np.roll(np.arange(DIRECTIONS), -1)
-MARGIN_M = 0.01
-"""An outline reaches this far beyond the readings."""
 BIN_M = 0.01
 MOST_LEVELS = 10
 LEAST_CELLS = 100
 MOST_HEIGHTS = 500
 """About as many readings tell the height of a level to begin with."""
-LEAST_AREA_M2 = 0.02
 LEVEL_COS2 = 0.82
 """Squared cosine of the largest angle, 25 degrees, of a level reading to the horizontal."""
 STEADY_COS = math.cos(math.radians(6))
 CLOSE, CLOSE_SHARE = 0.5, 0.75
 """Of the readings near a plane, less than this share is so close to one that is tilted between
 two: a table and the plates on it."""
-ARM = 3
-"""Cells to each side over which a surface is seen to be level; odd."""
 BEND = 0.024
 GRAZING_SIN2 = 0.04
 """Squared sine of the angle, 11.5 degrees, below which a surface is seen at a grazing angle."""
 
 
-class Support(NamedTuple):
-    """A horizontal plane that objects may stand on, in units of cells.
-
-    ``a * j + b * i + c`` is its inverse depth at cell (i, j); ``up`` (3,) its unit normal in the
-    sensor frame and ``offset`` its height along ``up``; ``reach`` (DIRECTIONS,) how far it extends
-    along evenly spaced directions of the level frame, metres; ``area_m2`` its visible area.
-    """
-
-    a: float
-    b: float
-    c: float
-    up: F8
-    offset: float
-    reach: F8
-    area_m2: float
-
-
-def find_planes(cells: Cells, up: F8, rng: np.random.Generator) -> list[tuple[Support, Readings]]:
+@kernel
+def find_planes(cells: Cells, up: F8, draws: F8) -> list[tuple[Support, Readings]]:
     """Return the horizontal planes of the scene, lowest first, each with its readings."""
     w, lens = cells.w, cells.lens
     # (1), (2) readings whose surface is level
     level, height, order, starts = _level_readings(w, lens, up)
     # (3) one plane candidate for each accumulation in height
     done = np.zeros(starts.size - 1, np.bool_)
-    supports: list[tuple[Support, Readings]] = []
+    found: list[tuple[Support, Readings]] = []
     for _ in range(MOST_LEVELS):
         near, plane, count, close = _next_level(lens, up, level, height, order, starts, done)
         if near.w.size < LEAST_CELLS:
@@ -95,13 +63,14 @@ def find_planes(cells: Cells, up: F8, rng: np.random.Generator) -> list[tuple[Su
             continue
         # (4) refine, and keep what lies in the plane
         if close < CLOSE_SHARE * count:
-            plane = _voted(lens, near, up, triples_of(near.w.size, rng), plane, close)
+            plane = _voted(lens, near, up, draws, plane, close)
         support = support_of(cells, near, plane)
-        if support is not None:
-            supports.append((support, near))
+        if support.area_m2 >= LEAST_AREA_M2:
+            found.append((support, near))
             _keep_off(plane, level, order, starts)
     # (5) ascending
-    return sorted(supports, key=lambda found: found[0].offset)
+    sort_by_height(found)
+    return found
 
 
 @kernel
@@ -241,9 +210,9 @@ def _next_level(
 
 
 @kernel
-def _voted(lens: Lens, near: Readings, up: F8, triples: I4, plane: F8, close: int) -> F8:
+def _voted(lens: Lens, near: Readings, up: F8, draws: F8, plane: F8, close: int) -> F8:
     """Return the plane most readings are close to, or ``plane``, to which ``close`` are."""
-    other, votes = consensus(near, triples, lens, up, (STEADY_COS, 1.0), CLOSE * TOLERANCE)
+    other, votes = consensus(near, draws, lens, up, (STEADY_COS, 1.0), CLOSE * TOLERANCE)
     return other if votes > close else plane
 
 
@@ -262,117 +231,3 @@ def _keep_off(plane: F8, level: Readings, order: I4, starts: I4) -> None:
         left[k + 1] = n
     for b in range(starts.size):
         starts[b] = left[starts[b]]
-
-
-def support_of(cells: Cells, readings: Readings, plane: F8) -> Support | None:
-    """Measure a plane (a, b, c) on readings near it; None if little of it is seen."""
-    normal, offset, reach, area = _measure(cells.w, cells.lens, readings, plane)
-    if area < LEAST_AREA_M2:
-        return None
-    a, b, c = plane.tolist()
-    return Support(a, b, c, normal, offset, reach, area)
-
-
-@kernel
-def _measure(w: F4, lens: Lens, readings: Readings, plane: F8) -> tuple[F8, float, F8, float]:
-    """Return the normal of a plane, its offset along it, how far it reaches, and its area, m2."""
-    normal = normal_of(plane, lens)
-    x, y = plane[0] * lens.fx, plane[1] * lens.fy
-    z = plane[0] * lens.cx + plane[1] * lens.cy + plane[2]
-    distance = 1 / math.sqrt(x * x + y * y + z * z)
-    area = _area_of(readings, plane, distance) / (lens.fx * lens.fy)
-    axes = np.array(level_axes(normal[0], normal[1], normal[2]))
-    beside = _beside_inliers(readings, plane, w.shape[0], w.shape[1])
-    return normal, -distance, _reach_of(w, lens, plane, axes, beside), area
-
-
-@kernel(fast=True, leaf=True)
-def _area_of(readings: Readings, plane: F8, distance: float) -> float:
-    """Return the visible area of a plane by that of a pixel at 1 m, from its distance."""
-    j, i, w = readings.j, readings.i, readings.w
-    total = 0.0
-    for k in range(w.size):
-        level = plane[0] * j[k] + plane[1] * i[k] + plane[2]
-        near = (level > 0) & (abs(w[k] - level) < TOLERANCE)
-        facing = level * distance  # the cosine between the normal and the ray
-        area = 1 / (level * level * (facing if facing > 0.05 else 0.05))
-        total += area if near else 0.0
-    return float(readings.share * total)
-
-
-@kernel(fast=True)
-def _beside_inliers(readings: Readings, plane: F8, rows: int, columns: int) -> U1:
-    """Mark the cells (rows, columns) to which the surface was seen to go on from an inlier."""
-    j, i, w = readings.j, readings.i, readings.w
-    top, width = np.int32(ARM), np.int32(columns)
-    place = np.zeros(w.size, np.int32)
-    for k in range(w.size):
-        level = plane[0] * j[k] + plane[1] * i[k] + plane[2]
-        near = (level > 0) & (abs(w[k] - level) < TOLERANCE)
-        here = np.int32(j[k]) + (np.int32(i[k]) + top) * width
-        place[k] = here if near else np.int32(0)
-    # There are margins above and below; those at the sides are cells that never are inliers.
-    n, margin = rows * columns, ARM * columns
-    inliers = np.zeros(n + 2 * margin, np.uint8)
-    for p in place:
-        inliers[p] = 1
-    inliers[0] = 0
-    above, below = inliers[:n], inliers[2 * margin :]
-    left, right = inliers[margin - ARM :], inliers[margin + ARM :]
-    beside = np.zeros(n, np.uint8)
-    for k in range(n):
-        beside[k] = above[k] | below[k] | left[k] | right[k]
-    return beside.reshape(rows, columns)
-
-
-@kernel
-def _reach_of(w: F4, lens: Lens, plane: F8, axes: F8, beside: U1) -> F8:
-    """Return how far the plane reaches along `DIRECTIONS`, metres, with a margin."""
-    across, along = axes[0], axes[1]
-    reach = np.full(DIRECTIONS, -np.inf)
-    for i in range(w.shape[0]):
-        # The outline is convex in the image too: the first and last cell of each row tell it.
-        first, last = _ends(w, plane, i, beside[i])
-        if first > last:
-            continue
-        for j in (first, last):
-            z = 1 / (plane[0] * j + plane[1] * i + plane[2])
-            x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
-            u = across[0] * x + across[1] * y + across[2] * z
-            v = along[0] * x + along[1] * y + along[2] * z
-            for k in range(DIRECTIONS):
-                there = COS[k] * u + SIN[k] * v
-                reach[k] = there if there > reach[k] else reach[k]
-    return reach + MARGIN_M
-
-
-@kernel(leaf=True)
-def _ends(w: F4, plane: F8, i: int, beside: U1) -> tuple[int, int]:
-    """Return the first and the last marked cell of a row in the plane; none: first > last."""
-    none = np.int32(beside.size)
-    first, last = none, np.int32(-1)
-    for k in range(beside.size):  # no more than 32 bits, and this vectorises
-        low = np.int32(k) if beside[k] else none
-        high = np.int32(k) if beside[k] else np.int32(-1)
-        first, last = (low if low < first else first), (high if high > last else last)
-    while first <= last and not (beside[first] and _is_in(w, plane, i, first)):
-        first += 1
-    while first < last and not (beside[last] and _is_in(w, plane, i, last)):
-        last -= 1
-    return int(first), int(last)
-
-
-@kernel(leaf=True)
-def _is_in(w: F4, plane: F8, i: int, j: int) -> bool:
-    level = plane[0] * j + plane[1] * i + plane[2]
-    return bool(level > 0 and abs(w[i, j] - level) < TOLERANCE)
-
-
-def corners_of(support: Support) -> F8:
-    """Return the corners (k, 3) of the convex outline, sensor frame, in order, without repeats."""
-    # Neighbouring sides x cos + y sin = reach meet at a corner.
-    here, there = support.reach, support.reach[NEXT]
-    along = (there - here * COS[1]) / SIN[1]
-    flat = np.array([here * COS - along * SIN, here * SIN + along * COS]).T
-    level = gravity_rotation(support.up)
-    return np.asarray(flat @ level[:2] + support.offset * level[2])

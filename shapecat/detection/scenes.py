@@ -7,10 +7,10 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U4, Bool, freeze
 from shapecat.config import DetectionSettings
-from shapecat.detection.candidates import Things, things_of
 from shapecat.detection.cells import NEAREST_M, Cells
-from shapecat.detection.planes import Support, corners_of
 from shapecat.detection.segmentation import Segmentation
+from shapecat.detection.supports import Support, corners_of
+from shapecat.detection.things import Things
 from shapecat.geometry import (
     IDENTITY,
     quaternion_from_rotation,
@@ -46,11 +46,10 @@ def scene_of(
     Lists beyond the labels are objects that the view does not show; their boxes are measured on
     ``points`` (n, 3), view frame.
     """
-    count = found.leaders.size - 1
-    things = things_of(cells, found, range_m=settings.max_range_m)
+    things, count = found.things, found.owners.size - 1
     kept = _kept(cells, things, indices, settings.min_points, image=points is None)
     position = {k + 1: n for n, k in enumerate(kept)}
-    boxes = _boxes(found, things, indices, points, sensor_from_view)
+    boxes = _boxes(found, indices, points, sensor_from_view)
     cut = _cut(cells, things) if points is None else _cut_cloud(cells, found, sensor_from_view)
     cut |= things.last
     owner, stand, hidden = found.owners[1:].tolist(), things.stand.tolist(), things.hidden.tolist()
@@ -78,27 +77,27 @@ def _kept(
     cells: Cells, things: Things, indices: Sequence[U4], least: int, *, image: bool
 ) -> list[int]:
     """Return which lists of points are objects, in the order of their first points."""
-    limits = np.full(len(indices), least)
+    limits = [float(least)] * len(indices)
     if image:
-        limits = np.maximum(limits, np.minimum(things.least, ENOUGH) * cells.factor**2)
-    enough = (k for k, limit in enumerate(limits.tolist()) if indices[k].size >= limit)
+        limits = [max(least, min(n, ENOUGH) * cells.factor**2) for n in things.least.tolist()]
+    enough = (k for k, limit in enumerate(limits) if indices[k].size >= limit)
     return sorted(enough, key=lambda k: int(indices[k][0]))
 
 
 def _boxes(
     found: Segmentation,
-    things: Things,
     indices: Sequence[U4],
     points: F4 | None,
     sensor_from_view: Pose,
 ) -> list[Box]:
     """Return the boxes of what the cells show, and on the points of what they do not."""
+    things = found.things
     sizes = [things.center, things.size, things.orientation]
     if sensor_from_view is IDENTITY:  # rows of frozen arrays need not be frozen one by one
         sizes = [freeze(rows, "n k", "f4") for rows in sizes]
     boxes = [Box(*row) for row in zip(*sizes, strict=True)]
     if points is not None:
-        extra = indices[found.leaders.size - 1 :]
+        extra = indices[found.owners.size - 1 :]
         boxes += [upright_box(points[index], found.up) for index in extra]
     return boxes if sensor_from_view is IDENTITY else [_moved(sensor_from_view, b) for b in boxes]
 
@@ -146,7 +145,7 @@ def _cut_cloud(cells: Cells, found: Segmentation, sensor_from_view: Pose) -> Boo
     Such a border is a straight side of the cloud as seen from the sensor's place, with more than
     one thing along it. A cloud fused from several views has none.
     """
-    result = np.zeros(found.leaders.size, bool)
+    result = np.zeros(found.owners.size, bool)
     valid = cells.w > 0
     if np.linalg.norm(sensor_from_view.translation) > NEAREST_M or not valid.any():
         return result[1:]

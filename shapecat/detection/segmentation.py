@@ -5,6 +5,7 @@ objects (`regions`), and learned trees (`parts`) between two rules bring the pie
 together again (`joins`). Nothing else is learned.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from shapecat.detection.axes import cut_at_axes
 from shapecat.detection.boards import boards_of
 from shapecat.detection.borders import meet
 from shapecat.detection.cells import Cells
+from shapecat.detection.consensus import draws_of
 from shapecat.detection.directions import estimate_up
 from shapecat.detection.fill import fill_enclosed, grow_feet
 from shapecat.detection.furniture import Field, Limits, is_no_object
@@ -25,12 +27,13 @@ from shapecat.detection.levels import find_levels
 from shapecat.detection.occluders import join_around, join_behind
 from shapecat.detection.parts import Sight, Trees, join_parts, trees
 from shapecat.detection.pieces import Pieces, pieces_after_cuts, pieces_of
-from shapecat.detection.planes import Support
 from shapecat.detection.reach import reach_over
 from shapecat.detection.regions import regions_of, rename
 from shapecat.detection.relief import raise_low
 from shapecat.detection.steps import cut_at_steps
+from shapecat.detection.supports import Support
 from shapecat.detection.surfaces import Surfaces, surfaces_of
+from shapecat.detection.things import Things, things_of
 from shapecat.detection.walls import clear_walls
 from shapecat.errors import ConfigError
 from shapecat.jit import kernel
@@ -57,6 +60,7 @@ class Rules(NamedTuple):
 
 
 RULES = Rules._fields
+NO_HINT = np.zeros(3)
 
 
 class Ground(NamedTuple):
@@ -103,9 +107,8 @@ class Segmentation(NamedTuple):
     planes : their rows of `table_of`.
     labels : (rows, columns) int16, 1..count, 0 elsewhere.
     filled : (rows, columns) uint8, 1 where a label lies at the level of the plane.
-    pieces : statistics of the regions the objects were joined from.
-    leaders : (count + 1,) the piece that holds the sums of each label.
     owners : (count + 1,) the plane that each label stands above; 0 for label 0.
+    things : what is measured of the labels.
     """
 
     up: F8
@@ -113,9 +116,8 @@ class Segmentation(NamedTuple):
     planes: F8
     labels: I4
     filled: U1
-    pieces: Pieces
-    leaders: I4
     owners: I4
+    things: Things
 
 
 def segment(
@@ -127,11 +129,12 @@ def segment(
 ) -> Segmentation | None:
     """Find planes and objects among ``cells``; None if there is no supporting plane."""
     rules, limits = _rules_of(settings.rules), _limits_of(settings)
-    supports, ground = _ground(cells, hint, rules, limits, rng)
-    if ground is None:
+    hint = NO_HINT if hint is None else hint
+    supports, ground = _ground(cells, hint, rules, limits, draws_of(rng))
+    if not supports:
         return None
-    labels, filled, pieces, leaders, owners = _objects(cells, ground, rules, limits, trees())
-    return Segmentation(ground.up, supports, ground.planes, labels, filled, pieces, leaders, owners)
+    objects = _objects(cells, ground, rules, limits, trees())
+    return Segmentation(ground.up, supports, ground.planes, *objects)
 
 
 def part(
@@ -139,14 +142,15 @@ def part(
 ) -> tuple[Ground, Parted] | None:
     """Find planes and the pieces of objects; None if no plane bears anything."""
     rules, limits = _rules_of(settings.rules), _limits_of(settings)
-    _, ground = _ground(cells, None, rules, limits, rng)
-    return None if ground is None else (ground, _part(cells, ground, rules, limits))
+    supports, ground = _ground(cells, NO_HINT, rules, limits, draws_of(rng))
+    return (ground, _part(cells, ground, rules, limits)) if supports else None
 
 
 def _limits_of(settings: DetectionSettings) -> Limits:
     return Limits(settings.max_height_m, settings.max_size_m, settings.max_range_m)
 
 
+@cache
 def _rules_of(text: str) -> Rules:
     rules = text.split()
     unknown = [rule for rule in rules if rule not in RULES]
@@ -156,32 +160,24 @@ def _rules_of(text: str) -> Rules:
     return Rules(*(rule in rules for rule in RULES))
 
 
-def _ground(
-    cells: Cells,
-    hint: F8 | None,
-    rules: Rules,
-    limits: Limits,
-    rng: np.random.Generator,
-) -> tuple[list[Support], Ground | None]:
-    up = estimate_up(cells, hint, rng)
-    supports = [] if up is None else boards_of(cells, find_levels(cells, up, rng))
-    if not supports:
-        return supports, None
-    up = max(supports, key=lambda s: s.area_m2).up
-    planes = table_of(supports, cells.lens)
-    heights, raised = _stand(cells, planes, rules, limits)
-    walls = clear_walls(cells, heights.owner, up, largest_m=limits.largest_m, rng=rng)
-    return supports, Ground(up, planes, heights, raised, walls)
-
-
 @kernel
-def _stand(cells: Cells, planes: F8, rules: Rules, limits: Limits) -> tuple[Heights, I4]:
-    """Return what every cell stands on, and the numbers of low objects."""
+def _ground(
+    cells: Cells, hint: F8, rules: Rules, limits: Limits, draws: F8
+) -> tuple[list[Support], Ground]:
+    """Return the planes, lowest first, and what is of use only if there are any."""
+    up = estimate_up(cells, hint, draws)
+    supports = boards_of(cells, find_levels(cells, up, draws))
+    largest = 0.0
+    for support in supports:
+        if support.area_m2 > largest:
+            up, largest = support.up, support.area_m2
+    planes = table_of(supports, cells.lens)
     heights = heights_of(cells, planes, limits.highest_m)
     raised = np.zeros(cells.w.shape, np.int16)
     if rules.low:
         raise_low(cells, heights, planes, raised, limits.largest_m)
-    return heights, raised
+    walls = clear_walls(cells, heights.owner, up, limits.largest_m, draws)
+    return supports, Ground(up, planes, heights, raised, walls)
 
 
 @kernel
@@ -208,8 +204,8 @@ def _part(cells: Cells, ground: Ground, rules: Rules, limits: Limits) -> Parted:
 @kernel
 def _objects(
     cells: Cells, ground: Ground, rules: Rules, limits: Limits, grown: Trees
-) -> tuple[I4, U1, Pieces, I4, I4]:
-    """Return the last five parts of a `Segmentation`."""
+) -> tuple[I4, U1, I4, Things]:
+    """Return the last four parts of a `Segmentation`."""
     surfaces, regions, pieces = _part(cells, ground, rules, limits)
     up, planes, heights, raised, walls = ground
     known = join_raised(pieces, raised, regions, surfaces.spans)
@@ -234,7 +230,8 @@ def _objects(
     owners = np.zeros(leaders.size, np.int64)
     for n in range(1, leaders.size):
         owners[n] = pieces.owner[leaders[n]] - 1
-    return labels, filled, pieces, leaders, owners
+    things = things_of(cells, labels, pieces, leaders, up, limits.range_m)
+    return labels, filled, owners, things
 
 
 @kernel

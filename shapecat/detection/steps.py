@@ -84,16 +84,13 @@ def cut_at_steps(
 @kernel
 def _number_tall(pieces: Pieces, labels: int) -> I4:
     """Return a number from 1 on for each label that may be a stack, 0 for the others."""
-    numbers = np.zeros(labels, np.int64)
-    n = 0
+    tall = np.zeros(labels, np.bool_)
     for p in range(1, labels):
-        if is_cut(pieces, p) or (
+        tall[p] = is_cut(pieces, p) or (
             pieces.shape[p, COUNT] >= 2 * LEAST_CELLS
             and pieces.shape[p, TOP] - pieces.shape[p, BOTTOM] >= 2 * BESIDE * BAND_M
-        ):
-            n += 1
-            numbers[p] = n
-    return numbers
+        )
+    return np.asarray(np.cumsum(tall) * tall)
 
 
 @kernel

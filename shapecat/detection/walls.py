@@ -12,7 +12,6 @@ from shapecat.detection.consensus import (
     consensus,
     normal_of,
     readings_of,
-    triples_of,
     without,
 )
 from shapecat.geometry import cross
@@ -35,16 +34,19 @@ LEAST_AREA_M2, LEAST_PART_M2, LEAST_WALL_M2 = 0.05, 0.04, 0.1
 LEAST_PATCH_M2, EXACT = 0.008, 0.0045
 """Smaller parts are cleared that lie in the wall as exactly as its readings do: standard deviation
 in inverse depth."""
+CUT_OFF = 0.75
+"""What two sides of the image cut off is a wall from this share of the largest object on."""
 FILLED = 0.3
 """Share of its extent that a wall fills: the front edges of a shelf lie in a plane too."""
 STRIP_M, STRIPS = 0.05, 400
 """Width of the strips whose area is summed to find the extent of a wall, and their number."""
 
 
-def clear_walls(
-    cells: Cells, owner: I4, up: F8, *, largest_m: float, rng: np.random.Generator
-) -> U1:
+@kernel
+def clear_walls(cells: Cells, owner: I4, up: F8, largest_m: float, draws: F8) -> U1:
     """Take the cells on walls from the object cells of ``owner`` (rows, columns), in place.
+
+    ``draws`` are of `draws_of`.
 
     Returns
     -------
@@ -52,59 +54,64 @@ def clear_walls(
     of many objects looks like a wall too, but all its parts are small.
     """
     walls = np.zeros(owner.shape, np.uint8)
-
-    def take(wanted: I4, most: int) -> None:
-        readings = readings_of(cells.w, wanted)
-        for _ in range(most):
-            triples = triples_of(readings.w.size, rng)
-            readings = _take(cells.w, cells.lens, owner, readings, triples, up, largest_m, walls)
-            if readings.w.size < LEAST_READINGS:
-                break
-
-    take(owner, MOST_WALLS)
+    _take(cells, owner, readings_of(cells.w, owner), MOST_WALLS, up, largest_m, draws, walls)
     # Of a wall behind a table most may be out of the reach of objects, and a corner in it.
-    take(((owner == 0) & (walls == 0)).view(np.int8), MOST_BEYOND)
+    beyond = readings_of(cells.w, (owner == 0) & (walls == 0))
+    _take(cells, owner, beyond, MOST_BEYOND, up, largest_m, draws, walls)
     return walls
 
 
 @kernel
 def _take(
-    w: F4,
-    lens: Lens,
+    cells: Cells,
     owner: I4,
     readings: Readings,
-    triples: I4,
+    most: int,
     up: F8,
     largest_m: float,
+    draws: F8,
     walls: U1,
-) -> Readings:
-    """Take the vertical plane with most readings, if it is a wall; return what is not near it.
-
-    No readings are returned if they agree on no plane.
-    """
-    vertical = (-VERTICAL_COS, VERTICAL_COS)
-    plane, count = consensus(readings, triples, lens, up, vertical, TOLERANCE)
-    if count < LEAST_READINGS:
-        return Readings(readings.j[:0], readings.i[:0], readings.w[:0], readings.share)
-    normal = normal_of(plane, lens)
-    if _is_wall(readings, lens, plane, normal, up, largest_m):
-        _clear(w, lens, owner, plane, normal, walls)
-    rest: Readings = without(readings, plane, 2 * TOLERANCE)
-    return rest
+) -> None:
+    """Take the vertical plane with most readings, if it is a wall, then that with most others."""
+    lens, vertical = cells.lens, (-VERTICAL_COS, VERTICAL_COS)
+    for _ in range(most):
+        plane, count = consensus(readings, draws, lens, up, vertical, TOLERANCE)
+        if count < LEAST_READINGS:
+            return
+        normal = normal_of(plane, lens)
+        if _is_wall(cells, readings, plane, normal, up, largest_m):
+            _clear(cells.w, lens, owner, plane, normal, walls)
+        readings = without(readings, plane, 2 * TOLERANCE)
 
 
 @kernel
 def _is_wall(
-    readings: Readings, lens: Lens, plane: F8, normal: F8, up: F8, largest_m: float
+    cells: Cells, readings: Readings, plane: F8, normal: F8, up: F8, largest_m: float
 ) -> bool:
+    """Whether the inliers of a plane are more than the face of an object."""
     across = cross(normal, up)
     strips = np.zeros((2, STRIPS))
-    area = readings.share * _measure(readings, lens, plane, normal, across, up, strips)
+    area = readings.share * _measure(readings, cells.lens, plane, normal, across, up, strips)
     # A strip of 5 cm counts that holds 5 cm of wall.
     full = readings.share * strips > STRIP_M**2
     width, height = STRIP_M * np.sum(full[0]), STRIP_M * np.sum(full[1])
-    dense = area > FILLED * width * height
-    return bool(area > LEAST_AREA_M2 and dense and max(width, height) > largest_m)
+    extent = math.hypot(width, height)
+    if area <= LEAST_AREA_M2 or area <= FILLED * width * height or extent <= CUT_OFF * largest_m:
+        return False
+    return bool(extent > largest_m or _is_in_corner(cells.w, readings, plane))
+
+
+@kernel
+def _is_in_corner(w: F4, readings: Readings, plane: F8) -> bool:
+    """Whether the inliers of a plane reach two sides of what is seen at all."""
+    off = readings.w - (plane[0] * readings.j + plane[1] * readings.i + plane[2])
+    near, everything = np.abs(off) < TOLERANCE, readings_of(w, w)
+    sides = 0
+    for own, seen in ((readings.j[near], everything.j), (readings.i[near], everything.i)):
+        margin = 1.5 * math.sqrt(readings.share)
+        sides += np.min(own) < np.min(seen) + margin
+        sides += np.max(own) > np.max(seen) - margin
+    return sides >= 2
 
 
 @kernel(leaf=True)

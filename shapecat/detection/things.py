@@ -1,7 +1,7 @@
-"""Candidates: labelled cells become records, with boxes, supports and flags."""
+"""Things: what is measured of labelled cells: boxes, what they stand on, and flags."""
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -23,9 +23,8 @@ from shapecat.detection.pieces import (
     Pieces,
     depths_of,
 )
-from shapecat.detection.segmentation import Segmentation
 from shapecat.detection.surfaces import span_of
-from shapecat.geometry import gravity_rotation, quaternion_from_rotation
+from shapecat.geometry import level_axes, row_quaternion
 from shapecat.jit import kernel
 
 __all__ = ["Things", "things_of"]
@@ -40,6 +39,10 @@ is below is hidden, and a strip of it may go with the object."""
 LIFTED_M, SUNK_M = 0.03, 0.015
 """What reaches no lower does not stand on the plane; what reaches this much lower than a surface
 does not stand on that."""
+
+
+Turned: TypeAlias = tuple[float, float, float, float]
+"""A quaternion (x, y, z, w)."""
 
 
 class Things(NamedTuple):
@@ -68,15 +71,17 @@ class Things(NamedTuple):
     least: F4
 
 
-def things_of(cells: Cells, found: Segmentation, *, range_m: float) -> Things:
-    """Measure the labels.
+@kernel
+def things_of(
+    cells: Cells, labels: I4, pieces: Pieces, leaders: I4, up: F8, range_m: float
+) -> Things:
+    """Measure the labels, the pieces of each of which are merged into one of ``leaders``.
 
     The box is the smallest over 60 yaws, as `shapecat.geometry.upright_box`, on the outermost
     cells. An object stands on another when it touches surface of it that faces up, more than it
     touches the plane; or, where that contact is hidden, when it ends where the other begins.
     """
-    count = found.leaders.size - 1
-    level = gravity_rotation(found.up)
+    count = leaders.size - 1
     things = Things(
         np.zeros((count, 3)),
         np.zeros((count, 3)),
@@ -89,25 +94,9 @@ def things_of(cells: Cells, found: Segmentation, *, range_m: float) -> Things:
         np.zeros(count, np.bool_),
         np.zeros(count, np.float32),
     )
-    turned = quaternion_from_rotation(level.T)
-    _measure(cells, found.labels, found.pieces, found.leaders, level, turned, range_m, things)
-    return things
-
-
-@kernel
-def _measure(
-    cells: Cells,
-    labels: I4,
-    pieces: Pieces,
-    leaders: I4,
-    level: F8,
-    turned: F8,
-    range_m: float,
-    things: Things,
-) -> None:
-    _measure_boxes(cells.w, cells.lens, labels, level, turned, things)
+    _measure_boxes(cells.w, cells.lens, labels, np.array(level_axes(up[0], up[1], up[2])), things)
     last, depth = count_last(cells.w, labels, leaders.size, range_m), depths_of(pieces)
-    for k in range(leaders.size - 1):
+    for k in range(count):
         p = leaders[k + 1]
         things.last[k], things.least[k] = last[k + 1] >= FEW, small_at(cells, depth[p])
         things.stand[k], things.support_m[k] = _stand(pieces, leaders, p)
@@ -116,6 +105,7 @@ def _measure(
             hidden += pieces.pairs[FRONT, q, p]
         things.hidden[k] = hidden > np.float32(OCCLUDED) * max(pieces.boundary[p], np.float32(1))
     _break_cycles(things)
+    return things
 
 
 @kernel(leaf=True)
@@ -165,8 +155,14 @@ def _break_cycles(things: Things) -> None:
 
 
 @kernel(fast=True)
-def _measure_boxes(w: F4, lens: Lens, labels: I4, level: F8, turned: F8, things: Things) -> None:
+def _measure_boxes(w: F4, lens: Lens, labels: I4, level: F8, things: Things) -> None:
     points, start = _outer_points(w, lens, labels, level, things)
+    back = level.T
+    turned = row_quaternion(
+        (back[0, 0], back[0, 1], back[0, 2]),
+        (back[1, 0], back[1, 1], back[1, 2]),
+        (back[2, 0], back[2, 1], back[2, 2]),
+    )
     reach = np.zeros(4 * YAWS.size, np.float32)
     for k in range(start.size - 1):
         if start[k] < start[k + 1]:
@@ -235,7 +231,7 @@ def _find_outer(labels: I4, i: int, first: int, end: int, outer: Bool) -> None:
 
 @kernel(fast=True, leaf=True)
 def _measure_box(
-    local: F4, first: int, end: int, level: F8, turned: F8, things: Things, k: int, reach: F4
+    local: F4, first: int, end: int, level: F8, turned: Turned, things: Things, k: int, reach: F4
 ) -> None:
     """Write the box of least area around some of the points (3, n), level frame."""
     zs = local[2, first:end]
