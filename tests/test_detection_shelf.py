@@ -39,6 +39,12 @@ def test_corner_of_a_wall_beside_the_table_is_no_object() -> None:
     assert seen("empty", 410029)[1] == []
 
 
+@pytest.mark.parametrize("seed", [370775, 380981])
+def test_wall_in_a_corner_of_the_image_is_no_object(seed: int) -> None:
+    """What is seen of it is no wider than an object, but the image cuts it off on two sides."""
+    assert seen("empty", seed)[1] == []
+
+
 @pytest.mark.parametrize("seed", [313, 336, 581])
 def test_side_of_a_shelf_seen_edge_on_is_no_object(seed: int) -> None:
     """Too narrow in the image to be fitted as a wall, and cut off by a board or the border."""
