@@ -4,6 +4,8 @@ The outline is that of the readings: it ends before the far edge of a table wher
 and at the front edge, over which things may stick out.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
@@ -20,6 +22,31 @@ BEYOND = 5
 """So many times as much of an object may be seen outside as inside."""
 
 
+class Search(NamedTuple):
+    """What is looked at around the outline of a plane.
+
+    Attributes
+    ----------
+    w, lens : as in `Cells`.
+    owner : as in `Heights`.
+    walls : from `clear_walls`.
+    me, plane : the number of the plane in ``owner``, and its row of `table_of`.
+    highest : so high above it an object reaches at most, metres.
+    outside : (rows, columns) float32 heights above it, metres, of the cells looked at.
+    noted : (rows, columns) int8 its number at these.
+    """
+
+    w: F4
+    lens: Lens
+    owner: I4
+    walls: U1
+    me: int
+    plane: F8
+    highest: float
+    outside: F4
+    noted: I4
+
+
 @kernel
 def reach_over(cells: Cells, heights: Heights, planes: F8, walls: U1, highest_m: float) -> None:
     """Give the parts of objects outside the outline of their plane to it, in place.
@@ -32,39 +59,20 @@ def reach_over(cells: Cells, heights: Heights, planes: F8, walls: U1, highest_m:
     planes : the rows of `table_of`.
     walls : from `clear_walls`; what is cleared stays so.
     """
-    outside = unset(heights.owner.shape, np.float32)
-    noted = np.zeros(heights.owner.shape, np.int8)
-    seen = np.zeros(heights.owner.shape, np.int32)
-    stacks = unset((2, cells.w.size), np.int32)
+    w, lens, owner = cells.w, cells.lens, heights.owner
+    outside, noted = unset(owner.shape, np.float32), np.zeros(owner.shape, np.int8)
+    seen, stacks = np.zeros(owner.shape, np.int32), unset((2, w.size), np.int32)
     looks = np.int64(0)  # a literal would be compiled apart
-    for number in range(len(planes), 0, -1):
-        looks = _reach(
-            cells.w, cells.lens, heights, number, planes[number - 1], walls, highest_m,
-            outside, noted, seen, looks, stacks,
-        )  # fmt: skip
+    for me in range(len(planes), 0, -1):
+        search = Search(w, lens, owner, walls, me, planes[me - 1], highest_m, outside, noted)
+        looks = _reach(search, heights.height, seen, looks, stacks)
 
 
 @kernel
-def _reach(
-    w: F4,
-    lens: Lens,
-    heights: Heights,
-    me: int,
-    plane: F8,
-    walls: U1,
-    highest: float,
-    outside: F4,
-    noted: I4,
-    seen: I4,
-    looks: int,
-    stacks: I4,
-) -> int:
-    """Add the parts outside one plane; return how many there were looked at, ``looks`` included.
-
-    Heights above the plane are kept in ``outside`` where ``noted`` has its number.
-    """
+def _reach(search: Search, height: F4, seen: I4, looks: int, stacks: I4) -> int:
+    """Add the parts outside one plane; return how many there were looked at, ``looks`` included."""
+    w, owner, me = search.w, search.owner, search.me
     rows, columns = w.shape
-    owner = heights.owner
     border = np.zeros(columns, np.uint8)
     for i in range(rows):
         if not _find_border(owner, me, i, border):
@@ -75,21 +83,17 @@ def _reach(
             for d in range(4):
                 y = i + (1 if d == 0 else -1 if d == 1 else 0)
                 x = j + (1 if d == 2 else -1 if d == 3 else 0)
-                if not _leads_out(
-                    w, lens, owner, me, plane, walls, highest, outside, noted, i, j, y, x
-                ):
+                if not _leads_out(search, i, j, y, x):
                     continue
                 looks += 1
-                n = _part_outside(
-                    w, lens, owner, me, plane, walls, highest, outside, noted, y, x, stacks[0]
-                )
+                n = _part_outside(search, y, x, stacks[0])
                 enough = max(n // BEYOND, 1)
                 if _part_inside(w, owner, me, seen, looks, i, j, enough, stacks[1]) < enough:
                     continue
                 for t in range(n):
                     v, u = place_of(stacks[0, t], columns)
                     owner[v, u] = me
-                    heights.height[v, u] = outside[v, u]
+                    height[v, u] = search.outside[v, u]
     return looks
 
 
@@ -118,25 +122,12 @@ def _find_border(owner: I4, me: int, i: int, border: U1) -> bool:
 
 
 @kernel(leaf=True)
-def _leads_out(
-    w: F4,
-    lens: Lens,
-    owner: I4,
-    me: int,
-    plane: F8,
-    walls: U1,
-    highest: float,
-    outside: F4,
-    noted: I4,
-    i: int,
-    j: int,
-    y: int,
-    x: int,
-) -> bool:
+def _leads_out(search: Search, i: int, j: int, y: int, x: int) -> bool:
     """Whether what stands on a plane goes on from (i, j) to (y, x) outside; notes its height if so.
 
     There it is above a lower plane or none, and not noted before.
     """
+    w, lens, owner, walls, me, plane, highest, outside, noted = search
     if y < 0 or x < 0 or y >= w.shape[0] or x >= w.shape[1]:
         return False
     if not 0 <= owner[y, x] < me or abs(w[y, x] - w[i, j]) >= JUMP:
@@ -154,22 +145,9 @@ def _leads_out(
 
 
 @kernel(leaf=True)
-def _part_outside(
-    w: F4,
-    lens: Lens,
-    owner: I4,
-    me: int,
-    plane: F8,
-    walls: U1,
-    highest: float,
-    outside: F4,
-    noted: I4,
-    i: int,
-    j: int,
-    stack: I4,
-) -> int:
+def _part_outside(search: Search, i: int, j: int, stack: I4) -> int:
     """Collect the connected cells outside, from one that is above the plane; return how many."""
-    columns = w.shape[1]
+    columns = search.w.shape[1]
     stack[0] = i * columns + j
     done, top = 0, 1
     while done < top:
@@ -178,7 +156,7 @@ def _part_outside(
         for d in range(4):
             y = i + (1 if d == 0 else -1 if d == 1 else 0)
             x = j + (1 if d == 2 else -1 if d == 3 else 0)
-            if _leads_out(w, lens, owner, me, plane, walls, highest, outside, noted, i, j, y, x):
+            if _leads_out(search, i, j, y, x):
                 stack[top] = y * columns + x
                 top += 1
     return top
