@@ -724,6 +724,14 @@ def test_a_row_of_boxes_is_no_wall() -> None:
     check([table(0.6, 0.4), *row], [1, 2, 3, 4, 5], tilt_deg=25, distance=1.2)
 
 
+@pytest.mark.parametrize("width", [0.45, 0.5])
+@pytest.mark.parametrize("y", [0.1, -0.2])
+def test_a_large_box_with_nothing_behind_is_no_wall(width: float, y: float) -> None:
+    """Its front is flat and large, and it is where the readings end, but not the image."""
+    large = box((-0.28, y, 0), (width, 0.06, 0.3), 0.15)
+    check([table(0.5, 0.35), large], [1], tilt_deg=25, distance=1.6)
+
+
 @pytest.mark.parametrize("columns", [1, 3, 213, 320, 641, 1999])
 def test_places_of_flat_cells_are_exact(columns: int) -> None:
     """A product stands for a division: the first cell of a row must not fall into the one above."""

@@ -14,6 +14,7 @@ from shapecat.jit import kernel
 from shapecat.types import Camera
 
 __all__ = [
+    "BORDER",
     "JUMP",
     "NEAREST_M",
     "Cells",
@@ -32,6 +33,8 @@ SMALL_M2 = 9e-4
 """Surface of the smallest object."""
 NEAREST_M = 0.05
 """Nothing measures nearer; keeps inverse depth within bounds."""
+BORDER = 0.12
+"""Share of the image in which its readings may begin: a registered Kinect is blind in a tenth."""
 LARGEST_FACTOR = 16
 MOST_CELLS = 100_000
 """Bounds the time of a frame: images that look far have larger cells."""

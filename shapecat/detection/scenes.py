@@ -7,7 +7,7 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U4, Bool, freeze
 from shapecat.config import DetectionSettings
-from shapecat.detection.cells import NEAREST_M, Cells
+from shapecat.detection.cells import BORDER, NEAREST_M, Cells
 from shapecat.detection.segmentation import Segmentation
 from shapecat.detection.supports import Support, corners_of
 from shapecat.detection.things import Things
@@ -23,8 +23,6 @@ from shapecat.types import Box, Candidate, Plane, Pose, Scene
 
 __all__ = ["scene_of"]
 
-BORDER = 0.12
-"""Share of the image in which its readings may begin: a registered Kinect is blind in a tenth."""
 ENOUGH = 60
 """Cells of what is no noise, however near and therefore small it is."""
 BORDER_CELLS, STRAIGHT, LEAST_FORWARD = 2.5, 0.3, 0.2

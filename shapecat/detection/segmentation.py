@@ -61,6 +61,7 @@ class Rules(NamedTuple):
 
 RULES = Rules._fields
 NO_HINT = np.zeros(3)
+"""Takes the place of a direction away from gravity that is not known."""
 
 
 class Ground(NamedTuple):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
-from shapecat.detection.cells import JUMP, Cells, Lens
+from shapecat.detection.cells import BORDER, JUMP, Cells, Lens
 from shapecat.detection.consensus import (
     TOLERANCE,
     Readings,
@@ -35,7 +35,8 @@ LEAST_PATCH_M2, EXACT = 0.008, 0.0045
 """Smaller parts are cleared that lie in the wall as exactly as its readings do: standard deviation
 in inverse depth."""
 CUT_OFF = 0.75
-"""What two sides of the image cut off is a wall from this share of the largest object on."""
+"""Diagonal of a wall that two sides of the image cut off, as a share of the width of the largest
+object."""
 FILLED = 0.3
 """Share of its extent that a wall fills: the front edges of a shelf lie in a plane too."""
 STRIP_M, STRIPS = 0.05, 400
@@ -95,22 +96,24 @@ def _is_wall(
     # A strip of 5 cm counts that holds 5 cm of wall.
     full = readings.share * strips > STRIP_M**2
     width, height = STRIP_M * np.sum(full[0]), STRIP_M * np.sum(full[1])
-    extent = math.hypot(width, height)
-    if area <= LEAST_AREA_M2 or area <= FILLED * width * height or extent <= CUT_OFF * largest_m:
+    if area <= LEAST_AREA_M2 or area <= FILLED * width * height:
         return False
-    return bool(extent > largest_m or _is_in_corner(cells.w, readings, plane))
+    if math.hypot(width, height) > CUT_OFF * largest_m and _is_cut_off(cells.w, readings, plane):
+        return True
+    return bool(max(width, height) > largest_m)
 
 
 @kernel
-def _is_in_corner(w: F4, readings: Readings, plane: F8) -> bool:
-    """Whether the inliers of a plane reach two sides of what is seen at all."""
+def _is_cut_off(w: F4, readings: Readings, plane: F8) -> bool:
+    """Whether the inliers of a plane reach two sides of the image, or of its readings near them."""
     off = readings.w - (plane[0] * readings.j + plane[1] * readings.i + plane[2])
     near, everything = np.abs(off) < TOLERANCE, readings_of(w, w)
-    sides = 0
-    for own, seen in ((readings.j[near], everything.j), (readings.i[near], everything.i)):
-        margin = 1.5 * math.sqrt(readings.share)
-        sides += np.min(own) < np.min(seen) + margin
-        sides += np.max(own) > np.max(seen) - margin
+    across = (readings.j[near], everything.j, w.shape[1])
+    down = (readings.i[near], everything.i, w.shape[0])
+    sides, margin = 0, 1.5 * math.sqrt(readings.share)
+    for own, seen, lines in (across, down):
+        sides += np.min(own) < min(np.min(seen) + margin, BORDER * lines)
+        sides += np.max(own) > max(np.max(seen) - margin, (1 - BORDER) * lines)
     return sides >= 2
 
 
