@@ -41,7 +41,7 @@ def test_corner_of_a_wall_beside_the_table_is_no_object() -> None:
 
 @pytest.mark.parametrize("seed", [370775, 380981])
 def test_wall_in_a_corner_of_the_image_is_no_object(seed: int) -> None:
-    """What is seen of it is no wider than an object, but the image cuts it off on two sides."""
+    """Little of it is seen, but the image cuts it off on two sides."""
     assert seen("empty", seed)[1] == []
 
 
