@@ -17,10 +17,10 @@ import click
 
 from benchmarks.measure import markdown, save
 from benchmarks.whole import tabletop, write
-from shapecat.jobs import Job
 from shapecat.pipeline import annotate, process
 from shapecat.recordings import open_recording
-from shapecat.run_folder import read_run
+from shapecat.runs.folder import read_run
+from shapecat.runs.jobs import Job
 
 
 def timed(work: Callable[[], object]) -> float:

@@ -23,7 +23,7 @@ from benchmarks.measure import markdown, save
 from shapecat.batch.manifest import Entry, Manifest
 from shapecat.batch.plans import plan_batch
 from shapecat.executors import open_executor
-from shapecat.jobs import Job
+from shapecat.runs.jobs import Job
 
 ROOT = Path(__file__).parents[1]
 WORKERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)

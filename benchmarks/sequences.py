@@ -23,10 +23,10 @@ from scipy.optimize import linear_sum_assignment
 
 from benchmarks.measure import markdown
 from shapecat.arrays import F8, U1
-from shapecat.corrections import read_track_table
 from shapecat.evaluation.metrics import expected_calibration_error
-from shapecat.jobs import Job
 from shapecat.pipeline import process
+from shapecat.runs.corrections import read_track_table
+from shapecat.runs.jobs import Job
 from shapecat.simulation import simulate
 from shapecat.simulation.scenes import SceneKind
 from shapecat.tracking.fusion import fuse, view_weights

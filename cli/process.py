@@ -94,7 +94,7 @@ def process(
     from shapecat.batch import exit_code
     from shapecat.batch.plans import plan_batch
     from shapecat.config import load_settings
-    from shapecat.jobs import Job
+    from shapecat.runs.jobs import Job
 
     job = Job(
         source=Path(),

@@ -13,29 +13,32 @@ from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
-from shapecat.corrections import TrackLabel, adopt_labels, read_labels
+import pyarrow as pa
+
 from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.detection import RecentFrames
 from shapecat.errors import NoStreamError, OutputError
 from shapecat.executors.order import Processes, read_ahead
 from shapecat.jit import CompileClock, compile_clock
-from shapecat.jobs import Job, Summary, describe_run, resume, same_work, summarize
-from shapecat.labels import read_labelled_frames
 from shapecat.learning import Categorizer, load_model
 from shapecat.outputs.rereading import with_clouds
 from shapecat.perception import Perceiver, View
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
 from shapecat.recordings.gravity import Upright
-from shapecat.run_folder import read_run, staged, sweep, write_run
-from shapecat.shown import read_shown_frames
-from shapecat.tables import (
+from shapecat.runs.corrections import TrackLabel, adopt_labels, read_labels
+from shapecat.runs.folder import read_run, staged, sweep, write_run
+from shapecat.runs.jobs import Job, Summary, describe_run, resume, same_work, summarize
+from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.shown import read_shown_frames
+from shapecat.runs.tables import (
     FrameRow,
     PerceptionTables,
     count_rows,
     discard_segments,
+    read_row_groups,
     release_memory,
 )
-from shapecat.tracks import track_run
+from shapecat.runs.tracks import track_run
 from shapecat.types import Frame, LabelledFrame, ShownFrame
 
 __all__ = ["Observer", "annotate", "annotate_again", "perceive_all", "process", "track"]
@@ -187,8 +190,14 @@ def perceive_all(
     run["counts"] = {"frames": count, "skipped": dict(skipped), "detections": found}
     if tables.done:
         run["counts"]["resumed"] = tables.done
-    run["fixed_frame"], run["up"] = upright.fixed_frame, upright.report(folder)
+    run["fixed_frame"], run["up"] = upright.fixed_frame, upright.report(_perceived(folder))
     run["warnings"] = [*recording.warnings, *upright.warnings, *recent.warnings()]
+
+
+def _perceived(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
+    """Yield what the tables say of up, frames beside planes."""
+    frames = read_row_groups(folder / "frames.parquet", ["topic", "frame", "up", "up_given"])
+    return zip(frames, read_row_groups(folder / "planes.parquet", ["topic", "frame"]), strict=True)
 
 
 def track(folder: Path, run: dict[str, Any], job: Job) -> None:

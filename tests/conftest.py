@@ -63,7 +63,7 @@ class Guesser:
 def guessed_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Process a short simulated recording; its categories are guesses. Copy it to change it."""
     import shapecat.pipeline  # noqa: PLC0415  only the tests that ask for it pay for it
-    from shapecat.jobs import Job  # noqa: PLC0415  the same
+    from shapecat.runs.jobs import Job  # noqa: PLC0415  the same
     from shapecat.simulation import simulate  # noqa: PLC0415  the same
 
     folder = tmp_path_factory.mktemp("guessed")

@@ -13,27 +13,22 @@ STAGES = {"detection", "surface", "description", "learning", "tracking"}
 BASE = {"arrays", "errors", "jit", "triangles", "types"}
 FLOOR = {
     **dict.fromkeys(BASE | {"__init__", "py"}, 0),
-    **dict.fromkeys(("config", "geometry", "run_folder", "executors"), 1),
+    **dict.fromkeys(("config", "geometry", "files", "executors"), 1),
     **dict.fromkeys(
         (
             *STAGES,
             "recordings",
             "simulation",
             "schemas",
-            "tables",
-            "corrections",
-            "labels",
-            "shown",
         ),
         2,
     ),
-    **dict.fromkeys(
-        ("outputs", "evaluation", "models", "perception", "rehearsal", "jobs", "tracks"), 3
-    ),
-    "pipeline": 4,
-    "batch": 5,
-    "cli": 6,
-    "__main__": 6,
+    **dict.fromkeys(("runs", "perception", "rehearsal"), 3),
+    **dict.fromkeys(("outputs", "evaluation", "models"), 4),
+    "pipeline": 5,
+    "batch": 6,
+    "cli": 7,
+    "__main__": 7,
 }
 FILES = sorted([*ROOT.glob("shapecat/**/*.py"), *ROOT.glob("cli/*.py")])
 

@@ -23,7 +23,7 @@ from shapecat.batch.finding import find_recordings
 from shapecat.batch.manifest import Manifest
 from shapecat.errors import RecordingError
 from shapecat.executors import LocalExecutor, WorkerLostError, open_executor
-from shapecat.jobs import Job
+from shapecat.runs.jobs import Job
 from tests.scenes import record
 from tests.test_executors import alive, wait_for
 

@@ -14,9 +14,9 @@ from click.testing import Result
 
 from shapecat.config import Settings
 from shapecat.errors import OutputError
-from shapecat.jobs import Job
 from shapecat.pipeline import process
-from shapecat.run_folder import read_run
+from shapecat.runs.folder import read_run
+from shapecat.runs.jobs import Job
 from tests.scenes import record
 
 FRAMES = 70

@@ -13,7 +13,6 @@ import pytest
 from click.testing import Result
 from numpy.testing import assert_allclose
 
-from shapecat.corrections import TrackLabel, adopt_labels, read_track_table
 from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.dataset import read_dataset
 from shapecat.geometry import rotation_from_quaternion
@@ -21,6 +20,7 @@ from shapecat.outputs.exports import export_run
 from shapecat.outputs.exports_kitti import rectified_from_sensor
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.rereading import FinishedRun, read_finished
+from shapecat.runs.corrections import TrackLabel, adopt_labels, read_track_table
 from shapecat.types import Box, Frame, LabelledFrame, LabelledObject, NeuralGas
 
 Run = Callable[..., Result]

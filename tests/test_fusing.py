@@ -16,10 +16,10 @@ from shapecat.detection import Earlier, RecentFrames, fuse
 from shapecat.detection.fusing import AGREE, REACH
 from shapecat.errors import ConfigError
 from shapecat.geometry import IDENTITY
-from shapecat.jobs import Job
 from shapecat.perception import perceive
 from shapecat.pipeline import process
-from shapecat.run_folder import read_run
+from shapecat.runs.folder import read_run
+from shapecat.runs.jobs import Job
 from shapecat.simulation import KINECT, make_scene, render_frame
 from shapecat.simulation.messages import MessageFactory
 from shapecat.simulation.paths import looking_at

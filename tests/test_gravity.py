@@ -8,11 +8,11 @@ import pytest
 
 from shapecat.errors import ConfigError
 from shapecat.geometry import IDENTITY
-from shapecat.jobs import Job
 from shapecat.pipeline import process
 from shapecat.recordings import open_recording
 from shapecat.recordings.gravity import Upright
-from shapecat.run_folder import read_run
+from shapecat.runs.folder import read_run
+from shapecat.runs.jobs import Job
 from shapecat.simulation.messages import MessageFactory
 from shapecat.types import Frame, Pose
 from tests.messages import CAMERA, EPOCH, SECOND, header, make, write

@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
-from shapecat.corrections import TrackLabel, adopt_labels, read_labels, read_track_table
 from shapecat.errors import OutputError
-from shapecat.labels import read_labelled_frames
 from shapecat.pipeline import annotate_again
-from shapecat.tables import TRACKS, FrameRow, PerceptionTables, write_table
+from shapecat.runs.corrections import TrackLabel, adopt_labels, read_labels, read_track_table
+from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.tables import TRACKS, FrameRow, PerceptionTables, write_table
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
 
 HEADER = "track,first_s,category,confidence,label,topic\n"

@@ -2,8 +2,8 @@
 
 from pathlib import Path
 
-from shapecat.jobs import Job
 from shapecat.pipeline import process
+from shapecat.runs.jobs import Job
 from tests.scenes import record
 
 PAGE = 4096

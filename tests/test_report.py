@@ -18,12 +18,12 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 
-from shapecat.corrections import TrackRow, TrackTable, read_labels, read_track_table
 from shapecat.outputs.report import write_report, write_reports
 from shapecat.outputs.report_drawing import SIDE, Snapshot, draw
 from shapecat.outputs.report_page import Card, run_page
 from shapecat.outputs.report_tracks import Course, read_courses
 from shapecat.outputs.rereading import FinishedRun, read_finished
+from shapecat.runs.corrections import TrackRow, TrackTable, read_labels, read_track_table
 from shapecat.types import NeuralGas
 
 Run = Callable[..., Result]

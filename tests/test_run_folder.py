@@ -3,7 +3,8 @@ from pathlib import Path
 import pytest
 
 from shapecat.errors import OutputError
-from shapecat.run_folder import digest, read_run, replacing, staged, write_run
+from shapecat.files import replacing
+from shapecat.runs.folder import digest, read_run, staged, write_run
 
 
 def test_folder_appears_whole(tmp_path: Path) -> None:

@@ -5,10 +5,10 @@ import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_allclose
 
-from shapecat.corrections import TrackLabel
 from shapecat.errors import OutputError
-from shapecat.labels import read_labelled_frames
-from shapecat.tables import (
+from shapecat.runs.corrections import TrackLabel
+from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.tables import (
     DETECTIONS,
     FRAMES,
     PLANES,

@@ -15,9 +15,10 @@ from shapecat.batch.finding import find_recordings
 from shapecat.batch.manifest import Entry, Manifest
 from shapecat.batch.remote import look_at, output_place
 from shapecat.errors import ConfigError, OutputError
-from shapecat.jobs import Job
+from shapecat.files import partial_folder
 from shapecat.learning import load_model
-from shapecat.run_folder import partial_folder, read_run
+from shapecat.runs.folder import read_run
+from shapecat.runs.jobs import Job
 
 __all__ = [
     "Batch",

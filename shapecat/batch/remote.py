@@ -16,7 +16,7 @@ from threading import Event, Thread
 from typing import Any
 
 from shapecat.errors import ConfigError, OutputError, RecordingError, ShapecatError
-from shapecat.run_folder import lock
+from shapecat.files import lock
 
 __all__ = [
     "Place",

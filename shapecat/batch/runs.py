@@ -16,9 +16,9 @@ from shapecat.batch.plans import Task
 from shapecat.batch.remote import download, fetch, look_at, scratch, upload
 from shapecat.errors import OutputError, ShapecatError
 from shapecat.executors import Mailbox, is_dropped, is_lost, post
-from shapecat.jobs import Job, Summary, summarize
 from shapecat.pipeline import Observer, process
-from shapecat.run_folder import read_run
+from shapecat.runs.folder import read_run
+from shapecat.runs.jobs import Job, Summary, summarize
 
 __all__ = ["Outcome", "Watcher", "attempt", "exit_code", "process_here", "process_on"]
 

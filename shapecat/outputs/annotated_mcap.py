@@ -14,12 +14,12 @@ from itertools import chain, islice, pairwise
 from pathlib import Path
 from typing import BinaryIO
 
+from shapecat.files import replacing
 from shapecat.outputs.annotation import Annotation, AnnotationChannel, Item
 from shapecat.outputs.annotations import ENCODERS, Encode, encoder_for
 from shapecat.outputs.mcap_append import Appender, copy_bytes
 from shapecat.recordings import Recording
 from shapecat.recordings.mcap_file import McapRecording, Summary
-from shapecat.run_folder import replacing
 from shapecat.types import ShownFrame
 
 __all__ = ["write_annotated"]

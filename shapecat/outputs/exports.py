@@ -11,7 +11,7 @@ from shapecat.outputs.exports_kitti import write_kitti
 from shapecat.outputs.exports_labelcloud import write_labelcloud
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.rereading import FinishedRun, open_source, read_finished, with_clouds
-from shapecat.run_folder import staged
+from shapecat.runs.folder import staged
 from shapecat.types import Frame, LabelledFrame
 
 __all__ = ["FORMATS", "export_run"]

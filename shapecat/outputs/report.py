@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from shapecat.corrections import read_track_table
 from shapecat.errors import OutputError
+from shapecat.files import replacing
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.report_drawing import draw
 from shapecat.outputs.report_page import Card, Listed, index_page, is_unsure, run_page
 from shapecat.outputs.report_tracks import read_courses, read_portraits, read_stage_seconds
 from shapecat.outputs.rereading import read_finished
-from shapecat.run_folder import replacing
+from shapecat.runs.corrections import read_track_table
 
 __all__ = ["find_runs", "write_report", "write_reports"]
 

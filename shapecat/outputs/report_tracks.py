@@ -11,12 +11,12 @@ import pyarrow.compute
 import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, F8, Bool, Record, array
-from shapecat.corrections import TrackRow
 from shapecat.errors import RecordingError, ShapecatError
 from shapecat.geometry import level_from_sensor, transform
 from shapecat.outputs.report_drawing import Snapshot
 from shapecat.outputs.rereading import FinishedRun, clouds_again, open_source
-from shapecat.tables import read_row_groups
+from shapecat.runs.corrections import TrackRow
+from shapecat.runs.tables import read_row_groups
 from shapecat.types import Frame, NeuralGas
 
 __all__ = ["Course", "Portrait", "read_courses", "read_portraits", "read_stage_seconds"]

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from shapecat.corrections import TrackLabel, read_labels
 from shapecat.errors import OutputError
-from shapecat.labels import read_labelled_frames
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
-from shapecat.run_folder import digest, read_run
+from shapecat.runs.corrections import TrackLabel, read_labels
+from shapecat.runs.folder import digest, read_run
+from shapecat.runs.labels import read_labelled_frames
 from shapecat.types import Frame, LabelledFrame
 
 __all__ = ["FinishedRun", "clouds_again", "open_source", "read_finished", "with_clouds"]

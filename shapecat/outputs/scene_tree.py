@@ -9,9 +9,9 @@ import pyarrow as pa
 
 from shapecat.detection.hierarchy import Node, format_tree
 from shapecat.errors import OutputError
-from shapecat.labels import read_labelled_frames
 from shapecat.outputs.rereading import FinishedRun, read_finished
-from shapecat.tables import read_row_groups
+from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.tables import read_row_groups
 from shapecat.types import Box, Candidate, Plane, Scene
 
 __all__ = ["describe_scene", "read_scene"]

@@ -1,10 +1,11 @@
 """Where up is, and where the sensor is, in each frame of a recording."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
 
 from shapecat.arrays import F4
 from shapecat.errors import ConfigError
@@ -16,7 +17,6 @@ from shapecat.recordings.transforms import (
     fixed_frame,
     read_transforms,
 )
-from shapecat.tables import read_row_groups
 from shapecat.types import Frame, Pose
 
 __all__ = ["Upright"]
@@ -121,14 +121,14 @@ class Upright:
             self._first_failure = self._first_failure or str(error)
             return None
 
-    def report(self, folder: Path) -> dict[str, Any]:
+    def report(self, perceived: Iterable[tuple[pa.Table, pa.Table]]) -> dict[str, Any]:
         """Return where up came from and how well the planes found agree, for run.json.
 
         Adds to ``warnings`` what a person should know.
 
         Parameters
         ----------
-        folder : of the run, with its tables of frames and planes.
+        perceived : the run's tables of frames and planes, row group by row group.
         """
         if self._failed:
             self.warnings.append(
@@ -139,11 +139,11 @@ class Upright:
         if len(self._given) > 1:
             report["frames"] = dict(self._given)
         if set(self._given) - {"planes"}:
-            report |= self._agreement(folder)
+            report |= self._agreement(perceived)
         return report
 
-    def _agreement(self, folder: Path) -> dict[str, Any]:
-        angles, bare = _angles_to_planes(folder)
+    def _agreement(self, perceived: Iterable[tuple[pa.Table, pa.Table]]) -> dict[str, Any]:
+        angles, bare = _angles_to_planes(perceived)
         typical = round(float(np.median(angles)), 1) if angles else None
         if typical is not None and typical > _DISAGREE_DEG:
             self.warnings.append(f"up and the planes found differ by {typical} degrees")
@@ -152,15 +152,15 @@ class Upright:
         return {"planes_differ_deg": typical, "frames_without_plane": bare}
 
 
-def _angles_to_planes(folder: Path) -> tuple[list[float], int]:
+def _angles_to_planes(
+    perceived: Iterable[tuple[pa.Table, pa.Table]],
+) -> tuple[list[float], int]:
     """Return the angle, in degrees, from the given up to that of the planes for each frame.
 
     Also the number of frames with a given up and without a plane.
     """
     angles, bare = [], 0
-    names = ("frames", ["topic", "frame", "up", "up_given"]), ("planes", ["topic", "frame"])
-    groups = (read_row_groups(folder / f"{name}.parquet", columns) for name, columns in names)
-    for frames, planes in zip(*groups, strict=True):
+    for frames, planes in perceived:
         level = {(row["topic"], row["frame"]) for row in planes.to_pylist()}
         for row in frames.to_pylist():
             if row["up_given"] is None:

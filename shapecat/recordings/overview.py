@@ -3,9 +3,9 @@
 from pathlib import Path
 from typing import Any
 
+from shapecat.files import input_size
 from shapecat.recordings.opening import open_recording
 from shapecat.recordings.streams import cloud_streams
-from shapecat.run_folder import input_size
 
 __all__ = ["describe_recording"]
 

@@ -10,10 +10,10 @@ import pyarrow as pa
 import pyarrow.compute
 
 from shapecat.arrays import F4
-from shapecat.corrections import TrackLabel
 from shapecat.geometry import box_corners, upright_box
-from shapecat.shown import ShownTracks
-from shapecat.tables import numbers, read_row_groups
+from shapecat.runs.corrections import TrackLabel
+from shapecat.runs.shown import ShownTracks
+from shapecat.runs.tables import numbers, read_row_groups
 from shapecat.types import Box, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 
 __all__ = ["read_labelled_frames"]

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, I4
 from shapecat.errors import OutputError
-from shapecat.run_folder import complete_folder, replacing
+from shapecat.files import complete_folder, replacing
 from shapecat.types import Perception, Pose
 
 __all__ = [

@@ -1,6 +1,5 @@
 """The folder of one run: built under a hidden name, renamed when complete."""
 
-import fcntl
 import hashlib
 import json
 import os
@@ -11,16 +10,12 @@ from pathlib import Path
 from typing import Any
 
 from shapecat.errors import OutputError
+from shapecat.files import lock, partial_folder, replacing
 
 __all__ = [
-    "complete_folder",
     "digest",
     "empty",
-    "input_size",
-    "lock",
-    "partial_folder",
     "read_run",
-    "replacing",
     "staged",
     "sweep",
     "write_run",
@@ -79,39 +74,8 @@ def sweep(folder: Path) -> None:
                 shutil.rmtree(partial_folder(folder), ignore_errors=True)
 
 
-@contextmanager
-def complete_folder(folder: Path) -> Iterator[Path]:
-    """Give a hidden folder that takes the name ``folder`` when the block succeeds.
-
-    Whatever a kill left half-made of it is discarded first.
-    """
-    hidden = partial_folder(folder)
-    shutil.rmtree(hidden, ignore_errors=True)
-    hidden.mkdir(parents=True)
-    yield hidden
-    hidden.rename(folder)
-
-
 class _BusyError(Exception):
     """Another process holds the folder."""
-
-
-def lock(folder: Path) -> int | None:
-    """Lock a folder for as long as this process lives, or until the number given is closed.
-
-    Returns
-    -------
-    None if another process holds it. A file system without locks never says so.
-    """
-    held = os.open(folder, os.O_RDONLY)
-    try:
-        fcntl.flock(held, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(held)
-        return None
-    except OSError:
-        pass
-    return held
 
 
 @contextmanager
@@ -123,11 +87,6 @@ def _locked(folder: Path) -> Iterator[None]:
         yield
     finally:
         os.close(held)
-
-
-def partial_folder(folder: Path) -> Path:
-    """Return the hidden folder that a run works in before it takes its name."""
-    return folder.with_name(f".{folder.name}.partial")
 
 
 def _old(folder: Path) -> Path:
@@ -152,26 +111,6 @@ def _swap(new: Path, folder: Path) -> None:
         folder.rename(old)
     new.rename(folder)
     shutil.rmtree(old, ignore_errors=True)
-
-
-@contextmanager
-def replacing(path: Path) -> Iterator[Path]:
-    """Give a hidden path beside ``path`` that takes its name when the block succeeds."""
-    hidden = path.with_name(f".{path.name}.partial")
-    try:
-        yield hidden
-        hidden.replace(path)
-    except OSError as error:
-        msg = f"{path}: cannot be written: {error.strerror or error}"
-        raise OutputError(msg) from error
-    finally:
-        hidden.unlink(missing_ok=True)
-
-
-def input_size(path: Path) -> int:
-    """Return the bytes of a file, or of the files of a folder."""
-    files = path.iterdir() if path.is_dir() else [path]
-    return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def digest(path: Path) -> str:

@@ -14,7 +14,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from shapecat.errors import OutputError
-from shapecat.run_folder import read_run, replacing
+from shapecat.files import replacing
+from shapecat.runs.folder import read_run
 from shapecat.types import CATEGORIES
 
 __all__ = [

@@ -12,10 +12,10 @@ import pyarrow.compute
 import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.corrections import TrackLabel
 from shapecat.executors.order import read_ahead
 from shapecat.geometry import box_corners, upright_box
-from shapecat.tables import (
+from shapecat.runs.corrections import TrackLabel
+from shapecat.runs.tables import (
     Key,
     frame_rows,
     numbers,
@@ -97,7 +97,7 @@ class ShownTracks:
 def read_shown_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[ShownFrame]:
     """Yield what the annotations of a run say, frame by frame in the order they were read.
 
-    As `shapecat.labels.read_labelled_frames`, without points, surfaces and posteriors, several
+    As `shapecat.runs.labels.read_labelled_frames`, without points, surfaces and posteriors, several
     times as fast.
     """
     shown = ShownTracks.read(folder, labels)

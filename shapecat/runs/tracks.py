@@ -12,8 +12,8 @@ import pyarrow.compute
 from scipy.spatial.transform import Rotation
 
 from shapecat.config import TrackingSettings
-from shapecat.run_folder import replacing
-from shapecat.tables import TRACKS, frame_rows, lists, numbers, read_row_groups, write_table
+from shapecat.files import replacing
+from shapecat.runs.tables import TRACKS, frame_rows, lists, numbers, read_row_groups, write_table
 from shapecat.tracking import FrameDetections, Track, track_recording
 
 __all__ = ["track_run"]

@@ -12,8 +12,9 @@ from typing import Any
 from shapecat import __version__
 from shapecat.config import Settings
 from shapecat.errors import OutputError
+from shapecat.files import input_size
 from shapecat.learning import Categorizer
-from shapecat.run_folder import digest, empty, input_size, read_run, write_run
+from shapecat.runs.folder import digest, empty, read_run, write_run
 
 __all__ = ["Job", "Summary", "describe_run", "resume", "same_work", "summarize"]
 
