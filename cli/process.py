@@ -7,6 +7,8 @@ from typing import Any
 
 import click
 
+from shapecat.stopping import Stopped
+
 from .options import config_option, json_option, model_option, set_option
 from .progress import KINDS, Progress, describe_plan, open_progress
 from .render import count_words, print_json, print_table
@@ -137,9 +139,12 @@ def _run(
 
 @contextmanager
 def _closing(executor: Any) -> Iterator[Any]:
-    """Let the workers end when all is done; kill them when it is not, as after Ctrl-C."""
+    """Let the workers end when all is done; have them put their work down after a signal."""
     try:
         yield executor
+    except Stopped:
+        getattr(executor, "stop", executor.terminate)()  # Dask and Ray have no way to ask
+        raise
     except BaseException:
         executor.terminate()
         raise

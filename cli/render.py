@@ -7,6 +7,8 @@ from typing import Any
 
 import click
 
+from shapecat import stopping
+
 PHASES = {
     "simulate": "simulating",
     "perceive": "finding and categorizing objects",
@@ -28,7 +30,8 @@ class Bars:
         self._tasks: dict[str, Any] = {}
 
     def __call__(self, phase: str, done: int, total: int | None) -> None:
-        """Show how far a phase has come."""
+        """Show how far a phase has come; end the work here if a signal has asked for it."""
+        stopping.check()
         if phase == "compile":
             click.echo(COMPILING, err=True)
             return

@@ -7,7 +7,7 @@ Each can be run again alone.
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from itertools import islice
 from pathlib import Path
@@ -15,9 +15,10 @@ from typing import Any, TypeVar
 
 import pyarrow as pa
 
+from shapecat import stopping
 from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.detection import RecentFrames
-from shapecat.errors import NoStreamError, OutputError
+from shapecat.errors import NoStreamError, OutputError, RecordingError
 from shapecat.executors.order import Processes, read_ahead
 from shapecat.jit import CompileClock, compile_clock
 from shapecat.learning import Categorizer, load_model
@@ -26,14 +27,24 @@ from shapecat.perception import Perceiver, View
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
 from shapecat.recordings.gravity import Upright
 from shapecat.runs.corrections import TrackLabel, adopt_labels, read_labels
-from shapecat.runs.folder import read_run, staged, sweep, write_run
-from shapecat.runs.jobs import Job, Summary, describe_run, resume, same_work, summarize
+from shapecat.runs.folder import (
+    clear,
+    made_by_run,
+    read_run,
+    recover,
+    staged,
+    sweep,
+    write_run,
+)
+from shapecat.runs.identity import ContentDigest, same_content, unchanged, work_id
+from shapecat.runs.jobs import Job, Summary, describe_run, resume, same_options, summarize
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.shown import read_shown_frames
 from shapecat.runs.tables import (
     FrameRow,
     PerceptionTables,
     count_rows,
+    count_segments,
     discard_segments,
     read_row_groups,
     release_memory,
@@ -70,18 +81,25 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
 
     Raises
     ------
-    RecordingError, NoStreamError, ModelError, OutputError : with nothing left behind.
+    RecordingError, NoStreamError, ModelError, OutputError : what was perceived before is kept.
+    Stopped : a signal has asked for it; the frames in work are finished and kept.
     """
     begun = time.perf_counter()
-    with open_recording(job.source) as recording, _compile_clock(observe, cores) as compiled:
+    with (
+        open_recording(job.source) as recording,
+        ContentDigest(job.source) as content,
+        _compile_clock(observe, cores) as compiled,
+    ):
         categorizer = load_model(job.model)
         categorizer.require_descriptor(DESCRIPTOR_NAMES)
         run = describe_run(job, categorizer)
         run["options"]["topics"] = [s.topic for s in choose_streams(recording, job.topics)]
-        if job.folder.exists() and not job.overwrite:
-            return _finished(job, recording, run, observe)
-        with staged(job.folder) as folder:
-            run = resume(folder, run)
+        recover(job.folder)
+        if made_by_run(job.folder) is not None and not job.overwrite:
+            return _finished(job, recording, run, content, observe)
+        with staged(job.folder, worth_keeping=_has_work) as folder:
+            run = resume(folder, run, job.source, content.result)
+            content.start()
             earlier = sum(run["seconds"].values())
             _once(
                 "perceive",
@@ -91,13 +109,40 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
                     recording, folder, run, job, categorizer, observe, cores=cores
                 ),
             )
+            _identify(run, content)
+            write_run(folder, run)
             discard_segments(folder)
             _once("track", folder, run, lambda: track(folder, run, job))
             annotate(folder, recording, run, observe, cores=cores)
+            _require_unchanged(folder, run, job)
             run["seconds"]["compile"] = compiled.seconds
             run["seconds"]["total"] = earlier + time.perf_counter() - begun
             write_run(folder, run)
     return summarize(job, run)
+
+
+def _has_work(folder: Path) -> bool:
+    """Return whether a run that was cut short has got so far that it can be resumed."""
+    return count_segments(folder) > 0 or (folder / "frames.parquet").exists()
+
+
+def _identify(run: dict[str, Any], content: ContentDigest) -> None:
+    """Note the digest of the input, now that it was read, and the name of the work."""
+    run["input"]["digest"] = run["input"]["digest"] or content.result()
+    run["work"] = work_id(run)
+
+
+def _require_unchanged(folder: Path, run: Mapping[str, Any], job: Job) -> None:
+    """Discard results that may be of two recordings.
+
+    Raises
+    ------
+    RecordingError : the recording was written to while it was read.
+    """
+    if not unchanged(run["input"]["files"], job.source):
+        clear(folder)
+        msg = f"{job.source}: has changed while it was processed; run the same command again"
+        raise RecordingError(msg)
 
 
 def _once(phase: str, folder: Path, run: dict[str, Any], work: Callable[[], None]) -> None:
@@ -130,11 +175,15 @@ def _compile_clock(observe: Observer, cores: int) -> Iterator[CompileClock]:
 
 
 def _finished(
-    job: Job, recording: Recording, planned: dict[str, Any], observe: Observer
+    job: Job,
+    recording: Recording,
+    planned: dict[str, Any],
+    content: ContentDigest,
+    observe: Observer,
 ) -> Summary:
     """Return what a complete folder holds, after removing or finishing what a kill left of it."""
     run = read_run(job.folder)
-    if not same_work(run, planned):
+    if not (same_options(run, planned) and same_content(run["input"], job.source, content.result)):
         msg = (
             f"{job.folder}: holds the results of another input, model or settings; "
             "choose another --out, or --overwrite it"
@@ -158,6 +207,7 @@ def perceive_all(
     """Write frames, detections and planes, frame by frame in flat memory."""
     skipped: Counter[str] = Counter()
     source, total = _select(recording, run["options"], skipped)
+    source = stopping.until_asked(_readable(source, job))
     recent = RecentFrames(job.settings.detection.fuse_frames)
     count = 0
     with (
@@ -182,6 +232,7 @@ def perceive_all(
             count += 1
             tables.write(perception, row)
             observe("perceive", count, total)
+        stopping.check()
     if not count:
         reasons = ", ".join(f"{n} {reason}" for reason, n in skipped.items()) or "none in range"
         msg = f"{job.source}: no usable frame on {', '.join(run['options']['topics'])} ({reasons})"
@@ -192,6 +243,15 @@ def perceive_all(
         run["counts"]["resumed"] = tables.done
     run["fixed_frame"], run["up"] = upright.fixed_frame, upright.report(_perceived(folder))
     run["warnings"] = [*recording.warnings, *upright.warnings, *recent.warnings()]
+
+
+def _readable(source: Iterator[Frame], job: Job) -> Iterator[Frame]:
+    """Yield frames; what a failing disk raises is an error of the recording, not of the results."""
+    try:
+        yield from source
+    except OSError as error:
+        msg = f"{job.source}: cannot be read: {error.strerror or error}"
+        raise RecordingError(msg) from error
 
 
 def _perceived(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
@@ -290,5 +350,6 @@ def _observed(
     items: Iterator[_Shown], phase: str, total: int, observe: Observer
 ) -> Iterator[_Shown]:
     for done, item in enumerate(items, start=1):
+        stopping.check()
         yield item
         observe(phase, done, total)

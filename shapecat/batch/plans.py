@@ -15,7 +15,7 @@ from shapecat.batch.finding import find_recordings
 from shapecat.batch.manifest import Entry, Manifest
 from shapecat.batch.remote import look_at, output_place
 from shapecat.errors import ConfigError, OutputError
-from shapecat.files import partial_folder
+from shapecat.files import partial_path
 from shapecat.learning import load_model
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
@@ -176,7 +176,7 @@ def _task(job: Job, manifest: Manifest | None, model_id: str) -> Task:
     key, size = look_at(job.origin) if job.origin else _input_key(job.source)
     work = _work_key(job, model_id)
     status: Status = "new"
-    if partial_folder(job.folder).exists():
+    if partial_path(job.folder).exists():
         status = "resume"
     elif _exists(job) and not job.overwrite:
         same = entry is not None and (entry.input, entry.work) == (key, work)

@@ -6,11 +6,13 @@ import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Executor, Future
+from contextlib import suppress
 from dataclasses import dataclass
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from threading import Lock
 from typing import Any, Protocol
 
+from shapecat import stopping
 from shapecat.batch.manifest import Entry, Manifest
 from shapecat.batch.plans import Task
 from shapecat.batch.remote import download, fetch, look_at, scratch, upload
@@ -32,6 +34,10 @@ _REPORT_S = 0.2
 """A worker tells how far it is no more often than this."""
 
 
+_HEED_S = 0.1
+"""Whoever waits for workers looks so often whether a signal has come."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What became of one job: a summary, or a message and the exit code it stands for."""
@@ -40,6 +46,9 @@ class Outcome:
     summary: Summary | None = None
     message: str = ""
     code: int = 0
+
+
+_Ended = tuple[Job, Future[Outcome]]
 
 
 class Watcher(Protocol):
@@ -58,6 +67,7 @@ def process_here(
     """Process the tasks one after the other in this process; yield what became of each."""
     ledger = _Ledger(tasks, manifest)
     for task in tasks:
+        stopping.check()
         name = task.job.folder.name
 
         def observe(phase: str, done: int, total: int | None, name: str = name) -> None:
@@ -83,6 +93,10 @@ def process_on(
 
     A recording whose worker dies is tried once more, then reported; the others go on. One that
     only waited when the scheduler was lost has not been tried.
+
+    Raises
+    ------
+    Stopped : a signal has asked for it; what runs goes on until the executor is stopped.
     """
     ledger = _Ledger(tasks, manifest)
 
@@ -101,7 +115,7 @@ def process_on(
 def _outcomes(
     executor: Executor, tasks: Sequence[Task], ledger: "_Ledger", address: str, cores: int
 ) -> Iterator[Outcome]:
-    ended: SimpleQueue[tuple[Job, Future[Outcome]]] = SimpleQueue()
+    ended: SimpleQueue[_Ended] = SimpleQueue()
 
     def begin(job: Job) -> None:
         future = executor.submit(_attempt_elsewhere, job, address, cores)
@@ -115,13 +129,21 @@ def _outcomes(
         while waiting and running < _AHEAD:
             begin(waiting.pop())
             running += 1
-        job, future = ended.get()
+        job, future = _next(ended)
         error = _error(future)
         if error is not None and is_lost(error) and ledger.lost(job, error) < _TRIES:
             begin(job)
             continue
         running -= 1
         yield future.result() if error is None else _unknown(job, error)
+
+
+def _next(ended: SimpleQueue[_Ended]) -> _Ended:
+    """Wait for the next one to end, or for a signal that asks to stop."""
+    while True:
+        stopping.check()
+        with suppress(Empty):
+            return ended.get(timeout=_HEED_S)
 
 
 def _error(future: Future[Outcome]) -> BaseException | None:

@@ -300,7 +300,7 @@ def _facts(run: Mapping[str, Any]) -> str:
         "skipped frames": skipped or "none",
         "shapecat": run["versions"]["shapecat"],
         "python": run["versions"].get("python", ""),
-        "input sha256": run["input"]["sha256"][:16],
+        "input digest": run["input"]["digest"],
     }
     return "".join(
         f"<dt>{escape(name)}</dt><dd>{escape(str(value))}</dd>" for name, value in facts.items()

@@ -10,7 +10,8 @@ from typing import Any
 from shapecat.errors import OutputError
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
 from shapecat.runs.corrections import TrackLabel, read_labels
-from shapecat.runs.folder import digest, read_run
+from shapecat.runs.folder import read_run
+from shapecat.runs.identity import content_digest, same_content
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.types import Frame, LabelledFrame
 
@@ -64,7 +65,7 @@ def open_source(finished: FinishedRun) -> Iterator[Recording]:
     """
     path = Path(finished.run["input"]["path"])
     with open_recording(path) as recording:
-        if digest(path) != finished.run["input"]["sha256"]:
+        if not same_content(finished.run["input"], path, lambda: content_digest(path)):
             msg = f"{path}: has changed since it was processed; process it again"
             raise OutputError(msg)
         yield recording
