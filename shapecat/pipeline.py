@@ -8,7 +8,7 @@ Each can be run again alone.
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -123,7 +123,9 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
 
 def _has_work(folder: Path) -> bool:
     """Return whether a run that was cut short has got so far that it can be resumed."""
-    return count_segments(folder) > 0 or (folder / "frames.parquet").exists()
+    with suppress(OutputError):
+        return count_segments(folder) > 0 or "perceive" in read_run(folder)["seconds"]
+    return False
 
 
 def _identify(run: dict[str, Any], content: ContentDigest) -> None:

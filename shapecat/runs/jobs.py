@@ -45,6 +45,7 @@ class Job:
     mcap: bool = True
     rrd: bool = True
     overwrite: bool = False
+    discard_labels: bool = False
     origin: str = ""
     target: str = ""
 
