@@ -15,11 +15,11 @@ from typing import Any, Protocol
 from shapecat import stopping
 from shapecat.batch.manifest import Entry, Manifest
 from shapecat.batch.plans import Task
-from shapecat.batch.remote import download, fetch, look_at, scratch, upload
+from shapecat.batch.remote import download, fetch, finish_upload, look_at, scratch, upload
 from shapecat.errors import OutputError, ShapecatError
 from shapecat.executors import Mailbox, is_dropped, is_lost, post
 from shapecat.pipeline import Observer, process
-from shapecat.runs.folder import read_run
+from shapecat.runs.folder import read_run, require_ours
 from shapecat.runs.jobs import Job, Summary, summarize
 
 __all__ = ["Outcome", "Watcher", "attempt", "exit_code", "process_here", "process_on"]
@@ -34,6 +34,8 @@ _REPORT_S = 0.2
 """A worker tells how far it is no more often than this."""
 
 
+_PREVIOUS = ("tracks.csv", "tracks.original.csv", "tracks.parquet", "frames.parquet")
+"""What carrying labels over to a new run needs of the old one."""
 _HEED_S = 0.1
 """Whoever waits for workers looks so often whether a signal has come."""
 
@@ -227,11 +229,20 @@ def _process_remote(job: Job, observe: Observer, cores: int) -> Summary:
 
 
 def _look_for_results(job: Job) -> None:
-    """Put what run.json at the target says where `process` looks for it."""
-    run = f"{job.target}/run.json"
-    if not job.overwrite and look_at(run)[1]:
+    """Put what `process` needs of the results at the target where it looks for them.
+
+    Raises
+    ------
+    OutputError : the target holds what shapecat did not make.
+    """
+    finish_upload(job.target)
+    wanted = ("run.json", *(_PREVIOUS if job.overwrite else ()))
+    there = [name for name in wanted if look_at(f"{job.target}/{name}")[1]]
+    if "run.json" in there:
         job.folder.mkdir(parents=True)
-        (job.folder / "run.json").write_bytes(fetch(run))
+    for name in there:
+        (job.folder / name).write_bytes(fetch(f"{job.target}/{name}"))
+    require_ours(job.folder)
 
 
 class _Ledger:

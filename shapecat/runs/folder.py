@@ -17,6 +17,7 @@ from shapecat.files import flush, lock, partial_path, replacing
 
 __all__ = [
     "OUTPUTS",
+    "RUN_FILES",
     "Marker",
     "clear",
     "made_by_run",
@@ -30,13 +31,13 @@ __all__ = [
 ]
 
 OUTPUTS = ("annotated.mcap", "review.rrd")
-_FILES = (
+RUN_FILES = (
     *(f"{name}.parquet" for name in ("frames", "detections", "planes", "tracks")),
     *("tracks.csv", "tracks.original.csv", "tracks.previous.csv", "report.html"),
     *OUTPUTS,
     "run.json",
 )
-_MADE = ("segments", *(partial_path(Path(name)).name for name in _FILES), *_FILES)
+_MADE = ("segments", *(partial_path(Path(name)).name for name in RUN_FILES), *RUN_FILES)
 
 _BEGUN = (".run.json.partial", ".export.json.partial")
 """What a kill may leave in a folder that has no marker yet."""
@@ -182,7 +183,7 @@ def clear(folder: Path, names: Collection[str] = _MADE) -> None:
 def sweep(folder: Path) -> None:
     """Remove the half-made files that a killed command has left in a complete folder."""
     with suppress(OSError):
-        clear(folder, [partial_path(Path(name)).name for name in _FILES])
+        clear(folder, [partial_path(Path(name)).name for name in RUN_FILES])
 
 
 class _BusyError(Exception):
