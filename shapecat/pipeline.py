@@ -8,7 +8,7 @@ Each can be run again alone.
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import suppress
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,12 +20,12 @@ from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.detection import RecentFrames
 from shapecat.errors import NoStreamError, OutputError, RecordingError
 from shapecat.executors.order import Processes, read_ahead
-from shapecat.jit import CompileClock, compile_clock
 from shapecat.learning import Categorizer, load_model
 from shapecat.outputs.rereading import with_clouds
 from shapecat.perception import Perceiver, View
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
 from shapecat.recordings.gravity import Upright
+from shapecat.rehearsal import compile_all
 from shapecat.runs.corrections import TrackLabel, adopt_labels, read_labels
 from shapecat.runs.folder import (
     clear,
@@ -85,11 +85,7 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
     Stopped : a signal has asked for it; the frames in work are finished and kept.
     """
     begun = time.perf_counter()
-    with (
-        open_recording(job.source) as recording,
-        ContentDigest(job.source) as content,
-        _compile_clock(observe, cores) as compiled,
-    ):
+    with open_recording(job.source) as recording, ContentDigest(job.source) as content:
         categorizer = load_model(job.model)
         categorizer.require_descriptor(DESCRIPTOR_NAMES)
         run = describe_run(job, categorizer)
@@ -99,6 +95,7 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
             return _finished(job, recording, run, content, observe)
         with staged(job.folder, worth_keeping=_has_work) as folder:
             run = resume(folder, run, job.source, content.result)
+            compiling_s = compile_all(lambda: observe("compile", 0, None), cores=cores)
             content.start()
             earlier = sum(run["seconds"].values())
             _once(
@@ -115,7 +112,7 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
             _once("track", folder, run, lambda: track(folder, run, job))
             annotate(folder, recording, run, observe, cores=cores)
             _require_unchanged(folder, run, job)
-            run["seconds"]["compile"] = compiled.seconds
+            run["seconds"]["compile"] = compiling_s
             run["seconds"]["total"] = earlier + time.perf_counter() - begun
             write_run(folder, run)
     return summarize(job, run)
@@ -156,24 +153,6 @@ def _once(phase: str, folder: Path, run: dict[str, Any], work: Callable[[], None
     release_memory()
     run["seconds"][phase] = time.perf_counter() - begun
     write_run(folder, run)
-
-
-@contextmanager
-def _compile_clock(observe: Observer, cores: int) -> Iterator[CompileClock]:
-    """Measure compilation, which happens once per installation, and let the user know of it.
-
-    With several cores another process takes a share of it.
-    """
-    with ExitStack() as stack:
-
-        def begin() -> None:
-            observe("compile", 0, None)
-            if cores > 1:
-                from shapecat.rehearsal import compile_ahead  # noqa: PLC0415  once per installation
-
-                stack.enter_context(compile_ahead())
-
-        yield stack.enter_context(compile_clock(begin))
 
 
 def _finished(
