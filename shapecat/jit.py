@@ -43,7 +43,7 @@ def kernel(
     """
 
     def compile_later(target: _F) -> Any:
-        folder = code_folder(Path(target.__code__.co_filename).parent)
+        folder = code_folder(_stage_of(Path(target.__code__.co_filename)))
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder or "")
         try:
             return njit(
@@ -82,12 +82,19 @@ def code_folder(stage: Path) -> Path | None:
     return None
 
 
+def _stage_of(file: Path) -> Path:
+    """Return the folder of the stage that a file is of: one here, also for files further down."""
+    inside = (folder for folder in file.parents if folder.parent == _HERE)
+    return next(inside, file.parent)
+
+
 def _digest(stage: Path) -> str:
     """Return a digest of the files of a stage, and of those that every stage may call."""
-    files = set(_SHARED) if stage == _HERE else {*stage.glob("*.py"), *_SHARED}
+    files = set(_SHARED) if stage == _HERE else {*stage.rglob("*.py"), *_SHARED}
     digest = hashlib.sha256()
     for file in sorted(files):
-        digest.update(f"{file.name}\0".encode() + file.read_bytes())
+        name = file.relative_to(_HERE if file in _SHARED else stage)
+        digest.update(f"{name}\0".encode() + file.read_bytes())
     return digest.hexdigest()[:16]
 
 

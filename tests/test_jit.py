@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 
+import shapecat
+from shapecat.jit import _stage_of
+
 CALLER = """
 from shapecat.jit import kernel
 from callee import twice
@@ -86,3 +89,12 @@ def test_a_kernel_is_compiled_where_nothing_can_be_kept(stage: Path) -> None:
     stage.joinpath("__pycache__").write_text("")
     assert run(stage, XDG_CACHE_HOME="/dev/null") == "7 0"
     assert run(stage, XDG_CACHE_HOME="/dev/null") == "7 0"
+
+
+def test_a_stage_is_one_with_its_sub_packages() -> None:
+    """Kernels call kernels of other sub-packages of their stage: an edit of any counts."""
+    here = Path(shapecat.__file__).parent
+
+    assert _stage_of(here / "detection" / "planes" / "ransac.py") == here / "detection"
+    assert _stage_of(here / "detection" / "pipeline.py") == here / "detection"
+    assert _stage_of(here / "geometry.py") == here

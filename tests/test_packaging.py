@@ -76,13 +76,21 @@ def bare(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def _take_machine_code(package: Path) -> None:
     """Give the package the kernels compiled here: compiling them once more takes minutes."""
     for kept in (ROOT / "shapecat").rglob("__pycache__/kernels-*"):
-        stage = package / kept.parent.parent.relative_to(ROOT / "shapecat")
+        here = kept.parent.parent
+        stage = package / here.relative_to(ROOT / "shapecat")
         target = stage / "__pycache__" / kept.name
         shutil.copytree(kept, target)
-        place = hashlib.sha1(str(stage).encode(), usedforsecurity=False).hexdigest()
-        for folder in target.iterdir():  # numba calls it by the path of the sources
-            if folder.is_dir():
-                folder.rename(target / f"{stage.name}_{place}")
+        for sources in (here, *here.rglob("*/")):
+            if (target / _numba_name(sources)).exists():
+                name = _numba_name(stage / sources.relative_to(here))
+                (target / _numba_name(sources)).rename(target / name)
+
+
+def _numba_name(sources: Path) -> str:
+    """Return what numba calls the folder for the kernels of a folder of sources."""
+    return (
+        f"{sources.name}_{hashlib.sha1(str(sources).encode(), usedforsecurity=False).hexdigest()}"
+    )
 
 
 def test_wheel_installs_one_top_level_package(wheel: Path) -> None:
