@@ -266,13 +266,13 @@ def _own_units(neurons: F4) -> tuple[F4, F4, F4, F4, F8, float]:
     return x, y, z, straight, middle, unit
 
 
-@kernel(fast=True)
+@kernel
 def _sum(rows: F4) -> float:
-    total = 0.0
+    total = np.float32(0.0)
     for i in range(rows.shape[0]):
         for j in range(rows.shape[1]):
             total += rows[i, j]
-    return total
+    return float(total)
 
 
 @kernel(fast=True)
