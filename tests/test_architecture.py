@@ -82,7 +82,7 @@ def test_help_answers_at_once() -> None:
         ended = resource.getrusage(resource.RUSAGE_CHILDREN)
         seconds.append(ended.ru_utime + ended.ru_stime - begun.ru_utime - begun.ru_stime)
 
-    assert min(seconds) < 0.3  # processor time: other tests run beside this one
+    assert min(seconds) < 0.15  # processor time: other tests run beside this one
 
 
 def test_help_loads_no_heavy_library() -> None:
