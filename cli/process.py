@@ -12,7 +12,7 @@ from shapecat.stopping import Stopped
 
 from .options import config_option, json_option, model_option, set_option
 from .progress import KINDS, Progress, describe_plan, open_progress
-from .render import count_words, print_json, print_table
+from .render import count_words, missed_words, print_json, print_table
 
 _MOST_ROWS = 100
 
@@ -170,10 +170,23 @@ def _print_closing(tasks: Sequence[Any], outcomes: Sequence[Any]) -> None:
     if complete and len(complete) <= _MOST_ROWS:
         columns = ("recording", "frames", "seconds", "tracks", "results")
         print_table(columns, [_row(outcome) for outcome in complete])
+    for outcome in complete:
+        if outcome.summary.corrections is not None:
+            _print_corrections(outcome)
     if len(tasks) > 1:
         frames = sum(o.summary.counts["frames"] for o in complete)
         failed = len(ordered) - len(complete)
         click.echo(f"{len(complete)} complete, {failed} failed, {frames:,} frames")
+
+
+def _print_corrections(outcome: Any) -> None:
+    """Say what became of the labels that a person gave to the results that were replaced."""
+    found = outcome.summary.corrections
+    done, missed = len(found["transferred"]), found["not_transferred"]
+    name = outcome.job.name.rpartition("/")[2]
+    kept = f"; they are in {outcome.summary.folder}/tracks.previous.csv" if missed else ""
+    text = f"{name}: {done} corrected labels carried over, {len(missed)} not{kept}"
+    click.echo("\n".join((text, *map(missed_words, missed))), err=True)
 
 
 def _row(outcome: Any) -> tuple[Any, ...]:
