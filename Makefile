@@ -27,7 +27,7 @@ setup: .venv/ready ## make the virtual environment .venv from the lock file
 	@touch $@
 
 demo: setup ## simulate a recording, process it, and say where the results lie
-	$(BIN)/shapecat simulate $(DEMO)/tabletop.mcap --scene tabletop --frames 60 --seed 3
+	$(BIN)/shapecat simulate $(DEMO)/tabletop.mcap --scene tabletop --frames 60 --seed 3 --overwrite
 	$(BIN)/shapecat process $(DEMO)/tabletop.mcap --out $(DEMO)/out --overwrite
 
 test: setup ## run all tests

@@ -5,6 +5,7 @@ nothing of time; track is cheap and knows nothing of points; annotate knows noth
 Each can be run again alone.
 """
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -67,6 +68,8 @@ _Shown = TypeVar("_Shown", LabelledFrame, ShownFrame)
 Observer = Callable[[str, int, int | None], None]
 """Called with the name of the phase, the frames done, and how many there are, if known."""
 
+_log = logging.getLogger(__name__)
+
 _AHEAD = 4
 """Frames read while one is written."""
 _MANY = 100
@@ -103,6 +106,9 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
         categorizer.require_descriptor(DESCRIPTOR_NAMES)
         run = describe_run(job, categorizer)
         run["options"]["topics"] = [s.topic for s in choose_streams(recording, job.topics)]
+        _log.info(
+            "%s: %s, model %s", job.name, " ".join(run["options"]["topics"]), job.model or "default"
+        )
         recover(job.folder)
         if made_by_run(job.folder) is not None and not job.overwrite:
             return _finished(job, recording, run, content, observe)
@@ -160,11 +166,14 @@ def _require_unchanged(folder: Path, run: Mapping[str, Any], job: Job) -> None:
 def _once(phase: str, folder: Path, run: dict[str, Any], work: Callable[[], None]) -> None:
     """Do a phase unless it is done, and note in run.json that it is, and how long it took."""
     if phase in run["seconds"]:
+        _log.info("%s: %s was done before", folder, phase)
         return
+    _log.info("%s: %s begins", folder, phase)
     begun = time.perf_counter()
     work()
     release_memory()
     run["seconds"][phase] = time.perf_counter() - begun
+    _log.info("%s: %s took %.2f s", folder, phase, run["seconds"][phase])
     write_run(folder, run)
 
 

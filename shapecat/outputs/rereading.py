@@ -1,7 +1,7 @@
 """A finished run beside its recording: labelled frames, and the clouds they were made from."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,14 @@ from shapecat.runs.identity import content_digest, same_content
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.types import Frame, LabelledFrame
 
-__all__ = ["FinishedRun", "clouds_again", "open_source", "read_finished", "with_clouds"]
+__all__ = [
+    "FinishedRun",
+    "clouds_again",
+    "find_runs",
+    "open_source",
+    "read_finished",
+    "with_clouds",
+]
 
 
 @dataclass(frozen=True)
@@ -52,6 +59,28 @@ def read_finished(folder: Path) -> FinishedRun:
     """
     run = read_run(folder)
     return FinishedRun(folder, run, read_labels(folder / "tracks.csv", run["model"]["categories"]))
+
+
+def find_runs(folders: Sequence[Path]) -> list[Path]:
+    """Return the folders that are runs, and the runs in the others, by name; each once.
+
+    Raises
+    ------
+    OutputError : a folder holds none.
+    """
+    runs = [run for folder in folders for run in _runs_in(folder)]
+    return list({run.resolve(): run for run in runs}.values())
+
+
+def _runs_in(folder: Path) -> list[Path]:
+    if (folder / "run.json").is_file():
+        return [folder]
+    runs = sorted(path.parent for path in folder.glob("*/run.json"))
+    runs = [run for run in runs if not run.name.startswith(".")]
+    if not runs:
+        msg = f"{folder}: no run.json there or one level below; expected results of a process"
+        raise OutputError(msg)
+    return runs
 
 
 @contextmanager
