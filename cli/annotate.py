@@ -41,6 +41,6 @@ def annotate(*, run: Path, labels: Path | None, by_place: bool, recording: Path 
 
 def _show(transfer: dict[str, Any]) -> None:
     done, missed = transfer["transferred"], transfer["not_transferred"]
-    click.echo(f"{len(done)} labels found their objects, {len(missed)} did not")
+    click.echo(f"{len(done)} of {len(done) + len(missed)} labels have found their objects")
     for item in missed:
         click.echo(missed_words(item), err=True)
