@@ -9,6 +9,7 @@ import click
 
 from shapecat import __version__
 from shapecat.errors import ShapecatError
+from shapecat.stopping import Stopped, heeding_signals
 
 from .annotate import annotate
 from .evaluate import evaluate
@@ -28,13 +29,16 @@ class _Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
-            return super().invoke(ctx)
+            with heeding_signals():
+                return super().invoke(ctx)
         except ShapecatError as error:
             click.echo(f"Error: {error}", err=True)
             ctx.exit(error.exit_code)
-        except KeyboardInterrupt:
-            click.echo("interrupted; run the same command again to go on", err=True)
-            ctx.exit(130)
+        except Stopped as stopped:
+            kept = ctx.invoked_subcommand == "process"
+            how = "what is done is kept: run the same command again to go on" if kept else ""
+            click.echo("; ".join(filter(None, ("stopped", how))), err=True)
+            ctx.exit(stopped.exit_code)
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  click's signature
         return list(self.commands)  # in the order of use, not of the alphabet

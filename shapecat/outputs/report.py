@@ -13,7 +13,7 @@ from shapecat.outputs.report_drawing import draw
 from shapecat.outputs.report_page import Card, Listed, index_page, is_unsure, run_page
 from shapecat.outputs.report_tracks import read_courses, read_portraits, read_stage_seconds
 from shapecat.outputs.rereading import read_finished
-from shapecat.runs.corrections import read_track_table
+from shapecat.runs.track_table import read_track_table
 
 __all__ = ["find_runs", "write_report", "write_reports"]
 

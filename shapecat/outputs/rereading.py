@@ -7,10 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from shapecat.errors import OutputError
+from shapecat.errors import OutputError, RecordingError
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
 from shapecat.runs.corrections import TrackLabel, read_labels
-from shapecat.runs.folder import digest, read_run
+from shapecat.runs.folder import read_run
+from shapecat.runs.identity import content_digest, same_content
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.types import Frame, LabelledFrame
 
@@ -54,18 +55,26 @@ def read_finished(folder: Path) -> FinishedRun:
 
 
 @contextmanager
-def open_source(finished: FinishedRun) -> Iterator[Recording]:
+def open_source(run: Mapping[str, Any], moved_to: Path | None = None) -> Iterator[Recording]:
     """Open the recording that a run was made from.
+
+    Parameters
+    ----------
+    moved_to : where it is now; where it was processed by default.
 
     Raises
     ------
     RecordingError : it is not there.
     OutputError : it is another one than it was.
     """
-    path = Path(finished.run["input"]["path"])
+    path = moved_to or Path(run["input"]["path"])
+    if moved_to is None and not path.exists():
+        msg = f"{path}: the recording is not there any more; say where it is: --recording PATH"
+        raise RecordingError(msg)
     with open_recording(path) as recording:
-        if digest(path) != finished.run["input"]["sha256"]:
-            msg = f"{path}: has changed since it was processed; process it again"
+        if not same_content(run["input"], path, lambda: content_digest(path)):
+            hint = "is another recording" if moved_to else "has changed since it was processed"
+            msg = f"{path}: {hint}; process it again"
             raise OutputError(msg)
         yield recording
 

@@ -7,8 +7,9 @@ meaning of one is not.
 """
 
 import shutil
+import time
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -33,6 +34,7 @@ __all__ = [
     "Key",
     "PerceptionTables",
     "count_rows",
+    "count_segments",
     "discard_segments",
     "frame_rows",
     "numbers",
@@ -131,7 +133,9 @@ causal one. Without a fixed frame ``center_fixed`` is in the sensor frame."""
 Key = tuple[str, int]
 """A frame: its topic, and its number there."""
 
-_SEGMENT_FRAMES = 32
+_GROUP_FRAMES = 32
+_SEGMENT_S = 2.0
+"""What a kill may cost: frames are kept in a segment at least so often."""
 _PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES}
 
 
@@ -147,8 +151,9 @@ class FrameRow:
 class PerceptionTables:
     """Writes frames, detections and planes side by side, a row group every 32 frames.
 
-    The row groups are first written as *segments*, folders that appear when complete, so that a
-    run that was killed goes on after its last one; leaving the block joins them into the tables.
+    What was perceived is first written as *segments*, folders that appear when complete, so that
+    a run that was cut short goes on after its last one; leaving the block joins them into the
+    tables, which are the same wherever it was cut.
 
     Attributes
     ----------
@@ -167,6 +172,7 @@ class PerceptionTables:
         self._categories = tuple(categories)
         self._pending: list[tuple[Perception, FrameRow]] = []
         self._segments = _segments(folder)
+        self._flushed = time.monotonic()
         self.done = sum(_read_segment(s / "frames.arrow").num_rows for s in self._segments)
 
     def __enter__(self) -> Self:
@@ -179,16 +185,19 @@ class PerceptionTables:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Write what is pending, and join the segments."""
-        if kind is None:
-            self._flush()
-            for name, schema in self._schemas.items():
-                _join(self._segments, self._folder / f"{name}.parquet", schema)
+        """Write what is pending, and join the segments; after an error only keep what is done."""
+        if kind is not None:
+            with suppress(OSError):
+                self._flush()
+            return
+        self._flush()
+        self._join()
 
     def write(self, perception: Perception, row: FrameRow) -> None:
         """Append one frame."""
         self._pending.append((perception, row))
-        if len(self._pending) >= _SEGMENT_FRAMES:
+        late = time.monotonic() - self._flushed > _SEGMENT_S
+        if late or len(self._pending) >= _GROUP_FRAMES:
             self._flush()
 
     def _flush(self) -> None:
@@ -205,9 +214,26 @@ class PerceptionTables:
                 _write_segment(hidden / f"{name}.arrow", _table(rows[name], schema))
         self._segments.append(segment)
         self._pending.clear()
+        self._flushed = time.monotonic()
+
+    def _join(self) -> None:
+        """Write the tables, whose row groups cover the same frames."""
+        with ExitStack() as stack:
+            writers = {}
+            for name, schema in self._schemas.items():
+                path = stack.enter_context(replacing(self._folder / f"{name}.parquet"))
+                writers[name] = stack.enter_context(_open_writer(path, schema))
+            for group in _row_groups(self._segments):
+                for name, writer in writers.items():
+                    writer.write_table(group[name])
 
 
 _SEGMENTS = "segments"
+
+
+def count_segments(folder: Path) -> int:
+    """Return how many segments a run that was cut short has left."""
+    return len(_segments(folder))
 
 
 def discard_segments(folder: Path) -> None:
@@ -220,11 +246,33 @@ def _segments(folder: Path) -> list[Path]:
     return sorted((folder / _SEGMENTS).glob("[0-9]*"))
 
 
-def _join(segments: Iterable[Path], path: Path, schema: pa.Schema) -> None:
-    """Write a table of a row group per segment."""
-    with replacing(path) as hidden, _open_writer(hidden, schema) as writer:
-        for segment in segments:
-            writer.write_table(_read_segment(segment / f"{path.stem}.arrow"))
+_Tables = dict[str, pa.Table]
+
+
+def _row_groups(segments: Iterable[Path]) -> Iterator[_Tables]:
+    """Yield the tables of 32 frames at a time, in whatever portions the segments have them."""
+    held: _Tables = {}
+    for segment in segments:
+        new = {name: _read_segment(segment / f"{name}.arrow") for name in _PERCEIVED}
+        held = {name: pa.concat_tables([held[name], new[name]]) for name in new} if held else new
+        while held["frames"].num_rows >= _GROUP_FRAMES:
+            group, held = _cut(held, _GROUP_FRAMES)
+            yield group
+    if held and held["frames"].num_rows:
+        yield held
+
+
+def _cut(tables: _Tables, count: int) -> tuple[_Tables, _Tables]:
+    """Part tables after a number of frames."""
+    first = set(frame_rows(tables["frames"][:count]))
+    ends = {"frames": count}
+    for name in ("detections", "planes"):
+        rows = frame_rows(tables[name])
+        ends[name] = max((rows[key].stop for key in first & set(rows)), default=0)
+    return (
+        {name: tables[name][:end].combine_chunks() for name, end in ends.items()},
+        {name: tables[name][end:] for name, end in ends.items()},
+    )
 
 
 def _write_segment(path: Path, table: pa.Table) -> None:
