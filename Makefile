@@ -40,6 +40,7 @@ odd: setup ## process damaged and odd recordings, print what became of each
 	$(BIN)/python -m tests.odd
 
 faults: setup ## interrupt, kill and starve the command at random, print what held
+	@$(BIN)/python -m shapecat.rehearsal
 	$(BIN)/python -m tests.faults --count 200 --minutes 13
 
 lint: setup ## check style and types

@@ -90,9 +90,9 @@ class Running:
         with contextlib.suppress(ProcessLookupError):
             (os.killpg if group else os.kill)(self.process.pid, number)
 
-    def end(self, struck: float | None = None) -> Ended:
+    def end(self, struck: float | None = None, limit_s: float = LIMIT_S) -> Ended:
         """Wait for the end, and for processes that outlive it."""
-        hung = self.wait_until(LIMIT_S)
+        hung = self.wait_until(limit_s)
         if hung:
             self.send(signal.SIGKILL, group=True)
         code = self.process.wait()
