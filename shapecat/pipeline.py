@@ -49,16 +49,9 @@ from shapecat.runs.identity import ContentDigest, file_stats, same_content, unch
 from shapecat.runs.jobs import Job, Summary, describe_run, resume, same_options, summarize
 from shapecat.runs.label_transfer import Transfer, lost_labels, transfer_labels
 from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.perceived import FrameRow, PerceptionTables, count_segments, discard_segments
 from shapecat.runs.shown import read_shown_frames
-from shapecat.runs.tables import (
-    FrameRow,
-    PerceptionTables,
-    count_rows,
-    count_segments,
-    discard_segments,
-    read_row_groups,
-    release_memory,
-)
+from shapecat.runs.tables import count_rows, read_row_groups, release_memory
 from shapecat.runs.tracks import track_run
 from shapecat.types import Frame, LabelledFrame, ShownFrame
 
