@@ -22,7 +22,7 @@ from benchmarks.measure import markdown
 from shapecat.config import DetectionSettings, Settings, SurfaceSettings
 from shapecat.learning import Categorizer, load_model, save_model
 from shapecat.pipeline import process
-from shapecat.runs.corrections import relabel
+from shapecat.runs.corrections import merged_with, relabel
 from shapecat.runs.jobs import Job
 from shapecat.runs.label_transfer import match_labels
 from shapecat.runs.tables import read_row_groups
@@ -30,7 +30,7 @@ from shapecat.runs.track_table import read_track_table
 from shapecat.simulation import KINECT, make_scene
 from shapecat.simulation.paths import walk
 from shapecat.simulation.recorder import record
-from shapecat.simulation.worlds import World
+from shapecat.simulation.worlds import FIRST_THING_LABEL, World
 
 SCENES = ("tabletop", "clutter", "walking", "rearranged")
 OTHER = Settings(
@@ -57,7 +57,10 @@ def name_of(truth: int) -> str:
 
 
 def objects_of(run: Path, recording: Path) -> dict[int, int]:
-    """Return by track which object of the simulator most of its points belong to, -1 for none."""
+    """Return by track which object of the simulator it shows, -1 for none.
+
+    That of most of its points that belong to an object, if those are a third of all.
+    """
     with np.load(recording.with_suffix(".labels.npz")) as file:
         labels = file["labels"].reshape(len(file["labels"]), -1)
     truth = json.loads(recording.with_suffix(".truth.json").read_text("utf-8"))
@@ -74,8 +77,14 @@ def objects_of(run: Path, recording: Path) -> dict[int, int]:
             if row["detection"] is not None:
                 key = row["topic"], row["frame"], row["detection"]
                 votes.setdefault(row["track"], Counter()).update(owner[key])
-    best = {track: count.most_common(1)[0][0] for track, count in votes.items()}
-    return {track: label - 20 if label >= 20 else -1 for track, label in best.items()}
+    return {track: _owner(count) for track, count in votes.items()}
+
+
+def _owner(count: Counter[int]) -> int:
+    things = Counter({label: n for label, n in count.items() if label >= FIRST_THING_LABEL})
+    if 3 * things.total() < count.total():
+        return -1
+    return things.most_common(1)[0][0] - FIRST_THING_LABEL
 
 
 def correct(run: Path, objects: dict[int, int]) -> None:
@@ -103,19 +112,20 @@ def judge(source: Path, objects: dict[int, int], target: Path, there: dict[int, 
     shown = set(there.values())
     rows = [row for row in read_track_table(source / "tracks.csv").rows if row.label]
     landed: dict[int, list[bool]] = {}
+    whole = {row.track: merged_with(row.label) for row in rows}
     for item in transfer.transferred:
         good = objects[item.old_track] == there[item.track]
         landed.setdefault(item.old_track, []).append(good)
     told = {item.old_track for item in transfer.missed}
     right = wrong = given = silent = 0
     for row in rows:
-        at = landed.get(row.track, [])
+        at = landed.get(row.track) or landed.get(whole[row.track] or -1, [])
         if not at and (objects[row.track] not in shown or objects[row.track] < 0):
             continue
         given += 1
         wrong += not all(at)
         right += bool(at) and all(at)
-        silent += not at and row.track not in told and not row.label.startswith("merge")
+        silent += not at and row.track not in told
     return Score(given, right, wrong + silent, sum(row.track in told for row in rows))
 
 

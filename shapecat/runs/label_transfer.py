@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 from shapecat.runs.corrections import merged_with, merging_with, relabel
 from shapecat.runs.folder import read_run, write_run
-from shapecat.runs.same_objects import Matches, match_in_place, match_in_time
+from shapecat.runs.same_objects import Group, Matches, match_in_place, match_in_time
 from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
 
 __all__ = ["Missed", "Transfer", "Transferred", "lost_labels", "match_labels", "transfer_labels"]
@@ -89,10 +89,11 @@ def match_labels(source: Path, target: Path) -> Transfer:
     folder = path.parent if _is_in_its_run(path, table) else None
     if not labelled:
         return Transfer(table.run, (), ())
+    group = _groups(labelled)
     if folder is not None and _same_recording(read_run(folder), read_run(target)):
-        matches = match_in_time(folder, target)
+        matches = match_in_time(folder, target, group)
     else:
-        matches = match_in_place(table.rows, folder, target)
+        matches = match_in_place(table.rows, folder, target, group)
     return _translate(table.run, labelled, matches)
 
 
@@ -106,6 +107,20 @@ def _is_in_its_run(path: Path, table: TrackTable) -> bool:
     return bool(table.run == read_run(folder).get("work"))
 
 
+def _groups(labelled: Sequence[TrackRow]) -> Group:
+    """Return which tracks a person has merged."""
+    partners = {row.track: merged_with(row.label) for row in labelled}
+
+    def root(track: int) -> int:
+        seen = {track}
+        while (partner := partners.get(track)) is not None and partner not in seen:
+            seen.add(partner)
+            track = partner
+        return track
+
+    return root
+
+
 def _same_recording(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     digests = [run["input"].get("digest") for run in (a, b)]
     return bool(digests[0]) and digests[0] == digests[1] and a["fixed_frame"] == b["fixed_frame"]
@@ -116,6 +131,8 @@ def _translate(work: str, labelled: Sequence[TrackRow], matches: Matches) -> Tra
     given: dict[int, Transferred] = {}
     missed = []
     for row in labelled:
+        if row.track not in matches.found and merged_with(row.label) in matches.found:
+            continue  # the part is not found on its own, the whole is
         label, reason = _label_there(row, matches)
         for match in matches.found.get(row.track, ()) if not reason else ():
             other = given.get(match.track)

@@ -6,7 +6,7 @@ still in both can be found again. What is ambiguous is told, not guessed.
 """
 
 from collections import Counter, defaultdict
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -20,7 +20,7 @@ from shapecat.runs.folder import read_run
 from shapecat.runs.tables import frame_rows, numbers, read_row_groups
 from shapecat.runs.track_table import TrackRow
 
-__all__ = ["Match", "Matches", "match_in_place", "match_in_time"]
+__all__ = ["Group", "Match", "Matches", "match_in_place", "match_in_time"]
 
 _GATE_M = 0.10
 """Detections of one object in one frame are no farther apart, however they were segmented."""
@@ -39,6 +39,10 @@ _SIZE_RATIO = 1.8
 """The largest extents of an object in two recordings differ by less."""
 _SAMPLES = 40
 """Detections per track whose size is read."""
+
+
+Group = Callable[[int], int]
+"""Returns a number that tracks have in common if a person has merged them."""
 
 
 class Match(NamedTuple):
@@ -87,8 +91,13 @@ def _read_tracks(folder: Path) -> _Tracks:
     )
 
 
-def match_in_time(source: Path, target: Path) -> Matches:
-    """Match tracks that are each other's nearest in most of the frames that both runs have."""
+def match_in_time(source: Path, target: Path, group: Group) -> Matches:
+    """Match tracks that are each other's nearest in most of the frames that both runs have.
+
+    Parameters
+    ----------
+    group : says of which object a track of the source is: tracks that were merged are one.
+    """
     old, new = _read_tracks(source), _read_tracks(target)
     votes: Counter[tuple[int, int]] = Counter()
     apart: defaultdict[tuple[int, int], float] = defaultdict(float)
@@ -100,27 +109,32 @@ def match_in_time(source: Path, target: Path) -> Matches:
             pair = int(old.tracks[here][a]), int(new.tracks[there][b])
             votes[pair] += 1
             apart[pair] += distance
-    return _by_majority(votes, apart, seen)
+    return _by_majority(votes, apart, seen, group)
 
 
 def _by_majority(
-    votes: Mapping[tuple[int, int], int], apart: Mapping[tuple[int, int], float], seen: Counter[int]
+    votes: Mapping[tuple[int, int], int],
+    apart: Mapping[tuple[int, int], float],
+    seen: Counter[int],
+    group: Group,
 ) -> Matches:
-    """Let each track of the target be the track of the source it is nearest to most often."""
+    """Let each track of the target be the object of the source it is nearest to most often."""
     found: dict[int, list[Match]] = {}
     reasons: dict[int, str] = {}
-    claims: dict[int, list[tuple[float, int]]] = {}
-    for (old, new), count in votes.items():
-        claims.setdefault(new, []).append((count / seen[new], old))
-    for new, shares in sorted(claims.items()):
-        (share, old), *others = sorted(shares, key=lambda item: (-item[0], item[1]))
-        rivals = [other for rival, other in others if rival >= _RIVAL]
-        if share < _MAJORITY or rivals:
-            for each in (old, *rivals):
-                reasons[each] = f"track {new} is it only part of the time"
+    claims: dict[int, dict[int, list[int]]] = {}
+    for old, new in sorted(votes):
+        claims.setdefault(new, {}).setdefault(group(old), []).append(old)
+    for new, objects in claims.items():
+        shares = {k: sum(votes[old, new] for old in o) / seen[new] for k, o in objects.items()}
+        best, *others = sorted(shares, key=lambda k: (-shares[k], k))
+        rivals = [k for k in others if shares[k] >= _RIVAL]
+        if shares[best] < _MAJORITY or rivals:
+            for old in (old for k in (best, *rivals) for old in objects[k]):
+                reasons[old] = f"track {new} is it only part of the time"
             continue
-        mean = apart[old, new] / votes[old, new]
-        found.setdefault(old, []).append(Match(new, round(mean, 4)))
+        for old in objects[best]:
+            mean = apart[old, new] / votes[old, new]
+            found.setdefault(old, []).append(Match(new, round(mean, 4)))
     return Matches(found, reasons)
 
 
@@ -142,8 +156,16 @@ class _Standing(NamedTuple):
     extent_m: float
 
 
-def match_in_place(rows: Sequence[TrackRow], source: Path | None, target: Path) -> Matches:
-    """Match what stands still in one place in both recordings."""
+def match_in_place(
+    rows: Sequence[TrackRow], source: Path | None, target: Path, group: Group
+) -> Matches:
+    """Match what stands still in one place in both recordings.
+
+    Parameters
+    ----------
+    rows : the tracks of the source, and their places if there are no tables.
+    group : as for `match_in_time`.
+    """
     _require_one_frame(source, target)
     new, _ = _standing(target)
     if source is None:
@@ -155,10 +177,11 @@ def match_in_place(rows: Sequence[TrackRow], source: Path | None, target: Path) 
     found: dict[int, list[Match]] = {}
     taken: dict[int, int] = {}
     for thing in old:
-        match, reason = _nearest_there(thing, old, new)
+        others = [other for other in old if group(other.track) != group(thing.track)]
+        match, reason = _nearest_there(thing, others, new)
         if match is None:
             reasons[thing.track] = reason
-        elif match.track in taken:
+        elif group(taken.get(match.track, thing.track)) != group(thing.track):
             reasons[thing.track] = f"track {match.track} may also be track {taken[match.track]}"
         else:
             taken[match.track] = thing.track
@@ -169,7 +192,10 @@ def match_in_place(rows: Sequence[TrackRow], source: Path | None, target: Path) 
 def _nearest_there(
     thing: _Standing, old: Sequence[_Standing], new: Sequence[_Standing]
 ) -> tuple[Match | None, str]:
-    """Return the only thing that stands where another one stood, or why there is none."""
+    """Return the only thing that stands where another one stood, or why there is none.
+
+    ``old`` are the other things that stood around.
+    """
     near = sorted((_apart(thing, other), k) for k, other in enumerate(new))
     reached = [(d, k) for d, k in near if d <= _reach(thing, new[k])]
     if not reached:
@@ -178,7 +204,7 @@ def _nearest_there(
     here = new[first]
     if others and others[0][0] - distance < _CLEAR_M:
         return None, f"tracks {here.track} and {new[others[0][1]].track} are both there"
-    rivals = [o.track for o in old if o is not thing and _apart(o, here) < distance + _CLEAR_M]
+    rivals = [other.track for other in old if _apart(other, here) < distance + _CLEAR_M]
     if rivals:
         return None, f"track {here.track} may also be track {rivals[0]}"
     ratio = max(thing.extent_m, here.extent_m) / min(thing.extent_m, here.extent_m)
