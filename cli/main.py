@@ -16,6 +16,7 @@ from .evaluate import evaluate
 from .export import export
 from .info import info
 from .learn import learn
+from .options import verbose_option
 from .process import process
 from .report import report
 from .scene import scene
@@ -46,8 +47,8 @@ class _Commands(click.Group):
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__)
-@click.option("-v", "--verbose", is_flag=True, help="Log what is done, on stderr.")
-def main(*, verbose: bool) -> None:
+@verbose_option
+def main() -> None:
     """Turn robot recordings into reviewed, labelled 3D objects.
 
     \b
@@ -57,8 +58,7 @@ def main(*, verbose: bool) -> None:
     """
     # The system's allocator gives memory back that long recordings no longer need.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
-    level = logging.INFO if verbose else logging.ERROR
-    logging.basicConfig(level=level, stream=sys.stderr, format="%(levelname)s %(message)s")
+    logging.basicConfig(level=logging.ERROR, stream=sys.stderr, format="%(levelname)s %(message)s")
 
 
 for _command in (

@@ -24,6 +24,7 @@ __all__ = [
     "lock",
     "partial_path",
     "replacing",
+    "require_writable",
 ]
 
 FSYNC = "SHAPECAT_FSYNC"
@@ -55,6 +56,26 @@ def replacing(path: Path) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             hidden.unlink(missing_ok=True)
+
+
+def require_writable(path: Path) -> None:
+    """Make the folders above a file that is to be written, and see that it can be.
+
+    Raises
+    ------
+    OutputError : it cannot, which is better known before the work than after it.
+    """
+    hidden = partial_path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        hidden.touch()
+        hidden.unlink()
+    except OSError as error:
+        msg = f"{path}: cannot be written: {error.strerror or error}"
+        raise OutputError(msg) from error
+    if path.is_dir():
+        msg = f"{path}: cannot be written: is a folder"
+        raise OutputError(msg)
 
 
 @contextmanager

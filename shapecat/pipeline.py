@@ -5,6 +5,7 @@ nothing of time; track is cheap and knows nothing of points; annotate knows noth
 Each can be run again alone.
 """
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
@@ -20,14 +21,22 @@ from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.detection import RecentFrames
 from shapecat.errors import NoStreamError, OutputError, RecordingError
 from shapecat.executors.order import Processes, read_ahead
+from shapecat.files import replacing
 from shapecat.learning import Categorizer, load_model
-from shapecat.outputs.rereading import with_clouds
+from shapecat.outputs.rereading import open_source, with_clouds
 from shapecat.perception import Perceiver, View
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
 from shapecat.recordings.gravity import Upright
 from shapecat.rehearsal import compile_all
-from shapecat.runs.corrections import TrackLabel, adopt_labels, read_labels
+from shapecat.runs.corrections import (
+    PREVIOUS,
+    TrackLabel,
+    adopt_labels,
+    has_labels,
+    read_labels,
+)
 from shapecat.runs.folder import (
+    OUTPUTS,
     clear,
     made_by_run,
     read_run,
@@ -36,19 +45,13 @@ from shapecat.runs.folder import (
     sweep,
     write_run,
 )
-from shapecat.runs.identity import ContentDigest, same_content, unchanged, work_id
+from shapecat.runs.identity import ContentDigest, file_stats, same_content, unchanged, work_id
 from shapecat.runs.jobs import Job, Summary, describe_run, resume, same_options, summarize
+from shapecat.runs.label_transfer import Transfer, lost_labels, transfer_labels
 from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.perceived import FrameRow, PerceptionTables, count_segments, discard_segments
 from shapecat.runs.shown import read_shown_frames
-from shapecat.runs.tables import (
-    FrameRow,
-    PerceptionTables,
-    count_rows,
-    count_segments,
-    discard_segments,
-    read_row_groups,
-    release_memory,
-)
+from shapecat.runs.tables import count_rows, read_row_groups, release_memory
 from shapecat.runs.tracks import track_run
 from shapecat.types import Frame, LabelledFrame, ShownFrame
 
@@ -57,6 +60,8 @@ __all__ = ["Observer", "annotate", "annotate_again", "perceive_all", "process", 
 _Shown = TypeVar("_Shown", LabelledFrame, ShownFrame)
 Observer = Callable[[str, int, int | None], None]
 """Called with the name of the phase, the frames done, and how many there are, if known."""
+
+_log = logging.getLogger(__name__)
 
 _AHEAD = 4
 """Frames read while one is written."""
@@ -90,6 +95,9 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
         categorizer.require_descriptor(DESCRIPTOR_NAMES)
         run = describe_run(job, categorizer)
         run["options"]["topics"] = [s.topic for s in choose_streams(recording, job.topics)]
+        _log.info(
+            "%s: %s, model %s", job.name, " ".join(run["options"]["topics"]), job.model or "default"
+        )
         recover(job.folder)
         if made_by_run(job.folder) is not None and not job.overwrite:
             return _finished(job, recording, run, content, observe)
@@ -110,6 +118,7 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
             write_run(folder, run)
             discard_segments(folder)
             _once("track", folder, run, lambda: track(folder, run, job))
+            _once("labels", folder, run, lambda: _keep_labels(folder, run, job))
             annotate(folder, recording, run, observe, cores=cores)
             _require_unchanged(folder, run, job)
             run["seconds"]["compile"] = compiling_s
@@ -147,11 +156,14 @@ def _require_unchanged(folder: Path, run: Mapping[str, Any], job: Job) -> None:
 def _once(phase: str, folder: Path, run: dict[str, Any], work: Callable[[], None]) -> None:
     """Do a phase unless it is done, and note in run.json that it is, and how long it took."""
     if phase in run["seconds"]:
+        _log.info("%s: %s was done before", folder, phase)
         return
+    _log.info("%s: %s begins", folder, phase)
     begun = time.perf_counter()
     work()
     release_memory()
     run["seconds"][phase] = time.perf_counter() - begun
+    _log.info("%s: %s took %.2f s", folder, phase, run["seconds"][phase])
     write_run(folder, run)
 
 
@@ -243,7 +255,26 @@ def _perceived(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
 
 def track(folder: Path, run: dict[str, Any], job: Job) -> None:
     """Follow the detections over time and fuse their posteriors: tracks.parquet, tracks.csv."""
-    run["counts"]["tracks"] = track_run(folder, job.settings.tracking, run["model"]["categories"])
+    run["counts"]["tracks"] = track_run(
+        folder, job.settings.tracking, run["model"]["categories"], work=run["work"]
+    )
+
+
+def _keep_labels(folder: Path, run: dict[str, Any], job: Job) -> None:
+    """Carry the labels that a person gave to the results that are replaced over to the new ones.
+
+    The table they were written into is kept beside the new one.
+    """
+    previous = job.folder / "tracks.csv"
+    if job.discard_labels or not has_labels(previous):
+        return
+    with replacing(folder / PREVIOUS) as path:
+        path.write_bytes(previous.read_bytes())
+    try:
+        transfer = transfer_labels(job.folder, folder)
+    except OutputError as error:
+        transfer = lost_labels(job.folder, str(error))
+    run["corrections"] = transfer.as_dict()
 
 
 def annotate(
@@ -296,23 +327,50 @@ def annotate(
         _once("review.rrd", folder, run, write_rrd)
 
 
-def annotate_again(folder: Path, labels: Path | None, observe: Observer = _ignore) -> None:
+def annotate_again(
+    folder: Path,
+    labels: Path | None,
+    observe: Observer = _ignore,
+    *,
+    by_place: bool = False,
+    recording: Path | None = None,
+) -> Transfer | None:
     """Write the outputs of a finished run again, with the labels a person has corrected.
+
+    Parameters
+    ----------
+    labels : the corrected table; that of the run itself by default.
+    by_place : the table, or run folder, is another run's: its labels go to the objects in the
+        same places.
+    recording : where the recording is now; where it was processed by default.
+
+    Returns
+    -------
+    What became of the labels that were looked for by place.
 
     Raises
     ------
     OutputError : the folder is not a finished run, or the table of labels does not fit it.
     RecordingError : the recording is no longer there.
     """
-    run = read_run(folder)
-    source = Path(run["input"]["path"])
-    adopt_labels(labels or folder / "tracks.csv", folder)
-    for output in ("annotated.mcap", "review.rrd"):
-        run["seconds"].pop(output, None)
-    write_run(folder, run)  # after a kill, the next run writes what is missing
-    with open_recording(source) as recording:
-        annotate(folder, recording, run, observe)
+    with open_source(read_run(folder), recording) as source:
+        transfer = _adopt(labels, folder, by_place=by_place)
+        run = read_run(folder)
+        run["input"] |= {"path": str(source.path.resolve()), "files": file_stats(source.path)}
+        for output in OUTPUTS:
+            run["seconds"].pop(output, None)
+        write_run(folder, run)  # after a kill, the next run writes what is missing
+        annotate(folder, source, run, observe)
     write_run(folder, run)
+    return transfer
+
+
+def _adopt(labels: Path | None, folder: Path, *, by_place: bool) -> Transfer | None:
+    """Make the labels of a table those of a run; return what became of those looked for."""
+    if by_place and labels is not None:
+        return transfer_labels(labels, folder)
+    adopt_labels(labels or folder / "tracks.csv", folder)
+    return None
 
 
 def _select(

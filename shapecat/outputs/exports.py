@@ -41,6 +41,7 @@ def export_run(
     out: Path,
     *,
     every: int = 1,
+    recording: Path | None = None,
     observe: Observer = _ignore,
 ) -> int:
     """Export the labels of a finished run with the points they belong to.
@@ -51,6 +52,7 @@ def export_run(
     Parameters
     ----------
     every : keep each so-many-th frame of a stream.
+    recording : where the recording is now; where it was processed by default.
 
     Returns
     -------
@@ -67,9 +69,9 @@ def export_run(
         raise ValueError(msg)
     finished = read_finished(folder)
     total = -(-int(finished.run["counts"]["frames"]) // every)
-    with open_source(finished) as recording:
+    with open_source(finished.run, recording) as source:
         chosen = _thinned(finished.frames(), every)
-        pairs = _observed(with_clouds(chosen, recording, finished.run), total, observe)
+        pairs = _observed(with_clouds(chosen, source, finished.run), total, observe)
         if format == "crops":
             return write_crops(out, pairs, finished)
         target = out / finished.name

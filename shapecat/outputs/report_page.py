@@ -20,7 +20,7 @@ from shapecat.outputs.colours import colour_of
 from shapecat.outputs.report_drawing import SIDE, Picture
 from shapecat.outputs.report_tracks import Course
 from shapecat.outputs.rereading import FinishedRun
-from shapecat.runs.corrections import TrackRow, TrackTable
+from shapecat.runs.track_table import TrackRow, TrackTable
 
 __all__ = ["Card", "Listed", "index_page", "is_unsure", "run_page"]
 

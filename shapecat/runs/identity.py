@@ -1,8 +1,8 @@
 """Who is who: a recording by its content, a run folder by an id of its own.
 
-A run has two names. ``id`` is random and belongs to this one folder: tables that leave it carry
-it, and a folder without it is none of ours. ``work`` is the same for the same content, settings,
-options and model.
+A run has two names. ``id`` is random and belongs to this one folder: one without it is none of
+ours. ``work`` tells what was done with what: runs that share it have the same tables, so a table
+that leaves its folder carries it.
 """
 
 import json
@@ -29,20 +29,28 @@ __all__ = [
 ]
 
 _BLOCK = 1 << 20
+_OUTPUTS = ("mcap", "rrd")
 
 Stats = list[list[Any]]
 """Per file: name, bytes, and the times of its content and its inode in nanoseconds."""
 
 
 def new_id() -> str:
-    """Return a random id; the letter in front keeps spreadsheets from reading a number."""
-    return f"r{secrets.token_hex(8)}"
+    """Return a random id."""
+    return secrets.token_hex(8)
 
 
 def work_id(run: Mapping[str, Any]) -> str:
-    """Return the name of the work that run.json describes, once its content is known."""
-    parts = [run["input"]["digest"], run["settings"], run["options"], run["model"]]
-    return xxhash.xxh3_128_hexdigest(json.dumps(parts, sort_keys=True).encode())
+    """Return the name of the work that run.json describes, once its content is known.
+
+    Content, settings, options, model and version, but for what the tables do not depend on. The
+    letter in front keeps spreadsheets from reading a number.
+    """
+    settings = {name: value for name, value in run["settings"].items() if name != "outputs"}
+    options = {name: value for name, value in run["options"].items() if name not in _OUTPUTS}
+    version = run["versions"]["shapecat"]
+    parts = [run["input"]["digest"], settings, options, run["model"], version]
+    return f"w{xxhash.xxh3_64_hexdigest(json.dumps(parts, sort_keys=True).encode())}"
 
 
 def file_stats(path: Path) -> Stats:

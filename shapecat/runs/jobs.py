@@ -63,7 +63,10 @@ class Job:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run came to; not ``fresh`` when it was complete before."""
+    """What a run came to; not ``fresh`` when it was complete before.
+
+    ``corrections`` is what became of the labels of the run it replaced, if there were any.
+    """
 
     source: str
     folder: Path
@@ -71,6 +74,7 @@ class Summary:
     seconds: float
     warnings: tuple[str, ...]
     fresh: bool = True
+    corrections: Mapping[str, Any] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for ``--json``."""
@@ -140,4 +144,5 @@ def summarize(job: Job, run: Mapping[str, Any], *, fresh: bool = True) -> Summar
         seconds=run["seconds"].get("total", 0.0),
         warnings=tuple(run["warnings"]),
         fresh=fresh,
+        corrections=run.get("corrections") if fresh else None,
     )
