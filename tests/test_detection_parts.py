@@ -5,7 +5,7 @@ import pytest
 
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
-from shapecat.detection.cells import cells_of
+from shapecat.detection.depth_grid import cells_of
 from shapecat.detection.parts import SIGNS, Sight, _sum_of, meet_at_all, signs_of, trees
 from shapecat.detection.segmentation import part
 from shapecat.models.parts import Pairs, collect, grow

@@ -6,8 +6,8 @@ Before that, `fuse` may join a frame with those that `RecentFrames` remembers.
 
 from shapecat.detection.detector import detect
 from shapecat.detection.fusing import fuse, with_own_readings
-from shapecat.detection.hierarchy import Hierarchy, Node, format_tree
 from shapecat.detection.recent import Earlier, RecentFrames
+from shapecat.detection.scene_graph import Hierarchy, Node, format_tree
 
 __all__ = [
     "Earlier",

@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import NEAREST_M, Cells, Lens
 from shapecat.detection.consensus import TOLERANCE, Readings
+from shapecat.detection.depth_grid import NEAREST_M, Cells, Lens
 from shapecat.detection.supports import COS, DIRECTIONS, SIN, Support, corners_of
 from shapecat.geometry import level_axes
 from shapecat.jit import kernel

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
-from shapecat.detection.cells import JUMP
+from shapecat.detection.depth_grid import JUMP
 from shapecat.detection.heights import Heights
 from shapecat.detection.pieces import (
     CONTACT,

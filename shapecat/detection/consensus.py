@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import Lens
+from shapecat.detection.depth_grid import Lens
 from shapecat.jit import kernel
 
 __all__ = [

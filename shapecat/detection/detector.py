@@ -5,11 +5,11 @@ from numpy.typing import ArrayLike
 
 from shapecat.arrays import F4, F8
 from shapecat.config import DetectionSettings
-from shapecat.detection.cells import cells_of
+from shapecat.detection.depth_grid import cells_of
 from shapecat.detection.pixels import pixels_of, points_of
 from shapecat.detection.scenes import scene_of
 from shapecat.detection.segmentation import Segmentation, segment
-from shapecat.detection.views import View, overview_of, view_of
+from shapecat.detection.virtual_camera import View, overview_of, view_of
 from shapecat.geometry import IDENTITY, inverse
 from shapecat.types import Camera, Frame, Scene
 

@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import JUMP, Cells, Lens
 from shapecat.detection.consensus import (
     TOLERANCE,
     cosine,
@@ -14,6 +13,7 @@ from shapecat.detection.consensus import (
     readings_of,
     refit,
 )
+from shapecat.detection.depth_grid import JUMP, Cells, Lens
 from shapecat.geometry import cross
 from shapecat.jit import kernel
 

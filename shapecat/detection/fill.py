@@ -3,7 +3,7 @@
 import numpy as np
 
 from shapecat.arrays import F4, I4, U1, Bool
-from shapecat.detection.cells import JUMP, place_of
+from shapecat.detection.depth_grid import JUMP, place_of
 from shapecat.detection.heights import LEAST_M, NOISE, Heights
 from shapecat.jit import kernel, unset
 

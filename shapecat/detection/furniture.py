@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, Bool
-from shapecat.detection.cells import JUMP, NEAREST_M, Lens, count_last, place_of
+from shapecat.detection.depth_grid import JUMP, NEAREST_M, Lens, count_last, place_of
 from shapecat.detection.heights import LEAST_M, NOISE
 from shapecat.detection.pieces import (
     AREA,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from shapecat.arrays import F4
-from shapecat.detection.cells import JUMP, NEAREST_M
+from shapecat.detection.depth_grid import JUMP, NEAREST_M
 from shapecat.detection.recent import Earlier
 from shapecat.geometry import IDENTITY
 from shapecat.jit import kernel

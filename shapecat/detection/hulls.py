@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import place_of
+from shapecat.detection.depth_grid import place_of
 from shapecat.jit import kernel
 
 __all__ = ["fill_hull"]

@@ -7,7 +7,7 @@ top of the lower one is level, at one height, and the upper one rises from there
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import Cells
+from shapecat.detection.depth_grid import Cells
 from shapecat.detection.heights import Heights
 from shapecat.detection.pieces import BAND_M, BANDS, BOTTOM, TOP, Pieces, note_cut, side_of
 from shapecat.detection.regions import cut_above

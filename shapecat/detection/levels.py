@@ -5,8 +5,8 @@ import math
 import numpy as np
 
 from shapecat.arrays import F8
-from shapecat.detection.cells import Cells, Lens
 from shapecat.detection.consensus import TOLERANCE, Readings, cosine, level_plane
+from shapecat.detection.depth_grid import Cells, Lens
 from shapecat.detection.grazing import add_grazing
 from shapecat.detection.planes import find_planes
 from shapecat.detection.supports import (

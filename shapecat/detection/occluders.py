@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.cells import JUMP, Lens
+from shapecat.detection.depth_grid import JUMP, Lens
 from shapecat.detection.pieces import (
     FEW,
     FRONT,

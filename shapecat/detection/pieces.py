@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.cells import Cells, Lens
+from shapecat.detection.depth_grid import Cells, Lens
 from shapecat.detection.heights import Heights
 from shapecat.detection.surfaces import Surfaces
 from shapecat.geometry import level_axes

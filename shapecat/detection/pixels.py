@@ -6,13 +6,13 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, U4, Bool
-from shapecat.detection.cells import JUMP, NEAREST_M, Cells, Lens, place_of
+from shapecat.detection.depth_grid import JUMP, NEAREST_M, Cells, Lens, place_of
 from shapecat.detection.fill import FRINGE
 from shapecat.detection.heights import LEAST_M, NOISE, inside
 from shapecat.detection.hidden import spread_labels
 from shapecat.detection.segmentation import Segmentation
 from shapecat.detection.surfaces import span_of
-from shapecat.detection.views import View
+from shapecat.detection.virtual_camera import View
 from shapecat.jit import kernel
 
 __all__ = ["pixels_of", "points_of"]

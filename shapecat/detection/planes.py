@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.cells import Cells, Lens
 from shapecat.detection.consensus import (
     TOLERANCE,
     Readings,
@@ -18,6 +17,7 @@ from shapecat.detection.consensus import (
     normal_of,
     refit,
 )
+from shapecat.detection.depth_grid import Cells, Lens
 from shapecat.detection.supports import (
     ARM,
     LEAST_AREA_M2,

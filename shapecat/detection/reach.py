@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
-from shapecat.detection.cells import JUMP, Cells, Lens, place_of
+from shapecat.detection.depth_grid import JUMP, Cells, Lens, place_of
 from shapecat.detection.heights import LEAST_M, NOISE, Heights, inside
 from shapecat.detection.walls import CLEARED
 from shapecat.jit import kernel, unset

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import JUMP, Cells, place_of
+from shapecat.detection.depth_grid import JUMP, Cells, place_of
 from shapecat.detection.heights import Heights
 from shapecat.detection.hulls import fill_hull
 from shapecat.detection.waves import (

@@ -7,7 +7,7 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U4, Bool, freeze
 from shapecat.config import DetectionSettings
-from shapecat.detection.cells import BORDER, NEAREST_M, Cells
+from shapecat.detection.depth_grid import BORDER, NEAREST_M, Cells
 from shapecat.detection.segmentation import Segmentation
 from shapecat.detection.supports import Support, corners_of
 from shapecat.detection.things import Things

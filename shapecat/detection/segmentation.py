@@ -15,8 +15,8 @@ from shapecat.config import DetectionSettings
 from shapecat.detection.axes import cut_at_axes
 from shapecat.detection.boards import boards_of
 from shapecat.detection.borders import meet
-from shapecat.detection.cells import Cells
 from shapecat.detection.consensus import draws_of
+from shapecat.detection.depth_grid import Cells
 from shapecat.detection.directions import estimate_up
 from shapecat.detection.fill import fill_enclosed, grow_feet
 from shapecat.detection.furniture import Field, Limits, is_no_object

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.cells import JUMP, Cells
+from shapecat.detection.depth_grid import JUMP, Cells
 from shapecat.detection.heights import Heights
 from shapecat.detection.pieces import (
     BAND_M,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from shapecat.arrays import F4, I4
-from shapecat.detection.cells import Lens
+from shapecat.detection.depth_grid import Lens
 from shapecat.jit import kernel
 
 __all__ = ["fit_tangents", "padded"]

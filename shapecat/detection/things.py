@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.cells import Cells, Lens, count_last, small_at
+from shapecat.detection.depth_grid import Cells, Lens, count_last, small_at
 from shapecat.detection.pieces import (
     BOTTOM,
     CONTACT,

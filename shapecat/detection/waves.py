@@ -6,7 +6,7 @@ They are higher than a plate is thick. What is left are steps and noise, which i
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import JUMP
+from shapecat.detection.depth_grid import JUMP
 from shapecat.jit import kernel
 
 __all__ = ["APART", "EVERY", "cut_feet", "excess_of", "noise_of", "subtract_mean"]

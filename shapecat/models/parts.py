@@ -18,7 +18,7 @@ import numpy as np
 from shapecat.arrays import F4, I4, U1, Bool
 from shapecat.config import DetectionSettings
 from shapecat.detection import parts
-from shapecat.detection.cells import Cells, cells_of
+from shapecat.detection.depth_grid import Cells, cells_of
 from shapecat.detection.joins import join_raised, join_small
 from shapecat.detection.occluders import join_around, join_behind
 from shapecat.detection.parts import SIGNS, Sight, Trees, meet_at_all, signs_of

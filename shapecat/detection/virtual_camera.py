@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.cells import CELL_M, JUMP, NEAREST_M, Cells, Lens
+from shapecat.detection.depth_grid import CELL_M, JUMP, NEAREST_M, Cells, Lens
 from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 from shapecat.types import Pose
