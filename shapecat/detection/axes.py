@@ -11,8 +11,8 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import Cells
-from shapecat.detection.heights import Heights
 from shapecat.detection.pieces import BAND_M, BANDS, COUNT, Pieces, is_cut, note_cut, side_of
+from shapecat.detection.planes.height_map import Heights
 from shapecat.detection.regions import cut_above
 from shapecat.detection.surfaces import Surfaces
 from shapecat.detection.traits import slope_of

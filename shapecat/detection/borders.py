@@ -6,7 +6,6 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
 from shapecat.detection.depth_grid import JUMP
-from shapecat.detection.heights import Heights
 from shapecat.detection.pieces import (
     CONTACT,
     FRONT,
@@ -21,6 +20,7 @@ from shapecat.detection.pieces import (
     Pieces,
     choose_samples,
 )
+from shapecat.detection.planes.height_map import Heights
 from shapecat.detection.surfaces import DOWN, RIGHT, Surfaces
 from shapecat.jit import kernel
 

@@ -4,7 +4,7 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U1, Bool
 from shapecat.detection.depth_grid import JUMP, place_of
-from shapecat.detection.heights import LEAST_M, NOISE, Heights
+from shapecat.detection.planes.height_map import LEAST_M, NOISE, Heights
 from shapecat.jit import kernel, unset
 
 __all__ = ["FRINGE", "fill_enclosed", "grow_feet"]

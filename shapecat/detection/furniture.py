@@ -6,7 +6,6 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, Bool
 from shapecat.detection.depth_grid import JUMP, NEAREST_M, Lens, count_last, place_of
-from shapecat.detection.heights import LEAST_M, NOISE
 from shapecat.detection.pieces import (
     AREA,
     BOTTOM,
@@ -23,6 +22,7 @@ from shapecat.detection.pieces import (
     depth_of,
     is_group,
 )
+from shapecat.detection.planes.height_map import LEAST_M, NOISE
 from shapecat.detection.traits import top_band
 from shapecat.detection.walls import CLEARED, ON_WALL
 from shapecat.jit import kernel

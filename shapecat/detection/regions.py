@@ -3,7 +3,7 @@
 import numpy as np
 
 from shapecat.arrays import F4, I4, U1
-from shapecat.detection.heights import Heights
+from shapecat.detection.planes.height_map import Heights
 from shapecat.detection.surfaces import DOWN, RIGHT, Surfaces
 from shapecat.jit import kernel, unset
 

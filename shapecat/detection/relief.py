@@ -11,8 +11,8 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.depth_grid import JUMP, Cells, place_of
-from shapecat.detection.heights import Heights
 from shapecat.detection.hulls import fill_hull
+from shapecat.detection.planes.height_map import Heights
 from shapecat.detection.waves import (
     APART,
     EVERY,

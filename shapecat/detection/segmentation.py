@@ -13,25 +13,25 @@ import numpy as np
 from shapecat.arrays import F8, I4, U1, Bool
 from shapecat.config import DetectionSettings
 from shapecat.detection.axes import cut_at_axes
-from shapecat.detection.boards import boards_of
 from shapecat.detection.borders import meet
-from shapecat.detection.consensus import draws_of
 from shapecat.detection.depth_grid import Cells
-from shapecat.detection.directions import estimate_up
 from shapecat.detection.fill import fill_enclosed, grow_feet
 from shapecat.detection.furniture import Field, Limits, is_no_object
-from shapecat.detection.heights import Heights, heights_of, table_of
 from shapecat.detection.joins import join_raised, join_small
 from shapecat.detection.ledges import cut_at_ledges
-from shapecat.detection.levels import find_levels
 from shapecat.detection.occluders import join_around, join_behind
 from shapecat.detection.parts import Sight, Trees, join_parts, trees
 from shapecat.detection.pieces import Pieces, pieces_after_cuts, pieces_of
+from shapecat.detection.planes.extent import Support
+from shapecat.detection.planes.height_map import Heights, heights_of, table_of
+from shapecat.detection.planes.parallel import find_levels
+from shapecat.detection.planes.ransac import draws_of
+from shapecat.detection.planes.supporting import boards_of
+from shapecat.detection.planes.up_direction import estimate_up
 from shapecat.detection.reach import reach_over
 from shapecat.detection.regions import regions_of, rename
 from shapecat.detection.relief import raise_low
 from shapecat.detection.steps import cut_at_steps
-from shapecat.detection.supports import Support
 from shapecat.detection.surfaces import Surfaces, surfaces_of
 from shapecat.detection.things import Things, things_of
 from shapecat.detection.walls import clear_walls

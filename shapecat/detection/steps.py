@@ -12,7 +12,6 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import JUMP, Cells
-from shapecat.detection.heights import Heights
 from shapecat.detection.pieces import (
     BAND_M,
     BANDS,
@@ -24,6 +23,7 @@ from shapecat.detection.pieces import (
     note_cut,
     side_of,
 )
+from shapecat.detection.planes.height_map import Heights
 from shapecat.detection.regions import cut_above
 from shapecat.detection.surfaces import Surfaces
 from shapecat.jit import kernel

@@ -7,7 +7,7 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U1
 from shapecat.detection.depth_grid import JUMP, Cells, Lens
-from shapecat.detection.heights import Heights
+from shapecat.detection.planes.height_map import Heights
 from shapecat.detection.tangents import fit_tangents, padded
 from shapecat.jit import kernel, unset
 

@@ -5,7 +5,8 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
-from shapecat.detection.consensus import (
+from shapecat.detection.depth_grid import BORDER, JUMP, Cells, Lens
+from shapecat.detection.planes.ransac import (
     TOLERANCE,
     Readings,
     consensus,
@@ -13,7 +14,6 @@ from shapecat.detection.consensus import (
     readings_of,
     without,
 )
-from shapecat.detection.depth_grid import BORDER, JUMP, Cells, Lens
 from shapecat.geometry import cross
 from shapecat.jit import kernel, unset
 

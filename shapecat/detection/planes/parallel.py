@@ -5,17 +5,17 @@ import math
 import numpy as np
 
 from shapecat.arrays import F8
-from shapecat.detection.consensus import TOLERANCE, Readings, cosine, level_plane
 from shapecat.detection.depth_grid import Cells, Lens
-from shapecat.detection.grazing import add_grazing
-from shapecat.detection.planes import find_planes
-from shapecat.detection.supports import (
+from shapecat.detection.planes.extent import (
     DIRECTIONS,
     LEAST_AREA_M2,
     Support,
     sort_by_height,
     support_of,
 )
+from shapecat.detection.planes.horizontal import find_planes
+from shapecat.detection.planes.oblique import add_grazing
+from shapecat.detection.planes.ransac import TOLERANCE, Readings, cosine, level_plane
 from shapecat.jit import kernel
 
 __all__ = ["find_levels"]

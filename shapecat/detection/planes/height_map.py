@@ -7,7 +7,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.depth_grid import Cells, Lens
-from shapecat.detection.supports import COS, DIRECTIONS, SIN, Support
+from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN, Support
 from shapecat.geometry import level_axes
 from shapecat.jit import kernel
 

@@ -8,7 +8,10 @@ planes is known, height alone is left to be found.
 import numpy as np
 
 from shapecat.arrays import F4, F8
-from shapecat.detection.consensus import (
+from shapecat.detection.depth_grid import Cells, Lens
+from shapecat.detection.planes.extent import ARM, LEAST_AREA_M2, Support, support_of
+from shapecat.detection.planes.horizontal import by_height, fullest
+from shapecat.detection.planes.ransac import (
     TOLERANCE,
     Readings,
     among,
@@ -18,9 +21,6 @@ from shapecat.detection.consensus import (
     normal_of,
     refit,
 )
-from shapecat.detection.depth_grid import Cells, Lens
-from shapecat.detection.planes import by_height, fullest
-from shapecat.detection.supports import ARM, LEAST_AREA_M2, Support, support_of
 from shapecat.jit import kernel
 
 __all__ = ["add_grazing"]

@@ -5,9 +5,9 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.consensus import TOLERANCE, Readings
 from shapecat.detection.depth_grid import NEAREST_M, Cells, Lens
-from shapecat.detection.supports import COS, DIRECTIONS, SIN, Support, corners_of
+from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN, Support, corners_of
+from shapecat.detection.planes.ransac import TOLERANCE, Readings
 from shapecat.geometry import level_axes
 from shapecat.jit import kernel
 

@@ -5,7 +5,16 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.consensus import (
+from shapecat.detection.depth_grid import Cells, Lens
+from shapecat.detection.planes.extent import (
+    ARM,
+    LEAST_AREA_M2,
+    MARGIN_M,
+    Support,
+    sort_by_height,
+    support_of,
+)
+from shapecat.detection.planes.ransac import (
     TOLERANCE,
     Readings,
     among,
@@ -16,15 +25,6 @@ from shapecat.detection.consensus import (
     middle_of,
     normal_of,
     refit,
-)
-from shapecat.detection.depth_grid import Cells, Lens
-from shapecat.detection.supports import (
-    ARM,
-    LEAST_AREA_M2,
-    MARGIN_M,
-    Support,
-    sort_by_height,
-    support_of,
 )
 from shapecat.jit import kernel
 

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, U1
-from shapecat.detection.consensus import TOLERANCE, Readings, normal_of
 from shapecat.detection.depth_grid import Cells, Lens
+from shapecat.detection.planes.ransac import TOLERANCE, Readings, normal_of
 from shapecat.geometry import level_axes
 from shapecat.jit import kernel
 

@@ -1,0 +1,1 @@
+"""Supporting planes: up, RANSAC, parallel levels, what bears objects, heights above it."""
