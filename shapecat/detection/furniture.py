@@ -6,6 +6,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, Bool
 from shapecat.detection.depth_grid import JUMP, NEAREST_M, Lens, count_last, place_of
+from shapecat.detection.foreground.walls import CLEARED, ON_WALL
 from shapecat.detection.pieces import (
     AREA,
     BOTTOM,
@@ -24,7 +25,6 @@ from shapecat.detection.pieces import (
 )
 from shapecat.detection.planes.height_map import LEAST_M, NOISE
 from shapecat.detection.traits import top_band
-from shapecat.detection.walls import CLEARED, ON_WALL
 from shapecat.jit import kernel
 
 __all__ = ["Field", "Limits", "is_no_object"]

@@ -16,6 +16,9 @@ from shapecat.detection.axes import cut_at_axes
 from shapecat.detection.borders import meet
 from shapecat.detection.depth_grid import Cells
 from shapecat.detection.fill import fill_enclosed, grow_feet
+from shapecat.detection.foreground.low_profile import raise_low
+from shapecat.detection.foreground.overhang import reach_over
+from shapecat.detection.foreground.walls import clear_walls
 from shapecat.detection.furniture import Field, Limits, is_no_object
 from shapecat.detection.joins import join_raised, join_small
 from shapecat.detection.ledges import cut_at_ledges
@@ -28,13 +31,10 @@ from shapecat.detection.planes.parallel import find_levels
 from shapecat.detection.planes.ransac import draws_of
 from shapecat.detection.planes.supporting import boards_of
 from shapecat.detection.planes.up_direction import estimate_up
-from shapecat.detection.reach import reach_over
 from shapecat.detection.regions import regions_of, rename
-from shapecat.detection.relief import raise_low
 from shapecat.detection.steps import cut_at_steps
 from shapecat.detection.surfaces import Surfaces, surfaces_of
 from shapecat.detection.things import Things, things_of
-from shapecat.detection.walls import clear_walls
 from shapecat.errors import ConfigError
 from shapecat.jit import kernel
 

@@ -10,8 +10,8 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
 from shapecat.detection.depth_grid import JUMP, Cells, Lens, place_of
+from shapecat.detection.foreground.walls import CLEARED
 from shapecat.detection.planes.height_map import LEAST_M, NOISE, Heights, inside
-from shapecat.detection.walls import CLEARED
 from shapecat.jit import kernel, unset
 
 __all__ = ["reach_over"]

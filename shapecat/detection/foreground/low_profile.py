@@ -11,9 +11,8 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.depth_grid import JUMP, Cells, place_of
-from shapecat.detection.hulls import fill_hull
-from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.waves import (
+from shapecat.detection.foreground.convex_hull import fill_hull
+from shapecat.detection.foreground.depth_error import (
     APART,
     EVERY,
     cut_feet,
@@ -21,6 +20,7 @@ from shapecat.detection.waves import (
     noise_of,
     subtract_mean,
 )
+from shapecat.detection.planes.height_map import Heights
 from shapecat.jit import kernel, unset
 
 __all__ = ["raise_low"]
