@@ -4,8 +4,8 @@
 Before that, `fuse` may join a frame with those that `RecentFrames` remembers.
 """
 
-from shapecat.detection.detector import detect
 from shapecat.detection.fusing import fuse, with_own_readings
+from shapecat.detection.pipeline import detect
 from shapecat.detection.recent import Earlier, RecentFrames
 from shapecat.detection.scene_graph import Hierarchy, Node, format_tree
 

@@ -62,7 +62,7 @@ other things from which they may hide the rest."""
 
 
 class Field(NamedTuple):
-    """What is known of the cells, as in `Cells`, `Heights`, `Parted` and `Surfaces`."""
+    """What is known of the cells, as in `Cells`, `Heights`, `OverSegmentation` and `Surfaces`."""
 
     w: F4
     lens: Lens

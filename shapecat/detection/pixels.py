@@ -10,7 +10,7 @@ from shapecat.detection.depth_grid import JUMP, NEAREST_M, Cells, Lens, place_of
 from shapecat.detection.fill import FRINGE
 from shapecat.detection.hidden import spread_labels
 from shapecat.detection.planes.height_map import LEAST_M, NOISE, inside
-from shapecat.detection.segmentation import Segmentation
+from shapecat.detection.records import LabelledGrid
 from shapecat.detection.surfaces import span_of
 from shapecat.detection.virtual_camera import View
 from shapecat.jit import kernel
@@ -24,7 +24,7 @@ UNSURE, BARE = -1, -2
 
 
 class Shown(NamedTuple):
-    """What is known of the cells, as in `Cells` and `Segmentation`; ``owners`` by label."""
+    """What is known of the cells, as in `Cells` and `LabelledGrid`; ``owners`` by label."""
 
     w: F4
     labels: I4
@@ -33,7 +33,7 @@ class Shown(NamedTuple):
     owners: I4
 
 
-def pixels_of(depth: F4, cells: Cells, found: Segmentation, *, range_m: float) -> list[U4]:
+def pixels_of(depth: F4, cells: Cells, found: LabelledGrid, *, range_m: float) -> list[U4]:
     """Return the ascending pixel indices of the labels 1, 2, ...
 
     A pixel takes the label of its cell, or else of the neighbour whose depth fits best; it keeps
@@ -43,7 +43,7 @@ def pixels_of(depth: F4, cells: Cells, found: Segmentation, *, range_m: float) -
     return _split(*_list_pixels(depth, shown, cells.factor, range_m, found.owners.size))
 
 
-def points_of(view: View, found: Segmentation, *, fused: bool) -> list[U4]:
+def points_of(view: View, found: LabelledGrid, *, fused: bool) -> list[U4]:
     """Return the ascending point indices of the labels, as `pixels_of`.
 
     With ``fused`` points behind the visible surface are given to what they touch; lists beyond
@@ -81,7 +81,7 @@ def _above(points: F4, cell: I4, lens: Lens, plane: F8) -> Bool:
     return result
 
 
-def _shown(cells: Cells, found: Segmentation) -> Shown:
+def _shown(cells: Cells, found: LabelledGrid) -> Shown:
     return Shown(cells.w, found.labels, found.filled, found.planes, found.owners)
 
 

@@ -9,7 +9,7 @@ from shapecat.arrays import F4, I4, U4, Bool, freeze
 from shapecat.config import DetectionSettings
 from shapecat.detection.depth_grid import BORDER, NEAREST_M, Cells
 from shapecat.detection.planes.extent import Support, corners_of
-from shapecat.detection.segmentation import Segmentation
+from shapecat.detection.records import LabelledGrid
 from shapecat.detection.things import Things
 from shapecat.geometry import (
     IDENTITY,
@@ -32,7 +32,7 @@ least cosine, about, of what is in front of a camera."""
 
 def scene_of(
     cells: Cells,
-    found: Segmentation,
+    found: LabelledGrid,
     indices: Sequence[U4],
     sensor_from_view: Pose,
     *,
@@ -83,7 +83,7 @@ def _kept(
 
 
 def _boxes(
-    found: Segmentation,
+    found: LabelledGrid,
     indices: Sequence[U4],
     points: F4 | None,
     sensor_from_view: Pose,
@@ -137,7 +137,7 @@ def _begin(w: F4, axis: int, step: int, reach: int) -> int:
     return first if first >= 0 and high - low > STRAIGHT * length else 0
 
 
-def _cut_cloud(cells: Cells, found: Segmentation, sensor_from_view: Pose) -> Bool:
+def _cut_cloud(cells: Cells, found: LabelledGrid, sensor_from_view: Pose) -> Bool:
     """Return whether each object reaches a border of what the sensor of a cloud saw.
 
     Such a border is a straight side of the cloud as seen from the sensor's place, with more than
