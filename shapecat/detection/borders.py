@@ -21,7 +21,7 @@ from shapecat.detection.pieces import (
     choose_samples,
 )
 from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.surfaces import DOWN, RIGHT, Surfaces
+from shapecat.detection.segmentation.connectivity import DOWN, RIGHT, Surfaces
 from shapecat.jit import kernel
 
 __all__ = ["meet"]

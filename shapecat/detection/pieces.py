@@ -8,7 +8,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import Cells, Lens
 from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.surfaces import Surfaces
+from shapecat.detection.segmentation.connectivity import Surfaces
 from shapecat.geometry import level_axes
 from shapecat.jit import kernel
 

@@ -23,7 +23,6 @@ from numpy.typing import ArrayLike
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.config import DetectionSettings
-from shapecat.detection.axes import cut_at_axes
 from shapecat.detection.borders import meet
 from shapecat.detection.depth_grid import Cells, cells_of
 from shapecat.detection.fill import fill_enclosed, grow_feet
@@ -32,7 +31,6 @@ from shapecat.detection.foreground.overhang import reach_over
 from shapecat.detection.foreground.walls import clear_walls
 from shapecat.detection.furniture import Field, Limits, is_no_object
 from shapecat.detection.joins import join_raised, join_small
-from shapecat.detection.ledges import cut_at_ledges
 from shapecat.detection.occluders import join_around, join_behind
 from shapecat.detection.parts import Sight, join_parts, trees
 from shapecat.detection.pieces import pieces_after_cuts, pieces_of
@@ -41,10 +39,12 @@ from shapecat.detection.planes import NO_HINT, find_supporting_planes
 from shapecat.detection.planes.height_map import heights_of
 from shapecat.detection.planes.ransac import draws_of
 from shapecat.detection.records import LabelledGrid, OverSegmentation, PlaneModel
-from shapecat.detection.regions import regions_of, rename
 from shapecat.detection.scenes import scene_of
-from shapecat.detection.steps import cut_at_steps
-from shapecat.detection.surfaces import surfaces_of
+from shapecat.detection.segmentation.axis_split import cut_at_axes
+from shapecat.detection.segmentation.connectivity import surfaces_of
+from shapecat.detection.segmentation.top_face_split import cut_at_ledges
+from shapecat.detection.segmentation.watershed import regions_of, rename
+from shapecat.detection.segmentation.width_split import cut_at_steps
 from shapecat.detection.things import things_of
 from shapecat.detection.virtual_camera import View, overview_of, view_of
 from shapecat.errors import ConfigError

@@ -11,7 +11,7 @@ from shapecat.detection.fill import FRINGE
 from shapecat.detection.hidden import spread_labels
 from shapecat.detection.planes.height_map import LEAST_M, NOISE, inside
 from shapecat.detection.records import LabelledGrid
-from shapecat.detection.surfaces import span_of
+from shapecat.detection.segmentation.connectivity import span_of
 from shapecat.detection.virtual_camera import View
 from shapecat.jit import kernel
 

@@ -6,7 +6,7 @@ from shapecat.arrays import F8, I4, U1
 from shapecat.detection.pieces import Pieces
 from shapecat.detection.planes.extent import Support
 from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.surfaces import Surfaces
+from shapecat.detection.segmentation.connectivity import Surfaces
 from shapecat.detection.things import Things
 
 __all__ = ["LabelledGrid", "OverSegmentation", "PlaneModel"]

@@ -23,7 +23,7 @@ from shapecat.detection.pieces import (
     Pieces,
     depths_of,
 )
-from shapecat.detection.surfaces import span_of
+from shapecat.detection.segmentation.connectivity import span_of
 from shapecat.geometry import level_axes, row_quaternion
 from shapecat.jit import kernel
 

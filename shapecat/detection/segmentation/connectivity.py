@@ -8,7 +8,7 @@ import numpy as np
 from shapecat.arrays import F4, I4, U1
 from shapecat.detection.depth_grid import JUMP, Cells, Lens
 from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.tangents import fit_tangents, padded
+from shapecat.detection.segmentation.normals import fit_tangents, padded
 from shapecat.jit import kernel, unset
 
 __all__ = ["DOWN", "RIGHT", "Surfaces", "span_of", "surfaces_of"]

@@ -24,8 +24,8 @@ from shapecat.detection.pieces import (
     side_of,
 )
 from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.regions import cut_above
-from shapecat.detection.surfaces import Surfaces
+from shapecat.detection.segmentation.connectivity import Surfaces
+from shapecat.detection.segmentation.watershed import cut_above
 from shapecat.jit import kernel
 
 __all__ = ["cut_at_steps"]

@@ -4,7 +4,7 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U1
 from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.surfaces import DOWN, RIGHT, Surfaces
+from shapecat.detection.segmentation.connectivity import DOWN, RIGHT, Surfaces
 from shapecat.jit import kernel, unset
 
 __all__ = ["cut_above", "regions_of", "rename"]
