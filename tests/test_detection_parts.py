@@ -6,7 +6,7 @@ import pytest
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.detection.depth_grid import cells_of
-from shapecat.detection.parts import SIGNS, Sight, _sum_of, meet_at_all, signs_of, trees
+from shapecat.detection.merging.learned import SIGNS, Sight, _sum_of, meet_at_all, signs_of, trees
 from shapecat.detection.pipeline import oversegment
 from shapecat.models.parts import Pairs, collect, grow
 from shapecat.simulation import KINECT, make_scene, render_frame

@@ -7,7 +7,8 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4, U1, Bool
 from shapecat.detection.depth_grid import JUMP, NEAREST_M, Lens, count_last, place_of
 from shapecat.detection.foreground.walls import CLEARED, ON_WALL
-from shapecat.detection.pieces import (
+from shapecat.detection.merging.segment_features import top_band
+from shapecat.detection.merging.segments import (
     AREA,
     BOTTOM,
     CONTACT,
@@ -24,7 +25,6 @@ from shapecat.detection.pieces import (
     is_group,
 )
 from shapecat.detection.planes.height_map import LEAST_M, NOISE
-from shapecat.detection.traits import top_band
 from shapecat.jit import kernel
 
 __all__ = ["Field", "Limits", "is_no_object"]

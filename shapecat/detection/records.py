@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 from shapecat.arrays import F8, I4, U1
-from shapecat.detection.pieces import Pieces
+from shapecat.detection.merging.segments import Pieces
 from shapecat.detection.planes.extent import Support
 from shapecat.detection.planes.height_map import Heights
 from shapecat.detection.segmentation.connectivity import Surfaces

@@ -7,7 +7,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import Cells, Lens, count_last, small_at
-from shapecat.detection.pieces import (
+from shapecat.detection.merging.segments import (
     BOTTOM,
     CONTACT,
     FEW,

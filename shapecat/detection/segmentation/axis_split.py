@@ -11,11 +11,19 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import Cells
-from shapecat.detection.pieces import BAND_M, BANDS, COUNT, Pieces, is_cut, note_cut, side_of
+from shapecat.detection.merging.segment_features import slope_of
+from shapecat.detection.merging.segments import (
+    BAND_M,
+    BANDS,
+    COUNT,
+    Pieces,
+    is_cut,
+    note_cut,
+    side_of,
+)
 from shapecat.detection.planes.height_map import Heights
 from shapecat.detection.segmentation.connectivity import Surfaces
 from shapecat.detection.segmentation.watershed import cut_above
-from shapecat.detection.traits import slope_of
 from shapecat.geometry import cross
 from shapecat.jit import kernel
 

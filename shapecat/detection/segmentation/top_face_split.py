@@ -8,11 +8,19 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.depth_grid import Cells
-from shapecat.detection.pieces import BAND_M, BANDS, BOTTOM, TOP, Pieces, note_cut, side_of
+from shapecat.detection.merging.segment_features import roundness_of
+from shapecat.detection.merging.segments import (
+    BAND_M,
+    BANDS,
+    BOTTOM,
+    TOP,
+    Pieces,
+    note_cut,
+    side_of,
+)
 from shapecat.detection.planes.height_map import Heights
 from shapecat.detection.segmentation.connectivity import Surfaces
 from shapecat.detection.segmentation.watershed import cut_above
-from shapecat.detection.traits import roundness_of
 from shapecat.jit import kernel
 
 __all__ = ["cut_at_ledges"]

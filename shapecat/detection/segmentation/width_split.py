@@ -12,7 +12,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import JUMP, Cells
-from shapecat.detection.pieces import (
+from shapecat.detection.merging.segments import (
     BAND_M,
     BANDS,
     BOTTOM,

@@ -4,7 +4,7 @@ import numpy as np
 
 from shapecat.arrays import I4, Bool
 from shapecat.detection.depth_grid import Cells, small_at
-from shapecat.detection.pieces import CONTACT, COUNT, Pieces, depths_of, is_group, merge
+from shapecat.detection.merging.segments import CONTACT, COUNT, Pieces, depths_of, is_group, merge
 from shapecat.jit import kernel
 
 __all__ = ["join_raised", "join_small"]

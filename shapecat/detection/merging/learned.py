@@ -12,7 +12,17 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, I4
-from shapecat.detection.pieces import (
+from shapecat.detection.merging.segment_features import (
+    LID_M,
+    apart,
+    behind,
+    lid_share,
+    roundness_of,
+    slope_of,
+    top_band,
+    width_of,
+)
+from shapecat.detection.merging.segments import (
     AREA,
     BOTTOM,
     CONTACT,
@@ -33,16 +43,6 @@ from shapecat.detection.pieces import (
     Pieces,
     may_join,
     merge,
-)
-from shapecat.detection.traits import (
-    LID_M,
-    apart,
-    behind,
-    lid_share,
-    roundness_of,
-    slope_of,
-    top_band,
-    width_of,
 )
 from shapecat.jit import kernel
 
@@ -117,7 +117,7 @@ class Sight(NamedTuple):
 @cache
 def trees() -> Trees:
     """Return the trees that belong to this version."""
-    content = files("shapecat.detection").joinpath(FILE).read_bytes()
+    content = files("shapecat.detection.merging").joinpath(FILE).read_bytes()
     with np.load(BytesIO(content), allow_pickle=False) as arrays:
         return Trees(*(arrays[name] for name in Trees._fields))
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
 from shapecat.detection.depth_grid import JUMP
-from shapecat.detection.pieces import (
+from shapecat.detection.merging.segments import (
     CONTACT,
     FRONT,
     HIDDEN,

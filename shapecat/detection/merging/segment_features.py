@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4
-from shapecat.detection.pieces import (
+from shapecat.detection.merging.segments import (
     BAND_M,
     BANDS,
     COUNT,

@@ -6,7 +6,8 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import JUMP, Lens
-from shapecat.detection.pieces import (
+from shapecat.detection.merging.segment_features import roundness_of, slope_of, width_of
+from shapecat.detection.merging.segments import (
     FEW,
     FRONT,
     LEFT,
@@ -17,7 +18,6 @@ from shapecat.detection.pieces import (
     may_join,
     merge,
 )
-from shapecat.detection.traits import roundness_of, slope_of, width_of
 from shapecat.jit import kernel
 
 __all__ = ["join_around", "join_behind"]
