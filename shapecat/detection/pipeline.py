@@ -23,12 +23,12 @@ from numpy.typing import ArrayLike
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.config import DetectionSettings
+from shapecat.detection.cleanup.holes import fill_enclosed, grow_feet
+from shapecat.detection.cleanup.structure import Field, Limits, is_no_object
 from shapecat.detection.depth_grid import Cells, cells_of
-from shapecat.detection.fill import fill_enclosed, grow_feet
 from shapecat.detection.foreground.low_profile import raise_low
 from shapecat.detection.foreground.overhang import reach_over
 from shapecat.detection.foreground.walls import clear_walls
-from shapecat.detection.furniture import Field, Limits, is_no_object
 from shapecat.detection.merging.across_occlusion import join_around, join_behind
 from shapecat.detection.merging.adjacency import meet
 from shapecat.detection.merging.learned import Sight, join_parts, trees

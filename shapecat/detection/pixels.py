@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, U4, Bool
+from shapecat.detection.cleanup.holes import FRINGE
 from shapecat.detection.depth_grid import JUMP, NEAREST_M, Cells, Lens, place_of
-from shapecat.detection.fill import FRINGE
 from shapecat.detection.hidden import spread_labels
 from shapecat.detection.planes.height_map import LEAST_M, NOISE, inside
 from shapecat.detection.records import LabelledGrid
