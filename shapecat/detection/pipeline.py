@@ -34,18 +34,18 @@ from shapecat.detection.merging.adjacency import meet
 from shapecat.detection.merging.learned import Sight, join_parts, trees
 from shapecat.detection.merging.segments import pieces_after_cuts, pieces_of
 from shapecat.detection.merging.small import join_raised, join_small
-from shapecat.detection.pixels import pixels_of, points_of
+from shapecat.detection.output.label_upsampling import pixels_of, points_of
+from shapecat.detection.output.measurements import things_of
+from shapecat.detection.output.scene import scene_of
 from shapecat.detection.planes import NO_HINT, find_supporting_planes
 from shapecat.detection.planes.height_map import heights_of
 from shapecat.detection.planes.ransac import draws_of
 from shapecat.detection.records import LabelledGrid, OverSegmentation, PlaneModel
-from shapecat.detection.scenes import scene_of
 from shapecat.detection.segmentation.axis_split import cut_at_axes
 from shapecat.detection.segmentation.connectivity import surfaces_of
 from shapecat.detection.segmentation.top_face_split import cut_at_ledges
 from shapecat.detection.segmentation.watershed import regions_of, rename
 from shapecat.detection.segmentation.width_split import cut_at_steps
-from shapecat.detection.things import things_of
 from shapecat.detection.virtual_camera import View, overview_of, view_of
 from shapecat.errors import ConfigError
 from shapecat.geometry import IDENTITY, inverse

@@ -4,10 +4,10 @@ from typing import NamedTuple
 
 from shapecat.arrays import F8, I4, U1
 from shapecat.detection.merging.segments import Pieces
+from shapecat.detection.output.measurements import Things
 from shapecat.detection.planes.extent import Support
 from shapecat.detection.planes.height_map import Heights
 from shapecat.detection.segmentation.connectivity import Surfaces
-from shapecat.detection.things import Things
 
 __all__ = ["LabelledGrid", "OverSegmentation", "PlaneModel"]
 

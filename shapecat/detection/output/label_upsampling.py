@@ -8,7 +8,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4, U1, U4, Bool
 from shapecat.detection.cleanup.holes import FRINGE
 from shapecat.detection.depth_grid import JUMP, NEAREST_M, Cells, Lens, place_of
-from shapecat.detection.hidden import spread_labels
+from shapecat.detection.output.occluded_points import spread_labels
 from shapecat.detection.planes.height_map import LEAST_M, NOISE, inside
 from shapecat.detection.records import LabelledGrid
 from shapecat.detection.segmentation.connectivity import span_of

@@ -8,9 +8,9 @@ import numpy as np
 from shapecat.arrays import F4, I4, U4, Bool, freeze
 from shapecat.config import DetectionSettings
 from shapecat.detection.depth_grid import BORDER, NEAREST_M, Cells
+from shapecat.detection.output.measurements import Things
 from shapecat.detection.planes.extent import Support, corners_of
 from shapecat.detection.records import LabelledGrid
-from shapecat.detection.things import Things
 from shapecat.geometry import (
     IDENTITY,
     quaternion_from_rotation,
