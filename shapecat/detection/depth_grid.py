@@ -10,13 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, I4
+from shapecat.geometry import DISCONTINUITY, NEAREST_M
 from shapecat.jit import kernel
 from shapecat.types import Camera
 
 __all__ = [
     "BORDER",
-    "JUMP",
-    "NEAREST_M",
     "Cells",
     "Lens",
     "cells_of",
@@ -25,14 +24,10 @@ __all__ = [
     "small_at",
 ]
 
-JUMP = 0.012
-"""Step in inverse depth that separates surfaces, 1/m: four steps of a Kinect, 1 cm at 0.9 m."""
 CELL_M = 0.0035
 """Size of a cell on the objects: small against the smallest object, larger than the noise."""
 SMALL_M2 = 9e-4
 """Surface of the smallest object."""
-NEAREST_M = 0.05
-"""Nothing measures nearer; keeps inverse depth within bounds."""
 BORDER = 0.12
 """Share of the image in which its readings may begin: a registered Kinect is blind in a tenth."""
 LARGEST_FACTOR = 16
@@ -86,7 +81,7 @@ def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_
     )
     rows, columns = depth.shape[0] // factor, depth.shape[1] // factor
     w = np.zeros((rows, columns), np.float32)
-    _average(depth, factor, np.float32(range_m), np.float32(JUMP), w)
+    _average(depth, factor, np.float32(range_m), np.float32(DISCONTINUITY), w)
     return Cells(w, lens, factor, factor * pixel_m)
 
 
@@ -128,7 +123,7 @@ def count_last(w: F4, labels: I4, size: int, range_m: float) -> I4:
     Label 0 has none.
     """
     count = np.zeros(size, np.int64)
-    most = np.float32(1 / range_m + JUMP / 2)
+    most = np.float32(1 / range_m + DISCONTINUITY / 2)
     for i in range(w.shape[0]):
         some = False
         for j in range(w.shape[1]):

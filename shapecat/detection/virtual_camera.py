@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import CELL_M, JUMP, NEAREST_M, Cells, Lens
-from shapecat.geometry import gravity_rotation
+from shapecat.detection.depth_grid import CELL_M, Cells, Lens
+from shapecat.geometry import DISCONTINUITY, NEAREST_M, gravity_rotation
 from shapecat.jit import kernel
 from shapecat.types import Pose
 
@@ -234,10 +234,10 @@ def _project(points: F4, place: F4, lens: Lens, w: F4, cell: I4) -> int:
             continue
         i, j = cell[k] // columns, cell[k] % columns
         v = np.float32(1) / points[k, 2]
-        if v > nearest[i, j] - JUMP:
+        if v > nearest[i, j] - DISCONTINUITY:
             w[i, j] += v
             count[i, j] += 1
-        elif v < nearest[i, j] - 3 * JUMP:
+        elif v < nearest[i, j] - 3 * DISCONTINUITY:
             behind += 1
     for i in range(rows):
         for j in range(columns):
@@ -257,11 +257,11 @@ def _close_holes(w: F4) -> None:
                 continue
             total, n = np.float32(0), 0
             a, b = source[i, j - 1], source[i, j + 1]
-            if (a > 0) & (b > 0) & (abs(a - b) < JUMP):
+            if (a > 0) & (b > 0) & (abs(a - b) < DISCONTINUITY):
                 total += a + b
                 n += 2
             a, b = source[i - 1, j], source[i + 1, j]
-            if (a > 0) & (b > 0) & (abs(a - b) < JUMP):
+            if (a > 0) & (b > 0) & (abs(a - b) < DISCONTINUITY):
                 total += a + b
                 n += 2
             if n > 0:

@@ -3,8 +3,9 @@
 import numpy as np
 
 from shapecat.arrays import F4, I4, U1, Bool
-from shapecat.detection.depth_grid import JUMP, place_of
+from shapecat.detection.depth_grid import place_of
 from shapecat.detection.planes.height_map import LEAST_M, NOISE, Heights
+from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel, unset
 
 __all__ = ["FRINGE", "fill_enclosed", "grow_feet"]
@@ -52,7 +53,7 @@ def grow_feet(w: F4, heights: Heights, labels: I4) -> None:
             x = j + (1 if d == 2 else -1 if d == 3 else 0)
             if y < 0 or x < 0 or y >= rows or x >= columns or labels[y, x] != 0:
                 continue
-            if owner[y, x] != -abs(owner[i, j]) or abs(w[y, x] - w[i, j]) >= JUMP:
+            if owner[y, x] != -abs(owner[i, j]) or abs(w[y, x] - w[i, j]) >= DISCONTINUITY:
                 continue
             z = 1 / w[y, x]
             if height[y, x] > FRINGE * (LEAST_M + NOISE * z * z):
@@ -136,8 +137,8 @@ def _flood_hole(
             if label > 0:
                 total += 1
                 sides[label] += 1
-                ahead[label] += w[y, x] > w[i, j] + JUMP
-                level[label] += abs(w[y, x] - w[i, j]) < JUMP
+                ahead[label] += w[y, x] > w[i, j] + DISCONTINUITY
+                level[label] += abs(w[y, x] - w[i, j]) < DISCONTINUITY
             elif w[y, x] <= 0:
                 total += 1
             elif not seen[y, x]:

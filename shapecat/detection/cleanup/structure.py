@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, Bool
-from shapecat.detection.depth_grid import JUMP, NEAREST_M, Lens, count_last, place_of
+from shapecat.detection.depth_grid import Lens, count_last, place_of
 from shapecat.detection.foreground.walls import CLEARED, ON_WALL
 from shapecat.detection.merging.segment_features import top_band
 from shapecat.detection.merging.segments import (
@@ -25,6 +25,7 @@ from shapecat.detection.merging.segments import (
     is_group,
 )
 from shapecat.detection.planes.height_map import LEAST_M, NOISE
+from shapecat.geometry import DISCONTINUITY, NEAREST_M
 from shapecat.jit import kernel
 
 __all__ = ["Field", "Limits", "is_no_object"]
@@ -183,7 +184,7 @@ def _count_leaving(field: Field, counts: I4) -> None:
                 if (
                     owner[y, x] == 0
                     and w[y, x] > max(plane[0] * x + plane[1] * y + plane[2], 0)
-                    and abs(w[y, x] - w[i, j]) < JUMP
+                    and abs(w[y, x] - w[i, j]) < DISCONTINUITY
                 ):
                     which = TO_WALL if field.walls[y, x] == CLEARED else BEYOND
                     counts[which, regions[i, j]] += 1
@@ -251,7 +252,7 @@ def _rise(w: F4, lens: Lens, i: int, j: int, up: F8, sign: int, most: float) -> 
         if v < 0 or u < 0 or v >= w.shape[0] or u >= w.shape[1]:
             break
         ahead = w[v, u] - inverse
-        if abs(ahead) < JUMP:
+        if abs(ahead) < DISCONTINUITY:
             reach, misses = d, 0.0
             continue
         misses += 0.5 if ahead > 0 else 1.0  # something in front of it hides it
@@ -295,6 +296,12 @@ def _followed(w: F4, lens: Lens, i: int, j: int, up: F8, rise: float) -> int:
     if z <= NEAREST_M:
         return -1
     v, u = int(lens.cy + lens.fy * y / z + 0.5), int(lens.cx + lens.fx * x / z + 0.5)
-    if v < 0 or u < 0 or v >= w.shape[0] or u >= w.shape[1] or abs(w[v, u] - 1 / z) >= JUMP:
+    if (
+        v < 0
+        or u < 0
+        or v >= w.shape[0]
+        or u >= w.shape[1]
+        or abs(w[v, u] - 1 / z) >= DISCONTINUITY
+    ):
         return -1
     return int(v * w.shape[1] + u)

@@ -6,7 +6,7 @@ They are higher than a plate is thick. What is left are steps and noise, which i
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import JUMP
+from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = ["APART", "EVERY", "cut_feet", "excess_of", "noise_of", "subtract_mean"]
@@ -110,7 +110,7 @@ def cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4, stack: I4, d
                 for d in range(4):
                     y = i + (1 if d == 0 else -1 if d == 1 else 0)
                     x = j + (1 if d == 2 else -1 if d == 3 else 0)
-                    if excess[y, x] != 0 and abs(w[y, x] - w[i, j]) < JUMP:
+                    if excess[y, x] != 0 and abs(w[y, x] - w[i, j]) < DISCONTINUITY:
                         stack[top], drop[top] = y * columns + x, excess[y, x]
                         excess[y, x] = 0
                         top += 1
@@ -122,7 +122,11 @@ def cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4, stack: I4, d
         for d in range(4):
             y = i + (1 if d == 0 else -1 if d == 1 else 0)
             x = j + (1 if d == 2 else -1 if d == 3 else 0)
-            if excess[y, x] != 0 and here - excess[y, x] > SLOPE and abs(w[y, x] - w[i, j]) < JUMP:
+            if (
+                excess[y, x] != 0
+                and here - excess[y, x] > SLOPE
+                and abs(w[y, x] - w[i, j]) < DISCONTINUITY
+            ):
                 stack[top], drop[top] = y * columns + x, excess[y, x]
                 excess[y, x] = 0
                 top += 1

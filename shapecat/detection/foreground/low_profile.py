@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import JUMP, Cells, place_of
+from shapecat.detection.depth_grid import Cells, place_of
 from shapecat.detection.foreground.convex_hull import fill_hull
 from shapecat.detection.foreground.depth_error import (
     APART,
@@ -21,6 +21,7 @@ from shapecat.detection.foreground.depth_error import (
     subtract_mean,
 )
 from shapecat.detection.planes.height_map import Heights
+from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel, unset
 
 __all__ = ["raise_low"]
@@ -319,13 +320,13 @@ def _outline(
             i, j = place_of(p, columns)
             sides += 1
             y, x = i + di, j + dj
-            known += excess[y, x] == 0 and w[y, x] > 0 and abs(w[y, x] - w[i, j]) < JUMP
-            hidden += w[y, x] <= 0 or w[y, x] > w[i, j] + JUMP
+            known += excess[y, x] == 0 and w[y, x] > 0 and abs(w[y, x] - w[i, j]) < DISCONTINUITY
+            hidden += w[y, x] <= 0 or w[y, x] > w[i, j] + DISCONTINUITY
             y, x = i + OUTWARD * di, j + OUTWARD * dj
             v, u = i - INWARD * di, j - INWARD * dj
             if min(y, x) < 0 or min(v, u) < 0 or max(y, v) >= rows or max(x, u) >= columns:
                 continue
-            known += 0 < w[y, x] < w[i, j] - JUMP
+            known += 0 < w[y, x] < w[i, j] - DISCONTINUITY
             if owner[y, x] != -number or excess[y, x] == 0 or abs(owner[v, u]) != number:
                 continue
             table += 1

@@ -9,9 +9,10 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
-from shapecat.detection.depth_grid import JUMP, Cells, Lens, place_of
+from shapecat.detection.depth_grid import Cells, Lens, place_of
 from shapecat.detection.foreground.walls import CLEARED
 from shapecat.detection.planes.height_map import LEAST_M, NOISE, Heights, inside
+from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel, unset
 
 __all__ = ["reach_over"]
@@ -130,7 +131,7 @@ def _leads_out(search: Search, i: int, j: int, y: int, x: int) -> bool:
     w, lens, owner, walls, me, plane, highest, outside, noted = search
     if y < 0 or x < 0 or y >= w.shape[0] or x >= w.shape[1]:
         return False
-    if not 0 <= owner[y, x] < me or abs(w[y, x] - w[i, j]) >= JUMP:
+    if not 0 <= owner[y, x] < me or abs(w[y, x] - w[i, j]) >= DISCONTINUITY:
         return False
     if w[y, x] <= 0 or walls[y, x] == CLEARED or noted[y, x] == me:
         return False
@@ -179,7 +180,7 @@ def _part_inside(
             x = j + (1 if d == 2 else -1 if d == 3 else 0)
             if y < 0 or x < 0 or y >= rows or x >= columns or owner[y, x] != me:
                 continue
-            if seen[y, x] != look and abs(w[y, x] - w[i, j]) < JUMP:
+            if seen[y, x] != look and abs(w[y, x] - w[i, j]) < DISCONTINUITY:
                 seen[y, x] = look
                 stack[top] = y * columns + x
                 top += 1

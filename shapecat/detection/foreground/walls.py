@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
-from shapecat.detection.depth_grid import BORDER, JUMP, Cells, Lens
+from shapecat.detection.depth_grid import BORDER, Cells, Lens
 from shapecat.detection.planes.ransac import (
     TOLERANCE,
     Readings,
@@ -14,7 +14,7 @@ from shapecat.detection.planes.ransac import (
     readings_of,
     without,
 )
-from shapecat.geometry import cross
+from shapecat.geometry import DISCONTINUITY, cross
 from shapecat.jit import kernel, unset
 
 __all__ = ["CLEARED", "ON_WALL", "clear_walls"]
@@ -191,5 +191,5 @@ def _mark(w: F4, owner: I4, plane: F8, found: U1) -> None:
         at_row = np.float32(plane[1] * i + plane[2])
         for j in range(w.shape[1]):
             off = abs(values[j] - (a * np.float32(j) + at_row))
-            on = (owners[j] >= 0) & (values[j] > 0) & (off < np.float32(JUMP))
+            on = (owners[j] >= 0) & (values[j] > 0) & (off < np.float32(DISCONTINUITY))
             states[j] = UNSEEN if on else 0

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.depth_grid import JUMP, Lens
+from shapecat.detection.depth_grid import Lens
 from shapecat.detection.merging.segment_features import roundness_of, slope_of, width_of
 from shapecat.detection.merging.segments import (
     FEW,
@@ -18,6 +18,7 @@ from shapecat.detection.merging.segments import (
     may_join,
     merge,
 )
+from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = ["join_around", "join_behind"]
@@ -135,7 +136,7 @@ def _continuation(
             looked += 1
             label = labels[i, j]
             if label == 0 or (pieces.group[label] != p and pieces.group[label] != q):
-                before = w[i, j] - 1 / z > JUMP
+                before = w[i, j] - 1 / z > DISCONTINUITY
                 hidden += before
                 free += not before
     return share if free <= FREE * looked and hidden >= BEHIND * looked else 0.0

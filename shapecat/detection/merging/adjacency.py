@@ -5,7 +5,6 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
-from shapecat.detection.depth_grid import JUMP
 from shapecat.detection.merging.segments import (
     CONTACT,
     FRONT,
@@ -22,6 +21,7 @@ from shapecat.detection.merging.segments import (
 )
 from shapecat.detection.planes.height_map import Heights
 from shapecat.detection.segmentation.connectivity import DOWN, RIGHT, Surfaces
+from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = ["meet"]
@@ -160,18 +160,18 @@ def _count(
     if p == 0:
         return
     owner, ahead = heights.owner, w[i, j] - w[y, x]
-    pieces.single[p, OVER] += lower and ahead > JUMP
+    pieces.single[p, OVER] += lower and ahead > DISCONTINUITY
     if q == 0:
-        if ahead < -JUMP:
+        if ahead < -DISCONTINUITY:
             pieces.single[p, HIDDEN] += 1
-        elif ahead < JUMP and owner[y, x] < 0 and gap <= GAP:
+        elif ahead < DISCONTINUITY and owner[y, x] < 0 and gap <= GAP:
             pieces.single[p, TABLE if owner[y, x] == -owner[i, j] else RIM] += 1
     elif link:
         pieces.pairs[CONTACT, p, q] += 1
         _count_onto(heights.height, surfaces.normal, labels, up, i, j, y, x, pieces)
-    elif ahead >= JUMP:
+    elif ahead >= DISCONTINUITY:
         pieces.pairs[FRONT, p, q] += 1
-    elif ahead > -JUMP and gap <= GAP:
+    elif ahead > -DISCONTINUITY and gap <= GAP:
         pieces.pairs[NEAR, p, q] += 1
 
 

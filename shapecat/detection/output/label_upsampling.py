@@ -7,12 +7,13 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, U4, Bool
 from shapecat.detection.cleanup.holes import FRINGE
-from shapecat.detection.depth_grid import JUMP, NEAREST_M, Cells, Lens, place_of
+from shapecat.detection.depth_grid import Cells, Lens, place_of
 from shapecat.detection.output.occluded_points import spread_labels
 from shapecat.detection.planes.height_map import LEAST_M, NOISE, inside
 from shapecat.detection.records import LabelledGrid
 from shapecat.detection.segmentation.connectivity import span_of
 from shapecat.detection.virtual_camera import View
+from shapecat.geometry import DISCONTINUITY, NEAREST_M
 from shapecat.jit import kernel
 
 __all__ = ["pixels_of", "points_of"]
@@ -211,7 +212,7 @@ def _find_high(plane: F8, i: int, first: int, w: F4, high: U1) -> None:
 
     The cells are those of row i from column ``first`` on.
     """
-    jump, zero, nowhere = np.float32(JUMP), np.float32(0), np.float32(1e-3)
+    jump, zero, nowhere = np.float32(DISCONTINUITY), np.float32(0), np.float32(1e-3)
     a, above = np.float32(plane[0]), np.float32(plane[3])
     # The farthest pixel of a cell is 1.5 cells away.
     level = np.float32(plane[1] * i + plane[2] + 1.5 * (abs(plane[0]) + abs(plane[1])))
@@ -278,13 +279,13 @@ def _mark_points(points: F4, cell: I4, lens: Lens, shown: Shown, marks: I4) -> N
 @kernel(leaf=True)
 def _fits(w: float, z: float) -> bool:
     """Whether a depth is within one jump of a cell; both sides are multiplied by the depth."""
-    return bool(abs(w * z - np.float32(1)) < np.float32(JUMP) * z)
+    return bool(abs(w * z - np.float32(1)) < np.float32(DISCONTINUITY) * z)
 
 
 @kernel(leaf=True)
 def _best_beside(w: F4, i: int, j: int, z: float) -> tuple[int, int]:
     """Return the neighbour of a cell whose depth fits best, (-1, -1) if none is in two jumps."""
-    row, column, nearest = -1, -1, np.float32(2 * JUMP) * z
+    row, column, nearest = -1, -1, np.float32(2 * DISCONTINUITY) * z
     for ii in range(max(i - 1, 0), min(i + 2, w.shape[0])):
         for jj in range(max(j - 1, 0), min(j + 2, w.shape[1])):
             gap = abs(w[ii, jj] * z - np.float32(1))

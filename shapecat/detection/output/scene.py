@@ -7,12 +7,13 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U4, Bool, freeze
 from shapecat.config import DetectionSettings
-from shapecat.detection.depth_grid import BORDER, NEAREST_M, Cells
+from shapecat.detection.depth_grid import BORDER, Cells
 from shapecat.detection.output.measurements import Things
 from shapecat.detection.planes.extent import Support, corners_of
 from shapecat.detection.records import LabelledGrid
 from shapecat.geometry import (
     IDENTITY,
+    NEAREST_M,
     quaternion_from_rotation,
     rotation_from_quaternion,
     transform,

@@ -5,10 +5,10 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import NEAREST_M, Cells, Lens
+from shapecat.detection.depth_grid import Cells, Lens
 from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN, Support, corners_of
 from shapecat.detection.planes.ransac import TOLERANCE, Readings
-from shapecat.geometry import level_axes
+from shapecat.geometry import NEAREST_M, level_axes
 from shapecat.jit import kernel
 
 __all__ = ["boards_of"]

@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import JUMP, Cells, Lens
+from shapecat.detection.depth_grid import Cells, Lens
 from shapecat.detection.planes.ransac import (
     TOLERANCE,
     cosine,
@@ -14,7 +14,7 @@ from shapecat.detection.planes.ransac import (
     readings_of,
     refit,
 )
-from shapecat.geometry import cross
+from shapecat.geometry import DISCONTINUITY, cross
 from shapecat.jit import kernel
 
 __all__ = ["estimate_up"]
@@ -243,7 +243,7 @@ def _facets(w: F4, lens: Lens) -> F4:
     """Return the normals and the positions (6, n) of every fourth cell on a smooth surface."""
     rows, columns = w.shape
     facets = np.zeros((6, (rows // 4 + 1) * (columns // 4 + 1)), np.float32)
-    bend, two = np.float32(2 * JUMP), np.float32(2)
+    bend, two = np.float32(2 * DISCONTINUITY), np.float32(2)
     n = 0
     for i in range(ARM, rows - ARM, 4):
         y = (i - lens.cy) / lens.fy

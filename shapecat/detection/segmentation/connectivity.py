@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, I4, U1
-from shapecat.detection.depth_grid import JUMP, Cells, Lens
+from shapecat.detection.depth_grid import Cells, Lens
 from shapecat.detection.planes.height_map import Heights
 from shapecat.detection.segmentation.normals import fit_tangents, padded
+from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel, unset
 
 __all__ = ["DOWN", "RIGHT", "Surfaces", "span_of", "surfaces_of"]
@@ -152,7 +153,7 @@ def _link_some(
     links: U1,
 ) -> None:
     """Link some cells of a row with their neighbours on one side."""
-    zero, jump = np.float32(0), np.float32(JUMP)
+    zero, jump = np.float32(0), np.float32(DISCONTINUITY)
     for k in range(links.size):
         v, v1, t, t1 = w[k], w1[k], level[k], level1[k]
         level_on = abs(v - v1) < jump
@@ -180,7 +181,7 @@ def _is_step(w: F4, owner: I4, i: int, j: int, di: int, dj: int) -> bool:
     step = w[i1, j1] - w[i, j]
     before = abs(step - (w[i, j] - w[i0, j0]) / REACH)
     after = abs(step - (w[i2, j2] - w[i1, j1]) / REACH)
-    return bool(min(before, after) >= SURE * JUMP and max(before, after) >= JUMP)
+    return bool(min(before, after) >= SURE * DISCONTINUITY and max(before, after) >= DISCONTINUITY)
 
 
 @kernel
@@ -225,7 +226,7 @@ def _compare(
 
     Three loops, for the compiler vectorises only those over few arrays.
     """
-    zero, one, gate = np.float32(0), np.float32(1), np.float32(2 * JUMP)
+    zero, one, gate = np.float32(0), np.float32(1), np.float32(2 * DISCONTINUITY)
     per_x, per_y = np.float32(1 / lens.fx), np.float32(1 / lens.fy)
     y1, y2 = np.float32(i - di - lens.cy) * per_y, np.float32(i + di - lens.cy) * per_y
     x1, x2 = np.float32(first - dj - lens.cx) * per_x, np.float32(first + dj - lens.cx) * per_x

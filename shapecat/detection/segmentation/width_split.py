@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.depth_grid import JUMP, Cells
+from shapecat.detection.depth_grid import Cells
 from shapecat.detection.merging.segments import (
     BAND_M,
     BANDS,
@@ -26,6 +26,7 @@ from shapecat.detection.merging.segments import (
 from shapecat.detection.planes.height_map import Heights
 from shapecat.detection.segmentation.connectivity import Surfaces
 from shapecat.detection.segmentation.watershed import cut_above
+from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = ["cut_at_steps"]
@@ -188,6 +189,6 @@ def _is_free(cells: Cells, at: int, sign: float, side: F8) -> bool:
         x = j + round(sign * step * side[0] / across)
         if y < 0 or x < 0 or y >= rows or x >= columns:
             return False
-        if w[y, x] - w[i, j] > JUMP:
+        if w[y, x] - w[i, j] > DISCONTINUITY:
             return False
     return True

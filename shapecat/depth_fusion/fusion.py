@@ -12,9 +12,8 @@ from typing import Any
 import numpy as np
 
 from shapecat.arrays import F4
-from shapecat.detection.depth_grid import JUMP, NEAREST_M
-from shapecat.detection.recent import Earlier
-from shapecat.geometry import IDENTITY
+from shapecat.depth_fusion.recent import Earlier
+from shapecat.geometry import DISCONTINUITY, IDENTITY, NEAREST_M
 from shapecat.jit import kernel
 from shapecat.types import Camera, Frame, Pose, Scene
 
@@ -24,8 +23,8 @@ AGREE = 0.006
 """Largest difference in inverse depth of two readings of one point, 1/m: two steps of a Kinect and
 twice its noise; 6 mm at 1 m, 24 mm at 2 m. With more, low things smear when they move."""
 LEAST_SHARE = 0.9
-"""Of the readings compared those without a `JUMP` between them: an image with fewer was taken
-elsewhere than its pose says."""
+"""Of the readings compared those without a `DISCONTINUITY` between them: an image with fewer was
+taken elsewhere than its pose says."""
 STRIDE = 8
 """Pixels between those that are compared to tell that share."""
 REACH = 2
@@ -138,14 +137,14 @@ def _share(guide: F4, before: F4, lens: F4, shift: F4) -> float:
             read = _read(before, x[u], y[u])
             if (guide[v, u] > 0) & (read > 0):
                 compared += 1
-                agreed += abs(read - z[u]) <= JUMP * read * z[u]
+                agreed += abs(read - z[u]) <= DISCONTINUITY * read * z[u]
     return agreed / max(compared, 1)
 
 
 @kernel
 def _add_resting(guide: F4, before: F4, total: F4, count: F4) -> None:
     """Do what `_add_moved` does for a camera that has not moved."""
-    agree, jump = np.float32(AGREE), np.float32(JUMP)
+    agree, jump = np.float32(AGREE), np.float32(DISCONTINUITY)
     zero, one = np.float32(0), np.float32(1)
     for v in range(guide.shape[0]):
         wanted, then, sums, counts = guide[v], before[v], total[v], count[v]
@@ -162,7 +161,7 @@ def _add_resting(guide: F4, before: F4, total: F4, count: F4) -> None:
 @kernel
 def _add_moved(guide: F4, before: F4, lens: F4, shift: F4, total: F4, count: F4) -> None:
     """Add the readings of the same points that agree; a hole that got one is a hole no more."""
-    agree, jump = np.float32(AGREE), np.float32(JUMP)
+    agree, jump = np.float32(AGREE), np.float32(DISCONTINUITY)
     places = np.zeros((3, guide.shape[1]), np.float32)
     x, y, z = places[0], places[1], places[2]
     for v in range(guide.shape[0]):
