@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shapecat.config import DetectionSettings
 from shapecat.detection import Hierarchy, Node, detect, format_tree
-from shapecat.detection.depth_grid import place_of
+from shapecat.detection.depth_grid import row_and_column
 from shapecat.errors import ConfigError
 from shapecat.types import Camera, Frame, Scene
 
@@ -736,5 +736,5 @@ def test_a_large_box_with_nothing_behind_is_no_wall(width: float, y: float) -> N
 def test_places_of_flat_cells_are_exact(columns: int) -> None:
     """A product stands for a division: the first cell of a row must not fall into the one above."""
     for i in (0, 1, 7, 199, 1999):
-        assert place_of(i * columns, columns) == (i, 0)
-        assert place_of(i * columns + columns - 1, columns) == (i, columns - 1)
+        assert row_and_column(i * columns, columns) == (i, 0)
+        assert row_and_column(i * columns + columns - 1, columns) == (i, columns - 1)

@@ -10,29 +10,29 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.depth_grid import Cells
-from shapecat.detection.merging.segment_features import slope_of
+from shapecat.detection.depth_grid import DepthGrid
+from shapecat.detection.merging.segment_features import lateral_curvature
 from shapecat.detection.merging.segments import (
     BAND_M,
     BANDS,
     COUNT,
-    Pieces,
-    is_cut,
-    note_cut,
-    side_of,
+    Segments,
+    is_split,
+    lateral_axis,
+    mark_split,
 )
-from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.segmentation.connectivity import Surfaces
-from shapecat.detection.segmentation.watershed import cut_above
+from shapecat.detection.planes.height_map import HeightMap
+from shapecat.detection.segmentation.connectivity import SurfaceGraph
+from shapecat.detection.segmentation.watershed import relabel_above
 from shapecat.geometry import cross
 from shapecat.jit import kernel
 
-__all__ = ["cut_at_axes"]
+__all__ = ["split_at_axis_changes"]
 
 STEEP = 0.35
 """Largest cosine between up and the normals of a side; on shoulders only a part would be below."""
 ROUND = 0.8
-"""`slope_of` from which a piece may be round."""
+"""`lateral_curvature` from which a segment may be round."""
 LEAST_CELLS, LEAST_BANDS = 60, 3
 """Of either part; an axis fitted to less is not sure."""
 APART_M, BEHIND_M, BETTER = 0.004, 0.01, 0.4
@@ -50,8 +50,14 @@ the mean of each band of height, and widths of bands."""
 
 
 @kernel
-def cut_at_axes(
-    cells: Cells, heights: Heights, surfaces: Surfaces, pieces: Pieces, labels: I4, up: F8, n: int
+def split_at_axis_changes(
+    grid: DepthGrid,
+    heights: HeightMap,
+    graph: SurfaceGraph,
+    segments: Segments,
+    labels: I4,
+    up: F8,
+    n: int,
 ) -> int:
     """Give what turns about another axis a label of its own, in place; return how many there are.
 
@@ -59,10 +65,10 @@ def cut_at_axes(
     ----------
     labels : (rows, columns) 1..n, 0 elsewhere.
     """
-    rounded = _number_rounded(pieces, n + 1)
-    things = np.max(rounded) + 1
-    sums, reach = np.zeros((things, BANDS, 11)), np.zeros((2, things, BANDS))
-    _add(cells, heights.height, surfaces, labels, rounded, up, sums, reach)
+    rounded = _number_rounded(segments, n + 1)
+    measured = np.max(rounded) + 1
+    sums, reach = np.zeros((measured, BANDS, 11)), np.zeros((2, measured, BANDS))
+    _add(grid, heights.height, graph, labels, rounded, up, sums, reach)
     for p in range(1, n + 1):
         if rounded[p] == 0:
             continue
@@ -70,8 +76,8 @@ def cut_at_axes(
         for band in np.flatnonzero(_cuts_of(sums[rounded[p]])):
             n += 1
             level = (band + 0.5) * BAND_M
-            cut_above(labels, surfaces.spans, heights.height, rest, level, n)
-            note_cut(pieces, p)
+            relabel_above(labels, graph.spans, heights.height, rest, level, n)
+            mark_split(segments, p)
             rest = n  # what this cut has left
     return n
 
@@ -96,21 +102,22 @@ def _cuts_of(bands: F8) -> Bool:
 
 
 @kernel
-def _number_rounded(pieces: Pieces, labels: int) -> I4:
+def _number_rounded(segments: Segments, labels: int) -> I4:
     """Return a number from 1 on for each of the labels that may be round, 0 for the others."""
     rounded = np.zeros(labels, np.bool_)
     for p in range(1, labels):
-        rounded[p] = is_cut(pieces, p) or (
-            pieces.shape[p, COUNT] >= 2 * LEAST_CELLS and slope_of(pieces.shape[p]) > ROUND
+        rounded[p] = is_split(segments, p) or (
+            segments.shape[p, COUNT] >= 2 * LEAST_CELLS
+            and lateral_curvature(segments.shape[p]) > ROUND
         )
     return np.asarray(np.cumsum(rounded) * rounded)
 
 
 @kernel
 def _add(
-    cells: Cells,
+    grid: DepthGrid,
     height: F4,
-    surfaces: Surfaces,
+    graph: SurfaceGraph,
     labels: I4,
     rounded: I4,
     up: F8,
@@ -118,20 +125,23 @@ def _add(
     reach: F8,
 ) -> None:
     """Collect the sums over the bands of each round thing; ``reach`` (2, things, bands) is room."""
-    w, lens, side = cells.w, cells.lens, side_of(up)
+    inv_depth, intrinsics, side = grid.inverse_depth, grid.intrinsics, lateral_axis(up)
     forward = cross(up, side)
     left, right = reach[0], reach[1]
     left[:], right[:] = np.inf, -np.inf
-    tangent, normal = surfaces.tangent, surfaces.normal
+    local_plane, normal = graph.local_plane, graph.normal
     for i in range(labels.shape[0]):
-        for j in range(surfaces.spans[i, 0], surfaces.spans[i, 1]):
+        for j in range(graph.spans[i, 0], graph.spans[i, 1]):
             p = rounded[labels[i, j]]
-            if not (p > 0 and tangent[i, 0, j] > 0):
+            if not (p > 0 and local_plane[i, 0, j] > 0):
                 continue
             if normal[i, 0, j] * up[0] + normal[i, 1, j] * up[1] + normal[i, 2, j] * up[2] > STEEP:
                 continue
-            depth = 1 / w[i, j]
-            x, y = (j - lens.cx) / lens.fx * depth, (i - lens.cy) / lens.fy * depth
+            depth = 1 / inv_depth[i, j]
+            x, y = (
+                (j - intrinsics.cx) / intrinsics.fx * depth,
+                (i - intrinsics.cy) / intrinsics.fy * depth,
+            )
             u = x * side[0] + y * side[1] + depth * side[2]
             f = x * forward[0] + y * forward[1] + depth * forward[2]
             z = u * u + f * f

@@ -7,23 +7,23 @@ top of the lower one is level, at one height, and the upper one rises from there
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import Cells
-from shapecat.detection.merging.segment_features import roundness_of
+from shapecat.detection.depth_grid import DepthGrid
+from shapecat.detection.merging.segment_features import normal_position_correlation
 from shapecat.detection.merging.segments import (
     BAND_M,
     BANDS,
     BOTTOM,
     TOP,
-    Pieces,
-    note_cut,
-    side_of,
+    Segments,
+    lateral_axis,
+    mark_split,
 )
-from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.segmentation.connectivity import Surfaces
-from shapecat.detection.segmentation.watershed import cut_above
+from shapecat.detection.planes.height_map import HeightMap
+from shapecat.detection.segmentation.connectivity import SurfaceGraph
+from shapecat.detection.segmentation.watershed import relabel_above
 from shapecat.jit import kernel
 
-__all__ = ["cut_at_ledges"]
+__all__ = ["split_at_top_faces"]
 
 LEDGE_M2 = 4e-4
 """Least visible area of a ledge."""
@@ -36,41 +36,42 @@ RISE_M = 0.025
 LEAST_ABOVE, LEAST_BELOW, CLEARANCE = 60, 40, 2
 """Cells of the upper and the lower object, so many bands away from the ledge."""
 TURNED = 0.95
-"""`roundness_of` of what is one thing turned about an axis: the top of a can makes it less."""
+"""`normal_position_correlation` of what is one thing turned about an axis: the top of a can makes
+it less."""
 HOLLOW = -0.1
-"""`slope_of` from which what rises is the inside of a container."""
+"""`lateral_curvature` from which what rises is the inside of a container."""
 
 
 @kernel
-def cut_at_ledges(
-    cells: Cells, heights: Heights, surfaces: Surfaces, pieces: Pieces, labels: I4, up: F8
+def split_at_top_faces(
+    grid: DepthGrid, heights: HeightMap, graph: SurfaceGraph, segments: Segments, labels: I4, up: F8
 ) -> int:
     """Give what stands on ledges labels of its own, in place; return the number of labels."""
-    height, side = heights.height, side_of(up)
-    n = pieces.group.size - 1
-    for p in range(1, pieces.group.size):
-        band = _ledge_of(pieces, p)
-        if band > 0 and _is_stack(cells, height, surfaces, labels, p, band, side):
+    height, side = heights.height, lateral_axis(up)
+    n = segments.parent.size - 1
+    for p in range(1, segments.parent.size):
+        band = _ledge_of(segments, p)
+        if band > 0 and _is_stack(grid, height, graph, labels, p, band, side):
             n += 1
-            cut_above(labels, surfaces.spans, height, p, (band + 1 + CLEARANCE / 2) * BAND_M, n)
-            note_cut(pieces, p)
+            relabel_above(labels, graph.spans, height, p, (band + 1 + CLEARANCE / 2) * BAND_M, n)
+            mark_split(segments, p)
     return n
 
 
 @kernel(leaf=True)
-def _ledge_of(pieces: Pieces, p: int) -> int:
-    """Return the band of the best ledge of a piece, 0 if it has none."""
-    if roundness_of(pieces.shape[p]) > TURNED:
+def _ledge_of(segments: Segments, p: int) -> int:
+    """Return the band of the best ledge of a segment, 0 if it has none."""
+    if normal_position_correlation(segments.shape[p]) > TURNED:
         return 0
-    top = int(pieces.shape[p, TOP] / BAND_M)
-    bottom = int(pieces.shape[p, BOTTOM] / BAND_M)
-    lid = pieces.lid[p]
+    top = int(segments.shape[p, TOP] / BAND_M)
+    bottom = int(segments.shape[p, BOTTOM] / BAND_M)
+    top_area = segments.top_area[p]
     ledge, best = 0, LEDGE_M2
     for band in range(max(bottom, 1) + 2, min(top - int(RISE_M / BAND_M), BANDS - 1)):
-        level = lid[band - 1] + lid[band] + lid[band + 1]
+        level = top_area[band - 1] + top_area[band] + top_area[band + 1]
         around = 0.0
         for k in range(max(band - NEAR, 0), min(band + NEAR + 1, BANDS)):
-            around += lid[k]
+            around += top_area[k]
         if level > best and level > FLAT * around:
             ledge, best = band, level
     return ledge
@@ -78,10 +79,15 @@ def _ledge_of(pieces: Pieces, p: int) -> int:
 
 @kernel(leaf=True)
 def _is_stack(
-    cells: Cells, height: F4, surfaces: Surfaces, labels: I4, p: int, band: int, side: F8
+    grid: DepthGrid, height: F4, graph: SurfaceGraph, labels: I4, p: int, band: int, side: F8
 ) -> bool:
-    """Whether enough of a piece lies above and below a ledge, and the above is not hollow."""
-    w, lens, normal, spans = cells.w, cells.lens, surfaces.normal, surfaces.spans
+    """Whether enough of a segment lies above and below a ledge, and the above is not hollow."""
+    inv_depth, intrinsics, normal, spans = (
+        grid.inverse_depth,
+        grid.intrinsics,
+        graph.normal,
+        graph.spans,
+    )
     n = above = below = 0
     sx = sxx = st = sxt = 0.0
     left, right = np.inf, -np.inf
@@ -97,8 +103,10 @@ def _is_stack(
             nx, ny, nz = normal[i, 0, j], normal[i, 1, j], normal[i, 2, j]
             if nx == 0 and ny == 0 and nz == 0:
                 continue
-            z = 1 / w[i, j]
-            x = (j - lens.cx) / lens.fx * z * side[0] + (i - lens.cy) / lens.fy * z * side[1]
+            z = 1 / inv_depth[i, j]
+            x = (j - intrinsics.cx) / intrinsics.fx * z * side[0] + (
+                i - intrinsics.cy
+            ) / intrinsics.fy * z * side[1]
             x += z * side[2]
             turn = nx * side[0] + ny * side[1] + nz * side[2]
             n += 1
