@@ -14,7 +14,7 @@ from shapecat.detection.merging.learned import (
     logit_of,
     pair_features,
 )
-from shapecat.detection.pipeline import oversegment
+from shapecat.detection.pipeline import ALL_STEPS, oversegment
 from shapecat.models.parts import Pairs, collect, grow
 from shapecat.simulation import KINECT, make_scene, render_frame
 from tests.test_detection import overlaps
@@ -63,9 +63,10 @@ def test_without_the_trees_objects_stay_in_pieces(seed: int) -> None:
     frame, seen = render_frame(world, 0, rng=rng, sensor=KINECT)
     labels = [thing.label for thing in world.things if np.count_nonzero(seen == thing.label) > 400]
     found = []
-    for rules in ("low concave ledge axis step small", "low concave ledge axis step small parts"):
-        settings = DetectionSettings(rules=rules)
-        scene = detect(frame, settings=settings, rng=np.random.default_rng(0))
+    for learned in (False, True):
+        steps = ALL_STEPS._replace(learned_merging=learned, across_occlusion=False)
+        rng = np.random.default_rng(0)
+        scene = detect(frame, settings=DetectionSettings(), rng=rng, steps=steps)
         found.append(np.mean(np.array(overlaps(scene, seen, labels)) > 0.75))
     assert found[1] > found[0]
 

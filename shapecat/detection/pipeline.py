@@ -15,7 +15,6 @@
 The thesis stops at objects that do not touch: steps 4 and 5 go beyond it.
 """
 
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -29,11 +28,11 @@ from shapecat.detection.depth_grid import DepthGrid, downsample
 from shapecat.detection.foreground.low_profile import find_low_profile
 from shapecat.detection.foreground.overhang import extend_overhang
 from shapecat.detection.foreground.walls import remove_walls
-from shapecat.detection.merging.across_occlusion import merge_across_occluder, merge_flanking
+from shapecat.detection.merging.across_occlusion import merge_across_occluder
 from shapecat.detection.merging.adjacency import measure_adjacency
 from shapecat.detection.merging.learned import ViewGeometry, load_trees, merge_learned
-from shapecat.detection.merging.segments import measure_segments, measure_split_segments
-from shapecat.detection.merging.small import merge_low_profile, merge_small
+from shapecat.detection.merging.low_profile import merge_low_profile
+from shapecat.detection.merging.segments import measure_segments
 from shapecat.detection.output.label_upsampling import label_pixels, label_points
 from shapecat.detection.output.measurements import measure_objects
 from shapecat.detection.output.scene import build_scene
@@ -41,40 +40,32 @@ from shapecat.detection.planes import NO_HINT, find_supporting_planes
 from shapecat.detection.planes.height_map import measure_heights
 from shapecat.detection.planes.ransac import draw_trials
 from shapecat.detection.records import OverSegmentation, PlaneModel, Segmentation
-from shapecat.detection.segmentation.axis_split import split_at_axis_changes
 from shapecat.detection.segmentation.connectivity import connect_surfaces
-from shapecat.detection.segmentation.top_face_split import split_at_top_faces
 from shapecat.detection.segmentation.watershed import relabel, watershed
 from shapecat.detection.segmentation.width_split import split_at_width_changes
 from shapecat.detection.virtual_camera import VirtualImage, top_view, virtual_image
-from shapecat.errors import ConfigError
 from shapecat.geometry import IDENTITY, inverse
 from shapecat.types import Camera, Frame, Scene
 
-__all__ = ["RULES", "detect", "label", "oversegment"]
+__all__ = ["ALL_STEPS", "Steps", "detect", "label", "oversegment"]
 
 
-class Rules(NamedTuple):
-    """Which of the rules beyond the thesis apply, in their order.
+class Steps(NamedTuple):
+    """Which of the steps beyond the thesis are taken, to measure what each is worth.
 
-    Without any of them what remains is the plane, the height above it, and depth jumps.
+    Without any of them what remains is the plane, the height above it, and depth discontinuities.
     """
 
-    low: bool
-    concave: bool
-    ledge: bool
-    axis: bool
-    step: bool
-    small: bool
-    parts: bool
-    occluder: bool
-    feet: bool
-    fill: bool
+    low_profile: bool = True
+    concavity: bool = True
+    width_split: bool = True
+    learned_merging: bool = True
+    across_occlusion: bool = True
+    contact_boundary: bool = True
+    hole_filling: bool = True
 
 
-RULES = Rules._fields
-
-
+ALL_STEPS = Steps()
 DEFAULT_UP = (0.0, -1.0, 0.0)
 """Up in an upright optical frame, where nothing else is known."""
 CROWDED = 0.08
@@ -87,6 +78,7 @@ def detect(
     up: ArrayLike | None = None,
     settings: DetectionSettings,
     rng: np.random.Generator,
+    steps: Steps = ALL_STEPS,
 ) -> Scene:
     """Find the supporting planes of a frame and the objects on them.
 
@@ -97,6 +89,7 @@ def detect(
         planes within 15 degrees of level count; without, it is estimated from the dominant plane.
     settings : see `DetectionSettings`.
     rng : source of what RANSAC tries; the same state gives the same scene.
+    steps : which steps are taken, for measuring what one is worth.
 
     Returns
     -------
@@ -106,7 +99,6 @@ def detect(
     Raises
     ------
     ValueError : ``up`` is not a direction.
-    ConfigError : ``settings.rules`` names an unknown rule.
 
     Notes
     -----
@@ -117,9 +109,9 @@ def detect(
     """
     hint = None if up is None else _unit(up)
     if frame.depth is not None and frame.camera is not None:
-        scene = _in_image(frame.depth, frame.camera, hint, settings, rng)
+        scene = _in_image(frame.depth, frame.camera, hint, settings, rng, steps)
     else:
-        scene = _in_cloud(frame.xyz(), hint, settings, rng)
+        scene = _in_cloud(frame.xyz(), hint, settings, rng, steps)
     return scene or Scene(np.array(DEFAULT_UP) if hint is None else hint, (), ())
 
 
@@ -138,9 +130,10 @@ def _in_image(
     hint: F8 | None,
     settings: DetectionSettings,
     rng: np.random.Generator,
+    steps: Steps,
 ) -> Scene | None:
     grid = downsample(depth, camera, range_m=settings.max_range_m)
-    found = None if grid is None else label(grid, hint, settings=settings, rng=rng)
+    found = None if grid is None else label(grid, hint, settings=settings, rng=rng, steps=steps)
     if grid is None or found is None:
         return None
     indices = label_pixels(depth, grid, found, range_m=settings.max_range_m)
@@ -148,13 +141,17 @@ def _in_image(
 
 
 def _in_cloud(
-    points: F4, hint: F8 | None, settings: DetectionSettings, rng: np.random.Generator
+    points: F4,
+    hint: F8 | None,
+    settings: DetectionSettings,
+    rng: np.random.Generator,
+    steps: Steps,
 ) -> Scene | None:
     view = virtual_image(points, range_m=settings.max_range_m)
-    found = None if view is None else _seen(view, hint, settings, rng)
+    found = None if view is None else _seen(view, hint, settings, rng, steps)
     if found is None:
         view = top_view(points, hint, range_m=settings.max_range_m, rng=rng)
-        found = None if view is None else _seen(view, hint, settings, rng)
+        found = None if view is None else _seen(view, hint, settings, rng, steps)
     if view is None or found is None:
         return None
     indices = label_points(view, found, fused=view.crowded > CROWDED)
@@ -165,10 +162,14 @@ def _in_cloud(
 
 
 def _seen(
-    view: VirtualImage, hint: F8 | None, settings: DetectionSettings, rng: np.random.Generator
+    view: VirtualImage,
+    hint: F8 | None,
+    settings: DetectionSettings,
+    rng: np.random.Generator,
+    steps: Steps,
 ) -> Segmentation | None:
     turned = None if hint is None else view.view_from_sensor.rotation @ hint
-    return label(view.grid, turned, settings=settings, rng=rng)
+    return label(view.grid, turned, settings=settings, rng=rng, steps=steps)
 
 
 def label(
@@ -177,27 +178,32 @@ def label(
     *,
     settings: DetectionSettings,
     rng: np.random.Generator,
+    steps: Steps = ALL_STEPS,
 ) -> Segmentation | None:
     """Find planes and objects among the samples; None if there is no supporting plane."""
-    model = _find_planes(grid, hint, settings, rng)
+    model = _find_planes(grid, hint, settings, rng, steps)
     if model is None:
         return None
-    oversegmentation = _oversegment(grid, model, settings)
-    known = _merge(grid, model, oversegmentation, settings)
+    oversegmentation = _oversegment(grid, model, steps)
+    known = _merge(grid, model, oversegmentation, steps)
     representatives = _clean_up(grid, model, oversegmentation, known, settings)
-    return _fill(grid, model, oversegmentation, representatives, settings)
+    return _fill(grid, model, oversegmentation, representatives, settings, steps)
 
 
 def oversegment(
     grid: DepthGrid, *, settings: DetectionSettings, rng: np.random.Generator
 ) -> tuple[PlaneModel, OverSegmentation] | None:
     """Find planes and the segments of objects; None if no plane bears anything."""
-    model = _find_planes(grid, None, settings, rng)
-    return None if model is None else (model, _oversegment(grid, model, settings))
+    model = _find_planes(grid, None, settings, rng, ALL_STEPS)
+    return None if model is None else (model, _oversegment(grid, model, ALL_STEPS))
 
 
 def _find_planes(
-    grid: DepthGrid, hint: F8 | None, settings: DetectionSettings, rng: np.random.Generator
+    grid: DepthGrid,
+    hint: F8 | None,
+    settings: DetectionSettings,
+    rng: np.random.Generator,
+    steps: Steps,
 ) -> PlaneModel | None:
     """Find what objects stand on and before; None if no plane bears anything."""
     trials = draw_trials(rng)
@@ -207,30 +213,21 @@ def _find_planes(
         return None
     heights = measure_heights(grid, planes, settings.max_height_m)
     low_profile = np.zeros(grid.inverse_depth.shape, np.int16)
-    if _rules_of(settings.rules).low:
+    if steps.low_profile:
         find_low_profile(grid, heights, planes, low_profile, settings.max_size_m)
     walls = remove_walls(grid, heights.plane_id, up, settings.max_size_m, trials)
     extend_overhang(grid, heights, planes, walls, settings.max_height_m)
     return PlaneModel(up, supports, planes, heights, low_profile, walls)
 
 
-def _oversegment(
-    grid: DepthGrid, model: PlaneModel, settings: DetectionSettings
-) -> OverSegmentation:
+def _oversegment(grid: DepthGrid, model: PlaneModel, steps: Steps) -> OverSegmentation:
     """Part what stands on the planes where two objects may meet."""
-    heights, up, rules = model.heights, model.up, _rules_of(settings.rules)
+    heights, up = model.heights, model.up
     graph = connect_surfaces(grid, heights)
-    labels, n = watershed(heights, graph, rules.concave)
+    labels, n = watershed(heights, graph, steps.concavity)
+    if steps.width_split:
+        n = split_at_width_changes(grid, heights, graph, labels, up, n)
     segments = measure_segments(grid, heights, graph, labels, n, up)
-    more = n
-    if rules.ledge:
-        more = split_at_top_faces(grid, heights, graph, segments, labels, up)
-    if rules.axis:
-        more = split_at_axis_changes(grid, heights, graph, segments, labels, up, more)
-    if rules.step:
-        more = split_at_width_changes(grid, heights, graph, segments, labels, up, more)
-    if more > n:
-        segments = measure_split_segments(grid, heights, graph, labels, more, up, segments)
     measure_adjacency(grid.inverse_depth, heights, graph, labels, up, segments)
     return OverSegmentation(graph, labels, segments)
 
@@ -239,19 +236,15 @@ def _merge(
     grid: DepthGrid,
     model: PlaneModel,
     oversegmentation: OverSegmentation,
-    settings: DetectionSettings,
+    steps: Steps,
 ) -> Bool:
     """Merge the segments of each object; return which are known to be low-profile objects."""
     graph, labels, segments = oversegmentation
-    rules = _rules_of(settings.rules)
     known: Bool = merge_low_profile(segments, model.low_profile, labels, graph.spans)
-    if rules.small:
-        merge_small(segments, grid)
-    if rules.parts:
+    if steps.learned_merging:
         merge_learned(segments, ViewGeometry(grid.intrinsics.fx, model.up[2]), load_trees())
-    if rules.occluder:
+    if steps.across_occlusion:
         merge_across_occluder(segments, grid.inverse_depth, grid.intrinsics, graph.normal, labels)
-        merge_flanking(segments)
     return known
 
 
@@ -298,17 +291,17 @@ def _fill(
     oversegmentation: OverSegmentation,
     representatives: I4,
     settings: DetectionSettings,
+    steps: Steps,
 ) -> Segmentation:
     """Complete the labels near the planes, and measure the objects."""
     labels, segments = (
         oversegmentation.labels,
         oversegmentation.segments,
     )  # of objects from `_clean_up` on
-    rules = _rules_of(settings.rules)
-    if rules.feet:
+    if steps.contact_boundary:
         fill_contact_boundary(grid.inverse_depth, model.heights, labels)
     filled = np.zeros(labels.shape, np.uint8)
-    if rules.fill:
+    if steps.hole_filling:
         fill_holes(
             grid.inverse_depth, model.heights.height, labels, representatives.size - 1, filled
         )
@@ -319,13 +312,3 @@ def _fill(
         grid, labels, segments, representatives, model.up, settings.max_range_m
     )
     return Segmentation(model.up, model.supports, model.planes, labels, filled, plane_ids, measured)
-
-
-@cache
-def _rules_of(text: str) -> Rules:
-    rules = text.split()
-    unknown = [rule for rule in rules if rule not in RULES]
-    if unknown:
-        msg = f"detection.rules: unknown {', '.join(unknown)}; known: {' '.join(RULES)}"
-        raise ConfigError(msg)
-    return Rules(*(rule in rules for rule in RULES))

@@ -19,7 +19,7 @@ from shapecat.arrays import F4, I4, U1, Bool
 from shapecat.config import DetectionSettings
 from shapecat.detection.depth_grid import DepthGrid, downsample
 from shapecat.detection.merging import learned
-from shapecat.detection.merging.across_occlusion import merge_across_occluder, merge_flanking
+from shapecat.detection.merging.across_occlusion import merge_across_occluder
 from shapecat.detection.merging.learned import (
     FEATURES,
     BoostedTrees,
@@ -27,9 +27,9 @@ from shapecat.detection.merging.learned import (
     are_adjacent,
     pair_features,
 )
+from shapecat.detection.merging.low_profile import merge_low_profile
 from shapecat.detection.merging.segments import Segments, merge
-from shapecat.detection.merging.small import merge_low_profile, merge_small
-from shapecat.detection.pipeline import RULES, oversegment
+from shapecat.detection.pipeline import oversegment
 from shapecat.learning.boosting import Tree, TreeSettings, grow_tree, make_bins
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
 from shapecat.simulation.scenes import SceneKind
@@ -38,7 +38,6 @@ from shapecat.types import CATEGORIES, Camera
 
 __all__ = ["collect", "grow", "main"]
 
-_OTHERS = " ".join(rule for rule in RULES if rule != "parts")
 _PURE = 0.6
 """A segment belongs to the object that has more than this share of it."""
 _NOISY = replace(IDEAL, noise=0.0015, step=0.0029)
@@ -137,7 +136,7 @@ def _pairs(
     owners : (h, w) the label of what each pixel shows.
     things : the labels of objects.
     """
-    settings = DetectionSettings(rules=_OTHERS)
+    settings = DetectionSettings()
     grid = downsample(depth, camera, range_m=settings.max_range_m)
     if grid is None:
         return
@@ -146,9 +145,7 @@ def _pairs(
         return
     ground, (graph, labels, segments) = found
     merge_low_profile(segments, ground.low_profile, labels, graph.spans)
-    merge_small(segments, grid)
     merge_across_occluder(segments, grid.inverse_depth, grid.intrinsics, graph.normal, labels)
-    merge_flanking(segments)
     counts = _count(owners.reshape(depth.shape), labels, grid)
     view_geometry, seen = ViewGeometry(grid.intrinsics.fx, float(ground.up[2])), set()
     while True:

@@ -6,18 +6,10 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import PinholeIntrinsics
-from shapecat.detection.merging.segment_features import (
-    lateral_curvature,
-    normal_position_correlation,
-    width_of,
-)
 from shapecat.detection.merging.segments import (
     FEW,
     FRONT,
-    LEFT,
-    RIGHTMOST,
     SAMPLES,
-    TOP,
     Segments,
     may_merge,
     merge,
@@ -25,7 +17,7 @@ from shapecat.detection.merging.segments import (
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
-__all__ = ["merge_across_occluder", "merge_flanking"]
+__all__ = ["merge_across_occluder"]
 
 COPLANAR_M, COPLANAR = 0.006, 0.05
 """How far a sample may lie off the local plane of another: metres, and per metre between them."""
@@ -36,10 +28,6 @@ LEAST_SAMPLES, MOST_LINES, STEPS = 4, 300, 8
 """Samples of a segment; lines between partners that are looked along, each in so many steps."""
 FREE, BEHIND = 0.12, 0.05
 """Between them, largest share in free space or on others, least share behind something."""
-SAME_TOP_M, FLANKED, TURNING, STEADY = 0.007, 0.12, 0.7, 1.75
-"""Two sides of one object: how far their tops differ; least share of the boundary of each behind
-what is between them; least `normal_position_correlation` both together, or of a hollow the
-negative; and how much faster than both together either may turn, as two cans side by side do."""
 
 
 @kernel
@@ -66,53 +54,6 @@ def merge_across_occluder(
             if k != p:
                 a, b = min(k, p), max(k, p)
                 scores[a, b] = _continuation(segments, a, b, inv_depth, intrinsics, normal, labels)
-
-
-@kernel
-def merge_flanking(segments: Segments) -> None:
-    """Join what is seen of one object on the left and on the right of something in front of it.
-
-    Neither side goes on in the other where the surface bends, but both end at one height, and
-    together they turn as one round thing does, one hollow, or the faces of one box.
-    """
-    n = segments.parent.size
-    for p in range(1, n):
-        for q in range(1, n):
-            if may_merge(segments, p, q) and _flank(segments, p, q):
-                merge(segments, p, q)
-
-
-@kernel
-def _flank(segments: Segments, left: int, right: int) -> bool:
-    """Whether two segments are the left and the right side of one object behind something."""
-    a, b = segments.shape[left], segments.shape[right]
-    if abs(a[TOP] - b[TOP]) > SAME_TOP_M or a[RIGHTMOST] > b[LEFT]:
-        return False
-    front, boundary = segments.pairs[FRONT], segments.boundary
-    between = False
-    for k in range(1, segments.parent.size):
-        x = segments.shape[k]
-        between |= (
-            front[k, left] > FLANKED * boundary[left]
-            and front[k, right] > FLANKED * boundary[right]
-            and x[LEFT] < b[LEFT]
-            and x[RIGHTMOST] > a[RIGHTMOST]
-            and width_of(x) > b[LEFT] - a[RIGHTMOST]
-        )
-    if not between:
-        return False
-    both = a + b
-    both[LEFT], both[RIGHTMOST] = a[LEFT], b[RIGHTMOST]
-    if abs(normal_position_correlation(both)) < TURNING:
-        return False
-    most = STEADY * _curvature_of(both)
-    return bool(_curvature_of(a) / most < 1 and _curvature_of(b) / most < 1)
-
-
-@kernel(leaf=True)
-def _curvature_of(row: F4) -> float:
-    """Return by how much the lateral normal of a segment changes per metre."""
-    return float(lateral_curvature(row) / max(width_of(row), 1e-3))
 
 
 @kernel

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.arrays import F4, F8, I4
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
@@ -44,12 +44,9 @@ __all__ = [
     "depth_of",
     "depths_of",
     "is_root",
-    "is_split",
     "lateral_axis",
-    "mark_split",
     "may_merge",
     "measure_segments",
-    "measure_split_segments",
     "merge",
 ]
 
@@ -105,32 +102,7 @@ def measure_segments(
     grid: DepthGrid, heights: HeightMap, graph: SurfaceGraph, labels: I4, n: int, up: F8
 ) -> Segments:
     """Collect the shapes of segments 1..n; `measure_adjacency` adds what they meet."""
-    segments: Segments = measure_split_segments(grid, heights, graph, labels, n, up, _blank(1))
-    return segments
-
-
-@kernel
-def measure_split_segments(
-    grid: DepthGrid,
-    heights: HeightMap,
-    graph: SurfaceGraph,
-    labels: I4,
-    n: int,
-    up: F8,
-    before: Segments,
-) -> Segments:
-    """Collect the shapes as `measure_segments`, of cut regions alone; the others are as ``before``.
-
-    What `is_split` is measured anew.
-    """
     segments: Segments = _blank(n + 1)
-    wanted = np.ones(n + 1, np.bool_)
-    wanted[0] = False
-    for p in range(1, before.parent.size):
-        if not is_split(before, p):
-            wanted[p] = False
-            segments.shape[p], segments.top_area[p] = before.shape[p], before.top_area[p]
-            segments.plane_id[p] = before.plane_id[p]
     _measure(
         grid.inverse_depth,
         grid.intrinsics,
@@ -139,7 +111,6 @@ def measure_split_segments(
         labels,
         up,
         lateral_axis(up),
-        wanted,
         segments,
     )
     return segments
@@ -182,10 +153,9 @@ def _measure(
     labels: I4,
     up: F8,
     side: F8,
-    wanted: Bool,
     segments: Segments,
 ) -> None:
-    """Add up the cells of the wanted labels; label 0 is not one."""
+    """Add up the cells of the labels; label 0 is none."""
     shape, plane_ids, top_area = segments.shape, segments.plane_id, segments.top_area
     plane_id, height = heights.plane_id, heights.height
     zero, one, far_off = np.float32(0), np.float32(1), np.float32(np.inf)
@@ -198,7 +168,7 @@ def _measure(
         j, end = spans[i]
         while j < end:
             p, first = labels[i, j], j
-            if not wanted[p]:
+            if p == 0:
                 j += 1
                 continue
             # Sums over the cells of one segment that follow each other.
@@ -314,19 +284,6 @@ def depths_of(segments: Segments) -> F4:
     for p in range(depths.size):
         depths[p] = depth_of(segments, p)
     return depths
-
-
-@kernel(leaf=True)
-def mark_split(segments: Segments, p: int) -> None:
-    """Note that a region, which may have been cut off itself, was cut: its statistics are wrong."""
-    if p < segments.parent.size:
-        segments.shape[p, COUNT] = 0
-
-
-@kernel(leaf=True)
-def is_split(segments: Segments, p: int) -> bool:
-    """Whether region ``p`` was cut, or cut off, since its statistics were collected."""
-    return bool(p >= segments.parent.size or segments.shape[p, COUNT] == 0)
 
 
 @kernel(leaf=True)

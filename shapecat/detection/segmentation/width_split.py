@@ -2,7 +2,7 @@
 
 What stands on a wider object, or on a narrower one, shows it at its sides even where its front
 goes on in one surface with that below. So does a cup at the ends of its handle: that both parts
-are one object is left to the joins.
+are one object is left to the merging.
 """
 
 import math
@@ -12,17 +12,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import DepthGrid
-from shapecat.detection.merging.segments import (
-    BAND_M,
-    BANDS,
-    BOTTOM,
-    COUNT,
-    TOP,
-    Segments,
-    is_split,
-    lateral_axis,
-    mark_split,
-)
+from shapecat.detection.merging.segments import BAND_M, BANDS, lateral_axis
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
 from shapecat.detection.segmentation.watershed import relabel_above
@@ -63,7 +53,6 @@ def split_at_width_changes(
     grid: DepthGrid,
     heights: HeightMap,
     graph: SurfaceGraph,
-    segments: Segments,
     labels: I4,
     up: F8,
     n: int,
@@ -74,37 +63,20 @@ def split_at_width_changes(
     ----------
     labels : (rows, columns) 1..n, 0 elsewhere.
     """
-    tall, side = _number_tall(segments, n + 1), lateral_axis(up)
-    outlines = _outlines_of(grid, heights.height, graph.spans, labels, tall, side)
+    side = lateral_axis(up)
+    outlines = _outlines_of(grid, heights.height, graph.spans, labels, n, side)
     for p in range(1, n + 1):
-        if tall[p] == 0:
-            continue
         rest = p
-        for band in np.flatnonzero(_cuts_of(grid, outlines, tall[p], side)):
+        for band in np.flatnonzero(_cuts_of(grid, outlines, p, side)):
             n += 1
             relabel_above(labels, graph.spans, heights.height, rest, band * BAND_M, n)
-            mark_split(segments, p)
             rest = n  # what this cut has left
     return n
 
 
 @kernel
-def _number_tall(segments: Segments, labels: int) -> I4:
-    """Return a number from 1 on for each label that may be a stack, 0 for the others."""
-    tall = np.zeros(labels, np.bool_)
-    for p in range(1, labels):
-        tall[p] = is_split(segments, p) or (
-            segments.shape[p, COUNT] >= 2 * LEAST_CELLS
-            and segments.shape[p, TOP] - segments.shape[p, BOTTOM] >= 2 * BESIDE * BAND_M
-        )
-    return np.asarray(np.cumsum(tall) * tall)
-
-
-@kernel
-def _outlines_of(
-    grid: DepthGrid, height: F4, spans: I4, labels: I4, tall: I4, side: F8
-) -> Outlines:
-    """Collect the outlines of what has a number."""
+def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, side: F8) -> Outlines:
+    """Collect the outlines of the labels 1..n."""
     inv_depth, intrinsics, columns = (
         grid.inverse_depth,
         grid.intrinsics,
@@ -116,12 +88,11 @@ def _outlines_of(
     c = np.float32(
         side[2] - intrinsics.cx * side[0] / intrinsics.fx - intrinsics.cy * side[1] / intrinsics.fy
     )
-    measured = np.max(tall) + 1
-    ends = np.full((2, measured, BANDS), np.inf, np.float32)
-    at, count = np.zeros((2, measured, BANDS), np.int32), np.zeros((measured, BANDS), np.int32)
+    ends = np.full((2, n + 1, BANDS), np.inf, np.float32)
+    at, count = np.zeros((2, n + 1, BANDS), np.int32), np.zeros((n + 1, BANDS), np.int32)
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):
-            p = tall[labels[i, j]]
+            p = labels[i, j]
             if p == 0:
                 continue
             u = (np.float32(j) * a + np.float32(i) * b + c) * (one / inv_depth[i, j])

@@ -1,13 +1,12 @@
-"""Merging that needs no learning: of small segments, and of those of one low-profile object."""
+"""Merging of low-profile objects: the segments of one are known by its outline."""
 
 import numpy as np
 
 from shapecat.arrays import I4, Bool
-from shapecat.detection.depth_grid import DepthGrid, smallest_object_at
-from shapecat.detection.merging.segments import CONTACT, COUNT, Segments, depths_of, is_root, merge
+from shapecat.detection.merging.segments import COUNT, Segments, merge
 from shapecat.jit import kernel
 
-__all__ = ["merge_low_profile", "merge_small"]
+__all__ = ["merge_low_profile"]
 
 RAISED = 0.5
 """Share of the cells of a segment that belong to one low object."""
@@ -44,22 +43,3 @@ def merge_low_profile(segments: Segments, low_profile: I4, labels: I4, spans: I4
         else:
             merge(segments, leader[best], p)
     return known
-
-
-@kernel
-def merge_small(segments: Segments, grid: DepthGrid) -> None:
-    """Join a segment smaller than about 9 cm2 to what it touches most."""
-    n = segments.parent.size
-    depth = depths_of(segments)
-    again = True
-    while again:
-        again = False
-        for p in range(1, n):
-            if not is_root(segments, p) or segments.shape[p, COUNT] >= smallest_object_at(
-                grid, depth[p]
-            ):
-                continue
-            q = np.argmax(segments.pairs[CONTACT, p])
-            if segments.pairs[CONTACT, p, q] > 0:
-                merge(segments, q, p)
-                again = True
