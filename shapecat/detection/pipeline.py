@@ -30,8 +30,9 @@ from shapecat.detection.foreground.overhang import extend_overhang
 from shapecat.detection.foreground.walls import remove_walls
 from shapecat.detection.merging.across_occlusion import merge_across_occluder
 from shapecat.detection.merging.adjacency import measure_adjacency
-from shapecat.detection.merging.learned import ViewGeometry, load_trees, merge_learned
+from shapecat.detection.merging.learned import load_trees, merge_learned
 from shapecat.detection.merging.low_profile import merge_low_profile
+from shapecat.detection.merging.pair_features import ViewGeometry
 from shapecat.detection.merging.segments import measure_segments
 from shapecat.detection.output.label_upsampling import label_pixels, label_points
 from shapecat.detection.output.measurements import measure_objects

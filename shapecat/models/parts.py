@@ -20,14 +20,15 @@ from shapecat.config import DetectionSettings
 from shapecat.detection.depth_grid import DepthGrid, downsample
 from shapecat.detection.merging import learned
 from shapecat.detection.merging.across_occlusion import merge_across_occluder
-from shapecat.detection.merging.learned import (
+from shapecat.detection.merging.learned import BoostedTrees
+from shapecat.detection.merging.low_profile import merge_low_profile
+from shapecat.detection.merging.pair_features import (
     FEATURES,
-    BoostedTrees,
+    PAIR_FEATURES,
     ViewGeometry,
     are_adjacent,
     pair_features,
 )
-from shapecat.detection.merging.low_profile import merge_low_profile
 from shapecat.detection.merging.segments import Segments, merge
 from shapecat.detection.pipeline import oversegment
 from shapecat.learning.boosting import Tree, TreeSettings, grow_tree, make_bins
@@ -157,9 +158,9 @@ def _pairs(
                 todo.append((p, q))
             if (p, q, rows[p], rows[q]) not in seen:
                 seen.add((p, q, rows[p], rows[q]))
-                features = np.zeros(FEATURES, np.float32)
-                pair_features(segments, p, q, view_geometry, features)
-                yield features, same
+                named = np.zeros(1, PAIR_FEATURES)
+                pair_features(segments, p, q, view_geometry, named[0])
+                yield named.view(np.float32), same
         if not todo:
             return
         merge(segments, *todo[rng.integers(len(todo))])

@@ -9,17 +9,7 @@ from shapecat.detection.depth_grid import PinholeIntrinsics, count_at_range_limi
 from shapecat.detection.foreground.walls import CLEARED, ON_WALL
 from shapecat.detection.merging.segment_features import top_band
 from shapecat.detection.merging.segments import (
-    AREA,
-    BOTTOM,
-    CONTACT,
-    COUNT,
     FEW,
-    FRONT,
-    HIDDEN,
-    LEFT,
-    RIGHTMOST,
-    RIM,
-    TOP,
     Segments,
     depth_of,
     is_root,
@@ -102,10 +92,10 @@ def is_background(
     for p in range(1, n):
         if not is_root(segments, p):
             continue
-        size, boundary = segments.shape[p, COUNT], segments.boundary[p]
+        size, boundary = segments.statistics[p].count, segments.statistics[p].boundary
         rejected[p] = (
             _is_shelf_edge(segments, p)
-            or segments.shape[p, RIGHTMOST] - segments.shape[p, LEFT] > limits.largest_m
+            or segments.statistics[p].right - segments.statistics[p].left > limits.largest_m
             or (not known[p] and _is_noise_blob(segments, p))
             or counts[THROUGH, p] >= FEW
             or counts[ON, p] > REMAINS * size
@@ -121,17 +111,19 @@ def is_background(
 @kernel(leaf=True)
 def _is_shelf_edge(segments: Segments, p: int) -> bool:
     """Whether a segment meets a board from below, as its edge and the legs below it do."""
-    rim = segments.single[p, RIM]
-    return bool(rim >= SHELF_EDGE_LINKS and rim >= SHELF_EDGE_SHARE * segments.boundary[p])
+    rim = segments.statistics[p].shelf_edge
+    return bool(
+        rim >= SHELF_EDGE_LINKS and rim >= SHELF_EDGE_SHARE * segments.statistics[p].boundary
+    )
 
 
 @kernel(leaf=True)
 def _is_noise_blob(segments: Segments, p: int) -> bool:
     """Whether a segment is as small and low as noise of the plane."""
-    shape = segments.shape[p]
-    if shape[TOP] >= BLOB * MIN_HEIGHT_M + BLOB_NOISE * HEIGHT_NOISE * depth_of(segments, p) ** 2:
+    shape = segments.statistics[p]
+    if shape.top >= BLOB * MIN_HEIGHT_M + BLOB_NOISE * HEIGHT_NOISE * depth_of(segments, p) ** 2:
         return False
-    return bool(shape[AREA] < BLOB_M2 or shape[COUNT] < BLOB_CELLS)
+    return bool(shape.area < BLOB_M2 or shape.count < BLOB_CELLS)
 
 
 @kernel(leaf=True)
@@ -140,20 +132,20 @@ def _is_edge_on_panel(segments: Segments, p: int, intrinsics: PinholeIntrinsics)
 
     An object has a front too, unless something hides it.
     """
-    shape, boundary = segments.shape[p], segments.boundary[p]
-    covered = shape[COUNT] * depth_of(segments, p) ** 2 / (intrinsics.fx * intrinsics.fy)
-    speckled = boundary * boundary > SPECKS * shape[COUNT]
-    if shape[AREA] <= (SPECKLED if speckled else EDGE_ON) * covered:
+    shape, boundary = segments.statistics[p], segments.statistics[p].boundary
+    covered = shape.count * depth_of(segments, p) ** 2 / (intrinsics.fx * intrinsics.fy)
+    speckled = boundary * boundary > SPECKS * shape.count
+    if shape.area <= (SPECKLED if speckled else EDGE_ON) * covered:
         return False
-    if shape[RIGHTMOST] - shape[LEFT] >= SLENDER * (shape[TOP] - shape[BOTTOM]):
+    if shape.right - shape.left >= SLENDER * (shape.top - shape.bottom):
         return False
-    upward, touching, hidden = 0.0, 0.0, segments.single[p, HIDDEN]
+    upward, touching, hidden = 0.0, 0.0, segments.statistics[p].hidden
     for band in range(top_band(shape) + 1):
         upward += segments.top_area[p, band]
     for q in range(segments.parent.size):
-        touching += segments.pairs[CONTACT, p, q]
-        hidden += segments.pairs[FRONT, q, p]
-    upright = upward < UPRIGHT * shape[AREA]
+        touching += segments.pairs[p, q].contact
+        hidden += segments.pairs[q, p].in_front
+    upright = upward < UPRIGHT * shape.area
     return bool(upright and touching < FEW and hidden < COVERED * boundary)
 
 

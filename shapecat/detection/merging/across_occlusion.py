@@ -8,7 +8,6 @@ from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import PinholeIntrinsics
 from shapecat.detection.merging.segments import (
     FEW,
-    FRONT,
     SAMPLES,
     Segments,
     may_merge,
@@ -107,10 +106,10 @@ def _continuation(
 @kernel(leaf=True)
 def _are_behind_one(segments: Segments, p: int, q: int) -> bool:
     """Whether one thing is in front of both segments."""
-    front = segments.pairs[FRONT]
+    pairs = segments.pairs
     some = False
     for k in range(1, segments.parent.size):
-        some |= (k != p) & (k != q) & (front[k, p] >= FEW) & (front[k, q] >= FEW)
+        some |= (k != p) & (k != q) & (pairs[k, p].in_front >= FEW) & (pairs[k, q].in_front >= FEW)
     return some
 
 
@@ -123,7 +122,7 @@ def _behind_one(segments: Segments) -> Bool:
         count = 0
         for p in range(1, n):
             hidden[count] = p
-            count += (p != k) & (segments.pairs[FRONT, k, p] >= FEW)
+            count += (p != k) & (segments.pairs[k, p].in_front >= FEW)
         for a in range(count):
             for b in range(a + 1, count):
                 together[hidden[a], hidden[b]] = True

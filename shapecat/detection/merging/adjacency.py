@@ -6,15 +6,6 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
 from shapecat.detection.merging.segments import (
-    CONTACT,
-    FRONT,
-    HIDDEN,
-    NEAR,
-    ONTO,
-    ONTO_HEIGHT,
-    OVER,
-    RIM,
-    TABLE,
     UPWARD,
     Segments,
     choose_samples,
@@ -127,10 +118,10 @@ def _count_side(
     beyond = y >= rows or x >= columns
     q = 0 if beyond else labels[y, x]
     ends = gap == 0 or p != q  # else the segment goes on behind the gap
-    segments.boundary[p] += (p > 0) & ends
+    segments.statistics[p].boundary += (p > 0) & ends
     if beyond or gap > SHADOW:
         return
-    segments.boundary[q] += (q > 0) & ends
+    segments.statistics[q].boundary += (q > 0) & ends
     if p == q:
         return
     fall = -up[di]  # how much lower the neighbour is seen, however the image is turned
@@ -171,19 +162,22 @@ def _count(
     if p == 0:
         return
     plane_id, ahead = heights.plane_id, inv_depth[i, j] - inv_depth[y, x]
-    segments.single[p, OVER] += lower and ahead > DISCONTINUITY
+    segments.statistics[p].upper_silhouette += lower and ahead > DISCONTINUITY
     if q == 0:
         if ahead < -DISCONTINUITY:
-            segments.single[p, HIDDEN] += 1
+            segments.statistics[p].hidden += 1
         elif ahead < DISCONTINUITY and plane_id[y, x] < 0 and gap <= GAP:
-            segments.single[p, TABLE if plane_id[y, x] == -plane_id[i, j] else RIM] += 1
+            if plane_id[y, x] == -plane_id[i, j]:
+                segments.statistics[p].plane_contact += 1
+            else:
+                segments.statistics[p].shelf_edge += 1
     elif link:
-        segments.pairs[CONTACT, p, q] += 1
+        segments.pairs[p, q].contact += 1
         _count_onto(heights.height, graph.normal, labels, up, i, j, y, x, segments)
     elif ahead >= DISCONTINUITY:
-        segments.pairs[FRONT, p, q] += 1
+        segments.pairs[p, q].in_front += 1
     elif ahead > -DISCONTINUITY and gap <= GAP:
-        segments.pairs[NEAR, p, q] += 1
+        segments.pairs[p, q].near += 1
 
 
 @kernel(leaf=True)
@@ -197,5 +191,5 @@ def _count_onto(
     if labels[y, x] != q:
         return
     if normal[y, 0, x] * up[0] + normal[y, 1, x] * up[1] + normal[y, 2, x] * up[2] > UPWARD:
-        segments.pairs[ONTO, p, q] += 1
-        segments.pairs[ONTO_HEIGHT, p, q] += height[y, x]
+        segments.pairs[p, q].rests_on += 1
+        segments.pairs[p, q].rests_on_height += height[y, x]

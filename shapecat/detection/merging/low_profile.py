@@ -3,7 +3,7 @@
 import numpy as np
 
 from shapecat.arrays import I4, Bool
-from shapecat.detection.merging.segments import COUNT, Segments, merge
+from shapecat.detection.merging.segments import Segments, merge
 from shapecat.jit import kernel
 
 __all__ = ["merge_low_profile"]
@@ -35,7 +35,7 @@ def merge_low_profile(segments: Segments, low_profile: I4, labels: I4, spans: I4
     leader = np.zeros(overlap.shape[1], np.int32)
     for p in range(1, n):
         best = np.argmax(overlap[p])
-        if overlap[p, best] <= RAISED * segments.shape[p, COUNT]:
+        if overlap[p, best] <= RAISED * segments.statistics[p].count:
             continue
         if leader[best] == 0:
             leader[best] = p

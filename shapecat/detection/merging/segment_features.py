@@ -4,23 +4,7 @@ import math
 
 import numpy as np
 
-from shapecat.arrays import F4
-from shapecat.detection.merging.segments import (
-    BAND_M,
-    BANDS,
-    COUNT,
-    FAR,
-    FITTED,
-    LEFT,
-    RIGHTMOST,
-    SIDE,
-    SIDE2,
-    SIDETURN,
-    TOP,
-    TURN,
-    TURN2,
-    Segments,
-)
+from shapecat.detection.merging.segments import BAND_M, BANDS, Row, Segments
 from shapecat.jit import kernel
 
 __all__ = [
@@ -39,25 +23,25 @@ TOP_DEPTH_M = 0.02
 
 
 @kernel(leaf=True)
-def width_of(row: F4) -> float:
-    """Return the lateral extent of a segment, metres; ``row`` is its row of `Segments.shape`."""
-    return float(row[RIGHTMOST] - row[LEFT])
+def width_of(row: Row) -> float:
+    """Return the lateral extent of a segment, metres; ``row`` is a `SEGMENT`."""
+    return float(row.right - row.left)
 
 
 @kernel(leaf=True)
-def lateral_distance(a: F4, b: F4) -> float:
+def lateral_distance(a: Row, b: Row) -> float:
     """Return the lateral distance of the middles of two segments, metres."""
-    return float(abs(a[LEFT] + a[RIGHTMOST] - b[LEFT] - b[RIGHTMOST]) / 2)
+    return float(abs(a.left + a.right - b.left - b.right) / 2)
 
 
 @kernel(leaf=True)
-def depth_difference(a: F4, b: F4) -> float:
+def depth_difference(a: Row, b: Row) -> float:
     """Return how much farther away than segment ``b`` segment ``a`` is on average, metres."""
-    return float(a[FAR] / a[COUNT] - b[FAR] / b[COUNT])
+    return float(a.depth_sum / a.count - b.depth_sum / b.count)
 
 
 @kernel(leaf=True)
-def lateral_curvature(row: F4) -> float:
+def lateral_curvature(row: Row) -> float:
     """Return by how much the lateral normal changes across a segment.
 
     2 for a whole cylinder seen from outside, -2 from inside, 0 for a plane.
@@ -67,7 +51,7 @@ def lateral_curvature(row: F4) -> float:
 
 
 @kernel(leaf=True)
-def normal_position_correlation(row: F4) -> float:
+def normal_position_correlation(row: Row) -> float:
     """Return the correlation of the lateral normal with the lateral position.
 
     1 for what is turned about an upright axis; the faces of a box, and tops that are level, do not
@@ -78,18 +62,18 @@ def normal_position_correlation(row: F4) -> float:
 
 
 @kernel(leaf=True)
-def _moments(row: F4) -> tuple[float, float, float]:
+def _moments(row: Row) -> tuple[float, float, float]:
     """Return the sums of squares of the lateral position and normal, and of products of both."""
-    n = max(row[FITTED], np.float32(1))
-    spread = row[SIDE2] - row[SIDE] * row[SIDE] / n
-    turning = row[TURN2] - row[TURN] * row[TURN] / n
-    return spread, turning, row[SIDETURN] - row[SIDE] * row[TURN] / n
+    n = max(row.fitted, np.float32(1))
+    spread = row.xx_sum - row.x_sum * row.x_sum / n
+    turning = row.normal_xx_sum - row.normal_x_sum * row.normal_x_sum / n
+    return spread, turning, row.x_normal_x_sum - row.x_sum * row.normal_x_sum / n
 
 
 @kernel(leaf=True)
 def top_area_share(segments: Segments, p: int, depth: float) -> float:
     """Return what faces up within ``depth`` of the top of a segment, by its width squared."""
-    row = segments.shape[p]
+    row = segments.statistics[p]
     top = top_band(row)
     area = 0.0
     for band in range(max(top - int(depth / BAND_M), 0), top + 1):
@@ -98,6 +82,6 @@ def top_area_share(segments: Segments, p: int, depth: float) -> float:
 
 
 @kernel(leaf=True)
-def top_band(row: F4) -> int:
+def top_band(row: Row) -> int:
     """Return the last band of height in which a segment has anything."""
-    return min(int(row[TOP] / BAND_M), BANDS - 1)
+    return min(int(row.top / BAND_M), BANDS - 1)

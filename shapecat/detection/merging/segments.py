@@ -1,9 +1,10 @@
 """Segments: the statistics of each segment, and of each pair of segments (from `adjacency`)."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
@@ -13,33 +14,16 @@ from shapecat.geometry import level_axes
 from shapecat.jit import kernel
 
 __all__ = [
-    "AREA",
     "BAND_M",
-    "BOTTOM",
-    "CONTACT",
-    "COUNT",
-    "FAR",
     "FEW",
-    "FITTED",
-    "FRONT",
-    "HIDDEN",
-    "LEFT",
-    "NEAR",
-    "ONTO",
-    "ONTO_HEIGHT",
-    "OVER",
-    "RIGHTMOST",
-    "RIM",
+    "PAIR",
     "SAMPLES",
-    "SIDE",
-    "SIDE2",
-    "SIDETURN",
-    "TABLE",
-    "TOP",
-    "TURN",
-    "TURN2",
+    "SEGMENT",
     "UPWARD",
+    "Records",
+    "Row",
     "Segments",
+    "add_statistics",
     "choose_samples",
     "depth_of",
     "depths_of",
@@ -50,17 +34,43 @@ __all__ = [
     "merge",
 ]
 
-CONTACT, FRONT, NEAR, ONTO, ONTO_HEIGHT = range(5)
-"""Pair statistics [p, q]: linked neighbours; places where p is in front of q; neighbours of equal
-depth over a gap; links whose far side on q faces up, and the sum of its heights."""
-TABLE, HIDDEN, RIM, OVER = range(4)
-"""Statistics of one segment: links with its plane; boundary behind things that are no segment;
-links with a higher plane, from below; places where it ends above what is farther away: what stands
-on something meets that there."""
-COUNT, LEFT, RIGHTMOST, FITTED, SIDE, SIDE2, TURN, TURN2, SIDETURN, TOP, BOTTOM, AREA, FAR = range(
-    13
+SEGMENT = np.dtype(
+    [
+        ("count", "f4"),  # cells
+        ("boundary", "f4"),  # sides of cells on the boundary
+        ("left", "f4"),  # lateral range, metres
+        ("right", "f4"),
+        ("bottom", "f4"),  # range of heights above the plane, metres
+        ("top", "f4"),
+        ("area", "f4"),  # of the surface seen, m2
+        ("depth_sum", "f4"),
+        ("fitted", "f4"),  # cells with a local plane, over which the next five are sums:
+        ("x_sum", "f4"),  # lateral position
+        ("xx_sum", "f4"),
+        ("normal_x_sum", "f4"),  # lateral part of the normal
+        ("normal_xx_sum", "f4"),
+        ("x_normal_x_sum", "f4"),
+        ("plane_contact", "f4"),  # links with its plane
+        ("hidden", "f4"),  # boundary behind what is of no segment
+        ("shelf_edge", "f4"),  # links with a higher plane, from below
+        ("upper_silhouette", "f4"),  # places where it ends above what is farther away
+    ]
 )
-"""The shape of one segment, in the order of `Segments.shape`."""
+"""The statistics of a segment."""
+PAIR = np.dtype(
+    [
+        ("contact", "f4"),  # linked neighbours
+        ("in_front", "f4"),  # places where the first is in front of the second
+        ("near", "f4"),  # neighbours of equal depth over a gap
+        ("rests_on", "f4"),  # links whose far side, on the second, faces up
+        ("rests_on_height", "f4"),  # the sum of the heights there
+    ]
+)
+"""What two segments have in common."""
+Records: TypeAlias = NDArray[np.void]
+"""An array of `SEGMENT` or `PAIR`."""
+Row: TypeAlias = Any
+"""One of its records."""
 FEW = 3
 """Links between two segments that are taken for a contact rather than for noise."""
 SAMPLES = 48
@@ -76,21 +86,16 @@ class Segments(NamedTuple):
 
     Attributes
     ----------
-    pairs : (5, n + 1, n + 1) float32, see `CONTACT` and the following.
-    single : (n + 1, 4) float32, see `TABLE` and the following.
-    boundary : (n + 1,) float32 sides of cells on the boundary.
-    shape : (n + 1, 13) float32: cells, lateral range, cells with a tangent, sums for the regression
-        of their lateral normal on the lateral position, height range, area, sum of the depths.
+    pairs : (n + 1, n + 1) of `PAIR`.
+    statistics : (n + 1,) of `SEGMENT`.
     top_area : (n + 1, BANDS) float32 m2 of surface that faces up, by height.
     samples : (n + 1, SAMPLES) int32 cells away from edges, -1 beyond the last.
     plane_id : (n + 1,) int8 the plane it is above, as in `HeightMap.plane_id`.
     parent : (n + 1,) int16 the segment it has been merged into.
     """
 
-    pairs: F4
-    single: F4
-    boundary: F4
-    shape: F4
+    pairs: Records
+    statistics: Records
     top_area: F4
     samples: I4
     plane_id: I4
@@ -120,18 +125,16 @@ def measure_segments(
 def _blank(size: int) -> Segments:
     """Return segments without any cell."""
     segments = Segments(
-        np.zeros((5, size, size), np.float32),
-        np.zeros((size, OVER + 1), np.float32),
-        np.zeros(size, np.float32),
-        np.zeros((size, 13), np.float32),
+        np.zeros((size, size), PAIR),
+        np.zeros(size, SEGMENT),
         np.zeros((size, BANDS), np.float32),
         np.full((size, SAMPLES), -1, np.int32),
         np.zeros(size, np.int8),
         np.arange(size).astype(np.int16),
     )
-    shape = segments.shape
-    shape[:, LEFT], shape[:, RIGHTMOST] = 1e9, -1e9
-    shape[:, BOTTOM], shape[:, TOP] = 1e9, -1e9
+    for p in range(size):
+        row = segments.statistics[p]
+        row.left, row.right, row.bottom, row.top = 1e9, -1e9, 1e9, -1e9
     return segments
 
 
@@ -156,7 +159,7 @@ def _measure(
     segments: Segments,
 ) -> None:
     """Add up the cells of the labels; label 0 is none."""
-    shape, plane_ids, top_area = segments.shape, segments.plane_id, segments.top_area
+    plane_ids, top_area = segments.plane_id, segments.top_area
     plane_id, height = heights.plane_id, heights.height
     zero, one, far_off = np.float32(0), np.float32(1), np.float32(np.inf)
     per_x, per_y = np.float32(1 / intrinsics.fx), np.float32(1 / intrinsics.fy)
@@ -199,18 +202,18 @@ def _measure(
                         top_area[p, band] += area
                 j += 1
             plane_ids[p] = plane_id[i, first]
-            row = shape[p]
-            row[COUNT] += j - first
-            row[FAR] += far
-            row[LEFT], row[RIGHTMOST] = min(row[LEFT], left), max(row[RIGHTMOST], right)
-            row[TOP], row[BOTTOM] = max(row[TOP], top), min(row[BOTTOM], bottom)
-            row[FITTED] += fitted
-            row[SIDE] += sides
-            row[SIDE2] += sides2
-            row[TURN] += turns
-            row[TURN2] += turns2
-            row[SIDETURN] += both
-            row[AREA] += areas
+            row = segments.statistics[p]
+            row.count += j - first
+            row.depth_sum += far
+            row.left, row.right = min(row.left, left), max(row.right, right)
+            row.top, row.bottom = max(row.top, top), min(row.bottom, bottom)
+            row.fitted += fitted
+            row.x_sum += sides
+            row.xx_sum += sides2
+            row.normal_x_sum += turns
+            row.normal_xx_sum += turns2
+            row.x_normal_x_sum += both
+            row.area += areas
 
 
 @kernel
@@ -223,8 +226,10 @@ def choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None:
         graph.concavity,
         segments.samples,
     )
-    stride = np.maximum(segments.shape[:, COUNT].astype(np.int32) // SAMPLES, 1)
-    wait, taken = stride.copy(), np.zeros_like(stride)
+    n = segments.parent.size
+    stride, wait, taken = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
+    for p in range(n):
+        stride[p] = wait[p] = max(int(segments.statistics[p].count) // SAMPLES, 1)
     for i in range(rows):
         for j in range(spans[i, 0], spans[i, 1]):
             p = labels[i, j]
@@ -241,22 +246,15 @@ def choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None:
 def merge(segments: Segments, p: int, q: int) -> None:
     """Add segment ``q`` to segment ``p``; both are groups of their own before."""
     n = segments.parent.size
-    for r in range(segments.pairs.shape[0]):
-        for k in range(n):
-            segments.pairs[r, p, k] += segments.pairs[r, q, k]
-            segments.pairs[r, q, k] = 0
-        for k in range(n):
-            segments.pairs[r, k, p] += segments.pairs[r, k, q]
-            segments.pairs[r, k, q] = 0
-        segments.pairs[r, p, p] = 0
-    segments.boundary[p] += segments.boundary[q]
-    segments.single[p] += segments.single[q]
-    segments.top_area[p] += segments.top_area[q]
-    a, b = segments.shape[p], segments.shape[q]
-    for k in (COUNT, FITTED, SIDE, SIDE2, TURN, TURN2, SIDETURN, AREA, FAR):
-        a[k] += b[k]
-    a[LEFT], a[RIGHTMOST] = min(a[LEFT], b[LEFT]), max(a[RIGHTMOST], b[RIGHTMOST])
-    a[TOP], a[BOTTOM] = max(a[TOP], b[TOP]), min(a[BOTTOM], b[BOTTOM])
+    pairs = segments.pairs
+    for k in range(n):
+        _add_pair(pairs[p, k], pairs[q, k])
+    for k in range(n):
+        _add_pair(pairs[k, p], pairs[k, q])
+    pairs[p, p] = np.zeros(1, PAIR)[0]
+    for band in range(BANDS):
+        segments.top_area[p, band] += segments.top_area[q, band]
+    add_statistics(segments.statistics[p], segments.statistics[q])
     # Half of the samples from each side.
     first, second = segments.samples[p].copy(), segments.samples[q].copy()
     mixed = 0
@@ -271,10 +269,42 @@ def merge(segments: Segments, p: int, q: int) -> None:
 
 
 @kernel(leaf=True)
+def _add_pair(a: Row, b: Row) -> None:
+    """Add a `PAIR` to another, and clear it."""
+    a.contact += b.contact
+    a.in_front += b.in_front
+    a.near += b.near
+    a.rests_on += b.rests_on
+    a.rests_on_height += b.rests_on_height
+    b.contact = b.in_front = b.near = b.rests_on = b.rests_on_height = 0.0
+
+
+@kernel(leaf=True)
+def add_statistics(a: Row, b: Row) -> None:
+    """Add a `SEGMENT` to another."""
+    a.count += b.count
+    a.boundary += b.boundary
+    a.left, a.right = min(a.left, b.left), max(a.right, b.right)
+    a.bottom, a.top = min(a.bottom, b.bottom), max(a.top, b.top)
+    a.area += b.area
+    a.depth_sum += b.depth_sum
+    a.fitted += b.fitted
+    a.x_sum += b.x_sum
+    a.xx_sum += b.xx_sum
+    a.normal_x_sum += b.normal_x_sum
+    a.normal_xx_sum += b.normal_xx_sum
+    a.x_normal_x_sum += b.x_normal_x_sum
+    a.plane_contact += b.plane_contact
+    a.hidden += b.hidden
+    a.shelf_edge += b.shelf_edge
+    a.upper_silhouette += b.upper_silhouette
+
+
+@kernel(leaf=True)
 def depth_of(segments: Segments, p: int) -> float:
     """Return the mean depth of a segment, metres; 1 where it has no cell."""
-    count = segments.shape[p, COUNT]
-    return float(segments.shape[p, FAR] / count) if count > 0 else 1.0
+    count = segments.statistics[p].count
+    return float(segments.statistics[p].depth_sum / count) if count > 0 else 1.0
 
 
 @kernel

@@ -13,18 +13,7 @@ from shapecat.detection.depth_grid import (
     smallest_object_at,
 )
 from shapecat.detection.merging.segments import (
-    BOTTOM,
-    CONTACT,
     FEW,
-    FRONT,
-    HIDDEN,
-    LEFT,
-    NEAR,
-    ONTO,
-    ONTO_HEIGHT,
-    RIGHTMOST,
-    TABLE,
-    TOP,
     Segments,
     depths_of,
 )
@@ -116,11 +105,11 @@ def measure_objects(
         measured.supported_by[k], measured.support_m[k] = _supporting_object(
             segments, representatives, p
         )
-        hidden = segments.single[p, HIDDEN]
+        hidden = segments.statistics[p].hidden
         for q in range(segments.parent.size):
-            hidden += segments.pairs[FRONT, q, p]
+            hidden += segments.pairs[q, p].in_front
         measured.hidden[k] = hidden > np.float32(OCCLUDED) * max(
-            segments.boundary[p], np.float32(1)
+            segments.statistics[p].boundary, np.float32(1)
         )
     _break_cycles(measured)
     return measured
@@ -129,32 +118,33 @@ def measure_objects(
 @kernel(leaf=True)
 def _supporting_object(segments: Segments, representatives: I4, p: int) -> tuple[int, float]:
     """Return what a segment stands on: a label or 0, and its height above the plane, metres."""
-    onto, shape = segments.pairs[ONTO, p], segments.shape
+    pairs, statistics = segments.pairs[p], segments.statistics
     best = 0
     for k in range(1, representatives.size):
-        best = k if onto[representatives[k]] > onto[representatives[best]] else best
-    met = onto[representatives[best]]
-    if met >= FEW and met > segments.single[p, TABLE]:
-        height = float(segments.pairs[ONTO_HEIGHT, p, representatives[best]] / met)
-        return (0, 0.0) if shape[p, BOTTOM] < height - SUNK_M else (best, height)
-    if shape[p, BOTTOM] > LIFTED_M and segments.single[p, TABLE] < FEW:
+        more = pairs[representatives[k]].rests_on > pairs[representatives[best]].rests_on
+        best = k if more else best
+    met = pairs[representatives[best]].rests_on
+    if met >= FEW and met > segments.statistics[p].plane_contact:
+        height = float(pairs[representatives[best]].rests_on_height / met)
+        return (0, 0.0) if statistics[p].bottom < height - SUNK_M else (best, height)
+    if statistics[p].bottom > LIFTED_M and segments.statistics[p].plane_contact < FEW:
         best = _hidden_support(segments, representatives, p)
-        return best, float(shape[representatives[best], TOP]) if best else 0.0
+        return best, float(statistics[representatives[best]].top) if best else 0.0
     return 0, 0.0
 
 
 @kernel(leaf=True)
 def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
     """Return the label below a segment that it meets most, 0 if none."""
-    shape, pairs = segments.shape, segments.pairs
-    middle = (shape[p, LEFT] + shape[p, RIGHTMOST]) / 2
+    statistics, pairs = segments.statistics, segments.pairs
+    middle = (statistics[p].left + statistics[p].right) / 2
     best, most = 0, 0.0
     for k in range(1, representatives.size):
         q = representatives[k]
-        met = pairs[CONTACT, p, q] + pairs[NEAR, p, q] + pairs[FRONT, p, q] + pairs[FRONT, q, p]
-        overlap = shape[q, TOP] - shape[p, BOTTOM]
+        met = pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front + pairs[q, p].in_front
+        overlap = statistics[q].top - statistics[p].bottom
         below = -GAP_M < overlap < OVERLAP_M
-        beside = shape[q, LEFT] < middle < shape[q, RIGHTMOST]
+        beside = statistics[q].left < middle < statistics[q].right
         if q != p and below and beside and met > most:
             best, most = k, met
     return best if most >= FEW else 0
