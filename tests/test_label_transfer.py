@@ -136,16 +136,23 @@ def test_mixed_tables_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_table_without_the_column_is_the_runs_own_or_refused(tmp_path: Path) -> None:
-    """Somebody deleted the column: in its place the table is known, elsewhere it is anybody's."""
-    mine = make_run(tmp_path / "mine", {1: still(CUP)}, labels={1: "bowl"})
-    lines = [line.rpartition(",")[0] for line in (mine / "tracks.csv").read_text().splitlines()]
-    (mine / "tracks.csv").write_text("\n".join(lines))
-    (tmp_path / "some.csv").write_text("\n".join(lines))
+    """Somebody deleted the column: the places tell; a table made by hand has none."""
+    mine = make_run(tmp_path / "mine", {1: still(CUP)})
+    theirs = make_run(tmp_path / "theirs", {1: still(shifted(CUP, y=0.01))})
+    for run, label in ((mine, "bowl"), (theirs, "can")):
+        lines = [line.rpartition(",")[0] for line in (run / "tracks.csv").read_text().splitlines()]
+        (tmp_path / f"{run.name}.csv").write_text(
+            "\n".join(lines).replace("0.9,,", f"0.9,{label},")
+        )
+    (tmp_path / "hand.csv").write_text("track,category,confidence,label\n1,cup,0,delete\n")
 
-    adopt_labels(mine / "tracks.csv", mine)
+    adopt_labels(tmp_path / "mine.csv", mine)
     assert labels_of(mine) == {1: "bowl"}
-    with pytest.raises(OutputError, match="does not say of which run"):
-        adopt_labels(tmp_path / "some.csv", mine)
+    with pytest.raises(OutputError, match="in other places"):
+        adopt_labels(tmp_path / "theirs.csv", mine)
+    assert labels_of(mine) == {1: "bowl"}
+    adopt_labels(tmp_path / "hand.csv", mine)
+    assert labels_of(mine) == {1: "delete"}
 
 
 def test_the_name_survives_a_spreadsheet(tmp_path: Path) -> None:

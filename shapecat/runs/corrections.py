@@ -210,26 +210,47 @@ def merging_with(track: int) -> str:
 def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: bool = True) -> None:
     """Refuse a table whose tracks are not those of the run in ``folder``.
 
-    ``known`` is a table that lies in the folder: it need not say whose it is.
+    ``known`` is a table that lies in the folder: it need not say whose it is. One without the
+    column, made by hand, goes by its places, if it has any.
 
     Raises
     ------
     OutputError : it is another run's, of several runs, or of nobody knows which.
     """
     own = read_run(folder).get("work", "") if (folder / "run.json").exists() else ""
-    if not own or set(table.runs) == {own} or (known and not table.runs):
+    if not own or set(table.runs) == {own}:
+        return
+    if not table.runs and (known or _places_agree(table, folder)):
         return
     if len(table.runs) > 1:
         found = f"holds tracks of several runs ({', '.join(table.runs)})"
     elif table.runs:
         found = f"holds the tracks of {_described(path.parent, table.run)}"
     else:
-        found = "does not say of which run its tracks are (no column `run`)"
+        found = "has tracks in other places (and no column `run`)"
     msg = (
         f"{path}: {found}, not those of {_described(folder, own)}; to find the same objects by "
         "their places use --by-place"
     )
     raise OutputError(msg)
+
+
+def _places_agree(table: TrackTable, folder: Path) -> bool:
+    """Return whether no track of a table is elsewhere than that of the run."""
+    own = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
+    return all(
+        _number(row.cells.get(axis)) in {None, _number(own[row.track].cells.get(axis))}
+        for row in table.rows
+        if row.track in own
+        for axis in "xyz"
+    )
+
+
+def _number(cell: str | None) -> float | None:
+    """Return the number in a cell, as a spreadsheet may write it."""
+    with suppress(ValueError, AttributeError):
+        return float((cell or "").strip().replace(",", "."))
+    return None
 
 
 def _described(folder: Path, work: str) -> str:
