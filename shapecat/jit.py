@@ -126,7 +126,7 @@ class CompileClock(Listener):  # type: ignore[misc]  # numba has no types
     def __init__(self, on_first: Callable[[], None]) -> None:
         """Call ``on_first`` when the first kernel is compiled."""
         self.seconds = 0.0
-        self._on_first = on_first
+        self._on_first: Callable[[], None] | None = on_first
         self._depth = 0
         self._begun = 0.0
 
@@ -134,8 +134,9 @@ class CompileClock(Listener):  # type: ignore[misc]  # numba has no types
         """Start the clock at the outermost kernel; the kernels it calls are compiled within."""
         if self._depth == 0:
             self._begun = time.perf_counter()
-            if self.seconds == 0:
-                self._on_first()
+            tell, self._on_first = self._on_first, None
+            if tell is not None:
+                tell()
         self._depth += 1
 
     def on_end(self, event: Event) -> None:  # noqa: ARG002  numba's signature

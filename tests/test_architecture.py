@@ -10,7 +10,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 STAGES = {"depth_fusion", "detection", "surface", "description", "learning", "tracking"}
-BASE = {"arrays", "errors", "jit", "triangles", "types"}
+BASE = {"arrays", "errors", "jit", "stopping", "triangles", "types"}
 FLOOR = {
     **dict.fromkeys(BASE | {"__init__", "py"}, 0),
     **dict.fromkeys(("config", "geometry", "files", "executors"), 1),
