@@ -36,11 +36,18 @@ def annotate(*, run: Path, labels: Path | None, by_place: bool, recording: Path 
         transfer = annotate_again(run, labels, bars, by_place=by_place, recording=recording)
     click.echo(f"{run}: wrote annotated.mcap and review.rrd")
     if transfer is not None:
-        _show(transfer.as_dict())
+        _show(transfer.as_dict(), labels)
 
 
-def _show(transfer: dict[str, Any]) -> None:
+def _show(transfer: dict[str, Any], labels: Path | None) -> None:
+    from shapecat.runs.label_transfer import TABLE_ALONE
+
     done, missed = transfer["transferred"], transfer["not_transferred"]
     click.echo(f"{len(done)} of {len(done) + len(missed)} labels have found their objects")
+    if transfer["by"] == TABLE_ALONE:
+        text = "the run is not beside the table: assumed to have the same fixed frame, and that"
+        click.echo(
+            f"{labels}: {text} nothing was moved; give the run's folder to be sure", err=True
+        )
     for item in missed:
         click.echo(missed_words(item), err=True)

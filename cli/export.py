@@ -46,7 +46,7 @@ def export(
     for run in runs:
         with progress_bars() as bars:
             count = export_run(run, kind, out, every=every, recording=recording, observe=bars)
-        click.echo(f"{run}: {count} labelled objects, counted in each frame, in {out}")
+        click.echo(f"{run}: {count} objects in {out}")
 
 
 def _require_own_names(runs: Sequence[Path]) -> None:

@@ -8,8 +8,7 @@ Each can be run again alone.
 import logging
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,11 +16,10 @@ from typing import Any, TypeVar
 import pyarrow as pa
 
 from shapecat import stopping
+from shapecat.depth_fusion import RecentFrames
 from shapecat.description import DESCRIPTOR_NAMES
-from shapecat.detection import RecentFrames
 from shapecat.errors import NoStreamError, OutputError, RecordingError
 from shapecat.executors.order import Processes, read_ahead
-from shapecat.files import replacing
 from shapecat.learning import Categorizer, load_model
 from shapecat.outputs.rereading import open_source, with_clouds
 from shapecat.perception import Perceiver, View
@@ -29,15 +27,12 @@ from shapecat.recordings import Recording, choose_streams, frames, open_recordin
 from shapecat.recordings.gravity import Upright
 from shapecat.rehearsal import compile_all
 from shapecat.runs.corrections import (
-    PREVIOUS,
     TrackLabel,
     adopt_labels,
-    has_labels,
     read_labels,
 )
 from shapecat.runs.folder import (
     OUTPUTS,
-    clear,
     made_by_run,
     read_run,
     recover,
@@ -45,11 +40,22 @@ from shapecat.runs.folder import (
     sweep,
     write_run,
 )
-from shapecat.runs.identity import ContentDigest, file_stats, same_content, unchanged, work_id
-from shapecat.runs.jobs import Job, Summary, describe_run, resume, same_options, summarize
-from shapecat.runs.label_transfer import Transfer, lost_labels, transfer_labels
+from shapecat.runs.identity import ContentDigest, file_stats, same_content
+from shapecat.runs.jobs import (
+    Job,
+    Summary,
+    describe_run,
+    has_work,
+    identify,
+    keep_labels,
+    require_unchanged,
+    resume,
+    same_options,
+    summarize,
+)
+from shapecat.runs.label_transfer import Transfer, transfer_labels
 from shapecat.runs.labels import read_labelled_frames
-from shapecat.runs.perceived import FrameRow, PerceptionTables, count_segments, discard_segments
+from shapecat.runs.perceived import FrameRow, PerceptionTables, discard_segments
 from shapecat.runs.shown import read_shown_frames
 from shapecat.runs.tables import count_rows, read_row_groups, release_memory
 from shapecat.runs.tracks import track_run
@@ -101,7 +107,7 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
         recover(job.folder)
         if made_by_run(job.folder) is not None and not job.overwrite:
             return _finished(job, recording, run, content, observe)
-        with staged(job.folder, worth_keeping=_has_work) as folder:
+        with staged(job.folder, worth_keeping=has_work) as folder:
             run = resume(folder, run, job.source, content.result)
             compiling_s = compile_all(lambda: observe("compile", 0, None), cores=cores)
             content.start()
@@ -114,43 +120,17 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
                     recording, folder, run, job, categorizer, observe, cores=cores
                 ),
             )
-            _identify(run, content)
+            identify(run, content)
             write_run(folder, run)
             discard_segments(folder)
             _once("track", folder, run, lambda: track(folder, run, job))
-            _once("labels", folder, run, lambda: _keep_labels(folder, run, job))
+            _once("labels", folder, run, lambda: keep_labels(folder, run, job))
             annotate(folder, recording, run, observe, cores=cores)
-            _require_unchanged(folder, run, job)
+            require_unchanged(folder, run, job.source)
             run["seconds"]["compile"] = compiling_s
             run["seconds"]["total"] = earlier + time.perf_counter() - begun
             write_run(folder, run)
     return summarize(job, run)
-
-
-def _has_work(folder: Path) -> bool:
-    """Return whether a run that was cut short has got so far that it can be resumed."""
-    with suppress(OutputError):
-        return count_segments(folder) > 0 or "perceive" in read_run(folder)["seconds"]
-    return False
-
-
-def _identify(run: dict[str, Any], content: ContentDigest) -> None:
-    """Note the digest of the input, now that it was read, and the name of the work."""
-    run["input"]["digest"] = run["input"]["digest"] or content.result()
-    run["work"] = work_id(run)
-
-
-def _require_unchanged(folder: Path, run: Mapping[str, Any], job: Job) -> None:
-    """Discard results that may be of two recordings.
-
-    Raises
-    ------
-    RecordingError : the recording was written to while it was read.
-    """
-    if not unchanged(run["input"]["files"], job.source):
-        clear(folder)
-        msg = f"{job.source}: has changed while it was processed; run the same command again"
-        raise RecordingError(msg)
 
 
 def _once(phase: str, folder: Path, run: dict[str, Any], work: Callable[[], None]) -> None:
@@ -258,23 +238,6 @@ def track(folder: Path, run: dict[str, Any], job: Job) -> None:
     run["counts"]["tracks"] = track_run(
         folder, job.settings.tracking, run["model"]["categories"], work=run["work"]
     )
-
-
-def _keep_labels(folder: Path, run: dict[str, Any], job: Job) -> None:
-    """Carry the labels that a person gave to the results that are replaced over to the new ones.
-
-    The table they were written into is kept beside the new one.
-    """
-    previous = job.folder / "tracks.csv"
-    if job.discard_labels or not has_labels(previous):
-        return
-    with replacing(folder / PREVIOUS) as path:
-        path.write_bytes(previous.read_bytes())
-    try:
-        transfer = transfer_labels(job.folder, folder)
-    except OutputError as error:
-        transfer = lost_labels(job.folder, str(error))
-    run["corrections"] = transfer.as_dict()
 
 
 def annotate(

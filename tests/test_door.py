@@ -9,6 +9,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from html.parser import HTMLParser
+from importlib import import_module
 from pathlib import Path
 from urllib.parse import unquote
 
@@ -306,3 +307,20 @@ def test_the_web_viewer_serves_this_machine_alone(tmp_path: Path) -> None:
     assert viewer.returncode == 130
     assert "Traceback" not in errors
     wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in below))
+
+
+@pytest.mark.parametrize("kind", ["plain", "rich", "none", "bars"])
+def test_the_compile_notice_appears_once(capsys: pytest.CaptureFixture[str], kind: str) -> None:
+    """Each recording, and each worker, tells of the kernels it compiles."""
+    open_progress = import_module("shapecat.cli.progress").open_progress
+    progress_bars = import_module("shapecat.cli.render").progress_bars
+    if kind == "bars":
+        with progress_bars() as bars:
+            for _ in range(3):
+                bars("compile", 0, None)
+    else:
+        with open_progress(kind, []) as progress:
+            for name in ("a", "b", "c"):
+                progress.progress(name, "compile", 0, None)
+
+    assert capsys.readouterr().err.count("compiling kernels") == 1

@@ -16,7 +16,7 @@ from shapecat.errors import OutputError
 from shapecat.runs.corrections import adopt_labels, read_labels
 from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.identity import new_id
-from shapecat.runs.label_transfer import match_labels, transfer_labels
+from shapecat.runs.label_transfer import TABLE_ALONE, match_labels, transfer_labels
 from shapecat.runs.tables import DETECTIONS, FRAMES, TRACKS, write_table
 from shapecat.runs.track_table import read_track_table
 from tests.scenes import record
@@ -136,16 +136,23 @@ def test_mixed_tables_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_table_without_the_column_is_the_runs_own_or_refused(tmp_path: Path) -> None:
-    """Somebody deleted the column: in its place the table is known, elsewhere it is anybody's."""
-    mine = make_run(tmp_path / "mine", {1: still(CUP)}, labels={1: "bowl"})
-    lines = [line.rpartition(",")[0] for line in (mine / "tracks.csv").read_text().splitlines()]
-    (mine / "tracks.csv").write_text("\n".join(lines))
-    (tmp_path / "some.csv").write_text("\n".join(lines))
+    """Somebody deleted the column: the places tell; a table made by hand has none."""
+    mine = make_run(tmp_path / "mine", {1: still(CUP)})
+    theirs = make_run(tmp_path / "theirs", {1: still(shifted(CUP, y=0.01))})
+    for run, label in ((mine, "bowl"), (theirs, "can")):
+        lines = [line.rpartition(",")[0] for line in (run / "tracks.csv").read_text().splitlines()]
+        (tmp_path / f"{run.name}.csv").write_text(
+            "\n".join(lines).replace("0.9,,", f"0.9,{label},")
+        )
+    (tmp_path / "hand.csv").write_text("track,category,confidence,label\n1,cup,0,delete\n")
 
-    adopt_labels(mine / "tracks.csv", mine)
+    adopt_labels(tmp_path / "mine.csv", mine)
     assert labels_of(mine) == {1: "bowl"}
-    with pytest.raises(OutputError, match="does not say of which run"):
-        adopt_labels(tmp_path / "some.csv", mine)
+    with pytest.raises(OutputError, match="in other places"):
+        adopt_labels(tmp_path / "theirs.csv", mine)
+    assert labels_of(mine) == {1: "bowl"}
+    adopt_labels(tmp_path / "hand.csv", mine)
+    assert labels_of(mine) == {1: "delete"}
 
 
 def test_the_name_survives_a_spreadsheet(tmp_path: Path) -> None:
@@ -248,6 +255,116 @@ def test_what_is_gone_is_told(tmp_path: Path) -> None:
     }
 
 
+def test_a_neighbour_is_not_taken_for_what_is_not_seen(tmp_path: Path) -> None:
+    """The labelled object is missing in the target; what stands beside it is the nearest there."""
+    source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"}, size=0.05)
+    beside = {5: still(shifted(CUP, y=0.08))}
+    target = make_run(tmp_path / "target", beside, size=0.05)
+
+    transfer = transfer_labels(source, target)
+
+    assert labels_of(target) == {5: ""}
+    assert [item.old_track for item in transfer.missed] == [1]
+
+
+@pytest.mark.parametrize("part_first", [False, True])
+def test_parts_and_pieces_become_one_whole(tmp_path: Path, part_first: bool) -> None:
+    """The target has two pieces, in one of which the part is; the order of lines is no matter."""
+    whole = [None if 5 <= k < 8 else CUP for k in range(FRAMES_EACH)]
+    part = still(shifted(CUP, y=0.01), frames=range(5, 8))
+    objects = {2: part, 1: whole} if part_first else {1: whole, 2: part}
+    labels = {1: "mug", 2: "merge with 1"}
+    source = make_run(tmp_path / "source", objects, labels=labels)
+    pieces = {9: still(CUP, frames=range(5)), 10: still(CUP, frames=range(5, 10))}
+    target = make_run(tmp_path / "target", pieces)
+
+    transfer = transfer_labels(source, target)
+
+    assert labels_of(target) == {9: "mug", 10: "mug"}
+    assert not transfer.missed
+
+
+def test_a_chain_of_merges_leads_to_the_whole(tmp_path: Path) -> None:
+    """Merges with one another would lead in a circle, and all labels would be lost."""
+    third = range(3), range(3, 6), range(6, 10)
+    objects = {k: still(CUP, frames=frames) for k, frames in enumerate(third, start=1)}
+    labels = {1: "merge with 2", 2: "merge with 3"}
+    source = make_run(tmp_path / "source", objects, labels=labels)
+    pieces = {k + 10: still(CUP, frames=frames) for k, frames in enumerate(third)}
+    target = make_run(tmp_path / "target", pieces)
+
+    transfer_labels(source, target)
+
+    assert labels_of(target) == {10: "merge with 12", 11: "merge with 12", 12: ""}
+
+
+# ---- what is there already, and what cannot be read
+
+
+def test_what_a_person_wrote_in_the_target_stays(tmp_path: Path) -> None:
+    """It was replaced without a word."""
+    source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"})
+    target = make_run(tmp_path / "target", {5: still(CUP)}, labels={5: "teapot"})
+
+    (missed,) = transfer_labels(source, target).missed
+
+    assert missed.reason == "track 5 is labelled teapot already"
+    assert labels_of(target) == {5: "teapot"}
+
+
+def test_a_label_that_was_carried_over_can_be_replaced(tmp_path: Path) -> None:
+    source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"})
+    target = make_run(tmp_path / "target", {5: still(CUP)})
+    transfer_labels(source, target)
+    write_csv(source / "tracks.csv", {1: still(CUP)}, "wsource", {1: "teapot"})
+
+    assert not transfer_labels(source, target).missed
+    assert labels_of(target) == {5: "teapot"}
+
+
+def test_one_label_that_contradicts_does_not_cost_the_others(tmp_path: Path) -> None:
+    """A person has merged a track of the target with one that the source says to delete."""
+    labels = {1: "delete", 3: "mug"}
+    source = make_run(tmp_path / "source", {1: still(CUP), 3: still(BOWL)}, labels=labels)
+    objects = {5: still(CUP), 6: still(CAN), 7: still(BOWL)}
+    target = make_run(tmp_path / "target", objects, labels={6: "merge with 5"})
+
+    (missed,) = transfer_labels(source, target).missed
+
+    assert (missed.old_track, "track 5 is deleted" in missed.reason) == (1, True)
+    assert labels_of(target) == {5: "", 6: "merge with 5", 7: "mug"}
+
+
+def test_one_misspelt_label_does_not_cost_the_others(tmp_path: Path) -> None:
+    labels = {1: "mug", 2: "bowll"}
+    source = make_run(tmp_path / "source", {1: still(CUP), 2: still(CAN)}, labels=labels)
+    target = make_run(tmp_path / "target", {5: still(CUP), 6: still(CAN)})
+
+    (missed,) = transfer_labels(source, target).missed
+
+    assert (missed.old_track, "did you mean bowl" in missed.reason) == (2, True)
+    assert labels_of(target) == {5: "mug", 6: ""}
+
+
+@pytest.mark.parametrize(
+    ("found", "broken", "told"),
+    [("\n2,", "\nx,", "line 3: expected numbers"), ("wsource\r\n2,", "wb\r\n2,", "several runs")],
+)
+def test_lines_are_not_left_out_without_a_word(
+    tmp_path: Path, found: str, broken: str, told: str
+) -> None:
+    labels = {1: "mug", 2: "tin"}
+    source = make_run(tmp_path / "source", {1: still(CUP), 2: still(CAN)}, labels=labels)
+    table = (source / "tracks.csv").read_bytes().decode()
+    assert found in table
+    (source / "tracks.csv").write_bytes(table.replace(found, broken).encode())
+    target = make_run(tmp_path / "target", {5: still(CUP), 6: still(CAN)})
+
+    with pytest.raises(OutputError, match=told):
+        transfer_labels(source, target)
+    assert labels_of(target) == {5: "", 6: ""}
+
+
 # ---- a second recording of the same place
 
 
@@ -290,6 +407,20 @@ def test_two_candidates_are_told_not_guessed(tmp_path: Path) -> None:
     assert labels_of(target) == {1: "", 2: ""}
 
 
+def test_identical_cups_that_swap_are_told_not_guessed(tmp_path: Path) -> None:
+    """They stand side by side, and in the second recording each is nearly where the other was."""
+    labels = {1: "mug", 2: "tin"}
+    beside = shifted(CUP, y=0.06)
+    source = make_run(tmp_path / "source", {1: still(CUP), 2: still(beside)}, labels=labels)
+    swapped = {1: still(shifted(CUP, y=0.025)), 2: still(shifted(CUP, y=0.035))}
+    target = second(tmp_path / "target", swapped)
+
+    transfer = transfer_labels(source, target)
+
+    assert labels_of(target) == {1: "", 2: ""}
+    assert {item.old_track for item in transfer.missed} == {1, 2}
+
+
 def test_something_of_another_size_is_another_thing(tmp_path: Path) -> None:
     source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"})
     target = second(tmp_path / "target", {1: still(CUP)}, size=0.2)
@@ -312,9 +443,10 @@ def test_a_table_alone_is_matched_by_its_places(tmp_path: Path) -> None:
     write_csv(tmp_path / "table.csv", {4: still(CUP), 5: still(CAN)}, "wfar", {4: "mug"})
     target = second(tmp_path / "target", {1: still(CAN), 2: still(shifted(CUP, z=0.01))})
 
-    transfer_labels(tmp_path / "table.csv", target)
+    transfer = transfer_labels(tmp_path / "table.csv", target)
 
     assert labels_of(target) == {1: "", 2: "mug"}
+    assert transfer.by == TABLE_ALONE
 
 
 # ---- the real command

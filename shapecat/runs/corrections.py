@@ -29,6 +29,7 @@ __all__ = [
     "PREVIOUS",
     "TrackLabel",
     "adopt_labels",
+    "find_misread",
     "has_labels",
     "merged_with",
     "merging_with",
@@ -74,8 +75,8 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
     """
     table = read_track_table(path)
     _require_same_run(path, table, path.parent)
-    labels, problems = _resolve(table.rows, categories, one_frame=_one_frame(path.parent))
-    _refuse(path, [*table.problems, *problems])
+    labels, misread = _resolve(table.rows, categories, one_frame=_one_frame(path.parent))
+    _refuse(path, [*table.problems, *_lines(table.rows, misread)])
     return labels
 
 
@@ -111,7 +112,7 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
     result = _relabelled(base, table.rows)
     known_categories = read_run(folder)["model"]["categories"]
     _, misread = _resolve(result.rows, known_categories, one_frame=_one_frame(folder))
-    _refuse(corrected, problems + misread)
+    _refuse(corrected, problems + _lines(result.rows, misread))
     if not original.exists():
         with replacing(original) as path:
             if in_place:
@@ -122,25 +123,55 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
         write_track_table(path, result)
 
 
-def relabel(folder: Path, labels: Mapping[int, str]) -> None:
+def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
     """Give tracks of a run labels; the others keep theirs, and the first table is kept as well.
+
+    Returns
+    -------
+    By track, why a label was not given: it cannot be understood, or contradicts those there.
 
     Raises
     ------
-    OutputError : a label cannot be understood, or the disk is full.
+    OutputError : the table of the run cannot be read or is another run's, or the disk is full.
     """
     current, original = folder / "tracks.csv", folder / ORIGINAL
     base = read_track_table(current)
-    rows = tuple(with_label(row, labels.get(row.track, row.label)) for row in base.rows)
-    _, problems = _resolve(
-        rows, read_run(folder)["model"]["categories"], one_frame=_one_frame(folder)
-    )
-    _refuse(current, problems)
+    _require_same_run(current, base, folder)
+    categories, one_frame = read_run(folder)["model"]["categories"], _one_frame(folder)
+    before = find_misread(base.rows, categories, one_frame=one_frame)
+    _refuse(current, [*base.problems, *_lines(base.rows, before)])
+    rows, refused = _given(base.rows, labels, categories, one_frame=one_frame)
     if not original.exists():
         with replacing(original) as path:
             write_track_table(path, unlabelled(base))
     with replacing(current) as path:
         write_track_table(path, replace(base, rows=rows))
+    return refused
+
+
+def _given(
+    rows: tuple[TrackRow, ...],
+    labels: Mapping[int, str],
+    categories: Iterable[str],
+    *,
+    one_frame: bool,
+) -> tuple[tuple[TrackRow, ...], dict[int, str]]:
+    """Return rows with labels, and why some were not given; one by one if not all can be."""
+    given = _labelled(rows, labels)
+    if not find_misread(given, categories, one_frame=one_frame):
+        return given, {}
+    refused = {}
+    for track in sorted(labels, key=lambda track: merged_with(labels[track]) is not None):
+        given = _labelled(rows, {track: labels[track]})
+        if misread := find_misread(given, categories, one_frame=one_frame):
+            refused[track] = misread.get(track) or next(iter(misread.values()))
+        else:
+            rows = given
+    return rows, refused
+
+
+def _labelled(rows: Iterable[TrackRow], labels: Mapping[int, str]) -> tuple[TrackRow, ...]:
+    return tuple(with_label(row, labels.get(row.track, row.label)) for row in rows)
 
 
 def has_labels(path: Path) -> bool:
@@ -179,26 +210,47 @@ def merging_with(track: int) -> str:
 def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: bool = True) -> None:
     """Refuse a table whose tracks are not those of the run in ``folder``.
 
-    ``known`` is a table that lies in the folder: it need not say whose it is.
+    ``known`` is a table that lies in the folder: it need not say whose it is. One without the
+    column, made by hand, goes by its places, if it has any.
 
     Raises
     ------
     OutputError : it is another run's, of several runs, or of nobody knows which.
     """
     own = read_run(folder).get("work", "") if (folder / "run.json").exists() else ""
-    if not own or set(table.runs) == {own} or (known and not table.runs):
+    if not own or set(table.runs) == {own}:
+        return
+    if not table.runs and (known or _places_agree(table, folder)):
         return
     if len(table.runs) > 1:
         found = f"holds tracks of several runs ({', '.join(table.runs)})"
     elif table.runs:
         found = f"holds the tracks of {_described(path.parent, table.run)}"
     else:
-        found = "does not say of which run its tracks are (no column `run`)"
+        found = "has tracks in other places (and no column `run`)"
     msg = (
         f"{path}: {found}, not those of {_described(folder, own)}; to find the same objects by "
         "their places use --by-place"
     )
     raise OutputError(msg)
+
+
+def _places_agree(table: TrackTable, folder: Path) -> bool:
+    """Return whether no track of a table is elsewhere than that of the run."""
+    own = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
+    return all(
+        _number(row.cells.get(axis)) in {None, _number(own[row.track].cells.get(axis))}
+        for row in table.rows
+        if row.track in own
+        for axis in "xyz"
+    )
+
+
+def _number(cell: str | None) -> float | None:
+    """Return the number in a cell, as a spreadsheet may write it."""
+    with suppress(ValueError, AttributeError):
+        return float((cell or "").strip().replace(",", "."))
+    return None
 
 
 def _described(folder: Path, work: str) -> str:
@@ -238,18 +290,29 @@ def _one_frame(folder: Path) -> bool:
     return (folder / "run.json").exists() and read_run(folder).get("fixed_frame") is not None
 
 
+def find_misread(
+    rows: Sequence[TrackRow], categories: Iterable[str] = (), *, one_frame: bool = True
+) -> dict[int, str]:
+    """Return by track why its label cannot be understood, or contradicts others."""
+    return _resolve(rows, categories, one_frame=one_frame)[1]
+
+
+def _lines(rows: Iterable[TrackRow], misread: Mapping[int, str]) -> list[str]:
+    return [f"line {row.line}: {misread[row.track]}" for row in rows if row.track in misread]
+
+
 def _resolve(
     rows: Sequence[TrackRow], categories: Iterable[str], *, one_frame: bool
-) -> tuple[dict[int, TrackLabel], list[str]]:
-    """Return what each track is shown as, and which lines cannot be understood."""
+) -> tuple[dict[int, TrackLabel], dict[int, str]]:
+    """Return what each track is shown as, and by track why its label cannot be understood."""
     known = {n.lower(): n for n in (UNKNOWN, *CATEGORIES, *categories, *(r.category for r in rows))}
     verdicts: dict[int, _Verdict] = {}
-    problems = []
+    misread = {}
     for row in rows:
         try:
             verdicts[row.track] = _understand(row.label, known) if row.label else row.category
         except ValueError as error:
-            problems.append(f"line {row.line}: {error}")
+            misread[row.track] = str(error)
             verdicts[row.track] = row.category
     by_track = {row.track: row for row in rows}
     labels = {}
@@ -260,13 +323,13 @@ def _resolve(
                 msg = f"track {shown.track} is of another topic, {shown.topic or 'none'}"
                 raise ValueError(msg)  # noqa: TRY301  collected with those of the calls
         except ValueError as error:
-            problems.append(f"line {row.line}: {row.label!r}: {error}")
+            misread[row.track] = f"{row.label!r}: {error}"
             continue
         category = verdicts[shown.track]
         if isinstance(category, str):
             confidence = 1.0 if shown.label else shown.confidence
             labels[row.track] = TrackLabel(shown.track, category, confidence)
-    return labels, problems
+    return labels, misread
 
 
 def _share_a_topic(a: TrackRow, b: TrackRow) -> bool:

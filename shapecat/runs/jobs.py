@@ -11,13 +11,34 @@ from typing import Any
 
 from shapecat import __version__
 from shapecat.config import Settings
-from shapecat.errors import OutputError
-from shapecat.files import input_size
+from shapecat.errors import OutputError, RecordingError
+from shapecat.files import input_size, replacing
 from shapecat.learning import Categorizer
+from shapecat.runs.corrections import PREVIOUS, has_labels
 from shapecat.runs.folder import clear, read_run, write_run
-from shapecat.runs.identity import file_stats, new_id, same_content, unchanged
+from shapecat.runs.identity import (
+    ContentDigest,
+    file_stats,
+    new_id,
+    same_content,
+    unchanged,
+    work_id,
+)
+from shapecat.runs.label_transfer import lost_labels, transfer_labels
+from shapecat.runs.perceived import count_segments
 
-__all__ = ["Job", "Summary", "describe_run", "resume", "same_options", "summarize"]
+__all__ = [
+    "Job",
+    "Summary",
+    "describe_run",
+    "has_work",
+    "identify",
+    "keep_labels",
+    "require_unchanged",
+    "resume",
+    "same_options",
+    "summarize",
+]
 
 _LIBRARIES = ("numpy", "numba", "mcap", "rosbags", "rerun-sdk", "pyarrow")
 
@@ -133,6 +154,49 @@ def resume(
     clear(folder)
     write_run(folder, planned)
     return planned
+
+
+def has_work(folder: Path) -> bool:
+    """Return whether a run that was cut short has got so far that it can be resumed."""
+    with suppress(OutputError):
+        return count_segments(folder) > 0 or "perceive" in read_run(folder)["seconds"]
+    return False
+
+
+def identify(run: dict[str, Any], content: ContentDigest) -> None:
+    """Note the digest of the input, now that it was read, and the name of the work."""
+    run["input"]["digest"] = run["input"]["digest"] or content.result()
+    run["work"] = work_id(run)
+
+
+def require_unchanged(folder: Path, run: Mapping[str, Any], source: Path) -> None:
+    """Discard results that may be of two recordings.
+
+    Raises
+    ------
+    RecordingError : the recording was written to while it was read.
+    """
+    if not unchanged(run["input"]["files"], source):
+        clear(folder)
+        msg = f"{source}: has changed while it was processed; run the same command again"
+        raise RecordingError(msg)
+
+
+def keep_labels(folder: Path, run: dict[str, Any], job: Job) -> None:
+    """Carry the labels that a person gave to the results that are replaced over to the new ones.
+
+    The table they were written into is kept beside the new one.
+    """
+    previous = job.folder / "tracks.csv"
+    if job.discard_labels or not has_labels(previous):
+        return
+    with replacing(folder / PREVIOUS) as path:
+        path.write_bytes(previous.read_bytes())
+    try:
+        transfer = transfer_labels(job.folder, folder)
+    except OutputError as error:
+        transfer = lost_labels(job.folder, str(error))
+    run["corrections"] = transfer.as_dict()
 
 
 def summarize(job: Job, run: Mapping[str, Any], *, fresh: bool = True) -> Summary:

@@ -1,16 +1,29 @@
 """Labels carried from one run to another: to the objects that are where, and when, they were."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from shapecat.runs.corrections import merged_with, merging_with, relabel
+from shapecat.errors import OutputError
+from shapecat.runs.corrections import find_misread, merged_with, merging_with, relabel
 from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.same_objects import Group, Matches, match_in_place, match_in_time
 from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
 
-__all__ = ["Missed", "Transfer", "Transferred", "lost_labels", "match_labels", "transfer_labels"]
+__all__ = [
+    "TABLE_ALONE",
+    "Missed",
+    "Transfer",
+    "Transferred",
+    "lost_labels",
+    "match_labels",
+    "transfer_labels",
+]
+
+IN_TIME, IN_PLACE = "frames in common", "places in another recording"
+TABLE_ALONE = "places in the table alone"
+"""Without the run beside it: neither its fixed frame is known, nor what was moved."""
 
 
 class Transferred(NamedTuple):
@@ -32,16 +45,21 @@ class Missed(NamedTuple):
 
 @dataclass(frozen=True)
 class Transfer:
-    """What became of the labels of another table; ``source`` names its run's work, if known."""
+    """What became of the labels of another table.
+
+    ``source`` names its run's work, if known; ``by`` tells what the objects were found by.
+    """
 
     source: str
     transferred: tuple[Transferred, ...]
     missed: tuple[Missed, ...]
+    by: str = ""
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for run.json."""
         return {
             "from": self.source,
+            "by": self.by,
             "transferred": [item._asdict() for item in self.transferred],
             "not_transferred": [item._asdict() for item in self.missed],
         }
@@ -57,7 +75,8 @@ def lost_labels(source: Path, reason: str) -> Transfer:
 def transfer_labels(source: Path, target: Path) -> Transfer:
     """Give the tracks of a run the labels that the same objects have in another table.
 
-    The labels go into tracks.csv of ``target``, what became of them into its run.json.
+    The labels go into tracks.csv of ``target``, what became of them into its run.json. Where a
+    person has labelled a track of ``target`` otherwise, that label stays.
 
     Parameters
     ----------
@@ -68,12 +87,38 @@ def transfer_labels(source: Path, target: Path) -> Transfer:
     ------
     OutputError : one of them cannot be read, or they have no frame of reference in common.
     """
-    transfer = match_labels(source, target)
-    relabel(target, {item.track: item.label for item in transfer.transferred})
     run = read_run(target)
+    transfer = match_labels(source, target)
+    transfer = _without(transfer, _labelled_otherwise(transfer, target, run))
+    refused = relabel(target, {item.track: item.label for item in transfer.transferred})
+    transfer = _without(transfer, refused)
     run["corrections"] = transfer.as_dict()
     write_run(target, run)
     return transfer
+
+
+def _labelled_otherwise(transfer: Transfer, target: Path, run: Mapping[str, Any]) -> dict[int, str]:
+    """Return the tracks that a person has given another label; an earlier transfer has no say."""
+    earlier = {
+        (item["track"], item["label"]) for item in run.get("corrections", {}).get("transferred", ())
+    }
+    own = {row.track: row.label for row in read_track_table(target / "tracks.csv").rows}
+    return {
+        item.track: f"track {item.track} is labelled {own[item.track]} already"
+        for item in transfer.transferred
+        if own[item.track] not in ("", item.label) and (item.track, own[item.track]) not in earlier
+    }
+
+
+def _without(transfer: Transfer, reasons: Mapping[int, str]) -> Transfer:
+    """Return a transfer without the labels of some tracks, told as missed."""
+    kept = tuple(item for item in transfer.transferred if item.track not in reasons)
+    missed = (
+        Missed(item.old_track, item.label, reasons[item.track])
+        for item in transfer.transferred
+        if item.track in reasons
+    )
+    return replace(transfer, transferred=kept, missed=(*transfer.missed, *missed))
 
 
 def match_labels(source: Path, target: Path) -> Transfer:
@@ -85,16 +130,39 @@ def match_labels(source: Path, target: Path) -> Transfer:
     """
     path = source / "tracks.csv" if source.is_dir() else source
     table = read_track_table(path)
-    labelled = [row for row in table.rows if row.label]
+    _require_whole(path, table)
     folder = path.parent if _is_in_its_run(path, table) else None
+    categories = read_run(folder)["model"]["categories"] if folder is not None else ()
+    misread = find_misread(table.rows, categories)
+    labelled = [row for row in table.rows if row.label and row.track not in misread]
+    wrong = tuple(
+        Missed(r.track, r.label, misread[r.track]) for r in table.rows if r.track in misread
+    )
     if not labelled:
-        return Transfer(table.run, (), ())
+        return Transfer(table.run, (), wrong)
     group = _groups(labelled)
     if folder is not None and _same_recording(read_run(folder), read_run(target)):
-        matches = match_in_time(folder, target, group)
+        by, matches = IN_TIME, match_in_time(folder, target, group)
     else:
+        by = TABLE_ALONE if folder is None else IN_PLACE
         matches = match_in_place(table.rows, folder, target, group)
-    return _translate(table.run, labelled, matches)
+    transferred, missed = _translate(labelled, group, matches)
+    return Transfer(table.run, transferred, (*wrong, *missed), by)
+
+
+def _require_whole(path: Path, table: TrackTable) -> None:
+    """Refuse a table with lines that cannot be read, or of several runs.
+
+    Raises
+    ------
+    OutputError : it is such a table.
+    """
+    if table.problems:
+        msg = f"{path}: {table.problems[0]}"
+        raise OutputError(msg)
+    if len(table.runs) > 1:
+        msg = f"{path}: holds tracks of several runs ({', '.join(table.runs)}); take one at a time"
+        raise OutputError(msg)
 
 
 def _is_in_its_run(path: Path, table: TrackTable) -> bool:
@@ -126,36 +194,35 @@ def _same_recording(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
     return bool(digests[0]) and digests[0] == digests[1] and a["fixed_frame"] == b["fixed_frame"]
 
 
-def _translate(work: str, labelled: Sequence[TrackRow], matches: Matches) -> Transfer:
-    """Give labels to the tracks of the target; what a merge refers to is translated as well."""
+def _translate(
+    labelled: Sequence[TrackRow], group: Group, matches: Matches
+) -> tuple[tuple[Transferred, ...], tuple[Missed, ...]]:
+    """Give labels to the tracks of the target; parts are merged with what the whole is there.
+
+    The whole is the track that others were merged with: it alone says what they all are.
+    """
     given: dict[int, Transferred] = {}
     missed = []
-    for row in labelled:
-        if row.track not in matches.found and merged_with(row.label) in matches.found:
-            continue  # the part is not found on its own, the whole is
-        label, reason = _label_there(row, matches)
-        for match in matches.found.get(row.track, ()) if not reason else ():
-            other = given.get(match.track)
-            if label and label == merging_with(match.track):
-                continue  # the target has made one track of the two
-            if other is not None and other.label != label:
-                reason = f"track {match.track} is also track {other.old_track}, a {other.label}"
-                continue
-            given[match.track] = Transferred(row.track, match.track, label, match.distance_m)
-        if reason:
-            missed.append(Missed(row.track, row.label, reason))
-    return Transfer(work, tuple(given.values()), tuple(missed))
+    for row in sorted(labelled, key=lambda row: group(row.track) != row.track):
+        whole = group(row.track)
+        there = matches.found.get(row.track, ())
+        if whole not in matches.found:
+            missed.append(Missed(row.track, row.label, _why(row.track, whole, matches)))
+        elif whole == row.track:
+            given |= {
+                m.track: Transferred(row.track, m.track, row.label, m.distance_m) for m in there
+            }
+        else:
+            first, *others = (match.track for match in matches.found[whole])
+            for match in there:  # none, if the part is not found on its own
+                if match.track not in (first, *others):
+                    label = merging_with(first)
+                    item = Transferred(row.track, match.track, label, match.distance_m)
+                    given.setdefault(match.track, item)
+    return tuple(given.values()), tuple(missed)
 
 
-def _label_there(row: TrackRow, matches: Matches) -> tuple[str, str]:
-    """Return the label a row's object has in the target, or why it has none."""
-    if row.track not in matches.found:
-        return "", matches.reasons.get(row.track, "nothing was found there")
-    partner = merged_with(row.label)
-    if partner is None:
-        return row.label, ""
-    there = matches.found.get(partner)
-    if not there:
-        reason = matches.reasons.get(partner, "nothing was found there")
-        return "", f"track {partner}, which it is merged with: {reason}"
-    return merging_with(there[0].track), ""
+def _why(track: int, whole: int, matches: Matches) -> str:
+    """Return why the whole that a track is part of has no match."""
+    reason = matches.reasons.get(whole, "nothing was found there")
+    return reason if track == whole else f"track {whole}, which it is merged with: {reason}"

@@ -22,7 +22,7 @@ from shapecat.runs.track_table import TrackRow
 
 __all__ = ["Group", "Match", "Matches", "match_in_place", "match_in_time"]
 
-_GATE_M = 0.10
+_MOST_REACH_M = 0.10
 """Detections of one object in one frame are no farther apart, however they were segmented."""
 _MAJORITY = 0.6
 """Share of the common frames in which two tracks are each other's nearest."""
@@ -99,13 +99,15 @@ def match_in_time(source: Path, target: Path, group: Group) -> Matches:
     group : says of which object a track of the source is: tracks that were merged are one.
     """
     old, new = _read_tracks(source), _read_tracks(target)
+    old_widths, new_widths = _widths(source, old), _widths(target, new)
     votes: Counter[tuple[int, int]] = Counter()
     apart: defaultdict[tuple[int, int], float] = defaultdict(float)
     seen: Counter[int] = Counter()
     for key in old.keys.keys() & new.keys.keys():
         here, there = old.keys[key], new.keys[key]
         seen.update(new.tracks[there].tolist())
-        for a, b, distance in _mutual_nearest(old.centers[here], new.centers[there]):
+        reach = _reach_at_once(old_widths[here], new_widths[there])
+        for a, b, distance in _mutual_nearest(old.centers[here], new.centers[there], reach):
             pair = int(old.tracks[here][a]), int(new.tracks[there][b])
             votes[pair] += 1
             apart[pair] += distance
@@ -138,12 +140,30 @@ def _by_majority(
     return Matches(found, reasons)
 
 
-def _mutual_nearest(a: F8, b: F8) -> Iterator[tuple[int, int, float]]:
-    """Yield the indices of points (n, 3) and (m, 3) that are each other's nearest, and how near."""
+def _widths(folder: Path, seen: _Tracks) -> F8:
+    """Return the width of each row's track (n,), metres."""
+    extents = _extents(folder, seen)
+    return np.array([extents[track][0] for track in seen.tracks.tolist()])
+
+
+def _reach_at_once(a: F8, b: F8) -> F8:
+    """Return how near (n, m) things of some widths are to each other only if they are the same.
+
+    Two that stand side by side are farther apart than half of their mean width.
+    """
+    mean = (a[:, None] + b[None]) / 2
+    return np.clip(_REACH * mean, _LEAST_REACH_M, _MOST_REACH_M)
+
+
+def _mutual_nearest(a: F8, b: F8, reach: F8) -> Iterator[tuple[int, int, float]]:
+    """Yield the indices of points (n, 3) and (m, 3) that are each other's nearest, and how near.
+
+    ``reach`` (n, m) says how near they must be.
+    """
     apart = np.linalg.norm(a[:, None] - b[None], axis=2)
     nearest = apart.argmin(axis=1)
     for k, j in enumerate(nearest.tolist()):
-        if apart[k, j] <= _GATE_M and int(apart[:, j].argmin()) == k:
+        if apart[k, j] <= reach[k, j] and int(apart[:, j].argmin()) == k:
             yield k, j, float(apart[k, j])
 
 

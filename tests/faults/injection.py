@@ -54,6 +54,11 @@ class Ended:
         return found
 
 
+def _heed_interrupts() -> None:
+    """Do not inherit that a shell lets its background jobs ignore them."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
 class Running:
     """A command in a session of its own whose stderr is read as it comes."""
 
@@ -67,6 +72,7 @@ class Running:
             text=True,
             errors="replace",
             start_new_session=True,
+            preexec_fn=_heed_interrupts,  # noqa: PLW1509  there is no other way
             env={**os.environ, **(environment or {})},
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
@@ -74,8 +80,9 @@ class Running:
 
     def _read(self) -> None:
         assert self.process.stderr is not None
-        for line in self.process.stderr:
-            self.lines.append((time.monotonic() - self.begun, line))
+        with self.process.stderr as stream:
+            for line in stream:
+                self.lines.append((time.monotonic() - self.begun, line))
 
     def wait_until(self, moment: float) -> bool:
         """Wait for a moment after the start; tell whether the command still runs then."""

@@ -1,0 +1,140 @@
+"""Adjacency: what segments meet along their outlines: each other, planes, and what hides them."""
+
+import math
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4, U1
+from shapecat.detection.merging.segments import (
+    UPWARD,
+    Segments,
+    choose_samples,
+)
+from shapecat.detection.planes.height_map import HeightMap
+from shapecat.detection.segmentation.connectivity import DOWN, RIGHT, SurfaceGraph
+from shapecat.geometry import DISCONTINUITY
+from shapecat.jit import kernel
+
+__all__ = ["measure_adjacency"]
+
+GAP, SHADOW = 3, 15
+"""Cells without a reading between two that are neighbours: of one surface, and of two, where the
+nearer one keeps the light of the projector from the other."""
+INWARD = 3
+"""Cells from a border to where it is known which way the surface faces."""
+DOWNWARD = 0.7
+"""Cosine of the largest angle, in the image, of a neighbour below to straight down."""
+
+
+@kernel
+def measure_adjacency(
+    inv_depth: F4, heights: HeightMap, graph: SurfaceGraph, labels: I4, up: F8, segments: Segments
+) -> None:
+    """Collect what segments meet, and their samples: what `measure_segments` leaves out."""
+    rows, columns = inv_depth.shape
+    plane_id, links, statistics = heights.plane_id, graph.links, segments.statistics
+    change, met = np.zeros(columns, np.uint8), np.zeros((2 * columns, 6), np.int32)
+    for i in range(rows):
+        if not _find_changes(links[i], labels[i], labels[min(i + 1, rows - 1)], change):
+            continue
+        n = 0
+        for j in range(columns):
+            p = labels[i, j]
+            if change[j] == 0 or inv_depth[i, j] <= 0 or (p == 0 and plane_id[i, j] > 0):
+                continue
+            for down in range(2):  # the neighbour on the right, the one below
+                y, x = i + down, j + 1 - down
+                if y >= rows or x >= columns:
+                    continue
+                link = links[i, j] & (DOWN if down else RIGHT)
+                if labels[y, x] == p and (p == 0 or link):
+                    continue
+                gap = 0
+                while gap <= SHADOW and y < rows and x < columns:
+                    if inv_depth[y, x] > 0 and not (labels[y, x] == 0 and plane_id[y, x] > 0):
+                        break
+                    gap, y, x = gap + 1, y + down, x + 1 - down
+                beyond = y >= rows or x >= columns
+                q = 0 if beyond else labels[y, x]
+                ends = gap == 0 or p != q  # else the segment goes on behind the gap
+                statistics[p].boundary += (p > 0) & ends
+                if beyond or gap > SHADOW:
+                    continue
+                statistics[q].boundary += (q > 0) & ends
+                if p != q:
+                    met[n, 0], met[n, 1], met[n, 2], met[n, 3] = j, y, x, down
+                    met[n, 4], met[n, 5] = gap, 0 if gap > 0 else link
+                    n += 1
+        _count(inv_depth, heights, graph.normal, labels, up, i, met[:n], segments)
+    choose_samples(graph, labels, segments)
+
+
+@kernel
+def _find_changes(links: U1, here: I4, below: I4, change: U1) -> bool:
+    """Mark the cells of a row from which a segment does not just go on to the right and down.
+
+    Returns whether there are any.
+    """
+    for j in range(here.size):
+        change[j] = (here[j] != below[j]) | ((here[j] > 0) & (links[j] != RIGHT | DOWN))
+    for j in range(here.size - 1):
+        change[j] |= here[j] != here[j + 1]
+    some = False
+    for j in range(here.size):
+        some |= change[j] != 0
+    return some
+
+
+@kernel
+def _count(
+    inv_depth: F4,
+    heights: HeightMap,
+    normal: F4,
+    labels: I4,
+    up: F8,
+    row: int,
+    met: I4,
+    segments: Segments,
+) -> None:
+    """Count for the segments at the two cells of each meeting what each has at the other.
+
+    Parameters
+    ----------
+    met : (n, 6) column of the first cell, row and column of the second; 1 if it is the neighbour
+        below; cells without a reading between; and not 0 if the surface goes on.
+    """
+    plane_id, height = heights.plane_id, heights.height
+    statistics, pairs = segments.statistics, segments.pairs
+    steep = DOWNWARD * math.hypot(up[0], up[1])
+    for m in range(2 * met.shape[0]):
+        i, j, y, x = row, met[m // 2, 0], met[m // 2, 1], met[m // 2, 2]
+        fall = -up[met[m // 2, 3]]  # how much lower (y, x) is seen, however the image is turned
+        gap, link = met[m // 2, 4], met[m // 2, 5]
+        if m % 2 == 1:
+            i, j, y, x, fall = y, x, row, met[m // 2, 0], -fall
+        p, q = labels[i, j], labels[y, x]
+        if p == 0:
+            continue
+        ahead = inv_depth[i, j] - inv_depth[y, x]
+        statistics[p].upper_silhouette += fall > steep and ahead > DISCONTINUITY
+        if q == 0:
+            if ahead < -DISCONTINUITY:
+                statistics[p].hidden += 1
+            elif ahead < DISCONTINUITY and plane_id[y, x] < 0 and gap <= GAP:
+                if plane_id[y, x] == -plane_id[i, j]:
+                    statistics[p].plane_contact += 1
+                else:
+                    statistics[p].shelf_edge += 1
+        elif link:
+            pairs[p, q].contact += 1
+            # Whether the segment at (y, x) faces up a little further in.
+            v = min(max(i + INWARD * (y - i), 0), labels.shape[0] - 1)
+            u = min(max(j + INWARD * (x - j), 0), labels.shape[1] - 1)
+            facing = normal[v, 0, u] * up[0] + normal[v, 1, u] * up[1] + normal[v, 2, u] * up[2]
+            if labels[v, u] == q and facing > UPWARD:
+                pairs[p, q].rests_on += 1
+                pairs[p, q].rests_on_height += height[v, u]
+        elif ahead >= DISCONTINUITY:
+            pairs[p, q].in_front += 1
+        elif ahead > -DISCONTINUITY and gap <= GAP:
+            pairs[p, q].near += 1

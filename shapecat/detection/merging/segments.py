@@ -1,0 +1,333 @@
+"""Segments: the statistics of each segment, and of each pair of segments (from `adjacency`)."""
+
+import math
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from shapecat.arrays import F4, F8, I4
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.planes.height_map import HeightMap
+from shapecat.detection.segmentation.connectivity import SurfaceGraph
+from shapecat.geometry import level_axes
+from shapecat.jit import kernel
+
+__all__ = [
+    "BAND_M",
+    "FEW",
+    "PAIR",
+    "SAMPLES",
+    "SEGMENT",
+    "UPWARD",
+    "Records",
+    "Row",
+    "Segments",
+    "add_statistics",
+    "choose_samples",
+    "depth_of",
+    "depths_of",
+    "is_root",
+    "lateral_axis",
+    "may_merge",
+    "measure_segments",
+    "merge",
+]
+
+SEGMENT = np.dtype(
+    [
+        ("count", "f4"),  # cells
+        ("boundary", "f4"),  # sides of cells on the boundary
+        ("left", "f4"),  # lateral range, metres
+        ("right", "f4"),
+        ("bottom", "f4"),  # range of heights above the plane, metres
+        ("top", "f4"),
+        ("area", "f4"),  # of the surface seen, m2
+        ("depth_sum", "f4"),
+        ("fitted", "f4"),  # cells with a local plane, over which the next five are sums:
+        ("x_sum", "f4"),  # lateral position
+        ("xx_sum", "f4"),
+        ("normal_x_sum", "f4"),  # lateral part of the normal
+        ("normal_xx_sum", "f4"),
+        ("x_normal_x_sum", "f4"),
+        ("plane_contact", "f4"),  # links with its plane
+        ("hidden", "f4"),  # boundary behind what is of no segment
+        ("shelf_edge", "f4"),  # links with a higher plane, from below
+        ("upper_silhouette", "f4"),  # places where it ends above what is farther away
+    ]
+)
+"""The statistics of a segment."""
+PAIR = np.dtype(
+    [
+        ("contact", "f4"),  # linked neighbours
+        ("in_front", "f4"),  # places where the first is in front of the second
+        ("near", "f4"),  # neighbours of equal depth over a gap
+        ("rests_on", "f4"),  # links whose far side, on the second, faces up
+        ("rests_on_height", "f4"),  # the sum of the heights there
+    ]
+)
+"""What two segments have in common."""
+Records: TypeAlias = NDArray[np.void]
+"""An array of `SEGMENT` or `PAIR`."""
+Row: TypeAlias = Any
+"""One of its records."""
+FEW = 3
+"""Links between two segments that are taken for a contact rather than for noise."""
+SAMPLES = 48
+"""Most cells, evenly spaced, that stand for a segment where to look at all would take too long."""
+BAND_M, BANDS = 0.005, 128
+"""Height of a band, and their number; what is higher counts in the last one."""
+UPWARD = 0.8
+"""Cosine of the largest angle to up of the normal of what faces up."""
+
+
+class Segments(NamedTuple):
+    """Statistics of n segments, row 0 is no segment; all but the samples add up in a merge.
+
+    Attributes
+    ----------
+    pairs : (n + 1, n + 1) of `PAIR`.
+    statistics : (n + 1,) of `SEGMENT`.
+    top_area : (n + 1, BANDS) float32 m2 of surface that faces up, by height.
+    samples : (n + 1, SAMPLES) int32 cells away from edges, -1 beyond the last.
+    plane_id : (n + 1,) int8 the plane it is above, as in `HeightMap.plane_id`.
+    parent : (n + 1,) int16 the segment it has been merged into.
+    """
+
+    pairs: Records
+    statistics: Records
+    top_area: F4
+    samples: I4
+    plane_id: I4
+    parent: I4
+
+
+@kernel
+def measure_segments(
+    grid: DepthGrid, heights: HeightMap, graph: SurfaceGraph, labels: I4, n: int, up: F8
+) -> Segments:
+    """Collect the shapes of segments 1..n; `measure_adjacency` adds what they meet."""
+    segments: Segments = _blank(n + 1)
+    _measure(
+        grid.inverse_depth,
+        grid.intrinsics,
+        heights,
+        graph,
+        labels,
+        up,
+        lateral_axis(up),
+        segments,
+    )
+    return segments
+
+
+@kernel
+def _blank(size: int) -> Segments:
+    """Return segments without any cell."""
+    segments = Segments(
+        np.zeros((size, size), PAIR),
+        np.zeros(size, SEGMENT),
+        np.zeros((size, BANDS), np.float32),
+        np.full((size, SAMPLES), -1, np.int32),
+        np.zeros(size, np.int8),
+        np.arange(size).astype(np.int16),
+    )
+    for p in range(size):
+        row = segments.statistics[p]
+        row.left, row.right, row.bottom, row.top = 1e9, -1e9, 1e9, -1e9
+    return segments
+
+
+@kernel
+def lateral_axis(up: F8) -> F8:
+    """Return the horizontal direction across the view, (3,) unit."""
+    across = math.hypot(up[0], up[1])
+    if across < 0.2:  # the camera looks straight down
+        return np.array(level_axes(up[0], up[1], up[2])[0])
+    return np.array([up[1] / across, -up[0] / across, 0.0])
+
+
+@kernel
+def _measure(
+    inv_depth: F4,
+    intrinsics: PinholeIntrinsics,
+    heights: HeightMap,
+    graph: SurfaceGraph,
+    labels: I4,
+    up: F8,
+    side: F8,
+    segments: Segments,
+) -> None:
+    """Add up the cells of the labels; label 0 is none."""
+    plane_ids, top_area = segments.plane_id, segments.top_area
+    plane_id, height = heights.plane_id, heights.height
+    zero, one, far_off = np.float32(0), np.float32(1), np.float32(np.inf)
+    per_x, per_y = np.float32(1 / intrinsics.fx), np.float32(1 / intrinsics.fy)
+    cx, cy, edge_on = np.float32(intrinsics.cx), np.float32(intrinsics.cy), np.float32(0.2)
+    sx, sy, sz = np.float32(side[0]), np.float32(side[1]), np.float32(side[2])
+    ux, uy, uz = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])
+    local_plane, normal, spans = graph.local_plane, graph.normal, graph.spans
+    for i in range(inv_depth.shape[0]):
+        j, end = spans[i]
+        while j < end:
+            p, first = labels[i, j], j
+            if p == 0:
+                j += 1
+                continue
+            # Sums over the cells of one segment that follow each other.
+            far = fitted = sides = sides2 = turns = turns2 = both = areas = zero
+            left, right, bottom, top = far_off, -far_off, far_off, -far_off
+            while j < end and labels[i, j] == p:
+                z = one / inv_depth[i, j]
+                x, y = (np.float32(j) - cx) * per_x * z, (np.float32(i) - cy) * per_y * z
+                along = x * sx + y * sy + z * sz
+                h = height[i, j]
+                far += z
+                left, right = min(left, along), max(right, along)
+                bottom, top = min(bottom, h), max(top, h)
+                if local_plane[i, 0, j] > 0:
+                    nx, ny, nz = normal[i, 0, j], normal[i, 1, j], normal[i, 2, j]
+                    turn = nx * sx + ny * sy + nz * sz
+                    fitted += one
+                    sides += along
+                    sides2 += along * along
+                    turns += turn
+                    turns2 += turn * turn
+                    both += along * turn
+                    facing = -(nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
+                    area = z * z * per_x * per_y / max(facing, edge_on)
+                    areas += area
+                    if nx * ux + ny * uy + nz * uz > np.float32(UPWARD):
+                        band = min(max(int(h / np.float32(BAND_M)), 0), BANDS - 1)
+                        top_area[p, band] += area
+                j += 1
+            plane_ids[p] = plane_id[i, first]
+            row = segments.statistics[p]
+            row.count += j - first
+            row.depth_sum += far
+            row.left, row.right = min(row.left, left), max(row.right, right)
+            row.top, row.bottom = max(row.top, top), min(row.bottom, bottom)
+            row.fitted += fitted
+            row.x_sum += sides
+            row.xx_sum += sides2
+            row.normal_x_sum += turns
+            row.normal_xx_sum += turns2
+            row.x_normal_x_sum += both
+            row.area += areas
+
+
+@kernel
+def choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None:
+    """Choose evenly spaced cells of each segment away from edges."""
+    rows, columns = labels.shape
+    spans, local_plane, concavity, samples = (
+        graph.spans,
+        graph.local_plane,
+        graph.concavity,
+        segments.samples,
+    )
+    n = segments.parent.size
+    stride, wait, taken = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
+    for p in range(n):
+        stride[p] = wait[p] = max(int(segments.statistics[p].count) // SAMPLES, 1)
+    for i in range(rows):
+        for j in range(spans[i, 0], spans[i, 1]):
+            p = labels[i, j]
+            if p == 0 or concavity[i, j] > 20 or not local_plane[i, 0, j] > 0:
+                continue
+            wait[p] -= 1
+            if wait[p] == 0 and taken[p] < SAMPLES:
+                samples[p, taken[p]] = i * columns + j
+                taken[p] += 1
+                wait[p] = stride[p]
+
+
+@kernel
+def merge(segments: Segments, p: int, q: int) -> None:
+    """Add segment ``q`` to segment ``p``; both are groups of their own before."""
+    n = segments.parent.size
+    pairs = segments.pairs
+    for k in range(n):
+        _add_pair(pairs[p, k], pairs[q, k])
+    for k in range(n):
+        _add_pair(pairs[k, p], pairs[k, q])
+    pairs[p, p] = np.zeros(1, PAIR)[0]
+    for band in range(BANDS):
+        segments.top_area[p, band] += segments.top_area[q, band]
+    add_statistics(segments.statistics[p], segments.statistics[q])
+    # Half of the samples from each side.
+    first, second = segments.samples[p].copy(), segments.samples[q].copy()
+    mixed = 0
+    for k in range(SAMPLES):
+        for source in (first, second):
+            if source[k] >= 0 and mixed < SAMPLES:
+                segments.samples[p, mixed] = source[k]
+                mixed += 1
+    for k in range(n):
+        if segments.parent[k] == q:
+            segments.parent[k] = p
+
+
+@kernel
+def _add_pair(a: Row, b: Row) -> None:
+    """Add a `PAIR` to another, and clear it."""
+    a.contact += b.contact
+    a.in_front += b.in_front
+    a.near += b.near
+    a.rests_on += b.rests_on
+    a.rests_on_height += b.rests_on_height
+    b.contact = b.in_front = b.near = b.rests_on = b.rests_on_height = 0.0
+
+
+@kernel
+def add_statistics(a: Row, b: Row) -> None:
+    """Add a `SEGMENT` to another."""
+    a.count += b.count
+    a.boundary += b.boundary
+    a.left, a.right = min(a.left, b.left), max(a.right, b.right)
+    a.bottom, a.top = min(a.bottom, b.bottom), max(a.top, b.top)
+    a.area += b.area
+    a.depth_sum += b.depth_sum
+    a.fitted += b.fitted
+    a.x_sum += b.x_sum
+    a.xx_sum += b.xx_sum
+    a.normal_x_sum += b.normal_x_sum
+    a.normal_xx_sum += b.normal_xx_sum
+    a.x_normal_x_sum += b.x_normal_x_sum
+    a.plane_contact += b.plane_contact
+    a.hidden += b.hidden
+    a.shelf_edge += b.shelf_edge
+    a.upper_silhouette += b.upper_silhouette
+
+
+@kernel
+def depth_of(segments: Segments, p: int) -> float:
+    """Return the mean depth of a segment, metres; 1 where it has no cell."""
+    count = segments.statistics[p].count
+    return float(segments.statistics[p].depth_sum / count) if count > 0 else 1.0
+
+
+@kernel
+def depths_of(segments: Segments) -> F4:
+    """Return `depth_of` all segments."""
+    depths = np.zeros(segments.parent.size, np.float32)
+    for p in range(depths.size):
+        depths[p] = depth_of(segments, p)
+    return depths
+
+
+@kernel
+def is_root(segments: Segments, p: int) -> bool:
+    """Whether a segment has not been merged into another."""
+    return bool(segments.parent[p] == p)
+
+
+@kernel
+def may_merge(segments: Segments, p: int, q: int) -> bool:
+    """Whether two segments stand above one plane, and neither has been merged into another."""
+    return bool(
+        p != q
+        and is_root(segments, p)
+        and is_root(segments, q)
+        and segments.plane_id[p] == segments.plane_id[q]
+    )

@@ -1,0 +1,70 @@
+"""Occluded points: what one view does not see of a cloud fused from several.
+
+The rules work on the surface that the virtual camera sees. Points behind it belong to the object
+whose points they touch; what touches none is clustered by distance alone (thesis Alg. 2).
+"""
+
+import numpy as np
+
+from shapecat.arrays import F4, I4
+from shapecat.jit import kernel
+
+__all__ = ["label_occluded_points"]
+
+VOXEL_M = 0.01
+
+
+def label_occluded_points(points: F4, labels: I4, first_new: int) -> I4:
+    """Complete the labels of ``points`` (n, 3), metres, any frame.
+
+    Parameters
+    ----------
+    labels : (n,) 1, 2, ... the known object; 0 to be found.
+    first_new : the label of the first cluster that touches no known object.
+
+    Returns
+    -------
+    (n,) labels, none of them 0. Points in voxels of 1 cm that touch, also by a corner, are
+    connected; in order of distance from the known, in steps of one voxel.
+    """
+    cell = np.floor((points - points.min(axis=0)) / VOXEL_M).astype(np.int64) + 1
+    _, ny, nz = cell.max(axis=0) + 2
+    keys, voxel = np.unique((cell[:, 0] * ny + cell[:, 1]) * nz + cell[:, 2], return_inverse=True)
+    known = np.zeros(keys.size, np.int64)
+    np.maximum.at(known, voxel, labels)
+    _spread(keys, int(ny), int(nz), known, first_new)
+    return np.where(labels > 0, labels, known[voxel])
+
+
+@kernel
+def _spread(keys: I4, ny: int, nz: int, known: I4, fresh: int) -> None:
+    queue = np.zeros(keys.size, np.int64)
+    done = top = 0
+    for k in range(keys.size):
+        if known[k] > 0:
+            queue[top] = k
+            top += 1
+    seed = 0
+    while True:
+        while done < top:
+            k = queue[done]
+            done += 1
+            for dx in range(-1, 2):
+                for dy in range(-1, 2):
+                    # The three voxels of a column are neighbours in the sorted keys.
+                    at = keys[k] + (dx * ny + dy) * nz - 1
+                    q = np.searchsorted(keys, at)
+                    while q < keys.size and keys[q] <= at + 2:
+                        if known[q] == 0:
+                            known[q] = known[k]
+                            queue[top] = q
+                            top += 1
+                        q += 1
+        while seed < keys.size and known[seed] > 0:
+            seed += 1
+        if seed == keys.size:
+            return
+        known[seed] = fresh
+        fresh += 1
+        queue[top] = seed
+        top += 1

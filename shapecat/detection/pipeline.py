@@ -1,0 +1,315 @@
+"""Detection on one page: from a frame to supporting planes and objects (thesis ch. 4).
+
+1. The depth image is downsampled to samples of inverse depth; a cloud is looked at through a
+   virtual camera first (`depth_grid`, `virtual_camera`).
+2. `planes`: the up direction; multi-plane RANSAC (Fischler and Bolles 1981); which of the planes
+   bear objects; how high every sample is above one (thesis Alg. 1 and 2).
+3. `foreground`: low-profile objects, walls, and what reaches over the edge of its plane.
+4. `segmentation`: surfaces are parted at depth discontinuities and concave edges (local convexity,
+   Stein et al. 2014) by a watershed (Meyer 1991), and where a stack changes its width.
+5. `merging`: relations between surface patches, learned (Richtsfeld et al. 2012, 2014), tell which
+   segments are of one object; others go on behind what is in front of them.
+6. `cleanup`: background structure and noise are rejected, holes are filled.
+7. `output`: boxes, what stands on what, labels at full resolution, the scene.
+
+The thesis stops at objects that do not touch: steps 4 and 5 go beyond it.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.config import DetectionSettings
+from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
+from shapecat.detection.cleanup.structure import LabelledGrid, Limits, is_background
+from shapecat.detection.depth_grid import DepthGrid, downsample
+from shapecat.detection.foreground.low_profile import find_low_profile
+from shapecat.detection.foreground.overhang import extend_overhang
+from shapecat.detection.foreground.walls import remove_walls
+from shapecat.detection.merging.across_occlusion import merge_across_occluder
+from shapecat.detection.merging.adjacency import measure_adjacency
+from shapecat.detection.merging.learned import load_trees, merge_learned
+from shapecat.detection.merging.low_profile import merge_low_profile
+from shapecat.detection.merging.pair_features import ViewGeometry
+from shapecat.detection.merging.segments import measure_segments
+from shapecat.detection.output.label_upsampling import label_pixels, label_points
+from shapecat.detection.output.measurements import measure_objects
+from shapecat.detection.output.scene import build_scene
+from shapecat.detection.planes import NO_HINT, find_supporting_planes
+from shapecat.detection.planes.height_map import measure_heights
+from shapecat.detection.planes.ransac import draw_trials
+from shapecat.detection.records import OverSegmentation, PlaneModel, Segmentation
+from shapecat.detection.segmentation.connectivity import connect_surfaces
+from shapecat.detection.segmentation.watershed import relabel, watershed
+from shapecat.detection.segmentation.width_split import split_at_width_changes
+from shapecat.detection.virtual_camera import VirtualImage, top_view, virtual_image
+from shapecat.geometry import IDENTITY, inverse
+from shapecat.types import Camera, Frame, Scene
+
+__all__ = ["ALL_STEPS", "Steps", "detect", "label", "oversegment"]
+
+
+class Steps(NamedTuple):
+    """Which of the steps beyond the thesis are taken, to measure what each is worth.
+
+    Without any of them what remains is the plane, the height above it, and depth discontinuities.
+    """
+
+    low_profile: bool = True
+    concavity: bool = True
+    width_split: bool = True
+    learned_merging: bool = True
+    across_occlusion: bool = True
+    contact_boundary: bool = True
+    hole_filling: bool = True
+
+
+ALL_STEPS = Steps()
+DEFAULT_UP = (0.0, -1.0, 0.0)
+"""Up in an upright optical frame, where nothing else is known."""
+CROWDED = 0.08
+"""Share of points behind others from which a cloud is taken for fused from several views."""
+
+
+def detect(
+    frame: Frame,
+    *,
+    up: ArrayLike | None = None,
+    settings: DetectionSettings,
+    rng: np.random.Generator,
+    steps: Steps = ALL_STEPS,
+) -> Scene:
+    """Find the supporting planes of a frame and the objects on them.
+
+    Parameters
+    ----------
+    frame : a depth image or a cloud. The sensor is at the origin of its frame.
+    up : (3,) direction away from gravity, sensor frame, of any length but zero. With it only
+        planes within 15 degrees of level count; without, it is estimated from the dominant plane.
+    settings : see `DetectionSettings`.
+    rng : source of what RANSAC tries; the same state gives the same scene.
+    steps : which steps are taken, for measuring what one is worth.
+
+    Returns
+    -------
+    The planes, lowest first, and the objects in the order of their first point; both empty if no
+    supporting plane is seen.
+
+    Raises
+    ------
+    ValueError : ``up`` is not a direction.
+
+    Notes
+    -----
+    Depth images are worked on in image space. A cloud is looked at through a virtual camera at
+    its origin and goes the same way, so both give the same answer on the same scene. A cloud that
+    was not taken from its origin is looked at from above its dominant plane; the points of a
+    fused cloud that are hidden in the view join what they touch.
+    """
+    hint = None if up is None else _unit(up)
+    if frame.depth is not None and frame.camera is not None:
+        scene = _in_image(frame.depth, frame.camera, hint, settings, rng, steps)
+    else:
+        scene = _in_cloud(frame.xyz(), hint, settings, rng, steps)
+    return scene or Scene(np.array(DEFAULT_UP) if hint is None else hint, (), ())
+
+
+def _unit(up: ArrayLike) -> F8:
+    vector = np.asarray(up, np.float64)
+    norm = float(np.linalg.norm(vector))
+    if vector.shape != (3,) or not (np.isfinite(norm) and norm > 1e-9):
+        msg = f"up must be a direction (3,), got {vector.tolist()}"
+        raise ValueError(msg)
+    return vector / norm
+
+
+def _in_image(
+    depth: F4,
+    camera: Camera,
+    hint: F8 | None,
+    settings: DetectionSettings,
+    rng: np.random.Generator,
+    steps: Steps,
+) -> Scene | None:
+    grid = downsample(depth, camera, range_m=settings.max_range_m)
+    found = None if grid is None else label(grid, hint, settings=settings, rng=rng, steps=steps)
+    if grid is None or found is None:
+        return None
+    indices = label_pixels(depth, grid, found, range_m=settings.max_range_m)
+    return build_scene(grid, found, indices, IDENTITY, settings=settings)
+
+
+def _in_cloud(
+    points: F4,
+    hint: F8 | None,
+    settings: DetectionSettings,
+    rng: np.random.Generator,
+    steps: Steps,
+) -> Scene | None:
+    view = virtual_image(points, range_m=settings.max_range_m)
+    found = None if view is None else _seen(view, hint, settings, rng, steps)
+    if found is None:
+        view = top_view(points, hint, range_m=settings.max_range_m, rng=rng)
+        found = None if view is None else _seen(view, hint, settings, rng, steps)
+    if view is None or found is None:
+        return None
+    indices = label_points(view, found, fused=view.crowded > CROWDED)
+    return build_scene(
+        view.grid, found, indices, inverse(view.view_from_sensor), settings=settings,
+        points=view.points,
+    )  # fmt: skip
+
+
+def _seen(
+    view: VirtualImage,
+    hint: F8 | None,
+    settings: DetectionSettings,
+    rng: np.random.Generator,
+    steps: Steps,
+) -> Segmentation | None:
+    turned = None if hint is None else view.view_from_sensor.rotation @ hint
+    return label(view.grid, turned, settings=settings, rng=rng, steps=steps)
+
+
+def label(
+    grid: DepthGrid,
+    hint: F8 | None,
+    *,
+    settings: DetectionSettings,
+    rng: np.random.Generator,
+    steps: Steps = ALL_STEPS,
+) -> Segmentation | None:
+    """Find planes and objects among the samples; None if there is no supporting plane."""
+    model = _find_planes(grid, hint, settings, rng, steps)
+    if model is None:
+        return None
+    oversegmentation = _oversegment(grid, model, steps)
+    known = _merge(grid, model, oversegmentation, steps)
+    representatives = _clean_up(grid, model, oversegmentation, known, settings)
+    return _fill(grid, model, oversegmentation, representatives, settings, steps)
+
+
+def oversegment(
+    grid: DepthGrid, *, settings: DetectionSettings, rng: np.random.Generator
+) -> tuple[PlaneModel, OverSegmentation] | None:
+    """Find planes and the segments of objects; None if no plane bears anything."""
+    model = _find_planes(grid, None, settings, rng, ALL_STEPS)
+    return None if model is None else (model, _oversegment(grid, model, ALL_STEPS))
+
+
+def _find_planes(
+    grid: DepthGrid,
+    hint: F8 | None,
+    settings: DetectionSettings,
+    rng: np.random.Generator,
+    steps: Steps,
+) -> PlaneModel | None:
+    """Find what objects stand on and before; None if no plane bears anything."""
+    trials = draw_trials(rng)
+    hint = NO_HINT if hint is None else hint
+    supports, up, planes = find_supporting_planes(grid, hint, trials)
+    if not supports:
+        return None
+    heights = measure_heights(grid, planes, settings.max_height_m)
+    low_profile = np.zeros(grid.inverse_depth.shape, np.int16)
+    if steps.low_profile:
+        find_low_profile(grid, heights, planes, low_profile, settings.max_size_m)
+    walls = remove_walls(grid, heights.plane_id, up, settings.max_size_m, trials)
+    extend_overhang(grid, heights, planes, walls, settings.max_height_m)
+    return PlaneModel(up, supports, planes, heights, low_profile, walls)
+
+
+def _oversegment(grid: DepthGrid, model: PlaneModel, steps: Steps) -> OverSegmentation:
+    """Part what stands on the planes where two objects may meet."""
+    heights, up = model.heights, model.up
+    graph = connect_surfaces(grid, heights)
+    labels, n = watershed(heights, graph, steps.concavity)
+    if steps.width_split:
+        n = split_at_width_changes(grid, heights, graph, labels, up, n)
+    segments = measure_segments(grid, heights, graph, labels, n, up)
+    measure_adjacency(grid.inverse_depth, heights, graph, labels, up, segments)
+    return OverSegmentation(graph, labels, segments)
+
+
+def _merge(
+    grid: DepthGrid,
+    model: PlaneModel,
+    oversegmentation: OverSegmentation,
+    steps: Steps,
+) -> Bool:
+    """Merge the segments of each object; return which are known to be low-profile objects."""
+    graph, labels, segments = oversegmentation
+    known: Bool = merge_low_profile(segments, model.low_profile, labels, graph.spans)
+    if steps.learned_merging:
+        merge_learned(segments, ViewGeometry(grid.intrinsics.fx, model.up[2]), load_trees())
+    if steps.across_occlusion:
+        merge_across_occluder(segments, grid.inverse_depth, grid.intrinsics, graph.normal, labels)
+    return known
+
+
+def _clean_up(
+    grid: DepthGrid,
+    model: PlaneModel,
+    oversegmentation: OverSegmentation,
+    known: Bool,
+    settings: DetectionSettings,
+) -> I4:
+    """Reject what is no object, and number the others; return their leading oversegmentation."""
+    graph, labels, segments = oversegmentation
+    field = LabelledGrid(
+        grid.inverse_depth,
+        grid.intrinsics,
+        model.planes,
+        model.heights.plane_id,
+        model.walls,
+        labels,
+        graph.spans,
+    )
+    limits = Limits(settings.max_height_m, settings.max_size_m, settings.max_range_m)
+    rejected = is_background(field, segments, model.up, known, limits)
+    representatives, numbers = _number(segments.parent, rejected)
+    relabel(labels, graph.spans, numbers)
+    return representatives
+
+
+def _number(parent: I4, rejected: Bool) -> tuple[I4, I4]:
+    """Return the leading segment of each object, and the label of each segment; group 0 is none."""
+    leading = (parent == np.arange(parent.size)) & ~rejected
+    leading[0] = False
+    representatives = np.concatenate([[0], np.flatnonzero(leading)])
+    numbers = np.zeros(parent.size, np.int16)
+    numbers[representatives] = np.arange(representatives.size)
+    numbers = numbers[parent]
+    parent[rejected[parent]] = 0
+    return representatives, numbers
+
+
+def _fill(
+    grid: DepthGrid,
+    model: PlaneModel,
+    oversegmentation: OverSegmentation,
+    representatives: I4,
+    settings: DetectionSettings,
+    steps: Steps,
+) -> Segmentation:
+    """Complete the labels near the planes, and measure the objects."""
+    labels, segments = (
+        oversegmentation.labels,
+        oversegmentation.segments,
+    )  # of objects from `_clean_up` on
+    if steps.contact_boundary:
+        fill_contact_boundary(grid.inverse_depth, model.heights, labels)
+    filled = np.zeros(labels.shape, np.uint8)
+    if steps.hole_filling:
+        fill_holes(
+            grid.inverse_depth, model.heights.height, labels, representatives.size - 1, filled
+        )
+    filled |= (model.low_profile > 0) & (labels > 0)  # it may lie at the level of its plane
+    plane_ids = segments.plane_id[representatives].astype(np.int64) - 1
+    plane_ids[0] = 0
+    measured = measure_objects(
+        grid, labels, segments, representatives, model.up, settings.max_range_m
+    )
+    return Segmentation(model.up, model.supports, model.planes, labels, filled, plane_ids, measured)
