@@ -9,7 +9,15 @@ from shapecat.simulation.mesh import extrude, moved, rounded_box
 from shapecat.simulation.worlds import Support
 from shapecat.types import Pose
 
-__all__ = ["make_counter", "make_room", "make_shelf", "make_table", "round_table"]
+__all__ = [
+    "make_bin",
+    "make_compartment",
+    "make_counter",
+    "make_room",
+    "make_shelf",
+    "make_table",
+    "round_table",
+]
 
 FLOOR, TABLE, BOARD, SIDE, BACK, WALL = 1, 2, 2, 7, 8, 9
 """Pixel labels; the boards of a shelf count up from `BOARD`."""
@@ -71,6 +79,39 @@ def make_shelf(
     return boards, sides
 
 
+def make_bin(rng: Generator) -> tuple[Support, list[Support]]:
+    """Return the bottom of an open bin, on the floor or raised, and its four sides."""
+    width, depth, tall = rng.uniform(0.3, 0.6), rng.uniform(0.25, 0.45), rng.uniform(0.1, 0.3)
+    height, thick = rng.choice([0.01, rng.uniform(0.4, 0.9)]), rng.uniform(0.003, 0.012)
+    bottom = _slab("bin", TABLE, (width, depth, 0.01), (0, 0, height))
+    beside, before = (width + thick) / 2, (depth + thick) / 2
+    sides = [
+        _board(name, label, size, (x, y, height))
+        for name, label, size, x, y in (
+            ("left_side", SIDE, (thick, depth, tall), -beside, 0),
+            ("right_side", SIDE, (thick, depth, tall), beside, 0),
+            ("front", BACK, (width + 2 * thick, thick, tall), 0, -before),
+            ("back", BACK, (width + 2 * thick, thick, tall), 0, before),
+        )
+    ]
+    return bottom, sides
+
+
+def make_compartment(rng: Generator) -> tuple[Support, list[Support], Support]:
+    """Return the board of a compartment that is open to the front, its sides and back, its top."""
+    width, depth, tall = rng.uniform(0.3, 0.5), rng.uniform(0.25, 0.4), rng.uniform(0.22, 0.35)
+    height, thick = rng.uniform(0.3, 1.2), 0.012
+    board = _slab("board_1", BOARD, (width, depth, thick), (0, 0, height))
+    beside, behind = (width + thick) / 2, (depth + thick) / 2
+    walls = [
+        _board("left_side", SIDE, (thick, depth, tall), (-beside, 0, height)),
+        _board("right_side", SIDE, (thick, depth, tall), (beside, 0, height)),
+        _board("back", BACK, (width + 2 * thick, thick, tall), (0, behind, height)),
+    ]
+    top = _board("top", WALL, (width + 2 * thick, depth, thick), (0, 0, height + tall))
+    return board, walls, top
+
+
 def _slab(name: str, label: int, size: Sequence[float], top_middle: Sequence[float]) -> Support:
     """Return a level board; ``top_middle`` is the centre of its upper face."""
     x, y, z = top_middle
@@ -82,5 +123,10 @@ def _slab(name: str, label: int, size: Sequence[float], top_middle: Sequence[flo
 
 def _wall(name: str, label: int, size: Sequence[float], place: Sequence[float]) -> Support:
     """Return an upright board that stands on the floor."""
-    shift = Pose(np.eye(3), np.array([*place, 0.0]))
+    return _board(name, label, size, (*place, 0.0))
+
+
+def _board(name: str, label: int, size: Sequence[float], place: Sequence[float]) -> Support:
+    """Return a board that nothing stands on; ``place`` is the centre of its lower face."""
+    shift = Pose(np.eye(3), np.array(place, np.float64))
     return Support(name, label, moved(rounded_box(size, fine=1), shift), np.zeros((0, 3)))

@@ -11,13 +11,24 @@ from shapecat.simulation.furniture import make_room, make_shelf, make_table, rou
 from shapecat.simulation.layout import Layout, Piece
 from shapecat.simulation.moving import crossing, rearranged, walking
 from shapecat.simulation.paths import hold, scattered, walk
+from shapecat.simulation.piles import bin_picking, pile, shelf_bin
 from shapecat.simulation.worlds import World
 from shapecat.types import CATEGORIES
 
 __all__ = ["SCENES", "SceneKind", "make_scene", "make_stage"]
 
 SceneKind = Literal[
-    "tabletop", "shelf", "clutter", "turntable", "walking", "crossing", "rearranged", "empty"
+    "tabletop",
+    "shelf",
+    "clutter",
+    "pile",
+    "bin",
+    "shelf_bin",
+    "turntable",
+    "walking",
+    "crossing",
+    "rearranged",
+    "empty",
 ]
 
 
@@ -36,6 +47,12 @@ class _Wish:
         more = [str(c) for c in rng.choice(self.categories, max(0, count - len(first)))]
         unknown = usual if self.distractors is None else self.distractors
         return [*(first + more)[:count], *["unknown"] * unknown]
+
+    def poured(self, rng: Generator) -> list[str]:
+        """Return the categories of 4 to 18 things in any order, one in six of no category."""
+        count = int(rng.integers(4, 19))
+        wanted = self.draw(rng, count - count // 6, usual=count // 6)
+        return [str(category) for category in rng.permutation(wanted)]
 
 
 def make_scene(
@@ -183,6 +200,9 @@ SCENES: dict[str, Callable[[Generator, _Wish], World]] = {
     "tabletop": _tabletop,
     "shelf": _shelf,
     "clutter": _clutter,
+    "pile": lambda rng, wish: pile(rng, wish.poured(rng), wish.frames, wish.rate_hz),
+    "bin": lambda rng, wish: bin_picking(rng, wish.poured(rng), wish.frames, wish.rate_hz),
+    "shelf_bin": lambda rng, wish: shelf_bin(rng, wish.poured(rng), wish.frames, wish.rate_hz),
     "turntable": _turntable,
     "walking": lambda rng, wish: walking(rng, wish.draw(rng, 11), wish.frames, wish.rate_hz),
     "crossing": lambda rng, wish: crossing(rng, wish.draw(rng, 7), wish.frames, wish.rate_hz),

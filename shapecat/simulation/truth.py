@@ -100,6 +100,7 @@ def _thing_truth(
         },
         "lying": thing.lying,
         "upside_down": thing.upside_down,
+        "tilted": thing.tilted,
         "on_support": thing.on_support,
         "on_track": thing.on_track,
         "visible": round(share, 4),

@@ -55,6 +55,8 @@ class Thing(Record):
     pose : ``world_from_mesh`` at the start.
     on_support : name of the support it stands on, or None.
     on_track : track of the thing it stands on, or None.
+    lying, upside_down : its own z axis is level, or points down.
+    tilted : none of its own axes is within 15 degrees of the vertical.
     """
 
     track: int
@@ -66,6 +68,7 @@ class Thing(Record):
     on_track: int | None
     lying: bool = False
     upside_down: bool = False
+    tilted: bool = False
 
     @property
     def label(self) -> int:

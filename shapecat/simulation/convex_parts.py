@@ -1,0 +1,118 @@
+"""Meshes as convex parts, for a physics engine: what is hollow stays hollow."""
+
+from collections.abc import Iterator
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from shapecat.arrays import F8
+from shapecat.simulation.mesh import Mesh
+
+__all__ = ["convex_parts", "hollowness"]
+
+_PITCH_M = 0.004
+"""Distance between samples of a surface."""
+_BLOCKS = 4
+"""Blocks along each axis into which a hollow mesh is cut: a wall is nearly flat within one."""
+_SKIN_M = 0.001
+"""A part is at least twice as thick: engines refuse solids without volume."""
+_HOLLOW = 0.2
+_COLUMNS = 9
+
+
+def convex_parts(mesh: Mesh) -> list[F8]:
+    """Return the corners (k, 3) of convex solids that together fill a mesh, metres, its frame.
+
+    A mesh without an opening at its top is one solid, its convex hull. The walls of others are cut
+    into blocks, so that what falls into a cup lies in the cup.
+    """
+    points = np.asarray(mesh.vertices, np.float64)
+    if hollowness(mesh) < _HOLLOW:
+        return [_thickened(_corners(points, _ALL_AROUND))]
+    return list(_blocks(_samples(mesh)))
+
+
+def hollowness(mesh: Mesh) -> float:
+    """Return the share of the convex hull, 0 to 1, that is open to above."""
+    points = _samples(mesh)
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = np.maximum(high - low, 1e-9)
+    hull = ConvexHull(mesh.vertices)
+    column = np.minimum(((points - low) / size * _COLUMNS).astype(int), _COLUMNS - 1)
+    top = np.full((_COLUMNS, _COLUMNS), low[2])
+    np.maximum.at(top, (column[:, 0], column[:, 1]), points[:, 2])
+    step = size[:2] / _COLUMNS
+    spots = low[:2] + (np.indices((_COLUMNS, _COLUMNS)).reshape(2, -1).T + 0.5) * step
+    lid, base = _span(hull, spots)
+    covered = lid > base
+    open_m = np.clip(lid - np.maximum(top.reshape(-1), base), 0, None)[covered]
+    return float(open_m.sum() / max((lid - base)[covered].sum(), 1e-12))
+
+
+def _span(hull: ConvexHull, spots: F8) -> tuple[F8, F8]:
+    """Return the highest and the lowest z of a hull at places (n, 2)."""
+    normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
+    lid, base = np.full(len(spots), np.inf), np.full(len(spots), -np.inf)
+    for (x, y, z), d in zip(normals, offsets, strict=True):
+        across = spots @ [x, y] + d
+        if abs(z) < 1e-9:
+            lid[across > 0] = -np.inf
+            continue
+        limit = -across / z
+        lid, base = (np.minimum(lid, limit), base) if z > 0 else (lid, np.maximum(base, limit))
+    return lid, base
+
+
+def _samples(mesh: Mesh) -> F8:
+    """Return points all over a surface, at most a pitch apart."""
+    corners = np.asarray(mesh.vertices, np.float64)[mesh.triangles]
+    longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    counts = np.ceil(longest / _PITCH_M).astype(int).clip(1, 100)
+    found = [np.asarray(mesh.vertices, np.float64)]
+    for n in np.unique(counts):
+        i, j = np.triu_indices(n + 1)
+        weights = np.stack([i, j - i, n - j], -1) / n
+        found.append((weights @ corners[counts == n]).reshape(-1, 3))
+    return np.concatenate(found)
+
+
+def _blocks(points: F8) -> Iterator[F8]:
+    low = points.min(axis=0)
+    side = np.maximum((points.max(axis=0) - low) / _BLOCKS, 4 * _SKIN_M)
+    cell = np.minimum(((points - low) / side).astype(int), _BLOCKS - 1)
+    number = np.ravel_multi_index(tuple(cell.T), (_BLOCKS,) * 3)
+    order = np.argsort(number, kind="stable")
+    starts = np.flatnonzero(np.diff(number[order], prepend=-1))
+    for part in np.split(points[order], starts[1:]):
+        yield _thickened(_corners(part, _AXES))
+
+
+def _thickened(points: F8) -> F8:
+    """Give a part at least its skin in all directions."""
+    for _ in range(3):  # a plane, a line, or a point
+        middle = points.mean(axis=0)
+        normal = np.linalg.eigh((points - middle).T @ (points - middle))[1][:, 0]
+        across = (points - middle) @ normal
+        if np.ptp(across) > 2 * _SKIN_M:
+            break
+        flat = points - across[:, None] * normal
+        points = np.concatenate([flat - _SKIN_M * normal, flat + _SKIN_M * normal])
+    return points
+
+
+def _corners(points: F8, directions: F8) -> F8:
+    """Return the points that are farthest in some direction: a hull of few corners."""
+    return np.asarray(points[np.unique((points @ directions.T).argmax(axis=0))])
+
+
+def _sphere(count: int) -> F8:
+    """Return unit vectors (count, 3) all around (a Fibonacci spiral)."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
+    flat = np.sqrt(1 - z * z)
+    return np.stack([flat * np.cos(turn), flat * np.sin(turn), z], -1)
+
+
+_AXES = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1]), -1).reshape(-1, 3).astype(float)
+_ALL_AROUND = np.concatenate([_AXES, _sphere(100)])
+"""Of a body: with its corners, if it is a box."""

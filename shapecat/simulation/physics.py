@@ -1,0 +1,167 @@
+"""Things are dropped and come to rest where a physics engine (MuJoCo) lets them."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.spatial import ConvexHull
+
+from shapecat.arrays import F8
+from shapecat.geometry import quaternion_from_rotation, rotation_from_quaternion, transform
+from shapecat.simulation.convex_parts import convex_parts
+from shapecat.simulation.mesh import Mesh
+from shapecat.types import Pose
+
+__all__ = ["Drop", "Rest", "settle"]
+
+_STEP_S = 0.004
+_DENSITY = 400.0
+"""Of a solid thing, kg/m3."""
+_HOLLOW_DENSITY = 1000.0
+"""Of the walls of a hollow one."""
+_START_SPEED = 0.1
+"""Downward, m/s."""
+_FRICTION = (0.7, 0.005, 0.002)
+"""Sliding, turning on the spot, rolling."""
+_CLEAR_M = 0.02
+"""A thing starts so far above the highest thing below it."""
+_FALL_STEPS = 75
+"""Between two things that are dropped."""
+_MOST_STEPS = 750
+"""After the last."""
+_STILL = 0.02
+"""What moves slower, in m/s and rad/s, has come to rest."""
+_LOOK_STEPS = 12
+_WAITING_M = 5.0
+"""So far beside the scene things wait, and apart from each other."""
+
+
+class Drop(NamedTuple):
+    """A thing to drop: how it is turned (3, 3), and over which place (2,), metres, world frame."""
+
+    mesh: Mesh
+    rotation: F8
+    place: F8
+
+
+class Rest(NamedTuple):
+    """Where a thing has come to rest.
+
+    Attributes
+    ----------
+    pose : ``world_from_mesh``, whole micrometres.
+    bearer : index of the thing that bears most of its weight; None if an obstacle does.
+    """
+
+    pose: Pose
+    bearer: int | None
+
+
+def settle(obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> list[Rest]:
+    """Drop things one after the other, each just above what lies there, until all lie still.
+
+    Parameters
+    ----------
+    obstacles : world frame; they never move.
+
+    Returns
+    -------
+    One for each drop, wherever it went.
+    """
+    import mujoco  # type: ignore[import-untyped]  # noqa: PLC0415  slow; most scenes need no physics
+
+    model = _model(mujoco, obstacles, drops)
+    data = mujoco.MjData(model)
+    shapes = [_extreme_points(drop.mesh) for drop in drops]
+    fixed = [np.asarray(obstacle.vertices, np.float64) for obstacle in obstacles]
+    for k, drop in enumerate(drops):
+        there = fixed + [transform(_pose(data, j), shapes[j]) for j in range(k)]
+        start = _start(drop, shapes[k], there)
+        _release(model, data, k, start)
+        for _ in range(_FALL_STEPS):
+            mujoco.mj_step(model, data)
+    for _ in range(_MOST_STEPS // _LOOK_STEPS):
+        if float(np.abs(data.qvel).max()) < _STILL:
+            break
+        for _ in range(_LOOK_STEPS):
+            mujoco.mj_step(model, data)
+    return _rests(mujoco, model, data, len(drops))
+
+
+def _model(mujoco: Any, obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> Any:
+    spec = mujoco.MjSpec()
+    spec.option.timestep = _STEP_S
+    spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
+    spec.option.enableflags |= int(
+        mujoco.mjtEnableBit.mjENBL_SLEEP
+    )  # what lies still costs nothing
+    for k, obstacle in enumerate(obstacles):
+        for j, part in enumerate(convex_parts(obstacle)):
+            _add_solid(mujoco, spec, spec.worldbody, f"obstacle{k}part{j}", part)
+    for k, drop in enumerate(drops):
+        waiting = [_WAITING_M + k, _WAITING_M, 0.0]
+        body = spec.worldbody.add_body(name=f"drop{k}", pos=waiting, gravcomp=1)
+        body.add_freejoint()
+        parts = convex_parts(drop.mesh)
+        for j, part in enumerate(parts):
+            solid = _add_solid(mujoco, spec, body, f"drop{k}part{j}", part)
+            solid.density = _DENSITY if len(parts) == 1 else _HOLLOW_DENSITY
+    return spec.compile()
+
+
+def _add_solid(mujoco: Any, spec: Any, body: Any, name: str, corners: F8) -> Any:
+    spec.add_mesh(name=name, uservert=np.asarray(corners, np.float64).reshape(-1))
+    kind = mujoco.mjtGeom.mjGEOM_MESH
+    return body.add_geom(type=kind, meshname=name, name=name, friction=_FRICTION, condim=6)
+
+
+def _extreme_points(mesh: Mesh) -> F8:
+    points = np.asarray(mesh.vertices, np.float64)
+    return np.asarray(points[ConvexHull(points).vertices])
+
+
+def _start(drop: Drop, points: F8, there: Sequence[F8]) -> Pose:
+    """Return a pose over a place, a little above all that lies there."""
+    turned = points @ drop.rotation.T
+    middle = (turned.min(axis=0) + turned.max(axis=0)) / 2
+    shift = np.array([*drop.place, 0.0]) - [*middle[:2], turned[:, 2].min()]
+    low, high = turned.min(axis=0)[:2] + shift[:2], turned.max(axis=0)[:2] + shift[:2]
+    top = max(
+        float(other[:, 2].max())
+        for other in there
+        if (other[:, :2].min(axis=0) < high).all() and (other[:, :2].max(axis=0) > low).all()
+    )
+    return Pose(drop.rotation, shift + np.array([0, 0, top + _CLEAR_M]))
+
+
+def _release(model: Any, data: Any, k: int, start: Pose) -> None:
+    """Put a thing that waits at its start, and let it fall."""
+    model.body_gravcomp[k + 1] = 0.0  # the world is body 0
+    x, y, z, w = quaternion_from_rotation(start.rotation)
+    data.qpos[7 * k : 7 * k + 7] = [*start.translation, w, x, y, z]
+    data.qvel[6 * k : 6 * k + 6] = [0, 0, -_START_SPEED, 0, 0, 0]  # wakes it
+
+
+def _pose(data: Any, k: int) -> Pose:
+    *place, w, x, y, z = np.round(data.qpos[7 * k : 7 * k + 7], 9)
+    return Pose(rotation_from_quaternion([x, y, z, w]), np.round(place, 6))
+
+
+def _rests(mujoco: Any, model: Any, data: Any, count: int) -> list[Rest]:
+    """Return where things lie, and on what: that which pushes them up most."""
+    model.opt.enableflags = 0  # what sleeps has no contacts
+    mujoco.mj_forward(model, data)
+    lift = np.zeros((count, count + 1))  # the last: obstacles
+    force = np.zeros(6)
+    for k in range(data.ncon):
+        contact = data.contact[k]
+        mujoco.mj_contactForce(model, data, k, force)
+        upward = float(force[:3] @ contact.frame.reshape(3, 3)[:, 2])  # on the second geom
+        one, two = (int(model.geom_bodyid[geom]) - 1 for geom in contact.geom)
+        for body, other, up in ((two, one, upward), (one, two, -upward)):
+            if body >= 0:
+                lift[body, other] += up
+    bearers = lift.argmax(axis=1)
+    return [
+        Rest(_pose(data, k), None if bearers[k] == count else int(bearers[k])) for k in range(count)
+    ]

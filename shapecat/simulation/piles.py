@@ -1,0 +1,169 @@
+"""Scenes that physics makes: piles on tables, things poured into bins, crowded compartments."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.random import Generator
+
+from shapecat.arrays import F8
+from shapecat.geometry import rotation_from_quaternion, transform
+from shapecat.simulation.distractors import make_distractor
+from shapecat.simulation.furniture import make_bin, make_compartment, make_room, make_table
+from shapecat.simulation.mesh import Mesh
+from shapecat.simulation.paths import walk
+from shapecat.simulation.physics import Drop, Rest, settle
+from shapecat.simulation.shapes import make_object
+from shapecat.simulation.worlds import Support, Thing, World
+
+__all__ = ["bin_picking", "pile", "shelf_bin"]
+
+_UPRIGHT = 0.45
+"""Share of the things that are dropped nearly upright; others are turned anyhow."""
+_SWAY_DEG = 8.0
+_UPRIGHT_COS, _LYING_COS = np.cos(np.radians(15)), np.sin(np.radians(15))
+_SUNK_M = 0.02
+"""What lies lower has fallen off its support."""
+
+
+class _Item(NamedTuple):
+    category: str
+    kind: str
+    mesh: Mesh
+
+
+def pile(rng: Generator, categories: Sequence[str], frames: int, rate_hz: float) -> World:
+    """Drop things in a heap on a table: they lean, lie across, and in each other."""
+    supports = (*make_room(rng, wall_chance=0.2), make_table(rng))
+    table = supports[-1]
+    spread = rng.uniform(0.07, 0.2)
+    drops, items = [], [_make(category, rng) for category in categories]
+    for item in items:
+        place = np.clip(rng.normal(0, spread, 2), -0.4, 0.4)
+        drops.append(Drop(item.mesh, _turned(rng), place))
+    things = _settled(items, drops, supports, table)
+    path = walk(
+        rng,
+        np.array([0, 0, table.height + 0.05]),
+        frames,
+        rate_hz,
+        distance=float(np.exp(rng.uniform(np.log(0.6), np.log(1.5)))),
+        elevation=rng.uniform(18, 75),
+        sweep=rng.uniform(20, 60),
+    )
+    return World("pile", supports, things, path, np.zeros(frames))
+
+
+def bin_picking(rng: Generator, categories: Sequence[str], frames: int, rate_hz: float) -> World:
+    """Pour things into a bin, and look into it from above."""
+    bottom, sides = make_bin(rng)
+    half = np.ptp(bottom.outline[:, :2], axis=0) / 2
+    items = [_make(category, rng) for category in categories]
+    items = [item for item in items if item.mesh.extents.max() < 1.6 * half.min()]
+    drops = []
+    for item in items:
+        room = np.maximum(half - float(item.mesh.extents.max()) / 2 - 0.01, 0)
+        drops.append(Drop(item.mesh, _turned(rng), rng.uniform(-room, room)))
+    supports = (*make_room(rng, wall_chance=0.2), bottom, *sides)
+    path = walk(
+        rng,
+        np.array([0, 0, bottom.height + 0.05]),
+        frames,
+        rate_hz,
+        distance=rng.uniform(0.6, 1.2),
+        elevation=rng.uniform(60, 84),
+        sweep=rng.uniform(10, 40),
+    )
+    things = _settled(items, drops, supports, bottom)
+    return World("bin", supports, things, path, np.zeros(frames))
+
+
+def shelf_bin(rng: Generator, categories: Sequence[str], frames: int, rate_hz: float) -> World:
+    """Put things into a compartment of a shelf, and look in from the front."""
+    board, walls, top = make_compartment(rng)
+    half = np.ptp(board.outline[:, :2], axis=0) / 2
+    room_m = top.mesh.vertices[:, 2].min() - board.height
+    items = [_make(category, rng) for category in categories]
+    items = [i for i in items if (i.mesh.extents[:2] < 1.6 * half.min()).all()]
+    drops = []
+    for item in items:
+        room = np.maximum(half - float(item.mesh.extents.max()) / 2 - 0.01, 0)
+        drops.append(Drop(item.mesh, _turned(rng), rng.uniform(-room, room)))
+    supports = (*make_room(rng, wall_chance=0.0), board, *walls)
+    things = _settled(items, drops, supports, board, highest_m=float(room_m))
+    path = walk(
+        rng,
+        np.array([0, 0, board.height + room_m / 3]),
+        frames,
+        rate_hz,
+        distance=rng.uniform(0.5, 0.9),
+        elevation=rng.uniform(5, 25),
+        sweep=rng.uniform(5, 20),
+    )
+    return World("shelf_bin", (*supports, top), things, path, np.zeros(frames))
+
+
+def _make(category: str, rng: Generator) -> _Item:
+    if category == "unknown":
+        return _Item(category, *make_distractor(rng))
+    return _Item(category, category, make_object(category, rng))
+
+
+def _turned(rng: Generator) -> F8:
+    """Return a rotation: nearly upright, or any."""
+    if rng.random() >= _UPRIGHT:
+        axis = rng.normal(size=4)
+        return rotation_from_quaternion(axis / np.linalg.norm(axis))
+    sway, turn = rng.normal(0, np.radians(_SWAY_DEG) / 2, 2), rng.uniform(0, np.pi)
+    axis = np.array([*sway, np.sin(turn), np.cos(turn)])
+    return rotation_from_quaternion(axis / np.linalg.norm(axis))
+
+
+def _settled(
+    items: Sequence[_Item],
+    drops: Sequence[Drop],
+    supports: Sequence[Support],
+    below: Support,
+    *,
+    highest_m: float = np.inf,
+) -> tuple[Thing, ...]:
+    """Return what stays on a support, and lower than a height above it."""
+    rests = settle([support.mesh for support in supports], drops)
+    stays = [_stays(k.mesh, rest, below, highest_m) for k, rest in zip(items, rests, strict=True)]
+    tracks = np.cumsum(stays) - 1
+    things = []
+    for k, (item, rest) in enumerate(zip(items, rests, strict=True)):
+        if not stays[k]:
+            continue
+        bearer = rest.bearer if rest.bearer is not None and stays[rest.bearer] else None
+        things.append(_thing(int(tracks[k]), item, rest, below, tracks, bearer))
+    return tuple(things)
+
+
+def _stays(mesh: Mesh, rest: Rest, below: Support, highest_m: float) -> bool:
+    points = transform(rest.pose, mesh.vertices)
+    low, high = points.min(axis=0), points.max(axis=0)
+    edge = below.outline[:, :2]
+    middle = (low + high)[:2] / 2
+    held = ((edge.min(axis=0) < middle) & (middle < edge.max(axis=0))).all()
+    return bool(held and low[2] > below.height - _SUNK_M and high[2] < below.height + highest_m)
+
+
+def _thing(
+    track: int, item: _Item, rest: Rest, below: Support, tracks: F8, bearer: int | None
+) -> Thing:
+    axes = rest.pose.rotation[2]  # heights of the thing's own axes
+    upright = axes[2] > _UPRIGHT_COS
+    straight = np.abs(axes).max() > _UPRIGHT_COS
+    return Thing(
+        track,
+        item.category,
+        item.kind,
+        item.mesh,
+        rest.pose,
+        below.name if bearer is None else None,
+        None if bearer is None else int(tracks[bearer]),
+        lying=item.category != "box" and abs(axes[2]) < _LYING_COS,
+        upside_down=axes[2] < -_UPRIGHT_COS,
+        tilted=not (upright or straight),
+    )
