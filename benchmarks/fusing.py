@@ -12,7 +12,8 @@ from benchmarks.measure import cpu_ms, markdown
 from benchmarks.overlap import Labelled, score
 from benchmarks.scenes import SEEN_PIXELS
 from shapecat.config import DetectionSettings
-from shapecat.detection import Earlier, RecentFrames, detect, fuse
+from shapecat.depth_fusion import Earlier, RecentFrames, fuse
+from shapecat.detection import detect
 from shapecat.simulation import KINECT, REALSENSE, Sensor, World, make_scene, render_frame
 from shapecat.simulation.scenes import SceneKind
 from shapecat.simulation.truth import frame_truth

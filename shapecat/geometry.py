@@ -1,4 +1,4 @@
-"""Poses, quaternions, boxes and the gravity frame: small numeric pieces shared by the stages."""
+"""Poses, quaternions, boxes, the gravity frame, limits of depth: what the stages share."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,9 @@ from shapecat.jit import kernel
 from shapecat.types import Box, Pose
 
 __all__ = [
+    "DISCONTINUITY",
     "IDENTITY",
+    "NEAREST_M",
     "box_corners",
     "compose",
     "cross",
@@ -27,6 +29,10 @@ __all__ = [
     "upright_box",
 ]
 
+DISCONTINUITY = 0.012
+"""Step in inverse depth that separates surfaces, 1/m: four steps of a Kinect, 1 cm at 0.9 m."""
+NEAREST_M = 0.05
+"""Nothing measures nearer; keeps inverse depth within bounds."""
 IDENTITY = Pose(np.eye(3), np.zeros(3))
 """The pose that changes nothing."""
 

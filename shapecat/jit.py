@@ -88,7 +88,7 @@ class _StageCache(FunctionCache):  # type: ignore[misc]  # numba has no types
 
     def __init__(self, target: Callable[..., Any]) -> None:
         super().__init__(target)
-        stage = Path(target.__code__.co_filename).parent
+        stage = _stage_of(Path(target.__code__.co_filename))
         self._cache_file._source_stamp = _stamp(stage)  # noqa: SLF001  it has no other place
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
@@ -98,11 +98,20 @@ class _StageCache(FunctionCache):  # type: ignore[misc]  # numba has no types
             return self._load_overload(sig, target_context)
 
 
+def _stage_of(file: Path) -> Path:
+    """Return the folder of the stage that a file is of: one here, also for files further down."""
+    here = Path(__file__).parent
+    inside = (folder for folder in file.parents if folder.parent == here)
+    return next(inside, file.parent)
+
+
 @cache
 def _stamp(stage: Path) -> tuple[tuple[str, float, int], ...]:
     """Return the names, times and sizes of the files of a stage, and of those all may call."""
-    files = {*stage.glob("*.py"), *(Path(__file__).with_name(name) for name in _SHARED)}
-    return tuple((f.name, f.stat().st_mtime, f.stat().st_size) for f in sorted(files))
+    here = Path(__file__).parent
+    found = () if stage == here else stage.rglob("*.py")
+    files = {*found, *(here / name for name in _SHARED)}
+    return tuple((str(f), f.stat().st_mtime, f.stat().st_size) for f in sorted(files))
 
 
 @kernel

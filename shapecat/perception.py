@@ -11,8 +11,9 @@ import numpy as np
 
 from shapecat.arrays import F4
 from shapecat.config import Settings
+from shapecat.depth_fusion import Earlier, fuse, with_own_readings
 from shapecat.description import DESCRIPTOR_NAMES, describe
-from shapecat.detection import Earlier, detect, fuse, with_own_readings
+from shapecat.detection import detect
 from shapecat.errors import ModelError
 from shapecat.geometry import inverse, level_from_sensor, transform
 from shapecat.learning import Categorizer, load_model

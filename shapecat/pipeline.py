@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 
 import pyarrow as pa
 
+from shapecat.depth_fusion import RecentFrames
 from shapecat.description import DESCRIPTOR_NAMES
-from shapecat.detection import RecentFrames
 from shapecat.errors import NoStreamError, OutputError
 from shapecat.executors.order import Processes, read_ahead
 from shapecat.jit import CompileClock, compile_clock

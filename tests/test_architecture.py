@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-STAGES = {"detection", "surface", "description", "learning", "tracking"}
+STAGES = {"depth_fusion", "detection", "surface", "description", "learning", "tracking"}
 BASE = {"arrays", "errors", "jit", "triangles", "types"}
 FLOOR = {
     **dict.fromkeys(BASE | {"__init__", "py"}, 0),

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from shapecat.config import DetectionSettings
 from shapecat.detection import Hierarchy, Node, detect, format_tree
-from shapecat.detection.cells import place_of
+from shapecat.detection.depth_grid import place_of
 from shapecat.errors import ConfigError
 from shapecat.types import Camera, Frame, Scene
 

@@ -5,9 +5,9 @@ import pytest
 
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
-from shapecat.detection.cells import cells_of
-from shapecat.detection.parts import SIGNS, Sight, _sum_of, meet_at_all, signs_of, trees
-from shapecat.detection.segmentation import part
+from shapecat.detection.depth_grid import cells_of
+from shapecat.detection.merging.learned import SIGNS, Sight, _sum_of, meet_at_all, signs_of, trees
+from shapecat.detection.pipeline import oversegment
 from shapecat.models.parts import Pairs, collect, grow
 from shapecat.simulation import KINECT, make_scene, render_frame
 from tests.test_detection import overlaps
@@ -31,7 +31,7 @@ def test_the_order_of_two_pieces_says_nothing() -> None:
     assert frame.camera is not None
     cells = cells_of(frame.depth, frame.camera, range_m=2.0)
     assert cells is not None
-    found = part(cells, settings=DetectionSettings(), rng=rng)
+    found = oversegment(cells, settings=DetectionSettings(), rng=rng)
     assert found is not None
     ground, (_, _, pieces) = found
     sight = Sight(cells.lens.fx, float(ground.up[2]))

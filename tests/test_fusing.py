@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from shapecat.arrays import F4
 from shapecat.config import Settings, with_overrides
-from shapecat.detection import Earlier, RecentFrames, fuse
-from shapecat.detection.fusing import AGREE, REACH
+from shapecat.depth_fusion import Earlier, RecentFrames, fuse
+from shapecat.depth_fusion.fusion import AGREE, REACH
 from shapecat.errors import ConfigError
 from shapecat.geometry import IDENTITY
 from shapecat.perception import perceive

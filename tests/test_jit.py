@@ -4,6 +4,9 @@ import subprocess
 import sys
 from pathlib import Path
 
+import shapecat
+from shapecat.jit import _stage_of
+
 CALLER = """
 from shapecat.jit import kernel
 from callee import twice
@@ -52,3 +55,12 @@ def test_a_kernel_from_the_cache_is_compiled_into_another(tmp_path: Path) -> Non
 
     assert _run(stages[1]).split() == ["7", "0", "1", "10"]
     assert _run(stages[1]).split() == ["7", "1", "0", "10"]
+
+
+def test_a_stage_is_one_with_its_sub_packages() -> None:
+    """Kernels call kernels of other sub-packages of their stage: an edit of any counts."""
+    here = Path(shapecat.__file__).parent
+
+    assert _stage_of(here / "detection" / "planes" / "ransac.py") == here / "detection"
+    assert _stage_of(here / "detection" / "pipeline.py") == here / "detection"
+    assert _stage_of(here / "geometry.py") == here

@@ -1,21 +1,9 @@
-"""Detection: supporting planes, object candidates and their hierarchy (thesis ch. 4).
+"""Detection: supporting planes, objects and the graph of a scene (thesis ch. 4).
 
 `detect` turns a frame into a `shapecat.types.Scene`; `Hierarchy` answers questions about it.
-Before that, `fuse` may join a frame with those that `RecentFrames` remembers.
 """
 
-from shapecat.detection.detector import detect
-from shapecat.detection.fusing import fuse, with_own_readings
-from shapecat.detection.hierarchy import Hierarchy, Node, format_tree
-from shapecat.detection.recent import Earlier, RecentFrames
+from shapecat.detection.pipeline import detect
+from shapecat.detection.scene_graph import Hierarchy, Node, format_tree
 
-__all__ = [
-    "Earlier",
-    "Hierarchy",
-    "Node",
-    "RecentFrames",
-    "detect",
-    "format_tree",
-    "fuse",
-    "with_own_readings",
-]
+__all__ = ["Hierarchy", "Node", "detect", "format_tree"]

@@ -17,13 +17,13 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U1, Bool
 from shapecat.config import DetectionSettings
-from shapecat.detection import parts
-from shapecat.detection.cells import Cells, cells_of
-from shapecat.detection.joins import join_raised, join_small
-from shapecat.detection.occluders import join_around, join_behind
-from shapecat.detection.parts import SIGNS, Sight, Trees, meet_at_all, signs_of
-from shapecat.detection.pieces import Pieces, merge
-from shapecat.detection.segmentation import RULES, part
+from shapecat.detection.depth_grid import Cells, cells_of
+from shapecat.detection.merging import learned as parts
+from shapecat.detection.merging.across_occlusion import join_around, join_behind
+from shapecat.detection.merging.learned import SIGNS, Sight, Trees, meet_at_all, signs_of
+from shapecat.detection.merging.segments import Pieces, merge
+from shapecat.detection.merging.small import join_raised, join_small
+from shapecat.detection.pipeline import RULES, oversegment
 from shapecat.learning.boosting import Tree, TreeSettings, grow_tree, make_bins
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
 from shapecat.simulation.scenes import SceneKind
@@ -135,7 +135,7 @@ def _pairs(
     cells = cells_of(depth, camera, range_m=settings.max_range_m)
     if cells is None:
         return
-    found = part(cells, settings=settings, rng=rng)
+    found = oversegment(cells, settings=settings, rng=rng)
     if found is None:
         return
     ground, (surfaces, regions, pieces) = found

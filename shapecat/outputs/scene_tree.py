@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from shapecat.detection.hierarchy import Node, format_tree
+from shapecat.detection.scene_graph import Node, format_tree
 from shapecat.errors import OutputError
 from shapecat.outputs.rereading import FinishedRun, read_finished
 from shapecat.runs.labels import read_labelled_frames

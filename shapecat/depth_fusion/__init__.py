@@ -1,0 +1,9 @@
+"""Depth fusion: consecutive depth images become one, before detection (thesis 4.2).
+
+`fuse` joins a frame with those that `RecentFrames` remembers.
+"""
+
+from shapecat.depth_fusion.fusion import fuse, with_own_readings
+from shapecat.depth_fusion.recent import Earlier, RecentFrames
+
+__all__ = ["Earlier", "RecentFrames", "fuse", "with_own_readings"]

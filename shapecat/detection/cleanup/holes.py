@@ -1,0 +1,234 @@
+"""Fill: cells near the level of the table that belong to objects: their feet and their floors."""
+
+import numpy as np
+
+from shapecat.arrays import F4, I4, U1, Bool
+from shapecat.detection.depth_grid import place_of
+from shapecat.detection.planes.height_map import LEAST_M, NOISE, Heights
+from shapecat.geometry import DISCONTINUITY
+from shapecat.jit import kernel, unset
+
+__all__ = ["FRINGE", "fill_enclosed", "grow_feet"]
+
+FRINGE = 0.6
+"""Share of the least height from which a reading next to an object belongs to it."""
+MOST_CELLS = 4000
+STACK = MOST_CELLS + 4
+"""Room for a hole that is found to be too large."""
+OPEN = 2
+"""Mark of cells seen that are no part of a hole."""
+SHARE = 0.6
+"""Least share of the boundary of a hole that is of what encloses it."""
+RAISED_M, RAISED_NOISE = 0.0012, 0.0008
+"""Mean height of a hole from which it is raised, metres, and by the square of its range, 1/m."""
+RAISED_SHARE, LABELLED = 0.35, 0.5
+"""Instead of `SHARE` where it is raised, and so much of its boundary is of any label."""
+LEVEL = 0.15
+"""Share of the boundary where the surface goes on: not so through the hole of a handle."""
+
+
+@kernel
+def grow_feet(w: F4, heights: Heights, labels: I4) -> None:
+    """Let the labels grow over the cells beside them that are hardly above their plane.
+
+    The least height of an object cell is safe against the noise of the plane; next to an object
+    less is enough. Further away what is so low is as often the plane.
+    """
+    owner, height = heights
+    rows, columns = labels.shape
+    edge = unset(labels.size, np.int32)
+    beside = np.zeros(columns, np.bool_)
+    count = 0
+    for i in range(rows):
+        if not _find_beside(owner, labels[i], i, beside):
+            continue
+        for j in range(columns):
+            if beside[j]:
+                edge[count] = i * columns + j
+                count += 1
+    for p in edge[:count]:
+        i, j = place_of(p, columns)
+        for d in range(4):
+            y = i + (1 if d == 0 else -1 if d == 1 else 0)
+            x = j + (1 if d == 2 else -1 if d == 3 else 0)
+            if y < 0 or x < 0 or y >= rows or x >= columns or labels[y, x] != 0:
+                continue
+            if owner[y, x] != -abs(owner[i, j]) or abs(w[y, x] - w[i, j]) >= DISCONTINUITY:
+                continue
+            z = 1 / w[y, x]
+            if height[y, x] > FRINGE * (LEAST_M + NOISE * z * z):
+                labels[y, x] = labels[i, j]
+
+
+@kernel(leaf=True)
+def _find_beside(owner: I4, labels: I4, i: int, beside: Bool) -> bool:
+    """Mark the labelled cells of a row that are beside cells of a plane; whether there are any."""
+    rows, columns = owner.shape
+    # Labelled cells are on no plane, so the row itself may stand for the one beyond the image.
+    above, here, below = owner[max(i - 1, 0)], owner[i], owner[min(i + 1, rows - 1)]
+    some = False
+    for j in range(columns):
+        beside[j] = (labels[j] > 0) & ((above[j] < 0) | (below[j] < 0))
+    for j in range(columns - 1):
+        beside[j] |= (labels[j] > 0) & (here[j + 1] < 0)
+    for j in range(columns - 1):
+        beside[j + 1] |= (labels[j + 1] > 0) & (here[j] < 0)
+    for j in range(columns):
+        some |= beside[j]
+    return some
+
+
+@kernel(leaf=True)
+def _extent_of(labels: I4) -> tuple[int, int, int, int]:
+    """Return the first row and column with a label, and those after the last."""
+    i0, j0 = labels.shape
+    i1 = j1 = 0
+    for i in range(labels.shape[0]):
+        some = 0
+        for j in range(labels.shape[1]):
+            some |= labels[i, j]
+        if some == 0:
+            continue
+        i0, i1 = min(i0, i), i + 1
+        j = 0
+        while j < j0 and labels[i, j] == 0:
+            j += 1
+        j0, j = j, labels.shape[1]
+        while j > j1 and labels[i, j - 1] == 0:
+            j -= 1
+        j1 = j
+    return i0, j0, i1, j1
+
+
+@kernel(leaf=True)
+def _flood_hole(
+    w: F4,
+    labels: I4,
+    extent: tuple[int, int, int, int],
+    seen: U1,
+    stack: I4,
+    sides: I4,
+    ahead: I4,
+    level: I4,
+) -> tuple[int, int]:
+    """Collect the unlabelled cells connected to the first of ``stack``, which `_may_be_hole`.
+
+    Counts, for each label, the sides of cells where it bounds the hole, where it is in front of
+    it, and where the surface goes on. Returns how many cells the hole has, 0 if it is large or
+    reaches the border of the extent, and how many sides, those to cells without a reading included.
+    """
+    sides[:] = 0
+    ahead[:] = 0
+    level[:] = 0
+    total = 0
+    done, top = 0, 1
+    seen[stack[0, 0], stack[0, 1]] = 1
+    while done < top:
+        i, j = stack[done, 0], stack[done, 1]
+        done += 1
+        if top >= MOST_CELLS or _is_open(seen, extent, i, j):
+            for t in range(top):
+                seen[stack[t, 0], stack[t, 1]] = OPEN
+            return 0, 0
+        for d in range(4):
+            y = i + (1 if d == 0 else -1 if d == 1 else 0)
+            x = j + (1 if d == 2 else -1 if d == 3 else 0)
+            label = labels[y, x]
+            if label > 0:
+                total += 1
+                sides[label] += 1
+                ahead[label] += w[y, x] > w[i, j] + DISCONTINUITY
+                level[label] += abs(w[y, x] - w[i, j]) < DISCONTINUITY
+            elif w[y, x] <= 0:
+                total += 1
+            elif not seen[y, x]:
+                seen[y, x] = 1
+                stack[top, 0], stack[top, 1] = y, x
+                top += 1
+    return top, total
+
+
+@kernel(leaf=True)
+def _mark_open(w: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1) -> None:
+    """Mark unlabelled cells from which others lead right and down to the border of the extent.
+
+    What leads left and up is found as the holes are looked for; the rest takes a flood.
+    """
+    i0, j0, i1, j1 = extent
+    for i in range(i1 - 1, i0 - 1, -1):
+        here, label, value = seen[i, j0:j1], labels[i, j0:j1], w[i, j0:j1]
+        for j in range(here.size):
+            here[j] = OPEN if (label[j] == 0) & (value[j] > 0) else 0
+        if i == i1 - 1:
+            continue
+        below, right = seen[i + 1, j0:j1], np.uint8(OPEN)
+        for j in range(here.size - 1, -1, -1):
+            right = (right | below[j]) & here[j]
+            here[j] = right
+
+
+@kernel(inline=True, leaf=True)
+def _may_be_hole(
+    w: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1, i: int, j: int
+) -> bool:
+    """Whether an unlabelled cell is new and not known to be open."""
+    if labels[i, j] != 0 or seen[i, j] or w[i, j] <= 0:
+        return False
+    if _is_open(seen, extent, i, j):
+        seen[i, j] = OPEN
+    return bool(seen[i, j] == 0)
+
+
+@kernel(inline=True, leaf=True)
+def _is_open(seen: U1, extent: tuple[int, int, int, int], i: int, j: int) -> bool:
+    """Whether a cell is on the border of the extent or next to what is known to be open."""
+    i0, j0, i1, j1 = extent
+    if i == i0 or j == j0 or i == i1 - 1 or j == j1 - 1:
+        return True
+    above, below = seen[i - 1, j] == OPEN, seen[i + 1, j] == OPEN
+    return bool(above | below | (seen[i, j - 1] == OPEN) | (seen[i, j + 1] == OPEN))
+
+
+@kernel(leaf=True)
+def _is_raised(w: F4, height: F4, stack: I4, cells: int) -> bool:
+    """Whether a hole lies a little above the plane, as the floor of a plate does."""
+    raised = far = 0.0
+    for t in range(cells):
+        i, j = stack[t, 0], stack[t, 1]
+        raised += height[i, j]
+        far += 1 / w[i, j]
+    return raised > cells * (RAISED_M + RAISED_NOISE * (far / cells) ** 2)
+
+
+@kernel
+def fill_enclosed(w: F4, height: F4, labels: I4, count: int, filled: U1) -> None:
+    """Give enclosed unlabelled cells to what encloses them, and mark them in ``filled``.
+
+    Cells are enclosed when 60 % of their boundary is one label and every other label on it is in
+    front of them.
+    """
+    seen = np.zeros(labels.shape, np.uint8)
+    stack = np.zeros((STACK, 2), np.int16)
+    sides, ahead, level = np.zeros((3, count + 1), np.int32)
+    extent = _extent_of(labels)
+    _mark_open(w, labels, extent, seen)
+    for si in range(extent[0], extent[2]):
+        for sj in range(extent[1], extent[3]):
+            if not _may_be_hole(w, labels, extent, seen, si, sj):
+                continue
+            stack[0, 0], stack[0, 1] = si, sj
+            cells, total = _flood_hole(w, labels, extent, seen, stack, sides, ahead, level)
+            if cells == 0:
+                continue
+            best = np.argmax(sides)
+            share = SHARE
+            if np.sum(sides) > LABELLED * total and _is_raised(w, height, stack, cells):
+                share = RAISED_SHARE
+            fits = sides[best] > max(0, share * total) and level[best] > LEVEL * total
+            for k in range(1, count + 1):
+                if k != best and ahead[k] < sides[k]:
+                    fits = False
+            if fits:
+                for t in range(cells):
+                    labels[stack[t, 0], stack[t, 1]] = best
+                    filled[stack[t, 0], stack[t, 1]] = 1

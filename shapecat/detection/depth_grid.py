@@ -1,0 +1,200 @@
+"""Cells: the depth image at the resolution the rules work at.
+
+Everything is done in inverse depth ``w = 1 / z`` (1/m): a plane is exactly linear in (column, row,
+w), and the noise of disparity cameras is constant in w, so thresholds need no model of range.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, I4
+from shapecat.geometry import DISCONTINUITY, NEAREST_M
+from shapecat.jit import kernel
+from shapecat.types import Camera
+
+__all__ = [
+    "BORDER",
+    "Cells",
+    "Lens",
+    "cells_of",
+    "count_last",
+    "place_of",
+    "small_at",
+]
+
+CELL_M = 0.0035
+"""Size of a cell on the objects: small against the smallest object, larger than the noise."""
+SMALL_M2 = 9e-4
+"""Surface of the smallest object."""
+BORDER = 0.12
+"""Share of the image in which its readings may begin: a registered Kinect is blind in a tenth."""
+LARGEST_FACTOR = 16
+MOST_CELLS = 100_000
+"""Bounds the time of a frame: images that look far have larger cells."""
+
+
+class Lens(NamedTuple):
+    """A pinhole camera in units of cells: cell (i, j) sees ((j - cx) / fx, (i - cy) / fy, 1)."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+class Cells(NamedTuple):
+    """The image of cells.
+
+    Attributes
+    ----------
+    w : (rows, columns) float32 inverse depth, 1/m; 0 where there is no reading.
+    lens : the camera in units of cells.
+    factor : pixels along the edge of a cell.
+    size_m : width of a cell at the median depth.
+    """
+
+    w: F4
+    lens: Lens
+    factor: int
+    size_m: float
+
+
+def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_M) -> Cells | None:
+    """Average pixels of ``depth`` (h, w), metres, into cells; None if there is no reading.
+
+    Readings beyond ``range_m`` are left out (thesis 4.2, pass-through filter).
+    """
+    sample = _sampled(depth, 5 if min(depth.shape) > 50 else 1, np.float32(range_m))
+    if sample.size == 0:
+        return None
+    pixel_m = _median_of(sample) / max(abs(camera.fx), 1e-6)
+    least = math.sqrt(depth.size / MOST_CELLS)
+    factor = round(min(max(cell_m / max(pixel_m, 1e-9), least, 1.0), LARGEST_FACTOR, *depth.shape))
+    shift = (factor - 1) / 2
+    lens = Lens(
+        camera.fx / factor,
+        camera.fy / factor,
+        (camera.cx - shift) / factor,
+        (camera.cy - shift) / factor,
+    )
+    rows, columns = depth.shape[0] // factor, depth.shape[1] // factor
+    w = np.zeros((rows, columns), np.float32)
+    _average(depth, factor, np.float32(range_m), np.float32(DISCONTINUITY), w)
+    return Cells(w, lens, factor, factor * pixel_m)
+
+
+def _median_of(values: F4) -> float:
+    """Return the upper median of at least one value; `numpy.median` takes twice as long."""
+    return float(np.partition(values, values.size // 2)[values.size // 2])
+
+
+@kernel
+def _sampled(depth: F4, step: int, range_m: float) -> F4:
+    """Return the readings in range among every so many pixels."""
+    rows, columns = depth.shape
+    result = np.zeros((rows // step + 1) * (columns // step + 1), np.float32)
+    n = 0
+    for i in range(step // 2, rows, step):
+        for j in range(step // 2, columns, step):
+            result[n] = depth[i, j]
+            n += (depth[i, j] >= np.float32(NEAREST_M)) & (depth[i, j] <= range_m)
+    return result[:n]
+
+
+@kernel(inline=True, leaf=True)
+def place_of(p: int, columns: int) -> tuple[int, int]:
+    """Return the row and column of a flat cell; to divide integers takes three times as long."""
+    i = int((p + 0.5) * (1.0 / columns))
+    return i, p - i * columns
+
+
+@kernel(leaf=True)
+def small_at(cells: Cells, depth_m: float) -> float:
+    """Return the number of cells of `SMALL_M2` at a depth, within reason."""
+    return float(min(max(SMALL_M2 * cells.lens.fx**2 / depth_m**2, 20.0), 75.0))
+
+
+@kernel
+def count_last(w: F4, labels: I4, size: int, range_m: float) -> I4:
+    """Return how many of the last readings before ``range_m`` the labels below ``size`` have.
+
+    Label 0 has none.
+    """
+    count = np.zeros(size, np.int64)
+    most = np.float32(1 / range_m + DISCONTINUITY / 2)
+    for i in range(w.shape[0]):
+        some = False
+        for j in range(w.shape[1]):
+            some |= (labels[i, j] > 0) & (w[i, j] < most)  # few rows have any; this vectorises
+        if not some:
+            continue
+        for j in range(w.shape[1]):
+            if labels[i, j] > 0 and w[i, j] < most:
+                count[labels[i, j]] += 1
+    return count
+
+
+@kernel
+def _average(depth: F4, factor: int, range_m: float, jump: float, w: F4) -> None:
+    """Write to ``w`` the inverse of the mean depth of the pixels near the nearest of each cell."""
+    if factor == 2:  # the usual case, in a form that vectorises
+        _average_two(depth, range_m, jump, w)
+        return
+    rows, columns = w.shape
+    zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
+    far, least = np.float32(1e9), np.float32(NEAREST_M)
+    # The pixels of a row of cells, sorted by their place in the cell: loops over these vectorise.
+    parts = np.zeros((factor * factor, columns), np.float32)
+    room = np.zeros((4, columns), np.float32)
+    nearest, limit, total, count = room[0], room[1], room[2], room[3]
+    for i in range(rows):
+        nearest[:] = far
+        for k in range(factor * factor):
+            x, part = k % factor, parts[k]
+            part[:] = depth[i * factor + k // factor, x : x + factor * columns : factor]
+            for j in range(columns):
+                z = part[j]
+                part[j] = z if (z >= least) & (z <= range_m) else far
+                nearest[j] = part[j] if part[j] < nearest[j] else nearest[j]
+        for j in range(columns):
+            # The depth that is one jump behind the nearest, in inverse depth.
+            slope = jump * nearest[j]
+            behind = nearest[j] / (one - (slope if slope < half else half))
+            limit[j] = behind if nearest[j] < far else zero
+        total[:], count[:] = zero, zero
+        for k in range(factor * factor):
+            part = parts[k]
+            for j in range(columns):
+                use = part[j] <= limit[j]
+                total[j] += part[j] if use else zero
+                count[j] += one if use else zero
+        out = w[i]
+        for j in range(columns):
+            out[j] = count[j] / total[j] if count[j] > zero else zero
+
+
+@kernel(leaf=True)
+def _average_two(depth: F4, range_m: float, jump: float, w: F4) -> None:
+    rows, columns = w.shape
+    zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
+    far, least = np.float32(1e9), np.float32(NEAREST_M)
+    for i in range(rows):
+        top, bottom, out = depth[2 * i], depth[2 * i + 1], w[i]
+        for j in range(columns):
+            a, b, c, d = top[2 * j], top[2 * j + 1], bottom[2 * j], bottom[2 * j + 1]
+            a = a if (a >= least) & (a <= range_m) else far
+            b = b if (b >= least) & (b <= range_m) else far
+            c = c if (c >= least) & (c <= range_m) else far
+            d = d if (d >= least) & (d <= range_m) else far
+            ab, cd = (a if a < b else b), (c if c < d else d)
+            nearest = ab if ab < cd else cd
+            slope = jump * nearest
+            limit = nearest / (one - (slope if slope < half else half))
+            limit = limit if nearest < far else zero
+            total = (a if a <= limit else zero) + (b if b <= limit else zero)
+            total += (c if c <= limit else zero) + (d if d <= limit else zero)
+            count = (one if a <= limit else zero) + (one if b <= limit else zero)
+            count += (one if c <= limit else zero) + (one if d <= limit else zero)
+            out[j] = count / total if nearest < far else zero

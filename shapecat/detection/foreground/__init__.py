@@ -1,0 +1,1 @@
+"""Foreground: which samples stand above a plane, where their height alone does not tell."""

@@ -1,0 +1,58 @@
+"""Hulls: the convex hull of a connected part of the cells, filled."""
+
+import math
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4
+from shapecat.detection.depth_grid import place_of
+from shapecat.jit import kernel
+
+__all__ = ["fill_hull"]
+
+
+@kernel
+def fill_hull(excess: F4, part: I4, stack: I4, count: int) -> int:
+    """Add the low cells within the convex hull of a part to it; return how many cells it has."""
+    rows, columns = excess.shape
+    parts = part.reshape(-1)
+    me = parts[stack[0]]
+    left, right = np.full(rows, columns, np.float64), np.full(rows, -1.0)
+    for t in range(count):
+        i, j = place_of(stack[t], columns)
+        left[i], right[i] = min(left[i], j), max(right[i], j)
+    first, last = 0, rows - 1
+    while right[first] < 0:
+        first += 1
+    while right[last] < 0:
+        last -= 1
+    right[:] = -right
+    _straighten(left, first, last)
+    _straighten(right, first, last)
+    top = count
+    for i in range(first, last + 1):
+        for j in range(math.ceil(left[i] - 1e-6), math.floor(1e-6 - right[i]) + 1):
+            if part[i, j] != me and excess[i, j] != 0:
+                stack[top] = i * columns + j
+                part[i, j] = me
+                top += 1
+    return top
+
+
+@kernel
+def _straighten(side: F8, first: int, last: int) -> None:
+    """Replace a side of an outline, by rows, with that of its hull, the largest convex one."""
+    corners = np.zeros(side.size, np.int32)
+    n = 0
+    for i in range(first, last + 1):
+        while n > 1:
+            a, b = corners[n - 2], corners[n - 1]
+            if (side[b] - side[a]) * (i - a) < (side[i] - side[a]) * (b - a):
+                break
+            n -= 1
+        corners[n] = i
+        n += 1
+    for k in range(1, n):
+        a, b = corners[k - 1], corners[k]
+        for i in range(a + 1, b):
+            side[i] = side[a] + (side[b] - side[a]) * (i - a) / (b - a)

@@ -1,0 +1,214 @@
+"""Waves: the slow swells of a flat surface, as sensors see it, levelled.
+
+They are higher than a plate is thick. What is left are steps and noise, which is measured.
+"""
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4
+from shapecat.geometry import DISCONTINUITY
+from shapecat.jit import kernel
+
+__all__ = ["APART", "EVERY", "cut_feet", "excess_of", "noise_of", "subtract_mean"]
+
+LOW_M = 0.03
+"""Higher things are objects anyway."""
+WINDOW = 20
+"""Cells to each side over which the mean is taken: more than a rim is wide, less than a wave."""
+MOST = 0.006
+"""Excess above which a cell counts no more in the mean, 1/m, lest it make a pit around it."""
+STEPS = 2**20
+"""Steps to 1/m of the sums, no more for a window of readings 1/m below the plane to fit 32 bits."""
+SLOPE = 0.0016
+"""Fall per cell of the side of something, 1/m."""
+APART = 5
+"""Cells over which rises are measured, of noise as of outlines."""
+BIN, BINS, EVERY = 2e-5, 500, 3
+"""How rises are counted: width of a bin, 1/m, their number, and every so many cells."""
+
+
+@kernel
+def excess_of(w: F4, owner: I4, height: F4, plane: F8, number: int, out: F4) -> int:
+    """Write the smoothed inverse depth above the plane of its low cells; 0 elsewhere.
+
+    Returns how many there are, but for those on the border of the image.
+    """
+    rows, columns = w.shape
+    zero = np.float32(0)
+    raw, mark = np.zeros((3, columns), np.float32), np.zeros((3, columns), np.float32)
+    total, count = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
+    n = 0
+    some = False
+    out[0, :] = out[rows - 1, :] = zero
+    for i in range(rows):
+        before = some
+        some = _find_low(w[i], owner[i], height[i], plane, number, i, raw[i % 3], mark[i % 3])
+        if i < 2:
+            continue
+        line = out[i - 1]
+        line[:] = zero
+        if not before:
+            continue
+        here, above, below = raw[(i - 1) % 3], raw[(i - 2) % 3], raw[i % 3]
+        for j in range(columns):
+            total[j] = here[j] + above[j] + below[j]
+        here, above, below = mark[(i - 1) % 3], mark[(i - 2) % 3], mark[i % 3]
+        for j in range(columns):
+            count[j] = here[j] + above[j] + below[j]
+        for j in range(1, columns - 1):
+            mean = (total[j - 1] + total[j] + total[j + 1]) / (
+                count[j - 1] + count[j] + count[j + 1]
+            )
+            line[j] = mean if here[j] > zero else zero
+        for j in range(1, columns - 1):
+            n += int(here[j])
+    return n
+
+
+@kernel(leaf=True)
+def _find_low(
+    w: F4, owner: I4, height: F4, plane: F8, number: int, i: int, raw: F4, mark: F4
+) -> bool:
+    """Write how far the low cells of row ``i`` are above the plane, and 1 for them, or else 0.
+
+    Returns whether there are any.
+    """
+    zero, one, low = np.float32(0), np.float32(1), np.float32(LOW_M)
+    slope, base = np.float32(plane[0]), np.float32(plane[1] * i + plane[2])
+    above, on = np.int8(number), np.int8(-number)
+    some = False
+    for j in range(w.size):
+        mine = ((owner[j] == above) | (owner[j] == on)) & (height[j] < low)
+        mark[j] = one if mine else zero
+        some |= mine
+    if some:
+        for j in range(w.size):
+            raw[j] = mark[j] * (w[j] - (slope * np.float32(j) + base))
+    else:
+        raw[:] = zero
+    return some
+
+
+@kernel
+def cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4, stack: I4, drop: F4) -> None:
+    """Clear the excess of the feet of what is not low: steep cells below it, down to the plane."""
+    rows, columns = excess.shape
+    top = 0
+    high, edge = np.float32(LOW_M), np.zeros(columns, np.bool_)
+    for i in range(1, rows - 1):
+        # Few cells are high and beside what is low, and this vectorises.
+        here, above, below = excess[i], excess[i - 1], excess[i + 1]
+        some = False
+        for j in range(1, columns - 1):
+            beside = (above[j] != 0) | (below[j] != 0) | (here[j - 1] != 0) | (here[j + 1] != 0)
+            edge[j] = beside & (owner[i, j] == number) & (height[i, j] >= high)
+            some |= edge[j]
+        if not some:
+            continue
+        for j in range(1, columns - 1):
+            if edge[j]:
+                for d in range(4):
+                    y = i + (1 if d == 0 else -1 if d == 1 else 0)
+                    x = j + (1 if d == 2 else -1 if d == 3 else 0)
+                    if excess[y, x] != 0 and abs(w[y, x] - w[i, j]) < DISCONTINUITY:
+                        stack[top], drop[top] = y * columns + x, excess[y, x]
+                        excess[y, x] = 0
+                        top += 1
+    done = 0
+    while done < top:
+        i, j = stack[done] // columns, stack[done] % columns
+        here = drop[done]
+        done += 1
+        for d in range(4):
+            y = i + (1 if d == 0 else -1 if d == 1 else 0)
+            x = j + (1 if d == 2 else -1 if d == 3 else 0)
+            if (
+                excess[y, x] != 0
+                and here - excess[y, x] > SLOPE
+                and abs(w[y, x] - w[i, j]) < DISCONTINUITY
+            ):
+                stack[top], drop[top] = y * columns + x, excess[y, x]
+                excess[y, x] = 0
+                top += 1
+
+
+@kernel
+def subtract_mean(excess: F4, relief: F4) -> None:
+    """Write the excess over its mean in a window around each low cell; 0 elsewhere.
+
+    The window slides: what enters it is added, what leaves it is taken away, down the rows for the
+    sums of the columns, and along a row for those of all its cells. Sums are of integers, which
+    take a quarter of the time of others in a row, and are exact.
+    """
+    rows, columns = excess.shape
+    sums = np.zeros(columns + 2 * WINDOW + 1, np.int32)
+    counts = np.zeros(sums.size, np.int32)
+    inside = slice(WINDOW + 1, WINDOW + 1 + columns)
+    total, count = np.zeros(columns, np.int32), np.zeros(columns, np.int32)
+    unit, zero = np.float32(1 / STEPS), np.float32(0)
+    for i in range(-WINDOW, rows):
+        entering, leaving = i + WINDOW, i - WINDOW - 1
+        if entering < rows:
+            _slide(excess[entering], np.int32(1), sums[inside], counts[inside])
+        if leaving >= 0:
+            _slide(excess[leaving], np.int32(-1), sums[inside], counts[inside])
+        if i < 0:
+            continue
+        here, out = excess[i], relief[i]
+        some = False
+        for j in range(columns):
+            some |= here[j] != zero
+        if not some:
+            out[:] = zero
+            continue
+        _add_windows(sums, counts, total, count)
+        for j in range(columns):
+            level = here[j] - unit * np.float32(total[j]) / np.float32(count[j])
+            out[j] = level if here[j] != zero else zero
+
+
+@kernel(leaf=True)
+def _slide(row: F4, sign: int, sums: I4, counts: I4) -> None:
+    """Add a row to the sums of the columns, or take it away."""
+    steps, most, least = np.float32(STEPS), np.float32(MOST), np.float32(-1)
+    for j in range(row.size):
+        value = row[j] if row[j] < most else most
+        sums[j] += sign * np.int32(steps * (value if value > least else least))
+        counts[j] += sign * np.int32(row[j] != 0)
+
+
+@kernel(leaf=True)
+def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
+    """Write the sums over the window around each column, and the counts, at least 1."""
+    width = 2 * WINDOW + 1
+    window = number = np.int32(0)
+    for j in range(width):
+        window += sums[j]
+        number += counts[j]
+    for j in range(total.size):
+        window += sums[j + width] - sums[j]
+        number += counts[j + width] - counts[j]
+        total[j], count[j] = window, max(number, 1)
+
+
+@kernel
+def noise_of(relief: F4, owner: I4, number: int) -> float:
+    """Return the median rise, 1/m, between cells of the plane as far apart as at an outline."""
+    rows, columns = relief.shape
+    histogram = np.zeros(BINS, np.int64)
+    n = 0
+    for i in range(0, rows - APART, EVERY):
+        for j in range(0, columns - APART, EVERY):
+            here = relief[i, j]
+            if owner[i, j] != -number or here == 0:
+                continue
+            for y, x in ((i + APART, j), (i, j + APART)):
+                if owner[y, x] == -number and relief[y, x] != 0:
+                    rise = abs(relief[y, x] - here)
+                    histogram[min(int(rise / BIN), BINS - 1)] += 1
+                    n += 1
+    below = bins = 0
+    while 2 * below < n:
+        below += histogram[bins]
+        bins += 1
+    return bins * BIN

@@ -1,0 +1,187 @@
+"""Reach: what stands on a plane and reaches over its outline.
+
+The outline is that of the readings: it ends before the far edge of a table where that is hidden,
+and at the front edge, over which things may stick out.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4, U1
+from shapecat.detection.depth_grid import Cells, Lens, place_of
+from shapecat.detection.foreground.walls import CLEARED
+from shapecat.detection.planes.height_map import LEAST_M, NOISE, Heights, inside
+from shapecat.geometry import DISCONTINUITY
+from shapecat.jit import kernel, unset
+
+__all__ = ["reach_over"]
+
+REACH_M = 0.15
+"""How far objects reach over an outline."""
+BEYOND = 5
+"""So many times as much of an object may be seen outside as inside."""
+
+
+class Search(NamedTuple):
+    """What is looked at around the outline of a plane.
+
+    Attributes
+    ----------
+    w, lens : as in `Cells`.
+    owner : as in `Heights`.
+    walls : from `clear_walls`.
+    me, plane : the number of the plane in ``owner``, and its row of `table_of`.
+    highest : so high above it an object reaches at most, metres.
+    outside : (rows, columns) float32 heights above it, metres, of the cells looked at.
+    noted : (rows, columns) int8 its number at these.
+    """
+
+    w: F4
+    lens: Lens
+    owner: I4
+    walls: U1
+    me: int
+    plane: F8
+    highest: float
+    outside: F4
+    noted: I4
+
+
+@kernel
+def reach_over(cells: Cells, heights: Heights, planes: F8, walls: U1, highest_m: float) -> None:
+    """Give the parts of objects outside the outline of their plane to it, in place.
+
+    A part is what is connected to object cells inside, and not many times larger than what is
+    inside: a wall behind a table does not stand on it.
+
+    Parameters
+    ----------
+    planes : the rows of `table_of`.
+    walls : from `clear_walls`; what is cleared stays so.
+    """
+    w, lens, owner = cells.w, cells.lens, heights.owner
+    outside, noted = unset(owner.shape, np.float32), np.zeros(owner.shape, np.int8)
+    seen, stacks = np.zeros(owner.shape, np.int32), unset((2, w.size), np.int32)
+    looks = np.int64(0)  # a literal would be compiled apart
+    for me in range(len(planes), 0, -1):
+        search = Search(w, lens, owner, walls, me, planes[me - 1], highest_m, outside, noted)
+        looks = _reach(search, heights.height, seen, looks, stacks)
+
+
+@kernel
+def _reach(search: Search, height: F4, seen: I4, looks: int, stacks: I4) -> int:
+    """Add the parts outside one plane; return how many there were looked at, ``looks`` included."""
+    w, owner, me = search.w, search.owner, search.me
+    rows, columns = w.shape
+    border = np.zeros(columns, np.uint8)
+    for i in range(rows):
+        if not _find_border(owner, me, i, border):
+            continue
+        for j in range(columns):
+            if border[j] == 0:
+                continue
+            for d in range(4):
+                y = i + (1 if d == 0 else -1 if d == 1 else 0)
+                x = j + (1 if d == 2 else -1 if d == 3 else 0)
+                if not _leads_out(search, i, j, y, x):
+                    continue
+                looks += 1
+                n = _part_outside(search, y, x, stacks[0])
+                enough = max(n // BEYOND, 1)
+                if _part_inside(w, owner, me, seen, looks, i, j, enough, stacks[1]) < enough:
+                    continue
+                for t in range(n):
+                    v, u = place_of(stacks[0, t], columns)
+                    owner[v, u] = me
+                    height[v, u] = search.outside[v, u]
+    return looks
+
+
+@kernel(leaf=True)
+def _find_border(owner: I4, me: int, i: int, border: U1) -> bool:
+    """Mark the cells of a row above a plane that are beside cells of lower planes or of none.
+
+    Returns
+    -------
+    Whether there are any.
+    """
+    rows, columns = owner.shape
+    above, here, below = owner[max(i - 1, 0)], owner[i], owner[min(i + 1, rows - 1)]
+    mine = np.uint8(me)  # without a sign what lies on a surface is larger
+    for j in range(columns):
+        lower = (np.uint8(above[j]) < mine) | (np.uint8(below[j]) < mine)
+        border[j] = lower & (np.uint8(here[j]) == mine)
+    for j in range(columns - 1):
+        border[j] |= (np.uint8(here[j]) == mine) & (np.uint8(here[j + 1]) < mine)
+    for j in range(columns - 1):
+        border[j + 1] |= (np.uint8(here[j + 1]) == mine) & (np.uint8(here[j]) < mine)
+    some = np.uint8(0)
+    for j in range(columns):
+        some |= border[j]
+    return bool(some > 0)
+
+
+@kernel(leaf=True)
+def _leads_out(search: Search, i: int, j: int, y: int, x: int) -> bool:
+    """Whether what stands on a plane goes on from (i, j) to (y, x) outside; notes its height if so.
+
+    There it is above a lower plane or none, and not noted before.
+    """
+    w, lens, owner, walls, me, plane, highest, outside, noted = search
+    if y < 0 or x < 0 or y >= w.shape[0] or x >= w.shape[1]:
+        return False
+    if not 0 <= owner[y, x] < me or abs(w[y, x] - w[i, j]) >= DISCONTINUITY:
+        return False
+    if w[y, x] <= 0 or walls[y, x] == CLEARED or noted[y, x] == me:
+        return False
+    z = 1 / w[y, x]
+    h = (w[y, x] - (plane[0] * x + plane[1] * y + plane[2])) * z * plane[3]
+    if not (LEAST_M + NOISE * z * z < h < highest):
+        return False
+    if not inside(plane, (x - lens.cx) / lens.fx * z, (y - lens.cy) / lens.fy * z, z, REACH_M):
+        return False
+    outside[y, x], noted[y, x] = h, me
+    return True
+
+
+@kernel(leaf=True)
+def _part_outside(search: Search, i: int, j: int, stack: I4) -> int:
+    """Collect the connected cells outside, from one that is above the plane; return how many."""
+    columns = search.w.shape[1]
+    stack[0] = i * columns + j
+    done, top = 0, 1
+    while done < top:
+        i, j = place_of(stack[done], columns)
+        done += 1
+        for d in range(4):
+            y = i + (1 if d == 0 else -1 if d == 1 else 0)
+            x = j + (1 if d == 2 else -1 if d == 3 else 0)
+            if _leads_out(search, i, j, y, x):
+                stack[top] = y * columns + x
+                top += 1
+    return top
+
+
+@kernel(leaf=True)
+def _part_inside(
+    w: F4, owner: I4, me: int, seen: I4, look: int, i: int, j: int, most: int, stack: I4
+) -> int:
+    """Count the connected object cells inside, up to ``most``."""
+    rows, columns = w.shape
+    stack[0] = i * columns + j
+    seen[i, j] = look
+    done, top = 0, 1
+    while done < top < most:
+        i, j = place_of(stack[done], columns)
+        done += 1
+        for d in range(4):
+            y = i + (1 if d == 0 else -1 if d == 1 else 0)
+            x = j + (1 if d == 2 else -1 if d == 3 else 0)
+            if y < 0 or x < 0 or y >= rows or x >= columns or owner[y, x] != me:
+                continue
+            if seen[y, x] != look and abs(w[y, x] - w[i, j]) < DISCONTINUITY:
+                seen[y, x] = look
+                stack[top] = y * columns + x
+                top += 1
+    return top

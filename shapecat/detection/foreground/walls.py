@@ -1,0 +1,195 @@
+"""Walls: vertical planes that are too large for an object."""
+
+import math
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4, U1
+from shapecat.detection.depth_grid import BORDER, Cells, Lens
+from shapecat.detection.planes.ransac import (
+    TOLERANCE,
+    Readings,
+    consensus,
+    normal_of,
+    readings_of,
+    without,
+)
+from shapecat.geometry import DISCONTINUITY, cross
+from shapecat.jit import kernel, unset
+
+__all__ = ["CLEARED", "ON_WALL", "clear_walls"]
+
+ON_WALL, CLEARED = 1, 2
+"""Cells on a wall; the former are of a small part, which may be an object the wall goes through."""
+UNSEEN = 3
+"""Cells on a wall whose part is not known yet."""
+
+MOST_WALLS, MOST_BEYOND, LEAST_READINGS = 5, 1, 50
+"""So many walls are looked for where objects may be, and beyond, as long as so many readings are
+left; this bounds the time."""
+VERTICAL_COS = 0.2
+"""Largest cosine between up and the normal of a wall."""
+LEAST_AREA_M2, LEAST_PART_M2, LEAST_WALL_M2 = 0.05, 0.04, 0.1
+"""Least area of a wall, of a connected part of it that is cleared, and of these parts together."""
+LEAST_PATCH_M2, EXACT = 0.008, 0.0045
+"""Smaller parts are cleared that lie in the wall as exactly as its readings do: standard deviation
+in inverse depth."""
+CUT_OFF = 0.75
+"""Diagonal of a wall that two sides of the image cut off, as a share of the width of the largest
+object."""
+FILLED = 0.3
+"""Share of its extent that a wall fills: the front edges of a shelf lie in a plane too."""
+STRIP_M, STRIPS = 0.05, 400
+"""Width of the strips whose area is summed to find the extent of a wall, and their number."""
+
+
+@kernel
+def clear_walls(cells: Cells, owner: I4, up: F8, largest_m: float, draws: F8) -> U1:
+    """Take the cells on walls from the object cells of ``owner`` (rows, columns), in place.
+
+    ``draws`` are of `draws_of`.
+
+    Returns
+    -------
+    (rows, columns) uint8 `CLEARED` or `ON_WALL` on walls, 0 elsewhere. A plane through the fronts
+    of many objects looks like a wall too, but all its parts are small.
+    """
+    walls = np.zeros(owner.shape, np.uint8)
+    _take(cells, owner, readings_of(cells.w, owner), MOST_WALLS, up, largest_m, draws, walls)
+    # Of a wall behind a table most may be out of the reach of objects, and a corner in it.
+    beyond = readings_of(cells.w, (owner == 0) & (walls == 0))
+    _take(cells, owner, beyond, MOST_BEYOND, up, largest_m, draws, walls)
+    return walls
+
+
+@kernel
+def _take(
+    cells: Cells,
+    owner: I4,
+    readings: Readings,
+    most: int,
+    up: F8,
+    largest_m: float,
+    draws: F8,
+    walls: U1,
+) -> None:
+    """Take the vertical plane with most readings, if it is a wall, then that with most others."""
+    lens, vertical = cells.lens, (-VERTICAL_COS, VERTICAL_COS)
+    for _ in range(most):
+        plane, count = consensus(readings, draws, lens, up, vertical, TOLERANCE)
+        if count < LEAST_READINGS:
+            return
+        normal = normal_of(plane, lens)
+        if _is_wall(cells, readings, plane, normal, up, largest_m):
+            _clear(cells.w, lens, owner, plane, normal, walls)
+        readings = without(readings, plane, 2 * TOLERANCE)
+
+
+@kernel
+def _is_wall(
+    cells: Cells, readings: Readings, plane: F8, normal: F8, up: F8, largest_m: float
+) -> bool:
+    """Whether the inliers of a plane are more than the face of an object."""
+    across = cross(normal, up)
+    strips = np.zeros((2, STRIPS))
+    area = readings.share * _measure(readings, cells.lens, plane, normal, across, up, strips)
+    # A strip of 5 cm counts that holds 5 cm of wall.
+    full = readings.share * strips > STRIP_M**2
+    width, height = STRIP_M * np.sum(full[0]), STRIP_M * np.sum(full[1])
+    if area <= LEAST_AREA_M2 or area <= FILLED * width * height:
+        return False
+    if math.hypot(width, height) > CUT_OFF * largest_m and _is_cut_off(cells.w, readings, plane):
+        return True
+    return bool(max(width, height) > largest_m)
+
+
+@kernel
+def _is_cut_off(w: F4, readings: Readings, plane: F8) -> bool:
+    """Whether the inliers of a plane reach two sides of the image, or of its readings near them."""
+    off = readings.w - (plane[0] * readings.j + plane[1] * readings.i + plane[2])
+    near, everything = np.abs(off) < TOLERANCE, readings_of(w, w)
+    across = (readings.j[near], everything.j, w.shape[1])
+    down = (readings.i[near], everything.i, w.shape[0])
+    sides, margin = 0, 1.5 * math.sqrt(readings.share)
+    for own, seen, lines in (across, down):
+        sides += np.min(own) < min(np.min(seen) + margin, BORDER * lines)
+        sides += np.max(own) > max(np.max(seen) - margin, (1 - BORDER) * lines)
+    return sides >= 2
+
+
+@kernel(leaf=True)
+def _measure(
+    readings: Readings, lens: Lens, plane: F8, normal: F8, across: F8, up: F8, strips: F8
+) -> float:
+    """Return the area of the inliers of a plane; add it to the strips they lie in."""
+    total = 0.0
+    for k in range(readings.w.size):
+        j, i, v = readings.j[k], readings.i[k], readings.w[k]
+        if abs(v - (plane[0] * j + plane[1] * i + plane[2])) >= TOLERANCE:
+            continue
+        z = 1.0 / v
+        x, y = (j - lens.cx) / lens.fx, (i - lens.cy) / lens.fy
+        facing = -(x * normal[0] + y * normal[1] + normal[2])
+        area = z * z / (lens.fx * lens.fy) / max(facing, 0.1)
+        total += area
+        for d, axis in enumerate((across, up)):
+            along = (axis[0] * x + axis[1] * y + axis[2]) * z
+            strip = math.floor(along / STRIP_M) + STRIPS // 2
+            strips[d, min(max(strip, 0), STRIPS - 1)] += area
+    return total
+
+
+@kernel
+def _clear(w: F4, lens: Lens, owner: I4, plane: F8, normal: F8, walls: U1) -> None:
+    """Take the connected parts of a wall that are large; others may be objects before it."""
+    rows, columns = w.shape
+    stack = unset(w.size, np.int32)
+    found = unset(w.shape, np.uint8)
+    _mark(w, owner, plane, found)
+    total = 0.0
+    for si in range(rows):
+        for sj in range(columns):
+            if found[si, sj] != UNSEEN:
+                continue
+            stack[0] = si * columns + sj
+            found[si, sj] = ON_WALL
+            done, top, area, off = 0, 1, 0.0, 0.0
+            while done < top:
+                i, j = stack[done] // columns, stack[done] % columns
+                done += 1
+                x, y = (j - lens.cx) / lens.fx, (i - lens.cy) / lens.fy
+                facing = -(x * normal[0] + y * normal[1] + normal[2])
+                area += 1 / (w[i, j] * w[i, j] * lens.fx * lens.fy * max(facing, 0.1))
+                off += (w[i, j] - (plane[0] * j + plane[1] * i + plane[2])) ** 2
+                for d in range(4):
+                    v = i + (1 if d == 0 else -1 if d == 1 else 0)
+                    u = j + (1 if d == 2 else -1 if d == 3 else 0)
+                    if v < 0 or u < 0 or v >= rows or u >= columns or found[v, u] != UNSEEN:
+                        continue
+                    found[v, u] = ON_WALL
+                    stack[top] = v * columns + u
+                    top += 1
+            if area >= LEAST_PART_M2 or (area >= LEAST_PATCH_M2 and off < top * EXACT**2):
+                total += area
+                for t in range(top):
+                    found[stack[t] // columns, stack[t] % columns] = CLEARED
+    if total < LEAST_WALL_M2:
+        return
+    np.maximum(walls, found, walls)
+    for i in range(rows):
+        owners, states = owner[i], found[i]
+        for j in range(columns):
+            owners[j] = 0 if states[j] == CLEARED else owners[j]
+
+
+@kernel(leaf=True)
+def _mark(w: F4, owner: I4, plane: F8, found: U1) -> None:
+    """Mark as unseen the cells on a wall that are no part of a level plane, as 0 the others."""
+    a = np.float32(plane[0])
+    for i in range(w.shape[0]):
+        values, owners, states = w[i], owner[i], found[i]
+        at_row = np.float32(plane[1] * i + plane[2])
+        for j in range(w.shape[1]):
+            off = abs(values[j] - (a * np.float32(j) + at_row))
+            on = (owners[j] >= 0) & (values[j] > 0) & (off < np.float32(DISCONTINUITY))
+            states[j] = UNSEEN if on else 0

@@ -1,0 +1,1 @@
+"""Merging: segments that are of one object come together again."""

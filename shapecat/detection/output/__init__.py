@@ -1,0 +1,1 @@
+"""Output: labels at full resolution, boxes, what stands on what, the scene."""

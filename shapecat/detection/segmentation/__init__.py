@@ -1,0 +1,1 @@
+"""Over-segmentation: surfaces are parted at depth discontinuities and concave edges."""

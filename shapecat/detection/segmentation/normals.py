@@ -1,0 +1,186 @@
+"""Tangents: least-squares planes around the object cells, many cells at a time.
+
+Numba's compiler handles 16 cells at once only where it knows that arrays do not overlap, which
+takes few arrays with constant distances. So the windows of a run of cells are copied to a buffer of
+fixed width first, and the sums of each cell stay in registers.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import F4, I4
+from shapecat.detection.depth_grid import Lens
+from shapecat.jit import kernel
+
+__all__ = ["fit_tangents", "padded"]
+
+WINDOW = 3
+"""Half the edge of the window a tangent plane is fitted to, in cells."""
+SIDE = 2 * WINDOW + 1
+GATE, GATE_SLOPE = 0.008, 0.008
+"""A sample of the fit lies within this of the centre, plus the slope times its distance."""
+LEAST_SAMPLES, LEAST_SPREAD = 5, 0.2
+RUN, BRIDGED = 128, 8
+"""Most cells in a run, and gaps of other cells that are part of it."""
+LANES = 8
+"""Runs are fitted in multiples of this, for what remains is not vectorised."""
+NONE = 1e9
+"""In place of the inverse depth of what is no sample."""
+PITCH = RUN + 2 * WINDOW
+"""Width of a row of the buffers."""
+
+
+@kernel
+def fit_tangents(w: F4, lens: Lens, owner: I4, spans: I4, tangent: F4, normal: F4) -> None:
+    """Write the tangent planes and normals of the object cells, as in `Surfaces`.
+
+    A plane is fitted to a checkerboard of 25 cells of the same owner; weights are 0 or 1. The
+    object cells of each row lie within ``spans``.
+    """
+    values = np.zeros(SIDE * PITCH, np.float32)
+    fits = np.zeros(6 * PITCH, np.float32)
+    for i in range(owner.shape[0]):
+        end, last = spans[i]
+        while end < last:
+            start, end = _next_run(owner[i], end, last)
+            _copy_windows(w, owner, i, start, end, values)
+            _fit_run(values, lens, i, start, padded(start, end) - start, fits)
+            _write(fits, tangent, normal, i, start, end)
+
+
+@kernel(inline=True, leaf=True)
+def padded(start: int, end: int) -> int:
+    """Return the end of the run from ``start`` on made a multiple of `LANES` long."""
+    return start + (end - start + LANES - 1) // LANES * LANES
+
+
+@kernel(leaf=True)
+def _write(fits: F4, tangent: F4, normal: F4, i: int, start: int, end: int) -> None:
+    for d in range(3):
+        one, other = tangent[i, d, start:end], normal[i, d, start:end]
+        for k in range(one.size):
+            one[k], other[k] = fits[d * PITCH + k], fits[(3 + d) * PITCH + k]
+
+
+@kernel(leaf=True)
+def _next_run(owner: I4, j: int, last: int) -> tuple[int, int]:
+    """Return the columns from and before which the next object cells of one owner in a row lie.
+
+    There are some before ``last``.
+    """
+    while owner[j] <= 0:
+        j += 1
+    start = end = j
+    me, last = owner[j], min(last, start + RUN)
+    while j < min(last, end + BRIDGED) and (owner[j] <= 0 or owner[j] == me):
+        end = j + 1 if owner[j] == me else end
+        j += 1
+    return start, end
+
+
+@kernel(leaf=True)
+def _copy_windows(w: F4, owner: I4, i: int, start: int, end: int, values: F4) -> None:
+    """Copy the rows around a run and `WINDOW` cells more at its ends; `NONE` for other owners."""
+    rows, columns = owner.shape
+    me, none = owner[i, start], np.float32(NONE)
+    left, right = max(start - WINDOW, 0), min(end + WINDOW, columns)
+    for d in range(SIDE):
+        y, first = i + d - WINDOW, d * PITCH
+        some = values[first : first + end - start + 2 * WINDOW]
+        some[:] = none
+        if 0 <= y < rows:
+            some = some[left - start + WINDOW :]
+            value, whose = w[y, left:right], owner[y, left:right]
+            for k in range(value.size):
+                some[k] = value[k] if whose[k] == me else none
+
+
+@kernel(fast=True, leaf=True)
+def _fit_run(values: F4, lens: Lens, i: int, start: int, n: int, fits: F4) -> None:
+    """Fit planes to the windows of ``n`` cells from (i, ``start``) on.
+
+    Rows of ``fits``: inverse depth, its two slopes, and the normal; 0 where there is no fit.
+    """
+    zero, one = np.float32(0), np.float32(1)
+    least, spread = np.float32(LEAST_SAMPLES), np.float32(LEAST_SPREAD)
+    fx, fy, y = np.float32(lens.fx), np.float32(lens.fy), np.float32(i - lens.cy)
+    for k in range(n):
+        p = k + WINDOW
+        center = values[WINDOW * PITCH + p]
+        # (1) sums over the rows of the window: 1, x, x x, v, x v
+        n0, x0, xx0, v0, xv0 = _four(values, p, center, 3, 3)
+        n1, x1, xx1, v1, xv1 = _three(values, PITCH + p, center, 2, 2)
+        n2, x2, xx2, v2, xv2 = _four(values, 2 * PITCH + p, center, 3, 1)
+        n3, x3, xx3, v3, xv3 = _three(values, 3 * PITCH + p, center, 2, 0)
+        n4, x4, xx4, v4, xv4 = _four(values, 4 * PITCH + p, center, 3, 1)
+        n5, x5, xx5, v5, xv5 = _three(values, 5 * PITCH + p, center, 2, 2)
+        n6, x6, xx6, v6, xv6 = _four(values, 6 * PITCH + p, center, 3, 3)
+        # (2) means and moments over the window
+        count = n0 + n1 + n2 + n3 + n4 + n5 + n6
+        share = one / max(count, one)
+        mx = (x0 + x1 + x2 + x3 + x4 + x5 + x6) * share
+        my = _times_row(n0, n1, n2, n4, n5, n6) * share
+        mv = (v0 + v1 + v2 + v3 + v4 + v5 + v6) * share
+        xx = (xx0 + xx1 + xx2 + xx3 + xx4 + xx5 + xx6) * share - mx * mx
+        xy = _times_row(x0, x1, x2, x4, x5, x6) * share - mx * my
+        yy = (np.float32(9) * (n0 + n6) + np.float32(4) * (n1 + n5) + n2 + n4) * share - my * my
+        xv = (xv0 + xv1 + xv2 + xv3 + xv4 + xv5 + xv6) * share - mx * mv
+        yv = _times_row(v0, v1, v2, v4, v5, v6) * share - my * mv
+        # (3) the plane, and its normal in the sensor frame
+        determinant = xx * yy - xy * xy
+        sound = (center < np.float32(NONE)) & (count >= least) & (determinant >= spread)
+        scale = one / (determinant if sound else one)
+        gx, gy = (xv * yy - yv * xy) * scale, (yv * xx - xv * xy) * scale
+        level = center + mv - gx * mx - gy * my
+        nx, ny = -fx * gx, -fy * gy
+        nz = gx * np.float32(start + k - lens.cx) + gy * y - level
+        sound &= level > zero
+        length = np.sqrt(nx * nx + ny * ny + nz * nz)
+        unit = one / (length if length > zero else one)
+        fits[k] = level if sound else zero
+        fits[PITCH + k], fits[2 * PITCH + k] = gx if sound else zero, gy if sound else zero
+        unit = unit if sound else zero
+        fits[3 * PITCH + k], fits[4 * PITCH + k] = nx * unit, ny * unit
+        fits[5 * PITCH + k] = nz * unit
+
+
+@kernel(fast=True, inline=True)
+def _times_row(a: float, b: float, c: float, e: float, f: float, g: float) -> Any:
+    """Return the sum of what is known of each row but the middle one, times its place."""
+    return np.float32(3) * (g - a) + np.float32(2) * (f - b) + (e - c)
+
+
+@kernel(fast=True, inline=True)
+def _four(
+    values: F4, p: int, center: float, far: int, near: int
+) -> tuple[float, float, float, float, float]:
+    """Return the sums over a row of a window sampled at -3, -1, 1 and 3 columns from ``p``."""
+    a, va = _sample(values, p - 3, center, far)
+    b, vb = _sample(values, p - 1, center, near)
+    c, vc = _sample(values, p + 1, center, near)
+    d, vd = _sample(values, p + 3, center, far)
+    three, nine = np.float32(3), np.float32(9)
+    x, xx = three * (d - a) + (c - b), nine * (a + d) + (b + c)
+    return a + b + c + d, x, xx, va + vb + vc + vd, three * (vd - va) + (vc - vb)
+
+
+@kernel(fast=True, inline=True)
+def _three(
+    values: F4, p: int, center: float, far: int, near: int
+) -> tuple[float, float, float, float, float]:
+    """Return the sums over a row of a window sampled at -2, 0 and 2 columns from ``p``."""
+    a, va = _sample(values, p - 2, center, far)
+    b, vb = _sample(values, p, center, near)
+    c, vc = _sample(values, p + 2, center, far)
+    two = np.float32(2)
+    return a + b + c, two * (c - a), two * two * (a + c), va + vb + vc, two * (vc - va)
+
+
+@kernel(fast=True, inline=True)
+def _sample(values: F4, p: int, center: float, distance: int) -> tuple[Any, Any]:
+    """Return the weight of a sample, and by that how much it differs from the centre."""
+    v = values[p] - center
+    use = abs(v) < np.float32(GATE + GATE_SLOPE * distance)
+    weight = np.float32(1) if use else np.float32(0)
+    return weight, weight * v

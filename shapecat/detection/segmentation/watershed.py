@@ -1,0 +1,212 @@
+"""Regions: pieces of surface bounded by jumps and concave edges."""
+
+import numpy as np
+
+from shapecat.arrays import F4, I4, U1
+from shapecat.detection.planes.height_map import Heights
+from shapecat.detection.segmentation.connectivity import DOWN, RIGHT, Surfaces
+from shapecat.jit import kernel, unset
+
+__all__ = ["cut_above", "regions_of", "rename"]
+
+EDGE_DEG = 27
+"""Concave angle that may part two objects; a bowl of 7 cm turns 16 degrees over the same cells."""
+WEAK_DEG, NO_EDGE_DEG = 17, 256
+"""Concave angle that continues such an edge; one that no edge has, for angles are in 8 bits."""
+RIDGE, RIDGE_CELLS = 0.5, 5
+"""Share of its angle that is left of an edge so far to either side of it."""
+LEAST_CELLS, MOST_REGIONS = 12, 250
+"""Smaller parts are scraps, that belong to what is around them; the number bounds the time."""
+BUCKET_DEG = 4
+"""Angles that differ less are flooded in one go."""
+
+
+@kernel
+def regions_of(heights: Heights, surfaces: Surfaces, concave: bool) -> tuple[I4, int]:  # noqa: FBT001  compiled kernels take their arguments by position
+    """Label the object cells: (rows, columns) int16 labels 1..n, 0 elsewhere, and n.
+
+    Flat cells that are linked make a seed; a flood from the seeds, flattest cells first, gives
+    the cells of an edge to its sides (Meyer 1991). With ``concave`` off only jumps part regions.
+    """
+    owner, links, edge, spans = heights.owner, surfaces.links, surfaces.edge, surfaces.spans
+    labels = np.zeros(owner.shape, np.int16)
+    barrier = np.zeros(owner.shape, np.uint8)
+    stack, part = unset(owner.size, np.int32), unset(owner.shape, np.int32)
+    _creases(edge, spans, EDGE_DEG if concave else NO_EDGE_DEG, barrier, stack)
+    n = _flat_parts(owner, spans, links, barrier, labels, np.int64(0), part)
+    _flood(links, edge, spans, labels, stack)
+    barrier[:] = 0
+    return labels, _flat_parts(owner, spans, links, barrier, labels, n, part)
+
+
+@kernel(leaf=True)
+def _creases(edge: U1, spans: I4, strong: int, barrier: U1, stack: I4) -> None:
+    """Mark strong concave edges, and weaker ones that continue them (hysteresis, Canny 1986)."""
+    rows, columns = edge.shape
+    top = 0
+    for i in range(rows):
+        for j in range(spans[i, 0], spans[i, 1]):
+            if edge[i, j] >= strong:
+                barrier[i, j] = 1
+                stack[top] = i * columns + j
+                top += 1
+    while top > 0:
+        top -= 1
+        i, j = stack[top] // columns, stack[top] % columns
+        for y in range(max(i - 1, 0), min(i + 2, rows)):
+            for x in range(max(j - 1, 0), min(j + 2, columns)):
+                if barrier[y, x] == 0 and edge[y, x] >= WEAK_DEG and _is_ridge(edge, y, x):
+                    barrier[y, x] = 1
+                    stack[top] = y * columns + x
+                    top += 1
+
+
+@kernel(leaf=True)
+def _is_ridge(edge: U1, i: int, j: int) -> bool:
+    """Whether an edge falls off on two opposite sides; inside a bowl it does not."""
+    rows, columns = edge.shape
+    least = RIDGE * edge[i, j]
+    for d in range(4):
+        di = 0 if d == 0 else RIDGE_CELLS
+        dj = RIDGE_CELLS if d == 0 else (0 if d == 1 else (RIDGE_CELLS if d == 2 else -RIDGE_CELLS))
+        if (
+            i - di < 0
+            or i + di >= rows
+            or min(j - dj, j + dj) < 0
+            or max(j - dj, j + dj) >= columns
+        ):
+            continue
+        if edge[i - di, j - dj] < least and edge[i + di, j + dj] < least:
+            return True
+    return False
+
+
+@kernel
+def _flat_parts(owner: I4, spans: I4, links: U1, barrier: U1, labels: I4, n: int, part: I4) -> int:
+    """Label linked unlabelled cells that are no barrier, from ``n`` + 1 on; return the last label.
+
+    Two passes with a table of equivalent labels (Rosenfeld and Pfaltz 1966). Small parts get none.
+    ``part`` (rows, columns) is room: links do not lead out of the spans, all of which is written.
+    """
+    rows = owner.shape[0]
+    room = rows + 2  # a row has at most one first label in two cells
+    for i in range(rows):
+        room += (spans[i, 1] - spans[i, 0]) // 2
+    parent, size = np.zeros(room, np.int32), np.zeros(room, np.int32)
+    count = 0
+    # (1) first labels, and which of them meet
+    for i in range(rows):
+        for j in range(spans[i, 0], spans[i, 1]):
+            part[i, j] = 0
+            if owner[i, j] <= 0 or labels[i, j] > 0 or barrier[i, j]:
+                continue
+            me = part[i, j - 1] if j > 0 and links[i, j - 1] & RIGHT else 0
+            above = part[i - 1, j] if i > 0 and links[i - 1, j] & DOWN else 0
+            if me == 0 and above == 0:
+                count += 1
+                parent[count] = me = count
+            elif me == 0:
+                me = above
+            elif above > 0 and above != me:
+                a, b = _root(parent, me), _root(parent, above)
+                parent[max(a, b)] = me = min(a, b)
+            part[i, j] = me
+            size[me] += 1
+    # (2) final labels, in the order of their first cells
+    for k in range(count, 0, -1):
+        size[parent[k]] += size[k] if parent[k] != k else 0
+    name = np.zeros(count + 1, np.int16)
+    for k in range(1, count + 1):
+        if parent[k] != k:
+            name[k] = name[parent[k]]
+        elif size[k] >= LEAST_CELLS and n < MOST_REGIONS:
+            n += 1
+            name[k] = n
+    for i in range(rows):
+        for j in range(spans[i, 0], spans[i, 1]):
+            if part[i, j] > 0:
+                labels[i, j] = name[part[i, j]]
+    return n
+
+
+@kernel(leaf=True)
+def _root(parent: I4, k: int) -> int:
+    while parent[k] != k:
+        k = parent[k]
+    return k
+
+
+@kernel(leaf=True)
+def _neighbour(p: int, d: int, columns: int, links: U1) -> int:
+    """Return the linked neighbour of cell ``p`` in direction ``d``, or -1.
+
+    No link leads over the border of the image.
+    """
+    if d == 0:
+        return p + 1 if links[p] & RIGHT else -1
+    if d == 1:
+        return p + columns if links[p] & DOWN else -1
+    if d == 2:
+        return p - 1 if p > 0 and links[p - 1] & RIGHT else -1
+    return p - columns if p >= columns and links[p - columns] & DOWN else -1
+
+
+@kernel
+def _flood(links: U1, edge: U1, spans: I4, labels: I4, following: I4) -> None:
+    """Grow the labels over links, cells with small concave angles first.
+
+    ``following`` (cells,) is room for the next cell of the same queue.
+    """
+    columns = labels.shape[1]
+    flat_links, flat_edge, flat = links.reshape(-1), edge.reshape(-1), labels.reshape(-1)
+    buckets = 256 // BUCKET_DEG
+    head = np.full(buckets, -1, np.int32)
+    tail = np.full(buckets, -1, np.int32)
+    for i in range(labels.shape[0]):
+        for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
+            if flat[p] <= 0:
+                continue
+            for d in range(4):
+                q = _neighbour(p, d, columns, flat_links)
+                if q >= 0 and flat[q] <= 0:
+                    if head[0] < 0:
+                        head[0] = p
+                    else:
+                        following[tail[0]] = p
+                    tail[0], following[p] = p, -1
+                    break
+    now = 0
+    while now < buckets:
+        p = head[now]
+        if p < 0:
+            now += 1
+            continue
+        head[now] = following[p]
+        for d in range(4):
+            q = _neighbour(p, d, columns, flat_links)
+            if q < 0 or flat[q] > 0:
+                continue
+            flat[q] = flat[p]
+            level = max(now, flat_edge[q] // BUCKET_DEG)
+            if head[level] < 0:
+                head[level] = q
+            else:
+                following[tail[level]] = q
+            tail[level], following[q] = q, -1
+
+
+@kernel(leaf=True)
+def rename(labels: I4, spans: I4, names: I4) -> None:
+    """Give labels (rows, columns) their new names (n,), in place; that of 0 is 0."""
+    for i in range(labels.shape[0]):
+        for j in range(spans[i, 0], spans[i, 1]):
+            labels[i, j] = names[labels[i, j]]
+
+
+@kernel(leaf=True)
+def cut_above(labels: I4, spans: I4, height: F4, label: int, level: float, name: int) -> None:
+    """Give the cells of a label that are higher than a level, metres, another name, in place."""
+    for i in range(labels.shape[0]):
+        for j in range(spans[i, 0], spans[i, 1]):
+            if labels[i, j] == label and height[i, j] > level:
+                labels[i, j] = name

@@ -1,0 +1,268 @@
+"""Views: an unorganized cloud as the image a depth camera would have taken of it."""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4
+from shapecat.detection.depth_grid import CELL_M, Cells, Lens
+from shapecat.geometry import DISCONTINUITY, NEAREST_M, gravity_rotation
+from shapecat.jit import kernel
+from shapecat.types import Pose
+
+__all__ = ["View", "overview_of", "view_of"]
+
+FIELD = 1.5
+"""Largest tangent of the angle between a point and the optical axis."""
+OUTSIDE = 9.0
+"""In place of the tangent of a point that is not in view."""
+MOST_CELLS = 400_000
+MOST_ROWS = 2000
+LEAST_POINTS = 100
+FARTHEST_M = 100.0
+LOAD = 1.8
+"""Points per occupied cell: with fewer, a surface has holes."""
+
+
+class View(NamedTuple):
+    """A cloud in a virtual camera.
+
+    Attributes
+    ----------
+    cells : the image of the nearest points.
+    points : (n, 3) float32 in the frame of the virtual camera; 0 where not used.
+    cell : (n,) int32 flat cell of each point, -1 outside.
+    view_from_sensor : pose of the cloud in the frame of the virtual camera.
+    crowded : share of the points that lie well behind others of their cell.
+    """
+
+    cells: Cells
+    points: F4
+    cell: I4
+    view_from_sensor: Pose
+    crowded: float
+
+
+def view_of(points: F4, *, range_m: float, origin: F8 | None = None) -> View | None:
+    """Look at ``points`` (n, 3), sensor frame, from ``origin``; None if there are too few.
+
+    The optical axis points at the middle of the cloud; the cells are as wide as the points are
+    apart, and not narrower than those of depth images.
+    """
+    origin = np.zeros(3) if origin is None else origin
+    axis, n = _middle(points, origin, range_m)
+    if n < LEAST_POINTS or np.linalg.norm(axis) < 0.3 * n:  # few, or all around the sensor
+        return None
+    rotation = _facing(axis)
+    pose = Pose(rotation, -rotation @ origin)
+    turned = np.zeros((len(points), 3), np.float32)
+    place = np.zeros((len(points), 2), np.float32)
+    bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
+    n = _turn(points, pose.rotation, pose.translation, range_m, turned, place, bounds)
+    return _imaged(turned, place, bounds, n, pose) if n >= LEAST_POINTS else None
+
+
+def overview_of(
+    points: F4, hint: F8 | None, *, range_m: float, rng: np.random.Generator
+) -> View | None:
+    """Look at a cloud that was not taken from its origin, from above its dominant plane.
+
+    The plane is the one with most points within 1 cm of it, of 200 through three points (with a
+    ``hint``, of those within 15 degrees of level); its upper side is the one with more points.
+    The viewpoint is 1 m from the middle of the cloud, 45 degrees above the plane.
+    """
+    used = points[np.isfinite(points).all(axis=1) & (np.abs(points) < FARTHEST_M).all(axis=1)]
+    if len(used) < LEAST_POINTS:
+        return None
+    sample = used[rng.choice(len(used), min(len(used), 4000), replace=False)].astype(np.float64)
+    a, b, c = sample[rng.integers(0, len(sample), (3, 200))]
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1)
+    normal = normal[length > 1e-9] / length[length > 1e-9, None]
+    a = a[length > 1e-9]
+    if hint is not None:
+        level = abs(normal @ hint) > 0.966
+        normal, a = normal[level], a[level]
+    if len(normal) == 0:
+        return None
+    height = sample @ normal.T - np.einsum("ij,ij->i", a, normal)
+    best = int(np.argmax(np.count_nonzero(abs(height) < 0.01, axis=0)))
+    up, above = normal[best], height[:, best]
+    if (
+        up @ hint
+        if hint is not None
+        else np.sum(abs(above) > 0.01, where=above > 0) * 2 - np.count_nonzero(abs(above) > 0.01)
+    ) < 0:
+        up = -up
+    middle = np.median(sample, axis=0)
+    side = gravity_rotation(up)[1]
+    origin = middle + math.sqrt(0.5) * (up - side)
+    return view_of(points, range_m=max(range_m, 2.0), origin=origin)
+
+
+@kernel
+def _middle(points: F4, origin: F8, range_m: float) -> tuple[F8, int]:
+    """Return the sum of the directions to the points within twice the range, and their number."""
+    ax = ay = az = 0.0
+    n = 0
+    for k in range(points.shape[0]):
+        x, y, z = points[k, 0] - origin[0], points[k, 1] - origin[1], points[k, 2] - origin[2]
+        distance = math.sqrt(x * x + y * y + z * z)
+        if (distance >= NEAREST_M) & (distance <= 2 * range_m):  # never so for NaN
+            scale = 1 / distance
+            ax += x * scale
+            ay += y * scale
+            az += z * scale
+            n += 1
+    return np.array([ax, ay, az]), n
+
+
+@kernel
+def _turn(
+    points: F4,
+    rotation: F8,
+    translation: F8,
+    range_m: float,
+    turned: F4,
+    place: F4,
+    bounds: F8,
+) -> int:
+    """Move the points in view to the virtual camera; return how many they are.
+
+    Their places (x / z, y / z), `OUTSIDE` for other points, and the bounds of these are written.
+    """
+    r, s = rotation, translation
+    n = 0
+    left = top = np.inf
+    right = bottom = -np.inf
+    for k in range(points.shape[0]):
+        place[k, 0] = OUTSIDE
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        depth = r[2, 0] * x + r[2, 1] * y + r[2, 2] * z + s[2]
+        if not ((depth >= NEAREST_M) & (depth <= range_m)):
+            continue
+        across = r[0, 0] * x + r[0, 1] * y + r[0, 2] * z + s[0]
+        down = r[1, 0] * x + r[1, 1] * y + r[1, 2] * z + s[1]
+        inverse = 1 / depth
+        u, v = across * inverse, down * inverse
+        if not ((abs(u) < FIELD) & (abs(v) < FIELD)):
+            continue
+        turned[k, 0], turned[k, 1], turned[k, 2] = across, down, depth
+        place[k, 0], place[k, 1] = u, v
+        left, right = min(left, u), max(right, u)
+        top, bottom = min(top, v), max(bottom, v)
+        n += 1
+    bounds[0], bounds[1], bounds[2], bounds[3] = left, top, right, bottom
+    return n
+
+
+def _facing(axis: F8) -> F8:
+    """Return the rotation that turns ``axis`` to +z and keeps +x right as well as it can."""
+    z = axis / np.linalg.norm(axis)
+    x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.8 else np.array([0.0, -1.0, 0.0])
+    x = x - (x @ z) * z
+    x /= np.linalg.norm(x)
+    return np.stack([x, np.cross(z, x), z])
+
+
+def _imaged(turned: F4, place: F4, bounds: F8, n: int, pose: Pose) -> View:
+    left, top, right, bottom = (float(v) for v in bounds)
+    width, height = right - left, bottom - top
+    z = turned[:: max(1, n // 20_000), 2]
+    depth = float(np.median(z[z > 0])) if (z > 0).any() else 1.0
+    pitch = max(
+        CELL_M / depth,
+        _spacing(place, bounds, n),
+        math.sqrt(width * height / MOST_CELLS),
+        max(width, height) / MOST_ROWS,
+        1e-6,
+    )
+    lens = Lens(1 / pitch, 1 / pitch, -left / pitch, -top / pitch)
+    w = np.zeros((int(height / pitch + 1.5), int(width / pitch + 1.5)), np.float32)
+    cell = np.full(len(turned), -1, np.int32)
+    behind = _project(turned, place, lens, w, cell)
+    _close_holes(w)
+    return View(Cells(w, lens, 1, pitch * depth), turned, cell, pose, behind / n)
+
+
+def _spacing(place: F4, bounds: F8, n: int) -> float:
+    """Return the pitch of an image in which nearly every cell of a surface has a point.
+
+    On a grid that is fine against the points every point has a cell of its own; coarser grids
+    are tried until a cell holds ``LOAD`` points on average.
+    """
+    span = max(bounds[2] - bounds[0], bounds[3] - bounds[1], 1e-6)
+    side = 1024
+    while side > 16:
+        if n >= LOAD * _occupied(place, bounds[0], bounds[1], side / span * 0.999, side):
+            break
+        side = int(side / 1.25)
+    return float(span / side)
+
+
+@kernel
+def _occupied(place: F4, left: float, top: float, scale: float, side: int) -> int:
+    seen = np.zeros((side, side), np.uint8)
+    n = 0
+    for k in range(place.shape[0]):
+        if place[k, 0] < OUTSIDE:
+            j, i = int((place[k, 0] - left) * scale), int((place[k, 1] - top) * scale)
+            n += 1 - seen[i, j]
+            seen[i, j] = 1
+    return n
+
+
+@kernel
+def _project(points: F4, place: F4, lens: Lens, w: F4, cell: I4) -> int:
+    """Average the nearest points of each cell; return how many lie well behind them."""
+    rows, columns = w.shape
+    nearest = np.zeros(w.shape, np.float32)
+    count = np.zeros(w.shape, np.float32)
+    for k in range(points.shape[0]):
+        if place[k, 0] == OUTSIDE:
+            continue
+        j = int(lens.fx * place[k, 0] + lens.cx + 0.5)
+        i = int(lens.fy * place[k, 1] + lens.cy + 0.5)
+        if i < 0 or j < 0 or i >= rows or j >= columns:
+            continue
+        cell[k] = i * columns + j
+        nearest[i, j] = max(nearest[i, j], np.float32(1) / points[k, 2])
+    behind = 0
+    for k in range(points.shape[0]):
+        if cell[k] < 0:
+            continue
+        i, j = cell[k] // columns, cell[k] % columns
+        v = np.float32(1) / points[k, 2]
+        if v > nearest[i, j] - DISCONTINUITY:
+            w[i, j] += v
+            count[i, j] += 1
+        elif v < nearest[i, j] - 3 * DISCONTINUITY:
+            behind += 1
+    for i in range(rows):
+        for j in range(columns):
+            if count[i, j] > 0:
+                w[i, j] /= count[i, j]
+    return behind
+
+
+@kernel
+def _close_holes(w: F4) -> None:
+    """Give cells between two neighbours of one surface their mean."""
+    rows, columns = w.shape
+    source = w.copy()
+    for i in range(1, rows - 1):
+        for j in range(1, columns - 1):
+            if source[i, j] > 0:
+                continue
+            total, n = np.float32(0), 0
+            a, b = source[i, j - 1], source[i, j + 1]
+            if (a > 0) & (b > 0) & (abs(a - b) < DISCONTINUITY):
+                total += a + b
+                n += 2
+            a, b = source[i - 1, j], source[i + 1, j]
+            if (a > 0) & (b > 0) & (abs(a - b) < DISCONTINUITY):
+                total += a + b
+                n += 2
+            if n > 0:
+                w[i, j] = total / n
