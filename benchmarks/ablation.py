@@ -1,4 +1,4 @@
-"""What each rule of the detection gains: overlap with the truth, the rules added one by one.
+"""What each step of the detection gains: overlap with the truth, the steps added one by one.
 
     python -m benchmarks.ablation --first 500 --count 30
 
@@ -13,14 +13,17 @@ import click
 import numpy as np
 
 from benchmarks.measure import markdown, save
-from benchmarks.overlap import Array, Finder, labelled_sets, score, with_rules
+from benchmarks.overlap import Array, Finder, labelled_sets, score, with_steps
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
+from shapecat.detection.pipeline import ALL_STEPS, Steps
 from shapecat.types import Frame
+
+NO_STEPS = Steps(*[False] * len(Steps._fields))
 
 
 def run(count: int, first_seed: int = 500) -> tuple[str, dict[str, Any]]:
-    """Score every set of rules on the same frames; return a Markdown table and the figures."""
+    """Score every set of steps on the same frames; return a Markdown table and the figures."""
     sets = labelled_sets(count, first_seed)
     figures: dict[str, Any] = {}
     rows = []
@@ -28,18 +31,23 @@ def run(count: int, first_seed: int = 500) -> tuple[str, dict[str, Any]]:
         scores = {name: score(frames, finder) for name, frames in sets.items()}
         figures[method] = scores
         rows.append((method, *(v for s in scores.values() for v in (s["F"], s["obj75"]))))
-    columns = ("rules", *(f"{name}, {what}" for name in sets for what in ("F", "obj75")))
+    columns = ("steps", *(f"{name}, {what}" for name in sets for what in ("F", "obj75")))
     return markdown("Detection, overlap with the truth", columns, rows), figures
 
 
 def _methods() -> Iterator[tuple[str, Finder]]:
-    rules = DetectionSettings().rules.split()
     yield "voxels, plane, DBSCAN (Open3D)", _clusters
-    yield "plane, height, depth jumps", with_rules([])
-    for k in range(1, len(rules) + 1):
-        yield f"+ {rules[k - 1]}", with_rules(rules[:k])
-    for rule in rules:
-        yield f"all but {rule}", with_rules([r for r in rules if r != rule])
+    yield "plane, height, depth discontinuities", with_steps(NO_STEPS)
+    steps = NO_STEPS
+    for name in Steps._fields:
+        steps = steps._replace(**{name: True})
+        yield f"+ {_words(name)}", with_steps(steps)
+    for name in Steps._fields:
+        yield f"all but {_words(name)}", with_steps(ALL_STEPS._replace(**{name: False}))
+
+
+def _words(name: str) -> str:
+    return name.replace("_", " ")
 
 
 def _clusters(frame: Frame) -> list[Array]:
@@ -51,7 +59,7 @@ def _clusters(frame: Frame) -> list[Array]:
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points[used]))
     low, high = cloud.get_min_bound(), cloud.get_max_bound()
     cloud, _, members = cloud.voxel_down_sample_and_trace(0.01, low, high)
-    up = detect(frame, settings=DetectionSettings(rules=""), rng=np.random.default_rng(0)).up
+    up = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0)).up
     cloud.estimate_normals(o3d.geometry.KDTreeSearchParamKNN(20))
     o3d.utility.random.seed(0)
     level = np.flatnonzero(np.abs(np.asarray(cloud.normals) @ up) > 0.95)

@@ -10,6 +10,7 @@ from scipy.optimize import linear_sum_assignment
 from benchmarks.scenes import labelled_clutter, labelled_tables
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
+from shapecat.detection.pipeline import Steps
 from shapecat.types import Frame
 
 Array = NDArray[Any]
@@ -36,12 +37,12 @@ def labelled_sets(count: int, first_seed: int) -> dict[str, list[Labelled]]:
     return {name: frames for name, frames in sets.items() if frames}
 
 
-def with_rules(rules: Sequence[str]) -> Finder:
-    """Return the detection with some of its rules."""
-    settings = DetectionSettings(rules=" ".join(rules))
+def with_steps(steps: Steps) -> Finder:
+    """Return the detection with some of its steps."""
+    settings = DetectionSettings()
 
     def find(frame: Frame) -> list[Array]:
-        scene = detect(frame, settings=settings, rng=np.random.default_rng(0))
+        scene = detect(frame, settings=settings, rng=np.random.default_rng(0), steps=steps)
         return [candidate.indices for candidate in scene.candidates]
 
     return find

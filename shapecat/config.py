@@ -39,8 +39,6 @@ class DetectionSettings:
     """Larger things are walls or furniture."""
     min_points: int = 60
     """Candidates with fewer points at full resolution are dropped."""
-    rules: str = "low concave ledge axis step small parts occluder feet fill"
-    """Rules beyond the thesis that separate and join objects, by name; any may be left out."""
 
     def __post_init__(self) -> None:
         """Refuse to hold more images in memory than help."""

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from shapecat.config import DetectionSettings
 from shapecat.detection import Hierarchy, Node, detect, format_tree
-from shapecat.detection.depth_grid import place_of
-from shapecat.errors import ConfigError
+from shapecat.detection.depth_grid import row_and_column
+from shapecat.detection.pipeline import Steps
 from shapecat.types import Camera, Frame, Scene
 
 Array = NDArray[Any]
@@ -465,24 +465,13 @@ def test_same_seed_same_scene() -> None:
         np.testing.assert_array_equal(x.box.orientation, y.box.orientation)
 
 
-def test_plain_rules_are_the_thesis() -> None:
-    """Without the rules beyond the thesis, touching boxes are one object."""
+def test_without_the_steps_beyond_the_thesis_touching_boxes_are_one() -> None:
+    """The benchmark of single steps would else measure nothing."""
     depth, _ = render([table(), box((0, 0, 0), (0.22, 0.18, 0.08)),
                        box((0, 0.01, 0.08), (0.1, 0.08, 0.1))])  # fmt: skip
-    plain = DetectionSettings(rules="")
-    scene = detect(frame_of(depth), settings=plain, rng=np.random.default_rng(0))
+    plain = Steps(*[False] * len(Steps._fields))
+    scene = detect(frame_of(depth), settings=DEFAULTS, rng=np.random.default_rng(0), steps=plain)
     assert len(scene.candidates) == 1
-
-
-def test_unknown_rule_is_refused() -> None:
-    """A misspelt rule is not silently switched off."""
-    depth, _ = render([table()])
-    with pytest.raises(ConfigError, match="known: low concave"):
-        detect(
-            frame_of(depth),
-            settings=DetectionSettings(rules="concav"),
-            rng=np.random.default_rng(0),
-        )
 
 
 @pytest.mark.parametrize("up", [(0, 0, 0), (np.nan, 0, 1), (0, 1)])
@@ -736,5 +725,5 @@ def test_a_large_box_with_nothing_behind_is_no_wall(width: float, y: float) -> N
 def test_places_of_flat_cells_are_exact(columns: int) -> None:
     """A product stands for a division: the first cell of a row must not fall into the one above."""
     for i in (0, 1, 7, 199, 1999):
-        assert place_of(i * columns, columns) == (i, 0)
-        assert place_of(i * columns + columns - 1, columns) == (i, columns - 1)
+        assert row_and_column(i * columns, columns) == (i, 0)
+        assert row_and_column(i * columns + columns - 1, columns) == (i, columns - 1)

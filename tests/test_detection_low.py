@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
+from shapecat.detection.pipeline import ALL_STEPS
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
 from shapecat.types import Camera, Frame, Scene
 from tests.test_detection import overlaps
@@ -38,14 +39,11 @@ def measured(depth: Array, seed: int = 0) -> Frame:
     return Frame("t", 0, 0, 0, "c", depth=depth.astype(np.float32), camera=CAMERA)
 
 
-def found(frame: Frame, rules: str | None = None) -> Scene:
-    settings = DetectionSettings() if rules is None else DetectionSettings(rules=rules)
-    return detect(frame, settings=settings, rng=np.random.default_rng(0))
-
-
-def without(rule: str) -> str:
-    """Return the default rules but one."""
-    return " ".join(r for r in DetectionSettings().rules.split() if r != rule)
+def found(frame: Frame, *, low_profile: bool = True) -> Scene:
+    """Return what is found with or without the step for low-profile objects."""
+    steps = ALL_STEPS._replace(low_profile=low_profile)
+    rng = np.random.default_rng(0)
+    return detect(frame, settings=DetectionSettings(), rng=rng, steps=steps)
 
 
 def bump(radius: float, edge: float) -> Array:
@@ -59,7 +57,7 @@ def test_a_swell_of_the_table_is_no_object() -> None:
     """A wave of the sensor's error that is higher than the least height of an object."""
     frame = measured(depth_of(0.009 * bump(50, 90)))
     assert len(found(frame).candidates) == 0
-    assert len(found(frame, without("low")).candidates) > 0, "the test shows nothing"
+    assert len(found(frame, low_profile=False).candidates) > 0, "the test shows nothing"
 
 
 def test_a_thin_plate_is_an_object() -> None:

@@ -5,9 +5,16 @@ import pytest
 
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
-from shapecat.detection.depth_grid import cells_of
-from shapecat.detection.merging.learned import SIGNS, Sight, _sum_of, meet_at_all, signs_of, trees
-from shapecat.detection.pipeline import oversegment
+from shapecat.detection.depth_grid import downsample
+from shapecat.detection.merging.learned import load_trees, logit_of
+from shapecat.detection.merging.pair_features import (
+    FEATURES,
+    PAIR_FEATURES,
+    ViewGeometry,
+    are_adjacent,
+    pair_features,
+)
+from shapecat.detection.pipeline import ALL_STEPS, oversegment
 from shapecat.models.parts import Pairs, collect, grow
 from shapecat.simulation import KINECT, make_scene, render_frame
 from tests.test_detection import overlaps
@@ -15,12 +22,12 @@ from tests.test_detection import overlaps
 
 def test_every_walk_through_the_trees_ends() -> None:
     """A child before its parent would be a walk without end."""
-    grown = trees()
+    grown = load_trees()
     inner = np.flatnonzero(grown.left)
     assert np.all(grown.left[inner] > inner)
     assert grown.left.max() + 1 < grown.left.size
     assert np.all(grown.left[grown.roots[1:] - 1] == 0)
-    assert 0 <= grown.feature.min() <= grown.feature.max() < SIGNS
+    assert 0 <= grown.feature.min() <= grown.feature.max() < FEATURES
     assert np.isfinite(grown.value).all()
 
 
@@ -29,22 +36,22 @@ def test_the_order_of_two_pieces_says_nothing() -> None:
     frame, _ = render_frame(make_scene("clutter", rng, frames=1), 0, rng=rng, sensor=KINECT)
     assert frame.depth is not None
     assert frame.camera is not None
-    cells = cells_of(frame.depth, frame.camera, range_m=2.0)
-    assert cells is not None
-    found = oversegment(cells, settings=DetectionSettings(), rng=rng)
+    grid = downsample(frame.depth, frame.camera, range_m=2.0)
+    assert grid is not None
+    found = oversegment(grid, settings=DetectionSettings(), rng=rng)
     assert found is not None
-    ground, (_, _, pieces) = found
-    sight = Sight(cells.lens.fx, float(ground.up[2]))
-    there, back = np.zeros((2, SIGNS), np.float32)
+    ground, (_, _, segments) = found
+    view_geometry = ViewGeometry(grid.intrinsics.fx, float(ground.up[2]))
+    there, back = np.zeros((2, 1), PAIR_FEATURES)
     seen = 0
-    for p in range(1, pieces.group.size):
+    for p in range(1, segments.parent.size):
         for q in range(1, p):
-            assert meet_at_all(pieces, p, q) == meet_at_all(pieces, q, p)
-            if meet_at_all(pieces, p, q):
-                signs_of(pieces, p, q, sight, there)
-                signs_of(pieces, q, p, sight, back)
+            assert are_adjacent(segments, p, q) == are_adjacent(segments, q, p)
+            if are_adjacent(segments, p, q):
+                pair_features(segments, p, q, view_geometry, there[0])
+                pair_features(segments, q, p, view_geometry, back[0])
                 assert np.array_equal(there, back)
-                assert np.isfinite(there).all()
+                assert np.isfinite(there.view(np.float32)).all()
                 seen += 1
     assert seen > 10
 
@@ -56,16 +63,17 @@ def test_without_the_trees_objects_stay_in_pieces(seed: int) -> None:
     frame, seen = render_frame(world, 0, rng=rng, sensor=KINECT)
     labels = [thing.label for thing in world.things if np.count_nonzero(seen == thing.label) > 400]
     found = []
-    for rules in ("low concave ledge axis step small", "low concave ledge axis step small parts"):
-        settings = DetectionSettings(rules=rules)
-        scene = detect(frame, settings=settings, rng=np.random.default_rng(0))
+    for learned in (False, True):
+        steps = ALL_STEPS._replace(learned_merging=learned, across_occlusion=False)
+        rng = np.random.default_rng(0)
+        scene = detect(frame, settings=DetectionSettings(), rng=rng, steps=steps)
         found.append(np.mean(np.array(overlaps(scene, seen, labels)) > 0.75))
     assert found[1] > found[0]
 
 
 def test_pairs_do_not_depend_on_the_number_of_processes() -> None:
     one, two = collect(0.001, 1), collect(0.001, 2)
-    assert np.array_equal(one.signs, two.signs)
+    assert np.array_equal(one.features, two.features)
     assert np.array_equal(one.same, two.same)
     assert 0.05 < one.same.mean() < 0.95
 
@@ -73,9 +81,9 @@ def test_pairs_do_not_depend_on_the_number_of_processes() -> None:
 def test_grown_trees_tell_what_they_were_shown() -> None:
     """And the same trees are grown each time."""
     rng = np.random.default_rng(0)
-    signs = rng.normal(size=(2000, SIGNS)).astype(np.float32)
-    same = (signs[:, 4] > 0) ^ (signs[:, 40] > 0.3)
-    first, second = (grow(Pairs(signs, same), seed=1) for _ in range(2))
+    features = rng.normal(size=(2000, FEATURES)).astype(np.float32)
+    same = (features[:, 4] > 0) ^ (features[:, 40] > 0.3)
+    first, second = (grow(Pairs(features, same), seed=1) for _ in range(2))
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
-    told = np.array([_sum_of(first, row) > 0 for row in signs])
+    told = np.array([logit_of(first, row) > 0 for row in features])
     assert np.mean(told == same) > 0.95

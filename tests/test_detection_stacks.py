@@ -5,6 +5,7 @@ import pytest
 
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
+from shapecat.detection.pipeline import ALL_STEPS, Steps
 from shapecat.simulation import KINECT, make_scene, render_frame
 from tests.test_detection import (
     Array,
@@ -176,26 +177,28 @@ def test_ball_on_a_can_whose_foot_is_hidden() -> None:
     check([*shapes, box((0, -0.1, 0), (0.2, 0.03, 0.05))], [1, 2, 3], tilt_deg=20)
 
 
-UNJOINED = "low concave ledge axis step small"
-"""The rules that part objects, without those that join parts of one again."""
+UNMERGED = ALL_STEPS._replace(
+    learned_merging=False, across_occlusion=False, contact_boundary=False, hole_filling=False
+)
+"""The steps that part objects, without those that merge parts of one again."""
 
 
-def overlaps_by(shapes: list[Shape], rules: str) -> list[float]:
-    """Return how well all but the first shape are found with some of the rules."""
+def overlaps_by(shapes: list[Shape], steps: Steps) -> list[float]:
+    """Return how well all but the first shape are found with some of the steps."""
     depth, seen = render(shapes)
     scene = detect(
-        frame_of(depth), settings=DetectionSettings(rules=rules), rng=np.random.default_rng(0)
+        frame_of(depth), settings=DetectionSettings(), rng=np.random.default_rng(0), steps=steps
     )
     return overlaps(scene, seen, list(range(1, len(shapes))))
 
 
 @pytest.mark.parametrize("upper", [0.16, 0.05])
 def test_boxes_with_flush_fronts_are_parted_where_the_outline_steps(upper: float) -> None:
-    """No edge parts them; what is wider above shows no ledge either."""
+    """No edge parts them; what is wider above shows no top of the lower one either."""
     boxes = [box((0, 0, 0), (0.1, 0.06, 0.1)), box((0, 0, 0.1), (upper, 0.06, 0.08))]
     shapes = [table(), *boxes]
-    assert min(overlaps_by(shapes, UNJOINED)) > 0.85
-    assert min(overlaps_by(shapes, UNJOINED.replace("step ", "").replace("ledge ", ""))) < 0.8
+    assert min(overlaps_by(shapes, UNMERGED)) > 0.85
+    assert min(overlaps_by(shapes, UNMERGED._replace(width_split=False))) < 0.8
 
 
 @pytest.mark.parametrize(("seed", "label"), [(1076, 20), (1132, 20), (1187, 21), (1395, 22)])
@@ -211,18 +214,20 @@ def test_outline_that_something_nearer_cuts_off_is_no_step() -> None:
         box((0, 0.1, 0), (0.16, 0.06, 0.2)),
         box((-0.06, -0.05, 0), (0.1, 0.05, 0.07)),
     ]
-    assert min(overlaps_by(shapes, UNJOINED)) > 0.85
+    assert min(overlaps_by(shapes, UNMERGED)) > 0.85
 
 
 @pytest.mark.parametrize("tilt_deg", [30, 40])
 def test_plate_that_juts_out_over_a_can_is_parted_from_it(tilt_deg: float) -> None:
-    """The tangent planes about its edge take the step for a slope.
+    """The local planes about its edge take the step for a slope.
 
     Whether it is the lid of the can, which cannot be seen, is left out.
     """
     shapes = [table(), can(0, 0, 0, 0.038, 0.06), can(0, 0, 0.06, 0.05, 0.012)]
     depth, seen = render(shapes, tilt_deg=tilt_deg)
-    parted = DetectionSettings(rules="low concave ledge axis step small occluder feet fill")
-    scene = detect(frame_of(depth), settings=parted, rng=np.random.default_rng(0))
+    steps = ALL_STEPS._replace(learned_merging=False)
+    scene = detect(
+        frame_of(depth), settings=DetectionSettings(), rng=np.random.default_rng(0), steps=steps
+    )
     assert len(scene.candidates) == 2
     assert min(overlaps(scene, seen, [1, 2])) > 0.8

@@ -1,4 +1,4 @@
-"""Cells: the depth image at the resolution the rules work at.
+"""Depth grid: the depth image, downsampled to the resolution that the other steps work at.
 
 Everything is done in inverse depth ``w = 1 / z`` (1/m): a plane is exactly linear in (column, row,
 w), and the noise of disparity cameras is constant in w, so thresholds need no model of range.
@@ -15,27 +15,27 @@ from shapecat.jit import kernel
 from shapecat.types import Camera
 
 __all__ = [
-    "BORDER",
-    "Cells",
-    "Lens",
-    "cells_of",
-    "count_last",
-    "place_of",
-    "small_at",
+    "BORDER_SHARE",
+    "DepthGrid",
+    "PinholeIntrinsics",
+    "count_at_range_limit",
+    "downsample",
+    "row_and_column",
+    "smallest_object_at",
 ]
 
 CELL_M = 0.0035
 """Size of a cell on the objects: small against the smallest object, larger than the noise."""
 SMALL_M2 = 9e-4
 """Surface of the smallest object."""
-BORDER = 0.12
+BORDER_SHARE = 0.12
 """Share of the image in which its readings may begin: a registered Kinect is blind in a tenth."""
 LARGEST_FACTOR = 16
 MOST_CELLS = 100_000
 """Bounds the time of a frame: images that look far have larger cells."""
 
 
-class Lens(NamedTuple):
+class PinholeIntrinsics(NamedTuple):
     """A pinhole camera in units of cells: cell (i, j) sees ((j - cx) / fx, (i - cy) / fy, 1)."""
 
     fx: float
@@ -44,24 +44,26 @@ class Lens(NamedTuple):
     cy: float
 
 
-class Cells(NamedTuple):
+class DepthGrid(NamedTuple):
     """The image of cells.
 
     Attributes
     ----------
-    w : (rows, columns) float32 inverse depth, 1/m; 0 where there is no reading.
-    lens : the camera in units of cells.
+    inv_depth : (rows, columns) float32 inverse depth, 1/m; 0 where there is no reading.
+    intrinsics : the camera in units of cells.
     factor : pixels along the edge of a cell.
     size_m : width of a cell at the median depth.
     """
 
-    w: F4
-    lens: Lens
+    inverse_depth: F4
+    intrinsics: PinholeIntrinsics
     factor: int
     size_m: float
 
 
-def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_M) -> Cells | None:
+def downsample(
+    depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_M
+) -> DepthGrid | None:
     """Average pixels of ``depth`` (h, w), metres, into cells; None if there is no reading.
 
     Readings beyond ``range_m`` are left out (thesis 4.2, pass-through filter).
@@ -73,16 +75,16 @@ def cells_of(depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_
     least = math.sqrt(depth.size / MOST_CELLS)
     factor = round(min(max(cell_m / max(pixel_m, 1e-9), least, 1.0), LARGEST_FACTOR, *depth.shape))
     shift = (factor - 1) / 2
-    lens = Lens(
+    intrinsics = PinholeIntrinsics(
         camera.fx / factor,
         camera.fy / factor,
         (camera.cx - shift) / factor,
         (camera.cy - shift) / factor,
     )
     rows, columns = depth.shape[0] // factor, depth.shape[1] // factor
-    w = np.zeros((rows, columns), np.float32)
-    _average(depth, factor, np.float32(range_m), np.float32(DISCONTINUITY), w)
-    return Cells(w, lens, factor, factor * pixel_m)
+    inv_depth = np.zeros((rows, columns), np.float32)
+    _average(depth, factor, np.float32(range_m), np.float32(DISCONTINUITY), inv_depth)
+    return DepthGrid(inv_depth, intrinsics, factor, factor * pixel_m)
 
 
 def _median_of(values: F4) -> float:
@@ -104,51 +106,53 @@ def _sampled(depth: F4, step: int, range_m: float) -> F4:
 
 
 @kernel(inline=True, leaf=True)
-def place_of(p: int, columns: int) -> tuple[int, int]:
+def row_and_column(p: int, columns: int) -> tuple[int, int]:
     """Return the row and column of a flat cell; to divide integers takes three times as long."""
     i = int((p + 0.5) * (1.0 / columns))
     return i, p - i * columns
 
 
 @kernel(leaf=True)
-def small_at(cells: Cells, depth_m: float) -> float:
+def smallest_object_at(grid: DepthGrid, depth_m: float) -> float:
     """Return the number of cells of `SMALL_M2` at a depth, within reason."""
-    return float(min(max(SMALL_M2 * cells.lens.fx**2 / depth_m**2, 20.0), 75.0))
+    return float(min(max(SMALL_M2 * grid.intrinsics.fx**2 / depth_m**2, 20.0), 75.0))
 
 
 @kernel
-def count_last(w: F4, labels: I4, size: int, range_m: float) -> I4:
+def count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) -> I4:
     """Return how many of the last readings before ``range_m`` the labels below ``size`` have.
 
     Label 0 has none.
     """
     count = np.zeros(size, np.int64)
     most = np.float32(1 / range_m + DISCONTINUITY / 2)
-    for i in range(w.shape[0]):
+    for i in range(inv_depth.shape[0]):
         some = False
-        for j in range(w.shape[1]):
-            some |= (labels[i, j] > 0) & (w[i, j] < most)  # few rows have any; this vectorises
+        for j in range(inv_depth.shape[1]):
+            some |= (labels[i, j] > 0) & (
+                inv_depth[i, j] < most
+            )  # few rows have any; this vectorises
         if not some:
             continue
-        for j in range(w.shape[1]):
-            if labels[i, j] > 0 and w[i, j] < most:
+        for j in range(inv_depth.shape[1]):
+            if labels[i, j] > 0 and inv_depth[i, j] < most:
                 count[labels[i, j]] += 1
     return count
 
 
 @kernel
-def _average(depth: F4, factor: int, range_m: float, jump: float, w: F4) -> None:
-    """Write to ``w`` the inverse of the mean depth of the pixels near the nearest of each cell."""
+def _average(depth: F4, factor: int, range_m: float, jump: float, inv_depth: F4) -> None:
+    """Write the inverse of the mean depth of the pixels near the nearest one of each cell."""
     if factor == 2:  # the usual case, in a form that vectorises
-        _average_two(depth, range_m, jump, w)
+        _average_two(depth, range_m, jump, inv_depth)
         return
-    rows, columns = w.shape
+    rows, columns = inv_depth.shape
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
     far, least = np.float32(1e9), np.float32(NEAREST_M)
     # The pixels of a row of cells, sorted by their place in the cell: loops over these vectorise.
     parts = np.zeros((factor * factor, columns), np.float32)
-    room = np.zeros((4, columns), np.float32)
-    nearest, limit, total, count = room[0], room[1], room[2], room[3]
+    scratch = np.zeros((4, columns), np.float32)
+    nearest, limit, total, count = scratch[0], scratch[1], scratch[2], scratch[3]
     for i in range(rows):
         nearest[:] = far
         for k in range(factor * factor):
@@ -170,18 +174,18 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, w: F4) -> None
                 use = part[j] <= limit[j]
                 total[j] += part[j] if use else zero
                 count[j] += one if use else zero
-        out = w[i]
+        out = inv_depth[i]
         for j in range(columns):
             out[j] = count[j] / total[j] if count[j] > zero else zero
 
 
 @kernel(leaf=True)
-def _average_two(depth: F4, range_m: float, jump: float, w: F4) -> None:
-    rows, columns = w.shape
+def _average_two(depth: F4, range_m: float, jump: float, inv_depth: F4) -> None:
+    rows, columns = inv_depth.shape
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
     far, least = np.float32(1e9), np.float32(NEAREST_M)
     for i in range(rows):
-        top, bottom, out = depth[2 * i], depth[2 * i + 1], w[i]
+        top, bottom, out = depth[2 * i], depth[2 * i + 1], inv_depth[i]
         for j in range(columns):
             a, b, c, d = top[2 * j], top[2 * j + 1], bottom[2 * j], bottom[2 * j + 1]
             a = a if (a >= least) & (a <= range_m) else far

@@ -15,7 +15,6 @@
 The thesis stops at objects that do not touch: steps 4 and 5 go beyond it.
 """
 
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -23,58 +22,51 @@ from numpy.typing import ArrayLike
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.config import DetectionSettings
-from shapecat.detection.cleanup.holes import fill_enclosed, grow_feet
-from shapecat.detection.cleanup.structure import Field, Limits, is_no_object
-from shapecat.detection.depth_grid import Cells, cells_of
-from shapecat.detection.foreground.low_profile import raise_low
-from shapecat.detection.foreground.overhang import reach_over
-from shapecat.detection.foreground.walls import clear_walls
-from shapecat.detection.merging.across_occlusion import join_around, join_behind
-from shapecat.detection.merging.adjacency import meet
-from shapecat.detection.merging.learned import Sight, join_parts, trees
-from shapecat.detection.merging.segments import pieces_after_cuts, pieces_of
-from shapecat.detection.merging.small import join_raised, join_small
-from shapecat.detection.output.label_upsampling import pixels_of, points_of
-from shapecat.detection.output.measurements import things_of
-from shapecat.detection.output.scene import scene_of
+from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
+from shapecat.detection.cleanup.structure import LabelledGrid, Limits, is_background
+from shapecat.detection.depth_grid import DepthGrid, downsample
+from shapecat.detection.foreground.low_profile import find_low_profile
+from shapecat.detection.foreground.overhang import extend_overhang
+from shapecat.detection.foreground.walls import remove_walls
+from shapecat.detection.merging.across_occlusion import merge_across_occluder
+from shapecat.detection.merging.adjacency import measure_adjacency
+from shapecat.detection.merging.learned import load_trees, merge_learned
+from shapecat.detection.merging.low_profile import merge_low_profile
+from shapecat.detection.merging.pair_features import ViewGeometry
+from shapecat.detection.merging.segments import measure_segments
+from shapecat.detection.output.label_upsampling import label_pixels, label_points
+from shapecat.detection.output.measurements import measure_objects
+from shapecat.detection.output.scene import build_scene
 from shapecat.detection.planes import NO_HINT, find_supporting_planes
-from shapecat.detection.planes.height_map import heights_of
-from shapecat.detection.planes.ransac import draws_of
-from shapecat.detection.records import LabelledGrid, OverSegmentation, PlaneModel
-from shapecat.detection.segmentation.axis_split import cut_at_axes
-from shapecat.detection.segmentation.connectivity import surfaces_of
-from shapecat.detection.segmentation.top_face_split import cut_at_ledges
-from shapecat.detection.segmentation.watershed import regions_of, rename
-from shapecat.detection.segmentation.width_split import cut_at_steps
-from shapecat.detection.virtual_camera import View, overview_of, view_of
-from shapecat.errors import ConfigError
+from shapecat.detection.planes.height_map import measure_heights
+from shapecat.detection.planes.ransac import draw_trials
+from shapecat.detection.records import OverSegmentation, PlaneModel, Segmentation
+from shapecat.detection.segmentation.connectivity import connect_surfaces
+from shapecat.detection.segmentation.watershed import relabel, watershed
+from shapecat.detection.segmentation.width_split import split_at_width_changes
+from shapecat.detection.virtual_camera import VirtualImage, top_view, virtual_image
 from shapecat.geometry import IDENTITY, inverse
 from shapecat.types import Camera, Frame, Scene
 
-__all__ = ["RULES", "detect", "label", "oversegment"]
+__all__ = ["ALL_STEPS", "Steps", "detect", "label", "oversegment"]
 
 
-class Rules(NamedTuple):
-    """Which of the rules beyond the thesis apply, in their order.
+class Steps(NamedTuple):
+    """Which of the steps beyond the thesis are taken, to measure what each is worth.
 
-    Without any of them what remains is the plane, the height above it, and depth jumps.
+    Without any of them what remains is the plane, the height above it, and depth discontinuities.
     """
 
-    low: bool
-    concave: bool
-    ledge: bool
-    axis: bool
-    step: bool
-    small: bool
-    parts: bool
-    occluder: bool
-    feet: bool
-    fill: bool
+    low_profile: bool = True
+    concavity: bool = True
+    width_split: bool = True
+    learned_merging: bool = True
+    across_occlusion: bool = True
+    contact_boundary: bool = True
+    hole_filling: bool = True
 
 
-RULES = Rules._fields
-
-
+ALL_STEPS = Steps()
 DEFAULT_UP = (0.0, -1.0, 0.0)
 """Up in an upright optical frame, where nothing else is known."""
 CROWDED = 0.08
@@ -87,6 +79,7 @@ def detect(
     up: ArrayLike | None = None,
     settings: DetectionSettings,
     rng: np.random.Generator,
+    steps: Steps = ALL_STEPS,
 ) -> Scene:
     """Find the supporting planes of a frame and the objects on them.
 
@@ -97,6 +90,7 @@ def detect(
         planes within 15 degrees of level count; without, it is estimated from the dominant plane.
     settings : see `DetectionSettings`.
     rng : source of what RANSAC tries; the same state gives the same scene.
+    steps : which steps are taken, for measuring what one is worth.
 
     Returns
     -------
@@ -106,7 +100,6 @@ def detect(
     Raises
     ------
     ValueError : ``up`` is not a direction.
-    ConfigError : ``settings.rules`` names an unknown rule.
 
     Notes
     -----
@@ -117,9 +110,9 @@ def detect(
     """
     hint = None if up is None else _unit(up)
     if frame.depth is not None and frame.camera is not None:
-        scene = _in_image(frame.depth, frame.camera, hint, settings, rng)
+        scene = _in_image(frame.depth, frame.camera, hint, settings, rng, steps)
     else:
-        scene = _in_cloud(frame.xyz(), hint, settings, rng)
+        scene = _in_cloud(frame.xyz(), hint, settings, rng, steps)
     return scene or Scene(np.array(DEFAULT_UP) if hint is None else hint, (), ())
 
 
@@ -138,176 +131,185 @@ def _in_image(
     hint: F8 | None,
     settings: DetectionSettings,
     rng: np.random.Generator,
+    steps: Steps,
 ) -> Scene | None:
-    cells = cells_of(depth, camera, range_m=settings.max_range_m)
-    found = None if cells is None else label(cells, hint, settings=settings, rng=rng)
-    if cells is None or found is None:
+    grid = downsample(depth, camera, range_m=settings.max_range_m)
+    found = None if grid is None else label(grid, hint, settings=settings, rng=rng, steps=steps)
+    if grid is None or found is None:
         return None
-    indices = pixels_of(depth, cells, found, range_m=settings.max_range_m)
-    return scene_of(cells, found, indices, IDENTITY, settings=settings)
+    indices = label_pixels(depth, grid, found, range_m=settings.max_range_m)
+    return build_scene(grid, found, indices, IDENTITY, settings=settings)
 
 
 def _in_cloud(
-    points: F4, hint: F8 | None, settings: DetectionSettings, rng: np.random.Generator
+    points: F4,
+    hint: F8 | None,
+    settings: DetectionSettings,
+    rng: np.random.Generator,
+    steps: Steps,
 ) -> Scene | None:
-    view = view_of(points, range_m=settings.max_range_m)
-    found = None if view is None else _seen(view, hint, settings, rng)
+    view = virtual_image(points, range_m=settings.max_range_m)
+    found = None if view is None else _seen(view, hint, settings, rng, steps)
     if found is None:
-        view = overview_of(points, hint, range_m=settings.max_range_m, rng=rng)
-        found = None if view is None else _seen(view, hint, settings, rng)
+        view = top_view(points, hint, range_m=settings.max_range_m, rng=rng)
+        found = None if view is None else _seen(view, hint, settings, rng, steps)
     if view is None or found is None:
         return None
-    indices = points_of(view, found, fused=view.crowded > CROWDED)
-    return scene_of(
-        view.cells, found, indices, inverse(view.view_from_sensor), settings=settings,
+    indices = label_points(view, found, fused=view.crowded > CROWDED)
+    return build_scene(
+        view.grid, found, indices, inverse(view.view_from_sensor), settings=settings,
         points=view.points,
     )  # fmt: skip
 
 
 def _seen(
-    view: View, hint: F8 | None, settings: DetectionSettings, rng: np.random.Generator
-) -> LabelledGrid | None:
+    view: VirtualImage,
+    hint: F8 | None,
+    settings: DetectionSettings,
+    rng: np.random.Generator,
+    steps: Steps,
+) -> Segmentation | None:
     turned = None if hint is None else view.view_from_sensor.rotation @ hint
-    return label(view.cells, turned, settings=settings, rng=rng)
+    return label(view.grid, turned, settings=settings, rng=rng, steps=steps)
 
 
 def label(
-    cells: Cells,
+    grid: DepthGrid,
     hint: F8 | None,
     *,
     settings: DetectionSettings,
     rng: np.random.Generator,
-) -> LabelledGrid | None:
+    steps: Steps = ALL_STEPS,
+) -> Segmentation | None:
     """Find planes and objects among the samples; None if there is no supporting plane."""
-    model = _find_planes(cells, hint, settings, rng)
+    model = _find_planes(grid, hint, settings, rng, steps)
     if model is None:
         return None
-    segments = _oversegment(cells, model, settings)
-    known = _merge(cells, model, segments, settings)
-    leaders = _clean_up(cells, model, segments, known, settings)
-    return _fill(cells, model, segments, leaders, settings)
+    oversegmentation = _oversegment(grid, model, steps)
+    known = _merge(grid, model, oversegmentation, steps)
+    representatives = _clean_up(grid, model, oversegmentation, known, settings)
+    return _fill(grid, model, oversegmentation, representatives, settings, steps)
 
 
 def oversegment(
-    cells: Cells, *, settings: DetectionSettings, rng: np.random.Generator
+    grid: DepthGrid, *, settings: DetectionSettings, rng: np.random.Generator
 ) -> tuple[PlaneModel, OverSegmentation] | None:
     """Find planes and the segments of objects; None if no plane bears anything."""
-    model = _find_planes(cells, None, settings, rng)
-    return None if model is None else (model, _oversegment(cells, model, settings))
+    model = _find_planes(grid, None, settings, rng, ALL_STEPS)
+    return None if model is None else (model, _oversegment(grid, model, ALL_STEPS))
 
 
 def _find_planes(
-    cells: Cells, hint: F8 | None, settings: DetectionSettings, rng: np.random.Generator
+    grid: DepthGrid,
+    hint: F8 | None,
+    settings: DetectionSettings,
+    rng: np.random.Generator,
+    steps: Steps,
 ) -> PlaneModel | None:
     """Find what objects stand on and before; None if no plane bears anything."""
-    draws = draws_of(rng)
+    trials = draw_trials(rng)
     hint = NO_HINT if hint is None else hint
-    supports, up, planes = find_supporting_planes(cells, hint, draws)
+    supports, up, planes = find_supporting_planes(grid, hint, trials)
     if not supports:
         return None
-    heights = heights_of(cells, planes, settings.max_height_m)
-    raised = np.zeros(cells.w.shape, np.int16)
-    if _rules_of(settings.rules).low:
-        raise_low(cells, heights, planes, raised, settings.max_size_m)
-    walls = clear_walls(cells, heights.owner, up, settings.max_size_m, draws)
-    reach_over(cells, heights, planes, walls, settings.max_height_m)
-    return PlaneModel(up, supports, planes, heights, raised, walls)
+    heights = measure_heights(grid, planes, settings.max_height_m)
+    low_profile = np.zeros(grid.inverse_depth.shape, np.int16)
+    if steps.low_profile:
+        find_low_profile(grid, heights, planes, low_profile, settings.max_size_m)
+    walls = remove_walls(grid, heights.plane_id, up, settings.max_size_m, trials)
+    extend_overhang(grid, heights, planes, walls, settings.max_height_m)
+    return PlaneModel(up, supports, planes, heights, low_profile, walls)
 
 
-def _oversegment(cells: Cells, model: PlaneModel, settings: DetectionSettings) -> OverSegmentation:
+def _oversegment(grid: DepthGrid, model: PlaneModel, steps: Steps) -> OverSegmentation:
     """Part what stands on the planes where two objects may meet."""
-    heights, up, rules = model.heights, model.up, _rules_of(settings.rules)
-    surfaces = surfaces_of(cells, heights)
-    regions, n = regions_of(heights, surfaces, rules.concave)
-    pieces = pieces_of(cells, heights, surfaces, regions, n, up)
-    more = n
-    if rules.ledge:
-        more = cut_at_ledges(cells, heights, surfaces, pieces, regions, up)
-    if rules.axis:
-        more = cut_at_axes(cells, heights, surfaces, pieces, regions, up, more)
-    if rules.step:
-        more = cut_at_steps(cells, heights, surfaces, pieces, regions, up, more)
-    if more > n:
-        pieces = pieces_after_cuts(cells, heights, surfaces, regions, more, up, pieces)
-    meet(cells.w, heights, surfaces, regions, up, pieces)
-    return OverSegmentation(surfaces, regions, pieces)
+    heights, up = model.heights, model.up
+    graph = connect_surfaces(grid, heights)
+    labels, n = watershed(heights, graph, steps.concavity)
+    if steps.width_split:
+        n = split_at_width_changes(grid, heights, graph, labels, up, n)
+    segments = measure_segments(grid, heights, graph, labels, n, up)
+    measure_adjacency(grid.inverse_depth, heights, graph, labels, up, segments)
+    return OverSegmentation(graph, labels, segments)
 
 
 def _merge(
-    cells: Cells, model: PlaneModel, segments: OverSegmentation, settings: DetectionSettings
+    grid: DepthGrid,
+    model: PlaneModel,
+    oversegmentation: OverSegmentation,
+    steps: Steps,
 ) -> Bool:
     """Merge the segments of each object; return which are known to be low-profile objects."""
-    surfaces, regions, pieces = segments
-    rules = _rules_of(settings.rules)
-    known: Bool = join_raised(pieces, model.raised, regions, surfaces.spans)
-    if rules.small:
-        join_small(pieces, cells)
-    if rules.parts:
-        join_parts(pieces, Sight(cells.lens.fx, model.up[2]), trees())
-    if rules.occluder:
-        join_behind(pieces, cells.w, cells.lens, surfaces.normal, regions)
-        join_around(pieces)
+    graph, labels, segments = oversegmentation
+    known: Bool = merge_low_profile(segments, model.low_profile, labels, graph.spans)
+    if steps.learned_merging:
+        merge_learned(segments, ViewGeometry(grid.intrinsics.fx, model.up[2]), load_trees())
+    if steps.across_occlusion:
+        merge_across_occluder(segments, grid.inverse_depth, grid.intrinsics, graph.normal, labels)
     return known
 
 
 def _clean_up(
-    cells: Cells,
+    grid: DepthGrid,
     model: PlaneModel,
-    segments: OverSegmentation,
+    oversegmentation: OverSegmentation,
     known: Bool,
     settings: DetectionSettings,
 ) -> I4:
-    """Reject what is no object, and number the others; return their leading segments."""
-    surfaces, regions, pieces = segments
-    field = Field(
-        cells.w, cells.lens, model.planes, model.heights.owner, model.walls, regions, surfaces.spans
+    """Reject what is no object, and number the others; return their leading oversegmentation."""
+    graph, labels, segments = oversegmentation
+    field = LabelledGrid(
+        grid.inverse_depth,
+        grid.intrinsics,
+        model.planes,
+        model.heights.plane_id,
+        model.walls,
+        labels,
+        graph.spans,
     )
     limits = Limits(settings.max_height_m, settings.max_size_m, settings.max_range_m)
-    refused = is_no_object(field, pieces, model.up, known, limits)
-    leaders, numbers = _number(pieces.group, refused)
-    rename(regions, surfaces.spans, numbers)
-    return leaders
+    rejected = is_background(field, segments, model.up, known, limits)
+    representatives, numbers = _number(segments.parent, rejected)
+    relabel(labels, graph.spans, numbers)
+    return representatives
 
 
-def _number(group: I4, refused: Bool) -> tuple[I4, I4]:
+def _number(parent: I4, rejected: Bool) -> tuple[I4, I4]:
     """Return the leading segment of each object, and the label of each segment; group 0 is none."""
-    leading = (group == np.arange(group.size)) & ~refused
+    leading = (parent == np.arange(parent.size)) & ~rejected
     leading[0] = False
-    leaders = np.concatenate([[0], np.flatnonzero(leading)])
-    numbers = np.zeros(group.size, np.int16)
-    numbers[leaders] = np.arange(leaders.size)
-    numbers = numbers[group]
-    group[refused[group]] = 0
-    return leaders, numbers
+    representatives = np.concatenate([[0], np.flatnonzero(leading)])
+    numbers = np.zeros(parent.size, np.int16)
+    numbers[representatives] = np.arange(representatives.size)
+    numbers = numbers[parent]
+    parent[rejected[parent]] = 0
+    return representatives, numbers
 
 
 def _fill(
-    cells: Cells,
+    grid: DepthGrid,
     model: PlaneModel,
-    segments: OverSegmentation,
-    leaders: I4,
+    oversegmentation: OverSegmentation,
+    representatives: I4,
     settings: DetectionSettings,
-) -> LabelledGrid:
+    steps: Steps,
+) -> Segmentation:
     """Complete the labels near the planes, and measure the objects."""
-    labels, pieces = segments.regions, segments.pieces  # of objects from `_clean_up` on
-    rules = _rules_of(settings.rules)
-    if rules.feet:
-        grow_feet(cells.w, model.heights, labels)
+    labels, segments = (
+        oversegmentation.labels,
+        oversegmentation.segments,
+    )  # of objects from `_clean_up` on
+    if steps.contact_boundary:
+        fill_contact_boundary(grid.inverse_depth, model.heights, labels)
     filled = np.zeros(labels.shape, np.uint8)
-    if rules.fill:
-        fill_enclosed(cells.w, model.heights.height, labels, leaders.size - 1, filled)
-    filled |= (model.raised > 0) & (labels > 0)  # it may lie at the level of its plane
-    owners = pieces.owner[leaders].astype(np.int64) - 1
-    owners[0] = 0
-    things = things_of(cells, labels, pieces, leaders, model.up, settings.max_range_m)
-    return LabelledGrid(model.up, model.supports, model.planes, labels, filled, owners, things)
-
-
-@cache
-def _rules_of(text: str) -> Rules:
-    rules = text.split()
-    unknown = [rule for rule in rules if rule not in RULES]
-    if unknown:
-        msg = f"detection.rules: unknown {', '.join(unknown)}; known: {' '.join(RULES)}"
-        raise ConfigError(msg)
-    return Rules(*(rule in rules for rule in RULES))
+    if steps.hole_filling:
+        fill_holes(
+            grid.inverse_depth, model.heights.height, labels, representatives.size - 1, filled
+        )
+    filled |= (model.low_profile > 0) & (labels > 0)  # it may lie at the level of its plane
+    plane_ids = segments.plane_id[representatives].astype(np.int64) - 1
+    plane_ids[0] = 0
+    measured = measure_objects(
+        grid, labels, segments, representatives, model.up, settings.max_range_m
+    )
+    return Segmentation(model.up, model.supports, model.planes, labels, filled, plane_ids, measured)

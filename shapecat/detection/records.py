@@ -3,13 +3,13 @@
 from typing import NamedTuple
 
 from shapecat.arrays import F8, I4, U1
-from shapecat.detection.merging.segments import Pieces
-from shapecat.detection.output.measurements import Things
-from shapecat.detection.planes.extent import Support
-from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.segmentation.connectivity import Surfaces
+from shapecat.detection.merging.segments import Segments
+from shapecat.detection.output.measurements import ObjectMeasurements
+from shapecat.detection.planes.extent import SupportingPlane
+from shapecat.detection.planes.height_map import HeightMap
+from shapecat.detection.segmentation.connectivity import SurfaceGraph
 
-__all__ = ["LabelledGrid", "OverSegmentation", "PlaneModel"]
+__all__ = ["OverSegmentation", "PlaneModel", "Segmentation"]
 
 
 class PlaneModel(NamedTuple):
@@ -19,17 +19,17 @@ class PlaneModel(NamedTuple):
     ----------
     up : (3,) unit vector.
     supports : the planes, lowest first.
-    planes : their rows of `table_of`.
+    planes : their rows of `pack_planes`.
     heights : of the samples, and the plane each is above.
-    raised : (rows, columns) int16, the numbers of the low-profile objects.
+    low_profile : (rows, columns) int16, the numbers of the low-profile objects.
     walls : (rows, columns) uint8, not 0 on walls.
     """
 
     up: F8
-    supports: list[Support]
+    supports: list[SupportingPlane]
     planes: F8
-    heights: Heights
-    raised: I4
+    heights: HeightMap
+    low_profile: I4
     walls: U1
 
 
@@ -38,34 +38,34 @@ class OverSegmentation(NamedTuple):
 
     Attributes
     ----------
-    surfaces : which samples are connected, and which way they face.
-    regions : (rows, columns) int16, the segments, 0 elsewhere.
-    pieces : their statistics.
+    graph : which samples are connected, and which way they face.
+    labels : (rows, columns) int16, the segments, 0 elsewhere.
+    segments : their statistics.
     """
 
-    surfaces: Surfaces
-    regions: I4
-    pieces: Pieces
+    graph: SurfaceGraph
+    labels: I4
+    segments: Segments
 
 
-class LabelledGrid(NamedTuple):
+class Segmentation(NamedTuple):
     """A depth grid with its objects.
 
     Attributes
     ----------
     up : (3,) unit vector.
     supports : the planes, lowest first.
-    planes : their rows of `table_of`.
+    planes : their rows of `pack_planes`.
     labels : (rows, columns) int16, 1..count, 0 elsewhere.
     filled : (rows, columns) uint8, 1 where a label lies at the level of the plane.
-    owners : (count + 1,) the plane that each label stands above; 0 for label 0.
-    things : what is measured of the labels.
+    plane_ids : (count + 1,) the plane that each label stands above; 0 for label 0.
+    measured : what is measured of the labels.
     """
 
     up: F8
-    supports: list[Support]
+    supports: list[SupportingPlane]
     planes: F8
     labels: I4
     filled: U1
-    owners: I4
-    things: Things
+    plane_ids: I4
+    measured: ObjectMeasurements

@@ -1,4 +1,4 @@
-"""The hierarchy of a scene: which planes and objects stand on which (thesis 4.5)."""
+"""Scene graph: which planes and objects stand on which, the thesis's hierarchy (4.5)."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Views: an unorganized cloud as the image a depth camera would have taken of it."""
+"""Virtual camera: the image that a depth camera would have taken of an unorganized cloud."""
 
 import math
 from typing import NamedTuple
@@ -6,12 +6,12 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import CELL_M, Cells, Lens
+from shapecat.detection.depth_grid import CELL_M, DepthGrid, PinholeIntrinsics
 from shapecat.geometry import DISCONTINUITY, NEAREST_M, gravity_rotation
 from shapecat.jit import kernel
 from shapecat.types import Pose
 
-__all__ = ["View", "overview_of", "view_of"]
+__all__ = ["VirtualImage", "top_view", "virtual_image"]
 
 FIELD = 1.5
 """Largest tangent of the angle between a point and the optical axis."""
@@ -25,26 +25,26 @@ LOAD = 1.8
 """Points per occupied cell: with fewer, a surface has holes."""
 
 
-class View(NamedTuple):
+class VirtualImage(NamedTuple):
     """A cloud in a virtual camera.
 
     Attributes
     ----------
-    cells : the image of the nearest points.
+    grid : the image of the nearest points.
     points : (n, 3) float32 in the frame of the virtual camera; 0 where not used.
     cell : (n,) int32 flat cell of each point, -1 outside.
     view_from_sensor : pose of the cloud in the frame of the virtual camera.
     crowded : share of the points that lie well behind others of their cell.
     """
 
-    cells: Cells
+    grid: DepthGrid
     points: F4
     cell: I4
     view_from_sensor: Pose
     crowded: float
 
 
-def view_of(points: F4, *, range_m: float, origin: F8 | None = None) -> View | None:
+def virtual_image(points: F4, *, range_m: float, origin: F8 | None = None) -> VirtualImage | None:
     """Look at ``points`` (n, 3), sensor frame, from ``origin``; None if there are too few.
 
     The optical axis points at the middle of the cloud; the cells are as wide as the points are
@@ -63,9 +63,9 @@ def view_of(points: F4, *, range_m: float, origin: F8 | None = None) -> View | N
     return _imaged(turned, place, bounds, n, pose) if n >= LEAST_POINTS else None
 
 
-def overview_of(
+def top_view(
     points: F4, hint: F8 | None, *, range_m: float, rng: np.random.Generator
-) -> View | None:
+) -> VirtualImage | None:
     """Look at a cloud that was not taken from its origin, from above its dominant plane.
 
     The plane is the one with most points within 1 cm of it, of 200 through three points (with a
@@ -98,7 +98,7 @@ def overview_of(
     middle = np.median(sample, axis=0)
     side = gravity_rotation(up)[1]
     origin = middle + math.sqrt(0.5) * (up - side)
-    return view_of(points, range_m=max(range_m, 2.0), origin=origin)
+    return virtual_image(points, range_m=max(range_m, 2.0), origin=origin)
 
 
 @kernel
@@ -166,7 +166,7 @@ def _facing(axis: F8) -> F8:
     return np.stack([x, np.cross(z, x), z])
 
 
-def _imaged(turned: F4, place: F4, bounds: F8, n: int, pose: Pose) -> View:
+def _imaged(turned: F4, place: F4, bounds: F8, n: int, pose: Pose) -> VirtualImage:
     left, top, right, bottom = (float(v) for v in bounds)
     width, height = right - left, bottom - top
     z = turned[:: max(1, n // 20_000), 2]
@@ -178,12 +178,14 @@ def _imaged(turned: F4, place: F4, bounds: F8, n: int, pose: Pose) -> View:
         max(width, height) / MOST_ROWS,
         1e-6,
     )
-    lens = Lens(1 / pitch, 1 / pitch, -left / pitch, -top / pitch)
-    w = np.zeros((int(height / pitch + 1.5), int(width / pitch + 1.5)), np.float32)
+    intrinsics = PinholeIntrinsics(1 / pitch, 1 / pitch, -left / pitch, -top / pitch)
+    inv_depth = np.zeros((int(height / pitch + 1.5), int(width / pitch + 1.5)), np.float32)
     cell = np.full(len(turned), -1, np.int32)
-    behind = _project(turned, place, lens, w, cell)
-    _close_holes(w)
-    return View(Cells(w, lens, 1, pitch * depth), turned, cell, pose, behind / n)
+    behind = _project(turned, place, intrinsics, inv_depth, cell)
+    _close_holes(inv_depth)
+    return VirtualImage(
+        DepthGrid(inv_depth, intrinsics, 1, pitch * depth), turned, cell, pose, behind / n
+    )
 
 
 def _spacing(place: F4, bounds: F8, n: int) -> float:
@@ -214,16 +216,16 @@ def _occupied(place: F4, left: float, top: float, scale: float, side: int) -> in
 
 
 @kernel
-def _project(points: F4, place: F4, lens: Lens, w: F4, cell: I4) -> int:
+def _project(points: F4, place: F4, intrinsics: PinholeIntrinsics, inv_depth: F4, cell: I4) -> int:
     """Average the nearest points of each cell; return how many lie well behind them."""
-    rows, columns = w.shape
-    nearest = np.zeros(w.shape, np.float32)
-    count = np.zeros(w.shape, np.float32)
+    rows, columns = inv_depth.shape
+    nearest = np.zeros(inv_depth.shape, np.float32)
+    count = np.zeros(inv_depth.shape, np.float32)
     for k in range(points.shape[0]):
         if place[k, 0] == OUTSIDE:
             continue
-        j = int(lens.fx * place[k, 0] + lens.cx + 0.5)
-        i = int(lens.fy * place[k, 1] + lens.cy + 0.5)
+        j = int(intrinsics.fx * place[k, 0] + intrinsics.cx + 0.5)
+        i = int(intrinsics.fy * place[k, 1] + intrinsics.cy + 0.5)
         if i < 0 or j < 0 or i >= rows or j >= columns:
             continue
         cell[k] = i * columns + j
@@ -235,22 +237,22 @@ def _project(points: F4, place: F4, lens: Lens, w: F4, cell: I4) -> int:
         i, j = cell[k] // columns, cell[k] % columns
         v = np.float32(1) / points[k, 2]
         if v > nearest[i, j] - DISCONTINUITY:
-            w[i, j] += v
+            inv_depth[i, j] += v
             count[i, j] += 1
         elif v < nearest[i, j] - 3 * DISCONTINUITY:
             behind += 1
     for i in range(rows):
         for j in range(columns):
             if count[i, j] > 0:
-                w[i, j] /= count[i, j]
+                inv_depth[i, j] /= count[i, j]
     return behind
 
 
 @kernel
-def _close_holes(w: F4) -> None:
+def _close_holes(inv_depth: F4) -> None:
     """Give cells between two neighbours of one surface their mean."""
-    rows, columns = w.shape
-    source = w.copy()
+    rows, columns = inv_depth.shape
+    source = inv_depth.copy()
     for i in range(1, rows - 1):
         for j in range(1, columns - 1):
             if source[i, j] > 0:
@@ -265,4 +267,4 @@ def _close_holes(w: F4) -> None:
                 total += a + b
                 n += 2
             if n > 0:
-                w[i, j] = total / n
+                inv_depth[i, j] = total / n

@@ -1,8 +1,8 @@
 """Grow the trees that tell parts of one object: ``python -m shapecat.models.parts``.
 
-Simulated scenes, as several sensors see them, give the pairs of pieces. The pieces of an object are
-joined in random order, and all pairs on the way are learned from: so the trees meet what they will
-have joined themselves.
+Simulated scenes, as several sensors see them, give the pairs of segments. The segments of an object
+are joined in random order, and all pairs on the way are learned from: so the trees meet what they
+will have joined themselves.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,13 +17,20 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U1, Bool
 from shapecat.config import DetectionSettings
-from shapecat.detection.depth_grid import Cells, cells_of
-from shapecat.detection.merging import learned as parts
-from shapecat.detection.merging.across_occlusion import join_around, join_behind
-from shapecat.detection.merging.learned import SIGNS, Sight, Trees, meet_at_all, signs_of
-from shapecat.detection.merging.segments import Pieces, merge
-from shapecat.detection.merging.small import join_raised, join_small
-from shapecat.detection.pipeline import RULES, oversegment
+from shapecat.detection.depth_grid import DepthGrid, downsample
+from shapecat.detection.merging import learned
+from shapecat.detection.merging.across_occlusion import merge_across_occluder
+from shapecat.detection.merging.learned import BoostedTrees
+from shapecat.detection.merging.low_profile import merge_low_profile
+from shapecat.detection.merging.pair_features import (
+    FEATURES,
+    PAIR_FEATURES,
+    ViewGeometry,
+    are_adjacent,
+    pair_features,
+)
+from shapecat.detection.merging.segments import Segments, merge
+from shapecat.detection.pipeline import oversegment
 from shapecat.learning.boosting import Tree, TreeSettings, grow_tree, make_bins
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
 from shapecat.simulation.scenes import SceneKind
@@ -32,9 +39,8 @@ from shapecat.types import CATEGORIES, Camera
 
 __all__ = ["collect", "grow", "main"]
 
-_OTHERS = " ".join(rule for rule in RULES if rule != "parts")
 _PURE = 0.6
-"""A piece belongs to the object that has more than this share of it."""
+"""A segment belongs to the object that has more than this share of it."""
 _NOISY = replace(IDEAL, noise=0.0015, step=0.0029)
 _BLENDED = replace(IDEAL, noise=0.0015, blend_px=3)
 _ROUNDS, _LEAVES, _RATE, _RIDGE, _LEAST, _ROWS = 200, 64, 0.1, 1.0, 2.0, 0.7
@@ -68,9 +74,9 @@ _SERIES = (
 
 
 class Pairs(NamedTuple):
-    """Pairs of pieces: ``signs`` (n, `SIGNS`), and whether both are of the ``same`` object (n,)."""
+    """Pairs of segments: ``features`` (n, `FEATURES`), and whether both are of one object (n,)."""
 
-    signs: F4
+    features: F4
     same: Bool
 
 
@@ -80,7 +86,7 @@ class Pairs(NamedTuple):
 @click.option("--jobs", default=2, show_default=True, help="Processes.")
 @click.option(
     "--out",
-    default=Path(parts.__file__).with_name(parts.FILE),
+    default=Path(learned.__file__).with_name(learned.FILE),
     type=click.Path(path_type=Path),
     help="File to write.",
 )
@@ -93,7 +99,7 @@ def main(*, share: float, seed: int, jobs: int, out: Path) -> None:
 
 
 def collect(share: float, jobs: int) -> Pairs:
-    """Return the pairs of pieces of a share of the scenes, whatever the number of jobs."""
+    """Return the pairs of segments of a share of the scenes, whatever the number of jobs."""
     chunks = [
         (series, series.first + k, min(_CHUNK, count - k))
         for series in _SERIES
@@ -104,7 +110,7 @@ def collect(share: float, jobs: int) -> Pairs:
         found = pool.map(_collect, chunks)
         with click.progressbar(found, length=len(chunks), label="scenes") as bar:
             both = list(bar)
-    return Pairs(np.concatenate([p.signs for p in both]), np.concatenate([p.same for p in both]))
+    return Pairs(np.concatenate([p.features for p in both]), np.concatenate([p.same for p in both]))
 
 
 def _collect(chunk: tuple[Series, int, int]) -> Pairs:
@@ -117,92 +123,90 @@ def _collect(chunk: tuple[Series, int, int]) -> Pairs:
         things = np.array([thing.label for thing in world.things])
         if frame.depth is not None and frame.camera is not None:
             found += _pairs(frame.depth, frame.camera, owners, things, rng)
-    signs = np.array([signs for signs, _ in found], np.float32).reshape(-1, SIGNS)
-    return Pairs(signs, np.array([same for _, same in found], bool))
+    features = np.array([features for features, _ in found], np.float32).reshape(-1, FEATURES)
+    return Pairs(features, np.array([same for _, same in found], bool))
 
 
 def _pairs(
     depth: F4, camera: Camera, owners: U1, things: I4, rng: np.random.Generator
 ) -> Iterator[tuple[F4, bool]]:
-    """Yield the pairs of a frame: of its pieces, and of what they are joined to.
+    """Yield the pairs of a frame: of its segments, and of what they are joined to.
 
     Parameters
     ----------
     owners : (h, w) the label of what each pixel shows.
     things : the labels of objects.
     """
-    settings = DetectionSettings(rules=_OTHERS)
-    cells = cells_of(depth, camera, range_m=settings.max_range_m)
-    if cells is None:
+    settings = DetectionSettings()
+    grid = downsample(depth, camera, range_m=settings.max_range_m)
+    if grid is None:
         return
-    found = oversegment(cells, settings=settings, rng=rng)
+    found = oversegment(grid, settings=settings, rng=rng)
     if found is None:
         return
-    ground, (surfaces, regions, pieces) = found
-    join_raised(pieces, ground.raised, regions, surfaces.spans)
-    join_small(pieces, cells)
-    join_behind(pieces, cells.w, cells.lens, surfaces.normal, regions)
-    join_around(pieces)
-    counts = _count(owners.reshape(depth.shape), regions, cells)
-    sight, seen = Sight(cells.lens.fx, float(ground.up[2])), set()
+    ground, (graph, labels, segments) = found
+    merge_low_profile(segments, ground.low_profile, labels, graph.spans)
+    merge_across_occluder(segments, grid.inverse_depth, grid.intrinsics, graph.normal, labels)
+    counts = _count(owners.reshape(depth.shape), labels, grid)
+    view_geometry, seen = ViewGeometry(grid.intrinsics.fx, float(ground.up[2])), set()
     while True:
-        rows, whose = _whose(pieces, counts, things)
+        rows, whose = _whose(segments, counts, things)
         todo = []
-        for p, q in _meeting(pieces, whose):
+        for p, q in _meeting(segments, whose):
             same = bool(whose[p] == whose[q] and whose[p] > 0)
             if same:
                 todo.append((p, q))
             if (p, q, rows[p], rows[q]) not in seen:
                 seen.add((p, q, rows[p], rows[q]))
-                signs = np.zeros(SIGNS, np.float32)
-                signs_of(pieces, p, q, sight, signs)
-                yield signs, same
+                named = np.zeros(1, PAIR_FEATURES)
+                pair_features(segments, p, q, view_geometry, named[0])
+                yield named.view(np.float32), same
         if not todo:
             return
-        merge(pieces, *todo[rng.integers(len(todo))])
+        merge(segments, *todo[rng.integers(len(todo))])
 
 
-def _count(owners: U1, regions: I4, cells: Cells) -> I4:
-    """Return (pieces, labels) how many cells of each piece show each label."""
-    middle, (rows, columns) = cells.factor // 2, regions.shape
-    seen = owners[middle :: cells.factor, middle :: cells.factor][:rows, :columns]
-    counts = np.zeros((regions.max() + 1, owners.max() + 1), np.int64)
-    np.add.at(counts, (regions.ravel(), seen.ravel()), 1)
+def _count(owners: U1, labels: I4, grid: DepthGrid) -> I4:
+    """Return (segments, labels) how many cells of each segment show each label."""
+    middle, (rows, columns) = grid.factor // 2, labels.shape
+    seen = owners[middle :: grid.factor, middle :: grid.factor][:rows, :columns]
+    counts = np.zeros((labels.max() + 1, owners.max() + 1), np.int64)
+    np.add.at(counts, (labels.ravel(), seen.ravel()), 1)
     return counts
 
 
-def _whose(pieces: Pieces, counts: I4, things: I4) -> tuple[I4, I4]:
-    """Return of each piece how many cells it has, and whose it is.
+def _whose(segments: Segments, counts: I4, things: I4) -> tuple[I4, I4]:
+    """Return of each segment how many cells it has, and whose it is.
 
     That is 0 for what is no object, and -1 for what is of several.
     """
     joined = np.zeros_like(counts)
-    np.add.at(joined, pieces.group, counts)
-    cells = joined.sum(axis=1)
+    np.add.at(joined, segments.parent, counts)
+    sizes = joined.sum(axis=1)
     best = joined.argmax(axis=1)
-    pure = joined[np.arange(len(best)), best] > _PURE * cells
-    return cells, np.where(pure, np.where(np.isin(best, things), best, 0), -1)
+    pure = joined[np.arange(len(best)), best] > _PURE * sizes
+    return sizes, np.where(pure, np.where(np.isin(best, things), best, 0), -1)
 
 
-def _meeting(pieces: Pieces, whose: I4) -> Iterator[tuple[int, int]]:
-    """Yield the pairs of pieces that meet, but for mixed ones and those that are no objects."""
-    n = pieces.group.size
+def _meeting(segments: Segments, whose: I4) -> Iterator[tuple[int, int]]:
+    """Yield the pairs of segments that meet, but for mixed ones and those that are no objects."""
+    n = segments.parent.size
     for p in range(1, n):
         for q in range(p + 1, n):
             known = min(whose[p], whose[q]) >= 0 and max(whose[p], whose[q]) > 0
-            if known and meet_at_all(pieces, p, q):
+            if known and are_adjacent(segments, p, q):
                 yield p, q
 
 
-def grow(pairs: Pairs, seed: int) -> Trees:
+def grow(pairs: Pairs, seed: int) -> BoostedTrees:
     """Grow trees on pairs: gradient boosting with the cross entropy (Friedman 2001)."""
     rng = np.random.default_rng(seed)
-    bins, n = make_bins(pairs.signs), len(pairs.same)
+    bins, n = make_bins(pairs.features), len(pairs.same)
     share = pairs.same.mean()
     logit = np.full(n, np.log(share / (1 - share)), np.float32)
     settings = TreeSettings(_LEAVES, _RATE, _RIDGE, _LEAST)
     grown: list[Tree] = [_leaf(float(logit[0]))]
-    columns = np.arange(SIGNS)
+    columns = np.arange(FEATURES)
     for _ in range(_ROUNDS):
         posterior = 1 / (1 + np.exp(-logit))
         rows = np.sort(rng.permutation(n)[: round(_ROWS * n)]).astype(np.int32)
@@ -217,11 +221,11 @@ def _leaf(value: float) -> Tree:
     return Tree(none, np.zeros(1, np.float32), none, np.array([value], np.float32))
 
 
-def _joined(grown: Sequence[Tree]) -> Trees:
+def _joined(grown: Sequence[Tree]) -> BoostedTrees:
     """Put the nodes of all trees behind each other."""
     roots = np.cumsum([0, *(len(tree.left) for tree in grown)])
     left = [np.where(t.left > 0, t.left + root, 0) for t, root in zip(grown, roots, strict=False)]
-    return Trees(
+    return BoostedTrees(
         roots[:-1].astype(np.int32),
         np.concatenate([tree.feature for tree in grown]).astype(np.int16),
         np.concatenate([tree.threshold for tree in grown]).astype(np.float32),

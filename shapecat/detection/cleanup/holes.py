@@ -1,14 +1,14 @@
-"""Fill: cells near the level of the table that belong to objects: their feet and their floors."""
+"""Hole filling: cells at the level of the table that are of objects: contacts and floors."""
 
 import numpy as np
 
 from shapecat.arrays import F4, I4, U1, Bool
-from shapecat.detection.depth_grid import place_of
-from shapecat.detection.planes.height_map import LEAST_M, NOISE, Heights
+from shapecat.detection.depth_grid import row_and_column
+from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, HeightMap
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel, unset
 
-__all__ = ["FRINGE", "fill_enclosed", "grow_feet"]
+__all__ = ["FRINGE", "fill_contact_boundary", "fill_holes"]
 
 FRINGE = 0.6
 """Share of the least height from which a reading next to an object belongs to it."""
@@ -28,44 +28,47 @@ LEVEL = 0.15
 
 
 @kernel
-def grow_feet(w: F4, heights: Heights, labels: I4) -> None:
+def fill_contact_boundary(inv_depth: F4, heights: HeightMap, labels: I4) -> None:
     """Let the labels grow over the cells beside them that are hardly above their plane.
 
     The least height of an object cell is safe against the noise of the plane; next to an object
     less is enough. Further away what is so low is as often the plane.
     """
-    owner, height = heights
+    plane_id, height = heights
     rows, columns = labels.shape
     edge = unset(labels.size, np.int32)
     beside = np.zeros(columns, np.bool_)
     count = 0
     for i in range(rows):
-        if not _find_beside(owner, labels[i], i, beside):
+        if not _find_beside(plane_id, labels[i], i, beside):
             continue
         for j in range(columns):
             if beside[j]:
                 edge[count] = i * columns + j
                 count += 1
     for p in edge[:count]:
-        i, j = place_of(p, columns)
+        i, j = row_and_column(p, columns)
         for d in range(4):
             y = i + (1 if d == 0 else -1 if d == 1 else 0)
             x = j + (1 if d == 2 else -1 if d == 3 else 0)
             if y < 0 or x < 0 or y >= rows or x >= columns or labels[y, x] != 0:
                 continue
-            if owner[y, x] != -abs(owner[i, j]) or abs(w[y, x] - w[i, j]) >= DISCONTINUITY:
+            if (
+                plane_id[y, x] != -abs(plane_id[i, j])
+                or abs(inv_depth[y, x] - inv_depth[i, j]) >= DISCONTINUITY
+            ):
                 continue
-            z = 1 / w[y, x]
-            if height[y, x] > FRINGE * (LEAST_M + NOISE * z * z):
+            z = 1 / inv_depth[y, x]
+            if height[y, x] > FRINGE * (MIN_HEIGHT_M + HEIGHT_NOISE * z * z):
                 labels[y, x] = labels[i, j]
 
 
 @kernel(leaf=True)
-def _find_beside(owner: I4, labels: I4, i: int, beside: Bool) -> bool:
+def _find_beside(plane_id: I4, labels: I4, i: int, beside: Bool) -> bool:
     """Mark the labelled cells of a row that are beside cells of a plane; whether there are any."""
-    rows, columns = owner.shape
+    rows, columns = plane_id.shape
     # Labelled cells are on no plane, so the row itself may stand for the one beyond the image.
-    above, here, below = owner[max(i - 1, 0)], owner[i], owner[min(i + 1, rows - 1)]
+    above, here, below = plane_id[max(i - 1, 0)], plane_id[i], plane_id[min(i + 1, rows - 1)]
     some = False
     for j in range(columns):
         beside[j] = (labels[j] > 0) & ((above[j] < 0) | (below[j] < 0))
@@ -102,7 +105,7 @@ def _extent_of(labels: I4) -> tuple[int, int, int, int]:
 
 @kernel(leaf=True)
 def _flood_hole(
-    w: F4,
+    inv_depth: F4,
     labels: I4,
     extent: tuple[int, int, int, int],
     seen: U1,
@@ -137,9 +140,9 @@ def _flood_hole(
             if label > 0:
                 total += 1
                 sides[label] += 1
-                ahead[label] += w[y, x] > w[i, j] + DISCONTINUITY
-                level[label] += abs(w[y, x] - w[i, j]) < DISCONTINUITY
-            elif w[y, x] <= 0:
+                ahead[label] += inv_depth[y, x] > inv_depth[i, j] + DISCONTINUITY
+                level[label] += abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY
+            elif inv_depth[y, x] <= 0:
                 total += 1
             elif not seen[y, x]:
                 seen[y, x] = 1
@@ -149,14 +152,14 @@ def _flood_hole(
 
 
 @kernel(leaf=True)
-def _mark_open(w: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1) -> None:
+def _mark_open(inv_depth: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1) -> None:
     """Mark unlabelled cells from which others lead right and down to the border of the extent.
 
     What leads left and up is found as the holes are looked for; the rest takes a flood.
     """
     i0, j0, i1, j1 = extent
     for i in range(i1 - 1, i0 - 1, -1):
-        here, label, value = seen[i, j0:j1], labels[i, j0:j1], w[i, j0:j1]
+        here, label, value = seen[i, j0:j1], labels[i, j0:j1], inv_depth[i, j0:j1]
         for j in range(here.size):
             here[j] = OPEN if (label[j] == 0) & (value[j] > 0) else 0
         if i == i1 - 1:
@@ -169,10 +172,10 @@ def _mark_open(w: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1) -
 
 @kernel(inline=True, leaf=True)
 def _may_be_hole(
-    w: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1, i: int, j: int
+    inv_depth: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1, i: int, j: int
 ) -> bool:
     """Whether an unlabelled cell is new and not known to be open."""
-    if labels[i, j] != 0 or seen[i, j] or w[i, j] <= 0:
+    if labels[i, j] != 0 or seen[i, j] or inv_depth[i, j] <= 0:
         return False
     if _is_open(seen, extent, i, j):
         seen[i, j] = OPEN
@@ -190,18 +193,18 @@ def _is_open(seen: U1, extent: tuple[int, int, int, int], i: int, j: int) -> boo
 
 
 @kernel(leaf=True)
-def _is_raised(w: F4, height: F4, stack: I4, cells: int) -> bool:
+def _is_raised(inv_depth: F4, height: F4, stack: I4, size: int) -> bool:
     """Whether a hole lies a little above the plane, as the floor of a plate does."""
-    raised = far = 0.0
-    for t in range(cells):
+    height_sum = far = 0.0
+    for t in range(size):
         i, j = stack[t, 0], stack[t, 1]
-        raised += height[i, j]
-        far += 1 / w[i, j]
-    return raised > cells * (RAISED_M + RAISED_NOISE * (far / cells) ** 2)
+        height_sum += height[i, j]
+        far += 1 / inv_depth[i, j]
+    return height_sum > size * (RAISED_M + RAISED_NOISE * (far / size) ** 2)
 
 
 @kernel
-def fill_enclosed(w: F4, height: F4, labels: I4, count: int, filled: U1) -> None:
+def fill_holes(inv_depth: F4, height: F4, labels: I4, count: int, filled: U1) -> None:
     """Give enclosed unlabelled cells to what encloses them, and mark them in ``filled``.
 
     Cells are enclosed when 60 % of their boundary is one label and every other label on it is in
@@ -211,24 +214,24 @@ def fill_enclosed(w: F4, height: F4, labels: I4, count: int, filled: U1) -> None
     stack = np.zeros((STACK, 2), np.int16)
     sides, ahead, level = np.zeros((3, count + 1), np.int32)
     extent = _extent_of(labels)
-    _mark_open(w, labels, extent, seen)
+    _mark_open(inv_depth, labels, extent, seen)
     for si in range(extent[0], extent[2]):
         for sj in range(extent[1], extent[3]):
-            if not _may_be_hole(w, labels, extent, seen, si, sj):
+            if not _may_be_hole(inv_depth, labels, extent, seen, si, sj):
                 continue
             stack[0, 0], stack[0, 1] = si, sj
-            cells, total = _flood_hole(w, labels, extent, seen, stack, sides, ahead, level)
-            if cells == 0:
+            size, total = _flood_hole(inv_depth, labels, extent, seen, stack, sides, ahead, level)
+            if size == 0:
                 continue
             best = np.argmax(sides)
             share = SHARE
-            if np.sum(sides) > LABELLED * total and _is_raised(w, height, stack, cells):
+            if np.sum(sides) > LABELLED * total and _is_raised(inv_depth, height, stack, size):
                 share = RAISED_SHARE
             fits = sides[best] > max(0, share * total) and level[best] > LEVEL * total
             for k in range(1, count + 1):
                 if k != best and ahead[k] < sides[k]:
                     fits = False
             if fits:
-                for t in range(cells):
+                for t in range(size):
                     labels[stack[t, 0], stack[t, 1]] = best
                     filled[stack[t, 0], stack[t, 1]] = 1

@@ -1,25 +1,25 @@
-"""Hulls: the convex hull of a connected part of the cells, filled."""
+"""Convex hull of a connected part of the grid, filled."""
 
 import math
 
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import place_of
+from shapecat.detection.depth_grid import row_and_column
 from shapecat.jit import kernel
 
 __all__ = ["fill_hull"]
 
 
 @kernel
-def fill_hull(excess: F4, part: I4, stack: I4, count: int) -> int:
+def fill_hull(residual: F4, part: I4, stack: I4, count: int) -> int:
     """Add the low cells within the convex hull of a part to it; return how many cells it has."""
-    rows, columns = excess.shape
+    rows, columns = residual.shape
     parts = part.reshape(-1)
     me = parts[stack[0]]
     left, right = np.full(rows, columns, np.float64), np.full(rows, -1.0)
     for t in range(count):
-        i, j = place_of(stack[t], columns)
+        i, j = row_and_column(stack[t], columns)
         left[i], right[i] = min(left[i], j), max(right[i], j)
     first, last = 0, rows - 1
     while right[first] < 0:
@@ -32,7 +32,7 @@ def fill_hull(excess: F4, part: I4, stack: I4, count: int) -> int:
     top = count
     for i in range(first, last + 1):
         for j in range(math.ceil(left[i] - 1e-6), math.floor(1e-6 - right[i]) + 1):
-            if part[i, j] != me and excess[i, j] != 0:
+            if part[i, j] != me and residual[i, j] != 0:
                 stack[top] = i * columns + j
                 part[i, j] = me
                 top += 1

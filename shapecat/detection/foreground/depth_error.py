@@ -1,4 +1,4 @@
-"""Waves: the slow swells of a flat surface, as sensors see it, levelled.
+"""Low-frequency depth error: the slow waves that sensors see in a flat surface, levelled.
 
 They are higher than a plate is thick. What is left are steps and noise, which is measured.
 """
@@ -9,7 +9,14 @@ from shapecat.arrays import F4, F8, I4
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
-__all__ = ["APART", "EVERY", "cut_feet", "excess_of", "noise_of", "subtract_mean"]
+__all__ = [
+    "APART",
+    "EVERY",
+    "clear_contact",
+    "filter_high_pass",
+    "measure_noise",
+    "measure_residual",
+]
 
 LOW_M = 0.03
 """Higher things are objects anyway."""
@@ -28,12 +35,14 @@ BIN, BINS, EVERY = 2e-5, 500, 3
 
 
 @kernel
-def excess_of(w: F4, owner: I4, height: F4, plane: F8, number: int, out: F4) -> int:
+def measure_residual(
+    inv_depth: F4, plane_id: I4, height: F4, plane: F8, number: int, out: F4
+) -> int:
     """Write the smoothed inverse depth above the plane of its low cells; 0 elsewhere.
 
     Returns how many there are, but for those on the border of the image.
     """
-    rows, columns = w.shape
+    rows, columns = inv_depth.shape
     zero = np.float32(0)
     raw, mark = np.zeros((3, columns), np.float32), np.zeros((3, columns), np.float32)
     total, count = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
@@ -42,7 +51,9 @@ def excess_of(w: F4, owner: I4, height: F4, plane: F8, number: int, out: F4) -> 
     out[0, :] = out[rows - 1, :] = zero
     for i in range(rows):
         before = some
-        some = _find_low(w[i], owner[i], height[i], plane, number, i, raw[i % 3], mark[i % 3])
+        some = _find_low(
+            inv_depth[i], plane_id[i], height[i], plane, number, i, raw[i % 3], mark[i % 3]
+        )
         if i < 2:
             continue
         line = out[i - 1]
@@ -67,7 +78,7 @@ def excess_of(w: F4, owner: I4, height: F4, plane: F8, number: int, out: F4) -> 
 
 @kernel(leaf=True)
 def _find_low(
-    w: F4, owner: I4, height: F4, plane: F8, number: int, i: int, raw: F4, mark: F4
+    inv_depth: F4, plane_id: I4, height: F4, plane: F8, number: int, i: int, raw: F4, mark: F4
 ) -> bool:
     """Write how far the low cells of row ``i`` are above the plane, and 1 for them, or else 0.
 
@@ -77,31 +88,33 @@ def _find_low(
     slope, base = np.float32(plane[0]), np.float32(plane[1] * i + plane[2])
     above, on = np.int8(number), np.int8(-number)
     some = False
-    for j in range(w.size):
-        mine = ((owner[j] == above) | (owner[j] == on)) & (height[j] < low)
+    for j in range(inv_depth.size):
+        mine = ((plane_id[j] == above) | (plane_id[j] == on)) & (height[j] < low)
         mark[j] = one if mine else zero
         some |= mine
     if some:
-        for j in range(w.size):
-            raw[j] = mark[j] * (w[j] - (slope * np.float32(j) + base))
+        for j in range(inv_depth.size):
+            raw[j] = mark[j] * (inv_depth[j] - (slope * np.float32(j) + base))
     else:
         raw[:] = zero
     return some
 
 
 @kernel
-def cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4, stack: I4, drop: F4) -> None:
+def clear_contact(
+    inv_depth: F4, plane_id: I4, height: F4, number: int, residual: F4, stack: I4, drop: F4
+) -> None:
     """Clear the excess of the feet of what is not low: steep cells below it, down to the plane."""
-    rows, columns = excess.shape
+    rows, columns = residual.shape
     top = 0
     high, edge = np.float32(LOW_M), np.zeros(columns, np.bool_)
     for i in range(1, rows - 1):
         # Few cells are high and beside what is low, and this vectorises.
-        here, above, below = excess[i], excess[i - 1], excess[i + 1]
+        here, above, below = residual[i], residual[i - 1], residual[i + 1]
         some = False
         for j in range(1, columns - 1):
             beside = (above[j] != 0) | (below[j] != 0) | (here[j - 1] != 0) | (here[j + 1] != 0)
-            edge[j] = beside & (owner[i, j] == number) & (height[i, j] >= high)
+            edge[j] = beside & (plane_id[i, j] == number) & (height[i, j] >= high)
             some |= edge[j]
         if not some:
             continue
@@ -110,9 +123,12 @@ def cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4, stack: I4, d
                 for d in range(4):
                     y = i + (1 if d == 0 else -1 if d == 1 else 0)
                     x = j + (1 if d == 2 else -1 if d == 3 else 0)
-                    if excess[y, x] != 0 and abs(w[y, x] - w[i, j]) < DISCONTINUITY:
-                        stack[top], drop[top] = y * columns + x, excess[y, x]
-                        excess[y, x] = 0
+                    if (
+                        residual[y, x] != 0
+                        and abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY
+                    ):
+                        stack[top], drop[top] = y * columns + x, residual[y, x]
+                        residual[y, x] = 0
                         top += 1
     done = 0
     while done < top:
@@ -123,24 +139,24 @@ def cut_feet(w: F4, owner: I4, height: F4, number: int, excess: F4, stack: I4, d
             y = i + (1 if d == 0 else -1 if d == 1 else 0)
             x = j + (1 if d == 2 else -1 if d == 3 else 0)
             if (
-                excess[y, x] != 0
-                and here - excess[y, x] > SLOPE
-                and abs(w[y, x] - w[i, j]) < DISCONTINUITY
+                residual[y, x] != 0
+                and here - residual[y, x] > SLOPE
+                and abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY
             ):
-                stack[top], drop[top] = y * columns + x, excess[y, x]
-                excess[y, x] = 0
+                stack[top], drop[top] = y * columns + x, residual[y, x]
+                residual[y, x] = 0
                 top += 1
 
 
 @kernel
-def subtract_mean(excess: F4, relief: F4) -> None:
+def filter_high_pass(residual: F4, high_pass: F4) -> None:
     """Write the excess over its mean in a window around each low cell; 0 elsewhere.
 
     The window slides: what enters it is added, what leaves it is taken away, down the rows for the
     sums of the columns, and along a row for those of all its cells. Sums are of integers, which
     take a quarter of the time of others in a row, and are exact.
     """
-    rows, columns = excess.shape
+    rows, columns = residual.shape
     sums = np.zeros(columns + 2 * WINDOW + 1, np.int32)
     counts = np.zeros(sums.size, np.int32)
     inside = slice(WINDOW + 1, WINDOW + 1 + columns)
@@ -149,12 +165,12 @@ def subtract_mean(excess: F4, relief: F4) -> None:
     for i in range(-WINDOW, rows):
         entering, leaving = i + WINDOW, i - WINDOW - 1
         if entering < rows:
-            _slide(excess[entering], np.int32(1), sums[inside], counts[inside])
+            _slide(residual[entering], np.int32(1), sums[inside], counts[inside])
         if leaving >= 0:
-            _slide(excess[leaving], np.int32(-1), sums[inside], counts[inside])
+            _slide(residual[leaving], np.int32(-1), sums[inside], counts[inside])
         if i < 0:
             continue
-        here, out = excess[i], relief[i]
+        here, out = residual[i], high_pass[i]
         some = False
         for j in range(columns):
             some |= here[j] != zero
@@ -192,19 +208,19 @@ def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
 
 
 @kernel
-def noise_of(relief: F4, owner: I4, number: int) -> float:
+def measure_noise(high_pass: F4, plane_id: I4, number: int) -> float:
     """Return the median rise, 1/m, between cells of the plane as far apart as at an outline."""
-    rows, columns = relief.shape
+    rows, columns = high_pass.shape
     histogram = np.zeros(BINS, np.int64)
     n = 0
     for i in range(0, rows - APART, EVERY):
         for j in range(0, columns - APART, EVERY):
-            here = relief[i, j]
-            if owner[i, j] != -number or here == 0:
+            here = high_pass[i, j]
+            if plane_id[i, j] != -number or here == 0:
                 continue
             for y, x in ((i + APART, j), (i, j + APART)):
-                if owner[y, x] == -number and relief[y, x] != 0:
-                    rise = abs(relief[y, x] - here)
+                if plane_id[y, x] == -number and high_pass[y, x] != 0:
+                    rise = abs(high_pass[y, x] - here)
                     histogram[min(int(rise / BIN), BINS - 1)] += 1
                     n += 1
     below = bins = 0

@@ -1,4 +1,4 @@
-"""Relief: low things that rise from their plane in a step, told from swells of its surface.
+"""Low-profile objects rise from their plane in a step, which slow errors of depth do not.
 
 Only an object has an edge. So waves of the surface are levelled first (`waves`), and what is low
 is judged by its outline rather than by its height.
@@ -10,21 +10,21 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import Cells, place_of
+from shapecat.detection.depth_grid import DepthGrid, row_and_column
 from shapecat.detection.foreground.convex_hull import fill_hull
 from shapecat.detection.foreground.depth_error import (
     APART,
     EVERY,
-    cut_feet,
-    excess_of,
-    noise_of,
-    subtract_mean,
+    clear_contact,
+    filter_high_pass,
+    measure_noise,
+    measure_residual,
 )
-from shapecat.detection.planes.height_map import Heights
+from shapecat.detection.planes.height_map import HeightMap
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel, unset
 
-__all__ = ["raise_low"]
+__all__ = ["find_low_profile"]
 
 LEVELS = np.array([3.0, 2.0, 1.3, 0.9, 0.6, 0.4], np.float32)
 """Heights above the mean at which outlines are looked for, as multiples of the least rise."""
@@ -68,7 +68,7 @@ BLOCK = 16
 """Cells that are looked at together: most are not above any level."""
 
 
-class Room(NamedTuple):
+class Scratch(NamedTuple):
     """Room for floods.
 
     ``seen`` and ``part`` (rows, columns) int32 hold the number of the last part at each cell, as
@@ -82,59 +82,84 @@ class Room(NamedTuple):
 
 
 @kernel
-def raise_low(cells: Cells, heights: Heights, planes: F8, raised: I4, largest_m: float) -> None:
+def find_low_profile(
+    grid: DepthGrid, heights: HeightMap, planes: F8, low_profile: I4, largest_m: float
+) -> None:
     """Give low objects the owners of objects, and swells those of the plane, in place.
 
     Parameters
     ----------
-    raised : (rows, columns) set to 1, 2, ... on low objects.
+    low_profile : (rows, columns) set to 1, 2, ... on low objects.
     largest_m : wider things are swells or furniture.
     """
-    w, owner, height = cells.w, heights.owner, heights.height
-    widest = largest_m * cells.lens.fx
-    images = unset((2, *w.shape), np.float32)
-    room = Room(
-        np.zeros(w.shape, np.int32),
-        np.zeros(w.shape, np.int32),
-        unset(w.size, np.int32),
-        unset(w.size, np.int32),
+    inv_depth, plane_id, height = grid.inverse_depth, heights.plane_id, heights.height
+    widest = largest_m * grid.intrinsics.fx
+    images = unset((2, *inv_depth.shape), np.float32)
+    scratch = Scratch(
+        np.zeros(inv_depth.shape, np.int32),
+        np.zeros(inv_depth.shape, np.int32),
+        unset(inv_depth.size, np.int32),
+        unset(inv_depth.size, np.int32),
     )
     objects = parts = np.int64(0)  # a literal would be compiled apart
     for k in range(len(planes)):
         number, plane = k + 1, planes[k].copy()
-        start, end = _rows_of(owner, number)
+        start, end = _rows_of(plane_id, number)
         if start == end:
             continue
         plane[2] += start * plane[1]  # rows count from ``start`` from here on
         rows = slice(start, end)
-        values, owners, above, marks = w[rows], owner[rows], height[rows], raised[rows]
-        excess, relief = images[0, rows], images[1, rows]
-        if excess_of(values, owners, above, plane, number, excess) < LEAST_CELLS:
+        values, plane_ids, above, marks = (
+            inv_depth[rows],
+            plane_id[rows],
+            height[rows],
+            low_profile[rows],
+        )
+        residual, high_pass = images[0, rows], images[1, rows]
+        if measure_residual(values, plane_ids, above, plane, number, residual) < LEAST_CELLS:
             continue
-        cut_feet(values, owners, above, number, excess, room.seeds, room.stack.view(np.float32))
-        subtract_mean(excess, relief)
-        clear = max(STEP, STEADY * noise_of(relief, owners, number))
+        clear_contact(
+            values,
+            plane_ids,
+            above,
+            number,
+            residual,
+            scratch.seeds,
+            scratch.stack.view(np.float32),
+        )
+        filter_high_pass(residual, high_pass)
+        clear = max(STEP, STEADY * measure_noise(high_pass, plane_ids, number))
         step = max(clear, SLIP * math.hypot(plane[0], plane[1]))
         least = np.float32(min(clear, FINE))
         objects, parts = _raise(
-            values, relief, owners, number, step, least, marks, widest, objects, parts, room
+            values,
+            high_pass,
+            plane_ids,
+            number,
+            step,
+            least,
+            marks,
+            widest,
+            objects,
+            parts,
+            scratch,
         )
-        parts = _lower(values, excess, owners, number, step, marks, parts, room)
+        parts = _lower(values, residual, plane_ids, number, step, marks, parts, scratch)
 
 
 @kernel(leaf=True)
-def _rows_of(owner: I4, number: int) -> tuple[int, int]:
+def _rows_of(plane_id: I4, number: int) -> tuple[int, int]:
     """Return the rows from which on and before which the cells of a plane are, with a margin.
 
     They are the same if there is none. What is looked at around a cell lies within the margin.
     """
-    rows = owner.shape[0]
+    rows = plane_id.shape[0]
     above, on = np.int8(number), np.int8(-number)
     start, end = rows, 0
     for i in range(rows):
         some = False
-        for j in range(owner.shape[1]):
-            some |= (owner[i, j] == above) | (owner[i, j] == on)
+        for j in range(plane_id.shape[1]):
+            some |= (plane_id[i, j] == above) | (plane_id[i, j] == on)
         if some:
             start, end = min(start, i), i + 1
     if end == 0:
@@ -145,28 +170,28 @@ def _rows_of(owner: I4, number: int) -> tuple[int, int]:
 
 @kernel
 def _raise(
-    w: F4,
-    relief: F4,
-    owner: I4,
+    inv_depth: F4,
+    high_pass: F4,
+    plane_id: I4,
     number: int,
     rise_least: float,
     level_least: float,
-    raised: I4,
+    low_profile: I4,
     widest: float,
     objects: int,
     me: int,
-    room: Room,
+    scratch: Scratch,
 ) -> tuple[int, int]:
     """Mark the parts above each level, filled, whose outline is that of an object.
 
     They are numbered from ``objects`` + 1 on, the parts that are looked at from ``me`` + 1 on.
-    Returns the last numbers. ``relief`` (rows, columns) is from `subtract_mean`; ``level_least`` is
-    what `LEVELS` are multiples of, 1/m.
+    Returns the last numbers. ``high_pass`` (rows, columns) is from `filter_high_pass`;
+    ``level_least`` is what `LEVELS` are multiples of, 1/m.
     """
-    flat, marks, owners = relief.reshape(-1), raised.reshape(-1), owner.reshape(-1)
-    seen, part, seeds, stack = room
+    flat, marks, plane_ids = high_pass.reshape(-1), low_profile.reshape(-1), plane_id.reshape(-1)
+    seen, part, seeds, stack = scratch
     visited, parts = seen.reshape(-1), part.reshape(-1)
-    n = _find_seeds(relief, level_least * LEVELS[-1], seeds)
+    n = _find_seeds(high_pass, level_least * LEVELS[-1], seeds)
     merits = np.zeros(1 + objects + LEVELS.size * (flat.size // LEAST_CELLS), np.float32)
     for multiple in LEVELS:
         level = level_least * multiple
@@ -175,7 +200,7 @@ def _raise(
             if visited[s] > first or not flat[s] > level:
                 continue
             me += 1
-            count = _flood(relief, level, s, me, seen, stack)
+            count = _flood(high_pass, level, s, me, seen, stack)
             if count < LEAST_CELLS:
                 continue
             known, best = 0, 0.0
@@ -183,10 +208,12 @@ def _raise(
                 parts[p] = me
                 known += marks[p] > 0
                 best = max(best, merits[marks[p]])
-            if known > SAME * count or _width(w, stack, count) > widest:
+            if known > SAME * count or _width(inv_depth, stack, count) > widest:
                 continue
-            filled = fill_hull(relief, part, stack, count)
-            outline = _outline(w, relief, owner, part, stack, filled, number, rise_least)
+            filled = fill_hull(high_pass, part, stack, count)
+            outline = _outline(
+                inv_depth, high_pass, plane_id, part, stack, filled, number, rise_least
+            )
             for p in stack[count:filled]:
                 best = max(best, merits[marks[p]])
             merit = outline.rise / outline.sides
@@ -194,24 +221,24 @@ def _raise(
                 objects += 1
                 merits[objects] = merit
                 for p in stack[:filled]:
-                    marks[p], owners[p] = objects, number
+                    marks[p], plane_ids[p] = objects, number
     return objects, me
 
 
 @kernel(leaf=True)
-def _find_seeds(relief: F4, least: float, seeds: I4) -> int:
+def _find_seeds(high_pass: F4, least: float, seeds: I4) -> int:
     """List cells above the lowest level that are higher than the ones before and above them.
 
     The first cell of a part above any level is one. Returns how many there are. Most cells are
     lower, and to pass over many of them at a time vectorises.
     """
-    rows, columns = relief.shape
+    rows, columns = high_pass.shape
     n = 0
     for i in range(1, rows):
         for start in range(1, columns, BLOCK):
             end = min(start + BLOCK, columns)
-            here, above = relief[i, start:end], relief[i - 1, start:end]
-            before = relief[i, start - 1 : end - 1]
+            here, above = high_pass[i, start:end], high_pass[i - 1, start:end]
+            before = high_pass[i, start - 1 : end - 1]
             some = False
             for k in range(here.size):
                 some |= (here[k] > least) & (here[k] > before[k]) & (here[k] > above[k])
@@ -244,14 +271,14 @@ class Outline(NamedTuple):
 
 
 @kernel(leaf=True)
-def _width(w: F4, stack: I4, count: int) -> float:
+def _width(inv_depth: F4, stack: I4, count: int) -> float:
     """Return the extent of a part along the rows, in cells a metre away."""
-    columns = w.shape[1]
+    columns = inv_depth.shape[1]
     first, last = columns, 0
     for p in stack[:count]:
-        _, j = place_of(p, columns)
+        _, j = row_and_column(p, columns)
         first, last = min(first, j), max(last, j)
-    return float((last - first) / w[stack[0] // columns, stack[0] % columns])
+    return float((last - first) / inv_depth[stack[0] // columns, stack[0] % columns])
 
 
 @kernel
@@ -268,13 +295,13 @@ def _is_object(outline: Outline, count: int) -> bool:
 
 
 @kernel(leaf=True)
-def _flood(excess: F4, level: float, start: int, n: int, part: I4, stack: I4) -> int:
+def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) -> int:
     """Give the connected cells above ``level`` the number ``n``; return how many.
 
     The cells at the border of the image are 0.
     """
-    columns = excess.shape[1]
-    flat, parts = excess.reshape(-1), part.reshape(-1)
+    columns = residual.shape[1]
+    flat, parts = residual.reshape(-1), part.reshape(-1)
     stack[0] = start
     parts[start] = n
     done, top = 0, 1
@@ -292,9 +319,9 @@ def _flood(excess: F4, level: float, start: int, n: int, part: I4, stack: I4) ->
 
 @kernel(leaf=True)
 def _outline(
-    w: F4,
-    excess: F4,
-    owner: I4,
+    inv_depth: F4,
+    residual: F4,
+    plane_id: I4,
     part: I4,
     stack: I4,
     count: int,
@@ -302,7 +329,7 @@ def _outline(
     rise_least: float,
 ) -> Outline:
     """Measure the outline of a part."""
-    rows, columns = excess.shape
+    rows, columns = residual.shape
     parts = part.reshape(-1)
     sides = table = known = hidden = steep = 0
     rise = 0.0
@@ -317,22 +344,26 @@ def _outline(
             dj = 1 if d == 2 else -1 if d == 3 else 0
             if parts[p + di * columns + dj] == me:
                 continue
-            i, j = place_of(p, columns)
+            i, j = row_and_column(p, columns)
             sides += 1
             y, x = i + di, j + dj
-            known += excess[y, x] == 0 and w[y, x] > 0 and abs(w[y, x] - w[i, j]) < DISCONTINUITY
-            hidden += w[y, x] <= 0 or w[y, x] > w[i, j] + DISCONTINUITY
+            known += (
+                residual[y, x] == 0
+                and inv_depth[y, x] > 0
+                and abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY
+            )
+            hidden += inv_depth[y, x] <= 0 or inv_depth[y, x] > inv_depth[i, j] + DISCONTINUITY
             y, x = i + OUTWARD * di, j + OUTWARD * dj
             v, u = i - INWARD * di, j - INWARD * dj
             if min(y, x) < 0 or min(v, u) < 0 or max(y, v) >= rows or max(x, u) >= columns:
                 continue
-            known += 0 < w[y, x] < w[i, j] - DISCONTINUITY
-            if owner[y, x] != -number or excess[y, x] == 0 or abs(owner[v, u]) != number:
+            known += 0 < inv_depth[y, x] < inv_depth[i, j] - DISCONTINUITY
+            if plane_id[y, x] != -number or residual[y, x] == 0 or abs(plane_id[v, u]) != number:
                 continue
             table += 1
             known += 1
-            step = (excess[v, u] - excess[y, x]) / rise_least
-            if excess[v, u] == 0:  # the inside is not low
+            step = (residual[v, u] - residual[y, x]) / rise_least
+            if residual[v, u] == 0:  # the inside is not low
                 step = MOST_STEPS
             rise += min(step, MOST_STEPS)
             steep += int(step > STEEP)
@@ -341,36 +372,36 @@ def _outline(
 
 @kernel
 def _lower(
-    w: F4,
-    excess: F4,
-    owner: I4,
+    inv_depth: F4,
+    residual: F4,
+    plane_id: I4,
     number: int,
     rise_least: float,
-    raised: I4,
+    low_profile: I4,
     me: int,
-    room: Room,
+    scratch: Scratch,
 ) -> int:
     """Give level parts of low object cells whose outline is that of a swell back to the plane.
 
     The parts are numbered from ``me`` + 1 on; returns the last number.
     """
-    rows, columns = excess.shape
-    _, part, seeds, stack = room
-    above = np.zeros(excess.shape, np.uint8)
+    rows, columns = residual.shape
+    _, part, seeds, stack = scratch
+    above = np.zeros(residual.shape, np.uint8)
     n = 0
     for i in range(rows):
         some = False
         for j in range(columns):
-            some |= (owner[i, j] == number) & (excess[i, j] != 0)
+            some |= (plane_id[i, j] == number) & (residual[i, j] != 0)
         if not some:
             continue
         for j in range(columns):
-            low = (owner[i, j] == number) & (excess[i, j] != 0) & (raised[i, j] == 0)
-            if low and _is_flat(excess, i, j):
+            low = (plane_id[i, j] == number) & (residual[i, j] != 0) & (low_profile[i, j] == 0)
+            if low and _is_flat(residual, i, j):
                 above[i, j] = 1
                 seeds[n] = i * columns + j
                 n += 1
-    parts, owners = part.reshape(-1), owner.reshape(-1)
+    parts, plane_ids = part.reshape(-1), plane_id.reshape(-1)
     first = me
     for s in seeds[:n]:
         if parts[s] > first:
@@ -379,23 +410,23 @@ def _lower(
         count = _flood(above, np.uint8(0), s, me, part, stack)
         if count < SMALL_PART:
             continue
-        line = _outline(w, excess, owner, part, stack, count, number, rise_least)
+        line = _outline(inv_depth, residual, plane_id, part, stack, count, number, rise_least)
         if line.table >= BESIDE * line.sides and line.rise < line.table:
             for t in range(count):
-                owners[stack[t]] = -number
+                plane_ids[stack[t]] = -number
     return me
 
 
 @kernel(leaf=True)
-def _is_flat(excess: F4, i: int, j: int) -> bool:
+def _is_flat(residual: F4, i: int, j: int) -> bool:
     """Whether a low cell is no part of the side of something."""
-    rows, columns = excess.shape
-    here = excess[i, j]
+    rows, columns = residual.shape
+    here = residual[i, j]
     for d in range(4):
         y = i + (2 if d == 0 else -2 if d == 1 else 0)
         x = j + (2 if d == 2 else -2 if d == 3 else 0)
         if y < 0 or x < 0 or y >= rows or x >= columns:
             continue
-        if excess[y, x] == 0 or abs(excess[y, x] - here) > SIDE:
+        if residual[y, x] == 0 or abs(residual[y, x] - here) > SIDE:
             return False
     return True

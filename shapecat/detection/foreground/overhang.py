@@ -1,4 +1,4 @@
-"""Reach: what stands on a plane and reaches over its outline.
+"""Overhang: what stands on a plane and reaches over its outline.
 
 The outline is that of the readings: it ends before the far edge of a table where that is hidden,
 and at the front edge, over which things may stick out.
@@ -9,13 +9,18 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
-from shapecat.detection.depth_grid import Cells, Lens, place_of
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, row_and_column
 from shapecat.detection.foreground.walls import CLEARED
-from shapecat.detection.planes.height_map import LEAST_M, NOISE, Heights, inside
+from shapecat.detection.planes.height_map import (
+    HEIGHT_NOISE,
+    MIN_HEIGHT_M,
+    HeightMap,
+    is_inside_outline,
+)
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel, unset
 
-__all__ = ["reach_over"]
+__all__ = ["extend_overhang"]
 
 REACH_M = 0.15
 """How far objects reach over an outline."""
@@ -28,28 +33,30 @@ class Search(NamedTuple):
 
     Attributes
     ----------
-    w, lens : as in `Cells`.
-    owner : as in `Heights`.
-    walls : from `clear_walls`.
-    me, plane : the number of the plane in ``owner``, and its row of `table_of`.
+    inv_depth, intrinsics : as in `DepthGrid`.
+    plane_id : as in `HeightMap`.
+    walls : from `remove_walls`.
+    me, plane : the number of the plane in ``plane_id``, and its row of `pack_planes`.
     highest : so high above it an object reaches at most, metres.
     outside : (rows, columns) float32 heights above it, metres, of the cells looked at.
-    noted : (rows, columns) int8 its number at these.
+    visited : (rows, columns) int8 its number at these.
     """
 
-    w: F4
-    lens: Lens
-    owner: I4
+    inverse_depth: F4
+    intrinsics: PinholeIntrinsics
+    plane_id: I4
     walls: U1
     me: int
     plane: F8
     highest: float
     outside: F4
-    noted: I4
+    visited: I4
 
 
 @kernel
-def reach_over(cells: Cells, heights: Heights, planes: F8, walls: U1, highest_m: float) -> None:
+def extend_overhang(
+    grid: DepthGrid, heights: HeightMap, planes: F8, walls: U1, highest_m: float
+) -> None:
     """Give the parts of objects outside the outline of their plane to it, in place.
 
     A part is what is connected to object cells inside, and not many times larger than what is
@@ -57,26 +64,28 @@ def reach_over(cells: Cells, heights: Heights, planes: F8, walls: U1, highest_m:
 
     Parameters
     ----------
-    planes : the rows of `table_of`.
-    walls : from `clear_walls`; what is cleared stays so.
+    planes : the rows of `pack_planes`.
+    walls : from `remove_walls`; what is cleared stays so.
     """
-    w, lens, owner = cells.w, cells.lens, heights.owner
-    outside, noted = unset(owner.shape, np.float32), np.zeros(owner.shape, np.int8)
-    seen, stacks = np.zeros(owner.shape, np.int32), unset((2, w.size), np.int32)
-    looks = np.int64(0)  # a literal would be compiled apart
+    inv_depth, intrinsics, plane_id = grid.inverse_depth, grid.intrinsics, heights.plane_id
+    outside, visited = unset(plane_id.shape, np.float32), np.zeros(plane_id.shape, np.int8)
+    seen, stacks = np.zeros(plane_id.shape, np.int32), unset((2, inv_depth.size), np.int32)
+    visits = np.int64(0)  # a literal would be compiled apart
     for me in range(len(planes), 0, -1):
-        search = Search(w, lens, owner, walls, me, planes[me - 1], highest_m, outside, noted)
-        looks = _reach(search, heights.height, seen, looks, stacks)
+        search = Search(
+            inv_depth, intrinsics, plane_id, walls, me, planes[me - 1], highest_m, outside, visited
+        )
+        visits = _extend(search, heights.height, seen, visits, stacks)
 
 
 @kernel
-def _reach(search: Search, height: F4, seen: I4, looks: int, stacks: I4) -> int:
-    """Add the parts outside one plane; return how many there were looked at, ``looks`` included."""
-    w, owner, me = search.w, search.owner, search.me
-    rows, columns = w.shape
+def _extend(search: Search, height: F4, seen: I4, visits: int, stacks: I4) -> int:
+    """Add the parts outside one plane; return the number of the last part visited."""
+    inv_depth, plane_id, me = search.inverse_depth, search.plane_id, search.me
+    rows, columns = inv_depth.shape
     border = np.zeros(columns, np.uint8)
     for i in range(rows):
-        if not _find_border(owner, me, i, border):
+        if not _find_border(plane_id, me, i, border):
             continue
         for j in range(columns):
             if border[j] == 0:
@@ -86,28 +95,31 @@ def _reach(search: Search, height: F4, seen: I4, looks: int, stacks: I4) -> int:
                 x = j + (1 if d == 2 else -1 if d == 3 else 0)
                 if not _leads_out(search, i, j, y, x):
                     continue
-                looks += 1
+                visits += 1
                 n = _part_outside(search, y, x, stacks[0])
                 enough = max(n // BEYOND, 1)
-                if _part_inside(w, owner, me, seen, looks, i, j, enough, stacks[1]) < enough:
+                if (
+                    _part_inside(inv_depth, plane_id, me, seen, visits, i, j, enough, stacks[1])
+                    < enough
+                ):
                     continue
                 for t in range(n):
-                    v, u = place_of(stacks[0, t], columns)
-                    owner[v, u] = me
+                    v, u = row_and_column(stacks[0, t], columns)
+                    plane_id[v, u] = me
                     height[v, u] = search.outside[v, u]
-    return looks
+    return visits
 
 
 @kernel(leaf=True)
-def _find_border(owner: I4, me: int, i: int, border: U1) -> bool:
+def _find_border(plane_id: I4, me: int, i: int, border: U1) -> bool:
     """Mark the cells of a row above a plane that are beside cells of lower planes or of none.
 
     Returns
     -------
     Whether there are any.
     """
-    rows, columns = owner.shape
-    above, here, below = owner[max(i - 1, 0)], owner[i], owner[min(i + 1, rows - 1)]
+    rows, columns = plane_id.shape
+    above, here, below = plane_id[max(i - 1, 0)], plane_id[i], plane_id[min(i + 1, rows - 1)]
     mine = np.uint8(me)  # without a sign what lies on a surface is larger
     for j in range(columns):
         lower = (np.uint8(above[j]) < mine) | (np.uint8(below[j]) < mine)
@@ -128,31 +140,37 @@ def _leads_out(search: Search, i: int, j: int, y: int, x: int) -> bool:
 
     There it is above a lower plane or none, and not noted before.
     """
-    w, lens, owner, walls, me, plane, highest, outside, noted = search
-    if y < 0 or x < 0 or y >= w.shape[0] or x >= w.shape[1]:
+    inv_depth, intrinsics, plane_id, walls, me, plane, highest, outside, visited = search
+    if y < 0 or x < 0 or y >= inv_depth.shape[0] or x >= inv_depth.shape[1]:
         return False
-    if not 0 <= owner[y, x] < me or abs(w[y, x] - w[i, j]) >= DISCONTINUITY:
+    if not 0 <= plane_id[y, x] < me or abs(inv_depth[y, x] - inv_depth[i, j]) >= DISCONTINUITY:
         return False
-    if w[y, x] <= 0 or walls[y, x] == CLEARED or noted[y, x] == me:
+    if inv_depth[y, x] <= 0 or walls[y, x] == CLEARED or visited[y, x] == me:
         return False
-    z = 1 / w[y, x]
-    h = (w[y, x] - (plane[0] * x + plane[1] * y + plane[2])) * z * plane[3]
-    if not (LEAST_M + NOISE * z * z < h < highest):
+    z = 1 / inv_depth[y, x]
+    h = (inv_depth[y, x] - (plane[0] * x + plane[1] * y + plane[2])) * z * plane[3]
+    if not (MIN_HEIGHT_M + HEIGHT_NOISE * z * z < h < highest):
         return False
-    if not inside(plane, (x - lens.cx) / lens.fx * z, (y - lens.cy) / lens.fy * z, z, REACH_M):
+    if not is_inside_outline(
+        plane,
+        (x - intrinsics.cx) / intrinsics.fx * z,
+        (y - intrinsics.cy) / intrinsics.fy * z,
+        z,
+        REACH_M,
+    ):
         return False
-    outside[y, x], noted[y, x] = h, me
+    outside[y, x], visited[y, x] = h, me
     return True
 
 
 @kernel(leaf=True)
 def _part_outside(search: Search, i: int, j: int, stack: I4) -> int:
     """Collect the connected cells outside, from one that is above the plane; return how many."""
-    columns = search.w.shape[1]
+    columns = search.inverse_depth.shape[1]
     stack[0] = i * columns + j
     done, top = 0, 1
     while done < top:
-        i, j = place_of(stack[done], columns)
+        i, j = row_and_column(stack[done], columns)
         done += 1
         for d in range(4):
             y = i + (1 if d == 0 else -1 if d == 1 else 0)
@@ -165,22 +183,22 @@ def _part_outside(search: Search, i: int, j: int, stack: I4) -> int:
 
 @kernel(leaf=True)
 def _part_inside(
-    w: F4, owner: I4, me: int, seen: I4, look: int, i: int, j: int, most: int, stack: I4
+    inv_depth: F4, plane_id: I4, me: int, seen: I4, look: int, i: int, j: int, most: int, stack: I4
 ) -> int:
     """Count the connected object cells inside, up to ``most``."""
-    rows, columns = w.shape
+    rows, columns = inv_depth.shape
     stack[0] = i * columns + j
     seen[i, j] = look
     done, top = 0, 1
     while done < top < most:
-        i, j = place_of(stack[done], columns)
+        i, j = row_and_column(stack[done], columns)
         done += 1
         for d in range(4):
             y = i + (1 if d == 0 else -1 if d == 1 else 0)
             x = j + (1 if d == 2 else -1 if d == 3 else 0)
-            if y < 0 or x < 0 or y >= rows or x >= columns or owner[y, x] != me:
+            if y < 0 or x < 0 or y >= rows or x >= columns or plane_id[y, x] != me:
                 continue
-            if seen[y, x] != look and abs(w[y, x] - w[i, j]) < DISCONTINUITY:
+            if seen[y, x] != look and abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY:
                 seen[y, x] = look
                 stack[top] = y * columns + x
                 top += 1

@@ -5,19 +5,19 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
-from shapecat.detection.depth_grid import BORDER, Cells, Lens
+from shapecat.detection.depth_grid import BORDER_SHARE, DepthGrid, PinholeIntrinsics
 from shapecat.detection.planes.ransac import (
-    TOLERANCE,
-    Readings,
-    consensus,
-    normal_of,
-    readings_of,
-    without,
+    INLIER_TOLERANCE,
+    DepthSamples,
+    plane_normal,
+    ransac_plane,
+    remove_inliers,
+    sample_grid,
 )
 from shapecat.geometry import DISCONTINUITY, cross
 from shapecat.jit import kernel, unset
 
-__all__ = ["CLEARED", "ON_WALL", "clear_walls"]
+__all__ = ["CLEARED", "ON_WALL", "remove_walls"]
 
 ON_WALL, CLEARED = 1, 2
 """Cells on a wall; the former are of a small part, which may be an object the wall goes through."""
@@ -44,93 +44,110 @@ STRIP_M, STRIPS = 0.05, 400
 
 
 @kernel
-def clear_walls(cells: Cells, owner: I4, up: F8, largest_m: float, draws: F8) -> U1:
-    """Take the cells on walls from the object cells of ``owner`` (rows, columns), in place.
+def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, largest_m: float, trials: F8) -> U1:
+    """Take the cells on walls from the object cells of ``plane_id`` (rows, columns), in place.
 
-    ``draws`` are of `draws_of`.
+    ``trials`` are of `draw_trials`.
 
     Returns
     -------
     (rows, columns) uint8 `CLEARED` or `ON_WALL` on walls, 0 elsewhere. A plane through the fronts
     of many objects looks like a wall too, but all its parts are small.
     """
-    walls = np.zeros(owner.shape, np.uint8)
-    _take(cells, owner, readings_of(cells.w, owner), MOST_WALLS, up, largest_m, draws, walls)
+    walls = np.zeros(plane_id.shape, np.uint8)
+    _take(
+        grid,
+        plane_id,
+        sample_grid(grid.inverse_depth, plane_id),
+        MOST_WALLS,
+        up,
+        largest_m,
+        trials,
+        walls,
+    )
     # Of a wall behind a table most may be out of the reach of objects, and a corner in it.
-    beyond = readings_of(cells.w, (owner == 0) & (walls == 0))
-    _take(cells, owner, beyond, MOST_BEYOND, up, largest_m, draws, walls)
+    beyond = sample_grid(grid.inverse_depth, (plane_id == 0) & (walls == 0))
+    _take(grid, plane_id, beyond, MOST_BEYOND, up, largest_m, trials, walls)
     return walls
 
 
 @kernel
 def _take(
-    cells: Cells,
-    owner: I4,
-    readings: Readings,
+    grid: DepthGrid,
+    plane_id: I4,
+    samples: DepthSamples,
     most: int,
     up: F8,
     largest_m: float,
-    draws: F8,
+    trials: F8,
     walls: U1,
 ) -> None:
     """Take the vertical plane with most readings, if it is a wall, then that with most others."""
-    lens, vertical = cells.lens, (-VERTICAL_COS, VERTICAL_COS)
+    intrinsics, vertical = grid.intrinsics, (-VERTICAL_COS, VERTICAL_COS)
     for _ in range(most):
-        plane, count = consensus(readings, draws, lens, up, vertical, TOLERANCE)
+        plane, count = ransac_plane(samples, trials, intrinsics, up, vertical, INLIER_TOLERANCE)
         if count < LEAST_READINGS:
             return
-        normal = normal_of(plane, lens)
-        if _is_wall(cells, readings, plane, normal, up, largest_m):
-            _clear(cells.w, lens, owner, plane, normal, walls)
-        readings = without(readings, plane, 2 * TOLERANCE)
+        normal = plane_normal(plane, intrinsics)
+        if _is_wall(grid, samples, plane, normal, up, largest_m):
+            _clear(grid.inverse_depth, intrinsics, plane_id, plane, normal, walls)
+        samples = remove_inliers(samples, plane, 2 * INLIER_TOLERANCE)
 
 
 @kernel
 def _is_wall(
-    cells: Cells, readings: Readings, plane: F8, normal: F8, up: F8, largest_m: float
+    grid: DepthGrid, samples: DepthSamples, plane: F8, normal: F8, up: F8, largest_m: float
 ) -> bool:
     """Whether the inliers of a plane are more than the face of an object."""
     across = cross(normal, up)
     strips = np.zeros((2, STRIPS))
-    area = readings.share * _measure(readings, cells.lens, plane, normal, across, up, strips)
+    area = samples.share * _measure(samples, grid.intrinsics, plane, normal, across, up, strips)
     # A strip of 5 cm counts that holds 5 cm of wall.
-    full = readings.share * strips > STRIP_M**2
+    full = samples.share * strips > STRIP_M**2
     width, height = STRIP_M * np.sum(full[0]), STRIP_M * np.sum(full[1])
     if area <= LEAST_AREA_M2 or area <= FILLED * width * height:
         return False
-    if math.hypot(width, height) > CUT_OFF * largest_m and _is_cut_off(cells.w, readings, plane):
+    if math.hypot(width, height) > CUT_OFF * largest_m and _is_cut_off(
+        grid.inverse_depth, samples, plane
+    ):
         return True
     return bool(max(width, height) > largest_m)
 
 
 @kernel
-def _is_cut_off(w: F4, readings: Readings, plane: F8) -> bool:
+def _is_cut_off(inv_depth: F4, samples: DepthSamples, plane: F8) -> bool:
     """Whether the inliers of a plane reach two sides of the image, or of its readings near them."""
-    off = readings.w - (plane[0] * readings.j + plane[1] * readings.i + plane[2])
-    near, everything = np.abs(off) < TOLERANCE, readings_of(w, w)
-    across = (readings.j[near], everything.j, w.shape[1])
-    down = (readings.i[near], everything.i, w.shape[0])
-    sides, margin = 0, 1.5 * math.sqrt(readings.share)
+    off = samples.inverse_depth - (plane[0] * samples.j + plane[1] * samples.i + plane[2])
+    near, everything = np.abs(off) < INLIER_TOLERANCE, sample_grid(inv_depth, inv_depth)
+    across = (samples.j[near], everything.j, inv_depth.shape[1])
+    down = (samples.i[near], everything.i, inv_depth.shape[0])
+    sides, margin = 0, 1.5 * math.sqrt(samples.share)
     for own, seen, lines in (across, down):
-        sides += np.min(own) < min(np.min(seen) + margin, BORDER * lines)
-        sides += np.max(own) > max(np.max(seen) - margin, (1 - BORDER) * lines)
+        sides += np.min(own) < min(np.min(seen) + margin, BORDER_SHARE * lines)
+        sides += np.max(own) > max(np.max(seen) - margin, (1 - BORDER_SHARE) * lines)
     return sides >= 2
 
 
 @kernel(leaf=True)
 def _measure(
-    readings: Readings, lens: Lens, plane: F8, normal: F8, across: F8, up: F8, strips: F8
+    samples: DepthSamples,
+    intrinsics: PinholeIntrinsics,
+    plane: F8,
+    normal: F8,
+    across: F8,
+    up: F8,
+    strips: F8,
 ) -> float:
     """Return the area of the inliers of a plane; add it to the strips they lie in."""
     total = 0.0
-    for k in range(readings.w.size):
-        j, i, v = readings.j[k], readings.i[k], readings.w[k]
-        if abs(v - (plane[0] * j + plane[1] * i + plane[2])) >= TOLERANCE:
+    for k in range(samples.inverse_depth.size):
+        j, i, v = samples.j[k], samples.i[k], samples.inverse_depth[k]
+        if abs(v - (plane[0] * j + plane[1] * i + plane[2])) >= INLIER_TOLERANCE:
             continue
         z = 1.0 / v
-        x, y = (j - lens.cx) / lens.fx, (i - lens.cy) / lens.fy
+        x, y = (j - intrinsics.cx) / intrinsics.fx, (i - intrinsics.cy) / intrinsics.fy
         facing = -(x * normal[0] + y * normal[1] + normal[2])
-        area = z * z / (lens.fx * lens.fy) / max(facing, 0.1)
+        area = z * z / (intrinsics.fx * intrinsics.fy) / max(facing, 0.1)
         total += area
         for d, axis in enumerate((across, up)):
             along = (axis[0] * x + axis[1] * y + axis[2]) * z
@@ -140,12 +157,14 @@ def _measure(
 
 
 @kernel
-def _clear(w: F4, lens: Lens, owner: I4, plane: F8, normal: F8, walls: U1) -> None:
+def _clear(
+    inv_depth: F4, intrinsics: PinholeIntrinsics, plane_id: I4, plane: F8, normal: F8, walls: U1
+) -> None:
     """Take the connected parts of a wall that are large; others may be objects before it."""
-    rows, columns = w.shape
-    stack = unset(w.size, np.int32)
-    found = unset(w.shape, np.uint8)
-    _mark(w, owner, plane, found)
+    rows, columns = inv_depth.shape
+    stack = unset(inv_depth.size, np.int32)
+    found = unset(inv_depth.shape, np.uint8)
+    _mark(inv_depth, plane_id, plane, found)
     total = 0.0
     for si in range(rows):
         for sj in range(columns):
@@ -157,10 +176,16 @@ def _clear(w: F4, lens: Lens, owner: I4, plane: F8, normal: F8, walls: U1) -> No
             while done < top:
                 i, j = stack[done] // columns, stack[done] % columns
                 done += 1
-                x, y = (j - lens.cx) / lens.fx, (i - lens.cy) / lens.fy
+                x, y = (j - intrinsics.cx) / intrinsics.fx, (i - intrinsics.cy) / intrinsics.fy
                 facing = -(x * normal[0] + y * normal[1] + normal[2])
-                area += 1 / (w[i, j] * w[i, j] * lens.fx * lens.fy * max(facing, 0.1))
-                off += (w[i, j] - (plane[0] * j + plane[1] * i + plane[2])) ** 2
+                area += 1 / (
+                    inv_depth[i, j]
+                    * inv_depth[i, j]
+                    * intrinsics.fx
+                    * intrinsics.fy
+                    * max(facing, 0.1)
+                )
+                off += (inv_depth[i, j] - (plane[0] * j + plane[1] * i + plane[2])) ** 2
                 for d in range(4):
                     v = i + (1 if d == 0 else -1 if d == 1 else 0)
                     u = j + (1 if d == 2 else -1 if d == 3 else 0)
@@ -177,19 +202,19 @@ def _clear(w: F4, lens: Lens, owner: I4, plane: F8, normal: F8, walls: U1) -> No
         return
     np.maximum(walls, found, walls)
     for i in range(rows):
-        owners, states = owner[i], found[i]
+        plane_ids, states = plane_id[i], found[i]
         for j in range(columns):
-            owners[j] = 0 if states[j] == CLEARED else owners[j]
+            plane_ids[j] = 0 if states[j] == CLEARED else plane_ids[j]
 
 
 @kernel(leaf=True)
-def _mark(w: F4, owner: I4, plane: F8, found: U1) -> None:
+def _mark(inv_depth: F4, plane_id: I4, plane: F8, found: U1) -> None:
     """Mark as unseen the cells on a wall that are no part of a level plane, as 0 the others."""
     a = np.float32(plane[0])
-    for i in range(w.shape[0]):
-        values, owners, states = w[i], owner[i], found[i]
+    for i in range(inv_depth.shape[0]):
+        values, plane_ids, states = inv_depth[i], plane_id[i], found[i]
         at_row = np.float32(plane[1] * i + plane[2])
-        for j in range(w.shape[1]):
+        for j in range(inv_depth.shape[1]):
             off = abs(values[j] - (a * np.float32(j) + at_row))
-            on = (owners[j] >= 0) & (values[j] > 0) & (off < np.float32(DISCONTINUITY))
+            on = (plane_ids[j] >= 0) & (values[j] > 0) & (off < np.float32(DISCONTINUITY))
             states[j] = UNSEEN if on else 0

@@ -1,4 +1,4 @@
-"""Borders: what pieces meet along their outlines: each other, planes, and what hides them."""
+"""Adjacency: what segments meet along their outlines: each other, planes, and what hides them."""
 
 import math
 
@@ -6,25 +6,16 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
 from shapecat.detection.merging.segments import (
-    CONTACT,
-    FRONT,
-    HIDDEN,
-    NEAR,
-    ONTO,
-    ONTO_HEIGHT,
-    OVER,
-    RIM,
-    TABLE,
     UPWARD,
-    Pieces,
+    Segments,
     choose_samples,
 )
-from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.segmentation.connectivity import DOWN, RIGHT, Surfaces
+from shapecat.detection.planes.height_map import HeightMap
+from shapecat.detection.segmentation.connectivity import DOWN, RIGHT, SurfaceGraph
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
-__all__ = ["meet"]
+__all__ = ["measure_adjacency"]
 
 GAP, SHADOW = 3, 15
 """Cells without a reading between two that are neighbours: of one surface, and of two, where the
@@ -36,40 +27,42 @@ DOWNWARD = 0.7
 
 
 @kernel
-def meet(w: F4, heights: Heights, surfaces: Surfaces, labels: I4, up: F8, pieces: Pieces) -> None:
-    """Collect what pieces meet, and their samples: what `pieces_of` leaves for after the cuts."""
-    change = np.zeros(w.shape[1], np.uint8)
-    _follow(w, heights, surfaces, labels, up, change, pieces)
-    choose_samples(surfaces, labels, pieces)
+def measure_adjacency(
+    inv_depth: F4, heights: HeightMap, graph: SurfaceGraph, labels: I4, up: F8, segments: Segments
+) -> None:
+    """Collect what segments meet, and their samples: what `measure_segments` leaves out."""
+    change = np.zeros(inv_depth.shape[1], np.uint8)
+    _follow(inv_depth, heights, graph, labels, up, change, segments)
+    choose_samples(graph, labels, segments)
 
 
 @kernel(leaf=True)
 def _follow(
-    w: F4,
-    heights: Heights,
-    surfaces: Surfaces,
+    inv_depth: F4,
+    heights: HeightMap,
+    graph: SurfaceGraph,
     labels: I4,
     up: F8,
     change: U1,
-    pieces: Pieces,
+    segments: Segments,
 ) -> None:
     """Count what meets at each side of each cell; ``change`` (columns,) is room."""
-    rows, columns = w.shape
-    links = surfaces.links
+    rows, columns = inv_depth.shape
+    links = graph.links
     steep = DOWNWARD * math.hypot(up[0], up[1])
     for i in range(rows):
         if not _find_changes(links[i], labels[i], labels[min(i + 1, rows - 1)], change):
             continue
         for j in range(columns):
-            if change[j] == 0 or _is_blank(w, heights.owner, labels, i, j):
+            if change[j] == 0 or _is_blank(inv_depth, heights.plane_id, labels, i, j):
                 continue
             for d in range(2):
-                _count_side(w, heights, surfaces, labels, up, steep, i, j, d, 1 - d, pieces)
+                _count_side(inv_depth, heights, graph, labels, up, steep, i, j, d, 1 - d, segments)
 
 
 @kernel(leaf=True)
 def _find_changes(links: U1, here: I4, below: I4, change: U1) -> bool:
-    """Mark the cells of a row from which a piece does not just go on to the right and down.
+    """Mark the cells of a row from which a segment does not just go on to the right and down.
 
     Returns whether there are any.
     """
@@ -84,16 +77,16 @@ def _find_changes(links: U1, here: I4, below: I4, change: U1) -> bool:
 
 
 @kernel(leaf=True)
-def _is_blank(w: F4, owner: I4, labels: I4, i: int, j: int) -> bool:
-    """Whether a cell has no reading, or is above a plane but of no piece."""
-    return bool(w[i, j] <= 0 or (labels[i, j] == 0 and owner[i, j] > 0))
+def _is_blank(inv_depth: F4, plane_id: I4, labels: I4, i: int, j: int) -> bool:
+    """Whether a cell has no reading, or is above a plane but of no segment."""
+    return bool(inv_depth[i, j] <= 0 or (labels[i, j] == 0 and plane_id[i, j] > 0))
 
 
 @kernel(inline=True, leaf=True)
 def _count_side(
-    w: F4,
-    heights: Heights,
-    surfaces: Surfaces,
+    inv_depth: F4,
+    heights: HeightMap,
+    graph: SurfaceGraph,
     labels: I4,
     up: F8,
     steep: float,
@@ -101,42 +94,51 @@ def _count_side(
     j: int,
     di: int,
     dj: int,
-    pieces: Pieces,
+    segments: Segments,
 ) -> None:
-    """Count what meets to the right of a cell, or below it, for the pieces on both sides.
+    """Count what meets to the right of a cell, or below it, for the segments on both sides.
 
     ``steep`` is how much a step in the image must fall to lead down.
     """
-    rows, columns = w.shape
+    rows, columns = inv_depth.shape
     y, x = i + di, j + dj
     if y >= rows or x >= columns:
         return
-    p, link = labels[i, j], surfaces.links[i, j] & (DOWN if di else RIGHT)
+    p, link = labels[i, j], graph.links[i, j] & (DOWN if di else RIGHT)
     if labels[y, x] == p and (p == 0 or link):
         return
     gap = 0
-    while gap <= SHADOW and y < rows and x < columns and _is_blank(w, heights.owner, labels, y, x):
+    while (
+        gap <= SHADOW
+        and y < rows
+        and x < columns
+        and _is_blank(inv_depth, heights.plane_id, labels, y, x)
+    ):
         gap, y, x = gap + 1, y + di, x + dj
     beyond = y >= rows or x >= columns
     q = 0 if beyond else labels[y, x]
-    ends = gap == 0 or p != q  # else the piece goes on behind the gap
-    pieces.boundary[p] += (p > 0) & ends
+    ends = gap == 0 or p != q  # else the segment goes on behind the gap
+    segments.statistics[p].boundary += (p > 0) & ends
     if beyond or gap > SHADOW:
         return
-    pieces.boundary[q] += (q > 0) & ends
+    segments.statistics[q].boundary += (q > 0) & ends
     if p == q:
         return
     fall = -up[di]  # how much lower the neighbour is seen, however the image is turned
     link = 0 if gap > 0 else link
-    _count(w, heights, surfaces, labels, up, i, j, y, x, gap, link, int(fall > steep), pieces)
-    _count(w, heights, surfaces, labels, up, y, x, i, j, gap, link, int(-fall > steep), pieces)
+    _count(
+        inv_depth, heights, graph, labels, up, i, j, y, x, gap, link, int(fall > steep), segments
+    )
+    _count(
+        inv_depth, heights, graph, labels, up, y, x, i, j, gap, link, int(-fall > steep), segments
+    )
 
 
 @kernel(inline=True, leaf=True)
 def _count(
-    w: F4,
-    heights: Heights,
-    surfaces: Surfaces,
+    inv_depth: F4,
+    heights: HeightMap,
+    graph: SurfaceGraph,
     labels: I4,
     up: F8,
     i: int,
@@ -146,9 +148,9 @@ def _count(
     gap: int,
     link: int,
     lower: int,
-    pieces: Pieces,
+    segments: Segments,
 ) -> None:
-    """Count for the piece at (i, j), if any, that it meets what is at (y, x).
+    """Count for the segment at (i, j), if any, that it meets what is at (y, x).
 
     Parameters
     ----------
@@ -159,32 +161,35 @@ def _count(
     p, q = labels[i, j], labels[y, x]
     if p == 0:
         return
-    owner, ahead = heights.owner, w[i, j] - w[y, x]
-    pieces.single[p, OVER] += lower and ahead > DISCONTINUITY
+    plane_id, ahead = heights.plane_id, inv_depth[i, j] - inv_depth[y, x]
+    segments.statistics[p].upper_silhouette += lower and ahead > DISCONTINUITY
     if q == 0:
         if ahead < -DISCONTINUITY:
-            pieces.single[p, HIDDEN] += 1
-        elif ahead < DISCONTINUITY and owner[y, x] < 0 and gap <= GAP:
-            pieces.single[p, TABLE if owner[y, x] == -owner[i, j] else RIM] += 1
+            segments.statistics[p].hidden += 1
+        elif ahead < DISCONTINUITY and plane_id[y, x] < 0 and gap <= GAP:
+            if plane_id[y, x] == -plane_id[i, j]:
+                segments.statistics[p].plane_contact += 1
+            else:
+                segments.statistics[p].shelf_edge += 1
     elif link:
-        pieces.pairs[CONTACT, p, q] += 1
-        _count_onto(heights.height, surfaces.normal, labels, up, i, j, y, x, pieces)
+        segments.pairs[p, q].contact += 1
+        _count_onto(heights.height, graph.normal, labels, up, i, j, y, x, segments)
     elif ahead >= DISCONTINUITY:
-        pieces.pairs[FRONT, p, q] += 1
+        segments.pairs[p, q].in_front += 1
     elif ahead > -DISCONTINUITY and gap <= GAP:
-        pieces.pairs[NEAR, p, q] += 1
+        segments.pairs[p, q].near += 1
 
 
 @kernel(leaf=True)
 def _count_onto(
-    height: F4, normal: F4, labels: I4, up: F8, i: int, j: int, y: int, x: int, pieces: Pieces
+    height: F4, normal: F4, labels: I4, up: F8, i: int, j: int, y: int, x: int, segments: Segments
 ) -> None:
-    """Count the link from cell (i, j) to (y, x) if the piece of that faces up beyond it."""
+    """Count the link from cell (i, j) to (y, x) if the segment of that faces up beyond it."""
     p, q = labels[i, j], labels[y, x]
     y = min(max(i + INWARD * (y - i), 0), labels.shape[0] - 1)
     x = min(max(j + INWARD * (x - j), 0), labels.shape[1] - 1)
     if labels[y, x] != q:
         return
     if normal[y, 0, x] * up[0] + normal[y, 1, x] * up[1] + normal[y, 2, x] * up[2] > UPWARD:
-        pieces.pairs[ONTO, p, q] += 1
-        pieces.pairs[ONTO_HEIGHT, p, q] += height[y, x]
+        segments.pairs[p, q].rests_on += 1
+        segments.pairs[p, q].rests_on_height += height[y, x]

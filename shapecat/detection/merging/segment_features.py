@@ -1,64 +1,48 @@
-"""Traits: what the statistics of pieces say: how wide, round, hollow or closed on top they are."""
+"""Segment features: how wide, round, hollow or closed on top a segment is."""
 
 import math
 
 import numpy as np
 
-from shapecat.arrays import F4
-from shapecat.detection.merging.segments import (
-    BAND_M,
-    BANDS,
-    COUNT,
-    FAR,
-    FITTED,
-    LEFT,
-    RIGHTMOST,
-    SIDE,
-    SIDE2,
-    SIDETURN,
-    TOP,
-    TURN,
-    TURN2,
-    Pieces,
-)
+from shapecat.detection.merging.segments import BAND_M, BANDS, Row, Segments
 from shapecat.jit import kernel
 
 __all__ = [
-    "LID_M",
-    "apart",
-    "behind",
-    "lid_share",
-    "roundness_of",
-    "slope_of",
+    "TOP_DEPTH_M",
+    "depth_difference",
+    "lateral_curvature",
+    "lateral_distance",
+    "normal_position_correlation",
+    "top_area_share",
     "top_band",
     "width_of",
 ]
 
-LID_M = 0.02
+TOP_DEPTH_M = 0.02
 """A top is closed by what faces up within this depth of it."""
 
 
 @kernel(leaf=True)
-def width_of(row: F4) -> float:
-    """Return the lateral extent of a piece, metres; ``row`` is its row of `Pieces.shape`."""
-    return float(row[RIGHTMOST] - row[LEFT])
+def width_of(row: Row) -> float:
+    """Return the lateral extent of a segment, metres; ``row`` is a `SEGMENT`."""
+    return float(row.right - row.left)
 
 
 @kernel(leaf=True)
-def apart(a: F4, b: F4) -> float:
-    """Return the lateral distance of the middles of two pieces, metres."""
-    return float(abs(a[LEFT] + a[RIGHTMOST] - b[LEFT] - b[RIGHTMOST]) / 2)
+def lateral_distance(a: Row, b: Row) -> float:
+    """Return the lateral distance of the middles of two segments, metres."""
+    return float(abs(a.left + a.right - b.left - b.right) / 2)
 
 
 @kernel(leaf=True)
-def behind(a: F4, b: F4) -> float:
-    """Return how much farther away than piece ``b`` piece ``a`` is on average, metres."""
-    return float(a[FAR] / a[COUNT] - b[FAR] / b[COUNT])
+def depth_difference(a: Row, b: Row) -> float:
+    """Return how much farther away than segment ``b`` segment ``a`` is on average, metres."""
+    return float(a.depth_sum / a.count - b.depth_sum / b.count)
 
 
 @kernel(leaf=True)
-def slope_of(row: F4) -> float:
-    """Return by how much the lateral normal changes across a piece.
+def lateral_curvature(row: Row) -> float:
+    """Return by how much the lateral normal changes across a segment.
 
     2 for a whole cylinder seen from outside, -2 from inside, 0 for a plane.
     """
@@ -67,7 +51,7 @@ def slope_of(row: F4) -> float:
 
 
 @kernel(leaf=True)
-def roundness_of(row: F4) -> float:
+def normal_position_correlation(row: Row) -> float:
     """Return the correlation of the lateral normal with the lateral position.
 
     1 for what is turned about an upright axis; the faces of a box, and tops that are level, do not
@@ -78,26 +62,26 @@ def roundness_of(row: F4) -> float:
 
 
 @kernel(leaf=True)
-def _moments(row: F4) -> tuple[float, float, float]:
+def _moments(row: Row) -> tuple[float, float, float]:
     """Return the sums of squares of the lateral position and normal, and of products of both."""
-    n = max(row[FITTED], np.float32(1))
-    spread = row[SIDE2] - row[SIDE] * row[SIDE] / n
-    turning = row[TURN2] - row[TURN] * row[TURN] / n
-    return spread, turning, row[SIDETURN] - row[SIDE] * row[TURN] / n
+    n = max(row.fitted, np.float32(1))
+    spread = row.xx_sum - row.x_sum * row.x_sum / n
+    turning = row.normal_xx_sum - row.normal_x_sum * row.normal_x_sum / n
+    return spread, turning, row.x_normal_x_sum - row.x_sum * row.normal_x_sum / n
 
 
 @kernel(leaf=True)
-def lid_share(pieces: Pieces, p: int, depth: float) -> float:
-    """Return what faces up within ``depth`` of the top of a piece, by its width squared."""
-    row = pieces.shape[p]
+def top_area_share(segments: Segments, p: int, depth: float) -> float:
+    """Return what faces up within ``depth`` of the top of a segment, by its width squared."""
+    row = segments.statistics[p]
     top = top_band(row)
     area = 0.0
     for band in range(max(top - int(depth / BAND_M), 0), top + 1):
-        area += pieces.lid[p, band]
+        area += segments.top_area[p, band]
     return float(area / max(width_of(row) ** 2, 1e-9))
 
 
 @kernel(leaf=True)
-def top_band(row: F4) -> int:
-    """Return the last band of height in which a piece has anything."""
-    return min(int(row[TOP] / BAND_M), BANDS - 1)
+def top_band(row: Row) -> int:
+    """Return the last band of height in which a segment has anything."""
+    return min(int(row.top / BAND_M), BANDS - 1)

@@ -1,155 +1,145 @@
-"""Pieces: what is known of each region, and of each pair of regions (from `borders`)."""
+"""Segments: the statistics of each segment, and of each pair of segments (from `adjacency`)."""
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
+from numpy.typing import NDArray
 
-from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.depth_grid import Cells, Lens
-from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.segmentation.connectivity import Surfaces
+from shapecat.arrays import F4, F8, I4
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.planes.height_map import HeightMap
+from shapecat.detection.segmentation.connectivity import SurfaceGraph
 from shapecat.geometry import level_axes
 from shapecat.jit import kernel
 
 __all__ = [
-    "AREA",
     "BAND_M",
-    "BOTTOM",
-    "CONTACT",
-    "COUNT",
-    "FAR",
     "FEW",
-    "FITTED",
-    "FRONT",
-    "HIDDEN",
-    "LEFT",
-    "NEAR",
-    "ONTO",
-    "ONTO_HEIGHT",
-    "OVER",
-    "RIGHTMOST",
-    "RIM",
+    "PAIR",
     "SAMPLES",
-    "SIDE",
-    "SIDE2",
-    "SIDETURN",
-    "TABLE",
-    "TOP",
-    "TURN",
-    "TURN2",
+    "SEGMENT",
     "UPWARD",
-    "Pieces",
+    "Records",
+    "Row",
+    "Segments",
+    "add_statistics",
     "choose_samples",
     "depth_of",
     "depths_of",
-    "is_cut",
-    "is_group",
-    "may_join",
+    "is_root",
+    "lateral_axis",
+    "may_merge",
+    "measure_segments",
     "merge",
-    "note_cut",
-    "pieces_after_cuts",
-    "pieces_of",
-    "side_of",
 ]
 
-CONTACT, FRONT, NEAR, ONTO, ONTO_HEIGHT = range(5)
-"""Pair statistics [p, q]: linked neighbours; places where p is in front of q; neighbours of equal
-depth over a gap; links whose far side on q faces up, and the sum of its heights."""
-TABLE, HIDDEN, RIM, OVER = range(4)
-"""Statistics of one piece: links with its plane; boundary behind things that are no piece; links
-with a higher plane, from below; places where it ends above what is farther away: what stands on
-something meets that there."""
-COUNT, LEFT, RIGHTMOST, FITTED, SIDE, SIDE2, TURN, TURN2, SIDETURN, TOP, BOTTOM, AREA, FAR = range(
-    13
+SEGMENT = np.dtype(
+    [
+        ("count", "f4"),  # cells
+        ("boundary", "f4"),  # sides of cells on the boundary
+        ("left", "f4"),  # lateral range, metres
+        ("right", "f4"),
+        ("bottom", "f4"),  # range of heights above the plane, metres
+        ("top", "f4"),
+        ("area", "f4"),  # of the surface seen, m2
+        ("depth_sum", "f4"),
+        ("fitted", "f4"),  # cells with a local plane, over which the next five are sums:
+        ("x_sum", "f4"),  # lateral position
+        ("xx_sum", "f4"),
+        ("normal_x_sum", "f4"),  # lateral part of the normal
+        ("normal_xx_sum", "f4"),
+        ("x_normal_x_sum", "f4"),
+        ("plane_contact", "f4"),  # links with its plane
+        ("hidden", "f4"),  # boundary behind what is of no segment
+        ("shelf_edge", "f4"),  # links with a higher plane, from below
+        ("upper_silhouette", "f4"),  # places where it ends above what is farther away
+    ]
 )
-"""The shape of one piece, in the order of `Pieces.shape`."""
+"""The statistics of a segment."""
+PAIR = np.dtype(
+    [
+        ("contact", "f4"),  # linked neighbours
+        ("in_front", "f4"),  # places where the first is in front of the second
+        ("near", "f4"),  # neighbours of equal depth over a gap
+        ("rests_on", "f4"),  # links whose far side, on the second, faces up
+        ("rests_on_height", "f4"),  # the sum of the heights there
+    ]
+)
+"""What two segments have in common."""
+Records: TypeAlias = NDArray[np.void]
+"""An array of `SEGMENT` or `PAIR`."""
+Row: TypeAlias = Any
+"""One of its records."""
 FEW = 3
-"""Links between two pieces that are taken for a contact rather than for noise."""
+"""Links between two segments that are taken for a contact rather than for noise."""
 SAMPLES = 48
-"""Most cells, evenly spaced, that stand for a piece where to look at all would take too long."""
+"""Most cells, evenly spaced, that stand for a segment where to look at all would take too long."""
 BAND_M, BANDS = 0.005, 128
 """Height of a band, and their number; what is higher counts in the last one."""
 UPWARD = 0.8
 """Cosine of the largest angle to up of the normal of what faces up."""
 
 
-class Pieces(NamedTuple):
-    """Statistics of n pieces; row 0 is no piece. All but the samples add up when pieces merge.
+class Segments(NamedTuple):
+    """Statistics of n segments, row 0 is no segment; all but the samples add up in a merge.
 
     Attributes
     ----------
-    pairs : (5, n + 1, n + 1) float32, see `CONTACT` and the following.
-    single : (n + 1, 4) float32, see `TABLE` and the following.
-    boundary : (n + 1,) float32 sides of cells on the boundary.
-    shape : (n + 1, 13) float32: cells, lateral range, cells with a tangent, sums for the regression
-        of their lateral normal on the lateral position, height range, area, sum of the depths.
-    lid : (n + 1, BANDS) float32 m2 of surface that faces up, by height.
+    pairs : (n + 1, n + 1) of `PAIR`.
+    statistics : (n + 1,) of `SEGMENT`.
+    top_area : (n + 1, BANDS) float32 m2 of surface that faces up, by height.
     samples : (n + 1, SAMPLES) int32 cells away from edges, -1 beyond the last.
-    owner : (n + 1,) int8 the plane it is above, as in `Heights.owner`.
-    group : (n + 1,) int16 the piece it has been merged into.
+    plane_id : (n + 1,) int8 the plane it is above, as in `HeightMap.plane_id`.
+    parent : (n + 1,) int16 the segment it has been merged into.
     """
 
-    pairs: F4
-    single: F4
-    boundary: F4
-    shape: F4
-    lid: F4
+    pairs: Records
+    statistics: Records
+    top_area: F4
     samples: I4
-    owner: I4
-    group: I4
+    plane_id: I4
+    parent: I4
 
 
 @kernel
-def pieces_of(
-    cells: Cells, heights: Heights, surfaces: Surfaces, labels: I4, n: int, up: F8
-) -> Pieces:
-    """Collect the shapes of regions 1..n; what they meet, and samples, are up to `borders.meet`."""
-    pieces: Pieces = pieces_after_cuts(cells, heights, surfaces, labels, n, up, _blank(1))
-    return pieces
+def measure_segments(
+    grid: DepthGrid, heights: HeightMap, graph: SurfaceGraph, labels: I4, n: int, up: F8
+) -> Segments:
+    """Collect the shapes of segments 1..n; `measure_adjacency` adds what they meet."""
+    segments: Segments = _blank(n + 1)
+    _measure(
+        grid.inverse_depth,
+        grid.intrinsics,
+        heights,
+        graph,
+        labels,
+        up,
+        lateral_axis(up),
+        segments,
+    )
+    return segments
 
 
 @kernel
-def pieces_after_cuts(
-    cells: Cells, heights: Heights, surfaces: Surfaces, labels: I4, n: int, up: F8, before: Pieces
-) -> Pieces:
-    """Collect the shapes as `pieces_of`, of cut regions alone; the others are as ``before``.
-
-    What `is_cut` is measured anew.
-    """
-    pieces: Pieces = _blank(n + 1)
-    wanted = np.ones(n + 1, np.bool_)
-    wanted[0] = False
-    for p in range(1, before.group.size):
-        if not is_cut(before, p):
-            wanted[p] = False
-            pieces.shape[p], pieces.lid[p] = before.shape[p], before.lid[p]
-            pieces.owner[p] = before.owner[p]
-    _measure(cells.w, cells.lens, heights, surfaces, labels, up, side_of(up), wanted, pieces)
-    return pieces
-
-
-@kernel
-def _blank(size: int) -> Pieces:
-    """Return pieces without any cell."""
-    pieces = Pieces(
-        np.zeros((5, size, size), np.float32),
-        np.zeros((size, OVER + 1), np.float32),
-        np.zeros(size, np.float32),
-        np.zeros((size, 13), np.float32),
+def _blank(size: int) -> Segments:
+    """Return segments without any cell."""
+    segments = Segments(
+        np.zeros((size, size), PAIR),
+        np.zeros(size, SEGMENT),
         np.zeros((size, BANDS), np.float32),
         np.full((size, SAMPLES), -1, np.int32),
         np.zeros(size, np.int8),
         np.arange(size).astype(np.int16),
     )
-    shape = pieces.shape
-    shape[:, LEFT], shape[:, RIGHTMOST] = 1e9, -1e9
-    shape[:, BOTTOM], shape[:, TOP] = 1e9, -1e9
-    return pieces
+    for p in range(size):
+        row = segments.statistics[p]
+        row.left, row.right, row.bottom, row.top = 1e9, -1e9, 1e9, -1e9
+    return segments
 
 
 @kernel
-def side_of(up: F8) -> F8:
+def lateral_axis(up: F8) -> F8:
     """Return the horizontal direction across the view, (3,) unit."""
     across = math.hypot(up[0], up[1])
     if across < 0.2:  # the camera looks straight down
@@ -159,44 +149,43 @@ def side_of(up: F8) -> F8:
 
 @kernel(leaf=True)
 def _measure(
-    w: F4,
-    lens: Lens,
-    heights: Heights,
-    surfaces: Surfaces,
+    inv_depth: F4,
+    intrinsics: PinholeIntrinsics,
+    heights: HeightMap,
+    graph: SurfaceGraph,
     labels: I4,
     up: F8,
     side: F8,
-    wanted: Bool,
-    pieces: Pieces,
+    segments: Segments,
 ) -> None:
-    """Add up the cells of the wanted labels; label 0 is not one."""
-    shape, owners, lid = pieces.shape, pieces.owner, pieces.lid
-    owner, height = heights.owner, heights.height
+    """Add up the cells of the labels; label 0 is none."""
+    plane_ids, top_area = segments.plane_id, segments.top_area
+    plane_id, height = heights.plane_id, heights.height
     zero, one, far_off = np.float32(0), np.float32(1), np.float32(np.inf)
-    per_x, per_y = np.float32(1 / lens.fx), np.float32(1 / lens.fy)
-    cx, cy, edge_on = np.float32(lens.cx), np.float32(lens.cy), np.float32(0.2)
+    per_x, per_y = np.float32(1 / intrinsics.fx), np.float32(1 / intrinsics.fy)
+    cx, cy, edge_on = np.float32(intrinsics.cx), np.float32(intrinsics.cy), np.float32(0.2)
     sx, sy, sz = np.float32(side[0]), np.float32(side[1]), np.float32(side[2])
     ux, uy, uz = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])
-    tangent, normal, spans = surfaces.tangent, surfaces.normal, surfaces.spans
-    for i in range(w.shape[0]):
+    local_plane, normal, spans = graph.local_plane, graph.normal, graph.spans
+    for i in range(inv_depth.shape[0]):
         j, end = spans[i]
         while j < end:
             p, first = labels[i, j], j
-            if not wanted[p]:
+            if p == 0:
                 j += 1
                 continue
-            # Sums over the cells of one piece that follow each other.
+            # Sums over the cells of one segment that follow each other.
             far = fitted = sides = sides2 = turns = turns2 = both = areas = zero
             left, right, bottom, top = far_off, -far_off, far_off, -far_off
             while j < end and labels[i, j] == p:
-                z = one / w[i, j]
+                z = one / inv_depth[i, j]
                 x, y = (np.float32(j) - cx) * per_x * z, (np.float32(i) - cy) * per_y * z
                 along = x * sx + y * sy + z * sz
                 h = height[i, j]
                 far += z
                 left, right = min(left, along), max(right, along)
                 bottom, top = min(bottom, h), max(top, h)
-                if tangent[i, 0, j] > 0:
+                if local_plane[i, 0, j] > 0:
                     nx, ny, nz = normal[i, 0, j], normal[i, 1, j], normal[i, 2, j]
                     turn = nx * sx + ny * sy + nz * sz
                     fitted += one
@@ -210,34 +199,41 @@ def _measure(
                     areas += area
                     if nx * ux + ny * uy + nz * uz > np.float32(UPWARD):
                         band = min(max(int(h / np.float32(BAND_M)), 0), BANDS - 1)
-                        lid[p, band] += area
+                        top_area[p, band] += area
                 j += 1
-            owners[p] = owner[i, first]
-            row = shape[p]
-            row[COUNT] += j - first
-            row[FAR] += far
-            row[LEFT], row[RIGHTMOST] = min(row[LEFT], left), max(row[RIGHTMOST], right)
-            row[TOP], row[BOTTOM] = max(row[TOP], top), min(row[BOTTOM], bottom)
-            row[FITTED] += fitted
-            row[SIDE] += sides
-            row[SIDE2] += sides2
-            row[TURN] += turns
-            row[TURN2] += turns2
-            row[SIDETURN] += both
-            row[AREA] += areas
+            plane_ids[p] = plane_id[i, first]
+            row = segments.statistics[p]
+            row.count += j - first
+            row.depth_sum += far
+            row.left, row.right = min(row.left, left), max(row.right, right)
+            row.top, row.bottom = max(row.top, top), min(row.bottom, bottom)
+            row.fitted += fitted
+            row.x_sum += sides
+            row.xx_sum += sides2
+            row.normal_x_sum += turns
+            row.normal_xx_sum += turns2
+            row.x_normal_x_sum += both
+            row.area += areas
 
 
 @kernel
-def choose_samples(surfaces: Surfaces, labels: I4, pieces: Pieces) -> None:
-    """Choose evenly spaced cells of each piece away from edges."""
+def choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None:
+    """Choose evenly spaced cells of each segment away from edges."""
     rows, columns = labels.shape
-    spans, tangent, edge, samples = surfaces.spans, surfaces.tangent, surfaces.edge, pieces.samples
-    stride = np.maximum(pieces.shape[:, COUNT].astype(np.int32) // SAMPLES, 1)
-    wait, taken = stride.copy(), np.zeros_like(stride)
+    spans, local_plane, concavity, samples = (
+        graph.spans,
+        graph.local_plane,
+        graph.concavity,
+        segments.samples,
+    )
+    n = segments.parent.size
+    stride, wait, taken = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
+    for p in range(n):
+        stride[p] = wait[p] = max(int(segments.statistics[p].count) // SAMPLES, 1)
     for i in range(rows):
         for j in range(spans[i, 0], spans[i, 1]):
             p = labels[i, j]
-            if p == 0 or edge[i, j] > 20 or not tangent[i, 0, j] > 0:
+            if p == 0 or concavity[i, j] > 20 or not local_plane[i, 0, j] > 0:
                 continue
             wait[p] -= 1
             if wait[p] == 0 and taken[p] < SAMPLES:
@@ -247,79 +243,91 @@ def choose_samples(surfaces: Surfaces, labels: I4, pieces: Pieces) -> None:
 
 
 @kernel
-def merge(pieces: Pieces, p: int, q: int) -> None:
-    """Add piece ``q`` to piece ``p``; both are groups of their own before."""
-    n = pieces.group.size
-    for r in range(pieces.pairs.shape[0]):
-        for k in range(n):
-            pieces.pairs[r, p, k] += pieces.pairs[r, q, k]
-            pieces.pairs[r, q, k] = 0
-        for k in range(n):
-            pieces.pairs[r, k, p] += pieces.pairs[r, k, q]
-            pieces.pairs[r, k, q] = 0
-        pieces.pairs[r, p, p] = 0
-    pieces.boundary[p] += pieces.boundary[q]
-    pieces.single[p] += pieces.single[q]
-    pieces.lid[p] += pieces.lid[q]
-    a, b = pieces.shape[p], pieces.shape[q]
-    for k in (COUNT, FITTED, SIDE, SIDE2, TURN, TURN2, SIDETURN, AREA, FAR):
-        a[k] += b[k]
-    a[LEFT], a[RIGHTMOST] = min(a[LEFT], b[LEFT]), max(a[RIGHTMOST], b[RIGHTMOST])
-    a[TOP], a[BOTTOM] = max(a[TOP], b[TOP]), min(a[BOTTOM], b[BOTTOM])
+def merge(segments: Segments, p: int, q: int) -> None:
+    """Add segment ``q`` to segment ``p``; both are groups of their own before."""
+    n = segments.parent.size
+    pairs = segments.pairs
+    for k in range(n):
+        _add_pair(pairs[p, k], pairs[q, k])
+    for k in range(n):
+        _add_pair(pairs[k, p], pairs[k, q])
+    pairs[p, p] = np.zeros(1, PAIR)[0]
+    for band in range(BANDS):
+        segments.top_area[p, band] += segments.top_area[q, band]
+    add_statistics(segments.statistics[p], segments.statistics[q])
     # Half of the samples from each side.
-    first, second = pieces.samples[p].copy(), pieces.samples[q].copy()
+    first, second = segments.samples[p].copy(), segments.samples[q].copy()
     mixed = 0
     for k in range(SAMPLES):
         for source in (first, second):
             if source[k] >= 0 and mixed < SAMPLES:
-                pieces.samples[p, mixed] = source[k]
+                segments.samples[p, mixed] = source[k]
                 mixed += 1
     for k in range(n):
-        if pieces.group[k] == q:
-            pieces.group[k] = p
+        if segments.parent[k] == q:
+            segments.parent[k] = p
 
 
 @kernel(leaf=True)
-def depth_of(pieces: Pieces, p: int) -> float:
-    """Return the mean depth of a piece, metres; 1 where it has no cell."""
-    count = pieces.shape[p, COUNT]
-    return float(pieces.shape[p, FAR] / count) if count > 0 else 1.0
+def _add_pair(a: Row, b: Row) -> None:
+    """Add a `PAIR` to another, and clear it."""
+    a.contact += b.contact
+    a.in_front += b.in_front
+    a.near += b.near
+    a.rests_on += b.rests_on
+    a.rests_on_height += b.rests_on_height
+    b.contact = b.in_front = b.near = b.rests_on = b.rests_on_height = 0.0
+
+
+@kernel(leaf=True)
+def add_statistics(a: Row, b: Row) -> None:
+    """Add a `SEGMENT` to another."""
+    a.count += b.count
+    a.boundary += b.boundary
+    a.left, a.right = min(a.left, b.left), max(a.right, b.right)
+    a.bottom, a.top = min(a.bottom, b.bottom), max(a.top, b.top)
+    a.area += b.area
+    a.depth_sum += b.depth_sum
+    a.fitted += b.fitted
+    a.x_sum += b.x_sum
+    a.xx_sum += b.xx_sum
+    a.normal_x_sum += b.normal_x_sum
+    a.normal_xx_sum += b.normal_xx_sum
+    a.x_normal_x_sum += b.x_normal_x_sum
+    a.plane_contact += b.plane_contact
+    a.hidden += b.hidden
+    a.shelf_edge += b.shelf_edge
+    a.upper_silhouette += b.upper_silhouette
+
+
+@kernel(leaf=True)
+def depth_of(segments: Segments, p: int) -> float:
+    """Return the mean depth of a segment, metres; 1 where it has no cell."""
+    count = segments.statistics[p].count
+    return float(segments.statistics[p].depth_sum / count) if count > 0 else 1.0
 
 
 @kernel
-def depths_of(pieces: Pieces) -> F4:
-    """Return `depth_of` all pieces."""
-    depths = np.zeros(pieces.group.size, np.float32)
+def depths_of(segments: Segments) -> F4:
+    """Return `depth_of` all segments."""
+    depths = np.zeros(segments.parent.size, np.float32)
     for p in range(depths.size):
-        depths[p] = depth_of(pieces, p)
+        depths[p] = depth_of(segments, p)
     return depths
 
 
 @kernel(leaf=True)
-def note_cut(pieces: Pieces, p: int) -> None:
-    """Note that a region, which may have been cut off itself, was cut: its statistics are wrong."""
-    if p < pieces.group.size:
-        pieces.shape[p, COUNT] = 0
+def is_root(segments: Segments, p: int) -> bool:
+    """Whether a segment has not been merged into another."""
+    return bool(segments.parent[p] == p)
 
 
 @kernel(leaf=True)
-def is_cut(pieces: Pieces, p: int) -> bool:
-    """Whether region ``p`` was cut, or cut off, since its statistics were collected."""
-    return bool(p >= pieces.group.size or pieces.shape[p, COUNT] == 0)
-
-
-@kernel(leaf=True)
-def is_group(pieces: Pieces, p: int) -> bool:
-    """Whether a piece has not been merged into another."""
-    return bool(pieces.group[p] == p)
-
-
-@kernel(leaf=True)
-def may_join(pieces: Pieces, p: int, q: int) -> bool:
-    """Whether two pieces stand above one plane, and neither has been merged into another."""
+def may_merge(segments: Segments, p: int, q: int) -> bool:
+    """Whether two segments stand above one plane, and neither has been merged into another."""
     return bool(
         p != q
-        and is_group(pieces, p)
-        and is_group(pieces, q)
-        and pieces.owner[p] == pieces.owner[q]
+        and is_root(segments, p)
+        and is_root(segments, q)
+        and segments.plane_id[p] == segments.plane_id[q]
     )

@@ -1,4 +1,4 @@
-"""Pixels: labels of cells brought back to full resolution."""
+"""Label upsampling: labels of cells brought back to full resolution."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -7,16 +7,16 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, U4, Bool
 from shapecat.detection.cleanup.holes import FRINGE
-from shapecat.detection.depth_grid import Cells, Lens, place_of
-from shapecat.detection.output.occluded_points import spread_labels
-from shapecat.detection.planes.height_map import LEAST_M, NOISE, inside
-from shapecat.detection.records import LabelledGrid
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, row_and_column
+from shapecat.detection.output.occluded_points import label_occluded_points
+from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, is_inside_outline
+from shapecat.detection.records import Segmentation
 from shapecat.detection.segmentation.connectivity import span_of
-from shapecat.detection.virtual_camera import View
+from shapecat.detection.virtual_camera import VirtualImage
 from shapecat.geometry import DISCONTINUITY, NEAREST_M
 from shapecat.jit import kernel
 
-__all__ = ["pixels_of", "points_of"]
+__all__ = ["label_pixels", "label_points"]
 
 MOST_LABELS = 1000
 HIGHEST_M = 0.6
@@ -24,42 +24,42 @@ UNSURE, BARE = -1, -2
 """Instead of a label: what takes more to tell, and cells without a label next to one that has."""
 
 
-class Shown(NamedTuple):
-    """What is known of the cells, as in `Cells` and `LabelledGrid`; ``owners`` by label."""
+class GridLabels(NamedTuple):
+    """What is known of the cells, as in `DepthGrid` and `Segmentation`; ``plane_ids`` by label."""
 
-    w: F4
+    inverse_depth: F4
     labels: I4
     filled: U1
     planes: F8
-    owners: I4
+    plane_ids: I4
 
 
-def pixels_of(depth: F4, cells: Cells, found: LabelledGrid, *, range_m: float) -> list[U4]:
+def label_pixels(depth: F4, grid: DepthGrid, found: Segmentation, *, range_m: float) -> list[U4]:
     """Return the ascending pixel indices of the labels 1, 2, ...
 
     A pixel takes the label of its cell, or else of the neighbour whose depth fits best; it keeps
     it only where it is above the plane itself, except in filled cells.
     """
-    shown = _shown(cells, found)
-    return _split(*_list_pixels(depth, shown, cells.factor, range_m, found.owners.size))
+    grid_labels = _shown(grid, found)
+    return _split(*_list_pixels(depth, grid_labels, grid.factor, range_m, found.plane_ids.size))
 
 
-def points_of(view: View, found: LabelledGrid, *, fused: bool) -> list[U4]:
-    """Return the ascending point indices of the labels, as `pixels_of`.
+def label_points(view: VirtualImage, found: Segmentation, *, fused: bool) -> list[U4]:
+    """Return the ascending point indices of the labels, as `label_pixels`.
 
     With ``fused`` points behind the visible surface are given to what they touch; lists beyond
     the labels are clusters that touch nothing visible.
     """
-    points, cells, labels = view.points, view.cells, found.owners.size
+    points, grid, labels = view.points, view.grid, found.plane_ids.size
     marks = np.zeros(len(points), np.int16)
-    _mark_points(points, view.cell, cells.lens, _shown(cells, found), marks)
+    _mark_points(points, view.cell, grid.intrinsics, _shown(grid, found), marks)
     if fused:
         above = marks > 0
         for plane in found.planes:
-            above |= _above(points, view.cell, cells.lens, plane)
+            above |= _above(points, view.cell, grid.intrinsics, plane)
         loose = np.flatnonzero(above)
         if loose.size:
-            spread = spread_labels(points[loose], marks[loose].astype(np.int64), labels)
+            spread = label_occluded_points(points[loose], marks[loose].astype(np.int64), labels)
             marks[loose] = np.where(spread <= MOST_LABELS, spread, 0)
             labels = max(labels, int(marks.max()) + 1)
     edges = np.flatnonzero(np.diff(marks, prepend=0, append=0)).astype(np.int32)
@@ -68,22 +68,26 @@ def points_of(view: View, found: LabelledGrid, *, fused: bool) -> list[U4]:
 
 
 @kernel
-def _above(points: F4, cell: I4, lens: Lens, plane: F8) -> Bool:
+def _above(points: F4, cell: I4, intrinsics: PinholeIntrinsics, plane: F8) -> Bool:
     """Return which points are above a plane and inside its outline."""
     result = np.zeros(len(points), np.bool_)
     for k in range(len(points)):
         if cell[k] >= 0:
             x, y, z = points[k, 0], points[k, 1], points[k, 2]
-            level = plane[0] * (lens.fx * x / z + lens.cx) + plane[1] * (lens.fy * y / z + lens.cy)
+            level = plane[0] * (intrinsics.fx * x / z + intrinsics.cx) + plane[1] * (
+                intrinsics.fy * y / z + intrinsics.cy
+            )
             h = (1 / z - level - plane[2]) * z * plane[3]
             result[k] = (
-                h > LEAST_M + NOISE * z * z and h < HIGHEST_M and inside(plane, x, y, z, 0.0)
+                h > MIN_HEIGHT_M + HEIGHT_NOISE * z * z
+                and h < HIGHEST_M
+                and is_inside_outline(plane, x, y, z, 0.0)
             )
     return result
 
 
-def _shown(cells: Cells, found: LabelledGrid) -> Shown:
-    return Shown(cells.w, found.labels, found.filled, found.planes, found.owners)
+def _shown(grid: DepthGrid, found: Segmentation) -> GridLabels:
+    return GridLabels(grid.inverse_depth, found.labels, found.filled, found.planes, found.plane_ids)
 
 
 def _split(order: U4, ends: I4) -> list[U4]:
@@ -94,44 +98,47 @@ def _split(order: U4, ends: I4) -> list[U4]:
 def _near(labels: I4) -> U1:
     """Return 1 for the cells that have a label or are next to one that has."""
     near = np.zeros(labels.shape, np.uint8)
-    room = np.zeros(labels.shape[1] + 2, np.int16)
+    scratch = np.zeros(labels.shape[1] + 2, np.int16)
     for i in range(labels.shape[0]):
-        _find_near(labels, i, room, near[i])
+        _find_near(labels, i, scratch, near[i])
     return near
 
 
 @kernel(leaf=True)
-def _find_near(labels: I4, i: int, room: I4, near: I4) -> None:
-    """Write a row of `_near`; ``room`` is (columns + 2,) with 0 at both ends."""
+def _find_near(labels: I4, i: int, scratch: I4, near: I4) -> None:
+    """Write a row of `_near`; ``scratch`` is (columns + 2,) with 0 at both ends."""
     rows, columns = labels.shape
     above, here, below = labels[max(i - 1, 0)], labels[i], labels[min(i + 1, rows - 1)]
     for j in range(columns):
-        room[j + 1] = above[j] | here[j] | below[j]
+        scratch[j + 1] = above[j] | here[j] | below[j]
     for j in range(columns):
-        near[j] = (room[j] | room[j + 1] | room[j + 2]) != 0
+        near[j] = (scratch[j] | scratch[j + 1] | scratch[j + 2]) != 0
 
 
 @kernel
 def _list_pixels(
-    depth: F4, shown: Shown, factor: int, range_m: float, labels: int
+    depth: F4, grid_labels: GridLabels, factor: int, range_m: float, labels: int
 ) -> tuple[U4, I4]:
     """Return the pixels of the labels below ``labels`` as `_listed`."""
-    rows, columns = shown.w.shape
+    rows, columns = grid_labels.inverse_depth.shape
     height, width = depth.shape
     # The cells of a row, and the same at full resolution.
     code, wide_code = np.zeros(columns, np.int16), np.zeros(width, np.int16)
     wide_w, line = np.zeros(width, np.float32), np.zeros(width, np.int16)
-    room, high = np.zeros(columns + 2, np.int16), np.zeros((len(shown.planes), columns), np.uint8)
+    scratch, high = (
+        np.zeros(columns + 2, np.int16),
+        np.zeros((len(grid_labels.planes), columns), np.uint8),
+    )
     runs = np.zeros((4 * width, 3), np.int32)
     far, shift, scale = np.float32(range_m), (factor - 1) * 0.5, 1.0 / factor
     n = 0
     for i in range(rows):
-        span = _code_cells(shown, i, room, high, code)
+        span = _code_cells(grid_labels, i, scratch, high, code)
         if span[0] == span[1]:
             continue
         x0, x1 = span[0] * factor, span[1] * factor if span[1] < columns else width
         _widen(code, factor, span, wide_code)
-        _widen(shown.w[i], factor, span, wide_w)
+        _widen(grid_labels.inverse_depth[i], factor, span, wide_w)
         for y in range(i * factor, (i + 1) * factor if i + 1 < rows else height):
             if n + width > len(runs):
                 runs = np.concatenate((runs, np.zeros_like(runs)))
@@ -144,8 +151,8 @@ def _list_pixels(
                     continue
                 if mark == UNSURE:
                     u, v = (x0 + k - shift) * scale, (y - shift) * scale
-                    j = min(place_of(x0 + k, factor)[0], columns - 1)
-                    mark = _label_of(shown, i, j, u, v, depth[y, x0 + k])
+                    j = min(row_and_column(x0 + k, factor)[0], columns - 1)
+                    mark = _label_of(grid_labels, i, j, u, v, depth[y, x0 + k])
                 if mark != label:
                     n = _end_run(label, first + start, first + k, runs, n)
                     label, start = mark, k
@@ -185,21 +192,25 @@ def _listed(runs: I4, labels: int) -> tuple[U4, I4]:
 
 
 @kernel(leaf=True)
-def _code_cells(shown: Shown, i: int, room: I4, high: U1, code: I4) -> tuple[int, int]:
+def _code_cells(
+    grid_labels: GridLabels, i: int, scratch: I4, high: U1, code: I4
+) -> tuple[int, int]:
     """Write what the pixels that fit each cell of a row are.
 
     That is its label if all of them have it, `UNSURE` if they may have it, `BARE` if it has none,
     and 0 away from all labels. Returns the first column that is not 0 and the one after the last.
     """
-    _find_near(shown.labels, i, room, code)
+    _find_near(grid_labels.labels, i, scratch, code)
     span: tuple[int, int] = span_of(code)
     part = slice(span[0], span[1])
     for k in range(len(high)):
-        _find_high(shown.planes[k], i, span[0], shown.w[i, part], high[k, part])
-    labels, filled = shown.labels[i], shown.filled[i]
+        _find_high(
+            grid_labels.planes[k], i, span[0], grid_labels.inverse_depth[i, part], high[k, part]
+        )
+    labels, filled = grid_labels.labels[i], grid_labels.filled[i]
     for j in range(span[0], span[1]):
         label = labels[j]
-        sure = filled[j] | high[np.uint32(shown.owners[np.uint16(label)]), j]
+        sure = filled[j] | high[np.uint32(grid_labels.plane_ids[np.uint16(label)]), j]
         what = label if sure else np.int16(UNSURE)
         what = what if label > 0 else np.int16(BARE)
         code[j] = what if code[j] != 0 else np.int16(0)
@@ -207,7 +218,7 @@ def _code_cells(shown: Shown, i: int, room: I4, high: U1, code: I4) -> tuple[int
 
 
 @kernel(leaf=True)
-def _find_high(plane: F8, i: int, first: int, w: F4, high: U1) -> None:
+def _find_high(plane: F8, i: int, first: int, inv_depth: F4, high: U1) -> None:
     """Write whether every pixel that fits a cell rises above a plane.
 
     The cells are those of row i from column ``first`` on.
@@ -216,9 +227,9 @@ def _find_high(plane: F8, i: int, first: int, w: F4, high: U1) -> None:
     a, above = np.float32(plane[0]), np.float32(plane[3])
     # The farthest pixel of a cell is 1.5 cells away.
     level = np.float32(plane[1] * i + plane[2] + 1.5 * (abs(plane[0]) + abs(plane[1])))
-    base, slope = np.float32(FRINGE * NOISE), np.float32(FRINGE * LEAST_M)
-    for j in range(w.size):
-        least = w[j] - jump if w[j] - jump > nowhere else nowhere
+    base, slope = np.float32(FRINGE * HEIGHT_NOISE), np.float32(FRINGE * MIN_HEIGHT_M)
+    for j in range(inv_depth.size):
+        least = inv_depth[j] - jump if inv_depth[j] - jump > nowhere else nowhere
         ground = level + a * np.float32(first + j)
         ground = ground if ground > zero else zero
         # Heights at the depth 1 / least, times the square of least.
@@ -226,9 +237,9 @@ def _find_high(plane: F8, i: int, first: int, w: F4, high: U1) -> None:
 
 
 @kernel(leaf=True)
-def _widen(cells: F4, factor: int, span: tuple[int, int], wide: F4) -> None:
+def _widen(row: F4, factor: int, span: tuple[int, int], wide: F4) -> None:
     """Write the cells of a part of a row to their pixels; those beyond the last cell are its."""
-    here, part = cells[span[0] : span[1]], wide[span[0] * factor : span[1] * factor]
+    here, part = row[span[0] : span[1]], wide[span[0] * factor : span[1] * factor]
     if factor == 2:  # the usual case, in a form that vectorises
         for j in range(here.size):
             part[2 * j] = part[2 * j + 1] = here[j]
@@ -236,59 +247,64 @@ def _widen(cells: F4, factor: int, span: tuple[int, int], wide: F4) -> None:
         for j in range(here.size):
             for k in range(factor):
                 part[j * factor + k] = here[j]
-    if span[1] == cells.size:
-        wide[cells.size * factor :] = cells[-1]
+    if span[1] == row.size:
+        wide[row.size * factor :] = row[-1]
 
 
 @kernel(leaf=True)
-def _mark(depth: F4, w: F4, code: I4, range_m: float, marks: I4) -> None:
+def _mark(depth: F4, inv_depth: F4, code: I4, range_m: float, marks: I4) -> None:
     """Write the labels of pixels (n,), `UNSURE` where it takes more to tell."""
     least, zero, unsure, bare = np.float32(NEAREST_M), np.int16(0), np.int16(UNSURE), np.int16(BARE)
     for x in range(depth.size):
         z = depth[x]
         fitting = code[x] if code[x] != bare else zero
         other = unsure if code[x] != zero else zero
-        mark = fitting if _fits(w[x], z) else other
+        mark = fitting if _fits(inv_depth[x], z) else other
         marks[x] = mark if (z >= least) & (z <= range_m) else zero
 
 
 @kernel(inline=True, leaf=True)
-def _label_of(shown: Shown, i: int, j: int, u: float, v: float, z: float) -> int:
+def _label_of(grid_labels: GridLabels, i: int, j: int, u: float, v: float, z: float) -> int:
     """Return the label of a depth in cell (i, j), at column u, row v; 0 if it has none."""
-    if not _fits(shown.w[i, j], z):
-        i, j = _best_beside(shown.w, i, j, z)
-    label = shown.labels[i, j] if i >= 0 else 0
-    if label > 0 and (shown.filled[i, j] or _rises(shown.planes, shown.owners[label], u, v, z)):
+    if not _fits(grid_labels.inverse_depth[i, j], z):
+        i, j = _best_beside(grid_labels.inverse_depth, i, j, z)
+    label = grid_labels.labels[i, j] if i >= 0 else 0
+    if label > 0 and (
+        grid_labels.filled[i, j]
+        or _rises(grid_labels.planes, grid_labels.plane_ids[label], u, v, z)
+    ):
         return int(label)
     return 0
 
 
 @kernel
-def _mark_points(points: F4, cell: I4, lens: Lens, shown: Shown, marks: I4) -> None:
+def _mark_points(
+    points: F4, cell: I4, intrinsics: PinholeIntrinsics, grid_labels: GridLabels, marks: I4
+) -> None:
     """Write the labels of the points (n, 3); ``cell`` (n,) is flat, -1 of what is not seen."""
-    columns = shown.w.shape[1]
-    near = _near(shown.labels).reshape(-1)
+    columns = grid_labels.inverse_depth.shape[1]
+    near = _near(grid_labels.labels).reshape(-1)
     for k in range(points.shape[0]):
         p = cell[k]
         if p >= 0 and near[p]:
             x, y, z = points[k]
-            u, v = lens.fx * x / z + lens.cx, lens.fy * y / z + lens.cy
-            marks[k] = _label_of(shown, p // columns, p % columns, u, v, z)
+            u, v = intrinsics.fx * x / z + intrinsics.cx, intrinsics.fy * y / z + intrinsics.cy
+            marks[k] = _label_of(grid_labels, p // columns, p % columns, u, v, z)
 
 
 @kernel(leaf=True)
-def _fits(w: float, z: float) -> bool:
+def _fits(inv_depth: float, z: float) -> bool:
     """Whether a depth is within one jump of a cell; both sides are multiplied by the depth."""
-    return bool(abs(w * z - np.float32(1)) < np.float32(DISCONTINUITY) * z)
+    return bool(abs(inv_depth * z - np.float32(1)) < np.float32(DISCONTINUITY) * z)
 
 
 @kernel(leaf=True)
-def _best_beside(w: F4, i: int, j: int, z: float) -> tuple[int, int]:
+def _best_beside(inv_depth: F4, i: int, j: int, z: float) -> tuple[int, int]:
     """Return the neighbour of a cell whose depth fits best, (-1, -1) if none is in two jumps."""
     row, column, nearest = -1, -1, np.float32(2 * DISCONTINUITY) * z
-    for ii in range(max(i - 1, 0), min(i + 2, w.shape[0])):
-        for jj in range(max(j - 1, 0), min(j + 2, w.shape[1])):
-            gap = abs(w[ii, jj] * z - np.float32(1))
+    for ii in range(max(i - 1, 0), min(i + 2, inv_depth.shape[0])):
+        for jj in range(max(j - 1, 0), min(j + 2, inv_depth.shape[1])):
+            gap = abs(inv_depth[ii, jj] * z - np.float32(1))
             better = gap < nearest  # a choice, for no branch could be foretold
             nearest = gap if better else nearest
             row, column = ii if better else row, jj if better else column
@@ -299,4 +315,4 @@ def _best_beside(w: F4, i: int, j: int, z: float) -> tuple[int, int]:
 def _rises(planes: F8, k: int, u: float, v: float, z: float) -> bool:
     """Whether a depth at column u, row v is above plane k, if only as a foot is."""
     h = (1 - (planes[k, 0] * u + planes[k, 1] * v + planes[k, 2]) * z) * planes[k, 3]
-    return bool(h > FRINGE * (LEAST_M + NOISE * z * z))
+    return bool(h > FRINGE * (MIN_HEIGHT_M + HEIGHT_NOISE * z * z))

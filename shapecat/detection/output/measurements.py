@@ -1,4 +1,4 @@
-"""Things: what is measured of labelled cells: boxes, what they stand on, and flags."""
+"""Measurements of labelled cells: boxes, what each object stands on, and flags."""
 
 import math
 from typing import NamedTuple, TypeAlias
@@ -6,28 +6,22 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.depth_grid import Cells, Lens, count_last, small_at
+from shapecat.detection.depth_grid import (
+    DepthGrid,
+    PinholeIntrinsics,
+    count_at_range_limit,
+    smallest_object_at,
+)
 from shapecat.detection.merging.segments import (
-    BOTTOM,
-    CONTACT,
     FEW,
-    FRONT,
-    HIDDEN,
-    LEFT,
-    NEAR,
-    ONTO,
-    ONTO_HEIGHT,
-    RIGHTMOST,
-    TABLE,
-    TOP,
-    Pieces,
+    Segments,
     depths_of,
 )
 from shapecat.detection.segmentation.connectivity import span_of
 from shapecat.geometry import level_axes, row_quaternion
 from shapecat.jit import kernel
 
-__all__ = ["Things", "things_of"]
+__all__ = ["ObjectMeasurements", "measure_objects"]
 
 OCCLUDED = 0.12
 """Share of the boundary behind something nearer that makes an object occluded."""
@@ -45,14 +39,14 @@ Turned: TypeAlias = tuple[float, float, float, float]
 """A quaternion (x, y, z, w)."""
 
 
-class Things(NamedTuple):
+class ObjectMeasurements(NamedTuple):
     """What is measured of the labels 1, 2, ..., one row each.
 
     Attributes
     ----------
     center, size, orientation : (n, 3), (n, 3) and (n, 4) of the upright box.
     low, high : (n, 2) the first and last row and column of cells.
-    stand : (n,) the label that each stands on, 0 for its plane.
+    supported_by : (n,) the label that each stands on, 0 for its plane.
     support_m : (n,) the height of that above the plane.
     hidden : (n,) whether something nearer hides a part.
     last : (n,) whether it ends where the range does, beyond which readings are left out.
@@ -64,7 +58,7 @@ class Things(NamedTuple):
     orientation: F8
     low: I4
     high: I4
-    stand: I4
+    supported_by: I4
     support_m: F8
     hidden: Bool
     last: Bool
@@ -72,17 +66,17 @@ class Things(NamedTuple):
 
 
 @kernel
-def things_of(
-    cells: Cells, labels: I4, pieces: Pieces, leaders: I4, up: F8, range_m: float
-) -> Things:
-    """Measure the labels, the pieces of each of which are merged into one of ``leaders``.
+def measure_objects(
+    grid: DepthGrid, labels: I4, segments: Segments, representatives: I4, up: F8, range_m: float
+) -> ObjectMeasurements:
+    """Measure the labels, the segments of each of which are merged into one of ``representatives``.
 
     The box is the smallest over 60 yaws, as `shapecat.geometry.upright_box`, on the outermost
     cells. An object stands on another when it touches surface of it that faces up, more than it
     touches the plane; or, where that contact is hidden, when it ends where the other begins.
     """
-    count = leaders.size - 1
-    things = Things(
+    count = representatives.size - 1
+    measured = ObjectMeasurements(
         np.zeros((count, 3)),
         np.zeros((count, 3)),
         np.zeros((count, 4)),
@@ -94,90 +88,116 @@ def things_of(
         np.zeros(count, np.bool_),
         np.zeros(count, np.float32),
     )
-    _measure_boxes(cells.w, cells.lens, labels, np.array(level_axes(up[0], up[1], up[2])), things)
-    last, depth = count_last(cells.w, labels, leaders.size, range_m), depths_of(pieces)
+    _measure_boxes(
+        grid.inverse_depth,
+        grid.intrinsics,
+        labels,
+        np.array(level_axes(up[0], up[1], up[2])),
+        measured,
+    )
+    last, depth = (
+        count_at_range_limit(grid.inverse_depth, labels, representatives.size, range_m),
+        depths_of(segments),
+    )
     for k in range(count):
-        p = leaders[k + 1]
-        things.last[k], things.least[k] = last[k + 1] >= FEW, small_at(cells, depth[p])
-        things.stand[k], things.support_m[k] = _stand(pieces, leaders, p)
-        hidden = pieces.single[p, HIDDEN]
-        for q in range(pieces.group.size):
-            hidden += pieces.pairs[FRONT, q, p]
-        things.hidden[k] = hidden > np.float32(OCCLUDED) * max(pieces.boundary[p], np.float32(1))
-    _break_cycles(things)
-    return things
+        p = representatives[k + 1]
+        measured.last[k], measured.least[k] = last[k + 1] >= FEW, smallest_object_at(grid, depth[p])
+        measured.supported_by[k], measured.support_m[k] = _supporting_object(
+            segments, representatives, p
+        )
+        hidden = segments.statistics[p].hidden
+        for q in range(segments.parent.size):
+            hidden += segments.pairs[q, p].in_front
+        measured.hidden[k] = hidden > np.float32(OCCLUDED) * max(
+            segments.statistics[p].boundary, np.float32(1)
+        )
+    _break_cycles(measured)
+    return measured
 
 
 @kernel(leaf=True)
-def _stand(pieces: Pieces, leaders: I4, p: int) -> tuple[int, float]:
-    """Return what a piece stands on: a label or 0, and its height above the plane, metres."""
-    onto, shape = pieces.pairs[ONTO, p], pieces.shape
+def _supporting_object(segments: Segments, representatives: I4, p: int) -> tuple[int, float]:
+    """Return what a segment stands on: a label or 0, and its height above the plane, metres."""
+    pairs, statistics = segments.pairs[p], segments.statistics
     best = 0
-    for k in range(1, leaders.size):
-        best = k if onto[leaders[k]] > onto[leaders[best]] else best
-    met = onto[leaders[best]]
-    if met >= FEW and met > pieces.single[p, TABLE]:
-        height = float(pieces.pairs[ONTO_HEIGHT, p, leaders[best]] / met)
-        return (0, 0.0) if shape[p, BOTTOM] < height - SUNK_M else (best, height)
-    if shape[p, BOTTOM] > LIFTED_M and pieces.single[p, TABLE] < FEW:
-        best = _hidden_stand(pieces, leaders, p)
-        return best, float(shape[leaders[best], TOP]) if best else 0.0
+    for k in range(1, representatives.size):
+        more = pairs[representatives[k]].rests_on > pairs[representatives[best]].rests_on
+        best = k if more else best
+    met = pairs[representatives[best]].rests_on
+    if met >= FEW and met > segments.statistics[p].plane_contact:
+        height = float(pairs[representatives[best]].rests_on_height / met)
+        return (0, 0.0) if statistics[p].bottom < height - SUNK_M else (best, height)
+    if statistics[p].bottom > LIFTED_M and segments.statistics[p].plane_contact < FEW:
+        best = _hidden_support(segments, representatives, p)
+        return best, float(statistics[representatives[best]].top) if best else 0.0
     return 0, 0.0
 
 
 @kernel(leaf=True)
-def _hidden_stand(pieces: Pieces, leaders: I4, p: int) -> int:
-    """Return the label below a piece that it meets most, 0 if none."""
-    shape, pairs = pieces.shape, pieces.pairs
-    middle = (shape[p, LEFT] + shape[p, RIGHTMOST]) / 2
+def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
+    """Return the label below a segment that it meets most, 0 if none."""
+    statistics, pairs = segments.statistics, segments.pairs
+    middle = (statistics[p].left + statistics[p].right) / 2
     best, most = 0, 0.0
-    for k in range(1, leaders.size):
-        q = leaders[k]
-        met = pairs[CONTACT, p, q] + pairs[NEAR, p, q] + pairs[FRONT, p, q] + pairs[FRONT, q, p]
-        overlap = shape[q, TOP] - shape[p, BOTTOM]
+    for k in range(1, representatives.size):
+        q = representatives[k]
+        met = pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front + pairs[q, p].in_front
+        overlap = statistics[q].top - statistics[p].bottom
         below = -GAP_M < overlap < OVERLAP_M
-        beside = shape[q, LEFT] < middle < shape[q, RIGHTMOST]
+        beside = statistics[q].left < middle < statistics[q].right
         if q != p and below and beside and met > most:
             best, most = k, met
     return best if most >= FEW else 0
 
 
 @kernel(leaf=True)
-def _break_cycles(things: Things) -> None:
+def _break_cycles(measured: ObjectMeasurements) -> None:
     """Put what stands on itself, by way of others, on its plane."""
-    stand = things.stand
-    for k in range(stand.size):
-        at = stand[k]
-        for _ in range(stand.size):
-            at = stand[at - 1] if at > 0 else 0
+    supported_by = measured.supported_by
+    for k in range(supported_by.size):
+        at = supported_by[k]
+        for _ in range(supported_by.size):
+            at = supported_by[at - 1] if at > 0 else 0
         if at > 0:
-            stand[k], things.support_m[k] = 0, 0.0
+            supported_by[k], measured.support_m[k] = 0, 0.0
 
 
 @kernel(fast=True)
-def _measure_boxes(w: F4, lens: Lens, labels: I4, level: F8, things: Things) -> None:
-    points, start = _outer_points(w, lens, labels, level, things)
+def _measure_boxes(
+    inv_depth: F4,
+    intrinsics: PinholeIntrinsics,
+    labels: I4,
+    level: F8,
+    measured: ObjectMeasurements,
+) -> None:
+    points, start = _outer_points(inv_depth, intrinsics, labels, level, measured)
     back = level.T
     turned = row_quaternion(
         (back[0, 0], back[0, 1], back[0, 2]),
         (back[1, 0], back[1, 1], back[1, 2]),
         (back[2, 0], back[2, 1], back[2, 2]),
     )
-    reach = np.zeros(4 * YAWS.size, np.float32)
+    span = np.zeros(4 * YAWS.size, np.float32)
     for k in range(start.size - 1):
         if start[k] < start[k + 1]:
-            _measure_box(points, start[k], start[k + 1], level, turned, things, k, reach)
+            _measure_box(points, start[k], start[k + 1], level, turned, measured, k, span)
 
 
 @kernel(fast=True)
-def _outer_points(w: F4, lens: Lens, labels: I4, level: F8, things: Things) -> tuple[F4, I4]:
+def _outer_points(
+    inv_depth: F4,
+    intrinsics: PinholeIntrinsics,
+    labels: I4,
+    level: F8,
+    measured: ObjectMeasurements,
+) -> tuple[F4, I4]:
     """Return some cells of each label in the level frame (3, n), and where each label begins.
 
-    They are the outermost, of which come `Things.low` and `Things.high`, and every 4th inside: the
-    nearest point of a ball is inside its outline.
+    They are the outermost, of which come `ObjectMeasurements.low` and `ObjectMeasurements.high`,
+    and every 4th inside: the nearest point of a ball is inside its outline.
     """
     rows, columns = labels.shape
-    low, high = things.low, things.high
+    low, high = measured.low, measured.high
     spans, outer = np.zeros((rows, 2), np.int64), np.zeros(columns, np.bool_)
     for i in range(rows):
         spans[i, 0], spans[i, 1] = span_of(labels[i])
@@ -200,8 +220,8 @@ def _outer_points(w: F4, lens: Lens, labels: I4, level: F8, things: Things) -> t
     place, points = start.copy(), np.zeros((3, n), np.float32)
     for i, j in chosen[:n]:
         k = labels[i, j] - 1
-        z = 1 / w[i, j]
-        x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
+        z = 1 / inv_depth[i, j]
+        x, y = (j - intrinsics.cx) / intrinsics.fx * z, (i - intrinsics.cy) / intrinsics.fy * z
         for d in range(3):
             points[d, place[k]] = level[d, 0] * x + level[d, 1] * y + level[d, 2] * z
         place[k] += 1
@@ -231,16 +251,23 @@ def _find_outer(labels: I4, i: int, first: int, end: int, outer: Bool) -> None:
 
 @kernel(fast=True, leaf=True)
 def _measure_box(
-    local: F4, first: int, end: int, level: F8, turned: Turned, things: Things, k: int, reach: F4
+    local: F4,
+    first: int,
+    end: int,
+    level: F8,
+    turned: Turned,
+    measured: ObjectMeasurements,
+    k: int,
+    span: F4,
 ) -> None:
     """Write the box of least area around some of the points (3, n), level frame."""
     zs = local[2, first:end]
-    _reach(local[0, first:end], local[1, first:end], reach)
+    _span_of(local[0, first:end], local[1, first:end], span)
     least = np.inf
     left = right = back = front = yaw = 0.0
     for t in range(YAWS.size):
-        x0, x1 = reach[t], reach[t + YAWS.size]
-        y0, y1 = reach[t + 2 * YAWS.size], reach[t + 3 * YAWS.size]
+        x0, x1 = span[t], span[t + YAWS.size]
+        y0, y1 = span[t + 2 * YAWS.size], span[t + 3 * YAWS.size]
         if (x1 - x0) * (y1 - y0) < least:
             least = (x1 - x0) * (y1 - y0)
             left, right, back, front, yaw = float(x0), float(x1), float(y0), float(y1), YAWS[t]
@@ -249,31 +276,31 @@ def _measure_box(
         z0 = zs[n] if zs[n] < z0 else z0
         z1 = zs[n] if zs[n] > z1 else z1
     bottom, top = np.float64(z0), np.float64(z1)
-    things.size[k] = right - left, front - back, top - bottom
+    measured.size[k] = right - left, front - back, top - bottom
     u, v, h = (left + right) / 2, (back + front) / 2, (bottom + top) / 2
     cos, sin = math.cos(yaw), math.sin(yaw)
     x, y = cos * u - sin * v, sin * u + cos * v
     for d in range(3):
-        things.center[k, d] = x * level[0, d] + y * level[1, d] + h * level[2, d]
+        measured.center[k, d] = x * level[0, d] + y * level[1, d] + h * level[2, d]
     # The axes of the box are the level axes turned by yaw: q = q_level * q_yaw.
-    x, y, z, w = turned
+    x, y, z, qw = turned
     cos, sin = math.cos(yaw / 2), math.sin(yaw / 2)
-    if w * cos < z * sin:
+    if qw * cos < z * sin:
         cos, sin = -cos, -sin
-    things.orientation[k, 0] = x * cos + y * sin
-    things.orientation[k, 1] = y * cos - x * sin
-    things.orientation[k, 2] = z * cos + w * sin
-    things.orientation[k, 3] = w * cos - z * sin
+    measured.orientation[k, 0] = x * cos + y * sin
+    measured.orientation[k, 1] = y * cos - x * sin
+    measured.orientation[k, 2] = z * cos + qw * sin
+    measured.orientation[k, 3] = qw * cos - z * sin
 
 
 @kernel(fast=True, leaf=True)
-def _reach(xs: F4, ys: F4, reach: F4) -> None:
+def _span_of(xs: F4, ys: F4, span: F4) -> None:
     """Write for each yaw the least and greatest place of points along it, and the same across it.
 
     All yaws are turned to at once, one point after the other: this vectorises.
     """
     n = YAWS.size
-    reach[:n], reach[n : 2 * n], reach[2 * n : 3 * n], reach[3 * n :] = (
+    span[:n], span[n : 2 * n], span[2 * n : 3 * n], span[3 * n :] = (
         np.inf,
         -np.inf,
         np.inf,
@@ -283,7 +310,7 @@ def _reach(xs: F4, ys: F4, reach: F4) -> None:
         x, y = xs[k], ys[k]
         for t in range(n):
             u, v = COS[t] * x + SIN[t] * y, COS[t] * y - SIN[t] * x
-            reach[t] = u if u < reach[t] else reach[t]
-            reach[t + n] = u if u > reach[t + n] else reach[t + n]
-            reach[t + 2 * n] = v if v < reach[t + 2 * n] else reach[t + 2 * n]
-            reach[t + 3 * n] = v if v > reach[t + 3 * n] else reach[t + 3 * n]
+            span[t] = u if u < span[t] else span[t]
+            span[t + n] = u if u > span[t + n] else span[t + n]
+            span[t + 2 * n] = v if v < span[t + 2 * n] else span[t + 2 * n]
+            span[t + 3 * n] = v if v > span[t + 3 * n] else span[t + 3 * n]

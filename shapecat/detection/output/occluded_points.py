@@ -1,4 +1,4 @@
-"""Hidden points: what one view does not see of a cloud fused from several.
+"""Occluded points: what one view does not see of a cloud fused from several.
 
 The rules work on the surface that the virtual camera sees. Points behind it belong to the object
 whose points they touch; what touches none is clustered by distance alone (thesis Alg. 2).
@@ -9,12 +9,12 @@ import numpy as np
 from shapecat.arrays import F4, I4
 from shapecat.jit import kernel
 
-__all__ = ["spread_labels"]
+__all__ = ["label_occluded_points"]
 
 VOXEL_M = 0.01
 
 
-def spread_labels(points: F4, labels: I4, first_new: int) -> I4:
+def label_occluded_points(points: F4, labels: I4, first_new: int) -> I4:
     """Complete the labels of ``points`` (n, 3), metres, any frame.
 
     Parameters

@@ -1,4 +1,4 @@
-"""Scenes: what segmentation found, as records in the sensor frame."""
+"""Scene builder: planes and objects as records in the sensor frame."""
 
 import math
 from collections.abc import Sequence
@@ -7,10 +7,10 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U4, Bool, freeze
 from shapecat.config import DetectionSettings
-from shapecat.detection.depth_grid import BORDER, Cells
-from shapecat.detection.output.measurements import Things
-from shapecat.detection.planes.extent import Support, corners_of
-from shapecat.detection.records import LabelledGrid
+from shapecat.detection.depth_grid import BORDER_SHARE, DepthGrid
+from shapecat.detection.output.measurements import ObjectMeasurements
+from shapecat.detection.planes.extent import SupportingPlane, outline_corners
+from shapecat.detection.records import Segmentation
 from shapecat.geometry import (
     IDENTITY,
     NEAREST_M,
@@ -22,7 +22,7 @@ from shapecat.geometry import (
 from shapecat.jit import kernel
 from shapecat.types import Box, Candidate, Plane, Pose, Scene
 
-__all__ = ["scene_of"]
+__all__ = ["build_scene"]
 
 ENOUGH = 60
 """Cells of what is no noise, however near and therefore small it is."""
@@ -31,9 +31,9 @@ BORDER_CELLS, STRAIGHT, LEAST_FORWARD = 2.5, 0.3, 0.2
 least cosine, about, of what is in front of a camera."""
 
 
-def scene_of(
-    cells: Cells,
-    found: LabelledGrid,
+def build_scene(
+    grid: DepthGrid,
+    found: Segmentation,
     indices: Sequence[U4],
     sensor_from_view: Pose,
     *,
@@ -45,24 +45,28 @@ def scene_of(
     Lists beyond the labels are objects that the view does not show; their boxes are measured on
     ``points`` (n, 3), view frame.
     """
-    things, count = found.things, found.owners.size - 1
-    kept = _kept(cells, things, indices, settings.min_points, image=points is None)
+    measured, count = found.measured, found.plane_ids.size - 1
+    kept = _kept(grid, measured, indices, settings.min_points, image=points is None)
     position = {k + 1: n for n, k in enumerate(kept)}
     boxes = _boxes(found, indices, points, sensor_from_view)
-    cut = _cut(cells, things) if points is None else _cut_cloud(cells, found, sensor_from_view)
-    cut |= things.last
-    owner, stand, hidden = found.owners[1:].tolist(), things.stand.tolist(), things.hidden.tolist()
+    cut = _cut(grid, measured) if points is None else _cut_cloud(grid, found, sensor_from_view)
+    cut |= measured.last
+    plane_id, supported_by, hidden = (
+        found.plane_ids[1:].tolist(),
+        measured.supported_by.tolist(),
+        measured.hidden.tolist(),
+    )
     candidates = []
     for k in kept:
         seen = k < count
-        on = position.get(stand[k]) if seen else None
+        on = position.get(supported_by[k]) if seen else None
         candidates.append(
             Candidate(
                 indices=indices[k],
                 box=boxes[k],
-                plane=owner[k] if seen else None,
+                plane=plane_id[k] if seen else None,
                 on_candidate=on,
-                support_m=0.0 if on is None else float(things.support_m[k]),
+                support_m=0.0 if on is None else float(measured.support_m[k]),
                 touches_border=seen and bool(cut[k]),
                 occluded=seen and hidden[k],
             )
@@ -73,94 +77,99 @@ def scene_of(
 
 
 def _kept(
-    cells: Cells, things: Things, indices: Sequence[U4], least: int, *, image: bool
+    grid: DepthGrid, measured: ObjectMeasurements, indices: Sequence[U4], least: int, *, image: bool
 ) -> list[int]:
     """Return which lists of points are objects, in the order of their first points."""
     limits = [float(least)] * len(indices)
     if image:
-        limits = [max(least, min(n, ENOUGH) * cells.factor**2) for n in things.least.tolist()]
+        limits = [max(least, min(n, ENOUGH) * grid.factor**2) for n in measured.least.tolist()]
     enough = (k for k, limit in enumerate(limits) if indices[k].size >= limit)
     return sorted(enough, key=lambda k: int(indices[k][0]))
 
 
 def _boxes(
-    found: LabelledGrid,
+    found: Segmentation,
     indices: Sequence[U4],
     points: F4 | None,
     sensor_from_view: Pose,
 ) -> list[Box]:
     """Return the boxes of what the cells show, and on the points of what they do not."""
-    things = found.things
-    sizes = [things.center, things.size, things.orientation]
+    measured = found.measured
+    sizes = [measured.center, measured.size, measured.orientation]
     if sensor_from_view is IDENTITY:  # rows of frozen arrays need not be frozen one by one
         sizes = [freeze(rows, "n k", "f4") for rows in sizes]
     boxes = [Box(*row) for row in zip(*sizes, strict=True)]
     if points is not None:
-        extra = indices[found.owners.size - 1 :]
+        extra = indices[found.plane_ids.size - 1 :]
         boxes += [upright_box(points[index], found.up) for index in extra]
     return boxes if sensor_from_view is IDENTITY else [_moved(sensor_from_view, b) for b in boxes]
 
 
-def _cut(cells: Cells, things: Things) -> Bool:
+def _cut(grid: DepthGrid, measured: ObjectMeasurements) -> Bool:
     """Return whether each object reaches the border of the image, or of its readings near it."""
-    result = np.zeros(len(things.low), bool)
-    _find_cut(cells.w, things.low, things.high, max(1, round(2 / cells.factor)), result)
+    result = np.zeros(len(measured.low), bool)
+    _find_cut(
+        grid.inverse_depth, measured.low, measured.high, max(1, round(2 / grid.factor)), result
+    )
     return result
 
 
 @kernel
-def _find_cut(w: F4, low: I4, high: I4, reach: int, cut: Bool) -> None:
+def _find_cut(inv_depth: F4, low: I4, high: I4, reach: int, cut: Bool) -> None:
     """Mark what is within ``reach`` of the lines of cells where the readings begin."""
     for axis in range(2):
-        first = _begin(w, axis, 1, reach) + reach
-        last = w.shape[axis] - 1 - _begin(w, axis, -1, reach) - reach
+        first = _begin(inv_depth, axis, 1, reach) + reach
+        last = inv_depth.shape[axis] - 1 - _begin(inv_depth, axis, -1, reach) - reach
         for k in range(cut.size):
             cut[k] |= (low[k, axis] < first) | (high[k, axis] > last)
 
 
 @kernel(leaf=True)
-def _begin(w: F4, axis: int, step: int, reach: int) -> int:
+def _begin(inv_depth: F4, axis: int, step: int, reach: int) -> int:
     """Return the line at which the readings begin: the first with any, if more than one thing is.
 
     The top of a tall thing with nothing behind it is no border. Lines are rows (``axis`` 0) or
     columns, from the first on or, with ``step`` -1, from the last.
     """
-    lines, length = w.shape[axis], w.shape[1 - axis]
+    lines, length = inv_depth.shape[axis], inv_depth.shape[1 - axis]
     first, low, high = -1, length, -1
-    for k in range(math.ceil(BORDER * lines)):
+    for k in range(math.ceil(BORDER_SHARE * lines)):
         if first >= 0 and k >= first + reach:
             break
         line = k if step > 0 else lines - 1 - k
         for n in range(length):
-            if (w[line, n] if axis == 0 else w[n, line]) > 0:
+            if (inv_depth[line, n] if axis == 0 else inv_depth[n, line]) > 0:
                 first = k if first < 0 else first
                 low, high = min(low, n), max(high, n)
     return first if first >= 0 and high - low > STRAIGHT * length else 0
 
 
-def _cut_cloud(cells: Cells, found: LabelledGrid, sensor_from_view: Pose) -> Bool:
+def _cut_cloud(grid: DepthGrid, found: Segmentation, sensor_from_view: Pose) -> Bool:
     """Return whether each object reaches a border of what the sensor of a cloud saw.
 
     Such a border is a straight side of the cloud as seen from the sensor's place, with more than
     one thing along it. A cloud fused from several views has none.
     """
-    result = np.zeros(found.owners.size, bool)
-    valid = cells.w > 0
+    result = np.zeros(found.plane_ids.size, bool)
+    valid = grid.inverse_depth > 0
     if np.linalg.norm(sensor_from_view.translation) > NEAREST_M or not valid.any():
         return result[1:]
     rows, columns = np.flatnonzero(valid.any(axis=1)), np.flatnonzero(valid.any(axis=0))
     last_row, last_column = valid.shape[0] - 1, valid.shape[1] - 1
     i = np.concatenate([rows, rows, *_ends(valid[:, columns], last_row)])
     j = np.concatenate([*_ends(valid[rows].T, last_column), columns, columns])
-    lens = cells.lens
-    ray = np.stack([(j - lens.cx) / lens.fx, (i - lens.cy) / lens.fy, np.ones(i.size)], 1)
+    intrinsics = grid.intrinsics
+    ray = np.stack(
+        [(j - intrinsics.cx) / intrinsics.fx, (i - intrinsics.cy) / intrinsics.fy, np.ones(i.size)],
+        1,
+    )
     seen = ray @ sensor_from_view.rotation.T
     ray = seen if (seen[:, 2] > LEAST_FORWARD).all() else ray  # else no optical frame
     place = ray[:, :2] / ray[:, 2:]
     spans = np.ptp(place, axis=0)
     for axis in range(2):
         for along in (place[:, axis], -place[:, axis]):
-            near = along > along.max() - BORDER_CELLS / lens.fx
+            near = along > along.max() - BORDER_CELLS / intrinsics.fx
             if np.ptp(place[near, 1 - axis]) > STRAIGHT * spans[1 - axis]:
                 result[found.labels[i[near], j[near]]] = True
     return result[1:]
@@ -177,8 +186,8 @@ def _moved(sensor_from_view: Pose, box: Box) -> Box:
     return Box(center, box.size, quaternion_from_rotation(rotation))
 
 
-def _plane(support: Support, lowest: float, sensor_from_view: Pose) -> Plane:
-    normal, offset, outline = support.up, support.offset, corners_of(support)
+def _plane(support: SupportingPlane, lowest: float, sensor_from_view: Pose) -> Plane:
+    normal, offset, outline = support.up, support.offset, outline_corners(support)
     if sensor_from_view is not IDENTITY:
         normal = sensor_from_view.rotation @ normal
         offset += float(normal @ sensor_from_view.translation)

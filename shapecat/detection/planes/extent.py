@@ -1,4 +1,4 @@
-"""Supports: what is measured of a horizontal plane: its outline and its area."""
+"""Plane extent: the outline and the area of a horizontal plane."""
 
 import math
 from typing import NamedTuple
@@ -6,8 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, U1
-from shapecat.detection.depth_grid import Cells, Lens
-from shapecat.detection.planes.ransac import TOLERANCE, Readings, normal_of
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.planes.ransac import INLIER_TOLERANCE, DepthSamples, plane_normal
 from shapecat.geometry import level_axes
 from shapecat.jit import kernel
 
@@ -18,10 +18,10 @@ __all__ = [
     "LEAST_AREA_M2",
     "MARGIN_M",
     "SIN",
-    "Support",
-    "corners_of",
+    "SupportingPlane",
+    "measure_plane",
+    "outline_corners",
     "sort_by_height",
-    "support_of",
 ]
 
 DIRECTIONS = 16
@@ -36,11 +36,11 @@ ARM = 3
 """Cells to each side over which a surface is seen to be level; odd."""
 
 
-class Support(NamedTuple):
+class SupportingPlane(NamedTuple):
     """A horizontal plane that objects may stand on, in units of cells.
 
     ``a * j + b * i + c`` is its inverse depth at cell (i, j); ``up`` (3,) its unit normal in the
-    sensor frame and ``offset`` its height along ``up``; ``reach`` (DIRECTIONS,) how far it extends
+    sensor frame and ``offset`` its height along ``up``; ``extent`` (DIRECTIONS,) how far it extends
     along evenly spaced directions of the level frame, metres; ``area_m2`` its visible area.
     """
 
@@ -49,48 +49,48 @@ class Support(NamedTuple):
     c: float
     up: F8
     offset: float
-    reach: F8
+    extent: F8
     area_m2: float
 
 
 @kernel
-def support_of(cells: Cells, readings: Readings, plane: F8) -> Support:
+def measure_plane(grid: DepthGrid, samples: DepthSamples, plane: F8) -> SupportingPlane:
     """Measure a plane (a, b, c) on readings near it."""
-    w, lens = cells.w, cells.lens
-    normal = normal_of(plane, lens)
-    x, y = plane[0] * lens.fx, plane[1] * lens.fy
-    z = plane[0] * lens.cx + plane[1] * lens.cy + plane[2]
+    inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
+    normal = plane_normal(plane, intrinsics)
+    x, y = plane[0] * intrinsics.fx, plane[1] * intrinsics.fy
+    z = plane[0] * intrinsics.cx + plane[1] * intrinsics.cy + plane[2]
     distance = 1 / math.sqrt(x * x + y * y + z * z)
-    area = _area_of(readings, plane, distance) / (lens.fx * lens.fy)
+    area = _area_of(samples, plane, distance) / (intrinsics.fx * intrinsics.fy)
     axes = np.array(level_axes(normal[0], normal[1], normal[2]))
-    beside = _beside_inliers(readings, plane, w.shape[0], w.shape[1])
-    reach = _reach_of(w, lens, plane, axes, beside)
-    return Support(plane[0], plane[1], plane[2], normal, -distance, reach, area)
+    beside = _beside_inliers(samples, plane, inv_depth.shape[0], inv_depth.shape[1])
+    extent = _extent_of(inv_depth, intrinsics, plane, axes, beside)
+    return SupportingPlane(plane[0], plane[1], plane[2], normal, -distance, extent, area)
 
 
 @kernel(fast=True, leaf=True)
-def _area_of(readings: Readings, plane: F8, distance: float) -> float:
+def _area_of(samples: DepthSamples, plane: F8, distance: float) -> float:
     """Return the visible area of a plane by that of a pixel at 1 m, from its distance."""
-    j, i, w = readings.j, readings.i, readings.w
+    j, i, inv_depth = samples.j, samples.i, samples.inverse_depth
     total = 0.0
-    for k in range(w.size):
+    for k in range(inv_depth.size):
         level = plane[0] * j[k] + plane[1] * i[k] + plane[2]
-        near = (level > 0) & (abs(w[k] - level) < TOLERANCE)
+        near = (level > 0) & (abs(inv_depth[k] - level) < INLIER_TOLERANCE)
         facing = level * distance  # the cosine between the normal and the ray
         area = 1 / (level * level * (facing if facing > 0.05 else 0.05))
         total += area if near else 0.0
-    return float(readings.share * total)
+    return float(samples.share * total)
 
 
 @kernel(fast=True)
-def _beside_inliers(readings: Readings, plane: F8, rows: int, columns: int) -> U1:
+def _beside_inliers(samples: DepthSamples, plane: F8, rows: int, columns: int) -> U1:
     """Mark the cells (rows, columns) to which the surface was seen to go on from an inlier."""
-    j, i, w = readings.j, readings.i, readings.w
+    j, i, inv_depth = samples.j, samples.i, samples.inverse_depth
     top, width = np.int32(ARM), np.int32(columns)
-    place = np.zeros(w.size, np.int32)
-    for k in range(w.size):
+    place = np.zeros(inv_depth.size, np.int32)
+    for k in range(inv_depth.size):
         level = plane[0] * j[k] + plane[1] * i[k] + plane[2]
-        near = (level > 0) & (abs(w[k] - level) < TOLERANCE)
+        near = (level > 0) & (abs(inv_depth[k] - level) < INLIER_TOLERANCE)
         here = np.int32(j[k]) + (np.int32(i[k]) + top) * width
         place[k] = here if near else np.int32(0)
     # There are margins above and below; those at the sides are cells that never are inliers.
@@ -108,28 +108,28 @@ def _beside_inliers(readings: Readings, plane: F8, rows: int, columns: int) -> U
 
 
 @kernel
-def _reach_of(w: F4, lens: Lens, plane: F8, axes: F8, beside: U1) -> F8:
+def _extent_of(inv_depth: F4, intrinsics: PinholeIntrinsics, plane: F8, axes: F8, beside: U1) -> F8:
     """Return how far the plane reaches along `DIRECTIONS`, metres, with a margin."""
     across, along = axes[0], axes[1]
-    reach = np.full(DIRECTIONS, -np.inf)
-    for i in range(w.shape[0]):
+    extent = np.full(DIRECTIONS, -np.inf)
+    for i in range(inv_depth.shape[0]):
         # The outline is convex in the image too: the first and last cell of each row tell it.
-        first, last = _ends(w, plane, i, beside[i])
+        first, last = _ends(inv_depth, plane, i, beside[i])
         if first > last:
             continue
         for j in (first, last):
             z = 1 / (plane[0] * j + plane[1] * i + plane[2])
-            x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
+            x, y = (j - intrinsics.cx) / intrinsics.fx * z, (i - intrinsics.cy) / intrinsics.fy * z
             u = across[0] * x + across[1] * y + across[2] * z
             v = along[0] * x + along[1] * y + along[2] * z
             for k in range(DIRECTIONS):
                 there = COS[k] * u + SIN[k] * v
-                reach[k] = there if there > reach[k] else reach[k]
-    return reach + MARGIN_M
+                extent[k] = there if there > extent[k] else extent[k]
+    return extent + MARGIN_M
 
 
 @kernel(leaf=True)
-def _ends(w: F4, plane: F8, i: int, beside: U1) -> tuple[int, int]:
+def _ends(inv_depth: F4, plane: F8, i: int, beside: U1) -> tuple[int, int]:
     """Return the first and the last marked cell of a row in the plane; none: first > last."""
     none = np.int32(beside.size)
     first, last = none, np.int32(-1)
@@ -137,36 +137,36 @@ def _ends(w: F4, plane: F8, i: int, beside: U1) -> tuple[int, int]:
         low = np.int32(k) if beside[k] else none
         high = np.int32(k) if beside[k] else np.int32(-1)
         first, last = (low if low < first else first), (high if high > last else last)
-    while first <= last and not (beside[first] and _is_in(w, plane, i, first)):
+    while first <= last and not (beside[first] and _is_in(inv_depth, plane, i, first)):
         first += 1
-    while first < last and not (beside[last] and _is_in(w, plane, i, last)):
+    while first < last and not (beside[last] and _is_in(inv_depth, plane, i, last)):
         last -= 1
     return int(first), int(last)
 
 
 @kernel(leaf=True)
-def _is_in(w: F4, plane: F8, i: int, j: int) -> bool:
+def _is_in(inv_depth: F4, plane: F8, i: int, j: int) -> bool:
     level = plane[0] * j + plane[1] * i + plane[2]
-    return bool(level > 0 and abs(w[i, j] - level) < TOLERANCE)
+    return bool(level > 0 and abs(inv_depth[i, j] - level) < INLIER_TOLERANCE)
 
 
 @kernel
-def corners_of(support: Support) -> F8:
+def outline_corners(support: SupportingPlane) -> F8:
     """Return the corners (k, 3) of the convex outline, sensor frame, in order, without repeats."""
-    up, reach = support.up, support.reach
+    up, extent = support.up, support.extent
     axes = level_axes(up[0], up[1], up[2])
     corners = np.zeros((DIRECTIONS, 3))
     for k in range(DIRECTIONS):
         # Neighbouring sides x cos + y sin = reach meet at a corner.
-        along = (reach[(k + 1) % DIRECTIONS] - reach[k] * COS[1]) / SIN[1]
-        x, y = reach[k] * COS[k] - along * SIN[k], reach[k] * SIN[k] + along * COS[k]
+        along = (extent[(k + 1) % DIRECTIONS] - extent[k] * COS[1]) / SIN[1]
+        x, y = extent[k] * COS[k] - along * SIN[k], extent[k] * SIN[k] + along * COS[k]
         for d in range(3):
             corners[k, d] = x * axes[0][d] + y * axes[1][d] + support.offset * axes[2][d]
     return corners
 
 
 @kernel
-def sort_by_height(found: list[tuple[Support, Readings]]) -> None:
+def sort_by_height(found: list[tuple[SupportingPlane, DepthSamples]]) -> None:
     """Put the lowest plane first, in place."""
     for k in range(1, len(found)):
         one, m = found[k], k

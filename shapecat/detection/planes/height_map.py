@@ -1,4 +1,4 @@
-"""Heights: which plane every cell stands above, and how far (thesis Alg. 2, step 2)."""
+"""Height map: the plane that every sample is above, and how far (thesis Alg. 2, step 2)."""
 
 import math
 from typing import NamedTuple
@@ -6,16 +6,23 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import Cells, Lens
-from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN, Support
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN, SupportingPlane
 from shapecat.geometry import level_axes
 from shapecat.jit import kernel
 
-__all__ = ["LEAST_M", "NOISE", "Heights", "heights_of", "inside", "table_of"]
+__all__ = [
+    "HEIGHT_NOISE",
+    "MIN_HEIGHT_M",
+    "HeightMap",
+    "is_inside_outline",
+    "measure_heights",
+    "pack_planes",
+]
 
-LEAST_M = 0.004
-"""Lowest height of an object cell, to which `NOISE` times the squared range is added."""
-NOISE = 0.0025
+MIN_HEIGHT_M = 0.004
+"""Lowest height of an object cell, to which `HEIGHT_NOISE` times the squared range is added."""
+HEIGHT_NOISE = 0.0025
 BEYOND_M = 0.1
 """What is level with a plane and this near to its outline is the plane, not an object below."""
 OUT = -9.0
@@ -24,64 +31,81 @@ FINE = 65536
 """Steps to 1/m of inverse depth, where it is rounded."""
 
 
-class Heights(NamedTuple):
+class HeightMap(NamedTuple):
     """What every cell stands on.
 
     Attributes
     ----------
-    owner : (rows, columns) int8: k + 1 above plane k and inside its outline, -(k + 1) on its
+    plane_id : (rows, columns) int8: k + 1 above plane k and inside its outline, -(k + 1) on its
         surface, 0 elsewhere.
-    height : (rows, columns) float32, metres above the plane of `owner`.
+    height : (rows, columns) float32, metres above the plane of `plane_id`.
     """
 
-    owner: I4
+    plane_id: I4
     height: F4
 
 
 @kernel
-def table_of(supports: list[Support], lens: Lens) -> F8:
+def pack_planes(supports: list[SupportingPlane], intrinsics: PinholeIntrinsics) -> F8:
     """Return one row of numbers per plane."""
     rows = np.zeros((len(supports), 13 + DIRECTIONS))
     for k, support in enumerate(supports):
-        _fill(rows[k], support, lens)
+        _fill(rows[k], support, intrinsics)
     return rows
 
 
 @kernel
-def _fill(row: F8, support: Support, lens: Lens) -> None:
+def _fill(row: F8, support: SupportingPlane, intrinsics: PinholeIntrinsics) -> None:
     """Write the plane, its distance, two level axes, a circle inside the outline, the outline."""
-    a, b, c, up, reach = support.a, support.b, support.c, support.up, support.reach
-    x, y, z = a * lens.fx, b * lens.fy, a * lens.cx + b * lens.cy + c
+    a, b, c, up, extent = support.a, support.b, support.c, support.up, support.extent
+    x, y, z = a * intrinsics.fx, b * intrinsics.fy, a * intrinsics.cx + b * intrinsics.cy + c
     row[0], row[1], row[2], row[3] = a, b, c, 1.0 / math.sqrt(x * x + y * y + z * z)
     axes = level_axes(up[0], up[1], up[2])
     for k in range(3):
         row[4 + k], row[7 + k] = axes[0][k], axes[1][k]
     # The circle is for a quick answer.
     quarter, half = DIRECTIONS // 4, DIRECTIONS // 2
-    row[10] = (reach[0] - reach[half]) / 2
-    row[11] = (reach[quarter] - reach[half + quarter]) / 2
-    room = np.min(reach - row[10] * COS - row[11] * SIN)
-    row[12] = max(room, 0.0) ** 2
-    row[13:] = reach
+    row[10] = (extent[0] - extent[half]) / 2
+    row[11] = (extent[quarter] - extent[half + quarter]) / 2
+    scratch = np.min(extent - row[10] * COS - row[11] * SIN)
+    row[12] = max(scratch, 0.0) ** 2
+    row[13:] = extent
 
 
 @kernel
-def heights_of(cells: Cells, planes: F8, highest_m: float) -> Heights:
-    """Give every cell to the highest plane it is above; ``planes`` are the rows of `table_of`."""
-    owner, height = np.zeros(cells.w.shape, np.int8), np.zeros(cells.w.shape, np.float32)
+def measure_heights(grid: DepthGrid, planes: F8, highest_m: float) -> HeightMap:
+    """Give every cell to the highest plane it is above; ``planes`` are from `pack_planes`."""
+    plane_id, height = (
+        np.zeros(grid.inverse_depth.shape, np.int8),
+        np.zeros(grid.inverse_depth.shape, np.float32),
+    )
     for number in range(len(planes), 0, -1):
-        _stand(cells.w, cells.lens, planes[number - 1], number, highest_m, owner, height)
-    return Heights(owner, height)
+        _assign(
+            grid.inverse_depth,
+            grid.intrinsics,
+            planes[number - 1],
+            number,
+            highest_m,
+            plane_id,
+            height,
+        )
+    return HeightMap(plane_id, height)
 
 
 @kernel(fast=True)
-def _stand(
-    w: F4, lens: Lens, plane: F8, number: int, highest: float, owner: I4, height: F4
+def _assign(
+    inv_depth: F4,
+    intrinsics: PinholeIntrinsics,
+    plane: F8,
+    number: int,
+    highest: float,
+    plane_id: I4,
+    height: F4,
 ) -> None:
     """Give the free cells inside the outline of a plane to it; the loops over a row vectorise."""
-    rows, columns = w.shape
+    rows, columns = inv_depth.shape
     a, scale, zero, one = np.float32(plane[0]), np.float32(plane[3]), np.float32(0), np.float32(1)
-    least, noise, below = np.float32(LEAST_M), np.float32(NOISE), np.float32(OUT)
+    least, noise, below = np.float32(MIN_HEIGHT_M), np.float32(HEIGHT_NOISE), np.float32(OUT)
     beyond, high = np.float32(BEYOND_M), np.float32(highest)
     above, surface = np.int8(number), np.int8(-number)
     x = np.arange(columns).astype(np.float32)
@@ -89,23 +113,23 @@ def _stand(
     # Level coordinates times inverse depth are linear in the image: (per column, per row, rest).
     sides = np.zeros((DIRECTIONS // 2, 3))
     for d in range(2):
-        p, q = plane[4 + 3 * d] / lens.fx, plane[5 + 3 * d] / lens.fy
+        p, q = plane[4 + 3 * d] / intrinsics.fx, plane[5 + 3 * d] / intrinsics.fy
         for k in range(DIRECTIONS // 2):
             part = SIN[k] if d else COS[k]
             sides[k, 0] += part * p
             sides[k, 1] += part * q
-            sides[k, 2] += part * (plane[6 + 3 * d] - p * lens.cx - q * lens.cy)
+            sides[k, 2] += part * (plane[6 + 3 * d] - p * intrinsics.cx - q * intrinsics.cy)
     # A plane seen edge on has heights between the steps of the sensor; so no division is unsafe.
     for i in range(rows):
         base = np.float32(plane[1] * i + plane[2])
-        values, owners, heights = w[i], owner[i], height[i]
+        values, plane_ids, heights = inv_depth[i], plane_id[i], height[i]
         some = False
         for j in range(columns):
             v = values[j]
             z = one / v if v > zero else zero
             h = (v - (a * x[j] + base)) * z * scale
             gate = least + noise * z * z
-            use = (v > zero) & (h > -gate) & (h < high) & (owners[j] == 0)
+            use = (v > zero) & (h > -gate) & (h < high) & (plane_ids[j] == 0)
             line[j] = h if use else below
             slack[j] = zero if h > gate else beyond * v
             some |= use
@@ -117,8 +141,8 @@ def _stand(
             far, near = np.float32(plane[13 + k]), np.float32(plane[13 + k + DIRECTIONS // 2])
             # Few rows reach beyond a side, and their bounds tell most of the others.
             ends = step * left + first, step * right + first
-            room = min(far * farthest, far * nearest), min(near * farthest, near * nearest)
-            if max(ends[0], ends[1]) <= room[0] and -min(ends[0], ends[1]) <= room[1]:
+            scratch = min(far * farthest, far * nearest), min(near * farthest, near * nearest)
+            if max(ends[0], ends[1]) <= scratch[0] and -min(ends[0], ends[1]) <= scratch[1]:
                 continue
             for j in range(columns):
                 v, more = values[j], slack[j]
@@ -127,7 +151,7 @@ def _stand(
                 line[j] = line[j] if within else below
         for j in range(columns):
             mine = above if slack[j] == zero else surface
-            owners[j] = mine if line[j] > below else owners[j]
+            plane_ids[j] = mine if line[j] > below else plane_ids[j]
         for j in range(columns):
             heights[j] = line[j] if line[j] > below else heights[j]
 
@@ -152,8 +176,8 @@ def _bounds(line: F4, values: F4) -> tuple[np.float32, np.float32, np.float32, n
 
 
 @kernel(leaf=True)
-def inside(plane: F8, x: float, y: float, z: float, slack: float) -> bool:
-    """Whether a point is within the outline of a row of `table_of`, or ``slack`` beyond it."""
+def is_inside_outline(plane: F8, x: float, y: float, z: float, slack: float) -> bool:
+    """Whether a point is within the outline of a row of `pack_planes`, or ``slack`` beyond it."""
     p = plane[4] * x + plane[5] * y + plane[6] * z
     q = plane[7] * x + plane[8] * y + plane[9] * z
     if (p - plane[10]) ** 2 + (q - plane[11]) ** 2 < plane[12]:

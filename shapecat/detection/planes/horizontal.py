@@ -1,34 +1,34 @@
-"""Planes: the horizontal levels of the scene (thesis 4.3, Alg. 1)."""
+"""Horizontal planes: one for each accumulation of level surface in height (thesis 4.3, Alg. 1)."""
 
 import math
 
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.depth_grid import Cells, Lens
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.planes.extent import (
     ARM,
     LEAST_AREA_M2,
     MARGIN_M,
-    Support,
+    SupportingPlane,
+    measure_plane,
     sort_by_height,
-    support_of,
 )
 from shapecat.detection.planes.ransac import (
-    TOLERANCE,
-    Readings,
-    among,
-    consensus,
+    INLIER_TOLERANCE,
+    DepthSamples,
     cosine,
-    count_near,
-    level_plane,
-    middle_of,
-    normal_of,
-    refit,
+    count_inliers,
+    horizontal_plane,
+    median_of,
+    plane_normal,
+    ransac_plane,
+    refine,
+    select,
 )
 from shapecat.jit import kernel
 
-__all__ = ["by_height", "find_planes", "fullest"]
+__all__ = ["by_height", "find_horizontal_planes", "fullest"]
 
 BIN_M = 0.01
 MOST_LEVELS = 10
@@ -47,24 +47,26 @@ GRAZING_SIN2 = 0.04
 
 
 @kernel
-def find_planes(cells: Cells, up: F8, draws: F8) -> list[tuple[Support, Readings]]:
+def find_horizontal_planes(
+    grid: DepthGrid, up: F8, trials: F8
+) -> list[tuple[SupportingPlane, DepthSamples]]:
     """Return the horizontal planes of the scene, lowest first, each with its readings."""
-    w, lens = cells.w, cells.lens
+    inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     # (1), (2) readings whose surface is level
-    level, height, order, starts = _level_readings(w, lens, up)
+    level, height, order, starts = _level_readings(inv_depth, intrinsics, up)
     # (3) one plane candidate for each accumulation in height
     done = np.zeros(starts.size - 1, np.bool_)
-    found: list[tuple[Support, Readings]] = []
+    found: list[tuple[SupportingPlane, DepthSamples]] = []
     for _ in range(MOST_LEVELS):
-        near, plane, count, close = _next_level(lens, up, level, height, order, starts, done)
-        if near.w.size < LEAST_CELLS:
+        near, plane, count, close = _next_level(intrinsics, up, level, height, order, starts, done)
+        if near.inverse_depth.size < LEAST_CELLS:
             break
         if count < LEAST_CELLS:
             continue
         # (4) refine, and keep what lies in the plane
         if close < CLOSE_SHARE * count:
-            plane = _voted(lens, near, up, draws, plane, close)
-        support = support_of(cells, near, plane)
+            plane = _voted(intrinsics, near, up, trials, plane, close)
+        support = measure_plane(grid, near, plane)
         if support.area_m2 >= LEAST_AREA_M2:
             found.append((support, near))
             _keep_off(plane, level, order, starts)
@@ -74,24 +76,26 @@ def find_planes(cells: Cells, up: F8, draws: F8) -> list[tuple[Support, Readings
 
 
 @kernel
-def _level_readings(w: F4, lens: Lens, up: F8) -> tuple[Readings, F4, I4, I4]:
+def _level_readings(
+    inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8
+) -> tuple[DepthSamples, F4, I4, I4]:
     """Find every second cell whose surface is level within 25 degrees.
 
     Returns
     -------
     These readings, their heights, and what `by_height` says of these.
     """
-    rows, columns = w.shape
-    even, odd = _halves(w)
+    rows, columns = inv_depth.shape
+    even, odd = _halves(inv_depth)
     width = max((columns - 2 * ARM + 1) // 2, 0)
-    x = (ARM + 2 * np.arange(width) - lens.cx) / lens.fx
+    x = (ARM + 2 * np.arange(width) - intrinsics.cx) / intrinsics.fx
     row = np.zeros(width, np.float32)
     found = np.zeros((4, width * (rows // 2) + 1), np.float32)
     j_of, i_of, w_of, height_of = found[0], found[1], found[2], found[3]
     lowest, highest = np.float32(np.inf), np.float32(-np.inf)
     n = np.uint32(0)  # a place without a sign is not asked whether it counts from the end
     for i in range(ARM, rows - ARM, 2):
-        _find_level(even, odd, lens, up, i, x, row)
+        _find_level(even, odd, intrinsics, up, i, x, row)
         values = odd[i]
         for k in range(width):
             j_of[n], i_of[n], w_of[n], height_of[n] = ARM + 2 * k, i, values[ARM // 2 + k], row[k]
@@ -102,17 +106,17 @@ def _level_readings(w: F4, lens: Lens, up: F8) -> tuple[Readings, F4, I4, I4]:
     base = float(lowest) if n > 0 else 0.0
     bins = int((float(highest) - base) / BIN_M) + 1 if n > 0 else 1
     order, starts = by_height(height_of[:n], base, bins)
-    return Readings(j_of[:n], i_of[:n], w_of[:n], 4), height_of[:n], order, starts
+    return DepthSamples(j_of[:n], i_of[:n], w_of[:n], 4), height_of[:n], order, starts
 
 
 @kernel
-def _halves(w: F4) -> tuple[F4, F4]:
+def _halves(inv_depth: F4) -> tuple[F4, F4]:
     """Return the even and the odd columns of an image: loops over these vectorise."""
-    rows, columns = w.shape
+    rows, columns = inv_depth.shape
     even = np.zeros((rows, (columns + 1) // 2), np.float32)
     odd = np.zeros((rows, columns // 2), np.float32)
     for i in range(rows):
-        row, evens, odds = w[i], even[i], odd[i]
+        row, evens, odds = inv_depth[i], even[i], odd[i]
         for k in range(odds.size):
             evens[k], odds[k] = row[2 * k], row[2 * k + 1]
         evens[-1] = row[(columns - 1) // 2 * 2]
@@ -120,12 +124,14 @@ def _halves(w: F4) -> tuple[F4, F4]:
 
 
 @kernel(fast=True, leaf=True)
-def _find_level(even: F4, odd: F4, lens: Lens, up: F8, i: int, x: F8, height: F4) -> None:
+def _find_level(
+    even: F4, odd: F4, intrinsics: PinholeIntrinsics, up: F8, i: int, x: F8, height: F4
+) -> None:
     """Write the heights of the cells of a row on odd columns, infinity where it is not level."""
     bend, two = np.float32(BEND), np.float32(2)
     sides, middle, above, below = even[i], odd[i], odd[i - ARM], odd[i + ARM]
     close_above, close_below = odd[i - 1], odd[i + 1]
-    y = (i - lens.cy) / lens.fy
+    y = (i - intrinsics.cy) / intrinsics.fy
     for k in range(x.size):
         m = k + ARM // 2
         center, left, right = middle[m], sides[k], sides[k + ARM]
@@ -139,7 +145,7 @@ def _find_level(even: F4, odd: F4, lens: Lens, up: F8, i: int, x: F8, height: F4
         smooth = abs(left + right - two * center) <= bend
         smooth &= abs(top + bottom - two * center) <= bend
         across, down = right - left, (bottom - top) * np.float32(ARM if narrow else 1)
-        nx, ny = across * (lens.fx / (2 * ARM)), down * (lens.fy / (2 * ARM))
+        nx, ny = across * (intrinsics.fx / (2 * ARM)), down * (intrinsics.fy / (2 * ARM))
         nz = center - nx * x[k] - ny * y
         along = -(nx * up[0] + ny * up[1] + nz * up[2])
         upwards = along > 0
@@ -178,8 +184,14 @@ def fullest(starts: I4, done: Bool) -> int:
 
 @kernel
 def _next_level(
-    lens: Lens, up: F8, level: Readings, height: F4, order: I4, starts: I4, done: Bool
-) -> tuple[Readings, F8, int, int]:
+    intrinsics: PinholeIntrinsics,
+    up: F8,
+    level: DepthSamples,
+    height: F4,
+    order: I4,
+    starts: I4,
+    done: Bool,
+) -> tuple[DepthSamples, F8, int, int]:
     """Fit a plane to the fullest bins that are not done.
 
     Returns
@@ -190,39 +202,51 @@ def _next_level(
     peak = fullest(starts, done)
     low, high = max(peak - 2, 0), min(peak + 3, done.size)
     chosen = order[starts[low] : starts[high]]
-    near = among(level, chosen)
+    near = select(level, chosen)
     if chosen.size < LEAST_CELLS:
         return near, np.zeros(3), 0, 0
     done[low:high] = True
-    offset = middle_of(height, chosen[:: 1 + chosen.size // MOST_HEIGHTS])
+    offset = median_of(height, chosen[:: 1 + chosen.size // MOST_HEIGHTS])
     if offset > -MARGIN_M:
         return near, np.zeros(3), 0, 0
-    plane = level_plane(lens, up, offset)
+    plane = horizontal_plane(intrinsics, up, offset)
     count = 0
     for _ in range(3):
-        count = refit(near.j, near.i, near.w, 1.5 * TOLERANCE, plane)
+        count = refine(near.j, near.i, near.inverse_depth, 1.5 * INLIER_TOLERANCE, plane)
         if count < LEAST_CELLS:
             break
-        if cosine(normal_of(plane, lens), up) < STEADY_COS:
-            plane = level_plane(lens, up, offset)
+        if cosine(plane_normal(plane, intrinsics), up) < STEADY_COS:
+            plane = horizontal_plane(intrinsics, up, offset)
             break
-    return near, plane, count, count_near(near, plane[0], plane[1], plane[2], CLOSE * TOLERANCE)
+    return (
+        near,
+        plane,
+        count,
+        count_inliers(near, plane[0], plane[1], plane[2], CLOSE * INLIER_TOLERANCE),
+    )
 
 
 @kernel
-def _voted(lens: Lens, near: Readings, up: F8, draws: F8, plane: F8, close: int) -> F8:
+def _voted(
+    intrinsics: PinholeIntrinsics, near: DepthSamples, up: F8, trials: F8, plane: F8, close: int
+) -> F8:
     """Return the plane most readings are close to, or ``plane``, to which ``close`` are."""
-    other, votes = consensus(near, draws, lens, up, (STEADY_COS, 1.0), CLOSE * TOLERANCE)
-    return other if votes > close else plane
+    other, inliers = ransac_plane(
+        near, trials, intrinsics, up, (STEADY_COS, 1.0), CLOSE * INLIER_TOLERANCE
+    )
+    return other if inliers > close else plane
 
 
 @kernel
-def _keep_off(plane: F8, level: Readings, order: I4, starts: I4) -> None:
+def _keep_off(plane: F8, level: DepthSamples, order: I4, starts: I4) -> None:
     """Take the readings near a plane from their order `by_height`, in place."""
-    j, i, w = level.j, level.i, level.w
-    off = np.zeros(w.size, np.uint8)
-    for k in range(w.size):
-        off[k] = abs(w[k] - (plane[0] * j[k] + plane[1] * i[k] + plane[2])) > 3 * TOLERANCE
+    j, i, inv_depth = level.j, level.i, level.inverse_depth
+    off = np.zeros(inv_depth.size, np.uint8)
+    for k in range(inv_depth.size):
+        off[k] = (
+            abs(inv_depth[k] - (plane[0] * j[k] + plane[1] * i[k] + plane[2]))
+            > 3 * INLIER_TOLERANCE
+        )
     left = np.zeros(order.size + 1, np.uint32)  # of those before each
     n = np.uint32(0)
     for k in range(starts[-1]):

@@ -1,4 +1,4 @@
-"""Consensus: planes that many readings agree on (RANSAC, Fischler and Bolles 1981)."""
+"""RANSAC: planes that many depth samples lie in (Fischler and Bolles 1981)."""
 
 import math
 from typing import NamedTuple
@@ -6,26 +6,26 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import Lens
+from shapecat.detection.depth_grid import PinholeIntrinsics
 from shapecat.jit import kernel
 
 __all__ = [
-    "TOLERANCE",
-    "Readings",
-    "among",
-    "consensus",
+    "INLIER_TOLERANCE",
+    "DepthSamples",
     "cosine",
-    "count_near",
-    "draws_of",
-    "level_plane",
-    "middle_of",
-    "normal_of",
-    "readings_of",
-    "refit",
-    "without",
+    "count_inliers",
+    "draw_trials",
+    "horizontal_plane",
+    "median_of",
+    "plane_normal",
+    "ransac_plane",
+    "refine",
+    "remove_inliers",
+    "sample_grid",
+    "select",
 ]
 
-TOLERANCE = 0.01
+INLIER_TOLERANCE = 0.01
 """Distance of an inlier from a plane in inverse depth, 1/m: three steps of a Kinect."""
 TRIALS, BLOCK = 240, 256
 """Planes that are tried, and after how many readings it is asked if one can still win."""
@@ -35,44 +35,48 @@ SAMPLE = 4800
 """About as many cells propose planes and vote."""
 
 
-class Readings(NamedTuple):
-    """Cells in a list: ``j`` (n,) columns, ``i`` (n,) rows, ``w`` (n,) inverse depth, float32.
+class DepthSamples(NamedTuple):
+    """Depth samples in a list: ``j`` (n,) columns, ``i`` (n,) rows, ``inverse_depth`` (n,) 1/m.
 
-    ``share`` is how many cells each stands for.
+    All float32. ``share`` is how many cells each stands for.
     """
 
     j: F4
     i: F4
-    w: F4
+    inverse_depth: F4
     share: int
 
 
 @kernel
-def readings_of(w: F4, wanted: F4) -> Readings:
+def sample_grid(inv_depth: F4, wanted: F4) -> DepthSamples:
     """Return evenly spaced cells with a reading, where ``wanted`` (rows, columns) is above 0."""
-    rows, columns = w.shape
-    stride = max(1, round(math.sqrt(w.size / SAMPLE)))
+    rows, columns = inv_depth.shape
+    stride = max(1, round(math.sqrt(inv_depth.size / SAMPLE)))
     result = np.zeros((3, (rows // stride + 1) * (columns // stride + 1)), np.float32)
     n = 0
     for i in range(stride // 2, rows, stride):
         for j in range(stride // 2, columns, stride):
-            result[0, n], result[1, n], result[2, n] = j, i, w[i, j]
-            n += (w[i, j] > 0) & (wanted[i, j] > 0)
-    return Readings(result[0, :n], result[1, :n], result[2, :n], stride * stride)
+            result[0, n], result[1, n], result[2, n] = j, i, inv_depth[i, j]
+            n += (inv_depth[i, j] > 0) & (wanted[i, j] > 0)
+    return DepthSamples(result[0, :n], result[1, :n], result[2, :n], stride * stride)
 
 
 @kernel
-def among(readings: Readings, chosen: I4) -> Readings:
+def select(samples: DepthSamples, chosen: I4) -> DepthSamples:
     """Return the readings at the ``chosen`` (n,) places in the list."""
     result = np.zeros((3, chosen.size), np.float32)
-    j, i, w = result[0], result[1], result[2]
+    j, i, inv_depth = result[0], result[1], result[2]
     for k in range(chosen.size):
-        j[k], i[k], w[k] = readings.j[chosen[k]], readings.i[chosen[k]], readings.w[chosen[k]]
-    return Readings(j, i, w, readings.share)
+        j[k], i[k], inv_depth[k] = (
+            samples.j[chosen[k]],
+            samples.i[chosen[k]],
+            samples.inverse_depth[chosen[k]],
+        )
+    return DepthSamples(j, i, inv_depth, samples.share)
 
 
 @kernel
-def middle_of(values: F4, chosen: I4) -> float:
+def median_of(values: F4, chosen: I4) -> float:
     """Return the upper median of the values at the ``chosen`` places, at least one.
 
     Source: Hoare 1961, Algorithm 65. `numpy.partition` in a kernel takes 15 ms to load.
@@ -99,24 +103,24 @@ def middle_of(values: F4, chosen: I4) -> float:
 
 
 @kernel
-def without(readings: Readings, plane: F8, tolerance: float) -> Readings:
+def remove_inliers(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSamples:
     """Return the readings that are not near a plane."""
     a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     gate = np.float32(tolerance)
-    rest = np.zeros((3, readings.w.size), np.float32)
+    rest = np.zeros((3, samples.inverse_depth.size), np.float32)
     n = 0
-    for k in range(readings.w.size):
-        j, i, v = readings.j[k], readings.i[k], readings.w[k]
+    for k in range(samples.inverse_depth.size):
+        j, i, v = samples.j[k], samples.i[k], samples.inverse_depth[k]
         rest[0, n], rest[1, n], rest[2, n] = j, i, v
         n += abs(v - (a * j + b * i + c)) > gate
-    return Readings(rest[0, :n], rest[1, :n], rest[2, :n], readings.share)
+    return DepthSamples(rest[0, :n], rest[1, :n], rest[2, :n], samples.share)
 
 
 @kernel
-def normal_of(plane: F8, lens: Lens) -> F8:
+def plane_normal(plane: F8, intrinsics: PinholeIntrinsics) -> F8:
     """Return the unit normal towards the camera of a plane (a, b, c) of inverse depth."""
     a, b, c = plane
-    x, y, z = -a * lens.fx, -b * lens.fy, -(a * lens.cx + b * lens.cy + c)
+    x, y, z = -a * intrinsics.fx, -b * intrinsics.fy, -(a * intrinsics.cx + b * intrinsics.cy + c)
     norm = math.sqrt(x * x + y * y + z * z)
     return np.array([x / norm, y / norm, z / norm])
 
@@ -128,22 +132,24 @@ def cosine(a: F8, b: F8) -> float:
 
 
 @kernel
-def level_plane(lens: Lens, up: F8, offset: float) -> F8:
+def horizontal_plane(intrinsics: PinholeIntrinsics, up: F8, offset: float) -> F8:
     """Return the plane ``up @ p == offset`` as inverse depth (a, b, c)."""
-    a, b = up[0] / lens.fx, up[1] / lens.fy
-    return np.array([a / offset, b / offset, (up[2] - a * lens.cx - b * lens.cy) / offset])
+    a, b = up[0] / intrinsics.fx, up[1] / intrinsics.fy
+    return np.array(
+        [a / offset, b / offset, (up[2] - a * intrinsics.cx - b * intrinsics.cy) / offset]
+    )
 
 
-def draws_of(rng: np.random.Generator) -> F8:
+def draw_trials(rng: np.random.Generator) -> F8:
     """Draw the numbers (n, 3) from 0 to 1 that tell all kernels of a frame which to try."""
     return rng.random((TRIALS, 3))
 
 
 @kernel
-def consensus(
-    readings: Readings,
-    draws: F8,
-    lens: Lens,
+def ransac_plane(
+    samples: DepthSamples,
+    trials: F8,
+    intrinsics: PinholeIntrinsics,
     guide: F8,
     cosines: tuple[float, float],
     tolerance: float,
@@ -155,78 +161,82 @@ def consensus(
 
     Parameters
     ----------
-    draws : of `draws_of`; the readings at these shares of the list propose planes.
+    trials : of `draw_trials`; the readings at these shares of the list propose planes.
     """
     best = np.zeros(3)
-    most, n = 0, readings.w.size
-    for t in range(len(draws) if n >= 3 else 0):
+    most, n = 0, samples.inverse_depth.size
+    for t in range(len(trials) if n >= 3 else 0):
         # (1) three readings propose a plane
-        p, q, r = int(draws[t, 0] * n), int(draws[t, 1] * n), int(draws[t, 2] * n)
-        w0 = float(readings.w[p])
-        j1, i1 = readings.j[q] - readings.j[p], readings.i[q] - readings.i[p]
-        j2, i2 = readings.j[r] - readings.j[p], readings.i[r] - readings.i[p]
+        p, q, r = int(trials[t, 0] * n), int(trials[t, 1] * n), int(trials[t, 2] * n)
+        w0 = float(samples.inverse_depth[p])
+        j1, i1 = samples.j[q] - samples.j[p], samples.i[q] - samples.i[p]
+        j2, i2 = samples.j[r] - samples.j[p], samples.i[r] - samples.i[p]
         double = i1 * j2 - i2 * j1
         if abs(double) < LEAST_DOUBLE_AREA:
             continue
-        a = (i1 * (readings.w[r] - w0) - i2 * (readings.w[q] - w0)) / double
-        b = (j2 * (readings.w[q] - w0) - j1 * (readings.w[r] - w0)) / double
-        c = w0 - a * readings.j[p] - b * readings.i[p]
-        nx, ny, nz = a * lens.fx, b * lens.fy, a * lens.cx + b * lens.cy + c
+        a = (i1 * (samples.inverse_depth[r] - w0) - i2 * (samples.inverse_depth[q] - w0)) / double
+        b = (j2 * (samples.inverse_depth[q] - w0) - j1 * (samples.inverse_depth[r] - w0)) / double
+        c = w0 - a * samples.j[p] - b * samples.i[p]
+        nx, ny, nz = a * intrinsics.fx, b * intrinsics.fy, a * intrinsics.cx + b * intrinsics.cy + c
         along = -(nx * guide[0] + ny * guide[1] + nz * guide[2])
         norm = math.sqrt(nx * nx + ny * ny + nz * nz)
         if not ((along >= cosines[0] * norm) & (along <= cosines[1] * norm)):
             continue
         # (2) all vote
-        votes = _votes(readings, a, b, c, tolerance, most)
-        if votes > most:
-            most = votes
+        inliers = _inliers_if_more(samples, a, b, c, tolerance, most)
+        if inliers > most:
+            most = inliers
             best[0], best[1], best[2] = a, b, c
     # (3) the inliers refit
     for _ in range(4):
-        refit(readings.j, readings.i, readings.w, tolerance, best)
-    votes = count_near(readings, best[0], best[1], best[2], tolerance) if most >= 3 else 0
-    return best, votes
+        refine(samples.j, samples.i, samples.inverse_depth, tolerance, best)
+    inliers = count_inliers(samples, best[0], best[1], best[2], tolerance) if most >= 3 else 0
+    return best, inliers
 
 
 @kernel
-def _votes(readings: Readings, a: float, b: float, c: float, tolerance: float, most: int) -> int:
+def _inliers_if_more(
+    samples: DepthSamples, a: float, b: float, c: float, tolerance: float, most: int
+) -> int:
     """Count the readings near a plane as long as there may be over ``most``."""
-    j, i, w, share = readings
-    votes = 0
-    for start in range(0, w.size, BLOCK):
-        if votes + w.size - start <= most:
+    j, i, inv_depth, share = samples
+    inliers = 0
+    for start in range(0, inv_depth.size, BLOCK):
+        if inliers + inv_depth.size - start <= most:
             break
         some = slice(start, start + BLOCK)
-        votes += count_near(Readings(j[some], i[some], w[some], share), a, b, c, tolerance)
-    return votes
+        inliers += count_inliers(
+            DepthSamples(j[some], i[some], inv_depth[some], share), a, b, c, tolerance
+        )
+    return inliers
 
 
 @kernel(fast=True)
-def count_near(readings: Readings, a: float, b: float, c: float, tolerance: float) -> int:
+def count_inliers(samples: DepthSamples, a: float, b: float, c: float, tolerance: float) -> int:
     """Count the readings near a plane."""
     a4, b4, c4, gate = np.float32(a), np.float32(b), np.float32(c), np.float32(tolerance)
     total = np.int32(0)
-    for k in range(readings.w.size):
-        level = a4 * readings.j[k] + b4 * readings.i[k] + c4
-        total += np.int32(abs(readings.w[k] - level) < gate)
+    for k in range(samples.inverse_depth.size):
+        level = a4 * samples.j[k] + b4 * samples.i[k] + c4
+        total += np.int32(abs(samples.inverse_depth[k] - level) < gate)
     return int(total)
 
 
 @kernel(fast=True, leaf=True)
-def refit(j: F4, i: F4, w: F4, tolerance: float, plane: F8) -> int:
+def refine(j: F4, i: F4, inv_depth: F4, tolerance: float, plane: F8) -> int:
     """Fit a plane (a, b, c) to its inliers by least squares; return how many they are.
 
     The plane stays as it is if they do not span one.
     """
-    if w.size == 0:
+    if inv_depth.size == 0:
         return 0
     a, b, c = plane[0], plane[1], plane[2]
-    j0, i0, w0 = float(j[0]), float(i[0]), float(w[0])
+    j0, i0, w0 = float(j[0]), float(i[0]), float(inv_depth[0])
     n = mx = my = mw = xx = xy = yy = xw = yw = 0.0
-    for k in range(w.size):
+    for k in range(inv_depth.size):
         # A sum of products with 0 or 1 vectorises.
-        near = 1.0 if abs(w[k] - (a * j[k] + b * i[k] + c)) < tolerance else 0.0
-        x, y, v = near * (j[k] - j0), near * (i[k] - i0), near * (w[k] - w0)
+        near = 1.0 if abs(inv_depth[k] - (a * j[k] + b * i[k] + c)) < tolerance else 0.0
+        x, y, v = near * (j[k] - j0), near * (i[k] - i0), near * (inv_depth[k] - w0)
         n += near
         mx += x
         my += y

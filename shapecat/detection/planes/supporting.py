@@ -1,17 +1,17 @@
-"""Boards: planes that are furniture, told from the tops of objects."""
+"""Supporting planes: tables and boards, told from the tops of objects."""
 
 import math
 
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import Cells, Lens
-from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN, Support, corners_of
-from shapecat.detection.planes.ransac import TOLERANCE, Readings
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN, SupportingPlane, outline_corners
+from shapecat.detection.planes.ransac import INLIER_TOLERANCE, DepthSamples
 from shapecat.geometry import NEAREST_M, level_axes
 from shapecat.jit import kernel
 
-__all__ = ["boards_of"]
+__all__ = ["supporting_planes"]
 
 SURE_AREA_M2 = 0.25
 """Planes larger than this are furniture, whatever is under their edge."""
@@ -30,15 +30,17 @@ LEAST_DROPS, CLOSED = 20, 0.5
 
 
 @kernel
-def boards_of(cells: Cells, found: list[tuple[Support, Readings]]) -> list[Support]:
+def supporting_planes(
+    grid: DepthGrid, found: list[tuple[SupportingPlane, DepthSamples]]
+) -> list[SupportingPlane]:
     """Leave out the tops of objects; ``found`` are planes, lowest first, with their readings.
 
     Under the front edge of a table or shelf there is nothing; a box is closed down to what it
     stands on. Things lower than 6 cm are never furniture, planes over a quarter of a square metre
     always.
     """
-    kept: list[Support] = []
-    for support, readings in found:
+    kept: list[SupportingPlane] = []
+    for support, samples in found:
         drop = math.inf
         for lower in kept:
             drop = support.offset - lower.offset if _overlaps(lower, support) else drop
@@ -47,7 +49,7 @@ def boards_of(cells: Cells, found: list[tuple[Support, Readings]]) -> list[Suppo
         if drop < math.inf and support.area_m2 < SURE_AREA_M2:
             seen = np.zeros(2, np.int64)
             plane = np.array([support.a, support.b, support.c])
-            _drop(cells.w, cells.lens, readings, plane, support.up, drop, seen)
+            _drop(grid.inverse_depth, grid.intrinsics, samples, plane, support.up, drop, seen)
             if seen[0] + seen[1] >= LEAST_DROPS:
                 if seen[0] > CLOSED * (seen[0] + seen[1]):
                     continue
@@ -58,26 +60,34 @@ def boards_of(cells: Cells, found: list[tuple[Support, Readings]]) -> list[Suppo
 
 
 @kernel
-def _overlaps(lower: Support, upper: Support) -> bool:
+def _overlaps(lower: SupportingPlane, upper: SupportingPlane) -> bool:
     """Whether the middle of ``upper`` lies over the outline of ``lower``."""
-    middle = np.sum(corners_of(upper), axis=0) / DIRECTIONS
+    middle = np.sum(outline_corners(upper), axis=0) / DIRECTIONS
     axes = level_axes(lower.up[0], lower.up[1], lower.up[2])
     x = axes[0][0] * middle[0] + axes[0][1] * middle[1] + axes[0][2] * middle[2]
     y = axes[1][0] * middle[0] + axes[1][1] * middle[1] + axes[1][2] * middle[2]
-    return bool(np.all(COS * x + SIN * y < lower.reach))
+    return bool(np.all(COS * x + SIN * y < lower.extent))
 
 
 @kernel(leaf=True)
-def _drop(w: F4, lens: Lens, readings: Readings, plane: F8, up: F8, drop: float, seen: I4) -> None:
+def _drop(
+    inv_depth: F4,
+    intrinsics: PinholeIntrinsics,
+    samples: DepthSamples,
+    plane: F8,
+    up: F8,
+    drop: float,
+    seen: I4,
+) -> None:
     """Look below the edge of a plane: count readings on a wall down from it, and beyond it."""
-    rows, columns = w.shape
-    for k in range(0, readings.w.size, 3):
-        i, j = readings.i[k], readings.j[k]
+    rows, columns = inv_depth.shape
+    for k in range(0, samples.inverse_depth.size, 3):
+        i, j = samples.i[k], samples.j[k]
         level = plane[0] * j + plane[1] * i + plane[2]
-        if level <= 0 or abs(readings.w[k] - level) >= TOLERANCE:
+        if level <= 0 or abs(samples.inverse_depth[k] - level) >= INLIER_TOLERANCE:
             continue
         z = 1 / level
-        x, y = (j - lens.cx) / lens.fx * z, (i - lens.cy) / lens.fy * z
+        x, y = (j - intrinsics.cx) / intrinsics.fx * z, (i - intrinsics.cy) / intrinsics.fy * z
         # Towards the camera, along the plane.
         h = x * up[0] + y * up[1] + z * up[2]
         tx, ty, tz = h * up[0] - x, h * up[1] - y, h * up[2] - z
@@ -87,13 +97,13 @@ def _drop(w: F4, lens: Lens, readings: Readings, plane: F8, up: F8, drop: float,
         tx, ty, tz = STEP_M * tx / length, STEP_M * ty / length, STEP_M * tz / length
         edge = False
         for _ in range(EDGE_STEPS):
-            v = int(lens.cy + lens.fy * (y + ty) / (z + tz) + 0.5)
-            u = int(lens.cx + lens.fx * (x + tx) / (z + tz) + 0.5)
-            if v < 0 or u < 0 or v >= rows or u >= columns or w[v, u] <= 0:
+            v = int(intrinsics.cy + intrinsics.fy * (y + ty) / (z + tz) + 0.5)
+            u = int(intrinsics.cx + intrinsics.fx * (x + tx) / (z + tz) + 0.5)
+            if v < 0 or u < 0 or v >= rows or u >= columns or inv_depth[v, u] <= 0:
                 break
-            ahead = w[v, u] - 1 / (z + tz)
-            edge = ahead < -2 * TOLERANCE
-            if edge or ahead > 2 * TOLERANCE:  # the end of the plane, or something on it
+            ahead = inv_depth[v, u] - 1 / (z + tz)
+            edge = ahead < -2 * INLIER_TOLERANCE
+            if edge or ahead > 2 * INLIER_TOLERANCE:  # the end of the plane, or something on it
                 break
             x, y, z = x + tx, y + ty, z + tz
         if not edge:
@@ -105,10 +115,13 @@ def _drop(w: F4, lens: Lens, readings: Readings, plane: F8, up: F8, drop: float,
             dx, dy, dz = x - s * up[0], y - s * up[1], z - s * up[2]
             if dz <= NEAREST_M:
                 break
-            v, u = int(lens.cy + lens.fy * dy / dz + 0.5), int(lens.cx + lens.fx * dx / dz + 0.5)
+            v, u = (
+                int(intrinsics.cy + intrinsics.fy * dy / dz + 0.5),
+                int(intrinsics.cx + intrinsics.fx * dx / dz + 0.5),
+            )
             if v < 0 or u < 0 or v >= rows or u >= columns:
                 break
-            if w[v, u] > 0:
-                behind = 1 / w[v, u] - dz
+            if inv_depth[v, u] > 0:
+                behind = 1 / inv_depth[v, u] - dz
                 seen[0] += abs(behind) < WALL_M
                 seen[1] += behind >= WALL_M

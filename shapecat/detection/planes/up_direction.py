@@ -1,18 +1,18 @@
-"""Directions: which way is up, as the surfaces of the scene tell it."""
+"""Up estimation: the direction that the surfaces of the scene tell to be up."""
 
 import math
 
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import Cells, Lens
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.planes.ransac import (
-    TOLERANCE,
+    INLIER_TOLERANCE,
     cosine,
-    level_plane,
-    normal_of,
-    readings_of,
-    refit,
+    horizontal_plane,
+    plane_normal,
+    refine,
+    sample_grid,
 )
 from shapecat.geometry import DISCONTINUITY, cross
 from shapecat.jit import kernel
@@ -39,59 +39,68 @@ direction lies in them, by the power of the share; and that the camera looks at 
 
 
 @kernel
-def estimate_up(cells: Cells, hint: F8, draws: F8) -> F8:
+def estimate_up(grid: DepthGrid, hint: F8, trials: F8) -> F8:
     """Return the normal of the dominant supporting plane, (3,) unit, or zeros if there is none.
 
     With a ``hint`` only planes within 15 degrees of being perpendicular to it count. Without, if
     it is zeros, the direction wins that faces most large levels: the normal of one of the largest
     planes, or the direction that two walls leave. What the camera looks at head-on counts less, so
     that the boards of a shelf beat its back. How the camera is turned about its axis makes no
-    difference. ``draws`` are of `draws_of`.
+    difference. ``trials`` are of `draw_trials`.
     """
-    facets = _facets(cells.w, cells.lens)
-    least = max(LEAST_SHARE * facets.shape[1], float(LEAST_FACETS))
+    oriented_points = _orient_points(grid.inverse_depth, grid.intrinsics)
+    least = max(LEAST_SHARE * oriented_points.shape[1], float(LEAST_FACETS))
     free = not np.any(hint)
-    found = _directions(facets[:3] if free else _facing(facets, hint), least, draws)
+    found = _directions(
+        oriented_points[:3] if free else _facing(oriented_points, hint), least, trials
+    )
     if len(found) == 0:
         return np.zeros(3)
-    up: F8 = _dominant(cells.w, cells.lens, facets, found, least, CORNER_COS if free else 0.0)
+    up: F8 = _dominant(
+        grid.inverse_depth,
+        grid.intrinsics,
+        oriented_points,
+        found,
+        least,
+        CORNER_COS if free else 0.0,
+    )
     return up
 
 
 @kernel
-def _directions(normals: F4, least: float, draws: F8) -> F8:
+def _directions(normals: F4, least: float, trials: F8) -> F8:
     """Return directions (n, 3) that many normals face, most first: RANSAC on one at a time."""
     found = np.zeros((MOST_DIRECTIONS, 3))
     for k in range(MOST_DIRECTIONS):
         if normals.shape[1] < least:
             return found[:k]
-        votes, normals = _most_faced(normals, draws, found[k])
-        if votes < least:
+        inliers, normals = _most_faced(normals, trials, found[k])
+        if inliers < least:
             return found[:k]
     return found
 
 
 @kernel
-def _facing(facets: F4, hint: F8) -> F4:
+def _facing(oriented_points: F4, hint: F8) -> F4:
     """Return the normals (3, n) of the facets that may be level."""
-    chosen = np.zeros((3, facets.shape[1]), np.float32)
+    chosen = np.zeros((3, oriented_points.shape[1]), np.float32)
     n = 0
-    for k in range(facets.shape[1]):
-        x, y, z = facets[0, k], facets[1, k], facets[2, k]
+    for k in range(oriented_points.shape[1]):
+        x, y, z = oriented_points[0, k], oriented_points[1, k], oriented_points[2, k]
         chosen[0, n], chosen[1, n], chosen[2, n] = x, y, z
         n += x * hint[0] + y * hint[1] + z * hint[2] > HINT_COS
     return chosen[:, :n].copy()
 
 
 @kernel
-def _most_faced(normals: F4, draws: F8, best: F8) -> tuple[int, F4]:
+def _most_faced(normals: F4, trials: F8, best: F8) -> tuple[int, F4]:
     """Write the direction most normals (3, n) face; return how many do, and those that do not."""
     most = -1
-    for draw in draws[:TRIALS, 0]:
+    for draw in trials[:TRIALS, 0]:
         t = int(draw * normals.shape[1])
-        votes = _votes(normals, t, most)
-        if votes > most:
-            most = votes
+        inliers = _inliers_if_more(normals, t, most)
+        if inliers > most:
+            most = inliers
             best[0], best[1], best[2] = normals[0, t], normals[1, t], normals[2, t]
     for _ in range(3):
         most = _mean_near(normals, best)
@@ -105,26 +114,26 @@ def _most_faced(normals: F4, draws: F8, best: F8) -> tuple[int, F4]:
 
 
 @kernel(fast=True, leaf=True)
-def _votes(normals: F4, t: int, most: int) -> int:
+def _inliers_if_more(normals: F4, t: int, most: int) -> int:
     """Count the normals that face as normal ``t`` does, as long as there may be over ``most``."""
     xs, ys, zs = normals[0], normals[1], normals[2]  # unpacked they would not be contiguous
     x, y, z = xs[t], ys[t], zs[t]
-    votes = 0
+    inliers = 0
     for start in range(0, xs.size, BLOCK):
-        if votes + xs.size - start <= most:
+        if inliers + xs.size - start <= most:
             break
         stop = start + BLOCK
-        votes += _count_facing(xs[start:stop], ys[start:stop], zs[start:stop], x, y, z)
-    return votes
+        inliers += _count_facing(xs[start:stop], ys[start:stop], zs[start:stop], x, y, z)
+    return inliers
 
 
 @kernel(fast=True, leaf=True)
 def _count_facing(xs: F4, ys: F4, zs: F4, x: float, y: float, z: float) -> int:
     least = np.float32(FACING_COS)
-    votes = np.int32(0)
+    inliers = np.int32(0)
     for k in range(xs.size):
-        votes += np.int32(xs[k] * x + ys[k] * y + zs[k] * z > least)
-    return int(votes)
+        inliers += np.int32(xs[k] * x + ys[k] * y + zs[k] * z > least)
+    return int(inliers)
 
 
 @kernel(fast=True, leaf=True)
@@ -134,20 +143,27 @@ def _mean_near(normals: F4, direction: F8) -> int:
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     least = np.float32(FACING_COS)
     sx = sy = sz = np.float64(0)
-    votes = np.int32(0)
+    inliers = np.int32(0)
     for k in range(xs.size):
         near = xs[k] * x + ys[k] * y + zs[k] * z > least
-        votes += np.int32(near)
+        inliers += np.int32(near)
         sx += xs[k] if near else np.float32(0)
         sy += ys[k] if near else np.float32(0)
         sz += zs[k] if near else np.float32(0)
     norm = math.sqrt(sx * sx + sy * sy + sz * sz)
     direction[0], direction[1], direction[2] = sx / norm, sy / norm, sz / norm
-    return int(votes)
+    return int(inliers)
 
 
 @kernel
-def _dominant(w: F4, lens: Lens, facets: F4, found: F8, least: float, corner_cos: float) -> F8:
+def _dominant(
+    inv_depth: F4,
+    intrinsics: PinholeIntrinsics,
+    oriented_points: F4,
+    found: F8,
+    least: float,
+    corner_cos: float,
+) -> F8:
     """Return the exact normal of the largest plane that faces the best direction, (3,).
 
     Parameters
@@ -157,7 +173,7 @@ def _dominant(w: F4, lens: Lens, facets: F4, found: F8, least: float, corner_cos
     """
     best, most = found[0], -1.0
     for k in range(len(found)):
-        merit = _merit(facets, found[k], least)
+        merit = _merit(oriented_points, found[k], least)
         if merit > most:
             best, most = found[k], merit
     for k in range(len(found)):
@@ -168,17 +184,17 @@ def _dominant(w: F4, lens: Lens, facets: F4, found: F8, least: float, corner_cos
             corner = cross(found[k], found[m])
             corner /= math.sqrt(cosine(corner, corner))
             for direction in (corner, -corner):
-                merit = _merit(facets, direction, least)
+                merit = _merit(oriented_points, direction, least)
                 if merit > most:
                     best, most = direction, merit
-    up: F8 = _settled(w, lens, facets, best)
+    up: F8 = _settled(inv_depth, intrinsics, oriented_points, best)
     return up
 
 
 @kernel
-def _merit(facets: F4, direction: F8, least: float) -> float:
+def _merit(oriented_points: F4, direction: F8, least: float) -> float:
     """Return how well a direction explains the surface: what of it lies in large levels."""
-    count = _count_levels(facets, direction)
+    count = _count_levels(oriented_points, direction)
     level, squares = _large_levels(count, least)
     if level == 0:
         return 0.0
@@ -196,7 +212,7 @@ def _large_levels(count: I4, least: float) -> tuple[int, int]:
 
     A level fills two bins and stands out from the next ones: a slanted surface has many heights.
     """
-    facets = squares = 0
+    oriented_points = squares = 0
     last = count.size - 1
     for k in range(last):
         here = count[k] + count[k + 1]
@@ -205,17 +221,24 @@ def _large_levels(count: I4, least: float) -> tuple[int, int]:
             there = count[m] + count[m + 1]
             stands_out &= here > there if m < k else here >= there
         if stands_out:
-            facets += here
+            oriented_points += here
             squares += here * here
-    return facets, squares
+    return oriented_points, squares
 
 
 @kernel
-def _count_levels(facets: F4, direction: F8) -> I4:
+def _count_levels(oriented_points: F4, direction: F8) -> I4:
     """Count the facets that face a direction by their height below the sensor."""
     x, y, z = direction
     count = np.zeros(HEIGHT_BINS + 1, np.int64)  # the last for what is out of bounds
-    nx, ny, nz, px, py, pz = facets[0], facets[1], facets[2], facets[3], facets[4], facets[5]
+    nx, ny, nz, px, py, pz = (
+        oriented_points[0],
+        oriented_points[1],
+        oriented_points[2],
+        oriented_points[3],
+        oriented_points[4],
+        oriented_points[5],
+    )
     level = np.zeros(nx.size, np.int32)
     for k in range(nx.size):
         faces = nx[k] * x + ny[k] * y + nz[k] * z > FACING_COS
@@ -227,39 +250,53 @@ def _count_levels(facets: F4, direction: F8) -> I4:
 
 
 @kernel
-def _settled(w: F4, lens: Lens, facets: F4, direction: F8) -> F8:
+def _settled(
+    inv_depth: F4, intrinsics: PinholeIntrinsics, oriented_points: F4, direction: F8
+) -> F8:
     """Return the exact normal of the largest plane that faces ``direction``."""
-    fullest = np.argmax(_count_levels(facets, direction))
-    plane = level_plane(lens, direction, -(fullest + 0.5) * LEVEL_BIN_M)
-    readings = readings_of(w, w)
+    fullest = np.argmax(_count_levels(oriented_points, direction))
+    plane = horizontal_plane(intrinsics, direction, -(fullest + 0.5) * LEVEL_BIN_M)
+    samples = sample_grid(inv_depth, inv_depth)
     for tolerance in (4, 3, 2, 1, 1):
-        refit(readings.j, readings.i, readings.w, tolerance * TOLERANCE, plane)
-    normal = normal_of(plane, lens)
+        refine(samples.j, samples.i, samples.inverse_depth, tolerance * INLIER_TOLERANCE, plane)
+    normal = plane_normal(plane, intrinsics)
     return normal if cosine(normal, direction) > SAME_COS else direction.copy()
 
 
 @kernel
-def _facets(w: F4, lens: Lens) -> F4:
+def _orient_points(inv_depth: F4, intrinsics: PinholeIntrinsics) -> F4:
     """Return the normals and the positions (6, n) of every fourth cell on a smooth surface."""
-    rows, columns = w.shape
-    facets = np.zeros((6, (rows // 4 + 1) * (columns // 4 + 1)), np.float32)
+    rows, columns = inv_depth.shape
+    oriented_points = np.zeros((6, (rows // 4 + 1) * (columns // 4 + 1)), np.float32)
     bend, two = np.float32(2 * DISCONTINUITY), np.float32(2)
     n = 0
     for i in range(ARM, rows - ARM, 4):
-        y = (i - lens.cy) / lens.fy
+        y = (i - intrinsics.cy) / intrinsics.fy
         for j in range(ARM, columns - ARM, 4):
-            center = w[i, j]
-            left, right, top, bottom = w[i, j - ARM], w[i, j + ARM], w[i - ARM, j], w[i + ARM, j]
+            center = inv_depth[i, j]
+            left, right, top, bottom = (
+                inv_depth[i, j - ARM],
+                inv_depth[i, j + ARM],
+                inv_depth[i - ARM, j],
+                inv_depth[i + ARM, j],
+            )
             smooth = (center > 0) & (left > 0) & (right > 0) & (top > 0) & (bottom > 0)
             smooth &= abs(left + right - two * center) <= bend
             smooth &= abs(top + bottom - two * center) <= bend
             if not smooth:
                 continue
-            x, z = (j - lens.cx) / lens.fx, 1 / float(center)
-            nx, ny = lens.fx / (2 * ARM) * (left - right), lens.fy / (2 * ARM) * (top - bottom)
+            x, z = (j - intrinsics.cx) / intrinsics.fx, 1 / float(center)
+            nx, ny = (
+                intrinsics.fx / (2 * ARM) * (left - right),
+                intrinsics.fy / (2 * ARM) * (top - bottom),
+            )
             nz = -nx * x - ny * y - center
             scale = 1 / math.sqrt(nx * nx + ny * ny + nz * nz)
-            facets[0, n], facets[1, n], facets[2, n] = scale * nx, scale * ny, scale * nz
-            facets[3, n], facets[4, n], facets[5, n] = x * z, y * z, z
+            oriented_points[0, n], oriented_points[1, n], oriented_points[2, n] = (
+                scale * nx,
+                scale * ny,
+                scale * nz,
+            )
+            oriented_points[3, n], oriented_points[4, n], oriented_points[5, n] = x * z, y * z, z
             n += 1
-    return facets[:, :n].copy()
+    return oriented_points[:, :n].copy()

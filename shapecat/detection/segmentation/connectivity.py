@@ -1,4 +1,7 @@
-"""Surfaces: a tangent plane for every object cell, the links between cells, and concave edges."""
+"""Connectivity: which object cells are of one surface, and how concave it is at each.
+
+Local convexity as a criterion to part objects: Stein et al. 2014.
+"""
 
 import math
 from typing import NamedTuple
@@ -6,18 +9,18 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, I4, U1
-from shapecat.detection.depth_grid import Cells, Lens
-from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.segmentation.normals import fit_tangents, padded
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.planes.height_map import HeightMap
+from shapecat.detection.segmentation.normals import fit_local_planes, padded
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel, unset
 
-__all__ = ["DOWN", "RIGHT", "Surfaces", "span_of", "surfaces_of"]
+__all__ = ["DOWN", "RIGHT", "SurfaceGraph", "connect_surfaces", "span_of"]
 
 RIGHT, DOWN = 1, 2
-"""Bits of `Surfaces.links`."""
+"""Bits of `SurfaceGraph.links`."""
 BENT = 4
-"""The same bits times this mark, for a time, the links that only a tangent plane tells."""
+"""The same bits times this mark, for a time, the links that only a local plane tells."""
 BASE, BASE_DIAGONAL = 3, 2
 """Cells between an edge and the surfaces on its two sides."""
 REACH, SURE = 2, 0.5
@@ -27,43 +30,43 @@ LEAST_CHORD = 3e-4
 """Squared distance of two normals from which their angle is a degree."""
 
 
-class Surfaces(NamedTuple):
+class SurfaceGraph(NamedTuple):
     """What every object cell knows of its surface.
 
     Attributes
     ----------
-    tangent : (rows, 3, columns) float32: inverse depth of the fitted plane at the cell, and its
+    local_plane : (rows, 3, columns) float32: inverse depth of the fitted plane at the cell, and its
         change per column and per row; 0 where there is no fit. Far from object cells nothing is
         written.
     normal : (rows, 3, columns) float32 unit normal towards the camera, sensor frame, or 0.
     links : (rows, columns) uint8: `RIGHT` and `DOWN` where the surface goes on to that neighbour.
-    edge : (rows, columns) uint8: the largest concave angle across the cell, degrees.
+    concavity : (rows, columns) uint8: the largest concave angle across the cell, degrees.
     spans : (rows, 2) int32: columns of the first object cell of each row and after the last; 0, 0
         where a row has none.
     """
 
-    tangent: F4
+    local_plane: F4
     normal: F4
     links: U1
-    edge: U1
+    concavity: U1
     spans: I4
 
 
 @kernel
-def surfaces_of(cells: Cells, heights: Heights) -> Surfaces:
-    """Fit tangent planes to the object cells, link them and measure concave angles."""
-    w, lens, owner = cells.w, cells.lens, heights.owner
-    rows, columns = w.shape
+def connect_surfaces(grid: DepthGrid, heights: HeightMap) -> SurfaceGraph:
+    """Fit local planes to the object cells, link them and measure concave angles."""
+    inv_depth, intrinsics, plane_id = grid.inverse_depth, grid.intrinsics, heights.plane_id
+    rows, columns = inv_depth.shape
     spans = np.zeros((rows, 2), np.int32)
     for i in range(rows):
-        spans[i, 0], spans[i, 1] = span_of(owner[i])
-    tangent, normal = _cleared(spans, columns), _cleared(spans, columns)
-    fit_tangents(w, lens, owner, spans, tangent, normal)
-    links = np.zeros(w.shape, np.uint8)
-    _link(w, owner, spans, tangent, links)
-    surfaces = Surfaces(tangent, normal, links, np.zeros(w.shape, np.uint8), spans)
-    _bend(w, lens, surfaces)
-    return surfaces
+        spans[i, 0], spans[i, 1] = span_of(plane_id[i])
+    local_plane, normal = _cleared(spans, columns), _cleared(spans, columns)
+    fit_local_planes(inv_depth, intrinsics, plane_id, spans, local_plane, normal)
+    links = np.zeros(inv_depth.shape, np.uint8)
+    _link(inv_depth, plane_id, spans, local_plane, links)
+    graph = SurfaceGraph(local_plane, normal, links, np.zeros(inv_depth.shape, np.uint8), spans)
+    _measure_concavity(inv_depth, intrinsics, graph)
+    return graph
 
 
 @kernel(leaf=True)
@@ -101,49 +104,64 @@ def _cleared(spans: I4, columns: int) -> F4:
 
 
 @kernel(leaf=True)
-def _link(w: F4, owner: I4, spans: I4, tangent: F4, links: U1) -> None:
-    """Link neighbours that differ by less than a jump, or as either tangent plane tells."""
-    rows = w.shape[0]
+def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) -> None:
+    """Link neighbours that differ by less than a jump, or as either local plane tells."""
+    rows = inv_depth.shape[0]
     for i in range(rows):
         start, end = spans[i]
         if start == end:
             continue
         here, there = slice(start, end - 1), slice(start + 1, end)
         _link_some(
-            owner[i, here], owner[i, there], w[i, here], w[i, there], tangent[i, 0, here],
-            tangent[i, 0, there], tangent[i, 1, here], tangent[i, 1, there], RIGHT, links[i, here],
-        )  # fmt: skip
+            plane_id[i, here],
+            plane_id[i, there],
+            inv_depth[i, here],
+            inv_depth[i, there],
+            local_plane[i, 0, here],
+            local_plane[i, 0, there],
+            local_plane[i, 1, here],
+            local_plane[i, 1, there],
+            RIGHT,
+            links[i, here],
+        )
         if i + 1 < rows:
             here = slice(start, end)
             _link_some(
-                owner[i, here], owner[i + 1, here], w[i, here], w[i + 1, here], tangent[i, 0, here],
-                tangent[i + 1, 0, here], tangent[i, 2, here], tangent[i + 1, 2, here], DOWN,
+                plane_id[i, here],
+                plane_id[i + 1, here],
+                inv_depth[i, here],
+                inv_depth[i + 1, here],
+                local_plane[i, 0, here],
+                local_plane[i + 1, 0, here],
+                local_plane[i, 2, here],
+                local_plane[i + 1, 2, here],
+                DOWN,
                 links[i, here],
-            )  # fmt: skip
-        _part_steps(w, owner, i, start, end, links[i])
+            )
+        _part_steps(inv_depth, plane_id, i, start, end, links[i])
 
 
 @kernel(leaf=True)
-def _part_steps(w: F4, owner: I4, i: int, start: int, end: int, links: U1) -> None:
-    """Take the links away that only a tangent plane tells, across a step."""
+def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links: U1) -> None:
+    """Take the links away that only a local plane tells, across a step."""
     some = False
     for j in range(links.size):
         some |= links[j] > (RIGHT | DOWN)  # few rows have any; this vectorises
     if not some:
         return
     for j in range(start, end):
-        if links[j] & BENT * RIGHT and _is_step(w, owner, i, j, 0, 1):
+        if links[j] & BENT * RIGHT and _is_step(inv_depth, plane_id, i, j, 0, 1):
             links[j] &= ~RIGHT
-        if links[j] & BENT * DOWN and _is_step(w, owner, i, j, 1, 0):
+        if links[j] & BENT * DOWN and _is_step(inv_depth, plane_id, i, j, 1, 0):
             links[j] &= ~DOWN
         links[j] &= RIGHT | DOWN
 
 
 @kernel(fast=True, leaf=True)
 def _link_some(
-    owner: I4,
+    plane_id: I4,
     owner1: I4,
-    w: F4,
+    inv_depth: F4,
     w1: F4,
     level: F4,
     level1: F4,
@@ -155,44 +173,48 @@ def _link_some(
     """Link some cells of a row with their neighbours on one side."""
     zero, jump = np.float32(0), np.float32(DISCONTINUITY)
     for k in range(links.size):
-        v, v1, t, t1 = w[k], w1[k], level[k], level1[k]
+        v, v1, t, t1 = inv_depth[k], w1[k], level[k], level1[k]
         level_on = abs(v - v1) < jump
         bent = (t > zero) & (abs(t + slope[k] - v1) < jump)
         bent |= (t1 > zero) & (abs(t1 - slope1[k] - v) < jump)
-        same = (owner[k] > 0) & (owner[k] == owner1[k])
+        same = (plane_id[k] > 0) & (plane_id[k] == owner1[k])
         link = np.uint8(bit) if level_on else np.uint8(bit + BENT * bit) if bent else np.uint8(0)
         links[k] |= link if same else np.uint8(0)
 
 
 @kernel(leaf=True)
-def _is_step(w: F4, owner: I4, i: int, j: int, di: int, dj: int) -> bool:
+def _is_step(inv_depth: F4, plane_id: I4, i: int, j: int, di: int, dj: int) -> bool:
     """Whether the readings change more from a cell to the next than they do before and after.
 
-    The window of a tangent plane reaches over a step and takes it for a slope, so that a plate
+    The window of a local plane reaches over a step and takes it for a slope, so that a plate
     would be linked with the can it stands on. At the edge of a surface that is seen at a grazing
     angle only one side has the slope.
     """
     i0, j0, i1, j1 = i - REACH * di, j - REACH * dj, i + di, j + dj
     i2, j2 = i1 + REACH * di, j1 + REACH * dj
-    if i0 < 0 or j0 < 0 or i2 >= w.shape[0] or j2 >= w.shape[1]:
+    if i0 < 0 or j0 < 0 or i2 >= inv_depth.shape[0] or j2 >= inv_depth.shape[1]:
         return False
-    if owner[i0, j0] != owner[i, j] or owner[i2, j2] != owner[i, j]:
+    if plane_id[i0, j0] != plane_id[i, j] or plane_id[i2, j2] != plane_id[i, j]:
         return False
-    step = w[i1, j1] - w[i, j]
-    before = abs(step - (w[i, j] - w[i0, j0]) / REACH)
-    after = abs(step - (w[i2, j2] - w[i1, j1]) / REACH)
+    step = inv_depth[i1, j1] - inv_depth[i, j]
+    before = abs(step - (inv_depth[i, j] - inv_depth[i0, j0]) / REACH)
+    after = abs(step - (inv_depth[i2, j2] - inv_depth[i1, j1]) / REACH)
     return bool(min(before, after) >= SURE * DISCONTINUITY and max(before, after) >= DISCONTINUITY)
 
 
 @kernel
-def _bend(w: F4, lens: Lens, surfaces: Surfaces) -> None:
+def _measure_concavity(inv_depth: F4, intrinsics: PinholeIntrinsics, graph: SurfaceGraph) -> None:
     """Measure the largest concave angle between the surfaces on two sides of each cell."""
-    rows, columns = w.shape
-    tangent, normal, edge = surfaces.tangent, surfaces.normal, surfaces.edge
-    room = np.zeros((3, columns), np.float32)
-    gaps, chords, worst = room[0], room[1], room[2]  # unpacked they would not be contiguous
+    rows, columns = inv_depth.shape
+    local_plane, normal, concavity = graph.local_plane, graph.normal, graph.concavity
+    scratch = np.zeros((3, columns), np.float32)
+    gaps, chords, worst = (
+        scratch[0],
+        scratch[1],
+        scratch[2],
+    )  # unpacked they would not be contiguous
     for i in range(rows):
-        start, end = surfaces.spans[i]
+        start, end = graph.spans[i]
         if start == end:
             continue
         worst[start:end] = LEAST_CHORD
@@ -203,15 +225,28 @@ def _bend(w: F4, lens: Lens, surfaces: Surfaces) -> None:
             first, last = max(start, abs(dj)), min(end, columns - abs(dj))
             last = min(padded(first, last), columns - abs(dj))
             if i - di >= 0 and i + di < rows and first < last:
-                _compare(w, lens, tangent, normal, i, first, last, di, dj, gaps, chords, worst)
-        _write_angles(tangent[i, 0, start:end], worst[start:end], edge[i, start:end])
+                _raise_concavity(
+                    inv_depth,
+                    intrinsics,
+                    local_plane,
+                    normal,
+                    i,
+                    first,
+                    last,
+                    di,
+                    dj,
+                    gaps,
+                    chords,
+                    worst,
+                )
+        _write_angles(local_plane[i, 0, start:end], worst[start:end], concavity[i, start:end])
 
 
 @kernel(fast=True, leaf=True)
-def _compare(
-    w: F4,
-    lens: Lens,
-    tangent: F4,
+def _raise_concavity(
+    inv_depth: F4,
+    intrinsics: PinholeIntrinsics,
+    local_plane: F4,
     normal: F4,
     i: int,
     first: int,
@@ -227,17 +262,28 @@ def _compare(
     Three loops, for the compiler vectorises only those over few arrays.
     """
     zero, one, gate = np.float32(0), np.float32(1), np.float32(2 * DISCONTINUITY)
-    per_x, per_y = np.float32(1 / lens.fx), np.float32(1 / lens.fy)
-    y1, y2 = np.float32(i - di - lens.cy) * per_y, np.float32(i + di - lens.cy) * per_y
-    x1, x2 = np.float32(first - dj - lens.cx) * per_x, np.float32(first + dj - lens.cx) * per_x
+    per_x, per_y = np.float32(1 / intrinsics.fx), np.float32(1 / intrinsics.fy)
+    y1, y2 = np.float32(i - di - intrinsics.cy) * per_y, np.float32(i + di - intrinsics.cy) * per_y
+    x1, x2 = (
+        np.float32(first - dj - intrinsics.cx) * per_x,
+        np.float32(first + dj - intrinsics.cx) * per_x,
+    )
     x, y = np.float32(dj), np.float32(di)
     a, b, left, right = i - di, i + di, first - dj, last - dj
-    here, worst = w[i, first:last], worst[first:last]
+    here, worst = inv_depth[i, first:last], worst[first:last]
     # (1) how far both planes are from the cell
-    v1, gx1, gy1 = tangent[a, 0, left:right], tangent[a, 1, left:right], tangent[a, 2, left:right]
+    v1, gx1, gy1 = (
+        local_plane[a, 0, left:right],
+        local_plane[a, 1, left:right],
+        local_plane[a, 2, left:right],
+    )
     nx1, ny1, nz1 = normal[a, 0, left:right], normal[a, 1, left:right], normal[a, 2, left:right]
     left, right = first + dj, last + dj
-    v2, gx2, gy2 = tangent[b, 0, left:right], tangent[b, 1, left:right], tangent[b, 2, left:right]
+    v2, gx2, gy2 = (
+        local_plane[b, 0, left:right],
+        local_plane[b, 1, left:right],
+        local_plane[b, 2, left:right],
+    )
     nx2, ny2, nz2 = normal[b, 0, left:right], normal[b, 1, left:right], normal[b, 2, left:right]
     for k in range(here.size):
         gap1 = abs(v1[k] + gx1[k] * x + gy1[k] * y - here[k])
@@ -259,12 +305,12 @@ def _compare(
 
 
 @kernel(fast=True, leaf=True)
-def _write_angles(level: F4, worst: F4, edge: U1) -> None:
-    """Write the angles, in degrees, of the chords of cells with a tangent plane."""
+def _write_angles(level: F4, worst: F4, concavity: U1) -> None:
+    """Write the angles, in degrees, of the chords of cells with a local plane."""
     degrees, most = np.float32(180 / math.pi), np.float32(120)
-    for k in range(edge.size):
+    for k in range(concavity.size):
         half = np.sqrt(worst[k]) * np.float32(0.5)
         # arcsin by its series: 1 degree off at a right angle
         angle = 2 * degrees * (half + half * half * half * np.float32(0.18))
         angle = angle if angle < most else most
-        edge[k] = np.uint8(angle) if level[k] > np.float32(0) else np.uint8(0)
+        concavity[k] = np.uint8(angle) if level[k] > np.float32(0) else np.uint8(0)

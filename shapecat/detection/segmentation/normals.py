@@ -1,4 +1,4 @@
-"""Tangents: least-squares planes around the object cells, many cells at a time.
+"""Normals: least-squares planes around the object cells, many cells at a time.
 
 Numba's compiler handles 16 cells at once only where it knows that arrays do not overlap, which
 takes few arrays with constant distances. So the windows of a run of cells are copied to a buffer of
@@ -10,13 +10,13 @@ from typing import Any
 import numpy as np
 
 from shapecat.arrays import F4, I4
-from shapecat.detection.depth_grid import Lens
+from shapecat.detection.depth_grid import PinholeIntrinsics
 from shapecat.jit import kernel
 
-__all__ = ["fit_tangents", "padded"]
+__all__ = ["fit_local_planes", "padded"]
 
 WINDOW = 3
-"""Half the edge of the window a tangent plane is fitted to, in cells."""
+"""Half the edge of the window a local plane is fitted to, in cells."""
 SIDE = 2 * WINDOW + 1
 GATE, GATE_SLOPE = 0.008, 0.008
 """A sample of the fit lies within this of the centre, plus the slope times its distance."""
@@ -32,21 +32,28 @@ PITCH = RUN + 2 * WINDOW
 
 
 @kernel
-def fit_tangents(w: F4, lens: Lens, owner: I4, spans: I4, tangent: F4, normal: F4) -> None:
-    """Write the tangent planes and normals of the object cells, as in `Surfaces`.
+def fit_local_planes(
+    inv_depth: F4,
+    intrinsics: PinholeIntrinsics,
+    plane_id: I4,
+    spans: I4,
+    local_plane: F4,
+    normal: F4,
+) -> None:
+    """Write the local planes and normals of the object cells, as in `SurfaceGraph`.
 
     A plane is fitted to a checkerboard of 25 cells of the same owner; weights are 0 or 1. The
     object cells of each row lie within ``spans``.
     """
     values = np.zeros(SIDE * PITCH, np.float32)
     fits = np.zeros(6 * PITCH, np.float32)
-    for i in range(owner.shape[0]):
+    for i in range(plane_id.shape[0]):
         end, last = spans[i]
         while end < last:
-            start, end = _next_run(owner[i], end, last)
-            _copy_windows(w, owner, i, start, end, values)
-            _fit_run(values, lens, i, start, padded(start, end) - start, fits)
-            _write(fits, tangent, normal, i, start, end)
+            start, end = _next_run(plane_id[i], end, last)
+            _copy_windows(inv_depth, plane_id, i, start, end, values)
+            _fit_run(values, intrinsics, i, start, padded(start, end) - start, fits)
+            _write(fits, local_plane, normal, i, start, end)
 
 
 @kernel(inline=True, leaf=True)
@@ -56,34 +63,34 @@ def padded(start: int, end: int) -> int:
 
 
 @kernel(leaf=True)
-def _write(fits: F4, tangent: F4, normal: F4, i: int, start: int, end: int) -> None:
+def _write(fits: F4, local_plane: F4, normal: F4, i: int, start: int, end: int) -> None:
     for d in range(3):
-        one, other = tangent[i, d, start:end], normal[i, d, start:end]
+        one, other = local_plane[i, d, start:end], normal[i, d, start:end]
         for k in range(one.size):
             one[k], other[k] = fits[d * PITCH + k], fits[(3 + d) * PITCH + k]
 
 
 @kernel(leaf=True)
-def _next_run(owner: I4, j: int, last: int) -> tuple[int, int]:
+def _next_run(plane_id: I4, j: int, last: int) -> tuple[int, int]:
     """Return the columns from and before which the next object cells of one owner in a row lie.
 
     There are some before ``last``.
     """
-    while owner[j] <= 0:
+    while plane_id[j] <= 0:
         j += 1
     start = end = j
-    me, last = owner[j], min(last, start + RUN)
-    while j < min(last, end + BRIDGED) and (owner[j] <= 0 or owner[j] == me):
-        end = j + 1 if owner[j] == me else end
+    me, last = plane_id[j], min(last, start + RUN)
+    while j < min(last, end + BRIDGED) and (plane_id[j] <= 0 or plane_id[j] == me):
+        end = j + 1 if plane_id[j] == me else end
         j += 1
     return start, end
 
 
 @kernel(leaf=True)
-def _copy_windows(w: F4, owner: I4, i: int, start: int, end: int, values: F4) -> None:
+def _copy_windows(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, values: F4) -> None:
     """Copy the rows around a run and `WINDOW` cells more at its ends; `NONE` for other owners."""
-    rows, columns = owner.shape
-    me, none = owner[i, start], np.float32(NONE)
+    rows, columns = plane_id.shape
+    me, none = plane_id[i, start], np.float32(NONE)
     left, right = max(start - WINDOW, 0), min(end + WINDOW, columns)
     for d in range(SIDE):
         y, first = i + d - WINDOW, d * PITCH
@@ -91,20 +98,22 @@ def _copy_windows(w: F4, owner: I4, i: int, start: int, end: int, values: F4) ->
         some[:] = none
         if 0 <= y < rows:
             some = some[left - start + WINDOW :]
-            value, whose = w[y, left:right], owner[y, left:right]
+            value, whose = inv_depth[y, left:right], plane_id[y, left:right]
             for k in range(value.size):
                 some[k] = value[k] if whose[k] == me else none
 
 
 @kernel(fast=True, leaf=True)
-def _fit_run(values: F4, lens: Lens, i: int, start: int, n: int, fits: F4) -> None:
+def _fit_run(
+    values: F4, intrinsics: PinholeIntrinsics, i: int, start: int, n: int, fits: F4
+) -> None:
     """Fit planes to the windows of ``n`` cells from (i, ``start``) on.
 
     Rows of ``fits``: inverse depth, its two slopes, and the normal; 0 where there is no fit.
     """
     zero, one = np.float32(0), np.float32(1)
     least, spread = np.float32(LEAST_SAMPLES), np.float32(LEAST_SPREAD)
-    fx, fy, y = np.float32(lens.fx), np.float32(lens.fy), np.float32(i - lens.cy)
+    fx, fy, y = np.float32(intrinsics.fx), np.float32(intrinsics.fy), np.float32(i - intrinsics.cy)
     for k in range(n):
         p = k + WINDOW
         center = values[WINDOW * PITCH + p]
@@ -134,7 +143,7 @@ def _fit_run(values: F4, lens: Lens, i: int, start: int, n: int, fits: F4) -> No
         gx, gy = (xv * yy - yv * xy) * scale, (yv * xx - xv * xy) * scale
         level = center + mv - gx * mx - gy * my
         nx, ny = -fx * gx, -fy * gy
-        nz = gx * np.float32(start + k - lens.cx) + gy * y - level
+        nz = gx * np.float32(start + k - intrinsics.cx) + gy * y - level
         sound &= level > zero
         length = np.sqrt(nx * nx + ny * ny + nz * nz)
         unit = one / (length if length > zero else one)

@@ -1,13 +1,13 @@
-"""Regions: pieces of surface bounded by jumps and concave edges."""
+"""Watershed: segments of surface bounded by depth discontinuities and concave edges."""
 
 import numpy as np
 
 from shapecat.arrays import F4, I4, U1
-from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.segmentation.connectivity import DOWN, RIGHT, Surfaces
+from shapecat.detection.planes.height_map import HeightMap
+from shapecat.detection.segmentation.connectivity import DOWN, RIGHT, SurfaceGraph
 from shapecat.jit import kernel, unset
 
-__all__ = ["cut_above", "regions_of", "rename"]
+__all__ = ["relabel", "relabel_above", "watershed"]
 
 EDGE_DEG = 27
 """Concave angle that may part two objects; a bowl of 7 cm turns 16 degrees over the same cells."""
@@ -22,31 +22,31 @@ BUCKET_DEG = 4
 
 
 @kernel
-def regions_of(heights: Heights, surfaces: Surfaces, concave: bool) -> tuple[I4, int]:  # noqa: FBT001  compiled kernels take their arguments by position
+def watershed(heights: HeightMap, graph: SurfaceGraph, concave: bool) -> tuple[I4, int]:  # noqa: FBT001  compiled kernels take their arguments by position
     """Label the object cells: (rows, columns) int16 labels 1..n, 0 elsewhere, and n.
 
     Flat cells that are linked make a seed; a flood from the seeds, flattest cells first, gives
     the cells of an edge to its sides (Meyer 1991). With ``concave`` off only jumps part regions.
     """
-    owner, links, edge, spans = heights.owner, surfaces.links, surfaces.edge, surfaces.spans
-    labels = np.zeros(owner.shape, np.int16)
-    barrier = np.zeros(owner.shape, np.uint8)
-    stack, part = unset(owner.size, np.int32), unset(owner.shape, np.int32)
-    _creases(edge, spans, EDGE_DEG if concave else NO_EDGE_DEG, barrier, stack)
-    n = _flat_parts(owner, spans, links, barrier, labels, np.int64(0), part)
-    _flood(links, edge, spans, labels, stack)
+    plane_id, links, concavity, spans = heights.plane_id, graph.links, graph.concavity, graph.spans
+    labels = np.zeros(plane_id.shape, np.int16)
+    barrier = np.zeros(plane_id.shape, np.uint8)
+    stack, part = unset(plane_id.size, np.int32), unset(plane_id.shape, np.int32)
+    _concave_edges(concavity, spans, EDGE_DEG if concave else NO_EDGE_DEG, barrier, stack)
+    n = _flat_parts(plane_id, spans, links, barrier, labels, np.int64(0), part)
+    _flood_labels(links, concavity, spans, labels, stack)
     barrier[:] = 0
-    return labels, _flat_parts(owner, spans, links, barrier, labels, n, part)
+    return labels, _flat_parts(plane_id, spans, links, barrier, labels, n, part)
 
 
 @kernel(leaf=True)
-def _creases(edge: U1, spans: I4, strong: int, barrier: U1, stack: I4) -> None:
+def _concave_edges(concavity: U1, spans: I4, strong: int, barrier: U1, stack: I4) -> None:
     """Mark strong concave edges, and weaker ones that continue them (hysteresis, Canny 1986)."""
-    rows, columns = edge.shape
+    rows, columns = concavity.shape
     top = 0
     for i in range(rows):
         for j in range(spans[i, 0], spans[i, 1]):
-            if edge[i, j] >= strong:
+            if concavity[i, j] >= strong:
                 barrier[i, j] = 1
                 stack[top] = i * columns + j
                 top += 1
@@ -55,17 +55,21 @@ def _creases(edge: U1, spans: I4, strong: int, barrier: U1, stack: I4) -> None:
         i, j = stack[top] // columns, stack[top] % columns
         for y in range(max(i - 1, 0), min(i + 2, rows)):
             for x in range(max(j - 1, 0), min(j + 2, columns)):
-                if barrier[y, x] == 0 and edge[y, x] >= WEAK_DEG and _is_ridge(edge, y, x):
+                if (
+                    barrier[y, x] == 0
+                    and concavity[y, x] >= WEAK_DEG
+                    and _is_ridge(concavity, y, x)
+                ):
                     barrier[y, x] = 1
                     stack[top] = y * columns + x
                     top += 1
 
 
 @kernel(leaf=True)
-def _is_ridge(edge: U1, i: int, j: int) -> bool:
+def _is_ridge(concavity: U1, i: int, j: int) -> bool:
     """Whether an edge falls off on two opposite sides; inside a bowl it does not."""
-    rows, columns = edge.shape
-    least = RIDGE * edge[i, j]
+    rows, columns = concavity.shape
+    least = RIDGE * concavity[i, j]
     for d in range(4):
         di = 0 if d == 0 else RIDGE_CELLS
         dj = RIDGE_CELLS if d == 0 else (0 if d == 1 else (RIDGE_CELLS if d == 2 else -RIDGE_CELLS))
@@ -76,29 +80,31 @@ def _is_ridge(edge: U1, i: int, j: int) -> bool:
             or max(j - dj, j + dj) >= columns
         ):
             continue
-        if edge[i - di, j - dj] < least and edge[i + di, j + dj] < least:
+        if concavity[i - di, j - dj] < least and concavity[i + di, j + dj] < least:
             return True
     return False
 
 
 @kernel
-def _flat_parts(owner: I4, spans: I4, links: U1, barrier: U1, labels: I4, n: int, part: I4) -> int:
+def _flat_parts(
+    plane_id: I4, spans: I4, links: U1, barrier: U1, labels: I4, n: int, part: I4
+) -> int:
     """Label linked unlabelled cells that are no barrier, from ``n`` + 1 on; return the last label.
 
     Two passes with a table of equivalent labels (Rosenfeld and Pfaltz 1966). Small parts get none.
     ``part`` (rows, columns) is room: links do not lead out of the spans, all of which is written.
     """
-    rows = owner.shape[0]
-    room = rows + 2  # a row has at most one first label in two cells
+    rows = plane_id.shape[0]
+    scratch = rows + 2  # a row has at most one first label in two cells
     for i in range(rows):
-        room += (spans[i, 1] - spans[i, 0]) // 2
-    parent, size = np.zeros(room, np.int32), np.zeros(room, np.int32)
+        scratch += (spans[i, 1] - spans[i, 0]) // 2
+    parent, size = np.zeros(scratch, np.int32), np.zeros(scratch, np.int32)
     count = 0
     # (1) first labels, and which of them meet
     for i in range(rows):
         for j in range(spans[i, 0], spans[i, 1]):
             part[i, j] = 0
-            if owner[i, j] <= 0 or labels[i, j] > 0 or barrier[i, j]:
+            if plane_id[i, j] <= 0 or labels[i, j] > 0 or barrier[i, j]:
                 continue
             me = part[i, j - 1] if j > 0 and links[i, j - 1] & RIGHT else 0
             above = part[i - 1, j] if i > 0 and links[i - 1, j] & DOWN else 0
@@ -152,13 +158,13 @@ def _neighbour(p: int, d: int, columns: int, links: U1) -> int:
 
 
 @kernel
-def _flood(links: U1, edge: U1, spans: I4, labels: I4, following: I4) -> None:
+def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4, following: I4) -> None:
     """Grow the labels over links, cells with small concave angles first.
 
     ``following`` (cells,) is room for the next cell of the same queue.
     """
     columns = labels.shape[1]
-    flat_links, flat_edge, flat = links.reshape(-1), edge.reshape(-1), labels.reshape(-1)
+    flat_links, flat_edge, flat = links.reshape(-1), concavity.reshape(-1), labels.reshape(-1)
     buckets = 256 // BUCKET_DEG
     head = np.full(buckets, -1, np.int32)
     tail = np.full(buckets, -1, np.int32)
@@ -196,7 +202,7 @@ def _flood(links: U1, edge: U1, spans: I4, labels: I4, following: I4) -> None:
 
 
 @kernel(leaf=True)
-def rename(labels: I4, spans: I4, names: I4) -> None:
+def relabel(labels: I4, spans: I4, names: I4) -> None:
     """Give labels (rows, columns) their new names (n,), in place; that of 0 is 0."""
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):
@@ -204,7 +210,7 @@ def rename(labels: I4, spans: I4, names: I4) -> None:
 
 
 @kernel(leaf=True)
-def cut_above(labels: I4, spans: I4, height: F4, label: int, level: float, name: int) -> None:
+def relabel_above(labels: I4, spans: I4, height: F4, label: int, level: float, name: int) -> None:
     """Give the cells of a label that are higher than a level, metres, another name, in place."""
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):

@@ -1,8 +1,8 @@
-"""Steps: stacked objects whose fronts are flush, parted where their outline steps in or out.
+"""Split at width changes: stacked objects whose fronts are flush, where the outline steps.
 
 What stands on a wider object, or on a narrower one, shows it at its sides even where its front
 goes on in one surface with that below. So does a cup at the ends of its handle: that both parts
-are one object is left to the joins.
+are one object is left to the merging.
 """
 
 import math
@@ -11,25 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.depth_grid import Cells
-from shapecat.detection.merging.segments import (
-    BAND_M,
-    BANDS,
-    BOTTOM,
-    COUNT,
-    TOP,
-    Pieces,
-    is_cut,
-    note_cut,
-    side_of,
-)
-from shapecat.detection.planes.height_map import Heights
-from shapecat.detection.segmentation.connectivity import Surfaces
-from shapecat.detection.segmentation.watershed import cut_above
+from shapecat.detection.depth_grid import DepthGrid
+from shapecat.detection.merging.segments import BAND_M, BANDS, lateral_axis
+from shapecat.detection.planes.height_map import HeightMap
+from shapecat.detection.segmentation.connectivity import SurfaceGraph
+from shapecat.detection.segmentation.watershed import relabel_above
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
-__all__ = ["cut_at_steps"]
+__all__ = ["split_at_width_changes"]
 
 STEP_M, STEPS_M = 0.01, 0.02
 """How far one side of the outline steps aside at least, and both together."""
@@ -50,17 +40,22 @@ class Outlines(NamedTuple):
     ends : (2, n, BANDS) float32 lateral position, metres, of the left end, and of the right end
         negated, so that both grow inwards; infinite where there is no cell.
     at : (2, n, BANDS) int32 the cells there.
-    cells : (n, BANDS) int32 the number of cells.
+    counts : (n, BANDS) int32 the number of cells.
     """
 
     ends: F4
     at: I4
-    cells: I4
+    counts: I4
 
 
 @kernel
-def cut_at_steps(
-    cells: Cells, heights: Heights, surfaces: Surfaces, pieces: Pieces, labels: I4, up: F8, n: int
+def split_at_width_changes(
+    grid: DepthGrid,
+    heights: HeightMap,
+    graph: SurfaceGraph,
+    labels: I4,
+    up: F8,
+    n: int,
 ) -> int:
     """Give what is above a step a label of its own, in place; return how many labels there are.
 
@@ -68,49 +63,39 @@ def cut_at_steps(
     ----------
     labels : (rows, columns) 1..n, 0 elsewhere.
     """
-    tall, side = _number_tall(pieces, n + 1), side_of(up)
-    outlines = _outlines_of(cells, heights.height, surfaces.spans, labels, tall, side)
+    side = lateral_axis(up)
+    outlines = _outlines_of(grid, heights.height, graph.spans, labels, n, side)
     for p in range(1, n + 1):
-        if tall[p] == 0:
-            continue
         rest = p
-        for band in np.flatnonzero(_cuts_of(cells, outlines, tall[p], side)):
+        for band in np.flatnonzero(_cuts_of(grid, outlines, p, side)):
             n += 1
-            cut_above(labels, surfaces.spans, heights.height, rest, band * BAND_M, n)
-            note_cut(pieces, p)
+            relabel_above(labels, graph.spans, heights.height, rest, band * BAND_M, n)
             rest = n  # what this cut has left
     return n
 
 
 @kernel
-def _number_tall(pieces: Pieces, labels: int) -> I4:
-    """Return a number from 1 on for each label that may be a stack, 0 for the others."""
-    tall = np.zeros(labels, np.bool_)
-    for p in range(1, labels):
-        tall[p] = is_cut(pieces, p) or (
-            pieces.shape[p, COUNT] >= 2 * LEAST_CELLS
-            and pieces.shape[p, TOP] - pieces.shape[p, BOTTOM] >= 2 * BESIDE * BAND_M
-        )
-    return np.asarray(np.cumsum(tall) * tall)
-
-
-@kernel
-def _outlines_of(cells: Cells, height: F4, spans: I4, labels: I4, tall: I4, side: F8) -> Outlines:
-    """Collect the outlines of what has a number."""
-    w, lens, columns = cells.w, cells.lens, cells.w.shape[1]
+def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, side: F8) -> Outlines:
+    """Collect the outlines of the labels 1..n."""
+    inv_depth, intrinsics, columns = (
+        grid.inverse_depth,
+        grid.intrinsics,
+        grid.inverse_depth.shape[1],
+    )
     one, per_band = np.float32(1), np.float32(1 / BAND_M)
     # The lateral position is linear in column and row, but for the depth.
-    a, b = np.float32(side[0] / lens.fx), np.float32(side[1] / lens.fy)
-    c = np.float32(side[2] - lens.cx * side[0] / lens.fx - lens.cy * side[1] / lens.fy)
-    things = np.max(tall) + 1
-    ends = np.full((2, things, BANDS), np.inf, np.float32)
-    at, count = np.zeros((2, things, BANDS), np.int32), np.zeros((things, BANDS), np.int32)
+    a, b = np.float32(side[0] / intrinsics.fx), np.float32(side[1] / intrinsics.fy)
+    c = np.float32(
+        side[2] - intrinsics.cx * side[0] / intrinsics.fx - intrinsics.cy * side[1] / intrinsics.fy
+    )
+    ends = np.full((2, n + 1, BANDS), np.inf, np.float32)
+    at, count = np.zeros((2, n + 1, BANDS), np.int32), np.zeros((n + 1, BANDS), np.int32)
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):
-            p = tall[labels[i, j]]
+            p = labels[i, j]
             if p == 0:
                 continue
-            u = (np.float32(j) * a + np.float32(i) * b + c) * (one / w[i, j])
+            u = (np.float32(j) * a + np.float32(i) * b + c) * (one / inv_depth[i, j])
             band = min(max(int(height[i, j] * per_band), 0), BANDS - 1)
             count[p, band] += 1
             if u < ends[0, p, band]:
@@ -121,15 +106,15 @@ def _outlines_of(cells: Cells, height: F4, spans: I4, labels: I4, tall: I4, side
 
 
 @kernel
-def _cuts_of(cells: Cells, outlines: Outlines, p: int, side: F8) -> Bool:
+def _cuts_of(grid: DepthGrid, outlines: Outlines, p: int, side: F8) -> Bool:
     """Return whether a label is to be cut below each of its bands."""
     cut, steps = np.zeros(BANDS, np.bool_), np.zeros(BANDS)
-    count = outlines.cells[p]
+    count = outlines.counts[p]
     seen = np.flatnonzero(count)
     if seen.size < 2 * BESIDE:
         return cut
     for band in range(seen[0] + BESIDE, seen[-1] - BESIDE + 2):
-        steps[band] = _step_at(cells, outlines, p, band, side)
+        steps[band] = _step_at(grid, outlines, p, band, side)
     last = 0
     for band in range(BESIDE, BANDS - BESIDE):
         here = steps[band]
@@ -142,7 +127,7 @@ def _cuts_of(cells: Cells, outlines: Outlines, p: int, side: F8) -> Bool:
 
 
 @kernel(leaf=True)
-def _step_at(cells: Cells, outlines: Outlines, p: int, band: int, side: F8) -> float:
+def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -> float:
     """Return by how much both sides step aside below a band, metres; 0 if neither does enough."""
     both = most = 0.0
     for k in range(2):
@@ -159,7 +144,7 @@ def _step_at(cells: Cells, outlines: Outlines, p: int, band: int, side: F8) -> f
             continue
         narrow = band + 1 if way > 0 else band - 3
         sign = -1.0 if k == 0 else 1.0
-        if _is_free(cells, at[narrow], sign, side) and _is_free(cells, at[narrow + 1], sign, side):
+        if _is_free(grid, at[narrow], sign, side) and _is_free(grid, at[narrow + 1], sign, side):
             both, most = both + step, max(most, step)
     return both if most >= STEP_M else 0.0
 
@@ -178,10 +163,10 @@ def _slope_of(end: F4, k: int) -> float:
 
 
 @kernel(leaf=True)
-def _is_free(cells: Cells, at: int, sign: float, side: F8) -> bool:
+def _is_free(grid: DepthGrid, at: int, sign: float, side: F8) -> bool:
     """Whether nothing nearer is beside a cell, left (-1) or right (1)."""
-    w = cells.w
-    rows, columns = w.shape
+    inv_depth = grid.inverse_depth
+    rows, columns = inv_depth.shape
     i, j = at // columns, at % columns
     across = max(math.hypot(side[0], side[1]), 1e-6)
     for step in range(1, SHADOW + 1):
@@ -189,6 +174,6 @@ def _is_free(cells: Cells, at: int, sign: float, side: F8) -> bool:
         x = j + round(sign * step * side[0] / across)
         if y < 0 or x < 0 or y >= rows or x >= columns:
             return False
-        if w[y, x] - w[i, j] > DISCONTINUITY:
+        if inv_depth[y, x] - inv_depth[i, j] > DISCONTINUITY:
             return False
     return True

@@ -1,0 +1,242 @@
+"""Pair features: what tells whether two adjacent segments are of one object, by name.
+
+Richtsfeld et al. 2014 learn from relations between surface patches; here they are those of the
+segments' outlines, extents, curvatures and places.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.detection.merging.segment_features import (
+    TOP_DEPTH_M,
+    depth_difference,
+    lateral_curvature,
+    lateral_distance,
+    normal_position_correlation,
+    top_area_share,
+    top_band,
+    width_of,
+)
+from shapecat.detection.merging.segments import (
+    FEW,
+    SEGMENT,
+    Row,
+    Segments,
+    add_statistics,
+    may_merge,
+)
+from shapecat.jit import kernel
+
+__all__ = ["FEATURES", "PAIR_FEATURES", "ViewGeometry", "are_adjacent", "pair_features"]
+
+_ADJACENCY = np.dtype(
+    [
+        ("contact_m", "f4"),  # length of the border where the surface goes on
+        ("contact", "f4"),  # shares of the border: where the surface goes on,
+        ("first_in_front", "f4"),
+        ("second_in_front", "f4"),
+        ("along_first", "f4"),  # contact by the outline of either
+        ("along_second", "f4"),
+        ("second_faces_up", "f4"),  # shares of the contact beyond which the other faces up
+        ("first_faces_up", "f4"),
+        ("above_second_m", "f4"),  # how far above its top
+        ("above_first_m", "f4"),
+        ("border_m", "f4"),
+    ]
+)
+"""What is where two segments meet."""
+_SEGMENT = np.dtype(
+    [
+        ("width_m", "f4"),
+        ("top_m", "f4"),
+        ("bottom_m", "f4"),
+        ("height_m", "f4"),
+        ("lateral_curvature", "f4"),
+        ("normal_position_correlation", "f4"),
+        ("plane_contact", "f4"),  # shares of the outline
+        ("hidden", "f4"),
+        ("shelf_edge", "f4"),
+        ("upper_silhouette", "f4"),
+        ("touching", "f4"),
+        ("in_front", "f4"),
+        ("behind", "f4"),
+        ("top_area", "f4"),  # by the width squared
+        ("facing_up", "f4"),  # share of the area
+        ("area_m2", "f4"),
+        ("filled", "f4"),  # area by width and height
+    ]
+)
+"""What one segment looks like, and what its outline is made of."""
+_RELATION = np.dtype(
+    [
+        ("area_ratio", "f4"),
+        ("width_ratio", "f4"),
+        ("lateral_distance", "f4"),  # by the larger width
+        ("depth_difference_m", "f4"),
+        ("depth_difference", "f4"),  # by the larger width
+        ("overlap", "f4"),  # of the lateral ranges, by the smaller width
+        ("top_over_top_m", "f4"),
+        ("bottom_over_top_m", "f4"),
+        ("other_bottom_over_top_m", "f4"),
+        ("bottom_over_bottom_m", "f4"),
+        ("most_beyond_m", "f4"),  # how far the first reaches over the sides of the second
+        ("least_beyond_m", "f4"),
+        ("lateral_curvature", "f4"),  # of both together
+        ("normal_position_correlation", "f4"),
+        ("cells", "f4"),  # of the first
+        ("cell_m", "f4"),
+        ("down", "f4"),  # as in `ViewGeometry`
+    ]
+)
+"""How two segments lie to each other, and how well they are seen."""
+PAIR_FEATURES = np.dtype(
+    [
+        ("adjacency", _ADJACENCY),
+        ("first", _SEGMENT),
+        ("second", _SEGMENT),
+        ("relation", _RELATION),
+    ]
+)
+"""The features of two segments, the smaller one first, all float32: lengths in metres, or shares.
+
+The trees number them in this order.
+"""
+FEATURES = PAIR_FEATURES.itemsize // np.dtype("f4").itemsize
+"""Their number."""
+FACING_M, FACING = 0.015, 0.5
+"""What faces each other: difference of the tops, metres; least share of the narrower one's width
+that has the other one before or behind it."""
+NOWHERE_M = -1.0
+"""Height of what faces up across a border where nothing does, metres."""
+
+
+class ViewGeometry(NamedTuple):
+    """How things are seen.
+
+    ``focal`` length in cells; ``down`` the cosine between the optical axis and up, its third part.
+    """
+
+    focal: float
+    down: float
+
+
+@kernel(leaf=True)
+def are_adjacent(segments: Segments, p: int, q: int) -> bool:
+    """Whether two segments above one plane touch, one hides the other, or they face each other."""
+    if not may_merge(segments, p, q):
+        return False
+    pairs = segments.pairs
+    met = pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front + pairs[q, p].in_front
+    return bool(met >= FEW or _face(segments.statistics[p], segments.statistics[q]))
+
+
+@kernel(leaf=True)
+def _face(a: Row, b: Row) -> bool:
+    """Whether two segments may be the near and the far wall of a pot: these touch nowhere."""
+    narrow, wide = min(width_of(a), width_of(b)), max(width_of(a), width_of(b))
+    common = min(a.right, b.right) - max(a.left, b.left)
+    level = abs(a.top - b.top) < FACING_M
+    return bool(level and common > FACING * narrow and abs(depth_difference(a, b)) < wide)
+
+
+@kernel
+def pair_features(
+    segments: Segments, p: int, q: int, view_geometry: ViewGeometry, out: Row
+) -> None:
+    """Write the `PAIR_FEATURES` of two segments to a record of them."""
+    first, second = segments.statistics[p].area, segments.statistics[q].area
+    if first > second or (first == second and p > q):
+        p, q = q, p
+    a, b = segments.statistics[p], segments.statistics[q]
+    cell = a.depth_sum / a.count / view_geometry.focal
+    _write_adjacency(segments, p, q, cell, out.adjacency)
+    _write_segment(segments, p, out.first)
+    _write_segment(segments, q, out.second)
+    relation = out.relation
+    _write_relation(a, b, relation)
+    both = np.zeros(1, SEGMENT)[0]
+    both.left, both.right = np.inf, -np.inf
+    add_statistics(both, a)
+    add_statistics(both, b)
+    relation.lateral_curvature = lateral_curvature(both)
+    relation.normal_position_correlation = normal_position_correlation(both)
+    relation.cells, relation.cell_m, relation.down = a.count, cell, view_geometry.down
+
+
+@kernel(leaf=True)
+def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) -> None:
+    pair, back = segments.pairs[p, q], segments.pairs[q, p]
+    met = pair.contact + pair.near + pair.in_front + back.in_front
+    surface = pair.contact + pair.near
+    out.contact_m = pair.contact * cell
+    out.contact = _share(pair.contact, met)
+    out.first_in_front = _share(pair.in_front, met)
+    out.second_in_front = _share(back.in_front, met)
+    out.along_first = _share(surface, segments.statistics[p].boundary)
+    out.along_second = _share(surface, segments.statistics[q].boundary)
+    out.second_faces_up = _share(pair.rests_on, pair.contact)
+    out.first_faces_up = _share(back.rests_on, pair.contact)
+    out.above_second_m = _above_top(segments, p, q)
+    out.above_first_m = _above_top(segments, q, p)
+    out.border_m = met * cell
+
+
+@kernel(leaf=True)
+def _above_top(segments: Segments, p: int, q: int) -> float:
+    """Return how far above the top of ``q`` faces up what ``p`` borders on there."""
+    onto = segments.pairs[p, q].rests_on
+    if onto == 0:
+        return NOWHERE_M
+    return float(segments.pairs[p, q].rests_on_height / onto - segments.statistics[q].top)
+
+
+@kernel(leaf=True)
+def _write_segment(segments: Segments, p: int, out: Row) -> None:
+    row = segments.statistics[p]
+    around = row.boundary
+    front = back = touch = up = 0.0
+    for k in range(segments.parent.size):
+        front += segments.pairs[p, k].in_front
+        back += segments.pairs[k, p].in_front
+        touch += segments.pairs[p, k].contact
+    for band in range(top_band(row) + 1):
+        up += segments.top_area[p, band]
+    wide, tall = width_of(row), row.top - row.bottom
+    out.width_m, out.top_m, out.bottom_m, out.height_m = wide, row.top, row.bottom, tall
+    out.lateral_curvature = lateral_curvature(row)
+    out.normal_position_correlation = normal_position_correlation(row)
+    out.plane_contact = _share(row.plane_contact, around)
+    out.hidden = _share(row.hidden, around)
+    out.shelf_edge = _share(row.shelf_edge, around)
+    out.upper_silhouette = _share(row.upper_silhouette, around)
+    out.touching = _share(touch, around)
+    out.in_front = _share(front, around)
+    out.behind = _share(back, around)
+    out.top_area = top_area_share(segments, p, TOP_DEPTH_M)
+    out.facing_up = _share(up, row.area)
+    out.area_m2 = row.area
+    out.filled = _share(row.area, wide * tall)
+
+
+@kernel(leaf=True)
+def _write_relation(a: Row, b: Row, out: Row) -> None:
+    narrow, wide = width_of(a), width_of(b)
+    most = max(narrow, wide)
+    left, right = b.left - a.left, a.right - b.right
+    common = min(a.right, b.right) - max(a.left, b.left)
+    out.area_ratio, out.width_ratio = _share(a.area, b.area), _share(narrow, wide)
+    out.lateral_distance = _share(lateral_distance(a, b), most)
+    out.depth_difference_m = depth_difference(a, b)
+    out.depth_difference = _share(depth_difference(a, b), most)
+    out.overlap = _share(common, min(narrow, wide))
+    out.top_over_top_m = a.top - b.top
+    out.bottom_over_top_m = a.bottom - b.top
+    out.other_bottom_over_top_m = b.bottom - a.top
+    out.bottom_over_bottom_m = a.bottom - b.bottom
+    out.most_beyond_m, out.least_beyond_m = max(left, right), min(left, right)
+
+
+@kernel(leaf=True)
+def _share(part: float, whole: float) -> float:
+    return float(part / whole) if whole > 0 else 0.0
