@@ -31,29 +31,40 @@ LEAST_DROPS, CLOSED = 20, 0.5
 
 @kernel
 def supporting_planes(
-    grid: DepthGrid, found: list[tuple[SupportingPlane, DepthSamples]]
+    grid: DepthGrid,
+    found: list[tuple[SupportingPlane, DepthSamples]],
+    covered_m2: F8,
+    tallest_m: float,
 ) -> list[SupportingPlane]:
-    """Leave out the tops of objects; ``found`` are planes, lowest first, with their readings.
+    """Leave out the tops of objects.
 
     Under the front edge of a table or shelf there is nothing; a box is closed down to what it
-    stands on. Things lower than 6 cm are never furniture, planes over a quarter of a square metre
-    always.
+    stands on. Things lower than 6 cm are never furniture; planes over a quarter of a square metre
+    always are, and what is higher than an object.
+
+    Parameters
+    ----------
+    found : planes, lowest first, with their readings.
+    covered_m2 : (n,) what of each lies under things, and counts as seen.
+    tallest_m : height of the tallest object.
     """
     kept: list[SupportingPlane] = []
-    for support, samples in found:
+    for k in range(len(found)):
+        support, samples = found[k]
+        area_m2 = support.area_m2 + covered_m2[k]
         drop = math.inf
         for lower in kept:
             drop = support.offset - lower.offset if _overlaps(lower, support) else drop
-        if drop < LEAST_DROP_M or (len(kept) > 0 and support.area_m2 < BOARD_AREA_M2):
+        if drop < LEAST_DROP_M or (len(kept) > 0 and area_m2 < BOARD_AREA_M2):
             continue
-        if drop < math.inf and support.area_m2 < SURE_AREA_M2:
+        if drop <= tallest_m and area_m2 < SURE_AREA_M2:
             seen = np.zeros(2, np.int64)
             plane = np.array([support.a, support.b, support.c])
             _drop(grid.inverse_depth, grid.intrinsics, samples, plane, support.up, drop, seen)
             if seen[0] + seen[1] >= LEAST_DROPS:
                 if seen[0] > CLOSED * (seen[0] + seen[1]):
                     continue
-            elif support.area_m2 < LIKELY_AREA_M2:
+            elif area_m2 < LIKELY_AREA_M2:
                 continue
         kept.append(support)
     return kept
