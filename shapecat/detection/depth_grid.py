@@ -105,14 +105,14 @@ def _sampled(depth: F4, step: int, range_m: float) -> F4:
     return result[:n]
 
 
-@kernel(inline=True, leaf=True)
+@kernel
 def row_and_column(p: int, columns: int) -> tuple[int, int]:
     """Return the row and column of a flat cell; to divide integers takes three times as long."""
     i = int((p + 0.5) * (1.0 / columns))
     return i, p - i * columns
 
 
-@kernel(leaf=True)
+@kernel
 def smallest_object_at(grid: DepthGrid, depth_m: float) -> float:
     """Return the number of cells of `SMALL_M2` at a depth, within reason."""
     return float(min(max(SMALL_M2 * grid.intrinsics.fx**2 / depth_m**2, 20.0), 75.0))
@@ -179,7 +179,7 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, inv_depth: F4)
             out[j] = count[j] / total[j] if count[j] > zero else zero
 
 
-@kernel(leaf=True)
+@kernel
 def _average_two(depth: F4, range_m: float, jump: float, inv_depth: F4) -> None:
     rows, columns = inv_depth.shape
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)

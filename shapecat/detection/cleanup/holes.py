@@ -63,7 +63,7 @@ def fill_contact_boundary(inv_depth: F4, heights: HeightMap, labels: I4) -> None
                 labels[y, x] = labels[i, j]
 
 
-@kernel(leaf=True)
+@kernel
 def _find_beside(plane_id: I4, labels: I4, i: int, beside: Bool) -> bool:
     """Mark the labelled cells of a row that are beside cells of a plane; whether there are any."""
     rows, columns = plane_id.shape
@@ -81,7 +81,7 @@ def _find_beside(plane_id: I4, labels: I4, i: int, beside: Bool) -> bool:
     return some
 
 
-@kernel(leaf=True)
+@kernel
 def _extent_of(labels: I4) -> tuple[int, int, int, int]:
     """Return the first row and column with a label, and those after the last."""
     i0, j0 = labels.shape
@@ -103,7 +103,7 @@ def _extent_of(labels: I4) -> tuple[int, int, int, int]:
     return i0, j0, i1, j1
 
 
-@kernel(leaf=True)
+@kernel
 def _flood_hole(
     inv_depth: F4,
     labels: I4,
@@ -114,7 +114,7 @@ def _flood_hole(
     ahead: I4,
     level: I4,
 ) -> tuple[int, int]:
-    """Collect the unlabelled cells connected to the first of ``stack``, which `_may_be_hole`.
+    """Collect the unlabelled cells connected to the first of ``stack``, not known to be open.
 
     Counts, for each label, the sides of cells where it bounds the hole, where it is in front of
     it, and where the surface goes on. Returns how many cells the hole has, 0 if it is large or
@@ -123,13 +123,18 @@ def _flood_hole(
     sides[:] = 0
     ahead[:] = 0
     level[:] = 0
+    i0, j0, i1, j1 = extent
     total = 0
     done, top = 0, 1
     seen[stack[0, 0], stack[0, 1]] = 1
     while done < top:
         i, j = stack[done, 0], stack[done, 1]
         done += 1
-        if top >= MOST_CELLS or _is_open(seen, extent, i, j):
+        open_ = i == i0 or j == j0 or i == i1 - 1 or j == j1 - 1
+        if not open_:
+            open_ = (seen[i - 1, j] == OPEN) | (seen[i + 1, j] == OPEN)
+            open_ |= (seen[i, j - 1] == OPEN) | (seen[i, j + 1] == OPEN)
+        if top >= MOST_CELLS or open_:
             for t in range(top):
                 seen[stack[t, 0], stack[t, 1]] = OPEN
             return 0, 0
@@ -151,7 +156,7 @@ def _flood_hole(
     return top, total
 
 
-@kernel(leaf=True)
+@kernel
 def _mark_open(inv_depth: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1) -> None:
     """Mark unlabelled cells from which others lead right and down to the border of the extent.
 
@@ -170,29 +175,7 @@ def _mark_open(inv_depth: F4, labels: I4, extent: tuple[int, int, int, int], see
             here[j] = right
 
 
-@kernel(inline=True, leaf=True)
-def _may_be_hole(
-    inv_depth: F4, labels: I4, extent: tuple[int, int, int, int], seen: U1, i: int, j: int
-) -> bool:
-    """Whether an unlabelled cell is new and not known to be open."""
-    if labels[i, j] != 0 or seen[i, j] or inv_depth[i, j] <= 0:
-        return False
-    if _is_open(seen, extent, i, j):
-        seen[i, j] = OPEN
-    return bool(seen[i, j] == 0)
-
-
-@kernel(inline=True, leaf=True)
-def _is_open(seen: U1, extent: tuple[int, int, int, int], i: int, j: int) -> bool:
-    """Whether a cell is on the border of the extent or next to what is known to be open."""
-    i0, j0, i1, j1 = extent
-    if i == i0 or j == j0 or i == i1 - 1 or j == j1 - 1:
-        return True
-    above, below = seen[i - 1, j] == OPEN, seen[i + 1, j] == OPEN
-    return bool(above | below | (seen[i, j - 1] == OPEN) | (seen[i, j + 1] == OPEN))
-
-
-@kernel(leaf=True)
+@kernel
 def _is_raised(inv_depth: F4, height: F4, stack: I4, size: int) -> bool:
     """Whether a hole lies a little above the plane, as the floor of a plate does."""
     height_sum = far = 0.0
@@ -215,9 +198,17 @@ def fill_holes(inv_depth: F4, height: F4, labels: I4, count: int, filled: U1) ->
     sides, ahead, level = np.zeros((3, count + 1), np.int32)
     extent = _extent_of(labels)
     _mark_open(inv_depth, labels, extent, seen)
-    for si in range(extent[0], extent[2]):
-        for sj in range(extent[1], extent[3]):
-            if not _may_be_hole(inv_depth, labels, extent, seen, si, sj):
+    i0, j0, i1, j1 = extent
+    for si in range(i0, i1):
+        for sj in range(j0, j1):
+            if labels[si, sj] != 0 or seen[si, sj] or inv_depth[si, sj] <= 0:
+                continue
+            open_ = si == i0 or sj == j0 or si == i1 - 1 or sj == j1 - 1
+            if not open_:
+                open_ = (seen[si - 1, sj] == OPEN) | (seen[si + 1, sj] == OPEN)
+                open_ |= (seen[si, sj - 1] == OPEN) | (seen[si, sj + 1] == OPEN)
+            if open_:
+                seen[si, sj] = OPEN
                 continue
             stack[0, 0], stack[0, 1] = si, sj
             size, total = _flood_hole(inv_depth, labels, extent, seen, stack, sides, ahead, level)

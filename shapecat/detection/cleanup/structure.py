@@ -108,7 +108,7 @@ def is_background(
     return rejected
 
 
-@kernel(leaf=True)
+@kernel
 def _is_shelf_edge(segments: Segments, p: int) -> bool:
     """Whether a segment meets a board from below, as its edge and the legs below it do."""
     rim = segments.statistics[p].shelf_edge
@@ -117,7 +117,7 @@ def _is_shelf_edge(segments: Segments, p: int) -> bool:
     )
 
 
-@kernel(leaf=True)
+@kernel
 def _is_noise_blob(segments: Segments, p: int) -> bool:
     """Whether a segment is as small and low as noise of the plane."""
     shape = segments.statistics[p]
@@ -126,7 +126,7 @@ def _is_noise_blob(segments: Segments, p: int) -> bool:
     return bool(shape.area < BLOB_M2 or shape.count < BLOB_CELLS)
 
 
-@kernel(leaf=True)
+@kernel
 def _is_edge_on_panel(segments: Segments, p: int, intrinsics: PinholeIntrinsics) -> bool:
     """Whether a segment is upright and seen only edge on, as sides of shelves are.
 
@@ -185,7 +185,7 @@ def _count_leaving(field: LabelledGrid, counts: I4) -> None:
                     counts[which, labels[i, j]] += 1
 
 
-@kernel(leaf=True)
+@kernel
 def _find_out(plane_id: I4, labels: I4, i: int, first: int, end: int, out: Bool) -> bool:
     """Mark the cells of a part of a row next to what no plane is below; whether there are any."""
     above, below, mine = (
@@ -203,7 +203,7 @@ def _find_out(plane_id: I4, labels: I4, i: int, first: int, end: int, out: Bool)
     return some
 
 
-@kernel(leaf=True)
+@kernel
 def _is_tall_structure(
     field: LabelledGrid, segments: Segments, p: int, up: F8, highest: float
 ) -> bool:
@@ -234,7 +234,7 @@ def _is_tall_structure(
     return bool(high > TALL_SHARE * n)
 
 
-@kernel(leaf=True)
+@kernel
 def _rise(
     inv_depth: F4, intrinsics: PinholeIntrinsics, i: int, j: int, up: F8, sign: int, most: float
 ) -> float:
@@ -266,7 +266,7 @@ def _rise(
     return reach
 
 
-@kernel(leaf=True)
+@kernel
 def _count_posts(field: LabelledGrid, up: F8, through: I4) -> None:
     """Count where each region goes on through the level of a board, as posts do.
 
@@ -296,7 +296,7 @@ def _count_posts(field: LabelledGrid, up: F8, through: I4) -> None:
                 through[labels[y, x]] += 1
 
 
-@kernel(leaf=True)
+@kernel
 def _followed(
     inv_depth: F4, intrinsics: PinholeIntrinsics, i: int, j: int, up: F8, rise: float
 ) -> int:

@@ -76,7 +76,7 @@ def measure_residual(
     return n
 
 
-@kernel(leaf=True)
+@kernel
 def _find_low(
     inv_depth: F4, plane_id: I4, height: F4, plane: F8, number: int, i: int, raw: F4, mark: F4
 ) -> bool:
@@ -183,7 +183,7 @@ def filter_high_pass(residual: F4, high_pass: F4) -> None:
             out[j] = level if here[j] != zero else zero
 
 
-@kernel(leaf=True)
+@kernel
 def _slide(row: F4, sign: int, sums: I4, counts: I4) -> None:
     """Add a row to the sums of the columns, or take it away."""
     steps, most, least = np.float32(STEPS), np.float32(MOST), np.float32(-1)
@@ -193,7 +193,7 @@ def _slide(row: F4, sign: int, sums: I4, counts: I4) -> None:
         counts[j] += sign * np.int32(row[j] != 0)
 
 
-@kernel(leaf=True)
+@kernel
 def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
     """Write the sums over the window around each column, and the counts, at least 1."""
     width = 2 * WINDOW + 1

@@ -147,7 +147,7 @@ def find_low_profile(
         parts = _lower(values, residual, plane_ids, number, step, marks, parts, scratch)
 
 
-@kernel(leaf=True)
+@kernel
 def _rows_of(plane_id: I4, number: int) -> tuple[int, int]:
     """Return the rows from which on and before which the cells of a plane are, with a margin.
 
@@ -225,7 +225,7 @@ def _raise(
     return objects, me
 
 
-@kernel(leaf=True)
+@kernel
 def _find_seeds(high_pass: F4, least: float, seeds: I4) -> int:
     """List cells above the lowest level that are higher than the ones before and above them.
 
@@ -270,7 +270,7 @@ class Outline(NamedTuple):
     steep: int
 
 
-@kernel(leaf=True)
+@kernel
 def _width(inv_depth: F4, stack: I4, count: int) -> float:
     """Return the extent of a part along the rows, in cells a metre away."""
     columns = inv_depth.shape[1]
@@ -294,7 +294,7 @@ def _is_object(outline: Outline, count: int) -> bool:
     return bool(outline.rise > least and outline.steep > STEEP_SHARE * table)
 
 
-@kernel(leaf=True)
+@kernel
 def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) -> int:
     """Give the connected cells above ``level`` the number ``n``; return how many.
 
@@ -317,7 +317,7 @@ def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) 
     return top
 
 
-@kernel(leaf=True)
+@kernel
 def _outline(
     inv_depth: F4,
     residual: F4,
@@ -417,7 +417,7 @@ def _lower(
     return me
 
 
-@kernel(leaf=True)
+@kernel
 def _is_flat(residual: F4, i: int, j: int) -> bool:
     """Whether a low cell is no part of the side of something."""
     rows, columns = residual.shape

@@ -110,7 +110,7 @@ def _extend(search: Search, height: F4, seen: I4, visits: int, stacks: I4) -> in
     return visits
 
 
-@kernel(leaf=True)
+@kernel
 def _find_border(plane_id: I4, me: int, i: int, border: U1) -> bool:
     """Mark the cells of a row above a plane that are beside cells of lower planes or of none.
 
@@ -134,7 +134,7 @@ def _find_border(plane_id: I4, me: int, i: int, border: U1) -> bool:
     return bool(some > 0)
 
 
-@kernel(leaf=True)
+@kernel
 def _leads_out(search: Search, i: int, j: int, y: int, x: int) -> bool:
     """Whether what stands on a plane goes on from (i, j) to (y, x) outside; notes its height if so.
 
@@ -163,7 +163,7 @@ def _leads_out(search: Search, i: int, j: int, y: int, x: int) -> bool:
     return True
 
 
-@kernel(leaf=True)
+@kernel
 def _part_outside(search: Search, i: int, j: int, stack: I4) -> int:
     """Collect the connected cells outside, from one that is above the plane; return how many."""
     columns = search.inverse_depth.shape[1]
@@ -181,7 +181,7 @@ def _part_outside(search: Search, i: int, j: int, stack: I4) -> int:
     return top
 
 
-@kernel(leaf=True)
+@kernel
 def _part_inside(
     inv_depth: F4, plane_id: I4, me: int, seen: I4, look: int, i: int, j: int, most: int, stack: I4
 ) -> int:

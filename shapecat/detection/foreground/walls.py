@@ -128,7 +128,7 @@ def _is_cut_off(inv_depth: F4, samples: DepthSamples, plane: F8) -> bool:
     return sides >= 2
 
 
-@kernel(leaf=True)
+@kernel
 def _measure(
     samples: DepthSamples,
     intrinsics: PinholeIntrinsics,
@@ -207,7 +207,7 @@ def _clear(
             plane_ids[j] = 0 if states[j] == CLEARED else plane_ids[j]
 
 
-@kernel(leaf=True)
+@kernel
 def _mark(inv_depth: F4, plane_id: I4, plane: F8, found: U1) -> None:
     """Mark as unseen the cells on a wall that are no part of a level plane, as 0 the others."""
     a = np.float32(plane[0])

@@ -103,7 +103,7 @@ def _continuation(
     return share if free <= FREE * looked and hidden >= BEHIND * looked else 0.0
 
 
-@kernel(leaf=True)
+@kernel
 def _are_behind_one(segments: Segments, p: int, q: int) -> bool:
     """Whether one thing is in front of both segments."""
     pairs = segments.pairs
@@ -155,7 +155,7 @@ def _find_partners(a: F8, b: F8, partners: I4) -> tuple[float, int]:
     return min(np.sum(in_a) / len(a), np.sum(in_b) / len(b)), n
 
 
-@kernel(leaf=True)
+@kernel
 def _on_line(first: F8, second: F8, u: float) -> tuple[float, float, float]:
     """Return the point at the share ``u`` of the way between two samples."""
     return (

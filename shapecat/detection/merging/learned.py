@@ -100,28 +100,25 @@ def _merge(
 @kernel
 def logit_of(grown: BoostedTrees, features: F4) -> float:
     """Return the logit that a pair with these features (n,) is of one object."""
+    roots, value = grown.roots, grown.value
+    feature, threshold, children = grown.feature, grown.threshold, grown.left
     nodes = np.zeros(LANES, np.int32)
     logit = 0.0
-    for first in range(0, grown.roots.size, LANES):
-        lanes = min(LANES, grown.roots.size - first)
-        nodes[:lanes] = grown.roots[first : first + lanes]
-        while _descend(grown, features, nodes):
-            pass
+    for first in range(0, roots.size, LANES):
+        lanes = min(LANES, roots.size - first)
         for lane in range(lanes):
-            logit += grown.value[nodes[lane]]
+            nodes[lane] = roots[first + lane]
+        inner = True
+        while inner:  # one level down in each tree
+            inner = False
+            for lane in range(LANES):
+                node = np.uint32(nodes[lane])  # unsigned: it cannot count from the end
+                left = children[node]
+                right = features[np.uint16(feature[node])] > threshold[node]
+                nodes[lane] = left + np.int32(right) if left > 0 else nodes[lane]
+                inner |= left > 0
+        for lane in range(lanes):
+            logit += value[nodes[lane]]
             if logit < HOPELESS:
                 return float(logit)
     return float(logit)
-
-
-@kernel(leaf=True)
-def _descend(grown: BoostedTrees, features: F4, nodes: I4) -> bool:
-    """Go down one level in each of `LANES` trees; whether any was not in a leaf."""
-    inner = False
-    for lane in range(LANES):
-        node = np.uint32(nodes[lane])  # unsigned numbers cannot count from the end: no test for it
-        left = grown.left[node]
-        right = features[np.uint16(grown.feature[node])] > grown.threshold[node]
-        nodes[lane] = left + np.int32(right) if left > 0 else nodes[lane]
-        inner |= left > 0
-    return inner

@@ -121,7 +121,7 @@ class ViewGeometry(NamedTuple):
     down: float
 
 
-@kernel(leaf=True)
+@kernel
 def are_adjacent(segments: Segments, p: int, q: int) -> bool:
     """Whether two segments above one plane touch, one hides the other, or they face each other."""
     if not may_merge(segments, p, q):
@@ -131,7 +131,7 @@ def are_adjacent(segments: Segments, p: int, q: int) -> bool:
     return bool(met >= FEW or _face(segments.statistics[p], segments.statistics[q]))
 
 
-@kernel(leaf=True)
+@kernel
 def _face(a: Row, b: Row) -> bool:
     """Whether two segments may be the near and the far wall of a pot: these touch nowhere."""
     narrow, wide = min(width_of(a), width_of(b)), max(width_of(a), width_of(b))
@@ -164,7 +164,7 @@ def pair_features(
     relation.cells, relation.cell_m, relation.down = a.count, cell, view_geometry.down
 
 
-@kernel(leaf=True)
+@kernel
 def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) -> None:
     pair, back = segments.pairs[p, q], segments.pairs[q, p]
     met = pair.contact + pair.near + pair.in_front + back.in_front
@@ -182,7 +182,7 @@ def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) 
     out.border_m = met * cell
 
 
-@kernel(leaf=True)
+@kernel
 def _above_top(segments: Segments, p: int, q: int) -> float:
     """Return how far above the top of ``q`` faces up what ``p`` borders on there."""
     onto = segments.pairs[p, q].rests_on
@@ -191,7 +191,7 @@ def _above_top(segments: Segments, p: int, q: int) -> float:
     return float(segments.pairs[p, q].rests_on_height / onto - segments.statistics[q].top)
 
 
-@kernel(leaf=True)
+@kernel
 def _write_segment(segments: Segments, p: int, out: Row) -> None:
     row = segments.statistics[p]
     around = row.boundary
@@ -219,7 +219,7 @@ def _write_segment(segments: Segments, p: int, out: Row) -> None:
     out.filled = _share(row.area, wide * tall)
 
 
-@kernel(leaf=True)
+@kernel
 def _write_relation(a: Row, b: Row, out: Row) -> None:
     narrow, wide = width_of(a), width_of(b)
     most = max(narrow, wide)
@@ -237,6 +237,6 @@ def _write_relation(a: Row, b: Row, out: Row) -> None:
     out.most_beyond_m, out.least_beyond_m = max(left, right), min(left, right)
 
 
-@kernel(leaf=True)
+@kernel
 def _share(part: float, whole: float) -> float:
     return float(part / whole) if whole > 0 else 0.0

@@ -22,25 +22,25 @@ TOP_DEPTH_M = 0.02
 """A top is closed by what faces up within this depth of it."""
 
 
-@kernel(leaf=True)
+@kernel
 def width_of(row: Row) -> float:
     """Return the lateral extent of a segment, metres; ``row`` is a `SEGMENT`."""
     return float(row.right - row.left)
 
 
-@kernel(leaf=True)
+@kernel
 def lateral_distance(a: Row, b: Row) -> float:
     """Return the lateral distance of the middles of two segments, metres."""
     return float(abs(a.left + a.right - b.left - b.right) / 2)
 
 
-@kernel(leaf=True)
+@kernel
 def depth_difference(a: Row, b: Row) -> float:
     """Return how much farther away than segment ``b`` segment ``a`` is on average, metres."""
     return float(a.depth_sum / a.count - b.depth_sum / b.count)
 
 
-@kernel(leaf=True)
+@kernel
 def lateral_curvature(row: Row) -> float:
     """Return by how much the lateral normal changes across a segment.
 
@@ -50,7 +50,7 @@ def lateral_curvature(row: Row) -> float:
     return float(both / max(spread, 1e-9) * width_of(row))
 
 
-@kernel(leaf=True)
+@kernel
 def normal_position_correlation(row: Row) -> float:
     """Return the correlation of the lateral normal with the lateral position.
 
@@ -61,7 +61,7 @@ def normal_position_correlation(row: Row) -> float:
     return float(both / math.sqrt(max(spread * turning, 1e-12)))
 
 
-@kernel(leaf=True)
+@kernel
 def _moments(row: Row) -> tuple[float, float, float]:
     """Return the sums of squares of the lateral position and normal, and of products of both."""
     n = max(row.fitted, np.float32(1))
@@ -70,7 +70,7 @@ def _moments(row: Row) -> tuple[float, float, float]:
     return spread, turning, row.x_normal_x_sum - row.x_sum * row.normal_x_sum / n
 
 
-@kernel(leaf=True)
+@kernel
 def top_area_share(segments: Segments, p: int, depth: float) -> float:
     """Return what faces up within ``depth`` of the top of a segment, by its width squared."""
     row = segments.statistics[p]
@@ -81,7 +81,7 @@ def top_area_share(segments: Segments, p: int, depth: float) -> float:
     return float(area / max(width_of(row) ** 2, 1e-9))
 
 
-@kernel(leaf=True)
+@kernel
 def top_band(row: Row) -> int:
     """Return the last band of height in which a segment has anything."""
     return min(int(row.top / BAND_M), BANDS - 1)

@@ -147,7 +147,7 @@ def lateral_axis(up: F8) -> F8:
     return np.array([up[1] / across, -up[0] / across, 0.0])
 
 
-@kernel(leaf=True)
+@kernel
 def _measure(
     inv_depth: F4,
     intrinsics: PinholeIntrinsics,
@@ -268,7 +268,7 @@ def merge(segments: Segments, p: int, q: int) -> None:
             segments.parent[k] = p
 
 
-@kernel(leaf=True)
+@kernel
 def _add_pair(a: Row, b: Row) -> None:
     """Add a `PAIR` to another, and clear it."""
     a.contact += b.contact
@@ -279,7 +279,7 @@ def _add_pair(a: Row, b: Row) -> None:
     b.contact = b.in_front = b.near = b.rests_on = b.rests_on_height = 0.0
 
 
-@kernel(leaf=True)
+@kernel
 def add_statistics(a: Row, b: Row) -> None:
     """Add a `SEGMENT` to another."""
     a.count += b.count
@@ -300,7 +300,7 @@ def add_statistics(a: Row, b: Row) -> None:
     a.upper_silhouette += b.upper_silhouette
 
 
-@kernel(leaf=True)
+@kernel
 def depth_of(segments: Segments, p: int) -> float:
     """Return the mean depth of a segment, metres; 1 where it has no cell."""
     count = segments.statistics[p].count
@@ -316,13 +316,13 @@ def depths_of(segments: Segments) -> F4:
     return depths
 
 
-@kernel(leaf=True)
+@kernel
 def is_root(segments: Segments, p: int) -> bool:
     """Whether a segment has not been merged into another."""
     return bool(segments.parent[p] == p)
 
 
-@kernel(leaf=True)
+@kernel
 def may_merge(segments: Segments, p: int, q: int) -> bool:
     """Whether two segments stand above one plane, and neither has been merged into another."""
     return bool(

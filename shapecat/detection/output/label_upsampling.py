@@ -104,7 +104,7 @@ def _near(labels: I4) -> U1:
     return near
 
 
-@kernel(leaf=True)
+@kernel
 def _find_near(labels: I4, i: int, scratch: I4, near: I4) -> None:
     """Write a row of `_near`; ``scratch`` is (columns + 2,) with 0 at both ends."""
     rows, columns = labels.shape
@@ -130,6 +130,8 @@ def _list_pixels(
         np.zeros((len(grid_labels.planes), columns), np.uint8),
     )
     runs = np.zeros((4 * width, 3), np.int32)
+    cells, places = np.zeros((2, width), np.int64), np.zeros((3, width), np.float64)
+    marks = np.zeros(width, np.int16)
     far, shift, scale = np.float32(range_m), (factor - 1) * 0.5, 1.0 / factor
     n = 0
     for i in range(rows):
@@ -144,15 +146,24 @@ def _list_pixels(
                 runs = np.concatenate((runs, np.zeros_like(runs)))
             part = line[x0:x1]
             _mark(depth[y, x0:x1], wide_w[x0:x1], wide_code[x0:x1], far, part)
-            label, start, first = 0, 0, y * width + x0
+            unsure = 0
+            for k in range(part.size):
+                if part[k] == UNSURE:
+                    cells[0, unsure] = i
+                    cells[1, unsure] = min(row_and_column(x0 + k, factor)[0], columns - 1)
+                    places[0, unsure], places[1, unsure] = (
+                        (x0 + k - shift) * scale,
+                        (y - shift) * scale,
+                    )
+                    places[2, unsure] = depth[y, x0 + k]
+                    unsure += 1
+            _settle(grid_labels, cells, places, unsure, marks)
+            unsure, label, start, first = 0, 0, 0, y * width + x0
             for k in range(part.size):
                 mark = part[k]
-                if mark == label:
-                    continue
                 if mark == UNSURE:
-                    u, v = (x0 + k - shift) * scale, (y - shift) * scale
-                    j = min(row_and_column(x0 + k, factor)[0], columns - 1)
-                    mark = _label_of(grid_labels, i, j, u, v, depth[y, x0 + k])
+                    mark = marks[unsure]
+                    unsure += 1
                 if mark != label:
                     n = _end_run(label, first + start, first + k, runs, n)
                     label, start = mark, k
@@ -161,7 +172,7 @@ def _list_pixels(
     return listed
 
 
-@kernel(leaf=True)
+@kernel
 def _end_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
     """Append the indices of a label to n runs, if it is one; return how many there are then."""
     if label > 0:
@@ -191,7 +202,7 @@ def _listed(runs: I4, labels: int) -> tuple[U4, I4]:
     return order, ends
 
 
-@kernel(leaf=True)
+@kernel
 def _code_cells(
     grid_labels: GridLabels, i: int, scratch: I4, high: U1, code: I4
 ) -> tuple[int, int]:
@@ -217,7 +228,7 @@ def _code_cells(
     return span
 
 
-@kernel(leaf=True)
+@kernel
 def _find_high(plane: F8, i: int, first: int, inv_depth: F4, high: U1) -> None:
     """Write whether every pixel that fits a cell rises above a plane.
 
@@ -236,7 +247,7 @@ def _find_high(plane: F8, i: int, first: int, inv_depth: F4, high: U1) -> None:
         high[j] = (least - ground) * least * above > slope * least * least + base
 
 
-@kernel(leaf=True)
+@kernel
 def _widen(row: F4, factor: int, span: tuple[int, int], wide: F4) -> None:
     """Write the cells of a part of a row to their pixels; those beyond the last cell are its."""
     here, part = row[span[0] : span[1]], wide[span[0] * factor : span[1] * factor]
@@ -251,7 +262,7 @@ def _widen(row: F4, factor: int, span: tuple[int, int], wide: F4) -> None:
         wide[row.size * factor :] = row[-1]
 
 
-@kernel(leaf=True)
+@kernel
 def _mark(depth: F4, inv_depth: F4, code: I4, range_m: float, marks: I4) -> None:
     """Write the labels of pixels (n,), `UNSURE` where it takes more to tell."""
     least, zero, unsure, bare = np.float32(NEAREST_M), np.int16(0), np.int16(UNSURE), np.int16(BARE)
@@ -263,18 +274,48 @@ def _mark(depth: F4, inv_depth: F4, code: I4, range_m: float, marks: I4) -> None
         marks[x] = mark if (z >= least) & (z <= range_m) else zero
 
 
-@kernel(inline=True, leaf=True)
-def _label_of(grid_labels: GridLabels, i: int, j: int, u: float, v: float, z: float) -> int:
-    """Return the label of a depth in cell (i, j), at column u, row v; 0 if it has none."""
-    if not _fits(grid_labels.inverse_depth[i, j], z):
-        i, j = _best_beside(grid_labels.inverse_depth, i, j, z)
-    label = grid_labels.labels[i, j] if i >= 0 else 0
-    if label > 0 and (
-        grid_labels.filled[i, j]
-        or _rises(grid_labels.planes, grid_labels.plane_ids[label], u, v, z)
-    ):
-        return int(label)
-    return 0
+@kernel
+def _settle(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks: I4) -> None:
+    """Write the labels of the first ``n`` of some depths, 0 where there is none.
+
+    Parameters
+    ----------
+    cells : (2, m) row and column of the cell of each.
+    places : (3, m) its column, row, in cells, and depth.
+    marks : (m,) to write to.
+    """
+    inv_depth, labels, filled = grid_labels.inverse_depth, grid_labels.labels, grid_labels.filled
+    planes, plane_ids = grid_labels.planes, grid_labels.plane_ids
+    rows, columns = inv_depth.shape
+    jump = np.float32(DISCONTINUITY)
+    for m in range(n):
+        i, j, u, v, z = (
+            cells[0, m],
+            cells[1, m],
+            places[0, m],
+            places[1, m],
+            np.float32(places[2, m]),
+        )
+        marks[m] = 0
+        if not abs(inv_depth[i, j] * z - np.float32(1)) < jump * z:
+            # The neighbour whose depth fits best, if any is within two jumps.
+            row, column, nearest = -1, -1, np.float32(2 * DISCONTINUITY) * z
+            for y in range(max(i - 1, 0), min(i + 2, rows)):
+                for x in range(max(j - 1, 0), min(j + 2, columns)):
+                    gap = abs(inv_depth[y, x] * z - np.float32(1))
+                    better = gap < nearest  # a choice, for no branch could be foretold
+                    nearest = gap if better else nearest
+                    row, column = y if better else row, x if better else column
+            if row < 0:
+                continue
+            i, j = row, column
+        label = labels[i, j]
+        if label <= 0:
+            continue
+        k = plane_ids[label]
+        h = (1 - (planes[k, 0] * u + planes[k, 1] * v + planes[k, 2]) * z) * planes[k, 3]
+        if filled[i, j] or h > FRINGE * (MIN_HEIGHT_M + HEIGHT_NOISE * z * z):
+            marks[m] = label
 
 
 @kernel
@@ -284,35 +325,26 @@ def _mark_points(
     """Write the labels of the points (n, 3); ``cell`` (n,) is flat, -1 of what is not seen."""
     columns = grid_labels.inverse_depth.shape[1]
     near = _near(grid_labels.labels).reshape(-1)
-    for k in range(points.shape[0]):
+    count = points.shape[0]
+    cells, places = np.zeros((2, count), np.int64), np.zeros((3, count), np.float64)
+    chosen, found = np.zeros(count, np.int64), np.zeros(count, np.int16)
+    n = 0
+    for k in range(count):
         p = cell[k]
-        if p >= 0 and near[p]:
-            x, y, z = points[k]
-            u, v = intrinsics.fx * x / z + intrinsics.cx, intrinsics.fy * y / z + intrinsics.cy
-            marks[k] = _label_of(grid_labels, p // columns, p % columns, u, v, z)
+        if p < 0 or not near[p]:
+            continue
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        cells[0, n], cells[1, n], chosen[n] = p // columns, p % columns, k
+        places[0, n] = intrinsics.fx * x / z + intrinsics.cx
+        places[1, n] = intrinsics.fy * y / z + intrinsics.cy
+        places[2, n] = z
+        n += 1
+    _settle(grid_labels, cells, places, n, found)
+    for m in range(n):
+        marks[chosen[m]] = found[m]
 
 
-@kernel(leaf=True)
+@kernel
 def _fits(inv_depth: float, z: float) -> bool:
     """Whether a depth is within one jump of a cell; both sides are multiplied by the depth."""
     return bool(abs(inv_depth * z - np.float32(1)) < np.float32(DISCONTINUITY) * z)
-
-
-@kernel(leaf=True)
-def _best_beside(inv_depth: F4, i: int, j: int, z: float) -> tuple[int, int]:
-    """Return the neighbour of a cell whose depth fits best, (-1, -1) if none is in two jumps."""
-    row, column, nearest = -1, -1, np.float32(2 * DISCONTINUITY) * z
-    for ii in range(max(i - 1, 0), min(i + 2, inv_depth.shape[0])):
-        for jj in range(max(j - 1, 0), min(j + 2, inv_depth.shape[1])):
-            gap = abs(inv_depth[ii, jj] * z - np.float32(1))
-            better = gap < nearest  # a choice, for no branch could be foretold
-            nearest = gap if better else nearest
-            row, column = ii if better else row, jj if better else column
-    return row, column
-
-
-@kernel(inline=True, leaf=True)
-def _rises(planes: F8, k: int, u: float, v: float, z: float) -> bool:
-    """Whether a depth at column u, row v is above plane k, if only as a foot is."""
-    h = (1 - (planes[k, 0] * u + planes[k, 1] * v + planes[k, 2]) * z) * planes[k, 3]
-    return bool(h > FRINGE * (MIN_HEIGHT_M + HEIGHT_NOISE * z * z))

@@ -115,7 +115,7 @@ def measure_objects(
     return measured
 
 
-@kernel(leaf=True)
+@kernel
 def _supporting_object(segments: Segments, representatives: I4, p: int) -> tuple[int, float]:
     """Return what a segment stands on: a label or 0, and its height above the plane, metres."""
     pairs, statistics = segments.pairs[p], segments.statistics
@@ -133,7 +133,7 @@ def _supporting_object(segments: Segments, representatives: I4, p: int) -> tuple
     return 0, 0.0
 
 
-@kernel(leaf=True)
+@kernel
 def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
     """Return the label below a segment that it meets most, 0 if none."""
     statistics, pairs = segments.statistics, segments.pairs
@@ -150,7 +150,7 @@ def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
     return best if most >= FEW else 0
 
 
-@kernel(leaf=True)
+@kernel
 def _break_cycles(measured: ObjectMeasurements) -> None:
     """Put what stands on itself, by way of others, on its plane."""
     supported_by = measured.supported_by
@@ -228,7 +228,7 @@ def _outer_points(
     return points, start
 
 
-@kernel(leaf=True)
+@kernel
 def _find_outer(labels: I4, i: int, first: int, end: int, outer: Bool) -> None:
     """Mark the labelled cells of a part of a row that are next to others, and every 4th inside."""
     rows, columns = labels.shape
@@ -249,7 +249,7 @@ def _find_outer(labels: I4, i: int, first: int, end: int, outer: Bool) -> None:
             outer[j] = labels[i, j] > 0
 
 
-@kernel(fast=True, leaf=True)
+@kernel(fast=True)
 def _measure_box(
     local: F4,
     first: int,
@@ -293,7 +293,7 @@ def _measure_box(
     measured.orientation[k, 3] = qw * cos - z * sin
 
 
-@kernel(fast=True, leaf=True)
+@kernel(fast=True)
 def _span_of(xs: F4, ys: F4, span: F4) -> None:
     """Write for each yaw the least and greatest place of points along it, and the same across it.
 

@@ -124,7 +124,7 @@ def _find_cut(inv_depth: F4, low: I4, high: I4, reach: int, cut: Bool) -> None:
             cut[k] |= (low[k, axis] < first) | (high[k, axis] > last)
 
 
-@kernel(leaf=True)
+@kernel
 def _begin(inv_depth: F4, axis: int, step: int, reach: int) -> int:
     """Return the line at which the readings begin: the first with any, if more than one thing is.
 

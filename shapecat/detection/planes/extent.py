@@ -68,7 +68,7 @@ def measure_plane(grid: DepthGrid, samples: DepthSamples, plane: F8) -> Supporti
     return SupportingPlane(plane[0], plane[1], plane[2], normal, -distance, extent, area)
 
 
-@kernel(fast=True, leaf=True)
+@kernel(fast=True)
 def _area_of(samples: DepthSamples, plane: F8, distance: float) -> float:
     """Return the visible area of a plane by that of a pixel at 1 m, from its distance."""
     j, i, inv_depth = samples.j, samples.i, samples.inverse_depth
@@ -128,7 +128,7 @@ def _extent_of(inv_depth: F4, intrinsics: PinholeIntrinsics, plane: F8, axes: F8
     return extent + MARGIN_M
 
 
-@kernel(leaf=True)
+@kernel
 def _ends(inv_depth: F4, plane: F8, i: int, beside: U1) -> tuple[int, int]:
     """Return the first and the last marked cell of a row in the plane; none: first > last."""
     none = np.int32(beside.size)
@@ -144,7 +144,7 @@ def _ends(inv_depth: F4, plane: F8, i: int, beside: U1) -> tuple[int, int]:
     return int(first), int(last)
 
 
-@kernel(leaf=True)
+@kernel
 def _is_in(inv_depth: F4, plane: F8, i: int, j: int) -> bool:
     level = plane[0] * j + plane[1] * i + plane[2]
     return bool(level > 0 and abs(inv_depth[i, j] - level) < INLIER_TOLERANCE)

@@ -156,7 +156,7 @@ def _assign(
             heights[j] = line[j] if line[j] > below else heights[j]
 
 
-@kernel(leaf=True)
+@kernel
 def _bounds(line: F4, values: F4) -> tuple[np.float32, np.float32, np.float32, np.float32]:
     """Return the first and last cell of a row that have a height, and bounds of their values."""
     left, right = 0, line.size - 1
@@ -175,7 +175,7 @@ def _bounds(line: F4, values: F4) -> tuple[np.float32, np.float32, np.float32, n
     return np.float32(left), np.float32(right), farthest, nearest
 
 
-@kernel(leaf=True)
+@kernel
 def is_inside_outline(plane: F8, x: float, y: float, z: float, slack: float) -> bool:
     """Whether a point is within the outline of a row of `pack_planes`, or ``slack`` beyond it."""
     p = plane[4] * x + plane[5] * y + plane[6] * z

@@ -123,7 +123,7 @@ def _halves(inv_depth: F4) -> tuple[F4, F4]:
     return even, odd
 
 
-@kernel(fast=True, leaf=True)
+@kernel(fast=True)
 def _find_level(
     even: F4, odd: F4, intrinsics: PinholeIntrinsics, up: F8, i: int, x: F8, height: F4
 ) -> None:

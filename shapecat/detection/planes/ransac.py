@@ -125,7 +125,7 @@ def plane_normal(plane: F8, intrinsics: PinholeIntrinsics) -> F8:
     return np.array([x / norm, y / norm, z / norm])
 
 
-@kernel(leaf=True)
+@kernel
 def cosine(a: F8, b: F8) -> float:
     """Return the cosine of the angle between two unit vectors (3,)."""
     return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
@@ -222,7 +222,7 @@ def count_inliers(samples: DepthSamples, a: float, b: float, c: float, tolerance
     return int(total)
 
 
-@kernel(fast=True, leaf=True)
+@kernel(fast=True)
 def refine(j: F4, i: F4, inv_depth: F4, tolerance: float, plane: F8) -> int:
     """Fit a plane (a, b, c) to its inliers by least squares; return how many they are.
 

@@ -80,7 +80,7 @@ def _overlaps(lower: SupportingPlane, upper: SupportingPlane) -> bool:
     return bool(np.all(COS * x + SIN * y < lower.extent))
 
 
-@kernel(leaf=True)
+@kernel
 def _drop(
     inv_depth: F4,
     intrinsics: PinholeIntrinsics,

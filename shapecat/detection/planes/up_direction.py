@@ -119,7 +119,7 @@ def _most_faced(normals: F4, trials: F8, best: F8) -> tuple[int, F4]:
     return most, rest[:, :n].copy()
 
 
-@kernel(fast=True, leaf=True)
+@kernel(fast=True)
 def _inliers_if_more(normals: F4, t: int, most: int) -> int:
     """Count the normals that face as normal ``t`` does, as long as there may be over ``most``."""
     xs, ys, zs = normals[0], normals[1], normals[2]  # unpacked they would not be contiguous
@@ -133,7 +133,7 @@ def _inliers_if_more(normals: F4, t: int, most: int) -> int:
     return inliers
 
 
-@kernel(fast=True, leaf=True)
+@kernel(fast=True)
 def _count_facing(xs: F4, ys: F4, zs: F4, x: float, y: float, z: float) -> int:
     least = np.float32(FACING_COS)
     inliers = np.int32(0)
@@ -142,7 +142,7 @@ def _count_facing(xs: F4, ys: F4, zs: F4, x: float, y: float, z: float) -> int:
     return int(inliers)
 
 
-@kernel(fast=True, leaf=True)
+@kernel(fast=True)
 def _mean_near(normals: F4, direction: F8) -> int:
     """Turn a direction to the mean of the normals that face it; return how many these are."""
     xs, ys, zs = normals[0], normals[1], normals[2]

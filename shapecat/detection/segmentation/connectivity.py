@@ -69,7 +69,7 @@ def connect_surfaces(grid: DepthGrid, heights: HeightMap) -> SurfaceGraph:
     return graph
 
 
-@kernel(leaf=True)
+@kernel
 def span_of(row: I4) -> tuple[int, int]:
     """Return the columns of the first number above 0 of a row and after the last, or 0 and 0."""
     some = False
@@ -103,7 +103,7 @@ def _cleared(spans: I4, columns: int) -> F4:
     return fits
 
 
-@kernel(leaf=True)
+@kernel
 def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) -> None:
     """Link neighbours that differ by less than a jump, or as either local plane tells."""
     rows = inv_depth.shape[0]
@@ -141,7 +141,7 @@ def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) ->
         _part_steps(inv_depth, plane_id, i, start, end, links[i])
 
 
-@kernel(leaf=True)
+@kernel
 def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links: U1) -> None:
     """Take the links away that only a local plane tells, across a step."""
     some = False
@@ -157,7 +157,7 @@ def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links
         links[j] &= RIGHT | DOWN
 
 
-@kernel(fast=True, leaf=True)
+@kernel(fast=True)
 def _link_some(
     plane_id: I4,
     owner1: I4,
@@ -182,7 +182,7 @@ def _link_some(
         links[k] |= link if same else np.uint8(0)
 
 
-@kernel(leaf=True)
+@kernel
 def _is_step(inv_depth: F4, plane_id: I4, i: int, j: int, di: int, dj: int) -> bool:
     """Whether the readings change more from a cell to the next than they do before and after.
 
@@ -242,7 +242,7 @@ def _measure_concavity(inv_depth: F4, intrinsics: PinholeIntrinsics, graph: Surf
         _write_angles(local_plane[i, 0, start:end], worst[start:end], concavity[i, start:end])
 
 
-@kernel(fast=True, leaf=True)
+@kernel(fast=True)
 def _raise_concavity(
     inv_depth: F4,
     intrinsics: PinholeIntrinsics,
@@ -304,7 +304,7 @@ def _raise_concavity(
         worst[k] = chord if chord > worst[k] else worst[k]
 
 
-@kernel(fast=True, leaf=True)
+@kernel(fast=True)
 def _write_angles(level: F4, worst: F4, concavity: U1) -> None:
     """Write the angles, in degrees, of the chords of cells with a local plane."""
     degrees, most = np.float32(180 / math.pi), np.float32(120)

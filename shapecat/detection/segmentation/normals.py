@@ -56,13 +56,13 @@ def fit_local_planes(
             _write(fits, local_plane, normal, i, start, end)
 
 
-@kernel(inline=True, leaf=True)
+@kernel
 def padded(start: int, end: int) -> int:
     """Return the end of the run from ``start`` on made a multiple of `LANES` long."""
     return start + (end - start + LANES - 1) // LANES * LANES
 
 
-@kernel(leaf=True)
+@kernel
 def _write(fits: F4, local_plane: F4, normal: F4, i: int, start: int, end: int) -> None:
     for d in range(3):
         one, other = local_plane[i, d, start:end], normal[i, d, start:end]
@@ -70,7 +70,7 @@ def _write(fits: F4, local_plane: F4, normal: F4, i: int, start: int, end: int) 
             one[k], other[k] = fits[d * PITCH + k], fits[(3 + d) * PITCH + k]
 
 
-@kernel(leaf=True)
+@kernel
 def _next_run(plane_id: I4, j: int, last: int) -> tuple[int, int]:
     """Return the columns from and before which the next object cells of one owner in a row lie.
 
@@ -86,7 +86,7 @@ def _next_run(plane_id: I4, j: int, last: int) -> tuple[int, int]:
     return start, end
 
 
-@kernel(leaf=True)
+@kernel
 def _copy_windows(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, values: F4) -> None:
     """Copy the rows around a run and `WINDOW` cells more at its ends; `NONE` for other owners."""
     rows, columns = plane_id.shape
@@ -103,7 +103,7 @@ def _copy_windows(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, val
                 some[k] = value[k] if whose[k] == me else none
 
 
-@kernel(fast=True, leaf=True)
+@kernel(fast=True)
 def _fit_run(
     values: F4, intrinsics: PinholeIntrinsics, i: int, start: int, n: int, fits: F4
 ) -> None:
@@ -154,13 +154,13 @@ def _fit_run(
         fits[5 * PITCH + k] = nz * unit
 
 
-@kernel(fast=True, inline=True)
+@kernel(fast=True)
 def _times_row(a: float, b: float, c: float, e: float, f: float, g: float) -> Any:
     """Return the sum of what is known of each row but the middle one, times its place."""
     return np.float32(3) * (g - a) + np.float32(2) * (f - b) + (e - c)
 
 
-@kernel(fast=True, inline=True)
+@kernel(fast=True)
 def _four(
     values: F4, p: int, center: float, far: int, near: int
 ) -> tuple[float, float, float, float, float]:
@@ -174,7 +174,7 @@ def _four(
     return a + b + c + d, x, xx, va + vb + vc + vd, three * (vd - va) + (vc - vb)
 
 
-@kernel(fast=True, inline=True)
+@kernel(fast=True)
 def _three(
     values: F4, p: int, center: float, far: int, near: int
 ) -> tuple[float, float, float, float, float]:
@@ -186,7 +186,7 @@ def _three(
     return a + b + c, two * (c - a), two * two * (a + c), va + vb + vc, two * (vc - va)
 
 
-@kernel(fast=True, inline=True)
+@kernel(fast=True)
 def _sample(values: F4, p: int, center: float, distance: int) -> tuple[Any, Any]:
     """Return the weight of a sample, and by that how much it differs from the centre."""
     v = values[p] - center

@@ -39,7 +39,7 @@ def watershed(heights: HeightMap, graph: SurfaceGraph, concave: bool) -> tuple[I
     return labels, _flat_parts(plane_id, spans, links, barrier, labels, n, part)
 
 
-@kernel(leaf=True)
+@kernel
 def _concave_edges(concavity: U1, spans: I4, strong: int, barrier: U1, stack: I4) -> None:
     """Mark strong concave edges, and weaker ones that continue them (hysteresis, Canny 1986)."""
     rows, columns = concavity.shape
@@ -65,7 +65,7 @@ def _concave_edges(concavity: U1, spans: I4, strong: int, barrier: U1, stack: I4
                     top += 1
 
 
-@kernel(leaf=True)
+@kernel
 def _is_ridge(concavity: U1, i: int, j: int) -> bool:
     """Whether an edge falls off on two opposite sides; inside a bowl it does not."""
     rows, columns = concavity.shape
@@ -135,26 +135,11 @@ def _flat_parts(
     return n
 
 
-@kernel(leaf=True)
+@kernel
 def _root(parent: I4, k: int) -> int:
     while parent[k] != k:
         k = parent[k]
     return k
-
-
-@kernel(leaf=True)
-def _neighbour(p: int, d: int, columns: int, links: U1) -> int:
-    """Return the linked neighbour of cell ``p`` in direction ``d``, or -1.
-
-    No link leads over the border of the image.
-    """
-    if d == 0:
-        return p + 1 if links[p] & RIGHT else -1
-    if d == 1:
-        return p + columns if links[p] & DOWN else -1
-    if d == 2:
-        return p - 1 if p > 0 and links[p - 1] & RIGHT else -1
-    return p - columns if p >= columns and links[p - columns] & DOWN else -1
 
 
 @kernel
@@ -173,8 +158,11 @@ def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4, following: I4
             if flat[p] <= 0:
                 continue
             for d in range(4):
-                q = _neighbour(p, d, columns, flat_links)
-                if q >= 0 and flat[q] <= 0:
+                step, way = (columns if d & 1 else 1), (DOWN if d & 1 else RIGHT)
+                q = p + step if d < 2 else p - step
+                if not (flat_links[p] & way if d < 2 else q >= 0 and flat_links[q] & way):
+                    continue
+                if flat[q] <= 0:
                     if head[0] < 0:
                         head[0] = p
                     else:
@@ -189,8 +177,11 @@ def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4, following: I4
             continue
         head[now] = following[p]
         for d in range(4):
-            q = _neighbour(p, d, columns, flat_links)
-            if q < 0 or flat[q] > 0:
+            step, way = (columns if d & 1 else 1), (DOWN if d & 1 else RIGHT)
+            q = p + step if d < 2 else p - step
+            if not (flat_links[p] & way if d < 2 else q >= 0 and flat_links[q] & way):
+                continue
+            if flat[q] > 0:
                 continue
             flat[q] = flat[p]
             level = max(now, flat_edge[q] // BUCKET_DEG)
@@ -201,7 +192,7 @@ def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4, following: I4
             tail[level], following[q] = q, -1
 
 
-@kernel(leaf=True)
+@kernel
 def relabel(labels: I4, spans: I4, names: I4) -> None:
     """Give labels (rows, columns) their new names (n,), in place; that of 0 is 0."""
     for i in range(labels.shape[0]):
@@ -209,7 +200,7 @@ def relabel(labels: I4, spans: I4, names: I4) -> None:
             labels[i, j] = names[labels[i, j]]
 
 
-@kernel(leaf=True)
+@kernel
 def relabel_above(labels: I4, spans: I4, height: F4, label: int, level: float, name: int) -> None:
     """Give the cells of a label that are higher than a level, metres, another name, in place."""
     for i in range(labels.shape[0]):

@@ -126,7 +126,7 @@ def _cuts_of(grid: DepthGrid, outlines: Outlines, p: int, side: F8) -> Bool:
     return cut
 
 
-@kernel(leaf=True)
+@kernel
 def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -> float:
     """Return by how much both sides step aside below a band, metres; 0 if neither does enough."""
     both = most = 0.0
@@ -149,20 +149,20 @@ def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -
     return both if most >= STEP_M else 0.0
 
 
-@kernel(leaf=True)
+@kernel
 def _second(end: F4, k: int, way: float) -> float:
     """Return the second largest of four values: noise makes spurs and dents one band high."""
     a, b, c, d = way * end[k], way * end[k + 1], way * end[k + 2], way * end[k + 3]
     return float(max(min(max(a, b), max(c, d)), min(a, b), min(c, d)))
 
 
-@kernel(leaf=True)
+@kernel
 def _slope_of(end: F4, k: int) -> float:
     """Return the change of four values from one to the next."""
     return float((end[k + 3] + end[k + 2] - end[k + 1] - end[k]) / 4)
 
 
-@kernel(leaf=True)
+@kernel
 def _is_free(grid: DepthGrid, at: int, sign: float, side: F8) -> bool:
     """Whether nothing nearer is beside a cell, left (-1) or right (1)."""
     inv_depth = grid.inverse_depth
