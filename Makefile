@@ -7,7 +7,7 @@ SCREENS := chromium chromium-driver mesa-vulkan-drivers
 DEMO := demo
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test odd lint format bench model parts lock clean
+.PHONY: help setup demo test odd faults lint format bench model parts lock clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -27,7 +27,7 @@ setup: .venv/ready ## make the virtual environment .venv from the lock file
 	@touch $@
 
 demo: setup ## simulate a recording, process it, and say where the results lie
-	$(BIN)/shapecat simulate $(DEMO)/tabletop.mcap --scene tabletop --frames 60 --seed 3
+	$(BIN)/shapecat simulate $(DEMO)/tabletop.mcap --scene tabletop --frames 60 --seed 3 --overwrite
 	$(BIN)/shapecat process $(DEMO)/tabletop.mcap --out $(DEMO)/out --overwrite
 
 test: setup ## run all tests
@@ -38,6 +38,10 @@ test: setup ## run all tests
 
 odd: setup ## process damaged and odd recordings, print what became of each
 	$(BIN)/python -m tests.odd
+
+faults: setup ## interrupt, kill and starve the command at random, print what held
+	@$(BIN)/python -m shapecat.rehearsal
+	$(BIN)/python -m tests.faults --count 200 --minutes 13
 
 lint: setup ## check style and types
 	$(BIN)/ruff format --check .

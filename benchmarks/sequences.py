@@ -25,8 +25,8 @@ from benchmarks.measure import markdown
 from shapecat.arrays import F8, U1
 from shapecat.evaluation.metrics import expected_calibration_error
 from shapecat.pipeline import process
-from shapecat.runs.corrections import read_track_table
 from shapecat.runs.jobs import Job
+from shapecat.runs.track_table import read_track_table
 from shapecat.simulation import simulate
 from shapecat.simulation.scenes import SceneKind
 from shapecat.tracking.fusion import fuse, view_weights

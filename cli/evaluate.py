@@ -39,7 +39,10 @@ def evaluate(
     """
     from shapecat.evaluation import evaluate_folder, format_report
     from shapecat.evaluation.page import write_page
+    from shapecat.files import require_writable
 
+    if page is not None:
+        require_writable(page)
     with progress_bars() as bars:
         report = evaluate_folder(dataset, model, baselines=baselines, observe=bars)
     if page is not None:

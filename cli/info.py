@@ -5,27 +5,51 @@ from typing import Any
 
 import click
 
-from .options import ANY_PATH, json_option
+from shapecat.errors import ShapecatError
+
+from .options import ANY_PATH, array_option
 from .render import print_json, print_table
 
 
 @click.command()
 @click.argument("recordings", nargs=-1, required=True, type=ANY_PATH)
-@json_option
-def info(*, recordings: tuple[Path, ...], as_json: bool) -> None:
-    """Show what a recording holds, and which cloud streams can be processed.
+@array_option
+@click.pass_context
+def info(ctx: click.Context, /, *, recordings: tuple[Path, ...], as_json: bool) -> None:
+    """Show what recordings hold, and which depth streams can be processed.
+
+    A folder is searched as by `shapecat process`. With --json, an array of one object per
+    recording is printed.
 
     \b
     shapecat info lab.mcap
+    shapecat info /data/recordings
     """
-    from shapecat.recordings.overview import describe_recording
+    from shapecat.batch.finding import find_recordings
 
-    overviews = [describe_recording(path) for path in recordings]
+    paths = [Path(source.path) for source in find_recordings(list(map(str, recordings))).kept]
+    overviews, codes = [], []
+    for path in paths:
+        overview, code = _describe(path)
+        codes.append(code)
+        if overview is not None:
+            overviews.append(overview)
+            if not as_json:
+                _show(overview)
     if as_json:
         print_json(overviews)
-        return
-    for overview in overviews:
-        _show(overview)
+    ctx.exit(0 if not any(codes) else 1 if not all(codes) else codes[0])
+
+
+def _describe(path: Path) -> tuple[dict[str, Any] | None, int]:
+    """Return what a recording holds, or print why it cannot be read; and the exit code."""
+    from shapecat.recordings.overview import describe_recording
+
+    try:
+        return describe_recording(path), 0
+    except ShapecatError as error:
+        click.echo(f"Error: {error}", err=True)
+        return None, error.exit_code
 
 
 def _show(overview: dict[str, Any]) -> None:

@@ -9,12 +9,14 @@ import click
 
 from shapecat import __version__
 from shapecat.errors import ShapecatError
+from shapecat.stopping import Stopped, heeding_signals
 
 from .annotate import annotate
 from .evaluate import evaluate
 from .export import export
 from .info import info
 from .learn import learn
+from .options import verbose_option
 from .process import process
 from .report import report
 from .scene import scene
@@ -28,13 +30,16 @@ class _Commands(click.Group):
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
-            return super().invoke(ctx)
+            with heeding_signals():
+                return super().invoke(ctx)
         except ShapecatError as error:
             click.echo(f"Error: {error}", err=True)
             ctx.exit(error.exit_code)
-        except KeyboardInterrupt:
-            click.echo("interrupted; run the same command again to go on", err=True)
-            ctx.exit(130)
+        except Stopped as stopped:
+            kept = ctx.invoked_subcommand == "process"
+            how = "what is done is kept: run the same command again to go on" if kept else ""
+            click.echo("; ".join(filter(None, ("stopped", how))), err=True)
+            ctx.exit(stopped.exit_code)
 
     def list_commands(self, ctx: click.Context) -> list[str]:  # noqa: ARG002  click's signature
         return list(self.commands)  # in the order of use, not of the alphabet
@@ -42,8 +47,8 @@ class _Commands(click.Group):
 
 @click.group(cls=_Commands, context_settings={"help_option_names": ["-h", "--help"]})
 @click.version_option(__version__)
-@click.option("-v", "--verbose", is_flag=True, help="Log what is done, on stderr.")
-def main(*, verbose: bool) -> None:
+@verbose_option
+def main() -> None:
     """Turn robot recordings into reviewed, labelled 3D objects.
 
     \b
@@ -53,8 +58,7 @@ def main(*, verbose: bool) -> None:
     """
     # The system's allocator gives memory back that long recordings no longer need.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
-    level = logging.INFO if verbose else logging.ERROR
-    logging.basicConfig(level=level, stream=sys.stderr, format="%(levelname)s %(message)s")
+    logging.basicConfig(level=logging.ERROR, stream=sys.stderr, format="%(levelname)s %(message)s")
 
 
 for _command in (

@@ -1,13 +1,36 @@
 """Options that several commands share, each as one decorator."""
 
+import logging
+import math
 from pathlib import Path
+from typing import Any
 
 import click
 
 EXISTING = click.Path(exists=True, path_type=Path)
 ANY_PATH = click.Path(path_type=Path)
 
+
+class _Seconds(click.FloatRange):
+    """A time after the start of a recording: neither negative nor NaN."""
+
+    name = "seconds"
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        seconds: float = super().convert(value, param, ctx)
+        if not math.isfinite(seconds):
+            self.fail(f"{value} is not a number of seconds", param, ctx)
+        return seconds
+
+
+SECONDS = _Seconds(min=0)
+
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+array_option = click.option(
+    "--json", "as_json", is_flag=True, help="Print a JSON array, an object per recording."
+)
 config_option = click.option(
     "--config", type=ANY_PATH, help="Settings in TOML; unknown names are refused."
 )
@@ -20,5 +43,20 @@ set_option = click.option(
 )
 model_option = click.option(
     "--model", type=ANY_PATH, help="Model file; the default model is shipped with the package."
+)
+
+
+def _be_verbose(_ctx: click.Context, _param: click.Parameter, value: bool) -> None:  # noqa: FBT001  click's signature
+    if value:
+        logging.getLogger("shapecat").setLevel(logging.INFO)
+
+
+verbose_option = click.option(
+    "-v",
+    "--verbose",
+    is_flag=True,
+    expose_value=False,
+    callback=_be_verbose,
+    help="Log what is done, on stderr.",
 )
 seed_option = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)

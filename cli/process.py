@@ -1,5 +1,6 @@
 """``shapecat process``."""
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -7,9 +8,11 @@ from typing import Any
 
 import click
 
-from .options import config_option, json_option, model_option, set_option
+from shapecat.stopping import Stopped
+
+from .options import SECONDS, array_option, config_option, model_option, set_option, verbose_option
 from .progress import KINDS, Progress, describe_plan, open_progress
-from .render import count_words, print_json, print_table
+from .render import count_words, missed_words, print_json, print_table
 
 _MOST_ROWS = 100
 
@@ -26,8 +29,8 @@ _MOST_ROWS = 100
     help="Where up is: from transforms, an IMU, or a vector in the sensor frame.",
 )
 @click.option("--fixed-frame", metavar="F", help="Frame in which things stand still.")
-@click.option("--start", "start_s", type=float, help="Seconds after the start of the recording.")
-@click.option("--end", "end_s", type=float, help="Seconds after the start of the recording.")
+@click.option("--start", "start_s", type=SECONDS, help="Seconds after the start of the recording.")
+@click.option("--end", "end_s", type=SECONDS, help="Seconds after the start of the recording.")
 @click.option("--every", type=click.IntRange(1), default=1, help="Read only every Nth frame.")
 @click.option(
     "--jobs",
@@ -53,11 +56,18 @@ _MOST_ROWS = 100
 )
 @click.option("--no-mcap", is_flag=True, help="Do not write annotated.mcap.")
 @click.option("--no-rrd", is_flag=True, help="Do not write review.rrd.")
-@click.option("--overwrite", is_flag=True, help="Replace results that are there.")
+@click.option(
+    "--overwrite",
+    is_flag=True,
+    help="Replace the results of an earlier run; corrected labels are carried over by place.",
+)
+@click.option("--discard-labels", is_flag=True, help="With --overwrite: drop corrected labels.")
+@click.option("--no-fsync", is_flag=True, help="Do not wait for the disk; for scratch folders.")
+@verbose_option
 @model_option
 @config_option
 @set_option
-@json_option
+@array_option
 @click.pass_context
 def process(
     ctx: click.Context,
@@ -73,6 +83,7 @@ def process(
     executor: str,
     scheduler: str | None,
     shard: str | None,
+    no_fsync: bool,
     progress: str,
     as_json: bool,
     **choices: Any,
@@ -94,8 +105,12 @@ def process(
     from shapecat.batch import exit_code
     from shapecat.batch.plans import plan_batch
     from shapecat.config import load_settings
+    from shapecat.files import FSYNC
     from shapecat.runs.jobs import Job
 
+    _require_range(choices["start_s"], choices["end_s"])
+    if no_fsync:
+        os.environ[FSYNC] = "0"  # which worker processes inherit
     job = Job(
         source=Path(),
         folder=Path(),
@@ -112,6 +127,13 @@ def process(
     else:
         _print_closing(batch.tasks, outcomes)
     ctx.exit(exit_code(outcomes))
+
+
+def _require_range(start_s: float | None, end_s: float | None) -> None:
+    """Refuse a part of the recording that is none."""
+    if end_s is not None and end_s <= (start_s or 0):
+        msg = f"--end {end_s:g} is not after --start {start_s or 0:g}"
+        raise click.UsageError(msg)
 
 
 def _run(
@@ -137,9 +159,12 @@ def _run(
 
 @contextmanager
 def _closing(executor: Any) -> Iterator[Any]:
-    """Let the workers end when all is done; kill them when it is not, as after Ctrl-C."""
+    """Let the workers end when all is done; have them put their work down after a signal."""
     try:
         yield executor
+    except Stopped:
+        getattr(executor, "stop", executor.terminate)()  # Dask and Ray have no way to ask
+        raise
     except BaseException:
         executor.terminate()
         raise
@@ -151,24 +176,33 @@ def _print_closing(tasks: Sequence[Any], outcomes: Sequence[Any]) -> None:
     ended = {outcome.job.folder: outcome for outcome in outcomes}
     ordered = [ended[task.job.folder] for task in tasks if task.job.folder in ended]
     complete = [outcome for outcome in ordered if outcome.summary]
-    shown = ordered if len(ordered) <= _MOST_ROWS else [o for o in ordered if not o.summary]
-    if complete or len(tasks) > 1:
+    if complete and len(complete) <= _MOST_ROWS:
         columns = ("recording", "frames", "seconds", "tracks", "results")
-        print_table(columns, [_row(outcome) for outcome in shown])
+        print_table(columns, [_row(outcome) for outcome in complete])
+    for outcome in complete:
+        if outcome.summary.corrections is not None:
+            _print_corrections(outcome)
     if len(tasks) > 1:
         frames = sum(o.summary.counts["frames"] for o in complete)
         failed = len(ordered) - len(complete)
         click.echo(f"{len(complete)} complete, {failed} failed, {frames:,} frames")
 
 
+def _print_corrections(outcome: Any) -> None:
+    """Say what became of the labels that a person gave to the results that were replaced."""
+    found = outcome.summary.corrections
+    done, missed = len(found["transferred"]), found["not_transferred"]
+    name = outcome.job.name.rpartition("/")[2]
+    kept = f"; the others are in {outcome.summary.folder}/tracks.previous.csv" if missed else ""
+    text = f"{name}: carried over {done} of {done + len(missed)} corrected labels{kept}"
+    click.echo("\n".join((text, *map(missed_words, missed))), err=True)
+
+
 def _row(outcome: Any) -> tuple[Any, ...]:
     summary = outcome.summary
-    name = outcome.job.name.rpartition("/")[2]
-    if summary is None:
-        return (name, "", "failed", outcome.message, "")
     counts = summary.counts
     return (
-        name,
+        outcome.job.name.rpartition("/")[2],
         counts["frames"],
         round(summary.seconds, 1) if summary.fresh else "was complete",
         count_words(counts["tracks"]),

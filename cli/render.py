@@ -7,6 +7,8 @@ from typing import Any
 
 import click
 
+from shapecat import stopping
+
 PHASES = {
     "simulate": "simulating",
     "perceive": "finding and categorizing objects",
@@ -26,11 +28,15 @@ class Bars:
     def __init__(self, progress: Any) -> None:
         self._progress = progress
         self._tasks: dict[str, Any] = {}
+        self._told = False
 
     def __call__(self, phase: str, done: int, total: int | None) -> None:
-        """Show how far a phase has come."""
+        """Show how far a phase has come; end the work here if a signal has asked for it."""
+        stopping.check()
         if phase == "compile":
-            click.echo(COMPILING, err=True)
+            if not self._told:
+                self._told = True
+                click.echo(COMPILING, err=True)
             return
         if phase not in self._tasks:
             name = PHASES.get(phase, phase)
@@ -80,6 +86,11 @@ def print_table(
     for row in rows:
         table.add_row(*map(str, row))
     Console(width=None if Console().is_terminal else 200).print(table)
+
+
+def missed_words(missed: Mapping[str, Any]) -> str:
+    """Return which label has not found its object, and why."""
+    return f"  track {missed['old_track']}, {missed['label']}: {missed['reason']}"
 
 
 def count_words(counts: Mapping[str, int]) -> str:

@@ -30,6 +30,7 @@ from .render import progress_bars
     "--frames", type=click.IntRange(1), default=90, show_default=True, help="30 per second."
 )
 @click.option("--clouds", is_flag=True, help="Write PointCloud2 instead of depth images.")
+@click.option("--overwrite", is_flag=True, help="Replace a recording that is there.")
 @seed_option
 def simulate(
     *,
@@ -39,6 +40,7 @@ def simulate(
     sensor: Any,
     frames: int,
     clouds: bool,
+    overwrite: bool,
     seed: int,
 ) -> None:
     """Make a recording of simulated objects, with the truth beside it.
@@ -49,9 +51,13 @@ def simulate(
     shapecat simulate demo.mcap --scene clutter --frames 60 --seed 3
     """
     from shapecat.simulation import simulate as write_simulation
+    from shapecat.simulation.recorder import written_paths
 
-    if container is None:
-        container = {".bag": "ros1", "": "ros2"}.get(out.suffix, "mcap")
+    container = _format_of(out, container)
+    there = [path for path in written_paths(out, container) if path.exists()]
+    if there and not overwrite:
+        msg = f"{there[0]} is there already; --overwrite replaces it"
+        raise click.UsageError(msg)
     with progress_bars() as bars:
         path = write_simulation(
             out,
@@ -64,3 +70,21 @@ def simulate(
             observe=bars,
         )
     click.echo(path)
+
+
+_SUFFIXES = {"mcap": ".mcap", "ros1": ".bag", "ros2": ""}
+
+
+def _format_of(out: Path, wanted: str | None) -> Any:
+    """Return the format that the suffix or the option names, if they do not contradict."""
+    named = next((name for name, suffix in _SUFFIXES.items() if suffix == out.suffix), None)
+    if named is None:
+        stem = out.with_suffix("").name
+        msg = f"{out.name}: name it {stem}.mcap, {stem}.bag, or {stem} for a ROS 2 folder"
+        raise click.UsageError(msg)
+    if wanted in {None, named} or not out.suffix:
+        return wanted or named
+    right = out.with_suffix(_SUFFIXES[wanted]).name
+    kind = "a folder" if wanted == "ros2" else "a file"
+    msg = f"--format {wanted} writes {kind}: name it {right}, not {out.name}"
+    raise click.UsageError(msg)

@@ -1,27 +1,49 @@
 """``shapecat view``."""
 
+import subprocess
+from contextlib import suppress
 from pathlib import Path
 
 import click
+
+from shapecat import stopping
 
 from .options import ANY_PATH
 
 
 @click.command()
 @click.argument("run", type=ANY_PATH)
+@click.option("--web", is_flag=True, help="Serve it to a browser on this machine until Ctrl-C.")
 @click.option("--screenshot", type=ANY_PATH, metavar="PNG", help="Draw it to a file, no window.")
-def view(*, run: Path, screenshot: Path | None) -> None:
+def view(*, run: Path, web: bool, screenshot: Path | None) -> None:
     """Open the review of a run in the Rerun viewer.
 
     \b
     shapecat view results/lab
+    shapecat view results/lab --web
     shapecat view results/lab --screenshot lab.png
     """
+    from shapecat.files import require_writable
     from shapecat.outputs.review_viewer import open_viewer, take_screenshot
 
     review = run / "review.rrd" if run.is_dir() else run
-    if screenshot is None:
-        open_viewer(review)
-    else:
+    if screenshot is not None:
+        require_writable(screenshot)
         take_screenshot(review, screenshot)
         click.echo(screenshot)
+    elif web:
+        _serve(review)
+    else:
+        open_viewer(review)
+
+
+def _serve(review: Path) -> None:
+    """Serve until the viewer ends or a signal comes."""
+    from shapecat.outputs.review_viewer import serve_viewer
+
+    with serve_viewer(review) as (address, viewer):
+        click.echo(address)
+        while viewer.poll() is None:
+            stopping.check()
+            with suppress(subprocess.TimeoutExpired):
+                viewer.wait(0.1)

@@ -1,7 +1,28 @@
-"""``python -m shapecat``."""
+"""``shapecat`` and ``python -m shapecat``: the command line."""
 
+import signal
 from importlib import import_module
+from typing import Any
+
+from shapecat.stopping import leave
+
+
+def run() -> None:
+    """Run the command line; a signal that comes before it listens ends the process."""
+    _handle(leave)
+    try:
+        # By name: type checkers see this package as the top-level folder cli.
+        import_module("shapecat.cli.main").main(prog_name="shapecat")
+    finally:
+        _handle(signal.SIG_IGN)  # the exit code is decided; Python would restore the default
+
+
+def _handle(handler: Any) -> None:
+    """Set the handler of the signals that ask to stop, unless they are ignored already."""
+    for signum in (signal.SIGINT, signal.SIGTERM):
+        if signal.getsignal(signum) is not signal.SIG_IGN:
+            signal.signal(signum, handler)
+
 
 if __name__ == "__main__":
-    # By name: type checkers see this package as the top-level folder cli.
-    import_module("shapecat.cli.main").main(prog_name="shapecat")
+    run()

@@ -1,34 +1,81 @@
-"""Files and folders that appear complete or not at all, and locks that end with their process."""
+"""Files and folders that appear complete or not at all, and locks that end with their process.
 
+What appears under its name lies on the disk: it is flushed before it is renamed, and its folder
+after, so that a power cut leaves no complete name with incomplete content. ``SHAPECAT_FSYNC=0``
+in the environment leaves that out, for scratch.
+"""
+
+import errno
 import fcntl
 import os
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from shapecat.errors import OutputError
 
-__all__ = ["complete_folder", "input_size", "lock", "partial_folder", "replacing"]
+__all__ = [
+    "FSYNC",
+    "complete_folder",
+    "flush",
+    "input_files",
+    "input_size",
+    "lock",
+    "partial_path",
+    "replacing",
+    "require_writable",
+]
+
+FSYNC = "SHAPECAT_FSYNC"
+"""The variable of the environment: worker processes inherit it."""
 
 
-def partial_folder(folder: Path) -> Path:
-    """Return the hidden folder that a run works in before it takes its name."""
-    return folder.with_name(f".{folder.name}.partial")
+def partial_path(path: Path) -> Path:
+    """Return the hidden name of a file or folder before it is complete."""
+    return path.with_name(f".{path.name}.partial")
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a hidden path beside ``path`` that takes its name when the block succeeds."""
-    hidden = path.with_name(f".{path.name}.partial")
+    """Give a hidden path beside ``path`` that takes its name when the block succeeds.
+
+    Raises
+    ------
+    OutputError : it cannot be written.
+    """
+    hidden = partial_path(path)
     try:
         yield hidden
+        flush(hidden)
         hidden.replace(path)
+        flush(path.parent)
     except OSError as error:
         msg = f"{path}: cannot be written: {error.strerror or error}"
         raise OutputError(msg) from error
     finally:
-        hidden.unlink(missing_ok=True)
+        with suppress(OSError):
+            hidden.unlink(missing_ok=True)
+
+
+def require_writable(path: Path) -> None:
+    """Make the folders above a file that is to be written, and see that it can be.
+
+    Raises
+    ------
+    OutputError : it cannot, which is better known before the work than after it.
+    """
+    hidden = partial_path(path)
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        hidden.touch()
+        hidden.unlink()
+    except OSError as error:
+        msg = f"{path}: cannot be written: {error.strerror or error}"
+        raise OutputError(msg) from error
+    if path.is_dir():
+        msg = f"{path}: cannot be written: is a folder"
+        raise OutputError(msg)
 
 
 @contextmanager
@@ -37,11 +84,34 @@ def complete_folder(folder: Path) -> Iterator[Path]:
 
     Whatever a kill left half-made of it is discarded first.
     """
-    hidden = partial_folder(folder)
+    hidden = partial_path(folder)
     shutil.rmtree(hidden, ignore_errors=True)
     hidden.mkdir(parents=True)
     yield hidden
+    for file in hidden.iterdir():
+        flush(file)
+    flush(hidden)
     hidden.rename(folder)
+    flush(folder.parent)
+
+
+def flush(path: Path) -> None:
+    """Wait until a file, or the names in a folder, lie on the disk.
+
+    Raises
+    ------
+    OSError : the disk is full or failing. A file system that cannot flush says nothing.
+    """
+    if os.environ.get(FSYNC) == "0":
+        return
+    number = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(number)
+    except OSError as error:
+        if error.errno not in {errno.EINVAL, errno.ENOTSUP}:
+            raise
+    finally:
+        os.close(number)
 
 
 def lock(folder: Path) -> int | None:
@@ -62,7 +132,11 @@ def lock(folder: Path) -> int | None:
     return held
 
 
+def input_files(path: Path) -> list[Path]:
+    """Return a file itself, or the files of a folder by name."""
+    return [f for f in sorted(path.iterdir()) if f.is_file()] if path.is_dir() else [path]
+
+
 def input_size(path: Path) -> int:
     """Return the bytes of a file, or of the files of a folder."""
-    files = path.iterdir() if path.is_dir() else [path]
-    return sum(file.stat().st_size for file in files if file.is_file())
+    return sum(file.stat().st_size for file in input_files(path))

@@ -5,39 +5,59 @@ nothing of time; track is cheap and knows nothing of points; annotate knows noth
 Each can be run again alone.
 """
 
+import logging
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
 import pyarrow as pa
 
+from shapecat import stopping
 from shapecat.depth_fusion import RecentFrames
 from shapecat.description import DESCRIPTOR_NAMES
-from shapecat.errors import NoStreamError, OutputError
+from shapecat.errors import NoStreamError, OutputError, RecordingError
 from shapecat.executors.order import Processes, read_ahead
-from shapecat.jit import CompileClock, compile_clock
 from shapecat.learning import Categorizer, load_model
-from shapecat.outputs.rereading import with_clouds
+from shapecat.outputs.rereading import open_source, with_clouds
 from shapecat.perception import Perceiver, View
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
 from shapecat.recordings.gravity import Upright
-from shapecat.runs.corrections import TrackLabel, adopt_labels, read_labels
-from shapecat.runs.folder import read_run, staged, sweep, write_run
-from shapecat.runs.jobs import Job, Summary, describe_run, resume, same_work, summarize
-from shapecat.runs.labels import read_labelled_frames
-from shapecat.runs.shown import read_shown_frames
-from shapecat.runs.tables import (
-    FrameRow,
-    PerceptionTables,
-    count_rows,
-    discard_segments,
-    read_row_groups,
-    release_memory,
+from shapecat.rehearsal import compile_all
+from shapecat.runs.corrections import (
+    TrackLabel,
+    adopt_labels,
+    read_labels,
 )
+from shapecat.runs.folder import (
+    OUTPUTS,
+    made_by_run,
+    read_run,
+    recover,
+    staged,
+    sweep,
+    write_run,
+)
+from shapecat.runs.identity import ContentDigest, file_stats, same_content
+from shapecat.runs.jobs import (
+    Job,
+    Summary,
+    describe_run,
+    has_work,
+    identify,
+    keep_labels,
+    require_unchanged,
+    resume,
+    same_options,
+    summarize,
+)
+from shapecat.runs.label_transfer import Transfer, transfer_labels
+from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.perceived import FrameRow, PerceptionTables, discard_segments
+from shapecat.runs.shown import read_shown_frames
+from shapecat.runs.tables import count_rows, read_row_groups, release_memory
 from shapecat.runs.tracks import track_run
 from shapecat.types import Frame, LabelledFrame, ShownFrame
 
@@ -46,6 +66,8 @@ __all__ = ["Observer", "annotate", "annotate_again", "perceive_all", "process", 
 _Shown = TypeVar("_Shown", LabelledFrame, ShownFrame)
 Observer = Callable[[str, int, int | None], None]
 """Called with the name of the phase, the frames done, and how many there are, if known."""
+
+_log = logging.getLogger(__name__)
 
 _AHEAD = 4
 """Frames read while one is written."""
@@ -70,18 +92,25 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
 
     Raises
     ------
-    RecordingError, NoStreamError, ModelError, OutputError : with nothing left behind.
+    RecordingError, NoStreamError, ModelError, OutputError : what was perceived before is kept.
+    Stopped : a signal has asked for it; the frames in work are finished and kept.
     """
     begun = time.perf_counter()
-    with open_recording(job.source) as recording, _compile_clock(observe, cores) as compiled:
+    with open_recording(job.source) as recording, ContentDigest(job.source) as content:
         categorizer = load_model(job.model)
         categorizer.require_descriptor(DESCRIPTOR_NAMES)
         run = describe_run(job, categorizer)
         run["options"]["topics"] = [s.topic for s in choose_streams(recording, job.topics)]
-        if job.folder.exists() and not job.overwrite:
-            return _finished(job, recording, run, observe)
-        with staged(job.folder) as folder:
-            run = resume(folder, run)
+        _log.info(
+            "%s: %s, model %s", job.name, " ".join(run["options"]["topics"]), job.model or "default"
+        )
+        recover(job.folder)
+        if made_by_run(job.folder) is not None and not job.overwrite:
+            return _finished(job, recording, run, content, observe)
+        with staged(job.folder, worth_keeping=has_work) as folder:
+            run = resume(folder, run, job.source, content.result)
+            compiling_s = compile_all(lambda: observe("compile", 0, None), cores=cores)
+            content.start()
             earlier = sum(run["seconds"].values())
             _once(
                 "perceive",
@@ -91,10 +120,14 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
                     recording, folder, run, job, categorizer, observe, cores=cores
                 ),
             )
+            identify(run, content)
+            write_run(folder, run)
             discard_segments(folder)
             _once("track", folder, run, lambda: track(folder, run, job))
+            _once("labels", folder, run, lambda: keep_labels(folder, run, job))
             annotate(folder, recording, run, observe, cores=cores)
-            run["seconds"]["compile"] = compiled.seconds
+            require_unchanged(folder, run, job.source)
+            run["seconds"]["compile"] = compiling_s
             run["seconds"]["total"] = earlier + time.perf_counter() - begun
             write_run(folder, run)
     return summarize(job, run)
@@ -103,38 +136,27 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
 def _once(phase: str, folder: Path, run: dict[str, Any], work: Callable[[], None]) -> None:
     """Do a phase unless it is done, and note in run.json that it is, and how long it took."""
     if phase in run["seconds"]:
+        _log.info("%s: %s was done before", folder, phase)
         return
+    _log.info("%s: %s begins", folder, phase)
     begun = time.perf_counter()
     work()
     release_memory()
     run["seconds"][phase] = time.perf_counter() - begun
+    _log.info("%s: %s took %.2f s", folder, phase, run["seconds"][phase])
     write_run(folder, run)
 
 
-@contextmanager
-def _compile_clock(observe: Observer, cores: int) -> Iterator[CompileClock]:
-    """Measure compilation, which happens once per installation, and let the user know of it.
-
-    With several cores another process takes a share of it.
-    """
-    with ExitStack() as stack:
-
-        def begin() -> None:
-            observe("compile", 0, None)
-            if cores > 1:
-                from shapecat.rehearsal import compile_ahead  # noqa: PLC0415  once per installation
-
-                stack.enter_context(compile_ahead())
-
-        yield stack.enter_context(compile_clock(begin))
-
-
 def _finished(
-    job: Job, recording: Recording, planned: dict[str, Any], observe: Observer
+    job: Job,
+    recording: Recording,
+    planned: dict[str, Any],
+    content: ContentDigest,
+    observe: Observer,
 ) -> Summary:
     """Return what a complete folder holds, after removing or finishing what a kill left of it."""
     run = read_run(job.folder)
-    if not same_work(run, planned):
+    if not (same_options(run, planned) and same_content(run["input"], job.source, content.result)):
         msg = (
             f"{job.folder}: holds the results of another input, model or settings; "
             "choose another --out, or --overwrite it"
@@ -158,6 +180,7 @@ def perceive_all(
     """Write frames, detections and planes, frame by frame in flat memory."""
     skipped: Counter[str] = Counter()
     source, total = _select(recording, run["options"], skipped)
+    source = stopping.until_asked(_readable(source, job))
     recent = RecentFrames(job.settings.detection.fuse_frames)
     count = 0
     with (
@@ -182,6 +205,7 @@ def perceive_all(
             count += 1
             tables.write(perception, row)
             observe("perceive", count, total)
+        stopping.check()
     if not count:
         reasons = ", ".join(f"{n} {reason}" for reason, n in skipped.items()) or "none in range"
         msg = f"{job.source}: no usable frame on {', '.join(run['options']['topics'])} ({reasons})"
@@ -194,6 +218,15 @@ def perceive_all(
     run["warnings"] = [*recording.warnings, *upright.warnings, *recent.warnings()]
 
 
+def _readable(source: Iterator[Frame], job: Job) -> Iterator[Frame]:
+    """Yield frames; what a failing disk raises is an error of the recording, not of the results."""
+    try:
+        yield from source
+    except OSError as error:
+        msg = f"{job.source}: cannot be read: {error.strerror or error}"
+        raise RecordingError(msg) from error
+
+
 def _perceived(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
     """Yield what the tables say of up, frames beside planes."""
     frames = read_row_groups(folder / "frames.parquet", ["topic", "frame", "up", "up_given"])
@@ -202,7 +235,9 @@ def _perceived(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
 
 def track(folder: Path, run: dict[str, Any], job: Job) -> None:
     """Follow the detections over time and fuse their posteriors: tracks.parquet, tracks.csv."""
-    run["counts"]["tracks"] = track_run(folder, job.settings.tracking, run["model"]["categories"])
+    run["counts"]["tracks"] = track_run(
+        folder, job.settings.tracking, run["model"]["categories"], work=run["work"]
+    )
 
 
 def annotate(
@@ -255,23 +290,50 @@ def annotate(
         _once("review.rrd", folder, run, write_rrd)
 
 
-def annotate_again(folder: Path, labels: Path | None, observe: Observer = _ignore) -> None:
+def annotate_again(
+    folder: Path,
+    labels: Path | None,
+    observe: Observer = _ignore,
+    *,
+    by_place: bool = False,
+    recording: Path | None = None,
+) -> Transfer | None:
     """Write the outputs of a finished run again, with the labels a person has corrected.
+
+    Parameters
+    ----------
+    labels : the corrected table; that of the run itself by default.
+    by_place : the table, or run folder, is another run's: its labels go to the objects in the
+        same places.
+    recording : where the recording is now; where it was processed by default.
+
+    Returns
+    -------
+    What became of the labels that were looked for by place.
 
     Raises
     ------
     OutputError : the folder is not a finished run, or the table of labels does not fit it.
     RecordingError : the recording is no longer there.
     """
-    run = read_run(folder)
-    source = Path(run["input"]["path"])
-    adopt_labels(labels or folder / "tracks.csv", folder)
-    for output in ("annotated.mcap", "review.rrd"):
-        run["seconds"].pop(output, None)
-    write_run(folder, run)  # after a kill, the next run writes what is missing
-    with open_recording(source) as recording:
-        annotate(folder, recording, run, observe)
+    with open_source(read_run(folder), recording) as source:
+        transfer = _adopt(labels, folder, by_place=by_place)
+        run = read_run(folder)
+        run["input"] |= {"path": str(source.path.resolve()), "files": file_stats(source.path)}
+        for output in OUTPUTS:
+            run["seconds"].pop(output, None)
+        write_run(folder, run)  # after a kill, the next run writes what is missing
+        annotate(folder, source, run, observe)
     write_run(folder, run)
+    return transfer
+
+
+def _adopt(labels: Path | None, folder: Path, *, by_place: bool) -> Transfer | None:
+    """Make the labels of a table those of a run; return what became of those looked for."""
+    if by_place and labels is not None:
+        return transfer_labels(labels, folder)
+    adopt_labels(labels or folder / "tracks.csv", folder)
+    return None
 
 
 def _select(
@@ -290,5 +352,6 @@ def _observed(
     items: Iterator[_Shown], phase: str, total: int, observe: Observer
 ) -> Iterator[_Shown]:
     for done, item in enumerate(items, start=1):
+        stopping.check()
         yield item
         observe(phase, done, total)

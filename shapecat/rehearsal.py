@@ -5,21 +5,32 @@
 compiles them now, for example while the image of a container is built.
 """
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import gc
+import hashlib
+import os
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import wait
+from contextlib import suppress
 from multiprocessing import current_process
+from pathlib import Path
 
+import numba
 import numpy as np
 
+from shapecat import stopping
 from shapecat.config import Settings
 from shapecat.description import describe
 from shapecat.detection import detect
-from shapecat.executors.local import LocalExecutor
+from shapecat.executors.local import LocalExecutor, WorkerLostError
+from shapecat.files import lock
+from shapecat.jit import code_folder
 from shapecat.learning import load_model
 from shapecat.surface import reconstruct, thin
 from shapecat.types import Camera, Frame
 
-__all__ = ["compile_ahead", "compile_all", "find_ball", "recognize_ball"]
+__all__ = ["compile_all", "find_ball", "recognize_ball"]
 
 _RADIUS_M = 0.05
 
@@ -57,30 +68,73 @@ def recognize_ball() -> str:
 
 _REHEARSALS: tuple[Callable[[], object], ...] = (find_ball, recognize_ball)
 """About as long each; none needs the kernels of another."""
+_POLL_S = 0.1
+_STAGES = ("description", "detection", "learning", "surface")
+"""Folders of the kernels that are rehearsed."""
 
 
-@contextmanager
-def compile_ahead() -> Iterator[None]:
-    """Compile in another process, during the block, what a recording needs after detection.
+def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> float:
+    """Compile the kernels in other processes, unless it was done before; return the seconds.
 
-    Machine code is shared through numba's cache on disk, kernel by kernel.
+    One process at a time does so, others wait for it.
+
+    Parameters
+    ----------
+    begin : called before it begins.
+
+    Raises
+    ------
+    Stopped : a signal has asked for it; kernels that are compiled are kept.
     """
-    if current_process().daemon:  # may have no others
-        yield
-        return
-    executor = LocalExecutor(1)
-    executor.submit(recognize_ball)
+    notes = _notes()
+    if notes is None or notes.exists():
+        return 0.0
+    begun = time.perf_counter()
+    while (held := lock(notes.parent)) is None:
+        stopping.check()
+        time.sleep(_POLL_S)
     try:
-        yield
+        if not notes.exists():
+            begin()
+            with suppress(WorkerLostError):  # its kernels are compiled when they are called
+                _rehearse(cores)
+                notes.touch()
+    finally:
+        os.close(held)
+    return time.perf_counter() - begun
+
+
+def _notes() -> Path | None:
+    """Return the file that says that all is compiled; None where machine code cannot be kept."""
+    folders = [code_folder(Path(__file__).with_name(stage)) for stage in _STAGES]
+    names = [folder.name for folder in folders if folder is not None]
+    if folders[0] is None or len(names) < len(_STAGES):
+        return None
+    made_of = (*names, numba.__version__, str(sys.implementation.cache_tag))
+    return folders[0] / f"complete-{hashlib.sha256(' '.join(made_of).encode()).hexdigest()[:16]}"
+
+
+def _rehearse(cores: int) -> None:
+    if current_process().daemon:  # may have no others
+        for rehearsal in _REHEARSALS:
+            rehearsal()
+        return
+    executor = LocalExecutor(min(cores, len(_REHEARSALS)))
+    try:
+        waiting = {executor.submit(_uncollected, rehearsal) for rehearsal in _REHEARSALS}
+        while waiting:
+            stopping.check()
+            done, waiting = wait(waiting, timeout=_POLL_S)
+            for future in done:
+                future.result()
     finally:
         executor.terminate()
 
 
-def compile_all() -> None:
-    """Compile whatever is not in the cache."""
-    with LocalExecutor(len(_REHEARSALS)) as executor:
-        for future in [executor.submit(rehearsal) for rehearsal in _REHEARSALS]:
-            future.result()
+def _uncollected(rehearsal: Callable[[], object]) -> None:
+    """Rehearse in a process that ends soon: collecting garbage is a twelfth of compiling."""
+    gc.disable()
+    rehearsal()
 
 
 if __name__ == "__main__":

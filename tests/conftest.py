@@ -1,7 +1,7 @@
 """What tests share: the command as installed, real data when present, a simulated recording."""
 
 from collections.abc import Callable
-from importlib.metadata import entry_points
+from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -28,9 +28,8 @@ def real_data() -> Path:
 
 @pytest.fixture(scope="session")
 def shapecat() -> Callable[..., Result]:
-    """Run the command through its entry point, as a user would."""
-    (script,) = entry_points(group="console_scripts", name="shapecat")
-    command: Any = script.load()
+    """Run the command as a user would, in this process."""
+    command: Any = import_module("shapecat.cli.main").main
 
     def run(*arguments: object) -> Result:
         result = CliRunner().invoke(command, list(map(str, arguments)))

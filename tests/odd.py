@@ -4,7 +4,7 @@ import json
 import sys
 import tempfile
 from collections.abc import Iterator
-from importlib.metadata import entry_points
+from importlib import import_module
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,8 +28,7 @@ class Verdict(NamedTuple):
 def examine(path: Path, out: Path, *options: str) -> Verdict:
     """Process a recording as a user would; an unknown error is a bug and is raised."""
     arguments = ["process", str(path), "--out", str(out), "--no-rrd", *options]
-    (script,) = entry_points(group="console_scripts", name="shapecat")
-    command: Any = script.load()
+    command: Any = import_module("shapecat.cli.main").main
     result = CliRunner().invoke(command, arguments)
     if result.exception is not None and not isinstance(result.exception, SystemExit):
         raise result.exception

@@ -3,7 +3,7 @@
 import ast
 import re
 from collections.abc import Callable
-from importlib.metadata import entry_points
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -20,8 +20,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
 
 
 def commands() -> dict[str, click.Command]:
-    (script,) = entry_points(group="console_scripts", name="shapecat")
-    group: Any = script.load()
+    group: Any = import_module("shapecat.cli.main").main
     found: dict[str, click.Command] = group.commands
     return found
 

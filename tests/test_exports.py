@@ -20,7 +20,8 @@ from shapecat.outputs.exports import export_run
 from shapecat.outputs.exports_kitti import rectified_from_sensor
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.rereading import FinishedRun, read_finished
-from shapecat.runs.corrections import TrackLabel, adopt_labels, read_track_table
+from shapecat.runs.corrections import TrackLabel, adopt_labels
+from shapecat.runs.track_table import read_track_table
 from shapecat.types import Box, Frame, LabelledFrame, LabelledObject, NeuralGas
 
 Run = Callable[..., Result]
@@ -207,7 +208,7 @@ def intrinsics(run: Path) -> np.ndarray:
     from shapecat.outputs.rereading import clouds_again, open_source  # noqa: PLC0415  here alone
 
     finished = read_finished(run)
-    with open_source(finished) as recording:
+    with open_source(finished.run) as recording:
         camera = next(iter(clouds_again(recording, finished.run))).camera
     assert camera is not None
     return np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])

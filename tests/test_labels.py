@@ -13,9 +13,11 @@ from mcap_ros2.decoder import DecoderFactory
 
 from shapecat.errors import OutputError
 from shapecat.pipeline import annotate_again
-from shapecat.runs.corrections import TrackLabel, adopt_labels, read_labels, read_track_table
+from shapecat.runs.corrections import TrackLabel, adopt_labels, read_labels
 from shapecat.runs.labels import read_labelled_frames
-from shapecat.runs.tables import TRACKS, FrameRow, PerceptionTables, write_table
+from shapecat.runs.perceived import FrameRow, PerceptionTables
+from shapecat.runs.tables import TRACKS, write_table
+from shapecat.runs.track_table import read_track_table
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
 
 HEADER = "track,first_s,category,confidence,label,topic\n"

@@ -1,5 +1,6 @@
 """The package as users get it: a wheel, in an environment with the runtime dependencies alone."""
 
+import hashlib
 import os
 import re
 import shutil
@@ -74,15 +75,22 @@ def bare(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def _take_machine_code(package: Path) -> None:
     """Give the package the kernels compiled here: compiling them once more takes minutes."""
-    for installed in package.rglob("*.py"):
-        source = ROOT / "shapecat" / installed.relative_to(package)
-        if source.exists():
-            assert installed.read_bytes() == source.read_bytes()
-            shutil.copystat(source, installed)  # what the kernels are known by
-    for code in (ROOT / "shapecat").rglob("__pycache__/*.nb[ic]"):
-        target = package / code.relative_to(ROOT / "shapecat")
-        target.parent.mkdir(exist_ok=True)
-        shutil.copy(code, target)
+    for kept in (ROOT / "shapecat").rglob("__pycache__/kernels-*"):
+        here = kept.parent.parent
+        stage = package / here.relative_to(ROOT / "shapecat")
+        target = stage / "__pycache__" / kept.name
+        shutil.copytree(kept, target)
+        for sources in (here, *here.rglob("*/")):
+            if (target / _numba_name(sources)).exists():
+                name = _numba_name(stage / sources.relative_to(here))
+                (target / _numba_name(sources)).rename(target / name)
+
+
+def _numba_name(sources: Path) -> str:
+    """Return what numba calls the folder for the kernels of a folder of sources."""
+    return (
+        f"{sources.name}_{hashlib.sha1(str(sources).encode(), usedforsecurity=False).hexdigest()}"
+    )
 
 
 def test_wheel_installs_one_top_level_package(wheel: Path) -> None:

@@ -1,8 +1,12 @@
-"""Compiling ahead: what is rehearsed must be the whole way, and leave nobody behind."""
+"""Compiling ahead: what is rehearsed must be the whole way, done once, and leave nobody behind."""
 
 import multiprocessing
+from pathlib import Path
 
-from shapecat.rehearsal import compile_ahead, find_ball, recognize_ball
+import pytest
+
+from shapecat import rehearsal
+from shapecat.rehearsal import compile_all, find_ball, recognize_ball
 
 
 def test_the_rehearsals_go_all_the_way() -> None:
@@ -11,10 +15,47 @@ def test_the_rehearsals_go_all_the_way() -> None:
     assert recognize_ball() == "ball"
 
 
-def test_the_other_process_ends_with_the_block() -> None:
+def mark(path: Path) -> None:
+    """Do no work, but leave a trace of it."""
+    with path.open("a") as file:
+        file.write("x")
+
+
+@pytest.fixture
+def trace(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    path = tmp_path / "trace"
+    monkeypatch.setattr(rehearsal, "_notes", lambda: tmp_path / "complete")
+    monkeypatch.setattr(rehearsal, "_rehearse", lambda _: mark(path))
+    return path
+
+
+def test_compiling_is_done_once(trace: Path) -> None:
+    """A run tells of it and waits for it: the next must not."""
+    told: list[str] = []
+
+    assert compile_all(lambda: told.append("begin")) > 0
+    assert compile_all(lambda: told.append("begin")) == 0
+    assert told == ["begin"]
+    assert trace.read_text() == "x"
+
+
+def test_an_interrupted_one_is_done_again(trace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Half of the kernels are not all of them."""
+
+    def interrupt(_cores: int) -> None:
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(rehearsal, "_rehearse", interrupt)
+        compile_all()
+    compile_all()
+    assert trace.read_text() == "x"
+
+
+def test_the_other_processes_end(monkeypatch: pytest.MonkeyPatch) -> None:
     before = set(multiprocessing.active_children())
-    with compile_ahead():
-        pass
+    monkeypatch.setattr(rehearsal, "_REHEARSALS", (multiprocessing.active_children,) * 2)
+    rehearsal._rehearse(2)
     left = set(multiprocessing.active_children()) - before
     for process in left:
         process.join(timeout=10)

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 from click.testing import Result
 
-from shapecat.batch.remote import download, list_urls, look_at, scratch, upload
+from shapecat.batch.remote import download, finish_upload, list_urls, look_at, scratch, upload
 from shapecat.errors import OutputError, RecordingError
 from tests.scenes import record
 
@@ -123,6 +123,37 @@ def test_upload_shows_nothing_before_it_is_whole(
 
     assert files("memory://half/run") == {"run.json", "tracks.csv"}
     assert files("memory://half") == {"run/run.json", "run/tracks.csv"}
+
+
+def test_a_strangers_place_is_not_touched(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text("{}")
+    system = fsspec.filesystem("memory")
+    system.pipe_file("/theirs/run/thesis.txt", b"years of work")
+    with pytest.raises(OutputError, match="did not make this"):
+        upload(tmp_path, "memory://theirs/run")
+
+    assert files("memory://theirs") == {"run/thesis.txt"}
+
+
+def test_an_upload_that_was_killed_is_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has taken the old run.json away, so that nobody takes half of each for a run."""
+    system = fsspec.filesystem("memory")
+    system.pipe_file("/killed/run/run.json", b"old")
+    system.pipe_file("/killed/run/notes.txt", b"mine")
+    for name in ("run.json", "tracks.csv"):
+        (tmp_path / name).write_text("new")
+    with monkeypatch.context() as patch:
+        patch.setattr(type(system), "mv", fail)
+        with pytest.raises(OutputError, match="cannot be uploaded"):
+            upload(tmp_path, "memory://killed/run")
+    assert files("memory://killed/run") == {"notes.txt"}
+
+    finish_upload("memory://killed/run")
+
+    assert files("memory://killed") == {f"run/{n}" for n in ("run.json", "tracks.csv", "notes.txt")}
+    assert system.cat_file("/killed/run/run.json") == b"new"
 
 
 def fail(*_: object, **__: object) -> None:

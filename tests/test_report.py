@@ -23,7 +23,8 @@ from shapecat.outputs.report_drawing import SIDE, Snapshot, draw
 from shapecat.outputs.report_page import Card, run_page
 from shapecat.outputs.report_tracks import Course, read_courses
 from shapecat.outputs.rereading import FinishedRun, read_finished
-from shapecat.runs.corrections import TrackRow, TrackTable, read_labels, read_track_table
+from shapecat.runs.corrections import read_labels
+from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
 from shapecat.types import NeuralGas
 
 Run = Callable[..., Result]

@@ -1,10 +1,13 @@
+import errno
+import os
 from pathlib import Path
 
 import pytest
 
 from shapecat.errors import OutputError
-from shapecat.files import replacing
-from shapecat.runs.folder import digest, read_run, staged, write_run
+from shapecat.files import partial_path, replacing
+from shapecat.runs.folder import previous_path, read_run, recover, staged, write_run
+from shapecat.runs.identity import content_digest, file_stats, new_id, same_content
 
 
 def test_folder_appears_whole(tmp_path: Path) -> None:
@@ -26,21 +29,103 @@ def test_nothing_is_left_after_an_error(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+def own(folder: Path, **files: str) -> Path:
+    """Make a run folder as an earlier run has left it."""
+    folder.mkdir(parents=True)
+    write_run(folder, {"id": new_id()})
+    for name, text in files.items():
+        (folder / name.replace("_", ".")).write_text(text)
+    return folder
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {path.name: path.read_text() for path in folder.iterdir() if path.name != "run.json"}
+
+
 def test_old_results_stay_until_the_new_are_complete(tmp_path: Path) -> None:
-    folder = tmp_path / "lab"
-    folder.mkdir()
-    (folder / "a").write_text("old")
+    folder = own(tmp_path / "lab", tracks_csv="old")
     with pytest.raises(RuntimeError), staged(folder) as hidden:
-        (hidden / "a").write_text("new")
+        (hidden / "tracks.csv").write_text("new")
         raise RuntimeError
 
-    assert (folder / "a").read_text() == "old"
+    assert contents(folder) == {"tracks.csv": "old"}
 
     with staged(folder) as hidden:
-        (hidden / "b").write_text("new")
+        (hidden / "frames.parquet").write_text("new")
 
     assert [p.name for p in tmp_path.iterdir()] == ["lab"]
-    assert [p.name for p in folder.iterdir()] == ["b"]
+    assert contents(folder) == {"frames.parquet": "new"}
+
+
+@pytest.mark.parametrize("name", ["lab", ".lab.partial"])
+@pytest.mark.parametrize("file", ["thesis.txt", "run.json", "tracks.csv"])
+def test_a_strangers_folder_is_not_touched(tmp_path: Path, name: str, file: str) -> None:
+    """Also not one that looks like ours but has no id."""
+    (tmp_path / name).mkdir()
+    (tmp_path / name / file).write_text("{}")
+    with pytest.raises(OutputError, match="did not make this"), staged(tmp_path / "lab"):
+        pytest.fail("must not begin")
+
+    assert {path.name: path.read_text() for path in (tmp_path / name).iterdir()} == {file: "{}"}
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+def test_a_file_or_link_in_the_way_is_not_touched(tmp_path: Path) -> None:
+    (tmp_path / "lab").write_text("mine")
+    (tmp_path / "link").symlink_to(own(tmp_path / "elsewhere"))
+    for name in ("lab", "link"):
+        with pytest.raises(OutputError, match="did not make this"), staged(tmp_path / name):
+            pytest.fail("must not begin")
+
+    assert (tmp_path / "lab").read_text() == "mine"
+    assert (tmp_path / "elsewhere" / "run.json").exists()
+
+
+def test_what_a_person_put_beside_the_results_moves_on(tmp_path: Path) -> None:
+    folder = own(tmp_path / "lab", tracks_csv="old", notes_txt="mine")
+    (folder / "photos").mkdir()
+    (folder / "photos" / "a.jpg").write_text("picture")
+    with staged(folder) as hidden:
+        (hidden / "tracks.csv").write_text("new")
+
+    assert [p.name for p in tmp_path.iterdir()] == ["lab"]
+    assert (folder / "photos" / "a.jpg").read_text() == "picture"
+    assert (folder / "notes.txt").read_text() == "mine"
+    assert (folder / "tracks.csv").read_text() == "new"
+
+
+def test_a_kill_between_the_renames_loses_neither(tmp_path: Path) -> None:
+    """The old folder is put back, and the new one waits until its run goes on."""
+    folder = own(tmp_path / "lab", tracks_csv="old")
+    own(partial_path(folder), tracks_csv="new")
+    folder.rename(previous_path(folder))
+
+    recover(folder)
+
+    assert contents(folder) == {"tracks.csv": "old"}
+    assert contents(partial_path(folder)) == {"tracks.csv": "new"}
+
+
+def test_a_kill_after_the_renames_is_tidied_up(tmp_path: Path) -> None:
+    folder = own(tmp_path / "lab", tracks_csv="new")
+    own(previous_path(folder), tracks_csv="old", notes_txt="mine")
+
+    recover(folder)
+
+    assert [p.name for p in tmp_path.iterdir()] == ["lab"]
+    assert contents(folder) == {"tracks.csv": "new", "notes.txt": "mine"}
+
+
+def test_work_that_can_be_resumed_stays_after_an_error(tmp_path: Path) -> None:
+    folder = tmp_path / "out" / "lab"
+    with (
+        pytest.raises(OutputError, match=r"No space left.*is kept"),
+        staged(folder, worth_keeping=lambda hidden: (hidden / "work").exists()) as hidden,
+    ):
+        (hidden / "work").write_text("hours")
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    assert (partial_path(folder) / "work").read_text() == "hours"
 
 
 def test_an_unwritable_place_is_one_line(tmp_path: Path) -> None:
@@ -75,11 +160,72 @@ def test_run_json_round_trip_and_foreign_folder(tmp_path: Path) -> None:
         read_run(tmp_path / "nowhere")
 
 
-def test_digest_sees_size_head_and_tail(tmp_path: Path) -> None:
+def test_digest_sees_every_byte(tmp_path: Path) -> None:
     path = tmp_path / "f"
+    middle = bytearray(b"a" * 3_000_000)
+    middle[1_500_000:1_504_096] = bytes(4096)
     seen = set()
-    for content in (b"", b"a", b"a" * 3_000_000, b"a" * 2_999_999 + b"b", b"a" * 3_000_001):
+    for content in (b"", b"a", b"a" * 3_000_000, bytes(middle), b"a" * 3_000_001):
         path.write_bytes(content)
-        seen.add(digest(path))
+        seen.add(content_digest(path))
 
     assert len(seen) == 5
+
+
+def test_digest_of_a_folder_sees_names_and_where_files_end(tmp_path: Path) -> None:
+    seen = set()
+    for k, files in enumerate(
+        ({"a": "xy", "b": "z"}, {"a": "x", "b": "yz"}, {"a": "xy", "c": "z"})
+    ):
+        (tmp_path / str(k)).mkdir()
+        for name, text in files.items():
+            (tmp_path / str(k) / name).write_text(text)
+        seen.add(content_digest(tmp_path / str(k)))
+
+    assert len(seen) == 3
+
+
+def test_content_is_read_only_where_times_cannot_tell(tmp_path: Path) -> None:
+    path = tmp_path / "f"
+    path.write_text("abc")
+    known = {"files": file_stats(path), "digest": content_digest(path)}
+
+    def read() -> str:
+        reads.append(path)
+        return content_digest(path)
+
+    reads: list[Path] = []
+    assert same_content(known, path, read)
+    assert not reads
+
+    path.rename(tmp_path / "g")
+    path = tmp_path / "g"
+    assert same_content(known, path, read)
+    assert len(reads) == 1
+
+    stat = path.stat()
+    path.write_text("xyz")
+    os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
+    assert not same_content(known, path, read)
+
+
+def test_flushed_before_and_after_it_takes_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else a power cut leaves a complete name with incomplete content."""
+    path, seen = tmp_path / "f", []
+
+    def fsync(number: int) -> None:
+        seen.append((str(Path(f"/proc/self/fd/{number}").readlink()), path.exists()))
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    with replacing(path) as hidden:
+        hidden.write_text("all")
+
+    assert seen == [(str(partial_path(path)), False), (str(tmp_path), True)]
+
+    monkeypatch.setenv("SHAPECAT_FSYNC", "0")
+    with replacing(path) as hidden:
+        hidden.write_text("more")
+
+    assert len(seen) == 2

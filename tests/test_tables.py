@@ -8,13 +8,12 @@ from numpy.testing import assert_allclose
 from shapecat.errors import OutputError
 from shapecat.runs.corrections import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.perceived import FrameRow, PerceptionTables
 from shapecat.runs.tables import (
     DETECTIONS,
     FRAMES,
     PLANES,
     TRACKS,
-    FrameRow,
-    PerceptionTables,
     lists,
     read_row_groups,
     write_table,

@@ -15,7 +15,7 @@ from shapecat.batch.finding import find_recordings
 from shapecat.batch.manifest import Entry, Manifest
 from shapecat.batch.remote import look_at, output_place
 from shapecat.errors import ConfigError, OutputError
-from shapecat.files import partial_folder
+from shapecat.files import partial_path
 from shapecat.learning import load_model
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
@@ -176,9 +176,10 @@ def _task(job: Job, manifest: Manifest | None, model_id: str) -> Task:
     key, size = look_at(job.origin) if job.origin else _input_key(job.source)
     work = _work_key(job, model_id)
     status: Status = "new"
-    if partial_folder(job.folder).exists():
+    there = _exists(job)
+    if partial_path(job.folder).exists() and (job.overwrite or not there):
         status = "resume"
-    elif _exists(job) and not job.overwrite:
+    elif there and not job.overwrite:
         same = entry is not None and (entry.input, entry.work) == (key, work)
         done = same and entry is not None and entry.state == "complete" and _whole(job)
         status = "complete" if done else "check"
@@ -212,8 +213,8 @@ def _input_key(source: Path) -> tuple[str, int]:
         stats = [(file.name, file.stat()) for file in files]
     except OSError:
         return "", 0
-    known = [(name, stat.st_size, stat.st_mtime_ns) for name, stat in stats]
-    return _hash(known), sum(size for _, size, _ in known)
+    known = [(name, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for name, stat in stats]
+    return _hash(known), sum(size for _, size, *_ in known)
 
 
 def _work_key(job: Job, model_id: str) -> str:

@@ -11,17 +11,19 @@ from collections.abc import Collection, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from hashlib import sha256
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from threading import Event, Thread
 from typing import Any
 
 from shapecat.errors import ConfigError, OutputError, RecordingError, ShapecatError
 from shapecat.files import lock
+from shapecat.runs.folder import RUN_FILES
 
 __all__ = [
     "Place",
     "download",
     "fetch",
+    "finish_upload",
     "is_url",
     "list_urls",
     "look_at",
@@ -179,30 +181,79 @@ def upload(folder: Path, url: str) -> None:
 
     Raises
     ------
+    OutputError : the storage cannot be written to, or the place is a stranger's.
+    """
+    system, path = _storage(url, OutputError)
+    hidden = _hidden(path)
+    try:
+        _require_ours(system, path, url)
+        _remove(system, hidden, RUN_FILES)
+        system.makedirs(hidden, exist_ok=True)
+        for file in sorted(folder.iterdir(), key=lambda file: file.name == "run.json"):
+            system.put_file(str(file), f"{hidden}/{file.name}")
+    except _failures() as error:
+        raise _cannot_upload(url, error) from error
+    finish_upload(url)
+
+
+def finish_upload(url: str) -> None:
+    """Rename what was sent as a whole, also by a process that was killed before it had.
+
+    Raises
+    ------
     OutputError : the storage cannot be written to.
     """
     system, path = _storage(url, OutputError)
-    parent, _, name = path.rstrip("/").rpartition("/")
-    hidden = f"{parent}/.{name}.partial"
+    hidden = _hidden(path)
     try:
-        _remove(system, hidden)
-        system.makedirs(hidden, exist_ok=True)
-        files = sorted(folder.iterdir(), key=lambda file: file.name == "run.json")
-        for file in files:
-            system.put_file(str(file), f"{hidden}/{file.name}")
-        _remove(system, path)
+        sent = [PurePosixPath(name).name for name in _list(system, hidden)]
+        if "run.json" not in sent:
+            return
+        _remove(system, path, ("run.json",))
         system.makedirs(path, exist_ok=True)
-        for file in files:
-            system.mv(f"{hidden}/{file.name}", f"{path}/{file.name}")
-        _remove(system, hidden)
+        for name in sorted(sent, key=lambda name: name == "run.json"):
+            system.mv(f"{hidden}/{name}", f"{path}/{name}")
+        _remove(system, path, set(RUN_FILES) - set(sent))
+        with suppress(*_failures()):
+            system.rmdir(hidden)  # object stores have no folders
     except _failures() as error:
-        msg = f"{url}: cannot be uploaded: {str(error) or type(error).__name__}"
-        raise OutputError(msg) from error
+        raise _cannot_upload(url, error) from error
 
 
-def _remove(system: Any, path: str) -> None:
-    if system.exists(path):
-        system.rm(path, recursive=True)
+def _hidden(path: str) -> str:
+    parent, _, name = path.rstrip("/").rpartition("/")
+    return f"{parent}/.{name}.partial"
+
+
+def _cannot_upload(url: str, error: Exception) -> OutputError:
+    return OutputError(f"{url}: cannot be uploaded: {str(error) or type(error).__name__}")
+
+
+def _require_ours(system: Any, path: str, url: str) -> None:
+    """Refuse to touch a place that holds files but no run's marker.
+
+    Raises
+    ------
+    OutputError : it is a stranger's.
+    """
+    names = {PurePosixPath(name).name for name in _list(system, path)}
+    if "run.json" not in names and names - set(RUN_FILES):
+        msg = f"{url}: shapecat did not make this; choose another --out, or move it away"
+        raise OutputError(msg)
+
+
+def _list(system: Any, path: str) -> list[str]:
+    """Return the paths of what lies in a folder; none where there is no folder."""
+    with suppress(FileNotFoundError):
+        return [str(name) for name in system.ls(path, detail=False)]
+    return []
+
+
+def _remove(system: Any, path: str, names: Collection[str]) -> None:
+    """Remove files from a folder."""
+    for name in _list(system, path):
+        if PurePosixPath(name).name in names:
+            system.rm(name)
 
 
 @dataclass(frozen=True)

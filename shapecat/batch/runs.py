@@ -6,18 +6,20 @@ import logging
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Executor, Future
+from contextlib import suppress
 from dataclasses import dataclass
-from queue import SimpleQueue
+from queue import Empty, SimpleQueue
 from threading import Lock
 from typing import Any, Protocol
 
+from shapecat import stopping
 from shapecat.batch.manifest import Entry, Manifest
 from shapecat.batch.plans import Task
-from shapecat.batch.remote import download, fetch, look_at, scratch, upload
+from shapecat.batch.remote import download, fetch, finish_upload, look_at, scratch, upload
 from shapecat.errors import OutputError, ShapecatError
 from shapecat.executors import Mailbox, is_dropped, is_lost, post
 from shapecat.pipeline import Observer, process
-from shapecat.runs.folder import read_run
+from shapecat.runs.folder import read_run, require_ours
 from shapecat.runs.jobs import Job, Summary, summarize
 
 __all__ = ["Outcome", "Watcher", "attempt", "exit_code", "process_here", "process_on"]
@@ -32,6 +34,12 @@ _REPORT_S = 0.2
 """A worker tells how far it is no more often than this."""
 
 
+_PREVIOUS = ("tracks.csv", "tracks.original.csv", "tracks.parquet", "frames.parquet")
+"""What carrying labels over to a new run needs of the old one."""
+_HEED_S = 0.1
+"""Whoever waits for workers looks so often whether a signal has come."""
+
+
 @dataclass(frozen=True)
 class Outcome:
     """What became of one job: a summary, or a message and the exit code it stands for."""
@@ -40,6 +48,9 @@ class Outcome:
     summary: Summary | None = None
     message: str = ""
     code: int = 0
+
+
+_Ended = tuple[Job, Future[Outcome]]
 
 
 class Watcher(Protocol):
@@ -58,6 +69,7 @@ def process_here(
     """Process the tasks one after the other in this process; yield what became of each."""
     ledger = _Ledger(tasks, manifest)
     for task in tasks:
+        stopping.check()
         name = task.job.folder.name
 
         def observe(phase: str, done: int, total: int | None, name: str = name) -> None:
@@ -83,6 +95,10 @@ def process_on(
 
     A recording whose worker dies is tried once more, then reported; the others go on. One that
     only waited when the scheduler was lost has not been tried.
+
+    Raises
+    ------
+    Stopped : a signal has asked for it; what runs goes on until the executor is stopped.
     """
     ledger = _Ledger(tasks, manifest)
 
@@ -101,7 +117,7 @@ def process_on(
 def _outcomes(
     executor: Executor, tasks: Sequence[Task], ledger: "_Ledger", address: str, cores: int
 ) -> Iterator[Outcome]:
-    ended: SimpleQueue[tuple[Job, Future[Outcome]]] = SimpleQueue()
+    ended: SimpleQueue[_Ended] = SimpleQueue()
 
     def begin(job: Job) -> None:
         future = executor.submit(_attempt_elsewhere, job, address, cores)
@@ -115,13 +131,21 @@ def _outcomes(
         while waiting and running < _AHEAD:
             begin(waiting.pop())
             running += 1
-        job, future = ended.get()
+        job, future = _next(ended)
         error = _error(future)
         if error is not None and is_lost(error) and ledger.lost(job, error) < _TRIES:
             begin(job)
             continue
         running -= 1
         yield future.result() if error is None else _unknown(job, error)
+
+
+def _next(ended: SimpleQueue[_Ended]) -> _Ended:
+    """Wait for the next one to end, or for a signal that asks to stop."""
+    while True:
+        stopping.check()
+        with suppress(Empty):
+            return ended.get(timeout=_HEED_S)
 
 
 def _error(future: Future[Outcome]) -> BaseException | None:
@@ -205,11 +229,20 @@ def _process_remote(job: Job, observe: Observer, cores: int) -> Summary:
 
 
 def _look_for_results(job: Job) -> None:
-    """Put what run.json at the target says where `process` looks for it."""
-    run = f"{job.target}/run.json"
-    if not job.overwrite and look_at(run)[1]:
+    """Put what `process` needs of the results at the target where it looks for them.
+
+    Raises
+    ------
+    OutputError : the target holds what shapecat did not make.
+    """
+    finish_upload(job.target)
+    wanted = ("run.json", *(_PREVIOUS if job.overwrite else ()))
+    there = [name for name in wanted if look_at(f"{job.target}/{name}")[1]]
+    if "run.json" in there:
         job.folder.mkdir(parents=True)
-        (job.folder / "run.json").write_bytes(fetch(run))
+    for name in there:
+        (job.folder / name).write_bytes(fetch(f"{job.target}/{name}"))
+    require_ours(job.folder)
 
 
 class _Ledger:

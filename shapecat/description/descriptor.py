@@ -167,9 +167,9 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
     cloud, starts = assign(cloud, x, y, z, np.float32(_REACH * gap))
     if cloud.shape[1] == 0:
         # none is near: describe the neurons themselves
-        cloud = np.zeros((3, count), np.float32)
-        cloud[0], cloud[1], cloud[2] = x, y, z
-        starts = np.arange(count + 1)
+        cloud = _in_rows(x, y, z)
+        for i in range(count):
+            starts[i + 1] = i + 1
     weight = np.zeros(count, np.float32)
     for i in range(count):
         weight[i] = (starts[i + 1] - starts[i]) / cloud.shape[1]
@@ -187,10 +187,10 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
     cx, cy, _ = vertical_axis(x, y, normals, weight)
     axis, point, _ = rotation_axis(x, y, z, weight, normals)
     turned = out[_REVOLUTION:_SOLIDS]
-    neurons_in_units = np.stack((x, y, z))
+    foot = np.zeros(3)
+    foot[0], foot[1] = cx, cy
     revolution(
-        cloud, owner, neurons_in_units, weight, normals, place, axis, point,
-        np.array([cx, cy, 0.0]), turned,
+        cloud, owner, _in_rows(x, y, z), weight, normals, place, axis, point, foot, turned,
     )  # fmt: skip
     solids(cloud, owner, x, y, normals, place, low, high, turned, out[_SOLIDS:_OUTLINE])
     outline(cloud, place, out[_OUTLINE:_METRIC])
@@ -208,11 +208,21 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
 
 
 @kernel
+def _in_rows(x: F4, y: F4, z: F4) -> F4:
+    """Return coordinates as one array (3, n)."""
+    rows = np.zeros((3, x.size), np.float32)
+    for i in range(x.size):
+        rows[0, i], rows[1, i], rows[2, i] = x[i], y[i], z[i]
+    return rows
+
+
+@kernel
 def _owners(starts: I4) -> I4:
     """Return the neuron of each point, of points that are sorted by neuron."""
     owner = np.zeros(starts[-1], np.int64)
     for k in range(starts.size - 1):
-        owner[starts[k] : starts[k + 1]] = k
+        for i in range(starts[k], starts[k + 1]):
+            owner[i] = k
     return owner
 
 
@@ -251,15 +261,33 @@ def _own_units(neurons: F4) -> tuple[F4, F4, F4, F4, F8, float]:
             y[i] = (neurons[i, 1] - middle[1]) / unit
             z[i] = (neurons[i, 2] - middle[2]) / unit
         straight = euclidean(x, y, z)
-        mean = straight.sum() / (count * (count - 1))
+        mean = _sum(straight) / (count * (count - 1))
         unit *= mean if mean > 0 else 1.0
     return x, y, z, straight, middle, unit
 
 
 @kernel
+def _sum(rows: F4) -> float:
+    total = np.float32(0.0)
+    for i in range(rows.shape[0]):
+        for j in range(rows.shape[1]):
+            total += rows[i, j]
+    return float(total)
+
+
+@kernel(fast=True)
+def _range(values: F4) -> tuple[float, float]:
+    low = high = values[0]
+    for value in values:
+        low = value if value < low else low
+        high = value if value > high else high
+    return low, high
+
+
+@kernel
 def _height_range(z: F4) -> tuple[float, float]:
     """Return the 2 % and 98 % quantile of ``z``, by a histogram of 256 bins."""
-    low, high = z.min(), z.max()
+    low, high = _range(z)
     if not high > low:
         return low, high
     scale = 256 / (high - low)
@@ -289,9 +317,7 @@ def _count(row: F4, start: int, bins: int, place: float, weight: float) -> None:
 
 
 @kernel
-def _find_bins(
-    lengths: F4, i: int, scale: float, one: float, bins: I4, shares: F4, kind: int
-) -> None:
+def _find_bins(lengths: F4, i: int, scale: float, one: float, bins: I4, shares: F4) -> None:
     """Write for row i of ``lengths`` the first of the two bins a length is shared between.
 
     And the share of the second, of a count of ``one``.
@@ -302,8 +328,8 @@ def _find_bins(
         place = place if place > 0 else np.float32(0)
         place = place if place < last else last
         k = min(np.int32(place), np.int32(_DISTANCE_BINS - 2))
-        bins[kind, j] = k
-        shares[kind, j] = (place - np.float32(k)) * one
+        bins[j] = k
+        shares[j] = (place - np.float32(k)) * one
 
 
 @kernel
@@ -318,17 +344,19 @@ def _distributions(
     for j in range(count):
         for i in range(count):  # column by column: the sums of all rows grow side by side
             sums[i] += paths[j, i]
-    mean_path = sums.astype(np.float64)
+    total = 0.0
+    for i in range(count):
+        total += sums[i]
     pairs = count * (count - 1)
     scale = np.float32(_DISTANCE_BINS / _DISTANCE_RANGE)
-    per_path = scale * np.float32(pairs / max(mean_path.sum(), 1e-9))
+    per_path = scale * np.float32(pairs / max(total, 1e-9))
     per_straight = scale  # the mean is the unit
     one = np.float32(1.0 / (count - 1))
     bins, shares = np.zeros((2, count), np.int32), np.zeros((2, count), np.float32)
     for i in range(count):
         row = rows[i]
-        _find_bins(paths, i, per_path, one, bins, shares, 0)
-        _find_bins(straight, i, per_straight, one, bins, shares, 1)
+        _find_bins(paths, i, per_path, one, bins[0], shares[0])
+        _find_bins(straight, i, per_straight, one, bins[1], shares[1])
         for j in range(count):
             if i == j:
                 continue
@@ -345,11 +373,18 @@ def _distributions(
     for i in range(count):
         for k in range(_CURVATURE):
             curvature[k] += weight[i] * rows[i, 1 + k]
-        _count(up, 0, _UP_BINS, (normals[2, i] + 1) / 2, weight[i])
-    _partition(rows, mean_path, weight, _RINGS, out, _RING_PATHS, _RING_STRAIGHT, _RING_CURVED)
-    _partition(
-        rows, z.astype(np.float64), weight, _BANDS, out, _BAND_PATHS, _BAND_STRAIGHT, _BAND_CURVED
-    )
+        place = (np.float64(normals[2, i]) + 1) / 2
+        _count(up, np.int64(0), np.int64(_UP_BINS), place, np.float64(weight[i]))
+    # numba compiles anew for every number that stands in a call, but not for these
+    rings, bands = np.int64(_RINGS), np.int64(_BANDS)
+    at, straight_at, curved_at = (
+        np.int64(_RING_PATHS), np.int64(_RING_STRAIGHT), np.int64(_RING_CURVED),
+    )  # fmt: skip
+    _partition(rows, sums, weight, rings, out, at, straight_at, curved_at)
+    at, straight_at, curved_at = (
+        np.int64(_BAND_PATHS), np.int64(_BAND_STRAIGHT), np.int64(_BAND_CURVED),
+    )  # fmt: skip
+    _partition(rows, z, weight, bands, out, at, straight_at, curved_at)
 
 
 @kernel
@@ -357,11 +392,13 @@ def _curvature_row(row: F4, first: float, second: float) -> None:
     row[0] = 1
     spread = first - second
     index = 2 / np.pi * np.arctan2(first + second, spread)
-    _count(row, 1, _SHAPE_BINS, (index + 1) / 2, 1.0)
+    _count(row, np.int64(1), np.int64(_SHAPE_BINS), (index + 1) / 2, 1.0)
     curved = np.sqrt((first * first + second * second) / 2)
-    _count(row, 1 + _SHAPE_BINS, _CURVED_BINS, (np.log2(curved + 1e-6) + 3) / 7, 1.0)
+    place = (np.log2(curved + 1e-6) + 3) / 7
+    _count(row, np.int64(1 + _SHAPE_BINS), np.int64(_CURVED_BINS), place, 1.0)
     mean = (first + second) / 2
-    _count(row, 1 + _SHAPE_BINS + _CURVED_BINS, _MEAN_BINS, (mean / (1 + abs(mean)) + 1) / 2, 1.0)
+    place = (mean / (1 + abs(mean)) + 1) / 2
+    _count(row, np.int64(1 + _SHAPE_BINS + _CURVED_BINS), np.int64(_MEAN_BINS), place, 1.0)
 
 
 @kernel
@@ -380,10 +417,10 @@ def _partition(
     A neuron counts in the two parts whose middles it lies between, so that a small change of the
     graph changes the descriptor little.
     """
-    low, high = order.min(), order.max()
+    low, high = _range(order)
     sums = np.zeros((parts, rows.shape[1]))
     for i in range(rows.shape[0]):
-        place = (order[i] - low) / (high - low) if high > low else 0.5
+        place = np.float64(order[i] - low) / (high - low) if high > low else 0.5
         at = min(max(place * parts - 0.5, 0.0), parts - 1.0)
         first = min(int(at), parts - 2)
         for side in range(2):

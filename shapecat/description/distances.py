@@ -37,7 +37,8 @@ def geodesic(straight: F4, edges: U2) -> F4:
     """
     count = straight.shape[0]
     padded = (count + 15) // 16 * 16  # whole vectors: no remainder in the inner loop
-    paths = np.full((padded, padded), _NO_PATH)
+    paths = np.zeros((padded, padded), np.float32)
+    paths[:] = _NO_PATH
     for e in range(edges.shape[0]):
         a, b = np.int64(edges[e, 0]), np.int64(edges[e, 1])
         paths[a, b] = paths[b, a] = straight[a, b]
@@ -52,7 +53,7 @@ def geodesic(straight: F4, edges: U2) -> F4:
     return joined
 
 
-@kernel(fast=True, inline=True)
+@kernel(fast=True)
 def _less(a: float, b: float) -> float:
     return a if a < b else b
 
@@ -76,7 +77,7 @@ def _ways(paths: F4, k: int, via: F4) -> None:
         via[0, j], via[1, j], via[2, j], via[3, j] = w0, w1, w2, w3
 
 
-@kernel(fast=True, inline=True)
+@kernel(fast=True)
 def _shorten(paths: F4, i: int, via: F4, k: int) -> None:
     """Let the paths of node i lead through the nodes k to k + 3 where that is shorter."""
     a = paths[i, k]

@@ -23,7 +23,7 @@ OUTLINE_NAMES = (
     "upright_fill",
     "long_fill",
 )
-_UPRIGHT, _TO_NARROW = False, True
+_UPRIGHT, _TO_NARROW = np.bool_(0), np.bool_(1)  # Python's own would be compiled one by one
 _LONG, _END = 2 * OUTLINE_SLICES, 4 * OUTLINE_SLICES
 
 
@@ -36,16 +36,19 @@ def outline(cloud: F4, eye: F4, out: F4) -> None:
     """
     across, upward = _image(cloud, eye)
     out[_END], out[_END + 3] = _widths(upward, across, _UPRIGHT, out[:_LONG])
-    mean_a, mean_u = across.mean(), upward.mean()
-    aa = au = uu = 0.0
+    mean_a = mean_u = aa = au = uu = 0.0
+    for i in range(across.size):
+        mean_a += across[i] / across.size
+        mean_u += upward[i] / across.size
     for i in range(across.size):
         a, u = across[i] - mean_a, upward[i] - mean_u
         aa, au, uu = aa + a * a, au + a * u, uu + u * u
     angle = 0.5 * np.arctan2(2 * au, aa - uu)
     c, s = np.float32(np.cos(angle)), np.float32(np.sin(angle))
-    out[_END + 1], out[_END + 4] = _widths(
-        c * across + s * upward, c * upward - s * across, _TO_NARROW, out[_LONG:_END]
-    )
+    for i in range(across.size):
+        a, u = across[i], upward[i]
+        across[i], upward[i] = c * a + s * u, c * u - s * a
+    out[_END + 1], out[_END + 4] = _widths(across, upward, _TO_NARROW, out[_LONG:_END])
     out[_END + 2] = abs(c)
 
 
@@ -77,7 +80,8 @@ def _widths(
     """Write width and offset of each slice; return the length and how much of its box is filled."""
     low, high = inner_range(along)
     length = max(high - low, 1e-6)
-    least, most = np.full(OUTLINE_SLICES, np.inf), np.full(OUTLINE_SLICES, -np.inf)
+    least, most = np.zeros(OUTLINE_SLICES), np.zeros(OUTLINE_SLICES)
+    least[:], most[:] = np.inf, -np.inf
     for i in range(along.size):
         k = min(max(int((along[i] - low) / length * OUTLINE_SLICES), 0), OUTLINE_SLICES - 1)
         least[k], most[k] = min(least[k], across[i]), max(most[k], across[i])

@@ -25,7 +25,7 @@ _OUTLIER = 3.0
 """Residuals beyond this many root mean squares pull no harder."""
 _DAMPING = 0.02
 _INWARD = -0.3
-_UPRIGHT, _MAY_TILT = False, True
+_UPRIGHT, _MAY_TILT = np.bool_(0), np.bool_(1)  # Python's own would be compiled one by one
 
 
 @kernel
@@ -115,12 +115,14 @@ def revolution(
     the axis.
     """
     slices = np.zeros((REVOLUTION_SLICES, 4))
-    upright = np.array([0.0, 0.0, 1.0])
+    upright, before = np.zeros(3), np.zeros(3)
+    upright[2] = 1.0
+    for j in range(3):
+        before[j] = axis[j]
     fit_axis(neurons, weight, normals, upright, foot, _UPRIGHT)
     rms, length, radius = _measure(cloud, owner, normals, upright, foot, slices)
     out[0] = min(rms / radius, 2.0)
     out[1] = radius / (radius + length)
-    before = axis.copy()
     fit_axis(neurons, weight, normals, axis, point, _MAY_TILT)
     rms, length, radius = _measure(cloud, owner, normals, axis, point, slices)
     out[2] = min(rms / radius, 2.0)
@@ -136,10 +138,10 @@ def revolution(
     facing = (axis[0] * eye[0] + axis[1] * eye[1] + axis[2] * eye[2]) / max(distance, 1e-6)
     out[6] = -facing if lean > 0 else facing
     for k in range(REVOLUTION_SLICES):
-        share, mean, residual, inward = slices[REVOLUTION_SLICES - 1 - k if lean > 0 else k]
+        own = REVOLUTION_SLICES - 1 - k if lean > 0 else k
         at = 7 + 4 * k
-        out[at], out[at + 1] = share, mean / widest
-        out[at + 2], out[at + 3] = min(residual / widest, 2.0), inward
+        out[at], out[at + 1] = slices[own, 0], slices[own, 1] / widest
+        out[at + 2], out[at + 3] = min(slices[own, 2] / widest, 2.0), slices[own, 3]
 
 
 @kernel
@@ -172,10 +174,14 @@ def _across(axis: F8) -> tuple[F8, F8]:
     small = 0
     for j in range(1, 3):
         small = j if abs(axis[j]) < abs(axis[small]) else small
-    first = -axis[small] * axis
-    first[small] += 1.0
-    first /= np.sqrt((first**2).sum())
-    return first, np.cross(axis, first)
+    first, second = np.zeros(3), np.zeros(3)
+    length = np.sqrt(max(1.0 - axis[small] * axis[small], 1e-12))
+    for j in range(3):
+        first[j] = ((1.0 if j == small else 0.0) - axis[small] * axis[j]) / length
+    for i in range(3):
+        j, k = (i + 1) % 3, (i + 2) % 3
+        second[i] = axis[j] * first[k] - axis[k] * first[j]
+    return first, second
 
 
 @kernel
@@ -187,7 +193,8 @@ def _place(
     The weight is the fourth power of the sine between normal and axis.
     """
     rows = np.zeros((5, cloud.shape[1]))
-    reach = np.array([np.inf, -np.inf])
+    reach = np.zeros(2)
+    reach[0], reach[1] = np.inf, -np.inf
     for i in range(cloud.shape[1]):
         x, y, z = cloud[0, i] - point[0], cloud[1, i] - point[1], cloud[2, i] - point[2]
         along = x * axis[0] + y * axis[1] + z * axis[2]
@@ -221,9 +228,12 @@ def _improve(
 ) -> float:
     """Move the axis by one Gauss-Newton step; return the root mean square residual before it."""
     first, second = _across(axis)
-    owner = np.arange(neurons.shape[1])
+    owner = np.zeros(neurons.shape[1], np.int64)
+    for i in range(owner.size):
+        owner[i] = i
     rows, reach = _place(neurons, owner, normals, axis, point, first, second)
-    rows[4] *= weight
+    for i in range(owner.size):
+        rows[4, i] *= weight[i]
     free = 4 if may_tilt else 2
     means = np.zeros((REVOLUTION_SLICES, 6))  # weight, radius, derivatives
     row = np.zeros(6)
@@ -273,12 +283,17 @@ def _move(axis: F8, point: F8, first: F8, second: F8, move: F8, farthest: float)
     """Shift and tilt the axis, by at most ``farthest`` and 0.3 rad."""
     length = np.sqrt(move[0] ** 2 + move[1] ** 2)
     share = min(1.0, farthest / max(length, 1e-9))
-    point += share * (move[0] * first + move[1] * second)
+    for j in range(3):
+        point[j] += share * (move[0] * first[j] + move[1] * second[j])
     if move.size == 4:
         tilt = np.sqrt(move[2] ** 2 + move[3] ** 2)
         share = min(1.0, 0.3 / max(tilt, 1e-9))
-        axis += share * (move[2] * first + move[3] * second)
-        axis /= np.sqrt((axis**2).sum())
+        squared = 0.0
+        for j in range(3):
+            axis[j] += share * (move[2] * first[j] + move[3] * second[j])
+            squared += axis[j] * axis[j]
+        for j in range(3):
+            axis[j] /= np.sqrt(squared)
 
 
 @kernel
@@ -296,8 +311,11 @@ def _measure(
         weights[k] += rows[4, i]
         slices[k, 0] += 1.0
         slices[k, 1] += rows[4, i] * rows[1, i]
-    total = weights.sum()
-    radius = slices[:, 1].sum() / max(total, 1e-9)
+    total = radius = 0.0
+    for k in range(REVOLUTION_SLICES):
+        total += weights[k]
+        radius += slices[k, 1]
+    radius /= max(total, 1e-9)
     enough = 1e-3 * count
     for k in range(REVOLUTION_SLICES):
         slices[k, 1] = slices[k, 1] / weights[k] if weights[k] > enough else 0.0

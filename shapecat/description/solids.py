@@ -91,7 +91,12 @@ def _box_frame(cloud: F4, x: F4, y: F4, normals: F4, eye: F4) -> tuple[F4, F4]:
         if cost < best:
             best, turn = cost, (c, s, toward_u, toward_v)
     c, s, toward_u, toward_v = turn
-    return toward_u * (c * cloud[0] + s * cloud[1]), toward_v * (c * cloud[1] - s * cloud[0])
+    count = cloud.shape[1]
+    u, v = np.zeros(count, np.float32), np.zeros(count, np.float32)
+    for i in range(count):
+        u[i] = toward_u * (c * cloud[0, i] + s * cloud[1, i])
+        v[i] = toward_v * (c * cloud[1, i] - s * cloud[0, i])
+    return u, v
 
 
 @kernel
@@ -120,14 +125,15 @@ def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, o
         corners[1, i] = max(du / long_u, dz / tall)
         corners[2, i] = max(dv / long_v, dz / tall)
     out[0] = sides / max(total, 1e-6) / flat
-    out[1] = off.sum() / count / size
+    out[1] = (off[0] + off[1] + off[2]) / count / size
     out[2] = min(long_u, long_v) / max(long_u, long_v)
     out[3] = tall / (tall + flat)
     out[4] = inner_range(corners[0])[0]
     first, second = inner_range(corners[1])[0], inner_range(corners[2])[0]
     out[5], out[6] = min(first, second), max(first, second)
     a = 0 if share[0] >= share[1] else 1
-    for k, face in enumerate((a, 1 - a, 2)):
+    for k in range(3):
+        face = 2 if k == 2 else (a if k == 0 else 1 - a)
         out[7 + k] = share[face] / count
         out[10 + k] = off[face] / max(share[face], 1.0) / size
 
@@ -136,7 +142,8 @@ def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, o
 def _ball(cloud: F4, low: float, high: float, out: F4) -> None:
     """Compare the points with the ball that fits them by least squares."""
     A, b = np.zeros((4, 4)), np.zeros(4)
-    row = np.ones(4)
+    row = np.zeros(4)
+    row[3] = 1.0
     for i in range(cloud.shape[1]):
         square = 0.0
         for j in range(3):
@@ -149,8 +156,12 @@ def _ball(cloud: F4, low: float, high: float, out: F4) -> None:
     for j in range(4):
         A[j, j] += 1e-3 * cloud.shape[1]
     solve(A, b)
-    middle = b[:3] / 2
-    radius = np.sqrt(max(b[3] + (middle**2).sum(), 1e-6))
+    middle = np.zeros(3)
+    squared = b[3]
+    for j in range(3):
+        middle[j] = b[j] / 2
+        squared += middle[j] * middle[j]
+    radius = np.sqrt(max(squared, 1e-6))
     cost = 0.0
     for i in range(cloud.shape[1]):
         square = 0.0

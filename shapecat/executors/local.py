@@ -7,17 +7,19 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from contextlib import suppress
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context, parent_process, resource_tracker
 from multiprocessing.connection import Connection, wait
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
+from shapecat import stopping
 from shapecat.executors.cores import limited_threads
 
 __all__ = ["LocalExecutor", "WorkerLostError"]
 
 # Spawned, not forked: the threads of numeric and Rerun libraries do not survive a fork.
 _SPAWN = get_context("spawn")
+_SIGNALS = {signal.SIGINT, signal.SIGTERM}
 
 
 class WorkerLostError(RuntimeError):
@@ -33,8 +35,9 @@ class LocalExecutor(Executor):
     """Runs tasks in spawned processes, as `concurrent.futures.ProcessPoolExecutor` does.
 
     It differs where a disk of recordings needs it to: a worker that dies fails its own task alone
-    and is replaced, workers end when their parent does, however it ended, and `terminate` does
-    not wait for tasks.
+    and is replaced, workers end when their parent does, however it ended, `stop` asks tasks to
+    put their work down, and `terminate` does not wait for them. Signals reach the parent alone,
+    which decides what they mean.
     """
 
     def __init__(self, workers: int, *, threads: int = 1) -> None:
@@ -89,6 +92,15 @@ class LocalExecutor(Executor):
             for attendant in self._attendants:
                 attendant.join()
 
+    def stop(self) -> None:
+        """Ask the tasks to stop, as a signal asks a command, and wait until they have."""
+        self.shutdown(wait=False, cancel_futures=True)
+        with self._lock:
+            for worker in self._workers.values():
+                worker.ask_to_stop()
+        for attendant in self._attendants:
+            attendant.join()
+
     def terminate(self) -> None:
         """Kill the workers in the middle of their tasks."""
         self.shutdown(wait=False, cancel_futures=True)
@@ -106,6 +118,8 @@ class LocalExecutor(Executor):
 
     def _attend(self, seat: int) -> None:
         """Give tasks to one worker after the other, for as long as there are any."""
+        resource_tracker.ensure_running()  # to start it lets signals through again
+        signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # which the workers inherit
         while task := self._tasks.get():
             if not task.future.set_running_or_notify_cancel():
                 continue
@@ -159,11 +173,17 @@ class _Worker:
 
     def __init__(self, threads: int) -> None:
         self.pipe, far = _SPAWN.Pipe()
-        # Daemonic ones may not start processes of their own; `_end_with_parent` ends these.
-        self.process = _SPAWN.Process(target=_serve, args=(far,), daemon=False)
+        asked, self._ask = _SPAWN.Pipe(duplex=False)
+        # Daemonic ones may not start processes of their own; `_watch_parent` ends these.
+        self.process = _SPAWN.Process(target=_serve, args=(far, asked), daemon=False)
         with limited_threads(threads):
             self.process.start()
         far.close()
+        asked.close()
+
+    def ask_to_stop(self) -> None:
+        """Let `stopping.asked` be true in the process."""
+        self._ask.close()
 
     def call(self, call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> Any:
         """Send a call and wait for its answer.
@@ -176,10 +196,9 @@ class _Worker:
         return self.pipe.recv()
 
 
-def _serve(pipe: Connection) -> None:
+def _serve(pipe: Connection, asked: Connection) -> None:
     """Answer calls until the parent closes the pipe or dies."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt means
-    threading.Thread(target=_end_with_parent, daemon=True).start()
+    threading.Thread(target=_watch_parent, args=(asked,), daemon=True).start()
     with suppress(EOFError, OSError):
         while True:
             function, arguments, options = pipe.recv()
@@ -191,13 +210,16 @@ def _answer(
 ) -> tuple[bool, Any]:
     try:
         return True, function(*arguments, **options)
-    except Exception as error:  # noqa: BLE001  it is raised by the future
+    except (Exception, stopping.Stopped) as error:  # noqa: BLE001  it is raised by the future
         return False, error
 
 
-def _end_with_parent() -> None:
-    """End this process, whatever it does, when its parent is gone."""
+def _watch_parent(asked: Connection) -> None:
+    """Stop the work when the parent asks; end, whatever it does, when the parent is gone."""
     parent = parent_process()
-    if parent is not None:
+    if parent is None:
+        return
+    if parent.sentinel not in wait([parent.sentinel, asked]):
+        stopping.request()
         wait([parent.sentinel])
-        os._exit(1)
+    os._exit(1)

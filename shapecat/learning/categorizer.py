@@ -203,7 +203,8 @@ def _predict(
         # (2) the dictionary: the leaf of each tree
         fall(features[i], roots, feature, split, left, word, rounds, words)
         # (3) the learners on the words
-        logits[:] = bias
+        for c in range(bias.size):
+            logits[c] = bias[c]
         for w in words:
             for c in range(bias.size):
                 logits[c] += votes[w, c]
@@ -211,14 +212,19 @@ def _predict(
             for c in range(bias.size):
                 for j in range(linear.shape[1]):
                     logits[c] += linear[c, j] * features[i, j]
-        logits /= temperature
-        known = logits[:categories]
-        exponentials = np.exp(known - known.max())
-        total = exponentials.sum()
-        posteriors[i] = exponentials / total
+        best = -np.inf
+        for c in range(bias.size):
+            logits[c] /= temperature
+            if c < categories:
+                best = max(best, logits[c])
+        total = 0.0
+        for c in range(categories):
+            total += np.exp(logits[c] - best)
+        for c in range(categories):
+            posteriors[i, c] = np.exp(logits[c] - best) / total
         # (4) novelty: the odds that it is none of them, or else that it is not the best of them
         if bias.size > categories:
-            odds = logits[categories] - known.max() - np.log(total)
+            odds = logits[categories] - best - np.log(total)
         else:
             odds = np.log(max(total - 1.0, 1e-30))
         novelty[i] = 2.0 / (1.0 + np.exp(min(threshold - odds, 80.0)))

@@ -2,16 +2,19 @@
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from shapecat.errors import OutputError
+from shapecat.files import flush, replacing
 from shapecat.outputs.exports_crops import write_crops
 from shapecat.outputs.exports_kitti import write_kitti
 from shapecat.outputs.exports_labelcloud import write_labelcloud
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.rereading import FinishedRun, open_source, read_finished, with_clouds
-from shapecat.runs.folder import staged
+from shapecat.runs.folder import clear, recover, staged
 from shapecat.types import Frame, LabelledFrame
 
 __all__ = ["FORMATS", "export_run"]
@@ -38,6 +41,7 @@ def export_run(
     out: Path,
     *,
     every: int = 1,
+    recording: Path | None = None,
     observe: Observer = _ignore,
 ) -> int:
     """Export the labels of a finished run with the points they belong to.
@@ -48,6 +52,7 @@ def export_run(
     Parameters
     ----------
     every : keep each so-many-th frame of a stream.
+    recording : where the recording is now; where it was processed by default.
 
     Returns
     -------
@@ -64,18 +69,51 @@ def export_run(
         raise ValueError(msg)
     finished = read_finished(folder)
     total = -(-int(finished.run["counts"]["frames"]) // every)
-    with open_source(finished) as recording:
+    with open_source(finished.run, recording) as source:
         chosen = _thinned(finished.frames(), every)
-        pairs = _observed(with_clouds(chosen, recording, finished.run), total, observe)
+        pairs = _observed(with_clouds(chosen, source, finished.run), total, observe)
         if format == "crops":
             return write_crops(out, pairs, finished)
         target = out / finished.name
+        recover(target, _made_by_export)
         _require_own(target, format)
-        with staged(target) as hidden:
+        with staged(target, _made_by_export) as hidden:
+            clear(hidden, _made_by_export(hidden) or ())
+            about = {"format": format, "run": finished.run["id"], "input": finished.run["input"]}
+            _mark(hidden, about)
             count = FORMATS[format](hidden, pairs, finished)
-            about = {"format": format, "input": finished.run["input"], "objects": count}
-            (hidden / _MARK).write_text(json.dumps(about, indent=1) + "\n", "utf-8")
+            for file in hidden.rglob("*"):
+                flush(file)
+            _mark(hidden, {**about, "objects": count})
     return count
+
+
+def _mark(folder: Path, about: Mapping[str, Any]) -> None:
+    """Note what an export is of, and which names it has made."""
+    made = sorted(path.name for path in folder.iterdir() if path.name != _MARK)
+    with replacing(folder / _MARK) as path:
+        path.write_text(json.dumps({**about, "made": made}, indent=1) + "\n", "utf-8")
+
+
+def _read_mark(folder: Path) -> dict[str, Any]:
+    """Return what an export says of itself; nothing where there is none."""
+    with suppress(OSError, ValueError):
+        about = json.loads((folder / _MARK).read_text("utf-8"))
+        if isinstance(about, dict) and isinstance(about.get("made"), list):
+            return about
+    return {}
+
+
+def _made_by_export(folder: Path) -> Collection[str] | None:
+    """Return the names that an export has made in a folder; None if it is not an export's.
+
+    One that was killed has not noted them: all that lies in its hidden folder is its own.
+    """
+    about = _read_mark(folder)
+    if not about:
+        return None
+    names = about["made"] if "objects" in about else [path.name for path in folder.iterdir()]
+    return [*(Path(str(name)).name for name in names if name != _MARK), _MARK]
 
 
 def _thinned(frames: Iterable[LabelledFrame], every: int) -> Iterator[LabelledFrame]:
@@ -98,10 +136,16 @@ def _require_own(target: Path, format: str) -> None:  # noqa: A002  # the word u
     """Refuse to replace anything but an earlier export, above all a run."""
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return
-    try:
-        made = json.loads((target / _MARK).read_text("utf-8"))["format"]
-    except (OSError, ValueError, KeyError, TypeError):
-        made = "something else"
+    made = _read_mark(target).get("format", "something else")
     if made != format:
         msg = f"{target}: holds {made}, not an earlier {format} export; choose another --out"
         raise OutputError(msg)
+    exported = (target / _MARK).stat().st_mtime_ns
+    changed = next((f for f in sorted(target.rglob("*")) if _is_later(f, exported)), None)
+    if changed is not None:
+        msg = f"{changed}: was changed after the export; choose another --out, or move it away"
+        raise OutputError(msg)
+
+
+def _is_later(file: Path, than_ns: int) -> bool:
+    return file.is_file() and file.stat().st_mtime_ns > than_ns

@@ -30,7 +30,7 @@ def write_crops(
     OutputError : the place is not writable.
     """
     # Recordings of the same name from different days are not taken for each other.
-    prefix = f"{safe_name(finished.name)}.{finished.run['input']['sha256'][:8]}"
+    prefix = f"{safe_name(finished.name)}.{finished.run['input']['digest'].rpartition(':')[2][:8]}"
     hidden = out / f".{prefix}.partial"
     several = len(finished.run["options"]["topics"]) > 1
     count = 0

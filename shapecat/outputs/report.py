@@ -6,16 +6,15 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from shapecat.errors import OutputError
 from shapecat.files import replacing
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.report_drawing import draw
 from shapecat.outputs.report_page import Card, Listed, index_page, is_unsure, run_page
 from shapecat.outputs.report_tracks import read_courses, read_portraits, read_stage_seconds
-from shapecat.outputs.rereading import read_finished
-from shapecat.runs.corrections import read_track_table
+from shapecat.outputs.rereading import find_runs, read_finished
+from shapecat.runs.track_table import read_track_table
 
-__all__ = ["find_runs", "write_report", "write_reports"]
+__all__ = ["write_report", "write_reports"]
 
 Observer = Callable[[str, int, int | None], None]
 
@@ -32,8 +31,8 @@ def write_reports(folders: Sequence[Path], observe: Observer = _ignore) -> list[
 
     Parameters
     ----------
-    folders : runs, or folders of runs. The index lies in the first folder of runs, or beside the
-        first run; a single run gets none.
+    folders : runs, or folders of runs. The index lies in the folder that holds all of them; a
+        single run gets none.
 
     Returns
     -------
@@ -43,11 +42,10 @@ def write_reports(folders: Sequence[Path], observe: Observer = _ignore) -> list[
     ------
     OutputError : a folder holds no run, or a page cannot be written.
     """
-    runs = [run for folder in folders for run in find_runs(folder)]
-    unique = list({run.resolve(): run for run in runs}.values())
-    many = len(unique) > 1 or any(folder not in runs for folder in folders)
-    first = next((folder for folder in folders if folder not in runs), folders[0].parent)
-    index = first / "index.html" if many else None
+    unique = find_runs(folders)
+    many = len(unique) > 1 or any(folder not in unique for folder in folders)
+    above = Path(os.path.commonpath([run.resolve().parent for run in unique]))
+    index = above / "index.html" if many else None
     pages, listed = [], []
     for done, run in enumerate(unique, start=1):
         item = write_report(run, index=index)
@@ -55,28 +53,11 @@ def write_reports(folders: Sequence[Path], observe: Observer = _ignore) -> list[
         listed.append(item)
         observe("report", done, len(unique))
     if index:
-        title = first.resolve().name
+        title = above.name
         with replacing(index) as path:
             path.write_text(index_page(title, listed), "utf-8")
         pages.append(index)
     return pages
-
-
-def find_runs(folder: Path) -> list[Path]:
-    """Return a folder if it is a run, else the runs in it, by name.
-
-    Raises
-    ------
-    OutputError : there is none.
-    """
-    if (folder / "run.json").is_file():
-        return [folder]
-    runs = sorted(path.parent for path in folder.glob("*/run.json"))
-    runs = [run for run in runs if not run.name.startswith(".")]
-    if not runs:
-        msg = f"{folder}: no run.json there or one level below; expected results of a process"
-        raise OutputError(msg)
-    return runs
 
 
 def write_report(folder: Path, *, index: Path | None = None) -> Listed:

@@ -20,7 +20,7 @@ from shapecat.outputs.colours import colour_of
 from shapecat.outputs.report_drawing import SIDE, Picture
 from shapecat.outputs.report_tracks import Course
 from shapecat.outputs.rereading import FinishedRun
-from shapecat.runs.corrections import TrackRow, TrackTable
+from shapecat.runs.track_table import TrackRow, TrackTable
 
 __all__ = ["Card", "Listed", "index_page", "is_unsure", "run_page"]
 
@@ -300,7 +300,7 @@ def _facts(run: Mapping[str, Any]) -> str:
         "skipped frames": skipped or "none",
         "shapecat": run["versions"]["shapecat"],
         "python": run["versions"].get("python", ""),
-        "input sha256": run["input"]["sha256"][:16],
+        "input digest": run["input"]["digest"],
     }
     return "".join(
         f"<dt>{escape(name)}</dt><dd>{escape(str(value))}</dd>" for name, value in facts.items()

@@ -15,8 +15,8 @@ from shapecat.errors import RecordingError, ShapecatError
 from shapecat.geometry import level_from_sensor, transform
 from shapecat.outputs.report_drawing import Snapshot
 from shapecat.outputs.rereading import FinishedRun, clouds_again, open_source
-from shapecat.runs.corrections import TrackRow
 from shapecat.runs.tables import read_row_groups
+from shapecat.runs.track_table import TrackRow
 from shapecat.types import Frame, NeuralGas
 
 __all__ = ["Course", "Portrait", "read_courses", "read_portraits", "read_stage_seconds"]
@@ -147,7 +147,7 @@ def _read_clouds(finished: FinishedRun, views: Mapping[int, Mapping[str, Any]]) 
     clouds: dict[int, F4] = {}
     if not wanted:
         return clouds
-    with open_source(finished) as recording:
+    with open_source(finished.run) as recording:
         for frame in clouds_again(recording, finished.run):
             for track in wanted.pop((frame.topic, frame.index), []):
                 clouds[track] = _points(frame, views[track]["indices"])

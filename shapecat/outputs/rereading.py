@@ -1,20 +1,28 @@
 """A finished run beside its recording: labelled frames, and the clouds they were made from."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from shapecat.errors import OutputError
+from shapecat.errors import OutputError, RecordingError
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
 from shapecat.runs.corrections import TrackLabel, read_labels
-from shapecat.runs.folder import digest, read_run
+from shapecat.runs.folder import read_run
+from shapecat.runs.identity import content_digest, same_content
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.types import Frame, LabelledFrame
 
-__all__ = ["FinishedRun", "clouds_again", "open_source", "read_finished", "with_clouds"]
+__all__ = [
+    "FinishedRun",
+    "clouds_again",
+    "find_runs",
+    "open_source",
+    "read_finished",
+    "with_clouds",
+]
 
 
 @dataclass(frozen=True)
@@ -53,19 +61,49 @@ def read_finished(folder: Path) -> FinishedRun:
     return FinishedRun(folder, run, read_labels(folder / "tracks.csv", run["model"]["categories"]))
 
 
+def find_runs(folders: Sequence[Path]) -> list[Path]:
+    """Return the folders that are runs, and the runs in the others, by name; each once.
+
+    Raises
+    ------
+    OutputError : a folder holds none.
+    """
+    runs = [run for folder in folders for run in _runs_in(folder)]
+    return list({run.resolve(): run for run in runs}.values())
+
+
+def _runs_in(folder: Path) -> list[Path]:
+    if (folder / "run.json").is_file():
+        return [folder]
+    runs = sorted(path.parent for path in folder.glob("*/run.json"))
+    runs = [run for run in runs if not run.name.startswith(".")]
+    if not runs:
+        msg = f"{folder}: no run.json there or one level below; expected results of a process"
+        raise OutputError(msg)
+    return runs
+
+
 @contextmanager
-def open_source(finished: FinishedRun) -> Iterator[Recording]:
+def open_source(run: Mapping[str, Any], moved_to: Path | None = None) -> Iterator[Recording]:
     """Open the recording that a run was made from.
+
+    Parameters
+    ----------
+    moved_to : where it is now; where it was processed by default.
 
     Raises
     ------
     RecordingError : it is not there.
     OutputError : it is another one than it was.
     """
-    path = Path(finished.run["input"]["path"])
+    path = moved_to or Path(run["input"]["path"])
+    if moved_to is None and not path.exists():
+        msg = f"{path}: the recording is not there any more; say where it is: --recording PATH"
+        raise RecordingError(msg)
     with open_recording(path) as recording:
-        if digest(path) != finished.run["input"]["sha256"]:
-            msg = f"{path}: has changed since it was processed; process it again"
+        if not same_content(run["input"], path, lambda: content_digest(path)):
+            hint = "is another recording" if moved_to else "has changed since it was processed"
+            msg = f"{path}: {hint}; process it again"
             raise OutputError(msg)
         yield recording
 

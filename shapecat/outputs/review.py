@@ -39,6 +39,7 @@ import numpy as np
 import rerun as rr
 
 from shapecat.errors import OutputError
+from shapecat.files import replacing
 from shapecat.geometry import transform
 from shapecat.outputs import review_shapes as shapes
 from shapecat.outputs.colours import colour_of
@@ -54,6 +55,8 @@ __all__ = ["open_viewer", "take_screenshot", "write_review"]
 
 _FLUSH_FRAMES, _PLOT_FRAMES = 32, 256  # curves make few columns: Rerun remembers each it wrote
 _DRAWN_AT_ONCE, _POINTS_AT_ONCE = 16, 1 << 19  # frames and points held back of a sensor
+_PATIENCE_S = 30.0
+"""A disk takes what is flushed in less, or Rerun's writer has died of an error."""
 _RESERVE_BYTES = 64 << 20  # Rerun waits for ever on a full disk: stop before
 
 
@@ -103,25 +106,20 @@ def write_review(
 
 @contextmanager
 def _recording(path: Path, name: str, run: Mapping[str, object]) -> Iterator[rr.RecordingStream]:
-    hidden = path.with_name(f".{path.name}.partial")
     identity = uuid.uuid5(uuid.NAMESPACE_OID, name + json.dumps(run, sort_keys=True, default=str))
     stream = rr.RecordingStream("shapecat", recording_id=identity, send_properties=False)
     try:
         _require_space(path.parent)
-        stream.save(hidden)
-        stream.set_log_time_enabled(False)
-        stream.send_recording_name(name)
-        try:
+        with replacing(path) as hidden:
+            stream.save(hidden)
+            stream.set_log_time_enabled(False)
+            stream.send_recording_name(name)
             yield stream
-        finally:
-            stream.disconnect()
-        hidden.replace(path)
+            stream.disconnect()  # not after an error: it would wait for a writer that has died
     except (OSError, RuntimeError) as error:  # RuntimeError: how Rerun reports files
         reason = error.strerror if isinstance(error, OSError) else str(error)
         msg = f"{path}: cannot be written: {reason or error}"
         raise OutputError(msg) from error
-    finally:
-        hidden.unlink(missing_ok=True)
 
 
 def _require_space(folder: Path) -> None:
@@ -180,7 +178,7 @@ class _Review:
         """Write out what is held back."""
         for entity in self._pending:
             self._send(entity)
-        self._stream.flush(timeout_sec=60)
+        self._stream.flush(timeout_sec=_PATIENCE_S)
 
     def plot(self) -> None:
         """Send what is held back of curves and paths."""
@@ -208,7 +206,7 @@ class _Review:
             if track.frames == 1:  # a line of one point is not seen
                 self._log(f"{track.entity}/posterior", self._dots(), static=True)
         self._stream.send_blueprint(lay_out(scenes or [nothing], tracks))
-        self._stream.flush(timeout_sec=60)
+        self._stream.flush(timeout_sec=_PATIENCE_S)
 
     def _draw(self, entity: str, labelled: LabelledFrame, frame: Frame) -> None:
         """Paint the frame, and hold it back until there are enough of them."""

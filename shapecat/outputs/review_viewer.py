@@ -8,30 +8,75 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
+from urllib.parse import quote
 
 import numpy as np
 
 from shapecat.errors import OutputError
 
-__all__ = ["open_viewer", "take_screenshot"]
+__all__ = ["open_viewer", "serve_viewer", "take_screenshot"]
 
 _SETTLE_S = 7.0  # until the viewer's greetings have faded; all else is drawn by then
 _LOAD_S = 30.0
+_OPEN_S = 2.0
+"""A viewer that cannot open a window ends sooner."""
+_HERE = "127.0.0.1"
+_DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 
 
 def open_viewer(path: Path) -> None:
-    """Open a review in a window of its own, and return at once.
+    """Open a review in a window of its own, and return as soon as that stays open.
 
     Raises
     ------
-    OutputError : there is no such file, or no viewer.
+    OutputError : there is no such file, no viewer, or no display.
     """
     _require_file(path)
-    subprocess.Popen([_viewer(), str(path.absolute())], start_new_session=True)
+    if sys.platform == "linux" and not any(os.environ.get(name) for name in _DISPLAYS):
+        msg = "no display to open a window on; use --web for a browser, or --screenshot FILE.png"
+        raise OutputError(msg)
+    with tempfile.TemporaryFile() as said:
+        viewer = _start(("--port", "auto", str(path.absolute())), said)
+        with suppress(subprocess.TimeoutExpired):
+            if viewer.wait(_OPEN_S) != 0:
+                raise OutputError(_why(said))
+
+
+@contextmanager
+def serve_viewer(path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
+    """Serve a review to browsers on this machine; give the address and the process that serves.
+
+    Raises
+    ------
+    OutputError : there is no such file or no viewer, or it ends at once.
+    """
+    _require_file(path)
+    web, data = _free_port(), _free_port()
+    options = ("--serve-web", "--web-viewer-port", str(web), "--port", str(data))
+    with tempfile.TemporaryFile() as said:
+        viewer = _start((*options, str(path.absolute())), said)
+        try:
+            _wait_for(viewer, web, said)
+            source = quote(f"rerun+http://{_HERE}:{data}/proxy", safe="")
+            yield f"http://{_HERE}:{web}/?url={source}", viewer
+        finally:
+            _end(viewer)
+
+
+def _start(options: Sequence[str], said: IO[bytes]) -> subprocess.Popen[bytes]:
+    """Start the viewer in a process group of its own, for this machine alone."""
+    command = [_viewer(), "--bind", _HERE, *options]
+    return subprocess.Popen(command, stdout=said, stderr=said, start_new_session=True)
+
+
+def _end(viewer: subprocess.Popen[bytes]) -> None:
+    with suppress(ProcessLookupError):
+        os.killpg(viewer.pid, signal.SIGKILL)  # `rerun` is a script that starts the viewer
+    viewer.wait()
 
 
 def take_screenshot(
@@ -52,15 +97,13 @@ def take_screenshot(
 
     _require_file(path)
     port = _free_port()
-    options = ["--bind", "127.0.0.1", "--port", str(port), "--hide-welcome-screen"]
-    window = ["--headless", "--window-size", f"{size[0]}x{size[1]}"]
+    options = ("--port", str(port), "--hide-welcome-screen")
+    window = ("--headless", "--window-size", f"{size[0]}x{size[1]}")
     with tempfile.TemporaryFile() as said:
-        viewer = subprocess.Popen(
-            [_viewer(), *options, *window], stdout=said, stderr=said, start_new_session=True
-        )
+        viewer = _start((*options, *window), said)
         try:
             _wait_for(viewer, port, said)
-            client = ViewerClient(f"rerun+http://127.0.0.1:{port}/proxy")
+            client = ViewerClient(f"rerun+http://{_HERE}:{port}/proxy")
             _show(client, path, stamp_ns)
             client.save_screenshot(str(png.absolute()))
             _wait_until(png.exists)
@@ -69,9 +112,7 @@ def take_screenshot(
             msg = _why(said) if ended else f"{path}: the viewer cannot draw it: {error}"
             raise OutputError(msg) from error
         finally:
-            with suppress(ProcessLookupError):
-                os.killpg(viewer.pid, signal.SIGKILL)  # `rerun` is a script that starts the viewer
-            viewer.wait()
+            _end(viewer)
 
 
 def _show(client: Any, path: Path, stamp_ns: int | None) -> None:
@@ -114,7 +155,7 @@ def _viewer() -> str:
 
 def _free_port() -> int:
     with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
+        probe.bind((_HERE, 0))
         return int(probe.getsockname()[1])
 
 
@@ -125,7 +166,7 @@ def _wait_for(viewer: subprocess.Popen[bytes], port: int, said: IO[bytes]) -> No
         if viewer.poll() is not None:
             raise OutputError(_why(said))
         with socket.socket() as probe:
-            return probe.connect_ex(("127.0.0.1", port)) == 0
+            return probe.connect_ex((_HERE, port)) == 0
 
     _wait_until(answers)
 

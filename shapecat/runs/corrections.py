@@ -5,34 +5,43 @@ through a spreadsheet: separators, quotes, line ends, the order of columns and n
 ``1.0`` do not matter.
 """
 
-import csv
-import io
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
 from shapecat.errors import OutputError
 from shapecat.files import replacing
 from shapecat.runs.folder import read_run
+from shapecat.runs.track_table import (
+    TrackRow,
+    TrackTable,
+    read_track_table,
+    unlabelled,
+    with_label,
+    write_track_table,
+)
 from shapecat.types import CATEGORIES
 
 __all__ = [
+    "PREVIOUS",
     "TrackLabel",
-    "TrackRow",
-    "TrackTable",
     "adopt_labels",
+    "find_misread",
+    "has_labels",
+    "merged_with",
+    "merging_with",
     "read_labels",
-    "read_track_table",
+    "relabel",
 ]
 
 UNKNOWN = "unknown"
 DELETE = "delete"
 ORIGINAL = "tracks.original.csv"
+PREVIOUS = "tracks.previous.csv"
 
-_COLUMNS = ("track", "category", "confidence", "label")
-_LARGEST_TABLE = 64 << 20
 _MERGE = re.compile(r"merged? +(?:with|into) +#?(\d{1,9})(?:[.,]0*)?", re.IGNORECASE)
 _NEW = re.compile(r"new +(.+)", re.IGNORECASE)
 _NAME = re.compile(r"[^\W\d_][\w .+&'()-]{0,58}[\w)]|[^\W\d_]")
@@ -47,28 +56,6 @@ class TrackLabel(NamedTuple):
     track: int
     category: str
     confidence: float
-
-
-@dataclass(frozen=True)
-class TrackRow:
-    """A line of tracks.csv; ``cells`` are all its columns as written."""
-
-    line: int
-    track: int
-    category: str
-    confidence: float
-    label: str
-    topic: str
-    cells: Mapping[str, str]
-
-
-@dataclass(frozen=True)
-class TrackTable:
-    """The lines of a tracks.csv that could be read, and what is wrong with the others."""
-
-    columns: tuple[str, ...]
-    rows: tuple[TrackRow, ...]
-    problems: tuple[str, ...]
 
 
 def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLabel]:
@@ -87,8 +74,9 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
     OutputError : the table is unreadable, or lines of it cannot be understood: each is named.
     """
     table = read_track_table(path)
-    labels, problems = _resolve(table.rows, categories, one_frame=_one_frame(path.parent))
-    _refuse(path, [*table.problems, *problems])
+    _require_same_run(path, table, path.parent)
+    labels, misread = _resolve(table.rows, categories, one_frame=_one_frame(path.parent))
+    _refuse(path, [*table.problems, *_lines(table.rows, misread)])
     return labels
 
 
@@ -101,11 +89,13 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
 
     Raises
     ------
-    OutputError : the table is unreadable, names tracks that the run does not have, or has labels
-        that cannot be understood. All such lines are named, and nothing is written.
+    OutputError : the table is unreadable, is another run's, names tracks that the run does not
+        have, or has labels that cannot be understood. All such lines are named, and nothing is
+        written.
     """
     current, original = folder / "tracks.csv", folder / ORIGINAL
     in_place = current.exists() and corrected.exists() and corrected.samefile(current)
+    _require_same_run(corrected, read_track_table(corrected), folder, known=in_place)
     base = read_track_table(original if original.exists() else current)
     if not in_place:
         base = _relabelled(base, read_track_table(current).rows)
@@ -122,131 +112,166 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
     result = _relabelled(base, table.rows)
     known_categories = read_run(folder)["model"]["categories"]
     _, misread = _resolve(result.rows, known_categories, one_frame=_one_frame(folder))
-    _refuse(corrected, problems + misread)
+    _refuse(corrected, problems + _lines(result.rows, misread))
     if not original.exists():
         with replacing(original) as path:
             if in_place:
-                _write(path, replace(base, rows=tuple(_with_label(row, "") for row in base.rows)))
+                write_track_table(path, unlabelled(base))
             else:
                 path.write_bytes(current.read_bytes())
     with replacing(current) as path:
-        _write(path, result)
+        write_track_table(path, result)
 
 
-def read_track_table(path: Path) -> TrackTable:
-    """Read a tracks.csv, also one that a spreadsheet has saved.
+def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
+    """Give tracks of a run labels; the others keep theirs, and the first table is kept as well.
+
+    Returns
+    -------
+    By track, why a label was not given: it cannot be understood, or contradicts those there.
 
     Raises
     ------
-    OutputError : the file is not a table with the columns of tracks.csv.
+    OutputError : the table of the run cannot be read or is another run's, or the disk is full.
     """
-    lines = csv.reader(io.StringIO(_text(path), newline=""), delimiter=_separator(path))
-    rows: dict[int, TrackRow] = {}
-    problems: list[str] = []
-    columns: tuple[str, ...] = ()
-    try:
-        for cells in lines:
-            if not any(cell.strip() for cell in cells) or cells[0].lower().startswith("sep="):
-                continue
-            if not columns:
-                columns = _header(path, cells)
-                continue
-            row = _row(lines.line_num, dict(zip(columns, cells, strict=False)))
-            if isinstance(row, str):
-                problems.append(row)
-            elif row.track in rows:
-                problems.append(f"line {row.line}: track {row.track} is listed twice")
-            else:
-                rows[row.track] = row
-    except csv.Error as error:
-        problems.append(f"line {lines.line_num}: {error}")
-    if not columns:
-        _header(path, [])
-    return TrackTable(columns, tuple(rows.values()), tuple(problems))
+    current, original = folder / "tracks.csv", folder / ORIGINAL
+    base = read_track_table(current)
+    _require_same_run(current, base, folder)
+    categories, one_frame = read_run(folder)["model"]["categories"], _one_frame(folder)
+    before = find_misread(base.rows, categories, one_frame=one_frame)
+    _refuse(current, [*base.problems, *_lines(base.rows, before)])
+    rows, refused = _given(base.rows, labels, categories, one_frame=one_frame)
+    if not original.exists():
+        with replacing(original) as path:
+            write_track_table(path, unlabelled(base))
+    with replacing(current) as path:
+        write_track_table(path, replace(base, rows=rows))
+    return refused
 
 
-def _text(path: Path) -> str:
-    """Return the text of a table in whichever encoding a spreadsheet has saved it."""
-    try:
-        if path.stat().st_size > _LARGEST_TABLE:
-            msg = f"{path}: larger than {_LARGEST_TABLE >> 20} MB, not a tracks.csv"
-            raise OutputError(msg)
-        content = path.read_bytes()
-    except OSError as error:
-        msg = f"{path}: cannot be read: {error.strerror or error}"
-        raise OutputError(msg) from error
-    wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
-    for encoding in ("utf-16",) if wide else ("utf-8-sig", "cp1252"):
-        try:
-            return content.decode(encoding)
-        except UnicodeDecodeError:
-            continue
-    msg = f"{path}: not a text; save the table as CSV"
+def _given(
+    rows: tuple[TrackRow, ...],
+    labels: Mapping[int, str],
+    categories: Iterable[str],
+    *,
+    one_frame: bool,
+) -> tuple[tuple[TrackRow, ...], dict[int, str]]:
+    """Return rows with labels, and why some were not given; one by one if not all can be."""
+    given = _labelled(rows, labels)
+    if not find_misread(given, categories, one_frame=one_frame):
+        return given, {}
+    refused = {}
+    for track in sorted(labels, key=lambda track: merged_with(labels[track]) is not None):
+        given = _labelled(rows, {track: labels[track]})
+        if misread := find_misread(given, categories, one_frame=one_frame):
+            refused[track] = misread.get(track) or next(iter(misread.values()))
+        else:
+            rows = given
+    return rows, refused
+
+
+def _labelled(rows: Iterable[TrackRow], labels: Mapping[int, str]) -> tuple[TrackRow, ...]:
+    return tuple(with_label(row, labels.get(row.track, row.label)) for row in rows)
+
+
+def has_labels(path: Path) -> bool:
+    """Return whether a person has filled in labels in a table, if there is one.
+
+    Raises
+    ------
+    OutputError : it cannot be read.
+    """
+    return path.exists() and any(row.label for row in read_track_table(path).rows)
+
+
+def merged_with(label: str) -> int | None:
+    """Return the number of the track that a label merges with; None for any other label.
+
+    Examples
+    --------
+    >>> merged_with("merge with 7"), merged_with("cup")
+    (7, None)
+    """
+    merge = _MERGE.fullmatch(label)
+    return int(merge[1]) if merge else None
+
+
+def merging_with(track: int) -> str:
+    """Return the label that merges with a track.
+
+    Examples
+    --------
+    >>> merging_with(7)
+    'merge with 7'
+    """
+    return f"merge with {track}"
+
+
+def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: bool = True) -> None:
+    """Refuse a table whose tracks are not those of the run in ``folder``.
+
+    ``known`` is a table that lies in the folder: it need not say whose it is. One without the
+    column, made by hand, goes by its places, if it has any.
+
+    Raises
+    ------
+    OutputError : it is another run's, of several runs, or of nobody knows which.
+    """
+    own = read_run(folder).get("work", "") if (folder / "run.json").exists() else ""
+    if not own or set(table.runs) == {own}:
+        return
+    if not table.runs and (known or _places_agree(table, folder)):
+        return
+    if len(table.runs) > 1:
+        found = f"holds tracks of several runs ({', '.join(table.runs)})"
+    elif table.runs:
+        found = f"holds the tracks of {_described(path.parent, table.run)}"
+    else:
+        found = "has tracks in other places (and no column `run`)"
+    msg = (
+        f"{path}: {found}, not those of {_described(folder, own)}; to find the same objects by "
+        "their places use --by-place"
+    )
     raise OutputError(msg)
 
 
-def _separator(path: Path) -> str:
-    """Return the separator of the line that names the columns."""
-    lines = (line for line in _text(path).splitlines() if "track" in line.lower())
-    header = next(lines, "")
-    return max(",;\t", key=header.count)
-
-
-def _header(path: Path, cells: Sequence[str]) -> tuple[str, ...]:
-    names = tuple(cell.strip().lower() for cell in cells)
-    missing = [name for name in _COLUMNS if name not in names]
-    if missing:
-        msg = f"{path}: no column {', '.join(missing)}; expected a table like a run's tracks.csv"
-        raise OutputError(msg)
-    return names
-
-
-def _row(line: int, cells: Mapping[str, str]) -> TrackRow | str:
-    """Return a row, or what is wrong with it."""
-    try:
-        track = _number(cells["track"])
-        confidence = _number(cells["confidence"])
-        if track != int(track):
-            raise ValueError  # noqa: TRY301  the same message for all that is not a number
-    except (KeyError, ValueError, OverflowError):
-        text = f"track {cells.get('track', '')!r}, confidence {cells.get('confidence', '')!r}"
-        return f"line {line}: expected numbers, got {text}"
-    return TrackRow(
-        line=line,
-        track=int(track),
-        category=cells.get("category", "").strip(),
-        confidence=confidence,
-        label=" ".join(cells.get("label", "").split()),
-        topic=cells.get("topic", "").strip(),
-        cells=cells,
+def _places_agree(table: TrackTable, folder: Path) -> bool:
+    """Return whether no track of a table is elsewhere than that of the run."""
+    own = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
+    return all(
+        _number(row.cells.get(axis)) in {None, _number(own[row.track].cells.get(axis))}
+        for row in table.rows
+        if row.track in own
+        for axis in "xyz"
     )
 
 
-def _number(text: str) -> float:
-    return float(text.strip().replace(",", "."))
+def _number(cell: str | None) -> float | None:
+    """Return the number in a cell, as a spreadsheet may write it."""
+    with suppress(ValueError, AttributeError):
+        return float((cell or "").strip().replace(",", "."))
+    return None
+
+
+def _described(folder: Path, work: str) -> str:
+    """Name a run, by its folder and recording if it is the one that lies there."""
+    with suppress(OutputError, KeyError):
+        run = read_run(folder)
+        if run["work"] == work:
+            return f"run {work} ({folder}, of {run['input']['path']})"
+    return f"run {work}"
 
 
 def _relabelled(base: TrackTable, rows: Iterable[TrackRow]) -> TrackTable:
     """Return a table with the labels of other rows, and the numbers of their lines."""
     given = {row.track: row for row in rows}
     changed = [
-        replace(_with_label(row, given[row.track].label), line=given[row.track].line)
+        replace(with_label(row, given[row.track].label), line=given[row.track].line)
         if row.track in given
         else row
         for row in base.rows
     ]
     return replace(base, rows=tuple(changed))
-
-
-def _with_label(row: TrackRow, label: str) -> TrackRow:
-    return replace(row, label=label, cells={**row.cells, "label": label})
-
-
-def _write(path: Path, table: TrackTable) -> None:
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, table.columns, lineterminator="\n", restval="")
-        writer.writeheader()
-        writer.writerows(row.cells for row in table.rows)
 
 
 def _refuse(path: Path, problems: Sequence[str]) -> None:
@@ -265,18 +290,29 @@ def _one_frame(folder: Path) -> bool:
     return (folder / "run.json").exists() and read_run(folder).get("fixed_frame") is not None
 
 
+def find_misread(
+    rows: Sequence[TrackRow], categories: Iterable[str] = (), *, one_frame: bool = True
+) -> dict[int, str]:
+    """Return by track why its label cannot be understood, or contradicts others."""
+    return _resolve(rows, categories, one_frame=one_frame)[1]
+
+
+def _lines(rows: Iterable[TrackRow], misread: Mapping[int, str]) -> list[str]:
+    return [f"line {row.line}: {misread[row.track]}" for row in rows if row.track in misread]
+
+
 def _resolve(
     rows: Sequence[TrackRow], categories: Iterable[str], *, one_frame: bool
-) -> tuple[dict[int, TrackLabel], list[str]]:
-    """Return what each track is shown as, and which lines cannot be understood."""
+) -> tuple[dict[int, TrackLabel], dict[int, str]]:
+    """Return what each track is shown as, and by track why its label cannot be understood."""
     known = {n.lower(): n for n in (UNKNOWN, *CATEGORIES, *categories, *(r.category for r in rows))}
     verdicts: dict[int, _Verdict] = {}
-    problems = []
+    misread = {}
     for row in rows:
         try:
             verdicts[row.track] = _understand(row.label, known) if row.label else row.category
         except ValueError as error:
-            problems.append(f"line {row.line}: {error}")
+            misread[row.track] = str(error)
             verdicts[row.track] = row.category
     by_track = {row.track: row for row in rows}
     labels = {}
@@ -287,13 +323,13 @@ def _resolve(
                 msg = f"track {shown.track} is of another topic, {shown.topic or 'none'}"
                 raise ValueError(msg)  # noqa: TRY301  collected with those of the calls
         except ValueError as error:
-            problems.append(f"line {row.line}: {row.label!r}: {error}")
+            misread[row.track] = f"{row.label!r}: {error}"
             continue
         category = verdicts[shown.track]
         if isinstance(category, str):
             confidence = 1.0 if shown.label else shown.confidence
             labels[row.track] = TrackLabel(shown.track, category, confidence)
-    return labels, problems
+    return labels, misread
 
 
 def _share_a_topic(a: TrackRow, b: TrackRow) -> bool:
@@ -328,8 +364,9 @@ def _understand(label: str, known: dict[str, str]) -> _Verdict:
         return known[label.lower()]
     if label.lower() == DELETE:
         return None
-    if merge := _MERGE.fullmatch(label):
-        return int(merge[1])
+    merge = merged_with(label)
+    if merge is not None:
+        return merge
     new = _NEW.fullmatch(label)
     name = new[1] if new else label
     if re.match(r"merged? ", label, re.IGNORECASE) or not _NAME.fullmatch(name):

@@ -1,77 +1,189 @@
-"""The folder of one run: built under a hidden name, renamed when complete."""
+"""The folder of one run: built under a hidden name, renamed when complete, never a stranger's.
 
-import hashlib
+A marker tells what is ours: run.json with the run's id, or the record that an export keeps. What
+has none is neither removed nor replaced, and what somebody has put beside our files stays.
+"""
+
 import json
 import os
 import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from shapecat.errors import OutputError
-from shapecat.files import lock, partial_folder, replacing
+from shapecat.files import flush, lock, partial_path, replacing
 
 __all__ = [
-    "digest",
-    "empty",
+    "OUTPUTS",
+    "RUN_FILES",
+    "Marker",
+    "clear",
+    "made_by_run",
+    "previous_path",
     "read_run",
+    "recover",
+    "require_ours",
     "staged",
     "sweep",
     "write_run",
 ]
 
-_SAMPLE = 1 << 20
+OUTPUTS = ("annotated.mcap", "review.rrd")
+RUN_FILES = (
+    *(f"{name}.parquet" for name in ("frames", "detections", "planes", "tracks")),
+    *("tracks.csv", "tracks.original.csv", "tracks.previous.csv", "report.html"),
+    *OUTPUTS,
+    "run.json",
+)
+_MADE = ("segments", *(partial_path(Path(name)).name for name in RUN_FILES), *RUN_FILES)
+
+_BEGUN = (".run.json.partial", ".export.json.partial")
+"""What a kill may leave in a folder that has no marker yet."""
+
+Marker = Callable[[Path], Collection[str] | None]
+"""Returns the names that were made in a folder, the marker last; None if it is none of ours."""
+
+
+def made_by_run(folder: Path) -> Collection[str] | None:
+    """Return the names that a run makes in its folder; None if the folder is not a run's."""
+    with suppress(OutputError):
+        if read_run(folder).get("id"):
+            return _MADE
+    return None
 
 
 @contextmanager
-def staged(folder: Path) -> Iterator[Path]:
+def staged(
+    folder: Path,
+    marker: Marker = made_by_run,
+    *,
+    worth_keeping: Callable[[Path], bool] = lambda _: False,
+) -> Iterator[Path]:
     """Give a hidden folder beside ``folder`` that takes its name when the block succeeds.
 
-    An older ``folder`` is replaced only then. On an error nothing is left behind; after an
-    interruption or a kill the hidden folder stays, and the next run finds in it what was done.
+    An older ``folder`` of ours is moved away then, and removed after. After a signal or a kill
+    the hidden folder stays, and the next run finds in it what was done; after an error, only
+    where it is ``worth_keeping``.
 
     Raises
     ------
-    OutputError : the disk is full, the place is not writable, or another run is writing there.
+    OutputError : the disk is full, the place is not writable or a stranger's, or another run is
+        writing there.
     """
-    hidden = partial_folder(folder)
+    hidden = partial_path(folder)
+    for place in (folder, hidden):
+        require_ours(place, marker)
     created = _missing_parents(folder)
     try:
         hidden.mkdir(parents=True, exist_ok=True)
         with _locked(hidden):
             yield hidden
-            _swap(hidden, folder)
-    except OSError as error:
-        _discard(hidden, created)
-        msg = f"{folder}: cannot write the results: {error.strerror or error}"
-        raise OutputError(msg) from error
+            _replace(folder, hidden, marker)
     except _BusyError as error:
         msg = f"{folder}: another run is writing there"
         raise OutputError(msg) from error
-    except Exception:
-        _discard(hidden, created)
-        raise
+    except Exception as error:
+        kept = worth_keeping(hidden)
+        if not kept:
+            _discard(hidden, created)
+        if not isinstance(error, OSError | OutputError):
+            raise
+        reason = f"{folder}: cannot write the results: {getattr(error, 'strerror', '') or error}"
+        text = str(error) if isinstance(error, OutputError) else reason
+        more = "; what is done is kept, and the same command goes on" if kept else ""
+        raise OutputError(text + more) from error
 
 
-def empty(folder: Path) -> None:
-    """Remove everything in a folder."""
-    for item in folder.iterdir():
+def require_ours(folder: Path, marker: Marker = made_by_run) -> None:
+    """Refuse to touch a folder that holds anything but our work.
+
+    Raises
+    ------
+    OutputError : it is a stranger's.
+    """
+    if folder.is_dir() and not folder.is_symlink():
+        begun = not any(_strangers(folder, _BEGUN))
+        if begun or marker(folder) is not None:
+            return
+    elif not folder.exists():
+        return
+    msg = f"{folder}: shapecat did not make this; choose another --out, or move it away"
+    raise OutputError(msg)
+
+
+def _strangers(folder: Path, names: Collection[str]) -> Iterator[Path]:
+    """Yield what lies in a folder beside the names that were made in it."""
+    return (item for item in folder.iterdir() if item.name not in names)
+
+
+def _replace(folder: Path, hidden: Path, marker: Marker) -> None:
+    """Let the complete hidden folder take its name; at any moment one of the two is whole."""
+    flush(hidden)
+    if folder.exists():
+        require_ours(folder, marker)
+        folder.rename(previous_path(folder))
+    hidden.rename(folder)
+    flush(folder.parent)
+    _retire(folder, marker)
+
+
+def previous_path(folder: Path) -> Path:
+    """Return where a folder is moved that a new one replaces."""
+    return folder.with_name(f".{folder.name}.old")
+
+
+def _retire(folder: Path, marker: Marker) -> None:
+    """Remove what was made in the replaced folder; what else was put there moves on."""
+    previous = previous_path(folder)
+    if not previous.is_dir():
+        return
+    names = marker(previous) or ()
+    for item in _strangers(previous, names):
+        if names and not (folder / item.name).exists():
+            item.rename(folder / item.name)
+    clear(previous, names)
+    with suppress(OSError):  # not empty
+        previous.rmdir()
+
+
+def recover(folder: Path, marker: Marker = made_by_run) -> None:
+    """Put back, or finish to remove, what a killed run has moved away.
+
+    Raises
+    ------
+    OutputError : the place is not writable.
+    """
+    previous, hidden = previous_path(folder), partial_path(folder)
+    if not previous.is_dir():
+        return
+    try:
+        with _locked(hidden if hidden.is_dir() else previous):
+            if not folder.exists() and marker(previous) is not None:
+                previous.rename(folder)
+            elif folder.exists() and marker(folder) is not None:
+                _retire(folder, marker)
+    except _BusyError:
+        return  # that run does it
+    except OSError as error:
+        msg = f"{folder}: cannot be written: {error.strerror or error}"
+        raise OutputError(msg) from error
+
+
+def clear(folder: Path, names: Collection[str] = _MADE) -> None:
+    """Remove from a folder, in their order, the names that were made in it."""
+    for item in (folder / name for name in names):
         if item.is_dir() and not item.is_symlink():
             shutil.rmtree(item)
         else:
-            item.unlink()
+            item.unlink(missing_ok=True)
 
 
 def sweep(folder: Path) -> None:
-    """Remove what killed runs left in and beside a complete folder."""
-    with suppress(OSError, _BusyError):
-        shutil.rmtree(_old(folder), ignore_errors=True)
-        for file in folder.glob(".*.partial"):
-            file.unlink()
-        if partial_folder(folder).exists():
-            with _locked(partial_folder(folder)):
-                shutil.rmtree(partial_folder(folder), ignore_errors=True)
+    """Remove the half-made files that a killed command has left in a complete folder."""
+    with suppress(OSError):
+        clear(folder, [partial_path(Path(name)).name for name in RUN_FILES])
 
 
 class _BusyError(Exception):
@@ -89,10 +201,6 @@ def _locked(folder: Path) -> Iterator[None]:
         os.close(held)
 
 
-def _old(folder: Path) -> Path:
-    return folder.with_name(f".{folder.name}.old")
-
-
 def _discard(hidden: Path, created: list[Path]) -> None:
     shutil.rmtree(hidden, ignore_errors=True)
     for parent in created:
@@ -102,33 +210,6 @@ def _discard(hidden: Path, created: list[Path]) -> None:
 
 def _missing_parents(folder: Path) -> list[Path]:
     return [parent for parent in folder.parents if not parent.exists()]
-
-
-def _swap(new: Path, folder: Path) -> None:
-    old = _old(folder)
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        folder.rename(old)
-    new.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
-
-
-def digest(path: Path) -> str:
-    """Return a hash that tells one recording from another without reading all of it.
-
-    SHA-256 over size, first and last MiB of the file, or of each file of a folder in name order.
-    """
-    total = hashlib.sha256()
-    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
-        if not file.is_file():
-            continue
-        size = file.stat().st_size
-        total.update(f"{size}".encode())
-        with file.open("rb") as stream:
-            total.update(stream.read(_SAMPLE))
-            stream.seek(max(0, size - _SAMPLE))
-            total.update(stream.read(_SAMPLE))
-    return total.hexdigest()
 
 
 def write_run(folder: Path, run: Mapping[str, Any]) -> None:

@@ -2,7 +2,7 @@
 
 import dataclasses
 import platform
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import version
@@ -11,12 +11,34 @@ from typing import Any
 
 from shapecat import __version__
 from shapecat.config import Settings
-from shapecat.errors import OutputError
-from shapecat.files import input_size
+from shapecat.errors import OutputError, RecordingError
+from shapecat.files import input_size, replacing
 from shapecat.learning import Categorizer
-from shapecat.runs.folder import digest, empty, read_run, write_run
+from shapecat.runs.corrections import PREVIOUS, has_labels
+from shapecat.runs.folder import clear, read_run, write_run
+from shapecat.runs.identity import (
+    ContentDigest,
+    file_stats,
+    new_id,
+    same_content,
+    unchanged,
+    work_id,
+)
+from shapecat.runs.label_transfer import lost_labels, transfer_labels
+from shapecat.runs.perceived import count_segments
 
-__all__ = ["Job", "Summary", "describe_run", "resume", "same_work", "summarize"]
+__all__ = [
+    "Job",
+    "Summary",
+    "describe_run",
+    "has_work",
+    "identify",
+    "keep_labels",
+    "require_unchanged",
+    "resume",
+    "same_options",
+    "summarize",
+]
 
 _LIBRARIES = ("numpy", "numba", "mcap", "rosbags", "rerun-sdk", "pyarrow")
 
@@ -44,6 +66,7 @@ class Job:
     mcap: bool = True
     rrd: bool = True
     overwrite: bool = False
+    discard_labels: bool = False
     origin: str = ""
     target: str = ""
 
@@ -61,7 +84,10 @@ class Job:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run came to; not ``fresh`` when it was complete before."""
+    """What a run came to; not ``fresh`` when it was complete before.
+
+    ``corrections`` is what became of the labels of the run it replaced, if there were any.
+    """
 
     source: str
     folder: Path
@@ -69,6 +95,7 @@ class Summary:
     seconds: float
     warnings: tuple[str, ...]
     fresh: bool = True
+    corrections: Mapping[str, Any] | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Return plain values for ``--json``."""
@@ -80,12 +107,15 @@ class Summary:
 
 
 def describe_run(job: Job, categorizer: Categorizer) -> dict[str, Any]:
-    """Return what run.json says before the work begins."""
+    """Return what run.json says before the work begins; the digest of the input comes later."""
     return {
+        "id": new_id(),
+        "work": "",
         "input": {
             "path": job.origin or str(job.source.resolve()),
             "bytes": input_size(job.source),
-            "sha256": digest(job.source),
+            "digest": "",
+            "files": file_stats(job.source),
         },
         "versions": {
             "shapecat": __version__,
@@ -103,25 +133,70 @@ def describe_run(job: Job, categorizer: Categorizer) -> dict[str, Any]:
     }
 
 
-def same_work(run: Mapping[str, Any], planned: Mapping[str, Any]) -> bool:
-    """Return whether a finished run was made from the same input, settings and model."""
-    return all(run.get(key) == planned[key] for key in ("settings", "options", "model")) and (
-        run.get("input", {}).get("sha256") == planned["input"]["sha256"]
-    )
+def same_options(run: Mapping[str, Any], planned: Mapping[str, Any]) -> bool:
+    """Return whether a run has the settings, options and model of another."""
+    return all(run.get(key) == planned[key] for key in ("settings", "options", "model"))
 
 
-def resume(folder: Path, planned: dict[str, Any]) -> dict[str, Any]:
+def resume(
+    folder: Path, planned: dict[str, Any], source: Path, digest: Callable[[], str]
+) -> dict[str, Any]:
     """Return the run that was killed in a folder; the planned one, if that was other work.
 
     What is left of other work is removed.
     """
     with suppress(OutputError):
         run = read_run(folder)
-        if same_work(run, planned) and run["versions"] == planned["versions"]:
+        known = run.get("input", {})
+        same = same_options(run, planned) and run.get("versions") == planned["versions"]
+        if same and (unchanged(known["files"], source) or same_content(known, source, digest)):
             return {**run, "input": planned["input"]}
-    empty(folder)
+    clear(folder)
     write_run(folder, planned)
     return planned
+
+
+def has_work(folder: Path) -> bool:
+    """Return whether a run that was cut short has got so far that it can be resumed."""
+    with suppress(OutputError):
+        return count_segments(folder) > 0 or "perceive" in read_run(folder)["seconds"]
+    return False
+
+
+def identify(run: dict[str, Any], content: ContentDigest) -> None:
+    """Note the digest of the input, now that it was read, and the name of the work."""
+    run["input"]["digest"] = run["input"]["digest"] or content.result()
+    run["work"] = work_id(run)
+
+
+def require_unchanged(folder: Path, run: Mapping[str, Any], source: Path) -> None:
+    """Discard results that may be of two recordings.
+
+    Raises
+    ------
+    RecordingError : the recording was written to while it was read.
+    """
+    if not unchanged(run["input"]["files"], source):
+        clear(folder)
+        msg = f"{source}: has changed while it was processed; run the same command again"
+        raise RecordingError(msg)
+
+
+def keep_labels(folder: Path, run: dict[str, Any], job: Job) -> None:
+    """Carry the labels that a person gave to the results that are replaced over to the new ones.
+
+    The table they were written into is kept beside the new one.
+    """
+    previous = job.folder / "tracks.csv"
+    if job.discard_labels or not has_labels(previous):
+        return
+    with replacing(folder / PREVIOUS) as path:
+        path.write_bytes(previous.read_bytes())
+    try:
+        transfer = transfer_labels(job.folder, folder)
+    except OutputError as error:
+        transfer = lost_labels(job.folder, str(error))
+    run["corrections"] = transfer.as_dict()
 
 
 def summarize(job: Job, run: Mapping[str, Any], *, fresh: bool = True) -> Summary:
@@ -133,4 +208,5 @@ def summarize(job: Job, run: Mapping[str, Any], *, fresh: bool = True) -> Summar
         seconds=run["seconds"].get("total", 0.0),
         warnings=tuple(run["warnings"]),
         fresh=fresh,
+        corrections=run.get("corrections") if fresh else None,
     )

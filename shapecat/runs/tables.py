@@ -6,22 +6,17 @@ side by side in flat memory. Adding a column is allowed within a schema version;
 meaning of one is not.
 """
 
-import shutil
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shapecat.arrays import F4, I4
+from shapecat.arrays import I4
 from shapecat.errors import OutputError
-from shapecat.files import complete_folder, replacing
-from shapecat.types import Perception, Pose
 
 __all__ = [
     "DETECTIONS",
@@ -29,13 +24,12 @@ __all__ = [
     "PLANES",
     "SCHEMA_VERSION",
     "TRACKS",
-    "FrameRow",
     "Key",
-    "PerceptionTables",
+    "arrow_table",
     "count_rows",
-    "discard_segments",
     "frame_rows",
     "numbers",
+    "open_writer",
     "read_row_groups",
     "release_memory",
     "rows_of",
@@ -131,116 +125,6 @@ causal one. Without a fixed frame ``center_fixed`` is in the sensor frame."""
 Key = tuple[str, int]
 """A frame: its topic, and its number there."""
 
-_SEGMENT_FRAMES = 32
-_PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES}
-
-
-@dataclass(frozen=True)
-class FrameRow:
-    """What the frames table adds to a `Perception`."""
-
-    log_time_ns: int
-    fixed_from_sensor: Pose | None
-    up_given: F4 | None = None
-
-
-class PerceptionTables:
-    """Writes frames, detections and planes side by side, a row group every 32 frames.
-
-    The row groups are first written as *segments*, folders that appear when complete, so that a
-    run that was killed goes on after its last one; leaving the block joins them into the tables.
-
-    Attributes
-    ----------
-    done : frames in the segments that an earlier run has left.
-    """
-
-    def __init__(self, folder: Path, *, categories: Sequence[str], model_id: str) -> None:
-        """Look for segments in ``folder``, which must exist."""
-        metadata = {
-            "schema_version": SCHEMA_VERSION,
-            "categories": ",".join(categories),
-            "model": model_id,
-        }
-        self._folder = folder
-        self._schemas = {name: s.with_metadata(metadata) for name, s in _PERCEIVED.items()}
-        self._categories = tuple(categories)
-        self._pending: list[tuple[Perception, FrameRow]] = []
-        self._segments = _segments(folder)
-        self.done = sum(_read_segment(s / "frames.arrow").num_rows for s in self._segments)
-
-    def __enter__(self) -> Self:
-        """Return itself."""
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Write what is pending, and join the segments."""
-        if kind is None:
-            self._flush()
-            for name, schema in self._schemas.items():
-                _join(self._segments, self._folder / f"{name}.parquet", schema)
-
-    def write(self, perception: Perception, row: FrameRow) -> None:
-        """Append one frame."""
-        self._pending.append((perception, row))
-        if len(self._pending) >= _SEGMENT_FRAMES:
-            self._flush()
-
-    def _flush(self) -> None:
-        if not self._pending:
-            return
-        rows = {
-            "frames": _frame_columns(self._pending),
-            "detections": _detection_columns(self._pending, self._categories),
-            "planes": _plane_columns([perception for perception, _ in self._pending]),
-        }
-        segment = self._folder / _SEGMENTS / f"{len(self._segments):06d}"
-        with complete_folder(segment) as hidden:
-            for name, schema in self._schemas.items():
-                _write_segment(hidden / f"{name}.arrow", _table(rows[name], schema))
-        self._segments.append(segment)
-        self._pending.clear()
-
-
-_SEGMENTS = "segments"
-
-
-def discard_segments(folder: Path) -> None:
-    """Remove what the tables were joined from."""
-    shutil.rmtree(folder / _SEGMENTS, ignore_errors=True)
-
-
-def _segments(folder: Path) -> list[Path]:
-    """Return the complete segments, in order."""
-    return sorted((folder / _SEGMENTS).glob("[0-9]*"))
-
-
-def _join(segments: Iterable[Path], path: Path, schema: pa.Schema) -> None:
-    """Write a table of a row group per segment."""
-    with replacing(path) as hidden, _open_writer(hidden, schema) as writer:
-        for segment in segments:
-            writer.write_table(_read_segment(segment / f"{path.stem}.arrow"))
-
-
-def _write_segment(path: Path, table: pa.Table) -> None:
-    """Write a part of a table as it lies in memory: it is soon read again, once."""
-    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
-        writer.write_table(table)
-
-
-def _read_segment(path: Path) -> pa.Table:
-    try:
-        with pa.OSFile(str(path), "rb") as source, pa.ipc.open_file(source) as reader:
-            return reader.read_all()
-    except (OSError, pa.ArrowException) as error:
-        msg = f"{path}: what a killed run left there cannot be read ({error}); use --overwrite"
-        raise OutputError(msg) from error
-
 
 def count_rows(folder: Path, table: str) -> int:
     """Return the number of rows of a table of a run folder."""
@@ -250,9 +134,9 @@ def count_rows(folder: Path, table: str) -> int:
 
 def write_table(path: Path, columns: dict[str, Any], schema: pa.Schema) -> None:
     """Write a whole table at once."""
-    writer = _open_writer(path, schema)
+    writer = open_writer(path, schema)
     with writer:
-        writer.write_table(_table(columns, schema))
+        writer.write_table(arrow_table(columns, schema))
 
 
 def read_row_groups(
@@ -312,7 +196,8 @@ def _reading(path: Path) -> Iterator[pq.ParquetFile]:
         raise OutputError(msg) from error
 
 
-def _open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
+def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
+    """Open a table to write row groups to."""
     # Ascending pixel indices shrink tenfold as differences; floats do not gain from a dictionary.
     texts = [f.name for f in schema if f.type == pa.string()]
     deltas = {f"{n}.list.element": "DELTA_BINARY_PACKED" for n in ("indices",) if n in schema.names}
@@ -327,7 +212,8 @@ def _open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
     )
 
 
-def _table(columns: dict[str, Any], schema: pa.Schema) -> pa.Table:
+def arrow_table(columns: dict[str, Any], schema: pa.Schema) -> pa.Table:
+    """Return columns as a table of a schema."""
     arrays = [
         column if isinstance(column, pa.Array) else pa.array(column, field.type)
         for field, column in ((field, columns[field.name]) for field in schema)
@@ -341,91 +227,3 @@ def lists(rows: Sequence[Any], kind: pa.DataType) -> pa.Array:
     offsets = np.concatenate([[0], np.cumsum([row.size for row in flat])]).astype(np.int32)
     values = np.concatenate(flat) if flat else np.zeros(0)
     return pa.ListArray.from_arrays(offsets, pa.array(values.astype(kind.to_pandas_dtype())))
-
-
-def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]]) -> dict[str, Any]:
-    return {
-        "topic": [p.topic for p, _ in rows],
-        "frame": [p.index for p, _ in rows],
-        "stamp_ns": [p.stamp_ns for p, _ in rows],
-        "log_time_ns": [row.log_time_ns for _, row in rows],
-        "frame_id": [p.frame_id for p, _ in rows],
-        "up": [p.scene.up for p, _ in rows],
-        "up_given": [row.up_given for _, row in rows],
-        "fixed_translation": [
-            row.fixed_from_sensor and row.fixed_from_sensor.translation for _, row in rows
-        ],
-        "fixed_rotation": [
-            row.fixed_from_sensor and row.fixed_from_sensor.rotation.ravel() for _, row in rows
-        ],
-        "stages": [list(p.seconds) for p, _ in rows],
-        "seconds": [list(p.seconds.values()) for p, _ in rows],
-    }
-
-
-def _detection_columns(
-    rows: Sequence[tuple[Perception, FrameRow]], categories: Sequence[str]
-) -> dict[str, Any]:
-    objects = [(p, row, k, d) for p, row in rows for k, d in enumerate(p.detections)]
-    found = [d for _, _, _, d in objects]
-    candidates = [d.candidate for d in found]
-    best = [int(np.argmax(d.posterior)) for d in found]
-    return {
-        "topic": [p.topic for p, *_ in objects],
-        "frame": [p.index for p, *_ in objects],
-        "stamp_ns": [p.stamp_ns for p, *_ in objects],
-        "frame_id": [p.frame_id for p, *_ in objects],
-        "detection": [k for _, _, k, _ in objects],
-        "plane": [c.plane for c in candidates],
-        "on_detection": [c.on_candidate for c in candidates],
-        "touches_border": [c.touches_border for c in candidates],
-        "occluded": [c.occluded for c in candidates],
-        "center": [c.box.center for c in candidates],
-        "size": [c.box.size for c in candidates],
-        "orientation": [c.box.orientation for c in candidates],
-        "center_fixed": [_center_fixed(row, d.candidate.box.center) for _, row, _, d in objects],
-        "height_m": [
-            _height(p, c.plane, c.support_m, c.box.center)
-            for (p, *_), c in zip(objects, candidates, strict=True)
-        ],
-        "points": [c.indices.size for c in candidates],
-        "indices": lists([c.indices for c in candidates], pa.uint32()),
-        "posterior": lists([d.posterior for d in found], pa.float32()),
-        "category": [
-            "unknown" if d.novelty > 1 else categories[k] for d, k in zip(found, best, strict=True)
-        ],
-        "confidence": [float(d.posterior[k]) for d, k in zip(found, best, strict=True)],
-        "novelty": [d.novelty for d in found],
-        "descriptor": lists([d.descriptor for d in found], pa.float32()),
-        "neurons": lists([d.gas.neurons for d in found], pa.float32()),
-        "edges": lists([d.gas.edges for d in found], pa.uint16()),
-        "seconds": [d.seconds for d in found],
-    }
-
-
-def _center_fixed(row: FrameRow, center: Any) -> Any:
-    pose = row.fixed_from_sensor
-    return None if pose is None else pose.rotation @ center + pose.translation
-
-
-def _height(perception: Perception, plane: int | None, support_m: float, center: Any) -> float:
-    """Return the height of a centre above what its object stands on, in metres."""
-    if plane is None:
-        return float("nan")
-    support = perception.scene.planes[plane]
-    return float(support.normal @ center) - support.offset - support_m
-
-
-def _plane_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
-    planes = [(p, k, plane) for p in perceptions for k, plane in enumerate(p.scene.planes)]
-    return {
-        "topic": [p.topic for p, *_ in planes],
-        "frame": [p.index for p, *_ in planes],
-        "stamp_ns": [p.stamp_ns for p, *_ in planes],
-        "plane": [k for _, k, _ in planes],
-        "normal": [plane.normal for *_, plane in planes],
-        "offset": [plane.offset for *_, plane in planes],
-        "height_m": [plane.height_m for *_, plane in planes],
-        "area_m2": [plane.area_m2 for *_, plane in planes],
-        "outline": lists([plane.outline for *_, plane in planes], pa.float32()),
-    }

@@ -35,9 +35,13 @@ _COLUMNS = (
 
 
 def track_run(
-    folder: Path, settings: TrackingSettings, categories: Sequence[str]
+    folder: Path, settings: TrackingSettings, categories: Sequence[str], *, work: str = ""
 ) -> dict[str, int]:
     """Track the detections of a run; write tracks.parquet and tracks.csv.
+
+    Parameters
+    ----------
+    work : goes into each line of tracks.csv, so that it is not taken for another run's.
 
     Returns
     -------
@@ -50,7 +54,7 @@ def track_run(
         write_table(path, _columns(tracks), TRACKS)
     labels = [_label(track, categories) for track in tracks]
     with replacing(folder / "tracks.csv") as path:
-        _write_csv(path, tracks, labels, categories, _start_ns(folder))
+        _write_csv(path, tracks, labels, categories, _start_ns(folder), work)
     return dict(Counter(labels))
 
 
@@ -161,6 +165,7 @@ _CSV = (
     "novelty",
     "guess",
     "topic",
+    "run",
 )
 
 
@@ -170,6 +175,7 @@ def _write_csv(
     labels: Sequence[str],
     categories: Sequence[str],
     start_ns: int,
+    work: str,
 ) -> None:
     """Write a line per track, those most worth a look first: unknown, then unsure."""
     rows = sorted(
@@ -197,6 +203,7 @@ def _write_csv(
                     f"{track.novelty:.2f}",
                     _guess(track, categories),
                     track.topic,
+                    work,
                 )
             )
 

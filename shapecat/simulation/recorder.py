@@ -1,7 +1,6 @@
 """Simulated recordings, with the truth beside them."""
 
 import json
-import shutil
 import tempfile
 import zipfile
 from collections.abc import Callable
@@ -13,6 +12,7 @@ import numpy as np
 
 from shapecat.arrays import U1
 from shapecat.errors import OutputError
+from shapecat.files import flush
 from shapecat.simulation.containers import CONTAINERS, Container
 from shapecat.simulation.scenes import SceneKind, make_scene
 from shapecat.simulation.sensors import SENSORS, Sensor
@@ -21,7 +21,7 @@ from shapecat.simulation.views import render_frame
 from shapecat.simulation.worlds import World
 from shapecat.types import Frame
 
-__all__ = ["EPOCH_NS", "record", "simulate"]
+__all__ = ["EPOCH_NS", "record", "simulate", "written_paths"]
 
 EPOCH_NS = 1_700_200_000_000_000_000
 """Stamp of the first frame."""
@@ -102,13 +102,13 @@ def record(
     if format not in CONTAINERS:
         msg = f"no recording format {format!r}; known: {', '.join(CONTAINERS)}"
         raise ValueError(msg)
-    suffix, container = CONTAINERS[format]
-    out = out if out.suffix or not suffix else out.with_name(out.name + suffix)
-    names = [out.name, f"{out.stem}.truth.json", f"{out.stem}.labels.npz"]
+    _, container = CONTAINERS[format]
+    paths = written_paths(out, format)
+    out = paths[0]
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=".simulated-") as hidden:
-            recording, truth, labels = (Path(hidden) / name for name in names)
+            recording, truth, labels = (Path(hidden) / path.name for path in paths)
             with container(recording) as writer, _LabelFile(labels, len(world), sensor) as pixels:
                 found = []
                 for index in range(len(world)):
@@ -121,8 +121,8 @@ def record(
                     found.append(_truth(world, frame, image, sensor, seed))
                     observe("simulate", index + 1, len(world))
             truth.write_text("[" + ",\n".join(map(json.dumps, found)) + "]\n", "utf-8")
-            for name in names:
-                _move(Path(hidden) / name, out.with_name(name))
+            for path in paths:
+                _move(Path(hidden) / path.name, path)
     except OSError as error:
         msg = f"{out}: cannot write the recording: {error.strerror or error}"
         raise OutputError(msg) from error
@@ -189,7 +189,28 @@ class _LabelFile:
         self._file.write(np.ascontiguousarray(labels).tobytes())
 
 
+def written_paths(out: Path, format: str) -> list[Path]:  # noqa: A002  the word users know
+    """Return what `simulate` writes: the recording, the truth, and the labels."""
+    suffix, _ = CONTAINERS[format]
+    out = out if out.suffix or not suffix else out.with_name(out.name + suffix)
+    names = (out.name, f"{out.stem}.truth.json", f"{out.stem}.labels.npz")
+    return [out.with_name(name) for name in names]
+
+
 def _move(made: Path, path: Path) -> None:
+    """Replace a file, or a recorded folder; a folder of anything else stays.
+
+    Raises
+    ------
+    OutputError : there is such a folder.
+    """
     if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
+        files = list(path.iterdir())
+        if any(file.name != "metadata.yaml" and file.suffix != ".db3" for file in files):
+            msg = f"{path}: a folder that is no recording; choose another name"
+            raise OutputError(msg)
+        for file in files:
+            file.unlink()
+        path.rmdir()
+    flush(made)
     made.replace(path)

@@ -236,7 +236,7 @@ def _two_points(cloud: Cloud, gas: Gas, state: np.uint64) -> int:
     for i in range(2):
         k = i * half + np.int64((state >> np.uint64(20 * i)) % np.uint64(half))
         gas.x[i], gas.y[i], gas.z[i] = cloud.x[k], cloud.y[k], cloud.z[k]
-    connect(gas, 0, 1)
+    connect(gas, np.int64(0), np.int64(1))
     return 2
 
 
@@ -249,7 +249,9 @@ def _adopt(cloud: Cloud, gas: Gas, neurons: F4, edges: U2, frame: F8) -> int:
     count = neurons.shape[0]
     unit = frame[3] if frame[3] > 0 else 1.0
     for i in range(count):
-        x, y, z = (neurons[i] - frame[:3]) / unit
+        x = (neurons[i, 0] - frame[0]) / unit
+        y = (neurons[i, 1] - frame[1]) / unit
+        z = (neurons[i, 2] - frame[2]) / unit
         if abs(x) < 1e6 and abs(y) < 1e6 and abs(z) < 1e6:
             gas.x[i], gas.y[i], gas.z[i] = x, y, z
     padded = (count + LANES - 1) // LANES * LANES
@@ -260,7 +262,8 @@ def _adopt(cloud: Cloud, gas: Gas, neurons: F4, edges: U2, frame: F8) -> int:
             gas.x, gas.y, gas.z, padded, cloud.x[k], cloud.y[k], cloud.z[k], mask
         )
         used[first] = True
-    place = np.full(count, -1, np.int64)
+    place = np.zeros(count, np.int64)
+    place[:] = -1
     kept = 0
     for i in range(count):
         if used[i]:

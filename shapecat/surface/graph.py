@@ -42,7 +42,10 @@ def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
     members = np.zeros(count, np.int64)
     for k in range(cloud.x.size):
         members[nearest[k, 0]] += 1
-    kept = _keep(gas, adjacent, members, members > 0, count)
+    stays = np.zeros(count, np.bool_)
+    for i in range(count):
+        stays[i] = members[i] > 0
+    kept = _keep(gas, adjacent, members, stays, count)
     if kept < 3:
         return adjacent[:0, :0]
     if kept < count:
@@ -52,7 +55,7 @@ def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
     # 3.
     limit = (_LONGEST * _GAP * _mean_gap(gas, kept)) ** 2
     for k in range(cloud.x.size):
-        a, b, c = nearest[k, 0], nearest[k, 1], nearest[k, 2]
+        a, b, c = np.int64(nearest[k, 0]), np.int64(nearest[k, 1]), np.int64(nearest[k, 2])
         adjacent[a, b] = adjacent[b, a] = True
         if not adjacent[a, c] and _squared(gas, a, c) < limit:
             adjacent[a, c] = adjacent[c, a] = True
@@ -65,9 +68,10 @@ def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
         weight = np.zeros(parts, np.int64)
         for i in range(kept):
             weight[part[i]] += members[i]
-        stays = weight >= share * cloud.x.size
-        stays[np.argmax(weight)] = True
-        kept = _keep(gas, adjacent, members, stays[part], kept)
+        heaviest = np.argmax(weight)
+        for i in range(kept):
+            stays[i] = part[i] == heaviest or weight[part[i]] >= share * cloud.x.size
+        kept = _keep(gas, adjacent, members, stays, kept)
         if kept < 3:
             return adjacent[:0, :0]
         # 5.
@@ -166,7 +170,9 @@ def _keep(gas: Gas, adjacent: Bool, members: I4, stays: Bool, count: int) -> int
 def _components(adjacent: Bool, count: int, part: I4) -> int:
     """Label the connected parts from 0 in the order of their first neuron; return their number."""
     part[:count] = -1
-    others = np.arange(count)  # those that may have no part yet
+    others = np.zeros(count, np.int64)  # those that may have no part yet
+    for i in range(count):
+        others[i] = i
     left = count
     stack = np.zeros(count, np.int64)
     parts = 0

@@ -58,15 +58,18 @@ _GAIN = 1 / 0.9995
 def empty_gas(room: int) -> Gas:
     """Return a gas without neurons that has room for at least ``room``."""
     size = (room + LANES - 1) // LANES * LANES
-    return Gas(
-        np.full(size, FAR, np.float32),
-        np.full(size, FAR, np.float32),
-        np.full(size, FAR, np.float32),
+    gas = Gas(
+        np.zeros(size, np.float32),
+        np.zeros(size, np.float32),
+        np.zeros(size, np.float32),
         np.zeros(size, np.float32),
         np.zeros(size, np.int32),
         np.zeros(size, np.int32),
-        np.full(size * size, ABSENT, np.int32),
+        np.zeros(size * size, np.int32),
     )
+    gas.x[:] = gas.y[:] = gas.z[:] = FAR
+    gas.born[:] = ABSENT
+    return gas
 
 
 @kernel
@@ -90,7 +93,7 @@ def connect(gas: Gas, i: int, j: int) -> None:
     _connect(gas.degree, gas.wins, gas.born, i, j)
 
 
-@kernel(inline=True)
+@kernel
 def _connect(degree: I4, wins: I4, born: I4, i: int, j: int) -> None:
     if born[i * degree.size + j] == ABSENT:
         degree[i] += 1
@@ -118,7 +121,7 @@ def _drop_old_edges(degree: I4, wins: I4, born: I4, count: int, a: int, oldest: 
             _disconnect(degree, born, a, j)
 
 
-@kernel(inline=True)
+@kernel
 def _fire(
     x: F4,
     y: F4,
@@ -170,10 +173,18 @@ def _insert(gas: Gas, count: int, q: int) -> int:
     gas.x[count] = half * (gas.x[q] + gas.x[f])
     gas.y[count] = half * (gas.y[q] + gas.y[f])
     gas.z[count] = half * (gas.z[q] + gas.z[f])
-    _disconnect(gas.degree, gas.born, q, f)
+    _disconnect(gas.degree, gas.born, q, np.int64(f))
     connect(gas, q, count)
-    connect(gas, f, count)
+    connect(gas, np.int64(f), count)
     return f
+
+
+@kernel
+def _in_order(count: int) -> I4:
+    order = np.zeros(count, np.int64)
+    for i in range(count):
+        order[i] = i
+    return order
 
 
 @kernel
@@ -208,7 +219,7 @@ def grow_fritzke(
     px, py, pz = cloud
     x, y, z, error, degree, wins, born = gas
     mask = index_mask(gas.x.size)
-    order = np.arange(points)
+    order = _in_order(points)
     cursor = points
     gain = 1.0
     fall = 0.9 / max(signals, 1)
@@ -272,7 +283,7 @@ def grow_thesis(
     px, py, pz = cloud
     x, y, z, error, degree, wins, born = gas
     mask = index_mask(gas.x.size)
-    order = np.arange(points)
+    order = _in_order(points)
     before = np.zeros(gas.x.size, np.int32)
     fall = 0.9 / (epochs * points)
     rest = 1.0
@@ -321,12 +332,13 @@ def _prune(gas: Gas, count: int, before: I4) -> int:
         for j in range(count):
             if is_edge(gas, i, j):
                 if heir >= 0:
-                    connect(gas, heir, j)
+                    connect(gas, np.int64(heir), j)
                 else:
                     heir = j
                 _disconnect(gas.degree, gas.born, i, j)
         if gas.degree[heir] == 0:
-            connect(gas, heir, (heir + 1) % count if (heir + 1) % count != i else (i + 1) % count)
+            after = (heir + 1) % count
+            connect(gas, np.int64(heir), after if after != i else (i + 1) % count)
         count -= 1
         _move(gas, count, i)
         before[i] = before[count]

@@ -2,7 +2,8 @@
 
 Numba's loop vectoriser checks for overlapping arrays and handles remainders on each call, which
 costs more than the work itself when the loops have five rounds; written as vector instructions of
-LLVM they are two to three times faster. LLVM splits the vectors on machines with narrower ones.
+LLVM they are two to four times faster, a fifth of the time of a frame (docs/decisions/0011). LLVM
+splits the vectors on machines with narrower ones.
 """
 
 # ruff: noqa: ARG001  # numba calls an intrinsic with the types of all its arguments
@@ -13,7 +14,6 @@ from typing import Any
 
 from llvmlite import ir  # type: ignore[import-untyped]  # it has no types
 from numba import types
-from numba.core import cgutils
 from numba.extending import intrinsic
 
 __all__ = ["LANES", "adapt", "three_nearest", "two_nearest"]
@@ -71,20 +71,34 @@ class _Vectors:
         return self._call(f"llvm.vector.reduce.smax.v{LANES}i32", _I32, a)
 
     def variable(self, value: _Value) -> _Value:
-        return cgutils.alloca_once_value(self.build, value)
+        with self.build.goto_entry_block():  # not in a loop, where it would use up the stack
+            place = self.build.alloca(value.type)
+        self.build.store(value, place)
+        return place
 
     @contextmanager
     def blocks(self, count: _Value) -> Iterator[tuple[_Value, _Value]]:
         """Loop over the blocks of ``count`` elements: the index of the first, and of each."""
-        lane = self.variable(ir.Constant(_INTS, list(range(LANES))))
-        with cgutils.for_range_slice(self.build, _I64(0), count, _I64(LANES), _I64) as (i, _):
-            index = self.build.load(lane)
-            yield i, index
-            self.build.store(self.build.add(index, _constant(LANES)), lane)
+        build = self.build
+        first, lane = self.variable(_I64(0)), self.variable(ir.Constant(_INTS, [*range(LANES)]))
+        test, body, end = (build.append_basic_block(name) for name in ("test", "body", "end"))
+        build.branch(test)
+        build.position_at_end(test)
+        build.cbranch(build.icmp_signed("<", build.load(first), count), body, end)
+        build.position_at_end(body)
+        i, index = build.load(first), build.load(lane)
+        yield i, index
+        build.store(build.add(i, _I64(LANES)), first)
+        build.store(build.add(index, _constant(LANES)), lane)
+        build.branch(test)
+        build.position_at_end(end)
 
     def _call(self, name: str, result: Any, *values: _Value) -> _Value:
-        kind = ir.FunctionType(result, [value.type for value in values])
-        function = cgutils.get_or_insert_function(self.build.module, kind, name)
+        module = self.build.module
+        function = module.globals.get(name)
+        if function is None:
+            kind = ir.FunctionType(result, [value.type for value in values])
+            function = ir.Function(module, kind, name)
         return self.build.call(function, values)
 
 

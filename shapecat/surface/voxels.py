@@ -10,6 +10,7 @@ __all__ = ["read_only", "voxelize"]
 _FRACTION_BITS = 16
 """Coordinates are summed as integers of a 2**16th voxel: sums do not depend on the order."""
 _RADIX_BITS = 11
+_LARGEST = np.int64(1 << 62)
 
 
 def voxelize(points: F4, *, voxel_m: float) -> F4:
@@ -71,8 +72,8 @@ def _voxelize(points: F4, voxel: float) -> tuple[F4, bool]:
     count = points.shape[0]
     scale = float(1 << _FRACTION_BITS) / voxel
     limit = float(1 << (19 + _FRACTION_BITS))
-    low = np.full(3, np.iinfo(np.int64).max)
-    high = np.full(3, np.iinfo(np.int64).min)
+    low, high = np.zeros(3, np.int64), np.zeros(3, np.int64)
+    low[:], high[:] = _LARGEST, -_LARGEST
     fixed = np.zeros((count, 3), np.int64)
     for i in range(count):
         for axis in range(3):
@@ -125,7 +126,9 @@ def _voxelize(points: F4, voxel: float) -> tuple[F4, bool]:
 @kernel
 def _radix_order(keys: np.ndarray, bound: int) -> np.ndarray:
     """Return the stable order that sorts ``keys``, which are >= 0 and below ``bound``."""
-    order = np.arange(keys.size)
+    order = np.zeros(keys.size, np.int64)
+    for i in range(keys.size):
+        order[i] = i
     other = np.zeros(keys.size, np.int64)
     shift = 0
     while (bound - 1) >> shift > 0:

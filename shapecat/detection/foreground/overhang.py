@@ -82,6 +82,7 @@ def extend_overhang(
 def _extend(search: Search, height: F4, seen: I4, visits: int, stacks: I4) -> int:
     """Add the parts outside one plane; return the number of the last part visited."""
     inv_depth, plane_id, me = search.inverse_depth, search.plane_id, search.me
+    visited = search.visited
     rows, columns = inv_depth.shape
     border = np.zeros(columns, np.uint8)
     for i in range(rows):
@@ -93,17 +94,21 @@ def _extend(search: Search, height: F4, seen: I4, visits: int, stacks: I4) -> in
             for d in range(4):
                 y = i + (1 if d == 0 else -1 if d == 1 else 0)
                 x = j + (1 if d == 2 else -1 if d == 3 else 0)
-                if not _leads_out(search, i, j, y, x):
+                if y < 0 or x < 0 or y >= rows or x >= columns:
+                    continue
+                if not 0 <= plane_id[y, x] < me or visited[y, x] == me:
+                    continue
+                n = _part_outside(search, i, j, d, stacks[0])
+                if n == 0:
                     continue
                 visits += 1
-                n = _part_outside(search, y, x, stacks[0])
                 enough = max(n // BEYOND, 1)
                 if (
                     _part_inside(inv_depth, plane_id, me, seen, visits, i, j, enough, stacks[1])
                     < enough
                 ):
                     continue
-                for t in range(n):
+                for t in range(1, n + 1):
                     v, u = row_and_column(stacks[0, t], columns)
                     plane_id[v, u] = me
                     height[v, u] = search.outside[v, u]
@@ -135,50 +140,42 @@ def _find_border(plane_id: I4, me: int, i: int, border: U1) -> bool:
 
 
 @kernel
-def _leads_out(search: Search, i: int, j: int, y: int, x: int) -> bool:
-    """Whether what stands on a plane goes on from (i, j) to (y, x) outside; notes its height if so.
+def _part_outside(search: Search, i: int, j: int, way: int, stack: I4) -> int:
+    """Collect the connected cells outside, from cell (i, j) inside on in one of four directions.
 
-    There it is above a lower plane or none, and not noted before.
+    They are above a lower plane or none, and not visited before; notes their heights. Returns how
+    many there are, in ``stack`` from its second place on.
     """
     inv_depth, intrinsics, plane_id, walls, me, plane, highest, outside, visited = search
-    if y < 0 or x < 0 or y >= inv_depth.shape[0] or x >= inv_depth.shape[1]:
-        return False
-    if not 0 <= plane_id[y, x] < me or abs(inv_depth[y, x] - inv_depth[i, j]) >= DISCONTINUITY:
-        return False
-    if inv_depth[y, x] <= 0 or walls[y, x] == CLEARED or visited[y, x] == me:
-        return False
-    z = 1 / inv_depth[y, x]
-    h = (inv_depth[y, x] - (plane[0] * x + plane[1] * y + plane[2])) * z * plane[3]
-    if not (MIN_HEIGHT_M + HEIGHT_NOISE * z * z < h < highest):
-        return False
-    if not is_inside_outline(
-        plane,
-        (x - intrinsics.cx) / intrinsics.fx * z,
-        (y - intrinsics.cy) / intrinsics.fy * z,
-        z,
-        REACH_M,
-    ):
-        return False
-    outside[y, x], visited[y, x] = h, me
-    return True
-
-
-@kernel
-def _part_outside(search: Search, i: int, j: int, stack: I4) -> int:
-    """Collect the connected cells outside, from one that is above the plane; return how many."""
-    columns = search.inverse_depth.shape[1]
+    rows, columns = inv_depth.shape
     stack[0] = i * columns + j
     done, top = 0, 1
     while done < top:
         i, j = row_and_column(stack[done], columns)
         done += 1
+        here = inv_depth[i, j]
         for d in range(4):
+            if done == 1 and d != way:
+                continue
             y = i + (1 if d == 0 else -1 if d == 1 else 0)
             x = j + (1 if d == 2 else -1 if d == 3 else 0)
-            if _leads_out(search, i, j, y, x):
+            if y < 0 or x < 0 or y >= rows or x >= columns or not 0 <= plane_id[y, x] < me:
+                continue
+            w = inv_depth[y, x]
+            if abs(w - here) >= DISCONTINUITY or w <= 0 or walls[y, x] == CLEARED:
+                continue
+            if visited[y, x] == me:
+                continue
+            z = 1 / w
+            h = (w - (plane[0] * x + plane[1] * y + plane[2])) * z * plane[3]
+            if not (MIN_HEIGHT_M + HEIGHT_NOISE * z * z < h < highest):
+                continue
+            across, down = (x - intrinsics.cx) / intrinsics.fx, (y - intrinsics.cy) / intrinsics.fy
+            if is_inside_outline(plane, across * z, down * z, z, REACH_M):
+                outside[y, x], visited[y, x] = h, me
                 stack[top] = y * columns + x
                 top += 1
-    return top
+    return top - 1
 
 
 @kernel

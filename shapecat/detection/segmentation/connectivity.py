@@ -143,17 +143,35 @@ def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) ->
 
 @kernel
 def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links: U1) -> None:
-    """Take the links away that only a local plane tells, across a step."""
+    """Take the links away that only a local plane tells, across a step.
+
+    There the readings change more from a cell to the next than they do before and after. The
+    window of a local plane reaches over a step and takes it for a slope, so that a plate would be
+    linked with the can it stands on. At the edge of a surface that is seen at a grazing angle only
+    one side has the slope.
+    """
     some = False
     for j in range(links.size):
         some |= links[j] > (RIGHT | DOWN)  # few rows have any; this vectorises
     if not some:
         return
     for j in range(start, end):
-        if links[j] & BENT * RIGHT and _is_step(inv_depth, plane_id, i, j, 0, 1):
-            links[j] &= ~RIGHT
-        if links[j] & BENT * DOWN and _is_step(inv_depth, plane_id, i, j, 1, 0):
-            links[j] &= ~DOWN
+        for bit in (RIGHT, DOWN):
+            if not links[j] & BENT * bit:
+                continue
+            di, dj = (0, 1) if bit == RIGHT else (1, 0)
+            i0, j0, i1, j1 = i - REACH * di, j - REACH * dj, i + di, j + dj
+            i2, j2 = i1 + REACH * di, j1 + REACH * dj
+            if i0 < 0 or j0 < 0 or i2 >= inv_depth.shape[0] or j2 >= inv_depth.shape[1]:
+                continue
+            if plane_id[i0, j0] != plane_id[i, j] or plane_id[i2, j2] != plane_id[i, j]:
+                continue
+            step = inv_depth[i1, j1] - inv_depth[i, j]
+            before = abs(step - (inv_depth[i, j] - inv_depth[i0, j0]) / REACH)
+            after = abs(step - (inv_depth[i2, j2] - inv_depth[i1, j1]) / REACH)
+            least, most = min(before, after), max(before, after)
+            if least >= SURE * DISCONTINUITY and most >= DISCONTINUITY:
+                links[j] &= ~bit
         links[j] &= RIGHT | DOWN
 
 
@@ -180,26 +198,6 @@ def _link_some(
         same = (plane_id[k] > 0) & (plane_id[k] == owner1[k])
         link = np.uint8(bit) if level_on else np.uint8(bit + BENT * bit) if bent else np.uint8(0)
         links[k] |= link if same else np.uint8(0)
-
-
-@kernel
-def _is_step(inv_depth: F4, plane_id: I4, i: int, j: int, di: int, dj: int) -> bool:
-    """Whether the readings change more from a cell to the next than they do before and after.
-
-    The window of a local plane reaches over a step and takes it for a slope, so that a plate
-    would be linked with the can it stands on. At the edge of a surface that is seen at a grazing
-    angle only one side has the slope.
-    """
-    i0, j0, i1, j1 = i - REACH * di, j - REACH * dj, i + di, j + dj
-    i2, j2 = i1 + REACH * di, j1 + REACH * dj
-    if i0 < 0 or j0 < 0 or i2 >= inv_depth.shape[0] or j2 >= inv_depth.shape[1]:
-        return False
-    if plane_id[i0, j0] != plane_id[i, j] or plane_id[i2, j2] != plane_id[i, j]:
-        return False
-    step = inv_depth[i1, j1] - inv_depth[i, j]
-    before = abs(step - (inv_depth[i, j] - inv_depth[i0, j0]) / REACH)
-    after = abs(step - (inv_depth[i2, j2] - inv_depth[i1, j1]) / REACH)
-    return bool(min(before, after) >= SURE * DISCONTINUITY and max(before, after) >= DISCONTINUITY)
 
 
 @kernel

@@ -1,0 +1,155 @@
+"""Who is who: a recording by its content, a run folder by an id of its own.
+
+A run has two names. ``id`` is random and belongs to this one folder: one without it is none of
+ours. ``work`` tells what was done with what: runs that share it have the same tables, so a table
+that leaves its folder carries it.
+"""
+
+import json
+import secrets
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from threading import Event, Thread
+from types import TracebackType
+from typing import Any, Self
+
+import xxhash
+
+from shapecat.errors import RecordingError
+from shapecat.files import input_files
+
+__all__ = [
+    "ContentDigest",
+    "content_digest",
+    "file_stats",
+    "new_id",
+    "same_content",
+    "unchanged",
+    "work_id",
+]
+
+_BLOCK = 1 << 20
+_OUTPUTS = ("mcap", "rrd")
+
+Stats = list[list[Any]]
+"""Per file: name, bytes, and the times of its content and its inode in nanoseconds."""
+
+
+def new_id() -> str:
+    """Return a random id."""
+    return secrets.token_hex(8)
+
+
+def work_id(run: Mapping[str, Any]) -> str:
+    """Return the name of the work that run.json describes, once its content is known.
+
+    Content, settings, options, model and version, but for what the tables do not depend on. The
+    letter in front keeps spreadsheets from reading a number.
+    """
+    settings = {name: value for name, value in run["settings"].items() if name != "outputs"}
+    options = {name: value for name, value in run["options"].items() if name not in _OUTPUTS}
+    version = run["versions"]["shapecat"]
+    parts = [run["input"]["digest"], settings, options, run["model"], version]
+    return f"w{xxhash.xxh3_64_hexdigest(json.dumps(parts, sort_keys=True).encode())}"
+
+
+def file_stats(path: Path) -> Stats:
+    """Return what changes when a recording is written to, without reading it."""
+    stats = [(file.name, file.stat()) for file in input_files(path)]
+    return [[name, s.st_size, s.st_mtime_ns, s.st_ctime_ns] for name, s in stats]
+
+
+def unchanged(before: Sequence[Sequence[Any]], path: Path) -> bool:
+    """Return whether a recording has the names, sizes and times of content it had before."""
+    try:
+        return [list(s[:3]) for s in before] == [s[:3] for s in file_stats(path)]
+    except OSError:
+        return False
+
+
+def content_digest(path: Path, *, cancelled: Event | None = None) -> str:
+    """Return a digest of the whole content of a recording: of a file, or the files of a folder.
+
+    XXH3 with 128 bits (Collet 2019): as fast as memory, and 4 kB that a disk has lost change it.
+    It does not withstand forgery.
+
+    Raises
+    ------
+    OSError : a file cannot be read.
+    InterruptedError : ``cancelled`` was set.
+    """
+    total = xxhash.xxh3_128()
+    block = memoryview(bytearray(_BLOCK))
+    for file in input_files(path):
+        if path.is_dir():
+            total.update(f"{file.name}\0{file.stat().st_size}\0".encode())
+        with file.open("rb", buffering=0) as stream:
+            while count := stream.readinto(block):
+                if cancelled is not None and cancelled.is_set():
+                    raise InterruptedError
+                total.update(block[:count])
+    return f"xxh3-128:{total.hexdigest()}"
+
+
+class ContentDigest:
+    """The digest of a recording, worked out in a thread while the recording is processed.
+
+    What the thread has read lies in memory when the frames are read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Prepare the digest of a file or folder."""
+        self._path = path
+        self._cancelled = Event()
+        self._digest = ""
+        self._error: OSError | None = None
+        self._thread = Thread(target=self._work, daemon=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Leave off reading."""
+        self._cancelled.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+
+    def start(self) -> None:
+        """Begin to read."""
+        if self._thread.ident is None:
+            self._thread.start()
+
+    def _work(self) -> None:
+        try:
+            self._digest = content_digest(self._path, cancelled=self._cancelled)
+        except OSError as error:
+            self._error = error
+
+    def result(self) -> str:
+        """Wait for the digest.
+
+        Raises
+        ------
+        RecordingError : the recording cannot be read.
+        """
+        self.start()
+        self._thread.join()
+        if self._error is not None:
+            msg = f"{self._path}: cannot be read: {self._error.strerror or self._error}"
+            raise RecordingError(msg) from self._error
+        return self._digest
+
+
+def same_content(known: Mapping[str, Any], path: Path, digest: Callable[[], str]) -> bool:
+    """Return whether a recording is the one that run.json knows as its ``input``.
+
+    The digest is asked for only where the times of its files cannot tell.
+    """
+    if known.get("files") == file_stats(path):
+        return True
+    return bool(known.get("digest")) and known["digest"] == digest()

@@ -1,0 +1,228 @@
+"""Labels carried from one run to another: to the objects that are where, and when, they were."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from shapecat.errors import OutputError
+from shapecat.runs.corrections import find_misread, merged_with, merging_with, relabel
+from shapecat.runs.folder import read_run, write_run
+from shapecat.runs.same_objects import Group, Matches, match_in_place, match_in_time
+from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
+
+__all__ = [
+    "TABLE_ALONE",
+    "Missed",
+    "Transfer",
+    "Transferred",
+    "lost_labels",
+    "match_labels",
+    "transfer_labels",
+]
+
+IN_TIME, IN_PLACE = "frames in common", "places in another recording"
+TABLE_ALONE = "places in the table alone"
+"""Without the run beside it: neither its fixed frame is known, nor what was moved."""
+
+
+class Transferred(NamedTuple):
+    """A label that has found its object; ``distance_m`` between the centres in the two runs."""
+
+    old_track: int
+    track: int
+    label: str
+    distance_m: float
+
+
+class Missed(NamedTuple):
+    """A label that has not, and why."""
+
+    old_track: int
+    label: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Transfer:
+    """What became of the labels of another table.
+
+    ``source`` names its run's work, if known; ``by`` tells what the objects were found by.
+    """
+
+    source: str
+    transferred: tuple[Transferred, ...]
+    missed: tuple[Missed, ...]
+    by: str = ""
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for run.json."""
+        return {
+            "from": self.source,
+            "by": self.by,
+            "transferred": [item._asdict() for item in self.transferred],
+            "not_transferred": [item._asdict() for item in self.missed],
+        }
+
+
+def lost_labels(source: Path, reason: str) -> Transfer:
+    """Return what is to be said of a table none of whose labels can be carried over."""
+    table = read_track_table(source / "tracks.csv")
+    missed = (Missed(row.track, row.label, reason) for row in table.rows if row.label)
+    return Transfer(table.run, (), tuple(missed))
+
+
+def transfer_labels(source: Path, target: Path) -> Transfer:
+    """Give the tracks of a run the labels that the same objects have in another table.
+
+    The labels go into tracks.csv of ``target``, what became of them into its run.json. Where a
+    person has labelled a track of ``target`` otherwise, that label stays.
+
+    Parameters
+    ----------
+    source : a run folder, or a tracks.csv.
+    target : a run folder with tracks.
+
+    Raises
+    ------
+    OutputError : one of them cannot be read, or they have no frame of reference in common.
+    """
+    run = read_run(target)
+    transfer = match_labels(source, target)
+    transfer = _without(transfer, _labelled_otherwise(transfer, target, run))
+    refused = relabel(target, {item.track: item.label for item in transfer.transferred})
+    transfer = _without(transfer, refused)
+    run["corrections"] = transfer.as_dict()
+    write_run(target, run)
+    return transfer
+
+
+def _labelled_otherwise(transfer: Transfer, target: Path, run: Mapping[str, Any]) -> dict[int, str]:
+    """Return the tracks that a person has given another label; an earlier transfer has no say."""
+    earlier = {
+        (item["track"], item["label"]) for item in run.get("corrections", {}).get("transferred", ())
+    }
+    own = {row.track: row.label for row in read_track_table(target / "tracks.csv").rows}
+    return {
+        item.track: f"track {item.track} is labelled {own[item.track]} already"
+        for item in transfer.transferred
+        if own[item.track] not in ("", item.label) and (item.track, own[item.track]) not in earlier
+    }
+
+
+def _without(transfer: Transfer, reasons: Mapping[int, str]) -> Transfer:
+    """Return a transfer without the labels of some tracks, told as missed."""
+    kept = tuple(item for item in transfer.transferred if item.track not in reasons)
+    missed = (
+        Missed(item.old_track, item.label, reasons[item.track])
+        for item in transfer.transferred
+        if item.track in reasons
+    )
+    return replace(transfer, transferred=kept, missed=(*transfer.missed, *missed))
+
+
+def match_labels(source: Path, target: Path) -> Transfer:
+    """Find for each label of a table the track of a run that is the same object.
+
+    Raises
+    ------
+    OutputError : as `transfer_labels`.
+    """
+    path = source / "tracks.csv" if source.is_dir() else source
+    table = read_track_table(path)
+    _require_whole(path, table)
+    folder = path.parent if _is_in_its_run(path, table) else None
+    categories = read_run(folder)["model"]["categories"] if folder is not None else ()
+    misread = find_misread(table.rows, categories)
+    labelled = [row for row in table.rows if row.label and row.track not in misread]
+    wrong = tuple(
+        Missed(r.track, r.label, misread[r.track]) for r in table.rows if r.track in misread
+    )
+    if not labelled:
+        return Transfer(table.run, (), wrong)
+    group = _groups(labelled)
+    if folder is not None and _same_recording(read_run(folder), read_run(target)):
+        by, matches = IN_TIME, match_in_time(folder, target, group)
+    else:
+        by = TABLE_ALONE if folder is None else IN_PLACE
+        matches = match_in_place(table.rows, folder, target, group)
+    transferred, missed = _translate(labelled, group, matches)
+    return Transfer(table.run, transferred, (*wrong, *missed), by)
+
+
+def _require_whole(path: Path, table: TrackTable) -> None:
+    """Refuse a table with lines that cannot be read, or of several runs.
+
+    Raises
+    ------
+    OutputError : it is such a table.
+    """
+    if table.problems:
+        msg = f"{path}: {table.problems[0]}"
+        raise OutputError(msg)
+    if len(table.runs) > 1:
+        msg = f"{path}: holds tracks of several runs ({', '.join(table.runs)}); take one at a time"
+        raise OutputError(msg)
+
+
+def _is_in_its_run(path: Path, table: TrackTable) -> bool:
+    """Return whether the tables beside a tracks.csv are those it came from."""
+    folder = path.parent
+    if not (folder / "run.json").exists() or not (folder / "tracks.parquet").exists():
+        return False
+    if not table.run:
+        return path.name == "tracks.csv"
+    return bool(table.run == read_run(folder).get("work"))
+
+
+def _groups(labelled: Sequence[TrackRow]) -> Group:
+    """Return which tracks a person has merged."""
+    partners = {row.track: merged_with(row.label) for row in labelled}
+
+    def root(track: int) -> int:
+        seen = {track}
+        while (partner := partners.get(track)) is not None and partner not in seen:
+            seen.add(partner)
+            track = partner
+        return track
+
+    return root
+
+
+def _same_recording(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
+    digests = [run["input"].get("digest") for run in (a, b)]
+    return bool(digests[0]) and digests[0] == digests[1] and a["fixed_frame"] == b["fixed_frame"]
+
+
+def _translate(
+    labelled: Sequence[TrackRow], group: Group, matches: Matches
+) -> tuple[tuple[Transferred, ...], tuple[Missed, ...]]:
+    """Give labels to the tracks of the target; parts are merged with what the whole is there.
+
+    The whole is the track that others were merged with: it alone says what they all are.
+    """
+    given: dict[int, Transferred] = {}
+    missed = []
+    for row in sorted(labelled, key=lambda row: group(row.track) != row.track):
+        whole = group(row.track)
+        there = matches.found.get(row.track, ())
+        if whole not in matches.found:
+            missed.append(Missed(row.track, row.label, _why(row.track, whole, matches)))
+        elif whole == row.track:
+            given |= {
+                m.track: Transferred(row.track, m.track, row.label, m.distance_m) for m in there
+            }
+        else:
+            first, *others = (match.track for match in matches.found[whole])
+            for match in there:  # none, if the part is not found on its own
+                if match.track not in (first, *others):
+                    label = merging_with(first)
+                    item = Transferred(row.track, match.track, label, match.distance_m)
+                    given.setdefault(match.track, item)
+    return tuple(given.values()), tuple(missed)
+
+
+def _why(track: int, whole: int, matches: Matches) -> str:
+    """Return why the whole that a track is part of has no match."""
+    reason = matches.reasons.get(whole, "nothing was found there")
+    return reason if track == whole else f"track {whole}, which it is merged with: {reason}"

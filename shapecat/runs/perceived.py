@@ -1,0 +1,274 @@
+"""What perceive writes: frames, detections and planes, in segments that a kill does not cost."""
+
+import shutil
+import time
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import numpy as np
+import pyarrow as pa
+
+from shapecat.arrays import F4
+from shapecat.errors import OutputError
+from shapecat.files import complete_folder, replacing
+from shapecat.runs.tables import (
+    DETECTIONS,
+    FRAMES,
+    PLANES,
+    SCHEMA_VERSION,
+    arrow_table,
+    frame_rows,
+    lists,
+    open_writer,
+)
+from shapecat.types import Perception, Pose
+
+__all__ = ["FrameRow", "PerceptionTables", "count_segments", "discard_segments"]
+
+_GROUP_FRAMES = 32
+_SEGMENT_S = 2.0
+"""What a kill may cost: frames are kept in a segment at least so often."""
+_PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES}
+
+
+@dataclass(frozen=True)
+class FrameRow:
+    """What the frames table adds to a `Perception`."""
+
+    log_time_ns: int
+    fixed_from_sensor: Pose | None
+    up_given: F4 | None = None
+
+
+class PerceptionTables:
+    """Writes frames, detections and planes side by side, a row group every 32 frames.
+
+    What was perceived is first written as *segments*, folders that appear when complete, so that
+    a run that was cut short goes on after its last one; leaving the block joins them into the
+    tables, which are the same wherever it was cut.
+
+    Attributes
+    ----------
+    done : frames in the segments that an earlier run has left.
+    """
+
+    def __init__(self, folder: Path, *, categories: Sequence[str], model_id: str) -> None:
+        """Look for segments in ``folder``, which must exist."""
+        metadata = {
+            "schema_version": SCHEMA_VERSION,
+            "categories": ",".join(categories),
+            "model": model_id,
+        }
+        self._folder = folder
+        self._schemas = {name: s.with_metadata(metadata) for name, s in _PERCEIVED.items()}
+        self._categories = tuple(categories)
+        self._pending: list[tuple[Perception, FrameRow]] = []
+        self._segments = _segments(folder)
+        self._flushed = time.monotonic()
+        self.done = sum(_read_segment(s / "frames.arrow").num_rows for s in self._segments)
+
+    def __enter__(self) -> Self:
+        """Return itself."""
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Write what is pending, and join the segments; after an error only keep what is done."""
+        if kind is not None:
+            with suppress(OSError):
+                self._flush()
+            return
+        self._flush()
+        self._join()
+
+    def write(self, perception: Perception, row: FrameRow) -> None:
+        """Append one frame."""
+        self._pending.append((perception, row))
+        late = time.monotonic() - self._flushed > _SEGMENT_S
+        if late or len(self._pending) >= _GROUP_FRAMES:
+            self._flush()
+
+    def _flush(self) -> None:
+        if not self._pending:
+            return
+        rows = {
+            "frames": _frame_columns(self._pending),
+            "detections": _detection_columns(self._pending, self._categories),
+            "planes": _plane_columns([perception for perception, _ in self._pending]),
+        }
+        segment = self._folder / _SEGMENTS / f"{len(self._segments):06d}"
+        with complete_folder(segment) as hidden:
+            for name, schema in self._schemas.items():
+                _write_segment(hidden / f"{name}.arrow", arrow_table(rows[name], schema))
+        self._segments.append(segment)
+        self._pending.clear()
+        self._flushed = time.monotonic()
+
+    def _join(self) -> None:
+        """Write the tables, whose row groups cover the same frames."""
+        with ExitStack() as stack:
+            writers = {}
+            for name, schema in self._schemas.items():
+                path = stack.enter_context(replacing(self._folder / f"{name}.parquet"))
+                writers[name] = stack.enter_context(open_writer(path, schema))
+            for group in _row_groups(self._segments):
+                for name, writer in writers.items():
+                    writer.write_table(group[name])
+
+
+_SEGMENTS = "segments"
+
+
+def count_segments(folder: Path) -> int:
+    """Return how many segments a run that was cut short has left."""
+    return len(_segments(folder))
+
+
+def discard_segments(folder: Path) -> None:
+    """Remove what the tables were joined from."""
+    shutil.rmtree(folder / _SEGMENTS, ignore_errors=True)
+
+
+def _segments(folder: Path) -> list[Path]:
+    """Return the complete segments, in order."""
+    return sorted((folder / _SEGMENTS).glob("[0-9]*"))
+
+
+_Tables = dict[str, pa.Table]
+
+
+def _row_groups(segments: Iterable[Path]) -> Iterator[_Tables]:
+    """Yield the tables of 32 frames at a time, in whatever portions the segments have them."""
+    held: _Tables = {}
+    for segment in segments:
+        new = {name: _read_segment(segment / f"{name}.arrow") for name in _PERCEIVED}
+        held = {name: pa.concat_tables([held[name], new[name]]) for name in new} if held else new
+        while held["frames"].num_rows >= _GROUP_FRAMES:
+            group, held = _cut(held, _GROUP_FRAMES)
+            yield group
+    if held and held["frames"].num_rows:
+        yield held
+
+
+def _cut(tables: _Tables, count: int) -> tuple[_Tables, _Tables]:
+    """Part tables after a number of frames."""
+    first = set(frame_rows(tables["frames"][:count]))
+    ends = {"frames": count}
+    for name in ("detections", "planes"):
+        rows = frame_rows(tables[name])
+        ends[name] = max((rows[key].stop for key in first & set(rows)), default=0)
+    return (
+        {name: tables[name][:end].combine_chunks() for name, end in ends.items()},
+        {name: tables[name][end:] for name, end in ends.items()},
+    )
+
+
+def _write_segment(path: Path, table: pa.Table) -> None:
+    """Write a part of a table as it lies in memory: it is soon read again, once."""
+    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
+        writer.write_table(table)
+
+
+def _read_segment(path: Path) -> pa.Table:
+    try:
+        with pa.OSFile(str(path), "rb") as source, pa.ipc.open_file(source) as reader:
+            return reader.read_all()
+    except (OSError, pa.ArrowException) as error:
+        msg = f"{path}: what a killed run left there cannot be read ({error}); use --overwrite"
+        raise OutputError(msg) from error
+
+
+def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]]) -> dict[str, Any]:
+    return {
+        "topic": [p.topic for p, _ in rows],
+        "frame": [p.index for p, _ in rows],
+        "stamp_ns": [p.stamp_ns for p, _ in rows],
+        "log_time_ns": [row.log_time_ns for _, row in rows],
+        "frame_id": [p.frame_id for p, _ in rows],
+        "up": [p.scene.up for p, _ in rows],
+        "up_given": [row.up_given for _, row in rows],
+        "fixed_translation": [
+            row.fixed_from_sensor and row.fixed_from_sensor.translation for _, row in rows
+        ],
+        "fixed_rotation": [
+            row.fixed_from_sensor and row.fixed_from_sensor.rotation.ravel() for _, row in rows
+        ],
+        "stages": [list(p.seconds) for p, _ in rows],
+        "seconds": [list(p.seconds.values()) for p, _ in rows],
+    }
+
+
+def _detection_columns(
+    rows: Sequence[tuple[Perception, FrameRow]], categories: Sequence[str]
+) -> dict[str, Any]:
+    objects = [(p, row, k, d) for p, row in rows for k, d in enumerate(p.detections)]
+    found = [d for _, _, _, d in objects]
+    candidates = [d.candidate for d in found]
+    best = [int(np.argmax(d.posterior)) for d in found]
+    return {
+        "topic": [p.topic for p, *_ in objects],
+        "frame": [p.index for p, *_ in objects],
+        "stamp_ns": [p.stamp_ns for p, *_ in objects],
+        "frame_id": [p.frame_id for p, *_ in objects],
+        "detection": [k for _, _, k, _ in objects],
+        "plane": [c.plane for c in candidates],
+        "on_detection": [c.on_candidate for c in candidates],
+        "touches_border": [c.touches_border for c in candidates],
+        "occluded": [c.occluded for c in candidates],
+        "center": [c.box.center for c in candidates],
+        "size": [c.box.size for c in candidates],
+        "orientation": [c.box.orientation for c in candidates],
+        "center_fixed": [_center_fixed(row, d.candidate.box.center) for _, row, _, d in objects],
+        "height_m": [
+            _height(p, c.plane, c.support_m, c.box.center)
+            for (p, *_), c in zip(objects, candidates, strict=True)
+        ],
+        "points": [c.indices.size for c in candidates],
+        "indices": lists([c.indices for c in candidates], pa.uint32()),
+        "posterior": lists([d.posterior for d in found], pa.float32()),
+        "category": [
+            "unknown" if d.novelty > 1 else categories[k] for d, k in zip(found, best, strict=True)
+        ],
+        "confidence": [float(d.posterior[k]) for d, k in zip(found, best, strict=True)],
+        "novelty": [d.novelty for d in found],
+        "descriptor": lists([d.descriptor for d in found], pa.float32()),
+        "neurons": lists([d.gas.neurons for d in found], pa.float32()),
+        "edges": lists([d.gas.edges for d in found], pa.uint16()),
+        "seconds": [d.seconds for d in found],
+    }
+
+
+def _center_fixed(row: FrameRow, center: Any) -> Any:
+    pose = row.fixed_from_sensor
+    return None if pose is None else pose.rotation @ center + pose.translation
+
+
+def _height(perception: Perception, plane: int | None, support_m: float, center: Any) -> float:
+    """Return the height of a centre above what its object stands on, in metres."""
+    if plane is None:
+        return float("nan")
+    support = perception.scene.planes[plane]
+    return float(support.normal @ center) - support.offset - support_m
+
+
+def _plane_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
+    planes = [(p, k, plane) for p in perceptions for k, plane in enumerate(p.scene.planes)]
+    return {
+        "topic": [p.topic for p, *_ in planes],
+        "frame": [p.index for p, *_ in planes],
+        "stamp_ns": [p.stamp_ns for p, *_ in planes],
+        "plane": [k for _, k, _ in planes],
+        "normal": [plane.normal for *_, plane in planes],
+        "offset": [plane.offset for *_, plane in planes],
+        "height_m": [plane.height_m for *_, plane in planes],
+        "area_m2": [plane.area_m2 for *_, plane in planes],
+        "outline": lists([plane.outline for *_, plane in planes], pa.float32()),
+    }

@@ -1,0 +1,169 @@
+"""tracks.csv: a line per track, made to be read and corrected, also in a spreadsheet.
+
+Separators, quotes, line ends, encodings, the order of columns and numbers such as ``1.0`` do not
+matter.
+"""
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from shapecat.errors import OutputError
+
+__all__ = [
+    "TrackRow",
+    "TrackTable",
+    "read_track_table",
+    "unlabelled",
+    "with_label",
+    "write_track_table",
+]
+
+_COLUMNS = ("track", "category", "confidence", "label")
+_LARGEST_TABLE = 64 << 20
+
+
+@dataclass(frozen=True)
+class TrackRow:
+    """A line of tracks.csv; ``cells`` are all its columns as written."""
+
+    line: int
+    track: int
+    category: str
+    confidence: float
+    label: str
+    topic: str
+    cells: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class TrackTable:
+    """The lines of a tracks.csv that could be read, and what is wrong with the others."""
+
+    columns: tuple[str, ...]
+    rows: tuple[TrackRow, ...]
+    problems: tuple[str, ...]
+
+    @property
+    def run(self) -> str:
+        """The ``work`` of the run that the tracks are of; empty if the table does not tell."""
+        return next(iter(self.runs), "")
+
+    @property
+    def runs(self) -> tuple[str, ...]:
+        """All that are named in the table: more than one if tables were mixed."""
+        ids = (row.cells.get("run", "").strip() for row in self.rows)
+        return tuple(dict.fromkeys(filter(None, ids)))
+
+
+def read_track_table(path: Path) -> TrackTable:
+    """Read a tracks.csv, also one that a spreadsheet has saved.
+
+    Raises
+    ------
+    OutputError : the file is not a table with the columns of tracks.csv.
+    """
+    lines = csv.reader(io.StringIO(_text(path), newline=""), delimiter=_separator(path))
+    rows: dict[int, TrackRow] = {}
+    problems: list[str] = []
+    columns: tuple[str, ...] = ()
+    try:
+        for cells in lines:
+            if not any(cell.strip() for cell in cells) or cells[0].lower().startswith("sep="):
+                continue
+            if not columns:
+                columns = _header(path, cells)
+                continue
+            row = _row(lines.line_num, dict(zip(columns, cells, strict=False)))
+            if isinstance(row, str):
+                problems.append(row)
+            elif row.track in rows:
+                problems.append(f"line {row.line}: track {row.track} is listed twice")
+            else:
+                rows[row.track] = row
+    except csv.Error as error:
+        problems.append(f"line {lines.line_num}: {error}")
+    if not columns:
+        _header(path, [])
+    return TrackTable(columns, tuple(rows.values()), tuple(problems))
+
+
+def _text(path: Path) -> str:
+    """Return the text of a table in whichever encoding a spreadsheet has saved it."""
+    try:
+        if path.stat().st_size > _LARGEST_TABLE:
+            msg = f"{path}: larger than {_LARGEST_TABLE >> 20} MB, not a tracks.csv"
+            raise OutputError(msg)
+        content = path.read_bytes()
+    except OSError as error:
+        msg = f"{path}: cannot be read: {error.strerror or error}"
+        raise OutputError(msg) from error
+    wide = content.startswith((b"\xff\xfe", b"\xfe\xff"))
+    for encoding in ("utf-16",) if wide else ("utf-8-sig", "cp1252"):
+        try:
+            return content.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+    msg = f"{path}: not a text; save the table as CSV"
+    raise OutputError(msg)
+
+
+def _separator(path: Path) -> str:
+    """Return the separator of the line that names the columns."""
+    lines = (line for line in _text(path).splitlines() if "track" in line.lower())
+    header = next(lines, "")
+    return max(",;\t", key=header.count)
+
+
+def _header(path: Path, cells: Sequence[str]) -> tuple[str, ...]:
+    names = tuple(cell.strip().lower() for cell in cells)
+    missing = [name for name in _COLUMNS if name not in names]
+    if missing:
+        msg = f"{path}: no column {', '.join(missing)}; expected a table like a run's tracks.csv"
+        raise OutputError(msg)
+    return names
+
+
+def _row(line: int, cells: Mapping[str, str]) -> TrackRow | str:
+    """Return a row, or what is wrong with it."""
+    try:
+        track = _number(cells["track"])
+        confidence = _number(cells["confidence"])
+        if track != int(track):
+            raise ValueError  # noqa: TRY301  the same message for all that is not a number
+    except (KeyError, ValueError, OverflowError):
+        text = f"track {cells.get('track', '')!r}, confidence {cells.get('confidence', '')!r}"
+        return f"line {line}: expected numbers, got {text}"
+    return TrackRow(
+        line=line,
+        track=int(track),
+        category=cells.get("category", "").strip(),
+        confidence=confidence,
+        label=" ".join(cells.get("label", "").split()),
+        topic=cells.get("topic", "").strip(),
+        cells=cells,
+    )
+
+
+def _number(text: str) -> float:
+    return float(text.strip().replace(",", "."))
+
+
+def unlabelled(table: TrackTable) -> TrackTable:
+    """Return a table without labels."""
+    return replace(table, rows=tuple(with_label(row, "") for row in table.rows))
+
+
+def with_label(row: TrackRow, label: str) -> TrackRow:
+    """Return a row with a label."""
+    return replace(row, label=label, cells={**row.cells, "label": label})
+
+
+def write_track_table(path: Path, table: TrackTable) -> None:
+    """Write a table, with all its columns."""
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, table.columns, lineterminator="\n", restval="")
+        writer.writeheader()
+        writer.writerows(row.cells for row in table.rows)

@@ -1,0 +1,104 @@
+"""Signals that ask a command to stop: noted when they arrive, heeded between two frames.
+
+An exception that a signal handler raises may surface inside compiled code, which then returns a
+result and an error at once, or crashes the interpreter. So the handler only takes a note, and the
+work asks for it where it can be put down: `asked` ends a loop, `check` raises `Stopped`.
+"""
+
+import os
+import signal
+import threading
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from types import FrameType
+from typing import TypeVar
+
+__all__ = ["Stopped", "asked", "check", "heeding_signals", "leave", "request", "until_asked"]
+
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_NOTICE = b"stopping after the frames in work; interrupt again to leave at once\n"
+_SHOW_CURSOR = b"\x1b[?25h"
+
+_Item = TypeVar("_Item")
+_received: list[int] = []
+
+
+class Stopped(KeyboardInterrupt):
+    """The work was put down because a signal asked for it; what is done is kept."""
+
+    def __init__(self, signum: int = signal.SIGINT) -> None:
+        """Remember the number of the signal."""
+        super().__init__(signum)
+        self.exit_code = 128 + signum
+
+
+def request(signum: int = signal.SIGINT) -> None:
+    """Ask this process to stop."""
+    _received.append(signum)
+
+
+def asked() -> bool:
+    """Return whether this process was asked to stop."""
+    return bool(_received)
+
+
+def check() -> None:
+    """Raise `Stopped` if this process was asked to stop."""
+    if _received:
+        raise Stopped(_received[0])
+
+
+def until_asked(items: Iterable[_Item]) -> Iterator[_Item]:
+    """Yield the items until this process is asked to stop.
+
+    Examples
+    --------
+    >>> list(until_asked("ab"))
+    ['a', 'b']
+    """
+    for item in items:
+        if asked():
+            return
+        yield item
+
+
+def leave(signum: int, _frame: FrameType | None = None) -> None:
+    """End this process at once, as a handler of signals; its workers end when they miss it."""
+    if os.isatty(2):
+        _say(_SHOW_CURSOR)
+    os._exit(128 + signum)
+
+
+def _say(text: bytes) -> None:
+    """Write to stderr past its buffer, which the handler may have interrupted."""
+    with suppress(OSError):
+        os.write(2, text)
+
+
+def _note(signum: int, frame: FrameType | None) -> None:
+    """Take a note of the first signal, leave with the second."""
+    if asked():
+        leave(signum, frame)
+    request(signum)
+    _say(_NOTICE)
+
+
+@contextmanager
+def heeding_signals() -> Iterator[None]:
+    """Take notes of SIGINT and SIGTERM in the block instead of raising.
+
+    Signals that are ignored, as SIGINT is for a job in the background, stay so. Outside the main
+    thread, which alone may handle signals, nothing changes.
+    """
+    before = {}
+    if threading.current_thread() is threading.main_thread():
+        handlers = {signum: signal.getsignal(signum) for signum in _SIGNALS}
+        before = {n: h for n, h in handlers.items() if h not in {None, signal.SIG_IGN}}
+    for signum in before:
+        signal.signal(signum, _note)
+    try:
+        yield
+    finally:
+        for signum, handler in before.items():
+            signal.signal(signum, handler)
+        _received.clear()

@@ -1,0 +1,218 @@
+"""How a command is disturbed: signals, dead workers, failing calls, a full disk, other input."""
+
+import contextlib
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+SIGNALS = {
+    "interrupt": signal.SIGINT,
+    "double": signal.SIGINT,
+    "terminate": signal.SIGTERM,
+    "kill": signal.SIGKILL,
+}
+COUNTERS = {"eioread": 0, "short": 0, "enospc": 1, "eio": 1, "erofs": 1, "clock": 2}
+KINDS = (*SIGNALS, "worker", "replace", "tmpfs", *COUNTERS)
+LIMIT_S = 120.0
+"""A command that takes longer hangs."""
+_LINGER_S = 8.0
+"""Processes of a command may outlive it so long."""
+
+
+@dataclass
+class Ended:
+    """What is known of a command that has ended."""
+
+    code: int
+    seconds: float
+    lines: list[tuple[float, str]] = field(default_factory=list)
+    struck: float | None = None
+    lingering: int = 0
+    hung: bool = False
+
+    @property
+    def text(self) -> str:
+        """All of stderr."""
+        return "".join(line for _, line in self.lines)
+
+    def events(self) -> list[tuple[float, dict[str, object]]]:
+        """Return the lines of progress with their moments."""
+        found = []
+        for moment, line in self.lines:
+            with contextlib.suppress(ValueError):
+                event = json.loads(line)
+                if isinstance(event, dict):
+                    found.append((moment, event))
+        return found
+
+
+def _heed_interrupts() -> None:
+    """Do not inherit that a shell lets its background jobs ignore them."""
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+
+
+class Running:
+    """A command in a session of its own whose stderr is read as it comes."""
+
+    def __init__(self, command: list[str], environment: Mapping[str, str] | None = None) -> None:
+        self.begun = time.monotonic()
+        self.lines: list[tuple[float, str]] = []
+        self.process = subprocess.Popen(
+            command,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            errors="replace",
+            start_new_session=True,
+            preexec_fn=_heed_interrupts,  # noqa: PLW1509  there is no other way
+            env={**os.environ, **(environment or {})},
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    def _read(self) -> None:
+        assert self.process.stderr is not None
+        with self.process.stderr as stream:
+            for line in stream:
+                self.lines.append((time.monotonic() - self.begun, line))
+
+    def wait_until(self, moment: float) -> bool:
+        """Wait for a moment after the start; tell whether the command still runs then."""
+        try:
+            self.process.wait(max(0.0, self.begun + moment - time.monotonic()))
+        except subprocess.TimeoutExpired:
+            return True
+        return False
+
+    def send(self, number: int, *, group: bool) -> None:
+        """Signal the command, or all of its processes."""
+        with contextlib.suppress(ProcessLookupError):
+            (os.killpg if group else os.kill)(self.process.pid, number)
+
+    def end(self, struck: float | None = None, limit_s: float = LIMIT_S) -> Ended:
+        """Wait for the end, and for processes that outlive it."""
+        hung = self.wait_until(limit_s)
+        if hung:
+            self.send(signal.SIGKILL, group=True)
+        code = self.process.wait()
+        seconds = time.monotonic() - self.begun
+        until = time.monotonic() + _LINGER_S
+        while (left := session(self.process.pid)) and time.monotonic() < until:
+            time.sleep(0.05)
+        if left:
+            self.send(signal.SIGKILL, group=True)
+        self._reader.join(5.0)
+        return Ended(code, seconds, self.lines, struck, len(left), hung)
+
+
+def session(leader: int) -> list[int]:
+    """Return the processes that live in the session of a leader, but for itself and zombies."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        if entry.name.isdigit() and int(entry.name) != leader:
+            with contextlib.suppress(OSError, IndexError):
+                fields = (entry / "stat").read_text().rpartition(")")[2].split()
+                if int(fields[3]) == leader and fields[0] not in {"Z", "X"}:
+                    found.append(int(entry.name))
+    return sorted(found)
+
+
+def disturb(kind: str, rng: random.Random, command: list[str], seconds: float) -> Ended:
+    """Run a command and signal it, or kill a worker, at a random moment of ``seconds``."""
+    running = Running(command)
+    moment = rng.uniform(0.3, max(0.4, seconds))
+    group = rng.random() < 0.5
+    again = rng.uniform(0.05, 1.0)
+    choice = rng.random()
+    if not running.wait_until(moment):
+        return running.end()
+    if kind == "worker":
+        workers = [p for p in session(running.process.pid) if not _tracks_resources(p)]
+        if not workers:
+            return running.end()
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(workers[int(choice * len(workers))], signal.SIGKILL)
+    else:
+        running.send(SIGNALS[kind], group=group)
+    if kind == "double" and running.wait_until(moment + again):
+        running.send(SIGNALS[kind], group=group)
+    return running.end(moment)
+
+
+def _tracks_resources(process: int) -> bool:
+    try:
+        return b"resource_tracker" in Path(f"/proc/{process}/cmdline").read_bytes()
+    except OSError:
+        return True
+
+
+def replace_input(
+    rng: random.Random, command: list[str], seconds: float, path: Path, other: Path
+) -> Ended:
+    """Run a command and replace its recording: by a rename, in place, or by its first half."""
+    moment, way = rng.uniform(0.3, max(0.4, seconds)), rng.choice(["rename", "rewrite", "cut"])
+    content = path.read_bytes() if way == "cut" else other.read_bytes()
+    own = path.with_suffix(".own")
+    shutil.copyfile(path, own)
+    own.replace(path)  # the recording is linked: what is written in place must be this case's
+    running = Running(command)
+    if not running.wait_until(moment):
+        return running.end()
+    if way == "rename":
+        own.write_bytes(content)
+        own.replace(path)
+    else:
+        path.write_bytes(content[: len(content) // 2] if way == "cut" else content)
+    return running.end(moment)
+
+
+def build_shim(folder: Path) -> Path | None:
+    """Compile the library that makes calls fail; None without a C compiler."""
+    compiler = shutil.which("cc")
+    if compiler is None:
+        return None
+    library, source = folder / "shim.so", Path(__file__).with_name("shim.c")
+    flags = ("-O2", "-shared", "-fPIC", "-o", str(library))
+    subprocess.run([compiler, *flags, str(source), "-ldl"], check=True)
+    return library
+
+
+def shimmed(library: Path, kind: str, nth: int, case: Path) -> dict[str, str]:
+    """Return the environment in which the ``nth`` call below a case is the first to fail."""
+    counts = case.with_name(f"{case.name}.counts")
+    counts.write_bytes(bytes(24))
+    return {
+        "LD_PRELOAD": str(library),
+        "FAULT_FOLDER": str(case),
+        "FAULT_KIND": kind,
+        "FAULT_NTH": str(nth),
+        "FAULT_COUNTS": str(counts),
+    }
+
+
+def mount(folder: Path, megabytes: int) -> bool:
+    """Put a small disk at a folder; False where that is not permitted."""
+    folder.mkdir(parents=True, exist_ok=True)
+    words = ["mount", "-t", "tmpfs", "-o", f"size={megabytes}m", "shapecat-faults", str(folder)]
+    try:
+        return subprocess.run(words, check=False, capture_output=True).returncode == 0
+    except FileNotFoundError:
+        return False
+
+
+def enlarge(folder: Path) -> None:
+    """Give the small disk room."""
+    subprocess.run(["mount", "-o", "remount,size=300m", str(folder)], check=True)
+
+
+def unmount(folder: Path) -> None:
+    """Take the small disk away."""
+    subprocess.run(["umount", str(folder)], check=False, capture_output=True)

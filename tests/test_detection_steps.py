@@ -1,0 +1,166 @@
+"""Steps of the detection on small made-up inputs whose answers are known."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from shapecat.detection.cleanup.holes import fill_holes
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
+from shapecat.detection.foreground.convex_hull import fill_hull
+from shapecat.detection.merging.pair_features import FEATURES, PAIR_FEATURES
+from shapecat.detection.merging.segments import PAIR, SEGMENT, add_statistics
+from shapecat.detection.planes import find_supporting_planes
+from shapecat.detection.planes.height_map import HeightMap, measure_heights
+from shapecat.detection.planes.ransac import (
+    draw_trials,
+    horizontal_plane,
+    median_of,
+    plane_normal,
+    ransac_plane,
+    sample_grid,
+)
+from shapecat.detection.segmentation.connectivity import connect_surfaces
+from shapecat.detection.segmentation.watershed import relabel, watershed
+from shapecat.types import Camera
+
+Floats = NDArray[np.float32]
+INTRINSICS = PinholeIntrinsics(262.5, 262.5, 159.5, 119.5)
+UP = np.array([0.0, -np.sqrt(0.5), -np.sqrt(0.5)])
+
+
+def table(distance_m: float = 0.7) -> Floats:
+    """Return the inverse depth of a level plane so far below the camera."""
+    i, j = np.mgrid[:240, :320]
+    x, y = (j - INTRINSICS.cx) / INTRINSICS.fx, (i - INTRINSICS.cy) / INTRINSICS.fy
+    return np.asarray((x * UP[0] + y * UP[1] + UP[2]) / -distance_m, np.float32)
+
+
+def test_a_plane_in_noise_is_found() -> None:
+    """Half of the samples are anywhere: least squares alone would lie between."""
+    rng = np.random.default_rng(0)
+    inv_depth = table()
+    lost = rng.random(inv_depth.shape) < 0.5
+    inv_depth[lost] = rng.uniform(0.5, 3, int(lost.sum()))
+    samples = sample_grid(inv_depth, inv_depth)
+    plane, count = ransac_plane(samples, draw_trials(rng), INTRINSICS, UP, (0.9, 1.0), 0.01)
+    np.testing.assert_allclose(plane, horizontal_plane(INTRINSICS, UP, -0.7), atol=2e-3)
+    assert plane_normal(plane, INTRINSICS) @ UP > 0.9999
+    assert 0.45 < count / samples.inverse_depth.size < 0.6
+
+
+def test_no_plane_among_two_samples() -> None:
+    """Three points span a plane, fewer must not make one up."""
+    inv_depth = np.zeros((240, 320), np.float32)
+    inv_depth[:5, :5] = 1
+    samples = sample_grid(inv_depth, inv_depth)
+    trials = draw_trials(np.random.default_rng(0))
+    assert ransac_plane(samples, trials, INTRINSICS, UP, (0.9, 1.0), 0.01)[1] == 0
+
+
+@pytest.mark.parametrize("size", [1, 2, 7, 100])
+def test_the_median_is_that_of_a_sorted_list(size: int) -> None:
+    values = np.random.default_rng(size).permutation(size).astype(np.float32)
+    assert median_of(values, np.arange(size)) == size // 2
+
+
+def test_heights_of_a_board_with_an_edge() -> None:
+    """What is beside the board is not above it, however high."""
+    inv_depth = table()
+    inv_depth[:, 200:] = 0
+    board = inv_depth.copy()
+    inv_depth[100:140, 80:120] = table(0.62)[100:140, 80:120]  # a box of 8 cm
+    inv_depth[100:140, 280:300] = table(0.62)[100:140, 280:300]  # and one in the air beside
+    trials = draw_trials(np.random.default_rng(0))
+    found, _, planes = find_supporting_planes(DepthGrid(board, INTRINSICS, 2, 0.0035), UP, trials)
+    assert len(found) == 1
+    heights = measure_heights(DepthGrid(inv_depth, INTRINSICS, 2, 0.0035), planes, 0.6)
+    assert (heights.plane_id[105:135, 85:115] == 1).all()
+    np.testing.assert_allclose(heights.height[105:135, 85:115], 0.08, atol=1e-4)
+    assert (heights.plane_id[100:140, 285:] == 0).all()
+    assert (heights.plane_id[180:200, 20:100] == -1).all()
+
+
+@pytest.mark.parametrize(("rise", "segments"), [(0.0, 1), (1.0, 2)])
+def test_two_faces_are_parted_where_they_meet_at_a_concave_edge(rise: float, segments: int) -> None:
+    """A face that goes on straight is one segment; one that turns towards the camera is two."""
+    inv_depth = np.zeros((240, 320), np.float32)
+    y = (np.arange(90, 150) - INTRINSICS.cy) / INTRINSICS.fy
+    edge = y[30]
+    # depth z on the planes z = 0.8 and z = 0.8 - rise (Y - Y_edge) below the edge
+    below = (0.8 + rise * edge * 0.8) / (1 + rise * y)
+    z = np.where(y > edge, below, 0.8)
+    inv_depth[90:150, 120:200] = (1 / z)[:, None].astype(np.float32)
+    plane_id = (inv_depth > 0).astype(np.int8)
+    heights = HeightMap(plane_id, np.where(plane_id, 0.1, 0).astype(np.float32))
+    graph = connect_surfaces(DepthGrid(inv_depth, INTRINSICS, 2, 0.0035), heights)
+
+    labels, n = watershed(heights, graph, True)
+
+    assert n == segments
+    assert (labels[90:150, 120:200] > 0).all()
+    assert (labels[90, 120] != labels[149, 120]) == (segments == 2)
+
+
+def test_relabel_keeps_what_is_none() -> None:
+    labels = np.array([[0, 1, 2], [2, 2, 0]], np.int16)
+    relabel(labels, np.array([[0, 3], [0, 3]], np.int32), np.array([0, 5, 0], np.int16))
+    np.testing.assert_array_equal(labels, [[0, 5, 0], [0, 0, 0]])
+
+
+def test_hull_of_an_l_is_filled() -> None:
+    """The cells between its arms belong to it, those beyond do not."""
+    residual = np.ones((12, 12), np.float32)
+    part, stack = np.zeros((12, 12), np.int32), np.zeros(144, np.int32)
+    cells = [(i, 2) for i in range(2, 9)] + [(8, j) for j in range(3, 9)]
+    for n, (i, j) in enumerate(cells):
+        part[i, j], stack[n] = 7, i * 12 + j
+    count = fill_hull(residual, part, stack, len(cells))
+    assert part[6, 4] == 7
+    assert part[3, 7] == 0
+    assert count == np.count_nonzero(part == 7)
+
+
+def test_a_hole_within_one_object_is_filled_and_a_bay_is_not() -> None:
+    inv_depth = np.full((40, 40), 1.25, np.float32)
+    labels = np.zeros((40, 40), np.int16)
+    labels[10:30, 10:30] = 1
+    labels[18:22, 18:22] = 0
+    labels[14:16, 10:20] = 0  # open to the left
+    height, filled = np.zeros((40, 40), np.float32), np.zeros((40, 40), np.uint8)
+    fill_holes(inv_depth, height, labels, 1, filled)
+    assert (labels[18:22, 18:22] == 1).all()
+    assert (filled[18:22, 18:22] == 1).all()
+    assert (labels[14:16, 10:20] == 0).all()
+
+
+def test_statistics_of_two_segments_add_up() -> None:
+    """Ranges are joined, sums are added: a field forgotten here would be lost in every merge."""
+    a, b = np.zeros(1, SEGMENT), np.zeros(1, SEGMENT)
+    for k, name in enumerate(SEGMENT.names or ()):
+        a[name], b[name] = k + 1, 100 + k
+    first = a.copy()
+    add_statistics(a[0], b[0])
+    for name in SEGMENT.names or ():
+        join = {"left": min, "bottom": min, "right": max, "top": max}.get(name)
+        expected = join(first[name][0], b[name][0]) if join else first[name][0] + b[name][0]
+        assert a[name][0] == expected, name
+
+
+def test_records_are_floats_without_gaps() -> None:
+    """The trees read the features of a pair as one row of numbers."""
+    assert PAIR_FEATURES.itemsize == 4 * FEATURES == 4 * 62
+    assert SEGMENT.itemsize == 4 * len(SEGMENT.names or ())
+    assert PAIR.itemsize == 4 * len(PAIR.names or ())
+
+
+def test_downsampling_keeps_the_nearer_side_of_an_edge() -> None:
+    """A mean over both sides would make up a surface between them."""
+    depth = np.full((480, 640), 0.9, np.float32)
+    depth[:, 321:] = 0.7
+    grid = downsample(depth, Camera(640, 480, 525, 525, 319.5, 239.5), range_m=2.0)
+    assert grid is not None
+    assert grid.factor == 2
+    np.testing.assert_allclose(np.unique(grid.inverse_depth), [1 / 0.9, 1 / 0.7], rtol=1e-6)
+    assert all(a <= b for a, b in pairwise(grid.inverse_depth[100]))

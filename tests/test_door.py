@@ -1,0 +1,326 @@
+"""What a new user meets at the door: plain refusals before work begins, nothing lost silently."""
+
+import json
+import logging
+import re
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from html.parser import HTMLParser
+from importlib import import_module
+from pathlib import Path
+from urllib.parse import unquote
+
+import pytest
+from click.testing import Result
+
+from tests.scenes import record
+from tests.test_executors import wait_for
+
+Run = Callable[..., Result]
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("door") / "lab.mcap", 12)
+
+
+@pytest.fixture(scope="module")
+def runs(shapecat: Run, recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Process the recording into three runs in different folders."""
+    out = tmp_path_factory.mktemp("runs")
+    for name in ("a", "b", "deep/c"):
+        done = shapecat("process", recording, "--out", out / name, "--no-rrd", "--jobs", 1)
+        assert done.exit_code == 0, done.stderr
+    return out
+
+
+def test_info_looks_into_a_folder_as_process_does(shapecat: Run, tmp_path: Path) -> None:
+    """A bag beside an MCAP file is no part of a ROS 2 recording, nor to be passed over."""
+    record(tmp_path / "one.mcap", 2)
+    record(tmp_path / "two.bag", 2, container="ros1")
+    found = json.loads(shapecat("info", tmp_path, "--json").stdout)
+
+    assert {Path(item["path"]).name: item["kind"] for item in found} == {
+        "one.mcap": "mcap",
+        "two.bag": "ros1",
+    }
+
+
+def test_info_goes_on_after_a_recording_that_cannot_be_read(
+    shapecat: Run, recording: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "bad.mcap").write_text("no recording")
+    result = shapecat("info", tmp_path / "bad.mcap", recording)
+
+    assert result.exit_code == 1
+    assert "bad.mcap" in result.stderr
+    assert "/camera/depth/image_raw" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--start", "1", "--end", "0.5"), "--end 0.5 is not after --start 1"),
+        (("--end", "-1"), "--end"),
+        (("--start", "nan"), "--start"),
+        (("--start", "-2"), "--start"),
+    ],
+)
+def test_an_impossible_range_is_wrong_usage(
+    shapecat: Run, recording: Path, tmp_path: Path, options: tuple[str, ...], words: str
+) -> None:
+    result = shapecat("process", recording, "--out", tmp_path / "out", *options)
+
+    assert result.exit_code == 2
+    assert words in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("place", ["before", "after"])
+def test_verbose_tells_what_is_done(recording: Path, tmp_path: Path, place: str) -> None:
+    """In a process of its own: logging is set up once."""
+    before, after = (["-v"], []) if place == "before" else ([], ["-v"])
+    command = [sys.executable, "-m", "shapecat", *before, "process", str(recording), *after]
+    done = subprocess.run(
+        [*command, "--out", str(tmp_path), "--no-rrd", "--jobs", "1", "--progress", "none"],
+        check=True,
+        capture_output=True,
+        text=True,
+    )
+
+    for words in ("/camera/depth/image_raw", "perceive", "track", "annotated.mcap", "default"):
+        assert words in done.stderr, done.stderr
+    assert done.stderr.count("\n") < 20
+
+
+def test_verbose_is_off_by_default(
+    shapecat: Run, recording: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    with caplog.at_level(logging.ERROR):
+        done = shapecat("process", recording, "--out", tmp_path, "--no-rrd", "--progress", "none")
+
+    assert done.stderr == ""
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ("learn", "default", "DATA", "--out", "PLACE/mine.npz"),
+        ("train", "DATA", "--out", "PLACE/mine.npz"),
+        ("evaluate", "DATA", "--report", "PLACE/page.html"),
+    ],
+)
+def test_a_place_that_cannot_be_written_is_noticed_before_the_work(
+    shapecat: Run, tmp_path: Path, command: tuple[str, ...]
+) -> None:
+    """Root may write anywhere, but not below a file. The data set need not even exist."""
+    (tmp_path / "file").write_text("")
+    names = {"DATA": str(tmp_path / "none"), "PLACE": str(tmp_path / "file")}
+    words = [names.get(word, word.replace("PLACE", names["PLACE"])) for word in command]
+    result = shapecat(*words)
+
+    assert result.exit_code in {1, 2}
+    assert "cannot be written" in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_missing_folders_of_a_model_are_made(tmp_path: Path) -> None:
+    from shapecat.files import require_writable  # noqa: PLC0415  beside its only use
+
+    require_writable(tmp_path / "new" / "deep" / "mine.npz")
+
+    assert list((tmp_path / "new" / "deep").iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "words"),
+    [
+        ("x.mcap", ("--format", "ros1"), "x.bag"),
+        ("x.bag", ("--format", "mcap"), "x.mcap"),
+        ("x.txt", (), "x.mcap"),
+        ("x.bag", ("--format", "ros2"), "folder"),
+    ],
+)
+def test_simulate_refuses_a_suffix_that_says_something_else(
+    shapecat: Run, tmp_path: Path, name: str, options: tuple[str, ...], words: str
+) -> None:
+    result = shapecat("simulate", tmp_path / name, "--frames", 1, *options)
+
+    assert result.exit_code == 2
+    assert words in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("there", ["x.mcap", "x.truth.json", "x.labels.npz"])
+def test_simulate_overwrites_nothing_unasked(shapecat: Run, tmp_path: Path, there: str) -> None:
+    (tmp_path / there).write_text("mine")
+    result = shapecat("simulate", tmp_path / "x.mcap", "--frames", 1)
+
+    assert result.exit_code == 2
+    assert "--overwrite" in result.stderr
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(there, "mine")]
+
+    assert shapecat("simulate", tmp_path / "x.mcap", "--frames", 1, "--overwrite").exit_code == 0
+    assert (tmp_path / "x.mcap").read_bytes().startswith(b"\x89MCAP")
+
+
+def test_simulate_never_removes_a_folder_of_other_things(shapecat: Run, tmp_path: Path) -> None:
+    (tmp_path / "x").mkdir()
+    (tmp_path / "x" / "thesis.txt").write_text("mine")
+    result = shapecat("simulate", tmp_path / "x", "--frames", 1, "--overwrite")
+
+    assert result.exit_code == 1
+    assert (tmp_path / "x" / "thesis.txt").read_text() == "mine"
+
+
+def test_export_takes_folders_of_runs(shapecat: Run, runs: Path, tmp_path: Path) -> None:
+    result = shapecat("export", runs / "a", runs / "deep" / "c" / "lab", "--format", "kitti",
+                      "--out", tmp_path / "kitti")  # fmt: skip
+    assert result.exit_code == 1
+    assert "lab" in result.stderr  # both would be OUT/lab
+
+    result = shapecat("export", runs / "a", "--format", "kitti", "--out", tmp_path / "kitti")
+    assert result.exit_code == 0, result.stderr
+    assert (tmp_path / "kitti" / "lab" / "label_2").is_dir()
+
+
+class Links(HTMLParser):
+    """Collects where the links of a page lead."""
+
+    def __init__(self, page: Path) -> None:
+        super().__init__()
+        self.found: list[str] = []
+        self.feed(page.read_text("utf-8"))
+
+    def handle_starttag(self, _tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        """Take down an href."""
+        self.found += [value for name, value in attrs if name == "href" and value]
+
+
+def test_an_index_over_scattered_runs_leads_to_all_of_them(shapecat: Run, runs: Path) -> None:
+    folders = [runs / "a" / "lab", runs / "b", runs / "deep" / "c"]
+    result = shapecat("report", *folders)
+
+    assert result.exit_code == 0, result.stderr
+    (index,) = runs.rglob("index.html")
+    assert index.parent == runs
+    links = [unquote(link) for link in Links(index).found if not re.match(r"[a-z]+:|#", link)]
+    pages = {(index.parent / link).resolve() for link in links}
+    assert pages >= {(runs / name / "lab" / "report.html").resolve() for name in ("a", "b")}
+    assert all(page.exists() for page in pages)
+    for page in pages:
+        back = [link for link in Links(page).found if link.endswith("index.html")]
+        assert [(page.parent / unquote(link)).resolve() for link in back] == [index.resolve()]
+
+
+def test_a_recording_that_was_moved_can_be_named(
+    shapecat: Run, recording: Path, tmp_path: Path
+) -> None:
+    lab = tmp_path / "lab.mcap"
+    lab.write_bytes(recording.read_bytes())
+    shapecat("process", lab, "--out", tmp_path, "--no-rrd", "--jobs", 1)
+    (tmp_path / "archive").mkdir()
+    lab = lab.rename(tmp_path / "archive" / "renamed.mcap")
+
+    lost = shapecat("annotate", tmp_path / "lab")
+    assert lost.exit_code == 3
+    assert "--recording" in lost.stderr
+    crops = ("--format", "crops", "--out", tmp_path / "crops")
+    assert "--recording" in shapecat("export", tmp_path / "lab", *crops).stderr
+
+    other = record(tmp_path / "other.mcap", 13)
+    wrong = shapecat("annotate", tmp_path / "lab", "--recording", other)
+    assert (wrong.exit_code, "another recording" in wrong.stderr) == (1, True)
+    exported = shapecat("export", tmp_path / "lab", *crops, "--recording", lab)
+    assert exported.exit_code == 0, exported.stderr
+    assert shapecat("annotate", tmp_path / "lab", "--recording", lab).exit_code == 0
+    assert shapecat("annotate", tmp_path / "lab").exit_code == 0  # it remembers
+
+
+def test_view_without_a_display_says_what_to_do(
+    shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "review.rrd").write_bytes(b"RRF2")
+    for name in ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET"):
+        monkeypatch.delenv(name, raising=False)
+    result = shapecat("view", tmp_path)
+
+    assert result.exit_code == 1
+    assert "--web" in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def listening(pid: int) -> set[str]:
+    """Return the addresses on which a process and its children listen."""
+    inodes = set()
+    for process in [pid, *descendants(pid)]:
+        for link in Path(f"/proc/{process}/fd").glob("*"):
+            try:
+                inodes.add(str(link.readlink()))
+            except OSError:
+                continue
+    found = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            _, local, _, state, *rest = line.split()
+            if state == "0A" and f"socket:[{rest[5]}]" in inodes:
+                found.add(local.partition(":")[0])
+    return found
+
+
+def descendants(pid: int) -> list[int]:
+    found = []
+    for path in Path(f"/proc/{pid}/task").glob("*/children"):
+        for child in map(int, path.read_text().split()):
+            found += [child, *descendants(child)]
+    return found
+
+
+def test_the_web_viewer_serves_this_machine_alone(tmp_path: Path) -> None:
+    """Recordings of a lab are nobody else's business in the same network."""
+    import rerun as rr  # noqa: PLC0415  loads for a second
+
+    stream = rr.RecordingStream("door")
+    stream.save(tmp_path / "review.rrd")
+    stream.log("a", rr.TextLog("b"))
+    stream.disconnect()
+    command = [sys.executable, "-m", "shapecat", "view", str(tmp_path), "--web"]
+    viewer = subprocess.Popen(
+        command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        assert viewer.stdout is not None
+        url = viewer.stdout.readline()
+        port = int(re.search(r"http://127\.0\.0\.1:(\d+)", url)[1])  # type: ignore[index]
+        with socket.create_connection(("127.0.0.1", port), timeout=10):
+            pass
+        here = {"0100007F", "0000000000000000FFFF00000100007F", "0" * 24 + "01000000"}
+        assert listening(viewer.pid)
+        assert listening(viewer.pid) <= here
+    finally:
+        below = descendants(viewer.pid)
+        viewer.send_signal(signal.SIGINT)
+        _, errors = viewer.communicate(timeout=20)
+    assert viewer.returncode == 130
+    assert "Traceback" not in errors
+    wait_for(lambda: not any(Path(f"/proc/{pid}").exists() for pid in below))
+
+
+@pytest.mark.parametrize("kind", ["plain", "rich", "none", "bars"])
+def test_the_compile_notice_appears_once(capsys: pytest.CaptureFixture[str], kind: str) -> None:
+    """Each recording, and each worker, tells of the kernels it compiles."""
+    open_progress = import_module("shapecat.cli.progress").open_progress
+    progress_bars = import_module("shapecat.cli.render").progress_bars
+    if kind == "bars":
+        with progress_bars() as bars:
+            for _ in range(3):
+                bars("compile", 0, None)
+    else:
+        with open_progress(kind, []) as progress:
+            for name in ("a", "b", "c"):
+                progress.progress(name, "compile", 0, None)
+
+    assert capsys.readouterr().err.count("compiling kernels") == 1

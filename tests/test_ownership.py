@@ -1,0 +1,93 @@
+"""What is another's is not touched, and what has changed is done again."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from click.testing import Result
+
+from shapecat.runs.folder import read_run
+from tests.scenes import record
+
+Run = Callable[..., Result]
+OPTIONS = ("--no-rrd", "--jobs", 1)
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("ownership") / "lab.mcap", 12)
+
+
+@pytest.mark.parametrize("option", ["--overwrite", "--no-mcap"])
+@pytest.mark.parametrize("name", ["thesis.txt", "run.json", "tracks.csv"])
+def test_a_strangers_folder_is_refused(
+    shapecat: Run, recording: Path, tmp_path: Path, option: str, name: str
+) -> None:
+    """Also with --overwrite, and also if it looks like a run."""
+    (tmp_path / "lab").mkdir()
+    (tmp_path / "lab" / name).write_text("{}")
+    done = shapecat("process", recording, "--out", tmp_path, *OPTIONS, option)
+
+    assert done.exit_code == 1
+    assert f"{tmp_path / 'lab'}: shapecat did not make this" in done.stderr
+    assert {path.name for path in tmp_path.rglob("*")} == {"lab", name}
+    assert (tmp_path / "lab" / name).read_text() == "{}"
+
+
+def test_files_beside_the_results_survive(shapecat: Run, recording: Path, tmp_path: Path) -> None:
+    shapecat("process", recording, "--out", tmp_path, *OPTIONS)
+    (tmp_path / "lab" / "notes.txt").write_text("mine")
+    before = read_run(tmp_path / "lab")
+    done = shapecat("process", recording, "--out", tmp_path, *OPTIONS, "--overwrite")
+
+    assert done.exit_code == 0
+    assert (tmp_path / "lab" / "notes.txt").read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["lab"]
+    after = read_run(tmp_path / "lab")
+    assert before["id"] != after["id"]
+    assert before["work"] == after["work"]
+
+
+def test_four_kilobytes_in_the_middle_make_another_recording(shapecat: Run, tmp_path: Path) -> None:
+    """A run over what a disk has lost since must not pass for complete."""
+    lab = record(tmp_path / "lab.bag", 12, container="ros1")  # not compressed: depth, not chunks
+    content = bytearray(lab.read_bytes())
+    command = ("process", lab, "--out", tmp_path / "out", *OPTIONS)
+    assert shapecat(*command).exit_code == 0
+    middle = len(content) // 2
+    content[middle : middle + 4096] = bytes(4096)
+    lab.write_bytes(content)
+
+    done = shapecat(*command)
+
+    assert done.exit_code == 1
+    assert "another input" in done.stderr
+    assert "was complete" not in done.stdout
+
+
+def test_a_copy_with_other_times_is_the_same_recording(
+    shapecat: Run, recording: Path, tmp_path: Path
+) -> None:
+    command = ("process", tmp_path / "lab.mcap", "--out", tmp_path / "out", *OPTIONS)
+    (tmp_path / "lab.mcap").write_bytes(recording.read_bytes())
+    assert shapecat(*command).exit_code == 0
+    (tmp_path / "lab.mcap").unlink()
+    (tmp_path / "lab.mcap").write_bytes(recording.read_bytes())
+
+    done = shapecat(*command)
+
+    assert done.exit_code == 0, done.stderr
+    assert "was complete" in done.stdout
+
+
+def test_each_failure_is_told_once(shapecat: Run, recording: Path, tmp_path: Path) -> None:
+    """On stderr when it happens, not again in a column of the closing table."""
+    (tmp_path / "lab.mcap").write_bytes(recording.read_bytes())
+    for k in range(3):
+        (tmp_path / f"bad{k}.mcap").write_text("no recording")
+    done = shapecat("process", tmp_path, "--out", tmp_path / "out", *OPTIONS)
+
+    assert done.exit_code == 1
+    assert done.output.count("not a recording") == 3
+    assert "bad" not in done.stdout
+    assert "1 complete, 3 failed" in done.stdout

@@ -1,0 +1,189 @@
+"""A person or a scheduler interrupts: the frames in work are kept, the exit code says so."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from shapecat import stopping
+from shapecat.executors import LocalExecutor
+from shapecat.pipeline import process
+from shapecat.runs.folder import read_run
+from shapecat.runs.jobs import Job
+from tests.scenes import record
+from tests.test_batch import heed_interrupts
+from tests.test_crash import assert_same_tables, contents
+from tests.test_executors import wait_for
+
+FRAMES = 240
+
+
+@pytest.fixture(scope="module")
+def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return record(tmp_path_factory.mktemp("stopping") / "table.mcap", FRAMES)
+
+
+@pytest.fixture(scope="module")
+def undisturbed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("undisturbed")
+    process(Job(recording, out / "table", rrd=False))
+    return out
+
+
+class Command:
+    """The real command, in a process group of its own as a shell starts it."""
+
+    def __init__(self, recording: Path, out: Path, *options: str) -> None:
+        arguments = ["process", str(recording), "--out", str(out), "--no-rrd", *options]
+        self.running = subprocess.Popen(
+            [sys.executable, "-m", "shapecat", *arguments, "--progress", "jsonl"],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            preexec_fn=heed_interrupts,  # noqa: PLW1509  there is no other way
+        )
+
+    def wait_for_frames(self, count: int) -> None:
+        """Read progress until so many frames are perceived."""
+        assert self.running.stderr is not None
+        for line in self.running.stderr:
+            event = json.loads(line)
+            if event.get("phase") == "perceive" and event["done"] >= count:
+                return
+        pytest.fail("ended before it could be interrupted")
+
+    def signal_group(self, signum: int) -> None:
+        """Signal as a terminal does: the command and its workers."""
+        os.killpg(self.running.pid, signum)
+
+    def end(self) -> tuple[int, str]:
+        """Return the exit code, and what is said after the signal."""
+        _, errors = self.running.communicate(timeout=60)
+        return self.running.returncode, errors
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_signal_keeps_what_is_done(
+    recording: Path, undisturbed: Path, tmp_path: Path, signum: int, code: int, jobs: str
+) -> None:
+    """It reaches the workers too, which must neither die of it nor show a traceback."""
+    command = Command(recording, tmp_path, "--jobs", jobs)
+    command.wait_for_frames(40)
+    command.signal_group(signum)
+    returned, errors = command.end()
+
+    assert returned == code
+    assert "Traceback" not in errors
+    assert "run the same command again to go on" in errors
+    assert not (tmp_path / "table").exists()
+
+    process(Job(recording, tmp_path / "table", rrd=False))
+
+    assert read_run(tmp_path / "table")["counts"]["resumed"] >= 40
+    assert contents(tmp_path) == contents(undisturbed)
+    assert_same_tables(tmp_path / "table", undisturbed / "table")
+
+
+def test_a_second_signal_leaves_at_once(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
+    command = Command(recording, tmp_path, "--jobs", "2")
+    command.wait_for_frames(40)
+    command.signal_group(signal.SIGINT)
+    command.signal_group(signal.SIGTERM)
+    returned, errors = command.end()
+
+    assert returned in {130, 143}
+    assert "Traceback" not in errors
+
+    process(Job(recording, tmp_path / "table", rrd=False))
+
+    assert_same_tables(tmp_path / "table", undisturbed / "table")
+
+
+def test_a_signal_while_libraries_load_ends_the_command() -> None:
+    """Before anything listens, Python would show a traceback of its own imports."""
+    code = (
+        "import os, signal, sys, shapecat.__main__ as entry;"
+        "sys.modules['shapecat.cli.main'] = None;"
+        "entry.import_module = lambda name: os.kill(os.getpid(), signal.SIGINT);"
+        "entry.run()"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        check=False,
+        capture_output=True,
+        preexec_fn=heed_interrupts,
+    )
+
+    assert (done.returncode, done.stderr) == (130, b"")
+
+
+@pytest.fixture
+def asked() -> Iterator[Callable[[], None]]:
+    """Stand for a signal that has arrived, and forget it after."""
+    with stopping.heeding_signals():
+        yield stopping.request
+
+
+def test_frames_in_work_are_finished(
+    recording: Path, tmp_path: Path, asked: Callable[[], None]
+) -> None:
+    """Results that other processes hold when the signal comes are not thrown away."""
+
+    def stop(phase: str, done: int, _total: int | None) -> None:
+        if (phase, done) == ("perceive", 20):
+            asked()
+
+    with pytest.raises(stopping.Stopped):
+        process(Job(recording, tmp_path / "table", rrd=False), stop, cores=2)
+
+    partial = tmp_path / ".table.partial" / "segments"
+    assert len(list(partial.glob("[0-9]*"))) == 1
+
+
+def work_until_asked(path: str) -> None:
+    Path(path).write_text("begun")
+    while True:
+        stopping.check()
+
+
+def test_workers_put_their_work_down_when_the_executor_stops(tmp_path: Path) -> None:
+    executor = LocalExecutor(1)
+    running = executor.submit(work_until_asked, str(tmp_path / "begun"))
+    waiting = executor.submit(work_until_asked, str(tmp_path / "never"))
+    wait_for((tmp_path / "begun").exists)
+
+    executor.stop()
+
+    assert isinstance(running.exception(timeout=0), stopping.Stopped)
+    assert waiting.cancelled()
+    assert not (tmp_path / "never").exists()
+
+
+def test_a_recording_that_is_written_to_meanwhile_gives_no_results(
+    recording: Path, undisturbed: Path, tmp_path: Path
+) -> None:
+    """Otherwise half of the tables are of another recording."""
+    moving = tmp_path / "table.mcap"
+    moving.write_bytes(recording.read_bytes())
+
+    def write(phase: str, done: int, _total: int | None) -> None:
+        if (phase, done) == ("perceive", 100):
+            moving.write_bytes(recording.read_bytes())
+
+    from shapecat.errors import RecordingError  # noqa: PLC0415  beside its only use
+
+    job = Job(moving, tmp_path / "out" / "table", rrd=False)
+    with pytest.raises(RecordingError, match="has changed while"):
+        process(job, write)
+    assert not (tmp_path / "out").exists()
+
+    process(job)
+
+    assert_same_tables(job.folder, undisturbed / "table")
