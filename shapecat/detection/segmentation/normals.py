@@ -47,13 +47,16 @@ def fit_local_planes(
     """
     values = np.zeros(SIDE * PITCH, np.float32)
     fits = np.zeros(6 * PITCH, np.float32)
-    for i in range(plane_id.shape[0]):
-        end, last = spans[i]
+    depths, owners = inv_depth.reshape(-1), plane_id.reshape(-1)
+    planes, normals = local_plane.reshape(-1), normal.reshape(-1)
+    shape = inv_depth.shape
+    for i in range(shape[0]):
+        end, last = int(spans[i, 0]), int(spans[i, 1])
         while end < last:
-            start, end = _next_run(plane_id[i], end, last)
-            _copy_windows(inv_depth, plane_id, i, start, end, values)
+            start, end = _next_run(owners, i * shape[1], end, last)
+            _copy_windows(depths, owners, shape, (i, start, end), values)
             _fit_run(values, intrinsics, i, start, padded(start, end) - start, fits)
-            _write(fits, local_plane, normal, i, start, end)
+            _write(fits, planes, normals, 3 * i * shape[1] + start, shape[1], end - start)
 
 
 @kernel
@@ -63,44 +66,56 @@ def padded(start: int, end: int) -> int:
 
 
 @kernel
-def _write(fits: F4, local_plane: F4, normal: F4, i: int, start: int, end: int) -> None:
+def _write(fits: F4, planes: F4, normals: F4, at: int, columns: int, n: int) -> None:
+    """Copy the fits of a run to where its local planes begin; neither slices nor signed indices."""
     for d in range(3):
-        one, other = local_plane[i, d, start:end], normal[i, d, start:end]
-        for k in range(one.size):
-            one[k], other[k] = fits[d * PITCH + k], fits[(3 + d) * PITCH + k]
+        to, plane = np.uint64(at + d * columns), np.uint64(d * PITCH)
+        unit = np.uint64((3 + d) * PITCH)
+        for k in range(np.uint64(n)):
+            planes[to + k] = fits[plane + k]
+        for k in range(np.uint64(n)):
+            normals[to + k] = fits[unit + k]
 
 
 @kernel
-def _next_run(plane_id: I4, j: int, last: int) -> tuple[int, int]:
+def _next_run(owners: I4, row: int, j: int, last: int) -> tuple[int, int]:
     """Return the columns from and before which the next object cells of one owner in a row lie.
 
-    There are some before ``last``.
+    There are some before ``last``; the row begins at ``row``.
     """
-    while plane_id[j] <= 0:
+    while owners[row + j] <= 0:
         j += 1
     start = end = j
-    me, last = plane_id[j], min(last, start + RUN)
-    while j < min(last, end + BRIDGED) and (plane_id[j] <= 0 or plane_id[j] == me):
-        end = j + 1 if plane_id[j] == me else end
+    me, last = owners[row + j], min(last, start + RUN)
+    while j < min(last, end + BRIDGED) and (owners[row + j] <= 0 or owners[row + j] == me):
+        end = j + 1 if owners[row + j] == me else end
         j += 1
     return start, end
 
 
 @kernel
-def _copy_windows(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, values: F4) -> None:
-    """Copy the rows around a run and `WINDOW` cells more at its ends; `NONE` for other owners."""
-    rows, columns = plane_id.shape
-    me, none = plane_id[i, start], np.float32(NONE)
+def _copy_windows(
+    depths: F4, owners: I4, shape: tuple[int, int], run: tuple[int, int, int], values: F4
+) -> None:
+    """Copy the rows around a run and `WINDOW` cells more at its ends; `NONE` for other owners.
+
+    Parameters
+    ----------
+    run : its row, its first column and that after its last.
+    """
+    rows, columns = shape
+    i, start, end = run
+    me, none = owners[i * columns + start], np.float32(NONE)
     left, right = max(start - WINDOW, 0), min(end + WINDOW, columns)
     for d in range(SIDE):
-        y, first = i + d - WINDOW, d * PITCH
-        some = values[first : first + end - start + 2 * WINDOW]
-        some[:] = none
+        y, first = i + d - WINDOW, np.uint64(d * PITCH)
+        for k in range(np.uint64(end - start + 2 * WINDOW)):
+            values[first + k] = none
         if 0 <= y < rows:
-            some = some[left - start + WINDOW :]
-            value, whose = inv_depth[y, left:right], plane_id[y, left:right]
-            for k in range(value.size):
-                some[k] = value[k] if whose[k] == me else none
+            to = np.uint64(d * PITCH + left - start + WINDOW)
+            at = np.uint64(y * columns + left)
+            for k in range(np.uint64(right - left)):
+                values[to + k] = depths[at + k] if owners[at + k] == me else none
 
 
 @kernel(fast=True)
