@@ -73,7 +73,8 @@ def test_heights_of_a_board_with_an_edge() -> None:
     inv_depth[100:140, 80:120] = table(0.62)[100:140, 80:120]  # a box of 8 cm
     inv_depth[100:140, 280:300] = table(0.62)[100:140, 280:300]  # and one in the air beside
     trials = draw_trials(np.random.default_rng(0))
-    found, _, planes = find_supporting_planes(DepthGrid(board, INTRINSICS, 2, 0.0035), UP, trials)
+    grid = DepthGrid(board, INTRINSICS, 2, 0.0035)
+    found, _, planes = find_supporting_planes(grid, UP, trials, tallest_m=0.5, upright=True)
     assert len(found) == 1
     heights = measure_heights(DepthGrid(inv_depth, INTRINSICS, 2, 0.0035), planes, 0.6)
     assert (heights.plane_id[105:135, 85:115] == 1).all()

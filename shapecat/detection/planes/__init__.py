@@ -8,13 +8,16 @@ from shapecat.detection.planes.covered import add_covered_planes
 from shapecat.detection.planes.extent import SupportingPlane
 from shapecat.detection.planes.height_map import pack_planes
 from shapecat.detection.planes.parallel import find_parallel_planes
-from shapecat.detection.planes.supporting import supporting_planes
+from shapecat.detection.planes.ransac import DepthSamples
+from shapecat.detection.planes.supporting import SURE_AREA_M2, supporting_planes
 from shapecat.detection.planes.up_direction import HELD, estimate_up
 
 __all__ = ["NO_HINT", "find_supporting_planes"]
 
 NO_HINT = np.zeros(3)
 """Takes the place of a direction away from gravity that is not known."""
+BORNE_M = 0.4
+"""What is higher above a large plane than this does not stand on it."""
 
 
 def find_supporting_planes(
@@ -39,11 +42,17 @@ def find_supporting_planes(
     """
     up = estimate_up(grid, hint, trials, HELD if upright else 0.0)
     found = find_parallel_planes(grid, up, trials)
-    if not found:
-        return [], up, np.zeros((0, 0))
-    found, covered_m2 = add_covered_planes(grid, found)
+    covered_m2 = np.zeros(len(found))
+    if _may_cover(found):
+        found, covered_m2 = add_covered_planes(grid, found)
     supports = supporting_planes(grid, found, covered_m2, tallest_m)
     largest = max(supports, key=lambda support: support.area_m2, default=None)
-    if largest is None:
-        return [], up, np.zeros((0, 0))
-    return supports, largest.up, pack_planes(supports, grid.intrinsics)
+    up = up if largest is None else largest.up
+    return supports, up, pack_planes(supports, grid.intrinsics)
+
+
+def _may_cover(found: list[tuple[SupportingPlane, DepthSamples]]) -> bool:
+    """Whether a plane may be the top of what covers another: no large one bears it or is above."""
+    large = [plane.offset for plane, _ in found if plane.area_m2 > SURE_AREA_M2]
+    highest = max(large, default=-np.inf)
+    return any(plane.offset > highest + BORNE_M for plane, _ in found)

@@ -36,9 +36,9 @@ LEVELS_APART = 2
 SEVERAL, CLEAR, ASLANT = 1.5, 2, 0.55
 """How much it counts that levels are several, by the power of their number; that what faces a
 direction lies in them, by the power of the share; and that the camera looks at them aslant."""
-HELD = 25.0
-"""How much it counts against a direction that the camera would be turned about its axis by the
-sine 1: a turn of 12 degrees halves."""
+HELD = 1.0
+"""How much it counts against a direction that the camera would be on its side or upside down: that
+halves its merit. With 3 of 570 turned views 3 were taken wrongly, with 9 16; with 0 and 1 none."""
 HALF_M = 1.5
 """Distance at which a surface counts half."""
 
