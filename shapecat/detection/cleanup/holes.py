@@ -183,7 +183,8 @@ def _is_raised(inv_depth: F4, height: F4, stack: I4, size: int) -> bool:
         i, j = stack[t, 0], stack[t, 1]
         height_sum += height[i, j]
         far += 1 / inv_depth[i, j]
-    return height_sum > size * (RAISED_M + RAISED_NOISE * (far / size) ** 2)
+    far /= size
+    return height_sum > size * (RAISED_M + RAISED_NOISE * far * far)
 
 
 @kernel

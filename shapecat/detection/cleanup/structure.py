@@ -73,7 +73,6 @@ class Limits(NamedTuple):
     range_m: float
 
 
-@kernel
 def is_background(
     field: LabelledGrid, segments: Segments, up: F8, known: Bool, limits: Limits
 ) -> Bool:
@@ -82,13 +81,24 @@ def is_background(
     What has been merged into another is left out. What is ``known`` to be an object is no noise.
     """
     n = segments.parent.size
-    counts, rejected = np.zeros((5, n), np.int64), np.zeros(n, np.bool_)
+    counts = np.zeros((5, n), np.int64)
     counts[LAST] = count_at_range_limit(field.inverse_depth, field.labels, n, limits.range_m)
     _count_posts(field, up, counts[THROUGH])
     _count_leaving(field, counts)
+    rejected: Bool = _is_rejected(field, segments, counts, up, known, limits)
+    return rejected
+
+
+@kernel
+def _is_rejected(
+    field: LabelledGrid, segments: Segments, counts: I4, up: F8, known: Bool, limits: Limits
+) -> Bool:
+    """Return what `is_background` does, from the counts (5, n + 1) of cells."""
+    n = segments.parent.size
+    rejected = np.zeros(n, np.bool_)
     for p in range(n):
-        if not is_root(segments, p):
-            counts[:, segments.parent[p]] += counts[:, p]
+        for what in range(5 if not is_root(segments, p) else 0):
+            counts[what, segments.parent[p]] += counts[what, p]
     for p in range(1, n):
         if not is_root(segments, p):
             continue

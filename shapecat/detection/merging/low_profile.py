@@ -41,5 +41,5 @@ def merge_low_profile(segments: Segments, low_profile: I4, labels: I4, spans: I4
             leader[best] = p
             known[p] = True
         else:
-            merge(segments, leader[best], p)
+            merge(segments, int(leader[best]), p)
     return known

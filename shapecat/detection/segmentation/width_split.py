@@ -48,7 +48,6 @@ class Outlines(NamedTuple):
     counts: I4
 
 
-@kernel
 def split_at_width_changes(
     grid: DepthGrid,
     heights: HeightMap,
