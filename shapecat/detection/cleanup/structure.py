@@ -234,19 +234,20 @@ def _is_tall_structure(
         i, j = row_and_column(s, columns)
         h = (1 - (plane[0] * j + plane[1] * i + plane[2]) / inv_depth[i, j]) * plane[3]
         n += 1
-        rise = _rise(inv_depth, intrinsics, i, j, up, 1, highest)
+        rise = _rise(inv_depth, intrinsics, i, j, up, 1.0, highest)
         if h + rise > highest - STEP_M:
             high += 1
         else:
             high += (
-                rise + _rise(inv_depth, intrinsics, i, j, up, -1, highest - rise) > highest - STEP_M
+                rise + _rise(inv_depth, intrinsics, i, j, up, -1.0, highest - rise)
+                > highest - STEP_M
             )
     return bool(high > TALL_SHARE * n)
 
 
 @kernel
 def _rise(
-    inv_depth: F4, intrinsics: PinholeIntrinsics, i: int, j: int, up: F8, sign: int, most: float
+    inv_depth: F4, intrinsics: PinholeIntrinsics, i: int, j: int, up: F8, sign: float, most: float
 ) -> float:
     """Return how far the surface of a cell goes straight on upwards, up to about ``most``.
 
