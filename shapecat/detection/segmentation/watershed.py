@@ -5,7 +5,7 @@ import numpy as np
 from shapecat.arrays import F4, I4, U1
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import DOWN, RIGHT, SurfaceGraph
-from shapecat.jit import kernel
+from shapecat.jit import kernel, unset
 
 __all__ = ["relabel", "relabel_above", "watershed"]
 
@@ -30,7 +30,7 @@ def watershed(heights: HeightMap, graph: SurfaceGraph, *, concave: bool) -> tupl
     plane_id, links, concavity, spans = heights.plane_id, graph.links, graph.concavity, graph.spans
     labels = np.zeros(plane_id.shape, np.int16)
     barrier = np.zeros(plane_id.shape, np.uint8)
-    stack, part = np.zeros(plane_id.size, np.int32), np.zeros(plane_id.shape, np.int32)
+    stack, part = unset(plane_id.size, np.int32), unset(plane_id.shape, np.int32)
     _concave_edges(concavity, spans, EDGE_DEG if concave else NO_EDGE_DEG, barrier, stack)
     n = _flat_parts(plane_id, spans, links, barrier, labels, 0, part)
     _flood_labels(links, concavity, spans, labels, stack)

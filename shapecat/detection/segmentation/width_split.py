@@ -64,13 +64,22 @@ def split_at_width_changes(
     """
     side = lateral_axis(up)
     outlines = _outlines_of(grid, heights.height, graph.spans, labels, n, side)
-    for p in range(1, n + 1):
-        rest = p
-        for band in np.flatnonzero(_cuts_of(grid, outlines, p, side)):
-            n += 1
-            relabel_above(labels, graph.spans, heights.height, rest, band * BAND_M, n)
-            rest = n  # what this cut has left
+    cuts = np.zeros((n + 1, BANDS), np.bool_)
+    _find_cuts(grid, outlines, side, cuts)
+    before = rest = 0
+    for p, band in np.argwhere(cuts):
+        n += 1
+        rest = rest if p == before else p  # what the cuts below have left
+        relabel_above(labels, graph.spans, heights.height, rest, band * BAND_M, n)
+        before, rest = p, n
     return n
+
+
+@kernel
+def _find_cuts(grid: DepthGrid, outlines: Outlines, side: F8, cuts: Bool) -> None:
+    """Mark the bands (n + 1, BANDS) below which each of the labels 1..n is to be cut."""
+    for p in range(1, len(cuts)):
+        _cut_label(grid, outlines, p, side, cuts)
 
 
 @kernel
@@ -106,9 +115,9 @@ def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, sid
 
 
 @kernel
-def _cuts_of(grid: DepthGrid, outlines: Outlines, p: int, side: F8) -> Bool:
-    """Return whether a label is to be cut below each of its bands."""
-    cut, steps = np.zeros(BANDS, np.bool_), np.zeros(BANDS, np.float64)
+def _cut_label(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool) -> None:
+    """Mark the bands below which a label is to be cut."""
+    steps = np.zeros(BANDS, np.float64)
     first, last, seen, above = 0, 0, 0, 0
     for band in range(BANDS):
         cells = outlines.counts[p, band]
@@ -116,7 +125,7 @@ def _cuts_of(grid: DepthGrid, outlines: Outlines, p: int, side: F8) -> Bool:
             first, last = (band if seen == 0 else first), band
             seen, above = seen + 1, above + cells
     if seen < 2 * BESIDE:
-        return cut
+        return
     for band in range(first + BESIDE, last - BESIDE + 2):
         steps[band] = _step_at(grid, outlines, p, band, side)
     below = 0  # cells since the last cut; ``above``: from here on
@@ -125,11 +134,10 @@ def _cuts_of(grid: DepthGrid, outlines: Outlines, p: int, side: F8) -> Bool:
         for k in range(band - BESIDE if largest else 0, band + BESIDE + 1 if largest else 0):
             largest &= steps[band] >= steps[k]
         if largest and min(below, above) >= LEAST_CELLS:
-            cut[band] = True
+            cuts[p, band] = True
             below = 0
         below += outlines.counts[p, band]
         above -= outlines.counts[p, band]
-    return cut
 
 
 @kernel
