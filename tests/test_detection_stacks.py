@@ -1,5 +1,7 @@
 """Stacks and containers: where one object ends, told without an edge."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
@@ -93,13 +95,32 @@ def test_tall_box_with_little_top_is_no_side_of_a_shelf(seed: int, label: int) -
     assert overlap_in_clutter(seed, [label]) > 0.8
 
 
-def test_box_whose_middle_something_hides_is_one_object() -> None:
-    """Its two sides are seen apart."""
-    rng = np.random.default_rng(7)
-    for _ in range(10):
-        behind = box((0, 0.1, 0), (rng.uniform(0.16, 0.24), 0.06, rng.uniform(0.06, 0.12)))
-        before = can(rng.uniform(-0.03, 0.03), -0.02, 0, rng.uniform(0.02, 0.035), 0.16)
-        check([table(), behind, before], [1, 2], tilt_deg=rng.uniform(20, 35))
+Scenery = Callable[[np.random.Generator], list[Shape]]
+
+
+def share_found(scenery: Scenery, steps: Steps, least: float, scenes: int = 20) -> float:
+    """Return in which share of made-up scenes each thing on the table is found so well."""
+    good = 0
+    for seed in range(scenes):
+        rng = np.random.default_rng((7, seed))
+        shapes = scenery(rng)
+        depth, seen = render(shapes, tilt_deg=rng.uniform(25, 35), seed=seed)
+        scene = detect(frame_of(depth), settings=DetectionSettings(), rng=rng, steps=steps)
+        good += min(overlaps(scene, seen, list(range(1, len(shapes))))) > least
+    return good / scenes
+
+
+def can_before_a_box(rng: np.random.Generator) -> list[Shape]:
+    back = box((0, 0.1, 0), (rng.uniform(0.16, 0.24), 0.06, rng.uniform(0.06, 0.12)))
+    radius, height = rng.uniform(0.02, 0.035), rng.uniform(0.12, 0.2)
+    return [table(), back, can(rng.uniform(-0.03, 0.03), -0.02, 0, radius, height)]
+
+
+def test_two_sides_of_a_box_are_one_object() -> None:
+    """What is in front of its middle hides where they meet."""
+    apart = ALL_STEPS._replace(across_occlusion=False)
+    assert share_found(can_before_a_box, ALL_STEPS, 0.75) > 0.9
+    assert share_found(can_before_a_box, apart, 0.75) < 0.4
 
 
 def test_two_cans_beside_a_third_are_no_sides_of_one() -> None:
@@ -120,16 +141,36 @@ def test_cans_of_one_radius_are_parted_by_their_axes() -> None:
     check(shapes, [1, 2], 0.8, tilt_deg=28)
 
 
-def test_most_stacks_of_two_boxes_are_parted() -> None:
-    """Boxes of any two widths; with fronts that are flush and of one width none could be."""
-    rng = np.random.default_rng(7)
-    parted = 0
-    for _ in range(20):
-        low, high = rng.uniform(0.06, 0.16, (2, 3))
-        boxes = [box((0, 0, 0), low, 0.2), box((0, 0, low[2]), high, 0.2 + rng.uniform(-0.2, 0.2))]
-        depth, seen = render([table(), *boxes], tilt_deg=rng.uniform(20, 40))
-        parted += min(overlaps(found(frame_of(depth)), seen, [1, 2])) > 0.75
-    assert parted >= 13
+def tower_of_cans(rng: np.random.Generator) -> list[Shape]:
+    radii = [rng.uniform(0.045, 0.05), rng.uniform(0.03, 0.034), rng.uniform(0.045, 0.05)]
+    tower, level = [table()], 0.0
+    for radius in radii:
+        height = rng.uniform(0.07, 0.1)
+        tower.append(can(rng.uniform(-0.004, 0.004), 0, level, radius, height))
+        level += height
+    return tower
+
+
+def test_towers_of_three_cans_of_two_widths() -> None:
+    """What stands on another may bear a third."""
+    whole = ALL_STEPS._replace(concavity=False, width_split=False)
+    assert share_found(tower_of_cans, ALL_STEPS, 0.75) > 0.7
+    assert share_found(tower_of_cans, whole, 0.75) < 0.2
+
+
+def flush_boxes(rng: np.random.Generator) -> list[Shape]:
+    narrow = rng.uniform(0.06, 0.1)
+    widths = rng.permutation([narrow, narrow + rng.uniform(0.03, 0.07)])
+    low, high = rng.uniform(0.07, 0.12, 2)
+    lower, upper = (widths[0], 0.06, low), (widths[1], 0.06, high)
+    return [table(), box((0, 0, 0), lower), box((0, 0, low), upper)]
+
+
+def test_stacked_boxes_with_flush_fronts_stay_two() -> None:
+    """Only their outline tells where one ends, and the merging must leave them apart."""
+    without = ALL_STEPS._replace(width_split=False)
+    assert share_found(flush_boxes, ALL_STEPS, 0.75) > 0.75
+    assert share_found(flush_boxes, without, 0.75) < 0.1
 
 
 def test_round_object_with_one_axis_stays_whole() -> None:
@@ -227,7 +268,8 @@ def test_outline_that_something_nearer_cuts_off_is_no_step() -> None:
 def test_plate_that_juts_out_over_a_can_is_parted_from_it() -> None:
     """The local planes about its edge take the step for a slope.
 
-    Whether it is the lid of the can, which cannot be seen, is left out.
+    Whether it is the lid of the can, which cannot be seen, is left out. So are flatter views, where
+    the step helps in one or two of twenty scenes only.
     """
     shapes = [table(), can(0, 0, 0, 0.038, 0.06), can(0, 0, 0.06, 0.05, 0.012)]
     depth, seen = render(shapes, tilt_deg=40)

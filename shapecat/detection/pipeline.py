@@ -233,7 +233,7 @@ def _oversegment(grid: DepthGrid, model: PlaneModel, steps: Steps) -> OverSegmen
     """Part what stands on the planes where two objects may meet."""
     heights, up = model.heights, model.up
     graph = connect_surfaces(grid, heights)
-    labels, n = watershed(heights, graph, steps.concavity)
+    labels, n = watershed(heights, graph, concave=steps.concavity)
     if steps.width_split:
         n = split_at_width_changes(grid, heights, graph, labels, up, n)
     segments = measure_segments(grid, heights, graph, labels, n, up)

@@ -60,14 +60,11 @@ class FlatGraph(NamedTuple):
     normal: F4
 
 
-@kernel
 def connect_surfaces(grid: DepthGrid, heights: HeightMap) -> SurfaceGraph:
     """Fit local planes to the object cells, link them and measure concave angles."""
     inv_depth, intrinsics, plane_id = grid.inverse_depth, grid.intrinsics, heights.plane_id
-    rows, columns = inv_depth.shape
-    spans = np.zeros((rows, 2), np.int32)
-    for i in range(rows):
-        spans[i, 0], spans[i, 1] = span_of(plane_id[i])
+    spans = _spans_of(plane_id)
+    columns = inv_depth.shape[1]
     local_plane, normal = _cleared(spans, columns), _cleared(spans, columns)
     fit_local_planes(inv_depth, intrinsics, plane_id, spans, local_plane, normal)
     links = np.zeros(inv_depth.shape, np.uint8)
@@ -75,6 +72,15 @@ def connect_surfaces(grid: DepthGrid, heights: HeightMap) -> SurfaceGraph:
     graph = SurfaceGraph(local_plane, normal, links, np.zeros(inv_depth.shape, np.uint8), spans)
     _measure_concavity(inv_depth, intrinsics, graph)
     return graph
+
+
+@kernel
+def _spans_of(plane_id: I4) -> I4:
+    """Return the spans of `SurfaceGraph`: of the numbers above 0 in each row."""
+    spans = np.zeros((plane_id.shape[0], 2), np.int32)
+    for i in range(len(spans)):
+        spans[i, 0], spans[i, 1] = span_of(plane_id[i])
+    return spans
 
 
 @kernel
@@ -129,7 +135,7 @@ def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) ->
             local_plane[i, 0, there],
             local_plane[i, 1, here],
             local_plane[i, 1, there],
-            RIGHT,
+            np.int64(RIGHT),
             links[i, here],
         )
         if i + 1 < rows:
@@ -143,7 +149,7 @@ def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) ->
                 local_plane[i + 1, 0, here],
                 local_plane[i, 2, here],
                 local_plane[i + 1, 2, here],
-                DOWN,
+                np.int64(DOWN),
                 links[i, here],
             )
         _part_steps(inv_depth, plane_id, i, start, end, links[i])

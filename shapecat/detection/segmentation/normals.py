@@ -51,7 +51,7 @@ def fit_local_planes(
     planes, normals = local_plane.reshape(-1), normal.reshape(-1)
     shape = inv_depth.shape
     for i in range(shape[0]):
-        end, last = int(spans[i, 0]), int(spans[i, 1])
+        end, last = np.int64(spans[i, 0]), np.int64(spans[i, 1])
         while end < last:
             start, end = _next_run(owners, i * shape[1], end, last)
             _copy_windows(depths, owners, shape, (i, start, end), values)
@@ -127,19 +127,21 @@ def _fit_run(
     Rows of ``fits``: inverse depth, its two slopes, and the normal; 0 where there is no fit.
     """
     zero, one = np.float32(0), np.float32(1)
+    g0, g1 = np.float32(GATE), np.float32(GATE + GATE_SLOPE)
+    g2, g3 = np.float32(GATE + GATE_SLOPE * 2), np.float32(GATE + GATE_SLOPE * 3)
     least, spread = np.float32(LEAST_SAMPLES), np.float32(LEAST_SPREAD)
     fx, fy, y = np.float32(intrinsics.fx), np.float32(intrinsics.fy), np.float32(i - intrinsics.cy)
     for k in range(n):
         p = k + WINDOW
         center = values[WINDOW * PITCH + p]
         # (1) sums over the rows of the window: 1, x, x x, v, x v
-        n0, x0, xx0, v0, xv0 = _four(values, p, center, 3, 3)
-        n1, x1, xx1, v1, xv1 = _three(values, PITCH + p, center, 2, 2)
-        n2, x2, xx2, v2, xv2 = _four(values, 2 * PITCH + p, center, 3, 1)
-        n3, x3, xx3, v3, xv3 = _three(values, 3 * PITCH + p, center, 2, 0)
-        n4, x4, xx4, v4, xv4 = _four(values, 4 * PITCH + p, center, 3, 1)
-        n5, x5, xx5, v5, xv5 = _three(values, 5 * PITCH + p, center, 2, 2)
-        n6, x6, xx6, v6, xv6 = _four(values, 6 * PITCH + p, center, 3, 3)
+        n0, x0, xx0, v0, xv0 = _four(values, p, center, g3, g3)
+        n1, x1, xx1, v1, xv1 = _three(values, PITCH + p, center, g2, g2)
+        n2, x2, xx2, v2, xv2 = _four(values, 2 * PITCH + p, center, g3, g1)
+        n3, x3, xx3, v3, xv3 = _three(values, 3 * PITCH + p, center, g2, g0)
+        n4, x4, xx4, v4, xv4 = _four(values, 4 * PITCH + p, center, g3, g1)
+        n5, x5, xx5, v5, xv5 = _three(values, 5 * PITCH + p, center, g2, g2)
+        n6, x6, xx6, v6, xv6 = _four(values, 6 * PITCH + p, center, g3, g3)
         # (2) means and moments over the window
         count = n0 + n1 + n2 + n3 + n4 + n5 + n6
         share = one / max(count, one)
@@ -177,7 +179,7 @@ def _times_row(a: float, b: float, c: float, e: float, f: float, g: float) -> An
 
 @kernel(fast=True)
 def _four(
-    values: F4, p: int, center: float, far: int, near: int
+    values: F4, p: int, center: float, far: float, near: float
 ) -> tuple[float, float, float, float, float]:
     """Return the sums over a row of a window sampled at -3, -1, 1 and 3 columns from ``p``."""
     a, va = _sample(values, p - 3, center, far)
@@ -191,7 +193,7 @@ def _four(
 
 @kernel(fast=True)
 def _three(
-    values: F4, p: int, center: float, far: int, near: int
+    values: F4, p: int, center: float, far: float, near: float
 ) -> tuple[float, float, float, float, float]:
     """Return the sums over a row of a window sampled at -2, 0 and 2 columns from ``p``."""
     a, va = _sample(values, p - 2, center, far)
@@ -202,9 +204,8 @@ def _three(
 
 
 @kernel(fast=True)
-def _sample(values: F4, p: int, center: float, distance: int) -> tuple[Any, Any]:
+def _sample(values: F4, p: int, center: float, gate: float) -> tuple[Any, Any]:
     """Return the weight of a sample, and by that how much it differs from the centre."""
     v = values[p] - center
-    use = abs(v) < np.float32(GATE + GATE_SLOPE * distance)
-    weight = np.float32(1) if use else np.float32(0)
+    weight = np.float32(1) if abs(v) < gate else np.float32(0)
     return weight, weight * v
