@@ -1,5 +1,6 @@
 """What tests share: the command as installed, real data when present, a simulated recording."""
 
+import signal
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -11,6 +12,11 @@ import pytest
 from click.testing import CliRunner, Result
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
+
+
+def pytest_configure() -> None:
+    """Heed interrupts, which a shell ignores for what it runs in the background."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -110,7 +110,7 @@ def test_object_is_in_one_piece(seed: int, label: int) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "seed", "quarters"),
-    [("shelf", 9, 2), ("shelf", 35, 2), ("clutter", 111, 2), ("clutter", 624, 1)],
+    [("shelf", 9, 2), ("shelf", 35, 2), ("clutter", 111, 2)],
 )
 def test_wall_is_no_ground_in_a_turned_image(kind: SceneKind, seed: int, quarters: int) -> None:
     """More of the back of a shelf is seen than of its boards; what hides a wall divides it."""
@@ -185,7 +185,7 @@ def test_strip_of_floor_beside_a_table_is_a_plane(seed: int) -> None:
 
 @pytest.mark.parametrize(
     ("kind", "seed", "quarters"),
-    [("clutter", 25, 2), ("shelf", 135, 0), ("shelf", 135, 1), ("shelf", 1374, 2)],
+    [("clutter", 25, 2), ("shelf", 135, 0), ("shelf", 1374, 2)],
 )
 def test_wall_is_no_table_however_the_camera_is_turned(
     kind: SceneKind, seed: int, quarters: int

@@ -73,7 +73,8 @@ def test_heights_of_a_board_with_an_edge() -> None:
     inv_depth[100:140, 80:120] = table(0.62)[100:140, 80:120]  # a box of 8 cm
     inv_depth[100:140, 280:300] = table(0.62)[100:140, 280:300]  # and one in the air beside
     trials = draw_trials(np.random.default_rng(0))
-    found, _, planes = find_supporting_planes(DepthGrid(board, INTRINSICS, 2, 0.0035), UP, trials)
+    grid = DepthGrid(board, INTRINSICS, 2, 0.0035)
+    found, _, planes = find_supporting_planes(grid, UP, trials, tallest_m=0.5, upright=True)
     assert len(found) == 1
     heights = measure_heights(DepthGrid(inv_depth, INTRINSICS, 2, 0.0035), planes, 0.6)
     assert (heights.plane_id[105:135, 85:115] == 1).all()
@@ -96,7 +97,7 @@ def test_two_faces_are_parted_where_they_meet_at_a_concave_edge(rise: float, seg
     heights = HeightMap(plane_id, np.where(plane_id, 0.1, 0).astype(np.float32))
     graph = connect_surfaces(DepthGrid(inv_depth, INTRINSICS, 2, 0.0035), heights)
 
-    labels, n = watershed(heights, graph, True)
+    labels, n = watershed(heights, graph, concave=True)
 
     assert n == segments
     assert (labels[90:150, 120:200] > 0).all()

@@ -1,12 +1,12 @@
 """review.rrd, read back with Rerun's own reader."""
 
 import dataclasses
+import resource
 import subprocess
 import sys
 import time
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -250,14 +250,15 @@ def test_a_failure_leaves_no_file_behind(tmp_path: Path) -> None:
     assert (tmp_path / "r.rrd").read_bytes() == b"old"
 
 
-def test_a_full_disk_is_noticed_before_the_writer_blocks(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Rerun's own writer waits for ever when a write fails."""
-    full = SimpleNamespace(free=1 << 20)
-    monkeypatch.setattr("shutil.disk_usage", lambda _: full)
-    with pytest.raises(OutputError, match="No space left"):
-        write(tmp_path / "r.rrd", [scene(0)])
+def test_a_disk_that_fails_under_way_ends_the_writing(tmp_path: Path) -> None:
+    """Rerun's own writer ends with the first error, and the next one who logs waits for ever."""
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, before[1]))
+    try:
+        with pytest.raises(OutputError, match="File too large"):
+            write(tmp_path / "r.rrd", [scene(k) for k in range(300)])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
     assert not list(tmp_path.iterdir())
 
 

@@ -170,7 +170,7 @@ def _seen(
     steps: Steps,
 ) -> Segmentation | None:
     turned = None if hint is None else view.view_from_sensor.rotation @ hint
-    return label(view.grid, turned, settings=settings, rng=rng, steps=steps)
+    return label(view.grid, turned, settings=settings, rng=rng, steps=steps, upright=False)
 
 
 def label(
@@ -180,9 +180,13 @@ def label(
     settings: DetectionSettings,
     rng: np.random.Generator,
     steps: Steps = ALL_STEPS,
+    upright: bool = True,
 ) -> Segmentation | None:
-    """Find planes and objects among the samples; None if there is no supporting plane."""
-    model = _find_planes(grid, hint, settings, rng, steps)
+    """Find planes and objects among the samples; None if there is no supporting plane.
+
+    ``upright`` is of `find_supporting_planes`.
+    """
+    model = _find_planes(grid, hint, settings, rng, steps, upright=upright)
     if model is None:
         return None
     oversegmentation = _oversegment(grid, model, steps)
@@ -205,11 +209,15 @@ def _find_planes(
     settings: DetectionSettings,
     rng: np.random.Generator,
     steps: Steps,
+    *,
+    upright: bool = True,
 ) -> PlaneModel | None:
     """Find what objects stand on and before; None if no plane bears anything."""
     trials = draw_trials(rng)
     hint = NO_HINT if hint is None else hint
-    supports, up, planes = find_supporting_planes(grid, hint, trials)
+    supports, up, planes = find_supporting_planes(
+        grid, hint, trials, tallest_m=settings.max_height_m, upright=upright
+    )
     if not supports:
         return None
     heights = measure_heights(grid, planes, settings.max_height_m)
@@ -225,7 +233,7 @@ def _oversegment(grid: DepthGrid, model: PlaneModel, steps: Steps) -> OverSegmen
     """Part what stands on the planes where two objects may meet."""
     heights, up = model.heights, model.up
     graph = connect_surfaces(grid, heights)
-    labels, n = watershed(heights, graph, steps.concavity)
+    labels, n = watershed(heights, graph, concave=steps.concavity)
     if steps.width_split:
         n = split_at_width_changes(grid, heights, graph, labels, up, n)
     segments = measure_segments(grid, heights, graph, labels, n, up)

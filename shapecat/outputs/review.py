@@ -25,26 +25,21 @@ Entities
 Timelines: ``sensor_time`` (of the measurement) and ``frame``.
 """
 
-import errno
 import json
-import os
-import shutil
 import uuid
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 
-from shapecat.errors import OutputError
-from shapecat.files import replacing
 from shapecat.geometry import transform
 from shapecat.outputs import review_shapes as shapes
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import paint
 from shapecat.outputs.review_curves import At, Curves, times_of
+from shapecat.outputs.review_file import ReviewFile, open_review
 from shapecat.outputs.review_layout import Eye, TrackView, choose_eye, lay_out, stepped_back
 from shapecat.outputs.review_paths import Paths
 from shapecat.outputs.review_shapes import DRAWINGS, Moment
@@ -55,9 +50,6 @@ __all__ = ["open_viewer", "take_screenshot", "write_review"]
 
 _FLUSH_FRAMES, _PLOT_FRAMES = 32, 256  # curves make few columns: Rerun remembers each it wrote
 _DRAWN_AT_ONCE, _POINTS_AT_ONCE = 16, 1 << 19  # frames and points held back of a sensor
-_PATIENCE_S = 30.0
-"""A disk takes what is flushed in less, or Rerun's writer has died of an error."""
-_RESERVE_BYTES = 64 << 20  # Rerun waits for ever on a full disk: stop before
 
 
 def write_review(
@@ -91,11 +83,13 @@ def write_review(
     The content depends on the arguments alone. Memory does not grow with the number of frames
     but for some numbers per track.
     """
-    with _recording(path, name, run) as stream:
-        review = _Review(stream, categories, cloud_points, fixed_frame)
+    stream = _stream(name, run)
+    with open_review(path, stream) as file:
+        stream.send_recording_name(name)
+        review = _Review(stream, file, categories, cloud_points, fixed_frame)
         review.begin(run)
         for k, (labelled, frame) in enumerate(frames):
-            _require_space(path.parent)
+            file.check()
             review.add(labelled, frame)
             if k % _PLOT_FRAMES == _PLOT_FRAMES - 1:
                 review.plot()
@@ -104,27 +98,12 @@ def write_review(
         review.end()
 
 
-@contextmanager
-def _recording(path: Path, name: str, run: Mapping[str, object]) -> Iterator[rr.RecordingStream]:
+def _stream(name: str, run: Mapping[str, object]) -> rr.RecordingStream:
+    """Return a stream whose content depends on what is logged alone."""
     identity = uuid.uuid5(uuid.NAMESPACE_OID, name + json.dumps(run, sort_keys=True, default=str))
     stream = rr.RecordingStream("shapecat", recording_id=identity, send_properties=False)
-    try:
-        _require_space(path.parent)
-        with replacing(path) as hidden:
-            stream.save(hidden)
-            stream.set_log_time_enabled(False)
-            stream.send_recording_name(name)
-            yield stream
-            stream.disconnect()  # not after an error: it would wait for a writer that has died
-    except (OSError, RuntimeError) as error:  # RuntimeError: how Rerun reports files
-        reason = error.strerror if isinstance(error, OSError) else str(error)
-        msg = f"{path}: cannot be written: {reason or error}"
-        raise OutputError(msg) from error
-
-
-def _require_space(folder: Path) -> None:
-    if shutil.disk_usage(folder).free < _RESERVE_BYTES:
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    stream.set_log_time_enabled(False)
+    return stream
 
 
 class _Review:
@@ -133,11 +112,12 @@ class _Review:
     def __init__(
         self,
         stream: rr.RecordingStream,
+        file: ReviewFile,
         categories: Sequence[str],
         cloud_points: int,
         fixed_frame: str | None,
     ) -> None:
-        self._stream = stream
+        self._stream, self._file = stream, file
         self._pending: dict[str, list[Moment]] = {}  # by entity of the sensor
         self._categories = tuple(categories)
         self._cloud_points = cloud_points
@@ -178,7 +158,7 @@ class _Review:
         """Write out what is held back."""
         for entity in self._pending:
             self._send(entity)
-        self._stream.flush(timeout_sec=_PATIENCE_S)
+        self._file.flush()
 
     def plot(self) -> None:
         """Send what is held back of curves and paths."""
@@ -206,7 +186,7 @@ class _Review:
             if track.frames == 1:  # a line of one point is not seen
                 self._log(f"{track.entity}/posterior", self._dots(), static=True)
         self._stream.send_blueprint(lay_out(scenes or [nothing], tracks))
-        self._stream.flush(timeout_sec=_PATIENCE_S)
+        self._file.flush()
 
     def _draw(self, entity: str, labelled: LabelledFrame, frame: Frame) -> None:
         """Paint the frame, and hold it back until there are enough of them."""

@@ -183,7 +183,8 @@ def _is_raised(inv_depth: F4, height: F4, stack: I4, size: int) -> bool:
         i, j = stack[t, 0], stack[t, 1]
         height_sum += height[i, j]
         far += 1 / inv_depth[i, j]
-    return height_sum > size * (RAISED_M + RAISED_NOISE * (far / size) ** 2)
+    far /= size
+    return height_sum > size * (RAISED_M + RAISED_NOISE * far * far)
 
 
 @kernel
@@ -195,7 +196,8 @@ def fill_holes(inv_depth: F4, height: F4, labels: I4, count: int, filled: U1) ->
     """
     seen = np.zeros(labels.shape, np.uint8)
     stack = np.zeros((STACK, 2), np.int16)
-    sides, ahead, level = np.zeros((3, count + 1), np.int32)
+    sides, ahead = np.zeros(count + 1, np.int32), np.zeros(count + 1, np.int32)
+    level = np.zeros(count + 1, np.int32)
     extent = _extent_of(labels)
     _mark_open(inv_depth, labels, extent, seen)
     i0, j0, i1, j1 = extent
@@ -214,9 +216,11 @@ def fill_holes(inv_depth: F4, height: F4, labels: I4, count: int, filled: U1) ->
             size, total = _flood_hole(inv_depth, labels, extent, seen, stack, sides, ahead, level)
             if size == 0:
                 continue
-            best = np.argmax(sides)
-            share = SHARE
-            if np.sum(sides) > LABELLED * total and _is_raised(inv_depth, height, stack, size):
+            best, labelled, share = 0, 0, SHARE
+            for k in range(1, count + 1):
+                labelled += sides[k]
+                best = k if sides[k] > sides[best] else best
+            if labelled > LABELLED * total and _is_raised(inv_depth, height, stack, size):
                 share = RAISED_SHARE
             fits = sides[best] > max(0, share * total) and level[best] > LEVEL * total
             for k in range(1, count + 1):

@@ -73,7 +73,6 @@ class Limits(NamedTuple):
     range_m: float
 
 
-@kernel
 def is_background(
     field: LabelledGrid, segments: Segments, up: F8, known: Bool, limits: Limits
 ) -> Bool:
@@ -82,13 +81,24 @@ def is_background(
     What has been merged into another is left out. What is ``known`` to be an object is no noise.
     """
     n = segments.parent.size
-    counts, rejected = np.zeros((5, n), np.int64), np.zeros(n, np.bool_)
+    counts = np.zeros((5, n), np.int64)
     counts[LAST] = count_at_range_limit(field.inverse_depth, field.labels, n, limits.range_m)
     _count_posts(field, up, counts[THROUGH])
     _count_leaving(field, counts)
+    rejected: Bool = _is_rejected(field, segments, counts, up, known, limits)
+    return rejected
+
+
+@kernel
+def _is_rejected(
+    field: LabelledGrid, segments: Segments, counts: I4, up: F8, known: Bool, limits: Limits
+) -> Bool:
+    """Return what `is_background` does, from the counts (5, n + 1) of cells."""
+    n = segments.parent.size
+    rejected = np.zeros(n, np.bool_)
     for p in range(n):
-        if not is_root(segments, p):
-            counts[:, segments.parent[p]] += counts[:, p]
+        for what in range(5 if not is_root(segments, p) else 0):
+            counts[what, segments.parent[p]] += counts[what, p]
     for p in range(1, n):
         if not is_root(segments, p):
             continue
@@ -224,19 +234,20 @@ def _is_tall_structure(
         i, j = row_and_column(s, columns)
         h = (1 - (plane[0] * j + plane[1] * i + plane[2]) / inv_depth[i, j]) * plane[3]
         n += 1
-        rise = _rise(inv_depth, intrinsics, i, j, up, 1, highest)
+        rise = _rise(inv_depth, intrinsics, i, j, up, 1.0, highest)
         if h + rise > highest - STEP_M:
             high += 1
         else:
             high += (
-                rise + _rise(inv_depth, intrinsics, i, j, up, -1, highest - rise) > highest - STEP_M
+                rise + _rise(inv_depth, intrinsics, i, j, up, -1.0, highest - rise)
+                > highest - STEP_M
             )
     return bool(high > TALL_SHARE * n)
 
 
 @kernel
 def _rise(
-    inv_depth: F4, intrinsics: PinholeIntrinsics, i: int, j: int, up: F8, sign: int, most: float
+    inv_depth: F4, intrinsics: PinholeIntrinsics, i: int, j: int, up: F8, sign: float, most: float
 ) -> float:
     """Return how far the surface of a cell goes straight on upwards, up to about ``most``.
 

@@ -233,20 +233,25 @@ def _find_seeds(high_pass: F4, least: float, seeds: I4) -> int:
     lower, and to pass over many of them at a time vectorises.
     """
     rows, columns = high_pass.shape
+    flat = high_pass.reshape(-1)
     n = 0
     for i in range(1, rows):
         for start in range(1, columns, BLOCK):
-            end = min(start + BLOCK, columns)
-            here, above = high_pass[i, start:end], high_pass[i - 1, start:end]
-            before = high_pass[i, start - 1 : end - 1]
+            # Unsigned indices instead of slices, each of which counts references.
+            here = np.uint64(i * columns + start)
+            before, above = here - np.uint64(1), np.uint64((i - 1) * columns + start)
+            cells = np.uint64(min(BLOCK, columns - start))
             some = False
-            for k in range(here.size):
-                some |= (here[k] > least) & (here[k] > before[k]) & (here[k] > above[k])
+            for k in range(cells):
+                value = flat[here + k]
+                some |= (value > least) & (value > flat[before + k]) & (value > flat[above + k])
             if not some:
                 continue
-            for k in range(here.size):
-                seeds[n] = i * columns + start + k
-                n += int((here[k] > least) & (here[k] > before[k]) & (here[k] > above[k]))
+            for k in range(cells):
+                value = flat[here + k]
+                seeds[n] = here + k
+                higher = (value > flat[before + k]) & (value > flat[above + k])
+                n += int((value > least) & higher)
     return n
 
 

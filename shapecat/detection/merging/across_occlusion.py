@@ -136,23 +136,26 @@ def _find_partners(a: F8, b: F8, partners: I4) -> tuple[float, int]:
     Returns the share of the samples that have a partner, of the segment with the lower one, and the
     number of pairs.
     """
-    in_a, in_b = np.zeros(len(a), np.uint8), np.zeros(len(b), np.uint8)
-    n = 0
+    in_a, in_b = np.zeros(SAMPLES, np.uint8), np.zeros(SAMPLES, np.uint8)
+    n = with_a = with_b = 0
     for s in range(len(a)):
+        x, y, z, nx, ny, nz = a[s, 0], a[s, 1], a[s, 2], a[s, 3], a[s, 4], a[s, 5]
         for t in range(len(b)):
-            if a[s, 3] * b[t, 3] + a[s, 4] * b[t, 4] + a[s, 5] * b[t, 5] < COPLANAR_COS:
+            mx, my, mz = b[t, 3], b[t, 4], b[t, 5]
+            if nx * mx + ny * my + nz * mz < COPLANAR_COS:
                 continue
-            dx, dy, dz = b[t, 0] - a[s, 0], b[t, 1] - a[s, 1], b[t, 2] - a[s, 2]
+            dx, dy, dz = b[t, 0] - x, b[t, 1] - y, b[t, 2] - z
             limit = COPLANAR_M + COPLANAR * math.sqrt(dx * dx + dy * dy + dz * dz)
-            if abs(dx * a[s, 3] + dy * a[s, 4] + dz * a[s, 5]) > limit:
+            if abs(dx * nx + dy * ny + dz * nz) > limit:
                 continue
-            if abs(dx * b[t, 3] + dy * b[t, 4] + dz * b[t, 5]) > limit:
+            if abs(dx * mx + dy * my + dz * mz) > limit:
                 continue
-            in_a[s] = 1
-            in_b[t] = 1
+            with_a += in_a[s] == 0
+            with_b += in_b[t] == 0
+            in_a[s] = in_b[t] = 1
             partners[n, 0], partners[n, 1] = s, t
             n += 1
-    return min(np.sum(in_a) / len(a), np.sum(in_b) / len(b)), n
+    return min(with_a / len(a), with_b / len(b)), n
 
 
 @kernel

@@ -12,7 +12,6 @@ RAISED = 0.5
 """Share of the cells of a segment that belong to one low object."""
 
 
-@kernel
 def merge_low_profile(segments: Segments, low_profile: I4, labels: I4, spans: I4) -> Bool:
     """Join the segments of each low object that is known by its outline; return which they are.
 
@@ -26,20 +25,26 @@ def merge_low_profile(segments: Segments, low_profile: I4, labels: I4, spans: I4
     (n + 1,) whether most of a segment is low and known to be an object.
     """
     known = np.zeros(segments.parent.size, np.bool_)
-    n = segments.parent.size
-    overlap = np.zeros((n, np.max(low_profile) + 1), np.int32)
+    count = int(low_profile.max(initial=0))
+    if count == 0:
+        return known
+    overlap = np.zeros((known.size, count + 1), np.int32)
+    _count_overlap(low_profile, labels, spans, overlap)
+    most = overlap.max(axis=1) > RAISED * segments.statistics["count"]
+    leader: dict[int, int] = {}
+    for p in np.flatnonzero(most[1:]) + 1:
+        first = leader.setdefault(int(overlap[p].argmax()), int(p))
+        if first == p:
+            known[p] = True
+        else:
+            merge(segments, first, int(p))
+    return known
+
+
+@kernel
+def _count_overlap(low_profile: I4, labels: I4, spans: I4, overlap: I4) -> None:
+    """Count the cells that each segment has of each low object."""
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):
             if low_profile[i, j] > 0:
                 overlap[labels[i, j], low_profile[i, j]] += 1
-    leader = np.zeros(overlap.shape[1], np.int32)
-    for p in range(1, n):
-        best = np.argmax(overlap[p])
-        if overlap[p, best] <= RAISED * segments.statistics[p].count:
-            continue
-        if leader[best] == 0:
-            leader[best] = p
-            known[p] = True
-        else:
-            merge(segments, leader[best], p)
-    return known

@@ -102,7 +102,6 @@ class Segments(NamedTuple):
     parent: I4
 
 
-@kernel
 def measure_segments(
     grid: DepthGrid, heights: HeightMap, graph: SurfaceGraph, labels: I4, n: int, up: F8
 ) -> Segments:
@@ -121,7 +120,6 @@ def measure_segments(
     return segments
 
 
-@kernel
 def _blank(size: int) -> Segments:
     """Return segments without any cell."""
     segments = Segments(
@@ -132,9 +130,8 @@ def _blank(size: int) -> Segments:
         np.zeros(size, np.int8),
         np.arange(size).astype(np.int16),
     )
-    for p in range(size):
-        row = segments.statistics[p]
-        row.left, row.right, row.bottom, row.top = 1e9, -1e9, 1e9, -1e9
+    for low, high in (("left", "right"), ("bottom", "top")):
+        segments.statistics[low], segments.statistics[high] = 1e9, -1e9
     return segments
 
 
@@ -251,18 +248,20 @@ def merge(segments: Segments, p: int, q: int) -> None:
         _add_pair(pairs[p, k], pairs[q, k])
     for k in range(n):
         _add_pair(pairs[k, p], pairs[k, q])
-    pairs[p, p] = np.zeros(1, PAIR)[0]
+    own = pairs[p, p]
+    own.contact = own.in_front = own.near = own.rests_on = own.rests_on_height = 0.0
     for band in range(BANDS):
         segments.top_area[p, band] += segments.top_area[q, band]
     add_statistics(segments.statistics[p], segments.statistics[q])
     # Half of the samples from each side.
-    first, second = segments.samples[p].copy(), segments.samples[q].copy()
-    mixed = 0
+    samples, first, mixed = segments.samples, np.zeros(SAMPLES, np.int32), 0
     for k in range(SAMPLES):
-        for source in (first, second):
-            if source[k] >= 0 and mixed < SAMPLES:
-                segments.samples[p, mixed] = source[k]
-                mixed += 1
+        first[k] = samples[p, k]
+    for k in range(2 * SAMPLES):
+        cell = samples[q, k // 2] if k % 2 else first[k // 2]
+        if cell >= 0 and mixed < SAMPLES:
+            samples[p, mixed] = cell
+            mixed += 1
     for k in range(n):
         if segments.parent[k] == q:
             segments.parent[k] = p

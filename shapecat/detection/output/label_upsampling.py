@@ -188,17 +188,18 @@ def _listed(runs: I4, labels: int) -> tuple[U4, I4]:
     The first end is that of label 0, which has none.
     """
     ends = np.zeros(labels, np.int64)
-    for label, first, end in runs:
-        ends[label] += end - first
+    for r in range(len(runs)):
+        ends[runs[r, 0]] += runs[r, 2] - runs[r, 1]
     ends = np.cumsum(ends)
     place = np.zeros(labels, np.int64)
     place[1:] = ends[:-1]
     order = np.zeros(ends[-1], np.uint32)
-    for label, first, end in runs:
-        out = order[place[label] : place[label] + end - first]
-        for k in range(out.size):
-            out[k] = first + k
-        place[label] += out.size
+    for r in range(len(runs)):
+        label, first, size = runs[r, 0], runs[r, 1], runs[r, 2] - runs[r, 1]
+        start = np.uint64(place[label])
+        for k in range(np.uint64(size)):
+            order[start + k] = first + k
+        place[label] += size
     return order, ends
 
 

@@ -45,7 +45,6 @@ class HeightMap(NamedTuple):
     height: F4
 
 
-@kernel
 def pack_planes(supports: list[SupportingPlane], intrinsics: PinholeIntrinsics) -> F8:
     """Return one row of numbers per plane."""
     rows = np.zeros((len(supports), 13 + DIRECTIONS))

@@ -4,14 +4,14 @@ import math
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F4, F8
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN, SupportingPlane, outline_corners
 from shapecat.detection.planes.ransac import INLIER_TOLERANCE, DepthSamples
 from shapecat.geometry import NEAREST_M, level_axes
 from shapecat.jit import kernel
 
-__all__ = ["supporting_planes"]
+__all__ = ["SURE_AREA_M2", "supporting_planes"]
 
 SURE_AREA_M2 = 0.25
 """Planes larger than this are furniture, whatever is under their edge."""
@@ -29,31 +29,41 @@ LEAST_DROPS, CLOSED = 20, 0.5
 """Readings below the edge that say enough, and the share of them on a wall that closes a box."""
 
 
-@kernel
 def supporting_planes(
-    grid: DepthGrid, found: list[tuple[SupportingPlane, DepthSamples]]
+    grid: DepthGrid,
+    found: list[tuple[SupportingPlane, DepthSamples]],
+    covered_m2: F8,
+    tallest_m: float,
 ) -> list[SupportingPlane]:
-    """Leave out the tops of objects; ``found`` are planes, lowest first, with their readings.
+    """Leave out the tops of objects.
 
     Under the front edge of a table or shelf there is nothing; a box is closed down to what it
-    stands on. Things lower than 6 cm are never furniture, planes over a quarter of a square metre
-    always.
+    stands on. Things lower than 6 cm are never furniture; planes over a quarter of a square metre
+    always are, and what is higher than an object.
+
+    Parameters
+    ----------
+    found : planes, lowest first, with their readings.
+    covered_m2 : (n,) what of each lies under things, and counts as seen.
+    tallest_m : height of the tallest object.
     """
     kept: list[SupportingPlane] = []
-    for support, samples in found:
+    for (support, samples), covered in zip(found, covered_m2, strict=True):
+        area_m2 = support.area_m2 + covered
         drop = math.inf
         for lower in kept:
             drop = support.offset - lower.offset if _overlaps(lower, support) else drop
-        if drop < LEAST_DROP_M or (len(kept) > 0 and support.area_m2 < BOARD_AREA_M2):
+        if drop < LEAST_DROP_M or (len(kept) > 0 and area_m2 < BOARD_AREA_M2):
             continue
-        if drop < math.inf and support.area_m2 < SURE_AREA_M2:
-            seen = np.zeros(2, np.int64)
+        if drop <= tallest_m and area_m2 < SURE_AREA_M2:
             plane = np.array([support.a, support.b, support.c])
-            _drop(grid.inverse_depth, grid.intrinsics, samples, plane, support.up, drop, seen)
-            if seen[0] + seen[1] >= LEAST_DROPS:
-                if seen[0] > CLOSED * (seen[0] + seen[1]):
+            on_wall, beyond = _drop(
+                grid.inverse_depth, grid.intrinsics, samples, plane, support.up, drop
+            )
+            if on_wall + beyond >= LEAST_DROPS:
+                if on_wall > CLOSED * (on_wall + beyond):
                     continue
-            elif support.area_m2 < LIKELY_AREA_M2:
+            elif area_m2 < LIKELY_AREA_M2:
                 continue
         kept.append(support)
     return kept
@@ -77,10 +87,10 @@ def _drop(
     plane: F8,
     up: F8,
     drop: float,
-    seen: I4,
-) -> None:
+) -> tuple[int, int]:
     """Look below the edge of a plane: count readings on a wall down from it, and beyond it."""
     rows, columns = inv_depth.shape
+    on_wall = farther = 0
     for k in range(0, samples.inverse_depth.size, 3):
         i, j = samples.i[k], samples.j[k]
         level = plane[0] * j + plane[1] * i + plane[2]
@@ -123,5 +133,6 @@ def _drop(
                 break
             if inv_depth[v, u] > 0:
                 behind = 1 / inv_depth[v, u] - dz
-                seen[0] += abs(behind) < WALL_M
-                seen[1] += behind >= WALL_M
+                on_wall += abs(behind) < WALL_M
+                farther += behind >= WALL_M
+    return on_wall, farther

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F4, F8
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.planes.ransac import (
     INLIER_TOLERANCE,
@@ -17,7 +17,7 @@ from shapecat.detection.planes.ransac import (
 from shapecat.geometry import DISCONTINUITY, cross
 from shapecat.jit import kernel
 
-__all__ = ["estimate_up"]
+__all__ = ["HELD", "estimate_up"]
 
 ARM = 3
 """Cells to each side over which a surface is seen to be smooth."""
@@ -36,17 +36,23 @@ LEVELS_APART = 2
 SEVERAL, CLEAR, ASLANT = 1.5, 2, 0.55
 """How much it counts that levels are several, by the power of their number; that what faces a
 direction lies in them, by the power of the share; and that the camera looks at them aslant."""
+HELD = 1.0
+"""How much it counts against a direction that the camera would be on its side or upside down: that
+halves its merit. With 3 of 570 turned views 3 were taken wrongly, with 9 16; with 0 and 1 none."""
+HALF_M = 1.5
+"""Distance at which a surface counts half."""
 
 
 @kernel
-def estimate_up(grid: DepthGrid, hint: F8, trials: F8) -> F8:
+def estimate_up(grid: DepthGrid, hint: F8, trials: F8, held: float) -> F8:
     """Return the normal of the dominant supporting plane, (3,) unit, or zeros if there is none.
 
     With a ``hint`` only planes within 15 degrees of being perpendicular to it count. Without, if
     it is zeros, the direction wins that faces most large levels: the normal of one of the largest
     planes, or the direction that two walls leave. What the camera looks at head-on counts less, so
-    that the boards of a shelf beat its back. How the camera is turned about its axis makes no
-    difference. ``trials`` are of `draw_trials`.
+    that the boards of a shelf beat its back; what is far counts less than what is near. That
+    the camera is turned about its axis takes the more to be believed the larger ``held`` is:
+    `HELD`, or 0 where nothing is known of it. ``trials`` are of `draw_trials`.
     """
     oriented_points = _orient_points(grid.inverse_depth, grid.intrinsics)
     least = max(LEAST_SHARE * oriented_points.shape[1], float(LEAST_FACETS))
@@ -61,8 +67,8 @@ def estimate_up(grid: DepthGrid, hint: F8, trials: F8) -> F8:
         grid.intrinsics,
         oriented_points,
         found,
-        least,
         CORNER_COS if free else 0.0,
+        held if free else 0.0,
     )
     return up
 
@@ -161,8 +167,8 @@ def _dominant(
     intrinsics: PinholeIntrinsics,
     oriented_points: F4,
     found: F8,
-    least: float,
     corner_cos: float,
+    held: float,
 ) -> F8:
     """Return the exact normal of the largest plane that faces the best direction, (3,).
 
@@ -170,10 +176,15 @@ def _dominant(
     ----------
     found : (n, 3) directions that surfaces face, at least one.
     corner_cos : two of them with a smaller cosine may be walls; 0 for none.
+    held : `HELD`; 0 where nothing is known of how the camera is held.
     """
+    total = 0.0
+    for k in range(oriented_points.shape[1]):
+        total += oriented_points[6, k]
+    least = total * max(LEAST_SHARE, LEAST_FACETS / oriented_points.shape[1])
     best, most = found[0], -1.0
     for k in range(len(found)):
-        merit = _merit(oriented_points, found[k], least)
+        merit = _merit(oriented_points, found[k], least, held)
         if merit > most:
             best, most = found[k], merit
     for k in range(len(found)):
@@ -184,7 +195,7 @@ def _dominant(
             corner = cross(found[k], found[m])
             corner /= math.sqrt(cosine(corner, corner))
             for direction in (corner, -corner):
-                merit = _merit(oriented_points, direction, least)
+                merit = _merit(oriented_points, direction, least, held)
                 if merit > most:
                     best, most = direction, merit
     up: F8 = _settled(inv_depth, intrinsics, oriented_points, best)
@@ -192,7 +203,7 @@ def _dominant(
 
 
 @kernel
-def _merit(oriented_points: F4, direction: F8, least: float) -> float:
+def _merit(oriented_points: F4, direction: F8, least: float, held: float) -> float:
     """Return how well a direction explains the surface: what of it lies in large levels."""
     count = _count_levels(oriented_points, direction)
     level, squares = _large_levels(count, least)
@@ -203,16 +214,17 @@ def _merit(oriented_points: F4, direction: F8, least: float) -> float:
     levels, clear = level**2 / squares, level / np.sum(count)
     # A camera that looks down at a board sees it aslant, and rather the wall behind it head-on.
     aslant = 1 - ASLANT * direction[2] ** 2
-    return float(level * levels**SEVERAL * clear**CLEAR * aslant)
+    turned = direction[0] ** 2 + max(direction[1], 0.0) ** 2
+    return float(level * levels**SEVERAL * clear**CLEAR * aslant / (1 + held * turned))
 
 
 @kernel
-def _large_levels(count: I4, least: float) -> tuple[int, int]:
+def _large_levels(count: F8, least: float) -> tuple[float, float]:
     """Return how many facets lie in levels of more than ``least``, and the sum of their squares.
 
     A level fills two bins and stands out from the next ones: a slanted surface has many heights.
     """
-    oriented_points = squares = 0
+    oriented_points = squares = 0.0
     last = count.size - 1
     for k in range(last):
         here = count[k] + count[k + 1]
@@ -227,10 +239,10 @@ def _large_levels(count: I4, least: float) -> tuple[int, int]:
 
 
 @kernel
-def _count_levels(oriented_points: F4, direction: F8) -> I4:
-    """Count the facets that face a direction by their height below the sensor."""
+def _count_levels(oriented_points: F4, direction: F8) -> F8:
+    """Weigh the facets that face a direction by their height below the sensor."""
     x, y, z = direction
-    count = np.zeros(HEIGHT_BINS + 1, np.int64)  # the last for what is out of bounds
+    count = np.zeros(HEIGHT_BINS + 1, np.float64)  # the last for what is out of bounds
     nx, ny, nz, px, py, pz = (
         oriented_points[0],
         oriented_points[1],
@@ -245,7 +257,7 @@ def _count_levels(oriented_points: F4, direction: F8) -> I4:
         below = math.floor(-(px[k] * x + py[k] * y + pz[k] * z) / LEVEL_BIN_M)
         level[k] = below if faces & (below >= 0) & (below < HEIGHT_BINS) else HEIGHT_BINS
     for k in range(nx.size):
-        count[level[k]] += 1
+        count[level[k]] += oriented_points[6, k]
     return count[:-1]
 
 
@@ -265,9 +277,9 @@ def _settled(
 
 @kernel
 def _orient_points(inv_depth: F4, intrinsics: PinholeIntrinsics) -> F4:
-    """Return the normals and the positions (6, n) of every fourth cell on a smooth surface."""
+    """Return normals, positions and weights (7, n) of every fourth cell on a smooth surface."""
     rows, columns = inv_depth.shape
-    oriented_points = np.zeros((6, (rows // 4 + 1) * (columns // 4 + 1)), np.float32)
+    oriented_points = np.zeros((7, (rows // 4 + 1) * (columns // 4 + 1)), np.float32)
     bend, two = np.float32(2 * DISCONTINUITY), np.float32(2)
     n = 0
     for i in range(ARM, rows - ARM, 4):
@@ -298,5 +310,6 @@ def _orient_points(inv_depth: F4, intrinsics: PinholeIntrinsics) -> F4:
                 scale * nz,
             )
             oriented_points[3, n], oriented_points[4, n], oriented_points[5, n] = x * z, y * z, z
+            oriented_points[6, n] = 1 / (1 + (z / HALF_M) ** 2)
             n += 1
     return oriented_points[:, :n].copy()

@@ -52,14 +52,19 @@ class SurfaceGraph(NamedTuple):
     spans: I4
 
 
-@kernel
+class FlatGraph(NamedTuple):
+    """The inverse depth, the local planes and the normals of all cells, as one row each."""
+
+    inv_depth: F4
+    plane: F4
+    normal: F4
+
+
 def connect_surfaces(grid: DepthGrid, heights: HeightMap) -> SurfaceGraph:
     """Fit local planes to the object cells, link them and measure concave angles."""
     inv_depth, intrinsics, plane_id = grid.inverse_depth, grid.intrinsics, heights.plane_id
-    rows, columns = inv_depth.shape
-    spans = np.zeros((rows, 2), np.int32)
-    for i in range(rows):
-        spans[i, 0], spans[i, 1] = span_of(plane_id[i])
+    spans = _spans_of(plane_id)
+    columns = inv_depth.shape[1]
     local_plane, normal = _cleared(spans, columns), _cleared(spans, columns)
     fit_local_planes(inv_depth, intrinsics, plane_id, spans, local_plane, normal)
     links = np.zeros(inv_depth.shape, np.uint8)
@@ -67,6 +72,15 @@ def connect_surfaces(grid: DepthGrid, heights: HeightMap) -> SurfaceGraph:
     graph = SurfaceGraph(local_plane, normal, links, np.zeros(inv_depth.shape, np.uint8), spans)
     _measure_concavity(inv_depth, intrinsics, graph)
     return graph
+
+
+@kernel
+def _spans_of(plane_id: I4) -> I4:
+    """Return the spans of `SurfaceGraph`: of the numbers above 0 in each row."""
+    spans = np.zeros((plane_id.shape[0], 2), np.int32)
+    for i in range(len(spans)):
+        spans[i, 0], spans[i, 1] = span_of(plane_id[i])
+    return spans
 
 
 @kernel
@@ -121,7 +135,7 @@ def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) ->
             local_plane[i, 0, there],
             local_plane[i, 1, here],
             local_plane[i, 1, there],
-            RIGHT,
+            np.int64(RIGHT),
             links[i, here],
         )
         if i + 1 < rows:
@@ -135,7 +149,7 @@ def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) ->
                 local_plane[i + 1, 0, here],
                 local_plane[i, 2, here],
                 local_plane[i + 1, 2, here],
-                DOWN,
+                np.int64(DOWN),
                 links[i, here],
             )
         _part_steps(inv_depth, plane_id, i, start, end, links[i])
@@ -204,13 +218,10 @@ def _link_some(
 def _measure_concavity(inv_depth: F4, intrinsics: PinholeIntrinsics, graph: SurfaceGraph) -> None:
     """Measure the largest concave angle between the surfaces on two sides of each cell."""
     rows, columns = inv_depth.shape
-    local_plane, normal, concavity = graph.local_plane, graph.normal, graph.concavity
-    scratch = np.zeros((3, columns), np.float32)
-    gaps, chords, worst = (
-        scratch[0],
-        scratch[1],
-        scratch[2],
-    )  # unpacked they would not be contiguous
+    local_plane, concavity = graph.local_plane, graph.concavity
+    flat = FlatGraph(inv_depth.reshape(-1), local_plane.reshape(-1), graph.normal.reshape(-1))
+    gaps, chords = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
+    worst = np.zeros(columns, np.float32)
     for i in range(rows):
         start, end = graph.spans[i]
         if start == end:
@@ -223,83 +234,69 @@ def _measure_concavity(inv_depth: F4, intrinsics: PinholeIntrinsics, graph: Surf
             first, last = max(start, abs(dj)), min(end, columns - abs(dj))
             last = min(padded(first, last), columns - abs(dj))
             if i - di >= 0 and i + di < rows and first < last:
-                _raise_concavity(
-                    inv_depth,
-                    intrinsics,
-                    local_plane,
-                    normal,
-                    i,
-                    first,
-                    last,
-                    di,
-                    dj,
-                    gaps,
-                    chords,
-                    worst,
-                )
+                cells, shift = (i, first, last, columns), (di, dj)
+                _raise_concavity(flat, intrinsics, cells, shift, gaps, chords, worst)
         _write_angles(local_plane[i, 0, start:end], worst[start:end], concavity[i, start:end])
 
 
 @kernel(fast=True)
 def _raise_concavity(
-    inv_depth: F4,
+    flat: FlatGraph,
     intrinsics: PinholeIntrinsics,
-    local_plane: F4,
-    normal: F4,
-    i: int,
-    first: int,
-    last: int,
-    di: int,
-    dj: int,
+    cells: tuple[int, int, int, int],
+    shift: tuple[int, int],
     gaps: F4,
     chords: F4,
     worst: F4,
 ) -> None:
     """Raise ``worst`` to the chord of the normals on two sides of some cells, where concave.
 
-    Three loops, for the compiler vectorises only those over few arrays.
+    Parameters
+    ----------
+    cells : a row, the first of its columns, that after the last, and how many columns there are.
+    shift : rows and columns to the places that are compared, on both sides of a cell.
+
+    Notes
+    -----
+    Three loops, for the compiler vectorises only those over few arrays; no slices, each of which
+    counts references; unsigned indices, for others may count from the end.
     """
+    i, first, last, columns = cells
+    di, dj = shift
     zero, one, gate = np.float32(0), np.float32(1), np.float32(2 * DISCONTINUITY)
     per_x, per_y = np.float32(1 / intrinsics.fx), np.float32(1 / intrinsics.fy)
     y1, y2 = np.float32(i - di - intrinsics.cy) * per_y, np.float32(i + di - intrinsics.cy) * per_y
-    x1, x2 = (
-        np.float32(first - dj - intrinsics.cx) * per_x,
-        np.float32(first + dj - intrinsics.cx) * per_x,
-    )
+    x1 = np.float32(first - dj - intrinsics.cx) * per_x
+    x2 = np.float32(first + dj - intrinsics.cx) * per_x
     x, y = np.float32(dj), np.float32(di)
-    a, b, left, right = i - di, i + di, first - dj, last - dj
-    here, worst = inv_depth[i, first:last], worst[first:last]
+    inv_depth, plane, normal = flat
+    n, here, to = np.uint64(last - first), np.uint64(i * columns + first), np.uint64(first)
+    # where the values, their slopes per column and per row of both sides begin
+    a0 = np.uint64(3 * (i - di) * columns + first - dj)
+    b0 = np.uint64(3 * (i + di) * columns + first + dj)
+    row = np.uint64(columns)
+    a1, a2, b1, b2 = a0 + row, a0 + row + row, b0 + row, b0 + row + row
     # (1) how far both planes are from the cell
-    v1, gx1, gy1 = (
-        local_plane[a, 0, left:right],
-        local_plane[a, 1, left:right],
-        local_plane[a, 2, left:right],
-    )
-    nx1, ny1, nz1 = normal[a, 0, left:right], normal[a, 1, left:right], normal[a, 2, left:right]
-    left, right = first + dj, last + dj
-    v2, gx2, gy2 = (
-        local_plane[b, 0, left:right],
-        local_plane[b, 1, left:right],
-        local_plane[b, 2, left:right],
-    )
-    nx2, ny2, nz2 = normal[b, 0, left:right], normal[b, 1, left:right], normal[b, 2, left:right]
-    for k in range(here.size):
-        gap1 = abs(v1[k] + gx1[k] * x + gy1[k] * y - here[k])
-        gap2 = abs(v2[k] - gx2[k] * x - gy2[k] * y - here[k])
+    for k in range(n):
+        v1, v2, v = plane[a0 + k], plane[b0 + k], inv_depth[here + k]
+        gap1 = abs(v1 + plane[a1 + k] * x + plane[a2 + k] * y - v)
+        gap2 = abs(v2 - plane[b1 + k] * x - plane[b2 + k] * y - v)
         gap = gap1 if gap1 > gap2 else gap2
-        gaps[k] = gap if (v1[k] > zero) & (v2[k] > zero) else one
+        gaps[k] = gap if (v1 > zero) & (v2 > zero) else one
     # (2) the angle, 0 where convex
-    for k in range(here.size):
-        nx, ny, nz = nx1[k] - nx2[k], ny1[k] - ny2[k], nz1[k] - nz2[k]
+    for k in range(n):
+        nx, ny = normal[a0 + k] - normal[b0 + k], normal[a1 + k] - normal[b1 + k]
+        nz = normal[a2 + k] - normal[b2 + k]
+        v1, v2 = plane[a0 + k], plane[b0 + k]
         # The ray from one place to the other, times both inverse depths: no division.
-        step = np.float32(k) * per_x
-        along = ((x1 + step) * v2[k] - (x2 + step) * v1[k]) * nx + (v2[k] - v1[k]) * nz
-        along += (y1 * v2[k] - y2 * v1[k]) * ny
+        step = np.float32(np.int32(k)) * per_x
+        along = ((x1 + step) * v2 - (x2 + step) * v1) * nx + (v2 - v1) * nz
+        along += (y1 * v2 - y2 * v1) * ny
         chords[k] = nx * nx + ny * ny + nz * nz if along < zero else zero
     # (3) the largest
-    for k in range(here.size):
+    for k in range(n):
         chord = chords[k] if gaps[k] <= gate else zero
-        worst[k] = chord if chord > worst[k] else worst[k]
+        worst[to + k] = chord if chord > worst[to + k] else worst[to + k]
 
 
 @kernel(fast=True)

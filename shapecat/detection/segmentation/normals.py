@@ -47,13 +47,16 @@ def fit_local_planes(
     """
     values = np.zeros(SIDE * PITCH, np.float32)
     fits = np.zeros(6 * PITCH, np.float32)
-    for i in range(plane_id.shape[0]):
-        end, last = spans[i]
+    depths, owners = inv_depth.reshape(-1), plane_id.reshape(-1)
+    planes, normals = local_plane.reshape(-1), normal.reshape(-1)
+    shape = inv_depth.shape
+    for i in range(shape[0]):
+        end, last = np.int64(spans[i, 0]), np.int64(spans[i, 1])
         while end < last:
-            start, end = _next_run(plane_id[i], end, last)
-            _copy_windows(inv_depth, plane_id, i, start, end, values)
+            start, end = _next_run(owners, i * shape[1], end, last)
+            _copy_windows(depths, owners, shape, (i, start, end), values)
             _fit_run(values, intrinsics, i, start, padded(start, end) - start, fits)
-            _write(fits, local_plane, normal, i, start, end)
+            _write(fits, planes, normals, 3 * i * shape[1] + start, shape[1], end - start)
 
 
 @kernel
@@ -63,44 +66,56 @@ def padded(start: int, end: int) -> int:
 
 
 @kernel
-def _write(fits: F4, local_plane: F4, normal: F4, i: int, start: int, end: int) -> None:
+def _write(fits: F4, planes: F4, normals: F4, at: int, columns: int, n: int) -> None:
+    """Copy the fits of a run to where its local planes begin; neither slices nor signed indices."""
     for d in range(3):
-        one, other = local_plane[i, d, start:end], normal[i, d, start:end]
-        for k in range(one.size):
-            one[k], other[k] = fits[d * PITCH + k], fits[(3 + d) * PITCH + k]
+        to, plane = np.uint64(at + d * columns), np.uint64(d * PITCH)
+        unit = np.uint64((3 + d) * PITCH)
+        for k in range(np.uint64(n)):
+            planes[to + k] = fits[plane + k]
+        for k in range(np.uint64(n)):
+            normals[to + k] = fits[unit + k]
 
 
 @kernel
-def _next_run(plane_id: I4, j: int, last: int) -> tuple[int, int]:
+def _next_run(owners: I4, row: int, j: int, last: int) -> tuple[int, int]:
     """Return the columns from and before which the next object cells of one owner in a row lie.
 
-    There are some before ``last``.
+    There are some before ``last``; the row begins at ``row``.
     """
-    while plane_id[j] <= 0:
+    while owners[row + j] <= 0:
         j += 1
     start = end = j
-    me, last = plane_id[j], min(last, start + RUN)
-    while j < min(last, end + BRIDGED) and (plane_id[j] <= 0 or plane_id[j] == me):
-        end = j + 1 if plane_id[j] == me else end
+    me, last = owners[row + j], min(last, start + RUN)
+    while j < min(last, end + BRIDGED) and (owners[row + j] <= 0 or owners[row + j] == me):
+        end = j + 1 if owners[row + j] == me else end
         j += 1
     return start, end
 
 
 @kernel
-def _copy_windows(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, values: F4) -> None:
-    """Copy the rows around a run and `WINDOW` cells more at its ends; `NONE` for other owners."""
-    rows, columns = plane_id.shape
-    me, none = plane_id[i, start], np.float32(NONE)
+def _copy_windows(
+    depths: F4, owners: I4, shape: tuple[int, int], run: tuple[int, int, int], values: F4
+) -> None:
+    """Copy the rows around a run and `WINDOW` cells more at its ends; `NONE` for other owners.
+
+    Parameters
+    ----------
+    run : its row, its first column and that after its last.
+    """
+    rows, columns = shape
+    i, start, end = run
+    me, none = owners[i * columns + start], np.float32(NONE)
     left, right = max(start - WINDOW, 0), min(end + WINDOW, columns)
     for d in range(SIDE):
-        y, first = i + d - WINDOW, d * PITCH
-        some = values[first : first + end - start + 2 * WINDOW]
-        some[:] = none
+        y, first = i + d - WINDOW, np.uint64(d * PITCH)
+        for k in range(np.uint64(end - start + 2 * WINDOW)):
+            values[first + k] = none
         if 0 <= y < rows:
-            some = some[left - start + WINDOW :]
-            value, whose = inv_depth[y, left:right], plane_id[y, left:right]
-            for k in range(value.size):
-                some[k] = value[k] if whose[k] == me else none
+            to = np.uint64(d * PITCH + left - start + WINDOW)
+            at = np.uint64(y * columns + left)
+            for k in range(np.uint64(right - left)):
+                values[to + k] = depths[at + k] if owners[at + k] == me else none
 
 
 @kernel(fast=True)
@@ -112,19 +127,21 @@ def _fit_run(
     Rows of ``fits``: inverse depth, its two slopes, and the normal; 0 where there is no fit.
     """
     zero, one = np.float32(0), np.float32(1)
+    g0, g1 = np.float32(GATE), np.float32(GATE + GATE_SLOPE)
+    g2, g3 = np.float32(GATE + GATE_SLOPE * 2), np.float32(GATE + GATE_SLOPE * 3)
     least, spread = np.float32(LEAST_SAMPLES), np.float32(LEAST_SPREAD)
     fx, fy, y = np.float32(intrinsics.fx), np.float32(intrinsics.fy), np.float32(i - intrinsics.cy)
     for k in range(n):
         p = k + WINDOW
         center = values[WINDOW * PITCH + p]
         # (1) sums over the rows of the window: 1, x, x x, v, x v
-        n0, x0, xx0, v0, xv0 = _four(values, p, center, 3, 3)
-        n1, x1, xx1, v1, xv1 = _three(values, PITCH + p, center, 2, 2)
-        n2, x2, xx2, v2, xv2 = _four(values, 2 * PITCH + p, center, 3, 1)
-        n3, x3, xx3, v3, xv3 = _three(values, 3 * PITCH + p, center, 2, 0)
-        n4, x4, xx4, v4, xv4 = _four(values, 4 * PITCH + p, center, 3, 1)
-        n5, x5, xx5, v5, xv5 = _three(values, 5 * PITCH + p, center, 2, 2)
-        n6, x6, xx6, v6, xv6 = _four(values, 6 * PITCH + p, center, 3, 3)
+        n0, x0, xx0, v0, xv0 = _four(values, p, center, g3, g3)
+        n1, x1, xx1, v1, xv1 = _three(values, PITCH + p, center, g2, g2)
+        n2, x2, xx2, v2, xv2 = _four(values, 2 * PITCH + p, center, g3, g1)
+        n3, x3, xx3, v3, xv3 = _three(values, 3 * PITCH + p, center, g2, g0)
+        n4, x4, xx4, v4, xv4 = _four(values, 4 * PITCH + p, center, g3, g1)
+        n5, x5, xx5, v5, xv5 = _three(values, 5 * PITCH + p, center, g2, g2)
+        n6, x6, xx6, v6, xv6 = _four(values, 6 * PITCH + p, center, g3, g3)
         # (2) means and moments over the window
         count = n0 + n1 + n2 + n3 + n4 + n5 + n6
         share = one / max(count, one)
@@ -162,7 +179,7 @@ def _times_row(a: float, b: float, c: float, e: float, f: float, g: float) -> An
 
 @kernel(fast=True)
 def _four(
-    values: F4, p: int, center: float, far: int, near: int
+    values: F4, p: int, center: float, far: float, near: float
 ) -> tuple[float, float, float, float, float]:
     """Return the sums over a row of a window sampled at -3, -1, 1 and 3 columns from ``p``."""
     a, va = _sample(values, p - 3, center, far)
@@ -176,7 +193,7 @@ def _four(
 
 @kernel(fast=True)
 def _three(
-    values: F4, p: int, center: float, far: int, near: int
+    values: F4, p: int, center: float, far: float, near: float
 ) -> tuple[float, float, float, float, float]:
     """Return the sums over a row of a window sampled at -2, 0 and 2 columns from ``p``."""
     a, va = _sample(values, p - 2, center, far)
@@ -187,9 +204,8 @@ def _three(
 
 
 @kernel(fast=True)
-def _sample(values: F4, p: int, center: float, distance: int) -> tuple[Any, Any]:
+def _sample(values: F4, p: int, center: float, gate: float) -> tuple[Any, Any]:
     """Return the weight of a sample, and by that how much it differs from the centre."""
     v = values[p] - center
-    use = abs(v) < np.float32(GATE + GATE_SLOPE * distance)
-    weight = np.float32(1) if use else np.float32(0)
+    weight = np.float32(1) if abs(v) < gate else np.float32(0)
     return weight, weight * v

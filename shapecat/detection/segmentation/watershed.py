@@ -21,8 +21,7 @@ BUCKET_DEG = 4
 """Angles that differ less are flooded in one go."""
 
 
-@kernel
-def watershed(heights: HeightMap, graph: SurfaceGraph, concave: bool) -> tuple[I4, int]:  # noqa: FBT001  compiled kernels take their arguments by position
+def watershed(heights: HeightMap, graph: SurfaceGraph, *, concave: bool) -> tuple[I4, int]:
     """Label the object cells: (rows, columns) int16 labels 1..n, 0 elsewhere, and n.
 
     Flat cells that are linked make a seed; a flood from the seeds, flattest cells first, gives
@@ -33,7 +32,7 @@ def watershed(heights: HeightMap, graph: SurfaceGraph, concave: bool) -> tuple[I
     barrier = np.zeros(plane_id.shape, np.uint8)
     stack, part = unset(plane_id.size, np.int32), unset(plane_id.shape, np.int32)
     _concave_edges(concavity, spans, EDGE_DEG if concave else NO_EDGE_DEG, barrier, stack)
-    n = _flat_parts(plane_id, spans, links, barrier, labels, np.int64(0), part)
+    n = _flat_parts(plane_id, spans, links, barrier, labels, 0, part)
     _flood_labels(links, concavity, spans, labels, stack)
     barrier[:] = 0
     return labels, _flat_parts(plane_id, spans, links, barrier, labels, n, part)
@@ -151,8 +150,8 @@ def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4, following: I4
     columns = labels.shape[1]
     flat_links, flat_edge, flat = links.reshape(-1), concavity.reshape(-1), labels.reshape(-1)
     buckets = 256 // BUCKET_DEG
-    head = np.full(buckets, -1, np.int32)
-    tail = np.full(buckets, -1, np.int32)
+    head, tail = np.zeros(buckets, np.int32), np.zeros(buckets, np.int32)
+    head[:] = -1
     for i in range(labels.shape[0]):
         for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
             if flat[p] <= 0:

@@ -48,7 +48,6 @@ class Outlines(NamedTuple):
     counts: I4
 
 
-@kernel
 def split_at_width_changes(
     grid: DepthGrid,
     heights: HeightMap,
@@ -65,13 +64,22 @@ def split_at_width_changes(
     """
     side = lateral_axis(up)
     outlines = _outlines_of(grid, heights.height, graph.spans, labels, n, side)
-    for p in range(1, n + 1):
-        rest = p
-        for band in np.flatnonzero(_cuts_of(grid, outlines, p, side)):
-            n += 1
-            relabel_above(labels, graph.spans, heights.height, rest, band * BAND_M, n)
-            rest = n  # what this cut has left
+    cuts = np.zeros((n + 1, BANDS), np.bool_)
+    _find_cuts(grid, outlines, side, cuts)
+    before = rest = 0
+    for p, band in np.argwhere(cuts):
+        n += 1
+        rest = rest if p == before else p  # what the cuts below have left
+        relabel_above(labels, graph.spans, heights.height, rest, band * BAND_M, n)
+        before, rest = p, n
     return n
+
+
+@kernel
+def _find_cuts(grid: DepthGrid, outlines: Outlines, side: F8, cuts: Bool) -> None:
+    """Mark the bands (n + 1, BANDS) below which each of the labels 1..n is to be cut."""
+    for p in range(1, len(cuts)):
+        _cut_label(grid, outlines, p, side, cuts)
 
 
 @kernel
@@ -88,7 +96,8 @@ def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, sid
     c = np.float32(
         side[2] - intrinsics.cx * side[0] / intrinsics.fx - intrinsics.cy * side[1] / intrinsics.fy
     )
-    ends = np.full((2, n + 1, BANDS), np.inf, np.float32)
+    ends = np.zeros((2, n + 1, BANDS), np.float32)
+    ends[:] = np.inf
     at, count = np.zeros((2, n + 1, BANDS), np.int32), np.zeros((n + 1, BANDS), np.int32)
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):
@@ -106,24 +115,29 @@ def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, sid
 
 
 @kernel
-def _cuts_of(grid: DepthGrid, outlines: Outlines, p: int, side: F8) -> Bool:
-    """Return whether a label is to be cut below each of its bands."""
-    cut, steps = np.zeros(BANDS, np.bool_), np.zeros(BANDS)
-    count = outlines.counts[p]
-    seen = np.flatnonzero(count)
-    if seen.size < 2 * BESIDE:
-        return cut
-    for band in range(seen[0] + BESIDE, seen[-1] - BESIDE + 2):
+def _cut_label(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool) -> None:
+    """Mark the bands below which a label is to be cut."""
+    steps = np.zeros(BANDS, np.float64)
+    first, last, seen, above = 0, 0, 0, 0
+    for band in range(BANDS):
+        cells = outlines.counts[p, band]
+        if cells > 0:
+            first, last = (band if seen == 0 else first), band
+            seen, above = seen + 1, above + cells
+    if seen < 2 * BESIDE:
+        return
+    for band in range(first + BESIDE, last - BESIDE + 2):
         steps[band] = _step_at(grid, outlines, p, band, side)
-    last = 0
-    for band in range(BESIDE, BANDS - BESIDE):
-        here = steps[band]
-        if here < STEPS_M or here < np.max(steps[band - BESIDE : band + BESIDE + 1]):
-            continue
-        if min(np.sum(count[last:band]), np.sum(count[band:])) >= LEAST_CELLS:
-            cut[band] = True
-            last = band
-    return cut
+    below = 0  # cells since the last cut; ``above``: from here on
+    for band in range(BANDS - BESIDE):
+        largest = steps[band] >= STEPS_M and band >= BESIDE
+        for k in range(band - BESIDE if largest else 0, band + BESIDE + 1 if largest else 0):
+            largest &= steps[band] >= steps[k]
+        if largest and min(below, above) >= LEAST_CELLS:
+            cuts[p, band] = True
+            below = 0
+        below += outlines.counts[p, band]
+        above -= outlines.counts[p, band]
 
 
 @kernel
@@ -133,7 +147,11 @@ def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -
     for k in range(2):
         end, at = outlines.ends[k, p], outlines.at[k, p]
         low, high = band - BESIDE, band + 1
-        change = np.sum(end[high : band + BESIDE]) - np.sum(end[low : band - 1])
+        after = before = np.float32(0)
+        for k4 in range(BESIDE - 1):
+            after += end[high + k4]
+            before += end[low + k4]
+        change = after - before
         if not abs(change) < np.inf:
             continue
         way = np.float32(1 if change > 0 else -1)

@@ -1,0 +1,164 @@
+"""Whether the plane of a table is found where little of the image tells which way is up.
+
+    python -m benchmarks.planes --first 730000 --count 100
+
+Simulated tables, one frame each, without a hint of up: covered to four fifths with flat boxes, cut
+to a fifth of the image, seen from 8 to 85 degrees of elevation.
+"""
+
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any
+
+import click
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import NDArray
+
+from benchmarks.measure import markdown
+from shapecat.config import DetectionSettings
+from shapecat.detection import detect
+from shapecat.geometry import inverse
+from shapecat.simulation import KINECT, Support, Thing, World, make_scene, render_frame
+from shapecat.simulation.furniture import make_room, make_table
+from shapecat.simulation.mesh import rounded_box
+from shapecat.simulation.paths import looking_at
+from shapecat.simulation.render import render
+from shapecat.types import Camera, Frame, Pose, Scene
+
+Array = NDArray[Any]
+HEIGHT_M, TILT_COS = 0.02, float(np.cos(np.radians(4)))
+"""How far the plane that is found may lie from the table, and how far it may be tilted."""
+COVERED, SHOWN, SEEN = 0.8, 0.2, 0.01
+"""Share of a table that is under boxes; of the image that shows a table which is cut, with what is
+on it; least share that shows a covered one between its boxes."""
+PREVIEW = Camera(80, 60, 65.6, 65.6, 39.5, 29.5)
+
+
+def covered(rng: Generator) -> World:
+    """Cover four fifths of a table with flat boxes, a dozen or more, that hardly touch."""
+    while True:
+        table = make_table(rng, tuple(rng.uniform([0.6, 0.45], [0.9, 0.65])))
+        supports = (*make_room(rng, wall_chance=0.3), table)
+        path = (_view(rng, table, rng.uniform(25, 65), rng.uniform(0.8, 1.2)),)
+        world = World("covered", supports, _flat_boxes(rng, table), path, np.zeros(1))
+        if _shown(world)[0] > SEEN:
+            return world
+
+
+def _flat_boxes(rng: Generator, table: Support) -> tuple[Thing, ...]:
+    half = np.abs(table.outline[:, :2]).max(axis=0)
+    fill = rng.uniform(np.sqrt(COVERED), 0.97)  # of the length of each side of a tile
+    tiles = list(_tiles(rng, -half, half, int(rng.integers(14, 28))))
+    things: list[Thing] = []
+    left = COVERED * np.prod(2 * half)
+    for k in rng.permutation(len(tiles)):
+        low, high = tiles[k]
+        size = fill * (high - low)
+        middle = (low + high) / 2 + rng.uniform(-0.5, 0.5, 2) * (1 - fill) * (high - low)
+        pose = Pose(np.eye(3), np.round([*middle, table.height], 6))
+        mesh = rounded_box([*size, rng.uniform(0.02, 0.06)], fine=1)
+        things.append(Thing(len(things), "box", "box", mesh, pose, table.name, None))
+        left -= np.prod(size)
+        if left < 0:
+            break
+    return tuple(things)
+
+
+def _tiles(rng: Generator, low: Array, high: Array, count: int) -> Iterator[tuple[Array, Array]]:
+    """Cut a rectangle across its longer side, again and again, into ``count`` of them."""
+    if count == 1:
+        yield low, high
+        return
+    first, axis = round(count * rng.uniform(0.4, 0.6)), int(np.argmax(high - low))
+    first = min(max(first, 1), count - 1)
+    middle = (np.arange(2) == axis) * (high - low) * first / count
+    other = (np.arange(2) != axis) * (high - low)
+    yield from _tiles(rng, low, low + middle + other, first)
+    yield from _tiles(rng, low + middle, high, count - first)
+
+
+def cut(rng: Generator) -> World:
+    """Look past a cluttered table, so far that a fifth of the image shows it."""
+    world = make_scene("clutter", rng, frames=1)
+    pose, angle = world.path[0], rng.uniform(0, 2 * np.pi)
+    aside = np.cos(angle) * pose.rotation[:, 0] + np.sin(angle) * pose.rotation[:, 1]
+    near, far = 0.0, 1.3
+    for _ in range(8):
+        turn = (near + far) / 2
+        gaze = np.cos(turn) * pose.rotation[:, 2] + np.sin(turn) * aside
+        world = replace(world, path=(looking_at(pose.translation, pose.translation + gaze),))
+        near, far = (turn, far) if sum(_shown(world)) > SHOWN else (near, turn)
+    return world
+
+
+def _shown(world: World) -> tuple[float, float]:
+    """Return the shares of the image that show the table, and what is on it."""
+    owners = render(world.geometry(0), PREVIEW, world.path[0]).owners
+    table = owners == world.supports.index(_table(world))
+    return float(table.mean()), float((owners >= len(world.supports)).mean())
+
+
+def tilted(rng: Generator) -> World:
+    """Look at a cluttered table from any elevation between 8 and 85 degrees."""
+    world = make_scene("clutter", rng, frames=1)
+    pose = _view(rng, _table(world), rng.uniform(8, 85), rng.uniform(0.65, 1.3))
+    return replace(world, path=(pose,))
+
+
+def _view(rng: Generator, table: Support, elevation: float, distance: float) -> Pose:
+    up, side = np.radians(elevation), rng.uniform(-2.1, -1.0)
+    target = np.array([*rng.uniform(-0.05, 0.05, 2), table.height])
+    flat = np.cos(up)
+    eye = target + distance * np.array([flat * np.cos(side), flat * np.sin(side), np.sin(up)])
+    return looking_at(eye, target, roll=float(np.radians(rng.normal(0, 3))))
+
+
+SCENES: dict[str, Callable[[Generator], World]] = {
+    "covered to four fifths": covered,
+    "cut to a fifth": cut,
+    "8 to 85 degrees": tilted,
+}
+
+
+def view_of(kind: str, seed: int) -> tuple[World, Frame]:
+    """Return a scene of a kind, and one Kinect frame of it."""
+    rng = np.random.default_rng(seed)
+    world = SCENES[kind](rng)
+    return world, render_frame(world, 0, rng=rng, sensor=KINECT)[0]
+
+
+def keeps_table(world: World, found: Scene) -> bool:
+    """Tell whether one of the planes that were found is the table."""
+    pose = inverse(world.path[0])
+    up, height = pose.rotation[:, 2], _table(world).height - world.path[0].translation[2]
+    return any(
+        plane.normal @ up > TILT_COS and abs(plane.offset - height) < HEIGHT_M
+        for plane in found.planes
+    )
+
+
+def _table(world: World) -> Support:
+    return next(support for support in world.supports if support.name == "table")
+
+
+@click.command(help=__doc__)
+@click.option("--first", default=730000, show_default=True, help="Seed of the first scene.")
+@click.option("--count", default=100, show_default=True, help="Scenes of each kind.")
+def main(*, first: int, count: int) -> None:
+    """Print a table of how many keep their plane, and the seeds of those that do not."""
+    rows = []
+    for kind in SCENES:
+        lost = []
+        for seed in range(first, first + count):
+            world, frame = view_of(kind, seed)
+            found = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0))
+            if not keeps_table(world, found):
+                lost.append(seed)
+        rows.append((kind, f"{count - len(lost)} of {count}", " ".join(map(str, lost)) or "-"))
+    title = f"Planes of tables without a hint of up, scenes {first} to {first + count - 1}"
+    print(markdown(title, ("scenes", "table kept", "lost"), rows))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,84 @@
+"""The file of a review. Rerun writes into a pipe, so that an error of the disk is ours to handle.
+
+Rerun's own writer ends with the first error, and whoever logs after that waits for ever.
+"""
+
+import os
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from threading import Thread
+from typing import IO
+
+import rerun as rr
+
+from shapecat.files import replacing
+
+__all__ = ["ReviewFile", "open_review"]
+
+_BLOCK = 1 << 20
+_PATIENCE_S = 60.0
+
+
+class ReviewFile:
+    """Takes what Rerun writes into a pipe to a file, in a thread; after an error it is dropped."""
+
+    def __init__(self, stream: rr.RecordingStream, file: IO[bytes]) -> None:
+        """Let ``stream`` write to ``file``."""
+        self._stream, self._file = stream, file
+        self._error: OSError | None = None
+        with tempfile.TemporaryDirectory(prefix="shapecat-") as folder:
+            pipe = Path(folder) / "review.rrd"
+            os.mkfifo(pipe)
+            self._pipe = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)  # does not wait for a writer
+            stream.save(pipe)
+        os.set_blocking(self._pipe, True)
+        self._thread = Thread(target=self._take, daemon=True)
+        self._thread.start()
+
+    def _take(self) -> None:
+        with os.fdopen(self._pipe, "rb", buffering=0) as pipe:
+            while block := pipe.read(_BLOCK):
+                if self._error is None:
+                    try:
+                        self._file.write(block)
+                    except OSError as error:
+                        self._error = error
+
+    def flush(self) -> None:
+        """Write out what is logged.
+
+        Raises
+        ------
+        OSError : the disk is full or failing.
+        """
+        self._stream.flush(timeout_sec=_PATIENCE_S)
+        self.check()
+
+    def check(self) -> None:
+        """Raise the error that writing has met, if any."""
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        """Write the rest, and end."""
+        self._stream.disconnect()
+        self._thread.join()
+
+
+@contextmanager
+def open_review(path: Path, stream: rr.RecordingStream) -> Iterator[ReviewFile]:
+    """Let a stream write to a file, which appears when the block succeeds.
+
+    Raises
+    ------
+    OutputError : it cannot be written.
+    """
+    with replacing(path) as hidden, hidden.open("wb") as file:
+        review = ReviewFile(stream, file)
+        try:
+            yield review
+        finally:
+            review.close()
+        review.check()

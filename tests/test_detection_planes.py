@@ -1,0 +1,90 @@
+"""Supporting planes where little of them is seen, and nothing is known of the up direction."""
+
+import numpy as np
+import pytest
+
+from benchmarks.planes import keeps_table, view_of
+from shapecat.config import DetectionSettings
+from shapecat.detection import detect
+from shapecat.detection.depth_grid import DepthGrid, downsample
+from shapecat.detection.planes import NO_HINT
+from shapecat.detection.planes.covered import add_covered_planes
+from shapecat.detection.planes.parallel import find_parallel_planes
+from shapecat.detection.planes.ransac import draw_trials
+from shapecat.detection.planes.up_direction import HELD, estimate_up
+from shapecat.simulation.mesh import Mesh, moved, rounded_box
+from shapecat.simulation.paths import looking_at
+from shapecat.simulation.render import geometry, render
+from shapecat.types import Camera, Pose
+
+CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+UP = np.array([0.0, -np.sqrt(0.5), -np.sqrt(0.5)])
+"""Of a camera that looks down by 45 degrees."""
+
+
+def block(x: float, y: float, z: float, size: tuple[float, float, float]) -> Mesh:
+    """Return a box by the middle of its lower face."""
+    return moved(rounded_box(size, fine=1), Pose(np.eye(3), np.array([x, y, z])))
+
+
+def grid_of(meshes: list[Mesh]) -> DepthGrid:
+    """Look down at the origin by 45 degrees from a metre away, without noise."""
+    pose = looking_at(np.array([0, -np.sqrt(0.5), np.sqrt(0.5)]), np.zeros(3))
+    here = Pose(np.eye(3), np.zeros(3))
+    depth = render(geometry([(mesh, here) for mesh in meshes]), CAMERA, pose).depth
+    grid = downsample(depth.astype(np.float32), CAMERA, range_m=2.0)
+    assert grid is not None
+    return grid
+
+
+def tiles(step: float, size: float, height: float) -> list[Mesh]:
+    """Return a table with 5 x 5 boxes on it."""
+    places = (np.arange(5) - 2) * step
+    boxes = [block(x, y, 0, (size, size, height)) for x in places for y in places]
+    return [block(0, 0, -0.03, (5 * step, 5 * step, 0.03)), *boxes]
+
+
+def heights(meshes: list[Mesh]) -> tuple[list[float], list[float]]:
+    """Return the heights of the planes that are found, and what of each is covered."""
+    grid, trials = grid_of(meshes), draw_trials(np.random.default_rng(0))
+    found, covered_m2 = add_covered_planes(grid, find_parallel_planes(grid, UP, trials))
+    return [plane.offset + np.sqrt(0.5) for plane, _ in found], list(covered_m2)
+
+
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [
+        *(("covered to four fifths", seed) for seed in (3, 12, 21, 24)),
+        *(("cut to a fifth", seed) for seed in (1015, 1028)),
+        *(("8 to 85 degrees", seed) for seed in (1, 5)),
+    ],
+)
+def test_table_is_found_without_a_hint(kind: str, seed: int) -> None:
+    """A frame that loses its table loses all objects: for strips, a wall, or a grazing view."""
+    world, frame = view_of(kind, seed)
+    found = detect(frame, settings=DetectionSettings(), rng=np.random.default_rng(0))
+    assert keeps_table(world, found)
+
+
+def test_table_is_found_in_strips_of_three_centimetres() -> None:
+    """They are narrower than what tells a tilt; the tops of the boxes are the largest plane."""
+    found, covered_m2 = heights(tiles(0.16, 0.13, 0.04))
+    np.testing.assert_allclose(found, [0, 0.04], atol=0.004)
+    assert covered_m2[0] > 0.1
+    assert covered_m2[1] == 0
+
+
+def test_lid_under_a_box_is_not_covered() -> None:
+    """It has nothing below and a top above it as a table has, but it is seen whole."""
+    boxes = [block(0, 0, 0, (0.3, 0.3, 0.2)), block(0.05, 0.05, 0.2, (0.2, 0.2, 0.05))]
+    _, covered_m2 = heights([block(0, 0, -0.03, (1.2, 1.0, 0.03)), *boxes])
+    assert covered_m2 == [0] * len(covered_m2)
+    assert len(covered_m2) > 1
+
+
+def test_camera_upside_down_is_believed_where_nothing_speaks_against_it() -> None:
+    """How cameras are held is no more than a prior: a table alone is level however it is seen."""
+    grid = grid_of([block(0, 0, -0.03, (1.2, 1.0, 0.03))])
+    turned = grid._replace(inverse_depth=np.ascontiguousarray(grid.inverse_depth[::-1, ::-1]))
+    up = estimate_up(turned, NO_HINT, draw_trials(np.random.default_rng(0)), HELD)
+    assert up @ [0, -UP[1], UP[2]] > np.cos(np.radians(2))
