@@ -14,7 +14,18 @@ from .render import progress_bars
 @click.option(
     "--scene",
     type=click.Choice(
-        ["tabletop", "shelf", "clutter", "turntable", "walking", "crossing", "rearranged"]
+        [
+            "tabletop",
+            "shelf",
+            "clutter",
+            "pile",
+            "bin",
+            "shelf_bin",
+            "turntable",
+            "walking",
+            "crossing",
+            "rearranged",
+        ]
     ),
     default="tabletop",
     show_default=True,

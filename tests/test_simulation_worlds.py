@@ -25,7 +25,8 @@ from shapecat.simulation.sensors import IDEAL, KINECT
 from shapecat.simulation.truth import robot_links
 from shapecat.types import CATEGORIES, Camera, Pose
 
-KINDS: tuple[SceneKind, ...] = get_args(SceneKind)
+SETTLED = {"pile", "bin", "shelf_bin"}  # by physics: things touch, and lie in each other
+KINDS: tuple[SceneKind, ...] = tuple(k for k in get_args(SceneKind) if k not in SETTLED)
 
 
 @pytest.fixture(scope="module", params=[(kind, seed) for kind in KINDS for seed in (1, 2)], ids=str)

@@ -126,11 +126,12 @@ def _start(drop: Drop, points: F8, there: Sequence[F8]) -> Pose:
     middle = (turned.min(axis=0) + turned.max(axis=0)) / 2
     shift = np.array([*drop.place, 0.0]) - [*middle[:2], turned[:, 2].min()]
     low, high = turned.min(axis=0)[:2] + shift[:2], turned.max(axis=0)[:2] + shift[:2]
-    top = max(
+    below = [
         float(other[:, 2].max())
         for other in there
         if (other[:, :2].min(axis=0) < high).all() and (other[:, :2].max(axis=0) > low).all()
-    )
+    ]
+    top = max(below, default=0.0)
     return Pose(drop.rotation, shift + np.array([0, 0, top + _CLEAR_M]))
 
 

@@ -153,8 +153,6 @@ def _thing(
     track: int, item: _Item, rest: Rest, below: Support, tracks: F8, bearer: int | None
 ) -> Thing:
     axes = rest.pose.rotation[2]  # heights of the thing's own axes
-    upright = axes[2] > _UPRIGHT_COS
-    straight = np.abs(axes).max() > _UPRIGHT_COS
     return Thing(
         track,
         item.category,
@@ -163,7 +161,7 @@ def _thing(
         rest.pose,
         below.name if bearer is None else None,
         None if bearer is None else int(tracks[bearer]),
-        lying=item.category != "box" and abs(axes[2]) < _LYING_COS,
-        upside_down=axes[2] < -_UPRIGHT_COS,
-        tilted=not (upright or straight),
+        lying=bool(item.category != "box" and abs(axes[2]) < _LYING_COS),
+        upside_down=bool(axes[2] < -_UPRIGHT_COS),
+        tilted=bool(np.abs(axes).max() < _UPRIGHT_COS),
     )

@@ -1,0 +1,158 @@
+"""Scenes that physics makes: what is hollow stays hollow, and truth tells what bears what."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+
+from shapecat.geometry import rotation_from_quaternion, transform
+from shapecat.simulation import make_scene, render_frame, simulate
+from shapecat.simulation.closed_shapes import make_ball, make_box
+from shapecat.simulation.convex_parts import convex_parts, hollowness
+from shapecat.simulation.mesh import Mesh, lathe, rounded_box
+from shapecat.simulation.physics import Drop, settle
+from shapecat.simulation.scenes import SceneKind
+from shapecat.simulation.shapes import make_object
+from shapecat.types import Pose
+
+SETTLED: tuple[SceneKind, ...] = ("pile", "bin", "shelf_bin")
+QUARTER = rotation_from_quaternion([0, 0, np.sin(0.3), np.cos(0.3)])
+"""A turn about the vertical that is no symmetry of a box."""
+
+
+def table(height: float = 0.7) -> Mesh:
+    """Return a slab whose top is at a height."""
+    slab = rounded_box([1.2, 0.8, 0.03], fine=1)
+    return Mesh(slab.vertices + np.array([0, 0, height - 0.03]), slab.triangles)
+
+
+@pytest.mark.parametrize("category", ["cup", "bowl", "plate"])
+def test_open_shapes_are_cut_into_parts_and_closed_ones_are_not(category: str) -> None:
+    """As its convex hull a cup would be full, and nothing could lie in it."""
+    for seed in range(5):
+        rng = np.random.default_rng(seed)
+        assert hollowness(make_object(category, rng)) > 0.25
+        assert len(convex_parts(make_object(category, rng))) > 10
+        for closed in ("box", "can", "bottle", "ball"):
+            assert len(convex_parts(make_object(closed, rng))) == 1
+
+
+def test_parts_cover_the_surface_and_leave_the_inside_open() -> None:
+    """A hole in a wall lets things fall out; a filled corner holds them up."""
+    cup = lathe([[0, 0], [0.05, 0], [0.05, 0.12], [0.046, 0.12], [0.046, 0.005], [0, 0.005]])
+    hulls = [ConvexHull(part).equations for part in convex_parts(cup)]
+
+    def depth(points: np.ndarray) -> np.ndarray:
+        """Return how deep points (n, 3) lie in the parts, metres; negative outside."""
+        return np.asarray(
+            np.max([-(points @ h[:, :3].T + h[:, 3]).max(axis=1) for h in hulls], axis=0)
+        )
+
+    assert depth(np.asarray(cup.vertices, np.float64)).min() > -0.002
+    inside = np.array([[0, 0, 0.04], [0.02, 0.01, 0.06], [-0.015, 0.02, 0.09]])
+    assert depth(inside).max() < -0.005
+
+
+def test_ball_that_is_dropped_into_a_cup_lies_in_it() -> None:
+    """The cup bears it, not the table."""
+    cup = lathe([[0, 0], [0.05, 0], [0.05, 0.1], [0.046, 0.1], [0.046, 0.005], [0, 0.005]])
+    ball = make_ball(np.random.default_rng(1))
+    ball = Mesh(ball.vertices * (0.05 / ball.extents.max()), ball.triangles)
+    place = np.array([0.11, -0.07])
+    first, second = settle([table()], [Drop(cup, QUARTER, place), Drop(ball, np.eye(3), place)])
+    middle = transform(second.pose, ball.vertices).mean(axis=0)
+    assert (first.bearer, second.bearer) == (None, 0)
+    assert np.hypot(*(middle[:2] - place)) < 0.03
+    assert 0.7 < transform(second.pose, ball.vertices)[:, 2].min() < 0.72
+
+
+def test_box_on_a_box_is_borne_by_it() -> None:
+    """Relations of objects are judged by this."""
+    low, high = rounded_box([0.12, 0.09, 0.07]), rounded_box([0.05, 0.06, 0.04])
+    place = np.array([-0.2, 0.13])
+    first, second = settle([table()], [Drop(low, QUARTER, place), Drop(high, QUARTER, place)])
+    assert (first.bearer, second.bearer) == (None, 0)
+    np.testing.assert_allclose(first.pose.translation, [-0.2, 0.13, 0.7], atol=2e-3)
+    np.testing.assert_allclose(second.pose.translation, [-0.2, 0.13, 0.77], atol=3e-3)
+    np.testing.assert_allclose(second.pose.rotation, QUARTER, atol=0.02)
+
+
+def test_what_misses_the_table_falls() -> None:
+    box = make_box(np.random.default_rng(2))
+    (rest,) = settle([table()], [Drop(box, np.eye(3), np.array([0.9, 0.0]))])
+    assert transform(rest.pose, box.vertices)[:, 2].max() < 0.5
+
+
+@pytest.mark.parametrize("kind", SETTLED)
+def test_settled_scenes_are_the_same_again(kind: SceneKind) -> None:
+    """Training and judging name their scenes by seeds."""
+    one, other = (make_scene(kind, np.random.default_rng(4), frames=2) for _ in range(2))
+    assert len(one.things) == len(other.things) > 2
+    for a, b in zip(one.things, other.things, strict=True):
+        assert np.array_equal(a.pose.translation, b.pose.translation)
+        assert np.array_equal(a.pose.rotation, b.pose.rotation)
+
+
+@pytest.mark.parametrize("kind", SETTLED)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_things_lie_on_their_support_and_not_in_each_other(kind: SceneKind, seed: int) -> None:
+    world = make_scene(kind, np.random.default_rng(seed), frames=1)
+    solids = [
+        (transform(thing.pose, thing.mesh.vertices), [moved_part(p, thing.pose) for p in parts])
+        for thing in world.things
+        for parts in [convex_parts(thing.mesh)]
+    ]
+    support = next(s for s in world.supports if s.name == world_support(world.kind))
+    for points, _ in solids:
+        assert points[:, 2].min() > support.height - 0.02  # it may hang over an edge
+    for i, (points, _) in enumerate(solids):
+        for j, (_, parts) in enumerate(solids):
+            if i == j:
+                continue
+            for part in parts:
+                hull = ConvexHull(part).equations
+                inside = -(points @ hull[:, :3].T + hull[:, 3]).max(axis=1)
+                assert inside.max() < 0.006, (i, j)
+
+
+def moved_part(part: np.ndarray, pose: Pose) -> np.ndarray:
+    return np.asarray(transform(pose, part), np.float64)
+
+
+def world_support(kind: str) -> str:
+    return {"pile": "table", "bin": "bin", "shelf_bin": "board_1"}[kind]
+
+
+def test_tilted_things_are_told_from_straight_ones() -> None:
+    """Categories of tilted things are judged apart."""
+    tilted = straight = 0
+    for seed in range(4):
+        for thing in make_scene("pile", np.random.default_rng(seed), frames=1).things:
+            upright = np.degrees(np.arccos(np.clip(np.abs(thing.pose.rotation[2]).max(), 0, 1)))
+            assert thing.tilted == (upright > 15)
+            tilted += thing.tilted
+            straight += not thing.tilted
+    assert tilted > 3
+    assert straight > 10
+
+
+def test_truth_of_a_pile_is_written(tmp_path: Path) -> None:
+    """It is JSON, and its relations name tracks that are listed."""
+    path = simulate(tmp_path / "pile.mcap", scene="pile", frames=2, seed=4)
+    first, _ = json.loads(path.with_suffix(".truth.json").read_text("utf-8"))
+    things = {o["track"]: o for o in [*first["objects"], *first["hidden"]]}
+    assert len(things) > 3
+    for thing in things.values():
+        assert (thing["on_support"] is None) != (thing["on_track"] is None)
+        assert thing["on_track"] is None or thing["on_track"] in things
+        assert isinstance(thing["tilted"], bool)
+
+
+@pytest.mark.parametrize("kind", SETTLED)
+def test_the_camera_sees_what_was_dropped(kind: SceneKind) -> None:
+    world = make_scene(kind, np.random.default_rng(3), frames=3)
+    _, labels = render_frame(world, 1, rng=np.random.default_rng(0))
+    seen = set(np.unique(labels).tolist())
+    assert sum(thing.label in seen for thing in world.things) > 0.5 * len(world.things)
