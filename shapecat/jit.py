@@ -28,19 +28,12 @@ _SHARED = tuple(_HERE / name for name in ("geometry.py", "jit.py", "triangles.py
 """Files beside this one whose kernels stages call."""
 
 
-def kernel(
-    function: _F | None = None,
-    *,
-    fast: bool = False,
-    inline: bool = False,  # noqa: ARG001
-    leaf: bool = False,  # noqa: ARG001
-) -> Any:
+def kernel(function: _F | None = None, *, fast: bool = False) -> Any:
     """Compile a function of numbers and arrays on its first call.
 
     Parameters
     ----------
     fast : let the compiler reorder sums. Only for kernels that never meet NaN.
-    inline, leaf : without effect; they go with the kernels of detection that still name them.
     """
 
     def compile_later(target: _F) -> Any:

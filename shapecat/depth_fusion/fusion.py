@@ -182,7 +182,7 @@ def _add_moved(guide: F4, before: F4, lens: F4, shift: F4, total: F4, count: F4)
                     wanted[u] = found
 
 
-@kernel(inline=True)
+@kernel
 def _place(wanted: F4, v: int, lens: F4, shift: F4, x: F4, y: F4, z: F4) -> None:
     """Write where the points of a row of pixels are in the earlier image: pixels and depth."""
     least = np.float32(NEAREST_M)
@@ -197,7 +197,7 @@ def _place(wanted: F4, v: int, lens: F4, shift: F4, x: F4, y: F4, z: F4) -> None
         y[u] = (depth * (lens[1, 0] * column + b) + shift[1]) * inverse
 
 
-@kernel(inline=True)
+@kernel
 def _read(before: F4, x: float, y: float) -> Any:
     """Interpolate between the four readings around a place; 0 where most of them is missing."""
     rows, columns = before.shape
