@@ -318,16 +318,9 @@ def _followed(
     z += rise * up[2]
     if z <= NEAREST_M:
         return -1
-    v, u = (
-        int(intrinsics.cy + intrinsics.fy * y / z + 0.5),
-        int(intrinsics.cx + intrinsics.fx * x / z + 0.5),
-    )
-    if (
-        v < 0
-        or u < 0
-        or v >= inv_depth.shape[0]
-        or u >= inv_depth.shape[1]
-        or abs(inv_depth[v, u] - 1 / z) >= DISCONTINUITY
-    ):
+    v = int(intrinsics.cy + intrinsics.fy * y / z + 0.5)
+    u = int(intrinsics.cx + intrinsics.fx * x / z + 0.5)
+    rows, columns = inv_depth.shape
+    if v < 0 or u < 0 or v >= rows or u >= columns:
         return -1
-    return int(v * inv_depth.shape[1] + u)
+    return int(v * columns + u) if abs(inv_depth[v, u] - 1 / z) < DISCONTINUITY else -1

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.detection.depth_grid import DepthGrid, row_and_column
+from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.foreground.convex_hull import fill_hull
 from shapecat.detection.foreground.depth_error import (
     APART,
@@ -20,8 +20,8 @@ from shapecat.detection.foreground.depth_error import (
     measure_noise,
     measure_residual,
 )
+from shapecat.detection.foreground.outline import is_object, measure_outline, width_of_part
 from shapecat.detection.planes.height_map import HeightMap
-from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel, unset
 
 __all__ = ["find_low_profile"]
@@ -35,15 +35,6 @@ STEP, STEADY, SLIP = 0.002, 3.5, 0.7
 cells of the plane that are as far apart; and as a share of what the plane itself rises in a cell,
 for where it is seen at a grazing angle readings that are a little beside their place seem to
 rise."""
-STEEP, STEEP_SHARE = 0.5, 0.7
-"""A rise that is more than noise, as a share of the mean, and the share of the outline that has
-it."""
-MOST_STEPS = 3
-"""A place counts for at most so many times the mean rise."""
-ALL_AROUND = 0.75
-"""Least sum of the rises for each side of the outline, whether it looks at the plane or not."""
-CHANCE = 16
-"""A short outline must rise more, by this over its sides: few waves rise all around."""
 GROWN = 0.95
 """Rise per side of a part that replaces known objects within it, as a share of the greatest of
 theirs: an object and a swell beside it rise less."""
@@ -51,19 +42,9 @@ SIDE = 0.004
 """Rise over two cells of the side of something, 1/m."""
 SAME = 0.9
 """Share of the cells of a part from which it is a known object."""
-INWARD = 2
-OUTWARD = APART - INWARD
-"""Cells from the outline to where its rise is measured."""
-LEAST_CELLS, LEAST_SIDES, SMALL_PART = 80, 30, 12
-ALONG, KNOWN, BESIDE = 0.4, 0.65, 0.3
-"""Shares of an outline: of an object, least along the plane, and, of what nothing hides, least
-along the plane, in touch with what is not low, or before something farther; of a swell, least along
-the plane."""
-BROAD = 1.5
-"""Cells for each side of the outline of what may be partly hidden: strips beside something else
-are narrower."""
-RAGGED = 80
-"""Square of the sides by the cells of what only fills a gap: 16 of a square, 50 of a crescent."""
+LEAST_CELLS, SMALL_PART = 80, 12
+BESIDE = 0.3
+"""Least share of the outline of a swell that is along the plane."""
 BLOCK = 16
 """Cells that are looked at together: most are not above any level."""
 
@@ -131,18 +112,9 @@ def find_low_profile(
         clear = max(STEP, STEADY * measure_noise(high_pass, plane_ids, number))
         step = max(clear, SLIP * math.hypot(plane[0], plane[1]))
         least = np.float32(min(clear, FINE))
+        bounds = (step, least, widest)
         objects, parts = _raise(
-            values,
-            high_pass,
-            plane_ids,
-            number,
-            step,
-            least,
-            marks,
-            widest,
-            objects,
-            parts,
-            scratch,
+            values, high_pass, plane_ids, number, bounds, marks, objects, parts, scratch
         )
         parts = _lower(values, residual, plane_ids, number, step, marks, parts, scratch)
 
@@ -174,10 +146,8 @@ def _raise(
     high_pass: F4,
     plane_id: I4,
     number: int,
-    rise_least: float,
-    level_least: float,
+    bounds: tuple[float, float, float],
     low_profile: I4,
-    widest: float,
     objects: int,
     me: int,
     scratch: Scratch,
@@ -185,9 +155,10 @@ def _raise(
     """Mark the parts above each level, filled, whose outline is that of an object.
 
     They are numbered from ``objects`` + 1 on, the parts that are looked at from ``me`` + 1 on.
-    Returns the last numbers. ``high_pass`` (rows, columns) is from `filter_high_pass`;
-    ``level_least`` is what `LEVELS` are multiples of, 1/m.
+    Returns the last numbers. ``high_pass`` (rows, columns) is from `filter_high_pass`; ``bounds``
+    are the least mean rise and what `LEVELS` are multiples of, 1/m, and the greatest width.
     """
+    rise_least, level_least, widest = bounds
     flat, marks, plane_ids = high_pass.reshape(-1), low_profile.reshape(-1), plane_id.reshape(-1)
     seen, part, seeds, stack = scratch
     visited, parts = seen.reshape(-1), part.reshape(-1)
@@ -208,16 +179,16 @@ def _raise(
                 parts[p] = me
                 known += marks[p] > 0
                 best = max(best, merits[marks[p]])
-            if known > SAME * count or _width(inv_depth, stack, count) > widest:
+            if known > SAME * count or width_of_part(inv_depth, stack, count) > widest:
                 continue
             filled = fill_hull(high_pass, part, stack, count)
-            outline = _outline(
+            outline = measure_outline(
                 inv_depth, high_pass, plane_id, part, stack, filled, number, rise_least
             )
             for p in stack[count:filled]:
                 best = max(best, merits[marks[p]])
             merit = outline.rise / outline.sides
-            if merit > GROWN * best and _is_object(outline, filled):
+            if merit > GROWN * best and is_object(outline, filled):
                 objects += 1
                 merits[objects] = merit
                 for p in stack[:filled]:
@@ -255,50 +226,6 @@ def _find_seeds(high_pass: F4, least: float, seeds: I4) -> int:
     return n
 
 
-class Outline(NamedTuple):
-    """What is known of an outline.
-
-    Attributes
-    ----------
-    sides : sides of cells; ``table`` of them look at the plane; ``known`` are these, those that
-        touch what is not low, and those before something farther; ``hidden`` end at something
-        nearer or where nothing is seen.
-    rise : sum of the rises of the ``table`` sides, as multiples of the least mean rise.
-    steep : how many of them are steep.
-    """
-
-    sides: int
-    table: int
-    known: int
-    hidden: int
-    rise: float
-    steep: int
-
-
-@kernel
-def _width(inv_depth: F4, stack: I4, count: int) -> float:
-    """Return the extent of a part along the rows, in cells a metre away."""
-    columns = inv_depth.shape[1]
-    first, last = columns, 0
-    for p in stack[:count]:
-        _, j = row_and_column(p, columns)
-        first, last = min(first, j), max(last, j)
-    return float((last - first) / inv_depth[stack[0] // columns, stack[0] % columns])
-
-
-@kernel
-def _is_object(outline: Outline, count: int) -> bool:
-    """Whether an outline around so many cells is that of an object."""
-    table, sides = outline.table, outline.sides
-    if table < KNOWN * sides and sides * sides > RAGGED * count:
-        return False
-    seen = sides - (outline.hidden if count > BROAD * sides else 0)
-    if table < max(LEAST_SIDES, ALONG * sides) or outline.known < KNOWN * seen:
-        return False
-    least = max(table * (1 + CHANCE / sides), ALL_AROUND * sides)
-    return bool(outline.rise > least and outline.steep > STEEP_SHARE * table)
-
-
 @kernel
 def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) -> int:
     """Give the connected cells above ``level`` the number ``n``; return how many.
@@ -320,59 +247,6 @@ def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) 
             stack[top] = q
             top += int(new)
     return top
-
-
-@kernel
-def _outline(
-    inv_depth: F4,
-    residual: F4,
-    plane_id: I4,
-    part: I4,
-    stack: I4,
-    count: int,
-    number: int,
-    rise_least: float,
-) -> Outline:
-    """Measure the outline of a part."""
-    rows, columns = residual.shape
-    parts = part.reshape(-1)
-    sides = table = known = hidden = steep = 0
-    rise = 0.0
-    me = parts[stack[0]]
-    for t in range(count):
-        p = stack[t]
-        beside = (parts[p - 1] == me) & (parts[p + 1] == me)
-        if beside & (parts[p - columns] == me) & (parts[p + columns] == me):
-            continue
-        for d in range(4):
-            di = 1 if d == 0 else -1 if d == 1 else 0
-            dj = 1 if d == 2 else -1 if d == 3 else 0
-            if parts[p + di * columns + dj] == me:
-                continue
-            i, j = row_and_column(p, columns)
-            sides += 1
-            y, x = i + di, j + dj
-            known += (
-                residual[y, x] == 0
-                and inv_depth[y, x] > 0
-                and abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY
-            )
-            hidden += inv_depth[y, x] <= 0 or inv_depth[y, x] > inv_depth[i, j] + DISCONTINUITY
-            y, x = i + OUTWARD * di, j + OUTWARD * dj
-            v, u = i - INWARD * di, j - INWARD * dj
-            if min(y, x) < 0 or min(v, u) < 0 or max(y, v) >= rows or max(x, u) >= columns:
-                continue
-            known += 0 < inv_depth[y, x] < inv_depth[i, j] - DISCONTINUITY
-            if plane_id[y, x] != -number or residual[y, x] == 0 or abs(plane_id[v, u]) != number:
-                continue
-            table += 1
-            known += 1
-            step = (residual[v, u] - residual[y, x]) / rise_least
-            if residual[v, u] == 0:  # the inside is not low
-                step = MOST_STEPS
-            rise += min(step, MOST_STEPS)
-            steep += int(step > STEEP)
-    return Outline(sides, table, known, hidden, rise, steep)
 
 
 @kernel
@@ -415,7 +289,9 @@ def _lower(
         count = _flood(above, np.uint8(0), s, me, part, stack)
         if count < SMALL_PART:
             continue
-        line = _outline(inv_depth, residual, plane_id, part, stack, count, number, rise_least)
+        line = measure_outline(
+            inv_depth, residual, plane_id, part, stack, count, number, rise_least
+        )
         if line.table >= BESIDE * line.sides and line.rise < line.table:
             for t in range(count):
                 plane_ids[stack[t]] = -number

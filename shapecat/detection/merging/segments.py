@@ -107,16 +107,8 @@ def measure_segments(
 ) -> Segments:
     """Collect the shapes of segments 1..n; `measure_adjacency` adds what they meet."""
     segments: Segments = _blank(n + 1)
-    _measure(
-        grid.inverse_depth,
-        grid.intrinsics,
-        heights,
-        graph,
-        labels,
-        up,
-        lateral_axis(up),
-        segments,
-    )
+    axis, intrinsics = lateral_axis(up), grid.intrinsics
+    _measure(grid.inverse_depth, intrinsics, heights, graph, labels, up, axis, segments)
     return segments
 
 

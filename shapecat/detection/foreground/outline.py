@@ -1,0 +1,130 @@
+"""Outlines of parts of a plane: an object rises along its own in a step, a swell does not."""
+
+from typing import NamedTuple
+
+from shapecat.arrays import F4, I4
+from shapecat.detection.depth_grid import row_and_column
+from shapecat.detection.foreground.depth_error import APART
+from shapecat.geometry import DISCONTINUITY
+from shapecat.jit import kernel
+
+__all__ = ["Outline", "is_object", "measure_outline", "width_of_part"]
+
+STEEP, STEEP_SHARE = 0.5, 0.7
+"""A rise that is more than noise, as a share of the mean, and the share of the outline that has
+it."""
+MOST_STEPS = 3
+"""A place counts for at most so many times the mean rise."""
+ALL_AROUND = 0.75
+"""Least sum of the rises for each side of the outline, whether it looks at the plane or not."""
+CHANCE = 16
+"""A short outline must rise more, by this over its sides: few waves rise all around."""
+INWARD = 2
+OUTWARD = APART - INWARD
+"""Cells from the outline to where its rise is measured."""
+LEAST_SIDES = 30
+ALONG, KNOWN = 0.4, 0.65
+"""Shares of an outline: least along the plane, and, of what nothing hides, least along the plane,
+in touch with what is not low, or before something farther."""
+BROAD = 1.5
+"""Cells for each side of the outline of what may be partly hidden: strips beside something else
+are narrower."""
+RAGGED = 80
+"""Square of the sides by the cells of what only fills a gap: 16 of a square, 50 of a crescent."""
+
+
+class Outline(NamedTuple):
+    """What is known of an outline.
+
+    Attributes
+    ----------
+    sides : sides of cells; ``table`` of them look at the plane; ``known`` are these, those that
+        touch what is not low, and those before something farther; ``hidden`` end at something
+        nearer or where nothing is seen.
+    rise : sum of the rises of the ``table`` sides, as multiples of the least mean rise.
+    steep : how many of them are steep.
+    """
+
+    sides: int
+    table: int
+    known: int
+    hidden: int
+    rise: float
+    steep: int
+
+
+@kernel
+def width_of_part(inv_depth: F4, stack: I4, count: int) -> float:
+    """Return the extent of a part along the rows, in cells a metre away."""
+    columns = inv_depth.shape[1]
+    first, last = columns, 0
+    for p in stack[:count]:
+        _, j = row_and_column(p, columns)
+        first, last = min(first, j), max(last, j)
+    return float((last - first) / inv_depth[stack[0] // columns, stack[0] % columns])
+
+
+@kernel
+def is_object(outline: Outline, count: int) -> bool:
+    """Whether an outline around so many cells is that of an object."""
+    table, sides = outline.table, outline.sides
+    if table < KNOWN * sides and sides * sides > RAGGED * count:
+        return False
+    seen = sides - (outline.hidden if count > BROAD * sides else 0)
+    if table < max(LEAST_SIDES, ALONG * sides) or outline.known < KNOWN * seen:
+        return False
+    least = max(table * (1 + CHANCE / sides), ALL_AROUND * sides)
+    return bool(outline.rise > least and outline.steep > STEEP_SHARE * table)
+
+
+@kernel
+def measure_outline(
+    inv_depth: F4,
+    residual: F4,
+    plane_id: I4,
+    part: I4,
+    stack: I4,
+    count: int,
+    number: int,
+    rise_least: float,
+) -> Outline:
+    """Measure the outline of a part."""
+    rows, columns = residual.shape
+    parts = part.reshape(-1)
+    sides = table = known = hidden = steep = 0
+    rise = 0.0
+    me = parts[stack[0]]
+    for t in range(count):
+        p = stack[t]
+        beside = (parts[p - 1] == me) & (parts[p + 1] == me)
+        if beside & (parts[p - columns] == me) & (parts[p + columns] == me):
+            continue
+        for d in range(4):
+            di = 1 if d == 0 else -1 if d == 1 else 0
+            dj = 1 if d == 2 else -1 if d == 3 else 0
+            if parts[p + di * columns + dj] == me:
+                continue
+            i, j = row_and_column(p, columns)
+            sides += 1
+            y, x = i + di, j + dj
+            known += (
+                residual[y, x] == 0
+                and inv_depth[y, x] > 0
+                and abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY
+            )
+            hidden += inv_depth[y, x] <= 0 or inv_depth[y, x] > inv_depth[i, j] + DISCONTINUITY
+            y, x = i + OUTWARD * di, j + OUTWARD * dj
+            v, u = i - INWARD * di, j - INWARD * dj
+            if min(y, x) < 0 or min(v, u) < 0 or max(y, v) >= rows or max(x, u) >= columns:
+                continue
+            known += 0 < inv_depth[y, x] < inv_depth[i, j] - DISCONTINUITY
+            if plane_id[y, x] != -number or residual[y, x] == 0 or abs(plane_id[v, u]) != number:
+                continue
+            table += 1
+            known += 1
+            step = (residual[v, u] - residual[y, x]) / rise_least
+            if residual[v, u] == 0:  # the inside is not low
+                step = MOST_STEPS
+            rise += min(step, MOST_STEPS)
+            steep += int(step > STEEP)
+    return Outline(sides, table, known, hidden, rise, steep)
