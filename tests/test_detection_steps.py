@@ -22,7 +22,7 @@ from shapecat.detection.planes.ransac import (
     sample_grid,
 )
 from shapecat.detection.segmentation.connectivity import connect_surfaces
-from shapecat.detection.segmentation.watershed import relabel, watershed
+from shapecat.detection.segmentation.watershed import _flat_parts, relabel, watershed
 from shapecat.types import Camera
 
 Floats = NDArray[np.float32]
@@ -102,6 +102,16 @@ def test_two_faces_are_parted_where_they_meet_at_a_concave_edge(rise: float, seg
     assert n == segments
     assert (labels[90:150, 120:200] > 0).all()
     assert (labels[90, 120] != labels[149, 120]) == (segments == 2)
+
+
+def test_speckle_fits_into_memory() -> None:
+    """In noise no cell is linked with another; each begins a part of its own."""
+    cells = np.ones((9, 8), np.int8)
+    labels, spans = np.zeros((9, 8), np.int16), np.tile(np.array([[0, 8]], np.int32), (9, 1))
+    none, part = np.zeros((9, 8), np.uint8), np.zeros((9, 8), np.int32)
+    # Python checks what machine code does not: whether an index is within its array.
+    assert _flat_parts.py_func(cells, spans, none, none, labels, 0, part) == 0
+    assert not labels.any()
 
 
 def test_relabel_keeps_what_is_none() -> None:
