@@ -12,7 +12,7 @@ from shapecat.detection.foreground.convex_hull import fill_hull
 from shapecat.detection.merging.pair_features import FEATURES, PAIR_FEATURES
 from shapecat.detection.merging.segments import PAIR, SEGMENT, add_statistics
 from shapecat.detection.planes import find_supporting_planes
-from shapecat.detection.planes.height_map import HeightMap, measure_heights
+from shapecat.detection.planes.height_map import HeightMap, measure_heights, pack_planes
 from shapecat.detection.planes.ransac import (
     draw_trials,
     horizontal_plane,
@@ -74,7 +74,8 @@ def test_heights_of_a_board_with_an_edge() -> None:
     inv_depth[100:140, 280:300] = table(0.62)[100:140, 280:300]  # and one in the air beside
     trials = draw_trials(np.random.default_rng(0))
     grid = DepthGrid(board, INTRINSICS, 2, 0.0035)
-    found, _, planes = find_supporting_planes(grid, UP, trials, tallest_m=0.5, upright=True)
+    found, _ = find_supporting_planes(grid, UP, trials, tallest_m=0.5, upright=True)
+    planes = pack_planes(found, INTRINSICS)
     assert len(found) == 1
     heights = measure_heights(DepthGrid(inv_depth, INTRINSICS, 2, 0.0035), planes, 0.6)
     assert (heights.plane_id[105:135, 85:115] == 1).all()
