@@ -13,9 +13,10 @@ from shapecat.evaluation import View, evaluate
 from shapecat.evaluation.training import fit_views
 from shapecat.evaluation.views import describe_views
 from shapecat.learning import Categorizer, load_model, save_model
+from shapecat.models.arrangements import World
 from shapecat.models.fragments import cut_fragment, cut_halo
 from shapecat.models.training import Simulated, collect
-from shapecat.models.worlds import World, simulate_views, simulate_world
+from shapecat.models.worlds import simulate_views, simulate_world
 from shapecat.types import CATEGORIES
 
 DATA = Path(__file__).parents[2] / "shared" / "data"

@@ -1,8 +1,8 @@
-"""Simulated tables with known objects: the views a model is trained and judged on."""
+"""Views of simulated objects: what a model is trained and judged on."""
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from typing import NamedTuple
@@ -13,75 +13,44 @@ from shapecat.arrays import F4, F8, I4
 from shapecat.config import Settings
 from shapecat.detection import detect
 from shapecat.evaluation import View
-from shapecat.evaluation.report import UNKNOWN
 from shapecat.evaluation.views import describe_view
 from shapecat.geometry import (
     IDENTITY,
     inverse,
     level_from_sensor,
-    rotation_from_quaternion,
     transform,
 )
 from shapecat.learning.baselines import shape_functions
+from shapecat.models.arrangements import ALONE, Actor, Arrangement, World, arrange, placed
 from shapecat.models.fragments import cut_fragment, cut_halo
-from shapecat.simulation.distractors import make_distractor
-from shapecat.simulation.mesh import Mesh, moved, rounded_box, standing
+from shapecat.simulation.mesh import Mesh, moved
 from shapecat.simulation.paths import looking_at
-from shapecat.simulation.placement import Rest, choose_rest, rests, turn_about_z
+from shapecat.simulation.placement import Rest
 from shapecat.simulation.render import Geometry, geometry, render
-from shapecat.simulation.sensors import KINECT, REALSENSE, measure
-from shapecat.simulation.shapes import make_object
+from shapecat.simulation.sensors import KINECT, REALSENSE, Sensor, measure
 from shapecat.surface import voxelize
-from shapecat.types import CATEGORIES, Camera, Frame, Pose, Scene
+from shapecat.types import Camera, Frame, Pose, Scene
 
-__all__ = ["World", "WorldView", "simulate_mesh", "simulate_views", "simulate_world"]
+__all__ = ["WorldView", "simulate_mesh", "simulate_views", "simulate_world"]
 
 _FEWEST_PIXELS = 80
 _LEAST_VISIBLE = 0.3
 _OVERLAP = 0.5
 _FRAGMENTS = 0.4
-_TABLE_M = (1.6, 1.2, 0.03)
 _COARSE = 4
 """Visible shares are judged in images this many times smaller."""
-_MANNERS = {
-    "cup": {"upright": 0.78, "lying": 0.12, "upside_down": 0.1},
-    "can": {"upright": 0.8, "lying": 0.2},
-    "bottle": {"upright": 0.8, "lying": 0.2},
-    "bowl": {"upright": 0.92, "upside_down": 0.08},
-    "plate": {"upright": 0.95, "upside_down": 0.05},
-    "box": {"upright": 0.5, "lying": 0.5},
-    UNKNOWN: {"upright": 0.7, "lying": 0.3},
-}
-_ROUND = {"cup", "can", "bottle"}
+_SCALES = (0.5, 1.0, 1.0, 1.0, 1.5)
+"""Resolutions of the sensors, as multiples of their own."""
 _SETTINGS = Settings()
-
-
-@dataclass(frozen=True)
-class World:
-    """What kind of tables are simulated.
-
-    ``kinds`` are the distractors to choose from, ``unknown`` their share of the objects;
-    ``lying`` the share of cups, cans and bottles that lie, if not the usual one: they are harder
-    than others, so one learns from more of them; ``leaning`` the share of objects that lean on
-    something unseen. ``keep`` keeps the clouds of the views.
-    """
-
-    seed: int
-    kinds: tuple[str, ...]
-    unknown: float = 0.17
-    lying: float | None = None
-    leaning: float = 0.0
-    cameras: int = 4
-    keep: bool = False
 
 
 class WorldView(NamedTuple):
     """One described view and its circumstances.
 
-    ``manner`` is upright, lying or upside_down; ``source`` truth, detected or fragment; ``visible``
-    the share of its pixels that has readings, ``overlap`` how well it was cut: what its points and
-    those readings share of what either covers; ``functions`` plain shape functions; ``view`` the
-    voxels, where they are kept.
+    ``manner`` is upright, lying, upside_down, leaning or tilted; ``source`` truth, detected or
+    fragment; ``visible`` the share of its pixels that has readings, ``overlap`` how well it was
+    cut: what its points and those readings share of what either covers; ``functions`` plain shape
+    functions; ``view`` the voxels, where they are kept.
     """
 
     descriptor: F4
@@ -99,15 +68,6 @@ class WorldView(NamedTuple):
     view: View | None
 
 
-class _Actor(NamedTuple):
-    """An object on the table: its mesh in the table's frame, where it stands, what it is."""
-
-    mesh: Mesh
-    label: str
-    manner: str
-    support_m: float
-
-
 class _Shot(NamedTuple):
     """One image of a world: the frame, its truth, and where the camera was."""
 
@@ -121,7 +81,7 @@ class _Shot(NamedTuple):
 class _Seen(NamedTuple):
     """An object in an image: by which sensor, how much of it, how well it was cut."""
 
-    actor: _Actor
+    actor: Actor
     sensor: str
     visible: float
     overlap: float
@@ -140,35 +100,38 @@ def simulate_views(world: World, numbers: Sequence[int], *, jobs: int = 1) -> It
 
 
 def simulate_world(world: World, number: int) -> list[WorldView]:
-    """Simulate one table, look at it from several places, and describe what is seen."""
+    """Simulate one arrangement, look at it from several places, and describe what is seen."""
     rng = np.random.default_rng((world.seed, number))
-    actors, name = _populate(world, rng), f"{world.seed}/{number}"
-    return look(actors, name, cameras=world.cameras, rng=rng, keep=world.keep)
+    arrangement, name = arrange(world, rng), f"{world.seed}/{number}"
+    return look(arrangement, name, cameras=world.cameras, rng=rng, keep=world.keep)
 
 
 def simulate_mesh(
     mesh: Mesh, label: str, name: str, rest: Rest, *, cameras: int, rng: np.random.Generator
 ) -> list[WorldView]:
     """Look at one given object, alone on the table, from several places."""
-    actor = _Actor(moved(mesh, rest.pose), label, rest.manner, 0.0)
-    return look([_placed(actor, (0.0, 0.0), 0.0, rng)], name, cameras=cameras, rng=rng)
+    actor = Actor(moved(mesh, rest.pose), label, rest.manner, 0.0)
+    alone = Arrangement([placed(actor, (0.0, 0.0), 0.0, rng)], (ALONE,))
+    return look(alone, name, cameras=cameras, rng=rng)
 
 
 def look(
-    actors: Sequence[_Actor],
+    arrangement: Arrangement,
     name: str,
     *,
     cameras: int,
     rng: np.random.Generator,
     keep: bool = False,
 ) -> list[WorldView]:
-    """Describe the objects on a table as seen from several places."""
-    table = rounded_box(_TABLE_M)
-    below = Pose(np.eye(3), np.array([0.0, 0.0, -_TABLE_M[2]]))
-    seen = geometry([*((actor.mesh, IDENTITY) for actor in actors), (table, below)])
+    """Describe objects as seen from several places."""
+    actors = arrangement.actors
+    if not actors:
+        return []
+    meshes = (*(actor.mesh for actor in actors), *arrangement.furniture)
+    seen = geometry([(mesh, IDENTITY) for mesh in meshes])
     views: list[WorldView] = []
     for _ in range(cameras):
-        shot = _shoot(seen, actors, rng)
+        shot = _shoot(seen, arrangement, rng)
         scene = detect(shot.frame, up=None, settings=_SETTINGS.detection, rng=rng)
         for k, actor in enumerate(actors):
             if shot.visible[k] >= _LEAST_VISIBLE:
@@ -176,101 +139,62 @@ def look(
     return views if keep else [view._replace(view=None) for view in views]
 
 
-# --- the table ---------------------------------------------------------------------------------
-
-
-def _populate(world: World, rng: np.random.Generator) -> list[_Actor]:
-    """Put objects on the table: apart, close together, or one on another."""
-    actors: list[_Actor] = []
-    spots: list[tuple[float, float, float]] = []
-    gap = float(rng.choice([0.003, 0.02, 0.08]))
-    for _ in range(int(rng.integers(3, 10))):
-        actor = _make(world, rng)
-        if world.leaning > 0 and rng.random() < world.leaning:
-            actor = _leant(actor, rng)
-        radius = float(np.hypot(actor.mesh.vertices[:, 0], actor.mesh.vertices[:, 1]).max())
-        spot = _free_spot(spots, radius + gap / 2, rng)
-        if spot is None:
-            continue
-        spots.append((*spot, radius + gap / 2))
-        actors.append(_placed(actor, spot, 0.0, rng))
-        top = actor.mesh.extents
-        if actor.label == "box" and top[:2].min() > 0.05 and rng.random() < 0.3:
-            above = _make(world, rng)
-            if np.all(above.mesh.extents[:2] < 1.3 * top[:2].min()):
-                actors.append(_placed(above, spot, float(top[2]), rng))
-    return actors
-
-
-def _make(world: World, rng: np.random.Generator) -> _Actor:
-    if rng.random() < world.unknown:
-        _, mesh = make_distractor(rng, str(rng.choice(list(world.kinds))))
-        return _rested(mesh, UNKNOWN, world, rng)
-    label = str(rng.choice(list(CATEGORIES)))
-    return _rested(make_object(label, rng), label, world, rng)
-
-
-def _rested(mesh: Mesh, label: str, world: World, rng: np.random.Generator) -> _Actor:
-    """Let an object lie as such objects do; upright where it cannot."""
-    chances = dict(_MANNERS.get(label, {"upright": 1.0}))
-    if world.lying is not None and label in _ROUND:
-        chances["upright"] += chances["lying"] - world.lying
-        chances["lying"] = world.lying
-    manner = str(rng.choice(list(chances), p=list(chances.values())))
-    rest = choose_rest(rests(mesh), manner, rng) if manner != "upright" else None
-    if rest is None:
-        return _Actor(standing(mesh), label, "upright", 0.0)
-    return _Actor(moved(mesh, rest.pose), label, manner, 0.0)
-
-
-def _leant(actor: _Actor, rng: np.random.Generator) -> _Actor:
-    """Tilt an object by up to 25 degrees, as if it leant on something."""
-    azimuth, half = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(5, 25)) / 2
-    axis = np.sin(half) * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    turn = Pose(rotation_from_quaternion(np.round([*axis, np.cos(half)], 9)), np.zeros(3))
-    return actor._replace(mesh=standing(moved(actor.mesh, turn)), manner="leaning")
-
-
-def _placed(
-    actor: _Actor, spot: tuple[float, float], support_m: float, rng: np.random.Generator
-) -> _Actor:
-    pose = turn_about_z(IDENTITY, rng.uniform(0, 2 * np.pi), np.array([*spot, support_m]))
-    return actor._replace(mesh=moved(actor.mesh, pose), support_m=support_m)
-
-
-def _free_spot(
-    spots: Sequence[tuple[float, float, float]], radius: float, rng: np.random.Generator
-) -> tuple[float, float] | None:
-    """Return a place of that radius near the middle of the table that nothing stands on."""
-    for reach in np.repeat([0.08, 0.16, 0.26, 0.36], 4):
-        x, y = rng.uniform(-reach, reach, 2)
-        if all(np.hypot(x - u, y - v) > radius + other for u, v, other in spots):
-            return float(x), float(y)
-    return None
-
-
 # --- the camera --------------------------------------------------------------------------------
 
 
-def _shoot(seen: Geometry, actors: Sequence[_Actor], rng: np.random.Generator) -> _Shot:
-    """Look at the table from somewhere with one of the sensors, better or worse than usual."""
-    name, sensor = (("kinect", KINECT), ("realsense", REALSENSE))[rng.integers(2)]
-    worse = float(rng.uniform(0.5, 1.3))
-    sensor = replace(sensor, noise=sensor.noise * worse, wave=sensor.wave * worse)
-    camera, pose = sensor.camera, _viewpoint(actors, rng)
+def _shoot(seen: Geometry, arrangement: Arrangement, rng: np.random.Generator) -> _Shot:
+    """Look at an arrangement from somewhere with a sensor."""
+    name, sensor = _draw_sensor(rng)
+    camera, pose = sensor.camera, _viewpoint(arrangement, rng)
     image = render(seen, camera, pose)
     depth, owners = measure(image, sensor, rng)
-    visible = _visible_shares(seen, owners, camera, pose, len(actors))
+    visible = _visible_shares(seen, owners, camera, pose, len(arrangement.actors))
     frame = Frame("/camera", 0, 0, 0, "camera", depth=depth, camera=camera)
     return _Shot(frame, owners, visible, pose, name)
 
 
-def _viewpoint(actors: Sequence[_Actor], rng: np.random.Generator) -> Pose:
-    """Return ``table_from_camera``: 0.45 to 1.9 m away, 15 to 65 degrees above the table."""
-    points = np.concatenate([actor.mesh.vertices for actor in actors])
+def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
+    """Draw one of the sensors, better or worse than usual, and of another resolution."""
+    name, sensor = (("kinect", KINECT), ("realsense", REALSENSE))[rng.integers(2)]
+    noise, wave, ragged = np.exp(rng.uniform(np.log([0.4, 0.4, 0.5]), np.log([2.5, 2.5, 1.6])))
+    sensor = replace(
+        sensor,
+        noise=float(sensor.noise * noise),
+        wave=float(sensor.wave * wave),
+        ragged_px=float(sensor.ragged_px * ragged),
+        blend_px=int(rng.choice([0, sensor.blend_px, 5])),
+    )
+    return name, _resized(sensor, float(rng.choice(_SCALES)))
+
+
+def _resized(sensor: Sensor, scale: float) -> Sensor:
+    """Return a sensor with more or fewer pixels in the same field of view."""
+    camera = sensor.camera
+    width, height = round(camera.width * scale), round(camera.height * scale)
+    middle = [(c + 0.5) * scale - 0.5 for c in (camera.cx, camera.cy)]
+    focal = camera.fx * scale, camera.fy * scale
+    return replace(
+        sensor,
+        camera=Camera(width, height, *focal, *middle),
+        grain=_scaled(sensor.grain, scale),
+        ragged_window=_scaled(sensor.ragged_window, scale),
+        ragged_px=sensor.ragged_px * scale,
+        wave_px=max(round(sensor.wave_px * scale), 2),
+        filled_px=sensor.filled_px * scale,
+    )
+
+
+def _scaled(window: tuple[int, int], scale: float) -> tuple[int, int]:
+    return max(round(window[0] * scale), 1), max(round(window[1] * scale), 1)
+
+
+def _viewpoint(arrangement: Arrangement, rng: np.random.Generator) -> Pose:
+    """Return ``table_from_camera``: 0.35 to 2.2 m away, as high as the arrangement says."""
+    points = np.concatenate([actor.mesh.vertices for actor in arrangement.actors])
     target = points.mean(axis=0) + rng.normal(0, 0.04, 3)
-    distance = float(np.exp(rng.uniform(np.log(0.45), np.log(1.9))))
-    azimuth, elevation = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(15, 65))
+    distance = float(np.exp(rng.uniform(np.log(0.35), np.log(2.2))))
+    azimuth = np.radians(rng.uniform(*arrangement.azimuth))
+    elevation = np.radians(rng.uniform(*arrangement.elevation))
     back = np.array(
         [
             np.cos(azimuth) * np.cos(elevation),
@@ -307,7 +231,7 @@ def _visible_shares(seen: Geometry, owners: I4, camera: Camera, pose: Pose, coun
 
 
 def _views_of(
-    shot: _Shot, scene: Scene, k: int, actor: _Actor, instance: str, rng: np.random.Generator
+    shot: _Shot, scene: Scene, k: int, actor: Actor, instance: str, rng: np.random.Generator
 ) -> list[WorldView]:
     """Return one view of an object, cut by the truth or as detected, and maybe a piece of it."""
     found = _cut_by_detection(shot, scene, k)
@@ -335,15 +259,14 @@ def _cut_by_detection(shot: _Shot, scene: Scene, k: int) -> tuple[View, float] |
         hits = int(np.count_nonzero(owners[candidate.indices] == k))
         overlap = hits / (total + candidate.indices.size - hits)
         if overlap >= _OVERLAP:
-            plane = scene.planes[candidate.plane or 0]
             points = shot.frame.xyz(candidate.indices)
             points = points[np.isfinite(points[:, 0])]
-            level = level_from_sensor(scene.up, plane.offset + candidate.support_m, points)
+            level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
             return View(transform(level, points), level.translation, "", ""), overlap
     return None
 
 
-def _cut_by_truth(shot: _Shot, k: int, actor: _Actor, rng: np.random.Generator) -> View:
+def _cut_by_truth(shot: _Shot, k: int, actor: Actor, rng: np.random.Generator) -> View:
     """Return the object's pixels, level up to a degree and a few millimetres."""
     indices = np.flatnonzero((shot.owners == k) & (np.asarray(shot.frame.depth) > 0))
     points = shot.frame.xyz(indices)
@@ -356,7 +279,7 @@ def _cut_by_truth(shot: _Shot, k: int, actor: _Actor, rng: np.random.Generator) 
     return View(transform(level, points), level.translation, "", "")
 
 
-def _centre(actor: _Actor) -> F8:
+def _centre(actor: Actor) -> F8:
     points = actor.mesh.vertices[:, :2]
     return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 

@@ -8,6 +8,7 @@ from numpy.random import Generator
 from shapecat.simulation.kitchen import KITCHEN
 from shapecat.simulation.mesh import Mesh, scaled, standing
 from shapecat.simulation.open_shapes import log_uniform
+from shapecat.simulation.procedural import PROCEDURAL
 from shapecat.simulation.tools import TOOLS
 from shapecat.simulation.toys import TOYS
 
@@ -20,14 +21,19 @@ DISTRACTORS: dict[str, Callable[[Generator], Mesh]] = {**KITCHEN, **TOOLS, **TOY
 def make_distractor(rng: Generator, kind: str | None = None) -> tuple[str, Mesh]:
     """Make a random object outside the categories; returns its kind and shape.
 
+    Parameters
+    ----------
+    kind : one of `DISTRACTORS`, which are drawn from by default, or a family of `PROCEDURAL`.
+
     Raises
     ------
     ValueError : there is no such kind.
     """
     chosen = str(rng.choice(list(DISTRACTORS))) if kind is None else kind
-    if chosen not in DISTRACTORS:
-        msg = f"no distractor {chosen!r}; known: {', '.join(DISTRACTORS)}"
+    makers = {**DISTRACTORS, **PROCEDURAL}
+    if chosen not in makers:
+        msg = f"no distractor {chosen!r}; known: {', '.join(makers)}"
         raise ValueError(msg)
-    mesh = DISTRACTORS[chosen](rng)
+    mesh = makers[chosen](rng)
     jitter = np.exp(rng.uniform(-0.12, 0.12, 3))
     return chosen, standing(scaled(mesh, jitter * log_uniform(rng, 0.75, 1.35)))

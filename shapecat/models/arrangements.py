@@ -1,0 +1,185 @@
+"""What a camera of the training looks at: objects on a table, in a pile, in a bin, on a shelf."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.evaluation.report import UNKNOWN
+from shapecat.geometry import IDENTITY, rotation_from_quaternion
+from shapecat.simulation.distractors import make_distractor
+from shapecat.simulation.mesh import Mesh, moved, rounded_box, standing
+from shapecat.simulation.piles import bin_picking, pile, shelf_bin
+from shapecat.simulation.placement import choose_rest, rests, turn_about_z
+from shapecat.simulation.shapes import make_object
+from shapecat.simulation.worlds import Thing
+from shapecat.simulation.worlds import World as Scene
+from shapecat.types import CATEGORIES, Pose
+
+__all__ = ["ALONE", "Actor", "Arrangement", "World", "arrange", "placed"]
+
+_TABLE_M = (1.6, 1.2, 0.03)
+_MANNERS = {
+    "cup": {"upright": 0.78, "lying": 0.12, "upside_down": 0.1},
+    "can": {"upright": 0.8, "lying": 0.2},
+    "bottle": {"upright": 0.8, "lying": 0.2},
+    "bowl": {"upright": 0.92, "upside_down": 0.08},
+    "plate": {"upright": 0.95, "upside_down": 0.05},
+    "box": {"upright": 0.5, "lying": 0.5},
+    UNKNOWN: {"upright": 0.7, "lying": 0.3},
+}
+_ROUND = {"cup", "can", "bottle"}
+
+
+@dataclass(frozen=True)
+class World:
+    """What kind of arrangements are simulated.
+
+    ``kinds`` are the distractors to choose from, ``unknown`` their share of the objects;
+    ``lying`` the share of cups, cans and bottles that lie, if not the usual one: they are harder
+    than others, so one learns from more of them; ``leaning`` the share of objects that lean on
+    something unseen; ``settled`` the share of arrangements that physics makes: piles, bins,
+    crowded compartments. ``keep`` keeps the clouds of the views.
+    """
+
+    seed: int
+    kinds: tuple[str, ...]
+    unknown: float = 0.17
+    lying: float | None = None
+    leaning: float = 0.0
+    settled: float = 0.0
+    cameras: int = 4
+    keep: bool = False
+
+
+class Actor(NamedTuple):
+    """An object: its mesh in the frame of its support (z = 0), where it stands, what it is."""
+
+    mesh: Mesh
+    label: str
+    manner: str
+    support_m: float
+
+
+class Arrangement(NamedTuple):
+    """Objects and furniture, z = 0 on what bears them, and from where they may be seen.
+
+    ``elevation`` and ``azimuth`` are ranges in degrees; the open side of a shelf is at -90.
+    """
+
+    actors: list[Actor]
+    furniture: tuple[Mesh, ...]
+    elevation: tuple[float, float] = (15.0, 65.0)
+    azimuth: tuple[float, float] = (-180.0, 180.0)
+
+
+ALONE = moved(rounded_box(_TABLE_M), Pose(np.eye(3), np.array([0.0, 0.0, -_TABLE_M[2]])))
+"""A table without room around it."""
+_SETTLED: tuple[tuple[Callable[..., Scene], float, Arrangement], ...] = (
+    (pile, 0.7, Arrangement([], (), (10.0, 85.0))),
+    (bin_picking, 0.15, Arrangement([], (), (50.0, 88.0))),
+    (shelf_bin, 0.15, Arrangement([], (), (5.0, 35.0), (-120.0, -60.0))),
+)
+"""What physics makes, its share, and from where it is seen."""
+
+
+def arrange(world: World, rng: np.random.Generator) -> Arrangement:
+    """Return random objects on a table, or as physics lets them lie."""
+    if world.settled > 0 and rng.random() < world.settled:
+        return _settled(world, rng)
+    return Arrangement(_spread(world, rng), (ALONE,))
+
+
+def _settled(world: World, rng: np.random.Generator) -> Arrangement:
+    """Let 4 to 18 objects settle in a pile, a bin, or a compartment of a shelf."""
+    chosen = int(rng.choice(len(_SETTLED), p=[share for _, share, _ in _SETTLED]))
+    make, _, seen_from = _SETTLED[chosen]
+    names = rng.choice(CATEGORIES, int(rng.integers(4, 19)))
+    names = np.where(rng.random(names.size) < world.unknown, UNKNOWN, names)
+    scene = make(rng, names.tolist(), 1, 30.0, kinds=world.kinds)
+    supports = {support.name: support for support in scene.supports}
+    bearing = next((t.on_support for t in scene.things if t.on_support is not None), "floor")
+    down = Pose(np.eye(3), np.array([0.0, 0.0, -supports[bearing].height]))
+    furniture = tuple(moved(support.mesh, down) for support in scene.supports)
+    return seen_from._replace(
+        actors=[_actor(thing, down) for thing in scene.things], furniture=furniture
+    )
+
+
+def _actor(thing: Thing, down: Pose) -> Actor:
+    mesh = moved(moved(thing.mesh, thing.pose), down)
+    manners = (("upside_down", thing.upside_down), ("lying", thing.lying), ("tilted", thing.tilted))
+    manner = next((name for name, so in manners if so), "upright")
+    return Actor(mesh, thing.category, manner, float(mesh.vertices[:, 2].min()))
+
+
+def _spread(world: World, rng: np.random.Generator) -> list[Actor]:
+    """Put objects on the table: apart, close together, or one on another."""
+    actors: list[Actor] = []
+    spots: list[tuple[float, float, float]] = []
+    gap = float(rng.choice([0.003, 0.02, 0.08]))
+    for _ in range(int(rng.integers(3, 10))):
+        actor = _make(world, rng)
+        if world.leaning > 0 and rng.random() < world.leaning:
+            actor = _leant(actor, rng)
+        radius = float(np.hypot(actor.mesh.vertices[:, 0], actor.mesh.vertices[:, 1]).max())
+        spot = _free_spot(spots, radius + gap / 2, rng)
+        if spot is None:
+            continue
+        spots.append((*spot, radius + gap / 2))
+        actors.append(placed(actor, spot, 0.0, rng))
+        top = actor.mesh.extents
+        if actor.label == "box" and top[:2].min() > 0.05 and rng.random() < 0.3:
+            above = _make(world, rng)
+            if np.all(above.mesh.extents[:2] < 1.3 * top[:2].min()):
+                actors.append(placed(above, spot, float(top[2]), rng))
+    return actors
+
+
+def _make(world: World, rng: np.random.Generator) -> Actor:
+    if rng.random() < world.unknown:
+        _, mesh = make_distractor(rng, str(rng.choice(list(world.kinds))))
+        return _rested(mesh, UNKNOWN, world, rng)
+    label = str(rng.choice(list(CATEGORIES)))
+    return _rested(make_object(label, rng), label, world, rng)
+
+
+def _rested(mesh: Mesh, label: str, world: World, rng: np.random.Generator) -> Actor:
+    """Let an object lie as such objects do; upright where it cannot."""
+    chances = dict(_MANNERS.get(label, {"upright": 1.0}))
+    if world.lying is not None and label in _ROUND:
+        chances["upright"] += chances["lying"] - world.lying
+        chances["lying"] = world.lying
+    manner = str(rng.choice(list(chances), p=list(chances.values())))
+    rest = choose_rest(rests(mesh), manner, rng) if manner != "upright" else None
+    if rest is None:
+        return Actor(standing(mesh), label, "upright", 0.0)
+    return Actor(moved(mesh, rest.pose), label, manner, 0.0)
+
+
+def _leant(actor: Actor, rng: np.random.Generator) -> Actor:
+    """Tilt an object by up to 25 degrees, as if it leant on something."""
+    azimuth, half = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(5, 25)) / 2
+    axis = np.sin(half) * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    turn = Pose(rotation_from_quaternion(np.round([*axis, np.cos(half)], 9)), np.zeros(3))
+    return actor._replace(mesh=standing(moved(actor.mesh, turn)), manner="leaning")
+
+
+def placed(
+    actor: Actor, spot: tuple[float, float], support_m: float, rng: np.random.Generator
+) -> Actor:
+    """Return an object turned anyhow, over a place (x, y) and on a height, metres."""
+    pose = turn_about_z(IDENTITY, rng.uniform(0, 2 * np.pi), np.array([*spot, support_m]))
+    return actor._replace(mesh=moved(actor.mesh, pose), support_m=support_m)
+
+
+def _free_spot(
+    spots: Sequence[tuple[float, float, float]], radius: float, rng: np.random.Generator
+) -> tuple[float, float] | None:
+    """Return a place of that radius near the middle of the table that nothing stands on."""
+    for reach in np.repeat([0.08, 0.16, 0.26, 0.36], 4):
+        x, y = rng.uniform(-reach, reach, 2)
+        if all(np.hypot(x - u, y - v) > radius + other for u, v, other in spots):
+            return float(x), float(y)
+    return None
