@@ -88,29 +88,34 @@ def test_frames_without_anything_have_no_figures_but_nan() -> None:
     assert np.isnan([empty.mota, empty.idf1, empty.hota]).all()
 
 
-def turned(x: float, y: float, z: float, w: float, box: Box) -> Box:
+def box(center: list[float], size: list[float], orientation: list[float]) -> Box:
+    """Return a box of plain numbers."""
+    return Box(*(np.array(values, np.float64) for values in (center, size, orientation)))
+
+
+def turned(x: float, y: float, z: float, w: float, still: Box) -> Box:
     """Turn a box about the origin."""
     turn = rotation_from_quaternion([x, y, z, w])
-    own = rotation_from_quaternion(box.orientation)
-    return Box(turn @ box.center, box.size, quaternion_from_rotation(turn @ own))
+    own = rotation_from_quaternion(still.orientation)
+    return Box(turn @ still.center, still.size, quaternion_from_rotation(turn @ own))
 
 
 def test_box_iou_of_turned_boxes_is_that_by_hand_and_by_sampling() -> None:
     """Boxes are seen from a tilted camera: what holds for upright ones alone is wrong there."""
-    a = Box([0.1, -0.2, 0.9], [0.3, 0.2, 0.5], [0, 0, 0, 1])
-    b = Box([0.2, -0.15, 1.0], [0.3, 0.2, 0.5], [0, 0, 0, 1])
+    a = box([0.1, -0.2, 0.9], [0.3, 0.2, 0.5], [0, 0, 0, 1])
+    b = box([0.2, -0.15, 1.0], [0.3, 0.2, 0.5], [0, 0, 0, 1])
     shared = 0.2 * 0.15 * 0.4
     by_hand = shared / (2 * 0.3 * 0.2 * 0.5 - shared)
     assert box_iou(a, b) == pytest.approx(by_hand, rel=1e-5)
     tilt = (0.3, -0.5, 0.2, 0.7)
     assert box_iou(turned(*tilt, a), turned(*tilt, b)) == pytest.approx(by_hand, rel=1e-4)
 
-    c = Box([0.15, -0.1, 0.95], [0.25, 0.35, 0.3], [0.1, 0.25, -0.4, 0.8])
+    c = box([0.15, -0.1, 0.95], [0.25, 0.35, 0.3], [0.1, 0.25, -0.4, 0.8])
     points = np.random.default_rng(0).uniform(-0.5, 1.5, (400_000, 3))
     inside = [
-        (np.abs((points - box.center) @ rotation_from_quaternion(box.orientation))
-         <= box.size / 2).all(axis=1)
-        for box in (a, c)
+        (np.abs((points - b.center) @ rotation_from_quaternion(b.orientation))
+         <= b.size / 2).all(axis=1)
+        for b in (a, c)
     ]  # fmt: skip
     sampled = np.sum(inside[0] & inside[1]) / np.sum(inside[0] | inside[1])
     assert box_iou(a, c) == pytest.approx(float(sampled), abs=0.02)
@@ -119,10 +124,10 @@ def test_box_iou_of_turned_boxes_is_that_by_hand_and_by_sampling() -> None:
 
 
 def test_boxes_that_only_touch_or_are_flat_share_nothing() -> None:
-    a = Box([0, 0, 0], [1, 2, 3], [0, 0, 0, 1])
-    assert box_iou(a, Box([1, 0, 0], [1, 2, 3], [0, 0, 0, 1])) == 0
-    assert box_iou(a, Box([9, 0, 0], [1, 2, 3], [0, 0, 0, 1])) == 0
-    assert box_iou(a, Box([0, 0, 0], [1, 2, 0], [0, 0, 0, 1])) == 0
+    a = box([0, 0, 0], [1, 2, 3], [0, 0, 0, 1])
+    assert box_iou(a, box([1, 0, 0], [1, 2, 3], [0, 0, 0, 1])) == 0
+    assert box_iou(a, box([9, 0, 0], [1, 2, 3], [0, 0, 0, 1])) == 0
+    assert box_iou(a, box([0, 0, 0], [1, 2, 0], [0, 0, 0, 1])) == 0
 
 
 def test_masks_are_matched_for_the_greatest_overlap_in_all() -> None:

@@ -128,9 +128,9 @@ def _occurrences(frames: Iterable[SeenTogether]) -> _Occurrences:
         ]
         numbered.append((places[0], places[1], np.asarray(similarity, np.float64)))
     counts = [np.zeros(len(known)) for known in numbers]
-    for *sides, _ in numbered:
-        for count, places in zip(counts, sides, strict=True):
-            count[places] += 1
+    for true_places, found_places, _ in numbered:
+        counts[0][true_places] += 1
+        counts[1][found_places] += 1
     return _Occurrences(counts[0], counts[1], numbered)
 
 
