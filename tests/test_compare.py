@@ -1,5 +1,7 @@
 """`shapecat compare` at the door: figures, the table, the page, plain refusals."""
 
+import base64
+import io
 import json
 import shutil
 import subprocess
@@ -13,8 +15,11 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
+from PIL import Image
 
-from shapecat.evaluation.comparing import compare
+from shapecat.evaluation.comparing import Difference, compare
+from shapecat.evaluation.comparison_pictures import COLOURS, draw_frame
+from shapecat.evaluation.labellings import Item, Labelling
 from shapecat.evaluation.references_coco import filled_polygon, rle_mask
 from shapecat.runs.tables import DETECTIONS, FRAMES, TRACKS
 
@@ -316,3 +321,21 @@ def test_refusals_say_what_was_found_and_what_to_try(
     ):
         assert refused(shapecat, *words)[0] == code, words
         assert text in refused(shapecat, *words)[1]
+
+
+def test_a_part_split_off_is_seen_in_the_picture() -> None:
+    """Drawn from unions of masks, an object in two halves looked as if all were right."""
+    true = Labelling((Item(1, "cup", np.arange(0, 60)),), None, (10, 10))
+    halves = (Item(5, "can", np.arange(0, 40)), Item(6, "cup", np.arange(40, 70)))
+    head = ("/d", 0, START)
+    rows = [Difference(*head, "category", category="can"), Difference(*head, "surplus")]
+    picture = draw_frame(("/d", 0), None, Labelling(halves), true, {0: 0}, rows, 2.0)
+
+    assert picture is not None
+    content = base64.b64decode(picture.image.split(",")[1])
+    pixels = np.array(Image.open(io.BytesIO(content)).convert("RGB")).reshape(100, 3)
+    for part, name in ((slice(0, 40), "category"), (slice(40, 70), "surplus")):
+        assert len(np.unique(pixels[part], axis=0)) == 1
+        assert pixels[part][0].argmax() == np.argmax(COLOURS[name])
+    assert (pixels[70:] == pixels[70]).all()
+    assert len(np.unique(pixels, axis=0)) == 3

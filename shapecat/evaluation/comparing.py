@@ -204,7 +204,7 @@ def _compare_frame(
     best = tally.pictures.get(part)
     frame = next((f for f in clouds if (f.topic, f.index) == key), None)
     if differing and (best is None or severity > best.severity):
-        picture = draw_frame(key, frame, found, true, rows, severity)
+        picture = draw_frame(key, frame, found, true, matched.pairs, rows, severity)
         if picture is not None:
             tally.pictures[part] = picture
 

@@ -148,14 +148,19 @@ def format_page(found: Comparison) -> str:
     """Return a comparison as an HTML page with its pictures inside."""
     differing = [row for row in found.rows if row.difference]
     return _PAGE.substitute(
-        title=escape(f"{Path(found.run).name} compared"),
+        title=escape(f"{Path(found.run).name} compared with {Path(found.reference).name}"),
         subtitle=escape(f"{found.run} · {found.reference} ({found.kind})"),
         notes="".join(f'<p class="note">{escape(note)}</p>' for note in found.notes),
         figures=_table((), figure_rows(found)),
         legend="".join(
             f'<span><i style="background:rgb{colour}"></i>{name}</span>'
             for name, colour in zip(
-                ("both", "missed: only the reference", "surplus: only the run"),
+                (
+                    "both",
+                    "missed: only the reference",
+                    "surplus: only the run, or of another object",
+                    "taken for another category",
+                ),
                 COLOURS.values(),
                 strict=True,
             )

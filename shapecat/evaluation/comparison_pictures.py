@@ -1,7 +1,7 @@
 """Pictures of frames in which a run and the truth differ."""
 
 import base64
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,8 +15,14 @@ from shapecat.types import Frame
 __all__ = ["COLOURS", "Picture", "draw_frame", "words_of"]
 
 _SHADES = 48
-COLOURS = {"both": (66, 160, 71), "missed": (230, 81, 0), "surplus": (30, 100, 220)}
-"""Pixels of objects that both have, only the truth, only the run."""
+COLOURS = {
+    "both": (66, 160, 71),
+    "missed": (230, 81, 0),
+    "surplus": (30, 100, 220),
+    "category": (160, 40, 170),
+}
+"""Pixels that both have for the same object, the truth alone, the run alone; and those of an
+object that has another category."""
 _INK = 0.55
 
 
@@ -46,17 +52,26 @@ def draw_frame(
     frame: Frame | None,
     found: Labelling,
     true: Labelling,
+    pairs: Mapping[int, int],
     rows: Sequence[Any],
     severity: float,
 ) -> Picture | None:
-    """Draw found and true masks over the depth; None where there is no image to draw on."""
+    """Draw found and true masks over the depth; None where there is no image to draw on.
+
+    Parameters
+    ----------
+    pairs : found objects and the true ones they are.
+    rows : what differs, first of each found object, in their order.
+    """
     shape = true.shape
     if frame is not None:
         shape = frame.depth.shape if frame.depth is not None else None
     if shape is None:
         return None
     height, width = shape
-    image = _shades(frame, height, width) + _SHADES * _states(found, true, height * width)
+    image = _shades(frame, height, width) + _SHADES * _states(
+        found, true, pairs, rows, height * width
+    )
     code = base64.b64encode(png(image.reshape(height, width).astype(np.uint8), _palette())).decode()
     differing = tuple(row for row in rows if row.difference)
     captions = _captions(differing, found.items, true.items, width)
@@ -64,14 +79,23 @@ def draw_frame(
     return Picture(*key, uri, width, height, captions, severity, differing)
 
 
-def _states(found: Labelling, true: Labelling, size: int) -> U1:
-    """Return (n,) 0 for no object, 1 where both have one, 2 the truth alone, 3 the run alone."""
-    sides = np.zeros((2, size), np.bool_)
-    for side, labelling in zip(sides, (true, found), strict=True):
+def _states(
+    found: Labelling, true: Labelling, pairs: Mapping[int, int], rows: Sequence[Any], size: int
+) -> U1:
+    """Return (n,) 0 for no object, else the number of the colour.
+
+    Pixels that belong to different objects are surplus: parts of objects that were split show.
+    """
+    state = np.zeros(size, np.int64)
+    for number, labelling in ((2, true), (3, found)):
         for item in labelling.items:
             if item.pixels is not None:
-                side[item.pixels] = True
-    return np.select([sides.all(axis=0), sides[0], sides[1]], [1, 2, 3], 0)
+                state[item.pixels] = number
+    for i, j in pairs.items():
+        mine, theirs = found.items[i].pixels, true.items[j].pixels
+        if mine is not None and theirs is not None:
+            state[np.intersect1d(mine, theirs)] = 4 if rows[i].difference == "category" else 1
+    return state
 
 
 def _shades(frame: Frame | None, height: int, width: int) -> U1:

@@ -50,7 +50,7 @@ class Reference(ABC):
     """What a run is compared with; frames are asked for in the order they were recorded."""
 
     kind: str
-    """In words: simulated truth, COCO labels, KITTI labels, another run."""
+    """In words: truth of every pixel, COCO labels, KITTI labels, another run."""
     frames: int
     """How many frames it has."""
     tracked: bool = False

@@ -60,7 +60,7 @@ def open_reference(path: Path) -> Reference:
 class SimulatedTruth(Reference):
     """Truth as `shapecat simulate` writes it: NAME.truth.json beside NAME.labels.npz."""
 
-    kind = "simulated truth"
+    kind = "truth of every pixel"
 
     def __init__(self, path: Path, content: list[dict[str, Any]]) -> None:
         self._by_stamp = {int(entry["stamp_ns"]): entry for entry in content}
