@@ -5,19 +5,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from benchmarks.scenes import labelled_clutter, labelled_tables
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.detection.pipeline import Steps
+from shapecat.evaluation.overlap import Overlap, match_masks
 from shapecat.types import Frame
 
 Array = NDArray[Any]
 Finder = Callable[[Frame], list[Array]]
 """Returns the points of each object it finds."""
-MATCHED = 0.75
-"""Overlap F from which an object counts as found."""
 
 
 class Labelled(NamedTuple):
@@ -50,22 +48,12 @@ def with_steps(steps: Steps) -> Finder:
 
 def score(frames: Sequence[Labelled], finder: Finder) -> dict[str, float]:
     """Match found and true objects one to one; return the overlap F and the share matched."""
-    shared = found = true = hits = objects = 0.0
+    total = Overlap()
     for frame, labels, things in frames:
-        masks = [np.isin(labels, parts) for parts in things]
-        lists = [index[labels[index] > 0] for index in finder(frame)]
-        common = np.array([[m[p].sum() for m in masks] for p in lists]).reshape(
-            len(lists), len(masks)
-        )
-        sizes = np.array([p.size for p in lists]), np.array([m.sum() for m in masks])
-        overlap = 2 * common / np.maximum(sizes[0][:, None] + sizes[1], 1) if lists else common
-        rows, columns = linear_sum_assignment(-overlap)
-        shared += common[rows, columns].sum()
-        found, true = found + sizes[0].sum(), true + sizes[1].sum()
-        hits += np.count_nonzero(overlap[rows, columns] >= MATCHED)
-        objects += len(masks)
+        masks = [np.flatnonzero(np.isin(labels, parts)) for parts in things]
+        total += match_masks([index[labels[index] > 0] for index in finder(frame)], masks).overlap
     return {
-        "F": round(2 * shared / max(found + true, 1), 4),
-        "obj75": round(hits / max(objects, 1), 4),
-        "objects": objects,
+        "F": round(total.f, 4),
+        "obj75": round(total.share_found, 4),
+        "objects": float(total.objects),
     }

@@ -12,13 +12,12 @@ from typing import Any, NamedTuple
 import click
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import linear_sum_assignment
 
 from benchmarks.measure import markdown
-from benchmarks.overlap import MATCHED
 from benchmarks.scenes import SEEN_PIXELS
 from shapecat.config import Settings
 from shapecat.evaluation.metrics import auroc, expected_calibration_error
+from shapecat.evaluation.overlap import MATCHED_F, match_masks
 from shapecat.learning import Categorizer, load_model
 from shapecat.perception import perceive
 from shapecat.simulation import KINECT, REALSENSE, Thing, render_frame
@@ -75,27 +74,24 @@ def _matched(
     things: tuple[Thing, ...], labels: Array, seen: tuple[Detection, ...]
 ) -> Iterator[Judged]:
     """Match objects and detections one to one, by how well they cover each other (F)."""
-    masks = {t.track: labels == t.label for t in things}
-    things = tuple(t for t in things if np.count_nonzero(masks[t.track]) >= SEEN_PIXELS)
+    masks = {t.track: np.flatnonzero(labels == t.label) for t in things}
+    things = tuple(t for t in things if len(masks[t.track]) >= SEEN_PIXELS)
     lists = [d.candidate.indices[labels[d.candidate.indices] > 0] for d in seen]
-    common = np.array([[masks[t.track][p].sum() for t in things] for p in lists], np.int64)
-    common = common.reshape(len(lists), len(things))
-    sizes = np.array([p.size for p in lists], np.int64)
-    totals = np.array([masks[t.track].sum() for t in things], np.int64)
-    overlap = 2 * common / np.maximum(sizes[:, None] + totals, 1)
-    pairs = dict(zip(*linear_sum_assignment(-overlap)[::-1], strict=True))
+    matches = match_masks(lists, [masks[t.track] for t in things])
+    pairs = {column: row for row, column in matches.pairs}
     for k, thing in enumerate(things):
         row = pairs.get(k)
         if row is None:
             yield Judged(thing, 0, 0.0, None)
         else:
-            yield Judged(thing, int(common[row, k]), float(overlap[row, k]), seen[row])
+            shared = np.intersect1d(lists[row], masks[thing.track]).size
+            yield Judged(thing, shared, float(matches.f[row, k]), seen[row])
 
 
 def figures(scores: Scores, model: Categorizer) -> dict[str, float]:
     """Return F, the share of objects found, and how well those are categorized."""
     objects = scores.objects
-    well = [o for o in objects if o.overlap >= MATCHED and o.detection is not None]
+    well = [o for o in objects if o.overlap >= MATCHED_F and o.detection is not None]
     known = [o for o in well if o.thing.category != "unknown" and not o.thing.indistinct]
     strange = [o for o in well if o.thing.category == "unknown"]
     tilted = [o for o in known if o.thing.tilted]

@@ -3,26 +3,25 @@
     python -m benchmarks.sequences --seeds 10 --json
 
 Each sequence is written as an ordinary recording and processed as `shapecat process` does; its
-tables are judged against the truth, identities by motmetrics.
+tables are judged against the truth.
 """
 
 import json
 import tempfile
-import warnings
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import click
-import motmetrics
 import numpy as np
 import pyarrow.parquet as pq
 from scipy.optimize import linear_sum_assignment
 
 from benchmarks.measure import markdown
 from shapecat.arrays import F8, U1
+from shapecat.evaluation.identities import SeenTogether, judge_identities
 from shapecat.evaluation.metrics import expected_calibration_error
 from shapecat.pipeline import process
 from shapecat.runs.jobs import Job
@@ -99,13 +98,15 @@ def _object(item: dict[str, Any], *, listed: bool) -> Object:
     )
 
 
-def count_identities(folder: Path, truth: Sequence[Sequence[Object]]) -> motmetrics.MOTAccumulator:
-    """Compare where the tracks are with where the objects are, frame by frame.
+def seen_together(folder: Path, truth: Sequence[Sequence[Object]]) -> Iterator[SeenTogether]:
+    """Yield where the tracks are beside where the objects are, frame by frame.
 
-    A track at an object that is spared counts neither for nor against.
+    A track at an object that is spared counts neither for nor against. Similarity falls with the
+    distance, from 1 to `SAME` at the largest reach.
     """
     table = _within_range(folder / "run")
-    accumulator = motmetrics.MOTAccumulator(auto_id=True)
+    sequence = str(folder)
+    largest = max((o.reach for objects in truth for o in objects), default=NEAR_M)
     for k, objects in enumerate(truth):
         rows = [row for row in table if row["frame"] == k]
         gaps = np.array(
@@ -113,18 +114,16 @@ def count_identities(folder: Path, truth: Sequence[Sequence[Object]]) -> motmetr
         ).reshape(len(objects), len(rows))
         spared = np.array([o.spared for o in objects], bool)
         reach = np.array([o.reach for o in objects])[:, None]
-        gaps = np.where(gaps <= reach, gaps, np.nan)
-        cost = np.where(np.isfinite(gaps), gaps - 1, 0)
-        pairs = zip(*linear_sum_assignment(cost), strict=True)
-        drop = {int(j) for i, j in pairs if spared[i] and cost[i, j] < 0}
+        similarity = np.where(gaps <= reach, 1 - SAME * gaps / largest, 0)
+        pairs = zip(*linear_sum_assignment(-similarity), strict=True)
+        drop = {int(j) for i, j in pairs if spared[i] and similarity[i, j] > 0}
         keep = [j for j in range(len(rows)) if j not in drop]
         asked = np.flatnonzero(~spared).tolist()
-        accumulator.update(
-            [objects[i].track for i in asked],
-            [rows[j]["track"] for j in keep],
-            gaps[asked][:, keep],
+        yield SeenTogether(
+            [(sequence, objects[i].track) for i in asked],
+            [(sequence, rows[j]["track"]) for j in keep],
+            similarity[asked][:, keep],
         )
-    return accumulator
 
 
 def _within_range(run: Path) -> list[dict[str, Any]]:
@@ -180,15 +179,13 @@ def _seen(
     return thing if own[label] >= SAME * union else None
 
 
-def identities(counted: dict[str, list[motmetrics.MOTAccumulator]]) -> dict[str, dict[str, float]]:
+def identities(seen: dict[str, list[SeenTogether]]) -> dict[str, dict[str, float]]:
     """Return the figures of each kind of sequence, over all its frames."""
-    names = ["idf1", "mota", "num_switches", "num_misses", "num_false_positives", "num_objects"]
-    host, result = motmetrics.metrics.create(), {}
-    for kind, accumulators in counted.items():
-        with warnings.catch_warnings():  # of pandas, about its own future
-            warnings.simplefilter("ignore")
-            table = host.compute_many(accumulators, metrics=names, generate_overall=True)
-        result[kind] = {name: round(float(table.loc["OVERALL"][name]), 4) for name in names}
+    names = ("idf1", "mota", "hota", "switches", "misses", "false_positives", "objects")
+    result = {}
+    for kind, frames in seen.items():
+        figures = judge_identities(frames, threshold=SAME).as_dict()
+        result[kind] = {name: round(float(figures[name]), 4) for name in names}
     return result
 
 
@@ -232,23 +229,23 @@ def calibration(views: Iterable[View]) -> dict[int, dict[str, float]]:
 
 def evaluate(folder: Path, seeds: Iterable[int]) -> dict[str, Any]:
     """Make, process and judge the sequences of all kinds."""
-    counted: dict[str, list[motmetrics.MOTAccumulator]] = {}
+    seen: dict[str, list[SeenTogether]] = {}
     views: list[View] = []
     for seed in seeds:
         for kind in KINDS:
             place = folder / kind / str(seed)
             make_sequence(place, kind, seed)
-            counted.setdefault(kind, []).append(count_identities(place, read_truth(place)))
+            seen.setdefault(kind, []).extend(seen_together(place, read_truth(place)))
             views += read_views(place, kind, seed)
             click.echo(f"{kind} {seed}", err=True)
     decidable = [view for view in views if not view.undecidable]
     per_kind = {
-        kind: label_errors(v for v in decidable if v.track[0] == kind) for kind in sorted(counted)
+        kind: label_errors(v for v in decidable if v.track[0] == kind) for kind in sorted(seen)
     }
     final = {view.track: (view.truth, view.final) for view in views}
     wrong = Counter(f"{t} taken for {f}" for t, f in final.values() if t != f)
     return {
-        "identities": identities(counted),
+        "identities": identities(seen),
         "labels": {
             **per_kind,
             "all": label_errors(decidable),

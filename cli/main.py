@@ -12,6 +12,7 @@ from shapecat.errors import ShapecatError
 from shapecat.stopping import Stopped, heeding_signals
 
 from .annotate import annotate
+from .compare import compare
 from .evaluate import evaluate
 from .export import export
 from .info import info
@@ -72,6 +73,7 @@ for _command in (
     learn,
     train,
     evaluate,
+    compare,
     simulate,
 ):
     main.add_command(_command)

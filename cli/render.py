@@ -18,6 +18,7 @@ PHASES = {
     "export": "exporting",
     "train": "learning",
     "evaluate": "evaluating",
+    "compare": "comparing",
 }
 COMPILING = "compiling kernels, once per installation: a few minutes"
 

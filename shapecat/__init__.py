@@ -1,3 +1,19 @@
 """shapecat: from robot recordings to reviewed, labelled 3D objects."""
 
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from shapecat.api import Run, open_recording, open_run, process
+
+__all__ = ["Run", "open_recording", "open_run", "process"]
+
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    """Load the door from Python when it is first used: `shapecat --help` needs none of it."""
+    if name in __all__:
+        return getattr(import_module("shapecat.api"), name)
+    msg = f"module 'shapecat' has no attribute {name!r}"
+    raise AttributeError(msg)

@@ -19,6 +19,7 @@ __all__ = [
     "TrackingSettings",
     "load_settings",
     "with_overrides",
+    "with_settings",
 ]
 
 _MOST_FUSED = 30
@@ -128,7 +129,18 @@ def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Se
         except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
             msg = f"{path}: not a readable TOML file: {error}"
             raise ConfigError(msg) from error
-    return with_overrides(_build(Settings(), tree, ""), overrides)
+    return with_overrides(with_settings(Settings(), tree), overrides)
+
+
+def with_settings(settings: Settings, tree: Mapping[str, Any]) -> Settings:
+    """Change settings by a tree, such as ``{"seed": 3, "detection": {"max_range_m": 1.5}}``.
+
+    Raises
+    ------
+    ConfigError : a setting that does not exist, or a value that does not fit.
+    """
+    changed: Settings = _build(settings, tree, "")
+    return changed
 
 
 def with_overrides(settings: Settings, overrides: Sequence[str]) -> Settings:

@@ -12,7 +12,7 @@ ROOT = Path(__file__).parents[1]
 STAGES = {"depth_fusion", "detection", "surface", "description", "learning", "tracking"}
 BASE = {"arrays", "errors", "jit", "stopping", "triangles", "types"}
 FLOOR = {
-    **dict.fromkeys(BASE | {"__init__", "py"}, 0),
+    **dict.fromkeys(BASE | {"py"}, 0),
     **dict.fromkeys(("config", "geometry", "files", "executors"), 1),
     **dict.fromkeys(
         (
@@ -27,6 +27,8 @@ FLOOR = {
     **dict.fromkeys(("outputs", "evaluation", "models"), 4),
     "pipeline": 5,
     "batch": 6,
+    "api": 7,
+    "__init__": 7,  # names the door from Python, and loads it when it is used
     "cli": 7,
     "__main__": 7,
 }

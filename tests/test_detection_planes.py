@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from benchmarks.overlap import MATCHED
 from benchmarks.piles import judge
 from benchmarks.planes import keeps_table, view_of
 from shapecat.config import DetectionSettings, Settings
@@ -15,6 +14,7 @@ from shapecat.detection.planes.covered import add_covered_planes
 from shapecat.detection.planes.parallel import find_parallel_planes
 from shapecat.detection.planes.ransac import draw_trials
 from shapecat.detection.planes.up_direction import HELD, estimate_up
+from shapecat.evaluation.overlap import MATCHED_F
 from shapecat.learning import load_model
 from shapecat.simulation.mesh import Mesh, moved, rounded_box
 from shapecat.simulation.paths import looking_at
@@ -133,7 +133,7 @@ def test_objects_in_compartments_are_found_where_their_board_is_hardly_seen() ->
     found = seen = 0
     for seed in range(3002, 3008):
         scores = judge("shelf bin", "Kinect", seed, 1, load_model(None), Settings())
-        found += sum(judged.overlap >= MATCHED for judged in scores.objects)
+        found += sum(judged.overlap >= MATCHED_F for judged in scores.objects)
         seen += len(scores.objects)
     assert seen > 40
     assert found > 0.55 * seen

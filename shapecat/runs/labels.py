@@ -16,7 +16,7 @@ from shapecat.runs.shown import ShownTracks
 from shapecat.runs.tables import numbers, read_row_groups
 from shapecat.types import Box, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 
-__all__ = ["read_labelled_frames"]
+__all__ = ["read_labelled_frames", "rows_by_frame"]
 
 
 def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[LabelledFrame]:
@@ -30,14 +30,14 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
         read_row_groups(folder / f"{name}.parquet") for name in ("frames", "detections", "planes")
     )
     for frames, detections, planes in zip(*groups, strict=True):
-        objects = _by_frame(detections)
-        supports = _by_frame(planes)
+        objects = rows_by_frame(detections)
+        supports = rows_by_frame(planes)
         for row in frames.to_pylist():
             key = (row["topic"], row["frame"])
             yield _labelled_frame(row, objects.get(key, []), supports.get(key, []), shown)
 
 
-def _by_frame(table: pa.Table) -> dict[tuple[str, int], list[dict[str, Any]]]:
+def rows_by_frame(table: pa.Table) -> dict[tuple[str, int], list[dict[str, Any]]]:
     """Group rows by frame; list columns of numbers become arrays without a detour."""
     columns = {
         name: _arrays(table[name])

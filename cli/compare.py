@@ -1,0 +1,67 @@
+"""``shapecat compare``."""
+
+from pathlib import Path
+from typing import Any
+
+import click
+
+from .options import ANY_PATH, json_option
+from .render import print_json, print_table, progress_bars
+
+
+@click.command()
+@click.argument("run", type=ANY_PATH)
+@click.argument("truth", type=ANY_PATH)
+@click.option(
+    "--out",
+    type=ANY_PATH,
+    help="New folder for the page with pictures, the table of all objects, and the figures.",
+)
+@click.option("--recording", type=ANY_PATH, help="Where the recording is now, for the pictures.")
+@json_option
+def compare(
+    *, run: Path, truth: Path, out: Path | None, recording: Path | None, as_json: bool
+) -> None:
+    """Compare a run with the truth, with labels of other tools, or with another run.
+
+    TRUTH is NAME.truth.json as `shapecat simulate` writes it (or the recording beside it), a COCO
+    file, a folder with label_2 (KITTI), or another run of the same recording, which is then taken
+    for true. Frames are matched by their stamps.
+
+    \b
+    shapecat compare results/demo demo.truth.json
+    shapecat compare results/lab results-before/lab --out differences
+    """
+    from shapecat.evaluation.comparing import compare as compare_run
+    from shapecat.evaluation.comparison_page import figure_rows, require_new, write_comparison
+
+    if out is not None:
+        require_new(out)
+    with progress_bars() as bars:
+        found = compare_run(run, truth, recording=recording, observe=bars)
+    if out is not None:
+        write_comparison(out, found)
+    if as_json:
+        print_json(found.as_dict())
+        return
+    _print(found, figure_rows(found))
+    if out is not None:
+        click.echo(f"\n{out / 'comparison.html'}")
+
+
+def _print(found: Any, rows: Any) -> None:
+    """Print the figures, then how many differences there are of each kind."""
+    click.echo(f"{found.run} compared with {found.reference} ({found.kind})\n")
+    print_table(("figure", "value", "meaning"), rows)
+    kinds = found.as_dict()["differences"]
+    click.echo(f"\n{_words(kinds)}")
+    for note in found.notes:
+        click.echo(note, err=True)
+
+
+def _words(kinds: dict[str, int]) -> str:
+    if not kinds:
+        return "no differences"
+    parts = [f"{count} {name}" for name, count in sorted(kinds.items(), key=lambda i: -i[1])]
+    total = sum(kinds.values())
+    return f"{total} difference{'s' if total != 1 else ''}: {', '.join(parts)}"

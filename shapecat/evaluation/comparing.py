@@ -1,0 +1,299 @@
+"""A run compared with the truth, with labels of other tools, or with another run."""
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from shapecat.errors import OutputError, RecordingError
+from shapecat.evaluation.comparison_figures import Pairs, figures_of
+from shapecat.evaluation.comparison_matching import (
+    SAME_BOX,
+    SAME_MASK,
+    Matched,
+    item_box_iou,
+    match_objects,
+    seen_together,
+)
+from shapecat.evaluation.comparison_pictures import Picture, draw_frame
+from shapecat.evaluation.identities import SeenTogether
+from shapecat.evaluation.labellings import Item, Labelling, Reference
+from shapecat.evaluation.overlap import MATCHED_F, Overlap
+from shapecat.evaluation.references import OtherRun, open_reference, read_complete, run_labellings
+from shapecat.outputs.rereading import FinishedRun, clouds_again, open_source
+from shapecat.runs.tables import Key
+from shapecat.types import Frame
+
+__all__ = ["Comparison", "Difference", "compare"]
+
+_PICTURES = 12
+
+Observer = Callable[[str, int, int | None], None]
+
+
+def _ignore(_phase: str, _done: int, _total: int | None) -> None:
+    """Observe nothing."""
+
+
+class Difference(NamedTuple):
+    """A true object and what was found of it, or one of the two: a row of the table.
+
+    ``difference`` is ``missed``, ``surplus``, ``outline``, ``category``, ``identity``, or None
+    where they agree; ``f``, ``iou`` and ``box_iou`` are None where they cannot be computed.
+    """
+
+    topic: str
+    frame: int
+    stamp_ns: int
+    difference: str | None
+    true_track: int | None = None
+    true_category: str | None = None
+    track: int | None = None
+    category: str | None = None
+    confidence: float | None = None
+    f: float | None = None
+    iou: float | None = None
+    box_iou: float | None = None
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """What a comparison came to.
+
+    Attributes
+    ----------
+    figures : all figures by name, plain values; None where they cannot be computed.
+    rows : every object of every frame compared.
+    pictures : the frames that differ most, in the order of time.
+    notes : what the reader should know.
+    """
+
+    run: str
+    reference: str
+    kind: str
+    figures: Mapping[str, Any]
+    rows: tuple[Difference, ...]
+    pictures: tuple[Picture, ...]
+    notes: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return plain values for ``--json``."""
+        kinds = Counter(row.difference for row in self.rows if row.difference)
+        head = {"run": self.run, "reference": self.reference, "kind": self.kind}
+        return {**head, **self.figures, "differences": dict(kinds), "notes": list(self.notes)}
+
+
+@dataclass
+class _Tally:
+    """What is counted while frames go by."""
+
+    overlap: Overlap = field(default_factory=Overlap)
+    pairs: Pairs = field(default_factory=Pairs)
+    seen: list[SeenTogether] = field(default_factory=list)
+    rows: list[Difference] = field(default_factory=list)
+    last: dict[int, int] = field(default_factory=dict)
+    pictures: dict[int, Picture] = field(default_factory=dict)
+    compared: int = 0
+    only_run: int = 0
+    masks: bool = True
+
+
+def compare(
+    folder: Path,
+    reference: Path,
+    *,
+    recording: Path | None = None,
+    observe: Observer = _ignore,
+) -> Comparison:
+    """Compare a finished run with what is true, or taken for true.
+
+    Parameters
+    ----------
+    reference : see `open_reference`.
+    recording : where the recording is now; it is read for the pictures alone.
+
+    Raises
+    ------
+    OutputError : the folder is no complete run, or the other is of another recording.
+    RecordingError : the reference cannot be read, or has no frame in common with the run.
+    """
+    finished = read_complete(folder)
+    other = open_reference(reference)
+    if isinstance(other, OtherRun):
+        _require_same_recording(finished, other)
+    tally = _Tally()
+    with ExitStack() as stack:
+        clouds, notes = _clouds(finished, recording, stack)
+        total = int(finished.run["counts"]["frames"])
+        for done, (key, row, found) in enumerate(run_labellings(finished), start=1):
+            true = other.at(key, row["stamp_ns"])
+            if true is None:
+                tally.only_run += 1
+            else:
+                _compare_frame(
+                    tally, key, row, found, true, clouds, (done - 1) * _PICTURES // total
+                )
+            observe("compare", done, total)
+    if not tally.compared:
+        raise RecordingError(_nothing_in_common(finished, reference, other))
+    return Comparison(
+        run=str(folder),
+        reference=str(reference),
+        kind=other.kind,
+        figures=_figures(tally, other, finished),
+        rows=tuple(tally.rows),
+        pictures=tuple(tally.pictures[k] for k in sorted(tally.pictures)),
+        notes=tuple(notes),
+    )
+
+
+def _require_same_recording(finished: FinishedRun, other: OtherRun) -> None:
+    a, b = finished.run["input"], other.finished.run["input"]
+    if a["digest"] != b["digest"]:
+        msg = f"{other.finished.folder}: a run of another recording: {b['path']}, not {a['path']}"
+        raise OutputError(msg)
+
+
+def _nothing_in_common(finished: FinishedRun, reference: Path, other: Reference) -> str:
+    stamps = [row["stamp_ns"] for _, row, _ in run_labellings(finished)]
+    own = f"stamps {min(stamps)} to {max(stamps)}" if stamps else "none"
+    return (
+        f"{reference}: no frame in common with {finished.folder}: it has "
+        f"{other.describe_frames()}, the run {own}; is it of another recording?"
+    )
+
+
+def _clouds(
+    finished: FinishedRun, recording: Path | None, stack: ExitStack
+) -> tuple[Iterator[Frame], list[str]]:
+    """Return the frames of the recording, none with a note where it is not to be had."""
+    try:
+        source = stack.enter_context(open_source(finished.run, recording))
+        return clouds_again(source, finished.run), []
+    except (RecordingError, OutputError) as error:
+        if recording is not None:
+            raise
+        return iter(()), [f"Pictures without depth: {error}"]
+
+
+def _compare_frame(
+    tally: _Tally,
+    key: Key,
+    row: Mapping[str, Any],
+    found: Labelling,
+    true: Labelling,
+    clouds: Iterator[Frame],
+    part: int,
+) -> None:
+    """Match the objects of a frame, and take down what is the same and what differs."""
+    tally.compared += 1
+    found = _labelled_part(found, true, key)
+    matched = match_objects(found.items, true.items)
+    tally.masks &= matched.overlap is not None
+    tally.overlap += matched.overlap or Overlap()
+    rows = list(_differences(tally, key, row["stamp_ns"], found.items, true.items, matched))
+    tally.rows += rows
+    tally.pairs.add(found.items, true.items, matched)
+    tally.seen.append(seen_together(found.items, true.items, matched))
+    differing = [item for item in rows if item.difference]
+    severity = len(differing) + 1 - float(np.mean([item.iou or 0 for item in rows] or [1]))
+    best = tally.pictures.get(part)
+    frame = next((f for f in clouds if (f.topic, f.index) == key), None)
+    if differing and (best is None or severity > best.severity):
+        picture = draw_frame(key, frame, found, true, matched.pairs, rows, severity)
+        if picture is not None:
+            tally.pictures[part] = picture
+
+
+def _labelled_part(found: Labelling, true: Labelling, key: Key) -> Labelling:
+    """Return what was found where labels are known.
+
+    Raises
+    ------
+    RecordingError : the labels are of an image of another size.
+    """
+    size = None if true.shape is None else true.shape[0] * true.shape[1]
+    pixels = [item.pixels for item in found.items if item.pixels is not None and item.pixels.size]
+    if size is not None and any(int(some.max()) >= size for some in pixels):
+        msg = f"frame {key[1]} of {key[0]}: labels are of an image of another size, {true.shape}"
+        raise RecordingError(msg)
+    if true.known is None:
+        return found
+    items = (
+        item
+        if item.pixels is None
+        else Item(**{**vars(item), "pixels": item.pixels[true.known[item.pixels]]})
+        for item in found.items
+    )
+    return Labelling(tuple(items))
+
+
+def _differences(
+    tally: _Tally,
+    key: Key,
+    stamp_ns: int,
+    found: Sequence[Item],
+    true: Sequence[Item],
+    matched: Matched,
+) -> Iterator[Difference]:
+    """Yield the rows of a frame: pairs, what was missed, what is surplus."""
+    head = (*key, stamp_ns)
+    for i, a in enumerate(found):
+        if i not in matched.pairs:
+            yield Difference(
+                *head, "surplus", track=a.track, category=a.category, confidence=a.confidence
+            )
+            continue
+        b, j = true[matched.pairs[i]], matched.pairs[i]
+        f = None if matched.f is None else float(matched.f[i, j])
+        iou = None if f is None else float(matched.similarity[i, j])
+        kind = _kind(tally, a, b, f)
+        yield Difference(
+            *head,
+            kind,
+            true_track=b.track,
+            true_category=b.category,
+            track=a.track,
+            category=a.category,
+            confidence=a.confidence,
+            f=f,
+            iou=iou,
+            box_iou=item_box_iou(a, b),
+        )
+    for j, b in enumerate(true):
+        if j not in matched.pairs.values():
+            yield Difference(*head, "missed", true_track=b.track, true_category=b.category)
+
+
+def _kind(tally: _Tally, a: Item, b: Item, f: float | None) -> str | None:
+    """Return in what a found and a true object differ, the gravest first."""
+    switched = False
+    if a.track is not None and b.track is not None:
+        switched = tally.last.get(b.track, a.track) != a.track
+        tally.last[b.track] = a.track
+    if b.decidable and a.category != b.category:
+        return "category"
+    if switched:
+        return "identity"
+    return "outline" if f is not None and f < MATCHED_F else None
+
+
+def _figures(tally: _Tally, other: Reference, finished: FinishedRun) -> dict[str, Any]:
+    frames = {
+        "compared": tally.compared,
+        "only_in_run": tally.only_run,
+        "only_in_reference": max(other.frames - tally.compared, 0),
+    }
+    return figures_of(
+        frames,
+        tally.pairs,
+        overlap=tally.overlap if tally.masks else None,
+        seen=tally.seen if other.tracked else None,
+        rows=tally.rows,
+        categories=tuple(finished.run["model"]["categories"]),
+        threshold=SAME_MASK if tally.masks else SAME_BOX,
+    )

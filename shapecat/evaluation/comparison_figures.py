@@ -1,0 +1,129 @@
+"""The figures of a comparison, from what was counted frame by frame."""
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from shapecat.evaluation.identities import SeenTogether, judge_identities
+from shapecat.evaluation.labellings import Item
+from shapecat.evaluation.metrics import expected_calibration_error
+from shapecat.evaluation.overlap import Overlap
+
+__all__ = ["Pairs", "figures_of"]
+
+
+@dataclass
+class Pairs:
+    """Matched objects whose category can be told: what is true, what was said."""
+
+    truth: list[str] = field(default_factory=list)
+    labels: list[str] = field(default_factory=list)
+    views: list[str] = field(default_factory=list)
+    posteriors: list[Any] = field(default_factory=list)
+
+    def add(self, found: Sequence[Item], true: Sequence[Item], matched: Any) -> None:
+        """Take down the pairs of a frame."""
+        for i, j in matched.pairs.items():
+            if true[j].decidable:
+                self.truth.append(true[j].category)
+                self.labels.append(found[i].category)
+                self.views.append(found[i].view_category)
+                self.posteriors.append(found[i].posterior)
+
+
+def figures_of(
+    frames: Mapping[str, int],
+    pairs: Pairs,
+    *,
+    overlap: Overlap | None,
+    seen: Sequence[SeenTogether] | None,
+    rows: Sequence[Any],
+    categories: Sequence[str],
+    threshold: float,
+) -> dict[str, Any]:
+    """Return all figures by name, as plain values; None where they cannot be computed.
+
+    Parameters
+    ----------
+    overlap : None without masks.
+    seen : None without identities.
+    categories : those of the model; true objects of others are left out where categories count.
+    """
+    boxes = [row.box_iou for row in rows if row.box_iou is not None]
+    return {
+        "frames": dict(frames),
+        "objects": _objects(rows, overlap),
+        "overlap": None if overlap is None else _overlap(overlap),
+        "category": _category(pairs, categories),
+        "box_iou": {"n": len(boxes), "mean": _mean(boxes)},
+        "tracking": None if seen is None else _tracking(seen, threshold),
+    }
+
+
+def _objects(rows: Sequence[Any], overlap: Overlap | None) -> dict[str, Any]:
+    """Count true and found objects; found well where masks tell it, else where boxes match."""
+    true = sum(row.difference != "surplus" for row in rows)
+    detections = sum(row.difference != "missed" for row in rows)
+    hits = overlap.hits if overlap else sum(r.difference not in {"surplus", "missed"} for r in rows)
+    share = _share(hits, true)
+    return {"true": true, "detections": detections, "found": hits, "share_found": share}
+
+
+def _overlap(overlap: Overlap) -> dict[str, float]:
+    return {
+        "f": round(overlap.f, 4),
+        "precision": round(overlap.precision, 4),
+        "recall": round(overlap.recall, 4),
+    }
+
+
+def _category(pairs: Pairs, categories: Sequence[str]) -> dict[str, Any]:
+    """Judge final labels and single views; the posteriors of single views are what is calibrated.
+
+    Where the truth is another run, it may say unknown: no category of the model, left out.
+    """
+    known = [k for k, name in enumerate(pairs.truth) if name in categories]
+    truth = np.array([categories.index(pairs.truth[k]) for k in known], np.int64)
+    wrong = Counter((pairs.truth[k], pairs.labels[k]) for k in known)
+    names = [(a, b, count) for (a, b), count in wrong.most_common() if a != b]
+    posteriors = np.array([pairs.posteriors[k] for k in known])
+    error = expected_calibration_error(truth, posteriors) if known else None
+    return {
+        "n": len(known),
+        "accuracy": _agreement(pairs.truth, pairs.labels, known),
+        "balanced": _balanced(pairs.truth, pairs.labels, known),
+        "view_accuracy": _agreement(pairs.truth, pairs.views, known),
+        "view_balanced": _balanced(pairs.truth, pairs.views, known),
+        "ece": None if error is None else round(error, 4),
+        "taken_for": [{"true": a, "label": b, "n": count} for a, b, count in names],
+    }
+
+
+def _agreement(truth: Sequence[str], said: Sequence[str], known: Sequence[int]) -> float | None:
+    return _mean([truth[k] == said[k] for k in known])
+
+
+def _balanced(truth: Sequence[str], said: Sequence[str], known: Sequence[int]) -> float | None:
+    """Return the mean recall of the categories."""
+    names = sorted({truth[k] for k in known})
+    recalls = [_agreement(truth, said, [k for k in known if truth[k] == name]) for name in names]
+    return _mean([value for value in recalls if value is not None])
+
+
+def _tracking(seen: Sequence[SeenTogether], threshold: float) -> dict[str, Any]:
+    figures = judge_identities(seen, threshold=threshold).as_dict()
+    return {
+        name: None if value != value else round(value, 4)  # noqa: PLR0124  NaN
+        for name, value in figures.items()
+    }
+
+
+def _mean(values: Sequence[float]) -> float | None:
+    return round(float(np.mean(values)), 4) if len(values) else None
+
+
+def _share(part: int, whole: int) -> float | None:
+    return round(part / whole, 4) if whole else None

@@ -1,0 +1,239 @@
+"""A comparison to look at: its figures, a page with pictures, a table of all objects."""
+
+import json
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import pyarrow as pa
+
+from shapecat.errors import OutputError
+from shapecat.evaluation.comparing import Comparison, Difference
+from shapecat.evaluation.comparison_pictures import COLOURS, Picture, words_of
+from shapecat.files import complete_folder
+from shapecat.runs.tables import write_table
+
+__all__ = ["OBJECTS", "figure_rows", "format_page", "require_new", "write_comparison"]
+
+_MOST_ROWS = 500
+
+OBJECTS = pa.schema(
+    [
+        ("topic", pa.string()),
+        ("frame", pa.int32()),
+        ("stamp_ns", pa.int64()),
+        ("difference", pa.string()),
+        ("true_track", pa.int64()),
+        ("true_category", pa.string()),
+        ("track", pa.int64()),
+        ("category", pa.string()),
+        ("confidence", pa.float32()),
+        ("f", pa.float32()),
+        ("iou", pa.float32()),
+        ("box_iou", pa.float32()),
+    ]
+)
+"""One row per true object with what was found of it, and per found object without a true one."""
+
+
+def require_new(folder: Path) -> None:
+    """Refuse a folder that holds something, before the work begins.
+
+    Raises
+    ------
+    OutputError : it is there and not empty, or cannot be made.
+    """
+    try:
+        taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
+        folder.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        msg = f"{folder}: cannot be written: {error.strerror or error}"
+        raise OutputError(msg) from error
+    if taken:
+        msg = f"{folder}: is there already; choose another --out, or move it away"
+        raise OutputError(msg)
+
+
+def write_comparison(folder: Path, found: Comparison) -> None:
+    """Write comparison.html, objects.parquet and comparison.json into a new folder.
+
+    Raises
+    ------
+    OutputError : the folder holds something, or is not writable.
+    """
+    require_new(folder)
+    columns = zip(*found.rows, strict=True) if found.rows else ([] for _ in Difference._fields)
+    table = dict(zip(Difference._fields, map(list, columns), strict=True))
+    try:
+        with complete_folder(folder) as hidden:
+            write_table(hidden / "objects.parquet", table, OBJECTS)
+            (hidden / "comparison.html").write_text(format_page(found), "utf-8")
+            text = json.dumps(found.as_dict(), indent=1, ensure_ascii=False)
+            (hidden / "comparison.json").write_text(text + "\n", "utf-8")
+    except OSError as error:
+        msg = f"{folder}: cannot be written: {error.strerror or error}"
+        raise OutputError(msg) from error
+
+
+_Row = tuple[str, str, str]
+
+
+def figure_rows(found: Comparison) -> list[_Row]:
+    """Return name, value and meaning of each figure that could be computed."""
+    figures, rows = found.figures, list[_Row]()
+    frames, objects, category = (figures[n] for n in ("frames", "objects", "category"))
+    aside = [
+        f"{frames[name]} only in the {words}"
+        for name, words in (("only_in_run", "run"), ("only_in_reference", "reference"))
+        if frames[name]
+    ]
+    rows.append(("frames", str(frames["compared"]), ", ".join(aside) or "the same in both"))
+    rows.append(
+        (
+            "objects found",
+            _percent(objects["share_found"]),
+            f"{objects['found']} of {objects['true']}; {objects['detections']} detections",
+        )
+    )
+    if overlap := figures["overlap"]:
+        pair = f"precision {overlap['precision']:.3f}, recall {overlap['recall']:.3f} of pixels"
+        rows.append(("overlap F", f"{overlap['f']:.3f}", pair))
+    if category["n"]:
+        rows += _category_rows(category)
+    if figures["box_iou"]["n"]:
+        boxes = figures["box_iou"]
+        rows.append(("box IoU", f"{boxes['mean']:.3f}", f"mean of {boxes['n']} pairs, in 3D"))
+    if tracking := figures["tracking"]:
+        rows += _tracking_rows(tracking)
+    return rows
+
+
+def _category_rows(category: dict[str, Any]) -> list[_Row]:
+    most = ", ".join(f"{k['true']} as {k['label']} {k['n']}×" for k in category["taken_for"][:3])
+    return [
+        (
+            "category right",
+            _percent(category["accuracy"]),
+            f"of {category['n']} matched objects" + (f"; {most}" if most else ""),
+        ),
+        ("  of single views", _percent(category["view_accuracy"]), "before tracks fuse them"),
+        ("calibration error", f"{category['ece']:.3f}", "of single views (ECE); 0 is honest"),
+    ]
+
+
+def _tracking_rows(tracking: dict[str, Any]) -> list[_Row]:
+    lost = f"{tracking['misses']} misses, {tracking['false_positives']} false positives"
+    parts = (
+        f"detection {_text(tracking['detection_accuracy'])}, "
+        f"association {_text(tracking['association_accuracy'])}"
+    )
+    return [
+        ("IDF1", _text(tracking["idf1"]), "how long identities are kept"),
+        ("MOTA", _text(tracking["mota"]), f"{lost}, {tracking['switches']} identity switches"),
+        ("HOTA", _text(tracking["hota"]), parts),
+    ]
+
+
+def _percent(share: float | None) -> str:
+    return "–" if share is None else f"{100 * share:.1f} %"
+
+
+def _text(value: float | None) -> str:
+    return "–" if value is None else f"{value:.3f}"
+
+
+def format_page(found: Comparison) -> str:
+    """Return a comparison as an HTML page with its pictures inside."""
+    differing = [row for row in found.rows if row.difference]
+    return _PAGE.substitute(
+        title=escape(f"{Path(found.run).name} compared with {Path(found.reference).name}"),
+        subtitle=escape(f"{found.run} · {found.reference} ({found.kind})"),
+        notes="".join(f'<p class="note">{escape(note)}</p>' for note in found.notes),
+        figures=_table((), figure_rows(found)),
+        legend="".join(
+            f'<span><i style="background:rgb{colour}"></i>{name}</span>'
+            for name, colour in zip(
+                (
+                    "both",
+                    "missed: only the reference",
+                    "surplus: only the run, or of another object",
+                    "taken for another category",
+                ),
+                COLOURS.values(),
+                strict=True,
+            )
+        ),
+        pictures="".join(map(_picture, found.pictures)) or "<p>No frame differs.</p>"
+        if not differing or found.pictures
+        else "<p>No pictures: the frames are not images.</p>",
+        count=_count(differing),
+        rows=_table(_HEAD, [_cells(row) for row in differing[:_MOST_ROWS]]),
+    )
+
+
+_HEAD = ("frame", "difference", "true", "found", "track", "confidence", "overlap F", "box IoU")
+
+
+def _count(rows: Sequence[Difference]) -> str:
+    more = f"; the first {_MOST_ROWS} are here" if len(rows) > _MOST_ROWS else ""
+    return f"{len(rows)} difference{'s' if len(rows) != 1 else ''}{more}"
+
+
+def _cells(row: Difference) -> tuple[str, ...]:
+    return (
+        str(row.frame),
+        words_of(row),
+        row.true_category or "",
+        row.category or "",
+        "" if row.track is None else f"#{row.track}",
+        "" if row.confidence is None else f"{row.confidence:.2f}",
+        "" if row.f is None else f"{row.f:.2f}",
+        "" if row.box_iou is None else f"{row.box_iou:.2f}",
+    )
+
+
+def _picture(picture: Picture) -> str:
+    texts = "".join(
+        f'<text x="{min(max(c.x, 70), picture.width - 70):.0f}" y="{max(c.y, 14):.0f}">'
+        f"{escape(c.text)}</text>"
+        for c in picture.captions
+    )
+    listed = "; ".join(words_of(row) for row in picture.rows)
+    return (
+        f'<figure><svg viewBox="0 0 {picture.width} {picture.height}" role="img" '
+        f'aria-label="{escape(listed)}"><image href="{picture.image}" width="{picture.width}" '
+        f'height="{picture.height}"/>{texts}</svg><figcaption><b>{escape(picture.topic)} '
+        f"frame {picture.frame}</b>: {escape(listed)}</figcaption></figure>"
+    )
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    lines = [f"<tr>{''.join(f'<th>{escape(c)}</th>' for c in head)}</tr>"] if head else []
+    lines += [f"<tr>{''.join(f'<td>{escape(c)}</td>' for c in row)}</tr>" for row in rows]
+    return f"<table>{''.join(lines)}</table>"
+
+
+_PAGE = Template(
+    """<!DOCTYPE html><html lang="en"><meta charset="utf-8">
+<meta name="viewport" content="width=device-width">
+<title>$title</title><style>
+body{font:15px/1.5 system-ui,sans-serif;max-width:70em;margin:2em auto;padding:0 1em;color:#222}
+h1{margin-bottom:0}.sub,.note{color:#666}.note{border-left:3px solid #e65100;padding-left:.6em}
+table{border-collapse:collapse;margin:1em 0}td,th{padding:.2em 1em .2em 0;text-align:left}
+tr+tr{border-top:1px solid #ddd}td:nth-child(2){font-variant-numeric:tabular-nums}
+.pictures{display:grid;grid-template-columns:repeat(auto-fill,minmax(26em,1fr));gap:1.2em}
+figure{margin:0}figure svg{width:100%;border-radius:4px;display:block}
+figcaption{font-size:13px;color:#444}
+text{font:600 15px system-ui,sans-serif;fill:#fff;stroke:#000;stroke-width:3px;paint-order:stroke;
+text-anchor:middle}
+.legend span{margin-right:1.5em}.legend i{display:inline-block;width:.9em;height:.9em;
+border-radius:2px;margin-right:.4em;vertical-align:-1px}
+</style><body><h1>$title</h1><p class="sub">$subtitle</p>$notes
+$figures<h2>Frames that differ most</h2>
+<p>The one that differs most of each twelfth of the run.</p>
+<p class="legend">$legend</p><div class="pictures">$pictures</div>
+<h2>Frame by frame</h2><p>$count. All objects are in objects.parquet.</p>$rows</body></html>
+"""
+)

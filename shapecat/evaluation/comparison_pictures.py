@@ -1,0 +1,149 @@
+"""Pictures of frames in which a run and the truth differ."""
+
+import base64
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import U1
+from shapecat.evaluation.labellings import Item, Labelling
+from shapecat.outputs.exports_files import png
+from shapecat.runs.tables import Key
+from shapecat.types import Frame
+
+__all__ = ["COLOURS", "Picture", "draw_frame", "words_of"]
+
+_SHADES = 48
+COLOURS = {
+    "both": (66, 160, 71),
+    "missed": (230, 81, 0),
+    "surplus": (30, 100, 220),
+    "category": (160, 40, 170),
+}
+"""Pixels that both have for the same object, the truth alone, the run alone; and those of an
+object that has another category."""
+_INK = 0.55
+
+
+class Caption(NamedTuple):
+    """A text at a place of the picture, in pixels."""
+
+    x: float
+    y: float
+    text: str
+
+
+class Picture(NamedTuple):
+    """A frame as a data URI of a PNG, with captions; the more it differs, the graver."""
+
+    topic: str
+    frame: int
+    image: str
+    width: int
+    height: int
+    captions: tuple[Caption, ...]
+    severity: float
+    rows: tuple[Any, ...]
+
+
+def draw_frame(
+    key: Key,
+    frame: Frame | None,
+    found: Labelling,
+    true: Labelling,
+    pairs: Mapping[int, int],
+    rows: Sequence[Any],
+    severity: float,
+) -> Picture | None:
+    """Draw found and true masks over the depth; None where there is no image to draw on.
+
+    Parameters
+    ----------
+    pairs : found objects and the true ones they are.
+    rows : what differs, first of each found object, in their order.
+    """
+    shape = true.shape
+    if frame is not None:
+        shape = frame.depth.shape if frame.depth is not None else None
+    if shape is None:
+        return None
+    height, width = shape
+    image = _shades(frame, height, width) + _SHADES * _states(
+        found, true, pairs, rows, height * width
+    )
+    code = base64.b64encode(png(image.reshape(height, width).astype(np.uint8), _palette())).decode()
+    differing = tuple(row for row in rows if row.difference)
+    captions = _captions(differing, found.items, true.items, width)
+    uri = f"data:image/png;base64,{code}"
+    return Picture(*key, uri, width, height, captions, severity, differing)
+
+
+def _states(
+    found: Labelling, true: Labelling, pairs: Mapping[int, int], rows: Sequence[Any], size: int
+) -> U1:
+    """Return (n,) 0 for no object, else the number of the colour.
+
+    Pixels that belong to different objects are surplus: parts of objects that were split show.
+    """
+    state = np.zeros(size, np.int64)
+    for number, labelling in ((2, true), (3, found)):
+        for item in labelling.items:
+            if item.pixels is not None:
+                state[item.pixels] = number
+    for i, j in pairs.items():
+        mine, theirs = found.items[i].pixels, true.items[j].pixels
+        if mine is not None and theirs is not None:
+            state[np.intersect1d(mine, theirs)] = 4 if rows[i].difference == "category" else 1
+    return state
+
+
+def _shades(frame: Frame | None, height: int, width: int) -> U1:
+    """Return (n,) the brightness of each pixel: lit from the camera, nearer is brighter."""
+    if frame is None or frame.depth is None:
+        return np.full(height * width, _SHADES * 3 // 4)
+    depth = np.asarray(frame.depth, np.float64)
+    seen = depth > 0
+    z = np.where(seen, depth, np.nan)
+    near, far = np.nanpercentile(z, [2, 90]) if seen.any() else (0.0, 1.0)
+    distance = np.clip((z - near) / max(far - near, 1e-3), 0, 1)
+    slope = np.hypot(*np.gradient(z)) / z
+    light = 1 / np.sqrt(1 + (slope * 250) ** 2)
+    shade = (0.35 + 0.65 * light) * (1 - 0.5 * distance)
+    level = np.nan_to_num(shade, nan=0.2) * (_SHADES - 1)
+    return np.where(seen, level, 2).astype(np.int64).reshape(-1)
+
+
+def _palette() -> U1:
+    """Return (k, 3) all shades of no object, then tinted by each colour."""
+    grey = np.repeat(np.linspace(0, 255, _SHADES)[:, None], 3, axis=1)
+    tinted = [grey * (1 - _INK) + _INK * np.array(colour) for colour in COLOURS.values()]
+    return np.concatenate([grey, *tinted]).astype(np.uint8)
+
+
+def _captions(
+    rows: Sequence[Any], found: Sequence[Item], true: Sequence[Item], width: int
+) -> tuple[Caption, ...]:
+    """Return what differs at the place of each object."""
+    captions = []
+    for row in rows:
+        mine = row.difference != "missed"
+        wanted = (row.track, row.category) if mine else (row.true_track, row.true_category)
+        items = found if mine else true
+        item = next((i for i in items if (i.track, i.category) == wanted), None)
+        if item is not None and item.pixels is not None and item.pixels.size:
+            y, x = np.divmod(item.pixels, width)
+            captions.append(Caption(float(x.mean()), float(y.min()) - 4, words_of(row)))
+    return tuple(captions)
+
+
+def words_of(row: Any) -> str:
+    """Return in words in what a found and a true object differ."""
+    track = "" if row.track is None else f" #{row.track}"
+    return {
+        "missed": f"missed {row.true_category}",
+        "surplus": f"surplus {row.category}{track}",
+        "category": f"{row.true_category} taken for {row.category}{track}",
+        "identity": f"{row.true_category} now{track}",
+        "outline": f"{row.category}{track}: outline differs",
+    }[row.difference]

@@ -1,0 +1,174 @@
+"""How well tracks keep the identities of objects: MOTA, IDF1 and HOTA."""
+
+from collections import Counter
+from collections.abc import Hashable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from shapecat.arrays import F8, I4, Bool
+
+__all__ = ["Identities", "SeenTogether", "judge_identities"]
+
+_ALPHAS = np.arange(0.05, 0.99, 0.05)
+_FORBIDDEN = 1e6
+
+
+class SeenTogether(NamedTuple):
+    """The true and the found objects of a frame, and how similar they are.
+
+    ``true`` and ``found`` are identities, each once; ``similarity`` (true, found) lies within 0
+    and 1, with 0 for pairs that cannot be the same object.
+    """
+
+    true: Sequence[Hashable]
+    found: Sequence[Hashable]
+    similarity: F8
+
+
+@dataclass(frozen=True)
+class Identities:
+    """Figures of tracking over all frames; NaN without true objects."""
+
+    idf1: float
+    mota: float
+    hota: float
+    detection_accuracy: float
+    association_accuracy: float
+    switches: int
+    misses: int
+    false_positives: int
+    objects: int
+
+    def as_dict(self) -> dict[str, Any]:
+        """Return the figures by name."""
+        return asdict(self)
+
+
+class _Occurrences(NamedTuple):
+    """How often each identity was there, and the frames with positions instead of identities."""
+
+    true: F8
+    found: F8
+    frames: list[tuple[I4, I4, F8]]
+
+
+def judge_identities(frames: Iterable[SeenTogether], *, threshold: float = 0.5) -> Identities:
+    """Judge tracks against true objects, frame by frame in the order of time.
+
+    Source: Bernardin 2008 (MOTA), Ristani 2016 (IDF1), Luiten 2020 (HOTA).
+
+    Parameters
+    ----------
+    threshold : pairs less similar are not the same object; HOTA goes through all thresholds.
+    """
+    frames = list(frames)
+    counts = _clear_mot(frames, threshold)
+    seen = _occurrences(frames)
+    hota, detection, association = _hota(seen)
+    errors = counts["misses"] + counts["false_positives"] + counts["switches"]
+    objects = counts["objects"]
+    return Identities(
+        idf1=_idf1(seen, threshold),
+        mota=1 - errors / objects if objects else float("nan"),
+        hota=hota,
+        detection_accuracy=detection,
+        association_accuracy=association,
+        switches=counts["switches"],
+        misses=counts["misses"],
+        false_positives=counts["false_positives"],
+        objects=objects,
+    )
+
+
+def _clear_mot(frames: Iterable[SeenTogether], threshold: float) -> Counter[str]:
+    """Count misses, false positives and switches; a pair goes on as long as it can."""
+    last: dict[Hashable, Hashable] = {}
+    counts: Counter[str] = Counter()
+    for frame in frames:
+        true, found, similarity = frame
+        pairs = _pairs(frame, np.asarray(similarity) >= threshold, last)
+        matched = {true[i]: found[j] for i, j in pairs}
+        counts["switches"] += sum(last.get(t, f) != f for t, f in matched.items())
+        counts["misses"] += len(true) - len(matched)
+        counts["false_positives"] += len(found) - len(matched)
+        counts["objects"] += len(true)
+        last.update(matched)
+    return counts
+
+
+def _pairs(
+    frame: SeenTogether, allowed: Bool, last: Mapping[Hashable, Hashable]
+) -> list[tuple[int, int]]:
+    """Match a frame: the pairs of before where they are allowed, then the most similar."""
+    true, found, similarity = frame
+    place = {name: j for j, name in enumerate(found)}
+    pairs: dict[int, int] = {}
+    for i, name in enumerate(true):
+        j = place.get(last.get(name), -1) if name in last else -1
+        if j >= 0 and allowed[i, j] and j not in pairs.values():
+            pairs[i] = j
+    rows = [i for i in range(len(true)) if i not in pairs]
+    columns = [j for j in range(len(found)) if j not in pairs.values()]
+    cost = np.where(allowed, 1 - np.asarray(similarity), _FORBIDDEN)[np.ix_(rows, columns)]
+    rest = zip(*linear_sum_assignment(cost), strict=True)
+    new = [(rows[i], columns[j]) for i, j in rest if cost[i, j] < _FORBIDDEN]
+    return [*pairs.items(), *new]
+
+
+def _occurrences(frames: Iterable[SeenTogether]) -> _Occurrences:
+    numbers: tuple[dict[Hashable, int], dict[Hashable, int]] = ({}, {})
+    numbered = []
+    for true, found, similarity in frames:
+        places = [
+            np.array([known.setdefault(name, len(known)) for name in names], np.int64)
+            for known, names in zip(numbers, (true, found), strict=True)
+        ]
+        numbered.append((places[0], places[1], np.asarray(similarity, np.float64)))
+    counts = [np.zeros(len(known)) for known in numbers]
+    for true_places, found_places, _ in numbered:
+        counts[0][true_places] += 1
+        counts[1][found_places] += 1
+    return _Occurrences(counts[0], counts[1], numbered)
+
+
+def _idf1(seen: _Occurrences, threshold: float) -> float:
+    """Return the F of the best lasting one-to-one assignment of tracks to objects."""
+    together = np.zeros((seen.true.size, seen.found.size))
+    for true, found, similarity in seen.frames:
+        together[np.ix_(true, found)] += similarity >= threshold
+    kept = together[linear_sum_assignment(-together)].sum()
+    total = seen.true.sum() + seen.found.sum()
+    return float(2 * kept / total) if total else float("nan")
+
+
+def _hota(seen: _Occurrences) -> tuple[float, float, float]:
+    """Return HOTA, detection accuracy and association accuracy, the means over thresholds."""
+    if not (seen.true.sum() and seen.found.sum()):
+        return (0.0, 0.0, 0.0) if seen.true.sum() else (float("nan"),) * 3
+    alignment = _alignment(seen)
+    matches = np.zeros((_ALPHAS.size, *alignment.shape))
+    for true, found, similarity in seen.frames:
+        score = alignment[np.ix_(true, found)] * similarity
+        rows, columns = linear_sum_assignment(-score)
+        same = similarity[rows, columns] >= _ALPHAS[:, None] - 1e-9
+        matches[:, true[rows], found[columns]] += same
+    total = seen.true.sum() + seen.found.sum()
+    hits = matches.sum(axis=(1, 2))
+    ever = seen.true[:, None] + seen.found - matches
+    association = (matches * matches / np.maximum(ever, 1)).sum(axis=(1, 2)) / np.maximum(hits, 1)
+    detection = hits / (total - hits)
+    hota = np.sqrt(detection * association)
+    return float(hota.mean()), float(detection.mean()), float(association.mean())
+
+
+def _alignment(seen: _Occurrences) -> F8:
+    """Return (true, found) how much of their time two identities spend together."""
+    together = np.zeros((seen.true.size, seen.found.size))
+    for true, found, similarity in seen.frames:
+        beside = similarity.sum(axis=0) + similarity.sum(axis=1)[:, None] - similarity
+        share = np.where(beside > 1e-9, similarity / np.maximum(beside, 1e-9), 0)
+        together[np.ix_(true, found)] += share
+    return np.asarray(together / (seen.true[:, None] + seen.found - together))

@@ -1,0 +1,156 @@
+"""How well found objects cover true ones: masks and boxes matched one to one."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.spatial import ConvexHull, QhullError
+
+from shapecat.arrays import F8, U4
+from shapecat.geometry import box_corners, rotation_from_quaternion
+from shapecat.types import Box
+
+__all__ = ["MATCHED_F", "MaskMatches", "Overlap", "box_iou", "match_masks"]
+
+MATCHED_F = 0.75
+"""Overlap F from which an object counts as found."""
+
+_EDGES = np.array(
+    [[k, (k + 1) % 4] for k in range(4)]
+    + [[4 + k, 4 + (k + 1) % 4] for k in range(4)]
+    + [[k, k + 4] for k in range(4)]
+)  # of the corners in the order of `box_corners`
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Pixels and objects counted over frames; they can be added.
+
+    ``shared``, ``found`` and ``true`` are pixels of matched pairs, of all found and of all true
+    objects; ``hits`` are true objects whose match has an overlap F of at least `MATCHED_F`.
+    """
+
+    shared: int = 0
+    found: int = 0
+    true: int = 0
+    hits: int = 0
+    objects: int = 0
+    detections: int = 0
+
+    def __add__(self, other: "Overlap") -> "Overlap":
+        """Return the counts of both."""
+        return Overlap(*(a + b for a, b in zip(_counts(self), _counts(other), strict=True)))
+
+    @property
+    def precision(self) -> float:
+        """The share of found pixels that are right."""
+        return self.shared / max(self.found, 1)
+
+    @property
+    def recall(self) -> float:
+        """The share of true pixels that were found."""
+        return self.shared / max(self.true, 1)
+
+    @property
+    def f(self) -> float:
+        """The harmonic mean of precision and recall."""
+        return 2 * self.shared / max(self.found + self.true, 1)
+
+    @property
+    def share_found(self) -> float:
+        """The share of true objects that are hits."""
+        return self.hits / max(self.objects, 1)
+
+
+def _counts(overlap: Overlap) -> tuple[int, ...]:
+    names = ("shared", "found", "true", "hits", "objects", "detections")
+    return tuple(getattr(overlap, name) for name in names)
+
+
+@dataclass(frozen=True)
+class MaskMatches:
+    """Found (rows) and true masks (columns) of a frame.
+
+    ``f`` and ``iou`` (found, true) are their overlaps; ``pairs`` are matched one to one.
+    """
+
+    f: F8
+    iou: F8
+    pairs: tuple[tuple[int, int], ...]
+    overlap: Overlap
+
+
+def match_masks(found: Sequence[U4], true: Sequence[U4]) -> MaskMatches:
+    """Match masks, given as indices of pixels, so that the sum of their overlap F is greatest.
+
+    Source: Xie et al. 2020 (overlap F of unseen objects), after Ochs et al. 2014.
+    """
+    common = _common(found, true)
+    sizes = np.array([len(m) for m in found]), np.array([len(m) for m in true])
+    total = sizes[0][:, None] + sizes[1]
+    f = 2 * common / np.maximum(total, 1)
+    iou = common / np.maximum(total - common, 1)
+    rows, columns = linear_sum_assignment(-f)
+    overlap = Overlap(
+        shared=int(common[rows, columns].sum()),
+        found=int(sizes[0].sum()),
+        true=int(sizes[1].sum()),
+        hits=int(np.count_nonzero(f[rows, columns] >= MATCHED_F)),
+        objects=len(true),
+        detections=len(found),
+    )
+    return MaskMatches(f, iou, tuple(zip(rows.tolist(), columns.tolist(), strict=True)), overlap)
+
+
+def _common(found: Sequence[U4], true: Sequence[U4]) -> F8:
+    """Return (found, true) how many pixels each two masks share."""
+    size = max((int(mask.max()) + 1 for mask in (*found, *true) if len(mask)), default=0)
+    common = np.zeros((len(found), len(true)), np.int64)
+    for k, mask in enumerate(true):
+        inside = np.zeros(size, np.bool_)
+        inside[mask] = True
+        common[:, k] = [np.count_nonzero(inside[other]) for other in found]
+    return common
+
+
+def box_iou(a: Box, b: Box) -> float:
+    """Return the intersection over union of two boxes in one frame, turned in any way.
+
+    The corners of the intersection are the corners of a box inside the other, and the points
+    where edges of a box pass through faces of the other.
+
+    Examples
+    --------
+    >>> cube = Box([0, 0, 0], [2, 2, 2], [0, 0, 0, 1])
+    >>> box_iou(cube, Box([1, 0, 0], [2, 2, 2], [0, 0, 0, 1]))
+    0.3333333333333333
+    """
+    points = np.concatenate([_inside(a, b), _inside(b, a)])
+    volumes = [float(np.prod(box.size, dtype=np.float64)) for box in (a, b)]
+    if len(points) < 4 or min(volumes) <= 0:
+        return 0.0
+    try:
+        shared = min(float(ConvexHull(points).volume), *volumes)
+    except QhullError:  # flat: they touch
+        return 0.0
+    return shared / (sum(volumes) - shared)
+
+
+def _inside(a: Box, b: Box) -> F8:
+    """Return (n, 3) corners and points of edges of ``a`` where they enter ``b``, and leave it."""
+    turn = rotation_from_quaternion(b.orientation)
+    corners = (box_corners(a) - b.center) @ turn
+    half = b.size.astype(np.float64) / 2
+    start, step = corners[_EDGES[:, 0]], corners[_EDGES[:, 1]] - corners[_EDGES[:, 0]]
+    still = np.abs(step) < 1e-12
+    safe = np.where(still, 1.0, step)
+    sides = np.stack([(-half - start) / safe, (half - start) / safe])
+    outside = still & (np.abs(start) > half + 1e-9)
+    low = np.where(still, 0.0, sides.min(axis=0)).max(axis=1)
+    high = np.where(still, 1.0, sides.max(axis=0)).min(axis=1)
+    low, high = np.maximum(low, 0), np.minimum(high, 1)
+    met = (low <= high) & ~outside.any(axis=1)
+    ends = np.concatenate([start + low[:, None] * step, start + high[:, None] * step])
+    points = ends[np.tile(met, 2)] @ turn.T + b.center
+    return np.asarray(points)

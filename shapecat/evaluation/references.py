@@ -1,0 +1,241 @@
+"""What a run can be compared with: simulated truth, labels of other tools, another run."""
+
+import json
+import zipfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import IO, Any, cast
+
+import numpy as np
+
+from shapecat.arrays import U1
+from shapecat.errors import OutputError, RecordingError
+from shapecat.evaluation.labellings import Item, Labelling, Reference
+from shapecat.evaluation.references_coco import CocoLabels
+from shapecat.evaluation.references_kitti import KittiLabels
+from shapecat.outputs.rereading import FinishedRun, read_finished
+from shapecat.runs.labels import rows_by_frame
+from shapecat.runs.tables import Key, read_row_groups
+from shapecat.types import Box
+
+__all__ = ["OtherRun", "SimulatedTruth", "open_reference", "read_complete", "run_labellings"]
+
+
+def open_reference(path: Path) -> Reference:
+    """Open what a run is compared with.
+
+    Parameters
+    ----------
+    path : a run folder; a folder with ``label_2`` (KITTI); a JSON file, of `shapecat simulate` or
+        COCO; or a simulated recording with its truth beside it.
+
+    Raises
+    ------
+    RecordingError : there is nothing of the kind, or it is damaged.
+    """
+    if (path / "run.json").is_file():
+        return OtherRun(path)
+    if (path / "label_2").is_dir():
+        return KittiLabels(path)
+    beside = path.with_name(f"{path.stem}.truth.json")
+    if path.suffix != ".json" and beside.is_file():
+        path = beside
+    if path.suffix != ".json" or not path.is_file():
+        msg = (
+            f"{path}: nothing to compare with; expected NAME.truth.json of `shapecat simulate`, "
+            "a COCO file, a folder with label_2 (KITTI), or a run"
+        )
+        raise RecordingError(msg)
+    try:
+        content = json.loads(path.read_text("utf-8"))
+        if isinstance(content, list):
+            return SimulatedTruth(path, content)
+        return CocoLabels(path, content)
+    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = f"it lacks {error}" if isinstance(error, KeyError) else error
+        msg = f"{path}: neither truth of `shapecat simulate` nor COCO labels ({reason})"
+        raise RecordingError(msg) from error
+
+
+class SimulatedTruth(Reference):
+    """Truth as `shapecat simulate` writes it: NAME.truth.json beside NAME.labels.npz."""
+
+    kind = "truth of every pixel"
+
+    def __init__(self, path: Path, content: list[dict[str, Any]]) -> None:
+        self._by_stamp = {int(entry["stamp_ns"]): entry for entry in content}
+        self.frames = len(content)
+        objects = [item for entry in content for item in entry["objects"]]
+        self.tracked = bool(objects) and all("track" in item for item in objects)
+        labels = path.with_name(f"{path.name.removesuffix('truth.json')}labels.npz")
+        self._labels = _LabelImages(labels)
+
+    def at(self, key: Key, stamp_ns: int) -> Labelling | None:  # noqa: ARG002  stamps are enough
+        """Return the objects of a frame."""
+        entry = self._by_stamp.get(stamp_ns)
+        if entry is None:
+            return None
+        image = self._labels.read(int(entry["frame"]))
+        flat = image.reshape(-1)
+        items = (
+            Item(
+                track=item.get("track"),
+                category=str(item["category"]),
+                pixels=np.flatnonzero(np.isin(flat, item["parts"])),
+                box=Box(**item["box"]) if "box" in item else None,
+                decidable=not item["ambiguous"],
+            )
+            for item in entry["objects"]
+        )
+        return Labelling(tuple(items), flat > 0, (image.shape[0], image.shape[1]))
+
+    def describe_frames(self) -> str:
+        """Return the range of stamps."""
+        stamps = list(self._by_stamp)
+        return f"stamps {min(stamps)} to {max(stamps)}" if stamps else "no frames"
+
+
+class _LabelImages:
+    """``labels`` (t, h, w) uint8 of an .npz, read forward image by image in flat memory."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._next = 0
+        try:
+            # Closed with the object: it is read from as long as frames are asked for.
+            self._file = zipfile.ZipFile(path).open("labels.npy")  # noqa: SIM115
+            self._shape = _image_shape(self._file)
+        except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
+            msg = f"{path}: not the labels of a simulated recording ({error})"
+            raise RecordingError(msg) from error
+
+    def read(self, index: int) -> U1:
+        """Return an image; earlier ones cannot be asked for any more.
+
+        Raises
+        ------
+        RecordingError : the file does not hold it.
+        """
+        _, height, width = self._shape
+        size = height * width
+        try:
+            self._file.seek(self._file.tell() + (index - self._next) * size)
+            data = self._file.read(size)
+        except (OSError, ValueError, zipfile.BadZipFile) as error:
+            msg = f"{self._path}: damaged at image {index} ({error})"
+            raise RecordingError(msg) from error
+        self._next = index + 1
+        if index >= self._shape[0] or len(data) < size:
+            msg = f"{self._path}: ends before image {index}; simulate the recording again"
+            raise RecordingError(msg)
+        return np.frombuffer(data, np.uint8).reshape(height, width)
+
+
+def _image_shape(file: IO[bytes]) -> tuple[int, int, int]:
+    """Read the header of an array of images; return their number, height and width.
+
+    Raises
+    ------
+    ValueError : it is another array.
+    """
+    version = np.lib.format.read_magic(file)
+    shape, _, dtype = np.lib.format.read_array_header_1_0(file)
+    if version != (1, 0) or len(shape) != 3 or dtype != np.uint8:
+        msg = f"expected images of uint8, got {shape} {dtype}"
+        raise ValueError(msg)
+    return shape[0], shape[1], shape[2]
+
+
+class OtherRun(Reference):
+    """Another run of the same recording; its final labels are taken for true."""
+
+    kind, tracked = "another run", True
+
+    def __init__(self, folder: Path) -> None:
+        self.finished = read_complete(folder)
+        groups = read_row_groups(folder / "frames.parquet", ["topic", "frame"])
+        keys = [zip(*(g[n].to_pylist() for n in ("topic", "frame")), strict=True) for g in groups]
+        self._keys: set[Key] = {key for some in keys for key in some}
+        self.frames = len(self._keys)
+        self._rest = run_labellings(self.finished)
+
+    def at(self, key: Key, stamp_ns: int) -> Labelling | None:  # noqa: ARG002  keys are enough
+        """Return the objects of a frame."""
+        if key not in self._keys:
+            return None
+        for other, _, labelling in self._rest:
+            if other == key:
+                return labelling
+        msg = f"{self.finished.folder}: frames in another order; process the recording again"
+        raise OutputError(msg)
+
+    def describe_frames(self) -> str:
+        """Return the topics."""
+        return f"frames of {', '.join(sorted({topic for topic, _ in self._keys})) or 'no topic'}"
+
+
+def read_complete(folder: Path) -> FinishedRun:
+    """Read a run whose tracks are there.
+
+    Raises
+    ------
+    OutputError : it is no run, or was not completed.
+    """
+    if not (folder / "run.json").is_file():
+        msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
+        raise OutputError(msg)
+    if not ((folder / "tracks.parquet").is_file() and (folder / "tracks.csv").is_file()):
+        msg = f"{folder}: the run is not complete: no tracks; give the same command again to go on"
+        raise OutputError(msg)
+    return read_finished(folder)
+
+
+def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, Any], Labelling]]:
+    """Yield the frames of a run in order: topic and number, the row of the frame, its objects.
+
+    Detections without a track have their own category; those of deleted tracks are left out.
+    """
+    folder = finished.folder
+    tracks = _tracks(folder)
+    wanted = ("topic", "frame", "detection", "center", "size", "orientation", "indices")
+    columns = [*wanted, "posterior", "category", "confidence"]
+    groups = zip(
+        read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns", "up"]),
+        read_row_groups(folder / "detections.parquet", columns),
+        strict=True,
+    )
+    for frames, detections in groups:
+        found = rows_by_frame(detections)
+        for row in frames.to_pylist():
+            key = (row["topic"], row["frame"])
+            items = (_item(r, tracks, finished) for r in found.get(key, []))
+            yield key, row, Labelling(tuple(item for item in items if item is not None))
+
+
+def _tracks(folder: Path) -> dict[tuple[str, int, int], int]:
+    """Return the track of each detection."""
+    tracks: dict[tuple[str, int, int], int] = {}
+    names = ("topic", "frame", "detection", "track")
+    for group in read_row_groups(folder / "tracks.parquet", names):
+        rows = zip(*(group[name].to_pylist() for name in names), strict=True)
+        tracks |= {row[:3]: row[3] for row in rows if row[2] is not None}
+    return tracks
+
+
+def _item(
+    row: Mapping[str, Any], tracks: Mapping[tuple[str, int, int], int], finished: FinishedRun
+) -> Item | None:
+    """Return a detection with the final label of its track; None if a person has deleted it."""
+    track = tracks.get((row["topic"], row["frame"], row["detection"]))
+    label = None if track is None else finished.labels.get(track)
+    if track is not None and label is None:
+        return None
+    return Item(
+        track=None if label is None else label.track,
+        category=row["category"] if label is None else label.category,
+        pixels=cast("Any", row["indices"]).astype(np.int64),
+        box=Box(row["center"], row["size"], row["orientation"]),
+        confidence=row["confidence"] if label is None else label.confidence,
+        view_category=row["category"],
+        posterior=row["posterior"],
+    )

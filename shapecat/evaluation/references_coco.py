@@ -1,0 +1,153 @@
+"""COCO instance labels, on images of the size of the depth image."""
+
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import I4, Bool
+from shapecat.errors import RecordingError
+from shapecat.evaluation.labellings import Item, Labelling, Reference
+from shapecat.runs.tables import Key
+
+__all__ = ["CocoLabels", "filled_polygon", "rle_mask"]
+
+_MOST_PIXELS = 50_000_000
+_A_STAMP = 10**12
+"""Larger numbers in names of images are stamps in nanoseconds, smaller ones count frames."""
+
+
+class CocoLabels(Reference):
+    """Masks as polygons or run lengths.
+
+    An image is of the frame with its ``stamp_ns``, its ``frame``, or the last number in its
+    ``file_name``: a stamp in nanoseconds, or the number of the frame.
+    """
+
+    kind = "COCO labels"
+
+    def __init__(self, path: Path, content: Mapping[str, Any]) -> None:
+        self._path = path
+        names = {item["id"]: str(item["name"]) for item in content["categories"]}
+        self._labels = defaultdict(list)
+        for item in content["annotations"]:
+            self._labels[item["image_id"]].append({**item, "name": names[item["category_id"]]})
+        self._images = {_number_of(image): image for image in content["images"]}
+        self.frames = len(self._images)
+        items = [item for some in self._labels.values() for item in some]
+        self.tracked = bool(items) and all(_track_of(item) is not None for item in items)
+
+    def at(self, key: Key, stamp_ns: int) -> Labelling | None:
+        """Return the objects of a frame."""
+        image = self._images.get(stamp_ns) or self._images.get(key[1])
+        if image is None or image.get("topic", key[0]) != key[0]:
+            return None
+        height, width = int(image["height"]), int(image["width"])
+        if not 0 < height * width <= _MOST_PIXELS:
+            msg = f"{self._path}: image {image['id']} is {width}×{height}"
+            raise RecordingError(msg)
+        items = (self._item(item, height, width) for item in self._labels[image["id"]])
+        return Labelling(tuple(items), None, (height, width))
+
+    def _item(self, item: Mapping[str, Any], height: int, width: int) -> Item:
+        try:
+            mask = _mask(item["segmentation"], height, width)
+        except (KeyError, ValueError, TypeError, IndexError) as error:
+            msg = f"{self._path}: annotation {item.get('id')} has no readable mask ({error!r})"
+            raise RecordingError(msg) from error
+        return Item(
+            track=_track_of(item),
+            category=item["name"],
+            pixels=np.flatnonzero(mask),
+            decidable=not item.get("iscrowd"),
+        )
+
+    def describe_frames(self) -> str:
+        """Return the range of numbers."""
+        numbers = list(self._images)
+        return f"images {min(numbers)} to {max(numbers)}" if numbers else "no images"
+
+
+def _track_of(item: Mapping[str, Any]) -> int | None:
+    own = item.get("track_id", item.get("attributes", {}).get("track_id"))
+    return None if own is None else int(own)
+
+
+def _number_of(image: Mapping[str, Any]) -> int:
+    """Return the stamp of an image, or the number of its frame."""
+    for name in ("stamp_ns", "frame"):
+        if name in image:
+            return int(image[name])
+    digits = re.findall(r"\d+", Path(image["file_name"]).stem)
+    if not digits:
+        msg = f"the name {image['file_name']!r} has neither a stamp nor a number of a frame"
+        raise ValueError(msg)
+    return max(map(int, digits)) if int(max(digits, key=int)) > _A_STAMP else int(digits[-1])
+
+
+def _mask(segmentation: Any, height: int, width: int) -> Bool:
+    if isinstance(segmentation, Mapping):
+        if tuple(segmentation["size"]) != (height, width):
+            msg = f"size {segmentation['size']}, the image is {[height, width]}"
+            raise ValueError(msg)
+        return rle_mask(segmentation["counts"], height, width)
+    mask = np.zeros((height, width), np.bool_)
+    for polygon in segmentation:
+        mask |= filled_polygon(np.reshape(polygon, (-1, 2)), height, width)
+    return mask
+
+
+def rle_mask(counts: str | Sequence[int], height: int, width: int) -> Bool:
+    """Return the mask (h, w) of run lengths, column by column; a text is COCO's compressed form.
+
+    Raises
+    ------
+    ValueError : they do not fill the image.
+
+    Examples
+    --------
+    >>> rle_mask([1, 2, 1], 2, 2).astype(int)
+    array([[0, 1],
+           [1, 0]])
+    """
+    lengths = _uncompressed(counts) if isinstance(counts, str) else list(map(int, counts))
+    if sum(lengths) != height * width or min(lengths, default=0) < 0:
+        msg = f"run lengths of {sum(lengths)} pixels for an image of {height * width}"
+        raise ValueError(msg)
+    values = np.arange(len(lengths)) % 2 == 1
+    return np.asarray(np.repeat(values, lengths).reshape(width, height).T)
+
+
+def _uncompressed(text: str) -> list[int]:
+    """Return the run lengths of a text: five bits a letter, from the third on as differences."""
+    lengths: list[int] = []
+    value = shift = 0
+    for letter in text.encode("ascii"):
+        bits = letter - 48
+        value |= (bits & 0x1F) << shift
+        shift += 5
+        if bits & 0x20:
+            continue
+        if bits & 0x10:
+            value -= 1 << shift
+        lengths.append(value + (lengths[-2] if len(lengths) > 2 else 0))
+        value = shift = 0
+    return lengths
+
+
+def filled_polygon(corners: I4, height: int, width: int) -> Bool:
+    """Return (h, w) the pixels whose middle lies in a polygon of corners (n, 2), x and y.
+
+    Pixel (0, 0) reaches from 0 to 1.
+    """
+    corners = np.asarray(corners, np.float64)
+    x, y = np.arange(width) + 0.5, np.arange(height) + 0.5
+    inside = np.zeros((height, width), np.bool_)
+    for (x0, y0), (x1, y1) in zip(corners, np.roll(corners, -1, axis=0), strict=True):
+        rows = np.flatnonzero((y0 <= y) != (y1 <= y))
+        crossing = x0 + (y[rows] - y0) * (x1 - x0) / (y1 - y0 or 1.0)
+        inside[rows] ^= x < crossing[:, None]
+    return inside

@@ -1,0 +1,87 @@
+"""KITTI 3D labels: label_2 and calib, as `shapecat export --format kitti` writes them."""
+
+import csv
+from pathlib import Path
+
+import numpy as np
+from scipy.linalg import rq
+
+from shapecat.arrays import F8
+from shapecat.errors import RecordingError
+from shapecat.evaluation.labellings import Item, Labelling, Reference
+from shapecat.geometry import quaternion_from_rotation
+from shapecat.runs.tables import Key
+from shapecat.types import Box
+
+__all__ = ["KittiLabels"]
+
+
+class KittiLabels(Reference):
+    """Boxes, without pixels and identities.
+
+    ``frames.csv`` tells the stamp of each number; without it the number is that of the frame.
+    Boxes are in the rectified camera; the rotation in ``P2`` leads back to the sensor.
+    """
+
+    kind = "KITTI labels"
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        numbers = sorted(path.stem for path in (folder / "label_2").glob("*.txt"))
+        try:
+            self._names = _stamps(folder / "frames.csv") or {int(name): name for name in numbers}
+        except (OSError, ValueError, KeyError) as error:
+            msg = f"{folder}: not a folder of KITTI labels ({error})"
+            raise RecordingError(msg) from error
+        self.frames = len(self._names)
+
+    def at(self, key: Key, stamp_ns: int) -> Labelling | None:
+        """Return the objects of a frame."""
+        name = self._names.get(stamp_ns) or self._names.get(key[1])
+        if name is None:
+            return None
+        path = self._folder / "label_2" / f"{name}.txt"
+        try:
+            turn = _sensor_from_rectified(self._folder / "calib" / f"{name}.txt")
+            lines = path.read_text("utf-8").splitlines()
+            items = [_item(line.split(), turn) for line in lines if line.strip()]
+        except (OSError, ValueError, IndexError, np.linalg.LinAlgError) as error:
+            msg = f"{path}: not a label of KITTI ({error})"
+            raise RecordingError(msg) from error
+        return Labelling(tuple(item for item in items if item.category != "DontCare"))
+
+    def describe_frames(self) -> str:
+        """Return the range of stamps or numbers."""
+        known = list(self._names)
+        return f"frames {min(known)} to {max(known)}" if known else "no frames"
+
+
+def _stamps(path: Path) -> dict[int, str]:
+    """Return the name of each frame by its stamp; nothing where no table tells it."""
+    if not path.is_file():
+        return {}
+    with path.open(newline="", encoding="utf-8") as file:
+        return {int(row["stamp_ns"]): row["number"] for row in csv.DictReader(file)}
+
+
+def _sensor_from_rectified(path: Path) -> F8:
+    """Return the (3, 3) rotation of ``P2``, without its intrinsics; none where there is no file."""
+    if not path.is_file():
+        return np.eye(3)
+    lines = dict(line.split(":", 1) for line in path.read_text("utf-8").splitlines() if ":" in line)
+    projection = np.array(lines.get("P2", "1 0 0 0 0 1 0 0 0 0 1 0").split(), np.float64)
+    intrinsic, turn = rq(projection.reshape(3, 4)[:, :3])
+    return np.asarray(np.sign(np.diag(intrinsic))[:, None] * turn)
+
+
+def _item(words: list[str], turn: F8) -> Item:
+    """Return a label: type truncated occluded alpha bbox h w l x y z rotation_y."""
+    height, width, length, x, y, z, yaw = map(float, words[8:15])
+    c, s = np.cos(yaw), np.sin(yaw)
+    axes = np.array([[c, s, 0.0], [0.0, 0.0, -1.0], [-s, c, 0.0]])  # columns: along, across, up
+    box = Box(
+        turn @ np.array([x, y - height / 2, z]),
+        np.array([length, width, height]),
+        quaternion_from_rotation(turn @ axes),
+    )
+    return Item(track=None, category=words[0].replace("_", " "), box=box)

@@ -1,0 +1,199 @@
+"""A finished run for those who program: its tables as arrays, its frames with their points."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from shapecat.arrays import F4, I4, Bool
+from shapecat.errors import OutputError
+from shapecat.outputs.rereading import FinishedRun, open_source, read_finished, with_clouds
+from shapecat.runs.tables import numbers
+from shapecat.types import Frame, LabelledFrame, LabelledObject
+
+__all__ = ["Run", "RunFrame", "Table"]
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a run; it is read when it is asked for, columns that are named alone."""
+
+    path: Path
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The names of its columns."""
+        return tuple(pq.read_schema(self.path).names)
+
+    def arrow(self, columns: Sequence[str] | None = None) -> pa.Table:
+        """Read it as an Arrow table.
+
+        Raises
+        ------
+        OutputError : it cannot be read, or has no such column.
+        """
+        try:
+            known = self.columns
+            if missing := [name for name in columns or () if name not in known]:
+                msg = f"{self.path}: no column {missing[0]}; known: {', '.join(known)}"
+                raise OutputError(msg)
+            with pq.ParquetFile(self.path) as file:
+                return file.read(columns=None if columns is None else list(columns))
+        except (OSError, pa.ArrowException) as error:
+            msg = f"{self.path}: not a readable table of a run ({error})"
+            raise OutputError(msg) from error
+
+    def pandas(self, columns: Sequence[str] | None = None) -> Any:
+        """Read it as a pandas data frame; pandas must be installed."""
+        return self.arrow(columns).to_pandas()
+
+    def numpy(self, column: str) -> Any:
+        """Read a column as an array: (n,), or (n, k) of lists of one length.
+
+        Lists of different lengths become an object array of arrays. A missing number is NaN, a
+        missing list a row of NaN.
+        """
+        values = self.arrow([column])[column].combine_chunks()
+        if pa.types.is_fixed_size_list(values.type):
+            return _rows(values, values.type.list_size)
+        if not pa.types.is_list(values.type):
+            return values.to_numpy(zero_copy_only=False)
+        lengths = set(values.value_lengths().to_pylist())
+        if len(lengths) == 1 and None not in lengths:
+            return numbers(pa.chunked_array([values])).reshape(len(values), -1)
+        ragged = np.zeros(len(values), object)
+        ragged[:] = [np.asarray(row) for row in values.to_pylist()]
+        return ragged
+
+
+def _rows(values: pa.FixedSizeListArray, width: int) -> Any:
+    """Return (n, width) the numbers of lists, NaN where one is missing."""
+    valid = np.asarray(values.is_valid().to_numpy(zero_copy_only=False), np.bool_)
+    rows = np.full((len(values), width), np.nan, values.type.value_type.to_pandas_dtype())
+    rows[valid] = values.drop_null().flatten().to_numpy().reshape(-1, width)
+    return rows
+
+
+@dataclass(frozen=True)
+class RunFrame:
+    """A frame of a run with what the sensor read.
+
+    What other sensors read at the same time, such as colour, has its place beside ``reading``.
+    """
+
+    labelled: LabelledFrame
+    reading: Frame
+
+    @property
+    def objects(self) -> tuple[LabelledObject, ...]:
+        """The objects with their final labels, box, posterior and surface."""
+        return self.labelled.objects
+
+    @property
+    def stamp_ns(self) -> int:
+        """The time of measurement in nanoseconds."""
+        return self.labelled.stamp_ns
+
+    @property
+    def points(self) -> F4:
+        """(n, 3) metres, sensor frame; a row per pixel of a depth image, NaN without reading."""
+        return self.reading.xyz()
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """(h, w) of a depth image, (n,) of a cloud: that of masks and labels."""
+        return (len(self.points),) if self.reading.depth is None else self.reading.depth.shape
+
+    @property
+    def labels(self) -> I4:
+        """The number of the track of each pixel or point, -1 where there is none."""
+        image = np.full(self.shape, -1, np.int32)
+        for item in self.objects:
+            image.reshape(-1)[item.indices] = item.track
+        return image
+
+    def mask(self, item: LabelledObject) -> Bool:
+        """Return which pixels or points belong to an object."""
+        mask = np.zeros(self.shape, np.bool_)
+        mask.reshape(-1)[item.indices] = True
+        return mask
+
+    def points_of(self, item: LabelledObject) -> F4:
+        """Return (n, 3) the points of an object: metres, sensor frame."""
+        return self.reading.xyz(item.indices)
+
+
+class Run:
+    """A finished run: its tables, its tracks with their final labels, its frames."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._finished: FinishedRun = read_finished(folder)
+        self.detections = Table(folder / "detections.parquet")
+        self.tracks = Table(folder / "tracks.parquet")
+        self.frame_table = Table(folder / "frames.parquet")
+        self.planes = Table(folder / "planes.parquet")
+
+    def __repr__(self) -> str:
+        counts = self.info["counts"]
+        return f"<Run {self.folder}: {counts['frames']} frames, {len(self.labels)} tracks>"
+
+    @property
+    def info(self) -> Mapping[str, Any]:
+        """What run.json says: input, settings, counts, seconds, warnings."""
+        return self._finished.run
+
+    @property
+    def categories(self) -> tuple[str, ...]:
+        """The categories in the order of every posterior, then those that a person has added."""
+        return self._finished.categories
+
+    @cached_property
+    def labels(self) -> dict[int, str]:
+        """The final category of each track, corrections included; deleted tracks are missing."""
+        return {track: label.category for track, label in self._finished.labels.items()}
+
+    def posterior(self, track: int) -> tuple[Any, Any]:
+        """Return the posterior of a track over time.
+
+        Returns
+        -------
+        (n,) seconds since the first frame of the run, and (n, categories) causal posteriors: of
+        the views so far.
+
+        Raises
+        ------
+        KeyError : there is no such track.
+        """
+        rows = np.flatnonzero(self.tracks.numpy("track") == track)
+        if not len(rows):
+            raise KeyError(track)
+        start = self.frame_table.numpy("stamp_ns").min()
+        seconds = (self.tracks.numpy("stamp_ns")[rows] - start) * 1e-9
+        return seconds, self.tracks.numpy("posterior")[rows]
+
+    def labelled_frames(self) -> Iterator[LabelledFrame]:
+        """Yield the frames without their points: the recording is not needed."""
+        return self._finished.frames()
+
+    def frames(self, recording: str | Path | None = None) -> Iterator[RunFrame]:
+        """Yield the frames with their points, in flat memory.
+
+        Parameters
+        ----------
+        recording : where the recording is now; where it was processed by default.
+
+        Raises
+        ------
+        RecordingError : it is not there.
+        OutputError : it is another one than it was.
+        """
+        moved = None if recording is None else Path(recording)
+        with open_source(self.info, moved) as source:
+            for labelled, reading in with_clouds(self.labelled_frames(), source, self.info):
+                yield RunFrame(labelled, reading)

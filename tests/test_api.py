@@ -1,0 +1,125 @@
+"""The door from Python: light to import, arrays of the stated shapes, every printed block works."""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import shapecat
+from shapecat.errors import ConfigError, OutputError
+
+PAGE = Path(__file__).parents[1] / "docs" / "python.md"
+
+
+def blocks(kind: str) -> list[str]:
+    return re.findall(rf"^```{kind}\n(.*?)^```", PAGE.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Run every block of the page, in order, in an empty folder, as one script."""
+    folder = tmp_path_factory.mktemp("python")
+    (folder / "page.py").write_text("\n".join(blocks("python")), "utf-8")
+    script = "\n".join(["set -eu", *blocks("sh"), f"{sys.executable} page.py"])
+    programs = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
+    done = subprocess.run(
+        ["bash", "-c", script],
+        cwd=folder,
+        env={**os.environ, "PATH": programs},
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=300,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+def test_every_block_of_the_page_works_as_printed(place: Path) -> None:
+    text = PAGE.read_text("utf-8")
+    assert len(blocks("python")) + len(blocks("sh")) == text.count("```") // 2
+    assert (place / "posterior.png").read_bytes().startswith(b"\x89PNG")
+    (plot,) = (block for block in blocks("python") if "savefig" in block)
+    assert len([line for line in plot.splitlines() if line.strip()]) <= 10
+
+
+def test_frames_have_the_points_and_masks_of_the_tables(place: Path) -> None:
+    """A mask of the wrong frame, or transposed, would have other pixels than the table says."""
+    run = shapecat.open_run(place / "results" / "demo")
+    rows = pq.read_table(run.folder / "detections.parquet").to_pylist()
+    objects = 0
+    for frame in run.frames(recording=place / "demo.mcap"):
+        assert frame.labels.shape == frame.shape == (480, 640)
+        for item in frame.objects:
+            objects += 1
+            place_in_time = (frame.labelled.index, frame.stamp_ns, item.indices.tolist())
+            mine = [r for r in rows if (r["frame"], r["stamp_ns"], r["indices"]) == place_in_time]
+            assert len(mine) == 1
+            assert frame.mask(item).ravel().nonzero()[0].tolist() == mine[0]["indices"]
+            assert (frame.labels[frame.mask(item)] == item.track).all()
+            points = frame.points_of(item)
+            assert np.nanmax(np.abs(points.mean(axis=0) - item.box.center)) < item.box.size.max()
+            assert item.category == run.labels[item.track]
+    assert objects == run.tracks.arrow(["detection"])["detection"].drop_null().length() > 20
+
+
+def test_columns_are_arrays_with_nan_where_nothing_is(place: Path) -> None:
+    run = shapecat.open_run(str(place / "results" / "demo"))
+    n = run.info["counts"]["detections"]
+
+    assert run.detections.numpy("center").shape == (n, 3)
+    assert run.detections.numpy("category").shape == (n,)
+    assert run.detections.numpy("posterior").shape == (n, 7)
+    assert run.detections.numpy("indices").shape == (n,)  # of different lengths
+    assert run.detections.numpy("indices")[0].dtype.kind in "ui"
+    assert run.frame_table.numpy("up_given").shape == (10, 3)
+    assert run.frame_table.numpy("fixed_rotation").shape == (10, 9)
+    with pytest.raises(OutputError, match=r"no column centre; known: .*center"):
+        run.detections.numpy("centre")
+    with pytest.raises(KeyError):
+        run.posterior(999)
+
+
+def test_a_missing_list_is_a_row_of_nan(tmp_path: Path) -> None:
+    """Arrow keeps what lies behind a null, or nothing: rows must not move up."""
+    import pyarrow as pa  # noqa: PLC0415  beside its only use
+
+    from shapecat.outputs.opened_run import Table  # noqa: PLC0415  the same
+
+    kind = pa.list_(pa.float32(), 2)
+    column = pa.array([[1, 2], None, [5, 6]], kind)
+    pq.write_table(pa.table({"a": column}), tmp_path / "t.parquet")
+
+    assert np.array_equal(
+        Table(tmp_path / "t.parquet").numpy("a"),
+        np.array([[1, 2], [np.nan, np.nan], [5, 6]], np.float32),
+        equal_nan=True,
+    )
+
+
+def test_wrong_settings_and_folders_are_refused_in_one_line(place: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"did you mean detection\.max_range_m"):
+        shapecat.process(place / "demo.mcap", tmp_path, detection={"max_range": 1.0})
+    with pytest.raises(OutputError, match="another input, model or settings"):
+        shapecat.process(place / "demo.mcap", place / "results", rrd=False)
+    with pytest.raises(OutputError, match=r"no run\.json there"):
+        shapecat.open_run(tmp_path)
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = shapecat.nothing
+
+
+def test_import_loads_no_library() -> None:
+    """The commands import the package: what it loads, `--help` waits for."""
+    code = (
+        "import sys, shapecat; assert 'numpy' not in sys.modules; shapecat.open_run;"
+        "heavy = {'open3d', 'rerun', 'matplotlib', 'sklearn', 'pandas'} & set(sys.modules);"
+        "sys.exit(', '.join(sorted(heavy)) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+
+    assert done.returncode == 0, done.stderr

@@ -1,0 +1,341 @@
+"""`shapecat compare` at the door: figures, the table, the page, plain refusals."""
+
+import base64
+import io
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from click.testing import Result
+from PIL import Image
+
+from shapecat.evaluation.comparing import Difference, compare
+from shapecat.evaluation.comparison_pictures import COLOURS, draw_frame
+from shapecat.evaluation.labellings import Item, Labelling
+from shapecat.evaluation.references_coco import filled_polygon, rle_mask
+from shapecat.runs.tables import DETECTIONS, FRAMES, TRACKS
+
+Run = Callable[..., Result]
+SCORER = Path(__file__).parents[2] / "shared" / "tools" / "score_scenes.py"
+START, STEP = 1_700_000_000_000_000_000, 100_000_000
+SIDE = 10
+NAMES = ["cup", "can", "box"]
+
+
+def block(x: int, y: int, w: int, h: int) -> list[int]:
+    """Return the pixels of a rectangle in an image of 10 by 10."""
+    return [v * SIDE + u for v in range(y, y + h) for u in range(x, x + w)]
+
+
+CUP, CAN, BOX = block(0, 0, 4, 5), block(5, 0, 4, 4), block(1, 6, 5, 3)
+LESS = block(5, 0, 4, 3)
+FOUND: list[list[tuple[int | None, list[int], str]]] = [
+    [(1, CUP, "cup"), (2, LESS, "can")],
+    [(1, CUP, "cup"), (2, LESS, "can"), (3, BOX, "box")],
+    [(4, CUP, "can"), (2, LESS, "can"), (3, BOX, "box"), (None, block(8, 8, 2, 2), "cup")],
+]
+"""By frame the track, the pixels and the category of the single view of each detection."""
+FINAL = {1: "cup", 2: "can", 3: "box", 4: "cup"}
+
+
+def write_run(folder: Path, *, digest: str = "one", shift_ns: int = 0) -> Path:
+    """Write the tables of a run of three frames by hand; the recording is nowhere."""
+    folder.mkdir(parents=True)
+    stamps = [START + shift_ns + STEP * k for k in range(3)]
+    none: dict[str, Any] = dict.fromkeys(FRAMES.names)
+    frames = [
+        none | {"topic": "/d", "frame": k, "stamp_ns": stamp, "up": [0, -1, 0]}
+        for k, stamp in enumerate(stamps)
+    ]
+    rows, tracks = [], []
+    for k, found in enumerate(FOUND):
+        for n, (track, pixels, category) in enumerate(found):
+            head = {"topic": "/d", "frame": k, "stamp_ns": stamps[k], "detection": n}
+            sure = [0.8 if name == category else 0.1 for name in NAMES]
+            box = {"center": [0.1 * n, 0, 1], "size": [0.1, 0.2, 0.3], "orientation": [0, 0, 0, 1]}
+            own = {"indices": pixels, "posterior": sure, "category": category, "confidence": 0.8}
+            rows.append(dict.fromkeys(DETECTIONS.names) | head | box | own)
+            if track is not None:
+                tracks.append(dict.fromkeys(TRACKS.names) | head | {"track": track})
+    for name, content, schema in (
+        ("frames", frames, FRAMES), ("detections", rows, DETECTIONS), ("tracks", tracks, TRACKS)
+    ):  # fmt: skip
+        pq.write_table(pa.Table.from_pylist(content, schema), folder / f"{name}.parquet")
+    lines = [f"{track},{category},0.9," for track, category in FINAL.items()]
+    (folder / "tracks.csv").write_text("\n".join(["track,category,confidence,label", *lines]))
+    about = {
+        "id": "x",
+        "input": {"path": str(folder / "gone.mcap"), "digest": digest},
+        "model": {"categories": NAMES},
+        "counts": {"frames": 3},
+        "options": {"topics": ["/d"]},
+    }
+    (folder / "run.json").write_text(json.dumps(about))
+    return folder
+
+
+def true_objects() -> list[dict[str, Any]]:
+    return [
+        {"label": 7, "parts": [7], "category": "cup", "ambiguous": False, "track": 11},
+        {"label": 8, "parts": [8, 9], "category": "box", "ambiguous": False, "track": 12},
+        {"label": 5, "parts": [5], "category": "box", "ambiguous": True, "track": 13},
+    ]
+
+
+def write_truth(folder: Path) -> Path:
+    """Write truth as the simulator does: a cup, a box of two parts, and a box in doubt."""
+    image = np.full(SIDE * SIDE, 3, np.uint8)
+    for label, pixels in ((7, CUP), (8, CAN[:8]), (9, CAN[8:]), (5, BOX)):
+        image[pixels] = label
+    image[block(9, 8, 1, 2)] = 0  # half of the detection without a track is not labelled
+    np.savez_compressed(folder / "lab.labels.npz", labels=np.stack([image.reshape(10, 10)] * 3))
+    truth = [
+        {"frame": k, "scene": "learn1", "stamp_ns": START + STEP * k, "objects": true_objects()}
+        for k in range(3)
+    ]
+    (folder / "lab.truth.json").write_text(json.dumps(truth))
+    return folder / "lab.truth.json"
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    return write_run(tmp_path / "lab")
+
+
+@pytest.fixture
+def truth(tmp_path: Path) -> Path:
+    return write_truth(tmp_path)
+
+
+def test_figures_are_those_by_hand(run: Path, truth: Path) -> None:
+    """Cup 20 pixels, can 16 of which 12 are found, box 15; once missed; 2 labelled surplus."""
+    figures = compare(run, truth).figures
+    shared, found, true = 3 * 20 + 3 * 12 + 2 * 15, 3 * 20 + 3 * 12 + 2 * 15 + 2, 3 * (20 + 16 + 15)
+
+    assert figures["overlap"]["f"] == pytest.approx(2 * shared / (found + true), abs=1e-4)
+    assert figures["overlap"]["precision"] == pytest.approx(shared / found, abs=1e-4)
+    assert figures["objects"] == {"true": 9, "detections": 9, "found": 8, "share_found": 0.8889}
+    category = figures["category"]
+    assert category["n"] == 6  # the box in doubt is not asked for
+    assert category["accuracy"] == 0.5  # cups right, the box always a can
+    assert category["view_accuracy"] == pytest.approx(2 / 6, abs=1e-4)
+    assert category["taken_for"] == [{"true": "box", "label": "can", "n": 3}]
+    assert category["ece"] == pytest.approx(0.8 - 2 / 6, abs=1e-4)
+    tracking = figures["tracking"]
+    assert (tracking["switches"], tracking["misses"], tracking["false_positives"]) == (1, 1, 0)
+    assert tracking["mota"] == pytest.approx(1 - 2 / 9, abs=1e-4)
+    assert tracking["idf1"] == pytest.approx(2 * 7 / (9 + 8), abs=1e-4)
+
+
+def test_the_table_tells_every_difference_once(shapecat: Run, run: Path, truth: Path) -> None:
+    out = run.parent / "out"
+    result = shapecat("compare", run, truth, "--out", out)
+
+    assert result.exit_code == 0, result.stderr
+    rows = pq.read_table(out / "objects.parquet").to_pylist()
+    told = [
+        (r["frame"], r["difference"], r["true_category"], r["category"], r["track"])
+        for r in rows
+        if r["difference"]
+    ]
+    assert sorted(told, key=str) == sorted(
+        [
+            (0, "category", "box", "can", 2),
+            (0, "missed", "box", None, None),
+            (1, "category", "box", "can", 2),
+            (2, "category", "box", "can", 2),
+            (2, "identity", "cup", "cup", 4),
+            (2, "surplus", None, "cup", None),
+        ],
+        key=str,
+    )
+    assert len(rows) == 10
+    cut = next(r for r in rows if r["track"] == 2)
+    assert (cut["f"], cut["iou"]) == (pytest.approx(24 / 28), pytest.approx(12 / 16))
+    figures = json.loads((out / "comparison.json").read_text())
+    assert figures["differences"] == {"category": 3, "missed": 1, "identity": 1, "surplus": 1}
+    assert json.loads(shapecat("compare", run, truth, "--json").stdout) == figures
+    page = (out / "comparison.html").read_text()
+    assert page.count("<figure>") == 3
+    for words in ("box taken for can #2", "missed box", "surplus cup", "cup now #4", "data:image"):
+        assert words in page
+    assert "6 differences: 3 category" in result.stdout
+    assert "the recording is not there any more" in result.stderr
+
+
+def test_nothing_is_replaced(shapecat: Run, run: Path, truth: Path) -> None:
+    (run.parent / "out").mkdir()
+    (run.parent / "out" / "mine.txt").write_text("mine")
+    result = shapecat("compare", run, truth, "--out", run.parent / "out")
+
+    assert (result.exit_code, "--out" in result.stderr) == (1, True)
+    assert [p.name for p in (run.parent / "out").iterdir()] == ["mine.txt"]
+
+
+@pytest.mark.skipif(not SCORER.exists(), reason="the other scorer is not on this machine")
+def test_figures_are_those_of_another_scorer(run: Path, truth: Path) -> None:
+    labels = truth.with_name("lab.labels.npz")
+    command = [sys.executable, SCORER, run / "detections.parquet", labels, truth, "--json"]
+    done = subprocess.run(list(map(str, command)), check=True, capture_output=True, text=True)
+    theirs, ours = json.loads(done.stdout), compare(run, truth).figures
+
+    assert ours["overlap"]["f"] == pytest.approx(theirs["all"]["F"], abs=1e-3)
+    assert ours["overlap"]["precision"] == pytest.approx(theirs["all"]["P"], abs=1e-3)
+    assert ours["overlap"]["recall"] == pytest.approx(theirs["all"]["R"], abs=1e-3)
+    assert ours["objects"]["share_found"] == pytest.approx(theirs["all"]["obj75"], abs=1e-3)
+    assert ours["category"]["n"] == theirs["category"]["n"]
+    assert ours["category"]["view_accuracy"] == pytest.approx(theirs["category"]["accuracy"], 1e-3)
+    assert ours["category"]["view_balanced"] == pytest.approx(theirs["category"]["balanced"], 1e-3)
+
+
+def test_a_run_differs_from_itself_in_nothing_and_from_a_corrected_one_in_the_labels(
+    shapecat: Run, run: Path
+) -> None:
+    same = json.loads(shapecat("compare", run, run, "--json").stdout)
+    assert (same["overlap"]["f"], same["differences"]) == (1, {})
+    assert same["box_iou"] == {"n": 9, "mean": 1}
+
+    other = write_run(run.parent / "other")
+    text = (other / "tracks.csv").read_text()
+    (other / "tracks.csv").write_text(text.replace("2,can,0.9,", "2,can,0.9,box") + "delete")
+    changed = json.loads(shapecat("compare", run, other, "--json").stdout)
+    assert changed["differences"] == {"category": 3, "surplus": 1}
+
+
+def test_coco_masks_in_all_forms_are_compared(shapecat: Run, run: Path) -> None:
+    """A polygon, run lengths, and compressed run lengths of the same cup; stamps in the names."""
+    mask = np.zeros(100, np.bool_)
+    mask[CUP] = True
+    columns = mask.reshape(10, 10).T.ravel()
+    changes = np.flatnonzero(np.diff(np.concatenate([[False], columns, [False]]).astype(int)))
+    counts = np.diff([0, *changes.tolist(), 100]).tolist()
+    forms: list[Any] = [
+        [[0, 0, 4, 0, 4, 5, 0, 5]],
+        {"size": [10, 10], "counts": counts},
+        {"size": [10, 10], "counts": compressed(counts)},
+    ]
+    content = {
+        "categories": [{"id": 4, "name": "cup"}],
+        "images": [
+            {"id": k, "file_name": f"{START + STEP * k}.png", "width": 10, "height": 10}
+            for k in range(3)
+        ],
+        "annotations": [
+            {"id": k, "image_id": k, "category_id": 4, "segmentation": form, "track_id": 1}
+            for k, form in enumerate(forms)
+        ],
+    }
+    (run.parent / "coco.json").write_text(json.dumps(content))
+    found = json.loads(shapecat("compare", run, run.parent / "coco.json", "--json").stdout)
+
+    assert found["kind"] == "COCO labels"
+    assert found["objects"]["found"] == found["objects"]["true"] == 3
+    assert found["overlap"]["recall"] == 1
+    assert found["category"]["accuracy"] == 1
+    assert found["tracking"]["switches"] == 1
+
+
+def compressed(counts: list[int]) -> str:
+    """Write run lengths as pycocotools does (rleToString in maskApi.c)."""
+    text = ""
+    for k, count in enumerate(counts):
+        value = count - (counts[k - 2] if k > 2 else 0)
+        more = True
+        while more:
+            bits = value & 0x1F
+            value >>= 5
+            more = value != -1 if bits & 0x10 else value != 0
+            text += chr((bits | 0x20 if more else bits) + 48)
+    return text
+
+
+def test_run_lengths_survive_the_compressed_form() -> None:
+    """Long, short and falling run lengths: differences of both signs, several letters."""
+    counts = [3, 40, 1000, 5, 7, 900, 2, 1, 42]
+    expected = rle_mask(counts, 40, 50)
+
+    assert expected.sum() == 40 + 5 + 900 + 1
+    assert (rle_mask(compressed(counts), 40, 50) == expected).all()
+    with pytest.raises(ValueError, match="1999"):
+        rle_mask([1999], 40, 50)
+
+
+def test_a_slanted_polygon_has_its_area() -> None:
+    mask = filled_polygon(np.array([[3.0, 2.0], [40.0, 10.0], [12.0, 35.0]]), 50, 60)
+
+    assert mask.sum() == pytest.approx(abs(37 * 33 - 9 * 8) / 2, rel=0.02)
+    assert mask[10, 20]
+    assert not mask[30, 30]
+
+
+def test_kitti_boxes_come_back_from_a_tilted_camera(
+    shapecat: Run, guessed_run: Path, tmp_path: Path
+) -> None:
+    """What was exported is read back: a wrong axis or half a height would cost overlap."""
+    done = shapecat("export", guessed_run, "--format", "kitti", "--out", tmp_path / "kitti")
+    assert done.exit_code == 0, done.stderr
+    labels = next((tmp_path / "kitti").iterdir())
+    found = json.loads(shapecat("compare", guessed_run, labels, "--json").stdout)
+
+    assert found["kind"] == "KITTI labels"
+    assert (found["overlap"], found["tracking"]) == (None, None)
+    assert found["box_iou"]["n"] == found["objects"]["true"] > 5
+    assert found["box_iou"]["mean"] > 0.999
+
+
+def refused(shapecat: Run, *words: object) -> tuple[int, str]:
+    result = shapecat("compare", *words)
+    assert result.stdout == ""
+    assert result.stderr.count("\n") == 1
+    return result.exit_code, result.stderr
+
+
+def test_refusals_say_what_was_found_and_what_to_try(
+    shapecat: Run, run: Path, truth: Path, tmp_path: Path
+) -> None:
+    half = shutil.copytree(run, tmp_path / "half")
+    (half / "tracks.csv").unlink()
+    later = write_run(tmp_path / "later", digest="two", shift_ns=STEP // 2)
+    (tmp_path / "odd.json").write_text('{"images": []}')
+    (tmp_path / "bad").mkdir()
+    broken = write_truth(tmp_path / "bad")
+    broken.with_name("lab.labels.npz").write_bytes(b"PK")
+
+    for words, code, text in (
+        ((tmp_path, truth), 1, "no run.json there"),
+        ((half, truth), 1, "not complete"),
+        ((later, truth), 3, "no frame in common"),
+        ((run, later), 1, "another recording"),
+        ((run, tmp_path / "none.json"), 3, "nothing to compare with"),
+        ((run, tmp_path / "odd.json"), 3, "lacks 'categories'"),
+        ((run, broken), 3, "not the labels of a simulated recording"),
+        ((run, truth, "--recording", tmp_path / "no.mcap"), 3, "no.mcap"),
+    ):
+        assert refused(shapecat, *words)[0] == code, words
+        assert text in refused(shapecat, *words)[1]
+
+
+def test_a_part_split_off_is_seen_in_the_picture() -> None:
+    """Drawn from unions of masks, an object in two halves looked as if all were right."""
+    true = Labelling((Item(1, "cup", np.arange(0, 60)),), None, (10, 10))
+    halves = (Item(5, "can", np.arange(0, 40)), Item(6, "cup", np.arange(40, 70)))
+    head = ("/d", 0, START)
+    rows = [Difference(*head, "category", category="can"), Difference(*head, "surplus")]
+    picture = draw_frame(("/d", 0), None, Labelling(halves), true, {0: 0}, rows, 2.0)
+
+    assert picture is not None
+    content = base64.b64decode(picture.image.split(",")[1])
+    pixels = np.array(Image.open(io.BytesIO(content)).convert("RGB")).reshape(100, 3)
+    for part, name in ((slice(0, 40), "category"), (slice(40, 70), "surplus")):
+        assert len(np.unique(pixels[part], axis=0)) == 1
+        assert pixels[part][0].argmax() == np.argmax(COLOURS[name])
+    assert (pixels[70:] == pixels[70]).all()
+    assert len(np.unique(pixels, axis=0)) == 3
