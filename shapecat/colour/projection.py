@@ -1,0 +1,239 @@
+"""Points of the depth sensor on the image of a colour camera, and what hides what there."""
+
+from functools import lru_cache
+
+import numpy as np
+
+from shapecat.arrays import F4, I4, Bool
+from shapecat.colour_types import LensCamera
+from shapecat.jit import kernel
+from shapecat.lenses import distort
+from shapecat.types import Camera, Pose
+
+__all__ = ["hidden", "project", "splat_depth"]
+
+_FOOTPRINT_PX = 0.05
+"""A depth pixel covers so much more of the colour image on each side, to leave no gaps."""
+_HIDDEN = 0.02
+"""A point is hidden where something is nearer by more than this share of its distance."""
+_BESIDE_PX = 30
+"""Depth pixels so far from labelled ones are looked at, for what lies beside and between them."""
+_WIDEST = 3.0
+"""Slopes beyond this, 72 degrees off the axis, are not looked at."""
+_FISHEYE = {"equidistant", "fisheye"}
+
+
+def project(points: F4, lens: LensCamera, colour_from_depth: Pose) -> F4:
+    """Return where a colour camera sees points.
+
+    Parameters
+    ----------
+    points : (n, 3) metres, sensor frame; rows that are not finite stay so.
+    colour_from_depth : pose of the sensor in the optical frame of the colour camera.
+
+    Returns
+    -------
+    (n, 3) column, row (0 is the middle of the first pixel) and distance along the optical axis,
+    metres; NaN behind the camera, and beyond what a lens with distortion maps one to one.
+
+    Examples
+    --------
+    >>> lens = LensCamera(Camera(640, 480, 500.0, 500.0, 320.0, 240.0))
+    >>> project(np.array([[0.1, -0.2, 1.0]]), lens, Pose(np.eye(3), np.array([0.1, 0.0, 1.0])))
+    array([[370., 190.,   2.]], dtype=float32)
+    """
+    local = np.asarray(points, np.float64) @ colour_from_depth.rotation.T
+    local += colour_from_depth.translation
+    z = np.where(local[:, 2] > 1e-3, local[:, 2], np.nan)
+    rays = local[:, :2] / z[:, None]
+    camera = lens.pinhole
+    if lens.model:
+        within = (rays**2).sum(axis=1, keepdims=True) < _reach(lens) ** 2
+        rays = distort(np.where(within, rays, np.nan), lens.model, lens.coefficients)
+    seen = rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
+    return np.column_stack([seen, z]).astype(np.float32)
+
+
+@lru_cache(maxsize=16)
+def _reach(lens: LensCamera) -> float:
+    """Return the slope up to which rays farther out are seen farther out.
+
+    Beyond, the polynomial of a lens turns back and shows the side of the scene in its middle.
+    """
+    slopes = np.linspace(0, _WIDEST, 601)[1:]
+    seen = distort(np.column_stack([slopes, 0 * slopes]), lens.model, lens.coefficients)[:, 0]
+    back = np.flatnonzero(np.diff(seen) <= 0)
+    return float(slopes[back[0]]) if back.size else _WIDEST
+
+
+def splat_depth(
+    depth: F4, camera: Camera, labels: I4, lens: LensCamera, colour_from_depth: Pose
+) -> tuple[F4, I4]:
+    """Paint a depth image as a colour camera sees it, where it has labels and around them.
+
+    Each depth pixel covers a square on the colour image, as large as its own, and a little more;
+    where several cover a pixel, the nearest shows.
+
+    Parameters
+    ----------
+    depth : (h, w) metres, 0 where there is no reading.
+    labels : (h, w) int32 what each depth pixel belongs to, 0 for nothing.
+
+    Returns
+    -------
+    As the colour camera sees it: (height, width) inverse distance, 0 where nothing is known, and
+    int32 labels, -1 there. Far from labelled pixels nothing is looked at.
+
+    Notes
+    -----
+    O(depth pixels + what they cover).
+    """
+    target = lens.pinhole
+    nearest = np.zeros((target.height, target.width), np.float32)
+    owners = np.full(nearest.shape, -1, np.int32)
+    rows, columns = _around(depth, labels, camera, colour_from_depth)
+    x = (np.arange(camera.width) - camera.cx) / camera.fx
+    y = (np.arange(camera.height) - camera.cy) / camera.fy
+    turn = colour_from_depth.rotation
+    # A ray is turned by adding what its column and its row give to each coordinate.
+    by_column, by_row = np.outer(x, turn[:, 0]), np.outer(y, turn[:, 1]) + turn[:, 2]
+    d = np.zeros(8, np.float32)
+    d[: len(lens.coefficients[:8])] = lens.coefficients[:8]
+    kind = 0 if not lens.model else 2 if lens.model in _FISHEYE else 1
+    intrinsics = (target.fx, target.fy, target.cx, target.cy)
+    scale = max(target.fx / camera.fx, target.fy / camera.fy)
+    limits = (_reach(lens) ** 2 if kind else np.inf, scale / 2, _FOOTPRINT_PX)
+    _splat(
+        depth[rows, columns],
+        labels[rows, columns],
+        by_column[columns].astype(np.float32),
+        by_row[rows].astype(np.float32),
+        colour_from_depth.translation.astype(np.float32),
+        np.array(intrinsics, np.float32),
+        kind,
+        d,
+        np.array(limits, np.float32),
+        nearest,
+        owners,
+    )
+    return nearest, owners
+
+
+def _around(depth: F4, labels: I4, camera: Camera, colour_from_depth: Pose) -> tuple[slice, slice]:
+    """Return the rows and columns of what may hide labelled pixels, or lie beside them.
+
+    Between a near and a far pixel that one camera sees in the same place, the other sees the
+    parallax: focal length by distance of the cameras by difference of the inverse depths.
+    """
+    top, bottom, left, right, near, far = _extent(depth, labels)
+    if bottom <= top:
+        return slice(0, 0), slice(0, 0)
+    shift = float(np.linalg.norm(colour_from_depth.translation))
+    margin = int(max(camera.fx, camera.fy) * shift * (1 / near - 1 / far)) + _BESIDE_PX
+    return (
+        slice(max(0, top - margin), bottom + margin),
+        slice(max(0, left - margin), right + margin),
+    )
+
+
+@kernel
+def _extent(depth: F4, labels: I4) -> tuple[int, int, int, int, float, float]:
+    """Return where labelled pixels are, the least depth of all, and the greatest of theirs."""
+    top, bottom, left, right = depth.shape[0], 0, depth.shape[1], 0
+    near, far = np.inf, 0.0
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            z = float(depth[v, u])
+            if z > 0:
+                near = min(near, z)
+                if labels[v, u] > 0:
+                    far = max(far, z)
+                    top, bottom = min(top, v), max(bottom, v + 1)
+                    left, right = min(left, u), max(right, u + 1)
+    return top, bottom, left, right, near, far
+
+
+@kernel
+def _bend(x: float, y: float, kind: int, d: F4) -> tuple[float, float]:
+    """Return `shapecat.lenses.distort` of one ray: 1 is the polynomial, 2 the fisheye."""
+    one, two = np.float32(1), np.float32(2)
+    r = x * x + y * y
+    if kind == 2:
+        radius = max(np.sqrt(r), np.float32(1e-9))
+        angle = np.arctan(radius)
+        s = angle * angle
+        bent = angle * (one + s * (d[0] + s * (d[1] + s * (d[2] + s * d[3])))) / radius
+        return x * bent, y * bent
+    k1, k2, p1, p2, k3, k4, k5, k6 = d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7]
+    radial = (one + r * (k1 + r * (k2 + r * k3))) / (one + r * (k4 + r * (k5 + r * k6)))
+    a = x * radial + two * p1 * x * y + p2 * (r + two * x * x)
+    b = y * radial + p1 * (r + two * y * y) + two * p2 * x * y
+    return a, b
+
+
+@kernel
+def _splat(
+    depth: F4,
+    labels: I4,
+    by_column: F4,
+    by_row: F4,
+    translation: F4,
+    intrinsics: F4,
+    kind: int,
+    d: F4,
+    limits: F4,
+    nearest: F4,
+    owners: I4,
+) -> None:
+    height, width = nearest.shape
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    tx, ty, tz = translation[0], translation[1], translation[2]
+    reach, scale, margin = limits[0], limits[1], limits[2]
+    one = np.float32(1)
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            z = depth[v, u]
+            pz = (by_column[u, 2] + by_row[v, 2]) * z + tz
+            if not (z > 0 and pz > np.float32(1e-3)):
+                continue
+            near = one / pz
+            x = ((by_column[u, 0] + by_row[v, 0]) * z + tx) * near
+            y = ((by_column[u, 1] + by_row[v, 1]) * z + ty) * near
+            if kind:
+                if x * x + y * y >= reach:
+                    continue
+                x, y = _bend(x, y, kind, d)
+            column, row, half = x * fx + cx, y * fy + cy, scale * z * near + margin
+            if not (-half < column < width + half and -half < row < height + half):
+                continue
+            # The pixels whose middle lies in the square; a cast to int rounds towards 0.
+            left, right = int(max(column - half + one, np.float32(0))), int(column + half)
+            top, bottom = int(max(row - half + one, np.float32(0))), int(row + half)
+            for j in range(top, min(bottom, height - 1) + 1):
+                for i in range(left, min(right, width - 1) + 1):
+                    if near > nearest[j, i]:
+                        nearest[j, i] = near
+                        owners[j, i] = labels[v, u]
+
+
+def hidden(seen: F4, nearest: F4) -> Bool:
+    """Tell which points the colour camera does not see.
+
+    Parameters
+    ----------
+    seen : (n, 3) as from `project`.
+    nearest : (h, w) inverse distance as from `splat_depth`.
+
+    Returns
+    -------
+    (n,) True for points behind something nearer, and outside of the image.
+    """
+    height, width = nearest.shape
+    with np.errstate(invalid="ignore"):
+        inside = (seen[:, 0] > -0.5) & (seen[:, 0] < width - 0.5)
+        inside &= (seen[:, 1] > -0.5) & (seen[:, 1] < height - 0.5)
+    result = np.ones(len(seen), bool)
+    u, v, z = seen[inside].T
+    front = nearest[np.rint(v).astype(np.int64), np.rint(u).astype(np.int64)]
+    result[inside] = front * z * (1 - _HIDDEN) > 1
+    return result
