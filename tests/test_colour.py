@@ -66,17 +66,17 @@ def test_the_painted_image_agrees_with_projected_points() -> None:
     depth[rows, columns] = rng.uniform(0.5, 1.5, rows.shape)
     labels[rows, columns] = 1 + np.arange(rows.size).reshape(rows.shape)
     frame = Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH)
-    _, owners = splat_depth(depth, DEPTH, labels, LENS, TURNED)
+    painted = splat_depth(depth, DEPTH, labels, LENS, TURNED)
 
     seen = project(frame.xyz(), LENS, TURNED)
     found = 0
     for label, index in zip(
         labels[rows, columns].ravel(), (rows * 160 + columns).ravel(), strict=True
     ):
-        v, u = np.nonzero(owners == label)
+        v, u = np.nonzero(painted.labels == label)
         if v.size and 3 < seen[index, 0] < 236 and 3 < seen[index, 1] < 196:
-            assert abs(u.mean() - seen[index, 0]) <= 0.51
-            assert abs(v.mean() - seen[index, 1]) <= 0.51
+            assert abs(u.mean() + painted.left - seen[index, 0]) <= 0.51
+            assert abs(v.mean() + painted.top - seen[index, 1]) <= 0.51
             found += 1
     assert found > 40
 
@@ -110,8 +110,8 @@ def test_what_the_colour_camera_does_not_see_gets_no_mask() -> None:
     points = frame.xyz()
     seen = project(points, lens, shift)
     assert frame.depth is not None
-    nearest, _ = splat_depth(frame.depth, DEPTH, np.ones((120, 160), np.int32), lens, shift)
-    covered = hidden(seen, nearest).reshape(120, 160)
+    painted = splat_depth(frame.depth, DEPTH, np.ones((120, 160), np.int32), lens, shift)
+    covered = hidden(seen, painted).reshape(120, 160)
     assert covered[60, 64]  # on the far board, right of the near one as the depth camera sees it
     assert not covered[60, 110]
     assert not covered[60, 30]

@@ -1,6 +1,7 @@
 """Dense masks of objects on a colour image."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from shapecat.colour_types import LensCamera
 from shapecat.jit import kernel
 from shapecat.types import Frame, Pose
 
-__all__ = ["Mask", "dense_masks", "united"]
+__all__ = ["NOTHING", "Mask", "dense_masks", "labelled_masks", "united"]
 
 _NARROW_PX = 4.0
 """Gaps in an object that are not wider, in pixels of the depth image, are closed."""
@@ -83,14 +84,18 @@ def dense_masks(
     labels = np.zeros(frame.depth.shape, np.int32)
     for number, indices in enumerate(objects, start=1):
         labels.reshape(-1)[indices] = number
-    scale = 1.0
     if colour_from_depth is None or lens is None:
         labels[(frame.depth <= 0) & (labels == 0)] = -1
-        seen = labels
-    else:
-        scale = lens.pinhole.fx / frame.camera.fx
-        _, seen = splat_depth(frame.depth, frame.camera, labels, lens, colour_from_depth)
-    return labelled_masks(seen, len(objects), scale)
+        return labelled_masks(labels, len(objects))
+    scale = lens.pinhole.fx / frame.camera.fx
+    painted = splat_depth(frame.depth, frame.camera, labels, lens, colour_from_depth)
+    masks = labelled_masks(painted.labels, len(objects), scale)
+    return tuple(
+        replace(mask, left=mask.left + painted.left, top=mask.top + painted.top)
+        if mask.pixels.size
+        else mask
+        for mask in masks
+    )
 
 
 def labelled_masks(seen: I4, count: int, scale: float = 1.0) -> tuple[Mask, ...]:

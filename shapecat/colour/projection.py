@@ -1,6 +1,7 @@
 """Points of the depth sensor on the image of a colour camera, and what hides what there."""
 
 from functools import lru_cache
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from shapecat.jit import kernel
 from shapecat.lenses import distort
 from shapecat.types import Camera, Pose
 
-__all__ = ["hidden", "project", "splat_depth"]
+__all__ = ["Painted", "hidden", "project", "splat_depth"]
 
 _FOOTPRINT_PX = 0.05
 """A depth pixel covers so much more of the colour image on each side, to leave no gaps."""
@@ -66,9 +67,22 @@ def _reach(lens: LensCamera) -> float:
     return float(slopes[back[0]]) if back.size else _WIDEST
 
 
+class Painted(NamedTuple):
+    """A part of an image as the colour camera sees it, from row ``top`` and column ``left`` on.
+
+    ``nearest`` (h, w) is the inverse distance, 0 where nothing is known; ``labels`` (h, w) int32
+    what is seen, -1 there.
+    """
+
+    left: int
+    top: int
+    nearest: F4
+    labels: I4
+
+
 def splat_depth(
     depth: F4, camera: Camera, labels: I4, lens: LensCamera, colour_from_depth: Pose
-) -> tuple[F4, I4]:
+) -> Painted:
     """Paint a depth image as a colour camera sees it, where it has labels and around them.
 
     Each depth pixel covers a square on the colour image, as large as its own, and a little more;
@@ -79,44 +93,35 @@ def splat_depth(
     depth : (h, w) metres, 0 where there is no reading.
     labels : (h, w) int32 what each depth pixel belongs to, 0 for nothing.
 
-    Returns
-    -------
-    As the colour camera sees it: (height, width) inverse distance, 0 where nothing is known, and
-    int32 labels, -1 there. Far from labelled pixels nothing is looked at.
-
     Notes
     -----
     O(depth pixels + what they cover).
     """
     target = lens.pinhole
-    nearest = np.zeros((target.height, target.width), np.float32)
-    owners = np.full(nearest.shape, -1, np.int32)
     rows, columns = _around(depth, labels, camera, colour_from_depth)
-    x = (np.arange(camera.width) - camera.cx) / camera.fx
-    y = (np.arange(camera.height) - camera.cy) / camera.fy
+    depth, labels = (np.ascontiguousarray(image[rows, columns]) for image in (depth, labels))
+    x = (np.arange(camera.width)[columns] - camera.cx) / camera.fx
+    y = (np.arange(camera.height)[rows] - camera.cy) / camera.fy
     turn = colour_from_depth.rotation
     # A ray is turned by adding what its column and its row give to each coordinate.
-    by_column, by_row = np.outer(x, turn[:, 0]), np.outer(y, turn[:, 1]) + turn[:, 2]
+    by_column = np.outer(x, turn[:, 0]).astype(np.float32)
+    by_row = (np.outer(y, turn[:, 1]) + turn[:, 2]).astype(np.float32)
+    shift = colour_from_depth.translation.astype(np.float32)
     d = np.zeros(8, np.float32)
     d[: len(lens.coefficients[:8])] = lens.coefficients[:8]
     kind = 0 if not lens.model else 2 if lens.model in _FISHEYE else 1
-    intrinsics = (target.fx, target.fy, target.cx, target.cy)
     scale = max(target.fx / camera.fx, target.fy / camera.fy)
-    limits = (_reach(lens) ** 2 if kind else np.inf, scale / 2, _FOOTPRINT_PX)
-    _splat(
-        depth[rows, columns],
-        labels[rows, columns],
-        by_column[columns].astype(np.float32),
-        by_row[rows].astype(np.float32),
-        colour_from_depth.translation.astype(np.float32),
-        np.array(intrinsics, np.float32),
-        kind,
-        d,
-        np.array(limits, np.float32),
-        nearest,
-        owners,
-    )
-    return nearest, owners
+    limits = np.array((_reach(lens) ** 2 if kind else np.inf, scale / 2, _FOOTPRINT_PX), np.float32)
+    numbers = np.array((target.fx, target.fy, target.cx, target.cy), np.float32)
+    size = (target.width, target.height)
+    margin = int(_BESIDE_PX * scale)
+    rays, lens_of = (by_column, by_row, shift), (numbers, kind, d, limits)
+    left, top, right, bottom = _landing(depth, labels, *rays, *lens_of, size, margin)
+    nearest = np.zeros((max(0, bottom - top), max(0, right - left)), np.float32)
+    owners = np.full(nearest.shape, -1, np.int32)
+    numbers[2:] -= (left, top)
+    _splat(depth, labels, *rays, *lens_of, nearest, owners)
+    return Painted(left, top, nearest, owners)
 
 
 def _around(depth: F4, labels: I4, camera: Camera, colour_from_depth: Pose) -> tuple[slice, slice]:
@@ -172,13 +177,61 @@ def _bend(x: float, y: float, kind: int, d: F4) -> tuple[float, float]:
 
 
 @kernel
+def _place(
+    px: float, py: float, pz: float, numbers: F4, kind: int, d: F4, reach: float
+) -> tuple[Any, Any, Any]:
+    """Return column, row and inverse distance of a point; 0 for one that is not seen."""
+    nowhere = np.float32(0), np.float32(0), np.float32(0)
+    if not pz > np.float32(1e-3):
+        return nowhere
+    near = np.float32(1) / pz
+    x, y = px * near, py * near
+    if kind:
+        if x * x + y * y >= reach:
+            return nowhere
+        x, y = _bend(x, y, kind, d)
+    return x * numbers[0] + numbers[2], y * numbers[1] + numbers[3], near
+
+
+@kernel
+def _landing(
+    depth: F4,
+    labels: I4,
+    by_column: F4,
+    by_row: F4,
+    shift: F4,
+    numbers: F4,
+    kind: int,
+    d: F4,
+    limits: F4,
+    size: tuple[int, int],
+    margin: int,
+) -> tuple[int, int, int, int]:
+    """Return the window around where labelled pixels land: left, top, right, bottom."""
+    left, top, right, bottom = size[0], size[1], 0, 0
+    for v in range(0, depth.shape[0], 2):
+        for u in range(0, depth.shape[1], 2):
+            z = depth[v, u]
+            if labels[v, u] > 0 and z > 0:
+                px = (by_column[u, 0] + by_row[v, 0]) * z + shift[0]
+                py = (by_column[u, 1] + by_row[v, 1]) * z + shift[1]
+                pz = (by_column[u, 2] + by_row[v, 2]) * z + shift[2]
+                x, y, near = _place(px, py, pz, numbers, kind, d, limits[0])
+                inside = -margin < x < size[0] + margin and -margin < y < size[1] + margin
+                if near > 0 and inside:
+                    left, top = min(left, int(x) - margin), min(top, int(y) - margin)
+                    right, bottom = max(right, int(x) + margin), max(bottom, int(y) + margin)
+    return max(left, 0), max(top, 0), min(right, size[0]), min(bottom, size[1])
+
+
+@kernel
 def _splat(
     depth: F4,
     labels: I4,
     by_column: F4,
     by_row: F4,
-    translation: F4,
-    intrinsics: F4,
+    shift: F4,
+    numbers: F4,
     kind: int,
     d: F4,
     limits: F4,
@@ -186,54 +239,51 @@ def _splat(
     owners: I4,
 ) -> None:
     height, width = nearest.shape
-    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    tx, ty, tz = translation[0], translation[1], translation[2]
     reach, scale, margin = limits[0], limits[1], limits[2]
-    one = np.float32(1)
+    wide, tall = np.float32(width), np.float32(height)
+    nought, one, two = np.float32(0), np.float32(1), np.float32(2)
     for v in range(depth.shape[0]):
+        ray_x, ray_y, ray_z = by_row[v, 0], by_row[v, 1], by_row[v, 2]
         for u in range(depth.shape[1]):
-            z = depth[v, u]
-            pz = (by_column[u, 2] + by_row[v, 2]) * z + tz
-            if not (z > 0 and pz > np.float32(1e-3)):
+            z, label = depth[v, u], labels[v, u]
+            # What is of no object matters by what it hides: a quarter of it is enough.
+            if not z > nought or (label == 0 and (u | v) & 1):
                 continue
-            near = one / pz
-            x = ((by_column[u, 0] + by_row[v, 0]) * z + tx) * near
-            y = ((by_column[u, 1] + by_row[v, 1]) * z + ty) * near
-            if kind:
-                if x * x + y * y >= reach:
-                    continue
-                x, y = _bend(x, y, kind, d)
-            column, row, half = x * fx + cx, y * fy + cy, scale * z * near + margin
-            if not (-half < column < width + half and -half < row < height + half):
-                continue
+            px = (by_column[u, 0] + ray_x) * z + shift[0]
+            py = (by_column[u, 1] + ray_y) * z + shift[1]
+            pz = (by_column[u, 2] + ray_z) * z + shift[2]
+            column, row, near = _place(px, py, pz, numbers, kind, d, reach)
+            half = scale * z * near + margin if label else two * scale * z * near
             # The pixels whose middle lies in the square; a cast to int rounds towards 0.
-            left, right = int(max(column - half + one, np.float32(0))), int(column + half)
-            top, bottom = int(max(row - half + one, np.float32(0))), int(row + half)
-            for j in range(top, min(bottom, height - 1) + 1):
-                for i in range(left, min(right, width - 1) + 1):
-                    if near > nearest[j, i]:
-                        nearest[j, i] = near
-                        owners[j, i] = labels[v, u]
+            left, right = max(column - half + one, nought), min(column + half, wide - one)
+            top, bottom = max(row - half + one, nought), min(row + half, tall - one)
+            if near > nought and left < right + one and top < bottom + one:
+                for j in range(np.uint32(top), np.uint32(max(bottom, nought)) + np.uint32(1)):
+                    for i in range(np.uint32(left), np.uint32(max(right, nought)) + np.uint32(1)):
+                        if near > nearest[j, i]:
+                            nearest[j, i] = near
+                            owners[j, i] = label
 
 
-def hidden(seen: F4, nearest: F4) -> Bool:
+def hidden(seen: F4, painted: Painted) -> Bool:
     """Tell which points the colour camera does not see.
 
     Parameters
     ----------
     seen : (n, 3) as from `project`.
-    nearest : (h, w) inverse distance as from `splat_depth`.
+    painted : what is nearest, as from `splat_depth`.
 
     Returns
     -------
-    (n,) True for points behind something nearer, and outside of the image.
+    (n,) True for points behind something nearer, and outside of what is painted.
     """
-    height, width = nearest.shape
+    height, width = painted.nearest.shape
+    seen = seen - np.array([painted.left, painted.top, 0], np.float32)
     with np.errstate(invalid="ignore"):
         inside = (seen[:, 0] > -0.5) & (seen[:, 0] < width - 0.5)
         inside &= (seen[:, 1] > -0.5) & (seen[:, 1] < height - 0.5)
     result = np.ones(len(seen), bool)
     u, v, z = seen[inside].T
-    front = nearest[np.rint(v).astype(np.int64), np.rint(u).astype(np.int64)]
+    front = painted.nearest[np.rint(v).astype(np.int64), np.rint(u).astype(np.int64)]
     result[inside] = front * z * (1 - _HIDDEN) > 1
     return result
