@@ -23,7 +23,6 @@ from shapecat.recordings.protobuf import message_decoder
 from shapecat.runs.corrections import read_labels
 from shapecat.runs.jobs import Job
 from shapecat.runs.masks import read_masks
-from shapecat.simulation import simulate
 from tests.conftest import Guesser
 from tests.test_exports import relabel
 from tests.test_review import rows
@@ -32,15 +31,10 @@ IMAGES = "/camera/color/image_raw/compressed"
 FRAMES = 4
 
 
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Process a simulated recording with a colour camera; its categories are guesses."""
-    folder = tmp_path_factory.mktemp("coloured")
-    source = simulate(folder / "table.mcap", frames=FRAMES, seed=7, color=True)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
-        shapecat.pipeline.process(Job(source=source, folder=folder / "out" / "table"), cores=2)
-    return folder / "out" / "table"
+@pytest.fixture
+def run(coloured_run: Path) -> Path:
+    """Return a run with colour."""
+    return coloured_run
 
 
 def recorded(path: Path, topic: str) -> list[tuple[int, Any]]:
@@ -189,12 +183,11 @@ def test_annotations_in_json_and_protobuf_say_the_same() -> None:
     validate: Any = import_module("jsonschema").validate
     validate(plain, json.loads(as_json.schema))
     ((packed, pack),) = image_encoder_for("protobuf")
-    decode: Any = message_decoder(packed.schema, packed.schema_name)
+    decode = message_decoder(packed.schema, packed.schema_name)
     message = decode(pack(DRAWING))
 
     assert as_json.schema_name == packed.schema_name == "foxglove.ImageAnnotations"
-    for read in (lambda v: v["points"], lambda v: v["texts"]):
-        assert len(read(plain)) == 2
+    assert len(plain["points"]) == len(plain["texts"]) == 2
     first = plain["points"][0]
     assert [(p["x"], p["y"]) for p in first["points"]] == [(11, 22), (44, 22), (44, 66), (11, 66)]
     assert [(p.x, p.y) for p in message.points[0].points] == [

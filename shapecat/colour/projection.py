@@ -5,13 +5,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, I4, Bool
+from shapecat.arrays import F4, I4, U1, Bool
 from shapecat.colour_types import LensCamera
 from shapecat.jit import kernel
 from shapecat.lenses import distort
 from shapecat.types import Camera, Pose
 
-__all__ = ["Painted", "hidden", "project", "splat_depth"]
+__all__ = ["Painted", "hidden", "project", "rectified", "splat_depth"]
 
 _FOOTPRINT_PX = 0.05
 """A depth pixel covers so much more of the colour image on each side, to leave no gaps."""
@@ -53,6 +53,32 @@ def project(points: F4, lens: LensCamera, colour_from_depth: Pose) -> F4:
         rays = distort(np.where(within, rays, np.nan), lens.model, lens.coefficients)
     seen = rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
     return np.column_stack([seen, z]).astype(np.float32)
+
+
+def rectified(pixels: U1, lens: LensCamera) -> U1:
+    """Return an image (h, w, 3) as the pinhole of its camera would show it.
+
+    Between four pixels colours are interpolated; what the lens has not seen is black.
+    """
+    if not lens.model:
+        return pixels
+    camera = lens.pinhole
+    v, u = np.mgrid[: camera.height, : camera.width]
+    rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1)
+    x, y = distort(rays, lens.model, lens.coefficients).transpose(2, 0, 1)
+    x, y = x * camera.fx + camera.cx, y * camera.fy + camera.cy
+    inside = (x >= 0) & (x <= camera.width - 1) & (y >= 0) & (y <= camera.height - 1)
+    inside &= (rays**2).sum(axis=-1) < _reach(lens) ** 2
+    x, y = np.where(inside, x, 0), np.where(inside, y, 0)
+    left, top = (
+        np.minimum(x.astype(int), camera.width - 2),
+        np.minimum(y.astype(int), camera.height - 2),
+    )
+    a, b = (x - left)[..., None], (y - top)[..., None]
+    upper = pixels[top, left] * (1 - a) + pixels[top, left + 1] * a
+    lower = pixels[top + 1, left] * (1 - a) + pixels[top + 1, left + 1] * a
+    mixed = upper * (1 - b) + lower * b
+    return np.asarray(np.rint(mixed * inside[..., None]), np.uint8)
 
 
 @lru_cache(maxsize=16)

@@ -10,7 +10,14 @@ from shapecat.arrays import U1
 from shapecat.colour_types import COMPRESSED_FORMATS, ColourImage
 from shapecat.recordings.messages import MessageError
 
-__all__ = ["COLOUR_ENCODINGS", "cloud_colours", "compressed_kind", "compressed_size", "pixels_of"]
+__all__ = [
+    "COLOUR_ENCODINGS",
+    "cloud_colours",
+    "compressed_kind",
+    "compressed_size",
+    "encoded",
+    "pixels_of",
+]
 
 _LARGEST = 1 << 26
 """Images with more pixels are refused."""
@@ -116,6 +123,23 @@ def pixels_of(image: ColourImage, *, shrink: int = 1) -> U1:
     if image.encoding in COMPRESSED_FORMATS:
         return _decompressed(image, shrink)
     return _raw_pixels(image)
+
+
+def encoded(image: ColourImage) -> tuple[str, bytes]:
+    """Return an image as a file, without loss: its suffix, and its bytes, as they came or as PNG.
+
+    Raises
+    ------
+    MessageError : damaged; what came compressed is decoded once to make sure.
+    """
+    from PIL import Image  # noqa: PLC0415  # loaded where there is colour
+
+    pixels = pixels_of(image)
+    if image.encoding in COMPRESSED_FORMATS:
+        return ".jpg" if image.encoding == "jpeg" else ".png", bytes(image.data)
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "png", compress_level=4)
+    return ".png", file.getvalue()
 
 
 def _decompressed(image: ColourImage, shrink: int) -> U1:
