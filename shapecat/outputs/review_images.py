@@ -89,6 +89,7 @@ class Images:
         layer = rr.EncodedImage(contents=picture.masks, media_type="image/png", draw_order=1.0)
         self._stream.log(f"{entity}/masks", layer)
         boxes, colours = picture.boxes, [colour_of(item.category) for item in picture.objects]
+        lighter = [[(part + 255) // 2 for part in colour] for colour in colours]
         self._stream.log(
             f"{entity}/boxes",
             rr.Boxes2D(
@@ -103,7 +104,7 @@ class Images:
             rr.Points2D(
                 boxes[:, :2] + boxes[:, 2:] * np.array((0.5, 0), np.float32),
                 labels=[label(item) for item in picture.objects],
-                colors=colours,
+                colors=lighter,
                 radii=0.5,
                 show_labels=True,
                 draw_order=3.0,
