@@ -5,10 +5,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, I4, U1, Bool
+from shapecat.arrays import F4, F8, I4, U1, Bool
 from shapecat.colour_types import LensCamera
 from shapecat.jit import kernel
-from shapecat.lenses import distort
+from shapecat.lenses import LENS_MODELS, distort
 from shapecat.types import Camera, Pose
 
 __all__ = ["Painted", "hidden", "project", "rectified", "splat_depth"]
@@ -43,16 +43,24 @@ def project(points: F4, lens: LensCamera, colour_from_depth: Pose) -> F4:
     >>> project(np.array([[0.1, -0.2, 1.0]]), lens, Pose(np.eye(3), np.array([0.1, 0.0, 1.0])))
     array([[370., 190.,   2.]], dtype=float32)
     """
-    local = np.asarray(points, np.float64) @ colour_from_depth.rotation.T
-    local += colour_from_depth.translation
-    z = np.where(local[:, 2] > 1e-3, local[:, 2], np.nan)
-    rays = local[:, :2] / z[:, None]
-    camera = lens.pinhole
-    if lens.model:
-        within = (rays**2).sum(axis=1, keepdims=True) < _reach(lens) ** 2
-        rays = distort(np.where(within, rays, np.nan), lens.model, lens.coefficients)
-    seen = rays * (camera.fx, camera.fy) + (camera.cx, camera.cy)
-    return np.column_stack([seen, z]).astype(np.float32)
+    camera, (kind, d) = lens.pinhole, _distortion(lens)
+    numbers = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    reach = _reach(lens) ** 2 if kind else np.inf
+    seen = np.zeros((len(points), 3), np.float32)
+    rotation = np.ascontiguousarray(colour_from_depth.rotation)
+    points, shift = np.asarray(points, np.float64), colour_from_depth.translation
+    _project(points, rotation, shift, numbers, kind, d.astype(np.float64), reach, seen)
+    return seen
+
+
+def _distortion(lens: LensCamera) -> tuple[int, F4]:
+    """Return what kernels know of a lens: 0 none, 1 the polynomial, 2 the fisheye; 8 numbers."""
+    if lens.model and lens.model not in LENS_MODELS:
+        msg = f"lens distortion {lens.model!r} is not known"
+        raise ValueError(msg)
+    d = np.zeros(8, np.float32)
+    d[: len(lens.coefficients[:8])] = lens.coefficients[:8]
+    return 0 if not lens.model else 2 if lens.model in _FISHEYE else 1, d
 
 
 def rectified(pixels: U1, lens: LensCamera) -> U1:
@@ -133,9 +141,7 @@ def splat_depth(
     by_column = np.outer(x, turn[:, 0]).astype(np.float32)
     by_row = (np.outer(y, turn[:, 1]) + turn[:, 2]).astype(np.float32)
     shift = colour_from_depth.translation.astype(np.float32)
-    d = np.zeros(8, np.float32)
-    d[: len(lens.coefficients[:8])] = lens.coefficients[:8]
-    kind = 0 if not lens.model else 2 if lens.model in _FISHEYE else 1
+    kind, d = _distortion(lens)
     scale = max(target.fx / camera.fx, target.fy / camera.fy)
     limits = np.array((_reach(lens) ** 2 if kind else np.inf, scale / 2, _FOOTPRINT_PX), np.float32)
     numbers = np.array((target.fx, target.fy, target.cx, target.cy), np.float32)
@@ -207,7 +213,7 @@ def _place(
     px: float, py: float, pz: float, numbers: F4, kind: int, d: F4, reach: float
 ) -> tuple[Any, Any, Any]:
     """Return column, row and inverse distance of a point; 0 for one that is not seen."""
-    nowhere = np.float32(0), np.float32(0), np.float32(0)
+    nowhere = numbers[0] * 0, numbers[0] * 0, numbers[0] * 0  # of the precision of the others
     if not pz > np.float32(1e-3):
         return nowhere
     near = np.float32(1) / pz
@@ -248,6 +254,22 @@ def _landing(
                     left, top = min(left, int(x) - margin), min(top, int(y) - margin)
                     right, bottom = max(right, int(x) + margin), max(bottom, int(y) + margin)
     return max(left, 0), max(top, 0), min(right, size[0]), min(bottom, size[1])
+
+
+@kernel
+def _project(
+    points: F8, rotation: F8, shift: F8, numbers: F8, kind: int, d: F8, reach: float, seen: F4
+) -> None:
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        px = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + shift[0]
+        py = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + shift[1]
+        pz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + shift[2]
+        column, row, near = _place(px, py, pz, numbers, kind, d, reach)
+        if near > 0:
+            seen[i, 0], seen[i, 1], seen[i, 2] = column, row, pz
+        else:
+            seen[i] = np.nan
 
 
 @kernel

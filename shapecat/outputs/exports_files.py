@@ -59,11 +59,19 @@ def png(
     if alpha is not None:
         parts.append((b"tRNS", np.ascontiguousarray(alpha, np.uint8).tobytes()))
     pixels = np.concatenate([unfiltered, rows], axis=1).tobytes()
-    parts += [(b"IDAT", zlib.compress(pixels, level)), (b"IEND", b"")]
+    parts += [(b"IDAT", _compressed(pixels, level)), (b"IEND", b"")]
     return b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
         for name, body in parts
     )
+
+
+def _compressed(data: bytes, level: int) -> bytes:
+    """Compress; at level 1 by runs of equal bytes alone, which masks are made of."""
+    if level > 1:
+        return zlib.compress(data, level)
+    packer = zlib.compressobj(1, strategy=zlib.Z_RLE)
+    return packer.compress(data) + packer.flush()
 
 
 def safe_name(text: str) -> str:

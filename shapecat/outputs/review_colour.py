@@ -35,7 +35,8 @@ def true_colours(
     image = view.image
     if not frame.organized and view.registered:
         return pixels_of(image).reshape(-1, 3)[pixels], np.ones(pixels.size, bool)
-    shrink = 4 if pitch >= 4 else 2 if pitch >= 2 else 1
+    apart = 1.5 * pitch * (image.width / frame.camera.width if frame.camera is not None else 1.0)
+    shrink = next((k for k in (4, 2) if k <= apart), 1)  # finer than the points are apart
     colours = pixels_of(image, shrink=shrink)
     if view.colour_from_depth is None or view.lens is None:
         v, u = np.divmod(pixels, image.width)
