@@ -17,15 +17,19 @@ from mcap_ros2.decoder import DecoderFactory
 import shapecat.pipeline
 from shapecat.colour.masks import Mask
 from shapecat.colour.rle import rle_counts, rle_mask, rle_text
+from shapecat.colour_types import ColourImage, ColourView
 from shapecat.errors import NoStreamError
+from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encoder_for
+from shapecat.outputs.review import write_review
 from shapecat.recordings.protobuf import message_decoder
 from shapecat.runs.corrections import read_labels
 from shapecat.runs.jobs import Job
 from shapecat.runs.masks import read_masks
+from tests.colour_messages import gradient, png
 from tests.conftest import Guesser
 from tests.test_exports import relabel
-from tests.test_review import rows
+from tests.test_review import TOPIC, labelled_object, rows, scene, stamp
 
 IMAGES = "/camera/color/image_raw/compressed"
 FRAMES = 4
@@ -225,3 +229,34 @@ def test_run_lengths_are_those_of_coco_and_come_back() -> None:
         rle_mask(np.array([5]), 2, 3)
     # The example of a 3 x 4 image in the docstring, and COCO's text of larger differences.
     assert rle_text(np.array([3, 2, 1, 1, 5])) == "321O4"
+
+
+def test_a_damaged_image_costs_the_review_only_itself(tmp_path: Path) -> None:
+    """The size of a file may be right and its content not: the frame is shown without colour."""
+    whole = png(gradient())
+    half, views = len(whole) // 2, []
+    for k, data in enumerate((whole, whole[:half] + bytes(20) + whole[half + 20 :])):
+        image = ColourImage("/color", stamp(k), stamp(k), "optical", "png", 64, 48, 0, data)
+        views.append(Coloured(ColourView(image), (Mask(3, 4, np.ones((5, 6), bool)),)))
+    scenes = [(*scene(k, [labelled_object(1)]), view) for k, view in enumerate(views)]
+    path = tmp_path / "review.rrd"
+    write_review(
+        path,
+        scenes,
+        name="lab",
+        run={},
+        categories=("cup", "can"),
+        cloud_points=1000,
+        fixed_frame=None,
+        threads=2,
+    )
+
+    entity = f"/images/{TOPIC}"
+    images = [row for row in rows(path, entity) if row.get("EncodedImage:blob")]
+    assert [row["frame"] for row in images] == [0]
+    (box,) = (row for row in rows(path, f"{entity}/boxes") if row.get("Boxes2D:centers"))
+    assert np.allclose(box["Boxes2D:centers"], [[6, 6.5]])
+    assert np.allclose(box["Boxes2D:half_sizes"], [[3, 2.5]])
+    texts = [row["TextLog:text"][0] for row in rows(path, "/log")]
+    assert any(text.startswith("/color: png image is damaged") for text in texts)
+    assert len(rows(path, f"/world/{TOPIC}/scene")) == 2
