@@ -2,37 +2,72 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import click
 
 from .options import ANY_PATH
 from .render import progress_bars
 
-_FORMATS = ("crops", "kitti", "labelcloud", "point-labels")
+_DATASETS = ("coco", "yolo")
+_FORMATS = (*_DATASETS, "crops", "kitti", "labelcloud", "point-labels")
 
 
 @click.command()
 @click.argument("folders", nargs=-1, required=True, type=ANY_PATH, metavar="DIR...")
 @click.option("--format", "kind", type=click.Choice(_FORMATS), required=True, help="See above.")
-@click.option("--out", type=ANY_PATH, required=True, help="Crops go to OUT, others to OUT/NAME.")
+@click.option(
+    "--out", type=ANY_PATH, required=True, help="Data sets go to OUT, others to OUT/NAME."
+)
 @click.option("--every", type=click.IntRange(1), default=1, help="Keep only every Nth frame.")
+@click.option(
+    "--per-track",
+    type=click.IntRange(0),
+    default=0,
+    help="coco, yolo: only frames in which N views of each track are that differ most.",
+    metavar="N",
+)
+@click.option(
+    "--min-confidence",
+    type=click.FloatRange(0, 1),
+    default=0.0,
+    help="coco, yolo: label only objects that are so sure.",
+)
+@click.option("--corrected-only", is_flag=True, help="coco, yolo: only labels a person has given.")
+@click.option("--depth", is_flag=True, help="coco, yolo: 16-bit depth images instead of colour.")
+@click.option(
+    "--val",
+    type=click.FloatRange(0, 1, max_open=True),
+    default=0.2,
+    show_default=True,
+    help="coco, yolo: share of the recordings for validation.",
+)
 @click.option("--recording", type=ANY_PATH, help="Where the recording is now, if it was moved.")
 def export(
-    *, folders: tuple[Path, ...], kind: str, out: Path, every: int, recording: Path | None
+    *,
+    folders: tuple[Path, ...],
+    kind: str,
+    out: Path,
+    every: int,
+    recording: Path | None,
+    **chosen: Any,
 ) -> None:
-    """Write the labels of runs, with their points, for other tools.
+    """Write the labels of runs, with their images or points, for other tools.
 
-    Each DIR is a run, or a folder of runs.
+    Each DIR is a run, or a folder of runs. All runs go into one data set of coco, yolo, or crops.
 
     \b
+    coco          colour images, masks (RLE), boxes, categories, tracks
+    yolo          colour images, a polygon per object
     crops         views of objects, laid out as for `shapecat train` and `learn`
-    kitti         label_2, calib, velodyne
+    kitti         label_2, calib, velodyne, image_2
     labelcloud    a project of the labelling tool labelCloud
     point-labels  masks for depth images, SemanticKITTI labels for clouds
 
     \b
     shapecat export results/lab --format crops --out crops
     shapecat export results --format kitti --out kitti
+    shapecat export results --format coco --out coco --per-track 20 --min-confidence 0.8
     """
     from shapecat.outputs.exports import export_run
     from shapecat.outputs.rereading import find_runs
@@ -43,10 +78,30 @@ def export(
         raise click.UsageError(msg)
     if kind != "crops":
         _require_own_names(runs)
+    if kind in _DATASETS:
+        _export_dataset(runs, kind, out, recording, {"every": every, **chosen})
+        return
+    given = [name for name, value in chosen.items() if value and name != "val"]
+    if given:
+        msg = f"--{given[0].replace('_', '-')} is for --format coco and yolo, not {kind}"
+        raise click.UsageError(msg)
     for run in runs:
         with progress_bars() as bars:
             count = export_run(run, kind, out, every=every, recording=recording, observe=bars)
         click.echo(f"{run}: {count} objects in {out}")
+
+
+def _export_dataset(
+    runs: Sequence[Path], kind: str, out: Path, recording: Path | None, chosen: dict[str, Any]
+) -> None:
+    """Gather runs in one data set."""
+    from shapecat.outputs.dataset_frames import Selection
+    from shapecat.outputs.exports import export_dataset
+
+    with progress_bars() as bars:
+        selection = Selection(**chosen)
+        count = export_dataset(runs, kind, out, selection, recording=recording, observe=bars)
+    click.echo(f"{len(runs)} runs: {count} objects in {out}")
 
 
 def _require_own_names(runs: Sequence[Path]) -> None:

@@ -54,6 +54,10 @@ _MOST_ROWS = 100
     show_default=True,
     help="How progress is shown on stderr.",
 )
+@click.option(
+    "--color", metavar="TOPIC", help="Colour images to use; by default those of the depth camera."
+)
+@click.option("--no-color", is_flag=True, help="Do not use colour images.")
 @click.option("--no-mcap", is_flag=True, help="Do not write annotated.mcap.")
 @click.option("--no-rrd", is_flag=True, help="Do not write review.rrd.")
 @click.option(
@@ -75,6 +79,8 @@ def process(
     *,
     recordings: tuple[str, ...],
     out: str,
+    color: str | None,
+    no_color: bool,
     no_mcap: bool,
     no_rrd: bool,
     config: Path | None,
@@ -108,6 +114,9 @@ def process(
     from shapecat.files import FSYNC
     from shapecat.runs.jobs import Job
 
+    if color is not None and no_color:
+        msg = "--color and --no-color contradict each other"
+        raise click.UsageError(msg)
     _require_range(choices["start_s"], choices["end_s"])
     if no_fsync:
         os.environ[FSYNC] = "0"  # which worker processes inherit
@@ -115,6 +124,7 @@ def process(
         source=Path(),
         folder=Path(),
         settings=load_settings(config, overrides),
+        color="" if no_color else color,
         mcap=not no_mcap,
         rrd=not no_rrd,
         **choices,

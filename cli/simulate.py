@@ -41,6 +41,7 @@ from .render import progress_bars
     "--frames", type=click.IntRange(1), default=90, show_default=True, help="30 per second."
 )
 @click.option("--clouds", is_flag=True, help="Write PointCloud2 instead of depth images.")
+@click.option("--color", is_flag=True, help="Add a colour camera beside the depth camera.")
 @click.option("--overwrite", is_flag=True, help="Replace a recording that is there.")
 @seed_option
 def simulate(
@@ -51,12 +52,14 @@ def simulate(
     sensor: Any,
     frames: int,
     clouds: bool,
+    color: bool,
     overwrite: bool,
     seed: int,
 ) -> None:
     """Make a recording of simulated objects, with the truth beside it.
 
-    OUT.truth.json says what stands where in each frame; OUT.labels.npz which pixel is whose.
+    OUT.truth.json says what stands where in each frame; OUT.labels.npz which pixel is whose, and
+    OUT.color_labels.npz with --color which pixel of the colour images.
 
     \b
     shapecat simulate demo.mcap --scene clutter --frames 60 --seed 3
@@ -65,7 +68,7 @@ def simulate(
     from shapecat.simulation.recorder import written_paths
 
     container = _format_of(out, container)
-    there = [path for path in written_paths(out, container) if path.exists()]
+    there = [path for path in written_paths(out, container, color=color) if path.exists()]
     if there and not overwrite:
         msg = f"{there[0]} is there already; --overwrite replaces it"
         raise click.UsageError(msg)
@@ -77,6 +80,7 @@ def simulate(
             sensor=sensor,
             frames=frames,
             clouds=clouds,
+            color=color,
             seed=seed,
             observe=bars,
         )

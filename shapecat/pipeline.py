@@ -21,7 +21,8 @@ from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import NoStreamError, OutputError, RecordingError
 from shapecat.executors.order import Processes, read_ahead
 from shapecat.learning import Categorizer, load_model
-from shapecat.outputs.rereading import open_source, with_clouds
+from shapecat.outputs.colouring import colours_of, with_colour, write_masks
+from shapecat.outputs.rereading import open_source
 from shapecat.perception import Perceiver, View
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
 from shapecat.recordings.gravity import Upright
@@ -101,6 +102,7 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
         categorizer.require_descriptor(DESCRIPTOR_NAMES)
         run = describe_run(job, categorizer)
         run["options"]["topics"] = [s.topic for s in choose_streams(recording, job.topics)]
+        colours = colours_of(recording, run["options"])
         _log.info(
             "%s: %s, model %s", job.name, " ".join(run["options"]["topics"]), job.model or "default"
         )
@@ -109,6 +111,7 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
             return _finished(job, recording, run, content, observe)
         with staged(job.folder, worth_keeping=has_work) as folder:
             run = resume(folder, run, job.source, content.result)
+            run["color"] = {topic: colour.topic for topic, colour in colours.items()}
             compiling_s = compile_all(lambda: observe("compile", 0, None), cores=cores)
             content.start()
             earlier = sum(run["seconds"].values())
@@ -248,7 +251,7 @@ def annotate(
     *,
     cores: int = 1,
 ) -> None:
-    """Write annotated.mcap and review.rrd from the tables, tracks.csv and the recording.
+    """Write masks.parquet, annotated.mcap and review.rrd from the tables and the recording.
 
     With several cores a thread reads while another writes.
     """
@@ -259,21 +262,25 @@ def annotate(
 
     def write_mcap() -> None:
         from shapecat.outputs.annotated_mcap import write_annotated  # noqa: PLC0415  on first use
+        from shapecat.outputs.image_annotations import read_image_frames  # noqa: PLC0415  the same
 
         shown = read_shown_frames(folder, labels())
+        images = read_image_frames(folder, labels()) if run.get("color") else None
         write_annotated(
             recording,
             folder / "annotated.mcap",
             _observed(shown, "annotate", total, observe),
             run=run,
             markers=settings["markers"],
+            images=images,
         )
 
     def write_rrd() -> None:
         from shapecat.outputs.review import write_review  # noqa: PLC0415  loads Rerun on first use
 
         labelled = read_labelled_frames(folder, labels())
-        pairs = with_clouds(_observed(labelled, "review", total, observe), recording, run)
+        shown = _observed(labelled, "review", total, observe)
+        pairs = with_colour(shown, recording, run, folder)
         write_review(
             folder / "review.rrd",
             read_ahead(pairs, count=_AHEAD) if cores > 1 else pairs,
@@ -282,8 +289,16 @@ def annotate(
             categories=run["model"]["categories"],
             cloud_points=settings["cloud_points"],
             fixed_frame=run["fixed_frame"],
+            threads=cores,
         )
 
+    def find_masks() -> None:
+        run["counts"]["color"] = write_masks(folder, recording, run, threads=cores)
+        known = [*run["warnings"], *recording.warnings]
+        run["warnings"] = list(dict.fromkeys(known))
+
+    if run.get("color"):
+        _once("masks", folder, run, find_masks)
     if run["options"]["mcap"]:
         _once("annotated.mcap", folder, run, write_mcap)
     if run["options"]["rrd"]:

@@ -238,7 +238,8 @@ class LabelledObject(Record):
 
     ``box`` is in the sensor frame, as are the ``neurons`` of ``gas``; ``posterior`` is this single
     view's, ``causal`` the track's up to this frame; ``confidence`` and ``category`` are final.
-    ``height_m`` is the height of the centre above what it stands on, NaN if on nothing.
+    ``height_m`` is the height of the centre above what it stands on, NaN if on nothing;
+    ``detections`` are its rows of the frame, several where tracks were merged.
     """
 
     track: int
@@ -252,6 +253,7 @@ class LabelledObject(Record):
     height_m: float = float("nan")
     touches_border: bool = False
     occluded: bool = False
+    detections: tuple[int, ...] = ()
 
 
 class LabelledFrame(Record):

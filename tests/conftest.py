@@ -77,3 +77,21 @@ def guessed_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
         shapecat.pipeline.process(Job(source=source, folder=folder / "out" / "table", rrd=False))
     return folder / "out" / "table"
+
+
+@pytest.fixture(scope="session")
+def coloured_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Process a simulated recording with a colour camera, in four frames; categories are guesses.
+
+    Copy it to change it.
+    """
+    import shapecat.pipeline  # noqa: PLC0415  the same
+    from shapecat.runs.jobs import Job  # noqa: PLC0415  the same
+    from shapecat.simulation import simulate  # noqa: PLC0415  the same
+
+    folder = tmp_path_factory.mktemp("coloured")
+    source = simulate(folder / "table.mcap", frames=4, seed=7, color=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
+        shapecat.pipeline.process(Job(source=source, folder=folder / "out" / "table"), cores=2)
+    return folder / "out" / "table"

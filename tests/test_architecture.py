@@ -10,13 +10,14 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 STAGES = {"depth_fusion", "detection", "surface", "description", "learning", "tracking"}
-BASE = {"arrays", "errors", "jit", "stopping", "triangles", "types"}
+BASE = {"arrays", "colour_types", "errors", "jit", "stopping", "triangles", "types"}
 FLOOR = {
     **dict.fromkeys(BASE | {"py"}, 0),
-    **dict.fromkeys(("config", "geometry", "files", "executors"), 1),
+    **dict.fromkeys(("config", "geometry", "files", "executors", "lenses"), 1),
     **dict.fromkeys(
         (
             *STAGES,
+            "colour",
             "recordings",
             "simulation",
             "schemas",

@@ -364,7 +364,7 @@ def test_the_command_names_what_it_wrote(shapecat: Run, run: Path, tmp_path: Pat
 
     assert result.exit_code == 0
     assert "objects in" in result.stdout
-    assert shapecat("export", run, "--format", "coco", "--out", tmp_path).exit_code == 2
+    assert shapecat("export", run, "--format", "voc", "--out", tmp_path).exit_code == 2
     missing = shapecat("export", tmp_path / "none", "--format", "crops", "--out", tmp_path)
     assert missing.exit_code == 1
     assert "no run.json" in missing.output

@@ -76,7 +76,7 @@ def write(path: Path, scenes: Iterable[tuple[LabelledFrame, Frame]], **options: 
         "cloud_points": 1000,
         "fixed_frame": None,
     }
-    review.write_review(path, scenes, **(settings | options))
+    review.write_review(path, ((*one, None) for one in scenes), **(settings | options))
     return path
 
 

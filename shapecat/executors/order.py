@@ -12,7 +12,7 @@ from typing import Generic, Self, TypeVar
 
 from shapecat.executors.local import LocalExecutor
 
-__all__ = ["Processes", "read_ahead"]
+__all__ = ["Processes", "map_ahead", "read_ahead"]
 
 _log = logging.getLogger(__name__)
 
@@ -155,6 +155,35 @@ def read_ahead(items: Iterable[_Item], *, count: int) -> Iterator[_Item]:
         while taken := pending.popleft().result():
             pending.append(pool.submit(take))
             yield taken[0]
+
+
+def map_ahead(
+    function: Callable[[_Item], _Result], items: Iterable[_Item], *, threads: int
+) -> Iterator[_Result]:
+    """Yield what a function makes of items, in their order, worked on in threads ahead.
+
+    Worth it for a function that spends its time in kernels, which do not hold the interpreter lock.
+
+    Parameters
+    ----------
+    threads : with one, all is done here when it is asked for.
+
+    Examples
+    --------
+    >>> list(map_ahead(abs, [-1, 2, -3], threads=2))
+    [1, 2, 3]
+    """
+    if threads < 2:
+        yield from map(function, items)
+        return
+    with _switching(), ThreadPoolExecutor(threads) as pool:
+        pending: deque[Future[_Result]] = deque()
+        for item in items:
+            pending.append(pool.submit(function, item))
+            if len(pending) > 2 * threads:
+                yield pending.popleft().result()
+        while pending:
+            yield pending.popleft().result()
 
 
 @contextmanager

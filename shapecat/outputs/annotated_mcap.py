@@ -7,16 +7,19 @@ MCAP. Annotations use the encoding of the source.
 import gc
 import json
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from heapq import merge
 from itertools import chain, islice, pairwise
+from operator import attrgetter
 from pathlib import Path
 from typing import BinaryIO
 
 from shapecat.files import replacing
 from shapecat.outputs.annotation import Annotation, AnnotationChannel, Item
 from shapecat.outputs.annotations import ENCODERS, Encode, encoder_for
+from shapecat.outputs.image_annotations import ImageFrame, image_encoder_for
 from shapecat.outputs.mcap_append import Appender, copy_bytes
 from shapecat.recordings import Recording
 from shapecat.recordings.mcap_file import McapRecording, Summary
@@ -41,6 +44,7 @@ def write_annotated(
     *,
     run: Mapping[str, object],
     markers: bool = False,
+    images: Iterable[ImageFrame] | None = None,
 ) -> None:
     """Write a copy of a recording with annotation channels.
 
@@ -52,6 +56,9 @@ def write_annotated(
     Parameters
     ----------
     markers : also write ``/shapecat/markers`` for RViz.
+    images : what is shown on the colour images, in the order of the recording: also write
+        ``/shapecat/image_annotations`` and, for ROS, ``/shapecat/detections_2d``, with the stamp,
+        frame id and log time of the image.
 
     Raises
     ------
@@ -61,12 +68,12 @@ def write_annotated(
     with _uncollected(), replacing(path) as hidden, hidden.open("wb", buffering=_BUFFER) as file:
         if isinstance(recording, McapRecording) and recording.indexed:
             with _copying(recording, hidden, file):
-                channels, items = _encoded(recording, frames, markers=markers)
+                channels, items = _encoded(recording, frames, images, markers=markers)
                 _append(recording.summary, file, channels, items, metadata)
         else:
             from shapecat.outputs.mcap_rewrite import rewrite  # noqa: PLC0415  loads YAML for ROS 1
 
-            channels, items = _encoded(recording, frames, markers=markers)
+            channels, items = _encoded(recording, frames, images, markers=markers)
             rewrite(recording, file, channels, items, metadata)
 
 
@@ -94,14 +101,34 @@ def _copying(recording: McapRecording, path: Path, file: BinaryIO) -> Iterator[N
 
 
 def _encoded(
-    recording: Recording, frames: Iterable[ShownFrame], *, markers: bool
+    recording: Recording,
+    frames: Iterable[ShownFrame],
+    images: Iterable[ImageFrame] | None,
+    *,
+    markers: bool,
 ) -> tuple[list[AnnotationChannel], Iterator[Item]]:
     """Return the annotation channels and their messages, which are made as they are read."""
     annotations = _annotations(frames)
     first = next(annotations, None)
-    kinds = encoder_for(_encoding(recording, first), markers=markers)
+    encoding = _encoding(recording, first)
+    kinds = encoder_for(encoding, markers=markers)
     items = _items(chain([first] if first else [], annotations), [encode for _, encode in kinds])
-    return [channel for channel, _ in kinds], items
+    channels = [channel for channel, _ in kinds]
+    if images is None:
+        return channels, items
+    drawn = image_encoder_for(encoding)
+    more = _image_items(images, [encode for _, encode in drawn], len(channels))
+    channels += [channel for channel, _ in drawn]
+    return channels, merge(items, more, key=attrgetter("log_time_ns"))
+
+
+def _image_items(
+    images: Iterable[ImageFrame], encoders: Sequence[Callable[[ImageFrame], bytes]], first: int
+) -> Iterator[Item]:
+    """Encode what is drawn on images; the channels count from ``first``."""
+    for image in images:
+        for number, encode in enumerate(encoders, start=first):
+            yield Item(number, image.log_time_ns, encode(image))
 
 
 def _items(annotations: Iterable[Annotation], encoders: Sequence[Encode]) -> Iterator[Item]:

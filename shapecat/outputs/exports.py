@@ -2,31 +2,40 @@
 
 import json
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from shapecat.errors import OutputError
 from shapecat.files import flush, replacing
+from shapecat.outputs.colouring import Coloured, with_colour
+from shapecat.outputs.dataset_frames import DatasetImage, Selection, images_of, split_runs
+from shapecat.outputs.exports_coco import DATASETS
 from shapecat.outputs.exports_crops import write_crops
 from shapecat.outputs.exports_kitti import write_kitti
 from shapecat.outputs.exports_labelcloud import write_labelcloud
 from shapecat.outputs.exports_points import write_point_labels
-from shapecat.outputs.rereading import FinishedRun, open_source, read_finished, with_clouds
+from shapecat.outputs.rereading import FinishedRun, open_source, read_finished
 from shapecat.runs.folder import clear, recover, staged
 from shapecat.types import Frame, LabelledFrame
 
-__all__ = ["FORMATS", "export_run"]
+__all__ = ["FORMATS", "export_dataset", "export_run"]
 
-Write = Callable[[Path, Iterable[tuple[LabelledFrame, Frame]], FinishedRun], int]
+Shown = tuple[LabelledFrame, Frame, Coloured | None]
+Write = Callable[[Path, Iterable[Shown], FinishedRun], int]
 Observer = Callable[[str, int, int | None], None]
 
+
+def _clouds(shown: Iterable[Shown]) -> Iterator[tuple[LabelledFrame, Frame]]:
+    return ((labelled, frame) for labelled, frame, _ in shown)
+
+
 FORMATS: dict[str, Write] = {
-    "crops": write_crops,
+    "crops": lambda out, shown, run: write_crops(out, _clouds(shown), run),
     "kitti": write_kitti,
-    "labelcloud": write_labelcloud,
-    "point-labels": write_point_labels,
+    "labelcloud": lambda out, shown, run: write_labelcloud(out, _clouds(shown), run),
+    "point-labels": lambda out, shown, run: write_point_labels(out, _clouds(shown), run),
 }
 _MARK = "export.json"
 
@@ -71,20 +80,83 @@ def export_run(
     total = -(-int(finished.run["counts"]["frames"]) // every)
     with open_source(finished.run, recording) as source:
         chosen = _thinned(finished.frames(), every)
-        pairs = _observed(with_clouds(chosen, source, finished.run), total, observe)
+        triples = with_colour(chosen, source, finished.run, folder)
+        pairs = _observed(triples, total, observe)
         if format == "crops":
-            return write_crops(out, pairs, finished)
-        target = out / finished.name
-        recover(target, _made_by_export)
-        _require_own(target, format)
-        with staged(target, _made_by_export) as hidden:
-            clear(hidden, _made_by_export(hidden) or ())
-            about = {"format": format, "run": finished.run["id"], "input": finished.run["input"]}
-            _mark(hidden, about)
-            count = FORMATS[format](hidden, pairs, finished)
-            for file in hidden.rglob("*"):
-                flush(file)
-            _mark(hidden, {**about, "objects": count})
+            return FORMATS[format](out, pairs, finished)
+        about = {"format": format, "run": finished.run["id"], "input": finished.run["input"]}
+        write = FORMATS[format]
+        return _staged(
+            out / finished.name, format, about, lambda hidden: write(hidden, pairs, finished)
+        )
+
+
+def export_dataset(
+    folders: Sequence[Path],
+    format: str,  # noqa: A002  # the word users know
+    out: Path,
+    selection: Selection,
+    *,
+    recording: Path | None = None,
+    observe: Observer = _ignore,
+) -> int:
+    """Export the images of some runs, with their labels, as one data set.
+
+    ``out`` is replaced only where an earlier export has written it. Images that are damaged are
+    left out.
+
+    Parameters
+    ----------
+    format : ``coco`` or ``yolo``.
+    recording : where the recording of a single run is now; where it was processed by default.
+
+    Returns
+    -------
+    The number of objects to train on, counted in each image.
+
+    Raises
+    ------
+    ValueError : an unknown format.
+    OutputError : not a finished run, one without images, or ``out`` holds something else.
+    RecordingError : a recording is no longer there.
+    """
+    if format not in DATASETS:
+        msg = f"no data set format {format!r}; known: {', '.join(DATASETS)}"
+        raise ValueError(msg)
+    runs = [read_finished(folder) for folder in folders]
+    categories = list(dict.fromkeys(name for run in runs for name in run.categories))
+    total = sum(int(run.run["counts"]["frames"]) for run in runs)
+
+    def images() -> Iterator[tuple[str, FinishedRun, DatasetImage]]:
+        done = 0
+        for split, run in zip(split_runs(runs, selection.val), runs, strict=True):
+            for image in images_of(run, selection, recording):
+                done += 1
+                observe("export", done, total)
+                yield split, run, image
+
+    about = {"format": format, "runs": {run.name: run.run["id"] for run in runs}}
+    return _staged(
+        out, format, about, lambda hidden: DATASETS[format](hidden, images(), categories)
+    )
+
+
+def _staged(
+    target: Path,
+    format: str,  # noqa: A002  # the word users know
+    about: Mapping[str, Any],
+    write: Callable[[Path], int],
+) -> int:
+    """Let ``write`` fill a folder that appears when complete, with the mark of an export."""
+    recover(target, _made_by_export)
+    _require_own(target, format)
+    with staged(target, _made_by_export) as hidden:
+        clear(hidden, _made_by_export(hidden) or ())
+        _mark(hidden, about)
+        count = write(hidden)
+        for file in hidden.rglob("*"):
+            flush(file)
+        _mark(hidden, {**about, "objects": count})
     return count
 
 
@@ -124,9 +196,7 @@ def _thinned(frames: Iterable[LabelledFrame], every: int) -> Iterator[LabelledFr
         seen[frame.topic] += 1
 
 
-def _observed(
-    pairs: Iterable[tuple[LabelledFrame, Frame]], total: int, observe: Observer
-) -> Iterator[tuple[LabelledFrame, Frame]]:
+def _observed(pairs: Iterable[Shown], total: int, observe: Observer) -> Iterator[Shown]:
     for done, pair in enumerate(pairs, start=1):
         yield pair
         observe("export", done, total)

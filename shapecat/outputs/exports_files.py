@@ -39,10 +39,13 @@ def write_pcd(path: Path, points: F4, *, viewpoint: Pose = IDENTITY) -> None:
     path.write_bytes(header.encode("ascii") + np.ascontiguousarray(points, "<f4").tobytes())
 
 
-def png(image: U1 | U2, palette: U1 | None = None, alpha: U1 | None = None) -> bytes:
+def png(
+    image: U1 | U2, palette: U1 | None = None, alpha: U1 | None = None, *, level: int = 9
+) -> bytes:
     """Encode an image (h, w), uint16 grey or uint8 entries of a palette (k, 3), as PNG.
 
-    ``alpha`` (k,) is the opacity of the first entries of the palette.
+    ``alpha`` (k,) is the opacity of the first entries of the palette; ``level`` from 1 to 9 trades
+    time for size.
     """
     height, width = image.shape
     wide = image.dtype == np.uint16
@@ -56,11 +59,19 @@ def png(image: U1 | U2, palette: U1 | None = None, alpha: U1 | None = None) -> b
     if alpha is not None:
         parts.append((b"tRNS", np.ascontiguousarray(alpha, np.uint8).tobytes()))
     pixels = np.concatenate([unfiltered, rows], axis=1).tobytes()
-    parts += [(b"IDAT", zlib.compress(pixels, 9)), (b"IEND", b"")]
+    parts += [(b"IDAT", _compressed(pixels, level)), (b"IEND", b"")]
     return b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
         for name, body in parts
     )
+
+
+def _compressed(data: bytes, level: int) -> bytes:
+    """Compress; at level 1 by runs of equal bytes alone, which masks are made of."""
+    if level > 1:
+        return zlib.compress(data, level)
+    packer = zlib.compressobj(1, strategy=zlib.Z_RLE)
+    return packer.compress(data) + packer.flush()
 
 
 def safe_name(text: str) -> str:

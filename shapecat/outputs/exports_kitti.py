@@ -2,31 +2,46 @@
 
 KITTI boxes turn about the vertical alone, so the rectified camera is a level one: it looks where
 the sensor looks, but along the horizon. ``P2`` turns back to the real camera, so that it maps
-rectified points to the pixels of the depth image. Source: the readme of the KITTI object
-development kit (Geiger 2012).
+rectified points to the pixels of the image in image_2, the colour image without the distortion of
+its lens; to those of the depth image where a frame has no colour image. Source: the readme of the
+KITTI object development kit (Geiger 2012).
 """
 
 import csv
+import logging
 from collections.abc import Iterable
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
+from PIL import Image
 
 from shapecat.arrays import F8
-from shapecat.geometry import rotation_from_quaternion
+from shapecat.colour.projection import project, rectified
+from shapecat.colour_types import LensCamera
+from shapecat.geometry import IDENTITY, rotation_from_quaternion
+from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.exports_files import finite_points, upward
 from shapecat.outputs.rereading import FinishedRun
-from shapecat.types import Frame, LabelledFrame, LabelledObject
+from shapecat.recordings import MessageError
+from shapecat.recordings.colour_image import pixels_of
+from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
 
 __all__ = ["rectified_from_sensor", "write_kitti"]
+
+_log = logging.getLogger(__name__)
 
 _VELO_FROM_RECTIFIED = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 
 
 def write_kitti(
-    out: Path, frames: Iterable[tuple[LabelledFrame, Frame]], _finished: FinishedRun
+    out: Path,
+    frames: Iterable[tuple[LabelledFrame, Frame, Coloured | None]],
+    _finished: FinishedRun,
 ) -> int:
     """Write label_2/, calib/ and velodyne/ with six digits per frame; return how many objects.
+
+    Frames with a colour image have it in image_2/, as PNG without distortion.
 
     ``frames.csv`` tells which frame a number is. Points are in the level frame of the sensor (x
     forward, y left, z up), intensity 0. The type is the category, blanks replaced by ``_``.
@@ -37,12 +52,13 @@ def write_kitti(
     with (out / "frames.csv").open("w", newline="", encoding="utf-8") as file:
         index = csv.writer(file, lineterminator="\n")
         index.writerow(("number", "topic", "frame", "stamp_ns"))
-        for number, (labelled, frame) in enumerate(frames):
+        for number, (labelled, frame, coloured) in enumerate(frames):
+            seen = _write_image(out, number, frame, coloured)
             index.writerow((f"{number:06d}", labelled.topic, labelled.index, labelled.stamp_ns))
             turn = rectified_from_sensor(upward(labelled), optical=_optical(labelled, frame))
-            lines = [_label(item, frame, turn) for item in labelled.objects]
+            lines = [_label(item, frame, turn, seen) for item in labelled.objects]
             (out / "label_2" / f"{number:06d}.txt").write_text("".join(lines), "utf-8")
-            (out / "calib" / f"{number:06d}.txt").write_text(_calibration(frame, turn), "utf-8")
+            (out / "calib" / f"{number:06d}.txt").write_text(_calibration(seen, turn), "utf-8")
             points = finite_points(frame) @ (_VELO_FROM_RECTIFIED @ turn).T
             rows = np.concatenate([points, np.zeros((len(points), 1))], axis=1)
             rows.astype("<f4").tofile(out / "velodyne" / f"{number:06d}.bin")
@@ -68,7 +84,36 @@ def rectified_from_sensor(up: F8, *, optical: bool) -> F8:
     return np.stack([np.cross(-up, forward), -up, forward])
 
 
-def _label(item: LabelledObject, frame: Frame, turn: F8) -> str:
+class _Seen(NamedTuple):
+    """The camera that 2D boxes and P2 are of; no camera for clouds."""
+
+    camera: Camera | None
+    pose: Pose
+    image: bool
+
+
+def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None) -> _Seen:
+    """Write the colour image of a frame, if it has one; return the camera that took it."""
+    own = _Seen(frame.camera, IDENTITY, image=False)
+    if coloured is None or coloured.view.image.height <= 1:
+        return own
+    view = coloured.view
+    lens = view.lens
+    if view.registered and frame.camera is not None:
+        lens = LensCamera(frame.camera)
+    if lens is None:
+        return own
+    try:
+        pixels = rectified(pixels_of(view.image), lens)
+    except MessageError as error:
+        _log.warning("image_2/%06d.png is missing: %s", number, error)
+        return own
+    (out / "image_2").mkdir(exist_ok=True)
+    Image.fromarray(pixels).save(out / "image_2" / f"{number:06d}.png", compress_level=4)
+    return _Seen(lens.pinhole, view.colour_from_depth or IDENTITY, image=True)
+
+
+def _label(item: LabelledObject, frame: Frame, turn: F8, seen: _Seen) -> str:
     """Return a line of 15 values: type truncated occluded alpha bbox h w l x y z rotation_y."""
     length, width, height = map(float, item.box.size)
     x, y, z = turn @ item.box.center
@@ -78,28 +123,34 @@ def _label(item: LabelledObject, frame: Frame, turn: F8) -> str:
     numbers = (
         float(item.touches_border),
         int(item.occluded),
-        *(f"{value:.5f}" for value in (alpha, *_pixels(item, frame))),
+        *(f"{value:.5f}" for value in (alpha, *_pixels(item, frame, seen))),
         *(f"{value:.5f}" for value in (height, width, length, x, y + height / 2, z, yaw)),
     )
     return " ".join([item.category.replace(" ", "_"), *map(str, numbers)]) + "\n"
 
 
-def _pixels(item: LabelledObject, frame: Frame) -> tuple[float, ...]:
+def _pixels(item: LabelledObject, frame: Frame, seen: _Seen) -> tuple[float, ...]:
     """Return left, top, right, bottom in the image; -1 where there is none."""
-    if frame.camera is None or not item.indices.size:
-        return (-1.0, -1.0, -1.0, -1.0)
-    v, u = np.divmod(item.indices.astype(np.int64), frame.camera.width)
+    camera, nowhere = seen.camera, (-1.0, -1.0, -1.0, -1.0)
+    if camera is None or not item.indices.size:
+        return nowhere
+    u, v, _ = project(frame.xyz(item.indices), LensCamera(camera), seen.pose).astype(np.float64).T
+    inside = (u > -0.5) & (u < camera.width - 0.5) & (v > -0.5) & (v < camera.height - 0.5)
+    if not inside.any():
+        return nowhere
+    u, v = np.rint(u[inside]), np.rint(v[inside])
     return (float(u.min()), float(v.min()), float(u.max()), float(v.max()))
 
 
-def _calibration(frame: Frame, turn: F8) -> str:
-    camera = frame.camera
+def _calibration(seen: _Seen, turn: F8) -> str:
+    camera = seen.camera
     intrinsic = np.eye(3)
     if camera is not None:
         intrinsic = np.array(
             [[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]], np.float64
         )
-    projection = np.concatenate([intrinsic @ turn.T, np.zeros((3, 1))], axis=1)
+    rotation, translation = seen.pose.rotation @ turn.T, seen.pose.translation[:, None]
+    projection = intrinsic @ np.concatenate([rotation, translation], axis=1)
     still = np.zeros((3, 1))
     rows = {
         **{f"P{k}": projection for k in range(4)},

@@ -1,7 +1,7 @@
-"""A finished run beside its recording: labelled frames, and the clouds they were made from."""
+"""A finished run, and the recording it was made from."""
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,7 +21,6 @@ __all__ = [
     "find_runs",
     "open_source",
     "read_finished",
-    "with_clouds",
 ]
 
 
@@ -114,23 +113,3 @@ def clouds_again(recording: Recording, run: Mapping[str, Any]) -> Iterator[Frame
     chosen = {name: options[name] for name in ("start_s", "end_s", "every")}
     streams = choose_streams(recording, options["topics"])
     return frames(recording, streams, skipped=Counter(), **chosen)
-
-
-def with_clouds(
-    labelled: Iterable[LabelledFrame], recording: Recording, run: Mapping[str, Any]
-) -> Iterator[tuple[LabelledFrame, Frame]]:
-    """Pair labelled frames, in the order they were read, with their clouds.
-
-    Raises
-    ------
-    OutputError : the recording does not hold one of them any more.
-    """
-    clouds = clouds_again(recording, run)
-    for label in labelled:
-        for frame in clouds:
-            if (label.topic, label.index) == (frame.topic, frame.index):
-                yield label, frame
-                break
-        else:
-            msg = f"{recording.path}: has changed since it was processed; process it again"
-            raise OutputError(msg)

@@ -16,6 +16,10 @@ Entities
             ├── captions       the same labels, drawn above the boxes
             ├── graphs         edges of the growing neural gas
             └── surfaces       its triangles
+    images/<topic>             the colour image, as it was recorded where it was compressed
+    ├── masks                  the pixels of each object, translucent in the colour of the category
+    ├── boxes                  around the masks
+    └── captions               labelled as in 3D
     tracks/<n>/posterior       fused posterior up to each frame, a line per category
     plots/objects/<category>   objects in view
     plots/seconds/<stage>      time spent on each frame
@@ -29,21 +33,27 @@ import json
 import uuid
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import rerun as rr
 
+from shapecat.executors.order import map_ahead
 from shapecat.geometry import transform
 from shapecat.outputs import review_shapes as shapes
+from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.review_cloud import paint
+from shapecat.outputs.review_cloud import PaintedCloud, paint
 from shapecat.outputs.review_curves import At, Curves, times_of
 from shapecat.outputs.review_file import ReviewFile, open_review
+from shapecat.outputs.review_images import Images, Picture, picture_of
 from shapecat.outputs.review_layout import Eye, TrackView, choose_eye, lay_out, stepped_back
 from shapecat.outputs.review_paths import Paths
 from shapecat.outputs.review_shapes import DRAWINGS, Moment
 from shapecat.outputs.review_viewer import open_viewer, take_screenshot
+from shapecat.recordings import MessageError
 from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
 
 __all__ = ["open_viewer", "take_screenshot", "write_review"]
@@ -54,25 +64,28 @@ _DRAWN_AT_ONCE, _POINTS_AT_ONCE = 16, 1 << 19  # frames and points held back of 
 
 def write_review(
     path: Path,
-    frames: Iterable[tuple[LabelledFrame, Frame]],
+    frames: Iterable[tuple[LabelledFrame, Frame, Coloured | None]],
     *,
     name: str,
     run: Mapping[str, object],
     categories: Sequence[str],
     cloud_points: int,
     fixed_frame: str | None,
+    threads: int = 1,
 ) -> None:
     """Write a run as a Rerun recording with its layout embedded.
 
     Parameters
     ----------
     path : the file; it appears when complete and replaces an older one.
-    frames : labelled frames with their points, in the order of the recording.
+    frames : labelled frames with their points, and their colour image if there is one, in the
+        order of the recording.
     name : name of the recording in the viewer.
     run : the contents of run.json; a list under ``warnings`` is also logged.
     categories : in the order of the posteriors.
     cloud_points : about how many points of each cloud to keep; 0 keeps all.
     fixed_frame : name of the frame in which tracks are shown; None for the sensor's own.
+    threads : so many paint ahead.
 
     Raises
     ------
@@ -86,11 +99,12 @@ def write_review(
     stream = _stream(name, run)
     with open_review(path, stream) as file:
         stream.send_recording_name(name)
-        review = _Review(stream, file, categories, cloud_points, fixed_frame)
+        review = _Review(stream, file, categories, fixed_frame)
         review.begin(run)
-        for k, (labelled, frame) in enumerate(frames):
+        painted = map_ahead(partial(_painted, limit=cloud_points), frames, threads=threads)
+        for k, one in enumerate(painted):
             file.check()
-            review.add(labelled, frame)
+            review.add(one)
             if k % _PLOT_FRAMES == _PLOT_FRAMES - 1:
                 review.plot()
             if k % _FLUSH_FRAMES == _FLUSH_FRAMES - 1:
@@ -106,6 +120,29 @@ def _stream(name: str, run: Mapping[str, object]) -> rr.RecordingStream:
     return stream
 
 
+class _Painted(NamedTuple):
+    """A frame ready to be written; ``damage`` is what is wrong with its colour image."""
+
+    labelled: LabelledFrame
+    frame: Frame
+    clouds: tuple[PaintedCloud, PaintedCloud]
+    picture: Picture | None
+    damage: str
+
+
+def _painted(item: tuple[LabelledFrame, Frame, Coloured | None], *, limit: int) -> _Painted:
+    """Paint the clouds and the masks of a frame; without colour if its image is damaged."""
+    labelled, frame, coloured = item
+    damage, parts = "", (labelled.planes, labelled.objects)
+    if coloured is not None:
+        try:
+            clouds = paint(frame, *parts, limit=limit, view=coloured.view)
+            return _Painted(labelled, frame, clouds, picture_of(labelled, coloured), "")
+        except MessageError as error:
+            damage = f"{coloured.view.image.topic}: {error}"
+    return _Painted(labelled, frame, paint(frame, *parts, limit=limit), None, damage)
+
+
 class _Review:
     """Writes frame after frame, and remembers what the layout and the paths need."""
 
@@ -114,13 +151,11 @@ class _Review:
         stream: rr.RecordingStream,
         file: ReviewFile,
         categories: Sequence[str],
-        cloud_points: int,
         fixed_frame: str | None,
     ) -> None:
         self._stream, self._file = stream, file
         self._pending: dict[str, list[Moment]] = {}  # by entity of the sensor
         self._categories = tuple(categories)
-        self._cloud_points = cloud_points
         self._fixed_frame = fixed_frame
         self._eyes: dict[str, Eye] = {}
         self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)  # of what has a fixed place
@@ -129,6 +164,7 @@ class _Review:
         self._aimed: set[str] = set()  # topics whose eye has seen an object
         self._paths = Paths(stream)
         self._curves = Curves(stream)
+        self._images = Images(stream)
         self._counted: dict[str, None] = {}  # categories met, in order
         self._warnings: list[str] = []
 
@@ -143,13 +179,18 @@ class _Review:
         if self._fixed_frame is not None:
             self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
-    def add(self, labelled: LabelledFrame, frame: Frame) -> None:
+    def add(self, painted: _Painted) -> None:
         """Write one frame."""
+        labelled, frame = painted.labelled, painted.frame
         entity = rr.new_entity_path(["world", labelled.topic])
         self._stream.set_time("sensor_time", timestamp=np.datetime64(labelled.stamp_ns, "ns"))
         self._stream.set_time("frame", sequence=labelled.index)
         self._place_sensor(entity, labelled, frame)
-        self._draw(entity, labelled, frame)
+        self._draw(entity, painted)
+        if painted.picture is not None:
+            self._images.add(labelled.topic, painted.picture)
+        if painted.damage:
+            self._log("log", rr.TextLog(painted.damage, level="WARN"))
         self._trace(entity, labelled)
         self._log_events(labelled)
         self._plot(labelled)
@@ -185,18 +226,18 @@ class _Review:
         for track in tracks:
             if track.frames == 1:  # a line of one point is not seen
                 self._log(f"{track.entity}/posterior", self._dots(), static=True)
-        self._stream.send_blueprint(lay_out(scenes or [nothing], tracks))
+        images = self._images.entities
+        self._stream.send_blueprint(lay_out(scenes or [nothing], tracks, images))
         self._file.flush()
 
-    def _draw(self, entity: str, labelled: LabelledFrame, frame: Frame) -> None:
-        """Paint the frame, and hold it back until there are enough of them."""
+    def _draw(self, entity: str, painted: _Painted) -> None:
+        """Hold a painted frame back until there are enough of them."""
         if entity not in self._pending:
             for name, drawing in DRAWINGS.items():
                 if drawing.style is not None:
                     self._log(f"{entity}/{name}", drawing.style, static=True)
         pending = self._pending.setdefault(entity, [])
-        clouds = paint(frame, labelled.planes, labelled.objects, limit=self._cloud_points)
-        pending.append(Moment(labelled, *clouds))
+        pending.append(Moment(painted.labelled, *painted.clouds))
         if len(pending) == _DRAWN_AT_ONCE or sum(m.size for m in pending) > _POINTS_AT_ONCE:
             self._send(entity)
 

@@ -1,12 +1,15 @@
 """The clouds of the review: which points are kept, and how they are coloured."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, U2, U4, Record, array
+from shapecat.colour_types import ColourView
 from shapecat.jit import kernel
 from shapecat.outputs.colours import colour_of
+from shapecat.outputs.review_colour import packed, tinted, true_colours
 from shapecat.types import Frame, LabelledObject, Plane
 
 __all__ = ["PaintedCloud", "paint"]
@@ -29,14 +32,23 @@ class PaintedCloud(Record):
 
 
 def paint(
-    frame: Frame, planes: Sequence[Plane], objects: Sequence[LabelledObject], *, limit: int
+    frame: Frame,
+    planes: Sequence[Plane],
+    objects: Sequence[LabelledObject],
+    *,
+    limit: int,
+    view: ColourView | None = None,
 ) -> tuple[PaintedCloud, PaintedCloud]:
     """Return the scene and the points on objects, together about ``limit`` points (0: all).
 
     Images are thinned on a grid of pixels, clouds by taking every k-th point; objects keep a
     finer grid, up to half of the points. Points of an object have the colour of its category,
     those of a plane a muted one, the others are grey; images are shaded as if lit from above the
-    camera.
+    camera. What a colour camera sees has its true colours, on objects tinted by the category.
+
+    Raises
+    ------
+    MessageError : the colour image is damaged.
     """
     owner = _owners(frame, objects)
     fine, near = _thin(frame, owner, limit // 2)
@@ -45,7 +57,17 @@ def paint(
     own = np.array([colour_of(o.category) for o in objects], np.uint8).reshape(-1, 3)
     palette = np.concatenate([_GROUND[None], own, _PLANES])
     labelled = _painted(frame, near, owner[near], palette, (), fine)
-    return _painted(frame, far, owner[far], palette, planes, coarse), labelled
+    rest = _painted(frame, far, owner[far], palette, planes, coarse)
+    if view is None:
+        return rest, labelled
+    points = np.concatenate([rest.points, labelled.points])
+    colours, known = true_colours(frame, view, points, np.concatenate([far, near]), fine)
+    n = far.size
+    mixed = tinted(colours[n:], palette[owner[near]])
+    return (
+        replace(rest, colours=packed(colours[:n], known[:n], rest.colours)),
+        replace(labelled, colours=packed(mixed, known[n:], labelled.colours)),
+    )
 
 
 def _painted(

@@ -1,7 +1,8 @@
 """The layout of the review: which views it opens with, and where the eye stands."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import rerun.blueprint as rrb
@@ -88,18 +89,29 @@ def _subject(labelled: LabelledFrame, frame: Frame, pose: Pose) -> tuple[F8, flo
     return transform(pose, (low + high) / 2), float(np.linalg.norm(high - low) / 2)
 
 
-def lay_out(scenes: Sequence[tuple[str, str, Eye]], tracks: Sequence[TrackView]) -> rrb.Blueprint:
-    """Return the blueprint: 3D on the left; tracks, plots and texts on the right.
+def lay_out(
+    scenes: Sequence[tuple[str, str, Eye]],
+    tracks: Sequence[TrackView],
+    images: Mapping[str, str] | None = None,
+) -> rrb.Blueprint:
+    """Return the blueprint: 3D and colour on the left; tracks, plots and texts on the right.
 
     Parameters
     ----------
     scenes : entity, title and eye of each 3D view.
     tracks : all tracks, in order of birth.
+    images : title of each colour image by its entity.
     """
-    views = [_scene_view(*scene) for scene in scenes]
+    left = _one_of([_scene_view(*scene) for scene in scenes])
+    if images:
+        pictures = [
+            rrb.Spatial2DView(origin=entity, name=title, background=_BACKGROUND)
+            for entity, title in images.items()
+        ]
+        left = rrb.Vertical(left, _one_of(pictures), row_shares=[5, 4])
     return rrb.Blueprint(
         rrb.Horizontal(
-            views[0] if len(views) == 1 else rrb.Tabs(*views),
+            left,
             rrb.Vertical(
                 _track_tabs(tracks),
                 rrb.Tabs(
@@ -124,6 +136,10 @@ def lay_out(scenes: Sequence[tuple[str, str, Eye]], tracks: Sequence[TrackView])
         auto_views=False,
         auto_layout=False,
     )
+
+
+def _one_of(views: Sequence[Any]) -> Any:
+    return views[0] if len(views) == 1 else rrb.Tabs(*views)
 
 
 def _scene_view(entity: str, title: str, eye: Eye) -> rrb.Spatial3DView:

@@ -17,7 +17,7 @@ from shapecat.outputs.annotation import (
     text_position,
 )
 from shapecat.outputs.colours import colour_of
-from shapecat.types import ShownBox, ShownFrame
+from shapecat.types import ShownBox
 
 __all__ = ["ArrayMessage", "RosMessages"]
 
@@ -70,6 +70,17 @@ class RosMessages:
     def definition(self, name: str) -> bytes:
         """Return the definition to embed: that of the store that encodes."""
         return _definition(self.ros1, name)
+
+    def make(self, kind: str, *values: Any) -> Any:
+        """Make a message of a type without its package; a header of what has a stamp and frame."""
+        if kind == "Header":
+            return self._header(*values)
+        return self._types[kind](*values)
+
+    def no_pose(self) -> Any:
+        """Return a pose that says nothing."""
+        pose = self._types["Pose"](self._types["Point"](0.0, 0.0, 0.0), self._upright)
+        return self._types["PoseWithCovariance"](pose, self._no_covariance)
 
     def serialize(self, message: Any, name: str) -> bytes:
         """Encode a message."""
@@ -184,7 +195,7 @@ class RosMessages:
     def _duration(self, lifetime_ns: int) -> Any:
         return self._types["Duration"](*divmod(lifetime_ns, 10**9))
 
-    def _header(self, frame: ShownFrame) -> Any:
+    def _header(self, frame: Any) -> Any:
         values = (self._time(frame.stamp_ns), frame.frame_id)
         return self._types["Header"](*((0, *values) if self.ros1 else values))
 
@@ -209,6 +220,8 @@ def _typestore(ros1: bool) -> Typestore:  # noqa: FBT001  # a cache key
         "Detection3DArray": "vision_msgs/msg/Detection3DArray",
         "SceneUpdate": "foxglove_msgs/msg/SceneUpdate",
         "MarkerArray": "visualization_msgs/msg/MarkerArray",
+        "Detection2DArray": "vision_msgs/msg/Detection2DArray",
+        "ImageAnnotations": "foxglove_msgs/msg/ImageAnnotations",
     }
     known = dict(get_typestore(Stores.ROS1_NOETIC).fielddefs) if ros1 else {}
     for file, name in names.items():

@@ -1,4 +1,4 @@
-"""foxglove.SceneUpdate as Protocol Buffers, from the definition in `shapecat.schemas`."""
+"""Foxglove's messages as Protocol Buffers, from the definitions in `shapecat.schemas`."""
 
 import re
 from functools import cache
@@ -7,7 +7,9 @@ from typing import Any
 
 from shapecat.recordings.protobuf import ProtobufField, encode_message
 
-__all__ = ["encode_scene", "scene_descriptors"]
+__all__ = ["descriptors_of", "encode_foxglove", "encode_scene", "scene_descriptors"]
+
+_SCENE = "foxglove.SceneUpdate"
 
 _KINDS = {"double": 1, "bool": 8, "string": 9, "int32": 5, "int64": 3}
 _MESSAGE, _ENUM = 11, 14
@@ -24,21 +26,28 @@ Messages = dict[str, dict[int, ProtobufField]]
 
 def encode_scene(scene: dict[str, Any]) -> bytes:
     """Encode a SceneUpdate of plain values; times have ``seconds`` and ``nanos``."""
-    return encode_message(scene, "foxglove.SceneUpdate", _messages())
+    return encode_foxglove(scene, _SCENE)
+
+
+def encode_foxglove(values: dict[str, Any], name: str) -> bytes:
+    """Encode a message of plain values: ``foxglove.SceneUpdate`` or ``ImageAnnotations``."""
+    return encode_message(values, name, _messages(name))
 
 
 @cache
-def _blocks() -> dict[str, str]:
-    """Return the text of each message by its full name."""
-    text = files("shapecat.schemas").joinpath("SceneUpdate.proto").read_text("utf-8")
+def _blocks(whole: str) -> dict[str, str]:
+    """Return the text of each message in the file of one by its full name."""
+    file = f"{whole.rpartition('.')[2]}.proto"
+    text = files("shapecat.schemas").joinpath(file).read_text("utf-8")
     own = {f"foxglove.{name}": body for name, body in _BLOCK.findall(text)}
-    return own | {name: "\n".join(lines) for name, lines in _GOOGLE.items()}
+    used = {name: lines for name, lines in _GOOGLE.items() if name in text}
+    return own | {name: "\n".join(lines) for name, lines in used.items()}
 
 
 @cache
-def _messages() -> Messages:
+def _messages(whole: str) -> Messages:
     """Return the fields of each message by number."""
-    return {name: _fields(body, name) for name, body in _blocks().items()}
+    return {name: _fields(body, name) for name, body in _blocks(whole).items()}
 
 
 def _fields(body: str, owner: str) -> dict[int, ProtobufField]:
@@ -55,30 +64,40 @@ def _fields(body: str, owner: str) -> dict[int, ProtobufField]:
     return fields
 
 
-@cache
 def scene_descriptors() -> bytes:
     """Return the FileDescriptorSet of foxglove.SceneUpdate, as MCAP embeds it."""
-    google = {name: f"google/protobuf/{name.rsplit('.', 1)[1].lower()}.proto" for name in _GOOGLE}
+    return descriptors_of(_SCENE)
+
+
+@cache
+def descriptors_of(whole: str) -> bytes:
+    """Return the FileDescriptorSet of a message, as MCAP embeds it."""
+    blocks = _blocks(whole)
+    google = {
+        name: f"google/protobuf/{name.rsplit('.', 1)[1].lower()}.proto"
+        for name in _GOOGLE
+        if name in blocks
+    }
     described = [
         {
             "name": file,
             "package": "google.protobuf",
-            "message_type": [_describe(name)],
+            "message_type": [_describe(name, whole)],
             "syntax": "proto3",
         }
         for name, file in google.items()
     ]
     own = {
-        "name": "foxglove/SceneUpdate.proto",
+        "name": f"{whole.replace('.', '/')}.proto",
         "package": "foxglove",
         "dependency": list(google.values()),
-        "message_type": [_describe(name) for name in _blocks() if name not in google],
+        "message_type": [_describe(name, whole) for name in blocks if name not in google],
         "syntax": "proto3",
     }
     return encode_message({"file": [*described, own]}, "set", _DESCRIPTOR)
 
 
-def _describe(name: str) -> dict[str, Any]:
+def _describe(name: str, whole: str) -> dict[str, Any]:
     fields = [
         {
             "name": field.name,
@@ -87,7 +106,7 @@ def _describe(name: str) -> dict[str, Any]:
             "type": field.kind,
             "type_name": f".{field.message}" if field.message else "",
         }
-        for number, field in _messages()[name].items()
+        for number, field in _messages(whole)[name].items()
     ]
     enums = [
         {
@@ -97,7 +116,7 @@ def _describe(name: str) -> dict[str, Any]:
                 for key, value in re.findall(r"(\w+) = (\d+);", values)
             ],
         }
-        for enum, values in _ENUM_LINE.findall(_blocks()[name])
+        for enum, values in _ENUM_LINE.findall(_blocks(whole)[name])
     ]
     return {"name": name.rsplit(".", 1)[1], "field": fields, "enum_type": enums}
 

@@ -15,6 +15,7 @@ __all__ = ["FOXGLOVE_TYPES", "as_ros", "ros_counterpart"]
 FOXGLOVE_TYPES = {
     "foxglove.PointCloud": "sensor_msgs/msg/PointCloud2",
     "foxglove.RawImage": "sensor_msgs/msg/Image",
+    "foxglove.CompressedImage": "sensor_msgs/msg/CompressedImage",
     "foxglove.CameraCalibration": "sensor_msgs/msg/CameraInfo",
     "foxglove.FrameTransform": "tf2_msgs/msg/TFMessage",
     "foxglove.FrameTransforms": "tf2_msgs/msg/TFMessage",
@@ -113,6 +114,12 @@ def _image(message: Any) -> Any:
     )
 
 
+def _compressed(message: Any) -> Any:
+    return SimpleNamespace(
+        header=_header(message), format=str(message.format), data=_bytes(message.data)
+    )
+
+
 def _calibration(message: Any) -> Any:
     matrices = {
         name: np.array(getattr(message, name, getattr(message, name.upper(), ())), np.float64)
@@ -151,6 +158,7 @@ def _transforms(message: Any) -> Any:
 _CONVERSIONS: dict[str, Callable[[Any], Any]] = {
     "foxglove.PointCloud": _cloud,
     "foxglove.RawImage": _image,
+    "foxglove.CompressedImage": _compressed,
     "foxglove.CameraCalibration": _calibration,
     "foxglove.FrameTransform": _transforms,
     "foxglove.FrameTransforms": _transforms,

@@ -1,8 +1,9 @@
 """The readings of a depth sensor, frame by frame."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
+from shapecat.recordings.messages import Message
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.sources import SOURCES, DepthSource, Source
 from shapecat.recordings.streams import Stream
@@ -19,6 +20,7 @@ def frames(
     end_s: float | None = None,
     every: int = 1,
     skipped: Counter[str],
+    heard: Mapping[str, Callable[[Message], None]] | None = None,
 ) -> Iterator[Frame]:
     """Read the frames of some streams in flat memory.
 
@@ -30,6 +32,7 @@ def frames(
     start_s, end_s : seconds of log time from the start of the recording.
     every : keep each so-many-th frame of a stream.
     skipped : frames that cannot be read are counted here by reason; they never raise.
+    heard : is told of the messages of other topics as they pass, so that they are read only once.
 
     Yields
     ------
@@ -50,7 +53,10 @@ def frames(
         if isinstance(source, DepthSource):
             infos.setdefault(source.info_topic, []).append(source)
     limits = [None if s is None else recording.start_ns + round(s * 1e9) for s in (start_s, end_s)]
-    for message in recording.messages({*sources, *infos}, *limits):
+    heard = heard or {}
+    for message in recording.messages({*sources, *infos, *heard}, *limits):
+        if message.topic in heard:
+            heard[message.topic](message)
         for depth in infos.get(message.topic, ()):
             yield from depth.calibrate(message, skipped)
         chosen = sources.get(message.topic)

@@ -1,11 +1,14 @@
 """What a recording holds, in plain values: for people and programs that look before they work."""
 
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from shapecat.files import input_size
+from shapecat.recordings.colour_streams import choose_colour
 from shapecat.recordings.opening import open_recording
-from shapecat.recordings.streams import cloud_streams
+from shapecat.recordings.recording import Recording
+from shapecat.recordings.streams import Stream, cloud_streams
 
 __all__ = ["describe_recording"]
 
@@ -19,7 +22,7 @@ def describe_recording(path: Path) -> dict[str, Any]:
     """
     with open_recording(path) as recording:
         streams = {stream.topic: stream for stream in cloud_streams(recording)}
-        infos = {stream.info_topic for stream in streams.values()}
+        uses = _uses(recording, streams)
         start, end = recording.start_ns, recording.end_ns
         return {
             "path": str(path),
@@ -33,13 +36,26 @@ def describe_recording(path: Path) -> dict[str, Any]:
                     "type": topic.type,
                     "encoding": topic.encoding,
                     "count": topic.count,
-                    "use": f"{streams[topic.name].kind} stream"
-                    if topic.name in streams
-                    else "camera"
-                    if topic.name in infos
-                    else "",
+                    "use": uses.get(topic.name, ""),
                 }
                 for topic in recording.topics
             ],
             "warnings": list(recording.warnings),
         }
+
+
+def _uses(recording: Recording, streams: Mapping[str, Stream]) -> dict[str, str]:
+    """Return what topics are used for."""
+    uses = {stream.info_topic: "camera" for stream in streams.values() if stream.info_topic}
+    for topic, stream in streams.items():
+        uses[topic] = f"{stream.kind} stream"
+        colour = choose_colour(recording, stream)
+        if colour is None:
+            continue
+        if colour.kind == "cloud":
+            uses[topic] += " with colours"
+            continue
+        uses[colour.topic] = f"colour of {topic}"
+        if colour.info_topic:
+            uses.setdefault(colour.info_topic, "camera")
+    return uses

@@ -13,7 +13,17 @@ from shapecat.recordings.foxglove import ros_counterpart
 from shapecat.recordings.messages import MessageError, Topic
 from shapecat.recordings.recording import Recording
 
-__all__ = ["CLOUD", "COMPRESSED", "IMAGE", "INFO", "Stream", "choose_streams", "cloud_streams"]
+__all__ = [
+    "CLOUD",
+    "COMPRESSED",
+    "IMAGE",
+    "INFO",
+    "Stream",
+    "choose_streams",
+    "cloud_streams",
+    "first_message",
+    "info_topic_of",
+]
 
 CLOUD = "sensor_msgs/msg/PointCloud2"
 IMAGE = "sensor_msgs/msg/Image"
@@ -62,7 +72,7 @@ def cloud_streams(recording: Recording) -> tuple[Stream, ...]:
     for topic in recording.topics:
         probe = _PROBES.get(ros_counterpart(topic.type))
         if probe is not None and topic.count != 0:
-            first = _first(recording, topic)
+            first = first_message(recording, topic)
             with suppress(AttributeError):  # a definition without the fields of its type
                 streams.append(probe(topic, first, infos))
     return tuple(stream for stream in streams if stream is not None)
@@ -157,7 +167,7 @@ def _rank(stream: Stream) -> tuple[int, int, int, str]:
     return (stream.kind != "depth", aligned, -(stream.count or 0), stream.topic)
 
 
-def _first(recording: Recording, topic: Topic) -> Any:
+def first_message(recording: Recording, topic: Topic) -> Any:
     """Decode the first message of a topic that can be decoded; None if none can."""
     same = (m for m in recording.messages([topic.name]) if m.type == topic.type)
     for message in islice(same, _PEEK):
@@ -191,12 +201,12 @@ def _probe_compressed(topic: Topic, first: Any, infos: list[str]) -> Stream | No
 
 
 def _depth_stream(topic: Topic, first: Any, infos: list[str], encoding: str) -> Stream:
-    info = _info_topic(topic.name, infos)
+    info = info_topic_of(topic.name, infos)
     frame_id = first.header.frame_id
     return Stream(topic.name, topic.type, "depth", info, topic.count, frame_id, encoding)
 
 
-def _info_topic(image: str, infos: list[str]) -> str | None:
+def info_topic_of(image: str, infos: list[str]) -> str | None:
     """Return the calibration nearest to an image: the one that shares most of its path."""
     parts = image.split("/")[:-1]
     for length in range(len(parts), 1, -1):

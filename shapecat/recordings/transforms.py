@@ -273,13 +273,20 @@ def fixed_frame(buffer: TransformBuffer, frame_id: str) -> str | None:
     return root if root != frame_id.lstrip("/") else None
 
 
-def read_transforms(recording: Recording, *, tolerance_ns: int = 100_000_000) -> TransformBuffer:
-    """Read every transform of a recording in one pass.
+def read_transforms(
+    recording: Recording, *, tolerance_ns: int = 100_000_000, static_only: bool = False
+) -> TransformBuffer:
+    """Read every transform of a recording in one pass, or the static ones, which are few.
 
     A topic whose name ends in ``tf_static`` holds static transforms.
     """
     buffer = TransformBuffer(tolerance_ns=tolerance_ns)
-    topics = {topic.name for topic in recording.topics if ros_counterpart(topic.type) in TF_TYPES}
+    topics = {
+        topic.name
+        for topic in recording.topics
+        if ros_counterpart(topic.type) in TF_TYPES
+        and (topic.name.endswith("tf_static") or not static_only)
+    }
     refused = 0
     for message in recording.messages(topics) if topics else ():
         if ros_counterpart(message.type) not in TF_TYPES:

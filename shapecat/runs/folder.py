@@ -32,7 +32,7 @@ __all__ = [
 
 OUTPUTS = ("annotated.mcap", "review.rrd")
 RUN_FILES = (
-    *(f"{name}.parquet" for name in ("frames", "detections", "planes", "tracks")),
+    *(f"{name}.parquet" for name in ("frames", "detections", "planes", "tracks", "masks")),
     *("tracks.csv", "tracks.original.csv", "tracks.previous.csv", "report.html"),
     *OUTPUTS,
     "run.json",

@@ -29,7 +29,7 @@ __all__ = [
 ]
 
 _BLOCK = 1 << 20
-_OUTPUTS = ("mcap", "rrd")
+_OUTPUTS = ("color", "mcap", "rrd")
 
 Stats = list[list[Any]]
 """Per file: name, bytes, and the times of its content and its inode in nanoseconds."""

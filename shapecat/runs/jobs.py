@@ -50,7 +50,8 @@ class Job:
     ``folder`` is where the results go, ``DIR/NAME``; ``origin`` the URL that ``source`` was
     downloaded from, ``target`` the one that the results are uploaded to, if any; ``start_s``
     and ``end_s`` count from the start of the recording; ``up`` is ``auto``, ``tf``, ``imu``, or a
-    vector ``X,Y,Z`` in the sensor frame.
+    vector ``X,Y,Z`` in the sensor frame; ``color`` is the topic of colour images, None for those
+    that belong to the depth stream, empty for none.
     """
 
     source: Path
@@ -63,6 +64,7 @@ class Job:
     end_s: float | None = None
     every: int = 1
     model: Path | None = None
+    color: str | None = None
     mcap: bool = True
     rrd: bool = True
     overwrite: bool = False
@@ -77,7 +79,7 @@ class Job:
 
     def selection(self) -> dict[str, Any]:
         """Return the options that decide what the tables hold, as stored in run.json."""
-        names = ("topics", "up", "fixed_frame", "start_s", "end_s", "every", "mcap", "rrd")
+        names = ("topics", "up", "fixed_frame", "start_s", "end_s", "every", "color", "mcap", "rrd")
         values = {name: getattr(self, name) for name in names}
         return {**values, "topics": list(self.topics)}
 

@@ -111,6 +111,7 @@ def _labelled_object(row: Mapping[str, Any], causal: F4, label: TrackLabel) -> L
         height_m=row["height_m"],
         touches_border=row["touches_border"],
         occluded=row["occluded"],
+        detections=(row["detection"],),
     )
 
 
@@ -133,4 +134,5 @@ def _join(parts: Sequence[LabelledObject], up: Sequence[float]) -> LabelledObjec
         height_m=float(np.dot(up, box.center)) - min(bottoms),
         touches_border=any(part.touches_border for part in parts),
         occluded=any(part.occluded for part in parts),
+        detections=tuple(number for part in parts for number in part.detections),
     )

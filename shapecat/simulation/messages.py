@@ -79,11 +79,22 @@ class MessageFactory:
             is_dense=False,
         )
 
-    def camera_info(self, camera: Camera, stamp_ns: int, frame_id: str) -> Any:
-        """Return sensor_msgs/CameraInfo without distortion."""
+    def compressed(self, data: bytes, stamp_ns: int, frame_id: str) -> Any:
+        """Return sensor_msgs/CompressedImage of a JPEG file."""
+        return self._make(
+            "sensor_msgs/msg/CompressedImage",
+            header=self._header(stamp_ns, frame_id),
+            format="rgb8; jpeg compressed bgr8",
+            data=np.frombuffer(data, np.uint8),
+        )
+
+    def camera_info(
+        self, camera: Camera, stamp_ns: int, frame_id: str, distortion: Sequence[float] = ()
+    ) -> Any:
+        """Return sensor_msgs/CameraInfo, without distortion or with that of ``plumb_bob``."""
         k = [camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1]
         p = [camera.fx, 0, camera.cx, 0, 0, camera.fy, camera.cy, 0, 0, 0, 1, 0]
-        matrices = {"d": [0] * _DISTORTION, "k": k, "r": np.eye(3).ravel(), "p": p}
+        matrices = {"d": [*distortion] or [0] * _DISTORTION, "k": k, "r": np.eye(3).ravel(), "p": p}
         if self.ros_version == 1:
             matrices = {name.upper(): value for name, value in matrices.items()}
         return self._make(

@@ -4,6 +4,7 @@ import json
 import tempfile
 import zipfile
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any, Literal, Self
@@ -13,13 +14,14 @@ import numpy as np
 from shapecat.arrays import U1
 from shapecat.errors import OutputError
 from shapecat.files import flush
+from shapecat.simulation.colour_camera import COLOUR, jpeg, render_colour
 from shapecat.simulation.containers import CONTAINERS, Container
 from shapecat.simulation.scenes import SceneKind, make_scene
 from shapecat.simulation.sensors import SENSORS, Sensor
 from shapecat.simulation.truth import LINK_FROM_OPTICAL, frame_truth, robot_links
 from shapecat.simulation.views import render_frame
 from shapecat.simulation.worlds import World
-from shapecat.types import Frame
+from shapecat.types import Camera, Frame
 
 __all__ = ["EPOCH_NS", "record", "simulate", "written_paths"]
 
@@ -28,6 +30,7 @@ EPOCH_NS = 1_700_200_000_000_000_000
 
 _LATENCY_NS = 12_000_000
 _OPTICAL = "camera_depth_optical_frame"
+_COLOUR_OPTICAL = "camera_color_optical_frame"
 
 
 def _ignore(phase: str, done: int, total: int | None) -> None:
@@ -43,6 +46,7 @@ def simulate(
     seed: int = 0,
     sensor: Literal["kinect", "realsense", "ideal"] = "kinect",
     clouds: bool = False,
+    color: bool = False,
     rate_hz: float = 30.0,
     observe: Callable[[str, int, int | None], None] = _ignore,
 ) -> Path:
@@ -57,6 +61,9 @@ def simulate(
     ----------
     out : path of the recording; the suffix of the format is added if it has none.
     clouds : write organized point clouds instead of depth images.
+    color : also write the images of a colour camera beside the depth camera:
+        /camera/color/image_raw/compressed (JPEG), /camera/color/camera_info, its place in
+        /tf_static; ``NAME.color_labels.npz`` says whose each of its pixels is.
     observe : told the phase, the frames done, and how many there are.
 
     Returns
@@ -79,6 +86,7 @@ def simulate(
         seed=seed,
         sensor=SENSORS[sensor],
         clouds=clouds,
+        color=color,
         rate_hz=rate_hz,
         observe=observe,
     )
@@ -92,6 +100,7 @@ def record(
     sensor: Sensor,
     format: Literal["mcap", "ros1", "ros2"] = "mcap",  # noqa: A002  # the word users know
     clouds: bool = False,
+    color: bool = False,
     rate_hz: float = 30.0,
     observe: Callable[[str, int, int | None], None] = _ignore,
 ) -> Path:
@@ -103,21 +112,28 @@ def record(
         msg = f"no recording format {format!r}; known: {', '.join(CONTAINERS)}"
         raise ValueError(msg)
     _, container = CONTAINERS[format]
-    paths = written_paths(out, format)
+    paths = written_paths(out, format, color=color)
     out = paths[0]
     try:
         out.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(dir=out.parent, prefix=".simulated-") as hidden:
-            recording, truth, labels = (Path(hidden) / path.name for path in paths)
-            with container(recording) as writer, _LabelFile(labels, len(world), sensor) as pixels:
+            recording, truth, *labels = (Path(hidden) / path.name for path in paths)
+            with container(recording) as writer, ExitStack() as stack:
+                cameras = (sensor.camera, COLOUR.lens.pinhole)
+                files = [
+                    stack.enter_context(_LabelFile(path, len(world), camera))
+                    for path, camera in zip(labels, cameras, strict=False)
+                ]
                 found = []
                 for index in range(len(world)):
                     rng = np.random.default_rng((seed, index))
                     frame, image = render_frame(
                         world, index, rng=rng, sensor=sensor, rate_hz=rate_hz, start_ns=EPOCH_NS
                     )
-                    _write_frame(writer, world, frame, clouds=clouds)
-                    pixels.append(image)
+                    _write_frame(writer, world, frame, clouds=clouds, color=color)
+                    files[0].append(image)
+                    if color:
+                        files[1].append(_write_colour(writer, world, frame))
                     found.append(_truth(world, frame, image, sensor, seed))
                     observe("simulate", index + 1, len(world))
             truth.write_text("[" + ",\n".join(map(json.dumps, found)) + "]\n", "utf-8")
@@ -129,13 +145,16 @@ def record(
     return out
 
 
-def _write_frame(writer: Container, world: World, frame: Frame, *, clouds: bool) -> None:
+def _write_frame(
+    writer: Container, world: World, frame: Frame, *, clouds: bool, color: bool
+) -> None:
     make, stamp, depth, camera = writer.messages, frame.stamp_ns, frame.depth, frame.camera
     if depth is None or camera is None:
         msg = "a simulated frame is a depth image"
         raise ValueError(msg)
     if frame.index == 0:
         still = [("camera_link", _OPTICAL, LINK_FROM_OPTICAL)]
+        still += [(_OPTICAL, _COLOUR_OPTICAL, COLOUR.depth_from_colour)] if color else []
         writer.write("/tf_static", make.transforms(still, stamp), stamp)
     links = robot_links(world.path[frame.index])
     writer.write("/tf", make.transforms(links, stamp), stamp + _LATENCY_NS // 4)
@@ -149,6 +168,18 @@ def _write_frame(writer: Container, world: World, frame: Frame, *, clouds: bool)
         writer.write("/camera/depth/points", make.cloud(points, stamp, _OPTICAL), logged)
     else:
         writer.write("/camera/depth/image_raw", make.image(depth, stamp, _OPTICAL), logged)
+
+
+def _write_colour(writer: Container, world: World, frame: Frame) -> U1:
+    """Write the colour image of a frame; return whose its pixels are."""
+    make, stamp = writer.messages, frame.stamp_ns
+    colours, labels = render_colour(world, frame.index)
+    lens, logged = COLOUR.lens, stamp + _LATENCY_NS + _LATENCY_NS // 2
+    info = make.camera_info(lens.pinhole, stamp, _COLOUR_OPTICAL, lens.coefficients)
+    writer.write("/camera/color/camera_info", info, logged)
+    image = make.compressed(jpeg(colours, COLOUR.quality), stamp, _COLOUR_OPTICAL)
+    writer.write("/camera/color/image_raw/compressed", image, logged)
+    return labels
 
 
 def _truth(world: World, frame: Frame, labels: U1, sensor: Sensor, seed: int) -> dict[str, Any]:
@@ -167,13 +198,13 @@ def _truth(world: World, frame: Frame, labels: U1, sensor: Sensor, seed: int) ->
 class _LabelFile:
     """``labels`` (t, h, w) uint8 in a compressed .npz, written frame by frame."""
 
-    def __init__(self, path: Path, frames: int, sensor: Sensor) -> None:
+    def __init__(self, path: Path, frames: int, camera: Camera) -> None:
         self._archive = zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=4)
         # A fixed date: the same labels are the same bytes.
         member = zipfile.ZipInfo("labels.npy")
         member.compress_type = zipfile.ZIP_DEFLATED
         self._file: IO[bytes] = self._archive.open(member, "w", force_zip64=True)
-        shape = (frames, sensor.camera.height, sensor.camera.width)
+        shape = (frames, camera.height, camera.width)
         header = {"descr": "|u1", "fortran_order": False, "shape": shape}
         np.lib.format.write_array_header_1_0(self._file, header)
 
@@ -189,11 +220,12 @@ class _LabelFile:
         self._file.write(np.ascontiguousarray(labels).tobytes())
 
 
-def written_paths(out: Path, format: str) -> list[Path]:  # noqa: A002  the word users know
+def written_paths(out: Path, format: str, *, color: bool = False) -> list[Path]:  # noqa: A002  the word users know
     """Return what `simulate` writes: the recording, the truth, and the labels."""
     suffix, _ = CONTAINERS[format]
     out = out if out.suffix or not suffix else out.with_name(out.name + suffix)
-    names = (out.name, f"{out.stem}.truth.json", f"{out.stem}.labels.npz")
+    names = [out.name, f"{out.stem}.truth.json", f"{out.stem}.labels.npz"]
+    names += [f"{out.stem}.color_labels.npz"] if color else []
     return [out.with_name(name) for name in names]
 
 

@@ -1,0 +1,138 @@
+"""Outlines of masks as polygons."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from shapecat.arrays import F8, I4, Bool
+from shapecat.colour.masks import Mask
+from shapecat.jit import kernel
+
+__all__ = ["joined", "outlines"]
+
+_TOLERANCE_PX = 0.75
+"""Corners that stick out no farther are left out: the steps of slanted edges do by 0.71."""
+
+
+def outlines(mask: Mask, tolerance_px: float = _TOLERANCE_PX) -> list[F8]:
+    """Return the outer outlines of the parts of a mask, the largest first.
+
+    Holes are not outlined; parts that touch by a corner alone are two.
+
+    Parameters
+    ----------
+    tolerance_px : so far an outline may be from the border of the pixels.
+
+    Returns
+    -------
+    (n, 2) columns and rows of at least three corners each, in the image; the first pixel is
+    between 0 and 1.
+
+    Examples
+    --------
+    >>> outlines(Mask(5, 7, np.ones((2, 3), bool)))[0].tolist()
+    [[5.0, 7.0], [8.0, 7.0], [8.0, 9.0], [5.0, 9.0]]
+    """
+    inside = np.pad(mask.pixels, 1)
+    corners = np.zeros((4 * inside.size + 4, 2), np.int64)
+    ends = np.zeros(inside.size + 1, np.int64)
+    count = _trace(inside, corners, ends)
+    rings = np.split(corners[: ends[count - 1]] if count else corners[:0], ends[: count - 1])
+    found = [ring for ring in rings if len(ring) and _area(ring) > 0]
+    found.sort(key=_area, reverse=True)
+    offset = np.array([mask.left - 1, mask.top - 1])
+    return [_simplified(ring.astype(np.float64), tolerance_px) + offset for ring in found]
+
+
+def joined(rings: Sequence[F8]) -> F8:
+    """Return one polygon of several, for formats that know no parts: linked there and back.
+
+    Source: as converters of COCO data sets do, by the nearest corners.
+    """
+    whole = rings[0]
+    for ring in rings[1:]:
+        apart = ((whole[:, None] - ring[None]) ** 2).sum(axis=-1)
+        i, j = np.unravel_index(int(apart.argmin()), apart.shape)
+        around = np.concatenate([ring[j:], ring[: j + 1]])
+        whole = np.concatenate([whole[: i + 1], around, whole[i:]])
+    return whole
+
+
+def _area(ring: F8) -> float:
+    """Return the area inside of corners that go clockwise on the image; negative for holes."""
+    x, y = ring.T
+    return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2
+
+
+def _simplified(ring: F8, tolerance: float) -> F8:
+    """Leave out corners of a closed line (Douglas and Peucker 1973)."""
+    far = int(((ring - ring[0]) ** 2).sum(axis=1).argmax())
+    closed = np.concatenate([ring, ring[:1]])
+    keep = np.zeros(len(closed), np.bool_)
+    keep[[0, far, -1]] = True
+    _keep_far(closed, 0, far, tolerance, keep)
+    _keep_far(closed, far, len(closed) - 1, tolerance, keep)
+    found = closed[:-1][keep[:-1]]
+    return found if len(found) >= 3 else ring
+
+
+@kernel
+def _keep_far(line: F8, first: int, last: int, tolerance: float, keep: Bool) -> None:
+    """Mark the corners between two that a straight line would miss by more than the tolerance."""
+    stack = [(first, last)]
+    while len(stack) > 0:
+        a, b = stack.pop()
+        dx, dy = line[b, 0] - line[a, 0], line[b, 1] - line[a, 1]
+        length = np.sqrt(dx * dx + dy * dy)
+        worst, at = tolerance, -1
+        for i in range(a + 1, b):
+            ex, ey = line[i, 0] - line[a, 0], line[i, 1] - line[a, 1]
+            apart = abs(dx * ey - dy * ex) / length if length > 0 else np.sqrt(ex * ex + ey * ey)
+            if apart > worst:
+                worst, at = apart, i
+        if at >= 0:
+            keep[at] = True
+            stack.append((a, at))
+            stack.append((at, b))
+
+
+@kernel
+def _trace(inside: Bool, corners: I4, ends: I4) -> int:
+    """Walk along the borders of pixels, the inside on the right; return how many walks there are.
+
+    ``inside`` has an empty border; each walk begins eastward above a pixel that was not walked.
+    """
+    walked = np.zeros(inside.shape, np.bool_)
+    count = length = 0
+    for v0 in range(1, inside.shape[0] - 1):
+        for u0 in range(1, inside.shape[1] - 1):
+            if not inside[v0, u0] or inside[v0 - 1, u0] or walked[v0, u0]:
+                continue
+            u, v, du, dv = u0, v0, 1, 0
+            corners[length, 0], corners[length, 1] = u, v
+            length += 1
+            while True:
+                if du == 1:
+                    walked[v, u] = True
+                u, v = u + du, v + dv
+                # The pixels ahead, left and right of the way: turn right where both are outside.
+                left = int(inside[v + (dv - 1 - du) // 2, u + (du - 1 + dv) // 2])
+                right = int(inside[v + (dv - 1 + du) // 2, u + (du - 1 - dv) // 2])
+                if u == u0 and v == v0 and _turn(du, dv, left, right) == (1, 0):
+                    break
+                turned = _turn(du, dv, left, right)
+                if turned != (du, dv):
+                    corners[length, 0], corners[length, 1] = u, v
+                    length += 1
+                    du, dv = turned
+            ends[count] = length
+            count += 1
+    return count
+
+
+@kernel
+def _turn(du: int, dv: int, left: int, right: int) -> tuple[int, int]:
+    """Return where to go on: right along the pixel, straight, or left around what is ahead."""
+    if not right:
+        return -dv, du
+    return (dv, -du) if left else (du, dv)

@@ -1,0 +1,92 @@
+"""Lenses with distortion: where a ray falls on the image, and which ray a pixel sees.
+
+Slopes are x / z and y / z of a ray in the camera's optical frame.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from shapecat.arrays import F8
+from shapecat.types import Camera
+
+__all__ = ["LENS_MODELS", "distort", "undistorted_rays"]
+
+LENS_MODELS = ("plumb_bob", "rational_polynomial", "equidistant", "fisheye")
+"""The models of OpenCV's calibration that are understood."""
+
+_ROUNDS = 20
+
+
+def distort(rays: F8, model: str, coefficients: Sequence[float]) -> F8:
+    """Return the slopes (..., 2) at which a lens shows rays of slopes (..., 2).
+
+    Source: the lens models of OpenCV's calibration (Brown 1966; Kannala & Brandt 2006).
+
+    Parameters
+    ----------
+    model : one of `LENS_MODELS`, or empty for a lens without distortion.
+
+    Raises
+    ------
+    ValueError : the model is not known.
+
+    Examples
+    --------
+    >>> distort(np.array([0.5, 0.0]), "plumb_bob", (0.1, 0, 0, 0, 0)).round(4)
+    array([0.5125, 0.    ])
+    """
+    if not model:
+        return np.asarray(rays, np.float64)
+    if model not in LENS_MODELS:
+        msg = f"lens distortion {model!r} is not known; known: {', '.join(LENS_MODELS)}"
+        raise ValueError(msg)
+    d = np.zeros(8)
+    d[: min(8, len(coefficients))] = coefficients[:8]
+    bend = _fisheye if model in {"equidistant", "fisheye"} else _polynomial
+    return bend(np.asarray(rays, np.float64), d)
+
+
+def undistorted_rays(camera: Camera, model: str, coefficients: Sequence[float]) -> F8 | None:
+    """Return (h, w, 2) the slopes x / z and y / z that each pixel sees.
+
+    Source: `distort`, inverted by fixed-point iteration as in OpenCV's undistortPoints.
+
+    Returns
+    -------
+    None for a model that is not known, or where the iteration does not settle.
+    """
+    if model not in LENS_MODELS or not np.isfinite(coefficients).all():
+        return None
+    u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
+    seen = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1)
+    rays = seen.copy()
+    with np.errstate(all="ignore"):  # a hostile lens diverges: found below
+        for _ in range(_ROUNDS):
+            rays += seen - distort(rays, model, coefficients)
+        error = np.abs(distort(rays, model, coefficients) - seen) * (camera.fx, camera.fy)
+    return rays if np.isfinite(rays).all() and error.max() < 0.1 else None
+
+
+def _polynomial(rays: F8, d: F8) -> F8:
+    """Brown's radial and tangential distortion; k4 to k6 are the rational part."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = d
+    x, y = rays[..., 0], rays[..., 1]
+    r = x * x + y * y
+    radial = (1 + r * (k1 + r * (k2 + r * k3))) / (1 + r * (k4 + r * (k5 + r * k6)))
+    return np.stack(
+        [
+            x * radial + 2 * p1 * x * y + p2 * (r + 2 * x * x),
+            y * radial + p1 * (r + 2 * y * y) + 2 * p2 * x * y,
+        ],
+        axis=-1,
+    )
+
+
+def _fisheye(rays: F8, d: F8) -> F8:
+    """Kannala and Brandt's equidistant model."""
+    radius = np.maximum(np.hypot(rays[..., 0], rays[..., 1]), 1e-12)
+    angle = np.arctan(radius)
+    s = angle * angle
+    bent = angle * (1 + s * (d[0] + s * (d[1] + s * (d[2] + s * d[3]))))
+    return np.asarray(rays * (bent / radius)[..., None])

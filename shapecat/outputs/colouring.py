@@ -1,0 +1,174 @@
+"""The colour images of a run: which there are, and the masks of its detections on them."""
+
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import U4
+from shapecat.colour.masks import NOTHING, Mask, dense_masks
+from shapecat.colour_types import ColourView
+from shapecat.errors import OutputError
+from shapecat.executors.order import map_ahead, read_ahead
+from shapecat.recordings import Recording, choose_streams
+from shapecat.recordings.colour_frames import frames_with_colour
+from shapecat.recordings.colour_streams import ColourStream, choose_colour
+from shapecat.runs.masks import FrameMasks, MaskTable, read_masks
+from shapecat.runs.tables import Key, frame_rows, numbers, read_row_groups
+from shapecat.types import Frame, LabelledFrame
+
+__all__ = ["Coloured", "colours_of", "views_again", "with_colour", "write_masks"]
+
+
+@dataclass(frozen=True)
+class Coloured:
+    """The colour image of a frame, and the mask of each of its objects, in their order."""
+
+    view: ColourView
+    masks: tuple[Mask, ...]
+
+
+def colours_of(recording: Recording, options: Mapping[str, Any]) -> dict[str, ColourStream]:
+    """Return the colour stream of each depth topic of a run that has one.
+
+    Raises
+    ------
+    NoStreamError : the topic that was asked for holds no colour images.
+    """
+    wanted = options.get("color")
+    if wanted == "":
+        return {}
+    streams = choose_streams(recording, options["topics"])
+    found = {stream.topic: choose_colour(recording, stream, wanted) for stream in streams}
+    return {topic: colour for topic, colour in found.items() if colour is not None}
+
+
+def views_again(
+    recording: Recording, run: Mapping[str, Any]
+) -> Iterator[tuple[Frame, ColourView | None]]:
+    """Read the frames that a run was made from once more, with their colour images."""
+    options = run["options"]
+    chosen = {name: options[name] for name in ("start_s", "end_s", "every")}
+    streams = choose_streams(recording, options["topics"])
+    colours = colours_of(recording, options)
+    return frames_with_colour(recording, streams, colours, skipped=Counter(), **chosen)
+
+
+def with_colour(
+    labelled: Iterable[LabelledFrame], recording: Recording, run: Mapping[str, Any], folder: Path
+) -> Iterator[tuple[LabelledFrame, Frame, Coloured | None]]:
+    """Pair labelled frames, in the order they were read, with their clouds and colour images.
+
+    Raises
+    ------
+    OutputError : the recording does not hold one of them any more.
+    """
+    views, masks = views_again(recording, run), _Masks(folder)
+    for label in labelled:
+        for frame, view in views:
+            found = masks.of((frame.topic, frame.index))
+            if (label.topic, label.index) == (frame.topic, frame.index):
+                yield label, frame, _coloured(label, view, found)
+                break
+        else:
+            msg = f"{recording.path}: has changed since it was processed; process it again"
+            raise OutputError(msg)
+
+
+def _coloured(
+    labelled: LabelledFrame, view: ColourView | None, found: FrameMasks | None
+) -> Coloured | None:
+    if view is None:
+        return None
+    objects = [found.mask(o.detections) if found else NOTHING for o in labelled.objects]
+    return Coloured(view, tuple(objects))
+
+
+class _Masks:
+    """The masks of a run, asked for in the order of its frames."""
+
+    def __init__(self, folder: Path) -> None:
+        self._rows = read_masks(folder)
+        self._next = next(self._rows, None)
+
+    def of(self, key: Key) -> FrameMasks | None:
+        """Return the masks of a frame; None if it has none."""
+        found = self._next
+        if found is None or found.key != key:
+            return None
+        self._next = next(self._rows, None)
+        return found
+
+
+def write_masks(
+    folder: Path, recording: Recording, run: Mapping[str, Any], *, threads: int = 1
+) -> int:
+    """Write the masks of all detections of a run; return how many frames have a colour image.
+
+    Parameters
+    ----------
+    threads : with several, one reads while the others project.
+    """
+    count, views = 0, views_again(recording, run)
+    if threads > 1:
+        views = read_ahead(views, count=threads + 2)
+    with MaskTable(folder) as table:
+        found = map_ahead(_masked, _beside(views, folder), threads=threads)
+        for row, detections, masks in found:
+            if row is not None:
+                table.write(row, detections, masks)
+                count += 1
+    return count
+
+
+def _beside(
+    views: Iterable[tuple[Frame, ColourView | None]], folder: Path
+) -> Iterator[tuple[Frame, ColourView | None, dict[int, U4]]]:
+    """Yield views beside the pixels of the detections of their frames."""
+    found = _indices(folder)
+    frames = iter(views)
+    for table in read_row_groups(folder / "frames.parquet", ["topic", "frame"]):
+        objects = next(found)
+        for key in zip(table["topic"].to_pylist(), table["frame"].to_pylist(), strict=True):
+            for frame, view in frames:
+                if (frame.topic, frame.index) == key:
+                    yield frame, view, objects.get(key, {})
+                    break
+
+
+def _indices(folder: Path) -> Iterator[dict[Key, dict[int, U4]]]:
+    """Yield by frame the pixels of each detection, row group by row group."""
+    wanted = ["topic", "frame", "detection", "indices"]
+    for table in read_row_groups(folder / "detections.parquet", wanted):
+        names, pixels = numbers(table["detection"]), table["indices"].combine_chunks()
+        ends, flat = np.from_dlpack(pixels.offsets), numbers(table["indices"])
+        ends = ends - ends[0] if len(ends) else ends
+        yield {
+            key: {int(names[k]): flat[ends[k] : ends[k + 1]] for k in range(rows.start, rows.stop)}
+            for key, rows in frame_rows(table).items()
+        }
+
+
+def _masked(
+    item: tuple[Frame, ColourView | None, dict[int, U4]],
+) -> tuple[dict[str, Any] | None, list[int], tuple[Mask, ...]]:
+    """Return the row of a frame, and its detections with their masks; no row without an image."""
+    frame, view, objects = item
+    if view is None or not frame.organized:
+        return None, [], ()
+    image = view.image
+    row = {
+        "topic": frame.topic,
+        "frame": frame.index,
+        "color_topic": image.topic,
+        "color_stamp_ns": image.stamp_ns,
+        "color_log_time_ns": image.log_time_ns,
+        "color_frame_id": image.frame_id,
+        "width": image.width,
+        "height": image.height,
+    }
+    masks = dense_masks(frame, list(objects.values()), view.lens, view.colour_from_depth)
+    return row, list(objects), masks

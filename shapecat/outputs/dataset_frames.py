@@ -1,0 +1,223 @@
+"""What of some runs goes into a data set of images: which frames, which objects, which split."""
+
+import logging
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xxhash
+
+from shapecat.arrays import F8
+from shapecat.colour.masks import Mask, dense_masks
+from shapecat.errors import OutputError
+from shapecat.outputs.colouring import Coloured, with_colour
+from shapecat.outputs.exports_files import png, safe_name
+from shapecat.outputs.rereading import FinishedRun, open_source
+from shapecat.recordings import MessageError
+from shapecat.recordings.colour_image import encoded
+from shapecat.runs.track_table import read_track_table
+from shapecat.types import Frame, LabelledFrame, LabelledObject
+
+__all__ = ["DatasetImage", "Selection", "images_of", "split_runs"]
+
+_log = logging.getLogger(__name__)
+
+_DEPTH_UNITS = 1000  # to a metre
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What goes into a data set.
+
+    Attributes
+    ----------
+    every : each so-many-th frame of a stream.
+    per_track : frames in which so many views of each track are, chosen to differ; 0 is all.
+    min_confidence : objects whose label is less certain are not labelled.
+    corrected_only : only objects are labelled whose label a person has given.
+    depth : the images are depth images, in millimetres.
+    val : share of the recordings that goes into the validation split.
+    """
+
+    every: int = 1
+    per_track: int = 0
+    min_confidence: float = 0.0
+    corrected_only: bool = False
+    depth: bool = False
+    val: float = 0.2
+
+
+@dataclass(frozen=True)
+class DatasetImage:
+    """An image of the data set: its name without folder, its file, and the objects on it.
+
+    ``sure`` tells of each object whether its label is to be trained on.
+    """
+
+    name: str
+    contents: bytes
+    width: int
+    height: int
+    labelled: LabelledFrame
+    objects: tuple[LabelledObject, ...]
+    masks: tuple[Mask, ...]
+    sure: tuple[bool, ...]
+
+
+def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
+    """Return ``train`` or ``val`` for each run: all runs of one recording go to the same.
+
+    The recordings are drawn by a digest of their content, so that more runs change little; one
+    recording alone is for training.
+
+    Raises
+    ------
+    ValueError : ``val`` is no share.
+    """
+    if not 0 <= val < 1:
+        msg = f"val must be at least 0 and less than 1, got {val}"
+        raise ValueError(msg)
+    known = {run.run["input"]["digest"] or run.name for run in runs}
+    order = sorted(known, key=lambda digest: xxhash.xxh3_64_hexdigest(digest.encode()))
+    chosen = set(order[: min(round(val * len(order)), len(order) - 1)])
+    return ["val" if (r.run["input"]["digest"] or r.name) in chosen else "train" for r in runs]
+
+
+def images_of(
+    finished: FinishedRun, selection: Selection, recording: Path | None = None
+) -> Iterator[DatasetImage]:
+    """Yield the images of a run that have an object to train on; damaged ones are logged.
+
+    Objects that a model is not to be trained on, as their label is not sure, are there as well;
+    those that are unknown are not.
+
+    Raises
+    ------
+    OutputError : the run has no colour images, and depth images were not asked for.
+    RecordingError : the recording is no longer there.
+    """
+    if not selection.depth and not finished.run.get("color"):
+        msg = f"{finished.folder}: no colour images; --depth exports depth images"
+        raise OutputError(msg)
+    corrected = _corrected(finished.folder)
+    chosen = _chosen(finished, selection, corrected)
+    several = len(finished.run["options"]["topics"]) > 1
+    with open_source(finished.run, recording) as source:
+        frames = (f for f in finished.frames() if (f.topic, f.index) in chosen)
+        for labelled, frame, coloured in with_colour(frames, source, finished.run, finished.folder):
+            stem = f"{safe_name(finished.name)}_"
+            stem += f"{safe_name(labelled.topic)}_" if several else ""
+            name = f"{stem}{labelled.index:06d}"
+            try:
+                image = _image(name, labelled, frame, coloured, selection, corrected)
+            except MessageError as error:
+                _log.warning("%s: left out frame %d: %s", finished.name, labelled.index, error)
+                continue
+            if image is not None and any(image.sure):
+                yield image
+
+
+def _corrected(folder: Path) -> set[int]:
+    """Return the tracks whose label a person has given."""
+    return {row.track for row in read_track_table(folder / "tracks.csv").rows if row.label}
+
+
+def _is_sure(item: LabelledObject, selection: Selection, corrected: set[int]) -> bool:
+    by_hand = item.track in corrected
+    if item.category == "unknown" and not by_hand:
+        return False
+    return by_hand or (item.confidence >= selection.min_confidence and not selection.corrected_only)
+
+
+def _image(
+    name: str,
+    labelled: LabelledFrame,
+    frame: Frame,
+    coloured: Coloured | None,
+    selection: Selection,
+    corrected: set[int],
+) -> DatasetImage | None:
+    """Return the image of a frame; None where it has none."""
+    found = _depth_file(labelled, frame) if selection.depth else _colour_file(coloured)
+    if found is None:
+        return None
+    suffix, contents, (height, width), masks = found
+    kept = [
+        (item, mask, _is_sure(item, selection, corrected))
+        for item, mask in zip(labelled.objects, masks, strict=True)
+        if mask.pixels.size and item.category != "unknown"
+    ]
+    objects, seen, sure = (
+        (tuple(column) for column in zip(*kept, strict=True)) if kept else [()] * 3
+    )
+    return DatasetImage(f"{name}{suffix}", contents, width, height, labelled, objects, seen, sure)
+
+
+_File = tuple[str, bytes, tuple[int, int], tuple[Mask, ...]]
+
+
+def _colour_file(coloured: Coloured | None) -> _File | None:
+    """Return suffix, content and size of a colour image, as it came, and its masks."""
+    if coloured is None or coloured.view.image.height <= 1:
+        return None
+    image = coloured.view.image
+    suffix, contents = encoded(image)
+    return suffix, contents, (image.height, image.width), coloured.masks
+
+
+def _depth_file(labelled: LabelledFrame, frame: Frame) -> _File | None:
+    """Return a depth image as 16-bit PNG in millimetres, and the masks on it."""
+    if frame.depth is None:
+        return None
+    units = np.minimum(np.rint(frame.depth * _DEPTH_UNITS), 2**16 - 1).astype(np.uint16)
+    masks = dense_masks(frame, [item.indices for item in labelled.objects])
+    return ".png", png(units, level=4), frame.depth.shape, masks
+
+
+def _chosen(
+    finished: FinishedRun, selection: Selection, corrected: set[int]
+) -> set[tuple[str, int]]:
+    """Return the frames to look at, by topic and number."""
+    seen: Counter[str] = Counter()
+    keys: list[tuple[str, int]] = []
+    views: dict[int, list[tuple[int, Any]]] = {}
+    for labelled in finished.frames():
+        number = seen[labelled.topic]
+        seen[labelled.topic] += 1
+        if number % selection.every:
+            continue
+        for item in labelled.objects if selection.per_track else ():
+            if _is_sure(item, selection, corrected):
+                views.setdefault(item.track, []).append((len(keys), _view(labelled, item)))
+        keys.append((labelled.topic, labelled.index))
+    if not selection.per_track:
+        return set(keys)
+    return {
+        keys[rows[k][0]]
+        for rows in views.values()
+        for k in _different(np.array([view for _, view in rows]), selection.per_track)
+    }
+
+
+def _view(labelled: LabelledFrame, item: LabelledObject) -> F8:
+    """Return what tells views of an object apart: from where, how near, how large, what shape."""
+    pose, center = labelled.fixed_from_sensor, np.asarray(item.box.center, np.float64)
+    distance = float(np.linalg.norm(center))
+    way = -center / max(distance, 1e-6)
+    way = way if pose is None else pose.rotation @ way
+    size = np.asarray(item.box.size, np.float64) / max(float(item.box.size.max()), 1e-6)
+    pixels = np.log(max(item.indices.size, 1))
+    return np.concatenate([way, [np.log(max(distance, 1e-6)), 0.3 * pixels], 0.5 * size])
+
+
+def _different(views: F8, count: int) -> list[int]:
+    """Choose views: the one with most pixels, then always the one least like those chosen."""
+    chosen = [int(views[:, 4].argmax())]
+    apart = np.linalg.norm(views - views[chosen[0]], axis=1)
+    while len(chosen) < min(count, len(views)):
+        chosen.append(int(apart.argmax()))
+        apart = np.minimum(apart, np.linalg.norm(views - views[chosen[-1]], axis=1))
+    return chosen

@@ -1,0 +1,193 @@
+"""What is drawn on the colour images of the annotated recording, in its encodings."""
+
+import json
+from collections.abc import Callable, Iterator, Mapping
+from importlib.resources import files
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from shapecat.outputs.annotation import AnnotationChannel
+from shapecat.outputs.colours import colour_of
+from shapecat.outputs.ros_annotations import RosMessages
+from shapecat.outputs.scene_protobuf import descriptors_of, encode_foxglove
+from shapecat.runs.corrections import TrackLabel
+from shapecat.runs.masks import read_masks
+from shapecat.runs.shown import ShownTracks
+
+__all__ = ["ImageBox", "ImageFrame", "image_encoder_for", "read_image_frames"]
+
+DETECTIONS_2D = "/shapecat/detections_2d"
+DRAWN = "/shapecat/image_annotations"
+_NAME = "foxglove.ImageAnnotations"
+_LINE_LOOP = 2
+
+
+class ImageBox(NamedTuple):
+    """An object on an image: left, top, width and height in pixels."""
+
+    track: int
+    category: str
+    confidence: float
+    box: tuple[int, int, int, int]
+
+    @property
+    def text(self) -> str:
+        """What is written above it."""
+        return f"#{self.track} {self.category} {self.confidence:.2f}"
+
+    @property
+    def corners(self) -> list[tuple[float, float]]:
+        """Its corners around, on the borders of its pixels."""
+        left, top, width, height = (float(value) for value in self.box)
+        right, bottom = left + width, top + height
+        return [(left, top), (right, top), (right, bottom), (left, bottom)]
+
+
+class ImageFrame(NamedTuple):
+    """An image and the objects on it."""
+
+    stamp_ns: int
+    log_time_ns: int
+    frame_id: str
+    boxes: tuple[ImageBox, ...]
+
+
+def read_image_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[ImageFrame]:
+    """Yield what is shown on the colour images of a run, each image once."""
+    shown = ShownTracks.read(folder, labels)
+    last = None
+    for masks in read_masks(folder):
+        if (masks.topic, masks.stamp_ns) == last:
+            continue
+        last = masks.topic, masks.stamp_ns
+        parts: dict[int, list[int]] = {}
+        named: dict[int, TrackLabel] = {}
+        for item in shown.of(masks.key):
+            parts.setdefault(item.label.track, []).append(item.detection)
+            named[item.label.track] = item.label
+        boxes = [
+            ImageBox(track, named[track].category, named[track].confidence, box)
+            for track, detections in parts.items()
+            if (box := masks.box(detections)) is not None
+        ]
+        yield ImageFrame(masks.stamp_ns, masks.log_time_ns, masks.frame_id, tuple(boxes))
+
+
+Encode = Callable[[ImageFrame], bytes]
+
+
+def image_encoder_for(encoding: str) -> list[tuple[AnnotationChannel, Encode]]:
+    """Return the channels that annotate images in an encoding, and how each encodes.
+
+    An encoding that is not known gets JSON.
+    """
+    return _ENCODERS.get(encoding, _json)()
+
+
+def _ros(encoding: str, schema_encoding: str) -> list[tuple[AnnotationChannel, Encode]]:
+    ros = RosMessages(ros1=encoding == "ros1")
+    kinds: dict[str, tuple[str, Callable[[RosMessages, ImageFrame], Any]]] = {
+        DETECTIONS_2D: ("vision_msgs/msg/Detection2DArray", _detections),
+        DRAWN: ("foxglove_msgs/msg/ImageAnnotations", _drawn),
+    }
+
+    def encoder(name: str, make: Callable[[RosMessages, ImageFrame], Any]) -> Encode:
+        return lambda frame: ros.serialize(make(ros, frame), name)
+
+    return [
+        (
+            AnnotationChannel(
+                topic,
+                encoding,
+                name.replace("/msg/", "/") if ros.ros1 else name,
+                schema_encoding,
+                ros.definition(name),
+            ),
+            encoder(name, make),
+        )
+        for topic, (name, make) in kinds.items()
+    ]
+
+
+def _json() -> list[tuple[AnnotationChannel, Encode]]:
+    schema = files("shapecat.schemas").joinpath("ImageAnnotations.json").read_bytes()
+    channel = AnnotationChannel(DRAWN, "json", _NAME, "jsonschema", schema)
+    return [(channel, lambda frame: json.dumps(_plain(frame, ("sec", "nsec"))).encode())]
+
+
+def _protobuf() -> list[tuple[AnnotationChannel, Encode]]:
+    channel = AnnotationChannel(DRAWN, "protobuf", _NAME, "protobuf", descriptors_of(_NAME))
+    return [(channel, lambda frame: encode_foxglove(_plain(frame, ("seconds", "nanos")), _NAME))]
+
+
+_ENCODERS: dict[str, Callable[[], list[tuple[AnnotationChannel, Encode]]]] = {
+    "cdr": lambda: _ros("cdr", "ros2msg"),
+    "ros1": lambda: _ros("ros1", "ros1msg"),
+    "json": _json,
+    "protobuf": _protobuf,
+}
+
+
+def _font_size(box: ImageBox) -> float:
+    return float(min(max(box.box[3] / 6, 10), 18))
+
+
+def _plain(frame: ImageFrame, parts: tuple[str, str]) -> dict[str, Any]:
+    """Make a foxglove.ImageAnnotations of plain values; ``parts`` of a time."""
+    time = dict(zip(parts, divmod(frame.stamp_ns, 10**9), strict=True))
+    points, texts = [], []
+    for box in frame.boxes:
+        red, green, blue = (part / 255 for part in colour_of(box.category))
+        colour = {"r": red, "g": green, "b": blue, "a": 1.0}
+        corners = [{"x": x, "y": y} for x, y in box.corners]
+        points.append(
+            {
+                "timestamp": time,
+                "type": _LINE_LOOP,
+                "points": corners,
+                "outline_color": colour,
+                "outline_colors": [],
+                "fill_color": colour | {"a": 0.15},
+                "thickness": 2.0,
+            }
+        )
+        texts.append(
+            {
+                "timestamp": time,
+                "position": corners[0],
+                "text": box.text,
+                "font_size": _font_size(box),
+                "text_color": {"r": 1.0, "g": 1.0, "b": 1.0, "a": 1.0},
+                "background_color": colour | {"a": 0.7},
+            }
+        )
+    return {"circles": [], "points": points, "texts": texts}
+
+
+def _detections(ros: RosMessages, frame: ImageFrame) -> Any:
+    """Make a vision_msgs/Detection2DArray."""
+    header = ros.make("Header", frame)
+    found = []
+    for one in frame.boxes:
+        left, top, width, height = (float(value) for value in one.box)
+        hypothesis = ros.make("ObjectHypothesis", one.category, float(one.confidence))
+        result = ros.make("ObjectHypothesisWithPose", hypothesis, ros.no_pose())
+        middle = ros.make("Point2D", left + width / 2, top + height / 2)
+        bounds = ros.make("BoundingBox2D", ros.make("Pose2D", middle, 0.0), width, height)
+        found.append(ros.make("Detection2D", header, [result], bounds, str(one.track)))
+    return ros.make("Detection2DArray", header, found)
+
+
+def _drawn(ros: RosMessages, frame: ImageFrame) -> Any:
+    """Make a foxglove_msgs/ImageAnnotations."""
+    time = ros.make("Header", frame).stamp
+    points, texts = [], []
+    for box in frame.boxes:
+        tone = [part / 255 for part in colour_of(box.category)]
+        line, fill, behind = (ros.make("Color", *tone, alpha) for alpha in (1.0, 0.15, 0.7))
+        corners = [ros.make("Point2", x, y) for x, y in box.corners]
+        points.append(ros.make("PointsAnnotation", time, _LINE_LOOP, corners, line, [], fill, 2.0))
+        white = ros.make("Color", 1.0, 1.0, 1.0, 1.0)
+        written = (corners[0], box.text, _font_size(box), white, behind)
+        texts.append(ros.make("TextAnnotation", time, *written))
+    return ros.make("ImageAnnotations", [], points, texts)

@@ -1,0 +1,268 @@
+"""Frames of a depth sensor, each with the colour image nearest to it in time."""
+
+from collections import Counter, deque
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from shapecat.colour_types import ColourImage, ColourView, LensCamera
+from shapecat.errors import RecordingError
+from shapecat.lenses import LENS_MODELS
+from shapecat.recordings.colour_image import cloud_colours, compressed_size
+from shapecat.recordings.colour_streams import ColourStream
+from shapecat.recordings.extrinsics import Extrinsics
+from shapecat.recordings.frames import frames
+from shapecat.recordings.messages import Message, MessageError
+from shapecat.recordings.pinhole import camera_of_info
+from shapecat.recordings.recording import Recording
+from shapecat.recordings.stamps import stamp_ns
+from shapecat.recordings.streams import Stream
+from shapecat.types import Camera, Frame
+
+__all__ = ["frames_with_colour"]
+
+_HELD_FRAMES = 8
+"""Frames that wait at most for a colour image behind them."""
+_KEPT_IMAGES, _KEPT_BYTES = 16, 96 << 20
+"""Colour images that wait at most for a frame; two in any case."""
+_PATIENCE_NS = 500_000_000
+"""A frame waits no longer than this, in log time."""
+_USUAL_PERIOD_NS = 100_000_000
+"""Assumed where a stream has a single image."""
+_NEAR, _EQUAL = 0.01, 1e-6
+"""Intrinsics that differ by less than this share of the width are nearly, or quite, the same."""
+_MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RecordingError)
+
+
+def frames_with_colour(
+    recording: Recording,
+    streams: Sequence[Stream],
+    colours: Mapping[str, ColourStream],
+    *,
+    skipped: Counter[str],
+    **chosen: Any,
+) -> Iterator[tuple[Frame, ColourView | None]]:
+    """Read frames as `shapecat.recordings.frames` does, each beside its colour image.
+
+    Parameters
+    ----------
+    colours : the colour stream of each depth topic that has one.
+    chosen : ``start_s, end_s, every``.
+
+    Yields
+    ------
+    Frames, and the image with the nearest stamp if that is within half a period of the colour
+    stream; None where there is none, or it cannot be read: the recording's warnings count those.
+    """
+    partners = {
+        stream.topic: _Partner(recording, stream, colours[stream.topic])
+        for stream in streams
+        if stream.topic in colours
+    }
+    waiting: deque[Frame] = deque()
+    for frame in frames(recording, streams, skipped=skipped, heard=_heard(partners), **chosen):
+        waiting.append(frame)
+        while waiting and _decided(waiting, partners):
+            yield _paired(waiting.popleft(), partners)
+    while waiting:
+        yield _paired(waiting.popleft(), partners)
+    for partner in partners.values():
+        partner.report()
+
+
+def _heard(partners: Mapping[str, "_Partner"]) -> dict[str, Any]:
+    """Return who is told of the messages of each topic."""
+    told: dict[str, list[Any]] = {}
+    for partner in partners.values():
+        told.setdefault(partner.stream.topic, []).append(partner.take)
+        if partner.stream.info_topic:
+            told.setdefault(partner.stream.info_topic, []).append(partner.calibrate)
+
+    def tell(message: Message) -> None:
+        for listener in told[message.topic]:
+            listener(message)
+
+    return dict.fromkeys(told, tell)
+
+
+def _decided(waiting: Sequence[Frame], partners: Mapping[str, "_Partner"]) -> bool:
+    first, last = waiting[0], waiting[-1]
+    partner = partners.get(first.topic)
+    return (
+        partner is None
+        or partner.reaches(first)
+        or len(waiting) > _HELD_FRAMES
+        or last.log_time_ns - first.log_time_ns > _PATIENCE_NS
+    )
+
+
+def _paired(frame: Frame, partners: Mapping[str, "_Partner"]) -> tuple[Frame, ColourView | None]:
+    partner = partners.get(frame.topic)
+    return frame, None if partner is None else partner.view(frame)
+
+
+class _Partner:
+    """The colour images of one depth stream as they pass."""
+
+    def __init__(self, recording: Recording, depth: Stream, colour: ColourStream) -> None:
+        self.stream = colour
+        self._recording = recording
+        self._images: deque[tuple[int, int, Any]] = deque()  # stamp, log time, decoded
+        self._info: Any = None
+        self._lens: LensCamera | None = None
+        self._steps: deque[int] = deque(maxlen=9)
+        self._newest: int | None = None
+        self._extrinsics = Extrinsics(recording, depth, colour)
+        self._left_out: Counter[str] = Counter()
+
+    def take(self, message: Message) -> None:
+        """Keep an image for a while."""
+        if message.type != self.stream.type:
+            return
+        try:
+            image = self._recording.decode(message)
+            stamp = stamp_ns(image.header) or message.log_time_ns
+        except _MALFORMED as error:
+            self._left_out[_reason(error, self.stream.topic)] += 1
+            return
+        if self._newest is not None and stamp > self._newest:
+            self._steps.append(stamp - self._newest)
+        self._newest = stamp
+        self._images.append((stamp, message.log_time_ns, image))
+        while len(self._images) > _KEPT_IMAGES or self._too_much():
+            self._images.popleft()
+
+    def calibrate(self, message: Message) -> None:
+        """Take the calibration, anew when it changes."""
+        try:
+            info = self._recording.decode(message)
+            key = np.concatenate([np.ravel(info.k if hasattr(info, "k") else info.K)])
+            if self._info is None or not np.array_equal(key, self._info[0]):
+                self._info, self._lens = (key, info), _lens_of(info, self.stream.topic)
+        except _MALFORMED as error:
+            self._left_out[f"calibration: {_reason(error, self.stream.topic)}"] += 1
+
+    def reaches(self, frame: Frame) -> bool:
+        """Tell whether no later image can be nearer to a frame."""
+        return self._newest is not None and self._newest >= frame.stamp_ns
+
+    def view(self, frame: Frame) -> ColourView | None:
+        """Return the image of a frame."""
+        nearest = min(self._images, key=lambda one: abs(one[0] - frame.stamp_ns), default=None)
+        if nearest is None or 2 * abs(nearest[0] - frame.stamp_ns) > self._period():
+            self._left_out["frames without a colour image of their time"] += 1
+            return None
+        try:
+            return self._view(frame, *nearest)
+        except _MALFORMED as error:
+            self._left_out[_reason(error, self.stream.topic)] += 1
+            return None
+
+    def report(self) -> None:
+        """Add what was left out to the recording's warnings."""
+        for reason, count in self._left_out.items():
+            self._recording.warn(f"{self.stream.topic}: no colour {count} times: {reason}")
+
+    def _too_much(self) -> bool:
+        kept = sum(len(image.data) for _, _, image in self._images)
+        return kept > _KEPT_BYTES and len(self._images) > 2
+
+    def _period(self) -> int:
+        if self._steps:
+            return int(np.median(self._steps))
+        count, span = self.stream.count or 0, self._recording.end_ns - self._recording.start_ns
+        return span // (count - 1) if count > 1 and span > 0 else _USUAL_PERIOD_NS
+
+    def _view(self, frame: Frame, stamp: int, log_time_ns: int, decoded: Any) -> ColourView:
+        image = _IMAGES[self.stream.kind](self.stream.topic, stamp, log_time_ns, decoded)
+        shape = (image.height, image.width)
+        if self.stream.kind == "cloud":
+            return ColourView(image, _lens(frame.camera))
+        same_shape = frame.depth is not None and frame.depth.shape == shape
+        lens = self._lens
+        if lens is not None and (lens.pinhole.height, lens.pinhole.width) != shape:
+            size = f"{lens.pinhole.width} x {lens.pinhole.height}"
+            msg = f"image of {shape[1]} x {shape[0]} pixels with camera info for {size}"
+            raise MessageError(msg)
+        recorder = self.stream.topic.startswith("/device_")
+        one_frame = image.frame_id == frame.frame_id and not recorder
+        if same_shape and one_frame and (lens is None or _alike(lens, frame.camera, _NEAR)):
+            return ColourView(image, lens or _lens(frame.camera))
+        if lens is None:
+            msg = "images without a sensor_msgs/CameraInfo"
+            raise MessageError(msg)
+        pose = self._extrinsics.colour_from_depth(frame.frame_id, image.frame_id, frame.stamp_ns)
+        if pose is not None:
+            return ColourView(image, lens, pose)
+        if same_shape and _alike(
+            lens, frame.camera, _EQUAL
+        ):  # two cameras are never calibrated to the same numbers
+            return ColourView(image, lens)
+        msg = f"no transform between {frame.frame_id} and {image.frame_id}"
+        raise MessageError(msg)
+
+
+def _reason(error: Exception, topic: str) -> str:
+    if isinstance(error, RecordingError):
+        return str(error).removeprefix(f"{topic}: ")[:160]
+    return "message is not laid out as its type says"
+
+
+def _lens(camera: Camera | None) -> LensCamera | None:
+    return None if camera is None else LensCamera(camera)
+
+
+def _lens_of(info: Any, topic: str) -> LensCamera:
+    rectified = any("rect" in part for part in topic.split("/")[-2:])
+    camera, distorted = camera_of_info(info, rectified=rectified)
+    if not distorted:
+        return LensCamera(camera)
+    model = str(info.distortion_model)
+    if model not in LENS_MODELS:
+        msg = f"lens distortion {model!r} is not known"
+        raise MessageError(msg)
+    coefficients = tuple(float(c) for c in (info.d if hasattr(info, "d") else info.D))
+    return LensCamera(camera, model, coefficients)
+
+
+def _alike(lens: LensCamera, camera: Camera | None, share: float) -> bool:
+    """Tell whether two cameras have the same intrinsics, to a share of the width."""
+    if camera is None:
+        return False
+    own, other = ((c.fx, c.fy, c.cx, c.cy) for c in (lens.pinhole, camera))
+    return bool(np.abs(np.subtract(own, other)).max() < share * camera.width)
+
+
+def _bytes(data: Any) -> memoryview:
+    return memoryview(data).cast("B") if len(data) else memoryview(b"")
+
+
+def _raw(topic: str, stamp: int, log_time_ns: int, decoded: Any) -> ColourImage:
+    width, height, step = int(decoded.width), int(decoded.height), int(decoded.step)
+    return ColourImage(
+        topic, stamp, log_time_ns, str(decoded.header.frame_id), str(decoded.encoding),
+        width, height, step, _bytes(decoded.data),
+    )  # fmt: skip
+
+
+def _compressed(topic: str, stamp: int, log_time_ns: int, decoded: Any) -> ColourImage:
+    data = _bytes(decoded.data)
+    kind, width, height = compressed_size(data)
+    frame_id = str(decoded.header.frame_id)
+    return ColourImage(topic, stamp, log_time_ns, frame_id, kind, width, height, 0, data)
+
+
+def _cloud(topic: str, stamp: int, log_time_ns: int, decoded: Any) -> ColourImage:
+    colours = cloud_colours(decoded)
+    if colours is None:
+        msg = "cloud without colours"
+        raise MessageError(msg)
+    height, width, _ = colours.shape
+    frame_id = str(decoded.header.frame_id)
+    return ColourImage(
+        topic, stamp, log_time_ns, frame_id, "rgb8", width, height, 3 * width, colours.tobytes()
+    )
+
+
+_IMAGES = {"raw": _raw, "compressed": _compressed, "cloud": _cloud}

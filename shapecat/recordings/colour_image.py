@@ -1,0 +1,236 @@
+"""Colour images become pixels: raw, JPEG, PNG, and the colours of point clouds."""
+
+import io
+import struct
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import U1
+from shapecat.colour_types import COMPRESSED_FORMATS, ColourImage
+from shapecat.recordings.messages import MessageError
+
+__all__ = [
+    "COLOUR_ENCODINGS",
+    "cloud_colours",
+    "compressed_kind",
+    "compressed_size",
+    "encoded",
+    "pixels_of",
+]
+
+_LARGEST = 1 << 26
+"""Images with more pixels are refused."""
+
+_CHANNELS = {
+    "rgb8": (1, (0, 1, 2), 3),
+    "bgr8": (1, (2, 1, 0), 3),
+    "8UC3": (1, (2, 1, 0), 3),
+    "rgba8": (1, (0, 1, 2), 4),
+    "bgra8": (1, (2, 1, 0), 4),
+    "8UC4": (1, (2, 1, 0), 4),
+    "rgb16": (2, (0, 1, 2), 3),
+    "bgr16": (2, (2, 1, 0), 3),
+    "mono8": (1, (0, 0, 0), 1),
+}
+"""Bytes of a channel, the channels of red, green and blue, and channels of a pixel."""
+
+_BAYER = {"bayer_rggb8": 0, "bayer_grbg8": 1, "bayer_gbrg8": 2, "bayer_bggr8": 3}
+"""Where red is in a block of two by two pixels, row by row."""
+
+_LUMA = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
+"""The byte of the first brightness in four bytes of two pixels."""
+
+COLOUR_ENCODINGS = frozenset({*_CHANNELS, *_BAYER, *_LUMA})
+"""Encodings of sensor_msgs/Image that are understood as colour; mono8 is grey."""
+
+_SOF = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
+"""Markers of a JPEG file behind which its size stands."""
+
+_PNG = b"\x89PNG\r\n\x1a\n"
+
+
+def compressed_kind(data: bytes | memoryview) -> str:
+    """Return what a compressed image is, by its first bytes: jpeg, png, or nothing known."""
+    begin = bytes(data[:8])
+    return "jpeg" if begin.startswith(b"\xff\xd8\xff") else "png" if begin == _PNG else ""
+
+
+def compressed_size(data: bytes | memoryview) -> tuple[str, int, int]:
+    """Return kind, width and height of a JPEG or PNG file, without decoding it.
+
+    Raises
+    ------
+    MessageError : another kind of file, one without a size or an end, or a too large one.
+    """
+    kind, view = compressed_kind(data), memoryview(data)
+    if not kind:
+        msg = f"compressed image is neither JPEG nor PNG: begins with {bytes(view[:4])!r}"
+        raise MessageError(msg)
+    width, height = _jpeg_size(view) if kind == "jpeg" else _png_size(view)
+    if not 0 < width * height <= _LARGEST:
+        msg = f"image of {width} x {height} pixels"
+        raise MessageError(msg)
+    end = b"\xff\xd9" if kind == "jpeg" else b"IEND"
+    if end not in bytes(view[max(0, len(view) - 4096) :]):
+        msg = f"{kind} image is cut off"
+        raise MessageError(msg)
+    return kind, width, height
+
+
+def _png_size(data: memoryview) -> tuple[int, int]:
+    if len(data) < 24:
+        msg = "png image is cut off"
+        raise MessageError(msg)
+    width, height = struct.unpack_from(">II", data, 16)
+    return int(width), int(height)
+
+
+def _jpeg_size(data: memoryview) -> tuple[int, int]:
+    """Walk the segments of a JPEG file to the one that holds its size."""
+    at = 2
+    while at + 9 <= len(data):
+        if data[at] != 0xFF:
+            break
+        marker = data[at + 1]
+        if marker == 0xFF or 0xD0 <= marker <= 0xD9 or marker == 1:  # filling, or without content
+            at += 1 if marker == 0xFF else 2
+            continue
+        if marker in _SOF:
+            height, width = struct.unpack_from(">HH", data, at + 5)
+            return int(width), int(height)
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    msg = "jpeg image without a size"
+    raise MessageError(msg)
+
+
+def pixels_of(image: ColourImage, *, shrink: int = 1) -> U1:
+    """Decode an image.
+
+    Parameters
+    ----------
+    shrink : a JPEG image may be decoded at 1/2, 1/4 or 1/8 of its size, down to this share: several
+        times as fast.
+
+    Returns
+    -------
+    (h, w, 3) red, green, blue.
+
+    Raises
+    ------
+    MessageError : damaged, an unknown encoding, or less data than its size needs.
+    """
+    if image.encoding in COMPRESSED_FORMATS:
+        return _decompressed(image, shrink)
+    return _raw_pixels(image)
+
+
+def encoded(image: ColourImage) -> tuple[str, bytes]:
+    """Return an image as a file, without loss: its suffix, and its bytes, as they came or as PNG.
+
+    Raises
+    ------
+    MessageError : damaged; what came compressed is decoded once to make sure.
+    """
+    from PIL import Image  # noqa: PLC0415  # loaded where there is colour
+
+    pixels = pixels_of(image)
+    if image.encoding in COMPRESSED_FORMATS:
+        return ".jpg" if image.encoding == "jpeg" else ".png", bytes(image.data)
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, "png", compress_level=4)
+    return ".png", file.getvalue()
+
+
+def _decompressed(image: ColourImage, shrink: int) -> U1:
+    from PIL import Image  # noqa: PLC0415  # loaded where there is colour
+
+    kind, width, height = compressed_size(image.data)
+    if (width, height) != (image.width, image.height):
+        msg = f"image of {width} x {height} pixels instead of {image.width} x {image.height}"
+        raise MessageError(msg)
+    try:
+        with Image.open(io.BytesIO(image.data), formats=[kind]) as file:
+            if shrink > 1:
+                file.draft("RGB", (max(1, width // shrink), max(1, height // shrink)))
+            return np.asarray(file.convert("RGB"))
+    except (OSError, SyntaxError, ValueError, EOFError, struct.error) as error:
+        msg = f"{kind} image is damaged: {' '.join(str(error).split())[:100]}"
+        raise MessageError(msg) from error
+
+
+def _raw_pixels(image: ColourImage) -> U1:
+    name = image.encoding
+    if name in _LUMA:
+        return _from_yuv(_rows(image, 2), _LUMA[name])
+    if name in _BAYER:
+        return _from_bayer(_rows(image, 1)[..., 0], _BAYER[name])
+    if name not in _CHANNELS:
+        msg = f"image encoding {name!r} is not colour"
+        raise MessageError(msg)
+    size, order, channels = _CHANNELS[name]
+    rows = _rows(image, size * channels)
+    # Of 16 bits the upper ones: the last byte of each channel, as all robots are little-endian.
+    return np.ascontiguousarray(rows[..., [size * k + size - 1 for k in order]])
+
+
+def _rows(image: ColourImage, pixel: int) -> U1:
+    """Return (h, w, pixel) the bytes of raw pixels."""
+    width, height, data = image.width, image.height, np.frombuffer(image.data, np.uint8)
+    row = image.step or width * pixel
+    need = (height - 1) * row + width * pixel
+    if not 0 < width * height <= _LARGEST or row < width * pixel or need > data.size:
+        msg = f"image of {width} x {height} pixels needs {need} bytes and has {data.size}"
+        raise MessageError(msg)
+    return np.ndarray((height, width, pixel), np.uint8, data, 0, (row, pixel, 1))
+
+
+def _from_yuv(rows: U1, luma: int) -> U1:
+    """Convert YUV 4:2:2 by the matrix of JFIF (ITU-R BT.601, full range)."""
+    height, width, _ = rows.shape
+    y = rows[..., luma].astype(np.float32)
+    chroma = rows[..., 1 - luma].astype(np.float32) - 128
+    u, v = (np.repeat(chroma[:, k : 2 * (width // 2) : 2], 2, axis=1) for k in (0, 1))
+    y = y[:, : u.shape[1]]
+    planes = (y + 1.402 * v, y - 0.344136 * u - 0.714136 * v, y + 1.772 * u)
+    result = np.zeros((height, width, 3), np.uint8)
+    result[:, : u.shape[1]] = np.clip(np.stack(planes, axis=-1) + 0.5, 0, 255)
+    return result
+
+
+def _from_bayer(mosaic: U1, red: int) -> U1:
+    """Give the pixels of each block of two by two the colour of the block."""
+    height, width = (size // 2 * 2 for size in mosaic.shape)
+    corner = [mosaic[k // 2 : height : 2, k % 2 : width : 2] for k in range(4)]
+    green = [k for k in range(4) if k not in {red, 3 - red}]
+    mean = (corner[green[0]].astype(np.uint16) + corner[green[1]]) // 2
+    block = np.stack([corner[red], mean.astype(np.uint8), corner[3 - red]], axis=-1)
+    result = np.zeros((*mosaic.shape, 3), np.uint8)
+    result[:height, :width] = block.repeat(2, axis=0).repeat(2, axis=1)
+    return result
+
+
+def cloud_colours(message: Any) -> U1 | None:
+    """Read the packed ``rgb`` or ``rgba`` field of a decoded PointCloud2.
+
+    Returns
+    -------
+    (h, w, 3) red, green, blue; None where there is no such field.
+
+    Raises
+    ------
+    MessageError : the field does not fit into the points, or there is less data than they need.
+    """
+    field = next((f for f in message.fields if f.name in {"rgb", "rgba"}), None)
+    if field is None:
+        return None
+    height, width, step = int(message.height), int(message.width), int(message.point_step)
+    row, offset = int(message.row_step) or width * step, int(field.offset)
+    data = np.frombuffer(message.data, np.uint8)
+    need = (height - 1) * row + (width - 1) * step + offset + 4
+    if height * width == 0 or offset + 4 > step or row < width * step or need > data.size:
+        msg = f"colours of {width} x {height} points do not fit in {data.size} bytes"
+        raise MessageError(msg)
+    packed = np.ndarray((height, width, 4), np.uint8, data, offset, (row, step, 1))
+    order = [1, 2, 3] if message.is_bigendian else [2, 1, 0]  # 0xAARRGGBB
+    return np.ascontiguousarray(packed[..., order])

@@ -1,0 +1,173 @@
+"""Which colour images belong to a depth stream."""
+
+from dataclasses import dataclass, replace
+from pathlib import PurePosixPath
+from typing import Any, Literal
+
+from shapecat.errors import NoStreamError
+from shapecat.recordings.colour_image import COLOUR_ENCODINGS, compressed_kind
+from shapecat.recordings.foxglove import ros_counterpart
+from shapecat.recordings.messages import Topic
+from shapecat.recordings.recording import Recording
+from shapecat.recordings.streams import (
+    CLOUD,
+    COMPRESSED,
+    IMAGE,
+    INFO,
+    Stream,
+    first_message,
+    info_topic_of,
+)
+
+__all__ = ["ColourStream", "choose_colour", "colour_streams"]
+
+_COLOUR_WORDS = ("color", "colour", "rgb")
+_OTHER_WORDS = ("infra", "/ir/", "depth/image", "confidence", "thermal", "mask")
+"""Grey images of these are none of a colour camera."""
+
+
+@dataclass(frozen=True)
+class ColourStream:
+    """A topic of colour images.
+
+    ``kind`` tells raw images from compressed ones and from clouds with a packed ``rgb`` field;
+    ``info_topic`` is the calibration, None if there is none; ``frame_id`` and ``encoding`` are
+    those of the first message; ``grey`` images are taken only where they are asked for.
+    """
+
+    topic: str
+    type: str
+    kind: Literal["raw", "compressed", "cloud"]
+    info_topic: str | None
+    count: int | None
+    frame_id: str
+    encoding: str
+
+    @property
+    def grey(self) -> bool:
+        """Whether it has no colour."""
+        return self.encoding == "mono8"
+
+
+def colour_streams(recording: Recording) -> tuple[ColourStream, ...]:
+    """Find the colour images of a recording, by topic, and the clouds with colours."""
+    infos = [
+        topic.name
+        for topic in recording.topics
+        if ros_counterpart(topic.type) == INFO and topic.count != 0
+    ]
+    found = (
+        _probe(topic, kind, recording, infos)
+        for topic in recording.topics
+        if topic.count != 0 and (kind := _KINDS.get(ros_counterpart(topic.type)))
+    )
+    return tuple(stream for stream in found if stream is not None)
+
+
+def choose_colour(
+    recording: Recording, stream: Stream, wanted: str | None = None
+) -> ColourStream | None:
+    """Choose the colour images of a depth stream: the wanted ones, or those that belong to it.
+
+    Images belong to a stream that have its frame, or share the beginning of its name
+    (``/camera/color/image_raw`` and ``/camera/depth/image_raw`` do). Of several the first is taken
+    of: the cloud's own colours; images in its frame; those that share most of the name; those
+    named after colour; more messages before fewer; compressed before raw; then by name. The only
+    colour images of a recording belong to its only camera, whatever their names.
+
+    Raises
+    ------
+    NoStreamError : the wanted topic holds no colour images.
+    """
+    streams = colour_streams(recording)
+    if wanted is not None:
+        chosen: ColourStream | None = _wanted(recording, streams, wanted)
+    else:
+        own = [one for one in streams if one.kind == "cloud" and one.topic == stream.topic]
+        images = [one for one in streams if one.kind != "cloud" and not one.grey]
+        near = [one for one in images if one.frame_id == stream.frame_id or _shared(one, stream)]
+        found = own or near or images[: len(images) == 1]
+        chosen = min(found, key=lambda one: _rank(one, stream), default=None)
+    if chosen is not None and chosen.info_topic == stream.info_topic:
+        return replace(chosen, info_topic=None)  # the calibration of the other camera
+    return chosen
+
+
+def _wanted(recording: Recording, streams: tuple[ColourStream, ...], wanted: str) -> ColourStream:
+    for one in streams:
+        if one.topic.strip("/") == wanted.strip("/"):
+            return one
+    known = ", ".join(one.topic for one in streams) or "none"
+    there = any(topic.name.strip("/") == wanted.strip("/") for topic in recording.topics)
+    state = "holds no colour images" if there else "does not exist"
+    msg = f"{recording.path}: topic {wanted} {state}; colour images: {known}"
+    raise NoStreamError(msg)
+
+
+def _rank(one: ColourStream, stream: Stream) -> tuple[bool, int, bool, int, bool, str]:
+    return (
+        not (one.frame_id and one.frame_id == stream.frame_id),
+        -_shared(one, stream),
+        not any(word in one.topic.lower() for word in _COLOUR_WORDS),
+        -(one.count or 0),
+        one.kind != "compressed",
+        one.topic,
+    )
+
+
+def _shared(one: ColourStream, stream: Stream) -> int:
+    """Return how many parts two names have in common at their beginning."""
+    a, b = (PurePosixPath(name.strip("/")).parts[:-1] for name in (one.topic, stream.topic))
+    same = [x == y for x, y in zip(a, b, strict=False)]
+    return same.index(False) if False in same else len(same)
+
+
+def _probe(
+    topic: Topic,
+    kind: Literal["raw", "compressed", "cloud"],
+    recording: Recording,
+    infos: list[str],
+) -> ColourStream | None:
+    first = first_message(recording, topic)
+    try:
+        encoding = _ENCODINGS[kind](first)
+        if not encoding or (encoding == "mono8" and _is_other(topic.name)):
+            return None
+        frame_id = str(first.header.frame_id)
+    except (AttributeError, TypeError):  # a definition without the fields of its type
+        return None
+    info = info_topic_of(topic.name, infos) if kind != "cloud" else None
+    return ColourStream(topic.name, topic.type, kind, info, topic.count, frame_id, encoding)
+
+
+def _is_other(name: str) -> bool:
+    return any(word in name.lower() for word in _OTHER_WORDS)
+
+
+def _raw_encoding(first: Any) -> str:
+    encoding = str(first.encoding)
+    return encoding if encoding in COLOUR_ENCODINGS else ""
+
+
+def _compressed_encoding(first: Any) -> str:
+    if "compressedDepth" in str(first.format):
+        return ""
+    kind = compressed_kind(bytes(first.data[:8]))
+    words = str(first.format).split(";")[0].strip()
+    return "mono8" if kind and words == "mono8" else kind
+
+
+def _cloud_encoding(first: Any) -> str:
+    return "rgb8" if any(field.name in {"rgb", "rgba"} for field in first.fields) else ""
+
+
+_KINDS: dict[str, Literal["raw", "compressed", "cloud"]] = {
+    IMAGE: "raw",
+    COMPRESSED: "compressed",
+    CLOUD: "cloud",
+}
+_ENCODINGS = {
+    "raw": _raw_encoding,
+    "compressed": _compressed_encoding,
+    "cloud": _cloud_encoding,
+}

@@ -1,0 +1,108 @@
+"""Where a depth sensor is in the frame of the colour camera."""
+
+from contextlib import suppress
+from typing import Any
+
+import numpy as np
+
+from shapecat.errors import RecordingError
+from shapecat.geometry import IDENTITY, compose, inverse, rotation_from_quaternion
+from shapecat.recordings.colour_streams import ColourStream
+from shapecat.recordings.recording import Recording
+from shapecat.recordings.streams import Stream
+from shapecat.recordings.transforms import (
+    ExtrapolationError,
+    TransformBuffer,
+    TransformError,
+    read_transforms,
+)
+from shapecat.types import Pose
+
+__all__ = ["Extrinsics"]
+
+_MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RecordingError)
+
+
+class Extrinsics:
+    """The transform between a depth sensor and a colour camera, from what a recording offers.
+
+    Static transforms are asked first, then all, then librealsense's own messages: the topic
+    ``extrinsics/depth_to_color`` of its ROS driver, the topics ``tf/N`` of its recorder.
+    """
+
+    def __init__(self, recording: Recording, depth: Stream, colour: ColourStream) -> None:
+        """Begin without having read anything."""
+        self._recording = recording
+        self._depth, self._colour = depth, colour
+        self._buffers: list[TransformBuffer | None] = [None, None]
+        self._fixed: Pose | None = None
+        self._looked = False
+
+    def colour_from_depth(self, depth_frame: str, colour_frame: str, stamp_ns: int) -> Pose | None:
+        """Return the pose at a time; None where the recording does not tell.
+
+        ``depth_frame`` and ``colour_frame`` are the frames of the messages.
+        """
+        recorder = self._depth.topic.startswith("/device_")  # whose frame ids are numbers
+        if depth_frame == colour_frame and not recorder:
+            return IDENTITY
+        for number in (0, 1) if not recorder else ():
+            pose = self._lookup(number, depth_frame, colour_frame, stamp_ns)
+            if pose is not None:
+                return pose
+        if not self._looked:
+            self._looked, self._fixed = True, self._realsense()
+        return self._fixed
+
+    def _lookup(
+        self, number: int, depth_frame: str, colour_frame: str, stamp_ns: int
+    ) -> Pose | None:
+        """Look a transform up among the static ones (0) or all (1)."""
+        buffer = self._buffers[number]
+        if buffer is None:
+            buffer = read_transforms(self._recording, static_only=number == 0)
+            self._buffers[number] = buffer
+        with suppress(TransformError):
+            try:
+                return buffer.lookup(colour_frame, depth_frame, stamp_ns)
+            except ExtrapolationError:
+                self._recording.warn(
+                    f"{self._colour.topic}: no transform from {depth_frame} to {colour_frame} "
+                    "at the time of some frames"
+                )
+        return None
+
+    def _realsense(self) -> Pose | None:
+        """Read librealsense's extrinsics: ``p_colour = rotation @ p_depth + translation``."""
+        for topic in self._recording.topics:
+            if topic.name.endswith("/extrinsics/depth_to_color"):
+                with suppress(*_MALFORMED):
+                    return _driver_pose(self._first(topic.name))
+        depth, colour = (self._recorder_pose(s.topic) for s in (self._depth, self._colour))
+        if depth is None or colour is None:
+            return None
+        return compose(colour, inverse(depth))
+
+    def _recorder_pose(self, image: str) -> Pose | None:
+        """Return ``stream_from_reference`` of a stream of librealsense's recorder."""
+        prefix = f"{image.rpartition('/image')[0]}/tf/"
+        for topic in self._recording.topics:
+            if topic.name.startswith(prefix) and len(prefix) > 4:
+                with suppress(*_MALFORMED):
+                    message = self._first(topic.name)
+                    move, turn = message.translation, message.rotation
+                    rotation = rotation_from_quaternion((turn.x, turn.y, turn.z, turn.w))
+                    return Pose(rotation, np.array([move.x, move.y, move.z]))
+        return None
+
+    def _first(self, topic: str) -> Any:
+        return self._recording.decode(next(self._recording.messages([topic])))
+
+
+def _driver_pose(message: Any) -> Pose | None:
+    rotation = np.asarray(message.rotation, np.float64).reshape(3, 3).T  # stored by columns
+    translation = np.asarray(message.translation, np.float64)
+    good = (
+        np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-3) and np.isfinite(translation).all()
+    )
+    return Pose(rotation, translation) if good else None

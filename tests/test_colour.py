@@ -1,0 +1,207 @@
+"""Masks on colour images: the right pixels, dense, and none that the camera does not see."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from shapecat.colour.masks import NOTHING, Mask, dense_masks, labelled_masks, united
+from shapecat.colour.projection import hidden, project, splat_depth
+from shapecat.colour_types import LensCamera
+from shapecat.geometry import IDENTITY, rotation_from_quaternion
+from shapecat.lenses import distort, undistorted_rays
+from shapecat.types import Camera, Frame, Pose
+
+DEPTH = Camera(160, 120, 140.0, 141.0, 80.3, 58.9)
+LENS = LensCamera(
+    Camera(240, 200, 205.0, 207.0, 121.4, 96.2), "plumb_bob", (0.11, -0.24, 0.002, -0.001, 0.08)
+)
+TURNED = Pose(rotation_from_quaternion((0.03, -0.05, 0.02, 1.0)), np.array([-0.05, 0.02, 0.01]))
+
+
+def test_a_worked_example_of_a_turned_camera_with_a_lens() -> None:
+    """A wrong order of turning, shifting and bending moves every mask; computed by hand."""
+    quarter = Pose(np.array([[0.0, 1, 0], [-1, 0, 0], [0, 0, 1]]), np.array([0.1, 0.2, 0.5]))
+    lens = LensCamera(
+        Camera(640, 480, 400.0, 300.0, 310.0, 250.0), "plumb_bob", (0.2, 0, 0.01, 0, 0)
+    )
+    # (0.3, -0.4, 1.5) turns to (-0.4, -0.3, 1.5), shifts to (-0.3, -0.1, 2.0): x = -.15, y = -.05.
+    # r = .025, radial = 1.005: x' = -.15075 + .02 * .0075 = -.1506;
+    # y' = -.05025 + .01 * (.025 + .005) = -.04995.
+    expected = [[310 - 0.1506 * 400, 250 - 0.04995 * 300, 2.0]]
+
+    np.testing.assert_allclose(
+        project(np.array([[0.3, -0.4, 1.5]]), lens, quarter), expected, rtol=1e-6
+    )
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial", "equidistant"])
+def test_lenses_bend_and_straighten_alike(model: str) -> None:
+    """One of the two directions is used by depth images, the other by masks."""
+    coefficients = (0.1, -0.05, 0.001, -0.002, 0.01, 0.02, -0.01, 0.003)
+    rays = undistorted_rays(LENS.pinhole, model, coefficients)
+    assert rays is not None
+    seen = distort(rays, model, coefficients)
+    v, u = np.mgrid[:200, :240]
+    pixels = seen * (205.0, 207.0) + (121.4, 96.2)
+    np.testing.assert_allclose(pixels, np.stack([u, v], axis=-1), atol=1e-3)
+
+
+def test_what_a_lens_cannot_show_is_not_shown() -> None:
+    """A polynomial turns back far from the axis and would paint the walls onto the table."""
+    lens = LensCamera(LENS.pinhole, "plumb_bob", (-0.4, 0.0, 0.0, 0.0, 0.0))
+    points = np.array([[0.2, 0, 1.0], [2.5, 0, 1.0], [0, 0, -1.0], [np.nan, 0, 1]])
+    seen = project(points, lens, IDENTITY)
+    assert np.isfinite(seen[:, 0]).tolist() == [True, False, False, False]
+
+
+def test_the_painted_image_agrees_with_projected_points() -> None:
+    """The kernel and the plain projection are one camera: every lone pixel lands in its place."""
+    depth = np.zeros((120, 160), np.float32)
+    labels = np.zeros((120, 160), np.int32)
+    rng = np.random.default_rng(3)
+    rows, columns = np.mgrid[8:112:13, 8:152:13]
+    depth[rows, columns] = rng.uniform(0.5, 1.5, rows.shape)
+    labels[rows, columns] = 1 + np.arange(rows.size).reshape(rows.shape)
+    frame = Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH)
+    painted = splat_depth(depth, DEPTH, labels, LENS, TURNED)
+
+    seen = project(frame.xyz(), LENS, TURNED)
+    found = 0
+    for label, index in zip(
+        labels[rows, columns].ravel(), (rows * 160 + columns).ravel(), strict=True
+    ):
+        v, u = np.nonzero(painted.labels == label)
+        if v.size and 3 < seen[index, 0] < 236 and 3 < seen[index, 1] < 196:
+            assert abs(u.mean() + painted.left - seen[index, 0]) <= 0.51
+            assert abs(v.mean() + painted.top - seen[index, 1]) <= 0.51
+            found += 1
+    assert found > 40
+
+
+def two_boards() -> tuple[Frame, Any, Any]:
+    """Return a near board in front of the left of a far one, before a wall."""
+    depth = np.full((120, 160), 2.0, np.float32)
+    depth[30:90, 40:120] = 1.0  # far board
+    depth[40:80, 20:60] = 0.6  # near board
+    pixels = np.arange(depth.size).reshape(depth.shape)
+    near = pixels[40:80, 20:60].ravel()
+    far = np.setdiff1d(pixels[30:90, 40:120], near)
+    return Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH), near, far
+
+
+def test_what_the_colour_camera_does_not_see_gets_no_mask() -> None:
+    """From 20 cm to the left the near board covers more of the far one: it must not be painted."""
+    frame, near, far = two_boards()
+    lens = LensCamera(Camera(320, 240, 280.0, 282.0, 160.6, 117.8))
+    shift = Pose(np.eye(3), np.array([0.2, 0.0, 0.0]))  # the colour camera is to the left
+    front, back = dense_masks(frame, (near, far), lens, shift)
+
+    assert not (front.full(240, 320) & back.full(240, 320)).any()
+    # Their left and right ends by the pinhole: 140 px / 0.6 m and 140 px / 1 m, twice as fine.
+    shift_near, shift_far = 280 * 0.2 / 0.6, 280 * 0.2 / 1.0
+    assert abs(front.left - (2 * 19.5 + shift_near)) <= 1.5
+    assert abs(front.left + front.box[2] - (2 * 59.5 + shift_near)) <= 1.5
+    row = back.full(240, 320)[120]
+    assert abs(np.flatnonzero(row)[0] - (2 * 59.5 + shift_near)) <= 1.5
+    assert abs(np.flatnonzero(row)[-1] - (2 * 119.5 + shift_far)) <= 1.5
+    points = frame.xyz()
+    seen = project(points, lens, shift)
+    assert frame.depth is not None
+    painted = splat_depth(frame.depth, DEPTH, np.ones((120, 160), np.int32), lens, shift)
+    covered = hidden(seen, painted).reshape(120, 160)
+    assert covered[60, 64]  # on the far board, right of the near one as the depth camera sees it
+    assert not covered[60, 110]
+    assert not covered[60, 30]
+
+
+def test_masks_have_no_holes_of_pixels_but_those_of_the_object() -> None:
+    """Finer images than the depth have gaps between its pixels; a handle's hole is none of them."""
+    depth = np.full((120, 160), 1.0, np.float32)
+    ring = np.zeros(depth.shape, bool)
+    ring[30:90, 40:110] = True
+    ring[50:70, 60:90] = False  # a window through which the wall is seen
+    depth[50:70, 60:90] = 1.3
+    rng = np.random.default_rng(0)
+    lost = rng.random(depth.shape) < 0.05
+    depth[lost] = 0
+    frame = Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH)
+    (mask,) = dense_masks(frame, (np.flatnonzero(ring & ~lost),), LENS, TURNED)
+
+    middle = project(np.array([[-0.04, 0.01, 1.3], [-0.2, 0.01, 1.0]]), LENS, TURNED)
+    full = mask.full(200, 240)
+    (hole_u, hole_v), (on_u, on_v) = np.rint(middle[:, :2]).astype(int)
+    assert not full[hole_v - 4 : hole_v + 5, hole_u - 4 : hole_u + 5].any()
+    assert full[on_v - 6 : on_v + 7, on_u - 6 : on_u + 7].all()
+    (registered,) = dense_masks(frame, (np.flatnonzero(ring & ~lost),))
+    solid = registered.full(120, 160)
+    assert solid[32:48, 42:108].all()
+    assert not solid[55:65, 65:85].any()
+
+
+def test_masks_of_two_objects_never_share_a_pixel_nor_swallow_the_table() -> None:
+    """Closing gaps must not join what stands side by side, nor what the table separates."""
+    seen = np.zeros((20, 40), np.int32)
+    seen[5:15, 5:15], seen[5:15, 17:27] = 1, 2
+    seen[9, 10] = seen[10, 20] = 0  # a pixel each
+    seen[:, 30:] = -1
+    one, two = labelled_masks(seen, 2)
+    assert (one.box, two.box) == ((5, 5, 10, 10), (17, 5, 10, 10))
+    assert one.area == two.area == 88  # of squares, whose corners are rounded
+
+
+def test_parts_of_an_object_are_united() -> None:
+    """A track that a person merged has one mask."""
+    seen = np.zeros((20, 40), np.int32)
+    seen[2:6, 3:9], seen[10:13, 20:31] = 1, 2
+    one, two = labelled_masks(seen, 2)
+    both = united((one, NOTHING, two))
+    np.testing.assert_array_equal(both.full(20, 40), one.full(20, 40) | two.full(20, 40))
+    assert both.box == (4, 2, 25, 11)
+    assert united(()).area == 0
+    assert Mask(0, 0, np.zeros((0, 0), bool)).box == (0, 0, 0, 0)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sensor", ["kinect", "realsense"])
+def test_masks_agree_with_what_the_simulated_colour_camera_sees(
+    tmp_path: Path, sensor: Literal["kinect", "realsense"]
+) -> None:
+    """The whole chain: lens, transform, occlusion, sensor faults; truth by the renderer."""
+    from shapecat.simulation import simulate  # noqa: PLC0415  slow to load
+
+    scores = []
+    for seed, scene in enumerate(("tabletop", "clutter", "tabletop", "clutter"), start=21):
+        path = tmp_path / f"{seed}.mcap"
+        simulate(path, scene=scene, frames=1, seed=seed, sensor=sensor, color=True)  # type: ignore[arg-type]
+        scores += overlaps(path)
+    assert len(scores) > 25
+    assert np.mean(scores) >= 0.9
+
+
+def overlaps(path: Path) -> list[float]:
+    """Return the intersection over union of the mask of each object with what is true."""
+    from shapecat.recordings import choose_streams, open_recording  # noqa: PLC0415  slow to load
+    from shapecat.recordings.colour_frames import frames_with_colour  # noqa: PLC0415  the same
+    from shapecat.recordings.colour_streams import choose_colour  # noqa: PLC0415  the same
+
+    labels = np.load(path.with_suffix(".labels.npz"))["labels"]
+    truth = np.load(path.with_suffix(".color_labels.npz"))["labels"]
+    scores = []
+    with open_recording(path) as recording:
+        (stream,) = choose_streams(recording)
+        colour = choose_colour(recording, stream)
+        assert colour is not None
+        colours = {stream.topic: colour}
+        for frame, view in frames_with_colour(recording, [stream], colours, skipped=Counter()):
+            assert view is not None
+            own, other = labels[frame.index].ravel(), truth[frame.index]
+            ids = [int(i) for i in np.unique(own) if i >= 20 and (own == i).sum() >= 100]
+            objects = [np.flatnonzero(own == i) for i in ids]
+            masks = dense_masks(frame, objects, view.lens, view.colour_from_depth)
+            for i, mask in zip(ids, masks, strict=True):
+                full = mask.full(*other.shape)
+                scores.append(float((full & (other == i)).sum() / (full | (other == i)).sum()))
+    return scores

@@ -1,0 +1,262 @@
+"""Colour in a run: its masks, the review, the annotated recording."""
+
+import json
+import shutil
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from click.testing import Result
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+import shapecat.pipeline
+from shapecat.colour.masks import Mask
+from shapecat.colour.rle import rle_counts, rle_mask, rle_text
+from shapecat.colour_types import ColourImage, ColourView
+from shapecat.errors import NoStreamError
+from shapecat.outputs.colouring import Coloured
+from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encoder_for
+from shapecat.outputs.review import write_review
+from shapecat.recordings.protobuf import message_decoder
+from shapecat.runs.corrections import read_labels
+from shapecat.runs.jobs import Job
+from shapecat.runs.masks import read_masks
+from tests.colour_messages import gradient, png
+from tests.conftest import Guesser
+from tests.test_exports import relabel
+from tests.test_review import TOPIC, labelled_object, rows, scene, stamp
+
+IMAGES = "/camera/color/image_raw/compressed"
+FRAMES = 4
+
+
+@pytest.fixture
+def run(coloured_run: Path) -> Path:
+    """Return a run with colour."""
+    return coloured_run
+
+
+def recorded(path: Path, topic: str) -> list[tuple[int, Any]]:
+    """Return log time and decoded message of a topic."""
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        found = reader.iter_decoded_messages(topics=[topic])
+        return [(message.log_time, decoded) for _, _, message, decoded in found]
+
+
+def test_masks_of_the_run_are_where_the_objects_are(run: Path) -> None:
+    """From recording to table: every clear object of the truth has its mask in every image."""
+    source = run.parents[1] / "table.mcap"
+    truth = np.load(source.with_suffix(".color_labels.npz"))["labels"]
+    found = list(read_masks(run))
+    assert [masks.key[1] for masks in found] == list(range(FRAMES))
+    best = []
+    for masks in found:
+        labels = truth[masks.key[1]]
+        assert (masks.height, masks.width) == labels.shape
+        own = [masks.mask([number]).full(*labels.shape) for number in masks.counts]
+        for label in np.unique(labels[labels >= 20]):
+            seen = labels == label
+            if seen.sum() > 2000:
+                best.append(max(float((seen & m).sum() / (seen | m).sum()) for m in own))
+    assert len(best) > 4 * FRAMES
+    assert np.median(best) > 0.85
+
+
+def test_boxes_of_the_table_are_those_of_its_masks(run: Path) -> None:
+    """Annotations use the boxes alone, exports the masks: they must not disagree."""
+    masks = next(iter(read_masks(run)))
+    for number, box in masks.boxes.items():
+        assert masks.mask([number]).box == box
+    numbers = list(masks.boxes)[:2]
+    assert masks.box(numbers) == masks.mask(numbers).box
+    assert masks.box([999]) is None
+    assert masks.mask([999]).area == 0
+
+
+def test_the_review_holds_images_as_they_came_and_boxes_of_the_tracks(run: Path) -> None:
+    """A second compression would blur what people look at; a wrong box misleads them."""
+    entity = "/images//camera/depth/image_raw"
+    source = run.parents[1] / "table.mcap"
+    stored = [bytes(bytearray(row["EncodedImage:blob"][0])) for row in _rows(run, entity)]
+    assert stored == [bytes(message.data) for _, message in recorded(source, IMAGES)]
+    boxes = _rows(run, f"{entity}/boxes")
+    captions = _rows(run, f"{entity}/captions")
+    labels = read_labels(run / "tracks.csv")
+    for masks, box, caption in zip(read_masks(run), boxes, captions, strict=True):
+        assert len(box["Boxes2D:half_sizes"]) == len(caption["Points2D:labels"]) > 0
+        shown = {text.split()[0] for text in caption["Points2D:labels"]}
+        assert shown <= {f"#{label.track}" for label in labels.values()}
+        left, top, width, height = next(iter(masks.boxes.values()))
+        middles = np.array(box["Boxes2D:centers"])
+        wanted = [left + width / 2, top + height / 2]
+        assert np.abs(middles - wanted).max(axis=1).min() < 0.01
+    layers = _rows(run, f"{entity}/masks")
+    assert all(bytes(bytearray(r["EncodedImage:blob"][0])).startswith(b"\x89PNG") for r in layers)
+
+
+def _rows(run: Path, entity: str) -> list[dict[str, Any]]:
+    return [row for row in rows(run / "review.rrd", entity) if len(row) > 2]
+
+
+def test_annotations_on_images_have_the_stamp_and_frame_of_the_image(run: Path) -> None:
+    """Foxglove draws what has the very stamp of the image, and nothing else."""
+    images = recorded(run / "annotated.mcap", IMAGES)
+    found = recorded(run / "annotated.mcap", "/shapecat/detections_2d")
+    drawn = recorded(run / "annotated.mcap", "/shapecat/image_annotations")
+    assert len(images) == len(found) == len(drawn) == FRAMES
+    for masks, (time, image), (time_2d, array), (_, drawing) in zip(
+        read_masks(run), images, found, drawn, strict=True
+    ):
+        assert time == time_2d
+        assert array.header.stamp.sec == image.header.stamp.sec
+        assert array.header.stamp.nanosec == image.header.stamp.nanosec
+        assert array.header.frame_id == image.header.frame_id == "camera_color_optical_frame"
+        assert len(array.detections) == len(drawing.points) == len(drawing.texts) > 3
+        boxes = set(masks.boxes.values())
+        for one, points, text in zip(array.detections, drawing.points, drawing.texts, strict=True):
+            left = one.bbox.center.position.x - one.bbox.size_x / 2
+            top = one.bbox.center.position.y - one.bbox.size_y / 2
+            assert (left, top, one.bbox.size_x, one.bbox.size_y) in boxes
+            assert (points.points[0].x, points.points[0].y) == (left, top)
+            assert (points.points[2].x, points.points[2].y) == (
+                left + one.bbox.size_x,
+                top + one.bbox.size_y,
+            )
+            assert points.type == 2
+            assert text.text.startswith(f"#{one.id} {one.results[0].hypothesis.class_id} ")
+
+
+def test_corrections_reach_the_images(run: Path, tmp_path: Path) -> None:
+    """A deleted track must go from the images too, and the masks are not made again for it."""
+    folder = tmp_path / "table"
+    shutil.copytree(run, folder)
+    relabel(folder, {1: "delete", 2: "wine glass"})
+    before = (folder / "masks.parquet").stat().st_mtime_ns
+    shapecat.pipeline.annotate_again(folder, None)
+
+    arrays = [m for _, m in recorded(folder / "annotated.mcap", "/shapecat/detections_2d")]
+    shown = [(d.id, d.results[0].hypothesis.class_id) for a in arrays for d in a.detections]
+    assert ("2", "wine glass") in shown
+    assert "1" not in {track for track, _ in shown}
+    assert (folder / "masks.parquet").stat().st_mtime_ns == before
+
+
+def test_colour_can_be_left_out_and_a_wrong_topic_is_refused(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shapecat: Callable[..., Result]
+) -> None:
+    """Who names a topic that holds no images learns so before the work, not after."""
+    from shapecat.pipeline import process  # noqa: PLC0415  the fixture has the name
+
+    monkeypatch.setattr("shapecat.pipeline.load_model", lambda _path: Guesser())
+    source = run.parents[1] / "table.mcap"
+    process(Job(source=source, folder=tmp_path / "a", color="", rrd=False, end_s=0.04))
+    assert not (tmp_path / "a" / "masks.parquet").exists()
+    assert not recorded(tmp_path / "a" / "annotated.mcap", "/shapecat/detections_2d")
+    with pytest.raises(NoStreamError, match="/tf holds no colour images; colour images: /camera"):
+        process(Job(source=source, folder=tmp_path / "b", color="/tf"))
+    result = shapecat("process", source, "--out", tmp_path, "--color", "/x", "--no-color")
+    assert result.exit_code == 2
+    assert "contradict" in result.stderr
+
+
+def test_run_json_names_the_colour_images(run: Path) -> None:
+    about = json.loads((run / "run.json").read_text())
+    assert about["color"] == {"/camera/depth/image_raw": IMAGES}
+    assert about["counts"]["color"] == FRAMES
+    assert pq.read_table(run / "masks.parquet").num_rows == FRAMES
+
+
+DRAWING = ImageFrame(
+    1_700_000_000_123_456_789,
+    5,
+    "optical",
+    (ImageBox(6, "cup", 0.97, (11, 22, 33, 44)), ImageBox(7, "unknown", 0.5, (0, 0, 5, 3))),
+)
+
+
+def test_annotations_in_json_and_protobuf_say_the_same() -> None:
+    """Read back by the schema that is embedded, as Foxglove does."""
+    ((as_json, encode),) = image_encoder_for("json")
+    plain = json.loads(encode(DRAWING))
+    validate: Any = import_module("jsonschema").validate
+    validate(plain, json.loads(as_json.schema))
+    ((packed, pack),) = image_encoder_for("protobuf")
+    decode = message_decoder(packed.schema, packed.schema_name)
+    message = decode(pack(DRAWING))
+
+    assert as_json.schema_name == packed.schema_name == "foxglove.ImageAnnotations"
+    assert len(plain["points"]) == len(plain["texts"]) == 2
+    first = plain["points"][0]
+    assert [(p["x"], p["y"]) for p in first["points"]] == [(11, 22), (44, 22), (44, 66), (11, 66)]
+    assert [(p.x, p.y) for p in message.points[0].points] == [
+        (11, 22),
+        (44, 22),
+        (44, 66),
+        (11, 66),
+    ]
+    assert message.points[0].type == first["type"] == 2
+    assert first["timestamp"] == {"sec": 1_700_000_000, "nsec": 123_456_789}
+    assert message.texts[0].text == plain["texts"][0]["text"] == "#6 cup 0.97"
+
+
+def test_run_lengths_are_those_of_coco_and_come_back() -> None:
+    """Whoever trains reads column by column; a row-wise mask would be noise."""
+    rng = np.random.default_rng(5)
+    for height, width in ((7, 9), (1, 6), (6, 1), (40, 31)):
+        for share in (0.0, 0.3, 0.8, 1.0):
+            full = rng.random((height, width)) < share
+            inside = np.argwhere(full)
+            if len(inside):
+                (top, left), (bottom, right) = inside.min(axis=0), inside.max(axis=0) + 1
+                mask = Mask(int(left), int(top), full[top:bottom, left:right])
+            else:
+                mask = Mask(0, 0, np.zeros((0, 0), bool))
+            counts = rle_counts(mask, height, width)
+            flat = full.T.ravel()
+            runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[-1], flat, [-1]]))))
+            expected = runs if len(flat) and not flat[0] else np.concatenate([[0], runs])
+            np.testing.assert_array_equal(counts, expected)
+            back = rle_mask(counts, height, width)
+            np.testing.assert_array_equal(back.full(height, width), full)
+            assert back.box == mask.box
+    with pytest.raises(ValueError, match="run lengths of 5 pixels"):
+        rle_mask(np.array([5]), 2, 3)
+    # The example of a 3 x 4 image in the docstring, and COCO's text of larger differences.
+    assert rle_text(np.array([3, 2, 1, 1, 5])) == "321O4"
+
+
+def test_a_damaged_image_costs_the_review_only_itself(tmp_path: Path) -> None:
+    """The size of a file may be right and its content not: the frame is shown without colour."""
+    whole = png(gradient())
+    half, views = len(whole) // 2, []
+    for k, data in enumerate((whole, whole[:half] + bytes(20) + whole[half + 20 :])):
+        image = ColourImage("/color", stamp(k), stamp(k), "optical", "png", 64, 48, 0, data)
+        views.append(Coloured(ColourView(image), (Mask(3, 4, np.ones((5, 6), bool)),)))
+    scenes = [(*scene(k, [labelled_object(1)]), view) for k, view in enumerate(views)]
+    path = tmp_path / "review.rrd"
+    write_review(
+        path,
+        scenes,
+        name="lab",
+        run={},
+        categories=("cup", "can"),
+        cloud_points=1000,
+        fixed_frame=None,
+        threads=2,
+    )
+
+    entity = f"/images/{TOPIC}"
+    images = [row for row in rows(path, entity) if row.get("EncodedImage:blob")]
+    assert [row["frame"] for row in images] == [0]
+    (box,) = (row for row in rows(path, f"{entity}/boxes") if row.get("Boxes2D:centers"))
+    assert np.allclose(box["Boxes2D:centers"], [[6, 6.5]])
+    assert np.allclose(box["Boxes2D:half_sizes"], [[3, 2.5]])
+    texts = [row["TextLog:text"][0] for row in rows(path, "/log")]
+    assert any(text.startswith("/color: png image is damaged") for text in texts)
+    assert len(rows(path, f"/world/{TOPIC}/scene")) == 2

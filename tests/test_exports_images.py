@@ -1,0 +1,311 @@
+"""Data sets of images: what lands in them, read back as trainers read them."""
+
+import csv
+import io
+import json
+import shutil
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import Result
+from PIL import Image, ImageDraw
+
+from shapecat.colour.masks import Mask
+from shapecat.colour.outline import joined, outlines
+from shapecat.errors import OutputError
+from shapecat.outputs.dataset_frames import Selection, split_runs
+from shapecat.outputs.exports import export_dataset, export_run
+from shapecat.outputs.rereading import FinishedRun, read_finished
+from shapecat.recordings.colour_image import encoded
+from shapecat.runs.masks import read_masks
+from tests.test_colour_outputs import IMAGES, recorded
+from tests.test_exports import relabel
+
+Run = Callable[..., Result]
+
+
+@pytest.fixture(scope="module")
+def run(coloured_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Correct a run: one track deleted, one a new category with a blank."""
+    folder = tmp_path_factory.mktemp("corrected") / "table"
+    shutil.copytree(coloured_run, folder)
+    relabel(folder, {1: "delete", 2: "wine glass"})
+    return folder
+
+
+def read_coco(out: Path, split: str = "train") -> dict[str, Any]:
+    found: dict[str, Any] = json.loads((out / f"annotations/instances_{split}.json").read_text())
+    return found
+
+
+def decoded(segmentation: dict[str, Any]) -> np.ndarray:
+    """Read COCO's compressed run lengths, as its rleFrString describes them."""
+    counts: list[int] = []
+    letters = iter(segmentation["counts"])
+    for letter in letters:
+        number, shift, value = 0, 0, ord(letter) - 48
+        while True:
+            number |= (value & 31) << shift
+            shift += 5
+            if not value & 32:
+                break
+            value = ord(next(letters)) - 48
+        if value & 16:
+            number -= 1 << shift
+        counts.append(number + (counts[-2] if len(counts) > 2 else 0))
+    height, width = segmentation["size"]
+    flat = np.repeat(np.arange(len(counts)) % 2 == 1, counts)
+    return flat.reshape(width, height).T
+
+
+def test_coco_holds_images_as_they_came_and_the_masks_of_the_tracks(
+    run: Path, tmp_path: Path
+) -> None:
+    """Every number in the file is one that a trainer relies on."""
+    count = export_dataset([run], "coco", tmp_path / "out", Selection())
+
+    data = read_coco(tmp_path / "out")
+    names = {c["id"]: c["name"] for c in data["categories"]}
+    assert "wine glass" in names.values()
+    assert min(names) == 1
+    source = Path(read_finished(run).run["input"]["path"])
+    files = [tmp_path / "out/images/train" / image["file_name"] for image in data["images"]]
+    assert [f.read_bytes() for f in files] == [bytes(m.data) for _, m in recorded(source, IMAGES)]
+    assert all(
+        np.asarray(Image.open(io.BytesIO(f.read_bytes()))).shape == (720, 960, 3) for f in files
+    )
+    tracks = {row["attributes"]["track"]: names[row["category_id"]] for row in data["annotations"]}
+    assert 1 not in tracks
+    assert tracks[2] == "wine glass"
+    assert len(data["annotations"]) == count > 12
+    assert len({row["id"] for row in data["annotations"]}) == count
+    wanted = {masks.key[1]: masks for masks in read_masks(run)}
+    frames = {image["id"]: image["frame"] for image in data["images"]}
+    for row in data["annotations"]:
+        mask = decoded(row["segmentation"])
+        v, u = np.nonzero(mask)
+        box = [u.min(), v.min(), np.ptp(u) + 1, np.ptp(v) + 1]
+        assert row["bbox"] == box
+        assert row["area"] == mask.sum()
+        assert tuple(map(int, box)) in wanted[frames[row["image_id"]]].boxes.values()
+        assert row["iscrowd"] == 0
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of its compiled part
+def test_coco_is_read_by_its_own_tools(run: Path, tmp_path: Path) -> None:
+    """Where the COCO API is installed, it gives the same masks."""
+    pytest.importorskip("pycocotools")
+    export_dataset([run], "coco", tmp_path / "out", Selection())
+    coco: Any = import_module("pycocotools.coco").COCO
+    read = coco(str(tmp_path / "out/annotations/instances_train.json"))
+    for row in read.dataset["annotations"]:
+        np.testing.assert_array_equal(read.annToMask(row) > 0, decoded(row["segmentation"]))
+
+
+def test_unsure_labels_are_crowds_and_corrected_ones_always_go(run: Path, tmp_path: Path) -> None:
+    """A wrong label teaches a wrong thing; an object that is merely left out teaches one too."""
+    export_dataset([run], "coco", tmp_path / "out", Selection(corrected_only=True))
+    data = read_coco(tmp_path / "out")
+    sure = {row["attributes"]["track"] for row in data["annotations"] if not row["iscrowd"]}
+    assert sure == {2}
+    assert sum(row["iscrowd"] for row in data["annotations"]) > 5
+
+    export_dataset([run], "coco", tmp_path / "out", Selection(min_confidence=1.0))
+    data = read_coco(tmp_path / "out")
+    assert {r["attributes"]["track"] for r in data["annotations"] if not r["iscrowd"]} == {2}
+
+
+def test_yolo_polygons_cover_the_masks(run: Path, tmp_path: Path) -> None:
+    """Classes count from 0 and corners are shares of the image: both are easily mistaken."""
+    export_dataset([run], "yolo", tmp_path / "yolo", Selection())
+    export_dataset([run], "coco", tmp_path / "coco", Selection())
+    data = read_coco(tmp_path / "coco")
+    names = {c["id"]: c["name"] for c in data["categories"]}
+    text = (tmp_path / "yolo/data.yaml").read_text()
+    for number, name in names.items():
+        assert f'  {number - 1}: "{name}"\n' in text
+    assert "val: images/train\n" in text  # which must name something
+    for image in data["images"]:
+        label = (tmp_path / "yolo/labels/train" / image["file_name"]).with_suffix(".txt")
+        rows = [r for r in data["annotations"] if r["image_id"] == image["id"]]
+        for line, row in zip(label.read_text().splitlines(), rows, strict=True):
+            number, *shares = line.split()
+            assert int(number) == row["category_id"] - 1
+            corners = np.array(list(map(float, shares))).reshape(-1, 2)
+            assert corners.min() >= 0
+            assert corners.max() <= 1
+            mask, drawn = decoded(row["segmentation"]), drawing(corners * (960, 720), 720, 960)
+            assert (mask & drawn).sum() / (mask | drawn).sum() > 0.93
+
+
+def drawing(corners: Any, height: int, width: int) -> Any:
+    """Fill a polygon, four times finer than pixels."""
+    image = Image.new("L", (4 * width, 4 * height))
+    ImageDraw.Draw(image).polygon([tuple(4 * corner) for corner in corners], fill=1)
+    return np.asarray(image).reshape(height, 4, width, 4).mean(axis=(1, 3)) > 0.5
+
+
+def test_outlines_are_those_of_the_pixels() -> None:
+    """Without tolerance the area of the polygons is that of the parts, whatever their shape."""
+    rng = np.random.default_rng(2)
+    for _ in range(20):
+        pixels = np.pad(rng.random((12, 17)) < 0.4, 2)
+        pixels[0, :] = pixels[-1, :] = pixels[:, 0] = True
+        parts = outlines(Mask(30, 50, pixels), 0.0)
+        image = np.zeros((70, 60), bool)
+        for part in parts:
+            assert part.min(axis=0).tolist() >= [30, 50]
+            image |= drawing(part, 70, 60)
+        inside = image[50 : 50 + pixels.shape[0], 30 : 30 + pixels.shape[1]]
+        assert (inside | ~pixels).all()  # holes are filled, nothing is lost
+        assert not np.delete(image, np.s_[50:66], axis=0).any()
+
+
+def test_parts_of_an_object_are_linked_into_one_polygon() -> None:
+    pixels = np.zeros((20, 40), bool)
+    pixels[2:9, 3:14], pixels[10:18, 22:38] = True, True
+    parts = outlines(Mask(0, 0, pixels))
+    assert len(parts) == 2
+    drawn = drawing(joined(parts), 20, 40)
+    assert (drawn & pixels).sum() / (drawn | pixels).sum() > 0.95
+
+
+def test_depth_images_are_millimetres_with_their_own_masks(run: Path, tmp_path: Path) -> None:
+    """Recordings without colour give data sets too, and depth keeps its 16 bits."""
+    export_dataset([run], "coco", tmp_path / "out", Selection(depth=True))
+    data = read_coco(tmp_path / "out")
+    source = Path(read_finished(run).run["input"]["path"])
+    (first, *_), messages = data["images"], recorded(source, "/camera/depth/image_raw")
+    pixels = np.asarray(Image.open(tmp_path / "out/images/train" / first["file_name"]))
+    stored = np.frombuffer(bytes(messages[0][1].data), "<u2").reshape(480, 640)
+    np.testing.assert_array_equal(pixels, stored)
+    assert all(row["segmentation"]["size"] == [480, 640] for row in data["annotations"])
+
+
+def test_a_run_without_colour_says_what_to_do(
+    guessed_run: Path, tmp_path: Path, shapecat: Run
+) -> None:
+    result = shapecat("export", guessed_run, "--format", "coco", "--out", tmp_path / "out")
+    assert result.exit_code == 1
+    assert "no colour images; --depth exports depth images" in result.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_several_runs_make_one_data_set_split_by_recording(
+    run: Path, coloured_run: Path, tmp_path: Path
+) -> None:
+    """Frames of one recording in both splits would make any model look good."""
+    other = tmp_path / "other"
+    shutil.copytree(coloured_run, other)
+    about = json.loads((other / "run.json").read_text())
+    about["input"]["digest"] = "xxh3-128:another"
+    (other / "run.json").write_text(json.dumps(about))
+    count = export_dataset([run, other], "coco", tmp_path / "out", Selection(val=0.5))
+
+    both = [read_coco(tmp_path / "out", split) for split in ("train", "val")]
+    recordings = [{image["recording"] for image in part["images"]} for part in both]
+    assert sorted(name for part in recordings for name in part) == ["other", "table"]
+    assert sum(len(part["annotations"]) for part in both) == count
+    tracks = [{row["track_id"] for row in part["annotations"]} for part in both]
+    assert not tracks[0] & tracks[1]
+    assert both[0]["categories"] == both[1]["categories"]
+
+
+def test_a_recording_is_never_in_both_splits() -> None:
+    def finished(name: str, digest: str) -> FinishedRun:
+        return FinishedRun(Path(name), {"input": {"digest": digest}}, {})
+
+    runs = [finished(f"r{k}", f"d{k // 2}") for k in range(20)]
+    splits = split_runs(runs, 0.3)
+    assert all(splits[k] == splits[k + 1] for k in range(0, 20, 2))
+    assert splits.count("val") == 6
+    assert split_runs(runs[::-1], 0.3) == splits[::-1]
+    assert split_runs(runs[:1], 0.9) == ["train"]
+    with pytest.raises(ValueError, match="val must be"):
+        split_runs(runs, 1.0)
+
+
+def test_frames_are_thinned_by_number_and_by_novelty_of_view(run: Path, tmp_path: Path) -> None:
+    export_dataset([run], "coco", tmp_path / "every", Selection(every=2))
+    assert [i["frame"] for i in read_coco(tmp_path / "every")["images"]] == [0, 2]
+    export_dataset([run], "coco", tmp_path / "track", Selection(per_track=1, corrected_only=True))
+    (image,) = read_coco(tmp_path / "track")["images"]
+    seen = [(m.boxes, m.key[1]) for m in read_masks(run)]
+    assert image["frame"] in {frame for _, frame in seen}
+
+
+def test_only_an_earlier_export_is_replaced(run: Path, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    export_dataset([run], "coco", out, Selection())
+    export_dataset([run], "coco", out, Selection(every=2))
+    assert len(read_coco(out)["images"]) == 2
+    with pytest.raises(OutputError, match="holds coco, not an earlier yolo export"):
+        export_dataset([run], "yolo", out, Selection())
+    with pytest.raises(OutputError, match="holds something else"):
+        export_dataset([run], "coco", run, Selection())
+
+
+def test_options_of_data_sets_are_refused_elsewhere(
+    run: Path, tmp_path: Path, shapecat: Run
+) -> None:
+    result = shapecat("export", run, "--format", "kitti", "--out", tmp_path, "--corrected-only")
+    assert result.exit_code == 2
+    assert "--corrected-only is for --format coco and yolo, not kitti" in result.stderr
+
+
+def test_kitti_boxes_project_onto_the_colour_image(run: Path, tmp_path: Path) -> None:
+    """P2, the 3D boxes and the image are three files that must tell of one camera."""
+    export_run(run, "kitti", tmp_path)
+    folder = tmp_path / "table"
+    with (folder / "frames.csv").open() as file:
+        numbers = [row["number"] for row in csv.DictReader(file)]
+    source = Path(read_finished(run).run["input"]["path"])
+    labels = np.load(source.with_suffix(".color_labels.npz"))["labels"]
+    checked = 0
+    for k, number in enumerate(numbers):
+        picture = np.asarray(Image.open(folder / "image_2" / f"{number}.png"))
+        assert picture.shape == (720, 960, 3)
+        lines = (folder / "calib" / f"{number}.txt").read_text().splitlines()
+        rows = dict(line.split(": ") for line in lines if line)
+        p2 = np.array(list(map(float, rows["P2"].split()))).reshape(3, 4)
+        for line in (folder / "label_2" / f"{number}.txt").read_text().splitlines():
+            values = list(map(float, line.split()[1:]))
+            left, top, right, bottom = values[3:7]
+            h, w, length, x, y, z, yaw = values[7:14]
+            half = np.array([length, 0, w]) / 2
+            corners = np.array([[i, j, m] for i in (-1, 1) for j in (0, -1) for m in (-1, 1)])
+            local = corners * (half + np.array([0, h, 0]))
+            c, s = np.cos(yaw), np.sin(yaw)
+            turned = local @ np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]]).T + (x, y, z)
+            seen = np.column_stack([turned, np.ones(8)]) @ p2.T
+            u, v = (seen[:, :2] / seen[:, 2:]).T
+            if right < 955 and bottom < 715 and left > 5 and top > 5:
+                assert u.min() - 6 <= left <= right <= u.max() + 6
+                assert v.min() - 6 <= top <= bottom <= v.max() + 6
+                # The lens bends by a few pixels: the middle of a box is on something.
+                middle = labels[k, int((top + bottom) / 2), int((left + right) / 2)]
+                checked += middle >= 20
+    assert checked > 10
+
+
+def test_a_damaged_image_costs_only_itself(run: Path, tmp_path: Path, monkeypatch: Any) -> None:
+    """One bad frame among thousands must not end the export."""
+    from shapecat.outputs import dataset_frames  # noqa: PLC0415  to be changed
+    from shapecat.recordings import MessageError  # noqa: PLC0415  the same
+
+    calls = iter(range(99))
+    whole = encoded
+
+    def failing(image: Any) -> tuple[str, bytes]:
+        if next(calls) == 1:
+            msg = "jpeg image is damaged"
+            raise MessageError(msg)
+        return whole(image)
+
+    monkeypatch.setattr(dataset_frames, "encoded", failing)
+    export_dataset([run], "coco", tmp_path / "out", Selection())
+    assert [i["frame"] for i in read_coco(tmp_path / "out")["images"]] == [0, 2, 3]

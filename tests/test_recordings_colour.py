@@ -1,0 +1,341 @@
+"""Colour streams: found, decoded, paired in time, placed beside the depth camera."""
+
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from rosbags.rosbag1 import Writer as Bag
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+
+from shapecat.colour_types import ColourImage, ColourView
+from shapecat.errors import NoStreamError
+from shapecat.geometry import rotation_from_quaternion
+from shapecat.recordings import choose_streams, open_recording
+from shapecat.recordings.colour_frames import frames_with_colour
+from shapecat.recordings.colour_image import cloud_colours, pixels_of
+from shapecat.recordings.colour_streams import choose_colour
+from shapecat.recordings.messages import MessageError
+from shapecat.recordings.overview import describe_recording
+from shapecat.types import Camera, Frame
+from tests.colour_messages import gradient, jpeg, packed, png, raw
+from tests.messages import (
+    EPOCH,
+    STORE,
+    cloud,
+    header,
+    image,
+    info,
+    make,
+    organized_points,
+    wavy_depth,
+    write,
+)
+
+MS = 10**6
+WIDE = Camera(80, 60, 71.0, 72.0, 40.2, 29.1)
+Pairs = list[tuple[Frame, ColourView | None]]
+
+
+def read(path: Path, wanted: str | None = None, **chosen: Any) -> tuple[Pairs, list[str]]:
+    with open_recording(path) as recording:
+        streams = choose_streams(recording)
+        found = {s.topic: choose_colour(recording, s, wanted) for s in streams}
+        colours = {topic: one for topic, one in found.items() if one is not None}
+        pairs = list(frames_with_colour(recording, streams, colours, skipped=Counter(), **chosen))
+        return pairs, recording.warnings
+
+
+def depth_items(*stamps: int, frame_id: str = "camera") -> list[tuple[str, int, Any]]:
+    items: list[tuple[str, int, Any]] = []
+    for stamp in stamps:
+        items.append(("/cam/depth/camera_info", stamp, info(stamp)))
+        items.append(("/cam/depth/image_raw", stamp, image(stamp, wavy_depth(), frame_id=frame_id)))
+    return items
+
+
+def in_order(items: list[tuple[str, int, Any]]) -> list[tuple[str, int, Any]]:
+    return sorted(items, key=lambda item: item[1])
+
+
+def static(parent: str, child: str, translation: Any, quaternion: Any) -> Any:
+    transform = make(
+        "geometry_msgs/msg/Transform",
+        make("geometry_msgs/msg/Vector3", *translation),
+        make("geometry_msgs/msg/Quaternion", *quaternion),
+    )
+    stamped = make("geometry_msgs/msg/TransformStamped", header(EPOCH, parent), child, transform)
+    return make("tf2_msgs/msg/TFMessage", [stamped])
+
+
+def beside(path: Path, *more: tuple[str, int, Any], frame_id: str = "color_optical") -> Path:
+    """Write a depth image with a colour image of another camera."""
+    items = depth_items(EPOCH)
+    items += [("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE, (0.1, -0.2, 0.001, 0.002, 0.0)))]
+    colours = raw(EPOCH, gradient(60, 80), "rgb8", frame_id)
+    return write(path, in_order([*items, *more, ("/cam/color/image_raw", EPOCH + 1, colours)]))
+
+
+@pytest.mark.parametrize(
+    ("encoding", "data"),
+    [
+        ("rgb8", gradient()),
+        ("bgr8", gradient()[..., ::-1]),
+        ("rgba8", np.concatenate([gradient(), np.full((48, 64, 1), 7, np.uint8)], axis=-1)),
+        ("bgra8", np.concatenate([gradient()[..., ::-1], np.zeros((48, 64, 1), "u1")], axis=-1)),
+        ("rgb16", gradient().astype("<u2") * 256 + 99),
+    ],
+)
+def test_raw_images_of_every_channel_order_give_the_same_pixels(encoding: str, data: Any) -> None:
+    """A swapped channel makes a red cup blue, in every data set that is trained on."""
+    message = raw(EPOCH, data, encoding)
+    found = ColourImage("", 0, 0, "", encoding, 64, 48, message.step, bytes(message.data))
+
+    np.testing.assert_array_equal(pixels_of(found), gradient())
+
+
+def test_mosaics_and_brightness_with_chroma_become_colours() -> None:
+    """Blocks of one colour come back as that colour, whatever the sensor's layout."""
+    red, green, blue = 200, 120, 40
+    mosaic = np.zeros((6, 8), np.uint8)
+    mosaic[::2, 1::2], mosaic[1::2, ::2] = red, blue  # grbg
+    mosaic[::2, ::2] = mosaic[1::2, 1::2] = green
+    y = 0.299 * red + 0.587 * green + 0.114 * blue
+    u, v = 128 + 0.564 * (blue - y), 128 + 0.713 * (red - y)
+    uyvy = np.tile(np.round([u, y, v, y]), (6, 4)).astype(np.uint8)
+    for encoding, data in (("bayer_grbg8", mosaic), ("yuv422", uyvy)):
+        width = data.shape[1] // (1 if data is mosaic else 2)
+        found = ColourImage("", 0, 0, "", encoding, width, 6, data.shape[1], data.tobytes())
+        pixels = pixels_of(found).astype(int)
+        assert np.abs(pixels - [red, green, blue]).max() <= 2
+
+
+def test_packed_colours_of_points_are_read_by_their_own_offset() -> None:
+    """The float of PCL holds 0x00RRGGBB; reading it as a number gives black objects."""
+    points = organized_points(wavy_depth())
+    data = np.zeros((48, 64), np.dtype([("xyz", "<f4", 3), ("pad", "<f4"), ("rgb", "<u4")]))
+    data["xyz"] = points
+    colours = gradient().astype(np.uint32)
+    data["rgb"] = (colours[..., 0] << 16) | (colours[..., 1] << 8) | colours[..., 2]
+    fields = [make("sensor_msgs/msg/PointField", n, 4 * k, 7, 1) for k, n in enumerate("xyz")]
+    fields.append(make("sensor_msgs/msg/PointField", "rgb", 16, 7, 1))
+    raw_bytes = np.frombuffer(data.tobytes(), np.uint8)
+    step = {"fields": fields, "point_step": 20, "row_step": 20 * 64, "data": raw_bytes}
+    message = cloud(EPOCH, points, **step)
+
+    np.testing.assert_array_equal(cloud_colours(message), gradient())
+    message.data = raw_bytes[:-40]
+    with pytest.raises(MessageError, match="do not fit"):
+        cloud_colours(message)
+
+
+def test_a_cloud_brings_its_own_colours(tmp_path: Path) -> None:
+    """Colours that are in the points need no second topic, and fit pixel by pixel."""
+    points = organized_points(wavy_depth())
+    data = np.zeros((48, 64), np.dtype([("xyz", "<f4", 3), ("rgb", "<u4")]))
+    data["xyz"], data["rgb"] = points, 0x0A141E
+    fields = [make("sensor_msgs/msg/PointField", n, 4 * k, 7, 1) for k, n in enumerate("xyz")]
+    fields.append(make("sensor_msgs/msg/PointField", "rgb", 12, 7, 1))
+    step = {"point_step": 16, "row_step": 1024, "data": np.frombuffer(data.tobytes(), "u1")}
+    path = write(tmp_path / "a.mcap", [("/p", 1, cloud(EPOCH, points, fields=fields, **step))])
+
+    ((frame, view),), _ = read(path)
+    assert view is not None
+    assert view.registered
+    assert frame.organized
+    np.testing.assert_array_equal(
+        np.unique(pixels_of(view.image).reshape(-1, 3), axis=0), [[10, 20, 30]]
+    )
+
+
+@pytest.mark.parametrize(("encode", "close"), [(jpeg, 4), (png, 0)])
+def test_compressed_images_are_kept_as_they_came(tmp_path: Path, encode: Any, close: int) -> None:
+    """A second compression would cost quality and time."""
+    body = encode(gradient())
+    items = [*depth_items(EPOCH), ("/cam/color/image_raw/compressed", EPOCH, packed(EPOCH, body))]
+    ((_, view),), warnings = read(write(tmp_path / "a.mcap", in_order(items)))
+
+    assert view is not None
+    assert bytes(view.image.data) == body
+    assert (view.image.width, view.image.height) == (64, 48)
+    assert np.abs(pixels_of(view.image).astype(int) - gradient()).max() <= close
+    assert not warnings
+
+
+def test_compressed_comes_before_raw_and_colour_before_infrared(tmp_path: Path) -> None:
+    """The wrong one of five streams of a camera must not be taken."""
+    items = depth_items(EPOCH)
+    for topic in ("/cam/infra1/image", "/cam/color/image_raw", "/other/color/image_raw"):
+        encoding = "mono8" if "infra" in topic else "rgb8"
+        data = gradient() if encoding == "rgb8" else gradient()[..., 0]
+        items.append(
+            (topic, EPOCH, raw(EPOCH, data, encoding, "far" if "other" in topic else "camera"))
+        )
+    body = jpeg(gradient())
+    items.append(("/cam/color/image_raw/compressed", EPOCH, packed(EPOCH, body)))
+    path = write(tmp_path / "a.mcap", in_order(items))
+
+    with open_recording(path) as recording:
+        (stream,) = choose_streams(recording)
+        chosen = choose_colour(recording, stream)
+        assert chosen is not None
+        assert chosen.topic == "/cam/color/image_raw/compressed"
+        other = choose_colour(recording, stream, "other/color/image_raw")
+        assert other is not None
+        assert other.topic == "/other/color/image_raw"
+        with pytest.raises(
+            NoStreamError, match="/nowhere does not exist; colour images: /cam/color"
+        ):
+            choose_colour(recording, stream, "/nowhere")
+        with pytest.raises(NoStreamError, match="holds no colour images"):
+            choose_colour(recording, stream, "/cam/depth/image_raw")
+    uses = {t["name"]: t["use"] for t in describe_recording(path)["topics"]}
+    assert uses["/cam/color/image_raw/compressed"] == "colour of /cam/depth/image_raw"
+
+
+def test_frames_pair_with_the_nearest_image_up_to_half_a_period(tmp_path: Path) -> None:
+    """An image of another moment paints the table onto what has moved."""
+    shades = {k: gradient(seed=k) for k in range(4)}
+    colours = [
+        ("/cam/color/image_raw", EPOCH + t * MS, raw(EPOCH + t * MS, shades[k], "rgb8"))
+        for k, t in enumerate((0, 40, 80, 120))
+    ]
+    stamps = [EPOCH + t * MS for t in (19, 21, 100, 141)]
+    pairs, warnings = read(write(tmp_path / "a.mcap", in_order([*depth_items(*stamps), *colours])))
+
+    nearest = [None if v is None else (v.image.stamp_ns - EPOCH) // MS for _, v in pairs]
+    assert nearest == [0, 40, 80, None]
+    assert [frame.index for frame, _ in pairs] == [0, 1, 2, 3]
+    assert any("1 times: frames without a colour image of their time" in w for w in warnings)
+
+
+def test_an_image_that_is_logged_late_is_waited_for(tmp_path: Path) -> None:
+    """Compression takes its time: the right image is often logged behind the next frame."""
+    stamps = [EPOCH + t * MS for t in (0, 33, 66)]
+    colours = [
+        ("/cam/color/image_raw", s + 50 * MS, raw(s, gradient(seed=k), "rgb8"))
+        for k, s in enumerate(stamps)
+    ]
+    pairs, _ = read(write(tmp_path / "a.mcap", in_order([*depth_items(*stamps), *colours])))
+
+    assert [v and v.image.stamp_ns for _, v in pairs] == stamps
+
+
+def test_damaged_images_are_left_out_and_counted(tmp_path: Path) -> None:
+    """One bad image must not cost a run, nor be passed over in silence."""
+    body = jpeg(gradient())
+    bodies = [body[:-200], b"\xff\xd8\xff", b"", b"no image", body]
+    stamps = [EPOCH + 100 * k * MS for k in range(5)]
+    colours = [
+        ("/cam/color/image_raw/compressed", s, packed(s, b))
+        for s, b in zip(stamps, bodies, strict=True)
+    ]
+    path = write(tmp_path / "a.mcap", in_order([*depth_items(*stamps), *colours]))
+    pairs, warnings = read(path, "/cam/color/image_raw/compressed")
+
+    assert [view is not None for _, view in pairs] == [False, False, False, False, True]
+    assert any("jpeg image is cut off" in w for w in warnings)
+    assert any("neither JPEG nor PNG" in w for w in warnings)
+
+
+def test_damage_inside_an_image_is_a_message_error() -> None:
+    """The header of a file may promise what its content does not keep."""
+    for body in (jpeg(gradient()), png(gradient())):
+        kind = "png" if body.startswith(b"\x89") else "jpeg"
+        damaged = body[: len(body) // 2] + body[-12:]
+        wrong = ColourImage("", 0, 0, "", kind, 64, 48, 0, damaged)
+        if kind == "png":
+            with pytest.raises(MessageError, match="damaged"):
+                pixels_of(wrong)
+        with pytest.raises(MessageError, match="instead of"):
+            pixels_of(ColourImage("", 0, 0, "", kind, 640, 480, 0, body))
+    short = ColourImage("", 0, 0, "", "rgb8", 640, 480, 1920, bytes(1000))
+    with pytest.raises(MessageError, match="needs 921600 bytes and has 1000"):
+        pixels_of(short)
+
+
+def test_another_camera_is_placed_by_the_transforms(tmp_path: Path) -> None:
+    """A turned pose: the inverse, or the wrong order of frames, would be far off."""
+    turn = (0.1, -0.2, 0.05, 0.97)
+    tf = ("/tf_static", EPOCH, static("camera", "color_optical", (0.05, 0.01, -0.02), turn))
+    ((_, view),), _ = read(beside(tmp_path / "a.mcap", tf))
+
+    assert view is not None
+    assert view.lens is not None
+    assert view.lens.model == "plumb_bob"
+    assert view.lens.pinhole == WIDE
+    assert view.colour_from_depth is not None
+    # depth_from_colour is what was published: a point 1 m ahead of the colour camera.
+    ahead = rotation_from_quaternion(turn) @ [0, 0, 1] + [0.05, 0.01, -0.02]
+    pose = view.colour_from_depth
+    np.testing.assert_allclose(pose.rotation @ ahead + pose.translation, [0, 0, 1], atol=1e-9)
+
+
+def test_without_a_transform_there_is_no_colour(tmp_path: Path) -> None:
+    """Colours in the wrong place are worse than none."""
+    ((_, view),), warnings = read(beside(tmp_path / "a.mcap"))
+
+    assert view is None
+    assert any("no transform between camera and color_optical" in w for w in warnings)
+
+
+def test_images_of_the_same_frame_but_another_size_are_projected(tmp_path: Path) -> None:
+    """The same frame id says where the camera is, not that the pixels are the same."""
+    ((_, view),), _ = read(beside(tmp_path / "a.mcap", frame_id="camera"))
+
+    assert view is not None
+    assert not view.registered
+    np.testing.assert_array_equal(view.colour_from_depth.rotation, np.eye(3))  # type: ignore[union-attr]
+
+
+def test_extrinsics_of_the_realsense_driver(tmp_path: Path) -> None:
+    """Rotations are stored by columns there; by rows a turned camera looks the other way."""
+    ros1 = get_typestore(Stores.ROS1_NOETIC)
+    text = "std_msgs/Header header\nfloat64[9] rotation\nfloat64[3] translation\n"
+    kind = "realsense2_camera/msg/Extrinsics"
+    ros1.register(get_types_from_msg(text, kind))
+    rotation = rotation_from_quaternion((0.02, 0.3, -0.1, 0.95))
+    path = tmp_path / "a.bag"
+    items = in_order(depth_items(EPOCH))
+    items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)))
+    items.append(("/cam/color/image_raw", EPOCH, raw(EPOCH, gradient(60, 80), "bgr8", "color")))
+    with Bag(path) as bag:
+        for topic, time, message in items:
+            name = message.__msgtype__
+            connection = bag.add_connection(topic, name, typestore=ros1)
+            data = STORE.cdr_to_ros1(STORE.serialize_cdr(message, name), name)
+            bag.write(connection, time, data)
+        own = ros1.types[kind](
+            ros1.types["std_msgs/msg/Header"](0, header(EPOCH).stamp, ""),
+            rotation.T.ravel(),
+            np.array([0.015, 0.001, -0.002]),
+        )
+        connection = bag.add_connection("/cam/extrinsics/depth_to_color", kind, typestore=ros1)
+        bag.write(connection, EPOCH, ros1.serialize_ros1(own, kind))
+    ((_, view),), _ = read(path)
+
+    assert view is not None
+    assert view.colour_from_depth is not None
+    np.testing.assert_allclose(view.colour_from_depth.rotation, rotation, atol=1e-12)
+    np.testing.assert_allclose(view.colour_from_depth.translation, [0.015, 0.001, -0.002])
+
+
+@pytest.mark.parametrize("container", ["mcap", "ros1", "ros2"])
+def test_simulated_recordings_bring_their_colour_camera(tmp_path: Path, container: Any) -> None:
+    """Each container of a recording gives the same image in the same place."""
+    from shapecat.simulation import simulate  # noqa: PLC0415  slow to load
+    from shapecat.simulation.colour_camera import COLOUR  # noqa: PLC0415  the same
+
+    path = simulate(tmp_path / "s", format=container, frames=2, seed=4, color=True)
+    pairs, warnings = read(path)
+
+    assert not warnings
+    for frame, view in pairs:
+        assert view is not None
+        assert view.image.stamp_ns == frame.stamp_ns
+        assert view.colour_from_depth is not None
+        place = -view.colour_from_depth.rotation.T @ view.colour_from_depth.translation
+        np.testing.assert_allclose(place, COLOUR.depth_from_colour.translation, atol=1e-8)
+        assert view.lens == COLOUR.lens
+        assert pixels_of(view.image).shape == (720, 960, 3)
