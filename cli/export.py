@@ -5,7 +5,7 @@ from pathlib import Path
 
 import click
 
-from .options import ANY_PATH
+from .options import ANY_PATH, BOXES, BOXES_HELP
 from .render import progress_bars
 
 _FORMATS = ("crops", "kitti", "labelcloud", "point-labels")
@@ -16,9 +16,16 @@ _FORMATS = ("crops", "kitti", "labelcloud", "point-labels")
 @click.option("--format", "kind", type=click.Choice(_FORMATS), required=True, help="See above.")
 @click.option("--out", type=ANY_PATH, required=True, help="Crops go to OUT, others to OUT/NAME.")
 @click.option("--every", type=click.IntRange(1), default=1, help="Keep only every Nth frame.")
+@click.option("--boxes", type=click.Choice(BOXES), default="full", help=BOXES_HELP)
 @click.option("--recording", type=ANY_PATH, help="Where the recording is now, if it was moved.")
 def export(
-    *, folders: tuple[Path, ...], kind: str, out: Path, every: int, recording: Path | None
+    *,
+    folders: tuple[Path, ...],
+    kind: str,
+    out: Path,
+    every: int,
+    boxes: str,
+    recording: Path | None,
 ) -> None:
     """Write the labels of runs, with their points, for other tools.
 
@@ -45,7 +52,15 @@ def export(
         _require_own_names(runs)
     for run in runs:
         with progress_bars() as bars:
-            count = export_run(run, kind, out, every=every, recording=recording, observe=bars)
+            count = export_run(
+                run,
+                kind,
+                out,
+                every=every,
+                visible_boxes=boxes == "visible",
+                recording=recording,
+                observe=bars,
+            )
         click.echo(f"{run}: {count} objects in {out}")
 
 

@@ -28,6 +28,7 @@ FORMATS: dict[str, Write] = {
     "labelcloud": write_labelcloud,
     "point-labels": write_point_labels,
 }
+_WITH_BOXES = ("kitti", "labelcloud")
 _MARK = "export.json"
 
 
@@ -41,6 +42,7 @@ def export_run(
     out: Path,
     *,
     every: int = 1,
+    visible_boxes: bool = False,
     recording: Path | None = None,
     observe: Observer = _ignore,
 ) -> int:
@@ -52,6 +54,7 @@ def export_run(
     Parameters
     ----------
     every : keep each so-many-th frame of a stream.
+    visible_boxes : boxes are around what is seen of the objects, not around all of them.
     recording : where the recording is now; where it was processed by default.
 
     Returns
@@ -70,7 +73,9 @@ def export_run(
     finished = read_finished(folder)
     total = -(-int(finished.run["counts"]["frames"]) // every)
     with open_source(finished.run, recording) as source:
-        chosen = _thinned(finished.frames(), every)
+        full = format in _WITH_BOXES and not visible_boxes
+        labelled = finished.frames_with_full_boxes() if full else finished.frames()
+        chosen = _thinned(labelled, every)
         pairs = _observed(with_clouds(chosen, source, finished.run), total, observe)
         if format == "crops":
             return write_crops(out, pairs, finished)
