@@ -9,11 +9,11 @@ import numpy as np
 from shapecat.arrays import F4, F8
 from shapecat.jit import kernel
 
-__all__ = ["DIRECTIONS", "fit_circle", "narrowest", "reach", "rectangle", "with_circle"]
+__all__ = ["DIRECTIONS", "QUARTER", "fit_circle", "narrowest", "reach", "rectangle"]
 
 DIRECTIONS = 96
 """Every 3.75 degrees; a quarter turn is a whole number of them."""
-_QUARTER, _HALF = DIRECTIONS // 4, DIRECTIONS // 2
+QUARTER, _HALF = DIRECTIONS // 4, DIRECTIONS // 2
 _ROUNDS = 5
 _OUTLIER = 0.05
 """Deviations beyond this share of the radius are of handles, and pull no harder."""
@@ -90,22 +90,12 @@ def fit_circle(reached: F8, cosines: F8, sines: F8, toward: F8) -> tuple[F8, flo
 
 
 @kernel
-def with_circle(reached: F8, cosines: F8, sines: F8, circle: F8) -> F8:
-    """Return how far points and a circle reach together."""
-    result = np.zeros(reached.size)
-    for k in range(reached.size):
-        round_one = circle[0] * cosines[k] + circle[1] * sines[k] + circle[2]
-        result[k] = max(reached[k], round_one)
-    return result
-
-
-@kernel
 def narrowest(reached: F8) -> int:
     """Return which of the first quarter of directions a rectangle of the least area has."""
     best, least = 0, np.inf
-    for k in range(_QUARTER):
+    for k in range(QUARTER):
         length = reached[k] + reached[k + _HALF]
-        width = reached[k + _QUARTER] + reached[(k + 3 * _QUARTER) % DIRECTIONS]
+        width = reached[k + QUARTER] + reached[(k + 3 * QUARTER) % DIRECTIONS]
         if length * width < least - 1e-9:
             best, least = k, length * width
     return best
@@ -114,6 +104,6 @@ def narrowest(reached: F8) -> int:
 @kernel
 def rectangle(reached: F8, side: int) -> tuple[float, float, float, float]:
     """Return the centre of an outline along a direction and across it, its length and its width."""
-    ahead, left = reached[side], reached[side + _QUARTER]
-    back, right = reached[side + _HALF], reached[side + _QUARTER + _HALF]
+    ahead, left = reached[side], reached[side + QUARTER]
+    back, right = reached[side + _HALF], reached[side + QUARTER + _HALF]
     return 0.5 * (ahead - back), 0.5 * (left - right), ahead + back, left + right

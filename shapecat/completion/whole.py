@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -9,11 +10,11 @@ from numpy.typing import ArrayLike
 from shapecat.arrays import F4, F8
 from shapecat.completion.outline import (
     DIRECTIONS,
+    QUARTER,
     fit_circle,
     narrowest,
     reach,
     rectangle,
-    with_circle,
 )
 from shapecat.geometry import gravity_rotation, quaternion_from_rotation
 from shapecat.types import FullBox
@@ -24,12 +25,31 @@ _ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 _COSINES, _SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 ENOUGH_POINTS = 256
 """So many points tell the outline; more cost time."""
-_STRAY = 0.01
-"""Share of the points that noise and mixed pixels put beyond the outline."""
-_TOP = 0.98
-"""Share of the points below the top."""
-_RIM, _RIM_POINTS = 0.3, 30
-"""Upper share of a cup, where it is round whatever its handle does below; points that tell it."""
+
+
+class _Shape(NamedTuple):
+    """What points tell of a shape: the share beyond its outline either way, that above its top.
+
+    Noise and mixed pixels put points there. Where many points lie at the outline, as on a wall
+    that is seen from its edge, or on a flat top, more of them stray than where a surface curves.
+    """
+
+    beyond: float
+    above: float
+
+
+_USUAL = _Shape(0.016, 0.02)
+_SHAPES = {
+    "box": _Shape(0.016, 0.05),
+    "can": _Shape(0.016, 0.05),
+    "bowl": _Shape(0.004, 0.02),
+    "plate": _Shape(0.004, 0.02),
+    "ball": _Shape(0.004, 0.02),
+}
+_HANDLE = 0.15
+"""What reaches farther beyond the circle of a cup, as a share of its radius, is a handle."""
+_WIDER = 1.1
+"""A cup is seen into, to its far rim: a circle that is so much wider than what is seen is wrong."""
 _ROUND = 0.1
 """A circle fits if the side that is seen deviates by less than this share of the radius."""
 _NOISE_M, _GUESS = 0.004, 0.35
@@ -63,27 +83,48 @@ def complete(
     level = gravity_rotation(up)
     some = points[:: max(1, -(-len(points) // ENOUGH_POINTS))] @ level.T.astype(np.float32)
     some[:, 2] -= np.float32(offset)
-    bounds = _bounds(some[:, 2])
     likely = dict(zip(categories, np.asarray(posterior).tolist(), strict=True))
-    seen = _reach(some)
-    rim = some[some[:, 2] > (1 - _RIM) * bounds[2]]
-    handled = max(likely, key=likely.__getitem__) == _HANDLED and len(rim) >= _RIM_POINTS
-    circle = _circle(_reach(rim) if handled else seen, some)
-    angular = likely.get(_ANGULAR, 0.0) if circle is not None else 1.0
-    whole = seen if circle is None else with_circle(seen, _COSINES, _SINES, circle)
-    return _box(seen, whole, angular, bounds, level, offset)
+    category = max(likely, key=likely.__getitem__)
+    shape = _SHAPES.get(category, _USUAL)
+    bounds = _bounds(some[:, 2], shape)
+    seen = _reach(some, shape)
+    circle = _circle(seen, some)
+    if circle is not None and category == _HANDLED and 2 * circle[2] > _WIDER * _width(seen):
+        circle = None  # through the handle
+    if circle is None:
+        return _box(seen, seen, narrowest(seen), 1.0, bounds, level, offset)
+    whole, side = _whole(seen, circle, handled=category == _HANDLED)
+    angular = likely.get(_ANGULAR, 0.0)
+    side = narrowest(seen) if angular > 0.5 else side
+    return _box(seen, whole, side, angular, bounds, level, offset)
 
 
-def _reach(points: F4) -> F8:
+def _reach(points: F4, shape: _Shape) -> F8:
     x, y = np.ascontiguousarray(points[:, :2].T)
-    return np.asarray(reach(x, y, int(_STRAY * len(points)), _COSINES, _SINES))
+    return np.asarray(reach(x, y, int(shape.beyond * len(points)), _COSINES, _SINES))
 
 
-def _bounds(heights: F4) -> tuple[float, float, float]:
+def _width(seen: F8) -> float:
+    return min(rectangle(seen, narrowest(seen))[2:])
+
+
+def _bounds(heights: F4, shape: _Shape) -> tuple[float, float, float]:
     """Return the bottom, the lowest height that is seen, and the top, above the support."""
-    ascending, stray = np.sort(heights), int((1 - _TOP) * len(heights))
-    lowest, top = float(ascending[stray]), float(ascending[-1 - stray])
+    ascending, count = np.sort(heights), len(heights)
+    lowest = float(ascending[int(_USUAL.above * count)])
+    top = float(ascending[-1 - int(shape.above * count)])
     return min(0.0, top), lowest, top
+
+
+def _whole(seen: F8, circle: F8, *, handled: bool) -> tuple[F8, int]:
+    """Return how far a circle reaches, with its handle, and the side that the box goes along."""
+    whole = circle[0] * _COSINES + circle[1] * _SINES + circle[2]
+    beyond = seen - whole
+    way = int(beyond.argmax())
+    if not handled or beyond[way] < _HANDLE * circle[2]:
+        return whole, 0
+    whole[way] = seen[way]
+    return whole, way % QUARTER
 
 
 def _circle(seen: F8, points: F4) -> F8 | None:
@@ -98,6 +139,7 @@ def _circle(seen: F8, points: F4) -> F8 | None:
 def _box(
     seen: F8,
     whole: F8,
+    side: int,
     angular: float,
     bounds: tuple[float, float, float],
     level: F8,
@@ -105,7 +147,6 @@ def _box(
 ) -> FullBox:
     """Return the box of a footprint: of what is seen if it is likely angular, else of the whole."""
     chosen = seen if angular > 0.5 else whole
-    side = narrowest(chosen)
     bottom, lowest, top = bounds
     x, y, length, width = rectangle(chosen, side)
     _, _, seen_length, seen_width = rectangle(seen, side)
