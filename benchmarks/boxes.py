@@ -36,8 +36,9 @@ SAME = 0.5
 ROUND = ("can", "bottle", "bowl", "plate", "ball")
 """Solids of revolution; a cup has a handle."""
 JUDGED = ("cup", "can", "box", "bottle", "bowl", "ball")
-KINDS: dict[SceneKind, int] = {"tabletop": 1, "pile": 1}
-"""Scenes, and how many of each there are to a seed."""
+KINDS: tuple[SceneKind, ...] = ("tabletop", "pile")
+GROUPS = ("tabletop, upright", "tabletop, lying", "pile, upright", "pile, tilted")
+_HOW: dict[SceneKind, str] = {"tabletop": "lying", "pile": "tilted"}
 FRAMES, RATE_HZ = 24, 8.0
 COLUMNS = ("objects", "views", "visible", "full, single view", "full, track")
 
@@ -53,8 +54,8 @@ class Upright(NamedTuple):
 class Judged(NamedTuple):
     """The overlaps of one object in one view: visible, full, and that of the track, if any."""
 
+    group: str
     category: str
-    tilted: bool
     thing: tuple[int, int]
     overlaps: Array
 
@@ -66,26 +67,25 @@ class Judged(NamedTuple):
 def main(*, first: int, count: int, as_json: bool) -> None:
     """Judge scenes and print a table."""
     found = [item for kind in KINDS for item in _judge_kind(kind, first, count)]
-    rows = [row for tilted in (False, True) for row in _rows(found, tilted=tilted)]
+    rows = [row for group in GROUPS for row in _rows(found, group)]
     if as_json:
         print(json.dumps({row[0]: dict(zip(COLUMNS, row[1:], strict=True)) for row in rows}))
         return
     print(markdown(f"3D overlap, seeds {first} to {first + count - 1}", ("", *COLUMNS), rows))
 
 
-def _rows(found: Sequence[Judged], *, tilted: bool) -> Iterator[list[Any]]:
+def _rows(found: Sequence[Judged], group: str) -> Iterator[list[Any]]:
     """Yield the mean overlaps of each category and of all that are judged together."""
-    name = "tilted" if tilted else "upright"
-    some = [item for item in found if item.tilted == tilted]
+    some = [item for item in found if item.group == group]
     for category in sorted({item.category for item in some}):
-        yield _row(f"{name}, {category}", [item for item in some if item.category == category])
-    yield _row(f"{name}, {', '.join(JUDGED)}", [item for item in some if item.category in JUDGED])
+        yield _row(f"{group}, {category}", [item for item in some if item.category == category])
+    yield _row(f"{group}, {', '.join(JUDGED)}", [item for item in some if item.category in JUDGED])
 
 
 def _row(name: str, some: Sequence[Judged]) -> list[Any]:
     overlaps = np.reshape([item.overlaps for item in some], (-1, 3))
-    means = np.round(np.nanmean(overlaps, axis=0), 3) if len(some) else np.full(3, np.nan)
-    return [name, len({item.thing for item in some}), len(some), *map(float, means)]
+    means = [round(float(np.nanmean(column)), 3) if len(some) else None for column in overlaps.T]
+    return [name, len({item.thing for item in some}), len(some), *means]
 
 
 def _judge_kind(kind: SceneKind, first: int, count: int) -> Iterator[Judged]:
@@ -96,7 +96,8 @@ def _judge_kind(kind: SceneKind, first: int, count: int) -> Iterator[Judged]:
                 folder / "recording.mcap", scene=kind, frames=FRAMES, seed=seed, rate_hz=RATE_HZ
             )
             process(Job(source, folder / "run", mcap=False, rrd=False))
-            yield from _judge_run(folder, seed)
+            for item in _judge_run(folder, seed):
+                yield item._replace(group=f"{kind}, {_HOW[kind] if item.group else 'upright'}")
 
 
 def _judge_run(folder: Path, seed: int) -> Iterator[Judged]:
@@ -122,8 +123,8 @@ def _judge_run(folder: Path, seed: int) -> Iterator[Judged]:
                 _upright(track, "_full", level) if track else None,
             )
             yield Judged(
+                "tilted" if thing["tilted"] or thing["lying"] else "",
                 thing["category"],
-                thing["tilted"] or thing["lying"],
                 (seed, thing["track"]),
                 np.array([_overlap(thing, box, level) for box in boxes]),
             )

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -26,26 +25,12 @@ _COSINES, _SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 ENOUGH_POINTS = 256
 """So many points tell the outline; more cost time."""
 
-
-class _Shape(NamedTuple):
-    """What points tell of a shape: the share beyond its outline either way, that above its top.
-
-    Noise and mixed pixels put points there. Where many points lie at the outline, as on a wall
-    that is seen from its edge, or on a flat top, more of them stray than where a surface curves.
-    """
-
-    beyond: float
-    above: float
-
-
-_USUAL = _Shape(0.016, 0.02)
-_SHAPES = {
-    "box": _Shape(0.016, 0.05),
-    "can": _Shape(0.016, 0.05),
-    "bowl": _Shape(0.004, 0.02),
-    "plate": _Shape(0.004, 0.02),
-    "ball": _Shape(0.004, 0.02),
-}
+_STRAY, _STRAY_CURVED = 0.016, 0.004
+"""Share of the points that noise and mixed pixels put beyond the outline, either way: fewer
+where a surface curves away than where many points lie at the outline, as those of a wall do."""
+_CURVED = ("bowl", "plate", "ball")
+_TOP = 0.98
+"""Share of the points below the top."""
 _HANDLE = 0.15
 """What reaches farther beyond the circle of a cup, as a share of its radius, is a handle."""
 _WIDER = 1.1
@@ -85,9 +70,8 @@ def complete(
     some[:, 2] -= np.float32(offset)
     likely = dict(zip(categories, np.asarray(posterior).tolist(), strict=True))
     category = max(likely, key=likely.__getitem__)
-    shape = _SHAPES.get(category, _USUAL)
-    bounds = _bounds(some[:, 2], shape)
-    seen = _reach(some, shape)
+    bounds = _bounds(some[:, 2])
+    seen = _reach(some, _STRAY_CURVED if category in _CURVED else _STRAY)
     circle = _circle(seen, some)
     if circle is not None and category == _HANDLED and 2 * circle[2] > _WIDER * _width(seen):
         circle = None  # through the handle
@@ -99,20 +83,19 @@ def complete(
     return _box(seen, whole, side, angular, bounds, level, offset)
 
 
-def _reach(points: F4, shape: _Shape) -> F8:
+def _reach(points: F4, stray: float) -> F8:
     x, y = np.ascontiguousarray(points[:, :2].T)
-    return np.asarray(reach(x, y, int(shape.beyond * len(points)), _COSINES, _SINES))
+    return np.asarray(reach(x, y, int(stray * len(points)), _COSINES, _SINES))
 
 
 def _width(seen: F8) -> float:
-    return min(rectangle(seen, narrowest(seen))[2:])
+    return float(min(rectangle(seen, narrowest(seen))[2:]))
 
 
-def _bounds(heights: F4, shape: _Shape) -> tuple[float, float, float]:
+def _bounds(heights: F4) -> tuple[float, float, float]:
     """Return the bottom, the lowest height that is seen, and the top, above the support."""
-    ascending, count = np.sort(heights), len(heights)
-    lowest = float(ascending[int(_USUAL.above * count)])
-    top = float(ascending[-1 - int(shape.above * count)])
+    ascending, stray = np.sort(heights), int((1 - _TOP) * len(heights))
+    lowest, top = float(ascending[stray]), float(ascending[-1 - stray])
     return min(0.0, top), lowest, top
 
 
