@@ -35,6 +35,8 @@ SAME = 0.5
 """A detection is of a thing if their pixels overlap so much (intersection over union)."""
 ROUND = ("can", "bottle", "bowl", "plate", "ball")
 """Solids of revolution; a cup has a handle."""
+ALIKE = 0.05
+"""One whose true length and width differ by a larger share is oval, and has a yaw."""
 JUDGED = ("cup", "can", "box", "bottle", "bowl", "ball")
 KINDS: tuple[SceneKind, ...] = ("tabletop", "pile")
 GROUPS = ("tabletop, upright", "tabletop, lying", "pile, upright", "pile, tilted")
@@ -165,7 +167,8 @@ def _overlap(thing: dict[str, Any], box: Upright | None, level: Array) -> float:
     if box is None:
         return float("nan")
     true = _upright(thing["box"], "", level)
-    if thing["category"] in ROUND and not (thing["tilted"] or thing["lying"]):
+    square = abs(true.size[0] - true.size[1]) < ALIKE * true.size[:2].max()
+    if thing["category"] in ROUND and square and not (thing["tilted"] or thing["lying"]):
         across = float(true.size[:2].mean())
         true = Upright(true.center, np.array([across, across, true.size[2]]), box.yaw)
     return overlap(true, box)

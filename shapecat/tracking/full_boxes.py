@@ -11,7 +11,7 @@ __all__ = ["BoxViews", "fuse_boxes"]
 
 _STILL_M = 0.05
 """Centres stray less while an object stands still."""
-_SQUARE = 0.05
+_SQUARE = 0.2
 """Weight of the yaw of a square footprint; that of an elongated one is its elongation more."""
 _SHARE = 0.5
 """Share of the views that have seen a smaller size than the fused one."""
