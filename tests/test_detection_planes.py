@@ -3,15 +3,19 @@
 import numpy as np
 import pytest
 
+from benchmarks.overlap import MATCHED
+from benchmarks.piles import judge
 from benchmarks.planes import keeps_table, view_of
-from shapecat.config import DetectionSettings
+from shapecat.config import DetectionSettings, Settings
 from shapecat.detection import detect
-from shapecat.detection.depth_grid import DepthGrid, downsample
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
 from shapecat.detection.planes import NO_HINT
+from shapecat.detection.planes.assumed import assume_plane
 from shapecat.detection.planes.covered import add_covered_planes
 from shapecat.detection.planes.parallel import find_parallel_planes
 from shapecat.detection.planes.ransac import draw_trials
 from shapecat.detection.planes.up_direction import HELD, estimate_up
+from shapecat.learning import load_model
 from shapecat.simulation.mesh import Mesh, moved, rounded_box
 from shapecat.simulation.paths import looking_at
 from shapecat.simulation.render import geometry, render
@@ -88,3 +92,48 @@ def test_camera_upside_down_is_believed_where_nothing_speaks_against_it() -> Non
     turned = grid._replace(inverse_depth=np.ascontiguousarray(grid.inverse_depth[::-1, ::-1]))
     up = estimate_up(turned, NO_HINT, draw_trials(np.random.default_rng(0)), HELD)
     assert up @ [0, -UP[1], UP[2]] > np.cos(np.radians(2))
+
+
+def test_assumed_plane_lies_just_below_what_no_plane_explains() -> None:
+    """Blobs in the air, 0.9 to 0.7 m below a turned camera; far ones decide nothing."""
+    up = np.array([0.36, -0.48, -0.8])
+    i, j = np.mgrid[:120, :160]
+    rays = np.stack([(j - 70) / 150, (i - 62) / 150, np.ones(i.shape)])
+    down = -np.tensordot(up, rays, 1)  # height below the camera, by depth
+    blob = np.where(j < 80, 0.9 - 0.2 * (i / 120), 0.0)
+    far = np.where(j > 150, 1.4, 0.0)
+    height = blob + far
+    inv_depth = np.where((height > 0) & (down > 0.2), down / np.maximum(height, 0.1), 0)
+    grid = DepthGrid(inv_depth.astype(np.float32), PinholeIntrinsics(150, 150, 70, 62), 4, 0.005)
+
+    plane = assume_plane(grid, inv_depth > 0, up, tallest_m=0.3)
+
+    assert plane is not None
+    assert plane.area_m2 == 0
+    np.testing.assert_allclose(plane.up, up)
+    lowest = -blob[(inv_depth > 0) & (j < 80)].max()
+    assert lowest - 0.025 < plane.offset < lowest
+    level = plane.a * j + plane.b * i + plane.c  # inverse depth of the plane at each cell
+    below = inv_depth[(inv_depth > 0) & (j < 80)] < level[(inv_depth > 0) & (j < 80)]
+    assert below.mean() < 0.02
+
+
+def test_no_plane_is_assumed_for_a_few_samples_or_above_the_camera() -> None:
+    grid = DepthGrid(np.ones((60, 80), np.float32), PinholeIntrinsics(75, 75, 39.5, 29.5), 8, 0.01)
+    few = np.zeros((60, 80), bool)
+    few[:6] = True
+    up = np.array([0.0, 0.0, -1.0])
+    assert assume_plane(grid, few, up, tallest_m=0.5) is None
+    assert assume_plane(grid, ~few, -up, tallest_m=0.5) is None
+    assert assume_plane(grid, ~few, up, tallest_m=0.5) is not None
+
+
+def test_objects_in_compartments_are_found_where_their_board_is_hardly_seen() -> None:
+    """Without a plane below them none of these 48 objects was found."""
+    found = seen = 0
+    for seed in range(3002, 3008):
+        scores = judge("shelf bin", "Kinect", seed, 1, load_model(None), Settings())
+        found += sum(judged.overlap >= MATCHED for judged in scores.objects)
+        seen += len(scores.objects)
+    assert seen > 40
+    assert found > 0.55 * seen

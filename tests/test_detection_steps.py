@@ -12,7 +12,7 @@ from shapecat.detection.foreground.convex_hull import fill_hull
 from shapecat.detection.merging.pair_features import FEATURES, PAIR_FEATURES
 from shapecat.detection.merging.segments import PAIR, SEGMENT, add_statistics
 from shapecat.detection.planes import find_supporting_planes
-from shapecat.detection.planes.height_map import HeightMap, measure_heights
+from shapecat.detection.planes.height_map import HeightMap, measure_heights, pack_planes
 from shapecat.detection.planes.ransac import (
     draw_trials,
     horizontal_plane,
@@ -22,7 +22,7 @@ from shapecat.detection.planes.ransac import (
     sample_grid,
 )
 from shapecat.detection.segmentation.connectivity import connect_surfaces
-from shapecat.detection.segmentation.watershed import relabel, watershed
+from shapecat.detection.segmentation.watershed import _flat_parts, relabel, watershed
 from shapecat.types import Camera
 
 Floats = NDArray[np.float32]
@@ -74,7 +74,8 @@ def test_heights_of_a_board_with_an_edge() -> None:
     inv_depth[100:140, 280:300] = table(0.62)[100:140, 280:300]  # and one in the air beside
     trials = draw_trials(np.random.default_rng(0))
     grid = DepthGrid(board, INTRINSICS, 2, 0.0035)
-    found, _, planes = find_supporting_planes(grid, UP, trials, tallest_m=0.5, upright=True)
+    found, _ = find_supporting_planes(grid, UP, trials, tallest_m=0.5, upright=True)
+    planes = pack_planes(found, INTRINSICS)
     assert len(found) == 1
     heights = measure_heights(DepthGrid(inv_depth, INTRINSICS, 2, 0.0035), planes, 0.6)
     assert (heights.plane_id[105:135, 85:115] == 1).all()
@@ -102,6 +103,16 @@ def test_two_faces_are_parted_where_they_meet_at_a_concave_edge(rise: float, seg
     assert n == segments
     assert (labels[90:150, 120:200] > 0).all()
     assert (labels[90, 120] != labels[149, 120]) == (segments == 2)
+
+
+def test_speckle_fits_into_memory() -> None:
+    """In noise no cell is linked with another; each begins a part of its own."""
+    cells = np.ones((9, 8), np.int8)
+    labels, spans = np.zeros((9, 8), np.int16), np.tile(np.array([[0, 8]], np.int32), (9, 1))
+    none, part = np.zeros((9, 8), np.uint8), np.zeros((9, 8), np.int32)
+    # Python checks what machine code does not: whether an index is within its array.
+    assert _flat_parts.py_func(cells, spans, none, none, labels, 0, part) == 0
+    assert not labels.any()
 
 
 def test_relabel_keeps_what_is_none() -> None:

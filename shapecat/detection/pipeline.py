@@ -38,7 +38,9 @@ from shapecat.detection.output.label_upsampling import label_pixels, label_point
 from shapecat.detection.output.measurements import measure_objects
 from shapecat.detection.output.scene import build_scene
 from shapecat.detection.planes import NO_HINT, find_supporting_planes
-from shapecat.detection.planes.height_map import measure_heights
+from shapecat.detection.planes.assumed import assume_plane, unexplained
+from shapecat.detection.planes.extent import SupportingPlane
+from shapecat.detection.planes.height_map import measure_heights, pack_planes
 from shapecat.detection.planes.ransac import draw_trials
 from shapecat.detection.records import OverSegmentation, PlaneModel, Segmentation
 from shapecat.detection.segmentation.connectivity import connect_surfaces
@@ -212,20 +214,45 @@ def _find_planes(
     *,
     upright: bool = True,
 ) -> PlaneModel | None:
-    """Find what objects stand on and before; None if no plane bears anything."""
+    """Find what objects stand on and before; None if nothing bears anything."""
     trials = draw_trials(rng)
-    hint = NO_HINT if hint is None else hint
-    supports, up, planes = find_supporting_planes(
-        grid, hint, trials, tallest_m=settings.max_height_m, upright=upright
+    supports, up = find_supporting_planes(
+        grid,
+        NO_HINT if hint is None else hint,
+        trials,
+        tallest_m=settings.max_height_m,
+        upright=upright,
     )
+    if not supports and not upright:  # a cloud may be looked at from elsewhere
+        return None
+    up = up if up.any() else np.array(DEFAULT_UP)
+    model = _separate(grid, supports, up, trials, settings, steps)
+    rest = unexplained(grid, model.heights.plane_id, model.walls)
+    assumed = assume_plane(grid, rest, up, tallest_m=settings.max_height_m)
+    if assumed is not None:
+        supports = sorted([*supports, assumed], key=lambda support: support.offset)
+        model = _separate(grid, supports, up, trials, settings, steps)
     if not supports:
         return None
+    extend_overhang(grid, model.heights, model.planes, model.walls, settings.max_height_m)
+    return model
+
+
+def _separate(
+    grid: DepthGrid,
+    supports: list[SupportingPlane],
+    up: F8,
+    trials: F8,
+    settings: DetectionSettings,
+    steps: Steps,
+) -> PlaneModel:
+    """Measure what stands above the planes, without walls."""
+    planes = pack_planes(supports, grid.intrinsics)
     heights = measure_heights(grid, planes, settings.max_height_m)
     low_profile = np.zeros(grid.inverse_depth.shape, np.int16)
     if steps.low_profile:
         find_low_profile(grid, heights, planes, low_profile, settings.max_size_m)
     walls = remove_walls(grid, heights.plane_id, up, settings.max_size_m, trials)
-    extend_overhang(grid, heights, planes, walls, settings.max_height_m)
     return PlaneModel(up, supports, planes, heights, low_profile, walls)
 
 

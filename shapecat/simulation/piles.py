@@ -8,7 +8,7 @@ from numpy.random import Generator
 
 from shapecat.arrays import F8
 from shapecat.geometry import rotation_from_quaternion, transform
-from shapecat.simulation.distractors import make_distractor
+from shapecat.simulation.distractors import DISTRACTORS, make_distractor
 from shapecat.simulation.furniture import make_bin, make_compartment, make_room, make_table
 from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.paths import walk
@@ -32,12 +32,19 @@ class _Item(NamedTuple):
     mesh: Mesh
 
 
-def pile(rng: Generator, categories: Sequence[str], frames: int, rate_hz: float) -> World:
+def pile(
+    rng: Generator,
+    categories: Sequence[str],
+    frames: int,
+    rate_hz: float,
+    *,
+    kinds: Sequence[str] = tuple(DISTRACTORS),
+) -> World:
     """Drop things in a heap on a table: they lean, lie across, and in each other."""
     supports = (*make_room(rng, wall_chance=0.2), make_table(rng))
     table = supports[-1]
     spread = rng.uniform(0.07, 0.2)
-    drops, items = [], [_make(category, rng) for category in categories]
+    drops, items = [], [_make(category, rng, kinds) for category in categories]
     for item in items:
         place = np.clip(rng.normal(0, spread, 2), -0.4, 0.4)
         drops.append(Drop(item.mesh, _turned(rng), place))
@@ -54,11 +61,18 @@ def pile(rng: Generator, categories: Sequence[str], frames: int, rate_hz: float)
     return World("pile", supports, things, path, np.zeros(frames))
 
 
-def bin_picking(rng: Generator, categories: Sequence[str], frames: int, rate_hz: float) -> World:
+def bin_picking(
+    rng: Generator,
+    categories: Sequence[str],
+    frames: int,
+    rate_hz: float,
+    *,
+    kinds: Sequence[str] = tuple(DISTRACTORS),
+) -> World:
     """Pour things into a bin, and look into it from above."""
     bottom, sides = make_bin(rng)
     half = np.ptp(bottom.outline[:, :2], axis=0) / 2
-    items = [_make(category, rng) for category in categories]
+    items = [_make(category, rng, kinds) for category in categories]
     items = [item for item in items if item.mesh.extents.max() < 1.6 * half.min()]
     drops = []
     for item in items:
@@ -78,12 +92,19 @@ def bin_picking(rng: Generator, categories: Sequence[str], frames: int, rate_hz:
     return World("bin", supports, things, path, np.zeros(frames))
 
 
-def shelf_bin(rng: Generator, categories: Sequence[str], frames: int, rate_hz: float) -> World:
+def shelf_bin(
+    rng: Generator,
+    categories: Sequence[str],
+    frames: int,
+    rate_hz: float,
+    *,
+    kinds: Sequence[str] = tuple(DISTRACTORS),
+) -> World:
     """Put things into a compartment of a shelf, and look in from the front."""
     board, walls, top = make_compartment(rng)
     half = np.ptp(board.outline[:, :2], axis=0) / 2
     room_m = top.mesh.vertices[:, 2].min() - board.height
-    items = [_make(category, rng) for category in categories]
+    items = [_make(category, rng, kinds) for category in categories]
     items = [i for i in items if (i.mesh.extents[:2] < 1.6 * half.min()).all()]
     drops = []
     for item in items:
@@ -103,9 +124,9 @@ def shelf_bin(rng: Generator, categories: Sequence[str], frames: int, rate_hz: f
     return World("shelf_bin", (*supports, top), things, path, np.zeros(frames))
 
 
-def _make(category: str, rng: Generator) -> _Item:
+def _make(category: str, rng: Generator, kinds: Sequence[str]) -> _Item:
     if category == "unknown":
-        return _Item(category, *make_distractor(rng))
+        return _Item(category, *make_distractor(rng, str(rng.choice(list(kinds)))))
     return _Item(category, category, make_object(category, rng))
 
 

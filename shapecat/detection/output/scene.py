@@ -46,16 +46,19 @@ def build_scene(
     ``points`` (n, 3), view frame.
     """
     measured, count = found.measured, found.plane_ids.size - 1
-    kept = _kept(grid, measured, indices, settings.min_points, image=points is None)
-    position = {k + 1: n for n, k in enumerate(kept)}
-    boxes = _boxes(found, indices, points, sensor_from_view)
-    cut = _cut(grid, measured) if points is None else _cut_cloud(grid, found, sensor_from_view)
-    cut |= measured.last
+    numbers = _numbers_of_seen(found.supports)
     plane_id, supported_by, hidden = (
-        found.plane_ids[1:].tolist(),
+        [numbers[k] for k in found.plane_ids[1:].tolist()],
         measured.supported_by.tolist(),
         measured.hidden.tolist(),
     )
+    cut = _cut(grid, measured) if points is None else _cut_cloud(grid, found, sensor_from_view)
+    cut |= measured.last
+    kept = _kept(grid, measured, indices, settings.min_points, image=points is None)
+    # What goes on beyond the image is rather furniture where no plane is seen below it.
+    kept = [k for k in kept if k >= count or plane_id[k] is not None or not cut[k]]
+    position = {k + 1: n for n, k in enumerate(kept)}
+    boxes = _boxes(found, indices, points, sensor_from_view)
     candidates = []
     for k in kept:
         seen = k < count
@@ -71,9 +74,17 @@ def build_scene(
                 occluded=seen and hidden[k],
             )
         )
-    lowest = found.supports[0].offset
-    planes = tuple(_plane(s, lowest, sensor_from_view) for s in found.supports)
+    seen_planes = [s for s in found.supports if s.area_m2 > 0]
+    planes = tuple(_plane(s, seen_planes[0].offset, sensor_from_view) for s in seen_planes)
     return Scene(sensor_from_view.rotation @ found.up, planes, tuple(candidates))
+
+
+def _numbers_of_seen(supports: Sequence[SupportingPlane]) -> list[int | None]:
+    """Return the numbers of the planes that are seen; one that is assumed has none."""
+    seen = np.cumsum([support.area_m2 > 0 for support in supports]) - 1
+    return [
+        int(k) if support.area_m2 > 0 else None for k, support in zip(seen, supports, strict=True)
+    ]
 
 
 def _kept(

@@ -6,7 +6,6 @@ from shapecat.arrays import F8
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.planes.covered import add_covered_planes
 from shapecat.detection.planes.extent import SupportingPlane
-from shapecat.detection.planes.height_map import pack_planes
 from shapecat.detection.planes.parallel import find_parallel_planes
 from shapecat.detection.planes.ransac import DepthSamples
 from shapecat.detection.planes.supporting import SURE_AREA_M2, supporting_planes
@@ -22,7 +21,7 @@ BORNE_M = 0.4
 
 def find_supporting_planes(
     grid: DepthGrid, hint: F8, trials: F8, *, tallest_m: float, upright: bool
-) -> tuple[list[SupportingPlane], F8, F8]:
+) -> tuple[list[SupportingPlane], F8]:
     """Find the horizontal planes that objects may stand on (thesis 4.3).
 
     Multi-plane RANSAC (Fischler and Bolles 1981): one plane for each accumulation of level
@@ -38,7 +37,7 @@ def find_supporting_planes(
 
     Returns
     -------
-    The planes, lowest first; the normal (3,) of the largest; and the rows of `pack_planes`.
+    The planes, lowest first, and the normal (3,) of the largest.
     """
     up = estimate_up(grid, hint, trials, HELD if upright else 0.0)
     found = find_parallel_planes(grid, up, trials)
@@ -48,7 +47,7 @@ def find_supporting_planes(
     supports = supporting_planes(grid, found, covered_m2, tallest_m)
     largest = max(supports, key=lambda support: support.area_m2, default=None)
     up = up if largest is None else largest.up
-    return supports, up, pack_planes(supports, grid.intrinsics)
+    return supports, up
 
 
 def _may_cover(found: list[tuple[SupportingPlane, DepthSamples]]) -> bool:

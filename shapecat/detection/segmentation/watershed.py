@@ -94,10 +94,10 @@ def _flat_parts(
     ``part`` (rows, columns) is room: links do not lead out of the spans, all of which is written.
     """
     rows = plane_id.shape[0]
-    scratch = rows + 2  # a row has at most one first label in two cells
+    most = 1  # in speckle no cell is linked
     for i in range(rows):
-        scratch += (spans[i, 1] - spans[i, 0]) // 2
-    parent, size = np.zeros(scratch, np.int32), np.zeros(scratch, np.int32)
+        most += spans[i, 1] - spans[i, 0]
+    parent, size = unset(most, np.int32), unset(most, np.int32)
     count = 0
     # (1) first labels, and which of them meet
     for i in range(rows):
@@ -110,6 +110,7 @@ def _flat_parts(
             if me == 0 and above == 0:
                 count += 1
                 parent[count] = me = count
+                size[count] = 0
             elif me == 0:
                 me = above
             elif above > 0 and above != me:

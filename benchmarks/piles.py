@@ -1,0 +1,156 @@
+"""How objects are found and categorized where physics let them fall: piles, bins, compartments.
+
+    python -m benchmarks.piles --first 740000 --count 60
+
+Simulated scenes of twelve objects, one frame each, by a Kinect and by a RealSense.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from benchmarks.measure import markdown
+from benchmarks.overlap import MATCHED
+from benchmarks.scenes import SEEN_PIXELS
+from shapecat.config import Settings
+from shapecat.evaluation.metrics import auroc, expected_calibration_error
+from shapecat.learning import Categorizer, load_model
+from shapecat.perception import perceive
+from shapecat.simulation import KINECT, REALSENSE, Thing, render_frame
+from shapecat.simulation.piles import bin_picking, pile, shelf_bin
+from shapecat.types import CATEGORIES, Detection
+
+Array = NDArray[Any]
+SCENES = {"pile": pile, "bin": bin_picking, "shelf bin": shelf_bin}
+SENSORS = {"Kinect": KINECT, "RealSense": REALSENSE}
+OBJECTS, UNKNOWN = 12, 1 / 6
+"""How many objects are dropped, and the share of those of no category."""
+
+
+class Judged(NamedTuple):
+    """An object that is seen: how well the best detection covers it, and that detection."""
+
+    thing: Thing
+    shared: int
+    overlap: float
+    detection: Detection | None
+
+
+class Scores(NamedTuple):
+    """The judged objects of some scenes, the pixels found and true, and how many were detected."""
+
+    objects: list[Judged]
+    found: int
+    true: int
+    detections: int
+
+
+def judge(
+    kind: str, sensor: str, first: int, count: int, model: Categorizer, settings: Settings
+) -> Scores:
+    """Perceive a frame of each of some scenes, and match what is found with what is there."""
+    objects: list[Judged] = []
+    found = true = detections = 0
+    for seed in range(first, first + count):
+        rng = np.random.default_rng(seed)
+        names = np.where(rng.random(OBJECTS) < UNKNOWN, "unknown", rng.choice(CATEGORIES, OBJECTS))
+        world = SCENES[kind](rng, names.tolist(), 1, 30.0)
+        frame, labels = render_frame(world, 0, rng=rng, sensor=SENSORS[sensor])
+        seen = perceive(frame, up=None, categorizer=model, settings=settings).detections
+        flat = labels.reshape(-1)
+        objects += _matched(world.things, flat, seen)
+        found += sum(int(np.count_nonzero(flat[d.candidate.indices] > 0)) for d in seen)
+        shown = [t.label for t in world.things if np.count_nonzero(flat == t.label) >= SEEN_PIXELS]
+        true += int(np.isin(flat, shown).sum())
+        detections += len(seen)
+    return Scores(objects, found, true, detections)
+
+
+def _matched(
+    things: tuple[Thing, ...], labels: Array, seen: tuple[Detection, ...]
+) -> Iterator[Judged]:
+    """Match objects and detections one to one, by how well they cover each other (F)."""
+    masks = {t.track: labels == t.label for t in things}
+    things = tuple(t for t in things if np.count_nonzero(masks[t.track]) >= SEEN_PIXELS)
+    lists = [d.candidate.indices[labels[d.candidate.indices] > 0] for d in seen]
+    common = np.array([[masks[t.track][p].sum() for t in things] for p in lists], np.int64)
+    common = common.reshape(len(lists), len(things))
+    sizes = np.array([p.size for p in lists], np.int64)
+    totals = np.array([masks[t.track].sum() for t in things], np.int64)
+    overlap = 2 * common / np.maximum(sizes[:, None] + totals, 1)
+    pairs = dict(zip(*linear_sum_assignment(-overlap)[::-1], strict=True))
+    for k, thing in enumerate(things):
+        row = pairs.get(k)
+        if row is None:
+            yield Judged(thing, 0, 0.0, None)
+        else:
+            yield Judged(thing, int(common[row, k]), float(overlap[row, k]), seen[row])
+
+
+def figures(scores: Scores, model: Categorizer) -> dict[str, float]:
+    """Return F, the share of objects found, and how well those are categorized."""
+    objects = scores.objects
+    well = [o for o in objects if o.overlap >= MATCHED and o.detection is not None]
+    known = [o for o in well if o.thing.category != "unknown" and not o.thing.indistinct]
+    strange = [o for o in well if o.thing.category == "unknown"]
+    tilted = [o for o in known if o.thing.tilted]
+    return {
+        "objects": len(objects),
+        "F": 2 * sum(o.shared for o in objects) / max(scores.found + scores.true, 1),
+        "found": len(well) / max(len(objects), 1),
+        "detections": scores.detections,
+        "category": _right(known, model),
+        "upright or lying": _right([o for o in known if not o.thing.tilted], model),
+        "tilted": _right(tilted, model),
+        "tilted objects": len(tilted),
+        "AUROC": auroc(_novelty(strange), _novelty(known)) if strange and known else float("nan"),
+        "ECE": _calibration(known, model),
+    }
+
+
+def _right(objects: list[Judged], model: Categorizer) -> float:
+    """Return the share that gets its category; *unknown* is wrong."""
+    right = [_category(o, model) == o.thing.category for o in objects]
+    return float(np.mean(right)) if right else float("nan")
+
+
+def _category(judged: Judged, model: Categorizer) -> str:
+    assert judged.detection is not None
+    if judged.detection.novelty > 1:
+        return "unknown"
+    return str(model.categories[int(np.argmax(judged.detection.posterior))])
+
+
+def _novelty(objects: list[Judged]) -> Array:
+    return np.array([o.detection.novelty for o in objects if o.detection is not None], np.float32)
+
+
+def _calibration(objects: list[Judged], model: Categorizer) -> float:
+    truth = np.array([model.categories.index(o.thing.category) for o in objects], np.int64)
+    posteriors = np.array([o.detection.posterior for o in objects if o.detection], np.float32)
+    return expected_calibration_error(truth, posteriors) if len(objects) else float("nan")
+
+
+@click.command()
+@click.option("--first", default=3000, show_default=True, help="Seed of the first scene.")
+@click.option("--count", default=60, show_default=True, help="Scenes of each kind.")
+@click.option("--model", type=click.Path(path_type=Path), help="Model file.  [default: ours]")
+def main(first: int, count: int, model: Path | None) -> None:
+    """Judge piles, bins and compartments, and print a table."""
+    categorizer, settings = load_model(model), Settings()
+    rows = []
+    for kind in SCENES:
+        for sensor in SENSORS:
+            found = figures(judge(kind, sensor, first, count, categorizer, settings), categorizer)
+            cells = (f"{v:.3f}" if isinstance(v, float) else str(v) for v in found.values())
+            rows.append((f"{kind}, {sensor}", *cells))
+    click.echo(markdown("Physics", ("scenes", *found), rows))
+
+
+if __name__ == "__main__":
+    main()
