@@ -37,7 +37,7 @@ _WIDER = 1.1
 """A cup is seen into, to its far rim: a circle that is so much wider than what is seen is wrong."""
 _ROUND = 0.1
 """A circle fits if the side that is seen deviates by less than this share of the radius."""
-_NOISE_M, _GUESS = 0.004, 0.35
+_NOISE_M, _GUESS = 0.006, 0.35
 """Deviation of a length that is seen, and of the part that is guessed, as a share of it."""
 _ANGULAR, _HANDLED = "box", "cup"
 
