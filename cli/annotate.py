@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from .options import ANY_PATH
+from .options import ANY_PATH, BOXES, BOXES_HELP
 from .render import missed_words, progress_bars
 
 
@@ -17,8 +17,16 @@ from .render import missed_words, progress_bars
     is_flag=True,
     help="LABELS is the table, or folder, of another run: label the objects in the same places.",
 )
+@click.option("--boxes", type=click.Choice(BOXES), help=BOXES_HELP)
 @click.option("--recording", type=ANY_PATH, help="Where the recording is now, if it was moved.")
-def annotate(*, run: Path, labels: Path | None, by_place: bool, recording: Path | None) -> None:
+def annotate(
+    *,
+    run: Path,
+    labels: Path | None,
+    by_place: bool,
+    boxes: str | None,
+    recording: Path | None,
+) -> None:
     """Write annotated.mcap and review.rrd again after tracks.csv was corrected.
 
     Fill the column `label` of RUN/tracks.csv in a spreadsheet: a category, or a name of your own.
@@ -33,7 +41,9 @@ def annotate(*, run: Path, labels: Path | None, by_place: bool, recording: Path 
         msg = "--by-place needs --labels: the table, or folder, of the other run"
         raise click.UsageError(msg)
     with progress_bars() as bars:
-        transfer = annotate_again(run, labels, bars, by_place=by_place, recording=recording)
+        transfer = annotate_again(
+            run, labels, bars, by_place=by_place, boxes=boxes, recording=recording
+        )
     click.echo(f"{run}: wrote annotated.mcap and review.rrd")
     if transfer is not None:
         _show(transfer.as_dict(), labels)

@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from .options import ANY_PATH
+from .options import ANY_PATH, BOXES, BOXES_HELP
 from .render import progress_bars
 
 _DATASETS = ("coco", "yolo")
@@ -42,6 +42,7 @@ _FORMATS = (*_DATASETS, "crops", "kitti", "labelcloud", "point-labels")
     show_default=True,
     help="coco, yolo: share of the recordings for validation.",
 )
+@click.option("--boxes", type=click.Choice(BOXES), default="full", help=BOXES_HELP)
 @click.option("--recording", type=ANY_PATH, help="Where the recording is now, if it was moved.")
 def export(
     *,
@@ -49,6 +50,7 @@ def export(
     kind: str,
     out: Path,
     every: int,
+    boxes: str,
     recording: Path | None,
     **chosen: Any,
 ) -> None:
@@ -87,7 +89,15 @@ def export(
         raise click.UsageError(msg)
     for run in runs:
         with progress_bars() as bars:
-            count = export_run(run, kind, out, every=every, recording=recording, observe=bars)
+            count = export_run(
+                run,
+                kind,
+                out,
+                every=every,
+                visible_boxes=boxes == "visible",
+                recording=recording,
+                observe=bars,
+            )
         click.echo(f"{run}: {count} objects in {out}")
 
 

@@ -59,4 +59,6 @@ verbose_option = click.option(
     callback=_be_verbose,
     help="Log what is done, on stderr.",
 )
+BOXES = ("full", "visible")
+BOXES_HELP = "Boxes around all of the objects (full), or around what is seen of them (visible)."
 seed_option = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)

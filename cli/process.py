@@ -10,7 +10,16 @@ import click
 
 from shapecat.stopping import Stopped
 
-from .options import SECONDS, array_option, config_option, model_option, set_option, verbose_option
+from .options import (
+    BOXES,
+    BOXES_HELP,
+    SECONDS,
+    array_option,
+    config_option,
+    model_option,
+    set_option,
+    verbose_option,
+)
 from .progress import KINDS, Progress, describe_plan, open_progress
 from .render import count_words, missed_words, print_json, print_table
 
@@ -58,6 +67,7 @@ _MOST_ROWS = 100
     "--color", metavar="TOPIC", help="Colour images to use; by default those of the depth camera."
 )
 @click.option("--no-color", is_flag=True, help="Do not use colour images.")
+@click.option("--boxes", type=click.Choice(BOXES), help=BOXES_HELP)
 @click.option("--no-mcap", is_flag=True, help="Do not write annotated.mcap.")
 @click.option("--no-rrd", is_flag=True, help="Do not write review.rrd.")
 @click.option(
@@ -90,6 +100,7 @@ def process(
     scheduler: str | None,
     shard: str | None,
     no_fsync: bool,
+    boxes: str | None,
     progress: str,
     as_json: bool,
     **choices: Any,
@@ -120,10 +131,11 @@ def process(
     _require_range(choices["start_s"], choices["end_s"])
     if no_fsync:
         os.environ[FSYNC] = "0"  # which worker processes inherit
+    chosen = [f"outputs.boxes={boxes}"] if boxes else []
     job = Job(
         source=Path(),
         folder=Path(),
-        settings=load_settings(config, overrides),
+        settings=load_settings(config, (*overrides, *chosen)),
         color="" if no_color else color,
         mcap=not no_mcap,
         rrd=not no_rrd,

@@ -93,6 +93,8 @@ class TrackingSettings:
 class OutputSettings:
     """What annotated.mcap and review.rrd hold."""
 
+    boxes: Literal["full", "visible"] = "full"
+    """What the boxes in annotated.mcap are around: all of an object, or what is seen of it."""
     markers: bool = False
     """Also write visualization_msgs/MarkerArray for RViz."""
     cloud_points: int = 30_000

@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4
+from shapecat.completion import ENOUGH_POINTS, complete
 from shapecat.config import Settings
 from shapecat.depth_fusion import Earlier, fuse, with_own_readings
 from shapecat.description import DESCRIPTOR_NAMES, describe
@@ -18,7 +19,7 @@ from shapecat.errors import ModelError
 from shapecat.geometry import inverse, level_from_sensor, transform
 from shapecat.learning import Categorizer, load_model
 from shapecat.surface import reconstruct, thin
-from shapecat.types import Candidate, Detection, Frame, NeuralGas, Perception, Scene
+from shapecat.types import Candidate, Detection, Frame, FullBox, NeuralGas, Perception, Scene
 
 __all__ = ["Perceiver", "View", "perceive"]
 
@@ -102,6 +103,10 @@ def perceive(
     if fused is not frame:
         scene = with_own_readings(scene, frame)
     detections = _categorize(scene, shapes, categorizer)
+    categorized = time.perf_counter()
+    detections = tuple(
+        replace(d, full=_full_box(frame, scene, d, categorizer.categories)) for d in detections
+    )
     return Perception(
         topic=frame.topic,
         index=frame.index,
@@ -112,7 +117,8 @@ def perceive(
         seconds={
             "detect": detected - begun,
             "describe": described - detected,
-            "categorize": time.perf_counter() - described,
+            "categorize": categorized - described,
+            "complete": time.perf_counter() - categorized,
         },
     )
 
@@ -138,6 +144,18 @@ def _describe_candidate(
     descriptor = describe(cloud, gas, eye=level.translation)
     in_sensor = NeuralGas(transform(inverse(level), gas.neurons), gas.edges)
     return _Shape(in_sensor, descriptor, time.perf_counter() - begun)
+
+
+def _full_box(
+    frame: Frame, scene: Scene, detection: Detection, categories: Sequence[str]
+) -> FullBox | None:
+    """Estimate the whole of an object; None where fusing has left it no reading of the frame."""
+    candidate = detection.candidate
+    some = candidate.indices[:: max(1, -(-len(candidate.indices) // ENOUGH_POINTS))]
+    if not len(some):
+        return None
+    offset = scene.support_offset(candidate)
+    return complete(frame.xyz(some), scene.up, offset, detection.posterior, categories)
 
 
 def _categorize(

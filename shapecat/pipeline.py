@@ -264,8 +264,9 @@ def annotate(
         from shapecat.outputs.annotated_mcap import write_annotated  # noqa: PLC0415  on first use
         from shapecat.outputs.image_annotations import read_image_frames  # noqa: PLC0415  the same
 
-        shown = read_shown_frames(folder, labels())
         images = read_image_frames(folder, labels()) if run.get("color") else None
+        boxes = run.get("boxes") or settings.get("boxes", "full")
+        shown = read_shown_frames(folder, labels(), visible=boxes == "visible")
         write_annotated(
             recording,
             folder / "annotated.mcap",
@@ -311,6 +312,7 @@ def annotate_again(
     observe: Observer = _ignore,
     *,
     by_place: bool = False,
+    boxes: str | None = None,
     recording: Path | None = None,
 ) -> Transfer | None:
     """Write the outputs of a finished run again, with the labels a person has corrected.
@@ -320,6 +322,7 @@ def annotate_again(
     labels : the corrected table; that of the run itself by default.
     by_place : the table, or run folder, is another run's: its labels go to the objects in the
         same places.
+    boxes : ``full`` or ``visible``; as before by default.
     recording : where the recording is now; where it was processed by default.
 
     Returns
@@ -335,6 +338,7 @@ def annotate_again(
         transfer = _adopt(labels, folder, by_place=by_place)
         run = read_run(folder)
         run["input"] |= {"path": str(source.path.resolve()), "files": file_stats(source.path)}
+        run |= {"boxes": boxes} if boxes else {}
         for output in OUTPUTS:
             run["seconds"].pop(output, None)
         write_run(folder, run)  # after a kill, the next run writes what is missing

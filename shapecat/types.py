@@ -21,6 +21,7 @@ __all__ = [
     "Candidate",
     "Detection",
     "Frame",
+    "FullBox",
     "LabelledFrame",
     "LabelledObject",
     "NeuralGas",
@@ -149,6 +150,15 @@ class Box(Record):
     orientation: F4 = array("4", "f4")
 
 
+class FullBox(Box):
+    """The box around all of an object, also what is hidden of it: an estimate.
+
+    ``size_std`` (3,) metres is the standard deviation of each length.
+    """
+
+    size_std: F4 = array("3", "f4")
+
+
 class Candidate(Record):
     """Points that may be one object.
 
@@ -210,7 +220,8 @@ class Detection(Record):
     """One object in one frame: everything later phases need.
 
     ``neurons`` of ``gas`` are in the sensor frame; ``posterior`` sums to 1 in the order of the
-    model's categories; ``novelty`` is 0 for a familiar shape and above 1 beyond the threshold.
+    model's categories; ``novelty`` is 0 for a familiar shape and above 1 beyond the threshold;
+    ``full`` is in the sensor frame, None where only the visible box is known.
     """
 
     candidate: Candidate
@@ -219,6 +230,7 @@ class Detection(Record):
     posterior: F4 = array("c", "f4")
     novelty: float
     seconds: float
+    full: FullBox | None = None
 
 
 class Perception(Record):
@@ -239,7 +251,8 @@ class LabelledObject(Record):
     ``box`` is in the sensor frame, as are the ``neurons`` of ``gas``; ``posterior`` is this single
     view's, ``causal`` the track's up to this frame; ``confidence`` and ``category`` are final.
     ``height_m`` is the height of the centre above what it stands on, NaN if on nothing;
-    ``detections`` are its rows of the frame, several where tracks were merged.
+    ``detections`` are its rows of the frame, several where tracks were merged; ``full`` is the box
+    around all of it, as the views of its track tell, if that is known.
     """
 
     track: int
@@ -254,6 +267,7 @@ class LabelledObject(Record):
     touches_border: bool = False
     occluded: bool = False
     detections: tuple[int, ...] = ()
+    full: Box | None = None
 
 
 class LabelledFrame(Record):

@@ -68,6 +68,28 @@ def test_frames_have_the_points_and_masks_of_the_tables(place: Path) -> None:
     assert objects == run.tracks.arrow(["detection"])["detection"].drop_null().length() > 20
 
 
+def test_colour_masks_show_the_objects_that_are_there(place: Path) -> None:
+    """A mask of another object or frame, or shifted, shows something else in truth."""
+    run = shapecat.open_run(place / "results" / "demo")
+    with np.load(place / "demo.color_labels.npz") as file:
+        truth = file["labels"]
+    shares, owners = [], set()
+    for frame in run.frames(recording=place / "demo.mcap"):
+        number = frame.labelled.index
+        assert frame.color is not None
+        assert frame.color.shape == (*truth[number].shape, 3)
+        for item in frame.objects:
+            mask = frame.color_mask(item)
+            assert mask is not None
+            count = np.bincount(truth[number][mask], minlength=256)
+            if count.sum() > 400:
+                owners.add((item.track, int(count.argmax())))
+                shares.append(count.max() / count.sum())
+    assert len(shares) > 20
+    assert np.median(shares) > 0.9
+    assert len({track for track, _ in owners}) == len(owners)  # one object a track
+
+
 def test_columns_are_arrays_with_nan_where_nothing_is(place: Path) -> None:
     run = shapecat.open_run(str(place / "results" / "demo"))
     n = run.info["counts"]["detections"]

@@ -9,7 +9,15 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-STAGES = {"depth_fusion", "detection", "surface", "description", "learning", "tracking"}
+STAGES = {
+    "completion",
+    "depth_fusion",
+    "description",
+    "detection",
+    "learning",
+    "surface",
+    "tracking",
+}
 BASE = {"arrays", "colour_types", "errors", "jit", "stopping", "triangles", "types"}
 FLOOR = {
     **dict.fromkeys(BASE | {"py"}, 0),

@@ -69,7 +69,8 @@ def make_run(
         "center_fixed": [list(place) for _, _, place in rows],
         "posterior": [[1.0, 0.0, 0.0]] * len(rows),
     }
-    write_table(folder / "tracks.parquet", columns, TRACKS)
+    full = {name: [None] * len(rows) for name in TRACKS.names if "_full" in name}
+    write_table(folder / "tracks.parquet", full | columns, TRACKS)
     order = sorted(range(len(rows)), key=lambda k: (rows[k][1], detections[k]))
     found = {name: [columns[name][k] for k in order] for name in ("topic", "frame", "stamp_ns")}
     empty = {field.name: [None] * len(rows) for field in DETECTIONS}

@@ -286,7 +286,8 @@ def write_run(folder: Path) -> None:
         "center_fixed": [[0, 0, 0]] * len(rows),
         "posterior": [[0.5, 0.5]] * len(rows),
     }
-    write_table(folder / "tracks.parquet", columns, TRACKS)
+    full = {name: [None] * len(rows) for name in TRACKS.names if "_full" in name}
+    write_table(folder / "tracks.parquet", full | columns, TRACKS)
 
 
 def test_merged_fragments_follow_each_other_as_one_track(tmp_path: Path) -> None:

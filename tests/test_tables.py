@@ -66,7 +66,8 @@ def write_tracks(folder: Path, rows: list[tuple[int, int, int | None]]) -> None:
         "center_fixed": [[0, 0, 0]] * len(rows),
         "posterior": [[0.5, 0.5]] * len(rows),
     }
-    write_table(folder / "tracks.parquet", columns, TRACKS)
+    full = {name: [None] * len(rows) for name in TRACKS.names if "_full" in name}
+    write_table(folder / "tracks.parquet", full | columns, TRACKS)
 
 
 def test_columns_are_those_of_the_contract(tmp_path: Path) -> None:

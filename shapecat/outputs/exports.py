@@ -37,6 +37,7 @@ FORMATS: dict[str, Write] = {
     "labelcloud": lambda out, shown, run: write_labelcloud(out, _clouds(shown), run),
     "point-labels": lambda out, shown, run: write_point_labels(out, _clouds(shown), run),
 }
+_WITH_BOXES = ("kitti", "labelcloud")
 _MARK = "export.json"
 
 
@@ -50,6 +51,7 @@ def export_run(
     out: Path,
     *,
     every: int = 1,
+    visible_boxes: bool = False,
     recording: Path | None = None,
     observe: Observer = _ignore,
 ) -> int:
@@ -61,6 +63,7 @@ def export_run(
     Parameters
     ----------
     every : keep each so-many-th frame of a stream.
+    visible_boxes : boxes are around what is seen of the objects, not around all of them.
     recording : where the recording is now; where it was processed by default.
 
     Returns
@@ -79,8 +82,9 @@ def export_run(
     finished = read_finished(folder)
     total = -(-int(finished.run["counts"]["frames"]) // every)
     with open_source(finished.run, recording) as source:
-        chosen = _thinned(finished.frames(), every)
-        triples = with_colour(chosen, source, finished.run, folder)
+        full = format in _WITH_BOXES and not visible_boxes
+        labelled = finished.frames_with_full_boxes() if full else finished.frames()
+        triples = with_colour(_thinned(labelled, every), source, finished.run, folder)
         pairs = _observed(triples, total, observe)
         if format == "crops":
             return FORMATS[format](out, pairs, finished)

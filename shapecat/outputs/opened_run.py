@@ -10,9 +10,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shapecat.arrays import F4, I4, Bool
+from shapecat.arrays import F4, I4, U1, Bool
 from shapecat.errors import OutputError
-from shapecat.outputs.rereading import FinishedRun, open_source, read_finished, with_clouds
+from shapecat.outputs.colouring import Coloured, with_colour
+from shapecat.outputs.rereading import FinishedRun, open_source, read_finished
+from shapecat.recordings.colour_image import pixels_of
 from shapecat.runs.tables import numbers
 from shapecat.types import Frame, LabelledFrame, LabelledObject
 
@@ -81,13 +83,11 @@ def _rows(values: pa.FixedSizeListArray, width: int) -> Any:
 
 @dataclass(frozen=True)
 class RunFrame:
-    """A frame of a run with what the sensor read.
-
-    What other sensors read at the same time, such as colour, has its place beside ``reading``.
-    """
+    """A frame of a run with what the sensor read, and its colour image, if it has one."""
 
     labelled: LabelledFrame
     reading: Frame
+    coloured: Coloured | None = None
 
     @property
     def objects(self) -> tuple[LabelledObject, ...]:
@@ -122,6 +122,19 @@ class RunFrame:
         mask = np.zeros(self.shape, np.bool_)
         mask.reshape(-1)[item.indices] = True
         return mask
+
+    @property
+    def color(self) -> U1 | None:
+        """(h, w, 3) uint8 red, green, blue: the colour image as it was taken; None without one."""
+        return None if self.coloured is None else pixels_of(self.coloured.view.image)
+
+    def color_mask(self, item: LabelledObject) -> Bool | None:
+        """Return which pixels of the colour image, (h, w), belong to an object; None without."""
+        if self.coloured is None:
+            return None
+        image = self.coloured.view.image
+        mask = self.coloured.masks[[o.track for o in self.objects].index(item.track)]
+        return mask.full(image.height, image.width)
 
     def points_of(self, item: LabelledObject) -> F4:
         """Return (n, 3) the points of an object: metres, sensor frame."""
@@ -195,5 +208,6 @@ class Run:
         """
         moved = None if recording is None else Path(recording)
         with open_source(self.info, moved) as source:
-            for labelled, reading in with_clouds(self.labelled_frames(), source, self.info):
-                yield RunFrame(labelled, reading)
+            shown = with_colour(self.labelled_frames(), source, self.info, self.folder)
+            for labelled, reading, coloured in shown:
+                yield RunFrame(labelled, reading, coloured)

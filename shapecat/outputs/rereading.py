@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -47,6 +47,12 @@ class FinishedRun:
     def frames(self) -> Iterator[LabelledFrame]:
         """Read the labelled frames."""
         return read_labelled_frames(self.folder, self.labels)
+
+    def frames_with_full_boxes(self) -> Iterator[LabelledFrame]:
+        """Read the labelled frames, each box that around all of its object, where it is known."""
+        for frame in self.frames():
+            objects = (replace(item, box=item.full or item.box) for item in frame.objects)
+            yield replace(frame, objects=tuple(objects))
 
 
 def read_finished(folder: Path) -> FinishedRun:

@@ -13,6 +13,7 @@ Entities
         └── objects
             ├── points         in the colour of the category
             ├── boxes          labelled "#track category confidence"
+            ├── full           boxes around all of the objects, dashed
             ├── captions       the same labels, drawn above the boxes
             ├── graphs         edges of the growing neural gas
             └── surfaces       its triangles

@@ -12,7 +12,7 @@ import pyarrow as pa
 import rerun as rr
 
 from shapecat.arrays import F4, F8, U4
-from shapecat.geometry import quaternion_from_rotation, rotation_from_quaternion
+from shapecat.geometry import box_corners, quaternion_from_rotation, rotation_from_quaternion
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import PaintedCloud
 from shapecat.types import Box, Camera, LabelledFrame, LabelledObject, Pose
@@ -31,6 +31,15 @@ __all__ = [
 
 _PLANE = (190, 205, 220)
 _CAPTION_M = 0.02  # from the top of a box to its label
+
+_EDGES = np.array(
+    [(k, (k + 1) % 4) for k in range(4)]
+    + [(k + 4, (k + 1) % 4 + 4) for k in range(4)]
+    + [(k, k + 4) for k in range(4)]
+)
+"""Pairs of the corners of a box, numbered as by `box_corners`."""
+_DASHES = (np.arange(5)[:, None] + [0.0, 0.5])[..., None] / 4.5
+"""(5, 2, 1) where the dashes of an edge begin and end, as shares of it: at both corners."""
 
 _Columns = Iterable[rr.ComponentColumn]
 Way = tuple[str, F8]
@@ -91,6 +100,20 @@ def _boxes(moments: Sequence[Moment]) -> _Columns:
         colors=_packed(objects, white=0.25),
         labels=[label(o) for o in objects],
     ).partition(counts)
+
+
+def _dashes(moments: Sequence[Moment]) -> _Columns:
+    """Return the edges of the full boxes, dashed."""
+    known = [[o for o in m.labelled.objects if o.full is not None] for m in moments]
+    objects = list(chain.from_iterable(known))
+    boxes = np.reshape([box_corners(o.full) for o in objects if o.full is not None], (-1, 8, 3))
+    starts, ends = boxes[:, _EDGES[:, 0]], boxes[:, _EDGES[:, 1]]
+    pairs = starts[:, :, None, None] + _DASHES * (ends - starts)[:, :, None, None]
+    dashes = len(_EDGES) * len(_DASHES)
+    yield from rr.LineStrips3D.columns(
+        strips=_segments(pairs.reshape(-1, 2, 3)),
+        colors=np.repeat(_packed(objects, white=0.45), dashes),
+    ).partition([dashes * len(each) for each in known])
 
 
 def _captions(moments: Sequence[Moment]) -> _Columns:
@@ -179,6 +202,7 @@ DRAWINGS: Mapping[str, Drawing] = {
     "planes": Drawing(rr.LineStrips3D.from_fields(colors=_PLANE, radii=0.001), _outlines),
     "planes/fill": Drawing(rr.Mesh3D.from_fields(albedo_factor=(*_PLANE, 28)), _fills),
     "objects/boxes": Drawing(rr.Boxes3D.from_fields(radii=0.001, show_labels=False), _boxes),
+    "objects/full": Drawing(rr.LineStrips3D.from_fields(radii=0.0008), _dashes),
     "objects/captions": Drawing(rr.Points3D.from_fields(radii=0.0005, show_labels=True), _captions),
     "objects/graphs": Drawing(rr.LineStrips3D.from_fields(radii=0.0008), _graphs),
     "objects/surfaces": Drawing(None, _surfaces),

@@ -9,7 +9,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute
 
-from shapecat.arrays import F4
+from shapecat.arrays import F4, F8
 from shapecat.geometry import box_corners, upright_box
 from shapecat.runs.corrections import TrackLabel
 from shapecat.runs.shown import ShownTracks
@@ -71,7 +71,8 @@ def _labelled_frame(
     parts: dict[int, list[LabelledObject]] = {}
     for item in shown.of(key):
         causal = shown.causal[item.row]
-        part = _labelled_object(found[item.detection], causal, item.label)
+        full = shown.full[item.row]
+        part = _labelled_object(found[item.detection], causal, item.label, full)
         parts.setdefault(item.label.track, []).append(part)
     return LabelledFrame(
         topic=row["topic"],
@@ -98,7 +99,9 @@ def _plane(row: Mapping[str, Any]) -> Plane:
     )
 
 
-def _labelled_object(row: Mapping[str, Any], causal: F4, label: TrackLabel) -> LabelledObject:
+def _labelled_object(
+    row: Mapping[str, Any], causal: F4, label: TrackLabel, full: F8
+) -> LabelledObject:
     return LabelledObject(
         track=label.track,
         category=label.category,
@@ -112,6 +115,7 @@ def _labelled_object(row: Mapping[str, Any], causal: F4, label: TrackLabel) -> L
         touches_border=row["touches_border"],
         occluded=row["occluded"],
         detections=(row["detection"],),
+        full=None if np.isnan(full[0]) else Box(full[:3], full[3:6], full[6:]),
     )
 
 
@@ -119,8 +123,8 @@ def _join(parts: Sequence[LabelledObject], up: Sequence[float]) -> LabelledObjec
     """Make one object of the parts of a merged track that are seen in the same frame."""
     if len(parts) == 1:
         return parts[0]
-    corners = np.concatenate([box_corners(part.box) for part in parts])
-    box = upright_box(corners.astype(np.float32), up)
+    box = _around([part.box for part in parts], up)
+    full = _around([part.full or part.box for part in parts], up)
     bottoms = [float(np.dot(up, part.box.center)) - part.height_m for part in parts]
     starts = np.cumsum([0, *(len(part.gas.neurons) for part in parts)])
     edges = [part.gas.edges + start for part, start in zip(parts, starts[:-1], strict=True)]
@@ -135,4 +139,10 @@ def _join(parts: Sequence[LabelledObject], up: Sequence[float]) -> LabelledObjec
         touches_border=any(part.touches_border for part in parts),
         occluded=any(part.occluded for part in parts),
         detections=tuple(number for part in parts for number in part.detections),
+        full=full if any(part.full for part in parts) else None,
     )
+
+
+def _around(boxes: Sequence[Box], up: Sequence[float]) -> Box:
+    corners = np.concatenate([box_corners(box) for box in boxes])
+    return upright_box(corners.astype(np.float32), up)

@@ -226,6 +226,10 @@ def _detection_columns(
         "center": [c.box.center for c in candidates],
         "size": [c.box.size for c in candidates],
         "orientation": [c.box.orientation for c in candidates],
+        "center_full": [d.full and d.full.center for d in found],
+        "size_full": [d.full and d.full.size for d in found],
+        "orientation_full": [d.full and d.full.orientation for d in found],
+        "size_full_std": [d.full and d.full.size_std for d in found],
         "center_fixed": [_center_fixed(row, d.candidate.box.center) for _, row, _, d in objects],
         "height_m": [
             _height(p, c.plane, c.support_m, c.box.center)

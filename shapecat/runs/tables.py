@@ -42,6 +42,12 @@ SCHEMA_VERSION = "1"
 _VEC3 = pa.list_(pa.float32(), 3)
 _QUATERNION = pa.list_(pa.float32(), 4)
 _FLOATS = pa.list_(pa.float32())
+_FULL = (
+    ("center_full", _VEC3),
+    ("size_full", _VEC3),
+    ("orientation_full", _QUATERNION),
+    ("size_full_std", _VEC3),
+)
 
 FRAMES = pa.schema(
     [
@@ -78,6 +84,7 @@ DETECTIONS = pa.schema(
         ("size", _VEC3),
         ("orientation", _QUATERNION),
         ("center_fixed", _VEC3),
+        *_FULL,
         ("height_m", pa.float32()),
         ("points", pa.int32()),
         ("indices", pa.list_(pa.uint32())),
@@ -91,7 +98,8 @@ DETECTIONS = pa.schema(
         ("seconds", pa.float32()),
     ]
 )
-"""One row per object per frame; lengths in metres, ``center`` and ``neurons`` in ``frame_id``."""
+"""One row per object per frame; lengths in metres, ``center`` and ``neurons`` in ``frame_id``.
+The box around all of an object, ``*_full``, is null where only the visible one is known."""
 
 PLANES = pa.schema(
     [
@@ -116,11 +124,13 @@ TRACKS = pa.schema(
         ("stamp_ns", pa.int64()),
         ("detection", pa.int32()),
         ("center_fixed", _VEC3),
+        *_FULL,
         ("posterior", _FLOATS),
     ]
 )
 """One row per track per frame; ``detection`` is null while the track coasts, ``posterior`` is the
-causal one. Without a fixed frame ``center_fixed`` is in the sensor frame."""
+causal one. Without a fixed frame ``center_fixed`` is in the sensor frame; ``center_full`` and
+``orientation_full`` are in the frame of ``center_fixed``, null while the track coasts."""
 
 Key = tuple[str, int]
 """A frame: its topic, and its number there."""

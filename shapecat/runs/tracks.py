@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from shapecat.config import TrackingSettings
 from shapecat.files import replacing
+from shapecat.runs.full_boxes import FullBoxes, full_columns
 from shapecat.runs.tables import TRACKS, frame_rows, lists, numbers, read_row_groups, write_table
 from shapecat.tracking import FrameDetections, Track, track_recording
 
@@ -51,7 +52,7 @@ def track_run(
     frames = _read_frames(folder, len(categories), placed)
     tracks = track_recording(frames, settings, together=placed)
     with replacing(folder / "tracks.parquet") as path:
-        write_table(path, _columns(tracks), TRACKS)
+        write_table(path, _columns(tracks, FullBoxes.read(folder, placed)), TRACKS)
     labels = [_label(track, categories) for track in tracks]
     with replacing(folder / "tracks.csv") as path:
         _write_csv(path, tracks, labels, categories, _start_ns(folder), work)
@@ -131,13 +132,14 @@ def _guess(track: Track, categories: Sequence[str]) -> str:
     return categories[int(np.argmax(track.posterior))]
 
 
-def _columns(tracks: Sequence[Track]) -> dict[str, Any]:
+def _columns(tracks: Sequence[Track], boxes: FullBoxes) -> dict[str, Any]:
     """Return the rows of all tracks, track after track, each in time."""
 
     def column(name: str) -> Any:
         return np.concatenate([getattr(track, name) for track in tracks]) if tracks else []
 
     detections = np.asarray(column("detections"), np.int32)
+    full = np.concatenate([np.zeros((0, 13)), *map(boxes.of_track, tracks)])
     return {
         "track": np.repeat([track.id for track in tracks], [len(track.frames) for track in tracks]),
         "topic": [topic for track in tracks for topic in track.topics],
@@ -147,6 +149,7 @@ def _columns(tracks: Sequence[Track]) -> dict[str, Any]:
         "center_fixed": pa.FixedSizeListArray.from_arrays(
             np.ravel(column("centers")).astype(np.float32), 3
         ),
+        **full_columns(full),
         "posterior": lists([p for track in tracks for p in track.causal], pa.float32()),
     }
 

@@ -1,0 +1,213 @@
+"""Boxes against the true ones, from simulated recordings to tables: 3D overlap by category.
+
+    python -m benchmarks.boxes --first 1000 --count 20 [--json]
+
+Each recording, of a camera that walks past a table or a pile, is processed as `shapecat process`
+does. Things with at least `SEEN_PIXELS` readings that were found are judged in every frame: the
+visible box, the full box of the single view, and that of the track. The overlap is that of
+upright boxes, exact. What is round about the vertical has no yaw of its own: its true box takes
+that of the box it is compared with.
+"""
+
+import json
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+import numpy as np
+import pyarrow.parquet as pq
+from numpy.typing import NDArray
+from scipy.optimize import linear_sum_assignment
+
+from benchmarks.measure import markdown
+from shapecat.geometry import gravity_rotation, rotation_from_quaternion
+from shapecat.pipeline import process
+from shapecat.runs.jobs import Job
+from shapecat.simulation import simulate
+from shapecat.simulation.scenes import SceneKind
+
+Array = NDArray[Any]
+SEEN_PIXELS = 250
+"""With fewer readings a thing is not judged."""
+SAME = 0.5
+"""A detection is of a thing if their pixels overlap so much (intersection over union)."""
+ROUND = ("can", "bottle", "bowl", "plate", "ball")
+"""Solids of revolution; a cup has a handle."""
+ALIKE = 0.05
+"""One whose true length and width differ by a larger share is oval, and has a yaw."""
+JUDGED = ("cup", "can", "box", "bottle", "bowl", "ball")
+KINDS: tuple[SceneKind, ...] = ("tabletop", "pile")
+GROUPS = ("tabletop, upright", "tabletop, lying", "pile, upright", "pile, tilted")
+_HOW: dict[SceneKind, str] = {"tabletop": "lying", "pile": "tilted"}
+FRAMES, RATE_HZ = 24, 8.0
+COLUMNS = ("objects", "views", "visible", "full, single view", "full, track")
+
+
+class Upright(NamedTuple):
+    """A box in a level frame: centre (3,), size (3,), yaw."""
+
+    center: Array
+    size: Array
+    yaw: float
+
+
+class Judged(NamedTuple):
+    """The overlaps of one object in one view: visible, full, and that of the track, if any."""
+
+    group: str
+    category: str
+    thing: tuple[int, int]
+    overlaps: Array
+
+
+@click.command(help=__doc__)
+@click.option("--first", default=1000, show_default=True, help="Seed of the first scene.")
+@click.option("--count", default=20, show_default=True, help="Scenes of each kind.")
+@click.option("--json", "as_json", is_flag=True, help="Print the means as JSON.")
+def main(*, first: int, count: int, as_json: bool) -> None:
+    """Judge scenes and print a table."""
+    found = [item for kind in KINDS for item in _judge_kind(kind, first, count)]
+    rows = [row for group in GROUPS for row in _rows(found, group)]
+    if as_json:
+        print(json.dumps({row[0]: dict(zip(COLUMNS, row[1:], strict=True)) for row in rows}))
+        return
+    print(markdown(f"3D overlap, seeds {first} to {first + count - 1}", ("", *COLUMNS), rows))
+
+
+def _rows(found: Sequence[Judged], group: str) -> Iterator[list[Any]]:
+    """Yield the mean overlaps of each category and of all that are judged together."""
+    some = [item for item in found if item.group == group]
+    for category in sorted({item.category for item in some}):
+        yield _row(f"{group}, {category}", [item for item in some if item.category == category])
+    yield _row(f"{group}, {', '.join(JUDGED)}", [item for item in some if item.category in JUDGED])
+
+
+def _row(name: str, some: Sequence[Judged]) -> list[Any]:
+    overlaps = np.reshape([item.overlaps for item in some], (-1, 3))
+    means = [round(float(np.nanmean(column)), 3) if len(some) else None for column in overlaps.T]
+    return [name, len({item.thing for item in some}), len(some), *means]
+
+
+def _judge_kind(kind: SceneKind, first: int, count: int) -> Iterator[Judged]:
+    for seed in range(first, first + count):
+        with tempfile.TemporaryDirectory() as name:
+            folder = Path(name)
+            source = simulate(
+                folder / "recording.mcap", scene=kind, frames=FRAMES, seed=seed, rate_hz=RATE_HZ
+            )
+            process(Job(source, folder / "run", mcap=False, rrd=False))
+            for item in _judge_run(folder, seed):
+                yield item._replace(group=f"{kind}, {_HOW[kind] if item.group else 'upright'}")
+
+
+def _judge_run(folder: Path, seed: int) -> Iterator[Judged]:
+    truth = json.loads((folder / "recording.truth.json").read_text("utf-8"))
+    labels = np.load(folder / "recording.labels.npz")["labels"]
+    detections = _by_frame(folder / "run" / "detections.parquet")
+    tracked = {
+        (row["frame"], row["detection"]): row
+        for rows in _by_frame(folder / "run" / "tracks.parquet").values()
+        for row in rows
+    }
+    ups = {
+        row["frame"]: row["up"] for row in pq.read_table(folder / "run/frames.parquet").to_pylist()
+    }
+    for frame in truth:
+        number = frame["frame"]
+        level = gravity_rotation(ups[number])
+        for thing, row in _matches(frame["objects"], detections.get(number, []), labels[number]):
+            track = tracked.get((number, row["detection"]))
+            boxes = (
+                _upright(row, "", level),
+                _upright(row, "_full", level),
+                _upright(track, "_full", level) if track else None,
+            )
+            yield Judged(
+                "tilted" if thing["tilted"] or thing["lying"] else "",
+                thing["category"],
+                (seed, thing["track"]),
+                np.array([_overlap(thing, box, level) for box in boxes]),
+            )
+
+
+def _by_frame(path: Path) -> dict[int, list[dict[str, Any]]]:
+    grouped: dict[int, list[dict[str, Any]]] = {}
+    for row in pq.read_table(path).to_pylist():
+        grouped.setdefault(row["frame"], []).append(row)
+    return grouped
+
+
+def _matches(
+    things: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]], labels: Array
+) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
+    """Match true and found objects one to one by their pixels."""
+    inside = [np.bincount(labels.reshape(-1)[r["indices"]], minlength=256) for r in rows]
+    iou = np.zeros((len(things), len(rows)))
+    for i, thing in enumerate(things):
+        for j, row in enumerate(rows):
+            common = inside[j][thing["label"]]
+            iou[i, j] = common / (thing["pixels"] + len(row["indices"]) - common)
+    for i, j in zip(*linear_sum_assignment(-iou), strict=True):
+        if iou[i, j] >= SAME and things[i]["pixels"] >= SEEN_PIXELS:
+            yield things[i], rows[j]
+
+
+def _upright(row: dict[str, Any], which: str, level: Array) -> Upright:
+    heading = level @ rotation_from_quaternion(row[f"orientation{which}"])[:, 0]
+    return Upright(
+        level @ np.array(row[f"center{which}"]),
+        np.array(row[f"size{which}"]),
+        float(np.arctan2(heading[1], heading[0])),
+    )
+
+
+def _overlap(thing: dict[str, Any], box: Upright | None, level: Array) -> float:
+    if box is None:
+        return float("nan")
+    true = _upright(thing["box"], "", level)
+    square = abs(true.size[0] - true.size[1]) < ALIKE * true.size[:2].max()
+    if thing["category"] in ROUND and square and not (thing["tilted"] or thing["lying"]):
+        across = float(true.size[:2].mean())
+        true = Upright(true.center, np.array([across, across, true.size[2]]), box.yaw)
+    return overlap(true, box)
+
+
+def overlap(a: Upright, b: Upright) -> float:
+    """Return the intersection over union of two upright boxes."""
+    top = min(a.center[2] + a.size[2] / 2, b.center[2] + b.size[2] / 2)
+    bottom = max(a.center[2] - a.size[2] / 2, b.center[2] - b.size[2] / 2)
+    corners = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * b.size[:2] / 2
+    seen = (corners @ _turn(b.yaw).T + b.center[:2] - a.center[:2]) @ _turn(a.yaw)
+    common = _area(_clipped(seen, a.size[:2] / 2)) * max(top - bottom, 0.0)
+    return float(common / (a.size.prod() + b.size.prod() - common))
+
+
+def _turn(yaw: float) -> Array:
+    return np.array([[np.cos(yaw), -np.sin(yaw)], [np.sin(yaw), np.cos(yaw)]])
+
+
+def _clipped(polygon: Array, half: Array) -> Array:
+    """Clip a polygon (k, 2) to a centred rectangle, edge by edge (Sutherland and Hodgman 1974)."""
+    for axis, sign in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        inside = half[axis] - sign * polygon[:, axis]
+        kept = []
+        for k in range(len(polygon)):
+            n = (k + 1) % len(polygon)
+            if inside[k] >= 0:
+                kept.append(polygon[k])
+            if inside[k] * inside[n] < 0:
+                share = inside[k] / (inside[k] - inside[n])
+                kept.append(polygon[k] + share * (polygon[n] - polygon[k]))
+        polygon = np.reshape(kept, (-1, 2))
+    return polygon
+
+
+def _area(polygon: Array) -> float:
+    x, y = polygon.T
+    return float(abs(x @ np.roll(y, -1) - y @ np.roll(x, -1)) / 2)
+
+
+if __name__ == "__main__":
+    main()

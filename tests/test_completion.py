@@ -1,0 +1,191 @@
+"""Whole boxes from one side: cylinders, boxes, balls of known size, seen from an oblique camera."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from numpy.testing import assert_allclose
+
+from benchmarks.boxes import Upright, overlap
+from shapecat.completion import complete
+from shapecat.geometry import gravity_rotation, rotation_from_quaternion
+from shapecat.tracking import BoxViews, fuse_boxes
+from shapecat.types import CATEGORIES, FullBox
+
+TILT = np.radians(37)
+UP = np.array([0, -np.cos(TILT), -np.sin(TILT)])
+"""Up for a camera that looks 37 degrees down."""
+LEVEL = gravity_rotation(UP)
+PLACE = np.array([0.21, 1.03, -0.74])
+"""Where the object stands, in the level frame of the camera."""
+RNG = np.random.default_rng(5)
+
+
+def above(height: float) -> np.ndarray:
+    return np.asarray(PLACE + np.array([0, 0, height]))
+
+
+def sure(category: str) -> np.ndarray:
+    return np.asarray(np.eye(len(CATEGORIES))[CATEGORIES.index(category)])
+
+
+def estimate(surface: np.ndarray, normals: np.ndarray, category: str) -> FullBox:
+    """Complete what a camera sees of a convex surface (n, 3) that stands at `PLACE`."""
+    points = surface + PLACE
+    seen = points[(normals * points).sum(axis=1) < 0] @ LEVEL
+    return complete(seen.astype(np.float32), UP, PLACE[2], sure(category), CATEGORIES)
+
+
+def cylinder(radius: float, height: float, count: int = 6000) -> tuple[np.ndarray, np.ndarray]:
+    angle, z = RNG.uniform(0, 2 * np.pi, count), RNG.uniform(0, height, count)
+    around = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
+    points = around * radius + np.array([0, 0, 1]) * z[:, None]
+    top = around * (radius * np.sqrt(RNG.uniform(0, 1, count)))[:, None] + [0, 0, height]
+    upward = np.tile([0.0, 0.0, 1.0], (count, 1))
+    return np.concatenate([points, top]), np.concatenate([around, upward])
+
+
+def cuboid(size: np.ndarray, yaw: float) -> tuple[np.ndarray, np.ndarray]:
+    points, normals = [], []
+    for axis in range(3):
+        for sign in (-1, 1):
+            face = RNG.uniform(-0.5, 0.5, (3000, 3))
+            face[:, axis] = sign / 2
+            points.append(face * size + [0, 0, size[2] / 2])
+            normals.append(np.tile(sign * np.eye(3)[axis], (3000, 1)))
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    return np.concatenate(points) @ turn.T, np.concatenate(normals) @ turn.T
+
+
+def test_the_hidden_half_of_a_can_is_its_seen_half() -> None:
+    """Its top shows all of its width, but a camera below the top must not halve it."""
+    points, normals = cylinder(0.034, 0.12)
+    side = normals[:, 2] == 0
+    box = estimate(points[side], normals[side], "can")
+
+    assert_allclose(np.sort(box.size), [0.068, 0.068, 0.12], rtol=0.05)
+    assert_allclose(LEVEL @ box.center, above(0.06), atol=0.003)
+    assert_allclose(rotation_from_quaternion(box.orientation)[:, 2], UP, atol=1e-6)
+
+
+def test_a_ball_is_as_high_and_as_deep_as_wide() -> None:
+    normals = RNG.normal(size=(8000, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    box = estimate(0.095 * normals + [0, 0, 0.095], normals, "ball")
+
+    assert_allclose(box.size, 0.19, rtol=0.05)
+    assert_allclose(LEVEL @ box.center, above(0.095), atol=0.006)
+
+
+def test_a_box_with_an_odd_yaw_keeps_its_lengths() -> None:
+    size = np.array([0.23, 0.09, 0.14])
+    points, normals = cuboid(size, 0.431)
+    box = estimate(points, normals, "box")
+    heading = LEVEL @ rotation_from_quaternion(box.orientation)[:, 0]
+    off = np.arctan2(heading[1], heading[0]) - 0.431
+
+    assert_allclose(np.sort(box.size), np.sort(size), rtol=0.06)
+    assert_allclose(LEVEL @ box.center, above(0.07), atol=0.006)
+    assert abs(np.sin(2 * off)) < np.sin(2 * np.radians(3))
+
+
+def test_what_an_occluder_hides_below_is_part_of_the_box() -> None:
+    """Something that stands reaches down to its support, and is less sure to."""
+    points, normals = cylinder(0.04, 0.2)
+    top = points[:, 2] > 0.12
+    box, hidden = (
+        estimate(points, normals, "bottle"),
+        estimate(points[top], normals[top], "bottle"),
+    )
+
+    assert hidden.size[2] == pytest.approx(0.2, rel=0.02)
+    assert hidden.size_std[2] > 3 * box.size_std[2]
+
+
+def test_a_bottle_that_lies_is_not_as_wide_as_long() -> None:
+    """A circle around its length would be four times its footprint."""
+    points, normals = cylinder(0.035, 0.25)
+    lying = points[:, [2, 0, 1]] + [-0.125, 0, 0.035]
+    box = estimate(lying, normals[:, [2, 0, 1]], "bottle")
+
+    assert np.sort(box.size)[-1] == pytest.approx(0.25, rel=0.08)
+    assert min(box.size[:2]) < 0.1
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 50])
+def test_few_points_in_one_place_give_a_finite_box(count: int) -> None:
+    """Equal points make every fit singular."""
+    points = np.tile(np.array([0.1, 0.2, 1.3], np.float32), (count, 1))
+    for category in CATEGORIES:
+        box = complete(points, UP, float(UP @ points[0]), sure(category), CATEGORIES)
+        assert np.isfinite([*box.center, *box.size, *box.size_std]).all()
+        assert (box.size >= 0).all()
+
+
+def test_no_point_is_refused() -> None:
+    with pytest.raises(ValueError, match="at least one point"):
+        complete(np.zeros((0, 3), np.float32), UP, 0.0, sure("cup"), CATEGORIES)
+
+
+def about_z(yaw: float) -> np.ndarray:
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+
+
+def test_views_agree_on_one_size_whatever_their_quarter_turns() -> None:
+    """Length and width swap with the yaw a view happens to find."""
+    size, yaw = np.array([0.21, 0.11, 0.3]), 0.37
+    noise = RNG.normal(0, 0.004, (9, 3))
+    quarters = np.array([0, 1, 0, 3, 2, 0, 1, 0, 1])
+    sizes = np.where((quarters % 2 == 1)[:, None], size[[1, 0, 2]], size) + noise
+    axes = np.stack([about_z(yaw + q * np.pi / 2) for q in quarters])
+    centers = PLACE + RNG.normal(0, 0.003, (9, 3))
+    views = BoxViews(centers, axes, sizes, np.full((9, 3), 0.01))
+    fused = fuse_boxes(views, np.zeros(9, np.bool_))
+
+    assert (fused.sizes == fused.sizes[0]).all()
+    for k in range(9):
+        true = Upright(PLACE, size, yaw)
+        heading = fused.axes[k][:, 0]
+        mine = Upright(fused.centers[k], fused.sizes[k], float(np.arctan2(heading[1], heading[0])))
+        assert overlap(true, mine) > 0.9
+
+
+def test_a_view_from_where_the_object_was_moved_to_keeps_its_place() -> None:
+    centers = np.zeros((7, 3))
+    centers[5:] = [0.4, 0.1, 0]
+    views = BoxViews(centers, np.tile(np.eye(3), (7, 1, 1)), np.ones((7, 3)), np.ones((7, 3)))
+    fused = fuse_boxes(views, np.zeros(7, np.bool_))
+
+    assert_allclose(fused.centers, centers)
+
+
+def test_overlap_of_turned_boxes_is_exact() -> None:
+    """A square turned by 45 degrees in another of the same size leaves an octagon."""
+    a = Upright(np.zeros(3), np.array([2.0, 2.0, 2.0]), 0.2)
+    b = Upright(np.array([0, 0, 0.5]), np.array([2.0, 2.0, 2.0]), 0.2 + np.pi / 4)
+    octagon = 8 * (np.sqrt(2) - 1)
+    common = octagon * 1.5
+
+    assert overlap(a, b) == pytest.approx(common / (16 - common))
+    assert overlap(a, a) == pytest.approx(1)
+    assert overlap(a, b._replace(center=np.array([0, 3.0, 0]))) == 0
+
+
+def test_a_track_has_one_full_size(guessed_run: Path) -> None:
+    """People read the size of an object from any row of its track."""
+    detections = pq.read_table(guessed_run / "detections.parquet").to_pylist()
+    tracks = pq.read_table(guessed_run / "tracks.parquet").to_pylist()
+    sizes: dict[int, set[tuple[float, ...]]] = {}
+    for row in tracks:
+        if row["detection"] is not None:
+            sizes.setdefault(row["track"], set()).add(tuple(row["size_full"]))
+            assert min(row["size_full_std"]) > 0
+        else:
+            assert row["center_full"] is None
+
+    assert len(sizes) > 3
+    assert all(len(found) == 1 for found in sizes.values())
+    assert all(min(row["size_full"]) > 0 for row in detections)

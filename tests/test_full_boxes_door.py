@@ -1,0 +1,72 @@
+"""Which boxes leave the house: whole ones, or with `--boxes visible` those of what is seen."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from click.testing import Result
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+Sizes = dict[tuple[int, str], list[float]]
+
+
+def annotated(folder: Path) -> Sizes:
+    """Return by stamp and track the sizes in annotated.mcap."""
+    found = {}
+    with (folder / "annotated.mcap").open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for _, _, _, message in reader.iter_decoded_messages(["/shapecat/detections"]):
+            stamp = message.header.stamp
+            for item in message.detections:
+                size = item.bbox.size
+                key = (stamp.sec * 10**9 + stamp.nanosec, item.id)
+                found[key] = [size.x, size.y, size.z]
+    return found
+
+
+def tables(folder: Path, *, full: bool) -> Sizes:
+    """Return the same of the tables: full sizes of the tracks, or the sizes of the detections."""
+    seen = {
+        (row["frame"], row["detection"]): row["size"]
+        for row in pq.read_table(folder / "detections.parquet").to_pylist()
+    }
+    return {
+        (row["stamp_ns"], str(row["track"])): row["size_full"]
+        if full
+        else seen[row["frame"], row["detection"]]
+        for row in pq.read_table(folder / "tracks.parquet").to_pylist()
+        if row["detection"] is not None
+    }
+
+
+@pytest.mark.parametrize("options", [(), ("--boxes", "visible"), ("--boxes", "full")])
+def test_annotations_have_the_boxes_asked_for(
+    guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result], options: tuple[str, ...]
+) -> None:
+    """Who annotates again with the other boxes must not get those of before."""
+    folder = tmp_path / "table"
+    shutil.copytree(guessed_run, folder)
+    result = shapecat("annotate", folder, *options)
+    assert result.exit_code == 0, result.output
+
+    found, expected = annotated(folder), tables(folder, full="visible" not in options)
+    other = tables(folder, full="visible" in options)
+    assert found.keys() == expected.keys()
+    keys = sorted(found)
+    assert np.allclose([found[k] for k in keys], [expected[k] for k in keys], atol=1e-6)
+    assert not np.allclose([found[k] for k in keys], [other[k] for k in keys], atol=1e-3)
+
+
+def test_export_refuses_other_boxes_by_name(
+    guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result]
+) -> None:
+    result = shapecat(
+        "export", guessed_run, "--format", "kitti", "--out", tmp_path, "--boxes", "whole"
+    )
+
+    assert result.exit_code == 2
+    assert "visible" in result.output
