@@ -20,7 +20,7 @@ from shapecat.learning import Categorizer, load_model
 from shapecat.surface import reconstruct, thin
 from shapecat.types import Candidate, Detection, Frame, NeuralGas, Perception, Scene
 
-__all__ = ["Perceiver", "View", "perceive"]
+__all__ = ["Perceiver", "View", "find_up", "perceive"]
 
 
 class View(NamedTuple):
@@ -115,6 +115,12 @@ def perceive(
             "categorize": time.perf_counter() - described,
         },
     )
+
+
+def find_up(frame: Frame, settings: Settings) -> F4 | None:
+    """Return the normal (3,) of the dominant supporting plane; None if no plane is found."""
+    scene = detect(frame, settings=settings.detection, rng=_rng(settings, frame, 0))
+    return scene.up if scene.planes else None
 
 
 def _rng(settings: Settings, frame: Frame, item: int) -> np.random.Generator:
