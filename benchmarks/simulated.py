@@ -151,7 +151,8 @@ def _judge_relations(view: View, matches: dict[int, int], total: Counter[str]) -
             continue
         candidate = view.found.candidates[matches[thing.label]]
         if thing.on_support is not None:
-            apart = abs(found[candidate.plane] - heights[thing.on_support])
+            height = np.inf if candidate.plane is None else found[candidate.plane]
+            apart = abs(height - heights[thing.on_support])
             right = candidate.on_candidate is None and bool(apart < SAME_HEIGHT_M)
         else:
             below = _label_of(by_track, thing)

@@ -28,8 +28,7 @@ def run(count: int) -> tuple[str, dict[str, Any]]:
         scene = detect(frame, settings=settings.detection, rng=np.random.default_rng(0))
         for candidate in scene.candidates[:4]:
             points = frame.xyz(candidate.indices)
-            plane = scene.planes[candidate.plane or 0]
-            level = level_from_sensor(scene.up, plane.offset, points)
+            level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
             upright = transform(level, points).astype(np.float32)
             cloud = voxelize(upright, voxel_m=settings.surface.voxel_m)
             gas = reconstruct(cloud, settings=settings.surface, rng=np.random.default_rng(0))

@@ -134,7 +134,7 @@ def _describe_candidate(
     """Stand the candidate upright on z = 0, learn its surface, and describe it."""
     begun = time.perf_counter()
     points = frame.xyz(candidate.indices)
-    level = level_from_sensor(scene.up, _support_offset(scene, candidate), points)
+    level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
     cloud = thin(transform(level, points).astype(np.float32), settings=settings.surface)
     gas = reconstruct(cloud, settings=settings.surface, rng=rng)
     if gas is None:
@@ -144,13 +144,6 @@ def _describe_candidate(
     descriptor = describe(cloud, gas, eye=level.translation)
     in_sensor = NeuralGas(transform(inverse(level), gas.neurons), gas.edges)
     return _Shape(in_sensor, descriptor, time.perf_counter() - begun)
-
-
-def _support_offset(scene: Scene, candidate: Candidate) -> float:
-    """Return how far along ``up`` the support of a candidate lies, in metres."""
-    if candidate.plane is None:
-        return float(scene.up @ candidate.box.center - candidate.box.size[2] / 2)
-    return scene.planes[candidate.plane].offset + candidate.support_m
 
 
 def _categorize(

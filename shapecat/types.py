@@ -181,6 +181,12 @@ class Scene(Record):
     planes: tuple[Plane, ...]
     candidates: tuple[Candidate, ...]
 
+    def support_offset(self, candidate: Candidate) -> float:
+        """Return how far along ``up`` lies what a candidate stands on; its bottom if unseen."""
+        if candidate.plane is None:
+            return float(self.up @ candidate.box.center - candidate.box.size[2] / 2)
+        return self.planes[candidate.plane].offset + candidate.support_m
+
 
 class NeuralGas(Record):
     """A graph that has learned the surface of a point cloud (thesis ch. 5).

@@ -34,8 +34,9 @@ from shapecat.detection.merging.learned import load_trees, merge_learned
 from shapecat.detection.merging.low_profile import merge_low_profile
 from shapecat.detection.merging.pair_features import ViewGeometry
 from shapecat.detection.merging.segments import measure_segments
-from shapecat.detection.output.label_upsampling import label_pixels, label_points
+from shapecat.detection.output.label_upsampling import label_pixels
 from shapecat.detection.output.measurements import measure_objects
+from shapecat.detection.output.point_labels import label_points
 from shapecat.detection.output.scene import build_scene
 from shapecat.detection.planes import NO_HINT, find_supporting_planes
 from shapecat.detection.planes.assumed import assume_plane, unexplained

@@ -66,7 +66,7 @@ def detected_views(folder: Path) -> Iterator[View]:
                 continue
             candidate = scene.candidates[found]
             points = _readings(frame, candidate.indices)
-            support = scene.planes[candidate.plane or 0].offset + candidate.support_m
+            support = scene.support_offset(candidate)
             name = f"{truth['scene']}_{item.get('label', 0)}"
             yield _view(points, scene.up, support, item["category"], name)
 

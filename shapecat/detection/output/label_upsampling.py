@@ -5,21 +5,25 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U1, U4, Bool
+from shapecat.arrays import F4, F8, I4, U1, U4
 from shapecat.detection.cleanup.holes import FRINGE
-from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, row_and_column
-from shapecat.detection.output.occluded_points import label_occluded_points
-from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, is_inside_outline
+from shapecat.detection.depth_grid import DepthGrid, row_and_column
+from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M
 from shapecat.detection.records import Segmentation
 from shapecat.detection.segmentation.connectivity import span_of
-from shapecat.detection.virtual_camera import VirtualImage
 from shapecat.geometry import DISCONTINUITY, NEAREST_M
 from shapecat.jit import kernel
 
-__all__ = ["label_pixels", "label_points"]
+__all__ = [
+    "GridLabels",
+    "find_near",
+    "grid_labels_of",
+    "label_pixels",
+    "list_runs",
+    "settle_labels",
+    "split_lists",
+]
 
-MOST_LABELS = 1000
-HIGHEST_M = 0.6
 UNSURE, BARE = -1, -2
 """Instead of a label: what takes more to tell, and cells without a label next to one that has."""
 
@@ -40,73 +44,28 @@ def label_pixels(depth: F4, grid: DepthGrid, found: Segmentation, *, range_m: fl
     A pixel takes the label of its cell, or else of the neighbour whose depth fits best; it keeps
     it only where it is above the plane itself, except in filled cells.
     """
-    grid_labels = _shown(grid, found)
-    return _split(*_list_pixels(depth, grid_labels, grid.factor, range_m, found.plane_ids.size))
+    grid_labels = grid_labels_of(grid, found)
+    return split_lists(
+        *_list_pixels(depth, grid_labels, grid.factor, range_m, found.plane_ids.size)
+    )
 
 
-def label_points(view: VirtualImage, found: Segmentation, *, fused: bool) -> list[U4]:
-    """Return the ascending point indices of the labels, as `label_pixels`.
-
-    With ``fused`` points behind the visible surface are given to what they touch; lists beyond
-    the labels are clusters that touch nothing visible.
-    """
-    points, grid, labels = view.points, view.grid, found.plane_ids.size
-    marks = np.zeros(len(points), np.int16)
-    _mark_points(points, view.cell, grid.intrinsics, _shown(grid, found), marks)
-    if fused:
-        above = marks > 0
-        for plane in found.planes:
-            above |= _above(points, view.cell, grid.intrinsics, plane)
-        loose = np.flatnonzero(above)
-        if loose.size:
-            spread = label_occluded_points(points[loose], marks[loose].astype(np.int64), labels)
-            marks[loose] = np.where(spread <= MOST_LABELS, spread, 0)
-            labels = max(labels, int(marks.max()) + 1)
-    edges = np.flatnonzero(np.diff(marks, prepend=0, append=0)).astype(np.int32)
-    runs = np.stack([marks[edges[:-1]], edges[:-1], edges[1:]], 1, dtype=np.int32)
-    return _split(*_listed(runs, labels))
-
-
-@kernel
-def _above(points: F4, cell: I4, intrinsics: PinholeIntrinsics, plane: F8) -> Bool:
-    """Return which points are above a plane and inside its outline."""
-    result = np.zeros(len(points), np.bool_)
-    for k in range(len(points)):
-        if cell[k] >= 0:
-            x, y, z = points[k, 0], points[k, 1], points[k, 2]
-            level = plane[0] * (intrinsics.fx * x / z + intrinsics.cx) + plane[1] * (
-                intrinsics.fy * y / z + intrinsics.cy
-            )
-            h = (1 / z - level - plane[2]) * z * plane[3]
-            result[k] = (
-                h > MIN_HEIGHT_M + HEIGHT_NOISE * z * z
-                and h < HIGHEST_M
-                and is_inside_outline(plane, x, y, z, 0.0)
-            )
-    return result
-
-
-def _shown(grid: DepthGrid, found: Segmentation) -> GridLabels:
+def grid_labels_of(grid: DepthGrid, found: Segmentation) -> GridLabels:
+    """Gather what the kernels here read."""
     return GridLabels(grid.inverse_depth, found.labels, found.filled, found.planes, found.plane_ids)
 
 
-def _split(order: U4, ends: I4) -> list[U4]:
+def split_lists(order: U4, ends: I4) -> list[U4]:
+    """Split what `list_runs` returns into the lists of the labels."""
     return [order[a:b] for a, b in pairwise(ends.tolist())]
 
 
 @kernel
-def _near(labels: I4) -> U1:
-    """Return 1 for the cells that have a label or are next to one that has."""
-    near = np.zeros(labels.shape, np.uint8)
-    scratch = np.zeros(labels.shape[1] + 2, np.int16)
-    for i in range(labels.shape[0]):
-        _find_near(labels, i, scratch, near[i])
-    return near
+def find_near(labels: I4, i: int, scratch: I4, near: I4) -> None:
+    """Mark the cells of a row that have a label or are next to one that has.
 
-
-@kernel
-def _find_near(labels: I4, i: int, scratch: I4, near: I4) -> None:
-    """Write a row of `_near`; ``scratch`` is (columns + 2,) with 0 at both ends."""
+    ``scratch`` is (columns + 2,) with 0 at both ends.
+    """
     rows, columns = labels.shape
     above, here, below = labels[max(i - 1, 0)], labels[i], labels[min(i + 1, rows - 1)]
     for j in range(columns):
@@ -119,7 +78,7 @@ def _find_near(labels: I4, i: int, scratch: I4, near: I4) -> None:
 def _list_pixels(
     depth: F4, grid_labels: GridLabels, factor: int, range_m: float, labels: int
 ) -> tuple[U4, I4]:
-    """Return the pixels of the labels below ``labels`` as `_listed`."""
+    """Return the pixels of the labels below ``labels`` as `list_runs`."""
     rows, columns = grid_labels.inverse_depth.shape
     height, width = depth.shape
     # The cells of a row, and the same at full resolution.
@@ -157,7 +116,7 @@ def _list_pixels(
                     )
                     places[2, unsure] = depth[y, x0 + k]
                     unsure += 1
-            _settle(grid_labels, cells, places, unsure, marks)
+            settle_labels(grid_labels, cells, places, unsure, marks)
             unsure, label, start, first = 0, 0, 0, y * width + x0
             for k in range(part.size):
                 mark = part[k]
@@ -168,7 +127,7 @@ def _list_pixels(
                     n = _end_run(label, first + start, first + k, runs, n)
                     label, start = mark, k
             n = _end_run(label, first + start, first + part.size, runs, n)
-    listed: tuple[U4, I4] = _listed(runs[:n], labels)
+    listed: tuple[U4, I4] = list_runs(runs[:n], labels)
     return listed
 
 
@@ -182,7 +141,7 @@ def _end_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
 
 
 @kernel
-def _listed(runs: I4, labels: int) -> tuple[U4, I4]:
+def list_runs(runs: I4, labels: int) -> tuple[U4, I4]:
     """Return the indices in the runs by label, ascending, and where those of each label end.
 
     The first end is that of label 0, which has none.
@@ -212,7 +171,7 @@ def _code_cells(
     That is its label if all of them have it, `UNSURE` if they may have it, `BARE` if it has none,
     and 0 away from all labels. Returns the first column that is not 0 and the one after the last.
     """
-    _find_near(grid_labels.labels, i, scratch, code)
+    find_near(grid_labels.labels, i, scratch, code)
     span: tuple[int, int] = span_of(code)
     part = slice(span[0], span[1])
     for k in range(len(high)):
@@ -276,7 +235,7 @@ def _mark(depth: F4, inv_depth: F4, code: I4, range_m: float, marks: I4) -> None
 
 
 @kernel
-def _settle(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks: I4) -> None:
+def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks: I4) -> None:
     """Write the labels of the first ``n`` of some depths, 0 where there is none.
 
     Parameters
@@ -317,32 +276,6 @@ def _settle(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks: I4) -
         h = (1 - (planes[k, 0] * u + planes[k, 1] * v + planes[k, 2]) * z) * planes[k, 3]
         if filled[i, j] or h > FRINGE * (MIN_HEIGHT_M + HEIGHT_NOISE * z * z):
             marks[m] = label
-
-
-@kernel
-def _mark_points(
-    points: F4, cell: I4, intrinsics: PinholeIntrinsics, grid_labels: GridLabels, marks: I4
-) -> None:
-    """Write the labels of the points (n, 3); ``cell`` (n,) is flat, -1 of what is not seen."""
-    columns = grid_labels.inverse_depth.shape[1]
-    near = _near(grid_labels.labels).reshape(-1)
-    count = points.shape[0]
-    cells, places = np.zeros((2, count), np.int64), np.zeros((3, count), np.float64)
-    chosen, found = np.zeros(count, np.int64), np.zeros(count, np.int16)
-    n = 0
-    for k in range(count):
-        p = cell[k]
-        if p < 0 or not near[p]:
-            continue
-        x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        cells[0, n], cells[1, n], chosen[n] = p // columns, p % columns, k
-        places[0, n] = intrinsics.fx * x / z + intrinsics.cx
-        places[1, n] = intrinsics.fy * y / z + intrinsics.cy
-        places[2, n] = z
-        n += 1
-    _settle(grid_labels, cells, places, n, found)
-    for m in range(n):
-        marks[chosen[m]] = found[m]
 
 
 @kernel

@@ -1,0 +1,102 @@
+"""Labels of points: what a cloud that was seen through a virtual camera takes from the cells."""
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4, U1, U4, Bool
+from shapecat.detection.depth_grid import PinholeIntrinsics
+from shapecat.detection.output.label_upsampling import (
+    GridLabels,
+    find_near,
+    grid_labels_of,
+    list_runs,
+    settle_labels,
+    split_lists,
+)
+from shapecat.detection.output.occluded_points import label_occluded_points
+from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, is_inside_outline
+from shapecat.detection.records import Segmentation
+from shapecat.detection.virtual_camera import VirtualImage
+from shapecat.jit import kernel
+
+__all__ = ["label_points"]
+
+MOST_LABELS = 1000
+HIGHEST_M = 0.6
+
+
+def label_points(view: VirtualImage, found: Segmentation, *, fused: bool) -> list[U4]:
+    """Return the ascending point indices of the labels, as `label_pixels`.
+
+    With ``fused`` points behind the visible surface are given to what they touch; lists beyond
+    the labels are clusters that touch nothing visible.
+    """
+    points, grid, labels = view.points, view.grid, found.plane_ids.size
+    marks = np.zeros(len(points), np.int16)
+    _mark_points(points, view.cell, grid.intrinsics, grid_labels_of(grid, found), marks)
+    if fused:
+        above = marks > 0
+        for plane in found.planes:
+            above |= _above(points, view.cell, grid.intrinsics, plane)
+        loose = np.flatnonzero(above)
+        if loose.size:
+            spread = label_occluded_points(points[loose], marks[loose].astype(np.int64), labels)
+            marks[loose] = np.where(spread <= MOST_LABELS, spread, 0)
+            labels = max(labels, int(marks.max()) + 1)
+    edges = np.flatnonzero(np.diff(marks, prepend=0, append=0)).astype(np.int32)
+    runs = np.stack([marks[edges[:-1]], edges[:-1], edges[1:]], 1, dtype=np.int32)
+    return split_lists(*list_runs(runs, labels))
+
+
+@kernel
+def _above(points: F4, cell: I4, intrinsics: PinholeIntrinsics, plane: F8) -> Bool:
+    """Return which points are above a plane and inside its outline."""
+    result = np.zeros(len(points), np.bool_)
+    for k in range(len(points)):
+        if cell[k] >= 0:
+            x, y, z = points[k, 0], points[k, 1], points[k, 2]
+            level = plane[0] * (intrinsics.fx * x / z + intrinsics.cx) + plane[1] * (
+                intrinsics.fy * y / z + intrinsics.cy
+            )
+            h = (1 / z - level - plane[2]) * z * plane[3]
+            result[k] = (
+                h > MIN_HEIGHT_M + HEIGHT_NOISE * z * z
+                and h < HIGHEST_M
+                and is_inside_outline(plane, x, y, z, 0.0)
+            )
+    return result
+
+
+@kernel
+def _mark_near(labels: I4) -> U1:
+    """Return 1 for the cells that have a label or are next to one that has."""
+    near = np.zeros(labels.shape, np.uint8)
+    scratch = np.zeros(labels.shape[1] + 2, np.int16)
+    for i in range(labels.shape[0]):
+        find_near(labels, i, scratch, near[i])
+    return near
+
+
+@kernel
+def _mark_points(
+    points: F4, cell: I4, intrinsics: PinholeIntrinsics, grid_labels: GridLabels, marks: I4
+) -> None:
+    """Write the labels of the points (n, 3); ``cell`` (n,) is flat, -1 of what is not seen."""
+    columns = grid_labels.inverse_depth.shape[1]
+    near = _mark_near(grid_labels.labels).reshape(-1)
+    count = points.shape[0]
+    cells, places = np.zeros((2, count), np.int64), np.zeros((3, count), np.float64)
+    chosen, found = np.zeros(count, np.int64), np.zeros(count, np.int16)
+    n = 0
+    for k in range(count):
+        p = cell[k]
+        if p < 0 or not near[p]:
+            continue
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        cells[0, n], cells[1, n], chosen[n] = p // columns, p % columns, k
+        places[0, n] = intrinsics.fx * x / z + intrinsics.cx
+        places[1, n] = intrinsics.fy * y / z + intrinsics.cy
+        places[2, n] = z
+        n += 1
+    settle_labels(grid_labels, cells, places, n, found)
+    for m in range(n):
+        marks[chosen[m]] = found[m]
