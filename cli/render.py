@@ -12,6 +12,7 @@ from shapecat import stopping
 PHASES = {
     "simulate": "simulating",
     "perceive": "finding and categorizing objects",
+    "revise": "looking again where frames disagree",
     "annotate": "writing annotated.mcap",
     "review": "writing review.rrd",
     "report": "drawing reports",

@@ -21,7 +21,7 @@ from shapecat.learning import Categorizer, load_model
 from shapecat.surface import reconstruct, thin
 from shapecat.types import Candidate, Detection, Frame, FullBox, NeuralGas, Perception, Scene
 
-__all__ = ["Perceiver", "View", "perceive"]
+__all__ = ["Perceiver", "View", "find_up", "perceive"]
 
 
 class View(NamedTuple):
@@ -121,6 +121,12 @@ def perceive(
             "complete": time.perf_counter() - categorized,
         },
     )
+
+
+def find_up(frame: Frame, settings: Settings) -> F4 | None:
+    """Return the normal (3,) of the dominant supporting plane; None if no plane is found."""
+    scene = detect(frame, settings=settings.detection, rng=_rng(settings, frame, 0))
+    return scene.up if scene.planes else None
 
 
 def _rng(settings: Settings, frame: Frame, item: int) -> np.random.Generator:

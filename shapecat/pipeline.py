@@ -7,25 +7,19 @@ Each can be run again alone.
 
 import logging
 import time
-from collections import Counter
 from collections.abc import Callable, Iterator
-from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
 
-import pyarrow as pa
-
 from shapecat import stopping
-from shapecat.depth_fusion import RecentFrames
 from shapecat.description import DESCRIPTOR_NAMES
-from shapecat.errors import NoStreamError, OutputError, RecordingError
-from shapecat.executors.order import Processes, read_ahead
-from shapecat.learning import Categorizer, load_model
+from shapecat.errors import OutputError
+from shapecat.executors.order import read_ahead
+from shapecat.learning import load_model
 from shapecat.outputs.colouring import colours_of, with_colour, write_masks
 from shapecat.outputs.rereading import open_source
-from shapecat.perception import Perceiver, View
-from shapecat.recordings import Recording, choose_streams, frames, open_recording
-from shapecat.recordings.gravity import Upright
+from shapecat.perceiving import Observer, ignore, perceive_all, revise
+from shapecat.recordings import Recording, choose_streams, open_recording
 from shapecat.rehearsal import compile_all
 from shapecat.runs.corrections import (
     TrackLabel,
@@ -56,31 +50,23 @@ from shapecat.runs.jobs import (
 )
 from shapecat.runs.label_transfer import Transfer, transfer_labels
 from shapecat.runs.labels import read_labelled_frames
-from shapecat.runs.perceived import FrameRow, PerceptionTables, discard_segments
+from shapecat.runs.segments import discard_segments
 from shapecat.runs.shown import read_shown_frames
-from shapecat.runs.tables import count_rows, read_row_groups, release_memory
+from shapecat.runs.tables import release_memory
 from shapecat.runs.tracks import track_run
-from shapecat.types import Frame, LabelledFrame, ShownFrame
+from shapecat.types import LabelledFrame, ShownFrame
 
-__all__ = ["Observer", "annotate", "annotate_again", "perceive_all", "process", "track"]
+__all__ = ["Observer", "annotate", "annotate_again", "process", "track"]
 
 _Shown = TypeVar("_Shown", LabelledFrame, ShownFrame)
-Observer = Callable[[str, int, int | None], None]
-"""Called with the name of the phase, the frames done, and how many there are, if known."""
 
 _log = logging.getLogger(__name__)
 
 _AHEAD = 4
 """Frames read while one is written."""
-_MANY = 100
-"""With so many frames other processes are started before anything is read."""
 
 
-def _ignore(_phase: str, _done: int, _total: int | None) -> None:
-    """Observe nothing."""
-
-
-def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary:
+def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
     """Process one recording into its run folder: perceive, track, annotate.
 
     A complete folder made from the same input, settings and model is left as it is. Nothing
@@ -122,6 +108,12 @@ def process(job: Job, observe: Observer = _ignore, *, cores: int = 1) -> Summary
                 lambda: perceive_all(
                     recording, folder, run, job, categorizer, observe, cores=cores
                 ),
+            )
+            _once(
+                "revise",
+                folder,
+                run,
+                lambda: revise(recording, folder, run, job, categorizer, observe, cores=cores),
             )
             identify(run, content)
             write_run(folder, run)
@@ -170,72 +162,6 @@ def _finished(
     return summarize(job, run, fresh=False)
 
 
-def perceive_all(
-    recording: Recording,
-    folder: Path,
-    run: dict[str, Any],
-    job: Job,
-    categorizer: Categorizer,
-    observe: Observer = _ignore,
-    *,
-    cores: int = 1,
-) -> None:
-    """Write frames, detections and planes, frame by frame in flat memory."""
-    skipped: Counter[str] = Counter()
-    source, total = _select(recording, run["options"], skipped)
-    source = stopping.until_asked(_readable(source, job))
-    recent = RecentFrames(job.settings.detection.fuse_frames)
-    count = 0
-    with (
-        Processes(Perceiver(categorizer, job.settings, job.model), cores) as processes,
-        PerceptionTables(
-            folder, categories=categorizer.categories, model_id=categorizer.model_id
-        ) as tables,
-    ):
-        if (total or 0) - tables.done >= _MANY:
-            processes.start()
-        upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame)
-
-        def view(frame: Frame) -> tuple[FrameRow, View]:
-            up, pose = upright.up(frame), upright.fixed_from_sensor(frame)
-            row = FrameRow(frame.log_time_ns, pose, up)
-            return row, View(frame, up, recent.before(frame, pose))
-
-        views = map(view, source)
-        for count, _ in enumerate(islice(views, tables.done), start=1):
-            observe("perceive", count, total)
-        for row, perception in processes.in_order(views):
-            count += 1
-            tables.write(perception, row)
-            observe("perceive", count, total)
-        stopping.check()
-    if not count:
-        reasons = ", ".join(f"{n} {reason}" for reason, n in skipped.items()) or "none in range"
-        msg = f"{job.source}: no usable frame on {', '.join(run['options']['topics'])} ({reasons})"
-        raise NoStreamError(msg)
-    found = count_rows(folder, "detections")
-    run["counts"] = {"frames": count, "skipped": dict(skipped), "detections": found}
-    if tables.done:
-        run["counts"]["resumed"] = tables.done
-    run["fixed_frame"], run["up"] = upright.fixed_frame, upright.report(_perceived(folder))
-    run["warnings"] = [*recording.warnings, *upright.warnings, *recent.warnings()]
-
-
-def _readable(source: Iterator[Frame], job: Job) -> Iterator[Frame]:
-    """Yield frames; what a failing disk raises is an error of the recording, not of the results."""
-    try:
-        yield from source
-    except OSError as error:
-        msg = f"{job.source}: cannot be read: {error.strerror or error}"
-        raise RecordingError(msg) from error
-
-
-def _perceived(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
-    """Yield what the tables say of up, frames beside planes."""
-    frames = read_row_groups(folder / "frames.parquet", ["topic", "frame", "up", "up_given"])
-    return zip(frames, read_row_groups(folder / "planes.parquet", ["topic", "frame"]), strict=True)
-
-
 def track(folder: Path, run: dict[str, Any], job: Job) -> None:
     """Follow the detections over time and fuse their posteriors: tracks.parquet, tracks.csv."""
     run["counts"]["tracks"] = track_run(
@@ -247,7 +173,7 @@ def annotate(
     folder: Path,
     recording: Recording,
     run: dict[str, Any],
-    observe: Observer = _ignore,
+    observe: Observer = ignore,
     *,
     cores: int = 1,
 ) -> None:
@@ -309,7 +235,7 @@ def annotate(
 def annotate_again(
     folder: Path,
     labels: Path | None,
-    observe: Observer = _ignore,
+    observe: Observer = ignore,
     *,
     by_place: bool = False,
     boxes: str | None = None,
@@ -353,18 +279,6 @@ def _adopt(labels: Path | None, folder: Path, *, by_place: bool) -> Transfer | N
         return transfer_labels(labels, folder)
     adopt_labels(labels or folder / "tracks.csv", folder)
     return None
-
-
-def _select(
-    recording: Recording, options: dict[str, Any], skipped: Counter[str]
-) -> tuple[Iterator[Frame], int | None]:
-    """Return the frames that the options select, and about how many there are."""
-    streams = choose_streams(recording, options["topics"])
-    chosen = {name: options[name] for name in ("start_s", "end_s", "every")}
-    whole = options["start_s"] is None and options["end_s"] is None
-    counts = [stream.count for stream in streams]
-    total = sum(-(-(n or 0) // options["every"]) for n in counts) if whole else 0
-    return frames(recording, streams, skipped=skipped, **chosen), total or None
 
 
 def _observed(

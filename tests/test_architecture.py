@@ -34,6 +34,7 @@ FLOOR = {
     ),
     **dict.fromkeys(("runs", "perception", "rehearsal"), 3),
     **dict.fromkeys(("outputs", "evaluation", "models"), 4),
+    "perceiving": 5,
     "pipeline": 5,
     "batch": 6,
     "api": 7,

@@ -86,12 +86,13 @@ def test_run_says_how_far_the_planes_found_disagree(
     process(Job(write(tmp_path / "a.mcap", items), tmp_path / "out", mcap=False, rrd=False))
     run = read_run(tmp_path / "out")
 
-    assert run["up"]["source"] == "transforms, z of map"
     assert any("up" in text for text in run["warnings"]) is warns
     if tilt_deg < 15:
+        assert run["up"]["source"] == "transforms, z of map"
         assert run["up"]["planes_differ_deg"] == pytest.approx(tilt_deg, abs=2)
     else:
-        assert run["up"]["frames_without_plane"] == 3
+        dropped = {"/camera/depth/image_raw": "transforms, z of map"}
+        assert run["up"] == {"source": "planes", "dropped": dropped}
 
 
 def test_without_any_source_up_is_that_of_the_planes(tmp_path: Path) -> None:

@@ -1,6 +1,6 @@
 """Where up is, and where the sensor is, in each frame of a recording."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -31,7 +31,8 @@ _DISAGREE_DEG = 10
 class Upright:
     """Answers, frame by frame, where up is and where the sensor is in the fixed frame.
 
-    Counts the look-ups that failed, for the report.
+    Counts the look-ups that failed, for the report. ``dropped`` are the topics whose given up is
+    not used, and where it came from.
     """
 
     transforms: TransformBuffer
@@ -40,6 +41,7 @@ class Upright:
     sources: tuple[str, ...]
     accelerometers: tuple[Accelerometer, ...] = ()
     warnings: list[str] = field(default_factory=list)
+    dropped: dict[str, str] = field(default_factory=dict)
     _failed: int = 0
     _first_failure: str = ""
     _given: dict[str, int] = field(default_factory=dict)
@@ -86,14 +88,46 @@ class Upright:
 
     def up(self, frame: Frame) -> F4 | None:
         """Return the unit vector (3,) that points up in the sensor frame, or None to estimate."""
-        source, vector = "option", self.vector
+        source, vector = ("", None) if frame.topic in self.dropped else self._find(frame)
+        source = "planes" if vector is None else source
+        self._given[source] = self._given.get(source, 0) + 1
+        return vector
+
+    def preview(self, frame: Frame) -> tuple[str, F4 | None]:
+        """Return by what up is given, and where (3,), without counting anything."""
+        counted = self._failed, self._first_failure
+        answer = self._find(frame)
+        self._failed, self._first_failure = counted
+        return answer
+
+    def _find(self, frame: Frame) -> tuple[str, F4 | None]:
+        if not self.sources:
+            return "option", self.vector
+        source, vector = "", None
         if "tf" in self.sources:
             source, vector = self._from_transforms(frame)
         if "imu" in self.sources and vector is None:
             source, vector = self._from_accelerometer(frame)
-        source = "planes" if vector is None else source
-        self._given[source] = self._given.get(source, 0) + 1
-        return vector
+        return source, vector
+
+    def contradict(self, topic: str, source: str, angles_deg: Sequence[float]) -> None:
+        """Drop the up of a topic that no plane confirms, unless the user asked for it; warn.
+
+        Parameters
+        ----------
+        angles_deg : how far the up of the planes is off in the frames looked at.
+        """
+        off = f"differs by {np.median(angles_deg):.0f} degrees from the planes of {topic}"
+        if not self.sources:
+            self.warnings.append(f"--up {off}: is it right? --up auto finds up from the planes")
+        elif len(self.sources) == 1:
+            self.warnings.append(f"up ({source}) {off}: is --up {self.sources[0]} right?")
+        else:
+            self.dropped[topic] = source
+            name = "imu" if source.startswith("imu") else "tf"
+            self.warnings.append(
+                f"up ({source}) {off} and is not used; to go by it, give --up {name}"
+            )
 
     def _from_transforms(self, frame: Frame) -> tuple[str, F4 | None]:
         for level in (name for name in _LEVEL_FRAMES if name in self.transforms.frames):
@@ -136,6 +170,8 @@ class Upright:
             )
         source = max(self._given, key=lambda name: self._given[name], default="planes")
         report: dict[str, Any] = {"source": source}
+        if self.dropped:
+            report["dropped"] = dict(self.dropped)
         if len(self._given) > 1:
             report["frames"] = dict(self._given)
         if set(self._given) - {"planes"}:

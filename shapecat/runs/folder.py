@@ -37,7 +37,12 @@ RUN_FILES = (
     *OUTPUTS,
     "run.json",
 )
-_MADE = ("segments", *(partial_path(Path(name)).name for name in RUN_FILES), *RUN_FILES)
+_MADE = (
+    "segments",
+    "revisions",
+    *(partial_path(Path(name)).name for name in RUN_FILES),
+    *RUN_FILES,
+)
 
 _BEGUN = (".run.json.partial", ".export.json.partial")
 """What a kill may leave in a folder that has no marker yet."""

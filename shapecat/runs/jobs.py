@@ -25,7 +25,7 @@ from shapecat.runs.identity import (
     work_id,
 )
 from shapecat.runs.label_transfer import lost_labels, transfer_labels
-from shapecat.runs.perceived import count_segments
+from shapecat.runs.segments import count_segments
 
 __all__ = [
     "Job",

@@ -1,8 +1,7 @@
 """What perceive writes: frames, detections and planes, in segments that a kill does not cost."""
 
-import shutil
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,35 +12,34 @@ import numpy as np
 import pyarrow as pa
 
 from shapecat.arrays import F4
-from shapecat.errors import OutputError
 from shapecat.files import complete_folder, replacing
-from shapecat.runs.tables import (
-    DETECTIONS,
-    FRAMES,
-    PLANES,
-    SCHEMA_VERSION,
-    arrow_table,
-    frame_rows,
-    lists,
-    open_writer,
+from shapecat.runs.segments import (
+    GROUP_FRAMES,
+    PERCEIVED,
+    REVISIONS,
+    SEGMENTS,
+    list_segments,
+    read_segment,
+    row_groups,
+    write_segment,
 )
+from shapecat.runs.tables import SCHEMA_VERSION, arrow_table, lists, open_writer
 from shapecat.types import Perception, Pose
 
-__all__ = ["FrameRow", "PerceptionTables", "count_segments", "discard_segments"]
+__all__ = ["FrameRow", "PerceptionTables"]
 
-_GROUP_FRAMES = 32
 _SEGMENT_S = 2.0
 """What a kill may cost: frames are kept in a segment at least so often."""
-_PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES}
 
 
 @dataclass(frozen=True)
 class FrameRow:
-    """What the frames table adds to a `Perception`."""
+    """What the frames table adds to a `Perception`; ``again`` if it is of a second look."""
 
     log_time_ns: int
     fixed_from_sensor: Pose | None
     up_given: F4 | None = None
+    again: bool = False
 
 
 class PerceptionTables:
@@ -49,27 +47,36 @@ class PerceptionTables:
 
     What was perceived is first written as *segments*, folders that appear when complete, so that
     a run that was cut short goes on after its last one; leaving the block joins them into the
-    tables, which are the same wherever it was cut.
+    tables, which are the same wherever it was cut. What is seen in a second look is kept in
+    segments of its own, and takes the place of what was seen first when the tables are joined.
 
     Attributes
     ----------
     done : frames in the segments that an earlier run has left.
     """
 
-    def __init__(self, folder: Path, *, categories: Sequence[str], model_id: str) -> None:
-        """Look for segments in ``folder``, which must exist."""
+    def __init__(
+        self,
+        folder: Path,
+        *,
+        categories: Sequence[str],
+        model_id: str,
+        again: bool = False,
+    ) -> None:
+        """Look for segments, of a second look if ``again``, in ``folder``, which must exist."""
         metadata = {
             "schema_version": SCHEMA_VERSION,
             "categories": ",".join(categories),
             "model": model_id,
         }
         self._folder = folder
-        self._schemas = {name: s.with_metadata(metadata) for name, s in _PERCEIVED.items()}
+        self._schemas = {name: s.with_metadata(metadata) for name, s in PERCEIVED.items()}
         self._categories = tuple(categories)
         self._pending: list[tuple[Perception, FrameRow]] = []
-        self._segments = _segments(folder)
+        self._place = folder / (REVISIONS if again else SEGMENTS)
+        self._segments = list_segments(self._place)
         self._flushed = time.monotonic()
-        self.done = sum(_read_segment(s / "frames.arrow").num_rows for s in self._segments)
+        self.done = sum(read_segment(s, "frames").num_rows for s in self._segments)
 
     def __enter__(self) -> Self:
         """Return itself."""
@@ -93,7 +100,7 @@ class PerceptionTables:
         """Append one frame."""
         self._pending.append((perception, row))
         late = time.monotonic() - self._flushed > _SEGMENT_S
-        if late or len(self._pending) >= _GROUP_FRAMES:
+        if late or len(self._pending) >= GROUP_FRAMES:
             self._flush()
 
     def _flush(self) -> None:
@@ -104,10 +111,10 @@ class PerceptionTables:
             "detections": _detection_columns(self._pending, self._categories),
             "planes": _plane_columns([perception for perception, _ in self._pending]),
         }
-        segment = self._folder / _SEGMENTS / f"{len(self._segments):06d}"
+        segment = self._place / f"{len(self._segments):06d}"
         with complete_folder(segment) as hidden:
             for name, schema in self._schemas.items():
-                _write_segment(hidden / f"{name}.arrow", arrow_table(rows[name], schema))
+                write_segment(hidden, name, arrow_table(rows[name], schema))
         self._segments.append(segment)
         self._pending.clear()
         self._flushed = time.monotonic()
@@ -119,71 +126,9 @@ class PerceptionTables:
             for name, schema in self._schemas.items():
                 path = stack.enter_context(replacing(self._folder / f"{name}.parquet"))
                 writers[name] = stack.enter_context(open_writer(path, schema))
-            for group in _row_groups(self._segments):
+            for group in row_groups(self._folder):
                 for name, writer in writers.items():
                     writer.write_table(group[name])
-
-
-_SEGMENTS = "segments"
-
-
-def count_segments(folder: Path) -> int:
-    """Return how many segments a run that was cut short has left."""
-    return len(_segments(folder))
-
-
-def discard_segments(folder: Path) -> None:
-    """Remove what the tables were joined from."""
-    shutil.rmtree(folder / _SEGMENTS, ignore_errors=True)
-
-
-def _segments(folder: Path) -> list[Path]:
-    """Return the complete segments, in order."""
-    return sorted((folder / _SEGMENTS).glob("[0-9]*"))
-
-
-_Tables = dict[str, pa.Table]
-
-
-def _row_groups(segments: Iterable[Path]) -> Iterator[_Tables]:
-    """Yield the tables of 32 frames at a time, in whatever portions the segments have them."""
-    held: _Tables = {}
-    for segment in segments:
-        new = {name: _read_segment(segment / f"{name}.arrow") for name in _PERCEIVED}
-        held = {name: pa.concat_tables([held[name], new[name]]) for name in new} if held else new
-        while held["frames"].num_rows >= _GROUP_FRAMES:
-            group, held = _cut(held, _GROUP_FRAMES)
-            yield group
-    if held and held["frames"].num_rows:
-        yield held
-
-
-def _cut(tables: _Tables, count: int) -> tuple[_Tables, _Tables]:
-    """Part tables after a number of frames."""
-    first = set(frame_rows(tables["frames"][:count]))
-    ends = {"frames": count}
-    for name in ("detections", "planes"):
-        rows = frame_rows(tables[name])
-        ends[name] = max((rows[key].stop for key in first & set(rows)), default=0)
-    return (
-        {name: tables[name][:end].combine_chunks() for name, end in ends.items()},
-        {name: tables[name][end:] for name, end in ends.items()},
-    )
-
-
-def _write_segment(path: Path, table: pa.Table) -> None:
-    """Write a part of a table as it lies in memory: it is soon read again, once."""
-    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
-        writer.write_table(table)
-
-
-def _read_segment(path: Path) -> pa.Table:
-    try:
-        with pa.OSFile(str(path), "rb") as source, pa.ipc.open_file(source) as reader:
-            return reader.read_all()
-    except (OSError, pa.ArrowException) as error:
-        msg = f"{path}: what a killed run left there cannot be read ({error}); use --overwrite"
-        raise OutputError(msg) from error
 
 
 def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]]) -> dict[str, Any]:
@@ -195,6 +140,7 @@ def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]]) -> dict[str, Any
         "frame_id": [p.frame_id for p, _ in rows],
         "up": [p.scene.up for p, _ in rows],
         "up_given": [row.up_given for _, row in rows],
+        "revised": [row.again and bool(p.scene.planes or p.detections) for p, row in rows],
         "fixed_translation": [
             row.fixed_from_sensor and row.fixed_from_sensor.translation for _, row in rows
         ],

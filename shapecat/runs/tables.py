@@ -58,6 +58,7 @@ FRAMES = pa.schema(
         ("frame_id", pa.string()),
         ("up", _VEC3),
         ("up_given", _VEC3),
+        ("revised", pa.bool_()),
         ("fixed_translation", pa.list_(pa.float64(), 3)),
         ("fixed_rotation", pa.list_(pa.float64(), 9)),
         ("stages", pa.list_(pa.string())),
@@ -65,9 +66,10 @@ FRAMES = pa.schema(
     ]
 )
 """One row per frame read, also those without a detection. ``up`` is what detection went by,
-``up_given`` where transforms, an IMU or an option said it is, null where nothing did. ``fixed_*``
-is ``fixed_from_sensor`` (rotation row by row), null without a fixed frame; ``seconds`` per entry
-of ``stages``."""
+``up_given`` where transforms, an IMU or an option said it is, null where nothing did; ``revised``
+where what is here was seen in a second look, with the up that the recording tells. ``fixed_*`` is
+``fixed_from_sensor`` (rotation row by row), null without a fixed frame; ``seconds`` per entry of
+``stages``."""
 
 DETECTIONS = pa.schema(
     [

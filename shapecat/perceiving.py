@@ -1,0 +1,222 @@
+"""The expensive phases: every frame is perceived, and some once more with what the others tell.
+
+Before the first frame is perceived the up direction that the recording gives is held against the
+planes of the first frames that show one: a fixed frame whose z is not up spoils all of them.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Iterator
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+
+from shapecat import stopping
+from shapecat.config import Settings
+from shapecat.depth_fusion import RecentFrames
+from shapecat.errors import NoStreamError, RecordingError
+from shapecat.executors.order import Processes
+from shapecat.learning import Categorizer
+from shapecat.perception import Perceiver, View, find_up
+from shapecat.recordings import Recording, choose_streams, frames
+from shapecat.recordings.gravity import Upright
+from shapecat.runs.jobs import Job
+from shapecat.runs.perceived import FrameRow, PerceptionTables
+from shapecat.runs.second_look import Revision, frames_to_revise
+from shapecat.runs.segments import read_segments
+from shapecat.runs.tables import Key, count_rows, read_row_groups
+from shapecat.types import Frame
+
+__all__ = ["Observer", "ignore", "perceive_all", "revise"]
+
+Observer = Callable[[str, int, int | None], None]
+"""Called with the name of the phase, the frames done, and how many there are, if known."""
+
+_MANY = 100
+"""With so many frames other processes are started before anything is read."""
+_CONFIRMS_DEG = 15.0
+"""A plane farther from level than this is none to detection: see `detect`."""
+_DOUBTS, _LOOKS = 3, 10
+"""So many frames with a plane have to contradict, of so many that are looked at."""
+
+
+def ignore(_phase: str, _done: int, _total: int | None) -> None:
+    """Observe nothing."""
+
+
+def perceive_all(
+    recording: Recording,
+    folder: Path,
+    run: dict[str, Any],
+    job: Job,
+    categorizer: Categorizer,
+    observe: Observer = ignore,
+    *,
+    cores: int = 1,
+) -> None:
+    """Write frames, detections and planes, frame by frame in flat memory."""
+    skipped: Counter[str] = Counter()
+    source, total = _select(recording, run["options"], skipped)
+    recent = RecentFrames(job.settings.detection.fuse_frames)
+    count = 0
+    with (
+        Processes(Perceiver(categorizer, job.settings, job.model), cores) as processes,
+        _tables(folder, categorizer) as tables,
+    ):
+        if (total or 0) - tables.done >= _MANY:
+            processes.start()
+        upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame)
+
+        def view(frame: Frame) -> tuple[FrameRow, View]:
+            up, pose = upright.up(frame), upright.fixed_from_sensor(frame)
+            row = FrameRow(frame.log_time_ns, pose, up)
+            return row, View(frame, up, recent.before(frame, pose))
+
+        source = _UpTrial(upright, job.settings).before(_readable(source, job))
+        views = map(view, stopping.until_asked(source))
+        for count, _ in enumerate(islice(views, tables.done), start=1):
+            observe("perceive", count, total)
+        for row, perception in processes.in_order(views):
+            count += 1
+            tables.write(perception, row)
+            observe("perceive", count, total)
+        stopping.check()
+    if not count:
+        reasons = ", ".join(f"{n} {reason}" for reason, n in skipped.items()) or "none in range"
+        msg = f"{job.source}: no usable frame on {', '.join(run['options']['topics'])} ({reasons})"
+        raise NoStreamError(msg)
+    found = count_rows(folder, "detections")
+    run["counts"] = {"frames": count, "skipped": dict(skipped), "detections": found}
+    if tables.done:
+        run["counts"]["resumed"] = tables.done
+    run["fixed_frame"], run["up"] = upright.fixed_frame, upright.report(_perceived(folder))
+    run["warnings"] = [*recording.warnings, *upright.warnings, *recent.warnings()]
+
+
+def revise(
+    recording: Recording,
+    folder: Path,
+    run: dict[str, Any],
+    job: Job,
+    categorizer: Categorizer,
+    observe: Observer = ignore,
+    *,
+    cores: int = 1,
+) -> None:
+    """Look again at frames that the recording disagrees with, and write the tables anew.
+
+    Where the user says where up is, nothing else does. What was seen first stays where the second
+    look finds nothing.
+    """
+    chosen = frames_to_revise(read_segments(folder)) if run["up"]["source"] != "option" else {}
+    if not chosen:
+        return
+    with (
+        Processes(Perceiver(categorizer, job.settings, job.model), cores) as processes,
+        _tables(folder, categorizer, again=True) as tables,
+    ):
+        views = islice(_views_again(recording, run, job, chosen), len(chosen))
+        done = sum(1 for _ in islice(views, tables.done))
+        for count, (row, perception) in enumerate(processes.in_order(views), start=done + 1):
+            tables.write(perception, row)
+            observe("revise", count, len(chosen))
+        stopping.check()
+    run["counts"]["detections"] = count_rows(folder, "detections")
+    revised = read_row_groups(folder / "frames.parquet", ["revised"])
+    run["counts"]["revised"] = sum(sum(group["revised"].to_pylist()) for group in revised)
+
+
+def _views_again(
+    recording: Recording, run: dict[str, Any], job: Job, chosen: dict[Key, Revision]
+) -> Iterator[tuple[FrameRow, View]]:
+    """Yield the chosen frames, to be perceived with another up."""
+    source, _ = _select(recording, run["options"], Counter())
+    upright = Upright.of(recording, up=job.up, fixed_frame=run["fixed_frame"])
+    recent = RecentFrames(job.settings.detection.fuse_frames)
+    for frame in stopping.until_asked(_readable(source, job)):
+        pose = upright.fixed_from_sensor(frame)
+        earlier = recent.before(frame, pose)
+        revision = chosen.get((frame.topic, frame.index))
+        if revision is not None:
+            row = FrameRow(frame.log_time_ns, pose, revision.up_given, again=True)
+            yield row, View(frame, revision.up, earlier)
+
+
+class _UpTrial:
+    """Looks at the first frames of each topic without the up that is given, and compares."""
+
+    def __init__(self, upright: Upright, settings: Settings) -> None:
+        self._upright, self._settings = upright, settings
+        self._off_deg: dict[str, list[float]] = {}
+        self._sources: dict[str, str] = {}
+        self._looks: Counter[str] = Counter()
+        self._decided: set[str] = set()
+
+    def before(self, source: Iterator[Frame]) -> Iterator[Frame]:
+        """Yield the frames, none before it is decided whether to believe the up of its topic."""
+        held: list[Frame] = []
+        for frame in source:
+            held.append(frame)
+            if frame.topic not in self._decided:
+                self._look(frame)
+            if self._looks.keys() <= self._decided:
+                yield from held
+                held.clear()
+        for topic in sorted(self._looks.keys() - self._decided):
+            self._decide(topic)
+        yield from held
+
+    def _look(self, frame: Frame) -> None:
+        self._looks[frame.topic] += 1
+        off = self._off_deg.setdefault(frame.topic, [])
+        source, given = self._upright.preview(frame)
+        found = None if given is None else find_up(frame, self._settings)
+        if given is not None and found is not None:
+            off.append(float(np.degrees(np.arccos(np.clip(given @ found, -1, 1)))))
+            self._sources[frame.topic] = source
+        enough = len(off) == _DOUBTS or self._looks[frame.topic] == _LOOKS
+        if enough or min(off, default=np.inf) <= _CONFIRMS_DEG:
+            self._decide(frame.topic)
+
+    def _decide(self, topic: str) -> None:
+        """Drop an up that no frame confirms, if enough have had the say."""
+        self._decided.add(topic)
+        off = self._off_deg[topic]
+        enough = len(off) >= min(_DOUBTS, self._looks[topic])
+        if enough and min(off) > _CONFIRMS_DEG:
+            self._upright.contradict(topic, self._sources[topic], off)
+
+
+def _tables(folder: Path, categorizer: Categorizer, *, again: bool = False) -> PerceptionTables:
+    return PerceptionTables(
+        folder, categories=categorizer.categories, model_id=categorizer.model_id, again=again
+    )
+
+
+def _readable(source: Iterator[Frame], job: Job) -> Iterator[Frame]:
+    """Yield frames; what a failing disk raises is an error of the recording, not of the results."""
+    try:
+        yield from source
+    except OSError as error:
+        msg = f"{job.source}: cannot be read: {error.strerror or error}"
+        raise RecordingError(msg) from error
+
+
+def _perceived(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
+    """Yield what the tables say of up, frames beside planes."""
+    frames = read_row_groups(folder / "frames.parquet", ["topic", "frame", "up", "up_given"])
+    return zip(frames, read_row_groups(folder / "planes.parquet", ["topic", "frame"]), strict=True)
+
+
+def _select(
+    recording: Recording, options: dict[str, Any], skipped: Counter[str]
+) -> tuple[Iterator[Frame], int | None]:
+    """Return the frames that the options select, and about how many there are."""
+    streams = choose_streams(recording, options["topics"])
+    chosen = {name: options[name] for name in ("start_s", "end_s", "every")}
+    whole = options["start_s"] is None and options["end_s"] is None
+    counts = [stream.count for stream in streams]
+    total = sum(-(-(n or 0) // options["every"]) for n in counts) if whole else 0
+    return frames(recording, streams, skipped=skipped, **chosen), total or None

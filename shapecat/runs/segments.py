@@ -1,0 +1,144 @@
+"""What perceive keeps while it works: parts of the tables, and those of a second look.
+
+Segments are folders that appear when complete, and do not change after. The tables are joined
+from them as often as it takes, so that a kill between two tables leaves nothing that lasts.
+"""
+
+import shutil
+from collections.abc import Iterator, Sequence
+from functools import lru_cache
+from pathlib import Path
+
+import pyarrow as pa
+
+from shapecat.errors import OutputError
+from shapecat.runs.tables import DETECTIONS, FRAMES, PLANES, Key, frame_rows, numbers
+
+__all__ = [
+    "GROUP_FRAMES",
+    "PERCEIVED",
+    "REVISIONS",
+    "SEGMENTS",
+    "count_segments",
+    "discard_segments",
+    "list_segments",
+    "read_segment",
+    "read_segments",
+    "row_groups",
+    "write_segment",
+]
+
+GROUP_FRAMES = 32
+PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES}
+SEGMENTS, REVISIONS = "segments", "revisions"
+
+
+def count_segments(folder: Path) -> int:
+    """Return how many segments a run that was cut short has left."""
+    return len(list_segments(folder / SEGMENTS))
+
+
+def discard_segments(folder: Path) -> None:
+    """Remove what the tables were joined from."""
+    for name in (SEGMENTS, REVISIONS):
+        shutil.rmtree(folder / name, ignore_errors=True)
+
+
+def read_segments(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
+    """Yield what was seen first, frames beside planes, segment by segment."""
+    for segment in list_segments(folder / SEGMENTS):
+        yield read_segment(segment, "frames"), read_segment(segment, "planes")
+
+
+def list_segments(place: Path) -> list[Path]:
+    """Return the complete segments in a folder, in order."""
+    return sorted(place.glob("[0-9]*"))
+
+
+_Tables = dict[str, pa.Table]
+
+
+def _read_tables(segment: Path) -> _Tables:
+    return {name: read_segment(segment, name) for name in PERCEIVED}
+
+
+def _latest(folder: Path) -> Iterator[_Tables]:
+    """Yield the tables of each segment, with the frames that were seen better in a second look."""
+    places = {
+        key: segment
+        for segment in list_segments(folder / REVISIONS)
+        for key in _revised(read_segment(segment, "frames"))
+    }
+    read = lru_cache(maxsize=2)(_read_tables)  # both go through the recording in its order
+    for segment in list_segments(folder / SEGMENTS):
+        first = _read_tables(segment)
+        keys = list(frame_rows(first["frames"]))
+        if places.keys().isdisjoint(keys):
+            yield first
+        else:
+            sources = [read(places[key]) if key in places else first for key in keys]
+            yield {name: _picked(name, keys, sources) for name in first}
+
+
+def _revised(frames: pa.Table) -> Iterator[Key]:
+    """Yield the frames that a second look has seen better."""
+    kept = numbers(frames["revised"].cast(pa.int8()))
+    return (key for key, revised in zip(frame_rows(frames), kept, strict=True) if revised)
+
+
+def _picked(name: str, keys: Sequence[Key], sources: Sequence[_Tables]) -> pa.Table:
+    """Return the rows of each frame, of a table, from its source."""
+    rows = {id(tables): frame_rows(tables[name]) for tables in sources}
+    chosen = [
+        (tables[name], rows[id(tables)].get(key, slice(0, 0)))
+        for key, tables in zip(keys, sources, strict=True)
+    ]
+    return pa.concat_tables(table[of] for table, of in chosen)
+
+
+def row_groups(folder: Path) -> Iterator[_Tables]:
+    """Yield the tables of 32 frames at a time, in whatever portions the segments have them."""
+    held: _Tables = {}
+    for new in _latest(folder):
+        held = {name: pa.concat_tables([held[name], new[name]]) for name in new} if held else new
+        while held["frames"].num_rows >= GROUP_FRAMES:
+            group, held = _cut(held, GROUP_FRAMES)
+            yield group
+    if held and held["frames"].num_rows:
+        yield held
+
+
+def _cut(tables: _Tables, count: int) -> tuple[_Tables, _Tables]:
+    """Part tables after a number of frames."""
+    first = set(frame_rows(tables["frames"][:count]))
+    ends = {"frames": count}
+    for name in ("detections", "planes"):
+        rows = frame_rows(tables[name])
+        ends[name] = max((rows[key].stop for key in first & set(rows)), default=0)
+    return (
+        {name: tables[name][:end].combine_chunks() for name, end in ends.items()},
+        {name: tables[name][end:] for name, end in ends.items()},
+    )
+
+
+def write_segment(segment: Path, name: str, table: pa.Table) -> None:
+    """Write a part of a table as it lies in memory: it is soon read again, once or twice."""
+    path = segment / f"{name}.arrow"
+    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
+        writer.write_table(table)
+
+
+def read_segment(segment: Path, name: str) -> pa.Table:
+    """Return a part of a table.
+
+    Raises
+    ------
+    OutputError : it cannot be read.
+    """
+    path = segment / f"{name}.arrow"
+    try:
+        with pa.OSFile(str(path), "rb") as source, pa.ipc.open_file(source) as reader:
+            return reader.read_all()
+    except (OSError, pa.ArrowException) as error:
+        msg = f"{path}: what a killed run left there cannot be read ({error}); use --overwrite"
+        raise OutputError(msg) from error

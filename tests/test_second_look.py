@@ -1,0 +1,320 @@
+"""What the whole recording tells of up is used in frames that are disturbed."""
+
+import csv
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from shapecat import stopping
+from shapecat.geometry import IDENTITY
+from shapecat.pipeline import process
+from shapecat.runs.folder import read_run
+from shapecat.runs.jobs import Job
+from shapecat.runs.second_look import frames_to_revise
+from shapecat.runs.tables import FRAMES, PLANES
+from shapecat.simulation import IDEAL, make_scene, render_frame
+from shapecat.simulation.messages import MessageFactory
+from shapecat.simulation.truth import LINK_FROM_OPTICAL, robot_links
+from shapecat.types import Camera, Pose
+from tests.messages import EPOCH, write
+from tests.scenes import OPTICAL, PERIOD, STEP
+from tests.test_crash import assert_same_tables
+
+MAKE = MessageFactory(2)
+TOPIC = "/depth/image_raw"
+COUNT = 60
+DISTURBED = (7, 16, 17, 31, 45, 52)
+MANY = tuple(range(3, COUNT, 4))
+LEANING = Pose(np.array([[1.0, 0, 0], [0, 0.28, -0.96], [0, 0.96, 0.28]]), np.zeros(3))
+"""The fixed frame of a log whose z is far from up."""
+
+
+@cache
+def views(moving: bool) -> tuple[tuple[Any, Any, Camera, Pose], ...]:
+    """Return depth, labels, camera and pose of a camera that walks past a table, or stands."""
+    world = make_scene("tabletop", np.random.default_rng(23), frames=90)
+    found = []
+    for k in range(12 if moving else 1):
+        frame, labels = render_frame(world, 2 * k, rng=np.random.default_rng(k), sensor=IDEAL)
+        assert frame.depth is not None
+        assert frame.camera is not None
+        c = frame.camera
+        small = Camera(160, 120, c.fx / STEP, c.fy / STEP, c.cx / STEP, c.cy / STEP)
+        depth = np.round(frame.depth[::STEP, ::STEP] * 1000) / np.float32(1000)
+        found.append((depth.astype(np.float32), labels[::STEP, ::STEP], small, world.path[2 * k]))
+    return tuple(found)
+
+
+def disturb(depth: Any, labels: Any) -> Any:
+    """Wipe the depth of all furniture, and hold a slanted board behind the top of the image."""
+    spoilt = np.where(labels < 20, 0, depth).astype(np.float32)
+    i, j = np.mgrid[:120, :160]
+    board = (i < 60) & (labels < 20)
+    spoilt[board] = (0.25 + 0.003 * j)[board]
+    return spoilt
+
+
+def items(
+    *, moving: bool, disturbed: tuple[int, ...] = (), poses: bool = True, fixed: Pose | None = None
+) -> Iterator[tuple[str, int, Any]]:
+    """Yield the messages of a recording; ``fixed`` turns the fixed frame."""
+    yield "/tf_static", EPOCH, MAKE.transforms([("camera_link", OPTICAL, LINK_FROM_OPTICAL)], EPOCH)
+    seen = [*views(moving), *views(moving)[-2:0:-1]]
+    for k in range(COUNT):
+        depth, labels, camera, pose = seen[k % len(seen)]
+        stamp = EPOCH + k * PERIOD
+        if poses:
+            turned = (
+                pose
+                if fixed is None
+                else Pose(fixed.rotation @ pose.rotation, fixed.rotation @ pose.translation)
+            )
+            yield "/tf", stamp, MAKE.transforms(robot_links(turned), stamp)
+        shown = disturb(depth, labels) if k in disturbed else depth
+        yield "/depth/camera_info", stamp, MAKE.camera_info(camera, stamp, OPTICAL)
+        yield "/depth/image_raw", stamp, MAKE.image(shown, stamp, OPTICAL)
+
+
+def run(path: Path, messages: Iterator[Any], *, cores: int = 1, **options: Any) -> Path:
+    out = path.with_suffix("")
+    process(Job(write(path, messages), out, mcap=False, rrd=False, **options), cores=cores)
+    return out
+
+
+def rows(out: Path, table: str, *columns: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = pq.read_table(
+        out / f"{table}.parquet", columns=list(columns)
+    ).to_pylist()
+    return found
+
+
+def revised(out: Path) -> list[int]:
+    return [row["frame"] for row in rows(out, "frames", "frame", "revised") if row["revised"]]
+
+
+def share_found(out: Path, plain: Path) -> float:
+    """Return how many objects of the frames that are disturbed are where they are without that."""
+    centers: dict[tuple[int, Path], list[Any]] = {}
+    for folder in (out, plain):
+        for row in rows(folder, "detections", "frame", "center"):
+            centers.setdefault((row["frame"], folder), []).append(row["center"])
+    near = [
+        min(np.linalg.norm(np.subtract(center, other)) for other in centers[k, out]) < 0.02
+        for k in DISTURBED
+        for center in centers[k, plain]
+    ]
+    return float(np.mean(near))
+
+
+def assert_same_tracks(one: Path, other: Path, fixed: Pose = IDENTITY) -> None:
+    """Each object is one track in both, of one category, in one place, while it is undisturbed."""
+    tracks = []
+    for out in (one, other):
+        with (out / "tracks.csv").open(newline="") as file:
+            tracks.append(list(csv.DictReader(file)))
+    assert len(tracks[0]) == len(tracks[1]) >= 5
+    for a in tracks[0]:
+        (b,) = [t for t in tracks[1] if np.linalg.norm(place(t) - fixed.rotation @ place(a)) < 0.03]
+        assert a["category"] == b["category"]
+        assert abs(int(a["frames"]) - int(b["frames"])) <= len(DISTURBED)
+
+
+def place(track: dict[str, str]) -> Any:
+    return np.array([float(track[axis]) for axis in "xyz"])
+
+
+@pytest.mark.parametrize("moving", [False, True])
+def test_a_recording_of_which_a_tenth_is_disturbed_loses_no_track(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, moving: bool
+) -> None:
+    """A camera without transforms that stands, and one with them that walks."""
+    plain = run(tmp_path / "plain.mcap", items(moving=moving, poses=moving))
+    spoilt = items(moving=moving, poses=moving, disturbed=DISTURBED)
+    out = run(tmp_path / "spoilt.mcap", spoilt)
+
+    assert revised(plain) == []
+    assert revised(out) == ([] if moving else [*DISTURBED])  # the transforms had told it already
+    assert "revised" not in read_run(plain)["counts"]
+    assert_same_tracks(plain, out)
+
+    monkeypatch.setattr("shapecat.perceiving.frames_to_revise", lambda _tables: {})
+    once = run(tmp_path / "once.mcap", items(moving=moving, poses=False, disturbed=DISTURBED))
+    assert share_found(out, plain) > share_found(once, plain) + 0.2
+
+
+def test_a_fixed_frame_whose_z_is_not_up_is_dropped(tmp_path: Path) -> None:
+    """Its poses are true all the same: up in it is what the planes agree on."""
+    plain = run(tmp_path / "plain.mcap", items(moving=True))
+    leaning = items(moving=True, fixed=LEANING, disturbed=DISTURBED)
+    out = run(tmp_path / "leaning.mcap", leaning)
+    told = read_run(out)
+
+    assert told["up"] == {"source": "planes", "dropped": {TOPIC: "transforms, z of map"}}
+    assert any("differs by 74 degrees" in text for text in told["warnings"])
+    assert all(row["up_given"] is None for row in rows(out, "frames", "up_given"))
+    assert set(revised(out)) >= set(DISTURBED)
+    assert_same_tracks(plain, out, LEANING)
+
+
+@pytest.mark.parametrize("up", ["0,0.28,-0.96", "tf"])
+def test_an_up_that_the_user_asks_for_is_kept(tmp_path: Path, up: str) -> None:
+    """Whoever gives it by hand may know better than the planes; a warning is all."""
+    leaning = items(moving=False, fixed=LEANING, disturbed=DISTURBED)
+    out = run(tmp_path / "leaning.mcap", leaning, up=up)
+    told = read_run(out)
+
+    assert "dropped" not in told["up"]
+    assert all(row["up_given"] is not None for row in rows(out, "frames", "up_given"))
+    assert any("--up" in text and "differs by" in text for text in told["warnings"])
+    assert revised(out) == []
+
+
+@pytest.fixture(scope="module")
+def spoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("spoilt")
+    run(folder / "table.mcap", items(moving=False, poses=False, disturbed=MANY))
+    return folder
+
+
+def test_the_second_look_does_not_depend_on_the_number_of_workers(
+    spoilt: Path, tmp_path: Path
+) -> None:
+    out = tmp_path / "table"
+    process(Job(spoilt / "table.mcap", out, mcap=False, rrd=False), cores=2)
+
+    assert revised(out) == [*MANY]
+    assert_same_tables(out, spoilt / "table")
+
+
+def test_an_interrupted_second_look_goes_on_where_it_stopped(spoilt: Path, tmp_path: Path) -> None:
+    job = Job(spoilt / "table.mcap", tmp_path / "table", mcap=False, rrd=False)
+
+    def stop(phase: str, done: int, _total: int | None) -> None:
+        if (phase, done) == ("revise", 5):
+            stopping.request()
+
+    with stopping.heeding_signals(), pytest.raises(stopping.Stopped):
+        process(job, stop)
+    assert (tmp_path / ".table.partial" / "revisions" / "000000").exists()
+
+    seen: list[tuple[str, int]] = []
+    process(job, lambda phase, done, _total: seen.append((phase, done)))
+
+    assert [done for phase, done in seen if phase == "revise"] == list(range(6, len(MANY) + 1))
+    assert not [done for phase, done in seen if phase == "perceive"]
+    assert_same_tables(job.folder, spoilt / "table")
+    assert {p.name for p in job.folder.iterdir()} == {p.name for p in (spoilt / "table").iterdir()}
+
+
+def test_a_kill_between_the_new_tables_leaves_nothing_that_lasts(
+    spoilt: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Some tables are of the second look then, others are not."""
+    job = Job(spoilt / "table.mcap", tmp_path / "table", mcap=False, rrd=False)
+
+    def die(*_args: object) -> int:
+        (tmp_path / ".table.partial" / "planes.parquet").write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    def prepare(phase: str, _done: int, _total: int | None) -> None:
+        if phase == "revise":
+            monkeypatch.setattr("shapecat.perceiving.count_rows", die)
+
+    with pytest.raises(KeyboardInterrupt):
+        process(job, prepare)
+    monkeypatch.undo()
+    process(job)
+
+    assert_same_tables(job.folder, spoilt / "table")
+
+
+def tables(
+    up: Any, *, given: Any = None, rotation: Any = None, offsets: Any = None
+) -> list[tuple[pa.Table, pa.Table]]:
+    """Return tables of one topic with a plane per frame, none where the offset is NaN."""
+    n = len(up)
+    offsets = np.full(n, -0.9) if offsets is None else offsets
+    columns = {
+        "topic": ["/d"] * n,
+        "frame": list(range(n)),
+        "stamp_ns": [EPOCH + k * PERIOD for k in range(n)],
+        "up": [list(map(float, vector)) for vector in up],
+        "up_given": [None] * n if given is None else [list(map(float, v)) for v in given],
+        "fixed_rotation": [None] * n if rotation is None else [list(r.ravel()) for r in rotation],
+    }
+    frames = pa.table({k: pa.array(v, FRAMES.field(k).type) for k, v in columns.items()})
+    level = np.flatnonzero(np.isfinite(offsets))
+    borne = {"topic": ["/d"] * len(level), "frame": level, "offset": offsets[level]}
+    planes = pa.table({k: pa.array(v, PLANES.field(k).type) for k, v in borne.items()})
+    return [
+        (frames[:9], planes.filter(pa.array(level < 9))),
+        (frames[9:], planes.filter(pa.array(level >= 9))),
+    ]
+
+
+def leaning(degrees: Any) -> Any:
+    """Return up (n, 3) of cameras that look down by so much."""
+    angle = np.radians(degrees)
+    return np.stack([0 * angle, -np.cos(angle), -np.sin(angle)], axis=1)
+
+
+def test_a_still_camera_knows_up_from_its_neighbours() -> None:
+    up, offsets = leaning(np.full(20, 35.0)), np.full(20, -0.9)
+    up[6], up[13], offsets[13], offsets[17] = leaning([80.0])[0], (0, -1, 0), np.nan, -0.5
+
+    chosen = frames_to_revise(tables(up, offsets=offsets))
+
+    assert list(chosen) == [("/d", 6), ("/d", 13), ("/d", 17)]
+    for revision in chosen.values():
+        np.testing.assert_allclose(revision.up, leaning([35.0])[0], atol=1e-6)
+        assert revision.up_given is None
+
+
+def test_a_camera_that_moves_unknown_to_all_is_no_neighbour() -> None:
+    """What held a moment before says nothing of where up is now."""
+    up, offsets = leaning(np.linspace(10, 70, 20)), np.full(20, -0.9)
+    offsets[8] = np.nan
+
+    assert frames_to_revise(tables(up, offsets=offsets)) == {}
+
+
+def test_poses_carry_up_through_any_motion() -> None:
+    """The fixed frame's z is not up here, and only the planes know."""
+    tilts = np.linspace(10, 70, 20)
+    truth, fixed_up = leaning(tilts), np.array([0.6, 0.0, 0.8])
+    rotation = [rotation_between(v, fixed_up) for v in truth]
+    up, offsets = truth.copy(), np.full(20, -0.9)
+    up[4], offsets[8] = (1, 0, 0), np.nan
+
+    chosen = frames_to_revise(tables(up, rotation=rotation, offsets=offsets))
+
+    assert [frame for _, frame in chosen] == [4, 8]
+    np.testing.assert_allclose(chosen["/d", 4].up, truth[4], atol=1e-5)
+
+
+def rotation_between(a: Any, b: Any) -> Any:
+    """Return a rotation (3, 3) that takes one unit vector to another."""
+    from scipy.spatial.transform import Rotation  # noqa: PLC0415  beside its only use
+
+    turn, _ = Rotation.align_vectors([b], [a])
+    return turn.as_matrix()
+
+
+def test_a_frame_that_was_told_the_same_is_not_looked_at_again() -> None:
+    """It would be seen the same; a reading of an IMU that was shaken is another matter."""
+    given, offsets = leaning(np.full(20, 35.0)), np.full(20, -0.9)
+    offsets[[5, 12]] = np.nan
+    given[12] = leaning([65.0])[0]
+
+    chosen = frames_to_revise(tables(leaning(np.full(20, 35.0)), given=given, offsets=offsets))
+
+    assert [frame for _, frame in chosen] == [12]
+    told = chosen["/d", 12].up_given
+    assert told is not None
+    np.testing.assert_allclose(told, given[12], atol=1e-6)
