@@ -8,13 +8,14 @@ from typing import IO, Any, cast
 
 import numpy as np
 
-from shapecat.arrays import U1
+from shapecat.arrays import F8, U1
 from shapecat.errors import OutputError, RecordingError
 from shapecat.evaluation.labellings import Item, Labelling, Reference
 from shapecat.evaluation.references_coco import CocoLabels
 from shapecat.evaluation.references_kitti import KittiLabels
 from shapecat.outputs.rereading import FinishedRun, read_finished
 from shapecat.runs.labels import rows_by_frame
+from shapecat.runs.shown import ShownTracks
 from shapecat.runs.tables import Key, read_row_groups
 from shapecat.types import Box
 
@@ -193,12 +194,14 @@ def read_complete(folder: Path) -> FinishedRun:
 def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, Any], Labelling]]:
     """Yield the frames of a run in order: topic and number, the row of the frame, its objects.
 
-    Detections without a track have their own category; those of deleted tracks are left out.
+    Detections without a track have their own category; those of deleted tracks are left out. Boxes
+    are around all of an object where that is known, as they are in labels.
     """
     folder = finished.folder
     tracks = _tracks(folder)
     wanted = ("topic", "frame", "detection", "center", "size", "orientation", "indices")
     columns = [*wanted, "posterior", "category", "confidence"]
+    shown = ShownTracks.read(folder, finished.labels)
     groups = zip(
         read_row_groups(folder / "frames.parquet", ["topic", "frame", "stamp_ns", "up"]),
         read_row_groups(folder / "detections.parquet", columns),
@@ -208,7 +211,8 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
         found = rows_by_frame(detections)
         for row in frames.to_pylist():
             key = (row["topic"], row["frame"])
-            items = (_item(r, tracks, finished) for r in found.get(key, []))
+            full = {item.detection: shown.full[item.row] for item in shown.of(key)}
+            items = (_item(r, tracks, finished, full) for r in found.get(key, []))
             yield key, row, Labelling(tuple(item for item in items if item is not None))
 
 
@@ -222,8 +226,18 @@ def _tracks(folder: Path) -> dict[tuple[str, int, int], int]:
     return tracks
 
 
+def _box(row: Mapping[str, Any], full: F8 | None) -> Box:
+    """Return the box around all of an object; where that is not known, around what is seen."""
+    if full is None or np.isnan(full[0]):
+        return Box(row["center"], row["size"], row["orientation"])
+    return Box(full[:3], full[3:6], full[6:])
+
+
 def _item(
-    row: Mapping[str, Any], tracks: Mapping[tuple[str, int, int], int], finished: FinishedRun
+    row: Mapping[str, Any],
+    tracks: Mapping[tuple[str, int, int], int],
+    finished: FinishedRun,
+    full: Mapping[int, F8],
 ) -> Item | None:
     """Return a detection with the final label of its track; None if a person has deleted it."""
     track = tracks.get((row["topic"], row["frame"], row["detection"]))
@@ -234,7 +248,7 @@ def _item(
         track=None if label is None else label.track,
         category=row["category"] if label is None else label.category,
         pixels=cast("Any", row["indices"]).astype(np.int64),
-        box=Box(row["center"], row["size"], row["orientation"]),
+        box=_box(row, full.get(row["detection"])),
         confidence=row["confidence"] if label is None else label.confidence,
         view_category=row["category"],
         posterior=row["posterior"],

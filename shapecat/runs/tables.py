@@ -132,7 +132,7 @@ TRACKS = pa.schema(
 )
 """One row per track per frame; ``detection`` is null while the track coasts, ``posterior`` is the
 causal one. Without a fixed frame ``center_fixed`` is in the sensor frame; ``center_full`` and
-``orientation_full`` are in the frame of ``center_fixed``, null while the track coasts."""
+``orientation_full`` always are, and null while the track coasts."""
 
 Key = tuple[str, int]
 """A frame: its topic, and its number there."""
