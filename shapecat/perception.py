@@ -124,9 +124,9 @@ def perceive(
 
 
 def find_up(frame: Frame, settings: Settings) -> F4 | None:
-    """Return the normal (3,) of the dominant supporting plane; None if no plane is found."""
+    """Return the normal (3,) of the supporting planes; None if too little of any is seen."""
     scene = detect(frame, settings=settings.detection, rng=_rng(settings, frame, 0))
-    return scene.up if scene.planes else None
+    return scene.up if sum(plane.area_m2 for plane in scene.planes) >= _TELLS_M2 else None
 
 
 def _rng(settings: Settings, frame: Frame, item: int) -> np.random.Generator:
@@ -188,5 +188,7 @@ def _categorize(
     )
 
 
+_TELLS_M2 = 0.1
+"""Area of planes that tells where up is; a smaller one may be the face of something."""
 _UNDECIDED = 2.0
 """Novelty of an object with too few points for a surface: beyond the threshold, so unknown."""
