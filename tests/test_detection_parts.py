@@ -15,9 +15,12 @@ from shapecat.detection.merging.pair_features import (
     pair_features,
 )
 from shapecat.detection.pipeline import ALL_STEPS, oversegment
-from shapecat.models.parts import Pairs, collect, grow
-from shapecat.simulation import KINECT, make_scene, render_frame
+from shapecat.models.parts import Growth, Pairs, Series, collect, grow
+from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
 from tests.test_detection import overlaps
+
+SCENES = (Series("clutter", KINECT, 2000, 4), Series("pile", REALSENSE, 85_000, 2))
+GROWTH = Growth(100, 32, 0.1)
 
 
 def test_every_walk_through_the_trees_ends() -> None:
@@ -71,8 +74,24 @@ def test_without_the_trees_objects_stay_in_pieces(seed: int) -> None:
     assert found[1] > found[0]
 
 
+def test_trees_that_are_added_correct_the_first() -> None:
+    """The first trees were shown one rule; what comes after adds another, and keeps the first."""
+    rng = np.random.default_rng(3)
+    features = rng.normal(size=(3000, FEATURES)).astype(np.float32)
+    old = features[:, 9] > 0.2
+    new = old & (features[:, 40] < 1.0)  # what the first find hopeless is not asked again
+    first = grow(Pairs(features, old), GROWTH, seed=0)
+    both = grow(Pairs(features, new), GROWTH, seed=0, after=first)
+    count = len(first.value)
+    for name in ("feature", "threshold", "left", "value"):
+        assert np.array_equal(getattr(both, name)[:count], getattr(first, name))
+    told = np.array([[logit_of(t, row) > 0 for row in features] for t in (first, both)])
+    assert np.mean(told[0] == new) < 0.95
+    assert np.mean(told[1] == new) > 0.97
+
+
 def test_pairs_do_not_depend_on_the_number_of_processes() -> None:
-    one, two = collect(0.001, 1), collect(0.001, 2)
+    one, two = (collect(SCENES, 1.0, jobs) for jobs in (1, 2))
     assert np.array_equal(one.features, two.features)
     assert np.array_equal(one.same, two.same)
     assert 0.05 < one.same.mean() < 0.95
@@ -83,7 +102,7 @@ def test_grown_trees_tell_what_they_were_shown() -> None:
     rng = np.random.default_rng(0)
     features = rng.normal(size=(2000, FEATURES)).astype(np.float32)
     same = (features[:, 4] > 0) ^ (features[:, 40] > 0.3)
-    first, second = (grow(Pairs(features, same), seed=1) for _ in range(2))
+    first, second = (grow(Pairs(features, same), GROWTH, seed=1) for _ in range(2))
     assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
     told = np.array([logit_of(first, row) > 0 for row in features])
     assert np.mean(told == same) > 0.95

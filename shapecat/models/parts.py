@@ -43,8 +43,20 @@ _PURE = 0.6
 """A segment belongs to the object that has more than this share of it."""
 _NOISY = replace(IDEAL, noise=0.0015, step=0.0029)
 _BLENDED = replace(IDEAL, noise=0.0015, blend_px=3)
-_ROUNDS, _LEAVES, _RATE, _RIDGE, _LEAST, _ROWS = 200, 64, 0.1, 1.0, 2.0, 0.7
+_RIDGE, _LEAST, _ROWS = 1.0, 2.0, 0.7
 _CHUNK = 25
+
+
+class Growth(NamedTuple):
+    """How many trees are grown, how many leaves each has, and what share of what lacks it adds."""
+
+    rounds: int
+    leaves: int
+    rate: float
+
+
+_FIRST, _MORE = Growth(200, 64, 0.1), Growth(80, 32, 0.05)
+"""Of the trees of tables and shelves; of those that piles add to them."""
 
 
 class Series(NamedTuple):
@@ -71,6 +83,16 @@ _SERIES = (
     Series("clutter", KINECT, 70_000, 150, ("box", "can", "plate")),
 )
 """Seeds below 2000 are for development, those from 100000 on for judging alone."""
+_SETTLED = (
+    Series("pile", KINECT, 80_000, 1500),
+    Series("pile", REALSENSE, 85_000, 900),
+    Series("pile", _BLENDED, 88_000, 200),
+    Series("bin", KINECT, 90_000, 400),
+    Series("bin", REALSENSE, 92_000, 300),
+    Series("shelf_bin", KINECT, 94_000, 300),
+    Series("shelf_bin", REALSENSE, 96_000, 300),
+)
+"""What physics lets fall, where objects lean, lie across and touch walls."""
 
 
 class Pairs(NamedTuple):
@@ -90,19 +112,23 @@ class Pairs(NamedTuple):
     type=click.Path(path_type=Path),
     help="File to write.",
 )
-def main(*, share: float, seed: int, jobs: int, out: Path) -> None:
+@click.option("--more", is_flag=True, help="Keep the trees that are there, and add those of piles.")
+def main(*, share: float, seed: int, jobs: int, out: Path, more: bool) -> None:
     """Simulate, part, grow; write the trees."""
-    pairs = collect(share, jobs)
-    grown = grow(pairs, seed)
+    at_rest = collect(_SERIES, share, jobs)
+    grown = learned.load_trees() if more else grow(at_rest, _FIRST, seed)
+    settled = collect(_SETTLED, share, jobs)
+    pairs = Pairs(*(np.concatenate(both) for both in zip(at_rest, settled, strict=True)))
+    grown = grow(pairs, _MORE, seed, after=grown)
     np.savez_compressed(out, **grown._asdict())
     click.echo(f"{len(pairs.same)} pairs, {pairs.same.mean():.0%} of one object; {out}")
 
 
-def collect(share: float, jobs: int) -> Pairs:
+def collect(scenes: Sequence[Series], share: float, jobs: int) -> Pairs:
     """Return the pairs of segments of a share of the scenes, whatever the number of jobs."""
     chunks = [
         (series, series.first + k, min(_CHUNK, count - k))
-        for series in _SERIES
+        for series in scenes
         for count in [round(series.scenes * share)]
         for k in range(0, count, _CHUNK)
     ]
@@ -198,21 +224,46 @@ def _meeting(segments: Segments, whose: I4) -> Iterator[tuple[int, int]]:
                 yield p, q
 
 
-def grow(pairs: Pairs, seed: int) -> BoostedTrees:
-    """Grow trees on pairs: gradient boosting with the cross entropy (Friedman 2001)."""
+def grow(
+    pairs: Pairs, growth: Growth, seed: int, *, after: BoostedTrees | None = None
+) -> BoostedTrees:
+    """Grow trees on pairs: gradient boosting with the cross entropy (Friedman 2001).
+
+    They add to what the trees ``after`` which they are grown tell.
+    """
     rng = np.random.default_rng(seed)
     bins, n = make_bins(pairs.features), len(pairs.same)
     share = pairs.same.mean()
-    logit = np.full(n, np.log(share / (1 - share)), np.float32)
-    settings = TreeSettings(_LEAVES, _RATE, _RIDGE, _LEAST)
-    grown: list[Tree] = [_leaf(float(logit[0]))]
+    first = after or _joined([_leaf(float(np.log(share / (1 - share))))])
+    logit = _logits(first, pairs.features)
+    settings = TreeSettings(growth.leaves, growth.rate, _RIDGE, _LEAST)
+    grown: list[Tree] = []
     columns = np.arange(FEATURES)
-    for _ in range(_ROUNDS):
+    for _ in range(growth.rounds):
         posterior = 1 / (1 + np.exp(-logit))
         rows = np.sort(rng.permutation(n)[: round(_ROWS * n)]).astype(np.int32)
         slope, bend = posterior - pairs.same, posterior * (1 - posterior)
         grown.append(grow_tree(bins, columns, rows, slope, bend, settings, logit))
-    return _joined(grown)
+    return _appended(first, _joined(grown))
+
+
+def _logits(trees: BoostedTrees, features: F4) -> F4:
+    """Return what all trees together say of each pair, (n,)."""
+    logit, rows = np.zeros(len(features), np.float32), np.arange(len(features))
+    for root in trees.roots:
+        node = np.full(len(features), root)
+        while (inner := trees.left[node] > 0).any():
+            right = features[rows, trees.feature[node]] > trees.threshold[node]
+            node = np.where(inner, trees.left[node] + right, node)
+        logit += trees.value[node]
+    return logit
+
+
+def _appended(first: BoostedTrees, more: BoostedTrees) -> BoostedTrees:
+    count = len(first.value)
+    left = np.where(more.left > 0, more.left + count, 0).astype(np.int32)
+    later = more._replace(roots=(more.roots + count).astype(np.int32), left=left)
+    return BoostedTrees(*(np.concatenate(both) for both in zip(first, later, strict=True)))
 
 
 def _leaf(value: float) -> Tree:

@@ -49,7 +49,7 @@ _CUT_WELL = 0.75
 """Overlap from which on a detection is taken for one object."""
 _MOSTLY = 0.7
 """Share of an object from which on it is taken for mostly visible."""
-_REJECTED = 0.08
+_REJECTED = 0.14
 """Share of partial views of known categories that the novelty threshold rejects: what is real is
 often hidden in part, and a piece is stranger than the whole."""
 _MANNERS = ("upright", "lying")

@@ -27,9 +27,8 @@ from shapecat.jit import kernel
 __all__ = ["FILE", "BoostedTrees", "load_trees", "logit_of", "merge_learned"]
 
 FILE = "parts.npz"
-LIKELY = 0.6
-"""Logit, of 0.65, from which on two segments are taken for parts of one object: a wrong join loses
-two objects, a missing one seldom one."""
+LIKELY = 0.0
+"""Logit, of even odds, from which on two segments are taken for parts of one object."""
 HOPELESS = -4.0
 """Logit of the first trees that the others never made up for; half of the pairs end so early."""
 LANES = 8
