@@ -15,10 +15,10 @@ alone: no real reading was used to learn or to calibrate it. Settings were chose
 simulated objects; the figures on real readings below were seen while choosing, so they flatter
 it a little.
 
-It tells {categories} by shape, seen from one side by a depth camera 0.35 to 2.2 m
-away and 5 to 88 degrees above, standing, lying, or as physics lets it fall in piles, bins and shelves;
-anything else should come out as *unknown* (novelty above 1). The threshold rejects 14 % of simulated
-views that show an object of these in part.
+It tells {categories} by shape, seen from one side by a depth camera 0.35 to 2.2 m away and 5 to
+88 degrees above, standing, lying, or as physics lets it fall in piles, bins and shelves; anything
+else should come out as *unknown* (novelty above 1). The threshold rejects 14 % of simulated views
+that show an object of these in part.
 
 ## Known confusions
 
