@@ -15,8 +15,6 @@
 The thesis stops at objects that do not touch: steps 4 and 5 go beyond it.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -47,29 +45,13 @@ from shapecat.detection.records import OverSegmentation, PlaneModel, Segmentatio
 from shapecat.detection.segmentation.connectivity import connect_surfaces
 from shapecat.detection.segmentation.watershed import relabel, watershed
 from shapecat.detection.segmentation.width_split import split_at_width_changes
+from shapecat.detection.steps import ALL_STEPS, Steps
 from shapecat.detection.virtual_camera import VirtualImage, top_view, virtual_image
 from shapecat.geometry import IDENTITY, inverse
 from shapecat.types import Camera, Frame, Scene
 
 __all__ = ["ALL_STEPS", "Steps", "detect", "label", "oversegment"]
 
-
-class Steps(NamedTuple):
-    """Which of the steps beyond the thesis are taken, to measure what each is worth.
-
-    Without any of them what remains is the plane, the height above it, and depth discontinuities.
-    """
-
-    low_profile: bool = True
-    concavity: bool = True
-    width_split: bool = True
-    learned_merging: bool = True
-    across_occlusion: bool = True
-    contact_boundary: bool = True
-    hole_filling: bool = True
-
-
-ALL_STEPS = Steps()
 DEFAULT_UP = (0.0, -1.0, 0.0)
 """Up in an upright optical frame, where nothing else is known."""
 CROWDED = 0.08
@@ -331,10 +313,7 @@ def _fill(
     steps: Steps,
 ) -> Segmentation:
     """Complete the labels near the planes, and measure the objects."""
-    labels, segments = (
-        oversegmentation.labels,
-        oversegmentation.segments,
-    )  # of objects from `_clean_up` on
+    _, labels, segments = oversegmentation  # labels of objects, from `_clean_up` on
     if steps.contact_boundary:
         fill_contact_boundary(grid.inverse_depth, model.heights, labels)
     filled = np.zeros(labels.shape, np.uint8)
