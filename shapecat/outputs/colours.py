@@ -9,13 +9,13 @@ CATEGORY_COLOURS: dict[str, tuple[int, int, int]] = {
     "cup": (229, 72, 77),
     "can": (70, 167, 88),
     "box": (62, 130, 246),
-    "bottle": (139, 146, 156),
+    "bottle": (172, 116, 66),
     "bowl": (240, 185, 40),
     "plate": (35, 190, 205),
     "ball": (214, 80, 190),
     "unknown": (226, 226, 220),
 }
-"""Red, green, blue from 0 to 255: the hues of the thesis, in tones that read on light and dark."""
+"""Red, green, blue from 0 to 255, in tones that read on light and dark; grey is left to unknown."""
 
 
 def colour_of(category: str) -> tuple[int, int, int]:

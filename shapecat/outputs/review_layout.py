@@ -174,6 +174,6 @@ def _track_view(track: TrackView) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin=track.entity,
         name=track.title,
-        axis_y=rrb.ScalarAxis(range=(0.0, 1.0), zoom_lock=True),
+        axis_y=rrb.ScalarAxis(range=(-0.05, 1.05), zoom_lock=True),
         plot_legend=rrb.PlotLegend(visible=False),
     )
