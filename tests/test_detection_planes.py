@@ -9,7 +9,7 @@ from shapecat.config import DetectionSettings, Settings
 from shapecat.detection import detect
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
 from shapecat.detection.planes import NO_HINT
-from shapecat.detection.planes.assumed import assume_plane
+from shapecat.detection.planes.assumed import assume_plane, unexplained
 from shapecat.detection.planes.covered import add_covered_planes
 from shapecat.detection.planes.parallel import find_parallel_planes
 from shapecat.detection.planes.ransac import draw_trials
@@ -120,12 +120,17 @@ def test_assumed_plane_lies_just_below_what_no_plane_explains() -> None:
 
 def test_no_plane_is_assumed_for_a_few_samples_or_above_the_camera() -> None:
     grid = DepthGrid(np.ones((60, 80), np.float32), PinholeIntrinsics(75, 75, 39.5, 29.5), 8, 0.01)
-    few = np.zeros((60, 80), bool)
-    few[:6] = True
+    few = np.zeros((60, 80), np.int8)
+    few[6:] = -1  # a tenth is above no plane
+    none = np.zeros((60, 80), np.uint8)
     up = np.array([0.0, 0.0, -1.0])
-    assert assume_plane(grid, few, up, tallest_m=0.5) is None
-    assert assume_plane(grid, ~few, -up, tallest_m=0.5) is None
-    assert assume_plane(grid, ~few, up, tallest_m=0.5) is not None
+    assert unexplained(grid, few, none) is None
+    assert unexplained(grid, ~few, (few < 0).astype(np.uint8)) is None
+    rest = unexplained(grid, ~few, none)
+    assert rest is not None
+    np.testing.assert_array_equal(rest, few == -1)
+    assert assume_plane(grid, rest, -up, tallest_m=0.5) is None
+    assert assume_plane(grid, rest, up, tallest_m=0.5) is not None
 
 
 def test_objects_in_compartments_are_found_where_their_board_is_hardly_seen() -> None:

@@ -211,7 +211,7 @@ def _find_planes(
     up = up if up.any() else np.array(DEFAULT_UP)
     model = _separate(grid, supports, up, trials, settings, steps)
     rest = unexplained(grid, model.heights.plane_id, model.walls)
-    assumed = assume_plane(grid, rest, up, tallest_m=settings.max_height_m)
+    assumed = None if rest is None else assume_plane(grid, rest, up, settings.max_height_m)
     if assumed is not None:
         supports = sorted([*supports, assumed], key=lambda support: support.offset)
         model = _separate(grid, supports, up, trials, settings, steps)

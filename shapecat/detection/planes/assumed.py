@@ -6,12 +6,13 @@ stands above no plane, a level plane is assumed below it, so that it is segmente
 
 import numpy as np
 
-from shapecat.arrays import F8, I4, U1, Bool
+from shapecat.arrays import F4, F8, I4, U1, Bool
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.planes.extent import ANGLES, MARGIN_M, SupportingPlane
 from shapecat.detection.planes.ransac import horizontal_plane
 from shapecat.detection.planes.up_direction import HALF_M
 from shapecat.geometry import level_axes
+from shapecat.jit import kernel
 
 __all__ = ["UNEXPLAINED", "assume_plane", "unexplained"]
 
@@ -22,15 +23,31 @@ FEW = 0.01
 """Share of the unexplained samples that may lie below the plane: noise."""
 
 
-def unexplained(grid: DepthGrid, plane_id: I4, walls: U1) -> Bool:
-    """Return the samples (rows, columns) that no plane is below, and that are on no wall."""
+def unexplained(grid: DepthGrid, plane_id: I4, walls: U1) -> Bool | None:
+    """Return the samples (rows, columns) above no plane and on no wall; None if they are few."""
+    rest, everything = _count(grid.inverse_depth, plane_id, walls)
+    if rest <= UNEXPLAINED * everything:
+        return None
     return np.asarray((plane_id == 0) & (walls == 0) & (grid.inverse_depth > 0))
 
 
-def assume_plane(
-    grid: DepthGrid, rest: Bool, up: F8, *, tallest_m: float
-) -> SupportingPlane | None:
-    """Return the level plane below most of some samples, of area 0; None if they are few.
+@kernel
+def _count(inv_depth: F4, plane_id: I4, walls: U1) -> tuple[int, int]:
+    """Return how many samples are above no plane and on no wall, and how many there are."""
+    rest = everything = 0
+    for i in range(inv_depth.shape[0]):
+        values, planes, on_wall = inv_depth[i], plane_id[i], walls[i]
+        some, all_ = np.int32(0), np.int32(0)
+        for j in range(values.size):  # no more than 32 bits, and this vectorises
+            seen = values[j] > 0
+            some += np.int32(seen & (planes[j] == 0) & (on_wall[j] == 0))
+            all_ += np.int32(seen)
+        rest, everything = rest + int(some), everything + int(all_)
+    return rest, everything
+
+
+def assume_plane(grid: DepthGrid, rest: Bool, up: F8, tallest_m: float) -> SupportingPlane | None:
+    """Return the level plane below most of some samples, of area 0; None above the camera.
 
     Parameters
     ----------
@@ -39,8 +56,6 @@ def assume_plane(
     tallest_m : height of the tallest object: the plane is the one with most surface within this
         height above it, what is near counting more than what is far.
     """
-    if np.count_nonzero(rest) <= UNEXPLAINED * np.count_nonzero(grid.inverse_depth):
-        return None
     i, j = np.nonzero(rest)
     z = 1 / grid.inverse_depth[i, j].astype(np.float64)
     k = grid.intrinsics
