@@ -1,8 +1,9 @@
 """How objects are found and categorized where physics let them fall: piles, bins, compartments.
 
     python -m benchmarks.piles --first 740000 --count 60
+    python -m benchmarks.piles --kind pile --sensor all --count 40
 
-Simulated scenes of twelve objects, one frame each, by a Kinect and by a RealSense.
+Simulated scenes of twelve objects, one frame each, by a Kinect and a RealSense or by all sensors.
 """
 
 from collections.abc import Iterator
@@ -20,13 +21,13 @@ from shapecat.evaluation.metrics import auroc, expected_calibration_error
 from shapecat.evaluation.overlap import MATCHED_F, match_masks
 from shapecat.learning import Categorizer, load_model
 from shapecat.perception import perceive
-from shapecat.simulation import KINECT, REALSENSE, Thing, render_frame
+from shapecat.simulation import Thing, render_frame
 from shapecat.simulation.piles import bin_picking, pile, shelf_bin
+from shapecat.simulation.sensors import PRESETS
 from shapecat.types import CATEGORIES, Detection
 
 Array = NDArray[Any]
 SCENES = {"pile": pile, "bin": bin_picking, "shelf bin": shelf_bin}
-SENSORS = {"Kinect": KINECT, "RealSense": REALSENSE}
 OBJECTS, UNKNOWN = 12, 1 / 6
 """How many objects are dropped, and the share of those of no category."""
 
@@ -59,7 +60,7 @@ def judge(
         rng = np.random.default_rng(seed)
         names = np.where(rng.random(OBJECTS) < UNKNOWN, "unknown", rng.choice(CATEGORIES, OBJECTS))
         world = SCENES[kind](rng, names.tolist(), 1, 30.0)
-        frame, labels = render_frame(world, 0, rng=rng, sensor=SENSORS[sensor])
+        frame, labels = render_frame(world, 0, rng=rng, sensor=PRESETS[sensor])
         seen = perceive(frame, up=None, categorizer=model, settings=settings).detections
         flat = labels.reshape(-1)
         objects += _matched(world.things, flat, seen)
@@ -135,13 +136,26 @@ def _calibration(objects: list[Judged], model: Categorizer) -> float:
 @click.command()
 @click.option("--first", default=3000, show_default=True, help="Seed of the first scene.")
 @click.option("--count", default=60, show_default=True, help="Scenes of each kind.")
+@click.option(
+    "--kind", "kinds", multiple=True, type=click.Choice(list(SCENES)), help="[default: all]"
+)
+@click.option(
+    "--sensor",
+    "sensors",
+    multiple=True,
+    type=click.Choice([*PRESETS, "all"]),
+    default=("kinect", "realsense"),
+    show_default=True,
+)
 @click.option("--model", type=click.Path(path_type=Path), help="Model file.  [default: ours]")
-def main(first: int, count: int, model: Path | None) -> None:
+def main(
+    first: int, count: int, kinds: tuple[str, ...], sensors: tuple[str, ...], model: Path | None
+) -> None:
     """Judge piles, bins and compartments, and print a table."""
     categorizer, settings = load_model(model), Settings()
     rows = []
-    for kind in SCENES:
-        for sensor in SENSORS:
+    for kind in kinds or SCENES:
+        for sensor in PRESETS if "all" in sensors else sensors:
             found = figures(judge(kind, sensor, first, count, categorizer, settings), categorizer)
             cells = (f"{v:.3f}" if isinstance(v, float) else str(v) for v in found.values())
             rows.append((f"{kind}, {sensor}", *cells))

@@ -8,6 +8,20 @@ import click
 from .options import ANY_PATH, seed_option
 from .render import progress_bars
 
+_SENSORS = (
+    "kinect",
+    "realsense",
+    "kinect-v2",
+    "azure-kinect",
+    "d415",
+    "d435",
+    "d455",
+    "sr300",
+    "l515",
+    "phone",
+)
+"""Named here too, so that help needs no simulator."""
+
 
 @click.command()
 @click.argument("out", type=ANY_PATH)
@@ -36,7 +50,13 @@ from .render import progress_bars
     type=click.Choice(["mcap", "ros1", "ros2"]),
     help="Recording format; by default what the suffix of OUT says, else mcap.",
 )
-@click.option("--sensor", type=click.Choice(["kinect", "realsense"]), default="kinect")
+@click.option(
+    "--sensor",
+    type=click.Choice(_SENSORS),
+    default="kinect",
+    show_default=True,
+    help="Depth camera.",
+)
 @click.option(
     "--frames", type=click.IntRange(1), default=90, show_default=True, help="30 per second."
 )

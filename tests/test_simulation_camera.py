@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 
 from shapecat.arrays import F8
+from shapecat.simulation.measuring import measure
 from shapecat.simulation.mesh import Mesh, lathe, rounded_box
 from shapecat.simulation.paths import looking_at
 from shapecat.simulation.render import Geometry, Image, alone_pixels, cropped, geometry, render
 from shapecat.simulation.scenes import make_scene
-from shapecat.simulation.sensors import IDEAL, KINECT, REALSENSE, Sensor, measure
+from shapecat.simulation.sensors import IDEAL, KINECT, REALSENSE, Sensor
 from shapecat.types import Camera, Pose
 
 HERE = Pose(np.eye(3), np.zeros(3))

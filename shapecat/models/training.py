@@ -29,6 +29,7 @@ from shapecat.models.studies import add_two_categories, compare_surfaces, compar
 from shapecat.models.worlds import WorldView, simulate_views
 from shapecat.simulation.distractors import DISTRACTORS
 from shapecat.simulation.procedural import PROCEDURAL
+from shapecat.simulation.sensors import PRESETS
 
 __all__ = ["Simulated", "collect", "main", "simulate"]
 
@@ -70,6 +71,7 @@ class Simulated(NamedTuple):
     source: np.ndarray
     visible: np.ndarray
     overlap: np.ndarray
+    sensor: np.ndarray
 
     def where(self, chosen: Bool) -> "Simulated":
         """Return the chosen views."""
@@ -79,6 +81,7 @@ class Simulated(NamedTuple):
             self.source[chosen],
             self.visible[chosen],
             self.overlap[chosen],
+            self.sensor[chosen],
         )
 
 
@@ -195,6 +198,7 @@ def _parts(views: Simulated, model: Categorizer) -> list[tuple[str, Report]]:
         "of these, lying": clear & (views.manner == "lying"),
         "of these, tilted in piles": clear & (views.manner == "tilted"),
         "of these, nearer than 1.4 m": clear & (views.views.distances < 1.4),
+        **{f"of these, by {name}": clear & (views.sensor == name) for name in PRESETS},
         "upside down": whole & (views.manner == "upside_down"),
         "30 to 70 % visible": whole & (views.visible < _MOSTLY),
         "fragments": ~whole,

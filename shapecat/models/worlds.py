@@ -23,11 +23,12 @@ from shapecat.geometry import (
 from shapecat.learning.baselines import shape_functions
 from shapecat.models.arrangements import ALONE, Actor, Arrangement, World, arrange, placed
 from shapecat.models.fragments import cut_fragment, cut_halo
+from shapecat.simulation.measuring import measure
 from shapecat.simulation.mesh import Mesh, moved
 from shapecat.simulation.paths import looking_at
 from shapecat.simulation.placement import Rest
 from shapecat.simulation.render import Geometry, geometry, render
-from shapecat.simulation.sensors import KINECT, REALSENSE, Sensor, measure
+from shapecat.simulation.sensors import PRESETS, Sensor, between, resized
 from shapecat.surface import voxelize
 from shapecat.types import Camera, Frame, Pose, Scene
 
@@ -41,6 +42,8 @@ _COARSE = 4
 """Visible shares are judged in images this many times smaller."""
 _SCALES = (0.5, 1.0, 1.0, 1.0, 1.5)
 """Resolutions of the sensors, as multiples of their own."""
+_WIDTHS = (224, 1280)
+"""Their least and greatest width in pixels."""
 _SETTINGS = Settings()
 
 
@@ -154,38 +157,22 @@ def _shoot(seen: Geometry, arrangement: Arrangement, rng: np.random.Generator) -
 
 
 def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
-    """Draw one of the sensors, better or worse than usual, and of another resolution."""
-    name, sensor = (("kinect", KINECT), ("realsense", REALSENSE))[rng.integers(2)]
-    noise, wave, ragged = np.exp(rng.uniform(np.log([0.4, 0.4, 0.5]), np.log([2.5, 2.5, 1.6])))
+    """Draw a sensor: one of the presets or between two, better or worse, of any resolution."""
+    names = list(PRESETS)
+    name, other = (names[k] for k in rng.integers(len(names), size=2))
+    share = float(rng.uniform(0, 0.6)) if rng.random() < 0.5 else 0.0
+    sensor = between(PRESETS[name], PRESETS[other], share)
+    noise, wave, ragged = np.exp(rng.uniform(np.log([0.4, 0.4, 0.5]), np.log([2.0, 2.5, 1.5])))
     sensor = replace(
         sensor,
         noise=float(sensor.noise * noise),
+        noise_m=float(sensor.noise_m * noise),
         wave=float(sensor.wave * wave),
+        device=int(rng.integers(1_000_000)),
         ragged_px=float(sensor.ragged_px * ragged),
-        blend_px=int(rng.choice([0, sensor.blend_px, 5])),
     )
-    return name, _resized(sensor, float(rng.choice(_SCALES)))
-
-
-def _resized(sensor: Sensor, scale: float) -> Sensor:
-    """Return a sensor with more or fewer pixels in the same field of view."""
-    camera = sensor.camera
-    width, height = round(camera.width * scale), round(camera.height * scale)
-    middle = [(c + 0.5) * scale - 0.5 for c in (camera.cx, camera.cy)]
-    focal = camera.fx * scale, camera.fy * scale
-    return replace(
-        sensor,
-        camera=Camera(width, height, *focal, *middle),
-        grain=_scaled(sensor.grain, scale),
-        ragged_window=_scaled(sensor.ragged_window, scale),
-        ragged_px=sensor.ragged_px * scale,
-        wave_px=max(round(sensor.wave_px * scale), 2),
-        filled_px=sensor.filled_px * scale,
-    )
-
-
-def _scaled(window: tuple[int, int], scale: float) -> tuple[int, int]:
-    return max(round(window[0] * scale), 1), max(round(window[1] * scale), 1)
+    scale = np.clip(rng.choice(_SCALES), *(np.array(_WIDTHS) / sensor.camera.width))
+    return name, resized(sensor, float(scale))
 
 
 def _viewpoint(arrangement: Arrangement, rng: np.random.Generator) -> Pose:

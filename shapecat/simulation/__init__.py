@@ -4,9 +4,10 @@ Everything comes from a seed and is the same on every machine.
 """
 
 from shapecat.simulation.layout import Piece, make_piece
+from shapecat.simulation.measuring import measure
 from shapecat.simulation.recorder import record, simulate
 from shapecat.simulation.scenes import make_scene, make_stage
-from shapecat.simulation.sensors import IDEAL, KINECT, REALSENSE, Sensor, measure
+from shapecat.simulation.sensors import IDEAL, KINECT, REALSENSE, Sensor
 from shapecat.simulation.views import render_frame
 from shapecat.simulation.worlds import Support, Thing, World
 

@@ -44,7 +44,7 @@ def simulate(
     format: Literal["mcap", "ros1", "ros2"] = "mcap",  # noqa: A002  # the word users know
     frames: int = 90,
     seed: int = 0,
-    sensor: Literal["kinect", "realsense", "ideal"] = "kinect",
+    sensor: str = "kinect",
     clouds: bool = False,
     color: bool = False,
     rate_hz: float = 30.0,

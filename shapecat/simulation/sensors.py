@@ -1,22 +1,17 @@
-"""From true depth to what a depth camera reports.
+"""Depth cameras: their intrinsics, and how wrong their readings are.
 
-The figures are fitted to real images: a Kinect v1 registered to its colour camera looking at a
-table with objects, and an Intel D435.
+The figures of the Kinect and the RealSense D435 are fitted to real images of tables with objects.
+Those of the others follow the makers' data sheets and the cited measurements.
 """
 
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import Literal
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
-from numpy.random import Generator
 
-from shapecat.arrays import F4, F8, I4, U1, Bool
-from shapecat.jit import kernel
-from shapecat.simulation.render import Image
 from shapecat.types import Camera
 
-__all__ = ["IDEAL", "KINECT", "REALSENSE", "SENSORS", "Sensor", "measure"]
+__all__ = ["IDEAL", "KINECT", "PRESETS", "REALSENSE", "SENSORS", "Sensor", "between", "resized"]
 
 
 @dataclass(frozen=True)
@@ -28,17 +23,22 @@ class Sensor:
     camera : its intrinsics.
     nearest_m, farthest_m : range in which it reports.
     step : quantum of the inverse depth; 0 is none.
-    noise : standard deviation of the inverse depth.
+    noise : standard deviation of the inverse depth, of cameras that triangulate.
+    noise_m : standard deviation of the depth in metres, of those that time light.
     grain : (across, down) width of the window over which the noise is alike.
     wave : standard deviation of a fixed error of the device, over `wave_px` pixels.
+    device : number of the device, which draws that error and how dark objects are.
     ragged_px : how far the outlines of things are displaced, standard deviation.
     ragged_window : (across, down) width over which they are displaced alike.
     shadow_m : places, along x, of the light source and the other cameras: what one of them does
         not see has no reading.
     filled_px : shadows are this much narrower than geometry says, on average.
     grazing : cosine of the angle of incidence at which half of the readings fail.
+    dark : spread of the logarithm of how much light objects return: a dark one fails sooner.
     holes : share of pixels in holes anywhere.
     blend_px : width over which near and far are mixed at outlines (flying pixels); 0 is none.
+    rounded_px : width over which edges and corners within a surface are rounded (multipath,
+        smoothing windows); 0 is none.
     border_px : (left, right, top, bottom) without readings.
     """
 
@@ -47,24 +47,32 @@ class Sensor:
     farthest_m: float = 4.0
     step: float = 0.0
     noise: float = 0.0
+    noise_m: float = 0.0
     grain: tuple[int, int] = (1, 1)
     wave: float = 0.0
     wave_px: int = 80
+    device: int = 1
     ragged_px: float = 0.0
     ragged_window: tuple[int, int] = (1, 1)
     shadow_m: tuple[float, ...] = ()
     filled_px: float = 0.0
     grazing: float = 0.0
+    dark: float = 0.0
     holes: float = 0.0
     blend_px: int = 0
+    rounded_px: int = 0
     border_px: tuple[int, int, int, int] = (0, 0, 0, 0)
 
 
-IDEAL = Sensor(Camera(640, 480, 525.0, 525.0, 319.5, 239.5), nearest_m=0.05, farthest_m=10.0)
+def _camera(width: int, height: int, focal: float) -> Camera:
+    return Camera(width, height, focal, focal, width / 2 - 0.5, height / 2 - 0.5)
+
+
+IDEAL = Sensor(_camera(640, 480, 525.0), nearest_m=0.05, farthest_m=10.0)
 """A camera without faults."""
 
 KINECT = Sensor(
-    Camera(640, 480, 525.0, 525.0, 319.5, 239.5),
+    _camera(640, 480, 525.0),
     nearest_m=0.45,
     step=0.0029,  # 1/8 px of a 580 px infrared camera, 7.5 cm from its projector
     noise=0.0018,
@@ -78,10 +86,10 @@ KINECT = Sensor(
     holes=0.0003,
     border_px=(4, 40, 4, 6),
 )
-"""Kinect v1 (structured light), depth registered to the colour camera."""
+"""Kinect v1, Xtion, Carmine (structured light), depth registered to the colour camera."""
 
 REALSENSE = Sensor(
-    Camera(640, 480, 610.0, 610.0, 319.5, 239.5),
+    _camera(640, 480, 610.0),
     nearest_m=0.2,
     step=0.0005,
     noise=0.0023,
@@ -98,264 +106,215 @@ REALSENSE = Sensor(
 )
 """Intel D435 (active stereo, the left infrared camera), its spatial filter switched on."""
 
-SENSORS: dict[Literal["ideal", "kinect", "realsense"], Sensor] = {
-    "ideal": IDEAL,
+_KINECT_V2 = Sensor(
+    _camera(512, 424, 365.0),
+    nearest_m=0.5,
+    farthest_m=4.5,
+    noise_m=0.0018,
+    grain=(3, 3),
+    wave=0.002,
+    wave_px=100,
+    ragged_px=0.5,
+    ragged_window=(2, 2),
+    grazing=0.1,
+    dark=0.3,
+    holes=0.001,
+    blend_px=3,
+    rounded_px=7,
+)
+"""Kinect v2 (time of flight): Wasenmüller and Stricker, Comparison of Kinect v1 and v2, 2016."""
+
+_AZURE_KINECT = Sensor(
+    _camera(640, 576, 504.0),
+    nearest_m=0.45,
+    noise_m=0.0013,
+    grain=(3, 3),
+    wave=0.0015,
+    wave_px=120,
+    ragged_px=0.5,
+    ragged_window=(2, 2),
+    grazing=0.12,
+    dark=0.35,
+    holes=0.001,
+    blend_px=3,
+    rounded_px=5,
+    border_px=(24, 24, 8, 8),
+)
+"""Azure Kinect (time of flight, narrow view): Tölgyessy et al., Evaluation of the Azure Kinect and
+its comparison to Kinect v1 and v2, 2021."""
+
+_D415 = Sensor(
+    _camera(848, 480, 615.0),
+    nearest_m=0.3,
+    step=0.0009,
+    noise=0.0020,
+    grain=(13, 7),
+    wave=0.006,
+    wave_px=110,
+    ragged_px=1.2,
+    ragged_window=(7, 7),
+    shadow_m=(0.055,),
+    filled_px=2.0,
+    grazing=0.15,
+    dark=0.2,
+    holes=0.002,
+    blend_px=5,
+    rounded_px=7,
+    border_px=(14, 0, 0, 0),
+)
+"""Intel D415: .06 px of 615 px and 55 mm; Grunnet-Jepsen et al., Best-known methods for tuning
+D400 depth cameras, 2018."""
+
+_D435 = Sensor(
+    _camera(848, 480, 425.0),
+    nearest_m=0.2,
+    step=0.0015,
+    noise=0.0035,
+    grain=(11, 7),
+    wave=0.009,
+    wave_px=90,
+    ragged_px=1.3,
+    ragged_window=(7, 7),
+    shadow_m=(0.05,),
+    filled_px=2.0,
+    grazing=0.15,
+    dark=0.2,
+    holes=0.003,
+    blend_px=5,
+    rounded_px=7,
+    border_px=(12, 0, 0, 0),
+)
+"""Intel D435 as it comes, unfiltered: .08 px of 425 px and 50 mm; source as of the D415."""
+
+_D455 = Sensor(
+    _camera(1280, 720, 640.0),
+    nearest_m=0.4,
+    step=0.0005,
+    noise=0.0013,
+    grain=(15, 9),
+    wave=0.004,
+    wave_px=130,
+    ragged_px=1.6,
+    ragged_window=(9, 9),
+    shadow_m=(0.095,),
+    filled_px=3.0,
+    grazing=0.15,
+    dark=0.2,
+    holes=0.002,
+    blend_px=7,
+    rounded_px=9,
+    border_px=(30, 0, 0, 0),
+)
+"""Intel D455: .08 px of 640 px and 95 mm; source as of the D415."""
+
+_SR300 = Sensor(
+    _camera(640, 480, 475.0),
+    nearest_m=0.2,
+    farthest_m=1.5,
+    step=0.0005,
+    noise=0.003,
+    grain=(3, 3),
+    wave=0.005,
+    wave_px=100,
+    ragged_px=0.6,
+    ragged_window=(2, 2),
+    shadow_m=(0.026,),
+    filled_px=1.0,
+    grazing=0.3,
+    dark=0.6,
+    holes=0.002,
+    blend_px=3,
+    border_px=(4, 4, 0, 0),
+)
+"""Intel F200, SR300 (coded light): Carfagni et al., On the performance of the Intel SR300 depth
+camera, 2017."""
+
+_L515 = Sensor(
+    _camera(640, 480, 460.0),
+    nearest_m=0.25,
+    noise_m=0.0025,
+    grain=(2, 2),
+    wave=0.001,
+    wave_px=140,
+    ragged_px=0.4,
+    ragged_window=(2, 2),
+    grazing=0.12,
+    dark=0.5,
+    holes=0.001,
+    blend_px=3,
+    rounded_px=3,
+)
+"""Intel L515 (scanned laser, time of flight): Servi et al., Metrological characterization and
+comparison of D415, D455, L515, 2021."""
+
+_PHONE = Sensor(
+    _camera(256, 192, 212.0),
+    nearest_m=0.25,
+    noise_m=0.0025,
+    grain=(5, 5),
+    wave=0.004,
+    wave_px=50,
+    ragged_px=0.8,
+    ragged_window=(3, 3),
+    blend_px=3,
+    rounded_px=5,
+)
+"""Lidar of a phone, densified to 256 by 192 with the colour image, without holes: Luetzenburg et
+al., Evaluation of the Apple iPhone 12 Pro LiDAR, 2021."""
+
+PRESETS = {
     "kinect": KINECT,
     "realsense": REALSENSE,
+    "kinect-v2": _KINECT_V2,
+    "azure-kinect": _AZURE_KINECT,
+    "d415": _D415,
+    "d435": _D435,
+    "d455": _D455,
+    "sr300": _SR300,
+    "l515": _L515,
+    "phone": _PHONE,
 }
-"""The sensors by name."""
+"""Real depth cameras by name."""
+
+SENSORS = {"ideal": IDEAL, **PRESETS}
+"""All sensors by name."""
 
 
-def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
-    """Report a rendered image as a depth camera does.
+def between(first: Sensor, second: Sensor, share: float) -> Sensor:
+    """Return a sensor with the first one's camera, whose faults are partly the second one's.
 
-    Parameters
-    ----------
-    image : what the sensor's camera, or a part of it, truly sees.
-
-    Returns
-    -------
-    depth : (h, w) float32 metres, 0 where there is no reading.
-    owners : (h, w) int16, the thing each reading belongs to, -1 where there is none.
+    ``share`` is 0 for the first one's own faults and 1 for those of the second.
     """
-    inverse, owners, cosine = _displaced(image, sensor, rng)
-    lost = np.zeros(image.inverse.shape, np.bool_)
-    for place in sensor.shadow_m:
-        _cast_shadow(inverse, place * sensor.camera.fx, lost)
-    if sensor.filled_px > 0:
-        middle = round(sensor.filled_px)
-        eaten = rng.integers(middle - 1, middle + 2, (inverse.shape[0] // 3 + 1, 16), np.int8)
-        _fill_shadow(inverse, owners, lost, eaten)
-    _lose_grazing(cosine, sensor, rng, lost)
-    _punch_holes(sensor, rng, lost)
-    _lose_border(sensor, lost)
-    if sensor.blend_px:
-        inverse = _blended(inverse, sensor.blend_px)
-    depth = np.zeros(inverse.shape, np.float32)
-    error = _error(inverse.shape, sensor, rng)
-    limits = np.array([sensor.step, sensor.nearest_m, sensor.farthest_m])
-    _read_out(inverse, error, lost, limits, depth, owners)
-    return depth, owners
+    mixed = {
+        field.name: _mixed(getattr(first, field.name), getattr(second, field.name), share)
+        for field in fields(Sensor)
+        if field.name not in {"camera", "device", "shadow_m", "border_px"}
+    }
+    return replace(first, **mixed)
 
 
-def _displaced(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4]:
-    """Look up the true image at places a little beside: ragged outlines (Barron and Malik 2013)."""
-    inverse = np.array(image.inverse)
-    owners, cosine = np.array(image.owners), np.array(image.cosine)
-    if sensor.ragged_px > 0:
-        across = _grain(inverse.shape, sensor.ragged_window, sensor.ragged_px, rng)
-        down = _grain(inverse.shape, sensor.ragged_window, sensor.ragged_px, rng)
-        _look_beside(
-            image.inverse, image.owners, image.cosine, across, down, inverse, owners, cosine
-        )
-    return inverse, owners, cosine
+def _mixed(first: Any, second: Any, share: float) -> Any:
+    mean = (1 - share) * np.asarray(first, float) + share * np.asarray(second, float)
+    if isinstance(first, tuple):
+        return tuple(np.rint(mean).astype(int).tolist())
+    return type(first)(round(float(mean)) if isinstance(first, int) else float(mean))
 
 
-def _grain(shape: tuple[int, int], window: tuple[int, int], deviation: float, rng: Generator) -> F4:
-    """Return nearly normal noise that is alike in a window (across, down).
-
-    Sums of bytes: many times faster than normal numbers.
-    """
-    wide, tall = window
-    raw = rng.integers(0, 256, (shape[0] + tall - 1, shape[1] + wide - 1), np.uint8)
-    result = np.zeros(shape, np.float32)
-    _box_sum(raw, wide, tall, result)
-    byte = np.sqrt((256**2 - 1) / 12)
-    result -= np.float32(127.5 * wide * tall)
-    result *= np.float32(deviation / (byte * np.sqrt(wide * tall)))
-    return result
-
-
-def _error(shape: tuple[int, int], sensor: Sensor, rng: Generator) -> F4:
-    """Return the error of the inverse depth before it is quantised."""
-    if sensor.noise <= 0:
-        return np.zeros(shape, np.float32)
-    error = _grain(shape, sensor.grain, sensor.noise, rng)
-    if sensor.wave > 0:
-        error += _wave(shape, sensor.wave, sensor.wave_px)
-    return error
+def resized(sensor: Sensor, scale: float) -> Sensor:
+    """Return a sensor with more or fewer pixels in the same field of view."""
+    camera = sensor.camera
+    middle = [(c + 0.5) * scale - 0.5 for c in (camera.cx, camera.cy)]
+    focal = camera.fx * scale, camera.fy * scale
+    return replace(
+        sensor,
+        camera=Camera(round(camera.width * scale), round(camera.height * scale), *focal, *middle),
+        grain=_scaled(sensor.grain, scale),
+        ragged_window=_scaled(sensor.ragged_window, scale),
+        ragged_px=sensor.ragged_px * scale,
+        wave_px=max(round(sensor.wave_px * scale), 2),
+        filled_px=sensor.filled_px * scale,
+    )
 
 
-@lru_cache(maxsize=8)
-def _wave(shape: tuple[int, int], deviation: float, spacing: int) -> F4:
-    """Return the fixed error of a device: smooth, the same in every image."""
-    knots = (shape[0] // spacing + 2, shape[1] // spacing + 2)
-    heights = np.random.default_rng(1).normal(0, 1.5 * deviation, knots)
-    result = np.zeros(shape, np.float32)
-    _interpolate(heights, spacing, result)
-    return result
-
-
-def _lose_grazing(cosine: F4, sensor: Sensor, rng: Generator, lost: Bool) -> None:
-    """Lose readings where the ray grazes the surface."""
-    if sensor.grazing > 0:
-        luck = _grain(cosine.shape, (3, 3), 0.5 * sensor.grazing, rng)
-        lost |= cosine < luck + np.float32(sensor.grazing)
-
-
-def _lose_border(sensor: Sensor, lost: Bool) -> None:
-    left, right, top, bottom = sensor.border_px
-    lost[:top] = True
-    lost[len(lost) - bottom :] = True
-    lost[:, :left] = True
-    lost[:, lost.shape[1] - right :] = True
-
-
-def _punch_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
-    """Lose readings in small holes anywhere."""
-    count = rng.poisson(sensor.holes * lost.size / 8) if sensor.holes > 0 else 0
-    rows = rng.integers(0, lost.shape[0], count)
-    columns = rng.integers(0, lost.shape[1], count)
-    sizes = rng.integers(1, 5, (count, 2))
-    for v, u, (tall, wide) in zip(rows, columns, sizes, strict=True):
-        lost[v : v + tall, u : u + wide] = True
-
-
-def _blended(inverse: F8, width: int) -> F8:
-    """Mix near and far across outlines, as stereo windows and smoothing filters do."""
-    result = np.zeros_like(inverse)
-    _blend(inverse, width // 2, result)
-    return result
-
-
-@kernel
-def _read_out(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, owners: I4) -> None:
-    step, nearest, farthest = limits
-    for v in range(inverse.shape[0]):
-        for u in range(inverse.shape[1]):
-            if not lost[v, u] and inverse[v, u] > 0:
-                w = inverse[v, u] + error[v, u]
-                if step > 0:
-                    w = np.floor(w / step + 0.5) * step
-                if w > 0:
-                    z = 1.0 / w
-                    if nearest <= z <= farthest:
-                        depth[v, u] = z
-            if depth[v, u] == 0:
-                owners[v, u] = -1
-
-
-@kernel
-def _look_beside(
-    inverse: F8, owners: I4, cosine: F4, across: F4, down: F4, out: F8, who: I4, angle: F4
-) -> None:
-    height, width = inverse.shape
-    for v in range(height):
-        for u in range(width):
-            x, y = int(np.floor(u + across[v, u] + 0.5)), int(np.floor(v + down[v, u] + 0.5))
-            x, y = min(max(x, 0), width - 1), min(max(y, 0), height - 1)
-            there, here = inverse[y, x], inverse[v, u]
-            # Only outlines move: on a surface the true depth of the pixel itself is reported.
-            if abs(there - here) < 0.03 and owners[y, x] == owners[v, u]:
-                x, y = u, v
-            out[v, u] = inverse[y, x]
-            who[v, u] = owners[y, x]
-            angle[v, u] = cosine[y, x]
-
-
-@kernel
-def _box_sum(raw: U1, wide: int, tall: int, out: F4) -> None:
-    height, width = out.shape
-    column = np.zeros(raw.shape[1], np.float32)
-    for v in range(height):
-        for u in range(column.size):
-            column[u] = raw[v, u]
-        for k in range(1, tall):
-            for u in range(column.size):
-                column[u] += raw[v + k, u]
-        for u in range(width):
-            out[v, u] = column[u]
-        for k in range(1, wide):
-            for u in range(width):
-                out[v, u] += column[u + k]
-
-
-@kernel
-def _interpolate(knots: F8, spacing: int, out: F4) -> None:
-    height, width = out.shape
-    for v in range(height):
-        i = v // spacing
-        t = (v - i * spacing) / spacing
-        for u in range(width):
-            j = u // spacing
-            s = (u - j * spacing) / spacing
-            low = knots[i, j] + s * (knots[i, j + 1] - knots[i, j])
-            high = knots[i + 1, j] + s * (knots[i + 1, j + 1] - knots[i + 1, j])
-            out[v, u] = low + t * (high - low)
-
-
-@kernel
-def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
-    """Mark what is hidden from a place beside the camera, at ``shift`` / focal length metres."""
-    height, width = inverse.shape
-    margin = int(abs(shift) * 5) + 2
-    nearest = np.zeros(width + 2 * margin)
-    for v in range(height):
-        nearest[:] = 0.0
-        for u in range(width):
-            w = inverse[v, u]
-            x = u - shift * w
-            start = int(np.floor(x + 0.5))
-            end = start
-            if u + 1 < width and abs(inverse[v, u + 1] - w) < 0.03:  # the surface goes on
-                end = max(start, int(np.floor(u + 1 - shift * inverse[v, u + 1] + 0.5)) - 1)
-            for cell in range(start, end + 1):
-                at = cell + margin
-                if 0 <= at < nearest.size and w > nearest[at]:
-                    nearest[at] = w
-        for u in range(width):
-            w = inverse[v, u]
-            at = int(np.floor(u - shift * w + 0.5)) + margin
-            if 0 <= at < nearest.size and nearest[at] > w + 0.03:
-                shadow[v, u] = True
-
-
-@kernel
-def _fill_shadow(inverse: F8, owners: I4, shadow: Bool, eaten: I4) -> None:
-    """Let the nearer side of each shadow grow into it: windows see the outline too early."""
-    height, width = inverse.shape
-    for v in range(height):
-        u = 0
-        while u < width:
-            if not shadow[v, u]:
-                u += 1
-                continue
-            end = u
-            while end < width and shadow[v, end]:
-                end += 1
-            grow = eaten[v // 3, (u // 8) % eaten.shape[1]]
-            before = inverse[v, u - 1] if u > 0 else 0.0
-            after = inverse[v, end] if end < width else 0.0
-            if before > after:
-                for k in range(u, min(u + grow, end)):
-                    inverse[v, k], owners[v, k] = before, owners[v, u - 1]
-                    shadow[v, k] = False
-            elif after > 0:
-                for k in range(max(end - grow, u), end):
-                    inverse[v, k], owners[v, k] = after, owners[v, end]
-                    shadow[v, k] = False
-            u = end
-
-
-@kernel
-def _blend(inverse: F8, reach: int, out: F8) -> None:
-    height, width = inverse.shape
-    for v in range(height):
-        for u in range(width):
-            here = inverse[v, u]
-            out[v, u] = here
-            if not (reach <= u < width - reach and reach <= v < height - reach) or here <= 0:
-                continue
-            edge = False
-            for k in range(1, reach + 1):
-                edge = edge or abs(inverse[v, u - k] - here) > 0.03
-                edge = edge or abs(inverse[v, u + k] - here) > 0.03
-            if not edge:
-                continue
-            total, count = 0.0, 0
-            for y in range(v - reach, v + reach + 1):
-                for x in range(u - reach, u + reach + 1):
-                    if inverse[y, x] > 0:
-                        total += inverse[y, x]
-                        count += 1
-            out[v, u] = total / count
+def _scaled(window: tuple[int, int], scale: float) -> tuple[int, int]:
+    return max(round(window[0] * scale), 1), max(round(window[1] * scale), 1)

@@ -4,8 +4,9 @@ import numpy as np
 from numpy.random import Generator
 
 from shapecat.arrays import U1
+from shapecat.simulation.measuring import measure
 from shapecat.simulation.render import render
-from shapecat.simulation.sensors import KINECT, Sensor, measure
+from shapecat.simulation.sensors import KINECT, Sensor
 from shapecat.simulation.worlds import World
 from shapecat.types import Frame, Pose
 

@@ -1,0 +1,114 @@
+"""How alike simulated sensors and real ones are: rough planes, wide edges, holes.
+
+    python -m benchmarks.sensors --real RECORDING --real RECORDING
+
+One line for each simulated sensor, on piles, and one for each folder of real recordings.
+"""
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.measure import markdown
+from shapecat import open_recording
+from shapecat.simulation import make_scene, render_frame
+from shapecat.simulation.sensors import PRESETS
+
+Array = NDArray[Any]
+WINDOWS = {"roughness": 16, "warp": 96}
+"""Width in pixels of an image 640 pixels wide: within the one noise shows, within the other what
+bends."""
+QUIETEST = 0.25
+"""Windows on planes are the quietest quarter; the others have objects in them."""
+JUMP_M, EDGE_PX = 0.06, 12
+"""Edges are steps of this height within so many pixels."""
+HEAD = ("sensor", "frames", "distance, m", "roughness, 1/m", "warp, 1/m", "edge, px", "holes")
+
+
+class Figures(NamedTuple):
+    """Of one frame: median distance in metres, errors of planes in 1/m, pixels, a share."""
+
+    distance: float
+    roughness: float
+    warp: float
+    edge: float
+    holes: float
+
+
+def measure_frame(depth: Array) -> Figures:
+    """Measure a depth image (h, w) in metres, 0 where there is no reading."""
+    scale = depth.shape[1] / 640
+    inverse = np.divide(1.0, depth, where=depth > 0, out=np.zeros(depth.shape))
+    errors = [_roughness(inverse, max(round(w * scale), 6)) for w in WINDOWS.values()]
+    edge = _edge_width(depth, max(round(EDGE_PX * scale), 4)) / scale
+    seen = depth > 0
+    rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
+    inside = seen[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return Figures(float(np.median(depth[seen])), *errors, edge, float(1 - inside.mean()))
+
+
+def _roughness(inverse: Array, width: int) -> float:
+    """Return the deviation from planes, which are linear in inverse depth, in quiet windows."""
+    v, u = np.mgrid[:width, :width].reshape(2, -1) - width / 2
+    design = np.column_stack([u, v, np.ones(width * width)])
+    project = np.linalg.pinv(design)
+    found = []
+    for top in range(0, inverse.shape[0] - width, width):
+        for left in range(0, inverse.shape[1] - width, width):
+            part = inverse[top : top + width, left : left + width].ravel()
+            if (part > 0).mean() > 0.99:
+                part = np.where(part > 0, part, np.median(part))
+                found.append(float((part - design @ (project @ part)).std()))
+    return float(np.quantile(found, QUIETEST)) if found else float("nan")
+
+
+def _edge_width(depth: Array, width: int) -> float:
+    """Return how many pixels of a row lie between the two sides of a step, on average."""
+    near, far = depth[:, : -width - 1], depth[:, width + 1 :]
+    step = (near > 0) & (far > 0) & (np.abs(far - near) > JUMP_M)
+    between = np.zeros(step.shape, np.int64)
+    for k in range(1, width + 1):
+        middle = depth[:, k : k + near.shape[1]]
+        off = np.minimum(np.abs(middle - near), np.abs(middle - far)) > JUMP_M / 4
+        between += off & (middle > 0)
+    return float(between[step].mean()) if step.any() else float("nan")
+
+
+def _simulated(name: str, first: int, count: int) -> Iterator[Figures]:
+    for seed in range(first, first + count):
+        rng = np.random.default_rng(seed)
+        world = make_scene("pile", rng, frames=1)
+        frame, _ = render_frame(world, 0, rng=rng, sensor=PRESETS[name])
+        yield measure_frame(np.asarray(frame.depth, np.float64))
+
+
+def _recorded(folder: Path) -> Iterator[Figures]:
+    for path in sorted(folder.rglob("*.mcap")):
+        with open_recording(path) as recording:
+            for frame in recording.frames():
+                if frame.depth is not None:
+                    yield measure_frame(np.asarray(frame.depth, np.float64))
+
+
+def _row(name: str, figures: list[Figures]) -> tuple[Any, ...]:
+    middle = np.nanmedian(np.array(figures), axis=0)
+    return (name, len(figures), *(f"{value:.2g}" for value in middle))
+
+
+@click.command()
+@click.option("--first", default=3000, show_default=True, help="Seed of the first scene.")
+@click.option("--count", default=10, show_default=True, help="Scenes per sensor.")
+@click.option("--real", multiple=True, type=click.Path(path_type=Path), help="Folder. Repeatable.")
+def main(first: int, count: int, real: tuple[Path, ...]) -> None:
+    """Measure simulated and real depth images, and print a table."""
+    rows = [_row(name, list(_simulated(name, first, count))) for name in PRESETS]
+    rows += [_row(folder.name, list(_recorded(folder))) for folder in real]
+    click.echo(markdown("Depth images, medians over frames", HEAD, rows))
+
+
+if __name__ == "__main__":
+    main()

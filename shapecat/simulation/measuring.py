@@ -1,0 +1,309 @@
+"""From true depth to what a depth camera reports."""
+
+from functools import lru_cache
+
+import numpy as np
+from numpy.random import Generator
+
+from shapecat.arrays import F4, F8, I4, U1, Bool
+from shapecat.jit import kernel
+from shapecat.simulation.render import Image
+from shapecat.simulation.sensors import Sensor
+
+__all__ = ["measure"]
+
+
+def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
+    """Report a rendered image as a depth camera does.
+
+    Parameters
+    ----------
+    image : what the sensor's camera, or a part of it, truly sees.
+
+    Returns
+    -------
+    depth : (h, w) float32 metres, 0 where there is no reading.
+    owners : (h, w) int16, the thing each reading belongs to, -1 where there is none.
+    """
+    inverse, owners, cosine = _displaced(image, sensor, rng)
+    lost = np.zeros(image.inverse.shape, np.bool_)
+    for place in sensor.shadow_m:
+        _cast_shadow(inverse, place * sensor.camera.fx, lost)
+    if sensor.filled_px > 0:
+        middle = round(sensor.filled_px)
+        eaten = rng.integers(middle - 1, middle + 2, (inverse.shape[0] // 3 + 1, 16), np.int8)
+        _fill_shadow(inverse, owners, lost, eaten)
+    _lose_grazing(_returned(cosine, owners, sensor), sensor, rng, lost)
+    _punch_holes(sensor, rng, lost)
+    _lose_border(sensor, lost)
+    if sensor.rounded_px:
+        inverse = _rounded(inverse, sensor.rounded_px)
+    if sensor.blend_px:
+        inverse = _blended(inverse, sensor.blend_px)
+    depth = np.zeros(inverse.shape, np.float32)
+    error = _error(inverse, sensor, rng)
+    limits = np.array([sensor.step, sensor.nearest_m, sensor.farthest_m])
+    _read_out(inverse, error, lost, limits, depth, owners)
+    return depth, owners
+
+
+def _displaced(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4]:
+    """Look up the true image at places a little beside: ragged outlines (Barron and Malik 2013)."""
+    inverse = np.array(image.inverse)
+    owners, cosine = np.array(image.owners), np.array(image.cosine)
+    if sensor.ragged_px > 0:
+        across = _grain(inverse.shape, sensor.ragged_window, sensor.ragged_px, rng)
+        down = _grain(inverse.shape, sensor.ragged_window, sensor.ragged_px, rng)
+        _look_beside(
+            image.inverse, image.owners, image.cosine, across, down, inverse, owners, cosine
+        )
+    return inverse, owners, cosine
+
+
+def _grain(shape: tuple[int, int], window: tuple[int, int], deviation: float, rng: Generator) -> F4:
+    """Return nearly normal noise that is alike in a window (across, down).
+
+    Sums of bytes: many times faster than normal numbers.
+    """
+    wide, tall = window
+    raw = rng.integers(0, 256, (shape[0] + tall - 1, shape[1] + wide - 1), np.uint8)
+    result = np.zeros(shape, np.float32)
+    _box_sum(raw, wide, tall, result)
+    byte = np.sqrt((256**2 - 1) / 12)
+    result -= np.float32(127.5 * wide * tall)
+    result *= np.float32(deviation / (byte * np.sqrt(wide * tall)))
+    return result
+
+
+def _error(inverse: F8, sensor: Sensor, rng: Generator) -> F4:
+    """Return the error of the inverse depth before it is quantised."""
+    error = np.zeros(inverse.shape, np.float32)
+    if sensor.noise > 0:
+        error += _grain(inverse.shape, sensor.grain, sensor.noise, rng)
+    if sensor.noise_m > 0:
+        in_metres = _grain(inverse.shape, sensor.grain, sensor.noise_m, rng)
+        error += in_metres * (inverse * inverse).astype(np.float32)
+    if sensor.wave > 0:
+        error += _wave(inverse.shape, sensor.wave, sensor.wave_px, sensor.device)
+    return error
+
+
+@lru_cache(maxsize=8)
+def _wave(shape: tuple[int, int], deviation: float, spacing: int, device: int) -> F4:
+    """Return the fixed error of a device: smooth, the same in every image."""
+    knots = (shape[0] // spacing + 2, shape[1] // spacing + 2)
+    heights = np.random.default_rng(device).normal(0, 1.5 * deviation, knots)
+    result = np.zeros(shape, np.float32)
+    _interpolate(heights, spacing, result)
+    return result
+
+
+def _returned(cosine: F4, owners: I4, sensor: Sensor) -> F4:
+    """Return the cosines, as if what returns less light were seen under a smaller angle."""
+    if sensor.dark <= 0 or owners.max(initial=-1) < 0:
+        return cosine
+    draws = np.random.default_rng((sensor.device, 2)).normal(0, sensor.dark, owners.max() + 1)
+    light = np.append(np.exp(draws), 1.0).astype(np.float32)
+    return cosine * light[owners]
+
+
+def _lose_grazing(cosine: F4, sensor: Sensor, rng: Generator, lost: Bool) -> None:
+    """Lose readings where the ray grazes the surface."""
+    if sensor.grazing > 0:
+        luck = _grain(cosine.shape, (3, 3), 0.5 * sensor.grazing, rng)
+        lost |= cosine < luck + np.float32(sensor.grazing)
+
+
+def _lose_border(sensor: Sensor, lost: Bool) -> None:
+    left, right, top, bottom = sensor.border_px
+    lost[:top] = True
+    lost[len(lost) - bottom :] = True
+    lost[:, :left] = True
+    lost[:, lost.shape[1] - right :] = True
+
+
+def _punch_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
+    """Lose readings in small holes anywhere."""
+    count = rng.poisson(sensor.holes * lost.size / 8) if sensor.holes > 0 else 0
+    rows = rng.integers(0, lost.shape[0], count)
+    columns = rng.integers(0, lost.shape[1], count)
+    sizes = rng.integers(1, 5, (count, 2))
+    for v, u, (tall, wide) in zip(rows, columns, sizes, strict=True):
+        lost[v : v + tall, u : u + wide] = True
+
+
+def _rounded(inverse: F8, width: int) -> F8:
+    """Average over a window what is of one surface, so that its edges and corners are round."""
+    across, both = np.zeros_like(inverse), np.zeros_like(inverse)
+    _smooth(inverse, width // 2, across)
+    _smooth(np.ascontiguousarray(across.T), width // 2, both.T)
+    return both
+
+
+def _blended(inverse: F8, width: int) -> F8:
+    """Mix near and far across outlines, as stereo windows and smoothing filters do."""
+    result = np.zeros_like(inverse)
+    _blend(inverse, width // 2, result)
+    return result
+
+
+@kernel
+def _read_out(inverse: F8, error: F4, lost: Bool, limits: F8, depth: F4, owners: I4) -> None:
+    step, nearest, farthest = limits
+    for v in range(inverse.shape[0]):
+        for u in range(inverse.shape[1]):
+            if not lost[v, u] and inverse[v, u] > 0:
+                w = inverse[v, u] + error[v, u]
+                if step > 0:
+                    w = np.floor(w / step + 0.5) * step
+                if w > 0:
+                    z = 1.0 / w
+                    if nearest <= z <= farthest:
+                        depth[v, u] = z
+            if depth[v, u] == 0:
+                owners[v, u] = -1
+
+
+@kernel
+def _look_beside(
+    inverse: F8, owners: I4, cosine: F4, across: F4, down: F4, out: F8, who: I4, angle: F4
+) -> None:
+    height, width = inverse.shape
+    for v in range(height):
+        for u in range(width):
+            x, y = int(np.floor(u + across[v, u] + 0.5)), int(np.floor(v + down[v, u] + 0.5))
+            x, y = min(max(x, 0), width - 1), min(max(y, 0), height - 1)
+            there, here = inverse[y, x], inverse[v, u]
+            # Only outlines move: on a surface the true depth of the pixel itself is reported.
+            if abs(there - here) < 0.03 and owners[y, x] == owners[v, u]:
+                x, y = u, v
+            out[v, u] = inverse[y, x]
+            who[v, u] = owners[y, x]
+            angle[v, u] = cosine[y, x]
+
+
+@kernel
+def _box_sum(raw: U1, wide: int, tall: int, out: F4) -> None:
+    height, width = out.shape
+    column = np.zeros(raw.shape[1], np.float32)
+    for v in range(height):
+        for u in range(column.size):
+            column[u] = raw[v, u]
+        for k in range(1, tall):
+            for u in range(column.size):
+                column[u] += raw[v + k, u]
+        for u in range(width):
+            out[v, u] = column[u]
+        for k in range(1, wide):
+            for u in range(width):
+                out[v, u] += column[u + k]
+
+
+@kernel
+def _interpolate(knots: F8, spacing: int, out: F4) -> None:
+    height, width = out.shape
+    for v in range(height):
+        i = v // spacing
+        t = (v - i * spacing) / spacing
+        for u in range(width):
+            j = u // spacing
+            s = (u - j * spacing) / spacing
+            low = knots[i, j] + s * (knots[i, j + 1] - knots[i, j])
+            high = knots[i + 1, j] + s * (knots[i + 1, j + 1] - knots[i + 1, j])
+            out[v, u] = low + t * (high - low)
+
+
+@kernel
+def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
+    """Mark what is hidden from a place beside the camera, at ``shift`` / focal length metres."""
+    height, width = inverse.shape
+    margin = int(abs(shift) * 5) + 2
+    nearest = np.zeros(width + 2 * margin)
+    for v in range(height):
+        nearest[:] = 0.0
+        for u in range(width):
+            w = inverse[v, u]
+            x = u - shift * w
+            start = int(np.floor(x + 0.5))
+            end = start
+            if u + 1 < width and abs(inverse[v, u + 1] - w) < 0.03:  # the surface goes on
+                end = max(start, int(np.floor(u + 1 - shift * inverse[v, u + 1] + 0.5)) - 1)
+            for cell in range(start, end + 1):
+                at = cell + margin
+                if 0 <= at < nearest.size and w > nearest[at]:
+                    nearest[at] = w
+        for u in range(width):
+            w = inverse[v, u]
+            at = int(np.floor(u - shift * w + 0.5)) + margin
+            if 0 <= at < nearest.size and nearest[at] > w + 0.03:
+                shadow[v, u] = True
+
+
+@kernel
+def _fill_shadow(inverse: F8, owners: I4, shadow: Bool, eaten: I4) -> None:
+    """Let the nearer side of each shadow grow into it: windows see the outline too early."""
+    height, width = inverse.shape
+    for v in range(height):
+        u = 0
+        while u < width:
+            if not shadow[v, u]:
+                u += 1
+                continue
+            end = u
+            while end < width and shadow[v, end]:
+                end += 1
+            grow = eaten[v // 3, (u // 8) % eaten.shape[1]]
+            before = inverse[v, u - 1] if u > 0 else 0.0
+            after = inverse[v, end] if end < width else 0.0
+            if before > after:
+                for k in range(u, min(u + grow, end)):
+                    inverse[v, k], owners[v, k] = before, owners[v, u - 1]
+                    shadow[v, k] = False
+            elif after > 0:
+                for k in range(max(end - grow, u), end):
+                    inverse[v, k], owners[v, k] = after, owners[v, end]
+                    shadow[v, k] = False
+            u = end
+
+
+@kernel
+def _blend(inverse: F8, reach: int, out: F8) -> None:
+    height, width = inverse.shape
+    for v in range(height):
+        for u in range(width):
+            here = inverse[v, u]
+            out[v, u] = here
+            if not (reach <= u < width - reach and reach <= v < height - reach) or here <= 0:
+                continue
+            edge = False
+            for k in range(1, reach + 1):
+                edge = edge or abs(inverse[v, u - k] - here) > 0.03
+                edge = edge or abs(inverse[v, u + k] - here) > 0.03
+            if not edge:
+                continue
+            total, count = 0.0, 0
+            for y in range(v - reach, v + reach + 1):
+                for x in range(u - reach, u + reach + 1):
+                    if inverse[y, x] > 0:
+                        total += inverse[y, x]
+                        count += 1
+            out[v, u] = total / count
+
+
+@kernel
+def _smooth(inverse: F8, reach: int, out: F8) -> None:
+    """Average along rows, as far as no step is met on the way."""
+    height, width = inverse.shape
+    for v in range(height):
+        for u in range(width):
+            total, count = inverse[v, u], 1
+            for way in (-1, 1):
+                last = inverse[v, u]
+                for k in range(1, reach + 1):
+                    x = u + way * k
+                    if not 0 <= x < width or abs(inverse[v, x] - last) >= 0.03:
+                        break
+                    last = inverse[v, x]
+                    total += last
+                    count += 1
+            out[v, u] = total / count
