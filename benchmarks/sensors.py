@@ -48,7 +48,8 @@ def measure_frame(depth: Array) -> Figures:
     seen = depth > 0
     rows, columns = np.flatnonzero(seen.any(axis=1)), np.flatnonzero(seen.any(axis=0))
     inside = seen[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    return Figures(float(np.median(depth[seen])), *errors, edge, float(1 - inside.mean()))
+    distance, holes = float(np.median(depth[seen])), float(1 - inside.mean())
+    return Figures(distance, errors[0], errors[1], edge, holes)
 
 
 def _roughness(inverse: Array, width: int) -> float:
