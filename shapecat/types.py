@@ -7,7 +7,6 @@ camera's is the optical frame (x right, y down, z forward).
 
 from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -207,13 +206,6 @@ class NeuralGas(Record):
 
     neurons: F4 = array("k 3", "f4")
     edges: U2 = array("m 2", "u2")
-
-    @cached_property
-    def triangles(self) -> U2:
-        """(t, 3) the triangles of the graph, for display: each i < j < k once."""
-        from shapecat.triangles import triangles_of  # noqa: PLC0415  # loads numba
-
-        return np.asarray(triangles_of(self.edges, len(self.neurons)))
 
 
 class Detection(Record):

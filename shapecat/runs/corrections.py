@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from shapecat.errors import OutputError
-from shapecat.files import replacing
 from shapecat.runs.folder import read_run
 from shapecat.runs.track_table import (
     TrackRow,
@@ -23,6 +22,7 @@ from shapecat.runs.track_table import (
     with_label,
     write_track_table,
 )
+from shapecat.system.files import replacing
 from shapecat.types import CATEGORIES
 
 __all__ = [

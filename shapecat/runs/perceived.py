@@ -12,7 +12,6 @@ import numpy as np
 import pyarrow as pa
 
 from shapecat.arrays import F4
-from shapecat.files import complete_folder, replacing
 from shapecat.runs.segments import (
     GROUP_FRAMES,
     PERCEIVED,
@@ -24,6 +23,7 @@ from shapecat.runs.segments import (
     write_segment,
 )
 from shapecat.runs.tables import SCHEMA_VERSION, arrow_table, lists, open_writer
+from shapecat.system.files import complete_folder, replacing
 from shapecat.types import Perception, Pose
 
 __all__ = ["FrameRow", "PerceptionTables"]

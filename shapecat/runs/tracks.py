@@ -12,9 +12,9 @@ import pyarrow.compute
 from scipy.spatial.transform import Rotation
 
 from shapecat.config import TrackingSettings
-from shapecat.files import replacing
 from shapecat.runs.full_boxes import FullBoxes, full_columns
 from shapecat.runs.tables import TRACKS, frame_rows, lists, numbers, read_row_groups, write_table
+from shapecat.system.files import replacing
 from shapecat.tracking import FrameDetections, Track, track_recording
 
 __all__ = ["track_run"]
