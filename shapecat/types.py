@@ -15,6 +15,7 @@ from shapecat.arrays import F4, F8, U2, U4, Record, array
 
 __all__ = [
     "CATEGORIES",
+    "UNKNOWN",
     "Box",
     "Camera",
     "Candidate",
@@ -35,6 +36,8 @@ __all__ = [
 
 CATEGORIES = ("cup", "can", "box", "bottle", "bowl", "plate", "ball")
 """The shape categories of the default model, in the order of every posterior."""
+UNKNOWN = "unknown"
+"""Category of an object that is of none of the model's; label and folder of shapes of none."""
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from shapecat.runs.track_table import (
     write_track_table,
 )
 from shapecat.system.files import replacing
-from shapecat.types import CATEGORIES
+from shapecat.types import CATEGORIES, UNKNOWN
 
 __all__ = [
     "PREVIOUS",
@@ -37,7 +37,6 @@ __all__ = [
     "relabel",
 ]
 
-UNKNOWN = "unknown"
 DELETE = "delete"
 ORIGINAL = "tracks.original.csv"
 PREVIOUS = "tracks.previous.csv"
