@@ -5,9 +5,8 @@ Transforms are named ``a_from_b``. "Sensor frame" is the frame named by ``frame_
 camera's is the optical frame (x right, y down, z forward).
 """
 
-from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,7 +29,6 @@ __all__ = [
     "Pose",
     "Scene",
     "ShownBox",
-    "ShownBoxes",
     "ShownFrame",
 ]
 
@@ -300,42 +298,6 @@ class ShownBox(NamedTuple):
     orientation: tuple[float, float, float, float]
 
 
-class ShownBoxes(Collection[ShownBox]):
-    """The boxes of a frame in columns: quick to make by the thousand.
-
-    Attributes
-    ----------
-    labels : the track, the category and the confidence of each box.
-    places : (n, 10) centre, size and orientation of each.
-    """
-
-    __slots__ = ("labels", "places")
-
-    def __init__(self, labels: tuple[tuple[int, str, float], ...], places: F8) -> None:
-        """Hold the columns as they are."""
-        self.labels, self.places = labels, places
-
-    @classmethod
-    def of(cls, boxes: Iterable[ShownBox]) -> Self:
-        """Take boxes apart."""
-        boxes = list(boxes)
-        places = [(*box.center, *box.size, *box.orientation) for box in boxes]
-        return cls(tuple(box[:3] for box in boxes), np.reshape(places, (-1, 10)).astype(np.float64))
-
-    def __len__(self) -> int:
-        """Return the number of boxes."""
-        return len(self.labels)
-
-    def __iter__(self) -> Iterator[ShownBox]:
-        """Yield the boxes."""
-        for label, row in zip(self.labels, self.places.tolist(), strict=True):
-            yield ShownBox(*label, tuple(row[:3]), tuple(row[3:6]), tuple(row[6:]))
-
-    def __contains__(self, box: object) -> bool:
-        """Tell whether a box is one of these."""
-        return box in tuple(self)
-
-
 @dataclass(frozen=True)
 class ShownFrame:
     """What annotation messages say of one frame; the fields are those of `LabelledFrame`."""
@@ -345,5 +307,5 @@ class ShownFrame:
     stamp_ns: int
     log_time_ns: int
     frame_id: str
-    objects: ShownBoxes
+    objects: tuple[ShownBox, ...]
     ended: tuple[int, ...]

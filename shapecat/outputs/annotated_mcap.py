@@ -175,7 +175,7 @@ def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
             periods[frame.topic] = max(1, frame.stamp_ns - last[frame.topic])
         last[frame.topic] = frame.stamp_ns
         period = periods.get(frame.topic, _PERIOD_NS)
-        here = {track for track, _, _ in frame.objects.labels}
+        here = {box.track for box in frame.objects}
         gone = (shown.get(frame.topic, set()) | set(frame.ended)) - here
         shown[frame.topic] = here
         gone -= set().union(*shown.values())  # another sensor still sees it
