@@ -39,7 +39,7 @@ def evaluate(
     """
     from shapecat.evaluation import evaluate_folder, format_report
     from shapecat.evaluation.page import write_page
-    from shapecat.files import require_writable
+    from shapecat.system.files import require_writable
 
     if page is not None:
         require_writable(page)

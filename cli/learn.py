@@ -26,7 +26,7 @@ def learn(*, model: Path, dataset: Path, out: Path, seed: int, as_json: bool) ->
     shapecat process lab.mcap --out again --model mine.npz
     """
     from shapecat.evaluation.training import learn_on_folder
-    from shapecat.files import require_writable
+    from shapecat.system.files import require_writable
 
     source = None if str(model) == "default" else model
     require_writable(out)

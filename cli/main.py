@@ -9,7 +9,7 @@ import click
 
 from shapecat import __version__
 from shapecat.errors import ShapecatError
-from shapecat.stopping import Stopped, heeding_signals
+from shapecat.system.stopping import Stopped, heeding_signals
 
 from .annotate import annotate
 from .compare import compare

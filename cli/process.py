@@ -8,7 +8,7 @@ from typing import Any
 
 import click
 
-from shapecat.stopping import Stopped
+from shapecat.system.stopping import Stopped
 
 from .options import (
     BOXES,
@@ -122,8 +122,8 @@ def process(
     from shapecat.batch import exit_code
     from shapecat.batch.plans import plan_batch
     from shapecat.config import load_settings
-    from shapecat.files import FSYNC
     from shapecat.runs.jobs import Job
+    from shapecat.system.files import FSYNC
 
     if color is not None and no_color:
         msg = "--color and --no-color contradict each other"

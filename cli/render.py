@@ -7,7 +7,7 @@ from typing import Any
 
 import click
 
-from shapecat import stopping
+from shapecat.system import stopping
 
 PHASES = {
     "simulate": "simulating",

@@ -24,7 +24,7 @@ def train(*, dataset: Path, out: Path, seed: int, as_json: bool) -> None:
     shapecat process lab.mcap --out results --model mine.npz
     """
     from shapecat.evaluation.training import train_on_folder
-    from shapecat.files import require_writable
+    from shapecat.system.files import require_writable
 
     require_writable(out)
     with progress_bars() as bars:

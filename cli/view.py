@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from shapecat import stopping
+from shapecat.system import stopping
 
 from .options import ANY_PATH
 
@@ -23,8 +23,8 @@ def view(*, run: Path, web: bool, screenshot: Path | None) -> None:
     shapecat view results/lab --web
     shapecat view results/lab --screenshot lab.png
     """
-    from shapecat.files import require_writable
     from shapecat.outputs.review_viewer import open_viewer, take_screenshot
+    from shapecat.system.files import require_writable
 
     review = run / "review.rrd" if run.is_dir() else run
     if screenshot is not None:

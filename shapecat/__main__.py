@@ -4,7 +4,7 @@ import signal
 from importlib import import_module
 from typing import Any
 
-from shapecat.stopping import leave
+from shapecat.system.stopping import leave
 
 
 def run() -> None:

@@ -11,14 +11,12 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-from shapecat import stopping
 from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import OutputError
 from shapecat.executors.order import read_ahead
 from shapecat.learning import load_model
 from shapecat.outputs.colouring import colours_of, with_colour, write_masks
 from shapecat.outputs.rereading import open_source
-from shapecat.perceiving import Observer, ignore, perceive_all, revise
 from shapecat.recordings import Recording, choose_streams, open_recording
 from shapecat.rehearsal import compile_all
 from shapecat.runs.corrections import (
@@ -50,10 +48,12 @@ from shapecat.runs.jobs import (
 )
 from shapecat.runs.label_transfer import Transfer, transfer_labels
 from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.perceiving import Observer, ignore, perceive_all, revise
 from shapecat.runs.segments import discard_segments
 from shapecat.runs.shown import read_shown_frames
 from shapecat.runs.tables import release_memory
 from shapecat.runs.tracks import track_run
+from shapecat.system import stopping
 from shapecat.types import LabelledFrame, ShownFrame
 
 __all__ = ["Observer", "annotate", "annotate_again", "process", "track"]

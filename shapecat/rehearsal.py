@@ -19,16 +19,16 @@ from pathlib import Path
 import numba
 import numpy as np
 
-from shapecat import stopping
 from shapecat.completion import complete
 from shapecat.config import Settings
 from shapecat.description import describe
 from shapecat.detection import detect
 from shapecat.executors.local import LocalExecutor, WorkerLostError
-from shapecat.files import lock
 from shapecat.jit import code_folder
 from shapecat.learning import load_model
 from shapecat.surface import reconstruct, thin
+from shapecat.system import stopping
+from shapecat.system.files import lock
 from shapecat.types import Camera, Frame
 
 __all__ = ["compile_all", "find_ball", "recognize_ball"]

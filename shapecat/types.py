@@ -5,10 +5,8 @@ Transforms are named ``a_from_b``. "Sensor frame" is the frame named by ``frame_
 camera's is the optical frame (x right, y down, z forward).
 """
 
-from collections.abc import Collection, Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 
@@ -16,6 +14,7 @@ from shapecat.arrays import F4, F8, U2, U4, Record, array
 
 __all__ = [
     "CATEGORIES",
+    "UNKNOWN",
     "Box",
     "Camera",
     "Candidate",
@@ -30,12 +29,13 @@ __all__ = [
     "Pose",
     "Scene",
     "ShownBox",
-    "ShownBoxes",
     "ShownFrame",
 ]
 
 CATEGORIES = ("cup", "can", "box", "bottle", "bowl", "plate", "ball")
 """The shape categories of the default model, in the order of every posterior."""
+UNKNOWN = "unknown"
+"""Category of an object that is of none of the model's; label and folder of shapes of none."""
 
 
 @dataclass(frozen=True)
@@ -208,13 +208,6 @@ class NeuralGas(Record):
     neurons: F4 = array("k 3", "f4")
     edges: U2 = array("m 2", "u2")
 
-    @cached_property
-    def triangles(self) -> U2:
-        """(t, 3) the triangles of the graph, for display: each i < j < k once."""
-        from shapecat.triangles import triangles_of  # noqa: PLC0415  # loads numba
-
-        return np.asarray(triangles_of(self.edges, len(self.neurons)))
-
 
 class Detection(Record):
     """One object in one frame: everything later phases need.
@@ -305,42 +298,6 @@ class ShownBox(NamedTuple):
     orientation: tuple[float, float, float, float]
 
 
-class ShownBoxes(Collection[ShownBox]):
-    """The boxes of a frame in columns: quick to make by the thousand.
-
-    Attributes
-    ----------
-    labels : the track, the category and the confidence of each box.
-    places : (n, 10) centre, size and orientation of each.
-    """
-
-    __slots__ = ("labels", "places")
-
-    def __init__(self, labels: tuple[tuple[int, str, float], ...], places: F8) -> None:
-        """Hold the columns as they are."""
-        self.labels, self.places = labels, places
-
-    @classmethod
-    def of(cls, boxes: Iterable[ShownBox]) -> Self:
-        """Take boxes apart."""
-        boxes = list(boxes)
-        places = [(*box.center, *box.size, *box.orientation) for box in boxes]
-        return cls(tuple(box[:3] for box in boxes), np.reshape(places, (-1, 10)).astype(np.float64))
-
-    def __len__(self) -> int:
-        """Return the number of boxes."""
-        return len(self.labels)
-
-    def __iter__(self) -> Iterator[ShownBox]:
-        """Yield the boxes."""
-        for label, row in zip(self.labels, self.places.tolist(), strict=True):
-            yield ShownBox(*label, tuple(row[:3]), tuple(row[3:6]), tuple(row[6:]))
-
-    def __contains__(self, box: object) -> bool:
-        """Tell whether a box is one of these."""
-        return box in tuple(self)
-
-
 @dataclass(frozen=True)
 class ShownFrame:
     """What annotation messages say of one frame; the fields are those of `LabelledFrame`."""
@@ -350,5 +307,5 @@ class ShownFrame:
     stamp_ns: int
     log_time_ns: int
     frame_id: str
-    objects: ShownBoxes
+    objects: tuple[ShownBox, ...]
     ended: tuple[int, ...]

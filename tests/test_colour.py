@@ -7,11 +7,11 @@ from typing import Any, Literal
 import numpy as np
 import pytest
 
+from shapecat.cameras.colour import LensCamera
+from shapecat.cameras.lenses import distort, undistorted_rays
 from shapecat.colour.masks import NOTHING, Mask, dense_masks, labelled_masks, united
 from shapecat.colour.projection import hidden, project, splat_depth
-from shapecat.colour_types import LensCamera
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
-from shapecat.lenses import distort, undistorted_rays
 from shapecat.types import Camera, Frame, Pose
 
 DEPTH = Camera(160, 120, 140.0, 141.0, 80.3, 58.9)

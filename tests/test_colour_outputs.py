@@ -15,9 +15,9 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 import shapecat.pipeline
+from shapecat.cameras.colour import ColourImage, ColourView
 from shapecat.colour.masks import Mask
 from shapecat.colour.rle import rle_counts, rle_mask, rle_text
-from shapecat.colour_types import ColourImage, ColourView
 from shapecat.errors import NoStreamError
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encoder_for

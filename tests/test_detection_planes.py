@@ -137,7 +137,7 @@ def test_objects_in_compartments_are_found_where_their_board_is_hardly_seen() ->
     """Without a plane below them none of these 48 objects was found."""
     found = seen = 0
     for seed in range(3002, 3008):
-        scores = judge("shelf bin", "Kinect", seed, 1, load_model(None), Settings())
+        scores = judge("shelf bin", "kinect", seed, 1, load_model(None), Settings())
         found += sum(judged.overlap >= MATCHED_F for judged in scores.objects)
         seen += len(scores.objects)
     assert seen > 40

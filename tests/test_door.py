@@ -128,7 +128,7 @@ def test_a_place_that_cannot_be_written_is_noticed_before_the_work(
 
 
 def test_missing_folders_of_a_model_are_made(tmp_path: Path) -> None:
-    from shapecat.files import require_writable  # noqa: PLC0415  beside its only use
+    from shapecat.system.files import require_writable  # noqa: PLC0415  beside its only use
 
     require_writable(tmp_path / "new" / "deep" / "mine.npz")
 

@@ -14,7 +14,8 @@ from shapecat.geometry import (
     transform,
     upright_box,
 )
-from shapecat.types import Camera, Frame, NeuralGas, Pose
+from shapecat.surface.triangles import triangles_of
+from shapecat.types import Camera, Frame, Pose
 
 number = st.floats(-1, 1, allow_subnormal=False)
 quaternion = st.lists(number, min_size=4, max_size=4).filter(lambda q: sum(x * x for x in q) > 0.01)
@@ -119,6 +120,6 @@ def test_points_without_a_reading_are_nan() -> None:
 
 
 def test_triangles_of_a_graph() -> None:
-    gas = NeuralGas(np.zeros((4, 3)), np.array([[0, 1], [0, 2], [1, 2], [2, 3]]))
+    edges = np.array([[0, 1], [0, 2], [1, 2], [2, 3]], np.uint16)
 
-    assert gas.triangles.tolist() == [[0, 1, 2]]
+    assert triangles_of(edges, 4).tolist() == [[0, 1, 2]]

@@ -21,7 +21,6 @@ from shapecat.learning.forest import FlatForest, flatten
 from shapecat.learning.incremental import add_categories
 from shapecat.learning.pnn import ProbabilisticNeuralNetwork
 from shapecat.learning.training import (
-    UNKNOWN,
     Examples,
     LearningSettings,
     choose_evenly,
@@ -29,6 +28,7 @@ from shapecat.learning.training import (
     fit_categorizer,
     make_chain,
 )
+from shapecat.types import UNKNOWN
 
 NAMES = tuple(f"x{k}" for k in range(8))
 BLOCKS = {"first": slice(0, 3), "second": slice(3, 8)}

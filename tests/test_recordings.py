@@ -15,8 +15,8 @@ from rosbags.rosbag2 import Writer as FolderWriter
 from rosbags.typesys import Stores, get_typestore
 
 from shapecat.errors import RecordingError
-from shapecat.files import lock
 from shapecat.recordings import MessageError, Topic, open_recording
+from shapecat.system.files import lock
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE1 = get_typestore(Stores.ROS1_NOETIC)

@@ -9,7 +9,7 @@ import pytest
 from rosbags.rosbag1 import Writer as Bag
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
-from shapecat.colour_types import ColourImage, ColourView
+from shapecat.cameras.colour import ColourImage, ColourView
 from shapecat.errors import NoStreamError
 from shapecat.geometry import rotation_from_quaternion
 from shapecat.recordings import choose_streams, open_recording

@@ -14,7 +14,7 @@ from shapecat.outputs.scene_protobuf import encode_scene, scene_descriptors
 from shapecat.recordings import choose_streams, frames, open_recording, read_transforms
 from shapecat.recordings.decoding import LIBRARY_ERRORS
 from shapecat.recordings.protobuf import encode_message, message_decoder
-from shapecat.types import Camera, Frame, ShownBoxes, ShownFrame
+from shapecat.types import Camera, Frame, ShownFrame
 from tests.foxglove_messages import (
     EPOCH,
     LAYOUT,
@@ -108,7 +108,7 @@ def test_protobuf_scene_is_read_by_its_own_descriptors() -> None:
 def test_protobuf_source_gets_protobuf_annotations(tmp_path: Path) -> None:
     source, target = tmp_path / "a.mcap", tmp_path / "out.mcap"
     write(source, "protobuf", [("/p", "foxglove.PointCloud", {})])
-    frame = ShownFrame("/p", 0, EPOCH, EPOCH, "camera", ShownBoxes.of([]), (7,))
+    frame = ShownFrame("/p", 0, EPOCH, EPOCH, "camera", (), (7,))
 
     with open_recording(source) as recording:
         write_annotated(recording, target, [frame], run={})

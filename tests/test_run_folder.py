@@ -5,9 +5,9 @@ from pathlib import Path
 import pytest
 
 from shapecat.errors import OutputError
-from shapecat.files import partial_path, replacing
 from shapecat.runs.folder import previous_path, read_run, recover, staged, write_run
 from shapecat.runs.identity import content_digest, file_stats, new_id, same_content
+from shapecat.system.files import partial_path, replacing
 
 
 def test_folder_appears_whole(tmp_path: Path) -> None:

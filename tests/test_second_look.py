@@ -11,7 +11,6 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from shapecat import stopping
 from shapecat.geometry import IDENTITY
 from shapecat.pipeline import process
 from shapecat.runs.folder import read_run
@@ -21,6 +20,7 @@ from shapecat.runs.tables import FRAMES, PLANES
 from shapecat.simulation import IDEAL, make_scene, render_frame
 from shapecat.simulation.messages import MessageFactory
 from shapecat.simulation.truth import LINK_FROM_OPTICAL, robot_links
+from shapecat.system import stopping
 from shapecat.types import Camera, Pose
 from tests.messages import EPOCH, write
 from tests.scenes import OPTICAL, PERIOD, STEP
@@ -143,7 +143,7 @@ def test_a_recording_of_which_a_tenth_is_disturbed_loses_no_track(
     assert "revised" not in read_run(plain)["counts"]
     assert_same_tracks(plain, out)
 
-    monkeypatch.setattr("shapecat.perceiving.frames_to_revise", lambda _tables: {})
+    monkeypatch.setattr("shapecat.runs.perceiving.frames_to_revise", lambda _tables: {})
     once = run(tmp_path / "once.mcap", items(moving=moving, poses=False, disturbed=DISTURBED))
     assert share_found(out, plain) > share_found(once, plain) + 0.2
 
@@ -224,7 +224,7 @@ def test_a_kill_between_the_new_tables_leaves_nothing_that_lasts(
 
     def prepare(phase: str, _done: int, _total: int | None) -> None:
         if phase == "revise":
-            monkeypatch.setattr("shapecat.perceiving.count_rows", die)
+            monkeypatch.setattr("shapecat.runs.perceiving.count_rows", die)
 
     with pytest.raises(KeyboardInterrupt):
         process(job, prepare)

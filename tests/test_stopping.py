@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from shapecat import stopping
 from shapecat.executors import LocalExecutor
 from shapecat.pipeline import process
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
+from shapecat.system import stopping
 from tests.scenes import record
 from tests.test_batch import heed_interrupts
 from tests.test_crash import assert_same_tables, contents

@@ -15,10 +15,10 @@ from shapecat.batch.finding import find_recordings
 from shapecat.batch.manifest import Entry, Manifest
 from shapecat.batch.remote import look_at, output_place
 from shapecat.errors import ConfigError, OutputError
-from shapecat.files import partial_path
 from shapecat.learning import load_model
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
+from shapecat.system.files import partial_path
 
 __all__ = [
     "Batch",

@@ -16,8 +16,8 @@ from threading import Event, Thread
 from typing import Any
 
 from shapecat.errors import ConfigError, OutputError, RecordingError, ShapecatError
-from shapecat.files import lock
 from shapecat.runs.folder import RUN_FILES
+from shapecat.system.files import lock
 
 __all__ = [
     "Place",

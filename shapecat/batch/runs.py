@@ -12,7 +12,6 @@ from queue import Empty, SimpleQueue
 from threading import Lock
 from typing import Any, Protocol
 
-from shapecat import stopping
 from shapecat.batch.manifest import Entry, Manifest
 from shapecat.batch.plans import Task
 from shapecat.batch.remote import download, fetch, finish_upload, look_at, scratch, upload
@@ -21,6 +20,7 @@ from shapecat.executors import Mailbox, is_dropped, is_lost, post
 from shapecat.pipeline import Observer, process
 from shapecat.runs.folder import read_run, require_ours
 from shapecat.runs.jobs import Job, Summary, summarize
+from shapecat.system import stopping
 
 __all__ = ["Outcome", "Watcher", "attempt", "exit_code", "process_here", "process_on"]
 

@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 
 from shapecat.arrays import I4, U4, Bool, Record, array
+from shapecat.cameras.colour import LensCamera
 from shapecat.colour.projection import splat_depth
-from shapecat.colour_types import LensCamera
 from shapecat.jit import kernel
 from shapecat.types import Frame, Pose
 

@@ -6,9 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, Bool
-from shapecat.colour_types import LensCamera
+from shapecat.cameras.colour import LensCamera
+from shapecat.cameras.lenses import LENS_MODELS, distort
 from shapecat.jit import kernel
-from shapecat.lenses import LENS_MODELS, distort
 from shapecat.types import Camera, Pose
 
 __all__ = ["Painted", "hidden", "project", "rectified", "splat_depth"]
@@ -192,7 +192,7 @@ def _extent(depth: F4, labels: I4) -> tuple[int, int, int, int, float, float]:
 
 @kernel
 def _bend(x: float, y: float, kind: int, d: F4) -> tuple[float, float]:
-    """Return `shapecat.lenses.distort` of one ray: 1 is the polynomial, 2 the fisheye."""
+    """Return `shapecat.cameras.lenses.distort` of one ray: 1 is the polynomial, 2 the fisheye."""
     one, two = np.float32(1), np.float32(2)
     r = x * x + y * y
     if kind == 2:

@@ -10,9 +10,10 @@ from shapecat.arrays import F4, F8, I4
 from shapecat.description import BLOCKS
 from shapecat.errors import RecordingError
 from shapecat.evaluation import metrics
-from shapecat.evaluation.report import UNKNOWN, Compared
+from shapecat.evaluation.report import Compared
 from shapecat.evaluation.training import fit_views
 from shapecat.evaluation.views import DescribedViews, Observer, ignore
+from shapecat.types import UNKNOWN
 
 __all__ = ["compare_learners"]
 

@@ -12,8 +12,8 @@ import pyarrow as pa
 from shapecat.errors import OutputError
 from shapecat.evaluation.comparing import Comparison, Difference
 from shapecat.evaluation.comparison_pictures import COLOURS, Picture, words_of
-from shapecat.files import complete_folder
 from shapecat.runs.tables import write_table
+from shapecat.system.files import complete_folder
 
 __all__ = ["OBJECTS", "figure_rows", "format_page", "require_new", "write_comparison"]
 

@@ -5,8 +5,7 @@ import itertools
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from pathlib import Path
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,19 +13,15 @@ from rich.console import Console
 from rich.table import Table
 
 from shapecat.arrays import F4, I4
-from shapecat.config import Settings
-from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import ModelError
 from shapecat.evaluation import metrics
-from shapecat.evaluation.dataset import Dataset, read_dataset
 from shapecat.evaluation.fused import Fused, fuse_views
-from shapecat.evaluation.views import DescribedViews, Observer, describe_views, ignore
-from shapecat.learning import Categorizer, load_model
+from shapecat.evaluation.views import DescribedViews
+from shapecat.learning import Categorizer
+from shapecat.types import UNKNOWN
 
-__all__ = ["Compared", "Report", "evaluate", "evaluate_folder", "format_report"]
+__all__ = ["Compared", "Report", "evaluate", "format_report", "require_categories"]
 
-UNKNOWN = "unknown"
-"""Folder and label of shapes of no category."""
 _ELEVATIONS = (-math.inf, 15.0, 30.0, 45.0, 60.0, math.inf)
 _DISTANCES_M = (0.0, 0.8, 1.1, 1.4, 1.7, math.inf)
 _POINTS = (0, 60, 120, 250, 500, 1000, math.inf)
@@ -96,58 +91,6 @@ class Report:
         }
 
 
-def evaluate_folder(
-    root: Path,
-    model: Path | None = None,
-    *,
-    baselines: Path | None = None,
-    observe: Observer = ignore,
-) -> Report:
-    """Evaluate a model (by default the shipped one) on a labelled data set.
-
-    Parameters
-    ----------
-    baselines : a data set to train the chain and plain learners on, which are then judged on
-        ``root`` too. It may be ``root`` itself: five folds by instance.
-
-    Raises
-    ------
-    RecordingError : there are no views, or one cannot be read, or too few to train on.
-    ModelError : no usable model, or one that does not know a category of the data set.
-    """
-    categorizer = load_model(model)
-    categorizer.require_descriptor(DESCRIPTOR_NAMES)
-    dataset = read_dataset(root)
-    _require_categories(dataset.categories, categorizer)
-    wanted = baselines is not None
-    views = _described(dataset, "evaluate", observe, with_functions=wanted)
-    report = evaluate(views, categorizer)
-    if baselines is None:
-        return report
-    train = None
-    if baselines.resolve() != root.resolve():
-        train = _described(read_dataset(baselines), "train", observe, with_functions=True)
-    from shapecat.evaluation.baselines import compare_learners  # noqa: PLC0415  scikit-learn
-
-    rows = compare_learners(
-        views, train, categories=categorizer.categories, root=baselines, observe=observe
-    )
-    return replace(report, baselines=rows)
-
-
-def _described(
-    dataset: Dataset, phase: str, observe: Observer, *, with_functions: bool
-) -> DescribedViews:
-    return describe_views(
-        dataset,
-        settings=Settings(),
-        total=len(dataset),
-        phase=phase,
-        observe=observe,
-        with_functions=with_functions,
-    )
-
-
 def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
     """Compare what a model says of described views with their labels.
 
@@ -158,7 +101,7 @@ def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
     ------
     ModelError : a label that the model does not know.
     """
-    _require_categories(np.unique(views.labels).tolist(), categorizer)
+    require_categories(np.unique(views.labels).tolist(), categorizer)
     begun = time.perf_counter()
     prediction = categorizer.predict(views.descriptors)
     predicting = (time.perf_counter() - begun) / max(len(views.labels), 1)
@@ -197,7 +140,8 @@ def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
     )
 
 
-def _require_categories(names: Sequence[str], categorizer: Categorizer) -> None:
+def require_categories(names: Sequence[str], categorizer: Categorizer) -> None:
+    """Raise ModelError where a model does not know the category of a label."""
     strange = sorted(set(names) - set(categorizer.categories) - {UNKNOWN})
     if strange:
         msg = (

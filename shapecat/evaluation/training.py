@@ -12,10 +12,10 @@ from shapecat.config import Settings
 from shapecat.description import BLOCKS, DESCRIPTOR_NAMES
 from shapecat.errors import ModelError, RecordingError
 from shapecat.evaluation.dataset import read_dataset
-from shapecat.evaluation.report import UNKNOWN, evaluate
+from shapecat.evaluation.report import evaluate
 from shapecat.evaluation.views import DescribedViews, Observer, describe_views, ignore
 from shapecat.learning import Categorizer, load_model, save_model
-from shapecat.types import CATEGORIES
+from shapecat.types import CATEGORIES, UNKNOWN
 
 __all__ = [
     "fit_views",

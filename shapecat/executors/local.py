@@ -12,8 +12,8 @@ from multiprocessing.connection import Connection, wait
 from queue import Empty, SimpleQueue
 from typing import Any, NamedTuple
 
-from shapecat import stopping
 from shapecat.executors.cores import limited_threads
+from shapecat.system import stopping
 
 __all__ = ["LocalExecutor", "WorkerLostError"]
 

@@ -14,7 +14,6 @@ from shapecat.learning.categorizer import Categorizer
 from shapecat.learning.pnn import ProbabilisticNeuralNetwork
 
 __all__ = [
-    "UNKNOWN",
     "Examples",
     "LearningSettings",
     "calibrate",
@@ -25,9 +24,6 @@ __all__ = [
     "fit_threshold",
     "make_chain",
 ]
-
-UNKNOWN = "unknown"
-"""Label of shapes of no category: they grow the dictionary and judge novelty."""
 
 
 @dataclass(frozen=True)

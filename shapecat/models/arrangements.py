@@ -6,7 +6,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.evaluation.report import UNKNOWN
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
 from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.mesh import Mesh, moved, rounded_box, standing
@@ -15,7 +14,7 @@ from shapecat.simulation.placement import choose_rest, rests, turn_about_z
 from shapecat.simulation.shapes import make_object
 from shapecat.simulation.worlds import Thing
 from shapecat.simulation.worlds import World as Scene
-from shapecat.types import CATEGORIES, Pose
+from shapecat.types import CATEGORIES, UNKNOWN, Pose
 
 __all__ = ["ALONE", "Actor", "Arrangement", "World", "arrange", "placed"]
 

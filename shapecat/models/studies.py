@@ -13,14 +13,13 @@ from shapecat.config import Settings, SurfaceSettings
 from shapecat.description import BLOCKS, DESCRIPTOR_NAMES, describe
 from shapecat.evaluation import View, metrics
 from shapecat.evaluation.baselines import compare_learners
-from shapecat.evaluation.report import UNKNOWN
 from shapecat.evaluation.training import fit_views
 from shapecat.evaluation.views import DescribedViews
 from shapecat.learning import Categorizer
 from shapecat.learning.incremental import add_categories
 from shapecat.learning.training import encode
 from shapecat.surface import reconstruct, voxelize
-from shapecat.types import NeuralGas
+from shapecat.types import UNKNOWN, NeuralGas
 
 __all__ = [
     "add_two_categories",

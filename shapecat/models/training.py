@@ -16,7 +16,6 @@ from shapecat.config import Settings
 from shapecat.description import BLOCKS
 from shapecat.evaluation import Report, View, evaluate, format_report
 from shapecat.evaluation.fused import FUSED
-from shapecat.evaluation.report import UNKNOWN
 from shapecat.evaluation.training import fit_views
 from shapecat.evaluation.views import DescribedViews, describe_views
 from shapecat.learning import Categorizer, save_model
@@ -30,6 +29,7 @@ from shapecat.models.worlds import WorldView, simulate_views
 from shapecat.simulation.distractors import DISTRACTORS
 from shapecat.simulation.procedural import PROCEDURAL
 from shapecat.simulation.sensors import PRESETS
+from shapecat.types import UNKNOWN
 
 __all__ = ["Simulated", "collect", "main", "simulate"]
 

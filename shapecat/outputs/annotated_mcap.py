@@ -16,13 +16,13 @@ from operator import attrgetter
 from pathlib import Path
 from typing import BinaryIO
 
-from shapecat.files import replacing
 from shapecat.outputs.annotation import Annotation, AnnotationChannel, Item
 from shapecat.outputs.annotations import ENCODERS, Encode, encoder_for
 from shapecat.outputs.image_annotations import ImageFrame, image_encoder_for
 from shapecat.outputs.mcap_append import Appender, copy_bytes
 from shapecat.recordings import Recording
 from shapecat.recordings.mcap_file import McapRecording, Summary
+from shapecat.system.files import replacing
 from shapecat.types import ShownFrame
 
 __all__ = ["write_annotated"]
@@ -175,7 +175,7 @@ def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
             periods[frame.topic] = max(1, frame.stamp_ns - last[frame.topic])
         last[frame.topic] = frame.stamp_ns
         period = periods.get(frame.topic, _PERIOD_NS)
-        here = {track for track, _, _ in frame.objects.labels}
+        here = {box.track for box in frame.objects}
         gone = (shown.get(frame.topic, set()) | set(frame.ended)) - here
         shown[frame.topic] = here
         gone -= set().union(*shown.values())  # another sensor still sees it

@@ -1,7 +1,8 @@
 """The annotation channels, in the encodings of recordings."""
 
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
 from importlib.resources import files
 from typing import Any
 
@@ -14,8 +15,7 @@ from shapecat.outputs.annotation import (
     text_position,
 )
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.ros_annotations import RosMessages
-from shapecat.outputs.ros_stencils import StencilEncoder
+from shapecat.outputs.ros_annotations import ArrayMessage, RosMessages
 from shapecat.outputs.scene_protobuf import encode_scene, scene_descriptors
 from shapecat.types import ShownBox, ShownFrame
 
@@ -63,10 +63,16 @@ def _ros(
                 schema_encoding,
                 ros.definition(message.name),
             ),
-            StencilEncoder(ros, message),
+            partial(_serialized, ros, message),
         )
         for topic, message in kinds.items()
     ]
+
+
+def _serialized(
+    ros: RosMessages, message: ArrayMessage, annotations: Iterable[Annotation]
+) -> Iterator[bytes]:
+    return (ros.serialize(message.make(one), message.name) for one in annotations)
 
 
 def _json(_markers: bool) -> list[tuple[AnnotationChannel, Encode]]:  # noqa: FBT001  # the same

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from shapecat.arrays import U4
+from shapecat.cameras.colour import ColourView
 from shapecat.colour.masks import NOTHING, Mask, dense_masks
-from shapecat.colour_types import ColourView
 from shapecat.errors import OutputError
 from shapecat.executors.order import map_ahead, read_ahead
 from shapecat.recordings import Recording, choose_streams

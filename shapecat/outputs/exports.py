@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from shapecat.errors import OutputError
-from shapecat.files import flush, replacing
 from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.dataset_frames import DatasetImage, Selection, images_of, split_runs
 from shapecat.outputs.exports_coco import DATASETS
@@ -18,6 +17,7 @@ from shapecat.outputs.exports_labelcloud import write_labelcloud
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.rereading import FinishedRun, open_source, read_finished
 from shapecat.runs.folder import clear, recover, staged
+from shapecat.system.files import flush, replacing
 from shapecat.types import Frame, LabelledFrame
 
 __all__ = ["FORMATS", "export_dataset", "export_run"]

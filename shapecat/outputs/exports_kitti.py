@@ -17,8 +17,8 @@ import numpy as np
 from PIL import Image
 
 from shapecat.arrays import F8
+from shapecat.cameras.colour import LensCamera
 from shapecat.colour.projection import project, rectified
-from shapecat.colour_types import LensCamera
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.exports_files import finite_points, upward

@@ -6,13 +6,13 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from urllib.parse import quote
 
-from shapecat.files import replacing
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.report_drawing import draw
 from shapecat.outputs.report_page import Card, Listed, index_page, is_unsure, run_page
 from shapecat.outputs.report_tracks import read_courses, read_portraits, read_stage_seconds
 from shapecat.outputs.rereading import find_runs, read_finished
 from shapecat.runs.track_table import read_track_table
+from shapecat.system.files import replacing
 
 __all__ = ["write_report", "write_reports"]
 

@@ -7,6 +7,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, U1, U2, Record, array
 from shapecat.outputs.exports_files import png
+from shapecat.surface.triangles import triangles_of
 from shapecat.types import NeuralGas
 
 __all__ = ["SIDE", "Picture", "Snapshot", "draw", "graph_points"]
@@ -81,7 +82,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[Picture, ...]:
 
 def graph_points(gas: NeuralGas) -> F4:
     """Return points spread over the triangles and edges of a graph, where its cloud is gone."""
-    corners = gas.neurons[gas.triangles]
+    corners = gas.neurons[triangles_of(gas.edges, len(gas.neurons))]
     weights = np.array([[a, b, 8 - a - b] for a in range(9) for b in range(9 - a)]) / 8
     faces = np.einsum("kc,tcd->tkd", weights, corners).reshape(-1, 3)
     ends = gas.neurons[gas.edges]

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, U2, U4, Record, array
-from shapecat.colour_types import ColourView
+from shapecat.cameras.colour import ColourView
 from shapecat.jit import kernel
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_colour import packed, tinted, true_colours

@@ -3,8 +3,8 @@
 import numpy as np
 
 from shapecat.arrays import F4, I4, U1, U4, Bool
+from shapecat.cameras.colour import ColourView, LensCamera
 from shapecat.colour.projection import project
-from shapecat.colour_types import ColourView, LensCamera
 from shapecat.jit import kernel
 from shapecat.recordings.colour_image import pixels_of
 from shapecat.types import Frame, Pose

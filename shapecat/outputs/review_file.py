@@ -13,7 +13,7 @@ from typing import IO
 
 import rerun as rr
 
-from shapecat.files import replacing
+from shapecat.system.files import replacing
 
 __all__ = ["ReviewFile", "open_review"]
 

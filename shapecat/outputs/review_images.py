@@ -7,7 +7,7 @@ import numpy as np
 import rerun as rr
 
 from shapecat.arrays import F4, U1
-from shapecat.colour_types import COMPRESSED_FORMATS, ColourImage
+from shapecat.cameras.colour import COMPRESSED_FORMATS, ColourImage
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.exports_files import png

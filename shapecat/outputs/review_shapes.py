@@ -15,6 +15,7 @@ from shapecat.arrays import F4, F8, U4
 from shapecat.geometry import box_corners, quaternion_from_rotation, rotation_from_quaternion
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import PaintedCloud
+from shapecat.surface.triangles import triangles_of
 from shapecat.types import Box, Camera, LabelledFrame, LabelledObject, Pose
 
 __all__ = [
@@ -147,14 +148,16 @@ def _segments(pairs: F4) -> pa.Array:
 
 def _surfaces(moments: Sequence[Moment]) -> _Columns:
     """Return the triangles of the graphs, one translucent mesh a frame."""
-    shown = [[o for o in m.labelled.objects if len(o.gas.triangles)] for m in moments]
+    every = chain.from_iterable(m.labelled.objects for m in moments)
+    faces = {o: triangles_of(o.gas.edges, len(o.gas.neurons)) for o in every}
+    shown = [[o for o in m.labelled.objects if len(faces[o])] for m in moments]
     objects = list(chain.from_iterable(shown))
     sizes = [len(o.gas.neurons) for o in objects]
     colours = np.repeat(_packed(objects, alpha=70), sizes)
     yield from rr.Mesh3D.columns(
         vertex_positions=_stacked([o.gas.neurons for o in objects], 3), vertex_colors=colours
     ).partition([sum(len(o.gas.neurons) for o in each) for each in shown])
-    meshes = [_mesh([(len(o.gas.neurons), o.gas.triangles) for o in each]) for each in shown]
+    meshes = [_mesh([(len(o.gas.neurons), faces[o]) for o in each]) for each in shown]
     yield _faces(meshes)
 
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable
 from functools import cache
 from importlib.resources import files
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
@@ -23,16 +23,10 @@ __all__ = ["ArrayMessage", "RosMessages"]
 
 
 class ArrayMessage(NamedTuple):
-    """A message whose last field is an array with the same number of elements for each object.
-
-    ``gone`` tells where it takes earlier tracks away, if it does: inside that array or before it.
-    """
+    """A kind of message: its name, and what makes one of what is shown in a frame."""
 
     name: str
-    whole: Callable[[Annotation], Any]
-    element: str
-    elements: tuple[Callable[[Annotation, ShownBox], Any], ...]
-    gone: Literal["", "before", "inside"] = ""
+    make: Callable[[Annotation], Any]
 
 
 class RosMessages:
@@ -46,26 +40,9 @@ class RosMessages:
         self._no_covariance = np.zeros(36)
         self._no_bytes = np.zeros(0, np.uint8)
         self._upright = self._types["Quaternion"](0.0, 0.0, 0.0, 1.0)
-        self.detections = ArrayMessage(
-            "vision_msgs/msg/Detection3DArray",
-            self._detections,
-            "vision_msgs/msg/Detection3D",
-            (self._detection,),
-        )
-        self.scene = ArrayMessage(
-            "foxglove_msgs/msg/SceneUpdate",
-            self._scene,
-            "foxglove_msgs/msg/SceneEntity",
-            (self._entity,),
-            gone="before",
-        )
-        self.markers = ArrayMessage(
-            "visualization_msgs/msg/MarkerArray",
-            self._markers,
-            "visualization_msgs/msg/Marker",
-            (self._cube_marker, self._text_marker),
-            gone="inside",
-        )
+        self.detections = ArrayMessage("vision_msgs/msg/Detection3DArray", self._detections)
+        self.scene = ArrayMessage("foxglove_msgs/msg/SceneUpdate", self._scene)
+        self.markers = ArrayMessage("visualization_msgs/msg/MarkerArray", self._markers)
 
     def definition(self, name: str) -> bytes:
         """Return the definition to embed: that of the store that encodes."""
@@ -87,14 +64,6 @@ class RosMessages:
         if self.ros1:
             return bytes(self._store.serialize_ros1(message, name))
         return bytes(self._store.serialize_cdr(message, name))
-
-    def shifted(self, message: Any, name: str) -> bytes:
-        """Encode a message as CDR that begins 4 bytes after a multiple of 8."""
-        outer = f"shapecat_msgs/msg/Shifted{name.rsplit('/', 1)[1]}"
-        if outer not in self._store.fielddefs:
-            definition = f"uint32 shift\n{name.replace('/msg/', '/')} message\n"
-            self._store.register(get_types_from_msg(definition, outer))
-        return self.serialize(self._store.types[outer](0, message), outer)[4:]
 
     def _detections(self, annotation: Annotation) -> Any:
         found = [self._detection(annotation, box) for box in annotation.frame.objects]

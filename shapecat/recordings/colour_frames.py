@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from shapecat.colour_types import ColourImage, ColourView, LensCamera
+from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
+from shapecat.cameras.lenses import LENS_MODELS
 from shapecat.errors import RecordingError
-from shapecat.lenses import LENS_MODELS
 from shapecat.recordings.colour_image import cloud_colours, compressed_size
 from shapecat.recordings.colour_streams import ColourStream
 from shapecat.recordings.extrinsics import Extrinsics

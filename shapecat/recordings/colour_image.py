@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from shapecat.arrays import U1
-from shapecat.colour_types import COMPRESSED_FORMATS, ColourImage
+from shapecat.cameras.colour import COMPRESSED_FORMATS, ColourImage
 from shapecat.recordings.messages import MessageError
 
 __all__ = [

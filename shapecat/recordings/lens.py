@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from shapecat.arrays import F4, F8
-from shapecat.lenses import undistorted_rays
+from shapecat.cameras.lenses import undistorted_rays
 from shapecat.recordings.pinhole import PinholeFit, fit_pinhole
 from shapecat.recordings.pointcloud2 import unorganized
 from shapecat.recordings.recording import Recording

@@ -4,11 +4,11 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from shapecat.files import input_size
 from shapecat.recordings.colour_streams import choose_colour
 from shapecat.recordings.opening import open_recording
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.streams import Stream, cloud_streams
+from shapecat.system.files import input_size
 
 __all__ = ["describe_recording"]
 

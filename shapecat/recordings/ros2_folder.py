@@ -15,11 +15,11 @@ from typing import ClassVar
 import zstandard
 
 from shapecat.errors import RecordingError
-from shapecat.files import lock
 from shapecat.recordings.mcap_file import McapRecording
 from shapecat.recordings.messages import Channel, Message, Topic
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.ros2_database import DatabaseRecording
+from shapecat.system.files import lock
 
 __all__ = ["FolderRecording"]
 

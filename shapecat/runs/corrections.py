@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 from shapecat.errors import OutputError
-from shapecat.files import replacing
 from shapecat.runs.folder import read_run
 from shapecat.runs.track_table import (
     TrackRow,
@@ -23,7 +22,8 @@ from shapecat.runs.track_table import (
     with_label,
     write_track_table,
 )
-from shapecat.types import CATEGORIES
+from shapecat.system.files import replacing
+from shapecat.types import CATEGORIES, UNKNOWN
 
 __all__ = [
     "PREVIOUS",
@@ -37,7 +37,6 @@ __all__ = [
     "relabel",
 ]
 
-UNKNOWN = "unknown"
 DELETE = "delete"
 ORIGINAL = "tracks.original.csv"
 PREVIOUS = "tracks.previous.csv"

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from shapecat.errors import OutputError
-from shapecat.files import flush, lock, partial_path, replacing
+from shapecat.system.files import flush, lock, partial_path, replacing
 
 __all__ = [
     "OUTPUTS",

@@ -16,7 +16,7 @@ from typing import Any, Self
 import xxhash
 
 from shapecat.errors import RecordingError
-from shapecat.files import input_files
+from shapecat.system.files import input_files
 
 __all__ = [
     "ContentDigest",

@@ -12,7 +12,6 @@ from typing import Any
 from shapecat import __version__
 from shapecat.config import Settings
 from shapecat.errors import OutputError, RecordingError
-from shapecat.files import input_size, replacing
 from shapecat.learning import Categorizer
 from shapecat.runs.corrections import PREVIOUS, has_labels
 from shapecat.runs.folder import clear, read_run, write_run
@@ -26,6 +25,7 @@ from shapecat.runs.identity import (
 )
 from shapecat.runs.label_transfer import lost_labels, transfer_labels
 from shapecat.runs.segments import count_segments
+from shapecat.system.files import input_size, replacing
 
 __all__ = [
     "Job",

@@ -13,8 +13,8 @@ import pyarrow as pa
 from shapecat.arrays import U4
 from shapecat.colour.masks import NOTHING, Mask, united
 from shapecat.colour.rle import rle_counts, rle_mask
-from shapecat.files import replacing
 from shapecat.runs.tables import SCHEMA_VERSION, Key, arrow_table, open_writer, read_row_groups
+from shapecat.system.files import replacing
 
 __all__ = ["MASKS", "FrameMasks", "MaskTable", "read_masks"]
 

@@ -12,7 +12,6 @@ import numpy as np
 import pyarrow as pa
 
 from shapecat.arrays import F4
-from shapecat.files import complete_folder, replacing
 from shapecat.runs.segments import (
     GROUP_FRAMES,
     PERCEIVED,
@@ -24,7 +23,8 @@ from shapecat.runs.segments import (
     write_segment,
 )
 from shapecat.runs.tables import SCHEMA_VERSION, arrow_table, lists, open_writer
-from shapecat.types import Perception, Pose
+from shapecat.system.files import complete_folder, replacing
+from shapecat.types import UNKNOWN, Perception, Pose
 
 __all__ = ["FrameRow", "PerceptionTables"]
 
@@ -185,7 +185,7 @@ def _detection_columns(
         "indices": lists([c.indices for c in candidates], pa.uint32()),
         "posterior": lists([d.posterior for d in found], pa.float32()),
         "category": [
-            "unknown" if d.novelty > 1 else categories[k] for d, k in zip(found, best, strict=True)
+            UNKNOWN if d.novelty > 1 else categories[k] for d, k in zip(found, best, strict=True)
         ],
         "confidence": [float(d.posterior[k]) for d, k in zip(found, best, strict=True)],
         "novelty": [d.novelty for d in found],

@@ -24,7 +24,7 @@ from shapecat.runs.tables import (
     rows_of,
     topic_codes,
 )
-from shapecat.types import Box, ShownBox, ShownBoxes, ShownFrame
+from shapecat.types import Box, ShownBox, ShownFrame
 
 __all__ = ["ShownTracks", "read_shown_frames"]
 
@@ -131,7 +131,7 @@ def read_shown_frames(
 
 def _boxes(
     keys: Sequence[Key], shown: ShownTracks, detections: pa.Table, *, visible: bool
-) -> Iterator[ShownBoxes]:
+) -> Iterator[tuple[ShownBox, ...]]:
     """Yield what is shown in each of some frames, whose detections are given."""
     all_rows, places = frame_rows(detections), _places(detections)
     spans = [shown.frames.get(key, _NO_ROWS) for key in keys]
@@ -143,8 +143,14 @@ def _boxes(
         full = np.concatenate([shown.full[span] for span in spans])
         places = np.where(np.isnan(full), places, full)
     for span, stop in zip(spans, accumulate(counts), strict=True):
-        labels = tuple(map(shown.labels.__getitem__, shown.tracks[span]))
-        yield ShownBoxes(labels, places[stop - len(labels) : stop])
+        labels = [shown.labels[track] for track in shown.tracks[span]]
+        rows = places[stop - len(labels) : stop].tolist()
+        yield tuple(map(_box, labels, rows))
+
+
+def _box(label: TrackLabel, row: Sequence[float]) -> ShownBox:
+    center, size, orientation = tuple(row[:3]), tuple(row[3:6]), tuple(row[6:])
+    return ShownBox(*label, center, size, orientation)  # type: ignore[arg-type]  # as long as these
 
 
 def _rows_of_lists(column: pa.ChunkedArray) -> F4:
@@ -160,12 +166,12 @@ def _places(table: pa.Table) -> F8:
     return np.hstack(columns).astype(np.float64)
 
 
-def _joined(boxes: ShownBoxes, up: F4) -> ShownBoxes:
+def _joined(boxes: Sequence[ShownBox], up: F4) -> tuple[ShownBox, ...]:
     """Make one box of the parts of each merged track."""
     parts: dict[int, list[ShownBox]] = {}
     for box in boxes:
         parts.setdefault(box.track, []).append(box)
-    return ShownBoxes.of(_join(some, up) for some in parts.values())
+    return tuple(_join(some, up) for some in parts.values())
 
 
 def _join(parts: Sequence[ShownBox], up: F4) -> ShownBox:

@@ -12,10 +12,11 @@ import pyarrow.compute
 from scipy.spatial.transform import Rotation
 
 from shapecat.config import TrackingSettings
-from shapecat.files import replacing
 from shapecat.runs.full_boxes import FullBoxes, full_columns
 from shapecat.runs.tables import TRACKS, frame_rows, lists, numbers, read_row_groups, write_table
+from shapecat.system.files import replacing
 from shapecat.tracking import FrameDetections, Track, track_recording
+from shapecat.types import UNKNOWN
 
 __all__ = ["track_run"]
 
@@ -125,7 +126,7 @@ def _streams_with_poses(folder: Path) -> set[str]:
 
 
 def _label(track: Track, categories: Sequence[str]) -> str:
-    return "unknown" if track.novelty > 1 else _guess(track, categories)
+    return UNKNOWN if track.novelty > 1 else _guess(track, categories)
 
 
 def _guess(track: Track, categories: Sequence[str]) -> str:
@@ -183,7 +184,7 @@ def _write_csv(
     """Write a line per track, those most worth a look first: unknown, then unsure."""
     rows = sorted(
         zip(tracks, labels, strict=True),
-        key=lambda item: (item[1] != "unknown", item[0].confidence, item[0].id),
+        key=lambda item: (item[1] != UNKNOWN, item[0].confidence, item[0].id),
     )
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")

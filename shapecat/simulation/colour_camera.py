@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from shapecat.arrays import F8, I4, U1
-from shapecat.colour_types import LensCamera
+from shapecat.cameras.colour import LensCamera
+from shapecat.cameras.lenses import undistorted_rays
 from shapecat.geometry import compose, inverse, rotation_from_quaternion
-from shapecat.lenses import undistorted_rays
 from shapecat.simulation.render import Image, render
 from shapecat.simulation.worlds import World
 from shapecat.types import Camera, Pose

@@ -13,7 +13,6 @@ import numpy as np
 
 from shapecat.arrays import U1
 from shapecat.errors import OutputError
-from shapecat.files import flush
 from shapecat.simulation.colour_camera import COLOUR, jpeg, render_colour
 from shapecat.simulation.containers import CONTAINERS, Container
 from shapecat.simulation.scenes import SceneKind, make_scene
@@ -21,6 +20,7 @@ from shapecat.simulation.sensors import SENSORS, Sensor
 from shapecat.simulation.truth import LINK_FROM_OPTICAL, frame_truth, robot_links
 from shapecat.simulation.views import render_frame
 from shapecat.simulation.worlds import World
+from shapecat.system.files import flush
 from shapecat.types import Camera, Frame
 
 __all__ = ["EPOCH_NS", "record", "simulate", "written_paths"]

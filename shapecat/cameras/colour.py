@@ -15,7 +15,7 @@ COMPRESSED_FORMATS = ("jpeg", "png")
 class LensCamera:
     """A camera whose images show the distortion of its lens.
 
-    ``model`` is one of `shapecat.lenses.LENS_MODELS`, empty for a lens without distortion.
+    ``model`` is one of `shapecat.cameras.lenses.LENS_MODELS`, empty for a lens without distortion.
     """
 
     pinhole: Camera

@@ -13,7 +13,6 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 
-from shapecat import stopping
 from shapecat.config import Settings
 from shapecat.depth_fusion import RecentFrames
 from shapecat.errors import NoStreamError, RecordingError
@@ -27,6 +26,7 @@ from shapecat.runs.perceived import FrameRow, PerceptionTables
 from shapecat.runs.second_look import Revision, frames_to_revise
 from shapecat.runs.segments import read_segments
 from shapecat.runs.tables import Key, count_rows, read_row_groups
+from shapecat.system import stopping
 from shapecat.types import Frame
 
 __all__ = ["Observer", "ignore", "perceive_all", "revise"]

@@ -1,0 +1,1 @@
+"""Cameras beyond the pinhole: lenses with distortion, and the images of colour."""

@@ -1,0 +1,64 @@
+"""A model judged on a labelled data set, beside plain learners where they are asked for."""
+
+from dataclasses import replace
+from pathlib import Path
+
+from shapecat.config import Settings
+from shapecat.description import DESCRIPTOR_NAMES
+from shapecat.evaluation.baselines import compare_learners
+from shapecat.evaluation.dataset import Dataset, read_dataset
+from shapecat.evaluation.report import Report, evaluate, require_categories
+from shapecat.evaluation.views import DescribedViews, Observer, describe_views, ignore
+from shapecat.learning import load_model
+
+__all__ = ["evaluate_folder"]
+
+
+def evaluate_folder(
+    root: Path,
+    model: Path | None = None,
+    *,
+    baselines: Path | None = None,
+    observe: Observer = ignore,
+) -> Report:
+    """Evaluate a model (by default the shipped one) on a labelled data set.
+
+    Parameters
+    ----------
+    baselines : a data set to train the chain and plain learners on, which are then judged on
+        ``root`` too. It may be ``root`` itself: five folds by instance.
+
+    Raises
+    ------
+    RecordingError : there are no views, or one cannot be read, or too few to train on.
+    ModelError : no usable model, or one that does not know a category of the data set.
+    """
+    categorizer = load_model(model)
+    categorizer.require_descriptor(DESCRIPTOR_NAMES)
+    dataset = read_dataset(root)
+    require_categories(dataset.categories, categorizer)
+    wanted = baselines is not None
+    views = _described(dataset, "evaluate", observe, with_functions=wanted)
+    report = evaluate(views, categorizer)
+    if baselines is None:
+        return report
+    train = None
+    if baselines.resolve() != root.resolve():
+        train = _described(read_dataset(baselines), "train", observe, with_functions=True)
+    rows = compare_learners(
+        views, train, categories=categorizer.categories, root=baselines, observe=observe
+    )
+    return replace(report, baselines=rows)
+
+
+def _described(
+    dataset: Dataset, phase: str, observe: Observer, *, with_functions: bool
+) -> DescribedViews:
+    return describe_views(
+        dataset,
+        settings=Settings(),
+        total=len(dataset),
+        phase=phase,
+        observe=observe,
+        with_functions=with_functions,
+    )
