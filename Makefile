@@ -5,9 +5,10 @@ BIN := .venv/bin
 OPEN3D_LIBRARIES := libegl1 libgl1 libx11-6 libusb-1.0-0
 SCREENS := chromium chromium-driver mesa-vulkan-drivers
 DEMO := demo
+PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test odd faults lint format bench model parts lock clean
+.PHONY: help setup demo test test-all screens kernels fixtures odd faults lint format bench model parts lock clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -30,17 +31,26 @@ demo: setup ## simulate a recording, process it, and say where the results lie
 	$(BIN)/shapecat simulate $(DEMO)/tabletop.mcap --scene tabletop --frames 60 --seed 3 --overwrite
 	$(BIN)/shapecat process $(DEMO)/tabletop.mcap --out $(DEMO)/out --overwrite
 
-test: setup ## run all tests
+test: setup screens kernels ## run the tests, in a few minutes
+	$(PYTEST) -m 'not many'
+
+test-all: setup screens kernels ## run all tests, also those that repeat one many times
+	$(PYTEST)
+
+screens:
 	@{ command -v chromedriver && ls /usr/share/vulkan/icd.d/*; } >/dev/null 2>&1 || $(call apt,$(SCREENS)) \
 	    || echo "(only tests of the report in a browser and of screenshots need them)" >&2
+
+kernels: setup
 	@$(BIN)/python -m shapecat.rehearsal
-	$(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder -m 'not many'
+
+fixtures: setup kernels ## make the recordings in fixtures/ anew, and the tables expected of them
+	$(BIN)/python -m tests.fixtures
 
 odd: setup ## process damaged and odd recordings, print what became of each
 	$(BIN)/python -m tests.odd
 
-faults: setup ## interrupt, kill and starve the command at random, print what held
-	@$(BIN)/python -m shapecat.rehearsal
+faults: setup kernels ## interrupt, kill and starve the command at random, print what held
 	$(BIN)/python -m tests.faults --count 200 --minutes 13
 
 lint: setup ## check style and types

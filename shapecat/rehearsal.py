@@ -9,6 +9,7 @@ import gc
 import hashlib
 import os
 import sys
+import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import wait
@@ -31,7 +32,7 @@ from shapecat.system import stopping
 from shapecat.system.files import lock
 from shapecat.types import Camera, Frame
 
-__all__ = ["compile_all", "find_ball", "recognize_ball"]
+__all__ = ["compile_all", "find_ball", "main", "recognize_ball"]
 
 _RADIUS_M = 0.05
 
@@ -71,6 +72,7 @@ def recognize_ball() -> str:
 _REHEARSALS: tuple[Callable[[], object], ...] = (find_ball, recognize_ball)
 """About as long each; none needs the kernels of another."""
 _POLL_S = 0.1
+_TELL_S = 10.0
 _STAGES = ("completion", "description", "detection", "learning", "surface")
 """Folders of the kernels that are rehearsed."""
 
@@ -139,5 +141,32 @@ def _uncollected(rehearsal: Callable[[], object]) -> None:
     rehearsal()
 
 
+def _count() -> int:
+    """Return the number of kernels that are compiled and kept."""
+    folders = (code_folder(Path(__file__).with_name(stage)) for stage in _STAGES)
+    return sum(len([*folder.rglob("*.nbi")]) for folder in folders if folder is not None)
+
+
+def main() -> None:
+    """Compile the kernels, and tell every ten seconds how many there are."""
+    ended = threading.Event()
+
+    def tell() -> None:
+        say("compiling the kernels, once per installation: about two minutes of two cores")
+        while not ended.wait(_TELL_S):
+            say(f"{_count()} kernels compiled")
+
+    def say(line: str) -> None:
+        sys.stdout.write(f"{line}\n")
+        sys.stdout.flush()
+
+    try:
+        seconds = compile_all(threading.Thread(target=tell, daemon=True).start)
+    finally:
+        ended.set()
+    if seconds:
+        say(f"all {_count()} kernels compiled in {seconds:.0f} s")
+
+
 if __name__ == "__main__":
-    compile_all()
+    main()

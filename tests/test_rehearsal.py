@@ -1,6 +1,7 @@
 """Compiling ahead: what is rehearsed must be the whole way, done once, and leave nobody behind."""
 
 import multiprocessing
+import threading
 from pathlib import Path
 
 import pytest
@@ -50,6 +51,30 @@ def test_an_interrupted_one_is_done_again(trace: Path, monkeypatch: pytest.Monke
         compile_all()
     compile_all()
     assert trace.read_text() == "x"
+
+
+def test_whoever_waits_is_told(
+    trace: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Minutes of silence look like a hang; kernels that are there already are no news."""
+    counted = threading.Event()
+
+    def count() -> int:
+        counted.set()
+        return 7
+
+    monkeypatch.setattr(rehearsal, "_TELL_S", 0.001)
+    monkeypatch.setattr(rehearsal, "_count", count)
+    monkeypatch.setattr(rehearsal, "_rehearse", lambda _: counted.wait())
+
+    rehearsal.main()
+    first, second, *_, last = capfd.readouterr().out.splitlines()
+    assert first.startswith("compiling")
+    assert second == "7 kernels compiled"
+    assert last.startswith("all 7 kernels")
+    rehearsal.main()
+    assert not capfd.readouterr().out
+    assert not trace.exists()
 
 
 def test_the_other_processes_end(monkeypatch: pytest.MonkeyPatch) -> None:
