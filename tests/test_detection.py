@@ -346,6 +346,19 @@ def test_object_cut_by_the_border_is_flagged() -> None:
     assert not right.touches_border
 
 
+def test_an_arm_that_reaches_into_the_image_is_no_object() -> None:
+    """What the border cuts across its breadth is robot or furniture; a box that looks in stays."""
+    arm = box((0.05, -0.35, 0.05), (0.2, 0.5, 0.09), 0.2)
+    small = box((-0.56, 0.05, 0), (0.08, 0.08, 0.06))
+    depth, seen = render([table(1, 1), arm, small, can(0.2, 0.15, 0, 0.04, 0.12)])
+    assert (seen[-1] == 1).sum() > 100
+    assert (seen[:, 0] == 2).any()
+    scene = found(frame_of(depth))
+    least = np.array(overlaps(scene, seen, [1, 2, 3]))
+    assert least[0] < 0.05
+    assert (least[1:] > 0.85).all()
+
+
 def test_the_border_is_where_readings_begin() -> None:
     """A registered Kinect is blind in a tenth of the image; the top of a bottle is no border."""
     shapes = [table(1, 1), box((-0.63, 0, 0), (0.08, 0.08, 0.1)), can(0.1, 0.45, 0, 0.04, 0.4)]

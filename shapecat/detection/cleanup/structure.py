@@ -20,9 +20,10 @@ from shapecat.jit import kernel
 
 __all__ = ["LabelledGrid", "Limits", "is_background"]
 
-THROUGH, BEYOND, TO_WALL, ON, LAST = range(5)
+THROUGH, BEYOND, TO_WALL, ON, LAST, BORDER = range(6)
 """Counts of cells of each region: from which it goes on through the level of a board; of their
-neighbours on the same surface beyond every plane and in walls; on walls; at the end of the range.
+neighbours on the same surface beyond every plane and in walls; on walls; at the end of the range;
+at the border of the image.
 """
 SHELF_EDGE_LINKS, SHELF_EDGE_SHARE = 8, 0.1
 """Links with a higher plane, from below, of the edge of a board or its legs; share of the boundary.
@@ -40,6 +41,10 @@ and in a wall: of the front of the side of a shelf half does, of a bowl that sta
 less."""
 CUT = 0.2
 """Share of the cells of a segment that are the last before the end of the range."""
+CUT_OFF, LARGE, MARGIN = 0.25, 0.02, 0.08
+"""Share of its outline, taken for a square, at which the border of the image cuts a segment of so
+large a share of the image, as it cuts robot arms, furniture and bent ends of tables; sensors leave
+so much of an image empty at most."""
 STEP_M, STEPS, MISSES = 0.02, 64, 2.0
 """A surface is followed up or down in at most so many steps, until it was not seen in more than
 two; where something hides it, half a step counts."""
@@ -81,23 +86,37 @@ def is_background(
     What has been merged into another is left out. What is ``known`` to be an object is no noise.
     """
     n = segments.parent.size
-    counts = np.zeros((5, n), np.int64)
+    counts = np.zeros((6, n), np.int64)
     counts[LAST] = count_at_range_limit(field.inverse_depth, field.labels, n, limits.range_m)
+    counts[BORDER] = _count_at_border(field, n)
     _count_posts(field, up, counts[THROUGH])
     _count_leaving(field, counts)
     rejected: Bool = _is_rejected(field, segments, counts, up, known, limits)
     return rejected
 
 
+def _count_at_border(field: LabelledGrid, count: int) -> I4:
+    """Count the cells of each region at the border of what the sensor's image shows."""
+    counts = np.zeros(count, np.int64)
+    for lines, across in ((field.labels, 1), (field.labels.T, 0)):
+        seen = np.flatnonzero((field.inverse_depth > 0).any(axis=across))
+        margin = MARGIN * len(lines)
+        if seen.size and seen[0] <= margin:
+            counts += np.bincount(lines[seen[0]], minlength=count)
+        if seen.size and seen[-1] >= len(lines) - 1 - margin:
+            counts += np.bincount(lines[seen[-1]], minlength=count)
+    return counts
+
+
 @kernel
 def _is_rejected(
     field: LabelledGrid, segments: Segments, counts: I4, up: F8, known: Bool, limits: Limits
 ) -> Bool:
-    """Return what `is_background` does, from the counts (5, n + 1) of cells."""
+    """Return what `is_background` does, from the counts (6, n + 1) of cells."""
     n = segments.parent.size
     rejected = np.zeros(n, np.bool_)
     for p in range(n):
-        for what in range(5 if not is_root(segments, p) else 0):
+        for what in range(6 if not is_root(segments, p) else 0):
             counts[what, segments.parent[p]] += counts[what, p]
     for p in range(1, n):
         if not is_root(segments, p):
@@ -110,6 +129,9 @@ def _is_rejected(
             or counts[THROUGH, p] >= FEW
             or counts[ON, p] > REMAINS * size
             or counts[LAST, p] > CUT * size
+            or (
+                size > LARGE * field.labels.size and counts[BORDER, p] > CUT_OFF * 4 * np.sqrt(size)
+            )
             or counts[BEYOND, p] > UNBOUNDED * boundary
             or counts[TO_WALL, p] > WALLED * boundary
             or _is_edge_on_panel(segments, p, field.intrinsics)
