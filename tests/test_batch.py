@@ -449,11 +449,10 @@ class DaskCluster:
             process.wait()
 
 
-@pytest.mark.ray
+@pytest.mark.many
 def test_ray_gives_the_same_tables(
     shapecat: Run, recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:
-    pytest.importorskip("ray")
     options = ("--out", tmp_path, "--executor", "ray", "--jobs", 2, "--no-rrd")
 
     assert shapecat("process", recordings, *options).exit_code == 1
