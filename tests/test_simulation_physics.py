@@ -17,7 +17,7 @@ from shapecat.simulation.scenes import SceneKind
 from shapecat.simulation.shapes import make_object
 from shapecat.types import Pose
 
-SETTLED: tuple[SceneKind, ...] = ("pile", "bin", "shelf_bin")
+SETTLED: tuple[SceneKind, ...] = ("pile", "bin", "shelf_bin", "room")
 QUARTER = rotation_from_quaternion([0, 0, np.sin(0.3), np.cos(0.3)])
 """A turn about the vertical that is no symmetry of a box."""
 
@@ -122,7 +122,7 @@ def moved_part(part: np.ndarray, pose: Pose) -> np.ndarray:
 
 
 def world_support(kind: str) -> str:
-    return {"pile": "table", "bin": "bin", "shelf_bin": "board_1"}[kind]
+    return {"pile": "table", "bin": "bin", "shelf_bin": "board_1", "room": "table"}[kind]
 
 
 def test_tilted_things_are_told_from_straight_ones() -> None:

@@ -25,7 +25,7 @@ from shapecat.simulation.sensors import IDEAL, KINECT
 from shapecat.simulation.truth import robot_links
 from shapecat.types import CATEGORIES, Camera, Pose
 
-SETTLED = {"pile", "bin", "shelf_bin"}  # by physics: things touch, and lie in each other
+SETTLED = {"pile", "bin", "shelf_bin", "room"}  # by physics: things touch, and lie in each other
 KINDS: tuple[SceneKind, ...] = tuple(k for k in get_args(SceneKind) if k not in SETTLED)
 
 

@@ -16,6 +16,7 @@ __all__ = [
     "make_room",
     "make_shelf",
     "make_table",
+    "make_wall",
     "round_table",
 ]
 
@@ -28,7 +29,7 @@ def make_room(rng: Generator, *, wall_chance: float) -> list[Support]:
     floor = _slab("floor", FLOOR, (8.0, 8.0, 0.05), (0, 0, 0))
     if rng.random() >= wall_chance:
         return [floor]
-    return [floor, _wall("wall", WALL, (8.0, 0.1, 2.6), (0, rng.uniform(0.8, 1.6)))]
+    return [floor, _upright("wall", WALL, (8.0, 0.1, 2.6), (0, rng.uniform(0.8, 1.6)))]
 
 
 def make_counter(rng: Generator) -> Support:
@@ -72,9 +73,9 @@ def make_shelf(
     ]
     beside, behind = (width + thick) / 2, (depth + thick) / 2
     sides = [
-        _wall("left_side", SIDE, (thick, depth, top), (-beside, 0)),
-        _wall("right_side", SIDE, (thick, depth, top), (beside, 0)),
-        _wall("back", BACK, (width + 2 * thick, thick, top), (0, behind)),
+        _upright("left_side", SIDE, (thick, depth, top), (-beside, 0)),
+        _upright("right_side", SIDE, (thick, depth, top), (beside, 0)),
+        _upright("back", BACK, (width + 2 * thick, thick, top), (0, behind)),
     ]
     return boards, sides
 
@@ -121,7 +122,12 @@ def _slab(name: str, label: int, size: Sequence[float], top_middle: Sequence[flo
     return Support(name, label, mesh, np.array(corners))
 
 
-def _wall(name: str, label: int, size: Sequence[float], place: Sequence[float]) -> Support:
+def make_wall(name: str, size: Sequence[float], place: Sequence[float]) -> Support:
+    """Return a wall or cupboard: its size, and where (x, y) on the floor its middle is."""
+    return _upright(name, WALL, size, place)
+
+
+def _upright(name: str, label: int, size: Sequence[float], place: Sequence[float]) -> Support:
     """Return an upright board that stands on the floor."""
     return _board(name, label, size, (*place, 0.0))
 

@@ -16,7 +16,7 @@ from shapecat.simulation.physics import Drop, Rest, settle
 from shapecat.simulation.shapes import make_object
 from shapecat.simulation.worlds import Support, Thing, World
 
-__all__ = ["bin_picking", "pile", "shelf_bin"]
+__all__ = ["Item", "bin_picking", "make_item", "pile", "settled", "shelf_bin"]
 
 _UPRIGHT = 0.45
 """Share of the things that are dropped nearly upright; others are turned anyhow."""
@@ -26,7 +26,9 @@ _SUNK_M = 0.02
 """What lies lower has fallen off its support."""
 
 
-class _Item(NamedTuple):
+class Item(NamedTuple):
+    """Something to drop: what shape it has, what it is, and its mesh."""
+
     category: str
     kind: str
     mesh: Mesh
@@ -44,11 +46,11 @@ def pile(
     supports = (*make_room(rng, wall_chance=0.2), make_table(rng))
     table = supports[-1]
     spread = rng.uniform(0.07, 0.2)
-    drops, items = [], [_make(category, rng, kinds) for category in categories]
+    drops, items = [], [make_item(category, rng, kinds) for category in categories]
     for item in items:
         place = np.clip(rng.normal(0, spread, 2), -0.4, 0.4)
         drops.append(Drop(item.mesh, _turned(rng), place))
-    things = _settled(items, drops, supports, table)
+    things = settled(items, drops, supports, table)
     path = walk(
         rng,
         np.array([0, 0, table.height + 0.05]),
@@ -72,7 +74,7 @@ def bin_picking(
     """Pour things into a bin, and look into it from above."""
     bottom, sides = make_bin(rng)
     half = np.ptp(bottom.outline[:, :2], axis=0) / 2
-    items = [_make(category, rng, kinds) for category in categories]
+    items = [make_item(category, rng, kinds) for category in categories]
     items = [item for item in items if item.mesh.extents.max() < 1.6 * half.min()]
     drops = []
     for item in items:
@@ -88,7 +90,7 @@ def bin_picking(
         elevation=rng.uniform(60, 84),
         sweep=rng.uniform(10, 40),
     )
-    things = _settled(items, drops, supports, bottom)
+    things = settled(items, drops, supports, bottom)
     return World("bin", supports, things, path, np.zeros(frames))
 
 
@@ -104,14 +106,14 @@ def shelf_bin(
     board, walls, top = make_compartment(rng)
     half = np.ptp(board.outline[:, :2], axis=0) / 2
     room_m = top.mesh.vertices[:, 2].min() - board.height
-    items = [_make(category, rng, kinds) for category in categories]
+    items = [make_item(category, rng, kinds) for category in categories]
     items = [i for i in items if (i.mesh.extents[:2] < 1.6 * half.min()).all()]
     drops = []
     for item in items:
         room = np.maximum(half - float(item.mesh.extents.max()) / 2 - 0.01, 0)
         drops.append(Drop(item.mesh, _turned(rng), rng.uniform(-room, room)))
     supports = (*make_room(rng, wall_chance=0.0), board, *walls)
-    things = _settled(items, drops, supports, board, highest_m=float(room_m))
+    things = settled(items, drops, supports, board, highest_m=float(room_m))
     path = walk(
         rng,
         np.array([0, 0, board.height + room_m / 3]),
@@ -124,10 +126,11 @@ def shelf_bin(
     return World("shelf_bin", (*supports, top), things, path, np.zeros(frames))
 
 
-def _make(category: str, rng: Generator, kinds: Sequence[str]) -> _Item:
+def make_item(category: str, rng: Generator, kinds: Sequence[str]) -> Item:
+    """Make something of a category, or of one of some kinds if it is of none."""
     if category == "unknown":
-        return _Item(category, *make_distractor(rng, str(rng.choice(list(kinds)))))
-    return _Item(category, category, make_object(category, rng))
+        return Item(category, *make_distractor(rng, str(rng.choice(list(kinds)))))
+    return Item(category, category, make_object(category, rng))
 
 
 def _turned(rng: Generator) -> F8:
@@ -140,15 +143,15 @@ def _turned(rng: Generator) -> F8:
     return rotation_from_quaternion(axis / np.linalg.norm(axis))
 
 
-def _settled(
-    items: Sequence[_Item],
+def settled(
+    items: Sequence[Item],
     drops: Sequence[Drop],
     supports: Sequence[Support],
     below: Support,
     *,
     highest_m: float = np.inf,
 ) -> tuple[Thing, ...]:
-    """Return what stays on a support, and lower than a height above it."""
+    """Drop things among supports; return what stays on one, and lower than a height above it."""
     rests = settle([support.mesh for support in supports], drops)
     stays = [_stays(k.mesh, rest, below, highest_m) for k, rest in zip(items, rests, strict=True)]
     tracks = np.cumsum(stays) - 1
@@ -171,7 +174,7 @@ def _stays(mesh: Mesh, rest: Rest, below: Support, highest_m: float) -> bool:
 
 
 def _thing(
-    track: int, item: _Item, rest: Rest, below: Support, tracks: F8, bearer: int | None
+    track: int, item: Item, rest: Rest, below: Support, tracks: F8, bearer: int | None
 ) -> Thing:
     axes = rest.pose.rotation[2]  # heights of the thing's own axes
     return Thing(

@@ -7,6 +7,7 @@ from numpy.random import Generator
 
 from shapecat.arrays import F8
 from shapecat.geometry import rotation_from_quaternion
+from shapecat.simulation.everyday import EVERYDAY
 from shapecat.simulation.mesh import (
     Mesh,
     extrude,
@@ -145,5 +146,6 @@ PROCEDURAL: dict[str, Callable[[Generator], Mesh]] = {
     "turned": _turned,
     "branched": _branched,
     "frame": _frame,
+    **EVERYDAY,
 }
 """The families, each with its maker."""

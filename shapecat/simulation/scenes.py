@@ -12,6 +12,7 @@ from shapecat.simulation.layout import Layout, Piece
 from shapecat.simulation.moving import crossing, rearranged, walking
 from shapecat.simulation.paths import hold, scattered, walk
 from shapecat.simulation.piles import bin_picking, pile, shelf_bin
+from shapecat.simulation.rooms import room
 from shapecat.simulation.worlds import World
 from shapecat.types import CATEGORIES
 
@@ -24,6 +25,7 @@ SceneKind = Literal[
     "pile",
     "bin",
     "shelf_bin",
+    "room",
     "turntable",
     "walking",
     "crossing",
@@ -203,6 +205,7 @@ SCENES: dict[str, Callable[[Generator, _Wish], World]] = {
     "pile": lambda rng, wish: pile(rng, wish.poured(rng), wish.frames, wish.rate_hz),
     "bin": lambda rng, wish: bin_picking(rng, wish.poured(rng), wish.frames, wish.rate_hz),
     "shelf_bin": lambda rng, wish: shelf_bin(rng, wish.poured(rng), wish.frames, wish.rate_hz),
+    "room": lambda rng, wish: room(rng, wish.draw(rng, 7), wish.frames, wish.rate_hz),
     "turntable": _turntable,
     "walking": lambda rng, wish: walking(rng, wish.draw(rng, 11), wish.frames, wish.rate_hz),
     "crossing": lambda rng, wish: crossing(rng, wish.draw(rng, 7), wish.frames, wish.rate_hz),

@@ -1,0 +1,93 @@
+"""How many detections in rooms full of other stuff are no object.
+
+    python -m benchmarks.rooms --first 790000 --count 40
+
+Simulated rooms, one frame each, every sensor in turn. What robots, people, screens, chairs, plants
+on the floor, cables, curtains and walls are detected as is surplus; so is all but the best
+detection of one object. A laptop, keyboard or plant on the table is an object of no category.
+"""
+
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import click
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.measure import markdown
+from benchmarks.scenes import SEEN_PIXELS
+from shapecat.config import Settings
+from shapecat.evaluation.overlap import MATCHED_F, match_masks
+from shapecat.learning import Categorizer, load_model
+from shapecat.perception import perceive
+from shapecat.simulation import make_scene, render_frame
+from shapecat.simulation.sensors import PRESETS
+from shapecat.simulation.worlds import FIRST_THING_LABEL
+
+Array = NDArray[Any]
+HEAD = ("sensor", "frames", "detections", "surplus", "of these pieces", "found", "surplus a frame")
+
+
+class Counts(NamedTuple):
+    """Of some frames: detections, those on no object, further pieces of one, objects, found."""
+
+    frames: int
+    detections: int
+    elsewhere: int
+    pieces: int
+    objects: int
+    found: int
+
+    def __add__(self, other: Any) -> "Counts":
+        """Return the sums."""
+        return Counts(*(int(a) + int(b) for a, b in zip(self, other, strict=True)))
+
+    def row(self, name: str) -> tuple[Any, ...]:
+        """Return a row of the table."""
+        surplus = self.elsewhere + self.pieces
+        found = f"{self.found / max(self.objects, 1):.3f}"
+        share = f"{surplus / max(self.frames, 1):.2f}"
+        return (name, self.frames, self.detections, surplus, self.pieces, found, share)
+
+
+def judge(sensor: str, seed: int, model: Categorizer, settings: Settings) -> Counts:
+    """Perceive a frame of a room, and count what is no object."""
+    rng = np.random.default_rng(seed)
+    world = make_scene("room", rng, frames=1)
+    frame, labels = render_frame(world, 0, rng=rng, sensor=PRESETS[sensor])
+    seen = perceive(frame, up=None, categorizer=model, settings=settings).detections
+    return count([d.candidate.indices for d in seen], labels.reshape(-1))
+
+
+def count(detections: list[Array], labels: Array) -> Counts:
+    """Count detections, lists of pixels, by what their pixels show."""
+    on_things = [float(np.mean(labels[d] >= FIRST_THING_LABEL)) > 0.5 for d in detections]
+    masks = [np.flatnonzero(labels == label) for label in np.unique(labels)]
+    seen = [m for m in masks if labels[m[0]] >= FIRST_THING_LABEL]
+    matches = match_masks(detections, seen)
+    kept = {row for row, _ in matches.pairs if on_things[row]}
+    listed = [k for k, mask in enumerate(seen) if len(mask) >= SEEN_PIXELS]
+    found = [k for row, k in matches.pairs if k in listed and matches.f[row, k] >= MATCHED_F]
+    pieces = sum(on_things) - len(kept)
+    elsewhere = len(detections) - sum(on_things)
+    return Counts(1, len(detections), elsewhere, pieces, len(listed), len(found))
+
+
+@click.command()
+@click.option("--first", default=3000, show_default=True, help="Seed of the first room.")
+@click.option("--count", "rooms", default=40, show_default=True, help="Rooms.")
+@click.option("--model", type=click.Path(path_type=Path), help="Model file.  [default: ours]")
+def main(first: int, rooms: int, model: Path | None) -> None:
+    """Count surplus detections in rooms, and print a table."""
+    categorizer, settings = load_model(model), Settings()
+    found = {name: Counts(0, 0, 0, 0, 0, 0) for name in PRESETS}
+    for k in range(rooms):
+        name = list(PRESETS)[k % len(PRESETS)]
+        found[name] += judge(name, first + k, categorizer, settings)
+    total = Counts(*(sum(column) for column in zip(*found.values(), strict=True)))
+    rows = [counts.row(name) for name, counts in found.items() if counts.frames]
+    click.echo(markdown("Rooms", HEAD, [*rows, total.row("all")]))
+
+
+if __name__ == "__main__":
+    main()

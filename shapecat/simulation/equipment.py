@@ -1,0 +1,192 @@
+"""What rooms are full of, besides objects: robot arms, people, screens, chairs, plants, cables."""
+
+from collections.abc import Sequence
+from itertools import pairwise
+
+import numpy as np
+from numpy.random import Generator
+from numpy.typing import ArrayLike
+
+from shapecat.arrays import F8
+from shapecat.simulation.mesh import (
+    Mesh,
+    join,
+    lathe,
+    moved,
+    rounded_box,
+    scaled,
+    smooth_path,
+    standing,
+    tube,
+)
+from shapecat.simulation.parts import ellipsoid, placed, rod
+from shapecat.types import Pose
+
+__all__ = [
+    "make_arm",
+    "make_cable",
+    "make_chair",
+    "make_curtain",
+    "make_forearm",
+    "make_keyboard",
+    "make_laptop",
+    "make_monitor",
+    "make_plant",
+]
+
+
+def make_arm(rng: Generator, base: F8, reach: F8) -> list[Mesh]:
+    """Return the links of a robot arm that stands at a place and holds its gripper over another.
+
+    Parameters
+    ----------
+    base, reach : (3,) metres, world frame: the foot, and the tips of the gripper.
+    """
+    thick = rng.uniform(0.035, 0.06)
+    wrist = _above(reach, rng.uniform(0.16, 0.24))
+    shoulder = _above(base, rng.uniform(0.2, 0.4))
+    elbow = _above((shoulder + wrist) / 2, rng.uniform(0.1, 0.35))
+    foot = placed(rod(0.04, 2 * thick), base)
+    links = [foot, *_links([base, shoulder, elbow, wrist], [thick, 0.9 * thick, 0.75 * thick])]
+    return [*links, *_gripper(rng, wrist, reach)]
+
+
+def _links(joints: Sequence[F8], radii: Sequence[float]) -> list[Mesh]:
+    """Return a limb between each two joints, and a motor at each joint but the first."""
+    parts = []
+    for (start, end), radius in zip(pairwise(joints), radii, strict=True):
+        ends = smooth_path(np.stack([start, end]), 6)
+        parts.append(tube(ends, radius * np.array([1, 0.8, 0.75, 0.75, 0.8, 1]), segments=14))
+        motor = placed(rod(3 * radius, 1.2 * radius), [0, 0, -1.5 * radius])
+        parts.append(placed(placed(motor, [0, 0, 0], about="x", degrees=90), end))
+    return parts
+
+
+def _gripper(rng: Generator, hand: F8, reach: F8) -> list[Mesh]:
+    """Return a palm, and two fingers that point down."""
+    turn, wide = rng.uniform(0, 180), rng.uniform(0.03, 0.09)
+    tall = float(hand[2] - reach[2])
+    palm = placed(rounded_box([wide + 0.05, 0.05, 0.5 * tall]), [0, 0, 0.45 * tall])
+    finger = rounded_box([0.012, 0.022, 0.5 * tall], fine=2)
+    fingers = [placed(finger, [side * wide / 2, 0, 0]) for side in (-1, 1)]
+    return [
+        placed(placed(part, [0, 0, 0], about="z", degrees=turn), [*hand[:2], reach[2]])
+        for part in (palm, *fingers)
+    ]
+
+
+def make_forearm(rng: Generator, reach: F8, start: F8) -> list[Mesh]:
+    """Return the arm and hand of a person who reaches from one place to another."""
+    over = _above((start + reach) / 2, rng.uniform(0.02, 0.12))
+    path = smooth_path(np.stack([start, over, reach]), 10)
+    arm = tube(path, np.linspace(rng.uniform(0.045, 0.06), 0.03, 10), segments=12)
+    palm = placed(ellipsoid([0.05, 0.045, 0.022]), reach)
+    ahead = (reach - start) / np.linalg.norm(reach - start)
+    side = np.array([-ahead[1], ahead[0], 0.0])
+    fingers = [
+        tube(
+            smooth_path(
+                reach
+                + np.outer([0.02, rng.uniform(0.06, 0.1)], ahead)
+                + np.outer([1.0, 1.2], spread * side)
+                - np.array([[0, 0, 0], [0, 0, 0.03]]),
+                5,
+            ),
+            0.009,
+            segments=8,
+        )
+        for spread in (-0.035, -0.012, 0.012, 0.035)
+    ]
+    return [arm, join([palm, *fingers])]
+
+
+def make_monitor(rng: Generator, place: ArrayLike, *, degrees: float) -> list[Mesh]:
+    """Return a screen on a stand."""
+    wide, tall, low = rng.uniform(0.4, 0.7), rng.uniform(0.26, 0.4), rng.uniform(0.08, 0.16)
+    parts = [
+        rounded_box([rng.uniform(0.18, 0.28), 0.18, 0.012]),
+        placed(rounded_box([0.05, 0.03, low + 0.1]), [0, 0.02, 0]),
+        placed(rounded_box([wide, 0.03, tall]), [0, 0, low]),
+    ]
+    return [_put(part, place, degrees) for part in parts]
+
+
+def make_chair(rng: Generator, place: ArrayLike, *, degrees: float) -> list[Mesh]:
+    """Return a chair: a seat, a back, four legs or one."""
+    high, wide = rng.uniform(0.42, 0.5), rng.uniform(0.38, 0.5)
+    back = rng.uniform(0.35, 0.55)
+    parts = [
+        placed(rounded_box([wide, wide, rng.uniform(0.03, 0.09)], radius=0.01), [0, 0, high]),
+        placed(rounded_box([wide, 0.04, back]), [0, wide / 2, high + rng.uniform(0.02, 0.2)]),
+    ]
+    if rng.random() < 0.4:
+        parts += [rod(high, 0.03), scaled(rod(0.06, wide / 2), [1, 1, 1])]
+    else:
+        spots = [(x, y) for x in (-0.45, 0.45) for y in (-0.45, 0.45)]
+        parts += [placed(rod(high, 0.016), [x * wide, y * wide, 0]) for x, y in spots]
+    return [_put(part, place, degrees) for part in parts]
+
+
+def make_curtain(rng: Generator, width: float, height: float, place: ArrayLike) -> Mesh:
+    """Return a curtain that hangs in folds along x."""
+    x, z = np.linspace(-width / 2, width / 2, 160), np.linspace(0, height, 4)
+    depth = rng.uniform(0.02, 0.06) * np.sin(x / rng.uniform(0.02, 0.05))
+    depth = depth * (1 + 0.5 * np.sin(3 * x + rng.uniform(0, 6)))
+    u, v = np.meshgrid(x, z)
+    points = np.stack([u, np.tile(depth, (4, 1)), v], -1).reshape(-1, 3)
+    row = np.arange(3)[:, None] * 160 + np.arange(159)[None]
+    cells = np.stack([row, row + 160, row + 1, row + 160, row + 161, row + 1], -1)
+    return placed(Mesh(points, cells.reshape(-1, 3)), place)
+
+
+def make_plant(rng: Generator) -> Mesh:
+    """Return a plant in a pot."""
+    r = rng.uniform(0.05, 0.09)
+    tall = r * rng.uniform(1.3, 2.0)
+    parts = [lathe([[0, 0], [0.75 * r, 0], [r, tall], [0.9 * r, tall], [0, 0.9 * tall]])]
+    for _ in range(int(rng.integers(7, 16))):
+        angle, out, up = rng.uniform(0, 6.3), rng.uniform(0.8, 3) * r, rng.uniform(1, 5) * r
+        c, s = np.cos(angle), np.sin(angle)
+        path = [
+            [0.2 * r * c, 0.2 * r * s, 0.9 * tall],
+            [0.5 * out * c, 0.5 * out * s, tall + up],
+            [out * c, out * s, tall + up * rng.uniform(0.5, 1.1)],
+        ]
+        width = r * rng.uniform(0.15, 0.5) * np.sin(np.linspace(0.3, 3.0, 9))
+        parts.append(tube(smooth_path(path, 9), width, segments=6, flatness=0.15))
+    return join(parts)
+
+
+def make_cable(rng: Generator, ends: F8) -> Mesh:
+    """Return a cable that lies between two places (2, 3) and wanders."""
+    steps = np.linspace(ends[0], ends[1], 6)
+    steps[1:-1, :2] += rng.normal(0, 0.06, (4, 2))
+    return tube(smooth_path(steps, 50), rng.uniform(0.002, 0.006), segments=6)
+
+
+def make_laptop(rng: Generator) -> Mesh:
+    """Return an open laptop."""
+    wide, deep = rng.uniform(0.28, 0.38), rng.uniform(0.2, 0.26)
+    base = rounded_box([wide, deep, rng.uniform(0.012, 0.022)])
+    lid = placed(rounded_box([wide, 0.008, deep]), [0, 0, 0])
+    tilt = -rng.uniform(0, 30)
+    return standing(join([base, placed(lid, [0, deep / 2, 0.012], about="x", degrees=tilt)]))
+
+
+def make_keyboard(rng: Generator) -> Mesh:
+    """Return a keyboard with rows of keys."""
+    wide, deep = rng.uniform(0.28, 0.45), rng.uniform(0.1, 0.15)
+    parts = [rounded_box([wide, deep, 0.014])]
+    key = rounded_box([0.9 * wide, deep / 7, 0.006])
+    parts += [placed(key, [0, y * deep, 0.014]) for y in (-0.33, -0.11, 0.11, 0.33)]
+    return join(parts)
+
+
+def _above(place: F8, height: float) -> F8:
+    return np.asarray(place + np.array([0.0, 0.0, height]))
+
+
+def _put(mesh: Mesh, place: ArrayLike, degrees: float) -> Mesh:
+    """Turn a mesh about z and move it."""
+    turned = placed(mesh, [0, 0, 0], about="z", degrees=degrees)
+    return moved(turned, Pose(np.eye(3), np.asarray(place, np.float64)))

@@ -1,0 +1,44 @@
+"""Rooms: what is no object is labelled so, and the benchmark counts what is detected on it."""
+
+import numpy as np
+import pytest
+
+from benchmarks.rooms import count
+from shapecat.simulation import make_scene
+from shapecat.simulation.distractors import make_distractor
+from shapecat.simulation.procedural import PROCEDURAL
+from shapecat.simulation.worlds import FIRST_THING_LABEL
+
+THING = FIRST_THING_LABEL
+
+
+def test_rooms_hold_objects_and_much_else() -> None:
+    """Otherwise the benchmark counts nothing."""
+    rooms = [make_scene("room", np.random.default_rng(seed), frames=1) for seed in range(8)]
+    assert sum(any(s.name.startswith("robot") for s in room.supports) for room in rooms) > 4
+    assert sum(any(s.name.startswith("room_") for s in room.supports) for room in rooms) > 4
+    for room in rooms:
+        assert len(room.things) >= 3
+        assert len({s.name for s in room.supports}) == len(room.supports)
+        assert all(1 <= s.label <= 9 for s in room.supports)
+
+
+def test_detections_on_no_object_and_pieces_are_surplus() -> None:
+    labels = np.repeat([2, 6, THING, THING + 1], 1000)
+    arm, most, rest = np.arange(1200, 1700), np.arange(2000, 2800), np.arange(2800, 3000)
+    blend = np.concatenate([np.arange(3000, 3400), np.arange(0, 700)])  # mostly table
+    counts = count([arm, most, rest, blend], labels)
+    assert (counts.detections, counts.elsewhere, counts.pieces) == (4, 2, 1)
+    assert (counts.objects, counts.found) == (2, 1)
+    total = counts + count([most], labels)
+    assert total.row("all")[3:] == (3, 1, "0.500", "1.50")
+
+
+@pytest.mark.parametrize("kind", PROCEDURAL)
+def test_families_make_things_of_the_size_of_a_hand(kind: str) -> None:
+    """What is learned as unknown fits on a table, and no two are alike."""
+    found = [make_distractor(np.random.default_rng(seed), kind)[1] for seed in range(30)]
+    for mesh in found:
+        assert 0.02 < mesh.extents.max() < 0.6
+        assert abs(mesh.vertices[:, 2].min()) < 1e-6
+    assert len({mesh.extents.tobytes() for mesh in found}) == len(found)
