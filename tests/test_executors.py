@@ -101,10 +101,8 @@ def test_terminate_kills_running_tasks(tmp_path: Path) -> None:
     waiting = one.submit(abs, -1)
     wait_for(lambda: (tmp_path / "pid").exists() and (tmp_path / "pid").read_text())
 
-    begun = time.monotonic()
     one.terminate()
 
-    assert time.monotonic() - begun < 3
     assert isinstance(running.exception(timeout=5), WorkerLostError)
     assert waiting.cancelled()
     assert not alive(int((tmp_path / "pid").read_text()))

@@ -2,11 +2,13 @@
 
 import itertools
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy import sparse
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.utils.estimator_checks import check_estimator
 
@@ -18,11 +20,12 @@ from shapecat.learning.calibration import fit_temperature, softmax
 from shapecat.learning.dictionary import ForestDictionary, WordLearner
 from shapecat.learning.features import FeatureBank
 from shapecat.learning.forest import FlatForest, flatten
-from shapecat.learning.incremental import add_categories
+from shapecat.learning.incremental import _Inputs, _shift, add_categories
 from shapecat.learning.pnn import ProbabilisticNeuralNetwork
 from shapecat.learning.training import (
     Examples,
     LearningSettings,
+    calibrate,
     choose_evenly,
     encode,
     fit_categorizer,
@@ -96,8 +99,11 @@ def test_flat_forest_falls_into_the_leaves_of_scikit_learn() -> None:
 
 
 @pytest.mark.parametrize("kernels", [0, 20])
-def test_prediction_agrees_with_scikit_learn(kernels: int) -> None:
-    """The compiled walk is a second implementation: it may not say anything else."""
+def test_prediction_agrees_with_the_fitted_chain(kernels: int) -> None:
+    """The compiled walk is a second implementation: it may not say anything else.
+
+    That its trees are walked as scikit-learn walks them, `test_flat_forest_falls…` checks.
+    """
     chosen = replace(SMALL, kernels=kernels)
     train, test = blobs(60, 1, (*CATEGORIES, UNKNOWN)), blobs(50, 9)
     chain = make_chain(BLOCKS, chosen, seed=0).fit(
@@ -337,3 +343,42 @@ def test_trees_that_would_not_end_are_refused(left: list[int]) -> None:
 
     with pytest.raises(ValueError, match="damaged"):
         FlatForest(np.array([0]), nothing, nothing, np.array(left))
+
+
+@pytest.mark.parametrize("rejected", [0.05, 0.2])
+def test_the_novelty_threshold_rejects_the_promised_share(rejected: float) -> None:
+    """Of the views it is chosen on, to the view; of fresh ones of the same kind, about as many."""
+    model = calibrate(fit(), blobs(400, 2), rejected=rejected)
+    seen, fresh = (model.predict(blobs(400, seed).descriptors).novelty > 1 for seed in (2, 3))
+
+    assert np.mean(seen) == pytest.approx(rejected, abs=0.003)
+    assert np.mean(fresh) == pytest.approx(rejected, abs=0.35 * rejected)
+
+
+def test_new_categories_are_raised_by_views_that_are_right_and_not_learned_from(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Views that are wrong already cannot be lost, and views learned from would be too kind."""
+    count = 200
+    rows = np.arange(count, dtype=np.float64)[:, None]
+    inputs = _Inputs(rows, sparse.csr_array((count, 1)))
+    margins = 1.0 + rows[:, 0] / count
+    truth = np.zeros(count, np.int64)
+    old = np.stack([margins, np.zeros(count)], axis=1)
+    old[::2] = [0.0, 0.01]  # every other view is taken for another category
+    fitted_on: list[set[float]] = []
+
+    def fit_new(some: _Inputs, *_: object) -> Any:
+        fitted_on.append(set(some.features[:, 0]))
+        return np.zeros((3, 1))
+
+    def logits(some: _Inputs, _: object) -> Any:
+        assert not fitted_on[-1] & set(some.features[:, 0])
+        return np.zeros((len(some.features), 1))
+
+    monkeypatch.setattr("shapecat.learning.incremental._fit_new", fit_new)
+    monkeypatch.setattr("shapecat.learning.incremental._logits", logits)
+    shift = _shift(inputs, old, truth, np.zeros((3, 1)), 0.1, np.random.default_rng(0))
+
+    assert len(fitted_on) > 1
+    assert shift == pytest.approx(float(np.quantile(margins[1::2], 0.006)))

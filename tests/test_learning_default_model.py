@@ -1,6 +1,5 @@
 """The model that is shipped, and the simulated views it is made from."""
 
-import time
 from importlib.resources import files
 from pathlib import Path
 
@@ -41,19 +40,6 @@ def test_the_shipped_model_is_small_and_has_its_card() -> None:
     assert load_model().model_id in (folder / "MODEL_CARD.md").read_text("utf-8")
 
 
-def test_the_shipped_model_answers_fast(model: Categorizer) -> None:
-    """Walked in Python its trees take far longer; how fast it is, the benchmarks say."""
-    x = np.zeros((1, len(DESCRIPTOR_NAMES)), np.float32)
-    model.predict(x)
-    seconds = []
-    for _ in range(200):
-        begun = time.perf_counter()
-        model.predict(x)
-        seconds.append(time.perf_counter() - begun)
-
-    assert min(seconds) < 3e-3
-
-
 def test_unseen_simulated_objects_are_recognised(model: Categorizer) -> None:
     """A few tables of a seed that nothing was made with; the card has the real figures."""
     kinds = ("pan", "hammer", "shoe", "chair")
@@ -63,7 +49,7 @@ def test_unseen_simulated_objects_are_recognised(model: Categorizer) -> None:
 
     assert report.n > 30
     assert report.accuracy is not None
-    assert report.accuracy > 0.85
+    assert report.accuracy > 0.95  # 0.984 when the model was made
 
 
 @pytest.fixture(scope="module")

@@ -157,12 +157,18 @@ def test_clouds_give_the_same_as_depth_images(
 
 
 def same_detections(expected: Path, actual: Path, *, atol: float) -> None:
-    columns = ("frame", "detection", "center", "category")
+    columns = ("frame", "detection", "center", "category", "posterior", "novelty")
     want, have = (rows(folder, "detections", *columns) for folder in (expected, actual))
     have_frames = {row["frame"] for row in have}
     want = [row for row in want if row["frame"] in have_frames]
     assert len(want) == len(have) > 0
     assert_allclose([r["center"] for r in have], [r["center"] for r in want], atol=atol)
+    same = [a["category"] == b["category"] for a, b in zip(have, want, strict=True)]
+    if atol < 1e-5:
+        assert all(same)
+        for name in ("posterior", "novelty"):
+            assert_allclose([r[name] for r in have], [r[name] for r in want], atol=1e-4)
+    assert np.mean(same) >= 0.9
 
 
 def test_same_input_gives_the_same_tables(

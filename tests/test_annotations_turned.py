@@ -1,0 +1,220 @@
+"""Annotations of a turned box with numbers that are all different, in every encoding."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.records import ChunkIndex
+from mcap_ros2.decoder import DecoderFactory
+from numpy.testing import assert_allclose
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.spatial.transform import Rotation
+
+from shapecat.outputs.annotated_mcap import write_annotated
+from shapecat.outputs.annotation import Annotation, text_position
+from shapecat.outputs.annotations import encoder_for
+from shapecat.outputs.colours import colour_of
+from shapecat.recordings import open_recording
+from shapecat.recordings.protobuf import message_decoder
+from shapecat.types import ShownBox, ShownFrame
+from tests.test_annotated_mcap import write_mcap
+
+SECOND = 10**9
+STAMP = 1_700_000_123 * SECOND + 456_789_012
+TURN = Rotation.from_euler("zyx", [0.9, -0.5, 2.4])
+CENTER, SIZE = (0.31, -0.22, 1.17), (0.06, 0.11, 0.19)
+BOX = ShownBox(7, "bowl", 0.625, CENTER, SIZE, tuple(TURN.as_quat().tolist()))
+FRAME = ShownFrame("/points", 4, STAMP, STAMP + 11, "optical", (BOX,), (5, 6))
+ANNOTATION = Annotation(FRAME, 2 * SECOND + 250_000_000, (5, 6))
+ABOVE = CENTER + TURN.apply([0, 0, SIZE[2] / 2 + 0.03])
+
+
+def decode_ros(name: str, schema: bytes, data: bytes, *, ros1: bool) -> Any:
+    """Decode with the definition that is embedded, as a reader in the field has to."""
+    store = get_typestore(Stores.EMPTY)
+    store.register(get_types_from_msg(schema.decode(), name.replace("/msg/", "/")))
+    kind = name if "/msg/" in name else name.replace("/", "/msg/")
+    return (store.deserialize_ros1 if ros1 else store.deserialize_cdr)(data, kind)
+
+
+def plain(message: Any) -> Any:
+    """Return a message as attributes, whatever it was decoded by; times in nanoseconds."""
+    if isinstance(message, dict):
+        message = SimpleNamespace(**message)
+    if isinstance(message, list | tuple):
+        return [plain(item) for item in message]
+    fields = getattr(message, "__dict__", None) or {
+        name: getattr(message, name) for name in getattr(message, "__slots__", ())
+    }
+    if not fields:
+        return message
+    names = set(fields) - {"__msgtype__"}
+    for seconds in ("sec", "seconds"):
+        if seconds in names and len(names) == 2:
+            (rest,) = names - {seconds}
+            return fields[seconds] * SECOND + fields[rest]
+    return SimpleNamespace(**{name: plain(fields[name]) for name in names})
+
+
+def messages(encoding: str) -> dict[str, Any]:
+    """Return the message of each topic, decoded by what its channel says of itself."""
+    found = {}
+    for channel, encode in encoder_for(encoding, markers=True):
+        (data,) = encode([ANNOTATION])
+        if encoding == "json":
+            message = json.loads(data)
+        elif encoding == "protobuf":
+            message = message_decoder(channel.schema, channel.schema_name)(data)
+        else:
+            message = decode_ros(
+                channel.schema_name, channel.schema, bytes(data), ros1=encoding == "ros1"
+            )
+        found[channel.topic] = plain(message)
+    return found
+
+
+def numbers(record: Any, names: str) -> list[float]:
+    return [getattr(record, name) for name in names]
+
+
+def same_turn(quaternion: Any) -> float:
+    """Return how far a quaternion (x, y, z, w) is from that of the box, radians."""
+    return float((Rotation.from_quat(numbers(quaternion, "xyzw")) * TURN.inv()).magnitude())
+
+
+def check_box(pose: Any, size: Any) -> None:
+    assert_allclose(numbers(pose.position, "xyz"), CENTER, atol=1e-6)
+    assert same_turn(pose.orientation) < 1e-6
+    assert_allclose(numbers(size, "xyz"), SIZE, atol=1e-6)
+
+
+def test_the_label_stands_above_the_top_of_the_box() -> None:
+    """By the transposed rotation it stands beside a box that is tilted."""
+    assert_allclose(text_position(*BOX[3:]), ABOVE, atol=1e-12)
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1", "json", "protobuf"])
+def test_a_scene_says_the_same_in_every_encoding(encoding: str) -> None:
+    scene = messages(encoding)["/shapecat/scene"]
+    (entity,), colour = scene.entities, np.array(colour_of("bowl")) / 255
+
+    assert (entity.timestamp, entity.frame_id, entity.id) == (STAMP, "optical", "track-7")
+    assert entity.lifetime == 2 * SECOND + 250_000_000
+    assert entity.frame_locked is False
+    (cube,), (text,) = entity.cubes, entity.texts
+    check_box(cube.pose, cube.size)
+    assert_allclose(numbers(cube.color, "rgba"), [*colour, 0.5], atol=1e-6)
+    assert_allclose(numbers(text.pose.position, "xyz"), ABOVE, atol=1e-6)
+    assert (text.billboard, text.font_size, text.scale_invariant) == (True, 0.03, False)
+    assert_allclose(numbers(text.color, "rgba"), [*colour, 1.0], atol=1e-6)
+    assert "7" in text.text
+    assert "bowl" in text.text
+    said = {item.key: item.value for item in entity.metadata}
+    assert said == {"category": "bowl", "confidence": "0.6250", "track": "7"}
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1", "json", "protobuf"])
+def test_a_deletion_removes_one_entity_and_not_the_scene(encoding: str) -> None:
+    """Type 1 of foxglove.SceneEntityDeletion removes all entities of the topic."""
+    deletions = messages(encoding)["/shapecat/scene"].deletions
+
+    assert [(d.timestamp, int(d.type), d.id) for d in deletions] == [
+        (STAMP, 0, "track-5"),
+        (STAMP, 0, "track-6"),
+    ]
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
+def test_detections_keep_every_number_in_its_place(encoding: str) -> None:
+    message = messages(encoding)["/shapecat/detections"]
+    (item,) = message.detections
+
+    for header in (message.header, item.header):
+        assert (header.stamp, header.frame_id) == (STAMP, "optical")
+    check_box(item.bbox.center, item.bbox.size)
+    (result,) = item.results
+    check_box(result.pose.pose, item.bbox.size)
+    assert (result.hypothesis.class_id, result.hypothesis.score) == ("bowl", 0.625)
+    assert item.id == "7"
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
+def test_markers_stand_where_the_boxes_do(encoding: str) -> None:
+    """RViz: a cube is type 1, a text that faces the viewer 9; action 2 removes one marker."""
+    markers = messages(encoding)["/shapecat/markers"].markers
+    gone, (cube, text) = markers[:4], markers[4:]
+
+    assert [(m.ns, m.id, m.action) for m in gone] == [
+        (f"shapecat/{kind}", track, 2) for track in (5, 6) for kind in ("box", "text")
+    ]
+    for marker in (cube, text):
+        assert (marker.header.stamp, marker.header.frame_id) == (STAMP, "optical")
+        assert (marker.id, marker.action) == (7, 0)
+        assert marker.lifetime == 2 * SECOND + 250_000_000
+    assert (cube.ns, cube.type, text.ns, text.type) == ("shapecat/box", 1, "shapecat/text", 9)
+    check_box(cube.pose, cube.scale)
+    assert_allclose(numbers(text.pose.position, "xyz"), ABOVE, atol=1e-6)
+    assert text.scale.z == pytest.approx(0.03)
+    colour = np.array(colour_of("bowl")) / 255
+    assert_allclose(numbers(cube.color, "rgba"), [*colour, 0.5], atol=1e-6)
+    assert_allclose(numbers(text.color, "rgba"), [*colour, 1.0], atol=1e-6)
+
+
+def chunk_indexes(path: Path) -> list[ChunkIndex]:
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    return list(summary.chunk_indexes)
+
+
+def index_end(data: bytes, at: int, count: int) -> int:
+    """Return where so many message index records (opcode 7) end that begin at a place."""
+    for _ in range(count):
+        assert data[at] == 7
+        at += 9 + int.from_bytes(data[at + 1 : at + 9], "little")
+    return at
+
+
+def test_chunk_indexes_tell_where_their_message_indexes_end(tmp_path: Path) -> None:
+    """Readers that fetch a chunk with its index in one request go by this length."""
+    frames = [replace(FRAME, index=k, log_time_ns=STAMP + k) for k in range(900)]
+    target = tmp_path / "out.mcap"
+    with open_recording(write_mcap(tmp_path / "a.mcap")) as recording:
+        write_annotated(recording, target, iter(frames), run={}, markers=True)
+    data, found = target.read_bytes(), chunk_indexes(target)
+
+    assert len(found) > 3
+    for index in found:
+        after = index.chunk_start_offset + index.chunk_length
+        end = index_end(data, after, len(index.message_index_offsets))
+        assert end - after == index.message_index_length
+        assert min(index.message_index_offsets.values()) == after
+
+
+def test_added_messages_are_found_by_time(tmp_path: Path) -> None:
+    """A seek reads only the chunks whose times say so."""
+    frames = [replace(FRAME, index=k, log_time_ns=STAMP + k * SECOND) for k in range(400)]
+    target = tmp_path / "out.mcap"
+    with open_recording(write_mcap(tmp_path / "a.mcap")) as recording:
+        write_annotated(recording, target, iter(frames), run={}, markers=False)
+    with target.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        window = {"starting_at": STAMP + 150 * SECOND, "ending_before": STAMP + 155 * SECOND}
+        times = [
+            message.log_time
+            for *_, message in reader.iter_messages(["/shapecat/detections"], **window)
+        ]
+        summary = reader.get_summary()
+
+    assert times == [STAMP + k * SECOND for k in range(150, 155)]
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_end_time == STAMP + 399 * SECOND
+    topics = {channel.id: channel.topic for channel in summary.channels.values()}
+    counts = {topics[k]: n for k, n in summary.statistics.channel_message_counts.items()}
+    assert counts == {"/points": 9, "/shapecat/detections": 400, "/shapecat/scene": 400}

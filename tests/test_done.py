@@ -1,0 +1,195 @@
+"""What counts as done: only the same work on the same content, and never half a line."""
+
+import json
+import os
+from collections.abc import Mapping
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from shapecat.batch import manifest as manifests
+from shapecat.batch.manifest import Entry, Manifest
+from shapecat.batch.plans import plan_batch
+from shapecat.batch.runs import Outcome, exit_code
+from shapecat.config import Settings
+from shapecat.errors import OutputError
+from shapecat.runs.folder import read_run, write_run
+from shapecat.runs.identity import work_id
+from shapecat.runs.jobs import Job, describe_run, resume, same_options
+
+MODEL: Any = SimpleNamespace(model_id="m1", categories=("cup", "can"))
+
+
+@pytest.fixture
+def source(tmp_path: Path) -> Path:
+    path = tmp_path / "lab.mcap"
+    path.write_bytes(b"recording")
+    return path
+
+
+def planned(source: Path, **changes: Any) -> dict[str, Any]:
+    run = describe_run(Job(source, source.parent / "lab", **changes), MODEL)
+    run["input"]["digest"] = "xxh3-128:0123"
+    return run
+
+
+CHANGES: Mapping[str, Mapping[str, Any]] = {
+    "settings": {"settings": Settings(seed=8)},
+    "start": {"start_s": 0.5},
+    "end": {"end_s": 0.5},
+    "every": {"every": 3},
+    "up": {"up": "imu"},
+    "fixed frame": {"fixed_frame": "odom"},
+    "topics": {"topics": ("/a",)},
+}
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_other_options_are_other_work(source: Path, name: str) -> None:
+    """Results of other work under the same name would be taken for those asked for."""
+    run, other = planned(source), planned(source, **CHANGES[name])
+
+    assert same_options(run, planned(source))
+    assert not same_options(run, other)
+    assert work_id(run) != work_id(other)
+
+
+@pytest.mark.parametrize("key", ["model", "version", "content"])
+def test_another_model_version_or_content_is_other_work(source: Path, key: str) -> None:
+    run, other = planned(source), planned(source)
+    if key == "model":
+        other["model"] = {**other["model"], "id": "m2"}
+        assert not same_options(run, other)
+    elif key == "version":
+        other["versions"] = {**other["versions"], "shapecat": "0.0.1"}
+    else:
+        other["input"] = {**other["input"], "digest": "xxh3-128:4567"}
+
+    assert work_id(run) == work_id(planned(source))
+    assert work_id(run) != work_id(other)
+
+
+@pytest.mark.parametrize("name", ["color", "mcap", "rrd"])
+def test_outputs_do_not_change_what_the_tables_are_of(source: Path, name: str) -> None:
+    """So that labels of a run without a review fit one with it."""
+    changed: Any = {"color": {"color": ""}, "mcap": {"mcap": False}, "rrd": {"rrd": False}}
+    assert work_id(planned(source)) == work_id(planned(source, **changed[name]))
+
+
+def partial(folder: Path, run: dict[str, Any]) -> None:
+    (folder / "segments" / "000000").mkdir(parents=True)
+    write_run(folder, run)
+
+
+def test_a_partial_run_of_the_same_work_goes_on(source: Path, tmp_path: Path) -> None:
+    folder, run = tmp_path / "half", planned(source)
+    partial(folder, run)
+
+    assert resume(folder, planned(source), source, lambda: "")["id"] == run["id"]
+    assert (folder / "segments" / "000000").exists()
+
+
+@pytest.mark.parametrize("what", ["model", "settings", "shapecat", "numpy", "content"])
+def test_a_partial_run_of_other_work_is_begun_anew(source: Path, tmp_path: Path, what: str) -> None:
+    """Half of the tables would be of another model or version."""
+    folder, run = tmp_path / "half", planned(source)
+    if what == "model":
+        run["model"] = {**run["model"], "id": "m2"}
+    elif what == "settings":
+        run["settings"] = {**run["settings"], "seed": 99}
+    elif what == "content":
+        run["input"] = {**run["input"], "files": [["lab.mcap", 5, 1, 1]]}
+    else:
+        run["versions"] = {**run["versions"], what: "0.0.1"}
+    partial(folder, run)
+    wanted = planned(source)
+
+    assert resume(folder, wanted, source, lambda: "xxh3-128:other")["id"] == wanted["id"]
+    assert not (folder / "segments").exists()
+    assert read_run(folder)["id"] == wanted["id"]
+
+
+def status_of(job: Job, source: Path, out: Path) -> str:
+    with plan_batch(job, [str(source.parent)], str(out)) as batch:
+        return next(task.status for task in batch.tasks if task.job.folder.name == source.stem)
+
+
+def test_a_batch_takes_nothing_of_another_model_for_done(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The plan goes by the manifest alone, without opening a file."""
+    (source.parent / "other.mcap").write_bytes(b"another")
+    out, job = tmp_path / "out", Job(Path(), Path(), mcap=False, rrd=False)
+    (out / "lab").mkdir(parents=True)
+    write_run(out / "lab", {"id": "1", "seconds": {}})
+    model = SimpleNamespace(model_id="m1")
+    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: model)
+    with plan_batch(job, [str(source.parent)], str(out)) as batch:
+        assert batch.manifest is not None
+        (task,) = (task for task in batch.tasks if task.job.folder.name == "lab")
+        batch.manifest.record(
+            [Entry("lab", "lab.mcap", "complete", input=task.input, work=task.work)]
+        )
+
+    assert status_of(job, source, out) == "complete"
+    model.model_id = "m2"
+    assert status_of(job, source, out) == "check"
+    model.model_id = "m1"
+    assert status_of(Job(Path(), Path(), settings=Settings(seed=3), rrd=False), source, out) != (
+        "complete"
+    )
+    source.write_bytes(b"recordinG")
+    assert status_of(job, source, out) == "check"
+
+
+def test_a_full_disk_leaves_no_torn_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The half of a line that did fit is taken back; else the next line is glued to it."""
+    path = tmp_path / "manifest.jsonl"
+    Manifest(path).record([Entry("a", "a.mcap", "complete")])
+    whole = path.read_bytes()
+    write = os.write
+
+    def fill(file: int, content: bytes) -> int:
+        if len(content) > 20:
+            return write(file, content[:20])
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(manifests.os, "write", fill)
+        with pytest.raises(OutputError, match="No space left"):
+            Manifest(path).record([Entry("b", "b" * 200, "failed")])
+    assert path.read_bytes() == whole
+
+    Manifest(path).record([Entry("c", "c.mcap", "planned")])
+    assert [json.loads(line)["folder"] for line in path.read_text().splitlines()] == ["a", "c"]
+
+
+def test_a_torn_line_of_a_crash_swallows_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "manifest.jsonl"
+    path.write_bytes(b'{"folder": "a", "recording": "a.mcap", "state": "comp')
+    Manifest(path).record([Entry("b", "b.mcap", "failed", tries=2, exit_code=3, message="bad")])
+
+    entry = Manifest(path).entries["b"]
+    assert (entry.state, entry.tries, entry.exit_code, entry.message) == ("failed", 2, 3, "bad")
+    assert list(Manifest(path).entries) == ["b"]
+
+
+def test_the_last_line_of_a_recording_holds(tmp_path: Path) -> None:
+    path = tmp_path / "manifest.jsonl"
+    for state in ("planned", "running", "failed", "complete"):
+        Manifest(path).record([Entry("a", "a.mcap", state)])  # type: ignore[arg-type]  all are states
+
+    assert Manifest(path).entries["a"].state == "complete"
+
+
+@pytest.mark.parametrize(
+    ("codes", "expected"),
+    [((0, 0), 0), ((0, 3), 1), ((3, 4), 3), ((4, 1), 4), ((1, 2), 2), ((1,), 1), ((), 0)],
+)
+def test_exit_codes_of_a_batch(codes: tuple[int, ...], expected: int) -> None:
+    """Documented in the reference: scripts go by them."""
+    outcomes = [Outcome(Job(Path("a"), Path("b")), code=code) for code in codes]
+
+    assert exit_code(outcomes) == expected

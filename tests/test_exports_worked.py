@@ -1,0 +1,160 @@
+"""Exports of one turned box that is worked out by hand, read as each format is described."""
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
+
+from shapecat.evaluation.clouds import read_pcd
+from shapecat.geometry import IDENTITY
+from shapecat.outputs.exports_kitti import write_kitti
+from shapecat.outputs.exports_labelcloud import write_labelcloud
+from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas
+
+CAMERA = Camera(160, 120, 143.0, 139.0, 77.4, 61.9)
+PITCH, ROLL = np.radians(34.0), np.radians(6.0)
+LEVEL_FROM_SENSOR = Rotation.from_euler("x", -PITCH) * Rotation.from_euler("z", ROLL)
+"""From the optical frame (x right, y down, z forward) to one whose y points along gravity."""
+UP = LEVEL_FROM_SENSOR.inv().apply([0, -1, 0])
+SIZE = np.array([0.31, 0.14, 0.23])
+"""Length, width and height of the box."""
+CENTER = np.array([-0.37, 0.52, 1.64])
+"""In the level camera: 0.37 m left, 0.52 m below, 1.64 m ahead."""
+YAW = 0.7
+"""From the level camera's x axis, about its y axis, which points down."""
+AXES = np.array(  # in the level camera: length, width, up
+    [[np.cos(YAW), 0, -np.sin(YAW)], [np.sin(YAW), 0, np.cos(YAW)], [0, -1, 0]]
+)
+PIXELS = [(40, 70), (41, 70), (63, 92), (52, 81)]
+"""Columns and rows that the object covers."""
+
+
+def labelled(*, cut: bool, hidden: bool) -> LabelledFrame:
+    turn = LEVEL_FROM_SENSOR.inv()
+    axes = turn.apply(AXES).T
+    box = Box(turn.apply(CENTER), SIZE, Rotation.from_matrix(axes).as_quat())
+    indices = np.array(sorted(v * CAMERA.width + u for u, v in PIXELS), np.uint32)
+    item = LabelledObject(
+        4, "bowl", 0.9, box, indices, NeuralGas(np.zeros((0, 3)), np.zeros((0, 2))),
+        np.array([1.0]), np.array([1.0]), touches_border=cut, occluded=hidden,
+    )  # fmt: skip
+    return LabelledFrame("/depth", 0, 5, 6, "optical", None, (), (item,), (), {}, UP)
+
+
+def frame() -> Frame:
+    """Return a depth image of a wall that is not parallel to it."""
+    v, u = np.mgrid[:120, :160]
+    depth = (1.2 + 0.003 * u + 0.002 * v).astype(np.float32)
+    return Frame("/depth", 0, 5, 6, "optical", depth, CAMERA)
+
+
+def kitti(folder: Path, *, cut: bool, hidden: bool) -> list[str]:
+    seen: Any = [(labelled(cut=cut, hidden=hidden), frame(), None)]
+    unused: Any = SimpleNamespace()
+    assert write_kitti(folder, seen, unused) == 1
+    return (folder / "label_2" / "000000.txt").read_text().split()
+
+
+def test_kitti_line_is_the_one_worked_out_by_hand(tmp_path: Path) -> None:
+    """Every number in its place and with its sign.
+
+    The bottom lies half a height below the centre; alpha is the yaw less the bearing of the box,
+    which lies to the left: so it is larger than the yaw.
+    """
+    kind, truncated, occluded, *words = kitti(tmp_path, cut=True, hidden=False)
+    alpha, *box = map(float, words[:5])
+    height, width, length, x, y, z, yaw = map(float, words[5:])
+
+    assert kind == "bowl"
+    assert (float(truncated), occluded) == (1.0, "0")
+    assert_allclose([height, width, length], [0.23, 0.14, 0.31], atol=1e-5)
+    assert_allclose([x, y, z], [-0.37, 0.52 + 0.115, 1.64], atol=1e-5)
+    assert yaw == pytest.approx(0.7, abs=1e-5)
+    assert alpha == pytest.approx(0.7 + np.arctan(0.37 / 1.64), abs=1e-5)
+    assert box == [40, 70, 63, 92]
+
+
+def test_kitti_tells_cut_from_hidden(tmp_path: Path) -> None:
+    """Truncated is left to right cut by the image; occluded is hidden by something else."""
+    assert kitti(tmp_path, cut=False, hidden=True)[1:3] == ["0.0", "1"]
+
+
+def test_kitti_calibration_leads_from_points_to_pixels(tmp_path: Path) -> None:
+    kitti(tmp_path, cut=False, hidden=False)
+    lines = (tmp_path / "calib" / "000000.txt").read_text().splitlines()
+    matrices = {
+        name: np.array(list(map(float, text.split()))).reshape(3, -1)
+        for name, text in (line.split(": ") for line in lines)
+    }
+    points = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
+    velo = np.column_stack([points[:, :3], np.ones(len(points))])
+    rectified = matrices["R0_rect"] @ matrices["Tr_velo_to_cam"] @ velo.T
+    pixels = matrices["P2"] @ np.vstack([rectified, np.ones(len(points))])
+
+    v, u = np.mgrid[:120, :160]
+    assert_allclose(pixels[0] / pixels[2], u.ravel(), atol=2e-3)
+    assert_allclose(pixels[1] / pixels[2], v.ravel(), atol=2e-3)
+    own = frame().xyz()
+    level = LEVEL_FROM_SENSOR.apply(own)  # x right, y down, z forward
+    assert_allclose(velo[:, :3], level[:, [2, 0, 1]] * [1, -1, -1], atol=1e-5)
+    assert (points[:, 3] == 0).all()
+
+
+def labelcloud(folder: Path) -> None:
+    finished: Any = SimpleNamespace(
+        categories=("cup", "bowl"), run={"versions": {"shapecat": "0"}}, labels={}
+    )
+    assert write_labelcloud(folder, [(labelled(cut=False, hidden=False), frame())], finished) == 1
+
+
+def corners_of(center: Sequence[float], size: Any, yaw: float) -> Any:
+    turn = Rotation.from_euler("z", yaw)
+    unit = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / 2
+    return turn.apply(unit * size) + center
+
+
+def apart(a: Any, b: Any) -> float:
+    """Return how far two sets of corners are from each other, whatever their order."""
+    return float(np.linalg.norm(a[:, None] - b[None], axis=2).min(axis=1).max())
+
+
+def test_labelcloud_clouds_are_in_the_frame_of_their_boxes(tmp_path: Path) -> None:
+    """Opened with our reader of PCD and with the format's own words."""
+    labelcloud(tmp_path)
+    (item,) = json.loads((tmp_path / "labels" / "000000.json").read_text())["objects"]
+    center, size = item["centroid"], item["dimensions"]
+    box = corners_of(
+        [center[a] for a in "xyz"],
+        [size[n] for n in ("length", "width", "height")],
+        item["rotations"]["z"],
+    )
+    (vertices,) = json.loads((tmp_path / "labels_vertices" / "000000.json").read_text())["objects"]
+    path = tmp_path / "pointclouds" / "000000.pcd"
+    header = path.read_bytes().split(b"DATA binary\n")[0].decode().splitlines()
+    words = {line.split()[0]: line.split()[1:] for line in header}
+    points = np.frombuffer(path.read_bytes().split(b"DATA binary\n", 1)[1], "<f4").reshape(-1, 3)
+
+    assert item["name"] == "bowl"
+    # The sensor is at the origin of both: from there box and points must look the same.
+    w, x, y, z = map(float, words["VIEWPOINT"][3:])
+    level_from_sensor = Rotation.from_quat([x, y, z, w])
+    assert_allclose(level_from_sensor.apply(frame().xyz()), points, atol=1e-5)
+    assert_allclose(level_from_sensor.apply(UP), [0, 0, 1], atol=1e-5)
+    source = labelled(cut=False, hidden=False).objects[0].box
+    turn = Rotation.from_quat(source.orientation)
+    unit = np.array([[a, b, c] for a in (-1, 1) for b in (-1, 1) for c in (-1, 1)]) / 2
+    meant = level_from_sensor.apply(turn.apply(unit * source.size) + source.center)
+    assert apart(meant, box) < 1e-4
+    assert apart(meant, np.array(vertices["vertices"])) < 1e-4
+    assert len(read_pcd(path).points) == len(points)
+
+
+def test_identity_is_not_the_pose_of_this_example() -> None:
+    """A turn that changes nothing would let every mistake pass."""
+    assert np.abs(LEVEL_FROM_SENSOR.as_matrix() - IDENTITY.rotation).max() > 0.3

@@ -1,0 +1,283 @@
+"""The tables of a sensor that is turned and moved, every number another: checked by SciPy."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from shapecat.config import TrackingSettings
+from shapecat.outputs.rereading import clouds_again, open_source
+from shapecat.pipeline import annotate_again
+from shapecat.runs.corrections import read_labels
+from shapecat.runs.folder import read_run
+from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.perceived import FrameRow, PerceptionTables
+from shapecat.runs.shown import read_shown_frames
+from shapecat.runs.tracks import _read_frames, track_run
+from shapecat.types import (
+    Box,
+    Candidate,
+    Detection,
+    FullBox,
+    NeuralGas,
+    Perception,
+    Plane,
+    Pose,
+    Scene,
+)
+
+CATEGORIES = ("cup", "can", "bowl")
+SECOND = 10**9
+EPOCH = 1_700_000_000 * SECOND
+FRAMES = 6
+TURNS = Rotation.from_euler("xyz", [[0.4 + 0.02 * k, -0.7, 1.9 + 0.05 * k] for k in range(FRAMES)])
+PLACES = np.array([[1.3 + 0.01 * k, -2.1, 0.6 + 0.02 * k] for k in range(FRAMES)])
+CENTERS = np.array([[3.1, 4.2, 0.7], [3.5, 4.9, 0.8], [2.6, 4.4, 0.9]])
+"""Of three objects that stand still in the fixed frame, metres."""
+UP = np.array([0.0, 0.0, 1.0])
+AXES = Rotation.from_euler("z", 0.6)
+POSTERIORS = np.array(
+    [
+        [[0.7, 0.2, 0.1], [0.6, 0.3, 0.1], [0.5, 0.1, 0.4]],
+        [[0.2, 0.7, 0.1], [0.1, 0.8, 0.1], [0.3, 0.6, 0.1]],
+    ]
+)
+"""Of each object, in even and in odd frames."""
+PARTIAL = [False, True, False, False, True, False]
+"""In which frames the image cuts the first object."""
+NOVELTIES = (0.4, 0.3, 2.5)
+SIZE = np.array([0.06, 0.11, 0.19])
+
+
+def seen(frame: int, item: int) -> Detection:
+    """Return an object as the sensor sees it in a frame."""
+    inverse = TURNS[frame].inv()
+    center = inverse.apply(CENTERS[item] - PLACES[frame])
+    orientation = (inverse * AXES).as_quat()
+    candidate = Candidate(
+        indices=np.arange(10 * item, 10 * item + 5),
+        box=Box(center, SIZE, orientation),
+        plane=0,
+        on_candidate=None,
+        support_m=0.0,
+        touches_border=item == 0 and PARTIAL[frame],
+        occluded=False,
+    )
+    gas = NeuralGas(np.zeros((2, 3)), np.array([[0, 1]]))
+    full = FullBox(center, SIZE + 0.01, orientation, np.full(3, 0.005))
+    posterior, novelty = POSTERIORS[frame % 2, item], NOVELTIES[item]
+    return Detection(candidate, gas, np.arange(4.0), posterior, novelty, 0.001, full)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write the tables of three objects that a moving, turned sensor sees."""
+    folder = tmp_path_factory.mktemp("turned")
+    outline = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1]])
+    with PerceptionTables(folder, categories=CATEGORIES, model_id="m") as tables:
+        for k in range(FRAMES):
+            up = TURNS[k].inv().apply(UP)
+            scene = Scene(up, (Plane(up, -0.5, outline, 0.5, 0.0),), ())
+            found = tuple(seen(k, item) for item in range(3))
+            stamp = EPOCH + k * SECOND // 10
+            perception = Perception("/depth", k, stamp, "cam", scene, found, {"detect": 0.01})
+            pose = Pose(TURNS[k].as_matrix(), PLACES[k])
+            tables.write(perception, FrameRow(stamp + 5, pose, up))
+    track_run(folder, TrackingSettings(), CATEGORIES, work="w0123")
+    return folder
+
+
+def rows(folder: Path, table: str) -> list[dict[str, Any]]:
+    found: list[dict[str, Any]] = pq.read_table(folder / f"{table}.parquet").to_pylist()
+    return found
+
+
+def lines(folder: Path) -> list[dict[str, str]]:
+    with (folder / "tracks.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_the_pose_of_the_sensor_is_written_row_by_row(run: Path) -> None:
+    """Transposed, it is a rotation too: only other numbers tell."""
+    for row in rows(run, "frames"):
+        k = row["frame"]
+        assert_allclose(np.reshape(row["fixed_rotation"], (3, 3)), TURNS[k].as_matrix())
+        assert_allclose(row["fixed_translation"], PLACES[k])
+        assert_allclose(row["up_given"], TURNS[k].inv().apply(UP), atol=1e-6)
+        assert (row["stamp_ns"], row["log_time_ns"]) == (
+            EPOCH + k * SECOND // 10,
+            EPOCH + k * SECOND // 10 + 5,
+        )
+
+
+def test_centres_are_in_the_sensor_frame_and_in_the_fixed_one(run: Path) -> None:
+    for row in rows(run, "detections"):
+        k, item = row["frame"], row["detection"]
+        own = TURNS[k].inv().apply(CENTERS[item] - PLACES[k])
+        assert_allclose(row["center"], own, atol=1e-5)
+        assert_allclose(row["center_fixed"], CENTERS[item], atol=1e-5)
+        assert_allclose(row["height_m"], TURNS[k].inv().apply(UP) @ own + 0.5, atol=1e-5)
+        assert row["touches_border"] == (item == 0 and PARTIAL[k])
+        assert row["category"] == ("cup", "can" if k % 2 else "cup", "unknown")[item] or k % 2
+
+
+def test_the_tracker_sees_boxes_in_the_fixed_frame(run: Path) -> None:
+    """By the inverse of the pose boxes that stand still would turn."""
+    found = list(_read_frames(run, len(CATEGORIES), {"/depth"}))
+
+    assert [frame.frame for frame in found] == list(range(FRAMES))
+    for k, frame in enumerate(found):
+        assert_allclose(frame.centers, CENTERS, atol=1e-5)
+        assert_allclose(frame.axes, np.tile(AXES.as_matrix(), (3, 1, 1)), atol=1e-5)
+        assert frame.partial.tolist() == [PARTIAL[k], False, False]
+        assert_allclose(frame.posteriors, POSTERIORS[k % 2], atol=1e-6)
+        assert_allclose(frame.novelties, NOVELTIES)
+
+
+def test_tracks_stay_where_their_objects_stand(run: Path) -> None:
+    tracks = rows(run, "tracks")
+
+    assert len(tracks) == 3 * FRAMES
+    for row in tracks:
+        k, item = row["frame"], row["detection"]
+        inverse = TURNS[k].inv()
+        assert_allclose(row["center_fixed"], CENTERS[item], atol=1e-5)
+        assert_allclose(row["center_full"], inverse.apply(CENTERS[item] - PLACES[k]), atol=1e-4)
+        turned = Rotation.from_quat(row["orientation_full"])
+        off = (turned.inv() * inverse * AXES).magnitude()
+        assert min(off % np.pi, np.pi - off % np.pi) < 1e-4
+        assert_allclose(row["size_full"], SIZE + 0.01, atol=1e-6)
+
+
+def test_causal_posteriors_know_their_own_view_and_none_after_it(run: Path) -> None:
+    """Row k is the geometric mean of views 0 to k; of those that are cut a quarter counts."""
+    for item in range(3):
+        weights = np.where(PARTIAL, 0.25, 1.0) if item == 0 else np.ones(FRAMES)
+        views = np.log([POSTERIORS[k % 2, item] for k in range(FRAMES)])
+        summed = np.cumsum(views * weights[:, None], axis=0) / np.cumsum(weights)[:, None]
+        wanted = np.exp(summed) / np.exp(summed).sum(axis=1, keepdims=True)
+        causal = [row["posterior"] for row in rows(run, "tracks") if row["detection"] == item]
+        assert_allclose(causal, wanted, atol=1e-6)
+
+
+def test_tracks_csv_begins_with_what_deserves_a_look(run: Path) -> None:
+    """A person reads from the top: unknown ones first, then the least sure."""
+    table = lines(run)
+
+    assert table[0]["category"] == "unknown"
+    assert "unknown" not in [row["category"] for row in table][1:]
+    confidences = [float(row["confidence"]) for row in table[1:]]
+    assert confidences == sorted(confidences)
+    assert confidences[0] < confidences[1]
+    assert table[0]["guess"] != "unknown"
+
+
+def test_tracks_csv_says_where_and_when(run: Path) -> None:
+    """Columns in another order are no error to any reader, only wrong."""
+    by_place = {round(float(row["x"]), 1): row for row in lines(run)}
+
+    assert sorted(by_place) == [2.6, 3.1, 3.5]
+    for center, novelty in zip(CENTERS, NOVELTIES, strict=True):
+        row = by_place[round(center[0], 1)]
+        place = [float(row[axis]) for axis in "xyz"]
+        assert_allclose(place, center, atol=1e-3)
+        assert (row["first_s"], row["last_s"], row["frames"]) == ("0.000", "0.500", "6")
+        assert (row["topic"], row["run"], row["label"]) == ("/depth", "w0123", "")
+        assert float(row["novelty"]) == pytest.approx(novelty, rel=0.1)
+
+
+def test_labelled_frames_and_annotations_show_the_same_boxes(run: Path) -> None:
+    """Two ways lead from the tables to what is shown."""
+    labels = read_labels(run / "tracks.csv", CATEGORIES)
+    shown = list(read_shown_frames(run, labels))
+    labelled = list(read_labelled_frames(run, labels))
+
+    assert [frame.index for frame in shown] == [frame.index for frame in labelled]
+    for one, other in zip(shown, labelled, strict=True):
+        assert one.stamp_ns == other.stamp_ns == EPOCH + one.index * SECOND // 10
+        assert other.fixed_from_sensor is not None
+        assert_allclose(other.fixed_from_sensor.rotation, TURNS[one.index].as_matrix())
+        for item, same in zip(one.objects, other.objects, strict=True):
+            assert (item.track, item.category) == (same.track, same.category)
+            assert same.full is not None
+            assert_allclose(item.center, same.full.center, atol=1e-6)
+            assert_allclose(item.size, same.full.size, atol=1e-6)
+            assert_allclose(item.orientation, same.full.orientation, atol=1e-6)
+
+
+def test_neurons_lie_among_the_points_of_their_object(guessed_run: Path) -> None:
+    """In any other frame than the sensor's they would float beside it."""
+    run = read_run(guessed_run)
+    found = rows(guessed_run, "detections")
+    count = 0
+    with open_source(run) as recording:
+        for frame in clouds_again(recording, run):
+            for row in (row for row in found if row["frame"] == frame.index):
+                points = frame.xyz(np.array(row["indices"], np.uint32))
+                points = points[np.isfinite(points).all(axis=1)]
+                neurons = np.reshape(row["neurons"], (-1, 3))
+                if len(neurons):
+                    distance, _ = cKDTree(points).query(neurons)
+                    assert np.quantile(distance, 0.95) < 0.01
+                    count += 1
+                low, high = points.min(axis=0) - 0.01, points.max(axis=0) + 0.01
+                assert (low < row["center"]).all()
+                assert (row["center"] < high).all()
+    assert count > 50
+
+
+def test_tracks_stand_where_the_simulator_put_them(guessed_run: Path) -> None:
+    """The last table against the truth: metres in the fixed frame, none of the axes exchanged."""
+    source = Path(read_run(guessed_run)["input"]["path"])
+    truth = json.loads(source.with_suffix(".truth.json").read_text())
+    things = {item["track"]: item["center"] for frame in truth for item in frame["objects"]}
+    centers = np.array(list(things.values()))
+    placed = np.array([[float(row[axis]) for axis in "xyz"] for row in lines(guessed_run)])
+    off, which = cKDTree(centers).query(placed)
+
+    assert len(placed) >= 0.8 * len(centers)
+    assert len(set(which.tolist())) >= 0.8 * len(placed)
+    assert np.median(off) < 0.03
+
+
+def test_corrected_labels_reach_every_output(coloured_run: Path, tmp_path: Path) -> None:
+    """An output that keeps its old labels teaches the mistake that was corrected."""
+    folder = tmp_path / "table"
+    shutil.copytree(coloured_run, folder)
+    number = int(lines(folder)[0]["track"])
+    corrected = tmp_path / "mine.csv"
+    corrected.write_text(f"track,category,confidence,label\n{number},cup,0,wine glass\n")
+
+    annotate_again(folder, corrected)
+
+    assert b"wine glass" in plain_mcap(folder / "annotated.mcap")
+    from rerun.chunk import RrdReader  # noqa: PLC0415  heavy
+
+    shown = {
+        label
+        for chunk in RrdReader(str(folder / "review.rrd")).stream().to_chunks()
+        for name, column in zip(
+            chunk.to_record_batch().schema.names, chunk.to_record_batch().columns, strict=True
+        )
+        if name.endswith(":labels")
+        for group in column.to_pylist()
+        for label in group or ()
+    }
+    assert any("wine glass" in label for label in shown), shown
+
+
+def plain_mcap(path: Path) -> bytes:
+    """Return all messages of what was added to a recording."""
+    from mcap.reader import make_reader  # noqa: PLC0415  beside its only use
+
+    with path.open("rb") as file:
+        messages = make_reader(file).iter_messages()
+        return b"".join(m.data for _, c, m in messages if c.topic.startswith("/shapecat/"))

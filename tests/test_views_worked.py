@@ -1,0 +1,184 @@
+"""Surfaces and descriptors of shapes whose numbers can be worked out."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+
+from shapecat.arrays import F8
+from shapecat.config import DetectionSettings, Settings, SurfaceSettings
+from shapecat.description import DESCRIPTOR_NAMES, describe
+from shapecat.detection import detect
+from shapecat.detection.depth_grid import downsample
+from shapecat.detection.virtual_camera import virtual_image
+from shapecat.perception import perceive
+from shapecat.simulation import IDEAL, make_scene, render_frame
+from shapecat.surface import reconstruct
+from shapecat.types import Camera, Frame, NeuralGas
+from tests.conftest import Guesser
+from tests.test_detection import box, frame_of, render, table
+
+COUNT = 1200
+
+
+def facing(points: F8, normals: F8, eye: F8) -> F8:
+    """Return the points of a surface that a sensor sees."""
+    return np.asarray(points[np.sum(normals * (eye - points), axis=1) > 0])
+
+
+def ball(middle: F8, radius: float, eye: F8) -> F8:
+    """Return what is seen of a ball, evenly (Fibonacci's sphere)."""
+    k = np.arange(2 * COUNT) + 0.5
+    z, angle = 1 - k / COUNT, k * np.pi * (1 + 5**0.5)
+    r = np.sqrt(1 - z * z)
+    normals = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+    return facing(middle + radius * normals, normals, eye)
+
+
+def gas_of(points: F8, seed: int = 0) -> NeuralGas:
+    gas = reconstruct(
+        points.astype(np.float32),
+        settings=SurfaceSettings(neurons=80, signals=5000),
+        rng=np.random.default_rng(seed),
+    )
+    assert gas is not None
+    return gas
+
+
+def described(points: F8, eye: F8) -> dict[str, float]:
+    values = describe(points.astype(np.float32), gas_of(points), eye.astype(np.float32))
+    return dict(zip(DESCRIPTOR_NAMES, values.tolist(), strict=True))
+
+
+def test_shares_of_a_ball_that_is_seen_from_the_side() -> None:
+    """Of a half sphere the area is even over z: normals up, sideways and down are bands of it."""
+    eye = np.array([3.0, 0.4, 0.2])
+    value = described(ball(np.array([0, 0, 0.2]), 0.06, eye), eye)
+
+    assert value["context.share_down"] == pytest.approx((1 - 0.25) / 2, abs=0.05)
+    assert value["context.share_side"] == pytest.approx(0.4, abs=0.05)
+    assert value["context.share_up"] == pytest.approx(0.1, abs=0.04)
+
+
+def test_where_an_object_begins_and_how_it_is_seen() -> None:
+    """It hangs 0.14 m above its support; the sensor looks down on it by the arc sine of 0.6."""
+    middle = np.array([0.0, 0.0, 0.2])
+    eye = middle + np.array([0.8, 0.0, 0.6])
+    value = described(ball(middle, 0.06, eye), eye)
+    below = described(ball(middle, 0.06, eye * [1, 1, -1]), eye * [1, 1, -1])
+
+    assert value["view.elevation"] == pytest.approx(0.6, abs=0.03)
+    assert below["view.elevation"] < -0.5
+    assert value["view.distance"] == pytest.approx(1.0, abs=0.06)
+    low = 0.2 - 0.06 * 0.8  # the lowest point that is seen lies on the horizon of the eye
+    assert value["metric.low"] == pytest.approx(low, abs=0.01)
+    assert value["metric.height"] == pytest.approx(0.26 - low, abs=0.012)
+
+
+def walls() -> F8:
+    """Return two walls 5 cm apart on a floor, as of a mug cut open."""
+    a, b = np.meshgrid(np.linspace(0, 0.08, 33), np.linspace(0, 0.08, 33))
+    a, b, zero = a.ravel(), b.ravel(), np.zeros(a.size)
+    floor = np.stack([a * 0.05 / 0.08, b, zero], axis=1)
+    left, right = np.stack([zero, b, a], axis=1), np.stack([zero + 0.05, b, a], axis=1)
+    return np.concatenate([left, floor, right])
+
+
+def test_no_edge_leads_through_the_air() -> None:
+    """Along such an edge the inside of a cup would be as near as its rim."""
+    points = walls()
+    gas = gas_of(points)
+    tree = cKDTree(points)
+    spacing = np.median(cKDTree(gas.neurons).query(gas.neurons, 2)[0][:, 1])
+    a, b = gas.neurons[gas.edges[:, 0]], gas.neurons[gas.edges[:, 1]]
+
+    assert np.linalg.norm(a - b, axis=1).max() < 3.5 * spacing
+    assert tree.query((a + b) / 2)[0].max() < spacing
+
+
+def test_parts_are_joined_once_and_where_they_are_nearest() -> None:
+    sheet = walls()[: 33 * 33]
+    points = np.concatenate([sheet, sheet + np.array([0.2, 0.03, 0.01])])
+    gas = gas_of(points)
+    right = gas.neurons[:, 0] > 0.1
+    bridges = right[gas.edges[:, 0]] != right[gas.edges[:, 1]]
+
+    assert 0 < np.count_nonzero(right) < len(right)
+    assert np.count_nonzero(bridges) == 1
+    a, b = gas.edges[bridges][0]
+    length = float(np.linalg.norm(gas.neurons[a] - gas.neurons[b]))
+    nearest = cKDTree(gas.neurons[right]).query(gas.neurons[~right])[0].min()
+    assert length == pytest.approx(float(nearest), rel=1e-5)
+
+
+def test_stacked_objects_are_described_from_what_they_stand_on() -> None:
+    """Described from the table up, a box on a box would begin at the height of the lower one."""
+    shapes = [table(), box((0, 0, 0), (0.22, 0.18, 0.08)), box((0, 0.01, 0.08), (0.1, 0.08, 0.1))]
+    frame = frame_of(render(shapes)[0])
+    seen = perceive(frame, up=None, categorizer=Guesser(), settings=Settings())  # type: ignore[arg-type]  stands in
+    upper = [d for d in seen.detections if d.candidate.on_candidate is not None]
+    low, high = (DESCRIPTOR_NAMES.index(f"metric.{name}") for name in ("low", "height"))
+
+    assert len(seen.detections) == 2
+    (top,) = upper
+    assert top.candidate.support_m == pytest.approx(0.08, abs=0.01)
+    assert top.descriptor[low] < 0.02
+    assert top.descriptor[high] == pytest.approx(0.1, abs=0.02)
+
+
+def scene_of(frame: Frame, up: F8 | None) -> F8:
+    scene = detect(frame, up=up, settings=DetectionSettings(), rng=np.random.default_rng(0))
+    return np.array(sorted(c.box.center.tolist() for c in scene.candidates))
+
+
+def test_a_turned_cloud_with_its_up_has_the_same_objects() -> None:
+    """What a caller says of up is in the frame of the points, however these are turned."""
+    rng = np.random.default_rng(11)
+    image, _ = render_frame(make_scene("tabletop", rng, frames=1), 0, rng=rng, sensor=IDEAL)
+    points = image.xyz()
+    up = detect(image, settings=DetectionSettings(), rng=np.random.default_rng(0)).up
+    turn = Rotation.from_euler("xyz", [0.25, -0.4, 0.9])
+    plain = Frame("/p", 0, 0, 0, "cam", points=points)
+    turned = Frame("/p", 0, 0, 0, "cam", points=turn.apply(points).astype(np.float32))
+    expected = scene_of(plain, np.asarray(up, np.float64))
+    found = scene_of(turned, turn.apply(up))
+
+    assert len(expected) >= 3
+    assert len(found) == len(expected)
+    assert cKDTree(turn.apply(expected)).query(found)[0].max() < 0.01
+
+
+def test_cells_of_an_image_see_where_their_pixels_do() -> None:
+    """Inverse depth of a plane is linear in the rays: shifted by half a pixel it is another."""
+    camera = Camera(320, 240, 260.3, 255.1, 158.7, 121.2)
+    normal, offset = np.array([0.21, -0.83, -0.35]), -0.9
+    v, u = np.mgrid[:240, :320]
+    rays = np.stack([(u - 158.7) / 260.3, (v - 121.2) / 255.1, np.ones(u.shape)], axis=-1)
+    inverse = rays @ normal / offset
+    depth = np.where(inverse > 0.4, 1 / np.maximum(inverse, 0.4), 0).astype(np.float32)
+    for cell_m in (0.0125, 0.019):  # two pixels a cell, and three
+        grid = downsample(depth, camera, range_m=2.4, cell_m=cell_m)
+        assert grid is not None
+        i, j = np.nonzero(grid.inverse_depth)
+        k = grid.intrinsics
+        ray = np.stack([(j - k.cx) / k.fx, (i - k.cy) / k.fy, np.ones(i.size)], axis=-1)
+        off = grid.inverse_depth[i, j] - ray @ normal / offset
+        step = np.abs(normal[:2] / offset / [k.fx, k.fy]) / grid.factor / 2  # of half a pixel
+        assert grid.factor > 1
+        assert abs(np.median(off)) < 0.1 * step.min()
+
+
+def test_cells_of_a_cloud_see_where_their_points_are() -> None:
+    rng = np.random.default_rng(5)
+    points = rng.uniform([-0.4, -0.3, 1.0], [0.4, 0.3, 1.001], (60_000, 3)).astype(np.float32)
+    view = virtual_image(points, range_m=2.0)
+    assert view is not None
+    used = view.cell >= 0
+    i, j = np.divmod(view.cell[used], view.grid.inverse_depth.shape[1])
+    x, y, z = view.points[used].T
+    k = view.grid.intrinsics
+    assert_allclose(np.mean(k.fx * x / z + k.cx - j), 0, atol=0.05)
+    assert_allclose(np.mean(k.fy * y / z + k.cy - i), 0, atol=0.05)
+    pose = view.view_from_sensor
+    assert_allclose(points[used] @ pose.rotation.T + pose.translation, view.points[used], atol=1e-5)
