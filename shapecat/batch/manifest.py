@@ -96,7 +96,7 @@ def _parse(line: bytes) -> Entry | None:
         entry = Entry(**values)
     except (ValueError, TypeError, RecursionError):
         return None
-    known = isinstance(entry.folder, str) and entry.state in get_args(State)
+    known = isinstance(values["folder"], str) and entry.state in get_args(State)
     return entry if known else None
 
 
