@@ -5,10 +5,12 @@ BIN := .venv/bin
 OPEN3D_LIBRARIES := libegl1 libgl1 libx11-6 libusb-1.0-0
 SCREENS := chromium chromium-driver mesa-vulkan-drivers
 DEMO := demo
+MUTATIONS := nice -n 19 $(BIN)/python -m tests.mutations
 PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test test-all screens kernels fixtures odd faults lint format bench model parts lock clean
+.PHONY: help setup demo test test-all mutations coverage screens kernels fixtures picture odd faults lint format \
+    bench model parts lock clean
 
 help: ## list the targets
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 12
@@ -31,21 +33,32 @@ demo: setup ## simulate a recording, process it, and say where the results lie
 	$(BIN)/shapecat simulate $(DEMO)/tabletop.mcap --scene tabletop --frames 60 --seed 3 --overwrite
 	$(BIN)/shapecat process $(DEMO)/tabletop.mcap --out $(DEMO)/out --overwrite
 
-test: setup screens kernels ## run the tests, in a few minutes
+test: setup kernels ## run the quick tests
+	@{ command -v chromedriver && ls /usr/share/vulkan/icd.d/*; } >/dev/null 2>&1 \
+	    || echo "(tests in a browser and of screenshots are skipped; \`make screens\` installs what they need)" >&2
 	$(PYTEST) -m 'not many'
 
-test-all: setup screens kernels ## run all tests, also those that repeat one many times
+test-all: setup kernels ## run all tests, also long ones, and a sample of mutants
 	$(PYTEST)
+	$(MUTATIONS) --minutes 4 --each 4
 
-screens:
-	@{ command -v chromedriver && ls /usr/share/vulkan/icd.d/*; } >/dev/null 2>&1 || $(call apt,$(SCREENS)) \
-	    || echo "(only tests of the report in a browser and of screenshots need them)" >&2
+mutations: setup kernels ## flip every operator of the modules without kernels, for hours
+	$(MUTATIONS)
+
+coverage: setup kernels ## run the quick tests and print which lines and branches they reach
+	$(PYTEST) -m 'not many' --cov --cov-report=term:skip-covered
+
+screens: ## install the packages that tests in a browser and of screenshots need
+	@{ command -v chromedriver && ls /usr/share/vulkan/icd.d/*; } >/dev/null 2>&1 || $(call apt,$(SCREENS))
 
 kernels: setup
 	@$(BIN)/python -m shapecat.rehearsal
 
 fixtures: setup kernels ## make the recordings in fixtures/ anew, and the tables expected of them
 	$(BIN)/python -m tests.fixtures
+
+picture: setup ## draw the picture of ARCHITECTURE.md anew from the imports of the code
+	$(BIN)/python -m tests.picture
 
 odd: setup ## process damaged and odd recordings, print what became of each
 	$(BIN)/python -m tests.odd

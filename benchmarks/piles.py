@@ -157,7 +157,7 @@ def main(
     for kind in kinds or SCENES:
         for sensor in PRESETS if "all" in sensors else sensors:
             found = figures(judge(kind, sensor, first, count, categorizer, settings), categorizer)
-            cells = (f"{v:.3f}" if isinstance(v, float) else str(v) for v in found.values())
+            cells = (f"{v:.3f}" if v % 1 else f"{v:g}" for v in found.values())
             rows.append((f"{kind}, {sensor}", *cells))
     click.echo(markdown("Physics", ("scenes", *found), rows))
 

@@ -40,7 +40,6 @@ def run(count: int) -> tuple[str, dict[str, Any]]:
             works: dict[str, Callable[[], Any]] = {
                 "voxelize": partial(voxelize, upright, voxel_m=settings.surface.voxel_m),
                 "neural gas": partial(_seeded, grow),
-                "neural gas, warm start": partial(_seeded, partial(grow, start=gas)),
                 "describe": partial(describe, cloud, gas, eye=eye),
                 "categorize": partial(model.predict, row),
                 "points to posterior": partial(_categorize, upright, eye, settings, model),

@@ -226,7 +226,7 @@ def _row(outcome: Any) -> tuple[Any, ...]:
     return (
         outcome.job.name.rpartition("/")[2],
         counts["frames"],
-        round(summary.seconds, 1) if summary.fresh else "was complete",
+        round(summary.seconds, 1) if summary.processed else "already complete",
         count_words(counts["tracks"]),
         outcome.job.target or summary.folder,
     )

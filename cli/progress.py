@@ -11,15 +11,15 @@ from typing import Any, Self
 
 import click
 
-from .render import COMPILING, PHASES
+from .render import COMPILING, PHASES, plural
 
 _LINE_S = 5.0
 _EVENT_S = 0.5
 WORDS = {
-    "complete": "complete already",
-    "resume": "to go on with",
-    "retry": "to try again",
-    "check": "with results to check",
+    "complete": "already complete",
+    "resume": "to resume",
+    "retry": "to retry",
+    "check": "to verify",
     "new": "new",
 }
 
@@ -29,11 +29,10 @@ def describe_plan(tasks: Sequence[Any], left_out: int, workers: int, cores: int)
     counts = Counter(task.status for task in tasks)
     parts = [f"{counts[status]} {words}" for status, words in WORDS.items() if counts[status]]
     todo = sum(task.bytes for task in tasks if task.status != "complete")
-    hands = f"{workers} at a time" if workers > 1 else "one at a time"
-    frames = f", {cores} frames of each at once" if cores > 1 else ""
-    aside = f"; {left_out} files left out that are no recordings" if left_out else ""
-    many = f"{len(tasks)} recordings: {', '.join(parts)}; {todo / 1e6:,.1f} MB to read"
-    return f"{many}, {hands}{frames}{aside}"
+    size = f"; {todo / 1e6:,.1f} MB" if todo else ""
+    hands = f"; {plural(workers * cores, 'process')}" if todo else ""
+    aside = f"; skipped {plural(left_out, 'file')} of other formats" if left_out else ""
+    return f"{plural(len(tasks), 'recording')}: {', '.join(parts)}{size}{hands}{aside}"
 
 
 class Progress:
@@ -81,7 +80,7 @@ class Progress:
                 self.failed += 1
             else:
                 self.complete += 1
-            if outcome.summary is None or outcome.summary.fresh:
+            if outcome.summary is None or outcome.summary.processed:
                 self.read += self.sizes.get(name, 0)
             self.show_ended(outcome)
 
@@ -174,7 +173,7 @@ class JsonProgress(Progress):
             folder=str(outcome.job.folder),
             state="failed" if known is None else "complete",
             seconds=None if known is None else round(known.seconds, 3),
-            fresh=None if known is None else known.fresh,
+            processed=None if known is None else known.processed,
             exit_code=outcome.code,
             message=outcome.message or None,
             complete=self.complete,

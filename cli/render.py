@@ -95,6 +95,12 @@ def missed_words(missed: Mapping[str, Any]) -> str:
     return f"  track {missed['old_track']}, {missed['label']}: {missed['reason']}"
 
 
+def plural(count: int, noun: str) -> str:
+    """Return a number and what is counted: ``1 file``, ``2 files``, ``3 processes``."""
+    ending = "" if count == 1 else "es" if noun.endswith("s") else "s"
+    return f"{count:,} {noun}{ending}"
+
+
 def count_words(counts: Mapping[str, int]) -> str:
     """Return counts as words, the most frequent first: ``3 cup, 2 can``."""
     ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))

@@ -57,9 +57,7 @@ class SurfaceSettings:
     neurons: int = 80
     """Neurons to grow to; fewer on small clouds."""
     signals: int = 6000
-    """Signals fired in all."""
-    warm_signals: int = 400
-    """Signals fired when the gas starts from an earlier graph of the same track."""
+    """Signals fired in total."""
     component_share: float = 0.35
     """Separate parts of the graph with a smaller share of the points are dropped."""
     voxel_m: float = 0.005
@@ -74,7 +72,7 @@ class TrackingSettings:
     """Nearest-centroid tracker and fusion (thesis 7.5.2)."""
 
     association: Literal["hungarian", "greedy"] = "hungarian"
-    """How detections go to tracks: with the least distance in all, or the nearest pair first."""
+    """How detections go to tracks: by the smallest total distance, or the nearest pair first."""
     gate_m: float = 0.12
     """Largest distance between a track and the centroid of its next detection; smaller for
     small objects."""

@@ -159,7 +159,7 @@ def _finished(
         raise OutputError(msg)
     sweep(job.folder)
     annotate(job.folder, recording, run, observe)
-    return summarize(job, run, fresh=False)
+    return summarize(job, run, processed=False)
 
 
 def track(folder: Path, run: dict[str, Any], job: Job) -> None:

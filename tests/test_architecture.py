@@ -155,3 +155,10 @@ def test_root_of_the_package_holds_what_everybody_uses() -> None:
 
 def test_architecture_page_is_short() -> None:
     assert (ROOT / "ARCHITECTURE.md").read_text("utf-8").count("\n") <= 150
+
+
+def test_the_picture_is_drawn_from_the_code_as_it_is() -> None:
+    """`make picture` renews it."""
+    from tests.picture import PICTURE, draw  # noqa: PLC0415  it imports this file
+
+    assert PICTURE.read_text("utf-8") == draw()

@@ -125,9 +125,9 @@ def test_plan_progress_and_closing_table(shapecat: Run, recordings: Path, tmp_pa
         e["recording"] for e in ended
     }
     assert "3 complete, 1 failed" in first.stdout
-    assert "1 to try again" in again.stderr
-    assert "3 complete already" in again.stderr
-    assert again.stdout.count("was complete") == 3
+    assert "1 to retry" in again.stderr
+    assert "3 already complete" in again.stderr
+    assert again.stdout.count("already complete") == 3
 
 
 def test_complete_recordings_are_not_opened_again(
@@ -144,7 +144,7 @@ def test_complete_recordings_are_not_opened_again(
     )
 
     assert done.exit_code == 0, done.output
-    assert done.stdout.count("was complete") == 3
+    assert done.stdout.count("already complete") == 3
     assert (one_by_one / "log" / "run.json").stat().st_mtime_ns == before
 
 

@@ -11,6 +11,15 @@ import pytest
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = {
     "tutorial.md": {"results/kitchen/report.html", "crops", "results/manifest.jsonl"},
+    "howto-labelling.md": {
+        "results/lab/report.html",
+        "mine.npz",
+        "page.html",
+        "again/lab/annotated.mcap",
+        "kitti/lab/label_2",
+        "coco/images/train",
+        "yolo/data.yaml",
+    },
     "howto-bag.md": {"results/robot/tracks.csv", "far/robot/run.json"},
     "howto-cluster.md": {
         "results/monday/run.json",

@@ -5,12 +5,11 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, get_args
 
 import pytest
 
-from shapecat.batch import manifest as manifests
-from shapecat.batch.manifest import Entry, Manifest
+from shapecat.batch.manifest import Entry, Manifest, State
 from shapecat.batch.plans import plan_batch
 from shapecat.batch.runs import Outcome, exit_code
 from shapecat.config import Settings
@@ -157,7 +156,7 @@ def test_a_full_disk_leaves_no_torn_line(tmp_path: Path, monkeypatch: pytest.Mon
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as patch:
-        patch.setattr(manifests.os, "write", fill)
+        patch.setattr("shapecat.batch.manifest.os.write", fill)
         with pytest.raises(OutputError, match="No space left"):
             Manifest(path).record([Entry("b", "b" * 200, "failed")])
     assert path.read_bytes() == whole
@@ -178,10 +177,10 @@ def test_a_torn_line_of_a_crash_swallows_nothing(tmp_path: Path) -> None:
 
 def test_the_last_line_of_a_recording_holds(tmp_path: Path) -> None:
     path = tmp_path / "manifest.jsonl"
-    for state in ("planned", "running", "failed", "complete"):
-        Manifest(path).record([Entry("a", "a.mcap", state)])  # type: ignore[arg-type]  all are states
+    for state in get_args(State):
+        Manifest(path).record([Entry("a", "a.mcap", state)])
 
-    assert Manifest(path).entries["a"].state == "complete"
+    assert Manifest(path).entries["a"].state == get_args(State)[-1]
 
 
 @pytest.mark.parametrize(

@@ -62,7 +62,7 @@ def test_four_kilobytes_in_the_middle_make_another_recording(shapecat: Run, tmp_
 
     assert done.exit_code == 1
     assert "another input" in done.stderr
-    assert "was complete" not in done.stdout
+    assert "already complete" not in done.stdout
 
 
 def test_a_copy_with_other_times_is_the_same_recording(
@@ -77,7 +77,7 @@ def test_a_copy_with_other_times_is_the_same_recording(
     done = shapecat(*command)
 
     assert done.exit_code == 0, done.stderr
-    assert "was complete" in done.stdout
+    assert "already complete" in done.stdout
 
 
 def test_each_failure_is_told_once(shapecat: Run, recording: Path, tmp_path: Path) -> None:

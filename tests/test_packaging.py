@@ -31,7 +31,8 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     source.mkdir()
     for name in ("shapecat", "cli", "schemas", "pyproject.toml", "README.md", "LICENSE"):
         run("cp", "-r", ROOT / name, source)
-    run(sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", out, source)
+    build = ("--no-deps", "--no-build-isolation", "-w", out)  # no network
+    run(sys.executable, "-m", "pip", "wheel", "-q", *build, source)
     return next(out.glob("*.whl"))
 
 

@@ -189,7 +189,7 @@ def test_complete_results_are_not_made_again(
     before = (run_folder / "run.json").stat().st_mtime_ns
     again = shapecat("process", recording, "--out", run_folder.parent)
     assert again.exit_code == 0
-    assert "was complete" in again.stdout
+    assert "already complete" in again.stdout
     assert (run_folder / "run.json").stat().st_mtime_ns == before
 
     other = shapecat("process", recording, "--out", run_folder.parent, "--set", "seed=1")

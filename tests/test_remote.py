@@ -77,7 +77,7 @@ def test_from_a_server_to_a_folder(
     tables = [tmp_path / out / "a" / "tracks.csv" for out in ("out", "here")]
     assert tables[0].read_bytes() == tables[1].read_bytes()
     again = shapecat("process", *urls[:2], "--out", tmp_path / "out", *OPTIONS)
-    assert again.stdout.count("was complete") == 2
+    assert again.stdout.count("already complete") == 2
 
 
 def test_from_a_folder_to_a_storage_and_on(shapecat: Run, served: Path) -> None:
@@ -89,7 +89,7 @@ def test_from_a_folder_to_a_storage_and_on(shapecat: Run, served: Path) -> None:
     assert {name.partition("/")[0] for name in files(out)} == {*expected, "manifest.jsonl"}
     assert {"a/run.json", "a/annotated.mcap", "b/tracks.csv"} <= files(out)
     again = shapecat("process", served, "--out", out, *OPTIONS)
-    assert again.stdout.count("was complete") == 2
+    assert again.stdout.count("already complete") == 2
     other = shapecat("process", served / "a.mcap", "--out", out, *OPTIONS, "--set", "seed=1")
     assert other.exit_code == 1
     assert "--overwrite" in other.stderr

@@ -202,48 +202,6 @@ def test_a_small_separate_part_is_dropped_and_a_large_one_joined() -> None:
     assert np.ptp(gas_of(np.concatenate([body, twin])).neurons[:, 0]) > 0.4
 
 
-# a warm start
-
-
-def test_warm_start_follows_the_object() -> None:
-    points = half_sphere(1000)
-    first = gas_of(points)
-    noise = rng().normal(scale=0.0005, size=points.shape)
-    moved = (points + noise + [0.004, 0, 0]).astype(np.float32)
-    after = reconstruct(moved, settings=SMALL, rng=rng(), start=first)
-    cold = gas_of(moved)
-    assert after is not None
-    assert len(after.neurons) == 40
-    out = np.linalg.norm(after.neurons - np.array([0.004, 0, 0]), axis=1)
-    assert out == pytest.approx(0.05, rel=0.06)
-
-    def step(gas: NeuralGas) -> float:
-        return float(np.linalg.norm(first.neurons[:, None] - gas.neurons, axis=2).min(0).mean())
-
-    assert step(after) < step(cold), "the graph of the next frame is steadier"
-
-
-def test_a_start_that_does_not_fit_is_replaced() -> None:
-    points = half_sphere()
-    cold = gas_of(points)
-    nowhere = NeuralGas(cold.neurons + 50, cold.edges)
-    broken = NeuralGas(np.full((5, 3), np.nan), np.array([[0, 9], [3, 3]]))
-    for start in (nowhere, broken):
-        gas = reconstruct(points, settings=SMALL, rng=rng(), start=start)
-        assert gas is not None
-        assert len(gas.neurons) > 3
-        assert np.abs(gas.neurons).max() < 0.06
-
-
-def test_a_start_with_edges_to_nowhere_is_read_within_bounds() -> None:
-    points = half_sphere()
-    cold = gas_of(points)
-    start = NeuralGas(cold.neurons, np.concatenate([cold.edges, [[1, 60000], [7, 7]]]))
-    gas = reconstruct(points, settings=SMALL, rng=rng(), start=start)
-    assert gas is not None
-    assert gas.edges.max() < len(gas.neurons)
-
-
 # the kernels
 
 

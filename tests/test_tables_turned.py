@@ -135,6 +135,7 @@ def test_the_tracker_sees_boxes_in_the_fixed_frame(run: Path) -> None:
 
     assert [frame.frame for frame in found] == list(range(FRAMES))
     for k, frame in enumerate(found):
+        assert frame.axes is not None
         assert_allclose(frame.centers, CENTERS, atol=1e-5)
         assert_allclose(frame.axes, np.tile(AXES.as_matrix(), (3, 1, 1)), atol=1e-5)
         assert frame.partial.tolist() == [PARTIAL[k], False, False]

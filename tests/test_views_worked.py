@@ -1,5 +1,7 @@
 """Surfaces and descriptors of shapes whose numbers can be worked out."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -78,8 +80,8 @@ def test_where_an_object_begins_and_how_it_is_seen() -> None:
 
 def walls() -> F8:
     """Return two walls 5 cm apart on a floor, as of a mug cut open."""
-    a, b = np.meshgrid(np.linspace(0, 0.08, 33), np.linspace(0, 0.08, 33))
-    a, b, zero = a.ravel(), b.ravel(), np.zeros(a.size)
+    a, b = (axis.ravel() for axis in np.meshgrid(*[np.linspace(0, 0.08, 33)] * 2))
+    zero = np.zeros(a.size)
     floor = np.stack([a * 0.05 / 0.08, b, zero], axis=1)
     left, right = np.stack([zero, b, a], axis=1), np.stack([zero + 0.05, b, a], axis=1)
     return np.concatenate([left, floor, right])
@@ -116,7 +118,8 @@ def test_stacked_objects_are_described_from_what_they_stand_on() -> None:
     """Described from the table up, a box on a box would begin at the height of the lower one."""
     shapes = [table(), box((0, 0, 0), (0.22, 0.18, 0.08)), box((0, 0.01, 0.08), (0.1, 0.08, 0.1))]
     frame = frame_of(render(shapes)[0])
-    seen = perceive(frame, up=None, categorizer=Guesser(), settings=Settings())  # type: ignore[arg-type]  stands in
+    guesser: Any = Guesser()
+    seen = perceive(frame, up=None, categorizer=guesser, settings=Settings())
     upper = [d for d in seen.detections if d.candidate.on_candidate is not None]
     low, high = (DESCRIPTOR_NAMES.index(f"metric.{name}") for name in ("low", "height"))
 

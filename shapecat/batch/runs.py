@@ -164,7 +164,7 @@ def _already(task: Task) -> Outcome | None:
     """Return the outcome of a task that is complete."""
     if task.status != "complete":
         return None
-    return Outcome(task.job, summarize(task.job, _run_of(task.job), fresh=False))
+    return Outcome(task.job, summarize(task.job, _run_of(task.job), processed=False))
 
 
 def _run_of(job: Job) -> Mapping[str, Any]:
@@ -223,7 +223,7 @@ def _process_remote(job: Job, observe: Observer, cores: int) -> Summary:
             text = str(error).replace(str(local.source), job.name)
             text = text.replace(str(local.folder), job.target or str(local.folder))
             raise type(error)(text) from error
-        if job.target and summary.fresh:
+        if job.target and summary.processed:
             upload(local.folder, job.target)
     return summary
 

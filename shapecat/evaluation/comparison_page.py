@@ -119,7 +119,7 @@ def _category_rows(category: dict[str, Any]) -> list[_Row]:
             f"of {category['n']} matched objects" + (f"; {most}" if most else ""),
         ),
         ("  of single views", _percent(category["view_accuracy"]), "before tracks fuse them"),
-        ("calibration error", f"{category['ece']:.3f}", "of single views (ECE); 0 is honest"),
+        ("calibration error", f"{category['ece']:.3f}", "of single views (ECE); 0 is perfect"),
     ]
 
 

@@ -56,6 +56,11 @@ def write_page(path: Path, report: Report, *, title: str) -> None:
         raise OutputError(msg) from error
 
 
+_CALIBRATION = (
+    "Accuracy by confidence. On the diagonal, of views with a confidence of 0.8, 80 % are right."
+)
+
+
 def _pictures(report: Report) -> dict[str, str]:
     """Return the pictures by the name of what they show."""
     return {
@@ -72,11 +77,11 @@ def format_page(report: Report, *, title: str) -> str:
         _table(("", ""), _figures(report)),
         "<h2>Confusion</h2><p>True category (row) taken for (column).</p>",
         confusion_svg(report.categories, report.confusion),
-        "<h2>Calibration</h2><p>Accuracy over confidence; the diagonal is honest.</p>",
+        f"<h2>Calibration</h2><p>{_CALIBRATION}</p>",
         calibration_svg(report.calibration),
     ]
     for name, rows in report.breakdowns:
-        parts += [f"<h2>Accuracy over {name}</h2>", accuracy_svg(rows)]
+        parts += [f"<h2>Accuracy by {name}</h2>", accuracy_svg(rows)]
         parts.append(_table(*_breakdown(name, rows)))
     parts += [f"<h2>{name}</h2>" + _table(head, rows) for name, head, rows in _comparisons(report)]
     return (
@@ -94,12 +99,12 @@ def format_markdown(report: Report, *, title: str, pictures: Mapping[str, str]) 
         _markdown(("", ""), _figures(report)),
         "## Confusion\n\nTrue category (row) taken for (column).",
         f"![Confusion]({pictures['confusion']})",
-        "## Calibration\n\nAccuracy over confidence; the diagonal is honest.",
+        f"## Calibration\n\n{_CALIBRATION}",
         f"![Calibration]({pictures['calibration']})",
     ]
     for name, rows in report.breakdowns:
-        picture = f"![Accuracy over {name}]({pictures[name]})"
-        parts += [f"## Accuracy over {name}", picture, _markdown(*_breakdown(name, rows))]
+        picture = f"![Accuracy by {name}]({pictures[name]})"
+        parts += [f"## Accuracy by {name}", picture, _markdown(*_breakdown(name, rows))]
     parts += [f"## {name}\n\n" + _markdown(head, rows) for name, head, rows in _comparisons(report)]
     return "\n\n".join(parts) + "\n"
 

@@ -72,7 +72,7 @@ class Report:
         parts = (
             ("distance", self.by_distance),
             ("elevation", self.by_elevation),
-            ("voxels", self.by_points),
+            ("points", self.by_points),
         )
         return tuple((name, rows) for name, rows in parts if rows)
 

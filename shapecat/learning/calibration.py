@@ -1,4 +1,4 @@
-"""Making confidences honest: one temperature, fitted on instances the learners never saw."""
+"""Calibrate confidences by one temperature, fitted on instances that training has not seen."""
 
 import numpy as np
 from scipy.optimize import minimize_scalar

@@ -128,6 +128,7 @@ class WordLearner(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # skle
 
     def _fit_logits(self, x: Any, labels: I4) -> tuple[F8, F8]:
         """Return coefficients (c, w) and intercepts (c,)."""
+        _require_strategy(self.strategy)
         if self.strategy == "multinomial":
             model = _linear(self.C).fit(x, labels)
             coef, intercept = model.coef_, model.intercept_
@@ -137,9 +138,6 @@ class WordLearner(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # skle
                     np.array([-1, 1]) / 2 * intercept,
                 )
             return coef, intercept
-        if self.strategy != "one_vs_rest":
-            msg = f"strategy must be multinomial or one_vs_rest, got {self.strategy!r}"
-            raise ValueError(msg)
         models = [_linear(self.C).fit(x, labels == c) for c in range(labels.max() + 1)]
         return (
             np.concatenate([model.coef_ for model in models]),
@@ -150,6 +148,12 @@ class WordLearner(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # skle
         tags = super().__sklearn_tags__()
         tags.input_tags.sparse = True
         return tags
+
+
+def _require_strategy(name: str) -> None:
+    if name not in {"multinomial", "one_vs_rest"}:
+        msg = f"strategy must be multinomial or one_vs_rest, got {name!r}"
+        raise ValueError(msg)
 
 
 def _linear(strength: float) -> LogisticRegression:

@@ -29,7 +29,7 @@ def describe_recording(path: Path) -> dict[str, Any]:
             "kind": recording.kind,
             "bytes": input_size(path),
             "start_ns": start,
-            "seconds": 0.0 if start is None or end is None else (end - start) * 1e-9,
+            "seconds": (end - start) * 1e-9,
             "topics": [
                 {
                     "name": topic.name,

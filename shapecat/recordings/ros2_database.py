@@ -42,7 +42,7 @@ class DatabaseRecording(Recording):
             self._reader.open()
             self._channels = {c.id: _channel(c) for c in self._reader.connections}
         except (ReaderError, apsw.Error, *LIBRARY_ERRORS) as error:
-            msg = f"not a readable ROS 2 bag: {error or type(error).__name__}"
+            msg = f"not a readable ROS 2 bag: {str(error) or type(error).__name__}"
             raise RecordingError(msg) from error
         counts: dict[tuple[str, str, str], int] = {}
         for connection in self._reader.connections:
@@ -73,17 +73,17 @@ class DatabaseRecording(Recording):
         wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
         if not wanted:
             return
-        raw = self._reader.messages(wanted, start_ns, stop_ns)
+        raw: Iterator[Any] = self._reader.messages(wanted, start_ns, stop_ns)  # data of any type
         while True:
             try:
                 connection, time, data = next(raw)
             except StopIteration:
                 return
             except (ReaderError, apsw.Error, OSError, *LIBRARY_ERRORS) as error:
-                self.warn(f"damaged: nothing read after this: {error or type(error).__name__}")
+                self.warn(f"damaged: nothing read after this: {str(error) or type(error).__name__}")
                 return
             channel = self._channels[connection.id]
-            if not isinstance(data, bytes | memoryview):  # SQLite has no types: maybe a number
+            if not isinstance(data, bytes | memoryview):
                 self.warn(f"{channel.topic}: left out a message that holds no bytes")
                 continue
             plain = self._plain(channel, bytes(data))

@@ -150,8 +150,13 @@ class DepthSource(Source):
             image = self.recording.decode(message)
             stamp_ns(image.header)
             self._waiting = (message, self.index - 1, image)
-        if self._waiting and stamp_ns(self._waiting[2].header) == self._info_stamp:
+        if self._wanted is not None and self._wanted == self._info_stamp:
             yield from self.finish(skipped)
+
+    @property
+    def _wanted(self) -> int | None:
+        """The time of the image that waits for its calibration, None if none does."""
+        return None if self._waiting is None else stamp_ns(self._waiting[2].header)
 
     def finish(self, skipped: Counter[str]) -> Iterator[Frame]:
         """Yield the image that waits, with the best calibration there is."""

@@ -86,7 +86,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run came to; not ``fresh`` when it was complete before.
+    """What a run came to; not ``processed`` when it was complete before.
 
     ``corrections`` is what became of the labels of the run it replaced, if there were any.
     """
@@ -96,7 +96,7 @@ class Summary:
     counts: Mapping[str, Any]
     seconds: float
     warnings: tuple[str, ...]
-    fresh: bool = True
+    processed: bool = True
     corrections: Mapping[str, Any] | None = None
 
     def as_dict(self) -> dict[str, Any]:
@@ -201,7 +201,7 @@ def keep_labels(folder: Path, run: dict[str, Any], job: Job) -> None:
     run["corrections"] = transfer.as_dict()
 
 
-def summarize(job: Job, run: Mapping[str, Any], *, fresh: bool = True) -> Summary:
+def summarize(job: Job, run: Mapping[str, Any], *, processed: bool = True) -> Summary:
     """Return the summary of a run."""
     return Summary(
         source=job.name,
@@ -209,6 +209,6 @@ def summarize(job: Job, run: Mapping[str, Any], *, fresh: bool = True) -> Summar
         counts=run["counts"],
         seconds=run["seconds"].get("total", 0.0),
         warnings=tuple(run["warnings"]),
-        fresh=fresh,
-        corrections=run.get("corrections") if fresh else None,
+        processed=processed,
+        corrections=run.get("corrections") if processed else None,
     )

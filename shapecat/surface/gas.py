@@ -16,9 +16,7 @@ from shapecat.surface.growth import (
     empty_gas,
     grow_fritzke,
     grow_thesis,
-    index_mask,
 )
-from shapecat.surface.lanes import LANES, two_nearest
 from shapecat.types import NeuralGas
 
 __all__ = ["MAX_NEURONS", "MIN_POINTS", "reconstruct"]
@@ -31,11 +29,11 @@ _MAX_POINTS = 1200
 """Of more points every k-th is fired: the result does not get better with more, only slower."""
 _NEURONS_PER_POINT = 0.45
 _FEWEST_NEURONS = 12
-_RATE, _WARM_RATE = 0.1, 0.15
+_RATE = 0.1
 """Epsilon_b, the share of the way the nearest neuron moves, at the start."""
 _RATE_NEIGHBOUR = 0.06
 """Epsilon_n as a share of epsilon_b."""
-_OLDEST, _WARM_OLDEST = 30, 50
+_OLDEST = 30
 """Age beyond which an edge goes (a_max)."""
 _GROWTH = 0.6
 """Share of the signals after which all neurons are there."""
@@ -48,11 +46,7 @@ _DISTANCE_LIMIT = 0.7
 
 
 def reconstruct(
-    points: F4,
-    *,
-    settings: SurfaceSettings,
-    rng: np.random.Generator,
-    start: NeuralGas | None = None,
+    points: F4, *, settings: SurfaceSettings, rng: np.random.Generator
 ) -> NeuralGas | None:
     """Learn the surface of one object as a graph.
 
@@ -66,9 +60,6 @@ def reconstruct(
     settings : ``method`` "fritzke" inserts a neuron every so many signals (thesis Algorithm 3),
         "thesis" where the error is large (Algorithm 4).
     rng : draws one number; the same points, settings and generator give the same graph.
-    start : an earlier graph of the same object, in the frame of the points. It is adapted with
-        ``settings.warm_signals`` signals instead of growing one from two neurons. Ignored by
-        ``method="thesis"``.
 
     Returns
     -------
@@ -91,9 +82,8 @@ def reconstruct(
     if points.ndim != 2 or points.shape[1] != 3:
         msg = f"expected points of shape (m, 3), got {points.shape}"
         raise ValueError(msg)
-    most = max(settings.neurons, 0 if start is None else len(start.neurons))
-    if most > MAX_NEURONS:
-        msg = f"at most {MAX_NEURONS} neurons, got {most}"
+    if settings.neurons > MAX_NEURONS:
+        msg = f"at most {MAX_NEURONS} neurons, got {settings.neurons}"
         raise ValueError(msg)
     if len(points) < MIN_POINTS:
         return None
@@ -102,16 +92,8 @@ def reconstruct(
     if settings.method == "thesis":
         found = _by_thesis(points, seed, settings.neurons, settings.component_share)
     else:
-        signals = settings.signals if start is None else settings.warm_signals
-        first = _NOTHING if start is None else start
         found = _by_fritzke(
-            points,
-            seed,
-            settings.neurons,
-            signals,
-            settings.component_share,
-            first.neurons,
-            first.edges,
+            points, seed, settings.neurons, settings.signals, settings.component_share
         )
     neurons, edges, finite = found
     if not finite:
@@ -122,39 +104,22 @@ def reconstruct(
 
 _Found: TypeAlias = tuple[F4, U2, bool]
 """Neurons, edges, and whether the points were finite."""
-_NOTHING = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
 
 
 @kernel
-def _by_fritzke(
-    points: F4,
-    seed: int,
-    neurons: int,
-    signals: int,
-    share: float,
-    start_neurons: F4,
-    start_edges: U2,
-) -> _Found:
-    """Grow by Algorithm 3, or adapt an earlier graph."""
+def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float) -> _Found:
+    """Grow by Algorithm 3."""
     cloud, frame = _normalise(points)
     target = _wanted(cloud, neurons)
-    gas = empty_gas(max(target, start_neurons.shape[0]))
+    gas = empty_gas(target)
     state = np.uint64(seed)
-    count = 0
     if not frame[3] < np.inf:
         return np.zeros((0, 3), np.float32), np.zeros((0, 2), np.uint16), False
-    if start_neurons.shape[0] >= 3:
-        count = _adopt(cloud, gas, start_neurons, start_edges, frame)
-    if count >= 3:
-        rate, oldest = _WARM_RATE, _WARM_OLDEST
-        interval = min(60, int(_GROWTH * signals) // max(target - count, 1))
-    else:
-        rate, oldest = _RATE, _OLDEST
-        interval = int(_GROWTH * signals) // target
-        count = _two_points(cloud, gas, state)
+    interval = int(_GROWTH * signals) // target
+    count = _two_points(cloud, gas, state)
     count = grow_fritzke(
         cloud, state, gas, count, target, signals,
-        max(interval, 1), rate, rate * _RATE_NEIGHBOUR, oldest,
+        max(interval, 1), _RATE, _RATE * _RATE_NEIGHBOUR, _OLDEST,
     )  # fmt: skip
     adjacent = link(cloud, gas, count, share)
     return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent), True
@@ -238,51 +203,6 @@ def _two_points(cloud: Cloud, gas: Gas, state: np.uint64) -> int:
         gas.x[i], gas.y[i], gas.z[i] = cloud.x[k], cloud.y[k], cloud.z[k]
     connect(gas, np.int64(0), np.int64(1))
     return 2
-
-
-@kernel
-def _adopt(cloud: Cloud, gas: Gas, neurons: F4, edges: U2, frame: F8) -> int:
-    """Take over an earlier graph without the neurons that are nearest to no point.
-
-    Returns the number of neurons that stay: 0 where fewer than 3 would.
-    """
-    count = neurons.shape[0]
-    unit = frame[3] if frame[3] > 0 else 1.0
-    for i in range(count):
-        x = (neurons[i, 0] - frame[0]) / unit
-        y = (neurons[i, 1] - frame[1]) / unit
-        z = (neurons[i, 2] - frame[2]) / unit
-        if abs(x) < 1e6 and abs(y) < 1e6 and abs(z) < 1e6:
-            gas.x[i], gas.y[i], gas.z[i] = x, y, z
-    padded = (count + LANES - 1) // LANES * LANES
-    mask = index_mask(padded)
-    used = np.zeros(padded, np.bool_)
-    for k in range(cloud.x.size):
-        first, _ = two_nearest(
-            gas.x, gas.y, gas.z, padded, cloud.x[k], cloud.y[k], cloud.z[k], mask
-        )
-        used[first] = True
-    place = np.zeros(count, np.int64)
-    place[:] = -1
-    kept = 0
-    for i in range(count):
-        if used[i]:
-            place[i] = kept
-            gas.x[kept], gas.y[kept], gas.z[kept] = gas.x[i], gas.y[i], gas.z[i]
-            kept += 1
-    gas.x[kept:count] = FAR
-    gas.y[kept:count] = FAR
-    gas.z[kept:count] = FAR
-    if kept < 3:
-        return 0
-    for e in range(edges.shape[0]):
-        a, b = int(edges[e, 0]), int(edges[e, 1])
-        if a < b < count and place[a] >= 0 and place[b] >= 0:
-            connect(gas, place[a], place[b])
-    for i in range(kept):
-        if gas.degree[i] == 0:  # its neighbours are gone
-            connect(gas, i, (i + 1) % kept)
-    return kept
 
 
 @kernel(fast=True)

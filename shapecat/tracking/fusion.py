@@ -89,7 +89,7 @@ def fuse_novelty(novelties: ArrayLike, weights: ArrayLike) -> float:
     return float(np.average(np.asarray(novelties, np.float64), weights=weight)) / limit
 
 
-def _evidence(views: F8, method: Method) -> F8:
+def _evidence(views: F8, method: str) -> F8:
     if method == "mean":
         return views
     if method == "product":

@@ -1,0 +1,1 @@
+"""Operators that are flipped on purpose, to see whether a test notices."""

@@ -1,0 +1,122 @@
+"""Draw the rooms of the package and their imports: ``python -m tests.picture``.
+
+A room is drawn in the layer that `tests.test_architecture` assigns to it. An arrow leads to what a
+room imports; those that follow from others are left out, and so are those to the two layers below,
+which everybody uses.
+"""
+
+from collections.abc import Iterator, Mapping
+from html import escape
+from pathlib import Path
+
+from tests.test_architecture import FILES, FLOOR, STAGES, imported_rooms, room
+
+__all__ = ["PICTURE", "draw"]
+
+PICTURE = Path(__file__).parents[1] / "docs" / "images" / "architecture.svg"
+WIDTH, ROW, BOX_H, GAP = 980, 70, 30, 14
+LAYERS = {
+    7.0: "doors",
+    6.0: "many recordings",
+    5.0: "the story",
+    4.0: "results",
+    3.0: "runs",
+    2.5: "stages",
+    2.0: "inputs",
+    1.0: "shared tools",
+    0.0: "base",
+}
+HIDDEN = {"__init__", "__main__", "py"}
+_Place = tuple[float, float, float]
+
+
+def imports() -> dict[str, set[str]]:
+    """Return what each room imports."""
+    found: dict[str, set[str]] = {}
+    for path in FILES:
+        found.setdefault(room(path), set()).update(imported_rooms(path) - {room(path)})
+    return {name: others - HIDDEN for name, others in found.items() if name not in HIDDEN}
+
+
+def reduced(graph: Mapping[str, set[str]]) -> dict[str, set[str]]:
+    """Return a graph without the edges that follow from a detour (transitive reduction)."""
+
+    def below(name: str) -> set[str]:
+        return set().union(*(graph.get(o, set()) | below(o) for o in graph.get(name, set())))
+
+    reach = {name: below(name) for name in graph}
+    return {name: others - reach[name] for name, others in graph.items()}
+
+
+def layer(name: str) -> float:
+    """Return the layer of a room; stages, which import nothing beside them, stand apart."""
+    return FLOOR[name] + 0.5 * (name in STAGES)
+
+
+def places(rooms: set[str]) -> dict[str, _Place]:
+    """Return the left edge, top and width of the box of each room."""
+    found: dict[str, _Place] = {}
+    for row, level in enumerate(LAYERS):
+        names = sorted(name for name in rooms if layer(name) == level)
+        widths = [9.0 * len(name) + 16 for name in names]
+        left = 130 + (WIDTH - 140 - sum(widths) - GAP * (len(names) - 1)) / 2
+        for name, width in zip(names, widths, strict=True):
+            found[name] = (left, 16 + row * ROW + (ROW - BOX_H) / 2 - 6, width)
+            left += width + GAP
+    return found
+
+
+def draw() -> str:
+    """Return the picture."""
+    graph = imports()
+    boxes = places(set(graph) | {"schemas"})
+    height = 16 + ROW * len(LAYERS)
+    parts = [
+        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" '
+        'font-family="sans-serif" font-size="15">',
+        '<marker id="a" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="7" markerHeight="7" '
+        'orient="auto"><path d="M0 0 8 4 0 8z" fill="#789"/></marker>',
+        f'<rect width="{WIDTH}" height="{height}" fill="#fff"/>',
+        *_bands(),
+        *_arrows(reduced(graph), boxes),
+        *_boxes(boxes),
+        "</svg>",
+    ]
+    return "\n".join(parts) + "\n"
+
+
+def _bands() -> Iterator[str]:
+    for row, name in enumerate(LAYERS.values()):
+        top = 10 + row * ROW
+        yield f'<rect x="6" y="{top}" width="{WIDTH - 12}" height="{ROW - 8}" rx="8" fill="#f2f5f8"/>'
+        yield f'<text x="18" y="{top + ROW / 2}" font-size="13" fill="#567">{escape(name)}</text>'
+
+
+def _arrows(graph: Mapping[str, set[str]], boxes: Mapping[str, _Place]) -> Iterator[str]:
+    for name, other in sorted((n, o) for n, others in graph.items() for o in others):
+        if FLOOR[other] < 2 or layer(other) == layer(name):
+            continue
+        (x1, y1, w1), (x2, y2, w2) = boxes[name], boxes[other]
+        start, end = (x1 + w1 / 2, y1 + BOX_H), (x2 + w2 / 2, y2)
+        bend = (end[1] - start[1]) / 2
+        yield (
+            f'<path d="M{start[0]:.0f} {start[1]:.0f}C{start[0]:.0f} {start[1] + bend:.0f} '
+            f'{end[0]:.0f} {end[1] - bend:.0f} {end[0]:.0f} {end[1]:.0f}" fill="none" '
+            'stroke="#789" marker-end="url(#a)"/>'
+        )
+
+
+def _boxes(boxes: Mapping[str, _Place]) -> Iterator[str]:
+    for name, (x, y, width) in sorted(boxes.items()):
+        yield (
+            f'<rect x="{x:.0f}" y="{y:.0f}" width="{width:.0f}" height="{BOX_H}" rx="6" '
+            'fill="#fff" stroke="#357"/>'
+        )
+        yield (
+            f'<text x="{x + width / 2:.0f}" y="{y + 20:.0f}" text-anchor="middle">'
+            f"{escape(name)}</text>"
+        )
+
+
+if __name__ == "__main__":
+    PICTURE.write_text(draw(), "utf-8")
