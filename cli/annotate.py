@@ -11,14 +11,14 @@ from .render import missed_words, progress_bars
 
 @click.command()
 @click.argument("run", type=ANY_PATH)
-@click.option("--labels", type=ANY_PATH, help="The corrected table; RUN/tracks.csv by default.")
+@click.option("--labels", type=ANY_PATH, help="Corrected table; RUN/tracks.csv by default.")
 @click.option(
     "--by-place",
     is_flag=True,
-    help="LABELS is the table, or folder, of another run: label the objects in the same places.",
+    help="LABELS is another run, or its table: transfer its labels to objects at the same places.",
 )
 @click.option("--boxes", type=click.Choice(BOXES), help=BOXES_HELP)
-@click.option("--recording", type=ANY_PATH, help="Where the recording is now, if it was moved.")
+@click.option("--recording", type=ANY_PATH, help="New place of a recording that was moved.")
 def annotate(
     *,
     run: Path,
@@ -27,9 +27,10 @@ def annotate(
     boxes: str | None,
     recording: Path | None,
 ) -> None:
-    """Write annotated.mcap and review.rrd again after tracks.csv was corrected.
+    """Write corrected labels into annotated.mcap and review.rrd.
 
-    Fill the column `label` of RUN/tracks.csv in a spreadsheet: a category, or a name of your own.
+    Correct the column `label` of RUN/tracks.csv in a spreadsheet, or in the page that `shapecat
+    report` makes.
 
     \b
     shapecat annotate results/lab --labels corrected.csv
@@ -53,11 +54,11 @@ def _show(transfer: dict[str, Any], labels: Path | None) -> None:
     from shapecat.runs.label_transfer import TABLE_ALONE
 
     done, missed = transfer["transferred"], transfer["not_transferred"]
-    click.echo(f"{len(done)} of {len(done) + len(missed)} labels have found their objects")
+    click.echo(f"{len(done)} of {len(done) + len(missed)} labels transferred")
     if transfer["by"] == TABLE_ALONE:
-        text = "the run is not beside the table: assumed to have the same fixed frame, and that"
+        text = "the folder of this table is no run: shapecat assumes the same fixed frame, and that"
         click.echo(
-            f"{labels}: {text} nothing was moved; give the run's folder to be sure", err=True
+            f"{labels}: {text} no object was moved; name the folder of the run to be sure", err=True
         )
     for item in missed:
         click.echo(missed_words(item), err=True)

@@ -15,18 +15,18 @@ from .render import print_json, print_table, progress_bars
 @click.option(
     "--out",
     type=ANY_PATH,
-    help="New folder for the page with pictures, the table of all objects, and the figures.",
+    help="New folder for a page with pictures, a table of all objects, and the figures.",
 )
-@click.option("--recording", type=ANY_PATH, help="Where the recording is now, for the pictures.")
+@click.option("--recording", type=ANY_PATH, help="New place of a recording that was moved.")
 @json_option
 def compare(
     *, run: Path, truth: Path, out: Path | None, recording: Path | None, as_json: bool
 ) -> None:
     """Compare a run with the truth, with labels of other tools, or with another run.
 
-    TRUTH is NAME.truth.json as `shapecat simulate` writes it (or the recording beside it), a COCO
-    file, a folder with label_2 (KITTI), or another run of the same recording, which is then taken
-    for true. Frames are matched by their stamps.
+    TRUTH is NAME.truth.json of `shapecat simulate` (or the recording beside it), a COCO file, a
+    folder with label_2 (KITTI), or another run of the same recording as the reference. Frames are
+    matched by their stamps.
 
     \b
     shapecat compare results/demo demo.truth.json

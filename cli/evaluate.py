@@ -15,13 +15,13 @@ from .render import print_json, progress_bars
     "--report",
     "page",
     type=ANY_PATH,
-    help="Also write the tables with their pictures, as .html or .md.",
+    help="Write a report with pictures, as .html or .md.",
 )
 @click.option(
     "--baselines",
     type=ANY_PATH,
     metavar="TRAINING_SET",
-    help="Also train the chain and plain learners (forest, linear, PNN, D2, ESF-like) on these "
+    help="Train the chain and simpler learners (forest, linear, PNN, D2, ESF-like) on these "
     "views and judge them on DATASET. DATASET itself: in five folds by instance.",
 )
 @json_option
@@ -30,8 +30,8 @@ def evaluate(
 ) -> None:
     """Measure a model on labelled views: accuracy, confusion, calibration, novelty.
 
-    DATASET is laid out as for `shapecat train`. Several views of one instance are also judged
-    together, 3, 10 and 30 at a time.
+    DATASET has the layout of `shapecat train`. The report also fuses 3, 10 and 30 views of one
+    instance.
 
     \b
     shapecat evaluate crops --model mine.npz --report crops.html

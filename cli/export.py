@@ -15,26 +15,41 @@ _FORMATS = (*_DATASETS, "crops", "kitti", "labelcloud", "point-labels")
 
 @click.command()
 @click.argument("folders", nargs=-1, required=True, type=ANY_PATH, metavar="DIR...")
-@click.option("--format", "kind", type=click.Choice(_FORMATS), required=True, help="See above.")
 @click.option(
-    "--out", type=ANY_PATH, required=True, help="Data sets go to OUT, others to OUT/NAME."
+    "--format",
+    "kind",
+    type=click.Choice(_FORMATS),
+    required=True,
+    help="Format of the export, listed above.",
+)
+@click.option(
+    "--out",
+    type=ANY_PATH,
+    required=True,
+    help="Folder for a data set; the other formats use OUT/NAME.",
 )
 @click.option("--every", type=click.IntRange(1), default=1, help="Keep only every Nth frame.")
 @click.option(
     "--per-track",
     type=click.IntRange(0),
     default=0,
-    help="coco, yolo: only frames in which N views of each track are that differ most.",
+    help="coco, yolo: keep frames with the N most different views of each track.",
     metavar="N",
 )
 @click.option(
     "--min-confidence",
     type=click.FloatRange(0, 1),
     default=0.0,
-    help="coco, yolo: label only objects that are so sure.",
+    help="coco, yolo: label only objects with at least this confidence.",
 )
-@click.option("--corrected-only", is_flag=True, help="coco, yolo: only labels a person has given.")
-@click.option("--depth", is_flag=True, help="coco, yolo: 16-bit depth images instead of colour.")
+@click.option(
+    "--corrected-only",
+    is_flag=True,
+    help="coco, yolo: use only labels that a person has confirmed.",
+)
+@click.option(
+    "--depth", is_flag=True, help="coco, yolo: export 16-bit depth images instead of colour images."
+)
 @click.option(
     "--val",
     type=click.FloatRange(0, 1, max_open=True),
@@ -43,7 +58,7 @@ _FORMATS = (*_DATASETS, "crops", "kitti", "labelcloud", "point-labels")
     help="coco, yolo: share of the recordings for validation.",
 )
 @click.option("--boxes", type=click.Choice(BOXES), default="full", help=BOXES_HELP)
-@click.option("--recording", type=ANY_PATH, help="Where the recording is now, if it was moved.")
+@click.option("--recording", type=ANY_PATH, help="New place of a recording that was moved.")
 def export(
     *,
     folders: tuple[Path, ...],
@@ -54,14 +69,14 @@ def export(
     recording: Path | None,
     **chosen: Any,
 ) -> None:
-    """Write the labels of runs, with their images or points, for other tools.
+    """Export the labels of runs, with images or points, for other tools.
 
     Each DIR is a run, or a folder of runs. All runs go into one data set of coco, yolo, or crops.
 
     \b
     coco          colour images, masks (RLE), boxes, categories, tracks
     yolo          colour images, a polygon per object
-    crops         views of objects, laid out as for `shapecat train` and `learn`
+    crops         views of objects, in the layout of `shapecat train` and `learn`
     kitti         label_2, calib, velodyne, image_2
     labelcloud    a project of the labelling tool labelCloud
     point-labels  masks for depth images, SemanticKITTI labels for clouds

@@ -16,10 +16,9 @@ from .render import print_json, print_table
 @array_option
 @click.pass_context
 def info(ctx: click.Context, /, *, recordings: tuple[Path, ...], as_json: bool) -> None:
-    """Show what recordings hold, and which depth streams can be processed.
+    """List the topics of recordings, and the depth streams that can be processed.
 
-    A folder is searched as by `shapecat process`. With --json, an array of one object per
-    recording is printed.
+    Each RECORDING may also be a folder with recordings.
 
     \b
     shapecat info lab.mcap

@@ -15,11 +15,10 @@ from .render import print_json, progress_bars
 @seed_option
 @json_option
 def learn(*, model: Path, dataset: Path, out: Path, seed: int, as_json: bool) -> None:
-    """Teach a model the categories of a data set that it does not know.
+    """Add the new categories of a data set to a model.
 
-    MODEL is a model file, or `default` for the one shipped with the package. What it knows stays
-    as it is. DATASET is laid out as for `shapecat train`, for example by `shapecat export --format
-    crops`.
+    MODEL is a model file, or `default` for the default model. Its categories stay as they are.
+    DATASET has the layout of `shapecat train`; `shapecat export --format crops` makes one.
 
     \b
     shapecat learn default crops --out mine.npz

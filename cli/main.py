@@ -53,9 +53,9 @@ def main() -> None:
     """Turn robot recordings into reviewed, labelled 3D objects.
 
     \b
-    shapecat simulate demo.mcap                 make a recording to try things on
-    shapecat process demo.mcap --out results    find, categorize and follow objects
-    shapecat view results/demo                  look at them in Rerun
+    shapecat simulate demo.mcap                 make a recording to try shapecat on
+    shapecat process demo.mcap --out results    find, categorize and track objects
+    shapecat view results/demo                  review them in Rerun
     """
     # The system's allocator gives memory back that long recordings no longer need.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")

@@ -31,18 +31,16 @@ json_option = click.option("--json", "as_json", is_flag=True, help="Print one JS
 array_option = click.option(
     "--json", "as_json", is_flag=True, help="Print a JSON array, an object per recording."
 )
-config_option = click.option(
-    "--config", type=ANY_PATH, help="Settings in TOML; unknown names are refused."
-)
+config_option = click.option("--config", type=ANY_PATH, help="TOML file with settings.")
 set_option = click.option(
     "--set",
     "overrides",
     multiple=True,
     metavar="NAME=VALUE",
-    help="Change one setting, for example detection.max_range_m=1.5. Repeatable.",
+    help="Change a setting, for example detection.max_range_m=1.5; repeatable.",
 )
 model_option = click.option(
-    "--model", type=ANY_PATH, help="Model file; the default model is shipped with the package."
+    "--model", type=ANY_PATH, help="Model file; the default model by default."
 )
 
 
@@ -57,8 +55,8 @@ verbose_option = click.option(
     is_flag=True,
     expose_value=False,
     callback=_be_verbose,
-    help="Log what is done, on stderr.",
+    help="Log each step to stderr.",
 )
 BOXES = ("full", "visible")
-BOXES_HELP = "Boxes around all of the objects (full), or around what is seen of them (visible)."
+BOXES_HELP = "Box the whole object (full), or its visible part."
 seed_option = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)

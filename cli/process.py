@@ -28,43 +28,51 @@ _MOST_ROWS = 100
 
 @click.command()
 @click.argument("recordings", nargs=-1, required=True)
-@click.option("--out", required=True, help="Results go to OUT/NAME per recording; may be a URL.")
-@click.option("--topic", "topics", multiple=True, help="Cloud stream to read. Repeatable.")
+@click.option(
+    "--out", required=True, help="Folder or URL for the results; each recording gets OUT/NAME."
+)
+@click.option(
+    "--topic", "topics", multiple=True, help="Topic with depth images or clouds; repeatable."
+)
 @click.option(
     "--up",
     default="auto",
     show_default=True,
     metavar="auto|tf|imu|X,Y,Z",
-    help="Where up is: from transforms, an IMU, or a vector in the sensor frame.",
+    help="Source of the up direction: transforms, an IMU, or a vector in the sensor frame.",
 )
-@click.option("--fixed-frame", metavar="F", help="Frame in which things stand still.")
-@click.option("--start", "start_s", type=SECONDS, help="Seconds after the start of the recording.")
-@click.option("--end", "end_s", type=SECONDS, help="Seconds after the start of the recording.")
-@click.option("--every", type=click.IntRange(1), default=1, help="Read only every Nth frame.")
+@click.option(
+    "--fixed-frame", metavar="F", help="Frame in which objects stand still, such as map or odom."
+)
+@click.option("--start", "start_s", type=SECONDS, help="Begin this long after the start.")
+@click.option("--end", "end_s", type=SECONDS, help="Stop this long after the start.")
+@click.option("--every", type=click.IntRange(1), default=1, help="Process every Nth frame.")
 @click.option(
     "--jobs",
     type=click.IntRange(1),
-    help="Cores to use: recordings at the same time, or frames where there are fewer. "
-    "All by default.",
+    help="Number of processes, one per core by default. They share the frames of a recording "
+    "if there are fewer recordings.",
 )
 @click.option(
     "--executor",
     type=click.Choice(["local", "dask", "ray"]),
     default="local",
     show_default=True,
-    help="Where recordings are processed.",
+    help="System that runs the work.",
 )
-@click.option("--scheduler", metavar="ADDRESS", help="Running Dask scheduler or Ray cluster.")
-@click.option("--shard", metavar="I/N", help="Only part I of N, for job arrays.")
+@click.option(
+    "--scheduler", metavar="ADDRESS", help="Address of a running Dask scheduler or Ray cluster."
+)
+@click.option("--shard", metavar="I/N", help="Process part I of N, for job arrays.")
 @click.option(
     "--progress",
     type=click.Choice(["auto", *KINDS]),
     default="auto",
     show_default=True,
-    help="How progress is shown on stderr.",
+    help="Format of the progress on stderr.",
 )
 @click.option(
-    "--color", metavar="TOPIC", help="Colour images to use; by default those of the depth camera."
+    "--color", metavar="TOPIC", help="Topic of colour images; that of the depth camera by default."
 )
 @click.option("--no-color", is_flag=True, help="Do not use colour images.")
 @click.option("--boxes", type=click.Choice(BOXES), help=BOXES_HELP)
@@ -73,10 +81,14 @@ _MOST_ROWS = 100
 @click.option(
     "--overwrite",
     is_flag=True,
-    help="Replace the results of an earlier run; corrected labels are carried over by place.",
+    help="Replace earlier results; corrected labels are transferred by place.",
 )
-@click.option("--discard-labels", is_flag=True, help="With --overwrite: drop corrected labels.")
-@click.option("--no-fsync", is_flag=True, help="Do not wait for the disk; for scratch folders.")
+@click.option(
+    "--discard-labels", is_flag=True, help="With --overwrite: do not transfer corrected labels."
+)
+@click.option(
+    "--no-fsync", is_flag=True, help="Do not flush files to the disk; for scratch folders."
+)
 @verbose_option
 @model_option
 @config_option
@@ -105,12 +117,12 @@ def process(
     as_json: bool,
     **choices: Any,
 ) -> None:
-    """Find, categorize and follow the objects in recordings.
+    """Find, categorize and track the objects in recordings.
 
-    Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a folder to search
-    for them, or a URL. The results are tables, annotated.mcap for Foxglove, and review.rrd for
-    Rerun; with several recordings OUT/manifest.jsonl says what became of each. The same command
-    again goes on with what is missing.
+    Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a folder with
+    recordings, or a URL. The results are tables, annotated.mcap for Foxglove, and review.rrd for
+    Rerun. For several recordings, OUT/manifest.jsonl records the state of each; the same command
+    again resumes the work.
 
     \b
     shapecat process lab.mcap kitchen.bag --out results

@@ -12,7 +12,7 @@ from shapecat.system import stopping
 PHASES = {
     "simulate": "simulating",
     "perceive": "finding and categorizing objects",
-    "revise": "looking again where frames disagree",
+    "revise": "revising frames that disagree",
     "annotate": "writing annotated.mcap",
     "review": "writing review.rrd",
     "report": "drawing reports",

@@ -11,10 +11,10 @@ from .render import progress_bars
 @click.command()
 @click.argument("folders", nargs=-1, required=True, type=ANY_PATH, metavar="DIR...")
 def report(*, folders: tuple[Path, ...]) -> None:
-    """Make a page per run to look through and correct its tracks in a browser.
+    """Make a page per run, to review and correct its tracks in a browser.
 
-    Each DIR is a run, or a folder of runs, which gets an index.html. Click categories on the page,
-    download the corrected tracks.csv, and apply it.
+    Each DIR is a run, or a folder of runs, which also gets an index.html. Click categories on the
+    page, download the corrected tracks.csv, and apply it with `shapecat annotate`.
 
     \b
     shapecat report results

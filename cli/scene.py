@@ -10,9 +10,9 @@ from .options import ANY_PATH
 @click.command()
 @click.argument("run", type=ANY_PATH)
 @click.option("--frame", type=click.IntRange(0), required=True, help="Number of the frame.")
-@click.option("--topic", help="Its cloud stream; needed if there are several.")
+@click.option("--topic", help="Topic of the frame, if the run has several.")
 def scene(*, run: Path, frame: int, topic: str | None) -> None:
-    """Print what stands on what in one frame of a run.
+    """Print which object stands on which in one frame of a run.
 
     \b
     shapecat scene results/lab --frame 12

@@ -48,7 +48,7 @@ _SENSORS = (
     "--format",
     "container",
     type=click.Choice(["mcap", "ros1", "ros2"]),
-    help="Recording format; by default what the suffix of OUT says, else mcap.",
+    help="Format of the recording; by default that of the suffix of OUT, else mcap.",
 )
 @click.option(
     "--sensor",
@@ -58,11 +58,15 @@ _SENSORS = (
     help="Depth camera.",
 )
 @click.option(
-    "--frames", type=click.IntRange(1), default=90, show_default=True, help="30 per second."
+    "--frames",
+    type=click.IntRange(1),
+    default=90,
+    show_default=True,
+    help="Number of frames; 30 are one second.",
 )
 @click.option("--clouds", is_flag=True, help="Write PointCloud2 instead of depth images.")
 @click.option("--color", is_flag=True, help="Add a colour camera beside the depth camera.")
-@click.option("--overwrite", is_flag=True, help="Replace a recording that is there.")
+@click.option("--overwrite", is_flag=True, help="Replace an existing recording.")
 @seed_option
 def simulate(
     *,
@@ -78,8 +82,8 @@ def simulate(
 ) -> None:
     """Make a recording of simulated objects, with the truth beside it.
 
-    OUT.truth.json says what stands where in each frame; OUT.labels.npz which pixel is whose, and
-    OUT.color_labels.npz with --color which pixel of the colour images.
+    OUT.truth.json holds the objects of each frame, OUT.labels.npz the object of each depth pixel,
+    and with --color OUT.color_labels.npz that of each colour pixel.
 
     \b
     shapecat simulate demo.mcap --scene clutter --frames 60 --seed 3

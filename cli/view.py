@@ -13,8 +13,15 @@ from .options import ANY_PATH
 
 @click.command()
 @click.argument("run", type=ANY_PATH)
-@click.option("--web", is_flag=True, help="Serve it to a browser on this machine until Ctrl-C.")
-@click.option("--screenshot", type=ANY_PATH, metavar="PNG", help="Draw it to a file, no window.")
+@click.option(
+    "--web", is_flag=True, help="Serve the review to a browser on this machine until Ctrl-C."
+)
+@click.option(
+    "--screenshot",
+    type=ANY_PATH,
+    metavar="PNG",
+    help="Write a picture instead of opening a window.",
+)
 def view(*, run: Path, web: bool, screenshot: Path | None) -> None:
     """Open the review of a run in the Rerun viewer.
 

@@ -9,7 +9,7 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import OutputError
@@ -49,6 +49,7 @@ from shapecat.runs.jobs import (
 from shapecat.runs.label_transfer import Transfer, transfer_labels
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.perceiving import Observer, ignore, perceive_all, revise
+from shapecat.runs.run_info import RunInfo
 from shapecat.runs.segments import discard_segments
 from shapecat.runs.shown import read_shown_frames
 from shapecat.runs.tables import release_memory
@@ -128,7 +129,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
     return summarize(job, run)
 
 
-def _once(phase: str, folder: Path, run: dict[str, Any], work: Callable[[], None]) -> None:
+def _once(phase: str, folder: Path, run: RunInfo, work: Callable[[], None]) -> None:
     """Do a phase unless it is done, and note in run.json that it is, and how long it took."""
     if phase in run["seconds"]:
         _log.info("%s: %s was done before", folder, phase)
@@ -145,7 +146,7 @@ def _once(phase: str, folder: Path, run: dict[str, Any], work: Callable[[], None
 def _finished(
     job: Job,
     recording: Recording,
-    planned: dict[str, Any],
+    planned: RunInfo,
     content: ContentDigest,
     observe: Observer,
 ) -> Summary:
@@ -162,7 +163,7 @@ def _finished(
     return summarize(job, run, processed=False)
 
 
-def track(folder: Path, run: dict[str, Any], job: Job) -> None:
+def track(folder: Path, run: RunInfo, job: Job) -> None:
     """Follow the detections over time and fuse their posteriors: tracks.parquet, tracks.csv."""
     run["counts"]["tracks"] = track_run(
         folder, job.settings.tracking, run["model"]["categories"], work=run["work"]
@@ -172,7 +173,7 @@ def track(folder: Path, run: dict[str, Any], job: Job) -> None:
 def annotate(
     folder: Path,
     recording: Recording,
-    run: dict[str, Any],
+    run: RunInfo,
     observe: Observer = ignore,
     *,
     cores: int = 1,

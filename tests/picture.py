@@ -66,16 +66,21 @@ def places(rooms: set[str]) -> dict[str, _Place]:
     return found
 
 
+_ARROW_HEAD = (
+    '<marker id="a" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="7" markerHeight="7" '
+    'orient="auto"><path d="M0 0 8 4 0 8z" fill="#789"/></marker>'
+)
+
+
 def draw() -> str:
     """Return the picture."""
     graph = imports()
     boxes = places(set(graph) | {"schemas"})
     height = 16 + ROW * len(LAYERS)
+    size = f'viewBox="0 0 {WIDTH} {height}" font-family="sans-serif" font-size="15"'
     parts = [
-        f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {WIDTH} {height}" '
-        'font-family="sans-serif" font-size="15">',
-        '<marker id="a" viewBox="0 0 8 8" refX="8" refY="4" markerWidth="7" markerHeight="7" '
-        'orient="auto"><path d="M0 0 8 4 0 8z" fill="#789"/></marker>',
+        f'<svg xmlns="http://www.w3.org/2000/svg" {size}>',
+        _ARROW_HEAD,
         f'<rect width="{WIDTH}" height="{height}" fill="#fff"/>',
         *_bands(),
         *_arrows(reduced(graph), boxes),
@@ -88,7 +93,8 @@ def draw() -> str:
 def _bands() -> Iterator[str]:
     for row, name in enumerate(LAYERS.values()):
         top = 10 + row * ROW
-        yield f'<rect x="6" y="{top}" width="{WIDTH - 12}" height="{ROW - 8}" rx="8" fill="#f2f5f8"/>'
+        shape = f'x="6" y="{top}" width="{WIDTH - 12}" height="{ROW - 8}" rx="8"'
+        yield f'<rect {shape} fill="#f2f5f8"/>'
         yield f'<text x="18" y="{top + ROW / 2}" font-size="13" fill="#567">{escape(name)}</text>'
 
 

@@ -17,6 +17,7 @@ from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.identity import work_id
 from shapecat.runs.jobs import Job, describe_run, resume, same_options
+from shapecat.runs.run_info import RunInfo
 
 MODEL: Any = SimpleNamespace(model_id="m1", categories=("cup", "can"))
 
@@ -28,7 +29,7 @@ def source(tmp_path: Path) -> Path:
     return path
 
 
-def planned(source: Path, **changes: Any) -> dict[str, Any]:
+def planned(source: Path, **changes: Any) -> RunInfo:
     run = describe_run(Job(source, source.parent / "lab", **changes), MODEL)
     run["input"]["digest"] = "xxh3-128:0123"
     return run
@@ -77,7 +78,7 @@ def test_outputs_do_not_change_what_the_tables_are_of(source: Path, name: str) -
     assert work_id(planned(source)) == work_id(planned(source, **changed[name]))
 
 
-def partial(folder: Path, run: dict[str, Any]) -> None:
+def partial(folder: Path, run: RunInfo) -> None:
     (folder / "segments" / "000000").mkdir(parents=True)
     write_run(folder, run)
 
@@ -122,7 +123,7 @@ def test_a_batch_takes_nothing_of_another_model_for_done(
     (source.parent / "other.mcap").write_bytes(b"another")
     out, job = tmp_path / "out", Job(Path(), Path(), mcap=False, rrd=False)
     (out / "lab").mkdir(parents=True)
-    write_run(out / "lab", {"id": "1", "seconds": {}})
+    write_run(out / "lab", planned(source))
     model = SimpleNamespace(model_id="m1")
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: model)
     with plan_batch(job, [str(source.parent)], str(out)) as batch:

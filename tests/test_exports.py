@@ -309,9 +309,8 @@ def test_loose_clouds_get_semantic_kitti_labels(tmp_path: Path) -> None:
     )
     frame = Frame("/scan", 0, 5, 5, "laser", points=points)
     labelled = LabelledFrame("/scan", 0, 5, 5, "laser", None, (), (item,), (), {})
-    finished = FinishedRun(
-        tmp_path, {"model": {"categories": ["cup", "can"]}}, {513: TrackLabel(513, "can", 1.0)}
-    )
+    run: Any = {"model": {"categories": ["cup", "can"]}}
+    finished = FinishedRun(tmp_path, run, {513: TrackLabel(513, "can", 1.0)})
 
     assert write_point_labels(tmp_path, [(labelled, frame)], finished) == 1
 

@@ -217,7 +217,8 @@ def test_several_runs_make_one_data_set_split_by_recording(
 
 def test_a_recording_is_never_in_both_splits() -> None:
     def finished(name: str, digest: str) -> FinishedRun:
-        return FinishedRun(Path(name), {"input": {"digest": digest}}, {})
+        run: Any = {"input": {"digest": digest}}
+        return FinishedRun(Path(name), run, {})
 
     runs = [finished(f"r{k}", f"d{k // 2}") for k in range(20)]
     splits = split_runs(runs, 0.3)

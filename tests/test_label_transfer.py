@@ -46,8 +46,9 @@ def make_run(
     folder.mkdir(parents=True)
     work = work or f"w{folder.name}"
     about = {"path": f"/recordings/{folder.name}.mcap", "digest": digest, "files": []}
-    run = {"id": new_id(), "work": work, "input": about, "fixed_frame": fixed_frame}
-    write_run(folder, {**run, "model": {"categories": ["cup", "can", "bowl"]}})
+    model = {"categories": ["cup", "can", "bowl"]}
+    run: Any = {"id": new_id(), "work": work, "input": about, "fixed_frame": fixed_frame}
+    write_run(folder, run | {"model": model})
     rows = [
         (track, frame, place)
         for track, path in objects.items()
@@ -551,5 +552,5 @@ def test_labels_of_another_run_go_by_place_when_asked(
 
     done = shapecat("annotate", two, "--labels", one / "tracks.csv", "--by-place")
     assert done.exit_code == 0, done.stderr
-    assert "1 of 1 labels have found their objects" in done.stdout
+    assert "1 of 1 labels transferred" in done.stdout
     assert "teapot" in annotated(two)

@@ -1,6 +1,7 @@
 import errno
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -32,7 +33,8 @@ def test_nothing_is_left_after_an_error(tmp_path: Path) -> None:
 def own(folder: Path, **files: str) -> Path:
     """Make a run folder as an earlier run has left it."""
     folder.mkdir(parents=True)
-    write_run(folder, {"id": new_id()})
+    run: Any = {"id": new_id()}
+    write_run(folder, run)
     for name, text in files.items():
         (folder / name.replace("_", ".")).write_text(text)
     return folder
@@ -149,9 +151,10 @@ def test_replacing_keeps_the_old_file_on_error(tmp_path: Path) -> None:
 
 
 def test_run_json_round_trip_and_foreign_folder(tmp_path: Path) -> None:
-    write_run(tmp_path, {"input": {"path": "ü"}})
+    run: Any = {"input": {"path": "ü"}}
+    write_run(tmp_path, run)
 
-    assert read_run(tmp_path) == {"input": {"path": "ü"}}
+    assert read_run(tmp_path) == run
 
     (tmp_path / "run.json").write_text("[]")
     with pytest.raises(OutputError, match="not a description"):
@@ -188,7 +191,7 @@ def test_digest_of_a_folder_sees_names_and_where_files_end(tmp_path: Path) -> No
 def test_content_is_read_only_where_times_cannot_tell(tmp_path: Path) -> None:
     path = tmp_path / "f"
     path.write_text("abc")
-    known = {"files": file_stats(path), "digest": content_digest(path)}
+    known: Any = {"files": file_stats(path), "digest": content_digest(path)}
 
     def read() -> str:
         reads.append(path)

@@ -1,14 +1,20 @@
+import json
+from importlib.resources import files
 from pathlib import Path
+from typing import get_type_hints
 
 import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_allclose
 
+from shapecat.config import Settings
 from shapecat.errors import OutputError
 from shapecat.runs.corrections import TrackLabel
+from shapecat.runs.folder import read_run
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.perceived import FrameRow, PerceptionTables
+from shapecat.runs.run_info import Counts, InputInfo, Options, RunInfo
 from shapecat.runs.tables import (
     DETECTIONS,
     FRAMES,
@@ -133,3 +139,26 @@ def test_a_foreign_file_is_not_a_table(tmp_path: Path) -> None:
     (tmp_path / "frames.parquet").write_bytes(b"hello")
     with pytest.raises(OutputError, match="process the recording again"):
         list(read_row_groups(tmp_path / "frames.parquet"))
+
+
+def test_run_json_is_as_its_schema_says(guessed_run: Path, coloured_run: Path) -> None:
+    """The schema is the documentation: it has every entry, and no other."""
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json.loads(files("shapecat.schemas").joinpath("run.json").read_text("utf-8"))
+    jsonschema.Draft202012Validator.check_schema(schema)
+
+    for folder in (guessed_run, coloured_run):
+        jsonschema.validate(read_run(folder), schema)
+    assert set(schema["properties"]) == set(RunInfo.__annotations__)
+    for name, kind in (("input", InputInfo), ("options", Options), ("counts", Counts)):
+        assert set(schema["properties"][name]["properties"]) == set(get_type_hints(kind))
+
+
+def test_the_schema_has_every_setting() -> None:
+    schema = json.loads(files("shapecat.schemas").joinpath("run.json").read_text("utf-8"))
+    known = schema["$defs"]["settings"]["properties"]
+    values = Settings().as_dict()
+
+    assert set(known) == set(values)
+    for group in set(values) - {"seed"}:
+        assert set(known[group]["properties"]) == set(values[group])

@@ -4,7 +4,7 @@ import dataclasses
 import json
 import logging
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future
 from contextlib import suppress
 from dataclasses import dataclass
@@ -20,6 +20,7 @@ from shapecat.executors import Mailbox, is_dropped, is_lost, post
 from shapecat.pipeline import Observer, process
 from shapecat.runs.folder import read_run, require_ours
 from shapecat.runs.jobs import Job, Summary, summarize
+from shapecat.runs.run_info import RunInfo
 from shapecat.system import stopping
 
 __all__ = ["Outcome", "Watcher", "attempt", "exit_code", "process_here", "process_on"]
@@ -167,11 +168,11 @@ def _already(task: Task) -> Outcome | None:
     return Outcome(task.job, summarize(task.job, _run_of(task.job), processed=False))
 
 
-def _run_of(job: Job) -> Mapping[str, Any]:
+def _run_of(job: Job) -> RunInfo:
     """Return what run.json of a complete run says."""
     if not job.target:
         return read_run(job.folder)
-    run: Mapping[str, Any] = json.loads(fetch(f"{job.target}/run.json"))
+    run: RunInfo = json.loads(fetch(f"{job.target}/run.json"))
     return run
 
 

@@ -17,6 +17,7 @@ from shapecat.recordings import Recording, choose_streams
 from shapecat.recordings.colour_frames import frames_with_colour
 from shapecat.recordings.colour_streams import ColourStream, choose_colour
 from shapecat.runs.masks import FrameMasks, MaskTable, read_masks
+from shapecat.runs.run_info import RunInfo, window_of
 from shapecat.runs.tables import Key, frame_rows, numbers, read_row_groups
 from shapecat.types import Frame, LabelledFrame
 
@@ -46,19 +47,16 @@ def colours_of(recording: Recording, options: Mapping[str, Any]) -> dict[str, Co
     return {topic: colour for topic, colour in found.items() if colour is not None}
 
 
-def views_again(
-    recording: Recording, run: Mapping[str, Any]
-) -> Iterator[tuple[Frame, ColourView | None]]:
+def views_again(recording: Recording, run: RunInfo) -> Iterator[tuple[Frame, ColourView | None]]:
     """Read the frames that a run was made from once more, with their colour images."""
     options = run["options"]
-    chosen = {name: options[name] for name in ("start_s", "end_s", "every")}
     streams = choose_streams(recording, options["topics"])
     colours = colours_of(recording, options)
-    return frames_with_colour(recording, streams, colours, skipped=Counter(), **chosen)
+    return frames_with_colour(recording, streams, colours, skipped=Counter(), **window_of(options))
 
 
 def with_colour(
-    labelled: Iterable[LabelledFrame], recording: Recording, run: Mapping[str, Any], folder: Path
+    labelled: Iterable[LabelledFrame], recording: Recording, run: RunInfo, folder: Path
 ) -> Iterator[tuple[LabelledFrame, Frame, Coloured | None]]:
     """Pair labelled frames, in the order they were read, with their clouds and colour images.
 
@@ -103,9 +101,7 @@ class _Masks:
         return found
 
 
-def write_masks(
-    folder: Path, recording: Recording, run: Mapping[str, Any], *, threads: int = 1
-) -> int:
+def write_masks(folder: Path, recording: Recording, run: RunInfo, *, threads: int = 1) -> int:
     """Write the masks of all detections of a run; return how many frames have a colour image.
 
     Parameters

@@ -1,6 +1,6 @@
 """A finished run for those who program: its tables as arrays, its frames with their points."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -15,6 +15,7 @@ from shapecat.errors import OutputError
 from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.rereading import FinishedRun, open_source, read_finished
 from shapecat.recordings.colour_image import pixels_of
+from shapecat.runs.run_info import RunInfo
 from shapecat.runs.tables import numbers
 from shapecat.types import Frame, LabelledFrame, LabelledObject
 
@@ -157,7 +158,7 @@ class Run:
         return f"<Run {self.folder}: {counts['frames']} frames, {len(self.labels)} tracks>"
 
     @property
-    def info(self) -> Mapping[str, Any]:
+    def info(self) -> RunInfo:
         """What run.json says: input, settings, counts, seconds, warnings."""
         return self._finished.run
 

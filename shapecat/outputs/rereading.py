@@ -5,7 +5,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 from shapecat.errors import OutputError, RecordingError
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
@@ -13,6 +12,7 @@ from shapecat.runs.corrections import TrackLabel, read_labels
 from shapecat.runs.folder import read_run
 from shapecat.runs.identity import content_digest, same_content
 from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.run_info import RunInfo, window_of
 from shapecat.types import Frame, LabelledFrame
 
 __all__ = [
@@ -29,7 +29,7 @@ class FinishedRun:
     """A run folder: run.json, and what each of its tracks is shown as."""
 
     folder: Path
-    run: Mapping[str, Any]
+    run: RunInfo
     labels: Mapping[int, TrackLabel]
 
     @property
@@ -89,7 +89,7 @@ def _runs_in(folder: Path) -> list[Path]:
 
 
 @contextmanager
-def open_source(run: Mapping[str, Any], moved_to: Path | None = None) -> Iterator[Recording]:
+def open_source(run: RunInfo, moved_to: Path | None = None) -> Iterator[Recording]:
     """Open the recording that a run was made from.
 
     Parameters
@@ -113,9 +113,8 @@ def open_source(run: Mapping[str, Any], moved_to: Path | None = None) -> Iterato
         yield recording
 
 
-def clouds_again(recording: Recording, run: Mapping[str, Any]) -> Iterator[Frame]:
+def clouds_again(recording: Recording, run: RunInfo) -> Iterator[Frame]:
     """Read the frames that a run was made from once more."""
     options = run["options"]
-    chosen = {name: options[name] for name in ("start_s", "end_s", "every")}
     streams = choose_streams(recording, options["topics"])
-    return frames(recording, streams, skipped=Counter(), **chosen)
+    return frames(recording, streams, skipped=Counter(), **window_of(options))

@@ -7,12 +7,13 @@ has none is neither removed nor replaced, and what somebody has put beside our f
 import json
 import os
 import shutil
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import cast
 
 from shapecat.errors import OutputError
+from shapecat.runs.run_info import RunInfo
 from shapecat.system.files import flush, lock, partial_path, replacing
 
 __all__ = [
@@ -217,13 +218,13 @@ def _missing_parents(folder: Path) -> list[Path]:
     return [parent for parent in folder.parents if not parent.exists()]
 
 
-def write_run(folder: Path, run: Mapping[str, Any]) -> None:
+def write_run(folder: Path, run: RunInfo) -> None:
     """Write run.json."""
     with replacing(folder / "run.json") as path:
         path.write_text(json.dumps(run, indent=1) + "\n", "utf-8")
 
 
-def read_run(folder: Path) -> dict[str, Any]:
+def read_run(folder: Path) -> RunInfo:
     """Read run.json.
 
     Raises
@@ -238,4 +239,4 @@ def read_run(folder: Path) -> dict[str, Any]:
     if not isinstance(run, dict):
         msg = f"{folder / 'run.json'}: not a description of a run"
         raise OutputError(msg)
-    return run
+    return cast("RunInfo", run)

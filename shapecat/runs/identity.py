@@ -7,7 +7,7 @@ that leaves its folder carries it.
 
 import json
 import secrets
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from threading import Event, Thread
 from types import TracebackType
@@ -16,6 +16,7 @@ from typing import Any, Self
 import xxhash
 
 from shapecat.errors import RecordingError
+from shapecat.runs.run_info import InputInfo, RunInfo
 from shapecat.system.files import input_files
 
 __all__ = [
@@ -40,7 +41,7 @@ def new_id() -> str:
     return secrets.token_hex(8)
 
 
-def work_id(run: Mapping[str, Any]) -> str:
+def work_id(run: RunInfo) -> str:
     """Return the name of the work that run.json describes, once its content is known.
 
     Content, settings, options, model and version, but for what the tables do not depend on. The
@@ -145,7 +146,7 @@ class ContentDigest:
         return self._digest
 
 
-def same_content(known: Mapping[str, Any], path: Path, digest: Callable[[], str]) -> bool:
+def same_content(known: InputInfo, path: Path, digest: Callable[[], str]) -> bool:
     """Return whether a recording is the one that run.json knows as its ``input``.
 
     The digest is asked for only where the times of its files cannot tell.

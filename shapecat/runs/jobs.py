@@ -24,6 +24,7 @@ from shapecat.runs.identity import (
     work_id,
 )
 from shapecat.runs.label_transfer import lost_labels, transfer_labels
+from shapecat.runs.run_info import Options, RunInfo
 from shapecat.runs.segments import count_segments
 from shapecat.system.files import input_size, replacing
 
@@ -77,11 +78,19 @@ class Job:
         """What the user calls the recording: its path, or URL."""
         return self.origin or str(self.source)
 
-    def selection(self) -> dict[str, Any]:
-        """Return the options that decide what the tables hold, as stored in run.json."""
-        names = ("topics", "up", "fixed_frame", "start_s", "end_s", "every", "color", "mcap", "rrd")
-        values = {name: getattr(self, name) for name in names}
-        return {**values, "topics": list(self.topics)}
+    def selection(self) -> Options:
+        """Return the options that decide the content of the results, as stored in run.json."""
+        return {
+            "topics": list(self.topics),
+            "up": self.up,
+            "fixed_frame": self.fixed_frame,
+            "start_s": self.start_s,
+            "end_s": self.end_s,
+            "every": self.every,
+            "color": self.color,
+            "mcap": self.mcap,
+            "rrd": self.rrd,
+        }
 
 
 @dataclass(frozen=True)
@@ -108,7 +117,7 @@ class Summary:
         }
 
 
-def describe_run(job: Job, categorizer: Categorizer) -> dict[str, Any]:
+def describe_run(job: Job, categorizer: Categorizer) -> RunInfo:
     """Return what run.json says before the work begins; the digest of the input comes later."""
     return {
         "id": new_id(),
@@ -128,21 +137,23 @@ def describe_run(job: Job, categorizer: Categorizer) -> dict[str, Any]:
         "options": job.selection(),
         "model": {"id": categorizer.model_id, "categories": list(categorizer.categories)},
         "fixed_frame": None,
-        "up": None,
+        "up": {},
         "counts": {},
         "seconds": {},
         "warnings": [],
     }
 
 
-def same_options(run: Mapping[str, Any], planned: Mapping[str, Any]) -> bool:
+def same_options(run: RunInfo, planned: RunInfo) -> bool:
     """Return whether a run has the settings, options and model of another."""
-    return all(run.get(key) == planned[key] for key in ("settings", "options", "model"))
+    return (
+        run.get("settings") == planned["settings"]
+        and run.get("options") == planned["options"]
+        and run.get("model") == planned["model"]
+    )
 
 
-def resume(
-    folder: Path, planned: dict[str, Any], source: Path, digest: Callable[[], str]
-) -> dict[str, Any]:
+def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str]) -> RunInfo:
     """Return the run that was killed in a folder; the planned one, if that was other work.
 
     What is left of other work is removed.
@@ -165,13 +176,13 @@ def has_work(folder: Path) -> bool:
     return False
 
 
-def identify(run: dict[str, Any], content: ContentDigest) -> None:
+def identify(run: RunInfo, content: ContentDigest) -> None:
     """Note the digest of the input, now that it was read, and the name of the work."""
     run["input"]["digest"] = run["input"]["digest"] or content.result()
     run["work"] = work_id(run)
 
 
-def require_unchanged(folder: Path, run: Mapping[str, Any], source: Path) -> None:
+def require_unchanged(folder: Path, run: RunInfo, source: Path) -> None:
     """Discard results that may be of two recordings.
 
     Raises
@@ -184,7 +195,7 @@ def require_unchanged(folder: Path, run: Mapping[str, Any], source: Path) -> Non
         raise RecordingError(msg)
 
 
-def keep_labels(folder: Path, run: dict[str, Any], job: Job) -> None:
+def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
     """Carry the labels that a person gave to the results that are replaced over to the new ones.
 
     The table they were written into is kept beside the new one.
@@ -201,7 +212,7 @@ def keep_labels(folder: Path, run: dict[str, Any], job: Job) -> None:
     run["corrections"] = transfer.as_dict()
 
 
-def summarize(job: Job, run: Mapping[str, Any], *, processed: bool = True) -> Summary:
+def summarize(job: Job, run: RunInfo, *, processed: bool = True) -> Summary:
     """Return the summary of a run."""
     return Summary(
         source=job.name,

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 from shapecat.errors import OutputError
 from shapecat.runs.corrections import find_misread, merged_with, merging_with, relabel
 from shapecat.runs.folder import read_run, write_run
+from shapecat.runs.run_info import RunInfo
 from shapecat.runs.same_objects import Group, Matches, match_in_place, match_in_time
 from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
 
@@ -97,7 +98,7 @@ def transfer_labels(source: Path, target: Path) -> Transfer:
     return transfer
 
 
-def _labelled_otherwise(transfer: Transfer, target: Path, run: Mapping[str, Any]) -> dict[int, str]:
+def _labelled_otherwise(transfer: Transfer, target: Path, run: RunInfo) -> dict[int, str]:
     """Return the tracks that a person has given another label; an earlier transfer has no say."""
     earlier = {
         (item["track"], item["label"]) for item in run.get("corrections", {}).get("transferred", ())

@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -23,6 +22,7 @@ from shapecat.recordings import Recording, choose_streams, frames
 from shapecat.recordings.gravity import Upright
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceived import FrameRow, PerceptionTables
+from shapecat.runs.run_info import Options, RunInfo, window_of
 from shapecat.runs.second_look import Revision, frames_to_revise
 from shapecat.runs.segments import read_segments
 from shapecat.runs.tables import Key, count_rows, read_row_groups
@@ -49,7 +49,7 @@ def ignore(_phase: str, _done: int, _total: int | None) -> None:
 def perceive_all(
     recording: Recording,
     folder: Path,
-    run: dict[str, Any],
+    run: RunInfo,
     job: Job,
     categorizer: Categorizer,
     observe: Observer = ignore,
@@ -98,7 +98,7 @@ def perceive_all(
 def revise(
     recording: Recording,
     folder: Path,
-    run: dict[str, Any],
+    run: RunInfo,
     job: Job,
     categorizer: Categorizer,
     observe: Observer = ignore,
@@ -129,7 +129,7 @@ def revise(
 
 
 def _views_again(
-    recording: Recording, run: dict[str, Any], job: Job, chosen: dict[Key, Revision]
+    recording: Recording, run: RunInfo, job: Job, chosen: dict[Key, Revision]
 ) -> Iterator[tuple[FrameRow, View]]:
     """Yield the chosen frames, to be perceived with another up."""
     source, _ = _select(recording, run["options"], Counter())
@@ -211,12 +211,11 @@ def _perceived(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
 
 
 def _select(
-    recording: Recording, options: dict[str, Any], skipped: Counter[str]
+    recording: Recording, options: Options, skipped: Counter[str]
 ) -> tuple[Iterator[Frame], int | None]:
     """Return the frames that the options select, and about how many there are."""
     streams = choose_streams(recording, options["topics"])
-    chosen = {name: options[name] for name in ("start_s", "end_s", "every")}
     whole = options["start_s"] is None and options["end_s"] is None
     counts = [stream.count for stream in streams]
     total = sum(-(-(n or 0) // options["every"]) for n in counts) if whole else 0
-    return frames(recording, streams, skipped=skipped, **chosen), total or None
+    return frames(recording, streams, skipped=skipped, **window_of(options)), total or None

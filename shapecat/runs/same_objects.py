@@ -248,15 +248,19 @@ def _require_one_frame(source: Path | None, target: Path) -> None:
     ------
     OutputError : a run has no fixed frame, or they have different ones.
     """
-    frames = {f: read_run(f)["fixed_frame"] for f in (source, target) if f is not None}
-    for folder, frame in frames.items():
-        if frame is None:
-            msg = f"{folder}: has no fixed frame, in which objects could be found again by place"
-            raise OutputError(msg)
-    if len(set(frames.values())) > 1:
-        names = " and ".join(frames.values())
-        msg = f"{target}: the fixed frames differ ({names}); process with --fixed-frame"
+    names = [_fixed_frame(folder) for folder in (source, target) if folder is not None]
+    if len(set(names)) > 1:
+        found = " and ".join(names)
+        msg = f"{target}: the fixed frames differ ({found}); process with --fixed-frame"
         raise OutputError(msg)
+
+
+def _fixed_frame(folder: Path) -> str:
+    name = read_run(folder)["fixed_frame"]
+    if name is None:
+        msg = f"{folder}: has no fixed frame, in which objects could be found again by place"
+        raise OutputError(msg)
+    return name
 
 
 def _place_of(row: TrackRow) -> F8:

@@ -1,0 +1,81 @@
+"""The contents of run.json, which describes a run; `schemas/run.json` documents each entry."""
+
+from typing import Any, NotRequired, TypedDict
+
+__all__ = ["Counts", "InputInfo", "ModelInfo", "Options", "RunInfo", "Window", "window_of"]
+
+
+class InputInfo(TypedDict):
+    """The recording: its path or URL, size, digest, and name, size and times of each file."""
+
+    path: str
+    bytes: int
+    digest: str
+    files: list[list[Any]]
+
+
+class Window(TypedDict):
+    """The part of a recording that is read."""
+
+    start_s: float | None
+    end_s: float | None
+    every: int
+
+
+class Options(Window):
+    """The options of `shapecat process` that decide the content of the results."""
+
+    topics: list[str]
+    up: str
+    fixed_frame: str | None
+    color: str | None
+    mcap: bool
+    rrd: bool
+
+
+class ModelInfo(TypedDict):
+    """The model: its id, and its categories in the order of every posterior."""
+
+    id: str
+    categories: list[str]
+
+
+class Counts(TypedDict, total=False):
+    """Numbers of frames, skipped frames by reason, detections, and tracks by category."""
+
+    frames: int
+    skipped: dict[str, int]
+    detections: int
+    resumed: int
+    revised: int
+    tracks: dict[str, int]
+    color: int
+
+
+class RunInfo(TypedDict):
+    """The contents of run.json.
+
+    ``id`` is random and belongs to one folder; ``work`` names what was done with what: runs that
+    share it have the same tables. ``seconds`` has an entry for each finished phase.
+    """
+
+    id: str
+    work: str
+    input: InputInfo
+    versions: dict[str, str]
+    settings: dict[str, Any]
+    options: Options
+    model: ModelInfo
+    fixed_frame: str | None
+    up: dict[str, Any]
+    counts: Counts
+    seconds: dict[str, float]
+    warnings: list[str]
+    color: NotRequired[dict[str, str]]
+    boxes: NotRequired[str]
+    corrections: NotRequired[dict[str, Any]]
+
+
+def window_of(options: Options) -> Window:
+    """Return the part of a recording that options select."""
+    return {"start_s": options["start_s"], "end_s": options["end_s"], "every": options["every"]}
