@@ -1,6 +1,5 @@
 """The door from Python: light to import, arrays of the stated shapes, every printed block works."""
 
-import os
 import re
 import subprocess
 import sys
@@ -12,6 +11,7 @@ import pytest
 
 import shapecat
 from shapecat.errors import ConfigError, OutputError
+from tests.test_docs_run import run_script
 
 PAGE = Path(__file__).parents[1] / "docs" / "python.md"
 
@@ -26,17 +26,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("python")
     (folder / "page.py").write_text("\n".join(blocks("python")), "utf-8")
     script = "\n".join(["set -eu", *blocks("sh"), f"{sys.executable} page.py"])
-    programs = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
-    done = subprocess.run(
-        ["bash", "-c", script],
-        cwd=folder,
-        env={**os.environ, "PATH": programs},
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
+    run_script(script, folder)
     return folder
 
 

@@ -40,19 +40,24 @@ def script(page: str) -> str:
     return "\n".join(["set -eu", "trap 'kill $(jobs -p) 2>/dev/null || true' EXIT", *lines])
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("page", PAGES)
-def test_page_works_as_printed(page: str, tmp_path: Path) -> None:
+def run_script(text: str, folder: Path) -> None:
+    """Run what a reader would type in a folder, with the installed command."""
     programs = f"{Path(sys.executable).parent}:{os.environ['PATH']}"
     done = subprocess.run(
-        ["bash", "-c", script(page)],
-        cwd=tmp_path,
+        ["bash", "-c", text],
+        cwd=folder,
         env={**os.environ, "PATH": programs},
         capture_output=True,
         text=True,
         check=False,
-        timeout=300,
+        timeout=600,
     )
-
     assert done.returncode == 0, done.stdout + done.stderr
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", PAGES)
+def test_page_works_as_printed(page: str, tmp_path: Path) -> None:
+    run_script(script(page), tmp_path)
+
     assert [name for name in PAGES[page] if not (tmp_path / name).exists()] == []

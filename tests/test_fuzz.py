@@ -63,6 +63,15 @@ def mcap(place: Path, **options: Any) -> Path:
     return path
 
 
+def write_all(writer: Any, make: MessageFactory) -> None:
+    known: dict[str, Any] = {}
+    for topic, time, message in items(make):
+        if topic not in known:
+            kind = message.__msgtype__
+            known[topic] = writer.add_connection(topic, kind, typestore=make.typestore)
+        writer.write(known[topic], time, make.serialize(message))
+
+
 def bag(place: Path, compression: Any = None) -> Path:
     make, path = MessageFactory(1), place / "a.bag"
     writer = BagWriter(path)
@@ -70,26 +79,14 @@ def bag(place: Path, compression: Any = None) -> Path:
     if compression is not None:
         writer.set_compression(compression)
     with writer:
-        known: dict[str, Any] = {}
-        for topic, time, message in items(make):
-            if topic not in known:
-                known[topic] = writer.add_connection(
-                    topic, message.__msgtype__, typestore=make.typestore
-                )
-            writer.write(known[topic], time, make.serialize(message))
+        write_all(writer, make)
     return path
 
 
 def folder(place: Path, plugin: StoragePlugin) -> Path:
     make, path = MessageFactory(2), place / "a"
     with FolderWriter(path, version=9, storage_plugin=plugin) as writer:
-        known: dict[str, Any] = {}
-        for topic, time, message in items(make):
-            if topic not in known:
-                known[topic] = writer.add_connection(
-                    topic, message.__msgtype__, typestore=make.typestore
-                )
-            writer.write(known[topic], time, make.serialize(message))
+        write_all(writer, make)
     (part,) = (file for file in path.iterdir() if file.suffix in {".db3", ".mcap"})
     return part
 

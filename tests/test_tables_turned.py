@@ -1,8 +1,6 @@
 """The tables of a sensor that is turned and moved, every number another: checked by SciPy."""
 
 import csv
-import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -10,14 +8,10 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_allclose
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from shapecat.config import TrackingSettings
-from shapecat.outputs.rereading import clouds_again, open_source
-from shapecat.pipeline import annotate_again
 from shapecat.runs.corrections import read_labels
-from shapecat.runs.folder import read_run
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.perceived import FrameRow, PerceptionTables
 from shapecat.runs.shown import read_shown_frames
@@ -212,73 +206,3 @@ def test_labelled_frames_and_annotations_show_the_same_boxes(run: Path) -> None:
             assert_allclose(item.center, same.full.center, atol=1e-6)
             assert_allclose(item.size, same.full.size, atol=1e-6)
             assert_allclose(item.orientation, same.full.orientation, atol=1e-6)
-
-
-def test_neurons_lie_among_the_points_of_their_object(guessed_run: Path) -> None:
-    """In any other frame than the sensor's they would float beside it."""
-    run = read_run(guessed_run)
-    found = rows(guessed_run, "detections")
-    count = 0
-    with open_source(run) as recording:
-        for frame in clouds_again(recording, run):
-            for row in (row for row in found if row["frame"] == frame.index):
-                points = frame.xyz(np.array(row["indices"], np.uint32))
-                points = points[np.isfinite(points).all(axis=1)]
-                neurons = np.reshape(row["neurons"], (-1, 3))
-                if len(neurons):
-                    distance, _ = cKDTree(points).query(neurons)
-                    assert np.quantile(distance, 0.95) < 0.01
-                    count += 1
-                low, high = points.min(axis=0) - 0.01, points.max(axis=0) + 0.01
-                assert (low < row["center"]).all()
-                assert (row["center"] < high).all()
-    assert count > 50
-
-
-def test_tracks_stand_where_the_simulator_put_them(guessed_run: Path) -> None:
-    """The last table against the truth: metres in the fixed frame, none of the axes exchanged."""
-    source = Path(read_run(guessed_run)["input"]["path"])
-    truth = json.loads(source.with_suffix(".truth.json").read_text())
-    things = {item["track"]: item["center"] for frame in truth for item in frame["objects"]}
-    centers = np.array(list(things.values()))
-    placed = np.array([[float(row[axis]) for axis in "xyz"] for row in lines(guessed_run)])
-    off, which = cKDTree(centers).query(placed)
-
-    assert len(placed) >= 0.8 * len(centers)
-    assert len(set(which.tolist())) >= 0.8 * len(placed)
-    assert np.median(off) < 0.03
-
-
-def test_corrected_labels_reach_every_output(coloured_run: Path, tmp_path: Path) -> None:
-    """An output that keeps its old labels teaches the mistake that was corrected."""
-    folder = tmp_path / "table"
-    shutil.copytree(coloured_run, folder)
-    number = int(lines(folder)[0]["track"])
-    corrected = tmp_path / "mine.csv"
-    corrected.write_text(f"track,category,confidence,label\n{number},cup,0,wine glass\n")
-
-    annotate_again(folder, corrected)
-
-    assert b"wine glass" in plain_mcap(folder / "annotated.mcap")
-    from rerun.chunk import RrdReader  # noqa: PLC0415  heavy
-
-    shown = {
-        label
-        for chunk in RrdReader(str(folder / "review.rrd")).stream().to_chunks()
-        for name, column in zip(
-            chunk.to_record_batch().schema.names, chunk.to_record_batch().columns, strict=True
-        )
-        if name.endswith(":labels")
-        for group in column.to_pylist()
-        for label in group or ()
-    }
-    assert any("wine glass" in label for label in shown), shown
-
-
-def plain_mcap(path: Path) -> bytes:
-    """Return all messages of what was added to a recording."""
-    from mcap.reader import make_reader  # noqa: PLC0415  beside its only use
-
-    with path.open("rb") as file:
-        messages = make_reader(file).iter_messages()
-        return b"".join(m.data for _, c, m in messages if c.topic.startswith("/shapecat/"))

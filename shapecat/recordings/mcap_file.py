@@ -6,7 +6,7 @@ out, and both are said in the warnings.
 
 import zlib
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -31,7 +31,7 @@ from shapecat.recordings.mcap_records import (
     split_message,
     walk,
 )
-from shapecat.recordings.messages import Channel, Message, Topic, ros_type
+from shapecat.recordings.messages import Channel, Message, Stamp, Topic, Topics, ros_type
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.time_order import Timed, in_time_order
 
@@ -103,15 +103,8 @@ class McapRecording(Recording):
         """Close the file."""
         self._file.close()
 
-    def channels(self) -> tuple[Channel, ...]:
-        """Return every channel."""
-        return tuple(self._channels.values())
-
     def messages(
-        self,
-        topics: Collection[str] | None = None,
-        start_ns: int | None = None,
-        stop_ns: int | None = None,
+        self, topics: Topics = None, start_ns: Stamp = None, stop_ns: Stamp = None
     ) -> Iterator[Message]:
         """Yield undecoded messages; see `Recording.messages`."""
         wanted = {

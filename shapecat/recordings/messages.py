@@ -1,11 +1,17 @@
 """The small records of a log: channels, messages, topics."""
 
+from collections.abc import Collection
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from shapecat.errors import RecordingError
 
-__all__ = ["Channel", "Message", "MessageError", "Topic", "ros_type"]
+__all__ = ["Channel", "Message", "MessageError", "Stamp", "Topic", "Topics", "ros_type"]
+
+Topics: TypeAlias = Collection[str] | None
+"""The names of topics; None means all."""
+Stamp: TypeAlias = int | None
+"""A log time in nanoseconds; None means no limit."""
 
 
 class MessageError(RecordingError):

@@ -1,12 +1,11 @@
 """What every reader offers."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any, ClassVar, Self
 
-from shapecat.recordings.messages import Channel, Message, Topic
+from shapecat.recordings.messages import Channel, Message, Stamp, Topic, Topics
 
 __all__ = ["Recording"]
 
@@ -34,11 +33,12 @@ class Recording(ABC):
         self.start_ns = 0
         self.end_ns = 0
         self.warnings: list[str] = []
+        self._channels: dict[int, Channel] = {}
         self._decoders: dict[tuple[str, str, bytes], Callable[[bytes | memoryview], Any]] = {}
 
-    @abstractmethod
     def channels(self) -> tuple[Channel, ...]:
         """Return every channel, also those without messages."""
+        return tuple(self._channels.values())
 
     def parts(self) -> list["Recording"]:
         """Return the files it is made of: itself, where it is one."""
@@ -46,10 +46,7 @@ class Recording(ABC):
 
     @abstractmethod
     def messages(
-        self,
-        topics: Collection[str] | None = None,
-        start_ns: int | None = None,
-        stop_ns: int | None = None,
+        self, topics: Topics = None, start_ns: Stamp = None, stop_ns: Stamp = None
     ) -> Iterator[Message]:
         """Yield undecoded messages in flat memory.
 
@@ -90,10 +87,5 @@ class Recording(ABC):
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()

@@ -6,13 +6,13 @@ without an index (``.bag.active``), or cut off. Damage never ends the reading.
 
 import struct
 from collections import Counter
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 from shapecat.errors import RecordingError
-from shapecat.recordings.messages import Channel, Message, Topic, ros_type
+from shapecat.recordings.messages import Channel, Message, Stamp, Topic, Topics, ros_type
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.ros1_records import (
     BAG_HEADER,
@@ -79,15 +79,8 @@ class BagRecording(Recording):
         """Close the bag."""
         self._file.close()
 
-    def channels(self) -> tuple[Channel, ...]:
-        """Return every connection."""
-        return tuple(self._channels.values())
-
     def messages(
-        self,
-        topics: Collection[str] | None = None,
-        start_ns: int | None = None,
-        stop_ns: int | None = None,
+        self, topics: Topics = None, start_ns: Stamp = None, stop_ns: Stamp = None
     ) -> Iterator[Message]:
         """Yield undecoded messages; see `Recording.messages`."""
         wanted = {n for n, c in self._channels.items() if topics is None or c.topic in topics}

@@ -1,6 +1,6 @@
 """ROS 2 bags in one SQLite file (.db3)."""
 
-from collections.abc import Collection, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -12,7 +12,7 @@ from rosbags.rosbag2.metadata import dump_qos_v8
 
 from shapecat.errors import RecordingError
 from shapecat.recordings.decoding import LIBRARY_ERRORS
-from shapecat.recordings.messages import Channel, Message, Topic, ros_type
+from shapecat.recordings.messages import Channel, Message, Stamp, Topic, Topics, ros_type
 from shapecat.recordings.recording import Recording
 
 __all__ = ["DatabaseRecording"]
@@ -59,15 +59,8 @@ class DatabaseRecording(Recording):
         """Close the database."""
         self._reader.close()
 
-    def channels(self) -> tuple[Channel, ...]:
-        """Return every topic."""
-        return tuple(self._channels.values())
-
     def messages(
-        self,
-        topics: Collection[str] | None = None,
-        start_ns: int | None = None,
-        stop_ns: int | None = None,
+        self, topics: Topics = None, start_ns: Stamp = None, stop_ns: Stamp = None
     ) -> Iterator[Message]:
         """Yield undecoded messages; see `Recording.messages`."""
         wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]

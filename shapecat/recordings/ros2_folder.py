@@ -4,7 +4,7 @@ import os
 import re
 import shutil
 import time
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from heapq import merge
 from itertools import pairwise
@@ -16,7 +16,7 @@ import zstandard
 
 from shapecat.errors import RecordingError
 from shapecat.recordings.mcap_file import McapRecording
-from shapecat.recordings.messages import Channel, Message, Topic
+from shapecat.recordings.messages import Channel, Message, Stamp, Topic, Topics
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.ros2_database import DatabaseRecording
 from shapecat.system.files import lock
@@ -87,10 +87,7 @@ class FolderRecording(Recording):
         return tuple(dict.fromkeys(c for part in self._parts for c in part.channels()))
 
     def messages(
-        self,
-        topics: Collection[str] | None = None,
-        start_ns: int | None = None,
-        stop_ns: int | None = None,
+        self, topics: Topics = None, start_ns: Stamp = None, stop_ns: Stamp = None
     ) -> Iterator[Message]:
         """Yield undecoded messages of all parts; see `Recording.messages`."""
         streams = [part.messages(topics, start_ns, stop_ns) for part in self._parts]

@@ -10,7 +10,6 @@ import secrets
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from threading import Event, Thread
-from types import TracebackType
 from typing import Any, Self
 
 import xxhash
@@ -109,12 +108,7 @@ class ContentDigest:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Leave off reading."""
         self._cancelled.set()
         if self._thread.ident is not None:
