@@ -21,13 +21,12 @@ import pyarrow.parquet as pq
 from mcap.reader import make_reader
 from mcap.writer import Writer
 
-from shapecat.recordings.protobuf import encode_message
 from shapecat.runs.jobs import Job
 from shapecat.simulation import KINECT, Sensor, make_scene, record
 from shapecat.simulation.messages import MessageFactory
 from shapecat.simulation.scenes import SceneKind
 from shapecat.types import Camera
-from tests.foxglove_messages import LAYOUT, descriptors, time
+from tests.foxglove_messages import descriptors, encode, time
 
 FIXTURES = Path(__file__).parents[1] / "fixtures"
 EXPECTED = FIXTURES / "expected"
@@ -205,7 +204,7 @@ def _as_foxglove(source: Path, target: Path) -> None:
                     number = writer.register_schema(kind, "protobuf", descriptors())
                     topic = channel.topic
                     channels[topic] = writer.register_channel(topic, "protobuf", number)
-                data = encode_message(values, kind, LAYOUT)
+                data = encode(values, kind)
                 writer.add_message(
                     channels[channel.topic], message.log_time, data, message.publish_time
                 )

@@ -2,20 +2,31 @@
 
 import base64
 import json
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from mcap.writer import Writer
 
-from shapecat.recordings.protobuf import ProtobufField, encode_message
+from shapecat.recordings.protobuf import message_class
 
 SECOND = 10**9
 EPOCH = 1_700_000_000 * SECOND
 DOUBLE, STRING, MESSAGE, RAW, ENUM, FIXED, INT64 = 1, 9, 11, 12, 14, 7, 3
 
 
-def field(name: str, kind: int, message: str = "", *, repeated: bool = False) -> ProtobufField:
-    return ProtobufField(name, kind, repeated, message)
+class Field(NamedTuple):
+    """A field: its name, its type as numbered in descriptor.proto, and the name of a message."""
+
+    name: str
+    kind: int
+    message: str
+    repeated: bool
+
+
+def field(name: str, kind: int, message: str = "", *, repeated: bool = False) -> Field:
+    return Field(name, kind, message, repeated)
 
 
 TIME = field("timestamp", MESSAGE, "google.protobuf.Timestamp")
@@ -66,43 +77,38 @@ LAYOUT = {
         5: field("rotation", MESSAGE, "foxglove.Quaternion"),
     },
 }
-DESCRIPTOR = {
-    "set": {1: field("file", MESSAGE, "file", repeated=True)},
-    "file": {2: field("package", STRING), 4: field("message_type", MESSAGE, "type", repeated=True)},
-    "type": {1: field("name", STRING), 2: field("field", MESSAGE, "field", repeated=True)},
-    "field": {
-        1: field("name", STRING),
-        3: field("number", 5),
-        4: field("label", 5),
-        5: field("type", 5),
-        6: field("type_name", STRING),
-    },
-}
 
 
-def descriptors(layout: dict[str, dict[int, ProtobufField]] = LAYOUT) -> bytes:
-    files = [
-        {
-            "package": name.rpartition(".")[0],
-            "message_type": [
-                {
-                    "name": name.rpartition(".")[2],
-                    "field": [
-                        {
-                            "name": f.name,
-                            "number": number,
-                            "label": 3 if f.repeated else 1,
-                            "type": f.kind,
-                            "type_name": f".{f.message}" if f.message else "",
-                        }
-                        for number, f in fields.items()
-                    ],
-                }
-            ],
-        }
-        for name, fields in layout.items()
-    ]
-    return encode_message({"file": files}, "set", DESCRIPTOR)
+def descriptors() -> bytes:
+    """Return the FileDescriptorSet of all messages of `LAYOUT`, a file for each package."""
+    found = FileDescriptorSet()
+    files = {}
+    for package in ("google.protobuf", "foxglove"):
+        files[package] = found.file.add(name=f"{package}.proto", package=package, syntax="proto3")
+    files["foxglove"].dependency.append("google.protobuf.proto")
+    files["foxglove"].enum_type.add(name="NumericType").value.add(name="UNKNOWN", number=0)
+    for name, fields in LAYOUT.items():
+        package, _, short = name.rpartition(".")
+        message = files[package].message_type.add(name=short)
+        for number, one in fields.items():
+            added = message.field.add(
+                name=one.name, number=number, label=3 if one.repeated else 1, type=one.kind
+            )
+            if one.message or one.kind == ENUM:
+                added.type_name = f".{one.message or 'foxglove.NumericType'}"
+    data: bytes = found.SerializeToString(deterministic=True)
+    return data
+
+
+def encode(values: dict[str, Any], name: str) -> bytes:
+    """Encode plain values as a message of `LAYOUT`."""
+    encoded: bytes = _class_of(name)(**values).SerializeToString(deterministic=True)
+    return encoded
+
+
+@cache
+def _class_of(name: str) -> Any:
+    return message_class(descriptors(), name)
 
 
 def time(stamp: int, encoding: str) -> dict[str, int]:
@@ -123,12 +129,9 @@ def write(path: Path, encoding: str, items: list[tuple[str, str, dict[str, Any]]
             text = descriptors() if encoding == "protobuf" else b"{}"
             schema = writer.register_schema(kind, schema_encoding, text)
             channel = writer.register_channel(topic, encoding, schema)
-            filled = {"timestamp": time(EPOCH, encoding), "frame_id": "camera"} | values
-            data = (
-                encode_message(filled, kind, LAYOUT)
-                if encoding == "protobuf"
-                else json.dumps(filled).encode()
-            )
+            own = {} if kind == "foxglove.FrameTransform" else {"frame_id": "camera"}
+            filled = {"timestamp": time(EPOCH, encoding)} | own | values
+            data = encode(filled, kind) if encoding == "protobuf" else json.dumps(filled).encode()
             writer.add_message(channel, EPOCH + k, data, EPOCH + k)
         writer.finish()
     return path

@@ -19,6 +19,7 @@ from shapecat.outputs.annotated_mcap import write_annotated
 from shapecat.outputs.annotation import Annotation, text_position
 from shapecat.outputs.annotations import encoder_for
 from shapecat.outputs.colours import colour_of
+from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encoder_for
 from shapecat.recordings import open_recording
 from shapecat.recordings.protobuf import message_decoder
 from shapecat.types import ShownBox, ShownFrame
@@ -218,3 +219,78 @@ def test_added_messages_are_found_by_time(tmp_path: Path) -> None:
     topics = {channel.id: channel.topic for channel in summary.channels.values()}
     counts = {topics[k]: n for k, n in summary.statistics.channel_message_counts.items()}
     assert counts == {"/points": 9, "/shapecat/detections": 400, "/shapecat/scene": 400}
+
+
+def test_what_another_sensor_still_sees_is_not_taken_away(tmp_path: Path) -> None:
+    """Tracks of two sensors share the scene: the last one that shows an object ends it."""
+
+    def seen(topic: str, k: int, *, there: bool) -> ShownFrame:
+        boxes = (BOX,) if there else ()
+        return ShownFrame(topic, k, STAMP + k, STAMP + k, "optical", boxes, ())
+
+    frames = [
+        seen("/a", 0, there=True),
+        seen("/b", 1, there=True),
+        seen("/a", 2, there=False),
+        seen("/b", 3, there=False),
+    ]
+    target = tmp_path / "out.mcap"
+    with open_recording(write_mcap(tmp_path / "a.mcap")) as recording:
+        write_annotated(recording, target, iter(frames), run={})
+    with target.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        scenes = [d for *_, d in reader.iter_decoded_messages(topics=["/shapecat/scene"])]
+
+    assert [[d.id for d in scene.deletions] for scene in scenes] == [[], [], [], ["track-7"]]
+
+
+IMAGE_BOX = ImageBox(7, "bowl", 0.625, (31, 44, 120, 66))
+IMAGE = ImageFrame(STAMP, STAMP + 3, "colour", (IMAGE_BOX,))
+
+
+def drawn(encoding: str) -> dict[str, Any]:
+    """Return what is drawn on an image, by topic, decoded by what its channel says of itself."""
+    found = {}
+    for channel, encode in image_encoder_for(encoding):
+        data = encode(IMAGE)
+        if encoding == "json":
+            message = json.loads(data)
+        elif encoding == "protobuf":
+            message = message_decoder(channel.schema, channel.schema_name)(data)
+        else:
+            ros1 = encoding == "ros1"
+            message = decode_ros(channel.schema_name, channel.schema, bytes(data), ros1=ros1)
+        found[channel.topic] = plain(message)
+    return found
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1", "json", "protobuf"])
+def test_image_annotations_say_the_same_in_every_encoding(encoding: str) -> None:
+    """Of a box 120 wide and 66 high at (31, 44), in the colour of its category."""
+    message, colour = drawn(encoding)["/shapecat/image_annotations"], colour_of("bowl")
+    (line,), (text,) = message.points, message.texts
+    corners = [(p.x, p.y) for p in line.points]
+
+    assert (line.timestamp, text.timestamp) == (STAMP, STAMP)
+    assert sorted(corners) == [(31, 44), (31, 110), (151, 44), (151, 110)]
+    assert corners[0] in {(corners[1][0], corners[3][1]), (corners[3][0], corners[1][1])}
+    assert_allclose(numbers(line.outline_color, "rgb"), np.array(colour) / 255, atol=1e-6)
+    assert_allclose(numbers(line.fill_color, "rgb"), np.array(colour) / 255, atol=1e-6)
+    assert_allclose(numbers(text.background_color, "rgb"), np.array(colour) / 255, atol=1e-6)
+    assert (text.position.x, text.position.y) == corners[0]
+    assert "bowl" in text.text
+
+
+@pytest.mark.parametrize("encoding", ["cdr", "ros1"])
+def test_detections_on_images_keep_every_number_in_its_place(encoding: str) -> None:
+    message = drawn(encoding)["/shapecat/detections_2d"]
+    (item,) = message.detections
+
+    assert (message.header.stamp, message.header.frame_id) == (STAMP, "colour")
+    middle = item.bbox.center.position
+    assert (middle.x, middle.y, item.bbox.size_x, item.bbox.size_y) == (91, 77, 120, 66)
+    assert (item.results[0].hypothesis.class_id, item.results[0].hypothesis.score) == (
+        "bowl",
+        0.625,
+    )
+    assert item.id == "7"

@@ -10,16 +10,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from shapecat.outputs.annotated_mcap import write_annotated
-from shapecat.outputs.scene_protobuf import encode_scene, scene_descriptors
+from shapecat.outputs.scene_protobuf import descriptors_of, encode_foxglove
 from shapecat.recordings import choose_streams, frames, open_recording, read_transforms
 from shapecat.recordings.decoding import LIBRARY_ERRORS
-from shapecat.recordings.protobuf import encode_message, message_decoder
+from shapecat.recordings.protobuf import message_decoder
 from shapecat.types import Camera, Frame, ShownFrame
 from tests.foxglove_messages import (
     EPOCH,
-    LAYOUT,
     content,
     descriptors,
+    encode,
     write,
 )
 
@@ -96,7 +96,8 @@ def test_protobuf_scene_is_read_by_its_own_descriptors() -> None:
         "entities": [{"id": "track-3", "frame_locked": True, "metadata": [{"key": "k"}]}],
     }
 
-    read_back = message_decoder(scene_descriptors(), "foxglove.SceneUpdate")(encode_scene(scene))
+    name = "foxglove.SceneUpdate"
+    read_back = message_decoder(descriptors_of(name), name)(encode_foxglove(scene, name))
 
     assert read_back.deletions[0].timestamp.seconds == 5
     assert (read_back.deletions[0].type, read_back.deletions[0].id) == (1, "a")
@@ -130,7 +131,7 @@ def test_protobuf_source_gets_protobuf_annotations(tmp_path: Path) -> None:
 @settings(deadline=None, max_examples=50)
 def test_integers_survive(values: dict[str, int]) -> None:
     name = "google.protobuf.Timestamp"
-    data = encode_message(values, name, LAYOUT)
+    data = encode(values, name)
 
     assert message_decoder(descriptors(), name)(data) == SimpleNamespace(**values)
 

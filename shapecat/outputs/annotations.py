@@ -16,7 +16,7 @@ from shapecat.outputs.annotation import (
 )
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.ros_annotations import ArrayMessage, RosMessages
-from shapecat.outputs.scene_protobuf import encode_scene, scene_descriptors
+from shapecat.outputs.scene_protobuf import descriptors_of, encode_foxglove
 from shapecat.types import ShownBox, ShownFrame
 
 __all__ = ["ENCODERS", "Encode", "encoder_for"]
@@ -84,10 +84,10 @@ def _json(_markers: bool) -> list[tuple[AnnotationChannel, Encode]]:  # noqa: FB
 
 
 def _protobuf(_markers: bool) -> list[tuple[AnnotationChannel, Encode]]:  # noqa: FBT001  # the same
-    name, schema = "foxglove.SceneUpdate", scene_descriptors()
-    channel = AnnotationChannel(SCENE, "protobuf", name, "protobuf", schema)
+    name = "foxglove.SceneUpdate"
+    channel = AnnotationChannel(SCENE, "protobuf", name, "protobuf", descriptors_of(name))
     return [
-        (channel, lambda some: (encode_scene(_plain_scene(a, _PROTOBUF)) for a in some)),
+        (channel, lambda some: (encode_foxglove(_plain_scene(a, _PROTOBUF), name) for a in some)),
     ]
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import ConvexHull
 
 from shapecat.arrays import F8, I4
-from shapecat.errors import RecordingError
+from shapecat.errors import ConfigError, RecordingError
 from shapecat.simulation.mesh import Mesh, moved, standing
 from shapecat.simulation.placement import Rest, rests
 from shapecat.simulation.render import geometry, render
@@ -35,9 +35,13 @@ def load_mesh(path: Path) -> Mesh:
     Raises
     ------
     RecordingError : there are no triangles in it.
+    ConfigError : Open3D is not installed.
     """
-    import open3d  # noqa: PLC0415  # it needs display libraries and half a second
-
+    try:
+        import open3d  # noqa: PLC0415  # an extra
+    except ImportError as error:
+        msg = f"{path}: meshes are read by Open3D: pip install 'shapecat[meshes]' ({error})"
+        raise ConfigError(msg) from error
     read: Any = open3d.io.read_triangle_mesh(path)
     if len(read.triangles) == 0:
         msg = f"{path}: no triangles found; expected a triangle mesh in metres"
