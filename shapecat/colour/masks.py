@@ -111,10 +111,8 @@ def labelled_masks(seen: I4, count: int, scale: float = 1.0) -> tuple[Mask, ...]
     _bounds(seen, boxes)
     narrow, wide = max(1, round(_NARROW_PX * scale)), max(1, round(_WIDE_PX * scale))
     filled = seen.copy()
-    found = boxes[boxes[:, 2] > 0]
-    if len(found):
-        (left, top), (right, bottom) = found[:, :2].min(axis=0), found[:, 2:].max(axis=0)
-        _fill(seen, (left, top, right, bottom), narrow, wide, filled)
+    for box in boxes[boxes[:, 2] > 0].tolist():
+        _fill(seen, tuple(box), narrow, wide, filled)
     reach = max(1, round(_RAGGED_PX * scale / 2))
     return tuple(
         _smoothed(filled, label, boxes[label].tolist(), reach) for label in range(1, count + 1)
@@ -184,7 +182,10 @@ def _step(label: int, packed: int) -> int:
 
 @kernel
 def _fill(seen: I4, region: tuple[int, int, int, int], narrow: int, wide: int, filled: I4) -> None:
-    """Give objects the pixels of no object that they surround: one sweep there, one back."""
+    """Give objects the pixels of no object that they surround in a region: a sweep there, one back.
+
+    ``region`` is left, top, and one more than right and bottom.
+    """
     left, top, right, bottom = region
     west = np.zeros((bottom - top, right - left), np.int64)
     north = np.zeros((bottom - top, right - left), np.int64)
@@ -205,7 +206,9 @@ def _fill(seen: I4, region: tuple[int, int, int, int], narrow: int, wide: int, f
             below[u - left] = _step(label, below[u - left])
             if label <= 0:
                 w, n = west[v - top, u - left], north[v - top, u - left]
-                filled[v, u] = _surrounding(label, w, packed, n, below[u - left], narrow, wide)
+                found = _surrounding(label, w, packed, n, below[u - left], narrow, wide)
+                if found > 0:
+                    filled[v, u] = found
 
 
 @kernel

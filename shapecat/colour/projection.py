@@ -1,22 +1,24 @@
 """Points of the depth sensor on the image of a colour camera, and what hides what there."""
 
 from functools import lru_cache
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, U1, Bool
+from shapecat.arrays import F4, I4, U1
 from shapecat.cameras.colour import LensCamera
 from shapecat.cameras.lenses import LENS_MODELS, distort
 from shapecat.jit import kernel
 from shapecat.types import Camera, Pose
 
-__all__ = ["Painted", "hidden", "project", "rectified", "splat_depth"]
+__all__ = ["Painted", "project", "rectified", "splat_depth"]
 
 _FOOTPRINT_PX = 0.05
 """A depth pixel covers so much more of the colour image on each side, to leave no gaps."""
 _HIDDEN = 0.02
-"""A point is hidden where something is nearer by more than this share of its distance."""
+"""An object is hidden where something else is nearer by more than this share of its distance."""
+_SPARSE = 2
+"""Of what is of no object, every so-many-th row and column is looked at."""
 _BESIDE_PX = 30
 """Depth pixels so far from labelled ones are looked at, for what lies beside and between them."""
 _WIDEST = 3.0
@@ -43,24 +45,30 @@ def project(points: F4, lens: LensCamera, colour_from_depth: Pose) -> F4:
     >>> project(np.array([[0.1, -0.2, 1.0]]), lens, Pose(np.eye(3), np.array([0.1, 0.0, 1.0])))
     array([[370., 190.,   2.]], dtype=float32)
     """
-    camera, (kind, d) = lens.pinhole, _distortion(lens)
-    numbers = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    reach = _reach(lens) ** 2 if kind else np.inf
-    seen = np.zeros((len(points), 3), np.float32)
-    rotation = np.ascontiguousarray(colour_from_depth.rotation)
-    points, shift = np.asarray(points, np.float64), colour_from_depth.translation
-    _project(points, rotation, shift, numbers, kind, d.astype(np.float64), reach, seen)
+    points = np.asarray(points, np.float64)
+    x, y, depth = (points @ colour_from_depth.rotation.T + colour_from_depth.translation).T.copy()
+    known = np.isfinite(depth) & np.isfinite(x) & np.isfinite(y)
+    near = np.where(known, depth, 0.0)
+    _see(x, y, near, *_lens_numbers(lens))
+    seen = np.stack([x, y, depth], axis=1).astype(np.float32)
+    seen[near <= 0] = np.nan
     return seen
 
 
-def _distortion(lens: LensCamera) -> tuple[int, F4]:
-    """Return what kernels know of a lens: 0 none, 1 the polynomial, 2 the fisheye; 8 numbers."""
+def _lens_numbers(lens: LensCamera) -> tuple[F4, int, F4, float]:
+    """Return what kernels know of a lens: fx, fy, cx, cy; its kind; 8 coefficients; its reach.
+
+    The kind is 0 for none, 1 for the polynomial, 2 for the fisheye; the reach a squared slope.
+    """
     if lens.model and lens.model not in LENS_MODELS:
         msg = f"lens distortion {lens.model!r} is not known"
         raise ValueError(msg)
     d = np.zeros(8, np.float32)
     d[: len(lens.coefficients[:8])] = lens.coefficients[:8]
-    return 0 if not lens.model else 2 if lens.model in _FISHEYE else 1, d
+    kind = 0 if not lens.model else 2 if lens.model in _FISHEYE else 1
+    camera, reach = lens.pinhole, _reach(lens) ** 2 if kind else np.inf
+    numbers = np.array((camera.fx, camera.fy, camera.cx, camera.cy), np.float32)
+    return numbers, kind, d, np.float32(reach)
 
 
 def rectified(pixels: U1, lens: LensCamera) -> U1:
@@ -104,13 +112,11 @@ def _reach(lens: LensCamera) -> float:
 class Painted(NamedTuple):
     """A part of an image as the colour camera sees it, from row ``top`` and column ``left`` on.
 
-    ``nearest`` (h, w) is the inverse distance, 0 where nothing is known; ``labels`` (h, w) int32
-    what is seen, -1 there.
+    ``labels`` (h, w) int32 is what is seen, -1 where nothing is known.
     """
 
     left: int
     top: int
-    nearest: F4
     labels: I4
 
 
@@ -119,8 +125,9 @@ def splat_depth(
 ) -> Painted:
     """Paint a depth image as a colour camera sees it, where it has labels and around them.
 
-    Each depth pixel covers a square on the colour image, as large as its own, and a little more;
-    where several cover a pixel, the nearest shows.
+    Each labelled depth pixel covers a square on the colour image, as large as its own, and a little
+    more; where several cover a pixel, the nearest shows. What has no label is painted coarsely: it
+    matters by what it hides, and by the gaps that are none.
 
     Parameters
     ----------
@@ -138,22 +145,18 @@ def splat_depth(
     y = (np.arange(camera.height)[rows] - camera.cy) / camera.fy
     turn = colour_from_depth.rotation
     # A ray is turned by adding what its column and its row give to each coordinate.
-    by_column = np.outer(x, turn[:, 0]).astype(np.float32)
+    by_column = np.outer(turn[:, 0], x).astype(np.float32)
     by_row = (np.outer(y, turn[:, 1]) + turn[:, 2]).astype(np.float32)
-    shift = colour_from_depth.translation.astype(np.float32)
-    kind, d = _distortion(lens)
+    rays = by_column, by_row, colour_from_depth.translation.astype(np.float32)
+    numbers, *distortion = _lens_numbers(lens)
     scale = max(target.fx / camera.fx, target.fy / camera.fy)
-    limits = np.array((_reach(lens) ** 2 if kind else np.inf, scale / 2, _FOOTPRINT_PX), np.float32)
-    numbers = np.array((target.fx, target.fy, target.cx, target.cy), np.float32)
-    size = (target.width, target.height)
-    margin = int(_BESIDE_PX * scale)
-    rays, lens_of = (by_column, by_row, shift), (numbers, kind, d, limits)
-    left, top, right, bottom = _landing(depth, labels, *rays, *lens_of, size, margin)
-    nearest = np.zeros((max(0, bottom - top), max(0, right - left)), np.float32)
-    owners = np.full(nearest.shape, -1, np.int32)
+    size, margin = (target.width, target.height), int(_BESIDE_PX * scale)
+    left, top, right, bottom = _landing(depth, labels, *rays, numbers, *distortion, size, margin)
+    seen = np.full((max(0, bottom - top), max(0, right - left)), -1, np.int32)
     numbers[2:] -= (left, top)
-    _splat(depth, labels, *rays, *lens_of, nearest, owners)
-    return Painted(left, top, nearest, owners)
+    half, cell = np.float32(scale / 2), max(2, int(_SPARSE * scale + 0.5))
+    _splat(depth, labels, *rays, numbers, *distortion, half, cell, seen)
+    return Painted(left, top, seen)
 
 
 def _around(depth: F4, labels: I4, camera: Camera, colour_from_depth: Pose) -> tuple[slice, slice]:
@@ -190,39 +193,57 @@ def _extent(depth: F4, labels: I4) -> tuple[int, int, int, int, float, float]:
     return top, bottom, left, right, near, far
 
 
-@kernel
-def _bend(x: float, y: float, kind: int, d: F4) -> tuple[float, float]:
-    """Return `shapecat.cameras.lenses.distort` of one ray: 1 is the polynomial, 2 the fisheye."""
-    one, two = np.float32(1), np.float32(2)
-    r = x * x + y * y
-    if kind == 2:
-        radius = max(np.sqrt(r), np.float32(1e-9))
-        angle = np.arctan(radius)
-        s = angle * angle
-        bent = angle * (one + s * (d[0] + s * (d[1] + s * (d[2] + s * d[3])))) / radius
-        return x * bent, y * bent
-    k1, k2, p1, p2, k3, k4, k5, k6 = d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7]
-    radial = (one + r * (k1 + r * (k2 + r * k3))) / (one + r * (k4 + r * (k5 + r * k6)))
-    a = x * radial + two * p1 * x * y + p2 * (r + two * x * x)
-    b = y * radial + p1 * (r + two * y * y) + two * p2 * x * y
-    return a, b
+@kernel(fast=True)
+def _see(x: F4, y: F4, z: F4, numbers: F4, kind: int, d: F4, reach: float) -> None:
+    """Turn points in the frame of a camera, in place, into column, row and inverse distance.
+
+    The inverse distance is 0 for what is not seen. Source of the lenses:
+    `shapecat.cameras.lenses.distort`.
+    """
+    one, two, nought = np.float32(1), np.float32(2), np.float32(0)
+    for k in range(x.size):
+        near = one / max(z[k], np.float32(1e-3))
+        x[k], y[k] = x[k] * near, y[k] * near
+        z[k] = near if z[k] > np.float32(1e-3) else nought
+    if kind == 1:
+        k1, k2, p1, p2, k3, k4, k5, k6 = d[0], d[1], d[2], d[3], d[4], d[5], d[6], d[7]
+        for k in range(x.size):
+            a, b = x[k], y[k]
+            r = a * a + b * b
+            radial = (one + r * (k1 + r * (k2 + r * k3))) / (one + r * (k4 + r * (k5 + r * k6)))
+            x[k] = a * radial + two * p1 * a * b + p2 * (r + two * a * a)
+            y[k] = b * radial + p1 * (r + two * b * b) + two * p2 * a * b
+            z[k] = z[k] if r < reach else nought
+    elif kind == 2:
+        for k in range(x.size):
+            r = x[k] * x[k] + y[k] * y[k]
+            radius = max(np.sqrt(r), np.float32(1e-9))
+            angle = np.arctan(radius)
+            s = angle * angle
+            bent = angle * (one + s * (d[0] + s * (d[1] + s * (d[2] + s * d[3])))) / radius
+            x[k], y[k] = x[k] * bent, y[k] * bent
+            z[k] = z[k] if r < reach else nought
+    for k in range(x.size):
+        x[k], y[k] = x[k] * numbers[0] + numbers[2], y[k] * numbers[1] + numbers[3]
 
 
 @kernel
-def _place(
-    px: float, py: float, pz: float, numbers: F4, kind: int, d: F4, reach: float
-) -> tuple[Any, Any, Any]:
-    """Return column, row and inverse distance of a point; 0 for one that is not seen."""
-    nowhere = numbers[0] * 0, numbers[0] * 0, numbers[0] * 0  # of the precision of the others
-    if not pz > np.float32(1e-3):
-        return nowhere
-    near = np.float32(1) / pz
-    x, y = px * near, py * near
-    if kind:
-        if x * x + y * y >= reach:
-            return nowhere
-        x, y = _bend(x, y, kind, d)
-    return x * numbers[0] + numbers[2], y * numbers[1] + numbers[3], near
+def _see_row(
+    depth: F4,
+    by_column: F4,
+    by_row: F4,
+    shift: F4,
+    numbers: F4,
+    kind: int,
+    d: F4,
+    reach: float,
+    seen: F4,
+) -> None:
+    """Find where a row of a depth image (w,) lands: (3, w) column, row, inverse distance."""
+    for k in range(3):
+        for u in range(depth.size):
+            seen[k, u] = (by_column[k, u] + by_row[k]) * depth[u] + shift[k]
+    _see(seen[0], seen[1], seen[2], numbers, kind, d, reach)
 
 
 @kernel
@@ -235,41 +256,22 @@ def _landing(
     numbers: F4,
     kind: int,
     d: F4,
-    limits: F4,
+    reach: float,
     size: tuple[int, int],
     margin: int,
 ) -> tuple[int, int, int, int]:
     """Return the window around where labelled pixels land: left, top, right, bottom."""
     left, top, right, bottom = size[0], size[1], 0, 0
-    for v in range(0, depth.shape[0], 2):
+    seen = np.zeros((3, depth.shape[1]), np.float32)
+    for v in range(0, depth.shape[0], 4):
+        _see_row(depth[v], by_column, by_row[v], shift, numbers, kind, d, reach, seen)
         for u in range(0, depth.shape[1], 2):
-            z = depth[v, u]
-            if labels[v, u] > 0 and z > 0:
-                px = (by_column[u, 0] + by_row[v, 0]) * z + shift[0]
-                py = (by_column[u, 1] + by_row[v, 1]) * z + shift[1]
-                pz = (by_column[u, 2] + by_row[v, 2]) * z + shift[2]
-                x, y, near = _place(px, py, pz, numbers, kind, d, limits[0])
-                inside = -margin < x < size[0] + margin and -margin < y < size[1] + margin
-                if near > 0 and inside:
+            if labels[v, u] > 0 and depth[v, u] > 0 and seen[2, u] > 0:
+                x, y = seen[0, u], seen[1, u]
+                if -margin < x < size[0] + margin and -margin < y < size[1] + margin:
                     left, top = min(left, int(x) - margin), min(top, int(y) - margin)
                     right, bottom = max(right, int(x) + margin), max(bottom, int(y) + margin)
     return max(left, 0), max(top, 0), min(right, size[0]), min(bottom, size[1])
-
-
-@kernel
-def _project(
-    points: F8, rotation: F8, shift: F8, numbers: F8, kind: int, d: F8, reach: float, seen: F4
-) -> None:
-    for i in range(points.shape[0]):
-        x, y, z = points[i, 0], points[i, 1], points[i, 2]
-        px = rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2] * z + shift[0]
-        py = rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2] * z + shift[1]
-        pz = rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2] * z + shift[2]
-        column, row, near = _place(px, py, pz, numbers, kind, d, reach)
-        if near > 0:
-            seen[i, 0], seen[i, 1], seen[i, 2] = column, row, pz
-        else:
-            seen[i] = np.nan
 
 
 @kernel
@@ -282,56 +284,63 @@ def _splat(
     numbers: F4,
     kind: int,
     d: F4,
-    limits: F4,
-    nearest: F4,
-    owners: I4,
+    reach: float,
+    scale: float,
+    cell: int,
+    seen: I4,
 ) -> None:
-    height, width = nearest.shape
-    reach, scale, margin = limits[0], limits[1], limits[2]
-    wide, tall = np.float32(width), np.float32(height)
-    nought, one, two = np.float32(0), np.float32(1), np.float32(2)
+    """Paint labels where they land, then take back what something without a label hides.
+
+    ``scale`` is half the pixels of the image to a pixel of the depth image, at equal distance.
+    """
+    height, width = seen.shape
+    wide, tall, per_cell = np.float32(width), np.float32(height), np.float32(1 / cell)
+    nought, margin = np.float32(0), np.float32(_FOOTPRINT_PX)
+    place = np.zeros((3, depth.shape[1]), np.float32)
+    nearest = np.zeros(seen.shape, np.float32)
+    front = np.zeros((height // cell + 1, width // cell + 1), np.float32)
     for v in range(depth.shape[0]):
-        ray_x, ray_y, ray_z = by_row[v, 0], by_row[v, 1], by_row[v, 2]
+        _see_row(depth[v], by_column, by_row[v], shift, numbers, kind, d, reach, place)
         for u in range(depth.shape[1]):
             z, label = depth[v, u], labels[v, u]
-            # What is of no object matters by what it hides: a quarter of it is enough.
-            if not z > nought or (label == 0 and (u | v) & 1):
+            column, row, near = place[0, u], place[1, u], place[2, u]
+            if not z > nought or not near > nought:
                 continue
-            px = (by_column[u, 0] + ray_x) * z + shift[0]
-            py = (by_column[u, 1] + ray_y) * z + shift[1]
-            pz = (by_column[u, 2] + ray_z) * z + shift[2]
-            column, row, near = _place(px, py, pz, numbers, kind, d, reach)
-            half = scale * z * near + margin if label else two * scale * z * near
-            # The pixels whose middle lies in the square; a cast to int rounds towards 0.
-            left, right = max(column - half + one, nought), min(column + half, wide - one)
-            top, bottom = max(row - half + one, nought), min(row + half, tall - one)
-            if near > nought and left < right + one and top < bottom + one:
-                for j in range(np.uint32(top), np.uint32(max(bottom, nought)) + np.uint32(1)):
-                    for i in range(np.uint32(left), np.uint32(max(right, nought)) + np.uint32(1)):
-                        if near > nearest[j, i]:
-                            nearest[j, i] = near
-                            owners[j, i] = label
+            if label > 0:
+                half = scale * z * near + margin
+                _paint_square(label, near, column, row, half, nearest, seen)
+            elif (u | v) & (_SPARSE - 1) == 0 and nought <= column < wide and nought <= row < tall:
+                j, i = np.uint32(row * per_cell), np.uint32(column * per_cell)
+                front[j, i] = max(front[j, i], near)
+    for j in range(front.shape[0]):
+        for i in range(front.shape[1]):
+            if front[j, i] > nought:
+                _hide_behind(front[j, i], j * cell, i * cell, cell, nearest, seen)
 
 
-def hidden(seen: F4, painted: Painted) -> Bool:
-    """Tell which points the colour camera does not see.
+@kernel
+def _paint_square(
+    label: int, near: float, column: float, row: float, half: float, nearest: F4, seen: I4
+) -> None:
+    """Paint the pixels whose middle lies in a square, where it is the nearest."""
+    nought, one = np.float32(0), np.float32(1)
+    # A cast to int rounds towards 0.
+    left, right = max(column - half + one, nought), min(column + half, seen.shape[1] - one)
+    top, bottom = max(row - half + one, nought), min(row + half, seen.shape[0] - one)
+    if left >= right + one or top >= bottom + one:
+        return
+    for j in range(np.uint32(top), np.uint32(max(bottom, nought)) + np.uint32(1)):
+        for i in range(np.uint32(left), np.uint32(max(right, nought)) + np.uint32(1)):
+            if near > nearest[j, i]:
+                nearest[j, i] = near
+                seen[j, i] = label
 
-    Parameters
-    ----------
-    seen : (n, 3) as from `project`.
-    painted : what is nearest, as from `splat_depth`.
 
-    Returns
-    -------
-    (n,) True for points behind something nearer, and outside of what is painted.
-    """
-    height, width = painted.nearest.shape
-    seen = seen - np.array([painted.left, painted.top, 0], np.float32)
-    with np.errstate(invalid="ignore"):
-        inside = (seen[:, 0] > -0.5) & (seen[:, 0] < width - 0.5)
-        inside &= (seen[:, 1] > -0.5) & (seen[:, 1] < height - 0.5)
-    result = np.ones(len(seen), bool)
-    u, v, z = seen[inside].T
-    front = painted.nearest[np.rint(v).astype(np.int64), np.rint(u).astype(np.int64)]
-    result[inside] = front * z * (1 - _HIDDEN) > 1
-    return result
+@kernel
+def _hide_behind(front: float, top: int, left: int, cell: int, nearest: F4, seen: I4) -> None:
+    """Give a cell of the image no label where something at inverse distance ``front`` is nearer."""
+    limit = front * np.float32(1 - _HIDDEN)
+    for j in range(top, min(top + cell, seen.shape[0])):
+        for i in range(left, min(left + cell, seen.shape[1])):
+            if limit > nearest[j, i]:
+                seen[j, i] = 0
