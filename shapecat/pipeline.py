@@ -7,6 +7,7 @@ Each can be run again alone.
 
 import logging
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
@@ -15,7 +16,7 @@ from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import OutputError
 from shapecat.executors.order import read_ahead
 from shapecat.learning import load_model
-from shapecat.outputs.colouring import colours_of, with_colour, write_masks
+from shapecat.outputs.colouring import Seen, colours_of, find_masks, with_colour
 from shapecat.outputs.rereading import open_source
 from shapecat.recordings import Recording, choose_streams, open_recording
 from shapecat.rehearsal import compile_all
@@ -48,6 +49,7 @@ from shapecat.runs.jobs import (
 )
 from shapecat.runs.label_transfer import Transfer, transfer_labels
 from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.masks import count_masks
 from shapecat.runs.perceiving import Observer, ignore, perceive_all, revise
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.segments import discard_segments
@@ -129,7 +131,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
     return summarize(job, run)
 
 
-def _once(phase: str, folder: Path, run: RunInfo, work: Callable[[], None]) -> None:
+def _once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]) -> None:
     """Do a phase unless it is done, and note in run.json that it is, and how long it took."""
     if phase in run["seconds"]:
         _log.info("%s: %s was done before", folder, phase)
@@ -178,9 +180,10 @@ def annotate(
     *,
     cores: int = 1,
 ) -> None:
-    """Write masks.parquet, annotated.mcap and review.rrd from the tables and the recording.
+    """Write masks.parquet, review.rrd and annotated.mcap from the tables and the recording.
 
-    With several cores a thread reads while another writes.
+    With several cores a thread reads while another writes. The recording is read once for the
+    masks and the review.
     """
     settings, total = run["settings"]["outputs"], run["counts"]["frames"]
 
@@ -208,7 +211,8 @@ def annotate(
 
         labelled = read_labelled_frames(folder, labels())
         shown = _observed(labelled, "review", total, observe)
-        pairs = with_colour(shown, recording, run, folder)
+        found = masks() if run.get("color") and not masks_known() else None
+        pairs = with_colour(shown, recording, run, folder, found)
         write_review(
             folder / "review.rrd",
             read_ahead(pairs, count=_AHEAD) if cores > 1 else pairs,
@@ -220,17 +224,22 @@ def annotate(
             threads=cores,
         )
 
-    def find_masks() -> None:
-        run["counts"]["color"] = write_masks(folder, recording, run, threads=cores)
-        known = [*run["warnings"], *recording.warnings]
-        run["warnings"] = list(dict.fromkeys(known))
+    def masks() -> Iterator[Seen]:
+        return find_masks(recording, run, folder, threads=cores)
 
-    if run.get("color"):
-        _once("masks", folder, run, find_masks)
-    if run["options"]["mcap"]:
-        _once("annotated.mcap", folder, run, write_mcap)
+    def masks_known() -> bool:
+        return (folder / "masks.parquet").exists()
+
     if run["options"]["rrd"]:
         _once("review.rrd", folder, run, write_rrd)
+    if run.get("color") and not masks_known():
+        _once("masks", folder, run, lambda: deque(masks(), maxlen=0))
+    if masks_known():
+        run["counts"]["color"] = count_masks(folder)
+    known = [*run["warnings"], *recording.warnings]
+    run["warnings"] = list(dict.fromkeys(known))
+    if run["options"]["mcap"]:
+        _once("annotated.mcap", folder, run, write_mcap)
 
 
 def annotate_again(

@@ -45,14 +45,12 @@ def project(points: F4, lens: LensCamera, colour_from_depth: Pose) -> F4:
     >>> project(np.array([[0.1, -0.2, 1.0]]), lens, Pose(np.eye(3), np.array([0.1, 0.0, 1.0])))
     array([[370., 190.,   2.]], dtype=float32)
     """
-    points = np.asarray(points, np.float64)
-    x, y, depth = (points @ colour_from_depth.rotation.T + colour_from_depth.translation).T.copy()
-    known = np.isfinite(depth) & np.isfinite(x) & np.isfinite(y)
-    near = np.where(known, depth, 0.0)
-    _see(x, y, near, *_lens_numbers(lens))
-    seen = np.stack([x, y, depth], axis=1).astype(np.float32)
-    seen[near <= 0] = np.nan
-    return seen
+    rotation = colour_from_depth.rotation.astype(np.float32)
+    shift, seen = colour_from_depth.translation.astype(np.float32), np.zeros((3, len(points)), "f4")
+    _turn(np.asarray(points, np.float32), rotation, shift, seen)
+    distances = seen[2].copy()
+    _see(seen[0], seen[1], seen[2], *_lens_numbers(lens))
+    return np.where(seen[2] > 0, (seen[0], seen[1], distances), np.float32(np.nan)).T
 
 
 def _lens_numbers(lens: LensCamera) -> tuple[F4, int, F4, float]:
@@ -68,7 +66,7 @@ def _lens_numbers(lens: LensCamera) -> tuple[F4, int, F4, float]:
     kind = 0 if not lens.model else 2 if lens.model in _FISHEYE else 1
     camera, reach = lens.pinhole, _reach(lens) ** 2 if kind else np.inf
     numbers = np.array((camera.fx, camera.fy, camera.cx, camera.cy), np.float32)
-    return numbers, kind, d, np.float32(reach)
+    return numbers, kind, d, reach
 
 
 def rectified(pixels: U1, lens: LensCamera) -> U1:
@@ -178,12 +176,15 @@ def _around(depth: F4, labels: I4, camera: Camera, colour_from_depth: Pose) -> t
 
 @kernel
 def _extent(depth: F4, labels: I4) -> tuple[int, int, int, int, float, float]:
-    """Return where labelled pixels are, the least depth of all, and the greatest of theirs."""
+    """Return about where labelled pixels are, the least depth of all, and the greatest of theirs.
+
+    Every other row and column is looked at.
+    """
     top, bottom, left, right = depth.shape[0], 0, depth.shape[1], 0
-    near, far = np.inf, 0.0
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            z = float(depth[v, u])
+    near, far = np.float32(np.inf), np.float32(0)
+    for v in range(0, depth.shape[0], 2):
+        for u in range(0, depth.shape[1], 2):
+            z = depth[v, u]
             if z > 0:
                 near = min(near, z)
                 if labels[v, u] > 0:
@@ -191,6 +192,17 @@ def _extent(depth: F4, labels: I4) -> tuple[int, int, int, int, float, float]:
                     top, bottom = min(top, v), max(bottom, v + 1)
                     left, right = min(left, u), max(right, u + 1)
     return top, bottom, left, right, near, far
+
+
+@kernel
+def _turn(points: F4, rotation: F4, shift: F4, turned: F4) -> None:
+    """Move points (n, 3) into the frame of a camera; behind it where they are not finite."""
+    for i in range(points.shape[0]):
+        x, y, z = points[i, 0], points[i, 1], points[i, 2]
+        known = np.isfinite(x + y + z)
+        for k in range(3):
+            value = rotation[k, 0] * x + rotation[k, 1] * y + rotation[k, 2] * z + shift[k]
+            turned[k, i] = value if known else np.float32(-1)
 
 
 @kernel(fast=True)
@@ -302,16 +314,18 @@ def _splat(
     for v in range(depth.shape[0]):
         _see_row(depth[v], by_column, by_row[v], shift, numbers, kind, d, reach, place)
         for u in range(depth.shape[1]):
-            z, label = depth[v, u], labels[v, u]
-            column, row, near = place[0, u], place[1, u], place[2, u]
+            label = labels[v, u]
+            if label <= 0 and (u | v) & (_SPARSE - 1):
+                continue
+            z, column, row, near = depth[v, u], place[0, u], place[1, u], place[2, u]
             if not z > nought or not near > nought:
                 continue
             if label > 0:
                 half = scale * z * near + margin
                 _paint_square(label, near, column, row, half, nearest, seen)
-            elif (u | v) & (_SPARSE - 1) == 0 and nought <= column < wide and nought <= row < tall:
-                j, i = np.uint32(row * per_cell), np.uint32(column * per_cell)
-                front[j, i] = max(front[j, i], near)
+            elif nought <= column < wide and nought <= row < tall:
+                y, x = np.uint32(row * per_cell), np.uint32(column * per_cell)
+                front[y, x] = max(front[y, x], near)
     for j in range(front.shape[0]):
         for i in range(front.shape[1]):
             if front[j, i] > nought:

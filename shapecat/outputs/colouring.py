@@ -1,6 +1,6 @@
 """The colour images of a run: which there are, and the masks of its detections on them."""
 
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,16 +12,19 @@ from shapecat.arrays import U4
 from shapecat.cameras.colour import ColourView
 from shapecat.colour.masks import NOTHING, Mask, dense_masks
 from shapecat.errors import OutputError
-from shapecat.executors.order import map_ahead, read_ahead
+from shapecat.executors.order import map_ahead
 from shapecat.recordings import Recording, choose_streams
 from shapecat.recordings.colour_frames import frames_with_colour
 from shapecat.recordings.colour_streams import ColourStream, choose_colour
-from shapecat.runs.masks import FrameMasks, MaskTable, read_masks
+from shapecat.runs.masks import FrameMasks, MaskRow, MaskTable, read_masks
 from shapecat.runs.run_info import RunInfo, window_of
 from shapecat.runs.tables import Key, frame_rows, numbers, read_row_groups
 from shapecat.types import Frame, LabelledFrame
 
-__all__ = ["Coloured", "colours_of", "views_again", "with_colour", "write_masks"]
+__all__ = ["Coloured", "Seen", "colours_of", "find_masks", "views_again", "with_colour"]
+
+Seen = tuple[Frame, ColourView | None, FrameMasks | None]
+"""A frame, its colour image, and the masks of its detections on it."""
 
 
 @dataclass(frozen=True)
@@ -56,24 +59,32 @@ def views_again(recording: Recording, run: RunInfo) -> Iterator[tuple[Frame, Col
 
 
 def with_colour(
-    labelled: Iterable[LabelledFrame], recording: Recording, run: RunInfo, folder: Path
+    labelled: Iterable[LabelledFrame],
+    recording: Recording,
+    run: RunInfo,
+    folder: Path,
+    seen: Iterator[Seen] | None = None,
 ) -> Iterator[tuple[LabelledFrame, Frame, Coloured | None]]:
     """Pair labelled frames, in the order they were read, with their clouds and colour images.
+
+    Parameters
+    ----------
+    seen : of `find_masks`, which is gone through to its end; by default the masks are read.
 
     Raises
     ------
     OutputError : the recording does not hold one of them any more.
     """
-    views, masks = views_again(recording, run), _Masks(folder)
+    seen = _with_known_masks(recording, run, folder) if seen is None else seen
     for label in labelled:
-        for frame, view in views:
-            found = masks.of((frame.topic, frame.index))
+        for frame, view, found in seen:
             if (label.topic, label.index) == (frame.topic, frame.index):
                 yield label, frame, _coloured(label, view, found)
                 break
         else:
             msg = f"{recording.path}: has changed since it was processed; process it again"
             raise OutputError(msg)
+    deque(seen, maxlen=0)
 
 
 def _coloured(
@@ -85,39 +96,31 @@ def _coloured(
     return Coloured(view, tuple(objects))
 
 
-class _Masks:
-    """The masks of a run, asked for in the order of its frames."""
-
-    def __init__(self, folder: Path) -> None:
-        self._rows = read_masks(folder)
-        self._next = next(self._rows, None)
-
-    def of(self, key: Key) -> FrameMasks | None:
-        """Return the masks of a frame; None if it has none."""
-        found = self._next
-        if found is None or found.key != key:
-            return None
-        self._next = next(self._rows, None)
-        return found
+def _with_known_masks(recording: Recording, run: RunInfo, folder: Path) -> Iterator[Seen]:
+    """Yield the frames of a run with the masks of its table."""
+    rows = read_masks(folder)
+    found = next(rows, None)
+    for frame, view in views_again(recording, run):
+        if found is not None and found.key == (frame.topic, frame.index):
+            yield frame, view, found
+            found = next(rows, None)
+        else:
+            yield frame, view, None
 
 
-def write_masks(folder: Path, recording: Recording, run: RunInfo, *, threads: int = 1) -> int:
-    """Write the masks of all detections of a run; return how many frames have a colour image.
+def find_masks(
+    recording: Recording, run: RunInfo, folder: Path, *, threads: int = 1
+) -> Iterator[Seen]:
+    """Find the masks of all detections of a run; the table appears with the last frame.
 
     Parameters
     ----------
     threads : with several, one reads while the others project.
     """
-    count, views = 0, views_again(recording, run)
-    if threads > 1:
-        views = read_ahead(views, count=threads + 2)
     with MaskTable(folder) as table:
-        found = map_ahead(_masked, _beside(views, folder), threads=threads)
-        for row, detections, masks in found:
-            if row is not None:
-                table.write(row, detections, masks)
-                count += 1
-    return count
+        items = _beside(views_again(recording, run), folder)
+        for (frame, view, _), row, masks in map_ahead(_masked, items, threads=threads):
+            yield frame, view, None if row is None else table.write(row, masks)
 
 
 def _beside(
@@ -148,15 +151,16 @@ def _indices(folder: Path) -> Iterator[dict[Key, dict[int, U4]]]:
         }
 
 
-def _masked(
-    item: tuple[Frame, ColourView | None, dict[int, U4]],
-) -> tuple[dict[str, Any] | None, list[int], tuple[Mask, ...]]:
-    """Return the row of a frame, and its detections with their masks; no row without an image."""
+_Item = tuple[Frame, ColourView | None, dict[int, U4]]
+
+
+def _masked(item: _Item) -> tuple[_Item, MaskRow | None, dict[int, Mask]]:
+    """Return a frame with its row of the table and its masks by detection; no row without image."""
     frame, view, objects = item
     if view is None or not frame.organized:
-        return None, [], ()
+        return item, None, {}
     image = view.image
-    row = {
+    row: MaskRow = {
         "topic": frame.topic,
         "frame": frame.index,
         "color_topic": image.topic,
@@ -167,4 +171,4 @@ def _masked(
         "height": image.height,
     }
     masks = dense_masks(frame, list(objects.values()), view.lens, view.colour_from_depth)
-    return row, list(objects), masks
+    return item, row, dict(zip(objects, masks, strict=True))

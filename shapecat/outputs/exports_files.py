@@ -40,19 +40,26 @@ def write_pcd(path: Path, points: F4, *, viewpoint: Pose = IDENTITY) -> None:
 
 
 def png(
-    image: U1 | U2, palette: U1 | None = None, alpha: U1 | None = None, *, level: int = 9
+    image: U1 | U2,
+    palette: U1 | None = None,
+    alpha: U1 | None = None,
+    *,
+    level: int = 9,
+    width: int | None = None,
 ) -> bytes:
     """Encode an image (h, w), uint16 grey or uint8 entries of a palette (k, 3), as PNG.
 
     ``alpha`` (k,) is the opacity of the first entries of the palette; ``level`` from 1 to 9 trades
-    time for size.
+    time for size. With ``width`` an image has two pixels of so many to a byte, the left one in its
+    upper half.
     """
-    height, width = image.shape
+    packed, height, width = width is not None, len(image), width or image.shape[1]
     wide = image.dtype == np.uint16
     rows = np.ascontiguousarray(image, ">u2" if wide else "u1").view(np.uint8).reshape(height, -1)
     unfiltered = np.zeros((height, 1), np.uint8)  # each row begins with its filter: none
     kind = _COLOUR_TYPES["grey" if palette is None else "palette"]
-    header = struct.pack(">IIBBBBB", width, height, 16 if wide else 8, kind, 0, 0, 0)
+    depth = 16 if wide else 4 if packed else 8
+    header = struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, 0)
     parts = [(b"IHDR", header)]
     if palette is not None:
         parts.append((b"PLTE", np.ascontiguousarray(palette, np.uint8).tobytes()))

@@ -189,7 +189,8 @@ class _Review:
         self._place_sensor(entity, labelled, frame)
         self._draw(entity, painted)
         if painted.picture is not None:
-            self._images.add(labelled.topic, painted.picture)
+            at = (labelled.stamp_ns, labelled.index)
+            self._images.add(labelled.topic, at, painted.picture)
         if painted.damage:
             self._log("log", rr.TextLog(painted.damage, level="WARN"))
         self._trace(entity, labelled)
@@ -200,6 +201,7 @@ class _Review:
         """Write out what is held back."""
         for entity in self._pending:
             self._send(entity)
+        self._images.send()
         self._file.flush()
 
     def plot(self) -> None:

@@ -1,7 +1,6 @@
 """The clouds of the review: which points are kept, and how they are coloured."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -9,7 +8,7 @@ from shapecat.arrays import F4, F8, I4, U1, U2, U4, Record, array
 from shapecat.cameras.colour import ColourView
 from shapecat.jit import kernel
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.review_colour import packed, tinted, true_colours
+from shapecat.outputs.review_colour import true_colours
 from shapecat.types import Frame, LabelledObject, Plane
 
 __all__ = ["PaintedCloud", "paint"]
@@ -56,32 +55,37 @@ def paint(
     near, far = _measured(frame, near), _measured(frame, far[owner[far] == 0])
     own = np.array([colour_of(o.category) for o in objects], np.uint8).reshape(-1, 3)
     palette = np.concatenate([_GROUND[None], own, _PLANES])
-    labelled = _painted(frame, near, owner[near], palette, (), fine)
-    rest = _painted(frame, far, owner[far], palette, planes, coarse)
-    if view is None:
-        return rest, labelled
-    points = np.concatenate([rest.points, labelled.points])
-    colours, known = true_colours(frame, view, points, np.concatenate([far, near]), fine)
+    pixels = np.concatenate([far, near])
+    points, tones = frame.xyz(pixels), owner[pixels]
+    colours = np.zeros(pixels.size, np.uint32)
+    if view is not None:
+        colours = true_colours(frame, view, points, pixels, fine, palette, tones)
+    rest = np.flatnonzero(colours == 0)
+    colours[rest] = _shaded(frame, pixels[rest], points[rest], tones[rest], palette, planes)
     n = far.size
-    mixed = tinted(colours[n:], palette[owner[near]])
     return (
-        replace(rest, colours=packed(colours[:n], known[:n], rest.colours)),
-        replace(labelled, colours=packed(mixed, known[n:], labelled.colours)),
+        PaintedCloud(points[:n], colours[:n], _radius(frame, points[:n], coarse)),
+        PaintedCloud(points[n:], colours[n:], _radius(frame, points[n:], fine)),
     )
 
 
-def _painted(
-    frame: Frame, pixels: I4, tones: U2, palette: U1, planes: Sequence[Plane], step: int
-) -> PaintedCloud:
-    """Return the points at ``pixels``, coloured by entries of the palette or by their plane."""
-    points = frame.xyz(pixels)
-    light, radius = np.ones(pixels.size, np.float32), _RADIUS_M
+def _shaded(
+    frame: Frame, pixels: I4, points: F4, tones: U2, palette: U1, planes: Sequence[Plane]
+) -> U4:
+    """Return (n,) the colours of points, from entries of the palette or of their plane."""
+    light = np.ones(pixels.size, np.float32)
     if frame.depth is not None and frame.camera is not None:
         light = _light(frame.depth, pixels, frame.camera.fx, frame.camera.fy)
-        middle = float(np.median(points[:, 2])) if len(points) else 0.0
-        radius = 0.55 * step * middle / frame.camera.fx
-    colours = _colours(points, light, tones, palette, _plane_rows(planes), len(_PLANES))
-    return PaintedCloud(points, colours, radius)
+    rows = _plane_rows(planes)
+    return np.asarray(_colours(points, light, tones, palette, rows, len(_PLANES)))
+
+
+def _radius(frame: Frame, points: F4, step: int) -> float:
+    """Return the radius at which points, ``step`` pixels apart, nearly close the surface."""
+    if frame.camera is None:
+        return _RADIUS_M
+    middle = float(np.median(points[::16, 2])) if len(points) else 0.0
+    return 0.55 * step * middle / frame.camera.fx
 
 
 def _owners(frame: Frame, objects: Sequence[LabelledObject]) -> U2:

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from shapecat.arrays import F4, I4, U1, U4, Bool
-from shapecat.cameras.colour import ColourView, LensCamera
+from shapecat.arrays import F4, I4, U1, U2, U4
+from shapecat.cameras.colour import ColourView
 from shapecat.colour.projection import project
 from shapecat.jit import kernel
 from shapecat.recordings.colour_image import pixels_of
-from shapecat.types import Frame, Pose
+from shapecat.types import Frame
 
-__all__ = ["packed", "tinted", "true_colours"]
+__all__ = ["true_colours"]
 
 _TINT = 0.35
 """Share of the colour of the category in that of an object."""
@@ -18,83 +18,81 @@ _HIDDEN = 0.05
 
 
 def true_colours(
-    frame: Frame, view: ColourView, points: F4, pixels: I4, pitch: int
-) -> tuple[U1, Bool]:
-    """Return the colours of some points of a frame, and which of them the colour camera sees.
+    frame: Frame, view: ColourView, points: F4, pixels: I4, pitch: int, palette: U1, tones: U2
+) -> U4:
+    """Return (n,) the colours 0xRRGGBBAA of points of a frame; 0 where the camera sees them not.
+
+    32 tones of each colour are enough to tell things apart, and the noise of the others would
+    double the size of the file.
 
     Parameters
     ----------
     points : (n, 3) metres, sensor frame.
     pixels : (n,) their indices in the frame.
     pitch : about how many pixels of the frame lie between neighbours.
+    palette, tones : (k, 3) colours, and (n,) which of them tints a point; 0 is none.
 
     Raises
     ------
     MessageError : the image is damaged.
     """
-    image = view.image
+    image, result = view.image, np.zeros(pixels.size, np.uint32)
     if not frame.organized and view.registered:
-        return pixels_of(image).reshape(-1, 3)[pixels], np.ones(pixels.size, bool)
-    apart = 1.5 * pitch * (image.width / frame.camera.width if frame.camera is not None else 1.0)
+        colours = pixels_of(image).reshape(-1, 1, 3)
+        seen = np.stack([np.zeros(pixels.size), pixels], axis=1)
+        _take(colours, (len(colours), 1), seen, palette, tones, result)
+        return result
+    finer = image.width / frame.camera.width if frame.camera is not None else 1.0
+    apart = 1.5 * pitch * finer
     shrink = next((k for k in (4, 2) if k <= apart), 1)  # finer than the points are apart
-    colours = pixels_of(image, shrink=shrink)
     if view.colour_from_depth is None or view.lens is None:
-        v, u = np.divmod(pixels, image.width)
-        known = np.ones(pixels.size, bool)
+        seen = np.stack(np.divmod(pixels, image.width)[::-1], axis=1).astype(np.float32)
     else:
-        u, v, known = _seen(frame, view.lens, view.colour_from_depth, points, pitch)
-    height, width = colours.shape[:2]
-    rows = np.minimum(v * height // image.height, height - 1)
-    columns = np.minimum(u * width // image.width, width - 1)
-    return colours[rows, columns], known
-
-
-def _seen(
-    frame: Frame, lens: LensCamera, colour_from_depth: Pose, points: F4, pitch: int
-) -> tuple[I4, I4, Bool]:
-    """Return the pixels of points, (0, 0) for those that are not seen, and which are seen."""
-    seen, camera = project(points, lens, colour_from_depth), lens.pinhole
-    finer = camera.fx / frame.camera.fx if frame.camera is not None else 1.0
-    cell = max(4.0, 1.5 * pitch * finer)
-    known = np.zeros(len(points), bool)
-    cells = np.zeros((int(camera.height / cell) + 2, int(camera.width / cell) + 2), np.float32)
-    _look(seen, (camera.height, camera.width), cell, 1 - _HIDDEN, cells, known)
-    u, v = (np.where(known, seen[:, k], 0) + 0.5 for k in range(2))
-    return u.astype(np.int64), v.astype(np.int64), known
+        seen = project(points, view.lens, view.colour_from_depth)
+        _hide(seen, (image.height, image.width), max(4.0, apart), 1 - _HIDDEN)
+    colours = pixels_of(image, shrink=shrink)
+    _take(colours, (image.height, image.width), seen, palette, tones, result)
+    return result
 
 
 @kernel
-def _look(
-    seen: F4, shape: tuple[int, int], cell: float, share: float, cells: F4, known: Bool
-) -> None:
-    """Find the nearest point around each cell of an image, then the points that are not behind."""
+def _hide(seen: F4, shape: tuple[int, int], cell: float, share: float) -> None:
+    """Make the columns of points NaN that lie behind the nearest around their cell of an image."""
+    cells = np.zeros((int(shape[0] / cell) + 2, int(shape[1] / cell) + 2), np.float32)
     for i in range(seen.shape[0]):
         u, v, z = seen[i, 0], seen[i, 1], seen[i, 2]
-        known[i] = -0.5 < u < shape[1] - 0.5 and -0.5 < v < shape[0] - 0.5 and z > 0
-        if known[i]:
+        if -0.5 < u < shape[1] - 0.5 and -0.5 < v < shape[0] - 0.5 and z > 0:
             # Of the four cells around it: neighbours may be more than a cell apart.
             x, y = int(u / cell + 0.5), int(v / cell + 0.5)
             for row in (max(y - 1, 0), y):
                 for column in (max(x - 1, 0), x):
                     cells[row, column] = max(cells[row, column], 1 / z)
+        else:
+            seen[i, 0] = np.nan
     for i in range(seen.shape[0]):
-        if known[i]:
+        if seen[i, 0] > -1:
             front = cells[int(max(seen[i, 1], 0) / cell), int(max(seen[i, 0], 0) / cell)]
-            known[i] = front * seen[i, 2] * share <= 1
+            if front * seen[i, 2] * share > 1:
+                seen[i, 0] = np.nan
 
 
-def tinted(colours: U1, tints: U1) -> U1:
-    """Mix colours (n, 3) with those of categories (n, 3)."""
-    mixed = (1 - _TINT) * colours + _TINT * tints.astype(np.float32)
-    return np.asarray(mixed + 0.5).astype(np.uint8)
+@kernel
+def _take(image: U1, shape: tuple[int, int], seen: F4, palette: U1, tones: U2, colours: U4) -> None:
+    """Look up the colours 0xRRGGBBAA of points at columns and rows of an image.
 
-
-def packed(colours: U1, known: Bool, otherwise: U4) -> U4:
-    """Return colours (n, 3) as 0xRRGGBBAA; where they are not known, others.
-
-    32 tones of each colour are enough to tell things apart, and the noise of the others would
-    double the size of the file.
+    ``shape`` is that of the whole image; the one that is looked up may be shrunk.
     """
-    red, green, blue = (colours & np.uint8(0xF8) | np.uint8(4)).astype(np.uint32).T
-    own = (red << 24) | (green << 16) | (blue << 8) | 255
-    return np.where(known, own, otherwise).astype(np.uint32)
+    height, width, _ = image.shape
+    tall, wide = height / shape[0], width / shape[1]
+    for i in range(seen.shape[0]):
+        if not seen[i, 0] > -0.5:
+            continue
+        v = min(int((seen[i, 1] + 0.5) * tall), height - 1)
+        u = min(int((seen[i, 0] + 0.5) * wide), width - 1)
+        packed = np.uint32(0)
+        for channel in range(3):
+            value = np.float32(image[v, u, channel])
+            if tones[i] > 0:
+                value += np.float32(_TINT) * (np.float32(palette[tones[i], channel]) - value)
+            packed = (packed << np.uint32(8)) | (np.uint32(value) & np.uint32(0xF8)) | np.uint32(4)
+        colours[i] = (packed << np.uint32(8)) | np.uint32(255)

@@ -1,14 +1,15 @@
 """The table of masks: what the colour camera sees of the detections of each frame."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.parquet as pq
 
 from shapecat.arrays import U4
 from shapecat.colour.masks import NOTHING, Mask, united
@@ -16,7 +17,7 @@ from shapecat.colour.rle import rle_counts, rle_mask
 from shapecat.runs.tables import SCHEMA_VERSION, Key, arrow_table, open_writer, read_row_groups
 from shapecat.system.files import replacing
 
-__all__ = ["MASKS", "FrameMasks", "MaskTable", "read_masks"]
+__all__ = ["MASKS", "FrameMasks", "MaskRow", "MaskTable", "count_masks", "read_masks"]
 
 MASKS = pa.schema(
     [
@@ -39,9 +40,13 @@ is seen in it the box (left, top, width, height) and the run lengths of its mask
 _GROUP = 32
 
 
+MaskRow = dict[str, Any]
+"""The columns of a row that tell of the frame and of its image, by name."""
+
+
 @dataclass(frozen=True)
 class FrameMasks:
-    """A row of the table."""
+    """A row of the table; ``masks`` are those that need not be decoded."""
 
     key: Key
     topic: str
@@ -52,12 +57,16 @@ class FrameMasks:
     height: int
     boxes: dict[int, tuple[int, int, int, int]]
     counts: dict[int, U4]
+    masks: dict[int, Mask] = field(default_factory=dict)
 
     def mask(self, detections: Sequence[int]) -> Mask:
         """Return what is seen of some detections, which are parts of one object."""
-        seen = [number for number in detections if number in self.counts]
-        found = [rle_mask(self.counts[number], self.height, self.width) for number in seen]
+        found = [self._mask(number) for number in detections if number in self.counts]
         return united(found) if found else NOTHING
+
+    def _mask(self, number: int) -> Mask:
+        found = self.masks.get(number)
+        return rle_mask(self.counts[number], self.height, self.width) if found is None else found
 
     def box(self, detections: Sequence[int]) -> tuple[int, int, int, int] | None:
         """Return left, top, width and height around some detections; None if none is seen."""
@@ -96,24 +105,28 @@ class MaskTable:
             self._flush()
         self._stack.__exit__(kind, error, trace)
 
-    def write(self, row: dict[str, Any], detections: Sequence[int], masks: Sequence[Mask]) -> None:
+    def write(self, row: MaskRow, masks: Mapping[int, Mask]) -> FrameMasks:
         """Append a frame: what is known of its image, and the masks of its detections."""
-        seen = [(n, mask) for n, mask in zip(detections, masks, strict=True) if mask.pixels.size]
+        seen = {number: mask for number, mask in masks.items() if mask.pixels.size}
         size = row["height"], row["width"]
-        found = {
-            "detection": [n for n, _ in seen],
-            "box": [value for _, mask in seen for value in mask.box],
-            "counts": [rle_counts(mask, *size) for _, mask in seen],
-        }
-        self._rows.append({**row, **found})
+        counts = {number: rle_counts(mask, *size) for number, mask in seen.items()}
+        boxes = [value for mask in seen.values() for value in mask.box]
+        found = {**row, "detection": list(seen), "box": boxes, "counts": list(counts.values())}
+        self._rows.append(found)
         if len(self._rows) == _GROUP:
             self._flush()
+        return _frame_masks(found, seen)
 
     def _flush(self) -> None:
         if self._rows:
             columns = {name: [row[name] for row in self._rows] for name in MASKS.names}
             self._writer.write_table(arrow_table(columns, self._writer.schema))
             self._rows = []
+
+
+def count_masks(folder: Path) -> int:
+    """Return how many frames of a run have a colour image."""
+    return int(pq.read_metadata(folder / "masks.parquet").num_rows)
 
 
 def read_masks(folder: Path) -> Iterator[FrameMasks]:
@@ -123,16 +136,21 @@ def read_masks(folder: Path) -> Iterator[FrameMasks]:
         return
     for group in read_row_groups(path):
         for row in group.to_pylist():
-            numbers = row["detection"]
-            boxes = np.reshape(row["box"], (-1, 4)).astype(int).tolist()
-            yield FrameMasks(
-                (row["topic"], row["frame"]),
-                row["color_topic"],
-                row["color_stamp_ns"],
-                row["color_log_time_ns"],
-                row["color_frame_id"],
-                row["width"],
-                row["height"],
-                {n: tuple(box) for n, box in zip(numbers, boxes, strict=True)},
-                dict(zip(numbers, row["counts"], strict=True)),
-            )
+            yield _frame_masks(row, {})
+
+
+def _frame_masks(row: MaskRow, masks: dict[int, Mask]) -> FrameMasks:
+    numbers = row["detection"]
+    boxes = np.reshape(row["box"], (-1, 4)).astype(int).tolist()
+    return FrameMasks(
+        (row["topic"], row["frame"]),
+        row["color_topic"],
+        row["color_stamp_ns"],
+        row["color_log_time_ns"],
+        row["color_frame_id"],
+        row["width"],
+        row["height"],
+        {n: tuple(box) for n, box in zip(numbers, boxes, strict=True)},
+        dict(zip(numbers, row["counts"], strict=True)),
+        masks,
+    )
