@@ -191,7 +191,7 @@ def _extent(depth: F4, labels: I4) -> tuple[int, int, int, int, float, float]:
                     far = max(far, z)
                     top, bottom = min(top, v), max(bottom, v + 1)
                     left, right = min(left, u), max(right, u + 1)
-    return top, bottom, left, right, near, far
+    return top, bottom, left, right, float(near), float(far)
 
 
 @kernel
