@@ -1,7 +1,7 @@
 """What tests share: the command as installed, real data when present, a simulated recording."""
 
 import signal
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
+
+from tests.browser import Browser
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 
@@ -95,3 +97,11 @@ def coloured_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
         shapecat.pipeline.process(Job(source=source, folder=folder / "out" / "table"), cores=2)
     return folder / "out" / "table"
+
+
+@pytest.fixture(scope="session")
+def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """Open a headless Chromium; the test is left out where there is none."""
+    opened = Browser(tmp_path_factory.mktemp("browser"))
+    yield opened
+    opened.close()

@@ -5,11 +5,9 @@ import io
 import json
 import re
 import shutil
-import socket
-import subprocess
-import time
-import urllib.request
-from collections.abc import Callable, Iterator
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,15 +15,23 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
+from PIL import Image
+from scipy import ndimage
 
-from shapecat.outputs.report import write_report, write_reports
-from shapecat.outputs.report_drawing import SIDE, Snapshot, draw
-from shapecat.outputs.report_page import Card, run_page
-from shapecat.outputs.report_tracks import Course, read_courses
+from shapecat.colour.masks import Mask
+from shapecat.outputs.report import read_reports, write_reports
+from shapecat.outputs.report.cards import Card
+from shapecat.outputs.report.choosing import choose_frames
+from shapecat.outputs.report.images import Crop, SeenFrame, crop_of, encode, look, worth_of
+from shapecat.outputs.report.page import run_page
+from shapecat.outputs.report.pictures import TrackPictures
+from shapecat.outputs.report.surfaces import SIDE, Snapshot, draw
+from shapecat.outputs.report.tracks import Timeline, read_timelines
 from shapecat.outputs.rereading import FinishedRun, read_finished
 from shapecat.runs.corrections import read_labels
 from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
-from shapecat.types import NeuralGas
+from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas
+from tests.browser import Browser
 
 Run = Callable[..., Result]
 
@@ -44,7 +50,7 @@ def data_of(page: str) -> dict[str, Any]:
     return content
 
 
-def test_every_track_has_a_card_with_three_pictures(run: Path) -> None:
+def test_every_track_has_a_card_with_its_pictures(run: Path) -> None:
     (page,) = write_reports([run])
     text = page.read_text("utf-8")
     table = read_track_table(run / "tracks.csv")
@@ -53,10 +59,11 @@ def test_every_track_has_a_card_with_three_pictures(run: Path) -> None:
     assert re.findall(r'<article class="card" id="track-(\d+)"', text) == [
         str(row.track) for row in table.rows
     ]
-    assert text.count("data:image/png;base64,") == 3 * len(table.rows)
+    assert text.count('class="side"') == 3 * len(table.rows)
+    assert text.count('class="crop"') == len(table.rows)
     assert text.count("<polyline") >= len(table.rows)
     assert [row["track"] for row in data_of(text)["rows"]] == [str(r.track) for r in table.rows]
-    assert "drawn from their graphs" not in text
+    assert "drawn from their meshes" not in text
 
 
 def test_page_needs_nothing_from_outside(run: Path) -> None:
@@ -66,6 +73,7 @@ def test_page_needs_nothing_from_outside(run: Path) -> None:
 
     assert not re.findall(r'(?:src|href)="(?!data:|#|\.\./)', text)
     assert "http" not in re.sub(r"http-equiv", "", text)
+    assert "connect-src 'none'" in text
     assert "@import" not in text
     assert "url(" not in text
 
@@ -80,31 +88,31 @@ def test_names_cannot_break_the_page(run: Path) -> None:
     table = (run / "tracks.csv").read_text().splitlines()
     table[1] = table[1].replace(table[1].split(",")[4], evil)
     (run / "tracks.csv").write_text("\n".join(table) + "\n")
-    courses = read_courses(run)
+    timelines = read_timelines(run)
     rows = read_track_table(run / "tracks.csv")
     finished = FinishedRun(run, about, {})
 
-    text = run_page(finished, rows, [Card(r, courses[r.track], (), None) for r in rows.rows], {})
+    text = run_page(finished, rows, [Card(r, timelines[r.track], None) for r in rows.rows], [], {})
 
     assert "<img src=x" not in text
     assert text.count("</script>") == 2
     assert data_of(text)["rows"][0]["category"] == evil
 
 
-def test_without_the_recording_objects_are_drawn_from_their_graphs(run: Path) -> None:
+def test_without_the_recording_surfaces_are_drawn_from_their_meshes(run: Path) -> None:
     about = json.loads((run / "run.json").read_text())
     about["input"]["path"] = str(run / "gone.mcap")
     (run / "run.json").write_text(json.dumps(about))
 
-    listed = write_report(run)
-    text = (run / "report.html").read_text("utf-8")
+    (report,) = read_reports([run]).runs
+    text = report.page()
 
-    assert "objects are drawn from their graphs" in text
+    assert "surfaces are drawn from their meshes" in text
     assert "gone.mcap" in text
-    assert text.count("data:image/png;base64,") == 3 * len(
-        read_track_table(run / "tracks.csv").rows
-    )
-    assert listed.faces
+    assert text.count('class="side"') == 3 * len(read_track_table(run / "tracks.csv").rows)
+    assert 'class="crop"' not in text
+    assert 'id="strip"' not in text
+    assert report.listed("x").faces
 
 
 def test_index_lists_runs_and_links_to_them(shapecat: Run, run: Path) -> None:
@@ -124,9 +132,7 @@ def test_index_lists_runs_and_links_to_them(shapecat: Run, run: Path) -> None:
 
 
 def decode(image: str) -> np.ndarray:
-    opened = pytest.importorskip("PIL.Image").open(
-        io.BytesIO(base64.b64decode(image.partition(",")[2]))
-    )
+    opened = Image.open(io.BytesIO(base64.b64decode(image.partition(",")[2])))
     return np.asarray(opened.convert("RGBA")).astype(int)
 
 
@@ -164,129 +170,172 @@ def test_drawing_takes_any_object(count: int) -> None:
     assert len(draw(Snapshot(ball(5)[:count], gas, np.ones(3)), (1, 2, 3))) == 3
 
 
+def a_frame(depth: np.ndarray) -> Frame:
+    height, width = depth.shape
+    camera = Camera(width, height, 300, 300, width / 2, height / 2)
+    return Frame("/d", 0, 0, 0, "camera", depth=depth, camera=camera)
+
+
+def seen(blur: float = 0, left: int = 60, top: int = 50, hidden: float = 0, side: int = 80) -> Any:
+    """Return a striped photograph with a square object."""
+    stripes = 127 + 100 * np.sign(np.sin(np.arange(240) / 3))
+    photo = ndimage.gaussian_filter(np.tile(stripes, (180, 1)), blur)
+    mask = Mask(left, top, np.ones((side, side), bool))
+    colour = np.repeat(photo[..., None], 3, axis=2).astype(np.uint8)
+    return SeenFrame((mask,), np.array([hidden]), a_frame(np.ones((180, 240))), colour)
+
+
+@pytest.mark.parametrize(
+    "worse", [{"blur": 3}, {"left": 0}, {"top": 0}, {"hidden": 0.3}, {"side": 30}]
+)
+def test_a_blurred_cut_hidden_or_small_view_is_worth_less(worse: dict[str, Any]) -> None:
+    assert worth_of(seen(**worse), 0) < 0.9 * worth_of(seen(), 0)
+
+
+def test_an_object_that_is_not_seen_is_worth_nothing() -> None:
+    nothing = Mask(0, 0, np.zeros((0, 0), bool))
+    assert worth_of(replace(seen(), masks=(nothing,)), 0) == 0
+
+
+@pytest.mark.parametrize(("left", "top"), [(60, 50), (0, 0), (160, 100)])
+def test_a_crop_shows_the_object_and_its_outline(left: int, top: int) -> None:
+    """Also at the border of the image, beyond which there is nothing to show."""
+    photo = np.zeros((180, 240, 3), np.uint8)
+    photo[top : top + 80, left : left + 80] = (250, 40, 40)
+    crop = crop_of(replace(seen(left=left, top=top), colour=photo), 0)
+    image = decode(crop.image)
+    red = image[..., 0] > 128
+    corners = np.array(re.findall(r"(\d+) (\d+)", crop.outline), int)
+    rows, columns = np.nonzero(red)
+
+    assert (crop.width, crop.height) == image.shape[1::-1] == (256, 256)
+    assert abs(corners.min(axis=0) - [columns.min(), rows.min()]).max() <= 3
+    assert abs(corners.max(axis=0) - [columns.max(), rows.max()]).max() <= 3
+    assert 0.3 < red.mean() < 0.6
+
+
+def labelled(*indices: np.ndarray, up: Sequence[int] = (0, -1, 0)) -> LabelledFrame:
+    gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+    box = Box(np.array([0, 0, 1]), np.full(3, 0.1), np.array([0, 0, 0, 1]))
+    items = [
+        LabelledObject(k, "cup", 0.9, box, pixels.astype(np.uint32), gas, np.ones(1), np.ones(1))
+        for k, pixels in enumerate(indices)
+    ]
+    return LabelledFrame(
+        "/d", 0, 0, 0, "camera", None, (), tuple(items), (), {}, np.asarray(up, np.float32)
+    )
+
+
+def test_what_is_nearer_hides_and_what_is_behind_does_not() -> None:
+    depth = np.full((120, 160), 1.2, np.float32)
+    depth[40:80, 40:80] = 1.0
+    depth[40:80, 80:120] = 0.8  # in front of the right side of the first
+    number = np.arange(depth.size).reshape(depth.shape)
+    both = labelled(number[40:80, 40:80].ravel(), number[40:80, 80:120].ravel())
+    found = look(both, a_frame(depth), None)
+
+    assert found is not None
+    assert found.hidden == pytest.approx([0.25, 0])
+    assert [mask.box for mask in found.masks] == [(40, 40, 40, 40), (80, 40, 40, 40)]
+
+
+def test_depth_is_shaded_as_a_relief() -> None:
+    """A step is dark below and light above; without reading it is dark."""
+    v, u = np.mgrid[:120, :160]
+    depth = 1 / (1 / 1.5 + 0.002 * np.hypot(u - 80, v - 60).clip(20, 40))
+    depth[:, 150:] = 0
+    found = look(labelled(), a_frame(depth.astype(np.float32)), None)
+
+    assert found is not None
+    image = found.pixels()
+    assert image.shape == (120, 160, 3)
+    assert image[:, 150:].max() < 30
+    up, down = image[25:38, 75:85].mean(), image[82:95, 75:85].mean()
+    assert abs(up - down) > 20
+
+
+@pytest.mark.parametrize(
+    ("right", "down", "away"),
+    [((1, 0, 0), (0, 1, 0), (0, 0, 1)), ((0, -1, 0), (0, 0, -1), (1, 0, 0))],
+    ids=["camera", "lidar"],
+)
+def test_a_loose_cloud_is_seen_upright(
+    right: Sequence[int], down: Sequence[int], away: Sequence[int]
+) -> None:
+    """A lidar has another idea of axes than a camera; on the page, up is up."""
+    x, y = np.random.default_rng(0).uniform(0, 1, (2, 60000))
+    pole = abs(x - 0.5) < 0.05
+    y[~pole] = 0.5 + 0.5 * y[~pole]  # a low wall with a pole
+    wall = np.stack([2 * x - 1, y - 0.5, np.full_like(x, 2)], axis=1)
+    points = (wall @ np.array([right, down, away])).astype(np.float32)
+    up = [-value for value in down]
+    frame = Frame("/d", 0, 0, 0, "lidar", points=points)
+    found = look(labelled(np.flatnonzero(pole), up=up), frame, None)
+
+    assert found is not None
+    left, _, width, height = found.masks[0].box
+    rows, columns = found.shape
+    assert (left + width / 2) / columns == pytest.approx(0.5, abs=0.05)
+    assert height > 0.9 * rows
+    assert width < 0.2 * columns
+    image = found.pixels()
+    assert image[: rows // 3, : columns // 4].max() < 30  # nothing above the wall
+
+
+def test_colour_is_shown_where_it_was_recorded(coloured_run: Path, tmp_path: Path) -> None:
+    run = tmp_path / "table"
+    shutil.copytree(coloured_run, run)
+    (report,) = read_reports([run]).runs
+    pictures = report.pictures
+    frame = pictures.frames[0]
+    image = decode(frame.image)
+    colours = [decode(seen.crop.image)[..., :3] for seen in pictures.tracks.values() if seen.crop]
+
+    assert len(pictures.frames) == 4
+    assert image.shape[:2] == (frame.height, frame.width)
+    assert np.ptp(image[..., :3], axis=2).mean() > 5  # shaded depth is grey
+    assert len(colours) == len(pictures.tracks) > 3
+    assert all(np.ptp(colour, axis=2).max() > 30 for colour in colours)
+    shown = set().union(*(frame.boxes for frame in pictures.frames))
+    assert shown == set(report.timelines)
+    for left, top, width, height in frame.boxes.values():
+        assert 0 <= left < left + width <= frame.width
+        assert 0 <= top < top + height <= frame.height
+
+
+def test_the_strip_is_spread_over_the_run_and_its_tracks(run: Path) -> None:
+    timelines = read_timelines(run)
+    chosen = choose_frames(run, timelines)
+    once = {key[:2]: key for line in timelines.values() for key in line.keys}
+
+    assert len(chosen.strip) == 12  # of twelve frames
+    assert max(map(len, chosen.candidates.values())) <= len(timelines)
+    looks = Counter(track for tracks in chosen.candidates.values() for track in tracks)
+    assert set(looks) == set(timelines)
+    assert max(looks.values()) <= 4
+    assert set(chosen.candidates) <= set(once)
+
+
 def many_tracks(folder: Path, count: int) -> str:
-    """Return a page with full pictures, graphs and time lines for many tracks."""
+    """Return a page with full pictures, meshes and time lines for many tracks."""
     rng = np.random.default_rng(1)
     edges = np.unique(np.sort(rng.integers(0, 80, (230, 2)), axis=1), axis=0)
     gas = NeuralGas(ball(80), edges[edges[:, 0] < edges[:, 1]])
-    pictures = draw(Snapshot(ball(), gas, np.array([1.0, 0.3, 0.6])), (200, 60, 60))
+    surfaces = draw(Snapshot(ball(), gas, np.array([1.0, 0.3, 0.6])), (200, 60, 60))
+    photo = ndimage.gaussian_filter(rng.uniform(0, 255, (256, 256, 3)), (1.5, 1.5, 0))
+    crop = Crop(*encode(photo.astype(np.uint8), quality=82), "M1 1 9 9Z")
+    pictures = TrackPictures(crop, surfaces, (0.1, 0.1, 0.1))
     cards = []
     for track in range(1, count + 1):
         causal = rng.dirichlet(np.ones(7), 300)
-        course = Course(np.arange(300) / 10, rng.random(300) < 0.9, causal, ())
+        line = Timeline(np.arange(300) / 10, rng.random(300) < 0.9, causal, ())
         cells = {"track": str(track), "category": "cup", "confidence": ".5", "label": ""}
         row = TrackRow(track + 1, track, "cup", 0.5, "", "/d", cells)
-        cards.append(Card(row, course, pictures, (0.1, 0.1, 0.1)))
+        cards.append(Card(row, line, pictures))
     table = TrackTable(
         ("track", "category", "confidence", "label"), tuple(c.row for c in cards), ()
     )
-    return run_page(FinishedRun(folder, read_finished(folder).run, {}), table, cards, {})
-
-
-class Browser:
-    """A headless Chromium, driven over the WebDriver protocol."""
-
-    def __init__(self, folder: Path) -> None:
-        with socket.socket() as free:
-            free.bind(("127.0.0.1", 0))
-            port = free.getsockname()[1]
-        driver = shutil.which("chromedriver")
-        if driver is None or not (shutil.which("chromium") or shutil.which("google-chrome")):
-            pytest.skip("no Chromium with its driver on this machine")
-        self._base = f"http://127.0.0.1:{port}"
-        self.downloads = folder / "downloads"
-        self.downloads.mkdir()
-        self._process = subprocess.Popen(
-            [driver, f"--port={port}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-        )
-        arguments = [
-            "--headless",
-            "--no-sandbox",
-            "--disable-gpu",
-            "--disable-background-networking",
-            "--window-size=1400,1000",
-            f"--user-data-dir={folder / 'profile'}",
-        ]
-        options = {"args": arguments, "binary": shutil.which("chromium") or "google-chrome"}
-        wanted = {
-            "goog:chromeOptions": options,
-            "goog:loggingPrefs": {"browser": "ALL"},
-            "timeouts": {"pageLoad": 60000},
-        }
-        for _ in range(100):
-            try:
-                self.session = self._send(
-                    "POST", "/session", {"capabilities": {"alwaysMatch": wanted}}
-                )["sessionId"]
-                break
-            except ConnectionError:
-                time.sleep(0.1)
-            except urllib.error.URLError:
-                time.sleep(0.1)
-        where = {"behavior": "allow", "downloadPath": str(self.downloads)}
-        self.cdp("Browser.setDownloadBehavior", where)
-
-    def close(self) -> None:
-        """End the browser and its driver."""
-        try:
-            self._send("DELETE", f"/session/{self.session}")
-        finally:
-            self._process.terminate()
-            self._process.wait(10)
-
-    def _send(self, method: str, path: str, body: object = None) -> Any:
-        content = None if body is None else json.dumps(body).encode()
-        headers = {"Content-Type": "application/json"}
-        request = urllib.request.Request(self._base + path, content, headers, method=method)  # noqa: S310  our own driver
-        with urllib.request.urlopen(request, timeout=90) as answer:  # noqa: S310  the same
-            return json.load(answer)["value"]
-
-    def _ask(self, method: str, path: str, body: object = None) -> Any:
-        return self._send(method, f"/session/{self.session}{path}", body)
-
-    def open(self, page: Path) -> None:
-        """Load a page from its file."""
-        self._ask("POST", "/url", {"url": page.as_uri()})
-
-    def run(self, script: str) -> Any:
-        """Return what a script returns."""
-        return self._ask("POST", "/execute/sync", {"script": script, "args": []})
-
-    def _find(self, selector: str) -> str:
-        found = self._ask("POST", "/element", {"using": "css selector", "value": selector})
-        return str(next(iter(found.values())))
-
-    def click(self, selector: str) -> None:
-        """Click an element as a person does."""
-        self._ask("POST", f"/element/{self._find(selector)}/click", {})
-
-    def type(self, selector: str, text: str) -> None:
-        """Type into an element."""
-        self._ask("POST", f"/element/{self._find(selector)}/value", {"text": text})
-
-    def cdp(self, command: str, parameters: object) -> Any:
-        """Send a command of the DevTools protocol."""
-        return self._ask("POST", "/goog/cdp/execute", {"cmd": command, "params": parameters})
-
-    def complaints(self) -> list[str]:
-        """Return warnings and errors of the console."""
-        return [entry["message"] for entry in self._ask("POST", "/se/log", {"type": "browser"})]
-
-    def downloaded(self) -> Path:
-        """Wait for a download to be complete."""
-        for _ in range(100):
-            found = list(self.downloads.glob("*.csv"))
-            if found:
-                return found[0]
-            time.sleep(0.05)
-        pytest.fail("nothing was downloaded")
-
-
-@pytest.fixture(scope="module")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    opened = Browser(tmp_path_factory.mktemp("browser"))
-    yield opened
-    opened.close()
+    return run_page(FinishedRun(folder, read_finished(folder).run, {}), table, cards, [], {})
 
 
 def test_corrections_clicked_in_a_browser_are_adopted(
@@ -369,7 +418,7 @@ def test_filters_in_a_browser(browser: Browser, run: Path) -> None:
     browser.run(choose % "open")
     assert rows[1].track not in browser.run(shown)
     assert browser.run(drawn) == "block"
-    browser.click("#graphs")
+    browser.click("#meshes")
     assert browser.run(drawn) == "none"
     assert browser.complaints() == []
 
@@ -407,26 +456,24 @@ def luminance(colour: str) -> float:
     return float(linear @ [0.2126, 0.7152, 0.0722])
 
 
-def test_five_hundred_tracks_open_at_once(browser: Browser, run: Path) -> None:
+def test_five_hundred_tracks_are_a_page_that_opens(browser: Browser, run: Path) -> None:
+    """The docs promise at most 70 kB per object."""
     text = many_tracks(run, 500)
     page = run / "many.html"
     page.write_text(text, "utf-8")
-    seconds = []
-    for _ in range(3):
-        browser.open(page)
-        assert browser.run("return document.querySelectorAll('.card').length") == 500
-        seconds.append(
-            browser.run("return performance.getEntriesByType('navigation')[0].loadEventEnd") / 1000
-        )
+    browser.open(page)
 
-    assert len(text.encode()) < 30e6
-    assert min(seconds) < 3
+    assert len(text.encode()) < 500 * 70e3
+    assert browser.run("return document.querySelectorAll('.card').length") == 500
+    assert browser.run("return document.body.dataset.ready") == "yes"
 
 
 def test_a_run_without_tracks_has_a_page(run: Path) -> None:
     (run / "tracks.csv").write_text((run / "tracks.csv").read_text().splitlines()[0] + "\n")
     table = pq.read_table(run / "tracks.parquet")
     pq.write_table(table.slice(0, 0), run / "tracks.parquet")
+    (report,) = read_reports([run]).runs
 
-    assert write_report(run).categories.total() == 0
-    assert "<article" not in (run / "report.html").read_text("utf-8")
+    assert report.listed("x").categories.total() == 0
+    assert "<article" not in report.page()
+    assert report.page().count('class="frame"') == 12  # also where nothing was found

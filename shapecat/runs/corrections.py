@@ -22,13 +22,14 @@ from shapecat.runs.track_table import (
     with_label,
     write_track_table,
 )
-from shapecat.system.files import replacing
+from shapecat.system.files import holding, replacing
 from shapecat.types import CATEGORIES, UNKNOWN
 
 __all__ = [
     "PREVIOUS",
     "TrackLabel",
     "adopt_labels",
+    "correct_label",
     "find_misread",
     "has_labels",
     "merged_with",
@@ -92,6 +93,11 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
         have, or has labels that cannot be understood. All such lines are named, and nothing is
         written.
     """
+    with holding(folder):
+        _adopt(corrected, folder)
+
+
+def _adopt(corrected: Path, folder: Path) -> None:
     current, original = folder / "tracks.csv", folder / ORIGINAL
     in_place = current.exists() and corrected.exists() and corrected.samefile(current)
     _require_same_run(corrected, read_track_table(corrected), folder, known=in_place)
@@ -133,6 +139,31 @@ def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
     ------
     OutputError : the table of the run cannot be read or is another run's, or the disk is full.
     """
+    with holding(folder):
+        return _relabel(folder, labels)
+
+
+def correct_label(folder: Path, track: int, label: str, *, seen: str) -> str:
+    """Give a track of a run a label, unless another one than ``seen`` was written meanwhile.
+
+    Returns
+    -------
+    Why it was not given; empty if it was.
+
+    Raises
+    ------
+    OutputError : as `relabel`.
+    """
+    with holding(folder):
+        rows = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
+        if track not in rows:
+            return f"there is no #{track}"
+        if rows[track].label != seen:
+            return f"its label is {rows[track].label!r} by now"
+        return _relabel(folder, {track: label}).get(track, "")
+
+
+def _relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
     current, original = folder / "tracks.csv", folder / ORIGINAL
     base = read_track_table(current)
     _require_same_run(current, base, folder)

@@ -19,6 +19,7 @@ __all__ = [
     "FSYNC",
     "complete_folder",
     "flush",
+    "holding",
     "input_files",
     "input_size",
     "lock",
@@ -130,6 +131,27 @@ def lock(folder: Path) -> int | None:
     except OSError:
         pass
     return held
+
+
+@contextmanager
+def holding(folder: Path) -> Iterator[None]:
+    """Hold the lock of a folder in the block; wait for it where another thread or process has it.
+
+    Raises
+    ------
+    OutputError : there is no such folder.
+    """
+    try:
+        held = os.open(folder, os.O_RDONLY)
+    except OSError as error:
+        msg = f"{folder}: {error.strerror or error}"
+        raise OutputError(msg) from error
+    try:
+        with suppress(OSError):  # a file system without locks
+            fcntl.flock(held, fcntl.LOCK_EX)
+        yield
+    finally:
+        os.close(held)
 
 
 def input_files(path: Path) -> list[Path]:

@@ -1,4 +1,4 @@
-"""Pictures of objects for the report: shaded points from three sides, and the graph over them."""
+"""The surface of an object: shaded points from three sides, and the mesh over them."""
 
 import base64
 from typing import NamedTuple
@@ -10,13 +10,13 @@ from shapecat.outputs.exports_files import png
 from shapecat.surface.triangles import triangles_of
 from shapecat.types import NeuralGas
 
-__all__ = ["SIDE", "Picture", "Snapshot", "draw", "graph_points"]
+__all__ = ["MOST_POINTS", "SIDE", "Picture", "Snapshot", "draw", "graph_points"]
 
 SIDE = 160
 """Width and height of a picture in pixels."""
 
 _SHADES = 14
-_MOST_POINTS = 8000
+MOST_POINTS = 8000
 _LIGHT = np.array([-0.4, 0.65, 0.65]) / np.linalg.norm([-0.4, 0.65, 0.65])
 
 
@@ -45,7 +45,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[Picture, ...]:
 
     All three have one scale: that of the sphere around the points and neurons.
     """
-    points = np.asarray(shot.points[:: 1 + len(shot.points) // _MOST_POINTS], np.float64)
+    points = np.asarray(shot.points[:: 1 + len(shot.points) // MOST_POINTS], np.float64)
     points = points if len(points) else np.asarray(graph_points(shot.gas), np.float64)
     everything = np.concatenate([points, shot.gas.neurons])
     if not len(everything):

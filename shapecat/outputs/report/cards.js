@@ -1,0 +1,143 @@
+// The gallery: what cards show, which are shown, in which order; and the table of corrections.
+const gallery = byId("gallery");
+const cards = [...gallery.querySelectorAll(".card")];
+const byTrack = new Map(cards.map((card) => [card.dataset.track, card]));
+const hiddenCategories = new Set();
+
+function cardOf(track) { return byTrack.get(track); }
+
+function showCard(card) {
+  if (!card) return;
+  const track = card.dataset.track, label = labels.get(track), category = card.dataset.category;
+  const changed = label !== "" && label !== category;
+  card.classList.toggle("changed", changed);
+  card.classList.toggle("confirmed", label === category);
+  card.classList.toggle("deleted", label === "delete");
+  const fix = card.querySelector(".fix");
+  fix.hidden = label === "";
+  fix.textContent = changed ? `→ ${label}` : label ? "✓" : "";
+  const verdict = changed ? `, corrected: ${label}` : label ? ", confirmed" : "";
+  card.setAttribute("aria-label", `#${track} ${category} ${card.querySelector(".sure").textContent}${verdict}`);
+  let named = false;
+  for (const button of card.querySelectorAll("[data-label]")) {
+    const pressed = button.dataset.label === label;
+    button.setAttribute("aria-pressed", String(pressed));
+    named = named || pressed;
+  }
+  const other = card.querySelector(".other");
+  if (document.activeElement !== other) other.value = named ? "" : label;
+}
+
+function fits(card) {
+  const label = labels.get(card.dataset.track);
+  const state = byId("state").value;
+  if (hiddenCategories.has(card.dataset.category)) return false;
+  if (Number(card.dataset.confidence) * 100 > Number(byId("confidence").value)) return false;
+  if (state === "open") return label === "";
+  if (state === "checked") return label !== "";
+  return state === "all" || (label !== "" && label !== card.dataset.category);
+}
+
+function filter() {
+  byId("limit").textContent = (Number(byId("confidence").value) / 100).toFixed(2);
+  let count = 0;
+  for (const card of cards) {
+    card.hidden = !fits(card);
+    count += card.hidden ? 0 : 1;
+  }
+  byId("shown").textContent = `${count} of ${cards.length} ${cards.length === 1 ? "track" : "tracks"}`;
+  byId("empty").hidden = count > 0;
+}
+
+function order() {
+  const how = byId("order").value;
+  const sorted = [...cards];
+  if (how === "time") sorted.sort((a, b) => a.dataset.first - b.dataset.first);
+  if (how === "category") sorted.sort((a, b) => a.dataset.category.localeCompare(b.dataset.category));
+  gallery.append(...sorted);
+}
+
+function element(name, text, className) {
+  const made = document.createElement(name);
+  made.textContent = text;
+  if (className) made.className = className;
+  return made;
+}
+
+function shownAs(row) {
+  const label = labels.get(row.track);
+  return MERGE.test(label) ? "merged" : label === "delete" ? "deleted" : label;
+}
+
+function summarize() {
+  const checked = data.rows.filter((row) => labels.get(row.track) !== "");
+  const right = checked.filter((row) => labels.get(row.track) === row.category).length;
+  byId("download").textContent = checked.length ? `Download tracks.csv (${checked.length})` : "Download tracks.csv";
+  byId("verdict").textContent = checked.length
+    ? `${right} of ${checked.length} checked ${checked.length === 1 ? "track was" : "tracks were"} right. Rows: the category found; columns: your label.`
+    : "Press a digit, or click a category on a card, to confirm or correct it.";
+  byId("confusion").replaceChildren(...(checked.length ? [confusion(checked)] : []));
+}
+
+function confusion(checked) {
+  const rank = (name) => (data.categories.includes(name) ? data.categories.indexOf(name) : 999);
+  const sort = (names) => [...new Set(names)].sort((a, b) => rank(a) - rank(b) || a.localeCompare(b));
+  const columns = sort(checked.map(shownAs));
+  const table = element("table", "", "confusion");
+  table.insertRow().append(element("th", ""), ...columns.map((name) => element("th", name)));
+  for (const name of sort(checked.map((row) => row.category))) {
+    const line = table.insertRow();
+    line.append(element("th", name));
+    for (const column of columns) {
+      const count = checked.filter((row) => row.category === name && shownAs(row) === column).length;
+      line.append(element("td", count || "", count ? (name === column ? "same" : "wrong") : ""));
+    }
+  }
+  return table;
+}
+
+function csv() {
+  const quote = (cell) => (/[",\r\n]/.test(cell) ? `"${cell.replaceAll('"', '""')}"` : cell);
+  const lines = data.rows.map((row) => data.columns.map((name, k) =>
+    quote(name === "label" ? labels.get(row.track) : row.cells[k])).join(","));
+  return [data.columns.map(quote).join(","), ...lines, ""].join("\n");
+}
+
+gallery.addEventListener("click", (event) => {
+  const button = event.target.closest("button[data-label]");
+  if (!button) return;
+  const pressed = button.getAttribute("aria-pressed") === "true";
+  setLabel(button.closest(".card").dataset.track, pressed ? "" : button.dataset.label);
+});
+gallery.addEventListener("change", (event) => {
+  if (!event.target.matches(".other")) return;
+  const track = event.target.closest(".card").dataset.track;
+  const label = known(event.target.value.trim().replace(/\s+/g, " "));
+  const wrong = problem(track, label);
+  event.target.setCustomValidity(wrong);
+  if (wrong) event.target.reportValidity(); else setLabel(track, label);
+});
+gallery.addEventListener("input", (event) => {
+  if (event.target.matches(".other")) event.target.setCustomValidity("");
+});
+byId("categories").addEventListener("click", (event) => {
+  const chip = event.target.closest(".chip");
+  if (!chip) return;
+  const shown = chip.getAttribute("aria-pressed") === "true";
+  chip.setAttribute("aria-pressed", String(!shown));
+  if (shown) hiddenCategories.add(chip.dataset.category); else hiddenCategories.delete(chip.dataset.category);
+  filter();
+});
+byId("confidence").addEventListener("input", filter);
+byId("state").addEventListener("change", filter);
+byId("order").addEventListener("change", order);
+byId("undo").addEventListener("click", undo);
+byId("meshes").addEventListener("change", (event) =>
+  document.body.classList.toggle("meshes", event.target.checked));
+byId("download").addEventListener("click", () => {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(new Blob([csv()], { type: "text/csv" }));
+  link.download = "tracks.csv";
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+});

@@ -1,0 +1,228 @@
+"""The card of a track, and the picture of a frame, as HTML."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from html import escape
+from importlib.resources import files
+from string import Template
+
+import numpy as np
+
+from shapecat.arrays import F8, I4, Bool
+from shapecat.outputs.colours import colour_of
+from shapecat.outputs.report.pictures import StripFrame, TrackPictures
+from shapecat.outputs.report.surfaces import SIDE, Picture
+from shapecat.outputs.report.tracks import Timeline
+from shapecat.outputs.wording import confidence_text, plural, time_span
+from shapecat.runs.track_table import TrackRow
+from shapecat.types import UNKNOWN
+
+__all__ = ["Card", "asset", "card_html", "css_colour", "frame_html", "is_unsure", "template"]
+
+_LINES = 3  # categories in a time line
+_MOST_STEPS = 80
+_DIGITS = 9
+_ROOMY = 4  # boxes whose whole labels fit into a small frame
+
+
+@dataclass(frozen=True)
+class Card:
+    """A track as the gallery shows it."""
+
+    row: TrackRow
+    timeline: Timeline
+    pictures: TrackPictures | None
+
+
+@cache
+def asset(name: str) -> str:
+    """Return a file of the page."""
+    return (files("shapecat.outputs.report") / name).read_text("utf-8")
+
+
+def template(name: str) -> Template:
+    """Return a file of the page to fill in."""
+    return Template(asset(name))
+
+
+def css_colour(category: str) -> str:
+    """Return the colour of a category as CSS writes it."""
+    return "#" + "".join(f"{part:02x}" for part in colour_of(category))
+
+
+def is_unsure(row: TrackRow) -> bool:
+    """Return whether a track should be checked before others."""
+    return row.category == UNKNOWN or row.confidence < 0.8
+
+
+def card_html(card: Card, categories: Sequence[str], names: Sequence[str], end: float) -> str:
+    """Return the card of a track.
+
+    Parameters
+    ----------
+    categories : of the posterior.
+    names : of all categories, the unknown first: their places are their digits.
+    end : seconds from the first to the last frame of the run.
+    """
+    row, line = card.row, card.timeline
+    return template("card.html").substitute(
+        track=row.track,
+        category=escape(row.category),
+        guess=_guess(row),
+        value=f"{row.confidence:.4g}",
+        first=f"{line.seconds[0] if len(line.seconds) else 0.0:.4g}",
+        colour=css_colour(row.category),
+        confidence=confidence_text(row.confidence),
+        pictures=_pictures(card),
+        line=_time_line(line, categories, end),
+        bars=_bars(line, categories, row, names),
+        facts=escape(" · ".join(_facts(card))),
+    )
+
+
+def _guess(row: TrackRow) -> str:
+    """Return what an unknown object might be; nothing for the others."""
+    guess = row.cells.get("guess", "")
+    if row.category != UNKNOWN or not guess:
+        return ""
+    return f'<span class="guess">perhaps {escape(guess)}</span>'
+
+
+def _pictures(card: Card) -> str:
+    if card.pictures is None:
+        return ""
+    sides = "".join(map(_side, card.pictures.surfaces))
+    crop = card.pictures.crop
+    if crop is None:
+        return sides
+    name = f"#{card.row.track} in a frame"
+    return (
+        f'<button type="button" class="crop" title="{name}"><img alt="{name}" '
+        f'src="{crop.image}"><svg viewBox="0 0 {crop.width} {crop.height}" aria-hidden="true">'
+        f'<path d="{crop.outline}"/></svg></button>{sides}'
+    )
+
+
+def _side(picture: Picture) -> str:
+    return (
+        f'<div class="side" title="{picture.title}"><img alt="surface {picture.title}" '
+        f'src="{picture.image}"><svg viewBox="0 0 {SIDE} {SIDE}" aria-hidden="true">'
+        f'<path d="{picture.edges}"/><path class="nodes" d="{picture.neurons}"/></svg></div>'
+    )
+
+
+def _facts(card: Card) -> list[str]:
+    line, cells = card.timeline, card.row.cells
+    seen = line.seconds[line.seen]
+    facts = [plural(len(seen), "view")]
+    if len(seen):
+        facts.append(time_span(float(seen[0]), float(seen[-1])))
+    if card.pictures:
+        facts.append(" × ".join(f"{100 * side:.0f}" for side in card.pictures.size) + " cm")
+    if cells.get("novelty"):
+        facts.append(f"novelty {cells['novelty']}")
+    return facts
+
+
+def _bars(line: Timeline, categories: Sequence[str], row: TrackRow, names: Sequence[str]) -> str:
+    """Return the posterior of all views, the likeliest category first; each bar is a button."""
+    last = line.causal[-1] if len(line.causal) else np.zeros(len(categories))
+    shares = dict(zip(categories, last.tolist(), strict=False))
+    order = sorted(shares, key=lambda name: -shares[name])
+    if row.category not in shares and row.category != UNKNOWN:
+        order.append(row.category)
+    return "".join(_bar(name, shares.get(name, 0), _digit(name, names)) for name in order)
+
+
+def _digit(name: str, names: Sequence[str]) -> str:
+    place = names.index(name) if name in names else _DIGITS + 1
+    return str(place) if place <= _DIGITS else ""
+
+
+def _bar(name: str, share: float, digit: str) -> str:
+    key = f"<kbd>{digit}</kbd>" if digit else "<span></span>"
+    style = f"--c:{css_colour(name)};--w:{share:.1%}"
+    return (
+        f'<li><button type="button" tabindex="-1" data-label="{escape(name)}" style="{style}">'
+        f"{key}<span>{escape(name)}</span><i></i><span>{confidence_text(share)}</span>"
+        "</button></li>"
+    )
+
+
+def _time_line(line: Timeline, categories: Sequence[str], end: float) -> str:
+    """Return the causal posterior over the time of the run, and below it when it was seen."""
+    chosen = _few(len(line.seconds))
+    if len(chosen) == 1:
+        chosen = chosen.repeat(2)  # a line of one corner is not drawn
+    x = np.round(300 * line.seconds[chosen] / (end or 1), 1)
+    best = np.argsort(-line.causal.max(axis=0, initial=0), kind="stable")[:_LINES]
+    lines = []
+    for k in best[::-1].tolist():
+        if k >= len(categories) or not len(x):
+            continue
+        y = np.round(33 - 31 * line.causal[chosen, k], 1)
+        dots = " ".join(f"{a:g},{b:g}" for a, b in zip(x.tolist(), y.tolist(), strict=True))
+        lines.append(f'<polyline points="{dots}" stroke="{css_colour(categories[k])}"/>')
+    seen = "".join(
+        f'<rect class="seen" x="{a:.1f}" y="38" width="{max(b - a, 1.5):.1f}" height="3" rx="1"/>'
+        for a, b in _spans(line.seconds, line.seen, 300 / (end or 1))
+    )
+    return (
+        '<svg class="line" viewBox="0 0 300 44" preserveAspectRatio="none" role="img" '
+        'aria-label="posterior over time"><title>posterior over time; below, when it was seen'
+        f'</title><path class="grid" d="M0 2H300M0 33H300"/>{"".join(lines)}{seen}</svg>'
+    )
+
+
+def _few(count: int) -> I4:
+    """Return at most `_MOST_STEPS` places of a row, the first and the last among them."""
+    return np.unique(np.linspace(0, count - 1, min(count, _MOST_STEPS)).round().astype(int))
+
+
+def _spans(seconds: F8, seen: Bool, scale: float) -> list[tuple[float, float]]:
+    """Return from where to where the track was seen without a gap."""
+    spans: list[tuple[float, float]] = []
+    before = False
+    for at, here in zip((seconds * scale).tolist(), seen.tolist(), strict=True):
+        if here and before:
+            spans[-1] = (spans[-1][0], at)
+        elif here:
+            spans.append((at, at))
+        before = here
+    return spans
+
+
+def frame_html(frame: StripFrame, categories: Mapping[int, str], *, several: bool) -> str:
+    """Return a frame of the strip with the boxes and labels of its tracks.
+
+    Parameters
+    ----------
+    categories : by track.
+    several : the recording has several topics, so that the caption names one.
+    """
+    name = f"{frame.seconds:.1f} s" + (f" {frame.topic}" if several else "")
+    boxes = "".join(
+        _box(frame, track, box, categories[track])
+        for track, box in frame.boxes.items()
+        if track in categories
+    )
+    kind = "frame" if len(frame.boxes) <= _ROOMY else "frame crowded"
+    style = f"--ratio:{frame.width / frame.height:.4f}"
+    return (
+        f'<button type="button" class="{kind}" style="{style}" data-name="{escape(name)}" '
+        f'aria-label="Frame at {escape(name)}"><span class="shot"><img alt="" src="{frame.image}">'
+        f'{boxes}</span><span class="caption">{escape(name)}</span></button>'
+    )
+
+
+def _box(
+    frame: StripFrame, track: int, box: tuple[float, float, float, float], category: str
+) -> str:
+    left, width = (100 * side / frame.width for side in box[::2])
+    top, height = (100 * side / frame.height for side in box[1::2])
+    style = f"left:{left:.1f}%;top:{top:.1f}%;width:{width:.1f}%;height:{height:.1f}%"
+    return (
+        f'<span class="box" data-track="{track}" style="{style};--c:{css_colour(category)}">'
+        f"<b>#{track}<i> {escape(category)}</i></b></span>"
+    )

@@ -1,0 +1,126 @@
+"""Which frames the report reads again: the best few views of each track, and a strip of frames.
+
+Both are chosen from the tables alone, before the recording is opened.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.outputs.report.tracks import Detected, Timeline
+from shapecat.runs.masks import FrameMasks, read_masks
+from shapecat.runs.tables import Key, read_row_groups
+
+__all__ = ["Choice", "choose_frames"]
+
+_CANDIDATES = 4
+"""Views of a track that are looked at: the best of each quarter of them."""
+_STRIP = 12
+_PARTIAL = 0.2
+"""Weight of a view that the border cuts off, or that something hides in part."""
+_COLOURLESS = 0.05
+"""Weight of a view without colour, where others have it."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The tracks to be looked at in some frames, and the frames of the strip with their seconds."""
+
+    candidates: Mapping[Key, frozenset[int]]
+    strip: Mapping[Key, float]
+
+    @property
+    def frames(self) -> frozenset[Key]:
+        """All frames that are needed."""
+        return frozenset({*self.candidates, *self.strip})
+
+
+class _View(NamedTuple):
+    place: int
+    key: Key
+    worth: float
+
+
+def choose_frames(folder: Path, timelines: Mapping[int, Timeline]) -> Choice:
+    """Choose the frames that show the tracks of a run best, and some that show all of the run."""
+    owner = {key: track for track, line in timelines.items() for key in line.keys if key[2] >= 0}
+    candidates: dict[Key, set[int]] = {}
+    for track, views in _views(folder, owner).items():
+        for view in _best_of_parts(views):
+            candidates.setdefault(view.key, set()).add(track)
+    shown: dict[Key, set[int]] = {}
+    for (topic, frame, _), track in owner.items():
+        shown.setdefault((topic, frame), set()).add(track)
+    strip = _strip(_stamps(folder), shown)
+    return Choice({key: frozenset(tracks) for key, tracks in candidates.items()}, strip)
+
+
+def _views(folder: Path, owner: Mapping[Detected, int]) -> dict[int, list[_View]]:
+    """Return the views of each track in the order of time, by size and wholeness."""
+    columns = ["topic", "frame", "detection", "points", "touches_border", "occluded"]
+    masks = _areas(read_masks(folder))
+    views: dict[int, list[_View]] = {}
+    for group in read_row_groups(folder / "detections.parquet", columns):
+        cells = (group[name].to_pylist() for name in columns)
+        for topic, frame, detection, points, border, occluded in zip(*cells, strict=True):
+            key = (topic, frame, detection)
+            if key not in owner:
+                continue
+            area, cut = masks.get(key, (_COLOURLESS * points, False))
+            whole = not (border or occluded or cut)
+            found = views.setdefault(owner[key], [])
+            worth = area * (1.0 if whole else _PARTIAL)
+            found.append(_View(len(found), (topic, frame), worth))
+    return views
+
+
+def _areas(masks: Iterator[FrameMasks]) -> dict[Detected, tuple[float, bool]]:
+    """Return the pixels of each mask, and whether the border of the image cuts it."""
+    found = {}
+    for frame in masks:
+        for number, (left, top, width, height) in frame.boxes.items():
+            right, bottom = frame.width - left - width, frame.height - top - height
+            area = float(np.sum(frame.counts[number][1::2]))
+            found[*frame.key, number] = (area, min(left, top, right, bottom) <= 0)
+    return found
+
+
+def _best_of_parts(views: Sequence[_View]) -> list[_View]:
+    """Return the best view of each of a few parts of the time of a track."""
+    ends = np.linspace(0, len(views), min(_CANDIDATES, len(views)) + 1).astype(int)
+    parts = [views[a:b] for a, b in pairwise(ends)]
+    return [max(part, key=lambda view: (view.worth, -view.place)) for part in parts]
+
+
+def _stamps(folder: Path) -> list[tuple[int, Key]]:
+    """Return the stamp of each frame, by time."""
+    columns = ["stamp_ns", "topic", "frame"]
+    rows = [
+        (stamp, (topic, frame))
+        for group in read_row_groups(folder / "frames.parquet", columns)
+        for stamp, topic, frame in zip(*(group[c].to_pylist() for c in columns), strict=True)
+    ]
+    return sorted(rows)
+
+
+def _strip(stamps: Sequence[tuple[int, Key]], shown: Mapping[Key, set[int]]) -> dict[Key, float]:
+    """Return one frame of each part of a run, those before others that show what none has shown."""
+    covered: set[tuple[str, int]] = set()
+    strip = {}
+    for part in np.array_split(np.arange(len(stamps)), min(_STRIP, len(stamps)) or 1):
+        best, most = None, (-1, -1, 0.0)
+        for k in part.tolist():
+            key = stamps[k][1]
+            tracks = {(key[0], track) for track in shown.get(key, ())}
+            worth = (len(tracks - covered), len(tracks), -abs(k - float(part.mean())))
+            if worth > most or best is None:
+                best, most = k, worth
+        if best is not None:
+            stamp, key = stamps[best]
+            strip[key] = (stamp - stamps[0][0]) * 1e-9
+            covered |= {(key[0], track) for track in shown.get(key, ())}
+    return strip

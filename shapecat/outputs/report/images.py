@@ -1,0 +1,297 @@
+"""What a frame looks like: its colour image, or its depth shaded as a relief; and crops of it."""
+
+import base64
+import io
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from PIL import Image
+from scipy import ndimage
+
+from shapecat.arrays import F4, F8, U1, U4, Bool, Record, array
+from shapecat.colour.masks import Mask, dense_masks
+from shapecat.colour.outline import outlines
+from shapecat.detection.virtual_camera import top_view, virtual_image
+from shapecat.geometry import gravity_rotation
+from shapecat.outputs.colouring import Coloured
+from shapecat.recordings.colour_image import pixels_of
+from shapecat.recordings.messages import MessageError
+from shapecat.types import Camera, Frame, LabelledFrame
+
+__all__ = ["CROP_PX", "Crop", "SeenFrame", "crop_of", "encode", "look", "worth_of"]
+
+CROP_PX = 256
+"""Longest side of the picture of an object."""
+
+_FRAME_PX = 960
+"""Longest side of the picture of a frame."""
+_MARGIN = 1.5
+"""Side of a crop over the longer side of the object."""
+_LEAST_PX = 24
+_GOOD_PX = 160
+"""An object of so many pixels across is shown as well as a larger one."""
+_GOOD_DETAIL = 12.0
+"""Grey levels of the Laplacian of a picture that is sharp."""
+_NEARER = 0.015
+"""What is so much nearer, metres and share of the distance, hides what is behind it."""
+_CROWDED = 0.08
+"""Share of points behind others from which a cloud is taken for fused from several views."""
+_FAR_M = 6.0
+_SAME_SURFACE = 0.02
+"""Neighbours whose depths differ by less than this share are of one surface."""
+_BLANK = 24
+"""Grey where there is no reading."""
+_LIGHT = np.array([-0.45, -0.65, -0.62])
+"""Towards the light, in the optical frame: from above and left."""
+
+
+Window = tuple[int, int, int, int]
+"""Left, top, right and bottom, pixels."""
+
+
+class SeenFrame(Record):
+    """A frame as it can be pictured.
+
+    Attributes
+    ----------
+    masks : the pixels of each object of the frame, in their order.
+    hidden : (n,) share of the outline of each object along which something nearer hides it.
+    depth : the depth image, of a cloud as well.
+    colour : (h, w, 3) red, green, blue; None where depth is shown.
+    """
+
+    masks: tuple[Mask, ...]
+    hidden: F8 = array("n", "f8")
+    depth: Frame
+    colour: U1 | None = array("h w 3", "u1", default=None)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Height and width of the picture."""
+        height, width, *_ = np.asarray(
+            self.depth.depth if self.colour is None else self.colour
+        ).shape
+        return height, width
+
+    def pixels(self, window: Window | None = None) -> U1:
+        """Return (h, w, 3) red, green, blue of a part of the picture; all by default."""
+        left, top, right, bottom = window or (0, 0, *self.shape[::-1])
+        if self.colour is not None:
+            return np.ascontiguousarray(self.colour[top:bottom, left:right])
+        return _shaded(self.depth, (left, top, right, bottom))
+
+
+class Crop(NamedTuple):
+    """A picture of an object as a data URI, its size, and its outline in it as SVG path data."""
+
+    image: str
+    width: int
+    height: int
+    outline: str
+
+
+def look(labelled: LabelledFrame, frame: Frame, coloured: Coloured | None) -> SeenFrame | None:
+    """Return a frame as a picture; None where no camera can see a cloud."""
+    found = _organized(labelled, frame)
+    if found is None:
+        return None
+    depth, objects = found
+    hidden = np.array([_hidden_share(depth.depth, pixels) for pixels in objects])
+    if coloured is not None and frame.organized and coloured.view.image.height > 1:
+        try:
+            return SeenFrame(coloured.masks, hidden, depth, pixels_of(coloured.view.image))
+        except MessageError:
+            pass  # a damaged image: depth is shown instead
+    return SeenFrame(dense_masks(depth, objects), hidden, depth)
+
+
+def _organized(labelled: LabelledFrame, frame: Frame) -> tuple[Frame, list[U4]] | None:
+    """Return a frame as a depth image, and the pixels of its objects there."""
+    indices = [item.indices for item in labelled.objects]
+    if frame.depth is not None:
+        return frame, indices
+    points = frame.xyz()
+    turn = _upright(points, labelled.up)
+    points = np.asarray(points @ turn.T, np.float32)
+    view = virtual_image(points, range_m=_FAR_M)
+    if view is None or view.crowded > _CROWDED:
+        up, rng = np.array([0.0, -1.0, 0.0]), np.random.default_rng(0)
+        view = top_view(points, up, range_m=_FAR_M, rng=rng) or view
+    if view is None:
+        return None
+    inverse = view.grid.inverse_depth
+    depth = np.divide(1, inverse, out=np.zeros_like(inverse), where=inverse > 0)
+    camera = Camera(depth.shape[1], depth.shape[0], *view.grid.intrinsics)
+    cells = [np.unique(view.cell[pixels]) for pixels in indices]
+    seen = Frame(
+        frame.topic, frame.index, frame.stamp_ns, frame.log_time_ns, frame.frame_id, depth, camera
+    )
+    return seen, [cell[cell >= 0].astype(np.uint32) for cell in cells]
+
+
+def _upright(points: F4, up: F4 | None) -> F8:
+    """Return the (3, 3) rotation to a level optical frame that looks at a cloud."""
+    level = gravity_rotation((0.0, -1.0, 0.0) if up is None else up)
+    x, y, _ = np.nan_to_num(np.nanmean(points @ level.T, axis=0)) if len(points) else (1.0, 0, 0)
+    far = np.hypot(x, y)
+    x, y = (x / far, y / far) if far > 1e-6 else (1.0, 0.0)
+    return np.asarray(np.array([[y, -x, 0], [0, 0, -1], [x, y, 0]]) @ level)
+
+
+def _hidden_share(depth: F4 | None, pixels: U4) -> float:
+    """Return the share of an object's outline beyond which something is nearer than the object."""
+    if depth is None or not pixels.size:
+        return 0.0
+    v, u = np.divmod(np.asarray(pixels, np.int64), depth.shape[1])
+    inside = np.zeros((int(np.ptp(v)) + 3, int(np.ptp(u)) + 3), bool)
+    inside[v - v.min() + 1, u - u.min() + 1] = True
+    padded = np.pad(depth, 1)
+    near = padded[v.min() : v.max() + 3, u.min() : u.max() + 3]
+    outline = hidden = 0
+    for axis, step in ((0, 1), (0, -1), (1, 1), (1, -1)):
+        outside = inside & ~np.roll(inside, step, axis)
+        beyond = np.roll(near, step, axis)[outside]
+        outline += int(np.count_nonzero(outside))
+        limit = near[outside] * (1 - _NEARER) - _NEARER
+        hidden += int(np.count_nonzero((beyond > 0) & (beyond < limit)))
+    return hidden / max(outline, 1)
+
+
+def _shaded(frame: Frame, window: Window) -> U1:
+    """Return (h, w, 3) a part of a depth image as a relief, lit from above and left.
+
+    A plane is linear in inverse depth: its normal is what the slopes say, in any perspective.
+    """
+    left, top, right, bottom = window
+    depth, camera = np.asarray(frame.depth)[top:bottom, left:right], frame.camera
+    valid = depth > 0
+    if camera is None or not valid.any():
+        return np.full((*depth.shape, 3), _BLANK, np.uint8)
+    inverse = _smooth(np.divide(1, depth, out=np.zeros(depth.shape), where=valid))
+    along, across = (_slope(inverse, axis) for axis in (0, 1))
+    v, u = np.indices(depth.shape)
+    towards = inverse - across * (u + left - camera.cx) - along * (v + top - camera.cy)
+    normal = -np.stack([across * camera.fx, along * camera.fy, towards], axis=-1)
+    normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
+    light = 0.25 + 0.75 * np.clip(normal @ (_LIGHT / np.linalg.norm(_LIGHT)), 0, 1)
+    near, far = np.percentile(depth[valid], [2, 98])
+    fade = 1 - 0.65 * np.clip((depth - near) / max(far - near, 0.05), 0, 1)
+    tone = (light * fade)[..., None] * np.array([238.0, 242.0, 250.0])
+    return np.where(valid[..., None], tone, _BLANK).astype(np.uint8)
+
+
+def _smooth(inverse: F8, passes: int = 6) -> F8:
+    """Average inverse depths with their neighbours on the same surface."""
+    for _ in range(passes):
+        total, weight = inverse.copy(), np.ones_like(inverse)
+        for axis in (0, 1):
+            for step in (-1, 1):
+                other = np.roll(inverse, step, axis)
+                same = np.abs(other - inverse) < _SAME_SURFACE * inverse
+                total += np.where(same, other, 0)
+                weight += same
+        inverse = total / weight
+    return inverse
+
+
+def _slope(inverse: F8, axis: int) -> F8:
+    """Return the slope along an axis: the flatter side of a pixel, so that edges stay sharp."""
+    step = np.diff(inverse, axis=axis)
+    ends = [(1, 0) if k == axis else (0, 0) for k in (0, 1)]
+    before = np.pad(step, ends, mode="edge")
+    after = np.pad(step, [pair[::-1] for pair in ends], mode="edge")
+    return np.where(np.abs(before) < np.abs(after), before, after)
+
+
+def encode(pixels: U1, *, quality: int = 72) -> tuple[str, int, int]:
+    """Return a picture as a data URI, no larger than the page shows it, and its size."""
+    image = Image.fromarray(np.ascontiguousarray(pixels))
+    image.thumbnail((_FRAME_PX, _FRAME_PX))
+    file = io.BytesIO()
+    image.save(file, "webp", quality=quality, method=4)
+    text = base64.b64encode(file.getvalue()).decode("ascii")
+    return f"data:image/webp;base64,{text}", image.width, image.height
+
+
+def _window(seen: SeenFrame, mask: Mask) -> Window:
+    """Return left, top, right and bottom of a square around an object, as far as the image goes."""
+    height, width = seen.shape
+    x, y, w, h = mask.box
+    side = max(_MARGIN * max(w, h), _LEAST_PX)
+    left = min(max(x + w / 2 - side / 2, 0), max(width - side, 0))
+    top = min(max(y + h / 2 - side / 2, 0), max(height - side, 0))
+    return round(left), round(top), round(min(left + side, width)), round(min(top + side, height))
+
+
+def _cut(seen: SeenFrame, window: Window) -> Image.Image:
+    image = Image.fromarray(seen.pixels(window))
+    scale = CROP_PX / max(image.size)
+    size = (max(1, round(image.width * scale)), max(1, round(image.height * scale)))
+    return image.resize(size, Image.Resampling.BICUBIC if scale > 1 else Image.Resampling.BOX)
+
+
+def worth_of(seen: SeenFrame, number: int) -> float:
+    """Return how well a frame shows its object of a number, from 0 to 1.
+
+    The product of four measures: the size in pixels, up to a size that fills the picture; the share
+    of the outline that is not the border of the image; the share that nothing hides; and the
+    sharpness, the Laplacian of what is shown.
+    """
+    mask = seen.masks[number]
+    if not mask.pixels.size:
+        return 0.0
+    size = min(1.0, float(np.sqrt(mask.area)) / _GOOD_PX)
+    free = 1 - _border_share(mask, *seen.shape)
+    detail = _GOOD_DETAIL if seen.colour is None else _detail(seen, mask)
+    sharp = detail / (detail + _GOOD_DETAIL)
+    return size * free**2 * (1 - float(seen.hidden[number])) ** 2 * sharp
+
+
+def _border_share(mask: Mask, height: int, width: int) -> float:
+    """Return the share of the outline of a mask that lies on the border of the image."""
+    inside = np.pad(mask.pixels, 1)
+    outline = sum(
+        int(np.count_nonzero(inside & ~np.roll(inside, step, axis)))
+        for axis in (0, 1)
+        for step in (1, -1)
+    )
+    left, top, w, h = mask.box
+    sides = (
+        (left <= 0, mask.pixels[:, 0]),
+        (top <= 0, mask.pixels[0]),
+        (left + w >= width, mask.pixels[:, -1]),
+        (top + h >= height, mask.pixels[-1]),
+    )
+    return sum(int(side.sum()) for there, side in sides if there) / max(outline, 1)
+
+
+def _detail(seen: SeenFrame, mask: Mask) -> float:
+    """Return the deviation of the Laplacian on an object, in grey levels, at the size shown."""
+    window = _window(seen, mask)
+    grey = np.asarray(_cut(seen, window).convert("L"), np.float32)
+    inside = _inside(mask.full(*seen.shape), window, grey.shape)
+    return float(ndimage.laplace(grey)[inside].std()) if inside.any() else 0.0
+
+
+def _inside(mask: Bool, window: Window, shape: Sequence[int]) -> Bool:
+    """Return a mask in a crop, without its outline, whose contrast is that of the background."""
+    left, top, right, bottom = window
+    whole = Image.fromarray(mask[top:bottom, left:right])
+    small = whole.resize((shape[1], shape[0]), Image.Resampling.NEAREST)
+    return np.asarray(ndimage.binary_erosion(np.asarray(small), iterations=3))
+
+
+def crop_of(seen: SeenFrame, number: int) -> Crop:
+    """Return the picture of an object in a frame."""
+    mask = seen.masks[number]
+    window = _window(seen, mask)
+    uri, width, height = encode(np.asarray(_cut(seen, window)), quality=82)
+    scale = np.array([width / (window[2] - window[0]), height / (window[3] - window[1])])
+    rings = [(ring - window[:2]) * scale for ring in outlines(mask)]
+    return Crop(uri, width, height, "".join(map(_path, rings)))
+
+
+def _path(ring: F8) -> str:
+    corners = " ".join(f"{x:.0f} {y:.0f}" for x, y in ring.tolist())
+    return f"M{corners}Z"

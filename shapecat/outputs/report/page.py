@@ -1,0 +1,255 @@
+"""The report of a run as one HTML page that works from a file; and the index over many."""
+
+import hashlib
+import json
+import re
+import shlex
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from shapecat.arrays import F8
+from shapecat.outputs.report.cards import (
+    Card,
+    asset,
+    card_html,
+    css_colour,
+    frame_html,
+    is_unsure,
+    template,
+)
+from shapecat.outputs.report.pictures import StripFrame
+from shapecat.outputs.rereading import FinishedRun
+from shapecat.outputs.wording import plural
+from shapecat.runs.track_table import TrackTable
+from shapecat.types import UNKNOWN
+
+__all__ = ["Listed", "index_page", "run_page"]
+
+_SCRIPTS = ("labels.js", "saving.js", "cards.js", "frames.js", "keys.js")
+
+
+@dataclass(frozen=True)
+class Listed:
+    """A run as the index lists it; ``link`` to its report, ``faces`` some of its pictures."""
+
+    link: str
+    name: str
+    run: Mapping[str, Any]
+    categories: Counter[str]
+    unsure: int
+    checked: int
+    faces: tuple[str, ...]
+
+
+def run_page(
+    finished: FinishedRun,
+    table: TrackTable,
+    cards: Sequence[Card],
+    frames: Sequence[StripFrame],
+    stages: Mapping[str, F8],
+    *,
+    notes: Sequence[str] = (),
+    index: str | None = None,
+    served: bool = False,
+) -> str:
+    """Return the page of a run.
+
+    Parameters
+    ----------
+    cards : the tracks, in the order of ``table``.
+    frames : the strip.
+    stages : seconds of each frame by stage.
+    notes : warnings beside those of the run.
+    index : link to the index over many runs.
+    served : corrections go to a server, not to a table to download.
+    """
+    run = finished.run
+    counts = Counter(card.row.category for card in cards)
+    names = (UNKNOWN, *finished.categories)
+    end = max((float(c.timeline.seconds[-1]) for c in cards if len(c.timeline.seconds)), default=0)
+    return template("page.html").substitute(
+        title=escape(finished.name),
+        style=asset("report.css"),
+        script="\n".join(map(asset, _SCRIPTS)),
+        connect="connect-src 'self'" if served else "connect-src 'none'",
+        back=f'<a href="{escape(index)}">all runs</a> ·' if index else "",
+        subtitle=escape(_subtitle(run)),
+        tiles=_tiles(_run_tiles(run, len(cards), sum(is_unsure(c.row) for c in cards), end)),
+        warnings=_warnings([*run["warnings"], *notes]),
+        strip=_strip(frames, cards),
+        chips="".join(_chip(name, counts[name]) for name in _ordered(counts, names)),
+        cards="".join(card_html(card, run["model"]["categories"], names, end) for card in cards),
+        next=_next_step(finished, served=served),
+        timings=_timings(run["seconds"], stages),
+        facts=_facts(run),
+        glossary=asset("glossary.html"),
+        names="".join(f'<option value="{escape(name)}">' for name in names),
+        data=_data(names, table, served=served),
+    )
+
+
+def index_page(title: str, runs: Sequence[Listed]) -> str:
+    """Return the page that lists many runs."""
+    total = sum((item.categories for item in runs), Counter[str]())
+    tiles = {
+        "recordings": len(runs),
+        "frames": sum(int(item.run["counts"]["frames"]) for item in runs),
+        "tracks": total.total(),
+        "uncertain": sum(item.unsure for item in runs),
+        "checked": sum(item.checked for item in runs),
+    }
+    return template("index.html").substitute(
+        title=escape(title),
+        style=asset("report.css"),
+        subtitle=escape(", ".join(f"{n} {name}" for name, n in total.most_common())),
+        tiles=_tiles(tiles),
+        runs="".join(map(_listed, runs)),
+    )
+
+
+def _ordered(counts: Mapping[str, int], names: Sequence[str]) -> list[str]:
+    return [name for name in names if name in counts] + sorted(set(counts) - set(names))
+
+
+def _subtitle(run: Mapping[str, Any]) -> str:
+    topics = ", ".join(run["options"]["topics"])
+    return f"{run['input']['path']} · {run['input']['bytes'] / 1e6:.1f} MB · {topics}"
+
+
+def _run_tiles(run: Mapping[str, Any], tracks: int, unsure: int, end: float) -> dict[str, Any]:
+    return {
+        "frames": run["counts"]["frames"],
+        "length": f"{end:.1f} s",
+        "detections": run["counts"]["detections"],
+        "tracks": tracks,
+        "uncertain": unsure,
+    }
+
+
+def _tiles(values: Mapping[str, Any]) -> str:
+    return "".join(
+        f"<div><dt>{escape(name)}</dt><dd>{escape(str(value))}</dd></div>"
+        for name, value in values.items()
+    )
+
+
+def _warnings(texts: Sequence[str]) -> str:
+    items = "".join(f"<li>⚠ {escape(text)}</li>" for text in texts)
+    return f'<ul class="warnings">{items}</ul>' if items else ""
+
+
+def _strip(frames: Sequence[StripFrame], cards: Sequence[Card]) -> str:
+    """Return the strip of frames; nothing where there are none."""
+    if not frames:
+        return ""
+    categories = {card.row.track: card.row.category for card in cards}
+    several = len({frame.topic for frame in frames}) > 1
+    items = "".join(frame_html(frame, categories, several=several) for frame in frames)
+    return f'<section class="strip" id="strip" aria-label="Frames">{items}</section>'
+
+
+def _chip(name: str, count: int) -> str:
+    return (
+        f'<button type="button" class="chip" data-category="{escape(name)}" aria-pressed="true" '
+        f'style="--c:{css_colour(name)}"><span class="dot"></span>{escape(name)} <b>{count}</b>'
+        "</button>"
+    )
+
+
+def _next_step(finished: FinishedRun, *, served: bool) -> str:
+    """Return how corrections get into the other outputs."""
+    folder = shlex.quote(str(finished.folder))
+    if served:
+        text, command = "Corrections are in tracks.csv already.", f"shapecat annotate {folder}"
+    else:
+        text = "Download tracks.csv first."
+        command = f"shapecat annotate {folder} --labels tracks.csv"
+    return (
+        f"{text} Bring them into annotated.mcap, review.rrd and every export with "
+        f"<code>{escape(command)}</code>"
+    )
+
+
+def _timings(phases: Mapping[str, float], stages: Mapping[str, F8]) -> str:
+    rows = [("stage, per frame", "median", "95th percentile", "")]
+    for name, values in stages.items():
+        middle, high = np.percentile(values, [50, 95]) * 1000 if len(values) else (0.0, 0.0)
+        rows.append((name, f"{middle:.1f}", f"{high:.1f}", "ms"))
+    rows.append(("phase", "total", "", ""))
+    rows += [(name, f"{seconds:.1f}", "", "s") for name, seconds in phases.items()]
+    lines = []
+    for cells in rows:
+        kind = "th" if not cells[3] else "td"
+        lines.append(
+            "<tr>" + "".join(f"<{kind}>{escape(cell)}</{kind}>" for cell in cells) + "</tr>"
+        )
+    return f"<table>{''.join(lines)}</table>"
+
+
+def _facts(run: Mapping[str, Any]) -> str:
+    skipped = ", ".join(f"{n} {reason}" for reason, n in run["counts"]["skipped"].items())
+    up = run["up"] or {}
+    facts = {
+        "model": run["model"]["id"],
+        "categories": ", ".join(run["model"]["categories"]),
+        "fixed frame": run["fixed_frame"] or "none: tracks are in the sensor frame",
+        "up": str(up.get("source", "")),
+        "colour images": ", ".join(filter(None, (run.get("color") or {}).values())) or "none",
+        "skipped frames": skipped or "none",
+        "shapecat": run["versions"]["shapecat"],
+        "python": run["versions"].get("python", ""),
+        "input digest": run["input"]["digest"],
+    }
+    return "".join(
+        f"<dt>{escape(name)}</dt><dd>{escape(str(value))}</dd>" for name, value in facts.items()
+    )
+
+
+def _data(names: Sequence[str], table: TrackTable, *, served: bool) -> str:
+    """Return what the script needs; nothing in it can end the script element."""
+    rows = [
+        {
+            "track": str(row.track),
+            "category": row.category,
+            "label": row.label,
+            "cells": [row.cells.get(name, "") for name in table.columns],
+        }
+        for row in table.rows
+    ]
+    content = {
+        "columns": table.columns,
+        "rows": rows,
+        "categories": names,
+        "colours": {name: css_colour(name) for name in names},
+        "served": served,
+    }
+    text = json.dumps(content, ensure_ascii=False, separators=(",", ":"))
+    key = hashlib.sha256(text.encode()).hexdigest()[:16]
+    text = json.dumps(content | {"key": key}, ensure_ascii=False, separators=(",", ":"))
+    return re.sub(r"[<>&\u2028\u2029]", lambda found: f"\\u{ord(found[0]):04x}", text)
+
+
+def _listed(item: Listed) -> str:
+    share = "".join(
+        f'<span style="--c:{css_colour(name)};--n:{count}" title="{count} {escape(name)}"></span>'
+        for name, count in item.categories.most_common()
+    )
+    words = ", ".join(f"{count} {name}" for name, count in item.categories.most_common())
+    seconds = item.run["seconds"].get("total", 0.0)
+    notes = [plural(item.run["counts"]["frames"], "frame"), f"processed in {seconds:.1f} s"]
+    notes += [f"{item.unsure} uncertain"] if item.unsure else []
+    notes += [f"{item.checked} checked"] if item.checked else []
+    faces = "".join(f'<img alt="" src="{face}">' for face in item.faces)
+    warnings = len(item.run["warnings"])
+    warn = f' · <span class="warn">⚠ {plural(warnings, "warning")}</span>' if warnings else ""
+    return (
+        f'<a class="run" href="{escape(item.link)}"><div><h3>{escape(item.name)}</h3>'
+        f'<p class="muted">{escape(" · ".join(notes))}{warn}</p></div>'
+        f'<div><div class="share">{share}</div><p class="muted">{escape(words) or "no tracks"}</p>'
+        f'</div><div class="faces">{faces}</div></a>'
+    )

@@ -1,0 +1,171 @@
+"""The pictures of a report: of each track its best view, and a strip of frames with boxes."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4
+from shapecat.errors import RecordingError, ShapecatError
+from shapecat.geometry import level_from_sensor, transform
+from shapecat.outputs.colouring import Coloured, with_colour
+from shapecat.outputs.colours import colour_of
+from shapecat.outputs.exports_files import support_offset
+from shapecat.outputs.report.choosing import Choice
+from shapecat.outputs.report.images import Crop, SeenFrame, crop_of, encode, look, worth_of
+from shapecat.outputs.report.surfaces import MOST_POINTS, Picture, Snapshot, draw
+from shapecat.outputs.rereading import FinishedRun, open_source
+from shapecat.runs.corrections import TrackLabel
+from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.track_table import TrackRow
+from shapecat.types import Frame, LabelledFrame, LabelledObject, NeuralGas
+
+__all__ = ["Pictures", "StripFrame", "TrackPictures", "take_pictures"]
+
+_UPRIGHT = np.array([0.0, -1.0, 0.0], np.float32)
+"""Up in an upright optical frame, where nothing else is known."""
+
+
+class TrackPictures(NamedTuple):
+    """The best view of a track: its crop, its surface, and the size of its box in metres."""
+
+    crop: Crop | None
+    surfaces: tuple[Picture, ...]
+    size: tuple[float, float, float]
+
+
+class StripFrame(NamedTuple):
+    """A frame as a data URI; ``boxes`` are left, top, width and height by track, pixels."""
+
+    image: str
+    width: int
+    height: int
+    seconds: float
+    topic: str
+    boxes: Mapping[int, tuple[float, float, float, float]]
+
+
+@dataclass(frozen=True)
+class Pictures:
+    """All pictures of a run, and why there are only surfaces from graphs, if so."""
+
+    tracks: Mapping[int, TrackPictures]
+    frames: Sequence[StripFrame]
+    reason: str = ""
+
+
+class _Best(NamedTuple):
+    """The best view of a track so far."""
+
+    worth: float
+    crop: Crop | None
+    shot: Snapshot
+    item: LabelledObject
+
+
+@dataclass
+class _Taken:
+    """What was taken so far."""
+
+    choice: Choice
+    best: dict[int, _Best] = field(default_factory=dict)
+    frames: list[StripFrame] = field(default_factory=list)
+
+    def add(self, labelled: LabelledFrame, frame: Frame | None, coloured: Coloured | None) -> None:
+        """Take a chosen frame; without what the sensor has read, only its meshes."""
+        key = (labelled.topic, labelled.index)
+        if frame is not None:
+            _require_unchanged(labelled, frame)
+        seen = None if frame is None else look(labelled, frame, coloured)
+        wanted = self.choice.candidates.get(key, frozenset())
+        for number, item in enumerate(labelled.objects):
+            if item.track not in wanted:
+                continue
+            worth = 1e-9 * item.indices.size if seen is None else worth_of(seen, number)
+            if item.track not in self.best or worth > self.best[item.track].worth:
+                shown = seen is not None and seen.masks[number].pixels.size > 0
+                crop = crop_of(seen, number) if seen is not None and shown else None
+                shot = _snapshot(labelled, frame, item)
+                self.best[item.track] = _Best(worth, crop, shot, item)
+        if seen is not None and key in self.choice.strip:
+            self.frames.append(_strip_frame(labelled, seen, self.choice.strip[key]))
+
+    def pictures(self, reason: str = "") -> Pictures:
+        """Draw the surfaces."""
+        tracks = {}
+        for track, (_, crop, shot, item) in self.best.items():
+            x, y, z = (float(side) for side in item.box.size)
+            tracks[track] = TrackPictures(crop, draw(shot, colour_of(item.category)), (x, y, z))
+        return Pictures(tracks, sorted(self.frames, key=lambda frame: frame.seconds), reason)
+
+
+def take_pictures(finished: FinishedRun, rows: Sequence[TrackRow], choice: Choice) -> Pictures:
+    """Read the chosen frames again and picture them.
+
+    Where the recording is gone, a track has its surface alone, drawn from its graph.
+    """
+    taken = _Taken(choice)
+    try:
+        with open_source(finished.run) as recording:
+            frames = _frames(finished, rows, choice)
+            for item in with_colour(frames, recording, finished.run, finished.folder):
+                taken.add(*item)
+    except ShapecatError as error:
+        taken = _Taken(choice)
+        for labelled in _frames(finished, rows, choice):
+            taken.add(labelled, None, None)
+        return taken.pictures(str(error))
+    return taken.pictures()
+
+
+def _frames(
+    finished: FinishedRun, rows: Sequence[TrackRow], choice: Choice
+) -> Iterator[LabelledFrame]:
+    """Yield the chosen frames, each track as it was found, before any correction."""
+    labels = {row.track: TrackLabel(row.track, row.category, row.confidence) for row in rows}
+    left = set(choice.frames)
+    for labelled in read_labelled_frames(finished.folder, labels):
+        if (labelled.topic, labelled.index) in left:
+            yield labelled
+            left.discard((labelled.topic, labelled.index))
+        if not left:
+            return
+
+
+def _strip_frame(labelled: LabelledFrame, seen: SeenFrame, seconds: float) -> StripFrame:
+    uri, width, height = encode(seen.pixels())
+    scale = width / seen.shape[1]
+    boxes = {
+        item.track: (scale * mask.left, scale * mask.top, scale * mask.box[2], scale * mask.box[3])
+        for item, mask in zip(labelled.objects, seen.masks, strict=True)
+        if mask.pixels.size
+    }
+    return StripFrame(uri, width, height, seconds, labelled.topic, boxes)
+
+
+def _snapshot(labelled: LabelledFrame, frame: Frame | None, item: LabelledObject) -> Snapshot:
+    """Return an object as it stands: z up, the support at z = 0."""
+    points = _points(frame, item)
+    up = _UPRIGHT if labelled.up is None else labelled.up
+    neurons, middle = item.gas.neurons, np.asarray([item.box.center])
+    body = next(points for points in (points, neurons, middle) if len(points))
+    level = level_from_sensor(up, support_offset(item, up), body)
+    gas = NeuralGas(transform(level, neurons), item.gas.edges)
+    return Snapshot(transform(level, points), gas, level.translation)
+
+
+def _points(frame: Frame | None, item: LabelledObject) -> F4:
+    """Return some points (n, 3) of an object, metres, sensor frame."""
+    if frame is None:
+        return np.zeros((0, 3), np.float32)
+    points = frame.xyz(item.indices[:: 1 + item.indices.size // MOST_POINTS])
+    return np.asarray(points[np.isfinite(points).all(axis=1)])
+
+
+def _require_unchanged(labelled: LabelledFrame, frame: Frame) -> None:
+    """Raise RecordingError if a frame has fewer readings than objects were found in."""
+    readings = frame.depth.size if frame.depth is not None else len(frame.xyz())
+    if any(item.indices.size and item.indices.max() >= readings for item in labelled.objects):
+        msg = f"frame {frame.index} of {frame.topic} has changed since it was processed"
+        raise RecordingError(msg)

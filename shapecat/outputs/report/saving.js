@@ -1,0 +1,100 @@
+// Where labels go: to tracks.csv by the server, or into this browser until they are downloaded.
+const storage = `shapecat:${data.key}`;
+const onDisk = new Map(labels);
+const sending = new Set();
+let lost = "";
+
+function save(track) {
+  if (data.served) send(track); else keep();
+}
+
+function keep() {
+  try {
+    const pairs = data.rows.map((row) => row.track).filter((t) => labels.get(t) !== onDisk.get(t));
+    localStorage.setItem(storage, JSON.stringify(Object.fromEntries(pairs.map((t) => [t, labels.get(t)]))));
+  } catch { /* a browser that keeps nothing for files still downloads */ }
+}
+
+function recall() {
+  try {
+    const kept = JSON.parse(localStorage.getItem(storage) || "{}");
+    for (const [track, label] of Object.entries(kept)) if (labels.has(track)) labels.set(track, label);
+  } catch { /* the same */ }
+}
+
+function unsaved() {
+  return data.rows.map((row) => row.track).filter((track) => labels.get(track) !== onDisk.get(track));
+}
+
+// Take over what other tabs and programs wrote, where this page has nothing newer.
+function adopt(disk) {
+  for (const [track, label] of Object.entries(disk)) {
+    if (!labels.has(track) || onDisk.get(track) === label) continue;
+    const untouched = labels.get(track) === onDisk.get(track);
+    onDisk.set(track, label);
+    if (untouched) { labels.set(track, label); forget(track); learn(label); refresh(track); }
+  }
+}
+
+async function ask(options) {
+  const reply = await fetch("labels", options).catch(() => { throw new Error("the server does not answer"); });
+  if (!reply.ok && reply.status !== 409) throw new Error(await reply.text());
+  return [reply.ok, await reply.json()];
+}
+
+// Send the newest label of a track until the disk has it; the server refuses it if the label there
+// is not the one this page knows.
+async function send(track) {
+  if (sending.has(track)) return;
+  sending.add(track);
+  try {
+    while (labels.get(track) !== onDisk.get(track)) {
+      showSaved();
+      const label = labels.get(track), wanted = { track: Number(track), label, seen: onDisk.get(track) };
+      const headers = { "Content-Type": "application/json" };
+      const [done, answer] = await ask({ method: "POST", keepalive: true, headers, body: JSON.stringify(wanted) });
+      lost = "";
+      if (done) onDisk.set(track, label);
+      adopt(answer.labels);
+      if (!done) refuse(track, answer.problem);
+    }
+  } catch (error) { lost = error.message; }
+  sending.delete(track);
+  showSaved();
+}
+
+function refuse(track, reason) {
+  labels.set(track, onDisk.get(track));
+  forget(track);
+  refresh(track);
+  say(`#${track} was not changed: ${reason}`, true);
+}
+
+function showSaved() {
+  const left = unsaved().length, one = left === 1;
+  byId("download").hidden = data.served && lost === "";
+  byId("saved").classList.toggle("bad", lost !== "" && left > 0);
+  if (!data.served) {
+    byId("saved").textContent = "Corrections stay in this browser until you download them.";
+  } else if (!left) {
+    byId("saved").textContent = "All corrections are in tracks.csv.";
+  } else {
+    byId("saved").textContent = lost
+      ? `${left} ${one ? "correction is" : "corrections are"} not on disk: ${lost}. Download the table to keep ${one ? "it" : "them"}.`
+      : "Saving …";
+  }
+}
+
+async function catchUp() {
+  try { adopt((await ask())[1].labels); lost = ""; } catch (error) { lost = error.message; }
+  for (const track of unsaved()) send(track);
+  showSaved();
+}
+
+if (data.served) {
+  addEventListener("focus", catchUp);
+  addEventListener("beforeunload", (event) => { if (unsaved().length) event.preventDefault(); });
+  setInterval(() => { if (lost && unsaved().length) catchUp(); }, 2000);
+} else {
+  recall();
+}

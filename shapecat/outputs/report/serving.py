@@ -1,0 +1,209 @@
+"""Reports served to this machine alone; corrections go to tracks.csv as they are made.
+
+Every request needs the token in its path, a Host that names this machine, and, where a browser
+tells it, an Origin that is this server: a page of a stranger can neither guess the first nor,
+with a name of its own that leads here, have the second.
+"""
+
+import json
+import logging
+import secrets
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler
+from pathlib import Path
+from socketserver import ThreadingTCPServer
+from typing import Any, NamedTuple
+from urllib.parse import unquote
+
+from shapecat.errors import ConfigError, OutputError
+from shapecat.outputs.report.writing import INDEX, PAGE, Reports, RunReport
+from shapecat.runs.corrections import correct_label
+from shapecat.runs.track_table import read_track_table
+
+__all__ = ["serve_reports"]
+
+_HOST = "127.0.0.1"
+_NAMES = frozenset({_HOST, "localhost"})
+_LABELS = "labels"
+"""The address, beside a page, of the labels of its run."""
+_LARGEST_BODY = 1 << 16
+_PATIENCE_S = 30
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "Content-Security-Policy": "frame-ancestors 'none'",
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Cross-Origin-Resource-Policy": "same-origin",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+}
+
+_log = logging.getLogger(__name__)
+
+
+class _Answer(NamedTuple):
+    status: HTTPStatus
+    content: str | dict[str, Any]
+
+    @property
+    def kind(self) -> str:
+        """The media type."""
+        if not isinstance(self.content, str):
+            return "application/json"
+        return "text/html" if self.status is HTTPStatus.OK else "text/plain"
+
+
+@dataclass(frozen=True)
+class _Site:
+    """What is served: pages by address, and the labels beside each report."""
+
+    reports: Reports
+    token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
+
+    @property
+    def start(self) -> str:
+        """The address to begin with."""
+        return INDEX if self.reports.indexed else self.reports.link(self.reports.runs[0])
+
+    def get(self, address: str) -> _Answer:
+        """Return a page, or the labels of a run, as they are on disk."""
+        if self.reports.indexed and address == INDEX:
+            return _Answer(HTTPStatus.OK, self.reports.index())
+        report, name = self._find(address)
+        if report is not None and name == PAGE:
+            return _Answer(HTTPStatus.OK, report.page(served=True))
+        if report is not None and name == _LABELS:
+            return _Answer(HTTPStatus.OK, {"labels": _labels(report.folder)})
+        return _Answer(HTTPStatus.NOT_FOUND, "no such page")
+
+    def post(self, address: str, body: bytes) -> _Answer:
+        """Write a label to disk; return those that are there then, and why it was not written."""
+        report, name = self._find(address)
+        if report is None or name != _LABELS:
+            return _Answer(HTTPStatus.NOT_FOUND, "no such page")
+        wanted = _correction(body)
+        if wanted is None:
+            return _Answer(HTTPStatus.BAD_REQUEST, "expected a track, its label, and the one seen")
+        track, label, seen = wanted
+        problem = correct_label(report.folder, track, label, seen=seen)
+        status = HTTPStatus.CONFLICT if problem else HTTPStatus.OK
+        return _Answer(status, {"labels": _labels(report.folder), "problem": problem})
+
+    def _find(self, address: str) -> tuple[RunReport | None, str]:
+        """Return the run that an address lies in, and what is asked for there."""
+        place, _, name = address.rpartition("/")
+        for report in self.reports.runs:
+            if unquote(self.reports.link(report)) == f"{place}/{PAGE}".lstrip("/"):
+                return report, name
+        return None, name
+
+
+def _labels(folder: Path) -> dict[int, str]:
+    return {row.track: row.label for row in read_track_table(folder / "tracks.csv").rows}
+
+
+def _correction(body: bytes) -> tuple[int, str, str] | None:
+    """Return track, label and the label seen before, if a body holds these and nothing strange."""
+    try:
+        found = json.loads(body)
+        track, label, seen = found["track"], found["label"], found["seen"]
+    except (ValueError, KeyError, TypeError, RecursionError):
+        return None
+    right = type(track) is int and isinstance(label, str) and isinstance(seen, str)
+    return (track, " ".join(label.split()), seen) if right else None
+
+
+class _Server(ThreadingTCPServer):
+    """Unlike `http.server.HTTPServer` it asks no name server who it is."""
+
+    allow_reuse_address = True
+    daemon_threads = True
+    site: _Site
+
+    def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002  given
+        """Log what has failed, such as an answer that a browser does not wait for."""
+        _log.warning("a request failed", exc_info=True)
+
+
+class _Handler(BaseHTTPRequestHandler):
+    server: _Server
+    timeout = _PATIENCE_S
+    server_version = "shapecat"
+    sys_version = ""
+
+    def do_GET(self) -> None:
+        """Answer with a page."""
+        self._serve(b"")
+
+    def do_POST(self) -> None:
+        """Take a correction."""
+        length = self.headers.get("Content-Length", "")
+        if not length.isdecimal() or int(length) > _LARGEST_BODY:
+            self._send(_Answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too long"))
+            return
+        self._serve(self.rfile.read(int(length)))
+
+    def _serve(self, body: bytes) -> None:
+        site = self.server.site
+        path, _, _ = self.path.partition("?")
+        token, _, address = path.removeprefix("/").partition("/")
+        known = secrets.compare_digest(token.encode(), site.token.encode())
+        if not (known and self._from_here()):
+            self._send(_Answer(HTTPStatus.FORBIDDEN, "use the address that shapecat has printed"))
+            return
+        try:
+            post, address = self.command == "POST", unquote(address)
+            self._send(site.post(address, body) if post else site.get(address))
+        except OutputError as error:
+            self._send(_Answer(HTTPStatus.INTERNAL_SERVER_ERROR, str(error)))
+
+    def _from_here(self) -> bool:
+        """Return whether a request names this machine, and comes from a page of this server."""
+        host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
+        return host.rpartition(":")[0] in _NAMES and origin in {None, f"http://{host}"}
+
+    def _send(self, answer: _Answer) -> None:
+        text = answer.content if isinstance(answer.content, str) else json.dumps(answer.content)
+        content = text.encode()
+        self.send_response(answer.status)
+        self.send_header("Content-Type", f"{answer.kind}; charset=utf-8")
+        self.send_header("Content-Length", str(len(content)))
+        for name, value in _HEADERS.items():
+            self.send_header(name, value)
+        self.end_headers()
+        self.wfile.write(content)
+
+    def log_message(self, format: str, *args: object) -> None:  # noqa: A002  the name is given
+        """Log without the token."""
+        _log.info("%s", (format % args).replace(self.server.site.token, "…"))
+
+
+@contextmanager
+def serve_reports(reports: Reports, *, port: int = 0) -> Iterator[str]:
+    """Serve reports on the loopback address in the block; give the address to open.
+
+    Parameters
+    ----------
+    port : 0 for one that is free.
+
+    Raises
+    ------
+    ConfigError : the port is taken, or not allowed.
+    """
+    try:
+        server = _Server((_HOST, port), _Handler)
+    except OSError as error:
+        msg = f"--port {port}: {error.strerror or error}"
+        raise ConfigError(msg) from error
+    server.site = _Site(reports)
+    thread = threading.Thread(target=server.serve_forever, daemon=True)
+    thread.start()
+    try:
+        yield f"http://{_HOST}:{server.server_address[1]}/{server.site.token}/{server.site.start}"
+    finally:
+        server.shutdown()
+        server.server_close()
+        thread.join()

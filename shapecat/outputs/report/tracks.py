@@ -1,0 +1,66 @@
+"""The timeline of each track: when it was seen, and its posterior so far."""
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute
+import pyarrow.parquet as pq
+
+from shapecat.arrays import F4, F8, Bool, Record, array
+from shapecat.runs.tables import read_row_groups
+
+__all__ = ["Detected", "Timeline", "read_stage_seconds", "read_timelines"]
+
+Detected = tuple[str, int, int]
+"""Topic, frame, detection."""
+
+
+class Timeline(Record):
+    """A track over time.
+
+    ``seconds`` (k,) from the first frame of the run; ``seen`` (k,) where it was detected;
+    ``causal`` (k, c) the posterior of the views so far; ``keys`` topic, frame and detection of
+    each row, -1 where it coasts.
+    """
+
+    seconds: F8 = array("k", "f8")
+    seen: Bool = array("k", "?")
+    causal: F4 = array("k c", "f4")
+    keys: tuple[Detected, ...]
+
+
+def read_timelines(folder: Path) -> dict[int, Timeline]:
+    """Read the timeline of every track of a run."""
+    start = min(_first_stamps(folder), default=0)
+    table = pq.read_table(folder / "tracks.parquet")
+    width = len(table["posterior"][0]) if table.num_rows else 0
+    tracks = table["track"].to_numpy()
+    seconds = (table["stamp_ns"].to_numpy() - start) * 1e-9
+    causal = table["posterior"].combine_chunks().flatten().to_numpy().reshape(-1, width or 1)
+    detections = pa.compute.fill_null(table["detection"], -1).to_numpy()
+    topics, frames = table["topic"].to_pylist(), table["frame"].to_pylist()
+    timelines = {}
+    for track in np.unique(tracks).tolist():
+        rows = np.flatnonzero(tracks == track)
+        rows = rows[np.argsort(seconds[rows], kind="stable")]
+        keys = tuple((topics[k], frames[k], int(detections[k])) for k in rows.tolist())
+        timelines[track] = Timeline(seconds[rows], detections[rows] >= 0, causal[rows], keys)
+    return timelines
+
+
+def _first_stamps(folder: Path) -> Iterator[int]:
+    for group in read_row_groups(folder / "frames.parquet", ["stamp_ns"]):
+        if group.num_rows:
+            yield int(pa.compute.min(group["stamp_ns"]).as_py())
+
+
+def read_stage_seconds(folder: Path) -> dict[str, F8]:
+    """Return the seconds each stage took on each frame."""
+    found: dict[str, list[float]] = {}
+    for group in read_row_groups(folder / "frames.parquet", ["stages", "seconds"]):
+        for row in group.to_pylist():
+            for stage, seconds in zip(row["stages"], row["seconds"], strict=True):
+                found.setdefault(stage, []).append(seconds)
+    return {stage: np.array(values) for stage, values in found.items()}

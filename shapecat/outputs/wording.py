@@ -1,0 +1,38 @@
+"""Numbers and times in words, the same in every output."""
+
+__all__ = ["confidence_text", "plural", "time_span"]
+
+
+def confidence_text(confidence: float) -> str:
+    """Return a confidence with two digits; less than certain is never shown as certain.
+
+    Examples
+    --------
+    >>> confidence_text(0.9999), confidence_text(1.0)
+    ('0.99', '1.00')
+    """
+    text = f"{confidence:.2f}"
+    return "0.99" if text == "1.00" and confidence < 1 else text
+
+
+def plural(count: int, noun: str) -> str:
+    """Return a number of things.
+
+    Examples
+    --------
+    >>> plural(1, "view"), plural(2, "view")
+    ('1 view', '2 views')
+    """
+    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
+
+
+def time_span(first_s: float, last_s: float) -> str:
+    """Return from when to when; one time if they look the same.
+
+    Examples
+    --------
+    >>> time_span(34.0, 34.01), time_span(0, 2)
+    ('34.0 s', '0.0–2.0 s')
+    """
+    first, last = f"{first_s:.1f}", f"{last_s:.1f}"
+    return f"{last} s" if first == last else f"{first}–{last} s"

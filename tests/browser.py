@@ -1,0 +1,171 @@
+"""A headless Chromium, where there is one, driven over the WebDriver protocol."""
+
+import json
+import shutil
+import socket
+import subprocess
+import time
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+__all__ = ["Browser"]
+
+_KEYS = {
+    "Backspace": "\ue003",
+    "Enter": "\ue007",
+    "Control": "\ue009",
+    "Escape": "\ue00c",
+    "Left": "\ue012",
+    "Up": "\ue013",
+    "Right": "\ue014",
+    "Down": "\ue015",
+    "Delete": "\ue017",
+}
+
+
+def _strokes(keys: list[str]) -> list[dict[str, str]]:
+    values = [_KEYS.get(key, key) for key in keys]
+    down = [{"type": "keyDown", "value": value} for value in values]
+    return down + [{"type": "keyUp", "value": value} for value in reversed(values)]
+
+
+class Browser:
+    """A headless Chromium, driven over the WebDriver protocol."""
+
+    def __init__(self, folder: Path) -> None:
+        with socket.socket() as free:
+            free.bind(("127.0.0.1", 0))
+            port = free.getsockname()[1]
+        driver = shutil.which("chromedriver")
+        if driver is None or not (shutil.which("chromium") or shutil.which("google-chrome")):
+            pytest.skip("no Chromium with its driver on this machine")
+        self._base = f"http://127.0.0.1:{port}"
+        self.downloads = folder / "downloads"
+        self.downloads.mkdir()
+        self._process = subprocess.Popen(
+            [driver, f"--port={port}"], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        arguments = [
+            "--headless",
+            "--no-sandbox",
+            "--disable-gpu",
+            "--disable-background-networking",
+            "--window-size=1400,1000",
+            f"--user-data-dir={folder / 'profile'}",
+        ]
+        options = {"args": arguments, "binary": shutil.which("chromium") or "google-chrome"}
+        wanted = {
+            "goog:chromeOptions": options,
+            "goog:loggingPrefs": {"browser": "ALL"},
+            "timeouts": {"pageLoad": 60000},
+        }
+        for _ in range(100):
+            try:
+                self.session = self._send(
+                    "POST", "/session", {"capabilities": {"alwaysMatch": wanted}}
+                )["sessionId"]
+                break
+            except ConnectionError:
+                time.sleep(0.1)
+            except urllib.error.URLError:
+                time.sleep(0.1)
+        where = {"behavior": "allow", "downloadPath": str(self.downloads)}
+        self.cdp("Browser.setDownloadBehavior", where)
+
+    def close(self) -> None:
+        """End the browser and its driver."""
+        try:
+            self._send("DELETE", f"/session/{self.session}")
+        finally:
+            self._process.terminate()
+            self._process.wait(10)
+
+    def _send(self, method: str, path: str, body: object = None) -> Any:
+        content = None if body is None else json.dumps(body).encode()
+        headers = {"Content-Type": "application/json"}
+        request = urllib.request.Request(self._base + path, content, headers, method=method)  # noqa: S310  our own driver
+        with urllib.request.urlopen(request, timeout=90) as answer:  # noqa: S310  the same
+            return json.load(answer)["value"]
+
+    def _ask(self, method: str, path: str, body: object = None) -> Any:
+        return self._send(method, f"/session/{self.session}{path}", body)
+
+    def open(self, page: Path | str) -> None:
+        """Load a page from its file, or its address."""
+        self._ask("POST", "/url", {"url": page.as_uri() if isinstance(page, Path) else page})
+
+    def run(self, script: str) -> Any:
+        """Return what a script returns."""
+        return self._ask("POST", "/execute/sync", {"script": script, "args": []})
+
+    def _find(self, selector: str) -> str:
+        found = self._ask("POST", "/element", {"using": "css selector", "value": selector})
+        return str(next(iter(found.values())))
+
+    def click(self, selector: str) -> None:
+        """Click an element as a person does."""
+        self._ask("POST", f"/element/{self._find(selector)}/click", {})
+
+    def type(self, selector: str, text: str) -> None:
+        """Type into an element."""
+        self._ask("POST", f"/element/{self._find(selector)}/value", {"text": text})
+
+    def press(self, *keys: str) -> None:
+        """Press keys one after the other, where the focus is; `Control+z` holds the first."""
+        events = [event for key in keys for event in _strokes(key.split("+"))]
+        source = {"type": "key", "id": "keyboard", "actions": events}
+        self._ask("POST", "/actions", {"actions": [source]})
+
+    def tab(self) -> str:
+        """Open another tab, and return its handle; `turn_to` chooses the tab to drive."""
+        return str(self._ask("POST", "/window/new", {"type": "tab"})["handle"])
+
+    def tabs(self) -> list[str]:
+        """Return the handles of the open tabs."""
+        return [str(handle) for handle in self._ask("GET", "/window/handles")]
+
+    def turn_to(self, tab: str) -> None:
+        """Drive a tab from now on."""
+        self._ask("POST", "/window", {"handle": tab})
+
+    def close_tab(self) -> None:
+        """Close the tab that is driven."""
+        self._ask("DELETE", "/window")
+
+    def renew(self) -> None:
+        """Leave all tabs for a new one, unasked, and forget their complaints."""
+        new, left = self.tab(), self.tabs()
+        for tab in left:
+            self.turn_to(tab)
+            if tab != new:
+                self.close_tab()
+        self.turn_to(new)
+        self.complaints()
+
+    def wait(self, script: str) -> None:
+        """Wait until a script returns true."""
+        for _ in range(400):
+            if self.run(script) is True:
+                return
+            time.sleep(0.05)
+        pytest.fail(f"still not so: {script}")
+
+    def cdp(self, command: str, parameters: object) -> Any:
+        """Send a command of the DevTools protocol."""
+        return self._ask("POST", "/goog/cdp/execute", {"cmd": command, "params": parameters})
+
+    def complaints(self) -> list[str]:
+        """Return warnings and errors of the console."""
+        return [entry["message"] for entry in self._ask("POST", "/se/log", {"type": "browser"})]
+
+    def downloaded(self) -> Path:
+        """Wait for a download to be complete."""
+        for _ in range(100):
+            found = list(self.downloads.glob("*.csv"))
+            if found:
+                return found[0]
+            time.sleep(0.05)
+        pytest.fail("nothing was downloaded")

@@ -1,0 +1,426 @@
+"""The served report: what is corrected is on disk, and nobody else can correct it."""
+
+import csv
+import http.client
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+from click.testing import Result
+
+from shapecat.outputs.report import read_reports, write_reports
+from shapecat.outputs.report.serving import serve_reports
+from shapecat.runs.corrections import adopt_labels, read_labels
+from shapecat.runs.track_table import read_track_table
+from tests.browser import Browser
+
+Run = Callable[..., Result]
+
+NAMES = ("cup", "can", "box", "bottle", "bowl", "plate", "ball")
+SAVED = (
+    "return document.getElementById('saved').textContent === 'All corrections are in tracks.csv.'"
+)
+
+
+@pytest.fixture
+def run(guessed_run: Path, tmp_path: Path) -> Path:
+    folder = tmp_path / "out" / "table"
+    shutil.copytree(guessed_run, folder)
+    return folder
+
+
+@pytest.fixture
+def long_run(run: Path) -> Path:
+    """Return a run of fifty tracks: copies of those that were found."""
+    with (run / "tracks.csv").open(newline="") as file:
+        rows = list(csv.DictReader(file))
+    tracks = pq.read_table(run / "tracks.parquet")
+    many, tables = [], []
+    for number in range(1, 51):
+        row = rows[number % len(rows)]
+        of_track = pa.compute.equal(tracks["track"], int(row["track"]))
+        copy = tracks.filter(of_track)
+        column = pa.array([number] * copy.num_rows, pa.int32())
+        tables.append(copy.set_column(0, tracks.schema.field("track"), column))
+        many.append(row | {"track": str(number)})
+    with (run / "tracks.csv").open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(many[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(many)
+    pq.write_table(pa.concat_tables(tables), run / "tracks.parquet")
+    return run
+
+
+class Server(subprocess.Popen[str]):
+    """``shapecat report --serve`` as a process of its own, and the address it printed."""
+
+    def __init__(self, *folders: Path) -> None:
+        command = [sys.executable, "-m", "shapecat", "report", "--serve", *map(str, folders)]
+        super().__init__(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert self.stdout is not None
+        self.address = self.stdout.readline().strip()
+
+
+@pytest.fixture
+def served() -> Iterator[Callable[..., Server]]:
+    servers: list[Server] = []
+
+    def serve(*folders: Path) -> Server:
+        servers.append(Server(*folders))
+        return servers[-1]
+
+    yield serve
+    for server in servers:
+        server.kill()
+        server.communicate()
+
+
+def labels_on_disk(run: Path) -> dict[int, str]:
+    return {row.track: row.label for row in read_track_table(run / "tracks.csv").rows}
+
+
+def order_of(browser: Browser) -> list[int]:
+    script = "return [...document.querySelectorAll('.card')].map((card) => +card.dataset.track)"
+    return [int(track) for track in browser.run(script)]
+
+
+def other_than(category: str, number: int) -> int:
+    """Return the digit of a category that is not this one."""
+    digit = 1 + number % len(NAMES)
+    return digit if NAMES[digit - 1] != category else 1 + digit % len(NAMES)
+
+
+def test_fifty_corrections_by_keyboard_outlive_the_server(
+    browser: Browser, served: Callable[..., Server], long_run: Path
+) -> None:
+    server = served(long_run)
+    browser.open(server.address)
+    categories = {row.track: row.category for row in read_track_table(long_run / "tracks.csv").rows}
+    wanted = {}
+    for number, track in enumerate(order_of(browser)):
+        digit = other_than(categories[track], number)
+        browser.press(str(digit), "Right")
+        wanted[track] = NAMES[digit - 1]
+    browser.wait(SAVED)
+    os.kill(server.pid, signal.SIGKILL)
+    server.wait()
+
+    assert len(wanted) == 50
+    assert labels_on_disk(long_run) == wanted
+    assert browser.complaints() == []
+
+    browser.open(served(long_run).address)
+    script = (
+        "return Object.fromEntries([...document.querySelectorAll('.card.changed')].map("
+        "(card) => [card.dataset.track, card.querySelector('.fix').textContent]))"
+    )
+    shown = browser.run(script)
+    assert {int(track): text for track, text in shown.items()} == {
+        track: f"→ {label}" for track, label in wanted.items()
+    }
+    adopt_labels(long_run / "tracks.csv", long_run)  # as `shapecat annotate RUN` does
+    assert {
+        t: label.category for t, label in read_labels(long_run / "tracks.csv").items()
+    } == wanted
+
+
+def test_a_page_tells_what_a_killed_server_has_not_written(
+    browser: Browser, served: Callable[..., Server], long_run: Path
+) -> None:
+    """Each correction is on disk, or the page says that it is not and offers it as a table."""
+    server = served(long_run)
+    browser.open(server.address)
+    order = order_of(browser)
+    for _ in order[:20]:
+        browser.press("d", "Right")
+    os.kill(server.pid, signal.SIGKILL)  # while requests may be on their way
+    server.wait()
+    for _ in order[20:25]:
+        browser.press("d", "Right")
+    browser.wait("return document.getElementById('saved').textContent.includes('does not answer')")
+    browser.wait("return !document.getElementById('download').hidden")
+    said = browser.run("return document.getElementById('saved').textContent")
+    browser.click("#download")
+    table = browser.downloaded()
+    downloaded = {row.track: row.label for row in read_track_table(table).rows}
+    table.unlink()
+    browser.renew()  # the page would ask before it is left
+
+    on_disk = labels_on_disk(long_run)
+    missing = [track for track in order[:25] if on_disk[track] != "delete"]
+    assert set(order[20:25]) <= set(missing)
+    assert int(said.split()[0]) >= len(missing)
+    assert [track for track, label in downloaded.items() if label] == sorted(order[:25])
+
+
+def ask(
+    address: str,
+    method: str = "GET",
+    path: str | None = None,
+    body: str | bytes | None = None,
+    headers: dict[str, str] | None = None,
+) -> tuple[int, str]:
+    """Send a request as no browser would stop it; return status and text."""
+    parts = urlsplit(address)
+    connection = http.client.HTTPConnection(parts.hostname or "", parts.port or 0)
+    connection.request(method, parts.path if path is None else path, body, headers or {})
+    answer = connection.getresponse()
+    text = answer.read().decode()
+    connection.close()
+    return answer.status, text
+
+
+@contextmanager
+def serving(*folders: Path) -> Iterator[tuple[str, str]]:
+    """Serve in this process; give the address of the page and that of its labels."""
+    with serve_reports(read_reports(folders)) as address:
+        yield address, urlsplit(address).path.rpartition("/")[0] + "/labels"
+
+
+def correction(track: int, label: str, seen: str = "") -> str:
+    return json.dumps({"track": track, "label": label, "seen": seen})
+
+
+@pytest.fixture(scope="module")
+def site(
+    guessed_run: Path, tmp_path_factory: pytest.TempPathFactory
+) -> Iterator[tuple[Path, str, str]]:
+    """Serve a run that no test of these changes: the run, its page, and its labels."""
+    run = tmp_path_factory.mktemp("site") / "ta ble#2"
+    shutil.copytree(guessed_run, run)
+    with serving(run) as (address, labels):
+        yield run, address, labels
+
+
+KNOWN = "/{token}/{page}"
+STRANGERS = {
+    "no token": ("/{page}", {}),
+    "another token": ("/AAAAAAAAAAAAAAAAAAAAAAAAAAAAAAAA/{page}", {}),
+    "a part of the token": ("/{token:.9}/{page}", {}),
+    "the token as a query": ("/{page}?token={token}", {}),
+    "another origin": (KNOWN, {"Origin": "http://evil.example"}),
+    "a page of another port": (KNOWN, {"Origin": "http://127.0.0.1:1"}),
+    "a page of no origin": (KNOWN, {"Origin": "null"}),
+    "a name that was led here": (KNOWN, {"Host": "evil.example:80"}),
+    "its own origin": (KNOWN, {"Host": "evil.example:80", "Origin": "http://evil.example:80"}),
+    "a name that begins alike": (KNOWN, {"Host": "127.0.0.1.evil.example:80"}),
+    "no host": (KNOWN, {"Host": ""}),
+}
+"""The path of a request, and its headers."""
+
+
+@pytest.mark.parametrize("stranger", STRANGERS)
+@pytest.mark.parametrize("method", ["GET", "POST"])
+def test_strangers_are_refused(site: tuple[Path, str, str], method: str, stranger: str) -> None:
+    """Any page in the browser can send requests to this machine, by a name of its own as well."""
+    run, address, labels = site
+    form, headers = STRANGERS[stranger]
+    place = labels if method == "POST" else urlsplit(address).path
+    _, token, page = place.split("/", 2)
+    before = (run / "tracks.csv").read_bytes()
+    path = form.format(token=token, page=page)
+    status, text = ask(address, method, path, correction(1, "bowl"), headers)
+
+    assert status == 403
+    assert "card" not in text
+    assert (run / "tracks.csv").read_bytes() == before
+    assert not (run / "tracks.original.csv").exists()
+
+
+def test_the_owner_is_served_by_either_name(site: tuple[Path, str, str]) -> None:
+    _, address, labels = site
+    port = urlsplit(address).port
+    for host in (f"127.0.0.1:{port}", f"localhost:{port}", "localhost:9000"):  # through a tunnel
+        for origin in ({}, {"Origin": f"http://{host}"}):
+            assert ask(address, headers={"Host": host, **origin})[0] == 200
+    assert json.loads(ask(address, path=labels)[1])["labels"]
+    assert ask(address, path=labels + "x")[0] == 404
+    assert ask(address, path=labels.replace("labels", "tracks.csv"))[0] == 404
+    assert ask(address, path=labels.replace("labels", "../../run.json"))[0] == 404
+
+
+def test_no_other_machine_can_connect(site: tuple[Path, str, str]) -> None:
+    """A server on all addresses would answer on this one of the loopback network as well."""
+    with socket.socket() as other, pytest.raises(ConnectionRefusedError):
+        other.connect(("127.0.0.2", urlsplit(site[1]).port))
+
+
+@pytest.mark.parametrize(
+    ("body", "status"),
+    [
+        ("", 400),
+        ("[]", 400),
+        ("{" * 5000, 400),
+        ('{"track": 1, "label": "cup"}', 400),
+        ('{"track": true, "label": "cup", "seen": ""}', 400),
+        ('{"track": "1", "label": "cup", "seen": ""}', 400),
+        ('{"track": 1, "label": null, "seen": ""}', 400),
+        ("x" * 70000, 413),
+        (correction(999, "cup"), 409),
+        (correction(1, "cupp"), 409),
+        (correction(1, "merge with 1"), 409),
+        (correction(1, "merge with 999"), 409),
+        (correction(1, "cup,delete"), 409),
+        (correction(1, "cup", seen="bowl"), 409),
+    ],
+)
+def test_what_makes_no_sense_is_not_written(
+    site: tuple[Path, str, str], body: str, status: int
+) -> None:
+    run, address, labels = site
+    before = (run / "tracks.csv").read_bytes()
+    found, text = ask(address, "POST", labels, body)
+
+    assert found == status
+    assert status != 409 or json.loads(text)["problem"]
+    assert (run / "tracks.csv").read_bytes() == before
+
+
+def test_a_correction_is_on_disk_before_it_is_confirmed(run: Path) -> None:
+    first = (run / "tracks.csv").read_bytes()
+    with serving(run) as (address, labels):
+        for label, seen in (
+            ("wine glass", ""),
+            ("merge with #2", "wine glass"),
+            ("", "merge with #2"),
+        ):
+            status, text = ask(address, "POST", labels, correction(1, label, seen))
+            assert status == 200
+            assert labels_on_disk(run)[1] == label
+            assert json.loads(text)["labels"]["1"] == label
+    assert (run / "tracks.original.csv").read_bytes() == first
+
+
+def test_corrections_at_the_same_time_are_all_written(run: Path) -> None:
+    """Each reads and writes the whole table: without a lock the last would undo the others."""
+    tracks = list(labels_on_disk(run))
+    with serving(run) as (address, labels), serving(run) as (again, others):
+        places = [(address, labels), (again, others)]
+
+        def correct(job: tuple[int, int]) -> int:
+            track, number = job
+            place, path = places[number % 2]
+            return ask(place, "POST", path, correction(track, NAMES[number % 7]))[0]
+
+        with ThreadPoolExecutor(8) as pool:
+            assert set(pool.map(correct, zip(tracks, range(len(tracks)), strict=True))) == {200}
+    assert labels_on_disk(run) == {t: NAMES[n % 7] for n, t in enumerate(tracks)}
+
+
+def test_two_tabs_do_not_overwrite_one_another(browser: Browser, run: Path) -> None:
+    first, second, third = list(labels_on_disk(run))[:3]
+    with serving(run) as (address, _):
+        browser.open(address)
+        one, two = browser.tabs()[0], browser.tab()
+        browser.turn_to(two)
+        browser.open(address)
+        late = "addEventListener('focus', (event) => event.stopImmediatePropagation(), true)"
+        browser.run(late)  # or it would ask for news when it is turned to
+        browser.turn_to(one)
+        browser.click(f"#track-{first} [data-label='unknown']")
+        browser.wait(SAVED)
+        browser.turn_to(two)
+        browser.click(f"#track-{first} [data-label='delete']")
+        browser.wait("return document.querySelector('#said').textContent.includes('not changed')")
+        fix = f"return document.querySelector('#track-{first} .fix').textContent"
+
+        assert labels_on_disk(run)[first] == "unknown"
+        assert browser.run(fix) in {"→ unknown", "✓"}
+        assert "unknown" in browser.run("return document.querySelector('#said').textContent")
+
+        browser.click(f"#track-{first} [data-label='delete']")  # knowing what is there, it may
+        browser.click(f"#track-{second} [data-label='unknown']")
+        browser.wait(SAVED)
+        browser.close_tab()
+        browser.turn_to(one)
+        browser.click(f"#track-{third} [data-label='unknown']")
+        browser.wait(SAVED)
+        assert browser.run(fix) == "→ delete"  # the answer told of the other tab's
+    found = labels_on_disk(run)
+    assert [found[track] for track in (first, second, third)] == ["delete", "unknown", "unknown"]
+
+
+def test_an_interrupt_ends_it_with_the_corrections_in_the_page(
+    served: Callable[..., Server], run: Path
+) -> None:
+    """The page that is mailed afterwards shows what was corrected."""
+    server = served(run.parent)
+    assert urlsplit(server.address).path.endswith("/index.html")
+    page = server.address.replace("index.html", "table/report.html")
+    assert ask(page, "GET")[0] == 200
+    labels = urlsplit(page).path.replace("report.html", "labels")
+    assert ask(page, "POST", labels, correction(1, "teapot"))[0] == 200
+    assert "1 checked" in ask(server.address)[1]
+    server.send_signal(signal.SIGINT)
+    _, errors = server.communicate()
+
+    assert server.returncode == 130
+    assert "Traceback" not in errors
+    assert "corrections go to tracks.csv as you make them" in errors
+    assert '"label":"teapot"' in (run / "report.html").read_text("utf-8")
+    assert "1 checked" in (run.parent / "index.html").read_text("utf-8")
+
+
+def test_a_port_that_is_taken_is_one_line(shapecat: Run, run: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        result = shapecat("report", run, "--serve", "--port", taken.getsockname()[1])
+
+    assert result.exit_code == 2
+    assert "in use" in result.stderr
+    assert shapecat("report", run, "--port", 8000).exit_code == 2
+
+
+def test_keys_undo_move_and_open(browser: Browser, run: Path) -> None:
+    """The same keys work in a page from a file."""
+    (page,) = write_reports([run])
+    browser.open(page)
+    order = order_of(browser)
+    focus = "return document.activeElement.dataset.track"
+    label = "return document.querySelector('#track-%d .fix').textContent"
+    assert browser.run(focus) == str(order[0])
+    ring = "return getComputedStyle(document.activeElement).outlineWidth"
+    assert browser.run(ring) == "3px"
+
+    browser.press("Right", "Down", "Up", "Left", "Right", "d")
+    assert browser.run(focus) == str(order[1])
+    assert browser.run(label % order[1]) == "→ delete"
+    browser.press("Left", "Control+z")
+    assert browser.run(label % order[1]) == ""
+    assert browser.run(focus) == str(order[1])  # where something was undone
+    browser.press("Enter")
+    assert browser.run(label % order[1]) == "✓"
+    browser.press("m", *f"{order[0]}", "Enter")
+    browser.wait(f"return document.activeElement.id === 'track-{order[1]}'")
+    assert browser.run(label % order[1]) == f"→ merge with #{order[0]}"
+    browser.press("Backspace", "n", *"mug", "Enter")
+    browser.wait(f"return document.activeElement.id === 'track-{order[1]}'")
+    browser.press("Right", "8")  # a new name gets a key
+    assert browser.run(label % order[2]) == "→ mug"
+    browser.press("u", "u")
+    assert browser.run(label % order[2]) == browser.run(label % order[1]) == ""
+
+    browser.press("f")
+    assert browser.run("return document.getElementById('large').open") is True
+    where = "return document.getElementById('where').textContent"
+    before = browser.run(where)
+    browser.press("Right")
+    assert browser.run(where) != before
+    shown = browser.run("return document.querySelectorAll('#stage .box').length")
+    assert shown > 0
+    browser.press("Escape")
+    assert browser.run("return document.getElementById('large').open") is False
+    assert browser.complaints() == []
