@@ -206,7 +206,7 @@ def test_scene_shows_updates_and_removes_tracks(tmp_path: Path) -> None:
         0,
         150_000_000,
     )
-    assert entity.texts[0].text == "track 3 cup 0.97"
+    assert entity.texts[0].text == "#3 cup 0.97"
     assert entity.texts[0].pose.position.z > entity.cubes[0].pose.position.z + 0.15
     assert {m.key: m.value for m in entity.metadata} == {
         "category": "cup",

@@ -28,6 +28,7 @@ from shapecat.outputs.report.pictures import TrackPictures
 from shapecat.outputs.report.surfaces import SIDE, Snapshot, draw
 from shapecat.outputs.report.tracks import Timeline, read_timelines
 from shapecat.outputs.rereading import FinishedRun, read_finished
+from shapecat.outputs.wording import caption, plural, time_span
 from shapecat.runs.corrections import read_labels
 from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas
@@ -76,6 +77,32 @@ def test_page_needs_nothing_from_outside(run: Path) -> None:
     assert "connect-src 'none'" in text
     assert "@import" not in text
     assert "url(" not in text
+
+
+@pytest.mark.parametrize(("confidence", "shown"), [(0.995, "0.99"), (0.9999, "0.99"), (1, "1.00")])
+def test_what_is_not_certain_is_nowhere_shown_as_certain(
+    run: Path, confidence: float, shown: str
+) -> None:
+    lines = (run / "tracks.csv").read_text().splitlines()
+    cells = lines[1].split(",")
+    cells[lines[0].split(",").index("confidence")] = str(confidence)
+    (run / "tracks.csv").write_text("\n".join([lines[0], ",".join(cells), *lines[2:]]) + "\n")
+    (report,) = read_reports([run]).runs
+
+    assert f'<span class="sure">{shown}</span>' in report.page()
+    assert "100 %" not in report.page()
+    assert caption(3, "cup", confidence) == f"#3 cup {shown}"
+
+
+def test_words_agree_with_their_numbers(run: Path) -> None:
+    assert (plural(1, "view"), plural(0, "view")) == ("1 view", "0 views")
+    assert (time_span(34.0, 34.04), time_span(0.5, 2)) == ("34.0 s", "0.5–2.0 s")
+    (report,) = read_reports([run]).runs
+    text = report.page()
+
+    assert "95th percentile" in text
+    gone = ("1 views", "of work", "looked at", "by first sight", "in all", "95 %", "#graphs")
+    assert [phrase for phrase in gone if phrase in text + report.listed("x").name] == []
 
 
 def test_names_cannot_break_the_page(run: Path) -> None:

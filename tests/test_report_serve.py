@@ -136,6 +136,7 @@ def test_fifty_corrections_by_keyboard_outlive_the_server(
     } == wanted
 
 
+@pytest.mark.slow
 def test_a_page_tells_what_a_killed_server_has_not_written(
     browser: Browser, served: Callable[..., Server], long_run: Path
 ) -> None:
@@ -352,6 +353,7 @@ def test_two_tabs_do_not_overwrite_one_another(browser: Browser, run: Path) -> N
     assert [found[track] for track in (first, second, third)] == ["delete", "unknown", "unknown"]
 
 
+@pytest.mark.slow
 def test_an_interrupt_ends_it_with_the_corrections_in_the_page(
     served: Callable[..., Server], run: Path
 ) -> None:

@@ -2,6 +2,7 @@
 
 from typing import Any, NamedTuple
 
+from shapecat.outputs.wording import caption
 from shapecat.types import ShownBox, ShownFrame
 
 __all__ = [
@@ -49,7 +50,7 @@ def entity_id(track: int) -> str:
 
 def text(box: ShownBox) -> str:
     """Return what is written above a box."""
-    return f"track {box.track} {box.category} {box.confidence:.2f}"
+    return caption(box.track, box.category, box.confidence)
 
 
 def properties(box: ShownBox) -> dict[str, str]:

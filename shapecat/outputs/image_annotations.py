@@ -10,6 +10,7 @@ from shapecat.outputs.annotation import AnnotationChannel
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.ros_annotations import RosMessages
 from shapecat.outputs.scene_protobuf import descriptors_of, encode_foxglove
+from shapecat.outputs.wording import caption
 from shapecat.runs.corrections import TrackLabel
 from shapecat.runs.masks import read_masks
 from shapecat.runs.shown import ShownTracks
@@ -33,7 +34,7 @@ class ImageBox(NamedTuple):
     @property
     def text(self) -> str:
         """What is written above it."""
-        return f"#{self.track} {self.category} {self.confidence:.2f}"
+        return caption(self.track, self.category, self.confidence)
 
     @property
     def corners(self) -> list[tuple[float, float]]:

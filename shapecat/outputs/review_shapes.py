@@ -15,6 +15,7 @@ from shapecat.arrays import F4, F8, U4
 from shapecat.geometry import box_corners, quaternion_from_rotation, rotation_from_quaternion
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import PaintedCloud
+from shapecat.outputs.wording import caption
 from shapecat.surface.triangles import triangles_of
 from shapecat.types import Box, Camera, LabelledFrame, LabelledObject, Pose
 
@@ -69,7 +70,7 @@ class Drawing(NamedTuple):
 
 def label(item: LabelledObject) -> str:
     """Return ``#track category confidence``."""
-    return f"#{item.track} {item.category} {item.confidence:.2f}"
+    return caption(item.track, item.category, item.confidence)
 
 
 def _points(clouds: Sequence[PaintedCloud]) -> _Columns:

@@ -1,6 +1,17 @@
 """Numbers and times in words, the same in every output."""
 
-__all__ = ["confidence_text", "plural", "time_span"]
+__all__ = ["caption", "confidence_text", "plural", "time_span"]
+
+
+def caption(track: int, category: str, confidence: float) -> str:
+    """Return what is written beside an object.
+
+    Examples
+    --------
+    >>> caption(6, "cup", 0.9999)
+    '#6 cup 0.99'
+    """
+    return f"#{track} {category} {confidence_text(confidence)}"
 
 
 def confidence_text(confidence: float) -> str:
