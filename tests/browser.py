@@ -72,8 +72,7 @@ class Browser:
                 time.sleep(0.1)
             except urllib.error.URLError:
                 time.sleep(0.1)
-        where = {"behavior": "allow", "downloadPath": str(self.downloads)}
-        self.cdp("Browser.setDownloadBehavior", where)
+        self._allow_downloads()
 
     def close(self) -> None:
         """End the browser and its driver."""
@@ -143,7 +142,13 @@ class Browser:
             if tab != new:
                 self.close_tab()
         self.turn_to(new)
+        self._allow_downloads()
         self.complaints()
+
+    def _allow_downloads(self) -> None:
+        """Let the tab that is driven download; each asks anew."""
+        where = {"behavior": "allow", "downloadPath": str(self.downloads)}
+        self.cdp("Browser.setDownloadBehavior", where)
 
     def wait(self, script: str) -> None:
         """Wait until a script returns true."""

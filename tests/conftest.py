@@ -100,8 +100,15 @@ def coloured_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def browser(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
-    """Open a headless Chromium; the test is left out where there is none."""
+def chromium(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Browser]:
+    """Start a headless Chromium; the test is left out where there is none."""
     opened = Browser(tmp_path_factory.mktemp("browser"))
     yield opened
     opened.close()
+
+
+@pytest.fixture
+def browser(chromium: Browser) -> Browser:
+    """Open an empty tab, without the tabs and complaints of other tests."""
+    chromium.renew()
+    return chromium

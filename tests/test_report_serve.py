@@ -157,7 +157,6 @@ def test_a_page_tells_what_a_killed_server_has_not_written(
     table = browser.downloaded()
     downloaded = {row.track: row.label for row in read_track_table(table).rows}
     table.unlink()
-    browser.renew()  # the page would ask before it is left
 
     on_disk = labels_on_disk(long_run)
     missing = [track for track in order[:25] if on_disk[track] != "delete"]
@@ -348,7 +347,7 @@ def test_two_tabs_do_not_overwrite_one_another(browser: Browser, run: Path) -> N
         browser.turn_to(one)
         browser.click(f"#track-{third} [data-label='unknown']")
         browser.wait(SAVED)
-        assert browser.run(fix) == "→ delete"  # the answer told of the other tab's
+        browser.wait(f"{fix} === '→ delete'")  # the answer told of the other tab's
     found = labels_on_disk(run)
     assert [found[track] for track in (first, second, third)] == ["delete", "unknown", "unknown"]
 
@@ -390,39 +389,33 @@ def test_keys_undo_move_and_open(browser: Browser, run: Path) -> None:
     """The same keys work in a page from a file."""
     (page,) = write_reports([run])
     browser.open(page)
-    order = order_of(browser)
-    focus = "return document.activeElement.dataset.track"
-    label = "return document.querySelector('#track-%d .fix').textContent"
-    assert browser.run(focus) == str(order[0])
+    a, b, c = order_of(browser)[:3]
     ring = "return getComputedStyle(document.activeElement).outlineWidth"
     assert browser.run(ring) == "3px"
 
-    browser.press("Right", "Down", "Up", "Left", "Right", "d")
-    assert browser.run(focus) == str(order[1])
-    assert browser.run(label % order[1]) == "→ delete"
-    browser.press("Left", "Control+z")
-    assert browser.run(label % order[1]) == ""
-    assert browser.run(focus) == str(order[1])  # where something was undone
-    browser.press("Enter")
-    assert browser.run(label % order[1]) == "✓"
-    browser.press("m", *f"{order[0]}", "Enter")
-    browser.wait(f"return document.activeElement.id === 'track-{order[1]}'")
-    assert browser.run(label % order[1]) == f"→ merge with #{order[0]}"
-    browser.press("Backspace", "n", *"mug", "Enter")
-    browser.wait(f"return document.activeElement.id === 'track-{order[1]}'")
-    browser.press("Right", "8")  # a new name gets a key
-    assert browser.run(label % order[2]) == "→ mug"
-    browser.press("u", "u")
-    assert browser.run(label % order[2]) == browser.run(label % order[1]) == ""
+    def after(*keys: str, track: int, label: str, focus: int) -> None:
+        """Press keys; wait until the label of a track and the focus are as they should be."""
+        browser.press(*keys)
+        shown = f"document.querySelector('#track-{track} .fix').textContent === '{label}'"
+        browser.wait(f"return {shown} && document.activeElement.dataset.track === '{focus}'")
+
+    after("Right", "Down", "Up", "Left", "Right", "d", track=b, label="→ delete", focus=b)
+    after("Left", "Control+z", track=b, label="", focus=b)  # where something was undone
+    after("Enter", track=b, label="✓", focus=b)
+    after("m", *str(a), "Enter", track=b, label=f"→ merge with #{a}", focus=b)
+    after("Backspace", track=b, label="", focus=b)
+    after("n", *"mug", "Enter", track=b, label="→ mug", focus=b)
+    after("Right", "8", track=c, label="→ mug", focus=c)  # a new name gets a key
+    after("u", track=c, label="", focus=c)
+    after("u", track=b, label="", focus=b)
 
     browser.press("f")
-    assert browser.run("return document.getElementById('large').open") is True
+    browser.wait("return document.getElementById('large').open")
     where = "return document.getElementById('where').textContent"
     before = browser.run(where)
     browser.press("Right")
-    assert browser.run(where) != before
-    shown = browser.run("return document.querySelectorAll('#stage .box').length")
-    assert shown > 0
+    browser.wait(f"{where} !== '{before}'")
+    assert browser.run("return document.querySelectorAll('#stage .box').length") > 0
     browser.press("Escape")
-    assert browser.run("return document.getElementById('large').open") is False
+    browser.wait("return !document.getElementById('large').open")
     assert browser.complaints() == []
