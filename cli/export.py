@@ -7,7 +7,7 @@ from typing import Any
 import click
 
 from .options import ANY_PATH, BOXES, BOXES_HELP
-from .render import progress_bars
+from .render import plural, progress_bars
 
 _DATASETS = ("coco", "yolo")
 _FORMATS = (*_DATASETS, "crops", "kitti", "labelcloud", "point-labels")
@@ -113,7 +113,7 @@ def export(
                 recording=recording,
                 observe=bars,
             )
-        click.echo(f"{run}: {count} objects in {out}")
+        click.echo(f"{run}: {plural(count, 'labelled view')} in {out}")
 
 
 def _export_dataset(
@@ -126,11 +126,11 @@ def _export_dataset(
     with progress_bars() as bars:
         selection = Selection(**chosen)
         count = export_dataset(runs, kind, out, selection, recording=recording, observe=bars)
-    click.echo(f"{len(runs)} runs: {count} objects in {out}")
+    click.echo(f"{plural(len(runs), 'run')}: {plural(count, 'labelled view')} in {out}")
 
 
 def _require_own_names(runs: Sequence[Path]) -> None:
-    """Refuse runs whose exports would have the same name."""
+    """Refuse runs with the same name: their exports would collide."""
     from shapecat.errors import OutputError
 
     names: dict[str, Path] = {}

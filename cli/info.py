@@ -41,7 +41,7 @@ def info(ctx: click.Context, /, *, recordings: tuple[Path, ...], as_json: bool) 
 
 
 def _describe(path: Path) -> tuple[dict[str, Any] | None, int]:
-    """Return what a recording holds, or print why it cannot be read; and the exit code."""
+    """Return the contents of a recording and an exit code; print the error if it cannot be read."""
     from shapecat.recordings.overview import describe_recording
 
     try:

@@ -27,7 +27,7 @@ from .view import view
 
 
 class _Commands(click.Group):
-    """Known errors end as one line and their own exit code; anything else is a bug."""
+    """Print known errors as one line and use their exit codes; other exceptions are bugs."""
 
     def invoke(self, ctx: click.Context) -> Any:
         try:

@@ -164,7 +164,7 @@ def process(
 
 
 def _require_range(start_s: float | None, end_s: float | None) -> None:
-    """Refuse a part of the recording that is none."""
+    """Refuse an empty range."""
     if end_s is not None and end_s <= (start_s or 0):
         msg = f"--end {end_s:g} is not after --start {start_s or 0:g}"
         raise click.UsageError(msg)
@@ -206,7 +206,7 @@ def _closing(executor: Any) -> Iterator[Any]:
 
 
 def _print_closing(tasks: Sequence[Any], outcomes: Sequence[Any]) -> None:
-    """Print what became of each recording, in the order of the plan."""
+    """Print the outcome of each recording, in the order of the plan."""
     ended = {outcome.job.folder: outcome for outcome in outcomes}
     ordered = [ended[task.job.folder] for task in tasks if task.job.folder in ended]
     complete = [outcome for outcome in ordered if outcome.summary]
@@ -223,7 +223,7 @@ def _print_closing(tasks: Sequence[Any], outcomes: Sequence[Any]) -> None:
 
 
 def _print_corrections(outcome: Any) -> None:
-    """Say what became of the labels that a person gave to the results that were replaced."""
+    """Report the transfer of corrected labels from the replaced results."""
     found = outcome.summary.corrections
     done, missed = len(found["transferred"]), found["not_transferred"]
     name = outcome.job.name.rpartition("/")[2]

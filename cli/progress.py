@@ -1,4 +1,4 @@
-"""What ``process`` shows while it works, on stderr: bars, plain lines, or JSON lines."""
+"""Progress of ``process`` on stderr: bars, plain lines, or JSON lines."""
 
 import json
 import sys
@@ -25,7 +25,7 @@ WORDS = {
 
 
 def describe_plan(tasks: Sequence[Any], left_out: int, workers: int, cores: int) -> str:
-    """Return what will be done, in one line."""
+    """Return a one-line summary of the plan."""
     counts = Counter(task.status for task in tasks)
     parts = [f"{counts[status]} {words}" for status, words in WORDS.items() if counts[status]]
     todo = sum(task.bytes for task in tasks if task.status != "complete")
@@ -36,10 +36,10 @@ def describe_plan(tasks: Sequence[Any], left_out: int, workers: int, cores: int)
 
 
 class Progress:
-    """Counts what has ended; the kinds below say how it is shown."""
+    """Count finished recordings; subclasses show them."""
 
     def __init__(self, tasks: Sequence[Any]) -> None:
-        """Begin with the plan."""
+        """Start from the plan."""
         self.lock = Lock()
         self.begun = time.monotonic()
         self.names = {task.job.folder.name: task.job.name for task in tasks}
@@ -57,10 +57,10 @@ class Progress:
         """Show nothing more."""
 
     def plan(self, text: str) -> None:
-        """Show the plan, where progress is shown at all."""
+        """Show the plan."""
 
     def progress(self, folder: str, phase: str, done: int, total: int | None) -> None:
-        """Hear how far a recording is."""
+        """Receive the progress of a recording."""
         with self.lock:
             if phase == "compile":
                 if not self._told:
@@ -72,7 +72,7 @@ class Progress:
                 self.show(folder)
 
     def ended(self, outcome: Any) -> None:
-        """Hear that a recording is complete or has failed."""
+        """Receive the outcome of a recording."""
         with self.lock:
             name = outcome.job.folder.name
             self.running.pop(name, None)
@@ -85,7 +85,7 @@ class Progress:
             self.show_ended(outcome)
 
     def remaining_s(self) -> float | None:
-        """Return about how long it will take, by the bytes read so far."""
+        """Return the estimated seconds left, from the bytes read so far."""
         if not self.read:
             return None
         rate = self.read / (time.monotonic() - self.begun)
@@ -96,10 +96,10 @@ class Progress:
         click.echo(text, err=True)
 
     def show(self, folder: str) -> None:
-        """Show how far a recording is."""
+        """Show the progress of a recording."""
 
     def show_ended(self, outcome: Any) -> None:
-        """Show what became of a recording."""
+        """Show the outcome of a recording."""
         if outcome.message:
             self.note(f"Error: {outcome.message}")
 
@@ -145,7 +145,7 @@ class JsonProgress(Progress):
     """One JSON object per line, for programs."""
 
     def __init__(self, tasks: Sequence[Any]) -> None:
-        """Begin with the plan."""
+        """Start from the plan."""
         super().__init__(tasks)
         self._last: dict[str, tuple[str, float]] = {}
         statuses = Counter(task.status for task in tasks)
@@ -156,7 +156,7 @@ class JsonProgress(Progress):
         _event("note", text=text)
 
     def show(self, folder: str) -> None:
-        """Write how far a recording is, a few times a second at most."""
+        """Write the progress of a recording, a few times a second at most."""
         phase, done, total = self.running[folder]
         before, now = self._last.get(folder, ("", 0.0)), time.monotonic()
         if phase != before[0] or now - before[1] >= _EVENT_S or done == total:
@@ -165,7 +165,7 @@ class JsonProgress(Progress):
             _event("progress", recording=recording, phase=phase, done=done, total=total)
 
     def show_ended(self, outcome: Any) -> None:
-        """Write what became of a recording."""
+        """Write the outcome of a recording."""
         known = outcome.summary
         _event(
             "ended",

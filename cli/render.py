@@ -1,4 +1,4 @@
-"""What the commands show: progress on stderr, results on stdout. Rich is loaded when first used."""
+"""Output of the commands: progress on stderr, results on stdout. Rich loads on first use."""
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
@@ -33,7 +33,7 @@ class Bars:
         self._told = False
 
     def __call__(self, phase: str, done: int, total: int | None) -> None:
-        """Show how far a phase has come; end the work here if a signal has asked for it."""
+        """Show the progress of a phase; stop here after a signal."""
         stopping.check()
         if phase == "compile":
             if not self._told:
@@ -46,7 +46,7 @@ class Bars:
         self._progress.update(self._tasks[phase], completed=done, total=total)
 
     def restart(self) -> None:
-        """Forget the bars: the next recording begins."""
+        """Remove the bars before the next recording."""
         for task in self._tasks.values():
             self._progress.remove_task(task)
         self._tasks.clear()
@@ -77,7 +77,7 @@ def print_json(value: Any) -> None:
 def print_table(
     columns: Sequence[str], rows: Sequence[Sequence[Any]], *, title: str | None = None
 ) -> None:
-    """Print a table; columns of numbers are set flush right."""
+    """Print a table with right-aligned columns of numbers."""
     from rich.console import Console
     from rich.table import Table
 
@@ -91,17 +91,17 @@ def print_table(
 
 
 def missed_words(missed: Mapping[str, Any]) -> str:
-    """Return which label has not found its object, and why."""
+    """Return a label that was not transferred, with the reason."""
     return f"  track {missed['old_track']}, {missed['label']}: {missed['reason']}"
 
 
 def plural(count: int, noun: str) -> str:
-    """Return a number and what is counted: ``1 file``, ``2 files``, ``3 processes``."""
+    """Return a count with its noun: ``1 file``, ``2 files``, ``3 processes``."""
     ending = "" if count == 1 else "es" if noun.endswith("s") else "s"
     return f"{count:,} {noun}{ending}"
 
 
 def count_words(counts: Mapping[str, int]) -> str:
-    """Return counts as words, the most frequent first: ``3 cup, 2 can``."""
+    """Return counts as text, largest first: ``3 cup, 2 can``."""
     ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
     return ", ".join(f"{count} {name}" for name, count in ordered) or "none"

@@ -32,12 +32,12 @@ class DetectionSettings:
     max_range_m: float = 2.0
     """Points farther from the sensor are ignored (thesis 4.2)."""
     fuse_frames: int = 1
-    """Consecutive depth images fused into one before detection, itself included (thesis 4.2);
-    1 fuses none."""
+    """Consecutive depth images fused before detection, including the current one (thesis 4.2); 1
+    turns fusion off."""
     max_height_m: float = 0.6
     """Points higher above a plane do not belong to an object on it."""
     max_size_m: float = 0.6
-    """Larger things are walls or furniture."""
+    """Larger segments are walls or furniture."""
     min_points: int = 60
     """Candidates with fewer points at full resolution are dropped."""
 
@@ -53,7 +53,7 @@ class SurfaceSettings:
     """Growing Neural Gas (thesis ch. 5)."""
 
     method: Literal["fritzke", "thesis"] = "fritzke"
-    """When a neuron is inserted: every lambda signals, or on accumulated error (Alg. 4)."""
+    """Insert a neuron every lambda signals (Alg. 3), or on accumulated error (Alg. 4)."""
     neurons: int = 80
     """Neurons to grow to; fewer on small clouds."""
     signals: int = 6000
@@ -61,10 +61,10 @@ class SurfaceSettings:
     component_share: float = 0.35
     """Separate parts of the graph with a smaller share of the points are dropped."""
     voxel_m: float = 0.005
-    """Edge of the voxels an object's points are averaged in before the gas."""
+    """Edge of the voxels in which the points of an object are averaged before the gas."""
     smooth_radius_m: float = 0.0
-    """Then moving least squares smooth them within this radius, 0.015 for example (thesis 4.2);
-    0 leaves them as they are."""
+    """Radius of moving least squares smoothing after the voxels, for example 0.015 (thesis 4.2);
+    0 turns it off."""
 
 
 @dataclass(frozen=True)
@@ -72,31 +72,31 @@ class TrackingSettings:
     """Nearest-centroid tracker and fusion (thesis 7.5.2)."""
 
     association: Literal["hungarian", "greedy"] = "hungarian"
-    """How detections go to tracks: by the smallest total distance, or the nearest pair first."""
+    """Assign detections to tracks by the smallest total distance, or the nearest pair first."""
     gate_m: float = 0.12
     """Largest distance between a track and the centroid of its next detection; smaller for
     small objects."""
     min_hits: int = 3
-    """Detections a track needs to be confirmed; fewer if fewer frames lie within half a second
-    of its first one."""
+    """Detections that confirm a track; fewer if fewer frames lie within half a second of its
+    first one."""
     max_missed_s: float = 5.0
-    """A track that was not seen for longer has ended; sooner while it is young. In hindsight an
-    object that comes back to its place gets its old track all the same."""
+    """A track ends after this time without a detection; sooner while it is young. An object that
+    comes back to its place later gets its old track."""
     fusion: Literal["mean", "product", "vote"] = "product"
-    """How the posteriors of the views become one; none grows surer by the number of views: the
-    product is tempered by it."""
+    """Fusion of the posteriors of all views. The product is tempered by the number of views, so
+    that confidence does not grow with it."""
 
 
 @dataclass(frozen=True)
 class OutputSettings:
-    """What annotated.mcap and review.rrd hold."""
+    """Contents of annotated.mcap and review.rrd."""
 
     boxes: Literal["full", "visible"] = "full"
-    """What the boxes in annotated.mcap are around: all of an object, or what is seen of it."""
+    """Boxes in annotated.mcap: around the whole object, or its visible part."""
     markers: bool = False
     """Also write visualization_msgs/MarkerArray for RViz."""
     cloud_points: int = 30_000
-    """Points of a cloud kept in review.rrd; 0 keeps all."""
+    """Points per cloud in review.rrd; 0 keeps all."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The errors a user can meet. Each message says what was found, where, and what to try."""
+"""Errors for the user. Each message names the problem, the place, and what to try."""
 
 __all__ = [
     "ConfigError",

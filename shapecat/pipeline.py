@@ -152,7 +152,7 @@ def _finished(
     content: ContentDigest,
     observe: Observer,
 ) -> Summary:
-    """Return what a complete folder holds, after removing or finishing what a kill left of it."""
+    """Return the summary of a complete folder; finish or remove leftovers of a kill first."""
     run = read_run(job.folder)
     if not (same_options(run, planned) and same_content(run["input"], job.source, content.result)):
         msg = (
@@ -284,7 +284,7 @@ def annotate_again(
 
 
 def _adopt(labels: Path | None, folder: Path, *, by_place: bool) -> Transfer | None:
-    """Make the labels of a table those of a run; return what became of those looked for."""
+    """Apply a table of labels to a run; return the transfer if it was by place."""
     if by_place and labels is not None:
         return transfer_labels(labels, folder)
     adopt_labels(labels or folder / "tracks.csv", folder)

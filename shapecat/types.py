@@ -151,7 +151,7 @@ class Box(Record):
 
 
 class FullBox(Box):
-    """The box around all of an object, also what is hidden of it: an estimate.
+    """The estimated box around a whole object, with its hidden part.
 
     ``size_std`` (3,) metres is the standard deviation of each length.
     """
@@ -182,7 +182,7 @@ class Candidate(Record):
 
 
 class Scene(Record):
-    """What detection finds in one frame.
+    """The result of the detection in one frame.
 
     ``up`` is a (3,) unit vector in the sensor frame; ``planes`` ascend in height.
     """
@@ -285,7 +285,7 @@ class LabelledFrame(Record):
 
 
 class ShownBox(NamedTuple):
-    """What annotation messages say of one object, in plain numbers.
+    """The annotation of one object, as plain numbers.
 
     ``center`` and ``size`` in metres, ``orientation`` x, y, z, w, as in `Box`; sensor frame.
     """
@@ -300,7 +300,7 @@ class ShownBox(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownFrame:
-    """What annotation messages say of one frame; the fields are those of `LabelledFrame`."""
+    """The annotations of one frame; the fields are those of `LabelledFrame`."""
 
     topic: str
     index: int

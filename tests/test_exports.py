@@ -369,7 +369,7 @@ def test_the_command_names_what_it_wrote(shapecat: Run, run: Path, tmp_path: Pat
     result = shapecat("export", run, "--format", "crops", "--out", tmp_path / "c", "--every", 6)
 
     assert result.exit_code == 0
-    assert "objects in" in result.stdout
+    assert "labelled views in" in result.stdout
     assert shapecat("export", run, "--format", "voc", "--out", tmp_path).exit_code == 2
     missing = shapecat("export", tmp_path / "none", "--format", "crops", "--out", tmp_path)
     assert missing.exit_code == 1

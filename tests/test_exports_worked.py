@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -11,9 +12,12 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from shapecat.colour.masks import Mask
 from shapecat.evaluation.clouds import read_pcd
 from shapecat.geometry import IDENTITY
-from shapecat.outputs.exports_kitti import write_kitti
+from shapecat.outputs.dataset_frames import DatasetImage
+from shapecat.outputs.exports_coco import write_coco, write_yolo
+from shapecat.outputs.exports_kitti import rectified_from_sensor, write_kitti
 from shapecat.outputs.exports_labelcloud import write_labelcloud
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas
 
@@ -158,3 +162,74 @@ def test_labelcloud_clouds_are_in_the_frame_of_their_boxes(tmp_path: Path) -> No
 def test_identity_is_not_the_pose_of_this_example() -> None:
     """A turn that changes nothing would let every mistake pass."""
     assert np.abs(LEVEL_FROM_SENSOR.as_matrix() - IDENTITY.rotation).max() > 0.3
+
+
+def test_kitti_of_a_cloud_has_no_pixels(tmp_path: Path) -> None:
+    """Loose points have no image: the 2D box is -1 four times, as the readme says."""
+    points = frame().xyz()
+    cloud = Frame("/scan", 0, 5, 6, "laser", points=points)
+    seen: Any = [(labelled(cut=False, hidden=False), cloud, None)]
+    unused: Any = SimpleNamespace()
+    write_kitti(tmp_path, seen, unused)
+    words = (tmp_path / "label_2" / "000000.txt").read_text().split()
+
+    assert list(map(float, words[4:8])) == [-1, -1, -1, -1]
+    rows = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
+    assert len(rows) == len(points)
+
+
+@pytest.mark.parametrize(("up", "forward"), [((0, 0, 1), (1, 0, 0)), ((0.3, 0, 0.95), (1, 0, 0))])
+def test_a_lidar_looks_along_its_x_axis(up: Any, forward: Any) -> None:
+    """REP 103: x forward, y left, z up; a camera looks along z."""
+    turn = rectified_from_sensor(np.array(up), optical=False)
+
+    assert turn[2] @ np.array(forward) > 0.9  # the rectified z axis, in the sensor frame
+    assert turn[0] @ np.array([0, -1, 0]) > 0.9  # x is right
+
+
+def dataset_image() -> DatasetImage:
+    """Return an image of 40 x 20 pixels with two objects; the second one is not sure."""
+    first, second = labelled(cut=False, hidden=True).objects[0], labelled(cut=True, hidden=False)
+    corner = np.zeros((6, 8), bool)
+    corner[:2], corner[:, :3] = True, True  # 16 pixels above, and 12 of the foot below
+    masks = (Mask(20, 5, corner), Mask(1, 2, np.ones((3, 4), bool)))
+    unsure = replace(second.objects[0], track=9, category="cup", confidence=0.4)
+    view = labelled(cut=False, hidden=False)
+    return DatasetImage("a.jpg", b"jpeg", 40, 20, view, (first, unsure), masks, (True, False))
+
+
+def finished() -> Any:
+    return SimpleNamespace(folder=Path("runs/lab"), name="lab")
+
+
+def test_coco_keeps_every_number_in_its_place(tmp_path: Path) -> None:
+    categories = ("cup", "can", "bowl")
+    assert write_coco(tmp_path, [("train", finished(), dataset_image())], categories) == 1
+    data = json.loads((tmp_path / "annotations" / "instances_train.json").read_text())
+    (image,), (sure, unsure) = data["images"], data["annotations"]
+    names = {entry["id"]: entry["name"] for entry in data["categories"]}
+
+    assert (image["width"], image["height"], image["file_name"]) == (40, 20, "a.jpg")
+    assert [names[a["category_id"]] for a in (sure, unsure)] == ["bowl", "cup"]
+    assert [a["iscrowd"] for a in (sure, unsure)] == [0, 1]
+    assert [a["bbox"] for a in (sure, unsure)] == [[20, 5, 8, 6], [1, 2, 4, 3]]
+    assert [a["area"] for a in (sure, unsure)] == [28, 12]
+    assert sure["segmentation"]["size"] == [20, 40]
+    assert [a["score"] for a in (sure, unsure)] == [0.9, 0.4]
+    assert sure["attributes"] == {"run": "lab", "track": 4, "occluded": True}
+    assert len({a["id"] for a in (sure, unsure)}) == len({a["track_id"] for a in (sure, unsure)})
+
+
+def test_yolo_leaves_out_what_is_not_sure(tmp_path: Path) -> None:
+    """Its format knows no crowds: an unsure label would be trained on."""
+    categories = ("cup", "can", "bowl")
+    assert write_yolo(tmp_path, [("val", finished(), dataset_image())], categories) == 1
+    (line,) = (tmp_path / "labels" / "val" / "a.txt").read_text().splitlines()
+    kind, *numbers = line.split()
+    corners = np.reshape(list(map(float, numbers)), (-1, 2)) * [40, 20]
+
+    assert kind == "2"
+    assert_allclose([corners.min(axis=0), corners.max(axis=0)], [[20, 5], [28, 11]], atol=0.51)
+    x, y = corners.T
+    area = abs(float(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))) / 2
+    assert area == pytest.approx(28, abs=14)

@@ -1,4 +1,4 @@
-"""Many recordings: what is to be done, what has been done, and none that stops the others."""
+"""Batches of recordings: plan, process, and record the state of each."""
 
 from shapecat.batch.plans import Batch, Shard, Task, plan_batch
 from shapecat.batch.runs import Outcome, exit_code, process_here, process_on

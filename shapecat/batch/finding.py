@@ -1,4 +1,4 @@
-"""From what a user names to recordings: files, folders to search, URLs."""
+"""Find the recordings that a user names: files, folders, URLs."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -83,7 +83,7 @@ def _searchable(path: Path) -> bool:
 
 
 def _is_bag(folder: Path) -> bool:
-    """Return whether a folder is a ROS 2 bag: it says so, or holds databases or splits alone."""
+    """Return whether a folder is a ROS 2 bag: with metadata, or with nothing but its parts."""
     if (folder / "metadata.yaml").exists():
         return True
     paths = list(folder.iterdir())

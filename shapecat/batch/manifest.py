@@ -1,4 +1,4 @@
-"""manifest.jsonl: what is known of every recording of a batch, one line per change.
+"""manifest.jsonl: the state of each recording of a batch, one line per change.
 
 The last line of a recording holds. Lines are appended whole, under a lock, so that several shards
 may write one file; a line that a crash or a full disk cut short is skipped.
@@ -26,7 +26,7 @@ State = Literal["planned", "running", "complete", "failed"]
 
 @dataclass(frozen=True)
 class Entry:
-    """One line: a recording and what became of it.
+    """A line of the manifest: a recording and its state.
 
     ``folder`` is the name of its run folder; ``input`` and ``work`` change when the recording, or
     what is to be done with it, does.
@@ -46,10 +46,10 @@ class Entry:
 
 
 class Manifest:
-    """The file, and its last entry for each run folder."""
+    """The manifest file, with the last entry of each run folder."""
 
     def __init__(self, path: Path) -> None:
-        """Read what is there; nothing if there is no such file, or it cannot be read."""
+        """Read the file, if there is one that can be read."""
         self.path = path
         self.entries: dict[str, Entry] = {}
         with suppress(OSError):  # reported when it is written to
@@ -90,7 +90,7 @@ def _without_nothing(entry: Entry) -> dict[str, Any]:
 
 
 def _parse(line: bytes) -> Entry | None:
-    """Return the entry of a line; None for one that is cut short or means something else."""
+    """Return the entry of a line, or None for an incomplete or foreign line."""
     try:
         values = json.loads(line)
         entry = Entry(**values)
@@ -114,7 +114,7 @@ def _appending(path: Path) -> Iterator[int]:
 
 
 def _write(file: int, content: bytes) -> None:
-    """Append lines, after ending one that was cut short; take them back if they do not fit."""
+    """Append lines; end an incomplete last line first, and undo a write that fails."""
     size = os.fstat(file).st_size
     if size and os.pread(file, 1, size - 1) != b"\n":
         content = b"\n" + content

@@ -1,4 +1,4 @@
-"""What a batch will do: find the recordings, give each a run folder, see what is done already."""
+"""Plan a batch: find recordings, assign run folders, check the state of each."""
 
 import dataclasses
 import hashlib
@@ -36,7 +36,7 @@ Status = Literal["complete", "resume", "retry", "check", "new"]
 
 @dataclass(frozen=True)
 class Task:
-    """One recording of a batch, and how far it is.
+    """A recording of a batch, and its status.
 
     ``status`` is ``complete`` where the manifest vouches for it, ``resume`` where a killed run
     goes on, ``retry`` where the last try failed, ``check`` where there are results of unknown
@@ -50,7 +50,7 @@ class Task:
     work: str
 
     def entry(self) -> Entry:
-        """Return what the manifest says before anything has happened."""
+        """Return the first manifest entry of the task."""
         return Entry(
             folder=self.job.folder.name,
             recording=self.job.name,
@@ -86,7 +86,7 @@ class Shard:
         return cls(index % count, count)
 
     def of(self, jobs: Sequence[Job]) -> list[Job]:
-        """Return every so-many-th job; the shards of one list are disjoint and cover it.
+        """Return the jobs of this shard; the shards of a list are disjoint and cover it.
 
         Examples
         --------
@@ -99,7 +99,7 @@ class Shard:
 
 @dataclass(frozen=True)
 class Batch:
-    """The tasks of a batch, its manifest if it has several recordings, and files left out."""
+    """The tasks of a batch, its manifest if it has several recordings, and the skipped files."""
 
     tasks: list[Task]
     manifest: Manifest | None
@@ -193,7 +193,7 @@ def _exists(job: Job) -> bool:
 
 
 def _whole(job: Job) -> bool:
-    """Return whether all outputs of a run are there; a correction may have been interrupted."""
+    """Return whether a run has all its outputs; an interrupted correction leaves it incomplete."""
     if job.target:
         return True  # uploaded as a whole
     outputs = [
@@ -207,7 +207,7 @@ def _whole(job: Job) -> bool:
 
 
 def _input_key(source: Path) -> tuple[str, int]:
-    """Return what changes when a recording is written to, and its bytes; without reading it."""
+    """Return a key of the files of a recording, and their size, without reading them."""
     try:
         files = sorted(source.iterdir()) if source.is_dir() else [source]
         stats = [(file.name, file.stat()) for file in files]
@@ -218,7 +218,7 @@ def _input_key(source: Path) -> tuple[str, int]:
 
 
 def _work_key(job: Job, model_id: str) -> str:
-    """Return what changes when settings, options or model do."""
+    """Return a key of settings, options and model."""
     return _hash([job.settings.as_dict(), job.selection(), model_id])
 
 

@@ -1,4 +1,4 @@
-"""Many recordings: process each on an executor, let none stop the others, note what became."""
+"""Process many recordings on an executor; a failure of one does not stop the others."""
 
 import dataclasses
 import json
@@ -43,7 +43,7 @@ _HEED_S = 0.1
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of one job: a summary, or a message and the exit code it stands for."""
+    """The outcome of a job: a summary, or an error message with its exit code."""
 
     job: Job
     summary: Summary | None = None
@@ -55,19 +55,19 @@ _Ended = tuple[Job, Future[Outcome]]
 
 
 class Watcher(Protocol):
-    """Is told what happens, possibly from several threads."""
+    """Receives progress and outcomes, possibly from several threads."""
 
     def progress(self, folder: str, phase: str, done: int, total: int | None) -> None:
-        """Hear how far the recording of a run folder is."""
+        """Receive the progress of a recording."""
 
     def ended(self, outcome: Outcome) -> None:
-        """Hear that a recording is complete or has failed."""
+        """Receive the outcome of a recording."""
 
 
 def process_here(
     tasks: Sequence[Task], watcher: Watcher, *, cores: int = 1, manifest: Manifest | None = None
 ) -> Iterator[Outcome]:
-    """Process the tasks one after the other in this process; yield what became of each."""
+    """Process the tasks one by one in this process; yield their outcomes."""
     ledger = _Ledger(tasks, manifest)
     for task in tasks:
         stopping.check()
@@ -92,7 +92,7 @@ def process_on(
     cores: int = 1,
     manifest: Manifest | None = None,
 ) -> Iterator[Outcome]:
-    """Process the tasks on an executor, the largest first; yield what became of each.
+    """Process the tasks on an executor, largest first; yield their outcomes.
 
     A recording whose worker dies is tried once more, then reported; the others go on. One that
     only waited when the scheduler was lost has not been tried.
@@ -142,7 +142,7 @@ def _outcomes(
 
 
 def _next(ended: SimpleQueue[_Ended]) -> _Ended:
-    """Wait for the next one to end, or for a signal that asks to stop."""
+    """Wait for the next outcome, or for a signal to stop."""
     while True:
         stopping.check()
         with suppress(Empty):
@@ -162,14 +162,14 @@ def _unknown(job: Job, error: BaseException) -> Outcome:
 
 
 def _already(task: Task) -> Outcome | None:
-    """Return the outcome of a task that is complete."""
+    """Return the outcome of a complete task, None for others."""
     if task.status != "complete":
         return None
     return Outcome(task.job, summarize(task.job, _run_of(task.job), processed=False))
 
 
 def _run_of(job: Job) -> RunInfo:
-    """Return what run.json of a complete run says."""
+    """Return the run.json of a complete run."""
     if not job.target:
         return read_run(job.folder)
     run: RunInfo = json.loads(fetch(f"{job.target}/run.json"))
@@ -230,7 +230,7 @@ def _process_remote(job: Job, observe: Observer, cores: int) -> Summary:
 
 
 def _look_for_results(job: Job) -> None:
-    """Put what `process` needs of the results at the target where it looks for them.
+    """Fetch the parts of earlier results at the target that `process` needs.
 
     Raises
     ------
@@ -247,7 +247,7 @@ def _look_for_results(job: Job) -> None:
 
 
 class _Ledger:
-    """Keeps the manifest, if there is one; a full disk must not end the batch."""
+    """Write the manifest, if there is one; a full disk does not end the batch."""
 
     def __init__(self, tasks: Sequence[Task], manifest: Manifest | None) -> None:
         self._manifest = manifest
@@ -258,7 +258,7 @@ class _Ledger:
         self._write([self._entries[name] for name in open_ones])
 
     def running(self, name: str) -> None:
-        """Note that a recording has begun, once per try."""
+        """Record the start of a recording, once per attempt."""
         with self._lock:
             entry = self._entries.get(name)
             if entry is not None and (entry.state, entry.tries) != ("running", self._tries[name]):
@@ -267,7 +267,7 @@ class _Ledger:
                 self._note(entry, state="running")
 
     def lost(self, job: Job, error: BaseException) -> int:
-        """Note that a worker died; return how many have died of this recording."""
+        """Record the death of a worker; return the number of deaths at this recording."""
         name = job.folder.name
         with self._lock:
             waited = self._entries[name].state != "running"
@@ -277,7 +277,7 @@ class _Ledger:
             return self._tries[name] - 1
 
     def ended(self, outcome: Outcome) -> None:
-        """Note what became of a recording."""
+        """Record the outcome of a recording."""
         with self._lock:
             entry = self._entries[outcome.job.folder.name]
             if outcome.summary is None:
@@ -311,7 +311,7 @@ class _Ledger:
 
 
 def exit_code(outcomes: Sequence[Outcome]) -> int:
-    """Return 0 if all are complete, 1 if some; if none is, what kept them: 3 before 4 before 1."""
+    """Return 0 if all are complete, 1 if some; if none, the exit code 3, 4, 2 or 1 of a failure."""
     codes = {outcome.code for outcome in outcomes}
     if codes <= {0}:
         return 0

@@ -1,4 +1,4 @@
-"""Plain learners beside the chain, on the same views: the chain has to earn its place."""
+"""Simple learners as baselines of the full chain, on the same views."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -70,7 +70,7 @@ def compare_learners(
 
 
 def _folds(views: DescribedViews, seed: int) -> Iterator[tuple[DescribedViews, DescribedViews]]:
-    """Yield what to learn from and what to judge on; all views of an instance are on one side."""
+    """Yield training and test views; all views of an instance are on one side."""
     from sklearn.model_selection import StratifiedGroupKFold  # noqa: PLC0415  only needed here
 
     fewest = min(

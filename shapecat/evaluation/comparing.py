@@ -36,11 +36,11 @@ Observer = Callable[[str, int, int | None], None]
 
 
 def _ignore(_phase: str, _done: int, _total: int | None) -> None:
-    """Observe nothing."""
+    """Ignore progress."""
 
 
 class Difference(NamedTuple):
-    """A true object and what was found of it, or one of the two: a row of the table.
+    """A row of the table: a true object and its match, or one without the other.
 
     ``difference`` is ``missed``, ``surplus``, ``outline``, ``category``, ``identity``, or None
     where they agree; ``f``, ``iou`` and ``box_iou`` are None where they cannot be computed.
@@ -62,7 +62,7 @@ class Difference(NamedTuple):
 
 @dataclass(frozen=True)
 class Comparison:
-    """What a comparison came to.
+    """The results of a comparison.
 
     Attributes
     ----------
@@ -89,7 +89,7 @@ class Comparison:
 
 @dataclass
 class _Tally:
-    """What is counted while frames go by."""
+    """Counts over the frames."""
 
     overlap: Overlap = field(default_factory=Overlap)
     pairs: Pairs = field(default_factory=Pairs)
@@ -109,7 +109,7 @@ def compare(
     recording: Path | None = None,
     observe: Observer = _ignore,
 ) -> Comparison:
-    """Compare a finished run with what is true, or taken for true.
+    """Compare a finished run with a reference.
 
     Parameters
     ----------
@@ -170,7 +170,7 @@ def _nothing_in_common(finished: FinishedRun, reference: Path, other: Reference)
 def _clouds(
     finished: FinishedRun, recording: Path | None, stack: ExitStack
 ) -> tuple[Iterator[Frame], list[str]]:
-    """Return the frames of the recording, none with a note where it is not to be had."""
+    """Return the frames of the recording, or none and a note if it is missing."""
     try:
         source = stack.enter_context(open_source(finished.run, recording))
         return clouds_again(source, finished.run), []
@@ -189,7 +189,7 @@ def _compare_frame(
     clouds: Iterator[Frame],
     part: int,
 ) -> None:
-    """Match the objects of a frame, and take down what is the same and what differs."""
+    """Match the objects of a frame and count agreements and differences."""
     tally.compared += 1
     found = _labelled_part(found, true, key)
     matched = match_objects(found.items, true.items)
@@ -210,7 +210,7 @@ def _compare_frame(
 
 
 def _labelled_part(found: Labelling, true: Labelling, key: Key) -> Labelling:
-    """Return what was found where labels are known.
+    """Return the detections in the labelled part of the image.
 
     Raises
     ------
@@ -240,7 +240,7 @@ def _differences(
     true: Sequence[Item],
     matched: Matched,
 ) -> Iterator[Difference]:
-    """Yield the rows of a frame: pairs, what was missed, what is surplus."""
+    """Yield the rows of a frame: pairs, missed and surplus objects."""
     head = (*key, stamp_ns)
     for i, a in enumerate(found):
         if i not in matched.pairs:
@@ -270,7 +270,7 @@ def _differences(
 
 
 def _kind(tally: _Tally, a: Item, b: Item, f: float | None) -> str | None:
-    """Return in what a found and a true object differ, the gravest first."""
+    """Return the most serious difference of a pair."""
     switched = False
     if a.track is not None and b.track is not None:
         switched = tally.last.get(b.track, a.track) != a.track

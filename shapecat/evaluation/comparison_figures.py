@@ -1,4 +1,4 @@
-"""The figures of a comparison, from what was counted frame by frame."""
+"""Figures of a comparison, from the counts over its frames."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,7 @@ __all__ = ["Pairs", "figures_of"]
 
 @dataclass
 class Pairs:
-    """Matched objects whose category can be told: what is true, what was said."""
+    """Categories of matched objects that are not ambiguous: true and predicted."""
 
     truth: list[str] = field(default_factory=list)
     labels: list[str] = field(default_factory=list)
@@ -64,7 +64,7 @@ def figures_of(
 
 
 def _objects(rows: Sequence[Any], overlap: Overlap | None) -> dict[str, Any]:
-    """Count true and found objects; found well where masks tell it, else where boxes match."""
+    """Count true and found objects, matched by masks, or by boxes without masks."""
     true = sum(row.difference != "surplus" for row in rows)
     detections = sum(row.difference != "missed" for row in rows)
     hits = overlap.hits if overlap else sum(r.difference not in {"surplus", "missed"} for r in rows)
@@ -81,7 +81,7 @@ def _overlap(overlap: Overlap) -> dict[str, float]:
 
 
 def _category(pairs: Pairs, categories: Sequence[str]) -> dict[str, Any]:
-    """Judge final labels and single views; the posteriors of single views are what is calibrated.
+    """Score final labels and single views; calibration uses the posteriors of single views.
 
     Where the truth is another run, it may say unknown: no category of the model, left out.
     """

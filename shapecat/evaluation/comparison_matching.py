@@ -49,12 +49,12 @@ def _best(iou: Any) -> dict[int, int]:
 
 
 def item_box_iou(a: Item, b: Item) -> float | None:
-    """Return the overlap of two boxes in 3D; None where an object has none."""
+    """Return the 3D overlap of two boxes; None if a box is missing."""
     return None if a.box is None or b.box is None else box_iou(a.box, b.box)
 
 
 def seen_together(found: Sequence[Item], true: Sequence[Item], matched: Matched) -> SeenTogether:
-    """Return what tracking is judged on; a track that was merged has its most similar part."""
+    """Return the objects for the tracking scores; of a merged track the most similar part."""
     best: dict[int, int] = {}
     for i, item in enumerate(found):
         if item.track is None:

@@ -1,4 +1,4 @@
-"""A comparison to look at: its figures, a page with pictures, a table of all objects."""
+"""Output of a comparison: figures, a page with pictures, a table of all objects."""
 
 import json
 from collections.abc import Sequence

@@ -56,7 +56,7 @@ def draw_frame(
     rows: Sequence[Any],
     severity: float,
 ) -> Picture | None:
-    """Draw found and true masks over the depth; None where there is no image to draw on.
+    """Draw found and true masks over the depth image; None without an image.
 
     Parameters
     ----------
@@ -124,7 +124,7 @@ def _palette() -> U1:
 def _captions(
     rows: Sequence[Any], found: Sequence[Item], true: Sequence[Item], width: int
 ) -> tuple[Caption, ...]:
-    """Return what differs at the place of each object."""
+    """Return the differences, each at the place of its object."""
     captions = []
     for row in rows:
         mine = row.difference != "missed"
@@ -138,7 +138,7 @@ def _captions(
 
 
 def words_of(row: Any) -> str:
-    """Return in words in what a found and a true object differ."""
+    """Return the difference of a pair in words."""
     track = "" if row.track is None else f" #{row.track}"
     return {
         "missed": f"missed {row.true_category}",

@@ -115,7 +115,7 @@ _READERS: dict[str, Callable[[Path], CloudFile]] = {
 
 
 def _valid_eye(eye: F8 | None) -> F8 | None:
-    """Return a viewpoint if it is one: the origin is what files say that do not know it."""
+    """Return a viewpoint, or None for the origin, which stands for an unknown one."""
     if eye is None or eye.shape != (3,) or not np.all(np.isfinite(eye)) or not np.any(eye):
         return None
     return eye

@@ -1,4 +1,4 @@
-"""A model judged on a labelled data set, beside plain learners where they are asked for."""
+"""Evaluation of a model, and optionally of baselines, on a labelled data set."""
 
 from dataclasses import replace
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What several views of one object come to, fused as tracks are (thesis 7.5.2)."""
+"""Scores of several fused views of one object (thesis 7.5.2)."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,4 +1,4 @@
-"""What is compared: the objects of a frame, from whichever source they come."""
+"""Labelled objects of a frame, from any source."""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
@@ -47,7 +47,7 @@ class Labelling:
 
 
 class Reference(ABC):
-    """What a run is compared with; frames are asked for in the order they were recorded."""
+    """A reference for comparisons; frames are requested in recording order."""
 
     kind: str
     """In words: truth of every pixel, COCO labels, KITTI labels, another run."""

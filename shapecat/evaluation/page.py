@@ -1,4 +1,4 @@
-"""An evaluation to show around: an HTML page with its pictures inside, or Markdown beside them."""
+"""Report of an evaluation: an HTML page with pictures, or Markdown with picture files."""
 
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -62,7 +62,7 @@ _CALIBRATION = (
 
 
 def _pictures(report: Report) -> dict[str, str]:
-    """Return the pictures by the name of what they show."""
+    """Return the pictures by name."""
     return {
         "confusion": confusion_svg(report.categories, report.confusion),
         "calibration": calibration_svg(report.calibration),
@@ -261,7 +261,7 @@ def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def _plain(text: str) -> str:
-    """Return text without what Markdown or HTML would take for marks."""
+    """Return text with the markup characters of Markdown and HTML escaped."""
     return escape(text).replace("|", "\\|").replace("\n", " ")
 
 

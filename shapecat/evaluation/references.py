@@ -1,4 +1,4 @@
-"""What a run can be compared with: simulated truth, labels of other tools, another run."""
+"""References for comparisons: simulated truth, labels of other tools, another run."""
 
 import json
 import zipfile
@@ -23,7 +23,7 @@ __all__ = ["OtherRun", "SimulatedTruth", "open_reference", "read_complete", "run
 
 
 def open_reference(path: Path) -> Reference:
-    """Open what a run is compared with.
+    """Open a reference.
 
     Parameters
     ----------
@@ -59,7 +59,7 @@ def open_reference(path: Path) -> Reference:
 
 
 class SimulatedTruth(Reference):
-    """Truth as `shapecat simulate` writes it: NAME.truth.json beside NAME.labels.npz."""
+    """Truth of `shapecat simulate`: NAME.truth.json and NAME.labels.npz."""
 
     kind = "truth of every pixel"
 
@@ -176,7 +176,7 @@ class OtherRun(Reference):
 
 
 def read_complete(folder: Path) -> FinishedRun:
-    """Read a run whose tracks are there.
+    """Read a complete run.
 
     Raises
     ------
@@ -227,7 +227,7 @@ def _tracks(folder: Path) -> dict[tuple[str, int, int], int]:
 
 
 def _box(row: Mapping[str, Any], full: F8 | None) -> Box:
-    """Return the box around all of an object; where that is not known, around what is seen."""
+    """Return the full box of an object, or the visible one if the full one is unknown."""
     if full is None or np.isnan(full[0]):
         return Box(row["center"], row["size"], row["orientation"])
     return Box(full[:3], full[3:6], full[6:])

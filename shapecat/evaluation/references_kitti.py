@@ -57,7 +57,7 @@ class KittiLabels(Reference):
 
 
 def _stamps(path: Path) -> dict[int, str]:
-    """Return the name of each frame by its stamp; nothing where no table tells it."""
+    """Return the name of each frame by its stamp; empty without a table."""
     if not path.is_file():
         return {}
     with path.open(newline="", encoding="utf-8") as file:
@@ -65,7 +65,7 @@ def _stamps(path: Path) -> dict[int, str]:
 
 
 def _sensor_from_rectified(path: Path) -> F8:
-    """Return the (3, 3) rotation of ``P2``, without its intrinsics; none where there is no file."""
+    """Return the (3, 3) rotation in ``P2``; the identity without a file."""
     if not path.is_file():
         return np.eye(3)
     lines = dict(line.split(":", 1) for line in path.read_text("utf-8").splitlines() if ":" in line)

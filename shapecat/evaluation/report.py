@@ -39,7 +39,7 @@ class Compared(NamedTuple):
 
 @dataclass(frozen=True)
 class Report:
-    """What an evaluation came to; undefined figures are None.
+    """The results of an evaluation; undefined figures are None.
 
     ``confusion`` counts true categories (rows) taken for others (columns), in the order of
     ``categories``; ``by_distance``, ``by_elevation`` (how far the sensor looks down) and
@@ -68,7 +68,7 @@ class Report:
 
     @property
     def breakdowns(self) -> tuple[tuple[str, tuple[tuple[str, int, float], ...]], ...]:
-        """The accuracies over ranges that have views, with what they are broken down by."""
+        """Accuracies per range of a quantity, for ranges with views."""
         parts = (
             ("distance", self.by_distance),
             ("elevation", self.by_elevation),
@@ -92,7 +92,7 @@ class Report:
 
 
 def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
-    """Compare what a model says of described views with their labels.
+    """Compare the predictions of a model with the labels of described views.
 
     Views labelled ``unknown`` count for novelty alone. The accuracies take the most probable
     category of every other view, novel or not.

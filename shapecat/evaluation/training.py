@@ -136,7 +136,7 @@ def order_categories(labels: Iterable[str]) -> tuple[str, ...]:
 
 
 def split_instances(labels: np.ndarray, instances: np.ndarray, rng: np.random.Generator) -> Bool:
-    """Return which views are held out: all of a fifth of the instances of each label.
+    """Return a mask of held-out views: all views of a fifth of the instances of each label.
 
     At least one instance of a label is held out and one is not; of a single one nothing is.
     """

@@ -27,7 +27,7 @@ _NOT_ASKED = np.zeros(0)
 
 
 class DescribedViews(NamedTuple):
-    """Views as the learners see them, and what the tables are broken down by.
+    """Described views, with the quantities for the breakdowns.
 
     ``descriptors`` (n, d); ``labels``, ``instances`` (n,) names; ``points`` (n,) voxels;
     ``distances`` (n,) metres from the sensor; ``seconds`` (n,) from points to descriptor;

@@ -1,4 +1,4 @@
-"""Plain learners to print beside the full chain: the chain has to earn its place."""
+"""Simple learners as baselines of the full chain."""
 
 from collections.abc import Callable, Mapping
 from typing import Any

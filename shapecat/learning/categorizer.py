@@ -22,7 +22,7 @@ _LARGEST = 1e6
 
 
 class Prediction(NamedTuple):
-    """What a model says of n objects.
+    """Predictions for n objects.
 
     ``posteriors`` (n, c) sum to 1 in the order of the model's categories; ``novelty`` (n,) is 0
     for a familiar shape, above 1 beyond the threshold, and at most 2.
@@ -111,7 +111,7 @@ class Categorizer(Record):
 
     @property
     def knows_unknown(self) -> bool:
-        """Whether there is a learner of shapes of no category."""
+        """Whether the model has a learner for unknown shapes."""
         return self.bias.size > len(self.categories)
 
     def require_descriptor(self, names: Sequence[str]) -> None:

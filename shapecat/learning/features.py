@@ -1,4 +1,4 @@
-"""What the learners see of a descriptor: its values standardised, and Parzen densities of them."""
+"""Features of a descriptor: its standardised values, and their Parzen densities."""
 
 import numpy as np
 

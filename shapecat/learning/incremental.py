@@ -28,7 +28,7 @@ _LARGEST_SHIFT = 2.0
 
 
 class _Inputs(NamedTuple):
-    """What the new learners see of n views: ``features`` (n, f) and ``words`` (n, w), sparse."""
+    """Inputs of the new learners: ``features`` (n, f) and sparse ``words`` (n, w) of n views."""
 
     features: F8
     words: sparse.csr_array
@@ -112,7 +112,7 @@ def add_categories(
 
 
 def _order(old: int, new: int, *, unknown: bool) -> I4:
-    """Return where each column of the final logits stands while the new learners are fitted."""
+    """Return the column of each final logit during the fit of the new learners."""
     first = old + unknown
     return np.concatenate([np.arange(old), np.arange(first, first + new), np.arange(old, first)])
 
@@ -125,7 +125,7 @@ def _known_views(categorizer: Categorizer) -> F4:
 
 
 def _extend_bank(bank: FeatureBank, x: F4, codes: I4, rng: np.random.Generator) -> FeatureBank:
-    """Give each new category its own column of densities, with the bandwidths of the others."""
+    """Add a density column per new category, with the bandwidths of the others."""
     z = bank.standardise(x)
     new = [
         np.sort(rng.permutation(np.flatnonzero(codes == code))[:_KERNELS])
@@ -203,7 +203,7 @@ def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, ridge: float, steps
 def _shift(
     inputs: _Inputs, old: F8, truth: I4, learned: F8, ridge: float, rng: np.random.Generator
 ) -> float:
-    """Return how far all new logits may be raised before they take too many known views.
+    """Return the largest offset of the new logits that takes few known views from old categories.
 
     Judged by learners of the other folds, on the known views that are right now.
     """

@@ -84,7 +84,7 @@ def load_model(path: Path | None = None) -> Categorizer:
 
 
 class _NotAModelError(Exception):
-    """What is wrong with the file."""
+    """The file is not a model."""
 
 
 def _parse(content: bytes) -> Categorizer:
@@ -108,7 +108,7 @@ def _parse(content: bytes) -> Categorizer:
 
 
 def _read_members(content: bytes) -> dict[str, bytes]:
-    """Unpack a small archive; what it claims about sizes is not believed."""
+    """Unpack a small archive without trusting its sizes."""
     if len(content) > _LARGEST_FILE:
         msg = f"it is larger than {_LARGEST_FILE >> 20} MB"
         raise _NotAModelError(msg)
@@ -138,7 +138,7 @@ def _unpack(archive: zipfile.ZipFile) -> dict[str, bytes]:
 
 
 def _parse_array(data: bytes) -> np.ndarray:
-    """Read the .npy format without allocating what the header merely claims."""
+    """Read the .npy format; allocate no more than the data hold."""
     stream = io.BytesIO(data)
     if np.lib.format.read_magic(stream) != (1, 0):
         msg = "an array is of an unknown version"

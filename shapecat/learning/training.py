@@ -28,7 +28,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class LearningSettings:
-    """How a model is learned. The defaults are those that measured best (see the model card)."""
+    """Settings of the training. The defaults measured best (see the model card)."""
 
     blocks: tuple[str, ...] = ()
     """Blocks of the descriptor that are used; all if empty."""

@@ -1,4 +1,4 @@
-"""Words of views: what dictionaries have in common, and sparse rows for the learners."""
+"""Bags of words of views, as sparse rows for the learners."""
 
 from typing import Any
 

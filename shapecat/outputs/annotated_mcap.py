@@ -91,7 +91,7 @@ def _uncollected() -> Iterator[None]:
 
 @contextmanager
 def _copying(recording: McapRecording, path: Path, file: BinaryIO) -> Iterator[None]:
-    """Copy the data section of a recording while the block writes what comes behind it."""
+    """Copy the data section of a recording while the block writes the annotations."""
     length = recording.summary.data_end
     with ThreadPoolExecutor(1) as pool:  # the copy does not hold the interpreter lock
         copying = pool.submit(copy_bytes, recording.path, path, length)
@@ -125,7 +125,7 @@ def _encoded(
 def _image_items(
     images: Iterable[ImageFrame], encoders: Sequence[Callable[[ImageFrame], bytes]], first: int
 ) -> Iterator[Item]:
-    """Encode what is drawn on images; the channels count from ``first``."""
+    """Encode image annotations for the channels from ``first`` on."""
     for image in images:
         for number, encode in enumerate(encoders, start=first):
             yield Item(number, image.log_time_ns, encode(image))
@@ -162,7 +162,7 @@ def _append(
 
 
 def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
-    """Look one frame ahead for the lifetime, and back for what is no longer shown."""
+    """Compute lifetimes from the next frame, and deletions from the frames before."""
     periods: dict[str, int] = {}
     last: dict[str, int] = {}
     shown: dict[str, set[int]] = {}

@@ -1,4 +1,4 @@
-"""What annotations say, whatever their encoding."""
+"""Content of annotations, independent of their encoding."""
 
 from typing import Any, NamedTuple
 
@@ -44,17 +44,17 @@ class Item(NamedTuple):
 
 
 def entity_id(track: int) -> str:
-    """Return what a track's entity is called."""
+    """Return the entity id of a track."""
     return f"track-{track}"
 
 
 def text(box: ShownBox) -> str:
-    """Return what is written above a box."""
+    """Return the text above a box."""
     return caption(box.track, box.category, box.confidence)
 
 
 def properties(box: ShownBox) -> dict[str, str]:
-    """Return what a viewer lists of a box."""
+    """Return the properties of a box for viewers."""
     return {
         "category": box.category,
         "confidence": f"{box.confidence:.4f}",
@@ -63,7 +63,7 @@ def properties(box: ShownBox) -> dict[str, str]:
 
 
 def text_position(center: Any, size: Any, orientation: Any) -> tuple[Any, Any, Any]:
-    """Return where the text goes: a little above the top of the box; metres, sensor frame.
+    """Return the position of the text, just above the box; metres, sensor frame.
 
     The parts of the box are numbers, or columns of as many boxes.
     """

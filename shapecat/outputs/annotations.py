@@ -1,4 +1,4 @@
-"""The annotation channels, in the encodings of recordings."""
+"""Annotation channels in each encoding of recordings."""
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -102,7 +102,7 @@ ENCODERS: dict[str, Callable[[bool], list[tuple[AnnotationChannel, Encode]]]] = 
 
 _JSON = ("sec", "nsec")
 _PROTOBUF = ("seconds", "nanos")
-"""What the parts of a time are called."""
+"""Names of the parts of a time."""
 
 
 def _plain_scene(annotation: Annotation, parts: tuple[str, str]) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""What of some runs goes into a data set of images: which frames, which objects, which split."""
+"""Select frames, objects and splits for an image data set."""
 
 import logging
 from collections import Counter
@@ -30,7 +30,7 @@ _DEPTH_UNITS = 1000  # to a metre
 
 @dataclass(frozen=True)
 class Selection:
-    """What goes into a data set.
+    """Options of a data set.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ def images_of(
 
 
 def _corrected(folder: Path) -> set[int]:
-    """Return the tracks whose label a person has given."""
+    """Return the tracks with a corrected label."""
     return {row.track for row in read_track_table(folder / "tracks.csv").rows if row.label}
 
 
@@ -140,7 +140,7 @@ def _image(
     selection: Selection,
     corrected: set[int],
 ) -> DatasetImage | None:
-    """Return the image of a frame; None where it has none."""
+    """Return the image of a frame, or None."""
     found = _depth_file(labelled, frame) if selection.depth else _colour_file(coloured)
     if found is None:
         return None
@@ -180,7 +180,7 @@ def _depth_file(labelled: LabelledFrame, frame: Frame) -> _File | None:
 def _chosen(
     finished: FinishedRun, selection: Selection, corrected: set[int]
 ) -> set[tuple[str, int]]:
-    """Return the frames to look at, by topic and number."""
+    """Return the selected frames, by topic and number."""
     seen: Counter[str] = Counter()
     keys: list[tuple[str, int]] = []
     views: dict[int, list[tuple[int, Any]]] = {}
@@ -203,7 +203,7 @@ def _chosen(
 
 
 def _view(labelled: LabelledFrame, item: LabelledObject) -> F8:
-    """Return what tells views of an object apart: from where, how near, how large, what shape."""
+    """Return features for the choice of different views: direction, distance, size and shape."""
     pose, center = labelled.fixed_from_sensor, np.asarray(item.box.center, np.float64)
     distance = float(np.linalg.norm(center))
     way = -center / max(distance, 1e-6)

@@ -165,14 +165,14 @@ def _staged(
 
 
 def _mark(folder: Path, about: Mapping[str, Any]) -> None:
-    """Note what an export is of, and which names it has made."""
+    """Write the marker of an export: its source, and the names that it made."""
     made = sorted(path.name for path in folder.iterdir() if path.name != _MARK)
     with replacing(folder / _MARK) as path:
         path.write_text(json.dumps({**about, "made": made}, indent=1) + "\n", "utf-8")
 
 
 def _read_mark(folder: Path) -> dict[str, Any]:
-    """Return what an export says of itself; nothing where there is none."""
+    """Return the marker of an export; empty without one."""
     with suppress(OSError, ValueError):
         about = json.loads((folder / _MARK).read_text("utf-8"))
         if isinstance(about, dict) and isinstance(about.get("made"), list):

@@ -1,4 +1,4 @@
-"""The files that exports are made of: PCD clouds, 16-bit PNG images, level frames."""
+"""Files of exports: PCD clouds, 16-bit PNG images, level frames."""
 
 import re
 import struct
@@ -74,7 +74,7 @@ def png(
 
 
 def _compressed(data: bytes, level: int) -> bytes:
-    """Compress; at level 1 by runs of equal bytes alone, which masks are made of."""
+    """Compress; level 1 encodes only runs of equal bytes, which suits masks."""
     if level > 1:
         return zlib.compress(data, level)
     packer = zlib.compressobj(1, strategy=zlib.Z_RLE)
@@ -99,7 +99,7 @@ def finite_points(frame: Frame) -> F4:
 
 
 def support_offset(item: LabelledObject, up: F4) -> float:
-    """Return how far along ``up`` the support of an object lies, metres, sensor frame."""
+    """Return the offset of the support of an object along ``up``, metres, sensor frame."""
     middle = float(np.dot(np.asarray(up, np.float64), item.box.center))
     half = float(item.box.size[2]) / 2
     return middle - (item.height_m if np.isfinite(item.height_m) else half)

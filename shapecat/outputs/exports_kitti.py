@@ -67,7 +67,7 @@ def write_kitti(
 
 
 def _optical(labelled: LabelledFrame, frame: Frame) -> bool:
-    """Tell whether the sensor looks along its z axis (images), not along x."""
+    """Return whether the sensor looks along its z axis, as cameras do."""
     return frame.organized or bool(upward(labelled)[1] < -0.7)
 
 
@@ -130,7 +130,7 @@ def _label(item: LabelledObject, frame: Frame, turn: F8, seen: _Seen) -> str:
 
 
 def _pixels(item: LabelledObject, frame: Frame, seen: _Seen) -> tuple[float, ...]:
-    """Return left, top, right, bottom in the image; -1 where there is none."""
+    """Return left, top, right, bottom in pixels; -1 without an image."""
     camera, nowhere = seen.camera, (-1.0, -1.0, -1.0, -1.0)
     if camera is None or not item.indices.size:
         return nowhere

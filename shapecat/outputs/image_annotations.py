@@ -1,4 +1,4 @@
-"""What is drawn on the colour images of the annotated recording, in its encodings."""
+"""Annotations on the colour images of the recording, in each encoding."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -54,7 +54,7 @@ class ImageFrame(NamedTuple):
 
 
 def read_image_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[ImageFrame]:
-    """Yield what is shown on the colour images of a run, each image once."""
+    """Yield the annotations of the colour images of a run, each image once."""
     shown = ShownTracks.read(folder, labels)
     last = None
     for masks in read_masks(folder):

@@ -49,13 +49,13 @@ class RosMessages:
         return _definition(self.ros1, name)
 
     def make(self, kind: str, *values: Any) -> Any:
-        """Make a message of a type without its package; a header of what has a stamp and frame."""
+        """Make a message by the short name of its type; a Header from a frame."""
         if kind == "Header":
             return self._header(*values)
         return self._types[kind](*values)
 
     def no_pose(self) -> Any:
-        """Return a pose that says nothing."""
+        """Return an identity pose."""
         pose = self._types["Pose"](self._types["Point"](0.0, 0.0, 0.0), self._upright)
         return self._types["PoseWithCovariance"](pose, self._no_covariance)
 

@@ -72,7 +72,7 @@ def frames_with_colour(
 
 
 def _heard(partners: Mapping[str, "_Partner"]) -> dict[str, Any]:
-    """Return who is told of the messages of each topic."""
+    """Return the listeners of each topic."""
     told: dict[str, list[Any]] = {}
     for partner in partners.values():
         told.setdefault(partner.stream.topic, []).append(partner.take)
@@ -144,7 +144,7 @@ class _Partner:
             self._left_out[f"calibration: {_reason(error, self.stream.topic)}"] += 1
 
     def reaches(self, frame: Frame) -> bool:
-        """Tell whether no later image can be nearer to a frame."""
+        """Return whether no later image can be nearer to a frame."""
         return self._newest is not None and self._newest >= frame.stamp_ns
 
     def view(self, frame: Frame) -> ColourView | None:
@@ -160,7 +160,7 @@ class _Partner:
             return None
 
     def report(self) -> None:
-        """Add what was left out to the recording's warnings."""
+        """Add a warning per reason for skipped images."""
         for reason, count in self._left_out.items():
             self._recording.warn(f"{self.stream.topic}: no colour {count} times: {reason}")
 
@@ -227,7 +227,7 @@ def _lens_of(info: Any, topic: str) -> LensCamera:
 
 
 def _alike(lens: LensCamera, camera: Camera | None, share: float) -> bool:
-    """Tell whether two cameras have the same intrinsics, to a share of the width."""
+    """Return whether two cameras have the same intrinsics, within a share of the width."""
     if camera is None:
         return False
     own, other = ((c.fx, c.fy, c.cx, c.cy) for c in (lens.pinhole, camera))

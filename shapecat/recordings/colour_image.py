@@ -51,7 +51,7 @@ _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def compressed_kind(data: bytes | memoryview) -> str:
-    """Return what a compressed image is, by its first bytes: jpeg, png, or nothing known."""
+    """Return the format of a compressed image by its first bytes: jpeg, png, or empty."""
     begin = bytes(data[:8])
     return "jpeg" if begin.startswith(b"\xff\xd8\xff") else "png" if begin == _PNG else ""
 

@@ -150,7 +150,7 @@ _DECODERS: dict[str, Callable[[Channel], Decoder]] = {
 
 
 def schema_of(channel: Channel) -> tuple[str, str, bytes]:
-    """Return name, encoding and text of a channel's schema, from the store where it has none."""
+    """Return name, encoding and text of a channel's schema, of the store for built-in types."""
     if channel.schema or channel.encoding != "cdr":
         return channel.schema_name, channel.schema_encoding, channel.schema
     store = _builtin("cdr")

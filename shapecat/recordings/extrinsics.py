@@ -24,7 +24,7 @@ _MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueErro
 
 
 class Extrinsics:
-    """The transform between a depth sensor and a colour camera, from what a recording offers.
+    """The transform between a depth sensor and a colour camera, from transforms or drivers.
 
     Static transforms are asked first, then all, then librealsense's own messages: the topic
     ``extrinsics/depth_to_color`` of its ROS driver, the topics ``tf/N`` of its recorder.
@@ -39,7 +39,7 @@ class Extrinsics:
         self._looked = False
 
     def colour_from_depth(self, depth_frame: str, colour_frame: str, stamp_ns: int) -> Pose | None:
-        """Return the pose at a time; None where the recording does not tell.
+        """Return the pose at a time; None if the recording has none.
 
         ``depth_frame`` and ``colour_frame`` are the frames of the messages.
         """

@@ -27,7 +27,7 @@ _POINT_FIELDS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
 
 
 def as_ros(kind: str, message: Any) -> Any:
-    """Give a decoded Foxglove message the fields of its ROS counterpart.
+    """Convert a decoded Foxglove message to the fields of its ROS counterpart.
 
     Messages of other types are returned as they are. Bytes may be base64 text, as in JSON.
     """

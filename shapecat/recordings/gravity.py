@@ -1,4 +1,4 @@
-"""Where up is, and where the sensor is, in each frame of a recording."""
+"""The up direction and the sensor pose in each frame of a recording."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ _DISAGREE_DEG = 10
 
 @dataclass
 class Upright:
-    """Answers, frame by frame, where up is and where the sensor is in the fixed frame.
+    """Gives up and the pose of the sensor in the fixed frame, frame by frame.
 
     Counts the look-ups that failed, for the report. ``dropped`` are the topics whose given up is
     not used, and where it came from.
@@ -94,7 +94,7 @@ class Upright:
         return vector
 
     def preview(self, frame: Frame) -> tuple[str, F4 | None]:
-        """Return by what up is given, and where (3,), without counting anything."""
+        """Return the source and direction (3,) of up, without counting the look-up."""
         counted = self._failed, self._first_failure
         answer = self._find(frame)
         self._failed, self._first_failure = counted

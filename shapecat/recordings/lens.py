@@ -26,7 +26,7 @@ class Lens:
         self._fit: PinholeFit | None = None
 
     def content(self, info: Any, camera: Camera, depth: F4) -> dict[str, Any]:
-        """Give depth with the pinhole nearest to the lens, or points where none is near."""
+        """Return depth with the nearest pinhole camera, or points if none fits."""
         model = str(info.distortion_model)
         coefficients = tuple(float(c) for c in (info.d if hasattr(info, "d") else info.D))
         self._calibrate((camera, model, coefficients), depth)

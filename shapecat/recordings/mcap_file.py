@@ -44,7 +44,7 @@ _SMALL = 1 << 16
 
 @dataclass
 class Summary:
-    """What the end of a file says about it, or what reading all of it showed."""
+    """The summary of a file, or what a full scan found."""
 
     schemas: dict[int, records.Schema] = field(default_factory=dict)
     channels: dict[int, records.Channel] = field(default_factory=dict)
@@ -68,7 +68,7 @@ class McapRecording(Recording):
     kind: ClassVar[str] = "mcap"
 
     def __init__(self, path: Path) -> None:
-        """Open the file and read its summary, or all of it where there is none.
+        """Open the file and read its summary, or scan it without one.
 
         Raises
         ------
@@ -179,7 +179,7 @@ class McapRecording(Recording):
         return summary if _is_complete(summary) else None
 
     def _agrees(self, summary: Summary) -> bool:
-        """Tell whether the channels are those that the chunks describe, which come first."""
+        """Return whether the summary agrees with the channels in the chunks."""
         unseen = set(summary.channels)
         for chunk in sorted(summary.chunks, key=lambda chunk: chunk.chunk_start_offset):
             if unseen.isdisjoint(chunk.message_index_offsets):
@@ -299,7 +299,7 @@ class McapRecording(Recording):
                 self.warn(f"left out a record at byte {record.offset}: {error}")
 
     def _chunk(self, record: Record) -> Iterator[RawMessage]:
-        """Yield the messages of a chunk; one that is cut off gives what is before the cut."""
+        """Yield the messages of a chunk, up to the cut if it is truncated."""
         try:
             read = read_chunk if record.whole else read_cut_chunk
             for opcode, content in split_chunk(read(self.content(record))):
@@ -384,7 +384,7 @@ _DEFINING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 
 
 def _is_complete(summary: Summary) -> bool:
-    """Tell whether every message can be found and named from the summary alone."""
+    """Return whether the summary alone locates every message."""
     numbers = {number for c in summary.chunks for number in c.message_index_offsets}
     statistics = summary.statistics
     if statistics is not None:

@@ -190,7 +190,7 @@ def read_chunk(content: bytes) -> memoryview:
 
 
 def read_cut_chunk(content: bytes) -> memoryview:
-    """Return what can be decompressed of a chunk whose end is missing.
+    """Return the part of a truncated chunk that can be decompressed.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What a recording holds, in plain values: for people and programs that look before they work."""
+"""Contents of a recording as plain values, for `shapecat info`."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -45,7 +45,7 @@ def describe_recording(path: Path) -> dict[str, Any]:
 
 
 def _uses(recording: Recording, streams: Mapping[str, Stream]) -> dict[str, str]:
-    """Return what topics are used for."""
+    """Return the use of each topic."""
     uses = {stream.info_topic: "camera" for stream in streams.values() if stream.info_topic}
     for topic, stream in streams.items():
         uses[topic] = f"{stream.kind} stream"

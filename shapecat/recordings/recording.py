@@ -1,4 +1,4 @@
-"""What every reader offers."""
+"""Interface of all readers."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -41,7 +41,7 @@ class Recording(ABC):
         return tuple(self._channels.values())
 
     def parts(self) -> list["Recording"]:
-        """Return the files it is made of: itself, where it is one."""
+        """Return the recordings of its files; itself for a single file."""
         return [self]
 
     @abstractmethod

@@ -52,7 +52,7 @@ class BagRecording(Recording):
     kind: ClassVar[str] = "ros1"
 
     def __init__(self, path: Path) -> None:
-        """Open the bag and read its index, or all of it where there is none.
+        """Open the bag and read its index, or scan it without one.
 
         Raises
         ------
@@ -165,7 +165,7 @@ class BagRecording(Recording):
         return counts
 
     def _agrees(self, chunks: list[_ChunkInfo]) -> bool:
-        """Tell whether the connections are those that the chunks describe, which come first."""
+        """Return whether the index agrees with the connections in the chunks."""
         unseen = set(self._channels)
         for chunk in sorted(chunks):
             if unseen.isdisjoint(chunk.counts):

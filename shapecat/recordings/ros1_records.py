@@ -67,7 +67,7 @@ class Record(NamedTuple):
 
     @property
     def op(self) -> int:
-        """What kind of record it is; 0 if it does not say."""
+        """The kind of the record; 0 if unknown."""
         return self.fields.get("op", b"\0")[0] if self.fields.get("op") else 0
 
 
@@ -167,7 +167,7 @@ def split(chunk: memoryview) -> Iterator[tuple[dict[str, bytes], memoryview]]:
 
 
 def expand(record: Record, data: bytes) -> tuple[memoryview, str]:
-    """Decompress a chunk as far as that goes.
+    """Decompress as much of a chunk as possible.
 
     Returns
     -------

@@ -28,7 +28,7 @@ _MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueErro
 
 @contextmanager
 def _counting(skipped: Counter[str]) -> Iterator[None]:
-    """Count what cannot be read, by reason."""
+    """Count unreadable messages, by reason."""
     try:
         yield
     except MessageError as error:
@@ -38,7 +38,7 @@ def _counting(skipped: Counter[str]) -> Iterator[None]:
 
 
 class Source:
-    """A stream and what is remembered from frame to frame; ``index`` counts its messages."""
+    """A stream with its state between frames; ``index`` counts its messages."""
 
     def __init__(self, recording: Recording, stream: Stream) -> None:
         """Begin reading a stream."""
@@ -52,7 +52,7 @@ class Source:
         raise NotImplementedError
 
     def finish(self, _skipped: Counter[str]) -> Iterator[Frame]:
-        """Yield what was held back."""
+        """Yield the frame that waits, if any."""
         yield from ()
 
     def frame(self, message: Message, index: int, header: Any, content: dict[str, Any]) -> Frame:

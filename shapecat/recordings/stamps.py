@@ -38,7 +38,7 @@ class Clock:
         self.counts = dict.fromkeys(_TEXTS, 0)
 
     def check(self, stamp: int, log_time: int) -> int:
-        """Return the stamp to use: the log time where the message has none."""
+        """Return the stamp, or the log time if the message has none."""
         if stamp == 0:
             self.counts["zero"] += 1
             return log_time
@@ -50,7 +50,7 @@ class Clock:
         return stamp
 
     def report(self, recording: Recording) -> None:
-        """Add what was odd to the recording's warnings."""
+        """Add warnings about odd stamps to the recording."""
         for name, count in self.counts.items():
             if count:
                 recording.warn(f"{self.topic}: {_TEXTS[name].format(count)}")

@@ -36,7 +36,7 @@ _PEEK = 5
 
 @dataclass(frozen=True)
 class Stream:
-    """A topic that gives frames.
+    """A topic with depth images or clouds.
 
     ``info_topic`` is the camera calibration of a depth image, None if there is none;
     ``frame_id`` and ``encoding`` (of images) are those of the first message.
@@ -52,7 +52,7 @@ class Stream:
 
     @property
     def usable(self) -> bool:
-        """Whether it has what frames need."""
+        """Whether frames can be made of it."""
         return self.kind == "points" or self.info_topic is not None
 
 
@@ -154,7 +154,7 @@ def _same_sensor(a: Stream, b: Stream) -> bool:
 
 
 def _sensor_namespace(topic: str) -> tuple[str, ...]:
-    """Return the parts of a topic before the one that says what is on it."""
+    """Return the namespace of the sensor in a topic name."""
     parts = PurePosixPath(topic.strip("/")).parts[:-1]
     for k, part in enumerate(parts):
         if any(word in part for word in ("depth", "points", "cloud", "image", "aligned")):

@@ -33,7 +33,7 @@ _FIXED = ("map", "odom", "world")
 
 
 class TransformError(ShapecatError):
-    """A transform that the recording does not give."""
+    """A transform is missing in the recording."""
 
 
 class UnknownFrameError(TransformError):

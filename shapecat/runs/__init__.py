@@ -1,1 +1,1 @@
-"""What a run is: its identity, its folder, its tables, and the labels a person corrected."""
+"""Runs: identity, folder, tables, and corrected labels."""

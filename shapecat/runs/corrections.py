@@ -1,4 +1,4 @@
-"""What a person says about the tracks of a run: tracks.csv with its column ``label`` filled in.
+"""Corrections of a run: the column ``label`` of tracks.csv.
 
 A label is a category, a new category, ``delete``, or ``merge with N``. The table may have passed
 through a spreadsheet: separators, quotes, line ends, the order of columns and numbers such as
@@ -48,7 +48,7 @@ _NAME = re.compile(r"[^\W\d_][\w .+&'()-]{0,58}[\w)]|[^\W\d_]")
 
 
 class TrackLabel(NamedTuple):
-    """What a track is shown as.
+    """The number, category and confidence that a track is shown with.
 
     ``track`` is its own number, or that of the track it was merged with, whose category it has.
     """
@@ -59,7 +59,7 @@ class TrackLabel(NamedTuple):
 
 
 def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLabel]:
-    """Read what each track is shown as; deleted tracks are missing.
+    """Read the final label of each track; deleted tracks are missing.
 
     A label a person filled in wins over the category, at confidence 1. Tracks of different topics
     can be merged if a sensor has seen both, or if the run.json beside the table tells of a fixed
@@ -129,7 +129,7 @@ def _adopt(corrected: Path, folder: Path) -> None:
 
 
 def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
-    """Give tracks of a run labels; the others keep theirs, and the first table is kept as well.
+    """Set labels of some tracks of a run; keep the other labels and the first table.
 
     Returns
     -------
@@ -205,7 +205,7 @@ def _labelled(rows: Iterable[TrackRow], labels: Mapping[int, str]) -> tuple[Trac
 
 
 def has_labels(path: Path) -> bool:
-    """Return whether a person has filled in labels in a table, if there is one.
+    """Return whether a table exists and has labels.
 
     Raises
     ------
@@ -238,7 +238,7 @@ def merging_with(track: int) -> str:
 
 
 def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: bool = True) -> None:
-    """Refuse a table whose tracks are not those of the run in ``folder``.
+    """Refuse a table of another run than that in ``folder``.
 
     ``known`` is a table that lies in the folder: it need not say whose it is. One without the
     column, made by hand, goes by its places, if it has any.
@@ -334,7 +334,7 @@ def _lines(rows: Iterable[TrackRow], misread: Mapping[int, str]) -> list[str]:
 def _resolve(
     rows: Sequence[TrackRow], categories: Iterable[str], *, one_frame: bool
 ) -> tuple[dict[int, TrackLabel], dict[int, str]]:
-    """Return what each track is shown as, and by track why its label cannot be understood."""
+    """Return the final label of each track, and the problem of each label that makes no sense."""
     known = {n.lower(): n for n in (UNKNOWN, *CATEGORIES, *categories, *(r.category for r in rows))}
     verdicts: dict[int, _Verdict] = {}
     misread = {}
@@ -384,7 +384,7 @@ def _follow(track: int, verdicts: Mapping[int, _Verdict]) -> int:
 
 
 def _understand(label: str, known: dict[str, str]) -> _Verdict:
-    """Tell what a label means; a new category becomes known.
+    """Interpret a label; a new category becomes known.
 
     Raises
     ------

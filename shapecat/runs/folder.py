@@ -67,7 +67,7 @@ def staged(
     *,
     worth_keeping: Callable[[Path], bool] = lambda _: False,
 ) -> Iterator[Path]:
-    """Give a hidden folder beside ``folder`` that takes its name when the block succeeds.
+    """Provide a hidden folder; rename it to ``folder`` when the block succeeds.
 
     An older ``folder`` of ours is moved away then, and removed after. After a signal or a kill
     the hidden folder stays, and the next run finds in it what was done; after an error, only
@@ -120,7 +120,7 @@ def require_ours(folder: Path, marker: Marker = made_by_run) -> None:
 
 
 def _strangers(folder: Path, names: Collection[str]) -> Iterator[Path]:
-    """Yield what lies in a folder beside the names that were made in it."""
+    """Yield the items of a folder that shapecat did not make."""
     return (item for item in folder.iterdir() if item.name not in names)
 
 
@@ -141,7 +141,7 @@ def previous_path(folder: Path) -> Path:
 
 
 def _retire(folder: Path, marker: Marker) -> None:
-    """Remove what was made in the replaced folder; what else was put there moves on."""
+    """Remove our files from the replaced folder; move other files to the new one."""
     previous = previous_path(folder)
     if not previous.is_dir():
         return
@@ -155,7 +155,7 @@ def _retire(folder: Path, marker: Marker) -> None:
 
 
 def recover(folder: Path, marker: Marker = made_by_run) -> None:
-    """Put back, or finish to remove, what a killed run has moved away.
+    """Restore, or finish removing, a folder that a killed run had moved away.
 
     Raises
     ------

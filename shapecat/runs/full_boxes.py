@@ -23,7 +23,7 @@ _WIDTH = sum(FULL_WIDTHS.values())
 
 @dataclass(frozen=True)
 class FullBoxes:
-    """The full boxes of all detections of a run, as single views tell them.
+    """The full boxes of all detections of a run, estimated from single views.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class FullBoxes:
         return cls(starts, np.concatenate(rows), np.concatenate(partial), _poses(folder, placed))
 
     def of_track(self, track: Track) -> F8:
-        """Return (k, 13) the fused boxes in each frame of a track, NaN where it has none."""
+        """Return the fused boxes (k, 13) in the frames of a track, NaN if unknown."""
         result = np.full((len(track.frames), _WIDTH), np.nan)
         seen = np.flatnonzero(np.asarray(track.detections) >= 0)
         keys = [(track.topics[k], int(track.frames[k])) for k in seen]

@@ -1,4 +1,4 @@
-"""Who is who: a recording by its content, a run folder by an id of its own.
+"""Identity: of a recording by its content, of a run folder by a random id.
 
 A run has two names. ``id`` is random and belongs to this one folder: one without it is none of
 ours. ``work`` tells what was done with what: runs that share it have the same tables, so a table
@@ -54,7 +54,7 @@ def work_id(run: RunInfo) -> str:
 
 
 def file_stats(path: Path) -> Stats:
-    """Return what changes when a recording is written to, without reading it."""
+    """Return name, size and times of each file of a recording, without reading it."""
     stats = [(file.name, file.stat()) for file in input_files(path)]
     return [[name, s.st_size, s.st_mtime_ns, s.st_ctime_ns] for name, s in stats]
 
@@ -109,13 +109,13 @@ class ContentDigest:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Leave off reading."""
+        """Stop reading."""
         self._cancelled.set()
         if self._thread.ident is not None:
             self._thread.join()
 
     def start(self) -> None:
-        """Begin to read."""
+        """Start reading."""
         if self._thread.ident is None:
             self._thread.start()
 

@@ -1,4 +1,4 @@
-"""A job is one recording and how to process it; a run is what run.json says became of it."""
+"""Jobs: a recording with its options. Runs: the description of the results in run.json."""
 
 import dataclasses
 import platform
@@ -75,7 +75,7 @@ class Job:
 
     @property
     def name(self) -> str:
-        """What the user calls the recording: its path, or URL."""
+        """The path or URL of the recording."""
         return self.origin or str(self.source)
 
     def selection(self) -> Options:
@@ -95,7 +95,7 @@ class Job:
 
 @dataclass(frozen=True)
 class Summary:
-    """What a run came to; not ``processed`` when it was complete before.
+    """The results of a run; ``processed`` is false if it was already complete.
 
     ``corrections`` is what became of the labels of the run it replaced, if there were any.
     """
@@ -118,7 +118,7 @@ class Summary:
 
 
 def describe_run(job: Job, categorizer: Categorizer) -> RunInfo:
-    """Return what run.json says before the work begins; the digest of the input comes later."""
+    """Return the run.json of new work; the digest of the input follows later."""
     return {
         "id": new_id(),
         "work": "",
@@ -170,7 +170,7 @@ def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], st
 
 
 def has_work(folder: Path) -> bool:
-    """Return whether a run that was cut short has got so far that it can be resumed."""
+    """Return whether an interrupted run has anything to resume."""
     with suppress(OutputError):
         return count_segments(folder) > 0 or "perceive" in read_run(folder)["seconds"]
     return False

@@ -46,7 +46,7 @@ class Missed(NamedTuple):
 
 @dataclass(frozen=True)
 class Transfer:
-    """What became of the labels of another table.
+    """The result of a label transfer.
 
     ``source`` names its run's work, if known; ``by`` tells what the objects were found by.
     """
@@ -67,14 +67,14 @@ class Transfer:
 
 
 def lost_labels(source: Path, reason: str) -> Transfer:
-    """Return what is to be said of a table none of whose labels can be carried over."""
+    """Return the result for a table none of whose labels can be transferred."""
     table = read_track_table(source / "tracks.csv")
     missed = (Missed(row.track, row.label, reason) for row in table.rows if row.label)
     return Transfer(table.run, (), tuple(missed))
 
 
 def transfer_labels(source: Path, target: Path) -> Transfer:
-    """Give the tracks of a run the labels that the same objects have in another table.
+    """Transfer the labels of another table to the same objects of a run.
 
     The labels go into tracks.csv of ``target``, what became of them into its run.json. Where a
     person has labelled a track of ``target`` otherwise, that label stays.
@@ -112,7 +112,7 @@ def _labelled_otherwise(transfer: Transfer, target: Path, run: RunInfo) -> dict[
 
 
 def _without(transfer: Transfer, reasons: Mapping[int, str]) -> Transfer:
-    """Return a transfer without the labels of some tracks, told as missed."""
+    """Return a transfer with the labels of some tracks moved to the missed ones."""
     kept = tuple(item for item in transfer.transferred if item.track not in reasons)
     missed = (
         Missed(item.old_track, item.label, reasons[item.track])
@@ -167,7 +167,7 @@ def _require_whole(path: Path, table: TrackTable) -> None:
 
 
 def _is_in_its_run(path: Path, table: TrackTable) -> bool:
-    """Return whether the tables beside a tracks.csv are those it came from."""
+    """Return whether the tables beside a tracks.csv belong to its run."""
     folder = path.parent
     if not (folder / "run.json").exists() or not (folder / "tracks.parquet").exists():
         return False
@@ -198,7 +198,7 @@ def _same_recording(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
 def _translate(
     labelled: Sequence[TrackRow], group: Group, matches: Matches
 ) -> tuple[tuple[Transferred, ...], tuple[Missed, ...]]:
-    """Give labels to the tracks of the target; parts are merged with what the whole is there.
+    """Translate labels to the tracks of the target; parts become merges with the whole.
 
     The whole is the track that others were merged with: it alone says what they all are.
     """

@@ -1,4 +1,4 @@
-"""From the tables of a run to labelled frames: what the outputs show."""
+"""Join the tables and labels of a run to labelled frames for the outputs."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace

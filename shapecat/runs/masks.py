@@ -1,4 +1,4 @@
-"""The table of masks: what the colour camera sees of the detections of each frame."""
+"""The table of masks: the pixels of each detection on the colour image."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -60,7 +60,7 @@ class FrameMasks:
     masks: dict[int, Mask] = field(default_factory=dict)
 
     def mask(self, detections: Sequence[int]) -> Mask:
-        """Return what is seen of some detections, which are parts of one object."""
+        """Return the union of the masks of some detections."""
         found = [self._mask(number) for number in detections if number in self.counts]
         return united(found) if found else NOTHING
 
@@ -69,7 +69,7 @@ class FrameMasks:
         return rle_mask(self.counts[number], self.height, self.width) if found is None else found
 
     def box(self, detections: Sequence[int]) -> tuple[int, int, int, int] | None:
-        """Return left, top, width and height around some detections; None if none is seen."""
+        """Return left, top, width and height around some detections, or None."""
         boxes = np.array([self.boxes[n] for n in detections if n in self.boxes])
         if not len(boxes):
             return None
@@ -130,7 +130,7 @@ def count_masks(folder: Path) -> int:
 
 
 def read_masks(folder: Path) -> Iterator[FrameMasks]:
-    """Yield the masks of a run, in the order of its frames; nothing where there is no colour."""
+    """Yield the masks of a run, in the order of its frames; none without colour."""
     path = folder / "masks.parquet"
     if not path.exists():
         return

@@ -1,4 +1,4 @@
-"""What perceive writes: frames, detections and planes, in segments that a kill does not cost."""
+"""The tables of perceive: frames, detections and planes, written in segments."""
 
 import time
 from collections.abc import Iterable, Sequence
@@ -33,7 +33,7 @@ _SEGMENT_S = 2.0
 
 @dataclass(frozen=True)
 class FrameRow:
-    """What the frames table adds to a `Perception`; ``again`` if it is of a second look."""
+    """Columns that the frames table adds to a `Perception`; ``again`` marks a second look."""
 
     log_time_ns: int
     fixed_from_sensor: Pose | None
@@ -82,7 +82,7 @@ class PerceptionTables:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:
-        """Write what is pending, and join the segments; after an error only keep what is done."""
+        """Write pending rows and join the segments; after an error, only write."""
         if kind is not None:
             with suppress(OSError):
                 self._flush()

@@ -1,4 +1,4 @@
-"""The expensive phases: every frame is perceived, and some once more with what the others tell.
+"""The expensive phases: perceive every frame, and revise some with the up of the others.
 
 Before the first frame is perceived the up direction that the recording gives is held against the
 planes of the first frames that show one: a fixed frame whose z is not up spoils all of them.
@@ -105,7 +105,7 @@ def revise(
     *,
     cores: int = 1,
 ) -> None:
-    """Look again at frames that the recording disagrees with, and write the tables anew.
+    """Perceive again the frames that disagree with the recording, and rewrite the tables.
 
     Where the user says where up is, nothing else does. What was seen first stays where the second
     look finds nothing.
@@ -155,7 +155,7 @@ class _UpTrial:
         self._decided: set[str] = set()
 
     def before(self, source: Iterator[Frame]) -> Iterator[Frame]:
-        """Yield the frames, none before it is decided whether to believe the up of its topic."""
+        """Yield the frames after the decision about the up of their topic."""
         held: list[Frame] = []
         for frame in source:
             held.append(frame)
@@ -196,7 +196,7 @@ def _tables(folder: Path, categorizer: Categorizer, *, again: bool = False) -> P
 
 
 def _readable(source: Iterator[Frame], job: Job) -> Iterator[Frame]:
-    """Yield frames; what a failing disk raises is an error of the recording, not of the results."""
+    """Yield frames; turn errors of the disk into errors of the recording."""
     try:
         yield from source
     except OSError as error:
@@ -205,7 +205,7 @@ def _readable(source: Iterator[Frame], job: Job) -> Iterator[Frame]:
 
 
 def _perceived(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
-    """Yield what the tables say of up, frames beside planes."""
+    """Yield the up columns of the frames and planes tables."""
     frames = read_row_groups(folder / "frames.parquet", ["topic", "frame", "up", "up_given"])
     return zip(frames, read_row_groups(folder / "planes.parquet", ["topic", "frame"]), strict=True)
 

@@ -168,7 +168,7 @@ def _mutual_nearest(a: F8, b: F8, reach: F8) -> Iterator[tuple[int, int, float]]
 
 
 class _Standing(NamedTuple):
-    """Where a track stands (3,), how wide and how large it is; NaN where nobody knows."""
+    """The place (3,), width and extent of a standing track; NaN if unknown."""
 
     track: int
     center: F8
@@ -179,7 +179,7 @@ class _Standing(NamedTuple):
 def match_in_place(
     rows: Sequence[TrackRow], source: Path | None, target: Path, group: Group
 ) -> Matches:
-    """Match what stands still in one place in both recordings.
+    """Match objects that stand still at one place in both recordings.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def match_in_place(
 def _nearest_there(
     thing: _Standing, old: Sequence[_Standing], new: Sequence[_Standing]
 ) -> tuple[Match | None, str]:
-    """Return the only thing that stands where another one stood, or why there is none.
+    """Return the only object at the place of another, or the reason why there is none.
 
     ``old`` are the other things that stood around.
     """
@@ -264,7 +264,7 @@ def _fixed_frame(folder: Path) -> str:
 
 
 def _place_of(row: TrackRow) -> F8:
-    """Return the place (3,) that a line of tracks.csv tells, metres.
+    """Return the place (3,) in a line of tracks.csv, metres.
 
     Raises
     ------

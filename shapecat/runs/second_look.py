@@ -1,4 +1,4 @@
-"""Which frames are looked at again, now that the whole recording is known, and with which up.
+"""Choose the frames to revise, with the up direction of the whole recording.
 
 Where the sensor's poses are known, up is one direction of the fixed frame in all frames. Where
 they are not, but the frames before and after agree, the camera was still, and up is theirs.
@@ -40,7 +40,7 @@ _STILL_M, _OFF_M = 0.03, 0.08
 
 
 class Revision(NamedTuple):
-    """How a frame is looked at again: the up to go by, and that which it was given before.
+    """The revision of a frame: the up to use, and the up it was given before.
 
     Both are unit vectors (3,) in the sensor frame; the second is None if there was none.
     """

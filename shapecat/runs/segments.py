@@ -1,4 +1,4 @@
-"""What perceive keeps while it works: parts of the tables, and those of a second look.
+"""Segments: parts of the tables that survive a kill, also of a second look.
 
 Segments are folders that appear when complete, and do not change after. The tables are joined
 from them as often as it takes, so that a kill between two tables leaves nothing that lasts.
@@ -39,13 +39,13 @@ def count_segments(folder: Path) -> int:
 
 
 def discard_segments(folder: Path) -> None:
-    """Remove what the tables were joined from."""
+    """Remove the segments after they were joined."""
     for name in (SEGMENTS, REVISIONS):
         shutil.rmtree(folder / name, ignore_errors=True)
 
 
 def read_segments(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
-    """Yield what was seen first, frames beside planes, segment by segment."""
+    """Yield frames and planes of the first look, segment by segment."""
     for segment in list_segments(folder / SEGMENTS):
         yield read_segment(segment, "frames"), read_segment(segment, "planes")
 

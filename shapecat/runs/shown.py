@@ -1,4 +1,4 @@
-"""Which track each detection of a run is shown as, and the boxes to annotate."""
+"""The track of each shown detection, and the boxes to annotate."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,7 +35,7 @@ _NONE = np.zeros((0, 0), np.float32)
 
 
 class ShownDetection(NamedTuple):
-    """A detection of a frame, what it is shown as, and its row in `ShownTracks.causal`."""
+    """A shown detection: its number, label, and row in `ShownTracks.causal`."""
 
     detection: int
     label: TrackLabel
@@ -44,7 +44,7 @@ class ShownDetection(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownTracks:
-    """What is shown in each frame of a run, by the labels of its tracks.
+    """Shown detections of each frame of a run, by the labels of its tracks.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class ShownTracks:
 def read_shown_frames(
     folder: Path, labels: Mapping[int, TrackLabel], *, visible: bool = False
 ) -> Iterator[ShownFrame]:
-    """Yield what the annotations of a run say, frame by frame in the order they were read.
+    """Yield the annotations of a run, frame by frame in reading order.
 
     As `shapecat.runs.labels.read_labelled_frames`, without points, surfaces and posteriors, several
     times as fast. The boxes are those around all of the objects; ``visible`` ones around
@@ -132,7 +132,7 @@ def read_shown_frames(
 def _boxes(
     keys: Sequence[Key], shown: ShownTracks, detections: pa.Table, *, visible: bool
 ) -> Iterator[tuple[ShownBox, ...]]:
-    """Yield what is shown in each of some frames, whose detections are given."""
+    """Yield the boxes of some frames, from their detections."""
     all_rows, places = frame_rows(detections), _places(detections)
     spans = [shown.frames.get(key, _NO_ROWS) for key in keys]
     firsts = [all_rows.get(key, _NO_ROWS).start for key in keys]

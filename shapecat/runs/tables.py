@@ -193,7 +193,7 @@ def numbers(column: pa.ChunkedArray) -> Any:
 
 
 def release_memory() -> None:
-    """Give the system back what was freed: the next phase has other needs."""
+    """Return freed memory to the system before the next phase."""
     for pool in (pa.default_memory_pool(), pa.system_memory_pool()):
         pool.release_unused()
 

@@ -40,7 +40,7 @@ class TrackRow:
 
 @dataclass(frozen=True)
 class TrackTable:
-    """The lines of a tracks.csv that could be read, and what is wrong with the others."""
+    """The rows of a tracks.csv, and the problems of lines that could not be read."""
 
     columns: tuple[str, ...]
     rows: tuple[TrackRow, ...]
@@ -48,7 +48,7 @@ class TrackTable:
 
     @property
     def run(self) -> str:
-        """The ``work`` of the run that the tracks are of; empty if the table does not tell."""
+        """The ``work`` of the run of the tracks; empty if unknown."""
         return next(iter(self.runs), "")
 
     @property
@@ -127,7 +127,7 @@ def _header(path: Path, cells: Sequence[str]) -> tuple[str, ...]:
 
 
 def _row(line: int, cells: Mapping[str, str]) -> TrackRow | str:
-    """Return a row, or what is wrong with it."""
+    """Return a row, or its problem."""
     try:
         track = _number(cells["track"])
         confidence = _number(cells["confidence"])

@@ -96,7 +96,7 @@ def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[Fra
 
 
 def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
-    """Return what the tracker reads of detections, as arrays; NaN where there is no fixed frame."""
+    """Return the columns for the tracker as arrays; NaN without a fixed frame."""
     columns = {name: table[name].to_numpy() for name in ("detection", "novelty")}
     widths = {"center": 3, "size": 3, "orientation": 4, "posterior": categories}
     for name, width in widths.items():

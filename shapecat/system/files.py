@@ -39,7 +39,7 @@ def partial_path(path: Path) -> Path:
 
 @contextmanager
 def replacing(path: Path) -> Iterator[Path]:
-    """Give a hidden path beside ``path`` that takes its name when the block succeeds.
+    """Provide a hidden path; rename it to ``path`` when the block succeeds.
 
     Raises
     ------
@@ -81,7 +81,7 @@ def require_writable(path: Path) -> None:
 
 @contextmanager
 def complete_folder(folder: Path) -> Iterator[Path]:
-    """Give a hidden folder that takes the name ``folder`` when the block succeeds.
+    """Provide a hidden folder; rename it to ``folder`` when the block succeeds.
 
     Whatever a kill left half-made of it is discarded first.
     """

@@ -24,7 +24,7 @@ _received: list[int] = []
 
 
 class Stopped(KeyboardInterrupt):
-    """The work was put down because a signal asked for it; what is done is kept."""
+    """A signal stopped the work; finished parts are kept."""
 
     def __init__(self, signum: int = signal.SIGINT) -> None:
         """Remember the number of the signal."""

@@ -35,7 +35,7 @@ class BoxViews(NamedTuple):
 
 
 def fuse_boxes(views: BoxViews, partial: Bool) -> BoxViews:
-    """Give the views of a track one size; while it stands still also one centre and one yaw.
+    """Fuse the boxes of a track to one size, and while it stands still to one centre and yaw.
 
     Sizes are weighted medians, after the boxes were turned by quarters so that they agree best. A
     view whose centre is elsewhere keeps it, and its own yaw.

@@ -1,4 +1,4 @@
-"""What only a recording tells: where the scene was exchanged, and which tracks are one object."""
+"""Hindsight: find scene cuts, and join the fragments of one object."""
 
 from collections.abc import Iterator, Sequence
 

@@ -81,5 +81,5 @@ class Hits:
         return rows, np.isin(rows, seen)
 
     def sees(self, member: I4, rows: I4) -> Bool:
-        """Tell which frames are of a topic that sees the track ``member``."""
+        """Return which frames are of a topic that sees the track ``member``."""
         return np.isin(self.topics[rows], self.topics[self.rows[member]])

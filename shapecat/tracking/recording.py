@@ -116,7 +116,7 @@ def _groups(labels: I4) -> list[I4]:
 
 
 def _without_gaps(hits: Hits, track: I4) -> list[I4]:
-    """Split a track where it was not seen for long: hindsight knows better what it is then."""
+    """Split a track at long gaps; hindsight joins the parts again."""
     if len(track) == 0:
         return []
     gap_s = np.diff(hits.stamps(track)) * 1e-9

@@ -1,4 +1,4 @@
-"""What the tracker reads and what it returns."""
+"""Input and output records of the tracker."""
 
 from shapecat.arrays import F4, F8, I4, Bool, Record, array
 
