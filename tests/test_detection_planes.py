@@ -10,10 +10,12 @@ from shapecat.detection import detect
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
 from shapecat.detection.planes import NO_HINT
 from shapecat.detection.planes.assumed import assume_plane, unexplained
-from shapecat.detection.planes.covered import add_covered_planes
-from shapecat.detection.planes.parallel import find_parallel_planes
+from shapecat.detection.planes.horizontal import find_horizontal_planes
+from shapecat.detection.planes.oriented_points import orient_points
 from shapecat.detection.planes.ransac import draw_trials
-from shapecat.detection.planes.up_direction import HELD, estimate_up
+from shapecat.detection.planes.settings import UP as UP_SETTINGS
+from shapecat.detection.planes.strips import add_strip_planes
+from shapecat.detection.planes.up_direction import estimate_up
 from shapecat.evaluation.overlap import MATCHED_F
 from shapecat.learning import load_model
 from shapecat.simulation.mesh import Mesh, moved, rounded_box
@@ -51,8 +53,9 @@ def tiles(step: float, size: float, height: float) -> list[Mesh]:
 def heights(meshes: list[Mesh]) -> tuple[list[float], list[float]]:
     """Return the heights of the planes that are found, and what of each is covered."""
     grid, trials = grid_of(meshes), draw_trials(np.random.default_rng(0))
-    found, covered_m2 = add_covered_planes(grid, find_parallel_planes(grid, UP, trials))
-    return [plane.offset + np.sqrt(0.5) for plane, _ in found], list(covered_m2)
+    found = find_horizontal_planes(grid, orient_points(grid), UP, trials)
+    planes = add_strip_planes(grid, found)
+    return [one.plane.offset + np.sqrt(0.5) for one in planes], [one.covered_m2 for one in planes]
 
 
 @pytest.mark.parametrize(
@@ -90,7 +93,8 @@ def test_camera_upside_down_is_believed_where_nothing_speaks_against_it() -> Non
     """How cameras are held is no more than a prior: a table alone is level however it is seen."""
     grid = grid_of([block(0, 0, -0.03, (1.2, 1.0, 0.03))])
     turned = grid._replace(inverse_depth=np.ascontiguousarray(grid.inverse_depth[::-1, ::-1]))
-    up = estimate_up(turned, NO_HINT, draw_trials(np.random.default_rng(0)), HELD)
+    trials = draw_trials(np.random.default_rng(0))
+    up = estimate_up(orient_points(turned), turned.intrinsics, NO_HINT, trials, UP_SETTINGS.held)
     assert up @ [0, -UP[1], UP[2]] > np.cos(np.radians(2))
 
 

@@ -230,7 +230,7 @@ def _separate(
     steps: Steps,
 ) -> PlaneModel:
     """Measure what stands above the planes, without walls."""
-    planes = pack_planes(supports, grid.intrinsics)
+    planes = pack_planes(supports)
     heights = measure_heights(grid, planes, settings.max_height_m)
     low_profile = np.zeros(grid.inverse_depth.shape, np.int16)
     if steps.low_profile:

@@ -7,13 +7,13 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4, U1
 from shapecat.detection.depth_grid import BORDER_SHARE, DepthGrid, PinholeIntrinsics
 from shapecat.detection.planes.ransac import (
-    INLIER_TOLERANCE,
     DepthSamples,
+    off_plane,
     plane_normal,
     ransac_plane,
-    remove_inliers,
     sample_grid,
 )
+from shapecat.detection.planes.settings import PLANES
 from shapecat.geometry import DISCONTINUITY, cross
 from shapecat.jit import kernel, unset
 
@@ -85,13 +85,13 @@ def _take(
     """Take the vertical plane with most readings, if it is a wall, then that with most others."""
     intrinsics, vertical = grid.intrinsics, (-VERTICAL_COS, VERTICAL_COS)
     for _ in range(most):
-        plane, count = ransac_plane(samples, trials, intrinsics, up, vertical, INLIER_TOLERANCE)
+        plane, count = ransac_plane(samples, trials, intrinsics, up, vertical, PLANES.tolerance)
         if count < LEAST_READINGS:
             return
         normal = plane_normal(plane, intrinsics)
         if _is_wall(grid, samples, plane, normal, up, largest_m):
             _clear(grid.inverse_depth, intrinsics, plane_id, plane, normal, walls)
-        samples = remove_inliers(samples, plane, 2 * INLIER_TOLERANCE)
+        samples = off_plane(samples, plane, 2 * PLANES.tolerance)
 
 
 @kernel
@@ -118,7 +118,7 @@ def _is_wall(
 def _is_cut_off(inv_depth: F4, samples: DepthSamples, plane: F8) -> bool:
     """Whether the inliers of a plane reach two sides of the image, or of its readings near them."""
     off = samples.inverse_depth - (plane[0] * samples.j + plane[1] * samples.i + plane[2])
-    near, everything = np.abs(off) < INLIER_TOLERANCE, sample_grid(inv_depth, inv_depth)
+    near, everything = np.abs(off) < PLANES.tolerance, sample_grid(inv_depth, inv_depth)
     across = (samples.j[near], everything.j, inv_depth.shape[1])
     down = (samples.i[near], everything.i, inv_depth.shape[0])
     sides, margin = 0, 1.5 * math.sqrt(samples.share)
@@ -142,7 +142,7 @@ def _measure(
     total = 0.0
     for k in range(samples.inverse_depth.size):
         j, i, v = samples.j[k], samples.i[k], samples.inverse_depth[k]
-        if abs(v - (plane[0] * j + plane[1] * i + plane[2])) >= INLIER_TOLERANCE:
+        if abs(v - (plane[0] * j + plane[1] * i + plane[2])) >= PLANES.tolerance:
             continue
         z = 1.0 / v
         x, y = (j - intrinsics.cx) / intrinsics.fx, (i - intrinsics.cy) / intrinsics.fy

@@ -5,35 +5,30 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, U1
-from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
-from shapecat.detection.planes.ransac import INLIER_TOLERANCE, DepthSamples, plane_normal
-from shapecat.geometry import level_axes
+from shapecat.arrays import F8, I4
+from shapecat.detection.depth_grid import DepthGrid
+from shapecat.detection.planes.ransac import DepthSamples, plane_normal
+from shapecat.detection.planes.settings import PLANES
+from shapecat.geometry import gravity_rotation, level_axes
 from shapecat.jit import kernel
 
 __all__ = [
-    "ARM",
     "COS",
     "DIRECTIONS",
-    "LEAST_AREA_M2",
-    "MARGIN_M",
     "SIN",
+    "PlaneCandidate",
     "SupportingPlane",
+    "area_of",
     "measure_plane",
     "outline_corners",
-    "sort_by_height",
 ]
 
 DIRECTIONS = 16
 """Sides of the convex outline of a plane."""
 ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 COS, SIN = np.cos(ANGLES), np.sin(ANGLES)
-MARGIN_M = 0.01
-"""An outline reaches this far beyond the readings."""
-LEAST_AREA_M2 = 0.02
-"""Visible area of the smallest plane."""
-ARM = 3
-"""Cells to each side over which a surface is seen to be level; odd."""
+BESIDE = 3
+"""Cells from a sample to those over which its surface was seen to go on."""
 
 
 class SupportingPlane(NamedTuple):
@@ -53,124 +48,89 @@ class SupportingPlane(NamedTuple):
     area_m2: float
 
 
+class PlaneCandidate(NamedTuple):
+    """A plane that may bear objects, samples near it, and what of it things cover, m²."""
+
+    plane: SupportingPlane
+    samples: DepthSamples
+    covered_m2: float = 0.0
+
+
 @kernel
 def measure_plane(grid: DepthGrid, samples: DepthSamples, plane: F8) -> SupportingPlane:
-    """Measure a plane (a, b, c) on readings near it."""
-    inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
-    normal = plane_normal(plane, intrinsics)
-    x, y = plane[0] * intrinsics.fx, plane[1] * intrinsics.fy
-    z = plane[0] * intrinsics.cx + plane[1] * intrinsics.cy + plane[2]
-    distance = 1 / math.sqrt(x * x + y * y + z * z)
-    area = _area_of(samples, plane, distance) / (intrinsics.fx * intrinsics.fy)
-    axes = np.array(level_axes(normal[0], normal[1], normal[2]))
-    beside = _beside_inliers(samples, plane, inv_depth.shape[0], inv_depth.shape[1])
-    extent = _extent_of(inv_depth, intrinsics, plane, axes, beside)
-    return SupportingPlane(plane[0], plane[1], plane[2], normal, -distance, extent, area)
+    """Measure a plane (a, b, c) on the samples near it."""
+    normal = plane_normal(plane, grid.intrinsics)
+    x, y = plane[0] * grid.intrinsics.fx, plane[1] * grid.intrinsics.fy
+    z = plane[0] * grid.intrinsics.cx + plane[1] * grid.intrinsics.cy + plane[2]
+    offset = -1 / math.sqrt(x * x + y * y + z * z)
+    area = area_of(samples, plane, -offset) / (grid.intrinsics.fx * grid.intrinsics.fy)
+    ends = _ends(samples, plane, grid.inverse_depth.shape[0], grid.inverse_depth.shape[1])
+    extent = _extent_of(grid, plane, normal, ends)
+    return SupportingPlane(plane[0], plane[1], plane[2], normal, offset, extent, area)
 
 
 @kernel(fast=True)
-def _area_of(samples: DepthSamples, plane: F8, distance: float) -> float:
-    """Return the visible area of a plane by that of a pixel at 1 m, from its distance."""
+def area_of(samples: DepthSamples, plane: F8, distance: float) -> float:
+    """Return the visible area of a plane by that of a cell at 1 m, from its distance."""
     j, i, inv_depth = samples.j, samples.i, samples.inverse_depth
     total = 0.0
     for k in range(inv_depth.size):
         level = plane[0] * j[k] + plane[1] * i[k] + plane[2]
-        near = (level > 0) & (abs(inv_depth[k] - level) < INLIER_TOLERANCE)
+        near = (level > 0) & (abs(inv_depth[k] - level) < PLANES.tolerance)
         facing = level * distance  # the cosine between the normal and the ray
         area = 1 / (level * level * (facing if facing > 0.05 else 0.05))
         total += area if near else 0.0
     return float(samples.share * total)
 
 
-@kernel(fast=True)
-def _beside_inliers(samples: DepthSamples, plane: F8, rows: int, columns: int) -> U1:
-    """Mark the cells (rows, columns) to which the surface was seen to go on from an inlier."""
-    j, i, inv_depth = samples.j, samples.i, samples.inverse_depth
-    top, width = np.int32(ARM), np.int32(columns)
-    place = np.zeros(inv_depth.size, np.int32)
-    for k in range(inv_depth.size):
-        level = plane[0] * j[k] + plane[1] * i[k] + plane[2]
-        near = (level > 0) & (abs(inv_depth[k] - level) < INLIER_TOLERANCE)
-        here = np.int32(j[k]) + (np.int32(i[k]) + top) * width
-        place[k] = here if near else np.int32(0)
-    # There are margins above and below; those at the sides are cells that never are inliers.
-    n, margin = rows * columns, ARM * columns
-    inliers = np.zeros(n + 2 * margin, np.uint8)
-    for p in place:
-        inliers[p] = 1
-    inliers[0] = 0
-    above, below = inliers[:n], inliers[2 * margin :]
-    left, right = inliers[margin - ARM :], inliers[margin + ARM :]
-    beside = np.zeros(n, np.uint8)
-    for k in range(n):
-        beside[k] = above[k] | below[k] | left[k] | right[k]
-    return beside.reshape(rows, columns)
+@kernel
+def _ends(samples: DepthSamples, plane: F8, rows: int, columns: int) -> I4:
+    """Return the first and last column (2, rows) of the inliers in each row; none: last is -1."""
+    ends = np.zeros((2, rows), np.int32)
+    for i in range(rows):
+        ends[0, i], ends[1, i] = columns, -1
+    for k in range(samples.inverse_depth.size):
+        level = plane[0] * samples.j[k] + plane[1] * samples.i[k] + plane[2]
+        if level > 0 and abs(samples.inverse_depth[k] - level) < PLANES.tolerance:
+            i, j = int(samples.i[k]), int(samples.j[k])
+            ends[0, i], ends[1, i] = min(ends[0, i], j), max(ends[1, i], j)
+    return ends
 
 
 @kernel
-def _extent_of(inv_depth: F4, intrinsics: PinholeIntrinsics, plane: F8, axes: F8, beside: U1) -> F8:
-    """Return how far the plane reaches along `DIRECTIONS`, metres, with a margin."""
-    across, along = axes[0], axes[1]
+def _extent_of(grid: DepthGrid, plane: F8, normal: F8, ends: I4) -> F8:
+    """Return how far the plane reaches along `DIRECTIONS`, metres, with a margin.
+
+    The outline is convex in the image too: the first and last cell of each row tell it, and what
+    of the plane is beside these.
+    """
+    inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
+    rows, columns = inv_depth.shape
+    across, along, _ = level_axes(normal[0], normal[1], normal[2])
     extent = np.full(DIRECTIONS, -np.inf)
-    for i in range(inv_depth.shape[0]):
-        # The outline is convex in the image too: the first and last cell of each row tell it.
-        first, last = _ends(inv_depth, plane, i, beside[i])
-        if first > last:
-            continue
-        for j in (first, last):
-            z = 1 / (plane[0] * j + plane[1] * i + plane[2])
-            x, y = (j - intrinsics.cx) / intrinsics.fx * z, (i - intrinsics.cy) / intrinsics.fy * z
-            u = across[0] * x + across[1] * y + across[2] * z
-            v = along[0] * x + along[1] * y + along[2] * z
-            for k in range(DIRECTIONS):
-                there = COS[k] * u + SIN[k] * v
-                extent[k] = there if there > extent[k] else extent[k]
-    return extent + MARGIN_M
+    for i in range(rows):
+        for side in range(2 if ends[1, i] >= 0 else 0):
+            j = ends[side, i]
+            for di, dj in ((0, 0), (0, -BESIDE), (0, BESIDE), (-BESIDE, 0), (BESIDE, 0)):
+                v, u = i + di, j + dj
+                if v < 0 or u < 0 or v >= rows or u >= columns:
+                    continue
+                level = plane[0] * u + plane[1] * v + plane[2]
+                if level <= 0 or abs(inv_depth[v, u] - level) >= PLANES.tolerance:
+                    continue
+                x, y = (u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy
+                p = (across[0] * x + across[1] * y + across[2]) / level
+                q = (along[0] * x + along[1] * y + along[2]) / level
+                for k in range(DIRECTIONS):
+                    there = COS[k] * p + SIN[k] * q + PLANES.margin_m
+                    extent[k] = there if there > extent[k] else extent[k]
+    return extent
 
 
-@kernel
-def _ends(inv_depth: F4, plane: F8, i: int, beside: U1) -> tuple[int, int]:
-    """Return the first and the last marked cell of a row in the plane; none: first > last."""
-    none = np.int32(beside.size)
-    first, last = none, np.int32(-1)
-    for k in range(beside.size):  # no more than 32 bits, and this vectorises
-        low = np.int32(k) if beside[k] else none
-        high = np.int32(k) if beside[k] else np.int32(-1)
-        first, last = (low if low < first else first), (high if high > last else last)
-    while first <= last and not (beside[first] and _is_in(inv_depth, plane, i, first)):
-        first += 1
-    while first < last and not (beside[last] and _is_in(inv_depth, plane, i, last)):
-        last -= 1
-    return int(first), int(last)
-
-
-@kernel
-def _is_in(inv_depth: F4, plane: F8, i: int, j: int) -> bool:
-    level = plane[0] * j + plane[1] * i + plane[2]
-    return bool(level > 0 and abs(inv_depth[i, j] - level) < INLIER_TOLERANCE)
-
-
-@kernel
-def outline_corners(support: SupportingPlane) -> F8:
+def outline_corners(plane: SupportingPlane) -> F8:
     """Return the corners (k, 3) of the convex outline, sensor frame, in order, without repeats."""
-    up, extent = support.up, support.extent
-    axes = level_axes(up[0], up[1], up[2])
-    corners = np.zeros((DIRECTIONS, 3))
-    for k in range(DIRECTIONS):
-        # Neighbouring sides x cos + y sin = reach meet at a corner.
-        along = (extent[(k + 1) % DIRECTIONS] - extent[k] * COS[1]) / SIN[1]
-        x, y = extent[k] * COS[k] - along * SIN[k], extent[k] * SIN[k] + along * COS[k]
-        for d in range(3):
-            corners[k, d] = x * axes[0][d] + y * axes[1][d] + support.offset * axes[2][d]
-    return corners
-
-
-@kernel
-def sort_by_height(found: list[tuple[SupportingPlane, DepthSamples]]) -> None:
-    """Put the lowest plane first, in place."""
-    for k in range(1, len(found)):
-        one, m = found[k], k
-        while m > 0 and found[m - 1][0].offset > one[0].offset:
-            found[m] = found[m - 1]
-            m -= 1
-        found[m] = one
+    # Neighbouring sides x cos + y sin = extent meet at a corner.
+    along = (np.roll(plane.extent, -1) - plane.extent * COS[1]) / SIN[1]
+    x, y = plane.extent * COS - along * SIN, plane.extent * SIN + along * COS
+    level = np.stack([x, y, np.full(DIRECTIONS, plane.offset)], axis=1)
+    return np.asarray(level @ gravity_rotation(plane.up))

@@ -1,6 +1,5 @@
 """Height map: the plane that every sample is above, and how far (thesis Alg. 2, step 2)."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -8,7 +7,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN, SupportingPlane
-from shapecat.geometry import level_axes
+from shapecat.geometry import gravity_rotation
 from shapecat.jit import kernel
 
 __all__ = [
@@ -27,6 +26,8 @@ BEYOND_M = 0.1
 """What is level with a plane and this near to its outline is the plane, not an object below."""
 OUT = -9.0
 """Takes the place of the height of cells that do not stand on a plane."""
+OUTLINE = 10
+"""Where the outline begins in a row of `pack_planes`."""
 FINE = 65536
 """Steps to 1/m of inverse depth, where it is rounded."""
 
@@ -45,30 +46,14 @@ class HeightMap(NamedTuple):
     height: F4
 
 
-def pack_planes(supports: list[SupportingPlane], intrinsics: PinholeIntrinsics) -> F8:
-    """Return one row of numbers per plane."""
-    rows = np.zeros((len(supports), 13 + DIRECTIONS))
-    for k, support in enumerate(supports):
-        _fill(rows[k], support, intrinsics)
+def pack_planes(supports: list[SupportingPlane]) -> F8:
+    """Return one row of numbers per plane: a, b, c, its depth, two level axes, the outline."""
+    rows = np.zeros((len(supports), OUTLINE + DIRECTIONS))
+    for row, support in zip(rows, supports, strict=True):
+        row[:4] = support.a, support.b, support.c, -support.offset
+        row[4:OUTLINE] = gravity_rotation(support.up)[:2].ravel()
+        row[OUTLINE:] = support.extent
     return rows
-
-
-@kernel
-def _fill(row: F8, support: SupportingPlane, intrinsics: PinholeIntrinsics) -> None:
-    """Write the plane, its distance, two level axes, a circle inside the outline, the outline."""
-    a, b, c, up, extent = support.a, support.b, support.c, support.up, support.extent
-    x, y, z = a * intrinsics.fx, b * intrinsics.fy, a * intrinsics.cx + b * intrinsics.cy + c
-    row[0], row[1], row[2], row[3] = a, b, c, 1.0 / math.sqrt(x * x + y * y + z * z)
-    axes = level_axes(up[0], up[1], up[2])
-    for k in range(3):
-        row[4 + k], row[7 + k] = axes[0][k], axes[1][k]
-    # The circle is for a quick answer.
-    quarter, half = DIRECTIONS // 4, DIRECTIONS // 2
-    row[10] = (extent[0] - extent[half]) / 2
-    row[11] = (extent[quarter] - extent[half + quarter]) / 2
-    scratch = np.min(extent - row[10] * COS - row[11] * SIN)
-    row[12] = max(scratch, 0.0) ** 2
-    row[13:] = extent
 
 
 @kernel
@@ -137,7 +122,10 @@ def _assign(
         left, right, farthest, nearest = _bounds(line, values)
         for k in range(DIRECTIONS // 2):
             step, first = np.float32(sides[k, 0]), np.float32(sides[k, 1] * i + sides[k, 2])
-            far, near = np.float32(plane[13 + k]), np.float32(plane[13 + k + DIRECTIONS // 2])
+            far, near = (
+                np.float32(plane[OUTLINE + k]),
+                np.float32(plane[OUTLINE + k + DIRECTIONS // 2]),
+            )
             # Few rows reach beyond a side, and their bounds tell most of the others.
             ends = step * left + first, step * right + first
             scratch = min(far * farthest, far * nearest), min(near * farthest, near * nearest)
@@ -179,9 +167,7 @@ def is_inside_outline(plane: F8, x: float, y: float, z: float, slack: float) -> 
     """Whether a point is within the outline of a row of `pack_planes`, or ``slack`` beyond it."""
     p = plane[4] * x + plane[5] * y + plane[6] * z
     q = plane[7] * x + plane[8] * y + plane[9] * z
-    if (p - plane[10]) ** 2 + (q - plane[11]) ** 2 < plane[12]:
-        return True
     for k in range(DIRECTIONS):  # noqa: SIM110  kernels have no generators
-        if COS[k] * p + SIN[k] * q > plane[13 + k] + slack:
+        if COS[k] * p + SIN[k] * q > plane[OUTLINE + k] + slack:
             return False
     return True

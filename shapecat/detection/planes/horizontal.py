@@ -1,257 +1,201 @@
-"""Horizontal planes: one for each accumulation of level surface in height (thesis 4.3, Alg. 1)."""
+"""Horizontal planes: one for each accumulation of level surface in height (thesis 4.3, Alg. 1).
 
-import math
+They are parallel: all get the one normal that the larger ones tell best. A board seen at a grazing
+angle, or only a strip of one, does not tell its tilt well: half a degree is a centimetre of height
+a metre away. What is not level then, such as the top of a tilted thing, is left out.
+"""
+
+from collections.abc import Iterable
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.arrays import F4, F8
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.planes.extent import (
-    ARM,
-    LEAST_AREA_M2,
-    MARGIN_M,
+    DIRECTIONS,
+    PlaneCandidate,
     SupportingPlane,
+    area_of,
     measure_plane,
-    sort_by_height,
 )
+from shapecat.detection.planes.oriented_points import OrientedPoints, level_samples
 from shapecat.detection.planes.ransac import (
-    INLIER_TOLERANCE,
     DepthSamples,
     cosine,
     count_inliers,
     horizontal_plane,
     median_of,
+    off_plane,
     plane_normal,
     ransac_plane,
     refine,
-    select,
 )
+from shapecat.detection.planes.settings import PLANES
 from shapecat.jit import kernel
 
-__all__ = ["by_height", "find_horizontal_planes", "fullest"]
+__all__ = ["find_horizontal_planes"]
 
-BIN_M = 0.01
-MOST_LEVELS = 10
-LEAST_CELLS = 100
-MOST_HEIGHTS = 500
-"""About as many readings tell the height of a level to begin with."""
-LEVEL_COS2 = 0.82
-"""Squared cosine of the largest angle, 25 degrees, of a level reading to the horizontal."""
-STEADY_COS = math.cos(math.radians(6))
-CLOSE, CLOSE_SHARE = 0.5, 0.75
-"""Of the readings near a plane, less than this share is so close to one that is tilted between
-two: a table and the plates on it."""
-BEND = 0.024
-GRAZING_SIN2 = 0.04
-"""Squared sine of the angle, 11.5 degrees, below which a surface is seen at a grazing angle."""
+MOST_PLANES = 10
+LEAST_SAMPLES = 44
+"""Points on a plane at least: a tenth of that is noise."""
 
 
-@kernel
 def find_horizontal_planes(
-    grid: DepthGrid, up: F8, trials: F8
-) -> list[tuple[SupportingPlane, DepthSamples]]:
-    """Return the horizontal planes of the scene, lowest first, each with its readings."""
-    inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
-    # (1), (2) readings whose surface is level
-    level, height, order, starts = _level_readings(inv_depth, intrinsics, up)
-    # (3) one plane candidate for each accumulation in height
-    done = np.zeros(starts.size - 1, np.bool_)
-    found: list[tuple[SupportingPlane, DepthSamples]] = []
-    for _ in range(MOST_LEVELS):
-        near, plane, count, close = _next_level(intrinsics, up, level, height, order, starts, done)
-        if near.inverse_depth.size < LEAST_CELLS:
-            break
-        if count < LEAST_CELLS:
-            continue
-        # (4) refine, and keep what lies in the plane
-        if close < CLOSE_SHARE * count:
-            plane = _voted(intrinsics, near, up, trials, plane, close)
-        support = measure_plane(grid, near, plane)
-        if support.area_m2 >= LEAST_AREA_M2:
-            found.append((support, near))
-            _keep_off(plane, level, order, starts)
-    # (5) ascending
-    sort_by_height(found)
-    return found
+    grid: DepthGrid, points: OrientedPoints, up: F8, trials: F8
+) -> list[PlaneCandidate]:
+    """Return the horizontal planes of the scene, lowest first, with one normal in common."""
+    found = _find(grid, points, up, trials)
+    better = _common_up(found) if found else up
+    if better @ up < PLANES.turned_cos:
+        found = _find(grid, points, better, trials)
+        better = _common_up(found) if found else better
+    if len(found) > 1:
+        turned = [_turn(grid.intrinsics, one.samples, one.plane, better) for one in found]
+        found = _measure(grid, found[0].samples, turned)
+    return sorted(found, key=lambda one: one.plane.offset)
 
 
-@kernel
-def _level_readings(
-    inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8
-) -> tuple[DepthSamples, F4, I4, I4]:
-    """Find every second cell whose surface is level within 25 degrees.
-
-    Returns
-    -------
-    These readings, their heights, and what `by_height` says of these.
-    """
-    rows, columns = inv_depth.shape
-    even, odd = _halves(inv_depth)
-    width = max((columns - 2 * ARM + 1) // 2, 0)
-    x = (ARM + 2 * np.arange(width) - intrinsics.cx) / intrinsics.fx
-    row = np.zeros(width, np.float32)
-    found = np.zeros((4, width * (rows // 2) + 1), np.float32)
-    j_of, i_of, w_of, height_of = found[0], found[1], found[2], found[3]
-    lowest, highest = np.float32(np.inf), np.float32(-np.inf)
-    n = np.uint32(0)  # a place without a sign is not asked whether it counts from the end
-    for i in range(ARM, rows - ARM, 2):
-        _find_level(even, odd, intrinsics, up, i, x, row)
-        values = odd[i]
-        for k in range(width):
-            j_of[n], i_of[n], w_of[n], height_of[n] = ARM + 2 * k, i, values[ARM // 2 + k], row[k]
-            level = row[k] < np.inf
-            h = row[k] if level else highest
-            lowest, highest = (row[k] if row[k] < lowest else lowest), max(h, highest)
-            n += np.uint32(level)
-    base = float(lowest) if n > 0 else 0.0
-    bins = int((float(highest) - base) / BIN_M) + 1 if n > 0 else 1
-    order, starts = by_height(height_of[:n], base, bins)
-    return DepthSamples(j_of[:n], i_of[:n], w_of[:n], 4), height_of[:n], order, starts
+def _find(grid: DepthGrid, points: OrientedPoints, up: F8, trials: F8) -> list[PlaneCandidate]:
+    samples, heights = level_samples(points, up)
+    planes = fit_horizontal_planes(samples, heights, grid.intrinsics, up, trials)
+    return _measure(grid, samples, planes)
 
 
-@kernel
-def _halves(inv_depth: F4) -> tuple[F4, F4]:
-    """Return the even and the odd columns of an image: loops over these vectorise."""
-    rows, columns = inv_depth.shape
-    even = np.zeros((rows, (columns + 1) // 2), np.float32)
-    odd = np.zeros((rows, columns // 2), np.float32)
-    for i in range(rows):
-        row, evens, odds = inv_depth[i], even[i], odd[i]
-        for k in range(odds.size):
-            evens[k], odds[k] = row[2 * k], row[2 * k + 1]
-        evens[-1] = row[(columns - 1) // 2 * 2]
-    return even, odd
+def _measure(grid: DepthGrid, samples: DepthSamples, planes: Iterable[F8]) -> list[PlaneCandidate]:
+    found = (PlaneCandidate(measure_plane(grid, samples, plane), samples) for plane in planes)
+    return [one for one in found if one.plane.area_m2 >= PLANES.least_m2]
+
+
+def _common_up(found: list[PlaneCandidate]) -> F8:
+    """Return the mean normal, weighted by how well each plane tells it: area and width squared."""
+    half = DIRECTIONS // 2
+    mean = np.zeros(3)
+    for plane, *_ in found:
+        width = (plane.extent[:half] + plane.extent[half:]).min()
+        mean += plane.area_m2 * width * width * plane.up
+    return np.asarray(mean / np.linalg.norm(mean))
 
 
 @kernel(fast=True)
-def _find_level(
-    even: F4, odd: F4, intrinsics: PinholeIntrinsics, up: F8, i: int, x: F8, height: F4
-) -> None:
-    """Write the heights of the cells of a row on odd columns, infinity where it is not level."""
-    bend, two = np.float32(BEND), np.float32(2)
-    sides, middle, above, below = even[i], odd[i], odd[i - ARM], odd[i + ARM]
-    close_above, close_below = odd[i - 1], odd[i + 1]
-    y = (i - intrinsics.cy) / intrinsics.fy
-    for k in range(x.size):
-        m = k + ARM // 2
-        center, left, right = middle[m], sides[k], sides[k + ARM]
-        rise = x[k] * up[0] + y * up[1] + up[2]
-        # A level surface near the height of the camera is narrow in the image.
-        narrow = rise * rise < GRAZING_SIN2 * (x[k] * x[k] + y * y + 1)
-        # All are read before some are chosen, or this would not vectorise.
-        far, near, far_below, near_below = above[m], close_above[m], below[m], close_below[m]
-        top, bottom = (near if narrow else far), (near_below if narrow else far_below)
-        seen = (center > 0) & (left > 0) & (right > 0) & (top > 0) & (bottom > 0)
-        smooth = abs(left + right - two * center) <= bend
-        smooth &= abs(top + bottom - two * center) <= bend
-        across, down = right - left, (bottom - top) * np.float32(ARM if narrow else 1)
-        nx, ny = across * (intrinsics.fx / (2 * ARM)), down * (intrinsics.fy / (2 * ARM))
-        nz = center - nx * x[k] - ny * y
-        along = -(nx * up[0] + ny * up[1] + nz * up[2])
-        upwards = along > 0
-        upwards &= along * along > LEVEL_COS2 * (nx * nx + ny * ny + nz * nz)
-        height[k] = rise / center if seen & smooth & upwards else np.inf
+def _turn(
+    intrinsics: PinholeIntrinsics, samples: DepthSamples, plane: SupportingPlane, up: F8
+) -> F8:
+    """Fit a plane with the normal ``up`` to the inliers of another, by least squares."""
+    # The inverse depth of the plane up @ p == offset is along / offset.
+    squares = products = 0.0
+    for k in range(samples.inverse_depth.size):
+        j, i, v = samples.j[k], samples.i[k], samples.inverse_depth[k]
+        near = abs(v - (plane.a * j + plane.b * i + plane.c)) < PLANES.tolerance
+        x, y = (j - intrinsics.cx) / intrinsics.fx, (i - intrinsics.cy) / intrinsics.fy
+        along = x * up[0] + y * up[1] + up[2] if near else 0.0
+        squares += along * along
+        products += along * v
+    turned: F8 = horizontal_plane(intrinsics, up, squares / products)
+    return turned
 
 
 @kernel
-def by_height(height: F4, base: float, bins: int) -> tuple[I4, I4]:
-    """Return the order of heights by bins, and where each bin starts."""
-    n = height.size
-    bin_of = np.zeros(n, np.uint32)
-    for k in range(n):
-        bin_of[k] = min(int((height[k] - base) / BIN_M), bins - 1)
-    starts = np.zeros(bins + 1, np.uint32)
-    for k in range(n):
-        starts[bin_of[k] + np.uint32(1)] += np.uint32(1)
-    for b in range(bins):
-        starts[b + 1] += starts[b]
-    place = starts.copy()
-    order = np.zeros(n, np.uint32)
-    for k in range(n):
-        order[place[bin_of[k]]] = k
-        place[bin_of[k]] += np.uint32(1)
-    return order, starts
+def fit_horizontal_planes(
+    rest: DepthSamples, height: F4, intrinsics: PinholeIntrinsics, up: F8, trials: F8
+) -> F8:
+    """Return the horizontal planes (n, 3) of inverse depth, fullest first.
 
-
-@kernel
-def fullest(starts: I4, done: Bool) -> int:
-    """Return the bin that with its neighbours holds most readings; those done count as empty."""
-    count = np.zeros(done.size + 2, np.int64)
-    for k in range(done.size):
-        count[k + 1] = 0 if done[k] else starts[k + 1] - starts[k]
-    return int(np.argmax(count[:-2] + 2 * count[1:-1] + count[2:]))
-
-
-@kernel
-def _next_level(
-    intrinsics: PinholeIntrinsics,
-    up: F8,
-    level: DepthSamples,
-    height: F4,
-    order: I4,
-    starts: I4,
-    done: Bool,
-) -> tuple[DepthSamples, F8, int, int]:
-    """Fit a plane to the fullest bins that are not done.
-
-    Returns
-    -------
-    The readings in these bins; the plane (a, b, c); how many of them lie in it, 0 if it is not
-    seen from above; and how many are close to it.
+    Parameters
+    ----------
+    rest, height : from `level_samples`.
     """
-    peak = fullest(starts, done)
-    low, high = max(peak - 2, 0), min(peak + 3, done.size)
-    chosen = order[starts[low] : starts[high]]
-    near = select(level, chosen)
-    if chosen.size < LEAST_CELLS:
-        return near, np.zeros(3), 0, 0
-    done[low:high] = True
-    offset = median_of(height, chosen[:: 1 + chosen.size // MOST_HEIGHTS])
-    if offset > -MARGIN_M:
-        return near, np.zeros(3), 0, 0
-    plane = horizontal_plane(intrinsics, up, offset)
+    found = np.zeros((MOST_PLANES, 3))
+    n = 0
+    # (3) one plane candidate for each accumulation in height
+    for _ in range(MOST_PLANES):
+        if height.size < LEAST_SAMPLES:
+            break
+        peak = _fullest(height)
+        near, near_height, rest, height = _split(rest, height, peak)
+        if near_height.size < LEAST_SAMPLES:
+            break
+        # (4) refine, and keep what lies in the plane
+        offset = median_of(near_height)
+        if offset > -PLANES.margin_m or not _fit(near, intrinsics, up, trials, offset, found[n]):
+            continue
+        off = off_plane(rest, found[n], 3 * PLANES.tolerance)
+        rest, height = off, _heights(off, intrinsics, up)
+        n += 1
+    return found[:n]
+
+
+@kernel
+def _heights(samples: DepthSamples, intrinsics: PinholeIntrinsics, up: F8) -> F4:
+    heights = np.zeros(samples.inverse_depth.size, np.float32)
+    for k in range(heights.size):
+        x, y = (
+            (samples.j[k] - intrinsics.cx) / intrinsics.fx,
+            (samples.i[k] - intrinsics.cy) / intrinsics.fy,
+        )
+        heights[k] = (x * up[0] + y * up[1] + up[2]) / samples.inverse_depth[k]
+    return heights
+
+
+@kernel
+def _fullest(height: F4) -> float:
+    """Return the middle of the bin that with its neighbours holds most of the heights."""
+    low = high = float(height[0])
+    for h in height:
+        low, high = min(low, h), max(high, h)
+    count = np.zeros(int((high - low) / PLANES.bin_m) + 3, np.int64)
+    for h in height:
+        count[int((h - low) / PLANES.bin_m) + 1] += 1
+    best, most = 0, -1
+    for b in range(1, count.size - 1):
+        here = count[b - 1] + 2 * count[b] + count[b + 1]
+        if here > most:
+            best, most = b, here
+    return low + (best - 0.5) * PLANES.bin_m
+
+
+@kernel
+def _split(
+    samples: DepthSamples, height: F4, peak: float
+) -> tuple[DepthSamples, F4, DepthSamples, F4]:
+    """Return the samples within five bins around a height, with their heights, and the others."""
+    parts = np.zeros((2, 4, height.size), np.float32)
+    n = np.zeros(2, np.int64)
+    for k in range(height.size):
+        p = int(abs(height[k] - peak) > 2.5 * PLANES.bin_m)
+        parts[p, 0, n[p]], parts[p, 1, n[p]] = samples.j[k], samples.i[k]
+        parts[p, 2, n[p]], parts[p, 3, n[p]] = samples.inverse_depth[k], height[k]
+        n[p] += 1
+    near, rest = parts[0], parts[1]
+    m, r = n[0], n[1]
+    return (
+        DepthSamples(near[0][:m], near[1][:m], near[2][:m], samples.share),
+        near[3][:m],
+        DepthSamples(rest[0][:r], rest[1][:r], rest[2][:r], samples.share),
+        rest[3][:r],
+    )
+
+
+@kernel
+def _fit(
+    near: DepthSamples, intrinsics: PinholeIntrinsics, up: F8, trials: F8, offset: float, plane: F8
+) -> bool:
+    """Write the plane of samples at about one height; return whether it is large enough."""
+    level = horizontal_plane(intrinsics, up, offset)
+    plane[0], plane[1], plane[2] = level
     count = 0
     for _ in range(3):
-        count = refine(near.j, near.i, near.inverse_depth, 1.5 * INLIER_TOLERANCE, plane)
-        if count < LEAST_CELLS:
+        count = refine(near, 1.5 * PLANES.tolerance, plane)
+        if count < LEAST_SAMPLES:
+            return False
+        if cosine(plane_normal(plane, intrinsics), up) < PLANES.steady_cos:
+            plane[0], plane[1], plane[2] = level
             break
-        if cosine(plane_normal(plane, intrinsics), up) < STEADY_COS:
-            plane = horizontal_plane(intrinsics, up, offset)
-            break
-    return (
-        near,
-        plane,
-        count,
-        count_inliers(near, plane[0], plane[1], plane[2], CLOSE * INLIER_TOLERANCE),
-    )
-
-
-@kernel
-def _voted(
-    intrinsics: PinholeIntrinsics, near: DepthSamples, up: F8, trials: F8, plane: F8, close: int
-) -> F8:
-    """Return the plane most readings are close to, or ``plane``, to which ``close`` are."""
-    other, inliers = ransac_plane(
-        near, trials, intrinsics, up, (STEADY_COS, 1.0), CLOSE * INLIER_TOLERANCE
-    )
-    return other if inliers > close else plane
-
-
-@kernel
-def _keep_off(plane: F8, level: DepthSamples, order: I4, starts: I4) -> None:
-    """Take the readings near a plane from their order `by_height`, in place."""
-    j, i, inv_depth = level.j, level.i, level.inverse_depth
-    off = np.zeros(inv_depth.size, np.uint8)
-    for k in range(inv_depth.size):
-        off[k] = (
-            abs(inv_depth[k] - (plane[0] * j[k] + plane[1] * i[k] + plane[2]))
-            > 3 * INLIER_TOLERANCE
+    close = count_inliers(near, plane, PLANES.tolerance / 2)
+    if close < PLANES.close_share * count:
+        voted, votes = ransac_plane(
+            near, trials, intrinsics, up, (PLANES.steady_cos, 1.0), PLANES.tolerance / 2
         )
-    left = np.zeros(order.size + 1, np.uint32)  # of those before each
-    n = np.uint32(0)
-    for k in range(starts[-1]):
-        order[n] = order[k]
-        n += np.uint32(off[order[k]])
-        left[k + 1] = n
-    for b in range(starts.size):
-        starts[b] = left[starts[b]]
+        if votes > close:
+            plane[0], plane[1], plane[2] = voted
+    area = area_of(near, plane, abs(offset)) / (intrinsics.fx * intrinsics.fy)
+    return bool(area >= PLANES.least_m2)

@@ -5,34 +5,31 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F4, F8
 from shapecat.detection.depth_grid import PinholeIntrinsics
 from shapecat.jit import kernel
 
 __all__ = [
-    "INLIER_TOLERANCE",
     "DepthSamples",
     "cosine",
     "count_inliers",
     "draw_trials",
     "horizontal_plane",
     "median_of",
+    "off_plane",
     "plane_normal",
     "ransac_plane",
     "refine",
-    "remove_inliers",
     "sample_grid",
-    "select",
 ]
 
-INLIER_TOLERANCE = 0.01
-"""Distance of an inlier from a plane in inverse depth, 1/m: three steps of a Kinect."""
 TRIALS, BLOCK = 240, 256
-"""Planes that are tried, and after how many readings it is asked if one can still win."""
+"""Planes that are tried: one of a seventh of the samples is missed with a chance of a half. After
+so many samples it is asked if a plane can still win."""
 LEAST_DOUBLE_AREA = 30.0
-"""Of the triangle of three readings, in cells squared: smaller ones are mostly noise."""
+"""Of the triangle of three samples, in cells squared: smaller ones are mostly noise."""
 SAMPLE = 4800
-"""About as many cells propose planes and vote."""
+"""About as many cells propose planes and vote: more take longer and find no others."""
 
 
 class DepthSamples(NamedTuple):
@@ -58,32 +55,16 @@ def sample_grid(inv_depth: F4, wanted: F4) -> DepthSamples:
         for j in range(stride // 2, columns, stride):
             result[0, n], result[1, n], result[2, n] = j, i, inv_depth[i, j]
             n += (inv_depth[i, j] > 0) & (wanted[i, j] > 0)
-    return DepthSamples(result[0, :n], result[1, :n], result[2, :n], stride * stride)
+    return DepthSamples(result[0][:n], result[1][:n], result[2][:n], stride * stride)
 
 
 @kernel
-def select(samples: DepthSamples, chosen: I4) -> DepthSamples:
-    """Return the readings at the ``chosen`` (n,) places in the list."""
-    result = np.zeros((3, chosen.size), np.float32)
-    j, i, inv_depth = result[0], result[1], result[2]
-    for k in range(chosen.size):
-        j[k], i[k], inv_depth[k] = (
-            samples.j[chosen[k]],
-            samples.i[chosen[k]],
-            samples.inverse_depth[chosen[k]],
-        )
-    return DepthSamples(j, i, inv_depth, samples.share)
-
-
-@kernel
-def median_of(values: F4, chosen: I4) -> float:
-    """Return the upper median of the values at the ``chosen`` places, at least one.
+def median_of(values: F4) -> float:
+    """Return the upper median of at least one value.
 
     Source: Hoare 1961, Algorithm 65. `numpy.partition` in a kernel takes 15 ms to load.
     """
-    sample = np.zeros(chosen.size, np.float32)
-    for k in range(chosen.size):
-        sample[k] = values[chosen[k]]
+    sample = values.copy()
     middle, low, high = sample.size // 2, 0, sample.size - 1
     while low < high:
         pivot, i, j = sample[middle], low, high
@@ -103,8 +84,8 @@ def median_of(values: F4, chosen: I4) -> float:
 
 
 @kernel
-def remove_inliers(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSamples:
-    """Return the readings that are not near a plane."""
+def off_plane(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSamples:
+    """Return the samples that are not near a plane."""
     a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     gate = np.float32(tolerance)
     rest = np.zeros((3, samples.inverse_depth.size), np.float32)
@@ -113,7 +94,7 @@ def remove_inliers(samples: DepthSamples, plane: F8, tolerance: float) -> DepthS
         j, i, v = samples.j[k], samples.i[k], samples.inverse_depth[k]
         rest[0, n], rest[1, n], rest[2, n] = j, i, v
         n += abs(v - (a * j + b * i + c)) > gate
-    return DepthSamples(rest[0, :n], rest[1, :n], rest[2, :n], samples.share)
+    return DepthSamples(rest[0][:n], rest[1][:n], rest[2][:n], samples.share)
 
 
 @kernel
@@ -154,80 +135,84 @@ def ransac_plane(
     cosines: tuple[float, float],
     tolerance: float,
 ) -> tuple[F8, int]:
-    """Return the plane (a, b, c) with most inliers, and how many readings these are.
+    """Return the plane (a, b, c) with most inliers, and how many samples these are.
 
     Only planes count whose normal towards the camera has a cosine within ``cosines`` to
-    ``guide``. No readings agree on a plane: 0.
+    ``guide``. No samples agree on a plane: 0.
 
     Parameters
     ----------
-    trials : of `draw_trials`; the readings at these shares of the list propose planes.
+    trials : of `draw_trials`; the samples at these shares of the list propose planes.
     """
-    best = np.zeros(3)
+    plane, best = np.zeros(3), np.zeros(3)
     most, n = 0, samples.inverse_depth.size
     for t in range(len(trials) if n >= 3 else 0):
-        # (1) three readings propose a plane
-        p, q, r = int(trials[t, 0] * n), int(trials[t, 1] * n), int(trials[t, 2] * n)
-        w0 = float(samples.inverse_depth[p])
-        j1, i1 = samples.j[q] - samples.j[p], samples.i[q] - samples.i[p]
-        j2, i2 = samples.j[r] - samples.j[p], samples.i[r] - samples.i[p]
-        double = i1 * j2 - i2 * j1
-        if abs(double) < LEAST_DOUBLE_AREA:
+        # (1) three samples propose a plane
+        if not _propose(samples, trials, t, plane):
             continue
-        a = (i1 * (samples.inverse_depth[r] - w0) - i2 * (samples.inverse_depth[q] - w0)) / double
-        b = (j2 * (samples.inverse_depth[q] - w0) - j1 * (samples.inverse_depth[r] - w0)) / double
-        c = w0 - a * samples.j[p] - b * samples.i[p]
-        nx, ny, nz = a * intrinsics.fx, b * intrinsics.fy, a * intrinsics.cx + b * intrinsics.cy + c
-        along = -(nx * guide[0] + ny * guide[1] + nz * guide[2])
-        norm = math.sqrt(nx * nx + ny * ny + nz * nz)
+        a, b = plane[0] * intrinsics.fx, plane[1] * intrinsics.fy
+        c = plane[0] * intrinsics.cx + plane[1] * intrinsics.cy + plane[2]
+        along, norm = (
+            -(a * guide[0] + b * guide[1] + c * guide[2]),
+            math.sqrt(a * a + b * b + c * c),
+        )
         if not ((along >= cosines[0] * norm) & (along <= cosines[1] * norm)):
             continue
         # (2) all vote
-        inliers = _inliers_if_more(samples, a, b, c, tolerance, most)
+        inliers = 0
+        for start in range(0, n, BLOCK):
+            if inliers + n - start <= most:
+                break
+            inliers += _count_part(samples, plane, tolerance, start, min(start + BLOCK, n))
         if inliers > most:
             most = inliers
-            best[0], best[1], best[2] = a, b, c
+            best[0], best[1], best[2] = plane[0], plane[1], plane[2]
     # (3) the inliers refit
     for _ in range(4):
-        refine(samples.j, samples.i, samples.inverse_depth, tolerance, best)
-    inliers = count_inliers(samples, best[0], best[1], best[2], tolerance) if most >= 3 else 0
-    return best, inliers
+        refine(samples, tolerance, best)
+    return best, count_inliers(samples, best, tolerance) if most >= 3 else 0
 
 
 @kernel
-def _inliers_if_more(
-    samples: DepthSamples, a: float, b: float, c: float, tolerance: float, most: int
-) -> int:
-    """Count the readings near a plane as long as there may be over ``most``."""
-    j, i, inv_depth, share = samples
-    inliers = 0
-    for start in range(0, inv_depth.size, BLOCK):
-        if inliers + inv_depth.size - start <= most:
-            break
-        some = slice(start, start + BLOCK)
-        inliers += count_inliers(
-            DepthSamples(j[some], i[some], inv_depth[some], share), a, b, c, tolerance
-        )
-    return inliers
+def _propose(samples: DepthSamples, trials: F8, t: int, plane: F8) -> bool:
+    """Write the plane through three samples; return whether they are far enough apart."""
+    j, i, w, n = samples.j, samples.i, samples.inverse_depth, samples.inverse_depth.size
+    p, q, r = int(trials[t, 0] * n), int(trials[t, 1] * n), int(trials[t, 2] * n)
+    j1, i1, w1 = j[q] - j[p], i[q] - i[p], float(w[q]) - w[p]
+    j2, i2, w2 = j[r] - j[p], i[r] - i[p], float(w[r]) - w[p]
+    double = i1 * j2 - i2 * j1
+    if abs(double) < LEAST_DOUBLE_AREA:
+        return False
+    plane[0], plane[1] = (i1 * w2 - i2 * w1) / double, (j2 * w1 - j1 * w2) / double
+    plane[2] = w[p] - plane[0] * j[p] - plane[1] * i[p]
+    return True
+
+
+@kernel
+def count_inliers(samples: DepthSamples, plane: F8, tolerance: float) -> int:
+    """Count the samples near a plane."""
+    first = np.int64(0)  # a literal would be compiled apart
+    return int(_count_part(samples, plane, tolerance, first, samples.inverse_depth.size))
 
 
 @kernel(fast=True)
-def count_inliers(samples: DepthSamples, a: float, b: float, c: float, tolerance: float) -> int:
-    """Count the readings near a plane."""
-    a4, b4, c4, gate = np.float32(a), np.float32(b), np.float32(c), np.float32(tolerance)
-    total = np.int32(0)
-    for k in range(samples.inverse_depth.size):
-        level = a4 * samples.j[k] + b4 * samples.i[k] + c4
-        total += np.int32(abs(samples.inverse_depth[k] - level) < gate)
+def _count_part(samples: DepthSamples, plane: F8, tolerance: float, start: int, stop: int) -> int:
+    """Count the samples near a plane from place ``start`` to ``stop`` in the list."""
+    j, i, inv_depth = samples.j, samples.i, samples.inverse_depth
+    a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
+    gate, total = np.float32(tolerance), np.int32(0)
+    for k in range(np.uint64(start), np.uint64(stop)):  # signed ones may count from the end
+        total += np.int32(abs(inv_depth[k] - (a * j[k] + b * i[k] + c)) < gate)
     return int(total)
 
 
 @kernel(fast=True)
-def refine(j: F4, i: F4, inv_depth: F4, tolerance: float, plane: F8) -> int:
+def refine(samples: DepthSamples, tolerance: float, plane: F8) -> int:
     """Fit a plane (a, b, c) to its inliers by least squares; return how many they are.
 
     The plane stays as it is if they do not span one.
     """
+    j, i, inv_depth = samples.j, samples.i, samples.inverse_depth
     if inv_depth.size == 0:
         return 0
     a, b, c = plane[0], plane[1], plane[2]
@@ -253,8 +238,7 @@ def refine(j: F4, i: F4, inv_depth: F4, tolerance: float, plane: F8) -> int:
     xw, yw = xw / n - mx * mw, yw / n - my * mw
     determinant = xx * yy - xy * xy
     if determinant > 1e-6 * (xx + yy) ** 2:
-        a = (xw * yy - yw * xy) / determinant
-        b = (yw * xx - xw * xy) / determinant
-        plane[0], plane[1] = a, b
-        plane[2] = w0 + mw - a * (mx + j0) - b * (my + i0)
+        plane[0] = (xw * yy - yw * xy) / determinant
+        plane[1] = (yw * xx - xw * xy) / determinant
+        plane[2] = w0 + mw - plane[0] * (mx + j0) - plane[1] * (my + i0)
     return int(n)

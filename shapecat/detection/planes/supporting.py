@@ -4,36 +4,25 @@ import math
 
 import numpy as np
 
-from shapecat.arrays import F4, F8
+from shapecat.arrays import F4
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
-from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN, SupportingPlane, outline_corners
-from shapecat.detection.planes.ransac import INLIER_TOLERANCE, DepthSamples
-from shapecat.geometry import NEAREST_M, level_axes
+from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN, PlaneCandidate, SupportingPlane
+from shapecat.detection.planes.ransac import DepthSamples
+from shapecat.detection.planes.settings import PLANES
+from shapecat.geometry import NEAREST_M
 from shapecat.jit import kernel
 
-__all__ = ["SURE_AREA_M2", "supporting_planes"]
+__all__ = ["supporting_planes"]
 
-SURE_AREA_M2 = 0.25
-"""Planes larger than this are furniture, whatever is under their edge."""
-LIKELY_AREA_M2 = 0.1
-"""Planes larger than this are furniture if nothing is seen of what is under their edge."""
-BOARD_AREA_M2 = 0.03
-"""Smaller planes are no furniture but for the lowest one, a floor that the table leaves to see."""
-LEAST_DROP_M = 0.06
-"""Lower things are objects."""
-STEP_M, EDGE_STEPS = 0.01, 5
-"""Length of a step, and how many of them from a cell towards the camera its plane may end after."""
-FIRST, LAST, WALL_M = 4, 20, 0.03
-"""Steps down from the edge between which it is looked for a wall; how far readings lie off one."""
-LEAST_DROPS, CLOSED = 20, 0.5
-"""Readings below the edge that say enough, and the share of them on a wall that closes a box."""
+BESIDE, DOWN = 5, 20
+"""Steps from a sample towards the camera after which its plane may end, and steps down from there
+that are looked at."""
+LEAST_BELOW = 20
+"""Samples below an edge that say enough."""
 
 
 def supporting_planes(
-    grid: DepthGrid,
-    found: list[tuple[SupportingPlane, DepthSamples]],
-    covered_m2: F8,
-    tallest_m: float,
+    grid: DepthGrid, found: list[PlaneCandidate], tallest_m: float
 ) -> list[SupportingPlane]:
     """Leave out the tops of objects.
 
@@ -43,96 +32,91 @@ def supporting_planes(
 
     Parameters
     ----------
-    found : planes, lowest first, with their readings.
-    covered_m2 : (n,) what of each lies under things, and counts as seen.
+    found : planes, lowest first. What of each lies under things counts as seen.
     tallest_m : height of the tallest object.
     """
     kept: list[SupportingPlane] = []
-    for (support, samples), covered in zip(found, covered_m2, strict=True):
-        area_m2 = support.area_m2 + covered
-        drop = math.inf
-        for lower in kept:
-            drop = support.offset - lower.offset if _overlaps(lower, support) else drop
-        if drop < LEAST_DROP_M or (len(kept) > 0 and area_m2 < BOARD_AREA_M2):
+    for plane, samples, covered_m2 in found:
+        area_m2 = plane.area_m2 + covered_m2
+        drops = [plane.offset - lower.offset for lower in kept if _overlaps(lower, plane)]
+        drop = drops[-1] if drops else math.inf
+        if drop < PLANES.least_drop_m or (kept and area_m2 < PLANES.board_m2):
             continue
-        if drop <= tallest_m and area_m2 < SURE_AREA_M2:
-            plane = np.array([support.a, support.b, support.c])
-            on_wall, beyond = _drop(
-                grid.inverse_depth, grid.intrinsics, samples, plane, support.up, drop
-            )
-            if on_wall + beyond >= LEAST_DROPS:
-                if on_wall > CLOSED * (on_wall + beyond):
-                    continue
-            elif area_m2 < LIKELY_AREA_M2:
-                continue
-        kept.append(support)
+        if drop > tallest_m or area_m2 >= PLANES.furniture_m2:
+            kept.append(plane)
+            continue
+        on_wall, beyond = _look_below(grid, samples, plane, drop)
+        enough = on_wall + beyond >= LEAST_BELOW
+        closed = enough and on_wall > PLANES.closed * (on_wall + beyond)
+        if not closed and (enough or area_m2 >= PLANES.likely_m2):
+            kept.append(plane)
     return kept
 
 
-@kernel
 def _overlaps(lower: SupportingPlane, upper: SupportingPlane) -> bool:
-    """Whether the middle of ``upper`` lies over the outline of ``lower``."""
-    middle = np.sum(outline_corners(upper), axis=0) / DIRECTIONS
-    axes = level_axes(lower.up[0], lower.up[1], lower.up[2])
-    x = axes[0][0] * middle[0] + axes[0][1] * middle[1] + axes[0][2] * middle[2]
-    y = axes[1][0] * middle[0] + axes[1][1] * middle[1] + axes[1][2] * middle[2]
+    """Whether the middle (Steiner point) of a plane is over the outline of a parallel one."""
+    x, y = upper.extent @ COS * 2 / DIRECTIONS, upper.extent @ SIN * 2 / DIRECTIONS
     return bool(np.all(COS * x + SIN * y < lower.extent))
 
 
 @kernel
-def _drop(
-    inv_depth: F4,
-    intrinsics: PinholeIntrinsics,
-    samples: DepthSamples,
-    plane: F8,
-    up: F8,
-    drop: float,
+def _look_below(
+    grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane, drop: float
 ) -> tuple[int, int]:
-    """Look below the edge of a plane: count readings on a wall down from it, and beyond it."""
-    rows, columns = inv_depth.shape
-    on_wall = farther = 0
-    for k in range(0, samples.inverse_depth.size, 3):
+    """Look below the edge of a plane: count samples on a wall down from it, and beyond it."""
+    on_wall = beyond = 0
+    for k in range(samples.inverse_depth.size):
         i, j = samples.i[k], samples.j[k]
-        level = plane[0] * j + plane[1] * i + plane[2]
-        if level <= 0 or abs(samples.inverse_depth[k] - level) >= INLIER_TOLERANCE:
+        level = plane.a * j + plane.b * i + plane.c
+        if level <= 0 or abs(samples.inverse_depth[k] - level) >= PLANES.tolerance:
             continue
-        z = 1 / level
-        x, y = (j - intrinsics.cx) / intrinsics.fx * z, (i - intrinsics.cy) / intrinsics.fy * z
-        # Towards the camera, along the plane.
-        h = x * up[0] + y * up[1] + z * up[2]
-        tx, ty, tz = h * up[0] - x, h * up[1] - y, h * up[2] - z
-        length = math.sqrt(tx * tx + ty * ty + tz * tz)
-        if length < 0.1 or z < 0.2:
+        x, y, z = _to_edge(grid, plane, i, j, 1 / level)
+        if z == 0:
             continue
-        tx, ty, tz = STEP_M * tx / length, STEP_M * ty / length, STEP_M * tz / length
-        edge = False
-        for _ in range(EDGE_STEPS):
-            v = int(intrinsics.cy + intrinsics.fy * (y + ty) / (z + tz) + 0.5)
-            u = int(intrinsics.cx + intrinsics.fx * (x + tx) / (z + tz) + 0.5)
-            if v < 0 or u < 0 or v >= rows or u >= columns or inv_depth[v, u] <= 0:
+        for step in range(4, min(DOWN, int(drop / PLANES.step_m))):  # an edge is rounded
+            s = PLANES.step_m * step
+            dx, dy, dz = x - s * plane.up[0], y - s * plane.up[1], z - s * plane.up[2]
+            seen = _inverse_depth_at(grid.inverse_depth, grid.intrinsics, dx, dy, dz)
+            if seen < 0:
                 break
-            ahead = inv_depth[v, u] - 1 / (z + tz)
-            edge = ahead < -2 * INLIER_TOLERANCE
-            if edge or ahead > 2 * INLIER_TOLERANCE:  # the end of the plane, or something on it
-                break
-            x, y, z = x + tx, y + ty, z + tz
-        if not edge:
-            continue
-        for step in range(FIRST, LAST):
-            s = STEP_M * step
-            if s > drop - STEP_M:
-                break
-            dx, dy, dz = x - s * up[0], y - s * up[1], z - s * up[2]
-            if dz <= NEAREST_M:
-                break
-            v, u = (
-                int(intrinsics.cy + intrinsics.fy * dy / dz + 0.5),
-                int(intrinsics.cx + intrinsics.fx * dx / dz + 0.5),
-            )
-            if v < 0 or u < 0 or v >= rows or u >= columns:
-                break
-            if inv_depth[v, u] > 0:
-                behind = 1 / inv_depth[v, u] - dz
-                on_wall += abs(behind) < WALL_M
-                farther += behind >= WALL_M
-    return on_wall, farther
+            if seen > 0:
+                behind = 1 / seen - dz
+                on_wall += abs(behind) < PLANES.wall_m
+                beyond += behind >= PLANES.wall_m
+    return on_wall, beyond
+
+
+@kernel
+def _to_edge(
+    grid: DepthGrid, plane: SupportingPlane, i: float, j: float, z: float
+) -> tuple[float, float, float]:
+    """Go along a plane towards the camera; return where it ends, zeros if it does not, metres."""
+    k, up = grid.intrinsics, plane.up
+    x, y = (j - k.cx) / k.fx * z, (i - k.cy) / k.fy * z
+    h = x * up[0] + y * up[1] + z * up[2]
+    tx, ty, tz = h * up[0] - x, h * up[1] - y, h * up[2] - z
+    length = math.sqrt(tx * tx + ty * ty + tz * tz)
+    step = PLANES.step_m / max(length, PLANES.step_m)
+    for _ in range(BESIDE):
+        seen = _inverse_depth_at(grid.inverse_depth, k, x + step * tx, y + step * ty, z + step * tz)
+        ahead = seen - 1 / (z + step * tz)
+        if seen > 0 and ahead < -2 * PLANES.tolerance:
+            return x, y, z
+        if seen <= 0 or ahead > 2 * PLANES.tolerance:  # nothing is known, or something is on it
+            break
+        x, y, z = x + step * tx, y + step * ty, z + step * tz
+    return 0.0, 0.0, 0.0
+
+
+@kernel
+def _inverse_depth_at(
+    inv_depth: F4, intrinsics: PinholeIntrinsics, x: float, y: float, z: float
+) -> float:
+    """Return what is seen in the direction of a point; -1 outside the image."""
+    if z <= NEAREST_M:
+        return -1.0
+    v = int(intrinsics.cy + intrinsics.fy * y / z + 0.5)
+    u = int(intrinsics.cx + intrinsics.fx * x / z + 0.5)
+    if v < 0 or u < 0 or v >= inv_depth.shape[0] or u >= inv_depth.shape[1]:
+        return -1.0
+    return float(inv_depth[v, u])

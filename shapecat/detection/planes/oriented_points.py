@@ -1,0 +1,107 @@
+"""Oriented points: where smooth surface is, and which way it faces, for every third sample."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, F8
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.planes.ransac import DepthSamples
+from shapecat.detection.planes.settings import PLANES
+from shapecat.geometry import DISCONTINUITY
+from shapecat.jit import kernel
+
+__all__ = ["OrientedPoints", "level_samples", "orient_points"]
+
+STRIDE = 3
+"""Samples from one point to the next, and over which its surface is seen to be smooth: less tells
+the tilt of a noisy surface too badly, more leaves no point on narrow boards."""
+FIRST = STRIDE // 2
+"""First row and column of points."""
+
+
+class OrientedPoints(NamedTuple):
+    """The points of n samples, row by row.
+
+    Attributes
+    ----------
+    inverse_depth : (rows, columns) float32, 1/m, of every third sample.
+    normals : (3, n) float32 unit vectors towards the camera; 0 where no smooth surface is seen.
+    positions : (3, n) float32, metres, sensor frame; 0 where nothing is seen.
+    smooth : how many are on smooth surface.
+    """
+
+    inverse_depth: F4
+    normals: F4
+    positions: F4
+    smooth: int
+
+
+def orient_points(grid: DepthGrid) -> OrientedPoints:
+    """Return the normal of every third sample that lies on a plane with those around it."""
+    coarse = np.ascontiguousarray(grid.inverse_depth[FIRST::STRIDE, FIRST::STRIDE])
+    normals, positions = np.zeros((2, 3, coarse.size), np.float32)
+    smooth = _orient(coarse, grid.intrinsics, normals, positions)
+    return OrientedPoints(coarse, normals, positions, smooth)
+
+
+@kernel
+def _orient(coarse: F4, intrinsics: PinholeIntrinsics, normals: F4, positions: F4) -> int:
+    """Write the normals and positions; return how many there are."""
+    rows, columns = coarse.shape
+    x = np.zeros(columns, np.float32)
+    for c in range(columns):
+        x[c] = (c * STRIDE + FIRST - intrinsics.cx) / intrinsics.fx
+    smooth = 0
+    for r in range(1, rows - 1):
+        y = np.float32((r * STRIDE + FIRST - intrinsics.cy) / intrinsics.fy)
+        smooth += _orient_row(coarse, r, y, x, (intrinsics.fx, intrinsics.fy), normals, positions)
+    return smooth
+
+
+@kernel(fast=True)
+def _orient_row(
+    coarse: F4, r: int, y: float, x: F4, focal: tuple[float, float], normals: F4, positions: F4
+) -> int:
+    """Write the points of a row; return how many are on smooth surface. The loop vectorises."""
+    zero, one, two = np.float32(0), np.float32(1), np.float32(2)
+    bend, count = np.float32(2 * DISCONTINUITY), np.int32(0)
+    across, down = np.float32(focal[0] / (2 * STRIDE)), np.float32(focal[1] / (2 * STRIDE))
+    above, here, below = coarse[r - 1], coarse[r], coarse[r + 1]
+    row = slice(r * here.size, (r + 1) * here.size)
+    nx, ny, nz = normals[0][row], normals[1][row], normals[2][row]
+    px, py, pz = positions[0][row], positions[1][row], positions[2][row]
+    for c in range(1, here.size - 1):
+        center, left, right, top, bottom = here[c], here[c - 1], here[c + 1], above[c], below[c]
+        smooth = (center > 0) & (left > 0) & (right > 0) & (top > 0) & (bottom > 0)
+        smooth &= abs(left + right - two * center) <= bend
+        smooth &= abs(top + bottom - two * center) <= bend
+        count += np.int32(smooth)
+        a, b = across * (left - right), down * (top - bottom)
+        d = -a * x[c] - b * y - center
+        scale, z = one / np.sqrt(a * a + b * b + d * d), one / center
+        scale = scale if smooth else zero
+        nx[c], ny[c], nz[c] = scale * a, scale * b, scale * d
+        z = z if center > 0 else zero
+        px[c], py[c], pz[c] = x[c] * z, y * z, z
+    return int(count)
+
+
+@kernel
+def level_samples(points: OrientedPoints, up: F8) -> tuple[DepthSamples, F4]:
+    """Return the samples of points that face up within 25 degrees, and their heights."""
+    coarse, normals, positions = points.inverse_depth, points.normals, points.positions
+    rows, columns = coarse.shape
+    x, y, z = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])
+    found = np.zeros((4, points.smooth + 1), np.float32)
+    least, n = np.float32(PLANES.level_cos), 0
+    for r in range(rows):
+        for c in range(columns):
+            k = r * columns + c
+            if normals[0, k] * x + normals[1, k] * y + normals[2, k] * z > least:
+                found[0, n], found[1, n] = c * STRIDE + FIRST, r * STRIDE + FIRST
+                found[2, n] = coarse[r, c]
+                found[3, n] = positions[0, k] * x + positions[1, k] * y + positions[2, k] * z
+                n += 1
+    samples = DepthSamples(found[0][:n], found[1][:n], found[2][:n], STRIDE * STRIDE)
+    return samples, found[3][:n]

@@ -1,0 +1,203 @@
+"""Planes by height alone: boards and tables of which narrow strips are seen.
+
+A strip is too narrow for its tilt to be told: a table between the flat boxes that cover it, or a
+board just below the camera that fills a few rows of the image. By height the samples of it lie
+within millimetres, so where the up direction is known, height alone is left to be found.
+"""
+
+from functools import partial
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, Bool
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.planes.extent import (
+    COS,
+    SIN,
+    PlaneCandidate,
+    SupportingPlane,
+    measure_plane,
+    outline_corners,
+)
+from shapecat.detection.planes.oriented_points import OrientedPoints
+from shapecat.detection.planes.ransac import DepthSamples, horizontal_plane
+from shapecat.detection.planes.settings import PLANES, STRIPS
+from shapecat.geometry import gravity_rotation
+from shapecat.jit import kernel, unset
+
+__all__ = ["add_strip_planes", "may_have_strips"]
+
+APART = 2
+"""Columns between the samples that are looked at."""
+ARM = 2
+"""Cells to each side over which a strip is seen to be level."""
+BINS = 600
+"""Of `StripSettings.bin_m`: no table is more than 3 m below the camera."""
+
+
+def may_have_strips(grid: DepthGrid, points: OrientedPoints, found: list[PlaneCandidate]) -> bool:
+    """Whether many points lie at a height where strips of a plane may be, with few below it."""
+    count = _count_by_height(points, found[0].plane.up)
+    return any(_may_be_strips(grid, found, peak) for peak in _peaks(count, STRIPS.least_points))
+
+
+def _may_be_strips(grid: DepthGrid, found: list[PlaneCandidate], height: float) -> bool:
+    """Whether a board at a height is seen at a grazing angle, or covered by what has tops above."""
+    large = [one.plane.offset for one in found if one.plane.area_m2 > PLANES.likely_m2]
+    up = found[0].plane.up
+    if height > up[1] / (grid.intrinsics.fy * STRIPS.grazing):
+        return all(abs(offset - height) > STRIPS.same_m for offset in large)
+    below = any(-STRIPS.same_m < height - offset < PLANES.borne_m for offset in large)
+    return not below and _is_under_one(found, height)
+
+
+def _is_under_one(found: list[PlaneCandidate], height: float) -> bool:
+    return any(STRIPS.same_m < one.plane.offset - height < STRIPS.tallest_m for one in found)
+
+
+def add_strip_planes(grid: DepthGrid, found: list[PlaneCandidate]) -> list[PlaneCandidate]:
+    """Add the planes of which strips are seen.
+
+    They have next to nothing below. A board shows some surface, a covered table more of it just
+    above, on the things that cover it.
+
+    Parameters
+    ----------
+    found : parallel planes, lowest first, at least one. One that is known may reach farther.
+    """
+    up = max(found, key=lambda one: one.plane.area_m2).plane.up
+    strips, area = _level_strips(grid.inverse_depth, grid.intrinsics, up)
+    planes = list(found)
+    for height in filter(partial(_may_be_strips, grid, found), _peaks(area, STRIPS.least_m2)):
+        new = _plane_at(grid, strips, up, height)
+        same = [k for k in planes if abs(k.plane.offset - new.plane.offset) < STRIPS.same_m]
+        if _is_under_one(found, height):
+            new = _covered(new, strips, grid.intrinsics)
+        if new.covered_m2 > 0:
+            new = _widened(same[0], new) if same else new
+        elif new.plane.area_m2 < max([PLANES.least_m2, *(k.plane.area_m2 for k in same)]):
+            continue
+        planes = [one for one in planes if not any(one is k for k in same)] + [new]
+    return sorted(planes, key=lambda one: one.plane.offset)
+
+
+def _widened(known: PlaneCandidate, table: PlaneCandidate) -> PlaneCandidate:
+    extent = np.maximum(known.plane.extent, table.plane.extent)
+    return known._replace(plane=known.plane._replace(extent=extent), covered_m2=table.covered_m2)
+
+
+def _plane_at(grid: DepthGrid, strips: F4, up: F8, height: float) -> PlaneCandidate:
+    """Measure the level plane of the strips at a height."""
+    near = np.ascontiguousarray(strips[:, abs(strips[3] - height) < 1.5 * STRIPS.bin_m])
+    offset = float(np.median(near[3])) if near.size else height
+    samples = DepthSamples(near[0], near[1], near[2], APART)
+    plane = measure_plane(grid, samples, horizontal_plane(grid.intrinsics, up, offset))
+    return PlaneCandidate(plane, samples)
+
+
+def _covered(seen: PlaneCandidate, strips: F4, intrinsics: PinholeIntrinsics) -> PlaneCandidate:
+    """Measure what of a plane is covered: nothing where most of its outline is seen."""
+    plane = seen.plane
+    corners = outline_corners(plane)
+    turned = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
+    outline_m2 = abs(float(turned @ plane.up)) / 2
+    borne_m2 = _area_over(strips, intrinsics, plane)
+    covers = plane.area_m2 < STRIPS.most_seen * outline_m2
+    covers &= borne_m2 >= max(PLANES.least_m2, plane.area_m2 / 2)
+    return seen._replace(covered_m2=borne_m2 + outline_m2 if covers else 0.0)
+
+
+def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane) -> float:
+    """Return how much level surface lies over the outline of a plane, m²."""
+    j, i, inv_depth, _ = strips.astype(np.float64)
+    x, y = (j - intrinsics.cx) / intrinsics.fx, (i - intrinsics.cy) / intrinsics.fy
+    level = gravity_rotation(plane.up) @ (np.stack([x, y, np.ones(j.size)]) / inv_depth)
+    above = level[2] - plane.offset
+    over = (above > STRIPS.same_m) & (above < STRIPS.tallest_m)
+    over &= (COS[:, None] * level[0] + SIN[:, None] * level[1] < plane.extent[:, None]).all(axis=0)
+    facing = np.maximum(-level[2] * inv_depth, STRIPS.least_rise)
+    return float((APART / (intrinsics.fx * intrinsics.fy * facing * inv_depth**2))[over].sum())
+
+
+@kernel
+def _peaks(amount: F8, least: float) -> F8:
+    """Return the heights (n,), ascending, of level surface with next to nothing below.
+
+    Parameters
+    ----------
+    amount : (BINS,) of surface by height, the lowest first.
+    least : of a peak, with the bins beside it.
+    """
+    peaks, n, bins = np.zeros(BINS), 0, STRIPS.below - 2
+    for k in range(STRIPS.below, BINS - 3):
+        here, own = amount[k], amount[k - 1] + amount[k] + amount[k + 1]
+        if own <= least or here < amount[k - 1] or here < amount[k + 1]:
+            continue
+        lower = 0.0
+        for m in range(k - STRIPS.below, k - 2):
+            lower += 3 * amount[m] / bins
+        falls = np.min(amount[k + 1 : k + 4]) < STRIPS.dip * here
+        if falls and own > STRIPS.contrast * lower:
+            peaks[n] = (k + 0.5 - BINS) * STRIPS.bin_m
+            n += 1
+    return peaks[:n]
+
+
+@kernel
+def _count_by_height(points: OrientedPoints, up: F8) -> F8:
+    """Count the points (BINS,) by height, the lowest first."""
+    x, y, z = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])
+    xs, ys, zs = points.positions[0], points.positions[1], points.positions[2]
+    count, scale = np.zeros(BINS), np.float32(-1 / STRIPS.bin_m)
+    for k in range(xs.size):
+        below = scale * (x * xs[k] + y * ys[k] + z * zs[k])
+        if (below > 0) & (below < BINS):
+            count[BINS - 1 - int(below)] += 1
+    return count
+
+
+@kernel
+def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple[F4, F8]:
+    """Return the columns, rows, inverse depths and heights (4, n) of samples on level surface.
+
+    Compared with cells beside them, most of these are nearer to level than to upright. With them
+    the area (BINS,) of their surface by height, the lowest first, m².
+    """
+    rows, columns = inv_depth.shape
+    across, down = np.float32(up[0] / intrinsics.fx), np.float32(up[1] / intrinsics.fy)
+    ahead = up[2] - intrinsics.cx * across - intrinsics.cy * down
+    level, area = np.zeros(columns, np.bool_), np.zeros(BINS)
+    found = unset((4, inv_depth.size // APART + rows), np.float32)
+    n = 0
+    for i in range(ARM, rows - ARM):
+        start = np.float32(ahead + i * down)
+        _find_level(inv_depth, i, (start, across, down), level)
+        for j in range(ARM, columns - ARM, APART):
+            if level[j]:
+                w, rise = inv_depth[i, j], start + across * np.float32(j)
+                found[0, n], found[1, n], found[2, n], found[3, n] = j, i, w, rise / w
+                facing = max(float(-rise), STRIPS.least_rise) * intrinsics.fx * intrinsics.fy
+                area[BINS - 1 - int(-rise / w / STRIPS.bin_m)] += APART / (facing * w * w)
+                n += 1
+    return found[:, :n].copy(), area
+
+
+@kernel(fast=True)
+def _find_level(inv_depth: F4, i: int, slope: tuple[float, float, float], level: Bool) -> None:
+    """Mark the cells of a row on level surface; the loop vectorises."""
+    start, across, down = slope
+    steep = np.float32(0.5 * ARM) * np.sqrt(across * across + down * down)
+    side, along = np.float32(ARM) * across, np.float32(ARM) * down
+    least, gate = np.float32(-STRIPS.least_depth_m), np.float32(-PLANES.tolerance / 2)
+    deepest = np.float32((1 - BINS) * STRIPS.bin_m)
+    here, above, below = inv_depth[i], inv_depth[i - ARM], inv_depth[i + ARM]
+    for j in range(ARM, level.size - ARM):
+        # On a level surface w / rise is the same everywhere.
+        w, rise = here[j], start + across * np.float32(j)
+        straight, flat, product = steep * w, gate * rise, w * rise
+        limit = straight if straight > flat else flat
+        near = np.uint8(abs(above[j] * rise - (product - w * along)) < limit)
+        near += np.uint8(abs(below[j] * rise - (product + w * along)) < limit)
+        near += np.uint8(abs(here[j - ARM] * rise - (product - w * side)) < limit)
+        near += np.uint8(abs(here[j + ARM] * rise - (product + w * side)) < limit)
+        level[j] = (near >= 3) & (rise < least) & (rise > deepest * w)
