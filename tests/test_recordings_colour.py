@@ -85,6 +85,7 @@ def beside(path: Path, *more: tuple[str, int, Any], frame_id: str = "color_optic
         ("rgba8", np.concatenate([gradient(), np.full((48, 64, 1), 7, np.uint8)], axis=-1)),
         ("bgra8", np.concatenate([gradient()[..., ::-1], np.zeros((48, 64, 1), "u1")], axis=-1)),
         ("rgb16", gradient().astype("<u2") * 256 + 99),
+        ("bgr16", gradient()[..., ::-1].astype("<u2") * 256 + 99),
     ],
 )
 def test_raw_images_of_every_channel_order_give_the_same_pixels(encoding: str, data: Any) -> None:
@@ -109,6 +110,39 @@ def test_mosaics_and_brightness_with_chroma_become_colours() -> None:
         found = ColourImage("", 0, 0, "", encoding, width, 6, data.shape[1], data.tobytes())
         pixels = pixels_of(found).astype(int)
         assert np.abs(pixels - [red, green, blue]).max() <= 2
+
+
+@pytest.mark.parametrize(
+    ("encoding", "red_at", "blue_at"),
+    [
+        ("bayer_rggb8", (0, 0), (1, 1)),
+        ("bayer_grbg8", (0, 1), (1, 0)),
+        ("bayer_gbrg8", (1, 0), (0, 1)),
+        ("bayer_bggr8", (1, 1), (0, 0)),
+    ],
+)
+def test_every_mosaic_has_red_where_its_name_says(
+    encoding: str, red_at: tuple[int, int], blue_at: tuple[int, int]
+) -> None:
+    mosaic = np.full((6, 8), 120, np.uint8)
+    mosaic[red_at[0] :: 2, red_at[1] :: 2] = 200
+    mosaic[blue_at[0] :: 2, blue_at[1] :: 2] = 40
+    found = ColourImage("", 0, 0, "", encoding, 8, 6, 8, mosaic.tobytes())
+
+    assert np.abs(pixels_of(found).astype(int) - [200, 120, 40]).max() <= 2
+
+
+@pytest.mark.parametrize("encoding", ["yuv422", "uyvy", "yuv422_yuy2", "yuyv"])
+def test_brightness_comes_where_the_encoding_says(encoding: str) -> None:
+    """UYVY is the order of yuv422, YUYV that of yuv422_yuy2."""
+    red, green, blue = 200, 120, 40
+    y = 0.299 * red + 0.587 * green + 0.114 * blue
+    u, v = 128 + 0.564 * (blue - y), 128 + 0.713 * (red - y)
+    pair = [y, u, y, v] if encoding in {"yuyv", "yuv422_yuy2"} else [u, y, v, y]
+    data = np.tile(np.round(pair), (6, 4)).astype(np.uint8)
+    found = ColourImage("", 0, 0, "", encoding, 8, 6, 16, data.tobytes())
+
+    assert np.abs(pixels_of(found).astype(int) - [red, green, blue]).max() <= 2
 
 
 def test_packed_colours_of_points_are_read_by_their_own_offset() -> None:
