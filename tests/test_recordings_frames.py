@@ -22,6 +22,7 @@ from shapecat.recordings import (
 from shapecat.recordings.compressed_depth import depth_of_compressed
 from shapecat.recordings.pinhole import fit_pinhole, still_fits
 from shapecat.recordings.pointcloud2 import cloud_points
+from shapecat.recordings.sources import DepthSource
 from shapecat.types import Camera, Frame
 from tests.messages import (
     CAMERA,
@@ -485,3 +486,22 @@ def test_recorded_clouds_match_the_depth_images(name: str) -> None:
         np.testing.assert_allclose(frame.depth, same.depth, atol=2e-7)
         for field in ("fx", "fy", "cx", "cy"):
             assert abs(getattr(frame.camera, field) - getattr(same.camera, field)) < 0.05
+
+
+def test_an_image_waits_no_longer_than_for_its_own_calibration(tmp_path: Path) -> None:
+    """With several streams, one that came a frame late would be out of order."""
+    items = [
+        ("/depth/image", 0, image(EPOCH, wavy_depth())),
+        ("/depth/camera_info", 1, info(EPOCH)),
+        ("/depth/image", 2, image(EPOCH + 5, wavy_depth())),
+        ("/depth/camera_info", 3, info(EPOCH + 5)),
+    ]
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        (stream,) = choose_streams(recording)
+        source, skipped = DepthSource(recording, stream), Counter[str]()
+        given = []
+        for message in recording.messages():
+            take = source.calibrate if message.topic.endswith("info") else source.read
+            given.append([frame.stamp_ns for frame in take(message, skipped)])
+
+    assert given == [[], [EPOCH], [], [EPOCH + 5]]

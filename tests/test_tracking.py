@@ -25,6 +25,7 @@ from shapecat.tracking.association import assign, size_key
 from shapecat.tracking.common_motion import find_common_motion
 from shapecat.tracking.fusion import fuse_novelty, view_weights
 from shapecat.tracking.hits import Hits
+from shapecat.tracking.recording import _without_gaps
 
 SETTINGS = TrackingSettings()
 SECOND = 1_000_000_000
@@ -514,3 +515,24 @@ def test_weights_of_views_reach_the_posterior_of_a_track() -> None:
     share = (3 * np.log(CUP) + 0.75 * np.log(BOX)) / 3.75
     np.testing.assert_allclose(track.posterior, np.exp(share) / np.exp(share).sum(), atol=1e-9)
     assert track.posterior[0] > 0.75
+
+
+@pytest.mark.parametrize(
+    ("period_s", "missing", "parts"),
+    [
+        (1.0, 0, 1),  # single pictures, one a second: slow, but nothing was missed
+        (0.05, 8, 1),  # eight frames of a fast camera are not half a second
+        (0.1, 8, 2),
+    ],
+)
+def test_only_a_long_gap_of_several_frames_splits_a_track(
+    period_s: float, missing: int, parts: int
+) -> None:
+    seen = [k for k in range(20) if not 6 <= k < 6 + missing]
+    frames = [
+        frame(k, [[0.0, 0, 0]] if k in seen else [], stamp_ns=round(k * period_s * SECOND))
+        for k in range(20)
+    ]
+    found = _without_gaps(Hits.of(frames), np.arange(len(seen)))
+
+    assert [len(part) for part in found] == ([20 - missing] if parts == 1 else [6, 14 - missing])
