@@ -6,6 +6,7 @@ import numpy as np
 import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_allclose
+from scipy.spatial.transform import Rotation
 
 from benchmarks.boxes import Upright, overlap
 from shapecat.completion import complete
@@ -189,3 +190,22 @@ def test_a_track_has_one_full_size(guessed_run: Path) -> None:
     assert len(sizes) > 3
     assert all(len(found) == 1 for found in sizes.values())
     assert all(min(row["size_full"]) > 0 for row in detections)
+
+
+def test_a_quarter_turn_exchanges_length_and_width() -> None:
+    """Half of the views call the longer side the second one: the box stays the same box."""
+    size, yaw = np.array([0.06, 0.15, 0.2]), 0.3
+    turns = [yaw + np.pi / 2 * (k % 2) for k in range(6)]
+    sizes = np.array([size[[1, 0, 2]] if k % 2 else size for k in range(6)])
+    axes = Rotation.from_euler("z", np.array(turns)[:, None]).as_matrix()
+    views = BoxViews(np.zeros((6, 3)), axes, sizes, np.tile([0.01, 0.03, 0.02], (6, 1)))
+
+    fused = fuse_boxes(views, np.zeros(6, bool))
+
+    along = np.array([np.cos(yaw), np.sin(yaw), 0.0])  # the shorter side lies along it
+    for lengths, turned in zip(fused.sizes, fused.axes, strict=True):
+        first = int(np.argmax(np.abs(along @ turned)))
+        assert abs(along @ turned[:, first]) == pytest.approx(1, abs=1e-6)
+        assert lengths[first] == pytest.approx(0.06)
+        assert lengths[1 - first] == pytest.approx(0.15)
+        assert lengths[2] == pytest.approx(0.2)

@@ -47,7 +47,7 @@ POSTERIORS = np.array(
 """Of each object, in even and in odd frames."""
 PARTIAL = [False, True, False, False, True, False]
 """In which frames the image cuts the first object."""
-NOVELTIES = np.array([[0.9 if cut else 0.4, 0.3, 2.5] for cut in PARTIAL])
+NOVELTIES = np.array([[0.9 if cut else 0.4, 0.3, 1.2] for cut in PARTIAL])
 """By frame and object: a cut view looks stranger than it is."""
 SIZE = np.array([0.06, 0.11, 0.19])
 

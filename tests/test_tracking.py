@@ -536,3 +536,14 @@ def test_only_a_long_gap_of_several_frames_splits_a_track(
     found = _without_gaps(Hits.of(frames), np.arange(len(seen)))
 
     assert [len(part) for part in found] == ([20 - missing] if parts == 1 else [6, 14 - missing])
+
+
+@pytest.mark.parametrize(("hits", "alive"), [(2, 1), (3, 0)])
+def test_a_track_that_has_proved_itself_ends_by_time_alone(hits: int, alive: int) -> None:
+    """After ``min_hits`` detections no missed frame is forgiven that comes too late."""
+    tracker = Tracker(replace(SETTINGS, min_hits=3))
+    for k in range(hits):
+        step(tracker, k, [[0.0, 0, 0]], stamp_ns=2 * k * SECOND)
+    step(tracker, hits, np.zeros((0, 3)), stamp_ns=(2 * (hits - 1) + 5) * SECOND)
+
+    assert tracker.active == alive
