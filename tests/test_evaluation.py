@@ -289,7 +289,7 @@ def test_a_category_of_one_object_has_no_folds(trained: Path, tmp_path: Path) ->
 
 def test_accuracy_is_told_by_the_pose_of_the_sensor(compared: Report) -> None:
     """From above a can is a plate: one figure for all poses hides it."""
-    assert [name for name, _ in compared.breakdowns] == ["distance", "elevation", "voxels"]
+    assert [name for name, _ in compared.breakdowns] == ["distance", "elevation", "points"]
     assert sum(count for _, count, _ in compared.by_elevation) == compared.n
     assert compared.by_elevation[0][0] == "30-45°"
 
