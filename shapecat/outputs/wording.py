@@ -8,22 +8,25 @@ def caption(track: int, category: str, confidence: float) -> str:
 
     Examples
     --------
-    >>> caption(6, "cup", 0.9999)
+    >>> caption(6, "cup", 0.999)
     '#6 cup 0.99'
     """
     return f"#{track} {category} {confidence_text(confidence)}"
 
 
 def confidence_text(confidence: float) -> str:
-    """Return a confidence with two digits; less than certain is never shown as certain.
+    """Return a confidence with two digits, the same for one that tracks.csv has rounded to three.
+
+    Only what is certain to three digits is shown as certain.
 
     Examples
     --------
-    >>> confidence_text(0.9999), confidence_text(1.0)
-    ('0.99', '1.00')
+    >>> confidence_text(0.4954), confidence_text(0.495), confidence_text(0.999), confidence_text(1)
+    ('0.50', '0.50', '0.99', '1.00')
     """
-    text = f"{confidence:.2f}"
-    return "0.99" if text == "1.00" and confidence < 1 else text
+    thousandths = round(1000 * confidence)
+    hundredths = (thousandths + 5) // 10
+    return f"{min(hundredths, 99 + thousandths // 1000) / 100:.2f}"
 
 
 def plural(count: int, noun: str) -> str:

@@ -40,6 +40,7 @@ _CROWDED = 0.08
 _FAR_M = 6.0
 _SAME_SURFACE = 0.02
 """Neighbours whose depths differ by less than this share are of one surface."""
+_NEAR_TONE, _FAR_TONE = np.array([255, 238, 205]), np.array([92, 112, 168])
 _BLANK = 24
 """Grey where there is no reading."""
 _LIGHT = np.array([-0.45, -0.65, -0.62])
@@ -174,10 +175,10 @@ def _shaded(frame: Frame, window: Window) -> U1:
     towards = inverse - across * (u + left - camera.cx) - along * (v + top - camera.cy)
     normal = -np.stack([across * camera.fx, along * camera.fy, towards], axis=-1)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
-    light = 0.25 + 0.75 * np.clip(normal @ (_LIGHT / np.linalg.norm(_LIGHT)), 0, 1)
+    light = 0.3 + 0.7 * np.clip(normal @ (_LIGHT / np.linalg.norm(_LIGHT)), 0, 1)
     near, far = np.percentile(depth[valid], [2, 98])
-    fade = 1 - 0.65 * np.clip((depth - near) / max(far - near, 0.05), 0, 1)
-    tone = (light * fade)[..., None] * np.array([238.0, 242.0, 250.0])
+    share = np.clip((depth - near) / max(far - near, 0.05), 0, 1)[..., None]
+    tone = light[..., None] * (_NEAR_TONE * (1 - share) + _FAR_TONE * share)
     return np.where(valid[..., None], tone, _BLANK).astype(np.uint8)
 
 
@@ -218,10 +219,10 @@ def _window(seen: SeenFrame, mask: Mask) -> Window:
     """Return left, top, right and bottom of a square around an object, as far as the image goes."""
     height, width = seen.shape
     x, y, w, h = mask.box
-    side = max(_MARGIN * max(w, h), _LEAST_PX)
-    left = min(max(x + w / 2 - side / 2, 0), max(width - side, 0))
-    top = min(max(y + h / 2 - side / 2, 0), max(height - side, 0))
-    return round(left), round(top), round(min(left + side, width)), round(min(top + side, height))
+    side = round(max(_MARGIN * max(w, h), _LEAST_PX))
+    left = round(min(max(x + (w - side) / 2, 0), max(width - side, 0)))
+    top = round(min(max(y + (h - side) / 2, 0), max(height - side, 0)))
+    return left, top, min(left + side, width), min(top + side, height)
 
 
 def _cut(seen: SeenFrame, window: Window) -> Image.Image:
