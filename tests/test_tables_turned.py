@@ -50,6 +50,8 @@ PARTIAL = [False, True, False, False, True, False]
 NOVELTIES = np.array([[0.9 if cut else 0.4, 0.3, 1.2] for cut in PARTIAL])
 """By frame and object: a cut view looks stranger than it is."""
 SIZE = np.array([0.06, 0.11, 0.19])
+NEURONS = np.array([[0.1, 0.2, 0.3], [0.4, 0.5, 0.6], [0.7, 0.8, 0.9]])
+OUTLINE = np.array([[0.1, 0.2, 1.3], [1.4, 0.5, 1.6], [1.7, 1.8, 1.9], [0.2, 1.1, 1.2]])
 
 
 def seen(frame: int, item: int) -> Detection:
@@ -66,7 +68,7 @@ def seen(frame: int, item: int) -> Detection:
         touches_border=item == 0 and PARTIAL[frame],
         occluded=False,
     )
-    gas = NeuralGas(np.zeros((2, 3)), np.array([[0, 1]]))
+    gas = NeuralGas(NEURONS + item, np.array([[0, 2], [1, 2]]))
     full = FullBox(center, SIZE + 0.01, orientation, np.full(3, 0.005))
     posterior, novelty = POSTERIORS[frame % 2, item], float(NOVELTIES[frame, item])
     return Detection(candidate, gas, np.arange(4.0), posterior, novelty, 0.001, full)
@@ -76,11 +78,11 @@ def seen(frame: int, item: int) -> Detection:
 def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Write the tables of three objects that a moving, turned sensor sees."""
     folder = tmp_path_factory.mktemp("turned")
-    outline = np.array([[0, 0, 1], [1, 0, 1], [1, 1, 1]])
     with PerceptionTables(folder, categories=CATEGORIES, model_id="m") as tables:
         for k in range(FRAMES):
             up = TURNS[k].inv().apply(UP)
-            scene = Scene(up, (Plane(up, -0.5, outline, 0.5, 0.0),), ())
+            planes = (Plane(up, -0.5, OUTLINE, 0.7, 0.0), Plane(up, -0.2, OUTLINE + 1, 0.4, 0.3))
+            scene = Scene(up, planes, ())
             found = tuple(seen(k, item) for item in range(3))
             stamp = EPOCH + k * SECOND // 10
             perception = Perception("/depth", k, stamp, "cam", scene, found, {"detect": 0.01})
@@ -122,6 +124,37 @@ def test_centres_are_in_the_sensor_frame_and_in_the_fixed_one(run: Path) -> None
         assert_allclose(row["height_m"], TURNS[k].inv().apply(UP) @ own + 0.5, atol=1e-5)
         assert row["touches_border"] == (item == 0 and PARTIAL[k])
         assert row["category"] == ("cup", "can" if k % 2 else "cup", "unknown")[item] or k % 2
+
+
+def test_planes_keep_every_number_in_its_place(run: Path) -> None:
+    found = rows(run, "planes")
+
+    assert len(found) == 2 * FRAMES
+    for row in found:
+        k, number = row["frame"], row["plane"]
+        assert (row["topic"], row["stamp_ns"]) == ("/depth", EPOCH + k * SECOND // 10)
+        assert_allclose(row["normal"], TURNS[k].inv().apply(UP), atol=1e-6)
+        assert_allclose(row["offset"], (-0.5, -0.2)[number], rtol=1e-6)
+        assert_allclose(row["height_m"], (0.0, 0.3)[number], atol=1e-7)
+        assert_allclose(row["area_m2"], (0.7, 0.4)[number], rtol=1e-6)
+        assert_allclose(np.reshape(row["outline"], (-1, 3)), OUTLINE + number, rtol=1e-6)
+
+
+def test_lists_of_detections_are_row_by_row(run: Path) -> None:
+    """Neurons as x y z in turn, edges as pairs; and the columns that are plain numbers."""
+    for row in rows(run, "detections"):
+        item = row["detection"]
+        assert_allclose(np.reshape(row["neurons"], (-1, 3)), NEURONS + item, rtol=1e-6)
+        assert row["edges"] == [0, 2, 1, 2]
+        assert row["descriptor"] == [0, 1, 2, 3]
+        assert row["indices"] == list(range(10 * item, 10 * item + 5))
+        assert (row["points"], row["frame_id"], row["plane"]) == (5, "cam", 0)
+        assert_allclose(row["size"], SIZE, rtol=1e-6)
+        assert_allclose(row["size_full"], SIZE + 0.01, rtol=1e-6)
+        assert_allclose(row["size_full_std"], [0.005] * 3, rtol=1e-6)
+        assert_allclose(row["novelty"], NOVELTIES[row["frame"], item], rtol=1e-6)
+        best = int(np.argmax(POSTERIORS[row["frame"] % 2, item]))
+        assert row["confidence"] == pytest.approx(POSTERIORS[row["frame"] % 2, item, best])
 
 
 def test_the_tracker_sees_boxes_in_the_fixed_frame(run: Path) -> None:
