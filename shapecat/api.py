@@ -36,7 +36,7 @@ def open_run(folder: str | Path) -> Run:
 
 
 class OpenRecording:
-    """A recording to read frames from; a context manager."""
+    """An open recording; a context manager that yields frames."""
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording

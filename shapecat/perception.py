@@ -25,7 +25,7 @@ __all__ = ["Perceiver", "View", "find_up", "perceive"]
 
 
 class View(NamedTuple):
-    """A frame, where up is in it (None to estimate it), and the frames to fuse with it."""
+    """A frame, its up direction (None to estimate it), and the frames to fuse with it."""
 
     frame: Frame
     up: F4 | None
@@ -34,7 +34,7 @@ class View(NamedTuple):
 
 @dataclass(frozen=True)
 class Perceiver:
-    """Perceives frames, here or in another process, which reads the model's file itself.
+    """Perceives frames, in this or another process; each process reads the model file itself.
 
     Attributes
     ----------
@@ -124,7 +124,7 @@ def perceive(
 
 
 def find_up(frame: Frame, settings: Settings) -> F4 | None:
-    """Return the normal (3,) of the supporting planes; None if too little of any is seen."""
+    """Return the normal (3,) of the supporting planes, or None if they are too small."""
     scene = detect(frame, settings=settings.detection, rng=_rng(settings, frame, 0))
     return scene.up if sum(plane.area_m2 for plane in scene.planes) >= _TELLS_M2 else None
 
@@ -137,7 +137,7 @@ def _rng(settings: Settings, frame: Frame, item: int) -> np.random.Generator:
 def _describe_candidate(
     frame: Frame, scene: Scene, candidate: Candidate, settings: Settings, rng: np.random.Generator
 ) -> _Shape:
-    """Stand the candidate upright on z = 0, learn its surface, and describe it."""
+    """Move the candidate upright onto z = 0, learn its surface, and describe it."""
     begun = time.perf_counter()
     points = frame.xyz(candidate.indices)
     level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
@@ -155,7 +155,7 @@ def _describe_candidate(
 def _full_box(
     frame: Frame, scene: Scene, detection: Detection, categories: Sequence[str]
 ) -> FullBox | None:
-    """Estimate the whole of an object; None where fusing has left it no reading of the frame."""
+    """Estimate the full box of an object; None if no reading of the frame is left after fusion."""
     candidate = detection.candidate
     some = candidate.indices[:: max(1, -(-len(candidate.indices) // ENOUGH_POINTS))]
     if not len(some):

@@ -62,7 +62,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Shard:
-    """Part ``index`` of ``count``; counted from 0 or from 1, both name every part once."""
+    """Part ``index`` of ``count``. Counting may start at 0 or at 1."""
 
     index: int
     count: int

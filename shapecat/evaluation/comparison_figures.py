@@ -25,7 +25,7 @@ class Pairs:
     posteriors: list[Any] = field(default_factory=list)
 
     def add(self, found: Sequence[Item], true: Sequence[Item], matched: Any) -> None:
-        """Take down the pairs of a frame."""
+        """Add the pairs of a frame."""
         for i, j in matched.pairs.items():
             if true[j].decidable:
                 self.truth.append(true[j].category)

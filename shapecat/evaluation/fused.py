@@ -16,7 +16,7 @@ FUSED = (3, 10, 30)
 
 
 class Fused(NamedTuple):
-    """``groups`` of ``views`` views each, judged by their fused posterior."""
+    """Scores of ``groups`` of ``views`` views each, by their fused posterior."""
 
     views: int
     groups: int
@@ -27,7 +27,7 @@ class Fused(NamedTuple):
 def fuse_views(
     truth: I4, posteriors: F4, objects: np.ndarray, *, counts: Sequence[int] = FUSED
 ) -> tuple[Fused, ...]:
-    """Fuse the views of each object, so many at a time, in their order.
+    """Fuse the views of each object in groups, in their order.
 
     Views of one placement of an object err alike, so the product of their posteriors is tempered
     by their number, as tracks are fused by default: their plain product is far too sure of

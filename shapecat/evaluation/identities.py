@@ -17,7 +17,7 @@ _FORBIDDEN = 1e6
 
 
 class SeenTogether(NamedTuple):
-    """The true and the found objects of a frame, and how similar they are.
+    """The true and the found objects of a frame, and their similarity.
 
     ``true`` and ``found`` are identities, each once; ``similarity`` (true, found) lies within 0
     and 1, with 0 for pairs that cannot be the same object.
@@ -30,7 +30,7 @@ class SeenTogether(NamedTuple):
 
 @dataclass(frozen=True)
 class Identities:
-    """Figures of tracking over all frames; NaN without true objects."""
+    """Tracking scores over all frames; NaN without true objects."""
 
     idf1: float
     mota: float

@@ -82,7 +82,7 @@ class MaskMatches:
 
 
 def match_masks(found: Sequence[U4], true: Sequence[U4]) -> MaskMatches:
-    """Match masks, given as indices of pixels, so that the sum of their overlap F is greatest.
+    """Match masks (pixel indices) to maximise the sum of their overlap F.
 
     Source: Xie et al. 2020 (overlap F of unseen objects), after Ochs et al. 2014.
     """

@@ -37,7 +37,7 @@ class FlatForest(Record):
     left: U4 = array("n", "u4")
 
     def __post_init__(self) -> None:
-        """Check that every walk ends in a leaf, and that there are no more walks than nodes."""
+        """Check that every path ends in a leaf."""
         super().__post_init__()
         left = self.left.astype(np.int64)
         inner = np.flatnonzero(left)
@@ -57,12 +57,12 @@ class FlatForest(Record):
 
     @property
     def words(self) -> int:
-        """Number of words."""
+        """Number of leaves."""
         return int(np.count_nonzero(self.left == 0))
 
     @cached_property
     def parameters(self) -> tuple[np.ndarray, ...]:
-        """The arrays of `fall`; small types keep a large forest in the cache.
+        """The arrays for `fall`; small types keep a large forest in the cache.
 
         A leaf is its own child, so that trees of different depth are walked side by side.
         """
@@ -116,7 +116,7 @@ def fall(
     rounds: I4,
     result: I4,
 ) -> None:
-    """Write the word that x (f,) falls into in each tree into result (t,)."""
+    """Write the leaf of x (f,) in each tree to result (t,)."""
     node = np.zeros(_LANES, np.int32)
     for group in range(rounds.size):
         first = group * _LANES

@@ -1,4 +1,4 @@
-"""The recording with its annotations: every original message, and the labelled objects.
+"""The annotated recording: every original message, and the labelled objects.
 
 A finished MCAP file is copied byte for byte and extended; everything else is written anew, as
 MCAP. Annotations use the encoding of the source.
@@ -79,7 +79,7 @@ def write_annotated(
 
 @contextmanager
 def _uncollected() -> Iterator[None]:
-    """Keep the collector from looking for cycles, of which there are none, among all that lives."""
+    """Pause the garbage collector: there are no cycles to find."""
     enabled = gc.isenabled()
     gc.disable()
     try:

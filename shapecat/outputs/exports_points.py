@@ -1,4 +1,4 @@
-"""A label for every point: masks for depth images, SemanticKITTI labels for loose clouds.
+"""Point labels: masks for depth images, SemanticKITTI labels for unorganized clouds.
 
 A label is a class and an instance, the number of the track; 0 is no object. ``labels.json`` names
 the classes and says what each instance is. Source of the binary form: the description of

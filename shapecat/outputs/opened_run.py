@@ -1,4 +1,4 @@
-"""A finished run for those who program: its tables as arrays, its frames with their points."""
+"""A finished run in Python: tables as arrays, frames with points."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -24,13 +24,13 @@ __all__ = ["Run", "RunFrame", "Table"]
 
 @dataclass(frozen=True)
 class Table:
-    """A table of a run; it is read when it is asked for, columns that are named alone."""
+    """A table of a run; reads the requested columns on demand."""
 
     path: Path
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """The names of its columns."""
+        """Names of the columns."""
         return tuple(pq.read_schema(self.path).names)
 
     def arrow(self, columns: Sequence[str] | None = None) -> pa.Table:

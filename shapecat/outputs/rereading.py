@@ -39,7 +39,7 @@ class FinishedRun:
 
     @property
     def categories(self) -> tuple[str, ...]:
-        """Those of the model, and behind them those that a person has added."""
+        """The categories of the model, followed by those that a person has added."""
         known = tuple(self.run["model"]["categories"])
         added = {label.category for label in self.labels.values()} - {*known, "unknown"}
         return (*known, *sorted(added))
@@ -49,14 +49,14 @@ class FinishedRun:
         return read_labelled_frames(self.folder, self.labels)
 
     def frames_with_full_boxes(self) -> Iterator[LabelledFrame]:
-        """Read the labelled frames, each box that around all of its object, where it is known."""
+        """Read the labelled frames with full boxes where they are known."""
         for frame in self.frames():
             objects = (replace(item, box=item.full or item.box) for item in frame.objects)
             yield replace(frame, objects=tuple(objects))
 
 
 def read_finished(folder: Path) -> FinishedRun:
-    """Read what a run folder says about itself.
+    """Read run.json and the labels of a run folder.
 
     Raises
     ------
@@ -67,7 +67,7 @@ def read_finished(folder: Path) -> FinishedRun:
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:
-    """Return the folders that are runs, and the runs in the others, by name; each once.
+    """Return the runs among folders and in them, sorted by name, each once.
 
     Raises
     ------
@@ -114,7 +114,7 @@ def open_source(run: RunInfo, moved_to: Path | None = None) -> Iterator[Recordin
 
 
 def clouds_again(recording: Recording, run: RunInfo) -> Iterator[Frame]:
-    """Read the frames that a run was made from once more."""
+    """Read the frames of a run again."""
     options = run["options"]
     streams = choose_streams(recording, options["topics"])
     return frames(recording, streams, skipped=Counter(), **window_of(options))

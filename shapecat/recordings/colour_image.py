@@ -126,7 +126,7 @@ def pixels_of(image: ColourImage, *, shrink: int = 1) -> U1:
 
 
 def encoded(image: ColourImage) -> tuple[str, bytes]:
-    """Return an image as a file, without loss: its suffix, and its bytes, as they came or as PNG.
+    """Return suffix and bytes of an image file without loss: the original, or a PNG.
 
     Raises
     ------

@@ -48,7 +48,7 @@ class Upright:
 
     @classmethod
     def of(cls, recording: Recording, *, up: str, fixed_frame: str | None) -> "Upright":
-        """Prepare the answers for a recording.
+        """Read the transforms and accelerometers of a recording.
 
         Parameters
         ----------
@@ -156,7 +156,7 @@ class Upright:
             return None
 
     def report(self, perceived: Iterable[tuple[pa.Table, pa.Table]]) -> dict[str, Any]:
-        """Return where up came from and how well the planes found agree, for run.json.
+        """Return the source of up, and its agreement with the planes, for run.json.
 
         Adds to ``warnings`` what a person should know.
 

@@ -63,7 +63,7 @@ class TruncatedError(RecordingError):
     """
 
     def __init__(self, message: str, record: "Record | None" = None) -> None:
-        """Keep what there is."""
+        """Wrap the records of a chunk."""
         super().__init__(message)
         self.record = record
 

@@ -48,7 +48,7 @@ class Recording(ABC):
     def messages(
         self, topics: Topics = None, start_ns: Stamp = None, stop_ns: Stamp = None
     ) -> Iterator[Message]:
-        """Yield undecoded messages in flat memory.
+        """Yield undecoded messages in constant memory.
 
         Parameters
         ----------

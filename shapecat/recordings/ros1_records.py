@@ -1,4 +1,4 @@
-"""Records of a ROS 1 bag, read so that no length field is believed before it is checked.
+"""Records of a ROS 1 bag; every length field is checked before use.
 
 The layout is that of the bag format 2.0: every record is a header of named fields and data, each
 after its 32-bit length. https://wiki.ros.org/Bags/Format/2.0
@@ -46,13 +46,13 @@ _RATIO = 1000
 
 
 class BagError(RecordingError):
-    """A record that is damaged, or reaches beyond the end.
+    """A record is damaged, or extends beyond the end.
 
     ``record`` is its part that is there, if its header is whole.
     """
 
     def __init__(self, message: str, record: "Record | None" = None) -> None:
-        """Keep what there is."""
+        """Wrap the fields of a record."""
         super().__init__(message)
         self.record = record
 

@@ -1,4 +1,4 @@
-"""Messages of overlapping chunks in the order of time, in little memory."""
+"""Messages of overlapping chunks, sorted by time in little memory."""
 
 from collections.abc import Callable, Iterable, Iterator
 from heapq import heappop, heappush

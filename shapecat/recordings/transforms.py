@@ -41,7 +41,7 @@ class UnknownFrameError(TransformError):
 
 
 class DisconnectedError(TransformError):
-    """Two frames that no chain of transforms connects."""
+    """No chain of transforms connects two frames."""
 
 
 class ExtrapolationError(TransformError):

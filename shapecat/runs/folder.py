@@ -1,4 +1,4 @@
-"""The folder of one run: built under a hidden name, renamed when complete, never a stranger's.
+"""The folder of a run: built under a hidden name, renamed when complete.
 
 A marker tells what is ours: run.json with the run's id, or the record that an export keeps. What
 has none is neither removed nor replaced, and what somebody has put beside our files stays.
@@ -103,7 +103,7 @@ def staged(
 
 
 def require_ours(folder: Path, marker: Marker = made_by_run) -> None:
-    """Refuse to touch a folder that holds anything but our work.
+    """Refuse a folder that shapecat did not make.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def _strangers(folder: Path, names: Collection[str]) -> Iterator[Path]:
 
 
 def _replace(folder: Path, hidden: Path, marker: Marker) -> None:
-    """Let the complete hidden folder take its name; at any moment one of the two is whole."""
+    """Rename the complete hidden folder; at any moment one of the two is complete."""
     flush(hidden)
     if folder.exists():
         require_ours(folder, marker)
@@ -187,13 +187,13 @@ def clear(folder: Path, names: Collection[str] = _MADE) -> None:
 
 
 def sweep(folder: Path) -> None:
-    """Remove the half-made files that a killed command has left in a complete folder."""
+    """Remove incomplete files of a killed command from a complete folder."""
     with suppress(OSError):
         clear(folder, [partial_path(Path(name)).name for name in RUN_FILES])
 
 
 class _BusyError(Exception):
-    """Another process holds the folder."""
+    """Another process has locked the folder."""
 
 
 @contextmanager

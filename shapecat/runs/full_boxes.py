@@ -1,4 +1,4 @@
-"""The full boxes of a run: those of single views become those of tracks."""
+"""Full boxes of tracks, fused from those of single views."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -71,7 +71,7 @@ class FullBoxes:
 
 
 def _fused(rows: F8, partial: Bool, poses: F8) -> F8:
-    """Fuse the rows (k, 13) of one object in the common frame, and take them back to each own."""
+    """Fuse the rows (k, 13) of one object in the fixed frame, and transform them back."""
     turns, places = poses[:, :, :3], poses[:, :, 3]
     axes = Rotation.from_quat(rows[:, 6:10]).as_matrix()
     centers = np.einsum("kij,kj->ki", turns, rows[:, :3]) + places

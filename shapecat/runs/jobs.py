@@ -154,7 +154,7 @@ def same_options(run: RunInfo, planned: RunInfo) -> bool:
 
 
 def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str]) -> RunInfo:
-    """Return the run that was killed in a folder; the planned one, if that was other work.
+    """Return the interrupted run in a folder, or the planned one if that was other work.
 
     What is left of other work is removed.
     """
@@ -177,13 +177,13 @@ def has_work(folder: Path) -> bool:
 
 
 def identify(run: RunInfo, content: ContentDigest) -> None:
-    """Note the digest of the input, now that it was read, and the name of the work."""
+    """Record the digest of the input and the name of the work."""
     run["input"]["digest"] = run["input"]["digest"] or content.result()
     run["work"] = work_id(run)
 
 
 def require_unchanged(folder: Path, run: RunInfo, source: Path) -> None:
-    """Discard results that may be of two recordings.
+    """Discard the results if the recording changed during the work.
 
     Raises
     ------
@@ -196,7 +196,7 @@ def require_unchanged(folder: Path, run: RunInfo, source: Path) -> None:
 
 
 def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
-    """Carry the labels that a person gave to the results that are replaced over to the new ones.
+    """Transfer the corrected labels of the replaced results to the new ones.
 
     The table they were written into is kept beside the new one.
     """

@@ -20,7 +20,7 @@ __all__ = ["read_labelled_frames", "rows_by_frame"]
 
 
 def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[LabelledFrame]:
-    """Yield the frames of a run in the order they were read, with the final labels.
+    """Yield the frames of a run in reading order, with their final labels.
 
     Tracks missing from ``labels`` (deleted by a person) are left out. Tracks that were merged have
     one number; where several are seen in one frame, they are the parts of one object.
@@ -120,7 +120,7 @@ def _labelled_object(
 
 
 def _join(parts: Sequence[LabelledObject], up: Sequence[float]) -> LabelledObject:
-    """Make one object of the parts of a merged track that are seen in the same frame."""
+    """Join the parts of a merged track in one frame to one object."""
     if len(parts) == 1:
         return parts[0]
     box = _around([part.box for part in parts], up)

@@ -42,7 +42,7 @@ class FrameRow:
 
 
 class PerceptionTables:
-    """Writes frames, detections and planes side by side, a row group every 32 frames.
+    """Write frames, detections and planes together, a row group every 32 frames.
 
     What was perceived is first written as *segments*, folders that appear when complete, so that
     a run that was cut short goes on after its last one; leaving the block joins them into the
@@ -62,7 +62,7 @@ class PerceptionTables:
         model_id: str,
         again: bool = False,
     ) -> None:
-        """Look for segments, of a second look if ``again``, in ``folder``, which must exist."""
+        """Look for segments in ``folder``, those of a second look if ``again``."""
         metadata = {
             "schema_version": SCHEMA_VERSION,
             "categories": ",".join(categories),

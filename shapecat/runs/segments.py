@@ -34,7 +34,7 @@ SEGMENTS, REVISIONS = "segments", "revisions"
 
 
 def count_segments(folder: Path) -> int:
-    """Return how many segments a run that was cut short has left."""
+    """Return the number of segments of an interrupted run."""
     return len(list_segments(folder / SEGMENTS))
 
 

@@ -167,7 +167,7 @@ def _places(table: pa.Table) -> F8:
 
 
 def _joined(boxes: Sequence[ShownBox], up: F4) -> tuple[ShownBox, ...]:
-    """Make one box of the parts of each merged track."""
+    """Join the boxes of each merged track to one."""
     parts: dict[int, list[ShownBox]] = {}
     for box in boxes:
         parts.setdefault(box.track, []).append(box)
@@ -175,7 +175,7 @@ def _joined(boxes: Sequence[ShownBox], up: F4) -> tuple[ShownBox, ...]:
 
 
 def _join(parts: Sequence[ShownBox], up: F4) -> ShownBox:
-    """Make one box of the parts of a merged track that are seen in the same frame."""
+    """Join the boxes of a merged track in one frame."""
     if len(parts) == 1:
         return parts[0]
     corners = [box_corners(Box(*map(np.array, part[3:]))) for part in parts]
@@ -190,7 +190,7 @@ def _join(parts: Sequence[ShownBox], up: F4) -> ShownBox:
 def _ended(
     folder: Path, frames: Mapping[Key, slice], tracks: I4, stamps_ns: I4
 ) -> dict[Key, tuple[int, ...]]:
-    """Return the tracks to take away in the frame after the last one that shows them."""
+    """Return the tracks to delete in the frame after the last one that shows them."""
     keys = np.repeat(np.arange(len(frames)), [rows.stop - rows.start for rows in frames.values()])
     order = np.argsort(stamps_ns, kind="stable")
     last = dict(zip(tracks[order].tolist(), keys[order].tolist(), strict=True))

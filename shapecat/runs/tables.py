@@ -162,18 +162,18 @@ def read_row_groups(
 
 
 def frame_rows(table: pa.Table) -> dict[Key, slice]:
-    """Return the rows of each frame, which follow each other in every table."""
+    """Return the consecutive rows of each frame."""
     return rows_of(*topic_codes(table), numbers(table["frame"]))
 
 
 def topic_codes(table: pa.Table) -> tuple[list[str], I4]:
-    """Return the topics of a table, and which of them each row has."""
+    """Return the topics of a table, and the topic index of each row."""
     column = table["topic"].combine_chunks().dictionary_encode()
     return column.dictionary.to_pylist(), np.from_dlpack(column.indices)
 
 
 def rows_of(topics: Sequence[str], codes: I4, frames: I4) -> dict[Key, slice]:
-    """Return the rows of each frame, which follow each other."""
+    """Return the consecutive rows of each frame."""
     changes = (np.diff(codes) != 0) | (np.diff(frames) != 0)
     starts = np.flatnonzero(np.concatenate([np.ones(min(1, len(frames)), np.bool_), changes]))
     names = map(topics.__getitem__, codes[starts].tolist())
@@ -234,7 +234,7 @@ def arrow_table(columns: dict[str, Any], schema: pa.Schema) -> pa.Table:
 
 
 def lists(rows: Sequence[Any], kind: pa.DataType) -> pa.Array:
-    """Return ragged rows of numbers as one list column without a Python object per number."""
+    """Return ragged rows of numbers as a list column."""
     flat = [np.ravel(row) for row in rows]
     offsets = np.concatenate([[0], np.cumsum([row.size for row in flat])]).astype(np.int32)
     values = np.concatenate(flat) if flat else np.zeros(0)

@@ -1,4 +1,4 @@
-"""tracks.csv: a line per track, made to be read and corrected, also in a spreadsheet.
+"""tracks.csv: one line per track, for reading and correction, also in a spreadsheet.
 
 Separators, quotes, line ends, encodings, the order of columns and numbers such as ``1.0`` do not
 matter.

@@ -1,4 +1,4 @@
-"""From the table of detections to the tables of tracks."""
+"""Track the detections of a run, and write the tables of tracks."""
 
 import csv
 from collections import Counter
@@ -61,7 +61,7 @@ def track_run(
 
 
 def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[FrameDetections]:
-    """Yield the detections of each frame, all of a stream in one and the same frame.
+    """Yield the detections of each frame, those of a stream in one coordinate frame.
 
     ``fixed`` are the topics whose detections are taken in the fixed frame.
     """
@@ -181,7 +181,7 @@ def _write_csv(
     start_ns: int,
     work: str,
 ) -> None:
-    """Write a line per track, those most worth a look first: unknown, then unsure."""
+    """Write a line per track: unknown ones first, then by ascending confidence."""
     rows = sorted(
         zip(tracks, labels, strict=True),
         key=lambda item: (item[1] != UNKNOWN, item[0].confidence, item[0].id),

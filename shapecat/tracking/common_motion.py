@@ -54,7 +54,7 @@ class CommonMotion:
 
 
 def find_common_motion(hits: Hits, members: Sequence[I4]) -> CommonMotion | None:
-    """Find the turn about the up direction and the level shift in each frame, if there are any.
+    """Find the common rotation about up and the level shift of each frame, if any.
 
     Parameters
     ----------

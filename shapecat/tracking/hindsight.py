@@ -110,7 +110,7 @@ def _contradiction(key: F8, others: F8, known: Bool, others_known: Bool) -> F8:
 
 
 def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> Iterator[I4]:
-    """Yield, for each fragment, the later ones that start at the place or soon after its end."""
+    """Yield, for each fragment, the later ones that start at its place or soon after its end."""
     if len(limit) == 0:
         return
     rests = np.isfinite(fragments.rest)

@@ -19,7 +19,7 @@ _CHANGING = 0.5  # the same, if it is seen on both sides at once in one of them
 
 
 def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
-    """Join tracks that together, while both are seen, are no larger than one of them is alone.
+    """Join tracks of one object that was split: together they are no larger than one of them alone.
 
     Two objects side by side are larger than either of them. Of two pieces in the same frame the
     larger one stays in the track.

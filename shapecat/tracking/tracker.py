@@ -155,7 +155,7 @@ class Tracker:
         return found.ids
 
     def _tick(self, stamp_ns: int) -> float:
-        """Advance the clock, which never runs backwards; return the seconds passed."""
+        """Advance the clock, which never runs backwards; return the elapsed seconds."""
         elapsed = 0 if self._stamp_ns is None else stamp_ns - self._stamp_ns
         self._stamp_ns = stamp_ns
         if elapsed < -self._settings.max_missed_s * 1e9:
@@ -176,7 +176,7 @@ class Tracker:
 
 
 def _seed(centers: F8, size_keys: F8, posteriors: F8) -> _Active:
-    """Return the tracks that detections would begin, still without numbers."""
+    """Return new tracks of detections, without numbers."""
     n = len(centers)
     variance = np.tile([_NOISE_M**2, 0.0, _SPEED_M_S**2], (n, 1))
     return _Active(
