@@ -227,7 +227,8 @@ def _print_corrections(outcome: Any) -> None:
     found = outcome.summary.corrections
     done, missed = len(found["transferred"]), found["not_transferred"]
     name = outcome.job.name.rpartition("/")[2]
-    kept = f"; the others are in {outcome.summary.folder}/tracks.previous.csv" if missed else ""
+    where = outcome.job.target or outcome.summary.folder
+    kept = f"; the others are in {where}/tracks.previous.csv" if missed else ""
     text = f"{name}: carried over {done} of {done + len(missed)} corrected labels{kept}"
     click.echo("\n".join((text, *map(missed_words, missed))), err=True)
 

@@ -1,22 +1,34 @@
 """Recordings and results at URLs: nothing half-done is seen, nothing is left in scratch."""
 
+import csv
+import filecmp
 import functools
 import http.server
+import io
 import json
+import os
+import resource
+import shutil
 import tempfile
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import fsspec
 import pytest
 from click.testing import Result
 
-from shapecat.batch.remote import download, finish_upload, list_urls, look_at, scratch, upload
+from shapecat.batch import claims, storage
+from shapecat.batch.claims import claimed
+from shapecat.batch.finding import find_recordings, look_at
+from shapecat.batch.manifest import Entry, RemoteManifest
+from shapecat.batch.remote import Ticket, process_remote, scratch, upload
+from shapecat.batch.storage import Location
 from shapecat.errors import OutputError, RecordingError
+from shapecat.runs.jobs import Job
+from tests.object_storage import object_storage, requests
 from tests.scenes import record
-
-fsspec = pytest.importorskip("fsspec")
 
 Run = Callable[..., Result]
 OPTIONS = ("--no-rrd", "--jobs", 1)
@@ -47,6 +59,13 @@ def address(served: Path) -> Iterator[str]:
         server.shutdown()
 
 
+@pytest.fixture(scope="module")
+def bucket(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """Serve a bucket named lab; give the log of its requests."""
+    with object_storage(tmp_path_factory.mktemp("storage") / "log") as log:
+        yield log
+
+
 @pytest.fixture(autouse=True)
 def own_scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """Whatever a test does, nothing stays in scratch."""
@@ -57,9 +76,24 @@ def own_scratch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Pat
     assert list(folder.iterdir()) == []
 
 
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Do not wait long for what does not pass."""
+    monkeypatch.setattr(storage, "_WAITS_S", (0.01, 0.02))
+    monkeypatch.setattr(claims, "_BEAT_S", 0.2)
+    monkeypatch.setattr(claims, "_LOOK_S", 0.1)
+    monkeypatch.setattr(claims, "_STALE_S", 1.0)
+
+
 def files(url: str) -> set[str]:
-    system, path = fsspec.core.url_to_fs(url)
-    return {name.removeprefix(path).lstrip("/") for name in system.find(path)}
+    """Return the paths of the files below a URL."""
+    found = [name for name, _ in Location(url).walk()]
+    return {name.partition(f"{url.partition('://')[2]}/")[2] for name in found}
+
+
+def results(url: str) -> set[str]:
+    """Return the files at a URL, without the parts of the manifest."""
+    return {name for name in files(url) if not name.startswith(".manifest/")}
 
 
 def test_from_a_server_to_a_folder(
@@ -80,85 +114,274 @@ def test_from_a_server_to_a_folder(
     assert again.stdout.count("already complete") == 2
 
 
-def test_from_a_folder_to_a_storage_and_on(shapecat: Run, served: Path) -> None:
-    out = "memory://results/first"
+@pytest.mark.parametrize("out", ["memory://results/first", "s3://lab/results/first"])
+def test_from_a_folder_to_a_storage_and_on(
+    shapecat: Run, served: Path, bucket: Path, out: str
+) -> None:
     done = shapecat("process", served, "--out", out, *OPTIONS)
 
     assert done.exit_code == 1, done.output
     expected = {"a", "b"}
-    assert {name.partition("/")[0] for name in files(out)} == {*expected, "manifest.jsonl"}
+    assert {name.partition("/")[0] for name in results(out)} == {*expected, "manifest.jsonl"}
     assert {"a/run.json", "a/annotated.mcap", "b/tracks.csv"} <= files(out)
     again = shapecat("process", served, "--out", out, *OPTIONS)
     assert again.stdout.count("already complete") == 2
+    lines = (Location(out) / "manifest.jsonl").read() or b""
+    known = {line["folder"]: line for line in map(json.loads, lines.splitlines())}
+    states = {name: line["state"] for name, line in known.items()}
+    assert states == {"a": "complete", "b": "complete", "broken": "failed"}
+    assert known["a"]["frames"] == 6
     other = shapecat("process", served / "a.mcap", "--out", out, *OPTIONS, "--set", "seed=1")
     assert other.exit_code == 1
     assert "--overwrite" in other.stderr
+    assert bucket.exists()
+
+
+def test_results_are_not_made_again_without_a_manifest(
+    shapecat: Run, served: Path, bucket: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A killed command has not sent its last lines: the run folders themselves must be enough."""
+    for name in ("a.mcap", "b.bag"):
+        (Location("s3://lab/again") / name).upload(served / name)
+    command = ("process", "s3://lab/again/", "--out", "s3://lab/again/out", *OPTIONS)
+    assert shapecat(*command).exit_code == 0
+    for name in files("s3://lab/again/out"):
+        if "manifest" in name:
+            (Location("s3://lab/again/out") / name).remove()
+    monkeypatch.setattr("shapecat.batch.remote.process", None)
+
+    again = shapecat(*command)
+
+    assert again.exit_code == 0, again.output
+    assert again.stdout.count("already complete") == 2
+    for name in "ab":
+        assert len(requests(bucket, "PUT", f"/lab/again/out/{name}/run.json")) == 1
 
 
 def test_patterns_and_folders_of_a_storage(served: Path) -> None:
     url = f"file://{served}"
     both = {f"{url}/a.mcap", f"{url}/broken.mcap"}
 
-    assert set(list_urls(f"{url}/*.mcap", {".mcap"})) == both
-    assert set(list_urls(f"{url}/", {".mcap"})) == both
+    assert {source.url for source in find_recordings([f"{url}/*.mcap"]).kept} == both
+    every = {source.url for source in find_recordings([f"{url}/"]).kept}
+    assert every == {*both, f"{url}/b.bag"}
     assert look_at(f"{url}/a.mcap")[1] == (served / "a.mcap").stat().st_size
     assert look_at(f"{url}/none.mcap") == ("", 0)
 
 
+@pytest.mark.parametrize("place", ["memory://lab/mixed", "s3://lab/mixed"])
+def test_a_storage_is_searched_as_a_folder_is(bucket: Path, place: str) -> None:
+    """Results of earlier runs are no recordings; a ROS 2 bag is a folder, and one recording."""
+    here = Location(place)
+    for name in (
+        *("x.mcap", "d/y.bag", "bag/bag_0.db3", "bag/bag_1.db3", "bag/metadata.yaml"),
+        *("out/x/annotated.mcap", "out/x/run.json", "half/x/annotated.mcap"),
+        *("half/x/frames.parquet", "out/.x.old/annotated.mcap", "notes.txt"),
+    ):
+        (here / name).write(name.encode())
+    kept = find_recordings([f"{place}/"]).kept
+    found = {source.url.replace(":///", "://"): source for source in kept}
+
+    assert set(found) == {f"{place}/{name}" for name in ("x.mcap", "d/y.bag", "bag")}
+    assert found[f"{place}/bag"].stem == "bag"
+    assert found[f"{place}/bag"].bytes == len("bag/bag_0.db3") + len("bag/bag_1.db3")
+    before = found[f"{place}/x.mcap"].key
+    assert before == look_at(f"{place}/x.mcap")[0] or place.startswith("memory")
+    (here / "x.mcap").write(b"other content")
+    assert find_recordings([f"{place}/*.mcap"]).kept[0].key != before
+    assert bucket.exists()
+
+
+def test_a_bag_in_a_bucket(shapecat: Run, bucket: Path, tmp_path: Path) -> None:
+    bag = record(tmp_path / "bag", 4, container="ros2")
+    for file in bag.iterdir():
+        (Location("s3://lab/bags/kitchen") / file.name).upload(file)
+    for source in ("s3://lab/bags/", "s3://lab/bags/kitchen"):
+        done = shapecat("process", source, "--out", tmp_path / "out", *OPTIONS)
+        assert done.exit_code == 0, done.output
+    assert json.loads((tmp_path / "out/kitchen/run.json").read_text())["counts"]["frames"] == 4
+    assert requests(bucket, "GET", "metadata.yaml")
+
+
+def test_listings_come_in_pages(bucket: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(storage, "_PAGE", 3)
+    for k in range(10):
+        (Location("s3://lab/pages") / f"{k}" / "x.mcap").write(b"x")
+
+    assert Location("s3://lab/pages").names() == set("0123456789")
+    assert len(find_recordings(["s3://lab/pages/"]).kept) == 10
+    assert len(requests(bucket, "GET", "/lab")) >= 8
+
+
+@pytest.fixture(scope="module")
+def made(served: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a run folder, made as a worker makes one in scratch."""
+    folder = tmp_path_factory.mktemp("made") / "run"
+    process_remote(
+        Job(served / "a.mcap", folder, rrd=False), lambda *_: None, cores=1, ticket=Ticket("")
+    )
+    return folder
+
+
+PLACES = ["memory://half/run", "s3://lab/half/run"]
+
+
+@pytest.mark.parametrize("url", PLACES)
 def test_upload_shows_nothing_before_it_is_whole(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    made: Path, bucket: Path, monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
-    folder = tmp_path / "run"
-    folder.mkdir()
-    for name in ("run.json", "tracks.csv"):
-        (folder / name).write_text(name)
-    system = fsspec.filesystem("memory")
-    with monkeypatch.context() as patch:
-        patch.setattr(type(system), "put_file", fail)
-        with pytest.raises(OutputError, match="cannot be uploaded"):
-            upload(folder, "memory://half/run")
-    assert not system.exists("/half/run/run.json")
+    """Wherever it is cut, there is either no run.json, or all that it stands for."""
+    names = {path.name for path in made.iterdir()}
+    sent = Location.upload
+    for cut in range(len(names)):
+        left = [cut]
 
-    upload(folder, "memory://half/run")
+        def failing(self: Location, file: Path, left: list[int] = left) -> None:
+            left[0] -= 1
+            if left[0] < 0:
+                msg = "the connection broke"
+                raise OutputError(msg)
+            sent(self, file)
 
-    assert files("memory://half/run") == {"run.json", "tracks.csv"}
-    assert files("memory://half") == {"run/run.json", "run/tracks.csv"}
+        with monkeypatch.context() as patch, claimed(url, "one") as claim:
+            patch.setattr(Location, "upload", failing)
+            with pytest.raises(OutputError, match="broke"):
+                upload(made, url, claim)
+        assert "run.json" not in files(url)
+        assert len(files(url)) == cut or cut < 2
+
+    with claimed(url, "one") as claim:
+        upload(made, url, claim)
+    assert files(url) == names
+    assert files(url.removesuffix("/run")) == {f"run/{name}" for name in names}
+    assert bucket.exists()
 
 
-def test_a_strangers_place_is_not_touched(tmp_path: Path) -> None:
-    (tmp_path / "run.json").write_text("{}")
-    system = fsspec.filesystem("memory")
-    system.pipe_file("/theirs/run/thesis.txt", b"years of work")
-    with pytest.raises(OutputError, match="did not make this"):
-        upload(tmp_path, "memory://theirs/run")
-
-    assert files("memory://theirs") == {"run/thesis.txt"}
-
-
-def test_an_upload_that_was_killed_is_finished(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("url", ["memory://old/run", "s3://lab/old/run"])
+def test_labels_survive_a_replacement_that_was_killed(
+    shapecat: Run, served: Path, bucket: Path, monkeypatch: pytest.MonkeyPatch, url: str
 ) -> None:
-    """It has taken the old run.json away, so that nobody takes half of each for a run."""
-    system = fsspec.filesystem("memory")
-    system.pipe_file("/killed/run/run.json", b"old")
-    system.pipe_file("/killed/run/notes.txt", b"mine")
-    for name in ("run.json", "tracks.csv"):
-        (tmp_path / name).write_text("new")
+    """The old run is gone, the new one is not there: corrections must not be lost."""
+    out, place = url.removesuffix("/run"), Location(url)
+    shutil.copy(served / "a.mcap", served / "run.mcap")
+    command = ("process", served / "run.mcap", "--out", out, *OPTIONS)
+    assert shapecat(*command).exit_code == 0
+    (place / "tracks.csv").write(labelled((place / "tracks.csv").read() or b"", "cup"))
     with monkeypatch.context() as patch:
-        patch.setattr(type(system), "mv", fail)
-        with pytest.raises(OutputError, match="cannot be uploaded"):
-            upload(tmp_path, "memory://killed/run")
-    assert files("memory://killed/run") == {"notes.txt"}
+        patch.setattr(Location, "upload", fail)
+        assert shapecat(*command, "--overwrite").exit_code != 0
+    assert (place / "run.json").read() is None
+    (served / "run.mcap").touch()
 
-    finish_upload("memory://killed/run")
+    done = shapecat(*command)
 
-    assert files("memory://killed") == {f"run/{n}" for n in ("run.json", "tracks.csv", "notes.txt")}
-    assert system.cat_file("/killed/run/run.json") == b"new"
+    (served / "run.mcap").unlink()
+    assert done.exit_code == 0, done.output
+    assert "carried over 1 of 1" in done.stderr
+    assert not [name for name in files(out) if name.startswith(".run.old")]
+    assert bucket.exists()
+
+
+def labelled(table: bytes, label: str) -> bytes:
+    """Return tracks.csv with a label for its first track."""
+    rows = list(csv.DictReader(io.StringIO(table.decode())))
+    rows[0]["label"] = label
+    text = io.StringIO()
+    writer = csv.DictWriter(text, list(rows[0]))
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue().encode()
 
 
 def fail(*_: object, **__: object) -> None:
     msg = "no space"
-    raise OSError(msg)
+    raise OutputError(msg)
+
+
+def test_a_strangers_place_is_not_touched(made: Path) -> None:
+    (Location("memory://theirs/run") / "thesis.txt").write(b"years of work")
+    with (
+        claimed("memory://theirs/run", "one") as claim,
+        pytest.raises(OutputError, match="did not make this"),
+    ):
+        upload(made, "memory://theirs/run", claim)
+
+    assert files("memory://theirs") == {"run/thesis.txt"}
+
+
+@pytest.mark.parametrize("url", ["memory://claims/run", "s3://lab/claims/run"])
+def test_one_process_at_a_time_works_on_a_folder(bucket: Path, url: str) -> None:
+    with claimed(url, "one"), pytest.raises(OutputError, match="another run is writing there"):
+        claims.Claim(url, "two")
+    with claimed(url, "two") as claim:
+        assert not claim.inherited
+    assert files(url.removesuffix("/run")) == set()
+    assert bucket.exists()
+
+
+def test_a_dead_process_is_followed_and_a_late_one_ends(made: Path, bucket: Path) -> None:
+    """A worker that was held to be dead wakes up: its results must not mix with the new ones."""
+    url = "s3://lab/late/run"
+    first = claims.Claim(url, "one")  # whose heart does not beat
+    system: Any = fsspec.filesystem("s3")
+    system.call_s3("create_multipart_upload", Bucket="lab", Key="late/run/annotated.mcap")
+    with claimed(url, "two") as second:
+        assert second.inherited
+        upload(made, url, second)
+        assert system.list_multipart_uploads("lab") == []
+        assert not first.beat()
+        with pytest.raises(OutputError, match="taken over"):
+            upload(made, url, first)
+    first.release()
+    assert files("s3://lab/late") == {f"run/{path.name}" for path in made.iterdir()}
+    assert len(requests(bucket, "PUT", "/late/run/run.json")) == 1
+
+
+def test_a_batch_follows_its_own_dead_at_once(bucket: Path) -> None:
+    first = claims.Claim("s3://lab/same/run", "one")
+    second = claims.Claim("s3://lab/same/run", "one")
+    assert (first.inherited, second.inherited) == (False, True)
+    second.release()
+    assert bucket.exists()
+
+
+def entry(name: str, state: Any) -> Entry:
+    return Entry(name, f"{name}.mcap", state, "input", "work")
+
+
+def test_a_manifest_in_a_bucket_has_all_writers(bucket: Path) -> None:
+    """Two commands at once, one of them killed: no line that was sent is lost."""
+    url = "s3://lab/manifests"
+    killed = RemoteManifest(url)
+    killed.record([entry("a", "complete"), entry("b", "running")])
+    killed.send()
+    with RemoteManifest(url) as first:
+        assert first.entries["a"].state == "complete"
+        second = RemoteManifest(url)
+        second.record([entry("c", "complete")])
+        second.send()
+        first.record([entry("b", "complete")])
+    with RemoteManifest(url) as third:
+        found = {name: known.state for name, known in third.entries.items()}
+    assert found == dict.fromkeys("abc", "complete")
+    whole = (Location(url) / "manifest.jsonl").read() or b""
+    assert sorted(json.loads(line)["folder"] for line in whole.splitlines()) == ["a", "b", "c"]
+    assert RemoteManifest(url, "1-of-4").entries == {}
+    assert bucket.exists()
+
+
+def test_parts_of_a_manifest_stay_small(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sent anew with each line, the manifest of a large batch would outweigh its results."""
+    monkeypatch.setattr("shapecat.batch.manifest._PART_BYTES", 2000)
+    written = RemoteManifest("memory://parts")
+    for k in range(100):
+        written.record([entry(f"{k}", "complete")])
+        written.send()
+    sizes = [info["size"] for _, info in Location("memory://parts/.manifest").walk()]
+
+    assert max(sizes) < 2500
+    assert len(sizes) > 5
+    assert len(RemoteManifest("memory://parts").entries) == 100
 
 
 def test_scratch_of_killed_processes_is_removed(own_scratch: Path) -> None:
@@ -172,4 +395,74 @@ def test_scratch_of_killed_processes_is_removed(own_scratch: Path) -> None:
 
 def test_server_that_is_not_there_is_one_line(tmp_path: Path) -> None:
     with pytest.raises(RecordingError, match="cannot be downloaded"):
-        download("http://127.0.0.1:9/x.mcap", tmp_path)
+        Location("http://127.0.0.1:9/x.mcap").download(tmp_path / "x.mcap")
+
+
+def one_line(result: Result) -> str:
+    errors = [line for line in result.stderr.splitlines() if line.startswith("Error: ")]
+    assert len(errors) == 1, result.stderr
+    assert "Traceback" not in result.output
+    assert "bug" not in result.output
+    return errors[0]
+
+
+@pytest.mark.parametrize("source", ["s3://none/", "s3://none/*.mcap", "s3://none/a.mcap"])
+def test_a_bucket_that_is_not_there_is_one_line(
+    shapecat: Run, bucket: Path, tmp_path: Path, source: str
+) -> None:
+    read = shapecat("process", source, "--out", tmp_path, *OPTIONS)
+    assert read.exit_code == 3
+    assert source.rstrip("/") in one_line(read)
+    assert bucket.exists()
+
+
+def test_results_do_not_make_a_bucket(shapecat: Run, bucket: Path, served: Path) -> None:
+    """Its name may be misspelt. It is known before a frame is read."""
+    for recordings in ([served], [served / "a.mcap"]):
+        done = shapecat("process", *recordings, "--out", "s3://none/out", *OPTIONS)
+        assert done.exit_code == 1
+        assert "s3://none/out: cannot be listed: The specified bucket does not exist" in one_line(
+            done
+        )
+    assert not requests(bucket, "PUT", "/none")
+
+
+def test_missing_credentials_are_one_line(
+    shapecat: Run, bucket: Path, served: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY"):
+        monkeypatch.delenv(name)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    system: Any = fsspec.get_filesystem_class("s3")
+    for out, sources in (("s3://lab/none", [served]), (str(tmp_path), ["s3://lab/x.mcap"])):
+        system.clear_instance_cache()
+        done = shapecat("process", *sources, "--out", out, *OPTIONS)
+        assert done.exit_code in {1, 3}
+        assert "credentials" in one_line(done)
+    system.clear_instance_cache()
+    assert bucket.exists()
+
+
+def peak_mb() -> float:
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+@pytest.mark.slow
+def test_large_files_are_streamed(
+    bucket: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An hour's review.rrd does not fit into memory; it goes and comes in parts."""
+    monkeypatch.setattr(storage, "_PART_BYTES", 5 * 2**20)
+    large = tmp_path / "large"
+    block = os.urandom(2**20)
+    with large.open("wb") as file:
+        for _ in range(60):
+            file.write(block)
+    place = Location("s3://lab/large")
+    before = peak_mb()
+    place.upload(large)
+    place.download(tmp_path / "back")
+
+    assert peak_mb() - before < 45
+    assert filecmp.cmp(tmp_path / "back", large, shallow=False)
+    assert len(requests(bucket, "PUT", "/lab/large")) == 12

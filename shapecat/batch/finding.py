@@ -1,27 +1,36 @@
 """Find the recordings that a user names: files, folders, URLs."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from hashlib import sha256
 from pathlib import Path, PurePosixPath
+from typing import Any
 
-from shapecat.batch.remote import is_url, list_urls
+from shapecat.batch.storage import Location, content_key, is_url
 from shapecat.errors import RecordingError
 
-__all__ = ["Found", "Source", "find_recordings"]
+__all__ = ["Found", "Source", "find_recordings", "look_at"]
 
 SUFFIXES = {".mcap", ".bag", ".db3"}
 _OTHERS = (".mcap", ".bag")
 _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Source:
-    """A recording: a path, or a URL; ``stem`` and ``parent`` name its run folder."""
+    """A recording: a path, or a URL; ``stem`` and ``parent`` name its run folder.
+
+    ``key`` changes when what is at the URL does, and ``bytes`` is its size; neither is known of a
+    path before it is looked at.
+    """
 
     path: str
     url: str
     stem: str
     parent: str
+    key: str = ""
+    bytes: int = 0
 
 
 @dataclass(frozen=True)
@@ -43,9 +52,9 @@ def find_recordings(sources: Sequence[str]) -> Found:
     ------
     RecordingError : there is none.
     """
-    urls = [url for source in sources if is_url(source) for url in list_urls(source, SUFFIXES)]
+    remote = {found.url: found for source in sources if is_url(source) for found in _at(source)}
     paths, left_out = _find_paths([Path(source) for source in sources if not is_url(source)])
-    kept = [_of_path(path) for path in paths] + [_of_url(url) for url in dict.fromkeys(urls)]
+    kept = [_of_path(path) for path in paths] + list(remote.values())
     if not kept:
         msg = f"{' '.join(sources[:3])}: no recording there: no .mcap, .bag or .db3, no ROS 2 bag"
         raise RecordingError(msg)
@@ -57,9 +66,72 @@ def _of_path(path: Path) -> Source:
     return Source(str(path), "", whole.name if path.is_dir() else path.stem, whole.parent.name)
 
 
-def _of_url(url: str) -> Source:
+def _of_url(url: str, key: str, size: int) -> Source:
     pure = PurePosixPath(url.partition("://")[2].partition("?")[0])
-    return Source("", url, pure.stem, pure.parent.name)
+    stem = pure.stem if pure.suffix in SUFFIXES else pure.name
+    return Source("", url, stem, pure.parent.name, key, size)
+
+
+def _at(url: str) -> list[Source]:
+    """Return the recordings that a URL names: those of a pattern or a folder, or itself.
+
+    Raises
+    ------
+    RecordingError : the storage cannot be reached.
+    """
+    location = Location(url)
+    if any(character in url for character in "*["):
+        found = [(name, content_key(info), _size(info)) for name, info in location.walk(deep=True)]
+        kept = [known for known in found if PurePosixPath(known[0]).suffix in SUFFIXES]
+        return [_of_url(*known) for known in sorted(kept)]
+    if url.endswith("/"):
+        return [_of_url(*known) for known in sorted(_search_remote(location))]
+    return [_of_url(url, "", 0)]
+
+
+def look_at(url: str) -> tuple[str, int]:
+    """Return a key of the recording at a URL, and its bytes; empty if unknown."""
+    location = Location(url)
+    with suppress(RecordingError):  # reported when it is downloaded
+        info = location.info()
+        if info is not None and info.get("type") == "directory":
+            files = [(content_key(known), _size(known)) for _, known in location.walk()]
+            return _key_of_all(key for key, _ in files), sum(size for _, size in files)
+        if info is not None:
+            return content_key(info), _size(info)
+    return "", 0
+
+
+def _key_of_all(keys: Iterable[str]) -> str:
+    return sha256("".join(sorted(keys)).encode()).hexdigest()[:16]
+
+
+def _size(info: Mapping[str, Any]) -> int:
+    return int(info.get("size") or 0)
+
+
+def _search_remote(location: Location) -> Iterator[tuple[str, str, int]]:
+    """Yield URL, key and size of the recordings below a folder: ROS 2 bags are folders."""
+    files: list[tuple[str, str, int]] = []
+    bags, runs = set(), set()
+    for url, info in location.walk():
+        parent, _, name = url.rpartition("/")
+        if name == "metadata.yaml":
+            bags.add(parent)
+        elif name in {"run.json", "frames.parquet"}:
+            runs.add(parent)
+        elif PurePosixPath(name.removesuffix(".zstd")).suffix in SUFFIXES and "/." not in url:
+            files.append((url, content_key(info), _size(info)))
+    parts: dict[str, list[tuple[str, str, int]]] = {bag: [] for bag in bags}
+    for url, key, size in files:
+        parent = url.rpartition("/")[0]
+        if parent in bags:
+            parts[parent].append((url, key, size))
+        elif parent not in runs and not url.endswith(".zstd"):
+            yield url, key, size
+    for bag, found in parts.items():
+        if found:
+            yield bag, _key_of_all(key for _, key, _ in found), sum(size for *_, size in found)
 
 
 def _find_paths(sources: Sequence[Path]) -> tuple[list[Path], int]:

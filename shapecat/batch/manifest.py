@@ -1,35 +1,49 @@
 """manifest.jsonl: the state of each recording of a batch, one line per change.
 
-The last line of a recording holds. Lines are appended whole, under a lock, so that several shards
-may write one file; a line that a crash or a full disk cut short is skipped.
+The last line of a recording holds. In a folder, lines are appended whole, under a lock, so that
+several shards may write one file; a line that a crash or a full disk cut short is skipped. At a
+URL nothing can be appended: there the lines are parts, each of one writer.
 """
 
-import dataclasses
 import fcntl
 import json
+import logging
 import os
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, Literal, get_args
+from threading import Event, Lock, Thread
+from typing import Any, Literal, Self, get_args
+from uuid import uuid4
 
-from shapecat.errors import OutputError
+from shapecat.batch.storage import Location, content_key, is_url
+from shapecat.errors import OutputError, ShapecatError
 
-__all__ = ["MANIFEST", "Entry", "Manifest", "State"]
+__all__ = ["MANIFEST", "Entry", "Manifest", "RemoteManifest", "State", "open_manifest"]
 
 MANIFEST = "manifest.jsonl"
+
+_log = logging.getLogger(__name__)
+
+_PARTS = ".manifest"
+_PART_BYTES = 2**20
+_MOST_BYTES = 8 * 2**20
+"""Lines that are not sent yet."""
+_SEND_S = 5.0
+"""Lines are sent so often."""
 
 State = Literal["planned", "running", "complete", "failed"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Entry:
     """A line of the manifest: a recording and its state.
 
     ``folder`` is the name of its run folder; ``input`` and ``work`` change when the recording, or
-    what is to be done with it, does.
+    what is to be done with it, does; ``tracks`` counts the tracks of each category.
     """
 
     folder: str
@@ -40,9 +54,17 @@ class Entry:
     tries: int = 0
     seconds: float | None = None
     frames: int | None = None
+    tracks: dict[str, int] | None = None
     exit_code: int = 0
     message: str = ""
     time: str = ""
+
+    def same_work(self, other: "Entry") -> bool:
+        """Return whether two entries have the same input and work."""
+        return (self.input, self.work) == (other.input, other.work)
+
+
+_NAMES = tuple(field.name for field in fields(Entry))
 
 
 class Manifest:
@@ -52,15 +74,18 @@ class Manifest:
         """Read the file, if there is one that can be read."""
         self.path = path
         self.entries: dict[str, Entry] = {}
-        with suppress(OSError):  # reported when it is written to
-            self._read()
+        with suppress(OSError), path.open("rb") as file:  # reported when it is written to
+            self._take(file)
 
-    def _read(self) -> None:
-        with self.path.open("rb") as file:
-            for line in file:
-                entry = _parse(line)
-                if entry is not None:
-                    self.entries[entry.folder] = entry
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Finish writing."""
+
+    def _take(self, lines: Iterable[bytes]) -> None:
+        for entry in filter(None, map(_parse, lines)):
+            self.entries[entry.folder] = entry
 
     def record(self, entries: Iterable[Entry]) -> None:
         """Append entries.
@@ -70,34 +95,146 @@ class Manifest:
         OutputError : the file cannot be written.
         """
         now = datetime.now(UTC).isoformat(timespec="milliseconds")
-        stamped = [dataclasses.replace(entry, time=now) for entry in entries]
+        stamped = [replace(entry, time=now) for entry in entries]
         self.entries.update((entry.folder, entry) for entry in stamped)
-        lines = [json.dumps(_without_nothing(entry), ensure_ascii=False) for entry in stamped]
-        if not lines:
-            return
+        if stamped:
+            self._append(b"".join(map(_line, stamped)))
+
+    def _append(self, lines: bytes) -> None:
         try:
             with _appending(self.path) as file:
-                _write(file, "".join(f"{line}\n" for line in lines).encode())
+                _write(file, lines)
         except OSError as error:
             msg = f"{self.path}: cannot be written: {error.strerror or error}"
             raise OutputError(msg) from error
 
 
-def _without_nothing(entry: Entry) -> dict[str, Any]:
-    return {
-        name: value for name, value in dataclasses.asdict(entry).items() if value not in {None, ""}
-    }
+class RemoteManifest(Manifest):
+    """A manifest at a URL, in parts: ``.manifest/SHARD/PART.jsonl``.
+
+    Nobody but its writer touches a part. The last one is replaced by a longer one every few
+    seconds, until it holds a megabyte. In the end ``manifest.jsonl`` says all of it, a line for
+    each recording. What a killed writer had not sent yet is known from the run folders.
+    """
+
+    def __init__(self, url: str, shard: str = "") -> None:
+        """Read what is there.
+
+        Parameters
+        ----------
+        shard : ``I-of-N``, which reads and writes parts of its own; empty for all.
+
+        Raises
+        ------
+        OutputError : the storage cannot be read.
+        """
+        self.entries = {}
+        place = Location(url, OutputError)
+        self._whole = place / (f"manifest-{shard}.jsonl" if shard else MANIFEST)
+        self._parts = place / _PARTS / (shard or "all")
+        self._writer, self._count = f"{datetime.now(UTC):%Y%m%dT%H%M%S}-{uuid4().hex[:8]}", 0
+        self._part, self._sent = bytearray(), 0
+        self._lock, self._sending, self._ended = Lock(), Lock(), Event()
+        self._seen: dict[str, str] = {}
+        self._read_parts()
+        self._thread = Thread(target=self._send_now_and_then, daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Send the rest, and the whole as one file."""
+        self._ended.set()
+        self._thread.join()
+        try:
+            self.send()
+            if self._count or self._part:
+                self._read_parts()
+                self._whole.write(b"".join(map(_line, self.entries.values())))
+        except ShapecatError as failure:
+            _log.error("%s", failure)
+
+    def _read_parts(self) -> None:
+        """Read new or grown parts of other writers."""
+        for url, info in self._parts.walk(deep=False):
+            name, key = url.rpartition("/")[2], content_key(info)
+            if not name.startswith(self._writer) and self._seen.get(name) != key:
+                self._seen[name] = key
+                self._take(((self._parts / name).read() or b"").splitlines())
+
+    def _take(self, lines: Iterable[bytes]) -> None:
+        """Keep the later of two entries, as writers may work at the same time."""
+        for entry in filter(None, map(_parse, lines)):
+            known = self.entries.get(entry.folder)
+            if known is None or known.time <= entry.time:
+                self.entries[entry.folder] = entry
+
+    def _append(self, lines: bytes) -> None:
+        with self._lock:
+            self._part += lines
+            much = len(self._part) > _MOST_BYTES
+        if much:
+            self.send()
+
+    def send(self) -> None:
+        """Send the lines recorded since the last time.
+
+        Raises
+        ------
+        OutputError : the storage cannot be written to; it is sent the next time.
+        """
+        with self._sending:
+            with self._lock:
+                content = bytes(self._part)
+            if len(content) == self._sent:
+                return
+            (self._parts / f"{self._writer}-{self._count:06}.jsonl").write(content)
+            self._sent = len(content)
+            if self._sent >= _PART_BYTES:
+                with self._lock:
+                    del self._part[: self._sent]
+                self._count += 1
+                self._sent = 0
+
+    def _send_now_and_then(self) -> None:
+        while not self._ended.wait(_SEND_S):
+            with suppress(ShapecatError):  # reported in the end, if it goes on
+                self.send()
+
+
+def open_manifest(out: str, *, shard: str | None = None) -> Manifest:
+    """Open the manifest in a folder or at a URL.
+
+    Parameters
+    ----------
+    shard : ``I/N``; at a URL it has a manifest of its own, as nothing locks it there.
+    """
+    if is_url(out):
+        return RemoteManifest(out, shard.replace("/", "-of-") if shard else "")
+    return Manifest(Path(out) / MANIFEST)
+
+
+def _line(entry: Entry) -> bytes:
+    values = ((name, getattr(entry, name)) for name in _NAMES)
+    known = {name: value for name, value in values if value is not None and value != ""}
+    return json.dumps(known, ensure_ascii=False).encode("utf-8", "surrogatepass") + b"\n"
 
 
 def _parse(line: bytes) -> Entry | None:
     """Return the entry of a line, or None for an incomplete or foreign line."""
     try:
         values = json.loads(line)
-        entry = Entry(**values)
-    except (ValueError, TypeError, RecursionError):
+        entry = Entry(**{name: _shared(name, value) for name, value in values.items()})
+    except (ValueError, TypeError, AttributeError, RecursionError):
         return None
     known = isinstance(values["folder"], str) and entry.state in get_args(State)
     return entry if known else None
+
+
+def _shared(name: str, value: Any) -> Any:
+    """Return one shared copy of a value that many entries have."""
+    return sys.intern(value) if name in {"state", "work"} and isinstance(value, str) else value
 
 
 @contextmanager

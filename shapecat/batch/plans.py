@@ -6,14 +6,16 @@ import json
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Literal
 
-from shapecat.batch.finding import find_recordings
-from shapecat.batch.manifest import Entry, Manifest
-from shapecat.batch.remote import look_at, output_place
+from shapecat.batch.claims import claim_name
+from shapecat.batch.finding import Source, find_recordings, look_at
+from shapecat.batch.manifest import Entry, Manifest, open_manifest
+from shapecat.batch.storage import Location, is_url
 from shapecat.errors import ConfigError, OutputError
 from shapecat.learning import load_model
 from shapecat.runs.folder import read_run
@@ -24,36 +26,62 @@ __all__ = [
     "Batch",
     "Shard",
     "Task",
+    "name_folders",
     "plan_batch",
-    "plan_folders",
 ]
+
+_Named = tuple[str, Source]
 
 _LOOKS_AT_ONCE = 16
 """Threads that look at files: on a network disk each look is a round trip."""
+_LOOKS = 256
+"""Recordings that a thread looks at before it takes others."""
 
 Status = Literal["complete", "resume", "retry", "check", "new"]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Task:
-    """A recording of a batch, and its status.
+    """A recording of a batch, and its status: a few hundred bytes, as there may be millions.
 
-    ``status`` is ``complete`` where the manifest vouches for it, ``resume`` where a killed run
-    goes on, ``retry`` where the last try failed, ``check`` where there are results of unknown
-    origin, else ``new``.
+    ``name`` is that of the run folder in ``out``. ``status`` is ``complete`` where the manifest
+    vouches for it, ``resume`` where a killed run goes on, ``retry`` where the last try failed,
+    ``check`` where there are results of unknown origin, else ``new``. ``input`` and ``work`` change
+    when the recording, or what is to be done with it, does.
     """
 
-    job: Job
+    like: Job
+    out: str
+    name: str
+    path: str
+    url: str
     status: Status
     bytes: int
     input: str
     work: str
 
+    @property
+    def recording(self) -> str:
+        """What the user calls the recording: its path, or URL."""
+        return self.url or self.path
+
+    @property
+    def job(self) -> Job:
+        """What is to be done."""
+        at_url = is_url(self.out)
+        return dataclasses.replace(
+            self.like,
+            source=Path(self.path),
+            folder=Path(self.name) if at_url else Path(self.out, self.name),
+            origin=self.url,
+            target=f"{self.out.rstrip('/')}/{self.name}" if at_url else "",
+        )
+
     def entry(self) -> Entry:
         """Return the first manifest entry of the task."""
         return Entry(
-            folder=self.job.folder.name,
-            recording=self.job.name,
+            folder=self.name,
+            recording=self.recording,
             state="planned",
             input=self.input,
             work=self.work,
@@ -85,15 +113,15 @@ class Shard:
             raise ConfigError(msg)
         return cls(index % count, count)
 
-    def of(self, jobs: Sequence[Job]) -> list[Job]:
-        """Return the jobs of this shard; the shards of a list are disjoint and cover it.
+    def of(self, named: Sequence[_Named]) -> list[_Named]:
+        """Return the recordings of this shard; the shards of a list are disjoint and cover it.
 
         Examples
         --------
         >>> [Shard.parse(f"{k}/3").index for k in (0, 1, 2, 3)]
         [0, 1, 2, 0]
         """
-        ordered = sorted(jobs, key=lambda job: job.folder.name)
+        ordered = sorted(named, key=lambda pair: pair[0])
         return ordered[self.index :: self.count]
 
 
@@ -106,27 +134,24 @@ class Batch:
     left_out: int
 
 
-def plan_folders(names: Sequence[str], parents: Sequence[str], out: Path) -> list[Path]:
-    """Return a run folder below ``out`` for each recording, by its name without suffix.
+def name_folders(names: Sequence[str], parents: Sequence[str]) -> list[str]:
+    """Return the name of a run folder for each recording: its own, without suffix.
 
     Recordings of the same name are told apart by their parent folders, then by number.
 
     Examples
     --------
-    >>> [str(folder) for folder in plan_folders(["x", "x", "y"], ["a", "b", ""], Path("o"))]
-    ['o/a_x', 'o/b_x', 'o/y']
+    >>> name_folders(["x", "x", "y"], ["a", "b", ""])
+    ['a_x', 'b_x', 'y']
     """
     counts = Counter(names)
-    unique = [
-        name if counts[name] == 1 else f"{parent}_{name}"
-        for name, parent in zip(names, parents, strict=True)
-    ]
     taken: set[str] = set()
     folders = []
-    for k, name in enumerate(unique):
-        free = name if name not in taken else f"{name}_{k + 1}"
+    for k, (name, parent) in enumerate(zip(names, parents, strict=True)):
+        unique = name if counts[name] == 1 else f"{parent}_{name}"
+        free = unique if unique not in taken else f"{unique}_{k + 1}"
         taken.add(free)
-        folders.append(out / free)
+        folders.append(free)
     return folders
 
 
@@ -146,56 +171,73 @@ def plan_batch(
     ------
     ConfigError : the shard makes no sense, or a URL needs a library that is not installed.
     RecordingError : a folder or URL holds no recording.
+    OutputError : a URL for the results cannot be reached.
     """
     part = Shard.parse(shard) if shard is not None else None
     found = find_recordings(sources)
-    folders = plan_folders(
-        [source.stem for source in found.kept], [source.parent for source in found.kept], Path(out)
-    )
-    with output_place(out, part_of=shard) as place:
-        jobs = [
-            dataclasses.replace(
-                job,
-                source=Path(source.path),
-                folder=place.folder(folder.name),
-                origin=source.url,
-                target=place.target(folder.name),
-            )
-            for source, folder in zip(found.kept, folders, strict=True)
-        ]
-        manifest = Manifest(place.manifest) if len(jobs) > 1 else None
+    names = name_folders([s.stem for s in found.kept], [s.parent for s in found.kept])
+    named = list(zip(names, found.kept, strict=True))
+    there = Location(out, OutputError).names() if is_url(out) else _names_in(Path(out))
+    with open_manifest(out, shard=shard) if len(named) > 1 else nullcontext() as manifest:
+        planner = _Planner(job, out, there, manifest)
+        chosen = part.of(named) if part is not None else named
+        yield Batch(planner.tasks(chosen), manifest, found.left_out)
+
+
+class _Planner:
+    """Checks the state of each recording; it lists the folder of results once."""
+
+    def __init__(self, job: Job, out: str, there: set[str], manifest: Manifest | None) -> None:
+        self._job, self._out, self._there, self._manifest = job, out, there, manifest
         model_id = load_model(job.model).model_id if manifest is not None else ""
-        chosen = part.of(jobs) if part is not None else jobs
+        self._work = _hash([job.settings.as_dict(), job.selection(), model_id])
+
+    def tasks(self, named: Sequence[_Named]) -> list[Task]:
+        """Return the task of each recording."""
+        chunks = [named[first : first + _LOOKS] for first in range(0, len(named), _LOOKS)]
         with ThreadPoolExecutor(_LOOKS_AT_ONCE) as pool:
-            tasks = list(pool.map(lambda job: _task(job, manifest, model_id), chosen))
-        yield Batch(tasks, manifest, found.left_out)
+            looked = pool.map(lambda chunk: [self._task(*each) for each in chunk], chunks)
+            return list(chain.from_iterable(looked))
+
+    def _task(self, name: str, source: Source) -> Task:
+        key, size = source.key, source.bytes
+        if not key:
+            key, size = look_at(source.url) if source.url else _input_key(Path(source.path))
+        task = Task(
+            self._job, self._out, name, source.path, source.url, "new", size, key, self._work
+        )
+        return dataclasses.replace(task, status=self._status(task))
+
+    def _status(self, task: Task) -> Status:
+        entry = self._manifest.entries.get(task.name) if self._manifest is not None else None
+        there = task.name in self._there
+        begun = not self._there.isdisjoint(_begun(task.name))
+        if begun and (self._job.overwrite or not there):
+            return "resume"
+        if there and not self._job.overwrite:
+            same = entry is not None and entry.same_work(task.entry())
+            done = same and entry is not None and entry.state == "complete" and _whole(task)
+            return "complete" if done else "check"
+        return "retry" if entry is not None and entry.state == "failed" else "new"
 
 
-def _task(job: Job, manifest: Manifest | None, model_id: str) -> Task:
-    entry = manifest.entries.get(job.folder.name) if manifest is not None else None
-    key, size = look_at(job.origin) if job.origin else _input_key(job.source)
-    work = _work_key(job, model_id)
-    status: Status = "new"
-    there = _exists(job)
-    if partial_path(job.folder).exists() and (job.overwrite or not there):
-        status = "resume"
-    elif there and not job.overwrite:
-        same = entry is not None and (entry.input, entry.work) == (key, work)
-        done = same and entry is not None and entry.state == "complete" and _whole(job)
-        status = "complete" if done else "check"
-    elif entry is not None and entry.state == "failed":
-        status = "retry"
-    return Task(job, status, size, key, work)
+def _names_in(folder: Path) -> set[str]:
+    """Return the names in a folder, if there is one that can be read."""
+    with suppress(OSError):
+        return {path.name for path in folder.iterdir()}
+    return set()
 
 
-def _exists(job: Job) -> bool:
-    return look_at(f"{job.target}/run.json")[1] > 0 if job.target else job.folder.exists()
+def _begun(name: str) -> set[str]:
+    """Return the names beside a run folder that show a run in progress."""
+    return {partial_path(Path(name)).name, claim_name(name)}
 
 
-def _whole(job: Job) -> bool:
+def _whole(task: Task) -> bool:
     """Return whether a run has all its outputs; an interrupted correction leaves it incomplete."""
+    job = task.job
     if job.target:
-        return True  # uploaded as a whole
+        return True  # complete when its manifest says so
     outputs = [
         name for name, made in (("annotated.mcap", job.mcap), ("review.rrd", job.rrd)) if made
     ]
@@ -215,11 +257,6 @@ def _input_key(source: Path) -> tuple[str, int]:
         return "", 0
     known = [(name, stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns) for name, stat in stats]
     return _hash(known), sum(size for _, size, *_ in known)
-
-
-def _work_key(job: Job, model_id: str) -> str:
-    """Return a key of settings, options and model."""
-    return _hash([job.settings.as_dict(), job.selection(), model_id])
 
 
 def _hash(value: object) -> str:

@@ -1,119 +1,184 @@
-"""Recordings and results at URLs: downloaded to scratch, uploaded, then renamed.
+"""A recording and its run folder at URLs: downloaded to scratch, processed, uploaded.
 
-fsspec, the extra ``remote``, knows the protocols; each storage has a package of its own (s3fs,
-gcsfs, ...). Without a URL nothing here is used.
+Object stores have no rename. A run folder there is complete when it has its run.json, which is
+sent last; without one, whatever else lies there is no run.
 """
 
+import dataclasses
 import os
 import shutil
 import tempfile
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from hashlib import sha256
 from pathlib import Path, PurePosixPath
-from threading import Event, Thread
-from typing import Any
 
-from shapecat.errors import ConfigError, OutputError, RecordingError, ShapecatError
-from shapecat.runs.folder import RUN_FILES
+from shapecat.batch.claims import Claim, claimed
+from shapecat.batch.storage import Location
+from shapecat.errors import OutputError, ShapecatError
+from shapecat.pipeline import Observer, process
+from shapecat.runs.folder import OUTPUTS, RUN_FILES, read_run, require_ours, write_run
+from shapecat.runs.jobs import Job, Summary, summarize
+from shapecat.runs.run_info import OriginInfo, RunInfo
 from shapecat.system.files import lock
 
-__all__ = [
-    "Place",
-    "download",
-    "fetch",
-    "finish_upload",
-    "is_url",
-    "list_urls",
-    "look_at",
-    "output_place",
-    "scratch",
-    "upload",
-]
+__all__ = ["Ticket", "process_remote", "scratch", "upload"]
 
 _SCRATCH = "shapecat-scratch-"
-_MANIFEST = "manifest.jsonl"
-_UPLOAD_S = 10.0
+_PREVIOUS = tuple(name for name in RUN_FILES if name not in {*OUTPUTS, "report.html"})
+"""Files that the transfer of labels to a new run needs; run.json last."""
 
 
-def is_url(text: str) -> bool:
-    """Return whether a source or an output is a URL rather than a path.
+@dataclass(frozen=True)
+class Ticket:
+    """Identifies the work of a task, so that it is not done twice.
 
-    Examples
-    --------
-    >>> is_url("s3://lab/x.mcap"), is_url("/data/x.mcap")
-    (True, False)
+    ``batch`` names the command that has sent it; ``input`` changes with the recording, ``work``
+    with what is to be done with it.
     """
-    return "://" in text
+
+    batch: str
+    input: str = ""
+    work: str = ""
+
+    def made(self, run: RunInfo) -> bool:
+        """Return whether a run has the same input and work."""
+        return bool(self.input and self.work) and run.get("origin") == self._origin()
+
+    def note(self, folder: Path) -> None:
+        """Add the origin to run.json."""
+        run = read_run(folder)
+        run["origin"] = self._origin()
+        write_run(folder, run)
+
+    def _origin(self) -> OriginInfo:
+        return {"input": self.input, "work": self.work}
 
 
-def _storage(url: str, error: type[ShapecatError] = RecordingError) -> tuple[Any, str]:
-    """Return the file system of a URL, and the path in it."""
-    try:
-        from fsspec.core import url_to_fs  # noqa: PLC0415  an extra
-    except ImportError as missing:
-        msg = f"{url}: URLs need fsspec: pip install 'shapecat[remote]'"
-        raise ConfigError(msg) from missing
-    try:
-        system, path = url_to_fs(url)
-    except ImportError as missing:
-        msg = f"{url}: {missing}"
-        raise ConfigError(msg) from missing
-    except (OSError, ValueError) as reason:
-        msg = f"{url}: cannot be reached: {reason}"
-        raise error(msg) from reason
-    return system, path
-
-
-def _failures() -> tuple[type[Exception], ...]:
-    """Return what storages raise when they fail: not all of it is an OSError."""
-    with suppress(ImportError):
-        from aiohttp import ClientError  # noqa: PLC0415  an extra
-
-        return (OSError, ValueError, NotImplementedError, ClientError)
-    return (OSError, ValueError, NotImplementedError)
-
-
-def list_urls(url: str, suffixes: Collection[str]) -> list[str]:
-    """Return the recordings that a URL names: those of a pattern or a folder, or itself.
+def process_remote(job: Job, observe: Observer, *, cores: int, ticket: Ticket) -> Summary:
+    """Process a job between downloading its recording and uploading its results.
 
     Raises
     ------
-    RecordingError : the storage cannot be reached.
+    RecordingError, NoStreamError, ModelError : as `process` does.
+    OutputError : the storage cannot be written to, or another process works on the run folder.
     """
-    system, path = _storage(url)
+    claim = claimed(job.target, ticket.batch) if job.target else nullcontext()
+    with scratch() as folder, claim as held:
+        local = job
+        if job.target:
+            local, run = _fetch_run(
+                dataclasses.replace(job, folder=folder / "output" / job.folder.name)
+            )
+            if run is not None and not local.overwrite and ticket.made(run):
+                return summarize(job, run, processed=False)
+        if job.origin:
+            (folder / "input").mkdir()
+            local = dataclasses.replace(local, source=_download(job.origin, folder / "input"))
+        summary = _process(job, local, observe, cores)
+        if held is not None and summary.processed:
+            ticket.note(local.folder)
+            upload(local.folder, job.target, held)
+    return dataclasses.replace(summary, folder=job.folder)
+
+
+def _process(job: Job, local: Job, observe: Observer, cores: int) -> Summary:
+    """Process the job in scratch; errors name the URLs."""
     try:
-        if any(c in path for c in "*["):
-            names = system.glob(path)
-        elif url.endswith("/"):
-            names = system.find(path)
-        else:
-            return [url]
-    except _failures() as error:
-        msg = f"{url}: cannot be listed: {error}"
-        raise RecordingError(msg) from error
-    kept = [name for name in sorted(names) if Path(name).suffix in suffixes]
-    return [str(system.unstrip_protocol(name)) for name in kept]
+        return process(local, observe, cores=cores)
+    except ShapecatError as error:
+        text = str(error).replace(str(local.source), job.name)
+        text = text.replace(str(local.folder), job.target or str(local.folder))
+        raise type(error)(text) from error
 
 
-def look_at(url: str) -> tuple[str, int]:
-    """Return what changes when a file at a URL does, and its bytes; empty where there is none."""
-    system, path = _storage(url)
-    try:
-        known = system.info(path)
-    except _failures():
-        return "", 0
-    marks = {name: str(value) for name, value in sorted(known.items()) if name in _MARKS}
-    return sha256(repr(marks).encode()).hexdigest()[:16], int(known.get("size") or 0)
+def _download(url: str, folder: Path) -> Path:
+    target = folder / PurePosixPath(url.partition("?")[0].rstrip("/")).name
+    Location(url).download(target)
+    return target
 
 
-_MARKS = {"size", "ETag", "etag", "mtime", "created", "LastModified", "last_modified", "md5Hash"}
+def _fetch_run(job: Job) -> tuple[Job, RunInfo | None]:
+    """Fetch the parts of earlier results at the target that `process` needs.
+
+    Returns
+    -------
+    The job, and what run.json says; None where there is no run. A run that was being replaced
+    when the process was killed is replaced by this one.
+
+    Raises
+    ------
+    OutputError : the target holds what shapecat did not make.
+    """
+    place = Location(job.target, OutputError)
+    if "run.json" not in _require_ours(place):
+        place, job = _replaced(place), dataclasses.replace(job, overwrite=True)
+    content = (place / "run.json").read()
+    if content is None:
+        return job, None
+    job.folder.mkdir(parents=True)
+    (job.folder / "run.json").write_bytes(content)
+    for name in _PREVIOUS[:-1] if job.overwrite else ():
+        previous = (place / name).read()
+        if previous is not None:
+            (job.folder / name).write_bytes(previous)
+    require_ours(job.folder)
+    return job, read_run(job.folder)
+
+
+def _require_ours(place: Location) -> set[str]:
+    """Return the names in a run folder; refuse one that holds files but none of a run.
+
+    Raises
+    ------
+    OutputError : it is a stranger's.
+    """
+    names = place.names()
+    if "run.json" not in names and names - set(RUN_FILES):
+        msg = f"{place.url}: shapecat did not make this; choose another --out, or move it away"
+        raise OutputError(msg)
+    return names
+
+
+def _replaced(place: Location) -> Location:
+    """Return the place of a run while another replaces it."""
+    parent, _, name = place.url.rstrip("/").rpartition("/")
+    return Location(f"{parent}/.{name}.old", OutputError)
+
+
+def upload(folder: Path, url: str, claim: Claim) -> None:
+    """Send a run folder; run.json, which makes it a run, comes last.
+
+    Raises
+    ------
+    OutputError : the storage cannot be written to, the place is a stranger's, or another process
+        has taken it over.
+    """
+    place = Location(url, OutputError)
+    old = _replaced(place)
+    names = _require_ours(place)
+    if claim.inherited:
+        place.abort_uploads()
+    claim.require()
+    if "run.json" in names:
+        for name in _PREVIOUS:
+            if name in names:
+                (place / name).copy(old / name)
+        (place / "run.json").remove()
+    sent = sorted(path.name for path in folder.iterdir() if path.name in RUN_FILES)
+    for name in sorted(sent, key=lambda name: name == "run.json"):
+        if name == "run.json":
+            claim.require()
+        (place / name).upload(folder / name)
+    for name in (set(RUN_FILES) - set(sent)) & names:
+        (place / name).remove()
+    for name in old.names():
+        (old / name).remove()
 
 
 @contextmanager
 def scratch() -> Iterator[Path]:
-    """Give a folder that is removed in the end; what killed processes have left goes as well."""
+    """Give a temporary folder; also remove those of killed processes."""
     parent = Path(tempfile.gettempdir())
     for left in parent.glob(f"{_SCRATCH}*"):
         with suppress(OSError):
@@ -136,187 +201,3 @@ def _remove_unless_used(folder: Path) -> None:
 def _release(held: int | None) -> None:
     if held is not None:
         os.close(held)
-
-
-def download(url: str, folder: Path) -> Path:
-    """Fetch a recording into a folder.
-
-    Raises
-    ------
-    RecordingError : it is not there, or the connection broke.
-    """
-    system, path = _storage(url)
-    target = folder / Path(path.partition("?")[0]).name
-    try:
-        system.get(path, str(target), recursive=system.isdir(path))
-    except _failures() as error:
-        msg = f"{url}: cannot be downloaded: {str(error) or type(error).__name__}"
-        raise RecordingError(msg) from error
-    if not target.exists():
-        msg = f"{url}: does not exist"
-        raise RecordingError(msg)
-    return target
-
-
-def fetch(url: str) -> bytes:
-    """Return the content of a small file.
-
-    Raises
-    ------
-    OutputError : it cannot be read.
-    """
-    system, path = _storage(url, OutputError)
-    try:
-        return bytes(system.cat_file(path))
-    except _failures() as error:
-        msg = f"{url}: cannot be read: {str(error) or type(error).__name__}"
-        raise OutputError(msg) from error
-
-
-def upload(folder: Path, url: str) -> None:
-    """Send a run folder under a hidden name, then rename it; run.json comes last.
-
-    Object stores have no rename: theirs is a copy, file by file, and what has no run.json is not
-    complete.
-
-    Raises
-    ------
-    OutputError : the storage cannot be written to, or the place is a stranger's.
-    """
-    system, path = _storage(url, OutputError)
-    hidden = _hidden(path)
-    try:
-        _require_ours(system, path, url)
-        _remove(system, hidden, RUN_FILES)
-        system.makedirs(hidden, exist_ok=True)
-        for file in sorted(folder.iterdir(), key=lambda file: file.name == "run.json"):
-            system.put_file(str(file), f"{hidden}/{file.name}")
-    except _failures() as error:
-        raise _cannot_upload(url, error) from error
-    finish_upload(url)
-
-
-def finish_upload(url: str) -> None:
-    """Rename what was sent as a whole, also by a process that was killed before it had.
-
-    Raises
-    ------
-    OutputError : the storage cannot be written to.
-    """
-    system, path = _storage(url, OutputError)
-    hidden = _hidden(path)
-    try:
-        sent = [PurePosixPath(name).name for name in _list(system, hidden)]
-        if "run.json" not in sent:
-            return
-        _remove(system, path, ("run.json",))
-        system.makedirs(path, exist_ok=True)
-        for name in sorted(sent, key=lambda name: name == "run.json"):
-            system.mv(f"{hidden}/{name}", f"{path}/{name}")
-        _remove(system, path, set(RUN_FILES) - set(sent))
-        with suppress(*_failures()):
-            system.rmdir(hidden)  # object stores have no folders
-    except _failures() as error:
-        raise _cannot_upload(url, error) from error
-
-
-def _hidden(path: str) -> str:
-    parent, _, name = path.rstrip("/").rpartition("/")
-    return f"{parent}/.{name}.partial"
-
-
-def _cannot_upload(url: str, error: Exception) -> OutputError:
-    return OutputError(f"{url}: cannot be uploaded: {str(error) or type(error).__name__}")
-
-
-def _require_ours(system: Any, path: str, url: str) -> None:
-    """Refuse to touch a place that holds files but no run's marker.
-
-    Raises
-    ------
-    OutputError : it is a stranger's.
-    """
-    names = {PurePosixPath(name).name for name in _list(system, path)}
-    if "run.json" not in names and names - set(RUN_FILES):
-        msg = f"{url}: shapecat did not make this; choose another --out, or move it away"
-        raise OutputError(msg)
-
-
-def _list(system: Any, path: str) -> list[str]:
-    """Return the paths of what lies in a folder; none where there is no folder."""
-    with suppress(FileNotFoundError):
-        return [str(name) for name in system.ls(path, detail=False)]
-    return []
-
-
-def _remove(system: Any, path: str, names: Collection[str]) -> None:
-    """Remove files from a folder."""
-    for name in _list(system, path):
-        if PurePosixPath(name).name in names:
-            system.rm(name)
-
-
-@dataclass(frozen=True)
-class Place:
-    """Where results go: a folder, or a URL with a local folder that stands in for it."""
-
-    root: Path
-    url: str
-    manifest: Path
-
-    def folder(self, name: str) -> Path:
-        """Return the run folder of a recording; with a URL only its name is of use."""
-        return self.root / name
-
-    def target(self, name: str) -> str:
-        """Return the URL of a run folder; empty without one."""
-        return f"{self.url}/{name}" if self.url else ""
-
-
-@contextmanager
-def output_place(out: str, *, part_of: str | None = None) -> Iterator[Place]:
-    """Give the place of ``out``; the manifest of one at a URL is sent there as it grows.
-
-    Parameters
-    ----------
-    part_of : the shard, which keeps a manifest of its own at a URL: nothing locks it there.
-    """
-    if not is_url(out):
-        yield Place(Path(out), "", Path(out) / _MANIFEST)
-        return
-    url = out.rstrip("/")
-    name = _MANIFEST if part_of is None else f"manifest-{part_of.replace('/', '-of-')}.jsonl"
-    system, path = _storage(f"{url}/{name}", OutputError)
-    with scratch() as folder:
-        file = folder / name
-        with suppress(*_failures()):
-            system.get_file(path, str(file))
-        with _sent(file, system, path):
-            yield Place(folder, url, file)
-
-
-@contextmanager
-def _sent(file: Path, system: Any, path: str) -> Iterator[None]:
-    """Send a file every few seconds if it has grown, and once more in the end."""
-    ended, sent = Event(), [file.stat().st_size if file.exists() else 0]
-
-    def send() -> None:
-        with suppress(*_failures()):
-            size = file.stat().st_size
-            if size != sent[0]:
-                system.makedirs(path.rpartition("/")[0], exist_ok=True)
-                system.put_file(str(file), path)
-                sent[0] = size
-
-    def send_now_and_then() -> None:
-        while not ended.wait(_UPLOAD_S):
-            send()
-
-    thread = Thread(target=send_now_and_then, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join()
-        send()

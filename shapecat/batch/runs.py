@@ -1,24 +1,26 @@
 """Process many recordings on an executor; a failure of one does not stop the others."""
 
-import dataclasses
 import json
 import logging
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from concurrent.futures import CancelledError, Executor, Future
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import islice
 from queue import Empty, SimpleQueue
 from threading import Lock
 from typing import Any, Protocol
+from uuid import uuid4
 
 from shapecat.batch.manifest import Entry, Manifest
 from shapecat.batch.plans import Task
-from shapecat.batch.remote import download, fetch, finish_upload, look_at, scratch, upload
+from shapecat.batch.remote import Ticket, process_remote
+from shapecat.batch.storage import Location
 from shapecat.errors import OutputError, ShapecatError
 from shapecat.executors import Mailbox, is_dropped, is_lost, post
 from shapecat.pipeline import Observer, process
-from shapecat.runs.folder import read_run, require_ours
+from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job, Summary, summarize
 from shapecat.runs.run_info import RunInfo
 from shapecat.system import stopping
@@ -31,12 +33,10 @@ _TRIES = 2
 """Times a recording is begun before it is held to kill its workers."""
 _AHEAD = 1000
 """Recordings handed to an executor at a time: a scheduler need not hold a hundred thousand."""
+_LINES = 1000
+"""Lines of the manifest that are made at a time."""
 _REPORT_S = 0.2
 """A worker tells how far it is no more often than this."""
-
-
-_PREVIOUS = ("tracks.csv", "tracks.original.csv", "tracks.parquet", "frames.parquet")
-"""What carrying labels over to a new run needs of the old one."""
 _HEED_S = 0.1
 """Whoever waits for workers looks so often whether a signal has come."""
 
@@ -51,7 +51,7 @@ class Outcome:
     code: int = 0
 
 
-_Ended = tuple[Job, Future[Outcome]]
+_Ended = tuple[Task, Future[Outcome]]
 
 
 class Watcher(Protocol):
@@ -68,18 +68,21 @@ def process_here(
     tasks: Sequence[Task], watcher: Watcher, *, cores: int = 1, manifest: Manifest | None = None
 ) -> Iterator[Outcome]:
     """Process the tasks one by one in this process; yield their outcomes."""
-    ledger = _Ledger(tasks, manifest)
+    ledger, batch = _Ledger(manifest), uuid4().hex
+    ledger.plan(tasks)
     for task in tasks:
         stopping.check()
-        name = task.job.folder.name
 
-        def observe(phase: str, done: int, total: int | None, name: str = name) -> None:
+        def observe(phase: str, done: int, total: int | None, name: str = task.name) -> None:
             watcher.progress(name, phase, done, total)
 
-        if task.status != "complete":
-            ledger.running(name)
-        outcome = _already(task) or attempt(task.job, observe, cores=cores)
-        ledger.ended(outcome)
+        if task.status == "complete":
+            outcome = ledger.known(task)
+        else:
+            ledger.begin(task)
+            ledger.running(task.name)
+            outcome = attempt(task.job, observe, cores=cores, ticket=_ticket(task, batch))
+            ledger.ended(task, outcome)
         watcher.ended(outcome)
         yield outcome
 
@@ -101,7 +104,8 @@ def process_on(
     ------
     Stopped : a signal has asked for it; what runs goes on until the executor is stopped.
     """
-    ledger = _Ledger(tasks, manifest)
+    ledger = _Ledger(manifest)
+    ledger.plan(tasks)
 
     def receive(report: Any) -> None:
         name, phase, done, total = report
@@ -110,7 +114,6 @@ def process_on(
 
     with Mailbox(receive) as mailbox:
         for outcome in _outcomes(executor, tasks, ledger, mailbox.address, cores):
-            ledger.ended(outcome)
             watcher.ended(outcome)
             yield outcome
 
@@ -119,26 +122,34 @@ def _outcomes(
     executor: Executor, tasks: Sequence[Task], ledger: "_Ledger", address: str, cores: int
 ) -> Iterator[Outcome]:
     ended: SimpleQueue[_Ended] = SimpleQueue()
+    batch = uuid4().hex
 
-    def begin(job: Job) -> None:
-        future = executor.submit(_attempt_elsewhere, job, address, cores)
-        future.add_done_callback(lambda done: ended.put((job, done)))
+    def begin(task: Task) -> None:
+        ledger.begin(task)
+        future = executor.submit(_attempt_elsewhere, task.job, address, cores, _ticket(task, batch))
+        future.add_done_callback(lambda done: ended.put((task, done)))
 
-    yield from filter(None, map(_already, tasks))
-    todo = [task for task in tasks if task.status != "complete"]
-    waiting = [task.job for task in sorted(todo, key=lambda task: task.bytes)]
+    yield from (ledger.known(task) for task in tasks if task.status == "complete")
+    waiting = [task for task in tasks if task.status != "complete"]
+    waiting.sort(key=lambda task: task.bytes)
     running = 0
     while waiting or running:
         while waiting and running < _AHEAD:
             begin(waiting.pop())
             running += 1
-        job, future = _next(ended)
+        task, future = _next(ended)
         error = _error(future)
-        if error is not None and is_lost(error) and ledger.lost(job, error) < _TRIES:
-            begin(job)
+        if error is not None and is_lost(error) and ledger.lost(task, error) < _TRIES:
+            begin(task)
             continue
         running -= 1
-        yield future.result() if error is None else _unknown(job, error)
+        outcome = future.result() if error is None else _unknown(task.job, error)
+        ledger.ended(task, outcome)
+        yield outcome
+
+
+def _ticket(task: Task, batch: str) -> Ticket:
+    return Ticket(batch, task.input, task.work)
 
 
 def _next(ended: SimpleQueue[_Ended]) -> _Ended:
@@ -161,25 +172,27 @@ def _unknown(job: Job, error: BaseException) -> Outcome:
     return Outcome(job, message=f"{job.name}: {type(error).__name__}: {error}", code=1)
 
 
-def _already(task: Task) -> Outcome | None:
-    """Return the outcome of a complete task, None for others."""
-    if task.status != "complete":
-        return None
-    return Outcome(task.job, summarize(task.job, _run_of(task.job), processed=False))
-
-
 def _run_of(job: Job) -> RunInfo:
-    """Return the run.json of a complete run."""
+    """Return the run.json of a complete run.
+
+    Raises
+    ------
+    OutputError : it cannot be read.
+    """
     if not job.target:
         return read_run(job.folder)
-    run: RunInfo = json.loads(fetch(f"{job.target}/run.json"))
+    try:
+        run: RunInfo = json.loads((Location(job.target, OutputError) / "run.json").read() or b"")
+    except ValueError as error:
+        msg = f"{job.target}: no run.json there, though the manifest says that it is complete"
+        raise OutputError(msg) from error
     return run
 
 
-def _attempt_elsewhere(job: Job, address: str, cores: int) -> Outcome:
+def _attempt_elsewhere(job: Job, address: str, cores: int, ticket: Ticket) -> Outcome:
     """Process one job in a worker."""
     logging.basicConfig(level=logging.ERROR, format="%(levelname)s %(message)s")
-    return attempt(job, _reporter(job.folder.name, address), cores=cores)
+    return attempt(job, _reporter(job.folder.name, address), cores=cores, ticket=ticket)
 
 
 def _reporter(name: str, address: str) -> Observer:
@@ -195,11 +208,11 @@ def _reporter(name: str, address: str) -> Observer:
     return observe
 
 
-def attempt(job: Job, observe: Observer, *, cores: int = 1) -> Outcome:
+def attempt(job: Job, observe: Observer, *, cores: int = 1, ticket: Ticket) -> Outcome:
     """Process one job; a known error is an outcome, an unknown one too, but logged in full."""
     try:
         if job.origin or job.target:
-            return Outcome(job, _process_remote(job, observe, cores))
+            return Outcome(job, process_remote(job, observe, cores=cores, ticket=ticket))
         return Outcome(job, process(job, observe, cores=cores))
     except ShapecatError as error:
         return Outcome(job, message=str(error), code=error.exit_code)
@@ -208,97 +221,85 @@ def attempt(job: Job, observe: Observer, *, cores: int = 1) -> Outcome:
         return Outcome(job, message=f"{job.name}: {type(error).__name__}: {error}", code=1)
 
 
-def _process_remote(job: Job, observe: Observer, cores: int) -> Summary:
-    """Process a job between downloading its recording and uploading its results."""
-    with scratch() as folder:
-        local = job
-        if job.origin:
-            (folder / "input").mkdir()
-            local = dataclasses.replace(local, source=download(job.origin, folder / "input"))
-        if job.target:
-            local = dataclasses.replace(local, folder=folder / "output" / job.folder.name)
-            _look_for_results(local)
-        try:
-            summary = process(local, observe, cores=cores)
-        except ShapecatError as error:
-            text = str(error).replace(str(local.source), job.name)
-            text = text.replace(str(local.folder), job.target or str(local.folder))
-            raise type(error)(text) from error
-        if job.target and summary.processed:
-            upload(local.folder, job.target)
-    return summary
-
-
-def _look_for_results(job: Job) -> None:
-    """Fetch the parts of earlier results at the target that `process` needs.
-
-    Raises
-    ------
-    OutputError : the target holds what shapecat did not make.
-    """
-    finish_upload(job.target)
-    wanted = ("run.json", *(_PREVIOUS if job.overwrite else ()))
-    there = [name for name in wanted if look_at(f"{job.target}/{name}")[1]]
-    if "run.json" in there:
-        job.folder.mkdir(parents=True)
-    for name in there:
-        (job.folder / name).write_bytes(fetch(f"{job.target}/{name}"))
-    require_ours(job.folder)
-
-
 class _Ledger:
-    """Write the manifest, if there is one; a full disk does not end the batch."""
+    """Writes the manifest, if there is one; a full disk does not end the batch."""
 
-    def __init__(self, tasks: Sequence[Task], manifest: Manifest | None) -> None:
+    def __init__(self, manifest: Manifest | None) -> None:
         self._manifest = manifest
         self._lock = Lock()
-        self._entries = {task.job.folder.name: task.entry() for task in tasks}
-        self._tries = dict.fromkeys(self._entries, 1)
-        open_ones = [task.job.folder.name for task in tasks if task.status != "complete"]
-        self._write([self._entries[name] for name in open_ones])
+        self._open: dict[str, Entry] = {}
+
+    def plan(self, tasks: Iterable[Task]) -> None:
+        """Record the recordings to process, unless the manifest has them already."""
+        entries = (task.entry() for task in tasks if task.status != "complete")
+        new = (entry for entry in entries if not self._is_noted(entry))
+        while some := list(islice(new, _LINES)):
+            self._write(some)
+
+    def _is_noted(self, entry: Entry) -> bool:
+        known = self._manifest.entries.get(entry.folder) if self._manifest is not None else None
+        return known is not None and known.state == "planned" and known.same_work(entry)
+
+    def known(self, task: Task) -> Outcome:
+        """Return the outcome of a complete task."""
+        job = task.job
+        entry = self._manifest.entries.get(task.name) if self._manifest is not None else None
+        if entry is not None and entry.tracks is not None and entry.frames is not None:
+            counts = {"frames": entry.frames, "tracks": entry.tracks}
+            summary = Summary(
+                job.name, job.folder, counts, entry.seconds or 0.0, (), processed=False
+            )
+            return Outcome(job, summary)
+        try:
+            return Outcome(job, summarize(job, _run_of(job), processed=False))
+        except OutputError as error:
+            return Outcome(job, message=str(error), code=error.exit_code)
+
+    def begin(self, task: Task) -> None:
+        """Remember a recording that was submitted."""
+        with self._lock:
+            self._open.setdefault(task.name, replace(task.entry(), tries=1))
 
     def running(self, name: str) -> None:
         """Record the start of a recording, once per attempt."""
         with self._lock:
-            entry = self._entries.get(name)
-            if entry is not None and (entry.state, entry.tries) != ("running", self._tries[name]):
-                if entry.state in {"complete", "failed"}:
-                    return
+            entry = self._open.get(name)
+            if entry is not None and entry.state != "running":
                 self._note(entry, state="running")
 
-    def lost(self, job: Job, error: BaseException) -> int:
+    def lost(self, task: Task, error: BaseException) -> int:
         """Record the death of a worker; return the number of deaths at this recording."""
-        name = job.folder.name
         with self._lock:
-            waited = self._entries[name].state != "running"
+            entry = self._open[task.name]
+            waited = entry.state != "running"
             if not (is_dropped(error) and waited):
-                self._tries[name] += 1
-                self._note(self._entries[name], state="planned")
-            return self._tries[name] - 1
+                entry = self._note(entry, state="planned", tries=entry.tries + 1)
+            return entry.tries - 1
 
-    def ended(self, outcome: Outcome) -> None:
+    def ended(self, task: Task, outcome: Outcome) -> None:
         """Record the outcome of a recording."""
         with self._lock:
-            entry = self._entries[outcome.job.folder.name]
-            if outcome.summary is None:
+            entry, summary = self._open[task.name], outcome.summary
+            if summary is None:
                 self._note(entry, state="failed", exit_code=outcome.code, message=outcome.message)
-                return
-            known = self._manifest and self._manifest.entries.get(entry.folder)
-            if known and (known.state, known.input, known.work) == (
-                "complete",
-                entry.input,
-                entry.work,
-            ):
-                return
-            frames = outcome.summary.counts["frames"]
-            self._note(
-                entry, state="complete", seconds=round(outcome.summary.seconds, 3), frames=frames
-            )
+            elif not self._is_complete(entry):
+                self._note(
+                    entry,
+                    state="complete",
+                    seconds=round(summary.seconds, 3),
+                    frames=summary.counts["frames"],
+                    tracks=summary.counts["tracks"],
+                )
+            del self._open[task.name]
 
-    def _note(self, entry: Entry, **changes: Any) -> None:
-        new = dataclasses.replace(entry, tries=self._tries[entry.folder], **changes)
-        self._entries[entry.folder] = new
+    def _is_complete(self, entry: Entry) -> bool:
+        known = self._manifest.entries.get(entry.folder) if self._manifest is not None else None
+        return known is not None and known.state == "complete" and known.same_work(entry)
+
+    def _note(self, entry: Entry, **changes: Any) -> Entry:
+        new = self._open[entry.folder] = replace(entry, **changes)
         self._write([new])
+        return new
 
     def _write(self, entries: Sequence[Entry]) -> None:
         if self._manifest is None:

@@ -2,7 +2,16 @@
 
 from typing import Any, NotRequired, TypedDict
 
-__all__ = ["Counts", "InputInfo", "ModelInfo", "Options", "RunInfo", "Window", "window_of"]
+__all__ = [
+    "Counts",
+    "InputInfo",
+    "ModelInfo",
+    "Options",
+    "OriginInfo",
+    "RunInfo",
+    "Window",
+    "window_of",
+]
 
 
 class InputInfo(TypedDict):
@@ -52,6 +61,13 @@ class Counts(TypedDict, total=False):
     color: int
 
 
+class OriginInfo(TypedDict):
+    """What the recording and the work are known by where results are kept at a URL."""
+
+    input: str
+    work: str
+
+
 class RunInfo(TypedDict):
     """The contents of run.json.
 
@@ -73,6 +89,7 @@ class RunInfo(TypedDict):
     warnings: list[str]
     color: NotRequired[dict[str, str]]
     boxes: NotRequired[str]
+    origin: NotRequired[OriginInfo]
     corrections: NotRequired[dict[str, Any]]
 
 

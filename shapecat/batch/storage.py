@@ -1,0 +1,284 @@
+"""Files and folders at URLs, through fsspec; requests that may succeed later are repeated.
+
+fsspec is the extra ``remote``; each storage has a package of its own (s3fs, gcsfs, ...). Without a
+URL nothing here is used.
+"""
+
+import errno
+import random
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from datetime import datetime
+from functools import partial
+from hashlib import sha256
+from pathlib import Path, PurePosixPath
+from typing import Any, TypeVar
+
+from shapecat.errors import ConfigError, RecordingError, ShapecatError
+
+__all__ = ["Location", "content_key", "is_url"]
+
+_T = TypeVar("_T")
+
+_WAITS_S = (0.5, 1.0, 2.0, 4.0, 8.0)
+"""Between attempts, plus or minus half, so that refused workers do not return together."""
+_DIGESTS = ("ETag", "etag", "md5Hash", "content_md5")
+_TIMES = ("mtime", "LastModified", "last_modified", "created")
+"""Entries of a file's info that change with its content, or when it is written."""
+_PASSING = {
+    errno.EAGAIN,
+    errno.EBUSY,  # s3fs: SlowDown, ServiceUnavailable
+    errno.ECONNREFUSED,
+    errno.ECONNRESET,
+    errno.EPIPE,
+    errno.ETIMEDOUT,
+    getattr(errno, "EREMOTEIO", errno.EIO),  # s3fs: InternalError
+}
+_PASSING_NAMES = {"ClientPayloadError", "ServerDisconnectedError"}
+"""Errors of aiohttp by name, as it need not be installed."""
+_PAGE = 1000
+"""Names in a listing of S3, which gives no more at a time."""
+_PART_BYTES = 16 * 2**20
+_MOST_PARTS = 9_000
+"""Of a multipart upload; S3 takes 10,000."""
+
+
+def is_url(text: str) -> bool:
+    """Return whether a source or an output is a URL rather than a path.
+
+    Examples
+    --------
+    >>> is_url("s3://lab/x.mcap"), is_url("/data/x.mcap")
+    (True, False)
+    """
+    return "://" in text
+
+
+def content_key(info: Mapping[str, Any]) -> str:
+    """Return a key of a file's content, from its info."""
+    names = _DIGESTS if any(name in info for name in _DIGESTS) else _TIMES
+    values = [info[name] for name in names if name in info]
+    known = [v.isoformat() if isinstance(v, datetime) else str(v) for v in values]
+    marks = [info.get("size"), *known]
+    return sha256(repr(marks).encode()).hexdigest()[:16]
+
+
+class Location:
+    """A file or folder at a URL. Failures become errors of one line."""
+
+    def __init__(self, url: str, error: type[ShapecatError] = RecordingError) -> None:
+        """Find the storage of a URL, without a request.
+
+        Parameters
+        ----------
+        error : what failures become.
+
+        Raises
+        ------
+        ConfigError : a library is missing.
+        ShapecatError : the URL makes no sense.
+        """
+        self.url, self._error = url, error
+        self._system, self._path = _connect(url, error)
+
+    def __truediv__(self, name: str) -> "Location":
+        return Location(f"{self.url.rstrip('/')}/{name}", self._error)
+
+    def _tried(self, done: str, call: Callable[[], _T]) -> _T:
+        """Call; repeat a call that may succeed later.
+
+        Raises
+        ------
+        ShapecatError : it failed all the same.
+        FileNotFoundError, FileExistsError : as the storage says.
+        """
+        for wait_s in (*_WAITS_S, 0.0):
+            try:
+                return call()
+            except (FileNotFoundError, FileExistsError):
+                raise
+            except Exception as error:  # every storage has errors of its own
+                if not wait_s or not _may_pass(error):
+                    raise self._as_error(done, error) from error
+            time.sleep(wait_s * random.uniform(0.5, 1.5))  # noqa: S311  no secret
+        raise AssertionError
+
+    def _as_error(self, done: str, error: Exception) -> ShapecatError:
+        reason = " ".join((str(error) or type(error).__name__).split())
+        return self._error(f"{self.url}: cannot be {done}: {reason}")
+
+    def info(self) -> Mapping[str, Any] | None:
+        """Return size, times and digest of a file; None if there is none."""
+        with suppress(FileNotFoundError):
+            known: Mapping[str, Any] = self._tried("read", lambda: self._system.info(self._path))
+            return known
+        return None
+
+    def read(self) -> bytes | None:
+        """Return the content of a small file; None if there is none."""
+        with suppress(FileNotFoundError):
+            return bytes(self._tried("read", lambda: self._system.cat_file(self._path)))
+        return None
+
+    def write(self, content: bytes) -> None:
+        """Write a small file."""
+        self._put("written", lambda: self._system.pipe_file(self._path, content))
+
+    def create(self, content: bytes) -> bool:
+        """Write a small file unless there is one; return whether there was none.
+
+        Storages that cannot decide that look first.
+        """
+        try:
+            self._put("written", lambda: self._system.pipe_file(self._path, content, mode="create"))
+        except FileExistsError:
+            return False
+        return True
+
+    def upload(self, file: Path) -> None:
+        """Send a file, in parts if it is large: memory holds a few of them."""
+        options = self._in_parts(file.stat().st_size)
+        self._put("uploaded", lambda: self._system.put_file(str(file), self._path, **options))
+
+    def _in_parts(self, size: int = 0) -> dict[str, int]:
+        """Return options that limit the memory of a transfer; the default is half a gigabyte."""
+        part = max(_PART_BYTES, -(-size // _MOST_PARTS))
+        return {"chunksize": part, "max_concurrency": 2} if self._is_s3() else {}
+
+    def _put(self, done: str, call: Callable[[], Any]) -> None:
+        if not self._is_s3():  # which would make a bucket of a name that is misspelt
+            self._tried(done, lambda: self._system.makedirs(self._parent(), exist_ok=True))
+        try:
+            self._tried(done, call)
+        except FileNotFoundError as error:
+            raise self._as_error(done, error) from error
+
+    def download(self, target: Path) -> None:
+        """Fetch a file, or a folder with all in it, piece by piece.
+
+        Raises
+        ------
+        ShapecatError : it is not there, or the connection broke.
+        """
+
+        def get() -> None:
+            folder = self._system.isdir(self._path)
+            self._system.get(self._path, str(target), recursive=folder, **self._in_parts())
+
+        with suppress(FileNotFoundError):
+            self._tried("downloaded", get)
+        if not target.exists():
+            msg = f"{self.url}: does not exist"
+            raise self._error(msg)
+
+    def copy(self, other: "Location") -> None:
+        """Copy a file within the storage."""
+        self._put("copied", lambda: self._system.cp_file(self._path, other._path))  # noqa: SLF001  of this class
+
+    def remove(self) -> None:
+        """Remove a file, if there is one."""
+        with suppress(FileNotFoundError):
+            self._tried("removed", lambda: self._system.rm_file(self._path))
+
+    def names(self) -> set[str]:
+        """Return the names in a folder."""
+        return {PurePosixPath(url).name for url, _ in self.walk(deep=False)}
+
+    def walk(self, *, deep: bool = True) -> Iterator[tuple[str, Mapping[str, Any]]]:
+        """Yield URL and info of the files in a folder, or of those that match a pattern.
+
+        Parameters
+        ----------
+        deep : also the files in its folders; otherwise the folders themselves.
+        """
+        found = self._match() if _is_pattern(self._path) else self._list(deep=deep)
+        with suppress(FileNotFoundError):
+            for info in found:
+                yield str(self._system.unstrip_protocol(info["name"].rstrip("/"))), info
+
+    def _match(self) -> Iterator[Mapping[str, Any]]:
+        system = self._system
+        yield from self._tried("listed", lambda: system.glob(self._path, detail=True)).values()
+
+    def _list(self, *, deep: bool) -> Iterator[Mapping[str, Any]]:
+        system, path = self._system, self._path
+        if self._is_s3():
+            yield from self._list_pages(deep=deep)
+        elif deep:
+            yield from self._tried("listed", lambda: system.find(path, detail=True)).values()
+        else:
+            yield from self._tried("listed", lambda: system.ls(path, detail=True))
+
+    def _list_pages(self, *, deep: bool) -> Iterator[Mapping[str, Any]]:
+        """Yield the infos of a folder in S3, page by page: a bucket may hold millions."""
+        bucket, key, _ = self._system.split_path(self._path)
+        prefix = f"{key.rstrip('/')}/" if key else ""
+        delimiter = "" if deep else "/"
+        options = {"Bucket": bucket, "Prefix": prefix, "Delimiter": delimiter, "MaxKeys": _PAGE}
+        call = self._system.call_s3
+        while True:
+            try:
+                page = self._tried("listed", lambda: call("list_objects_v2", **options))
+            except FileNotFoundError as error:  # the bucket: a folder without files is an empty one
+                raise self._as_error(done="listed", error=error) from error
+            for item in page.get("Contents", ()):
+                yield {**item, "name": f"{bucket}/{item['Key']}", "size": item["Size"]}
+            for item in page.get("CommonPrefixes", ()):
+                yield {"name": f"{bucket}/{item['Prefix']}", "size": 0}
+            if not page.get("IsTruncated"):
+                return
+            options["ContinuationToken"] = page["NextContinuationToken"]
+
+    def abort_uploads(self) -> None:
+        """Abort unfinished multipart uploads to a folder, which cost money."""
+        if not self._is_s3():
+            return
+        bucket, key, _ = self._system.split_path(self._path)
+        call = self._system.call_s3
+        options = {"Bucket": bucket, "Prefix": f"{key}/"}
+        begun = self._tried("listed", lambda: call("list_multipart_uploads", **options))
+        for upload in begun.get("Uploads", ()):
+            known = {"Bucket": bucket, "Key": upload["Key"], "UploadId": upload["UploadId"]}
+            with suppress(FileNotFoundError):
+                self._tried("removed", partial(call, "abort_multipart_upload", **known))
+
+    def _is_s3(self) -> bool:
+        return "s3" in self._system.protocol
+
+    def _parent(self) -> str:
+        return self._path.rstrip("/").rpartition("/")[0]
+
+
+def _connect(url: str, error: type[ShapecatError]) -> tuple[Any, str]:
+    """Return the file system of a URL, and the path in it."""
+    try:
+        from fsspec.core import url_to_fs  # noqa: PLC0415  an extra
+    except ImportError as missing:
+        msg = f"{url}: URLs need fsspec: pip install 'shapecat[remote]'"
+        raise ConfigError(msg) from missing
+    try:
+        # Listings are not kept: other workers change what lies there.
+        system, path = url_to_fs(url, use_listings_cache=False)
+    except ImportError as missing:
+        msg = f"{url}: {missing}"
+        raise ConfigError(msg) from missing
+    except (OSError, ValueError) as reason:
+        msg = f"{url}: cannot be reached: {reason}"
+        raise error(msg) from reason
+    return system, str(path)
+
+
+def _is_pattern(path: str) -> bool:
+    return any(character in path for character in "*[")
+
+
+def _may_pass(error: Exception) -> bool:
+    """Return whether a call may succeed later: the server is busy, a connection broke."""
+    status = getattr(error, "status", None)
+    if isinstance(status, int):
+        return status == 429 or status >= 500
+    known = (
+        isinstance(error, TimeoutError | ConnectionError) or type(error).__name__ in _PASSING_NAMES
+    )
+    return known or getattr(error, "errno", None) in _PASSING

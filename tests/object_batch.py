@@ -1,0 +1,185 @@
+"""A batch in object storage, on Dask workers without a shared disk, with losses on the way.
+
+    python -m tests.object_batch --count 2000        by hand; some minutes
+
+The storage refuses a share of the requests. One worker is killed when a third of the recordings
+are done, the scheduler and all workers when two thirds are; both are started anew, as whoever runs
+a cluster would. `Report` says what came of it.
+"""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from tests.object_storage import object_storage, requests
+from tests.scenes import record
+
+QUIET: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+IN, OUT = "s3://lab/in", "s3://lab/out"
+FRAMES = 3
+
+
+@dataclass(frozen=True)
+class Report:
+    """What came of a batch.
+
+    ``made`` counts how often each recording became a run; ``left`` names what lies in the bucket
+    beside runs and manifest.
+    """
+
+    code: int
+    errors: str
+    seconds: float
+    states: Counter[str]
+    tries: Counter[int]
+    made: Counter[str]
+    left: list[str]
+    refused: int
+
+
+class DaskCluster:
+    """A scheduler and workers, each in a folder of its own: they share no disk."""
+
+    def __init__(self, address: str, folder: Path, workers: int = 2) -> None:
+        """Start them."""
+        host = ("--host", "127.0.0.1", "--dashboard-address", "127.0.0.1:0")
+        port = address.rpartition(":")[2]
+        self._processes = [self._start(folder, "scheduler", "--port", port, *host)]
+        self._processes += [
+            self._start(folder / f"worker{k}", "worker", address, "--nthreads", "1", *host)
+            for k in range(workers)
+        ]
+
+    @staticmethod
+    def _start(folder: Path, *arguments: str) -> subprocess.Popen[bytes]:
+        folder.mkdir(parents=True, exist_ok=True)
+        command = [sys.executable, "-m", "dask", *arguments]
+        environment = {**os.environ, "TMPDIR": str(folder), "PYTHONPATH": str(Path.cwd())}
+        return subprocess.Popen(
+            command, cwd=folder, env=environment, start_new_session=True, **QUIET
+        )
+
+    def kill_a_worker(self) -> None:
+        """Kill the process that computes; its nanny starts another."""
+        nanny = self._processes[1].pid
+        for child in children(nanny):
+            if b"spawn_main" in Path(f"/proc/{child}/cmdline").read_bytes():
+                os.kill(child, signal.SIGKILL)
+
+    def kill(self) -> None:
+        """Kill all of it."""
+        for process in self._processes:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.wait()
+
+
+def children(process: int) -> list[int]:
+    """Return the processes that one has started."""
+    threads = Path(f"/proc/{process}/task").glob("*/children")
+    return [int(pid) for thread in threads for pid in thread.read_text().split()]
+
+
+def free_address() -> str:
+    """Return an address that a scheduler can listen at."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        return f"tcp://127.0.0.1:{server.getsockname()[1]}"
+
+
+def fill(count: int, folder: Path) -> None:
+    """Put so many recordings into the bucket: each is one of five."""
+    import fsspec  # noqa: PLC0415  an extra
+
+    system = fsspec.filesystem("s3")
+    kinds = [record(folder / f"{k}.mcap", FRAMES + k).read_bytes() for k in range(5)]
+    for first in range(0, count, 100):
+        some = range(first, min(count, first + 100))
+        system.pipe({f"{IN}/run_{k:04}.mcap".removeprefix("s3://"): kinds[k % 5] for k in some})
+
+
+def run(count: int, folder: Path, *, refused: float) -> Report:
+    """Process so many recordings; kill a worker, then the scheduler and all workers."""
+    with object_storage(folder / "log", refused=refused) as log:
+        fill(count, folder)
+        address = free_address()
+        cluster = DaskCluster(address, folder / "dask")
+        command = [sys.executable, "-m", "shapecat", "process", f"{IN}/", "--out", OUT, "--no-rrd"]
+        command += ["--executor", "dask", "--scheduler", address, "--progress", "plain"]
+        begun = time.monotonic()
+        errors = folder / "errors"
+        with errors.open("wb") as file:
+            process = subprocess.Popen(command, stderr=file, stdout=subprocess.DEVNULL)
+        try:
+            wait_until(lambda: len(set(made(log))) >= count // 3, process)
+            cluster.kill_a_worker()
+            wait_until(lambda: len(set(made(log))) >= 2 * count // 3, process)
+            cluster.kill()
+            cluster = DaskCluster(address, folder / "dask")
+            process.wait(timeout=60 + 5 * count)
+        finally:
+            process.kill()
+            cluster.kill()
+        seconds = time.monotonic() - begun
+        return _report(process.returncode, errors.read_text("utf-8"), seconds, log)
+
+
+def wait_until(condition: Callable[[], bool], process: subprocess.Popen[bytes]) -> None:
+    """Wait for a condition, or for a process to end."""
+    while not condition() and process.poll() is None:
+        time.sleep(0.5)
+
+
+def made(log: Path) -> list[str]:
+    """Return the names of the recordings that became runs, in order, as often as they did."""
+    return [path.split("/")[-2] for path in requests(log, "PUT", "/run.json")]
+
+
+def _report(code: int, errors: str, seconds: float, log: Path) -> Report:
+    import fsspec  # noqa: PLC0415  an extra
+
+    system: Any = fsspec.filesystem("s3", use_listings_cache=False)
+    bucket = OUT.removeprefix("s3://")
+    lines = system.cat_file(f"{bucket}/manifest.jsonl").splitlines()
+    entries = [json.loads(line) for line in lines]
+    places = {path.removeprefix(f"{bucket}/").split("/")[0] for path in system.find(bucket)}
+    known = {entry["folder"] for entry in entries}
+    unfinished = [upload["Key"] for upload in system.list_multipart_uploads("lab")]
+    return Report(
+        code=code,
+        errors=errors,
+        seconds=seconds,
+        states=Counter(entry["state"] for entry in entries),
+        tries=Counter(entry["tries"] for entry in entries),
+        made=Counter(made(log)),
+        left=sorted(places - known - {"manifest.jsonl", ".manifest"}) + unfinished,
+        refused=sum(line.endswith(" 503") for line in log.read_text("utf-8").splitlines()),
+    )
+
+
+if __name__ == "__main__":
+    import click
+
+    @click.command()
+    @click.option("--count", default=2000)
+    @click.option("--refused", default=0.05, help="Share of requests that the storage refuses.")
+    def main(count: int, refused: float) -> None:
+        """Run the batch, print what came of it."""
+        with tempfile.TemporaryDirectory() as folder:
+            report = run(count, Path(folder), refused=refused)
+        twice = [name for name, times in report.made.items() if times != 1]
+        click.echo(
+            f"exit code {report.code}, {report.seconds:.0f} s, {dict(report.states)}, tries"
+            f" {dict(report.tries)}, {len(report.made)} made, {len(twice)} not once, left:"
+            f" {report.left}, {report.refused} requests refused\n{report.errors[-1000:]}"
+        )
+
+    main()

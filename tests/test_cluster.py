@@ -1,0 +1,114 @@
+"""Batches in object storage, on workers that share no disk: nothing lost, nothing done twice."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import pyarrow.parquet as pq
+import pytest
+
+from tests.object_batch import IN, OUT, Report, children, fill, made, run, wait_until
+from tests.object_storage import object_storage
+
+TABLES = ("frames", "detections", "planes", "tracks")
+PROCESS = [sys.executable, "-m", "shapecat", "process", f"{IN}/", "--out", OUT, "--no-rrd"]
+
+pytestmark = pytest.mark.many
+
+
+@pytest.fixture
+def bucket(tmp_path: Path) -> Iterator[Path]:
+    """Serve a bucket that refuses some requests; give the log of all."""
+    with object_storage(tmp_path / "log", refused=0.03) as log:
+        yield log
+
+
+def assert_right(report: Report, count: int) -> None:
+    assert report.code == 0, report.errors
+    assert report.states == {"complete": count}
+    assert len(report.made) == count
+    assert set(report.made.values()) == {1}
+    assert report.left == []
+    assert report.refused > 0
+    assert "bug" not in report.errors
+
+
+def test_a_batch_on_dask_survives_a_worker_and_the_scheduler(tmp_path: Path) -> None:
+    """The storage is throttled, a worker is killed, later the scheduler and all workers are."""
+    report = run(18, tmp_path, refused=0.05)
+
+    assert_right(report, 18)
+
+
+def ray_workers(driver: int) -> list[int]:
+    """Return the processes that Ray computes in, below the process that started it."""
+    found, below = [], [driver]
+    while below:
+        process = below.pop()
+        below += children(process)
+        name = Path(f"/proc/{process}/cmdline").read_bytes()
+        if name.startswith(b"ray::") and b"IDLE" not in name:
+            found.append(process)
+    return found
+
+
+def test_a_batch_on_ray_survives_a_worker(bucket: Path, tmp_path: Path) -> None:
+    fill(10, tmp_path)
+    options = ("--executor", "ray", "--jobs", "2")
+    with (tmp_path / "errors").open("wb") as errors:
+        driver = subprocess.Popen([*PROCESS, *options], stderr=errors, stdout=subprocess.DEVNULL)
+        wait_until(lambda: len(made(bucket)) >= 3, driver)
+        wait_until(lambda: bool(ray_workers(driver.pid)), driver)
+        os.kill(ray_workers(driver.pid)[0], signal.SIGKILL)
+        code = driver.wait(timeout=300)
+
+    assert code == 0, (tmp_path / "errors").read_text()
+    assert sorted(made(bucket)) == [f"run_{k:04}" for k in range(10)]
+    assert_same_tables(tmp_path)
+
+
+def assert_same_tables(folder: Path) -> None:
+    """Compare what lies in the bucket with what one process makes of the same recordings."""
+    from shapecat.pipeline import process  # noqa: PLC0415  only where it is needed
+    from shapecat.runs.jobs import Job  # noqa: PLC0415  the same
+
+    system: Any = fsspec.filesystem("s3")
+    for k in range(2):
+        here = folder / "here" / f"run_{k:04}"
+        process(Job(folder / f"{k}.mcap", here, rrd=False))
+        for name in TABLES:
+            with system.open(f"{OUT}/run_{k:04}/{name}.parquet") as file:
+                there = pq.read_table(file)
+            expected = pq.read_table(here / f"{name}.parquet")
+            timed = [column for column in there.column_names if column == "seconds"]
+            assert expected.drop_columns(timed).equals(there.drop_columns(timed)), name
+
+
+def test_a_killed_command_is_gone_on_with(bucket: Path, tmp_path: Path) -> None:
+    """Kill -9 at any moment; and then the same command twice at once."""
+    fill(8, tmp_path)
+    command = [*PROCESS, "--jobs", "2"]
+    quiet: Any = {"stderr": subprocess.PIPE, "stdout": subprocess.DEVNULL, "text": True}
+    first = subprocess.Popen(command, stderr=subprocess.DEVNULL, stdout=subprocess.DEVNULL)
+    wait_until(lambda: len(made(bucket)) >= 2, first)
+    first.kill()
+    first.wait()
+
+    both = [subprocess.Popen(command, **quiet) for _ in range(2)]
+    errors = [process.communicate(timeout=300)[1] for process in both]
+    last = subprocess.run(command, check=False, **quiet)
+
+    for text in errors:
+        told = [line for line in text.splitlines() if line.startswith("Error")]
+        assert all("another run is writing there" in line for line in told), text
+    assert last.returncode == 0, last.stderr
+    assert sorted(made(bucket)) == [f"run_{k:04}" for k in range(8)]
+    assert_same_tables(tmp_path)
+    lines = fsspec.filesystem("s3").cat_file(f"{OUT}/manifest.jsonl").splitlines()
+    assert len(lines) == 8
+    assert all(b'"state": "complete"' in line for line in lines)
