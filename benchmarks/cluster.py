@@ -1,27 +1,35 @@
 """A hundred thousand recordings on 1 to 1,000 workers, simulated from measured costs.
 
-    python -m benchmarks.cluster          writes docs/images/scaling.png, prints the table
+    python -m benchmarks.cluster          writes docs/images/scaling.png, prints the tables
+    python -m benchmarks.cluster --check  compares the model with 1 to 4 workers on this machine
+    python -m benchmarks.cluster --limits measures planning and manifest up to a million recordings
 
-What is measured here: what handing a task to a worker costs (locally and with Dask), what a line
-of the manifest costs, what planning a recording costs. What is measured elsewhere and given as an
-option: CPU time per frame (`benchmarks.whole`). What is assumed is written in `Assumed`.
+What is measured here: the cost of handing a task to a worker (locally and with Dask), of a line of
+the manifest, and of planning a recording. What is measured elsewhere and given as an option: CPU
+time per frame (`benchmarks.whole`). What is assumed is written in `Assumed`.
 """
 
 import heapq
 import json
 import math
+import resource
 import tempfile
 import time
 from concurrent.futures import Executor
 from dataclasses import asdict, dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import click
 import numpy as np
 
+from benchmarks.batch import process
 from benchmarks.measure import markdown, save
-from shapecat.batch.manifest import Entry, Manifest
-from shapecat.batch.plans import plan_batch
+from shapecat.batch.finding import Source
+from shapecat.batch.manifest import Entry, Manifest, RemoteManifest
+from shapecat.batch.plans import _Planner, plan_batch
+from shapecat.batch.runs import _Ledger
+from shapecat.batch.storage import Location
 from shapecat.executors import open_executor
 from shapecat.runs.jobs import Job
 
@@ -42,6 +50,8 @@ class Assumed:
     storage_mb_s: float = 1250.0  # shared by all: a file server on 10 Gbit/s
     stream_mb_s: float = 250.0  # one worker alone
     startup_s: float = 3.0  # of a worker, once
+    recording_s: float = 0.1  # CPU time of a recording beside its frames
+    cores: int = 0  # that the workers share; 0 for one each
 
 
 @dataclass(frozen=True)
@@ -78,6 +88,7 @@ def simulate(
     """
     rng = np.random.default_rng(0)
     frames = rng.lognormal(math.log(given.median_frames), given.spread, given.recordings)
+    crowded = max(1.0, workers / given.cores) if given.cores else 1.0
     written = given.written_mb if written_mb is None else written_mb
     scheduler, storage, manifest = Queue(), Queue(), Queue()
     planned = costs.plan_s * given.recordings
@@ -96,8 +107,9 @@ def simulate(
             after = max(storage.serve(now, n * given.read_mb / given.storage_mb_s), now + alone)
             state = "work"
         elif state == "work":
-            after, state = now + n * costs.frame_s, "write"
-            compute += n * costs.frame_s
+            spent = n * costs.frame_s + given.recording_s
+            after, state = now + crowded * spent, "write"
+            compute += spent
         elif state == "write":
             alone = n * written / given.stream_mb_s
             after = max(storage.serve(now, n * written / given.storage_mb_s), now + alone)
@@ -174,15 +186,125 @@ def draw(path: Path, results: dict[str, list[dict[str, float]]]) -> None:
     figure.savefig(path, dpi=110)
 
 
+def per_hour(costs: Measured, given: Assumed) -> list[tuple[str, ...]]:
+    """Return what a recorded hour costs: wall time, CPU time, storage, and which of them binds."""
+    frames = 30 * 3600.0
+    cpu_h = frames * costs.frame_s / 3600
+    rows = []
+    lean = 0.003 + given.read_mb / 1000
+    for cores, storage_mb_s, written, words in (
+        (1, given.storage_mb_s, given.written_mb, "one core"),
+        (2, given.storage_mb_s, given.written_mb, "two cores"),
+        (200, given.storage_mb_s, given.written_mb, "100 nodes of two cores, 10 Gbit/s"),
+        (200, 10 * given.storage_mb_s, given.written_mb, "the same, 100 Gbit/s"),
+        (200, given.storage_mb_s, lean, "the same, tables alone, 10 Gbit/s"),
+    ):
+        gigabytes = frames * (given.read_mb + written) / 1000
+        storage_s = 1000 * gigabytes / storage_mb_s
+        compute_s = 3600 * cpu_h / cores
+        wall_s = max(storage_s, compute_s)
+        bound = "storage" if storage_s > compute_s else "cores"
+        rows.append((words, f"{wall_s:.0f}", f"{cpu_h:.2f}", f"{gigabytes:.0f}", bound))
+    return rows
+
+
+def check(folder: Path, *, recordings: int, frames: int) -> list[tuple[str, ...]]:
+    """Compare the model with 1 to 4 workers that share the cores of this machine."""
+    from tests.scenes import record  # noqa: PLC0415  the small scene of the tests
+
+    (folder / "in").mkdir()
+    for k in range(recordings):
+        record(folder / "in" / f"{k:02}.mcap", frames)
+    one = record(folder / "one.mcap", 1)
+
+    def wall_s(name: str, source: Path, jobs: int) -> float:
+        code, seconds = process(source, folder / name, "--jobs", str(jobs), "--no-rrd")
+        assert code == 0
+        return seconds
+
+    startup_s, long_s = wall_s("a", one, 1), wall_s("b", folder / "in" / "00.mcap", 1)
+    frame_s = (long_s - startup_s) / (frames - 1)
+    base_s = wall_s("w1", folder / "in", 1)
+    recording_s = max(0.0, (base_s - startup_s) / recordings - frames * frame_s)
+    given = Assumed(recordings, frames, 0.0, 0.0, 0.0, 1e9, 1e9, startup_s, recording_s, 2)
+    costs = Measured(frame_s, 0.001, 0.0001, 0.001)
+    rows = []
+    for workers in range(1, 5):
+        told = 3600 * simulate(workers, costs, given)["hours"]
+        seen = base_s if workers == 1 else wall_s(f"w{workers}", folder / "in", workers)
+        rows.append((f"{workers}", f"{seen:.1f}", f"{told:.1f}", f"{100 * (told / seen - 1):+.0f}"))
+    return rows
+
+
+def limits(count: int) -> tuple[str, ...]:
+    """Plan so many made-up recordings, note them all, read the manifest, and plan them again."""
+    first = f"kitchen_{0:07}"
+    named = [
+        (name := f"kitchen_{k:07}", Source("", f"s3://lab/{name}.mcap", name, "", f"{k:016x}", 4))
+        for k in range(count)
+    ]
+    out = "memory://out"
+    spent, before = [time.process_time()], peak_mb()
+    manifest = RemoteManifest(out)
+    tasks = planner(out, set(), manifest).tasks(named)
+    spent.append(time.process_time())
+    ledger = _Ledger(manifest)
+    ledger.plan(tasks)
+    for some in range(0, count, 1000):
+        entries = [task.entry() for task in tasks[some : some + 1000]]
+        manifest.record(
+            replace(e, state="complete", frames=1800, seconds=46.4, tracks={"cup": 3}, tries=1)
+            for e in entries
+        )
+    manifest.send()
+    spent.append(time.process_time())
+    del manifest, tasks, ledger
+    again = RemoteManifest(out)
+    spent.append(time.process_time())
+    tasks = planner(out, {name for name, _ in named}, again).tasks(named)
+    assert tasks[0].name == first
+    assert all(task.status == "complete" for task in tasks)
+    spent.append(time.process_time())
+    seconds = [f"{after - before:.1f}" for before, after in pairwise(spent)]
+    stored = sum(info["size"] for _, info in Location(f"{out}/.manifest").walk()) / 1e6
+    return (f"{count:,}", *seconds, f"{stored:.0f}", f"{peak_mb() - before - stored:.0f}")
+
+
+def planner(out: str, there: set[str], manifest: Manifest) -> _Planner:
+    """Return the part of a plan that sees what is done."""
+    return _Planner(Job(Path(), Path()), out, there, manifest)
+
+
+def peak_mb() -> float:
+    """Return the most memory that this process has held."""
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
 @click.command()
 @click.option("--frame-ms", default=25.8, help="CPU time per frame, all outputs on.")
 @click.option("--recordings", default=100_000)
 @click.option("--plot", type=click.Path(path_type=Path), default=ROOT / "docs/images/scaling.png")
-def main(*, frame_ms: float, recordings: int, plot: Path) -> None:
-    """Simulate, print a table, draw a plot, write ``build/benchmarks_cluster.json``."""
-    given = Assumed(recordings=recordings)
+@click.option("--check", "only_check", is_flag=True, help="Compare the model with 1 to 4 workers.")
+@click.option("--limits", "count", type=int, help="Plan so many made-up recordings.")
+def main(
+    *, frame_ms: float, recordings: int, plot: Path, only_check: bool, count: int | None
+) -> None:
+    """Simulate, print tables, draw a plot, write ``build/benchmarks_cluster.json``."""
+    if only_check:
+        with tempfile.TemporaryDirectory() as folder:
+            rows = check(Path(folder), recordings=16, frames=60)
+        print(markdown("model", ("workers", "measured s", "model s", "error %"), rows))
+    elif count:
+        columns = ("recordings", "plan s", "note s", "read s", "plan again s", "MB stored", "MB")
+        print(markdown("limits", columns, [limits(count)]))
+    else:
+        study(Assumed(recordings=recordings), frame_ms / 1000, plot)
+
+
+def study(given: Assumed, frame_s: float, plot: Path) -> None:
+    """Simulate the cluster, print tables, draw a plot."""
     wide = replace(given, storage_mb_s=10 * given.storage_mb_s)
-    costs = measure(frame_ms / 1000)["dask"]
+    costs = measure(frame_s)["dask"]
     lean = 0.003 + given.read_mb / 1000  # MB per frame: tables alone
     results = {
         "all outputs, 10 Gbit/s": [simulate(n, costs, given) for n in WORKERS],
@@ -196,6 +318,8 @@ def main(*, frame_ms: float, recordings: int, plot: Path) -> None:
         ]
         columns = ("workers", "hours", "computing %", "storage %", "scheduler %", "manifest %")
         print(markdown(title, (*columns, "plan %"), shown))
+    columns = ("", "wall s", "CPU-hours", "GB", "bound by")
+    print(markdown("a recorded hour at 30 Hz", columns, per_hour(costs, given)))
     print(json.dumps(asdict(costs)))
     draw(plot, results)
     figures = {"assumed": asdict(given), "measured": asdict(costs), "results": results}

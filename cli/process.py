@@ -155,12 +155,14 @@ def process(
     )
     with plan_batch(job, recordings, out, shard=shard) as batch:
         watcher = open_progress(progress, batch.tasks)
-        outcomes = _run(batch, watcher, jobs, executor, scheduler)
+        tally = _Tally(keep_all=as_json)
+        for outcome in _run(batch, watcher, jobs, executor, scheduler):
+            tally.add(outcome)
     if as_json:
-        print_json([outcome.summary.as_dict() for outcome in outcomes if outcome.summary])
+        print_json([outcome.summary.as_dict() for outcome in tally.kept if outcome.summary])
     else:
-        _print_closing(batch.tasks, outcomes)
-    ctx.exit(exit_code(outcomes))
+        _print_closing(batch.tasks, tally)
+    ctx.exit(exit_code(list(tally.of_each_code.values())))
 
 
 def _require_range(start_s: float | None, end_s: float | None) -> None:
@@ -172,7 +174,7 @@ def _require_range(start_s: float | None, end_s: float | None) -> None:
 
 def _run(
     batch: Any, watcher: Progress, jobs: int | None, name: str, scheduler: str | None
-) -> list[Any]:
+) -> Iterator[Any]:
     """Process the tasks of a batch here where one process is enough, else on an executor."""
     from shapecat.batch import process_here, process_on
     from shapecat.executors import open_executor, share_cores
@@ -182,13 +184,11 @@ def _run(
         watcher.plan(describe_plan(batch.tasks, batch.left_out, workers, cores))
     if name == "local" and scheduler is None and workers <= 1:
         with watcher:
-            tasks = batch.tasks
-            return list(process_here(tasks, watcher, cores=cores, manifest=batch.manifest))
+            yield from process_here(batch.tasks, watcher, cores=cores, manifest=batch.manifest)
+        return
     started = open_executor(name, workers=workers, threads=1, address=scheduler)
     with _closing(started) as executor, watcher:
-        return list(
-            process_on(executor, batch.tasks, watcher, cores=cores, manifest=batch.manifest)
-        )
+        yield from process_on(executor, batch.tasks, watcher, cores=cores, manifest=batch.manifest)
 
 
 @contextmanager
@@ -205,21 +205,40 @@ def _closing(executor: Any) -> Iterator[Any]:
     executor.shutdown()
 
 
-def _print_closing(tasks: Sequence[Any], outcomes: Sequence[Any]) -> None:
+class _Tally:
+    """The outcomes of a batch: all of a few, counts of many, as there may be a million."""
+
+    def __init__(self, *, keep_all: bool) -> None:
+        self.complete = self.failed = self.frames = 0
+        self.of_each_code: dict[int, Any] = {}
+        self.kept: list[Any] = []
+        self._most = None if keep_all else _MOST_ROWS
+
+    def add(self, outcome: Any) -> None:
+        """Count an outcome."""
+        self.of_each_code.setdefault(outcome.code, outcome)
+        if outcome.summary is None:
+            self.failed += 1
+            return
+        self.complete += 1
+        self.frames += outcome.summary.counts["frames"]
+        few = self._most is None or self.complete <= self._most
+        if few or outcome.summary.corrections is not None:
+            self.kept.append(outcome)
+
+
+def _print_closing(tasks: Sequence[Any], tally: _Tally) -> None:
     """Print the outcome of each recording, in the order of the plan."""
-    ended = {outcome.job.folder: outcome for outcome in outcomes}
-    ordered = [ended[task.job.folder] for task in tasks if task.job.folder in ended]
-    complete = [outcome for outcome in ordered if outcome.summary]
-    if complete and len(complete) <= _MOST_ROWS:
+    ended = {outcome.job.folder.name: outcome for outcome in tally.kept}
+    complete = [ended[task.name] for task in tasks if task.name in ended]
+    if 0 < tally.complete <= _MOST_ROWS:
         columns = ("recording", "frames", "seconds", "tracks", "results")
         print_table(columns, [_row(outcome) for outcome in complete])
     for outcome in complete:
         if outcome.summary.corrections is not None:
             _print_corrections(outcome)
     if len(tasks) > 1:
-        frames = sum(o.summary.counts["frames"] for o in complete)
-        failed = len(ordered) - len(complete)
-        click.echo(f"{len(complete)} complete, {failed} failed, {frames:,} frames")
+        click.echo(f"{tally.complete} complete, {tally.failed} failed, {tally.frames:,} frames")
 
 
 def _print_corrections(outcome: Any) -> None:

@@ -42,8 +42,7 @@ class Progress:
         """Start from the plan."""
         self.lock = Lock()
         self.begun = time.monotonic()
-        self.names = {task.job.folder.name: task.job.name for task in tasks}
-        self.sizes: dict[str, int] = {task.job.folder.name: task.bytes for task in tasks}
+        self.tasks = {task.name: task for task in tasks}
         self.todo: int = sum(task.bytes for task in tasks if task.status != "complete")
         self.read = 0
         self.running: dict[str, tuple[str, int, int | None]] = {}
@@ -67,7 +66,7 @@ class Progress:
                     self._told = True
                     self.note(COMPILING)
                 return
-            if folder in self.names:
+            if folder in self.tasks:
                 self.running[folder] = (phase, done, total)
                 self.show(folder)
 
@@ -80,8 +79,9 @@ class Progress:
                 self.failed += 1
             else:
                 self.complete += 1
-            if outcome.summary is None or outcome.summary.processed:
-                self.read += self.sizes.get(name, 0)
+            task = self.tasks.get(name)
+            if task is not None and (outcome.summary is None or outcome.summary.processed):
+                self.read += task.bytes
             self.show_ended(outcome)
 
     def remaining_s(self) -> float | None:
@@ -120,13 +120,13 @@ class PlainProgress(Progress):
             return
         self._last = now
         running = ", ".join(_words(name, *state) for name, state in sorted(self.running.items()))
-        if len(self.names) == 1:
+        if len(self.tasks) == 1:
             self.note(running)
             return
         left = self.remaining_s()
         eta = "" if left is None else f", about {_duration(left)} left"
         failed = f", {self.failed} failed" if self.failed else ""
-        done = f"{self.complete + self.failed}/{len(self.names)} recordings{failed}{eta}"
+        done = f"{self.complete + self.failed}/{len(self.tasks)} recordings{failed}{eta}"
         self.note(f"{done}; {running}")
 
 
@@ -161,7 +161,7 @@ class JsonProgress(Progress):
         before, now = self._last.get(folder, ("", 0.0)), time.monotonic()
         if phase != before[0] or now - before[1] >= _EVENT_S or done == total:
             self._last[folder] = (phase, now)
-            recording = self.names[folder]
+            recording = self.tasks[folder].recording
             _event("progress", recording=recording, phase=phase, done=done, total=total)
 
     def show_ended(self, outcome: Any) -> None:
@@ -178,7 +178,7 @@ class JsonProgress(Progress):
             message=outcome.message or None,
             complete=self.complete,
             failed=self.failed,
-            of=len(self.names),
+            of=len(self.tasks),
         )
 
 

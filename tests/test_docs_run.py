@@ -27,6 +27,8 @@ PAGES = {
         "shards/monday/run.json",  # the first of four
         "dask/monday/run.json",
         "dask/tuesday/run.json",
+        "ray/monday/run.json",
+        "ray/tuesday/run.json",
         "stored/monday/run.json",
     },
 }

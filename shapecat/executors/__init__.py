@@ -30,7 +30,11 @@ __all__ = [
 Name = Literal["local", "dask", "ray"]
 EXECUTORS: tuple[str, ...] = get_args(Name)
 
-_LOST = {"WorkerLostError", "BrokenProcessPool", "KilledWorker", "WorkerCrashedError"}
+_LOST = {
+    *("WorkerLostError", "BrokenProcessPool"),
+    "KilledWorker",  # Dask
+    *("WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"),  # Ray
+}
 _DROPPED = {"CancelledError", "FutureCancelledError", "CommClosedError"}
 """Errors by name, as neither Dask nor Ray need be installed."""
 

@@ -8,6 +8,9 @@ from shapecat.executors.cores import THREAD_LIMITS
 
 __all__ = ["RayExecutor"]
 
+_STORE_BYTES = 100 * 2**20
+"""Of shared memory for arguments and results, which are small; Ray takes a third by default."""
+
 
 class RayExecutor(Executor):
     """Runs each call as a Ray task of one core."""
@@ -26,7 +29,12 @@ class RayExecutor(Executor):
             raise ConfigError(msg) from error
         self._ray = ray
         variables = dict.fromkeys(THREAD_LIMITS, str(threads))
-        started = {"address": address} if address else {"num_cpus": workers}
+        alone = {
+            "num_cpus": workers,
+            "include_dashboard": False,
+            "object_store_memory": _STORE_BYTES,
+        }
+        started = {"address": address} if address else alone
         try:
             ray.init(**started, runtime_env={"env_vars": variables}, log_to_driver=False)
         except (ConnectionError, RuntimeError, ValueError) as error:
