@@ -190,7 +190,7 @@ def per_hour(costs: Measured, given: Assumed) -> list[tuple[str, ...]]:
     """Return what a recorded hour costs: wall time, CPU time, storage, and which of them binds."""
     frames = 30 * 3600.0
     cpu_h = frames * costs.frame_s / 3600
-    rows = []
+    rows: list[tuple[str, ...]] = []
     lean = 0.003 + given.read_mb / 1000
     for cores, storage_mb_s, written, words in (
         (1, given.storage_mb_s, given.written_mb, "one core"),
@@ -228,7 +228,7 @@ def check(folder: Path, *, recordings: int, frames: int) -> list[tuple[str, ...]
     recording_s = max(0.0, (base_s - startup_s) / recordings - frames * frame_s)
     given = Assumed(recordings, frames, 0.0, 0.0, 0.0, 1e9, 1e9, startup_s, recording_s, 2)
     costs = Measured(frame_s, 0.001, 0.0001, 0.001)
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for workers in range(1, 5):
         told = 3600 * simulate(workers, costs, given)["hours"]
         seen = base_s if workers == 1 else wall_s(f"w{workers}", folder / "in", workers)
@@ -313,13 +313,13 @@ def study(given: Assumed, frame_s: float, plot: Path) -> None:
     }
     for title, rows in results.items():
         shown = [
-            (n, f"{r['hours']:.1f}", *(f"{100 * r[key]:.1f}" for key in tuple(r)[1:]))
+            (f"{n}", f"{r['hours']:.1f}", *(f"{100 * r[key]:.1f}" for key in tuple(r)[1:]))
             for n, r in zip(WORKERS, rows, strict=True)
         ]
         columns = ("workers", "hours", "computing %", "storage %", "scheduler %", "manifest %")
         print(markdown(title, (*columns, "plan %"), shown))
-    columns = ("", "wall s", "CPU-hours", "GB", "bound by")
-    print(markdown("a recorded hour at 30 Hz", columns, per_hour(costs, given)))
+    costs_of_it = ("", "wall s", "CPU-hours", "GB", "bound by")
+    print(markdown("a recorded hour at 30 Hz", costs_of_it, per_hour(costs, given)))
     print(json.dumps(asdict(costs)))
     draw(plot, results)
     figures = {"assumed": asdict(given), "measured": asdict(costs), "results": results}
