@@ -26,6 +26,7 @@ from shapecat.tracking.common_motion import find_common_motion
 from shapecat.tracking.fusion import fuse_novelty, view_weights
 from shapecat.tracking.hits import Hits
 from shapecat.tracking.recording import _without_gaps
+from shapecat.tracking.surplus import without_shadows
 
 SETTINGS = TrackingSettings()
 SECOND = 1_000_000_000
@@ -547,3 +548,31 @@ def test_a_track_that_has_proved_itself_ends_by_time_alone(hits: int, alive: int
     step(tracker, hits, np.zeros((0, 3)), stamp_ns=(2 * (hits - 1) + 5) * SECOND)
 
     assert tracker.active == alive
+
+
+@pytest.mark.parametrize(
+    ("begin", "x", "kept"),
+    [
+        (10, 0.01, False),  # inside the host, while it is seen
+        (10, 0.2, True),  # beside it
+        (27, 0.01, True),  # at its place, after it has gone
+        (0, 0.01, True),  # and before it came
+    ],
+)
+def test_a_short_track_inside_a_longer_one_is_its_shadow(
+    begin: int, x: float, *, kept: bool
+) -> None:
+    host, shadow = range(3, 27), range(begin, begin + 3)
+    members: tuple[list[int], list[int]] = ([], [])
+    frames, count = [], 0
+    for k in range(30):
+        places = [[0.0, 0, 0]] * (k in host) + [[x, 0.0, 0]] * (k in shadow)
+        frames.append(frame(k, places))
+        for which, there in enumerate((k in host, k in shadow)):
+            members[which].extend([count] * there)
+            count += there
+    tracks = [np.array(member) for member in members]
+
+    found = without_shadows(Hits.of(frames), tracks)
+
+    assert [len(member) for member in found] == ([24, 3] if kept else [24])
