@@ -6,11 +6,11 @@ They are higher than a plate is thick. What is left are steps and noise, which i
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4
+from shapecat.detection.foreground.settings import LOW
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = [
-    "APART",
     "EVERY",
     "clear_contact",
     "filter_high_pass",
@@ -18,18 +18,8 @@ __all__ = [
     "measure_residual",
 ]
 
-LOW_M = 0.03
-"""Higher things are objects anyway."""
-WINDOW = 20
-"""Cells to each side over which the mean is taken: more than a rim is wide, less than a wave."""
-MOST = 0.006
-"""Excess above which a cell counts no more in the mean, 1/m, lest it make a pit around it."""
 STEPS = 2**20
-"""Steps to 1/m of the sums, no more for a window of readings 1/m below the plane to fit 32 bits."""
-SLOPE = 0.0016
-"""Fall per cell of the side of something, 1/m."""
-APART = 5
-"""Cells over which rises are measured, of noise as of outlines."""
+"""Steps to 1/m of the sums, no more for a window of samples 1/m below the plane to fit 32 bits."""
 BIN, BINS, EVERY = 2e-5, 500, 3
 """How rises are counted: width of a bin, 1/m, their number, and every so many cells."""
 
@@ -84,7 +74,7 @@ def _find_low(
 
     Returns whether there are any.
     """
-    zero, one, low = np.float32(0), np.float32(1), np.float32(LOW_M)
+    zero, one, low = np.float32(0), np.float32(1), np.float32(LOW.low_m)
     slope, base = np.float32(plane[0]), np.float32(plane[1] * i + plane[2])
     above, on = np.int8(number), np.int8(-number)
     some = False
@@ -107,7 +97,7 @@ def clear_contact(
     """Clear the excess of the feet of what is not low: steep cells below it, down to the plane."""
     rows, columns = residual.shape
     top = 0
-    high, edge = np.float32(LOW_M), np.zeros(columns, np.bool_)
+    high, edge = np.float32(LOW.low_m), np.zeros(columns, np.bool_)
     for i in range(1, rows - 1):
         # Few cells are high and beside what is low, and this vectorises.
         here, above, below = residual[i], residual[i - 1], residual[i + 1]
@@ -140,7 +130,7 @@ def clear_contact(
             x = j + (1 if d == 2 else -1 if d == 3 else 0)
             if (
                 residual[y, x] != 0
-                and here - residual[y, x] > SLOPE
+                and here - residual[y, x] > LOW.slope
                 and abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY
             ):
                 stack[top], drop[top] = y * columns + x, residual[y, x]
@@ -157,13 +147,13 @@ def filter_high_pass(residual: F4, high_pass: F4) -> None:
     take a quarter of the time of others in a row, and are exact.
     """
     rows, columns = residual.shape
-    sums = np.zeros(columns + 2 * WINDOW + 1, np.int32)
+    sums = np.zeros(columns + 2 * LOW.window + 1, np.int32)
     counts = np.zeros(sums.size, np.int32)
-    inside = slice(WINDOW + 1, WINDOW + 1 + columns)
+    inside = slice(LOW.window + 1, LOW.window + 1 + columns)
     total, count = np.zeros(columns, np.int32), np.zeros(columns, np.int32)
     unit, zero = np.float32(1 / STEPS), np.float32(0)
-    for i in range(-WINDOW, rows):
-        entering, leaving = i + WINDOW, i - WINDOW - 1
+    for i in range(-LOW.window, rows):
+        entering, leaving = i + LOW.window, i - LOW.window - 1
         if entering < rows:
             _slide(residual[entering], np.int32(1), sums[inside], counts[inside])
         if leaving >= 0:
@@ -186,7 +176,7 @@ def filter_high_pass(residual: F4, high_pass: F4) -> None:
 @kernel
 def _slide(row: F4, sign: int, sums: I4, counts: I4) -> None:
     """Add a row to the sums of the columns, or take it away."""
-    steps, most, least = np.float32(STEPS), np.float32(MOST), np.float32(-1)
+    steps, most, least = np.float32(STEPS), np.float32(LOW.most), np.float32(-1)
     for j in range(row.size):
         value = row[j] if row[j] < most else most
         sums[j] += sign * np.int32(steps * (value if value > least else least))
@@ -196,7 +186,7 @@ def _slide(row: F4, sign: int, sums: I4, counts: I4) -> None:
 @kernel
 def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
     """Write the sums over the window around each column, and the counts, at least 1."""
-    width = 2 * WINDOW + 1
+    width = 2 * LOW.window + 1
     window = number = np.int32(0)
     for j in range(width):
         window += sums[j]
@@ -213,12 +203,12 @@ def measure_noise(high_pass: F4, plane_id: I4, number: int) -> float:
     rows, columns = high_pass.shape
     histogram = np.zeros(BINS, np.int64)
     n = 0
-    for i in range(0, rows - APART, EVERY):
-        for j in range(0, columns - APART, EVERY):
+    for i in range(0, rows - LOW.apart, EVERY):
+        for j in range(0, columns - LOW.apart, EVERY):
             here = high_pass[i, j]
             if plane_id[i, j] != -number or here == 0:
                 continue
-            for y, x in ((i + APART, j), (i, j + APART)):
+            for y, x in ((i + LOW.apart, j), (i, j + LOW.apart)):
                 if plane_id[y, x] == -number and high_pass[y, x] != 0:
                     rise = abs(high_pass[y, x] - here)
                     histogram[min(int(rise / BIN), BINS - 1)] += 1

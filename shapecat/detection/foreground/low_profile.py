@@ -13,7 +13,6 @@ from shapecat.arrays import F4, F8, I4
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.foreground.convex_hull import fill_hull
 from shapecat.detection.foreground.depth_error import (
-    APART,
     EVERY,
     clear_contact,
     filter_high_pass,
@@ -21,30 +20,12 @@ from shapecat.detection.foreground.depth_error import (
     measure_residual,
 )
 from shapecat.detection.foreground.outline import is_object, measure_outline, width_of_part
+from shapecat.detection.foreground.settings import LOW
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.jit import kernel, unset
 
 __all__ = ["find_low_profile"]
 
-LEVELS = np.array([3.0, 2.0, 1.3, 0.9, 0.6, 0.4], np.float32)
-"""Heights above the mean at which outlines are looked for, as multiples of the least rise."""
-FINE = 0.006
-"""Most that they are multiples of, 1/m: more is not noise but a plane at a grazing angle."""
-STEP, STEADY, SLIP = 0.002, 3.5, 0.7
-"""Least mean rise across the outline of an object: 1/m; as a multiple of the median rise between
-cells of the plane that are as far apart; and as a share of what the plane itself rises in a cell,
-for where it is seen at a grazing angle readings that are a little beside their place seem to
-rise."""
-GROWN = 0.95
-"""Rise per side of a part that replaces known objects within it, as a share of the greatest of
-theirs: an object and a swell beside it rise less."""
-SIDE = 0.004
-"""Rise over two cells of the side of something, 1/m."""
-SAME = 0.9
-"""Share of the cells of a part from which it is a known object."""
-LEAST_CELLS, SMALL_PART = 80, 12
-BESIDE = 0.3
-"""Least share of the outline of a swell that is along the plane."""
 BLOCK = 16
 """Cells that are looked at together: most are not above any level."""
 
@@ -97,7 +78,7 @@ def find_low_profile(
             low_profile[rows],
         )
         residual, high_pass = images[0, rows], images[1, rows]
-        if measure_residual(values, plane_ids, above, plane, number, residual) < LEAST_CELLS:
+        if measure_residual(values, plane_ids, above, plane, number, residual) < LOW.least_cells:
             continue
         clear_contact(
             values,
@@ -109,9 +90,9 @@ def find_low_profile(
             scratch.stack.view(np.float32),
         )
         filter_high_pass(residual, high_pass)
-        clear = max(STEP, STEADY * measure_noise(high_pass, plane_ids, number))
-        step = max(clear, SLIP * math.hypot(plane[0], plane[1]))
-        least = np.float32(min(clear, FINE))
+        clear = max(LOW.step, LOW.steady * measure_noise(high_pass, plane_ids, number))
+        step = max(clear, LOW.slip * math.hypot(plane[0], plane[1]))
+        least = np.float32(min(clear, LOW.fine))
         bounds = (step, least, widest)
         objects, parts = _raise(
             values, high_pass, plane_ids, number, bounds, marks, objects, parts, scratch
@@ -136,8 +117,8 @@ def _rows_of(plane_id: I4, number: int) -> tuple[int, int]:
             start, end = min(start, i), i + 1
     if end == 0:
         return 0, 0
-    start = max(start - APART, 0)
-    return start - start % EVERY, min(end + APART, rows)  # noise is measured on the same rows
+    start = max(start - LOW.apart, 0)
+    return start - start % EVERY, min(end + LOW.apart, rows)  # noise is measured on the same rows
 
 
 @kernel
@@ -156,30 +137,30 @@ def _raise(
 
     They are numbered from ``objects`` + 1 on, the parts that are looked at from ``me`` + 1 on.
     Returns the last numbers. ``high_pass`` (rows, columns) is from `filter_high_pass`; ``bounds``
-    are the least mean rise and what `LEVELS` are multiples of, 1/m, and the greatest width.
+    are the least mean rise and what levels are multiples of, 1/m, and the greatest width.
     """
     rise_least, level_least, widest = bounds
     flat, marks, plane_ids = high_pass.reshape(-1), low_profile.reshape(-1), plane_id.reshape(-1)
     seen, part, seeds, stack = scratch
     visited, parts = seen.reshape(-1), part.reshape(-1)
-    n = _find_seeds(high_pass, level_least * LEVELS[-1], seeds)
-    merits = np.zeros(1 + objects + LEVELS.size * (flat.size // LEAST_CELLS), np.float32)
-    for multiple in LEVELS:
-        level = level_least * multiple
+    n = _find_seeds(high_pass, level_least * LOW.levels[-1], seeds)
+    merits = np.zeros(1 + objects + len(LOW.levels) * (flat.size // LOW.least_cells), np.float32)
+    for multiple in LOW.levels:
+        level = np.float32(level_least * multiple)
         first = me
         for s in seeds[:n]:
             if visited[s] > first or not flat[s] > level:
                 continue
             me += 1
             count = _flood(high_pass, level, s, me, seen, stack)
-            if count < LEAST_CELLS:
+            if count < LOW.least_cells:
                 continue
             known, best = 0, 0.0
             for p in stack[:count]:
                 parts[p] = me
                 known += marks[p] > 0
                 best = max(best, merits[marks[p]])
-            if known > SAME * count or width_of_part(inv_depth, stack, count) > widest:
+            if known > LOW.same * count or width_of_part(inv_depth, stack, count) > widest:
                 continue
             filled = fill_hull(high_pass, part, stack, count)
             outline = measure_outline(
@@ -188,7 +169,7 @@ def _raise(
             for p in stack[count:filled]:
                 best = max(best, merits[marks[p]])
             merit = outline.rise / outline.sides
-            if merit > GROWN * best and is_object(outline, filled):
+            if merit > LOW.grown * best and is_object(outline, filled):
                 objects += 1
                 merits[objects] = merit
                 for p in stack[:filled]:
@@ -287,12 +268,12 @@ def _lower(
             continue
         me += 1
         count = _flood(above, np.uint8(0), s, me, part, stack)
-        if count < SMALL_PART:
+        if count < LOW.small_part:
             continue
         line = measure_outline(
             inv_depth, residual, plane_id, part, stack, count, number, rise_least
         )
-        if line.table >= BESIDE * line.sides and line.rise < line.table:
+        if line.table >= LOW.beside * line.sides and line.rise < line.table:
             for t in range(count):
                 plane_ids[stack[t]] = -number
     return me
@@ -308,6 +289,6 @@ def _is_flat(residual: F4, i: int, j: int) -> bool:
         x = j + (2 if d == 2 else -2 if d == 3 else 0)
         if y < 0 or x < 0 or y >= rows or x >= columns:
             continue
-        if residual[y, x] == 0 or abs(residual[y, x] - here) > SIDE:
+        if residual[y, x] == 0 or abs(residual[y, x] - here) > LOW.side:
             return False
     return True

@@ -4,33 +4,11 @@ from typing import NamedTuple
 
 from shapecat.arrays import F4, I4
 from shapecat.detection.depth_grid import row_and_column
-from shapecat.detection.foreground.depth_error import APART
+from shapecat.detection.foreground.settings import LOW, OUTLINES
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = ["Outline", "is_object", "measure_outline", "width_of_part"]
-
-STEEP, STEEP_SHARE = 0.5, 0.7
-"""A rise that is more than noise, as a share of the mean, and the share of the outline that has
-it."""
-MOST_STEPS = 3
-"""A place counts for at most so many times the mean rise."""
-ALL_AROUND = 0.75
-"""Least sum of the rises for each side of the outline, whether it looks at the plane or not."""
-CHANCE = 16
-"""A short outline must rise more, by this over its sides: few waves rise all around."""
-INWARD = 2
-OUTWARD = APART - INWARD
-"""Cells from the outline to where its rise is measured."""
-LEAST_SIDES = 30
-ALONG, KNOWN = 0.4, 0.65
-"""Shares of an outline: least along the plane, and, of what nothing hides, least along the plane,
-in touch with what is not low, or before something farther."""
-BROAD = 1.5
-"""Cells for each side of the outline of what may be partly hidden: strips beside something else
-are narrower."""
-RAGGED = 80
-"""Square of the sides by the cells of what only fills a gap: 16 of a square, 50 of a crescent."""
 
 
 class Outline(NamedTuple):
@@ -68,13 +46,16 @@ def width_of_part(inv_depth: F4, stack: I4, count: int) -> float:
 def is_object(outline: Outline, count: int) -> bool:
     """Whether an outline around so many cells is that of an object."""
     table, sides = outline.table, outline.sides
-    if table < KNOWN * sides and sides * sides > RAGGED * count:
+    if table < OUTLINES.known * sides and sides * sides > OUTLINES.ragged * count:
         return False
-    seen = sides - (outline.hidden if count > BROAD * sides else 0)
-    if table < max(LEAST_SIDES, ALONG * sides) or outline.known < KNOWN * seen:
+    seen = sides - (outline.hidden if count > OUTLINES.broad * sides else 0)
+    if (
+        table < max(OUTLINES.least_sides, OUTLINES.along * sides)
+        or outline.known < OUTLINES.known * seen
+    ):
         return False
-    least = max(table * (1 + CHANCE / sides), ALL_AROUND * sides)
-    return bool(outline.rise > least and outline.steep > STEEP_SHARE * table)
+    least = max(table * (1 + OUTLINES.chance / sides), OUTLINES.all_around * sides)
+    return bool(outline.rise > least and outline.steep > OUTLINES.steep_share * table)
 
 
 @kernel
@@ -92,7 +73,7 @@ def measure_outline(
     rows, columns = residual.shape
     parts = part.reshape(-1)
     sides = table = known = hidden = steep = 0
-    rise = 0.0
+    rise, outward = 0.0, LOW.apart - OUTLINES.inward
     me = parts[stack[0]]
     for t in range(count):
         p = stack[t]
@@ -113,8 +94,8 @@ def measure_outline(
                 and abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY
             )
             hidden += inv_depth[y, x] <= 0 or inv_depth[y, x] > inv_depth[i, j] + DISCONTINUITY
-            y, x = i + OUTWARD * di, j + OUTWARD * dj
-            v, u = i - INWARD * di, j - INWARD * dj
+            y, x = i + outward * di, j + outward * dj
+            v, u = i - OUTLINES.inward * di, j - OUTLINES.inward * dj
             if min(y, x) < 0 or min(v, u) < 0 or max(y, v) >= rows or max(x, u) >= columns:
                 continue
             known += 0 < inv_depth[y, x] < inv_depth[i, j] - DISCONTINUITY
@@ -124,7 +105,7 @@ def measure_outline(
             known += 1
             step = (residual[v, u] - residual[y, x]) / rise_least
             if residual[v, u] == 0:  # the inside is not low
-                step = MOST_STEPS
-            rise += min(step, MOST_STEPS)
-            steep += int(step > STEEP)
+                step = OUTLINES.most_steps
+            rise += min(step, OUTLINES.most_steps)
+            steep += int(step > OUTLINES.steep)
     return Outline(sides, table, known, hidden, rise, steep)

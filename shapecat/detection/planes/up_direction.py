@@ -43,12 +43,12 @@ def estimate_up(
     found = _directions(normals, least, trials)
     if len(found) == 0:
         return np.zeros(3)
-    best, most = found[0], -1.0
-    for direction in _hypotheses(found, UP.corner_cos if free else 0.0):
-        merit = _merit(surface, direction, held if free else 0.0)
-        if merit > most:
-            best, most = direction, merit
-    up: F8 = _settled(points, surface, intrinsics, best)
+    hypotheses = _hypotheses(found, UP.corner_cos if free else 0.0)
+    best, most = 0, -1.0
+    for k in range(len(hypotheses)):
+        merit = _merit(surface, hypotheses[k], held if free else 0.0)
+        best, most = (k, merit) if merit > most else (best, most)
+    up: F8 = _settled(points, surface, intrinsics, hypotheses[best])
     return up
 
 
@@ -146,8 +146,9 @@ def _hypotheses(found: F8, corner_cos: float) -> F8:
     """Return the directions (n, 3) that may be up: those found, and those that two walls leave."""
     n = len(found)
     result = np.zeros((n * n, 3))
-    result[0:n] = found
     for k in range(len(found)):
+        for d in range(3):
+            result[k, d] = found[k, d]
         for m in range(k):
             if abs(cosine(found[k], found[m])) < corner_cos:
                 corner = cross(found[k], found[m])

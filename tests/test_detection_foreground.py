@@ -1,0 +1,216 @@
+"""Foreground and planes on small made-up images whose answers are known."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.foreground.depth_error import filter_high_pass, measure_noise
+from shapecat.detection.foreground.low_profile import find_low_profile
+from shapecat.detection.foreground.outline import Outline, is_object
+from shapecat.detection.foreground.overhang import extend_overhang
+from shapecat.detection.foreground.settings import LOW
+from shapecat.detection.foreground.walls import CLEARED, ON_WALL, remove_walls
+from shapecat.detection.planes.extent import (
+    COS,
+    DIRECTIONS,
+    PlaneCandidate,
+    SupportingPlane,
+    measure_plane,
+    outline_corners,
+)
+from shapecat.detection.planes.height_map import (
+    HeightMap,
+    is_inside_outline,
+    measure_heights,
+    pack_planes,
+)
+from shapecat.detection.planes.horizontal import find_horizontal_planes
+from shapecat.detection.planes.oriented_points import level_samples, orient_points
+from shapecat.detection.planes.ransac import draw_trials, horizontal_plane
+from shapecat.detection.planes.supporting import supporting_planes
+
+Floats = NDArray[np.float32]
+INTRINSICS = PinholeIntrinsics(262.5, 262.5, 159.5, 119.5)
+UP = np.array([0.0, -np.sqrt(0.5), -np.sqrt(0.5)])
+I, J = np.mgrid[:240, :320]
+ALONG = ((J - 159.5) * UP[0] + (I - 119.5) * UP[1]) / 262.5 + UP[2]
+"""Height of a ray a metre along the optical axis."""
+
+
+def level(below_m: float) -> Floats:
+    """Return the inverse depth of a level plane so far below the camera."""
+    return np.asarray(ALONG / -below_m, np.float32)
+
+
+def grid_of(inv_depth: Floats) -> DepthGrid:
+    return DepthGrid(np.ascontiguousarray(inv_depth, np.float32), INTRINSICS, 2, 0.0035)
+
+
+def plane_of(grid: DepthGrid, below_m: float) -> SupportingPlane:
+    samples, _ = level_samples(orient_points(grid), UP)
+    plane: SupportingPlane = measure_plane(
+        grid, samples, horizontal_plane(INTRINSICS, UP, -below_m)
+    )
+    return plane
+
+
+def heights_of(grid: DepthGrid, plane: SupportingPlane) -> tuple[HeightMap, NDArray[np.float64]]:
+    planes = pack_planes([plane])
+    return measure_heights(grid, planes, 0.5), planes
+
+
+def test_points_face_the_way_their_surface_does() -> None:
+    """Half of the image is a table; nothing is seen in the other."""
+    inv_depth = level(0.7)
+    inv_depth[:, 160:] = 0
+    points = orient_points(grid_of(inv_depth))
+    seen = points.normals[2] != 0
+    assert np.count_nonzero(seen) == points.smooth
+    assert 0.9 < points.smooth / (80 * 53) < 1
+    np.testing.assert_allclose(UP @ points.normals[:, seen], 1, atol=1e-4)
+    np.testing.assert_allclose(UP @ points.positions[:, seen], -0.7, atol=1e-4)
+
+
+def test_levels_apart_are_two_planes_with_one_normal() -> None:
+    """A box of 12 cm on a table; noise tilts each alone."""
+    rng = np.random.default_rng(0)
+    inv_depth = level(0.7)
+    inv_depth[90:180, 110:220] = level(0.58)[90:180, 110:220]
+    inv_depth += rng.normal(0, 0.002, inv_depth.shape).astype(np.float32)
+    grid = grid_of(inv_depth)
+    found = find_horizontal_planes(grid, orient_points(grid), UP, draw_trials(rng))
+    np.testing.assert_allclose([one.plane.offset for one in found], [-0.7, -0.58], atol=2e-3)
+    np.testing.assert_allclose(found[0].plane.up, found[1].plane.up)
+    assert found[0].plane.up @ UP > np.cos(np.radians(0.5))
+
+
+def test_outline_and_area_are_those_of_a_rectangle() -> None:
+    """A board of 40 by 30 cm, 70 cm below the camera."""
+    z = -0.7 / ALONG
+    x, y, depth = (J - 159.5) / 262.5 * z, (I - 119.5) / 262.5 * z, z
+    forward = np.array([0, -np.sqrt(0.5), np.sqrt(0.5)])
+    across, along = x, forward[1] * y + forward[2] * depth
+    board = (abs(across) < 0.2) & (abs(along - 0.7) < 0.15)
+    plane = plane_of(grid_of(np.where(board, level(0.7), 0)), 0.7)
+    corners = outline_corners(plane)
+    assert 0.75 * 0.12 < plane.area_m2 <= 0.12  # what is near an edge tells no normal
+    np.testing.assert_allclose(corners @ UP, -0.7, atol=1e-9)
+    np.testing.assert_allclose(abs(corners[:, 0]).max(), 0.2, atol=0.02)
+    np.testing.assert_allclose(np.ptp(corners @ forward), 0.3, atol=0.04)
+
+
+def test_a_point_is_inside_the_outline_or_just_beyond_it() -> None:
+    plane = SupportingPlane(0, 0, 0, np.array([0.0, 0, -1]), -1.0, np.full(DIRECTIONS, 0.5), 1.0)
+    row = pack_planes([plane])[0]
+    assert is_inside_outline(row, 0.45, 0.0, 1.0, 0.0)
+    assert not is_inside_outline(row, 0.6, 0.0, 1.0, 0.0)
+    assert is_inside_outline(row, 0.6, 0.0, 1.0, 0.15)
+    assert abs(COS).max() == 1
+
+
+@pytest.mark.parametrize(("closed", "kept"), [(True, 1), (False, 2)])
+def test_a_box_is_closed_below_its_edge_and_a_board_is_not(closed: bool, kept: int) -> None:
+    """Both are 15 cm above the floor and equally large."""
+    inv_depth = level(0.9)
+    z = -0.75 / ALONG
+    forward = np.array([0, -np.sqrt(0.5), np.sqrt(0.5)])
+    along = forward[1] * (I - 119.5) / 262.5 * z + forward[2] * z
+    top = (abs((J - 159.5) / 262.5 * z) < 0.2) & (abs(along - 0.8) < 0.15)
+    edge = 0.65  # how far ahead of the camera the front is: a wall down to the floor
+    front = edge / ((I - 119.5) / 262.5 * forward[1] + forward[2])
+    height = ALONG * front
+    wall = (height < -0.75) & (height > -0.9) & (abs((J - 159.5) / 262.5 * front) < 0.2)
+    if closed:
+        inv_depth = np.where(wall, 1 / front, inv_depth)
+    grid = grid_of(np.where(top, level(0.75), inv_depth))
+    rng = np.random.default_rng(0)
+    found = find_horizontal_planes(grid, orient_points(grid), UP, draw_trials(rng))
+    assert len(found) == 2
+    assert all(isinstance(one, PlaneCandidate) for one in found)
+    assert len(supporting_planes(grid, found, tallest_m=0.5)) == kept
+
+
+def test_a_large_upright_face_is_a_wall_and_a_small_one_an_object() -> None:
+    """Both are a metre before the camera, which looks ahead; walls are above no plane."""
+    up = np.array([0.0, -1.0, 0.0])
+    trials = draw_trials(np.random.default_rng(0))
+    grid = grid_of(np.ones((240, 320), np.float32))
+    large = np.ones((240, 320), np.int8)
+    walls = remove_walls(grid, large, up, 0.5, trials)
+    assert (walls == CLEARED).mean() > 0.95
+    assert not large.any()
+
+    small = np.zeros((240, 320), np.int8)
+    small[100:150, 140:190] = 1
+    only = DepthGrid(np.where(small > 0, grid.inverse_depth, 0), INTRINSICS, 2, 0.0035)
+    walls = remove_walls(only, small, up, 0.5, trials)
+    assert not (walls == CLEARED).any()
+    assert small.sum() == 2500
+    assert ON_WALL != CLEARED
+
+
+@pytest.mark.parametrize(("width", "taken"), [(20, True), (110, False)])
+def test_overhang_belongs_to_the_object_unless_it_is_many_times_larger(
+    width: int,
+    taken: bool,
+) -> None:
+    """A face goes on beyond the edge of the plane: a handle, or a wall behind the table."""
+    inv_depth = level(0.7)
+    inv_depth[100:140, 150 : 170 + width] = level(0.6)[100:140, 150 : 170 + width]
+    plane_id = np.full((240, 320), -1, np.int8)
+    plane_id[:, 170:] = 0
+    plane_id[100:140, 150:170] = 1
+    heights = HeightMap(plane_id, np.full((240, 320), 0.1, np.float32))
+    plane = plane_of(grid_of(level(0.7)), 0.7)
+    none = np.zeros((240, 320), np.uint8)
+    planes = pack_planes([plane])
+    extend_overhang(grid_of(inv_depth), heights, planes, none, 0.5)
+    assert (plane_id[100:140, 170 : 170 + width] == 1).all() == taken
+    assert (plane_id[:, 290:] == 0).all()
+
+
+def test_a_flat_plate_in_noise_is_found_and_a_swell_is_not() -> None:
+    """Both rise by 6 mm: in a step, and over 40 cells."""
+    rng = np.random.default_rng(1)
+    table, noise = level(0.7), rng.normal(0, 0.0007, (240, 320))
+    gap = level(0.694) - table
+    inside = (J - 90) ** 2 + (I - 140) ** 2 < 26**2
+    swell = np.exp(-((J - 230) ** 2 + (I - 140) ** 2) / (2 * 40**2))
+    grid = grid_of(table + noise + gap * (inside + swell))
+    plane = plane_of(grid_of(table), 0.7)
+    heights, planes = heights_of(grid, plane)
+    low = np.zeros((240, 320), np.int16)
+    find_low_profile(grid, heights, planes, low, 0.5)
+    assert (low[inside] > 0).mean() > 0.9
+    assert (low[:, 170:] > 0).mean() < 0.01
+    assert (heights.plane_id[:, 170:] == 1).mean() < 0.05
+
+
+def test_outline_of_an_object_rises_everywhere_along_the_plane() -> None:
+    round_ = Outline(sides=100, table=95, known=95, hidden=0, rise=150.0, steep=90)
+    assert is_object(round_, 600)
+    assert not is_object(round_._replace(steep=50), 600)  # a swell rises here and there
+    assert not is_object(round_._replace(table=30, known=40, rise=60.0), 600)
+    assert not is_object(round_._replace(rise=90.0), 600)
+
+
+def test_high_pass_keeps_a_step_and_levels_a_slope() -> None:
+    """The mean in the window takes away what changes slowly."""
+    residual = np.asarray(0.001 + 1e-6 * (I + J), np.float32)
+    residual[120:126, 160:166] += 0.005
+    high_pass = np.zeros_like(residual)
+    filter_high_pass(residual, high_pass)
+    inner = np.s_[2 * LOW.window : -2 * LOW.window, 2 * LOW.window : -2 * LOW.window]
+    step = high_pass[122, 162]
+    assert step == pytest.approx(0.005, rel=0.05)
+    assert np.median(abs(high_pass[inner])) < 1e-5
+
+
+def test_noise_is_the_median_rise_on_the_plane() -> None:
+    rng = np.random.default_rng(0)
+    high_pass = rng.normal(0, 0.001, (240, 320)).astype(np.float32)
+    plane_id = np.full((240, 320), -1, np.int8)
+    expected = 0.6745 * np.sqrt(2) * 0.001
+    assert measure_noise(high_pass, plane_id, 1) == pytest.approx(expected, rel=0.05)
+    assert measure_noise(high_pass, plane_id, 2) == 0
