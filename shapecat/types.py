@@ -153,10 +153,15 @@ class Box(Record):
 class FullBox(Box):
     """The estimated box around a whole object, with its hidden part.
 
-    ``size_std`` (3,) metres is the standard deviation of each length.
+    Attributes
+    ----------
+    size_std : (3,) metres, the standard deviation of each length.
+    outline : (96,) metres, how far what is seen reaches from the centre in as many directions
+        around, from the first axis of the box towards the second.
     """
 
     size_std: F4 = array("3", "f4")
+    outline: F4 = array("k", "f4")
 
 
 class Candidate(Record):

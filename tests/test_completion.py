@@ -1,4 +1,4 @@
-"""Whole boxes from one side: cylinders, boxes, balls of known size, seen from an oblique camera."""
+"""Whole boxes, from one side and from several, of cylinders, boxes and balls of known size."""
 
 from pathlib import Path
 
@@ -9,9 +9,8 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from benchmarks.boxes import Upright, overlap
-from shapecat.completion import complete
+from shapecat.completion import DIRECTIONS, BoxViews, complete, fuse_boxes
 from shapecat.geometry import gravity_rotation, rotation_from_quaternion
-from shapecat.tracking import BoxViews, fuse_boxes
 from shapecat.types import CATEGORIES, FullBox
 
 TILT = np.radians(37)
@@ -135,6 +134,20 @@ def about_z(yaw: float) -> np.ndarray:
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
+def rectangular(size: np.ndarray) -> np.ndarray:
+    """Return how far a rectangle reaches from its middle in each direction."""
+    angles = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+    return np.asarray(abs(np.cos(angles)) * size[0] / 2 + abs(np.sin(angles)) * size[1] / 2)
+
+
+def views_of(centers: np.ndarray, axes: np.ndarray, sizes: np.ndarray) -> BoxViews:
+    """Return views, from all around, of boxes whose outlines are seen."""
+    outlines = np.stack([rectangular(size) for size in sizes])
+    around = np.linspace(0, 2 * np.pi, len(centers), endpoint=False)
+    sensors = centers + np.stack([np.cos(around), np.sin(around), np.ones(len(centers))], axis=1)
+    return BoxViews(centers, axes, sizes, np.full(sizes.shape, 0.01), outlines, sensors)
+
+
 def test_views_agree_on_one_size_whatever_their_quarter_turns() -> None:
     """Length and width swap with the yaw a view happens to find."""
     size, yaw = np.array([0.21, 0.11, 0.3]), 0.37
@@ -143,8 +156,7 @@ def test_views_agree_on_one_size_whatever_their_quarter_turns() -> None:
     sizes = np.where((quarters % 2 == 1)[:, None], size[[1, 0, 2]], size) + noise
     axes = np.stack([about_z(yaw + q * np.pi / 2) for q in quarters])
     centers = PLACE + RNG.normal(0, 0.003, (9, 3))
-    views = BoxViews(centers, axes, sizes, np.full((9, 3), 0.01))
-    fused = fuse_boxes(views, np.zeros(9, np.bool_))
+    fused = fuse_boxes(views_of(centers, axes, sizes), np.ones(9), sure("box"), CATEGORIES)
 
     assert (fused.sizes == fused.sizes[0]).all()
     for k in range(9):
@@ -155,12 +167,58 @@ def test_views_agree_on_one_size_whatever_their_quarter_turns() -> None:
 
 
 def test_a_view_from_where_the_object_was_moved_to_keeps_its_place() -> None:
-    centers = np.zeros((7, 3))
-    centers[5:] = [0.4, 0.1, 0]
-    views = BoxViews(centers, np.tile(np.eye(3), (7, 1, 1)), np.ones((7, 3)), np.ones((7, 3)))
-    fused = fuse_boxes(views, np.zeros(7, np.bool_))
+    """And its yaw; its length and width are those of the others, whichever way around."""
+    centers, sizes = np.zeros((7, 3)), np.tile([0.2, 0.1, 0.3], (7, 1))
+    centers[5:], axes = [0.4, 0.1, 0], np.tile(np.eye(3), (7, 1, 1))
+    sizes[6], axes[6] = [0.1, 0.2, 0.3], about_z(0.5)
+    fused = fuse_boxes(views_of(centers, axes, sizes), np.ones(7), sure("box"), CATEGORIES)
 
-    assert_allclose(fused.centers, centers)
+    assert_allclose(fused.centers, centers, atol=1e-12)
+    assert_allclose(fused.axes[5], np.eye(3), atol=1e-12)
+    assert_allclose(fused.axes[6], about_z(0.5 + np.pi / 2), atol=1e-12)
+    assert_allclose(fused.sizes, np.tile([0.2, 0.1, 0.3], (7, 1)))
+
+
+def test_the_sides_that_several_views_show_make_an_oval_whole() -> None:
+    """An oval bottle looks round from each side; only from around does it show its two widths."""
+    points, normals = cylinder(1.0, 0.25)
+    wall = normals[:, 2] == 0
+    oval = points[wall] * [0.045, 0.033, 1.0]
+    outward = normals[wall] / [0.045, 0.033, 1.0]
+    views = []
+    for angle in np.radians([10, 40, 70, 100, 130]):
+        away = about_z(-angle - np.pi / 2)  # what a sensor in this direction sees ahead of it
+        place = PLACE.copy()
+        seen = ((outward @ away.T) * (oval @ away.T + place)).sum(axis=1) < 0
+        box = complete(
+            ((oval[seen] @ away.T + place) @ LEVEL).astype(np.float32),
+            UP, place[2], sure("bottle"), CATEGORIES,
+        )  # fmt: skip
+        axes = away.T @ LEVEL @ rotation_from_quaternion(box.orientation)
+        center = away.T @ (LEVEL @ box.center - place)
+        views.append((center, axes, box.size, box.size_std, box.outline, away.T @ -place))
+    stacked = BoxViews(*map(np.array, zip(*views, strict=True)))
+    fused = fuse_boxes(stacked, np.ones(5), sure("bottle"), CATEGORIES)
+
+    assert_allclose(np.sort(fused.sizes[0]), [0.066, 0.09, 0.25], atol=0.006)
+    assert_allclose(fused.centers, np.tile([0, 0, 0.125], (5, 1)), atol=0.004)
+    heading = fused.axes[0][:, int(fused.sizes[0, 1] > fused.sizes[0, 0])]
+    assert abs(heading[0]) > np.cos(np.radians(8))
+
+
+def test_the_handle_of_a_cup_is_in_its_box() -> None:
+    """It is seen beside the cup; an oval around the rest alone would cut it off."""
+    points, normals = cylinder(0.04, 0.1)
+    wall = normals[:, 2] == 0
+    tips = np.stack([np.full(60, -0.068), RNG.normal(0, 0.003, 60), RNG.uniform(0.03, 0.07, 60)], 1)
+    outward = np.concatenate([normals[wall], -np.tile(PLACE, (60, 1))])
+    box = estimate(np.concatenate([points[wall], tips]), outward, "cup")
+    turned = LEVEL @ rotation_from_quaternion(box.orientation)
+    inside = turned.T @ (above(0.05) + np.array([-0.065, 0, 0]) - LEVEL @ box.center)
+
+    assert (abs(inside) < box.size / 2).all()
+    assert (LEVEL @ box.center)[0] < PLACE[0] - 0.005
+    assert box.size[:2].max() < 0.12
 
 
 def test_overlap_of_turned_boxes_is_exact() -> None:
@@ -198,14 +256,12 @@ def test_a_quarter_turn_exchanges_length_and_width() -> None:
     turns = [yaw + np.pi / 2 * (k % 2) for k in range(6)]
     sizes = np.array([size[[1, 0, 2]] if k % 2 else size for k in range(6)])
     axes = Rotation.from_euler("z", np.array(turns)[:, None]).as_matrix()
-    views = BoxViews(np.zeros((6, 3)), axes, sizes, np.tile([0.01, 0.03, 0.02], (6, 1)))
-
-    fused = fuse_boxes(views, np.zeros(6, bool))
+    fused = fuse_boxes(views_of(np.zeros((6, 3)), axes, sizes), np.ones(6), sure("box"), CATEGORIES)
 
     along = np.array([np.cos(yaw), np.sin(yaw), 0.0])  # the shorter side lies along it
     for lengths, turned in zip(fused.sizes, fused.axes, strict=True):
         first = int(np.argmax(np.abs(along @ turned)))
         assert abs(along @ turned[:, first]) == pytest.approx(1, abs=1e-6)
-        assert lengths[first] == pytest.approx(0.06)
-        assert lengths[1 - first] == pytest.approx(0.15)
+        assert lengths[first] == pytest.approx(0.06, abs=0.002)
+        assert lengths[1 - first] == pytest.approx(0.15, abs=0.002)
         assert lengths[2] == pytest.approx(0.2)

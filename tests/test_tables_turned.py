@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from shapecat.completion import DIRECTIONS
 from shapecat.config import TrackingSettings
 from shapecat.runs.corrections import read_labels
 from shapecat.runs.labels import read_labelled_frames
@@ -69,7 +70,10 @@ def seen(frame: int, item: int) -> Detection:
         occluded=False,
     )
     gas = NeuralGas(NEURONS + item, np.array([[0, 2], [1, 2]]))
-    full = FullBox(center, SIZE + 0.01, orientation, np.full(3, 0.005))
+    around = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
+    length, width, _ = SIZE + 0.01
+    oval = (length + width) / 4 + (length - width) / 4 * np.cos(2 * around)
+    full = FullBox(center, SIZE + 0.01, orientation, np.full(3, 0.005), oval)
     posterior, novelty = POSTERIORS[frame % 2, item], float(NOVELTIES[frame, item])
     return Detection(candidate, gas, np.arange(4.0), posterior, novelty, 0.001, full)
 
@@ -179,11 +183,12 @@ def test_tracks_stay_where_their_objects_stand(run: Path) -> None:
         k, item = row["frame"], row["detection"]
         inverse = TURNS[k].inv()
         assert_allclose(row["center_fixed"], CENTERS[item], atol=1e-5)
-        assert_allclose(row["center_full"], inverse.apply(CENTERS[item] - PLACES[k]), atol=1e-4)
+        assert_allclose(row["center_full"], inverse.apply(CENTERS[item] - PLACES[k]), atol=0.01)
         turned = Rotation.from_quat(row["orientation_full"])
         off = (turned.inv() * inverse * AXES).magnitude()
-        assert min(off % np.pi, np.pi - off % np.pi) < 1e-4
-        assert_allclose(row["size_full"], SIZE + 0.01, atol=1e-6)
+        quarter = np.pi / 2  # as which a turned box is the same box
+        assert min(off % quarter, quarter - off % quarter) < np.radians(4)
+        assert_allclose(np.sort(row["size_full"]), SIZE + 0.01, atol=0.006)
 
 
 def test_causal_posteriors_know_their_own_view_and_none_after_it(run: Path) -> None:

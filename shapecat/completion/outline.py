@@ -1,7 +1,9 @@
-"""Outlines of footprints as support functions: how far points, a circle, both reach each way.
+"""Outlines of footprints as support functions: how far points, an oval, both reach each way.
 
 The reach h of a convex outline in the direction t is the largest ``p . t`` of its points. That of a
-circle is ``center . t + radius``, linear in what is sought; that of a union is the larger one.
+circle is ``center . t + radius``; an oval is wider one way and narrower across, to first order by
+``p cos 2a + q sin 2a`` in the direction a. Both are linear in what is sought. The reach of a union
+is the larger one.
 """
 
 import numpy as np
@@ -9,16 +11,16 @@ import numpy as np
 from shapecat.arrays import F4, F8
 from shapecat.jit import kernel
 
-__all__ = ["DIRECTIONS", "QUARTER", "fit_circle", "narrowest", "reach", "rectangle"]
+__all__ = ["DIRECTIONS", "QUARTER", "fit_oval", "narrowest", "reach", "rectangle"]
 
 DIRECTIONS = 96
 """Every 3.75 degrees; a quarter turn is a whole number of them."""
 QUARTER, _HALF = DIRECTIONS // 4, DIRECTIONS // 2
 _ROUNDS = 5
-_OUTLIER = 0.05
+_OUTLIER = 0.03
 """Deviations beyond this share of the radius are of handles, and pull no harder."""
-_SEEN = -0.03
-"""Where points reach as far as this share of the radius short of the circle, its rim is seen."""
+_ROUNDNESS = 5.0
+"""So many directions weigh against an oval: most things are round, and one side tells little."""
 
 
 @kernel
@@ -49,44 +51,41 @@ def _insert(ascending: F4, value: float) -> None:
 
 
 @kernel
-def fit_circle(reached: F8, cosines: F8, sines: F8, toward: F8) -> tuple[F8, float]:
-    """Fit a circle to what a sensor sees of its outline, by weighted least squares.
+def fit_oval(reached: F8, seen: F8, cosines: F8, sines: F8) -> tuple[F8, float, float]:
+    """Fit an oval to an outline by weighted least squares, of which one side is seen.
 
-    The half that faces the sensor is seen wherever it looks from; of the other half, what turns out
-    to reach as far as the circle, as the far rim of a bowl does.
+    Of the side that faces no sensor counts what turns out to reach as far as the oval, as the far
+    rim of a bowl does.
 
     Parameters
     ----------
     reached : (k,) of `reach`.
-    toward : (2,) unit vector to the sensor.
+    seen : (k,) weight of each direction, 0 for those that face no sensor.
 
     Returns
     -------
-    (3,) the centre and the radius; the root mean square deviation of the half that faces the
-    sensor, in metres.
+    (k,) the reach of the oval; its mean radius; the root mean square deviation of what is seen.
     """
-    circle: F8 = np.zeros(3)
-    for step in range(_ROUNDS):
-        A, b = np.zeros((3, 3)), np.zeros(3)
+    rows = np.ones((5, reached.size))
+    rows[0], rows[1] = cosines, sines
+    rows[3], rows[4] = cosines**2 - sines**2, 2 * cosines * sines
+    weights = seen.copy()
+    oval: F8 = np.zeros(reached.size)
+    x: F8 = np.zeros(5)
+    for _ in range(_ROUNDS):
+        A = (rows * weights) @ rows.T
+        A[3, 3] += _ROUNDNESS
+        A[4, 4] += _ROUNDNESS
+        x = np.linalg.solve(A, (rows * weights) @ reached)
+        oval = x @ rows
+        limit = _OUTLIER * abs(x[2]) + 1e-9
         for k in range(reached.size):
-            row = (cosines[k], sines[k], 1.0)
-            off = reached[k] - (circle[0] * row[0] + circle[1] * row[1] + circle[2])
-            facing = row[0] * toward[0] + row[1] * toward[1] > -1e-6
-            limit = _OUTLIER * circle[2]
-            if not facing and (step == 0 or off < _SEEN * circle[2]):
-                continue
-            weight = 1.0 if step == 0 or abs(off) < limit else limit / abs(off)
-            for i in range(3):
-                b[i] += weight * row[i] * reached[k]
-                for j in range(3):
-                    A[i, j] += weight * row[i] * row[j]
-        circle = np.linalg.solve(A, b)
-    total = count = 0.0
-    for k in range(reached.size):
-        if cosines[k] * toward[0] + sines[k] * toward[1] > -1e-6:
-            off = reached[k] - (circle[0] * cosines[k] + circle[1] * sines[k] + circle[2])
-            total, count = total + off * off, count + 1.0
-    return circle, np.sqrt(total / count)
+            off = reached[k] - oval[k]
+            known = seen[k] if seen[k] > 0 else 1.0 if off > -limit else 0.0
+            weights[k] = known * min(1.0, limit / max(abs(off), 1e-12))
+    facing = seen > 0
+    off = (reached - oval)[facing]
+    return oval, x[2], np.sqrt((off * off).mean())
 
 
 @kernel

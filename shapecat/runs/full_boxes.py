@@ -10,9 +10,10 @@ import pyarrow as pa
 import pyarrow.compute
 from scipy.spatial.transform import Rotation
 
-from shapecat.arrays import F8, I4, Bool
+from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.completion import DIRECTIONS, BoxViews, FusedBoxes, fuse_boxes
 from shapecat.runs.tables import Key, frame_rows, numbers, read_row_groups
-from shapecat.tracking import BoxViews, Track, fuse_boxes
+from shapecat.tracking import Track, view_weights
 
 __all__ = ["FULL_WIDTHS", "FullBoxes", "full_columns", "numbers_or_nan"]
 
@@ -29,12 +30,14 @@ class FullBoxes:
     ----------
     starts : by frame, the row of its first detection.
     rows : (n, 13) the columns of `FULL_WIDTHS` side by side; NaN where they are null.
+    outlines : (n, 96) float32, how far what is seen reaches.
     partial : (n,) whether the object is cut.
     poses : by frame, ``fixed_from_sensor`` as (3, 4), where the frame of the tracks is fixed.
     """
 
     starts: Mapping[Key, int]
     rows: F8
+    outlines: F4
     partial: Bool
     poses: Mapping[Key, F8]
 
@@ -43,17 +46,29 @@ class FullBoxes:
         """Read the full boxes of a run; the topics ``placed`` are tracked in the fixed frame."""
         starts: dict[Key, int] = {}
         rows, partial, count = [np.zeros((0, _WIDTH))], [np.zeros(0, np.bool_)], 0
+        outlines = [np.zeros((0, DIRECTIONS), np.float32)]
         cut = ("touches_border", "occluded")
-        wanted = ["topic", "frame", *cut, *FULL_WIDTHS]
+        wanted = ["topic", "frame", *cut, *FULL_WIDTHS, "outline_full"]
         for table in read_row_groups(folder / "detections.parquet", wanted):
             of_frames = frame_rows(table)
             starts |= {key: count + found.start for key, found in of_frames.items()}
             rows.append(numbers_or_nan(table))
+            around = np.full((table.num_rows, DIRECTIONS), np.nan, np.float32)
+            around[~np.isnan(rows[-1][:, 0])] = numbers(table["outline_full"]).reshape(
+                -1, DIRECTIONS
+            )
+            outlines.append(around)
             partial.append(np.logical_or(*(table[name].to_numpy() for name in cut)))
             count += table.num_rows
-        return cls(starts, np.concatenate(rows), np.concatenate(partial), _poses(folder, placed))
+        return cls(
+            starts,
+            np.concatenate(rows),
+            np.concatenate(outlines),
+            np.concatenate(partial),
+            _poses(folder, placed),
+        )
 
-    def of_track(self, track: Track) -> F8:
+    def of_track(self, track: Track, categories: Sequence[str]) -> F8:
         """Return the fused boxes (k, 13) in the frames of a track, NaN if unknown."""
         result = np.full((len(track.frames), _WIDTH), np.nan)
         seen = np.flatnonzero(np.asarray(track.detections) >= 0)
@@ -63,19 +78,27 @@ class FullBoxes:
         known = ~np.isnan(self.rows[rows, 0])
         if known.any():
             poses = self._poses_of([key for key, has in zip(keys, known, strict=True) if has])
-            result[seen[known]] = _fused(self.rows[rows[known]], self.partial[rows[known]], poses)
+            views = _views(self.rows[rows[known]], self.outlines[rows[known]], poses)
+            weights = view_weights(self.partial[rows[known]])
+            fused = fuse_boxes(views, weights, track.posterior, categories)
+            result[seen[known]] = _rows(fused, poses)
         return result
 
     def _poses_of(self, keys: Sequence[Key]) -> F8:
         return np.array([self.poses.get(key, np.eye(3, 4)) for key in keys])
 
 
-def _fused(rows: F8, partial: Bool, poses: F8) -> F8:
-    """Fuse the rows (k, 13) of one object in the fixed frame, and transform them back."""
+def _views(rows: F8, outlines: F4, poses: F8) -> BoxViews:
+    """Return the rows (k, 13) of one object in the fixed frame."""
     turns, places = poses[:, :, :3], poses[:, :, 3]
-    axes = Rotation.from_quat(rows[:, 6:10]).as_matrix()
+    axes = turns @ Rotation.from_quat(rows[:, 6:10]).as_matrix()
     centers = np.einsum("kij,kj->ki", turns, rows[:, :3]) + places
-    fused = fuse_boxes(BoxViews(centers, turns @ axes, rows[:, 3:6], rows[:, 10:]), partial)
+    return BoxViews(centers, axes, rows[:, 3:6], rows[:, 10:], outlines, places)
+
+
+def _rows(fused: FusedBoxes, poses: F8) -> F8:
+    """Return (k, 13) boxes of the fixed frame, each in its sensor frame."""
+    turns, places = poses[:, :, :3], poses[:, :, 3]
     back = np.einsum("kji,kj->ki", turns, fused.centers - places)
     own = Rotation.from_matrix(np.swapaxes(turns, 1, 2) @ fused.axes).as_quat()
     return np.hstack([back, fused.sizes, own, fused.stds])

@@ -170,6 +170,7 @@ def _detection_columns(
         "size_full": [d.full and d.full.size for d in found],
         "orientation_full": [d.full and d.full.orientation for d in found],
         "size_full_std": [d.full and d.full.size_std for d in found],
+        "outline_full": lists([d.full.outline if d.full else () for d in found], pa.float32()),
         "center_fixed": [_center_fixed(row, d.candidate.box.center) for _, row, _, d in objects],
         "height_m": [
             _height(p, c.plane, c.support_m, c.box.center)

@@ -87,6 +87,7 @@ DETECTIONS = pa.schema(
         ("orientation", _QUATERNION),
         ("center_fixed", _VEC3),
         *_FULL,
+        ("outline_full", _FLOATS),
         ("height_m", pa.float32()),
         ("points", pa.int32()),
         ("indices", pa.list_(pa.uint32())),

@@ -53,7 +53,7 @@ def track_run(
     frames = _read_frames(folder, len(categories), placed)
     tracks = track_recording(frames, settings, together=placed)
     with replacing(folder / "tracks.parquet") as path:
-        write_table(path, _columns(tracks, FullBoxes.read(folder, placed)), TRACKS)
+        write_table(path, _columns(tracks, FullBoxes.read(folder, placed), categories), TRACKS)
     labels = [_label(track, categories) for track in tracks]
     with replacing(folder / "tracks.csv") as path:
         _write_csv(path, tracks, labels, categories, _start_ns(folder), work)
@@ -133,14 +133,18 @@ def _guess(track: Track, categories: Sequence[str]) -> str:
     return categories[int(np.argmax(track.posterior))]
 
 
-def _columns(tracks: Sequence[Track], boxes: FullBoxes) -> dict[str, Any]:
+def _columns(
+    tracks: Sequence[Track], boxes: FullBoxes, categories: Sequence[str]
+) -> dict[str, Any]:
     """Return the rows of all tracks, track after track, each in time."""
 
     def column(name: str) -> Any:
         return np.concatenate([getattr(track, name) for track in tracks]) if tracks else []
 
     detections = np.asarray(column("detections"), np.int32)
-    full = np.concatenate([np.zeros((0, 13)), *map(boxes.of_track, tracks)])
+    full = np.concatenate(
+        [np.zeros((0, 13)), *(boxes.of_track(track, categories) for track in tracks)]
+    )
     return {
         "track": np.repeat([track.id for track in tracks], [len(track.frames) for track in tracks]),
         "topic": [topic for track in tracks for topic in track.topics],

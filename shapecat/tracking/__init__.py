@@ -3,23 +3,21 @@
 `track_recording` is the whole of it: detections per frame in, tracks out.
 """
 
-from shapecat.tracking.full_boxes import BoxViews, fuse_boxes
-from shapecat.tracking.fusion import causal, fuse
+from shapecat.tracking.fusion import causal, fuse, view_weights
 from shapecat.tracking.hindsight import Fragments, merge_fragments, scene_cuts
 from shapecat.tracking.recording import track_recording
 from shapecat.tracking.records import FrameDetections, Track
 from shapecat.tracking.tracker import Tracker
 
 __all__ = [
-    "BoxViews",
     "Fragments",
     "FrameDetections",
     "Track",
     "Tracker",
     "causal",
     "fuse",
-    "fuse_boxes",
     "merge_fragments",
     "scene_cuts",
     "track_recording",
+    "view_weights",
 ]

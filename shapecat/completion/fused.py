@@ -1,0 +1,142 @@
+"""One whole box for an object, from its outlines in several views."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F8
+from shapecat.completion.outline import DIRECTIONS
+from shapecat.completion.whole import COSINES, SINES, Footprint, faced, footprint
+
+__all__ = ["BoxViews", "FusedBoxes", "fuse_boxes"]
+
+_STILL_M = 0.05
+"""Centres stray less while an object stands still."""
+_UNSEEN = 0.05
+"""Weight of an outline where it does not face the sensor, beside those that do."""
+_SQUARE = 0.2
+"""Weight of the yaw of a square footprint; that of an elongated one is its elongation more."""
+_COMMON = 0.5
+"""Share of a single view's error that all views have in common, as they see the same side."""
+
+
+class BoxViews(NamedTuple):
+    """Full boxes of k views of one object, in one frame.
+
+    Attributes
+    ----------
+    centers, sizes, stds : (k, 3) metres: centres, lengths, and the deviations of the lengths.
+    axes : (k, 3, 3) the columns are the axes of the boxes; the third one is up.
+    outlines : (k, 96) metres, how far what is seen reaches from the centre in each direction, from
+        the first axis towards the second.
+    sensors : (k, 3) metres, where each view is from.
+    """
+
+    centers: F8
+    axes: F8
+    sizes: F8
+    stds: F8
+    outlines: F8
+    sensors: F8
+
+
+class FusedBoxes(NamedTuple):
+    """The boxes of an object in each of its views, of one size; as in `BoxViews`."""
+
+    centers: F8
+    axes: F8
+    sizes: F8
+    stds: F8
+
+
+def fuse_boxes(
+    views: BoxViews, weights: F8, posterior: F8, categories: Sequence[str]
+) -> FusedBoxes:
+    """Give the views of a track one size; while it stands still also one centre and one yaw.
+
+    The outlines of the views from which it stands in the same place are laid over each other, and
+    the footprint is estimated from their median. A view whose centre is elsewhere keeps it, and
+    its own yaw.
+
+    Parameters
+    ----------
+    views : at least one.
+    weights : (k,) of the views.
+    posterior : (c,) of the track, in the order of ``categories``.
+    """
+    middle = _median(views.centers, weights)
+    first = int(np.linalg.norm(views.centers - middle, axis=1).argmin())
+    still = np.linalg.norm(views.centers - views.centers[first], axis=1) < _STILL_M
+    some, own = BoxViews(*(values[still] for values in views)), weights[still]
+    base, origin = _mean_axes(some, own), views.centers[first]
+    seen, facing = _overlaid(some, own, origin, base)
+    plan = footprint(seen, facing, posterior, categories)
+    places = (some.centers - origin) @ base
+    height = float(_median(some.sizes[:, 2:], own)[0])
+    bottom = float(_median(places[:, 2:] - some.sizes[:, 2:] / 2, own)[0])
+    std = np.array([*plan.std, _median(some.stds[:, 2:], own)[0]])
+    std *= np.sqrt(_COMMON + (1 - _COMMON) / len(own))
+    center = origin + base @ (*plan.center, bottom + height / 2)
+    return FusedBoxes(
+        np.where(still[:, None], center, views.centers),
+        np.where(
+            still[:, None, None],
+            base @ _about_z(plan.side * 2 * np.pi / DIRECTIONS),
+            _alike(views, plan),
+        ),
+        np.tile([*plan.size, height], (len(weights), 1)),
+        np.tile(std, (len(weights), 1)),
+    )
+
+
+def _mean_axes(views: BoxViews, weights: F8) -> F8:
+    """Return the axes (3, 3) of the first view, turned to the mean yaw: quarter turns are alike."""
+    first = views.axes[0]
+    x, y, _ = first.T @ views.axes[:, :, 0].T
+    length, width = views.sizes[:, 0], views.sizes[:, 1]
+    elongation = abs(length - width) / np.maximum(np.maximum(length, width), 1e-6)
+    total = np.sum(weights * (_SQUARE + elongation) * np.exp(4j * np.arctan2(y, x)))
+    return np.asarray(first @ _about_z(float(np.angle(total)) / 4))
+
+
+def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F8]:
+    """Return the median outline about a place, and the share of views that face each direction.
+
+    Directions go around from the first of the axes ``base``.
+    """
+    reached = np.zeros((len(weights), DIRECTIONS))
+    facing = np.zeros(reached.shape, np.bool_)
+    steps = np.arange(DIRECTIONS, dtype=np.float64)
+    for k, axes in enumerate(views.axes):
+        x, y = (base.T @ axes[:, 0])[:2]
+        turn = np.arctan2(y, x) * (DIRECTIONS / (2 * np.pi))
+        around = np.interp(steps - turn, steps, views.outlines[k], period=DIRECTIONS)
+        along, across = (base.T @ (views.centers[k] - origin))[:2]
+        reached[k] = around + along * COSINES + across * SINES
+        facing[k] = faced((base.T @ (views.sensors[k] - origin))[:2])
+    each = weights[:, None] * np.where(facing, 1.0, _UNSEEN)
+    share = (weights[:, None] * facing).sum(axis=0) / weights.sum()
+    return _median(reached, each), share
+
+
+def _alike(views: BoxViews, plan: Footprint) -> F8:
+    """Return (k, 3, 3) the axes of the views, a quarter turned where a box is the other way."""
+    other = (views.sizes[:, 0] < views.sizes[:, 1]) != (plan.size[0] < plan.size[1])
+    quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
+    return np.where(other[:, None, None], views.axes @ quarter, views.axes)
+
+
+def _about_z(angle: float) -> F8:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _median(values: F8, weights: F8) -> F8:
+    """Return the weighted median (n,) of values (k, n); weights (k,), or for each value."""
+    weights = np.broadcast_to(weights if weights.ndim == 2 else weights[:, None], values.shape)
+    order = np.argsort(values, axis=0, kind="stable")
+    summed = np.cumsum(np.take_along_axis(weights, order, 0), axis=0)
+    at = np.argmax(summed >= 0.5 * summed[-1], axis=0)
+    found = np.take_along_axis(order, at[None], 0)
+    return np.asarray(np.take_along_axis(values, found, 0)[0])
