@@ -5,7 +5,6 @@ import io
 import json
 import shutil
 from collections.abc import Callable
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -93,17 +92,6 @@ def test_coco_holds_images_as_they_came_and_the_masks_of_the_tracks(
         assert row["area"] == mask.sum()
         assert tuple(map(int, box)) in wanted[frames[row["image_id"]]].boxes.values()
         assert row["iscrowd"] == 0
-
-
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of its compiled part
-def test_coco_is_read_by_its_own_tools(run: Path, tmp_path: Path) -> None:
-    """Where the COCO API is installed, it gives the same masks."""
-    pytest.importorskip("pycocotools")
-    export_dataset([run], "coco", tmp_path / "out", Selection())
-    coco: Any = import_module("pycocotools.coco").COCO
-    read = coco(str(tmp_path / "out/annotations/instances_train.json"))
-    for row in read.dataset["annotations"]:
-        np.testing.assert_array_equal(read.annToMask(row) > 0, decoded(row["segmentation"]))
 
 
 def test_unsure_labels_are_crowds_and_corrected_ones_always_go(run: Path, tmp_path: Path) -> None:

@@ -1,0 +1,214 @@
+"""Data sets of images as other people's code reads them, and every option at the door."""
+
+import json
+import shutil
+import warnings
+from collections.abc import Callable, Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from click.testing import Result
+from PIL import Image
+
+from shapecat.outputs.dataset_frames import Selection
+from shapecat.outputs.exports import export_dataset
+from tests.test_exports import relabel
+from tests.test_exports_images import decoded, read_coco
+
+Run = Callable[..., Result]
+RUNS = 5
+
+
+@pytest.fixture(scope="module")
+def runs(coloured_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a folder of runs of five recordings; in each one track is corrected."""
+    folder = tmp_path_factory.mktemp("runs")
+    for k in range(RUNS):
+        shutil.copytree(coloured_run, folder / f"lab{k}")
+        relabel(folder / f"lab{k}", {2: "wine glass"})
+        about = json.loads((folder / f"lab{k}/run.json").read_text())
+        about["input"]["digest"] = f"xxh3-128:{k}"
+        (folder / f"lab{k}/run.json").write_text(json.dumps(about))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def coco(runs: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a data set whose labels are sure and not sure."""
+    out = tmp_path_factory.mktemp("readback") / "coco"
+    export_dataset([runs / "lab0"], "coco", out, Selection(corrected_only=True))
+    return out
+
+
+@pytest.fixture
+def supervision() -> Iterator[Any]:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it tells of itself on import
+        yield import_module("supervision")
+
+
+def export(shapecat: Run, runs: Path, out: Path, *options: str) -> None:
+    result = shapecat("export", runs, "--out", out, *options)
+    assert result.exit_code == 0, result.output
+
+
+def rows(out: Path) -> list[dict[str, Any]]:
+    """Return the annotations of both splits."""
+    return [row for split in ("train", "val") for row in read_coco(out, split)["annotations"]]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of its compiled part
+def test_the_coco_api_reads_masks_boxes_ids_and_crowds(coco: Path) -> None:
+    read = import_module("pycocotools.coco").COCO(str(coco / "annotations/instances_train.json"))
+    rle = import_module("pycocotools.mask")
+    data = read_coco(coco)
+
+    assert sorted(read.getImgIds()) == sorted(image["id"] for image in data["images"])
+    assert len(read.getAnnIds()) == len(data["annotations"])
+    crowds = set(read.getAnnIds(iscrowd=True))
+    assert crowds == {row["id"] for row in data["annotations"] if row["iscrowd"]}
+    assert 0 < len(crowds) < len(data["annotations"])
+    (glass,) = read.getCatIds(catNms=["wine glass"])
+    assert set(read.getAnnIds(catIds=[glass])) == set(read.getAnnIds(iscrowd=False))
+    for row in read.loadAnns(read.getAnnIds()):
+        np.testing.assert_array_equal(read.annToMask(row) > 0, decoded(row["segmentation"]))
+        assert rle.area(read.annToRLE(row)) == row["area"]
+        assert rle.toBbox(read.annToRLE(row)).tolist() == row["bbox"]
+
+
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # of its compiled part
+def test_labels_evaluated_against_themselves_are_perfect(coco: Path) -> None:
+    """The evaluation of the COCO challenge, which most training reports."""
+    path = str(coco / "annotations/instances_train.json")
+    truth = import_module("pycocotools.coco").COCO(path)
+    found = truth.loadRes([row for row in truth.dataset["annotations"] if not row["iscrowd"]])
+    evaluation = import_module("pycocotools.cocoeval").COCOeval(truth, found, "segm")
+    evaluation.evaluate()
+    evaluation.accumulate()
+    evaluation.summarize()
+
+    assert evaluation.stats[0] == pytest.approx(1.0)
+
+
+def test_supervision_reads_coco(coco: Path, supervision: Any) -> None:
+    data = read_coco(coco)
+    read = supervision.DetectionDataset.from_coco(
+        str(coco / "images/train"), str(coco / "annotations/instances_train.json"), force_masks=True
+    )
+
+    names = {row["id"]: row["name"] for row in data["categories"]}
+    by_image = {image["file_name"]: image["id"] for image in data["images"]}
+    assert len(read) == len(by_image)
+    for path, pixels, found in read:
+        wanted = [r for r in data["annotations"] if r["image_id"] == by_image[Path(path).name]]
+        assert pixels.shape == (720, 960, 3)
+        assert [read.classes[k] for k in found.class_id] == [
+            names[row["category_id"]] for row in wanted
+        ]
+        for row, box, mask in zip(wanted, found.xyxy, found.mask, strict=True):
+            left, top, width, height = row["bbox"]
+            np.testing.assert_allclose(box, [left, top, left + width, top + height])
+            np.testing.assert_array_equal(mask, decoded(row["segmentation"]))
+
+
+def test_supervision_reads_yolo(runs: Path, tmp_path: Path, supervision: Any) -> None:
+    """Polygons cover the masks that COCO has of the same objects."""
+    export_dataset([runs / "lab0"], "yolo", tmp_path / "yolo", Selection())
+    export_dataset([runs / "lab0"], "coco", tmp_path / "coco", Selection())
+    data = read_coco(tmp_path / "coco")
+    names = {row["id"]: row["name"] for row in data["categories"]}
+    read = supervision.DetectionDataset.from_yolo(
+        str(tmp_path / "yolo/images/train"),
+        str(tmp_path / "yolo/labels/train"),
+        str(tmp_path / "yolo/data.yaml"),
+        force_masks=True,
+    )
+
+    by_image = {image["file_name"]: image["id"] for image in data["images"]}
+    assert len(read) == len(by_image) > 0
+    for path, _, found in read:
+        wanted = [r for r in data["annotations"] if r["image_id"] == by_image[Path(path).name]]
+        classes = [read.classes[k] for k in found.class_id]
+        assert classes == [names[row["category_id"]] for row in wanted]
+        for row, mask in zip(wanted, found.mask, strict=True):
+            true = decoded(row["segmentation"])
+            assert (mask & true).sum() / (mask | true).sum() > 0.9
+
+
+def test_the_layout_is_the_one_that_cvat_imports(coco: Path) -> None:
+    """images/SUBSET and annotations/instances_SUBSET.json, as its format COCO 1.0 asks for."""
+    for path in (coco / "annotations").iterdir():
+        subset = path.stem.removeprefix("instances_")
+        data = json.loads(path.read_text())
+        assert {"info", "licenses", "categories", "images", "annotations"} <= data.keys()
+        assert len({row["name"] for row in data["categories"]}) == len(data["categories"])
+        for image in data["images"]:
+            assert {"id", "width", "height", "file_name"} <= image.keys()
+            with Image.open(coco / "images" / subset / image["file_name"]) as file:
+                assert file.size == (image["width"], image["height"])
+        images = {image["id"] for image in data["images"]}
+        for row in data["annotations"]:
+            assert row["image_id"] in images
+            assert {"id", "category_id", "segmentation", "area", "bbox", "iscrowd"} <= row.keys()
+
+
+def test_a_folder_of_five_runs_is_one_data_set_split_by_recording(
+    runs: Path, tmp_path: Path, shapecat: Run
+) -> None:
+    export(shapecat, runs, tmp_path / "out", "--format", "coco", "--val", "0.4")
+    recordings = [
+        {image["recording"] for image in read_coco(tmp_path / "out", split)["images"]}
+        for split in ("train", "val")
+    ]
+
+    assert [len(found) for found in recordings] == [3, 2]
+    assert set.union(*recordings) == {f"lab{k}" for k in range(RUNS)}
+    for split, found in zip(("train", "val"), recordings, strict=True):
+        files = [file.name for file in (tmp_path / "out/images" / split).iterdir()]
+        assert {name.partition("_")[0] for name in files} == found
+        assert len(files) == len(read_coco(tmp_path / "out", split)["images"])
+
+
+def test_options_choose_frames_and_labels_at_the_door(
+    runs: Path, tmp_path: Path, shapecat: Run
+) -> None:
+    """Each option alone, from the command to the file."""
+    found = {}
+    options = {
+        "all": (),
+        "every": ("--every", "2"),
+        "track": ("--per-track", "1"),
+        "sure": ("--min-confidence", "0.99"),
+        "corrected": ("--corrected-only",),
+    }
+    for name, chosen in options.items():
+        export(shapecat, runs, tmp_path / name, "--format", "coco", *chosen)
+        found[name] = rows(tmp_path / name)
+    images = {
+        name: sum(len(read_coco(tmp_path / name, split)["images"]) for split in ("train", "val"))
+        for name in options
+    }
+
+    assert images["every"] == images["all"] / 2
+    assert RUNS <= images["track"] < images["all"]
+    assert {r["attributes"]["track"] for r in found["track"]} == {
+        r["attributes"]["track"] for r in found["all"]
+    }
+    assert not any(row["iscrowd"] for row in found["all"])
+    for row in found["sure"]:
+        assert row["iscrowd"] == (row["score"] < 0.99 and row["attributes"]["track"] != 2)
+    for row in found["corrected"]:
+        assert row["iscrowd"] == (row["attributes"]["track"] != 2)
+
+
+def test_depth_images_at_the_door_have_16_bits(runs: Path, tmp_path: Path, shapecat: Run) -> None:
+    export(shapecat, runs / "lab0", tmp_path / "out", "--format", "yolo", "--depth")
+    files = sorted((tmp_path / "out/images/train").iterdir())
+
+    assert files
+    with Image.open(files[0]) as file:
+        assert file.mode.startswith("I;16")
+        assert 300 < np.median(np.asarray(file)[np.asarray(file) > 0]) < 5000
