@@ -188,7 +188,7 @@ def test_tracks_stay_where_their_objects_stand(run: Path) -> None:
         off = (turned.inv() * inverse * AXES).magnitude()
         quarter = np.pi / 2  # as which a turned box is the same box
         assert min(off % quarter, quarter - off % quarter) < np.radians(4)
-        assert_allclose(np.sort(row["size_full"]), SIZE + 0.01, atol=0.006)
+        assert_allclose(np.sort(row["size_full"]), SIZE + 0.01, atol=0.03)
 
 
 def test_causal_posteriors_know_their_own_view_and_none_after_it(run: Path) -> None:
