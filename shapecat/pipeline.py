@@ -57,6 +57,7 @@ from shapecat.runs.shown import read_shown_frames
 from shapecat.runs.tables import release_memory
 from shapecat.runs.tracks import track_run
 from shapecat.system import stopping
+from shapecat.system.files import holding
 from shapecat.types import LabelledFrame, ShownFrame
 
 __all__ = ["Observer", "annotate", "annotate_again", "process", "track"]
@@ -286,7 +287,8 @@ def annotate_again(
 def _adopt(labels: Path | None, folder: Path, *, by_place: bool) -> Transfer | None:
     """Apply a table of labels to a run; return the transfer if it was by place."""
     if by_place and labels is not None:
-        return transfer_labels(labels, folder)
+        with holding(folder):
+            return transfer_labels(labels, folder)
     adopt_labels(labels or folder / "tracks.csv", folder)
     return None
 

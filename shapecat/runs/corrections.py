@@ -139,8 +139,19 @@ def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
     ------
     OutputError : the table of the run cannot be read or is another run's, or the disk is full.
     """
-    with holding(folder):
-        return _relabel(folder, labels)
+    current, original = folder / "tracks.csv", folder / ORIGINAL
+    base = read_track_table(current)
+    _require_same_run(current, base, folder)
+    categories, one_frame = read_run(folder)["model"]["categories"], _one_frame(folder)
+    before = find_misread(base.rows, categories, one_frame=one_frame)
+    _refuse(current, [*base.problems, *_lines(base.rows, before)])
+    rows, refused = _given(base.rows, labels, categories, one_frame=one_frame)
+    if not original.exists():
+        with replacing(original) as path:
+            write_track_table(path, unlabelled(base))
+    with replacing(current) as path:
+        write_track_table(path, replace(base, rows=rows))
+    return refused
 
 
 def correct_label(folder: Path, track: int, label: str, *, seen: str) -> str:
@@ -160,23 +171,7 @@ def correct_label(folder: Path, track: int, label: str, *, seen: str) -> str:
             return f"there is no #{track}"
         if rows[track].label != seen:
             return f"its label is {rows[track].label!r} by now"
-        return _relabel(folder, {track: label}).get(track, "")
-
-
-def _relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
-    current, original = folder / "tracks.csv", folder / ORIGINAL
-    base = read_track_table(current)
-    _require_same_run(current, base, folder)
-    categories, one_frame = read_run(folder)["model"]["categories"], _one_frame(folder)
-    before = find_misread(base.rows, categories, one_frame=one_frame)
-    _refuse(current, [*base.problems, *_lines(base.rows, before)])
-    rows, refused = _given(base.rows, labels, categories, one_frame=one_frame)
-    if not original.exists():
-        with replacing(original) as path:
-            write_track_table(path, unlabelled(base))
-    with replacing(current) as path:
-        write_track_table(path, replace(base, rows=rows))
-    return refused
+        return relabel(folder, {track: label}).get(track, "")
 
 
 def _given(
