@@ -23,6 +23,7 @@ __all__ = [
 ]
 
 _MOST_FUSED = 30
+_LARGEST_BLOCK = 64
 
 
 @dataclass(frozen=True)
@@ -104,10 +105,19 @@ class Settings:
     """The whole tree. ``seed`` fixes every random choice."""
 
     seed: int = 0
+    reuse_frames: int = 16
+    """Frames are perceived in blocks of so many: an object that looks as it did before in its
+    block keeps that description; 1 describes every object in every frame."""
     detection: DetectionSettings = field(default_factory=DetectionSettings)
     surface: SurfaceSettings = field(default_factory=SurfaceSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     outputs: OutputSettings = field(default_factory=OutputSettings)
+
+    def __post_init__(self) -> None:
+        """Refuse to hold more images in memory than help."""
+        if not 1 <= self.reuse_frames <= _LARGEST_BLOCK:
+            msg = f"reuse_frames must be from 1 to {_LARGEST_BLOCK}, got {self.reuse_frames}"
+            raise ConfigError(msg)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the tree as plain dictionaries, as stored in the outputs."""

@@ -1,4 +1,8 @@
-"""One frame, and those to fuse with it: detect, reconstruct, describe, categorize."""
+"""One frame, and those to fuse with it: detect, reconstruct, describe, categorize.
+
+Consecutive frames are perceived in blocks: an object that looks as in an earlier frame of its
+block keeps the description of that frame. Blocks know nothing of each other.
+"""
 
 import time
 from collections.abc import Sequence
@@ -16,25 +20,42 @@ from shapecat.depth_fusion import Earlier, fuse, with_own_readings
 from shapecat.description import DESCRIPTOR_NAMES, describe
 from shapecat.detection import detect
 from shapecat.errors import ModelError
-from shapecat.geometry import inverse, level_from_sensor, transform
+from shapecat.geometry import IDENTITY, inverse, level_from_sensor, transform
 from shapecat.learning import Categorizer, load_model
+from shapecat.reuse import KeyView, Sight, find_key_views, reused, shows_the_same, update
 from shapecat.surface import reconstruct, thin
-from shapecat.types import Candidate, Detection, Frame, FullBox, NeuralGas, Perception, Scene
+from shapecat.types import (
+    Candidate,
+    Detection,
+    Frame,
+    NeuralGas,
+    Perception,
+    Pose,
+    Scene,
+)
 
 __all__ = ["Perceiver", "View", "find_up", "perceive"]
 
 
 class View(NamedTuple):
-    """A frame, its up direction (None to estimate it), and the frames to fuse with it."""
+    """A frame, and what is known of it.
+
+    Attributes
+    ----------
+    up : (3,) unit vector in the sensor frame, or None to estimate it from the planes.
+    earlier : frames to fuse with this one.
+    pose : ``fixed_from_sensor``, None if it is not known.
+    """
 
     frame: Frame
     up: F4 | None
-    earlier: tuple[Earlier, ...]
+    earlier: tuple[Earlier, ...] = ()
+    pose: Pose | None = None
 
 
 @dataclass(frozen=True)
 class Perceiver:
-    """Perceives frames, in this or another process; each process reads the model file itself.
+    """Perceives blocks of frames, here or in a process that reads the model's file itself.
 
     Attributes
     ----------
@@ -45,15 +66,15 @@ class Perceiver:
     settings: Settings
     model: Path | None
 
-    def __call__(self, view: View) -> Perception:
-        """Perceive a frame."""
-        return perceive(
-            view.frame,
-            up=view.up,
-            categorizer=self.categorizer,
-            settings=self.settings,
-            earlier=view.earlier,
-        )
+    def __call__(self, views: Sequence[View]) -> list[Perception]:
+        """Perceive consecutive frames; later ones may repeat what earlier ones show."""
+        known: dict[str, _Known] = {}
+        perceptions = []
+        for view in views:
+            topic = view.frame.topic
+            perception, known[topic] = _perceive(view, known.get(topic, _NOTHING), self)
+            perceptions.append(perception)
+        return perceptions
 
     def __reduce__(self) -> tuple[Any, ...]:
         return _read_perceiver, (self.model, self.categorizer.model_id, self.settings)
@@ -91,36 +112,127 @@ def perceive(
     up : (3,) unit vector in the sensor frame, or None to estimate it from the planes.
     earlier : frames to fuse with this one; indices are those of the frame's own readings.
     """
-    begun = time.perf_counter()
-    fused = fuse(frame, earlier, range_m=settings.detection.max_range_m)
-    scene = detect(fused, up=up, settings=settings.detection, rng=_rng(settings, frame, 0))
-    detected = time.perf_counter()
-    shapes = [
-        _describe_candidate(fused, scene, candidate, settings, _rng(settings, frame, k))
-        for k, candidate in enumerate(scene.candidates, start=1)
-    ]
-    described = time.perf_counter()
-    if fused is not frame:
-        scene = with_own_readings(scene, frame)
-    detections = _categorize(scene, shapes, categorizer)
-    categorized = time.perf_counter()
-    detections = tuple(
-        replace(d, full=_full_box(frame, scene, d, categorizer.categories)) for d in detections
-    )
-    return Perception(
+    view = View(frame, up, tuple(earlier))
+    perception, _ = _perceive(view, _NOTHING, Perceiver(categorizer, settings, None))
+    return perception
+
+
+class _Known(NamedTuple):
+    """What the frames of a topic have shown before, in the same block.
+
+    Attributes
+    ----------
+    view : the last frame that was not repeated, after fusing; None if there is none.
+    perception : what was found in it.
+    keys : the views of objects that were described.
+    """
+
+    view: View | None
+    perception: Perception | None
+    keys: tuple[KeyView, ...]
+
+
+_NOTHING = _Known(None, None, ())
+
+
+def _perceive(view: View, known: _Known, perceiver: Perceiver) -> tuple[Perception, _Known]:
+    """Perceive a frame; return also what is known after it."""
+    clock, frame, range_m = _Clock(), view.frame, perceiver.settings.detection.max_range_m
+    seen = view._replace(frame=fuse(frame, view.earlier, range_m=range_m), earlier=())
+    if known.perception is not None and _repeats(seen, known.view, range_m):
+        repeated = _repeated(frame, known.perception)
+        clock.lap("detect")
+        return replace(repeated, seconds=clock.seconds), known
+    scene, detections, keys = _look(seen, known.keys, perceiver, clock)
+    perception = Perception(
         topic=frame.topic,
         index=frame.index,
         stamp_ns=frame.stamp_ns,
         frame_id=frame.frame_id,
         scene=scene,
         detections=detections,
-        seconds={
-            "detect": detected - begun,
-            "describe": described - detected,
-            "categorize": categorized - described,
-            "complete": time.perf_counter() - categorized,
-        },
+        seconds=clock.seconds,
     )
+    after = _Known(seen, perception, keys)
+    return (perception if seen.frame is frame else _of_frame(frame, perception)), after
+
+
+def _look(
+    view: View, keys: tuple[KeyView, ...], perceiver: Perceiver, clock: "_Clock"
+) -> tuple[Scene, tuple[Detection, ...], tuple[KeyView, ...]]:
+    """Find the objects of a frame, and describe those that no view is known of."""
+    frame, settings = view.frame, perceiver.settings
+    scene = detect(frame, up=view.up, settings=settings.detection, rng=_rng(settings, frame, 0))
+    clock.lap("detect")
+    sights = [_sight(view, scene, candidate) for candidate in scene.candidates]
+    found = find_key_views(sights, keys)
+    new = [k for k, key in enumerate(found) if key is None]
+    shapes = [_describe(sights[k], scene, settings, _rng(settings, frame, k + 1)) for k in new]
+    clock.lap("describe")
+    named = _categorize([sights[k] for k in new], shapes, perceiver.categorizer)
+    clock.lap("categorize")
+    whole = [_completed(frame, scene, d, perceiver.categorizer.categories) for d in named]
+    described = dict(zip(new, whole, strict=True))
+    detections = tuple(
+        described[k] if key is None else reused(key, sights[k]) for k, key in enumerate(found)
+    )
+    clock.lap("complete")
+    return scene, detections, update(keys, [KeyView(sights[k], described[k]) for k in new])
+
+
+def _repeats(view: View, then: View | None, range_m: float) -> bool:
+    """Tell whether a frame shows what an earlier one showed, from the same place."""
+    if then is None or (view.up is None) != (then.up is None):
+        return False
+    if view.up is not None and then.up is not None and view.up @ then.up < _SAME_UP:
+        return False
+    return shows_the_same(view.frame, view.pose, then.frame, then.pose, range_m=range_m)
+
+
+def _repeated(frame: Frame, first: Perception) -> Perception:
+    """Return what was found in an earlier frame as found in this one."""
+    detections = tuple(
+        replace(d, seconds=0.0, reused_from=first.index if d.reused_from is None else d.reused_from)
+        for d in first.detections
+    )
+    again = replace(
+        first,
+        index=frame.index,
+        stamp_ns=frame.stamp_ns,
+        detections=detections,
+        reused_from=first.index,
+    )
+    return _of_frame(frame, again)
+
+
+def _of_frame(frame: Frame, perception: Perception) -> Perception:
+    """Leave out the pixels where the frame itself has no reading."""
+    scene = with_own_readings(perception.scene, frame)
+    detections = tuple(
+        replace(detection, candidate=candidate)
+        for detection, candidate in zip(perception.detections, scene.candidates, strict=True)
+    )
+    return replace(perception, scene=scene, detections=detections)
+
+
+class _Clock:
+    """Tells how long each of some steps takes."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+        self._last = time.perf_counter()
+
+    def lap(self, step: str) -> None:
+        """Note that a step has ended."""
+        now = time.perf_counter()
+        self.seconds[step], self._last = now - self._last, now
+
+
+def _sight(view: View, scene: Scene, candidate: Candidate) -> Sight:
+    center = candidate.box.center
+    height_m = float(scene.up @ center) - scene.support_offset(candidate)
+    place = transform(view.pose or IDENTITY, center)
+    return Sight(view.frame, view.pose, scene.up, candidate, height_m, place)
 
 
 def find_up(frame: Frame, settings: Settings) -> F4 | None:
@@ -134,13 +246,11 @@ def _rng(settings: Settings, frame: Frame, item: int) -> np.random.Generator:
     return np.random.default_rng((settings.seed, abs(frame.stamp_ns), item))
 
 
-def _describe_candidate(
-    frame: Frame, scene: Scene, candidate: Candidate, settings: Settings, rng: np.random.Generator
-) -> _Shape:
-    """Move the candidate upright onto z = 0, learn its surface, and describe it."""
+def _describe(sight: Sight, scene: Scene, settings: Settings, rng: np.random.Generator) -> _Shape:
+    """Stand the candidate upright on z = 0, learn its surface, and describe it."""
     begun = time.perf_counter()
-    points = frame.xyz(candidate.indices)
-    level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
+    points = sight.frame.xyz(sight.candidate.indices)
+    level = level_from_sensor(scene.up, scene.support_offset(sight.candidate), points)
     cloud = thin(transform(level, points).astype(np.float32), settings=settings.surface)
     gas = reconstruct(cloud, settings=settings.surface, rng=rng)
     if gas is None:
@@ -152,43 +262,44 @@ def _describe_candidate(
     return _Shape(in_sensor, descriptor, time.perf_counter() - begun)
 
 
-def _full_box(
+def _completed(
     frame: Frame, scene: Scene, detection: Detection, categories: Sequence[str]
-) -> FullBox | None:
-    """Estimate the full box of an object; None if no reading of the frame is left after fusion."""
+) -> Detection:
+    """Estimate the whole of an object."""
     candidate = detection.candidate
     some = candidate.indices[:: max(1, -(-len(candidate.indices) // ENOUGH_POINTS))]
-    if not len(some):
-        return None
     offset = scene.support_offset(candidate)
-    return complete(frame.xyz(some), scene.up, offset, detection.posterior, categories)
+    full = complete(frame.xyz(some), scene.up, offset, detection.posterior, categories)
+    return replace(detection, full=full)
 
 
 def _categorize(
-    scene: Scene, shapes: list[_Shape], categorizer: Categorizer
-) -> tuple[Detection, ...]:
-    """Categorize all candidates of a frame in one call; one without a surface is undecided."""
+    sights: Sequence[Sight], shapes: Sequence[_Shape], categorizer: Categorizer
+) -> list[Detection]:
+    """Categorize some candidates in one call; one without a surface is undecided."""
     if not shapes:
-        return ()
+        return []
     begun = time.perf_counter()
     prediction = categorizer.predict(np.stack([shape.descriptor for shape in shapes]))
     each = (time.perf_counter() - begun) / len(shapes)
     known = [len(shape.gas.neurons) > 0 for shape in shapes]
     uniform = np.full(len(categorizer.categories), 1 / len(categorizer.categories))
-    return tuple(
+    return [
         Detection(
-            candidate=candidate,
+            candidate=sight.candidate,
             gas=shape.gas,
             descriptor=shape.descriptor,
             posterior=prediction.posteriors[k] if known[k] else uniform,
             novelty=float(prediction.novelty[k]) if known[k] else _UNDECIDED,
             seconds=shape.seconds + each,
         )
-        for k, (candidate, shape) in enumerate(zip(scene.candidates, shapes, strict=True))
-    )
+        for k, (sight, shape) in enumerate(zip(sights, shapes, strict=True))
+    ]
 
 
 _TELLS_M2 = 0.1
 """Area of planes that tells where up is; a smaller one may be the face of something."""
 _UNDECIDED = 2.0
 """Novelty of an object with too few points for a surface: beyond the threshold, so unknown."""
+_SAME_UP = float(np.cos(np.radians(1.0)))
+"""Ups that are nearer to each other are the same, measured twice."""

@@ -27,6 +27,7 @@ from shapecat.detection import detect
 from shapecat.executors.local import LocalExecutor, WorkerLostError
 from shapecat.jit import code_folder
 from shapecat.learning import load_model
+from shapecat.reuse import Sight, looks_the_same, shows_the_same
 from shapecat.surface import reconstruct, thin
 from shapecat.system import stopping
 from shapecat.system.files import lock
@@ -51,7 +52,9 @@ def find_ball() -> int:
         "ball", 0, 0, 0, "camera", depth=depth, camera=Camera(640, 480, 525, 525, 320, 240)
     )
     scene = detect(frame, settings=Settings().detection, rng=np.random.default_rng(0))
-    return len(scene.candidates)
+    sights = [Sight(frame, None, scene.up, ball, 0.0, ball.box.center) for ball in scene.candidates]
+    same = shows_the_same(frame, None, frame, None, range_m=2.0)
+    return len([each for each in sights if same and looks_the_same(each, each)])
 
 
 def recognize_ball() -> str:
@@ -73,7 +76,7 @@ _REHEARSALS: tuple[Callable[[], object], ...] = (find_ball, recognize_ball)
 """About as long each; none needs the kernels of another."""
 _POLL_S = 0.1
 _TELL_S = 10.0
-_STAGES = ("completion", "description", "detection", "learning", "surface")
+_STAGES = ("completion", "description", "detection", "learning", "reuse", "surface")
 """Folders of the kernels that are rehearsed."""
 
 

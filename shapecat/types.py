@@ -219,7 +219,8 @@ class Detection(Record):
 
     ``neurons`` of ``gas`` are in the sensor frame; ``posterior`` sums to 1 in the order of the
     model's categories; ``novelty`` is 0 for a familiar shape and above 1 beyond the threshold;
-    ``full`` is in the sensor frame, None where only the visible box is known.
+    ``full`` is in the sensor frame, None where only the visible box is known; ``reused_from`` is
+    the index of the frame whose description it repeats, None if it has its own.
     """
 
     candidate: Candidate
@@ -229,10 +230,14 @@ class Detection(Record):
     novelty: float
     seconds: float
     full: FullBox | None = None
+    reused_from: int | None = None
 
 
 class Perception(Record):
-    """All that is known of one frame before anything is followed over time."""
+    """All that is known of one frame before anything is followed over time.
+
+    ``reused_from`` is the index of the frame whose scene it repeats, None if it has its own.
+    """
 
     topic: str
     index: int
@@ -241,6 +246,7 @@ class Perception(Record):
     scene: Scene
     detections: tuple[Detection, ...]
     seconds: dict[str, float]
+    reused_from: int | None = None
 
 
 class LabelledObject(Record):

@@ -13,6 +13,7 @@ STAGES = {
     "description",
     "detection",
     "learning",
+    "reuse",
     "surface",
     "tracking",
 }

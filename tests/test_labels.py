@@ -275,7 +275,8 @@ def write_run(folder: Path) -> None:
                 for k in range(2)
             )
             scene = Scene(np.array([0, -1, 0]), (plane,), ())
-            tables.write(Perception("/d", index, index, "cam", scene, found, {}), FrameRow(0, None))
+            seen = Perception("/d", index, index, "cam", scene, found, {})
+            tables.write([seen], [FrameRow(0, None)])
     rows = [(1, 0, 0), (1, 1, 0), (1, 2, 0), (2, 0, 1), (3, 1, 1), (3, 2, 1)]
     columns = {
         "track": [t for t, _, _ in rows],

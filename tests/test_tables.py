@@ -59,7 +59,7 @@ def perception(index: int, count: int) -> Perception:
 def write_run_tables(folder: Path, counts: list[int], pose: Pose | None = None) -> None:
     with PerceptionTables(folder, categories=CATEGORIES, model_id="m1") as tables:
         for index, count in enumerate(counts):
-            tables.write(perception(index, count), FrameRow(2000 + index, pose))
+            tables.write([perception(index, count)], [FrameRow(2000 + index, pose)])
 
 
 def write_tracks(folder: Path, rows: list[tuple[int, int, int | None]]) -> None:

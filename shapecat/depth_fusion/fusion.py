@@ -53,7 +53,7 @@ def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
     depend on what the images show.
     """
     depth, camera = frame.depth, frame.camera
-    if depth is None or camera is None:
+    if depth is None or camera is None or not earlier:
         return frame
     guide = _guide(depth, np.float32(range_m))
     total, count = depth.copy(), (depth > 0).astype(np.float32)

@@ -20,11 +20,11 @@ _Kept = TypeVar("_Kept")
 _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
-_ALONE = 8
+_ALONE = 1
 """Items worked on before other processes are started, which a short run can do without."""
 _AWAY = 2
 """Items sent to each other process: one to work on, one to go on with."""
-_HELD = 64
+_HELD = 8
 """Results held at most, which wait for one that another process works on."""
 _SWITCH_S = 5e-4
 """A thread back from a kernel waits no longer than this for the interpreter lock."""

@@ -90,9 +90,9 @@ class PerceptionTables:
         self._flush()
         self._join()
 
-    def write(self, perception: Perception, row: FrameRow) -> None:
-        """Append one frame."""
-        self._pending.append((perception, row))
+    def write(self, perceptions: Sequence[Perception], rows: Sequence[FrameRow]) -> None:
+        """Append a block of frames, which no segment parts."""
+        self._pending.extend(zip(perceptions, rows, strict=True))
         late = time.monotonic() - self._flushed > _SEGMENT_S
         if late or len(self._pending) >= GROUP_FRAMES:
             self._flush()
@@ -135,6 +135,7 @@ def _frame_columns(rows: Sequence[tuple[Perception, FrameRow]]) -> dict[str, Any
         "up": [p.scene.up for p, _ in rows],
         "up_given": [row.up_given for _, row in rows],
         "revised": [row.again and bool(p.scene.planes or p.detections) for p, row in rows],
+        "reused_from": [p.reused_from for p, _ in rows],
         "fixed_translation": [
             row.fixed_from_sensor and row.fixed_from_sensor.translation for _, row in rows
         ],
@@ -184,6 +185,7 @@ def _detection_columns(
         ],
         "confidence": [float(d.posterior[k]) for d, k in zip(found, best, strict=True)],
         "novelty": [d.novelty for d in found],
+        "reused_from": [d.reused_from for d in found],
         "descriptor": lists([d.descriptor for d in found], pa.float32()),
         "neurons": lists([d.gas.neurons for d in found], pa.float32()),
         "edges": lists([d.gas.edges for d in found], pa.uint16()),

@@ -72,15 +72,15 @@ def perceive_all(
         def view(frame: Frame) -> tuple[FrameRow, View]:
             up, pose = upright.up(frame), upright.fixed_from_sensor(frame)
             row = FrameRow(frame.log_time_ns, pose, up)
-            return row, View(frame, up, recent.before(frame, pose))
+            return row, View(frame, up, recent.before(frame, pose), pose)
 
         source = _UpTrial(upright, job.settings).before(_readable(source, job))
-        views = map(view, stopping.until_asked(source))
-        for count, _ in enumerate(islice(views, tables.done), start=1):
+        views = map(view, source)
+        for count, _ in enumerate(stopping.until_asked(islice(views, tables.done)), start=1):
             observe("perceive", count, total)
-        for row, perception in processes.in_order(views):
-            count += 1
-            tables.write(perception, row)
+        for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
+            tables.write(perceptions, rows)
+            count += len(rows)
             observe("perceive", count, total)
         stopping.check()
     if not count:
@@ -118,9 +118,10 @@ def revise(
         _tables(folder, categorizer, again=True) as tables,
     ):
         views = islice(_views_again(recording, run, job, chosen), len(chosen))
-        done = sum(1 for _ in islice(views, tables.done))
-        for count, (row, perception) in enumerate(processes.in_order(views), start=done + 1):
-            tables.write(perception, row)
+        count = sum(1 for _ in stopping.until_asked(islice(views, tables.done)))
+        for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
+            tables.write(perceptions, rows)
+            count += len(rows)
             observe("revise", count, len(chosen))
         stopping.check()
     run["counts"]["detections"] = count_rows(folder, "detections")
@@ -135,13 +136,22 @@ def _views_again(
     source, _ = _select(recording, run["options"], Counter())
     upright = Upright.of(recording, up=job.up, fixed_frame=run["fixed_frame"])
     recent = RecentFrames(job.settings.detection.fuse_frames)
-    for frame in stopping.until_asked(_readable(source, job)):
+    for frame in _readable(source, job):
         pose = upright.fixed_from_sensor(frame)
         earlier = recent.before(frame, pose)
         revision = chosen.get((frame.topic, frame.index))
         if revision is not None:
             row = FrameRow(frame.log_time_ns, pose, revision.up_given, again=True)
-            yield row, View(frame, revision.up, earlier)
+            yield row, View(frame, revision.up, earlier, pose)
+
+
+def _blocks(
+    views: Iterator[tuple[FrameRow, View]], size: int
+) -> Iterator[tuple[tuple[FrameRow, ...], tuple[View, ...]]]:
+    """Yield blocks of consecutive frames until asked to stop: where they begin never changes."""
+    while not stopping.asked() and (block := tuple(islice(views, size))):
+        rows, seen = zip(*block, strict=True)
+        yield rows, seen
 
 
 class _UpTrial:

@@ -59,6 +59,7 @@ FRAMES = pa.schema(
         ("up", _VEC3),
         ("up_given", _VEC3),
         ("revised", pa.bool_()),
+        ("reused_from", pa.int32()),
         ("fixed_translation", pa.list_(pa.float64(), 3)),
         ("fixed_rotation", pa.list_(pa.float64(), 9)),
         ("stages", pa.list_(pa.string())),
@@ -67,7 +68,8 @@ FRAMES = pa.schema(
 )
 """One row per frame read, also those without a detection. ``up`` is what detection went by,
 ``up_given`` where transforms, an IMU or an option said it is, null where nothing did; ``revised``
-where what is here was seen in a second look, with the up that the recording tells. ``fixed_*`` is
+where what is here was seen in a second look, with the up that the recording tells;
+``reused_from`` is the frame that shows the same, whose scene this one repeats. ``fixed_*`` is
 ``fixed_from_sensor`` (rotation row by row), null without a fixed frame; ``seconds`` per entry of
 ``stages``."""
 
@@ -95,6 +97,7 @@ DETECTIONS = pa.schema(
         ("category", pa.string()),
         ("confidence", pa.float32()),
         ("novelty", pa.float32()),
+        ("reused_from", pa.int32()),
         ("descriptor", _FLOATS),
         ("neurons", _FLOATS),
         ("edges", pa.list_(pa.uint16())),
@@ -102,7 +105,8 @@ DETECTIONS = pa.schema(
     ]
 )
 """One row per object per frame; lengths in metres, ``center`` and ``neurons`` in ``frame_id``.
-The box around all of an object, ``*_full``, is null where only the visible one is known."""
+The box around all of an object, ``*_full``, is null where only the visible one is known.
+``posterior`` to ``edges`` repeat those of the frame ``reused_from``; null where they are new."""
 
 PLANES = pa.schema(
     [

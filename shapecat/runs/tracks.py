@@ -31,6 +31,7 @@ _COLUMNS = (
     "center_fixed",
     "posterior",
     "novelty",
+    "reused_from",
     "touches_border",
     "occluded",
 )
@@ -92,6 +93,7 @@ def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[Fra
                 partial=here["partial"],
                 novelties=here["novelty"],
                 axes=np.reshape(turn or _NO_TURN, (3, 3)) @ here["axes"],
+                described=here["described"],
             )
 
 
@@ -103,6 +105,8 @@ def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
         columns[name] = numbers(table[name]).reshape(-1, width)
     turns = columns.pop("orientation")
     columns["axes"] = Rotation.from_quat(turns).as_matrix() if len(turns) else np.zeros((0, 3, 3))
+    first = table["reused_from"].combine_chunks()
+    columns["described"] = np.where(first.is_null(), table["frame"], first.fill_null(0))
     known = pa.compute.is_valid(table["center_fixed"]).to_numpy()
     columns["center_fixed"] = np.full((table.num_rows, 3), np.nan)
     columns["center_fixed"][known] = numbers(table["center_fixed"]).reshape(-1, 3)

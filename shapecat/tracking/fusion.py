@@ -38,7 +38,7 @@ def fuse(posteriors: ArrayLike, method: Method = "product", weights: ArrayLike |
     posteriors : rows that sum to 1.
     method : ``product``, tempered by the number of views, which is the geometric mean; ``mean``;
         ``vote``, the share of views won by each category, the first one on ties.
-    weights : (k,) positive weights of the views, equal by default.
+    weights : (k,) weights of the views, the first one positive; equal by default.
 
     Raises
     ------

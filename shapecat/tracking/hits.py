@@ -7,6 +7,7 @@ from typing import Self
 import numpy as np
 
 from shapecat.arrays import F8, I4, Bool
+from shapecat.tracking.fusion import view_weights
 from shapecat.tracking.records import FrameDetections
 
 __all__ = ["Hits"]
@@ -17,7 +18,7 @@ class Hits:
     """All detections of a stream: ``rows`` (n,) ascending, the positions of their frames.
 
     ``topics`` (f,) tell frames of one topic from those of others; ``axes`` (n, 3, 3) of the boxes,
-    None if those of some are not known.
+    None if those of some are not known; ``views`` (n,) tells views from those that repeat them.
     """
 
     frames: Sequence[FrameDetections]
@@ -30,16 +31,19 @@ class Hits:
     partial: Bool
     novelties: F8
     axes: F8 | None
+    views: I4
 
     @classmethod
     def of(cls, frames: Sequence[FrameDetections]) -> Self:
         """Gather the detections of at least one frame."""
         filled = [frame for frame in frames if len(frame.centers)] or frames[:1]
         axes = [frame.axes for frame in filled if frame.axes is not None]
+        topics = np.unique([frame.topic for frame in frames], return_inverse=True)[1]
+        rows = np.repeat(np.arange(len(frames)), [len(frame.centers) for frame in frames])
         return cls(
             frames,
-            np.unique([frame.topic for frame in frames], return_inverse=True)[1],
-            np.repeat(np.arange(len(frames)), [len(frame.centers) for frame in frames]),
+            topics,
+            rows,
             np.concatenate([frame.detections for frame in filled]),
             np.concatenate([frame.centers for frame in filled]),
             np.concatenate([frame.sizes for frame in filled]).astype(np.float64),
@@ -47,11 +51,19 @@ class Hits:
             np.concatenate([frame.partial for frame in filled]),
             np.concatenate([frame.novelties for frame in filled]).astype(np.float64),
             np.concatenate(axes) if len(axes) == len(filled) else None,
+            (topics[rows].astype(np.int64) << 32) + np.concatenate([_described(f) for f in filled]),
         )
 
     def stamps(self, hits: I4) -> I4:
         """Return the times of some hits."""
         return np.array([self.frames[r].stamp_ns for r in self.rows[hits]], np.int64)
+
+    def weights(self, member: I4) -> F8:
+        """Return how much each view of the track ``member`` counts: one that is repeated, once."""
+        _, first = np.unique(self.views[member], return_index=True)
+        new = np.zeros(len(member), np.bool_)
+        new[first] = True
+        return np.where(new, view_weights(self.partial[member]), 0.0)
 
     def at(self, rows: I4) -> tuple[I4, I4]:
         """Return the hits in some frames, and for each the position of its frame in ``rows``."""
@@ -83,3 +95,8 @@ class Hits:
     def sees(self, member: I4, rows: I4) -> Bool:
         """Return which frames are of a topic that sees the track ``member``."""
         return np.isin(self.topics[rows], self.topics[self.rows[member]])
+
+
+def _described(frame: FrameDetections) -> I4:
+    own = np.full(len(frame.centers), frame.frame, np.int32)
+    return own if frame.described is None else frame.described

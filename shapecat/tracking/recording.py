@@ -8,7 +8,7 @@ import numpy as np
 from shapecat.arrays import F8, I4, Bool
 from shapecat.config import TrackingSettings
 from shapecat.tracking.common_motion import CommonMotion, find_common_motion
-from shapecat.tracking.fusion import causal, fuse, fuse_novelty, view_weights
+from shapecat.tracking.fusion import causal, fuse, fuse_novelty
 from shapecat.tracking.hindsight import Fragments, merge_fragments, scene_cuts
 from shapecat.tracking.hits import Hits
 from shapecat.tracking.pieces import join_pieces
@@ -131,7 +131,7 @@ def _describe(hits: Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
     at = stamps[hits.rows]
     starts = [_line(at[f[:_LINE]], hits.centers[f[:_LINE]], 0) for f in fragments]
     ends = [_line(at[f[-_LINE:]], hits.centers[f[-_LINE:]], -1) for f in fragments]
-    views = [(f, view_weights(hits.partial[f])) for f in fragments]
+    views = [(f, hits.weights(f)) for f in fragments]
     return Fragments(
         np.array([at[f[0]] for f in fragments], np.int64),
         np.array([at[f[-1]] for f in fragments], np.int64),
@@ -195,7 +195,7 @@ def _build_track(
 ) -> Track:
     rows, source = hits.life(member, settings.max_missed_s)
     seen = hits.rows[member]
-    weights = view_weights(hits.partial[member])
+    weights = hits.weights(member)
     so_far = causal(hits.posteriors[member], settings.fusion, weights)
     stamps = np.array([hits.frames[r].stamp_ns for r in rows], np.int64)
     at = np.searchsorted(seen, rows, side="right") - 1  # the last detection up to each row

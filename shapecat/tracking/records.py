@@ -22,6 +22,8 @@ class FrameDetections(Record):
     novelties : (n,) novelty of the single views.
     axes : (n, 3, 3) the columns are the axes of the boxes, in the frame of the centres; None where
         only sizes are known.
+    described : (n,) number of the frame whose view each detection repeats, its own where it was
+        described itself; None where all were.
     """
 
     topic: str
@@ -34,6 +36,7 @@ class FrameDetections(Record):
     partial: Bool = array("n", "?")
     novelties: F4 = array("n", "f4")
     axes: F8 | None = array("n 3 3", "f8", default=None)
+    described: I4 | None = array("n", "i4", default=None)
 
 
 class Track(Record):

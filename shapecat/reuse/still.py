@@ -1,0 +1,93 @@
+"""Whether a depth image shows what an earlier one from the same place showed."""
+
+import numpy as np
+
+from shapecat.arrays import F4, Bool
+from shapecat.geometry import compose, inverse
+from shapecat.jit import kernel
+from shapecat.reuse.agreement import AGREE
+from shapecat.types import Frame, Pose
+
+__all__ = ["shows_the_same"]
+
+_MOVED_M, _TURNED_DEG = 0.003, 0.15
+"""A pose that differs by less is one that was measured twice."""
+_STRIDE = 2
+"""Pixels between those that are compared."""
+_SQUARE = 3
+"""What has changed shows in so many neighbours each way that all disagree: 6 by 6 pixels, fewer
+than the smallest object has. The noise of outlines makes thin lines."""
+
+
+def shows_the_same(
+    now: Frame, pose: Pose | None, then: Frame, then_pose: Pose | None, *, range_m: float
+) -> bool:
+    """Tell whether nothing within a range has moved, come or gone between two frames.
+
+    Parameters
+    ----------
+    pose, then_pose : ``fixed_from_sensor``, None where there is no fixed frame.
+
+    Notes
+    -----
+    Clouds that are no depth images are never the same: their points do not match one to one.
+    """
+    if now.depth is None or then.depth is None or now.camera != then.camera:
+        return False
+    if now.frame_id != then.frame_id or not _at_rest(pose, then_pose):
+        return False
+    return not _changed(now.depth, then.depth, np.float32(range_m))
+
+
+def _at_rest(pose: Pose | None, then: Pose | None) -> bool:
+    if pose is None or then is None:
+        return pose is then
+    moved = compose(inverse(then), pose)
+    turned = np.arccos(np.clip((np.trace(moved.rotation) - 1) / 2, -1, 1))
+    return bool(np.linalg.norm(moved.translation) <= _MOVED_M and turned <= np.radians(_TURNED_DEG))
+
+
+@kernel
+def _changed(now: F4, then: F4, range_m: float) -> bool:
+    """Tell whether there is a square of readings that all disagree."""
+    height, width = now.shape
+    rows = np.zeros(width, np.int64)  # that end here with enough neighbours which disagree
+    differs = np.zeros(width, np.bool_)
+    for v in range(0, height, _STRIDE):
+        _mark(now[v], then[v], range_m, differs)
+        run = 0
+        for u in range(0, width, _STRIDE):
+            run = run + 1 if differs[u] and _alone(now, then, v, u) else 0
+            rows[u] = rows[u] + 1 if run >= _SQUARE else 0
+            if rows[u] == _SQUARE:
+                return True
+    return False
+
+
+@kernel
+def _mark(now: F4, then: F4, range_m: float, differs: Bool) -> None:
+    """Mark the readings of a row that differ, unless both are out of range."""
+    for u in range(len(now)):
+        a, b = now[u], then[u]
+        near = (a <= range_m) | (b <= range_m)
+        differs[u] = near & (abs(a - b) > np.float32(AGREE) * a * b)
+
+
+@kernel
+def _alone(now: F4, then: F4, row: int, column: int) -> bool:
+    """Tell whether neither reading of a pixel has its like beside the other; none is like none."""
+    a, b = now[row, column], then[row, column]
+    return a != b and not (
+        (a > 0 and _finds(then, row, column, a)) or (b > 0 and _finds(now, row, column, b))
+    )
+
+
+@kernel
+def _finds(depth: F4, row: int, column: int, z: float) -> bool:
+    """Tell whether there is such a reading at a pixel or beside it."""
+    height, width = depth.shape
+    for v in range(max(row - 1, 0), min(row + 2, height)):
+        for u in range(max(column - 1, 0), min(column + 2, width)):
+            if abs(depth[v, u] - z) <= AGREE * depth[v, u] * z:
+                return True
+    return False

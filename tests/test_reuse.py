@@ -1,0 +1,340 @@
+"""What is repeated from an earlier frame, and above all what is not."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+import shapecat.pipeline
+from shapecat.config import Settings
+from shapecat.errors import ConfigError
+from shapecat.geometry import IDENTITY, transform
+from shapecat.perception import Perceiver, View
+from shapecat.reuse import shows_the_same
+from shapecat.runs.jobs import Job
+from shapecat.simulation import KINECT, make_scene, render_frame
+from shapecat.simulation.recorder import record
+from shapecat.simulation.worlds import Motion, World
+from shapecat.tracking.hits import Hits
+from shapecat.tracking.records import FrameDetections
+from shapecat.types import Detection, Frame, Perception, Pose
+from tests.conftest import Guesser
+
+FRAMES, CHANGE = 6, 3
+"""Frames of a scene, and the first one in which something is different."""
+
+
+def still_world(frames: int = FRAMES, **changes: Any) -> World:
+    """Return a table with things on it and a camera at rest."""
+    world = make_scene("tabletop", np.random.default_rng(11), frames=frames)
+    return replace(world, path=(world.path[0],) * frames, turns=np.zeros(frames), **changes)
+
+
+def shifted(track: int, shifts: Sequence[Any]) -> Motion:
+    """Return a motion by so much (3,) in each frame; None where the thing is not there."""
+    return Motion(track, np.array([(np.nan,) * 3 if s is None else s for s in shifts]))
+
+
+def alone(world: World) -> int:
+    """Return the thing that is farthest from all others."""
+    places = np.array([thing.pose.translation for thing in world.things])
+    gaps = np.linalg.norm(places[:, None] - places[None], axis=2) + 9 * np.eye(len(places))
+    return int(gaps.min(axis=1).argmax())
+
+
+def perceive(world: World, **settings: Any) -> list[Perception]:
+    """Perceive the frames of a world as one block, with noise of its own in each."""
+    views = []
+    for k in range(len(world)):
+        frame, _ = render_frame(world, k, rng=np.random.default_rng(k), sensor=KINECT)
+        views.append(View(replace(frame, index=k), None, (), world.path[k]))
+    guesser: Any = Guesser()
+    return Perceiver(guesser, Settings(**settings), None)(views)
+
+
+def at(world: World, perceptions: Sequence[Perception], k: int, place: Any) -> Detection:
+    """Return the detection nearest to a place in the world."""
+    found = perceptions[k].detections
+    gaps = [np.linalg.norm(transform(world.path[k], d.candidate.box.center) - place) for d in found]
+    assert min(gaps) < 0.08
+    return found[int(np.argmin(gaps))]
+
+
+def test_a_still_scene_is_perceived_once() -> None:
+    first, *others = perceive(still_world())
+    assert len(first.detections) >= 6
+    assert first.reused_from is None
+    assert {d.reused_from for d in first.detections} == {None}
+    for other in others:
+        assert other.reused_from == 0
+        assert {d.reused_from for d in other.detections} == {0}
+        for now, then in zip(other.detections, first.detections, strict=True):
+            assert np.array_equal(now.posterior, then.posterior)
+            assert np.array_equal(now.gas.neurons, then.gas.neurons)
+            share = np.isin(now.candidate.indices, then.candidate.indices).mean()
+            assert share == 1.0
+            assert len(now.candidate.indices) > 0.9 * len(then.candidate.indices)
+
+
+def test_only_readings_of_the_frame_itself_are_pixels_of_an_object() -> None:
+    """A repeated mask on a hole would paint, and export, points that do not exist."""
+    world = still_world(2)
+    perceptions = perceive(world)
+    frame, _ = render_frame(world, 1, rng=np.random.default_rng(1), sensor=KINECT)
+    assert frame.depth is not None
+    for found in perceptions[1].detections:
+        assert (frame.depth.reshape(-1)[found.candidate.indices] > 0).all()
+
+
+def test_what_moves_is_described_anew_and_nothing_else() -> None:
+    world = still_world()
+    track = alone(world)
+    place = world.things[track].pose.translation
+    shift = np.array([*(0.05 * place[:2] / np.linalg.norm(place[:2])), 0])
+    motion = shifted(track, [(0, 0, 0)] * CHANGE + [shift] * (FRAMES - CHANGE))
+    world = replace(world, motions=(motion,))
+
+    perceptions = perceive(world)
+
+    moved = at(world, perceptions, CHANGE, place + shift)
+    assert perceptions[CHANGE].reused_from is None
+    assert moved.reused_from is None
+    assert at(world, perceptions, CHANGE + 1, place + shift).reused_from == CHANGE
+    others = [d.reused_from for d in perceptions[CHANGE].detections if d is not moved]
+    assert others.count(0) >= len(others) - 1
+
+
+def test_another_object_at_the_same_place_is_described_anew() -> None:
+    """The label of what stood there before would stick to it."""
+    world = still_world()
+    names = [thing.category for thing in world.things]
+    track, other = alone(world), names.index("plate" if names[alone(world)] != "plate" else "can")
+    place = world.things[track].pose.translation
+    bottom = [thing.mesh.vertices[:, 2].min() for thing in world.things]
+    across = place - world.things[other].pose.translation
+    across[2] += bottom[track] - bottom[other]
+    motions = (
+        shifted(track, [(0, 0, 0)] * CHANGE + [None] * (FRAMES - CHANGE)),
+        shifted(other, [None] * CHANGE + [across] * (FRAMES - CHANGE)),
+    )
+
+    perceptions = perceive(replace(world, motions=motions))
+
+    assert at(world, perceptions, CHANGE - 1, place).reused_from == 0
+    assert at(world, perceptions, CHANGE, place).reused_from is None
+
+
+def test_what_is_partly_hidden_is_described_anew() -> None:
+    world = still_world()
+    track = alone(world)
+    blocker = (track + 1) % len(world.things)
+    place, eye = world.things[track].pose.translation, world.path[0].translation
+    between = place + 0.12 * (eye - place) / np.linalg.norm(eye - place)
+    shift = between - world.things[blocker].pose.translation
+    motion = shifted(blocker, [None] * CHANGE + [shift] * (FRAMES - CHANGE))
+
+    perceptions = perceive(replace(world, motions=(motion,)))
+
+    near = [
+        d.reused_from
+        for d in perceptions[CHANGE].detections
+        if np.linalg.norm(transform(world.path[0], d.candidate.box.center) - place) < 0.15
+    ]
+    assert perceptions[CHANGE].reused_from is None
+    assert near.count(None) == len(near)
+
+
+def test_a_slow_drift_is_not_repeated_for_ever() -> None:
+    """Each step alone is within the noise: what counts is the way since the description."""
+    frames, step = 16, 0.003
+    world = still_world(frames)
+    track = alone(world)
+    place = world.things[track].pose.translation
+    way = step * place[:2] / np.linalg.norm(place[:2])
+    motion = shifted(track, [(*(k * way), 0) for k in range(frames)])
+
+    perceptions = perceive(replace(world, motions=(motion,)))
+
+    origins = []
+    for k in range(frames):
+        found = at(world, perceptions, k, place + np.array([*(k * way), 0]))
+        origins.append(k if found.reused_from is None else found.reused_from)
+    assert max(k - origin for k, origin in enumerate(origins)) * step <= 0.02
+    assert len(set(origins)) >= 3
+
+
+def test_a_walking_camera_takes_surfaces_along() -> None:
+    """In the fixed frame, what is repeated stays exactly where it was."""
+    world = make_scene("tabletop", np.random.default_rng(11), frames=FRAMES, rate_hz=30.0)
+    perceptions = perceive(world)
+    assert all(p.reused_from is None for p in perceptions)
+    first = [(k, d) for k, p in enumerate(perceptions) for d in p.detections]
+    repeated = [(k, d) for k, d in first if d.reused_from is not None]
+    assert len(repeated) > len(first) / 3
+    for k, now in repeated:
+        then = next(
+            d
+            for j, d in first
+            if j == now.reused_from and np.array_equal(d.descriptor, now.descriptor)
+        )
+        here = transform(world.path[k], now.gas.neurons)
+        there = transform(world.path[now.reused_from or 0], then.gas.neurons)
+        assert np.allclose(here, there, atol=1e-5)
+        assert now.full is not None
+        assert then.full is not None
+        assert np.allclose(now.full.size, then.full.size)
+
+
+def test_a_wrong_pose_repeats_nothing() -> None:
+    """A camera that is said to rest, but moves, shows other points."""
+    world = make_scene("tabletop", np.random.default_rng(11), frames=12, rate_hz=3.0)
+    still = replace(world, path=(world.path[0],) * 12)
+    guesser: Any = Guesser()
+    views = [
+        View(
+            replace(
+                render_frame(world, k, rng=np.random.default_rng(k), sensor=KINECT)[0], index=k
+            ),
+            None,
+            (),
+            still.path[k],
+        )
+        for k in (0, 11)
+    ]
+    second = Perceiver(guesser, Settings(), None)(views)[1]
+    assert {d.reused_from for d in second.detections} == {None}
+
+
+def blank(index: int = 0) -> Frame:
+    frame, _ = render_frame(still_world(1), 0, rng=np.random.default_rng(0), sensor=KINECT)
+    return replace(frame, index=index)
+
+
+def test_something_as_small_as_the_smallest_object_is_a_change() -> None:
+    """60 points are an object: what is so small must not vanish in a scene that is repeated."""
+    frame = blank()
+    assert frame.depth is not None
+    for row, column in ((240, 320), (241, 323), (101, 77)):
+        depth = frame.depth.copy()
+        depth[row : row + 8, column : column + 8] = 0.8
+        other = replace(frame, depth=depth)
+        assert not shows_the_same(other, None, frame, None, range_m=2.0)
+        assert not shows_the_same(frame, None, other, None, range_m=2.0)
+
+
+def test_single_readings_and_what_is_out_of_range_are_no_change() -> None:
+    frame = blank()
+    assert frame.depth is not None
+    depth = frame.depth.copy()
+    depth[::7, ::5] = 0
+    assert shows_the_same(replace(frame, depth=depth), None, frame, None, range_m=2.0)
+    far = replace(frame, depth=np.full_like(frame.depth, 3.0))
+    farther = replace(frame, depth=np.full_like(frame.depth, 4.0))
+    assert shows_the_same(far, None, farther, None, range_m=2.0)
+    assert not shows_the_same(far, None, farther, None, range_m=3.5)
+
+
+@pytest.mark.parametrize(
+    ("pose", "then", "same"),
+    [
+        (IDENTITY, IDENTITY, True),
+        (Pose(np.eye(3), np.array([0.002, 0, 0])), IDENTITY, True),
+        (Pose(np.eye(3), np.array([0.01, 0, 0])), IDENTITY, False),
+        (Pose(np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1]]), np.zeros(3)), IDENTITY, False),
+        (None, IDENTITY, False),
+        (IDENTITY, None, False),
+    ],
+)
+def test_a_camera_that_has_moved_shows_another_scene(
+    pose: Pose | None, then: Pose | None, same: bool
+) -> None:
+    assert shows_the_same(blank(), pose, blank(), then, range_m=2.0) is same
+
+
+def test_the_tables_tell_what_is_repeated_within_each_block(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Blocks begin where they always do: so any worker, and any resumed run, repeats the same."""
+    monkeypatch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
+    source = record(still_world(10), tmp_path / "still.mcap", seed=1, sensor=KINECT)
+    out = tmp_path / "out"
+    shapecat.pipeline.process(
+        Job(source, out, mcap=False, rrd=False, settings=Settings(reuse_frames=4))
+    )
+    frames = pq.read_table(out / "frames.parquet").to_pylist()
+    detections = pq.read_table(out / "detections.parquet").to_pylist()
+    starts = [None, 0, 0, 0, None, 4, 4, 4, None, 8]
+    assert [row["reused_from"] for row in frames] == starts
+    assert {(row["frame"], row["reused_from"]) for row in detections} == set(enumerate(starts))
+    for row in detections:
+        first = next(
+            other
+            for other in detections
+            if other["frame"] == (row["frame"] // 4) * 4 and other["detection"] == row["detection"]
+        )
+        for name in ("posterior", "novelty", "descriptor", "neurons", "edges", "category"):
+            assert row[name] == first[name]
+
+
+def test_blocks_of_one_frame_repeat_nothing() -> None:
+    guesser: Any = Guesser()
+    perceiver = Perceiver(guesser, Settings(), None)
+    frame = blank()
+    for k in range(2):
+        (seen,) = perceiver([View(replace(frame, index=k), None, (), IDENTITY)])
+        assert {d.reused_from for d in seen.detections} == {None}
+
+
+@pytest.mark.parametrize("count", [0, 65])
+def test_blocks_have_bounds(count: int) -> None:
+    with pytest.raises(ConfigError, match="reuse_frames must be from 1 to 64"):
+        Settings(reuse_frames=count)
+
+
+def test_a_repeated_view_is_no_new_evidence() -> None:
+    """Thirty repeats of one wrong view must not outvote three right ones."""
+    described = [0, 0, 0, 0, 0, 5, 6, 7]
+    frames = [
+        FrameDetections(
+            topic="/d",
+            frame=k,
+            stamp_ns=k,
+            detections=np.array([0]),
+            centers=np.zeros((1, 3)),
+            sizes=np.ones((1, 3)),
+            posteriors=np.array([[0.5, 0.5]]),
+            partial=np.array([k == 6]),
+            novelties=np.zeros(1),
+            described=np.array([origin]),
+        )
+        for k, origin in enumerate(described)
+    ]
+    hits = Hits.of(frames)
+    assert hits.weights(np.arange(8)).tolist() == [1, 0, 0, 0, 0, 1, 0.25, 1]
+    # A track that begins with a repeat has nothing else to go by.
+    assert hits.weights(np.arange(2, 8)).tolist() == [1, 0, 0, 1, 0.25, 1]
+    plain = Hits.of([replace(frame, described=None) for frame in frames])
+    assert plain.weights(np.arange(8)).tolist() == [1, 1, 1, 1, 1, 1, 0.25, 1]
+
+
+def test_frames_of_two_topics_are_views_of_their_own() -> None:
+    frames = [
+        FrameDetections(
+            topic=topic,
+            frame=0,
+            stamp_ns=k,
+            detections=np.array([0]),
+            centers=np.zeros((1, 3)),
+            sizes=np.ones((1, 3)),
+            posteriors=np.array([[0.5, 0.5]]),
+            partial=np.array([False]),
+            novelties=np.zeros(1),
+            described=np.array([0]),
+        )
+        for k, topic in enumerate(("/a", "/b"))
+    ]
+    assert Hits.of(frames).weights(np.arange(2)).tolist() == [1, 1]
