@@ -20,9 +20,9 @@ from shapecat.depth_fusion import Earlier, fuse, with_own_readings
 from shapecat.description import DESCRIPTOR_NAMES, describe
 from shapecat.detection import detect
 from shapecat.errors import ModelError
-from shapecat.geometry import IDENTITY, inverse, level_from_sensor, transform
+from shapecat.geometry import inverse, level_from_sensor, transform
 from shapecat.learning import Categorizer, load_model
-from shapecat.reuse import KeyView, Sight, find_key_views, reused, shows_the_same, update
+from shapecat.reuse import KeyView, find_repeats, reused, shows_the_same, sight_of
 from shapecat.surface import reconstruct, thin
 from shapecat.types import (
     Candidate,
@@ -164,20 +164,28 @@ def _look(
     frame, settings = view.frame, perceiver.settings
     scene = detect(frame, up=view.up, settings=settings.detection, rng=_rng(settings, frame, 0))
     clock.lap("detect")
-    sights = [_sight(view, scene, candidate) for candidate in scene.candidates]
-    found = find_key_views(sights, keys)
-    new = [k for k, key in enumerate(found) if key is None]
-    shapes = [_describe(sights[k], scene, settings, _rng(settings, frame, k + 1)) for k in new]
+    sights = [
+        sight_of(frame, view.pose, each, scene.up, scene.height_of(each))
+        for each in scene.candidates
+    ]
+    repeats = find_repeats(sights, keys)
+    new = [k for k, repeat in enumerate(repeats) if repeat is None]
+    shapes = [
+        _describe(frame, scene, scene.candidates[k], settings, _rng(settings, frame, k + 1))
+        for k in new
+    ]
     clock.lap("describe")
-    named = _categorize([sights[k] for k in new], shapes, perceiver.categorizer)
+    found = [scene.candidates[k] for k in new]
+    named = _categorize(found, shapes, perceiver.categorizer)
     clock.lap("categorize")
     whole = [_completed(frame, scene, d, perceiver.categorizer.categories) for d in named]
     described = dict(zip(new, whole, strict=True))
     detections = tuple(
-        described[k] if key is None else reused(key, sights[k]) for k, key in enumerate(found)
+        described[k] if repeat is None else reused(repeat, sights[k])
+        for k, repeat in enumerate(repeats)
     )
     clock.lap("complete")
-    return scene, detections, update(keys, [KeyView(sights[k], described[k]) for k in new])
+    return scene, detections, (*keys, *(KeyView(sights[k], described[k]) for k in new))
 
 
 def _repeats(view: View, then: View | None, range_m: float) -> bool:
@@ -228,13 +236,6 @@ class _Clock:
         self.seconds[step], self._last = now - self._last, now
 
 
-def _sight(view: View, scene: Scene, candidate: Candidate) -> Sight:
-    center = candidate.box.center
-    height_m = float(scene.up @ center) - scene.support_offset(candidate)
-    place = transform(view.pose or IDENTITY, center)
-    return Sight(view.frame, view.pose, scene.up, candidate, height_m, place)
-
-
 def find_up(frame: Frame, settings: Settings) -> F4 | None:
     """Return the normal (3,) of the supporting planes, or None if they are too small."""
     scene = detect(frame, settings=settings.detection, rng=_rng(settings, frame, 0))
@@ -246,11 +247,13 @@ def _rng(settings: Settings, frame: Frame, item: int) -> np.random.Generator:
     return np.random.default_rng((settings.seed, abs(frame.stamp_ns), item))
 
 
-def _describe(sight: Sight, scene: Scene, settings: Settings, rng: np.random.Generator) -> _Shape:
+def _describe(
+    frame: Frame, scene: Scene, candidate: Candidate, settings: Settings, rng: np.random.Generator
+) -> _Shape:
     """Stand the candidate upright on z = 0, learn its surface, and describe it."""
     begun = time.perf_counter()
-    points = sight.frame.xyz(sight.candidate.indices)
-    level = level_from_sensor(scene.up, scene.support_offset(sight.candidate), points)
+    points = frame.xyz(candidate.indices)
+    level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
     cloud = thin(transform(level, points).astype(np.float32), settings=settings.surface)
     gas = reconstruct(cloud, settings=settings.surface, rng=rng)
     if gas is None:
@@ -274,7 +277,7 @@ def _completed(
 
 
 def _categorize(
-    sights: Sequence[Sight], shapes: Sequence[_Shape], categorizer: Categorizer
+    found: Sequence[Candidate], shapes: Sequence[_Shape], categorizer: Categorizer
 ) -> list[Detection]:
     """Categorize some candidates in one call; one without a surface is undecided."""
     if not shapes:
@@ -286,14 +289,14 @@ def _categorize(
     uniform = np.full(len(categorizer.categories), 1 / len(categorizer.categories))
     return [
         Detection(
-            candidate=sight.candidate,
+            candidate=candidate,
             gas=shape.gas,
             descriptor=shape.descriptor,
             posterior=prediction.posteriors[k] if known[k] else uniform,
             novelty=float(prediction.novelty[k]) if known[k] else _UNDECIDED,
             seconds=shape.seconds + each,
         )
-        for k, (sight, shape) in enumerate(zip(sights, shapes, strict=True))
+        for k, (candidate, shape) in enumerate(zip(found, shapes, strict=True))
     ]
 
 

@@ -17,7 +17,6 @@ from shapecat.errors import OutputError
 from shapecat.executors.order import read_ahead
 from shapecat.learning import load_model
 from shapecat.outputs.colouring import Seen, colours_of, find_masks, with_colour
-from shapecat.outputs.rereading import open_source
 from shapecat.recordings import Recording, choose_streams, open_recording
 from shapecat.rehearsal import compile_all
 from shapecat.runs.corrections import (
@@ -48,14 +47,11 @@ from shapecat.runs.jobs import (
     summarize,
 )
 from shapecat.runs.label_transfer import Transfer, transfer_labels
-from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.masks import count_masks
 from shapecat.runs.perceiving import Observer, ignore, perceive_all, revise
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.segments import discard_segments
-from shapecat.runs.shown import read_shown_frames
 from shapecat.runs.tables import release_memory
-from shapecat.runs.tracks import track_run
 from shapecat.system import stopping
 from shapecat.system.files import holding
 from shapecat.types import LabelledFrame, ShownFrame
@@ -168,6 +164,8 @@ def _finished(
 
 def track(folder: Path, run: RunInfo, job: Job) -> None:
     """Follow the detections over time and fuse their posteriors: tracks.parquet, tracks.csv."""
+    from shapecat.runs.tracks import track_run  # noqa: PLC0415  loads SciPy on first use
+
     run["counts"]["tracks"] = track_run(
         folder, job.settings.tracking, run["model"]["categories"], work=run["work"]
     )
@@ -194,6 +192,7 @@ def annotate(
     def write_mcap() -> None:
         from shapecat.outputs.annotated_mcap import write_annotated  # noqa: PLC0415  on first use
         from shapecat.outputs.image_annotations import read_image_frames  # noqa: PLC0415  the same
+        from shapecat.runs.shown import read_shown_frames  # noqa: PLC0415  the same
 
         images = read_image_frames(folder, labels()) if run.get("color") else None
         boxes = run.get("boxes") or settings.get("boxes", "full")
@@ -209,6 +208,7 @@ def annotate(
 
     def write_rrd() -> None:
         from shapecat.outputs.review import write_review  # noqa: PLC0415  loads Rerun on first use
+        from shapecat.runs.labels import read_labelled_frames  # noqa: PLC0415  the same
 
         labelled = read_labelled_frames(folder, labels())
         shown = _observed(labelled, "review", total, observe)
@@ -271,6 +271,8 @@ def annotate_again(
     OutputError : the folder is not a finished run, or the table of labels does not fit it.
     RecordingError : the recording is no longer there.
     """
+    from shapecat.outputs.rereading import open_source  # noqa: PLC0415  on first use
+
     with open_source(read_run(folder), recording) as source:
         transfer = _adopt(labels, folder, by_place=by_place)
         run = read_run(folder)

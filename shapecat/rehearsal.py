@@ -27,11 +27,11 @@ from shapecat.detection import detect
 from shapecat.executors.local import LocalExecutor, WorkerLostError
 from shapecat.jit import code_folder
 from shapecat.learning import load_model
-from shapecat.reuse import Sight, looks_the_same, shows_the_same
+from shapecat.reuse import KeyView, find_repeats, shows_the_same, sight_of
 from shapecat.surface import reconstruct, thin
 from shapecat.system import stopping
 from shapecat.system.files import lock
-from shapecat.types import Camera, Frame
+from shapecat.types import Camera, Candidate, Detection, Frame, NeuralGas
 
 __all__ = ["compile_all", "find_ball", "main", "recognize_ball"]
 
@@ -52,9 +52,15 @@ def find_ball() -> int:
         "ball", 0, 0, 0, "camera", depth=depth, camera=Camera(640, 480, 525, 525, 320, 240)
     )
     scene = detect(frame, settings=Settings().detection, rng=np.random.default_rng(0))
-    sights = [Sight(frame, None, scene.up, ball, 0.0, ball.box.center) for ball in scene.candidates]
     same = shows_the_same(frame, None, frame, None, range_m=2.0)
-    return len([each for each in sights if same and looks_the_same(each, each)])
+    sights = [sight_of(frame, None, ball, scene.up, _RADIUS_M) for ball in scene.candidates]
+    keys = [KeyView(sight, _undescribed(sight.candidate)) for sight in sights]
+    return sum(repeat is not None for repeat in find_repeats(sights, keys)) if same else 0
+
+
+def _undescribed(candidate: Candidate) -> Detection:
+    nothing = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+    return Detection(candidate, nothing, np.zeros(0), np.zeros(0), 0.0, 0.0)
 
 
 def recognize_ball() -> str:

@@ -202,6 +202,10 @@ class Scene(Record):
             return float(self.up @ candidate.box.center - candidate.box.size[2] / 2)
         return self.planes[candidate.plane].offset + candidate.support_m
 
+    def height_of(self, candidate: Candidate) -> float:
+        """Return how far the centre of a candidate's box is above what it stands on, in metres."""
+        return float(self.up @ candidate.box.center) - self.support_offset(candidate)
+
 
 class NeuralGas(Record):
     """A graph that has learned the surface of a point cloud (thesis ch. 5).
@@ -279,7 +283,8 @@ class LabelledFrame(Record):
 
     ``fixed_from_sensor`` is None where the recording has no fixed frame; ``ended`` names the
     tracks shown in an earlier frame of the topic that are not seen again; ``up`` (3,) is the unit
-    vector up in the sensor frame.
+    vector up in the sensor frame; ``reused_from`` is the index of the frame that shows the same,
+    None if there is none before it.
     """
 
     topic: str
@@ -293,6 +298,7 @@ class LabelledFrame(Record):
     ended: tuple[int, ...]
     seconds: dict[str, float]
     up: F4 | None = array("3", "f4", default=None)
+    reused_from: int | None = None
 
 
 class ShownBox(NamedTuple):

@@ -91,7 +91,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
             stamp = EPOCH + k * SECOND // 10
             perception = Perception("/depth", k, stamp, "cam", scene, found, {"detect": 0.01})
             pose = Pose(TURNS[k].as_matrix(), PLACES[k])
-            tables.write(perception, FrameRow(stamp + 5, pose, up))
+            tables.write([perception], [FrameRow(stamp + 5, pose, up)])
     track_run(folder, TrackingSettings(), CATEGORIES, work="w0123")
     return folder
 

@@ -6,15 +6,17 @@ Entities
 
     world                      up and handedness; the fixed frame if there is one
     ├── paths/<topic>          where the tracks have moved (below <topic> without a fixed frame)
-    └── <topic>                the sensor: fixed_from_sensor
-        ├── camera             pinhole, for depth images
-        ├── scene              points of no object, muted
+    ├── <topic>                the sensor: fixed_from_sensor, in every frame
+    │   ├── camera             pinhole, for depth images
+    │   └── objects
+    │       ├── boxes          labelled "#track category confidence"
+    │       └── captions       shorter, drawn above the boxes
+    └── seen/<topic>           the scene, ten times a second and when it has changed: where the
+        ├── scene              sensor was then (below <topic> without a fixed frame)
         ├── planes             outlines;  planes/fill  translucent
         └── objects
             ├── points         in the colour of the category
-            ├── boxes          labelled "#track category confidence"
             ├── full           boxes around all of the objects, dashed
-            ├── captions       the same labels, drawn above the boxes
             ├── graphs         edges of the growing neural gas
             └── surfaces       its triangles
     images/<topic>             the colour image, as it was recorded where it was compressed
@@ -33,34 +35,35 @@ Timelines: ``sensor_time`` (of the measurement) and ``frame``.
 import json
 import uuid
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
 
 from shapecat.executors.order import map_ahead
-from shapecat.geometry import transform
+from shapecat.geometry import IDENTITY, transform
 from shapecat.outputs import review_shapes as shapes
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import PaintedCloud, paint
-from shapecat.outputs.review_curves import At, Curves, times_of
-from shapecat.outputs.review_file import ReviewFile, open_review
+from shapecat.outputs.review_columns import At, Columns, curve
+from shapecat.outputs.review_file import open_review
 from shapecat.outputs.review_images import Images, Picture, picture_of
 from shapecat.outputs.review_layout import Eye, TrackView, choose_eye, lay_out, stepped_back
 from shapecat.outputs.review_paths import Paths
-from shapecat.outputs.review_shapes import DRAWINGS, Moment
+from shapecat.outputs.review_shapes import SCENE, SKETCH, Drawing, Moment
 from shapecat.outputs.review_viewer import open_viewer, take_screenshot
 from shapecat.recordings import MessageError
 from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
 
 __all__ = ["open_viewer", "take_screenshot", "write_review"]
 
-_FLUSH_FRAMES, _PLOT_FRAMES = 32, 256  # curves make few columns: Rerun remembers each it wrote
-_DRAWN_AT_ONCE, _POINTS_AT_ONCE = 16, 1 << 19  # frames and points held back of a sensor
+_FLUSH_FRAMES = 32
+_SCENE_NS = 90_000_000
+"""A scene is drawn no sooner after the one before it."""
 
 
 def write_review(
@@ -100,17 +103,17 @@ def write_review(
     stream = _stream(name, run)
     with open_review(path, stream) as file:
         stream.send_recording_name(name)
-        review = _Review(stream, file, categories, fixed_frame)
+        review = _Review(stream, categories, fixed_frame)
         review.begin(run)
-        painted = map_ahead(partial(_painted, limit=cloud_points), frames, threads=threads)
+        paint_one = partial(_painted, limit=cloud_points)
+        painted = map_ahead(paint_one, _chosen(frames), threads=threads)
         for k, one in enumerate(painted):
             file.check()
             review.add(one)
-            if k % _PLOT_FRAMES == _PLOT_FRAMES - 1:
-                review.plot()
             if k % _FLUSH_FRAMES == _FLUSH_FRAMES - 1:
-                review.flush()
+                file.flush()
         review.end()
+        file.flush()
 
 
 def _stream(name: str, run: Mapping[str, object]) -> rr.RecordingStream:
@@ -121,27 +124,53 @@ def _stream(name: str, run: Mapping[str, object]) -> rr.RecordingStream:
     return stream
 
 
-class _Painted(NamedTuple):
-    """A frame ready to be written; ``damage`` is what is wrong with its colour image."""
+class _Shown(NamedTuple):
+    """A frame to be written, and whether its scene is drawn."""
 
     labelled: LabelledFrame
     frame: Frame
-    clouds: tuple[PaintedCloud, PaintedCloud]
+    coloured: Coloured | None
+    drawn: bool
+
+
+def _chosen(frames: Iterable[tuple[LabelledFrame, Frame, Coloured | None]]) -> Iterator[_Shown]:
+    """Choose the frames whose scene is drawn: not too often, and not while it stays the same."""
+    last: dict[str, tuple[int, int]] = {}  # of each topic
+    for labelled, frame, coloured in frames:
+        first = labelled.index if labelled.reused_from is None else labelled.reused_from
+        stamp_ns, shown = last.get(labelled.topic, (None, None))
+        soon = stamp_ns is not None and 0 <= labelled.stamp_ns - stamp_ns < _SCENE_NS
+        drawn = not (soon or first == shown)
+        if drawn:
+            last[labelled.topic] = labelled.stamp_ns, first
+        yield _Shown(labelled, frame, coloured, drawn)
+
+
+class _Painted(NamedTuple):
+    """A frame ready to be written.
+
+    ``clouds`` are None where the scene is not drawn; ``damage`` is what is wrong with the image.
+    """
+
+    labelled: LabelledFrame
+    frame: Frame
+    clouds: tuple[PaintedCloud, PaintedCloud] | None
     picture: Picture | None
     damage: str
 
 
-def _painted(item: tuple[LabelledFrame, Frame, Coloured | None], *, limit: int) -> _Painted:
+def _painted(shown: _Shown, *, limit: int) -> _Painted:
     """Paint the clouds and the masks of a frame; without colour if its image is damaged."""
-    labelled, frame, coloured = item
+    labelled, frame, coloured, drawn = shown
     damage, parts = "", (labelled.planes, labelled.objects)
     if coloured is not None:
         try:
-            clouds = paint(frame, *parts, limit=limit, view=coloured.view)
+            clouds = paint(frame, *parts, limit=limit, view=coloured.view) if drawn else None
             return _Painted(labelled, frame, clouds, picture_of(labelled, coloured), "")
         except MessageError as error:
             damage = f"{coloured.view.image.topic}: {error}"
-    return _Painted(labelled, frame, paint(frame, *parts, limit=limit), None, damage)
+    clouds = paint(frame, *parts, limit=limit) if drawn else None
+    return _Painted(labelled, frame, clouds, None, damage)
 
 
 class _Review:
@@ -150,12 +179,10 @@ class _Review:
     def __init__(
         self,
         stream: rr.RecordingStream,
-        file: ReviewFile,
         categories: Sequence[str],
         fixed_frame: str | None,
     ) -> None:
-        self._stream, self._file = stream, file
-        self._pending: dict[str, list[Moment]] = {}  # by entity of the sensor
+        self._stream, self._columns = stream, Columns(stream)
         self._categories = tuple(categories)
         self._fixed_frame = fixed_frame
         self._eyes: dict[str, Eye] = {}
@@ -163,9 +190,9 @@ class _Review:
         self._cameras: dict[str, Camera] = {}
         self._tracks: dict[int, TrackView] = {}
         self._aimed: set[str] = set()  # topics whose eye has seen an object
-        self._paths = Paths(stream)
-        self._curves = Curves(stream)
-        self._images = Images(stream)
+        self._paths = Paths(self._columns)
+        self._images = Images(stream, self._columns)
+        self._styled: set[str] = set()  # entities whose style is written
         self._counted: dict[str, None] = {}  # categories met, in order
         self._warnings: list[str] = []
 
@@ -197,22 +224,9 @@ class _Review:
         self._log_events(labelled)
         self._plot(labelled)
 
-    def flush(self) -> None:
-        """Write out what is held back."""
-        for entity in self._pending:
-            self._send(entity)
-        self._images.send()
-        self._file.flush()
-
-    def plot(self) -> None:
-        """Send what is held back of curves and paths."""
-        self._paths.send()
-        self._curves.send()
-
     def end(self) -> None:
         """Write the layout and all that is left."""
-        self.plot()
-        self.flush()
+        self._columns.send()
         world = "/world"
         scenes = [
             (world if self._fixed_frame else entity, self._fixed_frame or topic, eye)
@@ -231,32 +245,29 @@ class _Review:
                 self._log(f"{track.entity}/posterior", self._dots(), static=True)
         images = self._images.entities
         self._stream.send_blueprint(lay_out(scenes or [nothing], tracks, images))
-        self._file.flush()
 
     def _draw(self, entity: str, painted: _Painted) -> None:
-        """Hold a painted frame back until there are enough of them."""
-        if entity not in self._pending:
-            for name, drawing in DRAWINGS.items():
-                if drawing.style is not None:
-                    self._log(f"{entity}/{name}", drawing.style, static=True)
-        pending = self._pending.setdefault(entity, [])
-        pending.append(Moment(painted.labelled, *painted.clouds))
-        if len(pending) == _DRAWN_AT_ONCE or sum(m.size for m in pending) > _POINTS_AT_ONCE:
-            self._send(entity)
-
-    def _send(self, entity: str) -> None:
-        """Write the frames of a sensor that are held back."""
-        moments = self._pending[entity]
-        if not moments:
+        """Write the sensor and the boxes, and the scene if it is due."""
+        labelled = painted.labelled
+        at, pose = (labelled.stamp_ns, labelled.index), self._pose(labelled)
+        if pose is not None:
+            self._columns.add(entity, at, pose, shapes.places)
+        for name, drawing in SKETCH.items():
+            self._add(f"{entity}/{name}", drawing, at, shapes.sketch(labelled), 64)
+        if painted.clouds is None:
             return
-        at = [(m.labelled.stamp_ns, m.labelled.index) for m in moments]
-        for name, drawing in DRAWINGS.items():
-            self._stream.send_columns(f"{entity}/{name}", times_of(at), drawing.columns(moments))
-        posed = [(at[k], pose) for k, m in enumerate(moments) if (pose := self._pose(m.labelled))]
-        if posed:
-            when, poses = zip(*posed, strict=True)
-            self._stream.send_columns(entity, times_of(when), shapes.places(poses))
-        moments.clear()
+        if self._fixed_frame is not None:
+            entity = rr.new_entity_path(["world", "seen", labelled.topic])
+            self._columns.add(entity, at, pose or IDENTITY, shapes.places)
+        moment = Moment(labelled, *painted.clouds)
+        for name, drawing in SCENE.items():
+            self._add(f"{entity}/{name}", drawing, at, moment, moment.size)
+
+    def _add(self, entity: str, drawing: Drawing, at: At, row: Any, size: int) -> None:
+        if drawing.style is not None and entity not in self._styled:
+            self._styled.add(entity)
+            self._log(entity, drawing.style, static=True)
+        self._columns.add(entity, at, row, drawing.columns, size=size)
 
     def _log(self, entity: str, *what: rr.AsComponents, static: bool = False) -> None:
         self._stream.log(entity, *what, static=static)
@@ -325,25 +336,31 @@ class _Review:
         at = (labelled.stamp_ns, labelled.index)
         for item in labelled.objects:
             self._tracks[item.track].frames += 1
-            self._curves.add(f"/tracks/{item.track}/posterior", at, item.causal.tolist())
+            self._columns.add(f"/tracks/{item.track}/posterior", at, item.causal, curve)
         counts = Counter(item.category for item in labelled.objects)
         self._counted.update(dict.fromkeys(counts))
         for category in self._counted:
-            self._plot_line("objects", category, at, counts[category], colour_of(category))
+            self._plot_line("objects", category, at, counts[category])
         for stage, seconds in labelled.seconds.items():
-            self._plot_line("seconds", stage, at, seconds, None)
+            self._plot_line("seconds", stage, at, seconds)
 
-    def _plot_line(
-        self,
-        group: str,
-        name: str,
-        at: At,
-        value: float,
-        colour: tuple[int, int, int] | None,
-    ) -> None:
+    def _plot_line(self, group: str, name: str, at: At, value: float) -> None:
         entity = f"/plots/{group}/{rr.escape_entity_path_part(name)}"
-        if self._curves.add(entity, at, [value]):
-            self._log(entity, rr.SeriesLines(names=name, colors=colour, widths=2), static=True)
+        if entity not in self._styled:
+            self._styled.add(entity)
+            line = _steps(name) if group == "objects" else rr.SeriesLines(names=name, widths=2)
+            self._log(entity, line, static=True)
+        self._columns.add(entity, at, [value], curve)
+
+
+def _steps(category: str) -> rr.SeriesLines:
+    """Return the line of a number that changes at once."""
+    return rr.SeriesLines(
+        names=category,
+        colors=colour_of(category),
+        widths=2,
+        interpolation_mode=rr.components.InterpolationMode.StepAfter,
+    )
 
 
 def _axes(frame: Frame, eye: Eye) -> rr.ViewCoordinates:

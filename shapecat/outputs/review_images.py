@@ -14,8 +14,8 @@ from shapecat.jit import kernel
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.exports_files import png
-from shapecat.outputs.review_curves import At, times_of
-from shapecat.outputs.review_shapes import label
+from shapecat.outputs.review_columns import At, Columns
+from shapecat.outputs.review_shapes import short_label
 from shapecat.recordings.colour_image import pixels_of
 from shapecat.types import LabelledFrame, LabelledObject
 
@@ -24,7 +24,6 @@ __all__ = ["Images", "Picture", "as_file", "picture_of"]
 _QUALITY = 85
 _OPACITY = 110
 _COLOURS = 16
-_AT_ONCE = 16
 
 
 def as_file(image: ColourImage) -> tuple[bytes, str]:
@@ -106,41 +105,23 @@ def _pack(pixels: Bool, left: int, top: int, number: int, packed: U1) -> None:
 
 
 class Images:
-    """Writes the colour images of the frames, some at once.
+    """Writes the colour images of the frames. ``entities`` are those met, with their titles."""
 
-    ``entities`` are those met, with their titles.
-    """
-
-    def __init__(self, stream: rr.RecordingStream) -> None:
+    def __init__(self, stream: rr.RecordingStream, columns: Columns) -> None:
         """Begin without images."""
-        self._stream = stream
-        self._pending: dict[str, list[tuple[At, Picture]]] = {}
+        self._stream, self._columns = stream, columns
         self.entities: dict[str, str] = {}
 
     def add(self, topic: str, at: At, picture: Picture) -> None:
-        """Hold back a picture beside a frame of a topic, until there are enough of them."""
+        """Add a picture beside a frame of a topic."""
         entity = rr.new_entity_path(["images", topic])
         if entity not in self.entities:
             self.entities[entity] = picture.topic
             for name, style in _STYLES.items():
                 self._stream.log(f"{entity}/{name}", style, static=True)
-        pending = self._pending.setdefault(entity, [])
-        pending.append((at, picture))
-        if len(pending) == _AT_ONCE:
-            self._send(entity)
-
-    def send(self) -> None:
-        """Write what is held back."""
-        for entity in self._pending:
-            self._send(entity)
-
-    def _send(self, entity: str) -> None:
-        if not self._pending[entity]:
-            return
-        at, pictures = zip(*self._pending[entity], strict=True)
-        for name, columns in _columns(pictures).items():
-            self._stream.send_columns(f"{entity}{name}", times_of(at), columns)
-        self._pending[entity].clear()
+        for name, draw in _DRAWINGS.items():
+            size = len(picture.contents) + len(picture.masks)  # every row keeps all of it
+            self._columns.add(f"{entity}{name}", at, picture, draw, size=size)
 
 
 _STYLES = {
@@ -150,25 +131,41 @@ _STYLES = {
 }
 
 
-def _columns(pictures: Sequence[Picture]) -> dict[str, Iterable[rr.ComponentColumn]]:
-    """Return what each entity below that of the image shows of some pictures."""
-    objects = [item for picture in pictures for item in picture.objects]
-    counts = [len(picture.objects) for picture in pictures]
-    boxes = np.concatenate([picture.boxes for picture in pictures])
+def _files(pictures: Sequence[Picture]) -> Iterable[rr.ComponentColumn]:
+    return rr.EncodedImage.columns(
+        blob=[picture.contents for picture in pictures],
+        media_type=[picture.media_type for picture in pictures],
+    )
+
+
+def _masks(pictures: Sequence[Picture]) -> Iterable[rr.ComponentColumn]:
+    return rr.EncodedImage.columns(blob=[picture.masks for picture in pictures])
+
+
+def _boxes(pictures: Sequence[Picture]) -> Iterable[rr.ComponentColumn]:
+    boxes, colours, counts = _objects_of(pictures)
     half = boxes[:, 2:] / 2
-    colours = np.array([colour_of(item.category) for item in objects], np.uint8).reshape(-1, 3)
-    return {
-        "": rr.EncodedImage.columns(
-            blob=[picture.contents for picture in pictures],
-            media_type=[picture.media_type for picture in pictures],
-        ),
-        "/masks": rr.EncodedImage.columns(blob=[picture.masks for picture in pictures]),
-        "/boxes": rr.Boxes2D.columns(
-            centers=boxes[:, :2] + half, half_sizes=half, colors=colours
-        ).partition(counts),
-        "/captions": rr.Points2D.columns(
-            positions=boxes[:, :2] + half * np.array((1, 0), np.float32),
-            colors=127 + colours // 2,
-            labels=[label(item) for item in objects],
-        ).partition(counts),
-    }
+    columns = rr.Boxes2D.columns(centers=boxes[:, :2] + half, half_sizes=half, colors=colours)
+    yield from columns.partition(counts)
+
+
+def _captions(pictures: Sequence[Picture]) -> Iterable[rr.ComponentColumn]:
+    boxes, colours, counts = _objects_of(pictures)
+    columns = rr.Points2D.columns(
+        positions=boxes[:, :2] + boxes[:, 2:] * np.array((0.5, 0), np.float32),
+        colors=127 + colours // 2,
+        labels=[short_label(item) for picture in pictures for item in picture.objects],
+    )
+    yield from columns.partition(counts)
+
+
+def _objects_of(pictures: Sequence[Picture]) -> tuple[F4, U1, list[int]]:
+    """Return the boxes and colours of the objects of all pictures, and how many each has."""
+    tones = [colour_of(item.category) for picture in pictures for item in picture.objects]
+    boxes = np.concatenate([picture.boxes for picture in pictures])
+    counts = [len(picture.objects) for picture in pictures]
+    return boxes, np.array(tones, np.uint8).reshape(-1, 3), counts
+
+
+_DRAWINGS = {"": _files, "/masks": _masks, "/boxes": _boxes, "/captions": _captions}
+"""What each entity below that of the image shows of some pictures."""

@@ -14,7 +14,7 @@ from shapecat.types import Frame, LabelledFrame, Pose
 __all__ = ["Eye", "TrackView", "choose_eye", "lay_out", "stepped_back"]
 
 _BACKGROUND = (16, 18, 23)
-_TRACKS_PER_TAB = 4
+_TIME = rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)  # all plots show the same times
 _WIDEST_M = 1.5  # radius of what can be overlooked at once
 _MOST_TRACKS = 48  # views; the tracks seen longest have one each, all are in the recording
 
@@ -115,8 +115,10 @@ def lay_out(
             rrb.Vertical(
                 _track_tabs(tracks),
                 rrb.Tabs(
-                    rrb.TimeSeriesView(origin="/plots/objects", name="Objects"),
-                    rrb.TimeSeriesView(origin="/plots/seconds", name="Seconds per frame"),
+                    rrb.TimeSeriesView(origin="/plots/objects", name="Objects", axis_x=_TIME),
+                    rrb.TimeSeriesView(
+                        origin="/plots/seconds", name="Seconds per frame", axis_x=_TIME
+                    ),
                 ),
                 rrb.Tabs(
                     rrb.TextLogView(
@@ -126,7 +128,7 @@ def lay_out(
                     ),
                     rrb.TextDocumentView(origin="/run", name="Run"),
                 ),
-                row_shares=[5, 2, 2],
+                row_shares=[3, 3, 2],
             ),
             column_shares=[5, 3],
         ),
@@ -155,25 +157,17 @@ def _scene_view(entity: str, title: str, eye: Eye) -> rrb.Spatial3DView:
 
 
 def _track_tabs(tracks: Sequence[TrackView]) -> rrb.Tabs:
+    """Return a tab for each track: plots one above the other are too low to read."""
     longest = sorted(tracks, key=lambda track: -track.frames)[:_MOST_TRACKS]
-    shown = [track for track in tracks if track in longest]
-    groups = [shown[k : k + _TRACKS_PER_TAB] for k in range(0, len(shown), _TRACKS_PER_TAB)]
-    tabs = [
-        rrb.Vertical(*(_track_view(track) for track in group), name=_span(group))
-        for group in groups
-    ]
-    return rrb.Tabs(*tabs, name="Posterior so far")
-
-
-def _span(group: Sequence[TrackView]) -> str:
-    first, last = (track.title.split()[0] for track in (group[0], group[-1]))
-    return first if first == last else f"{first} – {last}"
+    shown = [_track_view(track) for track in tracks if track in longest]
+    return rrb.Tabs(*shown, name="Posterior so far")
 
 
 def _track_view(track: TrackView) -> rrb.TimeSeriesView:
     return rrb.TimeSeriesView(
         origin=track.entity,
         name=track.title,
-        axis_y=rrb.ScalarAxis(range=(-0.05, 1.05), zoom_lock=True),
-        plot_legend=rrb.PlotLegend(visible=False),
+        axis_x=_TIME,
+        axis_y=rrb.ScalarAxis(range=(-0.08, 1.08), zoom_lock=True),
+        plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop),
     )

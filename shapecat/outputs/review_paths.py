@@ -1,14 +1,13 @@
-"""The paths of tracks in the review: held back, and sent by the column."""
+"""The paths of tracks in the review."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-import rerun as rr
 
 from shapecat.arrays import F8
-from shapecat.outputs.review_curves import At, times_of
-from shapecat.outputs.review_shapes import Way, paths
+from shapecat.outputs.review_columns import At, Columns
+from shapecat.outputs.review_shapes import paths
 
 __all__ = ["Paths"]
 
@@ -38,12 +37,12 @@ class _Path:
 
 
 class Paths:
-    """Paths of tracks by entity, sent as columns: all of an entity when one grows or ends."""
+    """Paths of tracks by entity, written all at once when one grows or ends."""
 
-    def __init__(self, stream: rr.RecordingStream) -> None:
-        self._stream = stream
+    def __init__(self, columns: Columns) -> None:
+        """Begin without paths."""
+        self._columns = columns
         self._paths: dict[str, dict[int, _Path]] = {}
-        self._pending: dict[str, list[tuple[At, list[Way]]]] = {}
 
     def add(
         self, entity: str, at: At, seen: Mapping[int, tuple[str, F8]], ended: Iterable[int]
@@ -57,12 +56,5 @@ class Paths:
         ]
         if any(grown) or any(path.drawn for path in gone):
             ways = [(path.category, np.array(path.places)) for path in known.values() if path.drawn]
-            self._pending.setdefault(entity, []).append((at, ways))
-
-    def send(self) -> None:
-        """Write what is held back."""
-        for entity, rows in self._pending.items():
-            if rows:
-                at, ways = zip(*rows, strict=True)
-                self._stream.send_columns(entity, times_of(at), paths(ways))
-                rows.clear()
+            size = sum(places.size for _, places in ways)
+            self._columns.add(entity, at, ways, paths, size=size)

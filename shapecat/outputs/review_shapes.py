@@ -5,7 +5,7 @@ What frames show goes by the column, some frames at once: a call for each costs 
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import chain
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -20,7 +20,8 @@ from shapecat.surface.triangles import triangles_of
 from shapecat.types import Box, Camera, LabelledFrame, LabelledObject, Pose
 
 __all__ = [
-    "DRAWINGS",
+    "SCENE",
+    "SKETCH",
     "Drawing",
     "Moment",
     "Way",
@@ -29,10 +30,14 @@ __all__ = [
     "paths",
     "pinhole",
     "places",
+    "short_label",
+    "sketch",
 ]
 
 _PLANE = (190, 205, 220)
 _CAPTION_M = 0.02  # from the top of a box to its label
+_SURE = 0.9
+"""A caption leaves out a higher confidence."""
 
 _EDGES = np.array(
     [(k, (k + 1) % 4) for k in range(4)]
@@ -61,16 +66,57 @@ class Moment(NamedTuple):
         return len(self.scene.points) + len(self.points.points)
 
 
+class Sketch(NamedTuple):
+    """What is drawn of an object in every frame."""
+
+    box: Box
+    category: str
+    label: str
+    caption: str
+
+
 class Drawing(NamedTuple):
-    """How an entity is drawn: what never changes, and what each of some frames shows."""
+    """How an entity is drawn: what never changes, and what each of some rows shows."""
 
     style: rr.AsComponents | None
-    columns: Callable[[Sequence[Moment]], _Columns]
+    columns: Callable[[Sequence[Any]], _Columns]
 
 
 def label(item: LabelledObject) -> str:
     """Return ``#track category confidence``."""
     return caption(item.track, item.category, item.confidence)
+
+
+def short_label(item: LabelledObject) -> str:
+    """Return ``#track category``, with the confidence where it is in doubt: long ones overlap."""
+    return label(item) if item.confidence < _SURE else f"#{item.track} {item.category}"
+
+
+def sketch(labelled: LabelledFrame) -> list[Sketch]:
+    """Return what is drawn of the objects of a frame."""
+    return [Sketch(o.box, o.category, label(o), short_label(o)) for o in labelled.objects]
+
+
+def _boxes(rows: Sequence[Sequence[Sketch]]) -> _Columns:
+    """Return the labelled boxes."""
+    every = list(chain.from_iterable(rows))
+    yield from rr.Boxes3D.columns(
+        centers=_stacked([o.box.center for o in every], 3),
+        half_sizes=_stacked([o.box.size for o in every], 3) / 2,
+        quaternions=_stacked([o.box.orientation for o in every], 4),
+        colors=_packed(every, white=0.25),
+        labels=[o.label for o in every],
+    ).partition([len(row) for row in rows])
+
+
+def _captions(rows: Sequence[Sequence[Sketch]]) -> _Columns:
+    """Return the captions, each a little above its box."""
+    every = list(chain.from_iterable(rows))
+    yield from rr.Points3D.columns(
+        positions=_stacked([_above(o.box) for o in every], 3),
+        colors=_packed(every, white=0.6),
+        labels=[o.caption for o in every],
+    ).partition([len(row) for row in rows])
 
 
 def _points(clouds: Sequence[PaintedCloud]) -> _Columns:
@@ -92,40 +138,18 @@ def _objects(moments: Sequence[Moment]) -> _Columns:
     return _points([moment.points for moment in moments])
 
 
-def _boxes(moments: Sequence[Moment]) -> _Columns:
-    """Return the labelled boxes."""
-    objects, counts = _objects_of(moments)
-    yield from rr.Boxes3D.columns(
-        centers=_stacked([o.box.center for o in objects], 3),
-        half_sizes=_stacked([o.box.size for o in objects], 3) / 2,
-        quaternions=_stacked([o.box.orientation for o in objects], 4),
-        colors=_packed(objects, white=0.25),
-        labels=[label(o) for o in objects],
-    ).partition(counts)
-
-
 def _dashes(moments: Sequence[Moment]) -> _Columns:
     """Return the edges of the full boxes, dashed."""
     known = [[o for o in m.labelled.objects if o.full is not None] for m in moments]
     objects = list(chain.from_iterable(known))
-    boxes = np.reshape([box_corners(o.full) for o in objects if o.full is not None], (-1, 8, 3))
-    starts, ends = boxes[:, _EDGES[:, 0]], boxes[:, _EDGES[:, 1]]
+    corners = np.reshape([box_corners(o.full) for o in objects if o.full is not None], (-1, 8, 3))
+    starts, ends = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]
     pairs = starts[:, :, None, None] + _DASHES * (ends - starts)[:, :, None, None]
     dashes = len(_EDGES) * len(_DASHES)
     yield from rr.LineStrips3D.columns(
         strips=_segments(pairs.reshape(-1, 2, 3)),
         colors=np.repeat(_packed(objects, white=0.45), dashes),
     ).partition([dashes * len(each) for each in known])
-
-
-def _captions(moments: Sequence[Moment]) -> _Columns:
-    """Return the labels, each a little above its box."""
-    objects, counts = _objects_of(moments)
-    yield from rr.Points3D.columns(
-        positions=_stacked([_above(o.box) for o in objects], 3),
-        colors=_packed(objects, white=0.6),
-        labels=[label(o) for o in objects],
-    ).partition(counts)
 
 
 def _graphs(moments: Sequence[Moment]) -> _Columns:
@@ -195,8 +219,8 @@ def _faces(meshes: Sequence[U4]) -> rr.ComponentColumn:
     return column.partition([len(mesh) for mesh in meshes])
 
 
-DRAWINGS: Mapping[str, Drawing] = {
-    # The colours of points are shaded already; labels of boxes would cover the objects.
+SCENE: Mapping[str, Drawing] = {
+    # The colours of points are shaded already.
     "scene": Drawing(
         rr.Points3D.from_fields(point_shading=rr.components.PointShading.Flat), _scene
     ),
@@ -205,13 +229,17 @@ DRAWINGS: Mapping[str, Drawing] = {
     ),
     "planes": Drawing(rr.LineStrips3D.from_fields(colors=_PLANE, radii=0.001), _outlines),
     "planes/fill": Drawing(rr.Mesh3D.from_fields(albedo_factor=(*_PLANE, 28)), _fills),
-    "objects/boxes": Drawing(rr.Boxes3D.from_fields(radii=0.001, show_labels=False), _boxes),
     "objects/full": Drawing(rr.LineStrips3D.from_fields(radii=0.0008), _dashes),
-    "objects/captions": Drawing(rr.Points3D.from_fields(radii=0.0005, show_labels=True), _captions),
     "objects/graphs": Drawing(rr.LineStrips3D.from_fields(radii=0.0008), _graphs),
     "objects/surfaces": Drawing(None, _surfaces),
 }
-"""What is drawn of a frame, by entity below the sensor's."""
+"""What is drawn of a `Moment`, some times a second, by entity below that of the scene."""
+SKETCH: Mapping[str, Drawing] = {
+    # Labels of boxes would cover the objects.
+    "objects/boxes": Drawing(rr.Boxes3D.from_fields(radii=0.001, show_labels=False), _boxes),
+    "objects/captions": Drawing(rr.Points3D.from_fields(radii=0.0005, show_labels=True), _captions),
+}
+"""What is drawn of the `Sketch` of every frame, by entity below that of the sensor."""
 
 
 def paths(snapshots: Sequence[Sequence[Way]]) -> _Columns:
@@ -280,7 +308,9 @@ def _tint(category: str, white: float) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _packed(objects: Sequence[LabelledObject], *, alpha: int = 255, white: float = 0.0) -> U4:
+def _packed(
+    objects: Sequence[LabelledObject | Sketch], *, alpha: int = 255, white: float = 0.0
+) -> U4:
     """Return (n,) colours 0xRRGGBBAA of the categories of objects."""
     tints = {category: _tint(category, white) for category in {o.category for o in objects}}
     numbers = {

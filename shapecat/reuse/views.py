@@ -5,28 +5,26 @@ cannot drift away from its description step by step.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, F8
+from shapecat.arrays import F4, F8, Bool
 from shapecat.geometry import (
     IDENTITY,
     compose,
     inverse,
     quaternion_from_rotation,
-    rotation_from_quaternion,
     transform,
 )
 from shapecat.reuse.agreement import agreement
 from shapecat.types import Candidate, Detection, Frame, FullBox, NeuralGas, Pose
 
-__all__ = ["KeyView", "Sight", "find_key_views", "looks_the_same", "reused", "update"]
+__all__ = ["KeyView", "Repeat", "Sight", "find_repeats", "reused", "sight_of"]
 
 _PLACE_M = 0.015
 """The centre of what is seen of a still object strays less while the view changes little."""
-_TURN_DEG, _FARTHER = 4.0, 0.05
+_TURN_DEG, _FARTHER = 6.0, 0.05
 """A view from a direction and a distance that differ by less shows the same shape."""
 _SIZE_M, _HEIGHT_M, _UP_DEG = 0.02, 0.01, 2.0
 """Larger differences of the box, of its height above the support, and of up are no noise."""
@@ -37,23 +35,48 @@ _AGREE, _BIAS = 0.95, 0.002
 the mean, in 1/m: 2 mm at 1 m."""
 
 
+_TRIES = 3
+"""Views of an object that are compared point by point, the newest first: masks may flicker."""
+
+
 class Sight(NamedTuple):
     """An object in a frame, before it is described.
 
     Attributes
     ----------
     pose : ``fixed_from_sensor``; None where there is no fixed frame.
-    up : (3,) unit vector, sensor frame.
-    height_m : from what the object stands on to the centre of its box.
-    place : (3,) that centre in the fixed frame, or else in that of the sensor.
+    numbers : (15,) what is compared first; see `sight_of`.
     """
 
     frame: Frame
     pose: Pose | None
-    up: F4
     candidate: Candidate
-    height_m: float
-    place: F8
+    numbers: F8
+
+
+_PLACE, _RAY, _UP, _SIZE = slice(3), slice(3, 6), slice(6, 9), slice(9, 12)
+_HEIGHT, _PIXELS, _KIND = 12, 13, 14
+"""Where in the numbers of a sight they are; all directions in the fixed frame, if there is one."""
+
+
+def sight_of(
+    frame: Frame, pose: Pose | None, candidate: Candidate, up: F4, height_m: float
+) -> Sight:
+    """Note what tells whether a candidate was seen alike before.
+
+    Parameters
+    ----------
+    up : (3,) unit vector, sensor frame.
+    height_m : from what the object stands on to the centre of its box.
+    """
+    turn, shift = (pose or IDENTITY).rotation, (pose or IDENTITY).translation
+    ray = turn @ candidate.box.center
+    length, width, height = candidate.box.size.tolist()
+    size = (max(length, width), min(length, width), height)  # the yaw of a box may flip
+    kind = candidate.touches_border + 2 * candidate.occluded + 4 * (pose is None)
+    pixels = len(candidate.indices)
+    numbers = np.array([*(ray + shift), *ray, *(turn @ up), *size, height_m, pixels, kind])
+    return Sight(frame, pose, candidate, numbers)
 
 
 class KeyView(NamedTuple):
@@ -63,7 +86,25 @@ class KeyView(NamedTuple):
     detection: Detection
 
 
-def find_key_views(sights: Sequence[Sight], keys: Sequence[KeyView]) -> list[KeyView | None]:
+class Move(NamedTuple):
+    """How the sensor frame of an earlier view lies in that of a later one.
+
+    ``pose`` is ``later_from_earlier``, ``back`` its inverse, ``quaternion`` (4,) x, y, z, w.
+    """
+
+    pose: Pose
+    back: Pose
+    quaternion: F8
+
+
+class Repeat(NamedTuple):
+    """A view that an object repeats, and how the sensor has moved since."""
+
+    key: KeyView
+    move: Move
+
+
+def find_repeats(sights: Sequence[Sight], keys: Sequence[KeyView]) -> list[Repeat | None]:
     """Find, for each object of a frame, the earlier view that it repeats; None where it is new.
 
     Parameters
@@ -76,90 +117,74 @@ def find_key_views(sights: Sequence[Sight], keys: Sequence[KeyView]) -> list[Key
     """
     if not keys or not sights:
         return [None] * len(sights)
-    gaps = _gaps(sights, [key.sight for key in keys])
-    nearest = gaps.argmin(axis=1).tolist()
-    near = (gaps.min(axis=1) <= _PLACE_M).tolist()
-    return [
-        keys[k] if is_near and looks_the_same(sight, keys[k].sight) else None
-        for sight, k, is_near in zip(sights, nearest, near, strict=True)
-    ]
+    now, then = (np.array([each.numbers for each in some]) for some in (sights, _sights(keys)))
+    alike, moves = _alike(now[:, None], then[None]), dict[int, Move]()
+    found: list[Repeat | None] = []
+    for sight, row in zip(sights, alike, strict=True):
+        newest_first = np.flatnonzero(row)[::-1].tolist()
+        tries = (_repeat(sight, keys[k], moves) for k in newest_first[:_TRIES])
+        found.append(next((repeat for repeat in tries if repeat is not None), None))
+    return found
 
 
-def update(keys: tuple[KeyView, ...], new: Sequence[KeyView]) -> tuple[KeyView, ...]:
-    """Return the key views after a frame: new ones take the place of those where they are."""
-    if not keys or not new:
-        return (*keys, *new)
-    gaps = _gaps([key.sight for key in keys], [key.sight for key in new])
-    kept = (gaps.min(axis=1) > 2 * _PLACE_M).tolist()
-    return (*(key for key, keep in zip(keys, kept, strict=True) if keep), *new)
+def _repeat(sight: Sight, key: KeyView, moves: dict[int, Move]) -> Repeat | None:
+    """Return the view as repeated if the points of the object agree as well."""
+    earlier = key.sight.frame.index
+    if earlier not in moves:
+        moves[earlier] = _between(key.sight, sight)
+    move = moves[earlier]
+    same = _agree(key.sight, sight, move.pose) and _agree(sight, key.sight, move.back)
+    return Repeat(key, move) if same else None
 
 
-def _gaps(some: Sequence[Sight], others: Sequence[Sight]) -> F8:
-    """Return the distances (m, n) between places."""
-    places, far = (np.array([sight.place for sight in each]) for each in (some, others))
-    return np.asarray(np.sqrt(((places[:, None] - far[None]) ** 2).sum(axis=2)))
-
-
-def reused(key: KeyView, sight: Sight) -> Detection:
+def reused(repeat: Repeat, sight: Sight) -> Detection:
     """Return the detection of an object that repeats a view: what was learned moves with it."""
-    first, move = key.detection, _between(key.sight, sight)
-    return replace(
-        first,
+    (key, move), first = repeat, repeat.key.detection
+    return Detection(
         candidate=sight.candidate,
-        gas=first.gas if move is IDENTITY else _moved_gas(move, first.gas),
-        full=first.full if move is IDENTITY else _moved_box(move, first.full),
+        gas=first.gas if move is _REST else _moved_gas(move, first.gas),
+        descriptor=first.descriptor,
+        posterior=first.posterior,
+        novelty=first.novelty,
         seconds=0.0,
+        full=first.full if move is _REST else _moved_box(move, first.full),
         reused_from=key.sight.frame.index,
     )
 
 
-def _moved_gas(move: Pose, gas: NeuralGas) -> NeuralGas:
-    return NeuralGas(transform(move, gas.neurons), gas.edges)
+def _moved_gas(move: Move, gas: NeuralGas) -> NeuralGas:
+    return NeuralGas(transform(move.pose, gas.neurons), gas.edges)
 
 
-def _moved_box(move: Pose, box: FullBox | None) -> FullBox | None:
+def _moved_box(move: Move, box: FullBox | None) -> FullBox | None:
     if box is None:
         return None
-    turned = move.rotation @ rotation_from_quaternion(box.orientation)
-    return replace(
-        box,
-        center=transform(move, box.center),
-        orientation=quaternion_from_rotation(turned),
+    x, y, z, w = move.quaternion.tolist()
+    product = np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])
+    return FullBox(
+        transform(move.pose, box.center), box.size, product @ box.orientation, box.size_std
     )
 
 
-def looks_the_same(now: Sight, then: Sight) -> bool:
-    """Tell whether an object looks in two frames the same, the cheap questions first."""
-    if (now.pose is None) != (then.pose is None):
-        return False
-    if not (_alike(now, then) and _seen_alike(now, then)):
-        return False
-    move = _between(then, now)
-    return _agree(then, now, move) and _agree(now, then, inverse(move))
+def _sights(keys: Sequence[KeyView]) -> list[Sight]:
+    return [key.sight for key in keys]
 
 
-def _alike(now: Sight, then: Sight) -> bool:
-    """Compare what was found out about the candidates."""
-    a, b = now.candidate, then.candidate
-    if (a.touches_border, a.occluded) != (b.touches_border, b.occluded):
-        return False
-    if abs(now.height_m - then.height_m) > _HEIGHT_M:
-        return False
-    sizes = [(*sorted(box.size[:2]), box.size[2]) for box in (a.box, b.box)]  # yaw may flip
-    return bool(np.abs(np.subtract(*sizes)).max() <= _SIZE_M)
-
-
-def _seen_alike(now: Sight, then: Sight) -> bool:
-    """Compare from where the object is seen, and how large it is in the image."""
-    rays = [_rotation(s) @ s.candidate.box.center for s in (now, then)]
-    ups = [_rotation(s) @ s.up for s in (now, then)]
-    far, before = (float(np.linalg.norm(ray)) for ray in rays)
-    area = len(now.candidate.indices) * far**2 / (len(then.candidate.indices) * before**2)
-    return (
-        rays[0] @ rays[1] >= np.cos(np.radians(_TURN_DEG)) * far * before
-        and ups[0] @ ups[1] >= np.cos(np.radians(_UP_DEG))
-        and abs(far / before - 1) <= _FARTHER
-        and abs(area - 1) <= _AREA
+def _alike(now: F8, then: F8) -> Bool:
+    """Tell which sights (..., 15) were seen alike, before their points are compared."""
+    far, before = (np.linalg.norm(each[..., _RAY], axis=-1) for each in (now, then))
+    area = now[..., _PIXELS] * far**2 / (then[..., _PIXELS] * before**2)
+    turned = (now[..., _RAY] * then[..., _RAY]).sum(axis=-1) / (far * before)
+    tilted = (now[..., _UP] * then[..., _UP]).sum(axis=-1)
+    return np.asarray(
+        (now[..., _KIND] == then[..., _KIND])
+        & (((now - then)[..., _PLACE] ** 2).sum(axis=-1) <= _PLACE_M**2)
+        & (turned >= np.cos(np.radians(_TURN_DEG)))
+        & (tilted >= np.cos(np.radians(_UP_DEG)))
+        & (np.abs(far / before - 1) <= _FARTHER)
+        & (np.abs(area - 1) <= _AREA)
+        & (np.abs(now - then)[..., _SIZE].max(axis=-1) <= _SIZE_M)
+        & (np.abs(now - then)[..., _HEIGHT] <= _HEIGHT_M)
     )
 
 
@@ -172,20 +197,15 @@ def _agree(one: Sight, other: Sight, move: Pose) -> bool:
     return share >= _AGREE and abs(bias) <= _BIAS
 
 
-def _rotation(sight: Sight) -> F8:
-    return (sight.pose or IDENTITY).rotation
+_REST = Move(IDENTITY, IDENTITY, np.array([0.0, 0.0, 0.0, 1.0]))
 
 
-def _between(one: Sight, other: Sight) -> Pose:
-    """Return ``other_from_one``, of the sensor in two frames."""
-    if one.pose is None or other.pose is None or _same_pose(one.pose, other.pose):
-        return IDENTITY
-    return compose(inverse(other.pose), one.pose)
-
-
-def _same_pose(a: Pose, b: Pose | None) -> bool:
-    return (
-        b is not None
-        and np.array_equal(a.rotation, b.rotation)
-        and np.array_equal(a.translation, b.translation)
-    )
+def _between(one: Sight, other: Sight) -> Move:
+    """Return how the sensor has moved from one sight to another."""
+    a, b = one.pose, other.pose
+    if a is None or b is None:
+        return _REST
+    if np.array_equal(a.rotation, b.rotation) and np.array_equal(a.translation, b.translation):
+        return _REST
+    pose = compose(inverse(b), a)
+    return Move(pose, inverse(pose), quaternion_from_rotation(pose.rotation))
