@@ -1,0 +1,127 @@
+"""The track phase over hours: time and memory on made-up tables, as perceive would write them.
+
+    python -m benchmarks.hours --hours 1
+    python -m benchmarks.hours --hours 10     a million frames, eight million detections
+
+Eight objects stand on a table before a camera that moves; each is seen in every frame.
+"""
+
+import json
+import tempfile
+import time
+from contextlib import ExitStack
+from multiprocessing import get_context
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import click
+import numpy as np
+import pyarrow as pa
+
+from benchmarks.measure import markdown, save
+from shapecat.config import TrackingSettings
+from shapecat.runs.segments import GROUP_FRAMES
+from shapecat.runs.tables import DETECTIONS, FRAMES, arrow_table, open_writer
+from shapecat.runs.tracks import track_run
+from shapecat.types import CATEGORIES
+
+PER_HOUR, OBJECTS = 100_000, 8
+PERIOD_NS = 36_000_000
+NOISE_M = 0.004
+
+
+def make_tables(folder: Path, frames: int) -> None:
+    """Write the frames and detections of a run; columns that tracking does not read are empty."""
+    rng = np.random.default_rng(0)
+    places = np.column_stack([rng.uniform(-0.5, 0.5, (OBJECTS, 2)), np.full(OBJECTS, 0.05)])
+    beliefs = rng.dirichlet(np.full(len(CATEGORIES), 0.2), OBJECTS)
+    with ExitStack() as stack:
+        writers = {
+            schema: stack.enter_context(open_writer(folder / f"{name}.parquet", schema))
+            for name, schema in (("frames", FRAMES), ("detections", DETECTIONS))
+        }
+        for first in range(0, frames, GROUP_FRAMES):
+            numbers = np.arange(first, min(first + GROUP_FRAMES, frames))
+            for schema, columns in (
+                (FRAMES, _frames(numbers)),
+                (DETECTIONS, _detections(numbers, places, beliefs, rng)),
+            ):
+                writers[schema].write_table(arrow_table(_filled(columns, schema), schema))
+
+
+def _frames(numbers: Any) -> dict[str, Any]:
+    n = len(numbers)
+    return {
+        "topic": ["/depth"] * n,
+        "frame": numbers,
+        "stamp_ns": numbers * PERIOD_NS,
+        "fixed_translation": [[0.0, 0.0, 0.0]] * n,
+        "fixed_rotation": [np.eye(3).ravel().tolist()] * n,
+    }
+
+
+def _detections(numbers: Any, places: Any, beliefs: Any, rng: Any) -> dict[str, Any]:
+    n = len(numbers) * OBJECTS
+    where = np.tile(places, (len(numbers), 1)) + rng.normal(0, NOISE_M, (n, 3))
+    size, turn = np.full((n, 3), 0.1), np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
+    return {
+        "topic": ["/depth"] * n,
+        "frame": np.repeat(numbers, OBJECTS),
+        "stamp_ns": np.repeat(numbers * PERIOD_NS, OBJECTS),
+        "detection": np.tile(np.arange(OBJECTS), len(numbers)),
+        "touches_border": np.zeros(n, bool),
+        "occluded": np.zeros(n, bool),
+        "novelty": np.full(n, 0.5),
+        "posterior": list(np.tile(beliefs, (len(numbers), 1))),
+        **dict.fromkeys(("center", "center_fixed", "center_full"), list(where)),
+        **dict.fromkeys(("size", "size_full", "size_full_std"), list(size)),
+        **dict.fromkeys(("orientation", "orientation_full"), list(turn)),
+    }
+
+
+def _filled(columns: dict[str, Any], schema: pa.Schema) -> dict[str, Any]:
+    n = len(columns["frame"])
+    return {f.name: columns.get(f.name, pa.nulls(n, f.type)) for f in schema}
+
+
+def _track(folder: Path, answer: Connection) -> None:
+    """Track in a process of its own, and tell the seconds and the peak of its memory."""
+    begun = time.perf_counter()
+    counts = track_run(folder, TrackingSettings(), CATEGORIES)
+    seconds = time.perf_counter() - begun
+    status = Path("/proc/self/status").read_text("utf-8")
+    peak_kb = next(line.split()[1] for line in status.splitlines() if line.startswith("VmHWM"))
+    answer.send(
+        {"seconds": seconds, "peak_mb": int(peak_kb) / 1024, "tracks": sum(counts.values())}
+    )
+
+
+def measure(frames: int) -> dict[str, Any]:
+    """Track a made-up run of so many frames."""
+    with tempfile.TemporaryDirectory() as name:
+        make_tables(Path(name), frames)
+        context = get_context("spawn")
+        here, there = context.Pipe()
+        process = context.Process(target=_track, args=(Path(name), there))
+        process.start()
+        there.close()
+        found: dict[str, Any] = here.recv()
+        process.join()
+    return {"frames": frames, **found}
+
+
+@click.command()
+@click.option("--hours", default=1.0, show_default=True, help="Hours of recording, at 28 Hz.")
+@click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+def main(*, hours: float, as_json: bool) -> None:
+    """Measure the track phase over so many hours, write ``build/benchmarks_hours.json``."""
+    figures = measure(round(hours * PER_HOUR))
+    save(Path("build/benchmarks_hours.json"), figures)
+    rows = [(f"{hours:g}", *(round(value, 1) for value in figures.values()))]
+    columns = ("hours", "frames", "seconds", "peak MB", "tracks")
+    click.echo(json.dumps(figures) if as_json else markdown("The track phase", columns, rows))
+
+
+if __name__ == "__main__":
+    main()
