@@ -64,7 +64,7 @@ def _frames(numbers: Any) -> dict[str, Any]:
 def _detections(numbers: Any, places: Any, beliefs: Any, rng: Any) -> dict[str, Any]:
     n = len(numbers) * OBJECTS
     where = np.tile(places, (len(numbers), 1)) + rng.normal(0, NOISE_M, (n, 3))
-    size, turn = np.full((n, 3), 0.1), np.tile([0.0, 0.0, 0.0, 1.0], (n, 1))
+    size, turn = list(np.full((n, 3), 0.1)), list(np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)))
     return {
         "topic": ["/depth"] * n,
         "frame": np.repeat(numbers, OBJECTS),
@@ -74,9 +74,9 @@ def _detections(numbers: Any, places: Any, beliefs: Any, rng: Any) -> dict[str, 
         "occluded": np.zeros(n, bool),
         "novelty": np.full(n, 0.5),
         "posterior": list(np.tile(beliefs, (len(numbers), 1))),
-        **dict.fromkeys(("center", "center_fixed", "center_full"), list(where)),
-        **dict.fromkeys(("size", "size_full", "size_full_std"), list(size)),
-        **dict.fromkeys(("orientation", "orientation_full"), list(turn)),
+        **{name: list(where) for name in ("center", "center_fixed", "center_full")},
+        **dict.fromkeys(("size", "size_full", "size_full_std"), size),
+        **dict.fromkeys(("orientation", "orientation_full"), turn),
     }
 
 

@@ -11,6 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from shapecat.config import Settings
 from shapecat.geometry import IDENTITY
 from shapecat.pipeline import process
 from shapecat.runs.folder import read_run
@@ -31,6 +32,8 @@ TOPIC = "/depth/image_raw"
 COUNT = 60
 DISTURBED = (7, 16, 17, 31, 45, 52)
 MANY = tuple(range(3, COUNT, 4))
+BLOCKS = Settings(reuse_frames=4)
+"""Shorter ones than usual, so that there are several to look at again."""
 LEANING = Pose(np.array([[1.0, 0, 0], [0, 0.28, -0.96], [0, 0.96, 0.28]]), np.zeros(3))
 """The fixed frame of a log whose z is far from up."""
 
@@ -178,7 +181,11 @@ def test_an_up_that_the_user_asks_for_is_kept(tmp_path: Path, up: str) -> None:
 @pytest.fixture(scope="module")
 def spoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("spoilt")
-    run(folder / "table.mcap", items(moving=False, poses=False, disturbed=MANY))
+    run(
+        folder / "table.mcap",
+        items(moving=False, poses=False, disturbed=MANY),
+        settings=BLOCKS,
+    )
     return folder
 
 
@@ -186,14 +193,14 @@ def test_the_second_look_does_not_depend_on_the_number_of_workers(
     spoilt: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "table"
-    process(Job(spoilt / "table.mcap", out, mcap=False, rrd=False), cores=2)
+    process(Job(spoilt / "table.mcap", out, mcap=False, rrd=False, settings=BLOCKS), cores=2)
 
     assert revised(out) == [*MANY]
     assert_same_tables(out, spoilt / "table")
 
 
 def test_an_interrupted_second_look_goes_on_where_it_stopped(spoilt: Path, tmp_path: Path) -> None:
-    job = Job(spoilt / "table.mcap", tmp_path / "table", mcap=False, rrd=False)
+    job = Job(spoilt / "table.mcap", tmp_path / "table", mcap=False, rrd=False, settings=BLOCKS)
 
     def stop(phase: str, done: int, _total: int | None) -> None:
         if (phase, done) == ("revise", 5):
@@ -206,7 +213,7 @@ def test_an_interrupted_second_look_goes_on_where_it_stopped(spoilt: Path, tmp_p
     seen: list[tuple[str, int]] = []
     process(job, lambda phase, done, _total: seen.append((phase, done)))
 
-    assert [done for phase, done in seen if phase == "revise"] == list(range(6, len(MANY) + 1))
+    assert [done for phase, done in seen if phase == "revise"] == list(range(9, len(MANY) + 1))
     assert not [done for phase, done in seen if phase == "perceive"]
     assert_same_tables(job.folder, spoilt / "table")
     assert {p.name for p in job.folder.iterdir()} == {p.name for p in (spoilt / "table").iterdir()}
@@ -216,7 +223,7 @@ def test_a_kill_between_the_new_tables_leaves_nothing_that_lasts(
     spoilt: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Some tables are of the second look then, others are not."""
-    job = Job(spoilt / "table.mcap", tmp_path / "table", mcap=False, rrd=False)
+    job = Job(spoilt / "table.mcap", tmp_path / "table", mcap=False, rrd=False, settings=BLOCKS)
 
     def die(*_args: object) -> int:
         (tmp_path / ".table.partial" / "planes.parquet").write_bytes(b"half")

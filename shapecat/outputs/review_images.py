@@ -132,14 +132,14 @@ _STYLES = {
 
 
 def _files(pictures: Sequence[Picture]) -> Iterable[rr.ComponentColumn]:
-    return rr.EncodedImage.columns(
+    yield from rr.EncodedImage.columns(
         blob=[picture.contents for picture in pictures],
         media_type=[picture.media_type for picture in pictures],
     )
 
 
 def _masks(pictures: Sequence[Picture]) -> Iterable[rr.ComponentColumn]:
-    return rr.EncodedImage.columns(blob=[picture.masks for picture in pictures])
+    yield from rr.EncodedImage.columns(blob=[picture.masks for picture in pictures])
 
 
 def _boxes(pictures: Sequence[Picture]) -> Iterable[rr.ComponentColumn]:

@@ -80,8 +80,8 @@ def perceive_all(
             observe("perceive", count, total)
         for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
             tables.write(perceptions, rows)
-            count += len(rows)
-            observe("perceive", count, total)
+            for count in range(count + 1, count + len(rows) + 1):  # noqa: B020  one by one
+                observe("perceive", count, total)
         stopping.check()
     if not count:
         reasons = ", ".join(f"{n} {reason}" for reason, n in skipped.items()) or "none in range"
@@ -121,8 +121,8 @@ def revise(
         count = sum(1 for _ in stopping.until_asked(islice(views, tables.done)))
         for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
             tables.write(perceptions, rows)
-            count += len(rows)
-            observe("revise", count, len(chosen))
+            for count in range(count + 1, count + len(rows) + 1):  # noqa: B020  one by one
+                observe("revise", count, len(chosen))
         stopping.check()
     run["counts"]["detections"] = count_rows(folder, "detections")
     revised = read_row_groups(folder / "frames.parquet", ["revised"])
