@@ -143,7 +143,7 @@ def test_phases_that_are_done_are_not_repeated(
     """Interrupted by the keyboard in a later phase, the next run begins with that phase."""
     job = Job(recording, tmp_path / "table", end_s=0.3, rrd=False)
     target = {
-        "track": "shapecat.pipeline.track_run",
+        "track": "shapecat.runs.tracks.track_run",
         "annotated.mcap": "shapecat.outputs.annotated_mcap.write_annotated",
     }[phase]
     with monkeypatch.context() as patch:
