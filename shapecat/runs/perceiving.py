@@ -80,7 +80,7 @@ def perceive_all(
             observe("perceive", count, total)
         for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
             tables.write(perceptions, rows)
-            for count in range(count + 1, count + len(rows) + 1):  # noqa: B020  one by one
+            for count in range(count + 1, count + len(rows) + 1):
                 observe("perceive", count, total)
         stopping.check()
     if not count:
@@ -121,7 +121,7 @@ def revise(
         count = sum(1 for _ in stopping.until_asked(islice(views, tables.done)))
         for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
             tables.write(perceptions, rows)
-            for count in range(count + 1, count + len(rows) + 1):  # noqa: B020  one by one
+            for count in range(count + 1, count + len(rows) + 1):
                 observe("revise", count, len(chosen))
         stopping.check()
     run["counts"]["detections"] = count_rows(folder, "detections")
