@@ -5,6 +5,7 @@ cannot drift away from its description step by step.
 """
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -161,9 +162,8 @@ def _moved_box(move: Move, box: FullBox | None) -> FullBox | None:
         return None
     x, y, z, w = move.quaternion.tolist()
     product = np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])
-    return FullBox(
-        transform(move.pose, box.center), box.size, product @ box.orientation, box.size_std
-    )
+    turned = product @ box.orientation
+    return replace(box, center=transform(move.pose, box.center), orientation=turned)
 
 
 def _sights(keys: Sequence[KeyView]) -> list[Sight]:

@@ -80,7 +80,8 @@ def perceive_all(
             observe("perceive", count, total)
         for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
             tables.write(perceptions, rows)
-            for count in range(count + 1, count + len(rows) + 1):
+            for _ in rows:
+                count += 1
                 observe("perceive", count, total)
         stopping.check()
     if not count:
@@ -121,7 +122,8 @@ def revise(
         count = sum(1 for _ in stopping.until_asked(islice(views, tables.done)))
         for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
             tables.write(perceptions, rows)
-            for count in range(count + 1, count + len(rows) + 1):
+            for _ in rows:
+                count += 1
                 observe("revise", count, len(chosen))
         stopping.check()
     run["counts"]["detections"] = count_rows(folder, "detections")
