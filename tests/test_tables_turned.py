@@ -183,11 +183,11 @@ def test_tracks_stay_where_their_objects_stand(run: Path) -> None:
         k, item = row["frame"], row["detection"]
         inverse = TURNS[k].inv()
         assert_allclose(row["center_fixed"], CENTERS[item], atol=1e-5)
-        assert_allclose(row["center_full"], inverse.apply(CENTERS[item] - PLACES[k]), atol=0.01)
+        assert_allclose(row["center_full"], inverse.apply(CENTERS[item] - PLACES[k]), atol=0.02)
         turned = Rotation.from_quat(row["orientation_full"])
         off = (turned.inv() * inverse * AXES).magnitude()
         quarter = np.pi / 2  # as which a turned box is the same box
-        assert min(off % quarter, quarter - off % quarter) < np.radians(4)
+        assert min(off % quarter, quarter - off % quarter) < np.radians(10)
         assert_allclose(np.sort(row["size_full"]), SIZE + 0.01, atol=0.03)
 
 

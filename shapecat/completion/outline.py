@@ -19,8 +19,6 @@ QUARTER, _HALF = DIRECTIONS // 4, DIRECTIONS // 2
 _ROUNDS = 5
 _OUTLIER = 0.03
 """Deviations beyond this share of the radius are of handles, and pull no harder."""
-_ROUNDNESS = 5.0
-"""So many directions weigh against an oval: most things are round, and one side tells little."""
 
 
 @kernel
@@ -51,7 +49,9 @@ def _insert(ascending: F4, value: float) -> None:
 
 
 @kernel
-def fit_oval(reached: F8, seen: F8, cosines: F8, sines: F8) -> tuple[F8, float, float]:
+def fit_oval(
+    reached: F8, seen: F8, roundness: float, cosines: F8, sines: F8
+) -> tuple[F8, float, float]:
     """Fit an oval to an outline by weighted least squares, of which one side is seen.
 
     Of the side that faces no sensor counts what turns out to reach as far as the oval, as the far
@@ -61,6 +61,7 @@ def fit_oval(reached: F8, seen: F8, cosines: F8, sines: F8) -> tuple[F8, float, 
     ----------
     reached : (k,) of `reach`.
     seen : (k,) weight of each direction, 0 for those that face no sensor.
+    roundness : so many directions weigh against an oval.
 
     Returns
     -------
@@ -74,8 +75,8 @@ def fit_oval(reached: F8, seen: F8, cosines: F8, sines: F8) -> tuple[F8, float, 
     x: F8 = np.zeros(5)
     for _ in range(_ROUNDS):
         A = (rows * weights) @ rows.T
-        A[3, 3] += _ROUNDNESS
-        A[4, 4] += _ROUNDNESS
+        A[3, 3] += roundness
+        A[4, 4] += roundness
         x = np.linalg.solve(A, (rows * weights) @ reached)
         oval = x @ rows
         limit = _OUTLIER * abs(x[2]) + 1e-9

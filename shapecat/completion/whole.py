@@ -35,7 +35,11 @@ _HANDLE = 0.06
 """What reaches farther beyond the oval of a cup, as a share of its radius, is a handle."""
 _EDGEWISE = -0.09
 """Cosine of the angle to the sensor from which on an outline is seen: a little behind its edge."""
-_ROUND = 0.1
+_ROUND = ("ball", "cup")
+"""Round by nature, or with a handle that would be taken for the long side of an oval."""
+_ROUNDNESS, _CIRCULAR = 5.0, 1e3
+"""So many directions weigh against an oval: most things are round, and one side tells little."""
+_FITS = 0.1
 """An oval fits if the side that is seen deviates by less than this share of the radius."""
 _NOISE_M, _GUESS = 0.006, 0.35
 """Deviation of a length that is seen, and of the part that is guessed, as a share of it."""
@@ -115,10 +119,11 @@ def footprint(seen: F8, facing: F8, posterior: F8, categories: Sequence[str]) ->
     """
     likely = dict(zip(categories, np.asarray(posterior).tolist(), strict=True))
     category, angular = max(likely, key=likely.__getitem__), likely.get(_ANGULAR, 0.0)
-    oval, radius, deviation = fit_oval(seen, facing, COSINES, SINES)
+    roundness = _CIRCULAR if category in _ROUND else _ROUNDNESS
+    oval, radius, deviation = fit_oval(seen, facing, roundness, COSINES, SINES)
     if category == _HANDLED and (seen - oval)[facing > 0].max() > _HANDLE * radius:
         oval = np.maximum(oval, np.where(facing > 0, seen, oval))
-    whole = oval if deviation < _ROUND * radius else seen
+    whole = oval if deviation < _FITS * radius else seen
     chosen = seen if category == _ANGULAR else whole
     side = narrowest(chosen)
     along, across, *size = rectangle(chosen, side)
