@@ -8,9 +8,9 @@ __all__ = ["LOW", "OUTLINES", "OVERHANG", "WALLS"]
 class LowProfileSettings(NamedTuple):
     """How low-profile objects are told from slow errors of depth."""
 
-    levels: tuple[float, ...] = (2.0, 0.9, 0.4)
-    """Heights above the mean at which outlines are looked for, as multiples of the least rise: a
-    book, a plate's rim, its well."""
+    levels: tuple[float, ...] = (3.0, 2.0, 1.3, 0.9, 0.6, 0.4)
+    """Heights above the mean at which outlines are looked for, as multiples of the least rise:
+    one of them parts an object from the swell beside it."""
     fine: float = 0.006
     """Most that they are multiples of, 1/m: more is no noise but a plane at a grazing angle."""
     step: float = 0.002

@@ -26,7 +26,7 @@ class UpSettings(NamedTuple):
     """Power of the number of levels: a shelf has several, the wall behind it one."""
     clear: float = 2.0
     """Power of the share of what faces a direction that lies in large levels."""
-    aslant: float = 0.55
+    aslant: float = 0.6
     """What of a direction's merit is lost where the camera looks along it: at walls, not tables."""
     held: float = 3.0
     """A direction that means a camera on its side or upside down counts a quarter."""
