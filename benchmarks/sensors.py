@@ -1,8 +1,9 @@
 """How alike simulated sensors and real ones are: rough planes, wide edges, holes.
 
-    python -m benchmarks.sensors --real RECORDING --real RECORDING
+    python -m benchmarks.sensors --real FOLDER --real FOLDER --picture sensors.png
 
-One line for each simulated sensor, on piles, and one for each folder of real recordings.
+One line for each simulated sensor, on piles, and one for each folder of real recordings. The
+picture shows a frame of each as shaded surfaces, in which noise, edges and holes are seen best.
 """
 
 from collections.abc import Iterator
@@ -17,6 +18,7 @@ from benchmarks.measure import markdown
 from shapecat import open_recording
 from shapecat.simulation import make_scene, render_frame
 from shapecat.simulation.sensors import PRESETS
+from shapecat.types import Frame
 
 Array = NDArray[Any]
 WINDOWS = {"roughness": 16, "warp": 96}
@@ -88,11 +90,48 @@ def _simulated(name: str, first: int, count: int) -> Iterator[Figures]:
 
 
 def _recorded(folder: Path) -> Iterator[Figures]:
+    for frame in _frames(folder):
+        yield measure_frame(np.asarray(frame.depth, np.float64))
+
+
+def _frames(folder: Path) -> Iterator[Frame]:
+    """Yield the depth images of the recordings in a folder."""
     for path in sorted(folder.rglob("*.mcap")):
         with open_recording(path) as recording:
-            for frame in recording.frames():
-                if frame.depth is not None:
-                    yield measure_frame(np.asarray(frame.depth, np.float64))
+            yield from (frame for frame in recording.frames() if frame.depth is not None)
+
+
+def _shaded(depth: Array, focal: float) -> Array:
+    """Return the brightness (h, w) of the surfaces of a depth image lit from the side."""
+    depth = np.where(depth > 0, depth, np.nan)
+    down, right = np.gradient(depth)
+    slopes = [np.arctan(step * focal / depth + tilt) for step, tilt in ((right, 0.5), (down, -0.6))]
+    return np.asarray(0.6 * np.cos(slopes[0]) + 0.4 * np.cos(slopes[1]))
+
+
+def draw(path: Path, seed: int, real: tuple[Path, ...]) -> None:
+    """Draw one pile as each sensor sees it, and the first frame of each real folder."""
+    import matplotlib as mpl  # noqa: PLC0415  only for the picture
+
+    mpl.use("agg")
+    from matplotlib import pyplot as plt  # noqa: PLC0415  after the backend is chosen
+
+    world = make_scene("pile", np.random.default_rng(seed), frames=1)
+    taken = [
+        (name, render_frame(world, 0, rng=np.random.default_rng(seed), sensor=sensor)[0])
+        for name, sensor in PRESETS.items()
+    ]
+    taken += [(folder.name, next(_frames(folder))) for folder in real]
+    figure, axes = plt.subplots(-(-len(taken) // 5), 5, figsize=(15, 2.6 * -(-len(taken) // 5)))
+    for axis in axes.flat:
+        axis.axis("off")
+    for (name, frame), axis in zip(taken, axes.flat, strict=False):
+        camera = frame.camera
+        shade = _shaded(np.asarray(frame.depth, np.float64), camera.fx if camera else 525.0)
+        axis.imshow(shade, cmap="gray", vmin=0.2, vmax=1.0)
+        axis.set_title(name, fontsize=9)
+    figure.tight_layout()
+    figure.savefig(path, dpi=70)
 
 
 def _row(name: str, figures: list[Figures]) -> tuple[Any, ...]:
@@ -104,8 +143,11 @@ def _row(name: str, figures: list[Figures]) -> tuple[Any, ...]:
 @click.option("--first", default=3000, show_default=True, help="Seed of the first scene.")
 @click.option("--count", default=10, show_default=True, help="Scenes per sensor.")
 @click.option("--real", multiple=True, type=click.Path(path_type=Path), help="Folder. Repeatable.")
-def main(first: int, count: int, real: tuple[Path, ...]) -> None:
+@click.option("--picture", type=click.Path(path_type=Path), help="Draw a frame of each.")
+def main(first: int, count: int, real: tuple[Path, ...], picture: Path | None) -> None:
     """Measure simulated and real depth images, and print a table."""
+    if picture is not None:
+        draw(picture, first, real)
     rows = [_row(name, list(_simulated(name, first, count))) for name in PRESETS]
     rows += [_row(folder.name, list(_recorded(folder))) for folder in real]
     click.echo(markdown("Depth images, medians over frames", HEAD, rows))
