@@ -76,13 +76,18 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
         self.jobs = jobs
         self.random_state = random_state
 
-    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Grow the trees on features X (n, f) and labels y (n,), unknown ones included."""
+    def fit(self, X: ArrayLike, y: ArrayLike, start: F4 | None = None) -> Self:
+        """Grow the trees on features X (n, f) and labels y (n,), unknown ones included.
+
+        ``start`` (n, k) are logits that the trees add to; by default those of the shares.
+        """
         x, y = validate_data(self, X, y, dtype=np.float32)
         check_classification_targets(y)
         self.classes_, labels = known_labels(y, self.unknown)
         labels = np.where(labels < 0, len(self.classes_), labels)
-        trees, self.bias_ = self._boost(make_bins(x), labels)
+        self.bias_ = np.log(np.bincount(labels) / labels.size)
+        scores = np.repeat(self.bias_[:, None], labels.size, axis=1) if start is None else start.T
+        trees = self._boost(make_bins(x), labels, np.array(scores, np.float32, order="C"))
         self.forest_, self.votes_ = _join(trees, self.bias_.size)
         return self
 
@@ -105,27 +110,27 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
         logits = self.logits(X)[:, : len(self.classes_)]
         return self.classes_[logits.argmax(axis=1)]
 
-    def _boost(self, bins: Bins, labels: I4) -> tuple[list[Tree], F8]:
-        """Return the trees, round by round, those of a round in the order of the categories."""
+    def _boost(self, bins: Bins, labels: I4, scores: F4) -> list[Tree]:
+        """Return the trees, round by round, those of a round in the order of the categories.
+
+        What they tell is added to ``scores`` (k, n).
+        """
         rng = np.random.default_rng(check_random_state(self.random_state).randint(2**31))
-        share = np.bincount(labels) / labels.size
-        bias = np.log(share)
-        scores = np.repeat(bias[:, None], labels.size, axis=1).astype(np.float32)
-        truth = labels == np.arange(share.size)[:, None]
+        truth = labels == np.arange(len(scores))[:, None]
         # K logits of which one is free: each moves (K - 1) / K of the way (Friedman 2001, eq. 36)
-        freedom = np.float32(share.size / (share.size - 1))
+        freedom = np.float32(len(scores) / (len(scores) - 1))
         trees: list[Tree] = []
         with ThreadPoolExecutor(self.jobs or 1) as pool:
             for _ in range(self.rounds):
                 posterior = np.exp(scores - scores.max(axis=0))
                 posterior /= posterior.sum(axis=0)
-                draws = [self._draw(bins, rng) for _ in share]
+                draws = [self._draw(bins, rng) for _ in scores]
                 grow = [
                     pool.submit(self._grow, bins, draw, p - t, freedom * p * (1 - p), score)
                     for draw, p, t, score in zip(draws, posterior, truth, scores, strict=True)
                 ]
                 trees += [tree.result() for tree in grow]
-        return trees, bias
+        return trees
 
     def _draw(self, bins: Bins, rng: np.random.Generator) -> tuple[I4, I4]:
         """Return the columns and the rows of one tree."""

@@ -1,0 +1,133 @@
+"""More trees for a fitted model, grown on views of a wider world."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from shapecat.arrays import F4
+from shapecat.learning.boosted import BoostedDictionary
+from shapecat.learning.categorizer import Categorizer
+from shapecat.learning.forest import FlatForest
+from shapecat.learning.training import Examples, LearningSettings, choose_evenly, encode
+
+__all__ = ["grow_on", "widened"]
+
+_CONSTANT = 1e-6
+"""A component that varies less says nothing."""
+
+
+def widened(
+    categorizer: Categorizer,
+    train: Examples,
+    *,
+    descriptor_names: Sequence[str],
+    blocks: Mapping[str, slice],
+    used: Sequence[str],
+) -> Categorizer:
+    """Give a model the components of blocks that its descriptor lacks; no prediction changes.
+
+    Parameters
+    ----------
+    train : views by which the new components are standardised.
+    blocks, used : where each block of the descriptor is, and those to be used.
+
+    Raises
+    ------
+    ValueError : a component of the model is no longer there.
+    """
+    place = {name: k for k, name in enumerate(descriptor_names)}
+    lost = [name for name in categorizer.descriptor_names if name not in place]
+    if lost:
+        msg = f"the descriptor has lost {', '.join(lost[:3])}"
+        raise ValueError(msg)
+    old = [place[categorizer.descriptor_names[k]] for k in categorizer.bank.columns]
+    chosen = {k for name in used for k in range(blocks[name].start, blocks[name].stop)}
+    new = sorted(chosen - set(old))
+    values = train.descriptors[:, new].astype(np.float64)
+    scale = values.std(axis=0)
+    inverse = np.divide(1.0, scale, where=scale > _CONSTANT, out=np.zeros_like(scale))
+    bank = categorizer.bank
+    more = (0, len(new))
+    return replace(
+        categorizer,
+        descriptor_names=tuple(descriptor_names),
+        bank=replace(
+            bank,
+            columns=np.array([*old, *new]),
+            mean=np.concatenate([bank.mean, values.mean(axis=0)]),
+            inverse_scale=np.concatenate([bank.inverse_scale, inverse]),
+            kernels=np.pad(bank.kernels, ((0, 0), more)),
+        ),
+        linear=np.pad(categorizer.linear, ((0, 0), more)),
+        known_descriptors=np.pad(categorizer.known_descriptors, ((0, 0), more)),
+    )
+
+
+def grow_on(
+    categorizer: Categorizer, train: Examples, *, settings: LearningSettings, seed: int
+) -> Categorizer:
+    """Grow more trees on what a model gets wrong; those it has stay as they are.
+
+    Parameters
+    ----------
+    train : views with the categories of the model, and of none.
+    settings : rounds, leaves, rate and jobs of the trees to grow.
+
+    Returns
+    -------
+    A model whose temperature and threshold still have to be fitted.
+
+    Raises
+    ------
+    ValueError : the model has no learner of shapes of no category, or has Parzen kernels.
+    """
+    if not categorizer.knows_unknown or len(categorizer.bank.kernels):
+        msg = "more trees are grown for a model without kernels that knows shapes of no category"
+        raise ValueError(msg)
+    count = len(categorizer.categories)
+    labels = encode(train.labels, categorizer.categories)
+    features = categorizer.bank.features(train.descriptors)
+    more = BoostedDictionary(
+        rounds=settings.rounds,
+        leaves=settings.leaves,
+        rate=settings.rate,
+        unknown=-1,
+        jobs=settings.jobs,
+        random_state=seed,
+    ).fit(features, labels, start=_logits(categorizer, features))
+    rng, half = np.random.default_rng(seed), settings.known_views // 2
+    codes = np.where(labels < 0, count, labels)
+    kept = choose_evenly(categorizer.known_category.astype(np.int64), half, rng)
+    added = choose_evenly(codes, half, rng)
+    seen = features[added, : categorizer.bank.mean.size]
+    return replace(
+        categorizer,
+        forest=_joined(categorizer.forest, more.forest_),
+        votes=np.concatenate([categorizer.votes, more.votes_]),
+        temperature=1.0,
+        threshold=0.0,
+        known_descriptors=np.concatenate([categorizer.known_descriptors[kept], seen]),
+        known_category=np.concatenate([categorizer.known_category[kept], codes[added]]),
+    )
+
+
+def _logits(categorizer: Categorizer, features: F4) -> F4:
+    """Return the logits (n, k) of features, a thousand views at a time."""
+    found = [
+        categorizer.votes[categorizer.forest.fall(part)].sum(axis=1, dtype=np.float32)
+        for part in np.array_split(features, len(features) // 1000 + 1)
+    ]
+    return np.asarray(np.concatenate(found) + categorizer.bias, np.float32)
+
+
+def _joined(first: FlatForest, second: FlatForest) -> FlatForest:
+    """Put the trees of one forest behind those of another."""
+    base = first.left.size
+    left = second.left.astype(np.int64)
+    return FlatForest(
+        np.concatenate([first.roots, second.roots.astype(np.int64) + base]),
+        np.concatenate([first.feature, second.feature]),
+        np.concatenate([first.threshold, second.threshold]),
+        np.concatenate([first.left, np.where(left > 0, left + base, 0)]),
+    )
