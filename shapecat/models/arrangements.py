@@ -8,7 +8,7 @@ import numpy as np
 
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
 from shapecat.simulation.distractors import make_distractor
-from shapecat.simulation.mesh import Mesh, moved, rounded_box, standing
+from shapecat.simulation.mesh import Mesh, moved, rounded_box, scaled, standing
 from shapecat.simulation.piles import bin_picking, pile, shelf_bin
 from shapecat.simulation.placement import choose_rest, rests, turn_about_z
 from shapecat.simulation.shapes import make_object
@@ -29,6 +29,9 @@ _MANNERS = {
     UNKNOWN: {"upright": 0.7, "lying": 0.3},
 }
 _ROUND = {"cup", "can", "bottle"}
+_RESIZED = 0.3
+"""Share of the tables with toys and blocks, or with things larger than usual."""
+_SIZES = (0.55, 1.5)
 
 
 @dataclass(frozen=True)
@@ -69,15 +72,15 @@ class Arrangement(NamedTuple):
 
     actors: list[Actor]
     furniture: tuple[Mesh, ...]
-    elevation: tuple[float, float] = (15.0, 65.0)
+    elevation: tuple[float, float] = (8.0, 80.0)
     azimuth: tuple[float, float] = (-180.0, 180.0)
 
 
 ALONE = moved(rounded_box(_TABLE_M), Pose(np.eye(3), np.array([0.0, 0.0, -_TABLE_M[2]])))
 """A table without room around it."""
 _SETTLED: tuple[tuple[Callable[..., Scene], float, Arrangement], ...] = (
-    (pile, 0.7, Arrangement([], (), (10.0, 85.0))),
-    (bin_picking, 0.15, Arrangement([], (), (50.0, 88.0))),
+    (pile, 0.7, Arrangement([], (), (8.0, 90.0))),
+    (bin_picking, 0.15, Arrangement([], (), (50.0, 90.0))),
     (shelf_bin, 0.15, Arrangement([], (), (5.0, 35.0), (-120.0, -60.0))),
 )
 """What physics makes, its share, and from where it is seen."""
@@ -118,8 +121,9 @@ def _spread(world: World, rng: np.random.Generator) -> list[Actor]:
     actors: list[Actor] = []
     spots: list[tuple[float, float, float]] = []
     gap = float(rng.choice([0.003, 0.02, 0.08]))
+    size = float(np.exp(rng.uniform(*np.log(_SIZES)))) if rng.random() < _RESIZED else 1.0
     for _ in range(int(rng.integers(3, 10))):
-        actor = _make(world, rng)
+        actor = _make(world, rng, size)
         if world.leaning > 0 and rng.random() < world.leaning:
             actor = _leant(actor, rng)
         radius = float(np.hypot(actor.mesh.vertices[:, 0], actor.mesh.vertices[:, 1]).max())
@@ -130,18 +134,19 @@ def _spread(world: World, rng: np.random.Generator) -> list[Actor]:
         actors.append(placed(actor, spot, 0.0, rng))
         top = actor.mesh.extents
         if actor.label == "box" and top[:2].min() > 0.05 and rng.random() < 0.3:
-            above = _make(world, rng)
+            above = _make(world, rng, size)
             if np.all(above.mesh.extents[:2] < 1.3 * top[:2].min()):
                 actors.append(placed(above, spot, float(top[2]), rng))
     return actors
 
 
-def _make(world: World, rng: np.random.Generator) -> Actor:
+def _make(world: World, rng: np.random.Generator, size: float) -> Actor:
+    """Make something, ``size`` times as large as such things are."""
     if rng.random() < world.unknown:
         _, mesh = make_distractor(rng, str(rng.choice(list(world.kinds))))
-        return _rested(mesh, UNKNOWN, world, rng)
+        return _rested(scaled(mesh, size), UNKNOWN, world, rng)
     label = str(rng.choice(list(CATEGORIES)))
-    return _rested(make_object(label, rng), label, world, rng)
+    return _rested(scaled(make_object(label, rng), size), label, world, rng)
 
 
 def _rested(mesh: Mesh, label: str, world: World, rng: np.random.Generator) -> Actor:

@@ -6,17 +6,19 @@ from pathlib import Path
 
 from shapecat.evaluation import Report
 
-__all__ = ["Table", "format_table", "write_card"]
+__all__ = ["PICTURE", "Table", "format_table", "write_card"]
 
+PICTURE = "worst_mistakes.png"
+"""The picture beside the card."""
 _HEAD = """# The default model
 
-Model `{model}`, made by `make model` (`python -m shapecat.models.training`) from the simulator
-alone: no real reading was used to learn or to calibrate it. Settings were chosen on
-simulated objects; the figures on real readings below were seen while choosing, so they flatter
-it a little.
+Model `{model}`, made by {command}
+from the simulator alone: no real reading was used to learn or to calibrate it. Settings were
+chosen on simulated objects; the figures on real readings below were seen while choosing, so they
+flatter it a little.
 
-It tells {categories} by shape, seen from one side by a depth camera 0.35 to 2.2 m away and 5 to
-88 degrees above, standing, lying, or as physics lets it fall in piles, bins and shelves; anything
+It tells {categories} by shape, seen from one side by a depth camera 0.25 to 3 m away and 5 to
+90 degrees above, standing, lying, or as physics lets it fall in piles, bins and shelves; anything
 else should come out as *unknown* (novelty above 1). The threshold rejects 14 % of simulated views
 that show an object of these in part.
 
@@ -29,7 +31,17 @@ that show an object of these in part.
   top clearly narrower than the body. Objects near a border are taken for either.
 - Cartons with a gable or a screw cap lie between box and bottle.
 - Objects of which much is hidden are categorized by the piece that is seen.
+
+## The worst mistakes
+
+Views of the test set whose wrong label the model is surest of. Color is the distance.
+
+![Points of the worst mistakes, with what they are and what the model says]({picture})
 """
+_ANEW = "`make model` (`python -m shapecat.models.training`)"
+_AFTER = """`python -m shapecat.models.training --after`
+on top of model `{after}`, whose trees it keeps (what each part of the method is worth
+was measured on that one),"""
 
 
 @dataclass(frozen=True)
@@ -59,13 +71,19 @@ def write_card(
     path: Path,
     *,
     model: str,
+    after: str | None,
     categories: Sequence[str],
     tables: Sequence[Table],
     confusion: Report,
     settings: Mapping[str, object],
 ) -> None:
-    """Write the card beside the model."""
-    head = _HEAD.format(model=model, categories=", ".join(categories))
+    """Write the card beside the model; ``after`` is the one whose trees it keeps."""
+    head = _HEAD.format(
+        model=model,
+        command=_ANEW if after is None else _AFTER.format(after=after),
+        categories=", ".join(categories),
+        picture=PICTURE,
+    )
     rows = tuple(
         (name, *map(str, row))
         for name, row in zip(confusion.categories, confusion.confusion, strict=True)

@@ -6,6 +6,7 @@ from dataclasses import replace
 from functools import partial
 from multiprocessing import get_context
 from typing import NamedTuple
+from zlib import crc32
 
 import numpy as np
 
@@ -37,13 +38,18 @@ __all__ = ["WorldView", "simulate_mesh", "simulate_views", "simulate_world"]
 _FEWEST_PIXELS = 80
 _LEAST_VISIBLE = 0.3
 _OVERLAP = 0.5
-_FRAGMENTS = 0.4
+_DETECTED = 0.75
+"""Share of the objects that are found which are cut as detection cuts them."""
+_FRAGMENTS = 0.3
 _COARSE = 4
 """Visible shares are judged in images this many times smaller."""
 _SCALES = (0.5, 1.0, 1.0, 1.0, 1.5)
 """Resolutions of the sensors, as multiples of their own."""
 _WIDTHS = (224, 1280)
 """Their least and greatest width in pixels."""
+_DISTANCES_M = (0.25, 3.0)
+_CLOSER_M = 0.03
+"""What is looked at is farther than the nearest reading by this."""
 _SETTINGS = Settings()
 
 
@@ -148,7 +154,7 @@ def look(
 def _shoot(seen: Geometry, arrangement: Arrangement, rng: np.random.Generator) -> _Shot:
     """Look at an arrangement from somewhere with a sensor."""
     name, sensor = _draw_sensor(rng)
-    camera, pose = sensor.camera, _viewpoint(arrangement, rng)
+    camera, pose = sensor.camera, _viewpoint(arrangement, sensor, rng)
     image = render(seen, camera, pose)
     depth, owners = measure(image, sensor, rng)
     visible = _visible_shares(seen, owners, camera, pose, len(arrangement.actors))
@@ -162,7 +168,8 @@ def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
     name, other = (names[k] for k in rng.integers(len(names), size=2))
     share = float(rng.uniform(0, 0.6)) if rng.random() < 0.5 else 0.0
     sensor = between(PRESETS[name], PRESETS[other], share)
-    noise, wave, ragged = np.exp(rng.uniform(np.log([0.4, 0.4, 0.5]), np.log([2.0, 2.5, 1.5])))
+    least, most = np.log([0.4, 0.4, 0.5, 0.5, 0.7]), np.log([2.0, 2.5, 1.5, 8.0, 2.0])
+    noise, wave, ragged, holes, dark = np.exp(rng.uniform(least, most))
     sensor = replace(
         sensor,
         noise=float(sensor.noise * noise),
@@ -170,16 +177,22 @@ def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
         wave=float(sensor.wave * wave),
         device=int(rng.integers(1_000_000)),
         ragged_px=float(sensor.ragged_px * ragged),
+        holes=float(sensor.holes * holes),
+        grazing=float(sensor.grazing * dark),
+        dark=float(sensor.dark * dark),
     )
     scale = np.clip(rng.choice(_SCALES), *(np.array(_WIDTHS) / sensor.camera.width))
     return name, resized(sensor, float(scale))
 
 
-def _viewpoint(arrangement: Arrangement, rng: np.random.Generator) -> Pose:
-    """Return ``table_from_camera``: 0.35 to 2.2 m away, as high as the arrangement says."""
+def _viewpoint(arrangement: Arrangement, sensor: Sensor, rng: np.random.Generator) -> Pose:
+    """Return ``table_from_camera``: 0.25 to 3 m away, as high as the arrangement says."""
     points = np.concatenate([actor.mesh.vertices for actor in arrangement.actors])
     target = points.mean(axis=0) + rng.normal(0, 0.04, 3)
-    distance = float(np.exp(rng.uniform(np.log(0.35), np.log(2.2))))
+    nearest, farthest = _DISTANCES_M
+    nearest = max(nearest, sensor.nearest_m + _CLOSER_M)
+    farthest = min(farthest, sensor.farthest_m)
+    distance = float(np.exp(rng.uniform(np.log(nearest), np.log(farthest))))
     azimuth = np.radians(rng.uniform(*arrangement.azimuth))
     elevation = np.radians(rng.uniform(*arrangement.elevation))
     back = np.array(
@@ -222,18 +235,18 @@ def _views_of(
 ) -> list[WorldView]:
     """Return one view of an object, cut by the truth or as detected, and maybe a piece of it."""
     found = _cut_by_detection(shot, scene, k)
-    if found is not None and rng.random() < 0.6:
+    if found is not None and rng.random() < _DETECTED:
         (view, overlap), source = found, "detected"
     else:
         view, overlap = cut_halo(_cut_by_truth(shot, k, actor, rng), rng), 1.0
         source = "truth"
     view = View(view.points, view.eye, actor.label, instance)
     seen = _Seen(actor, shot.sensor, float(shot.visible[k]), overlap)
-    described = [_described(view, source, seen, rng)]
+    described = [_described(view, source, seen)]
     if rng.random() < _FRAGMENTS:
         piece = cut_fragment(view, rng)
         if piece is not None:
-            described.append(_described(piece, "fragment", seen, rng))
+            described.append(_described(piece, "fragment", seen))
     return [item for item in described if item is not None]
 
 
@@ -271,7 +284,11 @@ def _centre(actor: Actor) -> F8:
     return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
-def _described(view: View, source: str, seen: _Seen, rng: np.random.Generator) -> WorldView | None:
+def _described(view: View, source: str, seen: _Seen) -> WorldView | None:
+    """Describe a view by its voxels; what is random in that depends on these alone."""
+    distance = float(np.linalg.norm(view.points.mean(axis=0) - view.eye))
+    view = replace(view, points=voxelize(view.points, voxel_m=_SETTINGS.surface.voxel_m))
+    rng = np.random.default_rng(crc32(view.points.tobytes()))
     described = describe_view(view, settings=_SETTINGS, rng=rng)
     if described is None:
         return None
@@ -280,7 +297,7 @@ def _described(view: View, source: str, seen: _Seen, rng: np.random.Generator) -
         label=seen.actor.label,
         instance=view.instance,
         points=described.points,
-        distance=float(np.linalg.norm(view.points.mean(axis=0) - view.eye)),
+        distance=distance,
         seconds=described.seconds,
         manner=seen.actor.manner,
         source=source,
@@ -288,5 +305,5 @@ def _described(view: View, source: str, seen: _Seen, rng: np.random.Generator) -
         overlap=seen.overlap,
         sensor=seen.sensor,
         functions=shape_functions(view.points, rng),
-        view=replace(view, points=voxelize(view.points, voxel_m=_SETTINGS.surface.voxel_m)),
+        view=view,
     )

@@ -1,0 +1,86 @@
+"""Pictures for the model card: what the model is most wrong about."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F8
+from shapecat.evaluation import View
+from shapecat.learning import Categorizer
+from shapecat.models.worlds import WorldView
+from shapecat.types import UNKNOWN
+
+__all__ = ["Mistake", "draw", "worst_mistakes"]
+
+_COLUMNS = 6
+
+
+class Mistake(NamedTuple):
+    """A view that gets a wrong label, its points, what it gets, and how sure the model is."""
+
+    seen: WorldView
+    view: View
+    said: str
+    confidence: float
+
+
+def worst_mistakes(
+    views: Sequence[WorldView], model: Categorizer, *, count: int = 12
+) -> list[Mistake]:
+    """Return the surest mistakes on views of different objects, the surest first."""
+    answer = model.predict(np.array([seen.descriptor for seen in views]))
+    found = []
+    for seen, posterior, novelty in zip(views, answer.posteriors, answer.novelty, strict=True):
+        strange = novelty > 1
+        said = UNKNOWN if strange else model.categories[int(posterior.argmax())]
+        known = 1 - float(novelty) / 2
+        sure = 1 - known if strange else known * float(posterior.max())
+        if said != seen.label and seen.view is not None:
+            found.append(Mistake(seen, seen.view, said, sure))
+    found.sort(key=lambda mistake: -mistake.confidence)
+    worst: dict[str, Mistake] = {}
+    for mistake in found:
+        worst.setdefault(mistake.seen.instance, mistake)
+    return list(worst.values())[:count]
+
+
+def draw(path: Path, mistakes: Sequence[Mistake]) -> None:
+    """Draw the points of views as the sensor sees them, and what the model said."""
+    import matplotlib as mpl  # noqa: PLC0415  only for pictures
+
+    mpl.use("agg")
+    from matplotlib import pyplot as plt  # noqa: PLC0415  after the backend is chosen
+
+    rows = -(-len(mistakes) // _COLUMNS)
+    figure, axes = plt.subplots(rows, _COLUMNS, figsize=(2.2 * _COLUMNS, 2.4 * rows), squeeze=False)
+    for axis in axes.flat:
+        axis.axis("off")
+    for mistake, axis in zip(mistakes, axes.flat, strict=False):
+        _draw_one(axis, mistake)
+    figure.tight_layout()
+    figure.savefig(path, dpi=80)
+
+
+def _draw_one(axis: Any, mistake: Mistake) -> None:
+    seen = mistake.seen
+    across, depth = _as_seen(mistake.view)
+    axis.scatter(*across.T, c=depth, s=3, cmap="viridis_r", linewidths=0)
+    axis.set_aspect("equal")
+    where = f"{seen.sensor}, {seen.distance:.1f} m, {seen.points} voxels"
+    axis.set_title(
+        f"{seen.label}, {seen.manner}\nas {mistake.said} ({mistake.confidence:.2f})\n{where}",
+        fontsize=7,
+    )
+
+
+def _as_seen(view: View) -> tuple[F8, F8]:
+    """Return the points (n, 2) across the line of sight, and their distance (n,)."""
+    points = np.asarray(view.points, np.float64)
+    sight = points.mean(axis=0) - view.eye
+    sight /= np.linalg.norm(sight)
+    right = np.cross(sight, [0.0, 0.0, 1.0])
+    right /= max(float(np.linalg.norm(right)), 1e-9)
+    across = (points - view.eye) @ np.stack([right, np.cross(right, sight)], axis=1)
+    return across, (points - view.eye) @ sight
