@@ -21,6 +21,7 @@ __all__ = [
     "gravity_rotation",
     "inverse",
     "level_axes",
+    "level_box",
     "level_from_sensor",
     "quaternion_from_rotation",
     "rotation_from_quaternion",
@@ -183,19 +184,34 @@ def upright_box(points: F4, up: ArrayLike) -> Box:
         msg = "a box needs at least one point"
         raise ValueError(msg)
     level = gravity_rotation(up)
-    local = np.ascontiguousarray((points @ level.T.astype(np.float32)).T)
-    angles = np.arange(60) * (np.pi / 120)
-    c, s = np.cos(angles), np.sin(angles)
-    along = _range_along(local[0], local[1], c, s)
-    across = _range_along(local[0], local[1], -s, c)
-    best = int(np.argmin((along[:, 1] - along[:, 0]) * (across[:, 1] - across[:, 0])))
-    low = np.array([along[best, 0], across[best, 0], local[2].min()])
-    high = np.array([along[best, 1], across[best, 1], local[2].max()])
-    box_from_level = np.array([[c[best], s[best], 0.0], [-s[best], c[best], 0.0], [0.0, 0.0, 1.0]])
-    sensor_from_box = (box_from_level @ level).T
-    return Box(
-        sensor_from_box @ ((low + high) / 2), high - low, quaternion_from_rotation(sensor_from_box)
-    )
+    return Box(*level_box(np.ascontiguousarray((points @ level.T.astype(np.float32)).T), level))
+
+
+@kernel
+def level_box(points: F4, level: F8) -> tuple[F8, F8, F8]:
+    """Return centre, size and orientation of the box of `upright_box`, sensor frame.
+
+    Parameters
+    ----------
+    points : (3, n) in the level frame, float32.
+    level : (3, 3) the axes of that frame, from `level_axes`.
+    """
+    yaw, low, high = _smallest_rectangle(points[0], points[1])
+    low[2] = high[2] = points[2, 0]
+    for k in range(points.shape[1]):
+        low[2], high[2] = min(low[2], points[2, k]), max(high[2], points[2, k])
+    cos, sin = math.cos(yaw), math.sin(yaw)
+    axes, middle = np.zeros((3, 3)), (low + high) / 2
+    for d in range(3):
+        axes[d, 0] = cos * level[0, d] + sin * level[1, d]
+        axes[d, 1] = cos * level[1, d] - sin * level[0, d]
+        axes[d, 2] = level[2, d]
+    center = np.zeros(3)
+    for d in range(3):
+        center[d] = axes[d, 0] * middle[0] + axes[d, 1] * middle[1] + axes[d, 2] * middle[2]
+    a, b, c = axes
+    turned = row_quaternion((a[0], a[1], a[2]), (b[0], b[1], b[2]), (c[0], c[1], c[2]))
+    return center, high - low, np.array(turned)
 
 
 def box_corners(box: Box) -> F8:
@@ -218,16 +234,25 @@ def _mean(points: F8) -> F8:
     return mean
 
 
+_YAWS = np.arange(60) * (np.pi / 120)
+_COS, _SIN = np.cos(_YAWS).astype(np.float32), np.sin(_YAWS).astype(np.float32)
+
+
 @kernel(fast=True)
-def _range_along(x: F4, y: F4, dx: F8, dy: F8) -> F8:
-    """Return (k, 2) the least and greatest ``x * dx + y * dy`` for each of k directions."""
-    result = np.zeros((dx.size, 2), np.float64)
-    for k in range(dx.size):
-        a, b = np.float32(dx[k]), np.float32(dy[k])
-        low = high = a * x[0] + b * y[0]
-        for i in range(x.size):
-            value = a * x[i] + b * y[i]
-            low = value if value < low else low
-            high = value if value > high else high
-        result[k] = low, high
-    return result
+def _smallest_rectangle(x: F4, y: F4) -> tuple[float, F8, F8]:
+    """Return yaw, least and greatest corner (3,) of the smallest rectangle around points.
+
+    All yaws are turned to at once, one point after the other: this vectorises.
+    """
+    n = _YAWS.size
+    left, back = np.full(n, np.float32(np.inf)), np.full(n, np.float32(np.inf))
+    right, front = np.full(n, np.float32(-np.inf)), np.full(n, np.float32(-np.inf))
+    for k in range(x.size):
+        for t in range(n):
+            u, v = _COS[t] * x[k] + _SIN[t] * y[k], _COS[t] * y[k] - _SIN[t] * x[k]
+            left[t], right[t] = u if u < left[t] else left[t], u if u > right[t] else right[t]
+            back[t], front[t] = v if v < back[t] else back[t], v if v > front[t] else front[t]
+    t = np.argmin((right - left) * (front - back))
+    low, high = np.zeros(3), np.zeros(3)
+    low[0], low[1], high[0], high[1] = left[t], back[t], right[t], front[t]
+    return _YAWS[t], low, high

@@ -24,7 +24,7 @@ _FAST = {"reassoc", "contract", "arcp", "nsz", "nnan"}
 """Fast-math flags that keep infinities: sums and minima may be vectorised."""
 _HERE = Path(__file__).parent
 _LARGE_BYTES = 2**24
-_SHARED = tuple(_HERE / name for name in ("geometry.py", "jit.py"))
+_SHARED = tuple(_HERE / name for name in ("geometry.py", "jit.py", "trees.py"))
 """Files beside this one whose kernels stages call."""
 
 

@@ -20,7 +20,7 @@ STAGES = {
 BASE = {"arrays", "errors", "jit", "system", "types"}
 FLOOR = {
     **dict.fromkeys(BASE | {"py"}, 0),
-    **dict.fromkeys(("cameras", "config", "executors", "geometry"), 1),
+    **dict.fromkeys(("cameras", "config", "executors", "geometry", "trees"), 1),
     **dict.fromkeys(
         (
             *STAGES,

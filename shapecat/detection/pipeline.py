@@ -15,20 +15,24 @@
 The thesis stops at objects that do not touch: steps 4 and 5 go beyond it.
 """
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import ArrayLike
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.config import DetectionSettings
+from shapecat.detection.cleanup import structure
 from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
-from shapecat.detection.cleanup.structure import LabelledGrid, Limits, is_background
+from shapecat.detection.cleanup.object_features import measure_object_features
+from shapecat.detection.cleanup.structure import find_background
 from shapecat.detection.depth_grid import DepthGrid, downsample
 from shapecat.detection.foreground.low_profile import find_low_profile
 from shapecat.detection.foreground.overhang import extend_overhang
 from shapecat.detection.foreground.walls import remove_walls
+from shapecat.detection.merging import learned
 from shapecat.detection.merging.across_occlusion import merge_across_occluder
 from shapecat.detection.merging.adjacency import measure_adjacency
-from shapecat.detection.merging.learned import load_trees, merge_learned
 from shapecat.detection.merging.low_profile import merge_low_profile
 from shapecat.detection.merging.pair_features import ViewGeometry
 from shapecat.detection.merging.segments import measure_segments
@@ -50,12 +54,20 @@ from shapecat.detection.virtual_camera import VirtualImage, top_view, virtual_im
 from shapecat.geometry import IDENTITY, inverse
 from shapecat.types import Camera, Frame, Scene
 
-__all__ = ["ALL_STEPS", "Steps", "detect", "label", "oversegment"]
+__all__ = ["ALL_STEPS", "Steps", "Task", "detect", "label", "merge_segments", "oversegment"]
 
 DEFAULT_UP = (0.0, -1.0, 0.0)
 """Up in an upright optical frame, where nothing else is known."""
 CROWDED = 0.08
 """Share of points behind others from which a cloud is taken for fused from several views."""
+
+
+class Task(NamedTuple):
+    """What the steps are told: settings, the source of RANSAC samples, which steps are taken."""
+
+    settings: DetectionSettings
+    rng: np.random.Generator
+    steps: Steps = ALL_STEPS
 
 
 def detect(
@@ -93,11 +105,11 @@ def detect(
     was not taken from its origin is looked at from above its dominant plane; the points of a
     fused cloud that are hidden in the view join what they touch.
     """
-    hint = None if up is None else _unit(up)
+    hint, task = None if up is None else _unit(up), Task(settings, rng, steps)
     if frame.depth is not None and frame.camera is not None:
-        scene = _in_image(frame.depth, frame.camera, hint, settings, rng, steps)
+        scene = _in_image(frame.depth, frame.camera, hint, task)
     else:
-        scene = _in_cloud(frame.xyz(), hint, settings, rng, steps)
+        scene = _in_cloud(frame.xyz(), hint, task)
     return scene or Scene(np.array(DEFAULT_UP) if hint is None else hint, (), ())
 
 
@@ -110,132 +122,89 @@ def _unit(up: ArrayLike) -> F8:
     return vector / norm
 
 
-def _in_image(
-    depth: F4,
-    camera: Camera,
-    hint: F8 | None,
-    settings: DetectionSettings,
-    rng: np.random.Generator,
-    steps: Steps,
-) -> Scene | None:
-    grid = downsample(depth, camera, range_m=settings.max_range_m)
-    found = None if grid is None else label(grid, hint, settings=settings, rng=rng, steps=steps)
+def _in_image(depth: F4, camera: Camera, hint: F8 | None, task: Task) -> Scene | None:
+    range_m = task.settings.max_range_m
+    grid = downsample(depth, camera, range_m=range_m)
+    found = None if grid is None else label(grid, hint, task)
     if grid is None or found is None:
         return None
-    indices = label_pixels(depth, grid, found, range_m=settings.max_range_m)
-    return build_scene(grid, found, indices, IDENTITY, settings=settings)
+    indices = label_pixels(depth, grid, found, range_m=range_m)
+    return build_scene(grid, found, indices, IDENTITY, settings=task.settings)
 
 
-def _in_cloud(
-    points: F4,
-    hint: F8 | None,
-    settings: DetectionSettings,
-    rng: np.random.Generator,
-    steps: Steps,
-) -> Scene | None:
-    view = virtual_image(points, range_m=settings.max_range_m)
-    found = None if view is None else _seen(view, hint, settings, rng, steps)
+def _in_cloud(points: F4, hint: F8 | None, task: Task) -> Scene | None:
+    view = virtual_image(points, range_m=task.settings.max_range_m)
+    found = None if view is None else _seen(view, hint, task)
     if found is None:
-        view = top_view(points, hint, range_m=settings.max_range_m, rng=rng)
-        found = None if view is None else _seen(view, hint, settings, rng, steps)
+        view = top_view(points, hint, range_m=task.settings.max_range_m, rng=task.rng)
+        found = None if view is None else _seen(view, hint, task)
     if view is None or found is None:
         return None
-    indices = label_points(view, found, fused=view.crowded > CROWDED)
+    indices, pose = label_points(view, found, fused=view.crowded > CROWDED), view.view_from_sensor
     return build_scene(
-        view.grid, found, indices, inverse(view.view_from_sensor), settings=settings,
-        points=view.points,
-    )  # fmt: skip
+        view.grid, found, indices, inverse(pose), settings=task.settings, points=view.points
+    )
 
 
-def _seen(
-    view: VirtualImage,
-    hint: F8 | None,
-    settings: DetectionSettings,
-    rng: np.random.Generator,
-    steps: Steps,
-) -> Segmentation | None:
+def _seen(view: VirtualImage, hint: F8 | None, task: Task) -> Segmentation | None:
     turned = None if hint is None else view.view_from_sensor.rotation @ hint
-    return label(view.grid, turned, settings=settings, rng=rng, steps=steps, upright=False)
+    return label(view.grid, turned, task, upright=False)
 
 
 def label(
-    grid: DepthGrid,
-    hint: F8 | None,
-    *,
-    settings: DetectionSettings,
-    rng: np.random.Generator,
-    steps: Steps = ALL_STEPS,
-    upright: bool = True,
+    grid: DepthGrid, hint: F8 | None, task: Task, *, upright: bool = True
 ) -> Segmentation | None:
     """Find planes and objects among the samples; None if there is no supporting plane.
 
     ``upright`` is of `find_supporting_planes`.
     """
-    model = _find_planes(grid, hint, settings, rng, steps, upright=upright)
+    model = _find_planes(grid, hint, task, upright=upright)
     if model is None:
         return None
-    oversegmentation = _oversegment(grid, model, steps)
-    known = _merge(grid, model, oversegmentation, steps)
-    representatives = _clean_up(grid, model, oversegmentation, known, settings)
-    return _fill(grid, model, oversegmentation, representatives, settings, steps)
+    oversegmentation = _oversegment(grid, model, task.steps)
+    known = merge_segments(grid, model, oversegmentation, task.steps)
+    representatives = _clean_up(grid, model, oversegmentation, known, task.settings)
+    return _fill(grid, model, oversegmentation, representatives, task)
 
 
-def oversegment(
-    grid: DepthGrid, *, settings: DetectionSettings, rng: np.random.Generator
-) -> tuple[PlaneModel, OverSegmentation] | None:
+def oversegment(grid: DepthGrid, task: Task) -> tuple[PlaneModel, OverSegmentation] | None:
     """Find planes and the segments of objects; None if no plane bears anything."""
-    model = _find_planes(grid, None, settings, rng, ALL_STEPS)
-    return None if model is None else (model, _oversegment(grid, model, ALL_STEPS))
+    model = _find_planes(grid, None, task)
+    return None if model is None else (model, _oversegment(grid, model, task.steps))
 
 
 def _find_planes(
-    grid: DepthGrid,
-    hint: F8 | None,
-    settings: DetectionSettings,
-    rng: np.random.Generator,
-    steps: Steps,
-    *,
-    upright: bool = True,
+    grid: DepthGrid, hint: F8 | None, task: Task, *, upright: bool = True
 ) -> PlaneModel | None:
     """Find what objects stand on and before; None if nothing bears anything."""
-    trials = draw_trials(rng)
-    supports, up = find_supporting_planes(
-        grid,
-        NO_HINT if hint is None else hint,
-        trials,
-        tallest_m=settings.max_height_m,
-        upright=upright,
-    )
+    trials, tallest_m = draw_trials(task.rng), task.settings.max_height_m
+    hint = NO_HINT if hint is None else hint
+    supports, up = find_supporting_planes(grid, hint, trials, tallest_m=tallest_m, upright=upright)
     if not supports and not upright:  # a cloud may be looked at from elsewhere
         return None
     up = up if up.any() else np.array(DEFAULT_UP)
-    model = _separate(grid, supports, up, trials, settings, steps)
+    model = _separate(grid, supports, up, trials, task)
     rest = unexplained(grid, model.heights.plane_id, model.walls)
-    assumed = None if rest is None else assume_plane(grid, rest, up, settings.max_height_m)
+    assumed = None if rest is None else assume_plane(grid, rest, up, tallest_m)
     if assumed is not None:
         supports = sorted([*supports, assumed], key=lambda support: support.offset)
-        model = _separate(grid, supports, up, trials, settings, steps)
+        model = _separate(grid, supports, up, trials, task)
     if not supports:
         return None
-    extend_overhang(grid, model.heights, model.planes, model.walls, settings.max_height_m)
+    extend_overhang(grid, model.heights, model.planes, model.walls, tallest_m)
     return model
 
 
 def _separate(
-    grid: DepthGrid,
-    supports: list[SupportingPlane],
-    up: F8,
-    trials: F8,
-    settings: DetectionSettings,
-    steps: Steps,
+    grid: DepthGrid, supports: list[SupportingPlane], up: F8, trials: F8, task: Task
 ) -> PlaneModel:
     """Measure what stands above the planes, without walls."""
-    planes = pack_planes(supports)
-    heights = measure_heights(grid, planes, settings.max_height_m)
+    planes, largest_m = pack_planes(supports), task.settings.max_size_m
+    heights = measure_heights(grid, planes, task.settings.max_height_m)
     low_profile = np.zeros(grid.inverse_depth.shape, np.int16)
-    if steps.low_profile:
-        find_low_profile(grid, heights, planes, low_profile, settings.max_size_m)
-    walls = remove_walls(grid, heights.plane_id, up, settings.max_size_m, trials)
+    if task.steps.low_profile:
+        find_low_profile(grid, heights, planes, low_profile, largest_m)
+    walls = remove_walls(grid, heights.plane_id, up, largest_m, trials)
     return PlaneModel(up, supports, planes, heights, low_profile, walls)
 
 
@@ -251,17 +220,15 @@ def _oversegment(grid: DepthGrid, model: PlaneModel, steps: Steps) -> OverSegmen
     return OverSegmentation(graph, labels, segments)
 
 
-def _merge(
-    grid: DepthGrid,
-    model: PlaneModel,
-    oversegmentation: OverSegmentation,
-    steps: Steps,
+def merge_segments(
+    grid: DepthGrid, model: PlaneModel, oversegmentation: OverSegmentation, steps: Steps
 ) -> Bool:
     """Merge the segments of each object; return which are known to be low-profile objects."""
     graph, labels, segments = oversegmentation
     known: Bool = merge_low_profile(segments, model.low_profile, labels, graph.spans)
     if steps.learned_merging:
-        merge_learned(segments, ViewGeometry(grid.intrinsics.fx, model.up[2]), load_trees())
+        view_geometry = ViewGeometry(grid.intrinsics.fx, model.up[2])
+        learned.merge_learned(segments, view_geometry, learned.load_trees())
     if steps.across_occlusion:
         merge_across_occluder(segments, grid.inverse_depth, grid.intrinsics, graph.normal, labels)
     return known
@@ -274,19 +241,10 @@ def _clean_up(
     known: Bool,
     settings: DetectionSettings,
 ) -> I4:
-    """Reject what is no object, and number the others; return their leading oversegmentation."""
+    """Reject what is no object, and number the others; return their representative segments."""
     graph, labels, segments = oversegmentation
-    field = LabelledGrid(
-        grid.inverse_depth,
-        grid.intrinsics,
-        model.planes,
-        model.heights.plane_id,
-        model.walls,
-        labels,
-        graph.spans,
-    )
-    limits = Limits(settings.max_height_m, settings.max_size_m, settings.max_range_m)
-    rejected = is_background(field, segments, model.up, known, limits)
+    features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
+    rejected = find_background(segments, features, settings.max_size_m, structure.load_trees())
     representatives, numbers = _number(segments.parent, rejected)
     relabel(labels, graph.spans, numbers)
     return representatives
@@ -309,22 +267,18 @@ def _fill(
     model: PlaneModel,
     oversegmentation: OverSegmentation,
     representatives: I4,
-    settings: DetectionSettings,
-    steps: Steps,
+    task: Task,
 ) -> Segmentation:
     """Complete the labels near the planes, and measure the objects."""
     _, labels, segments = oversegmentation  # labels of objects, from `_clean_up` on
-    if steps.contact_boundary:
+    if task.steps.contact_boundary:
         fill_contact_boundary(grid.inverse_depth, model.heights, labels)
     filled = np.zeros(labels.shape, np.uint8)
-    if steps.hole_filling:
-        fill_holes(
-            grid.inverse_depth, model.heights.height, labels, representatives.size - 1, filled
-        )
+    if task.steps.hole_filling:
+        fill_holes(grid.inverse_depth, labels, representatives.size - 1, filled)
     filled |= (model.low_profile > 0) & (labels > 0)  # it may lie at the level of its plane
     plane_ids = segments.plane_id[representatives].astype(np.int64) - 1
     plane_ids[0] = 0
-    measured = measure_objects(
-        grid, labels, segments, representatives, model.up, settings.max_range_m
-    )
+    range_m = task.settings.max_range_m
+    measured = measure_objects(grid, labels, segments, representatives, model.up, range_m)
     return Segmentation(model.up, model.supports, model.planes, labels, filled, plane_ids, measured)

@@ -190,18 +190,18 @@ def _predict(
 ) -> None:
     """Write posteriors (n, c) and novelty (n,) of descriptors x (n, d)."""
     columns, mean, scale, spans, bandwidth, level, spread, kernel_starts, kernels = bank
-    roots, feature, split, left, word, rounds = forest
+    trees, word = forest
     categories = posteriors.shape[1]
     features = np.zeros((x.shape[0], linear.shape[1]), np.float32)
     # (1) the probabilistic neural networks, one density per block and category
     write_features(
         x, columns, mean, scale, spans, bandwidth, level, spread, kernel_starts, kernels, features
     )
-    words = np.zeros(roots.size, np.int64)
+    words = np.zeros(trees.roots.size, np.int64)
     logits = np.zeros(bias.size)
     for i in range(x.shape[0]):
         # (2) the dictionary: the leaf of each tree
-        fall(features[i], roots, feature, split, left, word, rounds, words)
+        fall(features[i], trees, word, words)
         # (3) the learners on the words
         for c in range(bias.size):
             logits[c] = bias[c]

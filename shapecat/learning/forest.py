@@ -8,6 +8,7 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, U2, U4, Record, array
 from shapecat.jit import kernel
+from shapecat.trees import LANES, Trees, find_leaves
 
 __all__ = ["FlatForest", "flatten"]
 
@@ -61,28 +62,10 @@ class FlatForest(Record):
         return int(np.count_nonzero(self.left == 0))
 
     @cached_property
-    def parameters(self) -> tuple[np.ndarray, ...]:
-        """The arrays for `fall`; small types keep a large forest in the cache.
-
-        A leaf is its own child, so that trees of different depth are walked side by side.
-        """
-        leaf = self.left == 0
-        left = np.where(leaf, np.arange(self.left.size), self.left).astype(np.int32)
-        threshold = np.where(leaf, np.float32(np.inf), self.threshold).astype(np.float32)
-        groups = np.arange(0, self.roots.size, _LANES)
-        rounds = np.maximum.reduceat(self._depths(), groups)
-        return self.roots, self.feature, threshold, left, self.word, rounds
-
-    def _depths(self) -> I4:
-        """Return (t,) how many comparisons the deepest leaf of each tree needs."""
-        depths, tree = np.zeros(self.roots.size, np.int64), np.arange(self.roots.size)
-        nodes = self.roots.astype(np.int64)
-        while nodes.size:
-            inner = self.left[nodes] > 0
-            nodes, tree = self.left[nodes[inner]].astype(np.int64), tree[inner]
-            depths[tree] += 1
-            nodes, tree = np.concatenate([nodes, nodes + 1]), np.concatenate([tree, tree])
-        return depths
+    def parameters(self) -> tuple[Trees, I4]:
+        """The trees and words of `fall`; small types keep a large forest in the cache."""
+        left = self.left.astype(np.int32)
+        return Trees(self.roots, self.feature, self.threshold, left), self.word
 
     def fall(self, features: F4) -> I4:
         """Return the word of each tree that features (n, f) fall into: (n, t).
@@ -101,34 +84,13 @@ class FlatForest(Record):
         return result
 
 
-_LANES = 16
-"""Trees that are walked at the same time: one waits for memory while the others go on."""
-
-
 @kernel
-def fall(
-    x: F4,
-    roots: I4,
-    feature: I4,
-    threshold: F4,
-    left: I4,
-    word: I4,
-    rounds: I4,
-    result: I4,
-) -> None:
-    """Write the leaf of x (f,) in each tree to result (t,)."""
-    node = np.zeros(_LANES, np.int32)
-    for group in range(rounds.size):
-        first = group * _LANES
-        lanes = min(_LANES, roots.size - first)
-        for k in range(lanes):
-            node[k] = roots[first + k]
-        for _ in range(rounds[group]):
-            for k in range(lanes):
-                here = node[k]
-                node[k] = left[here] + (1 if x[feature[here]] > threshold[here] else 0)
-        for k in range(lanes):
-            result[first + k] = word[node[k]]
+def fall(x: F4, trees: Trees, word: I4, result: I4) -> None:
+    """Write the word that x (f,) falls into in each tree into result (t,)."""
+    leaves = np.zeros(LANES, np.int32)
+    for first in range(0, result.size, LANES):
+        for lane in range(find_leaves(x, trees, first, leaves)):
+            result[first + lane] = word[leaves[lane]]
 
 
 def flatten(trees: Sequence[Any]) -> FlatForest:

@@ -20,7 +20,6 @@ from shapecat.config import DetectionSettings
 from shapecat.detection.depth_grid import DepthGrid, downsample
 from shapecat.detection.merging import learned
 from shapecat.detection.merging.across_occlusion import merge_across_occluder
-from shapecat.detection.merging.learned import BoostedTrees
 from shapecat.detection.merging.low_profile import merge_low_profile
 from shapecat.detection.merging.pair_features import (
     FEATURES,
@@ -30,29 +29,21 @@ from shapecat.detection.merging.pair_features import (
     pair_features,
 )
 from shapecat.detection.merging.segments import Segments, merge
-from shapecat.detection.pipeline import oversegment
-from shapecat.learning.boosting import Tree, TreeSettings, grow_tree, make_bins
+from shapecat.detection.pipeline import Task, oversegment
+from shapecat.models.growing import Growth, grow
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
 from shapecat.simulation.scenes import SceneKind
 from shapecat.simulation.sensors import IDEAL, Sensor
+from shapecat.trees import write_trees
 from shapecat.types import CATEGORIES, Camera
 
-__all__ = ["collect", "grow", "main"]
+__all__ = ["collect", "count_labels", "main"]
 
 _PURE = 0.6
 """A segment belongs to the object that has more than this share of it."""
 _NOISY = replace(IDEAL, noise=0.0015, step=0.0029)
 _BLENDED = replace(IDEAL, noise=0.0015, blend_px=3)
-_RIDGE, _LEAST, _ROWS = 1.0, 2.0, 0.7
 _CHUNK = 25
-
-
-class Growth(NamedTuple):
-    """How many trees are grown, how many leaves each has, and what share of what lacks it adds."""
-
-    rounds: int
-    leaves: int
-    rate: float
 
 
 _FIRST, _MORE = Growth(200, 64, 0.1), Growth(80, 32, 0.05)
@@ -116,11 +107,11 @@ class Pairs(NamedTuple):
 def main(*, share: float, seed: int, jobs: int, out: Path, more: bool) -> None:
     """Simulate, part, grow; write the trees."""
     at_rest = collect(_SERIES, share, jobs)
-    grown = learned.load_trees() if more else grow(at_rest, _FIRST, seed)
+    grown = learned.load_trees() if more else grow(*at_rest, _FIRST, seed)
     settled = collect(_SETTLED, share, jobs)
     pairs = Pairs(*(np.concatenate(both) for both in zip(at_rest, settled, strict=True)))
-    grown = grow(pairs, _MORE, seed, after=grown)
-    np.savez_compressed(out, **grown._asdict())
+    grown = grow(*pairs, _MORE, seed, after=grown)
+    write_trees(out, grown)
     click.echo(f"{len(pairs.same)} pairs, {pairs.same.mean():.0%} of one object; {out}")
 
 
@@ -167,13 +158,13 @@ def _pairs(
     grid = downsample(depth, camera, range_m=settings.max_range_m)
     if grid is None:
         return
-    found = oversegment(grid, settings=settings, rng=rng)
+    found = oversegment(grid, Task(settings, rng))
     if found is None:
         return
     ground, (graph, labels, segments) = found
     merge_low_profile(segments, ground.low_profile, labels, graph.spans)
     merge_across_occluder(segments, grid.inverse_depth, grid.intrinsics, graph.normal, labels)
-    counts = _count(owners.reshape(depth.shape), labels, grid)
+    counts = count_labels(owners.reshape(depth.shape), labels, grid)
     view_geometry, seen = ViewGeometry(grid.intrinsics.fx, float(ground.up[2])), set()
     while True:
         rows, whose = _whose(segments, counts, things)
@@ -192,7 +183,7 @@ def _pairs(
         merge(segments, *todo[rng.integers(len(todo))])
 
 
-def _count(owners: U1, labels: I4, grid: DepthGrid) -> I4:
+def count_labels(owners: U1, labels: I4, grid: DepthGrid) -> I4:
     """Return (segments, labels) how many cells of each segment show each label."""
     middle, (rows, columns) = grid.factor // 2, labels.shape
     seen = owners[middle :: grid.factor, middle :: grid.factor][:rows, :columns]
@@ -222,67 +213,6 @@ def _meeting(segments: Segments, whose: I4) -> Iterator[tuple[int, int]]:
             known = min(whose[p], whose[q]) >= 0 and max(whose[p], whose[q]) > 0
             if known and are_adjacent(segments, p, q):
                 yield p, q
-
-
-def grow(
-    pairs: Pairs, growth: Growth, seed: int, *, after: BoostedTrees | None = None
-) -> BoostedTrees:
-    """Grow trees on pairs: gradient boosting with the cross entropy (Friedman 2001).
-
-    They add to what the trees ``after`` which they are grown tell.
-    """
-    rng = np.random.default_rng(seed)
-    bins, n = make_bins(pairs.features), len(pairs.same)
-    share = pairs.same.mean()
-    first = after or _joined([_leaf(float(np.log(share / (1 - share))))])
-    logit = _logits(first, pairs.features)
-    settings = TreeSettings(growth.leaves, growth.rate, _RIDGE, _LEAST)
-    grown: list[Tree] = []
-    columns = np.arange(FEATURES)
-    for _ in range(growth.rounds):
-        posterior = 1 / (1 + np.exp(-logit))
-        rows = np.sort(rng.permutation(n)[: round(_ROWS * n)]).astype(np.int32)
-        slope, bend = posterior - pairs.same, posterior * (1 - posterior)
-        grown.append(grow_tree(bins, columns, rows, slope, bend, settings, logit))
-    return _appended(first, _joined(grown))
-
-
-def _logits(trees: BoostedTrees, features: F4) -> F4:
-    """Return what all trees together say of each pair, (n,)."""
-    logit, rows = np.zeros(len(features), np.float32), np.arange(len(features))
-    for root in trees.roots:
-        node = np.full(len(features), root)
-        while (inner := trees.left[node] > 0).any():
-            right = features[rows, trees.feature[node]] > trees.threshold[node]
-            node = np.where(inner, trees.left[node] + right, node)
-        logit += trees.value[node]
-    return logit
-
-
-def _appended(first: BoostedTrees, more: BoostedTrees) -> BoostedTrees:
-    count = len(first.value)
-    left = np.where(more.left > 0, more.left + count, 0).astype(np.int32)
-    later = more._replace(roots=(more.roots + count).astype(np.int32), left=left)
-    return BoostedTrees(*(np.concatenate(both) for both in zip(first, later, strict=True)))
-
-
-def _leaf(value: float) -> Tree:
-    """Return a tree that adds the same to all."""
-    none = np.zeros(1, np.int64)
-    return Tree(none, np.zeros(1, np.float32), none, np.array([value], np.float32))
-
-
-def _joined(grown: Sequence[Tree]) -> BoostedTrees:
-    """Put the nodes of all trees behind each other."""
-    roots = np.cumsum([0, *(len(tree.left) for tree in grown)])
-    left = [np.where(t.left > 0, t.left + root, 0) for t, root in zip(grown, roots, strict=False)]
-    return BoostedTrees(
-        roots[:-1].astype(np.int32),
-        np.concatenate([tree.feature for tree in grown]).astype(np.int16),
-        np.concatenate([tree.threshold for tree in grown]).astype(np.float32),
-        np.concatenate(left).astype(np.int32),
-        np.concatenate([tree.value for tree in grown]).astype(np.float32),
-    )
 
 
 if __name__ == "__main__":

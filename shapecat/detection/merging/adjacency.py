@@ -5,13 +5,14 @@ import math
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
+from shapecat.detection.connected_components import DOWN, RIGHT
 from shapecat.detection.merging.segments import (
     UPWARD,
     Segments,
     choose_samples,
 )
 from shapecat.detection.planes.height_map import HeightMap
-from shapecat.detection.segmentation.connectivity import DOWN, RIGHT, SurfaceGraph
+from shapecat.detection.segmentation.connectivity import SurfaceGraph
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 

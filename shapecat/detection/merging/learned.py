@@ -9,12 +9,10 @@ features together tell them from what only touches or stands on it, and no few o
 
 from functools import cache
 from importlib.resources import files
-from io import BytesIO
-from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, I4
+from shapecat.arrays import F4
 from shapecat.detection.merging.pair_features import (
     PAIR_FEATURES,
     ViewGeometry,
@@ -23,8 +21,9 @@ from shapecat.detection.merging.pair_features import (
 )
 from shapecat.detection.merging.segments import Records, Segments, merge
 from shapecat.jit import kernel
+from shapecat.trees import BoostedTrees, logit_of, read_trees
 
-__all__ = ["FILE", "BoostedTrees", "load_trees", "logit_of", "merge_learned"]
+__all__ = ["FILE", "HOPELESS", "load_trees", "merge_learned"]
 
 FILE = "parts.npz"
 LIKELY = 0.3
@@ -32,34 +31,12 @@ LIKELY = 0.3
 two objects, a missing one seldom one."""
 HOPELESS = -4.0
 """Logit of the first trees that the others never made up for; half of the pairs end so early."""
-LANES = 8
-"""Trees that are walked at the same time: one waits for memory while the others go on."""
-
-
-class BoostedTrees(NamedTuple):
-    """Boosted trees, whose leaves add up to the logit that two segments are parts of one object.
-
-    Attributes
-    ----------
-    roots : (t,) first node of each tree.
-    feature, threshold : (m,) a pair goes left where this feature is <= this.
-    left : (m,) the left child, the right one stands behind it; 0 in leaves.
-    value : (m,) what a leaf adds.
-    """
-
-    roots: I4
-    feature: I4
-    threshold: F4
-    left: I4
-    value: F4
 
 
 @cache
 def load_trees() -> BoostedTrees:
     """Return the trees that belong to this version."""
-    content = files("shapecat.detection.merging").joinpath(FILE).read_bytes()
-    with np.load(BytesIO(content), allow_pickle=False) as arrays:
-        return BoostedTrees(*(arrays[name] for name in BoostedTrees._fields))
+    return read_trees(files("shapecat.detection.merging").joinpath(FILE).read_bytes())
 
 
 def merge_learned(segments: Segments, view_geometry: ViewGeometry, grown: BoostedTrees) -> None:
@@ -76,49 +53,23 @@ def _merge(
     named: Records,
     features: F4,
 ) -> None:
-    """Do what `merge_learned` does; ``named`` and ``features`` are room, the same one."""
+    """Do what `merge_learned` does; ``named`` and ``features`` are scratch, the same one."""
     n = segments.parent.size
     logits = np.full((n, n), -np.inf)
-    for p in range(1, n):
-        for q in range(p + 1, n):
-            if are_adjacent(segments, p, q):
-                pair_features(segments, p, q, view_geometry, named[0])
-                logits[p, q] = logit_of(grown, features)
+    changed = np.ones(n, np.bool_)  # what has to be asked for
     while True:
+        for p in range(1, n):
+            for q in range(p + 1, n):
+                if not (changed[p] or changed[q]):
+                    continue
+                logits[p, q] = -np.inf
+                if are_adjacent(segments, p, q):
+                    pair_features(segments, p, q, view_geometry, named[0])
+                    logits[p, q] = logit_of(grown, features, HOPELESS)
         best = np.argmax(logits)
         p, q = int(best // n), int(best % n)
         if logits[p, q] < LIKELY:
             return
         merge(segments, p, q)
-        for k in range(1, n):
-            logits[q, k] = logits[k, q] = logits[k, p] = logits[p, k] = -np.inf
-            if are_adjacent(segments, p, k):
-                pair_features(segments, p, k, view_geometry, named[0])
-                logits[min(p, k), max(p, k)] = logit_of(grown, features)
-
-
-@kernel
-def logit_of(grown: BoostedTrees, features: F4) -> float:
-    """Return the logit that a pair with these features (n,) is of one object."""
-    roots, value = grown.roots, grown.value
-    feature, threshold, children = grown.feature, grown.threshold, grown.left
-    nodes = np.zeros(LANES, np.int32)
-    logit = 0.0
-    for first in range(0, roots.size, LANES):
-        lanes = min(LANES, roots.size - first)
-        for lane in range(lanes):
-            nodes[lane] = roots[first + lane]
-        inner = True
-        while inner:  # one level down in each tree
-            inner = False
-            for lane in range(LANES):
-                node = np.uint32(nodes[lane])  # unsigned: it cannot count from the end
-                left = children[node]
-                right = features[np.uint16(feature[node])] > threshold[node]
-                nodes[lane] = left + np.int32(right) if left > 0 else nodes[lane]
-                inner |= left > 0
-        for lane in range(lanes):
-            logit += value[nodes[lane]]
-            if logit < HOPELESS:
-                return float(logit)
-    return float(logit)
+        changed[:] = False
+        changed[p] = changed[q] = True

@@ -9,14 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.detection.merging.segment_features import (
-    TOP_DEPTH_M,
+    SEGMENT_FEATURES,
     depth_difference,
     lateral_curvature,
     lateral_distance,
     normal_position_correlation,
-    top_area_share,
-    top_band,
+    share,
     width_of,
+    write_segment_features,
 )
 from shapecat.detection.merging.segments import (
     FEW,
@@ -46,28 +46,6 @@ _ADJACENCY = np.dtype(
     ]
 )
 """What is where two segments meet."""
-_SEGMENT = np.dtype(
-    [
-        ("width_m", "f4"),
-        ("top_m", "f4"),
-        ("bottom_m", "f4"),
-        ("height_m", "f4"),
-        ("lateral_curvature", "f4"),
-        ("normal_position_correlation", "f4"),
-        ("plane_contact", "f4"),  # shares of the outline
-        ("hidden", "f4"),
-        ("shelf_edge", "f4"),
-        ("upper_silhouette", "f4"),
-        ("touching", "f4"),
-        ("in_front", "f4"),
-        ("behind", "f4"),
-        ("top_area", "f4"),  # by the width squared
-        ("facing_up", "f4"),  # share of the area
-        ("area_m2", "f4"),
-        ("filled", "f4"),  # area by width and height
-    ]
-)
-"""What one segment looks like, and what its outline is made of."""
 _RELATION = np.dtype(
     [
         ("area_ratio", "f4"),
@@ -93,8 +71,8 @@ _RELATION = np.dtype(
 PAIR_FEATURES = np.dtype(
     [
         ("adjacency", _ADJACENCY),
-        ("first", _SEGMENT),
-        ("second", _SEGMENT),
+        ("first", SEGMENT_FEATURES),
+        ("second", SEGMENT_FEATURES),
         ("relation", _RELATION),
     ]
 )
@@ -151,8 +129,8 @@ def pair_features(
     a, b = segments.statistics[p], segments.statistics[q]
     cell = a.depth_sum / a.count / view_geometry.focal
     _write_adjacency(segments, p, q, cell, out.adjacency)
-    _write_segment(segments, p, out.first)
-    _write_segment(segments, q, out.second)
+    write_segment_features(segments, p, out.first)
+    write_segment_features(segments, q, out.second)
     relation = out.relation
     _write_relation(a, b, relation)
     both = np.zeros(1, SEGMENT)[0]
@@ -170,13 +148,13 @@ def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) 
     met = pair.contact + pair.near + pair.in_front + back.in_front
     surface = pair.contact + pair.near
     out.contact_m = pair.contact * cell
-    out.contact = _share(pair.contact, met)
-    out.first_in_front = _share(pair.in_front, met)
-    out.second_in_front = _share(back.in_front, met)
-    out.along_first = _share(surface, segments.statistics[p].boundary)
-    out.along_second = _share(surface, segments.statistics[q].boundary)
-    out.second_faces_up = _share(pair.rests_on, pair.contact)
-    out.first_faces_up = _share(back.rests_on, pair.contact)
+    out.contact = share(pair.contact, met)
+    out.first_in_front = share(pair.in_front, met)
+    out.second_in_front = share(back.in_front, met)
+    out.along_first = share(surface, segments.statistics[p].boundary)
+    out.along_second = share(surface, segments.statistics[q].boundary)
+    out.second_faces_up = share(pair.rests_on, pair.contact)
+    out.first_faces_up = share(back.rests_on, pair.contact)
     out.above_second_m = _above_top(segments, p, q)
     out.above_first_m = _above_top(segments, q, p)
     out.border_m = met * cell
@@ -192,51 +170,18 @@ def _above_top(segments: Segments, p: int, q: int) -> float:
 
 
 @kernel
-def _write_segment(segments: Segments, p: int, out: Row) -> None:
-    row = segments.statistics[p]
-    around = row.boundary
-    front = back = touch = up = 0.0
-    for k in range(segments.parent.size):
-        front += segments.pairs[p, k].in_front
-        back += segments.pairs[k, p].in_front
-        touch += segments.pairs[p, k].contact
-    for band in range(top_band(row) + 1):
-        up += segments.top_area[p, band]
-    wide, tall = width_of(row), row.top - row.bottom
-    out.width_m, out.top_m, out.bottom_m, out.height_m = wide, row.top, row.bottom, tall
-    out.lateral_curvature = lateral_curvature(row)
-    out.normal_position_correlation = normal_position_correlation(row)
-    out.plane_contact = _share(row.plane_contact, around)
-    out.hidden = _share(row.hidden, around)
-    out.shelf_edge = _share(row.shelf_edge, around)
-    out.upper_silhouette = _share(row.upper_silhouette, around)
-    out.touching = _share(touch, around)
-    out.in_front = _share(front, around)
-    out.behind = _share(back, around)
-    out.top_area = top_area_share(segments, p, TOP_DEPTH_M)
-    out.facing_up = _share(up, row.area)
-    out.area_m2 = row.area
-    out.filled = _share(row.area, wide * tall)
-
-
-@kernel
 def _write_relation(a: Row, b: Row, out: Row) -> None:
     narrow, wide = width_of(a), width_of(b)
     most = max(narrow, wide)
     left, right = b.left - a.left, a.right - b.right
     common = min(a.right, b.right) - max(a.left, b.left)
-    out.area_ratio, out.width_ratio = _share(a.area, b.area), _share(narrow, wide)
-    out.lateral_distance = _share(lateral_distance(a, b), most)
+    out.area_ratio, out.width_ratio = share(a.area, b.area), share(narrow, wide)
+    out.lateral_distance = share(lateral_distance(a, b), most)
     out.depth_difference_m = depth_difference(a, b)
-    out.depth_difference = _share(depth_difference(a, b), most)
-    out.overlap = _share(common, min(narrow, wide))
+    out.depth_difference = share(depth_difference(a, b), most)
+    out.overlap = share(common, min(narrow, wide))
     out.top_over_top_m = a.top - b.top
     out.bottom_over_top_m = a.bottom - b.top
     out.other_bottom_over_top_m = b.bottom - a.top
     out.bottom_over_bottom_m = a.bottom - b.bottom
     out.most_beyond_m, out.least_beyond_m = max(left, right), min(left, right)
-
-
-@kernel
-def _share(part: float, whole: float) -> float:
-    return float(part / whole) if whole > 0 else 0.0

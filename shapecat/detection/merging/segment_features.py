@@ -8,18 +8,40 @@ from shapecat.detection.merging.segments import BAND_M, BANDS, Row, Segments
 from shapecat.jit import kernel
 
 __all__ = [
-    "TOP_DEPTH_M",
+    "SEGMENT_FEATURES",
     "depth_difference",
     "lateral_curvature",
     "lateral_distance",
     "normal_position_correlation",
-    "top_area_share",
-    "top_band",
+    "share",
     "width_of",
+    "write_segment_features",
 ]
 
-TOP_DEPTH_M = 0.02
-"""A top is closed by what faces up within this depth of it."""
+SEGMENT_FEATURES = np.dtype(
+    [
+        ("width_m", "f4"),
+        ("top_m", "f4"),
+        ("bottom_m", "f4"),
+        ("height_m", "f4"),
+        ("lateral_curvature", "f4"),
+        ("normal_position_correlation", "f4"),
+        ("plane_contact", "f4"),  # shares of the outline
+        ("hidden", "f4"),
+        ("shelf_edge", "f4"),
+        ("upper_silhouette", "f4"),
+        ("touching", "f4"),
+        ("in_front", "f4"),
+        ("behind", "f4"),
+        ("top_area", "f4"),  # by the width squared
+        ("facing_up", "f4"),  # share of the area
+        ("area_m2", "f4"),
+        ("filled", "f4"),  # area by width and height
+    ]
+)
+"""What one segment looks like, and what its outline is made of."""
+TOP_BANDS = 4
+"""A top is closed by what faces up within 2 cm of it, in bands of height."""
 
 
 @kernel
@@ -71,17 +93,37 @@ def _moments(row: Row) -> tuple[float, float, float]:
 
 
 @kernel
-def top_area_share(segments: Segments, p: int, depth: float) -> float:
-    """Return what faces up within ``depth`` of the top of a segment, by its width squared."""
+def write_segment_features(segments: Segments, p: int, out: Row) -> None:
+    """Write the `SEGMENT_FEATURES` of a segment to a record of them."""
     row = segments.statistics[p]
-    top = top_band(row)
-    area = 0.0
-    for band in range(max(top - int(depth / BAND_M), 0), top + 1):
-        area += segments.top_area[p, band]
-    return float(area / max(width_of(row) ** 2, 1e-9))
+    around = row.boundary
+    front = back = touch = up = closed = 0.0
+    for k in range(segments.parent.size):
+        front += segments.pairs[p, k].in_front
+        back += segments.pairs[k, p].in_front
+        touch += segments.pairs[p, k].contact
+    top = min(int(row.top / BAND_M), BANDS - 1)
+    for band in range(top + 1):
+        up += segments.top_area[p, band]
+        closed += segments.top_area[p, band] if band >= top - TOP_BANDS else 0.0
+    wide, tall = width_of(row), row.top - row.bottom
+    out.width_m, out.top_m, out.bottom_m, out.height_m = wide, row.top, row.bottom, tall
+    out.lateral_curvature = lateral_curvature(row)
+    out.normal_position_correlation = normal_position_correlation(row)
+    out.plane_contact = share(row.plane_contact, around)
+    out.hidden = share(row.hidden, around)
+    out.shelf_edge = share(row.shelf_edge, around)
+    out.upper_silhouette = share(row.upper_silhouette, around)
+    out.touching = share(touch, around)
+    out.in_front = share(front, around)
+    out.behind = share(back, around)
+    out.top_area = closed / max(wide**2, 1e-9)
+    out.facing_up = share(up, row.area)
+    out.area_m2 = row.area
+    out.filled = share(row.area, wide * tall)
 
 
 @kernel
-def top_band(row: Row) -> int:
-    """Return the last band of height in which a segment has anything."""
-    return min(int(row.top / BAND_M), BANDS - 1)
+def share(part: float, whole: float) -> float:
+    """Return a part by the whole, 0 if there is none."""
+    return float(part / whole) if whole > 0 else 0.0

@@ -26,7 +26,6 @@ __all__ = [
     "add_statistics",
     "choose_samples",
     "depth_of",
-    "depths_of",
     "is_root",
     "lateral_axis",
     "may_merge",
@@ -296,15 +295,6 @@ def depth_of(segments: Segments, p: int) -> float:
     """Return the mean depth of a segment, metres; 1 where it has no cell."""
     count = segments.statistics[p].count
     return float(segments.statistics[p].depth_sum / count) if count > 0 else 1.0
-
-
-@kernel
-def depths_of(segments: Segments) -> F4:
-    """Return `depth_of` all segments."""
-    depths = np.zeros(segments.parent.size, np.float32)
-    for p in range(depths.size):
-        depths[p] = depth_of(segments, p)
-    return depths
 
 
 @kernel

@@ -7,10 +7,10 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, U4
 from shapecat.detection.cleanup.holes import FRINGE
+from shapecat.detection.connected_components import span_of
 from shapecat.detection.depth_grid import DepthGrid, row_and_column
 from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M
 from shapecat.detection.records import Segmentation
-from shapecat.detection.segmentation.connectivity import span_of
 from shapecat.geometry import DISCONTINUITY, NEAREST_M
 from shapecat.jit import kernel
 

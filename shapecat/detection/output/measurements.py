@@ -1,11 +1,11 @@
 """Measurements of labelled cells: boxes, what each object stands on, and flags."""
 
-import math
-from typing import NamedTuple, TypeAlias
+from typing import NamedTuple
 
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, Bool
+from shapecat.detection.connected_components import span_of
 from shapecat.detection.depth_grid import (
     DepthGrid,
     PinholeIntrinsics,
@@ -15,28 +15,21 @@ from shapecat.detection.depth_grid import (
 from shapecat.detection.merging.segments import (
     FEW,
     Segments,
-    depths_of,
+    depth_of,
 )
-from shapecat.detection.segmentation.connectivity import span_of
-from shapecat.geometry import level_axes, row_quaternion
+from shapecat.geometry import level_axes, level_box
 from shapecat.jit import kernel
 
 __all__ = ["ObjectMeasurements", "measure_objects"]
 
 OCCLUDED = 0.12
 """Share of the boundary behind something nearer that makes an object occluded."""
-YAWS = np.arange(60) * (np.pi / 120)
-COS, SIN = np.cos(YAWS).astype(np.float32), np.sin(YAWS).astype(np.float32)
 GAP_M, OVERLAP_M = 0.025, 0.04
 """How far the bottom of an object may seem to be above and below the top of what it stands on: what
 is below is hidden, and a strip of it may go with the object."""
 LIFTED_M, SUNK_M = 0.03, 0.015
 """What reaches no lower does not stand on the plane; what reaches this much lower than a surface
 does not stand on that."""
-
-
-Turned: TypeAlias = tuple[float, float, float, float]
-"""A quaternion (x, y, z, w)."""
 
 
 class ObjectMeasurements(NamedTuple):
@@ -95,13 +88,11 @@ def measure_objects(
         np.array(level_axes(up[0], up[1], up[2])),
         measured,
     )
-    last, depth = (
-        count_at_range_limit(grid.inverse_depth, labels, representatives.size, range_m),
-        depths_of(segments),
-    )
+    last = count_at_range_limit(grid.inverse_depth, labels, representatives.size, range_m)
     for k in range(count):
         p = representatives[k + 1]
-        measured.last[k], measured.least[k] = last[k + 1] >= FEW, smallest_object_at(grid, depth[p])
+        measured.last[k] = last[k + 1] >= FEW
+        measured.least[k] = smallest_object_at(grid, depth_of(segments, p))
         measured.supported_by[k], measured.support_m[k] = _supporting_object(
             segments, representatives, p
         )
@@ -171,16 +162,10 @@ def _measure_boxes(
     measured: ObjectMeasurements,
 ) -> None:
     points, start = _outer_points(inv_depth, intrinsics, labels, level, measured)
-    back = level.T
-    turned = row_quaternion(
-        (back[0, 0], back[0, 1], back[0, 2]),
-        (back[1, 0], back[1, 1], back[1, 2]),
-        (back[2, 0], back[2, 1], back[2, 2]),
-    )
-    span = np.zeros(4 * YAWS.size, np.float32)
     for k in range(start.size - 1):
         if start[k] < start[k + 1]:
-            _measure_box(points, start[k], start[k + 1], level, turned, measured, k, span)
+            box = level_box(points[:, start[k] : start[k + 1]], level)
+            measured.center[k], measured.size[k], measured.orientation[k] = box
 
 
 @kernel(fast=True)
@@ -247,70 +232,3 @@ def _find_outer(labels: I4, i: int, first: int, end: int, outer: Bool) -> None:
     if i % 4 == 0:
         for j in range(first + -first % 4, end, 4):
             outer[j] = labels[i, j] > 0
-
-
-@kernel(fast=True)
-def _measure_box(
-    local: F4,
-    first: int,
-    end: int,
-    level: F8,
-    turned: Turned,
-    measured: ObjectMeasurements,
-    k: int,
-    span: F4,
-) -> None:
-    """Write the box of least area around some of the points (3, n), level frame."""
-    zs = local[2, first:end]
-    _span_of(local[0, first:end], local[1, first:end], span)
-    least = np.inf
-    left = right = back = front = yaw = 0.0
-    for t in range(YAWS.size):
-        x0, x1 = span[t], span[t + YAWS.size]
-        y0, y1 = span[t + 2 * YAWS.size], span[t + 3 * YAWS.size]
-        if (x1 - x0) * (y1 - y0) < least:
-            least = (x1 - x0) * (y1 - y0)
-            left, right, back, front, yaw = float(x0), float(x1), float(y0), float(y1), YAWS[t]
-    z0 = z1 = zs[0]
-    for n in range(zs.size):
-        z0 = zs[n] if zs[n] < z0 else z0
-        z1 = zs[n] if zs[n] > z1 else z1
-    bottom, top = np.float64(z0), np.float64(z1)
-    measured.size[k] = right - left, front - back, top - bottom
-    u, v, h = (left + right) / 2, (back + front) / 2, (bottom + top) / 2
-    cos, sin = math.cos(yaw), math.sin(yaw)
-    x, y = cos * u - sin * v, sin * u + cos * v
-    for d in range(3):
-        measured.center[k, d] = x * level[0, d] + y * level[1, d] + h * level[2, d]
-    # The axes of the box are the level axes turned by yaw: q = q_level * q_yaw.
-    x, y, z, qw = turned
-    cos, sin = math.cos(yaw / 2), math.sin(yaw / 2)
-    if qw * cos < z * sin:
-        cos, sin = -cos, -sin
-    measured.orientation[k, 0] = x * cos + y * sin
-    measured.orientation[k, 1] = y * cos - x * sin
-    measured.orientation[k, 2] = z * cos + qw * sin
-    measured.orientation[k, 3] = qw * cos - z * sin
-
-
-@kernel(fast=True)
-def _span_of(xs: F4, ys: F4, span: F4) -> None:
-    """Write for each yaw the least and greatest place of points along it, and the same across it.
-
-    All yaws are turned to at once, one point after the other: this vectorises.
-    """
-    n = YAWS.size
-    span[:n], span[n : 2 * n], span[2 * n : 3 * n], span[3 * n :] = (
-        np.inf,
-        -np.inf,
-        np.inf,
-        -np.inf,
-    )
-    for k in range(xs.size):
-        x, y = xs[k], ys[k]
-        for t in range(n):
-            u, v = COS[t] * x + SIN[t] * y, COS[t] * y - SIN[t] * x
-            span[t] = u if u < span[t] else span[t]
-            span[t + n] = u if u > span[t + n] else span[t + n]
-            span[t + 2 * n] = v if v < span[t + 2 * n] else span[t + 2 * n]
-            span[t + 3 * n] = v if v > span[t + 3 * n] else span[t + 3 * n]

@@ -9,16 +9,15 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, I4, U1
+from shapecat.detection.connected_components import DOWN, RIGHT, spans_of
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.normals import fit_local_planes, padded
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel, unset
 
-__all__ = ["DOWN", "RIGHT", "SurfaceGraph", "connect_surfaces", "span_of"]
+__all__ = ["SurfaceGraph", "connect_surfaces"]
 
-RIGHT, DOWN = 1, 2
-"""Bits of `SurfaceGraph.links`."""
 BENT = 4
 """The same bits times this mark, for a time, the links that only a local plane tells."""
 BASE, BASE_DIAGONAL = 3, 2
@@ -63,7 +62,7 @@ class FlatGraph(NamedTuple):
 def connect_surfaces(grid: DepthGrid, heights: HeightMap) -> SurfaceGraph:
     """Fit local planes to the object cells, link them and measure concave angles."""
     inv_depth, intrinsics, plane_id = grid.inverse_depth, grid.intrinsics, heights.plane_id
-    spans = _spans_of(plane_id)
+    spans = spans_of(plane_id)
     columns = inv_depth.shape[1]
     local_plane, normal = _cleared(spans, columns), _cleared(spans, columns)
     fit_local_planes(inv_depth, intrinsics, plane_id, spans, local_plane, normal)
@@ -72,31 +71,6 @@ def connect_surfaces(grid: DepthGrid, heights: HeightMap) -> SurfaceGraph:
     graph = SurfaceGraph(local_plane, normal, links, np.zeros(inv_depth.shape, np.uint8), spans)
     _measure_concavity(inv_depth, intrinsics, graph)
     return graph
-
-
-@kernel
-def _spans_of(plane_id: I4) -> I4:
-    """Return the spans of `SurfaceGraph`: of the numbers above 0 in each row."""
-    spans = np.zeros((plane_id.shape[0], 2), np.int32)
-    for i in range(len(spans)):
-        spans[i, 0], spans[i, 1] = span_of(plane_id[i])
-    return spans
-
-
-@kernel
-def span_of(row: I4) -> tuple[int, int]:
-    """Return the columns of the first number above 0 of a row and after the last, or 0 and 0."""
-    some = False
-    for j in range(row.size):
-        some |= row[j] > 0  # many rows have none, and this vectorises
-    if not some:
-        return 0, 0
-    start, end = 0, row.size
-    while row[start] <= 0:
-        start += 1
-    while row[end - 1] <= 0:
-        end -= 1
-    return start, end
 
 
 @kernel

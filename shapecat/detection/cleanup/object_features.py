@@ -1,0 +1,187 @@
+"""Object features: what tells an object from background structure and noise, by name.
+
+What a segment looks like, where it ends, and what it goes on in: walls of bins lie at the outline
+of their bottom, walls of rooms go on where no plane reaches, arms are cut by the image border.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, I4, U1, Bool
+from shapecat.detection.connected_components import SIDES
+from shapecat.detection.depth_grid import DepthGrid, row_and_column
+from shapecat.detection.foreground.walls import CLEARED, ON_WALL
+from shapecat.detection.merging.segment_features import (
+    SEGMENT_FEATURES,
+    share,
+    write_segment_features,
+)
+from shapecat.detection.merging.segments import Records, Row, Segments, depth_of, is_root
+from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN
+from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M
+from shapecat.detection.records import OverSegmentation, PlaneModel
+from shapecat.geometry import DISCONTINUITY
+from shapecat.jit import kernel
+
+__all__ = ["OBJECT_FEATURES", "measure_object_features"]
+
+_SURROUNDINGS = np.dtype(
+    [
+        ("image_border", "f4"),  # cells at the border, by the outline of a square as large
+        ("range_limit", "f4"),  # shares of the cells: the last before the end of the range,
+        ("on_wall", "f4"),  # and on walls
+        ("beyond", "f4"),  # shares of the boundary: surface goes on where no plane is,
+        ("into_wall", "f4"),  # and in a wall
+        ("least_outside_m", "f4"),  # how far samples are outside the outline of the plane
+        ("mean_outside_m", "f4"),
+        ("most_outside_m", "f4"),
+        ("low_profile", "f4"),  # 1 if it is known as a low-profile object
+    ]
+)
+"""Where something ends, and what it goes on in."""
+_VISIBILITY = np.dtype(
+    [
+        ("cells", "f4"),
+        ("depth_m", "f4"),
+        ("cell_m", "f4"),
+        ("down", "f4"),  # cosine between the optical axis and up
+        ("top_by_noise", "f4"),  # by the least height of an object cell at that distance
+        ("slant", "f4"),  # area by what it covers of the view
+        ("ragged", "f4"),  # boundary squared by cells: 16 for a square
+    ]
+)
+"""How well something is seen."""
+OBJECT_FEATURES = np.dtype(
+    [("segment", SEGMENT_FEATURES), ("surroundings", _SURROUNDINGS), ("visibility", _VISIBILITY)]
+)
+"""The features of what may be an object, all float32: lengths in metres, or shares.
+
+The trees number them in this order.
+"""
+MARGIN = 0.08
+"""Share of the image that sensors leave empty at most at its border."""
+
+
+class LabelledGrid(NamedTuple):
+    """What is known of the samples: see `DepthGrid`, `PlaneModel` and `OverSegmentation`.
+
+    ``owner`` (n + 1,) is the segment that each label has been merged into.
+    """
+
+    inverse_depth: F4
+    planes: F8
+    plane_id: I4
+    walls: U1
+    labels: I4
+    spans: I4
+    owner: I4
+
+
+def measure_object_features(
+    grid: DepthGrid,
+    model: PlaneModel,
+    oversegmentation: OverSegmentation,
+    low_profile: Bool,
+    range_m: float,
+) -> Records:
+    """Return (n + 1,) the `OBJECT_FEATURES` of merged segments; 0 of what was merged into them.
+
+    ``low_profile`` (n + 1,) tells the known low-profile objects, from `merge_low_profile`.
+    """
+    graph, labels, segments = oversegmentation
+    features = np.zeros(segments.parent.size, OBJECT_FEATURES)
+    rows = features["surroundings"]
+    rows["low_profile"] = low_profile
+    seen = grid.inverse_depth, model.planes, model.heights.plane_id, model.walls
+    field = LabelledGrid(*seen, labels, graph.spans, segments.parent)
+    _count_cells(field, _border_lines(grid), 1 / range_m + DISCONTINUITY / 2, rows)
+    _measure(grid, model.planes, segments, model.up[2], features)
+    return features
+
+
+def _border_lines(grid: DepthGrid) -> tuple[int, int, int, int]:
+    """Return the first and last row, and column, with samples; -1 if that is no image border."""
+    lines = []
+    for axis in range(2):
+        count = grid.inverse_depth.shape[axis]
+        seen = np.flatnonzero((grid.inverse_depth > 0).any(axis=1 - axis))
+        first, last = (int(seen[0]), int(seen[-1])) if seen.size else (count, -1)
+        lines += [first if first <= MARGIN * count else -1]
+        lines += [last if last >= (1 - MARGIN) * count - 1 else -1]
+    return lines[0], lines[1], lines[2], lines[3]
+
+
+@kernel
+def _count_cells(
+    field: LabelledGrid, border: tuple[int, int, int, int], last: float, rows: Records
+) -> None:
+    """Count the cells of each segment at borders and on walls, and where its surface goes on.
+
+    ``last`` is the inverse depth of what ends with the range; ``rows`` are of `_SURROUNDINGS`.
+    """
+    inv_depth, plane_id, labels = field.inverse_depth, field.plane_id, field.labels
+    top, bottom, left, right = border
+    for i in range(labels.shape[0]):
+        for j in range(field.spans[i, 0], field.spans[i, 1]):
+            if labels[i, j] == 0:
+                continue
+            row, here = rows[field.owner[labels[i, j]]], inv_depth[i, j]
+            row.image_border += (i == top) | (i == bottom) | (j == left) | (j == right)
+            row.range_limit += here < last
+            row.on_wall += field.walls[i, j] == ON_WALL
+            for di, dj in SIDES:
+                y, x = i + di, j + dj
+                if y < 0 or x < 0 or y >= labels.shape[0] or x >= labels.shape[1]:
+                    continue
+                if plane_id[y, x] != 0 or abs(inv_depth[y, x] - here) >= DISCONTINUITY:
+                    continue
+                plane = field.planes[plane_id[i, j] - 1]
+                if inv_depth[y, x] > max(plane[0] * x + plane[1] * y + plane[2], 0):
+                    row.into_wall += field.walls[y, x] == CLEARED
+                    row.beyond += field.walls[y, x] != CLEARED
+
+
+@kernel
+def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: Records) -> None:
+    """Write the features of segments, whose cells are counted."""
+    for p in range(1, segments.parent.size):
+        if not is_root(segments, p):
+            continue
+        shape, around, seen = segments.statistics[p], out[p].surroundings, out[p].visibility
+        depth = depth_of(segments, p)
+        cell = depth / grid.intrinsics.fx
+        write_segment_features(segments, p, out[p].segment)
+        around.image_border = share(around.image_border, 4 * math.sqrt(shape.count))
+        around.range_limit = share(around.range_limit, shape.count)
+        around.on_wall = share(around.on_wall, shape.count)
+        around.beyond = share(around.beyond, shape.boundary)
+        around.into_wall = share(around.into_wall, shape.boundary)
+        _measure_outside(grid, planes[segments.plane_id[p] - 1], segments.samples[p], around)
+        seen.cells, seen.depth_m, seen.cell_m, seen.down = shape.count, depth, cell, down
+        seen.top_by_noise = shape.top / (MIN_HEIGHT_M + HEIGHT_NOISE * depth * depth)
+        seen.slant = share(shape.area, shape.count * cell * depth / grid.intrinsics.fy)
+        seen.ragged = share(shape.boundary * shape.boundary, shape.count)
+
+
+@kernel
+def _measure_outside(grid: DepthGrid, plane: F8, samples: I4, out: Row) -> None:
+    """Write how far samples are outside the outline of a row of `pack_planes`, inside negative."""
+    intrinsics, total, n = grid.intrinsics, 0.0, 0
+    for s in samples:
+        if s < 0:
+            break
+        i, j = row_and_column(s, grid.inverse_depth.shape[1])
+        z = 1 / grid.inverse_depth[i, j]
+        x, y = (j - intrinsics.cx) / intrinsics.fx * z, (i - intrinsics.cy) / intrinsics.fy * z
+        p = plane[4] * x + plane[5] * y + plane[6] * z
+        q = plane[7] * x + plane[8] * y + plane[9] * z
+        outside = -np.inf
+        for k in range(DIRECTIONS):
+            outside = max(outside, COS[k] * p + SIN[k] * q - plane[13 + k])
+        out.least_outside_m = min(out.least_outside_m, outside) if n > 0 else outside
+        out.most_outside_m = max(out.most_outside_m, outside) if n > 0 else outside
+        total += outside
+        n += 1
+    out.mean_outside_m = share(total, n)

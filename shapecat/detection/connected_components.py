@@ -1,0 +1,111 @@
+"""Connected components: the one flood fill of the detection.
+
+Two passes with a table of equivalent labels (Rosenfeld and Pfaltz 1966).
+"""
+
+import numpy as np
+
+from shapecat.arrays import I4, U1, Bool
+from shapecat.jit import kernel, unset
+
+__all__ = ["DOWN", "RIGHT", "SIDES", "connected_components", "span_of", "spans_of"]
+
+RIGHT, DOWN = 1, 2
+"""Bits of links: with the neighbour on the right, and with that below."""
+SIDES = ((0, 1), (1, 0), (0, -1), (-1, 0))
+"""Rows and columns to the neighbours that a cell shares a side with."""
+
+
+@kernel
+def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I4:
+    """Label the connected cells from 1 on, in the order of their first cells.
+
+    Parameters
+    ----------
+    inside : (rows, columns) which cells are numbered.
+    links : (rows, columns) uint8, `RIGHT` and `DOWN` to neighbours; links to others are ignored.
+    spans : (rows, 2) columns of the first cell of each row that may be inside, and after the last.
+    component : (rows, columns) int32 to write to: within the spans, 0 where not inside.
+
+    Returns
+    -------
+    (n + 1,) how many cells each has; none has number 0.
+    """
+    rows = inside.shape[0]
+    most = 1
+    for i in range(rows):
+        most += spans[i, 1] - spans[i, 0]
+    parent = unset(most, np.int32)
+    size = unset(most, np.int32)
+    count = 0
+    # (1) first numbers, and which of them meet
+    for i in range(rows):
+        start, end = spans[i]
+        over = i > 0 and spans[i - 1, 0] < spans[i - 1, 1]
+        for j in range(start, end):
+            component[i, j] = 0
+            if not inside[i, j]:
+                continue
+            me = component[i, j - 1] if j > start and links[i, j - 1] & RIGHT else 0
+            within = over and spans[i - 1, 0] <= j < spans[i - 1, 1]
+            above = component[i - 1, j] if within and links[i - 1, j] & DOWN else 0
+            if me == 0 and above == 0:
+                count += 1
+                parent[count] = me = count
+                size[count] = 0
+            elif me == 0:
+                me = above
+            elif above > 0 and above != me:
+                a, b = _root(parent, me), _root(parent, above)
+                parent[max(a, b)] = me = min(a, b)
+            component[i, j] = me
+            size[me] += 1
+    # (2) final numbers
+    for k in range(count, 0, -1):
+        if parent[k] != k:
+            size[parent[k]] += size[k]
+    sizes, n = np.zeros(count + 1, np.int32), 0
+    for k in range(1, count + 1):
+        if parent[k] == k:
+            n += 1
+            sizes[n] = size[k]
+            size[k] = n  # its final number, from here on
+        else:
+            size[k] = size[parent[k]]
+    for i in range(rows):
+        for j in range(spans[i, 0], spans[i, 1]):
+            if component[i, j] > 0:
+                component[i, j] = size[component[i, j]]
+    return sizes[: n + 1]
+
+
+@kernel
+def _root(parent: I4, k: int) -> int:
+    while parent[k] != k:
+        k = parent[k]
+    return k
+
+
+@kernel
+def spans_of(plane_id: I4) -> I4:
+    """Return (rows, 2) `span_of` each row of numbers (rows, columns)."""
+    spans = np.zeros((plane_id.shape[0], 2), np.int32)
+    for i in range(len(spans)):
+        spans[i, 0], spans[i, 1] = span_of(plane_id[i])
+    return spans
+
+
+@kernel
+def span_of(row: I4) -> tuple[int, int]:
+    """Return the columns of the first number above 0 of a row and after the last, or 0 and 0."""
+    some = False
+    for j in range(row.size):
+        some |= row[j] > 0  # many rows have none, and this vectorises
+    if not some:
+        return 0, 0
+    start, end = 0, row.size
+    while row[start] <= 0:
+        start += 1
+    while row[end - 1] <= 0:
+        end -= 1
+    return start, end

@@ -1,0 +1,86 @@
+"""Growing boosted trees that tell one thing from another, for the detection."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, Bool
+from shapecat.learning.boosting import Tree, TreeSettings, grow_tree, make_bins
+from shapecat.trees import BoostedTrees, Trees
+
+__all__ = ["Growth", "grow"]
+
+_RIDGE, _LEAST, _ROWS = 1.0, 2.0, 0.7
+
+
+class Growth(NamedTuple):
+    """How many trees are grown, how many leaves each has, and what share of what lacks it adds."""
+
+    rounds: int
+    leaves: int
+    rate: float
+
+
+def grow(
+    features: F4, truth: Bool, growth: Growth, seed: int, *, after: BoostedTrees | None = None
+) -> BoostedTrees:
+    """Grow trees on features (n, f): gradient boosting with the cross entropy (Friedman 2001).
+
+    They add to what the trees ``after`` which they are grown tell.
+    """
+    rng = np.random.default_rng(seed)
+    bins, n = make_bins(features), len(truth)
+    share = truth.mean()
+    first = after or _joined([_leaf(float(np.log(share / (1 - share))))])
+    logit = _logits(first, features)
+    settings = TreeSettings(growth.leaves, growth.rate, _RIDGE, _LEAST)
+    grown: list[Tree] = []
+    columns = np.arange(features.shape[1])
+    for _ in range(growth.rounds):
+        posterior = 1 / (1 + np.exp(-logit))
+        rows = np.sort(rng.permutation(n)[: round(_ROWS * n)]).astype(np.int32)
+        slope, bend = posterior - truth, posterior * (1 - posterior)
+        grown.append(grow_tree(bins, columns, rows, slope, bend, settings, logit))
+    return _appended(first, _joined(grown))
+
+
+def _logits(grown: BoostedTrees, features: F4) -> F4:
+    """Return what all trees together say of each row of features, (n,)."""
+    trees, value = grown
+    logit, rows = np.zeros(len(features), np.float32), np.arange(len(features))
+    for root in trees.roots:
+        node = np.full(len(features), root)
+        while (inner := trees.left[node] > 0).any():
+            right = features[rows, trees.feature[node]] > trees.threshold[node]
+            node = np.where(inner, trees.left[node] + right, node)
+        logit += value[node]
+    return logit
+
+
+def _appended(first: BoostedTrees, more: BoostedTrees) -> BoostedTrees:
+    count = len(first.value)
+    left = np.where(more.trees.left > 0, more.trees.left + count, 0).astype(np.int32)
+    roots = (more.trees.roots + count).astype(np.int32)
+    later = more.trees._replace(roots=roots, left=left)
+    both = Trees(*(np.concatenate(pair) for pair in zip(first.trees, later, strict=True)))
+    return BoostedTrees(both, np.concatenate([first.value, more.value]))
+
+
+def _leaf(value: float) -> Tree:
+    """Return a tree that adds the same to all."""
+    none = np.zeros(1, np.int64)
+    return Tree(none, np.zeros(1, np.float32), none, np.array([value], np.float32))
+
+
+def _joined(grown: Sequence[Tree]) -> BoostedTrees:
+    """Put the nodes of all trees behind each other."""
+    roots = np.cumsum([0, *(len(tree.left) for tree in grown)])
+    left = [np.where(t.left > 0, t.left + root, 0) for t, root in zip(grown, roots, strict=False)]
+    trees = Trees(
+        roots[:-1].astype(np.int32),
+        np.concatenate([tree.feature for tree in grown]).astype(np.int16),
+        np.concatenate([tree.threshold for tree in grown]).astype(np.float32),
+        np.concatenate(left).astype(np.int32),
+    )
+    return BoostedTrees(trees, np.concatenate([tree.value for tree in grown]).astype(np.float32))

@@ -1,0 +1,147 @@
+"""Grow the trees that reject background structure: ``python -m shapecat.models.structure``.
+
+Simulated scenes of all kinds, as all sensors see them, give what the segments are merged to: of
+objects, of furniture and walls, or of noise. Grown after those of `shapecat.models.parts`.
+"""
+
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from itertools import chain
+from multiprocessing import get_context
+from pathlib import Path
+from typing import NamedTuple
+
+import click
+import numpy as np
+
+from shapecat.arrays import F4, I4, U1, Bool
+from shapecat.config import DetectionSettings
+from shapecat.detection.cleanup import structure
+from shapecat.detection.cleanup.object_features import OBJECT_FEATURES, measure_object_features
+from shapecat.detection.depth_grid import downsample
+from shapecat.detection.pipeline import ALL_STEPS, Task, merge_segments, oversegment
+from shapecat.models.growing import Growth, grow
+from shapecat.models.parts import count_labels
+from shapecat.simulation import make_scene, render_frame
+from shapecat.simulation.scenes import SceneKind
+from shapecat.simulation.sensors import PRESETS
+from shapecat.trees import write_trees
+from shapecat.types import Frame
+
+__all__ = ["Series", "Told", "collect", "label_objects", "main"]
+
+FEATURES = OBJECT_FEATURES.itemsize // np.dtype("f4").itemsize
+_GROWTH = Growth(150, 16, 0.08)
+_OBJECT = 0.5
+"""Share of the cells of an object that show objects."""
+_CHUNK = 10
+
+
+class Series(NamedTuple):
+    """Scenes of one kind, the first seed and how many; each by another of the sensors in turn."""
+
+    kind: SceneKind
+    first: int
+    scenes: int
+    sensors: tuple[str, ...] = tuple(PRESETS)
+
+
+_TWO = ("kinect", "realsense")
+_SERIES = (
+    Series("bin", 600_000, 80),
+    Series("shelf_bin", 601_000, 80),
+    Series("clutter", 602_000, 80, _TWO),
+    Series("shelf", 603_000, 60, _TWO),
+    Series("empty", 604_000, 80, _TWO),
+    Series("pile", 605_000, 50),
+    Series("clutter", 606_000, 50),
+    Series("shelf", 607_000, 40),
+    Series("empty", 608_000, 60),
+    Series("tabletop", 609_000, 30),
+)
+
+
+class Told(NamedTuple):
+    """What segments were merged to: ``features`` (n, `FEATURES`), whether objects (n,)."""
+
+    features: F4
+    objects: Bool
+
+
+@click.command()
+@click.option("--seed", default=0, show_default=True, help="Seed of the draws.")
+@click.option("--jobs", default=2, show_default=True, help="Processes.")
+@click.option(
+    "--out",
+    default=Path(structure.__file__).with_name(structure.FILE),
+    type=click.Path(path_type=Path),
+    help="File to write.",
+)
+def main(*, seed: int, jobs: int, out: Path) -> None:
+    """Simulate, detect, grow; write the trees."""
+    told = collect(_SERIES, jobs)
+    write_trees(out, grow(*told, _GROWTH, seed))
+    click.echo(f"{len(told.objects)} segments, {told.objects.mean():.0%} of objects; {out}")
+
+
+def collect(scenes: tuple[Series, ...], jobs: int) -> Told:
+    """Return what the segments of the scenes are merged to, whatever the number of jobs."""
+    chunks = [
+        s._replace(first=s.first + k, scenes=min(_CHUNK, s.scenes - k))
+        for s in scenes
+        for k in range(0, s.scenes, _CHUNK)
+    ]
+    with (
+        ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool,
+        click.progressbar(pool.map(_collect, chunks), length=len(chunks), label="scenes") as bar,
+    ):
+        return Told(*(np.concatenate(part) for part in zip(*bar, strict=True)))
+
+
+def _collect(series: Series) -> Told:
+    frames = (_labelled(series, seed) for seed in range(series.first, series.first + series.scenes))
+    found = list(chain.from_iterable(frames))
+    rows = np.array([features for features, _ in found], np.float32).reshape(-1, FEATURES)
+    return Told(rows, np.array([is_object for _, is_object in found], bool))
+
+
+def _labelled(series: Series, seed: int) -> Iterator[tuple[F4, bool]]:
+    rng = np.random.default_rng(seed)
+    world = make_scene(series.kind, rng, frames=1)
+    sensor = PRESETS[series.sensors[seed % len(series.sensors)]]
+    frame, owners = render_frame(world, 0, rng=rng, sensor=sensor)
+    things = np.array([thing.label for thing in world.things], np.int64)
+    yield from label_objects(frame, owners, things)
+
+
+def label_objects(frame: Frame, owners: U1, things: I4) -> Iterator[tuple[F4, bool]]:
+    """Yield what the segments of a frame are merged to: the features, and whether an object.
+
+    Parameters
+    ----------
+    owners : (h, w) the label of what each pixel shows, 0 where that is not known.
+    things : the labels of objects.
+    """
+    settings = DetectionSettings()
+    if frame.depth is None or frame.camera is None:
+        return
+    grid = downsample(frame.depth, frame.camera, range_m=settings.max_range_m)
+    task = Task(settings, np.random.default_rng(0))
+    found = None if grid is None else oversegment(grid, task)
+    if grid is None or found is None:
+        return
+    model, oversegmentation = found
+    known = merge_segments(grid, model, oversegmentation, ALL_STEPS)
+    features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
+    _, labels, segments = oversegmentation
+    counts = count_labels(owners.reshape(frame.depth.shape), labels, grid)
+    merged = np.zeros_like(counts)
+    np.add.at(merged, segments.parent, counts)
+    known_cells = merged[:, 1:].sum(axis=1)
+    shares = merged[:, things[things < merged.shape[1]]].sum(axis=1) / np.maximum(known_cells, 1)
+    for p in np.unique(segments.parent[1:]):
+        yield features[p : p + 1].view(np.float32), bool(shares[p] > _OBJECT)
+
+
+if __name__ == "__main__":
+    main()
