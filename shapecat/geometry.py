@@ -252,7 +252,7 @@ def _smallest_rectangle(x: F4, y: F4) -> tuple[float, F8, F8]:
             u, v = _COS[t] * x[k] + _SIN[t] * y[k], _COS[t] * y[k] - _SIN[t] * x[k]
             left[t], right[t] = u if u < left[t] else left[t], u if u > right[t] else right[t]
             back[t], front[t] = v if v < back[t] else back[t], v if v > front[t] else front[t]
-    t = np.argmin((right - left) * (front - back))
+    best = int(np.argmin((right - left) * (front - back)))
     low, high = np.zeros(3), np.zeros(3)
-    low[0], low[1], high[0], high[1] = left[t], back[t], right[t], front[t]
-    return _YAWS[t], low, high
+    low[0], low[1], high[0], high[1] = left[best], back[best], right[best], front[best]
+    return _YAWS[best], low, high

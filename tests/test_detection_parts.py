@@ -5,8 +5,10 @@ import pytest
 
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
+from shapecat.detection.cleanup import structure
+from shapecat.detection.cleanup.object_features import OBJECT_FEATURES
 from shapecat.detection.depth_grid import downsample
-from shapecat.detection.merging.learned import load_trees, logit_of
+from shapecat.detection.merging import learned
 from shapecat.detection.merging.pair_features import (
     FEATURES,
     PAIR_FEATURES,
@@ -14,23 +16,30 @@ from shapecat.detection.merging.pair_features import (
     are_adjacent,
     pair_features,
 )
-from shapecat.detection.pipeline import ALL_STEPS, oversegment
-from shapecat.models.parts import Growth, Pairs, Series, collect, grow
+from shapecat.detection.pipeline import ALL_STEPS, Task, oversegment
+from shapecat.models.growing import Growth, grow
+from shapecat.models.parts import Series, collect
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
+from shapecat.trees import BoostedTrees, logit_of
 from tests.test_detection import overlaps
 
 SCENES = (Series("clutter", KINECT, 2000, 4), Series("pile", REALSENSE, 85_000, 2))
 GROWTH = Growth(100, 32, 0.1)
 
 
-def test_every_walk_through_the_trees_ends() -> None:
+@pytest.mark.parametrize(
+    ("grown", "features"),
+    [(learned.load_trees(), FEATURES), (structure.load_trees(), OBJECT_FEATURES.itemsize // 4)],
+    ids=["merging", "structure"],
+)
+def test_every_walk_through_the_trees_ends(grown: BoostedTrees, features: int) -> None:
     """A child before its parent would be a walk without end."""
-    grown = load_trees()
-    inner = np.flatnonzero(grown.left)
-    assert np.all(grown.left[inner] > inner)
-    assert grown.left.max() + 1 < grown.left.size
-    assert np.all(grown.left[grown.roots[1:] - 1] == 0)
-    assert 0 <= grown.feature.min() <= grown.feature.max() < FEATURES
+    roots, feature, _, left = grown.trees
+    inner = np.flatnonzero(left)
+    assert np.all(left[inner] > inner)
+    assert left.max() + 1 < left.size == grown.value.size
+    assert np.all(left[roots[1:] - 1] == 0)
+    assert 0 <= feature.min() <= feature.max() < features
     assert np.isfinite(grown.value).all()
 
 
@@ -41,7 +50,7 @@ def test_the_order_of_two_pieces_says_nothing() -> None:
     assert frame.camera is not None
     grid = downsample(frame.depth, frame.camera, range_m=2.0)
     assert grid is not None
-    found = oversegment(grid, settings=DetectionSettings(), rng=rng)
+    found = oversegment(grid, Task(DetectionSettings(), rng))
     assert found is not None
     ground, (_, _, segments) = found
     view_geometry = ViewGeometry(grid.intrinsics.fx, float(ground.up[2]))
@@ -66,8 +75,8 @@ def test_without_the_trees_objects_stay_in_pieces(seed: int) -> None:
     frame, seen = render_frame(world, 0, rng=rng, sensor=KINECT)
     labels = [thing.label for thing in world.things if np.count_nonzero(seen == thing.label) > 400]
     found = []
-    for learned in (False, True):
-        steps = ALL_STEPS._replace(learned_merging=learned, across_occlusion=False)
+    for merging in (False, True):
+        steps = ALL_STEPS._replace(learned_merging=merging, across_occlusion=False)
         rng = np.random.default_rng(0)
         scene = detect(frame, settings=DetectionSettings(), rng=rng, steps=steps)
         found.append(np.mean(np.array(overlaps(scene, seen, labels)) > 0.75))
@@ -80,12 +89,14 @@ def test_trees_that_are_added_correct_the_first() -> None:
     features = rng.normal(size=(3000, FEATURES)).astype(np.float32)
     old = features[:, 9] > 0.2
     new = old & (features[:, 40] < 1.0)  # what the first find hopeless is not asked again
-    first = grow(Pairs(features, old), GROWTH, seed=0)
-    both = grow(Pairs(features, new), GROWTH, seed=0, after=first)
+    first = grow(features, old, GROWTH, seed=0)
+    both = grow(features, new, GROWTH, seed=0, after=first)
     count = len(first.value)
-    for name in ("feature", "threshold", "left", "value"):
-        assert np.array_equal(getattr(both, name)[:count], getattr(first, name))
-    told = np.array([[logit_of(t, row) > 0 for row in features] for t in (first, both)])
+    for whole, part in zip(
+        (*both.trees[1:], both.value), (*first.trees[1:], first.value), strict=True
+    ):
+        assert np.array_equal(whole[:count], part)
+    told = np.array([[logit_of(t, row, -9) > 0 for row in features] for t in (first, both)])
     assert np.mean(told[0] == new) < 0.95
     assert np.mean(told[1] == new) > 0.97
 
@@ -102,7 +113,8 @@ def test_grown_trees_tell_what_they_were_shown() -> None:
     rng = np.random.default_rng(0)
     features = rng.normal(size=(2000, FEATURES)).astype(np.float32)
     same = (features[:, 4] > 0) ^ (features[:, 40] > 0.3)
-    first, second = (grow(Pairs(features, same), GROWTH, seed=1) for _ in range(2))
-    assert all(np.array_equal(a, b) for a, b in zip(first, second, strict=True))
-    told = np.array([logit_of(first, row) > 0 for row in features])
+    first, second = (grow(features, same, GROWTH, seed=1) for _ in range(2))
+    assert all(np.array_equal(a, b) for a, b in zip(first.trees, second.trees, strict=True))
+    assert np.array_equal(first.value, second.value)
+    told = np.array([logit_of(first, row, -np.inf) > 0 for row in features])
     assert np.mean(told == same) > 0.95

@@ -22,7 +22,7 @@ from shapecat.detection.planes.ransac import (
     sample_grid,
 )
 from shapecat.detection.segmentation.connectivity import connect_surfaces
-from shapecat.detection.segmentation.watershed import _flat_parts, relabel, watershed
+from shapecat.detection.segmentation.watershed import relabel, watershed
 from shapecat.types import Camera
 
 Floats = NDArray[np.float32]
@@ -105,16 +105,6 @@ def test_two_faces_are_parted_where_they_meet_at_a_concave_edge(rise: float, seg
     assert (labels[90, 120] != labels[149, 120]) == (segments == 2)
 
 
-def test_speckle_fits_into_memory() -> None:
-    """In noise no cell is linked with another; each begins a part of its own."""
-    cells = np.ones((9, 8), np.int8)
-    labels, spans = np.zeros((9, 8), np.int16), np.tile(np.array([[0, 8]], np.int32), (9, 1))
-    none, part = np.zeros((9, 8), np.uint8), np.zeros((9, 8), np.int32)
-    # Python checks what machine code does not: whether an index is within its array.
-    assert _flat_parts.py_func(cells, spans, none, none, labels, 0, part) == 0
-    assert not labels.any()
-
-
 def test_relabel_keeps_what_is_none() -> None:
     labels = np.array([[0, 1, 2], [2, 2, 0]], np.int16)
     relabel(labels, np.array([[0, 3], [0, 3]], np.int32), np.array([0, 5, 0], np.int16))
@@ -140,8 +130,8 @@ def test_a_hole_within_one_object_is_filled_and_a_bay_is_not() -> None:
     labels[10:30, 10:30] = 1
     labels[18:22, 18:22] = 0
     labels[14:16, 10:20] = 0  # open to the left
-    height, filled = np.zeros((40, 40), np.float32), np.zeros((40, 40), np.uint8)
-    fill_holes(inv_depth, height, labels, 1, filled)
+    filled = np.zeros((40, 40), np.uint8)
+    fill_holes(inv_depth, labels, 1, filled)
     assert (labels[18:22, 18:22] == 1).all()
     assert (filled[18:22, 18:22] == 1).all()
     assert (labels[14:16, 10:20] == 0).all()

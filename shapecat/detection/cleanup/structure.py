@@ -18,8 +18,8 @@ from shapecat.trees import BoostedTrees, logit_of, read_trees
 __all__ = ["FILE", "find_background", "load_trees"]
 
 FILE = "structure.npz"
-LEAST_LOGIT = -1.0
-"""Logit, of 0.27, from which on something is taken for an object: one that is missed is lost, one
+LEAST_LOGIT = -1.5
+"""Logit, of 0.18, from which on something is taken for an object: one that is missed is lost, one
 too many can still be rejected over time."""
 HOPELESS = -8.0
 """Logit of the first trees that the others never made up for."""
