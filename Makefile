@@ -84,8 +84,9 @@ bench: setup ## measure the speed of stages and whole recordings, print tables
 model: setup ## train the default model anew from the simulator
 	$(BIN)/python -m shapecat.models.training
 
-parts: setup ## grow the trees anew that join the pieces of an object, from the simulator
+parts: setup ## grow the trees of the detection anew: for merging segments, then for rejecting background
 	$(BIN)/python -m shapecat.models.parts
+	$(BIN)/python -m shapecat.models.structure
 
 lock: setup ## renew requirements.lock from pyproject.toml
 	$(BIN)/pip install --quiet uv

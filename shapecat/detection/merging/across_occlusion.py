@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.detection.depth_grid import PinholeIntrinsics
+from shapecat.arrays import F4, F8, I4
+from shapecat.detection.depth_grid import PinholeIntrinsics, row_and_column
 from shapecat.detection.merging.segments import (
     FEW,
     SAMPLES,
@@ -33,156 +33,113 @@ FREE, BEHIND = 0.12, 0.05
 def merge_across_occluder(
     segments: Segments, inv_depth: F4, intrinsics: PinholeIntrinsics, normal: F4, labels: I4
 ) -> None:
-    """Join segments behind the same occluder that continue each other, the best pair first."""
+    """Merge segments behind the same occluder that continue each other, the best pair first."""
     n = segments.parent.size
-    scores = np.zeros((n, n), np.float32)
-    together = _behind_one(segments)
-    for p in range(1, n):
-        for q in range(p + 1, n):
-            if together[p, q]:
-                scores[p, q] = _continuation(segments, p, q, inv_depth, intrinsics, normal, labels)
+    scores, changed = np.zeros((n, n), np.float32), np.ones(n, np.bool_)
     while True:
+        for p in range(1, n):
+            for q in range(p + 1, n):
+                if not (changed[p] or changed[q]):
+                    continue
+                scores[p, q] = 0
+                if may_merge(segments, p, q) and _are_behind_one(segments, p, q):
+                    a = _local_planes(segments.samples[p], inv_depth, intrinsics, normal)
+                    b = _local_planes(segments.samples[q], inv_depth, intrinsics, normal)
+                    share, lines = _find_partners(a, b)
+                    if share >= PARTNERS and _is_hidden(
+                        segments, p, q, inv_depth, intrinsics, labels, lines
+                    ):
+                        scores[p, q] = share
         best = np.argmax(scores)
         p, q = int(best // n), int(best % n)
         if scores[p, q] <= 0:
             return
         merge(segments, p, q)
-        scores[q, :] = 0
-        scores[:, q] = 0
-        for k in range(1, n):
-            if k != p:
-                a, b = min(k, p), max(k, p)
-                scores[a, b] = _continuation(segments, a, b, inv_depth, intrinsics, normal, labels)
-
-
-@kernel
-def _continuation(
-    segments: Segments,
-    p: int,
-    q: int,
-    inv_depth: F4,
-    intrinsics: PinholeIntrinsics,
-    normal: F4,
-    labels: I4,
-) -> float:
-    """Return how well segment q continues segment p behind an occluder, 0..1; 0 if it does not."""
-    if not may_merge(segments, p, q) or not _are_behind_one(segments, p, q):
-        return 0.0
-    a, b = np.zeros((SAMPLES, 6)), np.zeros((SAMPLES, 6))
-    na = _positions(segments.samples[p], inv_depth, intrinsics, normal, a)
-    nb = _positions(segments.samples[q], inv_depth, intrinsics, normal, b)
-    if na < LEAST_SAMPLES or nb < LEAST_SAMPLES:
-        return 0.0
-    partners = np.zeros((SAMPLES * SAMPLES, 2), np.uint8)
-    share, n = _find_partners(a[:na], b[:nb], partners)
-    if share < PARTNERS:
-        return 0.0
-    free = hidden = looked = 0
-    for k in range(0, n, max(1, n // MOST_LINES)):
-        first, second = a[partners[k, 0]], b[partners[k, 1]]
-        for step in range(1, STEPS):
-            x, y, z = _on_line(first, second, step / STEPS)
-            j, i = (
-                int(intrinsics.cx + intrinsics.fx * x / z + 0.5),
-                int(intrinsics.cy + intrinsics.fy * y / z + 0.5),
-            )
-            if (
-                i < 0
-                or j < 0
-                or i >= inv_depth.shape[0]
-                or j >= inv_depth.shape[1]
-                or inv_depth[i, j] <= 0
-            ):
-                continue
-            looked += 1
-            label = labels[i, j]
-            if label == 0 or (segments.parent[label] != p and segments.parent[label] != q):
-                before = inv_depth[i, j] - 1 / z > DISCONTINUITY
-                hidden += before
-                free += not before
-    return share if free <= FREE * looked and hidden >= BEHIND * looked else 0.0
+        changed[:] = False
+        changed[p] = changed[q] = True
 
 
 @kernel
 def _are_behind_one(segments: Segments, p: int, q: int) -> bool:
     """Whether one thing is in front of both segments."""
-    pairs = segments.pairs
-    some = False
+    pairs, some = segments.pairs, False
     for k in range(1, segments.parent.size):
         some |= (k != p) & (k != q) & (pairs[k, p].in_front >= FEW) & (pairs[k, q].in_front >= FEW)
     return some
 
 
 @kernel
-def _behind_one(segments: Segments) -> Bool:
-    """Return for all pairs p < q of segments (n + 1, n + 1) what `_are_behind_one` does."""
-    n = segments.parent.size
-    together, hidden = np.zeros((n, n), np.bool_), np.zeros(n, np.int64)
-    for k in range(1, n):
-        count = 0
-        for p in range(1, n):
-            hidden[count] = p
-            count += (p != k) & (segments.pairs[k, p].in_front >= FEW)
-        for a in range(count):
-            for b in range(a + 1, count):
-                together[hidden[a], hidden[b]] = True
-    return together
-
-
-@kernel
-def _find_partners(a: F8, b: F8, partners: I4) -> tuple[float, int]:
-    """Write the pairs of samples that lie in each other's local plane.
-
-    Returns the share of the samples that have a partner, of the segment with the lower one, and the
-    number of pairs.
-    """
-    in_a, in_b = np.zeros(SAMPLES, np.uint8), np.zeros(SAMPLES, np.uint8)
-    n = with_a = with_b = 0
-    for s in range(len(a)):
-        x, y, z, nx, ny, nz = a[s, 0], a[s, 1], a[s, 2], a[s, 3], a[s, 4], a[s, 5]
-        for t in range(len(b)):
-            mx, my, mz = b[t, 3], b[t, 4], b[t, 5]
-            if nx * mx + ny * my + nz * mz < COPLANAR_COS:
-                continue
-            dx, dy, dz = b[t, 0] - x, b[t, 1] - y, b[t, 2] - z
-            limit = COPLANAR_M + COPLANAR * math.sqrt(dx * dx + dy * dy + dz * dz)
-            if abs(dx * nx + dy * ny + dz * nz) > limit:
-                continue
-            if abs(dx * mx + dy * my + dz * mz) > limit:
-                continue
-            with_a += in_a[s] == 0
-            with_b += in_b[t] == 0
-            in_a[s] = in_b[t] = 1
-            partners[n, 0], partners[n, 1] = s, t
-            n += 1
-    return min(with_a / len(a), with_b / len(b)), n
-
-
-@kernel
-def _on_line(first: F8, second: F8, u: float) -> tuple[float, float, float]:
-    """Return the point at the share ``u`` of the way between two samples."""
-    return (
-        first[0] + u * (second[0] - first[0]),
-        first[1] + u * (second[1] - first[1]),
-        first[2] + u * (second[2] - first[2]),
-    )
-
-
-@kernel
-def _positions(
-    samples: I4, inv_depth: F4, intrinsics: PinholeIntrinsics, normal: F4, out: F8
-) -> int:
-    """Write position and normal of the samples of a segment; return how many there are."""
-    columns = inv_depth.shape[1]
-    n = 0
-    for s in samples:
-        if s < 0:
-            break
-        i, j = s // columns, s % columns
+def _local_planes(samples: I4, inv_depth: F4, intrinsics: PinholeIntrinsics, normal: F4) -> F8:
+    """Return (2, n, 3) the positions and normals of the samples of a segment, sensor frame."""
+    n = np.sum(samples >= 0)
+    planes = np.zeros((2, n, 3))
+    for k in range(n):
+        i, j = row_and_column(samples[k], inv_depth.shape[1])
         z = 1 / inv_depth[i, j]
-        out[n, 0] = (j - intrinsics.cx) / intrinsics.fx * z
-        out[n, 1] = (i - intrinsics.cy) / intrinsics.fy * z
-        out[n, 2] = z
-        out[n, 3], out[n, 4], out[n, 5] = normal[i, 0, j], normal[i, 1, j], normal[i, 2, j]
-        n += 1
-    return n
+        planes[0, k, 0] = (j - intrinsics.cx) / intrinsics.fx * z
+        planes[0, k, 1] = (i - intrinsics.cy) / intrinsics.fy * z
+        planes[0, k, 2] = z
+        for d in range(3):
+            planes[1, k, d] = normal[i, d, j]
+    return planes
+
+
+@kernel
+def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
+    """Find the pairs of samples that lie in each other's local plane.
+
+    Returns the share of the samples that have a partner, of the segment with the lower one, and
+    some of the pairs, (n, 2, 3) positions.
+    """
+    with_a, with_b = np.zeros(a.shape[1], np.bool_), np.zeros(b.shape[1], np.bool_)
+    pairs, n = np.zeros((SAMPLES * SAMPLES, 2), np.uint8), 0
+    if min(with_a.size, with_b.size) < LEAST_SAMPLES:
+        return 0.0, np.zeros((0, 2, 3))
+    for s in range(with_a.size):
+        for t in range(with_b.size):
+            alike = distance = off_a = off_b = 0.0
+            for d in range(3):
+                step = b[0, t, d] - a[0, s, d]
+                alike += a[1, s, d] * b[1, t, d]
+                distance += step * step
+                off_a += step * a[1, s, d]
+                off_b += step * b[1, t, d]
+            limit = COPLANAR_M + COPLANAR * math.sqrt(distance)
+            if alike >= COPLANAR_COS and abs(off_a) <= limit and abs(off_b) <= limit:
+                with_a[s] = with_b[t] = True
+                pairs[n, 0], pairs[n, 1] = s, t
+                n += 1
+    every = max(1, n // MOST_LINES)
+    lines = np.zeros(((n + every - 1) // every, 2, 3))
+    for k in range(len(lines)):
+        lines[k, 0], lines[k, 1] = a[0, pairs[k * every, 0]], b[0, pairs[k * every, 1]]
+    return min(np.mean(with_a), np.mean(with_b)), lines
+
+
+@kernel
+def _is_hidden(
+    segments: Segments,
+    p: int,
+    q: int,
+    inv_depth: F4,
+    intrinsics: PinholeIntrinsics,
+    labels: I4,
+    lines: F8,
+) -> bool:
+    """Whether the lines (n, 2, 3) between two segments are behind something, not in free space."""
+    free = hidden = looked = 0
+    for k in range(len(lines)):
+        for step in range(1, STEPS):
+            u, a, b = step / STEPS, lines[k, 0], lines[k, 1]
+            x, y, z = a[0] + u * (b[0] - a[0]), a[1] + u * (b[1] - a[1]), a[2] + u * (b[2] - a[2])
+            j = int(intrinsics.cx + intrinsics.fx * x / z + 0.5)
+            i = int(intrinsics.cy + intrinsics.fy * y / z + 0.5)
+            if i < 0 or j < 0 or i >= inv_depth.shape[0] or j >= inv_depth.shape[1]:
+                continue
+            owner = segments.parent[labels[i, j]]
+            looked += inv_depth[i, j] > 0
+            if inv_depth[i, j] > 0 and owner not in (p, q):
+                before = inv_depth[i, j] - 1 / z > DISCONTINUITY
+                hidden += before
+                free += not before
+    return free <= FREE * looked and hidden >= BEHIND * looked

@@ -19,7 +19,6 @@ from shapecat.geometry import (
     transform,
     upright_box,
 )
-from shapecat.jit import kernel
 from shapecat.types import Box, Candidate, Plane, Pose, Scene
 
 __all__ = ["build_scene"]
@@ -117,42 +116,24 @@ def _boxes(
 
 
 def _cut(grid: DepthGrid, measured: ObjectMeasurements) -> Bool:
-    """Return whether each object reaches the border of the image, or of its readings near it."""
-    result = np.zeros(len(measured.low), bool)
-    _find_cut(
-        grid.inverse_depth, measured.low, measured.high, max(1, round(2 / grid.factor)), result
-    )
-    return result
+    """Return whether each object reaches the border of the image, or of its samples near it."""
+    cut, near = np.zeros(len(measured.low), bool), max(1, round(2 / grid.factor))
+    for axis, lines in enumerate((grid.inverse_depth > 0, (grid.inverse_depth > 0).T)):
+        first = _begin(lines, near) + near
+        last = len(lines) - 1 - _begin(lines[::-1], near) - near
+        cut |= (measured.low[:, axis] < first) | (measured.high[:, axis] > last)
+    return cut
 
 
-@kernel
-def _find_cut(inv_depth: F4, low: I4, high: I4, reach: int, cut: Bool) -> None:
-    """Mark what is within ``reach`` of the lines of cells where the readings begin."""
-    for axis in range(2):
-        first = _begin(inv_depth, axis, 1, reach) + reach
-        last = inv_depth.shape[axis] - 1 - _begin(inv_depth, axis, -1, reach) - reach
-        for k in range(cut.size):
-            cut[k] |= (low[k, axis] < first) | (high[k, axis] > last)
+def _begin(lines: Bool, near: int) -> int:
+    """Return at which line of samples (lines, length) they begin, if more than one object does.
 
-
-@kernel
-def _begin(inv_depth: F4, axis: int, step: int, reach: int) -> int:
-    """Return the line at which the readings begin: the first with any, if more than one thing is.
-
-    The top of a tall thing with nothing behind it is no border. Lines are rows (``axis`` 0) or
-    columns, from the first on or, with ``step`` -1, from the last.
+    The top of a tall object with nothing behind it is no border.
     """
-    lines, length = inv_depth.shape[axis], inv_depth.shape[1 - axis]
-    first, low, high = -1, length, -1
-    for k in range(math.ceil(BORDER_SHARE * lines)):
-        if first >= 0 and k >= first + reach:
-            break
-        line = k if step > 0 else lines - 1 - k
-        for n in range(length):
-            if (inv_depth[line, n] if axis == 0 else inv_depth[n, line]) > 0:
-                first = k if first < 0 else first
-                low, high = min(low, n), max(high, n)
-    return first if first >= 0 and high - low > STRAIGHT * length else 0
+    some = lines[: math.ceil(BORDER_SHARE * len(lines))].any(axis=1)
+    first = int(some.argmax())
+    seen = np.flatnonzero(lines[first : first + near].any(axis=0))
+    return first if seen.size and np.ptp(seen) > STRAIGHT * lines.shape[1] else 0
 
 
 def _cut_cloud(grid: DepthGrid, found: Segmentation, sensor_from_view: Pose) -> Bool:
