@@ -40,6 +40,7 @@ from shapecat.detection.output.label_upsampling import label_pixels
 from shapecat.detection.output.measurements import measure_objects
 from shapecat.detection.output.point_labels import label_points
 from shapecat.detection.output.scene import build_scene
+from shapecat.detection.output.settings import OUTPUT
 from shapecat.detection.planes import NO_HINT, find_supporting_planes
 from shapecat.detection.planes.assumed import assume_plane, unexplained
 from shapecat.detection.planes.extent import SupportingPlane
@@ -58,8 +59,6 @@ __all__ = ["ALL_STEPS", "Steps", "Task", "detect", "label", "merge_segments", "o
 
 DEFAULT_UP = (0.0, -1.0, 0.0)
 """Up in an upright optical frame, where nothing else is known."""
-CROWDED = 0.08
-"""Share of points behind others from which a cloud is taken for fused from several views."""
 
 
 class Task(NamedTuple):
@@ -140,7 +139,10 @@ def _in_cloud(points: F4, hint: F8 | None, task: Task) -> Scene | None:
         found = None if view is None else _seen(view, hint, task)
     if view is None or found is None:
         return None
-    indices, pose = label_points(view, found, fused=view.crowded > CROWDED), view.view_from_sensor
+    indices, pose = (
+        label_points(view, found, fused=view.crowded > OUTPUT.crowded),
+        view.view_from_sensor,
+    )
     return build_scene(
         view.grid, found, indices, inverse(pose), settings=task.settings, points=view.points
     )

@@ -49,6 +49,7 @@ class Series(NamedTuple):
 _TWO = ("kinect", "realsense")
 _SERIES = (
     Series("bin", 600_000, 80),
+    Series("bin", 610_000, 120),
     Series("shelf_bin", 601_000, 80),
     Series("clutter", 602_000, 80, _TWO),
     Series("shelf", 603_000, 60, _TWO),

@@ -3,6 +3,7 @@
 import numpy as np
 
 from shapecat.arrays import F4, I4, U1, Bool
+from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import (
     DOWN,
     RIGHT,
@@ -14,16 +15,8 @@ from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, Hei
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
-__all__ = ["FRINGE", "fill_contact_boundary", "fill_holes"]
+__all__ = ["fill_contact_boundary", "fill_holes"]
 
-FRINGE = 0.6
-"""Share of the least height from which a sample next to an object belongs to it: the least height
-is safe against the noise of the plane, and what is as low farther away is as often the plane."""
-SHARE = 0.6
-"""Least share of the boundary of a hole that is of what encloses it: a ring seen from the side has
-so much around its hole, two objects side by side have half each."""
-GOES_ON_SHARE = 0.15
-"""Least share of the boundary where the surface goes on: not so through the hole of a handle."""
 BOUNDARY, IN_FRONT, GOES_ON = range(3)
 """Counts of sides of the cells of a hole that a label bounds: all, those where it is in front of
 the hole, and those where the surface goes on."""
@@ -35,7 +28,10 @@ def fill_contact_boundary(inv_depth: F4, heights: HeightMap, labels: I4) -> None
     plane_id, height = heights
     rows, columns = labels.shape
     before, low = labels.copy(), np.zeros(columns, np.bool_)
-    least, noise = np.float32(FRINGE * MIN_HEIGHT_M), np.float32(FRINGE * HEIGHT_NOISE)
+    least, noise = (
+        np.float32(CLEANUP.fringe * MIN_HEIGHT_M),
+        np.float32(CLEANUP.fringe * HEIGHT_NOISE),
+    )
     for i in range(rows):
         some = False
         for j in range(columns):  # few rows have any, and this vectorises
@@ -122,7 +118,10 @@ def _count_sides(inv_depth: F4, labels: I4, spans: I4, component: I4, sides: I4,
 def _owner_of(sides: I4, total: int) -> int:
     """Return the label that a hole belongs to, 0 if it belongs to none."""
     best = np.argmax(sides[:, BOUNDARY])
-    if sides[best, BOUNDARY] <= SHARE * total or sides[best, GOES_ON] <= GOES_ON_SHARE * total:
+    if (
+        sides[best, BOUNDARY] <= CLEANUP.enclosed_share * total
+        or sides[best, GOES_ON] <= CLEANUP.goes_on_share * total
+    ):
         return 0
     for k in range(1, len(sides)):
         if k != best and sides[k, IN_FRONT] < sides[k, BOUNDARY]:

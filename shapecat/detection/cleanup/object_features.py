@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, Bool
+from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import SIDES
 from shapecat.detection.depth_grid import DepthGrid, row_and_column
 from shapecat.detection.foreground.walls import CLEARED, ON_WALL
@@ -60,8 +61,6 @@ OBJECT_FEATURES = np.dtype(
 
 The trees number them in this order.
 """
-MARGIN = 0.08
-"""Share of the image that sensors leave empty at most at its border."""
 
 
 class LabelledGrid(NamedTuple):
@@ -108,8 +107,8 @@ def _border_lines(grid: DepthGrid) -> tuple[int, int, int, int]:
         count = grid.inverse_depth.shape[axis]
         seen = np.flatnonzero((grid.inverse_depth > 0).any(axis=1 - axis))
         first, last = (int(seen[0]), int(seen[-1])) if seen.size else (count, -1)
-        lines += [first if first <= MARGIN * count else -1]
-        lines += [last if last >= (1 - MARGIN) * count - 1 else -1]
+        lines += [first if first <= CLEANUP.border_share * count else -1]
+        lines += [last if last >= (1 - CLEANUP.border_share) * count - 1 else -1]
     return lines[0], lines[1], lines[2], lines[3]
 
 

@@ -11,6 +11,7 @@ from importlib.resources import files
 import numpy as np
 
 from shapecat.arrays import F4, Bool
+from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.merging.segments import Records, Segments, is_root
 from shapecat.jit import kernel
 from shapecat.trees import BoostedTrees, logit_of, read_trees
@@ -18,11 +19,6 @@ from shapecat.trees import BoostedTrees, logit_of, read_trees
 __all__ = ["FILE", "find_background", "load_trees"]
 
 FILE = "structure.npz"
-LEAST_LOGIT = -1.5
-"""Logit, of 0.18, from which on something is taken for an object: one that is missed is lost, one
-too many can still be rejected over time."""
-HOPELESS = -8.0
-"""Logit of the first trees that the others never made up for."""
 
 
 @cache
@@ -50,5 +46,8 @@ def find_background(
 def _reject(segments: Segments, features: F4, grown: BoostedTrees) -> Bool:
     rejected = np.zeros(len(features), np.bool_)
     for p in range(1, len(features)):
-        rejected[p] = is_root(segments, p) and logit_of(grown, features[p], HOPELESS) < LEAST_LOGIT
+        rejected[p] = (
+            is_root(segments, p)
+            and logit_of(grown, features[p], CLEANUP.hopeless) < CLEANUP.least_logit
+        )
     return rejected

@@ -6,27 +6,12 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.depth_grid import PinholeIntrinsics, row_and_column
-from shapecat.detection.merging.segments import (
-    FEW,
-    SAMPLES,
-    Segments,
-    may_merge,
-    merge,
-)
+from shapecat.detection.merging.segments import SAMPLES, Segments, may_merge, merge
+from shapecat.detection.merging.settings import MERGING
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = ["merge_across_occluder"]
-
-COPLANAR_M, COPLANAR = 0.006, 0.05
-"""How far a sample may lie off the local plane of another: metres, and per metre between them."""
-COPLANAR_COS = math.cos(math.radians(15))
-PARTNERS = 0.45
-"""Share of the samples of either segment that continue the other."""
-LEAST_SAMPLES, MOST_LINES, STEPS = 4, 300, 8
-"""Samples of a segment; lines between partners that are looked along, each in so many steps."""
-FREE, BEHIND = 0.12, 0.05
-"""Between them, largest share in free space or on others, least share behind something."""
 
 
 @kernel
@@ -46,7 +31,7 @@ def merge_across_occluder(
                     a = _local_planes(segments.samples[p], inv_depth, intrinsics, normal)
                     b = _local_planes(segments.samples[q], inv_depth, intrinsics, normal)
                     share, lines = _find_partners(a, b)
-                    if share >= PARTNERS and _is_hidden(
+                    if share >= MERGING.partners and _is_hidden(
                         segments, p, q, inv_depth, intrinsics, labels, lines
                     ):
                         scores[p, q] = share
@@ -64,14 +49,19 @@ def _are_behind_one(segments: Segments, p: int, q: int) -> bool:
     """Whether one thing is in front of both segments."""
     pairs, some = segments.pairs, False
     for k in range(1, segments.parent.size):
-        some |= (k != p) & (k != q) & (pairs[k, p].in_front >= FEW) & (pairs[k, q].in_front >= FEW)
+        some |= (
+            (k != p)
+            & (k != q)
+            & (pairs[k, p].in_front >= MERGING.few)
+            & (pairs[k, q].in_front >= MERGING.few)
+        )
     return some
 
 
 @kernel
 def _local_planes(samples: I4, inv_depth: F4, intrinsics: PinholeIntrinsics, normal: F4) -> F8:
     """Return (2, n, 3) the positions and normals of the samples of a segment, sensor frame."""
-    n = np.sum(samples >= 0)
+    n = int(np.sum(samples >= 0))
     planes = np.zeros((2, n, 3))
     for k in range(n):
         i, j = row_and_column(samples[k], inv_depth.shape[1])
@@ -93,7 +83,7 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
     """
     with_a, with_b = np.zeros(a.shape[1], np.bool_), np.zeros(b.shape[1], np.bool_)
     pairs, n = np.zeros((SAMPLES * SAMPLES, 2), np.uint8), 0
-    if min(with_a.size, with_b.size) < LEAST_SAMPLES:
+    if min(with_a.size, with_b.size) < MERGING.fewest_samples:
         return 0.0, np.zeros((0, 2, 3))
     for s in range(with_a.size):
         for t in range(with_b.size):
@@ -104,16 +94,16 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
                 distance += step * step
                 off_a += step * a[1, s, d]
                 off_b += step * b[1, t, d]
-            limit = COPLANAR_M + COPLANAR * math.sqrt(distance)
-            if alike >= COPLANAR_COS and abs(off_a) <= limit and abs(off_b) <= limit:
+            limit = MERGING.coplanar_m + MERGING.coplanar_slope * math.sqrt(distance)
+            if alike >= MERGING.coplanar_cos and abs(off_a) <= limit and abs(off_b) <= limit:
                 with_a[s] = with_b[t] = True
                 pairs[n, 0], pairs[n, 1] = s, t
                 n += 1
-    every = max(1, n // MOST_LINES)
+    every = max(1, n // MERGING.most_lines)
     lines = np.zeros(((n + every - 1) // every, 2, 3))
     for k in range(len(lines)):
         lines[k, 0], lines[k, 1] = a[0, pairs[k * every, 0]], b[0, pairs[k * every, 1]]
-    return min(np.mean(with_a), np.mean(with_b)), lines
+    return float(min(np.mean(with_a), np.mean(with_b))), lines
 
 
 @kernel
@@ -129,8 +119,8 @@ def _is_hidden(
     """Whether the lines (n, 2, 3) between two segments are behind something, not in free space."""
     free = hidden = looked = 0
     for k in range(len(lines)):
-        for step in range(1, STEPS):
-            u, a, b = step / STEPS, lines[k, 0], lines[k, 1]
+        for step in range(1, MERGING.line_steps):
+            u, a, b = step / MERGING.line_steps, lines[k, 0], lines[k, 1]
             x, y, z = a[0] + u * (b[0] - a[0]), a[1] + u * (b[1] - a[1]), a[2] + u * (b[2] - a[2])
             j = int(intrinsics.cx + intrinsics.fx * x / z + 0.5)
             i = int(intrinsics.cy + intrinsics.fy * y / z + 0.5)
@@ -142,4 +132,4 @@ def _is_hidden(
                 before = inv_depth[i, j] - 1 / z > DISCONTINUITY
                 hidden += before
                 free += not before
-    return free <= FREE * looked and hidden >= BEHIND * looked
+    return free <= MERGING.free_share * looked and hidden >= MERGING.hidden_share * looked

@@ -6,25 +6,14 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
 from shapecat.detection.connected_components import DOWN, RIGHT
-from shapecat.detection.merging.segments import (
-    UPWARD,
-    Segments,
-    choose_samples,
-)
+from shapecat.detection.merging.segments import Segments, choose_samples
+from shapecat.detection.merging.settings import MERGING
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = ["measure_adjacency"]
-
-GAP, SHADOW = 3, 15
-"""Cells without a reading between two that are neighbours: of one surface, and of two, where the
-nearer one keeps the light of the projector from the other."""
-INWARD = 3
-"""Cells from a border to where it is known which way the surface faces."""
-DOWNWARD = 0.7
-"""Cosine of the largest angle, in the image, of a neighbour below to straight down."""
 
 
 @kernel
@@ -51,7 +40,7 @@ def measure_adjacency(
                 if labels[y, x] == p and (p == 0 or link):
                     continue
                 gap = 0
-                while gap <= SHADOW and y < rows and x < columns:
+                while gap <= MERGING.shadow_cells and y < rows and x < columns:
                     if inv_depth[y, x] > 0 and not (labels[y, x] == 0 and plane_id[y, x] > 0):
                         break
                     gap, y, x = gap + 1, y + down, x + 1 - down
@@ -59,7 +48,7 @@ def measure_adjacency(
                 q = 0 if beyond else labels[y, x]
                 ends = gap == 0 or p != q  # else the segment goes on behind the gap
                 statistics[p].boundary += (p > 0) & ends
-                if beyond or gap > SHADOW:
+                if beyond or gap > MERGING.shadow_cells:
                     continue
                 statistics[q].boundary += (q > 0) & ends
                 if p != q:
@@ -106,7 +95,7 @@ def _count(
     """
     plane_id, height = heights.plane_id, heights.height
     statistics, pairs = segments.statistics, segments.pairs
-    steep = DOWNWARD * math.hypot(up[0], up[1])
+    steep = MERGING.down_cos * math.hypot(up[0], up[1])
     for m in range(2 * met.shape[0]):
         i, j, y, x = row, met[m // 2, 0], met[m // 2, 1], met[m // 2, 2]
         fall = -up[met[m // 2, 3]]  # how much lower (y, x) is seen, however the image is turned
@@ -121,7 +110,7 @@ def _count(
         if q == 0:
             if ahead < -DISCONTINUITY:
                 statistics[p].hidden += 1
-            elif ahead < DISCONTINUITY and plane_id[y, x] < 0 and gap <= GAP:
+            elif ahead < DISCONTINUITY and plane_id[y, x] < 0 and gap <= MERGING.gap_cells:
                 if plane_id[y, x] == -plane_id[i, j]:
                     statistics[p].plane_contact += 1
                 else:
@@ -129,13 +118,13 @@ def _count(
         elif link:
             pairs[p, q].contact += 1
             # Whether the segment at (y, x) faces up a little further in.
-            v = min(max(i + INWARD * (y - i), 0), labels.shape[0] - 1)
-            u = min(max(j + INWARD * (x - j), 0), labels.shape[1] - 1)
+            v = min(max(i + MERGING.inward_cells * (y - i), 0), labels.shape[0] - 1)
+            u = min(max(j + MERGING.inward_cells * (x - j), 0), labels.shape[1] - 1)
             facing = normal[v, 0, u] * up[0] + normal[v, 1, u] * up[1] + normal[v, 2, u] * up[2]
-            if labels[v, u] == q and facing > UPWARD:
+            if labels[v, u] == q and facing > MERGING.up_cos:
                 pairs[p, q].rests_on += 1
                 pairs[p, q].rests_on_height += height[v, u]
         elif ahead >= DISCONTINUITY:
             pairs[p, q].in_front += 1
-        elif ahead > -DISCONTINUITY and gap <= GAP:
+        elif ahead > -DISCONTINUITY and gap <= MERGING.gap_cells:
             pairs[p, q].near += 1

@@ -20,17 +20,13 @@ from shapecat.detection.merging.pair_features import (
     pair_features,
 )
 from shapecat.detection.merging.segments import Records, Segments, merge
+from shapecat.detection.merging.settings import MERGING
 from shapecat.jit import kernel
 from shapecat.trees import BoostedTrees, logit_of, read_trees
 
-__all__ = ["FILE", "HOPELESS", "load_trees", "merge_learned"]
+__all__ = ["FILE", "load_trees", "merge_learned"]
 
 FILE = "parts.npz"
-LIKELY = 0.3
-"""Logit, of 0.57, from which on two segments are taken for parts of one object: a wrong join loses
-two objects, a missing one seldom one."""
-HOPELESS = -4.0
-"""Logit of the first trees that the others never made up for; half of the pairs end so early."""
 
 
 @cache
@@ -65,10 +61,10 @@ def _merge(
                 logits[p, q] = -np.inf
                 if are_adjacent(segments, p, q):
                     pair_features(segments, p, q, view_geometry, named[0])
-                    logits[p, q] = logit_of(grown, features, HOPELESS)
+                    logits[p, q] = logit_of(grown, features, MERGING.hopeless)
         best = np.argmax(logits)
         p, q = int(best // n), int(best % n)
-        if logits[p, q] < LIKELY:
+        if logits[p, q] < MERGING.likely:
             return
         merge(segments, p, q)
         changed[:] = False

@@ -4,12 +4,10 @@ import numpy as np
 
 from shapecat.arrays import I4, Bool
 from shapecat.detection.merging.segments import Segments, merge
+from shapecat.detection.merging.settings import MERGING
 from shapecat.jit import kernel
 
 __all__ = ["merge_low_profile"]
-
-RAISED = 0.5
-"""Share of the cells of a segment that belong to one low object."""
 
 
 def merge_low_profile(segments: Segments, low_profile: I4, labels: I4, spans: I4) -> Bool:
@@ -30,7 +28,7 @@ def merge_low_profile(segments: Segments, low_profile: I4, labels: I4, spans: I4
         return known
     overlap = np.zeros((known.size, count + 1), np.int32)
     _count_overlap(low_profile, labels, spans, overlap)
-    most = overlap.max(axis=1) > RAISED * segments.statistics["count"]
+    most = overlap.max(axis=1) > MERGING.low_share * segments.statistics["count"]
     leader: dict[int, int] = {}
     for p in np.flatnonzero(most[1:]) + 1:
         first = leader.setdefault(int(overlap[p].argmax()), int(p))

@@ -18,14 +18,8 @@ from shapecat.detection.merging.segment_features import (
     width_of,
     write_segment_features,
 )
-from shapecat.detection.merging.segments import (
-    FEW,
-    SEGMENT,
-    Row,
-    Segments,
-    add_statistics,
-    may_merge,
-)
+from shapecat.detection.merging.segments import SEGMENT, Row, Segments, add_statistics, may_merge
+from shapecat.detection.merging.settings import MERGING
 from shapecat.jit import kernel
 
 __all__ = ["FEATURES", "PAIR_FEATURES", "ViewGeometry", "are_adjacent", "pair_features"]
@@ -82,11 +76,6 @@ The trees number them in this order.
 """
 FEATURES = PAIR_FEATURES.itemsize // np.dtype("f4").itemsize
 """Their number."""
-FACING_M, FACING = 0.015, 0.5
-"""What faces each other: difference of the tops, metres; least share of the narrower one's width
-that has the other one before or behind it."""
-NOWHERE_M = -1.0
-"""Height of what faces up across a border where nothing does, metres."""
 
 
 class ViewGeometry(NamedTuple):
@@ -106,7 +95,7 @@ def are_adjacent(segments: Segments, p: int, q: int) -> bool:
         return False
     pairs = segments.pairs
     met = pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front + pairs[q, p].in_front
-    return bool(met >= FEW or _face(segments.statistics[p], segments.statistics[q]))
+    return bool(met >= MERGING.few or _face(segments.statistics[p], segments.statistics[q]))
 
 
 @kernel
@@ -114,8 +103,10 @@ def _face(a: Row, b: Row) -> bool:
     """Whether two segments may be the near and the far wall of a pot: these touch nowhere."""
     narrow, wide = min(width_of(a), width_of(b)), max(width_of(a), width_of(b))
     common = min(a.right, b.right) - max(a.left, b.left)
-    level = abs(a.top - b.top) < FACING_M
-    return bool(level and common > FACING * narrow and abs(depth_difference(a, b)) < wide)
+    level = abs(a.top - b.top) < MERGING.facing_m
+    return bool(
+        level and common > MERGING.facing_share * narrow and abs(depth_difference(a, b)) < wide
+    )
 
 
 @kernel
@@ -165,7 +156,7 @@ def _above_top(segments: Segments, p: int, q: int) -> float:
     """Return how far above the top of ``q`` faces up what ``p`` borders on there."""
     onto = segments.pairs[p, q].rests_on
     if onto == 0:
-        return NOWHERE_M
+        return MERGING.nowhere_m
     return float(segments.pairs[p, q].rests_on_height / onto - segments.statistics[q].top)
 
 

@@ -5,6 +5,7 @@ import math
 import numpy as np
 
 from shapecat.detection.merging.segments import BAND_M, BANDS, Row, Segments
+from shapecat.detection.merging.settings import MERGING
 from shapecat.jit import kernel
 
 __all__ = [
@@ -40,8 +41,6 @@ SEGMENT_FEATURES = np.dtype(
     ]
 )
 """What one segment looks like, and what its outline is made of."""
-TOP_BANDS = 4
-"""A top is closed by what faces up within 2 cm of it, in bands of height."""
 
 
 @kernel
@@ -105,7 +104,7 @@ def write_segment_features(segments: Segments, p: int, out: Row) -> None:
     top = min(int(row.top / BAND_M), BANDS - 1)
     for band in range(top + 1):
         up += segments.top_area[p, band]
-        closed += segments.top_area[p, band] if band >= top - TOP_BANDS else 0.0
+        closed += segments.top_area[p, band] if band >= top - MERGING.top_bands else 0.0
     wide, tall = width_of(row), row.top - row.bottom
     out.width_m, out.top_m, out.bottom_m, out.height_m = wide, row.top, row.bottom, tall
     out.lateral_curvature = lateral_curvature(row)

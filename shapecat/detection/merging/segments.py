@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.merging.settings import MERGING
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
 from shapecat.geometry import level_axes
@@ -15,11 +16,9 @@ from shapecat.jit import kernel
 
 __all__ = [
     "BAND_M",
-    "FEW",
     "PAIR",
     "SAMPLES",
     "SEGMENT",
-    "UPWARD",
     "Records",
     "Row",
     "Segments",
@@ -70,14 +69,10 @@ Records: TypeAlias = NDArray[np.void]
 """An array of `SEGMENT` or `PAIR`."""
 Row: TypeAlias = Any
 """One of its records."""
-FEW = 3
-"""Links between two segments that are taken for a contact rather than for noise."""
 SAMPLES = 48
 """Most cells, evenly spaced, that stand for a segment where to look at all would take too long."""
 BAND_M, BANDS = 0.005, 128
 """Height of a band, and their number; what is higher counts in the last one."""
-UPWARD = 0.8
-"""Cosine of the largest angle to up of the normal of what faces up."""
 
 
 class Segments(NamedTuple):
@@ -151,7 +146,11 @@ def _measure(
     plane_id, height = heights.plane_id, heights.height
     zero, one, far_off = np.float32(0), np.float32(1), np.float32(np.inf)
     per_x, per_y = np.float32(1 / intrinsics.fx), np.float32(1 / intrinsics.fy)
-    cx, cy, edge_on = np.float32(intrinsics.cx), np.float32(intrinsics.cy), np.float32(0.2)
+    cx, cy, edge_on = (
+        np.float32(intrinsics.cx),
+        np.float32(intrinsics.cy),
+        np.float32(MERGING.edge_on_cos),
+    )
     sx, sy, sz = np.float32(side[0]), np.float32(side[1]), np.float32(side[2])
     ux, uy, uz = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])
     local_plane, normal, spans = graph.local_plane, graph.normal, graph.spans
@@ -185,7 +184,7 @@ def _measure(
                     facing = -(nx * x + ny * y + nz * z) / math.sqrt(x * x + y * y + z * z)
                     area = z * z * per_x * per_y / max(facing, edge_on)
                     areas += area
-                    if nx * ux + ny * uy + nz * uz > np.float32(UPWARD):
+                    if nx * ux + ny * uy + nz * uz > np.float32(MERGING.up_cos):
                         band = min(max(int(h / np.float32(BAND_M)), 0), BANDS - 1)
                         top_area[p, band] += area
                 j += 1
@@ -221,7 +220,7 @@ def choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None:
     for i in range(rows):
         for j in range(spans[i, 0], spans[i, 1]):
             p = labels[i, j]
-            if p == 0 or concavity[i, j] > 20 or not local_plane[i, 0, j] > 0:
+            if p == 0 or concavity[i, j] > MERGING.flat_deg or not local_plane[i, 0, j] > 0:
                 continue
             wait[p] -= 1
             if wait[p] == 0 and taken[p] < SAMPLES:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, U4
-from shapecat.detection.cleanup.holes import FRINGE
+from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import span_of
 from shapecat.detection.depth_grid import DepthGrid, row_and_column
 from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M
@@ -198,7 +198,10 @@ def _find_high(plane: F8, i: int, first: int, inv_depth: F4, high: U1) -> None:
     a, above = np.float32(plane[0]), np.float32(plane[3])
     # The farthest pixel of a cell is 1.5 cells away.
     level = np.float32(plane[1] * i + plane[2] + 1.5 * (abs(plane[0]) + abs(plane[1])))
-    base, slope = np.float32(FRINGE * HEIGHT_NOISE), np.float32(FRINGE * MIN_HEIGHT_M)
+    base, slope = (
+        np.float32(CLEANUP.fringe * HEIGHT_NOISE),
+        np.float32(CLEANUP.fringe * MIN_HEIGHT_M),
+    )
     for j in range(inv_depth.size):
         least = inv_depth[j] - jump if inv_depth[j] - jump > nowhere else nowhere
         ground = level + a * np.float32(first + j)
@@ -274,7 +277,7 @@ def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks:
             continue
         k = plane_ids[label]
         h = (1 - (planes[k, 0] * u + planes[k, 1] * v + planes[k, 2]) * z) * planes[k, 3]
-        if filled[i, j] or h > FRINGE * (MIN_HEIGHT_M + HEIGHT_NOISE * z * z):
+        if filled[i, j] or h > CLEANUP.fringe * (MIN_HEIGHT_M + HEIGHT_NOISE * z * z):
             marks[m] = label
 
 

@@ -12,24 +12,13 @@ from shapecat.detection.depth_grid import (
     count_at_range_limit,
     smallest_object_at,
 )
-from shapecat.detection.merging.segments import (
-    FEW,
-    Segments,
-    depth_of,
-)
+from shapecat.detection.merging.segments import Segments, depth_of
+from shapecat.detection.merging.settings import MERGING
+from shapecat.detection.output.settings import OUTPUT
 from shapecat.geometry import level_axes, level_box
 from shapecat.jit import kernel
 
 __all__ = ["ObjectMeasurements", "measure_objects"]
-
-OCCLUDED = 0.12
-"""Share of the boundary behind something nearer that makes an object occluded."""
-GAP_M, OVERLAP_M = 0.025, 0.04
-"""How far the bottom of an object may seem to be above and below the top of what it stands on: what
-is below is hidden, and a strip of it may go with the object."""
-LIFTED_M, SUNK_M = 0.03, 0.015
-"""What reaches no lower does not stand on the plane; what reaches this much lower than a surface
-does not stand on that."""
 
 
 class ObjectMeasurements(NamedTuple):
@@ -91,7 +80,7 @@ def measure_objects(
     last = count_at_range_limit(grid.inverse_depth, labels, representatives.size, range_m)
     for k in range(count):
         p = representatives[k + 1]
-        measured.last[k] = last[k + 1] >= FEW
+        measured.last[k] = last[k + 1] >= MERGING.few
         measured.least[k] = smallest_object_at(grid, depth_of(segments, p))
         measured.supported_by[k], measured.support_m[k] = _supporting_object(
             segments, representatives, p
@@ -99,7 +88,7 @@ def measure_objects(
         hidden = segments.statistics[p].hidden
         for q in range(segments.parent.size):
             hidden += segments.pairs[q, p].in_front
-        measured.hidden[k] = hidden > np.float32(OCCLUDED) * max(
+        measured.hidden[k] = hidden > np.float32(OUTPUT.occluded_share) * max(
             segments.statistics[p].boundary, np.float32(1)
         )
     _break_cycles(measured)
@@ -115,10 +104,13 @@ def _supporting_object(segments: Segments, representatives: I4, p: int) -> tuple
         more = pairs[representatives[k]].rests_on > pairs[representatives[best]].rests_on
         best = k if more else best
     met = pairs[representatives[best]].rests_on
-    if met >= FEW and met > segments.statistics[p].plane_contact:
+    if met >= MERGING.few and met > segments.statistics[p].plane_contact:
         height = float(pairs[representatives[best]].rests_on_height / met)
-        return (0, 0.0) if statistics[p].bottom < height - SUNK_M else (best, height)
-    if statistics[p].bottom > LIFTED_M and segments.statistics[p].plane_contact < FEW:
+        return (0, 0.0) if statistics[p].bottom < height - OUTPUT.sunk_m else (best, height)
+    if (
+        statistics[p].bottom > OUTPUT.lifted_m
+        and segments.statistics[p].plane_contact < MERGING.few
+    ):
         best = _hidden_support(segments, representatives, p)
         return best, float(statistics[representatives[best]].top) if best else 0.0
     return 0, 0.0
@@ -134,11 +126,11 @@ def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
         q = representatives[k]
         met = pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front + pairs[q, p].in_front
         overlap = statistics[q].top - statistics[p].bottom
-        below = -GAP_M < overlap < OVERLAP_M
+        below = -OUTPUT.gap_m < overlap < OUTPUT.overlap_m
         beside = statistics[q].left < middle < statistics[q].right
         if q != p and below and beside and met > most:
             best, most = k, met
-    return best if most >= FEW else 0
+    return best if most >= MERGING.few else 0
 
 
 @kernel

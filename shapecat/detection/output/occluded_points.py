@@ -7,11 +7,10 @@ whose points they touch; what touches none is clustered by distance alone (thesi
 import numpy as np
 
 from shapecat.arrays import F4, I4
+from shapecat.detection.output.settings import OUTPUT
 from shapecat.jit import kernel
 
 __all__ = ["label_occluded_points"]
-
-VOXEL_M = 0.01
 
 
 def label_occluded_points(points: F4, labels: I4, first_new: int) -> I4:
@@ -27,7 +26,7 @@ def label_occluded_points(points: F4, labels: I4, first_new: int) -> I4:
     (n,) labels, none of them 0. Points in voxels of 1 cm that touch, also by a corner, are
     connected; in order of distance from the known, in steps of one voxel.
     """
-    cell = np.floor((points - points.min(axis=0)) / VOXEL_M).astype(np.int64) + 1
+    cell = np.floor((points - points.min(axis=0)) / OUTPUT.voxel_m).astype(np.int64) + 1
     _, ny, nz = cell.max(axis=0) + 2
     keys, voxel = np.unique((cell[:, 0] * ny + cell[:, 1]) * nz + cell[:, 2], return_inverse=True)
     known = np.zeros(keys.size, np.int64)

@@ -13,15 +13,13 @@ from shapecat.detection.output.label_upsampling import (
     split_lists,
 )
 from shapecat.detection.output.occluded_points import label_occluded_points
+from shapecat.detection.output.settings import OUTPUT
 from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, is_inside_outline
 from shapecat.detection.records import Segmentation
 from shapecat.detection.virtual_camera import VirtualImage
 from shapecat.jit import kernel
 
 __all__ = ["label_points"]
-
-MOST_LABELS = 1000
-HIGHEST_M = 0.6
 
 
 def label_points(view: VirtualImage, found: Segmentation, *, fused: bool) -> list[U4]:
@@ -40,7 +38,7 @@ def label_points(view: VirtualImage, found: Segmentation, *, fused: bool) -> lis
         loose = np.flatnonzero(above)
         if loose.size:
             spread = label_occluded_points(points[loose], marks[loose].astype(np.int64), labels)
-            marks[loose] = np.where(spread <= MOST_LABELS, spread, 0)
+            marks[loose] = np.where(spread <= OUTPUT.most_labels, spread, 0)
             labels = max(labels, int(marks.max()) + 1)
     edges = np.flatnonzero(np.diff(marks, prepend=0, append=0)).astype(np.int32)
     runs = np.stack([marks[edges[:-1]], edges[:-1], edges[1:]], 1, dtype=np.int32)
@@ -60,7 +58,7 @@ def _above(points: F4, cell: I4, intrinsics: PinholeIntrinsics, plane: F8) -> Bo
             h = (1 / z - level - plane[2]) * z * plane[3]
             result[k] = (
                 h > MIN_HEIGHT_M + HEIGHT_NOISE * z * z
-                and h < HIGHEST_M
+                and h < OUTPUT.highest_m
                 and is_inside_outline(plane, x, y, z, 0.0)
             )
     return result

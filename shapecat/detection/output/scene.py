@@ -9,6 +9,7 @@ from shapecat.arrays import F4, I4, U4, Bool, freeze
 from shapecat.config import DetectionSettings
 from shapecat.detection.depth_grid import BORDER_SHARE, DepthGrid
 from shapecat.detection.output.measurements import ObjectMeasurements
+from shapecat.detection.output.settings import OUTPUT
 from shapecat.detection.planes.extent import SupportingPlane, outline_corners
 from shapecat.detection.records import Segmentation
 from shapecat.geometry import (
@@ -22,12 +23,6 @@ from shapecat.geometry import (
 from shapecat.types import Box, Candidate, Plane, Pose, Scene
 
 __all__ = ["build_scene"]
-
-ENOUGH = 60
-"""Cells of what is no noise, however near and therefore small it is."""
-BORDER_CELLS, STRAIGHT, LEAST_FORWARD = 2.5, 0.3, 0.2
-"""The border of a cloud: its width, and the least share of a side that it is straight along; the
-least cosine, about, of what is in front of a camera."""
 
 
 def build_scene(
@@ -92,16 +87,16 @@ def _kept(
     """Return which lists of points are objects, in the order of their first points."""
     limits = [float(least)] * len(indices)
     if image:
-        limits = [max(least, min(n, ENOUGH) * grid.factor**2) for n in measured.least.tolist()]
+        limits = [
+            max(least, min(n, OUTPUT.enough_cells) * grid.factor**2)
+            for n in measured.least.tolist()
+        ]
     enough = (k for k, limit in enumerate(limits) if indices[k].size >= limit)
     return sorted(enough, key=lambda k: int(indices[k][0]))
 
 
 def _boxes(
-    found: Segmentation,
-    indices: Sequence[U4],
-    points: F4 | None,
-    sensor_from_view: Pose,
+    found: Segmentation, indices: Sequence[U4], points: F4 | None, sensor_from_view: Pose
 ) -> list[Box]:
     """Return the boxes of what the cells show, and on the points of what they do not."""
     measured = found.measured
@@ -133,7 +128,7 @@ def _begin(lines: Bool, near: int) -> int:
     some = lines[: math.ceil(BORDER_SHARE * len(lines))].any(axis=1)
     first = int(some.argmax())
     seen = np.flatnonzero(lines[first : first + near].any(axis=0))
-    return first if seen.size and np.ptp(seen) > STRAIGHT * lines.shape[1] else 0
+    return first if seen.size and np.ptp(seen) > OUTPUT.straight_share * lines.shape[1] else 0
 
 
 def _cut_cloud(grid: DepthGrid, found: Segmentation, sensor_from_view: Pose) -> Bool:
@@ -156,13 +151,13 @@ def _cut_cloud(grid: DepthGrid, found: Segmentation, sensor_from_view: Pose) -> 
         1,
     )
     seen = ray @ sensor_from_view.rotation.T
-    ray = seen if (seen[:, 2] > LEAST_FORWARD).all() else ray  # else no optical frame
+    ray = seen if (seen[:, 2] > OUTPUT.forward_cos).all() else ray  # else no optical frame
     place = ray[:, :2] / ray[:, 2:]
     spans = np.ptp(place, axis=0)
     for axis in range(2):
         for along in (place[:, axis], -place[:, axis]):
-            near = along > along.max() - BORDER_CELLS / intrinsics.fx
-            if np.ptp(place[near, 1 - axis]) > STRAIGHT * spans[1 - axis]:
+            near = along > along.max() - OUTPUT.border_cells / intrinsics.fx
+            if np.ptp(place[near, 1 - axis]) > OUTPUT.straight_share * spans[1 - axis]:
                 result[found.labels[i[near], j[near]]] = True
     return result[1:]
 

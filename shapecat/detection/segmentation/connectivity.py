@@ -13,6 +13,7 @@ from shapecat.detection.connected_components import DOWN, RIGHT, spans_of
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.normals import fit_local_planes, padded
+from shapecat.detection.segmentation.settings import SEGMENTATION
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel, unset
 
@@ -20,13 +21,11 @@ __all__ = ["SurfaceGraph", "connect_surfaces"]
 
 BENT = 4
 """The same bits times this mark, for a time, the links that only a local plane tells."""
-BASE, BASE_DIAGONAL = 3, 2
-"""Cells between an edge and the surfaces on its two sides."""
-REACH, SURE = 2, 0.5
-"""Cells over which the slope beside a step is measured; how well one of two slopes that differ must
-explain the step, as a share of a jump."""
 LEAST_CHORD = 3e-4
 """Squared distance of two normals from which their angle is a degree."""
+
+BASE, BASE_DIAGONAL = SEGMENTATION.base, SEGMENTATION.base_diagonal
+REACH = SEGMENTATION.step_reach
 
 
 class SurfaceGraph(NamedTuple):
@@ -83,7 +82,7 @@ def _cleared(spans: I4, columns: int) -> F4:
         for y in range(max(i - BASE, 0), min(i + BASE + 1, rows)):
             if spans[y, 0] < spans[y, 1]:
                 start, end = min(start, spans[y, 0]), max(end, spans[y, 1])
-        start, end = max(start - BASE, 0), min(padded(start, end) + BASE, columns)
+        start, end = (max(start - BASE, 0), min(padded(start, end) + BASE, columns))
         for d in range(3):
             row = fits[i, d]
             for j in range(start, end):
@@ -148,7 +147,7 @@ def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links
             if not links[j] & BENT * bit:
                 continue
             di, dj = (0, 1) if bit == RIGHT else (1, 0)
-            i0, j0, i1, j1 = i - REACH * di, j - REACH * dj, i + di, j + dj
+            i0, j0, i1, j1 = (i - REACH * di, j - REACH * dj, i + di, j + dj)
             i2, j2 = i1 + REACH * di, j1 + REACH * dj
             if i0 < 0 or j0 < 0 or i2 >= inv_depth.shape[0] or j2 >= inv_depth.shape[1]:
                 continue
@@ -158,7 +157,7 @@ def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links
             before = abs(step - (inv_depth[i, j] - inv_depth[i0, j0]) / REACH)
             after = abs(step - (inv_depth[i2, j2] - inv_depth[i1, j1]) / REACH)
             least, most = min(before, after), max(before, after)
-            if least >= SURE * DISCONTINUITY and most >= DISCONTINUITY:
+            if least >= SEGMENTATION.sure * DISCONTINUITY and most >= DISCONTINUITY:
                 links[j] &= ~bit
         links[j] &= RIGHT | DOWN
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from shapecat.arrays import F4, I4
 from shapecat.detection.depth_grid import PinholeIntrinsics
+from shapecat.detection.segmentation.settings import SEGMENTATION
 from shapecat.jit import kernel
 
 __all__ = ["fit_local_planes", "padded"]
@@ -18,11 +19,8 @@ __all__ = ["fit_local_planes", "padded"]
 WINDOW = 3
 """Half the edge of the window a local plane is fitted to, in cells."""
 SIDE = 2 * WINDOW + 1
-GATE, GATE_SLOPE = 0.008, 0.008
-"""A sample of the fit lies within this of the centre, plus the slope times its distance."""
-LEAST_SAMPLES, LEAST_SPREAD = 5, 0.2
-RUN, BRIDGED = 128, 8
-"""Most cells in a run, and gaps of other cells that are part of it."""
+RUN = 128
+"""Most cells in a run."""
 LANES = 8
 """Runs are fitted in multiples of this, for what remains is not vectorised."""
 NONE = 1e9
@@ -87,7 +85,9 @@ def _next_run(owners: I4, row: int, j: int, last: int) -> tuple[int, int]:
         j += 1
     start = end = j
     me, last = owners[row + j], min(last, start + RUN)
-    while j < min(last, end + BRIDGED) and (owners[row + j] <= 0 or owners[row + j] == me):
+    while j < min(last, end + SEGMENTATION.bridged) and (
+        owners[row + j] <= 0 or owners[row + j] == me
+    ):
         end = j + 1 if owners[row + j] == me else end
         j += 1
     return start, end
@@ -127,9 +127,12 @@ def _fit_run(
     Rows of ``fits``: inverse depth, its two slopes, and the normal; 0 where there is no fit.
     """
     zero, one = np.float32(0), np.float32(1)
-    g0, g1 = np.float32(GATE), np.float32(GATE + GATE_SLOPE)
-    g2, g3 = np.float32(GATE + GATE_SLOPE * 2), np.float32(GATE + GATE_SLOPE * 3)
-    least, spread = np.float32(LEAST_SAMPLES), np.float32(LEAST_SPREAD)
+    g0, g1 = np.float32(SEGMENTATION.gate), np.float32(SEGMENTATION.gate + SEGMENTATION.gate_slope)
+    g2, g3 = (
+        np.float32(SEGMENTATION.gate + SEGMENTATION.gate_slope * 2),
+        np.float32(SEGMENTATION.gate + SEGMENTATION.gate_slope * 3),
+    )
+    least, spread = np.float32(SEGMENTATION.fewest_samples), np.float32(SEGMENTATION.least_spread)
     fx, fy, y = np.float32(intrinsics.fx), np.float32(intrinsics.fy), np.float32(i - intrinsics.cy)
     for k in range(n):
         p = k + WINDOW

@@ -6,19 +6,12 @@ from shapecat.arrays import F4, I4, U1, Bool
 from shapecat.detection.connected_components import DOWN, RIGHT, connected_components
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
+from shapecat.detection.segmentation.settings import SEGMENTATION
 from shapecat.jit import kernel, unset
 
 __all__ = ["relabel", "relabel_above", "watershed"]
 
-EDGE_DEG = 18
-"""Concave angle that may part two objects; a bowl of 7 cm turns 16 degrees over the same cells."""
-LEAST_CELLS = 12
-"""Smaller parts are scraps, that belong to what is around them."""
-MOST_SEGMENTS = 250
-"""Bounds the time, which grows with the square of their number."""
-BUCKET_DEG = 4
-"""Angles that differ less are flooded in one go."""
-BUCKETS = 256 // BUCKET_DEG
+BUCKETS = 256 // SEGMENTATION.bucket_deg
 
 
 def watershed(heights: HeightMap, graph: SurfaceGraph, *, concave: bool) -> tuple[I4, int]:
@@ -29,7 +22,7 @@ def watershed(heights: HeightMap, graph: SurfaceGraph, *, concave: bool) -> tupl
     part segments.
     """
     labels = np.zeros(heights.plane_id.shape, np.int16)
-    n = _label_parts(heights.plane_id, graph, EDGE_DEG if concave else 256, labels, 0)
+    n = _label_parts(heights.plane_id, graph, SEGMENTATION.edge_deg if concave else 256, labels, 0)
     _flood_labels(graph.links, graph.concavity, graph.spans, labels)
     return labels, _label_parts(heights.plane_id, graph, 256, labels, n)
 
@@ -46,7 +39,7 @@ def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n
     sizes = connected_components(inside, graph.links, spans, component)
     names = np.zeros(sizes.size, np.int16)
     for k in range(1, sizes.size):
-        if sizes[k] >= LEAST_CELLS and n < MOST_SEGMENTS:
+        if sizes[k] >= SEGMENTATION.least_cells and n < SEGMENTATION.most_segments:
             n += 1
             names[k] = n
     for i in range(len(spans)):
@@ -82,7 +75,7 @@ def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4) -> None:
             q = _linked(flat_links, p, d, columns)
             if q >= 0 and flat[q] <= 0:
                 flat[q] = flat[p]
-                _append(queue, max(now, angle[q] // BUCKET_DEG), q)
+                _append(queue, max(now, angle[q] // SEGMENTATION.bucket_deg), q)
 
 
 @kernel

@@ -15,21 +15,14 @@ from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.merging.segments import BAND_M, BANDS, lateral_axis
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
+from shapecat.detection.segmentation.settings import SEGMENTATION
 from shapecat.detection.segmentation.watershed import relabel_above
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
 
 __all__ = ["split_at_width_changes"]
 
-STEP_M, STEPS_M = 0.01, 0.02
-"""How far one side of the outline steps aside at least, and both together."""
-BESIDE = 5
-"""Bands of height below and above a step: as many as either part has at least. The nearest is left
-out, for a step is not sharp, the others tell where the outline was and is."""
-LEAST_CELLS = 60
-"""Of either part."""
-SHADOW = 6
-"""Cells without a reading beside what hides something, on a Kinect."""
+BESIDE = SEGMENTATION.bands_beside
 
 
 class Outlines(NamedTuple):
@@ -49,12 +42,7 @@ class Outlines(NamedTuple):
 
 
 def split_at_width_changes(
-    grid: DepthGrid,
-    heights: HeightMap,
-    graph: SurfaceGraph,
-    labels: I4,
-    up: F8,
-    n: int,
+    grid: DepthGrid, heights: HeightMap, graph: SurfaceGraph, labels: I4, up: F8, n: int
 ) -> int:
     """Give what is above a step a label of its own, in place; return how many labels there are.
 
@@ -130,10 +118,10 @@ def _cut_label(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool
         steps[band] = _step_at(grid, outlines, p, band, side)
     below = 0  # cells since the last cut; ``above``: from here on
     for band in range(BANDS - BESIDE):
-        largest = steps[band] >= STEPS_M and band >= BESIDE
+        largest = steps[band] >= SEGMENTATION.both_steps_m and band >= BESIDE
         for k in range(band - BESIDE if largest else 0, band + BESIDE + 1 if largest else 0):
             largest &= steps[band] >= steps[k]
-        if largest and min(below, above) >= LEAST_CELLS:
+        if largest and min(below, above) >= SEGMENTATION.part_cells:
             cuts[p, band] = True
             below = 0
         below += outlines.counts[p, band]
@@ -158,13 +146,13 @@ def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -
         # A slope goes on as it is on one of the two sides.
         slope = max(way * _slope_of(end, low), way * _slope_of(end, high), 0.0)
         step = -_second(end, high, -way) - _second(end, low, way) - BESIDE * slope
-        if step < STEP_M / 2:
+        if step < SEGMENTATION.side_step_m / 2:
             continue
         narrow = band + 1 if way > 0 else band - 3
         sign = -1.0 if k == 0 else 1.0
         if _is_free(grid, at[narrow], sign, side) and _is_free(grid, at[narrow + 1], sign, side):
             both, most = both + step, max(most, step)
-    return both if most >= STEP_M else 0.0
+    return both if most >= SEGMENTATION.side_step_m else 0.0
 
 
 @kernel
@@ -187,7 +175,7 @@ def _is_free(grid: DepthGrid, at: int, sign: float, side: F8) -> bool:
     rows, columns = inv_depth.shape
     i, j = at // columns, at % columns
     across = max(math.hypot(side[0], side[1]), 1e-6)
-    for step in range(1, SHADOW + 1):
+    for step in range(1, SEGMENTATION.shadow_cells + 1):
         y = i + round(sign * step * side[1] / across)
         x = j + round(sign * step * side[0] / across)
         if y < 0 or x < 0 or y >= rows or x >= columns:
