@@ -1,0 +1,109 @@
+"""Cleanup: what tells objects from background, and labels that are completed."""
+
+import numpy as np
+import pytest
+
+from shapecat.config import DetectionSettings
+from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
+from shapecat.detection.cleanup.object_features import (
+    OBJECT_FEATURES,
+    _border_lines,
+    measure_object_features,
+)
+from shapecat.detection.cleanup.structure import find_background, load_trees
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
+from shapecat.detection.merging.segments import _blank
+from shapecat.detection.pipeline import ALL_STEPS, Task, merge_segments, oversegment
+from shapecat.detection.planes.height_map import HeightMap
+from shapecat.trees import BoostedTrees, Trees
+from tests.test_detection import Array, Shape, box, frame_of, render, table
+
+INTRINSICS = PinholeIntrinsics(262.5, 262.5, 19.5, 19.5)
+
+
+def features_of(shapes: list[Shape], tilt_deg: float) -> tuple[Array, Array]:
+    """Return the object features of what stands on a table, and what is taken for background."""
+    depth, _ = render(shapes, tilt_deg=tilt_deg)
+    frame, settings = frame_of(depth), DetectionSettings()
+    assert frame.depth is not None
+    assert frame.camera is not None
+    grid = downsample(frame.depth, frame.camera, range_m=settings.max_range_m)
+    assert grid is not None
+    found = oversegment(grid, Task(settings, np.random.default_rng(0)))
+    assert found is not None
+    model, oversegmentation = found
+    known = merge_segments(grid, model, oversegmentation, ALL_STEPS)
+    features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
+    segments = oversegmentation.segments
+    rejected = find_background(segments, features, settings.max_size_m, load_trees())
+    seen = features["visibility"]["cells"] > 0
+    return features[seen], rejected[seen]
+
+
+def test_a_box_in_the_middle_of_a_table() -> None:
+    """It ends where it ends, inside the outline, and is an object."""
+    features, rejected = features_of([table(), box((0, 0, 0), (0.1, 0.08, 0.12))], tilt_deg=35)
+    assert len(features) == 1
+    around, segment = features["surroundings"][0], features["segment"][0]
+    ends = ("image_border", "range_limit", "on_wall", "beyond", "into_wall")
+    assert [around[name] for name in ends] == [0] * 5
+    assert -0.6 < around["least_outside_m"] <= around["mean_outside_m"]
+    assert around["mean_outside_m"] <= around["most_outside_m"] < -0.2
+    assert segment["top_m"] == pytest.approx(0.12, abs=0.01)
+    assert segment["width_m"] == pytest.approx(0.1, abs=0.015)
+    assert not rejected.any()
+
+
+def test_what_is_wider_than_an_object_is_none() -> None:
+    segments = _blank(2)
+    features = np.zeros(2, OBJECT_FEATURES)
+    features["segment"]["width_m"] = 0.2
+    always = BoostedTrees(Trees(*np.zeros((4, 1), np.int32)), np.ones(1, np.float32))
+    assert find_background(segments, features, 0.1, always)[1]
+    assert not find_background(segments, features, 0.3, always)[1]
+
+
+def test_the_image_border_is_where_samples_begin() -> None:
+    """A sensor may leave a strip empty; what is cut farther inside is no border."""
+    inv_depth = np.zeros((100, 200), np.float32)
+    inv_depth[3:60, 0:195] = 1
+    grid = DepthGrid(inv_depth, INTRINSICS, 1, 0.003)
+    assert _border_lines(grid) == (3, -1, 0, 194)
+    assert _border_lines(grid._replace(inverse_depth=np.zeros_like(inv_depth))) == (-1, -1, -1, -1)
+
+
+def test_a_contact_boundary_goes_to_the_object_beside_it() -> None:
+    """Only what rises a little, and only one cell far."""
+    inv_depth = np.full((8, 8), 1.0, np.float32)
+    labels, plane_id = np.zeros((8, 8), np.int16), np.full((8, 8), -1, np.int8)
+    labels[:4], plane_id[:4] = 3, 1
+    height = np.zeros((8, 8), np.float32)
+    height[4:6, :5] = 0.005  # more than .6 of 6.5 mm
+    fill_contact_boundary(inv_depth, HeightMap(plane_id, height), labels)
+    assert (labels[4, :5] == 3).all()
+    assert (labels[4, 5:] == 0).all()
+    assert (labels[5:] == 0).all()
+
+
+def test_a_hole_belongs_to_what_encloses_it() -> None:
+    """A can that stands before the ring hides some of its hole, and does not own it."""
+    inv_depth = np.full((40, 40), 1.25, np.float32)
+    labels, filled = np.zeros((40, 40), np.int16), np.zeros((40, 40), np.uint8)
+    labels[10:30, 10:30] = 1
+    labels[15:25, 15:25] = 0
+    labels[20:35, 18:21], inv_depth[20:35, 18:21] = 2, 1.4
+    hole = labels[15:25, 15:25] == 0
+    fill_holes(inv_depth, labels, 2, filled)
+    assert (labels[15:25, 15:25][hole] == 1).all()
+    assert filled.sum() == hole.sum()
+
+
+def test_the_space_between_two_boxes_is_no_hole() -> None:
+    """Each has half of its boundary."""
+    inv_depth = np.full((40, 40), 1.25, np.float32)
+    labels, filled = np.zeros((40, 40), np.int16), np.zeros((40, 40), np.uint8)
+    labels[10:30, 5:35] = 1
+    labels[20:30] *= 2
+    labels[17:23, 15:25] = 0
+    fill_holes(inv_depth, labels, 2, filled)
+    assert not filled.any()

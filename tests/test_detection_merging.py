@@ -1,0 +1,132 @@
+"""Segments and what they meet: two boxes that touch, a board behind a post, a plate."""
+
+import numpy as np
+import pytest
+
+from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.merging.across_occlusion import merge_across_occluder
+from shapecat.detection.merging.adjacency import measure_adjacency
+from shapecat.detection.merging.low_profile import merge_low_profile
+from shapecat.detection.merging.pair_features import (
+    PAIR_FEATURES,
+    ViewGeometry,
+    are_adjacent,
+    pair_features,
+)
+from shapecat.detection.merging.segment_features import (
+    SEGMENT_FEATURES,
+    share,
+    write_segment_features,
+)
+from shapecat.detection.merging.segments import Segments, measure_segments, merge
+from shapecat.detection.planes.height_map import HeightMap
+from shapecat.detection.segmentation.connectivity import SurfaceGraph, connect_surfaces
+from tests.test_detection import Array
+
+INTRINSICS = PinholeIntrinsics(250.0, 250.0, 99.5, 74.5)
+UP = np.array([0.0, -1.0, 0.0])
+"""A camera that looks straight ahead."""
+
+
+def measured(depth: Array, labels: Array) -> tuple[Segments, SurfaceGraph, DepthGrid]:
+    """Measure the labels of a depth image (150, 200), metres, 0 where there is nothing."""
+    with np.errstate(divide="ignore"):
+        inv_depth = np.where(depth > 0, 1 / depth, 0).astype(np.float32)
+    grid = DepthGrid(inv_depth, INTRINSICS, 1, 0.003)
+    plane_id = (labels > 0).astype(np.int8)
+    y = (np.arange(150)[:, None] - INTRINSICS.cy) / INTRINSICS.fy * depth
+    heights = HeightMap(plane_id, np.where(labels > 0, 0.25 - y, 0).astype(np.float32))
+    graph = connect_surfaces(grid, heights)
+    labels = labels.astype(np.int16)
+    segments = measure_segments(grid, heights, graph, labels, int(labels.max()), UP)
+    measure_adjacency(inv_depth, heights, graph, labels, UP, segments)
+    return segments, graph, grid
+
+
+def two_boxes(gap_m: float) -> tuple[Array, Array]:
+    """Return two fronts side by side, the right one farther away by ``gap_m``."""
+    depth, labels = np.zeros((150, 200)), np.zeros((150, 200), np.int16)
+    depth[50:100, 50:100], labels[50:100, 50:100] = 0.8, 1
+    depth[40:100, 100:140], labels[40:100, 100:140] = 0.8 + gap_m, 2
+    return depth, labels
+
+
+def test_two_boxes_that_touch() -> None:
+    segments, _, _ = measured(*two_boxes(0))
+    first, second = segments.statistics[1], segments.statistics[2]
+    assert first["count"] == 50 * 50
+    assert first["right"] - first["left"] == pytest.approx(49 / 250 * 0.8, rel=1e-3)
+    assert second["top"] - first["top"] == pytest.approx(10 / 250 * 0.8, rel=1e-3)
+    assert first["area"] == pytest.approx(0.16**2, rel=0.05)
+    assert segments.pairs[1, 2]["contact"] == segments.pairs[2, 1]["contact"] == 50
+    assert segments.pairs[1, 2]["in_front"] == segments.pairs[2, 1]["in_front"] == 0
+    assert are_adjacent(segments, 1, 2)
+
+
+def test_a_box_before_another() -> None:
+    segments, _, _ = measured(*two_boxes(0.1))
+    assert segments.pairs[1, 2]["contact"] == 0
+    assert segments.pairs[1, 2]["in_front"] == 50
+    assert segments.pairs[2, 1]["in_front"] == 0
+
+
+def test_features_of_two_boxes() -> None:
+    segments, _, _ = measured(*two_boxes(0))
+    out = np.zeros(1, PAIR_FEATURES)
+    pair_features(segments, 2, 1, ViewGeometry(250.0, 0.0), out[0])
+    assert out["adjacency"]["contact"] == 1
+    assert out["adjacency"]["contact_m"] == pytest.approx(50 / 250 * 0.8, rel=1e-3)
+    assert out["relation"]["top_over_top_m"] == pytest.approx(0.032, rel=1e-3)  # smaller first
+    assert abs(out["relation"]["lateral_curvature"][0]) < 0.1
+    segment = np.zeros(1, SEGMENT_FEATURES)
+    write_segment_features(segments, 1, segment[0])
+    assert segment["filled"] == pytest.approx(1, rel=0.06)
+    assert segment["facing_up"] == 0
+    assert share(1, 0) == 0
+
+
+def test_what_is_merged_adds_up() -> None:
+    segments, _, _ = measured(*two_boxes(0))
+    merge(segments, 1, 2)
+    assert segments.parent.tolist() == [0, 1, 1]
+    assert segments.statistics[1]["count"] == 50 * 50 + 60 * 40
+    assert not segments.pairs[1, 1]["contact"]
+    assert not are_adjacent(segments, 1, 2)
+    assert (segments.samples[1] >= 0).all()
+
+
+def behind_a_post(offset_m: float) -> tuple[Array, Array]:
+    """Return a board at 1 m whose middle a post hides; its right part ``offset_m`` farther."""
+    depth, labels = np.zeros((150, 200)), np.zeros((150, 200), np.int16)
+    depth[50:100, 40:90], labels[50:100, 40:90] = 1.0, 1
+    depth[50:100, 100:150], labels[50:100, 100:150] = 1.0 + offset_m, 2
+    depth[40:110, 90:100], labels[40:110, 90:100] = 0.7, 3
+    return depth, labels
+
+
+@pytest.mark.parametrize(("offset_m", "merged"), [(0.0, True), (0.05, False)])
+def test_a_board_goes_on_behind_a_post(offset_m: float, *, merged: bool) -> None:
+    depth, labels = behind_a_post(offset_m)
+    segments, graph, grid = measured(depth, labels)
+    merge_across_occluder(segments, grid.inverse_depth, INTRINSICS, graph.normal, labels)
+    assert (segments.parent[2] == 1) == merged
+    assert segments.parent[3] == 3
+
+
+def test_without_the_post_two_boards_stay_two() -> None:
+    depth, labels = behind_a_post(0)
+    depth[labels == 3], labels[labels == 3] = 0, 0
+    segments, graph, grid = measured(depth, labels)
+    merge_across_occluder(segments, grid.inverse_depth, INTRINSICS, graph.normal, labels)
+    assert segments.parent.tolist() == [0, 1, 2]
+
+
+def test_the_segments_of_a_plate_are_one() -> None:
+    """Most of both is of one low-profile object; of a box beside it little is."""
+    depth, labels = two_boxes(0)
+    labels[90:100, 50:140] = 3
+    segments, graph, _ = measured(depth, labels)
+    low = np.where((labels == 1) | (labels == 3), 1, 0).astype(np.int16)
+    known = merge_low_profile(segments, low, labels, graph.spans)
+    assert segments.parent.tolist() == [0, 1, 2, 1]
+    assert known.tolist() == [False, True, False, False]

@@ -1,0 +1,55 @@
+"""Output: boxes, borders and labels at full resolution of made-up labels."""
+
+import numpy as np
+import pytest
+
+from shapecat.detection.output.label_upsampling import list_runs, split_lists
+from shapecat.detection.output.occluded_points import label_occluded_points
+from shapecat.detection.output.scene import _begin
+from shapecat.geometry import rotation_from_quaternion, upright_box
+
+
+def test_runs_are_listed_by_label() -> None:
+    runs = np.array([[2, 3, 5], [1, 7, 9], [2, 11, 12]], np.int32)
+    lists = split_lists(*list_runs(runs, 4))
+    assert [each.tolist() for each in lists] == [[7, 8], [3, 4, 11], []]
+
+
+def test_occluded_points_join_what_they_touch() -> None:
+    """A row of points goes on from a known one; another stands apart; each keeps its label."""
+    along = np.arange(10) * 0.008
+    points = np.zeros((20, 3), np.float32)
+    points[:10, 0], points[10:, 0], points[10:, 1] = along, along, 0.3
+    labels = np.zeros(20, np.int64)
+    labels[0] = 5
+    found = label_occluded_points(points, labels, 9)
+    assert found.tolist() == [5] * 10 + [9] * 10
+
+
+@pytest.mark.parametrize(("rows", "expected"), [(range(4, 40), 4), (range(20, 40), 0)])
+def test_where_samples_begin(rows: range, expected: int) -> None:
+    """A strip may be empty; what begins in the middle is the top of an object."""
+    lines = np.zeros((40, 30), bool)
+    lines[list(rows), 5:25] = True
+    assert _begin(lines, 2) == expected
+
+
+def test_the_top_of_one_object_is_no_border() -> None:
+    lines = np.zeros((40, 30), bool)
+    lines[4:, 10:14] = True
+    assert _begin(lines, 2) == 0
+
+
+def test_the_box_of_a_turned_box() -> None:
+    """Its corners, turned by 30 degrees about an up that is aslant, give its size back."""
+    size = np.array([0.2, 0.1, 0.05])
+    corners = (np.array(np.meshgrid(*[(-0.5, 0.5)] * 3)).reshape(3, -1).T) * size
+    c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
+    up = np.array([0.0, -np.sqrt(0.5), -np.sqrt(0.5)])
+    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    axes = np.stack([[1, 0, 0], np.cross(up, [1, 0, 0]), up], 1)
+    box = upright_box((corners @ turn.T @ axes.T + [0, 0, 1]).astype(np.float32), up)
+    np.testing.assert_allclose(np.sort(box.size[:2]), [0.1, 0.2], atol=2e-3)
+    assert box.size[2] == pytest.approx(0.05, abs=1e-4)
+    np.testing.assert_allclose(box.center, [0, 0, 1], atol=1e-4)
+    np.testing.assert_allclose(rotation_from_quaternion(box.orientation)[:, 2], up, atol=1e-6)
