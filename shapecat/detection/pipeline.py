@@ -246,7 +246,8 @@ def _clean_up(
     """Reject what is no object, and number the others; return their representative segments."""
     graph, labels, segments = oversegmentation
     features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
-    rejected = find_background(segments, features, settings.max_size_m, structure.load_trees())
+    trees = structure.load_trees()
+    rejected = find_background(segments, features, grid, settings.max_size_m, trees)
     representatives, numbers = _number(segments.parent, rejected)
     relabel(labels, graph.spans, numbers)
     return representatives

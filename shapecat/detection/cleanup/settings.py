@@ -15,6 +15,10 @@ class CleanupSettings(NamedTuple):
     """Logit of the first trees that the others never made up for."""
     border_share: float = 0.08
     """Share of the image that sensors leave empty at most at its border."""
+    large_share: float = 0.02
+    """Share of the image that an arm, furniture or a bent end of a table covers at least."""
+    cut_share: float = 0.25
+    """Share of its outline, taken for a square, that is at the border of the image then."""
     fringe: float = 0.6
     """Share of the least height from which a sample next to an object belongs to it: the least
     height is safe against the noise of the plane, and what is as low farther away is as often

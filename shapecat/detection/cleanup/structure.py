@@ -12,6 +12,7 @@ import numpy as np
 
 from shapecat.arrays import F4, Bool
 from shapecat.detection.cleanup.settings import CLEANUP
+from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.merging.segments import Records, Segments, is_root
 from shapecat.jit import kernel
 from shapecat.trees import BoostedTrees, logit_of, read_trees
@@ -28,7 +29,7 @@ def load_trees() -> BoostedTrees:
 
 
 def find_background(
-    segments: Segments, features: Records, largest_m: float, grown: BoostedTrees
+    segments: Segments, features: Records, grid: DepthGrid, largest_m: float, grown: BoostedTrees
 ) -> Bool:
     """Return (n + 1,) whether each merged segment is no object: background, or too large for one.
 
@@ -39,6 +40,9 @@ def find_background(
     """
     rejected: Bool = _reject(segments, features.view(np.float32).reshape(len(features), -1), grown)
     rejected |= features["segment"]["width_m"] > largest_m
+    # No simulated scene has arms yet: what is large and cut across by the border of the image.
+    large = features["visibility"]["cells"] > CLEANUP.large_share * grid.inverse_depth.size
+    rejected |= large & (features["surroundings"]["image_border"] > CLEANUP.cut_share)
     return rejected
 
 
