@@ -35,7 +35,7 @@ def features_of(shapes: list[Shape], tilt_deg: float) -> tuple[Array, Array]:
     known = merge_segments(grid, model, oversegmentation, ALL_STEPS)
     features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
     segments = oversegmentation.segments
-    rejected = find_background(segments, features, grid, settings.max_size_m, load_trees())
+    rejected = find_background(segments, features, grid, settings, load_trees())
     seen = features["visibility"]["cells"] > 0
     return features[seen], rejected[seen]
 
@@ -60,8 +60,9 @@ def test_what_is_wider_than_an_object_is_none() -> None:
     features["segment"]["width_m"] = 0.2
     grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, 0.003)
     always = BoostedTrees(Trees(*np.zeros((4, 1), np.int32)), np.ones(1, np.float32))
-    assert find_background(segments, features, grid, 0.1, always)[1]
-    assert not find_background(segments, features, grid, 0.3, always)[1]
+    for widest, expected in ((0.1, True), (0.3, False)):
+        settings = DetectionSettings(max_size_m=widest)
+        assert find_background(segments, features, grid, settings, always)[1] == expected
 
 
 @pytest.mark.parametrize(("cells", "border"), [(400, 0.3), (20, 0.3), (400, 0.1)])
@@ -70,7 +71,7 @@ def test_what_is_large_and_cut_across_by_the_border_is_an_arm(cells: int, border
     features["visibility"]["cells"], features["surroundings"]["image_border"] = cells, border
     grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, 0.003)
     always = BoostedTrees(Trees(*np.zeros((4, 1), np.int32)), np.ones(1, np.float32))
-    found = find_background(_blank(2), features, grid, 0.3, always)[1]
+    found = find_background(_blank(2), features, grid, DetectionSettings(), always)[1]
     assert found == (cells > 100 and border > 0.2)
 
 

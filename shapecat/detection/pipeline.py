@@ -247,7 +247,7 @@ def _clean_up(
     graph, labels, segments = oversegmentation
     features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
     trees = structure.load_trees()
-    rejected = find_background(segments, features, grid, settings.max_size_m, trees)
+    rejected = find_background(segments, features, grid, settings, trees)
     representatives, numbers = _number(segments.parent, rejected)
     relabel(labels, graph.spans, numbers)
     return representatives

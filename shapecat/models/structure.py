@@ -6,6 +6,7 @@ objects, of furniture and walls, or of noise. Grown after those of `shapecat.mod
 
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import replace
 from itertools import chain
 from multiprocessing import get_context
 from pathlib import Path
@@ -38,12 +39,16 @@ _CHUNK = 10
 
 
 class Series(NamedTuple):
-    """Scenes of one kind, the first seed and how many; each by another of the sensors in turn."""
+    """Scenes of one kind, the first seed and how many; each by another of the sensors in turn.
+
+    With a ``scale`` all is so many times larger, and farther away.
+    """
 
     kind: SceneKind
     first: int
     scenes: int
     sensors: tuple[str, ...] = tuple(PRESETS)
+    scale: float = 1.0
 
 
 _TWO = ("kinect", "realsense")
@@ -59,8 +64,12 @@ _SERIES = (
     Series("shelf", 607_000, 40),
     Series("shelf_bin", 601_000, 80),
     Series("tabletop", 609_000, 30),
+    Series("clutter", 602_000, 80, _TWO, scale=1.8),
+    Series("clutter", 606_000, 50, scale=1.8),
+    Series("pile", 605_000, 50, scale=1.8),
+    Series("tabletop", 609_000, 30, scale=1.8),
 )
-"""Seeds of their own: the merging trees were not grown on them."""
+"""Seeds of their own: the merging trees were not grown on them. Large objects are too rare else."""
 
 
 class Told(NamedTuple):
@@ -112,8 +121,9 @@ def _labelled(series: Series, seed: int) -> Iterator[tuple[F4, bool]]:
     world = make_scene(series.kind, rng, frames=1)
     sensor = PRESETS[series.sensors[seed % len(series.sensors)]]
     frame, owners = render_frame(world, 0, rng=rng, sensor=sensor)
+    depth = None if frame.depth is None else frame.depth * np.float32(series.scale)
     things = np.array([thing.label for thing in world.things], np.int64)
-    yield from label_objects(frame, owners, things)
+    yield from label_objects(replace(frame, depth=depth), owners, things)
 
 
 def label_objects(frame: Frame, owners: U1, things: I4) -> Iterator[tuple[F4, bool]]:

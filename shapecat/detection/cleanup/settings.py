@@ -15,6 +15,8 @@ class CleanupSettings(NamedTuple):
     """Logit of the first trees that the others never made up for."""
     border_share: float = 0.08
     """Share of the image that sensors leave empty at most at its border."""
+    cut_off_m: float = 0.02
+    """What reaches so near to the greatest height, metres, goes on above it."""
     large_share: float = 0.02
     """Share of the image that an arm, furniture or a bent end of a table covers at least."""
     cut_share: float = 0.25

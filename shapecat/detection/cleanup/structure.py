@@ -11,6 +11,7 @@ from importlib.resources import files
 import numpy as np
 
 from shapecat.arrays import F4, Bool
+from shapecat.config import DetectionSettings
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.merging.segments import Records, Segments, is_root
@@ -29,19 +30,22 @@ def load_trees() -> BoostedTrees:
 
 
 def find_background(
-    segments: Segments, features: Records, grid: DepthGrid, largest_m: float, grown: BoostedTrees
+    segments: Segments,
+    features: Records,
+    grid: DepthGrid,
+    settings: DetectionSettings,
+    grown: BoostedTrees,
 ) -> Bool:
     """Return (n + 1,) whether each merged segment is no object: background, or too large for one.
 
-    Parameters
-    ----------
-    features : from `measure_object_features`.
-    largest_m : the width of the widest object.
+    ``features`` are from `measure_object_features`.
     """
     rejected: Bool = _reject(segments, features.view(np.float32).reshape(len(features), -1), grown)
-    rejected |= features["segment"]["width_m"] > largest_m
+    segment, cells = features["segment"], features["visibility"]["cells"]
+    rejected |= segment["width_m"] > settings.max_size_m
+    rejected |= segment["top_m"] > settings.max_height_m - CLEANUP.cut_off_m
     # No simulated scene has arms yet: what is large and cut across by the border of the image.
-    large = features["visibility"]["cells"] > CLEANUP.large_share * grid.inverse_depth.size
+    large = cells > CLEANUP.large_share * grid.inverse_depth.size
     rejected |= large & (features["surroundings"]["image_border"] > CLEANUP.cut_share)
     return rejected
 
