@@ -21,7 +21,7 @@ from shapecat.detection.merging.segment_features import (
 )
 from shapecat.detection.merging.segments import Records, Row, Segments, depth_of, is_root
 from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN
-from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M
+from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, OUTLINE
 from shapecat.detection.records import OverSegmentation, PlaneModel
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
@@ -178,7 +178,7 @@ def _measure_outside(grid: DepthGrid, plane: F8, samples: I4, out: Row) -> None:
         q = plane[7] * x + plane[8] * y + plane[9] * z
         outside = -np.inf
         for k in range(DIRECTIONS):
-            outside = max(outside, COS[k] * p + SIN[k] * q - plane[13 + k])
+            outside = max(outside, COS[k] * p + SIN[k] * q - plane[OUTLINE + k])
         out.least_outside_m = min(out.least_outside_m, outside) if n > 0 else outside
         out.most_outside_m = max(out.most_outside_m, outside) if n > 0 else outside
         total += outside

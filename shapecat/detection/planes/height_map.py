@@ -13,6 +13,7 @@ from shapecat.jit import kernel
 __all__ = [
     "HEIGHT_NOISE",
     "MIN_HEIGHT_M",
+    "OUTLINE",
     "HeightMap",
     "is_inside_outline",
     "measure_heights",
