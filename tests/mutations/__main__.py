@@ -39,6 +39,8 @@ KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.runs.folder": ("test_run_folder", "test_done"),
     "shapecat.runs.full_boxes": ("test_tables_turned", "test_completion"),
     "shapecat.runs.same_objects": ("test_label_transfer",),
+    "shapecat.runs.perceiving": ("test_pipeline", "test_crash"),
+    "shapecat.runs.second_look": ("test_second_look",),
     "shapecat.runs.segments": ("test_tables", "test_tables_turned"),
     "shapecat.outputs.exports": ("test_exports_worked", "test_exports_images"),
     "shapecat.outputs.report": ("test_report",),
@@ -50,17 +52,27 @@ KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.recordings.colour": ("test_recordings_colour",),
     "shapecat.recordings.foxglove": ("test_recordings_foxglove",),
     "shapecat.recordings.protobuf": ("test_recordings_foxglove",),
-    "shapecat.tracking": ("test_tracking", "test_tables_turned", "test_tracking_scenes"),
+    "shapecat.tracking": ("test_tracking", "test_tables_turned"),
     "shapecat.tracking.full_boxes": ("test_completion", "test_tables_turned"),
-    "shapecat.batch": ("test_done", "test_batch"),
+    "shapecat.batch": ("test_done",),
+    "shapecat.batch.remote": ("test_remote",),
+    "shapecat.batch.runs": ("test_done", "test_batch"),
     "shapecat.executors": ("test_executors",),
     "shapecat.system": ("test_run_folder", "test_done"),
     "shapecat.colour": ("test_colour",),
     "shapecat.cameras": ("test_cameras", "test_colour"),
 }
 """Test files by the beginning of a module's name; the longest that fits counts."""
-SLOW = ("shapecat.executors", "shapecat.outputs.report", "shapecat.outputs.review")
-"""Judged by tests with a browser, a viewer or processes: left out of samples."""
+SLOW = (
+    "shapecat.batch.remote",
+    "shapecat.batch.runs",
+    "shapecat.executors",
+    "shapecat.outputs.report",
+    "shapecat.outputs.review",
+    "shapecat.runs.perceiving",
+    "shapecat.runs.second_look",
+)
+"""Judged by tests with a browser, a viewer or whole recordings: left out of samples."""
 SLOWEST_S = 900.0
 
 
