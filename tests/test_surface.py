@@ -13,6 +13,7 @@ from shapecat.config import SurfaceSettings
 from shapecat.jit import kernel
 from shapecat.surface import MIN_POINTS, reconstruct, voxelize
 from shapecat.surface.gas import MAX_NEURONS
+from shapecat.surface.graph import link
 from shapecat.surface.growth import Cloud, connect, empty_gas, grow_fritzke, index_mask
 from shapecat.surface.lanes import adapt, three_nearest, two_nearest
 from shapecat.surface.triangles import triangles_of
@@ -307,3 +308,24 @@ def test_the_kernel_is_the_published_algorithm() -> None:
     np.testing.assert_allclose(found, expected.neurons, atol=1e-4)
     linked = gas.born.reshape(gas.x.size, -1)[:count, :count] < 1 << 29
     np.testing.assert_array_equal(np.argwhere(np.triu(linked)), expected.edges)
+
+
+def test_a_third_neighbour_far_away_is_not_linked() -> None:
+    """Two neurons apart from a row of others: their points' third nearest is across the gap."""
+    row = np.stack([np.arange(8.0), np.zeros(8), np.zeros(8)], axis=1) / 10
+    pair = np.array([[0.0, 0.9, 0.0], [0.1, 0.9, 0.0]])
+    neurons = np.concatenate([row, pair]).astype(np.float32)
+    around = np.array([[0.01, 0, 0], [-0.01, 0, 0], [0, 0.01, 0], [0, -0.01, 0]], np.float32)
+    points = (neurons[:, None] + around).reshape(-1, 3)
+    many = np.concatenate([points, np.repeat(points[-8:], 4, axis=0)])  # the pair has weight
+    gas = empty_gas(len(neurons))
+    gas.x[: len(neurons)], gas.y[: len(neurons)], gas.z[: len(neurons)] = neurons.T
+    cloud = Cloud(*(np.ascontiguousarray(axis) for axis in many.T))
+
+    adjacent = link(cloud, gas, len(neurons), 0.2)
+
+    between = adjacent[:8, 8:]
+    assert adjacent.shape == (10, 10)
+    assert np.count_nonzero(between) == 1
+    assert adjacent[8, 9]
+    assert all(adjacent[k, k + 1] for k in range(7))
