@@ -65,14 +65,14 @@ def test_what_is_wider_than_an_object_is_none() -> None:
         assert find_background(segments, features, grid, settings, always)[1] == expected
 
 
-@pytest.mark.parametrize(("cells", "border"), [(400, 0.3), (20, 0.3), (400, 0.1)])
+@pytest.mark.parametrize(("cells", "border"), [(400, 0.5), (20, 0.5), (400, 0.3)])
 def test_what_is_large_and_cut_across_by_the_border_is_an_arm(cells: int, border: float) -> None:
     features = np.zeros(2, OBJECT_FEATURES)
     features["visibility"]["cells"], features["surroundings"]["image_border"] = cells, border
     grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, 0.003)
     always = BoostedTrees(Trees(*np.zeros((4, 1), np.int32)), np.ones(1, np.float32))
     found = find_background(_blank(2), features, grid, DetectionSettings(), always)[1]
-    assert found == (cells > 100 and border > 0.2)
+    assert found == (cells > 100 and border > 0.4)
 
 
 def test_the_image_border_is_where_samples_begin() -> None:

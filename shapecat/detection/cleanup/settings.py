@@ -19,7 +19,7 @@ class CleanupSettings(NamedTuple):
     """What reaches so near to the greatest height, metres, goes on above it."""
     large_share: float = 0.02
     """Share of the image that an arm, furniture or a bent end of a table covers at least."""
-    cut_share: float = 0.25
+    cut_share: float = 0.4
     """Share of its outline, taken for a square, that is at the border of the image then."""
     fringe: float = 0.6
     """Share of the least height from which a sample next to an object belongs to it: the least

@@ -44,7 +44,7 @@ def find_background(
     segment, cells = features["segment"], features["visibility"]["cells"]
     rejected |= segment["width_m"] > settings.max_size_m
     rejected |= segment["top_m"] > settings.max_height_m - CLEANUP.cut_off_m
-    # No simulated scene has arms yet: what is large and cut across by the border of the image.
+    # Large and mostly outside the image: furniture, which the trees were not shown.
     large = cells > CLEANUP.large_share * grid.inverse_depth.size
     rejected |= large & (features["surroundings"]["image_border"] > CLEANUP.cut_share)
     return rejected
