@@ -35,6 +35,7 @@ _SENSORS = (
             "pile",
             "bin",
             "shelf_bin",
+            "room",
             "turntable",
             "walking",
             "crossing",
