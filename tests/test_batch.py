@@ -320,7 +320,8 @@ def test_full_disk_stops_the_large_and_not_the_small(shapecat: Run, tmp_path: Pa
     (tmp_path / "in").mkdir()
     record(tmp_path / "in" / "long.mcap", FRAMES)
     record(tmp_path / "in" / "short.mcap", 4)
-    command = ("process", tmp_path / "in", "--jobs", 2, "--no-rrd", "--out", tmp_path / "out")
+    options = ("--jobs", 2, "--no-rrd", "--set", "reuse_frames=1")
+    command = ("process", tmp_path / "in", *options, "--out", tmp_path / "out")
     assert shapecat(*command[:-1], tmp_path / "free").exit_code == 0
     largest = [
         max(path.stat().st_size for path in (tmp_path / "free" / name).iterdir())
