@@ -113,21 +113,21 @@ def _boxes(
 def _cut(grid: DepthGrid, measured: ObjectMeasurements) -> Bool:
     """Return whether each object reaches the border of the image, or of its samples near it."""
     cut, near = np.zeros(len(measured.low), bool), max(1, round(2 / grid.factor))
-    for axis, lines in enumerate((grid.inverse_depth > 0, (grid.inverse_depth > 0).T)):
+    for axis, lines in enumerate((grid.inverse_depth, grid.inverse_depth.T)):
         first = _begin(lines, near) + near
         last = len(lines) - 1 - _begin(lines[::-1], near) - near
         cut |= (measured.low[:, axis] < first) | (measured.high[:, axis] > last)
     return cut
 
 
-def _begin(lines: Bool, near: int) -> int:
+def _begin(lines: F4, near: int) -> int:
     """Return at which line of samples (lines, length) they begin, if more than one object does.
 
     The top of a tall object with nothing behind it is no border.
     """
-    some = lines[: math.ceil(BORDER_SHARE * len(lines))].any(axis=1)
+    some = (lines[: math.ceil(BORDER_SHARE * len(lines))] > 0).any(axis=1)
     first = int(some.argmax())
-    seen = np.flatnonzero(lines[first : first + near].any(axis=0))
+    seen = np.flatnonzero((lines[first : first + near] > 0).any(axis=0))
     return first if seen.size and np.ptp(seen) > OUTPUT.straight_share * lines.shape[1] else 0
 
 
