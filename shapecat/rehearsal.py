@@ -169,10 +169,13 @@ def main() -> None:
         sys.stdout.write(f"{line}\n")
         sys.stdout.flush()
 
+    teller = threading.Thread(target=tell, daemon=True)
     try:
-        seconds = compile_all(threading.Thread(target=tell, daemon=True).start)
+        seconds = compile_all(teller.start)
     finally:
         ended.set()
+        if teller.is_alive():
+            teller.join()
     if seconds:
         say(f"all {_count()} kernels compiled in {seconds:.0f} s")
 
