@@ -40,7 +40,7 @@ test: setup kernels ## run the quick tests
 
 test-all: setup kernels ## run all tests, also long ones, and a sample of mutants
 	$(PYTEST)
-	$(MUTATIONS) --only quick --minutes 4 --each 4 --least 0.6
+	$(MUTATIONS) --only quick --count 60 --least 0.65
 
 mutations: setup kernels ## flip every operator of the modules without kernels, for hours
 	$(MUTATIONS)
