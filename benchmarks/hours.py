@@ -3,7 +3,8 @@
     python -m benchmarks.hours --hours 1
     python -m benchmarks.hours --hours 10     a million frames, eight million detections
 
-Eight objects stand on a table before a camera that moves; each is seen in every frame.
+Eight objects stand on a table before a camera that moves. Each is overlooked now and then, and is
+taken away for a while every few minutes; here and there is something false for a few frames.
 """
 
 import json
@@ -20,29 +21,34 @@ import numpy as np
 import pyarrow as pa
 
 from benchmarks.measure import markdown, save
+from shapecat.completion import DIRECTIONS
 from shapecat.config import TrackingSettings
-from shapecat.runs.segments import GROUP_FRAMES
+from shapecat.runs.segments import group_frames
 from shapecat.runs.tables import DETECTIONS, FRAMES, arrow_table, open_writer
 from shapecat.runs.tracks import track_run
 from shapecat.types import CATEGORIES
 
-PER_HOUR, OBJECTS = 100_000, 8
+PER_HOUR, OBJECTS, PLACES_OF_FALSE = 100_000, 8, 8
 PERIOD_NS = 36_000_000
 NOISE_M = 0.004
+OVERLOOKED, FALSE = 0.01, 0.002  # shares of the detections, and of the frames that begin one
+FALSE_FRAMES, VISIT_FRAMES, AWAY_FRAMES = 5, 10_000, 500
 
 
 def make_tables(folder: Path, frames: int) -> None:
     """Write the frames and detections of a run; columns that tracking does not read are empty."""
     rng = np.random.default_rng(0)
-    places = np.column_stack([rng.uniform(-0.5, 0.5, (OBJECTS, 2)), np.full(OBJECTS, 0.05)])
-    beliefs = rng.dirichlet(np.full(len(CATEGORIES), 0.2), OBJECTS)
+    count = OBJECTS + PLACES_OF_FALSE
+    places = np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)), np.full(count, 0.05)])
+    beliefs = rng.dirichlet(np.full(len(CATEGORIES), 0.2), count)
     with ExitStack() as stack:
         writers = {
             schema: stack.enter_context(open_writer(folder / f"{name}.parquet", schema))
             for name, schema in (("frames", FRAMES), ("detections", DETECTIONS))
         }
-        for first in range(0, frames, GROUP_FRAMES):
-            numbers = np.arange(first, min(first + GROUP_FRAMES, frames))
+        length = group_frames(frames)
+        for first in range(0, frames, length):
+            numbers = np.arange(first, min(first + length, frames))
             for schema, columns in (
                 (FRAMES, _frames(numbers)),
                 (DETECTIONS, _detections(numbers, places, beliefs, rng)),
@@ -62,22 +68,37 @@ def _frames(numbers: Any) -> dict[str, Any]:
 
 
 def _detections(numbers: Any, places: Any, beliefs: Any, rng: Any) -> dict[str, Any]:
-    n = len(numbers) * OBJECTS
-    where = np.tile(places, (len(numbers), 1)) + rng.normal(0, NOISE_M, (n, 3))
+    rows, things = _shown(numbers, rng)
+    n = len(rows)
+    first = np.searchsorted(rows, rows)
+    where = places[things] + rng.normal(0, NOISE_M, (n, 3))
     size, turn = list(np.full((n, 3), 0.1)), list(np.tile([0.0, 0.0, 0.0, 1.0], (n, 1)))
     return {
         "topic": ["/depth"] * n,
-        "frame": np.repeat(numbers, OBJECTS),
-        "stamp_ns": np.repeat(numbers * PERIOD_NS, OBJECTS),
-        "detection": np.tile(np.arange(OBJECTS), len(numbers)),
+        "frame": numbers[rows],
+        "stamp_ns": numbers[rows] * PERIOD_NS,
+        "detection": np.arange(n) - first,
         "touches_border": np.zeros(n, bool),
         "occluded": np.zeros(n, bool),
         "novelty": np.full(n, 0.5),
-        "posterior": list(np.tile(beliefs, (len(numbers), 1))),
+        "posterior": list(beliefs[things]),
         **{name: list(where) for name in ("center", "center_fixed", "center_full")},
         **dict.fromkeys(("size", "size_full", "size_full_std"), size),
         **dict.fromkeys(("orientation", "orientation_full"), turn),
+        "outline_full": list(rng.normal(0.05, NOISE_M, (n, DIRECTIONS))),
     }
+
+
+def _shown(numbers: Any, rng: Any) -> tuple[Any, Any]:
+    """Return the rows of the frames of detections, and what each shows: the last ones are false."""
+    shown = rng.random((len(numbers), OBJECTS + PLACES_OF_FALSE)) > OVERLOOKED
+    turn = (numbers[:, None] + np.arange(OBJECTS) * VISIT_FRAMES // OBJECTS) % VISIT_FRAMES
+    shown[:, :OBJECTS] &= turn >= AWAY_FRAMES
+    begun = rng.random((len(numbers), PLACES_OF_FALSE)) < FALSE / PLACES_OF_FALSE
+    before = np.cumsum(np.pad(begun, ((FALSE_FRAMES, 0), (0, 0))), axis=0)
+    shown[:, OBJECTS:] = before[FALSE_FRAMES:] > before[:-FALSE_FRAMES]
+    rows, things = np.nonzero(shown)
+    return rows, things
 
 
 def _filled(columns: dict[str, Any], schema: pa.Schema) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
 from benchmarks.boxes import Upright, overlap
-from shapecat.completion import DIRECTIONS, BoxViews, complete, fuse_boxes
+from shapecat.completion import DIRECTIONS, BoxViews, FusedBoxes, complete, fuse_boxes
 from shapecat.geometry import gravity_rotation, rotation_from_quaternion
 from shapecat.types import CATEGORIES, FullBox
 
@@ -148,6 +148,14 @@ def views_of(centers: np.ndarray, axes: np.ndarray, sizes: np.ndarray) -> BoxVie
     return BoxViews(centers, axes, sizes, np.full(sizes.shape, 0.01), outlines, sensors)
 
 
+def fused_in(
+    views: BoxViews, weights: np.ndarray, posterior: np.ndarray, categories: tuple[str, ...]
+) -> FusedBoxes:
+    """Return the fused box in each of the views."""
+    box = fuse_boxes(views, weights, posterior, categories)
+    return box.in_views(views.centers, views.axes, views.sizes)
+
+
 def test_views_agree_on_one_size_whatever_their_quarter_turns() -> None:
     """Length and width swap with the yaw a view happens to find."""
     size, yaw = np.array([0.21, 0.11, 0.3]), 0.37
@@ -156,7 +164,7 @@ def test_views_agree_on_one_size_whatever_their_quarter_turns() -> None:
     sizes = np.where((quarters % 2 == 1)[:, None], size[[1, 0, 2]], size) + noise
     axes = np.stack([about_z(yaw + q * np.pi / 2) for q in quarters])
     centers = PLACE + RNG.normal(0, 0.003, (9, 3))
-    fused = fuse_boxes(views_of(centers, axes, sizes), np.ones(9), sure("box"), CATEGORIES)
+    fused = fused_in(views_of(centers, axes, sizes), np.ones(9), sure("box"), CATEGORIES)
 
     assert (fused.sizes == fused.sizes[0]).all()
     for k in range(9):
@@ -171,7 +179,7 @@ def test_a_view_from_where_the_object_was_moved_to_keeps_its_place() -> None:
     centers, sizes = np.zeros((7, 3)), np.tile([0.2, 0.1, 0.3], (7, 1))
     centers[5:], axes = [0.4, 0.1, 0], np.tile(np.eye(3), (7, 1, 1))
     sizes[6], axes[6] = [0.1, 0.2, 0.3], about_z(0.5)
-    fused = fuse_boxes(views_of(centers, axes, sizes), np.ones(7), sure("box"), CATEGORIES)
+    fused = fused_in(views_of(centers, axes, sizes), np.ones(7), sure("box"), CATEGORIES)
 
     assert_allclose(fused.centers, centers, atol=1e-12)
     assert_allclose(fused.axes[5], np.eye(3), atol=1e-12)
@@ -198,7 +206,7 @@ def test_the_sides_that_several_views_show_make_an_oval_whole() -> None:
         center = away.T @ (LEVEL @ box.center - place)
         views.append((center, axes, box.size, box.size_std, box.outline, away.T @ -place))
     stacked = BoxViews(*map(np.array, zip(*views, strict=True)))
-    fused = fuse_boxes(stacked, np.ones(5), sure("bottle"), CATEGORIES)
+    fused = fused_in(stacked, np.ones(5), sure("bottle"), CATEGORIES)
 
     assert_allclose(np.sort(fused.sizes[0]), [0.066, 0.09, 0.25], atol=0.006)
     assert_allclose(fused.centers, np.tile([0, 0, 0.125], (5, 1)), atol=0.004)
@@ -256,7 +264,7 @@ def test_a_quarter_turn_exchanges_length_and_width() -> None:
     turns = [yaw + np.pi / 2 * (k % 2) for k in range(6)]
     sizes = np.array([size[[1, 0, 2]] if k % 2 else size for k in range(6)])
     axes = Rotation.from_euler("z", np.array(turns)[:, None]).as_matrix()
-    fused = fuse_boxes(views_of(np.zeros((6, 3)), axes, sizes), np.ones(6), sure("box"), CATEGORIES)
+    fused = fused_in(views_of(np.zeros((6, 3)), axes, sizes), np.ones(6), sure("box"), CATEGORIES)
 
     along = np.array([np.cos(yaw), np.sin(yaw), 0.0])  # the shorter side lies along it
     for lengths, turned in zip(fused.sizes, fused.axes, strict=True):

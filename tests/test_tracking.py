@@ -175,17 +175,17 @@ def test_a_recording_of_single_pictures_keeps_every_detection() -> None:
         )
         for k in range(30)
     ]
-    tracks = track_recording(frames, SETTINGS)
+    tracks = tuple(track_recording(frames, SETTINGS))
     assert sum(track.hits for track in tracks) == 120
     assert len(tracks) >= 115
-    assert scene_cuts(frames, SETTINGS)[1:].mean() > 0.9
+    assert scene_cuts(Hits.of(frames), SETTINGS)[1:].mean() > 0.9
 
 
 def test_one_frame_is_enough_and_none_is_no_error() -> None:
     one = track_recording([frame(0, [[0, 0, 0], [1, 0, 0]])], SETTINGS)
     assert [track.id for track in one] == [1, 2]
-    assert track_recording([], SETTINGS) == ()
-    assert track_recording([frame(0, []), frame(1, [])], SETTINGS) == ()
+    assert list(track_recording([], SETTINGS)) == []
+    assert list(track_recording([frame(0, []), frame(1, [])], SETTINGS)) == []
 
 
 def test_a_false_detection_gets_no_track() -> None:
@@ -198,7 +198,7 @@ def test_one_odd_frame_is_no_cut() -> None:
     """All objects missed and two invented in one frame must not break the tracks."""
     seen = [[0, 0, 0], [0.3, 0, 0]]
     frames = [frame(k, [[0.1, 0.1, 0], [0.2, 0.1, 0]] if k == 9 else seen) for k in range(20)]
-    assert not scene_cuts(frames, SETTINGS).any()
+    assert not scene_cuts(Hits.of(frames), SETTINGS).any()
     assert [track.hits for track in track_recording(frames, SETTINGS)] == [19, 19]
 
 
@@ -214,7 +214,7 @@ def test_a_gap_is_filled_by_rows_on_the_line_and_a_long_one_is_left_out() -> Non
 def test_an_object_that_comes_back_to_its_place_keeps_its_track() -> None:
     """It left the view for longer than any patience: only hindsight knows."""
     frames = [frame(k, [0, 0, 0] if k < 20 or k >= 200 else [2, 0, 0]) for k in range(220)]
-    tracks = track_recording(frames, SETTINGS)
+    tracks = tuple(track_recording(frames, SETTINGS))
     assert [track.hits for track in tracks] == [40, 180]
 
 
@@ -283,13 +283,13 @@ def test_one_wrong_view_does_not_keep_what_comes_back_apart() -> None:
     cut = [frame(k, [0, 0, 0], posterior=cup) for k in range(100, 103)]
     back = [replace(seen, partial=np.ones(1, bool)) for seen in cut]
     whole = frame(103, [0, 0, 0], posterior=other)
-    tracks = track_recording([*before, *away, *back, whole], SETTINGS)
+    tracks = tuple(track_recording([*before, *away, *back, whole], SETTINGS))
     assert [track.hits for track in tracks] == [24]
 
 
 def test_streams_are_tracked_apart_and_numbered_together() -> None:
     frames = [frame(k, [0, 0, 0], topic=topic) for k in range(5) for topic in ("/a", "/b")]
-    tracks = track_recording(frames, SETTINGS)
+    tracks = tuple(track_recording(frames, SETTINGS))
     assert [(track.id, track.topic, track.hits) for track in tracks] == [(1, "/a", 5), (2, "/b", 5)]
 
 
@@ -298,7 +298,7 @@ def test_long_recordings_keep_their_tracks_whole() -> None:
     random = np.random.default_rng(0)
     places = np.column_stack([np.arange(6) * 0.2, np.zeros((6, 2))])
     frames = [frame(k, places + random.normal(0, 0.01, (6, 3))) for k in range(2000)]
-    tracks = track_recording(frames, SETTINGS)
+    tracks = tuple(track_recording(frames, SETTINGS))
     assert [track.hits for track in tracks] == [2000] * 6
 
 
@@ -351,20 +351,20 @@ def boxed(frames: list[list[tuple[float, float]]]) -> list[FrameDetections]:
 
 def test_pieces_of_an_object_that_is_split_now_and_then_are_no_tracks() -> None:
     whole, split = [(0.0, 0.2)], [(0.0, 0.12), (0.12, 0.2)]
-    tracks = track_recording(boxed(([whole] * 3 + [split] * 3) * 6), SETTINGS)
+    tracks = tuple(track_recording(boxed(([whole] * 3 + [split] * 3) * 6), SETTINGS))
     assert [track.hits for track in tracks] == [36]
 
 
 def test_a_burst_of_splits_is_no_track() -> None:
     """Nothing is missed in its life: what was there before and after it tells."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.12), (0.12, 0.2)]
-    tracks = track_recording(boxed([whole] * 20 + [split] * 6 + [whole] * 20), SETTINGS)
+    tracks = tuple(track_recording(boxed([whole] * 20 + [split] * 6 + [whole] * 20), SETTINGS))
     assert [track.hits for track in tracks] == [46]
 
 
 def test_neighbours_that_are_taken_for_one_now_and_then_stay_two() -> None:
     one, two = [(0.0, 0.2)], [(0.0, 0.1), (0.1, 0.2)]
-    tracks = track_recording(boxed(([two] * 9 + [one]) * 4), SETTINGS)
+    tracks = tuple(track_recording(boxed(([two] * 9 + [one]) * 4), SETTINGS))
     assert [track.hits for track in tracks][1] >= 36
     assert len(tracks) == 2
 
@@ -376,21 +376,21 @@ def test_a_sensor_that_sees_two_objects_as_one_does_not_make_one_a_piece() -> No
         for k in range(20)
         for topic, what, late in (("/a", two, 0), ("/b", one, 5))
     ]
-    tracks = track_recording(frames, SETTINGS, together={"/a", "/b"})
+    tracks = tuple(track_recording(frames, SETTINGS, together={"/a", "/b"}))
     assert len(tracks) == 2
     assert min(track.hits for track in tracks) >= 20
 
 
 def test_what_is_put_into_a_bowl_is_not_a_piece_of_the_bowl() -> None:
     bowl, filled = [(0.0, 0.2)], [(0.0, 0.2), (0.1, 0.16)]
-    tracks = track_recording(boxed([bowl] * 30 + [filled] * 8), SETTINGS)
+    tracks = tuple(track_recording(boxed([bowl] * 30 + [filled] * 8), SETTINGS))
     assert sorted(track.hits for track in tracks) == [8, 38]
 
 
 def test_an_object_that_comes_into_view_in_pieces_is_one_track() -> None:
     """Before it was ever whole, nothing but its later size tells that they are pieces."""
     whole, split = [(0.0, 0.2)], [(0.0, 0.08), (0.08, 0.2)]
-    tracks = track_recording(boxed([split] * 12 + [whole] * 30), SETTINGS)
+    tracks = tuple(track_recording(boxed([split] * 12 + [whole] * 30), SETTINGS))
     assert [track.hits for track in tracks] == [42]
 
 
@@ -406,7 +406,7 @@ def test_what_passes_behind_a_narrow_thing_is_one_track(partial: bool) -> None:
         )
         for k, places in enumerate(sides)
     ]
-    tracks = track_recording(frames, SETTINGS)
+    tracks = tuple(track_recording(frames, SETTINGS))
     assert [track.hits for track in tracks] == ([44] if partial else [24, 24])
 
 
@@ -416,7 +416,7 @@ def test_what_is_seen_in_one_between_its_two_sides_is_one_track(in_one: bool) ->
     left, right = (0.0, 0.05), (0.1, 0.15)
     split, whole = [left, right], [(0.0, 0.15)]
     change = [split, whole if in_one else split, split, split, split, split]
-    tracks = track_recording(boxed([[left]] * 18 + change + [[right]] * 14), SETTINGS)
+    tracks = tuple(track_recording(boxed([[left]] * 18 + change + [[right]] * 14), SETTINGS))
     assert [track.hits for track in tracks] == ([38] if in_one else [24, 20])
 
 
@@ -424,7 +424,9 @@ def test_what_is_there_after_a_while_unseen_need_not_be_the_same() -> None:
     """Unseen for 0.8 s, a track waits on; whether it came back is judged by all of its views."""
     before = [frame(k, [0, 0, 0], posterior=CUP) for k in range(20)]
     after = [frame(k, [0.02, 0, 0], posterior=BOX, size=(0.14, 0.14, 0.1)) for k in range(28, 50)]
-    tracks = track_recording([*before, *(frame(k, []) for k in range(20, 28)), *after], SETTINGS)
+    tracks = tuple(
+        track_recording([*before, *(frame(k, []) for k in range(20, 28)), *after], SETTINGS)
+    )
     assert [track.hits for track in tracks] == [20, 22]
 
 
@@ -445,7 +447,7 @@ def turning(*, speed: float, hidden: range, frames: int = 80) -> list[FrameDetec
 def test_an_object_hidden_on_a_turning_table_is_known_where_it_comes_back() -> None:
     """The others tell how far the table has turned: by 1.2 radians, 35 cm of its way."""
     frames = turning(speed=0.4, hidden=range(25, 55))
-    tracks = track_recording(frames, SETTINGS)
+    tracks = tuple(track_recording(frames, SETTINGS))
     assert sorted(track.hits for track in tracks) == [50, 80, 80, 80, 80]
     whole = next(track for track in tracks if track.hits == 50)
     radius = np.linalg.norm(whole.centers[:, :2], axis=1)
@@ -458,7 +460,7 @@ def test_a_common_motion_brings_the_detections_to_rest_and_back(speed: float) ->
     hits = Hits.of(frames)
     motion = find_common_motion(hits, [np.arange(k, 400, 5) for k in range(5)])
     assert motion is not None
-    still = np.array([one.centers for one in motion.still(frames)])
+    still = motion.still(hits).centers.reshape(80, 5, 3)
     assert still.std(axis=0).max() < 0.01
     back = motion.moved(hits.rows, still.reshape(-1, 3))
     assert back == pytest.approx(hits.centers, abs=1e-9)
@@ -477,7 +479,7 @@ def test_a_clock_that_jumps_back_is_a_cut() -> None:
     """Two sessions in one recording must not be joined by their equal time stamps."""
     stamps = [*range(100, 105), *range(50, 55)]
     frames = [frame(k, [0, 0, 0], stamp_ns=s * SECOND // 5) for k, s in enumerate(stamps)]
-    assert scene_cuts(frames, SETTINGS).tolist() == [k == 5 for k in range(10)]
+    assert scene_cuts(Hits.of(frames), SETTINGS).tolist() == [k == 5 for k in range(10)]
     assert [track.hits for track in track_recording(frames, SETTINGS)] == [5, 5]
 
 

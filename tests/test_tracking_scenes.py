@@ -313,7 +313,7 @@ def test_identities_survive_noise_misses_splits_and_occlusions(
     scores = []
     for seed in SEEDS:
         rows, truth = record(*scene(seed), seed)
-        scores.append(score(track_recording(rows, settings), truth))
+        scores.append(score(tuple(track_recording(rows, settings)), truth))
     assert np.mean([s.idf1 for s in scores]) >= idf1
     assert np.mean([s.mota for s in scores]) >= mota
     assert sum(s.switches for s in scores) <= switches
@@ -323,7 +323,7 @@ def test_score_agrees_with_a_published_library() -> None:
     """Guard the yardstick itself: motmetrics counts the same, when it is installed."""
     motmetrics = pytest.importorskip("motmetrics")
     rows, truth = record(*turntable(7), 7)
-    tracks = track_recording(rows, SETTINGS)
+    tracks = tuple(track_recording(rows, SETTINGS))
     visible = [
         Truth({k: p for k, p in t.places.items() if k not in t.hidden}, set()) for t in truth
     ]

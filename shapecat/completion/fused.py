@@ -7,9 +7,9 @@ import numpy as np
 
 from shapecat.arrays import F8
 from shapecat.completion.outline import DIRECTIONS
-from shapecat.completion.whole import COSINES, SINES, Footprint, faced, footprint
+from shapecat.completion.whole import COSINES, SINES, faced, footprint
 
-__all__ = ["BoxViews", "FusedBoxes", "fuse_boxes"]
+__all__ = ["BoxViews", "FusedBox", "FusedBoxes", "fuse_boxes"]
 
 _STILL_M = 0.05
 """Centres stray less while an object stands still."""
@@ -50,14 +50,37 @@ class FusedBoxes(NamedTuple):
     stds: F8
 
 
-def fuse_boxes(
-    views: BoxViews, weights: F8, posterior: F8, categories: Sequence[str]
-) -> FusedBoxes:
-    """Give the views of a track one size; while it stands still also one centre and one yaw.
+class FusedBox(NamedTuple):
+    """What views of an object say together.
+
+    Attributes
+    ----------
+    place : (3,) metres, where the views show it that say it.
+    center, axes, size, std : (3,), (3, 3), (3,), (3,) of its box there, as in `BoxViews`.
+    """
+
+    place: F8
+    center: F8
+    axes: F8
+    size: F8
+    std: F8
+
+    def in_views(self, centers: F8, axes: F8, sizes: F8) -> FusedBoxes:
+        """Return its box in views; one that shows it elsewhere keeps its own centre and yaw."""
+        still = np.linalg.norm(centers - self.place, axis=1) < _STILL_M
+        return FusedBoxes(
+            np.where(still[:, None], self.center, centers),
+            np.where(still[:, None, None], self.axes, _alike(axes, sizes, self.size)),
+            np.tile(self.size, (len(centers), 1)),
+            np.tile(self.std, (len(centers), 1)),
+        )
+
+
+def fuse_boxes(views: BoxViews, weights: F8, posterior: F8, categories: Sequence[str]) -> FusedBox:
+    """Return the size of an object, and the centre and the yaw that it has while it stands still.
 
     The outlines of the views from which it stands in the same place are laid over each other, and
-    the footprint is estimated from their median. A view whose centre is elsewhere keeps it, and
-    its own yaw.
+    the footprint is estimated from their median.
 
     Parameters
     ----------
@@ -76,17 +99,12 @@ def fuse_boxes(
     height = float(_median(some.sizes[:, 2:], own)[0])
     bottom = float(_median(places[:, 2:] - some.sizes[:, 2:] / 2, own)[0])
     std = np.array([*plan.std, _median(some.stds[:, 2:], own)[0]])
-    std *= np.sqrt(_COMMON + (1 - _COMMON) / len(own))
-    center = origin + base @ (*plan.center, bottom + height / 2)
-    return FusedBoxes(
-        np.where(still[:, None], center, views.centers),
-        np.where(
-            still[:, None, None],
-            base @ _about_z(plan.side * 2 * np.pi / DIRECTIONS),
-            _alike(views, plan),
-        ),
-        np.tile([*plan.size, height], (len(weights), 1)),
-        np.tile(std, (len(weights), 1)),
+    return FusedBox(
+        origin,
+        origin + base @ (*plan.center, bottom + height / 2),
+        base @ _about_z(plan.side * 2 * np.pi / DIRECTIONS),
+        np.array([*plan.size, height]),
+        std * np.sqrt(_COMMON + (1 - _COMMON) / len(own)),
     )
 
 
@@ -120,11 +138,11 @@ def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F
     return _median(reached, each), share
 
 
-def _alike(views: BoxViews, plan: Footprint) -> F8:
-    """Return (k, 3, 3) the axes of the views, a quarter turned where a box is the other way."""
-    other = (views.sizes[:, 0] < views.sizes[:, 1]) != (plan.size[0] < plan.size[1])
+def _alike(axes: F8, sizes: F8, size: F8) -> F8:
+    """Return axes (k, 3, 3), a quarter turned where a box is the other way round than ``size``."""
+    other = (sizes[:, 0] < sizes[:, 1]) != (size[0] < size[1])
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
-    return np.where(other[:, None, None], views.axes @ quarter, views.axes)
+    return np.where(other[:, None, None], axes @ quarter, axes)
 
 
 def _about_z(angle: float) -> F8:

@@ -2,8 +2,9 @@
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -11,113 +12,158 @@ import pyarrow.compute
 from scipy.spatial.transform import Rotation
 
 from shapecat.arrays import F4, F8, I4, Bool
-from shapecat.completion import DIRECTIONS, BoxViews, FusedBoxes, fuse_boxes
-from shapecat.runs.tables import Key, frame_rows, numbers, read_row_groups
+from shapecat.completion import DIRECTIONS, BoxViews, FusedBox, fuse_boxes
+from shapecat.runs.placed_frames import PlacedFrames
+from shapecat.runs.tables import numbers, opened, read_row_groups
 from shapecat.tracking import Track, view_weights
 
 __all__ = ["FULL_WIDTHS", "FullBoxes", "full_columns", "numbers_or_nan"]
 
 FULL_WIDTHS = {"center_full": 3, "size_full": 3, "orientation_full": 4, "size_full_std": 3}
 """Columns of full boxes, and how many numbers they have."""
+_BLOCK = 2**16
 _WIDTH = sum(FULL_WIDTHS.values())
+
+
+_BOX = sum(FULL_WIDTHS.values()) - FULL_WIDTHS["size_full_std"]
+_TELLING = 1000
+"""An object's box is estimated from so many of its views at most, spread over its life."""
+_AT_ONCE = 64  # row groups
 
 
 @dataclass(frozen=True)
 class FullBoxes:
     """The full boxes of all detections of a run, estimated from single views.
 
+    Their outlines and deviations, nine tenths of the numbers, stay on disk: few are needed.
+
     Attributes
     ----------
-    starts : by frame, the row of its first detection.
-    rows : (n, 13) the columns of `FULL_WIDTHS` side by side; NaN where they are null.
-    outlines : (n, 96) float32, how far what is seen reaches.
+    table : the detections.
+    groups : (g + 1,) the first row of each row group.
+    frames : the frames of the run.
+    rows : (n, 10) float32, centre, size and orientation side by side; NaN where they are null.
     partial : (n,) whether the object is cut.
-    poses : by frame, ``fixed_from_sensor`` as (3, 4), where the frame of the tracks is fixed.
     """
 
-    starts: Mapping[Key, int]
-    rows: F8
-    outlines: F4
+    table: Path
+    groups: I4
+    frames: PlacedFrames
+    rows: F4
     partial: Bool
-    poses: Mapping[Key, F8]
 
     @classmethod
     def read(cls, folder: Path, placed: Collection[str]) -> "FullBoxes":
         """Read the full boxes of a run; the topics ``placed`` are tracked in the fixed frame."""
-        starts: dict[Key, int] = {}
-        rows, partial, count = [np.zeros((0, _WIDTH))], [np.zeros(0, np.bool_)], 0
-        outlines = [np.zeros((0, DIRECTIONS), np.float32)]
+        frames, groups = PlacedFrames(placed), [0]
+        rows, partial = bytearray(), bytearray()
         cut = ("touches_border", "occluded")
-        wanted = ["topic", "frame", *cut, *FULL_WIDTHS, "outline_full"]
-        for table in read_row_groups(folder / "detections.parquet", wanted):
-            of_frames = frame_rows(table)
-            starts |= {key: count + found.start for key, found in of_frames.items()}
-            rows.append(numbers_or_nan(table))
-            around = np.full((table.num_rows, DIRECTIONS), np.nan, np.float32)
-            around[~np.isnan(rows[-1][:, 0])] = numbers(table["outline_full"]).reshape(
-                -1, DIRECTIONS
-            )
-            outlines.append(around)
-            partial.append(np.logical_or(*(table[name].to_numpy() for name in cut)))
-            count += table.num_rows
+        wanted = ["topic", "frame", *cut, *FULL_WIDTHS]
+        for seen, detections in zip(
+            read_row_groups(folder / "frames.parquet", PlacedFrames.COLUMNS),
+            read_row_groups(folder / "detections.parquet", wanted),
+            strict=True,
+        ):
+            frames.add(seen, detections, groups[-1])
+            rows += numbers_or_nan(detections)[:, :_BOX].astype(np.float32).tobytes()
+            partial += np.logical_or(*(detections[name].to_numpy() for name in cut)).tobytes()
+            groups.append(groups[-1] + detections.num_rows)
         return cls(
-            starts,
-            np.concatenate(rows),
-            np.concatenate(outlines),
-            np.concatenate(partial),
-            _poses(folder, placed),
+            folder / "detections.parquet",
+            np.array(groups),
+            frames,
+            np.frombuffer(rows, np.float32).reshape(-1, _BOX),
+            np.frombuffer(partial, np.bool_),
         )
 
-    def of_track(self, track: Track, categories: Sequence[str]) -> F8:
-        """Return the fused boxes (k, 13) in the frames of a track, NaN if unknown."""
-        result = np.full((len(track.frames), _WIDTH), np.nan)
-        seen = np.flatnonzero(np.asarray(track.detections) >= 0)
-        keys = [(track.topics[k], int(track.frames[k])) for k in seen]
-        first = [self.starts[key] for key in keys]
-        rows = np.array(first, np.int64) + track.detections[seen]
+    def of_tracks(self, tracks: Sequence[Track], categories: Sequence[str]) -> F8:
+        """Return the fused boxes (k, 13) in the frames of some tracks; NaN if unknown."""
+        seen = [self._seen(track) for track in tracks]
+        telling = [_spread(one.rows) for one in seen]
+        details = self._details(np.concatenate([np.zeros(0, np.int64), *telling]))
+        stops = accumulate(map(len, telling))
+        result = [np.zeros((0, _WIDTH))]
+        for track, one, rows, stop in zip(tracks, seen, telling, stops, strict=True):
+            boxes = np.full((len(track.frames), _WIDTH), np.nan)
+            if len(rows):
+                poses = one.poses[np.searchsorted(one.rows, rows)]
+                views = _views(self.rows[rows], details[stop - len(rows) : stop], poses)
+                weights = view_weights(self.partial[rows])
+                fused = fuse_boxes(views, weights, track.posterior, categories)
+                boxes[one.at] = _rows(fused, self.rows[one.rows], one.poses)
+            result.append(boxes)
+        return np.concatenate(result)
+
+    def _seen(self, track: Track) -> "_Seen":
+        """Return the detections of a track whose full boxes are known."""
+        at = np.flatnonzero(np.asarray(track.detections) >= 0)
+        found = self.frames.find([track.topics[k] for k in at], track.frames[at])
+        rows = self.frames.first[found] + track.detections[at]
         known = ~np.isnan(self.rows[rows, 0])
-        if known.any():
-            poses = self._poses_of([key for key, has in zip(keys, known, strict=True) if has])
-            views = _views(self.rows[rows[known]], self.outlines[rows[known]], poses)
-            weights = view_weights(self.partial[rows[known]])
-            fused = fuse_boxes(views, weights, track.posterior, categories)
-            result[seen[known]] = _rows(fused, poses)
+        return _Seen(at[known], rows[known], self.frames.poses[found[known]])
+
+    def _details(self, rows: I4) -> F4:
+        """Return (n, 3 + 96) the deviations and the outlines of detections."""
+        result = np.zeros((len(rows), 3 + DIRECTIONS), np.float32)
+        groups = np.unique(np.searchsorted(self.groups, rows, side="right") - 1)
+        with opened(self.table) as file:
+            for k in range(0, len(groups), _AT_ONCE):
+                some = groups[k : k + _AT_ONCE]
+                table = file.read_row_groups(some.tolist(), ["size_full_std", "outline_full"])
+                position = np.concatenate(
+                    [np.arange(self.groups[g], self.groups[g + 1]) for g in some]
+                )
+                inside = np.flatnonzero(np.isin(rows, position))
+                here = pa.array(np.searchsorted(position, rows[inside]))
+                for columns, name in (
+                    (slice(3), "size_full_std"),
+                    (slice(3, None), "outline_full"),
+                ):
+                    values = numbers(table[name].take(here))
+                    result[inside, columns] = values.reshape(len(inside), -1)
         return result
 
-    def _poses_of(self, keys: Sequence[Key]) -> F8:
-        return np.array([self.poses.get(key, np.eye(3, 4)) for key in keys])
+
+class _Seen(NamedTuple):
+    """Where in a track it is seen, in which rows of the table, and from where (k, 3, 4)."""
+
+    at: I4
+    rows: I4
+    poses: F8
 
 
-def _views(rows: F8, outlines: F4, poses: F8) -> BoxViews:
-    """Return the rows (k, 13) of one object in the fixed frame."""
+def _spread(rows: I4) -> I4:
+    """Return rows, not too many of them, from the first one to the last."""
+    if len(rows) <= _TELLING:
+        return rows
+    return np.asarray(rows[np.linspace(0, len(rows) - 1, _TELLING).round().astype(np.int64)])
+
+
+def _views(boxes: F4, details: F4, poses: F8) -> BoxViews:
+    """Return the boxes (k, 10) of one object in the fixed frame."""
+    centers, axes = _placed(boxes, poses)
+    sizes, stds = boxes[:, 3:6].astype(np.float64), details[:, :3].astype(np.float64)
+    return BoxViews(centers, axes, sizes, stds, details[:, 3:], poses[:, :, 3])
+
+
+def _placed(boxes: F4, poses: F8) -> tuple[F8, F8]:
+    """Return the centres and the axes of boxes in the fixed frame."""
     turns, places = poses[:, :, :3], poses[:, :, 3]
-    axes = turns @ Rotation.from_quat(rows[:, 6:10]).as_matrix()
-    centers = np.einsum("kij,kj->ki", turns, rows[:, :3]) + places
-    return BoxViews(centers, axes, rows[:, 3:6], rows[:, 10:], outlines, places)
+    axes = turns @ Rotation.from_quat(boxes[:, 6:10]).as_matrix()
+    return np.einsum("kij,kj->ki", turns, boxes[:, :3].astype(np.float64)) + places, axes
 
 
-def _rows(fused: FusedBoxes, poses: F8) -> F8:
-    """Return (k, 13) boxes of the fixed frame, each in its sensor frame."""
-    turns, places = poses[:, :, :3], poses[:, :, 3]
-    back = np.einsum("kji,kj->ki", turns, fused.centers - places)
-    own = Rotation.from_matrix(np.swapaxes(turns, 1, 2) @ fused.axes).as_quat()
-    return np.hstack([back, fused.sizes, own, fused.stds])
-
-
-def _poses(folder: Path, placed: Collection[str]) -> dict[Key, F8]:
-    """Return ``fixed_from_sensor`` of the frames of some topics that have one."""
-    names = ["topic", "frame", "fixed_translation", "fixed_rotation"]
-    return {
-        (row["topic"], row["frame"]): np.hstack(
-            [
-                np.reshape(row["fixed_rotation"], (3, 3)),
-                np.reshape(row["fixed_translation"], (3, 1)),
-            ]
-        )
-        for table in read_row_groups(folder / "frames.parquet", names)
-        for row in table.to_pylist()
-        if row["topic"] in placed and row["fixed_rotation"] is not None
-    }
+def _rows(fused: FusedBox, boxes: F4, poses: F8) -> F8:
+    """Return (k, 13) the fused box in the sensor frame of each view of it."""
+    result = np.zeros((len(boxes), _WIDTH))
+    for first in range(0, len(boxes), _BLOCK):
+        some = slice(first, first + _BLOCK)
+        seen = fused.in_views(*_placed(boxes[some], poses[some]), boxes[some, 3:6])
+        turns, places = poses[some, :, :3], poses[some, :, 3]
+        back = np.einsum("kji,kj->ki", turns, seen.centers - places)
+        own = Rotation.from_matrix(np.swapaxes(turns, 1, 2) @ seen.axes).as_quat()
+        result[some] = np.hstack([back, seen.sizes, own, seen.stds])
+    return result
 
 
 def numbers_or_nan(table: pa.Table, widths: Mapping[str, int] = FULL_WIDTHS) -> F8:

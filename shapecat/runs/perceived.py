@@ -16,6 +16,7 @@ from shapecat.runs.segments import (
     PERCEIVED,
     REVISIONS,
     SEGMENTS,
+    group_frames,
     list_segments,
     read_segment,
     row_groups,
@@ -115,12 +116,14 @@ class PerceptionTables:
 
     def _join(self) -> None:
         """Write the tables, whose row groups cover the same frames."""
+        place = self._folder / SEGMENTS
+        frames = sum(read_segment(s, "frames").num_rows for s in list_segments(place))
         with ExitStack() as stack:
             writers = {}
             for name, schema in self._schemas.items():
                 path = stack.enter_context(replacing(self._folder / f"{name}.parquet"))
                 writers[name] = stack.enter_context(open_writer(path, schema))
-            for group in row_groups(self._folder):
+            for group in row_groups(self._folder, group_frames(frames)):
                 for name, writer in writers.items():
                     writer.write_table(group[name])
 

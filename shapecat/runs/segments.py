@@ -21,6 +21,7 @@ __all__ = [
     "SEGMENTS",
     "count_segments",
     "discard_segments",
+    "group_frames",
     "list_segments",
     "read_segment",
     "read_segments",
@@ -29,6 +30,7 @@ __all__ = [
 ]
 
 GROUP_FRAMES = 32
+_GROUPS = 4096  # whoever opens a table reads 30 kB about each of its row groups
 PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES}
 SEGMENTS, REVISIONS = "segments", "revisions"
 
@@ -96,13 +98,18 @@ def _picked(name: str, keys: Sequence[Key], sources: Sequence[_Tables]) -> pa.Ta
     return pa.concat_tables(table[of] for table, of in chosen)
 
 
-def row_groups(folder: Path) -> Iterator[_Tables]:
-    """Yield the tables of 32 frames at a time, in whatever portions the segments have them."""
+def group_frames(frames: int) -> int:
+    """Return how many frames a row group holds: more of them after an hour of recording."""
+    return GROUP_FRAMES * max(1, -(-frames // (GROUP_FRAMES * _GROUPS)))
+
+
+def row_groups(folder: Path, length: int) -> Iterator[_Tables]:
+    """Yield the tables of so many frames at a time, whatever portions the segments have."""
     held: _Tables = {}
     for new in _latest(folder):
         held = {name: pa.concat_tables([held[name], new[name]]) for name in new} if held else new
-        while held["frames"].num_rows >= GROUP_FRAMES:
-            group, held = _cut(held, GROUP_FRAMES)
+        while held["frames"].num_rows >= length:
+            group, held = _cut(held, length)
             yield group
     if held and held["frames"].num_rows:
         yield held

@@ -15,7 +15,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from shapecat.arrays import I4
+from shapecat.arrays import F4, I4
 from shapecat.errors import OutputError
 
 __all__ = [
@@ -30,8 +30,10 @@ __all__ = [
     "frame_rows",
     "numbers",
     "open_writer",
+    "opened",
     "read_row_groups",
     "release_memory",
+    "rows_as_lists",
     "rows_of",
     "topic_codes",
     "write_table",
@@ -145,7 +147,7 @@ Key = tuple[str, int]
 
 def count_rows(folder: Path, table: str) -> int:
     """Return the number of rows of a table of a run folder."""
-    with _reading(folder / f"{table}.parquet") as file:
+    with opened(folder / f"{table}.parquet") as file:
         return int(file.metadata.num_rows)
 
 
@@ -160,7 +162,7 @@ def read_row_groups(
     path: Path, columns: Sequence[str] | None = None, *, at_once: int = 1
 ) -> Iterator[pa.Table]:
     """Yield the row groups of a table of a run folder, ``at_once`` at a time."""
-    with _reading(path) as file:
+    with opened(path) as file:
         count = file.num_row_groups
         for first in range(0, count, at_once):
             yield file.read_row_groups(range(first, min(first + at_once, count)), columns=columns)
@@ -204,7 +206,8 @@ def release_memory() -> None:
 
 
 @contextmanager
-def _reading(path: Path) -> Iterator[pq.ParquetFile]:
+def opened(path: Path) -> Iterator[pq.ParquetFile]:
+    """Open a table of a run folder."""
     try:
         with pq.ParquetFile(path) as file:
             yield file
@@ -244,3 +247,9 @@ def lists(rows: Sequence[Any], kind: pa.DataType) -> pa.Array:
     offsets = np.concatenate([[0], np.cumsum([row.size for row in flat])]).astype(np.int32)
     values = np.concatenate(flat) if flat else np.zeros(0)
     return pa.ListArray.from_arrays(offsets, pa.array(values.astype(kind.to_pandas_dtype())))
+
+
+def rows_as_lists(values: F4) -> pa.Array:
+    """Return the rows of an array (n, c) as a list column of float32."""
+    offsets = np.arange(len(values) + 1, dtype=np.int32) * values.shape[1]
+    return pa.ListArray.from_arrays(offsets, pa.array(values.astype(np.float32).ravel()))

@@ -2,24 +2,34 @@
 
 import csv
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute
 from scipy.spatial.transform import Rotation
 
+from shapecat.arrays import F8
 from shapecat.config import TrackingSettings
 from shapecat.runs.full_boxes import FullBoxes, full_columns
-from shapecat.runs.tables import TRACKS, frame_rows, lists, numbers, read_row_groups, write_table
+from shapecat.runs.tables import (
+    TRACKS,
+    arrow_table,
+    frame_rows,
+    numbers,
+    open_writer,
+    read_row_groups,
+    rows_as_lists,
+)
 from shapecat.system.files import replacing
 from shapecat.tracking import FrameDetections, Track, track_recording
 from shapecat.types import UNKNOWN
 
 __all__ = ["track_run"]
 
+_BATCH = 2**17  # rows of tracks.parquet that are made together
 _NO_TURN = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _COLUMNS = (
     "topic",
@@ -53,12 +63,27 @@ def track_run(
     placed = _streams_with_poses(folder)
     frames = _read_frames(folder, len(categories), placed)
     tracks = track_recording(frames, settings, together=placed)
-    with replacing(folder / "tracks.parquet") as path:
-        write_table(path, _columns(tracks, FullBoxes.read(folder, placed), categories), TRACKS)
-    labels = [_label(track, categories) for track in tracks]
+    lines = []
+    with replacing(folder / "tracks.parquet") as path, open_writer(path, TRACKS) as writer:
+        boxes = FullBoxes.read(folder, placed)
+        for some in _batches(tracks):
+            columns = _columns(some, boxes.of_tracks(some, categories), categories)
+            writer.write_table(arrow_table(columns, TRACKS), row_group_size=_BATCH)
+            lines += [_Line.of(track, categories) for track in some]
     with replacing(folder / "tracks.csv") as path:
-        _write_csv(path, tracks, labels, categories, _start_ns(folder), work)
-    return dict(Counter(labels))
+        _write_csv(path, lines, _start_ns(folder), work)
+    return dict(Counter(line.category for line in lines))
+
+
+def _batches(tracks: Iterable[Track]) -> Iterator[list[Track]]:
+    """Yield tracks in turn, about as many rows at a time: those of hours fill the memory."""
+    some: list[Track] = []
+    for track in tracks:
+        some.append(track)
+        if sum(len(one.frames) for one in some) >= _BATCH:
+            yield some
+            some = []
+    yield some
 
 
 def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[FrameDetections]:
@@ -129,38 +154,57 @@ def _streams_with_poses(folder: Path) -> set[str]:
     return {topic for topic, count in balance.items() if count > 0}
 
 
-def _label(track: Track, categories: Sequence[str]) -> str:
-    return UNKNOWN if track.novelty > 1 else _guess(track, categories)
+def _columns(tracks: Sequence[Track], boxes: F8, categories: Sequence[str]) -> dict[str, Any]:
+    """Return the rows of some tracks, track after track, each in time."""
 
+    def column(name: str, *width: int) -> Any:
+        none = np.zeros((0, *width))
+        return np.concatenate([none, *(getattr(track, name) for track in tracks)])
 
-def _guess(track: Track, categories: Sequence[str]) -> str:
-    return categories[int(np.argmax(track.posterior))]
-
-
-def _columns(
-    tracks: Sequence[Track], boxes: FullBoxes, categories: Sequence[str]
-) -> dict[str, Any]:
-    """Return the rows of all tracks, track after track, each in time."""
-
-    def column(name: str) -> Any:
-        return np.concatenate([getattr(track, name) for track in tracks]) if tracks else []
-
-    detections = np.asarray(column("detections"), np.int32)
-    full = np.concatenate(
-        [np.zeros((0, 13)), *(boxes.of_track(track, categories) for track in tracks)]
-    )
+    detections = column("detections").astype(np.int32)
     return {
         "track": np.repeat([track.id for track in tracks], [len(track.frames) for track in tracks]),
         "topic": [topic for track in tracks for topic in track.topics],
-        "frame": column("frames"),
-        "stamp_ns": column("stamps_ns"),
+        "frame": column("frames").astype(np.int32),
+        "stamp_ns": np.concatenate([np.zeros(0, np.int64), *(t.stamps_ns for t in tracks)]),
         "detection": pa.array(detections, pa.int32(), mask=detections < 0),
         "center_fixed": pa.FixedSizeListArray.from_arrays(
-            np.ravel(column("centers")).astype(np.float32), 3
+            column("centers", 3).astype(np.float32).ravel(), 3
         ),
-        **full_columns(full),
-        "posterior": lists([p for track in tracks for p in track.causal], pa.float32()),
+        **full_columns(boxes),
+        "posterior": rows_as_lists(column("causal", len(categories))),
     }
+
+
+class _Line(NamedTuple):
+    """What tracks.csv says of a track."""
+
+    track: int
+    first_ns: int
+    last_ns: int
+    hits: int
+    category: str
+    confidence: float
+    center: F8
+    novelty: float
+    guess: str
+    topic: str
+
+    @classmethod
+    def of(cls, track: Track, categories: Sequence[str]) -> Self:
+        guess = categories[int(np.argmax(track.posterior))]
+        return cls(
+            track.id,
+            int(track.stamps_ns[0]),
+            int(track.stamps_ns[-1]),
+            track.hits,
+            UNKNOWN if track.novelty > 1 else guess,
+            track.confidence,
+            np.median(track.centers, axis=0),
+            track.novelty,
+            guess,
+            track.topic,
+        )
 
 
 _CSV = (
@@ -181,40 +225,29 @@ _CSV = (
 )
 
 
-def _write_csv(
-    path: Path,
-    tracks: Sequence[Track],
-    labels: Sequence[str],
-    categories: Sequence[str],
-    start_ns: int,
-    work: str,
-) -> None:
+def _write_csv(path: Path, lines: Sequence[_Line], start_ns: int, work: str) -> None:
     """Write a line per track: unknown ones first, then by ascending confidence."""
-    rows = sorted(
-        zip(tracks, labels, strict=True),
-        key=lambda item: (item[1] != UNKNOWN, item[0].confidence, item[0].id),
-    )
+    rows = sorted(lines, key=lambda line: (line.category != UNKNOWN, line.confidence, line.track))
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow(_CSV)
-        for track, label in rows:
-            first, last = ((int(track.stamps_ns[k]) - start_ns) * 1e-9 for k in (0, -1))
-            x, y, z = np.median(track.centers, axis=0)
+        for line in rows:
+            x, y, z = line.center
             writer.writerow(
                 (
-                    track.id,
-                    f"{first:.3f}",
-                    f"{last:.3f}",
-                    track.hits,
-                    label,
-                    f"{track.confidence:.3f}",
+                    line.track,
+                    f"{(line.first_ns - start_ns) * 1e-9:.3f}",
+                    f"{(line.last_ns - start_ns) * 1e-9:.3f}",
+                    line.hits,
+                    line.category,
+                    f"{line.confidence:.3f}",
                     "",
                     f"{x:.3f}",
                     f"{y:.3f}",
                     f"{z:.3f}",
-                    f"{track.novelty:.2f}",
-                    _guess(track, categories),
-                    track.topic,
+                    f"{line.novelty:.2f}",
+                    line.guess,
+                    line.topic,
                     work,
                 )
             )

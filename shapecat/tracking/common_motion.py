@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 
 from shapecat.arrays import F8, I4
 from shapecat.tracking.hits import Hits
-from shapecat.tracking.records import FrameDetections
 
 __all__ = ["CommonMotion", "find_common_motion"]
 
@@ -33,18 +32,17 @@ class CommonMotion:
     rotations: F8
     translations: F8
 
-    def still(self, frames: Sequence[FrameDetections]) -> list[FrameDetections]:
+    def still(self, hits: Hits) -> Hits:
         """Return the detections as if nothing had moved."""
-        return [
-            replace(
-                frame,
-                centers=frame.centers @ rotation.T + translation,
-                axes=None if frame.axes is None else rotation @ frame.axes,
-            )
-            for frame, rotation, translation in zip(
-                frames, self.rotations, self.translations, strict=True
-            )
-        ]
+        centers = np.zeros(hits.centers.shape)
+        axes = None if hits.axes is None else np.zeros(hits.axes.shape, np.float32)
+        for block in hits.blocks():
+            turns = self.rotations[hits.rows[block]]
+            shifts = self.translations[hits.rows[block]]
+            centers[block] = np.einsum("nij,nj->ni", turns, hits.centers[block]) + shifts
+            if axes is not None and hits.axes is not None:
+                axes[block] = turns @ hits.axes[block]
+        return replace(hits, centers=centers, axes=axes)
 
     def moved(self, rows: I4, places: F8) -> F8:
         """Return where places (k, 3) of the still scene are in frames (k,)."""
@@ -73,15 +71,15 @@ def find_common_motion(hits: Hits, members: Sequence[I4]) -> CommonMotion | None
     long = [member for member in members if len(member) >= _LONG]
     if hits.axes is None or len(long) < 3:
         return None
-    which = np.concatenate(long)
-    owner = np.repeat(np.arange(len(long)), [len(member) for member in long])
-    strays = np.concatenate([np.full(len(m), _extent(hits.centers[m])) for m in long])
-    if np.mean(strays > _MOVED_M) < _MOST:
+    lengths = [len(member) for member in long]
+    moved = [_extent(hits.centers[member]) > _MOVED_M for member in long]
+    if np.average(moved, weights=lengths) < _MOST:
         return None
+    which, owner = np.concatenate(long), np.repeat(np.arange(len(long)), lengths)
     level = _level(hits.axes)
     local = hits.centers[which] @ level.T
     plane = local[:, 0] + 1j * local[:, 1]
-    rows, count = hits.rows[which], len(hits.frames)
+    rows, count = hits.rows[which], len(hits.stamps_ns)
     turn, shift = _between_neighbours(plane, rows, owner, count)
     weights = np.ones(len(which))
     for _ in range(_ROUNDS):
@@ -104,7 +102,7 @@ def _extent(centers: F8) -> float:
 
 def _level(axes: F8) -> F8:
     """Return the rotation into a frame whose third axis is up."""
-    up = axes[:, :, 2].mean(axis=0)
+    up = axes[:, :, 2].mean(axis=0, dtype=np.float64)
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first /= np.linalg.norm(first)
     up /= np.linalg.norm(up)

@@ -1,5 +1,6 @@
 """One posterior from the views of one object (thesis 7.5.2)."""
 
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -20,6 +21,8 @@ as often from 2 to 30 views as from one (0.03 to 0.075 measured)."""
 
 _FLOOR = 1e-6
 """Smallest probability a single view can give in a product: none may veto all others."""
+
+_BLOCK = 2**16
 
 
 def view_weights(partial: Bool) -> F8:
@@ -51,23 +54,36 @@ def fuse(posteriors: ArrayLike, method: Method = "product", weights: ArrayLike |
     >>> fuse([[0.5, 0.5], [0.9, 0.1], [0.2, 0.8]], "vote").round(2)
     array([0.67, 0.33])
     """
-    return np.asarray(causal(posteriors, method, weights)[-1])
+    for block in _running(posteriors, method, weights):
+        last = block[-1]
+    return np.asarray(last)
 
 
 def causal(
     posteriors: ArrayLike, method: Method = "product", weights: ArrayLike | None = None
 ) -> F8:
     """Return (k, c): row i is `fuse` of the first i + 1 views, in O(1) per view."""
-    views = np.asarray(posteriors, np.float64)
+    return np.concatenate(list(_running(posteriors, method, weights)))
+
+
+def _running(posteriors: ArrayLike, method: Method, weights: ArrayLike | None) -> Iterator[F8]:
+    """Yield the rows of `causal` in blocks: a track may have a million views."""
+    views = np.asarray(posteriors)
     if views.ndim != 2 or len(views) == 0:
         msg = f"fusion needs (k, c) posteriors of at least one view, got shape {views.shape}"
         raise ValueError(msg)
     weight = np.ones(len(views)) if weights is None else np.asarray(weights, np.float64)
-    evidence = _evidence(views, method)
-    running = np.cumsum(evidence * weight[:, None], axis=0) / np.cumsum(weight)[:, None]
-    if method == "product":
-        running = np.exp(running - running.max(axis=1, keepdims=True))
-    return np.asarray(running / running.sum(axis=1, keepdims=True))
+    total, sofar = np.zeros(views.shape[1]), np.cumsum(weight)[:, None]
+    for first in range(0, len(views), _BLOCK):
+        some = slice(first, first + _BLOCK)
+        evidence = _evidence(views[some].astype(np.float64), method) * weight[some, None]
+        evidence[0] += total
+        summed = np.cumsum(evidence, axis=0)
+        total = summed[-1]
+        running = summed / sofar[some]
+        if method == "product":
+            running = np.exp(running - running.max(axis=1, keepdims=True))
+        yield running / running.sum(axis=1, keepdims=True)
 
 
 def fuse_novelty(novelties: ArrayLike, weights: ArrayLike) -> float:

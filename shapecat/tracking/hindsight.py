@@ -1,6 +1,6 @@
 """Hindsight: find scene cuts, and join the fragments of one object."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from shapecat.arrays import F8, I4, Bool, Record, array
 from shapecat.config import TrackingSettings
 from shapecat.tracking.association import posterior_difference, size_difference, size_key
-from shapecat.tracking.records import FrameDetections
+from shapecat.tracking.hits import Hits
 from shapecat.tracking.tracker import reach
 
 __all__ = ["Fragments", "merge_fragments", "scene_cuts"]
@@ -152,7 +152,7 @@ def _distances(fragments: Fragments, i: int, after: I4, settings: TrackingSettin
     return np.asarray(np.minimum(resting, moving))
 
 
-def scene_cuts(frames: Sequence[FrameDetections], settings: TrackingSettings) -> Bool:
+def scene_cuts(hits: Hits, settings: TrackingSettings) -> Bool:
     """Return (k,) which frames of one stream show another scene than the frames before.
 
     Recordings made of single pictures put different objects at the same place from one frame to
@@ -161,12 +161,12 @@ def scene_cuts(frames: Sequence[FrameDetections], settings: TrackingSettings) ->
     both sides of it must disagree too. Frames without detections say nothing. A clock that
     jumps back by more than ``max_missed_s`` is a cut as well.
     """
-    stamps = np.array([frame.stamp_ns for frame in frames], np.int64)
+    stamps = hits.stamps_ns
     result = np.diff(stamps, prepend=stamps[:1]) < -settings.max_missed_s * 1e9
-    filled = [k for k, frame in enumerate(frames) if len(frame.centers)]
+    filled = np.unique(hits.rows).tolist()
     for n in range(1, len(filled)):
         last, k = filled[n - 1], filled[n]
-        slow = stamps[k] - stamps[k - 1] > _SLOW_S * 1e9
+        slow = bool(stamps[k] - stamps[k - 1] > _SLOW_S * 1e9)
         if k - last > 1 and not slow:
             continue  # unseen for some frames, an object may have moved anywhere
         pairs = [(last, k)]
@@ -174,30 +174,28 @@ def scene_cuts(frames: Sequence[FrameDetections], settings: TrackingSettings) ->
             pairs.append((last, filled[n + 1]))
         if n > 1 and not result[last]:
             pairs.append((filled[n - 2], k))
-        result[k] |= not any(
-            _continues(frames[i], frames[j], slow=slow, settings=settings) for i, j in pairs
-        )
+        result[k] |= not any(_continues(hits, i, j, slow=slow, settings=settings) for i, j in pairs)
     return np.asarray(result)
 
 
-def _continues(
-    a: FrameDetections, b: FrameDetections, *, slow: bool, settings: TrackingSettings
-) -> bool:
-    """Whether b may show the scene of a: objects in the same area are mostly the same.
+def _continues(hits: Hits, i: int, j: int, *, slow: bool, settings: TrackingSettings) -> bool:
+    """Whether frame j may show the scene of i: objects in the same area are mostly the same.
 
     Where frames are ``slow`` to follow each other, a motion is no excuse for a distance.
     """
-    distance = np.linalg.norm(a.centers[:, None] - b.centers[None], axis=2)
+    a, b = hits.of_frame(i), hits.of_frame(j)
+    distance = np.linalg.norm(hits.centers[a, None] - hits.centers[None, b], axis=2)
     near = distance < _NEIGHBOURHOOD_M
     comparable = min(int(near.any(axis=1).sum()), int(near.any(axis=0).sum()))
     if comparable == 0:
         return True
-    keys_a, keys_b = size_key(a.sizes), size_key(b.sizes)
+    keys_a, keys_b = size_key(hits.sizes[a]), size_key(hits.sizes[b])
     limit = 0.5 * reach(keys_a, settings.gate_m) if slow else np.full(len(keys_a), settings.gate_m)
+    other = posterior_difference(hits.posteriors[a], hits.posteriors[b])
     same = (
         (distance <= limit[:, None])
         & (size_difference(keys_a, keys_b) <= _SAME_SIZE)
-        & (posterior_difference(a.posteriors, b.posteriors) <= (_SAME_POSTERIOR if slow else 1.0))
+        & (other <= (_SAME_POSTERIOR if slow else 1.0))
     )
     found = min(int(same.any(axis=1).sum()), int(same.any(axis=0).sum()))
     return 2 * found >= comparable

@@ -1,80 +1,118 @@
 """All detections of a stream in columns, and the frames between those of a track."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Self
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from heapq import merge
+from typing import Any, Self
 
 import numpy as np
 
-from shapecat.arrays import F8, I4, Bool
+from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.tracking.fusion import view_weights
 from shapecat.tracking.records import FrameDetections
 
-__all__ = ["Hits"]
+__all__ = ["Hits", "gather"]
+
+_BLOCK = 2**16  # detections that are looked at together
+
+_OF_FRAMES = {"topics": "i4", "frames": "i4", "stamps_ns": "i8"}
+_OF_HITS: dict[str, tuple[str, tuple[Any, ...]]] = {
+    "numbers": ("i4", ()),
+    "centers": ("f8", (3,)),
+    "sizes": ("f4", (3,)),
+    "posteriors": ("f4", ("c",)),
+    "partial": ("?", ()),
+    "novelties": ("f4", ()),
+    "axes": ("f4", (3, 3)),
+    "described": ("i4", ()),
+}
 
 
 @dataclass(frozen=True)
 class Hits:
-    """All detections of a stream: ``rows`` (n,) ascending, the positions of their frames.
+    """All detections of a stream: some 120 bytes for each, as hours of them are kept at once.
 
-    ``topics`` (f,) tell frames of one topic from those of others; ``axes`` (n, 3, 3) of the boxes,
-    None if those of some are not known; ``views`` (n,) tells views from those that repeat them.
+    Attributes
+    ----------
+    names : the topics.
+    topics, frames, stamps_ns : (f,) of each frame, its position in ``names``, number and time.
+    first : (f + 1,) the first detection of each frame; they are in the order of the frames.
+    rows : (n,) ascending, the position of the frame of each detection.
+    numbers, centers, sizes, posteriors, partial, novelties, described : as in `FrameDetections`.
+    axes : (n, 3, 3) of the boxes, None if those of some are not known.
     """
 
-    frames: Sequence[FrameDetections]
+    names: tuple[str, ...]
     topics: I4
+    frames: I4
+    stamps_ns: I4
+    first: I4
     rows: I4
     numbers: I4
     centers: F8
-    sizes: F8
-    posteriors: F8
+    sizes: F4
+    posteriors: F4
     partial: Bool
-    novelties: F8
-    axes: F8 | None
-    views: I4
+    novelties: F4
+    axes: F4 | None
+    described: I4
 
     @classmethod
-    def of(cls, frames: Sequence[FrameDetections]) -> Self:
-        """Gather the detections of at least one frame."""
-        filled = [frame for frame in frames if len(frame.centers)] or frames[:1]
-        axes = [frame.axes for frame in filled if frame.axes is not None]
-        topics = np.unique([frame.topic for frame in frames], return_inverse=True)[1]
-        rows = np.repeat(np.arange(len(frames)), [len(frame.centers) for frame in frames])
-        return cls(
-            frames,
-            topics,
-            rows,
-            np.concatenate([frame.detections for frame in filled]),
-            np.concatenate([frame.centers for frame in filled]),
-            np.concatenate([frame.sizes for frame in filled]).astype(np.float64),
-            np.concatenate([frame.posteriors for frame in filled]).astype(np.float64),
-            np.concatenate([frame.partial for frame in filled]),
-            np.concatenate([frame.novelties for frame in filled]).astype(np.float64),
-            np.concatenate(axes) if len(axes) == len(filled) else None,
-            (topics[rows].astype(np.int64) << 32) + np.concatenate([_described(f) for f in filled]),
-        )
+    def of(cls, frames: Iterable[FrameDetections]) -> Self:
+        """Gather the detections of one stream."""
+        stream = _Gathered()
+        for frame in frames:
+            stream.add(frame)
+        return cls(**stream.columns())
+
+    def without_boxes(self) -> Self:
+        """Return them without sizes and axes, which no track is built from."""
+        return replace(self, sizes=np.zeros((0, 3), np.float32), axes=None)
+
+    def blocks(self) -> Iterator[slice]:
+        """Yield the detections of some frames, then those of the next ones, and so on."""
+        stops = np.searchsorted(self.first, np.arange(_BLOCK, len(self.rows), _BLOCK))
+        bounds = np.unique([0, *self.first[stops], len(self.rows)]).tolist()
+        yield from map(slice, bounds[:-1], bounds[1:])
+
+    def of_frame(self, row: int) -> slice:
+        """Return the detections of a frame."""
+        return slice(int(self.first[row]), int(self.first[row + 1]))
+
+    def owners(self, members: Sequence[I4]) -> I4:
+        """Return (n,) which of the tracks each detection is of, -1 if none."""
+        owner = np.full(len(self.rows), -1, np.int32)
+        for k, member in enumerate(members):
+            owner[member] = k
+        return owner
 
     def stamps(self, hits: I4) -> I4:
         """Return the times of some hits."""
-        return np.array([self.frames[r].stamp_ns for r in self.rows[hits]], np.int64)
+        return np.asarray(self.stamps_ns[self.rows[hits]])
 
     def weights(self, member: I4) -> F8:
         """Return how much each view of the track ``member`` counts: one that is repeated, once."""
-        _, first = np.unique(self.views[member], return_index=True)
+        topics = self.topics[self.rows[member]].astype(np.int64)
+        _, first = np.unique((topics << 32) + self.described[member], return_index=True)
         new = np.zeros(len(member), np.bool_)
         new[first] = True
         return np.where(new, view_weights(self.partial[member]), 0.0)
 
     def at(self, rows: I4) -> tuple[I4, I4]:
         """Return the hits in some frames, and for each the position of its frame in ``rows``."""
-        first, stop = np.searchsorted(self.rows, [rows, rows + 1])
+        first, stop = self.first[rows], self.first[rows + 1]
         which = np.repeat(np.arange(len(rows)), stop - first)
         return np.arange(which.size) - (np.cumsum(stop - first) - stop)[which], which
 
     def places(self, member: I4, rows: I4) -> F8:
         """Return (k, 3) where the track ``member`` is in frames: on the line between its hits."""
-        seen = self.rows[member]
-        lines = [np.interp(rows, seen, self.centers[member, axis]) for axis in range(3)]
+        if len(rows) == 0:
+            return np.zeros((0, 3))
+        # Those around the frames alone: a track of hours is asked for many short spans.
+        before, after = np.searchsorted(member, self.first[[rows.min() + 1, rows.max()]])
+        near = member[max(before - 1, 0) : after + 1]
+        seen = self.rows[near]
+        lines = [np.interp(rows, seen, self.centers[near, axis]) for axis in range(3)]
         return np.column_stack(lines)
 
     def life(self, member: I4, max_gap_s: float) -> tuple[I4, Bool]:
@@ -83,12 +121,9 @@ class Hits:
         Gaps that are longer than ``max_gap_s`` are left out, and so are topics that never see it.
         """
         seen = self.rows[member]
-        gap_s = np.diff(self.stamps(member)) * 1e-9
-        pieces = [
-            np.arange(a, b if gap <= max_gap_s else a + 1)
-            for a, b, gap in zip(seen[:-1], seen[1:], gap_s, strict=True)
-        ]
-        rows = np.concatenate([*pieces, seen[-1:]])
+        gap_s = np.diff(self.stamps_ns[seen]) * 1e-9
+        lengths = np.append(np.where(gap_s <= max_gap_s, np.diff(seen), 1), 1)
+        rows = np.repeat(seen - (np.cumsum(lengths) - lengths), lengths) + np.arange(lengths.sum())
         rows = rows[self.sees(member, rows)]
         return rows, np.isin(rows, seen)
 
@@ -96,7 +131,80 @@ class Hits:
         """Return which frames are of a topic that sees the track ``member``."""
         return np.isin(self.topics[rows], self.topics[self.rows[member]])
 
+    def seen_with(self, member: I4, other: I4) -> I4:
+        """Return the hits of another track in the topics that see the track ``member``."""
+        return other if len(self.names) == 1 else other[self.sees(member, self.rows[other])]
 
-def _described(frame: FrameDetections) -> I4:
-    own = np.full(len(frame.centers), frame.frame, np.int32)
-    return own if frame.described is None else frame.described
+
+def gather(frames: Iterable[FrameDetections], together: Collection[str] = ()) -> Iterator[Hits]:
+    """Yield the detections of each stream; of several topics ``together``, by time."""
+    streams: dict[str, _Gathered] = {}
+    for frame in frames:
+        name = "" if frame.topic in together else frame.topic
+        streams.setdefault(name, _Gathered()).add(frame)
+    while streams:  # none is kept longer than it is needed
+        yield Hits(**streams.pop(next(iter(streams))).columns())
+
+
+class _Gathered:
+    """The columns of a stream while it is read; bytes grow in place."""
+
+    def __init__(self) -> None:
+        self._names: dict[str, int] = {}
+        self._counts: list[int] = []
+        self._bytes = {name: bytearray() for name in (*_OF_FRAMES, *_OF_HITS)}
+        self._categories = 0
+
+    def add(self, frame: FrameDetections) -> None:
+        """Append the detections of the next frame."""
+        count, categories = frame.posteriors.shape
+        topic = self._names.setdefault(frame.topic, len(self._names))
+        self._counts.append(count)
+        own = {"topics": topic, "frames": frame.frame, "stamps_ns": frame.stamp_ns}
+        for name, kind in _OF_FRAMES.items():
+            self._bytes[name] += np.array(own[name], kind).tobytes()
+        if count == 0:
+            return
+        self._categories = categories
+        for name, (kind, _) in _OF_HITS.items():
+            self._bytes[name] += np.asarray(_column(frame, name), kind).tobytes()
+
+    def columns(self) -> dict[str, Any]:
+        """Return the columns of `Hits`; this has none any more."""
+        counts = np.array(self._counts, np.int32)
+        of_frames = {name: self._taken(name, kind) for name, kind in _OF_FRAMES.items()}
+        which: Any = slice(None)
+        frames: Any = slice(None)
+        if len(self._names) > 1:
+            frames = _by_time(of_frames["topics"], of_frames["stamps_ns"])
+            first = np.cumsum(counts) - counts
+            which = np.concatenate([np.arange(first[k], first[k] + counts[k]) for k in frames])
+        counts = counts[frames]
+        columns = {name: values[frames] for name, values in of_frames.items()}
+        columns["first"] = np.concatenate([[0], np.cumsum(counts)])
+        columns["rows"] = np.repeat(np.arange(len(counts), dtype=np.int32), counts)
+        total = len(columns["rows"])
+        for name, (kind, shape) in _OF_HITS.items():
+            values = self._taken(name, kind)
+            widths = tuple(self._categories if width == "c" else width for width in shape)
+            whole = values.size == total * int(np.prod(widths))
+            columns[name] = values.reshape(total, *widths)[which] if whole else None
+        return {"names": tuple(self._names), **columns}
+
+    def _taken(self, name: str, kind: str) -> Any:
+        return np.frombuffer(self._bytes.pop(name), kind)
+
+
+def _column(frame: FrameDetections, name: str) -> Any:
+    if name == "numbers":
+        return frame.detections
+    if name == "described" and frame.described is None:
+        return np.full(len(frame.detections), frame.frame)
+    values = getattr(frame, name)
+    return () if values is None else values
+
+
+def _by_time(topics: I4, stamps_ns: I4) -> Any:
+    """Return the order of frames by time, those of each topic kept in their order of recording."""
+    streams = (np.flatnonzero(topics == topic).tolist() for topic in range(topics.max() + 1))
+    return np.fromiter(merge(*streams, key=stamps_ns.tolist().__getitem__), np.int64)

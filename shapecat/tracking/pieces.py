@@ -1,6 +1,8 @@
 """Tracks that are one object: it was split into pieces for some frames."""
 
+from collections import Counter
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -35,34 +37,62 @@ def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
     """
     if hits.axes is None or len(members) < 2:
         return list(members)
-    axes, owner = hits.axes, np.full(len(hits.rows), -1)
-    for k, member in enumerate(members):
-        owner[member] = k
-    wholes = np.array([_wholes(hits, member) for member in members])
-    pairs = _neighbours(hits, owner)
-    topics = hits.topics[hits.rows[pairs]]
-    rooms = wholes[owner[pairs], topics]
-    duos, which = np.unique(np.sort(owner[pairs], axis=1), axis=0, return_inverse=True)
-    start, stop, share = _changes(hits, members, duos)
-    passing = (share <= _PASSING)[which] & hits.partial[pairs].all(axis=1)
-    rooms[passing, :, 1] = rooms[passing, :, 0]
-    for k in _where(share <= _CHANGING):
-        both = np.concatenate([members[m] for m in duos[k]])
-        rooms[which == k] = np.maximum(rooms[which == k], _in_one(hits, both, start[k], stop[k]))
-    fits = _fit(hits, axes, pairs, rooms)
-    together, fitting = np.unique(np.sort(owner[pairs[fits]], axis=1), axis=0, return_counts=True)
+    counts = _count_fits(hits, members)
     root = np.arange(len(members))
-    for (a, b), count in sorted(
-        zip(together.tolist(), fitting.tolist(), strict=True), key=lambda item: -item[1]
-    ):
+    for (a, b), count in sorted((+counts).items(), key=lambda item: (-item[1], item[0])):
         common = np.intersect1d(hits.rows[members[a]], hits.rows[members[b]]).size
         if count > _MOSTLY * common:
             root[root == max(root[a], root[b])] = min(root[a], root[b])
-    volume = hits.sizes.prod(axis=1)
-    return [
-        _largest(hits, np.concatenate([members[k] for k in _where(root == r)]), volume)
-        for r in np.unique(root)
-    ]
+    groups = [[members[k] for k in _where(root == r)] for r in np.unique(root)]
+    return [_largest(hits, np.concatenate(group)) for group in groups]
+
+
+def _count_fits(hits: Hits, members: Sequence[I4]) -> Counter[tuple[int, int]]:
+    """Return in how many frames pairs of tracks are pieces of one object."""
+    owner, counts = hits.owners(members), Counter[tuple[int, int]]()
+    rooms = _Rooms(hits, members)
+    for block in hits.blocks():
+        pairs = _neighbours(hits, owner, block)
+        duos, which = np.unique(np.sort(owner[pairs], axis=1), axis=0, return_inverse=True)
+        fits = _fit(hits, pairs, rooms.of(pairs, owner, duos, which.ravel()))
+        fitting = np.bincount(which.ravel()[fits], minlength=len(duos))
+        counts.update(dict(zip(map(tuple, duos.tolist()), fitting.tolist(), strict=True)))
+    return counts
+
+
+class _Rooms:
+    """How large the whole object is that two pieces may be of."""
+
+    def __init__(self, hits: Hits, members: Sequence[I4]) -> None:
+        self._hits, self._members = hits, members
+        self._wholes = np.array([_wholes(hits, member) for member in members])
+        self._in_one = cache(self._seen_in_one)
+
+    def of(self, pairs: I4, owner: I4, duos: I4, which: I4) -> F8:
+        """Return (p, 2, 3) the lengths that either track of pairs (p, 2) of detections tells.
+
+        ``which`` (p,) are their positions in ``duos`` (q, 2), the pairs of tracks.
+        """
+        hits = self._hits
+        rooms = self._wholes[owner[pairs], hits.topics[hits.rows[pairs]]]
+        share = _changes(hits, self._members, duos)
+        passing = (share <= _PASSING)[which] & hits.partial[pairs].all(axis=1)
+        rooms[passing, :, 1] = rooms[passing, :, 0]
+        for k in _where(share <= _CHANGING):
+            rooms[which == k] = np.maximum(rooms[which == k], self._in_one(*duos[k].tolist()))
+        return np.asarray(rooms)
+
+    def _seen_in_one(self, a: int, b: int) -> F8:
+        """Return the largest lengths of the hits of two tracks that are alone in their frames.
+
+        Only while both last; 0 if there are none.
+        """
+        hits, both = self._hits, np.concatenate([self._members[a], self._members[b]])
+        start = max(hits.rows[self._members[k][0]] for k in (a, b))
+        stop = min(hits.rows[self._members[k][-1]] for k in (a, b))
+        rows, at, counts = np.unique(hits.rows[both], return_index=True, return_counts=True)
+        alone = both[at[(counts == 1) & (rows > start) & (rows < stop)]]
+        return np.asarray(_sorted_sides(hits.sizes[alone]).max(axis=0, initial=0))
 
 
 def _where(mask: Bool) -> list[int]:
@@ -71,13 +101,14 @@ def _where(mask: Bool) -> list[int]:
 
 def _sorted_sides(sizes: F8) -> F8:
     """Return sizes (n, 3) as longer side, shorter side, height."""
-    return np.column_stack([sizes[:, :2].max(axis=1), sizes[:, :2].min(axis=1), sizes[:, 2]])
+    sides = np.sort(sizes[:, :2].astype(np.float64), axis=1)
+    return np.column_stack([sides[:, ::-1], sizes[:, 2]])
 
 
 def _wholes(hits: Hits, member: I4) -> F8:
     """Return (topics, 3) lengths of the whole object as each topic sees it, 0 if it does not."""
     topics = hits.topics[hits.rows[member]]
-    result = np.zeros((hits.topics.max() + 1, 3))
+    result = np.zeros((len(hits.names), 3))
     for topic in _where(np.bincount(topics) > 0):
         result[topic] = _whole(hits, member[topics == topic])
     return result
@@ -90,45 +121,34 @@ def _whole(hits: Hits, member: I4) -> F8:
     return np.asarray(np.quantile(lengths, 0.75, axis=0))
 
 
-def _neighbours(hits: Hits, owner: I4) -> I4:
+def _neighbours(hits: Hits, owner: I4, block: slice) -> I4:
     """Return (p, 2) tracked detections of the same frame that are near each other."""
-    tracked = np.flatnonzero(owner >= 0)
+    tracked = block.start + np.flatnonzero(owner[block] >= 0)
     places = np.column_stack([hits.centers[tracked], hits.rows[tracked]])
     found = cKDTree(places).query_pairs(_NEAR_M, output_type="ndarray")
     pairs = tracked[found]
     return np.asarray(pairs[np.lexsort(pairs.T)])
 
 
-def _changes(hits: Hits, members: Sequence[I4], duos: I4) -> tuple[I4, I4, F8]:
-    """Return when the later ones of pairs (q, 2) of tracks begin and the earlier ones end.
+def _changes(hits: Hits, members: Sequence[I4], duos: I4) -> F8:
+    """Return how long pairs (q, 2) of tracks both last, as a share of the shorter one's life.
 
-    And how long that takes, as a share of the shorter one's life; inf if it lies in the other's.
+    It is inf if that lies in the other's.
     """
     first = np.array([hits.rows[member[0]] for member in members])[duos]
     last = np.array([hits.rows[member[-1]] for member in members])[duos]
-    start, stop = first.max(axis=1), last.min(axis=1)
-    share = (stop - start + 1) / (last - first + 1).min(axis=1)
+    share = (last.min(axis=1) - first.max(axis=1) + 1) / (last - first + 1).min(axis=1)
     within = np.argmin(first, axis=1) != np.argmin(last, axis=1)
-    return start, stop, np.where(within, np.inf, share)
+    return np.where(within, np.inf, share)
 
 
-def _in_one(hits: Hits, both: I4, start: int, stop: int) -> F8:
-    """Return the largest lengths of the hits of two tracks that are alone in their frames.
-
-    Only between two frames; 0 if there are none.
-    """
-    rows, at, counts = np.unique(hits.rows[both], return_index=True, return_counts=True)
-    alone = both[at[(counts == 1) & (rows > start) & (rows < stop)]]
-    return np.asarray(_sorted_sides(hits.sizes[alone]).max(axis=0, initial=0))
-
-
-def _fit(hits: Hits, axes: F8, pairs: I4, wholes: F8) -> Bool:
+def _fit(hits: Hits, pairs: I4, wholes: F8) -> Bool:
     """Tell which pairs (p, 2) are pieces of either one's whole (p, 2, 3) object.
 
     Their common box is no larger than it, and neither shows all of it: in a bowl there may be
     something.
     """
-    joint = np.minimum(_joint(hits, axes, pairs), _joint(hits, axes, pairs[:, ::-1]))
+    joint = np.minimum(_joint(hits, pairs), _joint(hits, pairs[:, ::-1]))
     lengths = _sorted_sides(hits.sizes[pairs.ravel()]).reshape(-1, 2, 3)
     room = wholes * _SLACK + _SLACK_M
     lacking = np.any(lengths.max(axis=1)[:, None] < _LACKING * wholes, axis=2)
@@ -136,18 +156,22 @@ def _fit(hits: Hits, axes: F8, pairs: I4, wholes: F8) -> Bool:
     return np.asarray(np.any(fitting & lacking, axis=1))
 
 
-def _joint(hits: Hits, axes: F8, pairs: I4) -> F8:
+def _joint(hits: Hits, pairs: I4) -> F8:
     """Return (p, 3) the lengths of the boxes of both, along the axes of the first."""
     i, j = pairs.T
-    offset = np.einsum("pji,pj->pi", axes[i], hits.centers[j] - hits.centers[i])
-    turned = np.abs(np.einsum("pji,pjk->pik", axes[i], axes[j]))
+    if hits.axes is None:
+        raise ValueError
+    axes, others = hits.axes[i].astype(np.float64), hits.axes[j].astype(np.float64)
+    offset = np.einsum("pji,pj->pi", axes, hits.centers[j] - hits.centers[i])
+    turned = np.abs(np.einsum("pji,pjk->pik", axes, others))
     reach = 0.5 * np.einsum("pik,pk->pi", turned, hits.sizes[j])
-    own = 0.5 * hits.sizes[i]
+    own = 0.5 * hits.sizes[i].astype(np.float64)
     return _sorted_sides(np.maximum(own, offset + reach) - np.minimum(-own, offset - reach))
 
 
-def _largest(hits: Hits, member: I4, volume: F8) -> I4:
+def _largest(hits: Hits, member: I4) -> I4:
     """Return the largest of the hits of each frame."""
-    order = member[np.lexsort([-volume[member], hits.rows[member]])]
+    volume = hits.sizes[member].astype(np.float64).prod(axis=1)
+    order = member[np.lexsort([-volume, hits.rows[member]])]
     first = np.concatenate([[True], np.diff(hits.rows[order]) > 0])
     return np.asarray(order[first])

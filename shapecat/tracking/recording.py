@@ -1,7 +1,7 @@
 """From the detections of a recording to its tracks, with the future known."""
 
-from collections.abc import Collection, Iterable, Sequence
-from heapq import merge
+from collections.abc import Collection, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from shapecat.config import TrackingSettings
 from shapecat.tracking.common_motion import CommonMotion, find_common_motion
 from shapecat.tracking.fusion import causal, fuse, fuse_novelty
 from shapecat.tracking.hindsight import Fragments, merge_fragments, scene_cuts
-from shapecat.tracking.hits import Hits
+from shapecat.tracking.hits import Hits, gather
 from shapecat.tracking.pieces import join_pieces
 from shapecat.tracking.records import FrameDetections, Track
 from shapecat.tracking.surplus import without_pieces, without_shadows
@@ -31,7 +31,7 @@ def track_recording(
     settings: TrackingSettings,
     *,
     together: Collection[str] = (),
-) -> tuple[Track, ...]:
+) -> Iterator[Track]:
     """Track the objects of a recording, stream by stream.
 
     Parameters
@@ -42,76 +42,81 @@ def track_recording(
 
     Returns
     -------
-    Confirmed tracks, numbered from 1 in order of birth (time, then stream, then position). A
-    track is confirmed by ``settings.min_hits`` detections, or by as many as there are frames of
-    the same scene within half a second of its first; so a recording of single pictures, one per
-    second, keeps every detection. Detections of no confirmed track are taken for false.
+    Confirmed tracks, each made as it is asked for, numbered from 1 in order of birth (time, then
+    stream, then position). A track is confirmed by ``settings.min_hits`` detections, or by as
+    many as there are frames of the same scene within half a second of its first; so a recording
+    of single pictures, one per second, keeps every detection. Detections of no confirmed track
+    are taken for false.
 
     Notes
     -----
-    Time and memory grow linearly with the number of detections.
+    Time and memory grow linearly with the number of detections, memory by some 120 bytes each.
     """
-    streams: dict[str, list[FrameDetections]] = {}
-    for frame in frames:
-        streams.setdefault("" if frame.topic in together else frame.topic, []).append(frame)
-    if len(together) > 1 and "" in streams:
-        streams[""] = _interleaved(streams[""])
-    found = [track for stream in streams.values() for track in _track_stream(stream, settings)]
-    found.sort(key=lambda track: int(track.stamps_ns[0]))  # stable: then stream, then birth
-    return tuple(_renumbered(track, k + 1) for k, track in enumerate(found))
+    streams = [_track_stream(hits, settings) for hits in gather(frames, together)]
+    found = [(stream, member) for stream in streams for member in stream.members]
+    found.sort(key=lambda item: item[0].born_ns(item[1]))  # stable: then stream, then birth
+    return (_build_track(k, *item, settings) for k, item in enumerate(found, 1))
 
 
-def _interleaved(frames: Iterable[FrameDetections]) -> list[FrameDetections]:
-    """Merge streams by time, each kept in its order of recording."""
-    streams: dict[str, list[FrameDetections]] = {}
-    for frame in frames:
-        streams.setdefault(frame.topic, []).append(frame)
-    return list(merge(*streams.values(), key=lambda frame: frame.stamp_ns))
+@dataclass(frozen=True)
+class _Followed:
+    """A stream whose detections belong to tracks, at rest where there is a common motion."""
+
+    hits: Hits
+    members: list[I4]
+    motion: CommonMotion | None
+
+    def born_ns(self, member: I4) -> int:
+        return int(self.hits.stamps(member[:1])[0])
 
 
-def _track_stream(frames: Sequence[FrameDetections], settings: TrackingSettings) -> list[Track]:
+def _track_stream(hits: Hits, settings: TrackingSettings) -> _Followed:
     """Track a stream; where its objects move as one, as if they stood still."""
-    hits, members = _follow(frames, settings)
+    members = _follow(hits, settings)
     motion = find_common_motion(hits, members)
     if motion is not None:
-        hits, members = _follow(motion.still(frames), settings)
-    return [_build_track(hits, member, settings, motion) for member in members]
+        hits = motion.still(hits)
+        members = _follow(hits, settings)
+    return _Followed(hits.without_boxes(), members, motion)
 
 
-def _follow(frames: Sequence[FrameDetections], settings: TrackingSettings) -> tuple[Hits, list[I4]]:
-    """Return all detections of a stream, and which of them are of the same object."""
-    cuts = scene_cuts(frames, settings)
-    hits, scenes = Hits.of(frames), np.cumsum(cuts)
+def _follow(hits: Hits, settings: TrackingSettings) -> list[I4]:
+    """Return which detections of a stream are of the same object."""
+    cuts = scene_cuts(hits, settings)
+    scenes = np.cumsum(cuts)
     fragments = [
         group
-        for track in _groups(_associate(frames, cuts, settings))
+        for track in _groups(_associate(hits, cuts, settings))
         for group in _without_gaps(hits, track)
         if len(group)
-        and len(group) >= _needed(frames, scenes, int(hits.rows[group[0]]), settings.min_hits)
+        and len(group) >= _needed(hits, scenes, int(hits.rows[group[0]]), settings.min_hits)
     ]
     chains = _groups(merge_fragments(_describe(hits, fragments, scenes), settings))
     members = [np.sort(np.concatenate([fragments[k] for k in c])) for c in chains if len(c)]
     members = join_pieces(hits, members)
-    return hits, without_pieces(hits, without_shadows(hits, members), settings.max_missed_s)
+    return without_pieces(hits, without_shadows(hits, members), settings.max_missed_s)
 
 
-def _associate(frames: Sequence[FrameDetections], cuts: Bool, settings: TrackingSettings) -> I4:
-    """Return the tracker's number of every detection, frame after frame."""
-    tracker, ids = Tracker(settings), [np.zeros(0, np.int32)]
-    for frame, cut in zip(frames, cuts, strict=True):
+def _associate(hits: Hits, cuts: Bool, settings: TrackingSettings) -> I4:
+    """Return the tracker's number of every detection."""
+    tracker, ids = Tracker(settings), np.zeros(len(hits.rows), np.int32)
+    for row, (stamp_ns, cut) in enumerate(zip(hits.stamps_ns.tolist(), cuts.tolist(), strict=True)):
         if cut:
             tracker.reset()
-        ids.append(
-            tracker.step(
-                frame.stamp_ns, frame.centers, frame.sizes, frame.posteriors, partial=frame.partial
-            )
+        here = hits.of_frame(row)
+        ids[here] = tracker.step(
+            stamp_ns,
+            hits.centers[here],
+            hits.sizes[here],
+            hits.posteriors[here],
+            partial=hits.partial[here],
         )
-    return np.concatenate(ids)
+    return ids
 
 
 def _groups(labels: I4) -> list[I4]:
     """Return the positions of each label, ascending, by ascending label."""
-    order = np.argsort(labels, kind="stable")
+    order = np.argsort(labels, kind="stable").astype(np.int32)
     return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
 
 
@@ -127,14 +132,12 @@ def _without_gaps(hits: Hits, track: I4) -> list[I4]:
 def _describe(hits: Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
     """Summarise fragments: sizes by medians, which a few odd views do not move."""
     n = len(fragments)
-    stamps = np.array([frame.stamp_ns for frame in hits.frames], np.int64)
-    at = stamps[hits.rows]
-    starts = [_line(at[f[:_LINE]], hits.centers[f[:_LINE]], 0) for f in fragments]
-    ends = [_line(at[f[-_LINE:]], hits.centers[f[-_LINE:]], -1) for f in fragments]
-    views = [(f, hits.weights(f)) for f in fragments]
+    starts = [_line(hits, f[:_LINE], 0) for f in fragments]
+    ends = [_line(hits, f[-_LINE:], -1) for f in fragments]
+    fused = [_fused(hits, f) for f in fragments]
     return Fragments(
-        np.array([at[f[0]] for f in fragments], np.int64),
-        np.array([at[f[-1]] for f in fragments], np.int64),
+        np.array([hits.stamps(f[0]) for f in fragments], np.int64),
+        np.array([hits.stamps(f[-1]) for f in fragments], np.int64),
         np.reshape([place for place, _ in starts], (n, 3)),
         np.reshape([place for place, _ in ends], (n, 3)),
         np.reshape([velocity for _, velocity in starts], (n, 3)),
@@ -143,17 +146,24 @@ def _describe(hits: Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
         np.array([np.sum(~hits.partial[f]) for f in fragments], np.int32),
         np.reshape([_rest(hits, f) for f in fragments], (n, 3)),
         np.reshape([hits.partial[f[[0, -1]]] for f in fragments], (n, 2)),
-        np.reshape([fuse(hits.posteriors[f], weights=w) for f, w in views], (n, -1 if n else 0)),
-        np.array([fuse_novelty(hits.novelties[f], w) for f, w in views]),
+        np.reshape([posterior for posterior, _ in fused], (n, -1 if n else 0)),
+        np.array([novelty for _, novelty in fused]),
         np.array([scenes[hits.rows[f[0]]] for f in fragments], np.int32),
     )
+
+
+def _fused(hits: Hits, member: I4) -> tuple[F8, float]:
+    """Return the fused posterior and novelty of some views of one object."""
+    weights = hits.weights(member)
+    posterior = fuse(hits.posteriors[member], weights=weights)
+    return posterior, fuse_novelty(hits.novelties[member], weights)
 
 
 def _extent(hits: Hits, member: I4) -> F8:
     """Return the typical lengths of the whole views, or else the largest ones of the cut views."""
     whole = member[~hits.partial[member]]
     if len(whole):
-        return np.asarray(np.median(hits.sizes[whole], axis=0))
+        return np.asarray(np.median(hits.sizes[whole].astype(np.float64), axis=0))
     return np.asarray(hits.sizes[member].max(axis=0))
 
 
@@ -168,64 +178,47 @@ def _rest(hits: Hits, member: I4) -> F8:
     return np.asarray(np.median(whole, axis=0))
 
 
-def _line(stamps: I4, centers: F8, at: int) -> tuple[F8, F8]:
-    """Fit a uniform motion; return the place at one of the stamps, and the velocity in m/s.
+def _line(hits: Hits, some: I4, at: int) -> tuple[F8, F8]:
+    """Fit a uniform motion; return the place at one of some hits, and the velocity in m/s.
 
     A prior of standing still keeps the velocity of a few noisy points small.
     """
+    stamps, centers = hits.stamps(some), hits.centers[some]
     t = (stamps - stamps[at]) * 1e-9
     middle, mean = t.mean(), centers.mean(axis=0)
     velocity = (t - middle) @ (centers - mean) / (((t - middle) ** 2).sum() + 0.1)
     return mean - middle * velocity, velocity
 
 
-def _needed(frames: Sequence[FrameDetections], scenes: I4, row: int, min_hits: int) -> int:
+def _needed(hits: Hits, scenes: I4, row: int, min_hits: int) -> int:
     """Return how many detections confirm a track that was born in frame ``row``."""
-    near = 1
+    near, stamps = 1, hits.stamps_ns
     for direction in (1, -1):
         for k in range(row + direction, row + direction * min_hits, direction):
-            if not (0 <= k < len(frames)) or scenes[k] != scenes[row]:
+            if not (0 <= k < len(stamps)) or scenes[k] != scenes[row]:
                 break
-            near += abs(frames[k].stamp_ns - frames[row].stamp_ns) <= _BURST_NS
+            near += bool(abs(stamps[k] - stamps[row]) <= _BURST_NS)
     return min(min_hits, near)
 
 
-def _build_track(
-    hits: Hits, member: I4, settings: TrackingSettings, motion: CommonMotion | None
-) -> Track:
+def _build_track(number: int, stream: _Followed, member: I4, settings: TrackingSettings) -> Track:
+    hits = stream.hits
     rows, source = hits.life(member, settings.max_missed_s)
-    seen = hits.rows[member]
     weights = hits.weights(member)
     so_far = causal(hits.posteriors[member], settings.fusion, weights)
-    stamps = np.array([hits.frames[r].stamp_ns for r in rows], np.int64)
-    at = np.searchsorted(seen, rows, side="right") - 1  # the last detection up to each row
+    # The last detection up to each row.
+    at = np.searchsorted(hits.rows[member], rows, side="right") - 1
     places = hits.places(member, rows)
     return Track(
-        0,
-        tuple(hits.frames[r].topic for r in rows),
+        number,
+        tuple(map(hits.names.__getitem__, hits.topics[rows].tolist())),
         len(member),
-        np.array([hits.frames[r].frame for r in rows]),
-        stamps,
+        hits.frames[rows],
+        hits.stamps_ns[rows],
         np.where(source, hits.numbers[member][at], -1),
-        places if motion is None else motion.moved(rows, places),
+        places if stream.motion is None else stream.motion.moved(rows, places),
         so_far[at],
         so_far[-1],
         float(so_far[-1].max()),
         fuse_novelty(hits.novelties[member], weights),
-    )
-
-
-def _renumbered(track: Track, number: int) -> Track:
-    return Track(
-        number,
-        track.topics,
-        track.hits,
-        track.frames,
-        track.stamps_ns,
-        track.detections,
-        track.centers,
-        track.causal,
-        track.posterior,
-        track.confidence,
-        track.novelty,
     )

@@ -1,6 +1,7 @@
 """Tracks that are no objects: pieces of objects that were split for some frames."""
 
 from collections.abc import Sequence
+from functools import cache
 
 import numpy as np
 
@@ -21,18 +22,19 @@ def without_shadows(hits: Hits, members: Sequence[I4]) -> list[I4]:
     lengths = np.array([len(member) for member in members])
     first = np.array([hits.rows[member[0]] for member in members])
     last = np.array([hits.rows[member[-1]] for member in members])
+    radius = cache(lambda k: 0.6 * float(np.median(hits.sizes[members[k]], axis=0).min()))
     kept = []
     for member in members:
         low, high = hits.rows[member[0]], hits.rows[member[-1]]
         hosts = (_SHADOW * len(member) <= lengths) & (first <= high) & (last >= low)
-        if not any(_inside(hits, member, members[k]) for k in np.flatnonzero(hosts).tolist()):
+        places = np.flatnonzero(hosts).tolist()
+        if not any(_inside(hits, member, members[k], radius(k)) for k in places):
             kept.append(member)
     return kept
 
 
-def _inside(hits: Hits, member: I4, host: I4) -> bool:
+def _inside(hits: Hits, member: I4, host: I4, radius: float) -> bool:
     place = hits.places(host, hits.rows[member])
-    radius = 0.6 * np.median(hits.sizes[host], axis=0).min()
     distance = np.linalg.norm(hits.centers[member] - place, axis=1)
     return bool(np.median(distance) <= radius)
 
@@ -47,9 +49,7 @@ def without_pieces(hits: Hits, members: Sequence[I4], max_gap_s: float) -> list[
     """
     if hits.axes is None:
         return list(members)
-    owner = np.full(len(hits.rows), -1)
-    for k, member in enumerate(members):
-        owner[member] = k
+    owner = hits.owners(members)
     covered = [
         _covered(hits, member, max_gap_s) + _covered_beside(hits, k, members, owner)
         for k, member in enumerate(members)
@@ -78,8 +78,7 @@ def _covered_beside(hits: Hits, k: int, members: Sequence[I4], owner: I4) -> int
         beside, _ = hits.at(hits.rows[member[[end]]])
         found = [0]
         for hit in beside[(owner[beside] >= 0) & (owner[beside] != k)].tolist():
-            host = members[owner[hit]]
-            host = host[hits.sees(member, hits.rows[host])]
+            host = hits.seen_with(member, members[owner[hit]])
             i = int(np.searchsorted(host, hit))
             then = host[max(i - most, 0) : i] if way < 0 else host[i + 1 : i + 1 + most]
             place = hits.centers[member[end]] + hits.centers[then] - hits.centers[hit]

@@ -1,0 +1,76 @@
+"""Where each frame of a run was taken from, and where its detections begin."""
+
+from collections.abc import Collection, Sequence
+from functools import cached_property
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute
+
+from shapecat.arrays import F8, I4
+from shapecat.runs.tables import frame_rows, numbers, topic_codes
+
+__all__ = ["PlacedFrames"]
+
+
+class PlacedFrames:
+    """The frames of a run in columns, in their order, found by topic and number."""
+
+    COLUMNS = ("topic", "frame", "fixed_translation", "fixed_rotation")
+
+    def __init__(self, placed: Collection[str]) -> None:
+        """Start without frames; the topics ``placed`` are tracked in the fixed frame."""
+        self._placed = placed
+        self._codes: dict[str, int] = {}
+        self._keys, self._first, self._poses = bytearray(), bytearray(), bytearray()
+
+    def add(self, frames: pa.Table, detections: pa.Table, count: int) -> None:
+        """Append a row group; ``count`` detections are in those before it."""
+        topics, codes = topic_codes(frames)
+        known = [self._codes.setdefault(topic, len(self._codes)) for topic in topics]
+        keys = _keys(np.array(known, np.int64)[codes], numbers(frames["frame"]))
+        starts = {key: count + rows.start for key, rows in frame_rows(detections).items()}
+        of_frames = zip(frames["topic"].to_pylist(), frames["frame"].to_pylist(), strict=True)
+        first = np.array([starts.get(key, -1) for key in of_frames], np.int64)
+        self._keys += keys.tobytes()
+        self._first += first.tobytes()
+        self._poses += _poses(
+            frames, np.isin(np.array(topics), list(self._placed))[codes]
+        ).tobytes()
+
+    @cached_property
+    def first(self) -> I4:
+        """Return (f,) the first detection of each frame, -1 if it has none."""
+        return np.frombuffer(self._first, np.int64)
+
+    @cached_property
+    def poses(self) -> F8:
+        """Return (f, 3, 4) ``fixed_from_sensor``: nothing moves where no fixed frame is used."""
+        return np.frombuffer(self._poses, np.float64).reshape(-1, 3, 4)
+
+    @cached_property
+    def _order(self) -> I4:
+        return np.argsort(np.frombuffer(self._keys, np.int64), kind="stable")
+
+    def find(self, topics: Sequence[str], frames: I4) -> I4:
+        """Return the positions of frames of the run."""
+        codes = np.fromiter(map(self._codes.__getitem__, topics), np.int64, len(topics))
+        keys = np.frombuffer(self._keys, np.int64)
+        found = np.searchsorted(keys, _keys(codes, frames), sorter=self._order)
+        return np.asarray(self._order[found])
+
+
+def _keys(codes: I4, frames: I4) -> I4:
+    return np.asarray((codes << 32) + frames)
+
+
+def _poses(frames: pa.Table, placed: I4) -> F8:
+    result = np.tile(np.eye(3, 4), (frames.num_rows, 1, 1))
+    known = pa.compute.is_valid(frames["fixed_rotation"]).to_numpy()
+    turns, places = (
+        numbers(frames[name].filter(pa.array(known)))
+        for name in ("fixed_rotation", "fixed_translation")
+    )
+    result[known, :, :3], result[known, :, 3] = turns.reshape(-1, 3, 3), places.reshape(-1, 3)
+    result[~placed] = np.eye(3, 4)
+    return result
