@@ -71,7 +71,7 @@ KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.runs.segments": ("test_tables", "test_tables_turned"),
     "shapecat.runs.track_table": ("test_labels", "test_label_transfer"),
     "shapecat.system": ("test_run_folder", "test_done"),
-    "shapecat.tracking": ("test_tracking", "test_tables_turned"),
+    "shapecat.tracking": ("test_tracking_worked", "test_tracking", "test_tables_turned"),
     "shapecat.tracking.full_boxes": ("test_completion", "test_tables_turned"),
 }  # fmt: skip
 """Test files by the beginning of a module's name; the longest that fits counts."""

@@ -1,0 +1,357 @@
+"""The steps of the tracking against worked examples and other libraries, no two numbers alike."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from shapecat.arrays import F8
+from shapecat.config import TrackingSettings
+from shapecat.tracking import tracker
+from shapecat.tracking.common_motion import CommonMotion, _fit, _in_space, _level
+from shapecat.tracking.hindsight import Fragments, _contradiction, _distances
+from shapecat.tracking.hits import Hits
+from shapecat.tracking.pieces import _changes, _joint
+from shapecat.tracking.pieces import _fit as fit_pieces
+from shapecat.tracking.recording import _line, _needed
+from shapecat.tracking.records import FrameDetections
+from shapecat.tracking.surplus import _in_box
+from shapecat.tracking.tracker import Tracker
+
+SETTINGS = TrackingSettings()
+SECOND = 1_000_000_000
+TURNED = Rotation.from_euler("zyx", [0.7, -0.4, 0.3]).as_matrix()
+
+
+def frame(k: int, centers: Any, **changes: Any) -> FrameDetections:
+    """Return detections 0.1 s after those before."""
+    places = np.reshape(np.asarray(centers, float), (-1, 3))
+    n = len(places)
+    found = FrameDetections(
+        *("/depth", k, k * SECOND // 10, np.arange(n), places),
+        np.broadcast_to((0.13, 0.09, 0.07), (n, 3)),
+        np.broadcast_to((0.8, 0.2), (n, 2)),
+        np.zeros(n),
+        np.full(n, 0.5),
+        np.broadcast_to(np.eye(3), (n, 3, 3)),
+    )
+    return replace(found, **changes)
+
+
+def two_tracks(**changes: Any) -> tracker._Active:
+    """Return two tracks, one that moves; the variances are no multiples of each other."""
+    found = tracker._Active(
+        ids=np.array([4, 9], np.int32),
+        position=np.array([[0.11, -0.42, 0.83], [0.34, -0.15, 0.79]]),
+        velocity=np.array([[0.21, -0.07, 0.05], [0.0, 0.0, 0.0]]),
+        variance=np.array([[4e-4, 3e-4, 9e-3], [1e-4, 0.0, 2e-2]]),
+        size=np.log([[0.14, 0.10, 0.08], [0.31, 0.12, 0.05]]),
+        posterior=np.array([[0.7, 0.3], [0.2, 0.8]]),
+        hits=np.array([5, 2]),
+        born_ns=np.array([0, 3 * SECOND]),
+        seen_ns=np.array([4 * SECOND, 4 * SECOND + 70_000_000]),
+        missed=np.array([0, 1]),
+    )
+    return replace(found, **changes)
+
+
+# ---- the tracker
+
+
+def test_the_prediction_is_the_exact_one_of_a_fading_velocity() -> None:
+    """Van Loan's matrix exponential integrates the same stochastic equation."""
+    elapsed, decay, speed = 0.37, 1 / tracker._SPEED_MEMORY_S, tracker._SPEED_M_S
+    drift = np.array([[0.0, 1.0], [0.0, -decay]])
+    noise = np.diag([0.0, 2 * decay * speed**2])
+    block = expm(np.block([[-drift, noise], [np.zeros((2, 2)), drift.T]]) * elapsed)
+    step, process = block[2:, 2:].T, block[2:, 2:].T @ block[:2, 2:]
+    before = two_tracks()
+    after = tracker._predict(before, elapsed)
+
+    for k, (pp, pv, vv) in enumerate(before.variance):
+        expected = step @ [[pp, pv], [pv, vv]] @ step.T + process
+        assert_allclose(after.variance[k], expected[np.triu_indices(2)], rtol=1e-9)
+    state = np.stack([before.position, before.velocity])
+    moved = np.einsum("ij,jkx->ikx", step, state)
+    assert_allclose([after.position, after.velocity], moved, rtol=1e-12)
+
+
+def test_the_correction_is_kalmans_and_the_means_run() -> None:
+    """Textbook form, with the noise of a view that is cut and of another size."""
+    tracks, before = two_tracks(), two_tracks()
+    found = tracker._seed(
+        np.array([[0.0, 0.0, 0.5], [0.13, -0.40, 0.86]]),
+        np.log([[0.5, 0.4, 0.3], [0.17, 0.09, 0.11]]),
+        np.array([[0.5, 0.5], [0.4, 0.6]]),
+    )
+    found.seen_ns[:] = 5 * SECOND
+    odd = np.abs(before.size[0] - found.size[1]).mean()
+    tracker._correct(tracks, found, np.array([[0, 1]]), np.array([False, True]))
+
+    pp, pv, vv = before.variance[0]
+    covariance = np.array([[pp, pv], [pv, vv]])
+    noise = tracker._NOISE_M**2 * (1 + 10 * odd + 3)
+    gain = covariance[:, 0] / (pp + noise)
+    surprise = found.position[1] - before.position[0]
+    left = covariance - np.outer(gain, covariance[0])
+    assert_allclose(tracks.position[0], before.position[0] + gain[0] * surprise)
+    assert_allclose(tracks.velocity[0], before.velocity[0] + gain[1] * surprise)
+    assert_allclose(tracks.variance[0], left[np.triu_indices(2)])
+    rate = 0.25 / 6  # of a view that is cut, the sixth of its track
+    size = before.size[0] + rate * (found.size[1] - before.size[0])
+    assert_allclose(tracks.size[0], size)
+    assert_allclose(tracks.posterior[0], [0.7 - rate * 0.3, 0.3 + rate * 0.3])
+    assert tracks.hits.tolist() == [6, 2]
+    assert tracks.missed.tolist() == [0, 2]
+    assert tracks.seen_ns.tolist() == [5 * SECOND, before.seen_ns[1]]
+    assert_allclose(tracks.position[1], before.position[1])
+
+
+def test_the_cost_of_a_pair_is_the_sum_of_what_speaks_against_it() -> None:
+    """Distance over the gate squared, sizes, posteriors, and that a track is young."""
+    found = tracker._seed(
+        np.array([[0.13, -0.40, 0.86], [0.34, -0.15, 0.60]]),
+        np.log([[0.21, 0.10, 0.05], [0.31, 0.12, 0.05]]),
+        np.array([[0.4, 0.6], [0.2, 0.8]]),
+    )
+    costs = tracker._costs(two_tracks(), found, 4 * SECOND + 100_000_000, SETTINGS)
+
+    gate = 0.03 + 0.5 * 0.14 + 0.3 * 0.1  # its width, and a tenth of a second unseen
+    away = np.sqrt(0.02**2 + 0.02**2 + 0.03**2)
+    sizes = (np.log(0.21 / 0.14) + np.log(0.08 / 0.05)) / 3
+    assert gate > SETTINGS.gate_m  # which is the most that a gate is
+    assert costs[0, 0] == pytest.approx((away / 0.12) ** 2 + 0.8 * sizes + 0.5 * 0.3)
+    assert np.isinf(costs[0, 1])
+    assert np.isinf(costs[1]).all()  # 0.19 m below, and on the other side
+    near = replace(SETTINGS, gate_m=0.3)
+    young = tracker._costs(two_tracks(), found, 4 * SECOND + 100_000_000, near)
+    reach = 0.03 + 0.5 * 0.31 + 0.3 * 0.03
+    assert young[1, 1] == pytest.approx(np.inf if reach < 0.19 else (0.19 / reach) ** 2 + 0.2)
+
+
+@pytest.mark.parametrize(
+    ("changes", "clock_s", "alive"),
+    [
+        # Proved, and there for 4 s: waited for so long. The other was there for 1.07 s.
+        ({"missed": np.array([9, 9])}, 5.0, [4, 9]),
+        ({"missed": np.array([9, 9])}, 5.2, [4]),
+        ({"missed": np.array([9, 9])}, 7.9, [4]),
+        ({"missed": np.array([9, 9])}, 8.1, []),
+        # A frame that comes late: missed once, or twice for one that has not proved itself.
+        ({"missed": np.array([0, 1])}, 60.0, [4, 9]),
+        ({"missed": np.array([1, 2])}, 60.0, []),
+        # Born just now: half a second.
+        ({"missed": np.array([9, 9]), "born_ns": np.array([4 * SECOND] * 2)}, 4.45, [4, 9]),
+        ({"missed": np.array([9, 9]), "born_ns": np.array([4 * SECOND] * 2)}, 4.53, [9]),
+    ],
+)
+def test_a_track_is_waited_for_as_long_as_it_was_there(
+    changes: dict[str, Any], clock_s: float, alive: list[int]
+) -> None:
+    following = Tracker(SETTINGS)
+    following._clock_ns = round(clock_s * 1e9)
+
+    assert following._survivors(two_tracks(**changes)).ids.tolist() == alive
+
+
+# ---- fragments
+
+
+def test_the_line_through_detections_is_the_one_of_ridge_regression() -> None:
+    """Least squares with a row that says: it stands still."""
+    rng = np.random.default_rng(3)
+    stamps = np.array([5.0, 5.1, 5.3, 5.32, 5.8])
+    centers = rng.normal(size=(5, 3))
+    for at in (0, -1):
+        t = stamps - stamps[at]
+        rows = np.column_stack([np.ones(5), t - t.mean()])
+        design = np.vstack([rows, [0.0, np.sqrt(0.1)]])
+        (mean, slope), *_ = np.linalg.lstsq(design, np.vstack([centers, np.zeros(3)]))
+        place, velocity = _line((stamps * 1e9).astype(np.int64), centers, at)
+        assert_allclose(velocity, slope, rtol=1e-6)
+        assert_allclose(place, mean - t.mean() * slope, rtol=1e-6)
+
+
+def test_a_track_needs_as_many_detections_as_frames_are_near() -> None:
+    """Within half a second, on both sides, and in the same scene."""
+    stamps = np.array([0.0, 0.3, 0.45, 0.9, 2.0, 2.4, 2.6])
+    frames = [frame(k, [], stamp_ns=round(s * 1e9)) for k, s in enumerate(stamps)]
+    scenes = np.array([0, 0, 0, 0, 1, 1, 1])
+
+    needed = [_needed(frames, scenes, row, 9) for row in range(len(frames))]
+
+    assert needed == [3, 3, 4, 2, 2, 3, 2]
+    assert _needed(frames, scenes, 2, 3) == 3
+    assert _needed(frames, scenes, 1, 2) == 2
+
+
+def fragments(**changes: Any) -> Fragments:
+    """Return a fragment and two later ones: one that moves on, one that rests."""
+    columns: dict[str, Any] = {
+        "first_ns": np.array([0, 3 * SECOND, 30 * SECOND]),
+        "last_ns": np.array([2 * SECOND, 9 * SECOND, 40 * SECOND]),
+        "start": np.array([[0.0, 0.0, 0.0], [0.50, 0.2, 0.1], [0.9, -0.3, 0.4]]),
+        "end": np.array([[0.4, 0.1, 0.1], [0.7, 0.3, 0.1], [0.9, -0.3, 0.5]]),
+        "start_velocity": np.array([[0.0, 0, 0], [0.12, 0.06, 0.02], [0, 0, 0]]),
+        "end_velocity": np.array([[0.1, 0.14, -0.04], [0, 0, 0], [0, 0, 0]]),
+        "sizes": np.full((3, 3), 0.1),
+        "whole": np.array([3, 9, 9]),
+        "rest": np.array([[0.8, -0.3, 0.4], [np.nan] * 3, [0.5, 0.1, 0.1]]),
+        "cut": np.zeros((3, 2), bool),
+        "posteriors": np.full((3, 2), 0.5),
+        "novelties": np.zeros(3),
+        "scenes": np.zeros(3, int),
+    }
+    return Fragments(*(columns | changes).values())
+
+
+def test_the_way_from_one_fragment_to_the_next_is_the_shortest_of_five() -> None:
+    """From its end or its rest to their start or rest, or halfway on along both motions."""
+    found = _distances(fragments(), 0, np.array([1, 2]), SETTINGS)
+
+    # Halfway through the second between them: (.45, .17, .08) and (.44, .17, .09).
+    assert found[0] == pytest.approx(np.hypot(0.01, 0.01))
+    assert found[1] == pytest.approx(0.1)  # its rest is as near to where the first one ended
+    still = fragments(rest=np.full((3, 3), np.nan))
+    far = _distances(still, 0, np.array([2]), SETTINGS)  # 28 s later a motion says nothing
+    assert far == pytest.approx(np.linalg.norm([0.5, -0.4, 0.3]))
+
+
+@pytest.mark.parametrize(
+    ("known", "others_known", "expected"),
+    [
+        (True, True, (0.4 + 0.3 + 0.1) / 3),
+        (True, False, 0.3 / 3),  # the other one may be larger than it was seen
+        (False, True, (0.4 + 0.1) / 3),
+        (False, False, 0.0),
+    ],
+)
+def test_what_is_not_known_whole_may_be_larger(
+    known: bool, others_known: bool, expected: float
+) -> None:
+    key, others = np.array([1.4, 1.0, 0.6]), np.array([[1.0, 1.3, 0.5]])
+    found = _contradiction(key, others, np.bool_(known), np.array([others_known]))
+    assert found == pytest.approx([expected])
+
+
+# ---- pieces
+
+
+def turned_hits() -> Hits:
+    """Return two detections in one frame whose boxes are turned otherwise."""
+    other = Rotation.from_euler("z", 0.5).as_matrix() @ TURNED
+    places = [[0.31, -0.12, 0.83], [0.42, -0.05, 0.79]]
+    sizes, axes = np.array([[0.12, 0.05, 0.2], [0.07, 0.16, 0.09]]), np.stack([TURNED, other])
+    return Hits.of([frame(0, places, sizes=sizes, axes=axes), frame(1, [])])
+
+
+def test_the_common_box_of_two_pieces_holds_the_corners_of_both() -> None:
+    """Along the axes of the first: longer side, shorter side, height."""
+    hits = turned_hits()
+    signs = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
+    assert hits.axes is not None
+    corners = [
+        hits.centers[k] + (signs * hits.sizes[k]) @ hits.axes[k].T for k in range(2)
+    ]  # of either box
+    for i, j in ((0, 1), (1, 0)):
+        lengths = np.ptp(np.concatenate(corners) @ hits.axes[i], axis=0)
+        expected = [*sorted(lengths[:2], reverse=True), lengths[2]]
+        assert_allclose(_joint(hits, hits.axes, np.array([[i, j]])), [expected], rtol=1e-6)
+
+
+def test_pieces_fit_into_a_whole_that_neither_of_them_fills() -> None:
+    hits = turned_hits()
+    assert hits.axes is not None
+    pair = np.array([[0, 1]])
+    both = np.minimum(_joint(hits, hits.axes, pair), _joint(hits, hits.axes, pair[:, ::-1]))[0]
+
+    def fits(whole: F8, other: F8) -> bool:
+        return bool(fit_pieces(hits, hits.axes, pair, np.array([[whole, other]]))[0])
+
+    none = np.zeros(3)
+    assert fits(both, none)
+    assert fits(none, both)
+    assert fits((both - 0.0099) / 1.1, none)
+    assert not fits((both - 0.0101) / 1.1, none)
+    assert not fits(both * [1, 1, 0.85], none)
+    # One of them is as long, as wide and as high as the whole: something lies in a bowl.
+    largest = np.array([0.16, 0.07, 0.2])
+    assert not fits(np.maximum(largest, 0), none)
+
+
+def test_one_track_ends_soon_after_the_other_began() -> None:
+    """Rows 0 to 9 and 8 to 19: two frames of ten. One within the other is no change."""
+    rows = [range(10), range(8, 20), range(3, 6)]
+    members: list[list[int]] = [[], [], []]
+    frames, at = [], 0
+    for k in range(20):
+        there = [m for m, own in enumerate(rows) if k in own]
+        frames.append(frame(k, [[0.1 * m, 0, 0] for m in there]))
+        for m in there:
+            members[m].append(at)
+            at += 1
+    duos = np.array([[0, 1], [0, 2]])
+    start, stop, share = _changes(Hits.of(frames), [np.array(m) for m in members], duos)
+
+    assert start.tolist() == [8, 3]
+    assert stop.tolist() == [9, 5]
+    assert share.tolist() == [0.2, np.inf]
+
+
+def test_a_place_is_in_a_box_along_the_axes_of_the_box() -> None:
+    hits = turned_hits()
+    assert hits.axes is not None
+    offsets = np.array([0.0599, -0.0249, 0.0999]) * [1, -1, -1]
+    inside = hits.centers[0] + hits.axes[0] @ offsets
+    outside = [hits.centers[0] + hits.axes[0] @ (offsets * k) for k in np.eye(3) * 0.01 + 1]
+
+    assert _in_box(hits, np.array([0]), inside[None]).tolist() == [True]
+    assert _in_box(hits, np.zeros(3, int), np.array(outside)).tolist() == [False] * 3
+
+
+# ---- the common motion
+
+
+def test_the_level_frame_stands_up_and_is_right_handed() -> None:
+    level = _level(np.stack([TURNED, Rotation.from_euler("x", 0.02).as_matrix() @ TURNED]))
+
+    assert_allclose(level @ level.T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(level) == pytest.approx(1)
+    assert level[2] @ TURNED[:, 2] > 0.999
+
+
+def test_a_turn_in_the_plane_is_one_about_up_in_space() -> None:
+    """It moves points as the plane says, and leaves their heights."""
+    level = _level(TURNED[None])
+    turn, shift = np.exp(1j * np.array([0.4, -1.1])), np.array([0.3 - 0.2j, 0.05 + 0.7j])
+    motion = _in_space(level, turn, shift)
+    points = np.random.default_rng(5).normal(size=(7, 3))
+    for k in range(2):
+        flat = points @ level.T
+        moved = turn[k] * (flat[:, 0] + 1j * flat[:, 1]) + shift[k]
+        expected = np.column_stack([moved.real, moved.imag, flat[:, 2]]) @ level
+        still = points @ motion.rotations[k].T + motion.translations[k]
+        assert_allclose(still, expected, atol=1e-12)
+        assert_allclose(motion.moved(np.full(7, k), still), points, atol=1e-12)
+        alone = CommonMotion(motion.rotations[k : k + 1], motion.translations[k : k + 1])
+        (back,) = alone.still([frame(0, points)])
+        assert_allclose(back.centers, expected, atol=1e-12)
+        assert_allclose(back.axes, np.broadcast_to(motion.rotations[k], (7, 3, 3)))
+
+
+def test_turn_and_shift_of_each_frame_are_found_alone() -> None:
+    """A frame with a single point keeps what it had; a point that weighs nothing says nothing."""
+    turn, shift = np.exp(0.6j), 0.2 - 0.5j
+    seen = np.array([0.1 + 0.2j, -0.3 + 0.1j, 0.4 - 0.6j, 2.0 + 1.0j, 0.7 + 0.7j])
+    still = turn * seen + shift
+    still[3] += 5  # an outlier
+    rows, weights = np.array([0, 0, 0, 0, 1]), np.array([1.0, 0.5, 2.0, 0.0, 1.0])
+    kept = np.exp(1j * np.array([0.1, 0.2])), np.array([0.01j, 0.02])
+    found_turn, found_shift = _fit(seen, still, rows, weights, *kept)
+
+    assert_allclose(found_turn, [turn, kept[0][1]])
+    assert_allclose(found_shift, [shift, kept[1][1]], atol=1e-12)
