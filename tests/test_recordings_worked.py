@@ -1,0 +1,527 @@
+"""Choices, clocks, cuts and windows of recordings, each at its very limit."""
+
+import struct
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from numpy.testing import assert_allclose
+from rosbags.rosbag1 import Reader as BagReader
+from rosbags.rosbag1 import Writer as BagWriter
+from rosbags.typesys import Stores, get_typestore
+from scipy.spatial.transform import Rotation, Slerp
+
+from shapecat.cameras.colour import ColourImage
+from shapecat.recordings import choose_streams, open_recording, time_order
+from shapecat.recordings.colour_image import cloud_colours, compressed_size, pixels_of
+from shapecat.recordings.colour_streams import choose_colour
+from shapecat.recordings.extrinsics import Extrinsics
+from shapecat.recordings.imu import Accelerometer
+from shapecat.recordings.mcap_records import Opcode, TruncatedError, walk
+from shapecat.recordings.messages import MessageError
+from shapecat.recordings.overview import describe_recording
+from shapecat.recordings.pinhole import PinholeFit, still_fits
+from shapecat.recordings.ros1_records import BagError, split
+from shapecat.recordings.stamps import Clock
+from shapecat.recordings.streams import info_topic_of
+from shapecat.recordings.time_order import Timed, in_time_order
+from shapecat.recordings.transforms import TransformBuffer, _slerp
+from shapecat.types import Camera
+from tests.colour_messages import gradient, jpeg, packed, png, raw
+from tests.messages import EPOCH, SECOND, cloud, image, info, make, organized_points, wavy_depth
+from tests.messages import write as record
+from tests.test_recordings_colour import MS, WIDE, depth_items, in_order, read, static
+from tests.test_recordings_frames import read as read_depth
+
+OTHER = Camera(80, 60, 69.5, 73.5, 39.1, 30.3)
+
+
+# ---- which of several colour cameras
+
+
+def colour(topic: str, frame_id: str = "far", count: int = 1) -> list[tuple[str, int, Any]]:
+    """Return images of a topic, compressed if its name says so."""
+    stamps = [EPOCH + k * MS for k in range(count)]
+    if topic.endswith("compressed"):
+        return [(topic, s, packed(s, jpeg(gradient()), frame_id=frame_id)) for s in stamps]
+    return [(topic, s, raw(s, gradient(), "rgb8", frame_id)) for s in stamps]
+
+
+@pytest.mark.parametrize(
+    ("better", "worse"),
+    [
+        # In the frame of the depth camera, though the other one shares more of the name.
+        (colour("/z/view", "camera"), colour("/cam/depth/color/compressed", count=2)),
+        # Shares two parts of the name, not one.
+        (colour("/cam/depth/view/image"), colour("/cam/color/x/compressed", count=2)),
+        # Named after colour.
+        (colour("/cam/zcolour/image"), colour("/cam/aview/x/compressed", count=2)),
+        # More messages.
+        (colour("/cam/zrgb/image", count=2), colour("/cam/acolor/x/compressed")),
+        # Compressed.
+        (colour("/cam/zcolor/x/compressed"), colour("/cam/acolor/image")),
+        # By name.
+        (colour("/cam/acolor/image"), colour("/cam/bcolor/image")),
+    ],
+)
+def test_each_reason_for_a_colour_camera_outweighs_all_later_ones(
+    tmp_path: Path, better: Any, worse: Any
+) -> None:
+    path = record(tmp_path / "a.mcap", in_order([*depth_items(EPOCH), *worse, *better]))
+    with open_recording(path) as recording:
+        (stream,) = choose_streams(recording)
+        chosen = choose_colour(recording, stream)
+
+    assert chosen is not None
+    assert chosen.topic == better[0][0]
+
+
+def test_of_several_strange_cameras_none_belongs_to_the_depth_camera(tmp_path: Path) -> None:
+    """The only one does; two of other names and frames do not."""
+    path = record(tmp_path / "a.mcap", in_order([*depth_items(EPOCH), *colour("/one/image")]))
+    both = in_order([*depth_items(EPOCH), *colour("/one/image"), *colour("/two/image")])
+    for file, wanted in ((path, "/one/image"), (record(tmp_path / "b.mcap", both), None)):
+        with open_recording(file) as recording:
+            (stream,) = choose_streams(recording)
+            chosen = choose_colour(recording, stream)
+        assert (None if chosen is None else chosen.topic) == wanted
+
+
+def test_a_colour_camera_that_is_calibrated_anew_has_another_lens(tmp_path: Path) -> None:
+    """Each image is seen through the last calibration before it; a repeated one changes nothing."""
+    items = [*depth_items(EPOCH, EPOCH + 100 * MS, EPOCH + 200 * MS)]
+    items.append(("/tf_static", EPOCH, static("camera", "color", (0.05, 0, 0), (0, 0, 0, 1))))
+    for k, camera in enumerate((WIDE, WIDE, OTHER)):
+        stamp = EPOCH + 100 * k * MS
+        items.append(("/cam/color/camera_info", stamp, info(stamp, camera)))
+        items.append(("/cam/color/image_raw", stamp, raw(stamp, gradient(60, 80), "rgb8", "color")))
+    pairs, _ = read(record(tmp_path / "a.mcap", in_order(items)))
+
+    lenses = [view and view.lens and view.lens.pinhole for _, view in pairs]
+    assert lenses == [WIDE, WIDE, OTHER]
+
+
+DEPTH = Camera(64, 48, 60.0, 61.0, 31.2, 23.7)
+
+
+@pytest.mark.parametrize(
+    ("camera", "frame_id", "registered"),
+    [
+        # One frame: nearly the same calibration is the same camera.
+        (Camera(64, 48, 60.6, 61.0, 31.2, 23.7), "camera", True),
+        (Camera(64, 48, 60.0, 61.0, 31.2, 24.4), "camera", False),
+        # Another frame without a transform: only the very same numbers are one camera.
+        (DEPTH, "color", True),
+        (Camera(64, 48, 60.001, 61.0, 31.2, 23.7), "color", None),
+    ],
+)
+def test_pixels_are_taken_for_those_of_the_depth_image_if_the_cameras_are_one(
+    tmp_path: Path, camera: Camera, frame_id: str, registered: bool | None
+) -> None:
+    """None stands for no colour at all."""
+    items = depth_items(EPOCH)
+    items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, camera)))
+    items.append(("/cam/color/image_raw", EPOCH + 1, raw(EPOCH, gradient(), "rgb8", frame_id)))
+    ((_, view),), _ = read(record(tmp_path / "a.mcap", in_order(items)))
+
+    assert (None if view is None else view.registered) == registered
+    if view is not None:
+        assert view.lens is not None
+        assert view.lens.pinhole == camera
+
+
+def test_an_image_of_another_size_than_its_calibration_is_no_colour(tmp_path: Path) -> None:
+    items = depth_items(EPOCH)
+    items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)))
+    items.append(("/cam/color/image_raw", EPOCH, raw(EPOCH, gradient(61, 80), "rgb8")))
+    ((_, view),), warnings = read(record(tmp_path / "a.mcap", in_order(items)))
+
+    assert view is None
+    assert any("image of 80 x 61 pixels with camera info for 80 x 60" in w for w in warnings)
+
+
+@pytest.mark.parametrize(("gap_ms", "found"), [(49, True), (51, False)])
+def test_a_single_image_serves_frames_within_a_twentieth_of_a_second(
+    tmp_path: Path, gap_ms: int, found: bool
+) -> None:
+    items = [*depth_items(EPOCH + gap_ms * MS), *colour("/cam/color/image", "camera")]
+    ((_, view),), _ = read(record(tmp_path / "a.mcap", in_order(items)))
+
+    assert (view is not None) == found
+
+
+def test_the_recorder_of_librealsense_tells_where_its_streams_are(tmp_path: Path) -> None:
+    """Each stream has its own transform from the reference; both have to be used."""
+    turns = {"Depth_0": (0.02, 0.3, -0.1, 0.94), "Color_0": (-0.1, 0.05, 0.2, 0.97)}
+    moves = {"Depth_0": (0.01, -0.02, 0.03), "Color_0": (0.05, 0.07, -0.04)}
+    items: list[tuple[str, int, Any]] = []
+    for name, data in (("Depth_0", wavy_depth()), ("Color_0", gradient())):
+        sensor = f"/device_0/sensor_{int(name == 'Color_0')}/{name}"
+        move = make("geometry_msgs/msg/Vector3", *moves[name])
+        turn = make("geometry_msgs/msg/Quaternion", *turns[name])
+        items.append((f"{sensor}/tf/0", 0, make("geometry_msgs/msg/Transform", move, turn)))
+        items.append((f"{sensor}/info/camera_info", 1, info(EPOCH)))
+        message = image(EPOCH, data, "mono16") if name == "Depth_0" else raw(EPOCH, data, "rgb8")
+        items.append((f"{sensor}/image/data", 2, message))
+    path = record(tmp_path / "a.mcap", in_order(items))
+    with open_recording(path) as recording:
+        (stream,) = choose_streams(recording)
+        found = choose_colour(recording, stream)
+        assert found is not None
+        pose = Extrinsics(recording, stream, found).colour_from_depth("0", "0", EPOCH)
+
+    depth, seen = (Rotation.from_quat(turns[name]) for name in ("Depth_0", "Color_0"))
+    assert pose is not None
+    point = np.array([0.3, -0.2, 0.9])  # in the reference
+    in_depth = depth.apply(point) + moves["Depth_0"]
+    in_colour = seen.apply(point) + moves["Color_0"]
+    assert_allclose(pose.rotation @ in_depth + pose.translation, in_colour, atol=1e-12)
+
+
+# ---- calibrations of depth images
+
+
+def test_a_calibration_that_comes_too_late_serves_only_where_there_is_no_other(
+    tmp_path: Path,
+) -> None:
+    """The image waits for it: it has it if it is the first, and the one before it otherwise."""
+    depth = wavy_depth()
+    late = Camera(64, 48, 99.0, 98.0, 30.0, 20.0)
+    first = [("/d/image", 0, image(EPOCH, depth)), ("/d/camera_info", 1, info(EPOCH + 9, late))]
+    later = [
+        ("/d/camera_info", 0, info(EPOCH)),
+        ("/d/image", 1, image(EPOCH + 5, depth)),
+        ("/d/camera_info", 2, info(EPOCH + 9, late)),
+        ("/d/image", 3, image(EPOCH + 20, depth)),
+    ]
+    (only,), _, _ = read_depth(record(tmp_path / "a.mcap", first))
+    (before, after), _, _ = read_depth(record(tmp_path / "b.mcap", later))
+
+    assert only.camera == late
+    assert before.camera == DEPTH
+    assert after.camera == late
+
+
+@pytest.mark.parametrize(
+    ("image_topic", "expected"),
+    [
+        ("/cam/depth/image_raw", "/cam/depth/camera_info"),
+        ("/cam/depth/image/compressedDepth", "/cam/depth/camera_info"),
+        ("/cam/infra/image_raw", "/cam/camera_info"),
+        ("/device_0/sensor_0/Depth_0/image/data", "/device_0/sensor_0/Depth_0/info/camera_info"),
+        ("/other/image", None),  # several: none is near
+    ],
+)
+def test_the_calibration_that_shares_most_of_the_path_is_taken(
+    image_topic: str, expected: str | None
+) -> None:
+    infos = ["/cam/camera_info", "/cam/depth/camera_info", "/cam/color/camera_info",
+             "/device_0/sensor_0/Depth_0/info/camera_info"]  # fmt: skip
+    assert info_topic_of(image_topic, infos) == expected
+    assert info_topic_of(image_topic, ["/far/camera_info"]) == "/far/camera_info"
+
+
+def test_a_camera_still_fits_points_as_exact_as_those_it_was_fitted_to() -> None:
+    points = organized_points(wavy_depth())
+    assert still_fits(PinholeFit(DEPTH, 0.0), points)
+    for shift, error_px, fits in ((0.1, 0.0, False), (0.1, 0.05, True), (0.7, 9.0, False)):
+        moved = Camera(64, 48, 60.0, 61.0, 31.2 + shift, 23.7)
+        assert still_fits(PinholeFit(moved, error_px), points) == fits
+    few = np.full_like(points, np.nan)
+    assert still_fits(PinholeFit(DEPTH, 0.0), few)
+    assert not still_fits(PinholeFit(DEPTH, 0.0), few[:, :60])
+    assert not still_fits(PinholeFit(DEPTH, 0.0), few[:40])
+
+
+# ---- pixels
+
+
+def test_the_size_of_a_jpeg_is_found_behind_filling_and_segments() -> None:
+    """Markers of a restart have no length, 0xFF fills; the size stands in any frame header."""
+    begin, app = b"\xff\xd8", b"\xff\xe1\x00\x06abcd"
+    tables = b"\xff\xc4\x00\x05xyz"  # no frame, though it is among their numbers
+    for marker in (0xC0, 0xC2, 0xCF):
+        frame = bytes([0xFF, marker]) + struct.pack(">HBHHB", 8, 8, 123, 457, 3)
+        body = begin + app + b"\xff\x01\xff\xd0\xff\xff" + tables + frame + b"\xff\xd9"
+        assert compressed_size(body) == ("jpeg", 457, 123)
+    with pytest.raises(MessageError, match="without a size"):
+        compressed_size(begin + app + tables + b"\xff\xd9")
+    with pytest.raises(MessageError, match="without a size"):
+        compressed_size(begin + app + b"\x00" + frame + b"\xff\xd9")
+    huge = bytes([0xFF, 0xC0]) + struct.pack(">HBHHB", 8, 8, 65535, 65535, 3)
+    with pytest.raises(MessageError, match="65535 x 65535"):
+        compressed_size(begin + huge + b"\xff\xd9")
+
+
+def test_the_end_of_a_compressed_file_is_looked_for_at_its_end() -> None:
+    """Padding behind the end is no damage; an end far before it is one of a preview."""
+    for body in (jpeg(gradient()), png(gradient())):
+        assert compressed_size(body + bytes(4000))[1:] == (64, 48)
+        with pytest.raises(MessageError, match="cut off"):
+            compressed_size(body + bytes(5000))
+    with pytest.raises(MessageError, match="cut off"):
+        compressed_size(png(gradient())[:23])
+
+
+def test_odd_rows_and_columns_have_no_colour() -> None:
+    """Two by two pixels share a colour: what is left over stays black, and nothing moves."""
+    mosaic = np.full((5, 7), 90, np.uint8)
+    found = pixels_of(ColourImage("", 0, 0, "", "bayer_rggb8", 7, 5, 7, mosaic.tobytes()))
+    assert (found[:4, :6] == 90).all()
+    assert not found[4:].any()
+    assert not found[:, 6:].any()
+    rows = np.tile(np.array([128, 77], np.uint8), (2, 3))
+    found = pixels_of(ColourImage("", 0, 0, "", "uyvy", 3, 2, 6, rows.tobytes()))
+    assert (found[:, :2] == 77).all()
+    assert not found[:, 2:].any()
+
+
+def test_raw_pixels_may_end_with_the_last_pixel_and_not_before() -> None:
+    """Rows are padded, the last one need not be."""
+    data = np.arange(60, dtype=np.uint8).tobytes()
+    for step, size in ((8, 8 * 2 + 6), (6, 18), (0, 18)):
+        found = ColourImage("", 0, 0, "", "bgr8", 2, 3, step, data[:size])
+        first = (step or 6) * 2 + 3
+        assert pixels_of(found)[2, 1].tolist() == [first + 2, first + 1, first]
+        with pytest.raises(MessageError, match=f"needs {size} bytes and has {size - 1}"):
+            pixels_of(ColourImage("", 0, 0, "", "bgr8", 2, 3, step, data[: size - 1]))
+    with pytest.raises(MessageError, match="needs"):
+        pixels_of(ColourImage("", 0, 0, "", "bgr8", 2, 3, 5, data))
+
+
+def test_packed_colours_may_end_with_the_last_point_and_not_before() -> None:
+    points = np.zeros((3, 2, 3), np.float32)
+    field = [make("sensor_msgs/msg/PointField", "rgba", 5, 6, 1)]
+    data = np.arange(80, dtype=np.uint8)
+    for row, big in ((20, False), (24, True)):
+        need = 2 * row + 10 + 9
+        layout = {"fields": field, "point_step": 10, "row_step": row, "is_bigendian": big}
+        at = 2 * row + 10 + 5
+        expected = [at + 1, at + 2, at + 3] if big else [at + 2, at + 1, at]
+        found = cloud_colours(cloud(EPOCH, points, data=data[:need], **layout))
+        assert found is not None
+        assert found[2, 1].tolist() == expected
+        with pytest.raises(MessageError, match="do not fit"):
+            cloud_colours(cloud(EPOCH, points, data=data[: need - 1], **layout))
+    for change in ({"point_step": 8}, {"row_step": 19}):
+        with pytest.raises(MessageError, match="do not fit"):
+            cloud_colours(cloud(EPOCH, points, data=data, **({**layout, "row_step": 20} | change)))
+
+
+# ---- time
+
+
+def test_clocks_are_counted_for_what_is_wrong_with_them() -> None:
+    year2000 = 946_684_800 * SECOND
+    clock = Clock("/t")
+    jump = 10 * SECOND
+    readings = [
+        (EPOCH, EPOCH + 5),
+        (EPOCH + 1, EPOCH + 6 + jump),  # the delay changes by just ten seconds
+        (EPOCH + 2, EPOCH + 8 + 2 * jump),  # and by one nanosecond more
+        (EPOCH + 2, EPOCH + 8 + 2 * jump),  # twice the same time is not backwards
+        (EPOCH + 1, EPOCH + 7 + 2 * jump),  # backwards
+        (0, 77),  # none
+        (year2000 - 1, year2000),
+        (year2000 - 2, year2000 - 1),  # neither clock knows the year
+    ]
+    found = [clock.check(stamp, log_time) for stamp, log_time in readings]
+
+    assert found == [stamp or 77 for stamp, _ in readings]
+    assert clock.counts == {"zero": 1, "epoch": 1, "back": 3, "jump": 2}
+
+
+def test_overlapping_chunks_are_merged_in_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ties in the order of the file; a chunk is opened when it is due and there is room."""
+    chunks = {0: [10, 30, 50], 1: [20, 30, 40], 2: [50, 60], 3: [15, 70]}
+    opened: list[int] = []
+
+    def open_chunk(number: int) -> Any:
+        opened.append(number)
+        return iter([(Timed(t, 100), (t, number)) for t in chunks[number]])
+
+    def merged() -> list[tuple[int, int]]:
+        opened.clear()
+        due = [(times[0], 7 * number, number) for number, times in chunks.items()]
+        return list(in_time_order(due, open_chunk))
+
+    everything = sorted((t, n) for n, times in chunks.items() for t in times)
+    assert merged() == everything
+    assert opened == [0, 3, 1, 2]
+    monkeypatch.setattr(time_order, "_PENDING", 100)  # bytes: the next chunk waits for room
+    assert [n for _, n in merged()] == [0, 0, 0, 3, 3, 1, 1, 1, 2, 2]
+
+
+def test_rotations_are_interpolated_as_scipy_does() -> None:
+    rng = np.random.default_rng(8)
+    for spread in (1.0, 0.02, 1e-4):
+        a = rng.normal(size=4)
+        b = a + spread * rng.normal(size=4)
+        a, b = a / np.linalg.norm(a), -b / np.linalg.norm(b)
+        for share in (0.13, 0.77):
+            expected = Slerp([0, 1], Rotation.from_quat([a, b]))([share])
+            found = Rotation.from_quat(_slerp(a, b, share))
+            assert (found.inv() * expected).magnitude()[0] < 1e-7
+
+
+def test_a_transform_is_held_for_the_tolerance_and_no_longer() -> None:
+    """Of equal samples the middle one is left out, which must not change an answer."""
+    buffer = TransformBuffer(tolerance_ns=10)
+    for stamp, x in ((100, 1.0), (200, 2.0), (300, 2.0), (400, 2.0), (500, 5.0)):
+        assert buffer.add("map", "cup", stamp, ((x, 0, 0), (0, 0, 0, 1)), static=False)
+    places = {90: 1.0, 100: 1.0, 130: 1.3, 250: 2.0, 400: 2.0, 440: 3.2, 500: 5.0, 510: 5.0}
+    for stamp, x in places.items():
+        assert buffer.lookup("map", "cup", stamp).translation[0] == pytest.approx(x)
+    for stamp, said in ((89, "before the first"), (511, "after the last")):
+        with pytest.raises(Exception, match=said):
+            buffer.lookup("map", "cup", stamp)
+
+
+def test_accelerations_are_averaged_over_half_a_second_on_each_side() -> None:
+    bin_ns = 50_000_000
+    sensor = Accelerometer("/imu", "imu")
+    for number, value in ((20, (3.0, 0, 0)), (30, (0, 4.0, 0)), (41, (0, 0, 9.0))):
+        sensor.add(number * bin_ns + 7, np.array(value))
+
+    def up(number: int) -> list[float] | None:
+        found = sensor.up(number * bin_ns + 49)
+        return None if found is None else [round(float(x), 3) for x in found]
+
+    assert up(9) is None
+    assert up(10) == [1, 0, 0]
+    assert up(20) == [0.6, 0.8, 0]
+    assert up(30) == [0.6, 0.8, 0]
+    assert up(31) == pytest.approx([0, 0.406, 0.914])
+    assert up(41) == [0, 0, 1]
+    assert up(52) is None
+
+
+# ---- records and windows
+
+
+def test_a_record_may_end_with_its_chunk_and_not_behind_it() -> None:
+    """Of a ROS 1 bag: header and data, each after its length."""
+    header = struct.pack("<I", 4) + b"op=\x02"
+
+    def entry(data: bytes) -> bytes:
+        return struct.pack("<I", len(header)) + header + struct.pack("<I", len(data)) + data
+
+    first, second = entry(b"hello"), entry(b"world of bags")
+    found = [(fields["op"], bytes(data)) for fields, data in split(memoryview(first + second))]
+    assert found == [(b"\x02", b"hello"), (b"\x02", b"world of bags")]
+    for cut in range(1, len(second)):
+        with pytest.raises(BagError):
+            list(split(memoryview((first + second)[:-cut])))
+
+
+def test_an_mcap_record_may_end_with_the_file_and_not_behind_it(tmp_path: Path) -> None:
+    content = struct.pack("<BQ", Opcode.HEADER, 5) + b"hello"
+    more = struct.pack("<BQ", Opcode.METADATA, 3) + b"abc"
+    path = tmp_path / "records"
+    path.write_bytes(b"12" + content + more)
+    with path.open("rb") as file:
+        end = 2 + len(content + more)
+        assert list(walk(file, 2, end)) == [
+            (Opcode.HEADER, 11, 5, True),
+            (Opcode.METADATA, 2 + 14 + 9, 3, True),
+        ]
+        with pytest.raises(TruncatedError, match="byte 16") as cut:
+            list(walk(file, 2, end - 1))
+        assert cut.value.record == (Opcode.METADATA, 25, 2, False)
+
+
+TIMES = (5, 9, 9, 12, 30, 31, 31, 40, 52, 53, 53, 60)
+TEXTS = {"/a": 0, "/b": 1}
+
+
+def mcap_of(path: Path) -> Path:
+    """Write two messages a chunk, in an order that is not that of time."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1, compression=CompressionType.NONE)
+        writer.start("ros2", "test")
+        schema = writer.register_schema("std_msgs/msg/String", "ros2msg", b"string data")
+        channels = [writer.register_channel(topic, "cdr", schema) for topic in TEXTS]
+        for k, time in enumerate([*TIMES[6:], *TIMES[:6]]):
+            writer.add_message(channels[k % 2], time, b"\0\1\0\0" + bytes([k]), time)
+        writer.finish()
+    return path
+
+
+def bag_of(path: Path) -> Path:
+    store = get_typestore(Stores.ROS1_NOETIC)
+    writer = BagWriter(path)
+    writer.chunk_threshold = 1
+    with writer as bag:
+        kind = "std_msgs/msg/UInt8"
+        links = [bag.add_connection(topic, kind, typestore=store) for topic in TEXTS]
+        for k, time in enumerate([*TIMES[6:], *TIMES[:6]]):
+            message = store.types[kind](k)
+            bag.write(links[k % 2], time, store.serialize_ros1(message, kind))
+    return path
+
+
+@pytest.mark.parametrize("container", ["mcap", "bag"])
+def test_every_window_gives_the_messages_of_its_times(tmp_path: Path, container: str) -> None:
+    """As the format's own library reads them; a window has its start and not its stop."""
+    if container == "mcap":
+        path = mcap_of(tmp_path / "a.mcap")
+        with path.open("rb") as file:
+            read_all = list(make_reader(file).iter_messages())
+        known = [(c.topic, m.log_time, bytes(m.data)) for _, c, m in read_all]
+    else:
+        path = bag_of(tmp_path / "a.bag")
+        with BagReader(path) as bag:
+            known = [(c.topic, time, bytes(data)) for c, time, data in bag.messages()]
+    limits = [None, *sorted({t + d for t in TIMES for d in (-1, 0, 1)})]
+    with open_recording(path) as recording:
+        assert (recording.start_ns, recording.end_ns) == (5, 60)
+        assert [(t.name, t.count) for t in recording.topics] == [("/a", 6), ("/b", 6)]
+        assert not recording.warnings
+        for topics in (None, ["/a"], ["/b"]):
+            for start in limits:
+                for stop in limits:
+                    found = recording.messages(topics, start, stop)
+                    expected = Counter(
+                        (topic, time, data)
+                        for topic, time, data in known
+                        if (topics is None or topic in topics)
+                        and (start is None or time >= start)
+                        and (stop is None or time < stop)
+                    )
+                    got = [(m.topic, m.log_time_ns, bytes(m.data)) for m in found]
+                    assert Counter(got) == expected
+                    assert [time for _, time, _ in got] == sorted(time for _, time, _ in got)
+
+
+def test_a_recording_is_described_whole(tmp_path: Path) -> None:
+    """What `shapecat info` says: times, sizes, and the use of each topic."""
+    items = depth_items(EPOCH, EPOCH + 250 * MS)
+    items.append(("/cam/color/camera_info", EPOCH, info(EPOCH, WIDE)))
+    items.append(("/cam/color/image_raw", EPOCH, raw(EPOCH, gradient(60, 80), "rgb8", "color")))
+    items.append(("/tf_static", EPOCH, static("camera", "color", (0.05, 0, 0), (0, 0, 0, 1))))
+    path = record(tmp_path / "a.mcap", in_order(items))
+    points = organized_points(wavy_depth())
+    told = describe_recording(path)
+
+    uses = {topic["name"]: (topic["use"], topic["count"]) for topic in told.pop("topics")}
+    assert uses == {
+        "/cam/color/camera_info": ("camera", 1),
+        "/cam/color/image_raw": ("colour of /cam/depth/image_raw", 1),
+        "/cam/depth/camera_info": ("camera", 2),
+        "/cam/depth/image_raw": ("depth stream", 2),
+        "/tf_static": ("", 1),
+    }
+    assert told == {
+        "path": str(path),
+        "kind": "mcap",
+        "bytes": path.stat().st_size,
+        "start_ns": EPOCH,
+        "seconds": 0.25,
+        "warnings": [],
+    }
+    alone = record(tmp_path / "b.mcap", [("/points", 1, cloud(EPOCH, points))])
+    assert describe_recording(alone)["topics"][0]["use"] == "points stream"
