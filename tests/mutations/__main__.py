@@ -38,17 +38,20 @@ KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.cameras": ("test_cameras", "test_colour", "test_recordings_colour"),
     "shapecat.colour": ("test_colour", "test_colour_outputs", "test_exports_images"),
     "shapecat.executors": ("test_executors",),
-    "shapecat.outputs": ("test_annotations_turned", "test_annotated_mcap", "test_exports_worked"),
+    "shapecat.outputs": ("test_outputs_worked", "test_annotations_turned",
+                         "test_annotated_mcap", "test_exports_worked"),
     "shapecat.outputs.colouring": ("test_colour_outputs", "test_exports_images"),
-    "shapecat.outputs.dataset_frames": ("test_exports_worked", "test_exports_images",
-                                        "test_exports_readback"),
-    "shapecat.outputs.exports": ("test_exports_worked", "test_exports", "test_exports_images"),
-    "shapecat.outputs.image_annotations": ("test_annotations_turned", "test_colour_outputs"),
+    "shapecat.outputs.dataset_frames": ("test_outputs_worked", "test_exports_worked",
+                                        "test_exports_images", "test_exports_readback"),
+    "shapecat.outputs.exports": ("test_outputs_worked", "test_exports_worked", "test_exports",
+                                 "test_exports_images"),
+    "shapecat.outputs.image_annotations": ("test_outputs_worked", "test_annotations_turned",
+                                           "test_colour_outputs"),
     "shapecat.outputs.opened_run": ("test_api",),
     "shapecat.outputs.report": ("test_report", "test_report_serve"),
     "shapecat.outputs.rereading": ("test_tables_truth", "test_exports"),
     "shapecat.outputs.review": ("test_review",),
-    "shapecat.outputs.wording": ("test_report",),
+    "shapecat.outputs.wording": ("test_outputs_worked",),
     "shapecat.recordings": ("test_recordings_worked", "test_recordings_frames", "test_cameras",
                             "test_recordings", "test_recordings_colour"),
     "shapecat.recordings.colour": ("test_recordings_worked", "test_recordings_colour",
@@ -63,7 +66,7 @@ KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.recordings.transforms": ("test_recordings_worked", "test_transforms",
                                        "test_cameras"),
     "shapecat.runs": ("test_tables_turned", "test_tables", "test_done", "test_labels"),
-    "shapecat.runs.corrections": ("test_labels", "test_label_transfer"),
+    "shapecat.runs.corrections": ("test_outputs_worked", "test_labels", "test_label_transfer"),
     "shapecat.runs.folder": ("test_run_folder", "test_done"),
     "shapecat.runs.full_boxes": ("test_tables_turned", "test_completion"),
     "shapecat.runs.label_transfer": ("test_label_transfer",),
@@ -119,15 +122,16 @@ def _rank(seed: int, mutant: Mutant) -> bytes:
     return hashlib.sha256(f"{seed} {mutant.module} {mutant.flip.place}".encode()).digest()
 
 
-def tests_of(module: str) -> list[Path]:
-    """Return the test files that judge a module."""
-    fitting = max((name for name in KNOWN_BY if module.startswith(name)), key=len)
-    return [ROOT / "tests" / f"{name}.py" for name in KNOWN_BY[fitting]]
+def tests_of(mutant: Mutant) -> list[Path]:
+    """Return the test files that judge a mutant: also the examples in its module."""
+    fitting = max((name for name in KNOWN_BY if mutant.module.startswith(name)), key=len)
+    files = [ROOT / "tests" / f"{name}.py" for name in KNOWN_BY[fitting]]
+    return [mutant.file, *files] if "\n    >>> " in mutant.file.read_text("utf-8") else files
 
 
 def judge(mutant: Mutant, reached: Mapping[Path, Reached | None]) -> tuple[Mutant, str]:
     """Run the tests that reach a mutant, then the others of their files; tell what became of it."""
-    known = {file: reached[file] for file in tests_of(mutant.module)}
+    known = {file: reached[file] for file in tests_of(mutant)}
     found = {file: result for file, result in known.items() if result and result.by(mutant)}
     if not found:
         return mutant, "not judged" if None in known.values() else "survived"
@@ -148,7 +152,7 @@ def main() -> int:
     for name in LIBRARIES:
         importlib.import_module(name)
     mutants = sample(options.seed, options.count, options.only)
-    files = sorted({file for mutant in mutants for file in tests_of(mutant.module)})
+    files = sorted({file for mutant in mutants for file in tests_of(mutant)})
     counts: Counter[str] = Counter()
     with ProcessPoolExecutor(options.jobs, multiprocessing.get_context("fork")) as pool:
         reached = _traced(files, pool)

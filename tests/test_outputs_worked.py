@@ -1,0 +1,341 @@
+"""What leaves a run, on examples worked out by hand: no two numbers are alike."""
+
+import csv
+import io
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose
+from PIL import Image
+from scipy.spatial.transform import Rotation
+
+from shapecat.detection.scene_graph import Node
+from shapecat.errors import OutputError
+from shapecat.outputs.annotated_mcap import _annotations
+from shapecat.outputs.colours import colour_of
+from shapecat.outputs.dataset_frames import Selection, _chosen, _different, _view, split_runs
+from shapecat.outputs.exports import _made_by_export, _require_own, _thinned
+from shapecat.outputs.exports_files import support_offset, upright_cloud
+from shapecat.outputs.exports_points import write_point_labels
+from shapecat.outputs.image_annotations import ImageBox
+from shapecat.outputs.scene_tree import _candidate, _described
+from shapecat.runs.corrections import TrackLabel, _slips
+from shapecat.types import (
+    Box,
+    Camera,
+    Frame,
+    LabelledFrame,
+    LabelledObject,
+    NeuralGas,
+    Plane,
+    Pose,
+    Scene,
+    ShownBox,
+    ShownFrame,
+)
+from tests.test_exports_worked import UP
+
+MS = 1_000_000
+NO_GAS = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+UPRIGHT = (0.0, 0.0, 0.0, 1.0)
+
+
+def labelled_object(track: int, indices: Any = (), **changes: Any) -> LabelledObject:
+    box = Box((0.3, -0.2, 1.1), (0.12, 0.07, 0.19), UPRIGHT)
+    one = LabelledObject(
+        *(track, "cup", 0.6, box, np.array(indices, np.uint32), NO_GAS), np.ones(1), np.ones(1)
+    )
+    return replace(one, **changes)
+
+
+def labelled_frame(index: int, *objects: LabelledObject, topic: str = "/depth") -> LabelledFrame:
+    return LabelledFrame(topic, index, index * MS, 0, "cam", None, (), objects, (), {}, UP)
+
+
+# ---- annotations: how long, and which are deleted
+
+
+def shown(topic: str, stamp: int, *tracks: int, ended: tuple[int, ...] = ()) -> ShownFrame:
+    boxes = tuple(ShownBox(t, "cup", 0.9, (0, 0, 1), (1, 1, 1), UPRIGHT) for t in tracks)
+    return ShownFrame(topic, stamp, stamp, stamp, "cam", boxes, ended)
+
+
+def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
+    """The period is that to the next frame of the topic, else that from the one before."""
+    frames = [
+        shown("/a", 100, 1, 2),
+        shown("/a", 140, 2),
+        shown("/b", 150, 2, 7),
+        shown("/a", 200, 3, ended=(9,)),
+        shown("/b", 250, ended=(7,)),
+        shown("/c", 260, 4),
+    ]
+    found = [(a.lifetime_ns, a.gone) for a in _annotations(frames)]
+
+    assert found == [
+        (60, ()),  # 40 to the next
+        (60, (1,)),  # 40 from the one before, as another topic follows
+        (1_500_000_000, ()),  # a topic's first frame: a second is assumed
+        (90, (9,)),  # 2 is still seen on /b
+        (150, (2, 7)),
+        (1_500_000_000, ()),
+    ]
+
+
+# ---- data sets of images: which frames
+
+
+def finished(frames: list[LabelledFrame]) -> Any:
+    return SimpleNamespace(frames=lambda: iter(frames))
+
+
+def test_frames_are_thinned_topic_by_topic() -> None:
+    topics = ["/a", "/b", "/a", "/a", "/b", "/a", "/b"]
+    frames = [labelled_frame(k, topic=topic) for k, topic in enumerate(topics)]
+
+    assert [f.index for f in _thinned(frames, 2)] == [0, 1, 3, 6]
+    chosen = _chosen(finished(frames), Selection(every=2), set())
+    assert chosen == {("/a", 0), ("/b", 1), ("/a", 3), ("/b", 6)}
+
+
+def test_the_views_of_a_track_are_the_most_different_ones() -> None:
+    """First the one with most pixels, then always the one least like those chosen."""
+    columns = np.zeros((5, 8))
+    columns[:, 0], columns[:, 4] = [0, 1.0, 5, 5.4, 9], [0.1, 0.3, 0.1, 0.1, 0.2]
+    assert _different(columns, 3) == [1, 4, 2]
+    assert _different(columns, 9) == [1, 4, 2, 0, 3]
+
+    frames = [
+        labelled_frame(k, labelled_object(1, range(pixels), box=Box((x, 0, 1), (1, 1, 1), UPRIGHT)))
+        for k, (pixels, x) in enumerate([(30, 0.0), (99, 0.1), (30, 2.0), (30, 0.2)])
+    ]
+    chosen = _chosen(finished(frames), Selection(per_track=2), set())
+    assert chosen == {("/depth", 1), ("/depth", 2)}
+    unsure = Selection(per_track=2, min_confidence=0.61)
+    assert _chosen(finished(frames), unsure, set()) == set()
+    assert _chosen(finished(frames), unsure, {1}) == chosen
+    exact = Selection(per_track=2, min_confidence=0.6)
+    assert _chosen(finished(frames), exact, set()) == chosen
+    by_hand = Selection(per_track=2, corrected_only=True)
+    assert _chosen(finished(frames), by_hand, set()) == set()
+
+
+def test_a_view_is_a_direction_a_distance_a_size_and_a_shape() -> None:
+    turn = Rotation.from_euler("zyx", [0.4, 1.1, -0.3])
+    center, size = np.array([0.36, -0.48, 0.8]), np.array([0.12, 0.07, 0.24])
+    item = labelled_object(1, range(55), box=Box(center, size, UPRIGHT))
+    frame = replace(labelled_frame(0, item), fixed_from_sensor=Pose(turn.as_matrix(), np.zeros(3)))
+    found = _view(frame, item)
+
+    assert_allclose(found[:3], turn.apply(-center), atol=1e-6)  # it is a metre away
+    assert_allclose(found[3:5], [0, 0.3 * np.log(55)], atol=1e-6)
+    assert_allclose(found[5:], [0.25, 0.07 / 0.48, 0.5], atol=1e-6)
+    assert_allclose(_view(labelled_frame(0, item), item)[:3], -center, atol=1e-6)
+
+
+def runs(count: int, same: int = 0) -> Any:
+    digests = [f"xxh3:{max(k, same)}" for k in range(count)]
+    return [
+        SimpleNamespace(name=str(k), run={"input": {"digest": d}}) for k, d in enumerate(digests)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("count", "val", "expected"),
+    [(1, 0.9, 0), (10, 0.2, 2), (10, 0.26, 3), (3, 0.99, 2), (5, 0, 0)],
+)
+def test_a_share_of_the_recordings_is_for_validation(count: int, val: float, expected: int) -> None:
+    """One is always left to train on; runs of one recording are never on both sides."""
+    assert split_runs(runs(count), val).count("val") == expected
+    assert len(set(split_runs(runs(10, same=6), 0.4)[:7])) == 1
+    for wrong in (-0.1, 1.0):
+        with pytest.raises(ValueError, match="at least 0 and less than 1"):
+            split_runs(runs(count), wrong)
+
+
+# ---- exports: whose folder it is
+
+
+def test_only_an_export_of_the_same_kind_that_nobody_changed_is_replaced(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    _require_own(out, "kitti")
+    out.mkdir()
+    _require_own(out, "kitti")
+    (out / "notes.txt").write_text("mine")
+    with pytest.raises(OutputError, match="holds something else"):
+        _require_own(out, "kitti")
+    mark = out / "export.json"
+    mark.write_text(json.dumps({"format": "kitti", "made": ["notes.txt"], "objects": 3}))
+    _require_own(out, "kitti")
+    assert _made_by_export(out) == ["notes.txt", "export.json"]
+    with pytest.raises(OutputError, match="holds kitti, not an earlier labelcloud"):
+        _require_own(out, "labelcloud")
+    later = mark.stat().st_mtime_ns + 1000
+    (out / "deep").mkdir()
+    (out / "deep" / "label.txt").write_text("by hand")
+    os.utime(out / "deep" / "label.txt", ns=(later, later))
+    with pytest.raises(OutputError, match=r"label\.txt: was changed after the export"):
+        _require_own(out, "kitti")
+    mark.write_text(json.dumps({"format": "kitti", "made": ["../notes.txt"]}))  # killed in between
+    assert sorted(_made_by_export(out) or ()) == ["deep", "export.json", "notes.txt"]
+    mark.write_text(json.dumps({"made": "all"}))
+    assert _made_by_export(out) is None
+
+
+# ---- point labels
+
+
+def point_labels(out: Path) -> int:
+    depth = np.array([[0.5004, 1.2346, 65.5354], [70.0, 0.0, 65.536]], np.float32)
+    camera = Camera(3, 2, 143.0, 139.0, 1.25, 0.75)
+    image = Frame("/depth", 4, 5, 6, "cam", depth, camera)
+    points = np.array([[1, 2, 3], [np.nan, 0, 0], [4, 5, 6], [7, 8, np.inf]], np.float32)
+    cloud = Frame("/scan", 9, 7, 8, "laser", points=points)
+    cup, box = labelled_object(3, [0, 5]), labelled_object(300, [2], category="box")
+    scanned = labelled_frame(9, replace(box, indices=np.array([1, 2])), topic="/scan")
+    frames = [
+        (replace(labelled_frame(4, cup, box), stamp_ns=5), image),
+        (replace(scanned, stamp_ns=7), cloud),
+    ]
+    labels = {3: TrackLabel(3, "cup", 0.6), 300: TrackLabel(300, "box", 1.0)}
+    about: Any = SimpleNamespace(folder=out, labels=labels, categories=("cup", "can", "box"))
+    return write_point_labels(out, frames, about)
+
+
+def test_point_labels_are_class_and_instance_of_each_pixel_and_point(tmp_path: Path) -> None:
+    assert point_labels(tmp_path) == 3
+
+    def pixels(folder: str) -> list[list[int]]:
+        data = (tmp_path / folder / "000000.png").read_bytes()
+        return np.asarray(Image.open(io.BytesIO(data))).tolist()  # type: ignore[no-any-return]
+
+    assert pixels("depth") == [[500, 1235, 65535], [0, 0, 0]]
+    assert pixels("semantic") == [[2, 0, 4], [0, 0, 2]]
+    assert pixels("instance") == [[3, 0, 300], [0, 0, 3]]
+    rows = np.fromfile(tmp_path / "velodyne" / "000001.bin", "<f4").reshape(-1, 4)
+    assert rows.tolist() == [[1, 2, 3, 0], [4, 5, 6, 0]]
+    assert np.fromfile(tmp_path / "labels" / "000001.label", "<u4").tolist() == [0, 300 * 65536 + 4]
+    with (tmp_path / "frames.csv").open(newline="") as file:
+        first, second = csv.DictReader(file)
+    assert list(first.values()) == ["000000", "/depth", "4", "5", "3", "2", "143.0", "139.0",
+                                    "1.25", "0.75"]  # fmt: skip
+    assert list(second.values()) == ["000001", "/scan", "9", "7", *[""] * 6]
+
+
+def test_the_legend_of_point_labels_knows_red_from_blue(tmp_path: Path) -> None:
+    """The tools of SemanticKITTI read colours as blue, green, red."""
+    point_labels(tmp_path)
+    legend = json.loads((tmp_path / "labels.json").read_text())
+    lines = (tmp_path / "semantic-kitti.yaml").read_text().splitlines()
+    red, green, blue = colour_of("can")
+
+    assert legend["classes"] == {"0": "none", "1": "unknown", "2": "cup", "3": "can", "4": "box"}
+    assert legend["colours"]["3"] == [red, green, blue]
+    assert legend["colours"]["0"] == [0, 0, 0]
+    assert legend["instances"] == {"3": "cup", "300": "box"}
+    at = lines.index("color_map:")
+    assert lines[at + 1 : at + 5 : 3] == ["  0: [0, 0, 0]", f"  3: [{blue}, {green}, {red}]"]
+    at = lines.index("learning_ignore:")
+    assert lines[at + 1 :] == ["  0: true", *(f"  {k}: false" for k in range(1, 5))]
+
+
+# ---- crops
+
+
+def test_a_crop_stands_on_its_support() -> None:
+    """Height above the support where it is known, else half of the box."""
+    item = labelled_object(1, [0, 2], height_m=0.31)
+    middle = float(UP @ item.box.center)
+    assert support_offset(item, UP) == pytest.approx(middle - 0.31)
+    assert support_offset(replace(item, height_m=np.nan), UP) == pytest.approx(middle - 0.095)
+    points = np.array([[0.3, -0.2, 1.2], [9, 9, 9], [np.nan, 0, 1], [0.1, 0.4, 1.0]], np.float32)
+    frame = Frame("/scan", 0, 0, 0, "cam", points=points)
+    one = replace(item, indices=np.array([0, 2, 3]))
+    found = upright_cloud(labelled_frame(0, one), frame, one)
+    assert found is not None
+    assert_allclose(found[0][:, 2], points[[0, 3]] @ UP - (middle - 0.31), atol=1e-6)
+    nothing = replace(item, indices=np.array([2]))
+    assert upright_cloud(labelled_frame(0, nothing), frame, nothing) is None
+
+
+# ---- the hierarchy of a frame as text
+
+
+def row(**changes: Any) -> dict[str, Any]:
+    return {
+        "indices": [7, 8], "center": [0.3, -0.2, 1.1], "size": [0.124, 0.071, 0.196],
+        "orientation": UPRIGHT, "plane": 0, "on_detection": None, "height_m": 0.1,
+        "touches_border": False, "occluded": False,
+    } | changes  # fmt: skip
+
+
+def test_the_support_of_a_detection_is_above_its_plane() -> None:
+    """Height of the centre over the plane, less that over what it stands on."""
+    normal = np.array([0.6, 0.0, 0.8])
+    plane = Plane(normal, 0.4, np.zeros((3, 3)), 0.5, 0.7)
+    over = 0.6 * 0.3 + 0.8 * 1.1 - 0.4
+    stacked = _candidate(row(height_m=0.25, on_detection=3), [plane])
+    assert stacked.support_m == pytest.approx(over - 0.25)
+    assert stacked.on_candidate == 3
+    assert _candidate(row(height_m=over + 9e-6), [plane]).support_m == 0
+    assert _candidate(row(height_m=over + 2e-5), [plane]).support_m == pytest.approx(-2e-5, rel=0.1)
+    assert _candidate(row(plane=None), [plane]).support_m == 0
+
+
+def test_a_node_is_described_by_its_track_its_size_and_what_is_missing() -> None:
+    plane = Plane(np.array([0, 0, 1.0]), 0.4, np.zeros((3, 3)), 0.567, 0.734)
+    found = [
+        _candidate(row(**changes), [plane])
+        for changes in (
+            {},
+            {"touches_border": True, "occluded": True},
+            {"indices": [1]},
+            {"indices": [], "occluded": True},
+        )
+    ]
+    scene = Scene(np.array([0, 0, 1.0]), (plane,), tuple(found))
+    told = [_described(scene, Node("object", k), {7: "cup #6"}) for k in range(4)]
+
+    assert _described(scene, Node("plane", 0), {}) == "plane 0: 0.73 m high, 0.57 m2"
+    assert told == [
+        "cup #6: 12 x 7 x 20 cm",
+        "cup #6: 12 x 7 x 20 cm, cut by the border, occluded",
+        "object in no track: 12 x 7 x 20 cm",
+        "object: 12 x 7 x 20 cm, occluded",
+    ]
+
+
+# ---- image boxes and labels
+
+
+def test_the_corners_of_an_image_box_are_the_borders_of_its_pixels() -> None:
+    box = ImageBox(6, "cup", 0.8, (11, 23, 40, 7))
+    assert box.corners == [(11, 23), (51, 23), (51, 30), (11, 30)]
+    assert box.text == "#6 cup 0.80"
+
+
+def damerau(a: str, b: str) -> int:
+    """Count slips by trying all of them, one after the other."""
+    if not a or not b:
+        return len(a) + len(b)
+    ways = [
+        damerau(a[:-1], b) + 1,
+        damerau(a, b[:-1]) + 1,
+        damerau(a[:-1], b[:-1]) + (a[-1] != b[-1]),
+    ]
+    if len(a) > 1 and len(b) > 1 and a[-1] == b[-2] and a[-2] == b[-1]:
+        ways.append(damerau(a[:-2], b[:-2]) + 1)
+    return min(ways)
+
+
+def test_slips_are_counted_as_by_trying_them() -> None:
+    rng = np.random.default_rng(2)
+    for _ in range(200):
+        a, b = ("".join(rng.choice(list("abc"), rng.integers(0, 6))) for _ in range(2))
+        assert _slips(a, b) == _slips(b, a) == damerau(a, b)
