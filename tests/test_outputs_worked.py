@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from numpy.typing import ArrayLike
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
@@ -46,8 +47,12 @@ NO_GAS = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
 UPRIGHT = (0.0, 0.0, 0.0, 1.0)
 
 
+def box_at(center: ArrayLike, size: ArrayLike) -> Box:
+    return Box(np.asarray(center, float), np.asarray(size, float), np.array(UPRIGHT))
+
+
 def labelled_object(track: int, indices: Any = (), **changes: Any) -> LabelledObject:
-    box = Box((0.3, -0.2, 1.1), (0.12, 0.07, 0.19), UPRIGHT)
+    box = box_at((0.3, -0.2, 1.1), (0.12, 0.07, 0.19))
     one = LabelledObject(
         *(track, "cup", 0.6, box, np.array(indices, np.uint32), NO_GAS), np.ones(1), np.ones(1)
     )
@@ -112,7 +117,7 @@ def test_the_views_of_a_track_are_the_most_different_ones() -> None:
     assert _different(columns, 9) == [1, 4, 2, 0, 3]
 
     frames = [
-        labelled_frame(k, labelled_object(1, range(pixels), box=Box((x, 0, 1), (1, 1, 1), UPRIGHT)))
+        labelled_frame(k, labelled_object(1, range(pixels), box=box_at((x, 0, 1), (1, 1, 1))))
         for k, (pixels, x) in enumerate([(30, 0.0), (99, 0.1), (30, 2.0), (30, 0.2)])
     ]
     chosen = _chosen(finished(frames), Selection(per_track=2), set())
@@ -129,7 +134,7 @@ def test_the_views_of_a_track_are_the_most_different_ones() -> None:
 def test_a_view_is_a_direction_a_distance_a_size_and_a_shape() -> None:
     turn = Rotation.from_euler("zyx", [0.4, 1.1, -0.3])
     center, size = np.array([0.36, -0.48, 0.8]), np.array([0.12, 0.07, 0.24])
-    item = labelled_object(1, range(55), box=Box(center, size, UPRIGHT))
+    item = labelled_object(1, range(55), box=box_at(center, size))
     frame = replace(labelled_frame(0, item), fixed_from_sensor=Pose(turn.as_matrix(), np.zeros(3)))
     found = _view(frame, item)
 
