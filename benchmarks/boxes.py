@@ -105,10 +105,10 @@ def _judge_kind(kind: SceneKind, first: int, count: int) -> Iterator[Judged]:
 def _judge_run(folder: Path, seed: int) -> Iterator[Judged]:
     truth = json.loads((folder / "recording.truth.json").read_text("utf-8"))
     labels = np.load(folder / "recording.labels.npz")["labels"]
-    detections = _by_frame(folder / "run" / "detections.parquet")
+    detections = by_frame(folder / "run" / "detections.parquet")
     tracked = {
         (row["frame"], row["detection"]): row
-        for rows in _by_frame(folder / "run" / "tracks.parquet").values()
+        for rows in by_frame(folder / "run" / "tracks.parquet").values()
         for row in rows
     }
     ups = {
@@ -117,7 +117,7 @@ def _judge_run(folder: Path, seed: int) -> Iterator[Judged]:
     for frame in truth:
         number = frame["frame"]
         level = gravity_rotation(ups[number])
-        for thing, row in _matches(frame["objects"], detections.get(number, []), labels[number]):
+        for thing, row in matches(frame["objects"], detections.get(number, []), labels[number]):
             track = tracked.get((number, row["detection"]))
             boxes = (
                 _upright(row, "", level),
@@ -132,14 +132,15 @@ def _judge_run(folder: Path, seed: int) -> Iterator[Judged]:
             )
 
 
-def _by_frame(path: Path) -> dict[int, list[dict[str, Any]]]:
+def by_frame(path: Path) -> dict[int, list[dict[str, Any]]]:
+    """Return the rows of a table by frame."""
     grouped: dict[int, list[dict[str, Any]]] = {}
     for row in pq.read_table(path).to_pylist():
         grouped.setdefault(row["frame"], []).append(row)
     return grouped
 
 
-def _matches(
+def matches(
     things: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]], labels: Array
 ) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
     """Match true and found objects one to one by their pixels."""

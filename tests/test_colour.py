@@ -11,6 +11,7 @@ from shapecat.cameras.colour import LensCamera
 from shapecat.cameras.lenses import distort, undistorted_rays
 from shapecat.colour.masks import NOTHING, Mask, dense_masks, labelled_masks, united
 from shapecat.colour.projection import project, splat_depth
+from shapecat.colour.snapping import snapped
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
 from shapecat.types import Camera, Frame, Pose
 
@@ -154,6 +155,50 @@ def test_parts_of_an_object_are_united() -> None:
     assert both.box == (4, 2, 25, 11)
     assert united(()).area == 0
     assert Mask(0, 0, np.zeros((0, 0), bool)).box == (0, 0, 0, 0)
+
+
+def picture_of_a_box(colour: tuple[int, int, int]) -> tuple[Any, Any]:
+    """Return a grainy image of a box of a colour, rows 20 to 59 and columns 30 to 69, and which."""
+    rng = np.random.default_rng(1)
+    inside = np.zeros((80, 100), bool)
+    inside[20:60, 30:70] = True
+    grain = rng.integers(-9, 10, (80, 100, 3))
+    return (np.where(inside[..., None], colour, (120, 130, 140)) + grain).astype(np.uint8), inside
+
+
+@pytest.mark.parametrize(("top", "left"), [(18, 32), (22, 28), (18, 27)])
+def test_outlines_move_to_the_edges_of_the_colours(top: int, left: int) -> None:
+    """A mask two or three pixels beside its object teaches a wrong outline."""
+    pixels, inside = picture_of_a_box((170, 90, 60))
+    (mask,) = snapped([Mask(left, top, np.ones((40, 40), bool))], pixels)
+    wrong = mask.full(80, 100) ^ inside
+    assert wrong.sum() <= 8  # of 160 and more; corners may be rounded
+    (finer,) = snapped([Mask(left, top, np.ones((40, 40), bool))], pixels, 2.0)
+    assert (finer.full(80, 100) ^ inside).sum() <= 16
+
+
+def test_outlines_stay_where_both_sides_look_alike() -> None:
+    """Depth tells a white cup from a white table; colours must not move its outline at random."""
+    pixels, _ = picture_of_a_box((120, 130, 140))
+    before = Mask(28, 22, np.ones((40, 40), bool))
+    (mask,) = snapped([before], pixels)
+    assert (mask.full(80, 100) ^ before.full(80, 100)).sum() <= 40  # a quarter of a pixel
+    assert snapped([before], np.zeros((80, 100, 3), np.uint8))[0].box == before.box
+
+
+def test_masks_side_by_side_share_no_pixel_when_they_move() -> None:
+    """Each looks for its edge by itself: what one takes, the other must not."""
+    pixels, inside = picture_of_a_box((170, 90, 60))
+    left = Mask(30, 20, np.ones((40, 17), bool))
+    right = Mask(47, 20, np.ones((40, 23), bool))
+    pixels[20:60, 50:70] = np.where(inside[20:60, 50:70, None], (60, 90, 170), 0)
+    one, nothing, two = snapped([left, NOTHING, right], pixels)
+    assert nothing.area == 0
+    assert not (one.full(80, 100) & two.full(80, 100)).any()
+    # The right one gives up what it had beyond the edge at column 50.
+    assert abs(two.left - 50) <= 1
+    (whole,) = snapped([Mask(0, 0, np.ones((80, 100), bool))], pixels)
+    assert whole.area == 8000
 
 
 @pytest.mark.slow

@@ -13,11 +13,11 @@ import xxhash
 from shapecat.arrays import F8
 from shapecat.colour.masks import Mask, dense_masks
 from shapecat.errors import OutputError
-from shapecat.outputs.colouring import Coloured, with_colour
+from shapecat.outputs.colouring import Coloured, snapped_masks, with_colour
 from shapecat.outputs.exports_files import png, safe_name
 from shapecat.outputs.rereading import FinishedRun, open_source
 from shapecat.recordings import MessageError
-from shapecat.recordings.colour_image import encoded
+from shapecat.recordings.colour_image import encoded, pixels_of
 from shapecat.runs.track_table import read_track_table
 from shapecat.types import Frame, LabelledFrame, LabelledObject
 
@@ -141,7 +141,7 @@ def _image(
     corrected: set[int],
 ) -> DatasetImage | None:
     """Return the image of a frame, or None."""
-    found = _depth_file(labelled, frame) if selection.depth else _colour_file(coloured)
+    found = _depth_file(labelled, frame) if selection.depth else _colour_file(frame, coloured)
     if found is None:
         return None
     suffix, contents, (height, width), masks = found
@@ -159,13 +159,15 @@ def _image(
 _File = tuple[str, bytes, tuple[int, int], tuple[Mask, ...]]
 
 
-def _colour_file(coloured: Coloured | None) -> _File | None:
-    """Return suffix, content and size of a colour image, as it came, and its masks."""
+def _colour_file(frame: Frame, coloured: Coloured | None) -> _File | None:
+    """Return suffix, content and size of a colour image, as it came, and masks that fit it."""
     if coloured is None or coloured.view.image.height <= 1:
         return None
     image = coloured.view.image
-    suffix, contents = encoded(image)
-    return suffix, contents, (image.height, image.width), coloured.masks
+    pixels = pixels_of(image)
+    suffix, contents = encoded(image, pixels)
+    masks = snapped_masks(frame, coloured, pixels)
+    return suffix, contents, (image.height, image.width), masks
 
 
 def _depth_file(labelled: LabelledFrame, frame: Frame) -> _File | None:

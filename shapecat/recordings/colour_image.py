@@ -125,16 +125,15 @@ def pixels_of(image: ColourImage, *, shrink: int = 1) -> U1:
     return _raw_pixels(image)
 
 
-def encoded(image: ColourImage) -> tuple[str, bytes]:
+def encoded(image: ColourImage, pixels: U1) -> tuple[str, bytes]:
     """Return suffix and bytes of an image file without loss: the original, or a PNG.
 
-    Raises
-    ------
-    MessageError : damaged; what came compressed is decoded once to make sure.
+    Parameters
+    ----------
+    pixels : what `pixels_of` has decoded, so that no damaged file is handed on.
     """
     from PIL import Image  # noqa: PLC0415  # loaded where there is colour
 
-    pixels = pixels_of(image)
     if image.encoding in COMPRESSED_FORMATS:
         return ".jpg" if image.encoding == "jpeg" else ".png", bytes(image.data)
     file = io.BytesIO()

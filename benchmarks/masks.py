@@ -1,0 +1,124 @@
+"""Masks on the colour image against the true ones, from simulated recordings to a data set.
+
+    python -m benchmarks.masks --first 1000 --count 20
+
+Recordings of tables and clutter, taken by a Kinect or a RealSense with a colour camera beside it,
+are processed as `shapecat process` does. Judged are things with at least `SEEN_PIXELS` readings
+that the colour camera sees with at least `SEEN_ON_IMAGE` pixels, by intersection over union: the
+masks of masks.parquet, which depth alone tells, and those of exports, which lie on the edges of
+the colours.
+"""
+
+import json
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import click
+import numpy as np
+
+from benchmarks.boxes import SEEN_PIXELS, by_frame, matches
+from benchmarks.measure import markdown
+from shapecat.outputs.colouring import snapped_masks, with_colour
+from shapecat.pipeline import process
+from shapecat.recordings import open_recording
+from shapecat.recordings.colour_image import pixels_of
+from shapecat.runs.corrections import read_labels
+from shapecat.runs.folder import read_run
+from shapecat.runs.jobs import Job
+from shapecat.runs.labels import read_labelled_frames
+from shapecat.simulation import simulate
+
+SEEN_ON_IMAGE = 300
+KINDS: tuple[Literal["tabletop", "clutter"], ...] = ("tabletop", "clutter")
+SENSORS: tuple[Literal["kinect", "realsense"], ...] = ("kinect", "realsense")
+FRAMES, RATE_HZ = 2, 4.0
+COLUMNS = ("", "objects", "found", "of depth", "exported", "exported, missed ones are 0")
+
+
+class Judged(NamedTuple):
+    """The overlaps of one thing in one frame: of depth, and as exported; 0 if it was missed."""
+
+    sensor: str
+    found: bool
+    overlaps: tuple[float, float]
+
+
+@click.command(help=__doc__)
+@click.option("--first", default=1000, show_default=True, help="Seed of the first recording.")
+@click.option("--count", default=20, show_default=True, help="Recordings.")
+def main(*, first: int, count: int) -> None:
+    """Judge recordings and print a table."""
+    judged = [item for number in range(count) for item in _judge(number, first + number)]
+    rows = [_row(sensor, [item for item in judged if item.sensor == sensor]) for sensor in SENSORS]
+    rows.append(_row("both", judged))
+    print(markdown(f"Masks, seeds {first} to {first + count - 1}", COLUMNS, rows))
+
+
+def _row(name: str, some: list[Judged]) -> list[Any]:
+    of_found = np.mean([item.overlaps for item in some if item.found], axis=0)
+    of_all = np.mean([item.overlaps[1] for item in some])
+    shares = (round(float(share), 3) for share in (*of_found, of_all))
+    return [name, len(some), sum(item.found for item in some), *shares]
+
+
+def _judge(number: int, seed: int) -> Iterator[Judged]:
+    kind, sensor = KINDS[number % 2], SENSORS[number // 2 % 2]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        source = simulate(
+            folder / "recording.mcap",
+            scene=kind,
+            frames=FRAMES,
+            seed=seed,
+            sensor=sensor,
+            color=True,
+            rate_hz=RATE_HZ,
+        )
+        process(Job(source, folder / "run", mcap=False, rrd=False))
+        for found, overlaps in _judge_run(folder):
+            yield Judged(sensor, found, overlaps)
+
+
+def _judge_run(folder: Path) -> Iterator[tuple[bool, tuple[float, float]]]:
+    truth = {
+        frame["frame"]: frame["objects"]
+        for frame in json.loads((folder / "recording.truth.json").read_text("utf-8"))
+    }
+    on_depth = np.load(folder / "recording.labels.npz")["labels"]
+    on_image = np.load(folder / "recording.color_labels.npz")["labels"]
+    rows = by_frame(folder / "run" / "detections.parquet")
+    for number, masks in _masks(folder):
+        seen, things = on_image[number], truth[number]
+        pairs = matches(things, rows.get(number, []), on_depth[number])
+        found = {thing["label"]: row["detection"] for thing, row in pairs}
+        for thing in things:
+            mask = seen == thing["label"]
+            if thing["pixels"] >= SEEN_PIXELS and np.count_nonzero(mask) >= SEEN_ON_IMAGE:
+                own = masks.get(found.get(thing["label"], -1))
+                yield own is not None, _overlaps(own, mask) if own else (0.0, 0.0)
+
+
+def _masks(folder: Path) -> Iterator[tuple[int, dict[int, tuple[Any, Any]]]]:
+    """Yield by frame the two masks of each detection."""
+    run = read_run(folder / "run")
+    labels = read_labels(folder / "run" / "tracks.csv", run["model"]["categories"])
+    labelled = read_labelled_frames(folder / "run", labels)
+    with open_recording(folder / "recording.mcap") as recording:
+        for label, frame, coloured in with_colour(labelled, recording, run, folder / "run"):
+            if coloured is not None:
+                snapped = snapped_masks(frame, coloured, pixels_of(coloured.view.image))
+                pairs = zip(coloured.masks, snapped, strict=True)
+                names = (item.detections[0] for item in label.objects)
+                yield label.index, dict(zip(names, pairs, strict=True))
+
+
+def _overlaps(masks: tuple[Any, Any], true: Any) -> tuple[float, float]:
+    full = [mask.full(*true.shape) for mask in masks]
+    of_depth, exported = (float((m & true).sum() / (m | true).sum()) for m in full)
+    return of_depth, exported
+
+
+if __name__ == "__main__":
+    main()

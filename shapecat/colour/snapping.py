@@ -1,0 +1,139 @@
+"""Outlines of masks, moved to the edges of the colours beside them.
+
+Source: the local statistics of Lankton and Tannenbaum, Localizing region-based active contours,
+2008. differs: one step within a narrow band instead of a curve that evolves, since depth already
+tells the outline to a pixel or two.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from scipy import ndimage
+
+from shapecat.arrays import F4, I4, U1, Bool
+from shapecat.colour.masks import NOTHING, Mask
+from shapecat.jit import kernel
+
+__all__ = ["snapped"]
+
+_BAND_PX = 3.0
+"""Outlines move at most so far, in pixels of the depth image."""
+_CORE_PX = 1.5
+"""Pixels farther than this from the outline show the colours of their side."""
+_WINDOW_PX = 6.0
+"""Half the width of the window in which they are looked at."""
+_ERROR_PX = 3.0
+"""So far from the outline of depth, colours need to be e times as likely."""
+_FEWEST = 4
+"""Samples of a side without which a pixel stays what it is."""
+_NOISE = 64.0
+"""Variance of a channel, in squared grey levels, that every surface has."""
+_CERTAIN = 3.0
+"""Greatest logarithm of how much likelier one side is."""
+
+
+def snapped(masks: Sequence[Mask], pixels: U1, scale: float = 1.0) -> tuple[Mask, ...]:
+    """Return masks whose outlines lie on the edges of the colours, where there are such edges.
+
+    Each pixel near an outline goes to the side whose colours, around it, it has; the nearer to the
+    outline, the less it takes. Where both sides look alike the outline stays. No two masks share a
+    pixel.
+
+    Parameters
+    ----------
+    pixels : (h, w, 3) the colour image.
+    scale : pixels of it to a pixel of the depth image.
+
+    Notes
+    -----
+    O(length of the outlines); about a millisecond for an object.
+    """
+    owners = np.zeros(pixels.shape[:2], np.int32)
+    for number, mask in enumerate(masks, start=1):
+        height, width = mask.pixels.shape
+        part = owners[mask.top : mask.top + height, mask.left : mask.left + width]
+        part[mask.pixels] = number
+    return tuple(
+        _snapped(mask, number, owners, pixels, scale) if mask.pixels.size else NOTHING
+        for number, mask in enumerate(masks, start=1)
+    )
+
+
+def _snapped(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> Mask:
+    """Return one mask anew, and note it in ``owners``."""
+    band, window = max(2.0, _BAND_PX * scale), max(3, round(_WINDOW_PX * scale))
+    margin, (left, top, width, height) = int(band) + window, mask.box
+    top, bottom = max(0, top - margin), top + height + margin
+    left, right = max(0, left - margin), left + width + margin
+    part = owners[top:bottom, left:right]
+    inside = part == number
+    if inside.all() or not inside.any():
+        return mask
+    # The distance of the middles of pixels from the outline, positive inside.
+    within, without = (ndimage.distance_transform_edt(side) for side in (inside, ~inside))
+    depth = np.where(inside, within - 0.5, 0.5 - without).astype(np.float32)
+    near = np.abs(depth) <= band
+    likelier = np.zeros(depth.shape, np.float32)
+    colours = np.ascontiguousarray(pixels[top:bottom, left:right])
+    _compare(colours, depth, band, _CORE_PX * scale, window, likelier)
+    score = ndimage.uniform_filter(likelier, 3) + depth / np.float32(_ERROR_PX * scale)
+    found = np.where(near, score > 0, inside) & (inside | (part == 0))
+    part[inside], part[found] = 0, number
+    return _cut_out(found, left, top)
+
+
+def _cut_out(inside: Bool, left: int, top: int) -> Mask:
+    rows, columns = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+    if not rows.size:
+        return NOTHING
+    part = inside[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
+    return Mask(left + int(columns[0]), top + int(rows[0]), np.ascontiguousarray(part))
+
+
+@kernel
+def _compare(colours: U1, depth: F4, band: float, core: float, window: int, likelier: F4) -> None:
+    """Find by how much, as a logarithm, pixels of the band are likelier inside than outside.
+
+    Either side has a normal distribution, of the same variance in all channels, of the colours
+    of a grid of pixels around.
+    """
+    height, width, channels = colours.shape
+    step = max(1, window // 4)
+    total = np.zeros((2, channels), np.float32)
+    for v in range(height):
+        for u in range(width):
+            if abs(depth[v, u]) > band:
+                continue
+            total[:] = 0
+            outside = inside = 0
+            squares_outside = squares_inside = np.float32(0)
+            for y in range(max(v - window, 0), min(v + window + 1, height), step):
+                for x in range(max(u - window, 0), min(u + window + 1, width), step):
+                    if abs(depth[y, x]) <= core:
+                        continue
+                    square = np.float32(0)
+                    side = 1 if depth[y, x] > 0 else 0
+                    for k in range(channels):
+                        value = np.float32(colours[y, x, k])
+                        total[side, k] += value
+                        square += value * value
+                    if side:
+                        inside, squares_inside = inside + 1, squares_inside + square
+                    else:
+                        outside, squares_outside = outside + 1, squares_outside + square
+            if min(inside, outside) >= _FEWEST:
+                own = _unlikely(colours[v, u], total[1], squares_inside, inside)
+                other = _unlikely(colours[v, u], total[0], squares_outside, outside)
+                likelier[v, u] = min(max(other - own, -_CERTAIN), _CERTAIN)
+
+
+@kernel
+def _unlikely(colour: U1, total: F4, squares: float, count: int) -> float:
+    """Return the negative logarithm of the density of a colour, but for a constant."""
+    apart, of_means = 0.0, 0.0
+    for k in range(colour.size):
+        mean = total[k] / count
+        apart += (colour[k] - mean) ** 2
+        of_means += mean * mean
+    variance = max(squares / count - of_means, 0.0) / colour.size + _NOISE
+    return float((apart / variance + colour.size * np.log(variance)) / 2)
