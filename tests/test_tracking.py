@@ -463,7 +463,7 @@ def test_a_common_motion_brings_the_detections_to_rest_and_back(speed: float) ->
     still = motion.still(hits).centers.reshape(80, 5, 3)
     assert still.std(axis=0).max() < 0.01
     back = motion.moved(hits.rows, still.reshape(-1, 3))
-    assert back == pytest.approx(hits.centers, abs=1e-9)
+    assert back == pytest.approx(hits.centers, abs=1e-6)
 
 
 def test_what_stands_still_or_goes_its_own_way_has_no_common_motion() -> None:

@@ -28,7 +28,7 @@ _WIDTH = sum(FULL_WIDTHS.values())
 _BOX = sum(FULL_WIDTHS.values()) - FULL_WIDTHS["size_full_std"]
 _TELLING = 1000
 """An object's box is estimated from so many of its views at most, spread over its life."""
-_AT_ONCE = 64  # row groups
+_AT_ONCE = 8  # row groups
 
 
 @dataclass(frozen=True)
@@ -76,23 +76,22 @@ class FullBoxes:
             np.frombuffer(partial, np.bool_),
         )
 
-    def of_tracks(self, tracks: Sequence[Track], categories: Sequence[str]) -> F8:
+    def of_tracks(self, tracks: Sequence[Track], categories: Sequence[str]) -> F4:
         """Return the fused boxes (k, 13) in the frames of some tracks; NaN if unknown."""
         seen = [self._seen(track) for track in tracks]
-        telling = [_spread(one.rows) for one in seen]
-        details = self._details(np.concatenate([np.zeros(0, np.int64), *telling]))
-        stops = accumulate(map(len, telling))
-        result = [np.zeros((0, _WIDTH))]
-        for track, one, rows, stop in zip(tracks, seen, telling, stops, strict=True):
-            boxes = np.full((len(track.frames), _WIDTH), np.nan)
-            if len(rows):
-                poses = one.poses[np.searchsorted(one.rows, rows)]
-                views = _views(self.rows[rows], details[stop - len(rows) : stop], poses)
-                weights = view_weights(self.partial[rows])
+        telling = [_spread(len(one.rows)) for one in seen]
+        rows = [one.rows[some] for one, some in zip(seen, telling, strict=True)]
+        details = self._details(np.concatenate([np.zeros(0, np.int64), *rows]))
+        stops = list(accumulate(len(track.frames) for track in tracks))
+        result = np.full((stops[-1] if stops else 0, _WIDTH), np.nan, np.float32)
+        told = accumulate(map(len, telling))
+        for track, one, some, stop, end in zip(tracks, seen, telling, stops, told, strict=True):
+            if len(some):
+                views = self._views(one, some, details[end - len(some) : end])
+                weights = view_weights(self.partial[one.rows[some]])
                 fused = fuse_boxes(views, weights, track.posterior, categories)
-                boxes[one.at] = _rows(fused, self.rows[one.rows], one.poses)
-            result.append(boxes)
-        return np.concatenate(result)
+                self._show(fused, one, result[stop - len(track.frames) : stop])
+        return result
 
     def _seen(self, track: Track) -> "_Seen":
         """Return the detections of a track whose full boxes are known."""
@@ -100,7 +99,25 @@ class FullBoxes:
         found = self.frames.find([track.topics[k] for k in at], track.frames[at])
         rows = self.frames.first[found] + track.detections[at]
         known = ~np.isnan(self.rows[rows, 0])
-        return _Seen(at[known], rows[known], self.frames.poses[found[known]])
+        return _Seen(at[known], rows[known], found[known])
+
+    def _views(self, seen: "_Seen", some: I4, details: F4) -> BoxViews:
+        """Return some boxes of one object in the fixed frame."""
+        boxes, poses = self.rows[seen.rows[some]], self.frames.poses[seen.frames[some]]
+        centers, axes = _placed(boxes, poses)
+        sizes, stds = boxes[:, 3:6].astype(np.float64), details[:, :3].astype(np.float64)
+        return BoxViews(centers, axes, sizes, stds, details[:, 3:], poses[:, :, 3])
+
+    def _show(self, fused: FusedBox, seen: "_Seen", result: F4) -> None:
+        """Write the fused box in the sensor frame of each view of it."""
+        for first in range(0, len(seen.rows), _BLOCK):
+            at, rows, frames = (values[first : first + _BLOCK] for values in seen)
+            boxes, poses = self.rows[rows], self.frames.poses[frames]
+            shown = fused.in_views(*_placed(boxes, poses), boxes[:, 3:6])
+            turns, places = poses[:, :, :3], poses[:, :, 3]
+            back = np.einsum("kji,kj->ki", turns, shown.centers - places)
+            own = Rotation.from_matrix(np.swapaxes(turns, 1, 2) @ shown.axes).as_quat()
+            result[at] = np.hstack([back, shown.sizes, own, shown.stds])
 
     def _details(self, rows: I4) -> F4:
         """Return (n, 3 + 96) the deviations and the outlines of detections."""
@@ -125,25 +142,16 @@ class FullBoxes:
 
 
 class _Seen(NamedTuple):
-    """Where in a track it is seen, in which rows of the table, and from where (k, 3, 4)."""
+    """Where in a track it is seen, and in which rows of the tables of detections and frames."""
 
     at: I4
     rows: I4
-    poses: F8
+    frames: I4
 
 
-def _spread(rows: I4) -> I4:
-    """Return rows, not too many of them, from the first one to the last."""
-    if len(rows) <= _TELLING:
-        return rows
-    return np.asarray(rows[np.linspace(0, len(rows) - 1, _TELLING).round().astype(np.int64)])
-
-
-def _views(boxes: F4, details: F4, poses: F8) -> BoxViews:
-    """Return the boxes (k, 10) of one object in the fixed frame."""
-    centers, axes = _placed(boxes, poses)
-    sizes, stds = boxes[:, 3:6].astype(np.float64), details[:, :3].astype(np.float64)
-    return BoxViews(centers, axes, sizes, stds, details[:, 3:], poses[:, :, 3])
+def _spread(count: int) -> I4:
+    """Return positions, not too many of them, from the first one to the last."""
+    return np.linspace(0, count - 1, min(count, _TELLING)).round().astype(np.int64)
 
 
 def _placed(boxes: F4, poses: F8) -> tuple[F8, F8]:
@@ -151,19 +159,6 @@ def _placed(boxes: F4, poses: F8) -> tuple[F8, F8]:
     turns, places = poses[:, :, :3], poses[:, :, 3]
     axes = turns @ Rotation.from_quat(boxes[:, 6:10]).as_matrix()
     return np.einsum("kij,kj->ki", turns, boxes[:, :3].astype(np.float64)) + places, axes
-
-
-def _rows(fused: FusedBox, boxes: F4, poses: F8) -> F8:
-    """Return (k, 13) the fused box in the sensor frame of each view of it."""
-    result = np.zeros((len(boxes), _WIDTH))
-    for first in range(0, len(boxes), _BLOCK):
-        some = slice(first, first + _BLOCK)
-        seen = fused.in_views(*_placed(boxes[some], poses[some]), boxes[some, 3:6])
-        turns, places = poses[some, :, :3], poses[some, :, 3]
-        back = np.einsum("kji,kj->ki", turns, seen.centers - places)
-        own = Rotation.from_matrix(np.swapaxes(turns, 1, 2) @ seen.axes).as_quat()
-        result[some] = np.hstack([back, seen.sizes, own, seen.stds])
-    return result
 
 
 def numbers_or_nan(table: pa.Table, widths: Mapping[str, int] = FULL_WIDTHS) -> F8:
@@ -179,13 +174,13 @@ def _filled(column: pa.ChunkedArray, width: int) -> F8:
     return result
 
 
-def full_columns(rows: F8) -> dict[str, Any]:
+def full_columns(rows: F4) -> dict[str, Any]:
     """Return rows (n, 13) as columns of a table; null where they are NaN."""
     missing = pa.array(np.isnan(rows[:, 0]))
     return dict(_columns(rows, missing))
 
 
-def _columns(rows: F8, missing: pa.Array) -> Iterator[tuple[str, Any]]:
+def _columns(rows: F4, missing: pa.Array) -> Iterator[tuple[str, Any]]:
     stop: I4 = np.cumsum(list(FULL_WIDTHS.values()))
     for (name, width), end in zip(FULL_WIDTHS.items(), stop.tolist(), strict=True):
         values = np.ascontiguousarray(rows[:, end - width : end], np.float32).ravel()

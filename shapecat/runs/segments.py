@@ -7,6 +7,7 @@ from them as often as it takes, so that a kill between two tables leaves nothing
 import shutil
 from collections.abc import Iterator, Sequence
 from functools import lru_cache
+from math import isqrt
 from pathlib import Path
 
 import pyarrow as pa
@@ -30,7 +31,7 @@ __all__ = [
 ]
 
 GROUP_FRAMES = 32
-_GROUPS = 4096  # whoever opens a table reads 30 kB about each of its row groups
+_BALANCE = 2500
 PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES}
 SEGMENTS, REVISIONS = "segments", "revisions"
 
@@ -99,8 +100,12 @@ def _picked(name: str, keys: Sequence[Key], sources: Sequence[_Tables]) -> pa.Ta
 
 
 def group_frames(frames: int) -> int:
-    """Return how many frames a row group holds: more of them after an hour of recording."""
-    return GROUP_FRAMES * max(1, -(-frames // (GROUP_FRAMES * _GROUPS)))
+    """Return how many frames a row group holds, of a table of so many.
+
+    Whoever reads a table holds one of its row groups, and 30 kB about each of them: so both their
+    length and their number grow with the root of the length of the recording.
+    """
+    return GROUP_FRAMES * max(1, isqrt(frames // _BALANCE))
 
 
 def row_groups(folder: Path, length: int) -> Iterator[_Tables]:

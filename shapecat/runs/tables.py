@@ -6,8 +6,9 @@ side by side in flat memory. Adding a column is allowed within a schema version;
 meaning of one is not.
 """
 
+import ctypes
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -203,6 +204,8 @@ def release_memory() -> None:
     """Return freed memory to the system before the next phase."""
     for pool in (pa.default_memory_pool(), pa.system_memory_pool()):
         pool.release_unused()
+    with suppress(OSError, AttributeError):  # glibc keeps what is freed in pieces
+        ctypes.CDLL(None).malloc_trim(0)
 
 
 @contextmanager

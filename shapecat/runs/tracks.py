@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute
 from scipy.spatial.transform import Rotation
 
-from shapecat.arrays import F8
+from shapecat.arrays import F4, F8
 from shapecat.config import TrackingSettings
 from shapecat.runs.full_boxes import FullBoxes, full_columns
 from shapecat.runs.tables import (
@@ -21,6 +21,7 @@ from shapecat.runs.tables import (
     numbers,
     open_writer,
     read_row_groups,
+    release_memory,
     rows_as_lists,
 )
 from shapecat.system.files import replacing
@@ -65,10 +66,13 @@ def track_run(
     tracks = track_recording(frames, settings, together=placed)
     lines = []
     with replacing(folder / "tracks.parquet") as path, open_writer(path, TRACKS) as writer:
-        boxes = FullBoxes.read(folder, placed)
+        release_memory()
+        full = FullBoxes.read(folder, placed)
         for some in _batches(tracks):
-            columns = _columns(some, boxes.of_tracks(some, categories), categories)
-            writer.write_table(arrow_table(columns, TRACKS), row_group_size=_BATCH)
+            boxes = full.of_tracks(some, categories)
+            for parts, rows in _parts(some):
+                columns = _columns(parts, boxes[rows], categories)
+                writer.write_table(arrow_table(columns, TRACKS))
             lines += [_Line.of(track, categories) for track in some]
     with replacing(folder / "tracks.csv") as path:
         _write_csv(path, lines, _start_ns(folder), work)
@@ -76,14 +80,27 @@ def track_run(
 
 
 def _batches(tracks: Iterable[Track]) -> Iterator[list[Track]]:
-    """Yield tracks in turn, about as many rows at a time: those of hours fill the memory."""
+    """Yield tracks in turn: one that is long, or some that are not much longer together."""
     some: list[Track] = []
     for track in tracks:
+        if len(track.frames) > _BATCH and some:
+            yield some
+            some = []
         some.append(track)
-        if sum(len(one.frames) for one in some) >= _BATCH:
+        if sum(len(one.frames) for one in some) > _BATCH:
             yield some
             some = []
     yield some
+
+
+def _parts(some: list[Track]) -> Iterator[tuple[list[Track], slice]]:
+    """Yield what is written at once, and which rows of the batch that is."""
+    if len(some) != 1:
+        yield some, slice(None)
+        return
+    for first in range(0, len(some[0].frames), _BATCH):
+        rows = slice(first, first + _BATCH)
+        yield [some[0].part(rows)], rows
 
 
 def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[FrameDetections]:
@@ -154,25 +171,23 @@ def _streams_with_poses(folder: Path) -> set[str]:
     return {topic for topic, count in balance.items() if count > 0}
 
 
-def _columns(tracks: Sequence[Track], boxes: F8, categories: Sequence[str]) -> dict[str, Any]:
+def _columns(tracks: Sequence[Track], boxes: F4, categories: Sequence[str]) -> dict[str, Any]:
     """Return the rows of some tracks, track after track, each in time."""
 
-    def column(name: str, *width: int) -> Any:
-        none = np.zeros((0, *width))
-        return np.concatenate([none, *(getattr(track, name) for track in tracks)])
+    def column(name: str, kind: str, *width: int) -> Any:
+        values = [np.asarray(getattr(track, name), kind) for track in tracks]
+        return np.concatenate([np.zeros((0, *width), kind), *values])
 
-    detections = column("detections").astype(np.int32)
+    detections = column("detections", "i4")
     return {
         "track": np.repeat([track.id for track in tracks], [len(track.frames) for track in tracks]),
         "topic": [topic for track in tracks for topic in track.topics],
-        "frame": column("frames").astype(np.int32),
-        "stamp_ns": np.concatenate([np.zeros(0, np.int64), *(t.stamps_ns for t in tracks)]),
-        "detection": pa.array(detections, pa.int32(), mask=detections < 0),
-        "center_fixed": pa.FixedSizeListArray.from_arrays(
-            column("centers", 3).astype(np.float32).ravel(), 3
-        ),
+        "frame": column("frames", "i4"),
+        "stamp_ns": column("stamps_ns", "i8"),
+        "detection": pa.array(detections, mask=detections < 0),
+        "center_fixed": pa.FixedSizeListArray.from_arrays(column("centers", "f4", 3).ravel(), 3),
         **full_columns(boxes),
-        "posterior": rows_as_lists(column("causal", len(categories))),
+        "posterior": rows_as_lists(column("causal", "f4", len(categories))),
     }
 
 

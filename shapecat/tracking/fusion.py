@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from shapecat.arrays import F8, Bool
+from shapecat.arrays import F4, F8, Bool
 
 __all__ = ["PARTIAL_WEIGHT", "Method", "causal", "fuse", "fuse_novelty", "view_weights"]
 
@@ -61,9 +61,9 @@ def fuse(posteriors: ArrayLike, method: Method = "product", weights: ArrayLike |
 
 def causal(
     posteriors: ArrayLike, method: Method = "product", weights: ArrayLike | None = None
-) -> F8:
-    """Return (k, c): row i is `fuse` of the first i + 1 views, in O(1) per view."""
-    return np.concatenate(list(_running(posteriors, method, weights)))
+) -> F4:
+    """Return (k, c) float32: row i is `fuse` of the first i + 1 views, in O(1) per view."""
+    return np.concatenate([b.astype(np.float32) for b in _running(posteriors, method, weights)])
 
 
 def _running(posteriors: ArrayLike, method: Method, weights: ArrayLike | None) -> Iterator[F8]:

@@ -18,7 +18,7 @@ _BLOCK = 2**16  # detections that are looked at together
 _OF_FRAMES = {"topics": "i4", "frames": "i4", "stamps_ns": "i8"}
 _OF_HITS: dict[str, tuple[str, tuple[Any, ...]]] = {
     "numbers": ("i4", ()),
-    "centers": ("f8", (3,)),
+    "centers": ("f4", (3,)),
     "sizes": ("f4", (3,)),
     "posteriors": ("f4", ("c",)),
     "partial": ("?", ()),
@@ -30,7 +30,7 @@ _OF_HITS: dict[str, tuple[str, tuple[Any, ...]]] = {
 
 @dataclass(frozen=True)
 class Hits:
-    """All detections of a stream: some 120 bytes for each, as hours of them are kept at once.
+    """All detections of a stream: some 110 bytes for each, as hours of them are kept at once.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class Hits:
     first: I4
     rows: I4
     numbers: I4
-    centers: F8
+    centers: F4
     sizes: F4
     posteriors: F4
     partial: Bool
@@ -78,6 +78,10 @@ class Hits:
     def of_frame(self, row: int) -> slice:
         """Return the detections of a frame."""
         return slice(int(self.first[row]), int(self.first[row + 1]))
+
+    def centers_of(self, some: I4 | slice) -> F8:
+        """Return the centres (k, 3) of some hits, to reckon with."""
+        return np.asarray(self.centers[some], np.float64)
 
     def owners(self, members: Sequence[I4]) -> I4:
         """Return (n,) which of the tracks each detection is of, -1 if none."""

@@ -162,7 +162,7 @@ def _joint(hits: Hits, pairs: I4) -> F8:
     if hits.axes is None:
         raise ValueError
     axes, others = hits.axes[i].astype(np.float64), hits.axes[j].astype(np.float64)
-    offset = np.einsum("pji,pj->pi", axes, hits.centers[j] - hits.centers[i])
+    offset = np.einsum("pji,pj->pi", axes, hits.centers_of(j) - hits.centers_of(i))
     turned = np.abs(np.einsum("pji,pjk->pik", axes, others))
     reach = 0.5 * np.einsum("pik,pk->pi", turned, hits.sizes[j])
     own = 0.5 * hits.sizes[i].astype(np.float64)

@@ -50,7 +50,7 @@ def track_recording(
 
     Notes
     -----
-    Time and memory grow linearly with the number of detections, memory by some 120 bytes each.
+    Time and memory grow linearly with the number of detections, memory by some 110 bytes each.
     """
     streams = [_track_stream(hits, settings) for hits in gather(frames, together)]
     found = [(stream, member) for stream in streams for member in stream.members]
@@ -106,7 +106,7 @@ def _associate(hits: Hits, cuts: Bool, settings: TrackingSettings) -> I4:
         here = hits.of_frame(row)
         ids[here] = tracker.step(
             stamp_ns,
-            hits.centers[here],
+            hits.centers_of(here),
             hits.sizes[here],
             hits.posteriors[here],
             partial=hits.partial[here],
@@ -169,7 +169,7 @@ def _extent(hits: Hits, member: I4) -> F8:
 
 def _rest(hits: Hits, member: I4) -> F8:
     """Return where the whole views are if they are in one place, else nan."""
-    whole = hits.centers[member[~hits.partial[member]]]
+    whole = hits.centers_of(member[~hits.partial[member]])
     if (
         len(whole) < _LINE
         or np.ptp(np.quantile(whole, [0.1, 0.9], axis=0), axis=0).max() > _STILL_M
@@ -183,7 +183,7 @@ def _line(hits: Hits, some: I4, at: int) -> tuple[F8, F8]:
 
     A prior of standing still keeps the velocity of a few noisy points small.
     """
-    stamps, centers = hits.stamps(some), hits.centers[some]
+    stamps, centers = hits.stamps(some), hits.centers_of(some)
     t = (stamps - stamps[at]) * 1e-9
     middle, mean = t.mean(), centers.mean(axis=0)
     velocity = (t - middle) @ (centers - mean) / (((t - middle) ** 2).sum() + 0.1)
@@ -204,8 +204,8 @@ def _needed(hits: Hits, scenes: I4, row: int, min_hits: int) -> int:
 def _build_track(number: int, stream: _Followed, member: I4, settings: TrackingSettings) -> Track:
     hits = stream.hits
     rows, source = hits.life(member, settings.max_missed_s)
-    weights = hits.weights(member)
-    so_far = causal(hits.posteriors[member], settings.fusion, weights)
+    views, weights = hits.posteriors[member], hits.weights(member)
+    posterior = fuse(views, settings.fusion, weights)
     # The last detection up to each row.
     at = np.searchsorted(hits.rows[member], rows, side="right") - 1
     places = hits.places(member, rows)
@@ -217,8 +217,8 @@ def _build_track(number: int, stream: _Followed, member: I4, settings: TrackingS
         hits.stamps_ns[rows],
         np.where(source, hits.numbers[member][at], -1),
         places if stream.motion is None else stream.motion.moved(rows, places),
-        so_far[at],
-        so_far[-1],
-        float(so_far[-1].max()),
+        causal(views, settings.fusion, weights)[at],
+        posterior,
+        float(posterior.max()),
         fuse_novelty(hits.novelties[member], weights),
     )

@@ -1,5 +1,7 @@
 """Input and output records of the tracker."""
 
+from dataclasses import replace
+
 from shapecat.arrays import F4, F8, I4, Bool, Record, array
 
 __all__ = ["FrameDetections", "Track"]
@@ -71,6 +73,11 @@ class Track(Record):
     posterior: F4 = array("c", "f4")
     confidence: float
     novelty: float
+
+    def part(self, rows: slice) -> "Track":
+        """Return some of its rows; what is said of the whole stays."""
+        columns = ("topics", "frames", "stamps_ns", "detections", "centers", "causal")
+        return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
     @property
     def topic(self) -> str:

@@ -1,0 +1,69 @@
+"""Hours of recording are tracked in parts that fit into the memory; none of them is seen."""
+
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from benchmarks.hours import make_tables
+from shapecat.config import TrackingSettings
+from shapecat.runs import full_boxes, tracks
+from shapecat.runs.segments import group_frames
+from shapecat.tracking import fusion, hits
+from shapecat.types import CATEGORIES
+
+FRAMES = 600
+
+
+def tracked(folder: Path) -> tuple[pa.Table, str]:
+    tracks.track_run(folder, TrackingSettings(), CATEGORIES)
+    return pq.read_table(folder / "tracks.parquet"), (folder / "tracks.csv").read_text("utf-8")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder: Path = tmp_path_factory.mktemp("hours")
+    make_tables(folder, FRAMES)
+    return folder
+
+
+def test_the_length_of_the_parts_changes_nothing(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Parts that end within a frame, a track, or a row group; a track of several parts."""
+    whole, lines = tracked(folder)
+    sizes = {(tracks, "_BATCH"): 100, (full_boxes, "_BLOCK"): 7, (full_boxes, "_AT_ONCE"): 1}
+    sizes |= {(hits, "_BLOCK"): 50, (fusion, "_BLOCK"): 33}
+    for (module, name), size in sizes.items():
+        monkeypatch.setattr(module, name, size)
+
+    parts, others = tracked(folder)
+
+    assert whole.num_rows > 7 * FRAMES
+    assert parts.equals(whole)
+    assert others == lines
+
+
+def test_few_views_tell_the_box_of_all(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As large as if all had told it, within the noise of the outlines; in every row seen."""
+    whole, _ = tracked(folder)
+    monkeypatch.setattr(full_boxes, "_TELLING", 60)
+
+    few, _ = tracked(folder)
+
+    known = whole["size_full"].is_valid()
+    assert few["size_full"].is_valid().equals(known)
+    sizes = [
+        np.array(table["size_full"].filter(known).to_pylist(), np.float64) for table in (whole, few)
+    ]
+    assert np.abs(sizes[0] - sizes[1]).max() < 0.003
+    assert few.drop([n for n in few.column_names if n.endswith(("full", "full_std"))]).equals(
+        whole.drop([n for n in whole.column_names if n.endswith(("full", "full_std"))])
+    )
+
+
+@pytest.mark.parametrize(("frames", "length"), [(0, 32), (3000, 32), (10_000, 64), (10**6, 640)])
+def test_long_tables_have_long_row_groups(frames: int, length: int) -> None:
+    assert group_frames(frames) == length
