@@ -40,12 +40,14 @@ class Trees(NamedTuple):
 
 
 @kernel
-def find_leaves(x: F4, trees: Trees, first: int, leaves: I4) -> int:
-    """Walk the next trees with features x (f,), from tree ``first`` on; return how many these are.
+def find_leaves(
+    x: F4, roots: I4, feature: I4, threshold: F4, left: I4, first: int, leaves: I4
+) -> int:
+    """Walk the next `Trees` with features x (f,), from ``first`` on; return how many these are.
 
     ``leaves`` (`LANES`,) are nodes, any to begin with; the leaves that are reached are written.
+    The trees come as arrays: to take them from a tuple counts references, as long as a level takes.
     """
-    roots, feature, threshold, left = trees
     count = min(LANES, roots.size - first)
     for lane in range(count):
         leaves[lane] = roots[first + lane]
@@ -82,10 +84,12 @@ def write_trees(path: Path, grown: BoostedTrees) -> None:
 @kernel
 def logit_of(grown: BoostedTrees, features: F4, hopeless: float) -> float:
     """Return the sum of the leaves that features (n,) reach, or the first that is below a bound."""
+    (roots, feature, threshold, left), value = grown
     leaves, logit = np.zeros(LANES, np.int32), 0.0
-    for first in range(0, grown.trees.roots.size, LANES):
-        for lane in range(find_leaves(features, grown.trees, first, leaves)):
-            logit += grown.value[leaves[lane]]
+    for first in range(0, roots.size, LANES):
+        count = find_leaves(features, roots, feature, threshold, left, first, leaves)
+        for lane in range(count):
+            logit += value[leaves[lane]]
         if logit < hopeless:
             break
     return float(logit)

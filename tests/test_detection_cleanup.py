@@ -10,7 +10,7 @@ from shapecat.detection.cleanup.object_features import (
     _border_lines,
     measure_object_features,
 )
-from shapecat.detection.cleanup.structure import find_background, load_trees
+from shapecat.detection.cleanup.structure import find_background, load_trees, number_objects
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
 from shapecat.detection.merging.segments import _blank
 from shapecat.detection.pipeline import ALL_STEPS, Task, merge_segments, oversegment
@@ -119,3 +119,15 @@ def test_the_space_between_two_boxes_is_no_hole() -> None:
     labels[17:23, 15:25] = 0
     fill_holes(inv_depth, labels, 2, filled)
     assert not filled.any()
+
+
+def test_objects_that_are_left_are_numbered_in_the_order_of_their_segments() -> None:
+    """Segments 2 and 4 are merged into 1 and 3, of which 3 is rejected; 5 stays alone."""
+    parent = np.array([0, 1, 1, 3, 3, 5], np.int16)
+    rejected = np.array([False, False, False, True, False, False])
+    labels = np.array([[0, 1, 2], [3, 4, 5]], np.int16)
+    spans = np.array([[1, 3], [0, 3]], np.int32)
+
+    assert number_objects(parent, rejected, labels, spans).tolist() == [0, 1, 5]
+    assert labels.tolist() == [[0, 1, 1], [0, 0, 2]]
+    assert parent.tolist() == [0, 1, 1, 0, 0, 5]

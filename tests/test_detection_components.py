@@ -38,8 +38,9 @@ def test_components_end_where_links_do() -> None:
     assert component[3].tolist() == [1, 2, 2]
 
 
-def test_what_is_outside_the_spans_is_not_read() -> None:
-    inside = np.ones((3, 6), bool)
+def test_what_is_outside_the_spans_is_neither_read_nor_written() -> None:
+    inside = np.zeros((3, 6), bool)
+    inside[0, :2] = inside[1, 4:] = True
     component, links = np.full((3, 6), 77, np.int32), np.full((3, 6), BOTH, np.uint8)
     spans = np.array([[0, 2], [4, 6], [0, 0]], np.int32)
     assert connected_components(inside, links, spans, component).tolist() == [0, 2, 2]

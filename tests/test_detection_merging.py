@@ -10,7 +10,7 @@ from shapecat.detection.merging.low_profile import merge_low_profile
 from shapecat.detection.merging.pair_features import (
     PAIR_FEATURES,
     ViewGeometry,
-    are_adjacent,
+    find_adjacent,
     pair_features,
 )
 from shapecat.detection.merging.segment_features import (
@@ -60,7 +60,7 @@ def test_two_boxes_that_touch() -> None:
     assert first["area"] == pytest.approx(0.16**2, rel=0.05)
     assert segments.pairs[1, 2]["contact"] == segments.pairs[2, 1]["contact"] == 50
     assert segments.pairs[1, 2]["in_front"] == segments.pairs[2, 1]["in_front"] == 0
-    assert are_adjacent(segments, 1, 2)
+    assert find_adjacent(segments, 1)[2]
 
 
 def test_a_box_before_another() -> None:
@@ -91,7 +91,7 @@ def test_what_is_merged_adds_up() -> None:
     assert segments.parent.tolist() == [0, 1, 1]
     assert segments.statistics[1]["count"] == 50 * 50 + 60 * 40
     assert not segments.pairs[1, 1]["contact"]
-    assert not are_adjacent(segments, 1, 2)
+    assert not find_adjacent(segments, 1)[2]
     assert (segments.samples[1] >= 0).all()
 
 

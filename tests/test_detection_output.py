@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from shapecat.detection.depth_grid import find_borders
 from shapecat.detection.output.label_upsampling import list_runs, split_lists
 from shapecat.detection.output.occluded_points import label_occluded_points
-from shapecat.detection.output.scene import _begin
 from shapecat.geometry import rotation_from_quaternion, upright_box
 
 
@@ -26,18 +26,22 @@ def test_occluded_points_join_what_they_touch() -> None:
     assert found.tolist() == [5] * 10 + [9] * 10
 
 
-@pytest.mark.parametrize(("rows", "expected"), [(range(4, 40), 4), (range(20, 40), 0)])
-def test_where_samples_begin(rows: range, expected: int) -> None:
-    """A strip may be empty; what begins in the middle is the top of an object."""
-    lines = np.zeros((40, 30), bool)
-    lines[list(rows), 5:25] = True
-    assert _begin(lines, 2) == expected
+@pytest.mark.parametrize(("rows", "expected"), [(range(4, 40), [4, 19]), (range(20, 40), [-1, -1])])
+def test_where_samples_begin(rows: range, expected: list[int]) -> None:
+    """A strip may be blank; what begins in the middle is the top of an object."""
+    inv_depth = np.zeros((40, 30), np.float32)
+    inv_depth[list(rows), 5:25] = 1
+    assert find_borders(inv_depth, 2).tolist()[0] == expected
+    assert find_borders(np.ascontiguousarray(inv_depth[::-1]), 2).tolist()[1] == expected
+    assert find_borders(np.ascontiguousarray(inv_depth.T), 2).tolist()[2] == expected
 
 
-def test_the_top_of_one_object_is_no_border() -> None:
-    lines = np.zeros((40, 30), bool)
-    lines[4:, 10:14] = True
-    assert _begin(lines, 2) == 0
+def test_the_samples_behind_a_blank_strip_tell_how_wide_the_border_is() -> None:
+    inv_depth = np.zeros((40, 30), np.float32)
+    inv_depth[4:, 10:14] = 1
+    inv_depth[6, 2] = 1
+    assert find_borders(inv_depth, 2).tolist()[0] == [4, 3]
+    assert find_borders(inv_depth, 3).tolist()[0] == [4, 11]
 
 
 def test_the_box_of_a_turned_box() -> None:

@@ -13,7 +13,7 @@ from shapecat.detection.merging.pair_features import (
     FEATURES,
     PAIR_FEATURES,
     ViewGeometry,
-    are_adjacent,
+    find_adjacent,
     pair_features,
 )
 from shapecat.detection.pipeline import ALL_STEPS, Task, oversegment
@@ -58,8 +58,8 @@ def test_the_order_of_two_pieces_says_nothing() -> None:
     seen = 0
     for p in range(1, segments.parent.size):
         for q in range(1, p):
-            assert are_adjacent(segments, p, q) == are_adjacent(segments, q, p)
-            if are_adjacent(segments, p, q):
+            assert find_adjacent(segments, p)[q] == find_adjacent(segments, q)[p]
+            if find_adjacent(segments, p)[q]:
                 pair_features(segments, p, q, view_geometry, there[0])
                 pair_features(segments, q, p, view_geometry, back[0])
                 assert np.array_equal(there, back)

@@ -22,7 +22,7 @@ from shapecat.detection.planes.ransac import (
     sample_grid,
 )
 from shapecat.detection.segmentation.connectivity import connect_surfaces
-from shapecat.detection.segmentation.watershed import relabel, watershed
+from shapecat.detection.segmentation.watershed import watershed
 from shapecat.types import Camera
 
 Floats = NDArray[np.float32]
@@ -103,12 +103,6 @@ def test_two_faces_are_parted_where_they_meet_at_a_concave_edge(rise: float, seg
     assert n == segments
     assert (labels[90:150, 120:200] > 0).all()
     assert (labels[90, 120] != labels[149, 120]) == (segments == 2)
-
-
-def test_relabel_keeps_what_is_none() -> None:
-    labels = np.array([[0, 1, 2], [2, 2, 0]], np.int16)
-    relabel(labels, np.array([[0, 3], [0, 3]], np.int32), np.array([0, 5, 0], np.int16))
-    np.testing.assert_array_equal(labels, [[0, 5, 0], [0, 0, 0]])
 
 
 def test_hull_of_an_l_is_filled() -> None:

@@ -22,7 +22,7 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
 
     Parameters
     ----------
-    inside : (rows, columns) which cells are numbered.
+    inside : (rows, columns) which cells are numbered; none outside ``spans``.
     links : (rows, columns) uint8, `RIGHT` and `DOWN` to neighbours; links to others are ignored.
     spans : (rows, 2) columns of the first cell of each row that may be inside, and after the last.
     component : (rows, columns) int32 to write to: within the spans, 0 where not inside.
@@ -31,7 +31,8 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
     -------
     (n + 1,) how many cells each has; none has number 0.
     """
-    rows = inside.shape[0]
+    rows, columns = inside.shape
+    within, ways, numbers = inside.reshape(-1), links.reshape(-1), component.reshape(-1)
     most = 1
     for i in range(rows):
         most += spans[i, 1] - spans[i, 0]
@@ -40,15 +41,15 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
     count = 0
     # (1) first numbers, and which of them meet
     for i in range(rows):
-        start, end = spans[i]
-        over = i > 0 and spans[i - 1, 0] < spans[i - 1, 1]
-        for j in range(start, end):
-            component[i, j] = 0
-            if not inside[i, j]:
+        before = 0
+        for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
+            me, before = before, 0
+            if not within[p]:
+                numbers[p] = 0
                 continue
-            me = component[i, j - 1] if j > start and links[i, j - 1] & RIGHT else 0
-            within = over and spans[i - 1, 0] <= j < spans[i - 1, 1]
-            above = component[i - 1, j] if within and links[i - 1, j] & DOWN else 0
+            me = me if me > 0 and ways[p - 1] & RIGHT else 0
+            up = p - columns
+            above = numbers[up] if up >= 0 and within[up] and ways[up] & DOWN else 0
             if me == 0 and above == 0:
                 count += 1
                 parent[count] = me = count
@@ -58,7 +59,7 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
             elif above > 0 and above != me:
                 a, b = _root(parent, me), _root(parent, above)
                 parent[max(a, b)] = me = min(a, b)
-            component[i, j] = me
+            numbers[p] = before = me
             size[me] += 1
     # (2) final numbers
     for k in range(count, 0, -1):
@@ -72,10 +73,10 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
             size[k] = n  # its final number, from here on
         else:
             size[k] = size[parent[k]]
+    size[0] = 0
     for i in range(rows):
-        for j in range(spans[i, 0], spans[i, 1]):
-            if component[i, j] > 0:
-                component[i, j] = size[component[i, j]]
+        for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
+            numbers[p] = size[numbers[p]]
     return sizes[: n + 1]
 
 

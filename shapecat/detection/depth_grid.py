@@ -20,6 +20,7 @@ __all__ = [
     "PinholeIntrinsics",
     "count_at_range_limit",
     "downsample",
+    "find_borders",
     "row_and_column",
     "smallest_object_at",
 ]
@@ -97,11 +98,12 @@ def _sampled(depth: F4, step: int, range_m: float) -> F4:
     """Return the readings in range among every so many pixels."""
     rows, columns = depth.shape
     result = np.zeros((rows // step + 1) * (columns // step + 1), np.float32)
-    n = 0
+    n, one, least = np.uint64(0), np.uint64(1), np.float32(NEAREST_M)
     for i in range(step // 2, rows, step):
-        for j in range(step // 2, columns, step):
-            result[n] = depth[i, j]
-            n += (depth[i, j] >= np.float32(NEAREST_M)) & (depth[i, j] <= range_m)
+        for j in range(np.uint64(step // 2), np.uint64(columns), np.uint64(step)):
+            z = depth[i, j]
+            result[n] = z
+            n += one if (z >= least) & (z <= range_m) else np.uint64(0)
     return result[:n]
 
 
@@ -138,6 +140,31 @@ def count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) -
             if labels[i, j] > 0 and inv_depth[i, j] < most:
                 count[labels[i, j]] += 1
     return count
+
+
+@kernel
+def find_borders(inv_depth: F4, near: int) -> I4:
+    """Return (4, 2) how many lines at each side are blank, and how far the samples behind extend.
+
+    The sides are top, bottom, left and right. The extent, in cells along the side, is that of the
+    samples in the first ``near`` lines with any. Both are -1 if more than `BORDER_SHARE` are blank.
+    """
+    borders = np.full((4, 2), -1, np.int64)
+    for side in range(4):
+        axis, back = side // 2, side % 2 > 0
+        lines, length = inv_depth.shape[axis], inv_depth.shape[1 - axis]
+        first, low, high = math.ceil(BORDER_SHARE * lines), length, -1
+        for k in range(lines):
+            if k >= first + (near if high >= 0 else 0):
+                break
+            line = lines - 1 - k if back else k
+            for n in range(length):
+                if (inv_depth[line, n] if axis == 0 else inv_depth[n, line]) > 0:
+                    first = k if high < 0 else first
+                    low, high = min(low, n), max(high, n)
+        if high >= 0:
+            borders[side, 0], borders[side, 1] = first, high - low
+    return borders
 
 
 @kernel

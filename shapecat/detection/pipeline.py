@@ -25,7 +25,7 @@ from shapecat.config import DetectionSettings
 from shapecat.detection.cleanup import structure
 from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
 from shapecat.detection.cleanup.object_features import measure_object_features
-from shapecat.detection.cleanup.structure import find_background
+from shapecat.detection.cleanup.structure import find_background, number_objects
 from shapecat.detection.depth_grid import DepthGrid, downsample
 from shapecat.detection.foreground.low_profile import find_low_profile
 from shapecat.detection.foreground.overhang import extend_overhang
@@ -48,7 +48,7 @@ from shapecat.detection.planes.height_map import measure_heights, pack_planes
 from shapecat.detection.planes.ransac import draw_trials
 from shapecat.detection.records import OverSegmentation, PlaneModel, Segmentation
 from shapecat.detection.segmentation.connectivity import connect_surfaces
-from shapecat.detection.segmentation.watershed import relabel, watershed
+from shapecat.detection.segmentation.watershed import watershed
 from shapecat.detection.segmentation.width_split import split_at_width_changes
 from shapecat.detection.steps import ALL_STEPS, Steps
 from shapecat.detection.virtual_camera import VirtualImage, top_view, virtual_image
@@ -248,21 +248,8 @@ def _clean_up(
     features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
     trees = structure.load_trees()
     rejected = find_background(segments, features, grid, settings, trees)
-    representatives, numbers = _number(segments.parent, rejected)
-    relabel(labels, graph.spans, numbers)
+    representatives: I4 = number_objects(segments.parent, rejected, labels, graph.spans)
     return representatives
-
-
-def _number(parent: I4, rejected: Bool) -> tuple[I4, I4]:
-    """Return the leading segment of each object, and the label of each segment; group 0 is none."""
-    leading = (parent == np.arange(parent.size)) & ~rejected
-    leading[0] = False
-    representatives = np.concatenate([[0], np.flatnonzero(leading)])
-    numbers = np.zeros(parent.size, np.int16)
-    numbers[representatives] = np.arange(representatives.size)
-    numbers = numbers[parent]
-    parent[rejected[parent]] = 0
-    return representatives, numbers
 
 
 def _fill(
@@ -279,7 +266,8 @@ def _fill(
     filled = np.zeros(labels.shape, np.uint8)
     if task.steps.hole_filling:
         fill_holes(grid.inverse_depth, labels, representatives.size - 1, filled)
-    filled |= (model.low_profile > 0) & (labels > 0)  # it may lie at the level of its plane
+    if model.low_profile.max() > 0:  # it may lie at the level of its plane
+        filled |= (model.low_profile > 0) & (labels > 0)
     plane_ids = segments.plane_id[representatives].astype(np.int64) - 1
     plane_ids[0] = 0
     range_m = task.settings.max_range_m

@@ -87,9 +87,10 @@ class FlatForest(Record):
 @kernel
 def fall(x: F4, trees: Trees, word: I4, result: I4) -> None:
     """Write the word that x (f,) falls into in each tree into result (t,)."""
-    leaves = np.zeros(LANES, np.int32)
+    leaves, (roots, feature, threshold, left) = np.zeros(LANES, np.int32), trees
     for first in range(0, result.size, LANES):
-        for lane in range(find_leaves(x, trees, first, leaves)):
+        count = find_leaves(x, roots, feature, threshold, left, first, leaves)
+        for lane in range(count):
             result[first + lane] = word[leaves[lane]]
 
 

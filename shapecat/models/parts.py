@@ -25,7 +25,7 @@ from shapecat.detection.merging.pair_features import (
     FEATURES,
     PAIR_FEATURES,
     ViewGeometry,
-    are_adjacent,
+    find_adjacent,
     pair_features,
 )
 from shapecat.detection.merging.segments import Segments, merge
@@ -209,9 +209,10 @@ def _meeting(segments: Segments, whose: I4) -> Iterator[tuple[int, int]]:
     """Yield the pairs of segments that meet, but for mixed ones and those that are no objects."""
     n = segments.parent.size
     for p in range(1, n):
+        adjacent = find_adjacent(segments, p)
         for q in range(p + 1, n):
             known = min(whose[p], whose[q]) >= 0 and max(whose[p], whose[q]) > 0
-            if known and are_adjacent(segments, p, q):
+            if known and adjacent[q]:
                 yield p, q
 
 

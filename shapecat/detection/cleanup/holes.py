@@ -13,7 +13,7 @@ from shapecat.detection.connected_components import (
 )
 from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M, HeightMap
 from shapecat.geometry import DISCONTINUITY
-from shapecat.jit import kernel
+from shapecat.jit import kernel, unset
 
 __all__ = ["fill_contact_boundary", "fill_holes"]
 
@@ -34,7 +34,7 @@ def fill_contact_boundary(inv_depth: F4, heights: HeightMap, labels: I4) -> None
     )
     for i in range(rows):
         some = False
-        for j in range(columns):  # few rows have any, and this vectorises
+        for j in range(np.uint64(columns)):  # few rows have any, and this vectorises
             v = inv_depth[i, j]
             low[j] = height[i, j] * v * v > least * v * v + noise
             low[j] &= (plane_id[i, j] < 0) & (before[i, j] == 0)
@@ -59,12 +59,12 @@ def fill_holes(inv_depth: F4, labels: I4, count: int, filled: U1) -> None:
     of the labels 1..count, and every other label on it is in front of it.
     """
     inside, spans = _between_labels(inv_depth, labels)
-    component = np.zeros(labels.shape, np.int32)
+    component = unset(labels.shape, np.int32)
     links = np.full(labels.shape, RIGHT | DOWN, np.uint8)
     n = connected_components(inside, links, spans, component).size
     sides, total = np.zeros((n, count + 1, 3), np.int32), np.zeros(n, np.int32)
     owner = np.zeros(n, np.int16)
-    _count_sides(inv_depth, labels, spans, component, sides, total)
+    _count_sides(inv_depth, labels, inside, spans, component, sides, total)
     for p in range(1, n):
         owner[p] = _owner_of(sides[p], total[p])
     for i in range(len(spans)):
@@ -81,27 +81,31 @@ def _between_labels(inv_depth: F4, labels: I4) -> tuple[Bool, I4]:
     first, last = np.full(columns, rows, np.int32), np.full(columns, -1, np.int32)
     inside, spans = np.zeros(labels.shape, np.bool_), spans_of(labels)
     for i in range(rows):
-        for j in range(spans[i, 0], spans[i, 1]):
-            first[j] = min(first[j], i) if labels[i, j] > 0 else first[j]
-            last[j] = i if labels[i, j] > 0 else last[j]
+        row = np.int32(i)
+        for j in range(np.uint64(spans[i, 0]), np.uint64(spans[i, 1])):  # these vectorise
+            first[j] = row if (labels[i, j] > 0) & (row < first[j]) else first[j]
+            last[j] = row if labels[i, j] > 0 else last[j]
     for i in range(rows):
-        for j in range(spans[i, 0], spans[i, 1]):
-            inside[i, j] = (labels[i, j] == 0) & (inv_depth[i, j] > 0)
-            inside[i, j] &= (first[j] < i) & (i < last[j])
+        row = np.int32(i)
+        for j in range(np.uint64(spans[i, 0]), np.uint64(spans[i, 1])):
+            between = (first[j] < row) & (row < last[j])
+            inside[i, j] = (labels[i, j] == 0) & (inv_depth[i, j] > 0) & between
     return inside, spans
 
 
 @kernel
-def _count_sides(inv_depth: F4, labels: I4, spans: I4, component: I4, sides: I4, total: I4) -> None:
+def _count_sides(
+    inv_depth: F4, labels: I4, inside: Bool, spans: I4, component: I4, sides: I4, total: I4
+) -> None:
     """Count the sides of the cells of holes (n, labels, 3), and ``total`` (n,), with those to none.
 
     The total of a hole that is not enclosed is made too large for any label.
     """
     for i in range(len(spans)):
         for j in range(spans[i, 0], spans[i, 1]):
-            p, here = component[i, j], inv_depth[i, j]
-            if p == 0:
+            if not inside[i, j]:
                 continue
+            p, here = component[i, j], inv_depth[i, j]
             for di, dj in SIDES:
                 label, there = labels[i + di, j + dj], inv_depth[i + di, j + dj]
                 if label > 0:
@@ -110,7 +114,7 @@ def _count_sides(inv_depth: F4, labels: I4, spans: I4, component: I4, sides: I4,
                     sides[p, label, GOES_ON] += abs(there - here) < DISCONTINUITY
                 if label > 0 or there <= 0:
                     total[p] += 1
-                elif component[i + di, j + dj] == 0:
+                elif not inside[i + di, j + dj]:
                     total[p] += labels.size
 
 

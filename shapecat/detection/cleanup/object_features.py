@@ -12,7 +12,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4, U1, Bool
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.connected_components import SIDES
-from shapecat.detection.depth_grid import DepthGrid, row_and_column
+from shapecat.detection.depth_grid import DepthGrid, find_borders, row_and_column
 from shapecat.detection.foreground.walls import CLEARED, ON_WALL
 from shapecat.detection.merging.segment_features import (
     SEGMENT_FEATURES,
@@ -102,14 +102,15 @@ def measure_object_features(
 
 def _border_lines(grid: DepthGrid) -> tuple[int, int, int, int]:
     """Return the first and last row, and column, with samples; -1 if that is no image border."""
-    lines = []
-    for axis in range(2):
-        count = grid.inverse_depth.shape[axis]
-        seen = np.flatnonzero((grid.inverse_depth > 0).any(axis=1 - axis))
-        first, last = (int(seen[0]), int(seen[-1])) if seen.size else (count, -1)
-        lines += [first if first <= CLEANUP.border_share * count else -1]
-        lines += [last if last >= (1 - CLEANUP.border_share) * count - 1 else -1]
-    return lines[0], lines[1], lines[2], lines[3]
+    rows, columns = grid.inverse_depth.shape
+    top, bottom, left, right = find_borders(grid.inverse_depth, 1)[:, 0].tolist()
+    tall, wide = CLEANUP.border_share * rows, CLEANUP.border_share * columns
+    return (
+        top if top <= tall else -1,
+        rows - 1 - bottom if 0 <= bottom <= tall else -1,
+        left if left <= wide else -1,
+        columns - 1 - right if 0 <= right <= wide else -1,
+    )
 
 
 @kernel
@@ -120,26 +121,25 @@ def _count_cells(
 
     ``last`` is the inverse depth of what ends with the range; ``rows`` are of `_SURROUNDINGS`.
     """
-    inv_depth, plane_id, labels = field.inverse_depth, field.plane_id, field.labels
+    inv_depth, planes, plane_id, walls, labels, spans, owner = field
+    last_row, last_column = labels.shape[0] - 1, labels.shape[1] - 1
     top, bottom, left, right = border
     for i in range(labels.shape[0]):
-        for j in range(field.spans[i, 0], field.spans[i, 1]):
+        for j in range(spans[i, 0], spans[i, 1]):
             if labels[i, j] == 0:
                 continue
-            row, here = rows[field.owner[labels[i, j]]], inv_depth[i, j]
+            row, here = rows[owner[labels[i, j]]], inv_depth[i, j]
             row.image_border += (i == top) | (i == bottom) | (j == left) | (j == right)
             row.range_limit += here < last
-            row.on_wall += field.walls[i, j] == ON_WALL
+            row.on_wall += walls[i, j] == ON_WALL
             for di, dj in SIDES:
-                y, x = i + di, j + dj
-                if y < 0 or x < 0 or y >= labels.shape[0] or x >= labels.shape[1]:
-                    continue
+                y, x = min(max(i + di, 0), last_row), min(max(j + dj, 0), last_column)
                 if plane_id[y, x] != 0 or abs(inv_depth[y, x] - here) >= DISCONTINUITY:
                     continue
-                plane = field.planes[plane_id[i, j] - 1]
-                if inv_depth[y, x] > max(plane[0] * x + plane[1] * y + plane[2], 0):
-                    row.into_wall += field.walls[y, x] == CLEARED
-                    row.beyond += field.walls[y, x] != CLEARED
+                k = plane_id[i, j] - 1
+                if inv_depth[y, x] > max(planes[k, 0] * x + planes[k, 1] * y + planes[k, 2], 0):
+                    row.into_wall += walls[y, x] == CLEARED
+                    row.beyond += walls[y, x] != CLEARED
 
 
 @kernel

@@ -10,7 +10,7 @@ from importlib.resources import files
 
 import numpy as np
 
-from shapecat.arrays import F4, Bool
+from shapecat.arrays import F4, I4, Bool
 from shapecat.config import DetectionSettings
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.depth_grid import DepthGrid
@@ -18,7 +18,7 @@ from shapecat.detection.merging.segments import Records, Segments, is_root
 from shapecat.jit import kernel
 from shapecat.trees import BoostedTrees, logit_of, read_trees
 
-__all__ = ["FILE", "find_background", "load_trees"]
+__all__ = ["FILE", "find_background", "load_trees", "number_objects"]
 
 FILE = "structure.npz"
 
@@ -59,3 +59,31 @@ def _reject(segments: Segments, features: F4, grown: BoostedTrees) -> Bool:
             and logit_of(grown, features[p], CLEANUP.hopeless) < CLEANUP.least_logit
         )
     return rejected
+
+
+@kernel
+def number_objects(parent: I4, rejected: Bool, labels: I4, spans: I4) -> I4:
+    """Give the objects that are left numbers, and the cells of their segments these as labels.
+
+    Parameters
+    ----------
+    parent : (n + 1,) of `Segments`; 0 from here on for what is rejected.
+    labels : (rows, columns) of segments, of objects from here on; 0 elsewhere.
+
+    Returns
+    -------
+    (objects + 1,) the segment that each object is merged into; that of object 0 is 0.
+    """
+    representatives, n = np.zeros(parent.size, np.int64), 0
+    numbers = np.zeros(parent.size, np.int16)
+    for p in range(1, parent.size):
+        if parent[p] == p and not rejected[p]:
+            n += 1
+            representatives[n], numbers[p] = p, n
+    for p in range(1, parent.size):
+        q = parent[p]
+        numbers[p], parent[p] = numbers[q], 0 if rejected[q] else q
+    for i in range(labels.shape[0]):
+        for j in range(spans[i, 0], spans[i, 1]):
+            labels[i, j] = numbers[labels[i, j]]
+    return representatives[: n + 1]

@@ -38,31 +38,29 @@ def measure_residual(
     total, count = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
     n = 0
     some = False
-    out[0, :] = out[rows - 1, :] = zero
+    one, last = np.uint64(1), np.uint64(columns - 1)
+    for j in range(np.uint64(columns)):
+        out[0, j] = out[rows - 1, j] = zero
     for i in range(rows):
         before = some
-        some = _find_low(
-            inv_depth[i], plane_id[i], height[i], plane, number, i, raw[i % 3], mark[i % 3]
-        )
+        some = _find_low(inv_depth, plane_id, height, plane, number, i, raw, mark)
         if i < 2:
             continue
-        line = out[i - 1]
-        line[:] = zero
+        for j in range(np.uint64(columns)):
+            out[i - 1, j] = zero
         if not before:
             continue
-        here, above, below = raw[(i - 1) % 3], raw[(i - 2) % 3], raw[i % 3]
-        for j in range(columns):
-            total[j] = here[j] + above[j] + below[j]
-        here, above, below = mark[(i - 1) % 3], mark[(i - 2) % 3], mark[i % 3]
-        for j in range(columns):
-            count[j] = here[j] + above[j] + below[j]
-        for j in range(1, columns - 1):
-            mean = (total[j - 1] + total[j] + total[j + 1]) / (
-                count[j - 1] + count[j] + count[j + 1]
-            )
-            line[j] = mean if here[j] > zero else zero
-        for j in range(1, columns - 1):
-            n += int(here[j])
+        here, above, below = (i - 1) % 3, (i - 2) % 3, i % 3
+        for j in range(np.uint64(columns)):
+            total[j] = raw[here, j] + raw[above, j] + raw[below, j]
+        for j in range(np.uint64(columns)):
+            count[j] = mark[here, j] + mark[above, j] + mark[below, j]
+        for j in range(one, last):
+            sums = total[j - one] + total[j] + total[j + one]
+            mean = sums / (count[j - one] + count[j] + count[j + one])
+            out[i - 1, j] = mean if mark[here, j] > zero else zero
+        for j in range(one, last):
+            n += int(mark[here, j])
     return n
 
 
@@ -72,21 +70,19 @@ def _find_low(
 ) -> bool:
     """Write how far the low cells of row ``i`` are above the plane, and 1 for them, or else 0.
 
-    Returns whether there are any.
+    ``raw`` and ``mark`` (3, columns) hold the last three rows. Returns whether there are any.
     """
     zero, one, low = np.float32(0), np.float32(1), np.float32(LOW.low_m)
     slope, base = np.float32(plane[0]), np.float32(plane[1] * i + plane[2])
     above, on = np.int8(number), np.int8(-number)
-    some = False
-    for j in range(inv_depth.size):
-        mine = ((plane_id[j] == above) | (plane_id[j] == on)) & (height[j] < low)
-        mark[j] = one if mine else zero
+    some, row, columns = False, i % 3, np.uint64(inv_depth.shape[1])
+    for j in range(columns):
+        mine = ((plane_id[i, j] == above) | (plane_id[i, j] == on)) & (height[i, j] < low)
+        mark[row, j] = one if mine else zero
         some |= mine
-    if some:
-        for j in range(inv_depth.size):
-            raw[j] = mark[j] * (inv_depth[j] - (slope * np.float32(j) + base))
-    else:
-        raw[:] = zero
+    for j in range(columns):
+        at = slope * np.float32(np.int32(j)) + base
+        raw[row, j] = mark[row, j] * (inv_depth[i, j] - at) if some else zero
     return some
 
 
@@ -98,13 +94,14 @@ def clear_contact(
     rows, columns = residual.shape
     top = 0
     high, edge = np.float32(LOW.low_m), np.zeros(columns, np.bool_)
+    one, me = np.uint64(1), np.int8(number)
     for i in range(1, rows - 1):
         # Few cells are high and beside what is low, and this vectorises.
-        here, above, below = residual[i], residual[i - 1], residual[i + 1]
         some = False
-        for j in range(1, columns - 1):
-            beside = (above[j] != 0) | (below[j] != 0) | (here[j - 1] != 0) | (here[j + 1] != 0)
-            edge[j] = beside & (plane_id[i, j] == number) & (height[i, j] >= high)
+        for j in range(one, np.uint64(columns - 1)):
+            beside = (residual[i - 1, j] != 0) | (residual[i + 1, j] != 0)
+            beside |= (residual[i, j - one] != 0) | (residual[i, j + one] != 0)
+            edge[j] = beside & (plane_id[i, j] == me) & (height[i, j] >= high)
             some |= edge[j]
         if not some:
             continue
@@ -149,38 +146,35 @@ def filter_high_pass(residual: F4, high_pass: F4) -> None:
     rows, columns = residual.shape
     sums = np.zeros(columns + 2 * LOW.window + 1, np.int32)
     counts = np.zeros(sums.size, np.int32)
-    inside = slice(LOW.window + 1, LOW.window + 1 + columns)
     total, count = np.zeros(columns, np.int32), np.zeros(columns, np.int32)
     unit, zero = np.float32(1 / STEPS), np.float32(0)
     for i in range(-LOW.window, rows):
         entering, leaving = i + LOW.window, i - LOW.window - 1
         if entering < rows:
-            _slide(residual[entering], np.int32(1), sums[inside], counts[inside])
+            _slide(residual, entering, np.int32(1), sums, counts)
         if leaving >= 0:
-            _slide(residual[leaving], np.int32(-1), sums[inside], counts[inside])
+            _slide(residual, leaving, np.int32(-1), sums, counts)
         if i < 0:
             continue
-        here, out = residual[i], high_pass[i]
         some = False
-        for j in range(columns):
-            some |= here[j] != zero
-        if not some:
-            out[:] = zero
-            continue
-        _add_windows(sums, counts, total, count)
-        for j in range(columns):
-            level = here[j] - unit * np.float32(total[j]) / np.float32(count[j])
-            out[j] = level if here[j] != zero else zero
+        for j in range(np.uint64(columns)):
+            some |= residual[i, j] != zero
+        if some:
+            _add_windows(sums, counts, total, count)
+        for j in range(np.uint64(columns)):
+            level = residual[i, j] - unit * np.float32(total[j]) / np.float32(count[j])
+            high_pass[i, j] = level if residual[i, j] != zero else zero
 
 
 @kernel
-def _slide(row: F4, sign: int, sums: I4, counts: I4) -> None:
+def _slide(residual: F4, i: int, sign: int, sums: I4, counts: I4) -> None:
     """Add a row to the sums of the columns, or take it away."""
     steps, most, least = np.float32(STEPS), np.float32(LOW.most), np.float32(-1)
-    for j in range(row.size):
-        value = row[j] if row[j] < most else most
-        sums[j] += sign * np.int32(steps * (value if value > least else least))
-        counts[j] += sign * np.int32(row[j] != 0)
+    margin = np.uint64(LOW.window + 1)
+    for j in range(np.uint64(residual.shape[1])):
+        value = residual[i, j] if residual[i, j] < most else most
+        sums[j + margin] += sign * np.int32(steps * (value if value > least else least))
+        counts[j + margin] += sign * np.int32(residual[i, j] != 0)
 
 
 @kernel

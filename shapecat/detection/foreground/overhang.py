@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import F8, I4, U1
+from shapecat.detection.connected_components import SIDES
 from shapecat.detection.depth_grid import DepthGrid, row_and_column
 from shapecat.detection.foreground.settings import OVERHANG
 from shapecat.detection.foreground.walls import CLEARED
@@ -80,17 +81,19 @@ def _find_border(plane_id: I4, me: int, i: int, border: U1) -> bool:
     Whether there are any.
     """
     rows, columns = plane_id.shape
-    above, here, below = plane_id[max(i - 1, 0)], plane_id[i], plane_id[min(i + 1, rows - 1)]
+    above, below, one = max(i - 1, 0), min(i + 1, rows - 1), np.uint64(1)
     mine = np.uint8(me)  # without a sign what lies on a surface is larger
-    for j in range(columns):
-        lower = (np.uint8(above[j]) < mine) | (np.uint8(below[j]) < mine)
-        border[j] = lower & (np.uint8(here[j]) == mine)
-    for j in range(columns - 1):
-        border[j] |= (np.uint8(here[j]) == mine) & (np.uint8(here[j + 1]) < mine)
-    for j in range(columns - 1):
-        border[j + 1] |= (np.uint8(here[j + 1]) == mine) & (np.uint8(here[j]) < mine)
+    for j in range(np.uint64(columns)):
+        lower = (np.uint8(plane_id[above, j]) < mine) | (np.uint8(plane_id[below, j]) < mine)
+        border[j] = lower & (np.uint8(plane_id[i, j]) == mine)
+    for j in range(np.uint64(columns - 1)):
+        lower = np.uint8(plane_id[i, j + one]) < mine
+        border[j] |= (np.uint8(plane_id[i, j]) == mine) & lower
+    for j in range(one, np.uint64(columns)):
+        lower = np.uint8(plane_id[i, j - one]) < mine
+        border[j] |= (np.uint8(plane_id[i, j]) == mine) & lower
     some = np.uint8(0)
-    for j in range(columns):
+    for j in range(np.uint64(columns)):
         some |= border[j]
     return bool(some > 0)
 
@@ -98,15 +101,15 @@ def _find_border(plane_id: I4, me: int, i: int, border: U1) -> bool:
 @kernel
 def _goes_on(over: Overhang, i: int, j: int) -> bool:
     """Whether the surface at a cell above the plane goes on outside: floods take longer."""
-    inv_depth, plane_id = over.grid.inverse_depth, over.heights.plane_id
-    for y, x in ((i, j - 1), (i, j + 1), (i - 1, j), (i + 1, j)):
-        if y < 0 or x < 0 or y >= inv_depth.shape[0] or x >= inv_depth.shape[1]:
+    rows, columns = over.visited.shape
+    some, here = False, over.grid.inverse_depth[i, j]
+    for di, dj in SIDES:
+        y, x = i + di, j + dj
+        if not (0 <= y < rows and 0 <= x < columns and 0 <= over.heights.plane_id[y, x] < over.me):
             continue
-        outside = 0 <= plane_id[y, x] < over.me
-        joined = abs(inv_depth[y, x] - inv_depth[i, j]) < DISCONTINUITY
-        if outside and joined and _height_beside(over, y, x) > 0:
-            return True
-    return False
+        if abs(over.grid.inverse_depth[y, x] - here) < DISCONTINUITY:
+            some |= _height_beside(over, y, x) > 0
+    return some
 
 
 @kernel

@@ -4,9 +4,9 @@ import math
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.detection.depth_grid import PinholeIntrinsics, row_and_column
-from shapecat.detection.merging.segments import SAMPLES, Segments, may_merge, merge
+from shapecat.detection.merging.segments import SAMPLES, Segments, merge
 from shapecat.detection.merging.settings import MERGING
 from shapecat.geometry import DISCONTINUITY
 from shapecat.jit import kernel
@@ -22,12 +22,13 @@ def merge_across_occluder(
     n = segments.parent.size
     scores, changed = np.zeros((n, n), np.float32), np.ones(n, np.bool_)
     while True:
+        behind_one = _find_behind_one(segments)
         for p in range(1, n):
             for q in range(p + 1, n):
                 if not (changed[p] or changed[q]):
                     continue
                 scores[p, q] = 0
-                if may_merge(segments, p, q) and _are_behind_one(segments, p, q):
+                if behind_one[p, q]:
                     a = _local_planes(segments.samples[p], inv_depth, intrinsics, normal)
                     b = _local_planes(segments.samples[q], inv_depth, intrinsics, normal)
                     share, lines = _find_partners(a, b)
@@ -45,17 +46,23 @@ def merge_across_occluder(
 
 
 @kernel
-def _are_behind_one(segments: Segments, p: int, q: int) -> bool:
-    """Whether one thing is in front of both segments."""
-    pairs, some = segments.pairs, False
-    for k in range(1, segments.parent.size):
-        some |= (
-            (k != p)
-            & (k != q)
-            & (pairs[k, p].in_front >= MERGING.few)
-            & (pairs[k, q].in_front >= MERGING.few)
-        )
-    return some
+def _find_behind_one(segments: Segments) -> Bool:
+    """Return (n + 1, n + 1) which segments above one plane, p < q, one thing is in front of."""
+    pairs, parent, plane_id = segments.pairs, segments.parent, segments.plane_id
+    n = parent.size
+    found = np.zeros((n, n), np.bool_)
+    behind = np.zeros(n, np.int32)
+    for k in range(1, n):
+        count = 0
+        for p in range(1, n):
+            if parent[p] == p and pairs[k, p].in_front >= MERGING.few:
+                behind[count] = p
+                count += 1
+        for a in range(count):
+            for b in range(a + 1, count):
+                p, q = behind[a], behind[b]
+                found[p, q] |= plane_id[p] == plane_id[q]
+    return found
 
 
 @kernel

@@ -12,11 +12,11 @@ from importlib.resources import files
 
 import numpy as np
 
-from shapecat.arrays import F4
+from shapecat.arrays import F4, F8
 from shapecat.detection.merging.pair_features import (
     PAIR_FEATURES,
     ViewGeometry,
-    are_adjacent,
+    find_adjacent,
     pair_features,
 )
 from shapecat.detection.merging.segments import Records, Segments, merge
@@ -52,20 +52,35 @@ def _merge(
     """Do what `merge_learned` does; ``named`` and ``features`` are scratch, the same one."""
     n = segments.parent.size
     logits = np.full((n, n), -np.inf)
-    changed = np.ones(n, np.bool_)  # what has to be asked for
+    for p in range(1, n):
+        _rate(segments, p, p + 1, view_geometry, grown, named, features, logits)
     while True:
-        for p in range(1, n):
-            for q in range(p + 1, n):
-                if not (changed[p] or changed[q]):
-                    continue
-                logits[p, q] = -np.inf
-                if are_adjacent(segments, p, q):
-                    pair_features(segments, p, q, view_geometry, named[0])
-                    logits[p, q] = logit_of(grown, features, MERGING.hopeless)
         best = np.argmax(logits)
         p, q = int(best // n), int(best % n)
         if logits[p, q] < MERGING.likely:
             return
         merge(segments, p, q)
-        changed[:] = False
-        changed[p] = changed[q] = True
+        for k in range(n):
+            logits[q, k] = logits[k, q] = -np.inf
+        _rate(segments, p, 1, view_geometry, grown, named, features, logits)
+
+
+@kernel
+def _rate(
+    segments: Segments,
+    p: int,
+    first: int,
+    view_geometry: ViewGeometry,
+    grown: BoostedTrees,
+    named: Records,
+    features: F4,
+    logits: F8,
+) -> None:
+    """Write the logits of a segment with the others from ``first`` on, the lower one first."""
+    adjacent = find_adjacent(segments, p)
+    for q in range(first, adjacent.size):
+        low, high = min(p, q), max(p, q)
+        logits[low, high] = -np.inf
+        if adjacent[q]:
+            pair_features(segments, low, high, view_geometry, named[0])
+            logits[low, high] = logit_of(grown, features, MERGING.hopeless)

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from shapecat.arrays import Bool
 from shapecat.detection.merging.segment_features import (
     SEGMENT_FEATURES,
     depth_difference,
@@ -18,11 +19,11 @@ from shapecat.detection.merging.segment_features import (
     width_of,
     write_segment_features,
 )
-from shapecat.detection.merging.segments import SEGMENT, Row, Segments, add_statistics, may_merge
+from shapecat.detection.merging.segments import SEGMENT, Row, Segments, add_statistics
 from shapecat.detection.merging.settings import MERGING
 from shapecat.jit import kernel
 
-__all__ = ["FEATURES", "PAIR_FEATURES", "ViewGeometry", "are_adjacent", "pair_features"]
+__all__ = ["FEATURES", "PAIR_FEATURES", "ViewGeometry", "find_adjacent", "pair_features"]
 
 _ADJACENCY = np.dtype(
     [
@@ -89,13 +90,20 @@ class ViewGeometry(NamedTuple):
 
 
 @kernel
-def are_adjacent(segments: Segments, p: int, q: int) -> bool:
-    """Whether two segments above one plane touch, one hides the other, or they face each other."""
-    if not may_merge(segments, p, q):
-        return False
-    pairs = segments.pairs
-    met = pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front + pairs[q, p].in_front
-    return bool(met >= MERGING.few or _face(segments.statistics[p], segments.statistics[q]))
+def find_adjacent(segments: Segments, p: int) -> Bool:
+    """Return (n + 1,) with which others above its plane a segment may be of one object.
+
+    They touch, one hides the other, or they face each other.
+    """
+    statistics, pairs, parent = segments.statistics, segments.pairs, segments.parent
+    plane_id = segments.plane_id
+    adjacent = np.zeros(parent.size, np.bool_)
+    for q in range(1, parent.size if parent[p] == p else 1):
+        if q != p and parent[q] == q and plane_id[q] == plane_id[p]:
+            met = pairs[p, q].contact + pairs[p, q].near + pairs[p, q].in_front
+            met += pairs[q, p].in_front
+            adjacent[q] = met >= MERGING.few or _face(statistics[p], statistics[q])
+    return adjacent
 
 
 @kernel

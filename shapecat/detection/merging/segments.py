@@ -27,7 +27,6 @@ __all__ = [
     "depth_of",
     "is_root",
     "lateral_axis",
-    "may_merge",
     "measure_segments",
     "merge",
 ]
@@ -300,14 +299,3 @@ def depth_of(segments: Segments, p: int) -> float:
 def is_root(segments: Segments, p: int) -> bool:
     """Whether a segment has not been merged into another."""
     return bool(segments.parent[p] == p)
-
-
-@kernel
-def may_merge(segments: Segments, p: int, q: int) -> bool:
-    """Whether two segments stand above one plane, and neither has been merged into another."""
-    return bool(
-        p != q
-        and is_root(segments, p)
-        and is_root(segments, q)
-        and segments.plane_id[p] == segments.plane_id[q]
-    )

@@ -12,7 +12,7 @@ from shapecat.detection.depth_grid import DepthGrid, row_and_column
 from shapecat.detection.planes.height_map import HEIGHT_NOISE, MIN_HEIGHT_M
 from shapecat.detection.records import Segmentation
 from shapecat.geometry import DISCONTINUITY, NEAREST_M
-from shapecat.jit import kernel
+from shapecat.jit import kernel, unset
 
 __all__ = [
     "GridLabels",
@@ -26,6 +26,8 @@ __all__ = [
 
 UNSURE, BARE = -1, -2
 """Instead of a label: what takes more to tell, and cells without a label next to one that has."""
+BLOCK = 16
+"""Pixels that are looked at together: most are as those before."""
 
 
 class GridLabels(NamedTuple):
@@ -62,16 +64,16 @@ def split_lists(order: U4, ends: I4) -> list[U4]:
 
 @kernel
 def find_near(labels: I4, i: int, scratch: I4, near: I4) -> None:
-    """Mark the cells of a row that have a label or are next to one that has.
+    """Mark the cells of row ``i`` that have a label or are next to one that has.
 
     ``scratch`` is (columns + 2,) with 0 at both ends.
     """
     rows, columns = labels.shape
-    above, here, below = labels[max(i - 1, 0)], labels[i], labels[min(i + 1, rows - 1)]
-    for j in range(columns):
-        scratch[j + 1] = above[j] | here[j] | below[j]
-    for j in range(columns):
-        near[j] = (scratch[j] | scratch[j + 1] | scratch[j + 2]) != 0
+    above, below, one = max(i - 1, 0), min(i + 1, rows - 1), np.uint64(1)
+    for j in range(np.uint64(columns)):
+        scratch[j + one] = labels[above, j] | labels[i, j] | labels[below, j]
+    for j in range(np.uint64(columns)):
+        near[i, j] = (scratch[j] | scratch[j + one] | scratch[j + one + one]) != 0
 
 
 @kernel
@@ -81,52 +83,40 @@ def _list_pixels(
     """Return the pixels of the labels below ``labels`` as `list_runs`."""
     rows, columns = grid_labels.inverse_depth.shape
     height, width = depth.shape
-    # The cells of a row, and the same at full resolution.
-    code, wide_code = np.zeros(columns, np.int16), np.zeros(width, np.int16)
-    wide_w, line = np.zeros(width, np.float32), np.zeros(width, np.int16)
-    scratch, high = (
-        np.zeros(columns + 2, np.int16),
-        np.zeros((len(grid_labels.planes), columns), np.uint8),
-    )
-    runs = np.zeros((4 * width, 3), np.int32)
+    # The cells of a row at full resolution, and what becomes of its pixels.
+    wide_code, wide_w = np.zeros(width, np.int16), np.zeros(width, np.float32)
+    line, marks = np.zeros(width, np.int16), np.zeros(width, np.int16)
     cells, places = np.zeros((2, width), np.int64), np.zeros((3, width), np.float64)
-    marks = np.zeros(width, np.int16)
+    runs, n = np.zeros((4 * width, 3), np.int32), 0
+    code, spans = _code_cells(grid_labels)
     far, shift, scale = np.float32(range_m), (factor - 1) * 0.5, 1.0 / factor
-    n = 0
     for i in range(rows):
-        span = _code_cells(grid_labels, i, scratch, high, code)
-        if span[0] == span[1]:
+        if spans[i, 0] == spans[i, 1]:
             continue
-        x0, x1 = span[0] * factor, span[1] * factor if span[1] < columns else width
-        _widen(code, factor, span, wide_code)
-        _widen(grid_labels.inverse_depth[i], factor, span, wide_w)
+        _widen(code, grid_labels.inverse_depth, i, factor, spans[i], wide_code, wide_w)
+        x0, x1 = spans[i, 0] * factor, spans[i, 1] * factor if spans[i, 1] < columns else width
         for y in range(i * factor, (i + 1) * factor if i + 1 < rows else height):
             if n + width > len(runs):
                 runs = np.concatenate((runs, np.zeros_like(runs)))
-            part = line[x0:x1]
-            _mark(depth[y, x0:x1], wide_w[x0:x1], wide_code[x0:x1], far, part)
-            unsure = 0
-            for k in range(part.size):
-                if part[k] == UNSURE:
-                    cells[0, unsure] = i
-                    cells[1, unsure] = min(row_and_column(x0 + k, factor)[0], columns - 1)
-                    places[0, unsure], places[1, unsure] = (
-                        (x0 + k - shift) * scale,
-                        (y - shift) * scale,
-                    )
-                    places[2, unsure] = depth[y, x0 + k]
-                    unsure += 1
+            _mark(depth, wide_w, wide_code, (y, x0, x1), far, line)
+            unsure = _find_unsure(line, x0, x1, cells)
+            for m in range(unsure):
+                x = cells[1, m]
+                cells[0, m], cells[1, m] = i, min(row_and_column(x, factor)[0], columns - 1)
+                places[0, m], places[1, m] = (x - shift) * scale, (y - shift) * scale
+                places[2, m] = depth[y, x]
             settle_labels(grid_labels, cells, places, unsure, marks)
-            unsure, label, start, first = 0, 0, 0, y * width + x0
-            for k in range(part.size):
-                mark = part[k]
+            unsure, label, x, start, first = 0, 0, x0, x0, y * width
+            while x < x1:
+                mark = line[x]
                 if mark == UNSURE:
                     mark = marks[unsure]
                     unsure += 1
                 if mark != label:
-                    n = _end_run(label, first + start, first + k, runs, n)
-                    label, start = mark, k
-            n = _end_run(label, first + start, first + part.size, runs, n)
+                    n = _end_run(label, first + start, first + x, runs, n)
+                    label, start = mark, x
+                x = _end_of(line, x + 1, x1, label)
+            n = _end_run(label, first + start, first + x1, runs, n)
     listed: tuple[U4, I4] = list_runs(runs[:n], labels)
     return listed
 
@@ -163,74 +153,112 @@ def list_runs(runs: I4, labels: int) -> tuple[U4, I4]:
 
 
 @kernel
-def _code_cells(
-    grid_labels: GridLabels, i: int, scratch: I4, high: U1, code: I4
-) -> tuple[int, int]:
-    """Write what the pixels that fit each cell of a row are.
+def _find_unsure(line: I4, start: int, end: int, cells: I4) -> int:
+    """Write the columns of unsure pixels to ``cells[1]``; return how many there are."""
+    n = 0
+    for x in range(start, end, BLOCK):
+        last, some = min(x + BLOCK, end), False
+        for k in range(np.uint64(x), np.uint64(last)):
+            some |= line[k] == UNSURE  # few blocks have any, and this vectorises
+        for k in range(x, last if some else x):
+            cells[1, n] = k
+            n += line[k] == UNSURE
+    return n
+
+
+@kernel
+def _end_of(line: I4, x: int, end: int, mark: int) -> int:
+    """Return the first place from ``x`` on, before ``end``, where something else is marked."""
+    while x + BLOCK <= end:
+        same = True
+        for k in range(np.uint64(x), np.uint64(x + BLOCK)):
+            same &= line[k] == mark  # this vectorises
+        if not same:
+            break
+        x += BLOCK
+    while x < end and line[x] == mark:
+        x += 1
+    return x
+
+
+@kernel
+def _code_cells(grid_labels: GridLabels) -> tuple[I4, I4]:
+    """Return (rows, columns) what the pixels that fit each cell are, and the spans of these.
 
     That is its label if all of them have it, `UNSURE` if they may have it, `BARE` if it has none,
-    and 0 away from all labels. Returns the first column that is not 0 and the one after the last.
+    and 0 away from all labels.
     """
-    find_near(grid_labels.labels, i, scratch, code)
-    span: tuple[int, int] = span_of(code)
-    part = slice(span[0], span[1])
-    for k in range(len(high)):
-        _find_high(
-            grid_labels.planes[k], i, span[0], grid_labels.inverse_depth[i, part], high[k, part]
-        )
-    labels, filled = grid_labels.labels[i], grid_labels.filled[i]
-    for j in range(span[0], span[1]):
-        label = labels[j]
-        sure = filled[j] | high[np.uint32(grid_labels.plane_ids[np.uint16(label)]), j]
-        what = label if sure else np.int16(UNSURE)
-        what = what if label > 0 else np.int16(BARE)
-        code[j] = what if code[j] != 0 else np.int16(0)
-    return span
+    inv_depth, labels, filled, planes, plane_ids = grid_labels
+    code, spans = unset(labels.shape, np.int16), np.zeros((len(labels), 2), np.int32)
+    scratch = np.zeros(labels.shape[1] + 2, np.int16)
+    high = np.zeros((len(planes), labels.shape[1]), np.uint8)
+    for i in range(len(labels)):
+        find_near(labels, i, scratch, code)
+        spans[i] = span_of(code[i])
+        _find_high(planes, inv_depth, i, spans[i], high)
+        for j in range(np.uint64(spans[i, 0]), np.uint64(spans[i, 1])):
+            label = labels[i, j]
+            sure = filled[i, j] | high[np.uint32(plane_ids[np.uint16(label)]), j]
+            what = label if sure else np.int16(UNSURE)
+            what = what if label > 0 else np.int16(BARE)
+            code[i, j] = what if code[i, j] != 0 else np.int16(0)
+    return code, spans
 
 
 @kernel
-def _find_high(plane: F8, i: int, first: int, inv_depth: F4, high: U1) -> None:
-    """Write whether every pixel that fits a cell rises above a plane.
+def _find_high(planes: F8, inv_depth: F4, i: int, span: I4, high: U1) -> None:
+    """Write whether every pixel that fits a cell rises above each plane.
 
-    The cells are those of row i from column ``first`` on.
+    The cells are those of a span of row i.
     """
     jump, zero, nowhere = np.float32(DISCONTINUITY), np.float32(0), np.float32(1e-3)
-    a, above = np.float32(plane[0]), np.float32(plane[3])
-    # The farthest pixel of a cell is 1.5 cells away.
-    level = np.float32(plane[1] * i + plane[2] + 1.5 * (abs(plane[0]) + abs(plane[1])))
-    base, slope = (
-        np.float32(CLEANUP.fringe * HEIGHT_NOISE),
-        np.float32(CLEANUP.fringe * MIN_HEIGHT_M),
-    )
-    for j in range(inv_depth.size):
-        least = inv_depth[j] - jump if inv_depth[j] - jump > nowhere else nowhere
-        ground = level + a * np.float32(first + j)
-        ground = ground if ground > zero else zero
-        # Heights at the depth 1 / least, times the square of least.
-        high[j] = (least - ground) * least * above > slope * least * least + base
+    base = np.float32(CLEANUP.fringe * HEIGHT_NOISE)
+    slope = np.float32(CLEANUP.fringe * MIN_HEIGHT_M)
+    for k in range(len(planes)):
+        a, above = np.float32(planes[k, 0]), np.float32(planes[k, 3])
+        # The farthest pixel of a cell is 1.5 cells away.
+        farthest = 1.5 * (abs(planes[k, 0]) + abs(planes[k, 1]))
+        level = np.float32(planes[k, 1] * i + planes[k, 2] + farthest)
+        for j in range(np.uint64(span[0]), np.uint64(span[1])):
+            least = inv_depth[i, j] - jump if inv_depth[i, j] - jump > nowhere else nowhere
+            ground = level + a * np.float32(np.int32(j))
+            ground = ground if ground > zero else zero
+            # Heights at the depth 1 / least, times the square of least.
+            high[k, j] = (least - ground) * least * above > slope * least * least + base
 
 
 @kernel
-def _widen(row: F4, factor: int, span: tuple[int, int], wide: F4) -> None:
-    """Write the cells of a part of a row to their pixels; those beyond the last cell are its."""
-    here, part = row[span[0] : span[1]], wide[span[0] * factor : span[1] * factor]
+def _widen(
+    code: I4, inv_depth: F4, i: int, factor: int, span: I4, wide_code: I4, wide_w: F4
+) -> None:
+    """Write a span of a row of cells to their pixels; those beyond the last cell are its."""
+    start, end, two, one = np.uint64(span[0]), np.uint64(span[1]), np.uint64(2), np.uint64(1)
     if factor == 2:  # the usual case, in a form that vectorises
-        for j in range(here.size):
-            part[2 * j] = part[2 * j + 1] = here[j]
+        for j in range(start, end):
+            wide_code[two * j] = wide_code[two * j + one] = code[i, j]
+        for j in range(start, end):
+            wide_w[two * j] = wide_w[two * j + one] = inv_depth[i, j]
     else:
-        for j in range(here.size):
-            for k in range(factor):
-                part[j * factor + k] = here[j]
-    if span[1] == row.size:
-        wide[row.size * factor :] = row[-1]
+        for j in range(span[0], span[1]):
+            for x in range(j * factor, (j + 1) * factor):
+                wide_code[x], wide_w[x] = code[i, j], inv_depth[i, j]
+    for x in range(span[1] * factor, wide_w.size if span[1] == code.shape[1] else 0):
+        wide_code[x], wide_w[x] = code[i, -1], inv_depth[i, -1]
 
 
 @kernel
-def _mark(depth: F4, inv_depth: F4, code: I4, range_m: float, marks: I4) -> None:
-    """Write the labels of pixels (n,), `UNSURE` where it takes more to tell."""
+def _mark(
+    depth: F4, inv_depth: F4, code: I4, run: tuple[int, int, int], range_m: float, marks: I4
+) -> None:
+    """Write the labels of a run of pixels, `UNSURE` where it takes more to tell.
+
+    ``run`` is a row, its first column and that after its last; ``inv_depth`` and ``code`` are
+    those of the cells, by column. This vectorises.
+    """
     least, zero, unsure, bare = np.float32(NEAREST_M), np.int16(0), np.int16(UNSURE), np.int16(BARE)
-    for x in range(depth.size):
-        z = depth[x]
+    y, start, end = run
+    for x in range(np.uint64(start), np.uint64(end)):
+        z = depth[y, x]
         fitting = code[x] if code[x] != bare else zero
         other = unsure if code[x] != zero else zero
         mark = fitting if _fits(inv_depth[x], z) else other

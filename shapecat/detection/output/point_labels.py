@@ -70,7 +70,7 @@ def _mark_near(labels: I4) -> U1:
     near = np.zeros(labels.shape, np.uint8)
     scratch = np.zeros(labels.shape[1] + 2, np.int16)
     for i in range(labels.shape[0]):
-        find_near(labels, i, scratch, near[i])
+        find_near(labels, i, scratch, near)
     return near
 
 

@@ -1,13 +1,13 @@
 """Scene builder: planes and objects as records in the sensor frame."""
 
-import math
 from collections.abc import Sequence
+from itertools import count
 
 import numpy as np
 
 from shapecat.arrays import F4, I4, U4, Bool, freeze
 from shapecat.config import DetectionSettings
-from shapecat.detection.depth_grid import BORDER_SHARE, DepthGrid
+from shapecat.detection.depth_grid import DepthGrid, find_borders
 from shapecat.detection.output.measurements import ObjectMeasurements
 from shapecat.detection.output.settings import OUTPUT
 from shapecat.detection.planes.extent import SupportingPlane, outline_corners
@@ -39,7 +39,7 @@ def build_scene(
     Lists beyond the labels are objects that the view does not show; their boxes are measured on
     ``points`` (n, 3), view frame.
     """
-    measured, count = found.measured, found.plane_ids.size - 1
+    measured, seen = found.measured, found.plane_ids.size - 1
     numbers = _numbers_of_seen(found.supports)
     plane_id, supported_by, hidden = (
         [numbers[k] for k in found.plane_ids[1:].tolist()],
@@ -50,22 +50,21 @@ def build_scene(
     cut |= measured.last
     kept = _kept(grid, measured, indices, settings.min_points, image=points is None)
     # What goes on beyond the image is rather furniture where no plane is seen below it.
-    kept = [k for k in kept if k >= count or plane_id[k] is not None or not cut[k]]
+    kept = [k for k in kept if k >= seen or plane_id[k] is not None or not cut[k]]
     position = {k + 1: n for n, k in enumerate(kept)}
     boxes = _boxes(found, indices, points, sensor_from_view)
     candidates = []
     for k in kept:
-        seen = k < count
-        on = position.get(supported_by[k]) if seen else None
+        on = position.get(supported_by[k]) if k < seen else None
         candidates.append(
             Candidate(
                 indices=indices[k],
                 box=boxes[k],
-                plane=plane_id[k] if seen else None,
+                plane=plane_id[k] if k < seen else None,
                 on_candidate=on,
                 support_m=0.0 if on is None else float(measured.support_m[k]),
-                touches_border=seen and bool(cut[k]),
-                occluded=seen and hidden[k],
+                touches_border=k < seen and bool(cut[k]),
+                occluded=k < seen and hidden[k],
             )
         )
     seen_planes = [s for s in found.supports if s.area_m2 > 0]
@@ -75,10 +74,8 @@ def build_scene(
 
 def _numbers_of_seen(supports: Sequence[SupportingPlane]) -> list[int | None]:
     """Return the numbers of the planes that are seen; one that is assumed has none."""
-    seen = np.cumsum([support.area_m2 > 0 for support in supports]) - 1
-    return [
-        int(k) if support.area_m2 > 0 else None for k, support in zip(seen, supports, strict=True)
-    ]
+    numbers = count()
+    return [next(numbers) if support.area_m2 > 0 else None for support in supports]
 
 
 def _kept(
@@ -112,23 +109,17 @@ def _boxes(
 
 def _cut(grid: DepthGrid, measured: ObjectMeasurements) -> Bool:
     """Return whether each object reaches the border of the image, or of its samples near it."""
-    cut, near = np.zeros(len(measured.low), bool), max(1, round(2 / grid.factor))
-    for axis, lines in enumerate((grid.inverse_depth, grid.inverse_depth.T)):
-        first = _begin(lines, near) + near
-        last = len(lines) - 1 - _begin(lines[::-1], near) - near
-        cut |= (measured.low[:, axis] < first) | (measured.high[:, axis] > last)
+    near, shape = max(1, round(2 / grid.factor)), grid.inverse_depth.shape
+    cut = np.zeros(len(measured.low), bool)
+    for side, (blank, extent) in enumerate(find_borders(grid.inverse_depth, near).tolist()):
+        axis = side // 2
+        # The top of a tall object with nothing behind it is no border.
+        first = near + (blank if extent > OUTPUT.straight_share * shape[1 - axis] else 0)
+        if side % 2 == 0:
+            cut |= measured.low[:, axis] < first
+        else:
+            cut |= measured.high[:, axis] > shape[axis] - 1 - first
     return cut
-
-
-def _begin(lines: F4, near: int) -> int:
-    """Return at which line of samples (lines, length) they begin, if more than one object does.
-
-    The top of a tall object with nothing behind it is no border.
-    """
-    some = (lines[: math.ceil(BORDER_SHARE * len(lines))] > 0).any(axis=1)
-    first = int(some.argmax())
-    seen = np.flatnonzero((lines[first : first + near] > 0).any(axis=0))
-    return first if seen.size and np.ptp(seen) > OUTPUT.straight_share * lines.shape[1] else 0
 
 
 def _cut_cloud(grid: DepthGrid, found: Segmentation, sensor_from_view: Pose) -> Bool:

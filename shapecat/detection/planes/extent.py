@@ -27,6 +27,7 @@ DIRECTIONS = 16
 """Sides of the convex outline of a plane."""
 ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 COS, SIN = np.cos(ANGLES), np.sin(ANGLES)
+NEXT = (np.arange(DIRECTIONS) + 1) % DIRECTIONS
 BESIDE = 3
 """Cells from a sample to those over which its surface was seen to go on."""
 
@@ -130,7 +131,8 @@ def _extent_of(grid: DepthGrid, plane: F8, normal: F8, ends: I4) -> F8:
 def outline_corners(plane: SupportingPlane) -> F8:
     """Return the corners (k, 3) of the convex outline, sensor frame, in order, without repeats."""
     # Neighbouring sides x cos + y sin = extent meet at a corner.
-    along = (np.roll(plane.extent, -1) - plane.extent * COS[1]) / SIN[1]
-    x, y = plane.extent * COS - along * SIN, plane.extent * SIN + along * COS
-    level = np.stack([x, y, np.full(DIRECTIONS, plane.offset)], axis=1)
+    along = (plane.extent[NEXT] - plane.extent * COS[1]) / SIN[1]
+    level = np.full((DIRECTIONS, 3), plane.offset)
+    level[:, 0] = plane.extent * COS - along * SIN
+    level[:, 1] = plane.extent * SIN + along * COS
     return np.asarray(level @ gravity_rotation(plane.up))

@@ -107,20 +107,19 @@ def _assign(
     # A plane seen edge on has heights between the steps of the sensor; so no division is unsafe.
     for i in range(rows):
         base = np.float32(plane[1] * i + plane[2])
-        values, plane_ids, heights = inv_depth[i], plane_id[i], height[i]
         some = False
-        for j in range(columns):
-            v = values[j]
+        for j in range(np.uint64(columns)):
+            v = inv_depth[i, j]
             z = one / v if v > zero else zero
             h = (v - (a * x[j] + base)) * z * scale
             gate = least + noise * z * z
-            use = (v > zero) & (h > -gate) & (h < high) & (plane_ids[j] == 0)
+            use = (v > zero) & (h > -gate) & (h < high) & (plane_id[i, j] == 0)
             line[j] = h if use else below
             slack[j] = zero if h > gate else beyond * v
             some |= use
         if not some:
             continue
-        left, right, farthest, nearest = _bounds(line, values)
+        left, right, farthest, nearest = _bounds(line, inv_depth, i)
         for k in range(DIRECTIONS // 2):
             step, first = np.float32(sides[k, 0]), np.float32(sides[k, 1] * i + sides[k, 2])
             far, near = (
@@ -132,21 +131,23 @@ def _assign(
             scratch = min(far * farthest, far * nearest), min(near * farthest, near * nearest)
             if max(ends[0], ends[1]) <= scratch[0] and -min(ends[0], ends[1]) <= scratch[1]:
                 continue
-            for j in range(columns):
-                v, more = values[j], slack[j]
+            for j in range(np.uint64(columns)):
+                v, more = inv_depth[i, j], slack[j]
                 t = step * x[j] + first
                 within = (t <= far * v + more) & (-t <= near * v + more)
                 line[j] = line[j] if within else below
-        for j in range(columns):
+        for j in range(np.uint64(columns)):
             mine = above if slack[j] == zero else surface
-            plane_ids[j] = mine if line[j] > below else plane_ids[j]
-        for j in range(columns):
-            heights[j] = line[j] if line[j] > below else heights[j]
+            plane_id[i, j] = mine if line[j] > below else plane_id[i, j]
+        for j in range(np.uint64(columns)):
+            height[i, j] = line[j] if line[j] > below else height[i, j]
 
 
 @kernel
-def _bounds(line: F4, values: F4) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Return the first and last cell of a row that have a height, and bounds of their values."""
+def _bounds(
+    line: F4, inv_depth: F4, i: int
+) -> tuple[np.float32, np.float32, np.float32, np.float32]:
+    """Return the first and last cell of a row with a height, and bounds of their values."""
     left, right = 0, line.size - 1
     while line[left] <= OUT:
         left += 1
@@ -155,8 +156,8 @@ def _bounds(line: F4, values: F4) -> tuple[np.float32, np.float32, np.float32, n
     out, fine, one = np.float32(OUT), np.float32(FINE), np.float32(1)
     largest, smallest = np.int32(2**30), np.int32(0)
     least, most = largest, smallest
-    for k in range(line.size):  # integers, whose bounds vectorise
-        v, use = np.int32(values[k] * fine), line[k] > out
+    for k in range(np.uint64(line.size)):  # integers, whose bounds vectorise
+        v, use = np.int32(inv_depth[i, k] * fine), line[k] > out
         low, high = (v if use else largest), (v if use else smallest)
         least, most = (low if low < least else least), (high if high > most else most)
     farthest, nearest = np.float32(least) / fine, (np.float32(most) + one) / fine

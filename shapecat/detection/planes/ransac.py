@@ -176,16 +176,15 @@ def ransac_plane(
 @kernel
 def _propose(samples: DepthSamples, trials: F8, t: int, plane: F8) -> bool:
     """Write the plane through three samples; return whether they are far enough apart."""
-    j, i, w, n = samples.j, samples.i, samples.inverse_depth, samples.inverse_depth.size
+    n = samples.inverse_depth.size
     p, q, r = int(trials[t, 0] * n), int(trials[t, 1] * n), int(trials[t, 2] * n)
-    j1, i1, w1 = j[q] - j[p], i[q] - i[p], float(w[q]) - w[p]
-    j2, i2, w2 = j[r] - j[p], i[r] - i[p], float(w[r]) - w[p]
+    j, i, w = samples.j[p], samples.i[p], samples.inverse_depth[p]
+    j1, i1, w1 = samples.j[q] - j, samples.i[q] - i, float(samples.inverse_depth[q]) - w
+    j2, i2, w2 = samples.j[r] - j, samples.i[r] - i, float(samples.inverse_depth[r]) - w
     double = i1 * j2 - i2 * j1
-    if abs(double) < LEAST_DOUBLE_AREA:
-        return False
     plane[0], plane[1] = (i1 * w2 - i2 * w1) / double, (j2 * w1 - j1 * w2) / double
-    plane[2] = w[p] - plane[0] * j[p] - plane[1] * i[p]
-    return True
+    plane[2] = w - plane[0] * j - plane[1] * i
+    return bool(abs(double) >= LEAST_DOUBLE_AREA)
 
 
 @kernel

@@ -34,9 +34,10 @@ class SurfaceGraph(NamedTuple):
     Attributes
     ----------
     local_plane : (rows, 3, columns) float32: inverse depth of the fitted plane at the cell, and its
-        change per column and per row; 0 where there is no fit. Far from object cells nothing is
-        written.
-    normal : (rows, 3, columns) float32 unit normal towards the camera, sensor frame, or 0.
+        change per column and per row. The inverse depth is 0 where there is no fit, and the rest
+        as well in object cells; elsewhere, and far from object cells, nothing is written.
+    normal : (rows, 3, columns) float32 unit normal towards the camera, sensor frame, where
+        there is a local plane; 0 in other object cells.
     links : (rows, columns) uint8: `RIGHT` and `DOWN` where the surface goes on to that neighbour.
     concavity : (rows, columns) uint8: the largest concave angle across the cell, degrees.
     spans : (rows, 2) int32: columns of the first object cell of each row and after the last; 0, 0
@@ -63,7 +64,7 @@ def connect_surfaces(grid: DepthGrid, heights: HeightMap) -> SurfaceGraph:
     inv_depth, intrinsics, plane_id = grid.inverse_depth, grid.intrinsics, heights.plane_id
     spans = spans_of(plane_id)
     columns = inv_depth.shape[1]
-    local_plane, normal = _cleared(spans, columns), _cleared(spans, columns)
+    local_plane, normal = _blank(spans, columns)
     fit_local_planes(inv_depth, intrinsics, plane_id, spans, local_plane, normal)
     links = np.zeros(inv_depth.shape, np.uint8)
     _link(inv_depth, plane_id, spans, local_plane, links)
@@ -73,59 +74,37 @@ def connect_surfaces(grid: DepthGrid, heights: HeightMap) -> SurfaceGraph:
 
 
 @kernel
-def _cleared(spans: I4, columns: int) -> F4:
-    """Return an array (rows, 3, columns) that is 0 as far from object cells as is looked."""
+def _blank(spans: I4, columns: int) -> F4:
+    """Return an array (2, rows, 3, columns) without local planes as far as is looked."""
     rows = len(spans)
-    fits: F4 = unset((rows, 3, columns), np.float32)
+    fits: F4 = unset((2, rows, 3, columns), np.float32)
     for i in range(rows):
         start, end = columns, 0
         for y in range(max(i - BASE, 0), min(i + BASE + 1, rows)):
             if spans[y, 0] < spans[y, 1]:
                 start, end = min(start, spans[y, 0]), max(end, spans[y, 1])
-        start, end = (max(start - BASE, 0), min(padded(start, end) + BASE, columns))
-        for d in range(3):
-            row = fits[i, d]
-            for j in range(start, end):
-                row[j] = 0
+        for j in range(max(start - BASE, 0), min(padded(start, end) + BASE, columns)):
+            fits[0, i, 0, j] = 0
     return fits
 
 
 @kernel
 def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) -> None:
     """Link neighbours that differ by less than a jump, or as either local plane tells."""
-    rows = inv_depth.shape[0]
+    rows, columns = inv_depth.shape
+    depths, owners = inv_depth.reshape(-1), plane_id.reshape(-1)
+    planes, bits = local_plane.reshape(-1), links.reshape(-1)
     for i in range(rows):
-        start, end = spans[i]
+        start, end = spans[i, 0], spans[i, 1]
         if start == end:
             continue
-        here, there = slice(start, end - 1), slice(start + 1, end)
-        _link_some(
-            plane_id[i, here],
-            plane_id[i, there],
-            inv_depth[i, here],
-            inv_depth[i, there],
-            local_plane[i, 0, here],
-            local_plane[i, 0, there],
-            local_plane[i, 1, here],
-            local_plane[i, 1, there],
-            np.int64(RIGHT),
-            links[i, here],
-        )
+        cell, fit = i * columns + start, 3 * i * columns + start
+        run, right = (cell, fit, end - 1 - start), (1, 1, columns)
+        _link_some(owners, depths, planes, run, right, np.int64(RIGHT), bits)
         if i + 1 < rows:
-            here = slice(start, end)
-            _link_some(
-                plane_id[i, here],
-                plane_id[i + 1, here],
-                inv_depth[i, here],
-                inv_depth[i + 1, here],
-                local_plane[i, 0, here],
-                local_plane[i + 1, 0, here],
-                local_plane[i, 2, here],
-                local_plane[i + 1, 2, here],
-                np.int64(DOWN),
-                links[i, here],
-            )
-        _part_steps(inv_depth, plane_id, i, start, end, links[i])
+            run, below = (cell, fit, end - start), (columns, 3 * columns, 2 * columns)
+            _link_some(owners, depths, planes, run, below, np.int64(DOWN), bits)
+        _part_steps(inv_depth, plane_id, i, start, end, links)
 
 
 @kernel
@@ -138,13 +117,13 @@ def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links
     one side has the slope.
     """
     some = False
-    for j in range(links.size):
-        some |= links[j] > (RIGHT | DOWN)  # few rows have any; this vectorises
+    for j in range(np.uint64(start), np.uint64(end)):
+        some |= links[i, j] > (RIGHT | DOWN)  # few rows have any; this vectorises
     if not some:
         return
     for j in range(start, end):
         for bit in (RIGHT, DOWN):
-            if not links[j] & BENT * bit:
+            if not links[i, j] & BENT * bit:
                 continue
             di, dj = (0, 1) if bit == RIGHT else (1, 0)
             i0, j0, i1, j1 = (i - REACH * di, j - REACH * dj, i + di, j + dj)
@@ -158,33 +137,41 @@ def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links
             after = abs(step - (inv_depth[i2, j2] - inv_depth[i1, j1]) / REACH)
             least, most = min(before, after), max(before, after)
             if least >= SEGMENTATION.sure * DISCONTINUITY and most >= DISCONTINUITY:
-                links[j] &= ~bit
-        links[j] &= RIGHT | DOWN
+                links[i, j] &= ~bit
+        links[i, j] &= RIGHT | DOWN
 
 
 @kernel(fast=True)
 def _link_some(
     plane_id: I4,
-    owner1: I4,
     inv_depth: F4,
-    w1: F4,
-    level: F4,
-    level1: F4,
-    slope: F4,
-    slope1: F4,
+    planes: F4,
+    run: tuple[int, int, int],
+    steps: tuple[int, int, int],
     bit: int,
     links: U1,
 ) -> None:
-    """Link some cells of a row with their neighbours on one side."""
+    """Link a run of cells with their neighbours on one side; this vectorises.
+
+    Parameters
+    ----------
+    run : its first cell, where the local planes of that begin, and the number of cells.
+    steps : from a cell to its neighbour, from the one's local plane to the other's, and from the
+        inverse depth of a local plane to its slope that way.
+    """
     zero, jump = np.float32(0), np.float32(DISCONTINUITY)
-    for k in range(links.size):
-        v, v1, t, t1 = inv_depth[k], w1[k], level[k], level1[k]
+    cell, fit, step = np.uint64(run[0]), np.uint64(run[1]), np.uint64(steps[0])
+    along, slope = np.uint64(steps[1]), np.uint64(steps[2])
+    for k in range(np.uint64(max(run[2], 0))):
+        p, a = cell + k, fit + k
+        q, b = p + step, a + along
+        v, v1, t, t1 = inv_depth[p], inv_depth[q], planes[a], planes[b]
         level_on = abs(v - v1) < jump
-        bent = (t > zero) & (abs(t + slope[k] - v1) < jump)
-        bent |= (t1 > zero) & (abs(t1 - slope1[k] - v) < jump)
-        same = (plane_id[k] > 0) & (plane_id[k] == owner1[k])
+        bent = (t > zero) & (abs(t + planes[a + slope] - v1) < jump)
+        bent |= (t1 > zero) & (abs(t1 - planes[b + slope] - v) < jump)
+        same = (plane_id[p] > 0) & (plane_id[p] == plane_id[q])
         link = np.uint8(bit) if level_on else np.uint8(bit + BENT * bit) if bent else np.uint8(0)
-        links[k] |= link if same else np.uint8(0)
+        links[p] |= link if same else np.uint8(0)
 
 
 @kernel

@@ -3,15 +3,19 @@
 import numpy as np
 
 from shapecat.arrays import F4, I4, U1, Bool
-from shapecat.detection.connected_components import DOWN, RIGHT, connected_components
+from shapecat.detection.connected_components import DOWN, RIGHT, connected_components, spans_of
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
 from shapecat.detection.segmentation.settings import SEGMENTATION
 from shapecat.jit import kernel, unset
 
-__all__ = ["relabel", "relabel_above", "watershed"]
+__all__ = ["relabel_above", "watershed"]
 
+NO_EDGE = 255
+"""Concave angle that no edge has, degrees."""
 BUCKETS = 256 // SEGMENTATION.bucket_deg
+LEFT, UP = 4, 8
+"""Bits beside `RIGHT` and `DOWN`: ways to the other two neighbours."""
 
 
 def watershed(heights: HeightMap, graph: SurfaceGraph, *, concave: bool) -> tuple[I4, int]:
@@ -22,20 +26,18 @@ def watershed(heights: HeightMap, graph: SurfaceGraph, *, concave: bool) -> tupl
     part segments.
     """
     labels = np.zeros(heights.plane_id.shape, np.int16)
-    n = _label_parts(heights.plane_id, graph, SEGMENTATION.edge_deg if concave else 256, labels, 0)
+    edge_deg = SEGMENTATION.edge_deg if concave else NO_EDGE
+    n = _label_parts(heights.plane_id, graph, edge_deg, labels, 0)
     _flood_labels(graph.links, graph.concavity, graph.spans, labels)
-    return labels, _label_parts(heights.plane_id, graph, 256, labels, n)
+    return labels, _label_parts(heights.plane_id, graph, NO_EDGE, labels, n)
 
 
 @kernel
 def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n: int) -> int:
     """Label connected unlabelled cells with smaller angles, from ``n`` + 1 on; return the last."""
-    spans, component = graph.spans, unset(labels.shape, np.int32)
     inside: Bool = np.zeros(labels.shape, np.bool_)
-    for i in range(len(spans)):
-        for j in range(spans[i, 0], spans[i, 1]):
-            inside[i, j] = (plane_id[i, j] > 0) & (labels[i, j] == 0)
-            inside[i, j] &= graph.concavity[i, j] < edge_deg
+    _find_unlabelled(plane_id, graph.concavity, graph.spans, edge_deg, labels, inside)
+    spans, component = spans_of(inside.view(np.int8)), unset(labels.shape, np.int32)
     sizes = connected_components(inside, graph.links, spans, component)
     names = np.zeros(sizes.size, np.int16)
     for k in range(1, sizes.size):
@@ -44,66 +46,78 @@ def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n
             names[k] = n
     for i in range(len(spans)):
         for j in range(spans[i, 0], spans[i, 1]):
-            if inside[i, j]:
-                labels[i, j] = names[component[i, j]]
+            labels[i, j] |= names[component[i, j]]
     return n
 
 
 @kernel
+def _find_unlabelled(
+    plane_id: I4, concavity: U1, spans: I4, edge_deg: int, labels: I4, inside: Bool
+) -> None:
+    """Mark the object cells without a label whose angles are smaller; this vectorises."""
+    columns, most = labels.shape[1], np.uint8(edge_deg)
+    plane_ids, angle = plane_id.reshape(-1), concavity.reshape(-1)
+    flat, marks = labels.reshape(-1), inside.reshape(-1)
+    for i in range(len(spans)):
+        first, end = np.uint64(i * columns + spans[i, 0]), np.uint64(i * columns + spans[i, 1])
+        for p in range(first, end):
+            marks[p] = (plane_ids[p] > 0) & (flat[p] == 0) & (angle[p] < most)
+
+
+@kernel
 def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4) -> None:
-    """Grow the labels over links, cells with small concave angles first."""
-    columns = labels.shape[1]
-    flat_links, angle, flat = links.reshape(-1), concavity.reshape(-1), labels.reshape(-1)
-    queue = unset((3, max(flat.size, BUCKETS)), np.int32)
-    queue[0, :BUCKETS] = -1
-    for i in range(labels.shape[0]):
+    """Grow the labels over links, cells with small concave angles first.
+
+    There is a queue for each range of angles: ``following`` holds the next cell of each cell, -1
+    behind the last one. Behind the cells are the heads of the queues.
+    """
+    columns, size = labels.shape[1], labels.size
+    angle, flat = concavity.reshape(-1), labels.reshape(-1)
+    ways = unset(size, np.uint8)
+    _find_ways(links.reshape(-1), flat, spans, columns, ways)
+    following = unset(size + BUCKETS, np.int32)
+    following[size:] = -1
+    last = np.arange(size, size + BUCKETS)
+    for i in range(len(spans)):
         for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
-            some = False
-            for d in range(4 if flat[p] > 0 else 0):
-                q = _linked(flat_links, p, d, columns)
-                some |= q >= 0 and flat[q] <= 0
-            if some:
-                _append(queue, 0, p)
-    now = 0
-    while now < BUCKETS:
-        p = queue[0, now]
-        if p < 0:
-            now += 1
+            if ways[p] > 0 and flat[p] > 0:
+                following[last[0]], last[0], following[p] = p, p, -1
+    for bucket in range(BUCKETS):
+        p = following[size + bucket]
+        while p >= 0:
+            for d in range(4):
+                if not ways[p] >> d & 1:
+                    continue
+                q = p + (columns if d & 1 else 1) * (1 if d < 2 else -1)
+                if flat[q] <= 0:
+                    flat[q] = flat[p]
+                    at = max(bucket, angle[q] // SEGMENTATION.bucket_deg)
+                    following[last[at]], last[at], following[q] = q, q, -1
+            p = following[p]
+
+
+@kernel
+def _find_ways(links: U1, labels: I4, spans: I4, columns: int, ways: U1) -> None:
+    """Write in which directions each cell (n,) is linked with one without a label: bits.
+
+    The loops vectorise: unsigned indices cannot count from the end.
+    """
+    one, below = np.uint64(1), np.uint64(columns)
+    right, down, left, up = np.uint8(RIGHT), np.uint8(DOWN), np.uint8(LEFT), np.uint8(UP)
+    none = np.uint8(0)
+    for i in range(len(spans)):
+        first, end = np.uint64(i * columns + spans[i, 0]), np.uint64(i * columns + spans[i, 1])
+        if first == end:
             continue
-        queue[0, now] = queue[2, p]
-        for d in range(4):
-            q = _linked(flat_links, p, d, columns)
-            if q >= 0 and flat[q] <= 0:
-                flat[q] = flat[p]
-                _append(queue, max(now, angle[q] // SEGMENTATION.bucket_deg), q)
-
-
-@kernel
-def _linked(links: U1, p: int, d: int, columns: int) -> int:
-    """Return the neighbour of a flat cell on the right, below, left or above; -1 if not linked."""
-    step, way = (columns, DOWN) if d & 1 else (1, RIGHT)
-    from_ = p if d < 2 else p - step
-    if from_ < 0 or not links[from_] & way:
-        return -1
-    return p + step if d < 2 else from_
-
-
-@kernel
-def _append(queue: I4, bucket: int, p: int) -> None:
-    """Append a flat cell to a bucket of a queue: rows are the first of each, the last, the next."""
-    if queue[0, bucket] < 0:
-        queue[0, bucket] = p
-    else:
-        queue[2, queue[1, bucket]] = p
-    queue[1, bucket], queue[2, p] = p, -1
-
-
-@kernel
-def relabel(labels: I4, spans: I4, names: I4) -> None:
-    """Give labels (rows, columns) their new names (n,), in place; that of 0 is 0."""
-    for i in range(labels.shape[0]):
-        for j in range(spans[i, 0], spans[i, 1]):
-            labels[i, j] = names[labels[i, j]]
+        ways[end - one] = none
+        for p in range(first, end - one):
+            ways[p] = links[p] & right if labels[p + one] <= 0 else none
+        for p in range(first + one, end):
+            ways[p] |= left if (links[p - one] & right > 0) & (labels[p - one] <= 0) else none
+        for p in range(first, end if i + 1 < len(spans) else first):
+            ways[p] |= links[p] & down if labels[p + below] <= 0 else none
+        for p in range(first, end if i > 0 else first):
+            ways[p] |= up if (links[p - below] & down > 0) & (labels[p - below] <= 0) else none
 
 
 @kernel

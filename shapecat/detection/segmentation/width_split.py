@@ -41,6 +41,7 @@ class Outlines(NamedTuple):
     counts: I4
 
 
+@kernel
 def split_at_width_changes(
     grid: DepthGrid, heights: HeightMap, graph: SurfaceGraph, labels: I4, up: F8, n: int
 ) -> int:
@@ -52,22 +53,15 @@ def split_at_width_changes(
     """
     side = lateral_axis(up)
     outlines = _outlines_of(grid, heights.height, graph.spans, labels, n, side)
-    cuts = np.zeros((n + 1, BANDS), np.bool_)
-    _find_cuts(grid, outlines, side, cuts)
-    before = rest = 0
-    for p, band in np.argwhere(cuts):
-        n += 1
-        rest = rest if p == before else p  # what the cuts below have left
-        relabel_above(labels, graph.spans, heights.height, rest, band * BAND_M, n)
-        before, rest = p, n
-    return n
-
-
-@kernel
-def _find_cuts(grid: DepthGrid, outlines: Outlines, side: F8, cuts: Bool) -> None:
-    """Mark the bands (n + 1, BANDS) below which each of the labels 1..n is to be cut."""
-    for p in range(1, len(cuts)):
-        _cut_label(grid, outlines, p, side, cuts)
+    cuts, fresh = np.zeros(BANDS, np.bool_), n
+    for p in range(1, n + 1):
+        rest = p  # what the cuts below have left
+        for band in range(BANDS if _find_cuts(grid, outlines, p, side, cuts) else 0):
+            if cuts[band]:
+                fresh += 1
+                relabel_above(labels, graph.spans, heights.height, rest, band * BAND_M, fresh)
+                rest = fresh
+    return fresh
 
 
 @kernel
@@ -103,9 +97,8 @@ def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, sid
 
 
 @kernel
-def _cut_label(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool) -> None:
-    """Mark the bands below which a label is to be cut."""
-    steps = np.zeros(BANDS, np.float64)
+def _find_cuts(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool) -> bool:
+    """Mark the bands (BANDS,) below which label ``p`` is to be cut; return whether it is."""
     first, last, seen, above = 0, 0, 0, 0
     for band in range(BANDS):
         cells = outlines.counts[p, band]
@@ -113,7 +106,9 @@ def _cut_label(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool
             first, last = (band if seen == 0 else first), band
             seen, above = seen + 1, above + cells
     if seen < 2 * BESIDE:
-        return
+        return False
+    steps, some = np.zeros(BANDS, np.float64), False
+    cuts[:] = False
     for band in range(first + BESIDE, last - BESIDE + 2):
         steps[band] = _step_at(grid, outlines, p, band, side)
     below = 0  # cells since the last cut; ``above``: from here on
@@ -122,10 +117,11 @@ def _cut_label(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool
         for k in range(band - BESIDE if largest else 0, band + BESIDE + 1 if largest else 0):
             largest &= steps[band] >= steps[k]
         if largest and min(below, above) >= SEGMENTATION.part_cells:
-            cuts[p, band] = True
+            cuts[band] = some = True
             below = 0
         below += outlines.counts[p, band]
         above -= outlines.counts[p, band]
+    return some
 
 
 @kernel
