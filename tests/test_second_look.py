@@ -32,6 +32,8 @@ TOPIC = "/depth/image_raw"
 COUNT = 60
 DISTURBED = (7, 16, 17, 31, 45, 52)
 MANY = tuple(range(3, COUNT, 4))
+SHORTLY, BRIEF = 25, tuple(range(30, 36))
+"""The label of an object, and the only frames, a tenth of all, that show it where it is brief."""
 BLOCKS = Settings(reuse_frames=4)
 """Shorter ones than usual, so that there are several to look at again."""
 LEANING = Pose(np.array([[1.0, 0, 0], [0, 0.28, -0.96], [0, 0.96, 0.28]]), np.zeros(3))
@@ -64,14 +66,24 @@ def disturb(depth: Any, labels: Any) -> Any:
 
 
 def items(
-    *, moving: bool, disturbed: tuple[int, ...] = (), poses: bool = True, fixed: Pose | None = None
+    *,
+    moving: bool,
+    disturbed: tuple[int, ...] = (),
+    poses: bool = True,
+    fixed: Pose | None = None,
+    brief: bool = False,
 ) -> Iterator[tuple[str, int, Any]]:
-    """Yield the messages of a recording; ``fixed`` turns the fixed frame."""
+    """Yield the messages of a recording; ``fixed`` turns the fixed frame.
+
+    With ``brief`` the depth of one object is there in the frames `BRIEF` alone.
+    """
     yield "/tf_static", EPOCH, MAKE.transforms([("camera_link", OPTICAL, LINK_FROM_OPTICAL)], EPOCH)
     seen = [*views(moving), *views(moving)[-2:0:-1]]
     for k in range(COUNT):
         depth, labels, camera, pose = seen[k % len(seen)]
         stamp = EPOCH + k * PERIOD
+        if brief and k not in BRIEF:
+            depth = np.where(labels == SHORTLY, np.float32(0), depth)
         if poses:
             turned = (
                 pose
@@ -117,15 +129,17 @@ def share_found(out: Path, plain: Path) -> float:
 
 def assert_same_tracks(one: Path, other: Path, fixed: Pose = IDENTITY) -> None:
     """Each object is one track in both, of one category, in one place, while it is undisturbed."""
-    tracks = []
-    for out in (one, other):
-        with (out / "tracks.csv").open(newline="") as file:
-            tracks.append(list(csv.DictReader(file)))
+    tracks = tracks_of(one), tracks_of(other)
     assert len(tracks[0]) == len(tracks[1]) >= 5
     for a in tracks[0]:
         (b,) = [t for t in tracks[1] if np.linalg.norm(place(t) - fixed.rotation @ place(a)) < 0.03]
         assert a["category"] == b["category"]
         assert abs(int(a["frames"]) - int(b["frames"])) <= len(DISTURBED)
+
+
+def tracks_of(out: Path) -> list[dict[str, str]]:
+    with (out / "tracks.csv").open(newline="") as file:
+        return list(csv.DictReader(file))
 
 
 def place(track: dict[str, str]) -> Any:
@@ -149,6 +163,27 @@ def test_a_recording_of_which_a_tenth_is_disturbed_loses_no_track(
     monkeypatch.setattr("shapecat.runs.perceiving.frames_to_revise", lambda _tables: {})
     once = run(tmp_path / "once.mcap", items(moving=moving, poses=False, disturbed=DISTURBED))
     assert share_found(out, plain) > share_found(once, plain) + 0.2
+
+
+def test_disturbed_frames_in_a_row_end_no_track(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Nor is what is there in these alone lost; without the second look all tracks end."""
+
+    def recording(disturbed: tuple[int, ...]) -> Iterator[Any]:
+        return items(moving=False, poses=False, brief=True, disturbed=disturbed)
+
+    plain = run(tmp_path / "plain.mcap", recording(()))
+    out = run(tmp_path / "spoilt.mcap", recording(BRIEF))
+    monkeypatch.setattr("shapecat.runs.perceiving.frames_to_revise", lambda _tables: {})
+    once = run(tmp_path / "once.mcap", recording(BRIEF))
+
+    assert revised(out) == [*BRIEF]
+    assert_same_tracks(plain, out)
+    lengths = [int(track["frames"]) for track in tracks_of(out)]
+    assert sorted(lengths) == [len(BRIEF), *[COUNT] * (len(lengths) - 1)]
+    assert max(int(track["frames"]) for track in tracks_of(once)) <= BRIEF[0]
+    assert len(tracks_of(once)) > len(lengths)
 
 
 def test_a_fixed_frame_whose_z_is_not_up_is_dropped(tmp_path: Path) -> None:
