@@ -174,6 +174,18 @@ def test_views_agree_on_one_size_whatever_their_quarter_turns() -> None:
         assert overlap(true, mine) > 0.9
 
 
+def test_views_of_a_part_cut_nothing_off_that_whole_views_show() -> None:
+    """Behind an occluder half of a box is seen, from a side that the other views do not face."""
+    sizes = np.array([[0.2, 0.1, 0.3]] * 5 + [[0.16, 0.1, 0.3]] * 9)
+    centers = np.array([[0.0, 0, 0]] * 5 + [[-0.02, 0, 0]] * 9)
+    views = views_of(centers, np.tile(np.eye(3), (14, 1, 1)), sizes)
+    sensors = np.array([[-1.0, 0.2, 0]] * 5 + [[1.0, 0.2, 0]] * 9)
+    weights = np.array([1.0] * 5 + [0.25] * 9)
+    fused = fused_in(views._replace(sensors=sensors), weights, sure("box"), CATEGORIES)
+    np.testing.assert_allclose(fused.sizes[0], [0.2, 0.1, 0.3], atol=0.005)
+    np.testing.assert_allclose(fused.centers[0], 0, atol=0.005)
+
+
 def test_a_view_from_where_the_object_was_moved_to_keeps_its_place() -> None:
     """And its yaw; its length and width are those of the others, whichever way around."""
     centers, sizes = np.zeros((7, 3)), np.tile([0.2, 0.1, 0.3], (7, 1))

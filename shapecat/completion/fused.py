@@ -134,6 +134,10 @@ def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F
         reached[k] = around + along * COSINES + across * SINES
         facing[k] = faced((base.T @ (views.sensors[k] - origin))[:2])
     each = weights[:, None] * np.where(facing, 1.0, _UNSEEN)
+    # A view of a part reaches less far: it must not outvote what others show of the rest.
+    whole = weights >= weights.max()
+    shown = _median(reached[whole], each[whole])
+    reached = np.where(whole[:, None], reached, np.maximum(reached, shown))
     share = (weights[:, None] * facing).sum(axis=0) / weights.sum()
     return _median(reached, each), share
 
