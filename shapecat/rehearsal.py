@@ -18,6 +18,7 @@ from multiprocessing import current_process
 from pathlib import Path
 
 import numba
+import numba.np.linalg
 import numpy as np
 
 from shapecat.completion import complete
@@ -99,6 +100,7 @@ def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> 
     ------
     Stopped : a signal has asked for it; kernels that are compiled are kept.
     """
+    _load_blas_late()
     notes = _notes()
     if notes is None or notes.exists():
         return 0.0
@@ -115,6 +117,11 @@ def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> 
     finally:
         os.close(held)
     return time.perf_counter() - begun
+
+
+def _load_blas_late() -> None:
+    """Let Numba load SciPy's linear algebra, a tenth of a second, with a kernel that calls it."""
+    numba.np.linalg.ensure_blas = lambda: None
 
 
 def _notes() -> Path | None:

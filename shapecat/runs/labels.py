@@ -19,6 +19,24 @@ from shapecat.types import Box, LabelledFrame, LabelledObject, NeuralGas, Plane,
 __all__ = ["read_labelled_frames", "rows_by_frame"]
 
 
+_OBJECT = (
+    "topic",
+    "frame",
+    "detection",
+    "touches_border",
+    "occluded",
+    "center",
+    "size",
+    "orientation",
+    "height_m",
+    "indices",
+    "posterior",
+    "neurons",
+    "edges",
+)
+"""What is shown of a detection."""
+
+
 def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[LabelledFrame]:
     """Yield the frames of a run in reading order, with their final labels.
 
@@ -27,7 +45,8 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
     """
     shown = ShownTracks.read(folder, labels, causal=True)
     groups = (
-        read_row_groups(folder / f"{name}.parquet") for name in ("frames", "detections", "planes")
+        read_row_groups(folder / f"{name}.parquet", columns)
+        for name, columns in (("frames", None), ("detections", _OBJECT), ("planes", None))
     )
     for frames, detections, planes in zip(*groups, strict=True):
         objects = rows_by_frame(detections)
@@ -39,12 +58,7 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
 
 def rows_by_frame(table: pa.Table) -> dict[tuple[str, int], list[dict[str, Any]]]:
     """Group rows by frame; list columns of numbers become arrays without a detour."""
-    columns = {
-        name: _arrays(table[name])
-        if pa.types.is_list(table[name].type)
-        else table[name].to_pylist()
-        for name in table.column_names
-    }
+    columns = {name: _values(table[name]) for name in table.column_names}
     grouped: dict[tuple[str, int], list[dict[str, Any]]] = {}
     for k in range(table.num_rows):
         row = {name: values[k] for name, values in columns.items()}
@@ -52,9 +66,16 @@ def rows_by_frame(table: pa.Table) -> dict[tuple[str, int], list[dict[str, Any]]
     return grouped
 
 
-def _arrays(column: pa.ChunkedArray) -> list[Any]:
-    lengths = pa.compute.list_value_length(column).to_numpy()
-    return np.split(numbers(column), np.cumsum(lengths)[:-1]) if len(lengths) else []
+def _values(column: pa.ChunkedArray) -> Sequence[Any]:
+    """Return the values of a column; those of a list are an array, None where it is null."""
+    fixed = pa.types.is_fixed_size_list(column.type)
+    if column.null_count or not (fixed or pa.types.is_list(column.type)):
+        return list(column.to_pylist())
+    if fixed:
+        return list(numbers(column).reshape(len(column), column.type.list_size))
+    stops = np.cumsum(pa.compute.list_value_length(column).to_numpy()).tolist()
+    flat = numbers(column)
+    return [flat[a:b] for a, b in zip([0, *stops[:-1]], stops, strict=True)] if stops else []
 
 
 def _labelled_frame(
