@@ -31,7 +31,7 @@ __all__ = [
 ]
 
 GROUP_FRAMES = 32
-_BALANCE = 2500
+_BALANCE = 4096
 PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES}
 SEGMENTS, REVISIONS = "segments", "revisions"
 

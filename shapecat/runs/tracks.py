@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute
+import pyarrow.parquet as pq
 from scipy.spatial.transform import Rotation
 
 from shapecat.arrays import F4, F8
@@ -69,14 +70,22 @@ def track_run(
         release_memory()
         full = FullBoxes.read(folder, placed)
         for some in _batches(tracks):
-            boxes = full.of_tracks(some, categories)
-            for parts, rows in _parts(some):
-                columns = _columns(parts, boxes[rows], categories)
-                writer.write_table(arrow_table(columns, TRACKS))
+            _write(writer, some, full, categories)
             lines += [_Line.of(track, categories) for track in some]
+            some.clear()  # the next one may be as long
+            release_memory()
     with replacing(folder / "tracks.csv") as path:
         _write_csv(path, lines, _start_ns(folder), work)
     return dict(Counter(line.category for line in lines))
+
+
+def _write(
+    writer: pq.ParquetWriter, some: list[Track], full: FullBoxes, categories: Sequence[str]
+) -> None:
+    """Write some tracks with their full boxes."""
+    boxes = full.of_tracks(some, categories)
+    for parts, rows in _parts(some):
+        writer.write_table(arrow_table(_columns(parts, boxes[rows], categories), TRACKS))
 
 
 def _batches(tracks: Iterable[Track]) -> Iterator[list[Track]]:
@@ -87,6 +96,7 @@ def _batches(tracks: Iterable[Track]) -> Iterator[list[Track]]:
             yield some
             some = []
         some.append(track)
+        del track
         if sum(len(one.frames) for one in some) > _BATCH:
             yield some
             some = []
