@@ -64,6 +64,8 @@ def test_few_views_tell_the_box_of_all(folder: Path, monkeypatch: pytest.MonkeyP
     )
 
 
-@pytest.mark.parametrize(("frames", "length"), [(0, 32), (3000, 32), (10_000, 32), (10**5, 128), (10**6, 480)])
+@pytest.mark.parametrize(
+    ("frames", "length"), [(0, 32), (3000, 32), (10_000, 32), (10**5, 128), (10**6, 480)]
+)
 def test_long_tables_have_long_row_groups(frames: int, length: int) -> None:
     assert group_frames(frames) == length
