@@ -8,6 +8,8 @@ import click
 from .options import ANY_PATH, seed_option
 from .render import progress_bars
 
+_SCENES = ("tabletop", "shelf", "clutter", "pile", "bin", "shelf_bin", "room", "turntable",
+           "walking", "crossing", "rearranged")  # fmt: skip
 _SENSORS = (
     "kinect",
     "realsense",
@@ -27,21 +29,7 @@ _SENSORS = (
 @click.argument("out", type=ANY_PATH)
 @click.option(
     "--scene",
-    type=click.Choice(
-        [
-            "tabletop",
-            "shelf",
-            "clutter",
-            "pile",
-            "bin",
-            "shelf_bin",
-            "room",
-            "turntable",
-            "walking",
-            "crossing",
-            "rearranged",
-        ]
-    ),
+    type=click.Choice(_SCENES),
     default="tabletop",
     show_default=True,
 )

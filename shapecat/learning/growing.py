@@ -6,7 +6,6 @@ from dataclasses import replace
 import numpy as np
 
 from shapecat.arrays import F4
-from shapecat.learning.boosted import BoostedDictionary
 from shapecat.learning.categorizer import Categorizer
 from shapecat.learning.forest import FlatForest
 from shapecat.learning.training import Examples, LearningSettings, choose_evenly, encode
@@ -88,14 +87,7 @@ def grow_on(
     count = len(categorizer.categories)
     labels = encode(train.labels, categorizer.categories)
     features = categorizer.bank.features(train.descriptors)
-    more = BoostedDictionary(
-        rounds=settings.rounds,
-        leaves=settings.leaves,
-        rate=settings.rate,
-        unknown=-1,
-        jobs=settings.jobs,
-        random_state=seed,
-    ).fit(features, labels, start=_logits(categorizer, features))
+    more = settings.dictionary(seed).fit(features, labels, start=_logits(categorizer, features))
     rng, half = np.random.default_rng(seed), settings.known_views // 2
     codes = np.where(labels < 0, count, labels)
     kept = choose_evenly(categorizer.known_category.astype(np.int64), half, rng)

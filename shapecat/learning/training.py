@@ -47,6 +47,17 @@ class LearningSettings:
     jobs: int | None = None
     """Trees grown at the same time."""
 
+    def dictionary(self, seed: int) -> BoostedDictionary:
+        """Return the dictionary to fit; -1 is the label of shapes of no category."""
+        return BoostedDictionary(
+            rounds=self.rounds,
+            leaves=self.leaves,
+            rate=self.rate,
+            unknown=-1,
+            jobs=self.jobs,
+            random_state=seed,
+        )
+
 
 class Examples(NamedTuple):
     """Described views with their labels.
@@ -74,14 +85,7 @@ def make_chain(blocks: Mapping[str, slice], settings: LearningSettings, *, seed:
     densities = ProbabilisticNeuralNetwork(
         used, kernels=settings.kernels, unknown=-1, random_state=seed
     )
-    dictionary = BoostedDictionary(
-        rounds=settings.rounds,
-        leaves=settings.leaves,
-        rate=settings.rate,
-        unknown=-1,
-        jobs=settings.jobs,
-        random_state=seed,
-    )
+    dictionary = settings.dictionary(seed)
     return Pipeline([("densities", densities), ("dictionary", dictionary)])
 
 

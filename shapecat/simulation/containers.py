@@ -1,19 +1,12 @@
 """The containers a simulated recording can be written in."""
 
+from abc import ABC, abstractmethod
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Protocol, Self
+from typing import Any, ClassVar, Literal, Protocol, Self
 
 from mcap.writer import CompressionType
 from mcap.writer import Writer as McapFile
-from rosbags.interfaces import (
-    Qos,
-    QosDurability,
-    QosHistory,
-    QosLiveliness,
-    QosReliability,
-    QosTime,
-)
+from rosbags import interfaces as ros
 from rosbags.rosbag1 import Writer as Ros1File
 from rosbags.rosbag2 import Writer as Ros2Folder
 
@@ -43,12 +36,7 @@ class Container(Protocol):
 
     def __enter__(self) -> Self: ...
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None: ...
+    def __exit__(self, *_: object) -> None: ...
 
     def write(self, topic: str, message: Any, log_time_ns: int) -> None:
         """Append a message."""
@@ -68,12 +56,7 @@ class _Mcap:
         self._file.start(profile="ros2", library="shapecat")
         return self
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self._file.finish()
         self._stream.close()
 
@@ -92,79 +75,73 @@ class _Mcap:
         return int(self._file.register_channel(topic, "cdr", schema, {"offered_qos_profiles": qos}))
 
 
-class _Ros1:
+class _Bag(ABC):
+    """A recording of one of the writers of rosbags."""
+
+    ros_version: ClassVar[Literal[1, 2]]
+
+    def __init__(self, path: Path) -> None:
+        self.messages = MessageFactory(self.ros_version)
+        self._file = self.open(path)
+        self._connections: dict[str, Any] = {}
+
+    @abstractmethod
+    def open(self, path: Path) -> Any:
+        """Return the writer of a new recording."""
+
+    @abstractmethod
+    def quality(self, *, latched: bool) -> dict[str, Any]:
+        """Return how a topic is kept for those that subscribe late."""
+
+    def __enter__(self) -> Self:
+        self._file.open()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._file.close()
+
+    def write(self, topic: str, message: Any, log_time_ns: int) -> None:
+        if topic not in self._connections:
+            kind, store = message.__msgtype__, self.messages.typestore
+            quality = self.quality(latched=topic == _STATIC)
+            added = self._file.add_connection(topic, kind, typestore=store, **quality)
+            self._connections[topic] = added
+        self._file.write(self._connections[topic], log_time_ns, self.messages.serialize(message))
+
+
+class _Ros1(_Bag):
     """A ROS 1 bag."""
 
-    def __init__(self, path: Path) -> None:
-        self.messages = MessageFactory(1)
-        self._file = Ros1File(path)
-        self._connections: dict[str, Any] = {}
+    ros_version = 1
 
-    def __enter__(self) -> Self:
-        self._file.open()
-        return self
+    def open(self, path: Path) -> Any:
+        return Ros1File(path)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._file.close()
-
-    def write(self, topic: str, message: Any, log_time_ns: int) -> None:
-        if topic not in self._connections:
-            self._connections[topic] = self._file.add_connection(
-                topic,
-                message.__msgtype__,
-                typestore=self.messages.typestore,
-                latching=int(topic == _STATIC),
-            )
-        self._file.write(self._connections[topic], log_time_ns, self.messages.serialize(message))
+    def quality(self, *, latched: bool) -> dict[str, Any]:
+        return {"latching": int(latched)}
 
 
-class _Ros2:
+class _Ros2(_Bag):
     """A ROS 2 folder with an SQLite database."""
 
-    def __init__(self, path: Path) -> None:
-        self.messages = MessageFactory(2)
-        self._file = Ros2Folder(path, version=8)
-        self._connections: dict[str, Any] = {}
+    ros_version = 2
 
-    def __enter__(self) -> Self:
-        self._file.open()
-        return self
+    def open(self, path: Path) -> Any:
+        return Ros2Folder(path, version=8)
 
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._file.close()
-
-    def write(self, topic: str, message: Any, log_time_ns: int) -> None:
-        if topic not in self._connections:
-            self._connections[topic] = self._file.add_connection(
-                topic,
-                message.__msgtype__,
-                typestore=self.messages.typestore,
-                offered_qos_profiles=[_qos(latched=topic == _STATIC)],
-            )
-        self._file.write(self._connections[topic], log_time_ns, self.messages.serialize(message))
+    def quality(self, *, latched: bool) -> dict[str, Any]:
+        return {"offered_qos_profiles": [_qos(latched=latched)]}
 
 
-def _qos(*, latched: bool) -> Qos:
-    durability = QosDurability.TRANSIENT_LOCAL if latched else QosDurability.VOLATILE
-    ever = QosTime(2147483647, 4294967295)
-    return Qos(
-        QosHistory.KEEP_LAST,
+def _qos(*, latched: bool) -> ros.Qos:
+    kept, ever = ros.QosDurability, ros.QosTime(2147483647, 4294967295)
+    return ros.Qos(
+        ros.QosHistory.KEEP_LAST,
         1 if latched else 10,
-        QosReliability.RELIABLE,
-        durability,
-        ever,
-        ever,
-        QosLiveliness.AUTOMATIC,
+        ros.QosReliability.RELIABLE,
+        kept.TRANSIENT_LOCAL if latched else kept.VOLATILE,
+        *(ever, ever),
+        ros.QosLiveliness.AUTOMATIC,
         ever,
         avoid_ros_namespace_conventions=False,
     )
