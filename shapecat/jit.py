@@ -24,8 +24,8 @@ _FAST = {"reassoc", "contract", "arcp", "nsz", "nnan"}
 """Fast-math flags that keep infinities: sums and minima may be vectorised."""
 _HERE = Path(__file__).parent
 _LARGE_BYTES = 2**24
-_SHARED = tuple(_HERE / name for name in ("geometry.py", "jit.py", "trees.py"))
-"""Files beside this one whose kernels stages call."""
+_SHARED = (_HERE / "geometry.py", _HERE / "jit.py", *(_HERE / "trees").glob("*.py"))
+"""Files whose kernels stages call."""
 
 
 def kernel(function: _F | None = None, *, fast: bool = False) -> Any:

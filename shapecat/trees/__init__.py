@@ -1,0 +1,14 @@
+"""Decision trees that are walked by kernels: those of the dictionary, and boosted ones."""
+
+from shapecat.trees.boosted import BoostedTrees, logit_of, read_trees, write_trees
+from shapecat.trees.walking import LANES, Trees, find_leaves
+
+__all__ = [
+    "LANES",
+    "BoostedTrees",
+    "Trees",
+    "find_leaves",
+    "logit_of",
+    "read_trees",
+    "write_trees",
+]
