@@ -19,8 +19,14 @@ from tests.scenes import record
 
 TABLE = Scenario("table", ("table.mcap",))
 CASES = (
-    *(("interrupt", 1), ("interrupt", 2), ("double", 1), ("terminate", 1), ("kill", 1)),
-    *(("kill", 2), ("enospc", 1), ("eio", 1), ("short", 1), ("clock", 1)),
+    *(("interrupt", 1), ("kill", 1), ("enospc", 1)),
+    *(
+        pytest.param(kind, seed, marks=pytest.mark.many)
+        for kind, seed in (
+            *(("interrupt", 2), ("double", 1), ("terminate", 1), ("kill", 2)),
+            *(("eio", 1), ("short", 1), ("clock", 1)),
+        )
+    ),
 )
 
 
