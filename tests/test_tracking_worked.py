@@ -341,7 +341,7 @@ def test_a_turn_in_the_plane_is_one_about_up_in_space() -> None:
         assert_allclose(motion.moved(np.full(7, k), still), points, atol=1e-12)
         alone = CommonMotion(motion.rotations[k : k + 1], motion.translations[k : k + 1])
         back = alone.still(Hits.of([frame(0, points)]))
-        assert_allclose(back.centers, expected, atol=1e-12)
+        assert_allclose(back.centers, expected, atol=1e-6)  # kept in single precision
         assert back.axes is not None
         assert_allclose(back.axes, np.broadcast_to(motion.rotations[k], (7, 3, 3)))
 
