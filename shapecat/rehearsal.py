@@ -18,7 +18,6 @@ from multiprocessing import current_process
 from pathlib import Path
 
 import numba
-import numba.np.linalg
 import numpy as np
 
 from shapecat.completion import complete
@@ -99,11 +98,15 @@ def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> 
     Raises
     ------
     Stopped : a signal has asked for it; kernels that are compiled are kept.
+    RuntimeError : a process that compiles runs the script of the caller again, since that does not
+        ask for ``__name__ == "__main__"``. It would wait for its parent, which waits for it.
     """
-    _load_blas_late()
     notes = _notes()
     if notes is None or notes.exists():
         return 0.0
+    if getattr(current_process(), "_inheriting", False):  # as multiprocessing itself tells
+        msg = 'a script that processes needs `if __name__ == "__main__":` around what it calls'
+        raise RuntimeError(msg)
     begun = time.perf_counter()
     while (held := lock(notes.parent)) is None:
         stopping.check()
@@ -117,11 +120,6 @@ def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> 
     finally:
         os.close(held)
     return time.perf_counter() - begun
-
-
-def _load_blas_late() -> None:
-    """Let Numba load SciPy's linear algebra, a tenth of a second, with a kernel that calls it."""
-    numba.np.linalg.ensure_blas = lambda: None
 
 
 def _notes() -> Path | None:

@@ -1,6 +1,8 @@
 """Compiling ahead: what is rehearsed must be the whole way, done once, and leave nobody behind."""
 
 import multiprocessing
+import subprocess
+import sys
 import threading
 from pathlib import Path
 
@@ -85,3 +87,24 @@ def test_the_other_processes_end(monkeypatch: pytest.MonkeyPatch) -> None:
     for process in left:
         process.join(timeout=10)
     assert not any(process.is_alive() for process in left)
+
+
+UNGUARDED = """
+from pathlib import Path
+from shapecat import rehearsal
+rehearsal._notes = lambda: Path({notes!r})
+assert rehearsal.compile_all() > 0
+print("processed")
+"""
+
+
+def test_a_script_without_a_guard_does_not_wait_for_itself(tmp_path: Path) -> None:
+    """The process that compiles runs the script again, and would wait for its parent's lock."""
+    script = tmp_path / "script.py"
+    script.write_text(UNGUARDED.format(notes=str(tmp_path / "complete")))
+    ended = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, timeout=300, check=False
+    )
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout == "processed\n"
+    assert 'needs `if __name__ == "__main__":`' in ended.stderr
