@@ -54,22 +54,6 @@ def test_a_box_in_the_middle_of_a_table() -> None:
     assert not rejected.any()
 
 
-def test_what_touches_is_described_together() -> None:
-    """A gripper is told from a can by the arm it hangs on."""
-    small, large = box((-0.06, 0, 0), (0.06, 0.05, 0.05)), box((0.03, 0, 0), (0.12, 0.05, 0.16))
-    apart = box((0.3, 0, 0), (0.05, 0.05, 0.08))
-    features, _ = features_of([table(), small, large, apart], tilt_deg=35)
-    whole, cells = features["component"], features["visibility"]["cells"]
-    alone = np.flatnonzero(whole["segments"] == 1)
-    both = np.flatnonzero(whole["segments"] == 2)
-    assert len(alone) == 1
-    assert len(both) == 2
-    assert whole["share"][alone] == pytest.approx(1.0)
-    assert whole["share"][both] == pytest.approx(cells[both] / cells[both].sum())
-    assert whole["top_m"][both] == pytest.approx([0.16, 0.16], abs=0.01)
-    assert whole["top_m"][alone] == pytest.approx(0.08, abs=0.01)
-
-
 def test_what_is_wider_than_an_object_is_none() -> None:
     segments = _blank(2)
     features = np.zeros(2, OBJECT_FEATURES)
