@@ -8,7 +8,7 @@ import numpy as np
 from shapecat.arrays import I4, U1, Bool
 from shapecat.jit import kernel, unset
 
-__all__ = ["DOWN", "RIGHT", "SIDES", "connected_components", "root_of", "span_of", "spans_of"]
+__all__ = ["DOWN", "RIGHT", "SIDES", "connected_components", "span_of", "spans_of"]
 
 RIGHT, DOWN = 1, 2
 """Bits of links: with the neighbour on the right, and with that below."""
@@ -57,7 +57,7 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
             elif me == 0:
                 me = above
             elif above > 0 and above != me:
-                a, b = root_of(parent, me), root_of(parent, above)
+                a, b = _root(parent, me), _root(parent, above)
                 parent[max(a, b)] = me = min(a, b)
             numbers[p] = before = me
             size[me] += 1
@@ -81,8 +81,7 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
 
 
 @kernel
-def root_of(parent: I4, k: int) -> int:
-    """Return the least of the numbers that are joined with k in a table of parents (n,)."""
+def _root(parent: I4, k: int) -> int:
     while parent[k] != k:
         k = parent[k]
     return k

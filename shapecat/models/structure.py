@@ -32,7 +32,7 @@ from shapecat.types import Frame
 __all__ = ["Series", "Told", "collect", "label_objects", "main"]
 
 FEATURES = OBJECT_FEATURES.itemsize // np.dtype("f4").itemsize
-_GROWTH = Growth(300, 32, 0.06)
+_GROWTH = Growth(150, 16, 0.08)
 _OBJECT = 0.5
 """Share of the cells of an object that show objects."""
 _CHUNK = 10
@@ -68,7 +68,6 @@ _SERIES = (
     Series("clutter", 606_000, 50, scale=1.8),
     Series("pile", 605_000, 50, scale=1.8),
     Series("tabletop", 609_000, 30, scale=1.8),
-    Series("room", 612_000, 700),
 )
 """Seeds of their own: the merging trees were not grown on them. Large objects are too rare else."""
 

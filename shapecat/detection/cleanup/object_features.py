@@ -11,7 +11,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1, Bool
 from shapecat.detection.cleanup.settings import CLEANUP
-from shapecat.detection.connected_components import SIDES, root_of
+from shapecat.detection.connected_components import SIDES
 from shapecat.detection.depth_grid import DepthGrid, find_borders, row_and_column
 from shapecat.detection.foreground.walls import CLEARED, ON_WALL
 from shapecat.detection.merging.segment_features import (
@@ -54,22 +54,8 @@ _VISIBILITY = np.dtype(
     ]
 )
 """How well something is seen."""
-_COMPONENT = np.dtype(
-    [
-        ("share", "f4"),  # of its cells that are of the segment itself
-        ("segments", "f4"),
-        ("top_m", "f4"),  # highest above the plane
-        ("image_border", "f4"),  # as of the segment, of all that touches it
-    ]
-)
-"""The connected component of segments that touch: an arm ends in a gripper, a chair in its legs."""
 OBJECT_FEATURES = np.dtype(
-    [
-        ("segment", SEGMENT_FEATURES),
-        ("surroundings", _SURROUNDINGS),
-        ("visibility", _VISIBILITY),
-        ("component", _COMPONENT),
-    ]
+    [("segment", SEGMENT_FEATURES), ("surroundings", _SURROUNDINGS), ("visibility", _VISIBILITY)]
 )
 """The features of what may be an object, all float32: lengths in metres, or shares.
 
@@ -109,9 +95,7 @@ def measure_object_features(
     rows["low_profile"] = low_profile
     seen = grid.inverse_depth, model.planes, model.heights.plane_id, model.walls
     field = LabelledGrid(*seen, labels, graph.spans, segments.parent)
-    component = np.arange(segments.parent.size, dtype=np.int32)
-    _count_cells(field, _border_lines(grid), 1 / range_m + DISCONTINUITY / 2, rows, component)
-    _measure_components(segments, component, features)
+    _count_cells(field, _border_lines(grid), 1 / range_m + DISCONTINUITY / 2, rows)
     _measure(grid, model.planes, segments, model.up[2], features)
     return features
 
@@ -131,16 +115,11 @@ def _border_lines(grid: DepthGrid) -> tuple[int, int, int, int]:
 
 @kernel
 def _count_cells(
-    field: LabelledGrid,
-    border: tuple[int, int, int, int],
-    last: float,
-    rows: Records,
-    component: I4,
+    field: LabelledGrid, border: tuple[int, int, int, int], last: float, rows: Records
 ) -> None:
     """Count the cells of each segment at borders and on walls, and where its surface goes on.
 
-    ``last`` is the inverse depth of what ends with the range; ``rows`` are of `_SURROUNDINGS`;
-    ``component`` (n + 1,) are parents of segments, joined where these touch.
+    ``last`` is the inverse depth of what ends with the range; ``rows`` are of `_SURROUNDINGS`.
     """
     inv_depth, planes, plane_id, walls, labels, spans, owner = field
     last_row, last_column = labels.shape[0] - 1, labels.shape[1] - 1
@@ -155,39 +134,12 @@ def _count_cells(
             row.on_wall += walls[i, j] == ON_WALL
             for di, dj in SIDES:
                 y, x = min(max(i + di, 0), last_row), min(max(j + dj, 0), last_column)
-                if abs(inv_depth[y, x] - here) >= DISCONTINUITY:
-                    continue
-                if labels[y, x] != 0 and labels[y, x] != labels[i, j]:
-                    one = root_of(component, owner[labels[i, j]])
-                    other = root_of(component, owner[labels[y, x]])
-                    component[max(one, other)] = min(one, other)
-                if plane_id[y, x] != 0:
+                if plane_id[y, x] != 0 or abs(inv_depth[y, x] - here) >= DISCONTINUITY:
                     continue
                 k = plane_id[i, j] - 1
                 if inv_depth[y, x] > max(planes[k, 0] * x + planes[k, 1] * y + planes[k, 2], 0):
                     row.into_wall += walls[y, x] == CLEARED
                     row.beyond += walls[y, x] != CLEARED
-
-
-@kernel
-def _measure_components(segments: Segments, component: I4, out: Records) -> None:
-    """Write the features of connected components; the cells of segments are counted, not shares."""
-    for p in range(1, component.size):
-        if not is_root(segments, p):
-            continue
-        whole, shape = out[root_of(component, p)].component, segments.statistics[p]
-        whole.share += shape.count
-        whole.segments += 1
-        whole.top_m = max(whole.top_m, shape.top)
-        whole.image_border += out[p].surroundings.image_border
-    for p in range(component.size - 1, 0, -1):  # a root is the least of its component
-        if not is_root(segments, p):
-            continue
-        whole, mine = out[root_of(component, p)].component, out[p].component
-        cells = whole.share
-        mine.segments, mine.top_m = whole.segments, whole.top_m
-        mine.image_border = share(whole.image_border, 4 * math.sqrt(cells))
-        mine.share = share(segments.statistics[p].count, cells)
 
 
 @kernel
