@@ -7,7 +7,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute
 
-from shapecat.arrays import F8, I4
+from shapecat.arrays import F8, I4, Bool
 from shapecat.runs.tables import frame_rows, numbers, topic_codes
 
 __all__ = ["PlacedFrames"]
@@ -45,7 +45,7 @@ class PlacedFrames:
 
     @cached_property
     def poses(self) -> F8:
-        """Return (f, 3, 4) ``fixed_from_sensor``: nothing moves where no fixed frame is used."""
+        """Return (f, 3, 4) ``fixed_from_sensor``, metres; the identity without a fixed frame."""
         return np.frombuffer(self._poses, np.float64).reshape(-1, 3, 4)
 
     @cached_property
@@ -53,7 +53,7 @@ class PlacedFrames:
         return np.argsort(np.frombuffer(self._keys, np.int64), kind="stable")
 
     def find(self, topics: Sequence[str], frames: I4) -> I4:
-        """Return the positions of frames of the run."""
+        """Return (n,) the positions of frames of the run, given by topic and number (n,)."""
         codes = np.fromiter(map(self._codes.__getitem__, topics), np.int64, len(topics))
         keys = np.frombuffer(self._keys, np.int64)
         found = np.searchsorted(keys, _keys(codes, frames), sorter=self._order)
@@ -64,7 +64,7 @@ def _keys(codes: I4, frames: I4) -> I4:
     return np.asarray((codes << 32) + frames)
 
 
-def _poses(frames: pa.Table, placed: I4) -> F8:
+def _poses(frames: pa.Table, placed: Bool) -> F8:
     result = np.tile(np.eye(3, 4), (frames.num_rows, 1, 1))
     known = pa.compute.is_valid(frames["fixed_rotation"]).to_numpy()
     turns, places = (
