@@ -163,6 +163,8 @@ def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], st
         known = run.get("input", {})
         same = same_options(run, planned) and run.get("versions") == planned["versions"]
         if same and (unchanged(known["files"], source) or same_content(known, source, digest)):
+            if "perceive" in run["seconds"]:
+                run["counts"]["resumed"] = run["counts"]["frames"]
             return {**run, "input": planned["input"]}
     clear(folder)
     write_run(folder, planned)
