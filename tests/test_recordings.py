@@ -166,6 +166,7 @@ def test_damaged_chunk_is_left_out(tmp_path: Path) -> None:
         assert 0 < len(read) < 20
         assert 9 not in read
         assert "left out the chunk" in recording.warnings[0]
+        assert [message.log_time_ns for message in recording.messages()] == read
 
 
 @pytest.mark.parametrize("size", [10**9, 2**62])

@@ -17,6 +17,7 @@ from shapecat.outputs import review, review_viewer
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import paint
 from shapecat.outputs.review_layout import Eye, stepped_back
+from shapecat.outputs.review_scenes import choose_scenes
 from shapecat.outputs.review_shapes import markdown
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 from tests.test_executors import alive
@@ -202,6 +203,38 @@ def test_a_frame_without_a_pose_does_not_end_the_review(tmp_path: Path) -> None:
     scenes = [scene(k, [labelled_object(1)]) for k in range(2)]
     path = write(tmp_path / "r.rrd", scenes, fixed_frame="map")
     assert len(rows(path, f"/world/{TOPIC}/objects/boxes")) == 2
+
+
+def drawn(scenes: Iterable[tuple[LabelledFrame, Frame]], *, fixed: bool) -> list[int]:
+    shown = choose_scenes(((*one, None) for one in scenes), fixed=fixed)
+    return [one.labelled.index for one in shown if one.drawn]
+
+
+def walked(places: Iterable[float]) -> list[tuple[LabelledFrame, Frame]]:
+    """Return what a camera sees that walks along x, of an object at places x in the fixed frame."""
+    poses = [Pose(np.eye(3), np.array([0.1 * k, 0, 0])) for k in range(9)]
+    return [
+        scene(k, [labelled_object(1, x=x - 0.1 * k)], pose=pose)
+        for (k, pose), x in zip(enumerate(poses), places, strict=True)
+    ]
+
+
+def test_scenes_are_drawn_less_often_while_nothing_moves() -> None:
+    still = [0.5] * 9
+    assert drawn(walked(still), fixed=True) == [0, 3, 6]
+    assert drawn(walked(still), fixed=False) == list(range(9))
+    assert drawn(walked([0.5, 0.5, *[0.52] * 7]), fixed=True) == [0, 2, 5, 8]
+
+
+def test_an_object_that_comes_or_goes_is_drawn_at_once() -> None:
+    scenes = [scene(k, [labelled_object(1)] if k == 2 else []) for k in range(7)]
+    assert drawn(scenes, fixed=False) == [0, 2, 3, 6]
+
+
+def test_a_frame_that_repeats_another_is_not_drawn() -> None:
+    repeated = [dataclasses.replace(scene(k)[0], reused_from=0) for k in range(1, 9)]
+    scenes = [scene(0), *((labelled, image(labelled.index)) for labelled in repeated)]
+    assert drawn(scenes, fixed=False) == [0]
 
 
 def test_a_run_without_frames_or_objects_is_still_a_review(tmp_path: Path) -> None:

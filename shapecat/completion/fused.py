@@ -123,16 +123,11 @@ def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F
 
     Directions go around from the first of the axes ``base``.
     """
-    reached = np.zeros((len(weights), DIRECTIONS))
-    facing = np.zeros(reached.shape, np.bool_)
-    steps = np.arange(DIRECTIONS, dtype=np.float64)
-    for k, axes in enumerate(views.axes):
-        x, y = (base.T @ axes[:, 0])[:2]
-        turn = np.arctan2(y, x) * (DIRECTIONS / (2 * np.pi))
-        around = np.interp(steps - turn, steps, views.outlines[k], period=DIRECTIONS)
-        along, across = (base.T @ (views.centers[k] - origin))[:2]
-        reached[k] = around + along * COSINES + across * SINES
-        facing[k] = faced((base.T @ (views.sensors[k] - origin))[:2])
+    x, y, _ = (views.axes[:, :, 0] @ base).T
+    around = _turned(views.outlines, np.arctan2(y, x))
+    places = (views.centers - origin) @ base
+    reached = around + places[:, :1] * COSINES + places[:, 1:2] * SINES
+    facing = faced(((views.sensors - origin) @ base)[:, :2])
     each = weights[:, None] * np.where(facing, 1.0, _UNSEEN)
     # A view of a part reaches less far: it must not outvote what others show of the rest.
     whole = weights >= weights.max()
@@ -140,6 +135,16 @@ def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F
     reached = np.where(whole[:, None], reached, np.maximum(reached, shown))
     share = (weights[:, None] * facing).sum(axis=0) / weights.sum()
     return _median(reached, each), share
+
+
+def _turned(outlines: F8, angles: F8) -> F8:
+    """Return outlines (k, n), each turned by an angle, interpolated between its directions."""
+    rows = np.arange(len(outlines))[:, None]
+    steps = np.arange(DIRECTIONS) - angles[:, None] * (DIRECTIONS / (2 * np.pi))
+    before = np.floor(steps).astype(np.int64)
+    share = steps - before
+    first, second = (outlines[rows, at % DIRECTIONS] for at in (before, before + 1))
+    return np.asarray(first + share * (second - first))
 
 
 def _alike(axes: F8, sizes: F8, size: F8) -> F8:

@@ -100,9 +100,9 @@ def complete(
 
 
 def faced(toward: F8) -> Bool:
-    """Return (k,) which directions of an outline a sensor sees that lies ``toward`` (2,) it."""
-    x, y = toward / max(math.hypot(*toward), 1e-9)
-    return np.asarray(x * COSINES + y * SINES > _EDGEWISE)
+    """Return (..., k) which directions of an outline sensors see, ``toward`` (..., 2) it."""
+    x, y = toward[..., :1], toward[..., 1:]
+    return np.asarray(x * COSINES + y * SINES > _EDGEWISE * np.maximum(np.hypot(x, y), 1e-9))
 
 
 def footprint(seen: F8, facing: F8, posterior: F8, categories: Sequence[str]) -> Footprint:

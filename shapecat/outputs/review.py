@@ -11,7 +11,7 @@ Entities
     │   └── objects
     │       ├── boxes          labelled "#track category confidence"
     │       └── captions       shorter, drawn above the boxes
-    └── seen/<topic>           the scene, ten times a second and when it has changed: where the
+    └── seen/<topic>           the scene, four to ten times a second, when it has changed: where the
         ├── scene              sensor was then (below <topic> without a fixed frame)
         ├── planes             outlines;  planes/fill  translucent
         └── objects
@@ -35,7 +35,7 @@ Timelines: ``sensor_time`` (of the measurement) and ``frame``.
 import json
 import uuid
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -54,6 +54,7 @@ from shapecat.outputs.review_file import open_review
 from shapecat.outputs.review_images import Images, Picture, picture_of
 from shapecat.outputs.review_layout import Eye, TrackView, choose_eye, lay_out, stepped_back
 from shapecat.outputs.review_paths import Paths
+from shapecat.outputs.review_scenes import Shown, choose_scenes
 from shapecat.outputs.review_shapes import SCENE, SKETCH, Drawing, Moment
 from shapecat.outputs.review_viewer import open_viewer, take_screenshot
 from shapecat.recordings import MessageError
@@ -62,8 +63,6 @@ from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
 __all__ = ["open_viewer", "take_screenshot", "write_review"]
 
 _FLUSH_FRAMES = 32
-_SCENE_NS = 90_000_000
-"""A scene is drawn no sooner after the one before it."""
 
 
 def write_review(
@@ -105,8 +104,9 @@ def write_review(
         stream.send_recording_name(name)
         review = _Review(stream, categories, fixed_frame)
         review.begin(run)
+        drawn = choose_scenes(frames, fixed=fixed_frame is not None)
         paint_one = partial(_painted, limit=cloud_points)
-        painted = map_ahead(paint_one, _chosen(frames), threads=threads)
+        painted = map_ahead(paint_one, drawn, threads=threads)
         for k, one in enumerate(painted):
             file.check()
             review.add(one)
@@ -124,28 +124,6 @@ def _stream(name: str, run: Mapping[str, object]) -> rr.RecordingStream:
     return stream
 
 
-class _Shown(NamedTuple):
-    """A frame to be written, and whether its scene is drawn."""
-
-    labelled: LabelledFrame
-    frame: Frame
-    coloured: Coloured | None
-    drawn: bool
-
-
-def _chosen(frames: Iterable[tuple[LabelledFrame, Frame, Coloured | None]]) -> Iterator[_Shown]:
-    """Choose the frames whose scene is drawn: not too often, and not while it stays the same."""
-    last: dict[str, tuple[int, int]] = {}  # of each topic
-    for labelled, frame, coloured in frames:
-        first = labelled.index if labelled.reused_from is None else labelled.reused_from
-        stamp_ns, shown = last.get(labelled.topic, (None, None))
-        soon = stamp_ns is not None and 0 <= labelled.stamp_ns - stamp_ns < _SCENE_NS
-        drawn = not (soon or first == shown)
-        if drawn:
-            last[labelled.topic] = labelled.stamp_ns, first
-        yield _Shown(labelled, frame, coloured, drawn)
-
-
 class _Painted(NamedTuple):
     """A frame ready to be written.
 
@@ -159,7 +137,7 @@ class _Painted(NamedTuple):
     damage: str
 
 
-def _painted(shown: _Shown, *, limit: int) -> _Painted:
+def _painted(shown: Shown, *, limit: int) -> _Painted:
     """Paint the clouds and the masks of a frame; without colour if its image is damaged."""
     labelled, frame, coloured, drawn = shown
     damage, parts = "", (labelled.planes, labelled.objects)
@@ -293,7 +271,7 @@ class _Review:
         seen = {}
         if pose is not None or self._fixed_frame is None:
             for item in labelled.objects:
-                place = np.asarray(item.box.center, np.float64)
+                place = np.asarray((item.full or item.box).center, np.float64)
                 seen[item.track] = item.category, place if pose is None else transform(pose, place)
         if self._fixed_frame is not None:
             entity = "world"

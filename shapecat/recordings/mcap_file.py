@@ -84,6 +84,7 @@ class McapRecording(Recording):
             self.indexed = found is not None
             self.summary = found or Summary()
             self._counts: Counter[int] | None = None
+            self._checked: set[int] = set()  # where chunks are whose checksum fits
             self._times: list[int] = []
             if found is None:
                 self._scan()
@@ -301,12 +302,19 @@ class McapRecording(Recording):
     def _chunk(self, record: Record) -> Iterator[RawMessage]:
         """Yield the messages of a chunk, up to the cut if it is truncated."""
         try:
-            read = read_chunk if record.whole else read_cut_chunk
-            for opcode, content in split_chunk(read(self.content(record))):
+            for opcode, content in split_chunk(self._plain(record)):
                 yield from self._take(opcode, content)
         except ChunkError as error:
             part = "" if record.whole else "the rest of "
             self.warn(f"left out {part}the chunk at byte {record.offset - 9}: {error}")
+
+    def _plain(self, record: Record) -> memoryview:
+        """Return the decompressed records of a chunk; its checksum is compared the first time."""
+        if not record.whole:
+            return read_cut_chunk(self.content(record))
+        plain = read_chunk(self.content(record), checked=record.offset in self._checked)
+        self._checked.add(record.offset)
+        return plain
 
     def _take(self, opcode: int, content: memoryview) -> Iterator[RawMessage]:
         if opcode == Opcode.MESSAGE:
