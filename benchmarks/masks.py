@@ -20,7 +20,8 @@ import numpy as np
 
 from benchmarks.boxes import SEEN_PIXELS, by_frame, matches
 from benchmarks.measure import markdown
-from shapecat.outputs.colouring import snapped_masks, with_colour
+from shapecat.outputs.colouring import with_colour
+from shapecat.outputs.dataset_frames import snapped_masks
 from shapecat.pipeline import process
 from shapecat.recordings import open_recording
 from shapecat.recordings.colour_image import pixels_of

@@ -149,6 +149,19 @@ def test_processing_loads_no_display_library() -> None:
     assert done.returncode == 0, done.stderr
 
 
+def test_the_first_frame_waits_for_no_library_it_does_not_need() -> None:
+    """SciPy's images, data frames and Protocol Buffers take longer to load than all of ours."""
+    code = (
+        "import sys, shapecat.batch, shapecat.recordings.decoding;"
+        "late = {'scipy.ndimage', 'scipy.optimize', 'pandas', 'pyarrow.compute'};"
+        "late |= {'google.protobuf', 'PIL', 'rerun'};"
+        "sys.exit(', '.join(sorted(late & set(sys.modules))) or 0)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+
+    assert done.returncode == 0, done.stderr
+
+
 def test_root_of_the_package_holds_what_everybody_uses() -> None:
     """A file of one room that lies in the root hides which room it is of."""
     assert len(list((ROOT / "shapecat").glob("*.py"))) <= 12

@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from shapecat.arrays import U1, U4
+from shapecat.arrays import U4
 from shapecat.cameras.colour import ColourView
 from shapecat.colour.masks import NOTHING, Mask, dense_masks
-from shapecat.colour.snapping import snapped
 from shapecat.errors import OutputError
 from shapecat.executors.order import map_ahead
 from shapecat.recordings import Recording, choose_streams
@@ -27,7 +26,6 @@ __all__ = [
     "Seen",
     "colours_of",
     "find_masks",
-    "snapped_masks",
     "views_again",
     "with_colour",
 ]
@@ -103,14 +101,6 @@ def _coloured(
         return None
     objects = [found.mask(o.detections) if found else NOTHING for o in labelled.objects]
     return Coloured(view, tuple(objects))
-
-
-def snapped_masks(frame: Frame, coloured: Coloured, pixels: U1) -> tuple[Mask, ...]:
-    """Return the masks of a frame whose outlines lie on the edges of its colour image."""
-    lens, camera, scale = coloured.view.lens, frame.camera, 1.0
-    if not coloured.view.registered and lens is not None and camera is not None:
-        scale = lens.pinhole.fx / camera.fx
-    return snapped(coloured.masks, pixels, scale)
 
 
 def _with_known_masks(recording: Recording, run: RunInfo, folder: Path) -> Iterator[Seen]:

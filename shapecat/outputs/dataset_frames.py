@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 import xxhash
 
-from shapecat.arrays import F8
+from shapecat.arrays import F8, U1
 from shapecat.colour.masks import Mask, dense_masks
+from shapecat.colour.snapping import snapped
 from shapecat.errors import OutputError
-from shapecat.outputs.colouring import Coloured, snapped_masks, with_colour
+from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.exports_files import png, safe_name
 from shapecat.outputs.rereading import FinishedRun, open_source
 from shapecat.recordings import MessageError
@@ -21,7 +22,7 @@ from shapecat.recordings.colour_image import encoded, pixels_of
 from shapecat.runs.track_table import read_track_table
 from shapecat.types import Frame, LabelledFrame, LabelledObject
 
-__all__ = ["DatasetImage", "Selection", "images_of", "split_runs"]
+__all__ = ["DatasetImage", "Selection", "images_of", "snapped_masks", "split_runs"]
 
 _log = logging.getLogger(__name__)
 
@@ -177,6 +178,14 @@ def _depth_file(labelled: LabelledFrame, frame: Frame) -> _File | None:
     units = np.minimum(np.rint(frame.depth * _DEPTH_UNITS), 2**16 - 1).astype(np.uint16)
     masks = dense_masks(frame, [item.indices for item in labelled.objects])
     return ".png", png(units, level=4), frame.depth.shape, masks
+
+
+def snapped_masks(frame: Frame, coloured: Coloured, pixels: U1) -> tuple[Mask, ...]:
+    """Return the masks of a frame whose outlines lie on the edges of its colour image."""
+    lens, camera, scale = coloured.view.lens, frame.camera, 1.0
+    if not coloured.view.registered and lens is not None and camera is not None:
+        scale = lens.pinhole.fx / camera.fx
+    return snapped(coloured.masks, pixels, scale)
 
 
 def _chosen(

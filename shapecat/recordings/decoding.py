@@ -20,7 +20,6 @@ from rosbags.typesys.store import Typestore
 
 from shapecat.recordings.foxglove import as_ros
 from shapecat.recordings.messages import Channel, Message, MessageError
-from shapecat.recordings.protobuf import message_decoder
 
 __all__ = ["LIBRARY_ERRORS", "Decoder", "decode", "schema_of", "typestore_of"]
 
@@ -138,6 +137,8 @@ def _json(_channel: Channel) -> Decoder:
 
 
 def _protobuf(channel: Channel) -> Decoder:
+    from shapecat.recordings.protobuf import message_decoder  # noqa: PLC0415  on first use
+
     return message_decoder(channel.schema, channel.schema_name)
 
 

@@ -10,7 +10,6 @@ from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute
 
 from shapecat.arrays import F4, F8, I4, Bool
 from shapecat.runs.tables import Key, frame_rows, numbers, rows_of, topic_codes
@@ -188,7 +187,7 @@ def _joined(parts: list[_Stream]) -> _Stream:
 
 def _vectors(column: pa.ChunkedArray, width: int) -> F8:
     """Return a column of vectors (n, width), NaN where there is none."""
-    known = pa.compute.is_valid(column).to_numpy()
+    known = column.is_valid().to_numpy()
     vectors = np.full((len(known), width), np.nan)
     if known.any():
         vectors[known] = numbers(column).reshape(-1, width)
