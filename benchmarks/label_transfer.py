@@ -28,7 +28,7 @@ from shapecat.runs.label_transfer import match_labels
 from shapecat.runs.tables import read_row_groups
 from shapecat.runs.track_table import read_track_table
 from shapecat.simulation import KINECT, make_scene
-from shapecat.simulation.paths import walk
+from shapecat.simulation.paths import Filming, walk
 from shapecat.simulation.recorder import record
 from shapecat.simulation.worlds import FIRST_THING_LABEL, World
 
@@ -135,13 +135,7 @@ def second_pass(world: World, seed: int, frames: int) -> World:
     height = next(s.height for s in world.supports if s.level and s.name != "floor")
     target = np.array([0, 0, height + 0.05])
     elsewhere = walk(
-        rng,
-        target,
-        frames,
-        30.0,
-        distance=rng.uniform(0.8, 1.3),
-        elevation=rng.uniform(28, 52),
-        sweep=rng.uniform(25, 60),
+        rng, target, Filming(frames, 30.0), distance=(0.8, 1.3), elevation=(28, 52), sweep=(25, 60)
     )
     return replace(world, path=elsewhere)
 

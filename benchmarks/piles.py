@@ -22,6 +22,7 @@ from shapecat.evaluation.overlap import MATCHED_F, match_masks
 from shapecat.learning import Categorizer, load_model
 from shapecat.perception import perceive
 from shapecat.simulation import Thing, render_frame
+from shapecat.simulation.paths import Filming
 from shapecat.simulation.piles import bin_picking, pile, shelf_bin
 from shapecat.simulation.sensors import PRESETS
 from shapecat.types import CATEGORIES, Detection
@@ -59,7 +60,7 @@ def judge(
     for seed in range(first, first + count):
         rng = np.random.default_rng(seed)
         names = np.where(rng.random(OBJECTS) < UNKNOWN, "unknown", rng.choice(CATEGORIES, OBJECTS))
-        world = SCENES[kind](rng, names.tolist(), 1, 30.0)
+        world = SCENES[kind](rng, names.tolist(), Filming(1, 30.0))
         frame, labels = render_frame(world, 0, rng=rng, sensor=PRESETS[sensor])
         seen = perceive(frame, up=None, categorizer=model, settings=settings).detections
         flat = labels.reshape(-1)

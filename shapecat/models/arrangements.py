@@ -9,6 +9,7 @@ import numpy as np
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
 from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.mesh import Mesh, moved, rounded_box, scaled, standing
+from shapecat.simulation.paths import Filming
 from shapecat.simulation.piles import bin_picking, pile, shelf_bin
 from shapecat.simulation.placement import choose_rest, rests, turn_about_z
 from shapecat.simulation.shapes import make_object
@@ -99,7 +100,7 @@ def _settled(world: World, rng: np.random.Generator) -> Arrangement:
     make, _, seen_from = _SETTLED[chosen]
     names = rng.choice(CATEGORIES, int(rng.integers(4, 19)))
     names = np.where(rng.random(names.size) < world.unknown, UNKNOWN, names)
-    scene = make(rng, names.tolist(), 1, 30.0, kinds=world.kinds)
+    scene = make(rng, names.tolist(), Filming(1, 30.0), kinds=world.kinds)
     supports = {support.name: support for support in scene.supports}
     bearing = next((t.on_support for t in scene.things if t.on_support is not None), "floor")
     down = Pose(np.eye(3), np.array([0.0, 0.0, -supports[bearing].height]))

@@ -9,14 +9,14 @@ from numpy.random import Generator
 from shapecat.arrays import F8
 from shapecat.simulation.furniture import make_counter, make_room, make_table
 from shapecat.simulation.layout import Layout
-from shapecat.simulation.paths import stroll, walk
+from shapecat.simulation.paths import Filming, stroll, walk
 from shapecat.simulation.worlds import Motion, Support, World
 from shapecat.types import Pose
 
 __all__ = ["crossing", "rearranged", "walking"]
 
 
-def walking(rng: Generator, categories: Sequence[str], frames: int, rate_hz: float) -> World:
+def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
     """Walk along a counter and back: things leave the view and come back into it."""
     room, counter = make_room(rng, wall_chance=0.0), make_counter(rng)
     layout = Layout(rng, gap=rng.uniform(0.02, 0.05))
@@ -25,23 +25,16 @@ def walking(rng: Generator, categories: Sequence[str], frames: int, rate_hz: flo
         layout.put(
             category, _strip(counter, (middle - 0.3, middle + 0.3), (-0.22, 0.22)), _ANYWHERE
         )
-    path = stroll(
-        rng,
-        np.array([0, 0, counter.height + 0.05]),
-        frames,
-        rate_hz,
-        distance=rng.uniform(0.95, 1.2),
-        elevation=rng.uniform(30, 48),
-        reach=rng.uniform(0.6, 0.75),
-    )
-    return World("walking", (*room, counter), tuple(layout.things), path, np.zeros(frames))
+    target = np.array([0, 0, counter.height + 0.05])
+    path = stroll(rng, target, filming, distance=(0.95, 1.2), elevation=(30, 48), reach=(0.6, 0.75))
+    return World("walking", (*room, counter), tuple(layout.things), path, np.zeros(filming.frames))
 
 
-def crossing(rng: Generator, categories: Sequence[str], frames: int, rate_hz: float) -> World:
+def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
     """Slide two things to and fro on lanes between two rows: they hide others, and each other."""
     room, table = make_room(rng, wall_chance=0.3), make_table(rng, (1.3, 0.85))
     layout = Layout(rng, gap=0.02, enclosed=True)
-    t = np.arange(frames) / rate_hz
+    t = filming.times()
     motions = []
     for side, low in ((1.0, -0.13), (-1.0, 0.01)):
         lane = _strip(table, (-0.45, 0.45), (low, low + 0.12))
@@ -55,12 +48,12 @@ def crossing(rng: Generator, categories: Sequence[str], frames: int, rate_hz: fl
     rows = [_strip(table, (-0.5, 0.5), y) for y in ((-0.32, -0.15), (0.15, 0.37))]
     for k, category in enumerate(categories):
         layout.put(category, rows[k % 2], _ANYWHERE, attempts=20)
-    path = _walk_past(rng, table, frames, rate_hz, elevation=(25, 40), sweep=8)
+    path = _walk_past(rng, table, filming, elevation=(25, 40), sweep=8)
     things = tuple(layout.things)
-    return World("crossing", (*room, table), things, path, np.zeros(frames), tuple(motions))
+    return World("crossing", (*room, table), things, path, np.zeros(filming.frames), tuple(motions))
 
 
-def rearranged(rng: Generator, categories: Sequence[str], frames: int, rate_hz: float) -> World:
+def rearranged(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
     """Add a thing to a table, take one away, carry one elsewhere and push another one."""
     room, table = make_room(rng, wall_chance=0.3), make_table(rng, (1.3, 0.85))
     layout = Layout(rng, gap=0.04)
@@ -69,7 +62,7 @@ def rearranged(rng: Generator, categories: Sequence[str], frames: int, rate_hz: 
     back = _strip(table, (-0.45, 0.45), (-0.12, 0.36))
     for category in categories:
         layout.put(category, back, _ANYWHERE)
-    duration, t = frames / rate_hz, np.arange(frames) / rate_hz
+    duration, t = filming.frames / filming.rate_hz, filming.times()
     begun = rng.uniform([0.15, 0.15, 0.5, 0.15], 0.5 + np.array([0, 0, 0.3, 0])) * duration
     motions = [_pushed(0, layout.things[0].pose.translation, t - begun[0])]
     for k in range(1, len(layout.things)):
@@ -81,25 +74,24 @@ def rearranged(rng: Generator, categories: Sequence[str], frames: int, rate_hz: 
     there = t[:, None] < begun[2], t[:, None] >= begun[3]  # one goes, one comes
     for k, when in zip(others, there, strict=False):
         motions.append(Motion(k, np.where(when, np.zeros(3), np.nan)))
-    path = _walk_past(rng, table, frames, rate_hz, elevation=(30, 48), sweep=12)
+    path = _walk_past(rng, table, filming, elevation=(30, 48), sweep=12)
     things = tuple(layout.things)
-    return World("rearranged", (*room, table), things, path, np.zeros(frames), tuple(motions))
+    return World(
+        "rearranged", (*room, table), things, path, np.zeros(filming.frames), tuple(motions)
+    )
 
 
 def _walk_past(
     rng: Generator,
     table: Support,
-    frames: int,
-    rate_hz: float,
+    filming: Filming,
     *,
     elevation: tuple[float, float],
     sweep: float,
 ) -> tuple[Pose, ...]:
     """Walk on an arc in front of a table, looking down by degrees from a range."""
     middle = np.array([0, 0, table.height + 0.05])
-    distance = rng.uniform(1.0, 1.3)
-    down = rng.uniform(*elevation)
-    return walk(rng, middle, frames, rate_hz, distance=distance, elevation=down, sweep=sweep)
+    return walk(rng, middle, filming, distance=(1.0, 1.3), elevation=elevation, sweep=sweep)
 
 
 _ANYWHERE = np.array([0.6, 0.3])

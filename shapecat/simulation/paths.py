@@ -1,5 +1,7 @@
 """How the camera moves: world_from_camera with optical axes (x right, y down, z forward)."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.random import Generator
 
@@ -7,7 +9,22 @@ from shapecat.arrays import F8
 from shapecat.geometry import quaternion_from_rotation, rotation_from_quaternion
 from shapecat.types import Pose
 
-__all__ = ["hold", "looking_at", "scattered", "stroll", "walk"]
+__all__ = ["Filming", "hold", "looking_at", "scattered", "stroll", "walk"]
+
+
+class Filming(NamedTuple):
+    """How long and how fast a camera films."""
+
+    frames: int
+    rate_hz: float
+
+    def times(self) -> F8:
+        """Return the seconds of the frames since the first one."""
+        return np.arange(self.frames) / self.rate_hz
+
+
+Range = float | tuple[float, float]
+"""A value, or the range that it is drawn from."""
 
 
 def looking_at(eye: F8, target: F8, *, roll: float = 0.0) -> Pose:
@@ -29,12 +46,11 @@ def looking_at(eye: F8, target: F8, *, roll: float = 0.0) -> Pose:
 def walk(
     rng: Generator,
     target: F8,
-    frames: int,
-    rate_hz: float,
+    filming: Filming,
     *,
-    distance: float,
-    elevation: float,
-    sweep: float,
+    distance: Range,
+    elevation: Range,
+    sweep: Range,
 ) -> tuple[Pose, ...]:
     """Walk to and fro on an arc in front of a place, swaying a little, always looking at it.
 
@@ -45,7 +61,8 @@ def walk(
     elevation : degrees by which the camera looks down, at the start.
     sweep : degrees from the middle of the arc to its ends.
     """
-    t = np.arange(frames) / rate_hz
+    distance, elevation, sweep = (_drawn(rng, value) for value in (distance, elevation, sweep))
+    t = filming.times()
     speed = rng.uniform(0.25, 0.6) / distance  # walking speed, radians per second
     width = np.radians(sweep)
     phase = rng.uniform(-np.pi, np.pi)
@@ -75,12 +92,11 @@ def walk(
 def stroll(
     rng: Generator,
     target: F8,
-    frames: int,
-    rate_hz: float,
+    filming: Filming,
     *,
-    distance: float,
-    elevation: float,
-    reach: float,
+    distance: Range,
+    elevation: Range,
+    reach: Range,
 ) -> tuple[Pose, ...]:
     """Walk sideways to and fro along a counter, swaying a little, looking at what is in front.
 
@@ -90,7 +106,8 @@ def stroll(
     distance, reach : metres to the counter, and from its middle to where the way turns.
     elevation : degrees by which the camera looks down.
     """
-    t = np.arange(frames) / rate_hz
+    distance, elevation, reach = (_drawn(rng, value) for value in (distance, elevation, reach))
+    t = filming.times()
     speed = rng.uniform(0.4, 0.55)
     side = reach * np.sin(speed / reach * t + rng.uniform(-np.pi, np.pi))
     up, shift = np.radians(elevation), rng.uniform(0, 2 * np.pi, 4)
@@ -101,6 +118,10 @@ def stroll(
     eye = eye + np.column_stack([side, sway, bob])
     roll = np.radians(0.6 * np.sin(np.pi * 1.8 * t + shift[3]))
     return tuple(looking_at(e, g, roll=float(r)) for e, g, r in zip(eye, gaze, roll, strict=True))
+
+
+def _drawn(rng: Generator, value: Range) -> float:
+    return float(rng.uniform(*value) if isinstance(value, tuple) else value)
 
 
 def hold(

@@ -11,13 +11,15 @@ from shapecat.geometry import rotation_from_quaternion, transform
 from shapecat.simulation.distractors import DISTRACTORS, make_distractor
 from shapecat.simulation.furniture import make_bin, make_compartment, make_room, make_table
 from shapecat.simulation.mesh import Mesh
-from shapecat.simulation.paths import walk
+from shapecat.simulation.paths import Filming, walk
 from shapecat.simulation.physics import Drop, Rest, settle
 from shapecat.simulation.shapes import make_object
 from shapecat.simulation.worlds import Support, Thing, World
 
-__all__ = ["Item", "bin_picking", "make_item", "pile", "settled", "shelf_bin"]
+__all__ = ["KINDS", "Item", "bin_picking", "make_item", "pile", "settled", "shelf_bin"]
 
+KINDS = tuple(DISTRACTORS)
+"""What things of no category are."""
 _UPRIGHT = 0.45
 """Share of the things that are dropped nearly upright; others are turned anyhow."""
 _SWAY_DEG = 8.0
@@ -35,12 +37,7 @@ class Item(NamedTuple):
 
 
 def pile(
-    rng: Generator,
-    categories: Sequence[str],
-    frames: int,
-    rate_hz: float,
-    *,
-    kinds: Sequence[str] = tuple(DISTRACTORS),
+    rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
     """Drop things in a heap on a table: they lean, lie across, and in each other."""
     supports = (*make_room(rng, wall_chance=0.2), make_table(rng))
@@ -51,25 +48,20 @@ def pile(
         place = np.clip(rng.normal(0, spread, 2), -0.4, 0.4)
         drops.append(Drop(item.mesh, _turned(rng), place))
     things = settled(items, drops, supports, table)
+    target = np.array([0, 0, table.height + 0.05])
     path = walk(
         rng,
-        np.array([0, 0, table.height + 0.05]),
-        frames,
-        rate_hz,
+        target,
+        filming,
         distance=float(np.exp(rng.uniform(np.log(0.6), np.log(1.5)))),
-        elevation=rng.uniform(18, 75),
-        sweep=rng.uniform(20, 60),
+        elevation=(18, 75),
+        sweep=(20, 60),
     )
-    return World("pile", supports, things, path, np.zeros(frames))
+    return World("pile", supports, things, path, np.zeros(filming.frames))
 
 
 def bin_picking(
-    rng: Generator,
-    categories: Sequence[str],
-    frames: int,
-    rate_hz: float,
-    *,
-    kinds: Sequence[str] = tuple(DISTRACTORS),
+    rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
     """Pour things into a bin, and look into it from above."""
     bottom, sides = make_bin(rng)
@@ -81,26 +73,14 @@ def bin_picking(
         room = np.maximum(half - float(item.mesh.extents.max()) / 2 - 0.01, 0)
         drops.append(Drop(item.mesh, _turned(rng), rng.uniform(-room, room)))
     supports = (*make_room(rng, wall_chance=0.2), bottom, *sides)
-    path = walk(
-        rng,
-        np.array([0, 0, bottom.height + 0.05]),
-        frames,
-        rate_hz,
-        distance=rng.uniform(0.6, 1.2),
-        elevation=rng.uniform(60, 84),
-        sweep=rng.uniform(10, 40),
-    )
+    target = np.array([0, 0, bottom.height + 0.05])
+    path = walk(rng, target, filming, distance=(0.6, 1.2), elevation=(60, 84), sweep=(10, 40))
     things = settled(items, drops, supports, bottom)
-    return World("bin", supports, things, path, np.zeros(frames))
+    return World("bin", supports, things, path, np.zeros(filming.frames))
 
 
 def shelf_bin(
-    rng: Generator,
-    categories: Sequence[str],
-    frames: int,
-    rate_hz: float,
-    *,
-    kinds: Sequence[str] = tuple(DISTRACTORS),
+    rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
     """Put things into a compartment of a shelf, and look in from the front."""
     board, walls, top = make_compartment(rng)
@@ -114,16 +94,9 @@ def shelf_bin(
         drops.append(Drop(item.mesh, _turned(rng), rng.uniform(-room, room)))
     supports = (*make_room(rng, wall_chance=0.0), board, *walls)
     things = settled(items, drops, supports, board, highest_m=float(room_m))
-    path = walk(
-        rng,
-        np.array([0, 0, board.height + room_m / 3]),
-        frames,
-        rate_hz,
-        distance=rng.uniform(0.5, 0.9),
-        elevation=rng.uniform(5, 25),
-        sweep=rng.uniform(5, 20),
-    )
-    return World("shelf_bin", (*supports, top), things, path, np.zeros(frames))
+    target = np.array([0, 0, board.height + room_m / 3])
+    path = walk(rng, target, filming, distance=(0.5, 0.9), elevation=(5, 25), sweep=(5, 20))
+    return World("shelf_bin", (*supports, top), things, path, np.zeros(filming.frames))
 
 
 def make_item(category: str, rng: Generator, kinds: Sequence[str]) -> Item:

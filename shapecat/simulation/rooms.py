@@ -6,7 +6,6 @@ import numpy as np
 from numpy.random import Generator
 
 from shapecat.arrays import F8
-from shapecat.simulation.distractors import DISTRACTORS
 from shapecat.simulation.equipment import (
     make_arm,
     make_cable,
@@ -20,9 +19,9 @@ from shapecat.simulation.equipment import (
 )
 from shapecat.simulation.furniture import make_room, make_table, make_wall
 from shapecat.simulation.mesh import Mesh
-from shapecat.simulation.paths import walk
+from shapecat.simulation.paths import Filming, walk
 from shapecat.simulation.physics import Drop
-from shapecat.simulation.piles import Item, make_item, settled
+from shapecat.simulation.piles import KINDS, Item, make_item, settled
 from shapecat.simulation.worlds import Support, World, turned_about_z
 
 __all__ = ["room"]
@@ -34,12 +33,7 @@ _DEVICES = {"laptop": make_laptop, "keyboard": make_keyboard, "plant": make_plan
 
 
 def room(
-    rng: Generator,
-    categories: Sequence[str],
-    frames: int,
-    rate_hz: float,
-    *,
-    kinds: Sequence[str] = tuple(DISTRACTORS),
+    rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
     """Put things on a table in a room full of other stuff, which is no object."""
     supports = [*make_room(rng, wall_chance=0.7), make_table(rng)]
@@ -56,18 +50,11 @@ def room(
         drops.append(Drop(item.mesh, turned_about_z(rng.uniform(-0.6, 0.6)).rotation, place))
     solid = (table, *_named("robot", standing))
     things = settled(items, drops, solid, table)
-    path = walk(
-        rng,
-        np.array([0, 0, table.height + rng.uniform(0.0, 0.2)]),
-        frames,
-        rate_hz,
-        distance=rng.uniform(0.7, 2.2),
-        elevation=rng.uniform(12, 60),
-        sweep=rng.uniform(15, 60),
-    )
+    target = np.array([0, 0, table.height + rng.uniform(0.0, 0.2)])
+    path = walk(rng, target, filming, distance=(0.7, 2.2), elevation=(12, 60), sweep=(15, 60))
     rest = [s for s in supports if s is not table]
     everything = (*rest, *solid, *_named("room", around))
-    return World("room", everything, things, path, np.zeros(frames))
+    return World("room", everything, things, path, np.zeros(filming.frames))
 
 
 def _named(name: str, meshes: Sequence[Mesh]) -> list[Support]:

@@ -10,7 +10,7 @@ from numpy.random import Generator
 from shapecat.simulation.furniture import make_room, make_shelf, make_table, round_table
 from shapecat.simulation.layout import Layout, Piece
 from shapecat.simulation.moving import crossing, rearranged, walking
-from shapecat.simulation.paths import hold, scattered, walk
+from shapecat.simulation.paths import Filming, hold, scattered, walk
 from shapecat.simulation.piles import bin_picking, pile, shelf_bin
 from shapecat.simulation.rooms import room
 from shapecat.simulation.worlds import World
@@ -38,8 +38,7 @@ SceneKind = Literal[
 class _Wish:
     """What a scene is to have; ``distractors`` None leaves it to the kind of scene."""
 
-    frames: int
-    rate_hz: float
+    filming: Filming
     categories: tuple[str, ...]
     distractors: int | None
 
@@ -81,7 +80,7 @@ def make_scene(
     if kind not in SCENES:
         msg = f"no scene {kind!r}; known: {', '.join(SCENES)}"
         raise ValueError(msg)
-    return SCENES[kind](rng, _Wish(frames, rate_hz, tuple(categories), distractors))
+    return SCENES[kind](rng, _Wish(Filming(frames, rate_hz), tuple(categories), distractors))
 
 
 def make_stage(pieces: Sequence[Piece], rng: Generator, *, views: int = 8) -> World:
@@ -110,16 +109,11 @@ def _tabletop(rng: Generator, wish: _Wish) -> World:
     count = int(rng.integers(max(6, len(wish.categories)), 11))
     for category in wish.draw(rng, count):
         layout.put(category, table, np.array([0.38, 0.27]), stack=0.06)
-    path = walk(
-        rng,
-        np.array([0, 0, table.height + 0.05]),
-        wish.frames,
-        wish.rate_hz,
-        distance=rng.uniform(0.9, 1.4),
-        elevation=rng.uniform(28, 52),
-        sweep=rng.uniform(25, 60),
+    target = np.array([0, 0, table.height + 0.05])
+    path = walk(rng, target, wish.filming, distance=(0.9, 1.4), elevation=(28, 52), sweep=(25, 60))
+    return World(
+        "tabletop", (*room, table), tuple(layout.things), path, np.zeros(wish.filming.frames)
     )
-    return World("tabletop", (*room, table), tuple(layout.things), path, np.zeros(wish.frames))
 
 
 def _clutter(rng: Generator, wish: _Wish) -> World:
@@ -134,16 +128,11 @@ def _clutter(rng: Generator, wish: _Wish) -> World:
     for category in wanted:
         layout.gap = float(rng.choice([0.002, 0.008, 0.02]))
         layout.put(category, table, half, stack=0.3, attempts=4)
-    path = walk(
-        rng,
-        np.array([0, 0, table.height + 0.06]),
-        wish.frames,
-        wish.rate_hz,
-        distance=rng.uniform(0.65, 1.3),
-        elevation=rng.uniform(25, 58),
-        sweep=rng.uniform(20, 50),
+    target = np.array([0, 0, table.height + 0.06])
+    path = walk(rng, target, wish.filming, distance=(0.65, 1.3), elevation=(25, 58), sweep=(20, 50))
+    return World(
+        "clutter", (*room, table), tuple(layout.things), path, np.zeros(wish.filming.frames)
     )
-    return World("clutter", (*room, table), tuple(layout.things), path, np.zeros(wish.frames))
 
 
 def _shelf(rng: Generator, wish: _Wish) -> World:
@@ -155,17 +144,12 @@ def _shelf(rng: Generator, wish: _Wish) -> World:
     half = np.array([width / 2 - 0.06, depth / 2 - 0.03])
     for k, category in enumerate(wish.draw(rng, 12, usual=int(rng.integers(0, 2)))):
         layout.put(category, boards[k % 3], half, stack=0.5 if k > 5 else 0.0, attempts=8)
+    target = np.array([0, 0, low + 1.15 * step])
     path = walk(
-        rng,
-        np.array([0, 0, low + 1.15 * step]),
-        wish.frames,
-        wish.rate_hz,
-        distance=rng.uniform(1.25, 1.55),
-        elevation=rng.uniform(20, 30),
-        sweep=rng.uniform(12, 28),
+        rng, target, wish.filming, distance=(1.25, 1.55), elevation=(20, 30), sweep=(12, 28)
     )
     supports = (*make_room(rng, wall_chance=0.0), *boards, *sides)
-    return World("shelf", supports, tuple(layout.things), path, np.zeros(wish.frames))
+    return World("shelf", supports, tuple(layout.things), path, np.zeros(wish.filming.frames))
 
 
 def _turntable(rng: Generator, wish: _Wish) -> World:
@@ -177,39 +161,32 @@ def _turntable(rng: Generator, wish: _Wish) -> World:
         layout.put(category, table, np.array([0.3, 0.3]), attempts=4)
     target = np.array([0, 0, table.height + 0.04])
     distance, elevation = rng.uniform(0.9, 1.2), rng.uniform(28, 48)
-    path = hold(rng, target, wish.frames, distance=distance, elevation=elevation)
+    path = hold(rng, target, wish.filming.frames, distance=distance, elevation=elevation)
     speed = rng.choice([-1, 1]) * rng.uniform(0.25, 0.5)  # radians per second
-    turns = np.round(speed / wish.rate_hz * np.arange(wish.frames), 9)
+    turns = np.round(speed * wish.filming.times(), 9)
     return World("turntable", (*room, table), tuple(layout.things), path, turns)
 
 
 def _empty(rng: Generator, wish: _Wish) -> World:
     """Leave the table empty."""
     room, table = make_room(rng, wall_chance=0.5), make_table(rng)
-    path = walk(
-        rng,
-        np.array([0, 0, table.height]),
-        wish.frames,
-        wish.rate_hz,
-        distance=rng.uniform(0.8, 1.5),
-        elevation=rng.uniform(25, 60),
-        sweep=rng.uniform(10, 50),
-    )
-    return World("empty", (*room, table), (), path, np.zeros(wish.frames))
+    target = np.array([0, 0, table.height])
+    path = walk(rng, target, wish.filming, distance=(0.8, 1.5), elevation=(25, 60), sweep=(10, 50))
+    return World("empty", (*room, table), (), path, np.zeros(wish.filming.frames))
 
 
 SCENES: dict[str, Callable[[Generator, _Wish], World]] = {
     "tabletop": _tabletop,
     "shelf": _shelf,
     "clutter": _clutter,
-    "pile": lambda rng, wish: pile(rng, wish.poured(rng), wish.frames, wish.rate_hz),
-    "bin": lambda rng, wish: bin_picking(rng, wish.poured(rng), wish.frames, wish.rate_hz),
-    "shelf_bin": lambda rng, wish: shelf_bin(rng, wish.poured(rng), wish.frames, wish.rate_hz),
-    "room": lambda rng, wish: room(rng, wish.draw(rng, 7), wish.frames, wish.rate_hz),
+    "pile": lambda rng, wish: pile(rng, wish.poured(rng), wish.filming),
+    "bin": lambda rng, wish: bin_picking(rng, wish.poured(rng), wish.filming),
+    "shelf_bin": lambda rng, wish: shelf_bin(rng, wish.poured(rng), wish.filming),
+    "room": lambda rng, wish: room(rng, wish.draw(rng, 7), wish.filming),
     "turntable": _turntable,
-    "walking": lambda rng, wish: walking(rng, wish.draw(rng, 11), wish.frames, wish.rate_hz),
-    "crossing": lambda rng, wish: crossing(rng, wish.draw(rng, 7), wish.frames, wish.rate_hz),
-    "rearranged": lambda rng, wish: rearranged(rng, wish.draw(rng, 8), wish.frames, wish.rate_hz),
+    "walking": lambda rng, wish: walking(rng, wish.draw(rng, 11), wish.filming),
+    "crossing": lambda rng, wish: crossing(rng, wish.draw(rng, 7), wish.filming),
+    "rearranged": lambda rng, wish: rearranged(rng, wish.draw(rng, 8), wish.filming),
     "empty": _empty,
 }
 """The kinds of scenes."""
