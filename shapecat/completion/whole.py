@@ -31,15 +31,18 @@ where a surface curves away than where many points lie at the outline, as those 
 _CURVED = ("bowl", "plate", "ball")
 _TOP = 0.98
 """Share of the points below the top."""
+_NOISY_M, _FLAT = 0.004, 1 / 3
+"""Noise lifts the highest points of a flat top by so much at most; a top is flat that has such a
+share of the points."""
 _HANDLE = 0.06
 """What reaches farther beyond the oval of a cup, as a share of its radius, is a handle."""
-_EDGEWISE = -0.09
+_EDGEWISE = -0.2
 """Cosine of the angle to the sensor from which on an outline is seen: a little behind its edge."""
 _ROUND = ("ball", "cup")
 """Round by nature, or with a handle that would be taken for the long side of an oval."""
 _ROUNDNESS, _CIRCULAR = 5.0, 1e3
 """So many directions weigh against an oval: most things are round, and one side tells little."""
-_FITS = 0.1
+_FITS = 0.07
 """An oval fits if the side that is seen deviates by less than this share of the radius."""
 _NOISE_M, _GUESS = 0.006, 0.35
 """Deviation of a length that is seen, and of the part that is guessed, as a share of it."""
@@ -150,4 +153,7 @@ def _bounds(heights: F4) -> tuple[float, float, float]:
     """Return the bottom, the lowest height that is seen, and the top, above the support."""
     ascending, stray = np.sort(heights), int((1 - _TOP) * len(heights))
     lowest, top = float(ascending[stray]), float(ascending[-1 - stray])
+    near = ascending[np.searchsorted(ascending, top - _NOISY_M) :]
+    flat = min(1.0, len(near) / (_FLAT * len(ascending)))
+    top -= flat * (top - float(near[len(near) // 2]))
     return min(0.0, top), lowest, top
