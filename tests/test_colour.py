@@ -66,8 +66,9 @@ def test_the_painted_image_agrees_with_projected_points() -> None:
     rows, columns = np.mgrid[8:112:13, 8:152:13]
     depth[rows, columns] = rng.uniform(0.5, 1.5, rows.shape)
     labels[rows, columns] = 1 + np.arange(rows.size).reshape(rows.shape)
+    objects = [np.array([index], np.uint32) for index in (rows * 160 + columns).ravel()]
     frame = Frame("", 0, 0, 0, "", depth=depth, camera=DEPTH)
-    painted = splat_depth(depth, DEPTH, labels, LENS, TURNED)
+    painted = splat_depth(depth, DEPTH, objects, LENS, TURNED)
 
     seen = project(frame.xyz(), LENS, TURNED)
     found = 0

@@ -81,14 +81,13 @@ def dense_masks(
     if frame.depth is None or frame.camera is None:
         msg = "masks need a depth image"
         raise ValueError(msg)
-    labels = np.zeros(frame.depth.shape, np.int32)
-    for number, indices in enumerate(objects, start=1):
-        labels.reshape(-1)[indices] = number
     if colour_from_depth is None or lens is None:
-        labels[(frame.depth <= 0) & (labels == 0)] = -1
+        labels = np.where(frame.depth > 0, 0, -1).astype(np.int32)
+        for number, indices in enumerate(objects, start=1):
+            labels.reshape(-1)[indices] = number
         return labelled_masks(labels, len(objects))
     scale = lens.pinhole.fx / frame.camera.fx
-    painted = splat_depth(frame.depth, frame.camera, labels, lens, colour_from_depth)
+    painted = splat_depth(frame.depth, frame.camera, objects, lens, colour_from_depth)
     masks = labelled_masks(painted.labels, len(objects), scale)
     return tuple(
         replace(mask, left=mask.left + painted.left, top=mask.top + painted.top)

@@ -1,11 +1,12 @@
 """Points of the depth sensor on the image of a colour camera, and what hides what there."""
 
+from collections.abc import Sequence
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F4, I4, U1
+from shapecat.arrays import F4, I4, U1, U4, Bool
 from shapecat.cameras.colour import LensCamera
 from shapecat.cameras.lenses import LENS_MODELS, distort
 from shapecat.jit import kernel
@@ -17,7 +18,7 @@ _FOOTPRINT_PX = 0.05
 """A depth pixel covers so much more of the colour image on each side, to leave no gaps."""
 _HIDDEN = 0.02
 """An object is hidden where something else is nearer by more than this share of its distance."""
-_SPARSE = 2
+_SPARSE = 4
 """Of what is of no object, every so-many-th row and column is looked at."""
 _BESIDE_PX = 30
 """Depth pixels so far from labelled ones are looked at, for what lies beside and between them."""
@@ -119,79 +120,107 @@ class Painted(NamedTuple):
 
 
 def splat_depth(
-    depth: F4, camera: Camera, labels: I4, lens: LensCamera, colour_from_depth: Pose
+    depth: F4, camera: Camera, objects: Sequence[U4], lens: LensCamera, colour_from_depth: Pose
 ) -> Painted:
-    """Paint a depth image as a colour camera sees it, where it has labels and around them.
+    """Paint the objects of a depth image as a colour camera sees them.
 
-    Each labelled depth pixel covers a square on the colour image, as large as its own, and a little
-    more; where several cover a pixel, the nearest shows. What has no label is painted coarsely: it
-    matters by what it hides, and by the gaps that are none.
+    Each depth pixel of an object covers a square on the colour image, as large as its own, and a
+    little more; where several cover a pixel, the nearest shows. The other pixels are painted
+    coarsely: they matter by what they hide, and by the gaps that are none.
 
     Parameters
     ----------
     depth : (h, w) metres, 0 where there is no reading.
-    labels : (h, w) int32 what each depth pixel belongs to, 0 for nothing.
+    objects : indices of the pixels of each object.
 
     Notes
     -----
-    O(depth pixels + what they cover).
+    O(pixels of the objects and what they cover; a few around them).
     """
-    target = lens.pinhole
-    rows, columns = _around(depth, labels, camera, colour_from_depth)
-    depth, labels = (np.ascontiguousarray(image[rows, columns]) for image in (depth, labels))
-    x = (np.arange(camera.width)[columns] - camera.cx) / camera.fx
-    y = (np.arange(camera.height)[rows] - camera.cy) / camera.fy
-    turn = colour_from_depth.rotation
-    # A ray is turned by adding what its column and its row give to each coordinate.
-    by_column = np.outer(turn[:, 0], x).astype(np.float32)
-    by_row = (np.outer(y, turn[:, 1]) + turn[:, 2]).astype(np.float32)
-    rays = by_column, by_row, colour_from_depth.translation.astype(np.float32)
-    numbers, *distortion = _lens_numbers(lens)
+    target, numbers, *distortion = lens.pinhole, *_lens_numbers(lens)
     scale = max(target.fx / camera.fx, target.fy / camera.fy)
+    pixels = np.concatenate([np.zeros(0, np.uint32), *objects])
+    labels = np.repeat(np.arange(1, len(objects) + 1, dtype=np.int32), list(map(len, objects)))
+    beside = _beside(depth, pixels, camera, colour_from_depth)
+    rays = _rays(camera, colour_from_depth)
+    place, around = np.zeros((4, len(pixels)), "f4"), np.zeros((4, len(beside)), "f4")
+    for indices, seen in ((pixels, place), (beside, around)):
+        _move(depth, indices, *rays, seen)
+        _see(seen[0], seen[1], seen[2], numbers, *distortion)
     size, margin = (target.width, target.height), int(_BESIDE_PX * scale)
-    left, top, right, bottom = _landing(depth, labels, *rays, numbers, *distortion, size, margin)
+    left, top, right, bottom = _landing(place, size, margin)
     seen = np.full((max(0, bottom - top), max(0, right - left)), -1, np.int32)
-    numbers[2:] -= (left, top)
     half, cell = np.float32(scale / 2), max(2, int(_SPARSE * scale + 0.5))
-    _splat(depth, labels, *rays, numbers, *distortion, half, cell, seen)
+    corner = np.array((left, top), np.float32)
+    _splat(place, labels, around, corner, half, cell, seen)
     return Painted(left, top, seen)
 
 
-def _around(depth: F4, labels: I4, camera: Camera, colour_from_depth: Pose) -> tuple[slice, slice]:
-    """Return the rows and columns of what may hide labelled pixels, or lie beside them.
+def _rays(camera: Camera, colour_from_depth: Pose) -> tuple[F4, F4, F4]:
+    """Return what column and row (3, n) give to a ray that is turned, and the shift (3,)."""
+    x = (np.arange(camera.width) - camera.cx) / camera.fx
+    y = (np.arange(camera.height) - camera.cy) / camera.fy
+    turn = colour_from_depth.rotation
+    by_column, by_row = np.outer(turn[:, 0], x), np.outer(turn[:, 1], y) + turn[:, 2:]
+    return (
+        by_column.astype(np.float32),
+        by_row.astype(np.float32),
+        colour_from_depth.translation.astype(np.float32),
+    )
+
+
+def _beside(depth: F4, pixels: U4, camera: Camera, colour_from_depth: Pose) -> U4:
+    """Return the sparse pixels of no object that may hide those of objects, or lie beside them.
 
     Between a near and a far pixel that one camera sees in the same place, the other sees the
     parallax: focal length by distance of the cameras by difference of the inverse depths.
     """
-    top, bottom, left, right, near, far = _extent(depth, labels)
-    if bottom <= top:
-        return slice(0, 0), slice(0, 0)
+    own = np.zeros((-(-depth.shape[0] // _SPARSE), -(-depth.shape[1] // _SPARSE)), np.bool_)
+    top, bottom, left, right, near, far = _extent(depth, pixels, own)
+    if not near < np.inf or bottom < top:
+        return np.zeros(0, np.uint32)
     shift = float(np.linalg.norm(colour_from_depth.translation))
-    margin = int(max(camera.fx, camera.fy) * shift * (1 / near - 1 / far)) + _BESIDE_PX
-    return (
-        slice(max(0, top - margin), bottom + margin),
-        slice(max(0, left - margin), right + margin),
+    parallax = max(camera.fx, camera.fy) * shift * max(0.0, 1 / near - 1 / far)
+    margin = int(parallax) + _BESIDE_PX
+    return _list_others(
+        depth, own, (top - margin, bottom + margin), (left - margin, right + margin)
     )
 
 
 @kernel
-def _extent(depth: F4, labels: I4) -> tuple[int, int, int, int, float, float]:
-    """Return about where labelled pixels are, the least depth of all, and the greatest of theirs.
+def _extent(depth: F4, pixels: U4, own: Bool) -> tuple[int, int, int, int, float, float]:
+    """Return first and last row and column of some pixels, the least depth of all, their greatest.
 
-    Every other row and column is looked at.
+    ``own`` becomes which of the sparse pixels are theirs.
     """
-    top, bottom, left, right = depth.shape[0], 0, depth.shape[1], 0
+    top, bottom, left, right = depth.shape[0], -1, depth.shape[1], -1
     near, far = np.float32(np.inf), np.float32(0)
-    for v in range(0, depth.shape[0], 2):
-        for u in range(0, depth.shape[1], 2):
-            z = depth[v, u]
+    width = np.uint32(depth.shape[1])
+    for pixel in pixels:
+        v, u = int(pixel // width), int(pixel % width)
+        if depth[v, u] > 0:
+            far = max(far, depth[v, u])
+            top, bottom, left, right = min(top, v), max(bottom, v), min(left, u), max(right, u)
+            if v % _SPARSE == 0 and u % _SPARSE == 0:
+                own[v // _SPARSE, u // _SPARSE] = True
+    for j in range(own.shape[0]):
+        for i in range(own.shape[1]):
+            z = depth[j * _SPARSE, i * _SPARSE]
             if z > 0:
                 near = min(near, z)
-                if labels[v, u] > 0:
-                    far = max(far, z)
-                    top, bottom = min(top, v), max(bottom, v + 1)
-                    left, right = min(left, u), max(right, u + 1)
     return top, bottom, left, right, float(near), float(far)
+
+
+@kernel
+def _list_others(depth: F4, own: Bool, rows: tuple[int, int], columns: tuple[int, int]) -> U4:
+    """Return the sparse pixels with a reading, from a row to one and a column to one, but own."""
+    found, count = np.empty(own.size, np.uint32), 0
+    for j in range(max(0, rows[0]) // _SPARSE, min(rows[1] // _SPARSE + 1, own.shape[0])):
+        for i in range(max(0, columns[0]) // _SPARSE, min(columns[1] // _SPARSE + 1, own.shape[1])):
+            if depth[j * _SPARSE, i * _SPARSE] > 0 and not own[j, i]:
+                found[count] = (j * depth.shape[1] + i) * _SPARSE
+                count += 1
+    return found[:count]
 
 
 @kernel
@@ -240,92 +269,57 @@ def _see(x: F4, y: F4, z: F4, numbers: F4, kind: int, d: F4, reach: float) -> No
 
 
 @kernel
-def _see_row(
-    depth: F4,
-    by_column: F4,
-    by_row: F4,
-    shift: F4,
-    numbers: F4,
-    kind: int,
-    d: F4,
-    reach: float,
-    seen: F4,
-) -> None:
-    """Find where a row of a depth image (w,) lands: (3, w) column, row, inverse distance."""
-    for k in range(3):
-        for u in range(depth.size):
-            seen[k, u] = (by_column[k, u] + by_row[k]) * depth[u] + shift[k]
-    _see(seen[0], seen[1], seen[2], numbers, kind, d, reach)
+def _move(depth: F4, pixels: U4, by_column: F4, by_row: F4, shift: F4, moved: F4) -> None:
+    """Find pixels in the frame of the colour camera: (4, n) x, y, z, and their depth."""
+    width = np.uint32(depth.shape[1])
+    for i in range(pixels.size):
+        v, u = int(pixels[i] // width), int(pixels[i] % width)
+        z = depth[v, u]
+        for k in range(3):
+            moved[k, i] = (by_column[k, u] + by_row[k, v]) * z + shift[k]
+        moved[3, i] = z
+        if not z > 0:
+            moved[2, i] = -1
 
 
 @kernel
-def _landing(
-    depth: F4,
-    labels: I4,
-    by_column: F4,
-    by_row: F4,
-    shift: F4,
-    numbers: F4,
-    kind: int,
-    d: F4,
-    reach: float,
-    size: tuple[int, int],
-    margin: int,
-) -> tuple[int, int, int, int]:
-    """Return the window around where labelled pixels land: left, top, right, bottom."""
+def _landing(place: F4, size: tuple[int, int], margin: int) -> tuple[int, int, int, int]:
+    """Return the window around where pixels land: left, top, right, bottom."""
     left, top, right, bottom = size[0], size[1], 0, 0
-    seen = np.zeros((3, depth.shape[1]), np.float32)
-    for v in range(0, depth.shape[0], 4):
-        _see_row(depth[v], by_column, by_row[v], shift, numbers, kind, d, reach, seen)
-        for u in range(0, depth.shape[1], 2):
-            if labels[v, u] > 0 and depth[v, u] > 0 and seen[2, u] > 0:
-                x, y = seen[0, u], seen[1, u]
-                if -margin < x < size[0] + margin and -margin < y < size[1] + margin:
-                    left, top = min(left, int(x) - margin), min(top, int(y) - margin)
-                    right, bottom = max(right, int(x) + margin), max(bottom, int(y) + margin)
+    for i in range(place.shape[1]):
+        x, y = place[0, i], place[1, i]
+        if place[2, i] > 0 and -margin < x < size[0] + margin and -margin < y < size[1] + margin:
+            left, top = min(left, int(x) - margin), min(top, int(y) - margin)
+            right, bottom = max(right, int(x) + margin), max(bottom, int(y) + margin)
     return max(left, 0), max(top, 0), min(right, size[0]), min(bottom, size[1])
 
 
 @kernel
 def _splat(
-    depth: F4,
-    labels: I4,
-    by_column: F4,
-    by_row: F4,
-    shift: F4,
-    numbers: F4,
-    kind: int,
-    d: F4,
-    reach: float,
-    scale: float,
-    cell: int,
-    seen: I4,
+    place: F4, labels: I4, around: F4, corner: F4, scale: float, cell: int, seen: I4
 ) -> None:
     """Paint labels where they land, then take back what something without a label hides.
 
-    ``scale`` is half the pixels of the image to a pixel of the depth image, at equal distance.
+    Pixels land at (4, n) column, row, inverse distance, and have a depth. ``corner`` is left and
+    top of the window; ``scale`` half the pixels of the image to a pixel of the depth image, at
+    equal distance.
     """
     height, width = seen.shape
     wide, tall, per_cell = np.float32(width), np.float32(height), np.float32(1 / cell)
     nought, margin = np.float32(0), np.float32(_FOOTPRINT_PX)
-    place = np.zeros((3, depth.shape[1]), np.float32)
     nearest = np.zeros(seen.shape, np.float32)
     front = np.zeros((height // cell + 1, width // cell + 1), np.float32)
-    for v in range(depth.shape[0]):
-        _see_row(depth[v], by_column, by_row[v], shift, numbers, kind, d, reach, place)
-        for u in range(depth.shape[1]):
-            label = labels[v, u]
-            if label <= 0 and (u | v) & (_SPARSE - 1):
-                continue
-            z, column, row, near = depth[v, u], place[0, u], place[1, u], place[2, u]
-            if not z > nought or not near > nought:
-                continue
-            if label > 0:
-                half = scale * z * near + margin
-                _paint_square(label, near, column, row, half, nearest, seen)
-            elif nought <= column < wide and nought <= row < tall:
-                y, x = np.uint32(row * per_cell), np.uint32(column * per_cell)
-                front[y, x] = max(front[y, x], near)
+    for i in range(labels.size):
+        near = place[2, i]
+        if near > nought:
+            half = scale * place[3, i] * near + margin
+            column, row = place[0, i] - corner[0], place[1, i] - corner[1]
+            _paint_square(labels[i], near, column, row, half, nearest, seen)
+    for i in range(around.shape[1]):
+        near, column, row = around[2, i], around[0, i] - corner[0], around[1, i] - corner[1]
+        if near > nought and nought <= column < wide and nought <= row < tall:
+            y, x = np.uint32(row * per_cell), np.uint32(column * per_cell)
+            front[y, x] = max(front[y, x], near)
     for j in range(front.shape[0]):
         for i in range(front.shape[1]):
             if front[j, i] > nought:
