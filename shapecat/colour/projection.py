@@ -182,9 +182,8 @@ def _beside(depth: F4, pixels: U4, camera: Camera, colour_from_depth: Pose) -> U
     shift = float(np.linalg.norm(colour_from_depth.translation))
     parallax = max(camera.fx, camera.fy) * shift * max(0.0, 1 / near - 1 / far)
     margin = int(parallax) + _BESIDE_PX
-    return _list_others(
-        depth, own, (top - margin, bottom + margin), (left - margin, right + margin)
-    )
+    rows, columns = (top - margin, bottom + margin), (left - margin, right + margin)
+    return np.asarray(_list_others(depth, own, rows, columns))
 
 
 @kernel
@@ -214,7 +213,7 @@ def _extent(depth: F4, pixels: U4, own: Bool) -> tuple[int, int, int, int, float
 @kernel
 def _list_others(depth: F4, own: Bool, rows: tuple[int, int], columns: tuple[int, int]) -> U4:
     """Return the sparse pixels with a reading, from a row to one and a column to one, but own."""
-    found, count = np.empty(own.size, np.uint32), 0
+    found, count = np.zeros(own.size, np.uint32), 0
     for j in range(max(0, rows[0]) // _SPARSE, min(rows[1] // _SPARSE + 1, own.shape[0])):
         for i in range(max(0, columns[0]) // _SPARSE, min(columns[1] // _SPARSE + 1, own.shape[1])):
             if depth[j * _SPARSE, i * _SPARSE] > 0 and not own[j, i]:
