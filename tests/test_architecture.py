@@ -2,9 +2,9 @@
 
 import ast
 import graphlib
-import subprocess
-import sys
 from pathlib import Path
+
+from tests.loading import loaded_by
 
 ROOT = Path(__file__).parents[1]
 STAGES = {
@@ -128,38 +128,24 @@ def test_no_print_eval_or_bare_except() -> None:
 
 def test_help_loads_no_heavy_library() -> None:
     """A command that takes a second to explain itself makes people avoid it."""
-    code = (
-        "import sys, importlib; importlib.import_module('shapecat.cli.main');"
-        "heavy = {'numba', 'rerun', 'open3d', 'sklearn', 'scipy', 'pyarrow', 'numpy', 'rich'};"
-        "sys.exit(', '.join(sorted(heavy & set(sys.modules))) or 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    heavy = {"numba", "rerun", "open3d", "sklearn", "scipy", "pyarrow", "numpy", "rich"}
 
-    assert done.returncode == 0, done.stderr
+    assert loaded_by("import shapecat.cli.main", heavy) == set()
 
 
 def test_processing_loads_no_display_library() -> None:
     """Open3D needs libEGL and libX11, which a server or a container does not have."""
-    code = (
-        "import sys, shapecat.batch, shapecat.outputs.annotated_mcap, shapecat.outputs.review;"
-        "sys.exit(', '.join(sorted({'open3d', 'matplotlib', 'sklearn'} & set(sys.modules))) or 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    code = "import shapecat.batch, shapecat.outputs.annotated_mcap, shapecat.outputs.review"
 
-    assert done.returncode == 0, done.stderr
+    assert loaded_by(code, {"open3d", "matplotlib", "sklearn"}) == set()
 
 
 def test_the_first_frame_waits_for_no_library_it_does_not_need() -> None:
     """SciPy's images, data frames and Protocol Buffers take longer to load than all of ours."""
-    code = (
-        "import sys, shapecat.batch, shapecat.recordings.decoding;"
-        "late = {'scipy.ndimage', 'scipy.optimize', 'pandas', 'pyarrow.compute'};"
-        "late |= {'google.protobuf', 'PIL', 'rerun'};"
-        "sys.exit(', '.join(sorted(late & set(sys.modules))) or 0)"
-    )
-    done = subprocess.run([sys.executable, "-c", code], check=False, capture_output=True, text=True)
+    late = {"scipy.ndimage", "scipy.optimize", "pandas", "pyarrow.compute"}
+    late |= {"google.protobuf", "PIL", "rerun"}
 
-    assert done.returncode == 0, done.stderr
+    assert loaded_by("import shapecat.batch, shapecat.recordings.decoding", late) == set()
 
 
 def test_root_of_the_package_holds_what_everybody_uses() -> None:
@@ -176,3 +162,7 @@ def test_the_picture_is_drawn_from_the_code_as_it_is() -> None:
     from tests.picture import PICTURE, draw  # noqa: PLC0415  it imports this file
 
     assert PICTURE.read_text("utf-8") == draw()
+
+
+def test_a_library_that_is_loaded_is_seen() -> None:
+    assert loaded_by("import json.decoder", {"json", "numpy"}) == {"json"}

@@ -33,6 +33,9 @@ PAGES = {
     },
 }
 
+_STARTS_CLUSTERS = {"howto-cluster.md"}
+"""Starting Dask and Ray from the shell takes a minute; `test_executors` runs on both."""
+
 
 def script(page: str) -> str:
     """Return what a reader would type: the shell blocks, without installing packages."""
@@ -58,7 +61,10 @@ def run_script(text: str, folder: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("page", PAGES)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(p, marks=pytest.mark.many if p in _STARTS_CLUSTERS else ()) for p in PAGES],
+)
 def test_page_works_as_printed(page: str, tmp_path: Path) -> None:
     run_script(script(page), tmp_path)
 

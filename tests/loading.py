@@ -1,0 +1,16 @@
+"""Which libraries a piece of code loads, in an interpreter of its own."""
+
+import subprocess
+import sys
+from collections.abc import Set as AbstractSet
+
+
+def loaded_by(code: str, libraries: AbstractSet[str]) -> set[str]:
+    """Return those of some modules that are loaded once ``code`` has run."""
+    names = ",".join(sorted(libraries))
+    report = f"import sys; print(*set({names!r}.split(',')) & set(sys.modules))"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}\n{report}"], check=False, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    return set(done.stdout.split())
