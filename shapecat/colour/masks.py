@@ -124,14 +124,12 @@ def _smoothed(filled: I4, label: int, box: list[int], reach: int) -> Mask:
     if right <= left:
         return NOTHING
     left, top = max(0, left - reach), max(0, top - reach)
-    inside = filled[top : bottom + reach, left : right + reach] == label
-    pixels = np.zeros_like(inside)
-    _majority(inside, reach, pixels)
-    rows, columns = np.flatnonzero(pixels.any(axis=1)), np.flatnonzero(pixels.any(axis=0))
-    if not rows.size:
+    around = filled[top : bottom + reach, left : right + reach]
+    pixels = np.zeros(around.shape, np.bool_)
+    west, north, east, south = _majority(around, label, reach, pixels)
+    if east <= west:
         return NOTHING
-    part = pixels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    return Mask(left + int(columns[0]), top + int(rows[0]), part)
+    return Mask(left + west, top + north, pixels[north:south, west:east])
 
 
 def united(masks: Sequence[Mask]) -> Mask:
@@ -232,18 +230,26 @@ def _gap(packed: int) -> int:
 
 
 @kernel
-def _majority(inside: Bool, reach: int, pixels: Bool) -> None:
-    """Set the pixels of which more than half of the square around them, in the image, is set."""
-    height, width = inside.shape
+def _majority(seen: I4, label: int, reach: int, pixels: Bool) -> tuple[int, int, int, int]:
+    """Set the pixels of which most of the square around them, in the image, is of a label.
+
+    Returns left, top, and one more than right and bottom, of those that are set.
+    """
+    height, width = seen.shape
+    west, north, east, south = width, height, 0, 0
     sums = np.zeros((height + 1, width + 1), np.int32)
     for v in range(height):
         row = 0
         for u in range(width):
-            row += inside[v, u]
+            row += seen[v, u] == label
             sums[v + 1, u + 1] = sums[v, u + 1] + row
     for v in range(height):
         top, bottom = max(0, v - reach), min(height, v + reach + 1)
         for u in range(width):
             left, right = max(0, u - reach), min(width, u + reach + 1)
             count = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-            pixels[v, u] = 2 * count > (bottom - top) * (right - left)
+            if 2 * count > (bottom - top) * (right - left):
+                pixels[v, u] = True
+                west, north = min(west, u), min(north, v)
+                east, south = max(east, u + 1), max(south, v + 1)
+    return west, north, east, south

@@ -320,9 +320,7 @@ def _splat(
             y, x = np.uint32(row * per_cell), np.uint32(column * per_cell)
             front[y, x] = max(front[y, x], near)
     for j in range(front.shape[0]):
-        for i in range(front.shape[1]):
-            if front[j, i] > nought:
-                _hide_behind(front[j, i], j * cell, i * cell, cell, nearest, seen)
+        _hide_behind(front[j], cell, nearest[j * cell : (j + 1) * cell], seen[j * cell :])
 
 
 @kernel
@@ -344,10 +342,12 @@ def _paint_square(
 
 
 @kernel
-def _hide_behind(front: float, top: int, left: int, cell: int, nearest: F4, seen: I4) -> None:
-    """Give a cell of the image no label where something at inverse distance ``front`` is nearer."""
-    limit = front * np.float32(1 - _HIDDEN)
-    for j in range(top, min(top + cell, seen.shape[0])):
-        for i in range(left, min(left + cell, seen.shape[1])):
-            if limit > nearest[j, i]:
-                seen[j, i] = 0
+def _hide_behind(front: F4, cell: int, nearest: F4, seen: I4) -> None:
+    """Give rows no label where something at the inverse distances ``front`` of cells is nearer."""
+    limit = np.zeros(nearest.shape[1], np.float32)
+    for i in range(limit.size):
+        limit[i] = front[i // cell] * np.float32(1 - _HIDDEN)
+    for j in range(nearest.shape[0]):
+        own, labels = nearest[j], seen[j]
+        for i in range(limit.size):
+            labels[i] = 0 if limit[i] > own[i] else labels[i]

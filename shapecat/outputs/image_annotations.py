@@ -57,7 +57,7 @@ def read_image_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterato
     """Yield the annotations of the colour images of a run, each image once."""
     shown = ShownTracks.read(folder, labels)
     last = None
-    for masks in read_masks(folder):
+    for masks in read_masks(folder, boxes_only=True):
         if (masks.topic, masks.stamp_ns) == last:
             continue
         last = masks.topic, masks.stamp_ns

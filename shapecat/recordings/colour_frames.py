@@ -2,6 +2,7 @@
 
 from collections import Counter, deque
 from collections.abc import Iterator, Mapping, Sequence
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ _HELD_FRAMES = 8
 """Frames that wait at most for a colour image behind them."""
 _KEPT_IMAGES, _KEPT_BYTES = 16, 96 << 20
 """Colour images that wait at most for a frame; two in any case."""
+_STAMP_BYTES = 12
+"""With another stamp in its first bytes, as ROS has it there, a calibration is the same."""
 _PATIENCE_NS = 500_000_000
 """A frame waits no longer than this, in log time."""
 _USUAL_PERIOD_NS = 100_000_000
@@ -110,6 +113,7 @@ class _Partner:
         self._recording = recording
         self._images: deque[tuple[int, int, Any]] = deque()  # stamp, log time, decoded
         self._info: Any = None
+        self._calibration = b""
         self._lens: LensCamera | None = None
         self._steps: deque[int] = deque(maxlen=9)
         self._newest: int | None = None
@@ -135,11 +139,15 @@ class _Partner:
 
     def calibrate(self, message: Message) -> None:
         """Take the calibration, anew when it changes."""
+        content = bytes(message.data[_STAMP_BYTES:])
+        if content == self._calibration:
+            return
         try:
             info = self._recording.decode(message)
             key = np.concatenate([np.ravel(info.k if hasattr(info, "k") else info.K)])
             if self._info is None or not np.array_equal(key, self._info[0]):
                 self._info, self._lens = (key, info), _lens_of(info, self.stream.topic)
+            self._calibration = content
         except _MALFORMED as error:
             self._left_out[f"calibration: {_reason(error, self.stream.topic)}"] += 1
 
@@ -170,7 +178,7 @@ class _Partner:
 
     def _period(self) -> int:
         if self._steps:
-            return int(np.median(self._steps))
+            return int(median(self._steps))
         count, span = self.stream.count or 0, self._recording.end_ns - self._recording.start_ns
         return span // (count - 1) if count > 1 and span > 0 else _USUAL_PERIOD_NS
 

@@ -37,6 +37,7 @@ class Extrinsics:
         self._buffers: list[TransformBuffer | None] = [None, None]
         self._fixed: Pose | None = None
         self._looked = False
+        self._static: dict[tuple[str, str], Pose] = {}
 
     def colour_from_depth(self, depth_frame: str, colour_frame: str, stamp_ns: int) -> Pose | None:
         """Return the pose at a time; None if the recording has none.
@@ -46,9 +47,14 @@ class Extrinsics:
         recorder = self._depth.topic.startswith("/device_")  # whose frame ids are numbers
         if depth_frame == colour_frame and not recorder:
             return IDENTITY
+        frames = depth_frame, colour_frame
+        if frames in self._static:
+            return self._static[frames]
         for number in (0, 1) if not recorder else ():
             pose = self._lookup(number, depth_frame, colour_frame, stamp_ns)
             if pose is not None:
+                if number == 0:
+                    self._static[frames] = pose
                 return pose
         if not self._looked:
             self._looked, self._fixed = True, self._realsense()

@@ -70,11 +70,11 @@ class FrameMasks:
 
     def box(self, detections: Sequence[int]) -> tuple[int, int, int, int] | None:
         """Return left, top, width and height around some detections, or None."""
-        boxes = np.array([self.boxes[n] for n in detections if n in self.boxes])
-        if not len(boxes):
+        boxes = [self.boxes[n] for n in detections if n in self.boxes]
+        if not boxes:
             return None
-        left, top = boxes[:, :2].min(axis=0).tolist()
-        right, bottom = (boxes[:, :2] + boxes[:, 2:]).max(axis=0).tolist()
+        left, top = min(box[0] for box in boxes), min(box[1] for box in boxes)
+        right, bottom = max(box[0] + box[2] for box in boxes), max(box[1] + box[3] for box in boxes)
         return left, top, right - left, bottom - top
 
 
@@ -129,12 +129,16 @@ def count_masks(folder: Path) -> int:
     return int(pq.read_metadata(folder / "masks.parquet").num_rows)
 
 
-def read_masks(folder: Path) -> Iterator[FrameMasks]:
-    """Yield the masks of a run, in the order of its frames; none without colour."""
+def read_masks(folder: Path, *, boxes_only: bool = False) -> Iterator[FrameMasks]:
+    """Yield the masks of a run, in the order of its frames; none without colour.
+
+    With ``boxes_only`` they have no pixels, which are nearly all of the table.
+    """
     path = folder / "masks.parquet"
     if not path.exists():
         return
-    for group in read_row_groups(path):
+    wanted = [name for name in MASKS.names if name != "counts" or not boxes_only]
+    for group in read_row_groups(path, wanted):
         for row in group.to_pylist():
             yield _frame_masks(row, {})
 
@@ -151,6 +155,6 @@ def _frame_masks(row: MaskRow, masks: dict[int, Mask]) -> FrameMasks:
         row["width"],
         row["height"],
         {n: tuple(box) for n, box in zip(numbers, boxes, strict=True)},
-        dict(zip(numbers, row["counts"], strict=True)),
+        dict(zip(numbers, row["counts"], strict=True)) if "counts" in row else {},
         masks,
     )
