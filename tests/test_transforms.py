@@ -1,5 +1,6 @@
 """Transforms: the right pose, or an error that says what is missing."""
 
+import tracemalloc
 from bisect import bisect_right
 from itertools import pairwise
 from pathlib import Path
@@ -138,6 +139,22 @@ def test_a_frame_may_change_its_parent() -> None:
 
     assert buffer.lookup("world", "cup", 50).translation[0] == 1.0
     assert buffer.lookup("world", "cup", 100).translation[0] == 5.5
+
+
+def test_hours_of_transforms_take_little_memory() -> None:
+    """A hundred a second for ten hours and ten joints are 36 million."""
+    buffer = TransformBuffer()
+    tracemalloc.start()
+    try:
+        for k in range(20_000):
+            parent = f"body{k // 10_000}"  # another string each time
+            assert buffer.add(parent, "arm", EPOCH + k * SECOND, moved(k * 1e-3), static=False)
+        kept, _ = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert kept < 100 * 20_000
+    middle = buffer.lookup("body1", "arm", EPOCH + 15_000 * SECOND + SECOND // 2)
+    assert middle.translation == pytest.approx([15.0005, 0, 0])
 
 
 @pytest.mark.parametrize(

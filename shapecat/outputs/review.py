@@ -237,7 +237,7 @@ class _Review:
         if self._fixed_frame is not None:
             entity = rr.new_entity_path(["world", "seen", labelled.topic])
             self._columns.add(entity, at, pose or IDENTITY, shapes.places)
-        moment = Moment(labelled, *painted.clouds)
+        moment = Moment.of(labelled, *painted.clouds)
         for name, drawing in SCENE.items():
             self._add(f"{entity}/{name}", drawing, at, moment, moment.size)
 

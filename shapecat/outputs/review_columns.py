@@ -16,7 +16,7 @@ __all__ = ["At", "Columns", "curve"]
 At = tuple[int, int]
 """Stamp in nanoseconds, and number of the frame."""
 
-_ROWS, _NUMBERS = 256, 1 << 19
+_ROWS, _NUMBERS = 256, 1 << 17
 """Rows, and numbers in them, that an entity holds."""
 
 _Draw = Callable[[Sequence[Any]], Iterable[rr.ComponentColumn]]

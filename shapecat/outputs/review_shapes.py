@@ -17,7 +17,7 @@ from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import PaintedCloud
 from shapecat.outputs.wording import caption
 from shapecat.surface.triangles import triangles_of
-from shapecat.types import Box, Camera, LabelledFrame, LabelledObject, Pose
+from shapecat.types import Box, Camera, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 
 __all__ = [
     "SCENE",
@@ -53,12 +53,27 @@ Way = tuple[str, F8]
 """Category, and places (n, 3) in metres."""
 
 
-class Moment(NamedTuple):
-    """A frame as it is drawn: its labels, the points of no object, and those on objects."""
+class Surface(NamedTuple):
+    """What is drawn of an object in a scene, without its pixels, which would fill the memory."""
 
-    labelled: LabelledFrame
+    category: str
+    full: Box | None
+    gas: NeuralGas
+
+
+class Moment(NamedTuple):
+    """A scene as it is drawn: its objects and planes, the points of no object, those on objects."""
+
+    objects: tuple[Surface, ...]
+    planes: tuple[Plane, ...]
     scene: PaintedCloud
     points: PaintedCloud
+
+    @classmethod
+    def of(cls, labelled: LabelledFrame, scene: PaintedCloud, points: PaintedCloud) -> "Moment":
+        """Take from a frame what is drawn of it."""
+        objects = tuple(Surface(o.category, o.full, o.gas) for o in labelled.objects)
+        return cls(objects, labelled.planes, scene, points)
 
     @property
     def size(self) -> int:
@@ -140,7 +155,7 @@ def _objects(moments: Sequence[Moment]) -> _Columns:
 
 def _dashes(moments: Sequence[Moment]) -> _Columns:
     """Return the edges of the full boxes, dashed."""
-    known = [[o for o in m.labelled.objects if o.full is not None] for m in moments]
+    known = [[o for o in m.objects if o.full is not None] for m in moments]
     objects = list(chain.from_iterable(known))
     corners = np.reshape([box_corners(o.full) for o in objects if o.full is not None], (-1, 8, 3))
     starts, ends = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]
@@ -154,11 +169,11 @@ def _dashes(moments: Sequence[Moment]) -> _Columns:
 
 def _graphs(moments: Sequence[Moment]) -> _Columns:
     """Return the edges of the graphs."""
-    objects, _ = _objects_of(moments)
+    objects = [o for m in moments for o in m.objects]
     lines = [o.gas.neurons[o.gas.edges] for o in objects]
     pairs = np.concatenate(lines) if lines else np.zeros((0, 2, 3), np.float32)
     colours = np.repeat(_packed(objects, white=0.65), [len(each) for each in lines])
-    counts = [sum(len(o.gas.edges) for o in m.labelled.objects) for m in moments]
+    counts = [sum(len(o.gas.edges) for o in m.objects) for m in moments]
     yield from rr.LineStrips3D.columns(strips=_segments(pairs), colors=colours).partition(counts)
 
 
@@ -173,29 +188,30 @@ def _segments(pairs: F4) -> pa.Array:
 
 def _surfaces(moments: Sequence[Moment]) -> _Columns:
     """Return the triangles of the graphs, one translucent mesh a frame."""
-    every = chain.from_iterable(m.labelled.objects for m in moments)
-    faces = {o: triangles_of(o.gas.edges, len(o.gas.neurons)) for o in every}
-    shown = [[o for o in m.labelled.objects if len(faces[o])] for m in moments]
-    objects = list(chain.from_iterable(shown))
+    shown = [[(o, faces) for o in m.objects if len(faces := _triangles(o))] for m in moments]
+    objects = [o for each in shown for o, _ in each]
     sizes = [len(o.gas.neurons) for o in objects]
     colours = np.repeat(_packed(objects, alpha=70), sizes)
     yield from rr.Mesh3D.columns(
         vertex_positions=_stacked([o.gas.neurons for o in objects], 3), vertex_colors=colours
-    ).partition([sum(len(o.gas.neurons) for o in each) for each in shown])
-    meshes = [_mesh([(len(o.gas.neurons), faces[o]) for o in each]) for each in shown]
-    yield _faces(meshes)
+    ).partition([sum(len(o.gas.neurons) for o, _ in each) for each in shown])
+    yield _faces([_mesh([(len(o.gas.neurons), faces) for o, faces in each]) for each in shown])
+
+
+def _triangles(surface: Surface) -> U4:
+    return np.asarray(triangles_of(surface.gas.edges, len(surface.gas.neurons)))
 
 
 def _outlines(moments: Sequence[Moment]) -> _Columns:
     """Return the closed outlines of the planes."""
-    shown = [[p.outline for p in m.labelled.planes if len(p.outline)] for m in moments]
+    shown = [[p.outline for p in m.planes if len(p.outline)] for m in moments]
     strips = [np.concatenate([o, o[:1]]) for o in chain.from_iterable(shown)]
     yield from rr.LineStrips3D.columns(strips=strips).partition([len(each) for each in shown])
 
 
 def _fills(moments: Sequence[Moment]) -> _Columns:
     """Return the planes as polygons: fans, as outlines are convex."""
-    shown = [[p.outline for p in m.labelled.planes if len(p.outline) >= 3] for m in moments]
+    shown = [[p.outline for p in m.planes if len(p.outline) >= 3] for m in moments]
     corners = _stacked(list(chain.from_iterable(shown)), 3)
     counts = [sum(map(len, outlines)) for outlines in shown]
     yield from rr.Mesh3D.columns(vertex_positions=corners).partition(counts)
@@ -292,12 +308,6 @@ def _above(box: Box) -> F8:
     return np.asarray(box.center + (0.5 * box.size[2] + _CAPTION_M) * up)
 
 
-def _objects_of(moments: Sequence[Moment]) -> tuple[list[LabelledObject], list[int]]:
-    """Return the objects of all frames, and how many each has."""
-    objects = [item for moment in moments for item in moment.labelled.objects]
-    return objects, [len(moment.labelled.objects) for moment in moments]
-
-
 def _stacked(rows: Sequence[F8], width: int) -> F8:
     return np.concatenate([np.reshape(row, (-1, width)) for row in rows] or [np.zeros((0, width))])
 
@@ -308,9 +318,7 @@ def _tint(category: str, white: float) -> tuple[int, int, int]:
     return red, green, blue
 
 
-def _packed(
-    objects: Sequence[LabelledObject | Sketch], *, alpha: int = 255, white: float = 0.0
-) -> U4:
+def _packed(objects: Sequence[Surface | Sketch], *, alpha: int = 255, white: float = 0.0) -> U4:
     """Return (n,) colours 0xRRGGBBAA of the categories of objects."""
     tints = {category: _tint(category, white) for category in {o.category for o in objects}}
     numbers = {

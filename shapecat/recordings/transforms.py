@@ -3,6 +3,8 @@
 Stamps are integer nanoseconds; floats in seconds resolve no better than 238 ns today.
 """
 
+import sys
+from array import array
 from bisect import bisect_right
 from typing import Any, NamedTuple
 
@@ -55,26 +57,37 @@ class TransformLoopError(TransformError):
 class _Sample(NamedTuple):
     parent: str
     translation: tuple[float, float, float]
-    quaternion: tuple[float, float, float, float]
+    quaternion: tuple[float, ...]
 
 
 class _Track:
-    """The parent of one frame over time."""
+    """The parent of one frame over time: hours hold millions of samples, so they are packed."""
 
     def __init__(self) -> None:
-        self.stamps: list[int] = []
-        self.samples: list[_Sample] = []
+        self.stamps = array("q")
+        self._parents: list[str] = []
+        self._numbers = array("d")  # seven to a sample
+
+    def __getitem__(self, k: int) -> _Sample:
+        """Return a sample, from 0."""
+        x, y, z, *quaternion = self._numbers[7 * k : 7 * k + 7]
+        return _Sample(self._parents[k], (x, y, z), tuple(quaternion))
 
     def add(self, stamp: int, sample: _Sample) -> None:
         """Keep a sample in order of time; of three equal ones in a row the middle is not needed."""
-        at = bisect_right(self.stamps, stamp)
+        at, count = bisect_right(self.stamps, stamp), len(self.stamps)
         if at and self.stamps[at - 1] == stamp:
-            self.samples[at - 1] = sample
-        elif at == len(self.stamps) >= 2 and self.samples[-1] == self.samples[-2] == sample:
+            self._set(slice(at - 1, at), stamp, sample)
+        elif at == count >= 2 and self[count - 1] == self[count - 2] == sample:
             self.stamps[-1] = stamp
         else:
-            self.stamps.insert(at, stamp)
-            self.samples.insert(at, sample)
+            self._set(slice(at, at), stamp, sample)
+
+    def _set(self, at: slice, stamp: int, sample: _Sample) -> None:
+        self.stamps[at] = array("q", [stamp])
+        self._parents[at] = [sample.parent]
+        numbers = array("d", (*sample.translation, *sample.quaternion))
+        self._numbers[7 * at.start : 7 * at.stop] = numbers
 
 
 class TransformBuffer:
@@ -124,6 +137,7 @@ class TransformBuffer:
         fine = np.isfinite(translation).all() and np.isfinite(norm) and norm > 1e-6
         if not (fine and parent and child and parent != child):
             return False
+        parent = sys.intern(parent)  # one for all samples
         sample = _Sample(parent, tuple(translation.tolist()), tuple((quaternion / norm).tolist()))
         self._frames |= {parent, child}
         if static:
@@ -197,7 +211,7 @@ class TransformBuffer:
         if track is None:
             return None
         at = len(track.stamps) if stamp_ns is None else bisect_right(track.stamps, stamp_ns)
-        return track.samples[max(0, at - 1)].parent
+        return track[max(0, at - 1)].parent
 
     def _chain(self, frames: list[str], stamp_ns: int) -> Pose:
         """Return the transform from the first frame to the parent of the last."""
@@ -210,7 +224,7 @@ class TransformBuffer:
         if frame_id in self._static:
             return _pose(self._static[frame_id])
         track = self._moving[frame_id]
-        stamps, samples = track.stamps, track.samples
+        stamps = track.stamps
         late = stamp_ns - stamps[-1]
         early = stamps[0] - stamp_ns
         if max(late, early) > self.tolerance_ns:
@@ -223,8 +237,8 @@ class TransformBuffer:
             raise ExtrapolationError(msg)
         at = bisect_right(stamps, stamp_ns)
         if at in {0, len(stamps)}:
-            return _pose(samples[max(0, at - 1)])
-        before, after = samples[at - 1], samples[at]
+            return _pose(track[max(0, at - 1)])
+        before, after = track[at - 1], track[at]
         if before.parent != after.parent or before == after:
             return _pose(before)
         share = (stamp_ns - stamps[at - 1]) / (stamps[at] - stamps[at - 1])

@@ -65,7 +65,7 @@ class FullBoxes:
             strict=True,
         ):
             frames.add(seen, detections, groups[-1])
-            rows += numbers_or_nan(detections)[:, :_BOX].astype(np.float32).tobytes()
+            rows += numbers_or_nan(detections)[:, :_BOX].tobytes()
             partial += np.logical_or(*(detections[name].to_numpy() for name in cut)).tobytes()
             groups.append(groups[-1] + detections.num_rows)
         return cls(
@@ -161,13 +161,13 @@ def _placed(boxes: F4, poses: F8) -> tuple[F8, F8]:
     return np.einsum("kij,kj->ki", turns, boxes[:, :3].astype(np.float64)) + places, axes
 
 
-def numbers_or_nan(table: pa.Table, widths: Mapping[str, int] = FULL_WIDTHS) -> F8:
+def numbers_or_nan(table: pa.Table, widths: Mapping[str, int] = FULL_WIDTHS) -> F4:
     """Return the columns of full boxes side by side, NaN where they are null."""
     return np.hstack([_filled(table[name], width) for name, width in widths.items()])
 
 
-def _filled(column: pa.ChunkedArray, width: int) -> F8:
-    result = np.full((len(column), width), np.nan)
+def _filled(column: pa.ChunkedArray, width: int) -> F4:
+    result = np.full((len(column), width), np.nan, np.float32)
     known = pa.compute.is_valid(column).to_numpy()
     if known.any():
         result[known] = numbers(column.drop_null()).reshape(-1, width)

@@ -9,11 +9,11 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.compute
 
-from shapecat.arrays import F4, F8
+from shapecat.arrays import F4
 from shapecat.geometry import box_corners, upright_box
 from shapecat.runs.corrections import TrackLabel
 from shapecat.runs.shown import ShownTracks
-from shapecat.runs.tables import numbers, read_row_groups
+from shapecat.runs.tables import numbers, read_row_groups, release_memory
 from shapecat.types import Box, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 
 __all__ = ["read_labelled_frames", "rows_by_frame"]
@@ -44,6 +44,7 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
     one number; where several are seen in one frame, they are the parts of one object.
     """
     shown = ShownTracks.read(folder, labels, causal=True)
+    release_memory()  # of the table that it was made from
     groups = (
         read_row_groups(folder / f"{name}.parquet", columns)
         for name, columns in (("frames", None), ("detections", _OBJECT), ("planes", None))
@@ -122,7 +123,7 @@ def _plane(row: Mapping[str, Any]) -> Plane:
 
 
 def _labelled_object(
-    row: Mapping[str, Any], causal: F4, label: TrackLabel, full: F8
+    row: Mapping[str, Any], causal: F4, label: TrackLabel, full: F4
 ) -> LabelledObject:
     return LabelledObject(
         track=label.track,

@@ -58,11 +58,11 @@ class ShownTracks:
 
     frames: dict[Key, slice]
     detections: I4
-    tracks: list[int]
+    tracks: I4
     labels: Mapping[int, TrackLabel]
     ended: dict[Key, tuple[int, ...]]
     causal: F4
-    full: F8
+    full: F4
 
     @classmethod
     def read(
@@ -80,9 +80,10 @@ class ShownTracks:
         frames, tracks = numbers(table["frame"])[rows], numbers(table["track"])[rows]
         order = np.lexsort((detections, frames, codes[rows]))
         order = order[np.isin(tracks[order], list(labels))]
-        rows, tracks = rows[order], tracks[order].tolist()
+        rows, tracks = rows[order], tracks[order]
         of_frames = rows_of(topics, codes[rows], frames[order])
-        shown = np.array([labels[track].track for track in tracks], np.int64)
+        names, named = np.unique(tracks, return_inverse=True)
+        shown = np.array([labels[name].track for name in names.tolist()], np.int64)[named]
         return cls(
             of_frames,
             detections[order],
@@ -90,14 +91,16 @@ class ShownTracks:
             labels,
             _ended(folder, of_frames, shown, numbers(table["stamp_ns"])[rows]),
             _rows_of_lists(table["posterior"])[rows] if causal else _NONE,
-            numbers_or_nan(table, full)[rows] if full else np.full((len(rows), 10), np.nan),
+            numbers_or_nan(table, full)[rows]
+            if full
+            else np.full((len(rows), 10), np.nan, np.float32),
         )
 
     def of(self, key: Key) -> Iterator[ShownDetection]:
         """Yield the detections shown in a frame, in their order."""
         rows = self.frames.get(key, _NO_ROWS)
         for row in range(rows.start, rows.stop):
-            yield ShownDetection(int(self.detections[row]), self.labels[self.tracks[row]], row)
+            yield ShownDetection(int(self.detections[row]), self.labels[int(self.tracks[row])], row)
 
 
 def read_shown_frames(
@@ -143,7 +146,7 @@ def _boxes(
         full = np.concatenate([shown.full[span] for span in spans])
         places = np.where(np.isnan(full), places, full)
     for span, stop in zip(spans, accumulate(counts), strict=True):
-        labels = [shown.labels[track] for track in shown.tracks[span]]
+        labels = [shown.labels[track] for track in shown.tracks[span].tolist()]
         rows = places[stop - len(labels) : stop].tolist()
         yield tuple(map(_box, labels, rows))
 
@@ -192,12 +195,12 @@ def _ended(
 ) -> dict[Key, tuple[int, ...]]:
     """Return the tracks to delete in the frame after the last one that shows them."""
     keys = np.repeat(np.arange(len(frames)), [rows.stop - rows.start for rows in frames.values()])
-    order = np.argsort(stamps_ns, kind="stable")
-    last = dict(zip(tracks[order].tolist(), keys[order].tolist(), strict=True))
+    latest = np.argsort(stamps_ns, kind="stable")[::-1]
+    gone, at = np.unique(tracks[latest], return_index=True)
     following = _next_of_topic(folder)
     names = list(frames)
     ended: dict[Key, list[int]] = {}
-    for track, frame in sorted(last.items()):
+    for track, frame in zip(gone.tolist(), keys[latest[at]].tolist(), strict=True):
         if names[frame] in following:
             ended.setdefault(following[names[frame]], []).append(track)
     return {key: tuple(gone) for key, gone in ended.items()}
