@@ -22,8 +22,9 @@ from benchmarks.measure import markdown
 from shapecat.config import DetectionSettings, Settings, SurfaceSettings
 from shapecat.learning import Categorizer, load_model, save_model
 from shapecat.pipeline import process
-from shapecat.runs.corrections import merged_with, relabel
+from shapecat.runs.corrections import relabel
 from shapecat.runs.jobs import Job
+from shapecat.runs.label_meaning import merged_with
 from shapecat.runs.label_transfer import match_labels
 from shapecat.runs.tables import read_row_groups
 from shapecat.runs.track_table import read_track_table

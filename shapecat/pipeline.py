@@ -19,11 +19,7 @@ from shapecat.learning import load_model
 from shapecat.outputs.colouring import Seen, colours_of, find_masks, with_colour
 from shapecat.recordings import Recording, choose_streams, open_recording
 from shapecat.rehearsal import compile_all
-from shapecat.runs.corrections import (
-    TrackLabel,
-    adopt_labels,
-    read_labels,
-)
+from shapecat.runs.corrections import adopt_labels, read_labels
 from shapecat.runs.folder import (
     OUTPUTS,
     made_by_run,
@@ -46,6 +42,7 @@ from shapecat.runs.jobs import (
     same_options,
     summarize,
 )
+from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.label_transfer import Transfer, transfer_labels
 from shapecat.runs.masks import count_masks
 from shapecat.runs.perceiving import Observer, ignore, perceive_all, revise

@@ -20,7 +20,8 @@ from shapecat.outputs.exports import export_run
 from shapecat.outputs.exports_kitti import rectified_from_sensor
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.rereading import FinishedRun, read_finished
-from shapecat.runs.corrections import TrackLabel, adopt_labels
+from shapecat.runs.corrections import adopt_labels
+from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.track_table import read_track_table
 from shapecat.types import Box, Frame, LabelledFrame, LabelledObject, NeuralGas
 

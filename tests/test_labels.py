@@ -13,7 +13,8 @@ from mcap_ros2.decoder import DecoderFactory
 
 from shapecat.errors import OutputError
 from shapecat.pipeline import annotate_again
-from shapecat.runs.corrections import TrackLabel, adopt_labels, read_labels
+from shapecat.runs.corrections import adopt_labels, read_labels
+from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.perceived import FrameRow, PerceptionTables
 from shapecat.runs.tables import TRACKS, write_table

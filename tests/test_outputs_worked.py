@@ -26,7 +26,7 @@ from shapecat.outputs.exports_files import support_offset, upright_cloud
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.image_annotations import ImageBox
 from shapecat.outputs.scene_tree import _candidate, _described
-from shapecat.runs.corrections import TrackLabel, _slips
+from shapecat.runs.label_meaning import TrackLabel, _slips
 from shapecat.types import (
     Box,
     Camera,

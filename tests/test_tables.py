@@ -10,8 +10,8 @@ from numpy.testing import assert_allclose
 
 from shapecat.config import Settings
 from shapecat.errors import OutputError
-from shapecat.runs.corrections import TrackLabel
 from shapecat.runs.folder import read_run
+from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.perceived import FrameRow, PerceptionTables
 from shapecat.runs.run_info import Counts, InputInfo, Options, RunInfo

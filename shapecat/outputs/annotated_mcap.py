@@ -21,7 +21,8 @@ from shapecat.outputs.annotations import ENCODERS, Encode, encoder_for
 from shapecat.outputs.image_annotations import ImageFrame, image_encoder_for
 from shapecat.outputs.mcap_append import Appender, copy_bytes
 from shapecat.recordings import Recording
-from shapecat.recordings.mcap_file import McapRecording, Summary
+from shapecat.recordings.mcap_file import McapRecording
+from shapecat.recordings.mcap_summary import Summary
 from shapecat.system.files import replacing
 from shapecat.types import ShownFrame
 

@@ -11,7 +11,7 @@ from shapecat.outputs.colours import colour_of
 from shapecat.outputs.ros_annotations import RosMessages
 from shapecat.outputs.scene_protobuf import descriptors_of, encode_foxglove
 from shapecat.outputs.wording import caption
-from shapecat.runs.corrections import TrackLabel
+from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.masks import read_masks
 from shapecat.runs.shown import ShownTracks
 

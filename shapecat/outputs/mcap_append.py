@@ -21,8 +21,8 @@ from mcap.data_stream import RecordBuilder
 from mcap.opcode import Opcode
 
 from shapecat.outputs.annotation import AnnotationChannel
-from shapecat.recordings.mcap_file import Summary
 from shapecat.recordings.mcap_records import MAGIC, write_chunk_index
+from shapecat.recordings.mcap_summary import Summary
 
 __all__ = ["Appender", "copy_bytes"]
 

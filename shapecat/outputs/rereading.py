@@ -8,9 +8,10 @@ from pathlib import Path
 
 from shapecat.errors import OutputError, RecordingError
 from shapecat.recordings import Recording, choose_streams, frames, open_recording
-from shapecat.runs.corrections import TrackLabel, read_labels
+from shapecat.runs.corrections import read_labels
 from shapecat.runs.folder import read_run
 from shapecat.runs.identity import content_digest, same_content
+from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.run_info import RunInfo, window_of
 from shapecat.types import Frame, LabelledFrame

@@ -4,11 +4,8 @@ Damage never ends the reading: an unfinished file gives its whole chunks, a brok
 out, and both are said in the warnings.
 """
 
-import zlib
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import suppress
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
@@ -24,35 +21,21 @@ from shapecat.recordings.mcap_records import (
     TruncatedError,
     parse,
     read_chunk,
-    read_chunk_index,
     read_content,
     read_cut_chunk,
     split_chunk,
     split_message,
     walk,
 )
+from shapecat.recordings.mcap_summary import Summary, read_summary
 from shapecat.recordings.messages import Channel, Message, Stamp, Topic, Topics, ros_type
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.time_order import Timed, in_time_order
 
-__all__ = ["McapRecording", "Summary"]
+__all__ = ["McapRecording"]
 
-_FOOTER = 9 + 20
 _SMALL = 1 << 16
 """Messages up to this size are copied, so that they do not keep their chunk in memory."""
-
-
-@dataclass
-class Summary:
-    """The summary of a file, or what a full scan found."""
-
-    schemas: dict[int, records.Schema] = field(default_factory=dict)
-    channels: dict[int, records.Channel] = field(default_factory=dict)
-    chunks: list[records.ChunkIndex] = field(default_factory=list)
-    attachments: list[records.AttachmentIndex] = field(default_factory=list)
-    metadata: list[records.MetadataIndex] = field(default_factory=list)
-    statistics: records.Statistics | None = None
-    data_end: int = 0
 
 
 class McapRecording(Recording):
@@ -80,7 +63,7 @@ class McapRecording(Recording):
         try:
             self._size = self._file.seek(0, 2)
             self.profile = self._read_profile()
-            found = self._read_summary()
+            found = read_summary(self._file, self._size, self.warn)
             self.indexed = found is not None
             self.summary = found or Summary()
             self._counts: Counter[int] | None = None
@@ -152,94 +135,6 @@ class McapRecording(Recording):
         except (StopIteration, RecordingError):
             self.warn("the header is damaged")
             return ""
-
-    def _read_summary(self) -> Summary | None:
-        """Read the summary section; None where it is missing, damaged or does not cover all."""
-        footer_at = self._size - _FOOTER - len(MAGIC)
-        if footer_at < len(MAGIC):
-            return None
-        self._file.seek(footer_at)
-        tail = self._file.read()
-        if tail[-len(MAGIC) :] != MAGIC or tail[0] != Opcode.FOOTER:
-            return None
-        try:
-            footer = parse(records.Footer.read, tail[9:_FOOTER])
-            start = footer.summary_start
-            if not len(MAGIC) < start <= footer_at:
-                return None
-            if footer.summary_crc and footer.summary_crc != self._checksum(start):
-                self.warn("the index is damaged: read from beginning to end instead")
-                return None
-            summary = self._collect(start, footer_at)
-            summary.data_end = self._find_data_end(summary, start)
-            if not footer.summary_crc and not self._agrees(summary):
-                return None
-        except RecordingError:
-            self.warn("the index is damaged: read from beginning to end instead")
-            return None
-        return summary if _is_complete(summary) else None
-
-    def _agrees(self, summary: Summary) -> bool:
-        """Return whether the summary agrees with the channels in the chunks."""
-        unseen = set(summary.channels)
-        for chunk in sorted(summary.chunks, key=lambda chunk: chunk.chunk_start_offset):
-            if unseen.isdisjoint(chunk.message_index_offsets):
-                continue
-            unseen -= chunk.message_index_offsets.keys()
-            record = next(walk(self._file, chunk.chunk_start_offset, self._size))
-            with suppress(ChunkError):  # damaged: found out when it is read
-                for opcode, content in split_chunk(read_chunk(self.content(record))):
-                    if opcode == Opcode.SCHEMA:
-                        schema = parse(records.Schema.read, content)
-                        same = summary.schemas.get(schema.id) == schema
-                    elif opcode == Opcode.CHANNEL:
-                        channel = parse(records.Channel.read, content)
-                        same = summary.channels.get(channel.id) == channel
-                    else:
-                        same = True
-                    if not same:
-                        return False
-        return True
-
-    def _checksum(self, start: int) -> int:
-        """Return the checksum of the summary, and of the footer up to its own checksum."""
-        crc, left = 0, self._size - len(MAGIC) - 4 - start
-        self._file.seek(start)
-        while left > 0:
-            block = self._file.read(min(left, 1 << 20))
-            crc, left = zlib.crc32(block, crc), left - max(1, len(block))
-        return crc
-
-    def _collect(self, start: int, end: int) -> Summary:
-        summary = Summary()
-        for record in walk(self._file, start, end):
-            content = self.content(record)
-            match record.opcode:
-                case Opcode.SCHEMA:
-                    schema = parse(records.Schema.read, content)
-                    summary.schemas[schema.id] = schema
-                case Opcode.CHANNEL:
-                    channel = parse(records.Channel.read, content)
-                    summary.channels[channel.id] = channel
-                case Opcode.CHUNK_INDEX:
-                    summary.chunks.append(read_chunk_index(content))
-                case Opcode.ATTACHMENT_INDEX:
-                    summary.attachments.append(parse(records.AttachmentIndex.read, content))
-                case Opcode.METADATA_INDEX:
-                    summary.metadata.append(parse(records.MetadataIndex.read, content))
-                case Opcode.STATISTICS:
-                    summary.statistics = parse(records.Statistics.read, content)
-        return summary
-
-    def _find_data_end(self, summary: Summary, summary_start: int) -> int:
-        """Return where the data end record begins, walking from the last indexed record."""
-        ends = [c.chunk_start_offset + c.chunk_length for c in summary.chunks]
-        ends += [item.offset + item.length for item in (*summary.attachments, *summary.metadata)]
-        for record in walk(self._file, max(ends, default=len(MAGIC)), summary_start):
-            if record.opcode == Opcode.DATA_END:
-                return record.offset - 9
-        msg = "no data end record"
-        raise TruncatedError(msg)
 
     def _describe(self) -> None:
         """Take counts and times from the index."""
@@ -389,18 +284,6 @@ _NONE = ("", "", b"")
 _KNOWN = {int(opcode) for opcode in Opcode} | set(range(128, 256))
 """Opcodes from 128 on are for private use."""
 _DEFINING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
-
-
-def _is_complete(summary: Summary) -> bool:
-    """Return whether the summary alone locates every message."""
-    numbers = {number for c in summary.chunks for number in c.message_index_offsets}
-    statistics = summary.statistics
-    if statistics is not None:
-        numbers |= {n for n, count in statistics.channel_message_counts.items() if count}
-    schemas = {channel.schema_id for channel in summary.channels.values()} - {0}
-    named = numbers <= summary.channels.keys() and schemas <= summary.schemas.keys()
-    empty = statistics is not None and statistics.message_count == 0
-    return named and bool(summary.channels or empty) and bool(summary.chunks or empty)
 
 
 def _overlaps(

@@ -1,19 +1,22 @@
-"""Corrections of a run: the column ``label`` of tracks.csv.
+"""Corrections of a run: the column ``label`` of tracks.csv, checked and applied.
 
-A label is a category, a new category, ``delete``, or ``merge with N``. The table may have passed
-through a spreadsheet: separators, quotes, line ends, the order of columns and numbers such as
-``1.0`` do not matter.
+The table may have passed through a spreadsheet: separators, quotes, line ends, the order of
+columns and numbers such as ``1.0`` do not matter.
 """
 
-import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import NamedTuple
 
 from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run
+from shapecat.runs.label_meaning import (
+    TrackLabel,
+    find_misread,
+    merged_with,
+    resolve_labels,
+)
 from shapecat.runs.track_table import (
     TrackRow,
     TrackTable,
@@ -23,39 +26,18 @@ from shapecat.runs.track_table import (
     write_track_table,
 )
 from shapecat.system.files import holding, replacing
-from shapecat.types import CATEGORIES, UNKNOWN
 
 __all__ = [
     "PREVIOUS",
-    "TrackLabel",
     "adopt_labels",
     "correct_label",
-    "find_misread",
     "has_labels",
-    "merged_with",
-    "merging_with",
     "read_labels",
     "relabel",
 ]
 
-DELETE = "delete"
 ORIGINAL = "tracks.original.csv"
 PREVIOUS = "tracks.previous.csv"
-
-_MERGE = re.compile(r"merged? +(?:with|into) +#?(\d{1,9})(?:[.,]0*)?", re.IGNORECASE)
-_NEW = re.compile(r"new +(.+)", re.IGNORECASE)
-_NAME = re.compile(r"[^\W\d_][\w .+&'()-]{0,58}[\w)]|[^\W\d_]")
-
-
-class TrackLabel(NamedTuple):
-    """The number, category and confidence that a track is shown with.
-
-    ``track`` is its own number, or that of the track it was merged with, whose category it has.
-    """
-
-    track: int
-    category: str
-    confidence: float
 
 
 def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLabel]:
@@ -75,7 +57,7 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
     """
     table = read_track_table(path)
     _require_same_run(path, table, path.parent)
-    labels, misread = _resolve(table.rows, categories, one_frame=_one_frame(path.parent))
+    labels, misread = resolve_labels(table.rows, categories, one_frame=_one_frame(path.parent))
     _refuse(path, [*table.problems, *_lines(table.rows, misread)])
     return labels
 
@@ -116,7 +98,7 @@ def _adopt(corrected: Path, folder: Path) -> None:
     ]
     result = _relabelled(base, table.rows)
     known_categories = read_run(folder)["model"]["categories"]
-    _, misread = _resolve(result.rows, known_categories, one_frame=_one_frame(folder))
+    _, misread = resolve_labels(result.rows, known_categories, one_frame=_one_frame(folder))
     _refuse(corrected, problems + _lines(result.rows, misread))
     if not original.exists():
         with replacing(original) as path:
@@ -209,29 +191,6 @@ def has_labels(path: Path) -> bool:
     return path.exists() and any(row.label for row in read_track_table(path).rows)
 
 
-def merged_with(label: str) -> int | None:
-    """Return the number of the track that a label merges with; None for any other label.
-
-    Examples
-    --------
-    >>> merged_with("merge with 7"), merged_with("cup")
-    (7, None)
-    """
-    merge = _MERGE.fullmatch(label)
-    return int(merge[1]) if merge else None
-
-
-def merging_with(track: int) -> str:
-    """Return the label that merges with a track.
-
-    Examples
-    --------
-    >>> merging_with(7)
-    'merge with 7'
-    """
-    return f"merge with {track}"
-
-
 def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: bool = True) -> None:
     """Refuse a table of another run than that in ``folder``.
 
@@ -306,120 +265,10 @@ def _refuse(path: Path, problems: Sequence[str]) -> None:
         raise OutputError(msg)
 
 
-_Verdict = str | int | None
-"""A category, the number of the track to merge with, or None to delete."""
-
-
 def _one_frame(folder: Path) -> bool:
     """Return whether the sensors of a run have places in one frame."""
     return (folder / "run.json").exists() and read_run(folder).get("fixed_frame") is not None
 
 
-def find_misread(
-    rows: Sequence[TrackRow], categories: Iterable[str] = (), *, one_frame: bool = True
-) -> dict[int, str]:
-    """Return by track why its label cannot be understood, or contradicts others."""
-    return _resolve(rows, categories, one_frame=one_frame)[1]
-
-
 def _lines(rows: Iterable[TrackRow], misread: Mapping[int, str]) -> list[str]:
     return [f"line {row.line}: {misread[row.track]}" for row in rows if row.track in misread]
-
-
-def _resolve(
-    rows: Sequence[TrackRow], categories: Iterable[str], *, one_frame: bool
-) -> tuple[dict[int, TrackLabel], dict[int, str]]:
-    """Return the final label of each track, and the problem of each label that makes no sense."""
-    known = {n.lower(): n for n in (UNKNOWN, *CATEGORIES, *categories, *(r.category for r in rows))}
-    verdicts: dict[int, _Verdict] = {}
-    misread = {}
-    for row in rows:
-        try:
-            verdicts[row.track] = _understand(row.label, known) if row.label else row.category
-        except ValueError as error:
-            misread[row.track] = str(error)
-            verdicts[row.track] = row.category
-    by_track = {row.track: row for row in rows}
-    labels = {}
-    for row in rows:
-        try:
-            shown = by_track[_follow(row.track, verdicts)]
-            if not (one_frame or _share_a_topic(shown, row)):
-                msg = f"track {shown.track} is of another topic, {shown.topic or 'none'}"
-                raise ValueError(msg)  # noqa: TRY301  collected with those of the calls
-        except ValueError as error:
-            misread[row.track] = f"{row.label!r}: {error}"
-            continue
-        category = verdicts[shown.track]
-        if isinstance(category, str):
-            confidence = 1.0 if shown.label else shown.confidence
-            labels[row.track] = TrackLabel(shown.track, category, confidence)
-    return labels, misread
-
-
-def _share_a_topic(a: TrackRow, b: TrackRow) -> bool:
-    return a.topic == b.topic or bool(set(a.topic.split()) & set(b.topic.split()))
-
-
-def _follow(track: int, verdicts: Mapping[int, _Verdict]) -> int:
-    """Return the track that a track ends in after all merges."""
-    seen = [track]
-    while isinstance(target := verdicts[seen[-1]], int):
-        if target not in verdicts:
-            msg = f"there is no track {target}"
-            raise ValueError(msg)
-        if target in seen:
-            msg = f"leads in a circle: {' -> '.join(map(str, [*seen, target]))}"
-            raise ValueError(msg)
-        seen.append(target)
-        if verdicts[target] is None:
-            msg = f"track {target} is deleted"
-            raise ValueError(msg)
-    return seen[-1]
-
-
-def _understand(label: str, known: dict[str, str]) -> _Verdict:
-    """Interpret a label; a new category becomes known.
-
-    Raises
-    ------
-    ValueError : it means nothing, or is nearly something known.
-    """
-    if label.lower() in known:
-        return known[label.lower()]
-    if label.lower() == DELETE:
-        return None
-    merge = merged_with(label)
-    if merge is not None:
-        return merge
-    new = _NEW.fullmatch(label)
-    name = new[1] if new else label
-    if re.match(r"merged? ", label, re.IGNORECASE) or not _NAME.fullmatch(name):
-        msg = f"{label!r} is not a category, `{DELETE}` or `merge with N`"
-        raise ValueError(msg)
-    near = _nearest(name.lower(), [*known, DELETE])
-    if near and not new:
-        meant = known.get(near, near)
-        msg = f"{label!r}: did you mean {meant}? For a category of its own write `new {name}`"
-        raise ValueError(msg)
-    return known.setdefault(name.lower(), name)
-
-
-def _nearest(name: str, known: Sequence[str]) -> str | None:
-    """Return the known name that differs by a slip: one of a short name, two of a longer one."""
-    distances = [(_slips(name, other), other) for other in known]
-    slips, other = min(distances)
-    return other if slips <= (1 if min(len(name), len(other)) < 5 else 2) else None
-
-
-def _slips(a: str, b: str) -> int:
-    """Count letters to add, drop, change or swap with their neighbour (Damerau 1964)."""
-    before, last = list[int](), list(range(len(b) + 1))
-    for i, x in enumerate(a, start=1):
-        row = [i]
-        for j, y in enumerate(b, start=1):
-            row.append(min(last[j] + 1, row[j - 1] + 1, last[j - 1] + (x != y)))
-            if i > 1 and j > 1 and x == b[j - 2] and a[i - 2] == y:
-                row[j] = min(row[j], before[j - 2] + 1)
-        before, last = last, row
-    return last[-1]

@@ -6,8 +6,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from shapecat.errors import OutputError
-from shapecat.runs.corrections import find_misread, merged_with, merging_with, relabel
+from shapecat.runs.corrections import relabel
 from shapecat.runs.folder import read_run, write_run
+from shapecat.runs.label_meaning import find_misread, merged_with, merging_with
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.same_objects import Group, Matches, match_in_place, match_in_time
 from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table

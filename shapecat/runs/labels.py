@@ -11,7 +11,7 @@ import pyarrow.compute
 
 from shapecat.arrays import F4
 from shapecat.geometry import box_corners, upright_box
-from shapecat.runs.corrections import TrackLabel
+from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.shown import ShownTracks
 from shapecat.runs.tables import numbers, read_row_groups, release_memory
 from shapecat.types import Box, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose

@@ -14,8 +14,8 @@ import pyarrow.parquet as pq
 from shapecat.arrays import F4, F8, I4
 from shapecat.executors.order import read_ahead
 from shapecat.geometry import box_corners, upright_box
-from shapecat.runs.corrections import TrackLabel
 from shapecat.runs.full_boxes import FULL_WIDTHS, numbers_or_nan
+from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.tables import (
     Key,
     frame_rows,

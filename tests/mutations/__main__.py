@@ -69,6 +69,7 @@ KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.runs.corrections": ("test_outputs_worked", "test_labels", "test_label_transfer"),
     "shapecat.runs.folder": ("test_run_folder", "test_done"),
     "shapecat.runs.full_boxes": ("test_tables_turned", "test_completion"),
+    "shapecat.runs.label_meaning": ("test_outputs_worked", "test_labels", "test_label_transfer"),
     "shapecat.runs.label_transfer": ("test_label_transfer",),
     "shapecat.runs.masks": ("test_colour_outputs", "test_exports_images"),
     "shapecat.runs.perceiving": ("test_pipeline", "test_crash"),

@@ -16,7 +16,7 @@ from shapecat.outputs.report.choosing import Choice
 from shapecat.outputs.report.images import Crop, SeenFrame, crop_of, encode, look, worth_of
 from shapecat.outputs.report.surfaces import MOST_POINTS, Picture, Snapshot, draw
 from shapecat.outputs.rereading import FinishedRun, open_source
-from shapecat.runs.corrections import TrackLabel
+from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.track_table import TrackRow
 from shapecat.types import Frame, LabelledFrame, LabelledObject, NeuralGas

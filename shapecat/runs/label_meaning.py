@@ -1,0 +1,163 @@
+"""The meaning of a label that a person gives a track.
+
+A label is a category, a new category, ``delete``, or ``merge with N``.
+"""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple
+
+from shapecat.runs.track_table import TrackRow
+from shapecat.types import CATEGORIES, UNKNOWN
+
+__all__ = ["TrackLabel", "find_misread", "merged_with", "merging_with", "resolve_labels"]
+
+DELETE = "delete"
+
+_MERGE = re.compile(r"merged? +(?:with|into) +#?(\d{1,9})(?:[.,]0*)?", re.IGNORECASE)
+_NEW = re.compile(r"new +(.+)", re.IGNORECASE)
+_NAME = re.compile(r"[^\W\d_][\w .+&'()-]{0,58}[\w)]|[^\W\d_]")
+
+
+class TrackLabel(NamedTuple):
+    """The number, category and confidence that a track is shown with.
+
+    ``track`` is its own number, or that of the track it was merged with, whose category it has.
+    """
+
+    track: int
+    category: str
+    confidence: float
+
+
+def merged_with(label: str) -> int | None:
+    """Return the number of the track that a label merges with; None for any other label.
+
+    Examples
+    --------
+    >>> merged_with("merge with 7"), merged_with("cup")
+    (7, None)
+    """
+    merge = _MERGE.fullmatch(label)
+    return int(merge[1]) if merge else None
+
+
+def merging_with(track: int) -> str:
+    """Return the label that merges with a track.
+
+    Examples
+    --------
+    >>> merging_with(7)
+    'merge with 7'
+    """
+    return f"merge with {track}"
+
+
+_Verdict = str | int | None
+"""A category, the number of the track to merge with, or None to delete."""
+
+
+def find_misread(
+    rows: Sequence[TrackRow], categories: Iterable[str] = (), *, one_frame: bool = True
+) -> dict[int, str]:
+    """Return by track why its label cannot be understood, or contradicts others."""
+    return resolve_labels(rows, categories, one_frame=one_frame)[1]
+
+
+def resolve_labels(
+    rows: Sequence[TrackRow], categories: Iterable[str], *, one_frame: bool
+) -> tuple[dict[int, TrackLabel], dict[int, str]]:
+    """Return the final label of each track, and the problem of each label that makes no sense."""
+    known = {n.lower(): n for n in (UNKNOWN, *CATEGORIES, *categories, *(r.category for r in rows))}
+    verdicts: dict[int, _Verdict] = {}
+    misread = {}
+    for row in rows:
+        try:
+            verdicts[row.track] = _understand(row.label, known) if row.label else row.category
+        except ValueError as error:
+            misread[row.track] = str(error)
+            verdicts[row.track] = row.category
+    by_track = {row.track: row for row in rows}
+    labels = {}
+    for row in rows:
+        try:
+            shown = by_track[_follow(row.track, verdicts)]
+            if not (one_frame or _share_a_topic(shown, row)):
+                msg = f"track {shown.track} is of another topic, {shown.topic or 'none'}"
+                raise ValueError(msg)  # noqa: TRY301  collected with those of the calls
+        except ValueError as error:
+            misread[row.track] = f"{row.label!r}: {error}"
+            continue
+        category = verdicts[shown.track]
+        if isinstance(category, str):
+            confidence = 1.0 if shown.label else shown.confidence
+            labels[row.track] = TrackLabel(shown.track, category, confidence)
+    return labels, misread
+
+
+def _share_a_topic(a: TrackRow, b: TrackRow) -> bool:
+    return a.topic == b.topic or bool(set(a.topic.split()) & set(b.topic.split()))
+
+
+def _follow(track: int, verdicts: Mapping[int, _Verdict]) -> int:
+    """Return the track that a track ends in after all merges."""
+    seen = [track]
+    while isinstance(target := verdicts[seen[-1]], int):
+        if target not in verdicts:
+            msg = f"there is no track {target}"
+            raise ValueError(msg)
+        if target in seen:
+            msg = f"leads in a circle: {' -> '.join(map(str, [*seen, target]))}"
+            raise ValueError(msg)
+        seen.append(target)
+        if verdicts[target] is None:
+            msg = f"track {target} is deleted"
+            raise ValueError(msg)
+    return seen[-1]
+
+
+def _understand(label: str, known: dict[str, str]) -> _Verdict:
+    """Interpret a label; a new category becomes known.
+
+    Raises
+    ------
+    ValueError : it means nothing, or is nearly something known.
+    """
+    if label.lower() in known:
+        return known[label.lower()]
+    if label.lower() == DELETE:
+        return None
+    merge = merged_with(label)
+    if merge is not None:
+        return merge
+    new = _NEW.fullmatch(label)
+    name = new[1] if new else label
+    if re.match(r"merged? ", label, re.IGNORECASE) or not _NAME.fullmatch(name):
+        msg = f"{label!r} is not a category, `{DELETE}` or `merge with N`"
+        raise ValueError(msg)
+    near = _nearest(name.lower(), [*known, DELETE])
+    if near and not new:
+        meant = known.get(near, near)
+        msg = f"{label!r}: did you mean {meant}? For a category of its own write `new {name}`"
+        raise ValueError(msg)
+    return known.setdefault(name.lower(), name)
+
+
+def _nearest(name: str, known: Sequence[str]) -> str | None:
+    """Return the known name that differs by a slip: one of a short name, two of a longer one."""
+    distances = [(_slips(name, other), other) for other in known]
+    slips, other = min(distances)
+    return other if slips <= (1 if min(len(name), len(other)) < 5 else 2) else None
+
+
+def _slips(a: str, b: str) -> int:
+    """Count letters to add, drop, change or swap with their neighbour (Damerau 1964)."""
+    before, last = list[int](), list(range(len(b) + 1))
+    for i, x in enumerate(a, start=1):
+        row = [i]
+        for j, y in enumerate(b, start=1):
+            row.append(min(last[j] + 1, row[j - 1] + 1, last[j - 1] + (x != y)))
+            if i > 1 and j > 1 and x == b[j - 2] and a[i - 2] == y:
+                row[j] = min(row[j], before[j - 2] + 1)
+        before, last = last, row
+    return last[-1]
