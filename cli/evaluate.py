@@ -21,8 +21,9 @@ from .render import print_json, progress_bars
     "--baselines",
     type=ANY_PATH,
     metavar="TRAINING_SET",
-    help="Train the chain and simpler learners (forest, linear, PNN, D2, ESF-like) on these "
-    "views and judge them on DATASET. DATASET itself: in five folds by instance.",
+    help="Train a model and simpler learners (forest, linear, PNN, D2, ESF-like) on these views "
+    "and measure all of them on DATASET. If both are the same data set: five-fold "
+    "cross-validation by instance.",
 )
 @json_option
 def evaluate(

@@ -59,4 +59,6 @@ verbose_option = click.option(
 )
 BOXES = ("full", "visible")
 BOXES_HELP = "Box the whole object (full), or its visible part."
-seed_option = click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+seed_option = click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of all random draws."
+)

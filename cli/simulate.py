@@ -32,6 +32,7 @@ _SENSORS = (
     type=click.Choice(_SCENES),
     default="tabletop",
     show_default=True,
+    help="Kind of scene.",
 )
 @click.option(
     "--format",

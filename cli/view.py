@@ -14,7 +14,7 @@ from .options import ANY_PATH
 @click.command()
 @click.argument("run", type=ANY_PATH)
 @click.option(
-    "--web", is_flag=True, help="Serve the review to a browser on this machine until Ctrl-C."
+    "--web", is_flag=True, help="Serve the review to a browser on this machine until Ctrl+C."
 )
 @click.option(
     "--screenshot",

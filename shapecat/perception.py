@@ -136,7 +136,7 @@ _NOTHING = _Known(None, None, ())
 
 
 def _perceive(view: View, known: _Known, perceiver: Perceiver) -> tuple[Perception, _Known]:
-    """Perceive a frame; return also what is known after it."""
+    """Perceive a frame; return also the state that the next frame starts from."""
     clock, frame, range_m = _Clock(), view.frame, perceiver.settings.detection.max_range_m
     seen = view._replace(frame=fuse(frame, view.earlier, range_m=range_m), earlier=())
     if known.perception is not None and _repeats(seen, known.view, range_m):
@@ -279,7 +279,7 @@ def _completed(
 def _categorize(
     found: Sequence[Candidate], shapes: Sequence[_Shape], categorizer: Categorizer
 ) -> list[Detection]:
-    """Categorize some candidates in one call; one without a surface is undecided."""
+    """Categorize candidates in one call; without a surface all categories are equally likely."""
     if not shapes:
         return []
     begun = time.perf_counter()

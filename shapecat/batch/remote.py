@@ -56,7 +56,7 @@ class Ticket:
 
 
 def process_remote(job: Job, observe: Observer, *, cores: int, ticket: Ticket) -> Summary:
-    """Process a job between downloading its recording and uploading its results.
+    """Download the recording of a job, process it, and upload the results.
 
     Raises
     ------

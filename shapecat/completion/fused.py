@@ -42,7 +42,7 @@ class BoxViews(NamedTuple):
 
 
 class FusedBoxes(NamedTuple):
-    """The boxes of an object in each of its views, of one size; as in `BoxViews`."""
+    """The boxes of one object, one per view and all of one size; fields as in `BoxViews`."""
 
     centers: F8
     axes: F8
@@ -51,12 +51,12 @@ class FusedBoxes(NamedTuple):
 
 
 class FusedBox(NamedTuple):
-    """What views of an object say together.
+    """The box that several views of an object agree on.
 
     Attributes
     ----------
-    place : (3,) metres, where the views show it that say it.
-    center, axes, size, std : (3,), (3, 3), (3,), (3,) of its box there, as in `BoxViews`.
+    place : (3,) metres, the place of the object in those views.
+    center, axes, size, std : (3,), (3, 3), (3,), (3,) of the box at that place, as in `BoxViews`.
     """
 
     place: F8

@@ -115,7 +115,7 @@ def _shades(frame: Frame | None, height: int, width: int) -> U1:
 
 
 def _palette() -> U1:
-    """Return (k, 3) all shades of no object, then tinted by each colour."""
+    """Return the colour table (k, 3): shades of grey, then the shades tinted by each colour."""
     grey = np.repeat(np.linspace(0, 255, _SHADES)[:, None], 3, axis=1)
     tinted = [grey * (1 - _INK) + _INK * np.array(colour) for colour in COLOURS.values()]
     return np.concatenate([grey, *tinted]).astype(np.uint8)

@@ -47,7 +47,7 @@ class DescribedViews(NamedTuple):
     functions: F4 = _NOT_ASKED
 
     def where(self, chosen: np.ndarray) -> "DescribedViews":
-        """Return the chosen views: a mask or indices."""
+        """Return the views that a mask or indices select."""
         columns = {
             name: value[chosen]
             for name, value in self._asdict().items()
@@ -86,7 +86,7 @@ def describe_views(
     observe: Observer = ignore,
     with_functions: bool = False,
 ) -> DescribedViews:
-    """Describe views one by one; the k-th draws from the seed (settings.seed, k)."""
+    """Describe each view; view k draws its random numbers from the seed (settings.seed, k)."""
     found: list[tuple[DescribedView, str, str, float, float]] = []
     functions: list[F4] = []
     count = 0

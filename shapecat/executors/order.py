@@ -188,7 +188,7 @@ def map_ahead(
 
 @contextmanager
 def _switching() -> Iterator[None]:
-    """Let threads take turns more often than every 5 ms, longer than most kernels take."""
+    """Let threads switch more often than every 5 ms: most kernels take less time."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
     try:

@@ -46,7 +46,7 @@ was measured on that one),"""
 
 @dataclass(frozen=True)
 class Table:
-    """A titled table of the card, and what to read from it."""
+    """A table of the card, with its title and a note for the reader."""
 
     title: str
     head: tuple[str, ...]

@@ -96,7 +96,7 @@ def main(*, seed: int, jobs: int, out: Path) -> None:
 
 
 def collect(scenes: tuple[Series, ...], jobs: int) -> Told:
-    """Return what the segments of the scenes are merged to, whatever the number of jobs."""
+    """Return the merged segments of all scenes; the number of jobs does not change them."""
     chunks = [
         s._replace(first=s.first + k, scenes=min(_CHUNK, s.scenes - k))
         for s in scenes

@@ -260,7 +260,7 @@ def _add(
 
 
 def _right(model: Categorizer, views: DescribedViews, pair: tuple[str, str]) -> tuple[float, float]:
-    """Return the accuracies on the new and on the old categories."""
+    """Return the accuracy on the new categories, and that on the old ones."""
     known = views.where(views.labels != UNKNOWN)
     right = _best(model, known.descriptors) == encode(known.labels, model.categories)
     new = np.isin(known.labels, pair)

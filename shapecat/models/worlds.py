@@ -186,7 +186,7 @@ def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
 
 
 def _viewpoint(arrangement: Arrangement, sensor: Sensor, rng: np.random.Generator) -> Pose:
-    """Return ``table_from_camera``: 0.25 to 3 m away, as high as the arrangement says."""
+    """Return ``table_from_camera``: 0.25 to 3 m away, in the elevations of the arrangement."""
     points = np.concatenate([actor.mesh.vertices for actor in arrangement.actors])
     target = points.mean(axis=0) + rng.normal(0, 0.04, 3)
     nearest, farthest = _DISTANCES_M

@@ -181,9 +181,9 @@ def _read_mark(folder: Path) -> dict[str, Any]:
 
 
 def _made_by_export(folder: Path) -> Collection[str] | None:
-    """Return the names that an export has made in a folder; None if it is not an export's.
+    """Return the names that an export made in a folder; None if no export made the folder.
 
-    One that was killed has not noted them: all that lies in its hidden folder is its own.
+    A killed export leaves no list of names: everything in its hidden folder is its own.
     """
     about = _read_mark(folder)
     if not about:

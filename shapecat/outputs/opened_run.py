@@ -84,7 +84,7 @@ def _rows(values: pa.FixedSizeListArray, width: int) -> Any:
 
 @dataclass(frozen=True)
 class RunFrame:
-    """A frame of a run with what the sensor read, and its colour image, if it has one."""
+    """A frame of a run: its objects, the reading of the sensor, and the colour image, if any."""
 
     labelled: LabelledFrame
     reading: Frame

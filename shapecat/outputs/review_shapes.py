@@ -82,7 +82,7 @@ class Moment(NamedTuple):
 
 
 class Sketch(NamedTuple):
-    """What is drawn of an object in every frame."""
+    """The shapes that show an object in every frame."""
 
     box: Box
     category: str

@@ -94,5 +94,5 @@ class RunInfo(TypedDict):
 
 
 def window_of(options: Options) -> Window:
-    """Return the part of a recording that options select."""
+    """Return the start, end and step of the frames that options select."""
     return {"start_s": options["start_s"], "end_s": options["end_s"], "every": options["every"]}

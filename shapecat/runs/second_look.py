@@ -122,7 +122,7 @@ def _around(stream: _Stream, k: int) -> I4:
 
 
 def _other_support(stream: _Stream, off: Bool) -> Bool:
-    """Return where none of a frame's planes (n,) is where its neighbours have theirs."""
+    """Return (n,) in which frames no plane is as high as the lowest plane of nearby frames."""
     found = np.zeros(len(off), np.bool_)
     for k in np.flatnonzero(~off):
         near = _around(stream, int(k))

@@ -76,7 +76,7 @@ def _say(text: bytes) -> None:
 
 
 def _note(signum: int, frame: FrameType | None) -> None:
-    """Take a note of the first signal, leave with the second."""
+    """Note the first signal; leave the program at the second."""
     if asked():
         leave(signum, frame)
     request(signum)

@@ -179,7 +179,7 @@ def scene_cuts(hits: Hits, settings: TrackingSettings) -> Bool:
 
 
 def _continues(hits: Hits, i: int, j: int, *, slow: bool, settings: TrackingSettings) -> bool:
-    """Whether frame j may show the scene of i: objects in the same area are mostly the same.
+    """Return whether frame j may show the scene of frame i: most objects there are the same.
 
     Where frames are ``slow`` to follow each other, a motion is no excuse for a distance.
     """

@@ -98,7 +98,7 @@ def _follow(hits: Hits, settings: TrackingSettings) -> list[I4]:
 
 
 def _associate(hits: Hits, cuts: Bool, settings: TrackingSettings) -> I4:
-    """Return the tracker's number of every detection."""
+    """Return the track of every detection, as the tracker numbers it."""
     tracker, ids = Tracker(settings), np.zeros(len(hits.rows), np.int32)
     for row, (stamp_ns, cut) in enumerate(zip(hits.stamps_ns.tolist(), cuts.tolist(), strict=True)):
         if cut:
