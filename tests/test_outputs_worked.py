@@ -4,6 +4,7 @@ import csv
 import io
 import json
 import os
+import zlib
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -22,7 +23,7 @@ from shapecat.outputs.annotated_mcap import _annotations
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.dataset_frames import Selection, _chosen, _different, _view, split_runs
 from shapecat.outputs.exports import _made_by_export, _require_own, _thinned
-from shapecat.outputs.exports_files import support_offset, upright_cloud
+from shapecat.outputs.exports_files import png, support_offset, upright_cloud
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.image_annotations import ImageBox
 from shapecat.outputs.scene_tree import _candidate, _described
@@ -344,3 +345,17 @@ def test_slips_are_counted_as_by_trying_them() -> None:
     for _ in range(200):
         a, b = ("".join(rng.choice(list("abc"), rng.integers(0, 6))) for _ in range(2))
         assert _slips(a, b) == _slips(b, a) == damerau(a, b)
+
+
+@pytest.mark.parametrize("rows", [(0, 0), (0, 9), (3, 4), (0, 1), (8, 9)])
+def test_a_picture_of_masks_reads_back(rows: tuple[int, int]) -> None:
+    """Its blank rows are not compressed again, and a viewer compares the checksum of all."""
+    entries = np.zeros((9, 12), np.uint8)
+    entries[slice(*rows)] = np.arange(12) % 5
+    packed = entries[:, ::2] << 4 | entries[:, 1::2]
+    palette = np.arange(15, dtype=np.uint8).reshape(5, 3)
+    data = png(packed, palette, level=1, width=12)
+    at = data.index(b"IDAT")
+    zlib.decompress(data[at + 4 : at + 4 + int.from_bytes(data[at - 4 : at], "big")])
+    with Image.open(io.BytesIO(data)) as file:
+        np.testing.assert_array_equal(np.asarray(file), entries)

@@ -3,6 +3,7 @@
 import re
 import struct
 import zlib
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ __all__ = [
     "write_pcd",
 ]
 
+_ADLER = 65521
 _COLOUR_TYPES = {"grey": 0, "palette": 3}
 
 
@@ -65,7 +67,7 @@ def png(
         parts.append((b"PLTE", np.ascontiguousarray(palette, np.uint8).tobytes()))
     if alpha is not None:
         parts.append((b"tRNS", np.ascontiguousarray(alpha, np.uint8).tobytes()))
-    pixels = np.concatenate([unfiltered, rows], axis=1).tobytes()
+    pixels = np.concatenate([unfiltered, rows], axis=1)
     parts += [(b"IDAT", _compressed(pixels, level)), (b"IEND", b"")]
     return b"\x89PNG\r\n\x1a\n" + b"".join(
         struct.pack(">I", len(body)) + name + body + struct.pack(">I", zlib.crc32(name + body))
@@ -73,12 +75,32 @@ def png(
     )
 
 
-def _compressed(data: bytes, level: int) -> bytes:
-    """Compress; level 1 encodes only runs of equal bytes, which suits masks."""
+def _compressed(rows: U1, level: int) -> bytes:
+    """Compress rows (h, n); level 1 encodes only runs of equal bytes, which suits masks.
+
+    The blank rows before and after them, most of a picture of masks, are compressed once.
+    """
     if level > 1:
-        return zlib.compress(data, level)
-    packer = zlib.compressobj(1, strategy=zlib.Z_RLE)
-    return packer.compress(data) + packer.flush()
+        return zlib.compress(rows.tobytes(), level)
+    drawn, size = np.flatnonzero(rows.max(axis=1)), rows.shape[1]
+    first, last = (int(drawn[0]), int(drawn[-1]) + 1) if drawn.size else (0, 0)
+    before, after = first * size, (len(rows) - last) * size
+    middle = rows[first:last].tobytes()
+    high, low = divmod(zlib.adler32(middle), 1 << 16)
+    high = (high + before + after * low) % _ADLER  # a blank adds the lower sum to the upper one
+    parts = _blank(before, zlib.Z_FULL_FLUSH), _deflated(middle, zlib.Z_FULL_FLUSH)
+    end = _blank(after, zlib.Z_FINISH), struct.pack(">HH", high, low)
+    return b"".join((b"\x78\x01", *parts, *end))
+
+
+@lru_cache(maxsize=1024)
+def _blank(count: int, flush: int) -> bytes:
+    return _deflated(bytes(count), flush)
+
+
+def _deflated(data: bytes, flush: int) -> bytes:
+    packer = zlib.compressobj(1, zlib.DEFLATED, -zlib.MAX_WBITS, strategy=zlib.Z_RLE)
+    return packer.compress(data) + packer.flush(flush)
 
 
 def safe_name(text: str) -> str:
