@@ -3,15 +3,17 @@
 import json
 import os
 from collections.abc import Mapping
+from concurrent.futures import Executor, Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args
 
 import pytest
 
+from shapecat.batch.finding import Source
 from shapecat.batch.manifest import Entry, Manifest, State
-from shapecat.batch.plans import plan_batch
-from shapecat.batch.runs import Outcome, exit_code
+from shapecat.batch.plans import Shard, plan_batch
+from shapecat.batch.runs import Outcome, exit_code, process_on
 from shapecat.config import Settings
 from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run, write_run
@@ -193,3 +195,42 @@ def test_exit_codes_of_a_batch(codes: tuple[int, ...], expected: int) -> None:
     outcomes = [Outcome(Job(Path("a"), Path("b")), code=code) for code in codes]
 
     assert exit_code(outcomes) == expected
+
+
+def test_shards_are_disjoint_in_whatever_order_the_recordings_are_found() -> None:
+    """A machine may list a folder in another order than the next one."""
+    named = [(name, Source(f"{name}.mcap", "", name, "")) for name in "dbeac"]
+    first, second = Shard(0, 2).of(named), Shard(1, 2).of(named[::-1])
+
+    assert [name for name, _ in first] == ["a", "c", "e"]
+    assert [name for name, _ in second] == ["b", "d"]
+
+
+class Noting(Executor):
+    """Notes what it is handed, and does nothing."""
+
+    def __init__(self) -> None:
+        self.names: list[str] = []
+
+    def submit(self, _fn: Any, /, *args: Any, **_kwargs: Any) -> Future[Any]:
+        """Fail at once."""
+        self.names.append(args[0].folder.name)
+        future: Future[Any] = Future()
+        future.set_result(Outcome(args[0], message="nothing was done", code=1))
+        return future
+
+
+def test_the_largest_recordings_begin_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Begun last, a long one would keep a whole cluster waiting."""
+    monkeypatch.setattr(
+        "shapecat.batch.plans.load_model", lambda _path: SimpleNamespace(model_id="m1")
+    )
+    for name, size in (("a", 20), ("b", 3000), ("c", 400)):
+        (tmp_path / f"{name}.mcap").write_bytes(bytes(size))
+    executor, watcher = Noting(), SimpleNamespace(ended=lambda _outcome: None)
+    with plan_batch(Job(Path(), Path()), [str(tmp_path)], str(tmp_path / "out")) as batch:
+        list(process_on(executor, batch.tasks, watcher))
+
+    assert executor.names == ["b", "c", "a"]

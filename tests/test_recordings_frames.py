@@ -385,6 +385,19 @@ def test_streams_of_one_sensor_give_one_choice(tmp_path: Path) -> None:
     assert {stream.topic for stream in wanted} == {"/cam/depth/points"}
 
 
+def test_of_two_like_streams_the_one_with_more_messages_is_chosen(tmp_path: Path) -> None:
+    """A driver may publish one image on a topic before another takes over."""
+    items = [("/cam/depth/camera_info", 0, info(EPOCH))]
+    for number, topic in enumerate(["/cam/depth/a", "/cam/depth/b", "/cam/depth/b"]):
+        items.append((topic, number, image(EPOCH + number, wavy_depth())))
+    path = write(tmp_path / "a.mcap", items)
+
+    with open_recording(path) as recording:
+        (chosen,) = choose_streams(recording)
+
+    assert chosen.topic == "/cam/depth/b"
+
+
 def test_several_sensors_must_be_chosen_from(tmp_path: Path) -> None:
     points = np.ones((1, 3, 3), np.float32)
     left, right = cloud(EPOCH, points), cloud(EPOCH, points)

@@ -578,3 +578,24 @@ def test_a_short_track_inside_a_longer_one_is_its_shadow(
     found = without_shadows(Hits.of(frames), tracks)
 
     assert [len(member) for member in found] == ([24, 3] if kept else [24])
+
+
+def test_only_one_fragment_goes_on_where_two_ended() -> None:
+    """A track with two detections in one frame would give its number to two boxes."""
+    columns: dict[str, Any] = {
+        "first_ns": [0, 0, 20 * SECOND],
+        "last_ns": [2 * SECOND, 2 * SECOND, 30 * SECOND],
+        "start": [[0, 0, 0], [0.02, 0, 0], [0, 0, 0]],
+        "end": [[0, 0, 0], [0.02, 0, 0], [0, 0, 0]],
+        "start_velocity": np.zeros((3, 3)),
+        "end_velocity": np.zeros((3, 3)),
+        "sizes": np.full((3, 3), 0.1),
+        "whole": [20, 20, 20],
+        "rest": np.full((3, 3), np.nan),
+        "posteriors": [[0.8, 0.2]] * 3,
+        "cut": [[False, False]] * 3,
+        "novelties": [0.5] * 3,
+        "scenes": [0] * 3,
+    }
+
+    assert merge_fragments(Fragments(**columns), SETTINGS).tolist() == [0, 1, 0]
