@@ -17,6 +17,7 @@ from shapecat.runs.corrections import adopt_labels, read_labels
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.perceived import FrameRow, PerceptionTables
+from shapecat.runs.shown import _ended
 from shapecat.runs.tables import TRACKS, write_table
 from shapecat.runs.track_table import read_track_table
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
@@ -329,6 +330,21 @@ def test_a_deleted_track_ends_where_it_would_have_been_seen(tmp_path: Path) -> N
 
     assert [[o.track for o in f.objects] for f in frames] == [[1, 2], [1], [1]]
     assert [f.ended for f in frames] == [(), (2,), ()]
+
+
+def test_a_track_of_two_sensors_ends_where_it_was_last_seen_in_time(tmp_path: Path) -> None:
+    """Else its box is deleted on one topic, and stays on the other for ever."""
+    scene = Scene(np.array([0, -1, 0]), (), ())
+    times = [("/a", 0, 0), ("/b", 0, 1), ("/b", 1, 2), ("/a", 1, 3), ("/a", 2, 4)]
+    with PerceptionTables(tmp_path, categories=("cup", "can"), model_id="m") as tables:
+        for topic, index, stamp in times:
+            seen = Perception(topic, index, stamp, "cam", scene, (), {})
+            tables.write([seen], [FrameRow(stamp, None)])
+    frames = {("/a", 0): slice(0, 1), ("/a", 1): slice(1, 2), ("/b", 0): slice(2, 3)}
+
+    ended = _ended(tmp_path, frames, np.array([7, 7, 7]), np.array([0, 3, 1]))
+
+    assert ended == {("/a", 2): (7,)}
 
 
 def replayed(path: Path) -> list[tuple[int, set[str]]]:

@@ -1,6 +1,7 @@
 """The tables of a sensor that is turned and moved, every number another: checked by SciPy."""
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,11 @@ from scipy.spatial.transform import Rotation
 from shapecat.completion import DIRECTIONS
 from shapecat.config import TrackingSettings
 from shapecat.runs.corrections import read_labels
-from shapecat.runs.labels import read_labelled_frames
+from shapecat.runs.labels import _join, read_labelled_frames
 from shapecat.runs.perceived import FrameRow, PerceptionTables
 from shapecat.runs.shown import read_shown_frames
-from shapecat.runs.tracks import _read_frames, track_run
+from shapecat.runs.tracks import _Line, _read_frames, track_run
+from shapecat.tracking.records import Track
 from shapecat.types import (
     Box,
     Candidate,
@@ -259,3 +261,42 @@ def test_confidence_and_guess_are_those_of_all_views(run: Path) -> None:
         assert float(row["confidence"]) == pytest.approx(max(posterior), abs=6e-4)
         assert row["guess"] == CATEGORIES[int(np.argmax(posterior))]
         assert row["category"] in {row["guess"], "unknown"}
+
+
+def test_parts_of_a_merged_track_are_one_object(run: Path) -> None:
+    """One part may lie on the other: the lower support is that of the whole."""
+    frame = next(read_labelled_frames(run, read_labels(run / "tracks.csv", CATEGORIES)))
+    up = frame.up
+    assert up is not None
+    low, high = sorted(frame.objects, key=lambda part: float(up @ part.box.center))[::2]
+    parts = [replace(high, height_m=0.03), replace(low, height_m=0.07)]
+    bottoms = [float(up @ part.box.center) - part.height_m for part in parts]
+    whole = _join(parts, up.tolist())
+
+    assert bottoms[1] < bottoms[0] - 0.1
+    assert float(up @ whole.box.center) - whole.height_m == pytest.approx(bottoms[1])
+    assert whole.detections == (*high.detections, *low.detections)
+    assert len(set(whole.detections)) == 2
+
+
+def test_the_place_of_a_track_is_the_usual_one() -> None:
+    """A single stray view must not move the place that a person looks for."""
+    centers = np.array([[0.3, 1.1, 0.7], [0.31, 1.12, 0.72], [0.32, 1.13, 0.73], [1.5, 2.6, 0.1]])
+    track = Track(
+        id=3,
+        topics=("/depth",) * 4,
+        hits=4,
+        frames=np.arange(4),
+        stamps_ns=np.arange(4) * SECOND,
+        detections=np.zeros(4, int),
+        centers=centers,
+        causal=np.full((4, 3), 1 / 3),
+        posterior=np.array([0.2, 0.7, 0.1]),
+        confidence=0.7,
+        novelty=0.4,
+    )
+
+    line = _Line.of(track, CATEGORIES)
+
+    assert_allclose(line.center, [0.315, 1.125, 0.71])
+    assert (line.track, line.category, line.first_ns, line.last_ns) == (3, "can", 0, 3 * SECOND)
