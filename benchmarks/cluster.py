@@ -45,8 +45,9 @@ class Assumed:
     recordings: int = 100_000
     median_frames: float = 1800.0  # a minute at 30 Hz
     spread: float = 0.8  # of the logarithm of the frames: some last ten minutes
-    read_mb: float = 0.105  # per frame, compressed depth and transforms
-    written_mb: float = 0.41  # per frame: annotated.mcap, review.rrd, tables
+    read_mb: float = 0.086  # per frame, compressed depth and transforms
+    written_mb: float = 0.133  # per frame: annotated.mcap, review.rrd, tables
+    tables_mb: float = 0.016  # of these
     storage_mb_s: float = 1250.0  # shared by all: a file server on 10 Gbit/s
     stream_mb_s: float = 250.0  # one worker alone
     startup_s: float = 3.0  # of a worker, once
@@ -191,13 +192,12 @@ def per_hour(costs: Measured, given: Assumed) -> list[tuple[str, ...]]:
     frames = 30 * 3600.0
     cpu_h = frames * costs.frame_s / 3600
     rows: list[tuple[str, ...]] = []
-    lean = 0.003 + given.read_mb / 1000
     for cores, storage_mb_s, written, words in (
         (1, given.storage_mb_s, given.written_mb, "one core"),
         (2, given.storage_mb_s, given.written_mb, "two cores"),
         (200, given.storage_mb_s, given.written_mb, "100 nodes of two cores, 10 Gbit/s"),
         (200, 10 * given.storage_mb_s, given.written_mb, "the same, 100 Gbit/s"),
-        (200, given.storage_mb_s, lean, "the same, tables alone, 10 Gbit/s"),
+        (200, given.storage_mb_s, given.tables_mb, "the same, tables alone, 10 Gbit/s"),
     ):
         gigabytes = frames * (given.read_mb + written) / 1000
         storage_s = 1000 * gigabytes / storage_mb_s
@@ -281,7 +281,7 @@ def peak_mb() -> float:
 
 
 @click.command()
-@click.option("--frame-ms", default=25.8, help="CPU time per frame, all outputs on.")
+@click.option("--frame-ms", default=9.8, help="CPU time per frame, all outputs on.")
 @click.option("--recordings", default=100_000)
 @click.option("--plot", type=click.Path(path_type=Path), default=ROOT / "docs/images/scaling.png")
 @click.option("--check", "only_check", is_flag=True, help="Compare the model with 1 to 4 workers.")
@@ -305,11 +305,12 @@ def study(given: Assumed, frame_s: float, plot: Path) -> None:
     """Simulate the cluster, print tables, draw a plot."""
     wide = replace(given, storage_mb_s=10 * given.storage_mb_s)
     costs = measure(frame_s)["dask"]
-    lean = 0.003 + given.read_mb / 1000  # MB per frame: tables alone
     results = {
         "all outputs, 10 Gbit/s": [simulate(n, costs, given) for n in WORKERS],
         "all outputs, 100 Gbit/s": [simulate(n, costs, wide) for n in WORKERS],
-        "tables alone, 10 Gbit/s": [simulate(n, costs, given, written_mb=lean) for n in WORKERS],
+        "tables alone, 10 Gbit/s": [
+            simulate(n, costs, given, written_mb=given.tables_mb) for n in WORKERS
+        ],
     }
     for title, rows in results.items():
         shown = [
