@@ -8,6 +8,7 @@ taken away for a while every few minutes; here and there is something false for 
 """
 
 import json
+import os
 import tempfile
 import time
 from contextlib import ExitStack
@@ -122,6 +123,7 @@ def measure(frames: int) -> dict[str, Any]:
     """Track a made-up run of so many frames."""
     with tempfile.TemporaryDirectory() as name:
         make_tables(Path(name), frames)
+        os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # as the command does
         context = get_context("spawn")
         here, there = context.Pipe()
         process = context.Process(target=_track, args=(Path(name), there))
