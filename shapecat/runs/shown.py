@@ -69,32 +69,27 @@ class ShownTracks:
         cls, folder: Path, labels: Mapping[int, TrackLabel], *, causal: bool = False
     ) -> "ShownTracks":
         """Read the tracks of a run; those missing from ``labels`` are not shown."""
-        columns = ["track", "topic", "frame", "stamp_ns", "detection"]
         with pq.ParquetFile(folder / "tracks.parquet") as file:
-            full = _FULL if "center_full" in file.schema_arrow.names else {}  # of an older version
-            wanted = [*columns, *full, *(["posterior"] if causal else [])]
-            table = file.read(columns=wanted)
-        topics, codes = topic_codes(table)
-        seen = pa.compute.indices_nonzero(table["detection"].is_valid())
-        rows, detections = np.from_dlpack(seen), numbers(table["detection"].drop_null())
-        frames, tracks = numbers(table["frame"])[rows], numbers(table["track"])[rows]
-        order = np.lexsort((detections, frames, codes[rows]))
-        order = order[np.isin(tracks[order], list(labels))]
-        rows, tracks = rows[order], tracks[order]
-        of_frames = rows_of(topics, codes[rows], frames[order])
-        names, named = np.unique(tracks, return_inverse=True)
-        shown = np.array([labels[name].track for name in names.tolist()], np.int64)[named]
-        return cls(
-            of_frames,
-            detections[order],
-            tracks,
-            labels,
-            _ended(folder, of_frames, shown, numbers(table["stamp_ns"])[rows]),
-            _rows_of_lists(table["posterior"])[rows] if causal else _NONE,
-            numbers_or_nan(table, full)[rows]
-            if full
-            else np.full((len(rows), 10), np.nan, np.float32),
-        )
+            table = file.read(columns=["track", "topic", "frame", "stamp_ns", "detection"])
+            topics, codes = topic_codes(table)
+            seen = pa.compute.indices_nonzero(table["detection"].is_valid())
+            rows, detections = np.from_dlpack(seen), numbers(table["detection"].drop_null())
+            frames, tracks = numbers(table["frame"])[rows], numbers(table["track"])[rows]
+            order = np.lexsort((detections, frames, codes[rows]))
+            order = order[np.isin(tracks[order], list(labels))]
+            rows, tracks = rows[order], tracks[order]
+            of_frames = rows_of(topics, codes[rows], frames[order])
+            names, named = np.unique(tracks, return_inverse=True)
+            shown = np.array([labels[name].track for name in names.tolist()], np.int64)[named]
+            return cls(
+                of_frames,
+                detections[order],
+                tracks,
+                labels,
+                _ended(folder, of_frames, shown, numbers(table["stamp_ns"])[rows]),
+                _causal(file)[rows] if causal else _NONE,
+                _full(file)[rows],
+            )
 
     def of(self, key: Key) -> Iterator[ShownDetection]:
         """Yield the detections shown in a frame, in their order."""
@@ -156,10 +151,17 @@ def _box(label: TrackLabel, row: Sequence[float]) -> ShownBox:
     return ShownBox(*label, center, size, orientation)  # type: ignore[arg-type]  # as long as these
 
 
-def _rows_of_lists(column: pa.ChunkedArray) -> F4:
-    """Return (n, k) the numbers of lists of the same length."""
-    values = numbers(column)
-    return np.reshape(values, (len(column), values.size // max(len(column), 1)))
+def _causal(file: pq.ParquetFile) -> F4:
+    """Return (n, k) the causal posteriors of all rows."""
+    values, count = numbers(file.read(columns=["posterior"])["posterior"]), file.metadata.num_rows
+    return np.reshape(values, (count, values.size // max(count, 1)))
+
+
+def _full(file: pq.ParquetFile) -> F4:
+    """Return (n, 10) the full boxes of all rows, NaN where they are not known."""
+    if "center_full" not in file.schema_arrow.names:  # of an older version
+        return np.full((file.metadata.num_rows, sum(_FULL.values())), np.nan, np.float32)
+    return numbers_or_nan(file.read(columns=list(_FULL)), _FULL)
 
 
 def _places(table: pa.Table) -> F8:
