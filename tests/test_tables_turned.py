@@ -177,6 +177,21 @@ def test_the_tracker_sees_boxes_in_the_fixed_frame(run: Path) -> None:
         assert_allclose(frame.novelties, NOVELTIES[k], rtol=1e-6)
 
 
+def test_the_tracker_knows_which_views_repeat_an_earlier_one(tmp_path: Path) -> None:
+    """A view that is repeated while nothing moves would count as many."""
+    origins = [None, 0, 0, None]
+    scene = Scene(UP, (Plane(UP, -0.5, OUTLINE, 0.7, 0.0),), ())
+    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
+        for k, origin in enumerate(origins):
+            found = (replace(seen(k, 1), reused_from=origin),)
+            perception = Perception("/depth", k, k, "cam", scene, found, {})
+            tables.write([perception], [FrameRow(k, None)])
+
+    frames = list(_read_frames(tmp_path, len(CATEGORIES), set()))
+
+    assert [np.array(frame.described).tolist() for frame in frames] == [[0], [0], [0], [3]]
+
+
 def test_tracks_stay_where_their_objects_stand(run: Path) -> None:
     tracks = rows(run, "tracks")
 
