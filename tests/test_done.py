@@ -12,7 +12,7 @@ import pytest
 
 from shapecat.batch.finding import Source
 from shapecat.batch.manifest import Entry, Manifest, State
-from shapecat.batch.plans import Shard, plan_batch
+from shapecat.batch.plans import Shard, name_folders, plan_batch
 from shapecat.batch.runs import Outcome, exit_code, process_on
 from shapecat.config import Settings
 from shapecat.errors import OutputError
@@ -234,3 +234,10 @@ def test_the_largest_recordings_begin_first(
         list(process_on(executor, batch.tasks, watcher))
 
     assert executor.names == ["b", "c", "a"]
+
+
+def test_recordings_of_one_name_have_folders_of_their_own() -> None:
+    """Named by their parents, a person knows which is which; a number alone tells nothing."""
+    folders = name_folders(["x", "x", "x", "y"], ["a", "b", "a", "a"])
+
+    assert folders == ["a_x", "b_x", "a_x_3", "y"]
