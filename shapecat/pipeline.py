@@ -45,7 +45,7 @@ from shapecat.runs.jobs import (
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.label_transfer import Transfer, transfer_labels
 from shapecat.runs.masks import count_masks
-from shapecat.runs.perceiving import Observer, ignore, perceive_all, revise
+from shapecat.runs.perceiving import Observer, Work, ignore, perceive_all, revise
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.segments import discard_segments
 from shapecat.runs.tables import release_memory
@@ -98,20 +98,9 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             compiling_s = compile_all(lambda: observe("compile", 0, None), cores=cores)
             content.start()
             earlier = sum(run["seconds"].values())
-            _once(
-                "perceive",
-                folder,
-                run,
-                lambda: perceive_all(
-                    recording, folder, run, job, categorizer, observe, cores=cores
-                ),
-            )
-            _once(
-                "revise",
-                folder,
-                run,
-                lambda: revise(recording, folder, run, job, categorizer, observe, cores=cores),
-            )
+            work = Work(recording, folder, run, job, categorizer, observe, cores)
+            _once("perceive", folder, run, lambda: perceive_all(work))
+            _once("revise", folder, run, lambda: revise(work))
             identify(run, content)
             write_run(folder, run)
             discard_segments(folder)

@@ -1,15 +1,17 @@
 """Growing boosted trees that tell one thing from another, for the detection."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
+import click
 import numpy as np
 
 from shapecat.arrays import F4, Bool
 from shapecat.learning.boosting import Tree, TreeSettings, grow_tree, make_bins
 from shapecat.trees import BoostedTrees, Trees
 
-__all__ = ["Growth", "grow"]
+__all__ = ["Growth", "grow", "growing_options"]
 
 _RIDGE, _LEAST, _ROWS = 1.0, 2.0, 0.7
 
@@ -20,6 +22,22 @@ class Growth(NamedTuple):
     rounds: int
     leaves: int
     rate: float
+
+
+def growing_options(out: Path) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Add the options of a command that grows trees and writes them, by default to ``out``."""
+    options = (
+        click.option("--seed", default=0, show_default=True, help="Seed of the draws."),
+        click.option("--jobs", default=2, show_default=True, help="Processes."),
+        click.option("--out", default=out, type=click.Path(path_type=Path), help="File to write."),
+    )
+
+    def add(command: Callable[..., Any]) -> Callable[..., Any]:
+        for option in reversed(options):
+            command = option(command)
+        return command
+
+    return add
 
 
 def grow(

@@ -30,7 +30,7 @@ from shapecat.detection.merging.pair_features import (
 )
 from shapecat.detection.merging.segments import Segments, merge
 from shapecat.detection.pipeline import Task, oversegment
-from shapecat.models.growing import Growth, grow
+from shapecat.models.growing import Growth, grow, growing_options
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
 from shapecat.simulation.scenes import SceneKind
 from shapecat.simulation.sensors import IDEAL, Sensor
@@ -95,14 +95,7 @@ class Pairs(NamedTuple):
 
 @click.command()
 @click.option("--share", default=1.0, show_default=True, help="Share of the scenes to learn from.")
-@click.option("--seed", default=0, show_default=True, help="Seed of the draws.")
-@click.option("--jobs", default=2, show_default=True, help="Processes.")
-@click.option(
-    "--out",
-    default=Path(learned.__file__).with_name(learned.FILE),
-    type=click.Path(path_type=Path),
-    help="File to write.",
-)
+@growing_options(Path(learned.__file__).with_name(learned.FILE))
 @click.option("--more", is_flag=True, help="Keep the trees that are there, and add those of piles.")
 def main(*, share: float, seed: int, jobs: int, out: Path, more: bool) -> None:
     """Simulate, part, grow; write the trees."""

@@ -21,7 +21,7 @@ from shapecat.detection.cleanup import structure
 from shapecat.detection.cleanup.object_features import OBJECT_FEATURES, measure_object_features
 from shapecat.detection.depth_grid import downsample
 from shapecat.detection.pipeline import ALL_STEPS, Task, merge_segments, oversegment
-from shapecat.models.growing import Growth, grow
+from shapecat.models.growing import Growth, grow, growing_options
 from shapecat.models.parts import count_labels
 from shapecat.simulation import make_scene, render_frame
 from shapecat.simulation.scenes import SceneKind
@@ -80,14 +80,7 @@ class Told(NamedTuple):
 
 
 @click.command()
-@click.option("--seed", default=0, show_default=True, help="Seed of the draws.")
-@click.option("--jobs", default=2, show_default=True, help="Processes.")
-@click.option(
-    "--out",
-    default=Path(structure.__file__).with_name(structure.FILE),
-    type=click.Path(path_type=Path),
-    help="File to write.",
-)
+@growing_options(Path(structure.__file__).with_name(structure.FILE))
 def main(*, seed: int, jobs: int, out: Path) -> None:
     """Simulate, detect, grow; write the trees."""
     told = collect(_SERIES, jobs)

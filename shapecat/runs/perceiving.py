@@ -8,6 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from itertools import islice
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pyarrow as pa
@@ -29,7 +30,7 @@ from shapecat.runs.tables import Key, count_rows, read_row_groups
 from shapecat.system import stopping
 from shapecat.types import Frame
 
-__all__ = ["Observer", "ignore", "perceive_all", "revise"]
+__all__ = ["Observer", "Work", "ignore", "perceive_all", "revise"]
 
 Observer = Callable[[str, int, int | None], None]
 """Called with the name of the phase, the frames done, and how many there are, if known."""
@@ -46,17 +47,21 @@ def ignore(_phase: str, _done: int, _total: int | None) -> None:
     """Observe nothing."""
 
 
-def perceive_all(
-    recording: Recording,
-    folder: Path,
-    run: RunInfo,
-    job: Job,
-    categorizer: Categorizer,
-    observe: Observer = ignore,
-    *,
-    cores: int = 1,
-) -> None:
+class Work(NamedTuple):
+    """A job on its opened recording: where its tables go, and what run.json will say."""
+
+    recording: Recording
+    folder: Path
+    run: RunInfo
+    job: Job
+    categorizer: Categorizer
+    observe: Observer = ignore
+    cores: int = 1
+
+
+def perceive_all(work: Work) -> None:
     """Write frames, detections and planes, frame by frame in flat memory."""
+    recording, folder, run, job, categorizer, observe, cores = work
     skipped: Counter[str] = Counter()
     source, total = _select(recording, run["options"], skipped)
     recent = RecentFrames(job.settings.detection.fuse_frames)
@@ -96,21 +101,13 @@ def perceive_all(
     run["warnings"] = [*recording.warnings, *upright.warnings, *recent.warnings()]
 
 
-def revise(
-    recording: Recording,
-    folder: Path,
-    run: RunInfo,
-    job: Job,
-    categorizer: Categorizer,
-    observe: Observer = ignore,
-    *,
-    cores: int = 1,
-) -> None:
+def revise(work: Work) -> None:
     """Perceive again the frames that disagree with the recording, and rewrite the tables.
 
     Where the user says where up is, nothing else does. What was seen first stays where the second
     look finds nothing.
     """
+    recording, folder, run, job, categorizer, observe, cores = work
     chosen = frames_to_revise(read_segments(folder)) if run["up"]["source"] != "option" else {}
     if not chosen:
         return
