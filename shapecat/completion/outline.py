@@ -48,7 +48,6 @@ def _insert(ascending: F4, value: float) -> None:
     ascending[at - 1] = value
 
 
-@kernel
 def fit_oval(
     reached: F8, seen: F8, roundness: float, cosines: F8, sines: F8
 ) -> tuple[F8, float, float]:
@@ -80,13 +79,12 @@ def fit_oval(
         x = np.linalg.solve(A, (rows * weights) @ reached)
         oval = x @ rows
         limit = _OUTLIER * abs(x[2]) + 1e-9
-        for k in range(reached.size):
-            off = reached[k] - oval[k]
-            known = seen[k] if seen[k] > 0 else 1.0 if off > -limit else 0.0
-            weights[k] = known * min(1.0, limit / max(abs(off), 1e-12))
+        off = reached - oval
+        known = np.where(seen > 0, seen, off > -limit)
+        weights = known * np.minimum(1.0, limit / np.maximum(np.abs(off), 1e-12))
     facing = seen > 0
     off = (reached - oval)[facing]
-    return oval, x[2], np.sqrt((off * off).mean())
+    return oval, float(x[2]), float(np.sqrt((off * off).mean()))
 
 
 @kernel
@@ -101,7 +99,6 @@ def narrowest(reached: F8) -> int:
     return best
 
 
-@kernel
 def rectangle(reached: F8, side: int) -> tuple[float, float, float, float]:
     """Return the centre of an outline along a direction and across it, its length and its width."""
     ahead, left = reached[side], reached[side + QUARTER]

@@ -184,9 +184,9 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, inv_depth: F4)
         nearest[:] = far
         for k in range(factor * factor):
             x, part = k % factor, parts[k]
-            part[:] = depth[i * factor + k // factor, x : x + factor * columns : factor]
+            line = depth[i * factor + k // factor]
             for j in range(columns):
-                z = part[j]
+                z = line[x + factor * j]
                 part[j] = z if (z >= least) & (z <= range_m) else far
                 nearest[j] = part[j] if part[j] < nearest[j] else nearest[j]
         for j in range(columns):

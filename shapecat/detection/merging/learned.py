@@ -9,6 +9,7 @@ features together tell them from what only touches or stands on it, and no few o
 
 from functools import cache
 from importlib.resources import files
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,7 +18,11 @@ from shapecat.detection.merging.pair_features import (
     PAIR_FEATURES,
     ViewGeometry,
     find_adjacent,
-    pair_features,
+    write_pair_features,
+)
+from shapecat.detection.merging.segment_features import (
+    SEGMENT_FEATURES,
+    write_segment_features,
 )
 from shapecat.detection.merging.segments import Records, Segments, merge
 from shapecat.detection.merging.settings import MERGING
@@ -35,45 +40,50 @@ def load_trees() -> BoostedTrees:
     return read_trees(files("shapecat.detection.merging").joinpath(FILE).read_bytes())
 
 
+class Scratch(NamedTuple):
+    """The `PAIR_FEATURES` of a pair (1,), by name and as numbers (features,): the same ones."""
+
+    pair: Records
+    features: F4
+
+
 def merge_learned(segments: Segments, view_geometry: ViewGeometry, grown: BoostedTrees) -> None:
     """Merge segments that are likely parts of one object, the likeliest first."""
-    named = np.zeros(1, PAIR_FEATURES)
-    _merge(segments, view_geometry, grown, named, named.view(np.float32))
+    pair = np.zeros(1, PAIR_FEATURES)
+    _merge(segments, view_geometry, grown, Scratch(pair, pair.view(np.float32)))
 
 
 @kernel
 def _merge(
-    segments: Segments,
-    view_geometry: ViewGeometry,
-    grown: BoostedTrees,
-    named: Records,
-    features: F4,
+    segments: Segments, view_geometry: ViewGeometry, grown: BoostedTrees, scratch: Scratch
 ) -> None:
-    """Do what `merge_learned` does; ``named`` and ``features`` are scratch, the same one."""
     n = segments.parent.size
-    logits = np.full((n, n), -np.inf)
+    logits, looks = np.full((n, n), -np.inf), np.zeros(n, SEGMENT_FEATURES)
     for p in range(1, n):
-        _rate(segments, p, p + 1, view_geometry, grown, named, features, logits)
+        write_segment_features(segments, p, looks[p])
+    for p in range(1, n):
+        _rate(segments, looks, p, p + 1, view_geometry, grown, scratch, logits)
     while True:
         best = np.argmax(logits)
         p, q = int(best // n), int(best % n)
         if logits[p, q] < MERGING.likely:
             return
         merge(segments, p, q)
+        write_segment_features(segments, p, looks[p])  # others meet as much as before
         for k in range(n):
             logits[q, k] = logits[k, q] = -np.inf
-        _rate(segments, p, 1, view_geometry, grown, named, features, logits)
+        _rate(segments, looks, p, 1, view_geometry, grown, scratch, logits)
 
 
 @kernel
 def _rate(
     segments: Segments,
+    looks: Records,
     p: int,
     first: int,
     view_geometry: ViewGeometry,
     grown: BoostedTrees,
-    named: Records,
-    features: F4,
+    scratch: Scratch,
     logits: F8,
 ) -> None:
     """Write the logits of a segment with the others from ``first`` on, the lower one first."""
@@ -82,5 +92,5 @@ def _rate(
         low, high = min(p, q), max(p, q)
         logits[low, high] = -np.inf
         if adjacent[q]:
-            pair_features(segments, low, high, view_geometry, named[0])
-            logits[low, high] = logit_of(grown, features, MERGING.hopeless)
+            write_pair_features(segments, looks, low, high, view_geometry, scratch.pair[0])
+            logits[low, high] = logit_of(grown, scratch.features, MERGING.hopeless)

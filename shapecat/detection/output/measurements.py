@@ -187,7 +187,7 @@ def _outer_points(
             if outer[j]:
                 k = labels[i, j] - 1
                 if start[k + 1] == 0:
-                    low[k] = i, j
+                    low[k, 0], low[k, 1] = i, j
                 start[k + 1] += 1
                 low[k, 1] = min(low[k, 1], j)
                 high[k, 0], high[k, 1] = i, max(high[k, 1], j)
