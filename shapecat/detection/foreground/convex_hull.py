@@ -26,7 +26,8 @@ def fill_hull(residual: F4, part: I4, stack: I4, count: int) -> int:
         first += 1
     while right[last] < 0:
         last -= 1
-    right[:] = -right
+    for i in range(rows):
+        right[i] = -right[i]
     _straighten(left, first, last)
     _straighten(right, first, last)
     top = count

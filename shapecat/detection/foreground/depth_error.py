@@ -96,7 +96,12 @@ def clear_contact(
     high, edge = np.float32(LOW.low_m), np.zeros(columns, np.bool_)
     one, me = np.uint64(1), np.int8(number)
     for i in range(1, rows - 1):
-        # Few cells are high and beside what is low, and this vectorises.
+        # Few rows have high cells, few of these are beside what is low, and this vectorises.
+        some = False
+        for j in range(np.uint64(columns)):
+            some |= (plane_id[i, j] == me) & (height[i, j] >= high)
+        if not some:
+            continue
         some = False
         for j in range(one, np.uint64(columns - 1)):
             beside = (residual[i - 1, j] != 0) | (residual[i + 1, j] != 0)

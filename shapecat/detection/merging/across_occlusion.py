@@ -68,7 +68,9 @@ def _find_behind_one(segments: Segments) -> Bool:
 @kernel
 def _local_planes(samples: I4, inv_depth: F4, intrinsics: PinholeIntrinsics, normal: F4) -> F8:
     """Return (2, n, 3) the positions and normals of the samples of a segment, sensor frame."""
-    n = int(np.sum(samples >= 0))
+    n = 0
+    for cell in samples:
+        n += int(cell >= 0)
     planes = np.zeros((2, n, 3))
     for k in range(n):
         i, j = row_and_column(samples[k], inv_depth.shape[1])

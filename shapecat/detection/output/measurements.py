@@ -176,9 +176,11 @@ def _outer_points(
     rows, columns = labels.shape
     low, high = measured.low, measured.high
     spans, outer = np.zeros((rows, 2), np.int64), np.zeros(columns, np.bool_)
+    cells = n = 0
     for i in range(rows):
         spans[i, 0], spans[i, 1] = span_of(labels[i])
-    chosen, n = np.zeros((np.sum(spans[:, 1] - spans[:, 0]), 2), np.int32), 0
+        cells += spans[i, 1] - spans[i, 0]
+    chosen = np.zeros((cells, 2), np.int32)
     start = np.zeros(low.shape[0] + 1, np.int64)
     for i in range(rows):
         first, end = spans[i]

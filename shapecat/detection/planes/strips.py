@@ -136,7 +136,7 @@ def _peaks(amount: F8, least: float) -> F8:
         lower = 0.0
         for m in range(k - STRIPS.below, k - 2):
             lower += 3 * amount[m] / bins
-        falls = np.min(amount[k + 1 : k + 4]) < STRIPS.dip * here
+        falls = min(amount[k + 1], amount[k + 2], amount[k + 3]) < STRIPS.dip * here
         if falls and own > STRIPS.contrast * lower:
             peaks[n] = (k + 0.5 - BINS) * STRIPS.bin_m
             n += 1
