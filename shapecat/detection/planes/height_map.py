@@ -77,7 +77,7 @@ def measure_heights(grid: DepthGrid, planes: F8, highest_m: float) -> HeightMap:
     return HeightMap(plane_id, height)
 
 
-@kernel(fast=True)
+@kernel
 def _assign(
     inv_depth: F4,
     intrinsics: PinholeIntrinsics,
@@ -87,7 +87,11 @@ def _assign(
     plane_id: I4,
     height: F4,
 ) -> None:
-    """Give the free cells inside the outline of a plane to it; the loops over a row vectorise."""
+    """Give the free cells inside the outline of a plane to it; the loops over a row vectorise.
+
+    Not ``fast``: there is nothing to reorder, and a copy compiled within its caller would round
+    heights otherwise, so that the process that compiles found others than those that follow.
+    """
     rows, columns = inv_depth.shape
     a, scale, zero, one = np.float32(plane[0]), np.float32(plane[3]), np.float32(0), np.float32(1)
     least, noise, below = np.float32(MIN_HEIGHT_M), np.float32(HEIGHT_NOISE), np.float32(OUT)
