@@ -44,7 +44,6 @@ def kernel(function: _F | None = None, *, fast: bool = False) -> Any:
                 nogil=True,
                 cache=folder is not None,
                 error_model="numpy",
-                no_cfunc_wrapper=True,  # for callers in C, of which there are none
                 fastmath=_FAST if fast else False,
             )(target)
         finally:
