@@ -23,6 +23,7 @@ __all__ = [
 ]
 
 _ADLER = 65521
+"""Modulus of the sums of Adler-32, the checksum at the end of zlib data (RFC 1950)."""
 _COLOUR_TYPES = {"grey": 0, "palette": 3}
 
 
@@ -95,6 +96,7 @@ def _compressed(rows: U1, level: int) -> bytes:
 
 @lru_cache(maxsize=1024)
 def _blank(count: int, flush: int) -> bytes:
+    """Return so many zero bytes compressed; a flush of zlib ends them."""
     return _deflated(bytes(count), flush)
 
 
