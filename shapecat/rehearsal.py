@@ -24,7 +24,8 @@ from shapecat.completion import complete
 from shapecat.config import Settings
 from shapecat.description import describe
 from shapecat.detection import detect
-from shapecat.executors.local import LocalExecutor, WorkerLostError
+from shapecat.executors.local import LocalExecutor
+from shapecat.executors.worker import WorkerLostError
 from shapecat.jit import code_folder
 from shapecat.learning import load_model
 from shapecat.reuse import KeyView, find_repeats, shows_the_same, sight_of
@@ -33,7 +34,7 @@ from shapecat.system import stopping
 from shapecat.system.files import lock
 from shapecat.types import Camera, Candidate, Detection, Frame, NeuralGas
 
-__all__ = ["compile_all", "find_ball", "main", "recognize_ball"]
+__all__ = ["compile_all", "find_ball", "main", "recognize_ball", "rehearse"]
 
 _RADIUS_M = 0.05
 
@@ -86,6 +87,12 @@ _STAGES = ("completion", "description", "detection", "learning", "reuse", "surfa
 """Folders of the kernels that are rehearsed."""
 
 
+def rehearse() -> None:
+    """Call all kernels of perception once, which loads those that are compiled."""
+    for rehearsal in _REHEARSALS:
+        rehearsal()
+
+
 def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> float:
     """Compile the kernels in other processes, unless it was done before; return the seconds.
 
@@ -134,8 +141,7 @@ def _notes() -> Path | None:
 
 def _rehearse(cores: int) -> None:
     if current_process().daemon:  # may have no others
-        for rehearsal in _REHEARSALS:
-            rehearsal()
+        rehearse()
         return
     executor = LocalExecutor(min(cores, len(_REHEARSALS)))
     try:

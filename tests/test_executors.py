@@ -59,6 +59,16 @@ def wait_for(condition: Any, seconds: float = 20) -> None:
         time.sleep(0.02)
 
 
+class Unreadable:
+    """Can be pickled and not unpickled."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return raise_error, ()
+
+    def method(self) -> None:
+        """Do nothing."""
+
+
 @pytest.fixture(scope="module")
 def executor() -> Iterator[Executor]:
     with LocalExecutor(2) as made:
@@ -83,6 +93,27 @@ def test_results_errors_and_deaths_reach_their_own_futures(executor: Executor) -
 def test_what_cannot_be_sent_fails_alone(executor: Executor) -> None:
     assert executor.submit(lambda: 1).exception() is not None
     assert executor.submit(abs, -1).result() == 1
+
+
+def test_a_busy_worker_is_sent_its_next_task() -> None:
+    """It would wait while 20 MB of frames come, and nobody works meanwhile."""
+    one = LocalExecutor(1, ahead=1)
+    held, sent, waiting = (one.submit(time.sleep, seconds) for seconds in (60, 0, 0))
+    wait_for(sent.running)
+    assert not waiting.running()
+
+    one._workers[0].process.kill()
+
+    assert isinstance(held.exception(), WorkerLostError)
+    assert isinstance(sent.exception(), WorkerLostError)
+    assert waiting.exception() is None
+    one.shutdown()
+
+
+def test_what_cannot_be_received_costs_its_worker_alone() -> None:
+    with LocalExecutor(1) as one:
+        assert isinstance(one.submit(Unreadable().method).exception(20), WorkerLostError)
+        assert one.submit(abs, -1).result() == 1
 
 
 def test_workers_use_the_threads_they_are_given() -> None:
@@ -219,6 +250,28 @@ def test_reading_ahead_holds_few_items() -> None:
     for item in read_ahead(items(), count=3):
         used.append(item)  # noqa: PERF402  the source looks at it meanwhile
     assert used == list(range(200))
+
+
+def slow_elsewhere(seconds: float) -> int:
+    if parent_process() is not None:
+        time.sleep(seconds)
+    return os.getpid()
+
+
+def one_by_one() -> Iterator[tuple[int, float]]:
+    for k in range(3):
+        time.sleep(0.1)
+        yield k, 1.0
+
+
+def test_the_last_items_do_not_wait_for_a_slow_process() -> None:
+    """What was not sent to it yet is worked on here."""
+    with Processes(slow_elsewhere, 2) as processes:
+        processes.start()
+        wait_for(lambda: all(future.done() for future in processes._waking))
+        workers = [worker for _, worker in processes.in_order(one_by_one())]
+    assert workers[0] == workers[1] != os.getpid()
+    assert workers[2] == os.getpid()
 
 
 def inverse_of_rest(k: int) -> int:

@@ -10,8 +10,9 @@ from typing import Literal, get_args
 
 from shapecat.errors import ConfigError
 from shapecat.executors.cores import limited_threads, share_cores, usable_cores
-from shapecat.executors.local import LocalExecutor, WorkerLostError
+from shapecat.executors.local import LocalExecutor
 from shapecat.executors.mailbox import Mailbox, post
+from shapecat.executors.worker import WorkerLostError
 
 __all__ = [
     "EXECUTORS",

@@ -1,53 +1,38 @@
 """Processes on this machine that outlive neither their parent nor spoil each other's work."""
 
 import atexit
-import io
-import os
 import signal
 import threading
 from collections.abc import Callable
 from concurrent.futures import Executor, Future
 from contextlib import suppress
-from multiprocessing import get_context, parent_process, resource_tracker
-from multiprocessing.connection import Connection, wait
-from multiprocessing.reduction import ForkingPickler
+from multiprocessing import resource_tracker
 from queue import Empty, SimpleQueue
-from typing import Any, NamedTuple
+from typing import Any
 
-from shapecat.executors.cores import limited_threads
-from shapecat.system import stopping
+from shapecat.executors.worker import Task, Worker, WorkerLostError
 
-__all__ = ["LocalExecutor", "WorkerLostError"]
+__all__ = ["LocalExecutor"]
 
-# Spawned, not forked: the threads of numeric and Rerun libraries do not survive a fork.
-_SPAWN = get_context("spawn")
 _SIGNALS = {signal.SIGINT, signal.SIGTERM}
-
-
-class WorkerLostError(RuntimeError):
-    """The process that worked on a task has died: killed, out of memory, or crashed."""
-
-
-class _Task(NamedTuple):
-    future: Future[Any]
-    call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]
 
 
 class LocalExecutor(Executor):
     """Runs tasks in spawned processes, as `concurrent.futures.ProcessPoolExecutor` does.
 
-    It differs where a disk of recordings needs it to: a worker that dies fails its own task alone
+    It differs where a disk of recordings needs it to: a worker that dies fails its own tasks alone
     and is replaced, workers end when their parent does, however it ended, `stop` asks tasks to
     put their work down, and `terminate` does not wait for them. Signals reach the parent alone,
     which decides what they mean.
     """
 
-    def __init__(self, workers: int, *, threads: int = 1) -> None:
+    def __init__(self, workers: int, *, threads: int = 1, ahead: int = 0) -> None:
         """Prepare ``workers`` processes; each starts with its first task.
 
         Parameters
         ----------
         threads : that numeric libraries may use in each process.
+        ahead : tasks that a busy worker is sent in advance, and loses when it dies.
 
         Raises
         ------
@@ -56,10 +41,10 @@ class LocalExecutor(Executor):
         if workers < 1:
             msg = f"workers must be at least 1, got {workers}"
             raise ValueError(msg)
-        self._tasks: SimpleQueue[_Task | None] = SimpleQueue()
-        self._threads = threads
+        self._tasks: SimpleQueue[Task | None] = SimpleQueue()
+        self._threads, self._ahead = threads, ahead
         self._closed = False
-        self._workers: dict[int, _Worker] = {}
+        self._workers: dict[int, Worker] = {}
         self._lock = threading.Lock()
         self._attendants = [
             threading.Thread(target=self._attend, args=(k,), daemon=True) for k in range(workers)
@@ -78,7 +63,7 @@ class LocalExecutor(Executor):
         if self._closed:
             msg = "cannot submit after shutdown"
             raise RuntimeError(msg)
-        task = _Task(Future(), (fn, args, kwargs))
+        task = Task(Future(), (fn, args, kwargs))
         self._tasks.put(task)
         return task.future
 
@@ -119,141 +104,47 @@ class LocalExecutor(Executor):
                     task.future.cancel()
 
     def _attend(self, seat: int) -> None:
-        """Give tasks to one worker after the other, for as long as there are any."""
+        """Send tasks to one worker after the other, for as long as there are any."""
         resource_tracker.ensure_running()  # to start it lets signals through again
         signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # which the workers inherit
-        while task := self._tasks.get():
-            if not task.future.set_running_or_notify_cancel():
-                continue
+        room = threading.Semaphore(1 + self._ahead)
+        while room.acquire() and (task := self._tasks.get()):
             try:
-                self._answer(task, self._worker(seat).call(task.call))
-            except (EOFError, OSError):
-                self._discard(seat, task)
+                if task.future.set_running_or_notify_cancel():
+                    self._worker(seat, room).send(task)
+                else:
+                    room.release()
             except Exception as error:  # noqa: BLE001  a call that cannot be sent fails alone
                 task.future.set_exception(error)
-        with self._lock:
-            worker = self._workers.pop(seat, None)
-        if worker is not None:
-            worker.pipe.close()
-            worker.process.join()
+                room.release()
+        self._dismiss(seat)
 
-    def _answer(self, task: _Task, answer: tuple[bool, Any]) -> None:
-        done, value = answer
-        if done:
-            task.future.set_result(value)
-        else:
-            task.future.set_exception(value)
-
-    def _worker(self, seat: int) -> "_Worker":
-        with self._lock:
-            if seat not in self._workers:
-                if self._closed:
-                    raise EOFError
-                self._workers[seat] = _Worker(self._threads)
-            return self._workers[seat]
-
-    def _discard(self, seat: int, task: _Task) -> None:
-        """Fail the task of a worker that is gone; another takes its seat with the next task."""
-        with self._lock:
-            worker = self._workers.pop(seat, None)
-        code = None
-        if worker is not None:
-            worker.pipe.close()
-            worker.process.join(timeout=5)
-            code = worker.process.exitcode
-        task.future.set_exception(WorkerLostError(f"the worker process died ({_words(code)})"))
-
-
-def _words(code: int | None) -> str:
-    if code is not None and code < 0:
-        return f"signal {signal.Signals(-code).name}"
-    return f"exit code {code}"
-
-
-class _Worker:
-    """A process and the pipe to it."""
-
-    def __init__(self, threads: int) -> None:
-        self.pipe, far = _SPAWN.Pipe()
-        asked, self._ask = _SPAWN.Pipe(duplex=False)
-        # Daemonic ones may not start processes of their own; `_watch_parent` ends these.
-        self.process = _SPAWN.Process(target=_serve, args=(far, asked), daemon=False)
-        with limited_threads(threads):
-            self.process.start()
-        far.close()
-        asked.close()
-
-    def ask_to_stop(self) -> None:
-        """Let `stopping.asked` be true in the process."""
-        self._ask.close()
-
-    def call(self, call: tuple[Callable[..., Any], tuple[Any, ...], dict[str, Any]]) -> Any:
-        """Send a call and wait for its answer.
+    def _worker(self, seat: int, room: threading.Semaphore) -> Worker:
+        """Return the worker of a seat; where it is gone another takes its place.
 
         Raises
         ------
-        EOFError, OSError : the process is gone.
+        WorkerLostError : no other is started after a shutdown.
         """
-        _send(self.pipe, call)
-        return _receive(self.pipe)
+        worker = self._workers.get(seat)
+        if worker is not None and worker.lost:
+            self._dismiss(seat)
+        with self._lock:
+            if seat not in self._workers:
+                if self._closed:
+                    msg = "the worker process died before its task was sent"
+                    raise WorkerLostError(msg)
+                try:
+                    self._workers[seat] = Worker(self._threads, room)
+                except OSError as error:
+                    msg = f"no worker process can be started: {error}"
+                    raise WorkerLostError(msg) from error
+            return self._workers[seat]
 
-
-def _send(pipe: Connection, value: object) -> None:
-    """Send a value; its arrays go from where they lie into the pipe, without a copy."""
-    written, buffers = io.BytesIO(), list[Any]()
-    ForkingPickler(written, 5, True, buffers.append).dump(value)  # noqa: FBT003  by position alone
-    arrays = [buffer.raw() for buffer in buffers]
-    pipe.send([len(array) for array in arrays])
-    pipe.send_bytes(written.getbuffer())
-    for array in arrays:
-        rest = array
-        while rest:
-            rest = rest[os.write(pipe.fileno(), rest) :]
-
-
-def _receive(pipe: Connection) -> Any:
-    """Receive what `_send` has sent.
-
-    Raises
-    ------
-    EOFError, OSError : the other process is gone.
-    """
-    sizes, written = pipe.recv(), pipe.recv_bytes()
-    arrays = [bytearray(size) for size in sizes]
-    for array in arrays:
-        rest = memoryview(array)
-        while rest:
-            count = os.readv(pipe.fileno(), [rest])
-            if not count:
-                raise EOFError
-            rest = rest[count:]
-    return ForkingPickler.loads(written, buffers=arrays)
-
-
-def _serve(pipe: Connection, asked: Connection) -> None:
-    """Answer calls until the parent closes the pipe or dies."""
-    threading.Thread(target=_watch_parent, args=(asked,), daemon=True).start()
-    with suppress(EOFError, OSError):
-        while True:
-            function, arguments, options = _receive(pipe)
-            _send(pipe, _answer(function, arguments, options))
-
-
-def _answer(
-    function: Callable[..., Any], arguments: tuple[Any, ...], options: dict[str, Any]
-) -> tuple[bool, Any]:
-    try:
-        return True, function(*arguments, **options)
-    except (Exception, stopping.Stopped) as error:  # noqa: BLE001  it is raised by the future
-        return False, error
-
-
-def _watch_parent(asked: Connection) -> None:
-    """Stop the work when the parent asks; end, whatever it does, when the parent is gone."""
-    parent = parent_process()
-    if parent is None:
-        return
-    if parent.sentinel not in wait([parent.sentinel, asked]):
-        stopping.request()
-        wait([parent.sentinel])
-    os._exit(1)
+    def _dismiss(self, seat: int) -> None:
+        """Wait for the answers of a worker, and for its end."""
+        worker = self._workers.get(seat)
+        if worker is not None:
+            worker.end()
+            with self._lock:
+                del self._workers[seat]

@@ -3,7 +3,7 @@
 import logging
 import sys
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from itertools import islice
@@ -22,8 +22,11 @@ _Result = TypeVar("_Result")
 
 _ALONE = 1
 """Items worked on before other processes are started, which a short run can do without."""
-_AWAY = 2
-"""Items sent to each other process: one to work on, one to go on with."""
+_AHEAD, _AWAY = 1, 3
+"""Items sent to a process that is busy; and all that are meant for it, of which one waits here.
+
+While this process works, another one finishes what it has, and what waits is sent to it.
+"""
 _HELD = 8
 """Results held at most, which wait for one that another process works on."""
 _SWITCH_S = 5e-4
@@ -43,15 +46,21 @@ class Processes(Generic[_Item, _Result]):
     [('a', 2), ('b', 1)]
     """
 
-    def __init__(self, work: Callable[[_Item], _Result], count: int) -> None:
+    def __init__(
+        self,
+        work: Callable[[_Item], _Result],
+        count: int,
+        warm_up: Callable[[], object] = object,
+    ) -> None:
         """Prepare ``count`` processes; the others end with the block.
 
         Parameters
         ----------
+        warm_up : is called in the others before their first item.
         work : is sent to spawned processes, as the items are: picklable, and a script needs the
             usual ``if __name__ == "__main__"``. A daemonic process may have no others.
         """
-        self._work = work
+        self._work, self._warm_up = work, warm_up
         self._others = 0 if current_process().daemon else max(0, count - 1)
         self._executor: LocalExecutor | None = None
         self._waking: list[Future[None]] = []
@@ -67,9 +76,9 @@ class Processes(Generic[_Item, _Result]):
     def start(self) -> None:
         """Start the others now, not with the first items: they take seconds to come up."""
         if self._others and self._executor is None:
-            self._executor = LocalExecutor(self._others)
+            self._executor = LocalExecutor(self._others, ahead=_AHEAD)
             for _ in range(self._others):
-                self._waking.append(self._executor.submit(_wake, self._work))
+                self._waking.append(self._executor.submit(_wake, self._work, self._warm_up))
 
     def in_order(self, items: Iterable[tuple[_Kept, _Item]]) -> Iterator[tuple[_Kept, _Result]]:
         """Yield what the work makes of each item, in the order of the items, with what is kept.
@@ -79,34 +88,74 @@ class Processes(Generic[_Item, _Result]):
         items : pairs of what is kept here and what is worked on; held only until it is done.
         """
         source = iter(items)
-        for kept, item in islice(source, _ALONE if self._others else None):
-            yield kept, self._work(item)
-        self.start()
-        pending: deque[tuple[_Kept, Future[_Result]]] = deque()
-        away: list[Future[_Result]] = []
+        if self._executor is None:
+            for kept, item in islice(source, _ALONE if self._others else None):
+                yield kept, self._work(item)
+            self.start()
+        pending: deque[tuple[_Kept, _Turn[_Item, _Result]]] = deque()
         with _switching():
             for kept, item in source:
-                away = [future for future in away if not future.done()]
-                future = self._submit(item, len(away))
-                if not future.done():
-                    away.append(future)
-                pending.append((kept, future))
+                pending.append((kept, self._begin(item, [turn for _, turn in pending])))
                 while pending and (pending[0][1].done() or len(pending) > _HELD):
-                    first, future = pending.popleft()
-                    yield first, future.result()
-            for first, future in pending:
-                yield first, future.result()
+                    first, turn = pending.popleft()
+                    yield first, turn.result()
+            for _, turn in reversed(pending):
+                turn.recall()
+            for first, turn in pending:
+                yield first, turn.result()
 
-    def _submit(self, item: _Item, away: int) -> Future[_Result]:
-        """Send an item to another process if one has come up and is free, else work on it."""
+    def _begin(
+        self, item: _Item, turns: Sequence["_Turn[_Item, _Result]"]
+    ) -> "_Turn[_Item, _Result]":
+        """Send an item to another process if one has come up and has room, else work on it."""
         awake = sum(future.done() for future in self._waking)
-        if self._executor is None or away >= _AWAY * awake:
-            return _done(self._work, item)
-        return _sent(self._executor, self._work, item)
+        away = sum(not turn.done() for turn in turns)
+        return _Turn(self._work, item, self._executor if away < _AWAY * awake else None)
 
 
-def _wake(_work: object) -> None:
-    """Do nothing: to have received ``work`` is to have loaded what it needs."""
+class _Turn(Generic[_Item, _Result]):
+    """The work on an item, which another process does, or this one."""
+
+    def __init__(
+        self, work: Callable[[_Item], _Result], item: _Item, executor: Executor | None
+    ) -> None:
+        """Send the item, or work on it where there is no executor."""
+        self._work = work
+        self._item: _Item | None = None  # kept only while another process has it
+        self._future: Future[_Result]
+        if executor is None:
+            self._future = _done(work, item)
+        else:
+            self._item = item
+            self._future = executor.submit(work, item)
+            self._future.add_done_callback(self._let_go)
+
+    def _let_go(self, future: Future[_Result]) -> None:
+        if not future.cancelled() and future.exception() is None:
+            self._item = None
+
+    def done(self) -> bool:
+        """Return whether `result` need not wait."""
+        return self._future.done()
+
+    def recall(self) -> None:
+        """Work on the item here if it was not sent yet."""
+        if self._item is not None and self._future.cancel():
+            self._future, self._item = _done(self._work, self._item), None
+
+    def result(self) -> _Result:
+        """Return the result; what another process fails at is done here."""
+        self.recall()
+        error = self._future.exception()
+        if error is None or self._item is None:
+            return self._future.result()
+        _log.warning("another process failed (%s): going on without its result", error)
+        return self._work(self._item)
+
+
+def _wake(_work: object, warm_up: Callable[[], object]) -> None:
+    """Warm up; to have received the work is to have loaded what it needs."""
+    warm_up()
 
 
 def _done(work: Callable[[_Item], _Result], item: _Item) -> Future[_Result]:
@@ -115,25 +164,6 @@ def _done(work: Callable[[_Item], _Result], item: _Item) -> Future[_Result]:
         result.set_result(work(item))
     except Exception as error:  # noqa: BLE001  raised when its turn comes
         result.set_exception(error)
-    return result
-
-
-def _sent(executor: Executor, work: Callable[[_Item], _Result], item: _Item) -> Future[_Result]:
-    result: Future[_Result] = Future()
-
-    def settle(sent: Future[_Result]) -> None:
-        if sent.cancelled():
-            return
-        own = sent
-        if error := sent.exception():
-            _log.warning("another process failed (%s): going on without its result", error)
-            own = _done(work, item)
-        if error := own.exception():
-            result.set_exception(error)
-        else:
-            result.set_result(own.result())
-
-    executor.submit(work, item).add_done_callback(settle)
     return result
 
 

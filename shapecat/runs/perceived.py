@@ -30,6 +30,8 @@ __all__ = ["FrameRow", "PerceptionTables"]
 
 _SEGMENT_S = 2.0
 """What a kill may cost: frames are kept in a segment at least so often."""
+_SEGMENT_FRAMES = 2 * GROUP_FRAMES
+"""Held at most: each segment waits for the disk."""
 
 
 @dataclass(frozen=True)
@@ -95,7 +97,7 @@ class PerceptionTables:
         """Append a block of frames, which no segment parts."""
         self._pending.extend(zip(perceptions, rows, strict=True))
         late = time.monotonic() - self._flushed > _SEGMENT_S
-        if late or len(self._pending) >= GROUP_FRAMES:
+        if late or len(self._pending) >= _SEGMENT_FRAMES:
             self._flush()
 
     def _flush(self) -> None:

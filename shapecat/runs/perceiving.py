@@ -21,6 +21,7 @@ from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, View, find_up
 from shapecat.recordings import Recording, choose_streams, frames
 from shapecat.recordings.gravity import Upright
+from shapecat.rehearsal import rehearse
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceived import FrameRow, PerceptionTables
 from shapecat.runs.run_info import Options, RunInfo, window_of
@@ -67,7 +68,7 @@ def perceive_all(work: Work) -> None:
     recent = RecentFrames(job.settings.detection.fuse_frames)
     count = 0
     with (
-        Processes(Perceiver(categorizer, job.settings, job.model), cores) as processes,
+        Processes(Perceiver(categorizer, job.settings, job.model), cores, rehearse) as processes,
         _tables(folder, categorizer) as tables,
     ):
         if (total or 0) - tables.done >= _MANY:
@@ -112,7 +113,7 @@ def revise(work: Work) -> None:
     if not chosen:
         return
     with (
-        Processes(Perceiver(categorizer, job.settings, job.model), cores) as processes,
+        Processes(Perceiver(categorizer, job.settings, job.model), cores, rehearse) as processes,
         _tables(folder, categorizer, again=True) as tables,
     ):
         views = islice(_views_again(recording, run, job, chosen), len(chosen))
