@@ -154,6 +154,44 @@ def test_every_flipped_byte_ends_sensibly(tmp_path: Path) -> None:
                     continue
 
 
+@pytest.mark.parametrize("compression", list(CompressionType))
+def test_small_messages_are_read_without_the_images_behind_them(
+    tmp_path: Path, compression: CompressionType
+) -> None:
+    """To look for transforms was to decompress all of the recording once more."""
+    path = tmp_path / "a.mcap"
+    noise = np.random.default_rng(0).integers(0, 256, 100_000, np.uint8).tobytes()
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=10**6, compression=compression)
+        writer.start("ros2", "test")
+        schema = writer.register_schema(STRING, "ros2msg", b"string data")
+        small, large = (writer.register_channel(name, "cdr", schema) for name in ("/a", "/b"))
+        for time in range(3):
+            writer.add_message(small, time, text(f"message {time}"), time)
+        for time in range(3, 6):
+            writer.add_message(large, time, noise, time)
+        writer.finish()
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 0xFF  # in an image
+
+    assert times_read(path) == list(range(6))
+    path.write_bytes(data)
+    with open_recording(path) as recording:
+        assert [message.log_time_ns for message in recording.messages(["/a"])] == [0, 1, 2]
+        assert not recording.warnings
+        assert list(recording.messages(["/a", "/b"])) == []
+        assert "left out the chunk" in recording.warnings[0]
+
+
+def test_a_message_index_that_lacks_messages_is_not_believed(tmp_path: Path) -> None:
+    path = write_mcap(tmp_path / "a.mcap", [0, 1, 2], chunk_size=10_000)
+    data = path.read_bytes()
+    first = data.index(b"\x07" + struct.pack("<QH", 38, 1))  # the index of /a
+    path.write_bytes(data[: first + 9] + struct.pack("<H", 9) + data[first + 11 :])
+
+    assert times_read(path, topics=["/a"]) == [0, 2]
+
+
 def test_damaged_chunk_is_left_out(tmp_path: Path) -> None:
     path = write_mcap(tmp_path / "a.mcap", list(range(20)))
     data = bytearray(path.read_bytes())

@@ -6,6 +6,7 @@ out, and both are said in the warnings.
 
 from collections import Counter
 from collections.abc import Iterator
+from itertools import chain
 from pathlib import Path
 from typing import ClassVar
 
@@ -23,6 +24,7 @@ from shapecat.recordings.mcap_records import (
     read_chunk,
     read_content,
     read_cut_chunk,
+    read_message_index,
     split_chunk,
     split_message,
     walk,
@@ -36,6 +38,8 @@ __all__ = ["McapRecording"]
 
 _SMALL = 1 << 16
 """Messages up to this size are copied, so that they do not keep their chunk in memory."""
+_PART = 0.9
+"""A chunk that is needed to here is decompressed to its end, and its checksum compared."""
 
 
 class McapRecording(Recording):
@@ -194,19 +198,21 @@ class McapRecording(Recording):
             except ChunkError as error:
                 self.warn(f"left out a record at byte {record.offset}: {error}")
 
-    def _chunk(self, record: Record) -> Iterator[RawMessage]:
-        """Yield the messages of a chunk, up to the cut if it is truncated."""
+    def _chunk(self, record: Record, end: int | None = None) -> Iterator[RawMessage]:
+        """Yield the messages of a chunk, up to the cut if it is truncated, or up to ``end``."""
         try:
-            for opcode, content in split_chunk(self._plain(record)):
+            for opcode, content in split_chunk(self._plain(record, end)):
                 yield from self._take(opcode, content)
         except ChunkError as error:
             part = "" if record.whole else "the rest of "
             self.warn(f"left out {part}the chunk at byte {record.offset - 9}: {error}")
 
-    def _plain(self, record: Record) -> memoryview:
+    def _plain(self, record: Record, end: int | None) -> memoryview:
         """Return the decompressed records of a chunk; its checksum is compared the first time."""
         if not record.whole:
             return read_cut_chunk(self.content(record))
+        if end is not None:
+            return read_chunk(self.content(record), end=end)
         plain = read_chunk(self.content(record), checked=record.offset in self._checked)
         self._checked.add(record.offset)
         return plain
@@ -240,13 +246,13 @@ class McapRecording(Recording):
         ]
 
         def read(chunk: records.ChunkIndex) -> Iterator[tuple[Timed, RawMessage]]:
-            for message in self._indexed_chunk(chunk):
+            for message in self._indexed_chunk(chunk, wanted):
                 if message.channel_id in wanted:
                     yield Timed(message.log_time, len(message.data)), message
 
         yield from in_time_order(chunks, read)
 
-    def _indexed_chunk(self, chunk: records.ChunkIndex) -> Iterator[RawMessage]:
+    def _indexed_chunk(self, chunk: records.ChunkIndex, wanted: set[int]) -> Iterator[RawMessage]:
         try:
             record = next(walk(self._file, chunk.chunk_start_offset, self._size))
         except (TruncatedError, StopIteration):
@@ -254,7 +260,26 @@ class McapRecording(Recording):
         if record is None or record.opcode != Opcode.CHUNK:
             self.warn(f"no chunk at byte {chunk.chunk_start_offset}, where the index has one")
             return
-        yield from self._chunk(record)
+        yield from self._chunk(record, self._end_of(chunk, wanted))
+
+    def _end_of(self, chunk: records.ChunkIndex, wanted: set[int]) -> int | None:
+        """Return where the last wanted message of a chunk ends, None if it is needed to its end.
+
+        Transforms are read before the images that fill their chunks.
+        """
+        begin = chunk.chunk_start_offset + chunk.chunk_length
+        places: dict[int, list[int]] = {}
+        try:
+            for record in walk(self._file, begin, begin + chunk.message_index_length):
+                places |= [read_message_index(self.content(record))]
+        except (ChunkError, TruncatedError):
+            return None
+        if places.keys() != chunk.message_index_offsets.keys():
+            return None
+        last = max(chain([0], *(places[channel] for channel in places.keys() & wanted)))
+        later = (place for place in chain(*places.values()) if place > last)
+        end = min(later, default=chunk.uncompressed_size)
+        return end if end <= _PART * chunk.uncompressed_size else None
 
     def _channel(self, channel: records.Channel) -> Channel:
         schema = self.summary.schemas.get(channel.schema_id)
