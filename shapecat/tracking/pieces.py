@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Sequence
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -66,7 +66,8 @@ class _Rooms:
     def __init__(self, hits: Hits, members: Sequence[I4]) -> None:
         self._hits, self._members = hits, members
         self._wholes = np.array([_wholes(hits, member) for member in members])
-        self._in_one = cache(self._seen_in_one)
+        # Not of a method: a cycle would keep gigabytes of hits until they are collected.
+        self._in_one = cache(partial(_seen_in_one, hits, members))
 
     def of(self, pairs: I4, owner: I4, duos: I4, which: I4) -> F8:
         """Return (p, 2, 3) the lengths that either track of pairs (p, 2) of detections tells.
@@ -82,17 +83,18 @@ class _Rooms:
             rooms[which == k] = np.maximum(rooms[which == k], self._in_one(*duos[k].tolist()))
         return np.asarray(rooms)
 
-    def _seen_in_one(self, a: int, b: int) -> F8:
-        """Return the largest lengths of the hits of two tracks that are alone in their frames.
 
-        Only while both last; 0 if there are none.
-        """
-        hits, both = self._hits, np.concatenate([self._members[a], self._members[b]])
-        start = max(hits.rows[self._members[k][0]] for k in (a, b))
-        stop = min(hits.rows[self._members[k][-1]] for k in (a, b))
-        rows, at, counts = np.unique(hits.rows[both], return_index=True, return_counts=True)
-        alone = both[at[(counts == 1) & (rows > start) & (rows < stop)]]
-        return np.asarray(_sorted_sides(hits.sizes[alone]).max(axis=0, initial=0))
+def _seen_in_one(hits: Hits, members: Sequence[I4], a: int, b: int) -> F8:
+    """Return the largest lengths of the hits of two tracks that are alone in their frames.
+
+    Only while both last; 0 if there are none.
+    """
+    both = np.concatenate([members[a], members[b]])
+    start = max(hits.rows[members[k][0]] for k in (a, b))
+    stop = min(hits.rows[members[k][-1]] for k in (a, b))
+    rows, at, counts = np.unique(hits.rows[both], return_index=True, return_counts=True)
+    alone = both[at[(counts == 1) & (rows > start) & (rows < stop)]]
+    return np.asarray(_sorted_sides(hits.sizes[alone]).max(axis=0, initial=0))
 
 
 def _where(mask: Bool) -> list[int]:
