@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -58,6 +59,7 @@ def render_colour(world: World, frame: int, camera: ColourCamera = COLOUR) -> tu
     return colours, np.take(np.append(world.labels, np.uint8(0)), owners, mode="wrap")
 
 
+@lru_cache(maxsize=4)  # a recording has one lens
 def _lookup(lens: LensCamera) -> tuple[Camera, I4, I4]:
     """Return a finer pinhole camera, and its pixel that each pixel of the lens sees."""
     camera = lens.pinhole
@@ -71,6 +73,7 @@ def _lookup(lens: LensCamera) -> tuple[Camera, I4, I4]:
     size = np.ceil(high * (fx, fy) + (cx, cy)).astype(int) + 3
     fine = Camera(int(size[0]), int(size[1]), fx, fy, float(cx), float(cy))
     seen = np.rint(rays * (fx, fy) + (cx, cy)).astype(np.int32)
+    seen.flags.writeable = False
     return fine, seen[..., 1], seen[..., 0]
 
 
