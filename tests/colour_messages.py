@@ -10,12 +10,14 @@ from tests.messages import COMPRESSED, IMAGE, header, make
 
 
 def jpeg(colours: Any, quality: int = 95) -> bytes:
+    """Encode colours (h, w, 3) as JPEG."""
     file = io.BytesIO()
     Image.fromarray(colours).save(file, "jpeg", quality=quality, subsampling=0)
     return file.getvalue()
 
 
 def png(colours: Any) -> bytes:
+    """Encode colours (h, w, 3) as PNG."""
     file = io.BytesIO()
     Image.fromarray(colours).save(file, "png")
     return file.getvalue()
@@ -30,6 +32,7 @@ def raw(stamp: int, data: Any, encoding: str, frame_id: str = "camera") -> Any:
 
 
 def packed(stamp: int, body: bytes, kind: str = "jpeg", frame_id: str = "camera") -> Any:
+    """Make a compressed image from its encoded bytes."""
     return make(COMPRESSED, header(stamp, frame_id), kind, np.frombuffer(body, np.uint8))
 
 

@@ -1,5 +1,7 @@
 """What tests share: the command as installed, real data when present, a simulated recording."""
 
+import os
+import shutil
 import signal
 from collections.abc import Callable, Iterator
 from importlib import import_module
@@ -11,19 +13,40 @@ import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from shapecat.system.files import FSYNC
 from tests.browser import Browser
 
+LONGEST = (
+    *(
+        "test_batch",
+        "test_docs_run",
+        "test_report_serve",
+        "test_simulation_physics",
+        "test_stopping",
+    ),
+    *("test_report", "test_review", "test_pipeline", "test_learning_default_model", "test_loop"),
+    *("test_packaging", "test_detection_stacks", "test_tracking_scenes", "test_jit", "test_api"),
+)
+"""Files of tests by the seconds that they take, longest first."""
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 
 
 def pytest_configure() -> None:
-    """Heed interrupts, which a shell ignores for what it runs in the background."""
+    """Heed interrupts, which a shell ignores for what it runs in the background.
+
+    And do not wait for the disk: only `test_run_folder` and the faults look at that.
+    """
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    os.environ.setdefault(FSYNC, "0")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with the file that takes longest: at the end all workers but one would wait for it."""
-    items.sort(key=lambda item: item.path.name != "test_packaging.py")
+    """Begin with the files that take longest: at the end all workers but one would wait for them.
+
+    A worker takes a whole file, for its fixtures.
+    """
+    rank = {name: k for k, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(rank)))
 
 
 @pytest.fixture(scope="session")
@@ -74,11 +97,22 @@ def guessed_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from shapecat.simulation import simulate  # noqa: PLC0415  the same
 
     folder = tmp_path_factory.mktemp("guessed")
-    source = simulate(folder / "table.mcap", frames=12, seed=7)
+    source = simulate(folder / "table.mcap", frames=8, seed=7)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
         shapecat.pipeline.process(Job(source=source, folder=folder / "out" / "table", rrd=False))
     return folder / "out" / "table"
+
+
+@pytest.fixture(scope="session")
+def reported_run(guessed_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return that run with its report. Copy it to change it."""
+    from shapecat.outputs.report import write_reports  # noqa: PLC0415  the same
+
+    folder = tmp_path_factory.mktemp("reported") / "out" / "table"
+    shutil.copytree(guessed_run, folder)
+    write_reports([folder])
+    return folder
 
 
 @pytest.fixture(scope="session")

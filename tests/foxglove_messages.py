@@ -26,6 +26,7 @@ class Field(NamedTuple):
 
 
 def field(name: str, kind: int, message: str = "", *, repeated: bool = False) -> Field:
+    """Return a field, by default one that is not repeated."""
     return Field(name, kind, message, repeated)
 
 
@@ -112,15 +113,18 @@ def _class_of(name: str) -> Any:
 
 
 def time(stamp: int, encoding: str) -> dict[str, int]:
+    """Return a timestamp as an encoding writes it."""
     names = ("seconds", "nanos") if encoding == "protobuf" else ("sec", "nsec")
     return dict(zip(names, divmod(stamp, SECOND), strict=True))
 
 
 def content(data: bytes, encoding: str) -> Any:
+    """Return bytes as an encoding writes them."""
     return data if encoding == "protobuf" else base64.b64encode(data).decode()
 
 
 def write(path: Path, encoding: str, items: list[tuple[str, str, dict[str, Any]]]) -> Path:
+    """Write messages given as topic, type and values."""
     schema_encoding = "protobuf" if encoding == "protobuf" else "jsonschema"
     with path.open("wb") as file:
         writer = Writer(file)

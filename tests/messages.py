@@ -21,21 +21,25 @@ CAMERA = Camera(64, 48, 60.0, 61.0, 31.2, 23.7)
 
 
 def make(kind: str, *values: Any) -> Any:
+    """Make a message of a ROS 2 type from its fields, in order."""
     return STORE.types[kind](*values)
 
 
 def header(stamp: int, frame_id: str = "camera") -> Any:
+    """Make a header with a stamp in nanoseconds."""
     time = make("builtin_interfaces/msg/Time", *divmod(stamp, SECOND))
     return make("std_msgs/msg/Header", time, frame_id)
 
 
 def image(stamp: int, depth: Any, encoding: str = "16UC1", frame_id: str = "camera") -> Any:
+    """Make a raw depth image from (h, w)."""
     h, w = depth.shape
     data = np.frombuffer(np.ascontiguousarray(depth).tobytes(), np.uint8)
     return make(IMAGE, header(stamp, frame_id), h, w, encoding, 0, depth.itemsize * w, data)
 
 
 def info(stamp: int, camera: Camera = CAMERA, d: Iterable[float] = ()) -> Any:
+    """Make the calibration of a pinhole camera, with distortion ``d``."""
     k = np.array([camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1], np.float64)
     p = np.insert(k, (3, 6, 9), 0.0)
     roi = make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)  # a message
@@ -94,6 +98,7 @@ def wavy_depth(camera: Camera = CAMERA) -> Any:
 
 
 def organized_points(depth: Any, camera: Camera = CAMERA) -> Any:
+    """Return the points (h, w, 3) of a depth image in millimetres, metres."""
     frame = Frame("", 0, 0, 0, "", depth=depth / np.float32(1000), camera=camera)
     return frame.xyz().reshape(*depth.shape, 3)
 
@@ -156,5 +161,6 @@ def rvl(values: Any) -> bytes:
 
 
 def compressed(stamp: int, body: bytes, kind: str = "16UC1", ab: Any = (0.0, 0.0)) -> Any:
+    """Make a compressedDepth image; ``ab`` are the parameters of its quantization."""
     data = np.frombuffer(struct.pack("<iff", 0, *ab) + body, np.uint8)
     return make(COMPRESSED, header(stamp), f"{kind}; compressedDepth", data)

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.arrays import F4
+from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.foreground.depth_error import filter_high_pass, measure_noise
 from shapecat.detection.foreground.low_profile import find_low_profile
 from shapecat.detection.foreground.outline import Outline, is_object
@@ -29,21 +30,10 @@ from shapecat.detection.planes.horizontal import find_horizontal_planes
 from shapecat.detection.planes.oriented_points import level_samples, orient_points
 from shapecat.detection.planes.ransac import draw_trials, horizontal_plane
 from shapecat.detection.planes.supporting import supporting_planes
-
-Floats = NDArray[np.float32]
-INTRINSICS = PinholeIntrinsics(262.5, 262.5, 159.5, 119.5)
-UP = np.array([0.0, -np.sqrt(0.5), -np.sqrt(0.5)])
-I, J = np.mgrid[:240, :320]
-ALONG = ((J - 159.5) * UP[0] + (I - 119.5) * UP[1]) / 262.5 + UP[2]
-"""Height of a ray a metre along the optical axis."""
+from tests.level_planes import ALONG, INTRINSICS, UP, I, J, level
 
 
-def level(below_m: float) -> Floats:
-    """Return the inverse depth of a level plane so far below the camera."""
-    return np.asarray(ALONG / -below_m, np.float32)
-
-
-def grid_of(inv_depth: Floats) -> DepthGrid:
+def grid_of(inv_depth: F4) -> DepthGrid:
     return DepthGrid(np.ascontiguousarray(inv_depth, np.float32), INTRINSICS, 2, 0.0035)
 
 

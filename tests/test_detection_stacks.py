@@ -98,7 +98,7 @@ def test_tall_box_with_little_top_is_no_side_of_a_shelf(seed: int, label: int) -
 Scenery = Callable[[np.random.Generator], list[Shape]]
 
 
-def share_found(scenery: Scenery, steps: Steps, least: float, scenes: int = 20) -> float:
+def share_found(scenery: Scenery, steps: Steps, least: float, scenes: int = 10) -> float:
     """Return in which share of made-up scenes each thing on the table is found so well."""
     good = 0
     for seed in range(scenes):

@@ -4,10 +4,9 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from shapecat.detection.cleanup.holes import fill_holes
-from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
+from shapecat.detection.depth_grid import DepthGrid, downsample
 from shapecat.detection.foreground.convex_hull import fill_hull
 from shapecat.detection.merging.pair_features import FEATURES, PAIR_FEATURES
 from shapecat.detection.merging.segments import PAIR, SEGMENT, add_statistics
@@ -24,23 +23,13 @@ from shapecat.detection.planes.ransac import (
 from shapecat.detection.segmentation.connectivity import connect_surfaces
 from shapecat.detection.segmentation.watershed import watershed
 from shapecat.types import Camera
-
-Floats = NDArray[np.float32]
-INTRINSICS = PinholeIntrinsics(262.5, 262.5, 159.5, 119.5)
-UP = np.array([0.0, -np.sqrt(0.5), -np.sqrt(0.5)])
-
-
-def table(distance_m: float = 0.7) -> Floats:
-    """Return the inverse depth of a level plane so far below the camera."""
-    i, j = np.mgrid[:240, :320]
-    x, y = (j - INTRINSICS.cx) / INTRINSICS.fx, (i - INTRINSICS.cy) / INTRINSICS.fy
-    return np.asarray((x * UP[0] + y * UP[1] + UP[2]) / -distance_m, np.float32)
+from tests.level_planes import INTRINSICS, UP, level
 
 
 def test_a_plane_in_noise_is_found() -> None:
     """Half of the samples are anywhere: least squares alone would lie between."""
     rng = np.random.default_rng(0)
-    inv_depth = table()
+    inv_depth = level()
     lost = rng.random(inv_depth.shape) < 0.5
     inv_depth[lost] = rng.uniform(0.5, 3, int(lost.sum()))
     samples = sample_grid(inv_depth, inv_depth)
@@ -67,11 +56,11 @@ def test_the_median_is_that_of_a_sorted_list(size: int) -> None:
 
 def test_heights_of_a_board_with_an_edge() -> None:
     """What is beside the board is not above it, however high."""
-    inv_depth = table()
+    inv_depth = level()
     inv_depth[:, 200:] = 0
     board = inv_depth.copy()
-    inv_depth[100:140, 80:120] = table(0.62)[100:140, 80:120]  # a box of 8 cm
-    inv_depth[100:140, 280:300] = table(0.62)[100:140, 280:300]  # and one in the air beside
+    inv_depth[100:140, 80:120] = level(0.62)[100:140, 80:120]  # a box of 8 cm
+    inv_depth[100:140, 280:300] = level(0.62)[100:140, 280:300]  # and one in the air beside
     trials = draw_trials(np.random.default_rng(0))
     grid = DepthGrid(board, INTRINSICS, 2, 0.0035)
     found, _ = find_supporting_planes(grid, UP, trials, tallest_m=0.5, upright=True)

@@ -18,9 +18,9 @@ from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.perceived import FrameRow, PerceptionTables
 from shapecat.runs.shown import _ended
-from shapecat.runs.tables import TRACKS, write_table
 from shapecat.runs.track_table import read_track_table
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Scene
+from tests.track_tables import write_tracks
 
 HEADER = "track,first_s,category,confidence,label,topic\n"
 QUARTER = np.array([-(0.5**0.5), 0, 0, 0.5**0.5])  # the box stands along -y
@@ -280,17 +280,7 @@ def write_run(folder: Path) -> None:
             seen = Perception("/d", index, index, "cam", scene, found, {})
             tables.write([seen], [FrameRow(0, None)])
     rows = [(1, 0, 0), (1, 1, 0), (1, 2, 0), (2, 0, 1), (3, 1, 1), (3, 2, 1)]
-    columns = {
-        "track": [t for t, _, _ in rows],
-        "topic": ["/d"] * len(rows),
-        "frame": [f for _, f, _ in rows],
-        "stamp_ns": [f for _, f, _ in rows],
-        "detection": [d for _, _, d in rows],
-        "center_fixed": [[0, 0, 0]] * len(rows),
-        "posterior": [[0.5, 0.5]] * len(rows),
-    }
-    full = {name: [None] * len(rows) for name in TRACKS.names if "_full" in name}
-    write_table(folder / "tracks.parquet", full | columns, TRACKS)
+    write_tracks(folder, rows, topic="/d", begin_ns=0)
 
 
 def test_merged_fragments_follow_each_other_as_one_track(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 
-from shapecat.outputs.report import read_reports, write_reports
+from shapecat.outputs.report import read_reports
 from shapecat.outputs.report.serving import serve_reports
 from shapecat.runs.corrections import adopt_labels, read_labels
 from shapecat.runs.track_table import read_track_table
@@ -29,6 +29,7 @@ from tests.browser import Browser
 Run = Callable[..., Result]
 
 NAMES = ("cup", "can", "box", "bottle", "bowl", "plate", "ball")
+TRACKS = 16
 SAVED = (
     "return document.getElementById('saved').textContent === 'All corrections are in tracks.csv.'"
 )
@@ -43,12 +44,12 @@ def run(guessed_run: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def long_run(run: Path) -> Path:
-    """Return a run of fifty tracks: copies of those that were found."""
+    """Return a run of `TRACKS` tracks: copies of those that were found."""
     with (run / "tracks.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     tracks = pq.read_table(run / "tracks.parquet")
     many, tables = [], []
-    for number in range(1, 51):
+    for number in range(1, TRACKS + 1):
         row = rows[number % len(rows)]
         of_track = pa.compute.equal(tracks["track"], int(row["track"]))
         copy = tracks.filter(of_track)
@@ -102,7 +103,7 @@ def other_than(category: str, number: int) -> int:
     return digit if NAMES[digit - 1] != category else 1 + digit % len(NAMES)
 
 
-def test_fifty_corrections_by_keyboard_outlive_the_server(
+def test_corrections_by_keyboard_outlive_the_server(
     browser: Browser, served: Callable[..., Server], long_run: Path
 ) -> None:
     server = served(long_run)
@@ -117,7 +118,7 @@ def test_fifty_corrections_by_keyboard_outlive_the_server(
     os.kill(server.pid, signal.SIGKILL)
     server.wait()
 
-    assert len(wanted) == 50
+    assert len(wanted) == TRACKS
     assert labels_on_disk(long_run) == wanted
     assert browser.complaints() == []
 
@@ -144,11 +145,11 @@ def test_a_page_tells_what_a_killed_server_has_not_written(
     server = served(long_run)
     browser.open(server.address)
     order = order_of(browser)
-    for _ in order[:20]:
+    for _ in order[:9]:
         browser.press("d", "Right")
     os.kill(server.pid, signal.SIGKILL)  # while requests may be on their way
     server.wait()
-    for _ in order[20:25]:
+    for _ in order[9:13]:
         browser.press("d", "Right")
     browser.wait("return document.getElementById('saved').textContent.includes('does not answer')")
     browser.wait("return !document.getElementById('download').hidden")
@@ -159,10 +160,10 @@ def test_a_page_tells_what_a_killed_server_has_not_written(
     table.unlink()
 
     on_disk = labels_on_disk(long_run)
-    missing = [track for track in order[:25] if on_disk[track] != "delete"]
-    assert set(order[20:25]) <= set(missing)
+    missing = [track for track in order[:13] if on_disk[track] != "delete"]
+    assert set(order[9:13]) <= set(missing)
     assert int(said.split()[0]) >= len(missing)
-    assert [track for track, label in downloaded.items() if label] == sorted(order[:25])
+    assert [track for track, label in downloaded.items() if label] == sorted(order[:13])
 
 
 def ask(
@@ -385,9 +386,9 @@ def test_a_port_that_is_taken_is_one_line(shapecat: Run, run: Path) -> None:
     assert shapecat("report", run, "--port", 8000).exit_code == 2
 
 
-def test_keys_undo_move_and_open(browser: Browser, run: Path) -> None:
+def test_keys_undo_move_and_open(browser: Browser, reported_run: Path) -> None:
     """The same keys work in a page from a file."""
-    (page,) = write_reports([run])
+    page = reported_run / "report.html"
     browser.open(page)
     browser.run("localStorage.clear()")  # of another test that has corrected the same tracks
     browser.open(page)

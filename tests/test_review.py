@@ -354,6 +354,7 @@ def test_no_viewer_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     fake.chmod(0o755)
     monkeypatch.setattr(review_viewer, "_viewer", lambda: str(fake))
     monkeypatch.setattr(review_viewer, "_LOAD_S", 1.0)
+    monkeypatch.setattr(review_viewer, "_SETTLE_S", 0.1)
     with pytest.raises(OutputError, match="no answer"):
         review.take_screenshot(fake, tmp_path / "r.png")
     pid = int((tmp_path / "pid").read_text())
@@ -367,8 +368,11 @@ def test_no_viewer_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 @pytest.mark.skipif(
     not any(Path("/usr/share/vulkan").glob("icd.d/*.json")), reason="nothing to draw with"
 )
-def test_a_screenshot_shows_the_scene(recording: Path, tmp_path: Path) -> None:
+def test_a_screenshot_shows_the_scene(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Views that fail to draw, or an eye that looks away, would give an empty picture."""
+    monkeypatch.setattr(review_viewer, "_SETTLE_S", 2.0)  # the greetings may still be there
     png = tmp_path / "r.png"
     review.take_screenshot(recording, png, size=(640, 480), stamp_ns=stamp(0))
     image_module = pytest.importorskip("PIL.Image")

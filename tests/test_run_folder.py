@@ -222,6 +222,7 @@ def test_flushed_before_and_after_it_takes_its_name(
         seen.append((str(Path(f"/proc/self/fd/{number}").readlink()), path.exists()))
 
     monkeypatch.setattr(os, "fsync", fsync)
+    monkeypatch.delenv("SHAPECAT_FSYNC")
     with replacing(path) as hidden:
         hidden.write_text("all")
 

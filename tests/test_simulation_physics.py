@@ -1,6 +1,7 @@
 """Scenes that physics makes: what is hollow stays hollow, and truth tells what bears what."""
 
 import json
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -15,11 +16,18 @@ from shapecat.simulation.mesh import Mesh, lathe, rounded_box
 from shapecat.simulation.physics import Drop, settle
 from shapecat.simulation.scenes import SceneKind
 from shapecat.simulation.shapes import make_object
+from shapecat.simulation.worlds import World
 from shapecat.types import Pose
 
 SETTLED: tuple[SceneKind, ...] = ("pile", "bin", "shelf_bin", "room")
 QUARTER = rotation_from_quaternion([0, 0, np.sin(0.3), np.cos(0.3)])
 """A turn about the vertical that is no symmetry of a box."""
+
+
+@cache
+def settled(kind: SceneKind, seed: int) -> World:
+    """Make a scene once for all tests that look at it; two frames."""
+    return make_scene(kind, np.random.default_rng(seed), frames=2)
 
 
 def table(height: float = 0.7) -> Mesh:
@@ -88,7 +96,7 @@ def test_what_misses_the_table_falls() -> None:
 @pytest.mark.parametrize("kind", SETTLED)
 def test_settled_scenes_are_the_same_again(kind: SceneKind) -> None:
     """Training and judging name their scenes by seeds."""
-    one, other = (make_scene(kind, np.random.default_rng(4), frames=2) for _ in range(2))
+    one, other = settled(kind, 1), make_scene(kind, np.random.default_rng(1), frames=2)
     assert len(one.things) == len(other.things) > 2
     for a, b in zip(one.things, other.things, strict=True):
         assert np.array_equal(a.pose.translation, b.pose.translation)
@@ -96,9 +104,11 @@ def test_settled_scenes_are_the_same_again(kind: SceneKind) -> None:
 
 
 @pytest.mark.parametrize("kind", SETTLED)
-@pytest.mark.parametrize("seed", [1, 2, 3])
+@pytest.mark.parametrize(
+    "seed", [1, *(pytest.param(seed, marks=pytest.mark.many) for seed in (2, 3))]
+)
 def test_things_lie_on_their_support_and_not_in_each_other(kind: SceneKind, seed: int) -> None:
-    world = make_scene(kind, np.random.default_rng(seed), frames=1)
+    world = settled(kind, seed)
     solids = [
         (transform(thing.pose, thing.mesh.vertices), [moved_part(p, thing.pose) for p in parts])
         for thing in world.things
@@ -128,14 +138,14 @@ def world_support(kind: str) -> str:
 def test_tilted_things_are_told_from_straight_ones() -> None:
     """Categories of tilted things are judged apart."""
     tilted = straight = 0
-    for seed in range(4):
-        for thing in make_scene("pile", np.random.default_rng(seed), frames=1).things:
+    for seed in (1, 4):
+        for thing in settled("pile", seed).things:
             upright = np.degrees(np.arccos(np.clip(np.abs(thing.pose.rotation[2]).max(), 0, 1)))
             assert thing.tilted == (upright > 15)
             tilted += thing.tilted
             straight += not thing.tilted
-    assert tilted > 3
-    assert straight > 10
+    assert tilted > 1
+    assert straight > 5
 
 
 def test_truth_of_a_pile_is_written(tmp_path: Path) -> None:
@@ -152,7 +162,7 @@ def test_truth_of_a_pile_is_written(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("kind", SETTLED)
 def test_the_camera_sees_what_was_dropped(kind: SceneKind) -> None:
-    world = make_scene(kind, np.random.default_rng(3), frames=3)
+    world = settled(kind, 1)
     _, labels = render_frame(world, 1, rng=np.random.default_rng(0))
     seen = set(np.unique(labels).tolist())
     assert sum(thing.label in seen for thing in world.things) > 0.5 * len(world.things)

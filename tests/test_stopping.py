@@ -74,8 +74,15 @@ class Command:
         return self.running.returncode, errors
 
 
-@pytest.mark.parametrize("jobs", ["1", "2"])
-@pytest.mark.parametrize(("signum", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("signum", "code", "jobs"),
+    [
+        (signal.SIGINT, 130, "2"),
+        (signal.SIGTERM, 143, "1"),
+        pytest.param(signal.SIGINT, 130, "1", marks=pytest.mark.many),
+        pytest.param(signal.SIGTERM, 143, "2", marks=pytest.mark.many),
+    ],
+)
 def test_a_signal_keeps_what_is_done(
     recording: Path, undisturbed: Path, tmp_path: Path, signum: int, code: int, jobs: str
 ) -> None:

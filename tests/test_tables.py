@@ -19,12 +19,11 @@ from shapecat.runs.tables import (
     DETECTIONS,
     FRAMES,
     PLANES,
-    TRACKS,
     lists,
     read_row_groups,
-    write_table,
 )
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Pose, Scene
+from tests.track_tables import write_tracks
 
 CATEGORIES = ("cup", "can")
 
@@ -60,20 +59,6 @@ def write_run_tables(folder: Path, counts: list[int], pose: Pose | None = None) 
     with PerceptionTables(folder, categories=CATEGORIES, model_id="m1") as tables:
         for index, count in enumerate(counts):
             tables.write([perception(index, count)], [FrameRow(2000 + index, pose)])
-
-
-def write_tracks(folder: Path, rows: list[tuple[int, int, int | None]]) -> None:
-    columns = {
-        "track": [t for t, _, _ in rows],
-        "topic": ["/depth"] * len(rows),
-        "frame": [f for _, f, _ in rows],
-        "stamp_ns": [1000 + f for _, f, _ in rows],
-        "detection": [d for _, _, d in rows],
-        "center_fixed": [[0, 0, 0]] * len(rows),
-        "posterior": [[0.5, 0.5]] * len(rows),
-    }
-    full = {name: [None] * len(rows) for name in TRACKS.names if "_full" in name}
-    write_table(folder / "tracks.parquet", full | columns, TRACKS)
 
 
 def test_columns_are_those_of_the_contract(tmp_path: Path) -> None:

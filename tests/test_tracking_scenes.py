@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -291,6 +292,14 @@ def score(tracks: Sequence[Track], truth: Sequence[Truth], near_m: float = 0.1) 
     return Score(float(idf1), 1 - (faults + switches) / total, switches)
 
 
+@cache
+def recorded(
+    scene: Callable[[int], tuple[list[Thing], Sensor]], seed: int
+) -> tuple[list[FrameDetections], list[Truth]]:
+    """Make a recording once for all settings."""
+    return record(*scene(seed), seed)
+
+
 @pytest.mark.parametrize("association", ["hungarian", "greedy"])
 @pytest.mark.parametrize(
     ("scene", "idf1", "mota", "switches"),
@@ -312,7 +321,7 @@ def test_identities_survive_noise_misses_splits_and_occlusions(
     settings = replace(SETTINGS, association=association)
     scores = []
     for seed in SEEDS:
-        rows, truth = record(*scene(seed), seed)
+        rows, truth = recorded(scene, seed)
         scores.append(score(tuple(track_recording(rows, settings)), truth))
     assert np.mean([s.idf1 for s in scores]) >= idf1
     assert np.mean([s.mota for s in scores]) >= mota

@@ -4,7 +4,7 @@ import json
 import shutil
 import sqlite3
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -36,19 +36,48 @@ class Exhibit(NamedTuple):
     said: str = ""
 
 
+class McapChannels:
+    """Writes serialized ROS messages to an MCAP file; a topic gets its channel when it is met."""
+
+    def __init__(self, writer: Writer, make: MessageFactory, version: int = 2) -> None:
+        self._writer, self._make, self._version = writer, make, version
+        self._known: dict[str, int] = {}
+
+    def write(self, topic: str, kind: str, time: int, data: bytes) -> None:
+        """Write a message."""
+        if topic not in self._known:
+            self._known[topic] = self._register(topic, kind)
+        self._writer.add_message(self._known[topic], time, data, time)
+
+    def _register(self, topic: str, kind: str) -> int:
+        definition = self._make.typestore.generate_msgdef(kind, ros_version=self._version)[0]
+        name, encodings = kind, ("ros2msg", "cdr")
+        if self._version == 1:
+            name, encodings = kind.replace("/msg/", "/"), ("ros1msg", "ros1")
+        schema = self._writer.register_schema(name, encodings[0], definition.encode())
+        channel: int = self._writer.register_channel(topic, encodings[1], schema)
+        return channel
+
+
+def write_all(writer: Any, items: Iterable[tuple[str, str, int, bytes]], types: Any) -> None:
+    """Write serialized messages with a writer of rosbags."""
+    known: dict[str, Any] = {}
+    with writer:
+        for topic, kind, time, data in items:
+            if topic not in known:
+                known[topic] = writer.add_connection(topic, kind, typestore=types)
+            writer.write(known[topic], time, data)
+
+
 def mcap(path: Path, *, finish: bool = True, cut: int = 0, last: Any = (), **options: Any) -> Path:
     """Write the table, and then some bytes that are cut off, with some options of the writer."""
     path /= "a.mcap"
     with path.open("wb") as file:
         writer = Writer(file, **({"chunk_size": 60_000} | options))
         writer.start("ros2", "zoo")
-        channels: dict[str, int] = {}
-        for topic, kind, time, data in [*serialized(stream(FACTORY, FRAMES), FACTORY), *last]:
-            if topic not in channels:
-                text = FACTORY.typestore.generate_msgdef(kind, ros_version=2)[0].encode()
-                schema = writer.register_schema(kind, "ros2msg", text)
-                channels[topic] = writer.register_channel(topic, "cdr", schema)
-            writer.add_message(channels[topic], time, data, time)
+        channels = McapChannels(writer, FACTORY)
+        for item in [*serialized(stream(FACTORY, FRAMES), FACTORY), *last]:
+            channels.write(*item)
         if finish:
             writer.finish()
         else:
@@ -59,16 +88,12 @@ def mcap(path: Path, *, finish: bool = True, cut: int = 0, last: Any = (), **opt
 
 
 def bag(path: Path, compression: Any = None, *, threshold: int = 60_000) -> Path:
+    """Write the table as a ROS 1 bag in chunks of about ``threshold`` bytes."""
     writer = BagWriter(path / "a.bag")
     writer.chunk_threshold = threshold
     if compression is not None:
         writer.set_compression(compression)
-    with writer:
-        known: dict[str, Any] = {}
-        for topic, kind, time, data in serialized(stream(FACTORY1, FRAMES), FACTORY1):
-            if topic not in known:
-                known[topic] = writer.add_connection(topic, kind, typestore=FACTORY1.typestore)
-            writer.write(known[topic], time, data)
+    write_all(writer, serialized(stream(FACTORY1, FRAMES), FACTORY1), FACTORY1.typestore)
     return path / "a.bag"
 
 
@@ -88,33 +113,25 @@ def unsorted_bag(path: Path) -> Path:
     writer = BagWriter(path / "a.bag")
     writer.chunk_threshold = 1
     items = list(serialized(stream(FACTORY1, FRAMES), FACTORY1))
-    with writer:
-        known: dict[str, Any] = {}
-        for topic, kind, time, data in [*items[:1], *items[:0:-1]]:
-            if topic not in known:
-                known[topic] = writer.add_connection(topic, kind, typestore=FACTORY1.typestore)
-            writer.write(known[topic], time, data)
+    write_all(writer, [*items[:1], *items[:0:-1]], FACTORY1.typestore)
     return path / "a.bag"
 
 
 def folder(
     path: Path, plugin: StoragePlugin, mode: CompressionMode | None = None, *, metadata: bool = True
 ) -> Path:
+    """Write the table as a ROS 2 folder."""
     writer = FolderWriter(path / "a", version=9, storage_plugin=plugin)
     if mode is not None:
         writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        known: dict[str, Any] = {}
-        for topic, kind, time, data in serialized(stream(FACTORY, FRAMES), FACTORY):
-            if topic not in known:
-                known[topic] = writer.add_connection(topic, kind, typestore=FACTORY.typestore)
-            writer.write(known[topic], time, data)
+    write_all(writer, serialized(stream(FACTORY, FRAMES), FACTORY), FACTORY.typestore)
     if not metadata:
         (path / "a" / "metadata.yaml").unlink()
     return path / "a"
 
 
 def database(path: Path, *, definitions: bool) -> Path:
+    """Write the database of a ROS 2 folder, without its folder's metadata."""
     found = folder(path, StoragePlugin.SQLITE3) / "a.db3"
     if not definitions:
         base = sqlite3.connect(found)
@@ -143,19 +160,15 @@ def ros1_mcap(path: Path) -> Path:
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start("ros1", "zoo")
-        channels: dict[str, int] = {}
-        for topic, kind, time, data in serialized(stream(FACTORY1, FRAMES), FACTORY1):
-            if topic not in channels:
-                text = FACTORY1.typestore.generate_msgdef(kind, ros_version=1)[0].encode()
-                name = kind.replace("/msg/", "/")
-                schema = writer.register_schema(name, "ros1msg", text)
-                channels[topic] = writer.register_channel(topic, "ros1", schema)
-            writer.add_message(channels[topic], time, data, time)
+        channels = McapChannels(writer, FACTORY1, version=1)
+        for item in serialized(stream(FACTORY1, FRAMES), FACTORY1):
+            channels.write(*item)
         writer.finish()
     return path
 
 
 def plain(path: Path, items: Any) -> Path:
+    """Write messages to a.mcap in a folder."""
     return ros.write(path / "a.mcap", items)
 
 
@@ -166,6 +179,8 @@ def changed(path: Path, change: Callable[[str, Any], Any], *, clouds: bool = Fal
 
 
 def compressed_depth(path: Path, pack: Callable[[Any], bytes]) -> Path:
+    """Write the table with compressed depth images."""
+
     def change(topic: str, message: Any) -> Any:
         if not topic.endswith("image_raw"):
             return message
@@ -179,6 +194,7 @@ def compressed_depth(path: Path, pack: Callable[[Any], bytes]) -> Path:
 
 
 def realsense(path: Path) -> Path:
+    """Write the table as RealSense Viewer records it."""
     sensor = "/device_0/sensor_0"
     camera = views()[0].camera
     items: list[tuple[str, int, Any]] = [
@@ -238,6 +254,8 @@ def hostile_cloud(path: Path) -> Path:
 
 
 def empty_cloud(path: Path) -> Path:
+    """Let the first cloud have no point."""
+
     def change(topic: str, message: Any) -> Any:
         if topic.endswith("points") and message.header.stamp.nanosec == 0:
             message.height, message.width, message.row_step = 1, 0, 0
@@ -263,6 +281,7 @@ def flat_cloud(path: Path) -> Path:
 
 
 def distorted(path: Path, *, strong: bool) -> Path:
+    """Write the table with the calibration of a distorted lens."""
     coefficients = (0.3, -0.2, 0.01, 0.01, 0.0) if strong else (0.001, 0.0, 0.0, 0.0, 0.0)
 
     def change(topic: str, message: Any) -> Any:
@@ -286,15 +305,11 @@ def foreign(path: Path) -> Path:
             writer.register_channel("/no_schema", "cdr", 0),
             writer.register_channel("/tf", "cdr", broken),
         ]
-        known: dict[str, int] = {}
-        for topic, kind, time, data in serialized(stream(FACTORY, FRAMES), FACTORY):
+        own = McapChannels(writer, FACTORY)
+        for item in serialized(stream(FACTORY, FRAMES), FACTORY):
             for channel in channels:
-                writer.add_message(channel, time, b"\x00\x01\x00\x00\xff\xff\xff\xff", time)
-            if topic not in known:
-                text = FACTORY.typestore.generate_msgdef(kind, ros_version=2)[0].encode()
-                schema = writer.register_schema(kind, "ros2msg", text)
-                known[topic] = writer.register_channel(topic, "cdr", schema)
-            writer.add_message(known[topic], time, data, time)
+                writer.add_message(channel, item[2], b"\x00\x01\x00\x00\xff\xff\xff\xff", item[2])
+            own.write(*item)
         writer.finish()
     return found
 
@@ -345,6 +360,7 @@ def bad_frames(path: Path) -> Path:
 
 
 def fox(path: Path, encoding: str) -> Path:
+    """Write the table in messages of Foxglove."""
     items = []
     for k, view in enumerate(back_and_forth(FRAMES)):
         names = [{"name": n, "offset": 4 * j, "type": 7} for j, n in enumerate("xyz")]
@@ -365,16 +381,19 @@ def fox(path: Path, encoding: str) -> Path:
 
 
 def file(path: Path, name: str, content: bytes) -> Path:
+    """Write a file with some content."""
     (path / name).write_bytes(content)
     return path / name
 
 
 def empty_folder(path: Path) -> Path:
+    """Make a folder without a recording."""
     (path / "a").mkdir()
     return path / "a"
 
 
 def text_only(path: Path) -> Path:
+    """Write a recording that holds only text."""
     return plain(path, [("/log", EPOCH, ros.make("std_msgs/msg/String", "hello"))])
 
 

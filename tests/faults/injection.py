@@ -13,6 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from shapecat.system.files import FSYNC
+
 SIGNALS = {
     "interrupt": signal.SIGINT,
     "double": signal.SIGINT,
@@ -73,7 +75,7 @@ class Running:
             errors="replace",
             start_new_session=True,
             preexec_fn=_heed_interrupts,  # noqa: PLW1509  there is no other way
-            env={**os.environ, **(environment or {})},
+            env={**os.environ, FSYNC: "1", **(environment or {})},
         )
         self._reader = threading.Thread(target=self._read, daemon=True)
         self._reader.start()
