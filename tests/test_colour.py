@@ -9,9 +9,10 @@ import pytest
 
 from shapecat.cameras.colour import LensCamera
 from shapecat.cameras.lenses import distort, undistorted_rays
-from shapecat.colour.masks import NOTHING, Mask, dense_masks, labelled_masks, united
-from shapecat.colour.projection import project, splat_depth
+from shapecat.colour.masks import NOTHING, Mask, dense_masks, label_boxes, labelled_masks, united
+from shapecat.colour.projection import project
 from shapecat.colour.snapping import snapped
+from shapecat.colour.splatting import splat_depth
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
 from shapecat.types import Camera, Frame, Pose
 
@@ -141,7 +142,7 @@ def test_masks_of_two_objects_never_share_a_pixel_nor_swallow_the_table() -> Non
     seen[5:15, 5:15], seen[5:15, 17:27] = 1, 2
     seen[9, 10] = seen[10, 20] = 0  # a pixel each
     seen[:, 30:] = -1
-    one, two = labelled_masks(seen, 2)
+    one, two = labelled_masks(seen, label_boxes(seen, 2))
     assert (one.box, two.box) == ((5, 5, 10, 10), (17, 5, 10, 10))
     assert one.area == two.area == 88  # of squares, whose corners are rounded
 
@@ -150,7 +151,7 @@ def test_parts_of_an_object_are_united() -> None:
     """A track that a person merged has one mask."""
     seen = np.zeros((20, 40), np.int32)
     seen[2:6, 3:9], seen[10:13, 20:31] = 1, 2
-    one, two = labelled_masks(seen, 2)
+    one, two = labelled_masks(seen, label_boxes(seen, 2))
     both = united((one, NOTHING, two))
     np.testing.assert_array_equal(both.full(20, 40), one.full(20, 40) | two.full(20, 40))
     assert both.box == (4, 2, 25, 11)

@@ -1,17 +1,16 @@
 """Dense masks of objects on a colour image."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from shapecat.arrays import I4, U4, Bool, Record, array
 from shapecat.cameras.colour import LensCamera
-from shapecat.colour.projection import splat_depth
+from shapecat.colour.splatting import splat_depth
 from shapecat.jit import kernel
 from shapecat.types import Frame, Pose
 
-__all__ = ["NOTHING", "Mask", "dense_masks", "labelled_masks", "united"]
+__all__ = ["NOTHING", "Mask", "dense_masks", "label_boxes", "labelled_masks", "united"]
 
 _NARROW_PX = 4.0
 """Gaps in an object that are not wider, in pixels of the depth image, are closed."""
@@ -85,40 +84,38 @@ def dense_masks(
         labels = np.where(frame.depth > 0, 0, -1).astype(np.int32)
         for number, indices in enumerate(objects, start=1):
             labels.reshape(-1)[indices] = number
-        return labelled_masks(labels, len(objects))
+        return labelled_masks(labels, label_boxes(labels, len(objects)))
     scale = lens.pinhole.fx / frame.camera.fx
-    painted = splat_depth(frame.depth, frame.camera, objects, lens, colour_from_depth)
-    masks = labelled_masks(painted.labels, len(objects), scale)
-    return tuple(
-        replace(mask, left=mask.left + painted.left, top=mask.top + painted.top)
-        if mask.pixels.size
-        else mask
-        for mask in masks
+    left, top, labels, boxes = splat_depth(
+        frame.depth, frame.camera, objects, lens, colour_from_depth
     )
+    return labelled_masks(labels, boxes, scale, corner=(left, top))
 
 
-def labelled_masks(seen: I4, count: int, scale: float = 1.0) -> tuple[Mask, ...]:
+def labelled_masks(
+    seen: I4, boxes: I4, scale: float = 1.0, *, corner: tuple[int, int] = (0, 0)
+) -> tuple[Mask, ...]:
     """Return the dense mask of each label.
 
     Parameters
     ----------
     seen : (h, w) labels from 1, 0 for what is none, -1 where nothing is known.
-    count : of labels.
+    boxes : around each label, of `label_boxes`.
     scale : pixels of the image to a pixel of the depth image.
+    corner : column and row of the image where ``seen`` begins.
     """
-    boxes = np.zeros((count + 1, 4), np.int64)
-    _bounds(seen, boxes)
     narrow, wide = max(1, round(_NARROW_PX * scale)), max(1, round(_WIDE_PX * scale))
     filled = seen.copy()
     for box in boxes[boxes[:, 2] > 0].tolist():
         _fill(seen, tuple(box), narrow, wide, filled)
     reach = max(1, round(_RAGGED_PX * scale / 2))
+    places = boxes.tolist()
     return tuple(
-        _smoothed(filled, label, boxes[label].tolist(), reach) for label in range(1, count + 1)
+        _smoothed(filled, label, places[label], reach, corner) for label in range(1, len(boxes))
     )
 
 
-def _smoothed(filled: I4, label: int, box: list[int], reach: int) -> Mask:
+def _smoothed(filled: I4, label: int, box: list[int], reach: int, corner: tuple[int, int]) -> Mask:
     """Return the pixels around which most others are of the label; no two labels share one."""
     left, top, right, bottom = box
     if right <= left:
@@ -129,6 +126,7 @@ def _smoothed(filled: I4, label: int, box: list[int], reach: int) -> Mask:
     west, north, east, south = _majority(around, label, reach, pixels)
     if east <= west:
         return NOTHING
+    left, top = left + corner[0], top + corner[1]
     return Mask(left + west, top + north, pixels[north:south, west:east])
 
 
@@ -148,20 +146,28 @@ def united(masks: Sequence[Mask]) -> Mask:
 
 
 @kernel
-def _bounds(seen: I4, boxes: I4) -> None:
-    """Find left, top, and one more than right and bottom, of each label."""
+def label_boxes(seen: I4, count: int) -> I4:
+    """Return (count + 1, 4) left, top, and one more than right and bottom, of each label."""
+    boxes = np.zeros((count + 1, 4), np.int64)
     for label in range(boxes.shape[0]):
         boxes[label] = seen.shape[1], seen.shape[0], 0, 0
     for v in range(seen.shape[0]):
-        for u in range(seen.shape[1]):
-            label = seen[v, u]
-            if label > 0:
-                box = boxes[label]
-                box[0], box[1] = min(box[0], u), min(box[1], v)
-                box[2], box[3] = max(box[2], u + 1), max(box[3], v + 1)
+        row, last = seen[v], 0
+        for u in range(row.size):
+            label = row[u]
+            if label != last:  # where a run of pixels begins or ends
+                if last > 0:
+                    boxes[last, 2] = max(boxes[last, 2], u)
+                if label > 0:
+                    box = boxes[label]
+                    box[0], box[1], box[3] = min(box[0], u), min(box[1], v), max(box[3], v + 1)
+                last = label
+        if last > 0:
+            boxes[last, 2] = row.size
     for label in range(boxes.shape[0]):
         if boxes[label, 2] == 0:
             boxes[label] = 0
+    return boxes
 
 
 @kernel
@@ -171,10 +177,14 @@ def _step(label: int, packed: int) -> int:
     It is 4 times the distance, and 1 where a pixel was seen to be of no object; the object is
     in the upper half.
     """
-    if label > 0:
-        return label << 32
-    far = packed + 4
-    return far | 1 if label == 0 else far
+    return label << 16 if label > 0 else (packed + 4) | (label == 0)
+
+
+@kernel
+def _step_row(labels: I4, packed: I4, result: I4) -> None:
+    """Move all pixels of a row on."""
+    for u in range(labels.size):
+        result[u] = _step(labels[u], packed[u])
 
 
 @kernel
@@ -184,49 +194,47 @@ def _fill(seen: I4, region: tuple[int, int, int, int], narrow: int, wide: int, f
     ``region`` is left, top, and one more than right and bottom.
     """
     left, top, right, bottom = region
-    west = np.zeros((bottom - top, right - left), np.int64)
-    north = np.zeros((bottom - top, right - left), np.int64)
-    above = np.zeros(right - left, np.int64)
-    for v in range(top, bottom):
-        packed = 0
-        for u in range(left, right):
-            label = int(seen[v, u])
-            packed = _step(label, packed)
-            above[u - left] = _step(label, above[u - left])
-            west[v - top, u - left], north[v - top, u - left] = packed, above[u - left]
-    below = np.zeros(right - left, np.int64)
-    for v in range(bottom - 1, top - 1, -1):
-        packed = 0
-        for u in range(right - 1, left - 1, -1):
-            label = int(seen[v, u])
-            packed = _step(label, packed)
-            below[u - left] = _step(label, below[u - left])
-            if label <= 0:
-                w, n = west[v - top, u - left], north[v - top, u - left]
-                found = _surrounding(label, w, packed, n, below[u - left], narrow, wide)
+    height, width = bottom - top, right - left
+    west = np.zeros((height, width + 1), np.int32)  # of the pixel before
+    north = np.zeros((height + 1, width), np.int32)  # of the pixel above
+    for v in range(height):
+        row = seen[top + v, left:right]
+        _step_row(row, north[v], north[v + 1])
+        for u in range(width):
+            west[v, u + 1] = _step(row[u], west[v, u])
+    east, south = np.zeros(width + 1, np.int32), np.zeros((2, width), np.int32)
+    for v in range(height - 1, -1, -1):
+        row, below = seen[top + v, left:right], south[v % 2]
+        _step_row(row, south[(v + 1) % 2], below)
+        for u in range(width - 1, -1, -1):
+            label = row[u]
+            east[u] = _step(label, east[u + 1])
+            if label < 0 or (label == 0 and west[v, u + 1] >> 16 == east[u] >> 16):
+                w, n = west[v, u + 1], north[v + 1, u]
+                found = _surrounding(label, w, east[u], n, below[u], narrow, wide)
                 if found > 0:
-                    filled[v, u] = found
+                    filled[top + v, left + u] = found
 
 
 @kernel
 def _surrounding(label: int, w: int, e: int, n: int, s: int, narrow: int, wide: int) -> int:
     """Return the object that a pixel of none belongs to, from what lies in four directions."""
-    across = w >> 32 if w >> 32 == e >> 32 and _gap(w) + _gap(e) <= narrow + 1 else 0
-    along = n >> 32 if n >> 32 == s >> 32 and _gap(n) + _gap(s) <= narrow + 1 else 0
+    across = w >> 16 if w >> 16 == e >> 16 and _gap(w) + _gap(e) <= narrow + 1 else 0
+    along = n >> 16 if n >> 16 == s >> 16 and _gap(n) + _gap(s) <= narrow + 1 else 0
     if label == 0:
         return across if across == along else 0
     if across > 0 or along > 0:
         return across if across > 0 else along
-    found = w >> 32 if w >> 32 == e >> 32 or w >> 32 == n >> 32 else s >> 32
+    found = w >> 16 if w >> 16 == e >> 16 or w >> 16 == n >> 16 else s >> 16
     sides = 0
     for packed in (w, e, n, s):
-        sides += packed >> 32 == found and not packed & 1 and _gap(packed) <= wide
+        sides += packed >> 16 == found and not packed & 1 and _gap(packed) <= wide
     return found if sides >= 3 and found > 0 else -1
 
 
 @kernel
 def _gap(packed: int) -> int:
-    return (packed & 0xFFFFFFFF) >> 2
+    return (packed & 0xFFFF) >> 2
 
 
 @kernel
@@ -237,19 +245,38 @@ def _majority(seen: I4, label: int, reach: int, pixels: Bool) -> tuple[int, int,
     """
     height, width = seen.shape
     west, north, east, south = width, height, 0, 0
-    sums = np.zeros((height + 1, width + 1), np.int32)
-    for v in range(height):
-        row = 0
+    column = np.zeros(width + 2 * reach, np.int32)  # of each column, in the rows around
+    middle = column[reach : reach + width]
+    at = np.arange(width)
+    columns = np.minimum(width, at + reach + 1) - np.maximum(0, at - reach)
+    for v in range(-reach, height):
+        if v + reach < height:
+            _count(seen[v + reach], label, 1, middle)
+        if v > reach:
+            _count(seen[v - reach - 1], label, -1, middle)
+        if v < 0:
+            continue
+        count = np.zeros(width, np.int32)
+        for shift in range(2 * reach + 1):
+            for u in range(width):
+                count[u] += column[u + shift]
+        rows = min(height, v + reach + 1) - max(0, v - reach)
+        row = pixels[v]
         for u in range(width):
-            row += seen[v, u] == label
-            sums[v + 1, u + 1] = sums[v, u + 1] + row
-    for v in range(height):
-        top, bottom = max(0, v - reach), min(height, v + reach + 1)
-        for u in range(width):
-            left, right = max(0, u - reach), min(width, u + reach + 1)
-            count = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left]
-            if 2 * count > (bottom - top) * (right - left):
-                pixels[v, u] = True
-                west, north = min(west, u), min(north, v)
-                east, south = max(east, u + 1), max(south, v + 1)
+            row[u] = 2 * count[u] > rows * columns[u]
+        first, last = 0, width
+        while first < width and not row[first]:
+            first += 1
+        while last > first and not row[last - 1]:
+            last -= 1
+        if last > first:
+            west, east = min(west, first), max(east, last)
+            north, south = min(north, v), v + 1
     return west, north, east, south
+
+
+@kernel
+def _count(row: I4, label: int, one: int, counts: I4) -> None:
+    """Add a number to the counts of the pixels of a label."""
+    for u in range(row.size):
+        counts[u] += one if row[u] == label else 0

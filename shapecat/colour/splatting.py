@@ -1,0 +1,276 @@
+"""What a colour camera sees of a depth image: its pixels splatted, the nearest on top."""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, I4, U4, Bool
+from shapecat.cameras.colour import LensCamera
+from shapecat.colour.projection import Lens, kernel_lens, see
+from shapecat.jit import kernel
+from shapecat.types import Camera, Pose
+
+__all__ = ["Painted", "splat_depth"]
+
+_FOOTPRINT_PX = 0.05
+"""A depth pixel covers so much more of the colour image on each side, to leave no gaps."""
+_HIDDEN = 0.02
+"""An object is hidden where something else is nearer by more than this share of its distance."""
+_SPARSE = 4
+"""Of what is of no object, every so-many-th row and column is looked at."""
+_BESIDE_PX = 30
+"""Depth pixels so far from labelled ones are looked at, for what lies beside and between them."""
+
+
+class Painted(NamedTuple):
+    """A part of an image as the colour camera sees it, from row ``top`` and column ``left`` on.
+
+    ``labels`` (h, w) int32 is what is seen, -1 where nothing is known. Row ``k`` of ``boxes``
+    (n + 1, 4) is left, top, and one more than right and bottom, in this part, of what is painted of
+    label ``k``, also where something hides it; 0 where nothing is. Outside of the boxes no pixel
+    is known to be of no object.
+    """
+
+    left: int
+    top: int
+    labels: I4
+    boxes: I4
+
+
+def splat_depth(
+    depth: F4, camera: Camera, objects: Sequence[U4], lens: LensCamera, colour_from_depth: Pose
+) -> Painted:
+    """Paint the objects of a depth image as a colour camera sees them.
+
+    Each depth pixel of an object covers a square on the colour image, as large as its own, and a
+    little more; where several cover a pixel, the nearest shows. The other pixels are painted
+    coarsely: they matter by what they hide, and by the gaps that are none.
+
+    Parameters
+    ----------
+    depth : (h, w) metres, 0 where there is no reading.
+    objects : indices of the pixels of each object.
+
+    Notes
+    -----
+    O(pixels of the objects and what they cover; a few around them).
+    """
+    target = lens.pinhole
+    scale = max(target.fx / camera.fx, target.fy / camera.fy)
+    pixels = np.concatenate([np.zeros(0, np.uint32), *objects])
+    labels = np.repeat(np.arange(1, len(objects) + 1, dtype=np.int32), list(map(len, objects)))
+    rays, size = _rays(camera, colour_from_depth), (target.width, target.height)
+    parallax = max(camera.fx, camera.fy) * float(np.linalg.norm(colour_from_depth.translation))
+    boxes = np.zeros((len(objects) + 1, 4), np.int64)
+    left, top, seen = _splat(
+        depth, pixels, labels, rays, parallax, kernel_lens(lens), scale, size, boxes
+    )
+    return Painted(left, top, seen, boxes)
+
+
+def _rays(camera: Camera, colour_from_depth: Pose) -> tuple[F4, F4, F4]:
+    """Return what column and row (3, n) give to a ray that is turned, and the shift (3,)."""
+    x = (np.arange(camera.width) - camera.cx) / camera.fx
+    y = (np.arange(camera.height) - camera.cy) / camera.fy
+    turn = colour_from_depth.rotation
+    by_column, by_row = np.outer(turn[:, 0], x), np.outer(turn[:, 1], y) + turn[:, 2:]
+    return (
+        by_column.astype(np.float32),
+        by_row.astype(np.float32),
+        colour_from_depth.translation.astype(np.float32),
+    )
+
+
+@kernel
+def _splat(
+    depth: F4,
+    pixels: U4,
+    labels: I4,
+    rays: tuple[F4, F4, F4],
+    parallax: float,
+    lens: Lens,
+    scale: float,
+    size: tuple[int, int],
+    boxes: I4,
+) -> tuple[int, int, I4]:
+    """Return left, top and labels of the part of an image of a size where pixels land.
+
+    ``parallax`` is in pixels per inverse distance; ``scale`` pixels of the image to one of the
+    depth image, at equal distance. ``boxes`` become those of `Painted`.
+    """
+    beside = _list_beside(depth, pixels, parallax)
+    place, around = _see_pixels(depth, pixels, rays, lens), _see_pixels(depth, beside, rays, lens)
+    squares = _land(place, labels, np.float32(scale / 2), size, boxes)
+    left, top, right, bottom = _window(boxes, int(_BESIDE_PX * scale), size)
+    seen = np.full((bottom - top, right - left), np.int32(-1))
+    nearest = np.zeros(seen.shape, np.float32)
+    _paint(squares, labels, place[2], (left, top), nearest, seen)
+    cell = max(2, int(_SPARSE * scale + 0.5))
+    _hide(_front(around, (left, top), cell, seen.shape), cell, boxes, nearest, seen)
+    return left, top, seen
+
+
+@kernel
+def _list_beside(depth: F4, pixels: U4, parallax: float) -> U4:
+    """Return the sparse pixels of no object that may hide those of objects, or lie beside them.
+
+    Between a near and a far pixel that one camera sees in the same place, the other sees the
+    parallax: focal length by distance of the cameras by difference of the inverse depths.
+    """
+    rows, columns = (depth.shape[0] - 1) // _SPARSE + 1, (depth.shape[1] - 1) // _SPARSE + 1
+    own = np.zeros((rows, columns), np.bool_)
+    top, bottom, left, right, near, far = _extent(depth, pixels, own)
+    found, count = np.zeros(own.size, np.uint32), 0
+    if not near < np.inf or bottom < top:
+        return found[:0]
+    margin = int(parallax * max(0.0, 1 / near - 1 / far)) + _BESIDE_PX
+    first, last = max(0, left - margin) // _SPARSE, (right + margin) // _SPARSE
+    for j in range(max(0, top - margin) // _SPARSE, min((bottom + margin) // _SPARSE + 1, rows)):
+        for i in range(first, min(last + 1, columns)):
+            if depth[j * _SPARSE, i * _SPARSE] > 0 and not own[j, i]:
+                found[count] = (j * depth.shape[1] + i) * _SPARSE
+                count += 1
+    return found[:count]
+
+
+@kernel
+def _row_and_column(pixel: int, row: int, width: int) -> tuple[int, int]:
+    """Return where the pixel of an index lies; it is quick in the row of the pixel before."""
+    column = pixel - row * width
+    if not 0 <= column < width:
+        row = pixel // width
+        column = pixel - row * width
+    return row, column
+
+
+@kernel
+def _extent(depth: F4, pixels: U4, own: Bool) -> tuple[int, int, int, int, float, float]:
+    """Return first and last row and column of some pixels, the least depth of all, their greatest.
+
+    ``own`` becomes which of the sparse pixels are theirs.
+    """
+    top, bottom, left, right = depth.shape[0], -1, depth.shape[1], -1
+    near, far = np.float32(np.inf), np.float32(0)
+    v, width = 0, depth.shape[1]
+    for pixel in pixels:
+        v, u = _row_and_column(pixel, v, width)
+        z = depth[v, u]
+        if z > 0:
+            far = max(far, z)
+            top, bottom, left, right = min(top, v), max(bottom, v), min(left, u), max(right, u)
+            if (v | u) % _SPARSE == 0:  # a power of 2: of both
+                own[v // _SPARSE, u // _SPARSE] = True
+    for j in range(own.shape[0]):
+        for i in range(own.shape[1]):
+            z = depth[j * _SPARSE, i * _SPARSE]
+            if z > 0:
+                near = min(near, z)
+    return top, bottom, left, right, float(near), float(far)
+
+
+@kernel
+def _see_pixels(depth: F4, pixels: U4, rays: tuple[F4, F4, F4], lens: Lens) -> F4:
+    """Return where a camera sees pixels: (4, n) column, row, inverse distance, and their depth."""
+    by_column, by_row, shift = rays
+    moved = np.zeros((4, pixels.size), np.float32)
+    v, width = 0, depth.shape[1]
+    for i in range(pixels.size):
+        v, u = _row_and_column(pixels[i], v, width)
+        z = depth[v, u]
+        for k in range(3):
+            moved[k, i] = (by_column[k, u] + by_row[k, v]) * z + shift[k]
+        moved[3, i] = z
+        if not z > 0:
+            moved[2, i] = -1
+    numbers, kind, d, reach = lens
+    see(moved[0], moved[1], moved[2], numbers, kind, d, reach)
+    return moved
+
+
+@kernel
+def _land(place: F4, labels: I4, half: float, size: tuple[int, int], boxes: I4) -> I4:
+    """Return the pixels whose middle lies in the square that a pixel of the depth image covers.
+
+    They are (n, 4) left, top, and one more than right and bottom; ``boxes`` become those around
+    the squares of each label. A pixel lands at (4, n) column, row, inverse distance, and has a
+    depth; ``half`` is half the pixels of the image to one of the depth image, at equal distance.
+    """
+    nought, one = np.float32(0), np.float32(1)
+    width, height = np.float32(size[0]), np.float32(size[1])
+    squares = np.zeros((labels.size, 4), np.int32)
+    boxes[:, 0], boxes[:, 1] = size
+    for i in range(labels.size):
+        x, y, near = place[0, i], place[1, i], place[2, i]
+        reach = half * place[3, i] * near + np.float32(_FOOTPRINT_PX)
+        # A cast to int rounds towards 0.
+        left, right = int(max(x - reach + one, nought)), int(min(x + reach + one, width))
+        top, bottom = int(max(y - reach + one, nought)), int(min(y + reach + one, height))
+        if near > nought and left < right and top < bottom:
+            square, box = squares[i], boxes[labels[i]]
+            square[0], square[1], square[2], square[3] = left, top, right, bottom
+            box[0], box[1] = min(box[0], left), min(box[1], top)
+            box[2], box[3] = max(box[2], right), max(box[3], bottom)
+    return squares
+
+
+@kernel
+def _window(boxes: I4, margin: int, size: tuple[int, int]) -> tuple[int, int, int, int]:
+    """Return the window around boxes, which then tell of places in it; empty boxes become 0."""
+    left, top, right, bottom = size[0], size[1], 0, 0
+    for box in boxes:
+        if box[2] > 0:
+            left, top = min(left, box[0]), min(top, box[1])
+            right, bottom = max(right, box[2]), max(bottom, box[3])
+    if right == 0:
+        boxes[:] = 0
+        return 0, 0, 0, 0
+    left, top = max(left - margin, 0), max(top - margin, 0)
+    for box in boxes:
+        painted = box[2] > 0
+        for k in range(4):
+            box[k] = box[k] - (left, top)[k % 2] if painted else 0
+    return left, top, min(right + margin, size[0]), min(bottom + margin, size[1])
+
+
+@kernel
+def _paint(
+    squares: I4, labels: I4, near: F4, corner: tuple[int, int], nearest: F4, seen: I4
+) -> None:
+    """Paint the labels of squares into a window from ``corner`` on, where they are the nearest."""
+    left, top = corner
+    for i in range(labels.size):
+        for v in range(squares[i, 1] - top, squares[i, 3] - top):
+            for u in range(squares[i, 0] - left, squares[i, 2] - left):
+                if near[i] > nearest[v, u]:
+                    nearest[v, u] = near[i]
+                    seen[v, u] = labels[i]
+
+
+@kernel
+def _front(around: F4, corner: tuple[int, int], cell: int, shape: tuple[int, int]) -> F4:
+    """Return the greatest inverse distance of points in each cell of a window."""
+    height, width = np.float32(shape[0]), np.float32(shape[1])
+    left, top, per_cell = np.float32(corner[0]), np.float32(corner[1]), np.float32(1 / cell)
+    front = np.zeros((shape[0] // cell + 1, shape[1] // cell + 1), np.float32)
+    for i in range(around.shape[1]):
+        near, column, row = around[2, i], around[0, i] - left, around[1, i] - top
+        if near > 0 and 0 <= column < width and 0 <= row < height:
+            y, x = int(row * per_cell), int(column * per_cell)
+            front[y, x] = max(front[y, x], near)
+    return front
+
+
+@kernel
+def _hide(front: F4, cell: int, boxes: I4, nearest: F4, seen: I4) -> None:
+    """Give pixels in boxes no label where the front of their cell is nearer than they are."""
+    limit, share = np.zeros(seen.shape[1], np.float32), np.float32(1 - _HIDDEN)
+    for k in range(boxes.shape[0]):
+        left, top, right, bottom = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3]
+        for v in range(top, bottom):
+            if v == top or v % cell == 0:
+                for x in range(left // cell, (right - 1) // cell + 1):
+                    limit[x * cell : (x + 1) * cell] = front[v // cell, x] * share
+            labels, own = seen[v], nearest[v]
+            for u in range(left, right):
+                labels[u] = 0 if limit[u] > own[u] else labels[u]
