@@ -4,12 +4,14 @@ import signal
 from importlib import import_module
 from typing import Any
 
+from shapecat.system.garbage import collect_seldom
 from shapecat.system.stopping import leave
 
 
 def run() -> None:
     """Run the command line; a signal that comes before it listens ends the process."""
     _handle(leave)
+    collect_seldom()
     try:
         # By name: type checkers see this package as the top-level folder cli.
         import_module("shapecat.cli.main").main(prog_name="shapecat")

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 
 from shapecat.executors.cores import limited_threads
 from shapecat.system import stopping
+from shapecat.system.garbage import collect_seldom
 
 __all__ = ["Task", "Worker", "WorkerLostError"]
 
@@ -144,6 +145,7 @@ def _serve(connection: socket.socket, asked: Connection) -> None:
 
     Threads receive the next call and send the last answer while this one is worked on.
     """
+    collect_seldom()
     threading.Thread(target=_watch_parent, args=(asked,), daemon=True).start()
     calls: SimpleQueue[Any] = SimpleQueue()
     answers: SimpleQueue[Any] = SimpleQueue()
