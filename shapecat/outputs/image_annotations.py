@@ -172,7 +172,7 @@ def _detections(ros: RosMessages, frame: ImageFrame) -> Any:
     for one in frame.boxes:
         left, top, width, height = (float(value) for value in one.box)
         hypothesis = ros.make("ObjectHypothesis", one.category, float(one.confidence))
-        result = ros.make("ObjectHypothesisWithPose", hypothesis, ros.no_pose())
+        result = ros.make("ObjectHypothesisWithPose", hypothesis, ros.no_pose)
         middle = ros.make("Point2D", left + width / 2, top + height / 2)
         bounds = ros.make("BoundingBox2D", ros.make("Pose2D", middle, 0.0), width, height)
         found.append(ros.make("Detection2D", header, [result], bounds, str(one.track)))
@@ -182,13 +182,13 @@ def _detections(ros: RosMessages, frame: ImageFrame) -> Any:
 def _drawn(ros: RosMessages, frame: ImageFrame) -> Any:
     """Make a foxglove_msgs/ImageAnnotations."""
     time = ros.make("Header", frame).stamp
-    points, texts = [], []
+    points, texts, white = [], [], ros.make("Color", 1.0, 1.0, 1.0, 1.0)
     for box in frame.boxes:
-        tone = [part / 255 for part in colour_of(box.category)]
-        line, fill, behind = (ros.make("Color", *tone, alpha) for alpha in (1.0, 0.15, 0.7))
+        line, fill, behind = (
+            ros.colour("Color", box.category, alpha) for alpha in (1.0, 0.15, 0.7)
+        )
         corners = [ros.make("Point2", x, y) for x, y in box.corners]
         points.append(ros.make("PointsAnnotation", time, _LINE_LOOP, corners, line, [], fill, 2.0))
-        white = ros.make("Color", 1.0, 1.0, 1.0, 1.0)
         written = (corners[0], box.text, _font_size(box), white, behind)
         texts.append(ros.make("TextAnnotation", time, *written))
     return ros.make("ImageAnnotations", [], points, texts)

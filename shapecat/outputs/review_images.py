@@ -24,6 +24,7 @@ __all__ = ["Images", "Picture", "as_file", "picture_of"]
 _QUALITY = 85
 _OPACITY = 110
 _COLOURS = 16
+_BYTES_PER_NUMBER = 4
 
 
 def as_file(image: ColourImage) -> tuple[bytes, str]:
@@ -104,6 +105,10 @@ def _pack(pixels: Bool, left: int, top: int, number: int, packed: U1) -> None:
                 packed[top + v, at] = packed[top + v, at] & (0xF0 >> shift) | (number << shift)
 
 
+_Boxes = tuple[F4, list[tuple[int, int, int]], list[str]]
+"""Boxes (n, 4) on an image, their colours and their captions."""
+
+
 class Images:
     """Writes the colour images of the frames. ``entities`` are those met, with their titles."""
 
@@ -119,53 +124,48 @@ class Images:
             self.entities[entity] = picture.topic
             for name, style in _STYLES.items():
                 self._stream.log(f"{entity}/{name}", style, static=True)
-        for name, draw in _DRAWINGS.items():
-            size = len(picture.contents) + len(picture.masks)  # every row keeps all of it
-            self._columns.add(f"{entity}{name}", at, picture, draw, size=size)
+        files = {"": (picture.contents, picture.media_type), "/masks": (picture.masks, "image/png")}
+        for name, file in files.items():
+            size = len(file[0]) // _BYTES_PER_NUMBER
+            self._columns.add(f"{entity}{name}", at, file, _files, size=size)
+        tones = [colour_of(item.category) for item in picture.objects]
+        boxes = (picture.boxes, tones, [short_label(item) for item in picture.objects])
+        for name, draw in (("boxes", _boxes), ("captions", _captions)):
+            self._columns.add(f"{entity}/{name}", at, boxes, draw, size=len(picture.boxes))
 
 
 _STYLES = {
-    "masks": rr.EncodedImage.from_fields(media_type="image/png", draw_order=1.0),
+    "masks": rr.EncodedImage.from_fields(draw_order=1.0),
     "boxes": rr.Boxes2D.from_fields(draw_order=2.0),
     "captions": rr.Points2D.from_fields(radii=0.5, show_labels=True, draw_order=3.0),
 }
 
 
-def _files(pictures: Sequence[Picture]) -> Iterable[rr.ComponentColumn]:
-    yield from rr.EncodedImage.columns(
-        blob=[picture.contents for picture in pictures],
-        media_type=[picture.media_type for picture in pictures],
-    )
+def _files(rows: Sequence[tuple[bytes, str]]) -> Iterable[rr.ComponentColumn]:
+    contents, kinds = zip(*rows, strict=True)
+    yield from rr.EncodedImage.columns(blob=contents, media_type=kinds)
 
 
-def _masks(pictures: Sequence[Picture]) -> Iterable[rr.ComponentColumn]:
-    yield from rr.EncodedImage.columns(blob=[picture.masks for picture in pictures])
-
-
-def _boxes(pictures: Sequence[Picture]) -> Iterable[rr.ComponentColumn]:
-    boxes, colours, counts = _objects_of(pictures)
+def _boxes(rows: Sequence[_Boxes]) -> Iterable[rr.ComponentColumn]:
+    boxes, colours, counts = _joined(rows)
     half = boxes[:, 2:] / 2
     columns = rr.Boxes2D.columns(centers=boxes[:, :2] + half, half_sizes=half, colors=colours)
     yield from columns.partition(counts)
 
 
-def _captions(pictures: Sequence[Picture]) -> Iterable[rr.ComponentColumn]:
-    boxes, colours, counts = _objects_of(pictures)
+def _captions(rows: Sequence[_Boxes]) -> Iterable[rr.ComponentColumn]:
+    boxes, colours, counts = _joined(rows)
     columns = rr.Points2D.columns(
         positions=boxes[:, :2] + boxes[:, 2:] * np.array((0.5, 0), np.float32),
         colors=127 + colours // 2,
-        labels=[short_label(item) for picture in pictures for item in picture.objects],
+        labels=[text for _, _, texts in rows for text in texts],
     )
     yield from columns.partition(counts)
 
 
-def _objects_of(pictures: Sequence[Picture]) -> tuple[F4, U1, list[int]]:
-    """Return the boxes and colours of the objects of all pictures, and how many each has."""
-    tones = [colour_of(item.category) for picture in pictures for item in picture.objects]
-    boxes = np.concatenate([picture.boxes for picture in pictures])
-    counts = [len(picture.objects) for picture in pictures]
+def _joined(rows: Sequence[_Boxes]) -> tuple[F4, U1, list[int]]:
+    """Return the boxes and colours of the objects of all images, and how many each has."""
+    tones = [tone for _, tones, _ in rows for tone in tones]
+    boxes = np.concatenate([boxes for boxes, _, _ in rows])
+    counts = [len(texts) for _, _, texts in rows]
     return boxes, np.array(tones, np.uint8).reshape(-1, 3), counts
-
-
-_DRAWINGS = {"": _files, "/masks": _masks, "/boxes": _boxes, "/captions": _captions}
-"""What each entity below that of the image shows of some pictures."""

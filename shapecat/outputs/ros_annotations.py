@@ -40,6 +40,9 @@ class RosMessages:
         self._no_covariance = np.zeros(36)
         self._no_bytes = np.zeros(0, np.uint8)
         self._upright = self._types["Quaternion"](0.0, 0.0, 0.0, 1.0)
+        self._nowhere = self._types["Pose"](self._types["Point"](0.0, 0.0, 0.0), self._upright)
+        self.no_pose = self._types["PoseWithCovariance"](self._nowhere, self._no_covariance)
+        self._colours: dict[tuple[str, str, float], Any] = {}
         self.detections = ArrayMessage("vision_msgs/msg/Detection3DArray", self._detections)
         self.scene = ArrayMessage("foxglove_msgs/msg/SceneUpdate", self._scene)
         self.markers = ArrayMessage("visualization_msgs/msg/MarkerArray", self._markers)
@@ -54,10 +57,13 @@ class RosMessages:
             return self._header(*values)
         return self._types[kind](*values)
 
-    def no_pose(self) -> Any:
-        """Return an identity pose."""
-        pose = self._types["Pose"](self._types["Point"](0.0, 0.0, 0.0), self._upright)
-        return self._types["PoseWithCovariance"](pose, self._no_covariance)
+    def colour(self, kind: str, category: str, alpha: float) -> Any:
+        """Return the colour of a category as a ``Color`` or ``ColorRGBA``: always the same one."""
+        key = kind, category, alpha
+        if key not in self._colours:
+            tone = (part / 255 for part in colour_of(category))
+            self._colours[key] = self._types[kind](*tone, alpha)
+        return self._colours[key]
 
     def serialize(self, message: Any, name: str) -> bytes:
         """Encode a message."""
@@ -88,7 +94,9 @@ class RosMessages:
 
     def _entity(self, annotation: Annotation, box: ShownBox) -> Any:
         t, frame = self._types, annotation.frame
-        cube = t["CubePrimitive"](self._pose(box), self._size(box), self._colour("Color", box, 0.5))
+        cube = t["CubePrimitive"](
+            self._pose(box), self._size(box), self.colour("Color", box.category, 0.5)
+        )
         return t["SceneEntity"](
             self._time(frame.stamp_ns),
             frame.frame_id,
@@ -104,7 +112,7 @@ class RosMessages:
         )
 
     def _text(self, box: ShownBox) -> Any:
-        pose, colour = self._text_pose(box), self._colour("Color", box, 1.0)
+        pose, colour = self._text_pose(box), self.colour("Color", box.category, 1.0)
         return self._types["TextPrimitive"](pose, True, 0.03, False, colour, text(box))  # noqa: FBT003  # the order of the definition
 
     def _markers(self, annotation: Annotation) -> Any:
@@ -123,12 +131,12 @@ class RosMessages:
 
     def _cube_marker(self, annotation: Annotation, box: ShownBox) -> Any:
         given = {"pose": self._pose(box), "scale": self._size(box)}
-        colour = self._colour("ColorRGBA", box, 0.5)
+        colour = self.colour("ColorRGBA", box.category, 0.5)
         return self._marker(annotation, "box", box.track, color=colour, **given)
 
     def _text_marker(self, annotation: Annotation, box: ShownBox) -> Any:
         given = {"pose": self._text_pose(box), "scale": self._types["Vector3"](0.0, 0.0, 0.03)}
-        colour = self._colour("ColorRGBA", box, 1.0)
+        colour = self.colour("ColorRGBA", box.category, 1.0)
         return self._marker(annotation, "text", box.track, color=colour, text=text(box), **given)
 
     def _marker(self, annotation: Annotation, kind: str, number: int, **given: Any) -> Any:
@@ -139,7 +147,7 @@ class RosMessages:
             "id": number,
             "type": 1 if kind == "box" else 9,
             "action": 0,
-            "pose": t["Pose"](t["Point"](0.0, 0.0, 0.0), self._upright),
+            "pose": self._nowhere,
             "scale": t["Vector3"](0.0, 0.0, 0.0),
             "color": t["ColorRGBA"](0.0, 0.0, 0.0, 0.0),
             "lifetime": self._duration(annotation.lifetime_ns),
@@ -177,9 +185,6 @@ class RosMessages:
 
     def _size(self, box: ShownBox) -> Any:
         return self._types["Vector3"](*box.size)
-
-    def _colour(self, kind: str, box: ShownBox, alpha: float) -> Any:
-        return self._types[kind](*(part / 255 for part in colour_of(box.category)), alpha)
 
 
 @cache

@@ -166,7 +166,9 @@ def read_row_groups(
     with opened(path) as file:
         count = file.num_row_groups
         for first in range(0, count, at_once):
-            yield file.read_row_groups(range(first, min(first + at_once, count)), columns=columns)
+            yield file.read_row_groups(
+                range(first, min(first + at_once, count)), columns=columns, use_threads=False
+            )
 
 
 def frame_rows(table: pa.Table) -> dict[Key, slice]:
