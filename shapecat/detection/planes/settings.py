@@ -88,11 +88,15 @@ class StripSettings(NamedTuple):
     """Slope of a ray, down over forward, below which the surface of a cell is no larger."""
     below: int = 10
     """Bins below a plane in which there is next to nothing."""
+    above: int = 30
+    """Bins above a covered plane in which the tops of the things on it lie."""
+    covers: float = 1.0
+    """Tops of things that cover a plane show so many times its surface."""
     contrast: float = 2.0
     """A plane has so many times the surface of what is below."""
     dip: float = 0.6
     """Above a plane the surface falls to this share of its own."""
-    least_m2: float = 0.002
+    least_m2: float = 0.001
     """What is seen of a covered plane at least."""
     least_points: int = 15
     """Of every third sample, at a height that may be that of strips."""

@@ -5,8 +5,6 @@ board just below the camera that fills a few rows of the image. By height the sa
 within millimetres, so where the up direction is known, height alone is left to be found.
 """
 
-from functools import partial
-
 import numpy as np
 
 from shapecat.arrays import F4, F8, Bool
@@ -38,21 +36,19 @@ BINS = 600
 def may_have_strips(grid: DepthGrid, points: OrientedPoints, found: list[PlaneCandidate]) -> bool:
     """Whether many points lie at a height where strips of a plane may be, with few below it."""
     count = _count_by_height(points, found[0].plane.up)
-    return any(_may_be_strips(grid, found, peak) for peak in _peaks(count, STRIPS.least_points))
+    return any(_may_be_strips(grid, found, *peak) for peak in _peaks(count, STRIPS.least_points))
 
 
-def _may_be_strips(grid: DepthGrid, found: list[PlaneCandidate], height: float) -> bool:
+def _may_be_strips(
+    grid: DepthGrid, found: list[PlaneCandidate], height: float, above: float
+) -> bool:
     """Whether a board at a height is seen at a grazing angle, or covered by what has tops above."""
     large = [one.plane.offset for one in found if one.plane.area_m2 > PLANES.likely_m2]
     up = found[0].plane.up
     if height > up[1] / (grid.intrinsics.fy * STRIPS.grazing):
         return all(abs(offset - height) > STRIPS.same_m for offset in large)
     below = any(-STRIPS.same_m < height - offset < PLANES.borne_m for offset in large)
-    return not below and _is_under_one(found, height)
-
-
-def _is_under_one(found: list[PlaneCandidate], height: float) -> bool:
-    return any(STRIPS.same_m < one.plane.offset - height < STRIPS.tallest_m for one in found)
+    return above > STRIPS.covers and not below
 
 
 def add_strip_planes(grid: DepthGrid, found: list[PlaneCandidate]) -> list[PlaneCandidate]:
@@ -68,10 +64,12 @@ def add_strip_planes(grid: DepthGrid, found: list[PlaneCandidate]) -> list[Plane
     up = max(found, key=lambda one: one.plane.area_m2).plane.up
     strips, area = _level_strips(grid.inverse_depth, grid.intrinsics, up)
     planes = list(found)
-    for height in filter(partial(_may_be_strips, grid, found), _peaks(area, STRIPS.least_m2)):
+    for height, above in _peaks(area, STRIPS.least_m2):
+        if not _may_be_strips(grid, found, height, above):
+            continue
         new = _plane_at(grid, strips, up, height)
         same = [k for k in planes if abs(k.plane.offset - new.plane.offset) < STRIPS.same_m]
-        if _is_under_one(found, height):
+        if above > STRIPS.covers:
             new = _covered(new, strips, grid.intrinsics)
         if new.covered_m2 > 0:
             new = _widened(same[0], new) if same else new
@@ -121,14 +119,16 @@ def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane
 
 @kernel
 def _peaks(amount: F8, least: float) -> F8:
-    """Return the heights (n,), ascending, of level surface with next to nothing below.
+    """Return (n, 2) heights, ascending, of level surface with next to nothing below it.
+
+    Beside each stands how many times as much surface there is just above: tops of what covers it.
 
     Parameters
     ----------
     amount : (BINS,) of surface by height, the lowest first.
     least : of a peak, with the bins beside it.
     """
-    peaks, n, bins = np.zeros(BINS), 0, STRIPS.below - 2
+    peaks, n, bins = np.zeros((BINS, 2)), 0, STRIPS.below - 2
     for k in range(STRIPS.below, BINS - 3):
         here, own = amount[k], amount[k - 1] + amount[k] + amount[k + 1]
         if own <= least or here < amount[k - 1] or here < amount[k + 1]:
@@ -138,20 +138,24 @@ def _peaks(amount: F8, least: float) -> F8:
             lower += 3 * amount[m] / bins
         falls = min(amount[k + 1], amount[k + 2], amount[k + 3]) < STRIPS.dip * here
         if falls and own > STRIPS.contrast * lower:
-            peaks[n] = (k + 0.5 - BINS) * STRIPS.bin_m
+            upper = amount[k + 3 : k + STRIPS.above].sum()
+            peaks[n] = (k + 0.5 - BINS) * STRIPS.bin_m, upper / own
             n += 1
     return peaks[:n]
 
 
 @kernel
 def _count_by_height(points: OrientedPoints, up: F8) -> F8:
-    """Count the points (BINS,) by height, the lowest first."""
+    """Count the points (BINS,) by height, the lowest first, but those that face aside."""
     x, y, z = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])
     xs, ys, zs = points.positions[0], points.positions[1], points.positions[2]
+    nx, ny, nz = points.normals[0], points.normals[1], points.normals[2]
     count, scale = np.zeros(BINS), np.float32(-1 / STRIPS.bin_m)
     for k in range(xs.size):
         below = scale * (x * xs[k] + y * ys[k] + z * zs[k])
-        if (below > 0) & (below < BINS):
+        facing = x * nx[k] + y * ny[k] + z * nz[k]  # 0 where the surface is not smooth
+        aside = (facing < np.float32(0.7)) & (nz[k] < 0)
+        if (below > 0) & (below < BINS) & (not aside):
             count[BINS - 1 - int(below)] += 1
     return count
 
