@@ -80,21 +80,24 @@ def _tiles(rng: Generator, low: Array, high: Array, count: int) -> Iterator[tupl
 
 def cut(rng: Generator) -> World:
     """Look past a cluttered table, so far that a fifth of the image shows it."""
-    world = make_scene("clutter", rng, frames=1)
-    pose, angle = world.path[0], rng.uniform(0, 2 * np.pi)
-    aside = np.cos(angle) * pose.rotation[:, 0] + np.sin(angle) * pose.rotation[:, 1]
-    near, far = 0.0, 1.3
-    for _ in range(8):
-        turn = (near + far) / 2
-        gaze = np.cos(turn) * pose.rotation[:, 2] + np.sin(turn) * aside
-        world = replace(world, path=(looking_at(pose.translation, pose.translation + gaze),))
-        near, far = (turn, far) if sum(_shown(world)) > SHOWN else (near, turn)
-    return world
+    while True:
+        world = make_scene("clutter", rng, frames=1)
+        pose, angle = world.path[0], rng.uniform(0, 2 * np.pi)
+        aside = np.cos(angle) * pose.rotation[:, 0] + np.sin(angle) * pose.rotation[:, 1]
+        near, far = 0.0, 1.3
+        for _ in range(8):
+            turn = (near + far) / 2
+            gaze = np.cos(turn) * pose.rotation[:, 2] + np.sin(turn) * aside
+            world = replace(world, path=(looking_at(pose.translation, pose.translation + gaze),))
+            near, far = (turn, far) if sum(_shown(world)) > SHOWN else (near, turn)
+        if sum(_shown(world)) > SHOWN / 2:  # it is not nearer than a Kinect can tell
+            return world
 
 
 def _shown(world: World) -> tuple[float, float]:
-    """Return the shares of the image that show the table, and what is on it."""
-    owners = render(world.geometry(0), PREVIEW, world.path[0]).owners
+    """Return the shares of the image that tell the depth of the table, and of what is on it."""
+    seen = render(world.geometry(0), PREVIEW, world.path[0])
+    owners = np.where(seen.depth > KINECT.nearest_m, seen.owners, -1)
     table = owners == world.supports.index(_table(world))
     return float(table.mean()), float((owners >= len(world.supports)).mean())
 

@@ -40,7 +40,8 @@ def supporting_planes(
         area_m2 = plane.area_m2 + covered_m2
         drops = [plane.offset - lower.offset for lower in kept if _overlaps(lower, plane)]
         drop = drops[-1] if drops else math.inf
-        if drop < PLANES.least_drop_m or (kept and area_m2 < PLANES.board_m2):
+        high = tallest_m < drop < math.inf
+        if drop < PLANES.least_drop_m or (kept and area_m2 < PLANES.board_m2 and not high):
             continue
         if drop > tallest_m or area_m2 >= PLANES.furniture_m2:
             kept.append(plane)
