@@ -6,7 +6,9 @@ OPEN3D_LIBRARIES := libegl1 libgl1 libx11-6 libusb-1.0-0
 SCREENS := chromium chromium-driver mesa-vulkan-drivers
 DEMO := demo
 MUTATIONS := nice -n 19 $(BIN)/python -m tests.mutations
-PYTEST := $(BIN)/python -m pytest -q -n 2 --dist loadfile --no-loadscope-reorder
+# Two processes share the cores: threads of their libraries would only wait for each other.
+PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile \
+    --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-all mutations coverage screens kernels fixtures picture odd faults lint format \

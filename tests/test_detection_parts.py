@@ -101,7 +101,9 @@ def test_trees_that_are_added_correct_the_first() -> None:
     assert np.mean(told[1] == new) > 0.97
 
 
+@pytest.mark.many
 def test_pairs_do_not_depend_on_the_number_of_processes() -> None:
+    """Trees are grown on what several processes collect."""
     one, two = (collect(SCENES, 1.0, jobs) for jobs in (1, 2))
     assert np.array_equal(one.features, two.features)
     assert np.array_equal(one.same, two.same)

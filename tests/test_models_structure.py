@@ -1,6 +1,7 @@
 """What the trees that reject background learn from."""
 
 import numpy as np
+import pytest
 
 from shapecat.models.structure import FEATURES, Series, collect, label_objects
 from shapecat.simulation import KINECT, make_scene, render_frame
@@ -20,6 +21,7 @@ def test_objects_are_told_from_the_walls_of_their_bin() -> None:
     assert [is_object for _, is_object in none] == [False] * len(told)
 
 
+@pytest.mark.many
 def test_what_is_learned_does_not_depend_on_the_number_of_processes() -> None:
     one, two = (collect(SERIES, jobs) for jobs in (1, 2))
     assert np.array_equal(one.features, two.features)

@@ -253,7 +253,8 @@ def test_one_bad_recording_does_not_stop_the_others(
 ) -> None:
     bad = tmp_path / "bad.mcap"
     bad.write_bytes(b"no")
-    result = shapecat("process", bad, recording, "--out", tmp_path / "out", "--end", 0.1, "--json")
+    options = ("--end", 0.1, "--json", "--jobs", 1)
+    result = shapecat("process", bad, recording, "--out", tmp_path / "out", *options)
 
     assert result.exit_code == 1
     (summary,) = json.loads(result.stdout)

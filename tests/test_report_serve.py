@@ -122,12 +122,13 @@ def test_corrections_by_keyboard_outlive_the_server(
     assert labels_on_disk(long_run) == wanted
     assert browser.complaints() == []
 
-    browser.open(served(long_run).address)
     script = (
         "return Object.fromEntries([...document.querySelectorAll('.card.changed')].map("
         "(card) => [card.dataset.track, card.querySelector('.fix').textContent]))"
     )
-    shown = browser.run(script)
+    with serving(long_run) as (address, _):
+        browser.open(address)
+        shown = browser.run(script)
     assert {int(track): text for track, text in shown.items()} == {
         track: f"→ {label}" for track, label in wanted.items()
     }

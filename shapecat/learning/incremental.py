@@ -89,7 +89,7 @@ def add_categories(
     features = _features_of_standardised(bank, z)
     words = categorizer.forest.fall(features)
     inputs = _Inputs(features.astype(np.float64), bag_of_words(words, categorizer.forest.words))
-    old = _old_logits(categorizer, words, features)
+    old = _old_logits(categorizer, inputs)
     cold = old / categorizer.temperature
     learned = _fit_new(inputs, cold, truth, np.zeros((_width(inputs), count)), ridge, _STEPS)
     learned[-1] += _shift(inputs, cold, truth, learned, ridge, rng)
@@ -150,10 +150,9 @@ def _features_of_standardised(bank: FeatureBank, z: F4) -> F4:
     return plain.features(z)
 
 
-def _old_logits(categorizer: Categorizer, words: I4, features: F4) -> F8:
-    votes = categorizer.votes.astype(np.float64)[words].sum(axis=1)
-    width = categorizer.linear.shape[1]
-    linear = features[:, :width].astype(np.float64) @ categorizer.linear.T
+def _old_logits(categorizer: Categorizer, inputs: _Inputs) -> F8:
+    votes = inputs.words @ categorizer.votes.astype(np.float64)
+    linear = inputs.features[:, : categorizer.linear.shape[1]] @ categorizer.linear.T
     return np.asarray(votes + linear + categorizer.bias)
 
 

@@ -44,6 +44,6 @@ class TreeDictionary(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # 
 def bag_of_words(words: I4, vocabulary: int) -> sparse.csr_array:
     """Return words (n, t) as rows of zeros and ones (n, vocabulary)."""
     views, trees = words.shape
-    starts = np.arange(views + 1) * trees
-    ones = np.ones(words.size)
-    return sparse.csr_array((ones, words.reshape(-1), starts), shape=(views, vocabulary))
+    starts = np.arange(views + 1, dtype=np.int32) * trees
+    columns = words.reshape(-1).astype(np.int32)
+    return sparse.csr_array((np.ones(words.size), columns, starts), shape=(views, vocabulary))
