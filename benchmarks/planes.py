@@ -21,8 +21,8 @@ from shapecat.detection import detect
 from shapecat.geometry import inverse
 from shapecat.simulation import KINECT, Support, Thing, World, make_scene, render_frame
 from shapecat.simulation.furniture import make_room, make_table
-from shapecat.simulation.mesh import rounded_box
 from shapecat.simulation.paths import looking_at
+from shapecat.simulation.primitives import rounded_box
 from shapecat.simulation.render import render
 from shapecat.types import Camera, Frame, Pose, Scene
 

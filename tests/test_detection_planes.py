@@ -18,8 +18,9 @@ from shapecat.detection.planes.strips import add_strip_planes
 from shapecat.detection.planes.up_direction import estimate_up
 from shapecat.evaluation.overlap import MATCHED_F
 from shapecat.learning import load_model
-from shapecat.simulation.mesh import Mesh, moved, rounded_box
+from shapecat.simulation.mesh import Mesh, moved
 from shapecat.simulation.paths import looking_at
+from shapecat.simulation.primitives import rounded_box
 from shapecat.simulation.render import geometry, render
 from shapecat.types import Camera, Pose
 

@@ -7,8 +7,9 @@ import pytest
 
 from shapecat.arrays import F8
 from shapecat.simulation.measuring import measure
-from shapecat.simulation.mesh import Mesh, lathe, rounded_box
+from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.paths import looking_at
+from shapecat.simulation.primitives import lathe, rounded_box
 from shapecat.simulation.render import Geometry, Image, alone_pixels, cropped, geometry, render
 from shapecat.simulation.scenes import make_scene
 from shapecat.simulation.sensors import IDEAL, KINECT, REALSENSE, Sensor

@@ -12,8 +12,9 @@ from shapecat.geometry import rotation_from_quaternion, transform
 from shapecat.simulation import make_scene, render_frame, simulate
 from shapecat.simulation.closed_shapes import make_ball, make_box
 from shapecat.simulation.convex_parts import convex_parts, hollowness
-from shapecat.simulation.mesh import Mesh, lathe, rounded_box
+from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.physics import Drop, settle
+from shapecat.simulation.primitives import lathe, rounded_box
 from shapecat.simulation.scenes import SceneKind
 from shapecat.simulation.shapes import make_object
 from shapecat.simulation.worlds import World

@@ -8,8 +8,9 @@ from hypothesis import strategies as st
 from shapecat.arrays import F8
 from shapecat.simulation.distractors import DISTRACTORS, make_distractor
 from shapecat.simulation.footprints import overlap
-from shapecat.simulation.mesh import Mesh, lathe, moved, rounded_box, tube
+from shapecat.simulation.mesh import Mesh, moved
 from shapecat.simulation.placement import choose_rest, rests, turn_about_z
+from shapecat.simulation.primitives import lathe, rounded_box, tube
 from shapecat.simulation.render import geometry, render
 from shapecat.simulation.shapes import make_object
 from shapecat.types import CATEGORIES, Camera, Pose

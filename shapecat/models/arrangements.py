@@ -8,10 +8,11 @@ import numpy as np
 
 from shapecat.geometry import IDENTITY, rotation_from_quaternion
 from shapecat.simulation.distractors import make_distractor
-from shapecat.simulation.mesh import Mesh, moved, rounded_box, scaled, standing
+from shapecat.simulation.mesh import Mesh, moved, scaled, standing
 from shapecat.simulation.paths import Filming
 from shapecat.simulation.piles import bin_picking, pile, shelf_bin
 from shapecat.simulation.placement import choose_rest, rests, turn_about_z
+from shapecat.simulation.primitives import rounded_box
 from shapecat.simulation.shapes import make_object
 from shapecat.simulation.worlds import Thing
 from shapecat.simulation.worlds import World as Scene

@@ -7,19 +7,9 @@ from numpy.random import Generator
 
 from shapecat.arrays import F8
 from shapecat.geometry import rotation_from_quaternion
-from shapecat.simulation.mesh import (
-    Mesh,
-    extrude,
-    join,
-    lathe,
-    moved,
-    rounded_box,
-    scaled,
-    smooth_path,
-    standing,
-    tube,
-)
+from shapecat.simulation.mesh import Mesh, join, moved, scaled, standing
 from shapecat.simulation.open_shapes import log_uniform
+from shapecat.simulation.primitives import extrude, lathe, rounded_box, smooth_path, tube
 from shapecat.types import Pose
 
 __all__ = ["make_ball", "make_bottle", "make_box", "make_can"]

@@ -8,18 +8,9 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from shapecat.arrays import F8
-from shapecat.simulation.mesh import (
-    Mesh,
-    join,
-    lathe,
-    moved,
-    rounded_box,
-    scaled,
-    smooth_path,
-    standing,
-    tube,
-)
+from shapecat.simulation.mesh import Mesh, join, moved, scaled, standing
 from shapecat.simulation.parts import ellipsoid, placed, rod
+from shapecat.simulation.primitives import lathe, rounded_box, smooth_path, tube
 from shapecat.types import Pose
 
 __all__ = [

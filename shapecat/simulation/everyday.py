@@ -5,9 +5,10 @@ from collections.abc import Callable
 import numpy as np
 from numpy.random import Generator
 
-from shapecat.simulation.mesh import Mesh, extrude, join, rounded_box, smooth_path, standing, tube
+from shapecat.simulation.mesh import Mesh, join, standing
 from shapecat.simulation.open_shapes import log_uniform
 from shapecat.simulation.parts import ellipsoid, placed, rod
+from shapecat.simulation.primitives import extrude, rounded_box, smooth_path, tube
 
 __all__ = ["EVERYDAY"]
 

@@ -5,7 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.random import Generator
 
-from shapecat.simulation.mesh import extrude, moved, rounded_box
+from shapecat.simulation.mesh import moved
+from shapecat.simulation.primitives import extrude, rounded_box
 from shapecat.simulation.worlds import Support
 from shapecat.types import Pose
 

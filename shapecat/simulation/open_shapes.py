@@ -7,7 +7,8 @@ from numpy.random import Generator
 from numpy.typing import ArrayLike
 
 from shapecat.arrays import F8
-from shapecat.simulation.mesh import Mesh, join, lathe, smooth_path, standing, tube
+from shapecat.simulation.mesh import Mesh, join, standing
+from shapecat.simulation.primitives import lathe, smooth_path, tube
 
 __all__ = ["BOWL_BORDERS", "log_uniform", "make_bowl", "make_cup", "make_plate"]
 

@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from shapecat.geometry import rotation_from_quaternion
-from shapecat.simulation.mesh import Mesh, lathe, moved, scaled, smooth_path
+from shapecat.simulation.mesh import Mesh, moved, scaled
+from shapecat.simulation.primitives import lathe, smooth_path
 from shapecat.types import Pose
 
 __all__ = ["ellipsoid", "placed", "rod", "turned_body"]

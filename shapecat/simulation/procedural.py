@@ -8,19 +8,10 @@ from numpy.random import Generator
 from shapecat.arrays import F8
 from shapecat.geometry import rotation_from_quaternion
 from shapecat.simulation.everyday import EVERYDAY
-from shapecat.simulation.mesh import (
-    Mesh,
-    extrude,
-    join,
-    lathe,
-    moved,
-    rounded_box,
-    smooth_path,
-    standing,
-    tube,
-)
+from shapecat.simulation.mesh import Mesh, join, moved, standing
 from shapecat.simulation.open_shapes import log_uniform
 from shapecat.simulation.parts import ellipsoid, rod
+from shapecat.simulation.primitives import extrude, lathe, rounded_box, smooth_path, tube
 from shapecat.types import Pose
 
 __all__ = ["PROCEDURAL"]

@@ -5,8 +5,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.random import Generator
 
-from shapecat.simulation.mesh import Mesh, extrude, join, lathe, rounded_box, smooth_path, tube
+from shapecat.simulation.mesh import Mesh, join
 from shapecat.simulation.parts import ellipsoid, placed, rod
+from shapecat.simulation.primitives import extrude, lathe, rounded_box, smooth_path, tube
 
 __all__ = ["TOOLS"]
 
