@@ -44,7 +44,7 @@ def test_the_axis_is_found_from_a_bad_guess(
     axis /= np.linalg.norm(axis)
     weight = np.full(600, 1 / 600, np.float32)
 
-    fit_axis(cloud, weight, (normals @ turn.T).T.astype(np.float32), axis, point, True)
+    fit_axis(cloud, weight, (normals @ turn.T).T.astype(np.float32), axis, point, 4)
 
     assert abs(axis @ turn[:, 2]) > (0.998 if slope == 0 else 0.995)  # steps in place of a cone
     assert np.linalg.norm(point - (point @ turn[:, 2]) * turn[:, 2]) < 0.05

@@ -14,8 +14,9 @@ from shapecat.jit import kernel
 from shapecat.surface import MIN_POINTS, reconstruct, voxelize
 from shapecat.surface.gas import MAX_NEURONS
 from shapecat.surface.graph import link
-from shapecat.surface.growth import Cloud, connect, empty_gas, grow_fritzke, index_mask
+from shapecat.surface.growth import Cloud, grow_fritzke
 from shapecat.surface.lanes import adapt, three_nearest, two_nearest
+from shapecat.surface.neurons import connect, empty_gas, index_mask
 from shapecat.surface.triangles import triangles_of
 from shapecat.types import NeuralGas
 

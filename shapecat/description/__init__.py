@@ -1,5 +1,6 @@
 """Shape description (thesis ch. 6): the graph of a surface becomes a fixed list of numbers."""
 
-from shapecat.description.descriptor import BLOCKS, DESCRIPTOR_NAMES, describe
+from shapecat.description.blocks import BLOCKS, DESCRIPTOR_NAMES
+from shapecat.description.descriptor import describe
 
 __all__ = ["BLOCKS", "DESCRIPTOR_NAMES", "describe"]

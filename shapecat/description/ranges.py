@@ -1,11 +1,11 @@
-"""Ranges that a few stray values do not widen."""
+"""Ranges of values, also ones that a few stray values do not widen."""
 
 import numpy as np
 
 from shapecat.arrays import F4
 from shapecat.jit import kernel
 
-__all__ = ["inner_range"]
+__all__ = ["inner_range", "outer_range"]
 
 _BINS = 64
 _OUTSIDE = 0.02
@@ -38,3 +38,13 @@ def inner_range(values: F4) -> tuple[float, float]:
         seen += bins[last]
     above = last + (seen - limit) / bins[last]
     return low + below / scale, low + above / scale
+
+
+@kernel(fast=True)
+def outer_range(values: F4) -> tuple[float, float]:
+    """Return the smallest and the largest of values (n,)."""
+    low = high = values[0]
+    for value in values:
+        low = value if value < low else low
+        high = value if value > high else high
+    return low, high

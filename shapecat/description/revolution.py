@@ -25,7 +25,7 @@ _OUTLIER = 3.0
 """Residuals beyond this many root mean squares pull no harder."""
 _DAMPING = 0.02
 _INWARD = -0.3
-_UPRIGHT, _MAY_TILT = np.bool_(0), np.bool_(1)  # Python's own would be compiled one by one
+_SHIFTS, _SHIFTS_AND_TILTS = np.int64(2), np.int64(4)  # plain numbers are compiled one by one
 
 
 @kernel
@@ -119,11 +119,11 @@ def revolution(
     upright[2] = 1.0
     for j in range(3):
         before[j] = axis[j]
-    fit_axis(neurons, weight, normals, upright, foot, _UPRIGHT)
+    fit_axis(neurons, weight, normals, upright, foot, _SHIFTS)
     rms, length, radius = _measure(cloud, owner, normals, upright, foot, slices)
     out[0] = min(rms / radius, 2.0)
     out[1] = radius / (radius + length)
-    fit_axis(neurons, weight, normals, axis, point, _MAY_TILT)
+    fit_axis(neurons, weight, normals, axis, point, _SHIFTS_AND_TILTS)
     rms, length, radius = _measure(cloud, owner, normals, axis, point, slices)
     out[2] = min(rms / radius, 2.0)
     out[3] = length / (length + radius)
@@ -145,14 +145,7 @@ def revolution(
 
 
 @kernel
-def fit_axis(
-    neurons: F4,
-    weight: F4,
-    normals: F4,
-    axis: F8,
-    point: F8,
-    may_tilt: bool,  # noqa: FBT001  compiled kernels take their arguments by position
-) -> None:
+def fit_axis(neurons: F4, weight: F4, normals: F4, axis: F8, point: F8, free: int) -> None:
     """Move an axis so that the radius of the neurons is constant in each slice along it.
 
     Gauss-Newton steps on the residuals of the radius, of which the mean of the slice is eliminated
@@ -162,10 +155,11 @@ def fit_axis(
     ----------
     neurons, normals : (3, k); weight : (k,) share of the points.
     axis, point : (3,) the first guess, overwritten by the result.
+    free : 2 to shift the axis, 4 to tilt it as well.
     """
     limit = np.inf
     for _ in range(_ROUNDS):
-        limit = _OUTLIER * _improve(neurons, weight, normals, axis, point, may_tilt, limit)
+        limit = _OUTLIER * _improve(neurons, weight, normals, axis, point, free, limit)
 
 
 @kernel
@@ -218,13 +212,7 @@ def _slice(along: float, reach: F8) -> int:
 
 @kernel
 def _improve(
-    neurons: F4,
-    weight: F4,
-    normals: F4,
-    axis: F8,
-    point: F8,
-    may_tilt: bool,  # noqa: FBT001  compiled kernels take their arguments by position
-    limit: float,
+    neurons: F4, weight: F4, normals: F4, axis: F8, point: F8, free: int, limit: float
 ) -> float:
     """Move the axis by one Gauss-Newton step; return the root mean square residual before it."""
     first, second = _across(axis)
@@ -234,7 +222,6 @@ def _improve(
     rows, reach = _place(neurons, owner, normals, axis, point, first, second)
     for i in range(owner.size):
         rows[4, i] *= weight[i]
-    free = 4 if may_tilt else 2
     means = np.zeros((REVOLUTION_SLICES, 6))  # weight, radius, derivatives
     row = np.zeros(6)
     for i in range(rows.shape[1]):

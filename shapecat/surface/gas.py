@@ -8,15 +8,8 @@ from shapecat.arrays import F4, F8, U2
 from shapecat.config import SurfaceSettings
 from shapecat.jit import kernel
 from shapecat.surface.graph import edge_list, link
-from shapecat.surface.growth import (
-    FAR,
-    Cloud,
-    Gas,
-    connect,
-    empty_gas,
-    grow_fritzke,
-    grow_thesis,
-)
+from shapecat.surface.growth import Cloud, grow_fritzke, grow_thesis
+from shapecat.surface.neurons import FAR, Gas, connect, empty_gas
 from shapecat.types import NeuralGas
 
 __all__ = ["MAX_NEURONS", "MIN_POINTS", "reconstruct"]

@@ -4,8 +4,9 @@ import numpy as np
 
 from shapecat.arrays import I4, U2, Bool
 from shapecat.jit import kernel
-from shapecat.surface.growth import FAR, Cloud, Gas, index_mask, is_edge
+from shapecat.surface.growth import Cloud
 from shapecat.surface.lanes import LANES, three_nearest
+from shapecat.surface.neurons import FAR, Gas, index_mask, is_edge
 
 __all__ = ["edge_list", "link"]
 

@@ -7,18 +7,24 @@ import numpy as np
 from shapecat.arrays import F4, I4
 from shapecat.jit import kernel
 from shapecat.surface.lanes import LANES, adapt, two_nearest
+from shapecat.surface.neurons import (
+    ABSENT,
+    FAR,
+    Gas,
+    connect,
+    disconnect,
+    index_mask,
+    insert,
+    is_edge,
+    move,
+    refresh,
+)
 
-__all__ = [
-    "FAR",
-    "Cloud",
-    "Gas",
-    "connect",
-    "empty_gas",
-    "grow_fritzke",
-    "grow_thesis",
-    "index_mask",
-    "is_edge",
-]
+__all__ = ["Cloud", "grow_fritzke", "grow_thesis"]
+
+
+_GAIN = 1 / 0.9995
+"""What an error counts more than one a signal earlier."""
 
 
 class Cloud(NamedTuple):
@@ -29,88 +35,6 @@ class Cloud(NamedTuple):
     z: F4
 
 
-class Gas(NamedTuple):
-    """A gas with room for more neurons than it has; its arrays are padded to whole vectors.
-
-    ``x, y, z`` are positions, `FAR` away where no neuron is; ``error`` the accumulated squared
-    distance; ``degree`` the number of edges. ``wins`` counts how often a neuron was the nearest:
-    it is the clock of its edges. ``born[i * x.size + j]`` is `ABSENT`, or ``wins[i] + wins[j]``
-    when edge i-j was last refreshed, so that its age is ``wins[i] + wins[j] - born``. So ageing
-    all edges of the winner is one increment, and adapting its neighbours is one loop over a row.
-    """
-
-    x: F4
-    y: F4
-    z: F4
-    error: F4
-    degree: I4
-    wins: I4
-    born: I4
-
-
-ABSENT = np.int32(1 << 29)
-FAR = np.float32(1e18)
-_GAIN = 1 / 0.9995
-"""What an error counts more than one a signal earlier."""
-
-
-@kernel
-def empty_gas(room: int) -> Gas:
-    """Return a gas without neurons that has room for at least ``room``."""
-    size = (room + LANES - 1) // LANES * LANES
-    gas = Gas(
-        np.zeros(size, np.float32),
-        np.zeros(size, np.float32),
-        np.zeros(size, np.float32),
-        np.zeros(size, np.float32),
-        np.zeros(size, np.int32),
-        np.zeros(size, np.int32),
-        np.zeros(size * size, np.int32),
-    )
-    gas.x[:] = gas.y[:] = gas.z[:] = FAR
-    gas.born[:] = ABSENT
-    return gas
-
-
-@kernel
-def index_mask(count: int) -> int:
-    """Return the least 2**k - 1 that is at least ``count - 1``."""
-    mask = 1
-    while mask < count:
-        mask <<= 1
-    return mask - 1
-
-
-@kernel
-def is_edge(gas: Gas, i: int, j: int) -> bool:
-    """Return whether two neurons are linked."""
-    return bool(gas.born[i * gas.x.size + j] < ABSENT)
-
-
-@kernel
-def connect(gas: Gas, i: int, j: int) -> None:
-    """Link two neurons, or make their edge new."""
-    _connect(gas.degree, gas.wins, gas.born, i, j)
-
-
-@kernel
-def _connect(degree: I4, wins: I4, born: I4, i: int, j: int) -> None:
-    if born[i * degree.size + j] == ABSENT:
-        degree[i] += 1
-        degree[j] += 1
-    now = wins[i] + wins[j]
-    born[i * degree.size + j] = now
-    born[j * degree.size + i] = now
-
-
-@kernel
-def _disconnect(degree: I4, born: I4, i: int, j: int) -> None:
-    born[i * degree.size + j] = ABSENT
-    born[j * degree.size + i] = ABSENT
-    degree[i] -= 1
-    degree[j] -= 1
-
-
 @kernel
 def _drop_old_edges(degree: I4, wins: I4, born: I4, count: int, a: int, oldest: int) -> None:
     for j in range(count):
@@ -118,7 +42,7 @@ def _drop_old_edges(degree: I4, wins: I4, born: I4, count: int, a: int, oldest: 
         # differs: an edge stays when it is the last of either end, so that no neuron is ever
         # isolated and none has to be removed.
         if age > oldest and degree[a] > 1 and degree[j] > 1:
-            _disconnect(degree, born, a, j)
+            disconnect(degree, born, a, j)
 
 
 @kernel
@@ -158,25 +82,8 @@ def _fire(
         x, y, z, padded, sx, sy, sz, born, a * x.size, ABSENT, wins, a, rate_winner, rate_neighbour
     )
     # 9. the two are linked, or their edge is new again
-    _connect(degree, wins, born, a, b)
+    refresh(degree, wins, born, a, b)
     return a, age
-
-
-@kernel
-def _insert(gas: Gas, count: int, q: int) -> int:
-    """Insert neuron ``count`` between q and f, its neighbour with the largest error; return f."""
-    f = -1
-    for j in range(count):
-        if is_edge(gas, q, j) and (f < 0 or gas.error[j] > gas.error[f]):
-            f = j
-    half = np.float32(0.5)
-    gas.x[count] = half * (gas.x[q] + gas.x[f])
-    gas.y[count] = half * (gas.y[q] + gas.y[f])
-    gas.z[count] = half * (gas.z[q] + gas.z[f])
-    _disconnect(gas.degree, gas.born, q, np.int64(f))
-    connect(gas, q, count)
-    connect(gas, np.int64(f), count)
-    return f
 
 
 @kernel
@@ -245,7 +152,7 @@ def grow_fritzke(
         if until == 0 and count < target:
             until = interval
             q = int(np.argmax(gas.error[:count]))
-            f = _insert(gas, count, q)
+            f = insert(gas, count, q)
             gas.error[q] *= np.float32(0.5)
             gas.error[f] *= np.float32(0.5)
             gas.error[count] = gas.error[q]
@@ -308,7 +215,7 @@ def grow_thesis(
             pause -= 1
             if gas.error[a] > error_limit and pause <= 0 and count < target:
                 pause = 4
-                f = _insert(gas, count, a)
+                f = insert(gas, count, a)
                 gas.error[a] = gas.error[f] = gas.error[count] = 0
                 before[count] = -1
                 count += 1
@@ -335,30 +242,14 @@ def _prune(gas: Gas, count: int, before: I4) -> int:
                     connect(gas, np.int64(heir), j)
                 else:
                     heir = j
-                _disconnect(gas.degree, gas.born, i, j)
+                disconnect(gas.degree, gas.born, i, j)
         if gas.degree[heir] == 0:
             after = (heir + 1) % count
             connect(gas, np.int64(heir), after if after != i else (i + 1) % count)
         count -= 1
-        _move(gas, count, i)
+        move(gas, count, i)
         before[i] = before[count]
     return count
-
-
-@kernel
-def _move(gas: Gas, last: int, place: int) -> None:
-    """Give neuron ``last`` the free ``place``."""
-    size = gas.x.size
-    if last != place:
-        gas.x[place], gas.y[place], gas.z[place] = gas.x[last], gas.y[last], gas.z[last]
-        gas.wins[place], gas.degree[place] = gas.wins[last], gas.degree[last]
-        for j in range(last):
-            gas.born[place * size + j] = gas.born[j * size + place] = gas.born[last * size + j]
-        gas.born[place * size + place] = ABSENT
-    for j in range(size):
-        gas.born[last * size + j] = gas.born[j * size + last] = ABSENT
-    gas.x[last] = gas.y[last] = gas.z[last] = FAR
-    gas.wins[last] = gas.degree[last] = 0
 
 
 @kernel(fast=True)

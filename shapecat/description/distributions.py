@@ -1,0 +1,165 @@
+"""Histograms of distance and curvature over an object, its rings and its bands (thesis ch. 6)."""
+
+import numpy as np
+
+from shapecat.arrays import F4, I4
+from shapecat.description.blocks import (
+    BANDS,
+    BLOCKS,
+    CURVED_BINS,
+    DISTANCE_BINS,
+    MEAN_BINS,
+    RINGS,
+    SHAPE_BINS,
+    UP_BINS,
+)
+from shapecat.description.ranges import outer_range
+from shapecat.jit import kernel
+
+__all__ = ["distributions"]
+
+_DISTANCE_RANGE = 2.6
+"""Distances between neurons are counted up to this many times their mean."""
+_CURVATURE = SHAPE_BINS + CURVED_BINS + MEAN_BINS
+# kernels read numbers, not dictionaries
+_CURVED, _UP = BLOCKS["curvature"].start, BLOCKS["up"].start
+_RING_PATHS, _RING_STRAIGHT, _RING_CURVED = (
+    BLOCKS[f"ring_{name}"].start for name in ("geodesic", "euclid", "curvature")
+)
+_BAND_PATHS, _BAND_STRAIGHT, _BAND_CURVED = (
+    BLOCKS[f"band_{name}"].start for name in ("geodesic", "euclid", "curvature")
+)
+
+
+@kernel
+def _count(row: F4, start: int, bins: int, place: float, weight: float) -> None:
+    """Add ``weight`` at ``place`` (0 to 1) of a histogram, shared between the two nearest bins."""
+    at = min(max(place * bins - 0.5, 0.0), bins - 1.0)
+    k = min(int(at), bins - 2)
+    row[start + k] += weight * (k + 1 - at)
+    row[start + k + 1] += weight * (at - k)
+
+
+@kernel
+def _find_bins(lengths: F4, i: int, scale: float, one: float, bins: I4, shares: F4) -> None:
+    """Write for row i of ``lengths`` the first of the two bins a length is shared between.
+
+    And the share of the second, of a count of ``one``.
+    """
+    last = np.float32(DISTANCE_BINS - 1)
+    for j in range(lengths.shape[1]):
+        place = lengths[i, j] * scale - np.float32(0.5)
+        place = place if place > 0 else np.float32(0)
+        place = place if place < last else last
+        k = min(np.int32(place), np.int32(DISTANCE_BINS - 2))
+        bins[j] = k
+        shares[j] = (place - np.float32(k)) * one
+
+
+@kernel
+def distributions(
+    z: F4, straight: F4, paths: F4, weight: F4, normals: F4, curvatures: F4, out: F4
+) -> None:
+    """Write the histograms over the whole object, its rings and its bands."""
+    count = z.size
+    width = 1 + _CURVATURE + 2 * DISTANCE_BINS
+    rows = np.zeros((count, width), np.float32)
+    sums = np.zeros(count, np.float32)
+    for j in range(count):
+        for i in range(count):  # column by column: the sums of all rows grow side by side
+            sums[i] += paths[j, i]
+    total = 0.0
+    for i in range(count):
+        total += sums[i]
+    pairs = count * (count - 1)
+    scale = np.float32(DISTANCE_BINS / _DISTANCE_RANGE)
+    per_path = scale * np.float32(pairs / max(total, 1e-9))
+    per_straight = scale  # the mean is the unit
+    one = np.float32(1.0 / (count - 1))
+    bins, shares = np.zeros((2, count), np.int32), np.zeros((2, count), np.float32)
+    for i in range(count):
+        row = rows[i]
+        _find_bins(paths, i, per_path, one, bins[0], shares[0])
+        _find_bins(straight, i, per_straight, one, bins[1], shares[1])
+        for j in range(count):
+            if i == j:
+                continue
+            k, share = 1 + _CURVATURE + bins[0, j], shares[0, j]
+            row[k] += one - share
+            row[k + 1] += share
+            k, share = 1 + _CURVATURE + DISTANCE_BINS + bins[1, j], shares[1, j]
+            row[k] += one - share
+            row[k + 1] += share
+        first, second = curvatures[0, i], curvatures[1, i]
+        _curvature_row(row, first, second)
+    curvature = out[_CURVED:_UP]
+    up = out[_UP:_RING_PATHS]
+    for i in range(count):
+        for k in range(_CURVATURE):
+            curvature[k] += weight[i] * rows[i, 1 + k]
+        place = (np.float64(normals[2, i]) + 1) / 2
+        _count(up, np.int64(0), np.int64(UP_BINS), place, np.float64(weight[i]))
+    # numba compiles anew for every number that stands in a call, but not for these
+    rings, bands = np.int64(RINGS), np.int64(BANDS)
+    at, straight_at, curved_at = (
+        np.int64(_RING_PATHS), np.int64(_RING_STRAIGHT), np.int64(_RING_CURVED),
+    )  # fmt: skip
+    _partition(rows, sums, weight, rings, out, at, straight_at, curved_at)
+    at, straight_at, curved_at = (
+        np.int64(_BAND_PATHS), np.int64(_BAND_STRAIGHT), np.int64(_BAND_CURVED),
+    )  # fmt: skip
+    _partition(rows, z, weight, bands, out, at, straight_at, curved_at)
+
+
+@kernel
+def _curvature_row(row: F4, first: float, second: float) -> None:
+    row[0] = 1
+    spread = first - second
+    index = 2 / np.pi * np.arctan2(first + second, spread)
+    _count(row, np.int64(1), np.int64(SHAPE_BINS), (index + 1) / 2, 1.0)
+    curved = np.sqrt((first * first + second * second) / 2)
+    place = (np.log2(curved + 1e-6) + 3) / 7
+    _count(row, np.int64(1 + SHAPE_BINS), np.int64(CURVED_BINS), place, 1.0)
+    mean = (first + second) / 2
+    place = (mean / (1 + abs(mean)) + 1) / 2
+    _count(row, np.int64(1 + SHAPE_BINS + CURVED_BINS), np.int64(MEAN_BINS), place, 1.0)
+
+
+@kernel
+def _partition(
+    rows: F4,
+    order: F4,
+    weight: F4,
+    parts: int,
+    out: F4,
+    at_paths: int,
+    at_straight: int,
+    at_curvature: int,
+) -> None:
+    """Average ``rows`` over the parts in which ``order`` is cut at equal distances.
+
+    A neuron counts in the two parts whose middles it lies between, so that a small change of the
+    graph changes the descriptor little.
+    """
+    low, high = outer_range(order)
+    sums = np.zeros((parts, rows.shape[1]))
+    for i in range(rows.shape[0]):
+        place = np.float64(order[i] - low) / (high - low) if high > low else 0.5
+        at = min(max(place * parts - 0.5, 0.0), parts - 1.0)
+        first = min(int(at), parts - 2)
+        for side in range(2):
+            share = weight[i] * (at - first if side == 1 else first + 1 - at)
+            for k in range(rows.shape[1]):
+                sums[first + side, k] += share * rows[i, k]
+    for part in range(parts):
+        share = sums[part, 0]
+        norm = 1.0 / (share + 1e-3)
+        base = at_curvature + part * (1 + _CURVATURE)
+        out[base] = share
+        for k in range(_CURVATURE):
+            out[base + 1 + k] = sums[part, 1 + k] * norm
+        for k in range(DISTANCE_BINS):
+            out[at_paths + part * DISTANCE_BINS + k] = sums[part, 1 + _CURVATURE + k] * norm
+            out[at_straight + part * DISTANCE_BINS + k] = (
+                sums[part, 1 + _CURVATURE + DISTANCE_BINS + k] * norm
+            )

@@ -1,0 +1,137 @@
+"""The arrays of a growing neural gas: neurons and edges that are added, moved and removed."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F4, I4
+from shapecat.jit import kernel
+from shapecat.surface.lanes import LANES
+
+__all__ = [
+    "ABSENT",
+    "FAR",
+    "Gas",
+    "connect",
+    "disconnect",
+    "empty_gas",
+    "index_mask",
+    "insert",
+    "is_edge",
+    "move",
+    "refresh",
+]
+
+ABSENT = np.int32(1 << 29)
+FAR = np.float32(1e18)
+
+
+class Gas(NamedTuple):
+    """A gas with room for more neurons than it has; its arrays are padded to whole vectors.
+
+    ``x, y, z`` are positions, `FAR` away where no neuron is; ``error`` the accumulated squared
+    distance; ``degree`` the number of edges. ``wins`` counts how often a neuron was the nearest:
+    it is the clock of its edges. ``born[i * x.size + j]`` is `ABSENT`, or ``wins[i] + wins[j]``
+    when edge i-j was last refreshed, so that its age is ``wins[i] + wins[j] - born``. So ageing
+    all edges of the winner is one increment, and adapting its neighbours is one loop over a row.
+    """
+
+    x: F4
+    y: F4
+    z: F4
+    error: F4
+    degree: I4
+    wins: I4
+    born: I4
+
+
+@kernel
+def empty_gas(room: int) -> Gas:
+    """Return a gas without neurons that has room for at least ``room``."""
+    size = (room + LANES - 1) // LANES * LANES
+    gas = Gas(
+        np.zeros(size, np.float32),
+        np.zeros(size, np.float32),
+        np.zeros(size, np.float32),
+        np.zeros(size, np.float32),
+        np.zeros(size, np.int32),
+        np.zeros(size, np.int32),
+        np.zeros(size * size, np.int32),
+    )
+    gas.x[:] = gas.y[:] = gas.z[:] = FAR
+    gas.born[:] = ABSENT
+    return gas
+
+
+@kernel
+def index_mask(count: int) -> int:
+    """Return the least 2**k - 1 that is at least ``count - 1``."""
+    mask = 1
+    while mask < count:
+        mask <<= 1
+    return mask - 1
+
+
+@kernel
+def is_edge(gas: Gas, i: int, j: int) -> bool:
+    """Return whether two neurons are linked."""
+    return bool(gas.born[i * gas.x.size + j] < ABSENT)
+
+
+@kernel
+def connect(gas: Gas, i: int, j: int) -> None:
+    """Link two neurons, or make their edge new."""
+    refresh(gas.degree, gas.wins, gas.born, i, j)
+
+
+@kernel
+def refresh(degree: I4, wins: I4, born: I4, i: int, j: int) -> None:
+    """Link two neurons, or make their edge new, in the arrays of a `Gas`."""
+    if born[i * degree.size + j] == ABSENT:
+        degree[i] += 1
+        degree[j] += 1
+    now = wins[i] + wins[j]
+    born[i * degree.size + j] = now
+    born[j * degree.size + i] = now
+
+
+@kernel
+def disconnect(degree: I4, born: I4, i: int, j: int) -> None:
+    """Remove the edge between two neurons."""
+    born[i * degree.size + j] = ABSENT
+    born[j * degree.size + i] = ABSENT
+    degree[i] -= 1
+    degree[j] -= 1
+
+
+@kernel
+def insert(gas: Gas, count: int, q: int) -> int:
+    """Insert neuron ``count`` between q and f, its neighbour with the largest error; return f."""
+    f = -1
+    for j in range(count):
+        if is_edge(gas, q, j) and (f < 0 or gas.error[j] > gas.error[f]):
+            f = j
+    half = np.float32(0.5)
+    gas.x[count] = half * (gas.x[q] + gas.x[f])
+    gas.y[count] = half * (gas.y[q] + gas.y[f])
+    gas.z[count] = half * (gas.z[q] + gas.z[f])
+    disconnect(gas.degree, gas.born, q, np.int64(f))
+    connect(gas, q, count)
+    connect(gas, np.int64(f), count)
+    return f
+
+
+@kernel
+def move(gas: Gas, last: int, place: int) -> None:
+    """Give neuron ``last`` the free ``place``."""
+    size = gas.x.size
+    if last != place:
+        gas.x[place], gas.y[place], gas.z[place] = gas.x[last], gas.y[last], gas.z[last]
+        gas.wins[place], gas.degree[place] = gas.wins[last], gas.degree[last]
+        for j in range(last):
+            gas.born[place * size + j] = gas.born[j * size + place] = gas.born[last * size + j]
+        gas.born[place * size + place] = ABSENT
+    for j in range(size):
+        gas.born[last * size + j] = gas.born[j * size + last] = ABSENT
+    gas.x[last] = gas.y[last] = gas.z[last] = FAR
+    gas.wins[last] = gas.degree[last] = 0
