@@ -10,10 +10,12 @@ from typing import Any, Self
 
 from shapecat import pipeline
 from shapecat.config import load_settings, with_settings
+from shapecat.errors import ConfigError
 from shapecat.outputs.opened_run import Run, RunFrame, Table
 from shapecat.recordings import Recording, choose_streams, frames
 from shapecat.recordings import open_recording as _open_recording
 from shapecat.runs.jobs import Job
+from shapecat.system.scripts import runs_again
 from shapecat.types import Frame
 
 __all__ = ["OpenRecording", "Run", "RunFrame", "Table", "open_recording", "open_run", "process"]
@@ -125,9 +127,13 @@ def process(
 
     Raises
     ------
-    ConfigError : a setting that does not exist, or does not fit.
+    ConfigError : a setting that does not exist, or does not fit; or a script without that line asks
+        for several cores.
     RecordingError, NoStreamError, ModelError, OutputError : as the command, which prints them.
     """
+    if cores > 1 and runs_again():
+        msg = f'cores={cores} starts processes: a script needs `if __name__ == "__main__":`'
+        raise ConfigError(msg)
     source = Path(recording)
     job = Job(
         source=source,

@@ -32,6 +32,7 @@ from shapecat.reuse import KeyView, find_repeats, shows_the_same, sight_of
 from shapecat.surface import reconstruct, thin
 from shapecat.system import stopping
 from shapecat.system.files import lock
+from shapecat.system.scripts import runs_again
 from shapecat.types import Camera, Candidate, Detection, Frame, NeuralGas
 
 __all__ = ["compile_all", "find_ball", "main", "recognize_ball", "rehearse"]
@@ -140,7 +141,7 @@ def _notes() -> Path | None:
 
 
 def _rehearse(cores: int) -> None:
-    if current_process().daemon:  # may have no others
+    if current_process().daemon or runs_again():  # may have no others
         rehearse()
         return
     executor = LocalExecutor(min(cores, len(_REHEARSALS)))

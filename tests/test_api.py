@@ -1,6 +1,7 @@
 """The door from Python: light to import, arrays of the stated shapes, every printed block works."""
 
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -130,3 +131,18 @@ def test_import_loads_no_library() -> None:
 
     assert loaded_by("import shapecat", {"numpy"}) == set()
     assert loaded_by("import shapecat; shapecat.open_run", heavy) == set()
+
+
+def test_several_cores_in_a_script_without_a_guard_are_refused_at_once(tmp_path: Path) -> None:
+    """Each process would run the script again, and print a traceback of its own."""
+    script = tmp_path / "script.py"
+    script.write_text("import shapecat\nshapecat.process('none.mcap', 'out', cores=3)\n")
+    done = subprocess.run(
+        [sys.executable, str(script)], capture_output=True, text=True, check=False, cwd=tmp_path
+    )
+
+    assert done.returncode == 1
+    assert done.stderr.count("Traceback") == 1
+    last = done.stderr.splitlines()[-1]
+    assert last.endswith('cores=3 starts processes: a script needs `if __name__ == "__main__":`')
+    assert [path.name for path in tmp_path.iterdir()] == ["script.py"]

@@ -89,7 +89,7 @@ def test_the_other_processes_end(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not any(process.is_alive() for process in left)
 
 
-UNGUARDED = """
+UNGUARDED = """{says}
 from pathlib import Path
 from shapecat import rehearsal
 rehearsal._notes = lambda: Path({notes!r})
@@ -98,13 +98,15 @@ print("processed")
 """
 
 
-def test_a_script_without_a_guard_does_not_wait_for_itself(tmp_path: Path) -> None:
-    """The process that compiles runs the script again, and would wait for its parent's lock."""
+@pytest.mark.parametrize("says", ["", "# no __main__"])
+def test_a_script_without_a_guard_does_not_wait_for_itself(tmp_path: Path, says: str) -> None:
+    """A process that compiles would run the script again, and wait for its parent's lock."""
     script = tmp_path / "script.py"
-    script.write_text(UNGUARDED.format(notes=str(tmp_path / "complete")))
+    script.write_text(UNGUARDED.format(says=says, notes=str(tmp_path / "complete")))
     ended = subprocess.run(
         [sys.executable, str(script)], capture_output=True, text=True, timeout=300, check=False
     )
     assert ended.returncode == 0, ended.stderr
     assert ended.stdout == "processed\n"
-    assert 'needs `if __name__ == "__main__":`' in ended.stderr
+    assert bool(says) == ('needs `if __name__ == "__main__":`' in ended.stderr), ended.stderr
+    assert bool(says) == ("Traceback" in ended.stderr)
