@@ -1,4 +1,4 @@
-"""The records that travel through the house: frozen, shape-checked, read-only.
+"""The records that stages pass on: frozen, shape-checked, read-only.
 
 Units are metres, seconds, radians; stamps are integer nanoseconds; quaternions are x, y, z, w.
 Transforms are named ``a_from_b``. "Sensor frame" is the frame named by ``frame_id``; a depth

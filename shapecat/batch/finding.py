@@ -35,7 +35,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Found:
-    """The recordings, each once, and how many files were left out."""
+    """The recordings that were found, without duplicates, and the number of files left out."""
 
     kept: list[Source]
     left_out: int

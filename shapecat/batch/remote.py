@@ -178,7 +178,7 @@ def upload(folder: Path, url: str, claim: Claim) -> None:
 
 @contextmanager
 def scratch() -> Iterator[Path]:
-    """Give a temporary folder; also remove those of killed processes."""
+    """Yield a temporary folder; remove those that killed processes have left."""
     parent = Path(tempfile.gettempdir())
     for left in parent.glob(f"{_SCRATCH}*"):
         with suppress(OSError):

@@ -40,7 +40,7 @@ def reach(x: F4, y: F4, stray: int, cosines: F8, sines: F8) -> F8:
 
 @kernel
 def _insert(ascending: F4, value: float) -> None:
-    """Put a value in its place in a list, whose least one is lost."""
+    """Insert a value into a sorted list of fixed length; the smallest value drops out."""
     at = 1
     while at < ascending.size and ascending[at] < value:
         ascending[at - 1] = ascending[at]

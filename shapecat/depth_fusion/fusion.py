@@ -160,7 +160,7 @@ def _add_resting(guide: F4, before: F4, total: F4, count: F4) -> None:
 
 @kernel
 def _add_moved(guide: F4, before: F4, lens: F4, shift: F4, total: F4, count: F4) -> None:
-    """Add the readings of the same points that agree; a hole that got one is a hole no more."""
+    """Add readings of the same points that agree; fill holes that have got a reading."""
     agree, jump = np.float32(AGREE), np.float32(DISCONTINUITY)
     places = np.zeros((3, guide.shape[1]), np.float32)
     x, y, z = places[0], places[1], places[2]

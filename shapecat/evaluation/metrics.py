@@ -36,7 +36,7 @@ def accuracy(truth: I4, predicted: I4) -> float:
 
 
 def confusion(truth: I4, predicted: I4, categories: int) -> I4:
-    """Return how often each true category (row) was taken for each other (column).
+    """Count the views of each true category (row) by their predicted category (column).
 
     Examples
     --------

@@ -57,7 +57,7 @@ class DescribedViews(NamedTuple):
 
 
 class DescribedView(NamedTuple):
-    """One view: its descriptor (d,), how many voxels it has, how long it took."""
+    """The descriptor (d,) of a view, its number of voxels, and the seconds that it took."""
 
     descriptor: F4
     points: int
@@ -67,7 +67,7 @@ class DescribedView(NamedTuple):
 def describe_view(
     view: View, *, settings: Settings, rng: np.random.Generator
 ) -> DescribedView | None:
-    """Describe one view; None if it has too few points for a surface."""
+    """Describe a view; return None if it has too few points for a surface."""
     begun = time.perf_counter()
     cloud = thin(view.points, settings=settings.surface)
     gas = reconstruct(cloud, settings=settings.surface, rng=rng)

@@ -111,9 +111,9 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
         return self.classes_[logits.argmax(axis=1)]
 
     def _boost(self, bins: Bins, labels: I4, scores: F4) -> list[Tree]:
-        """Return the trees, round by round, those of a round in the order of the categories.
+        """Grow one tree per category in each round; return them round by round.
 
-        What they tell is added to ``scores`` (k, n).
+        The leaf values of all trees are added to ``scores`` (k, n).
         """
         rng = np.random.default_rng(check_random_state(self.random_state).randint(2**31))
         truth = labels == np.arange(len(scores))[:, None]

@@ -19,10 +19,10 @@ _LEAST_GAIN = 1e-6
 
 
 class TreeSettings(NamedTuple):
-    """How one tree grows.
+    """Settings of one tree.
 
-    ``leaves`` at most; ``rate`` every leaf is shrunk by; ``ridge`` added to the second derivative
-    of a leaf; ``least`` second derivative a leaf needs.
+    ``leaves`` is their largest number; ``rate`` shrinks every leaf value; ``ridge`` is added to the
+    second derivative of a leaf; a leaf needs a second derivative of at least ``least``.
     """
 
     leaves: int

@@ -77,7 +77,7 @@ def write_card(
     confusion: Report,
     settings: Mapping[str, object],
 ) -> None:
-    """Write the card beside the model; ``after`` is the one whose trees it keeps."""
+    """Write the card beside the model; ``after`` is the model whose trees it keeps."""
     head = _HEAD.format(
         model=model,
         command=_ANEW if after is None else _AFTER.format(after=after),

@@ -29,7 +29,7 @@ from shapecat.simulation.sensors import PRESETS
 from shapecat.trees import write_trees
 from shapecat.types import Frame
 
-__all__ = ["Series", "Told", "collect", "label_objects", "main"]
+__all__ = ["Samples", "Series", "collect", "label_objects", "main"]
 
 FEATURES = OBJECT_FEATURES.itemsize // np.dtype("f4").itemsize
 _GROWTH = Growth(150, 16, 0.08)
@@ -72,8 +72,8 @@ _SERIES = (
 """Seeds of their own: the merging trees were not grown on them. Large objects are too rare else."""
 
 
-class Told(NamedTuple):
-    """What segments were merged to: ``features`` (n, `FEATURES`), whether objects (n,)."""
+class Samples(NamedTuple):
+    """Merged segments: ``features`` (n, `FEATURES`), and whether each is of an object (n,)."""
 
     features: F4
     objects: Bool
@@ -83,12 +83,12 @@ class Told(NamedTuple):
 @growing_options(Path(structure.__file__).with_name(structure.FILE))
 def main(*, seed: int, jobs: int, out: Path) -> None:
     """Simulate, detect, grow; write the trees."""
-    told = collect(_SERIES, jobs)
-    write_trees(out, grow(*told, _GROWTH, seed))
-    click.echo(f"{len(told.objects)} segments, {told.objects.mean():.0%} of objects; {out}")
+    samples = collect(_SERIES, jobs)
+    write_trees(out, grow(*samples, _GROWTH, seed))
+    click.echo(f"{len(samples.objects)} segments, {samples.objects.mean():.0%} of objects; {out}")
 
 
-def collect(scenes: tuple[Series, ...], jobs: int) -> Told:
+def collect(scenes: tuple[Series, ...], jobs: int) -> Samples:
     """Return the merged segments of all scenes; the number of jobs does not change them."""
     chunks = [
         s._replace(first=s.first + k, scenes=min(_CHUNK, s.scenes - k))
@@ -99,14 +99,14 @@ def collect(scenes: tuple[Series, ...], jobs: int) -> Told:
         ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool,
         click.progressbar(pool.map(_collect, chunks), length=len(chunks), label="scenes") as bar,
     ):
-        return Told(*(np.concatenate(part) for part in zip(*bar, strict=True)))
+        return Samples(*(np.concatenate(part) for part in zip(*bar, strict=True)))
 
 
-def _collect(series: Series) -> Told:
+def _collect(series: Series) -> Samples:
     frames = (_labelled(series, seed) for seed in range(series.first, series.first + series.scenes))
     found = list(chain.from_iterable(frames))
     rows = np.array([features for features, _ in found], np.float32).reshape(-1, FEATURES)
-    return Told(rows, np.array([is_object for _, is_object in found], bool))
+    return Samples(rows, np.array([is_object for _, is_object in found], bool))
 
 
 def _labelled(series: Series, seed: int) -> Iterator[tuple[F4, bool]]:

@@ -22,12 +22,12 @@ from shapecat.types import Frame, LabelledFrame
 
 __all__ = ["FORMATS", "export_dataset", "export_run"]
 
-Shown = tuple[LabelledFrame, Frame, Coloured | None]
-Write = Callable[[Path, Iterable[Shown], FinishedRun], int]
+ExportedFrame = tuple[LabelledFrame, Frame, Coloured | None]
+Write = Callable[[Path, Iterable[ExportedFrame], FinishedRun], int]
 Observer = Callable[[str, int, int | None], None]
 
 
-def _clouds(shown: Iterable[Shown]) -> Iterator[tuple[LabelledFrame, Frame]]:
+def _clouds(shown: Iterable[ExportedFrame]) -> Iterator[tuple[LabelledFrame, Frame]]:
     return ((labelled, frame) for labelled, frame, _ in shown)
 
 
@@ -200,7 +200,9 @@ def _thinned(frames: Iterable[LabelledFrame], every: int) -> Iterator[LabelledFr
         seen[frame.topic] += 1
 
 
-def _observed(pairs: Iterable[Shown], total: int, observe: Observer) -> Iterator[Shown]:
+def _observed(
+    pairs: Iterable[ExportedFrame], total: int, observe: Observer
+) -> Iterator[ExportedFrame]:
     for done, pair in enumerate(pairs, start=1):
         yield pair
         observe("export", done, total)

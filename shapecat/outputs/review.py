@@ -38,7 +38,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import rerun as rr
@@ -48,16 +48,14 @@ from shapecat.geometry import IDENTITY, transform
 from shapecat.outputs import review_shapes as shapes
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.review_cloud import PaintedCloud, paint
 from shapecat.outputs.review_columns import At, Columns, curve
 from shapecat.outputs.review_file import open_review
-from shapecat.outputs.review_images import Images, Picture, picture_of
+from shapecat.outputs.review_images import Images
 from shapecat.outputs.review_layout import Eye, TrackView, choose_eye, lay_out, stepped_back
 from shapecat.outputs.review_paths import Paths
-from shapecat.outputs.review_scenes import Shown, choose_scenes
-from shapecat.outputs.review_shapes import SCENE, SKETCH, Drawing, Moment
+from shapecat.outputs.review_scenes import PaintedFrame, choose_scenes, paint_frame
+from shapecat.outputs.review_shapes import SCENE, SKETCH, Drawing, DrawnScene
 from shapecat.outputs.review_viewer import open_viewer, take_screenshot
-from shapecat.recordings import MessageError
 from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
 
 __all__ = ["open_viewer", "take_screenshot", "write_review"]
@@ -105,7 +103,7 @@ def write_review(
         review = _Review(stream, categories, fixed_frame)
         review.begin(run)
         drawn = choose_scenes(frames, fixed=fixed_frame is not None)
-        paint_one = partial(_painted, limit=cloud_points)
+        paint_one = partial(paint_frame, limit=cloud_points)
         painted = map_ahead(paint_one, drawn, threads=threads)
         for k, one in enumerate(painted):
             file.check()
@@ -122,33 +120,6 @@ def _stream(name: str, run: Mapping[str, object]) -> rr.RecordingStream:
     stream = rr.RecordingStream("shapecat", recording_id=identity, send_properties=False)
     stream.set_log_time_enabled(False)
     return stream
-
-
-class _Painted(NamedTuple):
-    """A frame ready to be written.
-
-    ``clouds`` are None where the scene is not drawn; ``damage`` is what is wrong with the image.
-    """
-
-    labelled: LabelledFrame
-    frame: Frame
-    clouds: tuple[PaintedCloud, PaintedCloud] | None
-    picture: Picture | None
-    damage: str
-
-
-def _painted(shown: Shown, *, limit: int) -> _Painted:
-    """Paint the clouds and the masks of a frame; without colour if its image is damaged."""
-    labelled, frame, coloured, drawn = shown
-    damage, parts = "", (labelled.planes, labelled.objects)
-    if coloured is not None:
-        try:
-            clouds = paint(frame, *parts, limit=limit, view=coloured.view) if drawn else None
-            return _Painted(labelled, frame, clouds, picture_of(labelled, coloured), "")
-        except MessageError as error:
-            damage = f"{coloured.view.image.topic}: {error}"
-    clouds = paint(frame, *parts, limit=limit) if drawn else None
-    return _Painted(labelled, frame, clouds, None, damage)
 
 
 class _Review:
@@ -185,7 +156,7 @@ class _Review:
         if self._fixed_frame is not None:
             self._log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
 
-    def add(self, painted: _Painted) -> None:
+    def add(self, painted: PaintedFrame) -> None:
         """Write one frame."""
         labelled, frame = painted.labelled, painted.frame
         entity = rr.new_entity_path(["world", labelled.topic])
@@ -224,7 +195,7 @@ class _Review:
         images = self._images.entities
         self._stream.send_blueprint(lay_out(scenes or [nothing], tracks, images))
 
-    def _draw(self, entity: str, painted: _Painted) -> None:
+    def _draw(self, entity: str, painted: PaintedFrame) -> None:
         """Write the sensor and the boxes, and the scene if it is due."""
         labelled = painted.labelled
         at, pose = (labelled.stamp_ns, labelled.index), self._pose(labelled)
@@ -237,9 +208,9 @@ class _Review:
         if self._fixed_frame is not None:
             entity = rr.new_entity_path(["world", "seen", labelled.topic])
             self._columns.add(entity, at, pose or IDENTITY, shapes.places)
-        moment = Moment.of(labelled, *painted.clouds)
+        scene = DrawnScene.of(labelled, *painted.clouds)
         for name, drawing in SCENE.items():
-            self._add(f"{entity}/{name}", drawing, at, moment, moment.size)
+            self._add(f"{entity}/{name}", drawing, at, scene, scene.size)
 
     def _add(self, entity: str, drawing: Drawing, at: At, row: Any, size: int) -> None:
         if drawing.style is not None and entity not in self._styled:

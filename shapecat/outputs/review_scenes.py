@@ -1,4 +1,4 @@
-"""Which frames of a review have their scene drawn: few while nothing moves."""
+"""The frames of a review: their scenes, drawn seldom while nothing moves, and their painting."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -7,9 +7,12 @@ from typing import NamedTuple
 from shapecat.arrays import F8
 from shapecat.geometry import IDENTITY, transform
 from shapecat.outputs.colouring import Coloured
+from shapecat.outputs.review_cloud import PaintedCloud, paint
+from shapecat.outputs.review_images import Picture, picture_of
+from shapecat.recordings import MessageError
 from shapecat.types import Frame, LabelledFrame
 
-__all__ = ["Shown", "choose_scenes"]
+__all__ = ["PaintedFrame", "ReviewFrame", "choose_scenes", "paint_frame"]
 
 _SOON_NS, _LATE_NS = 90_000_000, 240_000_000
 """From a scene to the next one: at least, and at most where the frames differ."""
@@ -17,7 +20,7 @@ _STILL_M = 0.015
 """What has moved so far is drawn as soon as it may be."""
 
 
-class Shown(NamedTuple):
+class ReviewFrame(NamedTuple):
     """A frame to be written, and whether its scene is drawn."""
 
     labelled: LabelledFrame
@@ -28,7 +31,7 @@ class Shown(NamedTuple):
 
 def choose_scenes(
     frames: Iterable[tuple[LabelledFrame, Frame, Coloured | None]], *, fixed: bool
-) -> Iterator[Shown]:
+) -> Iterator[ReviewFrame]:
     """Choose the frames whose scene is drawn: none that repeats, few while nothing moves.
 
     Parameters
@@ -42,7 +45,7 @@ def choose_scenes(
         drawn = before is None or _is_due(labelled, before, fixed=fixed)
         if drawn:
             last[labelled.topic] = labelled
-        yield Shown(labelled, frame, coloured, drawn)
+        yield ReviewFrame(labelled, frame, coloured, drawn)
 
 
 def _is_due(labelled: LabelledFrame, before: LabelledFrame, *, fixed: bool) -> bool:
@@ -66,3 +69,30 @@ def _places(labelled: LabelledFrame, *, fixed: bool) -> dict[int, F8]:
     return {
         o.track: transform(pose or IDENTITY, (o.full or o.box).center) for o in labelled.objects
     }
+
+
+class PaintedFrame(NamedTuple):
+    """A frame ready to be written.
+
+    ``clouds`` are None where the scene is not drawn; ``damage`` is what is wrong with the image.
+    """
+
+    labelled: LabelledFrame
+    frame: Frame
+    clouds: tuple[PaintedCloud, PaintedCloud] | None
+    picture: Picture | None
+    damage: str
+
+
+def paint_frame(chosen: ReviewFrame, *, limit: int) -> PaintedFrame:
+    """Paint the clouds and the masks of a frame; without colour if its image is damaged."""
+    labelled, frame, coloured, drawn = chosen
+    damage, parts = "", (labelled.planes, labelled.objects)
+    if coloured is not None:
+        try:
+            clouds = paint(frame, *parts, limit=limit, view=coloured.view) if drawn else None
+            return PaintedFrame(labelled, frame, clouds, picture_of(labelled, coloured), "")
+        except MessageError as error:
+            damage = f"{coloured.view.image.topic}: {error}"
+    clouds = paint(frame, *parts, limit=limit) if drawn else None
+    return PaintedFrame(labelled, frame, clouds, None, damage)

@@ -23,7 +23,7 @@ __all__ = [
     "SCENE",
     "SKETCH",
     "Drawing",
-    "Moment",
+    "DrawnScene",
     "Way",
     "label",
     "markdown",
@@ -61,7 +61,7 @@ class Surface(NamedTuple):
     gas: NeuralGas
 
 
-class Moment(NamedTuple):
+class DrawnScene(NamedTuple):
     """A scene as it is drawn: its objects and planes, the points of no object, those on objects."""
 
     objects: tuple[Surface, ...]
@@ -70,7 +70,7 @@ class Moment(NamedTuple):
     points: PaintedCloud
 
     @classmethod
-    def of(cls, labelled: LabelledFrame, scene: PaintedCloud, points: PaintedCloud) -> "Moment":
+    def of(cls, labelled: LabelledFrame, scene: PaintedCloud, points: PaintedCloud) -> "DrawnScene":
         """Take from a frame what is drawn of it."""
         objects = tuple(Surface(o.category, o.full, o.gas) for o in labelled.objects)
         return cls(objects, labelled.planes, scene, points)
@@ -143,19 +143,19 @@ def _points(clouds: Sequence[PaintedCloud]) -> _Columns:
     yield from rr.Points3D.columns(radii=[cloud.radius_m for cloud in clouds])
 
 
-def _scene(moments: Sequence[Moment]) -> _Columns:
+def _scene(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the points of no object."""
-    return _points([moment.scene for moment in moments])
+    return _points([moment.scene for moment in scenes])
 
 
-def _objects(moments: Sequence[Moment]) -> _Columns:
+def _objects(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the points on objects."""
-    return _points([moment.points for moment in moments])
+    return _points([moment.points for moment in scenes])
 
 
-def _dashes(moments: Sequence[Moment]) -> _Columns:
+def _dashes(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the edges of the full boxes, dashed."""
-    known = [[o for o in m.objects if o.full is not None] for m in moments]
+    known = [[o for o in m.objects if o.full is not None] for m in scenes]
     objects = list(chain.from_iterable(known))
     corners = np.reshape([box_corners(o.full) for o in objects if o.full is not None], (-1, 8, 3))
     starts, ends = corners[:, _EDGES[:, 0]], corners[:, _EDGES[:, 1]]
@@ -167,13 +167,13 @@ def _dashes(moments: Sequence[Moment]) -> _Columns:
     ).partition([dashes * len(each) for each in known])
 
 
-def _graphs(moments: Sequence[Moment]) -> _Columns:
+def _graphs(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the edges of the graphs."""
-    objects = [o for m in moments for o in m.objects]
+    objects = [o for m in scenes for o in m.objects]
     lines = [o.gas.neurons[o.gas.edges] for o in objects]
     pairs = np.concatenate(lines) if lines else np.zeros((0, 2, 3), np.float32)
     colours = np.repeat(_packed(objects, white=0.65), [len(each) for each in lines])
-    counts = [sum(len(o.gas.edges) for o in m.objects) for m in moments]
+    counts = [sum(len(o.gas.edges) for o in m.objects) for m in scenes]
     yield from rr.LineStrips3D.columns(strips=_segments(pairs), colors=colours).partition(counts)
 
 
@@ -186,9 +186,9 @@ def _segments(pairs: F4) -> pa.Array:
     return pa.ListArray.from_arrays(offsets, corners, type=kind)
 
 
-def _surfaces(moments: Sequence[Moment]) -> _Columns:
+def _surfaces(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the triangles of the graphs, one translucent mesh a frame."""
-    shown = [[(o, faces) for o in m.objects if len(faces := _triangles(o))] for m in moments]
+    shown = [[(o, faces) for o in m.objects if len(faces := _triangles(o))] for m in scenes]
     objects = [o for each in shown for o, _ in each]
     sizes = [len(o.gas.neurons) for o in objects]
     colours = np.repeat(_packed(objects, alpha=70), sizes)
@@ -202,16 +202,16 @@ def _triangles(surface: Surface) -> U4:
     return np.asarray(triangles_of(surface.gas.edges, len(surface.gas.neurons)))
 
 
-def _outlines(moments: Sequence[Moment]) -> _Columns:
+def _outlines(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the closed outlines of the planes."""
-    shown = [[p.outline for p in m.planes if len(p.outline)] for m in moments]
+    shown = [[p.outline for p in m.planes if len(p.outline)] for m in scenes]
     strips = [np.concatenate([o, o[:1]]) for o in chain.from_iterable(shown)]
     yield from rr.LineStrips3D.columns(strips=strips).partition([len(each) for each in shown])
 
 
-def _fills(moments: Sequence[Moment]) -> _Columns:
+def _fills(scenes: Sequence[DrawnScene]) -> _Columns:
     """Return the planes as polygons: fans, as outlines are convex."""
-    shown = [[p.outline for p in m.planes if len(p.outline) >= 3] for m in moments]
+    shown = [[p.outline for p in m.planes if len(p.outline) >= 3] for m in scenes]
     corners = _stacked(list(chain.from_iterable(shown)), 3)
     counts = [sum(map(len, outlines)) for outlines in shown]
     yield from rr.Mesh3D.columns(vertex_positions=corners).partition(counts)
@@ -249,7 +249,7 @@ SCENE: Mapping[str, Drawing] = {
     "objects/graphs": Drawing(rr.LineStrips3D.from_fields(radii=0.0008), _graphs),
     "objects/surfaces": Drawing(None, _surfaces),
 }
-"""What is drawn of a `Moment`, some times a second, by entity below that of the scene."""
+"""What is drawn of a `DrawnScene`, some times a second, by entity below that of the scene."""
 SKETCH: Mapping[str, Drawing] = {
     # Labels of boxes would cover the objects.
     "objects/boxes": Drawing(rr.Boxes3D.from_fields(radii=0.001, show_labels=False), _boxes),

@@ -76,17 +76,17 @@ def frames_with_colour(
 
 def _heard(partners: Mapping[str, "_Partner"]) -> dict[str, Any]:
     """Return the listeners of each topic."""
-    told: dict[str, list[Any]] = {}
+    listeners: dict[str, list[Any]] = {}
     for partner in partners.values():
-        told.setdefault(partner.stream.topic, []).append(partner.take)
+        listeners.setdefault(partner.stream.topic, []).append(partner.take)
         if partner.stream.info_topic:
-            told.setdefault(partner.stream.info_topic, []).append(partner.calibrate)
+            listeners.setdefault(partner.stream.info_topic, []).append(partner.calibrate)
 
     def tell(message: Message) -> None:
-        for listener in told[message.topic]:
+        for listener in listeners[message.topic]:
             listener(message)
 
-    return dict.fromkeys(told, tell)
+    return dict.fromkeys(listeners, tell)
 
 
 def _decided(waiting: Sequence[Frame], partners: Mapping[str, "_Partner"]) -> bool:

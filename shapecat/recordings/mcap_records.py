@@ -72,7 +72,7 @@ class TruncatedError(RecordingError):
 
 
 class ChunkError(RecordingError):
-    """A chunk that is damaged or not believable."""
+    """A chunk that is damaged, or whose sizes are not plausible."""
 
 
 class Record(NamedTuple):

@@ -41,7 +41,7 @@ class Recording(ABC):
         return tuple(self._channels.values())
 
     def parts(self) -> list["Recording"]:
-        """Return the recordings of its files; itself for a single file."""
+        """Return the recordings that it consists of: one per file, or itself alone."""
         return [self]
 
     @abstractmethod

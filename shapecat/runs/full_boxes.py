@@ -84,8 +84,8 @@ class FullBoxes:
         details = self._details(np.concatenate([np.zeros(0, np.int64), *rows]))
         stops = list(accumulate(len(track.frames) for track in tracks))
         result = np.full((stops[-1] if stops else 0, _WIDTH), np.nan, np.float32)
-        told = accumulate(map(len, telling))
-        for track, one, some, stop, end in zip(tracks, seen, telling, stops, told, strict=True):
+        ends = accumulate(map(len, telling))
+        for track, one, some, stop, end in zip(tracks, seen, telling, stops, ends, strict=True):
             if len(some):
                 views = self._views(one, some, details[end - len(some) : end])
                 weights = view_weights(self.partial[one.rows[some]])

@@ -67,7 +67,7 @@ def find_misread(
 def resolve_labels(
     rows: Sequence[TrackRow], categories: Iterable[str], *, one_frame: bool
 ) -> tuple[dict[int, TrackLabel], dict[int, str]]:
-    """Return the final label of each track, and the problem of each label that makes no sense."""
+    """Return the final label of each track, and the problem of each invalid label."""
     known = {n.lower(): n for n in (UNKNOWN, *CATEGORIES, *categories, *(r.category for r in rows))}
     verdicts: dict[int, _Verdict] = {}
     misread = {}

@@ -24,7 +24,7 @@ COLUMNS = {
 
 _OFF_DEG = 10.0
 """A frame disagrees whose up is so far off the recording's."""
-_TOLD_DEG = 5.0
+_AGREES_DEG = 5.0
 """A frame that was given an up so near the recording's would be seen the same again."""
 _STILL_DEG, _STILL_SHARE = 3.0, 0.6
 """The camera is still if so many of the frames around agree so well."""
@@ -90,8 +90,8 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
         expected = _fixed_up(stream, posed) if 2 * posed.sum() > len(posed) else _still_up(stream)
         off = ~stream.level | ~(_cosine(stream.up, expected) > _cos(_OFF_DEG))
         off |= ~posed & _other_support(stream, off)
-        told = _cosine(stream.given, expected) > _cos(_TOLD_DEG)
-        for k in np.flatnonzero(np.isfinite(expected[:, 0]) & off & ~told):
+        agrees = _cosine(stream.given, expected) > _cos(_AGREES_DEG)
+        for k in np.flatnonzero(np.isfinite(expected[:, 0]) & off & ~agrees):
             given = stream.given[k].astype(np.float32) if np.isfinite(stream.given[k, 0]) else None
             key = (topic, int(stream.frames[k]))
             found[key] = Revision(expected[k].astype(np.float32), given)

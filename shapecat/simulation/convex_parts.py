@@ -50,7 +50,7 @@ def hollowness(mesh: Mesh) -> float:
 
 
 def _span(hull: ConvexHull, spots: F8) -> tuple[F8, F8]:
-    """Return the highest and the lowest z of a hull at places (n, 2)."""
+    """Return the largest and the smallest z of a hull at horizontal positions (n, 2)."""
     normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
     lid, base = np.full(len(spots), np.inf), np.full(len(spots), -np.inf)
     for (x, y, z), d in zip(normals, offsets, strict=True):

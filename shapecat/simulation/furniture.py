@@ -1,4 +1,4 @@
-"""What things stand on: floors, tables, shelves, walls."""
+"""Furniture: floors, tables, shelves and walls."""
 
 from collections.abc import Sequence
 

@@ -174,7 +174,7 @@ class _Gathered:
             self._bytes[name] += np.asarray(_column(frame, name), kind).tobytes()
 
     def columns(self) -> dict[str, Any]:
-        """Return the columns of `Hits`; this has none any more."""
+        """Return the columns of `Hits`, and give up the bytes they are made of."""
         counts = np.array(self._counts, np.int32)
         of_frames = {name: self._taken(name, kind) for name, kind in _OF_FRAMES.items()}
         which: Any = slice(None)

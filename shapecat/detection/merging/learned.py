@@ -58,27 +58,27 @@ def _merge(
     segments: Segments, view_geometry: ViewGeometry, grown: BoostedTrees, scratch: Scratch
 ) -> None:
     n = segments.parent.size
-    logits, looks = np.full((n, n), -np.inf), np.zeros(n, SEGMENT_FEATURES)
+    logits, features = np.full((n, n), -np.inf), np.zeros(n, SEGMENT_FEATURES)
     for p in range(1, n):
-        write_segment_features(segments, p, looks[p])
+        write_segment_features(segments, p, features[p])
     for p in range(1, n):
-        _rate(segments, looks, p, p + 1, view_geometry, grown, scratch, logits)
+        _rate(segments, features, p, p + 1, view_geometry, grown, scratch, logits)
     while True:
         best = np.argmax(logits)
         p, q = int(best // n), int(best % n)
         if logits[p, q] < MERGING.likely:
             return
         merge(segments, p, q)
-        write_segment_features(segments, p, looks[p])  # others meet as much as before
+        write_segment_features(segments, p, features[p])  # others meet as much as before
         for k in range(n):
             logits[q, k] = logits[k, q] = -np.inf
-        _rate(segments, looks, p, 1, view_geometry, grown, scratch, logits)
+        _rate(segments, features, p, 1, view_geometry, grown, scratch, logits)
 
 
 @kernel
 def _rate(
     segments: Segments,
-    looks: Records,
+    features: Records,
     p: int,
     first: int,
     view_geometry: ViewGeometry,
@@ -92,5 +92,5 @@ def _rate(
         low, high = min(p, q), max(p, q)
         logits[low, high] = -np.inf
         if adjacent[q]:
-            write_pair_features(segments, looks, low, high, view_geometry, scratch.pair[0])
+            write_pair_features(segments, features, low, high, view_geometry, scratch.pair[0])
             logits[low, high] = logit_of(grown, scratch.features, MERGING.hopeless)

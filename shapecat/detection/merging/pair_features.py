@@ -129,24 +129,24 @@ def pair_features(
     segments: Segments, p: int, q: int, view_geometry: ViewGeometry, out: Row
 ) -> None:
     """Write the `PAIR_FEATURES` of two segments to a record of them."""
-    looks = np.zeros(segments.parent.size, SEGMENT_FEATURES)
-    write_segment_features(segments, p, looks[p])
-    write_segment_features(segments, q, looks[q])
-    write_pair_features(segments, looks, p, q, view_geometry, out)
+    features = np.zeros(segments.parent.size, SEGMENT_FEATURES)
+    write_segment_features(segments, p, features[p])
+    write_segment_features(segments, q, features[q])
+    write_pair_features(segments, features, p, q, view_geometry, out)
 
 
 @kernel
 def write_pair_features(
-    segments: Segments, looks: Records, p: int, q: int, view_geometry: ViewGeometry, out: Row
+    segments: Segments, features: Records, p: int, q: int, view_geometry: ViewGeometry, out: Row
 ) -> None:
-    """Write `pair_features`; ``looks`` (n + 1,) are the `SEGMENT_FEATURES` of each segment."""
+    """Write `pair_features`; ``features`` (n + 1,) are the `SEGMENT_FEATURES` of each segment."""
     first, second = segments.statistics[p].area, segments.statistics[q].area
     if first > second or (first == second and p > q):
         p, q = q, p
     a, b = segments.statistics[p], segments.statistics[q]
     cell = a.depth_sum / a.count / view_geometry.focal
     _write_adjacency(segments, p, q, cell, out.adjacency)
-    out.first, out.second = looks[p], looks[q]
+    out.first, out.second = features[p], features[q]
     relation = out.relation
     _write_relation(a, b, relation)
     both = np.zeros(1, SEGMENT)[0]

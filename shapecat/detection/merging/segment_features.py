@@ -40,7 +40,7 @@ SEGMENT_FEATURES = np.dtype(
         ("filled", "f4"),  # area by width and height
     ]
 )
-"""What one segment looks like, and what its outline is made of."""
+"""Features of one segment: its size, shape and faces, and what its outline is made of."""
 
 
 @kernel

@@ -31,7 +31,7 @@ BLOCK = 16
 
 
 class GridLabels(NamedTuple):
-    """What is known of the cells, as in `DepthGrid` and `Segmentation`; ``plane_ids`` by label."""
+    """The fields of `DepthGrid` and `Segmentation` that kernels read; ``plane_ids`` (labels,)."""
 
     inverse_depth: F4
     labels: I4
@@ -53,7 +53,7 @@ def label_pixels(depth: F4, grid: DepthGrid, found: Segmentation, *, range_m: fl
 
 
 def grid_labels_of(grid: DepthGrid, found: Segmentation) -> GridLabels:
-    """Gather what the kernels here read."""
+    """Gather the fields that the kernels here read."""
     return GridLabels(grid.inverse_depth, found.labels, found.filled, found.planes, found.plane_ids)
 
 
@@ -132,9 +132,9 @@ def _end_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
 
 @kernel
 def list_runs(runs: I4, labels: int) -> tuple[U4, I4]:
-    """Return the indices in the runs by label, ascending, and where those of each label end.
+    """Return all pixel indices of the runs, sorted by label, and the end of each label's part.
 
-    The first end is that of label 0, which has none.
+    Label 0 has no pixels: its end is 0.
     """
     ends = np.zeros(labels, np.int64)
     for r in range(len(runs)):

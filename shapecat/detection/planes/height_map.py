@@ -34,7 +34,7 @@ FINE = 65536
 
 
 class HeightMap(NamedTuple):
-    """What every cell stands on.
+    """The plane below each cell of the grid, and the height above it.
 
     Attributes
     ----------

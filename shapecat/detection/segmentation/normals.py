@@ -208,7 +208,7 @@ def _three(
 
 @kernel(fast=True)
 def _sample(values: F4, p: int, center: float, gate: float) -> tuple[Any, Any]:
-    """Return the weight of a sample, and by that how much it differs from the centre."""
+    """Return the weight of a sample, 0 or 1, and its weighted difference from the centre."""
     v = values[p] - center
     weight = np.float32(1) if abs(v) < gate else np.float32(0)
     return weight, weight * v

@@ -1,4 +1,4 @@
-"""The report of a run as a page that works from a file, and served to correct tracks on disk."""
+"""The report of a run: a page to open as a file, or served to write corrections to disk."""
 
 from shapecat.outputs.report.writing import Reports, read_reports, write_reports
 
