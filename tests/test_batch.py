@@ -170,6 +170,7 @@ def test_changed_work_is_not_taken_for_done(recordings: Path, one_by_one: Path) 
     mcap.with_name("aside").rename(mcap)
 
 
+@pytest.mark.many
 def test_two_processes_give_the_same_tables(
     shapecat: Run, recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:

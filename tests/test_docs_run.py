@@ -87,7 +87,7 @@ def test_page_works_as_printed(
 
 @pytest.mark.many
 def test_cluster_page_works_as_printed(tmp_path: Path) -> None:
-    """Starting Dask and Ray from the shell takes a minute; `test_executors` runs on both."""
+    """Starting Dask and Ray from the shell takes a minute; `test_batch` runs on Dask."""
     page = "howto-cluster.md"
     run_in_shell(commands(page), tmp_path)
 

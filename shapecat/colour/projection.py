@@ -35,6 +35,7 @@ def project(points: F4, lens: LensCamera, colour_from_depth: Pose) -> F4:
 
     Examples
     --------
+    >>> from shapecat.types import Camera
     >>> lens = LensCamera(Camera(640, 480, 500.0, 500.0, 320.0, 240.0))
     >>> project(np.array([[0.1, -0.2, 1.0]]), lens, Pose(np.eye(3), np.array([0.1, 0.0, 1.0])))
     array([[370., 190.,   2.]], dtype=float32)
