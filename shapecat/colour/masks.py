@@ -99,19 +99,19 @@ def labelled_masks(
 
     Parameters
     ----------
-    seen : (h, w) labels from 1, 0 for what is none, -1 where nothing is known.
+    seen : (h, w) labels from 1, 0 for what is none, -1 where nothing is known; gaps in it are
+        filled.
     boxes : around each label, of `label_boxes`.
     scale : pixels of the image to a pixel of the depth image.
     corner : column and row of the image where ``seen`` begins.
     """
     narrow, wide = max(1, round(_NARROW_PX * scale)), max(1, round(_WIDE_PX * scale))
-    filled = seen.copy()
     for box in boxes[boxes[:, 2] > 0].tolist():
-        _fill(seen, tuple(box), narrow, wide, filled)
+        _fill(seen, tuple(box), narrow, wide)
     reach = max(1, round(_RAGGED_PX * scale / 2))
     places = boxes.tolist()
     return tuple(
-        _smoothed(filled, label, places[label], reach, corner) for label in range(1, len(boxes))
+        _smoothed(seen, label, places[label], reach, corner) for label in range(1, len(boxes))
     )
 
 
@@ -188,10 +188,11 @@ def _step_row(labels: I4, packed: I4, result: I4) -> None:
 
 
 @kernel
-def _fill(seen: I4, region: tuple[int, int, int, int], narrow: int, wide: int, filled: I4) -> None:
+def _fill(seen: I4, region: tuple[int, int, int, int], narrow: int, wide: int) -> None:
     """Give objects the pixels of no object that they surround in a region: a sweep there, one back.
 
-    ``region`` is left, top, and one more than right and bottom.
+    ``region`` is left, top, and one more than right and bottom. A pixel is filled once all others
+    know what it was.
     """
     left, top, right, bottom = region
     height, width = bottom - top, right - left
@@ -213,7 +214,7 @@ def _fill(seen: I4, region: tuple[int, int, int, int], narrow: int, wide: int, f
                 w, n = west[v, u + 1], north[v + 1, u]
                 found = _surrounding(label, w, east[u], n, below[u], narrow, wide)
                 if found > 0:
-                    filled[top + v, left + u] = found
+                    row[u] = found
 
 
 @kernel

@@ -4,7 +4,7 @@ import gc
 
 __all__ = ["collect_seldom"]
 
-_MADE = 50_000
+_MADE = 100_000
 """Objects made between two searches. The libraries alone hold 230,000, which Python, with its 700,
 walks so often that it is 3 % of a run."""
 

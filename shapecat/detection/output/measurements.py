@@ -156,8 +156,11 @@ def _measure_boxes(
     points, start = _outer_points(inv_depth, intrinsics, labels, level, measured)
     for k in range(start.size - 1):
         if start[k] < start[k + 1]:
-            box = level_box(points[:, start[k] : start[k + 1]], level)
-            measured.center[k], measured.size[k], measured.orientation[k] = box
+            center, size, turned = level_box(points[:, start[k] : start[k + 1]], level)
+            for d in range(4):  # whole rows would compile the error of one that does not fit
+                measured.orientation[k, d] = turned[d]
+            for d in range(3):
+                measured.center[k, d], measured.size[k, d] = center[d], size[d]
 
 
 @kernel(fast=True)

@@ -139,7 +139,7 @@ def _peaks(amount: F8, least: float) -> F8:
         falls = min(amount[k + 1], amount[k + 2], amount[k + 3]) < STRIPS.dip * here
         if falls and own > STRIPS.contrast * lower:
             upper = amount[k + 3 : k + STRIPS.above].sum()
-            peaks[n] = (k + 0.5 - BINS) * STRIPS.bin_m, upper / own
+            peaks[n, 0], peaks[n, 1] = (k + 0.5 - BINS) * STRIPS.bin_m, upper / own
             n += 1
     return peaks[:n]
 
