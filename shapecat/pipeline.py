@@ -16,7 +16,7 @@ from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import OutputError
 from shapecat.executors.order import read_ahead
 from shapecat.learning import load_model
-from shapecat.outputs.colouring import Seen, colours_of, find_masks, with_colour
+from shapecat.outputs.colouring import Seen, colours_of, find_masks
 from shapecat.recordings import Recording, choose_streams, open_recording
 from shapecat.rehearsal import compile_all
 from shapecat.runs.corrections import adopt_labels, read_labels
@@ -194,12 +194,13 @@ def annotate(
 
     def write_rrd() -> None:
         from shapecat.outputs.review import write_review  # noqa: PLC0415  loads Rerun on first use
+        from shapecat.outputs.review_scenes import with_clouds  # noqa: PLC0415  the same
         from shapecat.runs.labels import read_labelled_frames  # noqa: PLC0415  the same
 
         labelled = read_labelled_frames(folder, labels())
         shown = _observed(labelled, "review", total, observe)
         found = masks() if run.get("color") and not masks_known() else None
-        pairs = with_colour(shown, recording, run, folder, found)
+        pairs = with_clouds(shown, recording, run, folder, found)
         write_review(
             folder / "review.rrd",
             read_ahead(pairs, count=_AHEAD) if cores > 1 else pairs,

@@ -22,6 +22,7 @@ from shapecat.errors import NoStreamError
 from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encoder_for
 from shapecat.outputs.review import write_review
+from shapecat.outputs.review_scenes import ReviewFrame
 from shapecat.recordings.protobuf import message_decoder
 from shapecat.runs.corrections import read_labels
 from shapecat.runs.jobs import Job
@@ -238,7 +239,9 @@ def test_a_damaged_image_costs_the_review_only_itself(tmp_path: Path) -> None:
     for k, data in enumerate((whole[:half] + bytes(20) + whole[half + 20 :], whole)):
         image = ColourImage("/color", stamp(k), stamp(k), "optical", "png", 64, 48, 0, data)
         views.append(Coloured(ColourView(image), (Mask(3, 4, np.ones((5, 6), bool)),)))
-    scenes = [(*scene(k, [labelled_object(1)]), view) for k, view in enumerate(views)]
+    scenes = [
+        ReviewFrame(*scene(k, [labelled_object(1)]), view, True) for k, view in enumerate(views)
+    ]
     path = tmp_path / "review.rrd"
     write_review(
         path,

@@ -55,6 +55,29 @@ def read(path: Path, *topics: str, **options: Any) -> tuple[list[Frame], Counter
         return result, skipped, recording.warnings
 
 
+def test_needed_frames_are_the_same_as_if_all_were_read(tmp_path: Path) -> None:
+    """Those between them are left out where the file has an index, and still counted."""
+    items = []
+    for k in range(12):
+        stamp = EPOCH + k * SECOND
+        items += [
+            ("/depth/camera_info", stamp, info(stamp)),
+            ("/depth/image_rect", stamp + 1, image(stamp, wavy_depth() + np.float32(0.1 * k))),
+        ]
+    path = write(tmp_path / "a.mcap", items)
+    every, _, _ = read(path)
+    times = {every[k].log_time_ns for k in (0, 5, 6, 11)}
+
+    some, _, _ = read(path, needed=lambda _, log_time_ns: log_time_ns in times)
+
+    assert len(every) == 12
+    assert [frame.index for frame in some] == [0, 5, 6, 11]
+    for frame in some:
+        same = every[frame.index]
+        assert (frame.stamp_ns, frame.camera) == (same.stamp_ns, same.camera)
+        np.testing.assert_array_equal(frame.depth, same.depth)
+
+
 def test_depth_image_and_organized_cloud_give_the_same_frame(tmp_path: Path) -> None:
     """Whatever a sensor's driver recorded, the objects must not change."""
     depth = wavy_depth()

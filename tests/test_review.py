@@ -17,7 +17,7 @@ from shapecat.outputs import review, review_viewer
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import paint
 from shapecat.outputs.review_layout import Eye, stepped_back
-from shapecat.outputs.review_scenes import choose_scenes
+from shapecat.outputs.review_scenes import ReviewFrame, choose_scenes
 from shapecat.outputs.review_shapes import markdown
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 from tests.test_executors import alive
@@ -77,7 +77,15 @@ def write(path: Path, scenes: Iterable[tuple[LabelledFrame, Frame]], **options: 
         "cloud_points": 1000,
         "fixed_frame": None,
     }
-    review.write_review(path, ((*one, None) for one in scenes), **(settings | options))
+    settings |= options
+    fixed = settings["fixed_frame"] is not None
+    pairs = list(scenes)
+    chosen = choose_scenes([labelled for labelled, _ in pairs], fixed=fixed)
+    frames = [
+        ReviewFrame(labelled, frame if due else None, None, due)
+        for (labelled, due), (_, frame) in zip(chosen, pairs, strict=True)
+    ]
+    review.write_review(path, frames, **settings)
     return path
 
 
@@ -206,8 +214,8 @@ def test_a_frame_without_a_pose_does_not_end_the_review(tmp_path: Path) -> None:
 
 
 def drawn(scenes: Iterable[tuple[LabelledFrame, Frame]], *, fixed: bool) -> list[int]:
-    shown = choose_scenes(((*one, None) for one in scenes), fixed=fixed)
-    return [one.labelled.index for one in shown if one.drawn]
+    chosen = choose_scenes((labelled for labelled, _ in scenes), fixed=fixed)
+    return [labelled.index for labelled, due in chosen if due]
 
 
 def walked(places: Iterable[float]) -> list[tuple[LabelledFrame, Frame]]:

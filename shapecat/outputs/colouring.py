@@ -1,8 +1,10 @@
 """The colour images of a run: which there are, and the masks of its detections on them."""
 
+import math
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from shapecat.executors.order import map_ahead
 from shapecat.recordings import Recording, choose_streams
 from shapecat.recordings.colour_frames import frames_with_colour
 from shapecat.recordings.colour_streams import ColourStream, choose_colour
+from shapecat.recordings.messages import Needed
 from shapecat.runs.masks import FrameMasks, MaskRow, MaskTable, read_masks
 from shapecat.runs.run_info import RunInfo, window_of
 from shapecat.runs.tables import Key, frame_rows, numbers, read_row_groups
@@ -32,6 +35,10 @@ __all__ = [
 
 Seen = tuple[Frame, ColourView | None, FrameMasks | None]
 """A frame, its colour image, and the masks of its detections on it."""
+
+
+_AHEAD = 4
+"""Frames that are looked for in advance."""
 
 
 @dataclass(frozen=True)
@@ -57,12 +64,20 @@ def colours_of(recording: Recording, options: Mapping[str, Any]) -> dict[str, Co
     return {topic: colour for topic, colour in found.items() if colour is not None}
 
 
-def views_again(recording: Recording, run: RunInfo) -> Iterator[tuple[Frame, ColourView | None]]:
-    """Read the frames that a run was made from once more, with their colour images."""
+def views_again(
+    recording: Recording, run: RunInfo, needed: Needed = None
+) -> Iterator[tuple[Frame, ColourView | None]]:
+    """Read the frames that a run was made from once more, with their colour images.
+
+    Parameters
+    ----------
+    needed : as for `shapecat.recordings.frames`.
+    """
     options = run["options"]
     streams = choose_streams(recording, options["topics"])
     colours = colours_of(recording, options)
-    return frames_with_colour(recording, streams, colours, skipped=Counter(), **window_of(options))
+    chosen = {"needed": needed, **window_of(options)}
+    return frames_with_colour(recording, streams, colours, skipped=Counter(), **chosen)
 
 
 def with_colour(
@@ -74,6 +89,8 @@ def with_colour(
 ) -> Iterator[tuple[LabelledFrame, Frame, Coloured | None]]:
     """Pair labelled frames, in the order they were read, with their clouds and colour images.
 
+    Frames between them need not be read.
+
     Parameters
     ----------
     seen : of `find_masks`, which is gone through to its end; by default the masks are read.
@@ -82,8 +99,9 @@ def with_colour(
     ------
     OutputError : the recording does not hold one of them any more.
     """
-    seen = _with_known_masks(recording, run, folder) if seen is None else seen
-    for label in labelled:
+    awaited = _Awaited(labelled)
+    seen = _with_known_masks(recording, run, folder, awaited.needs) if seen is None else seen
+    for label in awaited:
         for frame, view, found in seen:
             if (label.topic, label.index) == (frame.topic, frame.index):
                 yield label, frame, _coloured(label, view, found)
@@ -92,6 +110,27 @@ def with_colour(
             msg = f"{recording.path}: has changed since it was processed; process it again"
             raise OutputError(msg)
     deque(seen, maxlen=0)
+
+
+class _Awaited:
+    """Frames that are looked for; a few are known in advance, so that others need not be read."""
+
+    def __init__(self, frames: Iterable[LabelledFrame]) -> None:
+        self._source = iter(frames)
+        self._next = deque(islice(self._source, _AHEAD))
+
+    def __iter__(self) -> Iterator[LabelledFrame]:
+        """Yield the frames, each awaited until the next one is asked for."""
+        while self._next:
+            yield self._next[0]
+            self._next.popleft()
+            self._next.extend(islice(self._source, 1))
+
+    def needs(self, topic: str, log_time_ns: int) -> bool:
+        """Return whether a frame is awaited, or is later than those that are known."""
+        times = [one.log_time_ns for one in self._next if one.topic == topic]
+        last = self._next[-1].log_time_ns if len(self._next) == _AHEAD else math.inf
+        return log_time_ns in times or log_time_ns >= last
 
 
 def _coloured(
@@ -103,11 +142,13 @@ def _coloured(
     return Coloured(view, tuple(objects))
 
 
-def _with_known_masks(recording: Recording, run: RunInfo, folder: Path) -> Iterator[Seen]:
-    """Yield the frames of a run with the masks of its table."""
+def _with_known_masks(
+    recording: Recording, run: RunInfo, folder: Path, needed: Needed
+) -> Iterator[Seen]:
+    """Yield the needed frames of a run with the masks of its table; with colour it is all."""
     rows = read_masks(folder)
     found = next(rows, None)
-    for frame, view in views_again(recording, run):
+    for frame, view in views_again(recording, run, None if run.get("color") else needed):
         if found is not None and found.key == (frame.topic, frame.index):
             yield frame, view, found
             found = next(rows, None)

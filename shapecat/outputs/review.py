@@ -46,14 +46,13 @@ import rerun as rr
 from shapecat.executors.order import map_ahead
 from shapecat.geometry import IDENTITY, transform
 from shapecat.outputs import review_shapes as shapes
-from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_columns import At, Columns, curve
 from shapecat.outputs.review_file import open_review
 from shapecat.outputs.review_images import Images
 from shapecat.outputs.review_layout import Eye, TrackView, choose_eye, lay_out, stepped_back
 from shapecat.outputs.review_paths import Paths
-from shapecat.outputs.review_scenes import PaintedFrame, choose_scenes, paint_frame
+from shapecat.outputs.review_scenes import PaintedFrame, ReviewFrame, paint_frame
 from shapecat.outputs.review_shapes import SCENE, SKETCH, Drawing, DrawnScene
 from shapecat.outputs.review_viewer import open_viewer, take_screenshot
 from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
@@ -65,7 +64,7 @@ _FLUSH_FRAMES = 32
 
 def write_review(
     path: Path,
-    frames: Iterable[tuple[LabelledFrame, Frame, Coloured | None]],
+    frames: Iterable[ReviewFrame],
     *,
     name: str,
     run: Mapping[str, object],
@@ -79,8 +78,7 @@ def write_review(
     Parameters
     ----------
     path : the file; it appears when complete and replaces an older one.
-    frames : labelled frames with their points, and their colour image if there is one, in the
-        order of the recording.
+    frames : in the order of the recording, those that are drawn with their points.
     name : name of the recording in the viewer.
     run : the contents of run.json; a list under ``warnings`` is also logged.
     categories : in the order of the posteriors.
@@ -102,9 +100,7 @@ def write_review(
         stream.send_recording_name(name)
         review = _Review(stream, categories, fixed_frame)
         review.begin(run)
-        drawn = choose_scenes(frames, fixed=fixed_frame is not None)
-        paint_one = partial(paint_frame, limit=cloud_points)
-        painted = map_ahead(paint_one, drawn, threads=threads)
+        painted = map_ahead(partial(paint_frame, limit=cloud_points), frames, threads=threads)
         for k, one in enumerate(painted):
             file.check()
             review.add(one)
@@ -162,7 +158,8 @@ class _Review:
         entity = rr.new_entity_path(["world", labelled.topic])
         self._stream.set_time("sensor_time", timestamp=np.datetime64(labelled.stamp_ns, "ns"))
         self._stream.set_time("frame", sequence=labelled.index)
-        self._place_sensor(entity, labelled, frame)
+        if frame is not None:
+            self._place_sensor(entity, labelled, frame)
         self._draw(entity, painted)
         if painted.picture is not None:
             at = (labelled.stamp_ns, labelled.index)

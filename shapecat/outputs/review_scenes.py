@@ -1,18 +1,22 @@
 """The frames of a review: their scenes, drawn seldom while nothing moves, and their painting."""
 
 import math
+from collections import deque
 from collections.abc import Iterable, Iterator
+from itertools import tee
+from pathlib import Path
 from typing import NamedTuple
 
 from shapecat.arrays import F8
 from shapecat.geometry import IDENTITY, transform
-from shapecat.outputs.colouring import Coloured
+from shapecat.outputs.colouring import Coloured, Seen, with_colour
 from shapecat.outputs.review_cloud import PaintedCloud, paint
 from shapecat.outputs.review_images import Picture, picture_of
-from shapecat.recordings import MessageError
+from shapecat.recordings import MessageError, Recording
+from shapecat.runs.run_info import RunInfo
 from shapecat.types import Frame, LabelledFrame
 
-__all__ = ["PaintedFrame", "ReviewFrame", "choose_scenes", "paint_frame"]
+__all__ = ["PaintedFrame", "ReviewFrame", "choose_scenes", "paint_frame", "with_clouds"]
 
 _SOON_NS, _LATE_NS = 90_000_000, 240_000_000
 """From a scene to the next one: at least, and at most where the frames differ."""
@@ -21,18 +25,48 @@ _STILL_M = 0.015
 
 
 class ReviewFrame(NamedTuple):
-    """A frame to be written, and whether its scene is drawn."""
+    """A frame to be written, and whether its scene is drawn; else its points may be missing."""
 
     labelled: LabelledFrame
-    frame: Frame
+    frame: Frame | None
     coloured: Coloured | None
     drawn: bool
 
 
-def choose_scenes(
-    frames: Iterable[tuple[LabelledFrame, Frame, Coloured | None]], *, fixed: bool
+def with_clouds(
+    frames: Iterable[LabelledFrame],
+    recording: Recording,
+    run: RunInfo,
+    folder: Path,
+    seen: Iterator[Seen] | None = None,
 ) -> Iterator[ReviewFrame]:
-    """Choose the frames whose scene is drawn: none that repeats, few while nothing moves.
+    """Yield all frames of a run, with the clouds of those whose scene is drawn.
+
+    Parameters
+    ----------
+    seen : as for `shapecat.outputs.colouring.with_colour`.
+
+    Raises
+    ------
+    OutputError : the recording does not hold one of them any more.
+    """
+    first, second = tee(choose_scenes(frames, fixed=run["fixed_frame"] is not None))
+    coloured = bool(run.get("color"))  # then every frame shows a picture
+    wanted = (labelled for labelled, drawn in first if drawn or coloured)
+    read = with_colour(wanted, recording, run, folder, seen)
+    for labelled, drawn in second:
+        if drawn or coloured:
+            _, frame, view = next(read)
+            yield ReviewFrame(labelled, frame, view, drawn)
+        else:
+            yield ReviewFrame(labelled, None, None, drawn)
+    deque(read, maxlen=0)
+
+
+def choose_scenes(
+    frames: Iterable[LabelledFrame], *, fixed: bool
+) -> Iterator[tuple[LabelledFrame, bool]]:
+    """Tell which frames have their scene drawn: none that repeats, few while nothing moves.
 
     Parameters
     ----------
@@ -40,12 +74,12 @@ def choose_scenes(
         a camera that moves does not move the scene.
     """
     last: dict[str, LabelledFrame] = {}  # drawn of each topic
-    for labelled, frame, coloured in frames:
+    for labelled in frames:
         before = last.get(labelled.topic)
         drawn = before is None or _is_due(labelled, before, fixed=fixed)
         if drawn:
             last[labelled.topic] = labelled
-        yield ReviewFrame(labelled, frame, coloured, drawn)
+        yield labelled, drawn
 
 
 def _is_due(labelled: LabelledFrame, before: LabelledFrame, *, fixed: bool) -> bool:
@@ -78,7 +112,7 @@ class PaintedFrame(NamedTuple):
     """
 
     labelled: LabelledFrame
-    frame: Frame
+    frame: Frame | None
     clouds: tuple[PaintedCloud, PaintedCloud] | None
     picture: Picture | None
     damage: str
@@ -88,6 +122,8 @@ def paint_frame(chosen: ReviewFrame, *, limit: int) -> PaintedFrame:
     """Paint the clouds and the masks of a frame; without colour if its image is damaged."""
     labelled, frame, coloured, drawn = chosen
     damage, parts = "", (labelled.planes, labelled.objects)
+    if frame is None:
+        return PaintedFrame(labelled, None, None, None, "")
     if coloured is not None:
         try:
             clouds = paint(frame, *parts, limit=limit, view=coloured.view) if drawn else None

@@ -3,7 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 
-from shapecat.recordings.messages import Message
+from shapecat.recordings.messages import Message, Needed
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.sources import SOURCES, DepthSource, Source
 from shapecat.recordings.streams import Stream
@@ -21,6 +21,7 @@ def frames(
     every: int = 1,
     skipped: Counter[str],
     heard: Mapping[str, Callable[[Message], None]] | None = None,
+    needed: Needed = None,
 ) -> Iterator[Frame]:
     """Read the frames of some streams in flat memory.
 
@@ -33,6 +34,7 @@ def frames(
     every : keep each so-many-th frame of a stream.
     skipped : frames that cannot be read are counted here by reason; they never raise.
     heard : is told of the messages of other topics as they pass, so that they are read only once.
+    needed : tells by topic and log time which frames are; an indexed file may leave out others.
 
     Yields
     ------
@@ -54,7 +56,12 @@ def frames(
             infos.setdefault(source.info_topic, []).append(source)
     limits = [None if s is None else recording.start_ns + round(s * 1e9) for s in (start_s, end_s)]
     heard = heard or {}
-    for message in recording.messages({*sources, *infos, *heard}, *limits):
+
+    def is_needed(topic: str, log_time_ns: int) -> bool:
+        return needed is None or topic not in sources or needed(topic, log_time_ns)
+
+    topics = {*sources, *infos, *heard}
+    for message in recording.messages(topics, limits[0], limits[1], is_needed):
         if message.topic in heard:
             heard[message.topic](message)
         for depth in infos.get(message.topic, ()):
@@ -62,8 +69,10 @@ def frames(
         chosen = sources.get(message.topic)
         if chosen is not None and message.type == chosen.stream.type:
             chosen.index += 1
-            if (chosen.index - 1) % every == 0:
+            unread = not message.data and not is_needed(message.topic, message.log_time_ns)
+            if (chosen.index - 1) % every == 0 and not unread:
                 yield from chosen.read(message, skipped)
     for source in sources.values():
         yield from source.finish(skipped)
-        source.clock.report(recording)
+        if needed is None:  # else it has not seen all
+            source.clock.report(recording)

@@ -5,14 +5,19 @@ out, and both are said in the warnings.
 """
 
 from collections import Counter
-from collections.abc import Iterator
-from itertools import chain
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import ClassVar
 
 from mcap import records
 
 from shapecat.errors import RecordingError
+from shapecat.recordings.mcap_index import (
+    IndexedMessage,
+    overlaps,
+    read_message_index,
+    unread,
+)
 from shapecat.recordings.mcap_records import (
     MAGIC,
     ChunkError,
@@ -24,13 +29,12 @@ from shapecat.recordings.mcap_records import (
     read_chunk,
     read_content,
     read_cut_chunk,
-    read_message_index,
     split_chunk,
     split_message,
     walk,
 )
 from shapecat.recordings.mcap_summary import Summary, read_summary
-from shapecat.recordings.messages import Channel, Message, Stamp, Topic, Topics, ros_type
+from shapecat.recordings.messages import Channel, Message, Needed, Stamp, Topic, Topics, ros_type
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.time_order import Timed, in_time_order
 
@@ -92,7 +96,11 @@ class McapRecording(Recording):
         self._file.close()
 
     def messages(
-        self, topics: Topics = None, start_ns: Stamp = None, stop_ns: Stamp = None
+        self,
+        topics: Topics = None,
+        start_ns: Stamp = None,
+        stop_ns: Stamp = None,
+        needed: Needed = None,
     ) -> Iterator[Message]:
         """Yield undecoded messages; see `Recording.messages`."""
         wanted = {
@@ -100,19 +108,22 @@ class McapRecording(Recording):
             for number, channel in self._channels.items()
             if topics is None or channel.topic in topics
         }
-        raw = self._by_time(wanted, start_ns, stop_ns) if self.indexed else self._in_file(wanted)
+        if self.indexed:
+            raw = self._by_time(wanted, start_ns, stop_ns, needed)
+        else:
+            raw = self._in_file(wanted)
         for message in raw:
             if start_ns is not None and message.log_time < start_ns:
                 continue
             if stop_ns is not None and message.log_time >= stop_ns:
                 continue
-            yield Message(
-                self._channels[message.channel_id],
-                message.log_time,
-                message.publish_time,
-                message.sequence,
-                bytes(message.data) if len(message.data) <= _SMALL else message.data,
-            )
+            channel = self._channels[message.channel_id]
+            data: bytes | memoryview = message.data
+            if needed is not None and not needed(channel.topic, message.log_time):
+                data = b""
+            elif len(data) <= _SMALL:
+                data = bytes(data)
+            yield Message(channel, message.log_time, message.publish_time, message.sequence, data)
 
     def top_level(self) -> Iterator[Record]:
         """Yield the whole records of the data section, without their content."""
@@ -236,23 +247,44 @@ class McapRecording(Recording):
             self.summary.channels.setdefault(channel.id, channel)
 
     def _by_time(
-        self, wanted: set[int], start_ns: int | None, stop_ns: int | None
+        self, wanted: set[int], start_ns: int | None, stop_ns: int | None, needed: Needed
     ) -> Iterator[RawMessage]:
         """Merge the chunks by log time; ties in the order of the file."""
         chunks = [
             (c.message_start_time, c.chunk_start_offset, c)
             for c in self.summary.chunks
-            if _overlaps(c, wanted, start_ns, stop_ns)
+            if overlaps(c, wanted, start_ns, stop_ns)
         ]
 
+        def is_needed(message: IndexedMessage) -> bool:
+            if needed is None or message.channel_id not in wanted:
+                return message.channel_id in wanted
+            return needed(self._channels[message.channel_id].topic, message.log_time)
+
         def read(chunk: records.ChunkIndex) -> Iterator[tuple[Timed, RawMessage]]:
-            for message in self._indexed_chunk(chunk, wanted):
+            for message in self._indexed_chunk(chunk, is_needed):
                 if message.channel_id in wanted:
                     yield Timed(message.log_time, len(message.data)), message
 
         yield from in_time_order(chunks, read)
 
-    def _indexed_chunk(self, chunk: records.ChunkIndex, wanted: set[int]) -> Iterator[RawMessage]:
+    def _indexed_chunk(
+        self, chunk: records.ChunkIndex, needed: Callable[[IndexedMessage], bool]
+    ) -> Iterator[RawMessage]:
+        """Yield the messages of a chunk, those behind the last needed one without their data.
+
+        So transforms are read without the images that fill their chunks, and few images of many.
+        """
+        indexed = read_message_index(self._file, chunk)
+        last = max((m.place for m in indexed if needed(m)), default=-1)
+        end = min((m.place for m in indexed if m.place > last), default=chunk.uncompressed_size)
+        if end > _PART * chunk.uncompressed_size:
+            end = chunk.uncompressed_size
+        if last >= 0 or not indexed:
+            yield from self._chunk_at(chunk, end)
+        yield from (unread(message) for message in indexed if message.place >= end)
+
+    def _chunk_at(self, chunk: records.ChunkIndex, end: int) -> Iterator[RawMessage]:
         try:
             record = next(walk(self._file, chunk.chunk_start_offset, self._size))
         except (TruncatedError, StopIteration):
@@ -260,26 +292,7 @@ class McapRecording(Recording):
         if record is None or record.opcode != Opcode.CHUNK:
             self.warn(f"no chunk at byte {chunk.chunk_start_offset}, where the index has one")
             return
-        yield from self._chunk(record, self._end_of(chunk, wanted))
-
-    def _end_of(self, chunk: records.ChunkIndex, wanted: set[int]) -> int | None:
-        """Return where the last wanted message of a chunk ends, None if it is needed to its end.
-
-        Transforms are read before the images that fill their chunks.
-        """
-        begin = chunk.chunk_start_offset + chunk.chunk_length
-        places: dict[int, list[int]] = {}
-        try:
-            for record in walk(self._file, begin, begin + chunk.message_index_length):
-                places |= [read_message_index(self.content(record))]
-        except (ChunkError, TruncatedError):
-            return None
-        if places.keys() != chunk.message_index_offsets.keys():
-            return None
-        last = max(chain([0], *(places[channel] for channel in places.keys() & wanted)))
-        later = (place for place in chain(*places.values()) if place > last)
-        end = min(later, default=chunk.uncompressed_size)
-        return end if end <= _PART * chunk.uncompressed_size else None
+        yield from self._chunk(record, end if end < chunk.uncompressed_size else None)
 
     def _channel(self, channel: records.Channel) -> Channel:
         schema = self.summary.schemas.get(channel.schema_id)
@@ -309,14 +322,3 @@ _NONE = ("", "", b"")
 _KNOWN = {int(opcode) for opcode in Opcode} | set(range(128, 256))
 """Opcodes from 128 on are for private use."""
 _DEFINING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
-
-
-def _overlaps(
-    chunk: records.ChunkIndex, wanted: set[int], start_ns: int | None, stop_ns: int | None
-) -> bool:
-    if start_ns is not None and chunk.message_end_time < start_ns:
-        return False
-    if stop_ns is not None and chunk.message_start_time >= stop_ns:
-        return False
-    # Without message indexes any chunk may hold any channel.
-    return not chunk.message_index_offsets or not wanted.isdisjoint(chunk.message_index_offsets)

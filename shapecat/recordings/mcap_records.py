@@ -31,7 +31,6 @@ __all__ = [
     "read_chunk_index",
     "read_content",
     "read_cut_chunk",
-    "read_message_index",
     "split_chunk",
     "split_message",
     "walk",
@@ -47,10 +46,8 @@ _INDEX = struct.Struct("<QQQQI")
 _ENTRY = struct.Struct("<HQ")
 _NAMED = struct.Struct("<QI")
 _SIZES = struct.Struct("<QQ")
-_MESSAGE_INDEX = struct.Struct("<HI")
-_TIMED = struct.Struct("<QQ")
 """A chunk index: times, place and bytes of entries; an entry; bytes of the message indexes and of
-the compression's name; the sizes. A message index: channel and bytes of entries; an entry."""
+the compression's name; the sizes."""
 _FREELY = 256 << 20
 """Chunks up to this size are decompressed whatever they claim, bytes."""
 _RATIO = 1000
@@ -172,22 +169,6 @@ def write_chunk_index(index: records.ChunkIndex) -> bytes:
         _SIZES.pack(index.compressed_size, index.uncompressed_size),
     )
     return _HEAD.pack(Opcode.CHUNK_INDEX, sum(map(len, content))) + b"".join(content)
-
-
-def read_message_index(content: bytes) -> tuple[int, list[int]]:
-    """Return the channel of a message index, and where its messages are in their chunk.
-
-    Raises
-    ------
-    ChunkError : the record is not what it claims to be.
-    """
-    try:
-        channel, length = _MESSAGE_INDEX.unpack_from(content)
-        entries = content[_MESSAGE_INDEX.size :][:length]
-        return channel, [offset for _, offset in _TIMED.iter_unpack(entries)]
-    except struct.error as error:
-        msg = f"damaged record: {error}"
-        raise ChunkError(msg) from error
 
 
 def read_chunk(content: bytes, *, end: int | None = None, checked: bool = False) -> memoryview:

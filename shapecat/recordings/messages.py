@@ -1,17 +1,19 @@
 """The small records of a log: channels, messages, topics."""
 
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 from shapecat.errors import RecordingError
 
-__all__ = ["Channel", "Message", "MessageError", "Stamp", "Topic", "Topics", "ros_type"]
+__all__ = ["Channel", "Message", "MessageError", "Needed", "Stamp", "Topic", "Topics", "ros_type"]
 
 Topics: TypeAlias = Collection[str] | None
 """The names of topics; None means all."""
 Stamp: TypeAlias = int | None
 """A log time in nanoseconds; None means no limit."""
+Needed: TypeAlias = Callable[[str, int], bool] | None
+"""Tells by topic and log time whether the data of a message is needed; None means always."""
 
 
 class MessageError(RecordingError):

@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from shapecat.recordings.messages import Channel, Message, Stamp, Topic, Topics
+from shapecat.recordings.messages import Channel, Message, Needed, Stamp, Topic, Topics
 
 __all__ = ["Recording"]
 
@@ -46,7 +46,11 @@ class Recording(ABC):
 
     @abstractmethod
     def messages(
-        self, topics: Topics = None, start_ns: Stamp = None, stop_ns: Stamp = None
+        self,
+        topics: Topics = None,
+        start_ns: Stamp = None,
+        stop_ns: Stamp = None,
+        needed: Needed = None,
     ) -> Iterator[Message]:
         """Yield undecoded messages in constant memory.
 
@@ -54,6 +58,7 @@ class Recording(ABC):
         ----------
         topics : names to read; all by default.
         start_ns, stop_ns : log times of the first message and of the first one left out.
+        needed : an indexed file may give other messages without their data, unread.
 
         Yields
         ------

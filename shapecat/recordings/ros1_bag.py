@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 from shapecat.errors import RecordingError
-from shapecat.recordings.messages import Channel, Message, Stamp, Topic, Topics, ros_type
+from shapecat.recordings.messages import Channel, Message, Needed, Stamp, Topic, Topics, ros_type
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.ros1_records import (
     BAG_HEADER,
@@ -80,7 +80,11 @@ class BagRecording(Recording):
         self._file.close()
 
     def messages(
-        self, topics: Topics = None, start_ns: Stamp = None, stop_ns: Stamp = None
+        self,
+        topics: Topics = None,
+        start_ns: Stamp = None,
+        stop_ns: Stamp = None,
+        needed: Needed = None,  # noqa: ARG002  all data is read
     ) -> Iterator[Message]:
         """Yield undecoded messages; see `Recording.messages`."""
         wanted = {n for n, c in self._channels.items() if topics is None or c.topic in topics}

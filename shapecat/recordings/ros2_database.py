@@ -12,7 +12,7 @@ from rosbags.rosbag2.metadata import dump_qos_v8
 
 from shapecat.errors import RecordingError
 from shapecat.recordings.decoding import LIBRARY_ERRORS
-from shapecat.recordings.messages import Channel, Message, Stamp, Topic, Topics, ros_type
+from shapecat.recordings.messages import Channel, Message, Needed, Stamp, Topic, Topics, ros_type
 from shapecat.recordings.recording import Recording
 
 __all__ = ["DatabaseRecording"]
@@ -60,7 +60,11 @@ class DatabaseRecording(Recording):
         self._reader.close()
 
     def messages(
-        self, topics: Topics = None, start_ns: Stamp = None, stop_ns: Stamp = None
+        self,
+        topics: Topics = None,
+        start_ns: Stamp = None,
+        stop_ns: Stamp = None,
+        needed: Needed = None,  # noqa: ARG002  all data is read
     ) -> Iterator[Message]:
         """Yield undecoded messages; see `Recording.messages`."""
         wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]

@@ -16,7 +16,7 @@ import zstandard
 
 from shapecat.errors import RecordingError
 from shapecat.recordings.mcap_file import McapRecording
-from shapecat.recordings.messages import Channel, Message, Stamp, Topic, Topics
+from shapecat.recordings.messages import Channel, Message, Needed, Stamp, Topic, Topics
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.ros2_database import DatabaseRecording
 from shapecat.system.files import lock
@@ -87,10 +87,14 @@ class FolderRecording(Recording):
         return tuple(dict.fromkeys(c for part in self._parts for c in part.channels()))
 
     def messages(
-        self, topics: Topics = None, start_ns: Stamp = None, stop_ns: Stamp = None
+        self,
+        topics: Topics = None,
+        start_ns: Stamp = None,
+        stop_ns: Stamp = None,
+        needed: Needed = None,
     ) -> Iterator[Message]:
         """Yield undecoded messages of all parts; see `Recording.messages`."""
-        streams = [part.messages(topics, start_ns, stop_ns) for part in self._parts]
+        streams = [part.messages(topics, start_ns, stop_ns, needed) for part in self._parts]
         if self._overlap:
             yield from merge(*streams, key=lambda message: message.log_time_ns)
         else:

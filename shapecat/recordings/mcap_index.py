@@ -1,0 +1,61 @@
+"""What the indexes of an MCAP file tell of its chunks."""
+
+import struct
+from itertools import chain
+from typing import BinaryIO, NamedTuple
+
+from mcap import records
+
+from shapecat.recordings.mcap_records import (
+    RawMessage,
+    TruncatedError,
+    read_content,
+    walk,
+)
+
+__all__ = ["IndexedMessage", "overlaps", "read_message_index", "unread"]
+
+_HEAD = struct.Struct("<HI")
+_ENTRY = struct.Struct("<QQ")
+"""The channel and the bytes of the entries; an entry."""
+
+
+class IndexedMessage(NamedTuple):
+    """What an index tells of a message; ``place`` is where its record is in the chunk, bytes."""
+
+    channel_id: int
+    log_time: int
+    place: int
+
+
+def overlaps(
+    chunk: records.ChunkIndex, wanted: set[int], start_ns: int | None, stop_ns: int | None
+) -> bool:
+    """Return whether a chunk may hold wanted messages of a time."""
+    if start_ns is not None and chunk.message_end_time < start_ns:
+        return False
+    if stop_ns is not None and chunk.message_start_time >= stop_ns:
+        return False
+    # Without message indexes any chunk may hold any channel.
+    return not chunk.message_index_offsets or not wanted.isdisjoint(chunk.message_index_offsets)
+
+
+def read_message_index(file: BinaryIO, chunk: records.ChunkIndex) -> list[IndexedMessage]:
+    """Return the messages of a chunk; none if their index is damaged or lacks a channel."""
+    begin = chunk.chunk_start_offset + chunk.chunk_length
+    found: dict[int, list[IndexedMessage]] = {}
+    try:
+        for record in walk(file, begin, begin + chunk.message_index_length):
+            content = read_content(file, record)
+            channel, length = _HEAD.unpack_from(content)
+            entries = _ENTRY.iter_unpack(content[_HEAD.size :][:length])
+            found[channel] = [IndexedMessage(channel, time, place) for time, place in entries]
+    except (TruncatedError, struct.error):
+        return []
+    complete = found.keys() == chunk.message_index_offsets.keys()
+    return list(chain(*found.values())) if complete else []
+
+
+def unread(message: IndexedMessage) -> RawMessage:
+    """Return a message without its data."""
+    return RawMessage(message.channel_id, 0, message.log_time, message.log_time, memoryview(b""))
