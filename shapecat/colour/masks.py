@@ -149,8 +149,7 @@ def united(masks: Sequence[Mask]) -> Mask:
 def label_boxes(seen: I4, count: int) -> I4:
     """Return (count + 1, 4) left, top, and one more than right and bottom, of each label."""
     boxes = np.zeros((count + 1, 4), np.int64)
-    for label in range(boxes.shape[0]):
-        boxes[label] = seen.shape[1], seen.shape[0], 0, 0
+    boxes[:, 0], boxes[:, 1] = seen.shape[1], seen.shape[0]
     for v in range(seen.shape[0]):
         row, last = seen[v], 0
         for u in range(row.size):

@@ -136,20 +136,19 @@ def list_runs(runs: I4, labels: int) -> tuple[U4, I4]:
 
     Label 0 has no pixels: its end is 0.
     """
-    ends = np.zeros(labels, np.int64)
+    place, total = np.zeros(labels, np.int64), 0  # where the next pixel of each label goes
     for r in range(len(runs)):
-        ends[runs[r, 0]] += runs[r, 2] - runs[r, 1]
-    ends = np.cumsum(ends)
-    place = np.zeros(labels, np.int64)
-    place[1:] = ends[:-1]
-    order = np.zeros(ends[-1], np.uint32)
+        place[runs[r, 0]] += runs[r, 2] - runs[r, 1]
+    for label in range(labels):
+        place[label], total = total, total + place[label]
+    order = np.zeros(total, np.uint32)
     for r in range(len(runs)):
         label, first, size = runs[r, 0], runs[r, 1], runs[r, 2] - runs[r, 1]
         start = np.uint64(place[label])
         for k in range(np.uint64(size)):
             order[start + k] = first + k
         place[label] += size
-    return order, ends
+    return order, place
 
 
 @kernel
