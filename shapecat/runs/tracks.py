@@ -69,6 +69,7 @@ def track_run(
     with replacing(folder / "tracks.parquet") as path, open_writer(path, TRACKS) as writer:
         release_memory()
         full = FullBoxes.read(folder, placed)
+        release_memory()
         for some in _batches(tracks):
             _write(writer, some, full, categories)
             lines += [_Line.of(track, categories) for track in some]

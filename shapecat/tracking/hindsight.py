@@ -116,12 +116,13 @@ def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> 
     rests = np.isfinite(fragments.rest)
     starts = (fragments.start, np.where(rests, fragments.rest, fragments.start))
     ends = (fragments.end, np.where(rests, fragments.rest, fragments.end))
-    near = [cKDTree(a).query_ball_point(b, limit) for a in starts for b in ends]
+    trees = [cKDTree(places) for places in starts]
     order = np.argsort(fragments.first_ns, kind="stable")
     first = fragments.first_ns[order]
     window = int(settings.max_missed_s * 1e9)
-    for i, places in enumerate(zip(*near, strict=True)):
-        end = fragments.last_ns[i]
+    for i, end in enumerate(fragments.last_ns):
+        # One by one: all of them together are lists of millions of numbers after some hours.
+        places = [tree.query_ball_point(e[i], limit[i]) for tree in trees for e in ends]
         low, high = np.searchsorted(first, [end, end + window], side="right")
         for_place = np.unique(np.concatenate([np.array(p, np.int64) for p in places]))
         for_place = for_place[fragments.first_ns[for_place] > end]
