@@ -12,7 +12,7 @@ import pyarrow as pa
 from shapecat.errors import OutputError
 from shapecat.evaluation.comparing import Comparison, Difference
 from shapecat.evaluation.comparison_pictures import COLOURS, Picture, words_of
-from shapecat.runs.tables import write_table
+from shapecat.runs.tables import FRAME_COLUMNS, write_table
 from shapecat.system.files import complete_folder
 
 __all__ = ["OBJECTS", "figure_rows", "format_page", "require_new", "write_comparison"]
@@ -21,9 +21,7 @@ _MOST_ROWS = 500
 
 OBJECTS = pa.schema(
     [
-        ("topic", pa.string()),
-        ("frame", pa.int32()),
-        ("stamp_ns", pa.int64()),
+        *FRAME_COLUMNS,
         ("difference", pa.string()),
         ("true_track", pa.int64()),
         ("true_category", pa.string()),

@@ -22,6 +22,7 @@ from shapecat.errors import OutputError
 __all__ = [
     "DETECTIONS",
     "FRAMES",
+    "FRAME_COLUMNS",
     "PLANES",
     "SCHEMA_VERSION",
     "TRACKS",
@@ -52,11 +53,12 @@ _FULL = (
     ("size_full_std", _VEC3),
 )
 
+FRAME_COLUMNS = (("topic", pa.string()), ("frame", pa.int32()), ("stamp_ns", pa.int64()))
+"""A frame in a table: its topic, its number there, and its time."""
+
 FRAMES = pa.schema(
     [
-        ("topic", pa.string()),
-        ("frame", pa.int32()),
-        ("stamp_ns", pa.int64()),
+        *FRAME_COLUMNS,
         ("log_time_ns", pa.int64()),
         ("frame_id", pa.string()),
         ("up", _VEC3),
@@ -78,9 +80,7 @@ where what is here was seen in a second look, with the up that the recording tel
 
 DETECTIONS = pa.schema(
     [
-        ("topic", pa.string()),
-        ("frame", pa.int32()),
-        ("stamp_ns", pa.int64()),
+        *FRAME_COLUMNS,
         ("frame_id", pa.string()),
         ("detection", pa.int32()),
         ("plane", pa.int16()),
@@ -113,9 +113,7 @@ The box around all of an object, ``*_full``, is null where only the visible one 
 
 PLANES = pa.schema(
     [
-        ("topic", pa.string()),
-        ("frame", pa.int32()),
-        ("stamp_ns", pa.int64()),
+        *FRAME_COLUMNS,
         ("plane", pa.int16()),
         ("normal", _VEC3),
         ("offset", pa.float32()),
@@ -129,9 +127,7 @@ PLANES = pa.schema(
 TRACKS = pa.schema(
     [
         ("track", pa.int32()),
-        ("topic", pa.string()),
-        ("frame", pa.int32()),
-        ("stamp_ns", pa.int64()),
+        *FRAME_COLUMNS,
         ("detection", pa.int32()),
         ("center_fixed", _VEC3),
         *_FULL,
