@@ -29,7 +29,7 @@ from tests.browser import Browser
 Run = Callable[..., Result]
 
 NAMES = ("cup", "can", "box", "bottle", "bowl", "plate", "ball")
-TRACKS = 16
+TRACKS = 50
 SAVED = (
     "return document.getElementById('saved').textContent === 'All corrections are in tracks.csv.'"
 )
