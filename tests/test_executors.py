@@ -293,3 +293,24 @@ def test_errors_come_at_their_turn() -> None:
     assert next(ahead) == 1
     with pytest.raises(EOFError):
         next(ahead)
+
+
+class UnreadableError(Exception):
+    """Cannot be read again: that takes more than its message."""
+
+    def __init__(self, place: str, number: int) -> None:
+        super().__init__(f"{place}, {number}")
+
+
+def raise_unreadable() -> None:
+    place = "here"
+    raise UnreadableError(place, 1)
+
+
+def test_an_error_that_cannot_be_read_fails_its_task_alone() -> None:
+    """The one who waits for it would wait for ever."""
+    with LocalExecutor(1) as executor:
+        unread, after = executor.submit(raise_unreadable), executor.submit(abs, -3)
+        with pytest.raises(TypeError, match="number"):
+            unread.result(timeout=60)
+        assert after.result(timeout=60) == 3

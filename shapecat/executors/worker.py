@@ -83,6 +83,8 @@ class Worker:
                 done, value = _receive(self._socket)
             except (EOFError, OSError):
                 done, value = False, self._loss()
+            except Exception as error:  # noqa: BLE001  an answer that cannot be read fails alone
+                done, value = False, error
             if done:
                 task.future.set_result(value)
             else:
