@@ -169,8 +169,8 @@ class Browser:
     def downloaded(self) -> Path:
         """Wait for a download to be complete."""
         for _ in range(100):
-            found = list(self.downloads.glob("*.csv"))
-            if found:
+            found = [file for file in self.downloads.iterdir() if file.stat().st_size]
+            if [file.suffix for file in found] == [".csv"]:  # not .crdownload, nor its place
                 return found[0]
             time.sleep(0.05)
         pytest.fail("nothing was downloaded")

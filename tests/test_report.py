@@ -336,7 +336,8 @@ def test_colour_is_shown_where_it_was_recorded(coloured_run: Path, tmp_path: Pat
 
     assert len(pictures.frames) == 4
     assert image.shape[:2] == (frame.height, frame.width)
-    assert np.abs(recorded(run, frame.seconds) - image[..., :3]).max() <= 40
+    off = np.abs(recorded(run, frame.seconds) - image[..., :3])
+    assert np.quantile(off, 0.999) <= 30  # what WebP loses; the next frame is off by 77
     assert len(colours) == len(pictures.tracks) > 3
     assert all(np.ptp(colour, axis=2).max() > 30 for colour in colours)
     shown = set().union(*(frame.boxes for frame in pictures.frames))

@@ -167,6 +167,45 @@ def test_a_page_tells_what_a_killed_server_has_not_written(
     assert [track for track, label in downloaded.items() if label] == sorted(order[:13])
 
 
+NEWS = "return performance.getEntriesByType('resource').some((got) => /labels$/.test(got.name))"
+"""A page asks for news when it is turned to."""
+TROUBLE = {
+    "its answer comes late": (
+        "const answer = await real(...request);"
+        "await new Promise((done) => setTimeout(done, 500)); return answer;"
+    ),
+    "it is lost": "throw new TypeError();",
+}
+"""What happens to the first correction that a page sends."""
+
+
+@pytest.mark.parametrize("trouble", TROUBLE)
+def test_corrections_bear_what_happens_to_the_one_before(
+    browser: Browser, run: Path, trouble: str
+) -> None:
+    """A late answer knows nothing of later labels; what is lost is sent again."""
+    with serving(run) as (address, _):
+        browser.open(address)
+        browser.press("Right", "Left")
+        browser.wait(NEWS)
+        browser.run(
+            "const real = fetch; let sent = 0; window.answered = 0;"
+            "window.fetch = async (...request) => {"
+            "  const number = request[1]?.method === 'POST' ? ++sent : 0;"
+            f" try {{ if (number === 1) {{ {TROUBLE[trouble]} }} return await real(...request); }}"
+            "  finally { if (number) ++window.answered; } };"
+        )
+        first, second = order_of(browser)[:2]
+        browser.press("d", "Right", "d")
+        browser.wait("return window.answered >= 2")
+        browser.wait(SAVED)
+        for track in (first, second):
+            fix = browser.run(f"return document.querySelector('#track-{track} .fix').textContent")
+            assert fix == "→ delete"
+    found = labels_on_disk(run)
+    assert [found[track] for track in (first, second)] == ["delete", "delete"]
+
+
 def ask(
     address: str,
     method: str = "GET",

@@ -2,7 +2,7 @@
 const storage = `shapecat:${data.key}`;
 const onDisk = new Map(labels);
 const sending = new Set();
-let lost = "";
+let lost = "", before = Promise.resolve();
 
 function save(track) {
   if (data.served) send(track); else keep();
@@ -36,7 +36,14 @@ function adopt(disk) {
   }
 }
 
-async function ask(options) {
+// Send one request at a time: an answer that overtook a later one would undo what that told.
+function ask(options) {
+  const turn = before.then(() => request(options));
+  before = turn.catch(() => {});
+  return turn;
+}
+
+async function request(options) {
   const reply = await fetch("labels", options).catch(() => { throw new Error("the server does not answer"); });
   if (!reply.ok && reply.status !== 409) throw new Error(await reply.text());
   return [reply.ok, await reply.json()];
@@ -53,10 +60,10 @@ async function send(track) {
       const label = labels.get(track), wanted = { track: Number(track), label, seen: onDisk.get(track) };
       const headers = { "Content-Type": "application/json" };
       const [done, answer] = await ask({ method: "POST", keepalive: true, headers, body: JSON.stringify(wanted) });
-      lost = "";
       if (done) onDisk.set(track, label);
       adopt(answer.labels);
       if (!done) refuse(track, answer.problem);
+      if (lost) sendAgain();
     }
   } catch (error) { lost = error.message; }
   sending.delete(track);
@@ -85,9 +92,14 @@ function showSaved() {
   }
 }
 
-async function catchUp() {
-  try { adopt((await ask())[1].labels); lost = ""; } catch (error) { lost = error.message; }
+// The server answers again: send what it did not get.
+function sendAgain() {
+  lost = "";
   for (const track of unsaved()) send(track);
+}
+
+async function catchUp() {
+  try { adopt((await ask())[1].labels); sendAgain(); } catch (error) { lost = error.message; }
   showSaved();
 }
 
