@@ -115,6 +115,17 @@ def reported_run(guessed_run: Path, tmp_path_factory: pytest.TempPathFactory) ->
     return folder
 
 
+@pytest.fixture(scope="module")
+def undisturbed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Process the recording of a file of tests without any trouble; return the folder above."""
+    from shapecat.pipeline import process  # noqa: PLC0415  the same
+    from shapecat.runs.jobs import Job  # noqa: PLC0415  the same
+
+    out = tmp_path_factory.mktemp("undisturbed")
+    process(Job(recording, out / "table", rrd=False))
+    return out
+
+
 @pytest.fixture(scope="session")
 def coloured_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Process a simulated recording with a colour camera, in four frames; categories are guesses.

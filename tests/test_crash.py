@@ -49,13 +49,6 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("crash") / "table.mcap", FRAMES)
 
 
-@pytest.fixture(scope="module")
-def undisturbed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("undisturbed")
-    process(Job(recording, out / "table", rrd=False))
-    return out
-
-
 def kill_after(arguments: list[str], begun: Path, seconds: float) -> bool:
     """Kill a run so long after a file or folder has appeared; tell whether it was still alive."""
     running = subprocess.Popen(arguments, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)

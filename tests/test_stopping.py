@@ -28,13 +28,6 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("stopping") / "table.mcap", FRAMES)
 
 
-@pytest.fixture(scope="module")
-def undisturbed(recording: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    out = tmp_path_factory.mktemp("undisturbed")
-    process(Job(recording, out / "table", rrd=False))
-    return out
-
-
 def heed_interrupts_slowly() -> None:
     """Let whoever interrupts run first, or a busy machine ends the command before the signal."""
     heed_interrupts()

@@ -34,7 +34,7 @@ from shapecat.recordings.mcap_records import (
     walk,
 )
 from shapecat.recordings.mcap_summary import Summary, read_summary
-from shapecat.recordings.messages import Channel, Message, Needed, Stamp, Topic, Topics, ros_type
+from shapecat.recordings.messages import Channel, Message, Selection, Topic, ros_type
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.time_order import Timed, in_time_order
 
@@ -95,31 +95,15 @@ class McapRecording(Recording):
         """Close the file."""
         self._file.close()
 
-    def messages(
-        self,
-        topics: Topics = None,
-        start_ns: Stamp = None,
-        stop_ns: Stamp = None,
-        needed: Needed = None,
-    ) -> Iterator[Message]:
-        """Yield undecoded messages; see `Recording.messages`."""
-        wanted = {
-            number
-            for number, channel in self._channels.items()
-            if topics is None or channel.topic in topics
-        }
-        if self.indexed:
-            raw = self._by_time(wanted, start_ns, stop_ns, needed)
-        else:
-            raw = self._in_file(wanted)
+    def _read(self, selection: Selection) -> Iterator[Message]:
+        wanted = {n for n, c in self._channels.items() if selection.has_topic(c.topic)}
+        raw = self._by_time(wanted, selection) if self.indexed else self._in_file(wanted)
         for message in raw:
-            if start_ns is not None and message.log_time < start_ns:
-                continue
-            if stop_ns is not None and message.log_time >= stop_ns:
+            if not selection.has_time(message.log_time):
                 continue
             channel = self._channels[message.channel_id]
             data: bytes | memoryview = message.data
-            if needed is not None and not needed(channel.topic, message.log_time):
+            if selection.needed and not selection.needed(channel.topic, message.log_time):
                 data = b""
             elif len(data) <= _SMALL:
                 data = bytes(data)
@@ -246,20 +230,18 @@ class McapRecording(Recording):
             channel = parse(records.Channel.read, content)
             self.summary.channels.setdefault(channel.id, channel)
 
-    def _by_time(
-        self, wanted: set[int], start_ns: int | None, stop_ns: int | None, needed: Needed
-    ) -> Iterator[RawMessage]:
+    def _by_time(self, wanted: set[int], selection: Selection) -> Iterator[RawMessage]:
         """Merge the chunks by log time; ties in the order of the file."""
         chunks = [
             (c.message_start_time, c.chunk_start_offset, c)
             for c in self.summary.chunks
-            if overlaps(c, wanted, start_ns, stop_ns)
+            if overlaps(c, wanted, selection.start_ns, selection.stop_ns)
         ]
 
         def is_needed(message: IndexedMessage) -> bool:
-            if needed is None or message.channel_id not in wanted:
+            if selection.needed is None or message.channel_id not in wanted:
                 return message.channel_id in wanted
-            return needed(self._channels[message.channel_id].topic, message.log_time)
+            return selection.needed(self._channels[message.channel_id].topic, message.log_time)
 
         def read(chunk: records.ChunkIndex) -> Iterator[tuple[Timed, RawMessage]]:
             for message in self._indexed_chunk(chunk, is_needed):

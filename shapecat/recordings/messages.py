@@ -6,7 +6,17 @@ from typing import NamedTuple, TypeAlias
 
 from shapecat.errors import RecordingError
 
-__all__ = ["Channel", "Message", "MessageError", "Needed", "Stamp", "Topic", "Topics", "ros_type"]
+__all__ = [
+    "Channel",
+    "Message",
+    "MessageError",
+    "Needed",
+    "Selection",
+    "Stamp",
+    "Topic",
+    "Topics",
+    "ros_type",
+]
 
 Topics: TypeAlias = Collection[str] | None
 """The names of topics; None means all."""
@@ -18,6 +28,24 @@ Needed: TypeAlias = Callable[[str, int], bool] | None
 
 class MessageError(RecordingError):
     """A single message that cannot be decoded; the rest of the recording is unaffected."""
+
+
+class Selection(NamedTuple):
+    """Which messages of a recording are read; see `Recording.messages`."""
+
+    topics: Topics
+    start_ns: Stamp
+    stop_ns: Stamp
+    needed: Needed
+
+    def has_topic(self, topic: str) -> bool:
+        """Return whether messages of a topic are read."""
+        return self.topics is None or topic in self.topics
+
+    def has_time(self, log_time_ns: int) -> bool:
+        """Return whether a message of this log time is read."""
+        begun = self.start_ns is None or log_time_ns >= self.start_ns
+        return begun and (self.stop_ns is None or log_time_ns < self.stop_ns)
 
 
 class Channel(NamedTuple):

@@ -5,7 +5,15 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
-from shapecat.recordings.messages import Channel, Message, Needed, Stamp, Topic, Topics
+from shapecat.recordings.messages import (
+    Channel,
+    Message,
+    Needed,
+    Selection,
+    Stamp,
+    Topic,
+    Topics,
+)
 
 __all__ = ["Recording"]
 
@@ -44,7 +52,6 @@ class Recording(ABC):
         """Return the recordings that it consists of: one per file, or itself alone."""
         return [self]
 
-    @abstractmethod
     def messages(
         self,
         topics: Topics = None,
@@ -65,6 +72,11 @@ class Recording(ABC):
         Messages by log time; in the order of the file where it has no index. A part that cannot
         be read is left out and noted in ``warnings``.
         """
+        return self._read(Selection(topics, start_ns, stop_ns, needed))
+
+    @abstractmethod
+    def _read(self, selection: Selection) -> Iterator[Message]:
+        """Yield the messages that are selected."""
 
     @abstractmethod
     def close(self) -> None:

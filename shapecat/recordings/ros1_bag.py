@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import ClassVar, NamedTuple
 
 from shapecat.errors import RecordingError
-from shapecat.recordings.messages import Channel, Message, Needed, Stamp, Topic, Topics, ros_type
+from shapecat.recordings.messages import Channel, Message, Selection, Topic, ros_type
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.ros1_records import (
     BAG_HEADER,
@@ -79,18 +79,10 @@ class BagRecording(Recording):
         """Close the bag."""
         self._file.close()
 
-    def messages(
-        self,
-        topics: Topics = None,
-        start_ns: Stamp = None,
-        stop_ns: Stamp = None,
-        needed: Needed = None,  # noqa: ARG002  all data is read
-    ) -> Iterator[Message]:
-        """Yield undecoded messages; see `Recording.messages`."""
-        wanted = {n for n, c in self._channels.items() if topics is None or c.topic in topics}
-        for number, time, data in self._raw(wanted, start_ns, stop_ns):
-            early = start_ns is not None and time < start_ns
-            if not early and (stop_ns is None or time < stop_ns):
+    def _read(self, selection: Selection) -> Iterator[Message]:
+        wanted = {n for n, c in self._channels.items() if selection.has_topic(c.topic)}
+        for number, time, data in self._raw(wanted, selection.start_ns, selection.stop_ns):
+            if selection.has_time(time):
                 plain = bytes(data) if len(data) <= _SMALL else data
                 yield Message(self._channels[number], time, time, 0, plain)
 

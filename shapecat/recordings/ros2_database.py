@@ -12,7 +12,7 @@ from rosbags.rosbag2.metadata import dump_qos_v8
 
 from shapecat.errors import RecordingError
 from shapecat.recordings.decoding import LIBRARY_ERRORS
-from shapecat.recordings.messages import Channel, Message, Needed, Stamp, Topic, Topics, ros_type
+from shapecat.recordings.messages import Channel, Message, Selection, Topic, ros_type
 from shapecat.recordings.recording import Recording
 
 __all__ = ["DatabaseRecording"]
@@ -59,18 +59,12 @@ class DatabaseRecording(Recording):
         """Close the database."""
         self._reader.close()
 
-    def messages(
-        self,
-        topics: Topics = None,
-        start_ns: Stamp = None,
-        stop_ns: Stamp = None,
-        needed: Needed = None,  # noqa: ARG002  all data is read
-    ) -> Iterator[Message]:
-        """Yield undecoded messages; see `Recording.messages`."""
-        wanted = [c for c in self._reader.connections if topics is None or c.topic in topics]
+    def _read(self, selection: Selection) -> Iterator[Message]:
+        wanted = [c for c in self._reader.connections if selection.has_topic(c.topic)]
         if not wanted:
             return
-        raw: Iterator[Any] = self._reader.messages(wanted, start_ns, stop_ns)  # data of any type
+        times = selection.start_ns, selection.stop_ns
+        raw: Iterator[Any] = self._reader.messages(wanted, *times)  # data of any type
         while True:
             try:
                 connection, time, data = next(raw)

@@ -16,7 +16,7 @@ import zstandard
 
 from shapecat.errors import RecordingError
 from shapecat.recordings.mcap_file import McapRecording
-from shapecat.recordings.messages import Channel, Message, Needed, Stamp, Topic, Topics
+from shapecat.recordings.messages import Channel, Message, Selection, Topic
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.ros2_database import DatabaseRecording
 from shapecat.system.files import lock
@@ -86,15 +86,8 @@ class FolderRecording(Recording):
         """Return every channel of every part, each once."""
         return tuple(dict.fromkeys(c for part in self._parts for c in part.channels()))
 
-    def messages(
-        self,
-        topics: Topics = None,
-        start_ns: Stamp = None,
-        stop_ns: Stamp = None,
-        needed: Needed = None,
-    ) -> Iterator[Message]:
-        """Yield undecoded messages of all parts; see `Recording.messages`."""
-        streams = [part.messages(topics, start_ns, stop_ns, needed) for part in self._parts]
+    def _read(self, selection: Selection) -> Iterator[Message]:
+        streams = [part.messages(*selection) for part in self._parts]
         if self._overlap:
             yield from merge(*streams, key=lambda message: message.log_time_ns)
         else:

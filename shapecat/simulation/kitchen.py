@@ -51,15 +51,16 @@ def _pot(rng: Generator) -> Mesh:
     return join([body, *ears, placed(ellipsoid([0.018, 0.018, 0.014]), [0, 0, h + 0.045])])
 
 
+def _spout(way: list[list[float]], narrowest: float) -> Mesh:
+    return tube(smooth_path(way, 10), np.linspace(narrowest + 0.009, narrowest, 10))
+
+
 def _kettle(rng: Generator) -> Mesh:
     r, h = rng.uniform(0.075, 0.1), rng.uniform(0.11, 0.18)
     body = turned_body(
         [(0, 0), (r, 0), (1.03 * r, 0.3 * h), (0.75 * r, 0.85 * h), (0.3 * r, h), (0, 1.02 * h)]
     )
-    spout = tube(
-        smooth_path([[0.8 * r, 0, 0.45 * h], [1.35 * r, 0, 0.7 * h], [1.6 * r, 0, 0.95 * h]], 10),
-        np.linspace(0.018, 0.009, 10),
-    )
+    spout = _spout([[0.8 * r, 0, 0.45 * h], [1.35 * r, 0, 0.7 * h], [1.6 * r, 0, 0.95 * h]], 0.009)
     arch = [
         [-0.75 * r, 0, 0.8 * h],
         [-0.6 * r, 0, 1.35 * h],
@@ -75,10 +76,7 @@ def _teapot(rng: Generator) -> Mesh:
     body = turned_body(
         [(0, 0), (0.55 * r, 0), (r, 0.45 * h), (0.5 * r, 0.95 * h), (0.15 * r, h), (0, 1.02 * h)]
     )
-    spout = tube(
-        smooth_path([[0.85 * r, 0, 0.35 * h], [1.35 * r, 0, 0.5 * h], [1.6 * r, 0, 0.95 * h]], 10),
-        np.linspace(0.016, 0.007, 10),
-    )
+    spout = _spout([[0.85 * r, 0, 0.35 * h], [1.35 * r, 0, 0.5 * h], [1.6 * r, 0, 0.95 * h]], 0.007)
     ear = [
         [-0.8 * r, 0, 0.8 * h],
         [-1.55 * r, 0, 0.8 * h],

@@ -143,28 +143,6 @@ _AZURE_KINECT = Sensor(
 """Azure Kinect (time of flight, narrow view): Tölgyessy et al., Evaluation of the Azure Kinect and
 its comparison to Kinect v1 and v2, 2021."""
 
-_D415 = Sensor(
-    _camera(848, 480, 615.0),
-    nearest_m=0.3,
-    step=0.0009,
-    noise=0.0020,
-    grain=(13, 7),
-    wave=0.006,
-    wave_px=110,
-    ragged_px=1.2,
-    ragged_window=(7, 7),
-    shadow_m=(0.055,),
-    filled_px=2.0,
-    grazing=0.15,
-    dark=0.2,
-    holes=0.002,
-    blend_px=5,
-    rounded_px=7,
-    border_px=(14, 0, 0, 0),
-)
-"""Intel D415: .06 px of 615 px and 55 mm; Grunnet-Jepsen et al., Best-known methods for tuning
-D400 depth cameras, 2018."""
-
 _D435 = Sensor(
     _camera(848, 480, 425.0),
     nearest_m=0.2,
@@ -184,10 +162,28 @@ _D435 = Sensor(
     rounded_px=7,
     border_px=(12, 0, 0, 0),
 )
-"""Intel D435 as it comes, unfiltered: .08 px of 425 px and 50 mm; source as of the D415."""
+"""Intel D435 as it comes, unfiltered: .08 px of 425 px and 50 mm; Grunnet-Jepsen et al.,
+Best-known methods for tuning D400 depth cameras, 2018."""
 
-_D455 = Sensor(
-    _camera(1280, 720, 640.0),
+_D415 = replace(
+    _D435,
+    camera=_camera(848, 480, 615.0),
+    nearest_m=0.3,
+    step=0.0009,
+    noise=0.0020,
+    grain=(13, 7),
+    wave=0.006,
+    wave_px=110,
+    ragged_px=1.2,
+    shadow_m=(0.055,),
+    holes=0.002,
+    border_px=(14, 0, 0, 0),
+)
+"""Intel D415: .06 px of 615 px and 55 mm; source as of the D435."""
+
+_D455 = replace(
+    _D435,
+    camera=_camera(1280, 720, 640.0),
     nearest_m=0.4,
     step=0.0005,
     noise=0.0013,
@@ -198,14 +194,12 @@ _D455 = Sensor(
     ragged_window=(9, 9),
     shadow_m=(0.095,),
     filled_px=3.0,
-    grazing=0.15,
-    dark=0.2,
     holes=0.002,
     blend_px=7,
     rounded_px=9,
     border_px=(30, 0, 0, 0),
 )
-"""Intel D455: .08 px of 640 px and 95 mm; source as of the D415."""
+"""Intel D455: .08 px of 640 px and 95 mm; source as of the D435."""
 
 _SR300 = Sensor(
     _camera(640, 480, 475.0),

@@ -72,11 +72,11 @@ def run_page(
     counts = Counter(card.row.category for card in cards)
     names = (UNKNOWN, *finished.categories)
     end = max((float(c.timeline.seconds[-1]) for c in cards if len(c.timeline.seconds)), default=0)
+    connect = "'self'" if served else "'none'"
     return template("page.html").substitute(
         title=escape(finished.name),
-        style=asset("report.css"),
+        head=_head(finished.name, f"; script-src 'unsafe-inline'; connect-src {connect}"),
         script="\n".join(map(asset, _SCRIPTS)),
-        connect="connect-src 'self'" if served else "connect-src 'none'",
         back=f'<a href="{escape(index)}">all runs</a> ·' if index else "",
         subtitle=escape(_subtitle(run)),
         tiles=_tiles(_run_tiles(run, len(cards), sum(is_unsure(c.row) for c in cards), end)),
@@ -104,12 +104,20 @@ def index_page(title: str, runs: Sequence[Listed]) -> str:
         "checked": sum(item.checked for item in runs),
     }
     return template("index.html").substitute(
+        head=_head(title),
         title=escape(title),
-        style=asset("report.css"),
         subtitle=escape(", ".join(f"{n} {name}" for name, n in total.most_common())),
         tiles=_tiles(tiles),
         runs="".join(map(_listed, runs)),
     )
+
+
+def _head(title: str, scripts: str = "") -> str:
+    """Return the head of a page; ``scripts`` is what its policy allows them."""
+    filled = template("head.html").substitute(
+        title=escape(title), style=asset("report.css"), scripts=scripts
+    )
+    return filled.rstrip("\n")
 
 
 def _ordered(counts: Mapping[str, int], names: Sequence[str]) -> list[str]:
