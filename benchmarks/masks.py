@@ -107,7 +107,7 @@ def _masks(folder: Path) -> Iterator[tuple[int, dict[int, tuple[Any, Any]]]]:
     labels = read_labels(folder / "run" / "tracks.csv", run["model"]["categories"])
     labelled = read_labelled_frames(folder / "run", labels)
     with open_recording(folder / "recording.mcap") as recording:
-        for label, frame, coloured in with_colour(labelled, recording, run, folder / "run"):
+        for label, frame, coloured in with_colour(labelled, recording, run):
             if coloured is not None:
                 snapped = snapped_masks(frame, coloured, pixels_of(coloured.view.image))
                 pairs = zip(coloured.masks, snapped, strict=True)

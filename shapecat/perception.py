@@ -14,6 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from shapecat.arrays import F4
+from shapecat.cameras.colour import ColourView
+from shapecat.colour.image_masks import find_masks
 from shapecat.completion import ENOUGH_POINTS, complete
 from shapecat.config import Settings
 from shapecat.depth_fusion import Earlier, fuse, with_own_readings
@@ -45,12 +47,14 @@ class View(NamedTuple):
     up : (3,) unit vector in the sensor frame, or None to estimate it from the planes.
     earlier : frames to fuse with this one.
     pose : ``fixed_from_sensor``, None if it is not known.
+    colour : the colour image beside it; its pixels are not looked at.
     """
 
     frame: Frame
     up: F4 | None
     earlier: tuple[Earlier, ...] = ()
     pose: Pose | None = None
+    colour: ColourView | None = None
 
 
 @dataclass(frozen=True)
@@ -73,7 +77,7 @@ class Perceiver:
         for view in views:
             topic = view.frame.topic
             perception, known[topic] = _perceive(view, known.get(topic, _NOTHING), self)
-            perceptions.append(perception)
+            perceptions.append(_with_masks(view, perception))
         return perceptions
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -186,6 +190,17 @@ def _look(
     )
     clock.lap("complete")
     return scene, detections, (*keys, *(KeyView(sights[k], described[k]) for k in new))
+
+
+def _with_masks(view: View, perception: Perception) -> Perception:
+    """Add where the colour image shows the objects."""
+    if view.colour is None:
+        return perception
+    begun = time.perf_counter()
+    objects = [detection.candidate.indices for detection in perception.detections]
+    masks = find_masks(view.frame, view.colour, objects)
+    seconds = {**perception.seconds, "masks": time.perf_counter() - begun}
+    return replace(perception, seconds=seconds, masks=masks)
 
 
 def _repeats(view: View, then: View | None, range_m: float) -> bool:

@@ -7,7 +7,6 @@ Each can be run again alone.
 
 import logging
 import time
-from collections import deque
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
@@ -16,8 +15,8 @@ from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import OutputError
 from shapecat.executors.order import read_ahead
 from shapecat.learning import load_model
-from shapecat.outputs.colouring import Seen, colours_of, find_masks
 from shapecat.recordings import Recording, choose_streams, open_recording
+from shapecat.recordings.colour_streams import choose_colours
 from shapecat.rehearsal import compile_all
 from shapecat.runs.corrections import adopt_labels, read_labels
 from shapecat.runs.folder import (
@@ -44,7 +43,6 @@ from shapecat.runs.jobs import (
 )
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.label_transfer import Transfer, transfer_labels
-from shapecat.runs.masks import count_masks
 from shapecat.runs.perceiving import Observer, Work, ignore, perceive_all, revise
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.segments import discard_segments
@@ -84,8 +82,9 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
         categorizer = load_model(job.model)
         categorizer.require_descriptor(DESCRIPTOR_NAMES)
         run = describe_run(job, categorizer)
-        run["options"]["topics"] = [s.topic for s in choose_streams(recording, job.topics)]
-        colours = colours_of(recording, run["options"])
+        streams = choose_streams(recording, job.topics)
+        run["options"]["topics"] = [stream.topic for stream in streams]
+        colours = choose_colours(recording, streams, job.color)
         _log.info(
             "%s: %s, model %s", job.name, " ".join(run["options"]["topics"]), job.model or "default"
         )
@@ -165,10 +164,9 @@ def annotate(
     *,
     cores: int = 1,
 ) -> None:
-    """Write masks.parquet, review.rrd and annotated.mcap from the tables and the recording.
+    """Write review.rrd and annotated.mcap from the tables and the recording.
 
-    With several cores a thread reads while another writes. The recording is read once for the
-    masks and the review.
+    With several cores a thread reads while another writes.
     """
     settings, total = run["settings"]["outputs"], run["counts"]["frames"]
 
@@ -199,8 +197,7 @@ def annotate(
 
         labelled = read_labelled_frames(folder, labels())
         shown = _observed(labelled, "review", total, observe)
-        found = masks() if run.get("color") and not masks_known() else None
-        pairs = with_clouds(shown, recording, run, folder, found)
+        pairs = with_clouds(shown, recording, run)
         write_review(
             folder / "review.rrd",
             read_ahead(pairs, count=_AHEAD) if cores > 1 else pairs,
@@ -212,18 +209,8 @@ def annotate(
             threads=cores,
         )
 
-    def masks() -> Iterator[Seen]:
-        return find_masks(recording, run, folder, threads=cores)
-
-    def masks_known() -> bool:
-        return (folder / "masks.parquet").exists()
-
     if run["options"]["rrd"]:
         _once("review.rrd", folder, run, write_rrd)
-    if run.get("color") and not masks_known():
-        _once("masks", folder, run, lambda: deque(masks(), maxlen=0))
-    if masks_known():
-        run["counts"]["color"] = count_masks(folder)
     known = [*run["warnings"], *recording.warnings]
     run["warnings"] = list(dict.fromkeys(known))
     if run["options"]["mcap"]:

@@ -5,6 +5,7 @@ Transforms are named ``a_from_b``. "Sensor frame" is the frame named by ``frame_
 camera's is the optical frame (x right, y down, z forward).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,6 +22,7 @@ __all__ = [
     "Detection",
     "Frame",
     "FullBox",
+    "ImageMasks",
     "LabelledFrame",
     "LabelledObject",
     "NeuralGas",
@@ -237,10 +239,32 @@ class Detection(Record):
     reused_from: int | None = None
 
 
+class ImageMasks(Record):
+    """The pixels of the detections of a frame on the colour image beside it.
+
+    Attributes
+    ----------
+    topic, stamp_ns, log_time_ns, frame_id : of the image.
+    width, height : of the image, pixels.
+    boxes : left, top, width and height of the mask of each detection that the image shows, pixels.
+    counts : the run lengths of these masks, as of `shapecat.colour.rle.rle_counts`.
+    """
+
+    topic: str
+    stamp_ns: int
+    log_time_ns: int
+    frame_id: str
+    width: int
+    height: int
+    boxes: Mapping[int, tuple[int, int, int, int]]
+    counts: Mapping[int, U4]
+
+
 class Perception(Record):
     """All that is known of one frame before anything is followed over time.
 
-    ``reused_from`` is the index of the frame whose scene it repeats, None if it has its own.
+    ``reused_from`` is the index of the frame whose scene it repeats, None if it has its own;
+    ``masks`` are None without a colour image.
     """
 
     topic: str
@@ -251,6 +275,7 @@ class Perception(Record):
     detections: tuple[Detection, ...]
     seconds: dict[str, float]
     reused_from: int | None = None
+    masks: ImageMasks | None = None
 
 
 class LabelledObject(Record):
@@ -284,7 +309,7 @@ class LabelledFrame(Record):
     ``fixed_from_sensor`` is None where the recording has no fixed frame; ``ended`` names the
     tracks shown in an earlier frame of the topic that are not seen again; ``up`` (3,) is the unit
     vector up in the sensor frame; ``reused_from`` is the index of the frame that shows the same,
-    None if there is none before it.
+    None if there is none before it; ``masks`` are None without a colour image.
     """
 
     topic: str
@@ -299,6 +324,7 @@ class LabelledFrame(Record):
     seconds: dict[str, float]
     up: F4 | None = array("3", "f4", default=None)
     reused_from: int | None = None
+    masks: ImageMasks | None = None
 
 
 class ShownBox(NamedTuple):

@@ -2,7 +2,7 @@
 
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -16,11 +16,13 @@ from mcap_ros2.decoder import DecoderFactory
 
 import shapecat.pipeline
 from shapecat.cameras.colour import ColourImage, ColourView
+from shapecat.colour.image_masks import box_of, mask_of
 from shapecat.colour.masks import Mask
 from shapecat.colour.rle import rle_counts, rle_mask, rle_text
 from shapecat.errors import NoStreamError
-from shapecat.outputs.colouring import Coloured
+from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encoder_for
+from shapecat.outputs.rereading import open_source, read_finished
 from shapecat.outputs.review import write_review
 from shapecat.outputs.review_scenes import ReviewFrame
 from shapecat.recordings.protobuf import message_decoder
@@ -55,12 +57,12 @@ def test_masks_of_the_run_are_where_the_objects_are(run: Path) -> None:
     source = run.parents[1] / "table.mcap"
     truth = np.load(source.with_suffix(".color_labels.npz"))["labels"]
     found = list(read_masks(run))
-    assert [masks.key[1] for masks in found] == list(range(FRAMES))
+    assert [frame for (_, frame), _ in found] == list(range(FRAMES))
     best = []
-    for masks in found:
-        labels = truth[masks.key[1]]
+    for (_, frame), masks in found:
+        labels = truth[frame]
         assert (masks.height, masks.width) == labels.shape
-        own = [masks.mask([number]).full(*labels.shape) for number in masks.counts]
+        own = [mask_of(masks, [number]).full(*labels.shape) for number in masks.counts]
         for label in np.unique(labels[labels >= 20]):
             seen = labels == label
             if seen.sum() > 2000:
@@ -71,25 +73,34 @@ def test_masks_of_the_run_are_where_the_objects_are(run: Path) -> None:
 
 def test_boxes_of_the_table_are_those_of_its_masks(run: Path) -> None:
     """Annotations use the boxes alone, exports the masks: they must not disagree."""
-    masks = next(iter(read_masks(run)))
+    _, masks = next(iter(read_masks(run)))
     for number, box in masks.boxes.items():
-        assert masks.mask([number]).box == box
+        assert mask_of(masks, [number]).box == box
     numbers = list(masks.boxes)[:2]
-    assert masks.box(numbers) == masks.mask(numbers).box
-    assert masks.box([999]) is None
-    assert masks.mask([999]).area == 0
+    assert box_of(masks, numbers) == mask_of(masks, numbers).box
+    assert box_of(masks, [999]) is None
+    assert mask_of(masks, [999]).area == 0
 
 
 def test_the_review_holds_images_as_they_came_and_boxes_of_the_tracks(run: Path) -> None:
-    """A second compression would blur what people look at; a wrong box misleads them."""
+    """A second compression would blur what people look at; a wrong box misleads them.
+
+    Every frame whose scene is drawn has its own image.
+    """
     entity = "/images//camera/depth/image_raw"
     source = run.parents[1] / "table.mcap"
-    stored = [bytes(bytearray(row["EncodedImage:blob"][0])) for row in _rows(run, entity)]
-    assert stored == [bytes(message.data) for _, message in recorded(source, IMAGES)]
+    images = [bytes(message.data) for _, message in recorded(source, IMAGES)]
+    stored = {r["frame"]: bytes(bytearray(r["EncodedImage:blob"][0])) for r in _rows(run, entity)}
+    assert stored == {frame: images[frame] for frame in stored}
+    drawn = _rows(run, "/world/seen//camera/depth/image_raw/scene")
+    assert list(stored) == [row["frame"] for row in drawn]
+    assert 0 in stored
     boxes = _rows(run, f"{entity}/boxes")
     captions = _rows(run, f"{entity}/captions")
     labels = read_labels(run / "tracks.csv")
-    for masks, box, caption in zip(read_masks(run), boxes, captions, strict=True):
+    of_frame = {frame: masks for (_, frame), masks in read_masks(run)}
+    for box, caption in zip(boxes, captions, strict=True):
+        masks = of_frame[box["frame"]]
         assert len(box["Boxes2D:half_sizes"]) == len(caption["Points2D:labels"]) > 0
         shown = {text.split()[0] for text in caption["Points2D:labels"]}
         assert shown <= {f"#{label.track}" for label in labels.values()}
@@ -99,6 +110,24 @@ def test_the_review_holds_images_as_they_came_and_boxes_of_the_tracks(run: Path)
         assert np.abs(middles - wanted).max(axis=1).min() < 0.01
     layers = _rows(run, f"{entity}/masks")
     assert all(bytes(bytearray(r["EncodedImage:blob"][0])).startswith(b"\x89PNG") for r in layers)
+
+
+@pytest.mark.parametrize("wanted", [(1,), (0, 3), (2, 3), (0, 1, 2, 3)])
+def test_frames_that_are_read_alone_keep_their_own_image(run: Path, wanted: Sequence[int]) -> None:
+    """The images between frames are not read: none may take the place of another."""
+    finished = read_finished(run)
+    of_frame = {frame: masks for (_, frame), masks in read_masks(run)}
+    frames = (frame for frame in finished.frames() if frame.index in wanted)
+    with open_source(finished.run) as source:
+        for labelled, frame, coloured in with_colour(frames, source, finished.run):
+            assert frame.index == labelled.index
+            assert coloured is not None
+            assert coloured.view.image.stamp_ns == of_frame[frame.index].stamp_ns
+            assert [mask.box for mask in coloured.masks] == [
+                box_of(of_frame[frame.index], item.detections) or (0, 0, 0, 0)
+                for item in labelled.objects
+            ]
+            assert len(coloured.masks) > 3
 
 
 def _rows(run: Path, entity: str) -> list[dict[str, Any]]:
@@ -111,7 +140,7 @@ def test_annotations_on_images_have_the_stamp_and_frame_of_the_image(run: Path) 
     found = recorded(run / "annotated.mcap", "/shapecat/detections_2d")
     drawn = recorded(run / "annotated.mcap", "/shapecat/image_annotations")
     assert len(images) == len(found) == len(drawn) == FRAMES
-    for masks, (time, image), (time_2d, array), (_, drawing) in zip(
+    for (_, masks), (time, image), (time_2d, array), (_, drawing) in zip(
         read_masks(run), images, found, drawn, strict=True
     ):
         assert time == time_2d
@@ -239,9 +268,7 @@ def test_a_damaged_image_costs_the_review_only_itself(tmp_path: Path) -> None:
     for k, data in enumerate((whole[:half] + bytes(20) + whole[half + 20 :], whole)):
         image = ColourImage("/color", stamp(k), stamp(k), "optical", "png", 64, 48, 0, data)
         views.append(Coloured(ColourView(image), (Mask(3, 4, np.ones((5, 6), bool)),)))
-    scenes = [
-        ReviewFrame(*scene(k, [labelled_object(1)]), view, True) for k, view in enumerate(views)
-    ]
+    scenes = [ReviewFrame(*scene(k, [labelled_object(1)]), view) for k, view in enumerate(views)]
     path = tmp_path / "review.rrd"
     write_review(
         path,

@@ -13,6 +13,7 @@ import pytest
 from click.testing import Result
 from PIL import Image, ImageDraw
 
+from shapecat.colour.image_masks import mask_of
 from shapecat.colour.masks import Mask
 from shapecat.colour.outline import joined, outlines
 from shapecat.errors import OutputError
@@ -85,7 +86,7 @@ def test_coco_holds_images_as_they_came_and_the_masks_of_the_tracks(
     assert len(data["annotations"]) == count > 12
     # An annotation 0 counts as no match in pycocotools.
     assert sorted(row["id"] for row in data["annotations"]) == list(range(1, count + 1))
-    wanted = {masks.key[1]: masks for masks in read_masks(run)}
+    wanted = {frame: masks for (_, frame), masks in read_masks(run)}
     frames = {image["id"]: image["frame"] for image in data["images"]}
     for row in data["annotations"]:
         mask = decoded(row["segmentation"])
@@ -111,14 +112,14 @@ def test_masks_of_a_data_set_lie_on_the_edges_of_the_colours(
     true = np.load(coloured_run.parents[1] / "table.color_labels.npz")["labels"]
     data = read_coco(tmp_path / "out")
     frames = {image["id"]: image["frame"] for image in data["images"]}
-    of_depth = {masks.key[1]: masks for masks in read_masks(coloured_run)}
+    of_depth = {frame: masks for (_, frame), masks in read_masks(coloured_run)}
     overlaps = []
     for row in data["annotations"]:
         frame, mask = frames[row["image_id"]], decoded(row["segmentation"])
         own = np.bincount(true[frame][mask])[20:].argmax() + 20 == true[frame]
         depth = of_depth[frame]
         pairs = [
-            (nearest(row["bbox"], [box]), depth.mask([n]).full(*mask.shape))
+            (nearest(row["bbox"], [box]), mask_of(depth, [n]).full(*mask.shape))
             for n, box in depth.boxes.items()
         ]
         before = min(pairs, key=lambda pair: pair[0])[1]
@@ -256,8 +257,7 @@ def test_frames_are_thinned_by_number_and_by_novelty_of_view(run: Path, tmp_path
     assert [i["frame"] for i in read_coco(tmp_path / "every")["images"]] == [0, 2]
     export_dataset([run], "coco", tmp_path / "track", Selection(per_track=1, corrected_only=True))
     (image,) = read_coco(tmp_path / "track")["images"]
-    seen = [(m.boxes, m.key[1]) for m in read_masks(run)]
-    assert image["frame"] in {frame for _, frame in seen}
+    assert image["frame"] in {frame for (_, frame), _ in read_masks(run)}
 
 
 def test_only_an_earlier_export_is_replaced(run: Path, tmp_path: Path) -> None:

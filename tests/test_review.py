@@ -82,7 +82,7 @@ def write(path: Path, scenes: Iterable[tuple[LabelledFrame, Frame]], **options: 
     pairs = list(scenes)
     chosen = choose_scenes([labelled for labelled, _ in pairs], fixed=fixed)
     frames = [
-        ReviewFrame(labelled, frame if due else None, None, due)
+        ReviewFrame(labelled, frame if due else None)
         for (labelled, due), (_, frame) in zip(chosen, pairs, strict=True)
     ]
     review.write_review(path, frames, **settings)

@@ -1,41 +1,20 @@
-"""The colour images of a run: which there are, and the masks of its detections on them."""
+"""Labelled frames beside what the sensor and the colour camera have seen."""
 
-import math
 from collections import Counter, deque
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import islice
-from pathlib import Path
-from typing import Any
 
-import numpy as np
-
-from shapecat.arrays import U4
 from shapecat.cameras.colour import ColourView
-from shapecat.colour.masks import NOTHING, Mask, dense_masks
+from shapecat.colour.image_masks import mask_of
+from shapecat.colour.masks import Mask
 from shapecat.errors import OutputError
-from shapecat.executors.order import map_ahead
-from shapecat.recordings import Recording, choose_streams
-from shapecat.recordings.colour_frames import frames_with_colour
-from shapecat.recordings.colour_streams import ColourStream, choose_colour
-from shapecat.recordings.messages import Needed
-from shapecat.runs.masks import FrameMasks, MaskRow, MaskTable, read_masks
-from shapecat.runs.run_info import RunInfo, window_of
-from shapecat.runs.tables import Key, frame_rows, numbers, read_row_groups
+from shapecat.recordings import Recording
+from shapecat.runs.run_info import RunInfo
+from shapecat.runs.selection import read_frames
 from shapecat.types import Frame, LabelledFrame
 
-__all__ = [
-    "Coloured",
-    "Seen",
-    "colours_of",
-    "find_masks",
-    "views_again",
-    "with_colour",
-]
-
-Seen = tuple[Frame, ColourView | None, FrameMasks | None]
-"""A frame, its colour image, and the masks of its detections on it."""
-
+__all__ = ["Coloured", "with_colour"]
 
 _AHEAD = 4
 """Frames that are looked for in advance."""
@@ -49,73 +28,35 @@ class Coloured:
     masks: tuple[Mask, ...]
 
 
-def colours_of(recording: Recording, options: Mapping[str, Any]) -> dict[str, ColourStream]:
-    """Return the colour stream of each depth topic of a run that has one.
-
-    Raises
-    ------
-    NoStreamError : the topic that was asked for holds no colour images.
-    """
-    wanted = options.get("color")
-    if wanted == "":
-        return {}
-    streams = choose_streams(recording, options["topics"])
-    found = {stream.topic: choose_colour(recording, stream, wanted) for stream in streams}
-    return {topic: colour for topic, colour in found.items() if colour is not None}
-
-
-def views_again(
-    recording: Recording, run: RunInfo, needed: Needed = None
-) -> Iterator[tuple[Frame, ColourView | None]]:
-    """Read the frames that a run was made from once more, with their colour images.
-
-    Parameters
-    ----------
-    needed : as for `shapecat.recordings.frames`.
-    """
-    options = run["options"]
-    streams = choose_streams(recording, options["topics"])
-    colours = colours_of(recording, options)
-    chosen = {"needed": needed, **window_of(options)}
-    return frames_with_colour(recording, streams, colours, skipped=Counter(), **chosen)
-
-
 def with_colour(
-    labelled: Iterable[LabelledFrame],
-    recording: Recording,
-    run: RunInfo,
-    folder: Path,
-    seen: Iterator[Seen] | None = None,
+    labelled: Iterable[LabelledFrame], recording: Recording, run: RunInfo
 ) -> Iterator[tuple[LabelledFrame, Frame, Coloured | None]]:
     """Pair labelled frames, in the order they were read, with their clouds and colour images.
 
     Frames between them need not be read.
 
-    Parameters
-    ----------
-    seen : of `find_masks`, which is gone through to its end; by default the masks are read.
-
     Raises
     ------
     OutputError : the recording does not hold one of them any more.
     """
-    awaited = _Awaited(labelled)
-    seen = _with_known_masks(recording, run, folder, awaited.needs) if seen is None else seen
+    awaited = _Awaited(labelled, run)
+    read = read_frames(recording, run["options"], skipped=Counter(), needed=awaited.needs)
     for label in awaited:
-        for frame, view, found in seen:
+        for frame, view in read:
             if (label.topic, label.index) == (frame.topic, frame.index):
-                yield label, frame, _coloured(label, view, found)
+                yield label, frame, _coloured(label, view)
                 break
         else:
             msg = f"{recording.path}: has changed since it was processed; process it again"
             raise OutputError(msg)
-    deque(seen, maxlen=0)
 
 
 class _Awaited:
     """Frames that are looked for; a few are known in advance, so that others need not be read."""
 
-    def __init__(self, frames: Iterable[LabelledFrame]) -> None:
+    def __init__(self, frames: Iterable[LabelledFrame], run: RunInfo) -> None:
+        colours = run.get("color") or {}
+        self._topics, self._colours = set(run["options"]["topics"]), {*colours.values()}
         self._source = iter(frames)
         self._next = deque(islice(self._source, _AHEAD))
 
@@ -127,96 +68,23 @@ class _Awaited:
             self._next.extend(islice(self._source, 1))
 
     def needs(self, topic: str, log_time_ns: int) -> bool:
-        """Return whether a frame is awaited, or is later than those that are known."""
-        times = [one.log_time_ns for one in self._next if one.topic == topic]
-        last = self._next[-1].log_time_ns if len(self._next) == _AHEAD else math.inf
-        return log_time_ns in times or log_time_ns >= last
+        """Return whether a reading or an image is awaited, or may be of a frame not yet known.
+
+        Those frames are not earlier than the last one that is known, nor are their images earlier
+        than its image. Of other topics everything is needed.
+        """
+        if topic not in self._topics | self._colours:
+            return True
+        times = [m.log_time_ns for one in self._next if (m := one.masks) and m.topic == topic]
+        if topic in self._topics:
+            times += [one.log_time_ns for one in self._next]
+        later = len(self._next) == _AHEAD and log_time_ns >= max(times, default=0)
+        return later or log_time_ns in times
 
 
-def _coloured(
-    labelled: LabelledFrame, view: ColourView | None, found: FrameMasks | None
-) -> Coloured | None:
-    if view is None:
+def _coloured(labelled: LabelledFrame, view: ColourView | None) -> Coloured | None:
+    """Return the image of a frame with the masks that were found on it."""
+    if view is None or labelled.masks is None:
         return None
-    objects = [found.mask(o.detections) if found else NOTHING for o in labelled.objects]
-    return Coloured(view, tuple(objects))
-
-
-def _with_known_masks(
-    recording: Recording, run: RunInfo, folder: Path, needed: Needed
-) -> Iterator[Seen]:
-    """Yield the needed frames of a run with the masks of its table; with colour it is all."""
-    rows = read_masks(folder)
-    found = next(rows, None)
-    for frame, view in views_again(recording, run, None if run.get("color") else needed):
-        if found is not None and found.key == (frame.topic, frame.index):
-            yield frame, view, found
-            found = next(rows, None)
-        else:
-            yield frame, view, None
-
-
-def find_masks(
-    recording: Recording, run: RunInfo, folder: Path, *, threads: int = 1
-) -> Iterator[Seen]:
-    """Find the masks of all detections of a run; the table appears with the last frame.
-
-    Parameters
-    ----------
-    threads : with several, one reads while the others project.
-    """
-    with MaskTable(folder) as table:
-        items = _beside(views_again(recording, run), folder)
-        for (frame, view, _), row, masks in map_ahead(_masked, items, threads=threads):
-            yield frame, view, None if row is None else table.write(row, masks)
-
-
-def _beside(
-    views: Iterable[tuple[Frame, ColourView | None]], folder: Path
-) -> Iterator[tuple[Frame, ColourView | None, dict[int, U4]]]:
-    """Yield views beside the pixels of the detections of their frames."""
-    found = _indices(folder)
-    frames = iter(views)
-    for table in read_row_groups(folder / "frames.parquet", ["topic", "frame"]):
-        objects = next(found)
-        for key in zip(table["topic"].to_pylist(), table["frame"].to_pylist(), strict=True):
-            for frame, view in frames:
-                if (frame.topic, frame.index) == key:
-                    yield frame, view, objects.get(key, {})
-                    break
-
-
-def _indices(folder: Path) -> Iterator[dict[Key, dict[int, U4]]]:
-    """Yield by frame the pixels of each detection, row group by row group."""
-    wanted = ["topic", "frame", "detection", "indices"]
-    for table in read_row_groups(folder / "detections.parquet", wanted):
-        names, pixels = numbers(table["detection"]), table["indices"].combine_chunks()
-        ends, flat = np.from_dlpack(pixels.offsets), numbers(table["indices"])
-        ends = ends - ends[0] if len(ends) else ends
-        yield {
-            key: {int(names[k]): flat[ends[k] : ends[k + 1]] for k in range(rows.start, rows.stop)}
-            for key, rows in frame_rows(table).items()
-        }
-
-
-_Item = tuple[Frame, ColourView | None, dict[int, U4]]
-
-
-def _masked(item: _Item) -> tuple[_Item, MaskRow | None, dict[int, Mask]]:
-    """Return a frame with its row of the table and its masks by detection; no row without image."""
-    frame, view, objects = item
-    if view is None or not frame.organized:
-        return item, None, {}
-    image = view.image
-    row: MaskRow = {
-        "topic": frame.topic,
-        "frame": frame.index,
-        "color_topic": image.topic,
-        "color_stamp_ns": image.stamp_ns,
-        "color_log_time_ns": image.log_time_ns,
-        "color_frame_id": image.frame_id,
-        "width": image.width,
-        "height": image.height,
-    }
-    masks = dense_masks(frame, list(objects.values()), view.lens, view.colour_from_depth)
-    return item, row, dict(zip(objects, masks, strict=True))
+    masks = labelled.masks
+    return Coloured(view, tuple(mask_of(masks, item.detections) for item in labelled.objects))

@@ -108,7 +108,7 @@ def images_of(
     several = len(finished.run["options"]["topics"]) > 1
     with open_source(finished.run, recording) as source:
         frames = (f for f in finished.frames() if (f.topic, f.index) in chosen)
-        for labelled, frame, coloured in with_colour(frames, source, finished.run, finished.folder):
+        for labelled, frame, coloured in with_colour(frames, source, finished.run):
             stem = f"{safe_name(finished.name)}_"
             stem += f"{safe_name(labelled.topic)}_" if several else ""
             name = f"{stem}{labelled.index:06d}"

@@ -84,7 +84,7 @@ def export_run(
     with open_source(finished.run, recording) as source:
         full = format in _WITH_BOXES and not visible_boxes
         labelled = finished.frames_with_full_boxes() if full else finished.frames()
-        triples = with_colour(_thinned(labelled, every), source, finished.run, folder)
+        triples = with_colour(_thinned(labelled, every), source, finished.run)
         pairs = _observed(triples, total, observe)
         if format == "crops":
             return FORMATS[format](out, pairs, finished)

@@ -6,6 +6,7 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from shapecat.colour.image_masks import box_of
 from shapecat.outputs.annotation import AnnotationChannel
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.ros_annotations import RosMessages
@@ -54,22 +55,25 @@ class ImageFrame(NamedTuple):
 
 
 def read_image_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[ImageFrame]:
-    """Yield the annotations of the colour images of a run, each image once."""
+    """Yield the annotations of the colour images of a run, each image once.
+
+    The colours of loose points are no image.
+    """
     shown = ShownTracks.read(folder, labels)
     last = None
-    for masks in read_masks(folder, boxes_only=True):
-        if (masks.topic, masks.stamp_ns) == last:
+    for key, masks in read_masks(folder, boxes_only=True):
+        if (masks.topic, masks.stamp_ns) == last or masks.height <= 1:
             continue
         last = masks.topic, masks.stamp_ns
         parts: dict[int, list[int]] = {}
         named: dict[int, TrackLabel] = {}
-        for item in shown.of(masks.key):
+        for item in shown.of(key):
             parts.setdefault(item.label.track, []).append(item.detection)
             named[item.label.track] = item.label
         boxes = [
             ImageBox(track, named[track].category, named[track].confidence, box)
             for track, detections in parts.items()
-            if (box := masks.box(detections)) is not None
+            if (box := box_of(masks, detections)) is not None
         ]
         yield ImageFrame(masks.stamp_ns, masks.log_time_ns, masks.frame_id, tuple(boxes))
 

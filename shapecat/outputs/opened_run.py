@@ -209,6 +209,6 @@ class Run:
         """
         moved = None if recording is None else Path(recording)
         with open_source(self.info, moved) as source:
-            shown = with_colour(self.labelled_frames(), source, self.info, self.folder)
+            shown = with_colour(self.labelled_frames(), source, self.info)
             for labelled, reading, coloured in shown:
                 yield RunFrame(labelled, reading, coloured)

@@ -19,7 +19,7 @@ Entities
             ├── full           boxes around all of the objects, dashed
             ├── graphs         edges of the growing neural gas
             └── surfaces       its triangles
-    images/<topic>             the colour image, as it was recorded where it was compressed
+    images/<topic>             the colour image of a scene, as it was recorded if compressed
     ├── masks                  the pixels of each object, translucent in the colour of the category
     ├── boxes                  around the masks
     └── captions               labelled as in 3D

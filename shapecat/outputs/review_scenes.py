@@ -1,15 +1,13 @@
 """The frames of a review: their scenes, drawn seldom while nothing moves, and their painting."""
 
 import math
-from collections import deque
 from collections.abc import Iterable, Iterator
 from itertools import tee
-from pathlib import Path
 from typing import NamedTuple
 
 from shapecat.arrays import F8
 from shapecat.geometry import IDENTITY, transform
-from shapecat.outputs.colouring import Coloured, Seen, with_colour
+from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.review_cloud import PaintedCloud, paint
 from shapecat.outputs.review_images import Picture, picture_of
 from shapecat.recordings import MessageError, Recording
@@ -25,42 +23,26 @@ _STILL_M = 0.015
 
 
 class ReviewFrame(NamedTuple):
-    """A frame to be written, and whether its scene is drawn; else its points may be missing."""
+    """A frame to be written, with its points and its image if its scene is drawn."""
 
     labelled: LabelledFrame
-    frame: Frame | None
-    coloured: Coloured | None
-    drawn: bool
+    frame: Frame | None = None
+    coloured: Coloured | None = None
 
 
 def with_clouds(
-    frames: Iterable[LabelledFrame],
-    recording: Recording,
-    run: RunInfo,
-    folder: Path,
-    seen: Iterator[Seen] | None = None,
+    frames: Iterable[LabelledFrame], recording: Recording, run: RunInfo
 ) -> Iterator[ReviewFrame]:
-    """Yield all frames of a run, with the clouds of those whose scene is drawn.
-
-    Parameters
-    ----------
-    seen : as for `shapecat.outputs.colouring.with_colour`.
+    """Yield all frames of a run, with the clouds and images of those whose scene is drawn.
 
     Raises
     ------
     OutputError : the recording does not hold one of them any more.
     """
     first, second = tee(choose_scenes(frames, fixed=run["fixed_frame"] is not None))
-    coloured = bool(run.get("color"))  # then every frame shows a picture
-    wanted = (labelled for labelled, drawn in first if drawn or coloured)
-    read = with_colour(wanted, recording, run, folder, seen)
+    read = with_colour((labelled for labelled, drawn in first if drawn), recording, run)
     for labelled, drawn in second:
-        if drawn or coloured:
-            _, frame, view = next(read)
-            yield ReviewFrame(labelled, frame, view, drawn)
-        else:
-            yield ReviewFrame(labelled, None, None, drawn)
-    deque(read, maxlen=0)
+        yield ReviewFrame(*next(read)) if drawn else ReviewFrame(labelled)
 
 
 def choose_scenes(
@@ -120,15 +102,14 @@ class PaintedFrame(NamedTuple):
 
 def paint_frame(chosen: ReviewFrame, *, limit: int) -> PaintedFrame:
     """Paint the clouds and the masks of a frame; without colour if its image is damaged."""
-    labelled, frame, coloured, drawn = chosen
+    labelled, frame, coloured = chosen
     damage, parts = "", (labelled.planes, labelled.objects)
     if frame is None:
         return PaintedFrame(labelled, None, None, None, "")
     if coloured is not None:
         try:
-            clouds = paint(frame, *parts, limit=limit, view=coloured.view) if drawn else None
+            clouds = paint(frame, *parts, limit=limit, view=coloured.view)
             return PaintedFrame(labelled, frame, clouds, picture_of(labelled, coloured), "")
         except MessageError as error:
             damage = f"{coloured.view.image.topic}: {error}"
-    clouds = paint(frame, *parts, limit=limit) if drawn else None
-    return PaintedFrame(labelled, frame, clouds, None, damage)
+    return PaintedFrame(labelled, frame, paint(frame, *parts, limit=limit), None, damage)

@@ -51,7 +51,7 @@ def frames_with_colour(
     Parameters
     ----------
     colours : the colour stream of each depth topic that has one.
-    chosen : ``start_s, end_s, every``.
+    chosen : ``start_s, end_s, every``, and ``needed``, which is asked of colour images as well.
 
     Yields
     ------
@@ -70,7 +70,7 @@ def frames_with_colour(
             yield _paired(waiting.popleft(), partners)
     while waiting:
         yield _paired(waiting.popleft(), partners)
-    for partner in partners.values():
+    for partner in partners.values() if chosen.get("needed") is None else ():
         partner.report()
 
 

@@ -1,5 +1,6 @@
 """Which colour images belong to a depth stream."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import Any, Literal
@@ -19,7 +20,7 @@ from shapecat.recordings.streams import (
     info_topic_of,
 )
 
-__all__ = ["ColourStream", "choose_colour", "colour_streams"]
+__all__ = ["ColourStream", "choose_colour", "choose_colours", "colour_streams"]
 
 _COLOUR_WORDS = ("color", "colour", "rgb")
 _OTHER_WORDS = ("infra", "/ir/", "depth/image", "confidence", "thermal", "mask")
@@ -62,6 +63,21 @@ def colour_streams(recording: Recording) -> tuple[ColourStream, ...]:
         if topic.count != 0 and (kind := _KINDS.get(ros_counterpart(topic.type)))
     )
     return tuple(stream for stream in found if stream is not None)
+
+
+def choose_colours(
+    recording: Recording, streams: Sequence[Stream], wanted: str | None
+) -> dict[str, ColourStream]:
+    """Return the colour stream of each depth topic that has one; with ``""`` there is none.
+
+    Raises
+    ------
+    NoStreamError : the wanted topic holds no colour images.
+    """
+    if wanted == "":
+        return {}
+    found = {stream.topic: choose_colour(recording, stream, wanted) for stream in streams}
+    return {topic: colour for topic, colour in found.items() if colour is not None}
 
 
 def choose_colour(

@@ -34,7 +34,8 @@ def frames(
     every : keep each so-many-th frame of a stream.
     skipped : frames that cannot be read are counted here by reason; they never raise.
     heard : is told of the messages of other topics as they pass, so that they are read only once.
-    needed : tells by topic and log time which frames are; an indexed file may leave out others.
+    needed : tells by topic and log time which frames, and messages of ``heard``, are; an indexed
+        file may leave out others.
 
     Yields
     ------
@@ -58,18 +59,18 @@ def frames(
     heard = heard or {}
 
     def is_needed(topic: str, log_time_ns: int) -> bool:
-        return needed is None or topic not in sources or needed(topic, log_time_ns)
+        return needed is None or topic in infos or needed(topic, log_time_ns)
 
     topics = {*sources, *infos, *heard}
     for message in recording.messages(topics, limits[0], limits[1], is_needed):
-        if message.topic in heard:
+        unread = not message.data and not is_needed(message.topic, message.log_time_ns)
+        if message.topic in heard and not unread:
             heard[message.topic](message)
         for depth in infos.get(message.topic, ()):
             yield from depth.calibrate(message, skipped)
         chosen = sources.get(message.topic)
         if chosen is not None and message.type == chosen.stream.type:
             chosen.index += 1
-            unread = not message.data and not is_needed(message.topic, message.log_time_ns)
             if (chosen.index - 1) % every == 0 and not unread:
                 yield from chosen.read(message, skipped)
     for source in sources.values():

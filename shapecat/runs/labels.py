@@ -12,9 +12,18 @@ import pyarrow.compute
 from shapecat.arrays import F4
 from shapecat.geometry import box_corners, upright_box
 from shapecat.runs.label_meaning import TrackLabel
+from shapecat.runs.masks import read_masks
 from shapecat.runs.shown import ShownTracks
-from shapecat.runs.tables import numbers, read_row_groups, release_memory
-from shapecat.types import Box, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
+from shapecat.runs.tables import Key, numbers, read_row_groups, release_memory
+from shapecat.types import (
+    Box,
+    ImageMasks,
+    LabelledFrame,
+    LabelledObject,
+    NeuralGas,
+    Plane,
+    Pose,
+)
 
 __all__ = ["read_labelled_frames", "rows_by_frame"]
 
@@ -45,6 +54,7 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
     """
     shown = ShownTracks.read(folder, labels, causal=True)
     release_memory()  # of the table that it was made from
+    masks = _MasksByFrame(read_masks(folder))
     groups = (
         read_row_groups(folder / f"{name}.parquet", columns)
         for name, columns in (("frames", None), ("detections", _OBJECT), ("planes", None))
@@ -54,7 +64,23 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
         supports = rows_by_frame(planes)
         for row in frames.to_pylist():
             key = (row["topic"], row["frame"])
-            yield _labelled_frame(row, objects.get(key, []), supports.get(key, []), shown)
+            frame = _labelled_frame(row, objects.get(key, []), supports.get(key, []), shown)
+            yield replace(frame, masks=masks.of(key))
+
+
+class _MasksByFrame:
+    """The masks of frames that are asked for in the order of the table; not all have some."""
+
+    def __init__(self, rows: Iterator[tuple[Key, ImageMasks]]) -> None:
+        self._rows = rows
+        self._next = next(rows, None)
+
+    def of(self, key: Key) -> ImageMasks | None:
+        """Return the masks of a frame."""
+        if self._next is None or self._next[0] != key:
+            return None
+        found, self._next = self._next[1], next(self._rows, None)
+        return found
 
 
 def rows_by_frame(table: pa.Table) -> dict[tuple[str, int], list[dict[str, Any]]]:

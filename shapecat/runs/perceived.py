@@ -1,4 +1,4 @@
-"""The tables of perceive: frames, detections and planes, written in segments."""
+"""The tables of perceive: frames, detections, planes and masks, written in segments."""
 
 import time
 from collections.abc import Iterable, Sequence
@@ -11,6 +11,7 @@ import numpy as np
 import pyarrow as pa
 
 from shapecat.arrays import F4
+from shapecat.runs.masks import mask_columns
 from shapecat.runs.segments import (
     GROUP_FRAMES,
     PERCEIVED,
@@ -45,7 +46,7 @@ class FrameRow:
 
 
 class PerceptionTables:
-    """Write frames, detections and planes together, a row group every 32 frames.
+    """Write frames, detections, planes and masks together, a row group every 32 frames.
 
     What was perceived is first written as *segments*, folders that appear when complete, so that
     a run that was cut short goes on after its last one; leaving the block joins them into the
@@ -63,16 +64,21 @@ class PerceptionTables:
         *,
         categories: Sequence[str],
         model_id: str,
+        colour: bool = False,
         again: bool = False,
     ) -> None:
-        """Look for segments in ``folder``, those of a second look if ``again``."""
+        """Look for segments in ``folder``, those of a second look if ``again``.
+
+        Without ``colour`` there is no table of masks.
+        """
         metadata = {
             "schema_version": SCHEMA_VERSION,
             "categories": ",".join(categories),
             "model": model_id,
         }
         self._folder = folder
-        self._schemas = {name: s.with_metadata(metadata) for name, s in PERCEIVED.items()}
+        names = [name for name in PERCEIVED if name != "masks" or colour]
+        self._schemas = {name: PERCEIVED[name].with_metadata(metadata) for name in names}
         self._categories = tuple(categories)
         self._pending: list[tuple[Perception, FrameRow]] = []
         self._place = folder / (REVISIONS if again else SEGMENTS)
@@ -103,10 +109,12 @@ class PerceptionTables:
     def _flush(self) -> None:
         if not self._pending:
             return
+        perceptions = [perception for perception, _ in self._pending]
         rows = {
             "frames": _frame_columns(self._pending),
             "detections": _detection_columns(self._pending, self._categories),
-            "planes": _plane_columns([perception for perception, _ in self._pending]),
+            "planes": _plane_columns(perceptions),
+            "masks": mask_columns(perceptions),
         }
         segment = self._place / f"{len(self._segments):06d}"
         with complete_folder(segment) as hidden:

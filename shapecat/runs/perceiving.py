@@ -6,6 +6,7 @@ planes of the first frames that show one: a fixed frame whose z is not up spoils
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
@@ -13,20 +14,22 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 
+from shapecat.cameras.colour import ColourView
 from shapecat.config import Settings
 from shapecat.depth_fusion import RecentFrames
 from shapecat.errors import NoStreamError, RecordingError
 from shapecat.executors.order import Processes
 from shapecat.learning import Categorizer
 from shapecat.perception import Perceiver, View, find_up
-from shapecat.recordings import Recording, choose_streams, frames
+from shapecat.recordings import Recording
 from shapecat.recordings.gravity import Upright
 from shapecat.rehearsal import rehearse
 from shapecat.runs.jobs import Job
 from shapecat.runs.perceived import FrameRow, PerceptionTables
-from shapecat.runs.run_info import Options, RunInfo, window_of
+from shapecat.runs.run_info import RunInfo
 from shapecat.runs.second_look import Revision, frames_to_revise
 from shapecat.runs.segments import read_segments
+from shapecat.runs.selection import count_frames, read_frames
 from shapecat.runs.tables import Key, count_rows, read_row_groups
 from shapecat.system import stopping
 from shapecat.types import Frame
@@ -42,6 +45,10 @@ _CONFIRMS_DEG = 15.0
 """A plane farther from level than this is none to detection: see `detect`."""
 _DOUBTS, _LOOKS = 3, 10
 """So many frames with a plane have to contradict, of so many that are looked at."""
+
+
+_Reading = tuple[Frame, ColourView | None]
+"""A frame, and the colour image beside it."""
 
 
 def ignore(_phase: str, _done: int, _total: int | None) -> None:
@@ -61,27 +68,28 @@ class Work(NamedTuple):
 
 
 def perceive_all(work: Work) -> None:
-    """Write frames, detections and planes, frame by frame in flat memory."""
+    """Write frames, detections, planes and masks, frame by frame in flat memory."""
     recording, folder, run, job, categorizer, observe, cores = work
     skipped: Counter[str] = Counter()
-    source, total = _select(recording, run["options"], skipped)
+    total = count_frames(recording, run["options"])
     recent = RecentFrames(job.settings.detection.fuse_frames)
     count = 0
     with (
         Processes(Perceiver(categorizer, job.settings, job.model), cores, rehearse) as processes,
-        _tables(folder, categorizer) as tables,
+        _tables(folder, run, categorizer) as tables,
     ):
         if (total or 0) - tables.done >= _MANY:
             processes.start()
         upright = Upright.of(recording, up=job.up, fixed_frame=job.fixed_frame)
 
-        def view(frame: Frame) -> tuple[FrameRow, View]:
+        def view(reading: _Reading) -> tuple[FrameRow, View]:
+            frame, colour = reading
             up, pose = upright.up(frame), upright.fixed_from_sensor(frame)
             row = FrameRow(frame.log_time_ns, pose, up)
-            return row, View(frame, up, recent.before(frame, pose), pose)
+            return row, View(frame, up, recent.before(frame, pose), pose, colour)
 
-        source = _UpTrial(upright, job.settings).before(_readable(source, job))
-        views = map(view, source)
+        source = _readings(recording, run, job, skipped)
+        views = map(view, _UpTrial(upright, job.settings).before(source))
         for count, _ in enumerate(stopping.until_asked(islice(views, tables.done)), start=1):
             observe("perceive", count, total)
         for rows, perceptions in processes.in_order(_blocks(views, job.settings.reuse_frames)):
@@ -96,6 +104,8 @@ def perceive_all(work: Work) -> None:
         raise NoStreamError(msg)
     found = count_rows(folder, "detections")
     run["counts"] = {"frames": count, "skipped": dict(skipped), "detections": found}
+    if run.get("color"):
+        run["counts"]["color"] = count_rows(folder, "masks")
     if tables.done:
         run["counts"]["resumed"] = tables.done
     run["fixed_frame"], run["up"] = upright.fixed_frame, upright.report(_perceived(folder))
@@ -114,7 +124,7 @@ def revise(work: Work) -> None:
         return
     with (
         Processes(Perceiver(categorizer, job.settings, job.model), cores, rehearse) as processes,
-        _tables(folder, categorizer, again=True) as tables,
+        _tables(folder, run, categorizer, again=True) as tables,
     ):
         views = islice(_views_again(recording, run, job, chosen), len(chosen))
         count = sum(1 for _ in stopping.until_asked(islice(views, tables.done)))
@@ -133,16 +143,15 @@ def _views_again(
     recording: Recording, run: RunInfo, job: Job, chosen: dict[Key, Revision]
 ) -> Iterator[tuple[FrameRow, View]]:
     """Yield the chosen frames, to be perceived with another up."""
-    source, _ = _select(recording, run["options"], Counter())
     upright = Upright.of(recording, up=job.up, fixed_frame=run["fixed_frame"])
     recent = RecentFrames(job.settings.detection.fuse_frames)
-    for frame in _readable(source, job):
+    for frame, colour in _readings(recording, run, job, Counter()):
         pose = upright.fixed_from_sensor(frame)
         earlier = recent.before(frame, pose)
         revision = chosen.get((frame.topic, frame.index))
         if revision is not None:
             row = FrameRow(frame.log_time_ns, pose, revision.up_given, again=True)
-            yield row, View(frame, revision.up, earlier, pose)
+            yield row, View(frame, revision.up, earlier, pose, colour)
 
 
 def _blocks(
@@ -164,11 +173,12 @@ class _UpTrial:
         self._looks: Counter[str] = Counter()
         self._decided: set[str] = set()
 
-    def before(self, source: Iterator[Frame]) -> Iterator[Frame]:
+    def before(self, source: Iterator[_Reading]) -> Iterator[_Reading]:
         """Yield the frames after the decision about the up of their topic."""
-        held: list[Frame] = []
-        for frame in source:
-            held.append(frame)
+        held: list[_Reading] = []
+        for reading in source:
+            frame, _ = reading
+            held.append(reading)
             if frame.topic not in self._decided:
                 self._look(frame)
             if self._looks.keys() <= self._decided:
@@ -199,33 +209,36 @@ class _UpTrial:
             self._upright.contradict(topic, self._sources[topic], off)
 
 
-def _tables(folder: Path, categorizer: Categorizer, *, again: bool = False) -> PerceptionTables:
+def _tables(
+    folder: Path, run: RunInfo, categorizer: Categorizer, *, again: bool = False
+) -> PerceptionTables:
     return PerceptionTables(
-        folder, categories=categorizer.categories, model_id=categorizer.model_id, again=again
+        folder,
+        categories=categorizer.categories,
+        model_id=categorizer.model_id,
+        colour=bool(run.get("color")),
+        again=again,
     )
 
 
-def _readable(source: Iterator[Frame], job: Job) -> Iterator[Frame]:
-    """Yield frames; turn errors of the disk into errors of the recording."""
+def _readings(
+    recording: Recording, run: RunInfo, job: Job, skipped: Counter[str]
+) -> Iterator[_Reading]:
+    """Yield the frames of a run; errors of the disk become errors of the recording."""
     try:
-        yield from source
+        for frame, colour in read_frames(recording, run["options"], skipped=skipped):
+            yield frame, None if colour is None else _without_pixels(colour)
     except OSError as error:
         msg = f"{job.source}: cannot be read: {error.strerror or error}"
         raise RecordingError(msg) from error
+
+
+def _without_pixels(view: ColourView) -> ColourView:
+    """Leave out what masks do not need and other processes would be sent."""
+    return replace(view, image=replace(view.image, data=b""))
 
 
 def _perceived(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
     """Yield the up columns of the frames and planes tables."""
     frames = read_row_groups(folder / "frames.parquet", ["topic", "frame", "up", "up_given"])
     return zip(frames, read_row_groups(folder / "planes.parquet", ["topic", "frame"]), strict=True)
-
-
-def _select(
-    recording: Recording, options: Options, skipped: Counter[str]
-) -> tuple[Iterator[Frame], int | None]:
-    """Return the frames that the options select, and about how many there are."""
-    streams = choose_streams(recording, options["topics"])
-    whole = options["start_s"] is None and options["end_s"] is None
-    counts = [stream.count for stream in streams]
-    total = sum(-(-(n or 0) // options["every"]) for n in counts) if whole else 0
-    return frames(recording, streams, skipped=skipped, **window_of(options)), total or None

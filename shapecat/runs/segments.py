@@ -13,6 +13,7 @@ from pathlib import Path
 import pyarrow as pa
 
 from shapecat.errors import OutputError
+from shapecat.runs.masks import MASKS
 from shapecat.runs.tables import DETECTIONS, FRAMES, PLANES, Key, frame_rows, numbers
 
 __all__ = [
@@ -32,7 +33,8 @@ __all__ = [
 
 GROUP_FRAMES = 32
 _BALANCE = 4096
-PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES}
+PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES, "masks": MASKS}
+"""Of recordings without colour there are no masks."""
 SEGMENTS, REVISIONS = "segments", "revisions"
 
 
@@ -62,7 +64,8 @@ _Tables = dict[str, pa.Table]
 
 
 def _read_tables(segment: Path) -> _Tables:
-    return {name: read_segment(segment, name) for name in PERCEIVED}
+    names = [name for name in PERCEIVED if _part(segment, name).exists()]
+    return {name: read_segment(segment, name) for name in names}
 
 
 def _latest(folder: Path) -> Iterator[_Tables]:
@@ -124,7 +127,7 @@ def _cut(tables: _Tables, count: int) -> tuple[_Tables, _Tables]:
     """Part tables after a number of frames."""
     first = set(frame_rows(tables["frames"][:count]))
     ends = {"frames": count}
-    for name in ("detections", "planes"):
+    for name in tables.keys() - ends.keys():
         rows = frame_rows(tables[name])
         ends[name] = max((rows[key].stop for key in first & set(rows)), default=0)
     return (
@@ -135,8 +138,10 @@ def _cut(tables: _Tables, count: int) -> tuple[_Tables, _Tables]:
 
 def write_segment(segment: Path, name: str, table: pa.Table) -> None:
     """Write a part of a table as it lies in memory: it is soon read again, once or twice."""
-    path = segment / f"{name}.arrow"
-    with pa.OSFile(str(path), "wb") as sink, pa.ipc.new_file(sink, table.schema) as writer:
+    with (
+        pa.OSFile(str(_part(segment, name)), "wb") as sink,
+        pa.ipc.new_file(sink, table.schema) as writer,
+    ):
         writer.write_table(table)
 
 
@@ -147,10 +152,14 @@ def read_segment(segment: Path, name: str) -> pa.Table:
     ------
     OutputError : it cannot be read.
     """
-    path = segment / f"{name}.arrow"
+    path = _part(segment, name)
     try:
         with pa.OSFile(str(path), "rb") as source, pa.ipc.open_file(source) as reader:
             return reader.read_all()
     except (OSError, pa.ArrowException) as error:
         msg = f"{path}: what a killed run left there cannot be read ({error}); use --overwrite"
         raise OutputError(msg) from error
+
+
+def _part(segment: Path, name: str) -> Path:
+    return segment / f"{name}.arrow"

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.outputs.report.tracks import Detected, Timeline
-from shapecat.runs.masks import FrameMasks, read_masks
+from shapecat.runs.masks import read_masks
 from shapecat.runs.tables import Key, read_row_groups
+from shapecat.types import ImageMasks
 
 __all__ = ["Choice", "choose_frames"]
 
@@ -78,14 +79,14 @@ def _views(folder: Path, owner: Mapping[Detected, int]) -> dict[int, list[_View]
     return views
 
 
-def _areas(masks: Iterator[FrameMasks]) -> dict[Detected, tuple[float, bool]]:
+def _areas(masks: Iterator[tuple[Key, ImageMasks]]) -> dict[Detected, tuple[float, bool]]:
     """Return the pixels of each mask, and whether the border of the image cuts it."""
     found = {}
-    for frame in masks:
+    for key, frame in masks:
         for number, (left, top, width, height) in frame.boxes.items():
             right, bottom = frame.width - left - width, frame.height - top - height
             area = float(np.sum(frame.counts[number][1::2]))
-            found[*frame.key, number] = (area, min(left, top, right, bottom) <= 0)
+            found[*key, number] = (area, min(left, top, right, bottom) <= 0)
     return found
 
 

@@ -109,7 +109,7 @@ def take_pictures(finished: FinishedRun, rows: Sequence[TrackRow], choice: Choic
     try:
         with open_source(finished.run) as recording:
             frames = _frames(finished, rows, choice)
-            for item in with_colour(frames, recording, finished.run, finished.folder):
+            for item in with_colour(frames, recording, finished.run):
                 taken.add(*item)
     except ShapecatError as error:
         taken = _Taken(choice)

@@ -1,0 +1,59 @@
+"""The masks of the detections of a frame, as they are kept."""
+
+from collections.abc import Sequence
+
+from shapecat.arrays import U4
+from shapecat.cameras.colour import ColourView
+from shapecat.colour.masks import NOTHING, Mask, dense_masks, united
+from shapecat.colour.rle import rle_counts, rle_mask
+from shapecat.types import Frame, ImageMasks
+
+__all__ = ["box_of", "find_masks", "mask_of"]
+
+
+def find_masks(frame: Frame, view: ColourView, objects: Sequence[U4]) -> ImageMasks:
+    """Return the masks of detections on a colour image, whose pixels are not looked at.
+
+    Loose points have none.
+
+    Parameters
+    ----------
+    objects : indices into the frame of the pixels of each detection.
+    """
+    image = view.image
+    masks: tuple[Mask, ...] = ()
+    if frame.organized:
+        masks = dense_masks(frame, objects, view.lens, view.colour_from_depth)
+    seen = {number: mask for number, mask in enumerate(masks) if mask.pixels.size}
+    return ImageMasks(
+        image.topic,
+        image.stamp_ns,
+        image.log_time_ns,
+        image.frame_id,
+        image.width,
+        image.height,
+        {number: mask.box for number, mask in seen.items()},
+        {n: rle_counts(mask, image.height, image.width) for n, mask in seen.items()},
+    )
+
+
+def mask_of(masks: ImageMasks, detections: Sequence[int]) -> Mask:
+    """Return the union of the masks of some detections.
+
+    Raises
+    ------
+    ValueError : a mask is not one of this image.
+    """
+    counts = [masks.counts[number] for number in detections if number in masks.counts]
+    found = [rle_mask(runs, masks.height, masks.width) for runs in counts]
+    return united(found) if found else NOTHING
+
+
+def box_of(masks: ImageMasks, detections: Sequence[int]) -> tuple[int, int, int, int] | None:
+    """Return left, top, width and height around some detections, pixels; None if unseen."""
+    boxes = [masks.boxes[number] for number in detections if number in masks.boxes]
+    if not boxes:
+        return None
+    left, top = min(box[0] for box in boxes), min(box[1] for box in boxes)
+    right, bottom = max(box[0] + box[2] for box in boxes), max(box[1] + box[3] for box in boxes)
+    return left, top, right - left, bottom - top

@@ -1,0 +1,37 @@
+"""The frames of a recording that the options of a run select."""
+
+from collections import Counter
+from collections.abc import Iterator
+
+from shapecat.cameras.colour import ColourView
+from shapecat.recordings import Recording, choose_streams
+from shapecat.recordings.colour_frames import frames_with_colour
+from shapecat.recordings.colour_streams import choose_colours
+from shapecat.recordings.messages import Needed
+from shapecat.runs.run_info import Options, window_of
+from shapecat.types import Frame
+
+__all__ = ["count_frames", "read_frames"]
+
+
+def read_frames(
+    recording: Recording, options: Options, *, skipped: Counter[str], needed: Needed = None
+) -> Iterator[tuple[Frame, ColourView | None]]:
+    """Read the selected frames, each beside its colour image.
+
+    Parameters
+    ----------
+    skipped, needed : as for `shapecat.recordings.frames`.
+    """
+    streams = choose_streams(recording, options["topics"])
+    colours = choose_colours(recording, streams, options.get("color"))
+    window = window_of(options)
+    return frames_with_colour(recording, streams, colours, skipped=skipped, needed=needed, **window)
+
+
+def count_frames(recording: Recording, options: Options) -> int | None:
+    """Return about how many frames are selected, None if that is not known before."""
+    if options["start_s"] is not None or options["end_s"] is not None:
+        return None
+    streams = choose_streams(recording, options["topics"])
+    return sum(-(-(stream.count or 0) // options["every"]) for stream in streams) or None
