@@ -68,7 +68,7 @@ def dense_masks(
     Parameters
     ----------
     frame : a depth image.
-    objects : indices of the pixels of each object.
+    objects : (k,) uint32 flat indices of the pixels of each object.
     lens : the colour camera; not needed for a registered image.
     colour_from_depth : pose of the sensor in the optical frame of the colour camera; None where
         the image is registered: its pixels are those of the depth image.

@@ -45,7 +45,7 @@ def outlines(mask: Mask, tolerance_px: float = _TOLERANCE_PX) -> list[F8]:
 
 
 def joined(rings: Sequence[F8]) -> F8:
-    """Return one polygon of several, for formats that know no parts: linked there and back.
+    """Return one polygon (n, 2) of several, linked there and back, for formats without parts.
 
     Source: as converters of COCO data sets do, by the nearest corners.
     """

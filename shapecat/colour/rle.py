@@ -10,7 +10,9 @@ __all__ = ["rle_counts", "rle_mask", "rle_text"]
 
 
 def rle_counts(mask: Mask, height: int, width: int) -> U4:
-    """Return the lengths of the runs of a mask in its image, outside and inside by turns.
+    """Return the lengths (n,) of the runs of a mask in its image, outside and inside by turns.
+
+    The image of ``height`` by ``width`` pixels is read column by column.
 
     Examples
     --------
@@ -26,7 +28,7 @@ def rle_counts(mask: Mask, height: int, width: int) -> U4:
 
 
 def rle_mask(counts: U4, height: int, width: int) -> Mask:
-    """Return the mask of run lengths; the inverse of `rle_counts`.
+    """Return the mask of run lengths (n,); the inverse of `rle_counts`.
 
     Raises
     ------
@@ -51,7 +53,9 @@ def rle_mask(counts: U4, height: int, width: int) -> Mask:
 
 
 def rle_text(counts: U4) -> str:
-    """Return run lengths in COCO's own text: differences to the run before last, 5 bits a letter.
+    """Return run lengths (n,) in COCO's own text.
+
+    It holds the differences to the run before last, 5 bits a letter.
 
     Source: rleToString of the COCO API (Lin et al. 2014).
 

@@ -11,7 +11,7 @@ from shapecat.colour.projection import Lens, kernel_lens, see
 from shapecat.jit import kernel
 from shapecat.types import Camera, Pose
 
-__all__ = ["Painted", "splat_depth"]
+__all__ = ["SplattedLabels", "splat_depth"]
 
 _FOOTPRINT_PX = 0.05
 """A depth pixel covers so much more of the colour image on each side, to leave no gaps."""
@@ -23,7 +23,7 @@ _BESIDE_PX = 30
 """Depth pixels so far from labelled ones are looked at, for what lies beside and between them."""
 
 
-class Painted(NamedTuple):
+class SplattedLabels(NamedTuple):
     """A part of an image as the colour camera sees it, from row ``top`` and column ``left`` on.
 
     ``labels`` (h, w) int32 is what is seen, -1 where nothing is known. Row ``k`` of ``boxes``
@@ -40,7 +40,7 @@ class Painted(NamedTuple):
 
 def splat_depth(
     depth: F4, camera: Camera, objects: Sequence[U4], lens: LensCamera, colour_from_depth: Pose
-) -> Painted:
+) -> SplattedLabels:
     """Paint the objects of a depth image as a colour camera sees them.
 
     Each depth pixel of an object covers a square on the colour image, as large as its own, and a
@@ -66,7 +66,7 @@ def splat_depth(
     left, top, seen = _splat(
         depth, pixels, labels, rays, parallax, kernel_lens(lens), scale, size, boxes
     )
-    return Painted(left, top, seen, boxes)
+    return SplattedLabels(left, top, seen, boxes)
 
 
 def _rays(camera: Camera, colour_from_depth: Pose) -> tuple[F4, F4, F4]:
@@ -97,7 +97,7 @@ def _splat(
     """Return left, top and labels of the part of an image of a size where pixels land.
 
     ``parallax`` is in pixels per inverse distance; ``scale`` pixels of the image to one of the
-    depth image, at equal distance. ``boxes`` become those of `Painted`.
+    depth image, at equal distance. ``boxes`` become those of `SplattedLabels`.
     """
     beside = _list_beside(depth, pixels, parallax)
     place, around = _see_pixels(depth, pixels, rays, lens), _see_pixels(depth, beside, rays, lens)

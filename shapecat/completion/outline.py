@@ -89,7 +89,10 @@ def fit_oval(
 
 @kernel
 def narrowest(reached: F8) -> int:
-    """Return which of the first quarter of directions a rectangle of the least area has."""
+    """Return which of the first quarter of directions a rectangle of the least area has.
+
+    ``reached`` (`DIRECTIONS`,) is how far the outline extends in each direction, metres.
+    """
     best, least = 0, np.inf
     for k in range(QUARTER):
         length = reached[k] + reached[k + _HALF]
@@ -100,7 +103,10 @@ def narrowest(reached: F8) -> int:
 
 
 def rectangle(reached: F8, side: int) -> tuple[float, float, float, float]:
-    """Return the centre of an outline along a direction and across it, its length and its width."""
+    """Return the centre of an outline along a direction and across it, its length and its width.
+
+    In metres; ``reached`` as in `narrowest`, ``side`` the number of the direction.
+    """
     ahead, left = reached[side], reached[side + QUARTER]
     back, right = reached[side + _HALF], reached[side + QUARTER + _HALF]
     return 0.5 * (ahead - back), 0.5 * (left - right), ahead + back, left + right

@@ -119,7 +119,7 @@ def _joined(paths: F4, straight: F4) -> F4:
 
 @kernel(fast=True)
 def mean_gap(straight: F4) -> float:
-    """Return the mean distance from a node to the nearest other one."""
+    """Return the mean distance from a node to the nearest other one; their distances are (n, n)."""
     count = straight.shape[0]
     total = 0.0
     for i in range(count):

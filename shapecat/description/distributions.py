@@ -60,7 +60,17 @@ def _find_bins(lengths: F4, i: int, scale: float, one: float, bins: I4, shares: 
 def distributions(
     z: F4, straight: F4, paths: F4, weight: F4, normals: F4, curvatures: F4, out: F4
 ) -> None:
-    """Write the histograms over the whole object, its rings and its bands."""
+    """Write the histograms over the whole object, its rings and its bands.
+
+    Parameters
+    ----------
+    z : (n,) heights of the nodes; the unit is the mean distance between neurons.
+    straight, paths : (n, n) distances in space and along the surface.
+    weight : (n,) shares of the points that the nodes stand for.
+    normals : (3, n) unit vectors.
+    curvatures : (2, n) as `fit_surfaces` returns them.
+    out : the block of the descriptor, written in place.
+    """
     count = z.size
     width = 1 + _CURVATURE + 2 * DISTANCE_BINS
     rows = np.zeros((count, width), np.float32)

@@ -16,7 +16,8 @@ PROFILE_NAMES = tuple(f"{i}_{name}" for i in range(PROFILE_SLICES) for name in _
 def vertical_axis(x: F4, y: F4, normals: F4, weight: F4) -> tuple[float, float, float]:
     """Return the vertical line nearest to the horizontal lines along the normals.
 
-    Its x and y, and the root mean square distance of the lines to it. A weak pull to the centre of
+    Its x and y, and the root mean square distance of the lines to it. ``x``, ``y`` and
+    ``weight`` are (n,), ``normals`` (3, n). A weak pull to the centre of
     the neurons makes the answer unique where all normals are parallel or vertical.
     """
     axx = axy = ayy = bx = by = total = 0.0
@@ -58,6 +59,13 @@ def profile(
 
     For each of 8 slices of the height: share of the points, mean and deviation of the radius over
     the largest slice's, shares facing the axis and facing up, mean curvature.
+
+    Parameters
+    ----------
+    x, y, z, weight : (n,) places of the nodes, and the shares of points they stand for.
+    normals, curvatures : (3, n) and (2, n) as `fit_surfaces` returns them.
+    low, high : heights of the lowest and highest point.
+    out : the block of the descriptor, written in place.
     """
     cx, cy, _ = vertical_axis(x, y, normals, weight)
     widest = 1e-6

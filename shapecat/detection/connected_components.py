@@ -98,7 +98,7 @@ def spans_of(plane_id: I4) -> I4:
 
 @kernel
 def span_of(row: I4) -> tuple[int, int]:
-    """Return the columns of the first number above 0 of a row and after the last, or 0 and 0."""
+    """Return the columns of the first number above 0 of a row (n,) and after the last, or 0, 0."""
     some = False
     for j in range(row.size):
         some |= row[j] > 0  # many rows have none, and this vectorises

@@ -122,9 +122,10 @@ def smallest_object_at(grid: DepthGrid, depth_m: float) -> float:
 
 @kernel
 def count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) -> I4:
-    """Return how many of the last readings before ``range_m`` the labels below ``size`` have.
+    """Count each label's samples at the range limit: (size,) for the labels below ``size``.
 
-    Label 0 has none.
+    ``inv_depth`` (1/m) and ``labels`` are (rows, columns), ``range_m`` the limit in metres. Label 0
+    has none.
     """
     count = np.zeros(size, np.int64)
     most = np.float32(1 / range_m + DISCONTINUITY / 2)

@@ -158,7 +158,7 @@ def label(
 ) -> Segmentation | None:
     """Find planes and objects among the samples; None if there is no supporting plane.
 
-    ``upright`` is of `find_supporting_planes`.
+    ``hint`` is the up direction (3,), if it is known; ``upright`` is of `find_supporting_planes`.
     """
     model = _find_planes(grid, hint, task, upright=upright)
     if model is None:

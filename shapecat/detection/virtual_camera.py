@@ -71,6 +71,16 @@ def top_view(
     The plane is the one with most points within 1 cm of it, of 200 through three points (with a
     ``hint``, of those within 15 degrees of level); its upper side is the one with more points.
     The viewpoint is 1 m from the middle of the cloud, 45 degrees above the plane.
+
+    Parameters
+    ----------
+    points : (n, 3) metres, sensor frame; those that are not finite are left out.
+    hint : (3,) the up direction, if it is known.
+    range_m : metres; what is farther from the viewpoint is not seen.
+
+    Returns
+    -------
+    The image, or None where fewer than `LEAST_POINTS` points, or no plane, can be used.
     """
     used = points[np.isfinite(points).all(axis=1) & (np.abs(points) < FARTHEST_M).all(axis=1)]
     if len(used) < LEAST_POINTS:

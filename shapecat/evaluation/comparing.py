@@ -19,7 +19,7 @@ from shapecat.evaluation.comparison_matching import (
     match_objects,
     seen_together,
 )
-from shapecat.evaluation.comparison_pictures import Picture, draw_frame
+from shapecat.evaluation.comparison_pictures import DifferenceImage, draw_frame
 from shapecat.evaluation.identities import SeenTogether
 from shapecat.evaluation.labellings import Item, Labelling, Reference
 from shapecat.evaluation.overlap import MATCHED_F, Overlap
@@ -77,7 +77,7 @@ class Comparison:
     kind: str
     figures: Mapping[str, Any]
     rows: tuple[Difference, ...]
-    pictures: tuple[Picture, ...]
+    pictures: tuple[DifferenceImage, ...]
     notes: tuple[str, ...]
 
     def as_dict(self) -> dict[str, Any]:
@@ -96,7 +96,7 @@ class _Tally:
     seen: list[SeenTogether] = field(default_factory=list)
     rows: list[Difference] = field(default_factory=list)
     last: dict[int, int] = field(default_factory=dict)
-    pictures: dict[int, Picture] = field(default_factory=dict)
+    pictures: dict[int, DifferenceImage] = field(default_factory=dict)
     compared: int = 0
     only_run: int = 0
     masks: bool = True

@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from shapecat.errors import OutputError
 from shapecat.evaluation.comparing import Comparison, Difference
-from shapecat.evaluation.comparison_pictures import COLOURS, Picture, words_of
+from shapecat.evaluation.comparison_pictures import COLOURS, DifferenceImage, words_of
 from shapecat.runs.tables import FRAME_COLUMNS, write_table
 from shapecat.system.files import complete_folder
 
@@ -192,7 +192,7 @@ def _cells(row: Difference) -> tuple[str, ...]:
     )
 
 
-def _picture(picture: Picture) -> str:
+def _picture(picture: DifferenceImage) -> str:
     texts = "".join(
         f'<text x="{min(max(c.x, 70), picture.width - 70):.0f}" y="{max(c.y, 14):.0f}">'
         f"{escape(c.text)}</text>"

@@ -12,7 +12,7 @@ from shapecat.outputs.exports_files import png
 from shapecat.runs.tables import Key
 from shapecat.types import Frame
 
-__all__ = ["COLOURS", "Picture", "draw_frame", "words_of"]
+__all__ = ["COLOURS", "DifferenceImage", "draw_frame", "words_of"]
 
 _SHADES = 48
 COLOURS = {
@@ -34,7 +34,7 @@ class Caption(NamedTuple):
     text: str
 
 
-class Picture(NamedTuple):
+class DifferenceImage(NamedTuple):
     """A frame as a data URI of a PNG, with captions; the more it differs, the graver."""
 
     topic: str
@@ -55,7 +55,7 @@ def draw_frame(
     pairs: Mapping[int, int],
     rows: Sequence[Any],
     severity: float,
-) -> Picture | None:
+) -> DifferenceImage | None:
     """Draw found and true masks over the depth image; None without an image.
 
     Parameters
@@ -76,7 +76,7 @@ def draw_frame(
     differing = tuple(row for row in rows if row.difference)
     captions = _captions(differing, found.items, true.items, width)
     uri = f"data:image/png;base64,{code}"
-    return Picture(*key, uri, width, height, captions, severity, differing)
+    return DifferenceImage(*key, uri, width, height, captions, severity, differing)
 
 
 def _states(

@@ -31,7 +31,7 @@ class Bin(NamedTuple):
 
 
 def accuracy(truth: I4, predicted: I4) -> float:
-    """Return the share of views that are right; NaN without views."""
+    """Return the share of views (n,) whose category is right; NaN without views."""
     return float(np.mean(truth == predicted)) if len(truth) else float("nan")
 
 
@@ -49,19 +49,25 @@ def confusion(truth: I4, predicted: I4, categories: int) -> I4:
 
 
 def recall(table: I4) -> F8:
-    """Return the share of each category that is right, from a confusion table; NaN if none."""
+    """Return the share (c,) of each category that is right; NaN for one without views.
+
+    ``table`` is a confusion table (c, c), a row per true category.
+    """
     totals = table.sum(axis=1)
     return np.where(totals > 0, np.diag(table) / np.maximum(totals, 1), np.nan)
 
 
 def balanced_accuracy(table: I4) -> float:
-    """Return the mean recall of the categories that have views, from a confusion table."""
+    """Return the mean recall of the categories that have views, from a confusion table (c, c)."""
     shares = recall(table)
     return float(np.nanmean(shares)) if np.any(table) else float("nan")
 
 
 def calibration_curve(truth: I4, posteriors: F4, *, bins: int = 15) -> tuple[Bin, ...]:
-    """Return the bins of equal width in confidence that hold views."""
+    """Return the bins of equal width in confidence that hold views.
+
+    ``truth`` (n,) are the true columns of ``posteriors`` (n, c).
+    """
     confidence = np.asarray(posteriors, np.float64).max(axis=1, initial=0.0)
     right = np.asarray(posteriors).argmax(axis=1) == truth if len(truth) else np.zeros(0, bool)
     place = np.minimum((confidence * bins).astype(np.int64), bins - 1)
@@ -74,6 +80,8 @@ def calibration_curve(truth: I4, posteriors: F4, *, bins: int = 15) -> tuple[Bin
 
 def expected_calibration_error(truth: I4, posteriors: F4, *, bins: int = 15) -> float:
     """Return the mean distance between confidence and accuracy, over bins of confidence.
+
+    ``truth`` (n,) are the true columns of ``posteriors`` (n, c).
 
     Source: Naeini et al. 2015; Guo et al. 2017, eq. 3. NaN without views.
     """

@@ -104,7 +104,7 @@ class ProbabilisticNeuralNetwork(
 
 
 def known_labels(y: ArrayLike, unknown: Any) -> tuple[Any, I4]:
-    """Return the categories, sorted, and the column of each label, -1 where ``unknown``.
+    """Return the categories (c,), sorted, and the column (n,) of each label, -1 where ``unknown``.
 
     Raises
     ------
@@ -128,7 +128,10 @@ def spread_kernels(z: F4, count: int, rng: np.random.Generator) -> F4:
 def parzen_level(
     z: F4, labels: I4, starts: I4, kernels: F4, span: tuple[int, int], bandwidth: float
 ) -> tuple[float, float]:
-    """Return mean and deviation of the log density of views under their own category."""
+    """Return mean and deviation of the log density of views under their own category.
+
+    The arguments are those of `log_density_levels`; 0 and 1 where no view has a density.
+    """
     levels = log_density_levels(z, labels, starts, kernels, span, bandwidth)
     levels = levels[levels > -1e8]
     if levels.size == 0:

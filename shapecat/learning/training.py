@@ -170,7 +170,10 @@ def collapse(
 
 
 def choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:
-    """Return at most ``count`` indices of views with a code >= 0, evenly over the codes."""
+    """Return at most ``count`` ascending indices of views with a code >= 0, evenly over the codes.
+
+    ``codes`` is (n,).
+    """
     order = rng.permutation(len(codes))
     order = order[codes[order] >= 0]
     rank = np.zeros(len(order), np.int64)
@@ -209,6 +212,6 @@ def fit_threshold(categorizer: Categorizer, held_out: Examples, *, rejected: flo
 
 
 def encode(labels: np.ndarray, categories: Sequence[str]) -> I4:
-    """Return the column of each label, -1 for one that is not among the categories."""
+    """Return the column (n,) of each label, -1 for one that is not among the categories."""
     column = {name: k for k, name in enumerate(categories)}
     return np.array([column.get(str(label), -1) for label in labels], np.int64)

@@ -183,7 +183,7 @@ def spread(points: F4, count: int, rng: np.random.Generator) -> I4:
 
 
 def subsample(points: F4, count: int, rng: np.random.Generator) -> I4:
-    """Return ``count`` of the points, drawn at random."""
+    """Return the indices (count,) of points (n, 3) drawn at random; all if there are fewer."""
     return rng.permutation(len(points))[:count]
 
 
@@ -193,7 +193,10 @@ def sampled(
     surface: SurfaceSettings,
     rng: np.random.Generator,
 ) -> NeuralGas:
-    """Link chosen points as the gas's neurons are linked, without moving them."""
+    """Link chosen ones of points (n, 3), metres, as the gas links its neurons, without moving them.
+
+    ``choose`` returns the indices of so many points.
+    """
     chosen = points[np.unique(choose(points, min(surface.neurons, len(points)), rng))]
     gaps = ((chosen[:, None] - chosen) ** 2).sum(axis=2)
     near = np.argsort(gaps, axis=1)[:, 1 : _NEIGHBOURS + 1]

@@ -123,14 +123,14 @@ def finite_points(frame: Frame) -> F4:
 
 
 def support_offset(item: LabelledObject, up: F4) -> float:
-    """Return the offset of the support of an object along ``up``, metres, sensor frame."""
+    """Return the offset of the support of an object along ``up`` (3,), metres, sensor frame."""
     middle = float(np.dot(np.asarray(up, np.float64), item.box.center))
     half = float(item.box.size[2]) / 2
     return middle - (item.height_m if np.isfinite(item.height_m) else half)
 
 
 def upward(labelled: LabelledFrame) -> F4:
-    """Return the unit vector up of a frame.
+    """Return the unit vector up (3,) of a frame, sensor frame.
 
     Raises
     ------

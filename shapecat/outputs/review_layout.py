@@ -54,7 +54,7 @@ def choose_eye(labelled: LabelledFrame, frame: Frame, *, fixed: bool) -> Eye:
 
 
 def stepped_back(eye: Eye, low: F8, high: F8) -> Eye:
-    """Look from so far away that all is in view between two corners, unless that is too much."""
+    """Step back until a box between two corners (3,) is in view, unless it is too large."""
     radius = float(np.linalg.norm(high - low) / 2) + 0.1
     if not radius <= _WIDEST_M:
         return eye

@@ -45,9 +45,9 @@ def depth_of_image(message: Any, units: float | None = None) -> F4:
 
 
 def clean_depth(values: F4, units: float = 1) -> F4:
-    """Convert to metres and set to 0 what is negative, infinite or not a number.
+    """Convert (h, w) to metres and set to 0 what is negative, infinite or not a number.
 
-    ``units`` make a metre.
+    ``units`` make a metre, where ``values`` are whole numbers.
     """
     if values.dtype.kind == "u":
         # Dividing rounds to the nearest float; multiplying by 0.001 does not.

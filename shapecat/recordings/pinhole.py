@@ -66,7 +66,7 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
 
 
 def still_fits(fit: PinholeFit, points: F4) -> bool:
-    """Return whether a camera explains organized points as well as those it was fitted to."""
+    """Return whether a camera explains organized points (h, w, 3) as well as those of its fit."""
     camera, sample = fit.camera, _sample(points)
     if sample is None:
         return points.shape[:2] == (camera.height, camera.width)  # nothing speaks against it

@@ -162,7 +162,7 @@ def _placed(boxes: F4, poses: F8) -> tuple[F8, F8]:
 
 
 def numbers_or_nan(table: pa.Table, widths: Mapping[str, int] = FULL_WIDTHS) -> F4:
-    """Return the columns of full boxes side by side, NaN where they are null."""
+    """Return the columns of full boxes as (rows, sum of widths), NaN where they are null."""
     return np.hstack([_filled(table[name], width) for name, width in widths.items()])
 
 

@@ -173,13 +173,13 @@ def frame_rows(table: pa.Table) -> dict[Key, slice]:
 
 
 def topic_codes(table: pa.Table) -> tuple[list[str], I4]:
-    """Return the topics of a table, and the topic index of each row."""
+    """Return the topics of a table, and the index (rows,) of each row's topic."""
     column = table["topic"].combine_chunks().dictionary_encode()
     return column.dictionary.to_pylist(), np.from_dlpack(column.indices)
 
 
 def rows_of(topics: Sequence[str], codes: I4, frames: I4) -> dict[Key, slice]:
-    """Return the consecutive rows of each frame."""
+    """Return the consecutive rows of each frame; ``codes`` and ``frames`` are (rows,)."""
     changes = (np.diff(codes) != 0) | (np.diff(frames) != 0)
     starts = np.flatnonzero(np.concatenate([np.ones(min(1, len(frames)), np.bool_), changes]))
     names = map(topics.__getitem__, codes[starts].tolist())

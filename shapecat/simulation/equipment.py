@@ -67,7 +67,7 @@ def _gripper(rng: Generator, hand: F8, reach: F8) -> list[Mesh]:
 
 
 def make_forearm(rng: Generator, reach: F8, start: F8) -> list[Mesh]:
-    """Return the arm and hand of a person who reaches from one place to another."""
+    """Return the arm and hand of a person, from ``start`` (3,) to ``reach`` (3,), metres."""
     over = _above((start + reach) / 2, rng.uniform(0.02, 0.12))
     path = smooth_path(np.stack([start, over, reach]), 10)
     arm = tube(path, np.linspace(rng.uniform(0.045, 0.06), 0.03, 10), segments=12)
@@ -92,7 +92,7 @@ def make_forearm(rng: Generator, reach: F8, start: F8) -> list[Mesh]:
 
 
 def make_monitor(rng: Generator, place: ArrayLike, *, degrees: float) -> list[Mesh]:
-    """Return a screen on a stand."""
+    """Return a screen on a stand at a place (3,), metres, turned by ``degrees``."""
     wide, tall, low = rng.uniform(0.4, 0.7), rng.uniform(0.26, 0.4), rng.uniform(0.08, 0.16)
     parts = [
         rounded_box([rng.uniform(0.18, 0.28), 0.18, 0.012]),
@@ -103,7 +103,7 @@ def make_monitor(rng: Generator, place: ArrayLike, *, degrees: float) -> list[Me
 
 
 def make_chair(rng: Generator, place: ArrayLike, *, degrees: float) -> list[Mesh]:
-    """Return a chair: a seat, a back, four legs or one."""
+    """Return a chair at a place (3,), metres, turned by ``degrees``: a seat, a back, legs."""
     high, wide = rng.uniform(0.42, 0.5), rng.uniform(0.38, 0.5)
     back = rng.uniform(0.35, 0.55)
     parts = [
@@ -119,7 +119,7 @@ def make_chair(rng: Generator, place: ArrayLike, *, degrees: float) -> list[Mesh
 
 
 def make_curtain(rng: Generator, width: float, height: float, place: ArrayLike) -> Mesh:
-    """Return a curtain that hangs in folds along x."""
+    """Return a curtain that hangs in folds along x at a place (3,); lengths in metres."""
     x, z = np.linspace(-width / 2, width / 2, 160), np.linspace(0, height, 4)
     depth = rng.uniform(0.02, 0.06) * np.sin(x / rng.uniform(0.02, 0.05))
     depth = depth * (1 + 0.5 * np.sin(3 * x + rng.uniform(0, 6)))

@@ -61,7 +61,7 @@ def overlap(a: F8, b: F8, gap: float) -> bool:
 
 
 def inside(points: F8, outline: F8, margin: float) -> bool:
-    """Tell whether all points are in a convex outline, ``margin`` away from its edge."""
+    """Tell whether all points (n, 2) are in a convex outline (k, 2), ``margin`` from its edge."""
     if len(outline) < 3:
         return False
     normals = _normals(outline)

@@ -47,7 +47,7 @@ def join(parts: Sequence[Mesh]) -> Mesh:
 
 
 def scaled(mesh: Mesh, factors: ArrayLike) -> Mesh:
-    """Stretch by one factor, or one for each axis."""
+    """Stretch by one factor, or by (3,), one for each axis."""
     return Mesh(mesh.vertices * np.asarray(factors, np.float64), mesh.triangles)
 
 

@@ -14,7 +14,7 @@ __all__ = ["ellipsoid", "placed", "rod", "turned_body"]
 
 
 def placed(mesh: Mesh, place: ArrayLike, *, about: str = "", degrees: float = 0.0) -> Mesh:
-    """Turn a mesh about an axis and move it."""
+    """Turn a mesh about an axis, ``x``, ``y`` or ``z``, and move it to a place (3,), metres."""
     half = np.radians(degrees) / 2
     quaternion = [0.0, 0.0, 0.0, float(np.cos(half))]
     if about:
@@ -28,7 +28,7 @@ def rod(length: float, radius: float) -> Mesh:
 
 
 def ellipsoid(axes: ArrayLike) -> Mesh:
-    """Return an ellipsoid about the origin; ``axes`` are its half axes, metres."""
+    """Return an ellipsoid about the origin; ``axes`` (3,) are its half axes, metres."""
     t = np.linspace(-np.pi / 2, np.pi / 2, 17)
     return scaled(
         lathe(np.stack([np.cos(t), np.sin(t)], -1) * 0.1, segments=24), np.asarray(axes) * 10

@@ -28,7 +28,7 @@ Range = float | tuple[float, float]
 
 
 def looking_at(eye: F8, target: F8, *, roll: float = 0.0) -> Pose:
-    """Return the pose of a camera that looks at a point, level but for ``roll`` radians.
+    """Return the pose of a camera at ``eye`` (3,) that looks at ``target`` (3,), rolled by radians.
 
     Entries are rounded, so that the pose is the same on every machine.
     """
@@ -127,7 +127,7 @@ def _drawn(rng: Generator, value: Range) -> float:
 def hold(
     rng: Generator, target: F8, frames: int, *, distance: float, elevation: float
 ) -> tuple[Pose, ...]:
-    """Keep the camera still."""
+    """Keep the camera still, so many metres from ``target`` (3,) and degrees above it."""
     up = np.radians(elevation)
     eye = target + distance * np.array([0, -np.cos(up), np.sin(up)])
     return (looking_at(eye, target, roll=float(np.radians(rng.normal(0, 1.0)))),) * frames
@@ -141,7 +141,7 @@ def scattered(
     distance: tuple[float, float] = (0.5, 2.0),
     elevation: tuple[float, float] = (15.0, 60.0),
 ) -> tuple[Pose, ...]:
-    """Look at a place from random sides; ranges in metres and degrees."""
+    """Look at a place (3,) from random sides; ranges in metres and degrees."""
     poses = []
     for _ in range(count):
         up, side = np.radians(rng.uniform(*elevation)), rng.uniform(0, 2 * np.pi)

@@ -56,7 +56,7 @@ def rests(mesh: Mesh) -> tuple[Rest, ...]:
 
 
 def turn_about_z(pose: Pose, angle: float, place: F8) -> Pose:
-    """Turn what stands on the origin about z and move it."""
+    """Turn what stands on the origin about z, by radians, and move it to ``place`` (3,), metres."""
     c, s = np.round(np.cos(angle), 9), np.round(np.sin(angle), 9)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
     return Pose(turn @ pose.rotation, turn @ pose.translation + place)

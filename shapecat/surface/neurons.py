@@ -86,7 +86,7 @@ def connect(gas: Gas, i: int, j: int) -> None:
 
 @kernel
 def refresh(degree: I4, wins: I4, born: I4, i: int, j: int) -> None:
-    """Link two neurons, or make their edge new, in the arrays of a `Gas`."""
+    """Link two of n neurons, or make their edge new, in the arrays (n,) and (n * n,) of a `Gas`."""
     if born[i * degree.size + j] == ABSENT:
         degree[i] += 1
         degree[j] += 1
@@ -97,7 +97,7 @@ def refresh(degree: I4, wins: I4, born: I4, i: int, j: int) -> None:
 
 @kernel
 def disconnect(degree: I4, born: I4, i: int, j: int) -> None:
-    """Remove the edge between two neurons."""
+    """Remove the edge between two of n neurons, in the arrays (n,) and (n * n,) of a `Gas`."""
     born[i * degree.size + j] = ABSENT
     born[j * degree.size + i] = ABSENT
     degree[i] -= 1

@@ -33,7 +33,7 @@ def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
 
     Returns
     -------
-    The hits of each object, ascending, in the order of their first track.
+    The hits (k,) of each object, ascending, in the order of their first track.
     """
     if hits.axes is None or len(members) < 2:
         return list(members)

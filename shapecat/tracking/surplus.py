@@ -18,6 +18,7 @@ def without_shadows(hits: Hits, members: Sequence[I4]) -> list[I4]:
     """Drop short tracks inside longer ones: pieces of an object that was split for a moment.
 
     No object has its centre in the inner half of another one's for all the time it is seen.
+    ``members`` are the hits (k,) of each track, ascending.
     """
     lengths = np.array([len(member) for member in members])
     first = np.array([hits.rows[member[0]] for member in members])
@@ -45,7 +46,7 @@ def without_pieces(hits: Hits, members: Sequence[I4], max_gap_s: float) -> list[
     An object that is split in some frames leaves a track whose place lies, in the other frames,
     in the box of the whole object. What only stands close to another object, or is hidden by it,
     has its centre outside that box, whether it is seen or not. Frames without a view of the place
-    tell nothing.
+    tell nothing. ``members`` are the hits (k,) of each track, ascending.
     """
     if hits.axes is None:
         return list(members)

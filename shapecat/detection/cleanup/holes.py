@@ -24,7 +24,13 @@ the hole, and those where the surface goes on."""
 
 @kernel
 def fill_contact_boundary(inv_depth: F4, heights: HeightMap, labels: I4) -> None:
-    """Give the cells beside labelled ones, hardly above their plane, the same label, in place."""
+    """Give the cells beside labelled ones, hardly above their plane, the same label, in place.
+
+    Parameters
+    ----------
+    inv_depth : (rows, columns) inverse depth, 1/m; 0 where there is no sample.
+    labels : (rows, columns) int16, 0 is background.
+    """
     plane_id, height = heights
     rows, columns = labels.shape
     before, low = labels.copy(), np.zeros(columns, np.bool_)
@@ -56,7 +62,8 @@ def fill_holes(inv_depth: F4, labels: I4, count: int, filled: U1) -> None:
     """Give enclosed unlabelled cells to what encloses them, and mark them in ``filled``.
 
     A hole is connected, and has no sample without a label beside it. Most of its boundary is of one
-    of the labels 1..count, and every other label on it is in front of it.
+    of the labels 1..count, and every other label on it is in front of it. ``inv_depth`` (1/m),
+    ``labels`` and ``filled`` are (rows, columns).
     """
     inside, spans = _between_labels(inv_depth, labels)
     component = unset(labels.shape, np.int32)

@@ -13,7 +13,10 @@ __all__ = ["fill_hull"]
 
 @kernel
 def fill_hull(residual: F4, part: I4, stack: I4, count: int) -> int:
-    """Add the low cells within the convex hull of a part to it; return how many cells it has."""
+    """Add the low cells within the convex hull of a part to it; return how many cells it has.
+
+    ``residual`` and ``part`` are (rows, columns), the first ``count`` of ``stack`` the flat cells.
+    """
     rows, columns = residual.shape
     parts = part.reshape(-1)
     me = parts[stack[0]]

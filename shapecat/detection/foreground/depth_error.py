@@ -31,6 +31,13 @@ def measure_residual(
     """Write the smoothed inverse depth above the plane of its low cells; 0 elsewhere.
 
     Returns how many there are, but for those on the border of the image.
+
+    Parameters
+    ----------
+    inv_depth, plane_id, height : (rows, columns) inverse depth, 1/m, and as in `HeightMap`.
+    plane : (3,) coefficients of its inverse depth: per column, per row, constant.
+    number : of the plane.
+    out : (rows, columns) 1/m, written in place.
     """
     rows, columns = inv_depth.shape
     zero = np.float32(0)
@@ -90,7 +97,11 @@ def _find_low(
 def clear_contact(
     inv_depth: F4, plane_id: I4, height: F4, number: int, residual: F4, stack: I4, drop: F4
 ) -> None:
-    """Clear the excess of the feet of what is not low: steep cells below it, down to the plane."""
+    """Clear the residual where what is not low meets the plane: steep cells from it downwards.
+
+    All images are (rows, columns); ``residual`` is changed in place, ``stack`` and ``drop`` are
+    scratch, a number per cell.
+    """
     rows, columns = residual.shape
     top = 0
     high, edge = np.float32(LOW.low_m), np.zeros(columns, np.bool_)
@@ -142,7 +153,9 @@ def clear_contact(
 
 @kernel
 def filter_high_pass(residual: F4, high_pass: F4) -> None:
-    """Write the excess over its mean in a window around each low cell; 0 elsewhere.
+    """Write the residual less its mean in a window around each low cell; 0 elsewhere.
+
+    Both are (rows, columns), 1/m.
 
     The window slides: what enters it is added, what leaves it is taken away, down the rows for the
     sums of the columns, and along a row for those of all its cells. Sums are of integers, which
@@ -198,7 +211,10 @@ def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
 
 @kernel
 def measure_noise(high_pass: F4, plane_id: I4, number: int) -> float:
-    """Return the median rise, 1/m, between cells of the plane as far apart as at an outline."""
+    """Return the median rise, 1/m, between cells of the plane as far apart as at an outline.
+
+    ``high_pass`` (1/m) and ``plane_id`` are (rows, columns), ``number`` is of the plane.
+    """
     rows, columns = high_pass.shape
     histogram = np.zeros(BINS, np.int64)
     n = 0

@@ -33,7 +33,10 @@ class Outline(NamedTuple):
 
 @kernel
 def width_of_part(inv_depth: F4, stack: I4, count: int) -> float:
-    """Return the extent of a part along the rows, in cells a metre away."""
+    """Return the extent of a part along the rows, in cells a metre away.
+
+    ``inv_depth`` is (rows, columns), 1/m; the first ``count`` of ``stack`` are the flat cells.
+    """
     columns = inv_depth.shape[1]
     first, last = columns, 0
     for p in stack[:count]:
@@ -69,7 +72,16 @@ def measure_outline(
     number: int,
     rise_least: float,
 ) -> Outline:
-    """Measure the outline of a part."""
+    """Measure the outline of a part.
+
+    Parameters
+    ----------
+    inv_depth, residual, plane_id : (rows, columns) 1/m, 1/m, and as in `HeightMap`.
+    part : (rows, columns) numbers of the parts.
+    stack, count : the first ``count`` are the flat cells of this part.
+    number : of the plane it is on.
+    rise_least : 1/m; a smaller rise across the outline is noise.
+    """
     rows, columns = residual.shape
     parts = part.reshape(-1)
     sides = table = known = hidden = steep = 0

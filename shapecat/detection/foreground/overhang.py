@@ -57,7 +57,8 @@ def extend_overhang(
     Parameters
     ----------
     planes : the rows of `pack_planes`.
-    walls : from `remove_walls`; what is cleared stays so.
+    walls : (rows, columns) from `remove_walls`; what is cleared stays so.
+    highest_m : metres above a plane up to which objects are looked for.
     """
     shape = grid.inverse_depth.shape
     visited, stack = np.zeros(shape, np.int8), unset(grid.inverse_depth.size, np.int32)

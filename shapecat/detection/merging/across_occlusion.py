@@ -18,7 +18,14 @@ __all__ = ["merge_across_occluder"]
 def merge_across_occluder(
     segments: Segments, inv_depth: F4, intrinsics: PinholeIntrinsics, normal: F4, labels: I4
 ) -> None:
-    """Merge segments behind the same occluder that continue each other, the best pair first."""
+    """Merge segments behind the same occluder that continue each other, the best pair first.
+
+    Parameters
+    ----------
+    inv_depth : (rows, columns) inverse depth, 1/m.
+    normal : (rows, 3, columns) as in `SurfaceGraph`.
+    labels : (rows, columns) int16, the segments.
+    """
     n = segments.parent.size
     scores, changed = np.zeros((n, n), np.float32), np.ones(n, np.bool_)
     while True:

@@ -20,7 +20,14 @@ __all__ = ["measure_adjacency"]
 def measure_adjacency(
     inv_depth: F4, heights: HeightMap, graph: SurfaceGraph, labels: I4, up: F8, segments: Segments
 ) -> None:
-    """Collect what segments meet, and their samples: what `measure_segments` leaves out."""
+    """Collect what segments meet, and their samples: what `measure_segments` leaves out.
+
+    Parameters
+    ----------
+    inv_depth, labels : (rows, columns) inverse depth, 1/m, and the segments.
+    up : (3,) unit vector.
+    segments : from `measure_segments`; changed in place.
+    """
     rows, columns = inv_depth.shape
     plane_id, links, statistics = heights.plane_id, graph.links, segments.statistics
     change, met = np.zeros(columns, np.uint8), np.zeros((2 * columns, 6), np.int32)

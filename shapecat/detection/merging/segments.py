@@ -204,7 +204,7 @@ def _measure(
 
 @kernel
 def choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None:
-    """Choose evenly spaced cells of each segment away from edges."""
+    """Choose evenly spaced cells of each segment away from edges; ``labels`` (rows, columns)."""
     rows, columns = labels.shape
     spans, local_plane, concavity, samples = (
         graph.spans,

@@ -41,10 +41,11 @@ class GridLabels(NamedTuple):
 
 
 def label_pixels(depth: F4, grid: DepthGrid, found: Segmentation, *, range_m: float) -> list[U4]:
-    """Return the ascending pixel indices of the labels 1, 2, ...
+    """Return the ascending pixel indices (k,) of the labels 1, 2, ...
 
-    A pixel takes the label of its cell, or else of the neighbour whose depth fits best; it keeps
-    it only where it is above the plane itself, except in filled cells.
+    ``depth`` is (height, width), metres, ``range_m`` the farthest reading that counts. A pixel
+    takes the label of its cell, or else of the neighbour whose depth fits best; it keeps it only
+    where it is above the plane itself, except in filled cells.
     """
     grid_labels = grid_labels_of(grid, found)
     return split_lists(
@@ -58,7 +59,7 @@ def grid_labels_of(grid: DepthGrid, found: Segmentation) -> GridLabels:
 
 
 def split_lists(order: U4, ends: I4) -> list[U4]:
-    """Split what `list_runs` returns into the lists of the labels."""
+    """Split what `list_runs` returns, (n,) and (labels,), into the lists of the labels."""
     return [order[a:b] for a, b in pairwise(ends.tolist())]
 
 
@@ -132,9 +133,10 @@ def _end_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
 
 @kernel
 def list_runs(runs: I4, labels: int) -> tuple[U4, I4]:
-    """Return all pixel indices of the runs, sorted by label, and the end of each label's part.
+    """Return all pixel indices (n,) of the runs, sorted by label, and the end of each label's part.
 
-    Label 0 has no pixels: its end is 0.
+    ``runs`` is (r, 3): label, first pixel, and one more than the last. Label 0 has no pixels: its
+    end is 0.
     """
     place, total = np.zeros(labels, np.int64), 0  # where the next pixel of each label goes
     for r in range(len(runs)):

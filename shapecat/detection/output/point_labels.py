@@ -23,7 +23,7 @@ __all__ = ["label_points"]
 
 
 def label_points(view: VirtualImage, found: Segmentation, *, fused: bool) -> list[U4]:
-    """Return the ascending point indices of the labels, as `label_pixels`.
+    """Return the ascending point indices (k,) of the labels, as `label_pixels`.
 
     With ``fused`` points behind the visible surface are given to what they touch; lists beyond
     the labels are clusters that touch nothing visible.

@@ -72,7 +72,10 @@ def measure_plane(grid: DepthGrid, samples: DepthSamples, plane: F8) -> Supporti
 
 @kernel(fast=True)
 def area_of(samples: DepthSamples, plane: F8, distance: float) -> float:
-    """Return the visible area of a plane by that of a cell at 1 m, from its distance."""
+    """Return the visible area of a plane by that of a cell at 1 m, from its distance in metres.
+
+    ``plane`` (3,) are the coefficients of its inverse depth: per column, per row, constant.
+    """
     j, i, inv_depth = samples.j, samples.i, samples.inverse_depth
     total = 0.0
     for k in range(inv_depth.size):

@@ -48,7 +48,10 @@ class HeightMap(NamedTuple):
 
 
 def pack_planes(supports: list[SupportingPlane]) -> F8:
-    """Return one row of numbers per plane: a, b, c, its depth, two level axes, the outline."""
+    """Return one row of numbers per plane: a, b, c, its depth, two level axes, the outline.
+
+    (planes, `OUTLINE` + `DIRECTIONS`), lowest plane first; lengths in metres, sensor frame.
+    """
     rows = np.zeros((len(supports), OUTLINE + DIRECTIONS))
     for row, support in zip(rows, supports, strict=True):
         row[:4] = support.a, support.b, support.c, -support.offset
@@ -59,7 +62,10 @@ def pack_planes(supports: list[SupportingPlane]) -> F8:
 
 @kernel
 def measure_heights(grid: DepthGrid, planes: F8, highest_m: float) -> HeightMap:
-    """Give every cell to the highest plane it is above; ``planes`` are from `pack_planes`."""
+    """Give every cell to the highest plane it is above, no more than ``highest_m`` metres.
+
+    ``planes`` are from `pack_planes`.
+    """
     plane_id, height = (
         np.zeros(grid.inverse_depth.shape, np.int8),
         np.zeros(grid.inverse_depth.shape, np.float32),
@@ -170,7 +176,10 @@ def _bounds(
 
 @kernel
 def is_inside_outline(plane: F8, x: float, y: float, z: float, slack: float) -> bool:
-    """Whether a point is within the outline of a row of `pack_planes`, or ``slack`` beyond it."""
+    """Tell whether a point is within the outline of a row of `pack_planes`, or ``slack`` beyond it.
+
+    The point in the sensor frame and the slack are in metres.
+    """
     p = plane[4] * x + plane[5] * y + plane[6] * z
     q = plane[7] * x + plane[8] * y + plane[9] * z
     for k in range(DIRECTIONS):  # noqa: SIM110  kernels have no generators

@@ -43,7 +43,10 @@ LEAST_SAMPLES = 44
 def find_horizontal_planes(
     grid: DepthGrid, points: OrientedPoints, up: F8, trials: F8
 ) -> list[PlaneCandidate]:
-    """Return the horizontal planes of the scene, lowest first, with one normal in common."""
+    """Return the horizontal planes of the scene, lowest first, with one normal in common.
+
+    ``up`` is a unit vector (3,); ``trials`` are from `draw_trials`.
+    """
     found = _find(grid, points, up, trials)
     better = _common_up(found) if found else up
     if better @ up < PLANES.turned_cos:

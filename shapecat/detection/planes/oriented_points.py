@@ -89,7 +89,10 @@ def _orient_row(
 
 @kernel
 def level_samples(points: OrientedPoints, up: F8) -> tuple[DepthSamples, F4]:
-    """Return the samples of points that face up within 25 degrees, and their heights."""
+    """Return the samples of points that face up within 25 degrees, and their heights.
+
+    ``up`` is a unit vector (3,); the heights (n,) are in metres above the sensor.
+    """
     coarse, normals, positions = points.inverse_depth, points.normals, points.positions
     rows, columns = coarse.shape
     x, y, z = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])

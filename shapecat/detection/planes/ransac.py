@@ -60,7 +60,7 @@ def sample_grid(inv_depth: F4, wanted: F4) -> DepthSamples:
 
 @kernel
 def median_of(values: F4) -> float:
-    """Return the upper median of at least one value.
+    """Return the upper median of ``values`` (n,), at least one.
 
     Source: Hoare 1961, Algorithm 65. `numpy.partition` in a kernel takes 15 ms to load.
     """
@@ -85,7 +85,7 @@ def median_of(values: F4) -> float:
 
 @kernel
 def off_plane(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSamples:
-    """Return the samples that are not near a plane."""
+    """Return the samples not within ``tolerance``, 1/m, of a plane (3,) of inverse depth."""
     a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     gate = np.float32(tolerance)
     rest = np.zeros((3, samples.inverse_depth.size), np.float32)
@@ -189,7 +189,7 @@ def _propose(samples: DepthSamples, trials: F8, t: int, plane: F8) -> bool:
 
 @kernel
 def count_inliers(samples: DepthSamples, plane: F8, tolerance: float) -> int:
-    """Count the samples near a plane."""
+    """Count the samples within ``tolerance``, 1/m, of a plane (3,) of inverse depth."""
     first = np.int64(0)  # a literal would be compiled apart
     return int(_count_part(samples, plane, tolerance, first, samples.inverse_depth.size))
 

@@ -42,6 +42,12 @@ def fit_local_planes(
 
     A plane is fitted to a checkerboard of 25 cells of the same owner; weights are 0 or 1. The
     object cells of each row lie within ``spans``.
+
+    Parameters
+    ----------
+    inv_depth, plane_id : (rows, columns) inverse depth, 1/m, and as in `HeightMap`.
+    spans : (rows, 2) first column of the object cells, and one more than the last.
+    local_plane, normal : (rows, 3, columns), written in place.
     """
     values = np.zeros(SIDE * PITCH, np.float32)
     fits = np.zeros(6 * PITCH, np.float32)

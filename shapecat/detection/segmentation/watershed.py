@@ -122,7 +122,11 @@ def _find_ways(links: U1, labels: I4, spans: I4, columns: int, ways: U1) -> None
 
 @kernel
 def relabel_above(labels: I4, spans: I4, height: F4, label: int, level: float, name: int) -> None:
-    """Give the cells of a label that are higher than a level, metres, another name, in place."""
+    """Give the cells of a label that are higher than a level, metres, another name, in place.
+
+    ``labels`` and ``height`` are (rows, columns); the cells of each row lie within ``spans``
+    (rows, 2).
+    """
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):
             if labels[i, j] == label and height[i, j] > level:

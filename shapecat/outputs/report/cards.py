@@ -12,7 +12,7 @@ import numpy as np
 from shapecat.arrays import F8, I4, Bool
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.report.pictures import StripFrame, TrackPictures
-from shapecat.outputs.report.surfaces import SIDE, Picture
+from shapecat.outputs.report.surfaces import SIDE, SurfaceDrawing
 from shapecat.outputs.report.tracks import Timeline
 from shapecat.outputs.wording import confidence_text, plural, time_span
 from shapecat.runs.track_table import TrackRow
@@ -104,7 +104,7 @@ def _pictures(card: Card) -> str:
     )
 
 
-def _side(picture: Picture) -> str:
+def _side(picture: SurfaceDrawing) -> str:
     return (
         f'<div class="side" title="{picture.title}"><img alt="surface {picture.title}" '
         f'src="{picture.image}"><svg viewBox="0 0 {SIDE} {SIDE}" aria-hidden="true">'

@@ -206,7 +206,10 @@ def _slope(inverse: F8, axis: int) -> F8:
 
 
 def encode(pixels: U1, *, quality: int = 72) -> tuple[str, int, int]:
-    """Return a picture as a data URI, no larger than the page shows it, and its size."""
+    """Return a picture as a data URI, no larger than the page shows it, and its width and height.
+
+    ``pixels`` is (h, w, 3) or, with opacity, (h, w, 4).
+    """
     image = Image.fromarray(np.ascontiguousarray(pixels))
     image.thumbnail((_FRAME_PX, _FRAME_PX))
     file = io.BytesIO()

@@ -63,7 +63,7 @@ def run_page(
     ----------
     cards : the tracks, in the order of ``table``.
     frames : the strip.
-    stages : seconds of each frame by stage.
+    stages : seconds (frames,) by stage.
     notes : warnings beside those of the run.
     index : link to the index over many runs.
     served : corrections go to a server, not to a table to download.

@@ -14,7 +14,7 @@ from shapecat.outputs.colours import colour_of
 from shapecat.outputs.exports_files import support_offset
 from shapecat.outputs.report.choosing import Choice
 from shapecat.outputs.report.images import Crop, SeenFrame, crop_of, encode, look, worth_of
-from shapecat.outputs.report.surfaces import MOST_POINTS, Picture, Snapshot, draw
+from shapecat.outputs.report.surfaces import MOST_POINTS, Snapshot, SurfaceDrawing, draw
 from shapecat.outputs.rereading import FinishedRun, open_source
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
@@ -31,7 +31,7 @@ class TrackPictures(NamedTuple):
     """The best view of a track: its crop, its surface, and the size of its box in metres."""
 
     crop: Crop | None
-    surfaces: tuple[Picture, ...]
+    surfaces: tuple[SurfaceDrawing, ...]
     size: tuple[float, float, float]
 
 

@@ -10,7 +10,7 @@ from shapecat.outputs.exports_files import png
 from shapecat.surface.triangles import triangles_of
 from shapecat.types import NeuralGas
 
-__all__ = ["MOST_POINTS", "SIDE", "Picture", "Snapshot", "draw", "graph_points"]
+__all__ = ["MOST_POINTS", "SIDE", "Snapshot", "SurfaceDrawing", "draw", "graph_points"]
 
 SIDE = 160
 """Width and height of a picture in pixels."""
@@ -31,7 +31,7 @@ class Snapshot(Record):
     eye: F8 = array("3", "f8")
 
 
-class Picture(NamedTuple):
+class SurfaceDrawing(NamedTuple):
     """A picture as a data URI, and the graph over it as SVG path data in the same pixels."""
 
     title: str
@@ -40,7 +40,7 @@ class Picture(NamedTuple):
     neurons: str
 
 
-def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[Picture, ...]:
+def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[SurfaceDrawing, ...]:
     """Draw an object as the sensor sees it, from beside, and from above.
 
     All three have one scale: that of the sphere around the points and neurons.
@@ -70,7 +70,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[Picture, ...]:
         encoded = base64.b64encode(image).decode("ascii")
         nodes = np.round(_project(shot.gas.neurons - middle, view, scale)[:, :2]).astype(int)
         pictures.append(
-            Picture(
+            SurfaceDrawing(
                 title,
                 f"data:image/png;base64,{encoded}",
                 "".join(f"M{a} {b}L{c} {d}" for (a, b), (c, d) in nodes[shot.gas.edges].tolist()),
@@ -81,7 +81,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[Picture, ...]:
 
 
 def graph_points(gas: NeuralGas) -> F4:
-    """Return points spread over the triangles and edges of a graph, where its cloud is gone."""
+    """Return points (n, 3), metres, over the triangles and edges of a graph whose cloud is gone."""
     corners = gas.neurons[triangles_of(gas.edges, len(gas.neurons))]
     weights = np.array([[a, b, 8 - a - b] for a in range(9) for b in range(9 - a)]) / 8
     faces = np.einsum("kc,tcd->tkd", weights, corners).reshape(-1, 3)

@@ -57,7 +57,7 @@ def _first_stamps(folder: Path) -> Iterator[int]:
 
 
 def read_stage_seconds(folder: Path) -> dict[str, F8]:
-    """Return the seconds each stage took on each frame."""
+    """Return the seconds (frames,) each stage took, from the table of frames in a run's folder."""
     found: dict[str, list[float]] = {}
     for group in read_row_groups(folder / "frames.parquet", ["stages", "seconds"]):
         for row in group.to_pylist():
