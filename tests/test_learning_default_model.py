@@ -58,7 +58,7 @@ def test_unseen_simulated_objects_are_recognised(model: Categorizer) -> None:
 def tables() -> tuple[Simulated, Simulated]:
     """Simulate the same tables with one process and with two."""
     world = World(5, ("pan", "hammer"), cameras=1)
-    one, two = (collect(simulate_views(world, range(4), jobs=jobs)) for jobs in (1, 2))
+    one, two = (collect(simulate_views(world, range(2), jobs=jobs)) for jobs in (1, 2))
     return one, two
 
 

@@ -109,11 +109,12 @@ def test_corrections_by_keyboard_outlive_the_server(
     server = served(long_run)
     browser.open(server.address)
     categories = {row.track: row.category for row in read_track_table(long_run / "tracks.csv").rows}
-    wanted = {}
+    wanted, keys = {}, []
     for number, track in enumerate(order_of(browser)):
         digit = other_than(categories[track], number)
-        browser.press(str(digit), "Right")
+        keys += [str(digit), "Right"]
         wanted[track] = NAMES[digit - 1]
+    browser.press(*keys)
     browser.wait(SAVED)
     os.kill(server.pid, signal.SIGKILL)
     server.wait()
@@ -146,12 +147,10 @@ def test_a_page_tells_what_a_killed_server_has_not_written(
     server = served(long_run)
     browser.open(server.address)
     order = order_of(browser)
-    for _ in order[:9]:
-        browser.press("d", "Right")
+    browser.press(*["d", "Right"] * 9)
     os.kill(server.pid, signal.SIGKILL)  # while requests may be on their way
     server.wait()
-    for _ in order[9:13]:
-        browser.press("d", "Right")
+    browser.press(*["d", "Right"] * 4)
     browser.wait("return document.getElementById('saved').textContent.includes('does not answer')")
     browser.wait("return !document.getElementById('download').hidden")
     said = browser.run("return document.getElementById('saved').textContent")
