@@ -1,6 +1,7 @@
 """Colour in a run: its masks, the review, the annotated recording."""
 
 import json
+import pickle
 import shutil
 from collections.abc import Callable, Sequence
 from importlib import import_module
@@ -19,12 +20,15 @@ from shapecat.cameras.colour import ColourImage, ColourView
 from shapecat.colour.image_masks import box_of, mask_of
 from shapecat.colour.masks import Mask
 from shapecat.colour.rle import rle_counts, rle_mask, rle_text
+from shapecat.config import Settings
 from shapecat.errors import NoStreamError
 from shapecat.outputs.colouring import Coloured, with_colour
 from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encoder_for
 from shapecat.outputs.rereading import open_source, read_finished
 from shapecat.outputs.review import write_review
 from shapecat.outputs.review_scenes import ReviewFrame
+from shapecat.perception import Perceiver
+from shapecat.pipeline import process
 from shapecat.recordings.protobuf import message_decoder
 from shapecat.runs.corrections import read_labels
 from shapecat.runs.jobs import Job
@@ -181,8 +185,6 @@ def test_colour_can_be_left_out_and_a_wrong_topic_is_refused(
     run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shapecat: Callable[..., Result]
 ) -> None:
     """Who names a topic that holds no images learns so before the work, not after."""
-    from shapecat.pipeline import process  # noqa: PLC0415  the fixture has the name
-
     monkeypatch.setattr("shapecat.pipeline.load_model", lambda _path: Guesser())
     source = run.parents[1] / "table.mcap"
     process(Job(source=source, folder=tmp_path / "a", color="", rrd=False, end_s=0.04))
@@ -193,6 +195,44 @@ def test_colour_can_be_left_out_and_a_wrong_topic_is_refused(
     result = shapecat("process", source, "--out", tmp_path, "--color", "/x", "--no-color")
     assert result.exit_code == 2
     assert "contradict" in result.stderr
+
+
+def test_masks_do_not_depend_on_processes_and_survive_an_interruption(
+    run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Masks are found in any process, and wait in segments with the other tables."""
+    sent = []
+
+    def elsewhere(*parts: Any) -> Callable[[Any], Any]:
+        def perceive(views: Any) -> Any:
+            sent.append(pickle.dumps((Perceiver(*parts), views)))
+            perceiver, received = pickle.loads(sent[-1])  # noqa: S301  our own
+            return pickle.loads(pickle.dumps(perceiver(received)))  # noqa: S301  the same
+
+        return perceive
+
+    source, single = run.parents[1] / "table.mcap", Settings(reuse_frames=1)
+
+    def job(name: str) -> Job:
+        return Job(source=source, folder=tmp_path / name, settings=single, rrd=False, mcap=False)
+
+    def interrupt(phase: str, done: int, _total: int | None) -> None:
+        if phase == "perceive" and done == 3:
+            raise KeyboardInterrupt
+
+    process(job("one"))
+    with monkeypatch.context() as patched:
+        patched.setattr("shapecat.runs.perceiving.Perceiver", elsewhere)
+        process(job("sent"))
+    assert len(sent) == FRAMES
+    with pytest.raises(KeyboardInterrupt):
+        process(job("resumed"), interrupt)
+    summary = process(job("resumed"))
+    assert json.loads((summary.folder / "run.json").read_text())["counts"]["resumed"] == 3
+    masks = {name: pq.read_table(tmp_path / name / "masks.parquet") for name in ("one", "sent")}
+    assert masks["one"].equals(masks["sent"])
+    assert masks["one"].equals(pq.read_table(tmp_path / "resumed" / "masks.parquet"))
+    assert masks["one"].num_rows == FRAMES
 
 
 def test_run_json_names_the_colour_images(run: Path) -> None:
