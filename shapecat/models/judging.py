@@ -26,10 +26,8 @@ from shapecat.simulation.distractors import DISTRACTORS
 from shapecat.simulation.sensors import PRESETS
 from shapecat.types import UNKNOWN
 
-__all__ = ["USED_BLOCKS", "judge"]
+__all__ = ["judge"]
 
-USED_BLOCKS = tuple(name for name in BLOCKS if name not in {"metric", "view"})
-"""Scale-free: metric sizes help only on objects that the simulator makes."""
 _SURFACE_SEEDS = (4, 5)
 _SURFACE_TABLES = (150, 60)
 _TRACK_SEED, _TRACK_TABLES = 100_006, 24
@@ -204,11 +202,11 @@ def _studies(
         name: s.where(clear_views(s) & (s.views.labels != UNKNOWN)) for name, s in judged.items()
     }
     learned = train.where(train.views.labels != UNKNOWN)
-    choices: dict[str, Any] = {"blocks": USED_BLOCKS, "seed": seed, "jobs": jobs}
+    choices: dict[str, Any] = {"blocks": tuple(BLOCKS), "seed": seed, "jobs": jobs}
     plain = compare_with_plain(learned.views, known["test"].views, model, **choices)
     surfaces = compare_surfaces(*map(_kept_views, _SURFACE_SEEDS, _SURFACE_TABLES), **choices)
     shown = {name: seen.views for name, seen in known.items()}
-    added = add_two_categories(learned.views, shown, blocks=USED_BLOCKS, seed=seed)
+    added = add_two_categories(learned.views, shown, blocks=tuple(BLOCKS), seed=seed)
     return [
         Table(
             "Beside plain learners on the test tables, no view upside down",

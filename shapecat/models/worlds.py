@@ -47,6 +47,8 @@ _SCALES = (0.5, 1.0, 1.0, 1.0, 1.5)
 """Resolutions of the sensors, as multiples of their own."""
 _WIDTHS = (224, 1280)
 """Their least and greatest width in pixels."""
+_OFTEN = {"kinect": 3.0, "realsense": 2.0}
+"""How many times as often as others the sensors appear that most recordings come from."""
 _DISTANCES_M = (0.25, 3.0)
 _CLOSER_M = 0.03
 """What is looked at is farther than the nearest reading by this."""
@@ -165,7 +167,8 @@ def _shoot(seen: Geometry, arrangement: Arrangement, rng: np.random.Generator) -
 def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
     """Draw a sensor: one of the presets or between two, better or worse, of any resolution."""
     names = list(PRESETS)
-    name, other = (names[k] for k in rng.integers(len(names), size=2))
+    shares = np.array([_OFTEN.get(each, 1.0) for each in names])
+    name, other = (str(each) for each in rng.choice(names, 2, p=shares / shares.sum()))
     share = float(rng.uniform(0, 0.6)) if rng.random() < 0.5 else 0.0
     sensor = between(PRESETS[name], PRESETS[other], share)
     least, most = np.log([0.4, 0.4, 0.5, 0.5, 0.7]), np.log([2.0, 2.5, 1.5, 8.0, 2.0])
