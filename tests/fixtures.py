@@ -2,8 +2,9 @@
 
     python -m tests.fixtures
 
-Recordings come from the simulator and a seed: made again, they are the same bytes. Only their
-tables change with the detection and the model.
+Recordings come from the simulator and a seed: made again, they are the same bytes, except that
+processors round the pixels of colour images otherwise. Only their tables change with the detection
+and the model.
 """
 
 import csv
