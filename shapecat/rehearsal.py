@@ -66,17 +66,19 @@ def _undescribed(candidate: Candidate) -> Detection:
 
 
 def recognize_ball() -> str:
-    """Categorize a ball that is seen from everywhere, and return what it is taken for."""
-    rng = np.random.default_rng(0)
-    ways = rng.normal(size=(3000, 3))
-    points = _RADIUS_M * ways / np.linalg.norm(ways, axis=1)[:, None] + [0, 0, _RADIUS_M]
+    """Categorize a ball, and return what it is taken for."""
+    rng, eye = np.random.default_rng(0), np.array([1, 0, 1], np.float32)
+    ways = rng.normal(size=(6000, 3))
+    ways /= np.linalg.norm(ways, axis=1)[:, None]
+    seen = ways @ (eye - [0, 0, _RADIUS_M]) > _RADIUS_M
+    points = _RADIUS_M * ways[seen] + [0, 0, _RADIUS_M]
     settings, model = Settings(), load_model(None)
     cloud = thin(points.astype(np.float32), settings=settings.surface)
     gas = reconstruct(cloud, settings=settings.surface, rng=rng)
     if gas is None:
         return "unknown"
     complete(np.add(cloud, 1), (0, 0, 1), 0.0, np.ones(1), ("ball",))
-    descriptor = describe(cloud, gas, eye=np.array([1, 0, 1], np.float32))
+    descriptor = describe(cloud, gas, eye=eye)
     return model.categories[int(model.predict(descriptor[None]).posteriors[0].argmax())]
 
 
