@@ -246,8 +246,8 @@ class ImageMasks(Record):
     ----------
     topic, stamp_ns, log_time_ns, frame_id : of the image.
     width, height : of the image, pixels.
-    boxes : left, top, width and height of the mask of each detection that the image shows, pixels.
-    counts : the run lengths of these masks, as of `shapecat.colour.rle.rle_counts`.
+    boxes : left, top, width and height, pixels, of the mask of each detection on the image.
+    counts : (n,) uint32, the run lengths of each of them, as of `shapecat.colour.rle.rle_counts`.
     """
 
     topic: str

@@ -18,7 +18,7 @@ def find_masks(frame: Frame, view: ColourView, objects: Sequence[U4]) -> ImageMa
 
     Parameters
     ----------
-    objects : indices into the frame of the pixels of each detection.
+    objects : (k,) uint32 flat indices into the frame, of the pixels of each detection.
     """
     image = view.image
     masks: tuple[Mask, ...] = ()
