@@ -33,10 +33,10 @@ SEEN_PIXELS = 250
 """With fewer readings a thing is not judged."""
 SAME = 0.5
 """A detection is of a thing if their pixels overlap so much (intersection over union)."""
-ROUND = ("can", "bottle", "bowl", "plate", "ball")
-"""Solids of revolution; a cup has a handle."""
+ROUND = ("cup", "can", "bottle", "bowl", "plate", "ball")
+"""Solids of revolution, of most of which the length and the width are alike."""
 ALIKE = 0.05
-"""One whose true length and width differ by a larger share is oval, and has a yaw."""
+"""One whose true length and width differ by a larger share is oval or has a handle, and a yaw."""
 JUDGED = ("cup", "can", "box", "bottle", "bowl", "ball")
 KINDS: tuple[SceneKind, ...] = ("tabletop", "pile")
 GROUPS = ("tabletop, upright", "tabletop, lying", "pile, upright", "pile, tilted")

@@ -91,6 +91,29 @@ def test_a_box_with_an_odd_yaw_keeps_its_lengths() -> None:
     assert abs(np.sin(2 * off)) < np.sin(2 * np.radians(3))
 
 
+def test_noise_of_a_flat_side_does_not_bring_a_box_nearer() -> None:
+    """The farthest of many noisy points lie before the side; the far edge has few of them."""
+    size = np.array([0.16, 0.1, 0.2])
+    points, normals = cuboid(size, np.pi / 2 - 0.24)
+    rays = (points + PLACE) / np.linalg.norm(points + PLACE, axis=1)[:, None]
+    noisy = points + rays * RNG.normal(0, 0.0025, len(points))[:, None]
+    box = estimate(noisy, normals, "box")
+
+    axes, center = LEVEL @ rotation_from_quaternion(box.orientation), LEVEL @ box.center - PLACE
+    front = normals[0]  # of the side that is 8 cm before the middle
+    assert center @ front + abs(front @ axes) @ box.size / 2 == pytest.approx(0.08, abs=0.0035)
+
+
+def test_a_ball_that_is_hidden_in_part_stays_round() -> None:
+    """What something before it leaves of a ball is no circle."""
+    normals = RNG.normal(size=(8000, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    shown = normals[:, 0] > -0.4
+    box = estimate(0.06 * normals[shown] + [0, 0, 0.06], normals[shown], "ball")
+
+    assert box.size[0] == pytest.approx(box.size[1], rel=0.02)
+
+
 def test_what_an_occluder_hides_below_is_part_of_the_box() -> None:
     """Something that stands reaches down to its support, and is less sure to."""
     points, normals = cylinder(0.04, 0.2)

@@ -8,7 +8,7 @@ is the larger one.
 
 import numpy as np
 
-from shapecat.arrays import F4, F8
+from shapecat.arrays import F4, F8, I4
 from shapecat.jit import kernel
 
 __all__ = ["DIRECTIONS", "QUARTER", "fit_oval", "narrowest", "reach", "rectangle"]
@@ -22,26 +22,49 @@ _OUTLIER = 0.03
 
 
 @kernel
-def reach(x: F4, y: F4, stray: int, cosines: F8, sines: F8) -> F8:
-    """Return (k,) how far points reach in each of k directions, but for ``stray`` points each."""
-    result, highest = np.zeros(cosines.size), np.zeros(stray + 1, np.float32)
+def reach(x: F4, y: F4, strays: I4, noise: float, flat: float, cosines: F8, sines: F8) -> F8:
+    """Return (k,) how far points reach in each of k directions, but for some points each.
+
+    A flat side reaches as far as the mean of its points.
+
+    Parameters
+    ----------
+    strays : (k,) so many points are left out.
+    noise : metres; points so near to the farthest are of its side.
+    flat : a side is flat that has such a share of the points; with fewer, it counts for less.
+    """
+    result, highest = np.zeros(cosines.size), np.zeros(strays.max() + 1, np.float32)
     for k in range(cosines.size):
         a, b = np.float32(cosines[k]), np.float32(sines[k])
-        highest[:] = -np.inf
-        least = highest[0]
+        first = highest.size - 1 - strays[k]
+        highest[first:] = -np.inf
+        least = highest[first]
         for i in range(x.size):
             value = a * x[i] + b * y[i]
             if value > least:
-                _insert(highest, value)
-                least = highest[0]
+                _insert(highest, first, value)
+                least = highest[first]
         result[k] = least
+        if noise > 0:
+            result[k] -= _lifted(x, y, a, b, least, noise, flat)
     return result
 
 
 @kernel
-def _insert(ascending: F4, value: float) -> None:
-    """Insert a value into a sorted list of fixed length; the smallest value drops out."""
-    at = 1
+def _lifted(x: F4, y: F4, a: float, b: float, top: float, noise: float, flat: float) -> float:
+    """Return how far the farthest points of a side are from the mean of them, if it is flat."""
+    count, total = 0, 0.0
+    for i in range(x.size):
+        below = top - (a * x[i] + b * y[i])
+        if below < noise:
+            count, total = count + 1, total + below
+    return min(1.0, count / (flat * x.size)) * total / count
+
+
+@kernel
+def _insert(ascending: F4, first: int, value: float) -> None:
+    """Insert a value into a list that is sorted from ``first``; the smallest value drops out."""
+    at = first + 1
     while at < ascending.size and ascending[at] < value:
         ascending[at - 1] = ascending[at]
         at += 1

@@ -25,28 +25,47 @@ COSINES, SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 ENOUGH_POINTS = 256
 """So many points tell the outline; more cost time."""
 
-_STRAY, _STRAY_CURVED = 0.016, 0.004
-"""Share of the points that noise and mixed pixels put beyond the outline, either way: fewer
-where a surface curves away than where many points lie at the outline, as those of a wall do."""
-_CURVED = ("bowl", "plate", "ball")
 _TOP = 0.98
 """Share of the points below the top."""
 _NOISY_M, _FLAT = 0.004, 1 / 3
-"""Noise lifts the highest points of a flat top by so much at most; a top is flat that has such a
+"""Noise lifts the highest points of a flat top by so much at most; a face is flat that has such a
 share of the points."""
 _HANDLE = 0.06
 """What reaches farther beyond the oval of a cup, as a share of its radius, is a handle."""
 _EDGEWISE = -0.2
 """Cosine of the angle to the sensor from which on an outline is seen: a little behind its edge."""
-_ROUND = ("ball", "cup")
-"""Round by nature, or with a handle that would be taken for the long side of an oval."""
-_ROUNDNESS, _CIRCULAR = 5.0, 1e3
-"""So many directions weigh against an oval: most things are round, and one side tells little."""
-_FITS = 0.07
-"""An oval fits if the side that is seen deviates by less than this share of the radius."""
 _NOISE_M, _GUESS = 0.006, 0.35
 """Deviation of a length that is seen, and of the part that is guessed, as a share of it."""
 _ANGULAR, _HANDLED = "box", "cup"
+_CIRCULAR = 1e3
+
+
+class _Form(NamedTuple):
+    """What is known of the outlines of a category.
+
+    Attributes
+    ----------
+    stray : share of the points that noise and mixed pixels put beyond the outline: fewer where a
+        surface curves away than where many points lie at the outline, as those of a wall do.
+    noise : metres; so deep are the readings of a flat side.
+    roundness : so many directions weigh against an oval: one side tells little of the depth.
+    fits : an oval fits if the side that is seen deviates by less than this share of the radius.
+    """
+
+    stray: float = 0.016
+    noise: float = 0.0
+    roundness: float = 5.0
+    fits: float = 0.07
+
+
+_FORMS = {
+    "cup": _Form(roundness=_CIRCULAR),  # a handle would be taken for the long side of an oval
+    "box": _Form(noise=0.006),
+    "bottle": _Form(roundness=1.0, fits=0.1),  # many are oval
+    "bowl": _Form(stray=0.004),
+    "plate": _Form(stray=0.004),
+    "ball": _Form(stray=0.004, roundness=_CIRCULAR, fits=math.inf),
+}
 
 
 class Footprint(NamedTuple):
@@ -85,8 +104,8 @@ def complete(
     level = gravity_rotation(up)
     some = points[:: max(1, -(-len(points) // ENOUGH_POINTS))] @ level.T.astype(np.float32)
     some[:, 2] -= np.float32(offset)
-    seen = _reach(some, categories[int(np.argmax(posterior))])
     facing = faced(-some[:, :2].mean(axis=0, dtype=np.float64))
+    seen = _reach(some, facing, categories[int(np.argmax(posterior))])
     plan = footprint(seen, facing.astype(np.float64), posterior, categories)
     bottom, lowest, top = _bounds(some[:, 2])
     c, s = COSINES[plan.side], SINES[plan.side]
@@ -122,11 +141,11 @@ def footprint(seen: F8, facing: F8, posterior: F8, categories: Sequence[str]) ->
     """
     likely = dict(zip(categories, np.asarray(posterior).tolist(), strict=True))
     category, angular = max(likely, key=likely.__getitem__), likely.get(_ANGULAR, 0.0)
-    roundness = _CIRCULAR if category in _ROUND else _ROUNDNESS
-    oval, radius, deviation = fit_oval(seen, facing, roundness, COSINES, SINES)
+    form = _FORMS.get(category, _Form())
+    oval, radius, deviation = fit_oval(seen, facing, form.roundness, COSINES, SINES)
     if category == _HANDLED and (seen - oval)[facing > 0].max() > _HANDLE * radius:
         oval = np.maximum(oval, np.where(facing > 0, seen, oval))
-    whole = oval if deviation < _FITS * radius else seen
+    whole = oval if deviation < form.fits * radius else seen
     chosen = seen if category == _ANGULAR else whole
     side = narrowest(chosen)
     along, across, *size = rectangle(chosen, side)
@@ -143,10 +162,12 @@ def footprint(seen: F8, facing: F8, posterior: F8, categories: Sequence[str]) ->
     )
 
 
-def _reach(points: F4, category: str) -> F8:
+def _reach(points: F4, facing: Bool, category: str) -> F8:
     x, y = np.ascontiguousarray(points[:, :2].T)
-    stray = _STRAY_CURVED if category in _CURVED else _STRAY
-    return np.asarray(reach(x, y, int(stray * len(points)), COSINES, SINES))
+    form = _FORMS.get(category, _Form())
+    # Noise goes along the rays: less of it lies beyond the edges that face no sensor.
+    strays = (np.where(facing, 1.0, 0.5) * form.stray * len(points)).astype(np.int64)
+    return np.asarray(reach(x, y, strays, form.noise, _FLAT, COSINES, SINES))
 
 
 def _bounds(heights: F4) -> tuple[float, float, float]:
