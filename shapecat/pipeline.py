@@ -16,7 +16,7 @@ from shapecat.errors import OutputError
 from shapecat.executors.order import read_ahead
 from shapecat.learning import load_model
 from shapecat.recordings import Recording, choose_streams, open_recording
-from shapecat.recordings.colour_streams import choose_colours
+from shapecat.recordings.colour_streams import pair_colours
 from shapecat.rehearsal import compile_all
 from shapecat.runs.corrections import adopt_labels, read_labels
 from shapecat.runs.folder import (
@@ -84,7 +84,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
         run = describe_run(job, categorizer)
         streams = choose_streams(recording, job.topics)
         run["options"]["topics"] = [stream.topic for stream in streams]
-        colours = choose_colours(recording, streams, job.color)
+        colours = pair_colours(recording, streams, job.color)
         _log.info(
             "%s: %s, model %s", job.name, " ".join(run["options"]["topics"]), job.model or "default"
         )

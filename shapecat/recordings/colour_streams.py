@@ -20,7 +20,7 @@ from shapecat.recordings.streams import (
     info_topic_of,
 )
 
-__all__ = ["ColourStream", "choose_colour", "choose_colours", "colour_streams"]
+__all__ = ["ColourStream", "choose_colour", "colour_streams", "pair_colours"]
 
 _COLOUR_WORDS = ("color", "colour", "rgb")
 _OTHER_WORDS = ("infra", "/ir/", "depth/image", "confidence", "thermal", "mask")
@@ -65,7 +65,7 @@ def colour_streams(recording: Recording) -> tuple[ColourStream, ...]:
     return tuple(stream for stream in found if stream is not None)
 
 
-def choose_colours(
+def pair_colours(
     recording: Recording, streams: Sequence[Stream], wanted: str | None
 ) -> dict[str, ColourStream]:
     """Return the colour stream of each depth topic that has one; with ``""`` there is none.

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from shapecat.cameras.colour import ColourView
 from shapecat.recordings import Recording, choose_streams
 from shapecat.recordings.colour_frames import frames_with_colour
-from shapecat.recordings.colour_streams import choose_colours
+from shapecat.recordings.colour_streams import pair_colours
 from shapecat.recordings.messages import Needed
 from shapecat.runs.run_info import Options, window_of
 from shapecat.types import Frame
@@ -24,7 +24,7 @@ def read_frames(
     skipped, needed : as for `shapecat.recordings.frames`.
     """
     streams = choose_streams(recording, options["topics"])
-    colours = choose_colours(recording, streams, options.get("color"))
+    colours = pair_colours(recording, streams, options.get("color"))
     window = window_of(options)
     return frames_with_colour(recording, streams, colours, skipped=skipped, needed=needed, **window)
 
