@@ -25,15 +25,15 @@ def freeze(
 
     Parameters
     ----------
-    value : anything numpy can read without loss of kind.
-    shape : axes separated by blanks: a number is that size, a name is any size, the same
-        name always the same size. ``""`` is a scalar.
+    value : anything ``numpy.asarray`` converts.
+    shape : axes separated by spaces. A number is a fixed size; a name is any size, but every axis
+        of that name has the same size. ``""`` is a scalar.
     dtype : numpy type of the result.
-    sizes : sizes of named axes met so far; new names are added to it.
+    sizes : the sizes of the named axes so far; new names are added.
 
     Returns
     -------
-    A read-only view where the type fits already, otherwise a read-only copy.
+    A read-only view if the type already fits, otherwise a read-only copy.
 
     Raises
     ------
@@ -61,9 +61,9 @@ def _axes(shape: str) -> Axes:
 def _freeze(
     value: ArrayLike, axes: Axes, dtype: np.dtype[Any], sizes: dict[str, int]
 ) -> NDArray[Any]:
-    """Do the work of `freeze`: records are made by the thousand."""
+    """Do the work of `freeze` with parsed arguments, for speed."""
     result = np.asarray(value, dtype)
-    # A shape of numbers alone is compared at once.
+    # A shape without named axes is compared at once.
     if result.shape != axes and not _agree(axes, result.shape, sizes):
         known = f" with {sizes}" if sizes else ""
         names = ", ".join(map(str, axes))
@@ -76,7 +76,7 @@ def _freeze(
 
 
 def _agree(axes: Axes, shape: tuple[int, ...], sizes: dict[str, int]) -> bool:
-    """Whether a shape is as stated; ``sizes`` of names met for the first time are added."""
+    """Return whether a shape fits ``axes``; add the sizes of new names to ``sizes``."""
     if len(axes) != len(shape):
         return False
     for axis, size in zip(axes, shape, strict=True):
@@ -86,17 +86,17 @@ def _agree(axes: Axes, shape: tuple[int, ...], sizes: dict[str, int]) -> bool:
 
 
 def array(shape: str, dtype: str, **options: Any) -> Any:
-    """Declare an array field of a `Record`: its shape as in `freeze`, and its type."""
+    """Declare an array field of a `Record`, with its shape (as in `freeze`) and its type."""
     return field(metadata={"shape": shape, "dtype": dtype}, **options)
 
 
 @dataclass_transform(frozen_default=True, eq_default=False, field_specifiers=(array, field))
 class Record:
-    """Base of the frozen records: array fields are checked, frozen, and tied in their sizes.
+    """Base class of the records: a frozen dataclass that checks and freezes its array fields.
 
-    Every subclass is a frozen dataclass. A field declared by ``array("n 3", "f4")`` has as many
-    rows as every other field of the same record that names an axis ``n``. A field whose value is
-    ``None`` is left alone.
+    Within a record, axes of the same name have the same size: a field ``array("n 3", "f4")`` has
+    as many rows as a field ``array("n", "u4")`` has elements. Fields that are ``None`` are not
+    checked.
     """
 
     _arrays: ClassVar[tuple[tuple[str, Axes, np.dtype[Any]], ...]] = ()
@@ -111,7 +111,7 @@ class Record:
         )
 
     def __post_init__(self) -> None:
-        """Freeze the array fields."""
+        """Check the array fields and make them read-only."""
         sizes: dict[str, int] = {}
         for name, axes, dtype in self._arrays:
             value = getattr(self, name)

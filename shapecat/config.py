@@ -43,7 +43,7 @@ class DetectionSettings:
     """Candidates with fewer points at full resolution are dropped."""
 
     def __post_init__(self) -> None:
-        """Refuse to hold more images in memory than help."""
+        """Reject a ``fuse_frames`` that is out of range."""
         if not 1 <= self.fuse_frames <= _MOST_FUSED:
             msg = f"detection.fuse_frames must be from 1 to {_MOST_FUSED}, got {self.fuse_frames}"
             raise ConfigError(msg)
@@ -102,25 +102,25 @@ class OutputSettings:
 
 @dataclass(frozen=True)
 class Settings:
-    """The whole tree. ``seed`` fixes every random choice."""
+    """All settings. ``seed`` fixes every random choice."""
 
     seed: int = 0
     reuse_frames: int = 16
-    """Frames are perceived in blocks of so many: an object that looks as it did before in its
-    block keeps that description; 1 describes every object in every frame."""
+    """Frames per block. Within a block, an object that looks the same as in an earlier frame keeps
+    the description from there; 1 describes every object in every frame."""
     detection: DetectionSettings = field(default_factory=DetectionSettings)
     surface: SurfaceSettings = field(default_factory=SurfaceSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
     outputs: OutputSettings = field(default_factory=OutputSettings)
 
     def __post_init__(self) -> None:
-        """Refuse to hold more images in memory than help."""
+        """Reject a ``reuse_frames`` that is out of range."""
         if not 1 <= self.reuse_frames <= _LARGEST_BLOCK:
             msg = f"reuse_frames must be from 1 to {_LARGEST_BLOCK}, got {self.reuse_frames}"
             raise ConfigError(msg)
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the tree as plain dictionaries, as stored in the outputs."""
+        """Return the settings as nested dictionaries, as stored in the outputs."""
         return dataclasses.asdict(self)
 
 
@@ -129,8 +129,8 @@ def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Se
 
     Raises
     ------
-    ConfigError : the file cannot be read, or names a setting that does not exist (the nearest
-        name is offered) or a value that does not fit.
+    ConfigError : the file cannot be read, a setting does not exist (the message suggests the
+        nearest name), or a value has the wrong type or is out of range.
     """
     tree: Mapping[str, Any] = {}
     if path is not None:
@@ -143,18 +143,27 @@ def load_settings(path: Path | None = None, overrides: Sequence[str] = ()) -> Se
 
 
 def with_settings(settings: Settings, tree: Mapping[str, Any]) -> Settings:
-    """Change settings by a tree, such as ``{"seed": 3, "detection": {"max_range_m": 1.5}}``.
+    """Return settings with some values replaced.
+
+    Parameters
+    ----------
+    tree : the new values, for example ``{"seed": 3, "detection": {"max_range_m": 1.5}}``.
 
     Raises
     ------
-    ConfigError : a setting that does not exist, or a value that does not fit.
+    ConfigError : a setting does not exist, or a value has the wrong type or is out of range.
     """
     changed: Settings = _build(settings, tree, "")
     return changed
 
 
 def with_overrides(settings: Settings, overrides: Sequence[str]) -> Settings:
-    """Apply overrides such as ``detection.max_range_m=1.5``, in order.
+    """Return settings with overrides such as ``detection.max_range_m=1.5`` applied, in order.
+
+    Raises
+    ------
+    ConfigError : an override is not ``name=value``, a setting does not exist, or a value has the
+        wrong type or is out of range.
 
     Examples
     --------

@@ -37,7 +37,8 @@ __all__ = [
 CATEGORIES = ("cup", "can", "box", "bottle", "bowl", "plate", "ball")
 """The shape categories of the default model, in the order of every posterior."""
 UNKNOWN = "unknown"
-"""Category of an object that is of none of the model's; label and folder of shapes of none."""
+"""The category of an object that fits none of the model's categories. Also the label of such an
+object, and its folder in a data set."""
 
 
 @dataclass(frozen=True)
@@ -60,20 +61,20 @@ class Pose(Record):
 
 
 class Frame(Record):
-    """One reading of a depth sensor.
+    """One measurement of a depth sensor: a depth image with its camera, or a point cloud.
 
-    Either organized, ``depth`` with its ``camera``, or unorganized, ``points``; never both.
-    Indices into a frame count pixels row by row, or points.
+    It has either ``depth`` and ``camera``, or ``points``, never both. An index into a frame is a
+    pixel index (row by row) or the row of a point.
 
     Attributes
     ----------
-    topic : the stream it came from.
-    index : its number in that stream, from 0, counting skipped frames too.
+    topic : the stream of the recording.
+    index : number of the frame in its stream, from 0; skipped frames count.
     stamp_ns : time of the measurement (``header.stamp``).
-    log_time_ns : time it was recorded.
+    log_time_ns : time of the recording.
     frame_id : name of the sensor frame.
     depth : (h, w) metres along the optical axis; 0 where there is no reading, never NaN.
-    points : (n, 3) metres, sensor frame, finite; rows of NaN where there is no reading.
+    points : (n, 3) metres, sensor frame; rows of NaN where there is no reading.
     """
 
     topic: str
@@ -86,7 +87,7 @@ class Frame(Record):
     points: F4 | None = array("n 3", "f4", default=None)
 
     def __post_init__(self) -> None:
-        """Check that the frame is of exactly one kind."""
+        """Check that the frame has either depth or points, and a camera of the same size."""
         super().__post_init__()
         if (self.depth is None) == (self.points is None):
             msg = "a Frame has either depth or points"
@@ -103,7 +104,7 @@ class Frame(Record):
         return self.depth is not None
 
     def xyz(self, indices: U4 | None = None) -> F4:
-        """Return the points at ``indices`` (all by default): (n, 3) metres, sensor frame.
+        """Return the points at ``indices``, by default all: (n, 3) metres, sensor frame.
 
         Points without a reading are rows of NaN.
         """
@@ -129,7 +130,8 @@ class Plane(Record):
     ----------
     normal : (3,) unit vector, sensor frame, pointing up.
     offset : metres; the height of a point above the plane is ``normal @ p - offset``.
-    outline : (k, 3) metres, sensor frame: corners of its convex outline, in order.
+    outline : (k, 3) metres, sensor frame: the corners of the convex outline, in order.
+    area_m2 : visible area, square metres.
     height_m : height above the lowest plane of the scene, along the up direction.
     """
 
@@ -141,10 +143,13 @@ class Plane(Record):
 
 
 class Box(Record):
-    """An oriented box: its z axis is up, its yaw follows the points.
+    """An upright box: its z axis points up, its yaw fits the points.
 
-    ``center`` (3,) metres and ``orientation`` (x, y, z, w) of the box axes in the sensor frame;
-    ``size`` (3,) metres, full lengths along the box axes.
+    Attributes
+    ----------
+    center : (3,) metres, sensor frame.
+    size : (3,) metres, the full lengths along the axes of the box.
+    orientation : (4,) quaternion x, y, z, w: the axes of the box in the sensor frame.
     """
 
     center: F4 = array("3", "f4")
@@ -153,13 +158,13 @@ class Box(Record):
 
 
 class FullBox(Box):
-    """The estimated box around a whole object, with its hidden part.
+    """The estimated box around a whole object, including its hidden part.
 
     Attributes
     ----------
     size_std : (3,) metres, the standard deviation of each length.
-    outline : (96,) metres, how far what is seen reaches from the centre in as many directions
-        around, from the first axis of the box towards the second.
+    outline : (96,) metres, the support function of the visible points about the centre, in
+        horizontal directions every 3.75 degrees, from the first axis of the box to the second.
     """
 
     size_std: F4 = array("3", "f4")
@@ -172,11 +177,11 @@ class Candidate(Record):
     Attributes
     ----------
     indices : (n,) ascending indices into the frame, at full resolution.
-    plane : position of the plane it stands on in `Scene.planes`; None if on none.
-    on_candidate : position of the candidate it stands on in `Scene.candidates`, or None.
-    support_m : height of what it stands on above `plane`, metres (0 when it stands on the plane).
-    touches_border : it is cut by the border of the image, or where the range of readings ends.
-    occluded : something nearer hides a part of it.
+    plane : index in `Scene.planes` of the plane below it; None without one.
+    on_candidate : index in `Scene.candidates` of the candidate it stands on; None without one.
+    support_m : height of the surface it stands on above `plane`, metres; 0 on the plane itself.
+    touches_border : the border of the image, or the maximum range, cuts it off.
+    occluded : a nearer surface hides part of it.
     """
 
     indices: U4 = array("n", "u4")
@@ -191,7 +196,7 @@ class Candidate(Record):
 class Scene(Record):
     """The result of the detection in one frame.
 
-    ``up`` is a (3,) unit vector in the sensor frame; ``planes`` ascend in height.
+    ``up`` is a (3,) unit vector in the sensor frame; ``planes`` are in order of height.
     """
 
     up: F4 = array("3", "f4")
@@ -199,21 +204,26 @@ class Scene(Record):
     candidates: tuple[Candidate, ...]
 
     def support_offset(self, candidate: Candidate) -> float:
-        """Return how far along ``up`` lies what a candidate stands on; its bottom if unseen."""
+        """Return ``up @ p``, in metres, for points p of the surface a candidate stands on.
+
+        Without a plane, this is the bottom of the candidate's box.
+        """
         if candidate.plane is None:
             return float(self.up @ candidate.box.center - candidate.box.size[2] / 2)
         return self.planes[candidate.plane].offset + candidate.support_m
 
     def height_of(self, candidate: Candidate) -> float:
-        """Return how far the centre of a candidate's box is above what it stands on, in metres."""
+        """Return the height of a candidate's box centre above the surface it stands on, metres."""
         return float(self.up @ candidate.box.center) - self.support_offset(candidate)
 
 
 class NeuralGas(Record):
     """A graph that has learned the surface of a point cloud (thesis ch. 5).
 
-    ``neurons`` (k, 3) metres, in the frame of the points; ``edges`` (m, 2) pairs of neurons with
-    ``i < j``, each once, in lexicographic order.
+    Attributes
+    ----------
+    neurons : (k, 3) metres, in the frame of the points.
+    edges : (m, 2) pairs of neurons ``i < j``, each once, in lexicographic order.
     """
 
     neurons: F4 = array("k 3", "f4")
@@ -223,10 +233,15 @@ class NeuralGas(Record):
 class Detection(Record):
     """One object in one frame: everything later phases need.
 
-    ``neurons`` of ``gas`` are in the sensor frame; ``posterior`` sums to 1 in the order of the
-    model's categories; ``novelty`` is 0 for a familiar shape and above 1 beyond the threshold;
-    ``full`` is in the sensor frame, None where only the visible box is known; ``reused_from`` is
-    the index of the frame whose description it repeats, None if it has its own.
+    Attributes
+    ----------
+    gas : the surface, in the sensor frame.
+    descriptor : (d,) the shape descriptor.
+    posterior : (c,) probabilities, in the order of the model's categories.
+    novelty : 0 for a familiar shape, above 1 for a shape unlike all categories.
+    seconds : time spent on this object.
+    full : the box of the whole object, sensor frame; None if only the visible box is known.
+    reused_from : index of the frame from which the description is copied; None if it is new.
     """
 
     candidate: Candidate
@@ -240,14 +255,15 @@ class Detection(Record):
 
 
 class ImageMasks(Record):
-    """The pixels of the detections of a frame on the colour image beside it.
+    """The masks of a frame's detections on the colour image taken with it.
 
     Attributes
     ----------
-    topic, stamp_ns, log_time_ns, frame_id : of the image.
-    width, height : of the image, pixels.
-    boxes : left, top, width and height, pixels, of the mask of each detection on the image.
-    counts : (n,) uint32, the run lengths of each of them, as of `shapecat.colour.rle.rle_counts`.
+    topic, stamp_ns, log_time_ns, frame_id : as in `Frame`, but for the colour image.
+    width, height : size of the image, pixels.
+    boxes : left, top, width and height of each mask, pixels, by the number of the detection (from
+        0); detections that the image does not show are missing.
+    counts : (n,) uint32 run lengths of each mask, from `shapecat.colour.rle.rle_counts`.
     """
 
     topic: str
@@ -261,10 +277,10 @@ class ImageMasks(Record):
 
 
 class Perception(Record):
-    """All that is known of one frame before anything is followed over time.
+    """Everything found in one frame, before tracking.
 
-    ``reused_from`` is the index of the frame whose scene it repeats, None if it has its own;
-    ``masks`` are None without a colour image.
+    ``seconds`` is the time spent in each stage; ``reused_from`` is the index of the frame from
+    which the scene is copied, None if it is new; ``masks`` is None without a colour image.
     """
 
     topic: str
@@ -281,11 +297,17 @@ class Perception(Record):
 class LabelledObject(Record):
     """One object in one frame as the outputs show it: a detection with its track's label.
 
-    ``box`` is in the sensor frame, as are the ``neurons`` of ``gas``; ``posterior`` is this single
-    view's, ``causal`` the track's up to this frame; ``confidence`` and ``category`` are final.
-    ``height_m`` is the height of the centre above what it stands on, NaN if on nothing;
-    ``detections`` are its rows of the frame, several where tracks were merged; ``full`` is the box
-    around all of it, as the views of its track tell, if that is known.
+    Attributes
+    ----------
+    category, confidence : final, from all views of the track.
+    box, gas : the visible part, sensor frame.
+    indices : (n,) ascending indices into the frame.
+    posterior : (c,) from this view alone.
+    causal : (c,) fused from the track's views up to this frame.
+    height_m : height of the box centre above the surface it stands on; NaN if that is unknown.
+    touches_border, occluded : as in `Candidate`.
+    detections : numbers of its detections in the frame; several where tracks were merged.
+    full : the box of the whole object, estimated from the track's views; None if unknown.
     """
 
     track: int
@@ -306,10 +328,14 @@ class LabelledObject(Record):
 class LabelledFrame(Record):
     """One frame as the outputs show it, without its points.
 
-    ``fixed_from_sensor`` is None where the recording has no fixed frame; ``ended`` names the
-    tracks shown in an earlier frame of the topic that are not seen again; ``up`` (3,) is the unit
-    vector up in the sensor frame; ``reused_from`` is the index of the frame that shows the same,
-    None if there is none before it; ``masks`` are None without a colour image.
+    Attributes
+    ----------
+    fixed_from_sensor : None where the recording has no fixed frame.
+    ended : the tracks that the previous frame of the topic was the last to show.
+    seconds : time spent in each stage.
+    up : (3,) unit vector, sensor frame; None if unknown.
+    reused_from : index of the earlier frame from which the scene is copied; None if it is new.
+    masks : None without a colour image.
     """
 
     topic: str
@@ -330,7 +356,7 @@ class LabelledFrame(Record):
 class ShownBox(NamedTuple):
     """The annotation of one object, as plain numbers.
 
-    ``center`` and ``size`` in metres, ``orientation`` x, y, z, w, as in `Box`; sensor frame.
+    ``center`` (metres), ``size`` (metres) and ``orientation`` (x, y, z, w) are those of a `Box`.
     """
 
     track: int
@@ -343,7 +369,7 @@ class ShownBox(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownFrame:
-    """The annotations of one frame; the fields are those of `LabelledFrame`."""
+    """The annotations of one frame; the fields are as in `LabelledFrame`."""
 
     topic: str
     index: int

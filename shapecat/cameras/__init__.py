@@ -1,1 +1,1 @@
-"""Cameras beyond the pinhole: lenses with distortion, and the images of colour."""
+"""Lens distortion, and the records of colour cameras and their images."""

@@ -1,4 +1,4 @@
-"""The records of colour: an image as it was recorded, and the camera that saw it."""
+"""The records of colour cameras: an image as recorded, and its camera."""
 
 from dataclasses import dataclass
 
@@ -8,14 +8,17 @@ from shapecat.types import Camera, Pose
 __all__ = ["COMPRESSED_FORMATS", "ColourImage", "ColourView", "LensCamera"]
 
 COMPRESSED_FORMATS = ("jpeg", "png")
-"""Encodings of images that are files in themselves."""
+"""Encodings whose image data is a complete image file."""
 
 
 @dataclass(frozen=True)
 class LensCamera:
-    """A camera whose images show the distortion of its lens.
+    """A camera whose images are distorted by its lens.
 
-    ``model`` is one of `shapecat.cameras.lenses.LENS_MODELS`, empty for a lens without distortion.
+    Attributes
+    ----------
+    model : one of `shapecat.cameras.lenses.LENS_MODELS`, or empty without distortion.
+    coefficients : the distortion coefficients, in OpenCV's order.
     """
 
     pinhole: Camera
@@ -24,14 +27,14 @@ class LensCamera:
 
 
 class ColourImage(Record):
-    """A colour image as it was recorded, not decoded.
+    """A colour image as recorded, not decoded.
 
     Attributes
     ----------
-    topic, stamp_ns, log_time_ns, frame_id : as of a `shapecat.types.Frame`.
-    encoding : ``jpeg`` or ``png`` where ``data`` is such a file, else a ROS image encoding.
+    topic, stamp_ns, log_time_ns, frame_id : as in `shapecat.types.Frame`.
+    encoding : ``jpeg`` or ``png`` if ``data`` is such a file, otherwise a ROS image encoding.
     width, height : pixels.
-    step : bytes of a row of raw pixels.
+    step : bytes per row, for raw pixels.
     """
 
     topic: str
@@ -46,13 +49,13 @@ class ColourImage(Record):
 
 
 class ColourView(Record):
-    """A colour image beside a frame of the depth sensor.
+    """A colour image that belongs to a frame of the depth sensor.
 
     Attributes
     ----------
-    lens : the camera of the image.
-    colour_from_depth : where the sensor is, in the optical frame of the colour camera; None where
-        the image is registered: its pixels, row by row, are those of the frame.
+    lens : the colour camera; None if it is unknown.
+    colour_from_depth : pose of the depth sensor in the optical frame of the colour camera; None
+        for a registered image, whose pixels (row by row) are those of the frame.
     """
 
     image: ColourImage
@@ -61,5 +64,5 @@ class ColourView(Record):
 
     @property
     def registered(self) -> bool:
-        """Whether pixel k of the image is pixel, or point, k of the frame."""
+        """Whether pixel k of the image shows pixel (or point) k of the frame."""
         return self.colour_from_depth is None

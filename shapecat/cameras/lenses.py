@@ -1,6 +1,6 @@
-"""Lenses with distortion: where a ray falls on the image, and which ray a pixel sees.
+"""Lens distortion: the pixel that a ray hits, and the ray that a pixel sees.
 
-Slopes are x / z and y / z of a ray in the camera's optical frame.
+A ray is given by its slopes x / z and y / z in the optical frame of the camera.
 """
 
 from collections.abc import Sequence
@@ -13,19 +13,20 @@ from shapecat.types import Camera
 __all__ = ["LENS_MODELS", "distort", "undistorted_rays"]
 
 LENS_MODELS = ("plumb_bob", "rational_polynomial", "equidistant", "fisheye")
-"""The models of OpenCV's calibration that are understood."""
+"""The supported lens models of OpenCV's calibration."""
 
 _ROUNDS = 20
 
 
 def distort(rays: F8, model: str, coefficients: Sequence[float]) -> F8:
-    """Return the slopes (..., 2) at which a lens shows rays of slopes (..., 2).
+    """Return the slopes (..., 2) after distortion of rays with slopes (..., 2).
 
     Source: the lens models of OpenCV's calibration (Brown 1966; Kannala & Brandt 2006).
 
     Parameters
     ----------
     model : one of `LENS_MODELS`, or empty for a lens without distortion.
+    coefficients : in OpenCV's order, at most 8; missing ones are 0.
 
     Raises
     ------
@@ -48,13 +49,14 @@ def distort(rays: F8, model: str, coefficients: Sequence[float]) -> F8:
 
 
 def undistorted_rays(camera: Camera, model: str, coefficients: Sequence[float]) -> F8 | None:
-    """Return (h, w, 2) the slopes x / z and y / z that each pixel sees.
+    """Return the slopes x / z and y / z of the ray that each pixel sees.
 
     Source: `distort`, inverted by fixed-point iteration as in OpenCV's undistortPoints.
 
     Returns
     -------
-    None for a model that is not known, or where the iteration does not settle.
+    (h, w, 2) slopes; None if the model is not known, the coefficients are not finite, or the
+    iteration does not converge at every pixel.
     """
     if model not in LENS_MODELS or not np.isfinite(coefficients).all():
         return None
@@ -69,7 +71,7 @@ def undistorted_rays(camera: Camera, model: str, coefficients: Sequence[float]) 
 
 
 def _polynomial(rays: F8, d: F8) -> F8:
-    """Brown's radial and tangential distortion; k4 to k6 are the rational part."""
+    """Apply Brown's radial and tangential distortion; k4 to k6 are the rational part."""
     k1, k2, p1, p2, k3, k4, k5, k6 = d
     x, y = rays[..., 0], rays[..., 1]
     r = x * x + y * y
@@ -84,7 +86,7 @@ def _polynomial(rays: F8, d: F8) -> F8:
 
 
 def _fisheye(rays: F8, d: F8) -> F8:
-    """Kannala and Brandt's equidistant model."""
+    """Apply Kannala and Brandt's equidistant model."""
     radius = np.maximum(np.hypot(rays[..., 0], rays[..., 1]), 1e-12)
     angle = np.arctan(radius)
     s = angle * angle
