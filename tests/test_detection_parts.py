@@ -1,5 +1,7 @@
 """Parts of one object: told by trees that must be sound, and learned the same way each time."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -20,7 +22,7 @@ from shapecat.detection.pipeline import ALL_STEPS, Task, oversegment
 from shapecat.models.growing import Growth, grow
 from shapecat.models.parts import Series, collect
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
-from shapecat.trees import BoostedTrees, logit_of
+from shapecat.trees import BoostedTrees, logit_of, read_trees, write_trees
 from tests.test_detection import overlaps
 
 SCENES = (Series("clutter", KINECT, 2000, 4), Series("pile", REALSENSE, 85_000, 2))
@@ -41,6 +43,20 @@ def test_every_walk_through_the_trees_ends(grown: BoostedTrees, features: int) -
     assert np.all(left[roots[1:] - 1] == 0)
     assert 0 <= feature.min() <= feature.max() < features
     assert np.isfinite(grown.value).all()
+
+
+def test_trees_know_which_features_they_were_grown_with(tmp_path: Path) -> None:
+    """A field that is inserted without growing them anew would shift all that follow."""
+    inner = np.dtype([("width_m", "f4"), ("height_m", "f4")])
+    features = np.dtype([("first", inner), ("second", inner), ("border_m", "f4")])
+    grown = learned.load_trees()
+    write_trees(tmp_path / "grown.npz", grown, features)
+    content = (tmp_path / "grown.npz").read_bytes()
+
+    assert (read_trees(content, features).value == grown.value).all()
+    for changed in ([("second", inner), ("first", inner), ("border_m", "f4")], features.descr[:2]):
+        with pytest.raises(ValueError, match="grown with other features"):
+            read_trees(content, np.dtype(changed))
 
 
 def test_the_order_of_two_pieces_says_nothing() -> None:

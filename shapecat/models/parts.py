@@ -104,7 +104,7 @@ def main(*, share: float, seed: int, jobs: int, out: Path, more: bool) -> None:
     settled = collect(_SETTLED, share, jobs)
     pairs = Pairs(*(np.concatenate(both) for both in zip(at_rest, settled, strict=True)))
     grown = grow(*pairs, _MORE, seed, after=grown)
-    write_trees(out, grown)
+    write_trees(out, grown, PAIR_FEATURES)
     click.echo(f"{len(pairs.same)} pairs, {pairs.same.mean():.0%} of one object; {out}")
 
 

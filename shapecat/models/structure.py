@@ -84,7 +84,7 @@ class Samples(NamedTuple):
 def main(*, seed: int, jobs: int, out: Path) -> None:
     """Simulate, detect, grow; write the trees."""
     samples = collect(_SERIES, jobs)
-    write_trees(out, grow(*samples, _GROWTH, seed))
+    write_trees(out, grow(*samples, _GROWTH, seed), OBJECT_FEATURES)
     click.echo(f"{len(samples.objects)} segments, {samples.objects.mean():.0%} of objects; {out}")
 
 

@@ -1,8 +1,9 @@
 """Trees whose leaves add up to a logit, and their file."""
 
+from collections.abc import Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -20,15 +21,30 @@ class BoostedTrees(NamedTuple):
     value: F4
 
 
-def read_trees(content: bytes) -> BoostedTrees:
-    """Return the trees of a file that `write_trees` wrote."""
+def read_trees(content: bytes, features: np.dtype[Any]) -> BoostedTrees:
+    """Return the trees of a file that `write_trees` wrote.
+
+    Raises
+    ------
+    ValueError : the trees were grown with other features, or with these in another order.
+    """
     with np.load(BytesIO(content), allow_pickle=False) as arrays:
+        if arrays["names"].tolist() != list(_names(features)):
+            msg = "the trees were grown with other features than these: run `make parts`"
+            raise ValueError(msg)
         return BoostedTrees(Trees(*(arrays[name] for name in Trees._fields)), arrays["value"])
 
 
-def write_trees(path: Path, grown: BoostedTrees) -> None:
-    """Write trees to a file."""
-    np.savez_compressed(path, **grown.trees._asdict(), value=grown.value)
+def write_trees(path: Path, grown: BoostedTrees, features: np.dtype[Any]) -> None:
+    """Write trees to a file, with the names of the fields of ``features``, which may be nested."""
+    names = np.array(list(_names(features)))
+    np.savez_compressed(path, **grown.trees._asdict(), value=grown.value, names=names)
+
+
+def _names(features: np.dtype[Any]) -> Iterator[str]:
+    for name in features.names or ():
+        field = features[name]
+        yield from (f"{name}.{inner}" for inner in _names(field)) if field.names else (name,)
 
 
 @kernel

@@ -1,8 +1,8 @@
-"""Structure rejection: boosted trees tell objects from background structure and noise.
+"""Structure rejection: boosted trees separate objects from background structure and noise.
 
-Walls of bins, sides and edges of shelves, furniture, arms that reach in, bent ends of tables, blobs
-of noise: many weak features together tell them from objects. The trees are grown on simulated
-scenes, `python -m shapecat.models.structure`.
+Background structure is walls of bins, sides and edges of shelves, furniture, bent ends of tables
+and blobs of noise. No single feature separates it from objects, many weak ones together do. The
+trees are grown on simulated scenes (`shapecat.models.structure`), none of which has a robot arm.
 """
 
 from functools import cache
@@ -12,6 +12,7 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, Bool
 from shapecat.config import DetectionSettings
+from shapecat.detection.cleanup.object_features import OBJECT_FEATURES
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.merging.segments import Records, Segments, is_root
@@ -26,7 +27,9 @@ FILE = "structure.npz"
 @cache
 def load_trees() -> BoostedTrees:
     """Return the trees that belong to this version."""
-    return read_trees(files("shapecat.detection.cleanup").joinpath(FILE).read_bytes())
+    return read_trees(
+        files("shapecat.detection.cleanup").joinpath(FILE).read_bytes(), OBJECT_FEATURES
+    )
 
 
 def find_background(

@@ -37,7 +37,9 @@ FILE = "parts.npz"
 @cache
 def load_trees() -> BoostedTrees:
     """Return the trees that belong to this version."""
-    return read_trees(files("shapecat.detection.merging").joinpath(FILE).read_bytes())
+    return read_trees(
+        files("shapecat.detection.merging").joinpath(FILE).read_bytes(), PAIR_FEATURES
+    )
 
 
 class Scratch(NamedTuple):
