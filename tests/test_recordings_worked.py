@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation, Slerp
 from shapecat.cameras.colour import ColourImage
 from shapecat.recordings import choose_streams, open_recording, time_order
 from shapecat.recordings.colour_image import cloud_colours, compressed_size, pixels_of
-from shapecat.recordings.colour_streams import choose_colour
+from shapecat.recordings.colour_streams import choose_colour, pair_colours
 from shapecat.recordings.extrinsics import Extrinsics
 from shapecat.recordings.imu import Accelerometer
 from shapecat.recordings.mcap_records import Opcode, TruncatedError, walk
@@ -89,6 +89,31 @@ def test_of_several_strange_cameras_none_belongs_to_the_depth_camera(tmp_path: P
             (stream,) = choose_streams(recording)
             chosen = choose_colour(recording, stream)
         assert (None if chosen is None else chosen.topic) == wanted
+
+
+@pytest.mark.parametrize(
+    ("topic", "frame_id", "found"),
+    [
+        ("/right/depth/image_raw", "right", None),  # another sensor
+        ("/cam/aligned_depth/image_raw", "right", "/one/image"),  # the same, by its namespace
+        ("/right/depth/image_raw", "camera", "/one/image"),  # the same, by its frame
+    ],
+)
+def test_the_only_colour_camera_belongs_to_no_depth_camera_if_there_are_two(
+    tmp_path: Path, topic: str, frame_id: str, found: str | None
+) -> None:
+    """The masks of one of the two would be drawn on what the other sees."""
+    second = (topic, EPOCH, image(EPOCH, wavy_depth(), frame_id=frame_id))
+    items = [*depth_items(EPOCH), second, *colour("/one/image")]
+    with open_recording(record(tmp_path / "a.mcap", in_order(items))) as recording:
+        streams = choose_streams(recording, ["/cam/depth/image_raw", topic])
+        pairs = pair_colours(recording, streams, None)
+        wanted = pair_colours(recording, streams, "/one/image")
+
+    assert {stream.topic: pairs.get(stream.topic) for stream in streams} == {
+        stream.topic: None if found is None else wanted[stream.topic] for stream in streams
+    }
+    assert {colour.topic for colour in wanted.values()} == {"/one/image"}
 
 
 def test_a_colour_camera_that_is_calibrated_anew_has_another_lens(tmp_path: Path) -> None:

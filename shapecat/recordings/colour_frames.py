@@ -24,17 +24,17 @@ from shapecat.types import Camera, Frame
 __all__ = ["frames_with_colour"]
 
 _HELD_FRAMES = 8
-"""Frames that wait at most for a colour image behind them."""
+"""At most this many frames wait for a later colour image."""
 _KEPT_IMAGES, _KEPT_BYTES = 16, 96 << 20
-"""Colour images that wait at most for a frame; two in any case."""
+"""Limits on the colour images kept for later frames; two are always kept."""
 _STAMP_BYTES = 12
-"""With another stamp in its first bytes, as ROS has it there, a calibration is the same."""
+"""A ROS message holds its stamp in these first bytes: they do not change a calibration."""
 _PATIENCE_NS = 500_000_000
-"""A frame waits no longer than this, in log time."""
+"""A frame waits no longer than this for a colour image, in log time."""
 _USUAL_PERIOD_NS = 100_000_000
-"""Assumed where a stream has a single image."""
+"""Image period assumed if neither stamps nor count and duration give one."""
 _NEAR, _EQUAL = 0.01, 1e-6
-"""Intrinsics that differ by less than this share of the width are nearly, or quite, the same."""
+"""Intrinsics that differ by less than these fractions of the image width are similar, or equal."""
 _MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, RecordingError)
 
 
@@ -46,17 +46,19 @@ def frames_with_colour(
     skipped: Counter[str],
     **chosen: Any,
 ) -> Iterator[tuple[Frame, ColourView | None]]:
-    """Read frames as `shapecat.recordings.frames` does, each beside its colour image.
+    """Read frames as `shapecat.recordings.frames` does, each with its colour image.
 
     Parameters
     ----------
     colours : the colour stream of each depth topic that has one.
-    chosen : ``start_s, end_s, every``, and ``needed``, which is asked of colour images as well.
+    skipped : as for `frames`.
+    chosen : ``start_s``, ``end_s``, ``every`` and ``needed`` as for `frames`; ``needed`` is also
+        called for colour images.
 
     Yields
     ------
-    Frames, and the image with the nearest stamp if that is within half a period of the colour
-    stream; None where there is none, or it cannot be read: the recording's warnings count those.
+    Each frame with the colour image nearest in stamp, or None if no readable image is within half
+    a period of the colour stream. Unless ``needed`` is given, warnings count the missing images.
     """
     partners = {
         stream.topic: _Partner(recording, stream, colours[stream.topic])
@@ -75,7 +77,7 @@ def frames_with_colour(
 
 
 def _heard(partners: Mapping[str, "_Partner"]) -> dict[str, Any]:
-    """Return the listeners of each topic."""
+    """Return a callback for each colour topic and its calibration topic."""
     listeners: dict[str, list[Any]] = {}
     for partner in partners.values():
         listeners.setdefault(partner.stream.topic, []).append(partner.take)
@@ -106,7 +108,7 @@ def _paired(frame: Frame, partners: Mapping[str, "_Partner"]) -> tuple[Frame, Co
 
 
 class _Partner:
-    """The colour images of one depth stream as they pass."""
+    """The latest colour images for one depth stream."""
 
     def __init__(self, recording: Recording, depth: Stream, colour: ColourStream) -> None:
         self.stream = colour
@@ -121,7 +123,7 @@ class _Partner:
         self._left_out: Counter[str] = Counter()
 
     def take(self, message: Message) -> None:
-        """Keep an image for a while."""
+        """Decode a colour image and keep it for later frames."""
         if message.type != self.stream.type:
             return
         try:
@@ -138,7 +140,7 @@ class _Partner:
             self._images.popleft()
 
     def calibrate(self, message: Message) -> None:
-        """Take the calibration, anew when it changes."""
+        """Update the lens if the calibration has changed."""
         content = bytes(message.data[_STAMP_BYTES:])
         if content == self._calibration:
             return
@@ -152,11 +154,11 @@ class _Partner:
             self._left_out[f"calibration: {_reason(error, self.stream.topic)}"] += 1
 
     def reaches(self, frame: Frame) -> bool:
-        """Return whether no later image can be nearer to a frame."""
+        """Return whether the newest image is not older than a frame: later ones are not nearer."""
         return self._newest is not None and self._newest >= frame.stamp_ns
 
     def view(self, frame: Frame) -> ColourView | None:
-        """Return the image of a frame."""
+        """Return the colour image nearest to a frame in time; None if none is usable."""
         nearest = min(self._images, key=lambda one: abs(one[0] - frame.stamp_ns), default=None)
         if nearest is None or 2 * abs(nearest[0] - frame.stamp_ns) > self._period():
             self._left_out["frames without a colour image of their time"] += 1
@@ -168,7 +170,7 @@ class _Partner:
             return None
 
     def report(self) -> None:
-        """Add a warning per reason for skipped images."""
+        """Add a warning with a count for each reason why frames have no colour image."""
         for reason, count in self._left_out.items():
             self._recording.warn(f"{self.stream.topic}: no colour {count} times: {reason}")
 
@@ -235,7 +237,7 @@ def _lens_of(info: Any, topic: str) -> LensCamera:
 
 
 def _alike(lens: LensCamera, camera: Camera | None, share: float) -> bool:
-    """Return whether two cameras have the same intrinsics, within a share of the width."""
+    """Return whether two cameras' intrinsics differ by less than `share` of the image width."""
     if camera is None:
         return False
     own, other = ((c.fx, c.fy, c.cx, c.cy) for c in (lens.pinhole, camera))

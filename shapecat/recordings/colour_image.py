@@ -1,4 +1,4 @@
-"""Colour images become pixels: raw, JPEG, PNG, and the colours of point clouds."""
+"""Decode colour images to RGB pixels: raw, JPEG, PNG, and the colours of point clouds."""
 
 import io
 import struct
@@ -33,35 +33,35 @@ _CHANNELS = {
     "bgr16": (2, (2, 1, 0), 3),
     "mono8": (1, (0, 0, 0), 1),
 }
-"""Bytes of a channel, the channels of red, green and blue, and channels of a pixel."""
+"""Bytes per channel, the channel indices of red, green and blue, and channels per pixel."""
 
 _BAYER = {"bayer_rggb8": 0, "bayer_grbg8": 1, "bayer_gbrg8": 2, "bayer_bggr8": 3}
-"""Where red is in a block of two by two pixels, row by row."""
+"""Index of the red pixel in a block of 2 x 2 pixels, row by row."""
 
 _LUMA = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
-"""The byte of the first brightness in four bytes of two pixels."""
+"""Index of the first luma byte in the four bytes of two pixels."""
 
 COLOUR_ENCODINGS = frozenset({*_CHANNELS, *_BAYER, *_LUMA})
-"""Encodings of sensor_msgs/Image that are understood as colour; mono8 is grey."""
+"""Encodings of sensor_msgs/Image that can be decoded to RGB; mono8 becomes grey."""
 
 _SOF = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}
-"""Markers of a JPEG file behind which its size stands."""
+"""Start-of-frame markers of JPEG: the image size follows them."""
 
 _PNG = b"\x89PNG\r\n\x1a\n"
 
 
 def compressed_kind(data: bytes | memoryview) -> str:
-    """Return the format of a compressed image by its first bytes: jpeg, png, or empty."""
+    """Return ``jpeg``, ``png`` or an empty string, from the first bytes of a compressed image."""
     begin = bytes(data[:8])
     return "jpeg" if begin.startswith(b"\xff\xd8\xff") else "png" if begin == _PNG else ""
 
 
 def compressed_size(data: bytes | memoryview) -> tuple[str, int, int]:
-    """Return kind, width and height of a JPEG or PNG file, without decoding it.
+    """Return format, width and height of a JPEG or PNG file, without decoding it.
 
     Raises
     ------
-    MessageError : another kind of file, one without a size or an end, or a too large one.
+    MessageError : the data is neither JPEG nor PNG, is truncated, or has too many pixels.
     """
     kind, view = compressed_kind(data), memoryview(data)
     if not kind:
@@ -87,13 +87,13 @@ def _png_size(data: memoryview) -> tuple[int, int]:
 
 
 def _jpeg_size(data: memoryview) -> tuple[int, int]:
-    """Walk the segments of a JPEG file to the one that holds its size."""
+    """Return width and height of a JPEG file, from its start-of-frame segment."""
     at = 2
     while at + 9 <= len(data):
         if data[at] != 0xFF:
             break
         marker = data[at + 1]
-        if marker == 0xFF or 0xD0 <= marker <= 0xD9 or marker == 1:  # filling, or without content
+        if marker == 0xFF or 0xD0 <= marker <= 0xD9 or marker == 1:  # padding, or without content
             at += 1 if marker == 0xFF else 2
             continue
         if marker in _SOF:
@@ -105,20 +105,20 @@ def _jpeg_size(data: memoryview) -> tuple[int, int]:
 
 
 def pixels_of(image: ColourImage, *, shrink: int = 1) -> U1:
-    """Decode an image.
+    """Decode an image to RGB.
 
     Parameters
     ----------
-    shrink : a JPEG image may be decoded at 1/2, 1/4 or 1/8 of its size, down to this share: several
-        times as fast.
+    shrink : a JPEG image is decoded at 1/2, 1/4 or 1/8 of its size, which is several times as
+        fast, but not below 1 / ``shrink`` of it. Other formats ignore this.
 
     Returns
     -------
-    (h, w, 3) red, green, blue.
+    (h, w, 3) uint8 red, green, blue.
 
     Raises
     ------
-    MessageError : damaged, an unknown encoding, or less data than its size needs.
+    MessageError : the image is damaged or truncated, or its encoding is unknown.
     """
     if image.encoding in COMPRESSED_FORMATS:
         return _decompressed(image, shrink)
@@ -126,11 +126,11 @@ def pixels_of(image: ColourImage, *, shrink: int = 1) -> U1:
 
 
 def encoded(image: ColourImage, pixels: U1) -> tuple[str, bytes]:
-    """Return suffix and bytes of an image file without loss: the original, or a PNG.
+    """Return suffix and bytes of a lossless image file: the recorded JPEG or PNG, or a new PNG.
 
     Parameters
     ----------
-    pixels : what `pixels_of` has decoded, so that no damaged file is handed on.
+    pixels : (h, w, 3), from `pixels_of` at full size; it has shown that the image is undamaged.
     """
     from PIL import Image  # noqa: PLC0415  # loaded where there is colour
 
@@ -169,12 +169,12 @@ def _raw_pixels(image: ColourImage) -> U1:
         raise MessageError(msg)
     size, order, channels = _CHANNELS[name]
     rows = _rows(image, size * channels)
-    # Of 16 bits the upper ones: the last byte of each channel, as all robots are little-endian.
+    # Take the high byte of 16-bit channels: the last one, assuming little-endian data.
     return np.ascontiguousarray(rows[..., [size * k + size - 1 for k in order]])
 
 
 def _rows(image: ColourImage, pixel: int) -> U1:
-    """Return (h, w, pixel) the bytes of raw pixels."""
+    """Return the bytes of a raw image, (h, w, pixel), where `pixel` is the bytes per pixel."""
     width, height, data = image.width, image.height, np.frombuffer(image.data, np.uint8)
     row = image.step or width * pixel
     need = (height - 1) * row + width * pixel
@@ -185,7 +185,7 @@ def _rows(image: ColourImage, pixel: int) -> U1:
 
 
 def _from_yuv(rows: U1, luma: int) -> U1:
-    """Convert YUV 4:2:2 by the matrix of JFIF (ITU-R BT.601, full range)."""
+    """Convert YUV 4:2:2 to RGB with the JFIF matrix (ITU-R BT.601, full range)."""
     height, width, _ = rows.shape
     y = rows[..., luma].astype(np.float32)
     chroma = rows[..., 1 - luma].astype(np.float32) - 128
@@ -198,7 +198,7 @@ def _from_yuv(rows: U1, luma: int) -> U1:
 
 
 def _from_bayer(mosaic: U1, red: int) -> U1:
-    """Give the pixels of each block of two by two the colour of the block."""
+    """Demosaic a Bayer image: all pixels of a 2 x 2 block get the same colour."""
     height, width = (size // 2 * 2 for size in mosaic.shape)
     corner = [mosaic[k // 2 : height : 2, k % 2 : width : 2] for k in range(4)]
     green = [k for k in range(4) if k not in {red, 3 - red}]
@@ -214,11 +214,11 @@ def cloud_colours(message: Any) -> U1 | None:
 
     Returns
     -------
-    (h, w, 3) red, green, blue; None where there is no such field.
+    (h, w, 3) uint8 red, green, blue; None if the cloud has no such field.
 
     Raises
     ------
-    MessageError : the field does not fit into the points, or there is less data than they need.
+    MessageError : the cloud is empty, the field does not fit into a point, or data is missing.
     """
     field = next((f for f in message.fields if f.name in {"rgb", "rgba"}), None)
     if field is None:

@@ -1,4 +1,4 @@
-"""Which colour images belong to a depth stream."""
+"""Find the colour streams of a recording, and the one that belongs to a depth stream."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,6 +16,8 @@ from shapecat.recordings.streams import (
     IMAGE,
     INFO,
     Stream,
+    by_sensor,
+    cloud_streams,
     first_message,
     info_topic_of,
 )
@@ -24,16 +26,15 @@ __all__ = ["ColourStream", "choose_colour", "colour_streams", "pair_colours"]
 
 _COLOUR_WORDS = ("color", "colour", "rgb")
 _OTHER_WORDS = ("infra", "/ir/", "depth/image", "confidence", "thermal", "mask")
-"""Grey images of these are none of a colour camera."""
+"""Grey images on topics with these words are not from a colour camera."""
 
 
 @dataclass(frozen=True)
 class ColourStream:
-    """A topic of colour images.
+    """A topic of colour images, or of clouds with a packed ``rgb`` field.
 
-    ``kind`` tells raw images from compressed ones and from clouds with a packed ``rgb`` field;
-    ``info_topic`` is the calibration, None if there is none; ``frame_id`` and ``encoding`` are
-    those of the first message; ``grey`` images are taken only where they are asked for.
+    ``info_topic`` is the topic of the calibration, None if there is none; ``count`` is the number
+    of messages, None if unknown; ``frame_id`` and ``encoding`` are from the first message.
     """
 
     topic: str
@@ -46,12 +47,12 @@ class ColourStream:
 
     @property
     def grey(self) -> bool:
-        """Whether it has no colour."""
+        """Whether the images are grey: they are used only on request."""
         return self.encoding == "mono8"
 
 
 def colour_streams(recording: Recording) -> tuple[ColourStream, ...]:
-    """Find the colour images of a recording, by topic, and the clouds with colours."""
+    """Find the colour images and coloured clouds of a recording, sorted by topic."""
     infos = [
         topic.name
         for topic in recording.topics
@@ -68,11 +69,19 @@ def colour_streams(recording: Recording) -> tuple[ColourStream, ...]:
 def pair_colours(
     recording: Recording, streams: Sequence[Stream], wanted: str | None
 ) -> dict[str, ColourStream]:
-    """Return the colour stream of each depth topic that has one; with ``""`` there is none.
+    """Choose the colour streams of depth streams.
+
+    Parameters
+    ----------
+    wanted : the topic for all depth streams; None to choose one for each, empty for none.
+
+    Returns
+    -------
+    The colour stream of each depth topic that has one.
 
     Raises
     ------
-    NoStreamError : the wanted topic holds no colour images.
+    NoStreamError : the wanted topic does not exist or holds no colour images.
     """
     if wanted == "":
         return {}
@@ -83,17 +92,27 @@ def pair_colours(
 def choose_colour(
     recording: Recording, stream: Stream, wanted: str | None = None
 ) -> ColourStream | None:
-    """Choose the colour images of a depth stream: the wanted ones, or those that belong to it.
+    """Choose the colour stream of a depth stream.
 
-    Images belong to a stream that have its frame, or share the beginning of its name
-    (``/camera/color/image_raw`` and ``/camera/depth/image_raw`` do). Of several the first is taken
-    of: the cloud's own colours; images in its frame; those that share most of the name; those
-    named after colour; more messages before fewer; compressed before raw; then by name. The only
-    colour images of a recording belong to its only camera, whatever their names.
+    A cloud with colours is its own colour stream. Colour images belong to a depth stream if they
+    have the same frame or if the topic names begin with the same namespace
+    (``/camera/color/image_raw`` and ``/camera/depth/image_raw``). Among several, the preference is,
+    in this order: the same frame, the longest common namespace, a topic named after colour, more
+    messages, compressed images, the alphabetical order of topics. If a recording has one depth
+    sensor and one stream of colour images, they belong together whatever their names.
+
+    Parameters
+    ----------
+    wanted : the topic to return instead; it may hold grey images or a cloud.
+
+    Returns
+    -------
+    None if no colour stream belongs to the depth stream. ``info_topic`` is None where the only
+    calibration nearby is the depth stream's.
 
     Raises
     ------
-    NoStreamError : the wanted topic holds no colour images.
+    NoStreamError : the wanted topic does not exist or holds no colour images.
     """
     streams = colour_streams(recording)
     if wanted is not None:
@@ -102,7 +121,9 @@ def choose_colour(
         own = [one for one in streams if one.kind == "cloud" and one.topic == stream.topic]
         images = [one for one in streams if one.kind != "cloud" and not one.grey]
         near = [one for one in images if one.frame_id == stream.frame_id or _shared(one, stream)]
-        found = own or near or images[: len(images) == 1]
+        found = own or near
+        if not found and len(images) == 1 and len(by_sensor(cloud_streams(recording))) == 1:
+            found = images
         chosen = min(found, key=lambda one: _rank(one, stream), default=None)
     if chosen is not None and chosen.info_topic == stream.info_topic:
         return replace(chosen, info_topic=None)  # the calibration of the other camera
@@ -132,7 +153,7 @@ def _rank(one: ColourStream, stream: Stream) -> tuple[bool, int, bool, int, bool
 
 
 def _shared(one: ColourStream, stream: Stream) -> int:
-    """Return how many parts two names have in common at their beginning."""
+    """Return the number of leading namespace components that two topics share."""
     a, b = (PurePosixPath(name.strip("/")).parts[:-1] for name in (one.topic, stream.topic))
     same = [x == y for x, y in zip(a, b, strict=False)]
     return same.index(False) if False in same else len(same)

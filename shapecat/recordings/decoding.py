@@ -1,4 +1,4 @@
-"""From bytes to objects, by the definitions a recording holds."""
+"""Decode messages with the definitions stored in their recording."""
 
 import json
 import struct
@@ -39,7 +39,7 @@ LIBRARY_ERRORS = (
     ValueError,
     struct.error,
 )
-"""What the type system raises on hostile definitions and data."""
+"""Errors that decoding may raise on malformed definitions or data."""
 
 _MAX_DEFINITION = 1 << 20
 _MAX_UNROLLED = 4096
@@ -47,11 +47,11 @@ _SEPARATOR = "=" * 80 + "\n"
 
 
 def decode(message: Message, known: dict[tuple[str, str, bytes], Decoder]) -> Any:
-    """Decode a message; decoders are made once per definition and kept in ``known``.
+    """Decode a message; ``known`` caches one decoder per definition.
 
     Raises
     ------
-    MessageError : with topic, type and reason.
+    MessageError : the message cannot be decoded; the text gives topic, type and reason.
     """
     channel = message.channel
     key = (channel.type, channel.encoding, channel.schema)
@@ -68,9 +68,10 @@ def decode(message: Message, known: dict[tuple[str, str, bytes], Decoder]) -> An
 
 
 def typestore_of(channel: Channel) -> Typestore:
-    """Build a store of the types that a channel's definition names.
+    """Return a type store with the message types of a channel's definition.
 
-    Without a definition, that of the ROS distribution most recordings come from.
+    Without a definition it holds the types of ROS 1 Noetic or ROS 2 Humble. Raises one of
+    `LIBRARY_ERRORS` for a malformed definition.
     """
     if not channel.schema:
         return _builtin(channel.encoding)
@@ -80,7 +81,7 @@ def typestore_of(channel: Channel) -> Typestore:
     return _defined(channel.type, channel.schema_encoding, channel.schema)
 
 
-@lru_cache(maxsize=32)  # recordings of one robot hold the same definitions
+@lru_cache(maxsize=32)  # recordings of one robot share their definitions
 def _defined(kind: str, encoding: str, schema: bytes) -> Typestore:
     text = schema.decode("utf-8")
     types: dict[str, Any] = {}
@@ -90,7 +91,7 @@ def _defined(kind: str, encoding: str, schema: bytes) -> Typestore:
     else:
         types.update(get_types_from_msg(text.replace("\r\n", "\n"), kind))
     _refuse_unrolling(types)
-    # A store for every definition: two topics may disagree on a type.
+    # One store per definition, since two topics may define the same type differently.
     store = get_typestore(Stores.EMPTY)
     store.register({name: fields for name, fields in types.items() if name not in store.fielddefs})
     return store
@@ -105,7 +106,7 @@ def _idl_parts(text: str) -> Iterator[str]:
 
 
 def _refuse_unrolling(types: dict[str, Any]) -> None:
-    """Refuse fixed arrays of strings or messages for which the library would write code forever."""
+    """Reject long fixed-size arrays of strings or messages: rosbags unrolls them into code."""
     for name, (_, fields) in types.items():
         for field, description in fields:
             if description[0] != Nodetype.ARRAY:
@@ -151,7 +152,11 @@ _DECODERS: dict[str, Callable[[Channel], Decoder]] = {
 
 
 def schema_of(channel: Channel) -> tuple[str, str, bytes]:
-    """Return name, encoding and text of a channel's schema, of the store for built-in types."""
+    """Return name, encoding and text of a channel's schema.
+
+    A CDR channel without one gets the definition from ROS 2 Humble; encoding and text are empty
+    if its type is unknown there.
+    """
     if channel.schema or channel.encoding != "cdr":
         return channel.schema_name, channel.schema_encoding, channel.schema
     store = _builtin("cdr")

@@ -1,4 +1,4 @@
-"""Depth images become metres along the optical axis."""
+"""Convert depth images to metres along the optical axis."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from shapecat.recordings.messages import MessageError
 __all__ = ["DEPTH_ENCODINGS", "clean_depth", "depth_of_image"]
 
 DEPTH_ENCODINGS = {"16UC1": ("u2", 1000), "mono16": ("u2", 1000), "32FC1": ("f4", 1)}
-"""Type of a pixel and units in a metre (REP 118)."""
+"""Pixel type and units per metre (REP 118)."""
 
 
 def depth_of_image(message: Any, units: float | None = None) -> F4:
@@ -18,7 +18,7 @@ def depth_of_image(message: Any, units: float | None = None) -> F4:
 
     Parameters
     ----------
-    units : integer units in a metre where they are not millimetres.
+    units : units per metre of integer pixels; millimetres by default.
 
     Returns
     -------
@@ -26,7 +26,7 @@ def depth_of_image(message: Any, units: float | None = None) -> F4:
 
     Raises
     ------
-    MessageError : another encoding, or less data than the sizes claim.
+    MessageError : the encoding is not depth, the image is empty, or data is missing.
     """
     height, width = int(message.height), int(message.width)
     if message.encoding not in DEPTH_ENCODINGS:
@@ -45,9 +45,9 @@ def depth_of_image(message: Any, units: float | None = None) -> F4:
 
 
 def clean_depth(values: F4, units: float = 1) -> F4:
-    """Convert (h, w) to metres and set to 0 what is negative, infinite or not a number.
+    """Convert depth values (h, w) to metres; negative, infinite and NaN values become 0.
 
-    ``units`` make a metre, where ``values`` are whole numbers.
+    ``units`` is the number of units per metre; floating-point values are already metres.
     """
     if values.dtype.kind == "u":
         # Dividing rounds to the nearest float; multiplying by 0.001 does not.

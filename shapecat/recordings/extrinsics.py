@@ -1,4 +1,4 @@
-"""Where a depth sensor is in the frame of the colour camera."""
+"""The pose of the depth sensor in the frame of the colour camera."""
 
 from contextlib import suppress
 from typing import Any
@@ -24,14 +24,14 @@ _MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueErro
 
 
 class Extrinsics:
-    """The transform between a depth sensor and a colour camera, from transforms or drivers.
+    """The transform from a depth sensor to a colour camera.
 
-    Static transforms are asked first, then all, then librealsense's own messages: the topic
-    ``extrinsics/depth_to_color`` of its ROS driver, the topics ``tf/N`` of its recorder.
+    Sources are, in this order: static transforms, all transforms, and librealsense's own messages
+    (``extrinsics/depth_to_color`` of its ROS driver, ``tf/N`` of its recorder).
     """
 
     def __init__(self, recording: Recording, depth: Stream, colour: ColourStream) -> None:
-        """Begin without having read anything."""
+        """Store the streams; transforms are read on first use."""
         self._recording = recording
         self._depth, self._colour = depth, colour
         self._buffers: list[TransformBuffer | None] = [None, None]
@@ -40,9 +40,9 @@ class Extrinsics:
         self._static: dict[tuple[str, str], Pose] = {}
 
     def colour_from_depth(self, depth_frame: str, colour_frame: str, stamp_ns: int) -> Pose | None:
-        """Return the pose at a time; None if the recording has none.
+        """Return ``colour_from_depth`` at a time, or None if the recording does not hold it.
 
-        ``depth_frame`` and ``colour_frame`` are the frames of the messages.
+        ``depth_frame`` and ``colour_frame`` are the frame ids of the messages.
         """
         recorder = self._depth.topic.startswith("/device_")  # whose frame ids are numbers
         if depth_frame == colour_frame and not recorder:
@@ -63,7 +63,7 @@ class Extrinsics:
     def _lookup(
         self, number: int, depth_frame: str, colour_frame: str, stamp_ns: int
     ) -> Pose | None:
-        """Look a transform up among the static ones (0) or all (1)."""
+        """Look up a transform among the static ones (`number` 0) or all (1); None if missing."""
         buffer = self._buffers[number]
         if buffer is None:
             buffer = read_transforms(self._recording, static_only=number == 0)
@@ -90,7 +90,7 @@ class Extrinsics:
         return compose(colour, inverse(depth))
 
     def _recorder_pose(self, image: str) -> Pose | None:
-        """Return ``stream_from_reference`` of a stream of librealsense's recorder."""
+        """Return ``stream_from_reference`` as librealsense's recorder wrote it; None if absent."""
         prefix = f"{image.rpartition('/image')[0]}/tf/"
         for topic in self._recording.topics:
             if topic.name.startswith(prefix) and len(prefix) > 4:

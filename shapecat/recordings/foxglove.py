@@ -1,4 +1,4 @@
-"""Foxglove's messages in the shape of the ROS messages they correspond to."""
+"""Convert Foxglove messages to the corresponding ROS messages."""
 
 import base64
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ FOXGLOVE_TYPES = {
     "foxglove.FrameTransform": "tf2_msgs/msg/TFMessage",
     "foxglove.FrameTransforms": "tf2_msgs/msg/TFMessage",
 }
-"""The ROS type that each corresponds to."""
+"""The ROS type that corresponds to each Foxglove type."""
 
 _POINT_FIELDS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
 """PointField datatype of each PackedElementField type."""
@@ -29,19 +29,19 @@ _POINT_FIELDS = {1: 2, 2: 1, 3: 4, 4: 3, 5: 6, 6: 5, 7: 7, 8: 8}
 def as_ros(kind: str, message: Any) -> Any:
     """Convert a decoded Foxglove message to the fields of its ROS counterpart.
 
-    Messages of other types are returned as they are. Bytes may be base64 text, as in JSON.
+    Messages of other types are returned unchanged. Byte fields may be base64 text, as in JSON.
     """
     convert = _CONVERSIONS.get(_plain(kind))
     return message if convert is None else convert(message)
 
 
 def ros_counterpart(kind: str) -> str:
-    """Return the ROS type that a type corresponds to: itself if it is not Foxglove's."""
+    """Return the ROS type that corresponds to a Foxglove type; any other type unchanged."""
     return FOXGLOVE_TYPES.get(_plain(kind), kind)
 
 
 def _plain(kind: str) -> str:
-    """Return the name in JSON and protobuf of a type that may come from its ROS package."""
+    """Return a Foxglove type's name as in JSON and protobuf, also given its ROS name."""
     return kind.replace("foxglove_msgs/msg/", "foxglove.")
 
 
@@ -50,7 +50,7 @@ def _header(message: Any) -> Any:
 
 
 def _stamp(time: Any) -> Any:
-    """Read a time: of JSON, of ROS, or of protobuf, where it may be absent."""
+    """Read a time from JSON, ROS or protobuf; an absent one is 0."""
     seconds, rest = 0, 0
     for names in (("sec", "nsec"), ("sec", "nanosec"), ("seconds", "nanos")):
         seconds = int(getattr(time, names[0], seconds))
@@ -59,7 +59,7 @@ def _stamp(time: Any) -> Any:
 
 
 def _vector(value: Any, names: str, default: Sequence[float]) -> Any:
-    """Read coordinates, those of a message that is absent by default."""
+    """Read the coordinates `names` of a message; `default` if the message is absent."""
     values = default if value is None else [float(getattr(value, name)) for name in names]
     return SimpleNamespace(**dict(zip(names, values, strict=True)))
 
@@ -92,7 +92,7 @@ def _cloud(message: Any) -> Any:
 
 
 def _pose(pose: Any) -> Pose | None:
-    """Return a cloud's own pose, None where it is the identity."""
+    """Return a cloud's own pose; None if it has none, or the identity."""
     if pose is None:
         return None
     p = _vector(pose.position, "xyz", (0, 0, 0))

@@ -23,23 +23,23 @@ def frames(
     heard: Mapping[str, Callable[[Message], None]] | None = None,
     needed: Needed = None,
 ) -> Iterator[Frame]:
-    """Read the frames of some streams in flat memory.
+    """Read the frames of depth streams in constant memory.
 
-    An organized cloud that a pinhole camera explains becomes the depth image it was made from, so
-    that both forms of one reading give the same frame.
+    An organized cloud that fits a pinhole camera becomes the depth image it was made from, so that
+    both forms of the same data give the same frame.
 
     Parameters
     ----------
-    start_s, end_s : seconds of log time from the start of the recording.
-    every : keep each so-many-th frame of a stream.
-    skipped : frames that cannot be read are counted here by reason; they never raise.
-    heard : is told of the messages of other topics as they pass, so that they are read only once.
-    needed : tells by topic and log time which frames, and messages of ``heard``, are; an indexed
-        file may leave out others.
+    start_s, end_s : log time from the start of the recording, seconds; None for no limit.
+    every : keep every n-th message of a stream.
+    skipped : receives the number of unreadable frames by reason; they raise no error.
+    heard : callbacks for the messages of other topics, so that the file is read only once.
+    needed : returns for a topic and a log time (ns) whether the frame, or the message for
+        ``heard``, is needed; an indexed file may leave out the rest.
 
     Yields
     ------
-    Frames by log time. ``index`` counts the messages of the stream from ``start_s`` on.
+    Frames by log time. ``index`` counts the stream's messages from 0 at ``start_s``.
 
     Raises
     ------
@@ -75,5 +75,5 @@ def frames(
                 yield from chosen.read(message, skipped)
     for source in sources.values():
         yield from source.finish(skipped)
-        if needed is None:  # else it has not seen all
+        if needed is None:  # otherwise it has not seen every stamp
             source.clock.report(recording)

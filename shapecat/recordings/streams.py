@@ -1,4 +1,4 @@
-"""Which topics of a recording can be processed, and which are chosen by default."""
+"""Find the depth streams of a recording, and choose which to process."""
 
 from collections.abc import Sequence
 from contextlib import suppress
@@ -19,6 +19,7 @@ __all__ = [
     "IMAGE",
     "INFO",
     "Stream",
+    "by_sensor",
     "choose_streams",
     "cloud_streams",
     "first_message",
@@ -31,15 +32,16 @@ COMPRESSED = "sensor_msgs/msg/CompressedImage"
 INFO = "sensor_msgs/msg/CameraInfo"
 
 _PEEK = 5
-"""Messages looked at to tell what a topic holds: the first may be damaged."""
+"""Messages tried to find out what a topic holds: the first may be damaged."""
 
 
 @dataclass(frozen=True)
 class Stream:
-    """A topic with depth images or clouds.
+    """A topic of depth images or clouds.
 
-    ``info_topic`` is the camera calibration of a depth image, None if there is none;
-    ``frame_id`` and ``encoding`` (of images) are those of the first message.
+    ``info_topic`` is the topic of a depth image's calibration, None if there is none; ``count`` is
+    the number of messages, None if unknown; ``frame_id`` and ``encoding`` (empty for clouds) are
+    from the first message.
     """
 
     topic: str
@@ -52,16 +54,16 @@ class Stream:
 
     @property
     def usable(self) -> bool:
-        """Whether frames can be made of it."""
+        """Whether the stream gives frames: depth images need a calibration."""
         return self.kind == "points" or self.info_topic is not None
 
 
 def cloud_streams(recording: Recording) -> tuple[Stream, ...]:
-    """Find the clouds and depth images of a recording, by topic.
+    """Find the clouds and depth images of a recording, sorted by topic.
 
-    A depth image is told from a colour image by the encoding of its first message, and paired
-    with the calibration in its own namespace (``depth/image_raw`` with ``depth/camera_info``), or
-    with the only one there is.
+    The encoding of the first message distinguishes depth images from colour images. A depth image
+    is paired with the calibration in its own namespace (``depth/image_raw`` with
+    ``depth/camera_info``), or with the only calibration in the recording.
     """
     infos = [
         topic.name
@@ -79,17 +81,21 @@ def cloud_streams(recording: Recording) -> tuple[Stream, ...]:
 
 
 def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[Stream, ...]:
-    """Choose the streams to process: the wanted ones, or those of the only sensor.
+    """Choose the streams to process: the wanted ones, or the best one of the only sensor.
 
-    Streams belong to one sensor if they share a namespace (``/camera/depth/points`` and
-    ``/camera/aligned_depth_to_color/image_raw`` do) or a frame. Of one sensor's streams the first
-    is taken of: depth images before clouds, since they hold the same readings in an eighth of the
-    bytes; images as the sensor sees them before those aligned to another camera; more messages
-    before fewer; then by name.
+    Streams belong to the same sensor if they share a frame or the sensor's namespace
+    (``/camera/depth/points`` and ``/camera/aligned_depth_to_color/image_raw``). Within a sensor
+    the preference is, in this order: depth images, since a cloud holds the same data in eight
+    times the bytes; images not aligned to another camera; more messages; the alphabetical order.
+
+    Parameters
+    ----------
+    wanted : topics, with or without a leading slash.
 
     Raises
     ------
-    NoStreamError : there is none, a wanted one does not exist, or there are several sensors.
+    NoStreamError : no stream can be processed, a wanted one is missing or lacks a calibration, or
+        nothing is wanted and there are several sensors.
     """
     streams = cloud_streams(recording)
     if wanted:
@@ -97,7 +103,7 @@ def choose_streams(recording: Recording, wanted: Sequence[str] = ()) -> tuple[St
     usable = [stream for stream in streams if stream.usable]
     if not usable:
         raise NoStreamError(_why_none(recording, streams))
-    sensors = _by_sensor(usable)
+    sensors = by_sensor(usable)
     if len(sensors) > 1:
         names = ", ".join(f"{s.topic} ({s.kind})" for s in usable)
         msg = f"{recording.path}: several sensors: {names}; choose with --topic"
@@ -137,7 +143,8 @@ def _why_none(recording: Recording, streams: tuple[Stream, ...]) -> str:
     )
 
 
-def _by_sensor(streams: list[Stream]) -> list[list[Stream]]:
+def by_sensor(streams: Sequence[Stream]) -> list[list[Stream]]:
+    """Group streams by sensor, see `choose_streams`."""
     groups: list[list[Stream]] = []
     for stream in streams:
         same = [group for group in groups if any(_same_sensor(stream, other) for other in group)]
@@ -154,7 +161,7 @@ def _same_sensor(a: Stream, b: Stream) -> bool:
 
 
 def _sensor_namespace(topic: str) -> tuple[str, ...]:
-    """Return the namespace of the sensor in a topic name."""
+    """Return the part of a topic's namespace that names the sensor."""
     parts = PurePosixPath(topic.strip("/")).parts[:-1]
     for k, part in enumerate(parts):
         if any(word in part for word in ("depth", "points", "cloud", "image", "aligned")):
@@ -168,7 +175,7 @@ def _rank(stream: Stream) -> tuple[int, int, int, str]:
 
 
 def first_message(recording: Recording, topic: Topic) -> Any:
-    """Decode the first message of a topic that can be decoded; None if none can."""
+    """Return the first of a topic's first few messages that can be decoded; None if none can."""
     same = (m for m in recording.messages([topic.name]) if m.type == topic.type)
     for message in islice(same, _PEEK):
         try:
@@ -207,7 +214,10 @@ def _depth_stream(topic: Topic, first: Any, infos: list[str], encoding: str) -> 
 
 
 def info_topic_of(image: str, infos: list[str]) -> str | None:
-    """Return the calibration nearest to an image: the one that shares most of its path."""
+    """Return the calibration topic that shares the longest namespace with an image topic.
+
+    Without a common namespace it is the only calibration topic, or None if there are several.
+    """
     parts = image.split("/")[:-1]
     for length in range(len(parts), 1, -1):
         for name in _INFO_NAMES:
@@ -218,6 +228,6 @@ def info_topic_of(image: str, infos: list[str]) -> str | None:
 
 
 _INFO_NAMES = ("camera_info", "info/camera_info", "calibration")
-"""What calibrations are called: by ROS, by the RealSense viewer, by Foxglove."""
+"""Names of calibration topics in ROS, in the RealSense viewer and in Foxglove."""
 
 _PROBES = {CLOUD: _probe_cloud, IMAGE: _probe_image, COMPRESSED: _probe_compressed}
