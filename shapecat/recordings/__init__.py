@@ -1,4 +1,4 @@
-"""Robot recordings become frames: containers, clouds, depth images, transforms."""
+"""Read frames from robot recordings: containers, clouds, depth images, transforms."""
 
 from shapecat.recordings.frames import frames
 from shapecat.recordings.messages import Channel, Message, MessageError, Topic

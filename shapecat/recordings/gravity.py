@@ -29,10 +29,15 @@ _DISAGREE_DEG = 10
 
 @dataclass
 class Upright:
-    """Gives up and the pose of the sensor in the fixed frame, frame by frame.
+    """The up direction, and the pose of the sensor in the fixed frame, for each frame.
 
-    Counts the look-ups that failed, for the report. ``dropped`` are the topics whose given up is
-    not used, and where it came from.
+    Attributes
+    ----------
+    fixed_frame : None until it is chosen at the first frame.
+    vector : (3,) the up direction in the sensor frame that the user gave, or None.
+    sources : ``tf`` and ``imu``, in the order in which they are tried; empty with a vector.
+    warnings : for the user.
+    dropped : topics whose given up direction is ignored, and the source of that direction.
     """
 
     transforms: TransformBuffer
@@ -52,13 +57,13 @@ class Upright:
 
         Parameters
         ----------
-        up : ``tf``, ``imu``, ``auto`` for the first of these that there is, or a vector ``X,Y,Z``
-            in the sensor frame.
-        fixed_frame : name of the frame in which things stand still; None to choose one.
+        up : ``tf``, ``imu``, ``auto`` for the first of these that is available, or a vector
+            ``X,Y,Z`` in the sensor frame.
+        fixed_frame : name of the frame in which the scene is at rest; None to choose one.
 
         Raises
         ------
-        ConfigError : ``up`` is none of these, or the recording does not hold what it names.
+        ConfigError : ``up`` is malformed, or the recording lacks the wanted source or frame.
         """
         sources = _SOURCES.get(up, ())
         vector = None if sources else _parse_vector(up)
@@ -79,7 +84,7 @@ class Upright:
         return cls(transforms, fixed_frame, vector, sources, found)
 
     def fixed_from_sensor(self, frame: Frame) -> Pose | None:
-        """Return the pose of the sensor in the fixed frame, or None if it is not known."""
+        """Return the pose of the sensor in the fixed frame, or None if it is unknown."""
         if self.fixed_frame is None:
             self.fixed_frame = fixed_frame(self.transforms, frame.frame_id)
         if self.fixed_frame is None:
@@ -87,14 +92,14 @@ class Upright:
         return self._lookup(self.fixed_frame, frame)
 
     def up(self, frame: Frame) -> F4 | None:
-        """Return the unit vector (3,) that points up in the sensor frame, or None to estimate."""
+        """Return the up direction in the sensor frame, a unit vector (3,); None if unknown."""
         source, vector = ("", None) if frame.topic in self.dropped else self._find(frame)
         source = "planes" if vector is None else source
         self._given[source] = self._given.get(source, 0) + 1
         return vector
 
     def preview(self, frame: Frame) -> tuple[str, F4 | None]:
-        """Return the source and direction (3,) of up, without counting the look-up."""
+        """Return the source of the up direction, and the direction (3,), without counting it."""
         counted = self._failed, self._first_failure
         answer = self._find(frame)
         self._failed, self._first_failure = counted
@@ -111,11 +116,12 @@ class Upright:
         return source, vector
 
     def contradict(self, topic: str, source: str, angles_deg: Sequence[float]) -> None:
-        """Drop the up of a topic that no plane confirms, unless the user asked for it; warn.
+        """Warn that no plane confirms a topic's up direction; ignore it unless the user chose it.
 
         Parameters
         ----------
-        angles_deg : how far the up of the planes is off in the frames looked at.
+        source : as from `preview`.
+        angles_deg : angles between the up direction and that of the planes, one per frame.
         """
         off = f"differs by {np.median(angles_deg):.0f} degrees from the planes of {topic}"
         if not self.sources:
@@ -156,13 +162,13 @@ class Upright:
             return None
 
     def report(self, perceived: Iterable[tuple[pa.Table, pa.Table]]) -> dict[str, Any]:
-        """Return the source of up, and its agreement with the planes, for run.json.
+        """Return the source of the up direction and its agreement with the planes, for run.json.
 
-        Adds to ``warnings`` what a person should know.
+        Failed look-ups and large differences are added to ``warnings``.
 
         Parameters
         ----------
-        perceived : the run's tables of frames and planes, row group by row group.
+        perceived : the run's tables of frames and planes, one pair per row group.
         """
         if self._failed:
             self.warnings.append(
@@ -191,9 +197,12 @@ class Upright:
 def _angles_to_planes(
     perceived: Iterable[tuple[pa.Table, pa.Table]],
 ) -> tuple[list[float], int]:
-    """Return the angle, in degrees, from the given up to that of the planes for each frame.
+    """Compare the given up directions with the planes.
 
-    Also the number of frames with a given up and without a plane.
+    Returns
+    -------
+    The angle between the two in each frame, degrees; and the number of frames that have a given up
+    direction but no plane.
     """
     angles, bare = [], 0
     for frames, planes in perceived:

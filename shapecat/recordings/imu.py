@@ -1,4 +1,4 @@
-"""Accelerometers: at rest they feel the floor push up."""
+"""Accelerometers: at rest they measure the reaction to gravity, which points up."""
 
 from dataclasses import dataclass, field
 
@@ -14,26 +14,26 @@ __all__ = ["Accelerometer", "read_accelerometers"]
 IMU = "sensor_msgs/msg/Imu"
 _BIN_NS = 50_000_000
 _WINDOW = 10
-"""Bins to each side over which accelerations are averaged: half a second smooths out motions."""
+"""Bins averaged on each side: half a second, which smooths out motions."""
 
 
 @dataclass
 class Accelerometer:
-    """Accelerations of one topic, summed over twentieths of a second: memory grows slowly."""
+    """Accelerations of one topic, summed in bins of 50 ms to save memory."""
 
     topic: str
     frame_id: str
     _sums: dict[int, F8] = field(default_factory=dict)
 
     def add(self, stamp: int, acceleration: F8) -> None:
-        """Add a measurement (3,), in any unit."""
+        """Add a measurement (3,), in any unit, with its stamp in nanoseconds."""
         at = stamp // _BIN_NS
         self._sums[at] = self._sums.get(at, 0) + acceleration
 
     def up(self, stamp: int) -> F8 | None:
-        """Return the unit vector (3,) that points up in the sensor's frame around a time.
+        """Return the up direction in the IMU's frame around a time (ns), a unit vector (3,).
 
-        The mean over half a second before and after; None where nothing was measured.
+        It averages half a second before and after; None if nothing was measured then.
         """
         at = stamp // _BIN_NS
         near = [self._sums[k] for k in range(at - _WINDOW, at + _WINDOW + 1) if k in self._sums]
@@ -43,10 +43,10 @@ class Accelerometer:
 
 
 def read_accelerometers(recording: Recording) -> tuple[Accelerometer, ...]:
-    """Read the accelerations of a recording in one pass, by topic.
+    """Read the accelerations of all IMU topics in one pass, sorted by topic.
 
-    Messages without an acceleration (sensor_msgs/Imu: the first covariance is -1; or all zero, as
-    of a gyroscope alone) are left out.
+    Messages without an acceleration are left out: their first covariance is -1 (sensor_msgs/Imu),
+    or all values are zero, as from a gyroscope alone.
     """
     topics = {topic.name for topic in recording.topics if topic.type == IMU and topic.count != 0}
     found: dict[str, Accelerometer] = {}

@@ -1,4 +1,4 @@
-"""Depth images of a lens with distortion."""
+"""Depth images from a lens with distortion."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ __all__ = ["Lens"]
 
 
 class Lens:
-    """The lens of images that were not rectified; computed anew when the calibration changes."""
+    """The lens of unrectified depth images; recomputed when the calibration changes."""
 
     def __init__(self, recording: Recording, topic: str) -> None:
         """Begin without a calibration."""
@@ -26,7 +26,13 @@ class Lens:
         self._fit: PinholeFit | None = None
 
     def content(self, info: Any, camera: Camera, depth: F4) -> dict[str, Any]:
-        """Return depth with the nearest pinhole camera, or points if none fits."""
+        """Return the content of a `Frame`: depth and pinhole camera, or points if no camera fits.
+
+        Parameters
+        ----------
+        info : a decoded CameraInfo, with its ``camera`` as `camera_of_info` returns it.
+        depth : (h, w) metres.
+        """
         model = str(info.distortion_model)
         coefficients = tuple(float(c) for c in (info.d if hasattr(info, "d") else info.D))
         self._calibrate((camera, model, coefficients), depth)

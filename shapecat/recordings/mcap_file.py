@@ -1,7 +1,7 @@
-"""MCAP files: indexed ones by time, all others in the order of the file.
+"""Read MCAP files: by time if they are indexed, otherwise in file order.
 
-Damage never ends the reading: an unfinished file gives its whole chunks, a broken chunk is left
-out, and both are said in the warnings.
+Damage does not stop reading: a truncated file is read as far as possible, a damaged chunk is
+skipped, and a warning reports either.
 """
 
 from collections import Counter
@@ -43,7 +43,7 @@ __all__ = ["McapRecording"]
 _SMALL = 1 << 16
 """Messages up to this size are copied, so that they do not keep their chunk in memory."""
 _PART = 0.9
-"""A chunk that is needed to here is decompressed to its end, and its checksum compared."""
+"""If more than this share of a chunk is needed, all is decompressed and the checksum verified."""
 
 
 class McapRecording(Recording):
@@ -51,8 +51,8 @@ class McapRecording(Recording):
 
     Attributes
     ----------
-    indexed : whether it is finished and its index covers it.
-    summary : its schemas, channels and indexes.
+    indexed : whether the file is finished and its index is complete.
+    summary : schemas, channels and indexes.
     profile : ``ros2``, ``ros1`` or empty.
     """
 
@@ -63,8 +63,8 @@ class McapRecording(Recording):
 
         Raises
         ------
-        RecordingError : it is not an MCAP file.
-        OSError : it cannot be read.
+        RecordingError : the file is not MCAP.
+        OSError : the file cannot be read.
         """
         super().__init__(path)
         self._file = path.open("rb")
@@ -75,7 +75,7 @@ class McapRecording(Recording):
             self.indexed = found is not None
             self.summary = found or Summary()
             self._counts: Counter[int] | None = None
-            self._checked: set[int] = set()  # where chunks are whose checksum fits
+            self._checked: set[int] = set()  # offsets of chunks with a verified checksum
             self._times: list[int] = []
             if found is None:
                 self._scan()
@@ -110,7 +110,7 @@ class McapRecording(Recording):
             yield Message(channel, message.log_time, message.publish_time, message.sequence, data)
 
     def top_level(self) -> Iterator[Record]:
-        """Yield the whole records of the data section, without their content."""
+        """Yield the complete records of the data section, without their content."""
         try:
             for record in walk(self._file, len(MAGIC), self._size):
                 if record.opcode in {Opcode.DATA_END, Opcode.FOOTER}:
@@ -120,7 +120,7 @@ class McapRecording(Recording):
             return
 
     def content(self, record: Record) -> bytes:
-        """Read the content of a record of `top_level`."""
+        """Read the content of a record from `top_level`."""
         return read_content(self._file, record)
 
     def _read_profile(self) -> str:
@@ -144,7 +144,7 @@ class McapRecording(Recording):
             self._times += [chunk.message_start_time, chunk.message_end_time]
 
     def _scan(self) -> None:
-        """Read all of the file for its channels, counts and times."""
+        """Read the whole file to find its channels, counts and times."""
         self._counts = Counter()
         end, finished = len(MAGIC), False
         low = high = None
@@ -176,7 +176,7 @@ class McapRecording(Recording):
             yield from (m for m in self._expand(record) if m.channel_id in wanted)
 
     def _records(self) -> Iterator[Record]:
-        """Yield the records of the file, and the part of the last chunk that is there."""
+        """Yield the records of the file; a truncated last chunk is shortened to what is left."""
         try:
             yield from walk(self._file, len(MAGIC), self._size)
         except TruncatedError as error:
@@ -184,7 +184,7 @@ class McapRecording(Recording):
                 yield error.record
 
     def _expand(self, record: Record) -> Iterator[RawMessage]:
-        """Yield the messages of a top-level record; note its schemas and channels."""
+        """Yield the messages of a top-level record; store its schemas and channels."""
         if record.opcode == Opcode.CHUNK:
             yield from self._chunk(record)
         elif record.opcode in _DEFINING or record.opcode not in _KNOWN:
@@ -194,7 +194,7 @@ class McapRecording(Recording):
                 self.warn(f"left out a record at byte {record.offset}: {error}")
 
     def _chunk(self, record: Record, end: int | None = None) -> Iterator[RawMessage]:
-        """Yield the messages of a chunk, up to the cut if it is truncated, or up to ``end``."""
+        """Yield the messages of a chunk up to its end, its truncation, or the byte ``end``."""
         try:
             for opcode, content in split_chunk(self._plain(record, end)):
                 yield from self._take(opcode, content)
@@ -203,7 +203,7 @@ class McapRecording(Recording):
             self.warn(f"left out {part}the chunk at byte {record.offset - 9}: {error}")
 
     def _plain(self, record: Record, end: int | None) -> memoryview:
-        """Return the decompressed records of a chunk; its checksum is compared the first time."""
+        """Return the decompressed records of a chunk; verify its checksum the first time."""
         if not record.whole:
             return read_cut_chunk(self.content(record))
         if end is not None:
@@ -231,7 +231,7 @@ class McapRecording(Recording):
             self.summary.channels.setdefault(channel.id, channel)
 
     def _by_time(self, wanted: set[int], selection: Selection) -> Iterator[RawMessage]:
-        """Merge the chunks by log time; ties in the order of the file."""
+        """Yield the messages of all chunks by log time, in file order if times are equal."""
         chunks = [
             (c.message_start_time, c.chunk_start_offset, c)
             for c in self.summary.chunks
@@ -253,9 +253,9 @@ class McapRecording(Recording):
     def _indexed_chunk(
         self, chunk: records.ChunkIndex, needed: Callable[[IndexedMessage], bool]
     ) -> Iterator[RawMessage]:
-        """Yield the messages of a chunk, those behind the last needed one without their data.
+        """Yield the messages of a chunk; those after the last needed one have no data.
 
-        So transforms are read without the images that fill their chunks, and few images of many.
+        Reading only transforms, or few images of many, then decompresses little.
         """
         indexed = read_message_index(self._file, chunk)
         last = max((m.place for m in indexed if needed(m)), default=-1)
@@ -302,5 +302,5 @@ class McapRecording(Recording):
 
 _NONE = ("", "", b"")
 _KNOWN = {int(opcode) for opcode in Opcode} | set(range(128, 256))
-"""Opcodes from 128 on are for private use."""
+"""Opcodes that cause no warning; 128 to 255 are for private use."""
 _DEFINING = (Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)

@@ -1,4 +1,4 @@
-"""What the indexes of an MCAP file tell of its chunks."""
+"""The index of the messages in each chunk of an MCAP file."""
 
 import struct
 from itertools import chain
@@ -17,11 +17,11 @@ __all__ = ["IndexedMessage", "overlaps", "read_message_index", "unread"]
 
 _HEAD = struct.Struct("<HI")
 _ENTRY = struct.Struct("<QQ")
-"""The channel and the bytes of the entries; an entry."""
+"""Head of a message index: channel and bytes of entries. An entry: log time and offset."""
 
 
 class IndexedMessage(NamedTuple):
-    """What an index tells of a message; ``place`` is where its record is in the chunk, bytes."""
+    """An index entry; ``place`` is the byte offset of the message in the decompressed chunk."""
 
     channel_id: int
     log_time: int
@@ -31,7 +31,7 @@ class IndexedMessage(NamedTuple):
 def overlaps(
     chunk: records.ChunkIndex, wanted: set[int], start_ns: int | None, stop_ns: int | None
 ) -> bool:
-    """Return whether a chunk may hold wanted messages of a time."""
+    """Return whether a chunk may hold messages of wanted channels in ``[start_ns, stop_ns)``."""
     if start_ns is not None and chunk.message_end_time < start_ns:
         return False
     if stop_ns is not None and chunk.message_start_time >= stop_ns:
@@ -41,7 +41,7 @@ def overlaps(
 
 
 def read_message_index(file: BinaryIO, chunk: records.ChunkIndex) -> list[IndexedMessage]:
-    """Return the messages of a chunk; none if their index is damaged or lacks a channel."""
+    """Return the index entries of a chunk; none if an entry is damaged or a channel is missing."""
     begin = chunk.chunk_start_offset + chunk.chunk_length
     found: dict[int, list[IndexedMessage]] = {}
     try:
@@ -57,5 +57,5 @@ def read_message_index(file: BinaryIO, chunk: records.ChunkIndex) -> list[Indexe
 
 
 def unread(message: IndexedMessage) -> RawMessage:
-    """Return a message without its data."""
+    """Return an indexed message with empty data."""
     return RawMessage(message.channel_id, 0, message.log_time, message.log_time, memoryview(b""))

@@ -1,6 +1,6 @@
-"""Records of an MCAP file, read so that no length field is believed before it is checked.
+"""Records of an MCAP file; every length field is checked before use.
 
-The layout is that of the MCAP specification: every record is an opcode, a 64-bit length, and its
+The layout follows the MCAP specification: every record is an opcode, a 64-bit length, and its
 content. `mcap.records` parses the small records; messages are sliced without a copy.
 """
 
@@ -46,12 +46,12 @@ _INDEX = struct.Struct("<QQQQI")
 _ENTRY = struct.Struct("<HQ")
 _NAMED = struct.Struct("<QI")
 _SIZES = struct.Struct("<QQ")
-"""A chunk index: times, place and bytes of entries; an entry; bytes of the message indexes and of
-the compression's name; the sizes."""
+"""Parts of a chunk index: times, offset, length, and bytes of entries; an entry; bytes of the
+message indexes and of the compression's name; compressed and decompressed size."""
 _FREELY = 256 << 20
-"""Chunks up to this size are decompressed whatever they claim, bytes."""
+"""A chunk may always claim this decompressed size, bytes."""
 _RATIO = 1000
-"""Larger chunks must hold at least a byte for so many."""
+"""A larger chunk may claim up to this multiple of its compressed size."""
 
 _T = TypeVar("_T")
 
@@ -59,11 +59,11 @@ _T = TypeVar("_T")
 class TruncatedError(RecordingError):
     """The file ends inside a record, or a record claims to be longer than the file.
 
-    ``record`` is the part of it that is there, if its head is whole.
+    ``record`` is what is left of the record; None if not even its head is complete.
     """
 
     def __init__(self, message: str, record: "Record | None" = None) -> None:
-        """Wrap the records of a chunk."""
+        """Store what is left of the record."""
         super().__init__(message)
         self.record = record
 
@@ -73,7 +73,7 @@ class ChunkError(RecordingError):
 
 
 class Record(NamedTuple):
-    """Where the content of a record is in the file."""
+    """A record's opcode and its content's place in the file; ``whole`` is False if truncated."""
 
     opcode: int
     offset: int
@@ -82,7 +82,7 @@ class Record(NamedTuple):
 
 
 class RawMessage(NamedTuple):
-    """A message record, its data a view into its chunk."""
+    """A message record; ``data`` is a view into its chunk, times are nanoseconds."""
 
     channel_id: int
     sequence: int
@@ -96,7 +96,7 @@ def walk(file: BinaryIO, offset: int, end: int) -> Iterator[Record]:
 
     Raises
     ------
-    TruncatedError : a record reaches beyond ``end``.
+    TruncatedError : a record extends beyond ``end``.
     """
     while offset < end:
         file.seek(offset)
@@ -118,11 +118,11 @@ def read_content(file: BinaryIO, record: Record) -> bytes:
 
 
 def parse(read: Callable[[ReadDataStream], _T], content: bytes | memoryview) -> _T:
-    """Parse a small record with its class of `mcap.records`.
+    """Parse a small record with the ``read`` method of its class in `mcap.records`.
 
     Raises
     ------
-    ChunkError : the record is not what it claims to be.
+    ChunkError : the record is damaged.
     """
     try:
         return read(ReadDataStream(BytesIO(content)))
@@ -132,11 +132,11 @@ def parse(read: Callable[[ReadDataStream], _T], content: bytes | memoryview) -> 
 
 
 def read_chunk_index(content: bytes) -> records.ChunkIndex:
-    """Parse a chunk index, of which a recording has thousands: the library reads byte by byte.
+    """Parse a chunk index faster than the library: a recording has thousands of them.
 
     Raises
     ------
-    ChunkError : the record is not what it claims to be.
+    ChunkError : the record is damaged.
     """
     try:
         start, end, offset, length, entries = _INDEX.unpack_from(content)
@@ -158,7 +158,7 @@ def read_chunk_index(content: bytes) -> records.ChunkIndex:
 
 
 def write_chunk_index(index: records.ChunkIndex) -> bytes:
-    """Encode a whole chunk index record."""
+    """Encode a chunk index as a record, including its head."""
     entries = b"".join(_ENTRY.pack(*item) for item in index.message_index_offsets.items())
     name = index.compression.encode()
     times = (index.message_start_time, index.message_end_time)
@@ -176,12 +176,12 @@ def read_chunk(content: bytes, *, end: int | None = None, checked: bool = False)
 
     Parameters
     ----------
-    end : only so many bytes of them are needed, for which there is no checksum.
-    checked : its checksum is known to fit.
+    end : number of decompressed bytes to return, without verifying the checksum; None for all.
+    checked : whether the checksum has been verified before.
 
     Raises
     ------
-    ChunkError : sizes that do not fit, an unknown compression, damaged data, a wrong checksum.
+    ChunkError : the chunk is damaged, or its compression is unknown.
     """
     compression, size, crc, length, data = _open_chunk(content)
     if len(data) != length:
@@ -201,7 +201,7 @@ def read_cut_chunk(content: bytes) -> memoryview:
 
     Raises
     ------
-    ChunkError : not even its header is there, or it is damaged.
+    ChunkError : the chunk is damaged, its header is incomplete, or its compression is unknown.
     """
     compression, size, _, _, data = _open_chunk(content)
     return _decompress(_DECOMPRESS_PART[compression], data, size)
@@ -267,7 +267,7 @@ def _zstd_part(data: memoryview, size: int) -> bytes:
 
 
 _DECOMPRESS_PART = _DECOMPRESS | {"zstd": _zstd_part}
-"""LZ4 gives what it can in any case."""
+"""Decompressors for truncated data; LZ4 returns what it can anyway."""
 
 
 def split_chunk(chunk: memoryview) -> Iterator[tuple[int, memoryview]]:
@@ -275,7 +275,7 @@ def split_chunk(chunk: memoryview) -> Iterator[tuple[int, memoryview]]:
 
     Raises
     ------
-    ChunkError : a record reaches beyond the chunk.
+    ChunkError : a record extends beyond the chunk.
     """
     offset, end = 0, len(chunk)
     while offset < end:
@@ -296,7 +296,7 @@ def split_message(content: memoryview) -> RawMessage:
 
     Raises
     ------
-    ChunkError : it is too short.
+    ChunkError : the content is too short.
     """
     if len(content) < _MESSAGE.size:
         msg = f"message record of {len(content)} bytes"

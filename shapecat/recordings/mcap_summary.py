@@ -29,7 +29,7 @@ _FOOTER = 9 + 20
 
 @dataclass
 class Summary:
-    """The summary of a file, or what a full scan found."""
+    """The summary of a file, or what a full scan found; ``data_end`` is a byte offset."""
 
     schemas: dict[int, records.Schema] = field(default_factory=dict)
     channels: dict[int, records.Channel] = field(default_factory=dict)
@@ -41,12 +41,12 @@ class Summary:
 
 
 def read_summary(file: BinaryIO, size: int, warn: Callable[[str], None]) -> Summary | None:
-    """Read the summary section; None where it is missing, damaged or does not cover all.
+    """Read the summary section; return None if it is missing, damaged or incomplete.
 
     Parameters
     ----------
-    size : bytes of the file.
-    warn : receives what a person should know.
+    size : size of the file, bytes.
+    warn : receives warnings for the user.
     """
     footer_at = size - _FOOTER - len(MAGIC)
     if footer_at < len(MAGIC):
@@ -81,7 +81,7 @@ def _agrees(file: BinaryIO, size: int, summary: Summary) -> bool:
             continue
         unseen -= chunk.message_index_offsets.keys()
         record = next(walk(file, chunk.chunk_start_offset, size))
-        with suppress(ChunkError):  # damaged: found out when it is read
+        with suppress(ChunkError):  # damage is reported when the chunk is read
             for opcode, content in split_chunk(read_chunk(read_content(file, record))):
                 if opcode == Opcode.SCHEMA:
                     schema = parse(records.Schema.read, content)
@@ -97,7 +97,7 @@ def _agrees(file: BinaryIO, size: int, summary: Summary) -> bool:
 
 
 def _checksum(file: BinaryIO, size: int, start: int) -> int:
-    """Return the checksum of the summary, and of the footer up to its own checksum."""
+    """Return the checksum of the summary and of the footer up to its checksum field."""
     crc, left = 0, size - len(MAGIC) - 4 - start
     file.seek(start)
     while left > 0:
@@ -129,7 +129,7 @@ def _collect(file: BinaryIO, start: int, end: int) -> Summary:
 
 
 def _find_data_end(file: BinaryIO, summary: Summary, summary_start: int) -> int:
-    """Return where the data end record begins, walking from the last indexed record."""
+    """Return the offset of the data end record; walk there from the last indexed record."""
     ends = [c.chunk_start_offset + c.chunk_length for c in summary.chunks]
     ends += [item.offset + item.length for item in (*summary.attachments, *summary.metadata)]
     for record in walk(file, max(ends, default=len(MAGIC)), summary_start):

@@ -1,4 +1,4 @@
-"""The small records of a log: channels, messages, topics."""
+"""Channels, messages and topics of a recording, and which messages to read."""
 
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -23,15 +23,15 @@ Topics: TypeAlias = Collection[str] | None
 Stamp: TypeAlias = int | None
 """A log time in nanoseconds; None means no limit."""
 Needed: TypeAlias = Callable[[str, int], bool] | None
-"""Tells by topic and log time whether the data of a message is needed; None means always."""
+"""Whether a message's data is needed, given its topic and log time (ns); None means always."""
 
 
 class MessageError(RecordingError):
-    """A single message that cannot be decoded; the rest of the recording is unaffected."""
+    """A message cannot be decoded; the rest of the recording is unaffected."""
 
 
 class Selection(NamedTuple):
-    """Which messages of a recording are read; see `Recording.messages`."""
+    """The messages of a recording to read; see `Recording.messages`."""
 
     topics: Topics
     start_ns: Stamp
@@ -49,11 +49,11 @@ class Selection(NamedTuple):
 
 
 class Channel(NamedTuple):
-    """Where messages of one kind come from.
+    """A topic, with the type of its messages and the definition of that type.
 
     ``type`` is normalized to ``package/msg/Name`` for ROS types; ``schema_name`` is as recorded.
-    ``encoding`` is that of the messages: cdr, ros1, json, protobuf. ``metadata`` is what recorders
-    keep with a channel, such as ``offered_qos_profiles``.
+    ``encoding`` of messages is cdr, ros1, json or protobuf. ``metadata`` holds what recorders add,
+    such as ``offered_qos_profiles``.
     """
 
     topic: str
@@ -66,7 +66,7 @@ class Channel(NamedTuple):
 
 
 class Message(NamedTuple):
-    """One recorded message, undecoded. Times are nanoseconds."""
+    """A recorded message, not decoded. Times are nanoseconds."""
 
     channel: Channel
     log_time_ns: int
@@ -76,23 +76,23 @@ class Message(NamedTuple):
 
     @property
     def topic(self) -> str:
-        """The topic it was recorded on."""
+        """The topic of the message."""
         return self.channel.topic
 
     @property
     def type(self) -> str:
-        """Its normalized type."""
+        """The type of the message, normalized as in `Channel`."""
         return self.channel.type
 
     @property
     def encoding(self) -> str:
-        """How ``data`` is encoded."""
+        """The encoding of ``data``."""
         return self.channel.encoding
 
 
 @dataclass(frozen=True)
 class Topic:
-    """A topic of a recording with one type; ``count`` is None where it is not known."""
+    """A topic with one type; ``count`` is the number of messages, None if unknown."""
 
     name: str
     type: str

@@ -1,4 +1,4 @@
-"""From a path to the reader that understands it."""
+"""Open a recording with the reader for its format."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -13,11 +13,11 @@ __all__ = ["open_recording"]
 def open_recording(path: Path) -> Recording:
     """Open an MCAP file, a ROS 1 bag, or a ROS 2 bag (a .db3 file or a folder).
 
-    Files are told apart by what they begin with, not by their name.
+    The first bytes of a file determine its format, not its name.
 
     Raises
     ------
-    RecordingError : there is nothing, or nothing that can be read; one line with what was found.
+    RecordingError : the path does not exist or is no readable recording; the text is one line.
     """
     path = Path(path)
     try:
@@ -54,7 +54,7 @@ _READERS: dict[str, Callable[[Path], Recording]] = {
     "SQLite format 3": _database,
     "folder": _folder,
 }
-"""Readers by the first bytes of the file."""
+"""The reader for each beginning of a file, and for folders."""
 
 _EXPECTED = "expected an .mcap, .bag or .db3 file, or a ROS 2 bag folder"
 

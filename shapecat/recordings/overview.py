@@ -14,11 +14,11 @@ __all__ = ["describe_recording"]
 
 
 def describe_recording(path: Path) -> dict[str, Any]:
-    """Return path, kind, size, times, topics with their use, and warnings of one recording.
+    """Return a recording's path, kind, size, times, topics with their use, and warnings.
 
     Raises
     ------
-    RecordingError : it cannot be read.
+    RecordingError : the recording cannot be read.
     """
     with open_recording(path) as recording:
         streams = {stream.topic: stream for stream in cloud_streams(recording)}
@@ -45,7 +45,7 @@ def describe_recording(path: Path) -> dict[str, Any]:
 
 
 def _uses(recording: Recording, streams: Mapping[str, Stream]) -> dict[str, str]:
-    """Return the use of each topic."""
+    """Return what each topic is used for; unused topics are absent."""
     uses = {stream.info_topic: "camera" for stream in streams.values() if stream.info_topic}
     for topic, stream in streams.items():
         uses[topic] = f"{stream.kind} stream"

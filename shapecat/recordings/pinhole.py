@@ -12,28 +12,28 @@ from shapecat.types import Camera
 __all__ = ["LARGEST_ERROR_PX", "PinholeFit", "camera_of_info", "fit_pinhole", "still_fits"]
 
 LARGEST_ERROR_PX = 0.6
-"""Organized points farther from every pinhole camera than this are treated as unorganized."""
+"""A camera fits an organized cloud if 95 % of its points are reprojected within this distance."""
 
 _SAMPLES = 4096
 _FEWEST = 100
 _SPREAD = 0.1
-"""The readings must span this share of the image in both directions, else the fit is loose."""
+"""The samples must span this share of the width and height, or the fit is ill-conditioned."""
 
 
 @dataclass(frozen=True)
 class PinholeFit:
-    """A camera and how well it explains the points it was fitted to, RMS in pixels."""
+    """A camera, and the RMS reprojection error of the points it was fitted to, pixels."""
 
     camera: Camera
     error_px: float
 
 
 def fit_pinhole(points: F4) -> PinholeFit | None:
-    """Find the pinhole camera whose pixels see the points of an organized cloud.
+    """Fit a pinhole camera to the points of an organized cloud.
 
-    Column u sees x / z = (u - cx) / fx, so u is linear in x / z with slope fx and offset cx, and
-    the same holds for rows: two least-squares lines through a few thousand points, in double
-    precision, first through medians, then refitted without outliers.
+    A point in column u satisfies x / z = (u - cx) / fx, so u is linear in x / z with slope fx and
+    offset cx; the same holds for rows. The method fits two least-squares lines to a few thousand
+    points in double precision, first to medians, then without outliers.
 
     Parameters
     ----------
@@ -41,8 +41,8 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
 
     Returns
     -------
-    None if the points are few or in a narrow part of the image, or no camera explains 95 % of
-    them to `LARGEST_ERROR_PX`.
+    None if there are few points, or they cover a narrow part of the image, or no camera reprojects
+    95 % of them to within `LARGEST_ERROR_PX`.
     """
     height, width = points.shape[:2]
     sample = _sample(points)
@@ -66,16 +66,16 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
 
 
 def still_fits(fit: PinholeFit, points: F4) -> bool:
-    """Return whether a camera explains organized points (h, w, 3) as well as those of its fit."""
+    """Return whether a camera fits an organized cloud (h, w, 3) about as well as its own points."""
     camera, sample = fit.camera, _sample(points)
     if sample is None:
-        return points.shape[:2] == (camera.height, camera.width)  # nothing speaks against it
+        return points.shape[:2] == (camera.height, camera.width)  # too few points to contradict it
     largest, rms = _errors(camera, sample)
     return largest < LARGEST_ERROR_PX and rms < 2 * fit.error_px + 0.02
 
 
 def _errors(camera: Camera, sample: tuple[F8, F8, F8, F8]) -> tuple[float, float]:
-    """Return the distance in pixels that 95 % do not exceed, and the RMS without outliers."""
+    """Return the 95th percentile of the reprojection error and its RMS without outliers, pixels."""
     u, v, x, y = sample
     error = np.hypot(camera.fx * x + camera.cx - u, camera.fy * y + camera.cy - v)
     keep = error <= max(3.0 * float(np.median(error)), 1e-3)
@@ -83,7 +83,7 @@ def _errors(camera: Camera, sample: tuple[F8, F8, F8, F8]) -> tuple[float, float
 
 
 def _sample(points: F4) -> tuple[F8, F8, F8, F8] | None:
-    """Return u, v, x / z and y / z of readings spread over the image; None if there are few."""
+    """Return u, v, x / z and y / z of points spread over the image; None if there are few."""
     height, width = points.shape[:2]
     # A stride that shares no factor with the width visits all columns.
     stride = max(1, height * width // (4 * _SAMPLES)) | 1
@@ -126,16 +126,16 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
 
     Parameters
     ----------
-    rectified : the image has been rectified, so P describes it; otherwise K and D do.
+    rectified : whether the image is rectified: then P describes it, otherwise K and D.
 
     Returns
     -------
-    The camera of the full image as binned and cropped, and whether lens distortion is left that
-    it does not describe.
+    The camera after cropping and binning; and whether the image has lens distortion, which the
+    camera does not model.
 
     Raises
     ------
-    MessageError : the calibration is missing or not finite.
+    MessageError : a focal length is not positive, or a value is not finite.
     """
     k, p, d = (_field(info, name) for name in "kpd")
     use_p = rectified and p.size == 12 and p[0] > 0
@@ -155,7 +155,7 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
 
 
 def _field(info: Any, name: str) -> F8:
-    """Return a matrix by its ROS 2 name (lower case) or its ROS 1 name (upper case)."""
+    """Return a matrix by its ROS 2 name (lower case), or by its ROS 1 name (upper case)."""
     value = getattr(info, name, None)
     if value is None:
         value = getattr(info, name.upper())

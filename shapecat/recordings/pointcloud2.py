@@ -1,4 +1,4 @@
-"""PointCloud2 messages of any layout become coordinates."""
+"""Read the coordinates of PointCloud2 messages of any layout."""
 
 from typing import Any
 
@@ -19,15 +19,15 @@ def cloud_points(message: Any) -> F4:
     Parameters
     ----------
     message : has ``height, width, fields, is_bigendian, point_step, row_step, data`` as in
-        sensor_msgs/PointCloud2. ``is_dense`` is not believed.
+        sensor_msgs/PointCloud2. ``is_dense`` is ignored.
 
     Returns
     -------
-    (h, w, 3) float32 metres; a point without a reading has a coordinate that is not finite.
+    (h, w, 3) float32 metres, as recorded: coordinates may be NaN, infinite or zero.
 
     Raises
     ------
-    MessageError : no coordinates, a layout that does not fit, or less data than the sizes claim.
+    MessageError : x, y or z is missing, the layout is inconsistent, or data is missing.
     """
     height, width, step = int(message.height), int(message.width), int(message.point_step)
     if height * width == 0:
@@ -48,7 +48,7 @@ def cloud_points(message: Any) -> F4:
 
 
 def _axes(message: Any, step: int) -> list[tuple[int, str]]:
-    """Return offset and numpy type of x, y and z."""
+    """Return byte offset and NumPy type of x, y and z."""
     order = ">" if message.is_bigendian else "<"
     fields = {field.name: field for field in message.fields}
     axes = []
@@ -66,7 +66,7 @@ def _axes(message: Any, step: int) -> list[tuple[int, str]]:
 
 
 def organized(points: F4, camera: Camera) -> dict[str, Any]:
-    """Return depth and camera of an organized cloud (h, w, 3)."""
+    """Return the content of a `Frame` from an organized cloud (h, w, 3): depth and camera."""
     x, y, z = (points[..., k] for k in range(3))
     with np.errstate(over="ignore", invalid="ignore"):
         valid = np.isfinite(x + y + z) & (z > 0)
@@ -74,9 +74,9 @@ def organized(points: F4, camera: Camera) -> dict[str, Any]:
 
 
 def unorganized(points: F4) -> dict[str, Any]:
-    """Return the points of a cloud (h, w, 3) row by row, NaN where there is no reading.
+    """Return the content of a `Frame` from a cloud (h, w, 3): its points (h * w, 3), row by row.
 
-    Drivers mark missing readings by NaN, by infinity, or by the sensor's own position.
+    Points without a reading become NaN. Drivers mark them with NaN, infinity or the origin.
     """
     flat = np.array(points.reshape(-1, 3), np.float32)
     valid = np.isfinite(flat).all(1) & flat.any(1)

@@ -1,4 +1,4 @@
-"""Protocol Buffers by the descriptors that a recording holds."""
+"""Decode Protocol Buffers with the descriptors stored in a recording."""
 
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -31,7 +31,7 @@ def message_class(descriptors: bytes, name: str) -> Any:
 
 
 def _add(pool: DescriptorPool, name: str, files: dict[str, Any]) -> None:
-    """Add a file after those it depends on, in whatever order they were written."""
+    """Move a file from `files` to the pool, after the files that it depends on."""
     file = files.pop(name)
     for needed in file.dependency:
         if needed in files:
@@ -42,8 +42,8 @@ def _add(pool: DescriptorPool, name: str, files: dict[str, Any]) -> None:
 def message_decoder(descriptors: bytes, name: str) -> Callable[[bytes | memoryview], Any]:
     """Return a decoder for a message, given a serialized FileDescriptorSet.
 
-    Decoded messages have their fields as attributes, defaults where they are absent; an absent
-    message is None. The decoder raises ValueError for damaged data.
+    Decoded messages have their fields as attributes. An absent field has its default value, an
+    absent submessage is None. The decoder raises ValueError for damaged data.
 
     Raises
     ------

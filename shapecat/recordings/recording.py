@@ -1,4 +1,4 @@
-"""Interface of all readers."""
+"""The interface of all readers of recordings."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
@@ -21,21 +21,21 @@ _MOST_WARNINGS = 100
 
 
 class Recording(ABC):
-    """An open log. Use it as a context manager, or `close` it.
+    """An open recording. Use it as a context manager, or `close` it.
 
     Attributes
     ----------
     path : the file or folder.
-    topics : what was recorded, by name; a topic with two types appears twice.
-    start_ns, end_ns : log times of the first and last message; 0 when there is none.
-    warnings : what was odd about the recording, for the user.
+    topics : sorted by name; a topic with two types appears twice.
+    start_ns, end_ns : log times of the first and last message; 0 if there is none.
+    warnings : problems found in the recording, for the user.
     """
 
     kind: ClassVar[str]
     """``mcap``, ``ros1`` or ``ros2``."""
 
     def __init__(self, path: Path) -> None:
-        """Prepare the attributes; subclasses fill them."""
+        """Set empty attributes; subclasses fill them."""
         self.path = path
         self.topics: tuple[Topic, ...] = ()
         self.start_ns = 0
@@ -45,11 +45,11 @@ class Recording(ABC):
         self._decoders: dict[tuple[str, str, bytes], Callable[[bytes | memoryview], Any]] = {}
 
     def channels(self) -> tuple[Channel, ...]:
-        """Return every channel, also those without messages."""
+        """Return all channels, including those without messages."""
         return tuple(self._channels.values())
 
     def parts(self) -> list["Recording"]:
-        """Return the recordings that it consists of: one per file, or itself alone."""
+        """Return one recording per file; by default the recording itself."""
         return [self]
 
     def messages(
@@ -64,19 +64,19 @@ class Recording(ABC):
         Parameters
         ----------
         topics : names to read; all by default.
-        start_ns, stop_ns : log times of the first message and of the first one left out.
-        needed : an indexed file may give other messages without their data, unread.
+        start_ns, stop_ns : messages with ``start_ns <= log time < stop_ns`` are read.
+        needed : an indexed file may yield messages that are not needed with empty data.
 
         Yields
         ------
-        Messages by log time; in the order of the file where it has no index. A part that cannot
-        be read is left out and noted in ``warnings``.
+        Messages by log time, or in file order if the file has no index. Damaged parts are skipped
+        and added to ``warnings``.
         """
         return self._read(Selection(topics, start_ns, stop_ns, needed))
 
     @abstractmethod
     def _read(self, selection: Selection) -> Iterator[Message]:
-        """Yield the messages that are selected."""
+        """Yield the selected messages."""
 
     @abstractmethod
     def close(self) -> None:
@@ -85,18 +85,18 @@ class Recording(ABC):
     def decode(self, message: Message) -> Any:
         """Return a message as an object with the fields of its type as attributes.
 
-        The type is read from the definition that the recording itself holds.
+        The definition of the type is read from the recording itself.
 
         Raises
         ------
-        MessageError : the message, or the definition of its type, cannot be understood.
+        MessageError : the message, or the definition of its type, is malformed or unsupported.
         """
         from shapecat.recordings.decoding import decode  # noqa: PLC0415  # loads rosbags
 
         return decode(message, self._decoders)
 
     def warn(self, text: str) -> None:
-        """Add to ``warnings``, once; a badly damaged recording has no end of them."""
+        """Add a warning, unless it is a repetition or there are very many already."""
         if text not in self.warnings and len(self.warnings) <= _MOST_WARNINGS:
             enough = len(self.warnings) == _MOST_WARNINGS
             self.warnings.append("and more of this kind" if enough else text)

@@ -1,7 +1,7 @@
-"""ROS 1 bags (format 2.0): indexed ones by time, all others in the order of the file.
+"""Read ROS 1 bags (format 2.0): by time if they are indexed, otherwise in file order.
 
-Read by our own code because libraries refuse what a robot leaves when its power is cut: bags
-without an index (``.bag.active``), or cut off. Damage never ends the reading.
+Libraries reject the bags that a robot leaves when its power is cut: without an index
+(``.bag.active``) or truncated. This reader reads them as far as possible.
 """
 
 import struct
@@ -47,7 +47,7 @@ class _ChunkInfo(NamedTuple):
 
 
 class BagRecording(Recording):
-    """A ROS 1 bag; messages by the time they were recorded."""
+    """A ROS 1 bag; the log time of a message is when it was recorded."""
 
     kind: ClassVar[str] = "ros1"
 
@@ -56,8 +56,8 @@ class BagRecording(Recording):
 
         Raises
         ------
-        RecordingError : it is not a bag of version 2.0, or is encrypted.
-        OSError : it cannot be read.
+        RecordingError : the file is not a bag of version 2.0, is encrypted, or holds no topics.
+        OSError : the file cannot be read.
         """
         super().__init__(path)
         self._channels: dict[int, Channel] = {}
@@ -110,7 +110,7 @@ class BagRecording(Recording):
         yield from in_time_order(due, read)
 
     def _read_header(self) -> dict[str, bytes]:
-        """Return the header of the bag; empty if it is damaged."""
+        """Return the fields of the bag header; empty if it is damaged."""
         self._file.seek(0)
         if self._file.read(len(MAGIC)) != MAGIC:
             msg = "not a readable ROS 1 bag: not of version 2.0"
@@ -127,7 +127,7 @@ class BagRecording(Recording):
         return record.fields
 
     def _read_index(self, header: dict[str, bytes]) -> Counter[int] | None:
-        """Read connections and chunks from the end; None where that is missing or damaged."""
+        """Read the index and return the messages per connection; None if missing or damaged."""
         counts: Counter[int] = Counter()
         chunks = []
         try:
@@ -168,7 +168,7 @@ class BagRecording(Recording):
                 continue
             unseen -= chunk.counts.keys()
             record = next(walk(self._file, chunk.position, self._size))
-            with suppress(BagError):  # damaged: found out when it is read
+            with suppress(BagError):  # damage is reported when the chunk is read
                 for fields, data in split(expand(record, self._data(record))[0]):
                     if fields.get("op") == bytes([CONNECTION]):
                         number = u4(fields, "conn")
@@ -182,7 +182,7 @@ class BagRecording(Recording):
         return _ChunkInfo(u8(record.fields, "chunk_pos"), start, end, dict(pairs))
 
     def _scan(self) -> Counter[int]:
-        """Read all of the bag for its connections, counts and times."""
+        """Read the whole bag to find its connections, counts and times."""
         self._channels.clear()
         counts: Counter[int] = Counter()
         low = high = None
@@ -199,7 +199,7 @@ class BagRecording(Recording):
         return counts
 
     def _records(self) -> Iterator[Record]:
-        """Yield the chunks in the order of the file, and the part that is there of the last."""
+        """Yield the records in file order; a truncated last one is shortened to what is left."""
         try:
             yield from walk(self._file, self._first, self._size)
         except BagError as error:
@@ -208,9 +208,9 @@ class BagRecording(Recording):
                 yield error.record
 
     def _expand(self, record: Record) -> Iterator[tuple[int, int, memoryview]]:
-        """Yield connection, time and data of the messages of a record; note new connections.
+        """Yield connection, time (ns) and data of the messages of a record; store new connections.
 
-        A damaged chunk gives what is before the damage.
+        A damaged chunk is read up to the damage.
         """
         if record.op not in {CHUNK, CONNECTION}:
             return
@@ -247,7 +247,7 @@ class BagRecording(Recording):
         return None
 
     def _connect(self, fields: dict[str, bytes], data: bytes | memoryview) -> None:
-        """Note a connection."""
+        """Store the channel of a connection record."""
         self._channels.setdefault(u4(fields, "conn"), _channel(fields, data))
 
     def _data(self, record: Record) -> bytes:

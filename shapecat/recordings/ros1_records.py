@@ -1,7 +1,7 @@
 """Records of a ROS 1 bag; every length field is checked before use.
 
-The layout is that of the bag format 2.0: every record is a header of named fields and data, each
-after its 32-bit length. https://wiki.ros.org/Bags/Format/2.0
+The layout follows bag format 2.0: every record is a header of named fields, then data, both
+preceded by their 32-bit length. https://wiki.ros.org/Bags/Format/2.0
 """
 
 import bz2
@@ -40,25 +40,28 @@ _TIME = struct.Struct("<II")
 _LONGEST_HEADER = 1 << 20
 _STEP = 1 << 16
 _FREELY = 256 << 20
-"""Chunks up to this size are decompressed whatever they claim, bytes."""
+"""A chunk may always have this decompressed size, bytes."""
 _RATIO = 1000
-"""Larger chunks must hold at least a byte for so many."""
+"""A larger chunk may have up to this multiple of its compressed size."""
 
 
 class BagError(RecordingError):
-    """A record is damaged, or extends beyond the end.
+    """A record is damaged, or extends beyond the end of the file or chunk.
 
-    ``record`` is its part that is there, if its header is whole.
+    ``record`` is what is left of a truncated record; None if its header is incomplete.
     """
 
     def __init__(self, message: str, record: "Record | None" = None) -> None:
-        """Wrap the fields of a record."""
+        """Store what is left of the record."""
         super().__init__(message)
         self.record = record
 
 
 class Record(NamedTuple):
-    """The header of a record, and where it begins, and its data begin and end."""
+    """The header fields of a record, and byte offsets in the file.
+
+    The record begins at ``start``; its data extends from ``begin`` to ``end``.
+    """
 
     fields: dict[str, bytes]
     start: int
@@ -67,7 +70,7 @@ class Record(NamedTuple):
 
     @property
     def op(self) -> int:
-        """The kind of the record; 0 if unknown."""
+        """The opcode of the record; 0 if it has none."""
         return self.fields.get("op", b"\0")[0] if self.fields.get("op") else 0
 
 
@@ -76,7 +79,7 @@ def fields_of(header: bytes | memoryview) -> dict[str, bytes]:
 
     Raises
     ------
-    BagError : they do not fit.
+    BagError : the header is damaged.
     """
     fields, at, data = {}, 0, bytes(header)
     while at < len(data):
@@ -91,22 +94,32 @@ def fields_of(header: bytes | memoryview) -> dict[str, bytes]:
 
 
 def u4(fields: dict[str, bytes], name: str) -> int:
-    """Return an unsigned field of four bytes.
+    """Return an unsigned 32-bit field.
 
     Raises
     ------
-    BagError : it is not there.
+    BagError : the field is missing or has another size.
     """
     return int(_unpack(_LENGTH, fields, name)[0])
 
 
 def u8(fields: dict[str, bytes], name: str) -> int:
-    """Return an unsigned field of eight bytes."""
+    """Return an unsigned 64-bit field.
+
+    Raises
+    ------
+    BagError : the field is missing or has another size.
+    """
     return int(_unpack(_LONG, fields, name)[0])
 
 
 def time_of(fields: dict[str, bytes], name: str = "time") -> int:
-    """Return a time in nanoseconds."""
+    """Return a time field in nanoseconds.
+
+    Raises
+    ------
+    BagError : the field is missing or has another size.
+    """
     seconds, rest = _unpack(_TIME, fields, name)
     return int(seconds) * 10**9 + int(rest)
 
@@ -124,7 +137,7 @@ def walk(file: BinaryIO, start: int, end: int) -> Iterator[Record]:
 
     Raises
     ------
-    BagError : a record is damaged or reaches beyond ``end``.
+    BagError : a record is damaged or extends beyond ``end``.
     """
     while start < end:
         file.seek(start)
@@ -152,7 +165,7 @@ def split(chunk: memoryview) -> Iterator[tuple[dict[str, bytes], memoryview]]:
 
     Raises
     ------
-    BagError : a record is damaged or reaches beyond the chunk.
+    BagError : a record is damaged or extends beyond the chunk.
     """
     at, end = 0, len(chunk)
     while at < end:
@@ -171,7 +184,7 @@ def expand(record: Record, data: bytes) -> tuple[memoryview, str]:
 
     Returns
     -------
-    What it holds, and what is wrong with the rest; empty if nothing is.
+    The decompressed data, and why the rest of the chunk is missing; empty if it is complete.
     """
     method = record.fields.get("compression", b"").decode("latin-1")
     if method == "none":

@@ -18,14 +18,14 @@ from shapecat.recordings.recording import Recording
 __all__ = ["DatabaseRecording"]
 
 _ZSTD = b"\x28\xb5\x2f\xfd"
-"""Begins a compressed message; a CDR message begins with a zero byte."""
+"""First bytes of a compressed message; a CDR message begins with a zero byte."""
 _LARGEST = 1 << 30
-"""Compressed messages that claim to hold more are left out, bytes."""
+"""Compressed messages that claim a larger decompressed size, in bytes, are skipped."""
 _SCHEMAS = {MessageDefinitionFormat.MSG: "ros2msg", MessageDefinitionFormat.IDL: "ros2idl"}
 
 
 class DatabaseRecording(Recording):
-    """A ROS 2 bag in SQLite; messages by the time they were recorded."""
+    """A ROS 2 bag in SQLite; the log time of a message is when it was recorded."""
 
     kind: ClassVar[str] = "ros2"
 
@@ -34,7 +34,7 @@ class DatabaseRecording(Recording):
 
         Raises
         ------
-        RecordingError : it is not a ROS 2 bag, or is damaged.
+        RecordingError : the file is not a ROS 2 bag, or is damaged.
         """
         super().__init__(path)
         self._reader = Reader(path)
@@ -82,7 +82,7 @@ class DatabaseRecording(Recording):
                 yield Message(channel, time, time, 0, plain)
 
     def _plain(self, channel: Channel, data: bytes) -> bytes | None:
-        """Decompress a compressed message; None where that fails."""
+        """Return a message's data, decompressed if necessary; None if that fails."""
         if not data.startswith(_ZSTD):
             return data
         try:

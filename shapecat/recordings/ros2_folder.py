@@ -1,4 +1,4 @@
-"""ROS 2 bags in a folder: one or more parts in SQLite or MCAP, maybe compressed."""
+"""Read ROS 2 bags in a folder: one or more SQLite or MCAP files, possibly compressed."""
 
 import os
 import re
@@ -34,20 +34,20 @@ _NEW_S = 60
 
 
 class FolderRecording(Recording):
-    """A folder as ``ros2 bag record`` makes it, with or without its metadata.yaml.
+    """A bag folder as ``ros2 bag record`` writes it, with or without metadata.yaml.
 
-    The metadata only say which files belong to the bag: topics, times and definitions are taken
-    from the files themselves.
+    The metadata is read only for the list of files. Topics, times and definitions come from the
+    files themselves.
     """
 
     kind: ClassVar[str] = "ros2"
 
     def __init__(self, path: Path) -> None:
-        """Open all parts.
+        """Open all files of the bag.
 
         Raises
         ------
-        RecordingError : there is no part, or none that can be read.
+        RecordingError : the folder holds no .mcap or .db3 file, or none of them can be read.
         """
         super().__init__(path)
         self._scratch: TemporaryDirectory[str] | None = None
@@ -58,7 +58,7 @@ class FolderRecording(Recording):
         except BaseException:
             self.close()
             raise
-        # A part without messages says nothing about time.
+        # A file without messages has no times.
         self._parts.sort(key=lambda part: (part.end_ns == 0, part.start_ns, part.path.name))
         filled = [part for part in self._parts if part.end_ns]
         if filled:
@@ -69,7 +69,7 @@ class FolderRecording(Recording):
         self._note()
 
     def close(self) -> None:
-        """Close all parts and remove what was decompressed."""
+        """Close all files and remove the decompressed copies."""
         for part in self._parts:
             part.close()
         if self._scratch is not None:
@@ -79,11 +79,11 @@ class FolderRecording(Recording):
             self._lock = None
 
     def parts(self) -> list[Recording]:
-        """Return the recordings in the folder, by time."""
+        """Return one recording per file, sorted by start time."""
         return list(self._parts)
 
     def channels(self) -> tuple[Channel, ...]:
-        """Return every channel of every part, each once."""
+        """Return the channels of all files, without duplicates."""
         return tuple(dict.fromkeys(c for part in self._parts for c in part.channels()))
 
     def _read(self, selection: Selection) -> Iterator[Message]:
@@ -113,7 +113,7 @@ class FolderRecording(Recording):
     def _listed_names(self) -> set[str]:
         """Return the file names under ``relative_file_paths`` of metadata.yaml.
 
-        The file is always written by rosbag2 in block style, so a YAML parser is not needed.
+        It needs no YAML parser, since rosbag2 always writes the file in block style.
         """
         file = self.path / "metadata.yaml"
         try:
@@ -138,7 +138,7 @@ class FolderRecording(Recording):
             self.warn(f"left out {reason}")
 
     def _decompressed(self, file: Path) -> Path:
-        """Decompress a part into a temporary folder, within the space that there is."""
+        """Decompress a file into a temporary folder, using at most half of the free space."""
         if self._scratch is None:
             _remove_abandoned()
             self._scratch = TemporaryDirectory(prefix=_SCRATCH)
@@ -165,10 +165,10 @@ class FolderRecording(Recording):
 
 
 def _remove_abandoned() -> None:
-    """Remove the temporary folders of processes that were killed."""
+    """Remove the temporary folders of killed processes."""
     for folder in Path(gettempdir()).glob(f"{_SCRATCH}*"):
         with suppress(OSError):
-            # A new one may not be locked yet.
+            # A new folder may not be locked yet.
             if time.time() - folder.stat().st_mtime < _NEW_S or (held := lock(folder)) is None:
                 continue
             shutil.rmtree(folder, ignore_errors=True)
@@ -176,7 +176,7 @@ def _remove_abandoned() -> None:
 
 
 def _suffix(file: Path) -> str:
-    """Return the kind of a part, compressed or not."""
+    """Return the suffix of a file, without ``.zstd``."""
     return Path(file.stem).suffix if file.suffix == ".zstd" else file.suffix
 
 

@@ -1,4 +1,4 @@
-"""One stream being read: from messages to frames."""
+"""Convert the messages of a depth stream to frames."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -23,12 +23,12 @@ from shapecat.types import Camera, Frame, Pose
 __all__ = ["SOURCES", "DepthSource", "PointsSource", "Source"]
 
 _MALFORMED = (ArithmeticError, AttributeError, LookupError, TypeError, ValueError)
-"""Raised where a definition gives a message other fields than its type should have."""
+"""Raised if a message's definition lacks fields of its type."""
 
 
 @contextmanager
 def _counting(skipped: Counter[str]) -> Iterator[None]:
-    """Count unreadable messages, by reason."""
+    """Count unreadable messages by reason instead of raising."""
     try:
         yield
     except MessageError as error:
@@ -38,25 +38,30 @@ def _counting(skipped: Counter[str]) -> Iterator[None]:
 
 
 class Source:
-    """A stream with its state between frames; ``index`` counts its messages."""
+    """A stream and its state between frames; ``index`` is the number of its messages so far."""
 
     def __init__(self, recording: Recording, stream: Stream) -> None:
-        """Begin reading a stream."""
+        """Start before the first message."""
         self.recording = recording
         self.stream = stream
         self.index = 0
         self.clock = Clock(stream.topic)
 
     def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
-        """Yield the frame of a message, or a frame held back before it, or none."""
+        """Yield the frames that a message completes: its own or an earlier one, or none."""
         raise NotImplementedError
 
     def finish(self, _skipped: Counter[str]) -> Iterator[Frame]:
-        """Yield the frame that waits, if any."""
+        """Yield the frame that is held back, if any."""
         yield from ()
 
     def frame(self, message: Message, index: int, header: Any, content: dict[str, Any]) -> Frame:
-        """Make a frame."""
+        """Return a frame of ``content``: depth and camera, or points.
+
+        Raises
+        ------
+        MessageError : the log time is not within 0 to 2**63 - 1 ns.
+        """
         if not 0 <= message.log_time_ns < 2**63:
             msg = "log time out of range"
             raise MessageError(msg)
@@ -71,15 +76,15 @@ class Source:
 
 
 class PointsSource(Source):
-    """A stream of clouds; organized ones become depth images where a camera explains them."""
+    """A stream of clouds; organized ones become depth images if a pinhole camera fits."""
 
     def __init__(self, recording: Recording, stream: Stream) -> None:
-        """Begin without a camera."""
+        """Start without a camera."""
         super().__init__(recording, stream)
         self.fit: PinholeFit | None = None
 
     def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
-        """Yield the frame of a cloud."""
+        """Yield the frame of a cloud, or none if it is unreadable."""
         frame = None
         with _counting(skipped):
             cloud = self.recording.decode(message)
@@ -96,7 +101,7 @@ class PointsSource(Source):
         return unorganized(points) if camera is None else organized(points, camera)
 
     def _camera(self, points: F4) -> Camera | None:
-        """Keep the camera of earlier frames while it explains the points as well as then."""
+        """Return the camera of earlier frames if it still fits, or a new one; None if none fits."""
         if self.fit is not None and still_fits(self.fit, points):
             return self.fit.camera
         fit = fit_pinhole(points)
@@ -105,15 +110,15 @@ class PointsSource(Source):
 
 
 def _placed(points: F4, pose: Pose | None) -> F4:
-    """Move a cloud that has a pose of its own into the sensor frame."""
+    """Transform a cloud that has its own pose into the sensor frame."""
     return points if pose is None else transform(pose, points).astype(np.float32)
 
 
 class DepthSource(Source):
-    """A stream of depth images, each waiting for the calibration of its own time."""
+    """A stream of depth images; each is held back until the calibration of its stamp arrives."""
 
     def __init__(self, recording: Recording, stream: Stream) -> None:
-        """Begin without a calibration."""
+        """Start without a calibration."""
         super().__init__(recording, stream)
         self.info_topic = stream.info_topic or ""
         # "image_rect", "image_rect_raw", "image_rect/compressedDepth"
@@ -125,7 +130,7 @@ class DepthSource(Source):
         self._info_stamp: int | None = None
 
     def calibrate(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
-        """Take a calibration; yield the image that waited for it."""
+        """Store a calibration; yield the frame of the image that waited for it, if any."""
         try:
             info = self.recording.decode(message)
             stamp = stamp_ns(info.header)
@@ -136,7 +141,7 @@ class DepthSource(Source):
             self._info, self._info_stamp = info, stamp
             return
         wanted = stamp_ns(self._waiting[2].header)
-        # A later calibration means that the image's own is missing: the last one has to do.
+        # A later calibration means that the image's own is missing: use the last one before it.
         if stamp <= wanted or self._info is None:
             self._info, self._info_stamp = info, stamp
         if stamp >= wanted:
@@ -144,7 +149,7 @@ class DepthSource(Source):
             self._info, self._info_stamp = info, stamp
 
     def read(self, message: Message, skipped: Counter[str]) -> Iterator[Frame]:
-        """Hold an image back until its calibration is there; yield the one before it."""
+        """Hold an image back until its calibration arrives; yield the frame of the previous one."""
         yield from self.finish(skipped)
         with _counting(skipped):
             image = self.recording.decode(message)
@@ -155,11 +160,11 @@ class DepthSource(Source):
 
     @property
     def _wanted(self) -> int | None:
-        """The time of the image that waits for its calibration, None if none does."""
+        """The stamp (ns) of the image that is held back; None if there is none."""
         return None if self._waiting is None else stamp_ns(self._waiting[2].header)
 
     def finish(self, skipped: Counter[str]) -> Iterator[Frame]:
-        """Yield the image that waits, with the best calibration there is."""
+        """Yield the frame of the image that is held back, with the best calibration so far."""
         if self._waiting is None:
             return
         (message, index, image), self._waiting = self._waiting, None
@@ -188,7 +193,7 @@ class DepthSource(Source):
 
 
 def _depth_units(recording: Recording, topic: str) -> float | None:
-    """Return how many units make a metre, if the RealSense viewer recorded it."""
+    """Return the depth units per metre that the RealSense viewer recorded; None if it did not."""
     sensor = "/".join(topic.split("/")[:3])
     for other in recording.topics:
         name = other.name.replace(" ", "_")
@@ -200,7 +205,7 @@ def _depth_units(recording: Recording, topic: str) -> float | None:
 
 
 def _first(recording: Recording, topic: str) -> Any:
-    """Return the first message of a topic; it may lie before the chosen window."""
+    """Return the first decodable message of a topic in the whole recording; None if none is."""
     for message in recording.messages([topic]):
         with suppress(MessageError):
             return recording.decode(message)
@@ -211,4 +216,4 @@ SOURCES: dict[str, Callable[[Recording, Stream], Source]] = {
     "points": PointsSource,
     "depth": DepthSource,
 }
-"""By the kind of a stream."""
+"""The source for each kind of stream."""

@@ -1,4 +1,4 @@
-"""Time stamps of messages, and clocks that cannot be trusted."""
+"""Stamps of messages, and checks for unreliable clocks."""
 
 from typing import Any
 
@@ -8,9 +8,9 @@ from shapecat.recordings.recording import Recording
 __all__ = ["Clock", "stamp_ns"]
 
 _EPOCH_NS = 946_684_800 * 10**9
-"""The year 2000: earlier stamps count from when the sensor was switched on."""
+"""1 January 2000: earlier stamps probably count from when the sensor was switched on."""
 _JUMP_NS = 10 * 10**9
-"""A change of stamp against log time that is called a jump."""
+"""A larger change of the delay between stamp and log time counts as a jump."""
 
 
 def stamp_ns(header: Any) -> int:
@@ -18,7 +18,7 @@ def stamp_ns(header: Any) -> int:
 
     Raises
     ------
-    MessageError : it is negative, or does not fit in 63 bits.
+    MessageError : the stamp is negative, or does not fit in 63 bits.
     """
     stamp = int(header.stamp.sec) * 10**9 + int(header.stamp.nanosec)
     if not 0 <= stamp < 2**63:
@@ -28,17 +28,17 @@ def stamp_ns(header: Any) -> int:
 
 
 class Clock:
-    """Watches the stamps of one stream."""
+    """Counts odd stamps in one stream."""
 
     def __init__(self, topic: str) -> None:
-        """Watch a topic."""
+        """Start before the first stamp of a topic."""
         self.topic = topic
         self.last: int | None = None
         self.delay: int | None = None
         self.counts = dict.fromkeys(_TEXTS, 0)
 
     def check(self, stamp: int, log_time: int) -> int:
-        """Return the stamp, or the log time if the message has none."""
+        """Return the stamp, or the log time if the stamp is 0; both in nanoseconds."""
         if stamp == 0:
             self.counts["zero"] += 1
             return log_time

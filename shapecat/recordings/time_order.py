@@ -1,4 +1,4 @@
-"""Messages of overlapping chunks, sorted by time in little memory."""
+"""Sort the messages of overlapping chunks by time, in little memory."""
 
 from collections.abc import Callable, Iterable, Iterator
 from heapq import heappop, heappush
@@ -7,14 +7,14 @@ from typing import NamedTuple, TypeVar
 __all__ = ["Timed", "in_time_order"]
 
 _PENDING = 512 << 20
-"""Bytes of messages held back to bring overlapping chunks in order."""
+"""Once this many bytes of messages are held back, no further chunk is read ahead."""
 
 _C = TypeVar("_C")
 _M = TypeVar("_M")
 
 
 class Timed(NamedTuple):
-    """When something is, in nanoseconds, and how many bytes it holds."""
+    """The log time of a message in nanoseconds, and its size in bytes."""
 
     time: int
     size: int
@@ -24,12 +24,12 @@ def in_time_order(
     chunks: Iterable[tuple[int, int, _C]],
     read: Callable[[_C], Iterator[tuple[Timed, _M]]],
 ) -> Iterator[_M]:
-    """Merge the messages of chunks by time; ties in the order of the file.
+    """Yield the messages of all chunks by time, in file order if times are equal.
 
     Parameters
     ----------
-    chunks : time of the first message, position in the file, and the chunk.
-    read : yields the messages of a chunk; called when the chunk is due.
+    chunks : time of the first message (ns), offset in the file, and chunk.
+    read : yields the messages of a chunk; called only once they are needed.
     """
     waiting = sorted(chunks, key=lambda chunk: chunk[:2], reverse=True)
     heap: list[tuple[int, int, int, int, _M]] = []

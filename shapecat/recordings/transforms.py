@@ -1,6 +1,6 @@
-"""Where frames are relative to each other, over time.
+"""Transforms between coordinate frames over time.
 
-Stamps are integer nanoseconds; floats in seconds resolve no better than 238 ns today.
+Stamps are integer nanoseconds: today's time as a float in seconds has a resolution of 238 ns.
 """
 
 import sys
@@ -35,11 +35,11 @@ _FIXED = ("map", "odom", "world")
 
 
 class TransformError(ShapecatError):
-    """A transform is missing in the recording."""
+    """The recording does not hold a transform."""
 
 
 class UnknownFrameError(TransformError):
-    """A frame that no transform names."""
+    """No transform names a frame."""
 
 
 class DisconnectedError(TransformError):
@@ -47,11 +47,11 @@ class DisconnectedError(TransformError):
 
 
 class ExtrapolationError(TransformError):
-    """A time before the first or after the last transform of a frame."""
+    """A time is before the first or after the last transform of a frame."""
 
 
 class TransformLoopError(TransformError):
-    """Frames that are their own ancestors."""
+    """A frame is its own ancestor."""
 
 
 class _Sample(NamedTuple):
@@ -61,20 +61,20 @@ class _Sample(NamedTuple):
 
 
 class _Track:
-    """The parent of one frame over time: hours hold millions of samples, so they are packed."""
+    """The transforms from one frame to its parent, sorted by time; packed, since many."""
 
     def __init__(self) -> None:
         self.stamps = array("q")
         self._parents: list[str] = []
-        self._numbers = array("d")  # seven to a sample
+        self._numbers = array("d")  # seven per sample
 
     def __getitem__(self, k: int) -> _Sample:
-        """Return a sample, from 0."""
+        """Return sample `k`, counted from 0."""
         x, y, z, *quaternion = self._numbers[7 * k : 7 * k + 7]
         return _Sample(self._parents[k], (x, y, z), tuple(quaternion))
 
     def add(self, stamp: int, sample: _Sample) -> None:
-        """Keep a sample in order of time; of three equal ones in a row the middle is not needed."""
+        """Insert a sample by time; of three equal samples in a row, drop the middle one."""
         at, count = bisect_right(self.stamps, stamp), len(self.stamps)
         if at and self.stamps[at - 1] == stamp:
             self._set(slice(at - 1, at), stamp, sample)
@@ -91,11 +91,12 @@ class _Track:
 
 
 class TransformBuffer:
-    """Transforms between frames, static ones valid for all time.
+    """Transforms between frames; static ones are valid for all times.
 
     Parameters
     ----------
-    tolerance_ns : so far outside of its recorded time a transform is held constant.
+    tolerance_ns : how long before its first and after its last sample a transform is assumed to be
+        constant, nanoseconds.
     """
 
     def __init__(self, *, tolerance_ns: int = 100_000_000) -> None:
@@ -107,7 +108,7 @@ class TransformBuffer:
 
     @property
     def frames(self) -> tuple[str, ...]:
-        """Every frame named, sorted."""
+        """The names of all frames, sorted."""
         return tuple(sorted(self._frames))
 
     def add(
@@ -119,16 +120,17 @@ class TransformBuffer:
         *,
         static: bool,
     ) -> bool:
-        """Add a transform; one that is no transform is refused.
+        """Add a transform, unless it is invalid.
 
         Parameters
         ----------
         parent_from_child : translation (x, y, z) in metres and quaternion (x, y, z, w).
+        static : whether it is valid for all times; then ``stamp_ns`` is ignored.
 
         Returns
         -------
-        Whether it was added: not if a frame has no name or is its own parent, or a number is not
-        finite or the quaternion is zero.
+        False if the transform is invalid: a frame has no name or is its own parent, a number is
+        not finite, or the quaternion is zero.
         """
         parent, child = parent.strip().lstrip("/"), child.strip().lstrip("/")
         translation, quaternion = (np.asarray(part, np.float64) for part in parent_from_child)
@@ -147,17 +149,21 @@ class TransformBuffer:
         return True
 
     def ancestors(self, frame_id: str) -> tuple[str, ...]:
-        """Return a frame and its ancestors, nearest first; empty if no transform names it.
+        """Return a frame and its ancestors, nearest first, by the latest transforms.
+
+        Returns
+        -------
+        Empty if no transform names the frame.
 
         Raises
         ------
-        TransformLoopError
+        TransformLoopError : an ancestor of the frame is its own ancestor.
         """
         name = frame_id.lstrip("/")
         return tuple(self._ancestors(name)) if name in self._frames else ()
 
     def root_of(self, frame_id: str) -> str:
-        """Return the ancestor without a parent.
+        """Return the root of a frame's tree, by the latest transforms.
 
         Raises
         ------
@@ -168,7 +174,7 @@ class TransformBuffer:
     def lookup(self, target: str, source: str, stamp_ns: int) -> Pose:
         """Return ``target_from_source`` at a time.
 
-        Between two samples translations are interpolated linearly, rotations spherically.
+        Between two samples, translations are interpolated linearly and rotations by slerp.
 
         Raises
         ------
@@ -195,7 +201,7 @@ class TransformBuffer:
         return name
 
     def _ancestors(self, frame_id: str, stamp_ns: int | None = None) -> list[str]:
-        """Return a frame and its ancestors, at a time or at the last one."""
+        """Return a frame and its ancestors at a time; without one, by the latest transforms."""
         chain = [frame_id]
         while (parent := self._parent(chain[-1], stamp_ns)) is not None:
             if parent in chain or len(chain) > _DEEPEST:
@@ -262,18 +268,18 @@ def _slerp(a: F8, b: F8, share: float) -> F8:
     cosine = float(a @ b)
     if cosine < 0:
         b, cosine = -b, -cosine
-    if cosine > 0.9999:  # the arc is straight to 1e-9
+    if cosine > 0.9999:  # linear interpolation errs by less than 1e-7 rad
         return a + share * (b - a)
     angle = np.arccos(cosine)
     return np.asarray(np.sin((1 - share) * angle) * a + np.sin(share * angle) * b)
 
 
 def fixed_frame(buffer: TransformBuffer, frame_id: str) -> str | None:
-    """Choose a frame that does not move for a sensor frame: map, odom, world, or the root.
+    """Choose the fixed frame for a sensor frame: map, odom, world, or the root of its tree.
 
     Returns
     -------
-    None if no transform names ``frame_id``, or it is the root itself.
+    None if no transform names ``frame_id``, if it is the root itself, or if frames form a loop.
     """
     try:
         root = buffer.root_of(frame_id)
@@ -290,9 +296,12 @@ def fixed_frame(buffer: TransformBuffer, frame_id: str) -> str | None:
 def read_transforms(
     recording: Recording, *, tolerance_ns: int = 100_000_000, static_only: bool = False
 ) -> TransformBuffer:
-    """Read every transform of a recording in one pass, or the static ones, which are few.
+    """Read all transforms of a recording in one pass.
 
-    A topic whose name ends in ``tf_static`` holds static transforms.
+    Parameters
+    ----------
+    tolerance_ns : as for `TransformBuffer`.
+    static_only : read only static transforms, which are few: their topics end in ``tf_static``.
     """
     buffer = TransformBuffer(tolerance_ns=tolerance_ns)
     topics = {
@@ -316,7 +325,7 @@ def read_transforms(
 
 
 def _add(buffer: TransformBuffer, transform: Any, *, static: bool) -> bool:
-    """Add a decoded geometry_msgs/TransformStamped."""
+    """Add a decoded geometry_msgs/TransformStamped; return False if it is invalid."""
     move, turn = transform.transform.translation, transform.transform.rotation
     return buffer.add(
         transform.header.frame_id,
