@@ -1,1 +1,1 @@
-"""The command line: one thin command a file over the library."""
+"""The command line: one module per command, each a thin layer over the library."""

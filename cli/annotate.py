@@ -5,20 +5,26 @@ from typing import Any
 
 import click
 
-from .options import ANY_PATH, BOXES, BOXES_HELP
+from .options import ANY_PATH, BOXES, BOXES_HELP, RECORDING_HELP
 from .render import missed_words, progress_bars
 
 
 @click.command()
 @click.argument("run", type=ANY_PATH)
-@click.option("--labels", type=ANY_PATH, help="Corrected table; RUN/tracks.csv by default.")
+@click.option(
+    "--labels",
+    type=ANY_PATH,
+    metavar="LABELS",
+    help="Corrected table; RUN/tracks.csv by default.",
+)
 @click.option(
     "--by-place",
     is_flag=True,
-    help="LABELS is another run, or its table: transfer its labels to objects at the same places.",
+    help="LABELS is another run, or its tracks.csv: transfer each of its labels to the object at "
+    "the same place.",
 )
-@click.option("--boxes", type=click.Choice(BOXES), help=BOXES_HELP)
-@click.option("--recording", type=ANY_PATH, help="New place of a recording that was moved.")
+@click.option("--boxes", type=click.Choice(BOXES), help=f"{BOXES_HELP}; as before by default.")
+@click.option("--recording", type=ANY_PATH, help=RECORDING_HELP)
 def annotate(
     *,
     run: Path,
@@ -56,9 +62,7 @@ def _show(transfer: dict[str, Any], labels: Path | None) -> None:
     done, missed = transfer["transferred"], transfer["not_transferred"]
     click.echo(f"{len(done)} of {len(done) + len(missed)} labels transferred")
     if transfer["by"] == TABLE_ALONE:
-        text = "the folder of this table is no run: shapecat assumes the same fixed frame, and that"
-        click.echo(
-            f"{labels}: {text} no object was moved; name the folder of the run to be sure", err=True
-        )
+        text = "this table is not in a run folder, so shapecat assumes the same fixed frame and"
+        click.echo(f"{labels}: {text} unmoved objects; give the run folder to check both", err=True)
     for item in missed:
         click.echo(missed_words(item), err=True)

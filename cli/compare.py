@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from .options import ANY_PATH, json_option
+from .options import ANY_PATH, RECORDING_HELP, json_option
 from .render import print_json, print_table, progress_bars
 
 
@@ -15,18 +15,19 @@ from .render import print_json, print_table, progress_bars
 @click.option(
     "--out",
     type=ANY_PATH,
-    help="New folder for a page with pictures, a table of all objects, and the figures.",
+    help="New folder for a page with pictures, a table of all objects, and the metrics as JSON.",
 )
-@click.option("--recording", type=ANY_PATH, help="New place of a recording that was moved.")
+@click.option("--recording", type=ANY_PATH, help=RECORDING_HELP)
 @json_option
 def compare(
     *, run: Path, truth: Path, out: Path | None, recording: Path | None, as_json: bool
 ) -> None:
-    """Compare a run with the truth, with labels of other tools, or with another run.
+    """Compare a run with ground truth, other labels, or another run.
 
-    TRUTH is NAME.truth.json of `shapecat simulate` (or the recording beside it), a COCO file, a
-    folder with label_2 (KITTI), or another run of the same recording as the reference. Frames are
-    matched by their stamps.
+    TRUTH is the NAME.truth.json that `shapecat simulate` writes (or the recording beside it), a
+    COCO file, a KITTI folder (which has a folder label_2), or another run of the same recording.
+    Frames are matched by timestamp; those of another run, and those without a timestamp, by their
+    number.
 
     \b
     shapecat compare results/demo demo.truth.json
@@ -50,9 +51,9 @@ def compare(
 
 
 def _print(found: Any, rows: Any) -> None:
-    """Print the figures, then how many differences there are of each kind."""
+    """Print the metrics, then the number of differences of each kind."""
     click.echo(f"{found.run} compared with {found.reference} ({found.kind})\n")
-    print_table(("figure", "value", "meaning"), rows)
+    print_table(("metric", "value", "meaning"), rows)
     kinds = found.as_dict()["differences"]
     click.echo(f"\n{_words(kinds)}")
     for note in found.notes:

@@ -21,18 +21,26 @@ from .render import print_json, progress_bars
     "--baselines",
     type=ANY_PATH,
     metavar="TRAINING_SET",
-    help="Train a model and simpler learners (forest, linear, PNN, D2, ESF-like) on these views "
-    "and measure all of them on DATASET. If both are the same data set: five-fold "
-    "cross-validation by instance.",
+    help="Train shapecat's model and simpler classifiers on these views and compare them on "
+    "DATASET. If both are the same data set, use five-fold cross-validation by instance.",
 )
 @json_option
 def evaluate(
     *, dataset: Path, model: Path | None, page: Path | None, baselines: Path | None, as_json: bool
 ) -> None:
-    """Measure a model on labelled views: accuracy, confusion, calibration, novelty.
+    """Measure a model on labelled views of objects.
 
-    DATASET has the layout of `shapecat train`. The report also fuses 3, 10 and 30 views of one
-    instance.
+    Print accuracy, confusion matrix, calibration error and novelty detection, and the accuracy
+    after fusing 3, 10 and 30 views of an instance. DATASET is laid out as for `shapecat train`.
+
+    \b
+    --baselines compares these classifiers with shapecat's own:
+    forest        random forest on shapecat's descriptor
+    linear        logistic regression on the same
+    pnn           probabilistic neural network on the same
+    forest words  linear classifiers on the leaves of a forest, as in the thesis
+    D2            random forest on the distribution of point distances
+    ESF-like      random forest on distributions of distances, areas and angles
 
     \b
     shapecat evaluate crops --model mine.npz --report crops.html

@@ -6,11 +6,12 @@ from typing import Any
 
 import click
 
-from .options import ANY_PATH, BOXES, BOXES_HELP
+from .options import ANY_PATH, BOXES, BOXES_HELP, RECORDING_HELP
 from .render import plural, progress_bars
 
 _DATASETS = ("coco", "yolo")
-_FORMATS = (*_DATASETS, "crops", "kitti", "labelcloud", "point-labels")
+_WITH_BOXES = ("kitti", "labelcloud")
+_FORMATS = (*_DATASETS, "crops", *_WITH_BOXES, "point-labels")
 
 
 @click.command()
@@ -26,14 +27,17 @@ _FORMATS = (*_DATASETS, "crops", "kitti", "labelcloud", "point-labels")
     "--out",
     type=ANY_PATH,
     required=True,
-    help="Folder for a data set; the other formats use OUT/NAME.",
+    help="Folder for the export.",
 )
-@click.option("--every", type=click.IntRange(1), default=1, help="Keep only every Nth frame.")
+@click.option(
+    "--every", type=click.IntRange(1), default=1, metavar="N", help="Keep only every Nth frame."
+)
 @click.option(
     "--per-track",
     type=click.IntRange(0),
     default=0,
-    help="coco, yolo: keep frames with the N most different views of each track.",
+    help="coco, yolo: keep only the frames with the N most different views of each track; 0 keeps "
+    "all.",
     metavar="N",
 )
 @click.option(
@@ -55,31 +59,36 @@ _FORMATS = (*_DATASETS, "crops", "kitti", "labelcloud", "point-labels")
     type=click.FloatRange(0, 1, max_open=True),
     default=0.2,
     show_default=True,
-    help="coco, yolo: share of the recordings for validation.",
+    help="coco, yolo: fraction of the recordings in the validation split.",
 )
-@click.option("--boxes", type=click.Choice(BOXES), default="full", help=BOXES_HELP)
-@click.option("--recording", type=ANY_PATH, help="New place of a recording that was moved.")
+@click.option(
+    "--boxes",
+    type=click.Choice(BOXES),
+    help=f"kitti, labelcloud: {BOXES_HELP[0].lower()}{BOXES_HELP[1:]}; full by default.",
+)
+@click.option("--recording", type=ANY_PATH, help=RECORDING_HELP)
 def export(
     *,
     folders: tuple[Path, ...],
     kind: str,
     out: Path,
     every: int,
-    boxes: str,
+    boxes: str | None,
     recording: Path | None,
     **chosen: Any,
 ) -> None:
-    """Export the labels of runs, with images or points, for other tools.
+    """Export labels, with images or points, for other tools.
 
-    Each DIR is a run, or a folder of runs. All runs go into one data set of coco, yolo, or crops.
+    Each DIR is a run, or a folder of runs. coco, yolo and crops merge all runs into one data set,
+    OUT; the other formats write one folder per run, OUT/NAME, named after the run.
 
     \b
-    coco          colour images, masks (RLE), boxes, categories, tracks
-    yolo          colour images, a polygon per object
-    crops         views of objects, in the layout of `shapecat train` and `learn`
-    kitti         label_2, calib, velodyne, image_2
-    labelcloud    a project of the labelling tool labelCloud
-    point-labels  masks for depth images, SemanticKITTI labels for clouds
+    coco          image segmentation: colour images with masks (RLE), boxes, tracks
+    yolo          image segmentation: colour images with a polygon per object
+    crops         `shapecat train` and `learn`: the points of each object
+    kitti         3D detection: label_2, calib, velodyne, image_2
+    labelcloud    editing 3D boxes by hand in the tool labelCloud
+    point-labels  3D segmentation: masks of depth images, SemanticKITTI labels
 
     \b
     shapecat export results/lab --format crops --out crops
@@ -95,6 +104,9 @@ def export(
         raise click.UsageError(msg)
     if kind != "crops":
         _require_own_names(runs)
+    if boxes is not None and kind not in _WITH_BOXES:
+        msg = f"--boxes is for --format {' and '.join(_WITH_BOXES)}, not {kind}"
+        raise click.UsageError(msg)
     if kind in _DATASETS:
         _export_dataset(runs, kind, out, recording, {"every": every, **chosen})
         return
@@ -119,7 +131,7 @@ def export(
 def _export_dataset(
     runs: Sequence[Path], kind: str, out: Path, recording: Path | None, chosen: dict[str, Any]
 ) -> None:
-    """Gather runs in one data set."""
+    """Export several runs as one data set."""
     from shapecat.outputs.dataset_frames import Selection
     from shapecat.outputs.exports import export_dataset
 

@@ -12,13 +12,13 @@ from .render import print_json, print_table
 
 
 @click.command()
-@click.argument("recordings", nargs=-1, required=True, type=ANY_PATH)
+@click.argument("recordings", nargs=-1, required=True, type=ANY_PATH, metavar="RECORDING...")
 @array_option
 @click.pass_context
 def info(ctx: click.Context, /, *, recordings: tuple[Path, ...], as_json: bool) -> None:
-    """List the topics of recordings, and the depth streams that can be processed.
+    """List the topics of recordings and the depth streams to process.
 
-    Each RECORDING may also be a folder with recordings.
+    Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag, or a folder with recordings.
 
     \b
     shapecat info lab.mcap
@@ -41,7 +41,7 @@ def info(ctx: click.Context, /, *, recordings: tuple[Path, ...], as_json: bool) 
 
 
 def _describe(path: Path) -> tuple[dict[str, Any] | None, int]:
-    """Return the contents of a recording and an exit code; print the error if it cannot be read."""
+    """Return the contents of a recording, None if unreadable, and an exit code; print errors."""
     from shapecat.recordings.overview import describe_recording
 
     try:

@@ -1,4 +1,4 @@
-"""The entry point: the group of commands, and the one place where known errors become one line."""
+"""The entry point: the command group, which prints known errors as one line."""
 
 import logging
 import os
@@ -38,7 +38,7 @@ class _Commands(click.Group):
             ctx.exit(error.exit_code)
         except Stopped as stopped:
             kept = ctx.invoked_subcommand == "process"
-            how = "what is done is kept: run the same command again to go on" if kept else ""
+            how = "finished work is kept; run the same command again to continue" if kept else ""
             click.echo("; ".join(filter(None, ("stopped", how))), err=True)
             ctx.exit(stopped.exit_code)
 
@@ -57,7 +57,7 @@ def main() -> None:
     shapecat process demo.mcap --out results    find, categorize and track objects
     shapecat view results/demo                  review them in Rerun
     """
-    # The system's allocator gives memory back that long recordings no longer need.
+    # Unlike Arrow's default, the system's allocator returns freed memory during long recordings.
     os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")
     logging.basicConfig(level=logging.ERROR, stream=sys.stderr, format="%(levelname)s %(message)s")
 

@@ -7,12 +7,11 @@ from typing import Any
 
 import click
 
-EXISTING = click.Path(exists=True, path_type=Path)
 ANY_PATH = click.Path(path_type=Path)
 
 
 class _Seconds(click.FloatRange):
-    """A time after the start of a recording: neither negative nor NaN."""
+    """Seconds after the start of a recording: finite and not negative."""
 
     name = "seconds"
 
@@ -29,7 +28,7 @@ SECONDS = _Seconds(min=0)
 
 json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 array_option = click.option(
-    "--json", "as_json", is_flag=True, help="Print a JSON array, an object per recording."
+    "--json", "as_json", is_flag=True, help="Print a JSON array with one object per recording."
 )
 config_option = click.option("--config", type=ANY_PATH, help="TOML file with settings.")
 set_option = click.option(
@@ -37,10 +36,10 @@ set_option = click.option(
     "overrides",
     multiple=True,
     metavar="NAME=VALUE",
-    help="Change a setting, for example detection.max_range_m=1.5; repeatable.",
+    help="Change a setting, for example detection.max_range_m=1.5. Repeatable.",
 )
 model_option = click.option(
-    "--model", type=ANY_PATH, help="Model file; the default model by default."
+    "--model", type=ANY_PATH, help="Model file; by default the model that comes with shapecat."
 )
 
 
@@ -57,8 +56,13 @@ verbose_option = click.option(
     callback=_be_verbose,
     help="Log each step to stderr.",
 )
+RECORDING_HELP = "Path of the recording, if it was moved."
 BOXES = ("full", "visible")
-BOXES_HELP = "Box the whole object (full), or its visible part."
+BOXES_HELP = "Boxes enclose whole objects (full) or their visible parts"
 seed_option = click.option(
-    "--seed", type=click.IntRange(0), default=0, show_default=True, help="Seed of all random draws."
+    "--seed",
+    type=click.IntRange(0),
+    default=0,
+    show_default=True,
+    help="Seed of the random generator.",
 )

@@ -27,67 +27,79 @@ _MOST_ROWS = 100
 
 
 @click.command()
-@click.argument("recordings", nargs=-1, required=True)
+@click.argument("recordings", nargs=-1, required=True, metavar="RECORDING...")
+@click.option("--out", required=True, metavar="OUT", help="Folder or URL for the results.")
 @click.option(
-    "--out", required=True, help="Folder or URL for the results; each recording gets OUT/NAME."
-)
-@click.option(
-    "--topic", "topics", multiple=True, help="Topic with depth images or clouds; repeatable."
+    "--topic",
+    "topics",
+    multiple=True,
+    metavar="TOPIC",
+    help="Topic of depth images or point clouds, if there are several cameras. Repeatable.",
 )
 @click.option(
     "--up",
     default="auto",
     show_default=True,
     metavar="auto|tf|imu|X,Y,Z",
-    help="Source of the up direction: transforms, an IMU, or a vector in the sensor frame.",
+    help="Up direction: from transforms (tf), an accelerometer (imu), or a vector in the sensor "
+    "frame. auto uses transforms, else an accelerometer, else the planes that the camera sees.",
 )
 @click.option(
-    "--fixed-frame", metavar="F", help="Frame in which objects stand still, such as map or odom."
+    "--fixed-frame",
+    metavar="FRAME",
+    help="Frame in which objects stand still, such as map or odom; by default shapecat chooses "
+    "one.",
 )
-@click.option("--start", "start_s", type=SECONDS, help="Begin this long after the start.")
-@click.option("--end", "end_s", type=SECONDS, help="Stop this long after the start.")
-@click.option("--every", type=click.IntRange(1), default=1, help="Process every Nth frame.")
+@click.option("--start", "start_s", type=SECONDS, help="Skip the first SECONDS of a recording.")
+@click.option("--end", "end_s", type=SECONDS, help="Stop SECONDS after the start of a recording.")
+@click.option(
+    "--every", type=click.IntRange(1), default=1, metavar="N", help="Process every Nth frame."
+)
 @click.option(
     "--jobs",
     type=click.IntRange(1),
-    help="Number of processes, one per core by default. They share the frames of a recording "
-    "if there are fewer recordings.",
+    metavar="N",
+    help="Number of processes; one per core by default. If there are fewer recordings, several "
+    "processes share the frames of one.",
 )
 @click.option(
     "--executor",
     type=click.Choice(["local", "dask", "ray"]),
     default="local",
     show_default=True,
-    help="System that runs the work.",
+    help="Run the processes on this machine, or with Dask or Ray.",
 )
 @click.option(
     "--scheduler", metavar="ADDRESS", help="Address of a running Dask scheduler or Ray cluster."
 )
-@click.option("--shard", metavar="I/N", help="Process part I of N, for job arrays.")
+@click.option(
+    "--shard", metavar="I/N", help="Process part I of N, for job arrays; I counts from 0 or 1."
+)
 @click.option(
     "--progress",
     type=click.Choice(["auto", *KINDS]),
     default="auto",
     show_default=True,
-    help="Format of the progress on stderr.",
+    help="Show progress on stderr as bars (rich), plain lines, JSON lines, or not at all. auto "
+    "shows bars on a terminal, else plain lines.",
 )
 @click.option(
-    "--color", metavar="TOPIC", help="Topic of colour images; that of the depth camera by default."
+    "--color",
+    metavar="TOPIC",
+    help="Topic of colour images; by default those of the depth camera.",
 )
 @click.option("--no-color", is_flag=True, help="Do not use colour images.")
-@click.option("--boxes", type=click.Choice(BOXES), help=BOXES_HELP)
+@click.option("--boxes", type=click.Choice(BOXES), help=f"{BOXES_HELP}; full by default.")
 @click.option("--no-mcap", is_flag=True, help="Do not write annotated.mcap.")
 @click.option("--no-rrd", is_flag=True, help="Do not write review.rrd.")
 @click.option(
     "--overwrite",
     is_flag=True,
-    help="Replace earlier results; corrected labels are transferred by place.",
+    help="Replace earlier results; corrected labels go to the objects at the same places.",
 )
+@click.option("--discard-labels", is_flag=True, help="With --overwrite: drop corrected labels.")
 @click.option(
-    "--discard-labels", is_flag=True, help="With --overwrite: do not transfer corrected labels."
-)
-@click.option(
-    "--no-fsync", is_flag=True, help="Do not flush files to the disk; for scratch folders."
+    "--no-fsync", is_flag=True, help="Do not flush files to disk; faster, for scratch folders."
 )
 @verbose_option
 @model_option
@@ -120,9 +132,10 @@ def process(
     """Find, categorize and track the objects in recordings.
 
     Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a folder with
-    recordings, or a URL. The results are tables, annotated.mcap for Foxglove, and review.rrd for
-    Rerun. For several recordings, OUT/manifest.jsonl records the state of each; the same command
-    again resumes the work.
+    recordings, or a URL. The results of lab.mcap go to OUT/lab: tables, annotated.mcap for
+    Foxglove, and review.rrd for Rerun. If several recordings have the same name, each folder name
+    begins with that of the recording's parent folder. For several recordings, OUT/manifest.jsonl
+    records the state of each. Run the same command again to resume.
 
     \b
     shapecat process lab.mcap kitchen.bag --out results
@@ -130,7 +143,7 @@ def process(
     shapecat process /data/recordings --out results --jobs 8
     shapecat process /data/recordings --out results --shard 2/16
     """
-    # The libraries behind take a second to load: only when there is work.
+    # Load these heavy libraries only when there is work, so that --help stays fast.
     from shapecat.batch import exit_code
     from shapecat.batch.plans import plan_batch
     from shapecat.config import load_settings
@@ -139,6 +152,9 @@ def process(
 
     if color is not None and no_color:
         msg = "--color and --no-color contradict each other"
+        raise click.UsageError(msg)
+    if choices["discard_labels"] and not choices["overwrite"]:
+        msg = "--discard-labels needs --overwrite: without it, labels stay with their results"
         raise click.UsageError(msg)
     _require_range(choices["start_s"], choices["end_s"])
     if no_fsync:
@@ -166,7 +182,7 @@ def process(
 
 
 def _require_range(start_s: float | None, end_s: float | None) -> None:
-    """Refuse an empty range."""
+    """Reject an empty time range."""
     if end_s is not None and end_s <= (start_s or 0):
         msg = f"--end {end_s:g} is not after --start {start_s or 0:g}"
         raise click.UsageError(msg)
@@ -175,7 +191,7 @@ def _require_range(start_s: float | None, end_s: float | None) -> None:
 def _run(
     batch: Any, watcher: Progress, jobs: int | None, name: str, scheduler: str | None
 ) -> Iterator[Any]:
-    """Process the tasks of a batch here where one process is enough, else on an executor."""
+    """Process a batch in this process if one is enough, otherwise on an executor."""
     from shapecat.batch import process_here, process_on
     from shapecat.executors import open_executor, share_cores
 
@@ -193,7 +209,7 @@ def _run(
 
 @contextmanager
 def _closing(executor: Any) -> Iterator[Any]:
-    """Let the workers end when all is done; have them put their work down after a signal."""
+    """Shut the workers down after the work; after a signal, ask them to stop and save theirs."""
     try:
         yield executor
     except Stopped:
@@ -206,7 +222,7 @@ def _closing(executor: Any) -> Iterator[Any]:
 
 
 class _Tally:
-    """The outcomes of a batch: all of a few, counts of many, as there may be a million."""
+    """Counts of all outcomes of a batch; only the first 100 are kept, as there may be millions."""
 
     def __init__(self, *, keep_all: bool) -> None:
         self.complete = self.failed = self.frames = 0
@@ -228,7 +244,7 @@ class _Tally:
 
 
 def _print_closing(tasks: Sequence[Any], tally: _Tally) -> None:
-    """Print the outcome of each recording, in the order of the plan."""
+    """Print the complete recordings in the order of the plan, if they are few, and totals."""
     ended = {outcome.job.folder.name: outcome for outcome in tally.kept}
     complete = [ended[task.name] for task in tasks if task.name in ended]
     if 0 < tally.complete <= _MOST_ROWS:

@@ -25,7 +25,13 @@ WORDS = {
 
 
 def describe_plan(tasks: Sequence[Any], left_out: int, workers: int, cores: int) -> str:
-    """Return a one-line summary of the plan."""
+    """Return a one-line summary of the plan.
+
+    Parameters
+    ----------
+    left_out : number of skipped files.
+    workers, cores : recordings processed at once, and frames of each processed at once.
+    """
     counts = Counter(task.status for task in tasks)
     parts = [f"{counts[status]} {words}" for status, words in WORDS.items() if counts[status]]
     todo = sum(task.bytes for task in tasks if task.status != "complete")
@@ -36,10 +42,10 @@ def describe_plan(tasks: Sequence[Any], left_out: int, workers: int, cores: int)
 
 
 class Progress:
-    """Count finished recordings; subclasses show them."""
+    """Counts finished recordings and prints notes and errors; subclasses show more."""
 
     def __init__(self, tasks: Sequence[Any]) -> None:
-        """Start from the plan."""
+        """Begin with the planned tasks."""
         self.lock = Lock()
         self.begun = time.monotonic()
         self.tasks = {task.name: task for task in tasks}
@@ -53,13 +59,13 @@ class Progress:
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Show nothing more."""
+        """Leave the display as it is."""
 
     def plan(self, text: str) -> None:
-        """Show the plan."""
+        """Show the summary of the plan."""
 
     def progress(self, folder: str, phase: str, done: int, total: int | None) -> None:
-        """Receive the progress of a recording."""
+        """Receive the progress of the recording with this run folder; total is None if unknown."""
         with self.lock:
             if phase == "compile":
                 if not self._told:
@@ -85,7 +91,7 @@ class Progress:
             self.show_ended(outcome)
 
     def remaining_s(self) -> float | None:
-        """Return the estimated seconds left, from the bytes read so far."""
+        """Return the estimated seconds left, from the bytes read so far; None before the first."""
         if not self.read:
             return None
         rate = self.read / (time.monotonic() - self.begun)
@@ -105,7 +111,7 @@ class Progress:
 
 
 class PlainProgress(Progress):
-    """A line every few seconds."""
+    """Prints a line every few seconds."""
 
     _last = 0.0
 
@@ -114,7 +120,7 @@ class PlainProgress(Progress):
         self.note(text)
 
     def show(self, folder: str) -> None:  # noqa: ARG002  the line is about all
-        """Write a line, if the last one is some seconds old."""
+        """Write a line, if the previous one is at least five seconds old."""
         now = time.monotonic()
         if now - max(self._last, self.begun) < _LINE_S:
             return
@@ -142,10 +148,10 @@ def _duration(seconds: float) -> str:
 
 
 class JsonProgress(Progress):
-    """One JSON object per line, for programs."""
+    """Prints one JSON object per line, for programs."""
 
     def __init__(self, tasks: Sequence[Any]) -> None:
-        """Start from the plan."""
+        """Begin with the planned tasks and write the plan."""
         super().__init__(tasks)
         self._last: dict[str, tuple[str, float]] = {}
         statuses = Counter(task.status for task in tasks)
@@ -156,7 +162,7 @@ class JsonProgress(Progress):
         _event("note", text=text)
 
     def show(self, folder: str) -> None:
-        """Write the progress of a recording, a few times a second at most."""
+        """Write the progress of a recording, at most twice a second."""
         phase, done, total = self.running[folder]
         before, now = self._last.get(folder, ("", 0.0)), time.monotonic()
         if phase != before[0] or now - before[1] >= _EVENT_S or done == total:
@@ -214,7 +220,7 @@ class LiveProgress(Progress):
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Take the bars away."""
+        """Remove the bars."""
         self._stack.close()
 
     def plan(self, text: str) -> None:
@@ -236,7 +242,7 @@ class LiveProgress(Progress):
         self._rich.update(bar, description=text, completed=done, total=total)
 
     def show_ended(self, outcome: Any) -> None:
-        """Take the bar of a recording away, and name it if it failed."""
+        """Remove the bar of a recording; print its error if it failed."""
         bar = self._bars.pop(outcome.job.folder.name, None)
         if bar is not None:
             self._rich.remove_task(bar)
@@ -254,7 +260,7 @@ KINDS: dict[str, type[Progress]] = {
 
 
 def open_progress(kind: str, tasks: Sequence[Any]) -> Progress:
-    """Return a progress of a kind; ``auto`` is bars on a terminal and plain lines elsewhere."""
+    """Return a progress display; ``auto`` is bars on a terminal and plain lines elsewhere."""
     if kind == "auto":
         kind = "rich" if sys.stderr.isatty() else "plain"
     return KINDS[kind](tasks)

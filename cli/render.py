@@ -91,7 +91,7 @@ def print_table(
 
 
 def missed_words(missed: Mapping[str, Any]) -> str:
-    """Return a label that was not transferred, with the reason."""
+    """Describe a label that was not transferred, with the reason."""
     return f"  track {missed['old_track']}, {missed['label']}: {missed['reason']}"
 
 

@@ -17,17 +17,17 @@ if TYPE_CHECKING:
 
 @click.command()
 @click.argument("folders", nargs=-1, required=True, type=ANY_PATH, metavar="DIR...")
-@click.option("--serve", is_flag=True, help="Serve the pages to this machine until Ctrl+C.")
+@click.option("--serve", is_flag=True, help="Serve the pages on this machine until Ctrl+C.")
 @click.option(
-    "--port", type=click.IntRange(0, 65535), help="Port of --serve; by default one that is free."
+    "--port", type=click.IntRange(0, 65535), help="Port of --serve; by default a free one."
 )
 def report(*, folders: tuple[Path, ...], serve: bool, port: int | None) -> None:
-    """Make a page per run, to review and correct its tracks in a browser.
+    """Make a page per run to review and correct tracks in a browser.
 
-    Each DIR is a run, or a folder of runs, which also gets an index.html. The page needs no
-    network and can be mailed; download the corrected tracks.csv and apply it with
-    `shapecat annotate`. With --serve the page writes corrections to RUN/tracks.csv as you make
-    them.
+    Each DIR is a run, or a folder of runs. The page of a run is RUN/report.html; several runs also
+    get an index.html in the folder that contains them all. A page needs no network and can be
+    mailed. Download the corrected tracks.csv from it and apply the file with `shapecat annotate`.
+    With --serve the page writes corrections to RUN/tracks.csv as you make them.
 
     \b
     shapecat report results
@@ -53,7 +53,7 @@ def report(*, folders: tuple[Path, ...], serve: bool, port: int | None) -> None:
 
 
 def _serve(reports: "Reports", port: int) -> None:
-    """Serve until a signal comes; then the pages hold the corrections as well."""
+    """Serve until a signal arrives, then write the pages again with the corrections."""
     from shapecat.outputs.report.serving import serve_reports
 
     with serve_reports(reports, port=port) as address:

@@ -22,7 +22,7 @@ _SENSORS = (
     "l515",
     "phone",
 )
-"""Named here too, so that help needs no simulator."""
+"""Repeated here so that ``--help`` does not load the simulator."""
 
 
 @click.command()
@@ -32,27 +32,28 @@ _SENSORS = (
     type=click.Choice(_SCENES),
     default="tabletop",
     show_default=True,
-    help="Kind of scene.",
+    help="Kind of scene, listed above.",
 )
 @click.option(
     "--format",
     "container",
     type=click.Choice(["mcap", "ros1", "ros2"]),
-    help="Format of the recording; by default that of the suffix of OUT, else mcap.",
+    help="Format; by default the one that OUT's suffix names.",
 )
 @click.option(
     "--sensor",
     type=click.Choice(_SENSORS),
     default="kinect",
     show_default=True,
-    help="Depth camera.",
+    help="Depth camera to simulate.",
 )
 @click.option(
     "--frames",
     type=click.IntRange(1),
     default=90,
     show_default=True,
-    help="Number of frames; 30 are one second.",
+    metavar="N",
+    help="Number of frames, at 30 per second.",
 )
 @click.option("--clouds", is_flag=True, help="Write PointCloud2 instead of depth images.")
 @click.option("--color", is_flag=True, help="Add a colour camera beside the depth camera.")
@@ -70,10 +71,24 @@ def simulate(
     overwrite: bool,
     seed: int,
 ) -> None:
-    """Make a recording of simulated objects, with the truth beside it.
+    """Simulate a recording of objects, with ground truth beside it.
 
-    OUT.truth.json holds the objects of each frame, OUT.labels.npz the object of each depth pixel,
-    and with --color OUT.color_labels.npz that of each colour pixel.
+    OUT is NAME.mcap, NAME.bag (ROS 1), or NAME for a ROS 2 folder. NAME.truth.json holds the
+    objects of each frame, and NAME.labels.npz the object that each depth pixel shows. With --color,
+    NAME.color_labels.npz holds the object that each colour pixel shows.
+
+    \b
+    tabletop    separate objects on a table
+    shelf       objects on three boards of a shelf
+    clutter     objects close together and stacked on a table
+    pile        objects dropped in a heap on a table
+    bin         objects dropped into a bin
+    shelf_bin   objects in a compartment of a shelf, seen from the front
+    room        a table among robot arms, people and furniture
+    turntable   a turning table before a still camera
+    walking     a camera that moves along a counter and back
+    crossing    two moving objects that hide others and each other
+    rearranged  objects that are added, removed, carried and pushed
 
     \b
     shapecat simulate demo.mcap --scene clutter --frames 60 --seed 3
@@ -84,7 +99,7 @@ def simulate(
     container = _format_of(out, container)
     there = [path for path in written_paths(out, container, color=color) if path.exists()]
     if there and not overwrite:
-        msg = f"{there[0]} is there already; --overwrite replaces it"
+        msg = f"{there[0]} exists already; --overwrite replaces it"
         raise click.UsageError(msg)
     with progress_bars() as bars:
         path = write_simulation(
@@ -105,7 +120,7 @@ _SUFFIXES = {"mcap": ".mcap", "ros1": ".bag", "ros2": ""}
 
 
 def _format_of(out: Path, wanted: str | None) -> Any:
-    """Return the format that the suffix or the option names, if they do not contradict."""
+    """Return the format that the suffix or the option names; reject a contradiction."""
     named = next((name for name, suffix in _SUFFIXES.items() if suffix == out.suffix), None)
     if named is None:
         stem = out.with_suffix("").name

@@ -14,10 +14,12 @@ from .render import print_json, progress_bars
 @seed_option
 @json_option
 def train(*, dataset: Path, out: Path, seed: int, as_json: bool) -> None:
-    """Learn a model from labelled views of objects.
+    """Train a model on labelled views of objects.
 
-    DATASET/<category>/<instance>/<view>.pcd (or .ply, .npz): one partial view each, in metres, z
-    up, standing on z = 0. A folder named `unknown` holds shapes of no category.
+    DATASET holds one file per view, <category>/<instance>/<view>.pcd (or .ply, .npz): the points of
+    an object seen from one side, in metres, z up, with the supporting plane at z = 0. The category
+    folder `unknown` holds shapes that belong to no category. `shapecat export --format crops`
+    writes such a data set.
 
     \b
     shapecat train crops --out mine.npz

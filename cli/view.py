@@ -14,16 +14,16 @@ from .options import ANY_PATH
 @click.command()
 @click.argument("run", type=ANY_PATH)
 @click.option(
-    "--web", is_flag=True, help="Serve the review to a browser on this machine until Ctrl+C."
+    "--web", is_flag=True, help="Serve the viewer to a browser on this machine until Ctrl+C."
 )
 @click.option(
     "--screenshot",
     type=ANY_PATH,
     metavar="PNG",
-    help="Write a picture instead of opening a window.",
+    help="Write a screenshot instead of opening a window.",
 )
 def view(*, run: Path, web: bool, screenshot: Path | None) -> None:
-    """Open the review of a run in the Rerun viewer.
+    """Open review.rrd of a run in the Rerun viewer.
 
     \b
     shapecat view results/lab
@@ -45,7 +45,7 @@ def view(*, run: Path, web: bool, screenshot: Path | None) -> None:
 
 
 def _serve(review: Path) -> None:
-    """Serve until the viewer ends or a signal comes."""
+    """Serve until the viewer ends or a signal arrives."""
     from shapecat.outputs.review_viewer import serve_viewer
 
     with serve_viewer(review) as (address, viewer):

@@ -279,6 +279,18 @@ def test_options_of_data_sets_are_refused_elsewhere(
     assert "--corrected-only is for --format coco and yolo, not kitti" in result.stderr
 
 
+@pytest.mark.parametrize("kind", ["coco", "yolo", "crops", "point-labels"])
+def test_boxes_are_refused_by_formats_without_them(
+    run: Path, tmp_path: Path, shapecat: Run, kind: str
+) -> None:
+    """The option was ignored without a word."""
+    out = tmp_path / "out"
+    result = shapecat("export", run, "--format", kind, "--out", out, "--boxes", "visible")
+    assert result.exit_code == 2
+    assert f"--boxes is for --format kitti and labelcloud, not {kind}" in result.stderr
+    assert not out.exists()
+
+
 def test_kitti_boxes_project_onto_the_colour_image(run: Path, tmp_path: Path) -> None:
     """P2, the 3D boxes and the image are three files that must tell of one camera."""
     export_run(run, "kitti", tmp_path)

@@ -515,6 +515,14 @@ def test_overwriting_keeps_corrections(shapecat: Run, corrected: tuple[Path, Pat
     assert "teapot" not in annotated(run)
 
 
+def test_labels_are_not_discarded_without_overwriting(shapecat: Run, tmp_path: Path) -> None:
+    """Without --overwrite the option has no effect, and was ignored without a word."""
+    done = shapecat("process", tmp_path / "lab.mcap", "--out", tmp_path, "--discard-labels")
+
+    assert done.exit_code == 2
+    assert "--discard-labels needs --overwrite" in done.stderr
+
+
 def labels_in(table: Path) -> set[str]:
     return {row.label for row in read_track_table(table).rows if row.label}
 

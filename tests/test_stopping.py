@@ -87,7 +87,7 @@ def test_a_signal_keeps_what_is_done(
 
     assert returned == code
     assert "Traceback" not in errors
-    assert "run the same command again to go on" in errors
+    assert "run the same command again to continue" in errors
     assert not (tmp_path / "table").exists()
 
     process(Job(recording, tmp_path / "table", rrd=False))
