@@ -115,7 +115,10 @@ def test_parts_are_joined_once_and_where_they_are_nearest() -> None:
 
 
 def test_stacked_objects_are_described_from_what_they_stand_on() -> None:
-    """Described from the table up, a box on a box would begin at the height of the lower one."""
+    """Described from the table up, a box on a box would begin at the height of the lower one.
+
+    Completed from the table up, it would reach through it.
+    """
     shapes = [table(), box((0, 0, 0), (0.22, 0.18, 0.08)), box((0, 0.01, 0.08), (0.1, 0.08, 0.1))]
     frame = frame_of(render(shapes)[0])
     guesser: Any = Guesser()
@@ -128,6 +131,8 @@ def test_stacked_objects_are_described_from_what_they_stand_on() -> None:
     assert top.candidate.support_m == pytest.approx(0.08, abs=0.01)
     assert top.descriptor[low] < 0.02
     assert top.descriptor[high] == pytest.approx(0.1, abs=0.02)
+    assert top.full is not None
+    assert top.full.size[2] == pytest.approx(0.1, abs=0.02)
 
 
 def scene_of(frame: Frame, up: F8 | None) -> F8:
