@@ -118,6 +118,7 @@ def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> 
         msg = 'a script that processes needs `if __name__ == "__main__":` around what it calls'
         raise RuntimeError(msg)
     begun = time.perf_counter()
+    notes.parent.mkdir(parents=True, exist_ok=True)  # another version may have removed it
     while (held := lock(notes.parent)) is None:
         stopping.check()
         time.sleep(_POLL_S)

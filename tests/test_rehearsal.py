@@ -42,6 +42,17 @@ def test_compiling_is_done_once(trace: Path) -> None:
     assert trace.read_text() == "x"
 
 
+def test_kernels_are_kept_where_another_version_removed_their_folder(
+    trace: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """An update while a batch runs must not fail the recordings that are still to come."""
+    monkeypatch.setattr(rehearsal, "_notes", lambda: tmp_path / "removed" / "complete")
+
+    assert compile_all() > 0
+    assert compile_all() == 0
+    assert trace.read_text() == "x"
+
+
 def test_an_interrupted_one_is_done_again(trace: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Half of the kernels are not all of them."""
 
