@@ -1,6 +1,6 @@
-"""Simulated depth cameras looking at simulated scenes: fixtures, demos and training data.
+"""Simulated depth cameras and scenes, for fixtures, demos and training data.
 
-Everything comes from a seed and is the same on every machine.
+The seed alone determines the result, on every machine.
 """
 
 from shapecat.simulation.layout import Piece, make_piece

@@ -113,7 +113,7 @@ def _plain(rng: Generator, r: float, h: float) -> F8:
 
 
 def make_bottle(rng: Generator) -> Mesh:
-    """Make a closed body with a clearly narrower top: at most 0.62 of its width."""
+    """Make a closed body with a neck at most 0.62 times as wide as the body."""
     family = rng.choice(
         ["water", "wine", "shampoo", "spray", "cleanser", "squeeze", "slim", "pump", "trigger"],
         p=[0.2, 0.13, 0.17, 0.1, 0.1, 0.1, 0.08, 0.06, 0.06],
@@ -156,7 +156,7 @@ def make_bottle(rng: Generator) -> Mesh:
 
 
 def _bottle_side(rng: Generator, family: str, body: float) -> F8:
-    """Return the side of the body, from its foot to where the shoulder begins, of a unit bottle."""
+    """Return the side profile (radius, z) of a unit bottle, from its foot to its shoulder."""
     foot = rng.uniform(0.85, 0.98)
     waist = {"cleanser": rng.uniform(0.72, 1.0), "water": rng.uniform(0.84, 1.02)}.get(family, 1.0)
     top = {"squeeze": rng.uniform(0.75, 1.0), "shampoo": rng.uniform(0.8, 1.05)}.get(family, 1.0)
@@ -167,7 +167,7 @@ def _bottle_side(rng: Generator, family: str, body: float) -> F8:
 
 
 def _bottle(rng: Generator, side: F8, shoulder: float, neck: float, *, tip: bool) -> F8:
-    """Return the profile of a bottle of height and radius 1."""
+    """Return the profile (radius, z) of a bottle of height 1 and radius 1."""
     start, width = side[-1, 1], side[-1, 0]
     t = np.linspace(0, 1, 9)[1:]
     shape = rng.choice(["round", "cone", "bell"])
@@ -187,7 +187,7 @@ def _bottle(rng: Generator, side: F8, shoulder: float, neck: float, *, tip: bool
 
 
 def _flattened(mesh: Mesh, stretch: float, low: float, high: float, neck: float) -> Mesh:
-    """Make the body oval and leave the neck round."""
+    """Make the body oval but keep the neck round."""
     if stretch >= 1:
         return mesh
     points = np.asarray(mesh.vertices, np.float64)
@@ -200,7 +200,7 @@ def _flattened(mesh: Mesh, stretch: float, low: float, high: float, neck: float)
 
 
 def _bent(mesh: Mesh, shift: float, low: float, high: float) -> Mesh:
-    """Move the neck to one side, as on bottles one pours from."""
+    """Move the neck to one side, as on bottles for pouring."""
     points = np.array(mesh.vertices, np.float64)
     t = np.clip((points[:, 2] - low) / (high - low), 0, 1)
     points[:, 0] += shift * t * t * (3 - 2 * t)
@@ -208,7 +208,7 @@ def _bent(mesh: Mesh, shift: float, low: float, high: float) -> Mesh:
 
 
 def _pump(rng: Generator, radius: float, height: float) -> list[Mesh]:
-    """Return the head of a lotion pump: a stem with a beak."""
+    """Return the head of a lotion pump: a stem with a spout."""
     stem = rng.uniform(0.02, 0.045)
     thick = float(np.clip(0.35 * radius, 0.003, 0.006))
     z = height + stem
@@ -232,7 +232,7 @@ def _trigger(rng: Generator, radius: float, height: float) -> list[Mesh]:
 
 
 def make_box(rng: Generator) -> Mesh:
-    """Make a box: planar faces at right angles, edges sharp or a little round."""
+    """Make a box: planar faces at right angles, with sharp or slightly rounded edges."""
     family = rng.choice(
         ["any", "packet", "book", "small", "cube", "bar", "carton"],
         p=[0.22, 0.25, 0.15, 0.15, 0.09, 0.09, 0.05],
@@ -284,7 +284,7 @@ def _gable_carton(rng: Generator) -> Mesh:
 
 
 def make_ball(rng: Generator) -> Mesh:
-    """Make a ball, perhaps a little egg-like (0.95 to 1.05)."""
+    """Make a ball, often slightly ellipsoidal (each axis scaled by 0.97 to 1.03)."""
     diameter = log_uniform(rng, 0.032, 0.24)
     t = np.linspace(-np.pi / 2, np.pi / 2, 25)
     mesh = lathe(np.stack([np.cos(t), np.sin(t)], -1) * diameter / 2, segments=36)

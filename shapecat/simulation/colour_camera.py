@@ -1,4 +1,4 @@
-"""A textured colour camera beside the depth camera: other place, resolution and lens."""
+"""A colour camera beside the depth camera, with its own resolution and lens; textured scenes."""
 
 import io
 from dataclasses import dataclass
@@ -19,9 +19,10 @@ __all__ = ["COLOUR", "ColourCamera", "jpeg", "render_colour"]
 
 @dataclass(frozen=True)
 class ColourCamera:
-    """A colour camera on the rig of the depth camera.
+    """A colour camera mounted beside the depth camera.
 
-    ``depth_from_colour`` is its pose in the optical frame of the depth camera.
+    ``depth_from_colour`` is its pose in the optical frame of the depth camera; ``quality`` is that
+    of its JPEG images, 1 to 95.
     """
 
     lens: LensCamera
@@ -40,16 +41,16 @@ COLOUR = ColourCamera(
 """Like the colour camera of a RealSense: 5 cm to the right, turned by a degree, a wider image."""
 
 _FINE = 2
-"""Rendered so many times finer than the image, then looked up along the rays of the lens."""
+"""Oversampling of the rendered pinhole image, which the rays of the lens then sample."""
 
 
 def render_colour(world: World, frame: int, camera: ColourCamera = COLOUR) -> tuple[U1, U1]:
-    """Take a colour image of a world.
+    """Render a colour image of a world.
 
     Returns
     -------
-    (h, w, 3) uint8 red, green, blue; and (h, w) uint8 labels, 0 where there is nothing, else as of
-    the depth image.
+    The image (h, w, 3), uint8 red, green, blue; and its labels (h, w), uint8: those of
+    ``world.labels``, 0 where nothing is seen.
     """
     pose = compose(world.path[frame], camera.depth_from_colour)
     fine, rows, columns = _lookup(camera.lens)
@@ -61,7 +62,7 @@ def render_colour(world: World, frame: int, camera: ColourCamera = COLOUR) -> tu
 
 @lru_cache(maxsize=4)  # a recording has one lens
 def _lookup(lens: LensCamera) -> tuple[Camera, I4, I4]:
-    """Return a finer pinhole camera, and its pixel that each pixel of the lens sees."""
+    """Return a finer pinhole camera, and its row and column (h, w) for each pixel of the lens."""
     camera = lens.pinhole
     rays = undistorted_rays(camera, lens.model, lens.coefficients)
     if rays is None:
@@ -80,7 +81,7 @@ def _lookup(lens: LensCamera) -> tuple[Camera, I4, I4]:
 def _paint(
     world: World, frame: int, pose: Pose, camera: Camera, image: Image, rows: I4, columns: I4
 ) -> U1:
-    """Return the colours of what is seen: a texture that is fixed on each thing, in the light."""
+    """Return the shaded colours (h, w, 3) uint8; the texture moves with each object."""
     near, owners = image.inverse[rows, columns], image.owners[rows, columns]
     facing = np.abs(image.cosine[rows, columns])
     z = 1 / np.where(near > 0, near, 1.0)
@@ -105,9 +106,9 @@ def _in_mesh(points: F8, world_from_mesh: Pose) -> F8:
 
 
 def _texture(points: F8, number: int, *, plain: bool) -> F8:
-    """Return the colours of points on a surface: two tones in bands, and fine grain.
+    """Return the colours (n, 3), 0 to 255, of surface points (n, 3): two-tone bands and fine grain.
 
-    Arithmetic alone, no sines, so that images are the same on every machine.
+    The texture uses only basic arithmetic, no sines, so that images are equal on every machine.
     """
     draw = np.random.default_rng(number + 71)
     tone = draw.uniform(90, 180, 3) if plain else draw.uniform(30, 235, 3)
@@ -122,7 +123,7 @@ def _texture(points: F8, number: int, *, plain: bool) -> F8:
 
 def jpeg(colours: U1, quality: int = 85) -> bytes:
     """Encode (h, w, 3) uint8 as JPEG."""
-    from PIL import Image as Picture  # noqa: PLC0415  # loaded where there is colour
+    from PIL import Image as Picture  # noqa: PLC0415  # only for colour
 
     file = io.BytesIO()
     Picture.fromarray(colours).save(file, "jpeg", quality=quality)

@@ -1,4 +1,4 @@
-"""The containers a simulated recording can be written in."""
+"""The container formats of simulated recordings."""
 
 from abc import ABC, abstractmethod
 from pathlib import Path
@@ -28,7 +28,7 @@ _QOS = """- history: {history}
 
 
 class Container(Protocol):
-    """A recording being written; leaving the block completes it."""
+    """A recording being written; leaving the ``with`` block completes it."""
 
     messages: MessageFactory
 
@@ -43,7 +43,7 @@ class Container(Protocol):
 
 
 class _Mcap:
-    """MCAP with ROS 2 messages, zstd."""
+    """An MCAP file with ROS 2 messages, compressed with zstd."""
 
     def __init__(self, path: Path) -> None:
         self.messages = MessageFactory(2)
@@ -76,7 +76,7 @@ class _Mcap:
 
 
 class _Bag(ABC):
-    """A recording of one of the writers of rosbags."""
+    """A recording written by rosbags."""
 
     ros_version: ClassVar[Literal[1, 2]]
 
@@ -91,7 +91,7 @@ class _Bag(ABC):
 
     @abstractmethod
     def quality(self, *, latched: bool) -> dict[str, Any]:
-        """Return how a topic is kept for those that subscribe late."""
+        """Return the options of a topic; a latched one resends its last message to subscribers."""
 
     def __enter__(self) -> Self:
         self._file.open()
@@ -122,7 +122,7 @@ class _Ros1(_Bag):
 
 
 class _Ros2(_Bag):
-    """A ROS 2 folder with an SQLite database."""
+    """A ROS 2 bag: a folder with an SQLite database."""
 
     ros_version = 2
 
@@ -152,4 +152,4 @@ CONTAINERS: dict[str, tuple[str, type[Container]]] = {
     "ros1": (".bag", _Ros1),
     "ros2": ("", _Ros2),
 }
-"""Suffix and writer of each recording format."""
+"""File suffix and writer of each recording format."""

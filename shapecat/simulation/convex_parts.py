@@ -1,4 +1,4 @@
-"""Meshes as convex parts, for a physics engine: what is hollow stays hollow."""
+"""Approximate convex decomposition of meshes for a physics engine; hollow objects stay hollow."""
 
 from collections.abc import Iterator
 
@@ -13,18 +13,18 @@ __all__ = ["convex_parts", "hollowness"]
 _PITCH_M = 0.004
 """Distance between samples of a surface."""
 _BLOCKS = 4
-"""Blocks along each axis into which a hollow mesh is cut: a wall is nearly flat within one."""
+"""Blocks along each axis that a hollow mesh is cut into; a wall is nearly flat within a block."""
 _SKIN_M = 0.001
-"""A part is at least twice as thick: engines refuse solids without volume."""
+"""Half the least thickness of a part: physics engines reject solids without volume."""
 _HOLLOW = 0.2
 _COLUMNS = 9
 
 
 def convex_parts(mesh: Mesh) -> list[F8]:
-    """Return the corners (k, 3) of convex solids that together fill a mesh, metres, its frame.
+    """Return the corners (k, 3) of each convex solid of a mesh, metres, in the mesh's frame.
 
-    A mesh without an opening at its top is one solid, its convex hull. The walls of others are cut
-    into blocks, so that what falls into a cup lies in the cup.
+    A mesh without an opening at its top becomes one solid, its convex hull. The walls of an open
+    mesh are cut into blocks, so that an object can fall into a cup.
     """
     points = np.asarray(mesh.vertices, np.float64)
     if hollowness(mesh) < _HOLLOW:
@@ -33,7 +33,7 @@ def convex_parts(mesh: Mesh) -> list[F8]:
 
 
 def hollowness(mesh: Mesh) -> float:
-    """Return the share of the convex hull, 0 to 1, that is open to above."""
+    """Return the fraction (0 to 1) of the convex hull's volume that is empty and open above."""
     points = _samples(mesh)
     low, high = points.min(axis=0), points.max(axis=0)
     size = np.maximum(high - low, 1e-9)
@@ -64,7 +64,7 @@ def _span(hull: ConvexHull, spots: F8) -> tuple[F8, F8]:
 
 
 def _samples(mesh: Mesh) -> F8:
-    """Return points all over a surface, at most a pitch apart."""
+    """Return points (n, 3) over the whole surface, about `_PITCH_M` apart or closer."""
     corners = np.asarray(mesh.vertices, np.float64)[mesh.triangles]
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
     counts = np.ceil(longest / _PITCH_M).astype(int).clip(1, 100)
@@ -88,7 +88,7 @@ def _blocks(points: F8) -> Iterator[F8]:
 
 
 def _thickened(points: F8) -> F8:
-    """Give a part at least its skin in all directions."""
+    """Thicken a flat part (n, 3) to at least twice `_SKIN_M` in all directions."""
     for _ in range(3):  # a plane, a line, or a point
         middle = points.mean(axis=0)
         normal = np.linalg.eigh((points - middle).T @ (points - middle))[1][:, 0]
@@ -101,12 +101,12 @@ def _thickened(points: F8) -> F8:
 
 
 def _corners(points: F8, directions: F8) -> F8:
-    """Return the points that are farthest in some direction: a hull of few corners."""
+    """Return the points (k, 3) farthest along one of the directions: a hull with few corners."""
     return np.asarray(points[np.unique((points @ directions.T).argmax(axis=0))])
 
 
 def _sphere(count: int) -> F8:
-    """Return unit vectors (count, 3) all around (a Fibonacci spiral)."""
+    """Return unit vectors (count, 3) spread over the sphere (Fibonacci spiral)."""
     z = 1 - (2 * np.arange(count) + 1) / count
     turn = np.arange(count) * np.pi * (3 - np.sqrt(5))
     flat = np.sqrt(1 - z * z)
@@ -115,4 +115,4 @@ def _sphere(count: int) -> F8:
 
 _AXES = np.stack(np.meshgrid([-1, 0, 1], [-1, 0, 1], [-1, 0, 1]), -1).reshape(-1, 3).astype(float)
 _ALL_AROUND = np.concatenate([_AXES, _sphere(100)])
-"""Of a body: with its corners, if it is a box."""
+"""Directions for a convex hull; with `_AXES` among them, the hull of a box keeps its corners."""

@@ -1,4 +1,4 @@
-"""Things that are none of the seven categories, to learn what *unknown* looks like."""
+"""Objects outside the seven categories, which train and test the rejection of unknown shapes."""
 
 from collections.abc import Callable
 
@@ -15,19 +15,19 @@ from shapecat.simulation.toys import TOYS
 __all__ = ["DISTRACTORS", "make_distractor"]
 
 DISTRACTORS: dict[str, Callable[[Generator], Mesh]] = {**KITCHEN, **TOOLS, **TOYS}
-"""The kinds of things outside the categories, each with its maker."""
+"""Kinds of objects outside the categories, with the functions that make them."""
 
 
 def make_distractor(rng: Generator, kind: str | None = None) -> tuple[str, Mesh]:
-    """Make a random object outside the categories; returns its kind and shape.
+    """Make a random object outside the categories; return its kind and mesh.
 
     Parameters
     ----------
-    kind : one of `DISTRACTORS`, which are drawn from by default, or a family of `PROCEDURAL`.
+    kind : one of `DISTRACTORS` or `PROCEDURAL`; by default a random one of `DISTRACTORS`.
 
     Raises
     ------
-    ValueError : there is no such kind.
+    ValueError : the kind does not exist.
     """
     chosen = str(rng.choice(list(DISTRACTORS))) if kind is None else kind
     makers = {**DISTRACTORS, **PROCEDURAL}

@@ -1,4 +1,4 @@
-"""What rooms are full of, besides objects: robot arms, people, screens, chairs, plants, cables."""
+"""Background of rooms: robot arms, people, screens, chairs, curtains, plants, cables."""
 
 from collections.abc import Sequence
 from itertools import pairwise
@@ -27,11 +27,12 @@ __all__ = [
 
 
 def make_arm(rng: Generator, base: F8, reach: F8) -> list[Mesh]:
-    """Return the links of a robot arm that stands at a place and holds its gripper over another.
+    """Return the links of a robot arm from its base to its gripper.
 
     Parameters
     ----------
-    base, reach : (3,) metres, world frame: the foot, and the tips of the gripper.
+    base : (3,) position of the base, metres, world frame.
+    reach : (3,) position of the gripper's finger tips.
     """
     thick = rng.uniform(0.035, 0.06)
     wrist = _above(reach, rng.uniform(0.16, 0.24))
@@ -43,7 +44,7 @@ def make_arm(rng: Generator, base: F8, reach: F8) -> list[Mesh]:
 
 
 def _links(joints: Sequence[F8], radii: Sequence[float]) -> list[Mesh]:
-    """Return a limb between each two joints, and a motor at each joint but the first."""
+    """Return a tube between each pair of joints, and a motor at each joint except the first."""
     parts = []
     for (start, end), radius in zip(pairwise(joints), radii, strict=True):
         ends = smooth_path(np.stack([start, end]), 6)
@@ -54,7 +55,7 @@ def _links(joints: Sequence[F8], radii: Sequence[float]) -> list[Mesh]:
 
 
 def _gripper(rng: Generator, hand: F8, reach: F8) -> list[Mesh]:
-    """Return a palm, and two fingers that point down."""
+    """Return a palm at ``hand`` (3,) and two fingers that point down to ``reach`` (3,)."""
     turn, wide = rng.uniform(0, 180), rng.uniform(0.03, 0.09)
     tall = float(hand[2] - reach[2])
     palm = placed(rounded_box([wide + 0.05, 0.05, 0.5 * tall]), [0, 0, 0.45 * tall])
@@ -67,7 +68,7 @@ def _gripper(rng: Generator, hand: F8, reach: F8) -> list[Mesh]:
 
 
 def make_forearm(rng: Generator, reach: F8, start: F8) -> list[Mesh]:
-    """Return the arm and hand of a person, from ``start`` (3,) to ``reach`` (3,), metres."""
+    """Return a person's arm from ``start`` (3,) to the hand at ``reach`` (3,); metres."""
     over = _above((start + reach) / 2, rng.uniform(0.02, 0.12))
     path = smooth_path(np.stack([start, over, reach]), 10)
     arm = tube(path, np.linspace(rng.uniform(0.045, 0.06), 0.03, 10), segments=12)
@@ -92,7 +93,7 @@ def make_forearm(rng: Generator, reach: F8, start: F8) -> list[Mesh]:
 
 
 def make_monitor(rng: Generator, place: ArrayLike, *, degrees: float) -> list[Mesh]:
-    """Return a screen on a stand at a place (3,), metres, turned by ``degrees``."""
+    """Return a screen on a stand at ``place`` (3,), metres, turned by ``degrees`` about z."""
     wide, tall, low = rng.uniform(0.4, 0.7), rng.uniform(0.26, 0.4), rng.uniform(0.08, 0.16)
     parts = [
         rounded_box([rng.uniform(0.18, 0.28), 0.18, 0.012]),
@@ -103,7 +104,7 @@ def make_monitor(rng: Generator, place: ArrayLike, *, degrees: float) -> list[Me
 
 
 def make_chair(rng: Generator, place: ArrayLike, *, degrees: float) -> list[Mesh]:
-    """Return a chair at a place (3,), metres, turned by ``degrees``: a seat, a back, legs."""
+    """Return a chair at ``place`` (3,), metres, turned by ``degrees`` about z."""
     high, wide = rng.uniform(0.42, 0.5), rng.uniform(0.38, 0.5)
     back = rng.uniform(0.35, 0.55)
     parts = [
@@ -119,7 +120,7 @@ def make_chair(rng: Generator, place: ArrayLike, *, degrees: float) -> list[Mesh
 
 
 def make_curtain(rng: Generator, width: float, height: float, place: ArrayLike) -> Mesh:
-    """Return a curtain that hangs in folds along x at a place (3,); lengths in metres."""
+    """Return a folded curtain along x whose lower edge is centred at ``place`` (3,); metres."""
     x, z = np.linspace(-width / 2, width / 2, 160), np.linspace(0, height, 4)
     depth = rng.uniform(0.02, 0.06) * np.sin(x / rng.uniform(0.02, 0.05))
     depth = depth * (1 + 0.5 * np.sin(3 * x + rng.uniform(0, 6)))
@@ -149,7 +150,7 @@ def make_plant(rng: Generator) -> Mesh:
 
 
 def make_cable(rng: Generator, ends: F8) -> Mesh:
-    """Return a cable that lies between two places (2, 3) and wanders."""
+    """Return a winding cable between two points (2, 3), metres."""
     steps = np.linspace(ends[0], ends[1], 6)
     steps[1:-1, :2] += rng.normal(0, 0.06, (4, 2))
     return tube(smooth_path(steps, 50), rng.uniform(0.002, 0.006), segments=6)

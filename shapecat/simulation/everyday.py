@@ -1,4 +1,4 @@
-"""Families of everyday things of no category, no two alike: cutlery, clothes, bags, gadgets."""
+"""Families of random everyday objects outside the categories: cutlery, clothes, bags, gadgets."""
 
 from collections.abc import Callable
 
@@ -14,7 +14,7 @@ __all__ = ["EVERYDAY"]
 
 
 def _cutlery(rng: Generator) -> Mesh:
-    """Return a thin handle with a wide, flat end: spoons, knives, spatulas, brushes, combs."""
+    """Return a thin handle with a wide, flat end: a spoon, knife, spatula, brush or comb."""
     length = log_uniform(rng, 0.12, 0.32)
     head, start = rng.uniform(0.15, 0.45), rng.uniform(0.0, 0.06)
     t = np.linspace(0, 1, 24)
@@ -28,7 +28,7 @@ def _cutlery(rng: Generator) -> Mesh:
 
 
 def _cloth(rng: Generator) -> Mesh:
-    """Return a crumpled sheet that lies: clothes, towels, gloves, wrapping."""
+    """Return a crumpled sheet: clothes, a towel, a glove or wrapping."""
     side, count = log_uniform(rng, 0.08, 0.35), 22
     u, v = np.meshgrid(*[np.linspace(-0.5, 0.5, count)] * 2, indexing="ij")
     height = np.zeros(u.shape)
@@ -50,7 +50,7 @@ def _cloth(rng: Generator) -> Mesh:
 
 
 def _bag(rng: Generator) -> Mesh:
-    """Return a filled bag, flat at its seams: snacks, pouches, sacks, cushions."""
+    """Return a filled bag, flat at its seams: a snack bag, pouch, sack or cushion."""
     half = np.array([log_uniform(rng, 0.04, 0.13), log_uniform(rng, 0.05, 0.16)])
     full = float(half.min()) * rng.uniform(0.25, 0.8)
     points = np.asarray(ellipsoid([1.0, 1.0, 1.0]).vertices, np.float64)
@@ -68,7 +68,7 @@ def _bag(rng: Generator) -> Mesh:
 
 
 def _gadget(rng: Generator) -> Mesh:
-    """Return a body with knobs, lenses, aerials and feet: remotes, cameras, chargers, radios."""
+    """Return a body with knobs, lenses and aerials: a remote, camera, charger or radio."""
     size = np.array([log_uniform(rng, low, high) for low, high in _GADGET])
     parts = [rounded_box(size, radius=rng.uniform(0, 0.3) * float(size.min()), fine=2)]
     for _ in range(int(rng.integers(1, 6))):
@@ -92,7 +92,7 @@ _GADGET = ((0.05, 0.2), (0.03, 0.12), (0.012, 0.07))
 
 
 def _power_tool(rng: Generator) -> Mesh:
-    """Return a barrel, a grip and what they carry: drills, pistols, hair dryers, pliers."""
+    """Return a barrel with a grip, and perhaps a foot: a drill, pistol, hair dryer or pliers."""
     long, thick = log_uniform(rng, 0.09, 0.22), log_uniform(rng, 0.012, 0.03)
     path = long * np.array([[0, 0, 0], [0.5, 0, 0], [1, 0, rng.uniform(-0.1, 0.1)]])
     width = thick * np.interp(np.linspace(0, 1, 12), [0, 0.3, 0.7, 1], rng.uniform(0.5, 1.2, 4))
@@ -108,7 +108,7 @@ def _power_tool(rng: Generator) -> Mesh:
 
 
 def _vehicle(rng: Generator) -> Mesh:
-    """Return a body, a cabin and wheels: toy cars, trains, carts."""
+    """Return a body with a cabin and wheels: a toy car, train or cart."""
     long = log_uniform(rng, 0.05, 0.2)
     wide, tall = long * rng.uniform(0.3, 0.6), long * rng.uniform(0.12, 0.3)
     wheel = long * rng.uniform(0.07, 0.16)
@@ -122,7 +122,7 @@ def _vehicle(rng: Generator) -> Mesh:
 
 
 def _fixture(rng: Generator) -> Mesh:
-    """Return a profile with bends: brackets, pipe elbows, hooks, stands, clamps."""
+    """Return a bent profile: a bracket, pipe elbow, hook, stand or clamp."""
     arm = log_uniform(rng, 0.03, 0.11)
     if rng.random() < 0.5:
         radius = arm * rng.uniform(0.12, 0.4)
@@ -141,7 +141,7 @@ def _fixture(rng: Generator) -> Mesh:
 
 
 def _any_side(mesh: Mesh, rng: Generator) -> Mesh:
-    """Put something on one of its sides."""
+    """Return a mesh that rests on one of its sides."""
     about, degrees = str(rng.choice(["x", "y"])), float(rng.choice([0, 0, 90, 180]))
     return standing(placed(mesh, [0, 0, 0], about=about, degrees=degrees))
 
@@ -155,4 +155,4 @@ EVERYDAY: dict[str, Callable[[Generator], Mesh]] = {
     "vehicle": _vehicle,
     "fixture": _fixture,
 }
-"""The families, each with its maker."""
+"""The families, with the functions that make them."""

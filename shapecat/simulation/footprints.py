@@ -1,4 +1,4 @@
-"""Where there is room: flat outlines of things, and whether they overlap."""
+"""Outlines of objects seen from above, and tests whether they overlap."""
 
 import numpy as np
 from scipy.spatial import ConvexHull
@@ -12,14 +12,14 @@ __all__ = ["Footprint", "footprint", "inside", "overlap"]
 
 
 class Footprint(Record):
-    """The space a thing takes up, seen from above.
+    """Outline and height range of an object; metres, world frame.
 
     Attributes
     ----------
-    outline : (k, 2) convex, counter-clockwise, metres, world frame.
-    contact : (c, 2) convex outline of what touches the ground.
-    top : (t, 2) convex outline of its highest millimetre.
-    low, high : heights of its lowest and highest point, metres.
+    outline : (k, 2) convex outline seen from above, counter-clockwise.
+    contact : (c, 2) convex outline of the vertices within 1 mm of the lowest.
+    top : (t, 2) convex outline of the vertices within 1 mm of the highest.
+    low, high : z of the lowest and highest vertex.
     """
 
     outline: F8 = array("k 2", "f8")
@@ -29,7 +29,7 @@ class Footprint(Record):
     high: float
 
     def moved(self, shift: F8) -> "Footprint":
-        """Move by (3,) metres."""
+        """Return the footprint moved by ``shift`` (3,), metres."""
         flat = np.asarray(shift)[:2]
         return Footprint(
             self.outline + flat,
@@ -41,7 +41,7 @@ class Footprint(Record):
 
 
 def footprint(mesh: Mesh, world_from_mesh: Pose) -> Footprint:
-    """Find the outlines of a thing."""
+    """Return the footprint of a mesh at a pose."""
     points = transform(world_from_mesh, mesh.vertices)
     low, high = float(points[:, 2].min()), float(points[:, 2].max())
     contact = points[points[:, 2] < low + 0.001, :2]
@@ -50,7 +50,10 @@ def footprint(mesh: Mesh, world_from_mesh: Pose) -> Footprint:
 
 
 def overlap(a: F8, b: F8, gap: float) -> bool:
-    """Tell whether two convex outlines are nearer than ``gap`` (separating axes)."""
+    """Return whether two convex outlines (k, 2), (m, 2) are closer than ``gap`` metres.
+
+    Source: separating axis theorem; the distance between two corners is not considered.
+    """
     for one, other in ((a, b), (b, a)):
         normals = _normals(one)
         reach = (one @ normals.T).max(axis=0)
@@ -61,7 +64,10 @@ def overlap(a: F8, b: F8, gap: float) -> bool:
 
 
 def inside(points: F8, outline: F8, margin: float) -> bool:
-    """Tell whether all points (n, 2) are in a convex outline (k, 2), ``margin`` from its edge."""
+    """Return whether all points (n, 2) lie in a convex outline (k, 2), ``margin`` from its edge.
+
+    An outline that is a point or a line contains nothing.
+    """
     if len(outline) < 3:
         return False
     normals = _normals(outline)

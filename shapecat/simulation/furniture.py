@@ -1,4 +1,4 @@
-"""Furniture: floors, tables, shelves and walls."""
+"""Floors, walls, tables, shelves and bins; lengths in metres, z up."""
 
 from collections.abc import Sequence
 
@@ -26,7 +26,7 @@ FLOOR, TABLE, BOARD, SIDE, BACK, WALL = 1, 2, 2, 7, 8, 9
 
 
 def make_room(rng: Generator, *, wall_chance: float) -> list[Support]:
-    """Return a floor, perhaps with a wall behind the table."""
+    """Return a floor and, with probability ``wall_chance``, a wall behind the table."""
     floor = _slab("floor", FLOOR, (8.0, 8.0, 0.05), (0, 0, 0))
     if rng.random() >= wall_chance:
         return [floor]
@@ -34,15 +34,15 @@ def make_room(rng: Generator, *, wall_chance: float) -> list[Support]:
 
 
 def make_counter(rng: Generator) -> Support:
-    """Return a table top that is longer than a camera sees."""
+    """Return a counter top 2.4 m long, longer than the camera sees at once."""
     height, depth = rng.uniform(0.75, 0.95), rng.uniform(0.55, 0.65)
     return _slab("table", TABLE, (2.4, depth, 0.04), (0, 0, height))
 
 
 def make_table(rng: Generator, least: tuple[float, float] | None = None) -> Support:
-    """Return a rectangular or, now and then, a round table top.
+    """Return a random table top, one in five round.
 
-    ``least`` are lengths, metres; a table that has to have them is rectangular.
+    ``least`` is the minimum size in x and y, metres; with it, the table is rectangular.
     """
     height, thick = rng.uniform(0.6, 0.9), rng.uniform(0.018, 0.04)
     if least is not None:
@@ -55,7 +55,7 @@ def make_table(rng: Generator, least: tuple[float, float] | None = None) -> Supp
 
 
 def round_table(radius: float, height: float, thick: float) -> Support:
-    """Return a disc about the z axis of the world."""
+    """Return a disc centred on the world's z axis, its upper face at ``height``."""
     t = np.arange(48) * (2 * np.pi / 48)
     ring = np.stack([radius * np.cos(t), radius * np.sin(t)], -1)
     mesh = moved(extrude(ring, thick), Pose(np.eye(3), np.array([0, 0, height - thick])))
@@ -65,7 +65,7 @@ def round_table(radius: float, height: float, thick: float) -> Support:
 def make_shelf(
     width: float, depth: float, low: float, step: float
 ) -> tuple[list[Support], list[Support]]:
-    """Return three boards, the lowest at ``low``, ``step`` apart; and the sides and back."""
+    """Return three boards ``step`` apart, the lowest at z = ``low``; and two sides and a back."""
     thick = 0.02
     top = low + 3 * step
     boards = [
@@ -82,7 +82,7 @@ def make_shelf(
 
 
 def make_bin(rng: Generator) -> tuple[Support, list[Support]]:
-    """Return the bottom of an open bin, on the floor or raised, and its four sides."""
+    """Return the bottom of an open bin, on the floor or 0.4 to 0.9 m high, and its four sides."""
     width, depth, tall = rng.uniform(0.3, 0.6), rng.uniform(0.25, 0.45), rng.uniform(0.1, 0.3)
     height, thick = rng.choice([0.01, rng.uniform(0.4, 0.9)]), rng.uniform(0.003, 0.012)
     bottom = _slab("bin", TABLE, (width, depth, 0.01), (0, 0, height))
@@ -100,7 +100,7 @@ def make_bin(rng: Generator) -> tuple[Support, list[Support]]:
 
 
 def make_compartment(rng: Generator) -> tuple[Support, list[Support], Support]:
-    """Return the board of a compartment that is open to the front, its sides and back, its top."""
+    """Return a shelf compartment, open at the front: its board, its sides and back, and its top."""
     width, depth, tall = rng.uniform(0.3, 0.5), rng.uniform(0.25, 0.4), rng.uniform(0.22, 0.35)
     height, thick = rng.uniform(0.3, 1.2), 0.012
     board = _slab("board_1", BOARD, (width, depth, thick), (0, 0, height))
@@ -115,7 +115,7 @@ def make_compartment(rng: Generator) -> tuple[Support, list[Support], Support]:
 
 
 def _slab(name: str, label: int, size: Sequence[float], top_middle: Sequence[float]) -> Support:
-    """Return a level board; ``top_middle`` is the centre of its upper face."""
+    """Return a horizontal board; ``top_middle`` (3,) is the centre of its upper face."""
     x, y, z = top_middle
     mesh = moved(rounded_box(size, fine=1), Pose(np.eye(3), np.array([x, y, z - size[2]])))
     a, b = size[0] / 2, size[1] / 2
@@ -124,16 +124,16 @@ def _slab(name: str, label: int, size: Sequence[float], top_middle: Sequence[flo
 
 
 def make_wall(name: str, size: Sequence[float], place: Sequence[float]) -> Support:
-    """Return a wall or cupboard: its size, and where (x, y) on the floor its middle is."""
+    """Return a wall or cupboard of size (3,) on the floor, centred at ``place`` (2,)."""
     return _upright(name, WALL, size, place)
 
 
 def _upright(name: str, label: int, size: Sequence[float], place: Sequence[float]) -> Support:
-    """Return an upright board that stands on the floor."""
+    """Return an upright board on the floor, centred at ``place`` (2,)."""
     return _board(name, label, size, (*place, 0.0))
 
 
 def _board(name: str, label: int, size: Sequence[float], place: Sequence[float]) -> Support:
-    """Return a board that nothing stands on; ``place`` is the centre of its lower face."""
+    """Return a board that supports nothing; ``place`` (3,) is the centre of its lower face."""
     shift = Pose(np.eye(3), np.array(place, np.float64))
     return Support(name, label, moved(rounded_box(size, fine=1), shift), np.zeros((0, 3)))

@@ -1,4 +1,4 @@
-"""Things of the kitchen that are none of the seven categories."""
+"""Kitchen objects outside the seven categories."""
 
 from collections.abc import Callable
 
@@ -197,4 +197,4 @@ KITCHEN: dict[str, Callable[[Generator], Mesh]] = {
     "pear": _pear,
     "mushroom": _mushroom,
 }
-"""The kinds, each with its maker."""
+"""The kinds, with the functions that make them."""

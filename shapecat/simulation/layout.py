@@ -1,4 +1,4 @@
-"""Placing things on supports and on each other, none in another."""
+"""Placing objects on supports and on each other without collisions."""
 
 from typing import NamedTuple
 
@@ -17,9 +17,9 @@ from shapecat.types import Pose
 __all__ = ["Layout", "Piece", "make_piece"]
 
 _LYING = {"can": 0.2, "bottle": 0.22, "cup": 0.12, "box": 0.7}
-"""How often things of a category lie; a box lies on any of its faces."""
+"""Probability that an object of a category lies; a box lies on any of its faces."""
 _UPSIDE_DOWN = {"cup": 0.06, "bowl": 0.06, "plate": 0.03}
-"""How often open things stand on their rim."""
+"""Probability that an open object stands on its rim."""
 _WIDEST_M = 0.42
 _BEARERS = {"box", "can"}
 _SMALLEST_TOP_M = 0.035
@@ -27,7 +27,7 @@ _EDGE_M = 0.01
 
 
 class Piece(NamedTuple):
-    """A thing that has no place yet, and how it is going to rest."""
+    """An object to be placed, with its resting pose."""
 
     category: str
     kind: str
@@ -36,13 +36,13 @@ class Piece(NamedTuple):
 
 
 def make_piece(category: str, rng: Generator, *, manner: str | None = None) -> Piece:
-    """Make a random thing and choose how it rests.
+    """Make a random object and choose its resting pose.
 
     Parameters
     ----------
-    category : one of the shape categories; ``unknown`` is a distractor, which stands as made.
-    manner : ``upright``, ``lying`` or ``upside_down``; drawn by default. A thing that cannot rest
-        in that manner stands upright.
+    category : one of the shape categories, or ``unknown`` for a distractor, which stays upright.
+    manner : ``upright``, ``lying`` or ``upside_down``; random by default. An object that cannot
+        rest in this manner stands upright.
     """
     if category == "unknown":
         kind, mesh = make_distractor(rng)
@@ -64,13 +64,13 @@ def _draw_manner(category: str, rng: Generator) -> str:
 
 
 class Layout:
-    """Things on supports, filled one by one.
+    """Objects on supports, placed one by one.
 
     Parameters
     ----------
     gap : least distance between footprints, metres.
-    headroom : nothing may rise higher above its support, metres.
-    enclosed : nothing may stick out over the edge of its support.
+    headroom : greatest height of an object's top above its support, metres.
+    enclosed : whether objects must stay within the edges of their support.
     """
 
     def __init__(
@@ -87,13 +87,13 @@ class Layout:
     def put(
         self, category: str, support: Support, half: F8, *, stack: float = 0.0, attempts: int = 6
     ) -> bool:
-        """Place a new thing; tells whether there was room for it.
+        """Place a new object; return whether there was room for it.
 
         Parameters
         ----------
-        half : (2,) half the size, along x and y, of the area about the support's middle.
-        stack : chance of standing on another thing.
-        attempts : things to make before giving up.
+        half : (2,) half the size along x and y, metres, of the area around the support's centre.
+        stack : probability of placing it on another object.
+        attempts : number of objects to make and try before giving up.
         """
         for _ in range(attempts):
             piece = make_piece(category, self._rng)
@@ -107,7 +107,10 @@ class Layout:
         return False
 
     def put_piece(self, piece: Piece, support: Support, half: F8, *, tries: int = 40) -> bool:
-        """Place a given thing on a support; tells whether there was room for it."""
+        """Place a given object on a support; return whether there was room for it.
+
+        ``half`` is as for `put`; ``tries`` is the number of random positions to try.
+        """
         middle = support.outline[:, :2].mean(axis=0)
         for _ in range(tries):
             spot = middle + self._rng.uniform(-half, half)
@@ -119,11 +122,11 @@ class Layout:
         return False
 
     def room_for(self, k: int, support: Support, half: F8, *, tries: int = 200) -> F8 | None:
-        """Find another place for a thing that is there; it keeps its own, and takes the new one.
+        """Reserve a second position for object ``k``, which keeps its first one.
 
         Returns
         -------
-        (3,) the translation of its pose there, or None if there is no room.
+        The translation (3,) of its pose there, or None if there is no room.
         """
         thing, middle = self.things[k], support.outline[:, :2].mean(axis=0)
         for _ in range(tries):
@@ -193,6 +196,6 @@ class Layout:
 
 
 def _bears(below: Footprint, above: Footprint) -> bool:
-    """Tell whether the middle of a thing's contact, and most of it, lies on the top below."""
+    """Return whether the central 60 % of the upper object's contact lies on the lower one's top."""
     middle = above.contact.mean(axis=0)
     return inside(middle + 0.6 * (above.contact - middle), below.top, 0.002)

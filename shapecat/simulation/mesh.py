@@ -1,4 +1,4 @@
-"""Triangle meshes, and how they are joined, stretched and moved."""
+"""Triangle meshes, and functions that join, scale and move them."""
 
 from collections.abc import Sequence
 
@@ -12,15 +12,16 @@ __all__ = ["Mesh", "join", "moved", "scaled", "standing"]
 
 
 class Mesh(Record):
-    """A surface of triangles; which side of a triangle is outside does not matter.
+    """A triangle mesh; the winding order of its triangles does not matter.
 
-    Coordinates are whole micrometres, so that the last bit of a sine, which differs between
-    machines, never reaches a simulated recording.
+    Coordinates are rounded to 1 um, so that sines, whose last bit differs between machines, do not
+    change a simulated recording.
 
     Attributes
     ----------
-    vertices : (n, 3) metres, z up; an object stands on z = 0.
-    triangles : (m, 3) rows of ``vertices``.
+    vertices : (n, 3) metres, z up. Objects stand on z = 0; the meshes of supports are in the world
+        frame.
+    triangles : (m, 3) indices into ``vertices``.
     """
 
     vertices: F4 = array("n 3", "f4")
@@ -38,7 +39,7 @@ class Mesh(Record):
 
 
 def join(parts: Sequence[Mesh]) -> Mesh:
-    """Put meshes into one; what overlaps stays."""
+    """Concatenate meshes into one; overlapping surfaces are kept."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
     return Mesh(
         np.concatenate([part.vertices for part in parts]),
@@ -47,19 +48,19 @@ def join(parts: Sequence[Mesh]) -> Mesh:
 
 
 def scaled(mesh: Mesh, factors: ArrayLike) -> Mesh:
-    """Stretch by one factor, or by (3,), one for each axis."""
+    """Scale a mesh by one factor, or by a factor for each axis (3,)."""
     return Mesh(mesh.vertices * np.asarray(factors, np.float64), mesh.triangles)
 
 
 def moved(mesh: Mesh, pose: Pose) -> Mesh:
-    """Move by a pose ``a_from_mesh``."""
+    """Transform a mesh by a pose ``a_from_mesh``."""
     points = np.asarray(mesh.vertices, np.float64)
     turned = sum(points[:, k, None] * pose.rotation[:, k] for k in range(3))
     return Mesh(turned + pose.translation, mesh.triangles)
 
 
 def standing(mesh: Mesh) -> Mesh:
-    """Centre over the origin and put the lowest vertex on z = 0."""
+    """Centre a mesh over the origin, with its lowest vertex at z = 0."""
     low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
     middle = (np.asarray(low, np.float64) + high) / 2
     return Mesh(mesh.vertices - np.array([middle[0], middle[1], low[2]]), mesh.triangles)

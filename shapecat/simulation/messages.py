@@ -1,4 +1,4 @@
-"""Frames and transforms as ROS messages, for ROS 1 and ROS 2 alike."""
+"""Frames and transforms as ROS 1 or ROS 2 messages."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -18,7 +18,7 @@ _DISTORTION = 5
 
 
 class MessageFactory:
-    """Makes messages; the same calls give the ROS 1 or the ROS 2 form.
+    """Makes messages of one ROS version.
 
     Parameters
     ----------
@@ -35,14 +35,14 @@ class MessageFactory:
             self.typestore.register(get_types_from_msg(definition, _TF))
 
     def serialize(self, message: Any) -> bytes:
-        """Return the bytes of a message: CDR, or the ROS 1 encoding."""
+        """Return a message as bytes: the ROS 1 encoding, or CDR for ROS 2."""
         encode = (
             self.typestore.serialize_ros1 if self.ros_version == 1 else self.typestore.serialize_cdr
         )
         return bytes(encode(message, message.__msgtype__))
 
     def image(self, depth: F4, stamp_ns: int, frame_id: str) -> Any:
-        """Return sensor_msgs/Image: (h, w) metres as 16-bit millimetres."""
+        """Return a depth image (h, w) in metres as a sensor_msgs/Image in 16-bit millimetres."""
         millimetres = np.round(np.asarray(depth, np.float64) * 1000).astype("<u2")
         height, width = depth.shape
         return self._make(
@@ -57,7 +57,7 @@ class MessageFactory:
         )
 
     def cloud(self, points: F4, stamp_ns: int, frame_id: str) -> Any:
-        """Return an organized sensor_msgs/PointCloud2 of (h, w, 3) metres, NaN for no reading."""
+        """Return points (h, w, 3), metres, NaN without reading, as an organized PointCloud2."""
         height, width, _ = points.shape
         data = np.zeros((height, width, 4), "<f4")
         data[..., :3] = points
@@ -80,7 +80,7 @@ class MessageFactory:
         )
 
     def compressed(self, data: bytes, stamp_ns: int, frame_id: str) -> Any:
-        """Return sensor_msgs/CompressedImage of a JPEG file."""
+        """Return the bytes of a JPEG file as a sensor_msgs/CompressedImage."""
         return self._make(
             "sensor_msgs/msg/CompressedImage",
             header=self._header(stamp_ns, frame_id),
@@ -91,7 +91,7 @@ class MessageFactory:
     def camera_info(
         self, camera: Camera, stamp_ns: int, frame_id: str, distortion: Sequence[float] = ()
     ) -> Any:
-        """Return sensor_msgs/CameraInfo, without distortion or with that of ``plumb_bob``."""
+        """Return a sensor_msgs/CameraInfo; ``distortion`` are ``plumb_bob`` coefficients."""
         k = [camera.fx, 0, camera.cx, 0, camera.fy, camera.cy, 0, 0, 1]
         p = [camera.fx, 0, camera.cx, 0, 0, camera.fy, camera.cy, 0, 0, 0, 1, 0]
         matrices = {"d": [*distortion] or [0] * _DISTORTION, "k": k, "r": np.eye(3).ravel(), "p": p}
@@ -117,7 +117,7 @@ class MessageFactory:
         )
 
     def transforms(self, links: Sequence[tuple[str, str, Pose]], stamp_ns: int) -> Any:
-        """Return tf2_msgs/TFMessage of (parent, child, ``parent_from_child``)."""
+        """Return a tf2_msgs/TFMessage of links (parent, child, ``parent_from_child``)."""
         stamped = []
         for parent, child, pose in links:
             x, y, z, w = (float(q) for q in np.round(quaternion_from_rotation(pose.rotation), 9))

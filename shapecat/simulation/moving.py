@@ -1,4 +1,4 @@
-"""Scenes in which things move, come and go, or the camera walks past more than it sees."""
+"""Scenes with moving, added and removed objects, or with a camera that passes a long counter."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -17,11 +17,11 @@ __all__ = ["crossing", "rearranged", "walking"]
 
 
 def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
-    """Walk along a counter and back: things leave the view and come back into it."""
+    """Move the camera along a counter and back: objects leave the view and come back."""
     room, counter = make_room(rng, wall_chance=0.0), make_counter(rng)
     layout = Layout(rng, gap=rng.uniform(0.02, 0.05))
     for k, category in enumerate(categories):
-        middle = -0.85 + 1.7 * (k + 0.5) / len(categories)  # all along it, not all in one heap
+        middle = -0.85 + 1.7 * (k + 0.5) / len(categories)  # spread along the counter
         layout.put(
             category, _strip(counter, (middle - 0.3, middle + 0.3), (-0.22, 0.22)), _ANYWHERE
         )
@@ -31,7 +31,7 @@ def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> Worl
 
 
 def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
-    """Slide two things to and fro on lanes between two rows: they hide others, and each other."""
+    """Slide two objects back and forth between two rows; they occlude others and each other."""
     room, table = make_room(rng, wall_chance=0.3), make_table(rng, (1.3, 0.85))
     layout = Layout(rng, gap=0.02, enclosed=True)
     t = filming.times()
@@ -54,10 +54,10 @@ def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> Wor
 
 
 def rearranged(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
-    """Add a thing to a table, take one away, carry one elsewhere and push another one."""
+    """Add one object to a table, remove one, carry one to another place and push one."""
     room, table = make_room(rng, wall_chance=0.3), make_table(rng, (1.3, 0.85))
     layout = Layout(rng, gap=0.04)
-    lane = _strip(table, (-0.4, 0.4), (-0.32, -0.2))  # kept free for what is pushed
+    lane = _strip(table, (-0.4, 0.4), (-0.32, -0.2))  # kept free for the pushed object
     layout.put(str(rng.choice(_MOVERS)), lane, _ANYWHERE, attempts=40)
     back = _strip(table, (-0.45, 0.45), (-0.12, 0.36))
     for category in categories:
@@ -71,7 +71,7 @@ def rearranged(rng: Generator, categories: Sequence[str], filming: Filming) -> W
             motions.append(_carried(k, goal - layout.things[k].pose.translation, t - begun[1]))
             break
     others = [k for k in range(1, len(layout.things)) if k != motions[-1].track]
-    there = t[:, None] < begun[2], t[:, None] >= begun[3]  # one goes, one comes
+    there = t[:, None] < begun[2], t[:, None] >= begun[3]  # one is removed, one is added
     for k, when in zip(others, there, strict=False):
         motions.append(Motion(k, np.where(when, np.zeros(3), np.nan)))
     path = _walk_past(rng, table, filming, elevation=(30, 48), sweep=12)
@@ -89,18 +89,21 @@ def _walk_past(
     elevation: tuple[float, float],
     sweep: float,
 ) -> tuple[Pose, ...]:
-    """Walk on an arc in front of a table, looking down by degrees from a range."""
+    """Return a camera path on an arc in front of a table.
+
+    ``elevation`` is a range and ``sweep`` half the arc, both in degrees, as for `walk`.
+    """
     middle = np.array([0, 0, table.height + 0.05])
     return walk(rng, middle, filming, distance=(1.0, 1.3), elevation=elevation, sweep=sweep)
 
 
 _ANYWHERE = np.array([0.6, 0.3])
 _MOVERS = ("ball", "can", "cup", "bottle", "box")
-"""Things that fit on a lane, mostly."""
+"""Categories of moving objects, most of which fit on a lane."""
 
 
 def _strip(support: Support, x: tuple[float, float], y: tuple[float, float]) -> Support:
-    """Return a part of a support to place things on."""
+    """Return a support limited to ranges of x and y, metres, for placing objects."""
     corners = [[x[0], y[0]], [x[1], y[0]], [x[1], y[1]], [x[0], y[1]]]
     return replace(support, outline=np.column_stack([corners, np.full(4, support.height)]))
 
@@ -110,13 +113,13 @@ def _shifted(track: int, along: F8) -> Motion:
 
 
 def _pushed(track: int, start: F8, t: F8) -> Motion:
-    """Push a thing to the other side of its lane at 0.2 m/s."""
+    """Return the motion of an object pushed 0.4 m along its lane, at 0.2 m/s, from t = 0."""
     way = -np.sign(start[0] or 1.0) * 0.4
     return _shifted(track, way * np.clip(t * 0.2 / abs(way), 0, 1))
 
 
 def _carried(track: int, way: F8, t: F8) -> Motion:
-    """Lift a thing, carry it elsewhere and set it down: half a metre a second, 15 cm high."""
+    """Return the motion of an object lifted by 15 cm and carried by ``way`` (3,), at 0.5 m/s."""
     share = np.clip(t * 0.5 / max(float(np.linalg.norm(way)), 0.1), 0, 1)
     height = 0.6 * share * (1 - share)
     return Motion(track, np.round(np.outer(share, way) + np.outer(height, [0, 0, 1.0]), 6))

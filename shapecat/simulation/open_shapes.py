@@ -1,4 +1,4 @@
-"""Open shapes with a real inside: cups, bowls and plates, told apart by depth / diameter."""
+"""Hollow shapes: cups, bowls and plates, which differ in the ratio of depth to diameter."""
 
 from typing import Any
 
@@ -13,16 +13,16 @@ from shapecat.simulation.primitives import lathe, smooth_path, tube
 __all__ = ["BOWL_BORDERS", "log_uniform", "make_bowl", "make_cup", "make_plate"]
 
 BOWL_BORDERS = (0.2, 0.65)
-"""Depth / diameter of a bowl; a plate is flatter, a cup deeper."""
+"""Range of depth / diameter of bowls; plates are flatter, cups deeper."""
 
 
 def log_uniform(rng: Generator, low: float, high: float) -> float:
-    """Draw a number whose logarithm is uniform."""
+    """Draw a number between ``low`` and ``high`` with a uniformly distributed logarithm."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
 def make_cup(rng: Generator) -> Mesh:
-    """Make a mug, glass, beaker or teacup: deeper than 0.65 of its diameter."""
+    """Make a mug, glass, beaker or teacup, deeper than 0.65 of its diameter."""
     family = rng.choice(
         ["mug", "glass", "beaker", "teacup", "barrel", "espresso"],
         p=[0.34, 0.2, 0.1, 0.14, 0.14, 0.08],
@@ -62,7 +62,7 @@ def make_cup(rng: Generator) -> Mesh:
 
 
 def make_bowl(rng: Generator) -> Mesh:
-    """Make a bowl, ramekin or basin: depth between 0.2 and 0.65 of its diameter."""
+    """Make a bowl, ramekin or basin, 0.2 to 0.65 of its diameter deep."""
     family = rng.choice(
         ["round", "cone", "flared", "straight", "tulip"], p=[0.38, 0.2, 0.17, 0.15, 0.1]
     )
@@ -94,7 +94,7 @@ def make_bowl(rng: Generator) -> Mesh:
 
 
 def make_plate(rng: Generator) -> Mesh:
-    """Make a plate, saucer or shallow dish: depth up to 0.2 of its diameter."""
+    """Make a plate, saucer or shallow dish, at most 0.2 of its diameter deep."""
     family = rng.choice(["rimmed", "coupe", "flat", "deep"], p=[0.4, 0.22, 0.2, 0.18])
     diameter = log_uniform(rng, 0.11, 0.34)
     ratio = {
@@ -127,7 +127,10 @@ def make_plate(rng: Generator) -> Mesh:
 
 
 def _wall(shares: ArrayLike, radius: float, height: float, *, power: float) -> F8:
-    """Return the outside from bottom to top: radii are shares of the greatest one."""
+    """Return the outer profile (radius, z) from bottom to top.
+
+    ``shares`` (k,) are radii relative to the greatest one, which is ``radius``.
+    """
     shares = np.asarray(shares, np.float64)
     heights = np.linspace(0, 1, len(shares)) ** power
     path = smooth_path(np.stack([shares, heights], -1), 14)
@@ -141,7 +144,7 @@ def _wall(shares: ArrayLike, radius: float, height: float, *, power: float) -> F
 
 
 def _foot(rng: Generator, chance: float, tallest: float) -> tuple[float, float]:
-    """Return the radius of a foot ring, as a share of the bottom's, and its height."""
+    """Return the radius of a foot ring, relative to that of the bottom, and its height."""
     if rng.random() >= chance:
         return 1.0, 0.0
     return rng.uniform(0.7, 0.95), rng.uniform(0.3, 1.0) * tallest
@@ -150,7 +153,10 @@ def _foot(rng: Generator, chance: float, tallest: float) -> tuple[float, float]:
 def _hollow(
     outer: F8, wall: float, *, floor: float, foot: tuple[float, float], lip: float = 0.0
 ) -> F8:
-    """Return the whole profile of a vessel: foot, outside, rim, inside."""
+    """Return the closed profile (radius, z) of a vessel: foot, outside, rim, inside.
+
+    ``wall`` and ``floor`` are thicknesses, and ``lip`` the width of a flared rim, in metres.
+    """
     share, tall = foot
     bottom = outer[0, 0]
     outside = outer.copy()
@@ -174,7 +180,10 @@ def _hollow(
 
 
 def _section(rng: Generator, *, oval: float, square: float, facets: float) -> dict[str, Any]:
-    """Draw a cross-section: mostly round, else oval, square with round corners, or a polygon."""
+    """Draw a cross-section for `lathe`: mostly round, else oval, a rounded square or a polygon.
+
+    ``oval``, ``square`` and ``facets`` are the probabilities of these.
+    """
     kind = rng.random()
     if kind < oval:
         return {"stretch": rng.uniform(0.7, 0.95)}
@@ -186,7 +195,7 @@ def _section(rng: Generator, *, oval: float, square: float, facets: float) -> di
 
 
 def _handle_shape(rng: Generator, diameter: float, height: float) -> tuple[F8, float, float]:
-    """Draw a handle: (k, 2) reach and height, both from the wall's middle, radius, flatness."""
+    """Draw a handle: its curve (k, 2) outward and up from mid-wall, its radius and flatness."""
     tall = height * rng.uniform(0.25, 0.4)
     reach = diameter * rng.uniform(0.2, 0.42)
     curves = (
@@ -212,7 +221,7 @@ def _handle(outer: F8, shape: tuple[F8, float, float], wall: float, side: float)
 
 
 def _turned(mesh: Mesh, rng: Generator) -> Mesh:
-    """Turn a mesh by a random angle about z and stand it on the origin."""
+    """Turn a mesh by a random angle about z and place it on the origin."""
     angle = rng.uniform(0, 2 * np.pi)
     c, s = np.cos(angle), np.sin(angle)
     points = np.asarray(mesh.vertices, np.float64)

@@ -1,4 +1,4 @@
-"""Simple bodies that distractors are put together from."""
+"""Simple solids from which distractors are assembled."""
 
 from collections.abc import Sequence
 
@@ -14,7 +14,7 @@ __all__ = ["ellipsoid", "placed", "rod", "turned_body"]
 
 
 def placed(mesh: Mesh, place: ArrayLike, *, about: str = "", degrees: float = 0.0) -> Mesh:
-    """Turn a mesh about an axis, ``x``, ``y`` or ``z``, and move it to a place (3,), metres."""
+    """Turn a mesh about the axis ``x``, ``y`` or ``z``, then move it by ``place`` (3,), metres."""
     half = np.radians(degrees) / 2
     quaternion = [0.0, 0.0, 0.0, float(np.cos(half))]
     if about:
@@ -23,12 +23,12 @@ def placed(mesh: Mesh, place: ArrayLike, *, about: str = "", degrees: float = 0.
 
 
 def rod(length: float, radius: float) -> Mesh:
-    """Return an upright round rod from z = 0."""
+    """Return an upright cylinder that stands on z = 0; metres."""
     return lathe([[0, 0], [radius, 0], [radius, length], [0, length]], segments=16)
 
 
 def ellipsoid(axes: ArrayLike) -> Mesh:
-    """Return an ellipsoid about the origin; ``axes`` (3,) are its half axes, metres."""
+    """Return an ellipsoid centred on the origin; ``axes`` (3,) are its semi-axes, metres."""
     t = np.linspace(-np.pi / 2, np.pi / 2, 17)
     return scaled(
         lathe(np.stack([np.cos(t), np.sin(t)], -1) * 0.1, segments=24), np.asarray(axes) * 10
@@ -36,7 +36,7 @@ def ellipsoid(axes: ArrayLike) -> Mesh:
 
 
 def turned_body(knots: Sequence[tuple[float, float]], count: int = 26) -> Mesh:
-    """Turn a smooth curve through (radius, height) knots about the z axis."""
+    """Return a solid of revolution about z with a smooth profile through (radius, z) knots."""
     path = smooth_path(knots, count)
     path[:, 0] = np.maximum(path[:, 0], 0)
     return lathe(path, segments=36)

@@ -1,4 +1,4 @@
-"""How the camera moves: world_from_camera with optical axes (x right, y down, z forward)."""
+"""Camera paths: poses ``world_from_camera`` with optical axes (x right, y down, z forward)."""
 
 from typing import NamedTuple
 
@@ -13,24 +13,24 @@ __all__ = ["Filming", "hold", "looking_at", "scattered", "stroll", "walk"]
 
 
 class Filming(NamedTuple):
-    """How long and how fast a camera films."""
+    """Number of frames and frame rate."""
 
     frames: int
     rate_hz: float
 
     def times(self) -> F8:
-        """Return the seconds of the frames since the first one."""
+        """Return the time of each frame since the first, seconds."""
         return np.arange(self.frames) / self.rate_hz
 
 
 Range = float | tuple[float, float]
-"""A value, or the range that it is drawn from."""
+"""A value, or a range from which it is drawn."""
 
 
 def looking_at(eye: F8, target: F8, *, roll: float = 0.0) -> Pose:
-    """Return the pose of a camera at ``eye`` (3,) that looks at ``target`` (3,), rolled by radians.
+    """Return the pose of a camera at ``eye`` (3,) that looks at ``target`` (3,).
 
-    Entries are rounded, so that the pose is the same on every machine.
+    ``roll`` is in radians. Entries are rounded, so that the pose is the same on every machine.
     """
     forward = np.asarray(target, np.float64) - eye
     forward /= np.linalg.norm(forward)
@@ -52,14 +52,14 @@ def walk(
     elevation: Range,
     sweep: Range,
 ) -> tuple[Pose, ...]:
-    """Walk to and fro on an arc in front of a place, swaying a little, always looking at it.
+    """Walk back and forth on an arc in front of a target, swaying slightly, looking at the target.
 
     Parameters
     ----------
-    target : (3,) the place, metres; it is seen from the side of negative y.
-    distance : metres, at the start.
-    elevation : degrees by which the camera looks down, at the start.
-    sweep : degrees from the middle of the arc to its ends.
+    target : (3,) metres, world frame; the camera is on the side of negative y.
+    distance : mean distance to the target, metres.
+    elevation : mean angle by which the camera looks down, degrees.
+    sweep : half the angle of the arc, degrees.
     """
     distance, elevation, sweep = (_drawn(rng, value) for value in (distance, elevation, sweep))
     t = filming.times()
@@ -98,13 +98,14 @@ def stroll(
     elevation: Range,
     reach: Range,
 ) -> tuple[Pose, ...]:
-    """Walk sideways to and fro along a counter, swaying a little, looking at what is in front.
+    """Walk sideways back and forth along a counter, swaying slightly, looking straight ahead.
 
     Parameters
     ----------
-    target : (3,) middle of the counter, metres; it is seen from the side of negative y.
-    distance, reach : metres to the counter, and from its middle to where the way turns.
-    elevation : degrees by which the camera looks down.
+    target : (3,) middle of the counter, metres; the camera is on the side of negative y.
+    distance : distance to the counter, metres.
+    elevation : angle by which the camera looks down, degrees.
+    reach : distance from the middle of the counter to the turning points, metres.
     """
     distance, elevation, reach = (_drawn(rng, value) for value in (distance, elevation, reach))
     t = filming.times()
@@ -127,7 +128,7 @@ def _drawn(rng: Generator, value: Range) -> float:
 def hold(
     rng: Generator, target: F8, frames: int, *, distance: float, elevation: float
 ) -> tuple[Pose, ...]:
-    """Keep the camera still, so many metres from ``target`` (3,) and degrees above it."""
+    """Keep the camera still, looking at ``target`` (3,); lengths in metres, angles in degrees."""
     up = np.radians(elevation)
     eye = target + distance * np.array([0, -np.cos(up), np.sin(up)])
     return (looking_at(eye, target, roll=float(np.radians(rng.normal(0, 1.0)))),) * frames
@@ -141,7 +142,7 @@ def scattered(
     distance: tuple[float, float] = (0.5, 2.0),
     elevation: tuple[float, float] = (15.0, 60.0),
 ) -> tuple[Pose, ...]:
-    """Look at a place (3,) from random sides; ranges in metres and degrees."""
+    """Look at ``target`` (3,) from random directions; ranges in metres and degrees."""
     poses = []
     for _ in range(count):
         up, side = np.radians(rng.uniform(*elevation)), rng.uniform(0, 2 * np.pi)

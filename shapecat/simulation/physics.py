@@ -1,4 +1,4 @@
-"""Things are dropped and come to rest where a physics engine (MuJoCo) lets them."""
+"""Dropping objects until they come to rest, with the physics engine MuJoCo."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -16,28 +16,29 @@ __all__ = ["Drop", "Rest", "settle"]
 
 _STEP_S = 0.004
 _DENSITY = 400.0
-"""Of a solid thing, kg/m3."""
+"""Density of a solid object, kg/m3."""
 _HOLLOW_DENSITY = 1000.0
-"""Of the walls of a hollow one."""
+"""Density of the walls of a hollow object, kg/m3."""
 _START_SPEED = 0.1
-"""Downward, m/s."""
+"""Downward speed at the start of a drop, m/s."""
 _FRICTION = (0.7, 0.005, 0.002)
-"""Sliding, turning on the spot, rolling."""
+"""Sliding, torsional and rolling friction."""
 _CLEAR_M = 0.02
-"""A thing starts so far above the highest thing below it."""
+"""Height of a dropped object above the highest object below it."""
 _FALL_STEPS = 75
-"""Between two things that are dropped."""
+"""Simulation steps between two drops."""
 _MOST_STEPS = 750
-"""After the last."""
+"""Simulation steps after the last drop, at most."""
 _STILL = 0.02
-"""What moves slower, in m/s and rad/s, has come to rest."""
+"""Speed, in m/s and rad/s, below which an object is at rest."""
 _LOOK_STEPS = 12
+"""Simulation steps between two checks whether everything is at rest."""
 _WAITING_M = 5.0
-"""So far beside the scene things wait, and apart from each other."""
+"""Distance from the scene at which objects wait to be dropped."""
 
 
 class Drop(NamedTuple):
-    """A thing to drop: how it is turned (3, 3), and over which place (2,), metres, world frame."""
+    """An object to drop: its rotation (3, 3) and horizontal position (2,), world frame, metres."""
 
     mesh: Mesh
     rotation: F8
@@ -45,12 +46,12 @@ class Drop(NamedTuple):
 
 
 class Rest(NamedTuple):
-    """Where a thing has come to rest.
+    """Resting pose of a dropped object.
 
     Attributes
     ----------
-    pose : ``world_from_mesh``, whole micrometres.
-    bearer : index of the thing that bears most of its weight; None if an obstacle does.
+    pose : ``world_from_mesh``, rounded to 1 um.
+    bearer : index of the object that carries most of its weight; None if an obstacle does.
     """
 
     pose: Pose
@@ -58,19 +59,19 @@ class Rest(NamedTuple):
 
 
 def settle(obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> list[Rest]:
-    """Drop things one after the other, each just above what lies there, until all lie still.
+    """Drop objects one after the other, each from just above the others, until all are at rest.
 
     Parameters
     ----------
-    obstacles : world frame; they never move.
+    obstacles : fixed meshes, world frame.
 
     Returns
     -------
-    One for each drop, wherever it went.
+    One resting pose for each drop, also of objects that fell off.
     """
     import mujoco  # type: ignore[import-untyped]  # noqa: PLC0415  slow; most scenes need no physics
 
-    mujoco.set_mju_user_warning(_say_nothing)  # it would write a file where it is called
+    mujoco.set_mju_user_warning(_say_nothing)  # else it writes a log file into the working folder
     model = _model(mujoco, obstacles, drops)
     data = mujoco.MjData(model)
     shapes = [_extreme_points(drop.mesh) for drop in drops]
@@ -90,16 +91,14 @@ def settle(obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> list[Rest]:
 
 
 def _say_nothing(_: str) -> None:
-    """Ignore that a simulation has become unstable: what flies off is on no support."""
+    """Ignore warnings of an unstable simulation: objects that fly off end up on no support."""
 
 
 def _model(mujoco: Any, obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> Any:
     spec = mujoco.MjSpec()
     spec.option.timestep = _STEP_S
     spec.option.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
-    spec.option.enableflags |= int(
-        mujoco.mjtEnableBit.mjENBL_SLEEP
-    )  # what lies still costs nothing
+    spec.option.enableflags |= int(mujoco.mjtEnableBit.mjENBL_SLEEP)  # objects at rest cost nothing
     for k, obstacle in enumerate(obstacles):
         for j, part in enumerate(convex_parts(obstacle)):
             _add_solid(mujoco, spec, spec.worldbody, f"obstacle{k}part{j}", part)
@@ -126,7 +125,10 @@ def _extreme_points(mesh: Mesh) -> F8:
 
 
 def _start(drop: Drop, points: F8, there: Sequence[F8]) -> Pose:
-    """Return a pose over a place, a little above all that lies there."""
+    """Return the pose of a dropped object, slightly above everything at its position.
+
+    ``points`` are its extreme vertices; ``there`` are those of the other meshes, world frame.
+    """
     turned = points @ drop.rotation.T
     middle = (turned.min(axis=0) + turned.max(axis=0)) / 2
     shift = np.array([*drop.place, 0.0]) - [*middle[:2], turned[:, 2].min()]
@@ -141,7 +143,7 @@ def _start(drop: Drop, points: F8, there: Sequence[F8]) -> Pose:
 
 
 def _release(model: Any, data: Any, k: int, start: Pose) -> None:
-    """Put a thing that waits at its start, and let it fall."""
+    """Move a waiting object to its start pose and let it fall."""
     model.body_gravcomp[k + 1] = 0.0  # the world is body 0
     x, y, z, w = quaternion_from_rotation(start.rotation)
     data.qpos[7 * k : 7 * k + 7] = [*start.translation, w, x, y, z]
@@ -154,10 +156,10 @@ def _pose(data: Any, k: int) -> Pose:
 
 
 def _rests(mujoco: Any, model: Any, data: Any, count: int) -> list[Rest]:
-    """Return where things lie, and on what: that which pushes them up most."""
-    model.opt.enableflags = 0  # what sleeps has no contacts
+    """Return the resting pose of each object, and the body with the greatest upward force on it."""
+    model.opt.enableflags = 0  # sleeping bodies have no contacts
     mujoco.mj_forward(model, data)
-    lift = np.zeros((count, count + 1))  # the last: obstacles
+    lift = np.zeros((count, count + 1))  # the last column: obstacles
     force = np.zeros(6)
     for k in range(data.ncon):
         contact = data.contact[k]

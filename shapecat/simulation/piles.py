@@ -1,4 +1,4 @@
-"""Scenes that physics makes: piles on tables, things poured into bins, crowded compartments."""
+"""Scenes arranged by physics: piles on tables, filled bins, crowded shelf compartments."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -19,17 +19,17 @@ from shapecat.simulation.worlds import Support, Thing, World
 __all__ = ["KINDS", "Item", "bin_picking", "make_item", "pile", "settled", "shelf_bin"]
 
 KINDS = tuple(DISTRACTORS)
-"""What things of no category are."""
+"""Kinds of objects outside the categories."""
 _UPRIGHT = 0.45
-"""Share of the things that are dropped nearly upright; others are turned anyhow."""
+"""Fraction of the objects dropped nearly upright; the others have any rotation."""
 _SWAY_DEG = 8.0
 _UPRIGHT_COS, _LYING_COS = np.cos(np.radians(15)), np.sin(np.radians(15))
 _SUNK_M = 0.02
-"""What lies lower has fallen off its support."""
+"""An object this far below the surface of its support has fallen off."""
 
 
 class Item(NamedTuple):
-    """Something to drop: what shape it has, what it is, and its mesh."""
+    """An object to drop; ``kind`` is its category, or its kind of distractor."""
 
     category: str
     kind: str
@@ -39,7 +39,7 @@ class Item(NamedTuple):
 def pile(
     rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
-    """Drop things in a heap on a table: they lean, lie across, and in each other."""
+    """Drop objects in a heap on a table; they lean on, lie across and lie in each other."""
     supports = (*make_room(rng, wall_chance=0.2), make_table(rng))
     table = supports[-1]
     spread = rng.uniform(0.07, 0.2)
@@ -63,7 +63,7 @@ def pile(
 def bin_picking(
     rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
-    """Pour things into a bin, and look into it from above."""
+    """Drop objects into a bin and look into it from above."""
     bottom, sides = make_bin(rng)
     half = np.ptp(bottom.outline[:, :2], axis=0) / 2
     items = [make_item(category, rng, kinds) for category in categories]
@@ -82,7 +82,7 @@ def bin_picking(
 def shelf_bin(
     rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
-    """Put things into a compartment of a shelf, and look in from the front."""
+    """Drop objects into a shelf compartment and look into it from the front."""
     board, walls, top = make_compartment(rng)
     half = np.ptp(board.outline[:, :2], axis=0) / 2
     room_m = top.mesh.vertices[:, 2].min() - board.height
@@ -100,14 +100,14 @@ def shelf_bin(
 
 
 def make_item(category: str, rng: Generator, kinds: Sequence[str]) -> Item:
-    """Make something of a category, or of one of some kinds if it is of none."""
+    """Make an object of a category; for ``unknown``, a distractor of one of the kinds."""
     if category == "unknown":
         return Item(category, *make_distractor(rng, str(rng.choice(list(kinds)))))
     return Item(category, category, make_object(category, rng))
 
 
 def _turned(rng: Generator) -> F8:
-    """Return a rotation: nearly upright, or any."""
+    """Return a random rotation (3, 3): nearly upright with probability `_UPRIGHT`, else any."""
     if rng.random() >= _UPRIGHT:
         axis = rng.normal(size=4)
         return rotation_from_quaternion(axis / np.linalg.norm(axis))
@@ -124,7 +124,10 @@ def settled(
     *,
     highest_m: float = np.inf,
 ) -> tuple[Thing, ...]:
-    """Drop things among supports; return what stays on one, and lower than a height above it."""
+    """Drop items onto supports; return the objects that stay on ``below``, numbered in order.
+
+    Objects that rise ``highest_m`` or more above its surface are removed too.
+    """
     rests = settle([support.mesh for support in supports], drops)
     stays = [_stays(k.mesh, rest, below, highest_m) for k, rest in zip(items, rests, strict=True)]
     tracks = np.cumsum(stays) - 1
@@ -149,7 +152,7 @@ def _stays(mesh: Mesh, rest: Rest, below: Support, highest_m: float) -> bool:
 def _thing(
     track: int, item: Item, rest: Rest, below: Support, tracks: F8, bearer: int | None
 ) -> Thing:
-    axes = rest.pose.rotation[2]  # heights of the thing's own axes
+    axes = rest.pose.rotation[2]  # world z of the object's own axes
     return Thing(
         track,
         item.category,

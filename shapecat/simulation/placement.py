@@ -1,4 +1,4 @@
-"""How a thing can lie still on a level surface."""
+"""Stable resting poses of a mesh on a horizontal surface."""
 
 import numpy as np
 from numpy.random import Generator
@@ -13,11 +13,11 @@ __all__ = ["Rest", "choose_rest", "rests", "turn_about_z"]
 
 
 class Rest(Record):
-    """A way to rest on a level surface.
+    """A stable resting pose on a horizontal surface.
 
     Attributes
     ----------
-    pose : ``level_from_mesh``: what touches the surface is at z = 0, the middle over the origin.
+    pose : ``level_from_mesh``: the lowest point at z = 0, the centre of mass over the origin.
     manner : ``upright``, ``upside_down`` or ``lying``.
     """
 
@@ -26,14 +26,14 @@ class Rest(Record):
 
 
 def rests(mesh: Mesh) -> tuple[Rest, ...]:
-    """Find the faces of its convex hull that a thing does not roll off from.
+    """Return the stable resting poses of a mesh.
 
-    A thing rests on a face if its centre of mass, taken as that of its hull, lies above it. Manners
-    are told by how far the thing's own z axis is from the vertical: up to 15 degrees.
+    A mesh rests on a face of its convex hull if the hull's centre of mass lies above this face. It
+    is upright or upside down if its z axis is within 15 degrees of the vertical.
 
     Returns
     -------
-    One for each triangle of the hull it can rest on, in the order of their normals.
+    One pose for each stable face, in the order of the normals.
     """
     points = np.asarray(mesh.vertices, np.float64)
     hull = ConvexHull(points)
@@ -56,20 +56,23 @@ def rests(mesh: Mesh) -> tuple[Rest, ...]:
 
 
 def turn_about_z(pose: Pose, angle: float, place: F8) -> Pose:
-    """Turn what stands on the origin about z, by radians, and move it to ``place`` (3,), metres."""
+    """Turn a pose about z by ``angle``, radians, then move it by ``place`` (3,), metres."""
     c, s = np.round(np.cos(angle), 9), np.round(np.sin(angle), 9)
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
     return Pose(turn @ pose.rotation, turn @ pose.translation + place)
 
 
 def choose_rest(found: tuple[Rest, ...], manner: str, rng: Generator) -> Rest | None:
-    """Draw one of the rests of a manner; None if there is none."""
+    """Draw a resting pose of a manner; None if there is none."""
     fitting = [rest for rest in found if rest.manner == manner]
     return fitting[int(rng.integers(len(fitting)))] if fitting else None
 
 
 def _centre_of_mass(corners: F8, origin: F8) -> F8:
-    """Return the centre of a convex solid given by its triangles (k, 3, 3)."""
+    """Return the centre of mass (3,) of a convex solid with triangles (k, 3, 3).
+
+    ``origin`` (3,) is a point inside the solid.
+    """
     a = corners - origin
     volumes = np.abs(np.einsum("ij,ij->i", a[:, 0], np.cross(a[:, 1], a[:, 2])))
     centres = a.sum(axis=1) / 4
@@ -77,7 +80,7 @@ def _centre_of_mass(corners: F8, origin: F8) -> F8:
 
 
 def _inside(corners: F8, normals: F8, foot: F8) -> F8:
-    """Tell which points lie in their triangles, a little margin included."""
+    """Return (k,) whether each point lies in its triangle, with a tolerance of 1e-9."""
     signs = []
     for k in range(3):
         a, b = corners[:, k], corners[:, (k + 1) % 3]

@@ -1,4 +1,4 @@
-"""Mesh primitives: profiles that are turned, outlines that are swept or raised, rounded boxes."""
+"""Mesh primitives: solids of revolution, tubes, extruded outlines, rounded boxes."""
 
 from collections.abc import Sequence
 from typing import TypeAlias
@@ -16,7 +16,7 @@ Points: TypeAlias = F8 | Sequence[Sequence[float]]
 
 
 def _grid(rows: int, columns: int, *, closed: bool) -> I4:
-    """Return the triangles between rows of ``columns`` vertices; closed rows are rings."""
+    """Return the triangles (m, 3) between rows of ``columns`` vertices; closed rows are rings."""
     row = np.arange(rows - 1)[:, None] * columns
     column = np.arange(columns if closed else columns - 1)[None]
     after = (column + 1) % columns
@@ -33,15 +33,15 @@ def lathe(
     squareness: float = 2.0,
     turn: float = 0.0,
 ) -> Mesh:
-    """Turn a profile about the z axis.
+    """Make a solid of revolution about the z axis.
 
     Parameters
     ----------
-    profile : (k, 2) radius and height, metres, from the centre of the bottom along the surface.
-    segments : corners of a ring: few make a polygon.
-    stretch : length of the cross-section along y by that along x.
-    squareness : exponent of the superellipse: 2 is round, 6 a square with round corners.
-    turn : angle of the first corner.
+    profile : (k, 2) radius and z, metres, along the surface from the centre of the bottom.
+    segments : number of corners of the cross-section; few make a polygon.
+    stretch : size of the cross-section along y divided by that along x.
+    squareness : exponent of the superellipse: 2 is round, 6 a square with rounded corners.
+    turn : angle of the first corner, radians.
     """
     profile = np.asarray(profile, np.float64)
     angle = turn + np.arange(segments) * (2 * np.pi / segments)
@@ -69,9 +69,9 @@ def tube(
     Parameters
     ----------
     path : (k, 3) metres.
-    radius : one, or one for each point of the path, metres.
-    flatness : radius across the plane of the path by that in it.
-    closed : the path is a ring; otherwise its ends are covered.
+    radius : in the plane of the path, metres: a number, or (k,) one per point.
+    flatness : radius across the plane of the path divided by that in the plane.
+    closed : whether the path is a ring; if not, the ends are capped.
     """
     path = np.asarray(path, np.float64)
     k = len(path)
@@ -99,7 +99,7 @@ def tube(
 
 
 def _across(path: F8, along: F8) -> F8:
-    """Return unit vectors across a path, turning as little as possible along it."""
+    """Return unit vectors (k, 3) perpendicular to a path, with the least rotation along it."""
     spread = np.linalg.svd(path - path.mean(axis=0), full_matrices=False)[2]
     start = spread[-1] if abs(spread[-1] @ along[0]) < 0.9 else spread[0]
     if start[np.argmax(np.abs(start))] < 0:  # the sign of a singular vector is free
@@ -132,14 +132,14 @@ def smooth_path(points: Points, count: int = 16) -> F8:
 
 
 def rounded_box(size: ArrayLike, *, radius: float = 0.0, bulge: float = 0.0, fine: int = 4) -> Mesh:
-    """Make a box with round edges that stands on z = 0.
+    """Make a box with rounded edges that stands on z = 0.
 
     Parameters
     ----------
     size : (3,) metres.
-    radius : of the edges, metres, less than half the smallest size.
-    bulge : how far the middle of the side faces sticks out, metres.
-    fine : rows of squares on the flat part of a face.
+    radius : radius of the edges, metres; at most 0.45 of half the smallest size.
+    bulge : how far the middle of each side face bulges outward, metres.
+    fine : number of mesh cells along the flat part of a face.
     """
     half = np.asarray(size, np.float64) / 2
     radius = min(radius, 0.45 * float(half.min()))
@@ -173,17 +173,18 @@ def _box_lines(half: float, radius: float, fine: int) -> F8:
     if radius <= 0:
         return flat
     turn = radius * (1 - np.tan(np.pi / 4 * np.array([1.0, 0.66, 0.33])))
-    # Seen from the middle of its arc, a point of the square edge maps to equal angles.
+    # Projected onto the arc from its centre, these points of the square edge are at equal angles.
     edge = np.sort(radius - turn)[::-1]
     return np.concatenate([-(half - radius) - edge, flat, (half - radius + edge)[::-1]])
 
 
 def extrude(outline: Points, height: float) -> Mesh:
-    """Raise a flat outline, star-shaped about its mean, to a solid that stands on z = 0.
+    """Extrude a flat outline, star-shaped about its mean, from z = 0 to ``height``.
 
     Parameters
     ----------
-    outline : (k, 2) metres, in order.
+    outline : (k, 2) corners in order, metres.
+    height : metres.
     """
     outline = np.asarray(outline, np.float64)
     middle = outline.mean(axis=0)

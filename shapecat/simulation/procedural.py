@@ -1,4 +1,4 @@
-"""Procedural objects of no category: no two are alike, so that *unknown* is learned widely."""
+"""Procedural objects outside the categories: their variety widens what *unknown* covers."""
 
 from collections.abc import Callable
 
@@ -18,7 +18,7 @@ __all__ = ["PROCEDURAL"]
 
 
 def _assembly(rng: Generator) -> Mesh:
-    """Return three to five unlike bodies that go through each other: machines, toys, fittings."""
+    """Return three to five intersecting solids of different kinds: a machine, toy or fitting."""
     size = log_uniform(rng, 0.03, 0.09)
     parts, place = [], np.zeros(3)
     for _ in range(int(rng.integers(3, 6))):
@@ -48,7 +48,7 @@ def _anyhow(rng: Generator) -> F8:
 
 
 def _bent_rod(rng: Generator) -> Mesh:
-    """Return a rod of changing width along a bent path: tools, cutlery, fruit, cables."""
+    """Return a rod of varying width along a bent path: a tool, cutlery, fruit or cable."""
     length = log_uniform(rng, 0.1, 0.32)
     steps = rng.normal(size=(int(rng.integers(3, 7)), 3)) * [0.5, 0.5, 0.15]
     steps[:, 0] = np.abs(steps[:, 0]) + rng.uniform(0.1, 1.2)
@@ -62,7 +62,7 @@ def _bent_rod(rng: Generator) -> Mesh:
 
 
 def _slab(rng: Generator) -> Mesh:
-    """Return a slab with an irregular outline: gadgets, tools that lie, parts of packages."""
+    """Return a slab with an irregular outline: a gadget, a lying tool or part of a package."""
     corners = int(rng.choice([3, 5, 6, 7, 8, 9, 11, 13]))
     angle = np.sort(rng.uniform(0, 2 * np.pi, corners)) + rng.uniform(0, 6)
     radius = log_uniform(rng, 0.03, 0.1) * rng.uniform(0.25, 1.0, corners)
@@ -73,7 +73,7 @@ def _slab(rng: Generator) -> Mesh:
 
 
 def _lump(rng: Generator) -> Mesh:
-    """Return a lump with waves of several lengths: stones, bread, clothes, bags."""
+    """Return a lump with waves of several lengths: a stone, bread, clothes or a bag."""
     ball = ellipsoid(log_uniform(rng, 0.025, 0.08) * rng.uniform(0.35, 1.4, 3))
     points = np.asarray(ball.vertices, np.float64)
     unit = points / (np.linalg.norm(points, axis=1, keepdims=True) + 1e-12)
@@ -86,10 +86,10 @@ def _lump(rng: Generator) -> Mesh:
 
 
 def _turned(rng: Generator) -> Mesh:
-    """Return a turned body with bulges and waists: chess men, lamps, vases, spinning tops."""
+    """Return a solid of revolution with bulges and waists: a chess piece, lamp, vase or top."""
     height = log_uniform(rng, 0.05, 0.25)
     count = int(rng.integers(5, 9))
-    wide = (np.arange(count) + rng.integers(2)) % 2  # bulges and waists take turns
+    wide = (np.arange(count) + rng.integers(2)) % 2  # bulges and waists alternate
     radius = height * log_uniform(rng, 0.15, 0.6) * np.where(wide, 1.0, 0.35)
     radius *= rng.uniform(0.6, 1.3, count)
     levels = np.linspace(0, height, count)
@@ -101,7 +101,7 @@ def _turned(rng: Generator) -> Mesh:
 
 
 def _branched(rng: Generator) -> Mesh:
-    """Return limbs from one body: plants, animals, taps, clamps."""
+    """Return a body with limbs: a plant, animal, tap or clamp."""
     size = log_uniform(rng, 0.02, 0.05)
     parts = [ellipsoid(size * rng.uniform(0.4, 1.2, 3))]
     for _ in range(int(rng.integers(2, 7))):
@@ -113,7 +113,7 @@ def _branched(rng: Generator) -> Mesh:
 
 
 def _frame(rng: Generator) -> Mesh:
-    """Return a ring that is no circle, and a rod or two across: glasses, handles, wire, tape."""
+    """Return a distorted ring with up to two rods across: glasses, a handle, wire or tape."""
     t = np.arange(40) * (2 * np.pi / 40)
     radius = log_uniform(rng, 0.03, 0.09) * (
         1 + rng.uniform(0, 0.4) * np.cos(int(rng.integers(2, 5)) * t + rng.uniform(0, 6))
@@ -139,4 +139,4 @@ PROCEDURAL: dict[str, Callable[[Generator], Mesh]] = {
     "frame": _frame,
     **EVERYDAY,
 }
-"""The families, each with its maker."""
+"""The families, with the functions that make them."""

@@ -1,4 +1,4 @@
-"""Simulated recordings, with the truth beside them."""
+"""Simulated recordings with ground truth."""
 
 import json
 import tempfile
@@ -26,7 +26,7 @@ from shapecat.types import Camera, Frame
 __all__ = ["EPOCH_NS", "record", "simulate", "written_paths"]
 
 EPOCH_NS = 1_700_200_000_000_000_000
-"""Stamp of the first frame."""
+"""Timestamp of the first frame."""
 
 _LATENCY_NS = 12_000_000
 _OPTICAL = "camera_depth_optical_frame"
@@ -34,7 +34,7 @@ _COLOUR_OPTICAL = "camera_color_optical_frame"
 
 
 def _ignore(phase: str, done: int, total: int | None) -> None:
-    """Watch nothing."""
+    """Ignore progress."""
 
 
 def simulate(
@@ -53,18 +53,18 @@ def simulate(
     """Write a recording of a random scene.
 
     Topics: /camera/depth/image_raw (16UC1, mm) or /camera/depth/points, /camera/depth/camera_info,
-    /tf (map, base_link, camera_link) and /tf_static. Beside it, under the same name,
-    ``NAME.truth.json`` says what stands where in each frame and ``NAME.labels.npz`` whose each
-    pixel is. The same arguments give the same messages on every machine.
+    /tf (map, base_link, camera_link) and /tf_static. Beside the recording, ``NAME.truth.json``
+    lists the objects of each frame with their poses, and ``NAME.labels.npz`` holds the object of
+    each depth pixel. The same arguments give the same messages on every machine.
 
     Parameters
     ----------
     out : path of the recording; the suffix of the format is added if it has none.
     clouds : write organized point clouds instead of depth images.
     color : also write the images of a colour camera beside the depth camera:
-        /camera/color/image_raw/compressed (JPEG), /camera/color/camera_info, its place in
-        /tf_static; ``NAME.color_labels.npz`` says whose each of its pixels is.
-    observe : told the phase, the frames done, and how many there are.
+        /camera/color/image_raw/compressed (JPEG), /camera/color/camera_info, its pose in
+        /tf_static, and ``NAME.color_labels.npz`` with the object of each colour pixel.
+    observe : called with the phase, the number of finished frames, and the total.
 
     Returns
     -------
@@ -72,8 +72,8 @@ def simulate(
 
     Raises
     ------
-    ValueError : an unknown scene, format or sensor.
-    OutputError : the place is not writable.
+    ValueError : the scene, format or sensor does not exist.
+    OutputError : the recording cannot be written.
     """
     if sensor not in SENSORS:
         msg = f"no sensor {sensor!r}; known: {', '.join(SENSORS)}"
@@ -104,9 +104,9 @@ def record(
     rate_hz: float = 30.0,
     observe: Callable[[str, int, int | None], None] = _ignore,
 ) -> Path:
-    """Write a recording of a world; see `simulate`.
+    """Write a recording of a world, as `simulate` does.
 
-    ``seed`` draws the sensor's noise and names the scene in the truth.
+    ``seed`` seeds the sensor noise and names the scene in the ground truth.
     """
     if format not in CONTAINERS:
         msg = f"no recording format {format!r}; known: {', '.join(CONTAINERS)}"
@@ -162,7 +162,7 @@ def _write_frame(
     info = make.camera_info(camera, stamp, _OPTICAL)
     writer.write("/camera/depth/camera_info", info, logged)
     if clouds:
-        # As drivers do, from the depth image in whole millimetres.
+        # Like drivers, compute the points from a depth image in whole millimetres.
         image = np.round(depth * 1000) * np.float32(0.001)
         points = replace(frame, depth=image).xyz().reshape(camera.height, camera.width, 3)
         writer.write("/camera/depth/points", make.cloud(points, stamp, _OPTICAL), logged)
@@ -171,7 +171,7 @@ def _write_frame(
 
 
 def _write_colour(writer: Container, world: World, frame: Frame) -> U1:
-    """Write the colour image of a frame; return whose its pixels are."""
+    """Write the colour image of a frame; return its pixel labels (h, w)."""
     make, stamp = writer.messages, frame.stamp_ns
     colours, labels = render_colour(world, frame.index)
     lens, logged = COLOUR.lens, stamp + _LATENCY_NS + _LATENCY_NS // 2
@@ -196,11 +196,11 @@ def _truth(world: World, frame: Frame, labels: U1, sensor: Sensor, seed: int) ->
 
 
 class _LabelFile:
-    """``labels`` (t, h, w) uint8 in a compressed .npz, written frame by frame."""
+    """A compressed .npz with ``labels`` (t, h, w), uint8, written frame by frame."""
 
     def __init__(self, path: Path, frames: int, camera: Camera) -> None:
         self._archive = zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED, compresslevel=4)
-        # A fixed date: the same labels are the same bytes.
+        # ZipInfo's fixed date makes equal labels give equal bytes.
         member = zipfile.ZipInfo("labels.npy")
         member.compress_type = zipfile.ZIP_DEFLATED
         self._file: IO[bytes] = self._archive.open(member, "w", force_zip64=True)
@@ -221,7 +221,7 @@ class _LabelFile:
 
 
 def written_paths(out: Path, format: str, *, color: bool = False) -> list[Path]:  # noqa: A002  the word users know
-    """Return what `simulate` writes: the recording, the truth, and the labels."""
+    """Return the paths that `simulate` writes: the recording, the ground truth, the labels."""
     suffix, _ = CONTAINERS[format]
     out = out if out.suffix or not suffix else out.with_name(out.name + suffix)
     names = [out.name, f"{out.stem}.truth.json", f"{out.stem}.labels.npz"]
@@ -230,11 +230,11 @@ def written_paths(out: Path, format: str, *, color: bool = False) -> list[Path]:
 
 
 def _move(made: Path, path: Path) -> None:
-    """Replace a file, or a recorded folder; a folder of anything else stays.
+    """Move a finished file or folder to its path, replacing a file or a recorded folder.
 
     Raises
     ------
-    OutputError : there is such a folder.
+    OutputError : the path is a folder that holds anything but a ROS 2 bag.
     """
     if path.is_dir() and not path.is_symlink():
         files = list(path.iterdir())

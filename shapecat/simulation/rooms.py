@@ -27,15 +27,15 @@ from shapecat.simulation.worlds import Support, World, turned_about_z
 __all__ = ["room"]
 
 _EQUIPMENT = 6
-"""Pixel label of what is no object."""
+"""Pixel label of background equipment."""
 _DEVICES = {"laptop": make_laptop, "keyboard": make_keyboard, "plant": make_plant}
-"""Things on the table that are of no category, and larger than others."""
+"""Large objects on the table, outside the categories."""
 
 
 def room(
     rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
-    """Put things on a table in a room full of other stuff, which is no object."""
+    """Place objects on a table in a room full of background equipment."""
     supports = [*make_room(rng, wall_chance=0.7), make_table(rng)]
     table = supports[-1]
     supports += _walls(rng)
@@ -81,7 +81,7 @@ def _walls(rng: Generator) -> Iterator[Support]:
 
 
 def _arms(rng: Generator, table: Support) -> Iterator[Mesh]:
-    """Yield the parts of robot arms and of people that reach over the table."""
+    """Yield the parts of a robot arm and of a person's arm that reach over the table."""
     top = table.height
     if rng.random() < 0.75:
         beside = rng.choice([-1, 1]) * rng.uniform(0.35, 0.6)
@@ -117,7 +117,7 @@ def _around(rng: Generator) -> Iterator[Mesh]:
 
 
 def _beside(rng: Generator) -> F8:
-    """Return a place on the floor beside or behind the table."""
+    """Return a position (3,) on the floor beside or behind the table."""
     angle = rng.uniform(0.0, np.pi)
     return rng.uniform(0.95, 1.5) * np.array([np.cos(angle), np.sin(angle), 0.0])
 

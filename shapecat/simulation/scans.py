@@ -1,4 +1,4 @@
-"""Scanned and CAD meshes: read from PLY, stood upright whatever their axes."""
+"""Scanned and CAD meshes: reading them, and turning them upright."""
 
 from pathlib import Path
 from typing import Any
@@ -26,15 +26,15 @@ _AXES = np.array(
     ],
     np.float64,
 )
-"""Rotations that bring +z, -z, +x, -x, +y, -y of the file to +z."""
+"""Rotations that turn +z, -z, +x, -x, +y, -y of the file to +z."""
 
 
 def load_mesh(path: Path) -> Mesh:
-    """Read a triangle mesh in metres (.ply, .obj, .stl); axes as in the file.
+    """Read a triangle mesh in metres (.ply, .obj, .stl), with the axes of the file.
 
     Raises
     ------
-    RecordingError : there are no triangles in it.
+    RecordingError : the file holds no triangles.
     ConfigError : Open3D is not installed.
     """
     try:
@@ -50,11 +50,11 @@ def load_mesh(path: Path) -> Mesh:
 
 
 def uprighted(mesh: Mesh, category: str) -> Mesh:
-    """Stand a mesh upright: find which of its six axes is up, from its shape.
+    """Turn a mesh upright: estimate from its shape which of its six axis directions is up.
 
-    The axis of a turned body is the one about which its hull is roundest. A cup, bowl or plate
-    opens upward: seen from above its surface lies deepest under its hull. The top of a bottle is
-    its narrow end. A can and a ball have no top; a box stands as its file says.
+    A can stands on the axis along which its outline is roundest; a bottle also prefers its longest
+    axis, with its narrow end up. A cup, bowl or plate is turned so that its surface, seen from
+    above, lies deepest below its top. A box or a ball keeps the axes of the file.
     """
     points = np.asarray(mesh.vertices, np.float64)
     points = points - (points.min(axis=0) + points.max(axis=0)) / 2
@@ -76,11 +76,11 @@ def uprighted(mesh: Mesh, category: str) -> Mesh:
 
 
 def upright_poses(mesh: Mesh, category: str) -> tuple[Rest, ...]:
-    """Return the ways a mesh can rest, in terms of its own axes, upright first.
+    """Return the resting poses of a mesh that `uprighted` has turned, upright ones first.
 
     Raises
     ------
-    ValueError : no face of its hull is stable; the mesh is not of this world.
+    ValueError : no face of the convex hull is stable.
     """
     found = rests(uprighted(mesh, category))
     if not found:
@@ -91,13 +91,13 @@ def upright_poses(mesh: Mesh, category: str) -> tuple[Rest, ...]:
 
 
 def fill_ratio(mesh: Mesh) -> float:
-    """Return the volume of the hull by that of the bounding box: pi / 4 for a cylinder."""
+    """Return the volume of the convex hull divided by that of the bounding box."""
     hull = ConvexHull(np.asarray(mesh.vertices, np.float64))
     return float(hull.volume / np.prod(np.asarray(mesh.extents, np.float64)))
 
 
 def _roundness(points: F8) -> float:
-    """Return 1 if the outline seen along z is a circle, less the further it is from one."""
+    """Return the smallest width of the outline seen along z divided by the greatest."""
     angle = np.arange(16) * (np.pi / 16)
     flat = points[:, :2] @ [np.cos(angle), np.sin(angle)]
     widths = np.ptp(flat, axis=0)
@@ -105,7 +105,7 @@ def _roundness(points: F8) -> float:
 
 
 def _narrow_end(points: F8, triangles: I4) -> float:
-    """Return whether the upper part is narrower (positive) or wider than the lower part."""
+    """Return a positive number if the upper half has smaller cross-sections than the lower half."""
     low, high = points[:, 2].min(), points[:, 2].max()
     levels = np.linspace(low, high, 18)[1:-1]
     areas = [_slice_area(points[triangles], float(z)) for z in levels]
@@ -113,7 +113,7 @@ def _narrow_end(points: F8, triangles: I4) -> float:
 
 
 def _slice_area(corners: F8, z: float) -> float:
-    """Return the area of the hull of a level cut through triangles (m, 3, 3)."""
+    """Return the area of the convex hull of the horizontal section of triangles (m, 3, 3)."""
     a, b = corners, np.roll(corners, -1, axis=1)
     cut = (a[..., 2] < z) != (b[..., 2] < z)
     a, b = a[cut], b[cut]
@@ -124,7 +124,10 @@ def _slice_area(corners: F8, z: float) -> float:
 
 
 def _hollow(points: F8, mesh: Mesh) -> float:
-    """Return how far, on average, the surface seen from above lies below the top: its opening."""
+    """Return the median depth below the top of the middle of the surface, seen from above.
+
+    The depth is relative to the greatest distance from the z axis.
+    """
     turned = Mesh(points, mesh.triangles)
     far = 40 * float(np.abs(points).max())
     span = float(np.abs(points[:, :2]).max())

@@ -1,4 +1,4 @@
-"""Random scenes: tables, shelves, clutter, a turntable."""
+"""Random scenes of each kind."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -36,21 +36,24 @@ SceneKind = Literal[
 
 @dataclass(frozen=True)
 class _Wish:
-    """What a scene is to have; ``distractors`` None leaves it to the kind of scene."""
+    """Content of a scene; ``distractors`` None leaves their number to the kind of scene."""
 
     filming: Filming
     categories: tuple[str, ...]
     distractors: int | None
 
     def draw(self, rng: Generator, count: int, *, usual: int = 0) -> list[str]:
-        """Return the categories of ``count`` things, each once before any twice, and unknowns."""
+        """Return ``count`` categories, each once before any repeats, then the unknown objects.
+
+        ``usual`` is the number of unknown objects if the wish leaves it open.
+        """
         first = [str(c) for c in rng.permutation(self.categories)]
         more = [str(c) for c in rng.choice(self.categories, max(0, count - len(first)))]
         unknown = usual if self.distractors is None else self.distractors
         return [*(first + more)[:count], *["unknown"] * unknown]
 
     def poured(self, rng: Generator) -> list[str]:
-        """Return the categories of 4 to 18 things in any order, one in six of no category."""
+        """Return the categories of 4 to 18 objects in random order, one in six unknown."""
         count = int(rng.integers(4, 19))
         wanted = self.draw(rng, count - count // 6, usual=count // 6)
         return [str(category) for category in rng.permutation(wanted)]
@@ -65,17 +68,17 @@ def make_scene(
     categories: Sequence[str] = CATEGORIES,
     distractors: int | None = None,
 ) -> World:
-    """Make a random scene and the way a camera takes through it.
+    """Make a random scene and a camera path through it.
 
     Parameters
     ----------
-    frames : length of the way; the things do not depend on it.
-    categories : those that appear; each at least once where there is room.
-    distractors : things of no category; by default none on a tabletop, a few elsewhere.
+    frames : number of frames; the objects do not depend on it.
+    categories : categories to draw from; each appears at least once where there is room.
+    distractors : number of objects outside the categories; the kind of scene decides by default.
 
     Raises
     ------
-    ValueError : there is no such kind of scene.
+    ValueError : the kind of scene does not exist.
     """
     if kind not in SCENES:
         msg = f"no scene {kind!r}; known: {', '.join(SCENES)}"
@@ -84,14 +87,15 @@ def make_scene(
 
 
 def make_stage(pieces: Sequence[Piece], rng: Generator, *, views: int = 8) -> World:
-    """Put given things on a table, and look at them from scattered places: no path, no hurry.
+    """Place given objects on a table and look at them from random directions.
 
-    Each frame is another view, from any side, 0.5 to 2 m away, 15 to 60 degrees above. Things that
-    find no room are left out; one alone always stands in the middle.
+    Each frame is a view from any side, 0.5 to 2 m away and 15 to 60 degrees above. Objects without
+    room are left out; a single object stands in the middle.
 
     Parameters
     ----------
-    pieces : from `make_piece`, or made of a scanned mesh and one of its `upright_poses`.
+    pieces : from `make_piece`, or a scanned mesh with one of its `upright_poses`.
+    views : number of frames.
     """
     room, table = make_room(rng, wall_chance=0.2), make_table(rng)
     layout = Layout(rng, gap=rng.uniform(0.005, 0.04))
@@ -103,7 +107,7 @@ def make_stage(pieces: Sequence[Piece], rng: Generator, *, views: int = 8) -> Wo
 
 
 def _tabletop(rng: Generator, wish: _Wish) -> World:
-    """Put six to ten things with gaps on a table, all categories among them."""
+    """Place six to ten objects on a table with gaps, at least one of each category."""
     room, table = make_room(rng, wall_chance=0.3), make_table(rng)
     layout = Layout(rng, gap=rng.uniform(0.015, 0.05))
     count = int(rng.integers(max(6, len(wish.categories)), 11))
@@ -117,14 +121,14 @@ def _tabletop(rng: Generator, wish: _Wish) -> World:
 
 
 def _clutter(rng: Generator, wish: _Wish) -> World:
-    """Put many things in little room: nearly touching, stacked, hiding each other."""
+    """Crowd objects on a table: nearly touching, stacked, occluding each other."""
     room, table = make_room(rng, wall_chance=0.2), make_table(rng)
     layout = Layout(rng, gap=0.01)
     half = rng.uniform([0.2, 0.16], [0.32, 0.24])
     wanted = wish.draw(rng, int(rng.integers(7, 13)), usual=int(rng.integers(0, 3)))
     wanted.sort(
         key=lambda category: category not in {"box", "can"}
-    )  # what bears others comes first
+    )  # objects that can carry others come first
     for category in wanted:
         layout.gap = float(rng.choice([0.002, 0.008, 0.02]))
         layout.put(category, table, half, stack=0.3, attempts=4)
@@ -136,7 +140,7 @@ def _clutter(rng: Generator, wish: _Wish) -> World:
 
 
 def _shelf(rng: Generator, wish: _Wish) -> World:
-    """Put twelve things on three boards between walls, some stacked."""
+    """Place twelve objects on three boards of a shelf, some stacked."""
     width, depth = rng.uniform(0.85, 1.15), rng.uniform(0.3, 0.42)
     low, step = rng.uniform(0.25, 0.4), rng.uniform(0.33, 0.42)
     boards, sides = make_shelf(width, depth, low, step)
@@ -153,7 +157,7 @@ def _shelf(rng: Generator, wish: _Wish) -> World:
 
 
 def _turntable(rng: Generator, wish: _Wish) -> World:
-    """Hold the camera still before a turning table."""
+    """Turn a round table in front of a still camera."""
     room = make_room(rng, wall_chance=0.3)
     table = round_table(rng.uniform(0.38, 0.48), rng.uniform(0.65, 0.85), 0.03)
     layout = Layout(rng, gap=0.03)

@@ -1,7 +1,7 @@
-"""Depth cameras: their intrinsics, and how wrong their readings are.
+"""Depth cameras: their intrinsics and error models.
 
-The figures of the Kinect and the RealSense D435 are fitted to real images of tables with objects.
-Those of the others follow the makers' data sheets and the cited measurements.
+The parameters of the Kinect and the RealSense D435 are fitted to real images of tables with
+objects; the other cameras follow their data sheets and the cited measurements.
 """
 
 from dataclasses import dataclass, fields, replace
@@ -16,30 +16,32 @@ __all__ = ["IDEAL", "KINECT", "PRESETS", "REALSENSE", "SENSORS", "Sensor", "betw
 
 @dataclass(frozen=True)
 class Sensor:
-    """A depth camera and its faults. Disparities are in inverse depth, 1/m; lengths in pixels.
+    """A depth camera and its error model.
 
     Attributes
     ----------
-    camera : its intrinsics.
-    nearest_m, farthest_m : range in which it reports.
-    step : quantum of the inverse depth; 0 is none.
-    noise : standard deviation of the inverse depth, of cameras that triangulate.
-    noise_m : standard deviation of the depth in metres, of those that time light.
-    grain : (across, down) width of the window over which the noise is alike.
-    wave : standard deviation of a fixed error of the device, over `wave_px` pixels.
-    device : number of the device, which draws that error and how dark objects are.
-    ragged_px : how far the outlines of things are displaced, standard deviation.
-    ragged_window : (across, down) width over which they are displaced alike.
-    shadow_m : places, along x, of the light source and the other cameras: what one of them does
-        not see has no reading.
-    filled_px : shadows are this much narrower than geometry says, on average.
+    camera : intrinsics.
+    nearest_m, farthest_m : range of depth that is reported.
+    step : quantization of the inverse depth, 1/m; 0 is none.
+    noise : standard deviation of the inverse depth, 1/m, for cameras that triangulate.
+    noise_m : standard deviation of the depth, metres, for time-of-flight cameras.
+    grain : (across, down) correlation window of the noise, pixels.
+    wave : standard deviation of a fixed error of the device in inverse depth, 1/m.
+    wave_px : distance over which this error varies, pixels.
+    device : seed of the fixed error and of the objects' reflectance.
+    ragged_px : standard deviation by which the outlines of objects are displaced, pixels.
+    ragged_window : (across, down) correlation window of this displacement, pixels.
+    shadow_m : x positions of the light source and the other cameras, metres; a surface that one of
+        them does not see has no reading.
+    filled_px : mean width by which shadows are narrower than their geometry, pixels.
     grazing : cosine of the angle of incidence at which half of the readings fail.
-    dark : spread of the logarithm of how much light objects return: a dark one fails sooner.
-    holes : share of pixels in holes anywhere.
-    blend_px : width over which near and far are mixed at outlines (flying pixels); 0 is none.
-    rounded_px : width over which edges and corners within a surface are rounded (multipath,
-        smoothing windows); 0 is none.
-    border_px : (left, right, top, bottom) without readings.
+    dark : standard deviation of the logarithm of the objects' reflectance; a dark object loses
+        readings at smaller angles of incidence.
+    holes : approximate fraction of the pixels lost in small random holes.
+    blend_px : window that mixes near and far at outlines (flying pixels), pixels; 0 is none.
+    rounded_px : window that rounds edges and corners within a surface (multipath, smoothing
+        windows), pixels; 0 is none.
+    border_px : (left, right, top, bottom) margins without readings, pixels.
     """
 
     camera: Camera
@@ -69,7 +71,7 @@ def _camera(width: int, height: int, focal: float) -> Camera:
 
 
 IDEAL = Sensor(_camera(640, 480, 525.0), nearest_m=0.05, farthest_m=10.0)
-"""A camera without faults."""
+"""A camera without errors."""
 
 KINECT = Sensor(
     _camera(640, 480, 525.0),
@@ -86,7 +88,7 @@ KINECT = Sensor(
     holes=0.0003,
     border_px=(4, 40, 4, 6),
 )
-"""Kinect v1, Xtion, Carmine (structured light), depth registered to the colour camera."""
+"""Kinect v1, Xtion or Carmine (structured light), with depth registered to the colour camera."""
 
 REALSENSE = Sensor(
     _camera(640, 480, 610.0),
@@ -104,7 +106,7 @@ REALSENSE = Sensor(
     blend_px=3,
     border_px=(8, 0, 0, 0),
 )
-"""Intel D435 (active stereo, the left infrared camera), its spatial filter switched on."""
+"""Intel D435 (active stereo, left infrared camera) with its spatial filter switched on."""
 
 _KINECT_V2 = Sensor(
     _camera(512, 424, 365.0),
@@ -140,8 +142,8 @@ _AZURE_KINECT = Sensor(
     rounded_px=5,
     border_px=(24, 24, 8, 8),
 )
-"""Azure Kinect (time of flight, narrow view): Tölgyessy et al., Evaluation of the Azure Kinect and
-its comparison to Kinect v1 and v2, 2021."""
+"""Azure Kinect (time of flight, narrow field of view): Tölgyessy et al., Evaluation of the Azure
+Kinect and its comparison to Kinect v1 and v2, 2021."""
 
 _D435 = Sensor(
     _camera(848, 480, 425.0),
@@ -162,8 +164,8 @@ _D435 = Sensor(
     rounded_px=7,
     border_px=(12, 0, 0, 0),
 )
-"""Intel D435 as it comes, unfiltered: .08 px of 425 px and 50 mm; Grunnet-Jepsen et al.,
-Best-known methods for tuning D400 depth cameras, 2018."""
+"""Intel D435 without filters: disparity noise of 0.08 px at a focal length of 425 px and a baseline
+of 50 mm; Grunnet-Jepsen et al., Best-known methods for tuning D400 depth cameras, 2018."""
 
 _D415 = replace(
     _D435,
@@ -179,7 +181,8 @@ _D415 = replace(
     holes=0.002,
     border_px=(14, 0, 0, 0),
 )
-"""Intel D415: .06 px of 615 px and 55 mm; source as of the D435."""
+"""Intel D415: disparity noise of 0.06 px, focal length 615 px, baseline 55 mm; source as for the
+D435."""
 
 _D455 = replace(
     _D435,
@@ -199,7 +202,8 @@ _D455 = replace(
     rounded_px=9,
     border_px=(30, 0, 0, 0),
 )
-"""Intel D455: .08 px of 640 px and 95 mm; source as of the D435."""
+"""Intel D455: disparity noise of 0.08 px, focal length 640 px, baseline 95 mm; source as for the
+D435."""
 
 _SR300 = Sensor(
     _camera(640, 480, 475.0),
@@ -220,7 +224,7 @@ _SR300 = Sensor(
     blend_px=3,
     border_px=(4, 4, 0, 0),
 )
-"""Intel F200, SR300 (coded light): Carfagni et al., On the performance of the Intel SR300 depth
+"""Intel F200 or SR300 (coded light): Carfagni et al., On the performance of the Intel SR300 depth
 camera, 2017."""
 
 _L515 = Sensor(
@@ -253,8 +257,8 @@ _PHONE = Sensor(
     blend_px=3,
     rounded_px=5,
 )
-"""Lidar of a phone, densified to 256 by 192 with the colour image, without holes: Luetzenburg et
-al., Evaluation of the Apple iPhone 12 Pro LiDAR, 2021."""
+"""Lidar of a phone, which the phone densifies with its colour image to 256 x 192, without holes:
+Luetzenburg et al., Evaluation of the Apple iPhone 12 Pro LiDAR, 2021."""
 
 PRESETS = {
     "kinect": KINECT,
@@ -275,9 +279,10 @@ SENSORS = {"ideal": IDEAL, **PRESETS}
 
 
 def between(first: Sensor, second: Sensor, share: float) -> Sensor:
-    """Return a sensor with the first one's camera, whose faults are partly the second one's.
+    """Return the first sensor with an error model interpolated towards that of the second.
 
-    ``share`` is 0 for the first one's own faults and 1 for those of the second.
+    ``share`` is 0 for the first model and 1 for the second. The first sensor keeps its intrinsics,
+    device, shadows and borders.
     """
     mixed = {
         field.name: _mixed(getattr(first, field.name), getattr(second, field.name), share)
@@ -295,7 +300,7 @@ def _mixed(first: Any, second: Any, share: float) -> Any:
 
 
 def resized(sensor: Sensor, scale: float) -> Sensor:
-    """Return a sensor with more or fewer pixels in the same field of view."""
+    """Return a sensor with ``scale`` times the width and height, and the same field of view."""
     camera = sensor.camera
     middle = [(c + 0.5) * scale - 0.5 for c in (camera.cx, camera.cy)]
     focal = camera.fx * scale, camera.fy * scale

@@ -22,12 +22,12 @@ _MAKERS = {
 def make_object(category: str, rng: Generator) -> Mesh:
     """Make a random object of one of `shapecat.types.CATEGORIES`, standing on the origin.
 
-    The borders between the categories hold by construction: depth / diameter of cup, bowl and
-    plate, the narrow top of a bottle.
+    The shapes keep the definitions of the categories: the depth / diameter of cups, bowls and
+    plates, and the narrow neck of bottles.
 
     Raises
     ------
-    ValueError : there is no such category.
+    ValueError : the category does not exist.
     """
     if category not in _MAKERS:
         msg = f"no shapes for category {category!r}; known: {', '.join(_MAKERS)}"

@@ -1,4 +1,4 @@
-"""Tools and household things that are none of the seven categories."""
+"""Tools and household objects outside the seven categories."""
 
 from collections.abc import Callable
 
@@ -120,7 +120,7 @@ def _phone(rng: Generator) -> Mesh:
 
 
 def _stool(rng: Generator) -> Mesh:
-    """Return a trivet or spool: discs around an axle."""
+    """Return a spool: two discs on an axle."""
     r, h = rng.uniform(0.04, 0.07), rng.uniform(0.05, 0.12)
     core, disc = r * rng.uniform(0.25, 0.5), 0.008
     return lathe(
@@ -148,4 +148,4 @@ TOOLS: dict[str, Callable[[Generator], Mesh]] = {
     "spool": _stool,
     "shoe": _shoe,
 }
-"""The kinds, each with its maker."""
+"""The kinds, with the functions that make them."""

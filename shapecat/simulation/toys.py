@@ -1,4 +1,4 @@
-"""Toys, solids and lumps that are none of the seven categories."""
+"""Toys, solids and lumps outside the seven categories."""
 
 from collections.abc import Callable
 
@@ -136,4 +136,4 @@ TOYS: dict[str, Callable[[Generator], Mesh]] = {
     "plush": _plush,
     "blob": _blob,
 }
-"""The kinds, each with its maker."""
+"""The kinds, with the functions that make them."""

@@ -1,4 +1,4 @@
-"""What is true in a frame, for those who judge what was found in it."""
+"""Ground truth of a frame."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -15,16 +15,16 @@ from shapecat.types import Pose
 __all__ = ["AMBIGUOUS_PIXELS", "AMBIGUOUS_SHARE", "LISTED_PIXELS", "Truth", "frame_truth"]
 
 LISTED_PIXELS = 100
-"""Things with fewer readings are listed as hidden, not as objects."""
+"""Objects with fewer readings are listed as hidden."""
 AMBIGUOUS_PIXELS = 250
-"""With fewer readings the category cannot be told."""
+"""Objects with fewer readings have an ambiguous category."""
 AMBIGUOUS_SHARE = 0.4
-"""Nor if a smaller share of the visible side is seen."""
+"""So do objects with a smaller visible fraction of the side that faces the camera."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """The truth of one frame as it is written: JSON values."""
+    """The ground truth of one frame, as JSON values."""
 
     objects: list[dict[str, Any]]
     hidden: list[dict[str, Any]]
@@ -32,11 +32,11 @@ class Truth:
 
 
 def frame_truth(world: World, frame: int, labels: U1, sensor: Sensor) -> Truth:
-    """Tell what is true in a frame.
+    """Return the ground truth of a frame.
 
     Parameters
     ----------
-    labels : (h, w) pixel labels of the frame.
+    labels : (h, w) uint8 pixel labels of the frame, from `render_frame`.
     """
     seen = world.geometry(frame)
     pose = world.path[frame]
@@ -112,11 +112,11 @@ def _rounded(values: F8) -> list[float]:
 
 
 def robot_links(world_from_camera: Pose) -> list[tuple[str, str, Pose]]:
-    """Split the camera's pose into those of a robot: its base on the floor, its camera on a mast.
+    """Split the camera's pose into the links of a robot with its base on the floor.
 
     Returns
     -------
-    Parent, child, ``parent_from_child``: map to base_link, base_link to camera_link.
+    Links (parent, child, ``parent_from_child``): map to base_link, and base_link to camera_link.
     """
     world_from_link = compose(world_from_camera, inverse(LINK_FROM_OPTICAL))
     heading = world_from_link.rotation[:2, 0]
@@ -131,4 +131,4 @@ def robot_links(world_from_camera: Pose) -> list[tuple[str, str, Pose]]:
 
 
 LINK_FROM_OPTICAL = Pose(np.array([[0, 0, 1], [-1, 0, 0], [0, -1, 0]]), np.zeros(3))
-"""camera_link (x forward, z up, REP 103) from the optical frame (z forward, y down)."""
+"""Pose of the optical frame (z forward, y down) in camera_link (x forward, z up, REP 103)."""

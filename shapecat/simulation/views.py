@@ -1,4 +1,4 @@
-"""Frames with labels in memory: what training and evaluation on shapes are made of."""
+"""Simulated depth frames with pixel labels, in memory, for training and evaluation."""
 
 import numpy as np
 from numpy.random import Generator
@@ -23,18 +23,18 @@ def render_frame(
     start_ns: int = 0,
     topic: str = "/camera/depth/image_raw",
 ) -> tuple[Frame, U1]:
-    """Take one depth image of a world.
+    """Render one depth image of a world.
 
     Parameters
     ----------
-    view : a frame of the world's path, or ``world_from_camera`` to look from elsewhere at its
-        first frame.
-    rng : draws the sensor's noise.
+    view : index of a frame of the world's path, or a pose ``world_from_camera`` from which to see
+        the world of frame 0.
+    rng : generator of the sensor noise.
 
     Returns
     -------
-    The frame, and (h, w) uint8 labels: 0 no reading, 1 to 9 supports, then
-    `Thing.label`.
+    The frame, and pixel labels (h, w), uint8: 0 without reading, 1 to 9 on supports, and
+    `Thing.label` on objects.
     """
     index = view if isinstance(view, int) else 0
     pose = world.path[view] if isinstance(view, int) else view

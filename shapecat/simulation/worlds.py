@@ -1,4 +1,4 @@
-"""What stands where, and from where it is seen."""
+"""Simulated worlds: supports, objects, their motions, and a camera path."""
 
 from functools import cached_property
 
@@ -13,7 +13,7 @@ from shapecat.types import Pose
 __all__ = ["FIRST_THING_LABEL", "Motion", "Support", "Thing", "World", "turned_about_z"]
 
 FIRST_THING_LABEL = 20
-"""Pixel label of the thing with track 0; supports have 1 to 9, no reading is 0."""
+"""Pixel label of the object with track 0; supports have 1 to 9, pixels without reading 0."""
 
 
 class Support(Record):
@@ -23,9 +23,9 @@ class Support(Record):
     ----------
     name : unique in its world.
     label : pixel label, 1 to 9.
-    mesh : in the world frame.
-    outline : (k, 3) metres, world frame: corners of the level surface things can stand on; none
-        for a wall.
+    mesh : metres, world frame.
+    outline : (k, 3) corners of its horizontal surface, metres, world frame; k = 0 for a support
+        that nothing can stand on, such as a wall.
     """
 
     name: str
@@ -35,7 +35,7 @@ class Support(Record):
 
     @property
     def level(self) -> bool:
-        """Whether things can stand on it."""
+        """Whether objects can stand on it."""
         return len(self.outline) > 0
 
     @property
@@ -49,14 +49,15 @@ class Thing(Record):
 
     Attributes
     ----------
-    track : its number, from 0; its pixel label is `FIRST_THING_LABEL` more.
+    track : number of the object, from 0; its pixel label is `FIRST_THING_LABEL` + track.
     category : one of the shape categories, or ``unknown``.
-    kind : what it is, for people: the category or the kind of distractor.
+    kind : the category, or the kind of distractor.
+    mesh : metres, z up, standing on z = 0.
     pose : ``world_from_mesh`` at the start.
-    on_support : name of the support it stands on, or None.
-    on_track : track of the thing it stands on, or None.
-    lying, upside_down : its own z axis is level, or points down.
-    tilted : none of its own axes is within 15 degrees of the vertical.
+    on_support : name of the support that the object stands on; None if it stands on an object.
+    on_track : track of the object that it stands on; None if it stands on a support.
+    lying, upside_down : whether its own z axis is horizontal, or points down.
+    tilted : whether none of its own axes is within 15 degrees of the vertical.
     """
 
     track: int
@@ -77,17 +78,18 @@ class Thing(Record):
 
     @property
     def indistinct(self) -> bool:
-        """Whether its shape does not tell its category: a cup upside down without a handle."""
+        """Whether its shape does not determine its category: an upside-down cup without handle."""
         return self.category == "cup" and self.upside_down and not _one_sided(self.mesh)
 
 
 class Motion(Record):
-    """How a thing moves, comes and goes.
+    """The motion of one object, its appearance and disappearance.
 
     Attributes
     ----------
-    track : the thing.
-    shifts : (t, 3) metres, for each frame, from its pose at the start; NaN where it is not there.
+    track : track of the object.
+    shifts : (t, 3) translation from its start pose in each frame, metres, world frame; NaN in
+        frames where the object is absent.
     """
 
     track: int
@@ -95,13 +97,14 @@ class Motion(Record):
 
 
 class World(Record):
-    """A scene over time. The world frame is fixed, z up, the floor at z = 0.
+    """A scene over time; the world frame is fixed, with z up and the floor at z = 0.
 
     Attributes
     ----------
-    path : ``world_from_camera`` for each frame, optical axes.
-    turns : (t,) angle, for each frame, by which the things have turned about the world's z axis.
-    motions : of the things that do more than that.
+    kind : name of the kind of scene.
+    path : pose ``world_from_camera`` of the optical frame in each frame.
+    turns : (t,) rotation of all objects about the world's z axis in each frame, radians.
+    motions : motions of objects that also move by themselves.
     """
 
     kind: str
@@ -116,7 +119,7 @@ class World(Record):
         return len(self.path)
 
     def pose_of(self, thing: Thing, frame: int) -> Pose:
-        """Return ``world_from_mesh`` of a thing in a frame; where it would be if it is absent."""
+        """Return ``world_from_mesh`` of an object in a frame; its start pose if it is absent."""
         shift = self._shifts.get(thing.track)
         pose = thing.pose
         if shift is not None and np.isfinite(shift[frame]).all():
@@ -125,17 +128,17 @@ class World(Record):
         return compose(turned_about_z(turn), pose) if turn else pose
 
     def present(self, thing: Thing, frame: int) -> bool:
-        """Return whether a thing is there in a frame."""
+        """Return whether an object is present in a frame."""
         shift = self._shifts.get(thing.track)
         return shift is None or bool(np.isfinite(shift[frame]).all())
 
     def geometry(self, frame: int) -> Geometry:
-        """Return the triangles in the world frame; owners as in `labels`."""
+        """Return all triangles of a frame, in the world frame; owners index `labels`."""
         return self._gather(frame) if self.motions or self.turns[frame] else self._still
 
     @cached_property
     def labels(self) -> F8:
-        """(n,) uint8 pixel label of each owner: the supports, then the things."""
+        """(n,) uint8 pixel label of each owner: the supports, then the objects."""
         found = [s.label for s in self.supports] + [t.label for t in self.things]
         return np.array(found, np.uint8)
 
@@ -160,13 +163,13 @@ _NOTHING = Mesh(np.zeros((0, 3)), np.zeros((0, 3)))
 
 
 def turned_about_z(angle: float) -> Pose:
-    """Return the turn about z as a pose; entries are multiples of 1e-9."""
+    """Return a rotation about z by ``angle``, radians, as a pose; entries are rounded to 1e-9."""
     c, s = np.round(np.cos(angle), 9), np.round(np.sin(angle), 9)
     return Pose(np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]), np.zeros(3))
 
 
 def _one_sided(mesh: Mesh) -> bool:
-    """Tell whether something, such as a handle, sticks out on one side of an upright thing."""
+    """Return whether a part, such as a handle, sticks out on one side of an upright mesh."""
     points = np.asarray(mesh.vertices, np.float64)
     rim = points[points[:, 2] > points[:, 2].max() - 0.002, :2]
     angle = np.arange(64) * (2 * np.pi / 64)
