@@ -1,4 +1,4 @@
-"""``shapecat`` and ``python -m shapecat``: the command line."""
+"""The command line: ``shapecat`` or ``python -m shapecat``."""
 
 import signal
 from importlib import import_module
@@ -9,7 +9,7 @@ from shapecat.system.stopping import leave
 
 
 def run() -> None:
-    """Run the command line; a signal that comes before it listens ends the process."""
+    """Run the command line. A signal that arrives before it handles signals ends the process."""
     _handle(leave)
     collect_seldom()
     try:

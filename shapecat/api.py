@@ -1,6 +1,6 @@
-"""The door from Python: open a run, open a recording, process one.
+"""The Python interface: open a run, open a recording, process a recording.
 
-``import shapecat`` loads nothing of this until a name is used.
+``import shapecat`` loads this module only when one of its names is used.
 """
 
 from collections import Counter
@@ -24,7 +24,7 @@ Observer = Callable[[str, int, int | None], None]
 
 
 def _ignore(_phase: str, _done: int, _total: int | None) -> None:
-    """Observe nothing."""
+    """Ignore the progress."""
 
 
 def open_run(folder: str | Path) -> Run:
@@ -32,13 +32,13 @@ def open_run(folder: str | Path) -> Run:
 
     Raises
     ------
-    OutputError : the folder is no finished run.
+    OutputError : the folder is not a finished run.
     """
     return Run(Path(folder))
 
 
 class OpenRecording:
-    """An open recording; a context manager that yields frames."""
+    """An open recording, from which frames are read; a context manager that closes it."""
 
     def __init__(self, recording: Recording) -> None:
         self.recording = recording
@@ -50,12 +50,12 @@ class OpenRecording:
         self.close()
 
     def close(self) -> None:
-        """Close its files."""
+        """Close the files of the recording."""
         self.recording.close()
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """All topics."""
+        """The names of all topics."""
         return tuple(channel.topic for channel in self.recording.channels())
 
     def frames(
@@ -66,11 +66,13 @@ class OpenRecording:
         end_s: float | None = None,
         every: int = 1,
     ) -> Iterator[Frame]:
-        """Yield the readings of depth sensors, by log time; options as those of `process`.
+        """Yield the frames of depth sensors by log time; the options are as for `process`.
+
+        Unreadable frames are skipped.
 
         Raises
         ------
-        NoStreamError : there is no such stream, or none that can be read.
+        NoStreamError : a topic is missing or not usable, or none is given and none can be chosen.
         """
         streams = choose_streams(self.recording, topics)
         return frames(
@@ -88,7 +90,7 @@ def open_recording(path: str | Path) -> OpenRecording:
 
     Raises
     ------
-    RecordingError : it is none, or damaged from the start.
+    RecordingError : the path is not a readable recording.
     """
     return OpenRecording(_open_recording(Path(path)))
 
@@ -112,24 +114,26 @@ def process(
     observe: Observer | None = None,
     **settings: Any,
 ) -> Run:
-    """Process one recording into the folder ``out/NAME``, as `shapecat process` does.
+    """Process one recording as `shapecat process` does, and open the results.
 
-    A complete folder made from the same input and settings is opened as it is.
+    They are in ``out/NAME``, where NAME is the recording's file name without its suffix. If they
+    are there already, complete and from the same input, settings and model, they are only opened.
 
     Parameters
     ----------
-    topics, up, fixed_frame, start_s, end_s, every, model, config, overwrite : the options of the
-        command of the same names.
-    mcap, rrd : write annotated.mcap and review.rrd.
-    cores : processes that perceive. With several, a script needs ``if __name__ == "__main__":``.
-    observe : told the phase, the frames done, and how many there are, if known.
-    settings : ``seed=3``, ``detection={"max_range_m": 1.5}``; names as in the reference.
+    topics, up, fixed_frame, start_s, end_s, every, model, config, overwrite : as the options of
+        the command.
+    mcap, rrd : whether to write annotated.mcap and review.rrd.
+    cores : number of processes that perceive frames. If there are several, a script must have
+        ``if __name__ == "__main__":``.
+    observe : called with the phase, the number of frames done, and the total (None if unknown).
+    settings : for example ``seed=3`` or ``detection={"max_range_m": 1.5}``; see docs/reference.md.
 
     Raises
     ------
-    ConfigError : a setting that does not exist, or does not fit; or a script without that line asks
-        for several cores.
-    RecordingError, NoStreamError, ModelError, OutputError : as the command, which prints them.
+    ConfigError : a setting does not exist or has an invalid value, or a script without that line
+        asks for several cores.
+    RecordingError, NoStreamError, ModelError, OutputError : as for the command, which prints them.
     """
     if cores > 1 and runs_again():
         msg = f'cores={cores} starts processes: a script needs `if __name__ == "__main__":`'

@@ -1,4 +1,4 @@
-"""Errors for the user. Each message names the problem, the place, and what to try."""
+"""Errors shown to the user. Each message names the problem, the place, and what to try."""
 
 __all__ = [
     "ConfigError",
@@ -17,28 +17,28 @@ class ShapecatError(Exception):
 
 
 class RecordingError(ShapecatError):
-    """A recording that cannot be read: missing, damaged, or not a recording."""
+    """A recording cannot be read: it is missing, damaged, or not a recording."""
 
     exit_code = 3
 
 
 class NoStreamError(ShapecatError):
-    """A recording that is readable but holds no usable cloud stream or frame."""
+    """A readable recording has no usable frame or topic, or several sensors to choose from."""
 
     exit_code = 4
 
 
 class ConfigError(ShapecatError):
-    """A setting that does not exist or has an impossible value."""
+    """A setting or option does not exist or has an invalid value."""
 
     exit_code = 2
 
 
 class ModelError(ShapecatError):
-    """A model file that is missing, damaged, or made by something else."""
+    """A model file is missing, damaged or incompatible."""
 
     exit_code = 2
 
 
 class OutputError(ShapecatError):
-    """A result that cannot be written: a full disk or a folder without permission."""
+    """A result cannot be written, or the folder of a run cannot be used."""

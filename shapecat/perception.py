@@ -1,7 +1,7 @@
-"""One frame, and those to fuse with it: detect, reconstruct, describe, categorize.
+"""Perceive a frame, fused with earlier ones: detect, reconstruct, describe, categorize.
 
-Consecutive frames are perceived in blocks: an object that looks as in an earlier frame of its
-block keeps the description of that frame. Blocks know nothing of each other.
+Consecutive frames are perceived in blocks: an object that looks the same as in an earlier frame
+of its block keeps the description from that frame. Blocks are independent of each other.
 """
 
 import time
@@ -40,14 +40,14 @@ __all__ = ["Perceiver", "View", "find_up", "perceive"]
 
 
 class View(NamedTuple):
-    """A frame, and what is known of it.
+    """A frame with its context.
 
     Attributes
     ----------
-    up : (3,) unit vector in the sensor frame, or None to estimate it from the planes.
+    up : (3,) up direction in the sensor frame, a unit vector; None to estimate it from planes.
     earlier : frames to fuse with this one.
-    pose : ``fixed_from_sensor``, None if it is not known.
-    colour : the colour image beside it; its pixels are not looked at.
+    pose : ``fixed_from_sensor``, None if it is unknown.
+    colour : the colour image nearest in time, for masks; its pixels are not used.
     """
 
     frame: Frame
@@ -59,11 +59,11 @@ class View(NamedTuple):
 
 @dataclass(frozen=True)
 class Perceiver:
-    """Perceives blocks of frames, here or in a process that reads the model's file itself.
+    """Perceives blocks of frames; a pickled copy reads the model file again.
 
     Attributes
     ----------
-    model : the file of the categorizer, None for the default one.
+    model : path of the model file, None for the default model.
     """
 
     categorizer: Categorizer
@@ -71,7 +71,7 @@ class Perceiver:
     model: Path | None
 
     def __call__(self, views: Sequence[View]) -> list[Perception]:
-        """Perceive consecutive frames; later ones may repeat what earlier ones show."""
+        """Perceive consecutive frames; later ones may reuse the results of earlier ones."""
         known: dict[str, _Known] = {}
         perceptions = []
         for view in views:
@@ -109,12 +109,13 @@ def perceive(
 ) -> Perception:
     """Find, reconstruct, describe and categorize the objects of one frame (thesis ch. 4 to 7).
 
-    Pure: the result depends on the arguments alone, whichever worker computes it.
+    The result depends only on the arguments.
 
     Parameters
     ----------
-    up : (3,) unit vector in the sensor frame, or None to estimate it from the planes.
-    earlier : frames to fuse with this one; indices are those of the frame's own readings.
+    up : (3,) up direction in the sensor frame, a unit vector; None to estimate it from planes.
+    earlier : frames to fuse with this one. The pixels of candidates are only those with a reading
+        in ``frame`` itself.
     """
     view = View(frame, up, tuple(earlier))
     perception, _ = _perceive(view, _NOTHING, Perceiver(categorizer, settings, None))
@@ -122,13 +123,13 @@ def perceive(
 
 
 class _Known(NamedTuple):
-    """What the frames of a topic have shown before, in the same block.
+    """Results of the earlier frames of a topic in the same block.
 
     Attributes
     ----------
-    view : the last frame that was not repeated, after fusing; None if there is none.
-    perception : what was found in it.
-    keys : the views of objects that were described.
+    view : the last frame that was not a repetition, after fusion; None if there is none.
+    perception : the result of that frame.
+    keys : described objects, for comparison with later frames.
     """
 
     view: View | None
@@ -140,7 +141,7 @@ _NOTHING = _Known(None, None, ())
 
 
 def _perceive(view: View, known: _Known, perceiver: Perceiver) -> tuple[Perception, _Known]:
-    """Perceive a frame; return also the state that the next frame starts from."""
+    """Perceive a frame; return the result and the state for the next frame."""
     clock, frame, range_m = _Clock(), view.frame, perceiver.settings.detection.max_range_m
     seen = view._replace(frame=fuse(frame, view.earlier, range_m=range_m), earlier=())
     if known.perception is not None and _repeats(seen, known.view, range_m):
@@ -164,7 +165,7 @@ def _perceive(view: View, known: _Known, perceiver: Perceiver) -> tuple[Percepti
 def _look(
     view: View, keys: tuple[KeyView, ...], perceiver: Perceiver, clock: "_Clock"
 ) -> tuple[Scene, tuple[Detection, ...], tuple[KeyView, ...]]:
-    """Find the objects of a frame, and describe those that no view is known of."""
+    """Detect the objects of a frame, and describe those that match no earlier view."""
     frame, settings = view.frame, perceiver.settings
     scene = detect(frame, up=view.up, settings=settings.detection, rng=_rng(settings, frame, 0))
     clock.lap("detect")
@@ -193,7 +194,7 @@ def _look(
 
 
 def _with_masks(view: View, perception: Perception) -> Perception:
-    """Add where the colour image shows the objects."""
+    """Add the masks of the objects on the colour image, if there is one."""
     if view.colour is None:
         return perception
     begun = time.perf_counter()
@@ -204,7 +205,7 @@ def _with_masks(view: View, perception: Perception) -> Perception:
 
 
 def _repeats(view: View, then: View | None, range_m: float) -> bool:
-    """Tell whether a frame shows what an earlier one showed, from the same place."""
+    """Return whether a frame shows the same as an earlier one, with the same up direction."""
     if then is None or (view.up is None) != (then.up is None):
         return False
     if view.up is not None and then.up is not None and view.up @ then.up < _SAME_UP:
@@ -213,7 +214,7 @@ def _repeats(view: View, then: View | None, range_m: float) -> bool:
 
 
 def _repeated(frame: Frame, first: Perception) -> Perception:
-    """Return what was found in an earlier frame as found in this one."""
+    """Return the result of an earlier frame as the result of this one."""
     detections = tuple(
         replace(d, seconds=0.0, reused_from=first.index if d.reused_from is None else d.reused_from)
         for d in first.detections
@@ -229,7 +230,7 @@ def _repeated(frame: Frame, first: Perception) -> Perception:
 
 
 def _of_frame(frame: Frame, perception: Perception) -> Perception:
-    """Leave out the pixels where the frame itself has no reading."""
+    """Remove pixels without a reading in the frame itself from the candidates."""
     scene = with_own_readings(perception.scene, frame)
     detections = tuple(
         replace(detection, candidate=candidate)
@@ -239,33 +240,33 @@ def _of_frame(frame: Frame, perception: Perception) -> Perception:
 
 
 class _Clock:
-    """Tells how long each of some steps takes."""
+    """Measures the duration of successive steps."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
         self._last = time.perf_counter()
 
     def lap(self, step: str) -> None:
-        """Note that a step has ended."""
+        """Store the seconds since the previous lap as the duration of a step."""
         now = time.perf_counter()
         self.seconds[step], self._last = now - self._last, now
 
 
 def find_up(frame: Frame, settings: Settings) -> F4 | None:
-    """Return the normal (3,) of the supporting planes, or None if they are too small."""
+    """Return the up direction (3,) of the supporting planes; None if the planes are too small."""
     scene = detect(frame, settings=settings.detection, rng=_rng(settings, frame, 0))
     return scene.up if sum(plane.area_m2 for plane in scene.planes) >= _TELLS_M2 else None
 
 
 def _rng(settings: Settings, frame: Frame, item: int) -> np.random.Generator:
-    """Seed by (seed, stamp, object): the same whatever the order and the number of workers."""
+    """Return a generator seeded by (seed, stamp, object), whatever worker uses it and when."""
     return np.random.default_rng((settings.seed, abs(frame.stamp_ns), item))
 
 
 def _describe(
     frame: Frame, scene: Scene, candidate: Candidate, settings: Settings, rng: np.random.Generator
 ) -> _Shape:
-    """Stand the candidate upright on z = 0, learn its surface, and describe it."""
+    """Move a candidate to the level frame, its support at z = 0; learn and describe its surface."""
     begun = time.perf_counter()
     points = frame.xyz(candidate.indices)
     level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
@@ -283,7 +284,7 @@ def _describe(
 def _completed(
     frame: Frame, scene: Scene, detection: Detection, categories: Sequence[str]
 ) -> Detection:
-    """Estimate the whole of an object."""
+    """Add the estimated box of the whole object to a detection."""
     candidate = detection.candidate
     some = candidate.indices[:: max(1, -(-len(candidate.indices) // ENOUGH_POINTS))]
     offset = scene.support_offset(candidate)
@@ -294,7 +295,7 @@ def _completed(
 def _categorize(
     found: Sequence[Candidate], shapes: Sequence[_Shape], categorizer: Categorizer
 ) -> list[Detection]:
-    """Categorize candidates in one call; without a surface all categories are equally likely."""
+    """Categorize candidates in one call; the posterior is uniform for those without a surface."""
     if not shapes:
         return []
     begun = time.perf_counter()
@@ -316,8 +317,8 @@ def _categorize(
 
 
 _TELLS_M2 = 0.1
-"""Area of planes that tells where up is; a smaller one may be the face of something."""
+"""Planes with a smaller total area give no up direction: they may be the face of an object."""
 _UNDECIDED = 2.0
-"""Novelty of an object with too few points for a surface: beyond the threshold, so unknown."""
+"""Novelty of an object with too few points for a surface: above the threshold, so unknown."""
 _SAME_UP = float(np.cos(np.radians(1.0)))
-"""Ups that are nearer to each other are the same, measured twice."""
+"""Cosine between two measurements of the same up direction: within one degree."""

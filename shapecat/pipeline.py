@@ -1,8 +1,8 @@
-"""The story: a recording becomes detections, detections become tracks, tracks become annotations.
+"""Process a recording in three phases: perceive, track, annotate.
 
-Three phases, joined only by the tables of the run folder. Perceive is the expensive one and knows
-nothing of time; track is cheap and knows nothing of points; annotate knows nothing of perception.
-Each can be run again alone.
+The phases are connected only by the tables of the run folder, so each can be repeated alone.
+Perceiving is expensive and treats frames one by one; tracking is cheap and needs no points;
+annotating needs only the tables and the recording.
 """
 
 import logging
@@ -58,24 +58,24 @@ _Shown = TypeVar("_Shown", LabelledFrame, ShownFrame)
 _log = logging.getLogger(__name__)
 
 _AHEAD = 4
-"""Frames read while one is written."""
+"""Frames read ahead while one is written."""
 
 
 def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
     """Process one recording into its run folder: perceive, track, annotate.
 
-    A complete folder made from the same input, settings and model is left as it is. Nothing
-    appears under the final name before all of it is complete; a run that was killed goes on
-    where it stopped.
+    A complete folder made from the same input, settings and model is kept. A new folder gets its
+    final name only when it is complete; an interrupted run resumes where it stopped.
 
     Parameters
     ----------
-    cores : frames are perceived in so many processes. The tables do not depend on it.
+    observe : called with the phase, the number of frames done, and the total (None if unknown).
+    cores : number of processes that perceive frames; the tables do not depend on it.
 
     Raises
     ------
-    RecordingError, NoStreamError, ModelError, OutputError : what was perceived before is kept.
-    Stopped : a signal has asked for it; the frames in work are finished and kept.
+    RecordingError, NoStreamError, ModelError, OutputError : frames perceived so far are kept.
+    Stopped : a signal asked the process to stop; frames in progress are finished and kept.
     """
     begun = time.perf_counter()
     with open_recording(job.source) as recording, ContentDigest(job.source) as content:
@@ -114,7 +114,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
 
 
 def _once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]) -> None:
-    """Do a phase unless it is done, and note in run.json that it is, and how long it took."""
+    """Run a phase unless it is done, and write its duration to run.json."""
     if phase in run["seconds"]:
         _log.info("%s: %s was done before", folder, phase)
         return
@@ -134,7 +134,12 @@ def _finished(
     content: ContentDigest,
     observe: Observer,
 ) -> Summary:
-    """Return the summary of a complete folder; finish or remove leftovers of a kill first."""
+    """Return the summary of a complete folder, after finishing what a kill left unfinished.
+
+    Raises
+    ------
+    OutputError : the folder holds the results of another input, model or settings.
+    """
     run = read_run(job.folder)
     if not (same_options(run, planned) and same_content(run["input"], job.source, content.result)):
         msg = (
@@ -148,7 +153,7 @@ def _finished(
 
 
 def track(folder: Path, run: RunInfo, job: Job) -> None:
-    """Follow the detections over time and fuse their posteriors: tracks.parquet, tracks.csv."""
+    """Track the detections and fuse their posteriors; write tracks.parquet and tracks.csv."""
     from shapecat.runs.tracks import track_run  # noqa: PLC0415  loads SciPy on first use
 
     run["counts"]["tracks"] = track_run(
@@ -166,7 +171,7 @@ def annotate(
 ) -> None:
     """Write review.rrd and annotated.mcap from the tables and the recording.
 
-    With several cores a thread reads while another writes.
+    With several cores, one thread reads frames while others write.
     """
     settings, total = run["settings"]["outputs"], run["counts"]["frames"]
 
@@ -226,24 +231,25 @@ def annotate_again(
     boxes: str | None = None,
     recording: Path | None = None,
 ) -> Transfer | None:
-    """Write the outputs of a finished run again, with the labels a person has corrected.
+    """Write the outputs of a finished run again, with labels that a person corrected.
 
     Parameters
     ----------
-    labels : the corrected table; that of the run itself by default.
-    by_place : the table, or run folder, is another run's: its labels go to the objects in the
-        same places.
-    boxes : ``full`` or ``visible``; as before by default.
-    recording : where the recording is now; where it was processed by default.
+    labels : the corrected table; by default the run's own tracks.csv.
+    by_place : ``labels`` is the table or folder of another run, and its labels are transferred to
+        the objects at the same places.
+    boxes : ``full`` or ``visible``; by default as before.
+    recording : path of the recording; by default where it was processed.
 
     Returns
     -------
-    What became of the labels that were looked for by place.
+    The outcome of the transfer by place; None without one.
 
     Raises
     ------
-    OutputError : the folder is not a finished run, or the table of labels does not fit it.
-    RecordingError : the recording is no longer there.
+    OutputError : the folder is not a finished run, the table does not fit it, or the content of
+        the recording differs from what was processed.
+    RecordingError : the recording is missing or unreadable.
     """
     from shapecat.outputs.rereading import open_source  # noqa: PLC0415  on first use
 
@@ -261,7 +267,7 @@ def annotate_again(
 
 
 def _adopt(labels: Path | None, folder: Path, *, by_place: bool) -> Transfer | None:
-    """Apply a table of labels to a run; return the transfer if it was by place."""
+    """Apply a table of labels to a run; return the outcome of a transfer by place, else None."""
     if by_place and labels is not None:
         with holding(folder):
             return transfer_labels(labels, folder)

@@ -1,8 +1,8 @@
-"""Compiles the kernels of perception, which takes minutes once per installation, in two processes.
+"""Compile the kernels of perception in two processes: once per installation, it takes minutes.
 
     python -m shapecat.rehearsal
 
-compiles them now, for example while the image of a container is built.
+compiles them ahead of time, for example while a container image is built.
 """
 
 import gc
@@ -41,7 +41,7 @@ _RADIUS_M = 0.05
 
 
 def find_ball() -> int:
-    """Detect a ball that lies on a table, and return the number of objects found."""
+    """Detect a synthetic ball on a table; return the number of objects that match themselves."""
     v, u = np.mgrid[:480, :640]
     rays = np.stack([(u - 320) / 525, (v - 240) / 525, np.ones(u.shape)], axis=-1)
     up = np.array([0, -np.sqrt(0.5), -np.sqrt(0.5)])
@@ -66,7 +66,7 @@ def _undescribed(candidate: Candidate) -> Detection:
 
 
 def recognize_ball() -> str:
-    """Categorize a ball, and return what it is taken for."""
+    """Categorize a synthetic ball and return the category, ``unknown`` if it has no surface."""
     rng, eye = np.random.default_rng(0), np.array([1, 0, 1], np.float32)
     ways = rng.normal(size=(6000, 3))
     ways /= np.linalg.norm(ways, axis=1)[:, None]
@@ -83,38 +83,39 @@ def recognize_ball() -> str:
 
 
 _REHEARSALS: tuple[Callable[[], object], ...] = (find_ball, recognize_ball)
-"""About as long each; none needs the kernels of another."""
+"""They take about equally long, and none needs the kernels of another."""
 _POLL_S = 0.1
 _TELL_S = 10.0
 _STAGES = ("completion", "description", "detection", "learning", "reuse", "surface")
-"""Folders of the kernels that are rehearsed."""
+"""Folders with the kernels to compile."""
 
 
 def rehearse() -> None:
-    """Call all kernels of perception once, which loads those that are compiled."""
+    """Call all kernels of perception once, which compiles or loads them."""
     for rehearsal in _REHEARSALS:
         rehearsal()
 
 
 def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> float:
-    """Compile the kernels in other processes, unless it was done before; return the seconds.
+    """Compile the kernels in other processes, unless they are compiled; return the seconds taken.
 
-    One process at a time does so, others wait for it.
+    Only one process at a time compiles; others wait for it.
 
     Parameters
     ----------
-    begin : called before it begins.
+    begin : called before compilation begins.
+    cores : largest number of processes.
 
     Raises
     ------
-    Stopped : a signal has asked for it; kernels that are compiled are kept.
-    RuntimeError : a process that compiles runs the script of the caller again, since that does not
-        ask for ``__name__ == "__main__"``. It would wait for its parent, which waits for it.
+    Stopped : a signal asked the process to stop; compiled kernels are kept.
+    RuntimeError : this is a worker process that runs the main script again, since the script lacks
+        ``if __name__ == "__main__":``. It would wait for its parent, which waits for it.
     """
     notes = _notes()
     if notes is None or notes.exists():
         return 0.0
-    if getattr(current_process(), "_inheriting", False):  # as multiprocessing itself tells
+    if getattr(current_process(), "_inheriting", False):  # multiprocessing makes the same check
         msg = 'a script that processes needs `if __name__ == "__main__":` around what it calls'
         raise RuntimeError(msg)
     begun = time.perf_counter()
@@ -125,7 +126,7 @@ def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> 
     try:
         if not notes.exists():
             begin()
-            with suppress(WorkerLostError):  # its kernels are compiled when they are called
+            with suppress(WorkerLostError):  # the rest is compiled when it is called
                 _rehearse(cores)
                 notes.touch()
     finally:
@@ -134,7 +135,7 @@ def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> 
 
 
 def _notes() -> Path | None:
-    """Return the file that says that all is compiled; None where machine code cannot be kept."""
+    """Return the file that marks completion; None if machine code cannot be stored."""
     folders = [code_folder(Path(__file__).with_name(stage)) for stage in _STAGES]
     names = [folder.name for folder in folders if folder is not None]
     if folders[0] is None or len(names) < len(_STAGES):
@@ -144,7 +145,7 @@ def _notes() -> Path | None:
 
 
 def _rehearse(cores: int) -> None:
-    if current_process().daemon or runs_again():  # may have no others
+    if current_process().daemon or runs_again():  # may not start processes
         rehearse()
         return
     executor = LocalExecutor(min(cores, len(_REHEARSALS)))
@@ -160,23 +161,23 @@ def _rehearse(cores: int) -> None:
 
 
 def _uncollected(rehearsal: Callable[[], object]) -> None:
-    """Rehearse in a process that ends soon: collecting garbage is a twelfth of compiling."""
+    """Compile in a short-lived process without garbage collection, a twelfth of the time."""
     gc.disable()
     rehearsal()
 
 
 def _count() -> int:
-    """Return the number of kernels that are compiled and kept."""
+    """Return the number of kernels that are compiled and stored."""
     folders = (code_folder(Path(__file__).with_name(stage)) for stage in _STAGES)
     return sum(len([*folder.rglob("*.nbi")]) for folder in folders if folder is not None)
 
 
 def main() -> None:
-    """Compile the kernels, and tell every ten seconds how many there are."""
+    """Compile the kernels, and print their number every ten seconds."""
     ended = threading.Event()
 
     def tell() -> None:
-        say("compiling the kernels, once per installation: about two minutes of two cores")
+        say("compiling the kernels, once per installation: about two minutes on two cores")
         while not ended.wait(_TELL_S):
             say(f"{_count()} kernels compiled")
 

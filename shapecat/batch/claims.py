@@ -1,9 +1,10 @@
-"""Claims on run folders at URLs: one live process at a time works on each.
+"""Claims on run folders at URLs: only one process at a time works on a folder.
 
-Beside the folder ``NAME`` lies the object ``.NAME.claim`` while a process works on it. The storage
-must create an object only once; no two clocks are compared. Its owner writes the claim anew every
-few seconds, and whoever finds it unchanged for longer takes it over. An owner looks at its claim
-before its results become a run: one that was held to be dead does not overwrite those of another.
+While a process works on the folder ``NAME``, the object ``.NAME.claim`` exists beside it. The
+storage must support exclusive creation of an object. The owner rewrites its claim every few
+seconds; a process that sees it unchanged for longer takes it over. No clocks of different machines
+are compared. An owner checks its claim before it completes a run, so that a process that was
+presumed dead does not overwrite the results of another.
 """
 
 import json
@@ -22,31 +23,36 @@ from shapecat.system import stopping
 __all__ = ["Claim", "claim_name", "claimed"]
 
 _BEAT_S = 10.0
-"""A claim is written anew so often."""
+"""Period in which a claim is rewritten."""
 _STALE_S = 45.0
-"""A claim that has not changed for so long is a dead process's."""
+"""The owner of a claim that stays unchanged for this time is presumed dead."""
 _LOOK_S = 1.0
 
 
 def claim_name(folder: str) -> str:
-    """Return the name of the claim of a run folder, beside it."""
+    """Return the name of the claim on a run folder; it is in the same parent folder."""
     return f".{folder}.claim"
 
 
 class Claim:
-    """The claim of this process.
+    """The claim of this process on a run folder.
 
     Attributes
     ----------
-    inherited : whether a process that died had worked on the folder.
+    inherited : whether the claim was taken over from a dead process.
     """
 
     def __init__(self, url: str, batch: str) -> None:
-        """Claim a run folder for a batch. A batch knows which of its own workers have died.
+        """Claim a run folder; wait up to 45 s to find out whether its owner is dead.
+
+        Parameters
+        ----------
+        batch : identifies the command. A claim of the same batch is taken over without waiting,
+            since the batch knows that its worker has died.
 
         Raises
         ------
-        OutputError : another process works on it, or the storage cannot be written to.
+        OutputError : another process works on the folder, or the storage is not writable.
         """
         parent, _, name = url.rstrip("/").rpartition("/")
         self._url = url
@@ -61,7 +67,7 @@ class Claim:
         self.inherited = not self._create()
 
     def _create(self) -> bool:
-        """Create the object, or take it over; return whether there was none."""
+        """Create the claim and return True, or take it over and return False."""
         while not self._object.create(self._content()):
             content = self._object.read()
             if content is None:
@@ -79,7 +85,7 @@ class Claim:
 
         Raises
         ------
-        OutputError : its owner is at work.
+        OutputError : the claim changes, so its owner is alive.
         """
         waited = 0.0
         while waited < _STALE_S:
@@ -102,18 +108,18 @@ class Claim:
         return bool(_parse(self._object.read() or b"").get("owner") == self._known["owner"])
 
     def require(self) -> None:
-        """Require that no other process has taken the folder over.
+        """Check that no other process has taken over the folder.
 
         Raises
         ------
-        OutputError : somebody has: this process was silent for too long.
+        OutputError : another process has, since this one was silent for too long.
         """
         if not self._is_held():
             msg = f"{self._url}: another run has taken over: this one was not heard of for too long"
             raise OutputError(msg)
 
     def beat(self) -> bool:
-        """Renew the claim; return whether it is still this process's."""
+        """Rewrite the claim; return False if another process has taken it over."""
         with suppress(ShapecatError):  # the next beat may reach the storage
             if not self._is_held():
                 return False
@@ -122,7 +128,7 @@ class Claim:
         return True
 
     def release(self) -> None:
-        """Release the folder."""
+        """Remove the claim, unless another process has taken it over."""
         with suppress(ShapecatError):  # it goes stale
             if self._is_held():
                 self._object.remove()
@@ -130,11 +136,15 @@ class Claim:
 
 @contextmanager
 def claimed(url: str, batch: str) -> Iterator[Claim]:
-    """Claim a run folder at a URL for as long as the block takes.
+    """Hold a claim on the run folder at a URL during the block.
+
+    Parameters
+    ----------
+    batch : as for `Claim`.
 
     Raises
     ------
-    OutputError : another process works on it, or the storage cannot be written to.
+    OutputError : another process works on the folder, or the storage is not writable.
     """
     claim, ended = Claim(url, batch), Event()
 

@@ -19,10 +19,11 @@ _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A recording: a path, or a URL; ``stem`` and ``parent`` name its run folder.
+    """A recording at a path or a URL; the other one is empty.
 
-    ``key`` changes when what is at the URL does, and ``bytes`` is its size; neither is known of a
-    path before it is looked at.
+    ``stem`` is its name without suffix and ``parent`` the name of its folder; both serve to name
+    the run folder. ``key`` changes with the content at a URL, and ``bytes`` is its size; they are
+    empty and 0 for a path.
     """
 
     path: str
@@ -35,7 +36,7 @@ class Source:
 
 @dataclass(frozen=True)
 class Found:
-    """The recordings that were found, without duplicates, and the number of files left out."""
+    """The recordings without duplicates, and the number of files skipped."""
 
     kept: list[Source]
     left_out: int
@@ -44,13 +45,14 @@ class Found:
 def find_recordings(sources: Sequence[str]) -> Found:
     """Return the recordings among files, folders and URLs.
 
-    Folders are searched, other than ROS 2 bags; run folders and hidden ones are not. A file given
-    by itself is always kept; among several, one that neither is named nor begins like a recording
-    is left out, so that ``folder/*`` does what is meant.
+    Folders are searched recursively, except hidden files and folders and run folders; a ROS 2 bag
+    counts as one recording. A single file is always kept. Among several, files with neither the
+    suffix nor the first bytes of a recording are skipped and counted in ``left_out``, so that
+    ``folder/*`` works.
 
     Raises
     ------
-    RecordingError : there is none.
+    RecordingError : no recording was found.
     """
     remote = {found.url: found for source in sources if is_url(source) for found in _at(source)}
     paths, left_out = _find_paths([Path(source) for source in sources if not is_url(source)])
@@ -73,7 +75,7 @@ def _of_url(url: str, key: str, size: int) -> Source:
 
 
 def _at(url: str) -> list[Source]:
-    """Return the recordings that a URL names: those of a pattern or a folder, or itself.
+    """Return the recordings that match a pattern or are below a folder; any other URL itself.
 
     Raises
     ------
@@ -90,7 +92,7 @@ def _at(url: str) -> list[Source]:
 
 
 def look_at(url: str) -> tuple[str, int]:
-    """Return a key of the recording at a URL, and its bytes; empty if unknown."""
+    """Return a key of the content at a URL and its size in bytes; empty and 0 if unknown."""
     location = Location(url)
     with suppress(RecordingError):  # reported when it is downloaded
         info = location.info()
@@ -111,7 +113,7 @@ def _size(info: Mapping[str, Any]) -> int:
 
 
 def _search_remote(location: Location) -> Iterator[tuple[str, str, int]]:
-    """Yield URL, key and size of the recordings below a folder: ROS 2 bags are folders."""
+    """Yield URL, key and size in bytes of the recordings below a folder, also ROS 2 bag folders."""
     files: list[tuple[str, str, int]] = []
     bags, runs = set(), set()
     for url, info in location.walk():
@@ -155,7 +157,7 @@ def _searchable(path: Path) -> bool:
 
 
 def _is_bag(folder: Path) -> bool:
-    """Return whether a folder is a ROS 2 bag: with metadata, or with nothing but its parts."""
+    """Return whether a folder is a ROS 2 bag: it has metadata, or its files belong to one bag."""
     if (folder / "metadata.yaml").exists():
         return True
     paths = list(folder.iterdir())
@@ -167,13 +169,13 @@ def _is_bag(folder: Path) -> bool:
 
 
 def _are_splits(names: set[str]) -> bool:
-    """Return whether files are the numbered parts of one recording: a_0.mcap, a_1.mcap, ..."""
+    """Return whether the names are those of one split recording: a_0.mcap, a_1.mcap, ..."""
     base = min(names, default="").rpartition("_")[0]
     return len(names) > 1 and names == {f"{base}_{k}.mcap" for k in range(len(names))}
 
 
 def _search(folder: Path) -> Iterator[Path]:
-    """Yield the recordings below a folder, by name."""
+    """Yield the recordings below a folder, sorted by name in each folder."""
     if (folder / "run.json").exists():
         return
     for path in sorted(folder.iterdir()):

@@ -1,8 +1,8 @@
 """manifest.jsonl: the state of each recording of a batch, one line per change.
 
-The last line of a recording holds. In a folder, lines are appended whole, under a lock, so that
-several shards may write one file; a line that a crash or a full disk cut short is skipped. At a
-URL nothing can be appended: there the lines are parts, each of one writer.
+The last line of a recording is valid. In a folder, complete lines are appended under a lock, so
+that several shards can write to one file; a line truncated by a crash or a full disk is skipped.
+At a URL nothing can be appended: each writer writes files of its own, called parts.
 """
 
 import fcntl
@@ -31,9 +31,9 @@ _log = logging.getLogger(__name__)
 _PARTS = ".manifest"
 _PART_BYTES = 2**20
 _MOST_BYTES = 8 * 2**20
-"""Lines that are not sent yet."""
+"""Lines are sent at once when more than this are waiting."""
 _SEND_S = 5.0
-"""Lines are sent so often."""
+"""Period in which lines are sent."""
 
 State = Literal["planned", "running", "complete", "failed"]
 
@@ -42,8 +42,9 @@ State = Literal["planned", "running", "complete", "failed"]
 class Entry:
     """A line of the manifest: a recording and its state.
 
-    ``folder`` is the name of its run folder; ``input`` and ``work`` change when the recording, or
-    what is to be done with it, does; ``tracks`` counts the tracks of each category.
+    ``folder`` is the name of the run folder. ``input`` changes with the content of the recording,
+    ``work`` with the options, settings and model. ``tries`` counts attempts, ``seconds`` is the
+    duration, and ``tracks`` counts the tracks of each category. ``time`` is UTC in ISO 8601.
     """
 
     folder: str
@@ -71,7 +72,7 @@ class Manifest:
     """The manifest file, with the last entry of each run folder."""
 
     def __init__(self, path: Path) -> None:
-        """Read the file, if there is one that can be read."""
+        """Read the file, if it exists and is readable."""
         self.path = path
         self.entries: dict[str, Entry] = {}
         with suppress(OSError), path.open("rb") as file:  # reported when it is written to
@@ -88,7 +89,7 @@ class Manifest:
             self.entries[entry.folder] = entry
 
     def record(self, entries: Iterable[Entry]) -> None:
-        """Append entries.
+        """Append entries, stamped with the current time.
 
         Raises
         ------
@@ -112,17 +113,17 @@ class Manifest:
 class RemoteManifest(Manifest):
     """A manifest at a URL, in parts: ``.manifest/SHARD/PART.jsonl``.
 
-    Nobody but its writer touches a part. The last one is replaced by a longer one every few
-    seconds, until it holds a megabyte. In the end ``manifest.jsonl`` says all of it, a line for
-    each recording. What a killed writer had not sent yet is known from the run folders.
+    Only its writer changes a part. It replaces the last one by a longer one every few seconds,
+    until that holds a megabyte. At the end, ``manifest.jsonl`` gets the last line of each
+    recording. Lines that a killed writer had not sent are recovered from the run folders.
     """
 
     def __init__(self, url: str, shard: str = "") -> None:
-        """Read what is there.
+        """Read the parts that exist.
 
         Parameters
         ----------
-        shard : ``I-of-N``, which reads and writes parts of its own; empty for all.
+        shard : ``I-of-N``, which has parts of its own; empty without shards.
 
         Raises
         ------
@@ -144,7 +145,7 @@ class RemoteManifest(Manifest):
         return self
 
     def __exit__(self, *error: object) -> None:
-        """Send the rest, and the whole as one file."""
+        """Send the remaining lines, and all entries as one file."""
         self._ended.set()
         self._thread.join()
         try:
@@ -156,7 +157,7 @@ class RemoteManifest(Manifest):
             _log.error("%s", failure)
 
     def _read_parts(self) -> None:
-        """Read new or grown parts of other writers."""
+        """Read parts of other writers that are new or have changed."""
         for url, info in self._parts.walk(deep=False):
             name, key = url.rpartition("/")[2], content_key(info)
             if not name.startswith(self._writer) and self._seen.get(name) != key:
@@ -164,7 +165,7 @@ class RemoteManifest(Manifest):
                 self._take(((self._parts / name).read() or b"").splitlines())
 
     def _take(self, lines: Iterable[bytes]) -> None:
-        """Keep the later of two entries, as writers may work at the same time."""
+        """Keep the later of two entries, since several writers may work at the same time."""
         for entry in filter(None, map(_parse, lines)):
             known = self.entries.get(entry.folder)
             if known is None or known.time <= entry.time:
@@ -178,11 +179,11 @@ class RemoteManifest(Manifest):
             self.send()
 
     def send(self) -> None:
-        """Send the lines recorded since the last time.
+        """Send the lines recorded since the previous call.
 
         Raises
         ------
-        OutputError : the storage cannot be written to; it is sent the next time.
+        OutputError : the storage is not writable; the next call sends the lines again.
         """
         with self._sending:
             with self._lock:
@@ -208,7 +209,11 @@ def open_manifest(out: str, *, shard: str | None = None) -> Manifest:
 
     Parameters
     ----------
-    shard : ``I/N``; at a URL it has a manifest of its own, as nothing locks it there.
+    shard : ``I/N``. At a URL, each shard has its own manifest, since there are no locks.
+
+    Raises
+    ------
+    OutputError : the storage at the URL cannot be read.
     """
     if is_url(out):
         return RemoteManifest(out, shard.replace("/", "-of-") if shard else "")
@@ -222,7 +227,7 @@ def _line(entry: Entry) -> bytes:
 
 
 def _parse(line: bytes) -> Entry | None:
-    """Return the entry of a line, or None for an incomplete or foreign line."""
+    """Return the entry of a line, or None if the line is incomplete or not an entry."""
     try:
         values = json.loads(line)
         entry = Entry(**{name: _shared(name, value) for name, value in values.items()})
@@ -233,13 +238,13 @@ def _parse(line: bytes) -> Entry | None:
 
 
 def _shared(name: str, value: Any) -> Any:
-    """Return one shared copy of a value that many entries have."""
+    """Intern a value that many entries have in common, to save memory."""
     return sys.intern(value) if name in {"state", "work"} and isinstance(value, str) else value
 
 
 @contextmanager
 def _appending(path: Path) -> Iterator[int]:
-    """Open a file to append to, locked; the lock ends with the process, however it ends."""
+    """Open and lock a file for appending; the lock ends with the process."""
     path.parent.mkdir(parents=True, exist_ok=True)
     file = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
     try:
@@ -251,7 +256,7 @@ def _appending(path: Path) -> Iterator[int]:
 
 
 def _write(file: int, content: bytes) -> None:
-    """Append lines; end an incomplete last line first, and undo a write that fails."""
+    """Append lines, after ending an incomplete last line; undo a write that fails."""
     size = os.fstat(file).st_size
     if size and os.pread(file, 1, size - 1) != b"\n":
         content = b"\n" + content

@@ -33,21 +33,26 @@ __all__ = [
 _Named = tuple[str, Source]
 
 _LOOKS_AT_ONCE = 16
-"""Threads that look at files: on a network disk each look is a round trip."""
+"""Threads that check files: on a network disk each check is a round trip."""
 _LOOKS = 256
-"""Recordings that a thread looks at before it takes others."""
+"""Recordings per unit of work of such a thread."""
 
 Status = Literal["complete", "resume", "retry", "check", "new"]
 
 
 @dataclass(frozen=True, slots=True)
 class Task:
-    """A recording of a batch, and its status: a few hundred bytes, as there may be millions.
+    """A recording of a batch and its status; small, since a batch may have millions.
 
-    ``name`` is that of the run folder in ``out``. ``status`` is ``complete`` where the manifest
-    vouches for it, ``resume`` where a killed run goes on, ``retry`` where the last try failed,
-    ``check`` where there are results of unknown origin, else ``new``. ``input`` and ``work`` change
-    when the recording, or what is to be done with it, does.
+    Attributes
+    ----------
+    like : the job with the options of all tasks.
+    out : folder or URL of the batch; ``name`` is the run folder in it.
+    path, url : the recording; one of them is empty.
+    status : ``complete`` according to the manifest; ``resume`` if a run was interrupted; ``retry``
+        if the last attempt failed; ``check`` if there are results of unknown origin; else ``new``.
+    bytes : size of the recording, 0 if unknown.
+    input, work : change with the recording, and with the options, settings and model.
     """
 
     like: Job
@@ -62,12 +67,12 @@ class Task:
 
     @property
     def recording(self) -> str:
-        """What the user calls the recording: its path, or URL."""
+        """The path or URL of the recording."""
         return self.url or self.path
 
     @property
     def job(self) -> Job:
-        """What is to be done."""
+        """The job that processes the recording."""
         at_url = is_url(self.out)
         return dataclasses.replace(
             self.like,
@@ -90,18 +95,18 @@ class Task:
 
 @dataclass(frozen=True)
 class Shard:
-    """Part ``index`` of ``count``. Counting may start at 0 or at 1."""
+    """Part ``index`` of ``count`` parts of a batch, counted from 0."""
 
     index: int
     count: int
 
     @classmethod
     def parse(cls, text: str) -> "Shard":
-        """Read ``I/N``.
+        """Read ``I/N``, where I may be counted from 0 or from 1: N/N is the same as 0/N.
 
         Raises
         ------
-        ConfigError : it is not of that form, or I is larger than N.
+        ConfigError : the text is not of that form, N is 0, or I is larger than N.
         """
         first, slash, last = text.partition("/")
         if not slash or not (first.isdecimal() and last.isdecimal()):
@@ -114,7 +119,7 @@ class Shard:
         return cls(index % count, count)
 
     def of(self, named: Sequence[_Named]) -> list[_Named]:
-        """Return the recordings of this shard; the shards of a list are disjoint and cover it.
+        """Return the recordings of this shard; all shards are disjoint and cover the list.
 
         Examples
         --------
@@ -127,7 +132,10 @@ class Shard:
 
 @dataclass(frozen=True)
 class Batch:
-    """The tasks of a batch, its manifest if it has several recordings, and the skipped files."""
+    """The tasks of a batch, the manifest, and the number of files that are not recordings.
+
+    ``manifest`` is None for a single recording.
+    """
 
     tasks: list[Task]
     manifest: Manifest | None
@@ -135,9 +143,9 @@ class Batch:
 
 
 def name_folders(names: Sequence[str], parents: Sequence[str]) -> list[str]:
-    """Return the name of a run folder for each recording: its own, without suffix.
+    """Return a unique run folder name for each recording: its own name without suffix.
 
-    Recordings of the same name are told apart by their parent folders, then by number.
+    Recordings with the same name get the name of their parent folder in front, then a number.
 
     Examples
     --------
@@ -159,19 +167,20 @@ def name_folders(names: Sequence[str], parents: Sequence[str]) -> list[str]:
 def plan_batch(
     job: Job, sources: Sequence[str], out: str, *, shard: str | None = None
 ) -> Iterator[Batch]:
-    """Plan a job like ``job`` for each recording, without opening any.
+    """Plan a task for each recording, without opening any; the manifest is open in the block.
 
     Parameters
     ----------
+    job : the options, settings and model for all recordings.
     sources : files, folders to search, and URLs.
-    out : folder, or URL, below which each recording gets its run folder.
-    shard : ``I/N`` for a part of them.
+    out : folder or URL in which each recording gets its run folder.
+    shard : ``I/N`` to plan only a part of the recordings.
 
     Raises
     ------
-    ConfigError : the shard makes no sense, or a URL needs a library that is not installed.
-    RecordingError : a folder or URL holds no recording.
-    OutputError : a URL for the results cannot be reached.
+    ConfigError : the shard is invalid, or a URL needs a library that is not installed.
+    RecordingError : no recording was found, or a URL cannot be reached.
+    OutputError : the URL for the results cannot be reached.
     """
     part = Shard.parse(shard) if shard is not None else None
     found = find_recordings(sources)
@@ -185,7 +194,7 @@ def plan_batch(
 
 
 class _Planner:
-    """Checks the state of each recording; it lists the folder of results once."""
+    """Determines the status of each recording, given the names in the folder of results."""
 
     def __init__(self, job: Job, out: str, there: set[str], manifest: Manifest | None) -> None:
         self._job, self._out, self._there, self._manifest = job, out, there, manifest
@@ -222,22 +231,22 @@ class _Planner:
 
 
 def _names_in(folder: Path) -> set[str]:
-    """Return the names in a folder, if there is one that can be read."""
+    """Return the names in a folder; none if it is missing or unreadable."""
     with suppress(OSError):
         return {path.name for path in folder.iterdir()}
     return set()
 
 
 def _begun(name: str) -> set[str]:
-    """Return the names beside a run folder that show a run in progress."""
+    """Return the names that exist beside a run folder while a run is in progress."""
     return {partial_path(Path(name)).name, claim_name(name)}
 
 
 def _whole(task: Task) -> bool:
-    """Return whether a run has all its outputs; an interrupted correction leaves it incomplete."""
+    """Return whether a run has all its outputs; an interrupted `annotate` leaves some missing."""
     job = task.job
     if job.target:
-        return True  # complete when its manifest says so
+        return True  # trust the manifest, since a check costs a request
     outputs = [
         name for name, made in (("annotated.mcap", job.mcap), ("review.rrd", job.rrd)) if made
     ]
@@ -249,7 +258,7 @@ def _whole(task: Task) -> bool:
 
 
 def _input_key(source: Path) -> tuple[str, int]:
-    """Return a key of the files of a recording, and their size, without reading them."""
+    """Return a key of a recording's files, from names, sizes and times, and their total bytes."""
     try:
         files = sorted(source.iterdir()) if source.is_dir() else [source]
         stats = [(file.name, file.stat()) for file in files]

@@ -1,7 +1,7 @@
-"""A recording and its run folder at URLs: downloaded to scratch, processed, uploaded.
+"""Process a recording at a URL, or for a run folder at a URL, in a temporary folder.
 
-Object stores have no rename. A run folder there is complete when it has its run.json, which is
-sent last; without one, whatever else lies there is no run.
+Object stores cannot rename. A run folder there is complete if it holds run.json, which is uploaded
+last; without it, other files are not a run.
 """
 
 import dataclasses
@@ -26,15 +26,15 @@ __all__ = ["Ticket", "process_remote", "scratch", "upload"]
 
 _SCRATCH = "shapecat-scratch-"
 _PREVIOUS = tuple(name for name in RUN_FILES if name not in {*OUTPUTS, "report.html"})
-"""Files that the transfer of labels to a new run needs; run.json last."""
+"""Files of the previous run from which labels are transferred to a new run; run.json last."""
 
 
 @dataclass(frozen=True)
 class Ticket:
     """Identifies the work of a task, so that it is not done twice.
 
-    ``batch`` names the command that has sent it; ``input`` changes with the recording, ``work``
-    with what is to be done with it.
+    ``batch`` identifies the command that sent the task. ``input`` changes with the content of the
+    recording, ``work`` with the options, settings and model.
     """
 
     batch: str
@@ -42,11 +42,11 @@ class Ticket:
     work: str = ""
 
     def made(self, run: RunInfo) -> bool:
-        """Return whether a run has the same input and work."""
+        """Return whether a run was made from the same input and work."""
         return bool(self.input and self.work) and run.get("origin") == self._origin()
 
     def note(self, folder: Path) -> None:
-        """Add the origin to run.json."""
+        """Add input and work to run.json as its ``origin``."""
         run = read_run(folder)
         run["origin"] = self._origin()
         write_run(folder, run)
@@ -60,8 +60,8 @@ def process_remote(job: Job, observe: Observer, *, cores: int, ticket: Ticket) -
 
     Raises
     ------
-    RecordingError, NoStreamError, ModelError : as `process` does.
-    OutputError : the storage cannot be written to, or another process works on the run folder.
+    RecordingError, NoStreamError, ModelError : as for `process`.
+    OutputError : the storage is not writable, or another process works on the run folder.
     """
     claim = claimed(job.target, ticket.batch) if job.target else nullcontext()
     with scratch() as folder, claim as held:
@@ -83,7 +83,7 @@ def process_remote(job: Job, observe: Observer, *, cores: int, ticket: Ticket) -
 
 
 def _process(job: Job, local: Job, observe: Observer, cores: int) -> Summary:
-    """Process the job in scratch; errors name the URLs."""
+    """Process a job in the temporary folder; errors name the URLs instead of it."""
     try:
         return process(local, observe, cores=cores)
     except ShapecatError as error:
@@ -99,16 +99,16 @@ def _download(url: str, folder: Path) -> Path:
 
 
 def _fetch_run(job: Job) -> tuple[Job, RunInfo | None]:
-    """Fetch the parts of earlier results at the target that `process` needs.
+    """Download run.json of an earlier run at the target, and its labels if it is overwritten.
 
     Returns
     -------
-    The job, and what run.json says; None where there is no run. A run that was being replaced
-    when the process was killed is replaced by this one.
+    The job, and the content of run.json, None if there is no run. The job overwrites a run whose
+    replacement was interrupted.
 
     Raises
     ------
-    OutputError : the target holds what shapecat did not make.
+    OutputError : the target holds files that shapecat did not write.
     """
     place = Location(job.target, OutputError)
     if "run.json" not in _require_ours(place):
@@ -127,11 +127,11 @@ def _fetch_run(job: Job) -> tuple[Job, RunInfo | None]:
 
 
 def _require_ours(place: Location) -> set[str]:
-    """Return the names in a run folder; refuse one that holds files but none of a run.
+    """Return the names in a run folder.
 
     Raises
     ------
-    OutputError : it is a stranger's.
+    OutputError : the folder holds files that shapecat did not write, and no run.json.
     """
     names = place.names()
     if "run.json" not in names and names - set(RUN_FILES):
@@ -141,18 +141,18 @@ def _require_ours(place: Location) -> set[str]:
 
 
 def _replaced(place: Location) -> Location:
-    """Return the place of a run while another replaces it."""
+    """Return where a run is kept while a new one replaces it."""
     parent, _, name = place.url.rstrip("/").rpartition("/")
     return Location(f"{parent}/.{name}.old", OutputError)
 
 
 def upload(folder: Path, url: str, claim: Claim) -> None:
-    """Send a run folder; run.json, which makes it a run, comes last.
+    """Upload a run folder, run.json last.
 
     Raises
     ------
-    OutputError : the storage cannot be written to, the place is a stranger's, or another process
-        has taken it over.
+    OutputError : the storage is not writable, the folder there was not written by shapecat, or
+        another process has taken it over.
     """
     place = Location(url, OutputError)
     old = _replaced(place)
@@ -178,7 +178,7 @@ def upload(folder: Path, url: str, claim: Claim) -> None:
 
 @contextmanager
 def scratch() -> Iterator[Path]:
-    """Yield a temporary folder; remove those that killed processes have left."""
+    """Provide a temporary folder for the block; remove the folders of killed processes."""
     parent = Path(tempfile.gettempdir())
     for left in parent.glob(f"{_SCRATCH}*"):
         with suppress(OSError):

@@ -30,20 +30,20 @@ __all__ = ["Outcome", "Watcher", "attempt", "exit_code", "process_here", "proces
 _log = logging.getLogger(__name__)
 
 _TRIES = 2
-"""Times a recording is begun before it is held to kill its workers."""
+"""Attempts at a recording whose workers die, before it is reported as failed."""
 _AHEAD = 1000
-"""Recordings handed to an executor at a time: a scheduler need not hold a hundred thousand."""
+"""Recordings submitted to an executor at a time, so that a scheduler need not hold them all."""
 _LINES = 1000
-"""Lines of the manifest that are made at a time."""
+"""Lines of the manifest written at a time."""
 _REPORT_S = 0.2
-"""A worker tells how far it is no more often than this."""
+"""Shortest time between progress reports of a worker in one phase."""
 _HEED_S = 0.1
-"""Whoever waits for workers looks so often whether a signal has come."""
+"""Period in which a wait for workers checks for signals."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of a job: a summary, or an error message with its exit code."""
+    """The outcome of a job: a summary, or the message and exit code of an error."""
 
     job: Job
     summary: Summary | None = None
@@ -58,7 +58,7 @@ class Watcher(Protocol):
     """Receives progress and outcomes, possibly from several threads."""
 
     def progress(self, folder: str, phase: str, done: int, total: int | None) -> None:
-        """Receive the progress of a recording."""
+        """Receive the phase of a recording, the frames done, and the total (None if unknown)."""
 
     def ended(self, outcome: Outcome) -> None:
         """Receive the outcome of a recording."""
@@ -67,7 +67,17 @@ class Watcher(Protocol):
 def process_here(
     tasks: Sequence[Task], watcher: Watcher, *, cores: int = 1, manifest: Manifest | None = None
 ) -> Iterator[Outcome]:
-    """Process the tasks one by one in this process; yield their outcomes."""
+    """Process the tasks one by one in this process; yield their outcomes.
+
+    Parameters
+    ----------
+    cores : processes that perceive the frames of a recording.
+    manifest : receives the state of each recording.
+
+    Raises
+    ------
+    Stopped : a signal asked the process to stop.
+    """
     ledger, batch = _Ledger(manifest), uuid4().hex
     ledger.plan(tasks)
     for task in tasks:
@@ -97,12 +107,17 @@ def process_on(
 ) -> Iterator[Outcome]:
     """Process the tasks on an executor, largest first; yield their outcomes.
 
-    A recording whose worker dies is tried once more, then reported; the others go on. One that
-    only waited when the scheduler was lost has not been tried.
+    If a worker dies, its recording is retried once, then reported as failed. A recording that was
+    still queued when the scheduler was lost does not use up an attempt.
+
+    Parameters
+    ----------
+    cores : processes that perceive the frames of a recording.
+    manifest : receives the state of each recording.
 
     Raises
     ------
-    Stopped : a signal has asked for it; what runs goes on until the executor is stopped.
+    Stopped : a signal asked the process to stop; running tasks go on until the executor is stopped.
     """
     ledger = _Ledger(manifest)
     ledger.plan(tasks)
@@ -153,7 +168,7 @@ def _ticket(task: Task, batch: str) -> Ticket:
 
 
 def _next(ended: SimpleQueue[_Ended]) -> _Ended:
-    """Wait for the next outcome, or for a signal to stop."""
+    """Wait for the next finished task; raise `Stopped` at a signal."""
     while True:
         stopping.check()
         with suppress(Empty):
@@ -173,11 +188,11 @@ def _unknown(job: Job, error: BaseException) -> Outcome:
 
 
 def _run_of(job: Job) -> RunInfo:
-    """Return the run.json of a complete run.
+    """Return the content of run.json of a complete run.
 
     Raises
     ------
-    OutputError : it cannot be read.
+    OutputError : the file is missing or unreadable.
     """
     if not job.target:
         return read_run(job.folder)
@@ -209,7 +224,7 @@ def _reporter(name: str, address: str) -> Observer:
 
 
 def attempt(job: Job, observe: Observer, *, cores: int = 1, ticket: Ticket) -> Outcome:
-    """Process one job; a known error is an outcome, an unknown one too, but logged in full."""
+    """Process one job; an error becomes its outcome, and an unexpected one is logged in full."""
     try:
         if job.origin or job.target:
             return Outcome(job, process_remote(job, observe, cores=cores, ticket=ticket))
@@ -222,7 +237,7 @@ def attempt(job: Job, observe: Observer, *, cores: int = 1, ticket: Ticket) -> O
 
 
 class _Ledger:
-    """Writes the manifest, if there is one; a full disk does not end the batch."""
+    """Writes the manifest, if there is one; a failed write does not end the batch."""
 
     def __init__(self, manifest: Manifest | None) -> None:
         self._manifest = manifest
@@ -241,7 +256,7 @@ class _Ledger:
         return known is not None and known.state == "planned" and known.same_work(entry)
 
     def known(self, task: Task) -> Outcome:
-        """Return the outcome of a complete task."""
+        """Return the outcome of a task that was complete before."""
         job = task.job
         entry = self._manifest.entries.get(task.name) if self._manifest is not None else None
         if entry is not None and entry.tracks is not None and entry.frames is not None:
@@ -256,7 +271,7 @@ class _Ledger:
             return Outcome(job, message=str(error), code=error.exit_code)
 
     def begin(self, task: Task) -> None:
-        """Remember a recording that was submitted."""
+        """Store a recording as submitted."""
         with self._lock:
             self._open.setdefault(task.name, replace(task.entry(), tries=1))
 
@@ -268,7 +283,7 @@ class _Ledger:
                 self._note(entry, state="running")
 
     def lost(self, task: Task, error: BaseException) -> int:
-        """Record the death of a worker; return the number of deaths at this recording."""
+        """Record a lost worker; return the number of workers lost on this recording."""
         with self._lock:
             entry = self._open[task.name]
             waited = entry.state != "running"
@@ -312,7 +327,10 @@ class _Ledger:
 
 
 def exit_code(outcomes: Sequence[Outcome]) -> int:
-    """Return 0 if all are complete, 1 if some; if none, the exit code 3, 4, 2 or 1 of a failure."""
+    """Return 0 if all outcomes are complete, 1 if only some are.
+
+    If none is, return the first of the exit codes 3, 4 and 2 that occurs, else 1.
+    """
     codes = {outcome.code for outcome in outcomes}
     if codes <= {0}:
         return 0

@@ -1,7 +1,6 @@
 """Files and folders at URLs, through fsspec; requests that may succeed later are repeated.
 
-fsspec is the extra ``remote``; each storage has a package of its own (s3fs, gcsfs, ...). Without a
-URL nothing here is used.
+fsspec is in the extra ``remote``; each storage needs its own package (s3fs, gcsfs, ...).
 """
 
 import errno
@@ -22,10 +21,10 @@ __all__ = ["Location", "content_key", "is_url"]
 _T = TypeVar("_T")
 
 _WAITS_S = (0.5, 1.0, 2.0, 4.0, 8.0)
-"""Between attempts, plus or minus half, so that refused workers do not return together."""
+"""Waits between attempts, randomized by half, so that refused workers do not return together."""
 _DIGESTS = ("ETag", "etag", "md5Hash", "content_md5")
 _TIMES = ("mtime", "LastModified", "last_modified", "created")
-"""Entries of a file's info that change with its content, or when it is written."""
+"""Entries of a file's info that change with its content, or with the time it was written."""
 _PASSING = {
     errno.EAGAIN,
     errno.EBUSY,  # s3fs: SlowDown, ServiceUnavailable
@@ -36,12 +35,12 @@ _PASSING = {
     getattr(errno, "EREMOTEIO", errno.EIO),  # s3fs: InternalError
 }
 _PASSING_NAMES = {"ClientPayloadError", "ServerDisconnectedError"}
-"""Errors of aiohttp by name, as it need not be installed."""
+"""Errors of aiohttp by name, since it need not be installed."""
 _PAGE = 1000
-"""Names in a listing of S3, which gives no more at a time."""
+"""Names per page of a listing, the most that S3 returns."""
 _PART_BYTES = 16 * 2**20
 _MOST_PARTS = 9_000
-"""Of a multipart upload; S3 takes 10,000."""
+"""Largest number of parts of a multipart upload; S3 allows 10,000."""
 
 
 def is_url(text: str) -> bool:
@@ -56,7 +55,7 @@ def is_url(text: str) -> bool:
 
 
 def content_key(info: Mapping[str, Any]) -> str:
-    """Return a key of a file's content, from its info."""
+    """Return a key that changes with a file's content, from its size and its digest or times."""
     names = _DIGESTS if any(name in info for name in _DIGESTS) else _TIMES
     values = [info[name] for name in names if name in info]
     known = [v.isoformat() if isinstance(v, datetime) else str(v) for v in values]
@@ -65,19 +64,19 @@ def content_key(info: Mapping[str, Any]) -> str:
 
 
 class Location:
-    """A file or folder at a URL. Failures become errors of one line."""
+    """A file or folder at a URL; failures raise errors with a one-line message."""
 
     def __init__(self, url: str, error: type[ShapecatError] = RecordingError) -> None:
-        """Find the storage of a URL, without a request.
+        """Open the file system of a URL, without a request.
 
         Parameters
         ----------
-        error : what failures become.
+        error : class of the errors that failures raise.
 
         Raises
         ------
-        ConfigError : a library is missing.
-        ShapecatError : the URL makes no sense.
+        ConfigError : a library is not installed.
+        ShapecatError : the URL is invalid.
         """
         self.url, self._error = url, error
         self._system, self._path = _connect(url, error)
@@ -86,12 +85,12 @@ class Location:
         return Location(f"{self.url.rstrip('/')}/{name}", self._error)
 
     def _tried(self, done: str, call: Callable[[], _T]) -> _T:
-        """Call; repeat a call that may succeed later.
+        """Return the result of a call, repeated while it may still succeed.
 
         Raises
         ------
-        ShapecatError : it failed all the same.
-        FileNotFoundError, FileExistsError : as the storage says.
+        ShapecatError : the call failed; ``done`` is the verb of the message.
+        FileNotFoundError, FileExistsError : as from the storage.
         """
         for wait_s in (*_WAITS_S, 0.0):
             try:
@@ -109,14 +108,14 @@ class Location:
         return self._error(f"{self.url}: cannot be {done}: {reason}")
 
     def info(self) -> Mapping[str, Any] | None:
-        """Return size, times and digest of a file; None if there is none."""
+        """Return size, times and digest of a file; None if it does not exist."""
         with suppress(FileNotFoundError):
             known: Mapping[str, Any] = self._tried("read", lambda: self._system.info(self._path))
             return known
         return None
 
     def read(self) -> bytes | None:
-        """Return the content of a small file; None if there is none."""
+        """Return the content of a small file; None if it does not exist."""
         with suppress(FileNotFoundError):
             return bytes(self._tried("read", lambda: self._system.cat_file(self._path)))
         return None
@@ -126,9 +125,9 @@ class Location:
         self._put("written", lambda: self._system.pipe_file(self._path, content))
 
     def create(self, content: bytes) -> bool:
-        """Write a small file unless there is one; return whether there was none.
+        """Write a small file unless it exists; return whether it was written.
 
-        Storages that cannot decide that look first.
+        On storages without exclusive creation, two processes may both succeed.
         """
         try:
             self._put("written", lambda: self._system.pipe_file(self._path, content, mode="create"))
@@ -137,17 +136,17 @@ class Location:
         return True
 
     def upload(self, file: Path) -> None:
-        """Send a file, in parts if it is large: memory holds a few of them."""
+        """Upload a file, in parts if it is large, to limit memory."""
         options = self._in_parts(file.stat().st_size)
         self._put("uploaded", lambda: self._system.put_file(str(file), self._path, **options))
 
     def _in_parts(self, size: int = 0) -> dict[str, int]:
-        """Return options that limit the memory of a transfer; the default is half a gigabyte."""
+        """Return options that limit the memory of a transfer; S3's default is half a gigabyte."""
         part = max(_PART_BYTES, -(-size // _MOST_PARTS))
         return {"chunksize": part, "max_concurrency": 2} if self._is_s3() else {}
 
     def _put(self, done: str, call: Callable[[], Any]) -> None:
-        if not self._is_s3():  # which would make a bucket of a name that is misspelt
+        if not self._is_s3():  # S3 would create a bucket with a misspelt name
             self._tried(done, lambda: self._system.makedirs(self._parent(), exist_ok=True))
         try:
             self._tried(done, call)
@@ -155,11 +154,11 @@ class Location:
             raise self._as_error(done, error) from error
 
     def download(self, target: Path) -> None:
-        """Fetch a file, or a folder with all in it, piece by piece.
+        """Download a file, or a folder with its content.
 
         Raises
         ------
-        ShapecatError : it is not there, or the connection broke.
+        ShapecatError : the file does not exist, or the transfer failed.
         """
 
         def get() -> None:
@@ -177,7 +176,7 @@ class Location:
         self._put("copied", lambda: self._system.cp_file(self._path, other._path))  # noqa: SLF001  of this class
 
     def remove(self) -> None:
-        """Remove a file, if there is one."""
+        """Remove a file, if it exists."""
         with suppress(FileNotFoundError):
             self._tried("removed", lambda: self._system.rm_file(self._path))
 
@@ -186,11 +185,11 @@ class Location:
         return {PurePosixPath(url).name for url, _ in self.walk(deep=False)}
 
     def walk(self, *, deep: bool = True) -> Iterator[tuple[str, Mapping[str, Any]]]:
-        """Yield URL and info of the files in a folder, or of those that match a pattern.
+        """Yield URL and info of the files in a folder, or of the files that match a pattern.
 
         Parameters
         ----------
-        deep : also the files in its folders; otherwise the folders themselves.
+        deep : whether to descend into subfolders; otherwise these are yielded themselves.
         """
         found = self._match() if _is_pattern(self._path) else self._list(deep=deep)
         with suppress(FileNotFoundError):
@@ -220,7 +219,9 @@ class Location:
         while True:
             try:
                 page = self._tried("listed", lambda: call("list_objects_v2", **options))
-            except FileNotFoundError as error:  # the bucket: a folder without files is an empty one
+            except (
+                FileNotFoundError
+            ) as error:  # the bucket is missing; a missing folder is an empty one
                 raise self._as_error(done="listed", error=error) from error
             for item in page.get("Contents", ()):
                 yield {**item, "name": f"{bucket}/{item['Key']}", "size": item["Size"]}
@@ -231,7 +232,7 @@ class Location:
             options["ContinuationToken"] = page["NextContinuationToken"]
 
     def abort_uploads(self) -> None:
-        """Abort unfinished multipart uploads to a folder, which cost money."""
+        """Abort unfinished multipart uploads to a folder in S3, since their parts cost money."""
         if not self._is_s3():
             return
         bucket, key, _ = self._system.split_path(self._path)
@@ -251,14 +252,14 @@ class Location:
 
 
 def _connect(url: str, error: type[ShapecatError]) -> tuple[Any, str]:
-    """Return the file system of a URL, and the path in it."""
+    """Return the fsspec file system of a URL, and the path in it."""
     try:
         from fsspec.core import url_to_fs  # noqa: PLC0415  an extra
     except ImportError as missing:
         msg = f"{url}: URLs need fsspec: pip install 'shapecat[remote]'"
         raise ConfigError(msg) from missing
     try:
-        # Listings are not kept: other workers change what lies there.
+        # Listings are not cached, since other workers change the storage.
         system, path = url_to_fs(url, use_listings_cache=False)
     except ImportError as missing:
         msg = f"{url}: {missing}"
@@ -274,7 +275,7 @@ def _is_pattern(path: str) -> bool:
 
 
 def _may_pass(error: Exception) -> bool:
-    """Return whether a call may succeed later: the server is busy, a connection broke."""
+    """Return whether a call may succeed later: the server is busy, or a connection broke."""
     status = getattr(error, "status", None)
     if isinstance(status, int):
         return status == 429 or status >= 500

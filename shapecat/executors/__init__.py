@@ -1,7 +1,7 @@
 """Where tasks run: every executor has the interface of `concurrent.futures.Executor`.
 
-Nothing here knows what a task does. `local` needs no other package; `dask` and `ray` are thin
-adapters of libraries that the extras ``cluster`` and ``ray`` bring.
+Executors are independent of what the tasks do. `local` needs no other package; `dask` and `ray`
+are thin adapters for libraries in the extras ``cluster`` and ``ray``.
 """
 
 from collections.abc import Callable
@@ -37,20 +37,20 @@ _LOST = {
     *("WorkerCrashedError", "NodeDiedError", "OutOfMemoryError"),  # Ray
 }
 _DROPPED = {"CancelledError", "FutureCancelledError", "CommClosedError"}
-"""Errors by name, as neither Dask nor Ray need be installed."""
+"""Errors by name, since neither Dask nor Ray need be installed."""
 
 
 def open_executor(
     name: str, *, workers: int, threads: int = 1, address: str | None = None
 ) -> Executor:
-    """Start, or connect to, the workers.
+    """Start worker processes, or connect to running ones.
 
     Parameters
     ----------
     name : ``local``, ``dask`` or ``ray``.
-    workers : processes to start on this machine, where no ``address`` is given.
-    threads : threads that the numeric libraries of each may use.
-    address : of a running Dask scheduler or Ray cluster.
+    workers : number of processes to start on this machine if no ``address`` is given.
+    threads : number of threads for the numeric libraries in each process.
+    address : address of a running Dask scheduler or Ray cluster; not for ``local``.
 
     Raises
     ------
@@ -82,10 +82,10 @@ _OPENERS: dict[str, Callable[[int, int, str | None], Executor]] = {
 
 
 def is_lost(error: BaseException) -> bool:
-    """Return whether an error means that the worker died, not that the task failed."""
+    """Return whether an error means that the worker or scheduler is lost, not a failed task."""
     return type(error).__name__ in _LOST | _DROPPED
 
 
 def is_dropped(error: BaseException) -> bool:
-    """Return whether the task may not have been begun: its scheduler has gone."""
+    """Return whether the scheduler is lost, so that the task may not have started."""
     return type(error).__name__ in _DROPPED

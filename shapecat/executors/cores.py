@@ -1,4 +1,4 @@
-"""How many cores there are to share, and threads kept from taking more than their part."""
+"""Count and share the cores, and limit the threads of numeric libraries."""
 
 import os
 from collections.abc import Iterator
@@ -7,23 +7,24 @@ from contextlib import contextmanager
 __all__ = ["THREAD_LIMITS", "limited_threads", "share_cores", "usable_cores"]
 
 THREAD_LIMITS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""What numeric libraries read when they are loaded."""
+"""Environment variables that numeric libraries read when they are loaded."""
 
 
 def usable_cores() -> int:
-    """Return the cores this process may use: what taskset, Slurm or a container leave it."""
+    """Return the number of cores this process may use, within taskset, Slurm or a container."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return cores or 1
 
 
 def share_cores(jobs: int | None, recordings: int) -> tuple[int, int]:
-    """Return how many recordings to process at once, and how many frames of each.
+    """Return how many recordings to process at once, and how many frames of each at once.
 
-    Their product is no more than the cores, unless more ``jobs`` than cores are asked for.
+    The product does not exceed the usable cores, unless ``jobs`` does.
 
     Parameters
     ----------
-    jobs : cores to use; None for all.
+    jobs : number of cores to use; None for all.
+    recordings : number of recordings to process.
     """
     jobs = jobs or usable_cores()
     workers = max(1, min(jobs, recordings))
@@ -32,7 +33,7 @@ def share_cores(jobs: int | None, recordings: int) -> tuple[int, int]:
 
 @contextmanager
 def limited_threads(threads: int) -> Iterator[None]:
-    """Let processes started in the block use so many threads in numeric libraries."""
+    """Limit the threads of numeric libraries in processes that are started in the block."""
     before = {name: os.environ.get(name) for name in THREAD_LIMITS}
     os.environ.update(dict.fromkeys(THREAD_LIMITS, str(threads)))
     try:

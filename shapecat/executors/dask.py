@@ -1,4 +1,4 @@
-"""Dask: its client already speaks the interface of `concurrent.futures`."""
+"""Adapter for Dask, whose client already has the interface of `concurrent.futures`."""
 
 from concurrent.futures import Executor, Future
 from contextlib import suppress
@@ -14,11 +14,11 @@ _CLOSE_S = 10
 
 
 class _DaskExecutor(Executor):
-    """The executor of a client, that also closes the client and the cluster it started."""
+    """The executor of a client; it also closes the client and the cluster started here."""
 
     def __init__(self, client: Any, cluster: Any) -> None:
         self._client, self._cluster = client, cluster
-        # Not pure: a recording tried again is not the first try's result.
+        # Not pure: a second attempt must not return the result of the first.
         self._executor = client.get_executor(pure=False)
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
@@ -30,7 +30,7 @@ class _DaskExecutor(Executor):
         self._close(_CLOSE_S)
 
     def terminate(self) -> None:
-        """Cancel what waits; end the workers that were started here."""
+        """Cancel waiting tasks, and end the workers started here."""
         self._executor.shutdown(wait=False)
         self._close(1)
 
@@ -43,6 +43,8 @@ class _DaskExecutor(Executor):
 
 def open_dask(workers: int, threads: int, address: str | None) -> Executor:
     """Connect to a scheduler, or start one with processes on this machine.
+
+    The parameters are as for `open_executor`.
 
     Raises
     ------

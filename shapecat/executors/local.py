@@ -1,4 +1,4 @@
-"""Processes on this machine that outlive neither their parent nor spoil each other's work."""
+"""Worker processes on this machine that end with their parent and fail independently."""
 
 import atexit
 import signal
@@ -20,10 +20,9 @@ _SIGNALS = {signal.SIGINT, signal.SIGTERM}
 class LocalExecutor(Executor):
     """Runs tasks in spawned processes, as `concurrent.futures.ProcessPoolExecutor` does.
 
-    It differs where a disk of recordings needs it to: a worker that dies fails its own tasks alone
-    and is replaced, workers end when their parent does, however it ended, `stop` asks tasks to
-    put their work down, and `terminate` does not wait for them. Signals reach the parent alone,
-    which decides what they mean.
+    It differs as follows: a worker that dies fails only its own tasks and is replaced; workers end
+    when their parent ends for whatever reason; `stop` asks tasks to finish early; `terminate` does
+    not wait for tasks; signals reach only the parent, which decides what they mean.
     """
 
     def __init__(self, workers: int, *, threads: int = 1, ahead: int = 0) -> None:
@@ -31,12 +30,12 @@ class LocalExecutor(Executor):
 
         Parameters
         ----------
-        threads : that numeric libraries may use in each process.
-        ahead : tasks that a busy worker is sent in advance, and loses when it dies.
+        threads : number of threads for the numeric libraries in each process.
+        ahead : number of tasks sent to a busy worker in advance; they fail if it dies.
 
         Raises
         ------
-        ValueError : there is not at least one worker.
+        ValueError : ``workers`` is less than 1.
         """
         if workers < 1:
             msg = f"workers must be at least 1, got {workers}"
@@ -68,7 +67,7 @@ class LocalExecutor(Executor):
         return task.future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
-        """Let the workers end when their tasks are done."""
+        """Let the workers end when all submitted tasks are done."""
         self._closed = True
         atexit.unregister(self.terminate)
         if cancel_futures:
@@ -80,7 +79,7 @@ class LocalExecutor(Executor):
                 attendant.join()
 
     def stop(self) -> None:
-        """Ask the tasks to stop, as a signal asks a command, and wait until they have."""
+        """Ask running tasks to stop, as a signal would, and wait until they have."""
         self.shutdown(wait=False, cancel_futures=True)
         with self._lock:
             for worker in self._workers.values():
@@ -104,9 +103,9 @@ class LocalExecutor(Executor):
                     task.future.cancel()
 
     def _attend(self, seat: int) -> None:
-        """Send tasks to one worker after the other, for as long as there are any."""
-        resource_tracker.ensure_running()  # to start it lets signals through again
-        signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # which the workers inherit
+        """Send tasks to the worker of a seat, and to its successors, until the shutdown."""
+        resource_tracker.ensure_running()  # starting it later would unblock the signals
+        signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # the workers inherit it
         room = threading.Semaphore(1 + self._ahead)
         while room.acquire() and (task := self._tasks.get()):
             try:
@@ -120,11 +119,11 @@ class LocalExecutor(Executor):
         self._dismiss(seat)
 
     def _worker(self, seat: int, room: threading.Semaphore) -> Worker:
-        """Return the worker of a seat; where it is gone another takes its place.
+        """Return the worker of a seat; start one if there is none or it has died.
 
         Raises
         ------
-        WorkerLostError : no other is started after a shutdown.
+        WorkerLostError : the executor is shut down, or no process can be started.
         """
         worker = self._workers.get(seat)
         if worker is not None and worker.lost:
@@ -142,7 +141,7 @@ class LocalExecutor(Executor):
             return self._workers[seat]
 
     def _dismiss(self, seat: int) -> None:
-        """Wait for the answers of a worker, and for its end."""
+        """Wait for the outstanding answers of a worker, and for its end."""
         worker = self._workers.get(seat)
         if worker is not None:
             worker.end()

@@ -1,4 +1,4 @@
-"""How workers on this machine tell how far they are: datagrams, lost rather than waited for."""
+"""Progress reports from workers on this machine: datagrams, dropped rather than waited for."""
 
 import json
 import socket
@@ -15,14 +15,14 @@ _MOST_BYTES = 4096
 
 
 class Mailbox:
-    """Hands what workers `post` to a function, in a thread of its own.
+    """Passes the reports that workers `post` to a function, in a thread of its own.
 
-    A worker that dies while it posts harms nobody: there is no lock and no stream. The socket lies
-    in a folder that only this user may enter.
+    A worker that dies while it posts blocks nobody, since there is no lock and no stream. The
+    socket is in a folder that only this user may enter.
 
     Attributes
     ----------
-    address : what workers post to.
+    address : path of the socket, the address for `post`.
     """
 
     def __init__(self, receive: Callable[[Any], None]) -> None:
@@ -54,7 +54,7 @@ class Mailbox:
 
 
 def post(address: str, report: Any) -> None:
-    """Send a report, if it can be sent at once; from another machine it cannot."""
+    """Send a report without waiting; drop it if that fails, as from another machine."""
     with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
         sender.setblocking(False)  # noqa: FBT003  positional by definition
         sender.sendto(json.dumps(report).encode(), address)

@@ -1,4 +1,4 @@
-"""Items worked on in several processes, or read ahead in a thread, in their order."""
+"""Process items in several processes or threads, and yield the results in order."""
 
 import logging
 import sys
@@ -21,23 +21,23 @@ _Item = TypeVar("_Item")
 _Result = TypeVar("_Result")
 
 _ALONE = 1
-"""Items worked on before other processes are started, which a short run can do without."""
+"""Items processed here before other processes are started: a short run needs none."""
 _AHEAD, _AWAY = 1, 3
-"""Items sent to a process that is busy; and all that are meant for it, of which one waits here.
+"""Items sent to a busy process in advance; and all items of a process, of which one waits here.
 
-While this process works, another one finishes what it has, and what waits is sent to it.
+The waiting item is sent when the process finishes another one, even while this process works.
 """
 _HELD = 8
-"""Results held at most, which wait for one that another process works on."""
+"""At most this many items are in progress, or wait for the result of an earlier one."""
 _SWITCH_S = 5e-4
-"""A thread back from a kernel waits no longer than this for the interpreter lock."""
+"""A thread that returns from a kernel waits no longer than this for the interpreter lock."""
 
 
 class Processes(Generic[_Item, _Result]):
-    """Several processes, of which this is one, that share the items of one piece of work.
+    """Several processes, including this one, that share the items of one job.
 
-    This one works along: while the others come up, and whenever all are busy. What another fails
-    at, because it was killed or ran out of memory, is done here.
+    This process works on items while the others start, and whenever all of them are busy. It also
+    repeats items at which another process fails, for example out of memory.
 
     Examples
     --------
@@ -52,13 +52,13 @@ class Processes(Generic[_Item, _Result]):
         count: int,
         warm_up: Callable[[], object] = object,
     ) -> None:
-        """Prepare ``count`` processes; the others end with the block.
+        """Prepare ``count`` processes, including this one; the others end with the block.
 
         Parameters
         ----------
-        warm_up : is called in the others before their first item.
-        work : is sent to spawned processes, as the items are: picklable, and a script needs the
-            usual ``if __name__ == "__main__"``. A daemonic process may have no others.
+        work : called with each item. Spawned processes need it and the items to be picklable, and
+            a script to have ``if __name__ == "__main__":``. A daemonic process works alone.
+        warm_up : called in each other process before its first item.
         """
         self._work, self._warm_up = work, warm_up
         self._others = 0 if current_process().daemon else max(0, count - 1)
@@ -69,23 +69,23 @@ class Processes(Generic[_Item, _Result]):
         return self
 
     def __exit__(self, *error: object) -> None:
-        """End the others, whatever they do."""
+        """Kill the other processes."""
         if self._executor is not None:
             self._executor.terminate()
 
     def start(self) -> None:
-        """Start the others now, not with the first items: they take seconds to come up."""
+        """Start the other processes now, not with the first items: it takes seconds."""
         if self._others and self._executor is None:
             self._executor = LocalExecutor(self._others, ahead=_AHEAD)
             for _ in range(self._others):
                 self._waking.append(self._executor.submit(_wake, self._work, self._warm_up))
 
     def in_order(self, items: Iterable[tuple[_Kept, _Item]]) -> Iterator[tuple[_Kept, _Result]]:
-        """Yield what the work makes of each item, in the order of the items, with what is kept.
+        """Yield ``(kept, work(item))`` for each pair ``(kept, item)``, in order.
 
         Parameters
         ----------
-        items : pairs of what is kept here and what is worked on; held only until it is done.
+        items : pairs of a value that stays in this process and an item to work on.
         """
         source = iter(items)
         if self._executor is None:
@@ -107,19 +107,19 @@ class Processes(Generic[_Item, _Result]):
     def _begin(
         self, item: _Item, turns: Sequence["_Turn[_Item, _Result]"]
     ) -> "_Turn[_Item, _Result]":
-        """Send an item to another process if one has come up and has room, else work on it."""
+        """Send an item to another process if one has started and has room, else work on it here."""
         awake = sum(future.done() for future in self._waking)
         away = sum(not turn.done() for turn in turns)
         return _Turn(self._work, item, self._executor if away < _AWAY * awake else None)
 
 
 class _Turn(Generic[_Item, _Result]):
-    """The work on an item, which another process does, or this one."""
+    """The work on one item, in another process or in this one."""
 
     def __init__(
         self, work: Callable[[_Item], _Result], item: _Item, executor: Executor | None
     ) -> None:
-        """Send the item, or work on it where there is no executor."""
+        """Send the item, or work on it here if there is no executor."""
         self._work = work
         self._item: _Item | None = None  # kept only while another process has it
         self._future: Future[_Result]
@@ -135,16 +135,16 @@ class _Turn(Generic[_Item, _Result]):
             self._item = None
 
     def done(self) -> bool:
-        """Return whether `result` need not wait."""
+        """Return whether the work is finished."""
         return self._future.done()
 
     def recall(self) -> None:
-        """Work on the item here if it was not sent yet."""
+        """Work on the item here if it has not been sent yet."""
         if self._item is not None and self._future.cancel():
             self._future, self._item = _done(self._work, self._item), None
 
     def result(self) -> _Result:
-        """Return the result; what another process fails at is done here."""
+        """Return the result; work on the item here if another process failed."""
         self.recall()
         error = self._future.exception()
         if error is None or self._item is None:
@@ -154,7 +154,7 @@ class _Turn(Generic[_Item, _Result]):
 
 
 def _wake(_work: object, warm_up: Callable[[], object]) -> None:
-    """Warm up; to have received the work is to have loaded what it needs."""
+    """Warm up; unpickling the work has already imported what it needs."""
     warm_up()
 
 
@@ -168,7 +168,7 @@ def _done(work: Callable[[_Item], _Result], item: _Item) -> Future[_Result]:
 
 
 def read_ahead(items: Iterable[_Item], *, count: int) -> Iterator[_Item]:
-    """Yield the items, of which the next ``count`` are made in a thread meanwhile.
+    """Yield the items while a thread prepares the next ``count`` of them.
 
     Examples
     --------
@@ -190,13 +190,13 @@ def read_ahead(items: Iterable[_Item], *, count: int) -> Iterator[_Item]:
 def map_ahead(
     function: Callable[[_Item], _Result], items: Iterable[_Item], *, threads: int
 ) -> Iterator[_Result]:
-    """Yield what a function makes of items, in their order, worked on in threads ahead.
+    """Yield ``function(item)`` for each item, in order, computed ahead in threads.
 
-    Worth it for a function that spends its time in kernels, which do not hold the interpreter lock.
+    It pays for functions that spend their time in kernels, which release the interpreter lock.
 
     Parameters
     ----------
-    threads : with one, all is done here when it is asked for.
+    threads : with 1, each result is computed in this thread when it is requested.
 
     Examples
     --------
@@ -218,7 +218,7 @@ def map_ahead(
 
 @contextmanager
 def _switching() -> Iterator[None]:
-    """Let threads switch more often than every 5 ms: most kernels take less time."""
+    """Let threads switch more often than every 5 ms, since most kernels take less time."""
     before = sys.getswitchinterval()
     sys.setswitchinterval(_SWITCH_S)
     try:

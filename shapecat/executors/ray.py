@@ -1,4 +1,4 @@
-"""Ray: its remote functions behind the interface of `concurrent.futures`."""
+"""Adapter for Ray: its remote functions behind the interface of `concurrent.futures`."""
 
 from concurrent.futures import Executor, Future
 from typing import Any
@@ -9,14 +9,16 @@ from shapecat.executors.cores import THREAD_LIMITS
 __all__ = ["RayExecutor"]
 
 _STORE_BYTES = 100 * 2**20
-"""Of shared memory for arguments and results, which are small; Ray takes a third by default."""
+"""Shared memory for arguments and results, which are small; Ray's default is a third of all."""
 
 
 class RayExecutor(Executor):
-    """Runs each call as a Ray task of one core."""
+    """Runs each call as a Ray task on one core."""
 
     def __init__(self, workers: int, threads: int, address: str | None) -> None:
         """Connect to a cluster, or start one with ``workers`` cores on this machine.
+
+        The parameters are as for `open_executor`.
 
         Raises
         ------
@@ -43,7 +45,7 @@ class RayExecutor(Executor):
         self._running: set[Any] = set()
 
     def submit(self, fn: Any, /, *args: Any, **kwargs: Any) -> Future[Any]:
-        """Queue a call on the cluster; a worker that dies is reported, not tried again here."""
+        """Queue a call on the cluster; if its worker dies, the future raises without a retry."""
         reference = self._ray.remote(max_retries=0)(fn).remote(*args, **kwargs)
         self._running.add(reference)
         future: Future[Any] = reference.future()
@@ -51,7 +53,7 @@ class RayExecutor(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:  # noqa: FBT001, FBT002  as in the base class
-        """Wait for what runs, or cancel it, and disconnect."""
+        """Wait for running calls, or cancel them, and disconnect."""
         if cancel_futures:
             for reference in list(self._running):
                 self._ray.cancel(reference, force=True)
@@ -60,5 +62,5 @@ class RayExecutor(Executor):
         self._ray.shutdown()
 
     def terminate(self) -> None:
-        """Cancel what runs."""
+        """Cancel running calls and disconnect."""
         self.shutdown(wait=False, cancel_futures=True)

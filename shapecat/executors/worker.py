@@ -1,4 +1,4 @@
-"""A spawned process that answers calls, and the parent's side of it."""
+"""A spawned process that executes calls, and its counterpart in the parent."""
 
 import io
 import os
@@ -26,7 +26,7 @@ _SPAWN = get_context("spawn")
 
 
 class WorkerLostError(RuntimeError):
-    """The process that worked on a task has died: killed, out of memory, or crashed."""
+    """The process that worked on a task died: killed, out of memory, or crashed."""
 
 
 class Task(NamedTuple):
@@ -37,7 +37,7 @@ class Task(NamedTuple):
 
 
 class Worker:
-    """A process, the socket to it, and a thread that waits for its answers.
+    """A process, the socket to it, and a thread that receives its answers.
 
     Attributes
     ----------
@@ -45,11 +45,11 @@ class Worker:
     """
 
     def __init__(self, threads: int, room: threading.Semaphore) -> None:
-        """Start the process; ``room`` is released with each answer."""
+        """Start the process, with ``threads`` for numeric libraries; answers release ``room``."""
         self.lost = False
         self._socket, far = socket.socketpair()
         asked, self._ask = _SPAWN.Pipe(duplex=False)
-        # Daemonic ones may not start processes of their own; `_watch_parent` ends these.
+        # Not daemonic, since those may not start processes; `_watch_parent` ends it instead.
         self.process = _SPAWN.Process(target=_serve, args=(far, asked), daemon=False)
         with limited_threads(threads):
             self.process.start()
@@ -60,18 +60,18 @@ class Worker:
         self._listener.start()
 
     def ask_to_stop(self) -> None:
-        """Let `stopping.asked` be true in the process."""
+        """Make `stopping.asked` return True in the process."""
         self._ask.close()
 
     def send(self, task: Task) -> None:
-        """Send a call, perhaps while the process works on another; the listener settles it."""
+        """Send a call, even while the process works on another; the listener sets its future."""
         parts = _packed(task.call)
         self._sent.put(task)
-        with suppress(OSError):  # the listener meets the same
+        with suppress(OSError):  # the listener gets the same error
             _send(self._socket, parts)
 
     def end(self) -> None:
-        """Wait for the answers to all that was sent, then for the end of the process."""
+        """Wait for the outstanding answers, then for the end of the process."""
         self._sent.put(None)
         self._listener.join()
         self._socket.close()
@@ -104,21 +104,21 @@ def _words(code: int | None) -> str:
 
 
 def _packed(value: object) -> list[memoryview]:
-    """Pickle a value; its arrays follow as they lie, without a copy."""
+    """Pickle a value; return the pickle and the arrays in it, which are not copied."""
     written, buffers = io.BytesIO(), list[Any]()
     ForkingPickler(written, 5, True, buffers.append).dump(value)  # noqa: FBT003  by position alone
     return [written.getbuffer(), *(buffer.raw() for buffer in buffers)]
 
 
 def _send(connection: socket.socket, parts: Sequence[memoryview]) -> None:
-    """Send parts of any size, behind their number and their sizes."""
+    """Send parts of any size, preceded by their number and sizes."""
     connection.sendall(struct.pack(f"<{len(parts) + 1}Q", len(parts), *map(len, parts)))
     for part in parts:
         connection.sendall(part)
 
 
 def _receive(connection: socket.socket) -> Any:
-    """Receive a value that was packed and sent.
+    """Receive a value that `_packed` and `_send` sent.
 
     Raises
     ------
@@ -131,7 +131,7 @@ def _receive(connection: socket.socket) -> Any:
 
 
 def _read(connection: socket.socket, size: int) -> bytearray:
-    """Read so many bytes, most often in one call, that waits without the interpreter lock."""
+    """Read `size` bytes, usually in one call, which waits without the interpreter lock."""
     content = bytearray(size)
     rest = memoryview(content)
     while rest:
@@ -145,7 +145,7 @@ def _read(connection: socket.socket, size: int) -> bytearray:
 def _serve(connection: socket.socket, asked: Connection) -> None:
     """Answer calls until the parent closes the socket or dies.
 
-    Threads receive the next call and send the last answer while this one is worked on.
+    Threads receive the next call and send the previous answer during the current call.
     """
     collect_seldom()
     threading.Thread(target=_watch_parent, args=(asked,), daemon=True).start()
@@ -185,7 +185,7 @@ def _answer(
 
 
 def _watch_parent(asked: Connection) -> None:
-    """Stop the work when the parent asks; end, whatever it does, when the parent is gone."""
+    """Request a stop when the parent asks for it; end the process when the parent is gone."""
     parent = parent_process()
     if parent is None:
         return

@@ -1,1 +1,1 @@
-"""Between the work and the machine: files that appear complete, signals that ask to stop."""
+"""Atomic files and folders, locks, signals that ask to stop, and garbage collection."""

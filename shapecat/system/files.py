@@ -1,8 +1,8 @@
 """Files and folders that appear complete or not at all, and locks that end with their process.
 
-What appears under its name lies on the disk: it is flushed before it is renamed, and its folder
-after, so that a power cut leaves no complete name with incomplete content. ``SHAPECAT_FSYNC=0``
-in the environment leaves that out, for scratch.
+A file is flushed to disk before it is renamed to its final name, and its folder after that, so a
+power cut leaves no incomplete content under a final name. ``SHAPECAT_FSYNC=0`` in the environment
+skips flushing, for temporary data.
 """
 
 import errno
@@ -29,11 +29,11 @@ __all__ = [
 ]
 
 FSYNC = "SHAPECAT_FSYNC"
-"""The variable of the environment: worker processes inherit it."""
+"""The environment variable that disables flushing; worker processes inherit it."""
 
 
 def partial_path(path: Path) -> Path:
-    """Return the hidden name of a file or folder before it is complete."""
+    """Return the hidden name that a file or folder has until it is complete."""
     return path.with_name(f".{path.name}.partial")
 
 
@@ -43,7 +43,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
     Raises
     ------
-    OutputError : it cannot be written.
+    OutputError : the file cannot be written.
     """
     hidden = partial_path(path)
     try:
@@ -60,11 +60,11 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def require_writable(path: Path) -> None:
-    """Make the folders above a file that is to be written, and see that it can be.
+    """Make the folders above an output file, and check before the work that it can be written.
 
     Raises
     ------
-    OutputError : it cannot, which is better known before the work than after it.
+    OutputError : the file cannot be written.
     """
     hidden = partial_path(path)
     try:
@@ -83,7 +83,7 @@ def require_writable(path: Path) -> None:
 def complete_folder(folder: Path) -> Iterator[Path]:
     """Provide a hidden folder; rename it to ``folder`` when the block succeeds.
 
-    Whatever a kill left half-made of it is discarded first.
+    Remains of an earlier, interrupted block are deleted first.
     """
     hidden = partial_path(folder)
     shutil.rmtree(hidden, ignore_errors=True)
@@ -97,11 +97,11 @@ def complete_folder(folder: Path) -> Iterator[Path]:
 
 
 def flush(path: Path) -> None:
-    """Wait until a file, or the names in a folder, lie on the disk.
+    """Wait until a file, or the names in a folder, are stored on disk.
 
     Raises
     ------
-    OSError : the disk is full or failing. A file system that cannot flush says nothing.
+    OSError : the disk is full or failing. A file system that cannot flush raises nothing.
     """
     if os.environ.get(FSYNC) == "0":
         return
@@ -116,11 +116,11 @@ def flush(path: Path) -> None:
 
 
 def lock(folder: Path) -> int | None:
-    """Lock a folder for as long as this process lives, or until the number given is closed.
+    """Lock a folder until this process ends or the returned file descriptor is closed.
 
     Returns
     -------
-    None if another process holds it. A file system without locks never says so.
+    None if another process holds the lock; never on a file system without locks.
     """
     held = os.open(folder, os.O_RDONLY)
     try:
@@ -135,11 +135,11 @@ def lock(folder: Path) -> int | None:
 
 @contextmanager
 def holding(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder in the block; wait for it where another thread or process has it.
+    """Hold the lock of a folder in the block; wait while another thread or process holds it.
 
     Raises
     ------
-    OutputError : there is no such folder.
+    OutputError : the folder does not exist or cannot be opened.
     """
     try:
         held = os.open(folder, os.O_RDONLY)
@@ -155,10 +155,10 @@ def holding(folder: Path) -> Iterator[None]:
 
 
 def input_files(path: Path) -> list[Path]:
-    """Return a file itself, or the files of a folder by name."""
+    """Return a file itself, or the files in a folder, sorted by name."""
     return [f for f in sorted(path.iterdir()) if f.is_file()] if path.is_dir() else [path]
 
 
 def input_size(path: Path) -> int:
-    """Return the bytes of a file, or of the files of a folder."""
+    """Return the size of a file, or of the files in a folder, bytes."""
     return sum(file.stat().st_size for file in input_files(path))

@@ -1,14 +1,14 @@
-"""How often the processes of this program look for unreachable objects."""
+"""How often the processes of this program collect garbage."""
 
 import gc
 
 __all__ = ["collect_seldom"]
 
 _MADE = 100_000
-"""Objects made between two searches. The libraries alone hold 230,000, which Python, with its 700,
-walks so often that it is 3 % of a run."""
+"""Allocations between two collections. The libraries alone hold 230,000 objects, and with Python's
+default of 700, walking them takes 3 % of a run."""
 
 
 def collect_seldom() -> None:
-    """Search for garbage seldom: frames leave next to none that has to be searched for."""
+    """Collect garbage rarely: frames leave hardly any reference cycles."""
     gc.set_threshold(_MADE)

@@ -1,4 +1,4 @@
-"""The script that runs: whether processes that it starts would run it again."""
+"""Whether processes that the main script starts would run it again."""
 
 import sys
 from pathlib import Path
@@ -7,13 +7,13 @@ __all__ = ["runs_again"]
 
 
 def runs_again() -> bool:
-    """Whether a process that is started runs the script again, since nothing in it asks for that.
+    """Return whether a spawned process would repeat the calls of the main script.
 
-    A spawned process runs the main script to know its functions. Python's documentation asks for
-    ``if __name__ == "__main__":`` around all calls; a script that never says ``__main__`` has none.
+    A spawned process runs the main script to define its functions. Python's documentation asks for
+    ``if __name__ == "__main__":`` around all calls; a script without ``__main__`` lacks that line.
     """
     path = getattr(sys.modules.get("__main__"), "__file__", None)
-    if path is None:  # a console or a notebook, which nobody can run again
+    if path is None:  # a console or a notebook, which cannot run again
         return False
     try:
         return "__main__" not in Path(path).read_text("utf-8")

@@ -1,8 +1,8 @@
-"""Signals that ask a command to stop: noted when they arrive, heeded between two frames.
+"""Signals that ask a command to stop: stored when they arrive, obeyed between two frames.
 
 An exception that a signal handler raises may surface inside compiled code, which then returns a
-result and an error at once, or crashes the interpreter. So the handler only takes a note, and the
-work asks for it where it can be put down: `asked` ends a loop, `check` raises `Stopped`.
+result and an error at once, or crashes the interpreter. So the handler only stores the signal, and
+the work checks for it where it can be interrupted: `asked` ends a loop, `check` raises `Stopped`.
 """
 
 import os
@@ -27,7 +27,7 @@ class Stopped(KeyboardInterrupt):
     """A signal stopped the work; finished parts are kept."""
 
     def __init__(self, signum: int = signal.SIGINT) -> None:
-        """Remember the number of the signal."""
+        """Set the exit code of the signal."""
         super().__init__(signum)
         self.exit_code = 128 + signum
 
@@ -63,20 +63,20 @@ def until_asked(items: Iterable[_Item]) -> Iterator[_Item]:
 
 
 def leave(signum: int, _frame: FrameType | None = None) -> None:
-    """End this process at once, as a handler of signals; its workers end when they miss it."""
+    """End this process at once (a signal handler); its workers notice and end too."""
     if os.isatty(2):
         _say(_SHOW_CURSOR)
     os._exit(128 + signum)
 
 
 def _say(text: bytes) -> None:
-    """Write to stderr past its buffer, which the handler may have interrupted."""
+    """Write to stderr without its buffer: the signal may have interrupted a write to that."""
     with suppress(OSError):
         os.write(2, text)
 
 
 def _note(signum: int, frame: FrameType | None) -> None:
-    """Note the first signal; leave the program at the second."""
+    """Store the first signal; end the process at the second (a signal handler)."""
     if asked():
         leave(signum, frame)
     request(signum)
@@ -85,10 +85,10 @@ def _note(signum: int, frame: FrameType | None) -> None:
 
 @contextmanager
 def heeding_signals() -> Iterator[None]:
-    """Take notes of SIGINT and SIGTERM in the block instead of raising.
+    """Store SIGINT and SIGTERM in the block instead of raising.
 
-    Signals that are ignored, as SIGINT is for a job in the background, stay so. Outside the main
-    thread, which alone may handle signals, nothing changes.
+    Ignored signals, such as SIGINT in a background job, stay ignored. Outside the main thread,
+    which alone may handle signals, nothing changes.
     """
     before = {}
     if threading.current_thread() is threading.main_thread():
