@@ -1,6 +1,8 @@
 """A run that is killed at any moment leaves nothing or all of it, and the next run goes on."""
 
+import os
 import resource
+import shutil
 import subprocess
 import sys
 import time
@@ -13,7 +15,7 @@ import pytest
 from click.testing import Result
 
 from shapecat.config import Settings
-from shapecat.errors import OutputError
+from shapecat.errors import OutputError, RecordingError
 from shapecat.pipeline import process
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
@@ -188,6 +190,23 @@ def test_two_runs_do_not_write_one_folder(recording: Path, tmp_path: Path) -> No
     process(job, second)
 
     assert [path.name for path in tmp_path.iterdir()] == ["table"]
+
+
+def test_a_recording_that_is_still_written_to_has_no_results(
+    recording: Path, tmp_path: Path
+) -> None:
+    """Its first frames would be of one recording, and its outputs of another."""
+    source, out = tmp_path / "live.mcap", tmp_path / "out"
+    shutil.copy(recording, source)
+
+    def write(phase: str, done: int, _total: int | None) -> None:
+        if (phase, done) == ("perceive", 2):
+            os.utime(source, ns=(1, 1))
+
+    with pytest.raises(RecordingError, match="has changed while it was processed"):
+        process(Job(source, out / "live", end_s=0.1, rrd=False), write)
+
+    assert not out.exists()
 
 
 def test_unwritable_folder_is_one_line(

@@ -17,7 +17,7 @@ from shapecat.batch.runs import Outcome, exit_code, process_on
 from shapecat.config import Settings
 from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run, write_run
-from shapecat.runs.identity import work_id
+from shapecat.runs.identity import file_stats, unchanged, work_id
 from shapecat.runs.jobs import Job, describe_run, resume, same_options
 from shapecat.runs.run_info import RunInfo
 
@@ -78,6 +78,20 @@ def test_outputs_do_not_change_what_the_tables_are_of(source: Path, name: str) -
     """So that labels of a run without a review fit one with it."""
     changed: Any = {"color": {"color": ""}, "mcap": {"mcap": False}, "rrd": {"rrd": False}}
     assert work_id(planned(source)) == work_id(planned(source, **changed[name]))
+
+
+def test_a_recording_that_was_written_to_has_changed_though_it_is_as_long(source: Path) -> None:
+    """New rights alone are no change, though they renew the time of the inode."""
+    before = file_stats(source)
+    source.chmod(0o600)
+    assert unchanged(before, source)
+
+    source.write_bytes(b"another!!")
+    os.utime(source, ns=(3, before[0][2] + 1))
+
+    assert not unchanged(before, source)
+    source.unlink()
+    assert not unchanged(before, source)
 
 
 def partial(folder: Path, run: RunInfo) -> None:

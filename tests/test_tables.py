@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
 from typing import get_type_hints
@@ -94,6 +95,24 @@ def test_row_groups_cover_the_same_frames(tmp_path: Path) -> None:
         known = set(frames["frame"].to_pylist())
         assert set(detections["frame"].to_pylist()) <= known
         assert set(planes["frame"].to_pylist()) <= known
+
+
+def test_a_second_look_replaces_a_frame_only_where_it_sees_more_than_nothing(
+    tmp_path: Path,
+) -> None:
+    """With another up a scene may be lost: what was seen first is better than that."""
+    write_run_tables(tmp_path, [2, 1, 0, 2])
+    nothing = replace(perception(3, 0), scene=Scene(np.array([0, -1, 0]), (), ()))
+    again = PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1", again=True)
+    with again as tables:
+        rows = [FrameRow(2001, None, again=True), FrameRow(2003, None, again=True)]
+        tables.write([perception(1, 3), nothing], rows)
+
+    seen = {n: pq.read_table(tmp_path / f"{n}.parquet") for n in ("frames", "detections", "planes")}
+
+    assert seen["frames"]["revised"].to_pylist() == [False, True, False, False]
+    assert seen["detections"]["frame"].to_pylist() == [0, 0, 1, 1, 1, 3, 3]
+    assert seen["planes"]["frame"].to_pylist() == [0, 0, 1, 1, 2, 2, 3, 3]
 
 
 def test_labelled_frames_join_tracks_and_labels(tmp_path: Path) -> None:

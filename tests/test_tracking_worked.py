@@ -12,10 +12,11 @@ from scipy.spatial.transform import Rotation
 from shapecat.arrays import F8
 from shapecat.config import TrackingSettings
 from shapecat.tracking import tracker
+from shapecat.tracking.association import size_key
 from shapecat.tracking.common_motion import CommonMotion, _fit, _in_space, _level
 from shapecat.tracking.hindsight import Fragments, _contradiction, _distances
 from shapecat.tracking.hits import Hits
-from shapecat.tracking.pieces import _changes, _joint
+from shapecat.tracking.pieces import _changes, _joint, _largest
 from shapecat.tracking.pieces import _fit as fit_pieces
 from shapecat.tracking.recording import _line, _needed
 from shapecat.tracking.records import FrameDetections
@@ -131,6 +132,13 @@ def test_the_cost_of_a_pair_is_the_sum_of_what_speaks_against_it() -> None:
     young = tracker._costs(two_tracks(), found, 4 * SECOND + 100_000_000, near)
     reach = 0.03 + 0.5 * 0.31 + 0.3 * 0.03
     assert young[1, 1] == pytest.approx(np.inf if reach < 0.19 else (0.19 / reach) ** 2 + 0.2)
+
+
+def test_a_box_that_flips_by_a_quarter_turn_keeps_its_size() -> None:
+    """Its two sides change places; the height does not, though it is between them."""
+    expected = np.log([0.20, 0.06, 0.13])  # each a centimetre longer
+
+    assert_allclose(size_key(np.array([[0.05, 0.19, 0.12], [0.19, 0.05, 0.12]])), [expected] * 2)
 
 
 @pytest.mark.parametrize(
@@ -285,6 +293,18 @@ def test_pieces_fit_into_a_whole_that_neither_of_them_fills() -> None:
     # One of them is as long, as wide and as high as the whole: something lies in a bowl.
     largest = np.array([0.16, 0.07, 0.2])
     assert not fits(np.maximum(largest, 0), none)
+
+
+def test_of_two_pieces_the_larger_one_stays() -> None:
+    """By volume: the longer one, or the one that comes first, may be the smaller."""
+    flat, cube = (0.21, 0.04, 0.05), (0.09, 0.08, 0.07)
+    frames = [
+        frame(0, [[0.1, 0.2, 0.3]] * 2, sizes=[flat, cube]),
+        frame(1, [[0.1, 0.2, 0.3]] * 2, sizes=[cube, flat]),
+        frame(2, [[0.1, 0.2, 0.3]], sizes=[flat]),
+    ]
+
+    assert _largest(Hits.of(frames), np.array([4, 0, 3, 1, 2])).tolist() == [1, 2, 4]
 
 
 def test_one_track_ends_soon_after_the_other_began() -> None:
