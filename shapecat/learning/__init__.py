@@ -1,9 +1,9 @@
 """Learning shape categories (thesis ch. 7).
 
-A descriptor becomes, with Parzen densities of it where they are used (`features`), words of a
-dictionary of trees (`forest`); the words a calibrated posterior and a novelty (`categorizer`). This
-half predicts and needs no scikit-learn; `pnn`, `boosted`, `training`, `baselines` are the half that
-learns.
+`features` standardises a descriptor and may add Parzen densities. `forest` maps these features to
+words, the leaves of a dictionary of trees. `categorizer` turns the words into a calibrated
+posterior and a novelty. These modules predict and need no scikit-learn; `pnn`, `boosted`,
+`training` and `baselines` train.
 """
 
 from shapecat.learning.categorizer import Categorizer, Prediction

@@ -1,4 +1,4 @@
-"""Simple learners as baselines of the full chain."""
+"""Baseline classifiers, and descriptors from the literature."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -21,11 +21,17 @@ _SAMPLES = 4096
 def make_baselines(
     blocks: Mapping[str, slice], *, seed: int, jobs: int | None = None
 ) -> dict[str, Callable[[], Any]]:
-    """Return makers of unfitted baselines by name; all classify whole descriptors.
+    """Return functions that make unfitted baselines, by name; all classify whole descriptors.
 
-    ``forest`` votes directly, ``linear`` works on the standardised descriptor, ``pnn`` multiplies
-    the Parzen densities of the blocks, ``forest words`` are the thesis's chain: the leaves of a
-    forest grown on descriptor and densities, with linear one-versus-rest learners on top.
+    ``forest`` is a random forest; ``linear`` is logistic regression on the standardised descriptor;
+    ``pnn`` multiplies the Parzen densities of the blocks; ``forest words`` is the method of the
+    thesis: linear one-versus-rest classifiers on the leaves of a forest that is grown on the
+    descriptor and its densities.
+
+    Parameters
+    ----------
+    blocks : range of each block in the descriptor, by name.
+    jobs : number of trees grown at the same time.
     """
     spans = {name: (part.start, part.stop) for name, part in blocks.items()}
     return {
@@ -45,13 +51,14 @@ def make_baselines(
 
 
 def shape_functions(points: F4, rng: np.random.Generator, *, bins: int = 32) -> F4:
-    """Return plain shape distributions of points (n, 3), scale-free: (3 * bins,).
+    """Return scale-invariant shape distributions (3 * bins,) of points (n, 3).
 
-    Histograms, each of sum 1, of the distance of two random points (D2), the root of the area of
-    the triangle of three (D3), both up to 3 times their mean, and the angle at one of three (A3).
+    These are three histograms, each with sum 1: the distance between two random points (D2), the
+    root of the area of a triangle of three points (D3), both up to 3 times their mean, and the
+    angle at one of three points (A3).
 
     Sources: Osada et al. 2002 for D2; Wohlkinger and Vincze 2011 for the ensemble (ESF); differs:
-    lines are not traced to be told inside, outside or mixed.
+    lines between points are not classified as inside, outside or mixed.
     """
     a, b, c = points[rng.integers(0, len(points), (3, _SAMPLES))].astype(np.float64)
     ab, ac = b - a, c - a

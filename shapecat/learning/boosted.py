@@ -1,4 +1,4 @@
-"""Boosted trees as a dictionary of words, with one learner per category (thesis 7.3, 7.4)."""
+"""Boosted trees as a dictionary of words, with a classifier per category (thesis 7.3, 7.4)."""
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -27,32 +27,32 @@ _FEWEST_ROWS = 100
 
 
 class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc]  # sklearn is untyped
-    """The leaf a view falls into in each tree is a word; the words of a category's trees add up.
+    """Gradient-boosted trees whose leaves are words; a category's logit sums its words' values.
 
-    Each round grows one tree for each category against the rest, on what its posterior still
-    lacks. So the dictionary and the learners on its words are learned together.
+    Each round grows one tree per category against the rest, on the residual of its posterior. The
+    dictionary and the classifiers on its words are thus learned together.
 
     Parameters
     ----------
     rounds : trees per category.
-    leaves : words per tree, at most.
-    rate : each tree corrects this share of what is lacking.
-    columns, rows : share of the features and of the views a tree may use, drawn anew for each.
-    unknown : label of shapes of no category. They get trees and a learner of their own, behind
-        those of the categories.
-    jobs : trees grown at the same time; the result is the same.
+    leaves : maximum number of words (leaves) per tree.
+    rate : learning rate.
+    columns, rows : fraction of the features and of the views that each tree draws.
+    unknown : label of shapes that belong to no category; None if there are none. They get trees
+        and a logit of their own, after those of the categories.
+    jobs : number of trees grown at the same time; it does not affect the result.
     random_state : seed of the draws.
 
     Attributes
     ----------
     classes_ : the categories, without ``unknown``.
     forest_ : the `FlatForest` of all trees.
-    votes_ : (words, k) what each word adds to each logit, in half precision; k is one more than
-        the categories if there were unknown shapes.
-    bias_ : (k,).
+    votes_ : (words, k) the value that each word adds to each logit, rounded to half precision; k is
+        one more than the categories if there were unknown shapes.
+    bias_ : (k,) constants of the logits.
 
-    Source: thesis 7.3, 7.4; differs: trees are boosted instead of a random forest with linear
-    learners on top, see docs/decisions/0008-boosted-dictionary.md.
+    Source: thesis 7.3, 7.4; differs: the trees are boosted, instead of a random forest with linear
+    classifiers on top, see docs/decisions/0008-boosted-dictionary.md.
     """
 
     def __init__(
@@ -77,9 +77,10 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
         self.random_state = random_state
 
     def fit(self, X: ArrayLike, y: ArrayLike, start: F4 | None = None) -> Self:
-        """Grow the trees on features X (n, f) and labels y (n,), unknown ones included.
+        """Grow the trees on features X (n, f) and labels y (n,), including unknown ones.
 
-        ``start`` (n, k) are logits that the trees add to; by default those of the shares.
+        ``start`` (n, k) are the logits that the trees add to; by default the log frequencies of the
+        labels.
         """
         x, y = validate_data(self, X, y, dtype=np.float32)
         check_classification_targets(y)
@@ -92,12 +93,12 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
         return self
 
     def logits(self, X: ArrayLike) -> F8:
-        """Return the logits (n, k)."""
+        """Return the logits (n, k) of features X (n, f)."""
         words = self.words(X)
         return np.asarray(self.votes_[words].sum(axis=1) + self.bias_)
 
     def decision_function(self, X: ArrayLike) -> F8:
-        """Return the logits (n, c), in single column form (n,) for two categories."""
+        """Return the logits (n, c) of the categories; for two, their difference (n,)."""
         logits = self.logits(X)[:, : len(self.classes_)]
         return logits[:, 1] - logits[:, 0] if len(self.classes_) == 2 else logits
 
@@ -117,7 +118,7 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
         """
         rng = np.random.default_rng(check_random_state(self.random_state).randint(2**31))
         truth = labels == np.arange(len(scores))[:, None]
-        # K logits of which one is free: each moves (K - 1) / K of the way (Friedman 2001, eq. 36)
+        # One of K logits is free, so each moves (K - 1) / K of the way (Friedman 2001, eq. 36).
         freedom = np.float32(len(scores) / (len(scores) - 1))
         trees: list[Tree] = []
         with ThreadPoolExecutor(self.jobs or 1) as pool:
@@ -133,7 +134,7 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
         return trees
 
     def _draw(self, bins: Bins, rng: np.random.Generator) -> tuple[I4, I4]:
-        """Return the columns and the rows of one tree."""
+        """Draw the columns and the rows of one tree; return their indices."""
         features, views = bins.binned.shape
         width = max(round(self.columns * features), min(features, _FEWEST_COLUMNS))
         height = max(round(self.rows * views), min(views, _FEWEST_ROWS))
@@ -147,7 +148,7 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
 
 
 def _join(trees: Sequence[Tree], categories: int) -> tuple[FlatForest, F4]:
-    """Return the trees as one forest, and the votes (words, categories) of their leaves."""
+    """Return the trees as one forest, and the values (words, categories) of its leaves."""
     sizes = np.array([tree.left.size for tree in trees])
     roots = np.cumsum(sizes) - sizes
     base = np.repeat(roots, sizes)

@@ -1,4 +1,4 @@
-"""Calibrate confidences by one temperature, fitted on instances that training has not seen."""
+"""Calibration of confidences by one temperature, fitted on held-out instances."""
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -15,15 +15,15 @@ def softmax(logits: F8) -> F8:
 
 
 def fit_temperature(logits: F8, labels: I4) -> float:
-    """Return the temperature T for which ``softmax(logits / T)`` explains the labels best.
+    """Return the temperature T that makes ``softmax(logits / T)`` fit the labels best.
 
-    Minimises the negative log likelihood over T in [0.05, 20]; the order of the categories of a
-    view does not change.
+    T minimises the negative log-likelihood in [0.05, 20]. It does not change the order of the
+    categories of a view.
 
     Parameters
     ----------
     logits : (n, c).
-    labels : (n,) the true column of each row.
+    labels : (n,) true column of each row.
 
     Source: Guo et al. 2017, section 4.2.
 

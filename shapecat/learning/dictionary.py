@@ -1,4 +1,4 @@
-"""A random forest as a dictionary of words, and linear learners on the words (thesis 7.3, 7.4)."""
+"""A random forest as a dictionary, and linear classifiers on its words (thesis 7.3, 7.4)."""
 
 from typing import Any, Literal, Self
 
@@ -20,13 +20,13 @@ __all__ = ["ForestDictionary", "WordLearner"]
 
 
 class ForestDictionary(TreeDictionary):
-    """The leaf a view falls into in each tree of a random forest is a word.
+    """A random forest as a dictionary: the leaf that a view reaches in each tree is a word.
 
     Parameters
     ----------
-    trees : words of a view.
-    min_leaf : training views a leaf needs.
-    jobs : trees grown at the same time; the result is the same.
+    trees : number of trees, and thus of words per view.
+    min_leaf : minimum number of training views in a leaf.
+    jobs : number of trees grown at the same time; it does not affect the result.
     random_state : seed of the forest.
 
     Attributes
@@ -50,7 +50,7 @@ class ForestDictionary(TreeDictionary):
         self.random_state = random_state
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Grow the forest on features X (n, f) and labels y (n,), distractors included."""
+        """Grow the forest on features X (n, f) and labels y (n,), including unknown ones."""
         x, y = validate_data(self, X, y, dtype=np.float32)
         check_classification_targets(y)
         forest = RandomForestClassifier(
@@ -66,21 +66,21 @@ class ForestDictionary(TreeDictionary):
 
 
 class WordLearner(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # sklearn is untyped
-    """Linear learners on the words of a view.
+    """Logistic regression on the words of a view.
 
     Parameters
     ----------
-    strategy : ``"multinomial"`` learns all categories against each other, ``"one_vs_rest"`` one
-        learner per category, as in the thesis.
+    strategy : ``"multinomial"`` learns all categories together, ``"one_vs_rest"`` one classifier
+        per category, as in the thesis.
     C : inverse strength of the regularisation.
-    unknown : label of shapes of no category; those views are left out.
+    unknown : label of views to leave out; None if there are none.
 
     Attributes
     ----------
     classes_ : the categories, without ``unknown``.
-    coef_ : (c, words) in half precision: what each word adds to the logit of each category.
-    intercept_ : (c,).
-    temperature_ : divides the logits; 1 until calibrated.
+    coef_ : (c, words) the value that each word adds to each logit, rounded to half precision.
+    intercept_ : (c,) constants of the logits.
+    temperature_ : divisor of the logits; 1 until calibrated.
     """
 
     def __init__(
@@ -95,7 +95,7 @@ class WordLearner(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # skle
         self.unknown = unknown
 
     def fit(self, X: Any, y: ArrayLike) -> Self:
-        """Learn from words X (n, w), dense or sparse, and labels y (n,)."""
+        """Fit to words X (n, words), zeros and ones, dense or sparse, and labels y (n,)."""
         x, y = validate_data(self, X, y, dtype=np.float64, accept_sparse="csr")
         check_classification_targets(y)
         self.classes_, labels = known_labels(y, self.unknown)
@@ -106,7 +106,7 @@ class WordLearner(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # skle
         return self
 
     def decision_function(self, X: Any) -> F8:
-        """Return the logits (n, c), in single column form (n,) for two categories."""
+        """Return the logits (n, c); for two categories, their difference (n,)."""
         logits = self.logits(X)
         return logits[:, 1] - logits[:, 0] if len(self.classes_) == 2 else logits
 

@@ -1,4 +1,4 @@
-"""More trees for a fitted model, grown on views of a wider world."""
+"""More trees for a fitted model, grown on new views."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -13,7 +13,7 @@ from shapecat.learning.training import Examples, LearningSettings, choose_evenly
 __all__ = ["grow_on", "widened"]
 
 _CONSTANT = 1e-6
-"""A component that varies less says nothing."""
+"""A component with a smaller standard deviation counts as constant."""
 
 
 def widened(
@@ -24,16 +24,18 @@ def widened(
     blocks: Mapping[str, slice],
     used: Sequence[str],
 ) -> Categorizer:
-    """Give a model the components of blocks that its descriptor lacks; no prediction changes.
+    """Add the components of descriptor blocks that a model lacks; no prediction changes.
 
     Parameters
     ----------
-    train : views by which the new components are standardised.
-    blocks, used : where each block of the descriptor is, and those to be used.
+    train : views whose statistics standardise the new components.
+    descriptor_names : names of all components of the present descriptor.
+    blocks : range of each block in the descriptor, by name.
+    used : names of the blocks that the model should have.
 
     Raises
     ------
-    ValueError : a component of the model is no longer there.
+    ValueError : the present descriptor lacks a component of the model.
     """
     place = {name: k for k, name in enumerate(descriptor_names)}
     lost = [name for name in categorizer.descriptor_names if name not in place]
@@ -66,11 +68,11 @@ def widened(
 def grow_on(
     categorizer: Categorizer, train: Examples, *, settings: LearningSettings, seed: int
 ) -> Categorizer:
-    """Grow more trees on what a model gets wrong; those it has stay as they are.
+    """Grow more trees on the residuals of a model; its own trees stay unchanged.
 
     Parameters
     ----------
-    train : views with the categories of the model, and of none.
+    train : views of the model's categories, and of unknown shapes.
     settings : rounds, leaves, rate and jobs of the trees to grow.
 
     Returns
@@ -79,7 +81,7 @@ def grow_on(
 
     Raises
     ------
-    ValueError : the model has no learner of shapes of no category, or has Parzen kernels.
+    ValueError : the model has no logit for unknown shapes, or has Parzen kernels.
     """
     if not categorizer.knows_unknown or len(categorizer.bank.kernels):
         msg = "more trees are grown for a model without kernels that knows shapes of no category"
@@ -105,7 +107,7 @@ def grow_on(
 
 
 def _logits(categorizer: Categorizer, features: F4) -> F4:
-    """Return the logits (n, k) of features, a thousand views at a time."""
+    """Return the logits (n, k) of features (n, f), computed a thousand views at a time."""
     found = [
         categorizer.votes[categorizer.forest.fall(part)].sum(axis=1, dtype=np.float32)
         for part in np.array_split(features, len(features) // 1000 + 1)
@@ -114,7 +116,7 @@ def _logits(categorizer: Categorizer, features: F4) -> F4:
 
 
 def _joined(first: FlatForest, second: FlatForest) -> FlatForest:
-    """Put the trees of one forest behind those of another."""
+    """Concatenate two forests."""
     base = first.left.size
     left = second.left.astype(np.int64)
     return FlatForest(

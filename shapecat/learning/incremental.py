@@ -1,4 +1,4 @@
-"""New categories on a fixed dictionary, without learning the old ones again (thesis 7.5.3)."""
+"""Adding categories to a fixed dictionary without relearning the old ones (thesis 7.5.3)."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,14 +21,14 @@ _KERNELS = 100
 """Parzen kernels of a new category."""
 _FOLDS = 4
 _STEPS, _FEW_STEPS = 150, 40
-"""Of the minimiser: from nothing, and from a solution for a little more data."""
+"""Iterations of the minimiser: from zero, and from the solution for all folds."""
 _LOST = 0.006
-"""Share of the known views that new categories may take from old ones."""
+"""Fraction of the correctly categorized known views that new categories may take over."""
 _LARGEST_SHIFT = 2.0
 
 
 class _Inputs(NamedTuple):
-    """Inputs of the new learners: ``features`` (n, f) and sparse ``words`` (n, w) of n views."""
+    """Inputs of the new classifiers: ``features`` (n, f) and sparse ``words`` (n, w) of n views."""
 
     features: F8
     words: sparse.csr_array
@@ -45,21 +45,23 @@ def add_categories(
     rng: np.random.Generator,
     ridge: float = 1e-2,
 ) -> Categorizer:
-    """Learn categories a model does not have from a few views of each.
+    """Add new categories to a model from a few views of each.
 
-    Each new category gets its own densities and its own learner on the words, the densities and
-    the descriptor; dictionary, learners and temperature of the old categories stay as they are.
-    The known views inside the model are the examples of what the new categories are not.
+    Each new category gets its own densities, if the model has any, and its own linear classifier on
+    the words, the densities and the descriptor. The dictionary, the classifiers and the temperature
+    of the old categories stay as they are. The known views stored in the model are the negative
+    examples.
 
     Parameters
     ----------
-    descriptors : (n, d) views of the new categories; views of old ones are examples against.
+    descriptors : (n, d) views of the new categories; views of old categories are more negative
+        examples.
     labels : (n,) category names.
-    ridge : strength of the regularisation, per view.
+    ridge : strength of the L2 regularisation, per view.
 
     Returns
     -------
-    A model with the new categories behind the old ones, in the order of their names.
+    A model with the new categories, sorted by name, after the old ones.
 
     Raises
     ------
@@ -68,9 +70,10 @@ def add_categories(
 
     Notes
     -----
-    Minimises the class-balanced cross entropy of the joint posterior over the weights of the new
-    categories alone: a convex problem. Learned from few views, new learners are too timid; they are
-    raised to where they begin to take known views of other folds from old categories.
+    The class-balanced cross-entropy of the joint posterior is minimised over the weights of the new
+    categories alone, which is a convex problem. Classifiers learned from few views give logits that
+    are too low; a constant raises them until they begin to take held-out known views from the old
+    categories.
     """
     names = np.asarray(labels, str)
     added = sorted(set(names.tolist()) - set(categorizer.categories))
@@ -82,7 +85,7 @@ def add_categories(
     codes = np.array([categories.index(name) for name in names])
     bank = _extend_bank(categorizer.bank, descriptors, codes, rng)
     z = np.concatenate([known, bank.standardise(descriptors)])
-    # while the new learners are fitted they stand last, behind the one of unknown shapes
+    # During the fit, the new logits come last, after the one for unknown shapes.
     count, old_count = len(added), len(categorizer.categories)
     order = _order(old_count, count, unknown=categorizer.knows_unknown)
     truth = np.concatenate([categorizer.known_category.astype(np.int64), order[codes]])
@@ -112,7 +115,7 @@ def add_categories(
 
 
 def _order(old: int, new: int, *, unknown: bool) -> I4:
-    """Return the column of each final logit during the fit of the new learners."""
+    """Return the column that each final logit has during the fit."""
     first = old + unknown
     return np.concatenate([np.arange(old), np.arange(first, first + new), np.arange(old, first)])
 
@@ -125,7 +128,7 @@ def _known_views(categorizer: Categorizer) -> F4:
 
 
 def _extend_bank(bank: FeatureBank, x: F4, codes: I4, rng: np.random.Generator) -> FeatureBank:
-    """Add a density column per new category, with the bandwidths of the others."""
+    """Add the kernels of the new categories, with the bandwidths of the old ones."""
     z = bank.standardise(x)
     new = [
         np.sort(rng.permutation(np.flatnonzero(codes == code))[:_KERNELS])
@@ -142,7 +145,7 @@ def _extend_bank(bank: FeatureBank, x: F4, codes: I4, rng: np.random.Generator) 
 
 
 def _features_of_standardised(bank: FeatureBank, z: F4) -> F4:
-    """Return the features of descriptors that are standardised already."""
+    """Return the features (n, width) of standardised descriptors (n, d)."""
     width = z.shape[1]
     plain = replace(
         bank, columns=np.arange(width), mean=np.zeros(width), inverse_scale=np.ones(width)
@@ -157,7 +160,7 @@ def _old_logits(categorizer: Categorizer, inputs: _Inputs) -> F8:
 
 
 def _width(inputs: _Inputs) -> int:
-    """Return the number of weights of a learner: features, words, constant."""
+    """Return the number of weights per new category: features, words, constant."""
     return int(inputs.features.shape[1] + inputs.words.shape[1] + 1)
 
 
@@ -168,7 +171,10 @@ def _logits(inputs: _Inputs, weights: F8) -> F8:
 
 
 def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, ridge: float, steps: int) -> F8:
-    """Return the weights (`_width`, new categories) of the new logits."""
+    """Return the weights (`_width`, new categories) of the new logits.
+
+    ``old`` (n, k) are the old logits, divided by the temperature; ``truth`` (n,) true columns.
+    """
     views, first = old.shape
     count = start.shape[1]
     share = 1.0 / (np.bincount(truth, minlength=first + count)[truth] * np.unique(truth).size)
@@ -191,7 +197,7 @@ def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, ridge: float, steps
         value = float(share @ (total - own)) + 0.5 * ridge * float((weights[:-1] ** 2).sum())
         return value, slope.reshape(-1)
 
-    # threads gain nothing on sums so short; they wait for each other most of the time
+    # For such short sums, threads spend most of the time waiting for each other.
     with threadpool_limits(1):
         found = minimize(
             loss, start.reshape(-1), jac=True, method="L-BFGS-B", options={"maxiter": steps}
@@ -202,9 +208,9 @@ def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, ridge: float, steps
 def _shift(
     inputs: _Inputs, old: F8, truth: I4, learned: F8, ridge: float, rng: np.random.Generator
 ) -> float:
-    """Return the largest offset of the new logits that takes few known views from old categories.
+    """Return the largest constant for the new logits that takes few views from old categories.
 
-    Judged by learners of the other folds, on the known views that are right now.
+    It is measured by cross-validation on the views that the old logits categorize correctly.
     """
     fold = rng.permutation(len(truth)) % _FOLDS
     new = np.zeros((len(truth), learned.shape[1]))

@@ -1,4 +1,4 @@
-"""Model files: plain arrays and a JSON header in one .npz. Loading one executes nothing."""
+"""Model files: plain arrays and a JSON header in one .npz. Loading a model executes no code."""
 
 import io
 import json
@@ -27,7 +27,7 @@ _HEADER = "header.json"
 
 
 def save_model(path: Path, categorizer: Categorizer) -> None:
-    """Write a model; the same model gives the same bytes.
+    """Write a model; equal models give equal bytes.
 
     Raises
     ------
@@ -59,14 +59,14 @@ def _write_member(archive: zipfile.ZipFile, name: str, content: bytes) -> None:
 
 
 def load_model(path: Path | None = None) -> Categorizer:
-    """Read a model; without a path the default model shipped with the package.
+    """Read a model; without a path, read the default model that comes with the package.
 
-    A file can neither run code nor crash nor hang the reader: sizes are bounded by what the file
-    holds, every index is checked.
+    No file can run code, crash or hang the reader: sizes are bounded by the content of the file,
+    and every index is checked.
 
     Raises
     ------
-    ModelError : no such file, or it is damaged, not a model, or made by a newer version.
+    ModelError : the file does not exist, is damaged, is no model, or has another format version.
     """
     name = str(path) if path is not None else "the default model"
     source = path if path is not None else files("shapecat.models") / "default.npz"
@@ -108,7 +108,7 @@ def _parse(content: bytes) -> Categorizer:
 
 
 def _read_members(content: bytes) -> dict[str, bytes]:
-    """Unpack a small archive without trusting its sizes."""
+    """Unpack an archive without trusting the sizes it states."""
     if len(content) > _LARGEST_FILE:
         msg = f"it is larger than {_LARGEST_FILE >> 20} MB"
         raise _NotAModelError(msg)
@@ -138,7 +138,7 @@ def _unpack(archive: zipfile.ZipFile) -> dict[str, bytes]:
 
 
 def _parse_array(data: bytes) -> np.ndarray:
-    """Read the .npy format; allocate no more than the data hold."""
+    """Read an array in .npy format; allocate no more memory than the data need."""
     stream = io.BytesIO(data)
     if np.lib.format.read_magic(stream) != (1, 0):
         msg = "an array is of an unknown version"
@@ -168,7 +168,7 @@ def _assemble(kind: type[Record], parts: Mapping[str, Any], prefix: str) -> Reco
 
 
 def _checked(key: str, value: Any, hint: Any, dtype: str | None) -> Any:
-    """Return a value if it is of the type of its field."""
+    """Return a value, converted to its field's type, or raise `_NotAModelError`."""
     if dtype is not None:
         good = isinstance(value, np.ndarray) and value.dtype == np.dtype(f"<{dtype}")
     elif hint == tuple[str, ...]:

@@ -19,7 +19,7 @@ __all__ = ["ProbabilisticNeuralNetwork", "known_labels", "parzen_level", "spread
 
 _MULTIPLES = np.exp2(np.arange(-2.0, 2.6, 0.5))
 _JUDGES = 60
-"""Views of a category on which a bandwidth is judged."""
+"""Number of views per category on which a bandwidth is fitted."""
 
 
 class ProbabilisticNeuralNetwork(
@@ -27,18 +27,19 @@ class ProbabilisticNeuralNetwork(
     TransformerMixin,  # type: ignore[misc]
     BaseEstimator,  # type: ignore[misc]
 ):
-    """One Parzen density per category and block of the descriptor.
+    """A Parzen density for each category and block of the descriptor.
 
-    As a transformer it gives the standardised descriptor followed by the class-conditional log
-    densities, block by block; as a classifier it multiplies the densities (a baseline).
+    As a transformer, it returns the standardised descriptor followed by the class-conditional log
+    densities, all blocks of one category after the other. As a classifier, it multiplies the
+    densities (a baseline).
 
     Parameters
     ----------
-    blocks : first and last + 1 component of each block by name; components outside all blocks
-        are not used. None is one block of everything.
-    kernels : Gaussians kept of a category, drawn at random; 0 leaves the densities out.
+    blocks : half-open range of components of each block, by name; components outside all blocks
+        are not used. None makes all components one block.
+    kernels : Gaussians per category, drawn at random from its views; 0 leaves the densities out.
         differs: Specht keeps every training view.
-    unknown : label of shapes of no category; they get no density.
+    unknown : label of shapes that belong to no category and get no density; None if there are none.
     random_state : seed of the draw.
 
     Attributes
@@ -48,8 +49,8 @@ class ProbabilisticNeuralNetwork(
 
     Notes
     -----
-    The bandwidth of a block is the one among multiples of the typical distance between nearest
-    kernels under which left-out views of the same category are most likely.
+    The bandwidth of a block is a multiple of the typical distance between nearest kernels: the one
+    that maximises the likelihood of views under their own category, each view left out.
     """
 
     def __init__(
@@ -79,12 +80,12 @@ class ProbabilisticNeuralNetwork(
         return self
 
     def transform(self, X: ArrayLike) -> F4:
-        """Return the features of descriptors (n, d): standardised values, then log densities."""
+        """Return the features (n, f) of descriptors (n, d): standardised values, log densities."""
         check_is_fitted(self)
         return self.bank_.features(validate_data(self, X, dtype=np.float32, reset=False))
 
     def predict_proba(self, X: ArrayLike) -> F8:
-        """Return posteriors (n, c): the product of the densities of the blocks."""
+        """Return posteriors (n, c) from the product of the blocks' densities."""
         features = self.transform(X)
         bank = self.bank_
         densities = features[:, bank.mean.size :].reshape(
@@ -104,7 +105,7 @@ class ProbabilisticNeuralNetwork(
 
 
 def known_labels(y: ArrayLike, unknown: Any) -> tuple[Any, I4]:
-    """Return the categories (c,), sorted, and the column (n,) of each label, -1 where ``unknown``.
+    """Return the sorted categories (c,), and the column (n,) of each label, -1 for ``unknown``.
 
     Raises
     ------
@@ -128,9 +129,9 @@ def spread_kernels(z: F4, count: int, rng: np.random.Generator) -> F4:
 def parzen_level(
     z: F4, labels: I4, starts: I4, kernels: F4, span: tuple[int, int], bandwidth: float
 ) -> tuple[float, float]:
-    """Return mean and deviation of the log density of views under their own category.
+    """Return the mean and standard deviation of views' log densities under their own category.
 
-    The arguments are those of `log_density_levels`; 0 and 1 where no view has a density.
+    The arguments are as for `log_density_levels`. Without any density, the result is 0 and 1.
     """
     levels = log_density_levels(z, labels, starts, kernels, span, bandwidth)
     levels = levels[levels > -1e8]
@@ -178,7 +179,7 @@ def _fit_bank(
 
 
 def _fit_bandwidth(z: F4, labels: I4, starts: I4, kernels: F4, span: tuple[int, int]) -> float:
-    """Return the bandwidth under which views (n, d) are most likely, themselves left out."""
+    """Return the bandwidth with the greatest leave-one-out likelihood of views (n, d)."""
     first, last = span
     block = kernels[:, first:last].astype(np.float32)
     dimensions = max(int(np.count_nonzero(np.ptp(block, axis=0) > 0)), 1)
@@ -194,7 +195,10 @@ def _fit_bandwidth(z: F4, labels: I4, starts: I4, kernels: F4, span: tuple[int, 
 
 
 def _typical_distance(block: F4, starts: I4) -> float:
-    """Return the median distance, per root dimension, of a kernel to the next of its category."""
+    """Return the median distance between nearest kernels of a category.
+
+    The distance is divided by the root of the number of dimensions.
+    """
     nearest = []
     for first, last in itertools.pairwise(starts):
         rows = block[first:last].astype(np.float64)

@@ -1,4 +1,4 @@
-"""From descriptors and labels to a fitted `Categorizer`."""
+"""Training: from descriptors and labels to a fitted `Categorizer`."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -28,27 +28,27 @@ __all__ = [
 
 @dataclass(frozen=True)
 class LearningSettings:
-    """Settings of the training. The defaults measured best (see the model card)."""
+    """Settings of the training."""
 
     blocks: tuple[str, ...] = ()
-    """Blocks of the descriptor that are used; all if empty."""
+    """Blocks of the descriptor to use; all if empty."""
     kernels: int = 0
     """Parzen kernels per category in the probabilistic neural network; 0 leaves it out."""
     rounds: int = 500
-    """Rounds in which the dictionary grows one tree per category."""
+    """Boosting rounds; each grows one tree per category."""
     leaves: int = 16
-    """Words of a tree, at most."""
+    """Maximum number of leaves (words) of a tree."""
     rate: float = 0.06
-    """Share of what is lacking that a tree corrects."""
+    """Learning rate of the boosting."""
     known_views: int = 3000
-    """Views kept in the model, to learn new categories against."""
+    """Views stored in the model as negative examples for new categories."""
     rejected: float = 0.05
-    """Share of held-out views of known categories that the novelty threshold rejects."""
+    """Fraction of held-out views of known categories that the novelty threshold rejects."""
     jobs: int | None = None
-    """Trees grown at the same time."""
+    """Number of trees grown at the same time."""
 
     def dictionary(self, seed: int) -> BoostedDictionary:
-        """Return the dictionary to fit; -1 is the label of shapes of no category."""
+        """Return the unfitted dictionary; -1 is the label of unknown shapes."""
         return BoostedDictionary(
             rounds=self.rounds,
             leaves=self.leaves,
@@ -62,8 +62,12 @@ class LearningSettings:
 class Examples(NamedTuple):
     """Described views with their labels.
 
-    ``descriptors`` (n, d); ``labels`` (n,) category names, or `UNKNOWN`; ``instances`` (n,) the
-    physical object of each view: views of one instance never straddle training and testing.
+    Attributes
+    ----------
+    descriptors : (n, d).
+    labels : (n,) category names, or `UNKNOWN`.
+    instances : (n,) name of the physical object that each view shows; all views of an instance are
+        used either for training or for testing.
     """
 
     descriptors: F4
@@ -71,14 +75,14 @@ class Examples(NamedTuple):
     instances: np.ndarray
 
     def where(self, chosen: np.ndarray) -> "Examples":
-        """Return the chosen views: a mask or indices."""
+        """Return the chosen views; ``chosen`` is a mask (n,) or indices."""
         return Examples(*(values[chosen] for values in self))
 
 
 def make_chain(blocks: Mapping[str, slice], settings: LearningSettings, *, seed: int) -> Pipeline:
-    """Return the unfitted chain: densities, then the dictionary with its learners.
+    """Return the unfitted pipeline: features with densities, then the boosted dictionary.
 
-    It is fitted to `encode`d labels: -1 is a shape of no category.
+    It expects labels from `encode`, in which -1 is an unknown shape.
     """
     names = settings.blocks or tuple(blocks)
     used = {name: (blocks[name].start, blocks[name].stop) for name in names}
@@ -100,18 +104,20 @@ def fit_categorizer(
     seed: int = 0,
     notes: Mapping[str, Any] | None = None,
 ) -> Categorizer:
-    """Learn a model.
+    """Train and calibrate a model.
 
     Parameters
     ----------
-    train : the views to learn from.
-    held_out : views of other instances; they fit the temperature and the novelty threshold.
-    blocks : where each block of the descriptor is.
-    categories : the order of the posterior.
+    train : training views.
+    held_out : views of other instances, which fit the temperature and the novelty threshold.
+    descriptor_names : names of the components of the descriptor.
+    blocks : range of each block in the descriptor, by name.
+    categories : the categories in the order of the posterior.
+    notes : plain JSON values to store in the model.
 
     Raises
     ------
-    ValueError : fewer than two categories, or a category without training views.
+    ValueError : there are fewer than two categories, or one has no training views.
     """
     settings = settings or LearningSettings()
     missing = sorted(set(categories) - set(train.labels.tolist()))
@@ -133,7 +139,7 @@ def fit_categorizer(
 
 
 def _notes_of(settings: LearningSettings) -> dict[str, Any]:
-    """Return the settings that decide the model; the number of jobs does not."""
+    """Return the settings that affect the model: all except the number of jobs."""
     return {name: value for name, value in asdict(settings).items() if name != "jobs"}
 
 
@@ -147,7 +153,12 @@ def collapse(
     seed: int,
     notes: Mapping[str, Any],
 ) -> Categorizer:
-    """Turn a chain, fitted to `encode`d labels, into plain arrays: votes per leaf."""
+    """Return a fitted pipeline from `make_chain` as a `Categorizer`, not yet calibrated.
+
+    Parameters
+    ----------
+    train : the training views, some of which are stored in the model.
+    """
     bank, dictionary = chain["densities"].bank_, chain["dictionary"]
     columns = dictionary.bias_.size
     codes = encode(train.labels, categories)
@@ -170,9 +181,11 @@ def collapse(
 
 
 def choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:
-    """Return at most ``count`` ascending indices of views with a code >= 0, evenly over the codes.
+    """Return up to ``count`` indices of views, in ascending order, evenly drawn from all codes.
 
-    ``codes`` is (n,).
+    Parameters
+    ----------
+    codes : (n,) category of each view; views with a negative code are left out.
     """
     order = rng.permutation(len(codes))
     order = order[codes[order] >= 0]
@@ -184,9 +197,13 @@ def choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:
 
 
 def calibrate(categorizer: Categorizer, held_out: Examples, *, rejected: float) -> Categorizer:
-    """Fit temperature and novelty threshold on views of instances the learners never saw.
+    """Fit the temperature and the novelty threshold on held-out views.
 
-    Views labelled `UNKNOWN` are left out. Without any view left the model stays as it is.
+    Parameters
+    ----------
+    held_out : views of instances that training has not seen. Views with other labels than the
+        model's categories are left out; if none is left, the model stays as it is.
+    rejected : fraction of the views that the novelty threshold rejects.
     """
     codes = encode(held_out.labels, categorizer.categories)
     views, codes = held_out.descriptors[codes >= 0], codes[codes >= 0]
@@ -199,9 +216,9 @@ def calibrate(categorizer: Categorizer, held_out: Examples, *, rejected: float) 
 
 
 def fit_threshold(categorizer: Categorizer, held_out: Examples, *, rejected: float) -> Categorizer:
-    """Choose the novelty threshold that rejects this share of held-out views of known categories.
+    """Set the novelty threshold so that it rejects a given fraction of the held-out views.
 
-    Views labelled `UNKNOWN` are left out. Without any view left the model stays as it is.
+    The parameters are as for `calibrate`.
     """
     views = held_out.descriptors[encode(held_out.labels, categorizer.categories) >= 0]
     if not len(views):
@@ -212,6 +229,6 @@ def fit_threshold(categorizer: Categorizer, held_out: Examples, *, rejected: flo
 
 
 def encode(labels: np.ndarray, categories: Sequence[str]) -> I4:
-    """Return the column (n,) of each label, -1 for one that is not among the categories."""
+    """Return the column (n,) of each label (n,), -1 for labels outside the categories."""
     column = {name: k for k, name in enumerate(categories)}
     return np.array([column.get(str(label), -1) for label in labels], np.int64)

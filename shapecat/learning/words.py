@@ -1,4 +1,4 @@
-"""Bags of words of views, as sparse rows for the learners."""
+"""Bags of words of views, as sparse rows."""
 
 from typing import Any
 
@@ -15,23 +15,23 @@ __all__ = ["TreeDictionary", "bag_of_words"]
 
 
 class TreeDictionary(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # sklearn is untyped
-    """The leaf a view falls into in each tree is a word (thesis 7.3).
+    """A forest as a dictionary: the leaf that a view reaches in each tree is a word (thesis 7.3).
 
     Attributes
     ----------
-    forest_ : the `FlatForest` of all trees, set when it is fitted.
+    forest_ : the `FlatForest` of all trees, set by fitting.
     """
 
     forest_: FlatForest
 
     def words(self, X: ArrayLike) -> I4:
-        """Return the words of features (n, f): (n, trees)."""
+        """Return the words (n, trees) of features (n, f)."""
         check_is_fitted(self)
         return self.forest_.fall(validate_data(self, X, dtype=np.float32, reset=False))
 
     def transform(self, X: ArrayLike) -> sparse.csr_array:
-        """Return a row of zeros and ones per view (n, words)."""
-        words = self.words(X)  # first: it checks that the dictionary is learned
+        """Return a row of zeros and ones for each view, (n, words)."""
+        words = self.words(X)  # first, as this checks that the dictionary is fitted
         return bag_of_words(words, self.forest_.words)
 
     def __sklearn_tags__(self) -> Any:

@@ -1,4 +1,4 @@
-"""What a camera of the training looks at: objects on a table, in a pile, in a bin, on a shelf."""
+"""Arrangements of objects for training: on a table, in a pile, in a bin, on a shelf."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -32,19 +32,25 @@ _MANNERS = {
 }
 _ROUND = {"cup", "can", "bottle"}
 _RESIZED = 0.3
-"""Share of the tables with toys and blocks, or with things larger than usual."""
+"""Fraction of the tables whose objects are all smaller or larger than usual, by `_SIZES`."""
 _SIZES = (0.55, 1.5)
 
 
 @dataclass(frozen=True)
 class World:
-    """What kind of arrangements are simulated.
+    """Parameters of simulated arrangements.
 
-    ``kinds`` are the distractors to choose from, ``unknown`` their share of the objects;
-    ``lying`` the share of cups, cans and bottles that lie, if not the usual one: they are harder
-    than others, so one learns from more of them; ``leaning`` the share of objects that lean on
-    something unseen; ``settled`` the share of arrangements that physics makes: piles, bins,
-    crowded compartments. ``keep`` keeps the clouds of the views.
+    Attributes
+    ----------
+    seed : seed of all arrangements.
+    kinds : kinds of distractors to choose from.
+    unknown : fraction of the objects that are distractors.
+    lying : fraction of cups, cans and bottles that lie; None for the usual one. Lying objects are
+        harder, so training uses more of them.
+    leaning : fraction of the objects on tables that are tilted, as if they leant on something.
+    settled : fraction of the arrangements made by physics: piles, bins, crowded compartments.
+    cameras : number of images of each arrangement.
+    keep : whether to keep the points of the views.
     """
 
     seed: int
@@ -58,7 +64,15 @@ class World:
 
 
 class Actor(NamedTuple):
-    """An object: its mesh in the frame of its support (z = 0), where it stands, what it is."""
+    """An object of an arrangement.
+
+    Attributes
+    ----------
+    mesh : metres, in the frame of the arrangement.
+    label : category, or ``unknown``.
+    manner : ``upright``, ``upside_down``, ``lying``, ``leaning`` or ``tilted``.
+    support_m : height of the surface that it stands on; in piles, of its lowest vertex.
+    """
 
     mesh: Mesh
     label: str
@@ -67,9 +81,9 @@ class Actor(NamedTuple):
 
 
 class Arrangement(NamedTuple):
-    """Objects and furniture, z = 0 on what bears them, and from where they may be seen.
+    """Objects and furniture, with the supporting surface at z = 0, and the range of viewpoints.
 
-    ``elevation`` and ``azimuth`` are ranges in degrees; the open side of a shelf is at -90.
+    ``elevation`` and ``azimuth`` are ranges in degrees; the open side of a shelf is at azimuth -90.
     """
 
     actors: list[Actor]
@@ -79,17 +93,17 @@ class Arrangement(NamedTuple):
 
 
 ALONE = moved(rounded_box(_TABLE_M), Pose(np.eye(3), np.array([0.0, 0.0, -_TABLE_M[2]])))
-"""A table without room around it."""
+"""A table without a room around it."""
 _SETTLED: tuple[tuple[Callable[..., Scene], float, Arrangement], ...] = (
     (pile, 0.7, Arrangement([], (), (8.0, 90.0))),
     (bin_picking, 0.15, Arrangement([], (), (50.0, 90.0))),
     (shelf_bin, 0.15, Arrangement([], (), (5.0, 35.0), (-120.0, -60.0))),
 )
-"""What physics makes, its share, and from where it is seen."""
+"""Scenes made by physics, their probabilities, and the viewpoints for them."""
 
 
 def arrange(world: World, rng: np.random.Generator) -> Arrangement:
-    """Return random objects on a table, or as physics lets them lie."""
+    """Return random objects on a table, or settled by physics."""
     if world.settled > 0 and rng.random() < world.settled:
         return _settled(world, rng)
     return Arrangement(_spread(world, rng), (ALONE,))
@@ -119,7 +133,7 @@ def _actor(thing: Thing, down: Pose) -> Actor:
 
 
 def _spread(world: World, rng: np.random.Generator) -> list[Actor]:
-    """Put objects on the table: apart, close together, or one on another."""
+    """Place objects on the table: apart, close together, or one on another."""
     actors: list[Actor] = []
     spots: list[tuple[float, float, float]] = []
     gap = float(rng.choice([0.003, 0.02, 0.08]))
@@ -143,7 +157,7 @@ def _spread(world: World, rng: np.random.Generator) -> list[Actor]:
 
 
 def _make(world: World, rng: np.random.Generator, size: float) -> Actor:
-    """Make something, ``size`` times as large as such things are."""
+    """Make a random object or distractor, scaled by ``size``."""
     if rng.random() < world.unknown:
         _, mesh = make_distractor(rng, str(rng.choice(list(world.kinds))))
         return _rested(scaled(mesh, size), UNKNOWN, world, rng)
@@ -152,7 +166,7 @@ def _make(world: World, rng: np.random.Generator, size: float) -> Actor:
 
 
 def _rested(mesh: Mesh, label: str, world: World, rng: np.random.Generator) -> Actor:
-    """Let an object lie as such objects do; upright where it cannot."""
+    """Draw a resting pose from those usual for the label; upright if the mesh has none like it."""
     chances = dict(_MANNERS.get(label, {"upright": 1.0}))
     if world.lying is not None and label in _ROUND:
         chances["upright"] += chances["lying"] - world.lying
@@ -165,7 +179,7 @@ def _rested(mesh: Mesh, label: str, world: World, rng: np.random.Generator) -> A
 
 
 def _leant(actor: Actor, rng: np.random.Generator) -> Actor:
-    """Tilt an object by up to 25 degrees, as if it leant on something."""
+    """Tilt an object by 5 to 25 degrees, as if it leant on something."""
     azimuth, half = rng.uniform(0, 2 * np.pi), np.radians(rng.uniform(5, 25)) / 2
     axis = np.sin(half) * np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
     turn = Pose(rotation_from_quaternion(np.round([*axis, np.cos(half)], 9)), np.zeros(3))
@@ -175,7 +189,7 @@ def _leant(actor: Actor, rng: np.random.Generator) -> Actor:
 def placed(
     actor: Actor, spot: tuple[float, float], support_m: float, rng: np.random.Generator
 ) -> Actor:
-    """Return an object turned anyhow, over a place (x, y) and on a height, metres."""
+    """Turn an object randomly about z and place it at ``spot`` (x, y) and height, in metres."""
     pose = turn_about_z(IDENTITY, rng.uniform(0, 2 * np.pi), np.array([*spot, support_m]))
     return actor._replace(mesh=moved(actor.mesh, pose), support_m=support_m)
 
@@ -183,7 +197,10 @@ def placed(
 def _free_spot(
     spots: Sequence[tuple[float, float, float]], radius: float, rng: np.random.Generator
 ) -> tuple[float, float] | None:
-    """Return a place of that radius near the middle of the table that nothing stands on."""
+    """Return a free position (x, y) near the middle of the table, None if there is no room.
+
+    ``spots`` are the (x, y, radius) of the objects so far; metres.
+    """
     for reach in np.repeat([0.08, 0.16, 0.26, 0.36], 4):
         x, y = rng.uniform(-reach, reach, 2)
         if all(np.hypot(x - u, y - v) > radius + other for u, v, other in spots):

@@ -1,4 +1,4 @@
-"""The model card: what the default model was made from, and what it can and cannot do."""
+"""The model card: the training data of the default model, its accuracy and its weaknesses."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ from shapecat.evaluation import Report
 __all__ = ["PICTURE", "Table", "format_table", "write_card"]
 
 PICTURE = "worst_mistakes.png"
-"""The picture beside the card."""
+"""File name of the picture beside the card."""
 _HEAD = """# The default model
 
 Model `{model}`, made by {command}
@@ -46,7 +46,7 @@ was measured on that one),"""
 
 @dataclass(frozen=True)
 class Table:
-    """A table of the card, with its title and a note for the reader."""
+    """A table of the card, with its title and a note below it."""
 
     title: str
     head: tuple[str, ...]
@@ -77,7 +77,16 @@ def write_card(
     confusion: Report,
     settings: Mapping[str, object],
 ) -> None:
-    """Write the card beside the model; ``after`` is the model whose trees it keeps."""
+    """Write the model card.
+
+    Parameters
+    ----------
+    model : id of the model.
+    after : id of the model whose trees it keeps; None if it was trained from scratch.
+    tables : results to print.
+    confusion : report whose confusion matrix is printed.
+    settings : settings of the training, by name.
+    """
     head = _HEAD.format(
         model=model,
         command=_ANEW if after is None else _AFTER.format(after=after),

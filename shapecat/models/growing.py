@@ -1,4 +1,4 @@
-"""Growing boosted trees that tell one thing from another, for the detection."""
+"""Growing boosted trees as binary classifiers for the detection."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -17,7 +17,7 @@ _RIDGE, _LEAST, _ROWS = 1.0, 2.0, 0.7
 
 
 class Growth(NamedTuple):
-    """How many trees are grown, how many leaves each has, and what share of what lacks it adds."""
+    """Number of trees, leaves of each tree, and learning rate."""
 
     rounds: int
     leaves: int
@@ -27,8 +27,8 @@ class Growth(NamedTuple):
 def growing_options(out: Path) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Add the options of a command that grows trees and writes them, by default to ``out``."""
     options = (
-        click.option("--seed", default=0, show_default=True, help="Seed of the draws."),
-        click.option("--jobs", default=2, show_default=True, help="Processes."),
+        click.option("--seed", default=0, show_default=True, help="Seed of the random generator."),
+        click.option("--jobs", default=2, show_default=True, help="Number of processes."),
         click.option("--out", default=out, type=click.Path(path_type=Path), help="File to write."),
     )
 
@@ -43,9 +43,19 @@ def growing_options(out: Path) -> Callable[[Callable[..., Any]], Callable[..., A
 def grow(
     features: F4, truth: Bool, growth: Growth, seed: int, *, after: BoostedTrees | None = None
 ) -> BoostedTrees:
-    """Grow trees on features (n, f): gradient boosting with the cross entropy (Friedman 2001).
+    """Grow trees by gradient boosting with the cross-entropy loss.
 
-    They add to what the trees ``after`` which they are grown tell.
+    Parameters
+    ----------
+    features : (n, f).
+    truth : (n,) whether each row is of the positive class.
+    after : trees to continue from; by default the first tree is the log odds of the class.
+
+    Returns
+    -------
+    The trees of ``after`` followed by the new ones.
+
+    Source: Friedman 2001.
     """
     rng = np.random.default_rng(seed)
     bins, n = make_bins(features), len(truth)
@@ -64,7 +74,7 @@ def grow(
 
 
 def _logits(grown: BoostedTrees, features: F4) -> F4:
-    """Return what all trees together say of each row of features, (n,)."""
+    """Return the sum of all trees' leaf values for each row of features, (n,)."""
     trees, value = grown
     logit, rows = np.zeros(len(features), np.float32), np.arange(len(features))
     for root in trees.roots:
@@ -86,13 +96,13 @@ def _appended(first: BoostedTrees, more: BoostedTrees) -> BoostedTrees:
 
 
 def _leaf(value: float) -> Tree:
-    """Return a tree that adds the same to all."""
+    """Return a tree of one leaf, which adds a constant."""
     none = np.zeros(1, np.int64)
     return Tree(none, np.zeros(1, np.float32), none, np.array([value], np.float32))
 
 
 def _joined(grown: Sequence[Tree]) -> BoostedTrees:
-    """Put the nodes of all trees behind each other."""
+    """Concatenate the nodes of all trees."""
     roots = np.cumsum([0, *(len(tree.left) for tree in grown)])
     left = [np.where(t.left > 0, t.left + root, 0) for t, root in zip(grown, roots, strict=False)]
     trees = Trees(

@@ -1,4 +1,4 @@
-"""Judge a model on what it has never seen, and write what it reaches into its card."""
+"""Evaluate a model on data that it has not seen, and write the results into its card."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
@@ -32,7 +32,7 @@ _SURFACE_SEEDS = (4, 5)
 _SURFACE_TABLES = (150, 60)
 _TRACK_SEED, _TRACK_TABLES = 100_006, 24
 _DRAWN = 20
-"""Tables whose worst mistakes are drawn."""
+"""Number of test tables from which the worst mistakes are drawn."""
 _MANNERS = ("upright", "lying")
 _STEADY = """\
 Accuracies that differ by a point are alike at this size. What the gas is there for is steadiness:
@@ -52,7 +52,15 @@ def judge(
     meshes: Path | None,
     recorded: Sequence[Path],
 ) -> None:
-    """Judge a model; write its card, and the picture of its worst mistakes, into a folder."""
+    """Evaluate a model; write its card and the picture of its worst mistakes into a folder.
+
+    Parameters
+    ----------
+    sets : the sets named in `SETS`.
+    studies : whether to run the studies of the method's parts.
+    meshes : folder of meshes to evaluate on; None for none.
+    recorded : folders of labelled recordings to evaluate on.
+    """
     judged = {"test": sets["test"]}
     rows = [_figures(name, report) for name, report in _parts(sets["test"], model)]
     tracks = {"simulated": collect(_tracks(jobs))} if studies else {}
@@ -99,7 +107,7 @@ def _test_views() -> list[WorldView]:
 
 
 def _parts(views: Simulated, model: Categorizer) -> list[tuple[str, Report]]:
-    """Evaluate the parts of a set that differ in difficulty."""
+    """Return a report for each part of a set; the parts differ in difficulty."""
     whole = views.source != "fragment"
     clear = clear_views(views)
     parts = {
@@ -162,13 +170,13 @@ def _counts(sets: dict[str, Simulated]) -> list[tuple[str, ...]]:
 
 
 def _tracks(jobs: int) -> Iterable[WorldView]:
-    """Simulate tables that are looked at from many places."""
+    """Simulate tables that are seen from many viewpoints."""
     world = World(_TRACK_SEED, tuple(DISTRACTORS), unknown=0.0, cameras=max(FUSED) + 6)
     return simulate_views(world, range(_TRACK_TABLES), jobs=jobs)
 
 
 def _fused_table(tracks: dict[str, Simulated], model: Categorizer) -> Table:
-    """Judge several views of one placement of an object together."""
+    """Return the accuracy of several fused views of one placement of an object."""
     rows = []
     for name, seen in tracks.items():
         clear = seen.where(clear_views(seen))
@@ -197,7 +205,7 @@ def _fused_table(tracks: dict[str, Simulated], model: Categorizer) -> Table:
 def _studies(
     train: Simulated, judged: dict[str, Simulated], model: Categorizer, seed: int, jobs: int
 ) -> list[Table]:
-    """Return what each part of the method is worth."""
+    """Return tables that show what each part of the method contributes."""
     known = {
         name: s.where(clear_views(s) & (s.views.labels != UNKNOWN)) for name, s in judged.items()
     }

@@ -1,4 +1,4 @@
-"""Views of scanned and CAD meshes, which the simulator did not make: what a model is judged by."""
+"""Views of scanned and CAD meshes, to evaluate a model on shapes from outside the simulator."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,23 +11,24 @@ from shapecat.simulation.scans import load_mesh, upright_poses, uprighted
 __all__ = ["mesh_views"]
 
 _PLACEMENTS = {"upright": 3, "lying": 2}
-"""How many in two, of each manner of resting."""
+"""Number of placements in each resting manner, for each unit of ``placements``."""
 _NEVER_LIE = {"ball", "bowl", "plate"}
 
 
 def mesh_views(
     folder: Path, *, seed: int, placements: int = 2, cameras: int = 2
 ) -> Iterator[WorldView]:
-    """Yield views of each mesh of ``<category>/*.ply``, alone on a table.
+    """Yield views of each mesh in ``<category>/*.ply``, alone on a table.
 
     Parameters
     ----------
-    placements : 3 upright and 2 lying ones for each of these; what never lies stands in all.
-    cameras : views of each placement; those of one placement share the name of their instance.
+    placements : each mesh is placed 3 times upright and 2 times lying for each unit; balls, bowls
+        and plates are always upright.
+    cameras : images of each placement, whose views share their instance name.
 
     Raises
     ------
-    RecordingError : one of the files is not a mesh.
+    RecordingError : a file is not a mesh.
     """
     for number, path in enumerate(sorted(folder.glob("*/*.ply"))):
         label = path.parent.name

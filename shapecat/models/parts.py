@@ -1,8 +1,8 @@
-"""Grow the trees that tell parts of one object: ``python -m shapecat.models.parts``.
+"""Grow the trees that decide which segments to merge: ``python -m shapecat.models.parts``.
 
-Simulated scenes, as several sensors see them, give the pairs of segments. The segments of an object
-are joined in random order, and all pairs on the way are learned from: so the trees meet what they
-will have joined themselves.
+Simulated scenes, seen by several sensors, give pairs of segments. The segments of each object are
+merged in random order, and the trees learn from all pairs on the way, so that they also know
+partially merged segments.
 """
 
 from collections.abc import Iterator, Sequence
@@ -40,18 +40,18 @@ from shapecat.types import CATEGORIES, Camera
 __all__ = ["collect", "count_labels", "main"]
 
 _PURE = 0.6
-"""A segment belongs to the object that has more than this share of it."""
+"""A segment belongs to an object that owns more than this fraction of its cells."""
 _NOISY = replace(IDEAL, noise=0.0015, step=0.0029)
 _BLENDED = replace(IDEAL, noise=0.0015, blend_px=3)
 _CHUNK = 25
 
 
 _FIRST, _MORE = Growth(200, 64, 0.1), Growth(80, 32, 0.05)
-"""Of the trees of tables and shelves; of those that piles add to them."""
+"""Growth of the trees for tables and shelves, and of those that piles add to them."""
 
 
 class Series(NamedTuple):
-    """Scenes of one kind that one sensor sees: the first seed, how many, and what is in them."""
+    """Scenes of one kind, seen by one sensor: the first seed, their number, their categories."""
 
     kind: SceneKind
     sensor: Sensor
@@ -73,7 +73,7 @@ _SERIES = (
     Series("clutter", REALSENSE, 60_000, 150, ("box",)),
     Series("clutter", KINECT, 70_000, 150, ("box", "can", "plate")),
 )
-"""Seeds below 2000 are for development, those from 100000 on for judging alone."""
+"""Seeds below 2000 are for development, seeds from 100000 on for evaluation only."""
 _SETTLED = (
     Series("pile", KINECT, 80_000, 1500),
     Series("pile", REALSENSE, 85_000, 900),
@@ -83,22 +83,22 @@ _SETTLED = (
     Series("shelf_bin", KINECT, 94_000, 300),
     Series("shelf_bin", REALSENSE, 96_000, 300),
 )
-"""What physics lets fall, where objects lean, lie across and touch walls."""
+"""Scenes arranged by physics, in which objects lean, lie across each other and touch walls."""
 
 
 class Pairs(NamedTuple):
-    """Pairs of segments: ``features`` (n, `FEATURES`), and whether both are of one object (n,)."""
+    """Pairs of segments: ``features`` (n, `FEATURES`); ``same`` (n,), whether of one object."""
 
     features: F4
     same: Bool
 
 
 @click.command()
-@click.option("--share", default=1.0, show_default=True, help="Share of the scenes to learn from.")
+@click.option("--share", default=1.0, show_default=True, help="Fraction of the scenes to use.")
 @growing_options(Path(learned.__file__).with_name(learned.FILE))
-@click.option("--more", is_flag=True, help="Keep the trees that are there, and add those of piles.")
+@click.option("--more", is_flag=True, help="Keep the existing trees, and add those for piles.")
 def main(*, share: float, seed: int, jobs: int, out: Path, more: bool) -> None:
-    """Simulate, part, grow; write the trees."""
+    """Simulate scenes, collect pairs of segments, and grow and write the trees."""
     at_rest = collect(_SERIES, share, jobs)
     grown = learned.load_trees() if more else grow(*at_rest, _FIRST, seed)
     settled = collect(_SETTLED, share, jobs)
@@ -109,7 +109,10 @@ def main(*, share: float, seed: int, jobs: int, out: Path, more: bool) -> None:
 
 
 def collect(scenes: Sequence[Series], share: float, jobs: int) -> Pairs:
-    """Return the pairs of segments of a share of the scenes, whatever the number of jobs."""
+    """Return the pairs of segments of a fraction of the scenes.
+
+    The number of jobs does not affect the result.
+    """
     chunks = [
         (series, series.first + k, min(_CHUNK, count - k))
         for series in scenes
@@ -140,12 +143,13 @@ def _collect(chunk: tuple[Series, int, int]) -> Pairs:
 def _pairs(
     depth: F4, camera: Camera, owners: U1, things: I4, rng: np.random.Generator
 ) -> Iterator[tuple[F4, bool]]:
-    """Yield the pairs of a frame: of its segments, and of what they are joined to.
+    """Yield the pairs of a frame, of single and of merged segments: features, whether one object.
 
     Parameters
     ----------
-    owners : (h, w) the label of what each pixel shows.
-    things : the labels of objects.
+    depth : (h, w) metres, 0 without reading.
+    owners : (h, w) pixel labels of the scene.
+    things : (k,) labels of objects.
     """
     settings = DetectionSettings()
     grid = downsample(depth, camera, range_m=settings.max_range_m)
@@ -177,7 +181,13 @@ def _pairs(
 
 
 def count_labels(owners: U1, labels: I4, grid: DepthGrid) -> I4:
-    """Return (segments, labels) how many cells of each segment show each label."""
+    """Return (segments, labels) the number of cells of each segment with each label.
+
+    Parameters
+    ----------
+    owners : (h, w) pixel labels at full resolution.
+    labels : (rows, columns) segment of each cell of the grid.
+    """
     middle, (rows, columns) = grid.factor // 2, labels.shape
     seen = owners[middle :: grid.factor, middle :: grid.factor][:rows, :columns]
     counts = np.zeros((labels.max() + 1, owners.max() + 1), np.int64)
@@ -186,9 +196,9 @@ def count_labels(owners: U1, labels: I4, grid: DepthGrid) -> I4:
 
 
 def _whose(segments: Segments, counts: I4, things: I4) -> tuple[I4, I4]:
-    """Return of each segment how many cells it has, and whose it is.
+    """Return the number of cells (n,) and the owner (n,) of each merged segment.
 
-    That is 0 for what is no object, and -1 for what is of several.
+    The owner is the label of an object, 0 for background, or -1 for a mixed segment.
     """
     joined = np.zeros_like(counts)
     np.add.at(joined, segments.parent, counts)
@@ -199,7 +209,7 @@ def _whose(segments: Segments, counts: I4, things: I4) -> tuple[I4, I4]:
 
 
 def _meeting(segments: Segments, whose: I4) -> Iterator[tuple[int, int]]:
-    """Yield the pairs of segments that meet, but for mixed ones and those that are no objects."""
+    """Yield the adjacent pairs of segments that are not mixed, at least one of an object."""
     n = segments.parent.size
     for p in range(1, n):
         adjacent = find_adjacent(segments, p)

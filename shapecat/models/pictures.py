@@ -1,4 +1,4 @@
-"""Pictures for the model card: what the model is most wrong about."""
+"""Pictures for the model card: the model's worst mistakes."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,7 @@ _COLUMNS = 6
 
 
 class Mistake(NamedTuple):
-    """A view that gets a wrong label, its points, what it gets, and how sure the model is."""
+    """A view with a wrong label: the predicted label ``said`` and its confidence."""
 
     seen: WorldView
     view: View
@@ -29,7 +29,7 @@ class Mistake(NamedTuple):
 def worst_mistakes(
     views: Sequence[WorldView], model: Categorizer, *, count: int = 12
 ) -> list[Mistake]:
-    """Return the surest mistakes on views of different objects, the surest first."""
+    """Return the most confident mistakes on different objects, the most confident first."""
     answer = model.predict(np.array([seen.descriptor for seen in views]))
     found = []
     for seen, posterior, novelty in zip(views, answer.posteriors, answer.novelty, strict=True):
@@ -47,7 +47,7 @@ def worst_mistakes(
 
 
 def draw(path: Path, mistakes: Sequence[Mistake]) -> None:
-    """Draw the points of views as the sensor sees them, and what the model said."""
+    """Draw the points of each mistaken view from the sensor's side, with the predicted label."""
     import matplotlib as mpl  # noqa: PLC0415  only for pictures
 
     mpl.use("agg")
@@ -76,7 +76,7 @@ def _draw_one(axis: Any, mistake: Mistake) -> None:
 
 
 def _as_seen(view: View) -> tuple[F8, F8]:
-    """Return the points (n, 2) across the line of sight, and their distance (n,)."""
+    """Return the points (n, 2) projected across the line of sight, and their depth (n,), metres."""
     points = np.asarray(view.points, np.float64)
     sight = points.mean(axis=0) - view.eye
     sight /= np.linalg.norm(sight)

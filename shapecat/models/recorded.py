@@ -1,8 +1,9 @@
-"""Views of real objects, cut out of recordings by hand-made labels: what a model is judged by.
+"""Views of real objects from recordings with hand-made labels, to evaluate a model.
 
-A folder holds ``depth.mcap`` and ``truth.json``, one entry a frame with its ``objects``: each a
-``category`` and either the ``parts`` it has in ``labels.npz`` (an image of numbers per frame; 1 to
-9 are tables) or its ``centroid_m`` and ``extent_m`` in the sensor frame.
+A folder holds ``depth.mcap`` and ``truth.json``, with one entry per frame. Each of its ``objects``
+has a ``category`` and either its ``parts``, the numbers of its pixels in the label images of
+``labels.npz`` (one per frame; 1 to 9 are tables), or its ``centroid_m`` and ``extent_m`` in the
+sensor frame.
 """
 
 import json
@@ -24,13 +25,13 @@ from shapecat.types import Frame, Scene
 __all__ = ["detected_views", "labelled_views"]
 
 _OVERLAP = 0.5
-"""A detection is an object if they share this much of what either covers."""
+"""IoU of masks at which a detection matches an object."""
 _STACKED_M = 0.025
-"""An object whose lowest points are higher above the table stands on another."""
+"""An object whose lowest points are this far above the table stands on another object."""
 
 
 def labelled_views(folder: Path) -> Iterator[View]:
-    """Yield the unambiguous objects of a folder with label images, cut by their labels."""
+    """Yield the unambiguous objects of a folder with label images, segmented by these labels."""
     labels = np.load(folder / "labels.npz", allow_pickle=False)
     images = labels[labels.files[0]]
     for number, (frame, truth) in enumerate(_frames(folder)):
@@ -47,9 +48,9 @@ def labelled_views(folder: Path) -> Iterator[View]:
 
 
 def detected_views(folder: Path) -> Iterator[View]:
-    """Yield the unambiguous objects of a folder as our own detection cuts them.
+    """Yield the unambiguous objects of a folder, segmented by shapecat's detection.
 
-    Objects that are not found, or merged with others, are left out.
+    Objects that are missed, or merged with others, are left out.
     """
     path = folder / "labels.npz"
     labels = np.load(path, allow_pickle=False) if path.exists() else None
@@ -91,7 +92,10 @@ def _view(points: F4, up: F8, support: float, category: str, instance: str) -> V
 
 
 def _table(frame: Frame, image: np.ndarray) -> tuple[F8, float]:
-    """Return up and offset of the plane of the table: RANSAC, then least squares."""
+    """Return the up direction (3,) and the offset, metres, of the table's plane.
+
+    Both are in the sensor frame. The plane is fitted by RANSAC, then by least squares.
+    """
     counts = np.bincount(image[(image > 0) & (image < 10)], minlength=10)
     points = _readings(frame, np.flatnonzero(image == counts.argmax())).astype(np.float64)
     rng = np.random.default_rng(0)
@@ -111,7 +115,7 @@ def _table(frame: Frame, image: np.ndarray) -> tuple[F8, float]:
 
 
 def _by_label(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int | None:
-    """Return the candidate that overlaps an object best, if enough."""
+    """Return the index of the candidate with the best IoU; None if it is too small."""
     mine = np.isin(image, item["parts"])
     shares = [
         mine[c.indices].sum() / (mine.sum() + np.count_nonzero(~mine[c.indices]))
@@ -121,7 +125,7 @@ def _by_label(scene: Scene, image: np.ndarray, item: dict[str, Any]) -> int | No
 
 
 def _by_place(scene: Scene, item: dict[str, Any]) -> int | None:
-    """Return the candidate nearest to where an object is, if near enough."""
+    """Return the index of the candidate nearest to an object; None if it is too far."""
     place = np.array(item["centroid_m"])
     gaps = [float(np.linalg.norm(c.box.center - place)) for c in scene.candidates]
     reach = 0.5 * max(item["extent_m"])

@@ -1,6 +1,7 @@
-"""The simulated sets that a model is trained, calibrated and tested on.
+"""The simulated training, calibration and test sets.
 
-Tables, objects and kinds of distractors of the three sets never meet.
+The sets share no arrangements and no objects; the test set shares no kind of distractor with the
+other two.
 """
 
 from collections.abc import Iterable
@@ -29,22 +30,22 @@ __all__ = [
 ]
 
 SETS = {"training": (1, 100_000), "calibration": (2, 160), "test": (100_003, 100)}
-"""Seed of each set, and its most tables; seeds from 100000 on are for judging alone."""
+"""Seed and greatest number of tables of each set; seeds from 100000 on are for evaluation only."""
 _SHARES: dict[str, dict[str, Any]] = {
     "training": {"unknown": 0.3, "lying": 0.35, "leaning": 0.05, "settled": 0.4, "cameras": 10},
     "calibration": {"unknown": 0.17, "settled": 0.4},
     "test": {"unknown": 0.3, "settled": 0.5},
 }
 CUT_WELL = 0.75
-"""Overlap from which on a detection is taken for one object."""
+"""IoU from which a detection counts as well segmented."""
 MOSTLY = 0.7
-"""Share of an object from which on it is taken for mostly visible."""
+"""Visible fraction from which an object counts as mostly visible."""
 _TIMES = 3
-"""Each family of procedural objects is met so many times as often as a kind."""
+"""How many times as often as a kind of distractor a family of procedural objects is drawn."""
 
 
 class Simulated(NamedTuple):
-    """Simulated views, and the circumstances the tables are broken down by."""
+    """Simulated views with the circumstances of each, (n,), as in `WorldView`."""
 
     views: DescribedViews
     manner: np.ndarray
@@ -66,7 +67,7 @@ class Simulated(NamedTuple):
 
 
 def world_of(name: str) -> World:
-    """Return what one of the sets is simulated from."""
+    """Return the parameters of a set's arrangements."""
     kinds = [kind for k, kind in enumerate(DISTRACTORS) if (k % 3 == 0) == (name == "test")]
     if name == "training":
         kinds += _TIMES * list(PROCEDURAL)
@@ -74,7 +75,7 @@ def world_of(name: str) -> World:
 
 
 def simulate(name: str, worlds: int, jobs: int) -> Simulated:
-    """Simulate one of the sets; kinds of distractors in the test set are met nowhere else."""
+    """Simulate up to ``worlds`` arrangements of a set."""
     numbers = range(min(worlds, SETS[name][1]))
     views = simulate_views(world_of(name), numbers, jobs=jobs)
     click.echo(f"simulating {len(numbers)} tables of the {name} set", err=True)
@@ -82,7 +83,7 @@ def simulate(name: str, worlds: int, jobs: int) -> Simulated:
 
 
 def collect(views: Iterable[WorldView]) -> Simulated:
-    """Gather views into columns."""
+    """Collect views into columns."""
     rows = list(views)
     columns = {name: np.array([getattr(r, name) for r in rows]) for name in WorldView._fields}
     described = DescribedViews(
@@ -99,15 +100,15 @@ def collect(views: Iterable[WorldView]) -> Simulated:
 
 
 def clear_views(views: Simulated) -> Bool:
-    """Return which views are whole, mostly visible, cut well, and not upside down.
+    """Return (n,) which views are whole, mostly visible, well segmented and not upside down.
 
-    Where detection merges an object with others there is no right answer: that is judged with
-    detection, and here in a line of its own.
+    If detection merges an object with others, no category is right. The evaluation of the detection
+    covers this case; the model card gives badly segmented views a row of their own.
     """
     return np.asarray(~partial_views(views) & (views.manner != "upside_down"))
 
 
 def partial_views(views: Simulated) -> Bool:
-    """Return which views show a piece of an object, or more than the object."""
+    """Return (n,) which views show only a part of an object, or more than the object."""
     seen = (views.source != "fragment") & (views.visible >= MOSTLY)
     return np.asarray(~seen | (views.overlap < CUT_WELL))

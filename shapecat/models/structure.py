@@ -1,7 +1,8 @@
 """Grow the trees that reject background structure: ``python -m shapecat.models.structure``.
 
-Simulated scenes of all kinds, as all sensors see them, give what the segments are merged to: of
-objects, of furniture and walls, or of noise. Grown after those of `shapecat.models.parts`.
+Simulated scenes of several kinds, seen by all sensors, give merged segments of objects, of
+furniture and walls, and of noise. Grow the trees of `shapecat.models.parts` first, as they merge
+the segments.
 """
 
 from collections.abc import Iterator
@@ -34,14 +35,14 @@ __all__ = ["Samples", "Series", "collect", "label_objects", "main"]
 FEATURES = OBJECT_FEATURES.itemsize // np.dtype("f4").itemsize
 _GROWTH = Growth(150, 16, 0.08)
 _OBJECT = 0.5
-"""Share of the cells of an object that show objects."""
+"""A merged segment is an object if more than this fraction of its labelled cells shows objects."""
 _CHUNK = 10
 
 
 class Series(NamedTuple):
-    """Scenes of one kind, the first seed and how many; each by another of the sensors in turn.
+    """Scenes of one kind: the first seed and their number; the sensors take turns.
 
-    With a ``scale`` all is so many times larger, and farther away.
+    ``scale`` multiplies all sizes and distances.
     """
 
     kind: SceneKind
@@ -69,11 +70,12 @@ _SERIES = (
     Series("pile", 605_000, 50, scale=1.8),
     Series("tabletop", 609_000, 30, scale=1.8),
 )
-"""Seeds of their own: the merging trees were not grown on them. Large objects are too rare else."""
+"""The merging trees were not grown on these seeds. The scaled scenes add large objects, which are
+too rare otherwise."""
 
 
 class Samples(NamedTuple):
-    """Merged segments: ``features`` (n, `FEATURES`), and whether each is of an object (n,)."""
+    """Merged segments: ``features`` (n, `FEATURES`); ``objects`` (n,), whether of an object."""
 
     features: F4
     objects: Bool
@@ -82,14 +84,14 @@ class Samples(NamedTuple):
 @click.command()
 @growing_options(Path(structure.__file__).with_name(structure.FILE))
 def main(*, seed: int, jobs: int, out: Path) -> None:
-    """Simulate, detect, grow; write the trees."""
+    """Simulate scenes, detect merged segments, and grow and write the trees."""
     samples = collect(_SERIES, jobs)
     write_trees(out, grow(*samples, _GROWTH, seed), OBJECT_FEATURES)
     click.echo(f"{len(samples.objects)} segments, {samples.objects.mean():.0%} of objects; {out}")
 
 
 def collect(scenes: tuple[Series, ...], jobs: int) -> Samples:
-    """Return the merged segments of all scenes; the number of jobs does not change them."""
+    """Return the merged segments of all scenes; the number of jobs does not affect the result."""
     chunks = [
         s._replace(first=s.first + k, scenes=min(_CHUNK, s.scenes - k))
         for s in scenes
@@ -120,12 +122,12 @@ def _labelled(series: Series, seed: int) -> Iterator[tuple[F4, bool]]:
 
 
 def label_objects(frame: Frame, owners: U1, things: I4) -> Iterator[tuple[F4, bool]]:
-    """Yield what the segments of a frame are merged to: the features, and whether an object.
+    """Yield the merged segments of a frame: features (1, `FEATURES`), and whether an object.
 
     Parameters
     ----------
-    owners : (h, w) the label of what each pixel shows, 0 where that is not known.
-    things : the labels of objects.
+    owners : (h, w) pixel labels of the scene, 0 where unknown.
+    things : (k,) labels of objects, in ascending order.
     """
     settings = DetectionSettings()
     if frame.depth is None or frame.camera is None:

@@ -1,4 +1,4 @@
-"""Studies printed in the model card: what each part of the method is worth."""
+"""Studies for the model card: what each part of the method contributes."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -32,7 +32,7 @@ __all__ = [
 ]
 
 _MOST = 16_000
-"""Views that plain learners learn from: enough for them, and they take long."""
+"""Number of views on which the baselines are trained; more take too long."""
 _PAIRS = (("bottle", "plate"), ("bowl", "ball"), ("cup", "box"))
 _FEW = (20, 100)
 _ROUNDS = 250
@@ -51,7 +51,12 @@ def compare_with_plain(
     seed: int,
     jobs: int,
 ) -> list[tuple[str, ...]]:
-    """Judge the model beside plain learners: name, views learned from, accuracy, balanced."""
+    """Compare the model with baseline classifiers on the same test views.
+
+    Returns
+    -------
+    Rows of classifier, number of training views, accuracy, balanced accuracy.
+    """
     part = train.where(_some(len(train.labels), seed))
     truth, predicted = encode(test.labels, model.categories), _best(model, test.descriptors)
     table = metrics.confusion(truth, predicted, len(model.categories))
@@ -75,7 +80,7 @@ def compare_with_plain(
 
 
 def _some(count: int, seed: int) -> I4:
-    """Choose the views that plain learners learn from."""
+    """Return the indices of the views on which the baselines are trained."""
     return np.sort(np.random.default_rng(seed).permutation(count)[:_MOST])
 
 
@@ -91,10 +96,14 @@ _Reconstruct = Callable[[F4, np.random.Generator], NeuralGas | None]
 def compare_surfaces(
     train: Sequence[View], test: Sequence[View], *, blocks: Sequence[str], seed: int, jobs: int
 ) -> list[tuple[str, ...]]:
-    """Judge ways to a graph: name, accuracy, instability, milliseconds from points to descriptor.
+    """Compare methods of surface reconstruction, each with a model of its own.
 
-    Each gets a model of its own. Instability is how far the descriptor moves between two frames,
-    as a share of the mean distance between views of different categories.
+    Instability is how far the descriptor moves between two frames, relative to the mean distance
+    between views of different categories.
+
+    Returns
+    -------
+    Rows of method, accuracy, instability, milliseconds from points to descriptor.
     """
     surface = Settings().surface
     ways: dict[str, _Reconstruct] = {
@@ -141,7 +150,7 @@ def _judge(
 
 
 def _described(views: Sequence[View], way: _Reconstruct, seed: int) -> DescribedViews:
-    """Describe views; where a way finds no graph the descriptor is zero."""
+    """Describe views; without a graph, the descriptor is zero."""
     descriptors = np.zeros((len(views), len(DESCRIPTOR_NAMES)), np.float32)
     seconds = np.zeros(len(views))
     for k, view in enumerate(views):
@@ -162,7 +171,11 @@ def _described(views: Sequence[View], way: _Reconstruct, seed: int) -> Described
 
 
 def next_frames(views: Sequence[View], seed: int) -> Iterator[View]:
-    """Yield what a slowly moving camera sees next: turned 2 degrees, shifted, with new noise."""
+    """Yield each view as a slowly moving camera sees it next.
+
+    The points are turned by 2 degrees about z, shifted by 2 mm, get 1 mm of noise and are voxelized
+    again.
+    """
     c, s = np.cos(np.radians(2)), np.sin(np.radians(2))
     turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     for k, view in enumerate(views):
@@ -173,7 +186,10 @@ def next_frames(views: Sequence[View], seed: int) -> Iterator[View]:
 
 
 def spread(points: F4, count: int, rng: np.random.Generator) -> I4:
-    """Return points of which each was the farthest from those before it (Gonzalez 1985)."""
+    """Return the indices (count,) of points (n, 3) chosen by farthest-point sampling.
+
+    Source: Gonzalez 1985.
+    """
     chosen = [int(rng.integers(len(points)))]
     nearest = np.full(len(points), np.inf, np.float32)
     for _ in range(count - 1):
@@ -183,7 +199,7 @@ def spread(points: F4, count: int, rng: np.random.Generator) -> I4:
 
 
 def subsample(points: F4, count: int, rng: np.random.Generator) -> I4:
-    """Return the indices (count,) of points (n, 3) drawn at random; all if there are fewer."""
+    """Return the indices (count,) of randomly drawn points (n, 3); all if there are fewer."""
     return rng.permutation(len(points))[:count]
 
 
@@ -193,9 +209,9 @@ def sampled(
     surface: SurfaceSettings,
     rng: np.random.Generator,
 ) -> NeuralGas:
-    """Link chosen ones of points (n, 3), metres, as the gas links its neurons, without moving them.
+    """Return a graph of sampled points (n, 3), metres, each linked to its nearest neighbours.
 
-    ``choose`` returns the indices of so many points.
+    ``choose`` returns the indices of a given number of points.
     """
     chosen = points[np.unique(choose(points, min(surface.neurons, len(points)), rng))]
     gaps = ((chosen[:, None] - chosen) ** 2).sum(axis=2)
@@ -211,12 +227,12 @@ def sampled(
 def add_two_categories(
     train: DescribedViews, test: dict[str, DescribedViews], *, blocks: Sequence[str], seed: int
 ) -> list[tuple[str, ...]]:
-    """Add two categories to a model of the others, from few views, beside learning all anew.
+    """Compare adding two categories to a model, from few views, with training it from scratch.
 
     Returns
     -------
-    Rows: data, views of each new category, way, accuracy on the new, on the old ones, what the old
-    ones lost, seconds. Means over three pairs of categories.
+    Rows of data set, views per new category, method, accuracy on the new categories, accuracy on
+    the old ones, loss on the old ones, seconds; means over three pairs of categories.
     """
     train = train.where(_some(len(train.labels), seed))
     found: dict[tuple[str, ...], list[tuple[float, ...]]] = {}
@@ -263,7 +279,7 @@ def _add(
 
 
 def _right(model: Categorizer, views: DescribedViews, pair: tuple[str, str]) -> tuple[float, float]:
-    """Return the accuracy on the new categories, and that on the old ones."""
+    """Return the accuracy on the new categories and on the old ones."""
     known = views.where(views.labels != UNKNOWN)
     right = _best(model, known.descriptors) == encode(known.labels, model.categories)
     new = np.isin(known.labels, pair)

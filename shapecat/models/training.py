@@ -1,7 +1,7 @@
-"""Make the default model: ``python -m shapecat.models.training``.
+"""Train the default model and write its card: ``python -m shapecat.models.training``.
 
-Simulated tables give the views. Besides the model this writes its card. With ``--after`` a
-model keeps its trees, and more are grown on what it gets wrong in this world.
+The views come from simulated tables. With ``--after``, an existing model keeps its trees, and more
+trees are grown that correct its errors on these views.
 """
 
 from collections.abc import Sequence
@@ -23,29 +23,29 @@ __all__ = ["grow", "main"]
 
 _HERE = Path(__file__).parent
 _REJECTED = 0.14
-"""Share of partial views of known categories that the novelty threshold rejects: what is real is
-often hidden in part, and a piece is stranger than the whole."""
+"""Fraction of the partial views of known categories that the novelty threshold rejects. Real
+objects are often partly hidden, and a partial view is more novel than a whole one."""
 _TREES: dict[str, Any] = {"rounds": 320, "leaves": 40, "rate": 0.09}
-"""So many views bear larger trees; fewer of them take as long as the defaults."""
+"""This many views support larger trees; fewer of these take as long as the default ones."""
 _MORE: dict[str, Any] = {"rounds": 150, "rate": 0.06}
-"""Of the trees that are grown for a model that has some."""
+"""Settings of the trees that are added to an existing model."""
 
 
 @click.command()
-@click.option("--worlds", default=8000, show_default=True, help="Tables to learn from.")
-@click.option("--seed", default=0, show_default=True, help="Seed of the learners.")
-@click.option("--jobs", default=2, show_default=True, help="Processes.")
+@click.option("--worlds", default=8000, show_default=True, help="Number of training tables.")
+@click.option("--seed", default=0, show_default=True, help="Seed of the training.")
+@click.option("--jobs", default=2, show_default=True, help="Number of processes.")
 @click.option("--out", default=_HERE, type=click.Path(path_type=Path), help="Folder to write to.")
 @click.option(
-    "--after", type=click.Path(path_type=Path), help="Model whose trees are kept, to grow more."
+    "--after", type=click.Path(path_type=Path), help="Model whose trees are kept and extended."
 )
-@click.option("--studies/--no-studies", default=True, help="What each part of the method is worth.")
-@click.option("--meshes", type=click.Path(path_type=Path), help="Folder of meshes to judge by.")
+@click.option("--studies/--no-studies", default=True, help="Run the studies of the method's parts.")
+@click.option("--meshes", type=click.Path(path_type=Path), help="Folder of meshes to evaluate on.")
 @click.option(
     "--recorded",
     multiple=True,
     type=click.Path(path_type=Path),
-    help="Folder of labelled recordings to judge by. Repeatable.",
+    help="Folder of labelled recordings to evaluate on. Repeatable.",
 )
 def main(
     *,
@@ -58,7 +58,7 @@ def main(
     meshes: Path | None,
     recorded: Sequence[Path],
 ) -> None:
-    """Simulate, learn, judge; write default.npz and MODEL_CARD.md."""
+    """Simulate views, train and evaluate the model; write default.npz and MODEL_CARD.md."""
     sets = {name: simulate(name, worlds, jobs) for name in SETS}
     train, held_out = sets["training"], sets["calibration"]
     if after is None:
@@ -70,7 +70,7 @@ def main(
 
 
 def _fit(train: Simulated, held_out: Simulated, seed: int, choices: dict[str, Any]) -> Categorizer:
-    """Learn a model; its temperature is fitted on all views held out, its threshold on pieces."""
+    """Train a model; fit its temperature on all held-out views, its threshold on partial ones."""
     model = fit_views(train.views, held_out.views, seed=seed, rejected=_REJECTED, **choices)
     return _with_threshold(model, held_out)
 
@@ -78,7 +78,7 @@ def _fit(train: Simulated, held_out: Simulated, seed: int, choices: dict[str, An
 def grow(
     model: Categorizer, train: Simulated, held_out: Simulated, seed: int, jobs: int
 ) -> Categorizer:
-    """Grow more trees for a model on the training set; calibrate it as a new one."""
+    """Grow more trees for a model on the training set, then calibrate it like a new one."""
     views = _examples(train)
     wider = widened(
         model, views, descriptor_names=DESCRIPTOR_NAMES, blocks=BLOCKS, used=tuple(BLOCKS)

@@ -1,4 +1,4 @@
-"""Views of simulated objects: what a model is trained and judged on."""
+"""Views of simulated objects, for training and evaluating a model."""
 
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -39,29 +39,41 @@ _FEWEST_PIXELS = 80
 _LEAST_VISIBLE = 0.3
 _OVERLAP = 0.5
 _DETECTED = 0.75
-"""Share of the objects that are found which are cut as detection cuts them."""
+"""Fraction of the detected objects whose view is segmented by the detection."""
 _FRAGMENTS = 0.3
+"""Fraction of the views that also give a partial view."""
 _COARSE = 4
-"""Visible shares are judged in images this many times smaller."""
+"""Visible fractions are computed in images this many times smaller."""
 _SCALES = (0.5, 1.0, 1.0, 1.0, 1.5)
-"""Resolutions of the sensors, as multiples of their own."""
+"""Factors on the sensors' own resolutions."""
 _WIDTHS = (224, 1280)
-"""Their least and greatest width in pixels."""
+"""Least and greatest image width, pixels."""
 _OFTEN = {"kinect": 3.0, "realsense": 2.0}
-"""How many times as often as others the sensors appear that most recordings come from."""
+"""Weights of sensors that most recordings come from; others have weight 1."""
 _DISTANCES_M = (0.25, 3.0)
 _CLOSER_M = 0.03
-"""What is looked at is farther than the nearest reading by this."""
+"""Least distance of the target beyond the sensor's near limit."""
 _SETTINGS = Settings()
 
 
 class WorldView(NamedTuple):
     """One described view and its circumstances.
 
-    ``manner`` is upright, lying, upside_down, leaning or tilted; ``source`` truth, detected or
-    fragment; ``visible`` the share of its pixels that has readings, ``overlap`` how well it was
-    cut: what its points and those readings share of what either covers; ``functions`` plain shape
-    functions; ``view`` the voxels, where they are kept.
+    Attributes
+    ----------
+    descriptor : (d,) descriptor.
+    label : true category, or ``unknown``.
+    instance : name of the object.
+    points : number of voxels.
+    distance : mean distance from the sensor, metres.
+    seconds : time from points to descriptor.
+    manner : ``upright``, ``lying``, ``upside_down``, ``leaning`` or ``tilted``.
+    source : how the view was segmented: ``truth``, ``detected`` or ``fragment``.
+    visible : fraction of the object's unoccluded pixels that have readings.
+    overlap : IoU of the view's points and the object's readings.
+    sensor : name of the sensor.
+    functions : shape distributions, from `shape_functions`.
+    view : the voxels; None if not kept.
     """
 
     descriptor: F4
@@ -80,7 +92,14 @@ class WorldView(NamedTuple):
 
 
 class _Shot(NamedTuple):
-    """One image of a world: the frame, its truth, and where the camera was."""
+    """One image of an arrangement.
+
+    Attributes
+    ----------
+    owners : (h, w) index of the object or furniture of each reading, -1 without.
+    visible : (k,) visible fraction of each object.
+    table_from_camera : pose of the optical frame.
+    """
 
     frame: Frame
     owners: I4
@@ -90,7 +109,7 @@ class _Shot(NamedTuple):
 
 
 class _Seen(NamedTuple):
-    """An object in an image: by which sensor, how much of it, how well it was cut."""
+    """An object in an image, with the circumstances of its view as in `WorldView`."""
 
     actor: Actor
     sensor: str
@@ -99,7 +118,10 @@ class _Seen(NamedTuple):
 
 
 def simulate_views(world: World, numbers: Sequence[int], *, jobs: int = 1) -> Iterator[WorldView]:
-    """Yield the views of some worlds, in order, whatever the number of jobs."""
+    """Yield the views of the arrangements with these numbers, in order.
+
+    The number of jobs does not affect the result.
+    """
     one = partial(simulate_world, world)
     if jobs <= 1:
         for number in numbers:
@@ -111,7 +133,7 @@ def simulate_views(world: World, numbers: Sequence[int], *, jobs: int = 1) -> It
 
 
 def simulate_world(world: World, number: int) -> list[WorldView]:
-    """Simulate one arrangement, look at it from several places, and describe what is seen."""
+    """Simulate one arrangement and describe its objects from several viewpoints."""
     rng = np.random.default_rng((world.seed, number))
     arrangement, name = arrange(world, rng), f"{world.seed}/{number}"
     return look(arrangement, name, cameras=world.cameras, rng=rng, keep=world.keep)
@@ -120,7 +142,7 @@ def simulate_world(world: World, number: int) -> list[WorldView]:
 def simulate_mesh(
     mesh: Mesh, label: str, name: str, rest: Rest, *, cameras: int, rng: np.random.Generator
 ) -> list[WorldView]:
-    """Look at one given object, alone on the table, from several places."""
+    """Describe one given object, alone on the table, from several viewpoints."""
     actor = Actor(moved(mesh, rest.pose), label, rest.manner, 0.0)
     alone = Arrangement([placed(actor, (0.0, 0.0), 0.0, rng)], (ALONE,))
     return look(alone, name, cameras=cameras, rng=rng)
@@ -134,7 +156,14 @@ def look(
     rng: np.random.Generator,
     keep: bool = False,
 ) -> list[WorldView]:
-    """Describe objects as seen from several places."""
+    """Describe the objects of an arrangement from several viewpoints.
+
+    Parameters
+    ----------
+    name : prefix of the instance names.
+    cameras : number of viewpoints, each with its own sensor.
+    keep : whether to keep the points of the views.
+    """
     actors = arrangement.actors
     if not actors:
         return []
@@ -154,7 +183,7 @@ def look(
 
 
 def _shoot(seen: Geometry, arrangement: Arrangement, rng: np.random.Generator) -> _Shot:
-    """Look at an arrangement from somewhere with a sensor."""
+    """Take an image of an arrangement with a random sensor from a random viewpoint."""
     name, sensor = _draw_sensor(rng)
     camera, pose = sensor.camera, _viewpoint(arrangement, sensor, rng)
     image = render(seen, camera, pose)
@@ -165,7 +194,7 @@ def _shoot(seen: Geometry, arrangement: Arrangement, rng: np.random.Generator) -
 
 
 def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
-    """Draw a sensor: one of the presets or between two, better or worse, of any resolution."""
+    """Draw a preset, perhaps mixed with another, and vary its errors and resolution."""
     names = list(PRESETS)
     shares = np.array([_OFTEN.get(each, 1.0) for each in names])
     name, other = (str(each) for each in rng.choice(names, 2, p=shares / shares.sum()))
@@ -209,7 +238,11 @@ def _viewpoint(arrangement: Arrangement, sensor: Sensor, rng: np.random.Generato
 
 
 def _visible_shares(seen: Geometry, owners: I4, camera: Camera, pose: Pose, count: int) -> F8:
-    """Return for each object which share of its pixels, in and out of the image, has readings."""
+    """Return (count,) the visible fraction of each object.
+
+    It is the number of readings divided by the pixels that the object would have alone in an image
+    twice as wide and high; 0 with fewer than `_FEWEST_PIXELS` readings.
+    """
     seen_pixels = np.bincount(owners[owners >= 0], minlength=count + 1)
     width, height = camera.width // _COARSE, camera.height // _COARSE
     wide = Camera(
@@ -236,7 +269,7 @@ def _visible_shares(seen: Geometry, owners: I4, camera: Camera, pose: Pose, coun
 def _views_of(
     shot: _Shot, scene: Scene, k: int, actor: Actor, instance: str, rng: np.random.Generator
 ) -> list[WorldView]:
-    """Return one view of an object, cut by the truth or as detected, and maybe a piece of it."""
+    """Return a view of an object, segmented by truth or detection, and perhaps a partial view."""
     found = _cut_by_detection(shot, scene, k)
     if found is not None and rng.random() < _DETECTED:
         (view, overlap), source = found, "detected"
@@ -254,7 +287,7 @@ def _views_of(
 
 
 def _cut_by_detection(shot: _Shot, scene: Scene, k: int) -> tuple[View, float] | None:
-    """Return the object as detection cuts it, and how well; None where it was not found."""
+    """Return the object as detection segments it, with the IoU; None if it was not found."""
     owners = shot.owners.reshape(-1)
     valid = np.asarray(shot.frame.depth).reshape(-1) > 0
     total = int(np.count_nonzero((owners == k) & valid))
@@ -270,7 +303,7 @@ def _cut_by_detection(shot: _Shot, scene: Scene, k: int) -> tuple[View, float] |
 
 
 def _cut_by_truth(shot: _Shot, k: int, actor: Actor, rng: np.random.Generator) -> View:
-    """Return the object's pixels, level up to a degree and a few millimetres."""
+    """Return the object's true pixels in a level frame with errors of a degree and some mm."""
     indices = np.flatnonzero((shot.owners == k) & (np.asarray(shot.frame.depth) > 0))
     points = shot.frame.xyz(indices)
     camera_from_table = inverse(shot.table_from_camera)
@@ -288,7 +321,7 @@ def _centre(actor: Actor) -> F8:
 
 
 def _described(view: View, source: str, seen: _Seen) -> WorldView | None:
-    """Describe a view by its voxels; what is random in that depends on these alone."""
+    """Describe a view by its voxels, which also seed the random generator; None if impossible."""
     distance = float(np.linalg.norm(view.points.mean(axis=0) - view.eye))
     view = replace(view, points=voxelize(view.points, voxel_m=_SETTINGS.surface.voxel_m))
     rng = np.random.default_rng(crc32(view.points.tobytes()))
