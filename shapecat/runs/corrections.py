@@ -43,17 +43,17 @@ PREVIOUS = "tracks.previous.csv"
 def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLabel]:
     """Read the final label of each track; deleted tracks are missing.
 
-    A label a person filled in wins over the category, at confidence 1. Tracks of different topics
-    can be merged if a sensor has seen both, or if the run.json beside the table tells of a fixed
-    frame that they share.
+    A label that a person filled in replaces the category and has confidence 1. Two tracks can be
+    merged if they have a topic in common, or if run.json beside the table has a fixed frame.
 
     Parameters
     ----------
-    categories : those of the model; the categories in the table are known as well.
+    categories : the model's categories; the categories in the table are known as well.
 
     Raises
     ------
-    OutputError : the table is unreadable, or lines of it cannot be understood: each is named.
+    OutputError : the table is unreadable, belongs to another run, or has invalid lines, which the
+        text lists.
     """
     table = read_track_table(path)
     _require_same_run(path, table, path.parent)
@@ -63,17 +63,16 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
 
 
 def adopt_labels(corrected: Path, folder: Path) -> None:
-    """Make the labels of a corrected table those of a run.
+    """Apply the labels of a corrected table to a run.
 
-    Only the column ``label`` is taken over, and tracks that the table does not list keep their
-    label. The first table is kept as tracks.original.csv. ``corrected`` may be the tracks.csv of
-    the run itself.
+    Only the column ``label`` is read, and tracks that the table does not list keep their label.
+    The original table is kept as tracks.original.csv. ``corrected`` may be the run's own
+    tracks.csv.
 
     Raises
     ------
-    OutputError : the table is unreadable, is another run's, names tracks that the run does not
-        have, or has labels that cannot be understood. All such lines are named, and nothing is
-        written.
+    OutputError : the table is unreadable, belongs to another run, names tracks that the run does
+        not have, or has invalid labels. The text lists all such lines, and nothing is written.
     """
     with holding(folder):
         _adopt(corrected, folder)
@@ -111,15 +110,15 @@ def _adopt(corrected: Path, folder: Path) -> None:
 
 
 def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
-    """Set labels of some tracks of a run; keep the other labels and the first table.
+    """Set the labels of some tracks of a run; keep the other labels and the original table.
 
     Returns
     -------
-    By track, why a label was not given: it cannot be understood, or contradicts those there.
+    The reason for each track whose label was rejected: it is invalid, or contradicts other labels.
 
     Raises
     ------
-    OutputError : the table of the run cannot be read or is another run's, or the disk is full.
+    OutputError : the run's table is unreadable, invalid or another run's, or cannot be written.
     """
     current, original = folder / "tracks.csv", folder / ORIGINAL
     base = read_track_table(current)
@@ -137,15 +136,19 @@ def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
 
 
 def correct_label(folder: Path, track: int, label: str, *, seen: str) -> str:
-    """Give a track of a run a label, unless another one than ``seen`` was written meanwhile.
+    """Set the label of a track of a run, unless it has changed since the caller read it.
+
+    Parameters
+    ----------
+    seen : the label that the caller read.
 
     Returns
     -------
-    Why it was not given; empty if it was.
+    Why the label was rejected; empty if it was set.
 
     Raises
     ------
-    OutputError : as `relabel`.
+    OutputError : as for `relabel`.
     """
     with holding(folder):
         rows = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
@@ -163,7 +166,10 @@ def _given(
     *,
     one_frame: bool,
 ) -> tuple[tuple[TrackRow, ...], dict[int, str]]:
-    """Return rows with labels, and why some were not given; one by one if not all can be."""
+    """Return the rows with their new labels, and the reasons for rejected ones, by track.
+
+    If the labels are not valid together, they are set one by one, merges last.
+    """
     given = _labelled(rows, labels)
     if not find_misread(given, categories, one_frame=one_frame):
         return given, {}
@@ -186,20 +192,22 @@ def has_labels(path: Path) -> bool:
 
     Raises
     ------
-    OutputError : it cannot be read.
+    OutputError : the table is unreadable.
     """
     return path.exists() and any(row.label for row in read_track_table(path).rows)
 
 
 def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: bool = True) -> None:
-    """Refuse a table of another run than that in ``folder``.
+    """Check that a table belongs to the run in ``folder``.
 
-    ``known`` is a table that lies in the folder: it need not say whose it is. One without the
-    column, made by hand, goes by its places, if it has any.
+    Parameters
+    ----------
+    known : whether the table is in the folder itself, so that it needs no column ``run``. Any
+        other table without this column must have its tracks at the same positions.
 
     Raises
     ------
-    OutputError : it is another run's, of several runs, or of nobody knows which.
+    OutputError : the table belongs to another run or to several, or has other positions.
     """
     own = read_run(folder).get("work", "") if (folder / "run.json").exists() else ""
     if not own or set(table.runs) == {own}:
@@ -220,7 +228,7 @@ def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: boo
 
 
 def _places_agree(table: TrackTable, folder: Path) -> bool:
-    """Return whether no track of a table is elsewhere than that of the run."""
+    """Return whether the tracks of a table have the same positions as in the run, or none."""
     own = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
     return all(
         _number(row.cells.get(axis)) in {None, _number(own[row.track].cells.get(axis))}
@@ -231,14 +239,14 @@ def _places_agree(table: TrackTable, folder: Path) -> bool:
 
 
 def _number(cell: str | None) -> float | None:
-    """Return the number in a cell, as a spreadsheet may write it."""
+    """Return the number in a cell, also with a decimal comma; None if it is not a number."""
     with suppress(ValueError, AttributeError):
         return float((cell or "").strip().replace(",", "."))
     return None
 
 
 def _described(folder: Path, work: str) -> str:
-    """Name a run, by its folder and recording if it is the one that lies there."""
+    """Return a description of a run, with its folder and recording if the folder holds it."""
     with suppress(OutputError, KeyError):
         run = read_run(folder)
         if run["work"] == work:
@@ -247,7 +255,7 @@ def _described(folder: Path, work: str) -> str:
 
 
 def _relabelled(base: TrackTable, rows: Iterable[TrackRow]) -> TrackTable:
-    """Return a table with the labels of other rows, and the numbers of their lines."""
+    """Return a table with the labels and line numbers of other rows."""
     given = {row.track: row for row in rows}
     changed = [
         replace(with_label(row, given[row.track].label), line=given[row.track].line)
@@ -266,7 +274,7 @@ def _refuse(path: Path, problems: Sequence[str]) -> None:
 
 
 def _one_frame(folder: Path) -> bool:
-    """Return whether the sensors of a run have places in one frame."""
+    """Return whether a run has a fixed frame, so that its sensors share coordinates."""
     return (folder / "run.json").exists() and read_run(folder).get("fixed_frame") is not None
 
 

@@ -1,7 +1,7 @@
 """The folder of a run: built under a hidden name, renamed when complete.
 
-A marker tells what is ours: run.json with the run's id, or the record that an export keeps. What
-has none is neither removed nor replaced, and what somebody has put beside our files stays.
+A marker shows that shapecat made a folder: run.json with the run's id, or the record of an export.
+A folder without a marker is neither removed nor replaced. Other files in a run folder are kept.
 """
 
 import json
@@ -46,14 +46,14 @@ _MADE = (
 )
 
 _BEGUN = (".run.json.partial", ".export.json.partial")
-"""What a kill may leave in a folder that has no marker yet."""
+"""Files that a kill may leave in a folder without a marker."""
 
 Marker = Callable[[Path], Collection[str] | None]
-"""Returns the names that were made in a folder, the marker last; None if it is none of ours."""
+"""Returns the names that shapecat makes in a folder, the marker last; None without a marker."""
 
 
 def made_by_run(folder: Path) -> Collection[str] | None:
-    """Return the names that a run makes in its folder; None if the folder is not a run's."""
+    """Return the names that a run makes in its folder; None if the folder holds no run."""
     with suppress(OutputError):
         if read_run(folder).get("id"):
             return _MADE
@@ -69,14 +69,14 @@ def staged(
 ) -> Iterator[Path]:
     """Provide a hidden folder; rename it to ``folder`` when the block succeeds.
 
-    An older ``folder`` of ours is moved away then, and removed after. After a signal or a kill
-    the hidden folder stays, and the next run finds in it what was done; after an error, only
-    where it is ``worth_keeping``.
+    An earlier ``folder`` is moved away first and removed afterwards. After a signal or a kill, the
+    hidden folder is kept, so that the next run can resume; after an error, only if
+    ``worth_keeping`` returns True for it.
 
     Raises
     ------
-    OutputError : the disk is full, the place is not writable or a stranger's, or another run is
-        writing there.
+    OutputError : the folder cannot be written, was not made by shapecat, or another run is writing
+        to it.
     """
     hidden = partial_path(folder)
     for place in (folder, hidden):
@@ -103,11 +103,11 @@ def staged(
 
 
 def require_ours(folder: Path, marker: Marker = made_by_run) -> None:
-    """Refuse a folder that shapecat did not make.
+    """Check that a folder is missing, empty or made by shapecat.
 
     Raises
     ------
-    OutputError : it is a stranger's.
+    OutputError : shapecat did not make the folder.
     """
     if folder.is_dir() and not folder.is_symlink():
         begun = not any(_strangers(folder, _BEGUN))
@@ -120,12 +120,12 @@ def require_ours(folder: Path, marker: Marker = made_by_run) -> None:
 
 
 def _strangers(folder: Path, names: Collection[str]) -> Iterator[Path]:
-    """Yield the items of a folder that shapecat did not make."""
+    """Yield the items of a folder that are not in ``names``."""
     return (item for item in folder.iterdir() if item.name not in names)
 
 
 def _replace(folder: Path, hidden: Path, marker: Marker) -> None:
-    """Rename the complete hidden folder; at any moment one of the two is complete."""
+    """Rename the complete hidden folder; at any moment the old or the new folder is complete."""
     flush(hidden)
     if folder.exists():
         require_ours(folder, marker)
@@ -136,7 +136,7 @@ def _replace(folder: Path, hidden: Path, marker: Marker) -> None:
 
 
 def previous_path(folder: Path) -> Path:
-    """Return where a folder is moved that a new one replaces."""
+    """Return the hidden path of a folder while a new one replaces it."""
     return folder.with_name(f".{folder.name}.old")
 
 
@@ -155,11 +155,11 @@ def _retire(folder: Path, marker: Marker) -> None:
 
 
 def recover(folder: Path, marker: Marker = made_by_run) -> None:
-    """Restore, or finish removing, a folder that a killed run had moved away.
+    """Restore a folder that a killed run had moved away, or finish removing it.
 
     Raises
     ------
-    OutputError : the place is not writable.
+    OutputError : the folder cannot be written.
     """
     previous, hidden = previous_path(folder), partial_path(folder)
     if not previous.is_dir():
@@ -171,14 +171,14 @@ def recover(folder: Path, marker: Marker = made_by_run) -> None:
             elif folder.exists() and marker(folder) is not None:
                 _retire(folder, marker)
     except _BusyError:
-        return  # that run does it
+        return  # the other run does it
     except OSError as error:
         msg = f"{folder}: cannot be written: {error.strerror or error}"
         raise OutputError(msg) from error
 
 
 def clear(folder: Path, names: Collection[str] = _MADE) -> None:
-    """Remove from a folder, in their order, the names that were made in it."""
+    """Remove the given files and folders from a folder, in this order."""
     for item in (folder / name for name in names):
         if item.is_dir() and not item.is_symlink():
             shutil.rmtree(item)
@@ -187,7 +187,7 @@ def clear(folder: Path, names: Collection[str] = _MADE) -> None:
 
 
 def sweep(folder: Path) -> None:
-    """Remove incomplete files of a killed command from a complete folder."""
+    """Remove incomplete files that a killed command left in a complete folder."""
     with suppress(OSError):
         clear(folder, [partial_path(Path(name)).name for name in RUN_FILES])
 
@@ -229,7 +229,7 @@ def read_run(folder: Path) -> RunInfo:
 
     Raises
     ------
-    OutputError : the folder is not the result of a run.
+    OutputError : the folder has no readable run.json.
     """
     try:
         run = json.loads((folder / "run.json").read_text("utf-8"))

@@ -1,4 +1,4 @@
-"""Full boxes of tracks, fused from those of single views."""
+"""Full boxes of tracks, fused from the full boxes of their detections."""
 
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -20,14 +20,14 @@ from shapecat.tracking import Track, view_weights
 __all__ = ["FULL_WIDTHS", "FullBoxes", "full_columns", "numbers_or_nan"]
 
 FULL_WIDTHS = {"center_full": 3, "size_full": 3, "orientation_full": 4, "size_full_std": 3}
-"""Columns of full boxes, and how many numbers they have."""
+"""Columns of full boxes, and the number of values in each."""
 _BLOCK = 2**16
 _WIDTH = sum(FULL_WIDTHS.values())
 
 
 _BOX = sum(FULL_WIDTHS.values()) - FULL_WIDTHS["size_full_std"]
 _TELLING = 1000
-"""An object's box is estimated from so many of its views at most, spread over its life."""
+"""Largest number of views from which a track's box is fused, spread over its time span."""
 _AT_ONCE = 8  # row groups
 
 
@@ -35,15 +35,16 @@ _AT_ONCE = 8  # row groups
 class FullBoxes:
     """The full boxes of all detections of a run, estimated from single views.
 
-    Their outlines and deviations, nine tenths of the numbers, stay on disk: few are needed.
+    Outlines and standard deviations, nine tenths of the numbers, are read when they are needed.
 
     Attributes
     ----------
-    table : the detections.
-    groups : (g + 1,) the first row of each row group.
+    table : path of the detections table.
+    groups : (g + 1,) first row of each row group, and the number of rows.
     frames : the frames of the run.
-    rows : (n, 10) float32, centre, size and orientation side by side; NaN where they are null.
-    partial : (n,) whether the object is cut.
+    rows : (n, 10) float32 centre and size (metres) and orientation (x y z w) in the sensor frame;
+        NaN if unknown.
+    partial : (n,) whether the object is occluded or cut off by the image border.
     """
 
     table: Path
@@ -77,7 +78,12 @@ class FullBoxes:
         )
 
     def of_tracks(self, tracks: Sequence[Track], categories: Sequence[str]) -> F4:
-        """Return the fused boxes (k, 13) in the frames of some tracks; NaN if unknown."""
+        """Return the fused boxes of some tracks in each of their frames, track after track.
+
+        Returns
+        -------
+        (k, 13) float32 with the columns of `FULL_WIDTHS`, in the sensor frame; NaN if unknown.
+        """
         seen = [self._seen(track) for track in tracks]
         telling = [_spread(len(one.rows)) for one in seen]
         rows = [one.rows[some] for one, some in zip(seen, telling, strict=True)]
@@ -94,7 +100,7 @@ class FullBoxes:
         return result
 
     def _seen(self, track: Track) -> "_Seen":
-        """Return the detections of a track whose full boxes are known."""
+        """Return the detections of a track that have a full box."""
         at = np.flatnonzero(np.asarray(track.detections) >= 0)
         found = self.frames.find([track.topics[k] for k in at], track.frames[at])
         rows = self.frames.first[found] + track.detections[at]
@@ -102,14 +108,14 @@ class FullBoxes:
         return _Seen(at[known], rows[known], found[known])
 
     def _views(self, seen: "_Seen", some: I4, details: F4) -> BoxViews:
-        """Return some boxes of one object in the fixed frame."""
+        """Return the boxes of some views of a track in the fixed frame."""
         boxes, poses = self.rows[seen.rows[some]], self.frames.poses[seen.frames[some]]
         centers, axes = _placed(boxes, poses)
         sizes, stds = boxes[:, 3:6].astype(np.float64), details[:, :3].astype(np.float64)
         return BoxViews(centers, axes, sizes, stds, details[:, 3:], poses[:, :, 3])
 
     def _show(self, fused: FusedBox, seen: "_Seen", result: F4) -> None:
-        """Write the fused box in the sensor frame of each view of it."""
+        """Write the fused box to ``result``, in the sensor frame of each view."""
         for first in range(0, len(seen.rows), _BLOCK):
             at, rows, frames = (values[first : first + _BLOCK] for values in seen)
             boxes, poses = self.rows[rows], self.frames.poses[frames]
@@ -120,7 +126,7 @@ class FullBoxes:
             result[at] = np.hstack([back, shown.sizes, own, shown.stds])
 
     def _details(self, rows: I4) -> F4:
-        """Return (n, 3 + 96) the deviations and the outlines of detections."""
+        """Return the standard deviations and outlines (n, 3 + `DIRECTIONS`) of detections."""
         result = np.zeros((len(rows), 3 + DIRECTIONS), np.float32)
         groups = np.unique(np.searchsorted(self.groups, rows, side="right") - 1)
         with opened(self.table) as file:
@@ -142,7 +148,7 @@ class FullBoxes:
 
 
 class _Seen(NamedTuple):
-    """Where in a track it is seen, and in which rows of the tables of detections and frames."""
+    """The views of a track: their positions in the track, in the detections and in the frames."""
 
     at: I4
     rows: I4
@@ -150,19 +156,19 @@ class _Seen(NamedTuple):
 
 
 def _spread(count: int) -> I4:
-    """Return positions, not too many of them, from the first one to the last."""
+    """Return at most `_TELLING` of ``count`` positions, spread evenly from first to last."""
     return np.linspace(0, count - 1, min(count, _TELLING)).round().astype(np.int64)
 
 
 def _placed(boxes: F4, poses: F8) -> tuple[F8, F8]:
-    """Return the centres and the axes of boxes in the fixed frame."""
+    """Return the centres (k, 3) and axes (k, 3, 3) of boxes in the fixed frame."""
     turns, places = poses[:, :, :3], poses[:, :, 3]
     axes = turns @ Rotation.from_quat(boxes[:, 6:10]).as_matrix()
     return np.einsum("kij,kj->ki", turns, boxes[:, :3].astype(np.float64)) + places, axes
 
 
 def numbers_or_nan(table: pa.Table, widths: Mapping[str, int] = FULL_WIDTHS) -> F4:
-    """Return the columns of full boxes as (rows, sum of widths), NaN where they are null."""
+    """Return the columns of full boxes as one array (rows, sum of widths); null becomes NaN."""
     return np.hstack([_filled(table[name], width) for name, width in widths.items()])
 
 
@@ -175,7 +181,7 @@ def _filled(column: pa.ChunkedArray, width: int) -> F4:
 
 
 def full_columns(rows: F4) -> dict[str, Any]:
-    """Return rows (n, 13) as columns of a table; null where they are NaN."""
+    """Return full boxes (n, 13) as columns of a table; NaN rows become null."""
     missing = pa.array(np.isnan(rows[:, 0]))
     return dict(_columns(rows, missing))
 

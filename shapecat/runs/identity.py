@@ -1,8 +1,8 @@
-"""Identity: of a recording by its content, of a run folder by a random id.
+"""Identify a recording by its content, and a run folder by a random id.
 
-A run has two names. ``id`` is random and belongs to this one folder: one without it is none of
-ours. ``work`` tells what was done with what: runs that share it have the same tables, so a table
-that leaves its folder carries it.
+A run has two ids. ``id`` is random and marks one folder as made by shapecat. ``work`` identifies
+the recording and how it was processed: runs with the same ``work`` have the same tables, and
+tracks.csv has it in each line.
 """
 
 import json
@@ -32,7 +32,7 @@ _BLOCK = 1 << 20
 _OUTPUTS = ("color", "mcap", "rrd")
 
 Stats = list[list[Any]]
-"""Per file: name, bytes, and the times of its content and its inode in nanoseconds."""
+"""Per file: name, size in bytes, and the times when content and inode changed, nanoseconds."""
 
 
 def new_id() -> str:
@@ -41,10 +41,10 @@ def new_id() -> str:
 
 
 def work_id(run: RunInfo) -> str:
-    """Return the name of the work that run.json describes, once its content is known.
+    """Return the id of the work that run.json describes, once the digest of the input is known.
 
-    Content, settings, options, model and version, but for what the tables do not depend on. The
-    letter in front keeps spreadsheets from reading a number.
+    It is a hash of content, settings, options, model and version, without those that do not affect
+    the tables. The first letter keeps spreadsheets from reading a number.
     """
     settings = {name: value for name, value in run["settings"].items() if name != "outputs"}
     options = {name: value for name, value in run["options"].items() if name not in _OUTPUTS}
@@ -60,7 +60,7 @@ def file_stats(path: Path) -> Stats:
 
 
 def unchanged(before: Sequence[Sequence[Any]], path: Path) -> bool:
-    """Return whether a recording has the names, sizes and times of content it had before."""
+    """Return whether the files of a recording have the same names, sizes and content times."""
     try:
         return [list(s[:3]) for s in before] == [s[:3] for s in file_stats(path)]
     except OSError:
@@ -68,10 +68,9 @@ def unchanged(before: Sequence[Sequence[Any]], path: Path) -> bool:
 
 
 def content_digest(path: Path, *, cancelled: Event | None = None) -> str:
-    """Return a digest of the whole content of a recording: of a file, or the files of a folder.
+    """Return a digest of the whole content of a recording: of a file, or of a folder's files.
 
-    XXH3 with 128 bits (Collet 2019): as fast as memory, and 4 kB that a disk has lost change it.
-    It does not withstand forgery.
+    XXH3 with 128 bits (Collet 2019) is as fast as memory and detects damage, but not forgery.
 
     Raises
     ------
@@ -92,9 +91,9 @@ def content_digest(path: Path, *, cancelled: Event | None = None) -> str:
 
 
 class ContentDigest:
-    """The digest of a recording, worked out in a thread while the recording is processed.
+    """The digest of a recording, computed in a thread while the recording is processed.
 
-    What the thread has read lies in memory when the frames are read.
+    The thread also brings the files into the page cache, from which frames are read.
     """
 
     def __init__(self, path: Path) -> None:
@@ -141,9 +140,9 @@ class ContentDigest:
 
 
 def same_content(known: InputInfo, path: Path, digest: Callable[[], str]) -> bool:
-    """Return whether a recording is the one that run.json knows as its ``input``.
+    """Return whether a recording has the content of the ``input`` in a run.json.
 
-    The digest is asked for only where the times of its files cannot tell.
+    ``digest`` is called only if the names, sizes or times of the files differ.
     """
     if known.get("files") == file_stats(path):
         return True

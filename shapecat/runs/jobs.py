@@ -1,4 +1,4 @@
-"""Jobs: a recording with its options. Runs: the description of the results in run.json."""
+"""Jobs: recordings with their options. Runs: descriptions of results in run.json."""
 
 import dataclasses
 import platform
@@ -48,11 +48,21 @@ _LIBRARIES = ("numpy", "numba", "mcap", "rosbags", "rerun-sdk", "pyarrow")
 class Job:
     """One recording to process, and how.
 
-    ``folder`` is where the results go, ``DIR/NAME``; ``origin`` the URL that ``source`` was
-    downloaded from, ``target`` the one that the results are uploaded to, if any; ``start_s``
-    and ``end_s`` count from the start of the recording; ``up`` is ``auto``, ``tf``, ``imu``, or a
-    vector ``X,Y,Z`` in the sensor frame; ``color`` is the topic of colour images, None for those
-    that belong to the depth stream, empty for none.
+    Attributes
+    ----------
+    folder : where the results are written, ``DIR/NAME``.
+    topics : depth topics; empty to choose one.
+    up : ``auto``, ``tf``, ``imu``, or a vector ``X,Y,Z`` in the sensor frame.
+    fixed_frame : None to choose one.
+    start_s, end_s : seconds from the start of the recording; None for no limit.
+    every : every n-th frame is processed.
+    model : path of the model file; None for the default model.
+    color : topic of the colour images; None to choose one, empty for none.
+    mcap, rrd : whether to write annotated.mcap and review.rrd.
+    overwrite : whether to replace results of another input, settings or model.
+    discard_labels : whether to discard the labels of the replaced results.
+    origin : URL from which ``source`` was downloaded; empty if none.
+    target : URL to which the results are uploaded; empty if none.
     """
 
     source: Path
@@ -79,7 +89,7 @@ class Job:
         return self.origin or str(self.source)
 
     def selection(self) -> Options:
-        """Return the options that decide the content of the results, as stored in run.json."""
+        """Return the options that affect the results, as stored in run.json."""
         return {
             "topics": list(self.topics),
             "up": self.up,
@@ -95,9 +105,9 @@ class Job:
 
 @dataclass(frozen=True)
 class Summary:
-    """The results of a run; ``processed`` is false if it was already complete.
+    """A summary of a run; ``processed`` is False if it was already complete.
 
-    ``corrections`` is what became of the labels of the run it replaced, if there were any.
+    ``corrections`` is the outcome of transferring labels from the replaced run; None without any.
     """
 
     source: str
@@ -118,7 +128,7 @@ class Summary:
 
 
 def describe_run(job: Job, categorizer: Categorizer) -> RunInfo:
-    """Return the run.json of new work; the digest of the input follows later."""
+    """Return the content of run.json for new work; the digest of the input follows later."""
     return {
         "id": new_id(),
         "work": "",
@@ -145,7 +155,7 @@ def describe_run(job: Job, categorizer: Categorizer) -> RunInfo:
 
 
 def same_options(run: RunInfo, planned: RunInfo) -> bool:
-    """Return whether a run has the settings, options and model of another."""
+    """Return whether two runs have the same settings, options and model."""
     return (
         run.get("settings") == planned["settings"]
         and run.get("options") == planned["options"]
@@ -154,9 +164,9 @@ def same_options(run: RunInfo, planned: RunInfo) -> bool:
 
 
 def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str]) -> RunInfo:
-    """Return the interrupted run in a folder, or the planned one if that was other work.
+    """Return the interrupted run in a folder if it does the planned work; else start anew.
 
-    What is left of other work is removed.
+    Starting anew removes the files of other work and returns ``planned``.
     """
     with suppress(OutputError):
         run = read_run(folder)
@@ -179,17 +189,17 @@ def has_work(folder: Path) -> bool:
 
 
 def identify(run: RunInfo, content: ContentDigest) -> None:
-    """Record the digest of the input and the name of the work."""
+    """Set the digest of the input and the id of the work."""
     run["input"]["digest"] = run["input"]["digest"] or content.result()
     run["work"] = work_id(run)
 
 
 def require_unchanged(folder: Path, run: RunInfo, source: Path) -> None:
-    """Discard the results if the recording changed during the work.
+    """Remove the results if the recording has changed since it was read.
 
     Raises
     ------
-    RecordingError : the recording was written to while it was read.
+    RecordingError : the recording has changed.
     """
     if not unchanged(run["input"]["files"], source):
         clear(folder)
@@ -200,7 +210,7 @@ def require_unchanged(folder: Path, run: RunInfo, source: Path) -> None:
 def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
     """Transfer the corrected labels of the replaced results to the new ones.
 
-    The table they were written into is kept beside the new one.
+    The table with the original labels is kept as tracks.previous.csv.
     """
     previous = job.folder / "tracks.csv"
     if job.discard_labels or not has_labels(previous):

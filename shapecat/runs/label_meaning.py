@@ -1,4 +1,4 @@
-"""The meaning of a label that a person gives a track.
+"""The meaning of the label that a person gives a track.
 
 A label is a category, a new category, ``delete``, or ``merge with N``.
 """
@@ -20,9 +20,10 @@ _NAME = re.compile(r"[^\W\d_][\w .+&'()-]{0,58}[\w)]|[^\W\d_]")
 
 
 class TrackLabel(NamedTuple):
-    """The number, category and confidence that a track is shown with.
+    """The number, category and confidence with which a track is shown.
 
-    ``track`` is its own number, or that of the track it was merged with, whose category it has.
+    ``track`` is its own number. For a merged track it is the number of the track it was merged
+    with, and category and confidence are also from there.
     """
 
     track: int
@@ -43,7 +44,7 @@ def merged_with(label: str) -> int | None:
 
 
 def merging_with(track: int) -> str:
-    """Return the label that merges with a track.
+    """Return the label that merges another track with ``track``.
 
     Examples
     --------
@@ -60,14 +61,24 @@ _Verdict = str | int | None
 def find_misread(
     rows: Sequence[TrackRow], categories: Iterable[str] = (), *, one_frame: bool = True
 ) -> dict[int, str]:
-    """Return by track why its label cannot be understood, or contradicts others."""
+    """Return why a label is invalid or contradicts other labels, by track."""
     return resolve_labels(rows, categories, one_frame=one_frame)[1]
 
 
 def resolve_labels(
     rows: Sequence[TrackRow], categories: Iterable[str], *, one_frame: bool
 ) -> tuple[dict[int, TrackLabel], dict[int, str]]:
-    """Return the final label of each track, and the problem of each invalid label."""
+    """Return the final labels and the problems of invalid ones, both by track.
+
+    Parameters
+    ----------
+    categories : known categories, besides those in the rows.
+    one_frame : whether tracks of different topics may be merged.
+
+    Returns
+    -------
+    Deleted tracks have neither a label nor a problem.
+    """
     known = {n.lower(): n for n in (UNKNOWN, *CATEGORIES, *categories, *(r.category for r in rows))}
     verdicts: dict[int, _Verdict] = {}
     misread = {}
@@ -100,7 +111,12 @@ def _share_a_topic(a: TrackRow, b: TrackRow) -> bool:
 
 
 def _follow(track: int, verdicts: Mapping[int, _Verdict]) -> int:
-    """Return the track that a track ends in after all merges."""
+    """Return the track at the end of a chain of merges.
+
+    Raises
+    ------
+    ValueError : a track in the chain is missing or deleted, or the chain is a loop.
+    """
     seen = [track]
     while isinstance(target := verdicts[seen[-1]], int):
         if target not in verdicts:
@@ -117,11 +133,11 @@ def _follow(track: int, verdicts: Mapping[int, _Verdict]) -> int:
 
 
 def _understand(label: str, known: dict[str, str]) -> _Verdict:
-    """Interpret a label; a new category becomes known.
+    """Interpret a label; add a new category to ``known``.
 
     Raises
     ------
-    ValueError : it means nothing, or is nearly something known.
+    ValueError : the label is malformed, or likely a misspelt known name.
     """
     if label.lower() in known:
         return known[label.lower()]
@@ -144,14 +160,14 @@ def _understand(label: str, known: dict[str, str]) -> _Verdict:
 
 
 def _nearest(name: str, known: Sequence[str]) -> str | None:
-    """Return the known name that differs by a slip: one of a short name, two of a longer one."""
+    """Return the nearest known name within one edit (short names) or two; None if there is none."""
     distances = [(_slips(name, other), other) for other in known]
     slips, other = min(distances)
     return other if slips <= (1 if min(len(name), len(other)) < 5 else 2) else None
 
 
 def _slips(a: str, b: str) -> int:
-    """Count letters to add, drop, change or swap with their neighbour (Damerau 1964)."""
+    """Return the edit distance: letters added, dropped, changed or swapped (Damerau 1964)."""
     before, last = list[int](), list(range(len(b) + 1))
     for i, x in enumerate(a, start=1):
         row = [i]

@@ -1,4 +1,4 @@
-"""Labels carried from one run to another: to the objects that are where, and when, they were."""
+"""Transfer labels from one run to another, to the same objects."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -25,11 +25,11 @@ __all__ = [
 
 IN_TIME, IN_PLACE = "frames in common", "places in another recording"
 TABLE_ALONE = "places in the table alone"
-"""Without the run beside it: neither its fixed frame is known, nor what was moved."""
+"""Matching without the table's run: its fixed frame is unknown, and which objects moved."""
 
 
 class Transferred(NamedTuple):
-    """A label that has found its object; ``distance_m`` between the centres in the two runs."""
+    """A transferred label; ``distance_m`` is between the object's centres in the two runs."""
 
     old_track: int
     track: int
@@ -38,7 +38,7 @@ class Transferred(NamedTuple):
 
 
 class Missed(NamedTuple):
-    """A label that has not, and why."""
+    """A label that could not be transferred, and why."""
 
     old_track: int
     label: str
@@ -47,9 +47,10 @@ class Missed(NamedTuple):
 
 @dataclass(frozen=True)
 class Transfer:
-    """The result of a label transfer.
+    """The outcome of a label transfer.
 
-    ``source`` names its run's work, if known; ``by`` tells what the objects were found by.
+    ``source`` is the ``work`` id of the labels' run, empty if unknown; ``by`` says how objects were
+    matched.
     """
 
     source: str
@@ -68,17 +69,17 @@ class Transfer:
 
 
 def lost_labels(source: Path, reason: str) -> Transfer:
-    """Return the result for a table none of whose labels can be transferred."""
+    """Return the outcome if none of a run's labels can be transferred."""
     table = read_track_table(source / "tracks.csv")
     missed = (Missed(row.track, row.label, reason) for row in table.rows if row.label)
     return Transfer(table.run, (), tuple(missed))
 
 
 def transfer_labels(source: Path, target: Path) -> Transfer:
-    """Transfer the labels of another table to the same objects of a run.
+    """Transfer the labels of another run to the same objects in a run.
 
-    The labels go into tracks.csv of ``target``, what became of them into its run.json. Where a
-    person has labelled a track of ``target`` otherwise, that label stays.
+    The labels are written to tracks.csv of ``target``, the outcome to its run.json. If a person
+    gave a track of ``target`` another label, that label is kept.
 
     Parameters
     ----------
@@ -87,7 +88,7 @@ def transfer_labels(source: Path, target: Path) -> Transfer:
 
     Raises
     ------
-    OutputError : one of them cannot be read, or they have no frame of reference in common.
+    OutputError : one of them is unreadable, or the two have different fixed frames or none.
     """
     run = read_run(target)
     transfer = match_labels(source, target)
@@ -100,7 +101,7 @@ def transfer_labels(source: Path, target: Path) -> Transfer:
 
 
 def _labelled_otherwise(transfer: Transfer, target: Path, run: RunInfo) -> dict[int, str]:
-    """Return the tracks that a person has given another label; an earlier transfer has no say."""
+    """Return messages for tracks that have another label, unless it is from a transfer."""
     earlier = {
         (item["track"], item["label"]) for item in run.get("corrections", {}).get("transferred", ())
     }
@@ -113,7 +114,7 @@ def _labelled_otherwise(transfer: Transfer, target: Path, run: RunInfo) -> dict[
 
 
 def _without(transfer: Transfer, reasons: Mapping[int, str]) -> Transfer:
-    """Return a transfer with the labels of some tracks moved to the missed ones."""
+    """Return a transfer in which the labels of the given tracks are missed for these reasons."""
     kept = tuple(item for item in transfer.transferred if item.track not in reasons)
     missed = (
         Missed(item.old_track, item.label, reasons[item.track])
@@ -124,11 +125,11 @@ def _without(transfer: Transfer, reasons: Mapping[int, str]) -> Transfer:
 
 
 def match_labels(source: Path, target: Path) -> Transfer:
-    """Find for each label of a table the track of a run that is the same object.
+    """Find the tracks of a run that are the same objects as the labelled tracks of a table.
 
     Raises
     ------
-    OutputError : as `transfer_labels`.
+    OutputError : as for `transfer_labels`.
     """
     path = source / "tracks.csv" if source.is_dir() else source
     table = read_track_table(path)
@@ -153,11 +154,11 @@ def match_labels(source: Path, target: Path) -> Transfer:
 
 
 def _require_whole(path: Path, table: TrackTable) -> None:
-    """Refuse a table with lines that cannot be read, or of several runs.
+    """Check that a table has only valid lines, all from one run.
 
     Raises
     ------
-    OutputError : it is such a table.
+    OutputError : a line is invalid, or the table holds tracks of several runs.
     """
     if table.problems:
         msg = f"{path}: {table.problems[0]}"
@@ -168,7 +169,7 @@ def _require_whole(path: Path, table: TrackTable) -> None:
 
 
 def _is_in_its_run(path: Path, table: TrackTable) -> bool:
-    """Return whether the tables beside a tracks.csv belong to its run."""
+    """Return whether the other tables in the folder of a tracks.csv are from the same run."""
     folder = path.parent
     if not (folder / "run.json").exists() or not (folder / "tracks.parquet").exists():
         return False
@@ -178,7 +179,7 @@ def _is_in_its_run(path: Path, table: TrackTable) -> bool:
 
 
 def _groups(labelled: Sequence[TrackRow]) -> Group:
-    """Return which tracks a person has merged."""
+    """Return the function from a track to the track that it was finally merged with."""
     partners = {row.track: merged_with(row.label) for row in labelled}
 
     def root(track: int) -> int:
@@ -199,9 +200,10 @@ def _same_recording(a: Mapping[str, Any], b: Mapping[str, Any]) -> bool:
 def _translate(
     labelled: Sequence[TrackRow], group: Group, matches: Matches
 ) -> tuple[tuple[Transferred, ...], tuple[Missed, ...]]:
-    """Translate labels to the tracks of the target; parts become merges with the whole.
+    """Return the labels for the tracks of the target, and the labels without a match.
 
-    The whole is the track that others were merged with: it alone says what they all are.
+    The label of a whole, the track that others were merged with, is copied to its matches. Matches
+    of the other tracks are merged with the first match of the whole.
     """
     given: dict[int, Transferred] = {}
     missed = []
@@ -216,7 +218,7 @@ def _translate(
             }
         else:
             first, *others = (match.track for match in matches.found[whole])
-            for match in there:  # none, if the part is not found on its own
+            for match in there:  # empty if the part has no match of its own
                 if match.track not in (first, *others):
                     label = merging_with(first)
                     item = Transferred(row.track, match.track, label, match.distance_m)
@@ -225,6 +227,6 @@ def _translate(
 
 
 def _why(track: int, whole: int, matches: Matches) -> str:
-    """Return why the whole that a track is part of has no match."""
+    """Return why the whole of a track has no match."""
     reason = matches.reasons.get(whole, "nothing was found there")
     return reason if track == whole else f"track {whole}, which it is merged with: {reason}"

@@ -1,4 +1,4 @@
-"""Join the tables and labels of a run to labelled frames for the outputs."""
+"""Join the tables and labels of a run into labelled frames for the outputs."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -43,17 +43,17 @@ _OBJECT = (
     "neurons",
     "edges",
 )
-"""What is shown of a detection."""
+"""Columns of a detection that the outputs show."""
 
 
 def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[LabelledFrame]:
     """Yield the frames of a run in reading order, with their final labels.
 
-    Tracks missing from ``labels`` (deleted by a person) are left out. Tracks that were merged have
-    one number; where several are seen in one frame, they are the parts of one object.
+    Tracks missing from ``labels`` (deleted by a person) are left out. Merged tracks have the same
+    number; if several of them are in one frame, they are joined into one object.
     """
     shown = ShownTracks.read(folder, labels, causal=True)
-    release_memory()  # of the table that it was made from
+    release_memory()  # which the table of tracks used
     masks = _MasksByFrame(read_masks(folder))
     groups = (
         read_row_groups(folder / f"{name}.parquet", columns)
@@ -69,14 +69,14 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
 
 
 class _MasksByFrame:
-    """The masks of frames that are asked for in the order of the table; not all have some."""
+    """The masks of frames, requested in the order of the table; some frames have none."""
 
     def __init__(self, rows: Iterator[tuple[Key, ImageMasks]]) -> None:
         self._rows = rows
         self._next = next(rows, None)
 
     def of(self, key: Key) -> ImageMasks | None:
-        """Return the masks of a frame."""
+        """Return the masks of a frame; None if it has none."""
         if self._next is None or self._next[0] != key:
             return None
         found, self._next = self._next[1], next(self._rows, None)
@@ -84,7 +84,7 @@ class _MasksByFrame:
 
 
 def rows_by_frame(table: pa.Table) -> dict[tuple[str, int], list[dict[str, Any]]]:
-    """Group rows by frame; list columns of numbers become arrays without a detour."""
+    """Group rows by frame; the values of list columns without nulls become arrays."""
     columns = {name: _values(table[name]) for name in table.column_names}
     grouped: dict[tuple[str, int], list[dict[str, Any]]] = {}
     for k in range(table.num_rows):
@@ -94,7 +94,7 @@ def rows_by_frame(table: pa.Table) -> dict[tuple[str, int], list[dict[str, Any]]
 
 
 def _values(column: pa.ChunkedArray) -> Sequence[Any]:
-    """Return the values of a column; those of a list are an array, None where it is null."""
+    """Return the values of a column: arrays for a list column without nulls, else Python values."""
     fixed = pa.types.is_fixed_size_list(column.type)
     if column.null_count or not (fixed or pa.types.is_list(column.type)):
         return list(column.to_pylist())
@@ -169,7 +169,7 @@ def _labelled_object(
 
 
 def _join(parts: Sequence[LabelledObject], up: Sequence[float]) -> LabelledObject:
-    """Join the parts of a merged track in one frame to one object."""
+    """Join the parts of a merged track in one frame into one object."""
     if len(parts) == 1:
         return parts[0]
     box = _around([part.box for part in parts], up)

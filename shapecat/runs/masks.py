@@ -29,8 +29,8 @@ MASKS = pa.schema(
         ("counts", pa.list_(pa.list_(pa.uint32()))),
     ]
 )
-"""One row per frame that has a colour image: the size of the image, and for each detection that
-is seen in it the box (left, top, width, height) and the run lengths of its mask."""
+"""One row per frame that has a colour image: the size of the image, and for each detection visible
+in it the box (left, top, width, height; pixels) and the run lengths of the mask."""
 
 
 def mask_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
@@ -52,9 +52,9 @@ def mask_columns(perceptions: Iterable[Perception]) -> dict[str, Any]:
 
 
 def read_masks(folder: Path, *, boxes_only: bool = False) -> Iterator[tuple[Key, ImageMasks]]:
-    """Yield the masks of a run by frame, in the order of its frames; none without colour.
+    """Yield frames and their masks in the order of the frames table; nothing without colour.
 
-    With ``boxes_only`` they have no run lengths, which are nearly all of the table.
+    With ``boxes_only``, the run lengths are left out, which are most of the table.
     """
     path = folder / "masks.parquet"
     if not path.exists():
@@ -73,7 +73,7 @@ def read_masks(folder: Path, *, boxes_only: bool = False) -> Iterator[tuple[Key,
 
 
 def _run_lengths(column: pa.ChunkedArray) -> Iterator[U4]:
-    """Yield the run lengths of each mask; lists of lists take long as Python's."""
+    """Yield the run lengths of each mask, without making Python lists, which is slow."""
     masks = column.combine_chunks().flatten()
     ends, values = np.from_dlpack(masks.offsets), numbers(pa.chunked_array([masks]))
     ends = ends - ends[0] if len(ends) else ends

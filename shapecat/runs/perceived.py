@@ -30,14 +30,14 @@ from shapecat.types import UNKNOWN, Perception, Pose
 __all__ = ["FrameRow", "PerceptionTables"]
 
 _SEGMENT_S = 2.0
-"""What a kill may cost: frames are kept in a segment at least so often."""
+"""Frames are written to a segment at least this often, to limit what a kill may cost."""
 _SEGMENT_FRAMES = 2 * GROUP_FRAMES
-"""Held at most: each segment waits for the disk."""
+"""Frames are written to a segment when this many are waiting."""
 
 
 @dataclass(frozen=True)
 class FrameRow:
-    """Columns that the frames table adds to a `Perception`; ``again`` marks a second look."""
+    """Values of the frames table that a `Perception` lacks; ``again`` marks a second look."""
 
     log_time_ns: int
     fixed_from_sensor: Pose | None
@@ -46,16 +46,16 @@ class FrameRow:
 
 
 class PerceptionTables:
-    """Write frames, detections, planes and masks together, a row group every 32 frames.
+    """Writes the tables of frames, detections, planes and masks.
 
-    What was perceived is first written as *segments*, folders that appear when complete, so that
-    a run that was cut short goes on after its last one; leaving the block joins them into the
-    tables, which are the same wherever it was cut. What is seen in a second look is kept in
-    segments of its own, and takes the place of what was seen first when the tables are joined.
+    Frames are first written as *segments*, folders that appear when complete, so that an
+    interrupted run resumes after its last segment. Leaving the block joins the segments into
+    tables, which do not depend on where a run was interrupted. A second look has segments of its
+    own, whose frames replace those of the first look when the tables are joined.
 
     Attributes
     ----------
-    done : frames in the segments that an earlier run has left.
+    done : number of frames in the segments of an interrupted run.
     """
 
     def __init__(
@@ -67,9 +67,9 @@ class PerceptionTables:
         colour: bool = False,
         again: bool = False,
     ) -> None:
-        """Look for segments in ``folder``, those of a second look if ``again``.
+        """Find the segments in ``folder``, those of the second look if ``again``.
 
-        Without ``colour`` there is no table of masks.
+        Without ``colour``, no table of masks is written.
         """
         metadata = {
             "schema_version": SCHEMA_VERSION,
@@ -100,7 +100,7 @@ class PerceptionTables:
         self._join()
 
     def write(self, perceptions: Sequence[Perception], rows: Sequence[FrameRow]) -> None:
-        """Append a block of frames, which no segment parts."""
+        """Append a block of frames, all to the same segment."""
         self._pending.extend(zip(perceptions, rows, strict=True))
         late = time.monotonic() - self._flushed > _SEGMENT_S
         if late or len(self._pending) >= _SEGMENT_FRAMES:
@@ -125,7 +125,7 @@ class PerceptionTables:
         self._flushed = time.monotonic()
 
     def _join(self) -> None:
-        """Write the tables, whose row groups cover the same frames."""
+        """Write the tables; their row groups cover the same frames."""
         place = self._folder / SEGMENTS
         frames = sum(read_segment(s, "frames").num_rows for s in list_segments(place))
         with ExitStack() as stack:
@@ -212,7 +212,7 @@ def _center_fixed(row: FrameRow, center: Any) -> Any:
 
 
 def _height(perception: Perception, plane: int | None, support_m: float, center: Any) -> float:
-    """Return the height of a centre above what its object stands on, in metres."""
+    """Return the height of a centre above the object's support, metres; NaN without a plane."""
     if plane is None:
         return float("nan")
     support = perception.scene.planes[plane]

@@ -1,7 +1,7 @@
-"""The expensive phases: perceive every frame, and revise some with the up of the others.
+"""The expensive phases: perceive every frame, then revise some with a better up direction.
 
-Before the first frame is perceived the up direction that the recording gives is held against the
-planes of the first frames that show one: a fixed frame whose z is not up spoils all of them.
+Before the first frame is perceived, the up direction that the recording gives is compared with the
+planes in the first frames: a fixed frame whose z axis is not up would spoil all of them.
 """
 
 from collections import Counter
@@ -37,26 +37,26 @@ from shapecat.types import Frame
 __all__ = ["Observer", "Work", "ignore", "perceive_all", "revise"]
 
 Observer = Callable[[str, int, int | None], None]
-"""Called with the name of the phase, the frames done, and how many there are, if known."""
+"""Called with the phase, the number of frames done, and the total (None if unknown)."""
 
 _MANY = 100
-"""With so many frames other processes are started before anything is read."""
+"""With at least this many frames, other processes are started before anything is read."""
 _CONFIRMS_DEG = 15.0
-"""A plane farther from level than this is none to detection: see `detect`."""
+"""A plane confirms an up direction within this angle, as in `detect`."""
 _DOUBTS, _LOOKS = 3, 10
-"""So many frames with a plane have to contradict, of so many that are looked at."""
+"""Frames with a plane that must contradict the up direction, and frames that are checked."""
 
 
 _Reading = tuple[Frame, ColourView | None]
-"""A frame, and the colour image beside it."""
+"""A frame and its colour image; None if it has none."""
 
 
 def ignore(_phase: str, _done: int, _total: int | None) -> None:
-    """Observe nothing."""
+    """Ignore the progress."""
 
 
 class Work(NamedTuple):
-    """A job on its opened recording: where its tables go, and what run.json will say."""
+    """A job with its open recording, the folder of its tables, and the content of run.json."""
 
     recording: Recording
     folder: Path
@@ -68,7 +68,12 @@ class Work(NamedTuple):
 
 
 def perceive_all(work: Work) -> None:
-    """Write frames, detections, planes and masks, frame by frame in flat memory."""
+    """Perceive every frame in constant memory; write frames, detections, planes and masks.
+
+    Raises
+    ------
+    NoStreamError : no frame could be read.
+    """
     recording, folder, run, job, categorizer, observe, cores = work
     skipped: Counter[str] = Counter()
     total = count_frames(recording, run["options"])
@@ -113,10 +118,10 @@ def perceive_all(work: Work) -> None:
 
 
 def revise(work: Work) -> None:
-    """Perceive again the frames that disagree with the recording, and rewrite the tables.
+    """Perceive frames that disagree with the rest again, and rewrite the tables.
 
-    Where the user says where up is, nothing else does. What was seen first stays where the second
-    look finds nothing.
+    An up direction that the user gave is never revised. A frame keeps its first result if the
+    second look finds nothing.
     """
     recording, folder, run, job, categorizer, observe, cores = work
     chosen = frames_to_revise(read_segments(folder)) if run["up"]["source"] != "option" else {}
@@ -142,7 +147,7 @@ def revise(work: Work) -> None:
 def _views_again(
     recording: Recording, run: RunInfo, job: Job, chosen: dict[Key, Revision]
 ) -> Iterator[tuple[FrameRow, View]]:
-    """Yield the chosen frames, to be perceived with another up."""
+    """Yield the chosen frames with their revised up directions."""
     upright = Upright.of(recording, up=job.up, fixed_frame=run["fixed_frame"])
     recent = RecentFrames(job.settings.detection.fuse_frames)
     for frame, colour in _readings(recording, run, job, Counter()):
@@ -157,14 +162,14 @@ def _views_again(
 def _blocks(
     views: Iterator[tuple[FrameRow, View]], size: int
 ) -> Iterator[tuple[tuple[FrameRow, ...], tuple[View, ...]]]:
-    """Yield blocks of consecutive frames until asked to stop: where they begin never changes."""
+    """Yield blocks of ``size`` consecutive frames, always the same, until asked to stop."""
     while not stopping.asked() and (block := tuple(islice(views, size))):
         rows, seen = zip(*block, strict=True)
         yield rows, seen
 
 
 class _UpTrial:
-    """Looks at the first frames of each topic without the up that is given, and compares."""
+    """Compares the given up direction with the planes in the first frames of each topic."""
 
     def __init__(self, upright: Upright, settings: Settings) -> None:
         self._upright, self._settings = upright, settings
@@ -174,7 +179,7 @@ class _UpTrial:
         self._decided: set[str] = set()
 
     def before(self, source: Iterator[_Reading]) -> Iterator[_Reading]:
-        """Yield the frames after the decision about the up of their topic."""
+        """Yield the frames, held back until the up direction of their topic is decided."""
         held: list[_Reading] = []
         for reading in source:
             frame, _ = reading
@@ -201,7 +206,7 @@ class _UpTrial:
             self._decide(frame.topic)
 
     def _decide(self, topic: str) -> None:
-        """Drop an up that no frame confirms, if enough have had the say."""
+        """Reject the up direction of a topic if no frame confirms it and enough contradict it."""
         self._decided.add(topic)
         off = self._off_deg[topic]
         enough = len(off) >= min(_DOUBTS, self._looks[topic])
@@ -224,7 +229,7 @@ def _tables(
 def _readings(
     recording: Recording, run: RunInfo, job: Job, skipped: Counter[str]
 ) -> Iterator[_Reading]:
-    """Yield the frames of a run; errors of the disk become errors of the recording."""
+    """Yield the frames of a run; an OSError becomes a RecordingError."""
     try:
         for frame, colour in read_frames(recording, run["options"], skipped=skipped):
             yield frame, None if colour is None else _without_pixels(colour)
@@ -234,11 +239,11 @@ def _readings(
 
 
 def _without_pixels(view: ColourView) -> ColourView:
-    """Leave out what masks do not need and other processes would be sent."""
+    """Remove the pixels, which masks do not need, before the image is sent to other processes."""
     return replace(view, image=replace(view.image, data=b""))
 
 
 def _perceived(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
-    """Yield the up columns of the frames and planes tables."""
+    """Yield the tables of frames and planes, with the columns for `Upright.report`."""
     frames = read_row_groups(folder / "frames.parquet", ["topic", "frame", "up", "up_given"])
     return zip(frames, read_row_groups(folder / "planes.parquet", ["topic", "frame"]), strict=True)

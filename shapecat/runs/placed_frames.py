@@ -1,4 +1,4 @@
-"""Where each frame of a run was taken from, and where its detections begin."""
+"""The sensor pose and the first detection of each frame of a run."""
 
 from collections.abc import Collection, Sequence
 from functools import cached_property
@@ -14,7 +14,7 @@ __all__ = ["PlacedFrames"]
 
 
 class PlacedFrames:
-    """The frames of a run in columns, in their order, found by topic and number."""
+    """The frames of a run as columns in table order, with a look-up by topic and number."""
 
     COLUMNS = ("topic", "frame", "fixed_translation", "fixed_rotation")
 
@@ -25,7 +25,7 @@ class PlacedFrames:
         self._keys, self._first, self._poses = bytearray(), bytearray(), bytearray()
 
     def add(self, frames: pa.Table, detections: pa.Table, count: int) -> None:
-        """Append a row group; ``count`` detections are in those before it."""
+        """Append a row group; ``count`` is the number of detections in earlier ones."""
         topics, codes = topic_codes(frames)
         known = [self._codes.setdefault(topic, len(self._codes)) for topic in topics]
         keys = _keys(np.array(known, np.int64)[codes], numbers(frames["frame"]))
@@ -40,12 +40,12 @@ class PlacedFrames:
 
     @cached_property
     def first(self) -> I4:
-        """Return (f,) the first detection of each frame, -1 if it has none."""
+        """Return the row (f,) of each frame's first detection; -1 if it has none."""
         return np.frombuffer(self._first, np.int64)
 
     @cached_property
     def poses(self) -> F8:
-        """Return (f, 3, 4) ``fixed_from_sensor``, metres; the identity without a fixed frame."""
+        """Return ``fixed_from_sensor`` (f, 3, 4), metres; the identity if it is not used."""
         return np.frombuffer(self._poses, np.float64).reshape(-1, 3, 4)
 
     @cached_property
@@ -53,7 +53,7 @@ class PlacedFrames:
         return np.argsort(np.frombuffer(self._keys, np.int64), kind="stable")
 
     def find(self, topics: Sequence[str], frames: I4) -> I4:
-        """Return (n,) the positions of frames of the run, given by topic and number (n,)."""
+        """Return the positions (n,) of the frames with the given topics and numbers (n,)."""
         codes = np.fromiter(map(self._codes.__getitem__, topics), np.int64, len(topics))
         keys = np.frombuffer(self._keys, np.int64)
         found = np.searchsorted(keys, _keys(codes, frames), sorter=self._order)

@@ -15,7 +15,7 @@ __all__ = [
 
 
 class InputInfo(TypedDict):
-    """The recording: its path or URL, size, digest, and name, size and times of each file."""
+    """The recording: path or URL, size, digest, and the name, size and times of each file."""
 
     path: str
     bytes: int
@@ -24,7 +24,7 @@ class InputInfo(TypedDict):
 
 
 class Window(TypedDict):
-    """The part of a recording that is read."""
+    """The part of a recording that is read: see `shapecat.recordings.frames`."""
 
     start_s: float | None
     end_s: float | None
@@ -32,7 +32,7 @@ class Window(TypedDict):
 
 
 class Options(Window):
-    """The options of `shapecat process` that decide the content of the results."""
+    """The options of `shapecat process` that affect the results."""
 
     topics: list[str]
     up: str
@@ -50,7 +50,11 @@ class ModelInfo(TypedDict):
 
 
 class Counts(TypedDict, total=False):
-    """Numbers of frames, skipped frames by reason, detections, and tracks by category."""
+    """Numbers of frames, detections and tracks.
+
+    ``skipped`` is by reason, ``tracks`` by category; ``resumed`` and ``revised`` count frames;
+    ``color`` counts frames with a colour image.
+    """
 
     frames: int
     skipped: dict[str, int]
@@ -62,7 +66,7 @@ class Counts(TypedDict, total=False):
 
 
 class OriginInfo(TypedDict):
-    """What the recording and the work are known by where results are kept at a URL."""
+    """Keys of the recording and of the work in a run folder at a URL; see `Ticket`."""
 
     input: str
     work: str
@@ -71,8 +75,8 @@ class OriginInfo(TypedDict):
 class RunInfo(TypedDict):
     """The contents of run.json.
 
-    ``id`` is random and belongs to one folder; ``work`` names what was done with what: runs that
-    share it have the same tables. ``seconds`` has an entry for each finished phase.
+    ``id`` is random and belongs to one folder; ``work`` identifies the recording and how it was
+    processed. ``seconds`` has the duration of each finished phase.
     """
 
     id: str
@@ -94,5 +98,5 @@ class RunInfo(TypedDict):
 
 
 def window_of(options: Options) -> Window:
-    """Return the start, end and step of the frames that options select."""
+    """Return the part of a recording that options select."""
     return {"start_s": options["start_s"], "end_s": options["end_s"], "every": options["every"]}

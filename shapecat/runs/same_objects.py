@@ -1,8 +1,8 @@
-"""Which tracks of two runs are the same object.
+"""Find the tracks of two runs that are the same object.
 
-Two runs of one recording have frames in common, in which detections of the same object are each
-other's nearest. Two recordings of one place share a fixed frame alone, in which only what stood
-still in both can be found again. What is ambiguous is told, not guessed.
+Two runs of one recording have common frames, in which detections of the same object are mutual
+nearest neighbours. Two recordings of one place have only a fixed frame in common, in which only
+objects at rest can be found again. Ambiguous cases are reported, not guessed.
 """
 
 from collections import Counter, defaultdict
@@ -23,30 +23,30 @@ from shapecat.runs.track_table import TrackRow
 __all__ = ["Group", "Match", "Matches", "match_in_place", "match_in_time"]
 
 _MOST_REACH_M = 0.10
-"""Detections of one object in one frame are no farther apart, however they were segmented."""
+"""Largest distance between two detections of one object in one frame, however segmented."""
 _MAJORITY = 0.6
-"""Share of the common frames in which two tracks are each other's nearest."""
+"""Least share of common frames in which matching tracks are mutual nearest neighbours."""
 _RIVAL = 0.25
-"""With such a share another track has a claim too."""
+"""Another track with at least this share makes a match ambiguous."""
 _STILL_M = 0.04
-"""The centres of what stands still scatter less, though it is seen from elsewhere."""
+"""Largest scatter of the centres of an object at rest, seen from several places."""
 _REACH = 0.5
-"""Centres of what two views show of an object are closer than this part of its width."""
+"""Largest distance between the centres of one object in two views, relative to its width."""
 _LEAST_REACH_M = 0.04
 _CLEAR_M = 0.03
-"""The next object is farther than the nearest by at least this, or the place is ambiguous."""
+"""The second nearest object must be farther than the nearest by this, or it is ambiguous."""
 _SIZE_RATIO = 1.8
-"""The largest extents of an object in two recordings differ by less."""
+"""Largest ratio between the largest extents of an object in two recordings."""
 _SAMPLES = 40
-"""Detections per track whose size is read."""
+"""About this many detections of each track are read for its size."""
 
 
 Group = Callable[[int], int]
-"""Returns a number that tracks have in common if a person has merged them."""
+"""Maps a track to a number that is the same for tracks that a person merged."""
 
 
 class Match(NamedTuple):
-    """A track of the target, and how far its centre is from that of the other, metres."""
+    """A track of the target, and the distance of its centre from the source track's, metres."""
 
     track: int
     distance_m: float
@@ -54,14 +54,22 @@ class Match(NamedTuple):
 
 @dataclass(frozen=True)
 class Matches:
-    """By track of the source, those of the target that are it too, or why there are none."""
+    """The tracks of the target that match each track of the source, or why there are none."""
 
     found: Mapping[int, Sequence[Match]]
     reasons: Mapping[int, str]
 
 
 class _Tracks(NamedTuple):
-    """Where tracks were seen: arrays (n,), in the order of topic and stamp; centres (n, 3)."""
+    """All detections of the tracks of a run, sorted by topic and stamp.
+
+    Attributes
+    ----------
+    tracks, numbers, detections : (n,) numbers of the track, the frame and the detection.
+    frames : topic and stamp (ns) of each detection.
+    centers : (n, 3) metres, fixed frame.
+    keys : the detections of each topic and stamp.
+    """
 
     tracks: I4
     frames: list[tuple[str, int]]
@@ -72,7 +80,7 @@ class _Tracks(NamedTuple):
 
 
 def _read_tracks(folder: Path) -> _Tracks:
-    """Read where the tracks of a run were seen, without the frames in which they coast."""
+    """Read the detections of the tracks of a run."""
     columns = ["track", "topic", "frame", "stamp_ns", "detection", "center_fixed"]
     with pq.ParquetFile(folder / "tracks.parquet") as file:
         table = file.read(columns=columns)
@@ -92,11 +100,11 @@ def _read_tracks(folder: Path) -> _Tracks:
 
 
 def match_in_time(source: Path, target: Path, group: Group) -> Matches:
-    """Match tracks that are each other's nearest in most of the frames that both runs have.
+    """Match tracks that are mutual nearest neighbours in most frames common to both runs.
 
     Parameters
     ----------
-    group : says of which object a track of the source is: tracks that were merged are one.
+    group : maps merged tracks of the source to the same number; they are one object.
     """
     old, new = _read_tracks(source), _read_tracks(target)
     old_widths, new_widths = _widths(source, old), _widths(target, new)
@@ -120,7 +128,7 @@ def _by_majority(
     seen: Counter[int],
     group: Group,
 ) -> Matches:
-    """Let each track of the target be the object of the source it is nearest to most often."""
+    """Match each track of the target with the object of the source that most frames agree on."""
     found: dict[int, list[Match]] = {}
     reasons: dict[int, str] = {}
     claims: dict[int, dict[int, list[int]]] = {}
@@ -147,18 +155,18 @@ def _widths(folder: Path, seen: _Tracks) -> F8:
 
 
 def _reach_at_once(a: F8, b: F8) -> F8:
-    """Return how near (n, m) things of some widths are to each other only if they are the same.
+    """Return the largest distance (n, m) between detections of one object, given their widths.
 
-    Two that stand side by side are farther apart than half of their mean width.
+    Two objects side by side are farther apart than half of their mean width.
     """
     mean = (a[:, None] + b[None]) / 2
     return np.clip(_REACH * mean, _LEAST_REACH_M, _MOST_REACH_M)
 
 
 def _mutual_nearest(a: F8, b: F8, reach: F8) -> Iterator[tuple[int, int, float]]:
-    """Yield the indices of points (n, 3) and (m, 3) that are each other's nearest, and how near.
+    """Yield index pairs and distances of mutual nearest neighbours of points (n, 3) and (m, 3).
 
-    ``reach`` (n, m) says how near they must be.
+    ``reach`` (n, m) is the largest distance of each pair, metres.
     """
     apart = np.linalg.norm(a[:, None] - b[None], axis=2)
     nearest = apart.argmin(axis=1)
@@ -168,7 +176,7 @@ def _mutual_nearest(a: F8, b: F8, reach: F8) -> Iterator[tuple[int, int, float]]
 
 
 class _Standing(NamedTuple):
-    """The place (3,), width and extent of a standing track; NaN if unknown."""
+    """Centre (3,), width and largest extent of a track at rest, metres; NaN if unknown."""
 
     track: int
     center: F8
@@ -179,12 +187,17 @@ class _Standing(NamedTuple):
 def match_in_place(
     rows: Sequence[TrackRow], source: Path | None, target: Path, group: Group
 ) -> Matches:
-    """Match objects that stand still at one place in both recordings.
+    """Match objects that are at rest at the same place in two recordings.
 
     Parameters
     ----------
-    rows : the tracks of the source, and their places if there are no tables.
+    rows : the tracks of the source; their positions are used if ``source`` is None.
+    source : folder of the source run; None if only its tracks.csv exists.
     group : as for `match_in_time`.
+
+    Raises
+    ------
+    OutputError : the fixed frames are missing or differ, or a row has no position.
     """
     _require_one_frame(source, target)
     new, _ = _standing(target)
@@ -212,9 +225,9 @@ def match_in_place(
 def _nearest_there(
     thing: _Standing, old: Sequence[_Standing], new: Sequence[_Standing]
 ) -> tuple[Match | None, str]:
-    """Return the only object at the place of another, or the reason why there is none.
+    """Return the only object at the place of ``thing``, or the reason why there is none.
 
-    ``old`` are the other things that stood around.
+    ``old`` are the other objects of the source, ``new`` the objects of the target.
     """
     near = sorted((_apart(thing, other), k) for k, other in enumerate(new))
     reached = [(d, k) for d, k in near if d <= _reach(thing, new[k])]
@@ -242,11 +255,11 @@ def _reach(a: _Standing, b: _Standing) -> float:
 
 
 def _require_one_frame(source: Path | None, target: Path) -> None:
-    """Refuse places that cannot be compared.
+    """Check that positions in two runs can be compared.
 
     Raises
     ------
-    OutputError : a run has no fixed frame, or they have different ones.
+    OutputError : a run has no fixed frame, or the fixed frames differ.
     """
     names = [_fixed_frame(folder) for folder in (source, target) if folder is not None]
     if len(set(names)) > 1:
@@ -264,11 +277,11 @@ def _fixed_frame(folder: Path) -> str:
 
 
 def _place_of(row: TrackRow) -> F8:
-    """Return the place (3,) in a line of tracks.csv, metres.
+    """Return the position (3,) in a line of tracks.csv, metres.
 
     Raises
     ------
-    OutputError : it tells none.
+    OutputError : the line has no position.
     """
     try:
         place = [float(row.cells[name].strip().replace(",", ".")) for name in "xyz"]
@@ -279,7 +292,7 @@ def _place_of(row: TrackRow) -> F8:
 
 
 def _standing(folder: Path) -> tuple[list[_Standing], list[int]]:
-    """Return where the tracks of a run stand, and the tracks that were moved."""
+    """Return the tracks of a run that are at rest, and the numbers of those that moved."""
     seen = _read_tracks(folder)
     extents = _extents(folder, seen)
     still, moved = [], []
@@ -296,7 +309,7 @@ def _standing(folder: Path) -> tuple[list[_Standing], list[int]]:
 
 
 def _extents(folder: Path, seen: _Tracks) -> dict[int, tuple[float, float]]:
-    """Return the width and the largest extent of each track, metres, medians of some views."""
+    """Return the width and largest extent of each track, metres: medians of some views."""
     wanted: dict[tuple[str, int], list[int]] = {}
     for track in np.unique(seen.tracks):
         rows = np.flatnonzero(seen.tracks == track)

@@ -1,7 +1,8 @@
-"""Choose the frames to revise, with the up direction of the whole recording.
+"""Choose the frames to perceive again with the up direction of the whole recording.
 
-Where the sensor's poses are known, up is one direction of the fixed frame in all frames. Where
-they are not, but the frames before and after agree, the camera was still, and up is theirs.
+If the sensor poses are known, up is the same direction of the fixed frame in all frames. If they
+are not, but the frames before and after agree, the camera was at rest, and their up direction is
+used.
 """
 
 from collections.abc import Iterable, Iterator
@@ -20,28 +21,29 @@ COLUMNS = {
     "frames": ("topic", "frame", "stamp_ns", "up", "up_given", "fixed_rotation"),
     "planes": ("topic", "frame", "offset"),
 }
-"""What is read of the tables."""
+"""Columns that are read from each table."""
 
 _OFF_DEG = 10.0
-"""A frame disagrees whose up is so far off the recording's."""
+"""A frame is revised if its up direction differs by more from the recording's."""
 _AGREES_DEG = 5.0
-"""A frame that was given an up so near the recording's would be seen the same again."""
+"""A frame is not revised if the given up direction differs by less from the recording's."""
 _STILL_DEG, _STILL_SHARE = 3.0, 0.6
-"""The camera is still if so many of the frames around agree so well."""
+"""The camera is at rest if more than this share of the nearby frames agree to this angle."""
 _FIXED_SHARE = 0.5
-"""The fixed frame has an up if more of the frames agree than not, to `_OFF_DEG`."""
+"""Up is known in the fixed frame if more than this share of the frames agree to `_OFF_DEG`."""
 _AROUND, _AROUND_NS = 30, 3_000_000_000
-"""Frames before and after, and nanoseconds, over which a camera may be known to be still."""
+"""Nearby frames: at most this many before and after, and at most this far in time."""
 _FEWEST = 4
-"""Frames that have to agree."""
+"""With fewer frames to compare, nothing is decided."""
 _STILL_M, _OFF_M = 0.03, 0.08
-"""A still camera keeps its height above the support; a support so far from it is another one."""
+"""Largest variation of the height of a support below a camera at rest, and the least height
+difference to another support."""
 
 
 class Revision(NamedTuple):
-    """The revision of a frame: the up to use, and the up it was given before.
+    """The up direction to use for a frame, and the one that was given before.
 
-    Both are unit vectors (3,) in the sensor frame; the second is None if there was none.
+    Both are unit vectors (3,) in the sensor frame; ``up_given`` is None if there was none.
     """
 
     up: F4
@@ -51,9 +53,12 @@ class Revision(NamedTuple):
 class _Stream(NamedTuple):
     """The frames of a topic, in their order.
 
-    ``up`` and ``given`` (n, 3) are in the sensor frame, ``given`` NaN where nothing was;
-    ``rotation`` (n, 3, 3) is of ``fixed_from_sensor``, NaN where it is not known; ``offsets`` of
-    each frame's planes along its up, in metres.
+    Attributes
+    ----------
+    up : (n, 3) up directions in the sensor frame.
+    given : (n, 3) up directions from other sources than planes; NaN if there is none.
+    rotation : (n, 3, 3) of ``fixed_from_sensor``; NaN if unknown.
+    offsets : of each frame's planes along its up direction, ascending, metres.
     """
 
     frames: I4
@@ -65,24 +70,24 @@ class _Stream(NamedTuple):
 
     @property
     def level(self) -> Bool:
-        """Whether a plane was found, per frame."""
+        """Whether each frame has a plane, (n,)."""
         return np.array([len(offsets) > 0 for offsets in self.offsets], np.bool_)
 
 
 def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, Revision]:
-    """Return the frames without a plane, or with one that the recording disagrees with.
+    """Return the frames without a plane, or with one that disagrees with the recording.
 
     Parameters
     ----------
-    tables : frames beside planes, portion by portion, with `COLUMNS`.
+    tables : pairs of frames and planes tables with `COLUMNS`, segment by segment.
 
     Returns
     -------
-    The frames whose up is known better than when they were seen, in their order.
+    The frames whose up direction is now known better, in their order.
 
     Notes
     -----
-    Holds a few numbers per frame.
+    Memory holds a few numbers per frame.
     """
     found: dict[Key, Revision] = {}
     for topic, stream in _streams(tables).items():
@@ -99,14 +104,14 @@ def frames_to_revise(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[Key, R
 
 
 def _fixed_up(stream: _Stream, posed: Bool) -> F8:
-    """Return up (n, 3) by what most frames say of the fixed frame's; NaN where it is not known."""
+    """Return the up directions (n, 3) if most frames agree on one in the fixed frame; else NaN."""
     in_fixed = np.einsum("nij,nj->ni", stream.rotation, stream.up)
     agreed = _agreed(in_fixed[posed & stream.level], _OFF_DEG, _FIXED_SHARE)
     return np.asarray(np.einsum("nji,j->ni", stream.rotation, agreed))
 
 
 def _still_up(stream: _Stream) -> F8:
-    """Return up (n, 3) by the frames around, where the camera was still; else NaN."""
+    """Return the up directions (n, 3) of nearby frames if the camera was at rest; else NaN."""
     level, expected = stream.level, np.full(stream.up.shape, np.nan)
     for k in range(len(expected)):
         near = _around(stream, k)
@@ -115,14 +120,17 @@ def _still_up(stream: _Stream) -> F8:
 
 
 def _around(stream: _Stream, k: int) -> I4:
-    """Return the numbers of the frames around one, without it."""
+    """Return the indices of the frames near frame ``k``, without ``k``."""
     near = np.arange(max(0, k - _AROUND), min(len(stream.frames), k + _AROUND + 1))
     soon = np.abs(stream.stamps_ns[near] - stream.stamps_ns[k]) <= _AROUND_NS
     return np.asarray(near[soon & (near != k)])
 
 
 def _other_support(stream: _Stream, off: Bool) -> Bool:
-    """Return (n,) in which frames no plane is as high as the lowest plane of nearby frames."""
+    """Return whether all planes of a frame differ in height from the lowest of nearby frames.
+
+    ``off`` (n,) marks the frames that are not compared; the result is (n,) too.
+    """
     found = np.zeros(len(off), np.bool_)
     for k in np.flatnonzero(~off):
         near = _around(stream, int(k))
@@ -136,7 +144,7 @@ def _other_support(stream: _Stream, off: Bool) -> Bool:
 
 
 def _agreed(up: F8, within_deg: float, share: float) -> F8:
-    """Return the direction (3,) that so large a share of some (n, 3) agree with; NaN if none."""
+    """Return the direction (3,) on which more than `share` of ``up`` (n, 3) agree; NaN if none."""
     if len(up) < _FEWEST:
         return np.full(3, np.nan)
     near = _cosine(up, np.median(up, axis=0)) > _cos(within_deg)
@@ -147,7 +155,7 @@ def _agreed(up: F8, within_deg: float, share: float) -> F8:
 
 
 def _cosine(a: F8, b: F8) -> F8:
-    """Return the cosine (n,) between directions (n, 3) and others, (n, 3) or one (3,)."""
+    """Return the cosines (n,) between directions (n, 3) and other directions, (n, 3) or (3,)."""
     lengths = np.linalg.norm(a, axis=-1) * np.linalg.norm(b, axis=-1)
     return np.asarray((a * b).sum(axis=-1) / np.maximum(lengths, 1e-9))
 
@@ -165,7 +173,7 @@ def _streams(tables: Iterable[tuple[pa.Table, pa.Table]]) -> dict[str, _Stream]:
 
 
 def _parts(frames: pa.Table, planes: pa.Table) -> Iterator[tuple[str, _Stream]]:
-    """Yield the frames of each topic in a portion of the tables."""
+    """Yield the frames of each topic in a part of the tables."""
     topics, codes = topic_codes(frames)
     rows, offsets = frame_rows(planes), numbers(planes["offset"]).copy()
     index, stamps = numbers(frames["frame"]), numbers(frames["stamp_ns"])
@@ -186,7 +194,7 @@ def _joined(parts: list[_Stream]) -> _Stream:
 
 
 def _vectors(column: pa.ChunkedArray, width: int) -> F8:
-    """Return a column of vectors (n, width), NaN where there is none."""
+    """Return a column of vectors as (n, width); null becomes NaN."""
     known = column.is_valid().to_numpy()
     vectors = np.full((len(known), width), np.nan)
     if known.any():

@@ -1,7 +1,7 @@
-"""Segments: parts of the tables that survive a kill, also of a second look.
+"""Segments: parts of the tables that survive a kill, for the first and the second look.
 
-Segments are folders that appear when complete, and do not change after. The tables are joined
-from them as often as it takes, so that a kill between two tables leaves nothing that lasts.
+Segments are folders that appear when complete and never change. The tables can be joined from
+them again and again, so a kill while they are joined does no harm.
 """
 
 import shutil
@@ -34,7 +34,7 @@ __all__ = [
 GROUP_FRAMES = 32
 _BALANCE = 4096
 PERCEIVED = {"frames": FRAMES, "detections": DETECTIONS, "planes": PLANES, "masks": MASKS}
-"""Of recordings without colour there are no masks."""
+"""The tables of perceive; recordings without colour have no masks."""
 SEGMENTS, REVISIONS = "segments", "revisions"
 
 
@@ -44,7 +44,7 @@ def count_segments(folder: Path) -> int:
 
 
 def discard_segments(folder: Path) -> None:
-    """Remove the segments after they were joined."""
+    """Remove all segments, after they have been joined."""
     for name in (SEGMENTS, REVISIONS):
         shutil.rmtree(folder / name, ignore_errors=True)
 
@@ -69,13 +69,13 @@ def _read_tables(segment: Path) -> _Tables:
 
 
 def _latest(folder: Path) -> Iterator[_Tables]:
-    """Yield the tables of each segment, with the frames that were seen better in a second look."""
+    """Yield the tables of each segment; frames are replaced if a second look found more."""
     places = {
         key: segment
         for segment in list_segments(folder / REVISIONS)
         for key in _revised(read_segment(segment, "frames"))
     }
-    read = lru_cache(maxsize=2)(_read_tables)  # both go through the recording in its order
+    read = lru_cache(maxsize=2)(_read_tables)  # both are in the order of the recording
     for segment in list_segments(folder / SEGMENTS):
         first = _read_tables(segment)
         keys = list(frame_rows(first["frames"]))
@@ -87,13 +87,13 @@ def _latest(folder: Path) -> Iterator[_Tables]:
 
 
 def _revised(frames: pa.Table) -> Iterator[Key]:
-    """Yield the frames that a second look has seen better."""
+    """Yield the frames in which a second look found a plane or a detection."""
     kept = numbers(frames["revised"].cast(pa.int8()))
     return (key for key, revised in zip(frame_rows(frames), kept, strict=True) if revised)
 
 
 def _picked(name: str, keys: Sequence[Key], sources: Sequence[_Tables]) -> pa.Table:
-    """Return the rows of each frame, of a table, from its source."""
+    """Return the rows of a table, those of each frame from its source."""
     rows = {id(tables): frame_rows(tables[name]) for tables in sources}
     chosen = [
         (tables[name], rows[id(tables)].get(key, slice(0, 0)))
@@ -103,16 +103,16 @@ def _picked(name: str, keys: Sequence[Key], sources: Sequence[_Tables]) -> pa.Ta
 
 
 def group_frames(frames: int) -> int:
-    """Return how many frames a row group holds, of a table of so many.
+    """Return the number of frames per row group, for a table of ``frames`` frames.
 
-    Whoever reads a table holds one of its row groups, and 30 kB about each of them: so both their
-    length and their number grow with the root of the length of the recording.
+    A reader holds one row group, and 30 kB of metadata for every one. So both the length and the
+    number of row groups grow with the square root of the number of frames.
     """
     return GROUP_FRAMES * max(1, isqrt(frames // _BALANCE))
 
 
 def row_groups(folder: Path, length: int) -> Iterator[_Tables]:
-    """Yield the tables of so many frames at a time, whatever portions the segments have."""
+    """Yield the tables of ``length`` frames at a time, whatever the length of the segments."""
     held: _Tables = {}
     for new in _latest(folder):
         held = {name: pa.concat_tables([held[name], new[name]]) for name in new} if held else new
@@ -124,7 +124,7 @@ def row_groups(folder: Path, length: int) -> Iterator[_Tables]:
 
 
 def _cut(tables: _Tables, count: int) -> tuple[_Tables, _Tables]:
-    """Part tables after a number of frames."""
+    """Split tables after ``count`` frames."""
     first = set(frame_rows(tables["frames"][:count]))
     ends = {"frames": count}
     for name in tables.keys() - ends.keys():
@@ -137,7 +137,7 @@ def _cut(tables: _Tables, count: int) -> tuple[_Tables, _Tables]:
 
 
 def write_segment(segment: Path, name: str, table: pa.Table) -> None:
-    """Write a part of a table as it lies in memory: it is soon read again, once or twice."""
+    """Write a part of a table uncompressed: it is soon read again, once or twice."""
     with (
         pa.OSFile(str(_part(segment, name)), "wb") as sink,
         pa.ipc.new_file(sink, table.schema) as writer,
@@ -146,11 +146,11 @@ def write_segment(segment: Path, name: str, table: pa.Table) -> None:
 
 
 def read_segment(segment: Path, name: str) -> pa.Table:
-    """Return a part of a table.
+    """Read a part of a table.
 
     Raises
     ------
-    OutputError : it cannot be read.
+    OutputError : the file is unreadable.
     """
     path = _part(segment, name)
     try:

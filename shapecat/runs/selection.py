@@ -17,7 +17,7 @@ __all__ = ["count_frames", "read_frames"]
 def read_frames(
     recording: Recording, options: Options, *, skipped: Counter[str], needed: Needed = None
 ) -> Iterator[tuple[Frame, ColourView | None]]:
-    """Read the selected frames, each beside its colour image.
+    """Read the selected frames, each with its colour image, or None.
 
     Parameters
     ----------
@@ -30,7 +30,7 @@ def read_frames(
 
 
 def count_frames(recording: Recording, options: Options) -> int | None:
-    """Return about how many frames are selected, None if that is not known before."""
+    """Return the approximate number of selected frames; None if it is not known in advance."""
     if options["start_s"] is not None or options["end_s"] is not None:
         return None
     streams = choose_streams(recording, options["topics"])

@@ -1,4 +1,4 @@
-"""The track of each shown detection, and the boxes to annotate."""
+"""The detections to show with the labels of their tracks, and the boxes to annotate."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -44,16 +44,17 @@ class ShownDetection(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownTracks:
-    """Shown detections of each frame of a run, by the labels of its tracks.
+    """The detections to show in each frame of a run.
 
     Attributes
     ----------
-    frames : by frame, the rows of ``detections`` and ``tracks``.
-    detections, tracks : the detections that are shown, and the track each belongs to.
-    labels : what each track is shown as.
-    ended : by frame, the tracks that the frame before it on its topic was the last to show.
-    causal : (rows, categories) the causal posteriors, if asked for.
-    full : (rows, 10) centre, size and orientation of the full boxes, NaN where they are not known.
+    frames : the rows of the arrays below, for each frame.
+    detections, tracks : (rows,) numbers of the detections in their frames, and of their tracks.
+    labels : the label of each track.
+    ended : for each frame, the tracks that were shown last in the previous frame of the topic.
+    causal : (rows, categories) causal posteriors; empty unless requested.
+    full : (rows, 10) centre, size (metres) and orientation of the full boxes in the sensor frame;
+        NaN if unknown.
     """
 
     frames: dict[Key, slice]
@@ -92,7 +93,7 @@ class ShownTracks:
             )
 
     def of(self, key: Key) -> Iterator[ShownDetection]:
-        """Yield the detections shown in a frame, in their order."""
+        """Yield the detections to show in a frame, by number."""
         rows = self.frames.get(key, _NO_ROWS)
         for row in range(rows.start, rows.stop):
             yield ShownDetection(int(self.detections[row]), self.labels[int(self.tracks[row])], row)
@@ -103,9 +104,9 @@ def read_shown_frames(
 ) -> Iterator[ShownFrame]:
     """Yield the annotations of a run, frame by frame in reading order.
 
-    As `shapecat.runs.labels.read_labelled_frames`, without points, surfaces and posteriors, several
-    times as fast. The boxes are those around all of the objects; ``visible`` ones around
-    what is seen of them.
+    It omits points, surfaces and posteriors, and is several times as fast as
+    `shapecat.runs.labels.read_labelled_frames`. Boxes enclose whole objects, as far as known; with
+    ``visible``, only their visible parts.
     """
     shown = ShownTracks.read(folder, labels)
     wanted = ("topic", "frame", "stamp_ns", "log_time_ns", "frame_id", "up")
@@ -130,7 +131,7 @@ def read_shown_frames(
 def _boxes(
     keys: Sequence[Key], shown: ShownTracks, detections: pa.Table, *, visible: bool
 ) -> Iterator[tuple[ShownBox, ...]]:
-    """Yield the boxes of some frames, from their detections."""
+    """Yield the boxes to show in each of some frames."""
     all_rows, places = frame_rows(detections), _places(detections)
     spans = [shown.frames.get(key, _NO_ROWS) for key in keys]
     firsts = [all_rows.get(key, _NO_ROWS).start for key in keys]
@@ -152,27 +153,27 @@ def _box(label: TrackLabel, row: Sequence[float]) -> ShownBox:
 
 
 def _causal(file: pq.ParquetFile) -> F4:
-    """Return (n, k) the causal posteriors of all rows."""
+    """Return the causal posteriors (n, k) of all rows."""
     values, count = numbers(file.read(columns=["posterior"])["posterior"]), file.metadata.num_rows
     return np.reshape(values, (count, values.size // max(count, 1)))
 
 
 def _full(file: pq.ParquetFile) -> F4:
-    """Return (n, 10) the full boxes of all rows, NaN where they are not known."""
-    if "center_full" not in file.schema_arrow.names:  # of an older version
+    """Return the full boxes (n, 10) of all rows; NaN if unknown."""
+    if "center_full" not in file.schema_arrow.names:  # from an older version
         return np.full((file.metadata.num_rows, sum(_FULL.values())), np.nan, np.float32)
     return numbers_or_nan(file.read(columns=list(_FULL)), _FULL)
 
 
 def _places(table: pa.Table) -> F8:
-    """Return (n, 10) the boxes of detections."""
+    """Return the visible boxes (n, 10) of detections."""
     widths = {"center": 3, "size": 3, "orientation": 4}
     columns = [numbers(table[name]).reshape(-1, width) for name, width in widths.items()]
     return np.hstack(columns).astype(np.float64)
 
 
 def _joined(boxes: Sequence[ShownBox], up: F4) -> tuple[ShownBox, ...]:
-    """Join the boxes of each merged track to one."""
+    """Join the boxes of each merged track into one."""
     parts: dict[int, list[ShownBox]] = {}
     for box in boxes:
         parts.setdefault(box.track, []).append(box)
@@ -195,7 +196,7 @@ def _join(parts: Sequence[ShownBox], up: F4) -> ShownBox:
 def _ended(
     folder: Path, frames: Mapping[Key, slice], tracks: I4, stamps_ns: I4
 ) -> dict[Key, tuple[int, ...]]:
-    """Return the tracks to delete in the frame after the last one that shows them."""
+    """Return the tracks that end in each frame: those shown last in the frame before it."""
     keys = np.repeat(np.arange(len(frames)), [rows.stop - rows.start for rows in frames.values()])
     latest = np.argsort(stamps_ns, kind="stable")[::-1]
     gone, at = np.unique(tracks[latest], return_index=True)

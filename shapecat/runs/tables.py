@@ -1,8 +1,8 @@
-"""The Parquet tables between the phases: their columns, and how records become rows.
+"""The Parquet tables between the phases: their columns, and how to read and write them.
 
 A run folder holds ``frames``, ``detections`` and ``planes`` (written by perceive), and ``tracks``
 (written by track). Row groups of the first three cover the same frames, so that they can be read
-side by side in flat memory. Adding a column is allowed within a schema version; changing the
+side by side in constant memory. Adding a column is allowed within a schema version; changing the
 meaning of one is not.
 """
 
@@ -54,7 +54,7 @@ _FULL = (
 )
 
 FRAME_COLUMNS = (("topic", pa.string()), ("frame", pa.int32()), ("stamp_ns", pa.int64()))
-"""A frame in a table: its topic, its number there, and its time."""
+"""Columns that identify a frame: topic, number on that topic, and stamp."""
 
 FRAMES = pa.schema(
     [
@@ -71,12 +71,11 @@ FRAMES = pa.schema(
         ("seconds", _FLOATS),
     ]
 )
-"""One row per frame read, also those without a detection. ``up`` is what detection went by,
-``up_given`` where transforms, an IMU or an option said it is, null where nothing did; ``revised``
-where what is here was seen in a second look, with the up that the recording tells;
-``reused_from`` is the frame that shows the same, whose scene this one repeats. ``fixed_*`` is
-``fixed_from_sensor`` (rotation row by row), null without a fixed frame; ``seconds`` per entry of
-``stages``."""
+"""One row per frame read, also without detections. ``up`` is the up direction that detection used;
+``up_given`` is from transforms, an IMU or an option, null without these. ``revised`` is true if
+the result is from a second look, with the up direction of the whole recording. ``reused_from`` is
+the earlier frame whose scene this one repeats, null if none. ``fixed_*`` is ``fixed_from_sensor``
+(rotation row by row), null if unknown. ``seconds`` has one entry per entry of ``stages``."""
 
 DETECTIONS = pa.schema(
     [
@@ -108,8 +107,8 @@ DETECTIONS = pa.schema(
     ]
 )
 """One row per object per frame; lengths in metres, ``center`` and ``neurons`` in ``frame_id``.
-The box around all of an object, ``*_full``, is null where only the visible one is known.
-``posterior`` to ``edges`` repeat those of the frame ``reused_from``; null where they are new."""
+``*_full`` is the box of the whole object, null if only the visible part is known. The columns
+``posterior`` to ``edges`` are copied from the frame ``reused_from``, unless that is null."""
 
 PLANES = pa.schema(
     [
@@ -134,12 +133,12 @@ TRACKS = pa.schema(
         ("posterior", _FLOATS),
     ]
 )
-"""One row per track per frame; ``detection`` is null while the track coasts, ``posterior`` is the
-causal one. Without a fixed frame ``center_fixed`` is in the sensor frame; ``center_full`` and
-``orientation_full`` always are, and null while the track coasts."""
+"""One row per track per frame; ``detection`` is null while the track coasts; ``posterior`` is
+causal. ``center_fixed`` is in the fixed frame, or the sensor frame if there is none.
+``center_full`` and ``orientation_full`` are in the sensor frame, null while the track coasts."""
 
 Key = tuple[str, int]
-"""A frame: its topic, and its number there."""
+"""A frame: its topic, and its number on that topic."""
 
 
 def count_rows(folder: Path, table: str) -> int:
@@ -149,7 +148,7 @@ def count_rows(folder: Path, table: str) -> int:
 
 
 def write_table(path: Path, columns: dict[str, Any], schema: pa.Schema) -> None:
-    """Write a whole table at once."""
+    """Write a table as one row group."""
     writer = open_writer(path, schema)
     with writer:
         writer.write_table(arrow_table(columns, schema))
@@ -168,18 +167,24 @@ def read_row_groups(
 
 
 def frame_rows(table: pa.Table) -> dict[Key, slice]:
-    """Return the consecutive rows of each frame."""
+    """Return the rows of each frame of a table, which are consecutive."""
     return rows_of(*topic_codes(table), numbers(table["frame"]))
 
 
 def topic_codes(table: pa.Table) -> tuple[list[str], I4]:
-    """Return the topics of a table, and the index (rows,) of each row's topic."""
+    """Return the topics in a table, and the index of each row's topic, (rows,)."""
     column = table["topic"].combine_chunks().dictionary_encode()
     return column.dictionary.to_pylist(), np.from_dlpack(column.indices)
 
 
 def rows_of(topics: Sequence[str], codes: I4, frames: I4) -> dict[Key, slice]:
-    """Return the consecutive rows of each frame; ``codes`` and ``frames`` are (rows,)."""
+    """Return the rows of each frame, which are consecutive.
+
+    Parameters
+    ----------
+    codes : (rows,) index of each row's topic.
+    frames : (rows,) number of each row's frame.
+    """
     changes = (np.diff(codes) != 0) | (np.diff(frames) != 0)
     starts = np.flatnonzero(np.concatenate([np.ones(min(1, len(frames)), np.bool_), changes]))
     names = map(topics.__getitem__, codes[starts].tolist())
@@ -189,26 +194,30 @@ def rows_of(topics: Sequence[str], codes: I4, frames: I4) -> dict[Key, slice]:
 
 
 def numbers(column: pa.ChunkedArray) -> Any:
-    """Return the numbers of a column without nulls; those of lists row after row.
+    """Return a column without nulls as a flat array; lists are concatenated.
 
-    Arrow's own way, and any scalar or array made by it, loads Pandas, which takes a third of a
-    second.
+    Arrow's own conversion loads pandas, which takes a third of a second.
     """
     array = column.combine_chunks()
     return np.from_dlpack(array if pa.types.is_primitive(array.type) else array.flatten())
 
 
 def release_memory() -> None:
-    """Return freed memory to the system before the next phase."""
+    """Return freed memory to the operating system."""
     for pool in (pa.default_memory_pool(), pa.system_memory_pool()):
         pool.release_unused()
-    with suppress(OSError, AttributeError):  # glibc keeps what is freed in pieces
+    with suppress(OSError, AttributeError):  # glibc keeps small freed blocks
         ctypes.CDLL(None).malloc_trim(0)
 
 
 @contextmanager
 def opened(path: Path) -> Iterator[pq.ParquetFile]:
-    """Open a table of a run folder."""
+    """Open a table of a run folder.
+
+    Raises
+    ------
+    OutputError : the table is missing or unreadable.
+    """
     try:
         with pq.ParquetFile(path) as file:
             yield file
@@ -218,8 +227,8 @@ def opened(path: Path) -> Iterator[pq.ParquetFile]:
 
 
 def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
-    """Open a table to write row groups to."""
-    # Ascending pixel indices shrink tenfold as differences; floats do not gain from a dictionary.
+    """Open a table for writing row groups."""
+    # Ascending pixel indices shrink tenfold as differences; a dictionary does not help floats.
     texts = [f.name for f in schema if f.type == pa.string()]
     deltas = {f"{n}.list.element": "DELTA_BINARY_PACKED" for n in ("indices",) if n in schema.names}
     return pq.ParquetWriter(
@@ -234,7 +243,7 @@ def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
 
 
 def arrow_table(columns: dict[str, Any], schema: pa.Schema) -> pa.Table:
-    """Return columns as a table of a schema."""
+    """Return columns as a table with a schema."""
     arrays = [
         column if isinstance(column, pa.Array) else pa.array(column, field.type)
         for field, column in ((field, columns[field.name]) for field in schema)
@@ -243,7 +252,7 @@ def arrow_table(columns: dict[str, Any], schema: pa.Schema) -> pa.Table:
 
 
 def lists(rows: Sequence[Any], kind: pa.DataType) -> pa.Array:
-    """Return ragged rows of numbers as a list column."""
+    """Return rows of numbers, of any length, as a list column."""
     flat = [np.ravel(row) for row in rows]
     offsets = np.concatenate([[0], np.cumsum([row.size for row in flat])]).astype(np.int32)
     values = np.concatenate(flat) if flat else np.zeros(0)

@@ -1,7 +1,6 @@
-"""tracks.csv: one line per track, for reading and correction, also in a spreadsheet.
+"""tracks.csv: one line per track, to read and correct, also in a spreadsheet.
 
-Separators, quotes, line ends, encodings, the order of columns and numbers such as ``1.0`` do not
-matter.
+Any separator, quotes, line ends, encoding, order of columns, and numbers such as ``1.0`` are read.
 """
 
 import csv
@@ -27,7 +26,7 @@ _LARGEST_TABLE = 64 << 20
 
 @dataclass(frozen=True)
 class TrackRow:
-    """A line of tracks.csv; ``cells`` are all its columns as written."""
+    """A line of tracks.csv; ``line`` counts from 1, ``cells`` holds all columns as text."""
 
     line: int
     track: int
@@ -40,7 +39,7 @@ class TrackRow:
 
 @dataclass(frozen=True)
 class TrackTable:
-    """The rows of a tracks.csv, and the problems of lines that could not be read."""
+    """The rows of a tracks.csv, and the problems of invalid lines."""
 
     columns: tuple[str, ...]
     rows: tuple[TrackRow, ...]
@@ -48,12 +47,12 @@ class TrackTable:
 
     @property
     def run(self) -> str:
-        """The ``work`` of the run of the tracks; empty if unknown."""
+        """The ``work`` id of the run of the tracks; empty if unknown."""
         return next(iter(self.runs), "")
 
     @property
     def runs(self) -> tuple[str, ...]:
-        """All that are named in the table: more than one if tables were mixed."""
+        """All ``work`` ids in the table: more than one if tables were mixed."""
         ids = (row.cells.get("run", "").strip() for row in self.rows)
         return tuple(dict.fromkeys(filter(None, ids)))
 
@@ -63,7 +62,7 @@ def read_track_table(path: Path) -> TrackTable:
 
     Raises
     ------
-    OutputError : the file is not a table with the columns of tracks.csv.
+    OutputError : the file is unreadable, or lacks columns of tracks.csv.
     """
     lines = csv.reader(io.StringIO(_text(path), newline=""), delimiter=_separator(path))
     rows: dict[int, TrackRow] = {}
@@ -91,7 +90,7 @@ def read_track_table(path: Path) -> TrackTable:
 
 
 def _text(path: Path) -> str:
-    """Return the text of a table in whichever encoding a spreadsheet has saved it."""
+    """Return the text of a table, in any of the encodings that spreadsheets use."""
     try:
         if path.stat().st_size > _LARGEST_TABLE:
             msg = f"{path}: larger than {_LARGEST_TABLE >> 20} MB, not a tracks.csv"
@@ -111,7 +110,7 @@ def _text(path: Path) -> str:
 
 
 def _separator(path: Path) -> str:
-    """Return the separator of the line that names the columns."""
+    """Return the separator in the header line: a comma, a semicolon or a tab."""
     lines = (line for line in _text(path).splitlines() if "track" in line.lower())
     header = next(lines, "")
     return max(",;\t", key=header.count)
@@ -127,7 +126,7 @@ def _header(path: Path, cells: Sequence[str]) -> tuple[str, ...]:
 
 
 def _row(line: int, cells: Mapping[str, str]) -> TrackRow | str:
-    """Return a row, or its problem."""
+    """Return a row, or the problem of an invalid line."""
     try:
         track = _number(cells["track"])
         confidence = _number(cells["confidence"])

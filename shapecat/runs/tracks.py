@@ -31,7 +31,7 @@ from shapecat.types import UNKNOWN
 
 __all__ = ["track_run"]
 
-_BATCH = 2**17  # rows of tracks.parquet that are made together
+_BATCH = 2**17  # rows of tracks.parquet written at a time
 _NO_TURN = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 _COLUMNS = (
     "topic",
@@ -56,7 +56,7 @@ def track_run(
 
     Parameters
     ----------
-    work : goes into each line of tracks.csv, so that it is not taken for another run's.
+    work : ``work`` id of the run, written to each line of tracks.csv.
 
     Returns
     -------
@@ -73,7 +73,7 @@ def track_run(
         for some in _batches(tracks):
             _write(writer, some, full, categories)
             lines += [_Line.of(track, categories) for track in some]
-            some.clear()  # the next one may be as long
+            some.clear()  # the next batch may be as long
             release_memory()
     with replacing(folder / "tracks.csv") as path:
         _write_csv(path, lines, _start_ns(folder), work)
@@ -90,7 +90,7 @@ def _write(
 
 
 def _batches(tracks: Iterable[Track]) -> Iterator[list[Track]]:
-    """Yield tracks in turn: one that is long, or some that are not much longer together."""
+    """Yield batches of tracks: one long track, or several short ones."""
     some: list[Track] = []
     for track in tracks:
         if len(track.frames) > _BATCH and some:
@@ -105,7 +105,7 @@ def _batches(tracks: Iterable[Track]) -> Iterator[list[Track]]:
 
 
 def _parts(some: list[Track]) -> Iterator[tuple[list[Track], slice]]:
-    """Yield what is written at once, and which rows of the batch that is."""
+    """Yield the tracks to write at a time, and their rows in the batch."""
     if len(some) != 1:
         yield some, slice(None)
         return
@@ -115,9 +115,9 @@ def _parts(some: list[Track]) -> Iterator[tuple[list[Track], slice]]:
 
 
 def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[FrameDetections]:
-    """Yield the detections of each frame, those of a stream in one coordinate frame.
+    """Yield the detections of each frame, in the sensor frame.
 
-    ``fixed`` are the topics whose detections are taken in the fixed frame.
+    For the topics in ``fixed`` they are in the fixed frame.
     """
     groups = zip(
         read_row_groups(
@@ -151,7 +151,7 @@ def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[Fra
 
 
 def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
-    """Return the columns for the tracker as arrays; NaN without a fixed frame."""
+    """Return the columns for the tracker as arrays; ``center_fixed`` is NaN if unknown."""
     columns = {name: table[name].to_numpy() for name in ("detection", "novelty")}
     widths = {"center": 3, "size": 3, "orientation": 4, "posterior": categories}
     for name, width in widths.items():
@@ -170,9 +170,9 @@ def _columns_of(table: pa.Table, categories: int) -> dict[str, Any]:
 
 
 def _streams_with_poses(folder: Path) -> set[str]:
-    """Return the topics whose sensor has a pose in the fixed frame most of the time.
+    """Return the topics whose sensor pose in the fixed frame is known in most frames.
 
-    Their detections in frames without one cannot be placed, and are not tracked.
+    Their detections in the other frames are not tracked.
     """
     balance: Counter[str] = Counter()
     for group in read_row_groups(folder / "frames.parquet", ["topic", "fixed_translation"]):
@@ -183,7 +183,7 @@ def _streams_with_poses(folder: Path) -> set[str]:
 
 
 def _columns(tracks: Sequence[Track], boxes: F4, categories: Sequence[str]) -> dict[str, Any]:
-    """Return the rows of some tracks, track after track, each in time."""
+    """Return the table columns of some tracks, track after track, each by time."""
 
     def column(name: str, kind: str, *width: int) -> Any:
         values = [np.asarray(getattr(track, name), kind) for track in tracks]
@@ -203,7 +203,7 @@ def _columns(tracks: Sequence[Track], boxes: F4, categories: Sequence[str]) -> d
 
 
 class _Line(NamedTuple):
-    """What tracks.csv says of a track."""
+    """The values of a track in tracks.csv."""
 
     track: int
     first_ns: int
@@ -252,7 +252,7 @@ _CSV = (
 
 
 def _write_csv(path: Path, lines: Sequence[_Line], start_ns: int, work: str) -> None:
-    """Write a line per track: unknown ones first, then by ascending confidence."""
+    """Write a line per track, unknown categories first, then by ascending confidence."""
     rows = sorted(lines, key=lambda line: (line.category != UNKNOWN, line.confidence, line.track))
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file, lineterminator="\n")
