@@ -1,4 +1,4 @@
-# Everything a developer does, by name. `make` alone lists the targets.
+# The developer's commands. `make` alone lists the targets.
 
 PYTHON ?= python3
 BIN := .venv/bin
@@ -6,7 +6,7 @@ OPEN3D_LIBRARIES := libegl1 libgl1 libx11-6 libusb-1.0-0
 SCREENS := chromium chromium-driver mesa-vulkan-drivers
 DEMO := demo
 MUTATIONS := nice -n 19 $(BIN)/python -m tests.mutations
-# Two processes share the cores: threads of their libraries would only wait for each other.
+# Two test processes use both cores, so their libraries must not start threads.
 PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile \
     --no-loadscope-reorder
 
@@ -28,44 +28,44 @@ setup: .venv/ready ## make the virtual environment .venv from the lock file
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --require-hashes -r requirements.lock
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --editable .
 	@$(BIN)/python -c 'import open3d' >/dev/null 2>&1 || $(call apt,$(OPEN3D_LIBRARIES)) \
-	    || echo "(only reading .pcd/.ply data sets and smoothing need them)" >&2
+	    || echo "(only training on triangle meshes needs them)" >&2
 	@touch $@
 
-demo: setup ## simulate a recording, process it, and say where the results lie
+demo: setup ## simulate a recording, process it, and print where the results are
 	$(BIN)/shapecat simulate $(DEMO)/tabletop.mcap --scene tabletop --frames 60 --seed 3 --overwrite
 	$(BIN)/shapecat process $(DEMO)/tabletop.mcap --out $(DEMO)/out --overwrite
 
 test: setup kernels ## run the quick tests
 	@{ command -v chromedriver && ls /usr/share/vulkan/icd.d/*; } >/dev/null 2>&1 \
-	    || echo "(tests in a browser and of screenshots are skipped; \`make screens\` installs what they need)" >&2
+	    || echo "(browser and screenshot tests are skipped; \`make screens\` installs what they need)" >&2
 	$(PYTEST) -m 'not many'
 
-test-all: setup kernels ## run all tests, also long ones, and a sample of mutants
+test-all: setup kernels ## run all tests, including long ones, and a sample of mutants
 	$(PYTEST)
 	$(MUTATIONS) --only quick --count 60 --least 0.65
 
-mutations: setup kernels ## flip every operator of the modules without kernels, for hours
+mutations: setup kernels ## flip every operator in the modules without kernels (takes hours)
 	$(MUTATIONS)
 
-coverage: setup kernels ## run the quick tests and print which lines and branches they reach
+coverage: setup kernels ## run the quick tests and print the lines and branches that they reach
 	$(PYTEST) -m 'not many' --cov --cov-report=term:skip-covered
 
-screens: ## install the packages that tests in a browser and of screenshots need
+screens: ## install the packages that browser and screenshot tests need
 	@{ command -v chromedriver && ls /usr/share/vulkan/icd.d/*; } >/dev/null 2>&1 || $(call apt,$(SCREENS))
 
 kernels: setup
 	@$(BIN)/python -m shapecat.rehearsal
 
-fixtures: setup kernels ## make the recordings in fixtures/ anew, and the tables expected of them
+fixtures: setup kernels ## remake the recordings in fixtures/ and their expected tables
 	$(BIN)/python -m tests.fixtures
 
-picture: setup ## draw the picture of ARCHITECTURE.md anew from the imports of the code
+picture: setup ## redraw the picture in ARCHITECTURE.md from the imports of the code
 	$(BIN)/python -m tests.picture
 
-odd: setup ## process damaged and odd recordings, print what became of each
+odd: setup ## process damaged and unusual recordings and print the outcome of each
 	$(BIN)/python -m tests.odd
 
-faults: setup kernels ## interrupt, kill and starve the command at random, print what held
+faults: setup kernels ## interrupt, kill and starve the command at random and print the outcomes
 	$(BIN)/python -m tests.faults --count 200 --minutes 13
 
 lint: setup ## check style and types
@@ -78,27 +78,27 @@ format: setup ## format the code
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix-only .
 
-bench: setup ## measure the speed of stages and whole recordings, print tables
+bench: setup ## measure stages and whole recordings, and print tables
 	$(BIN)/python -m benchmarks
 	$(BIN)/python -m benchmarks.whole
 	$(BIN)/python -m benchmarks.cluster
 
-model: setup ## train the default model anew from the simulator
+model: setup ## train the default model on the simulator
 	$(BIN)/python -m shapecat.models.training
 
-parts: setup ## grow the trees of the detection anew: for merging segments, then for rejecting background
+parts: setup ## grow the trees of detection: for merging segments, then for rejecting background
 	$(BIN)/python -m shapecat.models.parts
 	$(BIN)/python -m shapecat.models.structure
 
-lock: setup ## renew requirements.lock from pyproject.toml
+lock: setup ## update requirements.lock from pyproject.toml
 	$(BIN)/pip install --quiet uv
 	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --group dev --generate-hashes \
 	    --no-emit-index-url --no-header pyproject.toml --output-file requirements.lock
 
-clean: ## remove the environment and everything made
+clean: ## remove the environment and all build products
 	rm -rf .venv build dist $(DEMO) *.egg-info
 
-# Install Debian packages where that is allowed, otherwise name the command.
+# Install Debian packages as root; otherwise print the command for it.
 apt = { [ "$$(id -u)" = 0 ] && command -v apt-get >/dev/null \
     && apt-get update -qq && apt-get install -y -qq --no-install-recommends $(1) >/dev/null; } \
     || { echo "missing system packages: sudo apt-get install -y $(1)" >&2; false; }

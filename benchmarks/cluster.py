@@ -295,7 +295,7 @@ def main(
             rows = check(Path(folder), recordings=16, frames=60)
         print(markdown("model", ("workers", "measured s", "model s", "error %"), rows))
     elif count:
-        columns = ("recordings", "plan s", "note s", "read s", "plan again s", "MB stored", "MB")
+        columns = ("recordings", "plan s", "write s", "read s", "plan again s", "MB stored", "MB")
         print(markdown("limits", columns, [limits(count)]))
     else:
         study(Assumed(recordings=recordings), frame_ms / 1000, plot)
