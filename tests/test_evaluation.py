@@ -258,7 +258,7 @@ def test_plain_learners_are_judged_beside_the_chain(compared: Report, tmp_path: 
     """All see the same views: a chain that a plain learner beats has to show it."""
     names = [item.learner for item in compared.baselines]
 
-    assert names[:4] == ["the chain", "forest", "linear", "pnn"]
+    assert names[:4] == ["shapecat", "forest", "linear", "pnn"]
     assert names[-2:] == ["forest on D2", "forest on D2, D3, A3 (ESF-like)"]
     assert all(item.accuracy == item.balanced_accuracy for item in compared.baselines)
     assert min(item.accuracy or 0 for item in compared.baselines) >= 0.75

@@ -98,7 +98,7 @@ def test_the_model_stands_beside_plain_learners_on_the_same_views() -> None:
     rows = compare_with_plain(train, test, model, **choices)
 
     names = [name for name, *_ in rows]
-    assert names[:3] == ["the model", "the chain", "forest"]
+    assert names[:3] == ["the model", "shapecat", "forest"]
     assert names[-2:] == ["forest on D2", "forest on D2, D3, A3 (ESF-like)"]
     assert {learned for _, learned, *_ in rows} == {"60"}
     assert rows[0][2:] == ("1.000", "1.000")

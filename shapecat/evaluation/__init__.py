@@ -1,4 +1,4 @@
-"""Evaluation (thesis ch. 8): tables and figures for any model and labelled data set."""
+"""Evaluation of models on labelled data sets, and of runs against a reference (thesis ch. 8)."""
 
 from shapecat.evaluation.dataset import Dataset, View, read_dataset
 from shapecat.evaluation.folder import evaluate_folder

@@ -1,4 +1,4 @@
-"""Simple learners as baselines of the full chain, on the same views."""
+"""Comparison of shapecat's classifier with baselines on the same views."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -21,7 +21,7 @@ _FOLDS = 5
 
 
 _Learner = Callable[[DescribedViews, DescribedViews, tuple[str, ...]], F8]
-"""Learns from views and returns posteriors of others in the order of the categories."""
+"""Trains on some views; returns the posteriors (n, c) of others for the given categories."""
 
 
 def compare_learners(
@@ -35,26 +35,26 @@ def compare_learners(
     jobs: int | None = None,
     observe: Observer = ignore,
 ) -> tuple[Compared, ...]:
-    """Train the chain and each plain learner on the same views, and judge them on the same views.
+    """Train shapecat's classifier and baselines on the same views, and test them on the same views.
 
     Parameters
     ----------
-    test : views to judge on; those labelled ``unknown`` are left out.
-    train : views to learn from. None is learning from ``test`` itself, in five folds: each learner
-        is judged on views of instances it has not seen, in as many turns.
-    categories : order of the posteriors; one that a learner has not seen counts as missed.
-    root : the folder that errors name.
-    blocks : the blocks of the descriptor to learn from.
-    jobs : processes.
+    test : test views; those labelled ``unknown`` are left out.
+    train : training views. If None, use ``test`` in five-fold cross-validation by instance.
+    categories : order of the posteriors; a category without training views counts as missed.
+    root : folder to name in errors.
+    blocks : names of the descriptor's blocks to use.
+    jobs : number of trees grown at the same time.
 
     Returns
     -------
-    The chain, then the baselines of `shapecat.learning.baselines`, and forests on plain shape
-    distributions (D2, and D2, D3 and A3 together).
+    Results of shapecat's classifier, of the baselines of `shapecat.learning.baselines`, and of
+    forests on shape distributions (D2; D2, D3 and A3 together).
 
     Raises
     ------
-    RecordingError : fewer than two categories to learn from.
+    RecordingError : there are fewer than two categories, or, for cross-validation, a category with
+        only one instance.
     """
     splits = list(_folds(test, seed)) if train is None else [(train, test)]
     if not splits or any(len(_known(part.labels)) < 2 for part, _ in splits):
@@ -93,7 +93,7 @@ def _judged(
     splits: list[tuple[DescribedViews, DescribedViews]],
     categories: tuple[str, ...],
 ) -> tuple[I4, F8]:
-    """Return the truth and the posteriors of all judged views."""
+    """Return the true columns (n,) and the posteriors (n, c) of all test views."""
     truths, posteriors = [], []
     for train, test in splits:
         known = test.where(test.labels != UNKNOWN)
@@ -117,7 +117,7 @@ def _learners(blocks: tuple[str, ...], seed: int, jobs: int | None) -> dict[str,
     from shapecat.learning.baselines import make_baselines  # noqa: PLC0415  scikit-learn
 
     makers = make_baselines({name: BLOCKS[name] for name in blocks}, seed=seed, jobs=jobs)
-    learners: dict[str, _Learner] = {"the chain": _chain(blocks, seed, jobs)}
+    learners: dict[str, _Learner] = {"shapecat": _chain(blocks, seed, jobs)}
     learners |= {name: _plain(make, _descriptors) for name, make in makers.items()}
     learners["forest on D2"] = _plain(makers["forest"], _d2)
     learners["forest on D2, D3, A3 (ESF-like)"] = _plain(makers["forest"], _functions)
@@ -125,7 +125,7 @@ def _learners(blocks: tuple[str, ...], seed: int, jobs: int | None) -> dict[str,
 
 
 def _chain(blocks: tuple[str, ...], seed: int, jobs: int | None) -> _Learner:
-    """Return the whole chain: also shown the views of no category, as `shapecat train` is."""
+    """Return shapecat's classifier, trained also on unknown shapes, like `shapecat train`."""
 
     def learn(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
         nothing = train.where(np.zeros(0, np.int64))
@@ -145,7 +145,7 @@ def _plain(make: Callable[[], Any], features: Callable[[DescribedViews], F4]) ->
 
 
 def _in_order(posteriors: F4, found: Any, categories: tuple[str, ...]) -> F8:
-    """Return columns in the order of ``categories``: 0 where the learner does not know one."""
+    """Return the columns in the order of ``categories``; 0 for those missing in ``found``."""
     names = [str(name) for name in found]
     result = np.zeros((len(posteriors), len(categories)))
     for column, name in enumerate(categories):

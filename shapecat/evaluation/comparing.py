@@ -1,4 +1,4 @@
-"""A run compared with the truth, with labels of other tools, or with another run."""
+"""Comparison of a run with ground truth, labels of other tools, or another run."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -40,10 +40,16 @@ def _ignore(_phase: str, _done: int, _total: int | None) -> None:
 
 
 class Difference(NamedTuple):
-    """A row of the table: a true object and its match, or one without the other.
+    """A row of the table: a true object and the detection matched to it, or one without the other.
 
-    ``difference`` is ``missed``, ``surplus``, ``outline``, ``category``, ``identity``, or None
-    where they agree; ``f``, ``iou`` and ``box_iou`` are None where they cannot be computed.
+    Attributes
+    ----------
+    difference : ``missed``, ``surplus``, ``outline`` (``f`` below 0.75), ``category``, ``identity``
+        (another track than before), or None if both agree.
+    true_track, true_category : from the reference; None without a true object.
+    track, category, confidence : from the run; None without a detection.
+    f, iou : overlap of the masks; None without masks.
+    box_iou : overlap of the 3D boxes; None without boxes.
     """
 
     topic: str
@@ -66,10 +72,12 @@ class Comparison:
 
     Attributes
     ----------
-    figures : all figures by name, plain values; None where they cannot be computed.
-    rows : every object of every frame compared.
+    run, reference : paths of the two.
+    kind : kind of the reference, in words.
+    figures : metrics by name, plain values; None if they cannot be computed.
+    rows : all objects of all compared frames.
     pictures : the frames that differ most, in the order of time.
-    notes : what the reader should know.
+    notes : remarks for the reader.
     """
 
     run: str
@@ -89,7 +97,7 @@ class Comparison:
 
 @dataclass
 class _Tally:
-    """Counts over the frames."""
+    """Counts over all frames."""
 
     overlap: Overlap = field(default_factory=Overlap)
     pairs: Pairs = field(default_factory=Pairs)
@@ -113,12 +121,12 @@ def compare(
 
     Parameters
     ----------
-    reference : see `open_reference`.
-    recording : where the recording is now; it is read for the pictures alone.
+    reference : path as for `open_reference`.
+    recording : present path of the recording, if it was moved; only the pictures need it.
 
     Raises
     ------
-    OutputError : the folder is no complete run, or the other is of another recording.
+    OutputError : the folder is not a complete run, or the reference is a run of another recording.
     RecordingError : the reference cannot be read, or has no frame in common with the run.
     """
     finished = read_complete(folder)
@@ -170,7 +178,7 @@ def _nothing_in_common(finished: FinishedRun, reference: Path, other: Reference)
 def _clouds(
     finished: FinishedRun, recording: Path | None, stack: ExitStack
 ) -> tuple[Iterator[Frame], list[str]]:
-    """Return the frames of the recording, or none and a note if it is missing."""
+    """Return the frames of the recording; if it is missing, no frames and a note."""
     try:
         source = stack.enter_context(open_source(finished.run, recording))
         return clouds_again(source, finished.run), []
@@ -210,11 +218,11 @@ def _compare_frame(
 
 
 def _labelled_part(found: Labelling, true: Labelling, key: Key) -> Labelling:
-    """Return the detections in the labelled part of the image.
+    """Return the detections without the pixels that have no label in the truth.
 
     Raises
     ------
-    RecordingError : the labels are of an image of another size.
+    RecordingError : the size of the label image differs from that of the depth image.
     """
     size = None if true.shape is None else true.shape[0] * true.shape[1]
     pixels = [item.pixels for item in found.items if item.pixels is not None and item.pixels.size]

@@ -1,4 +1,4 @@
-"""Figures of a comparison, from the counts over its frames."""
+"""Metrics of a comparison, from the counts over its frames."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -17,7 +17,15 @@ __all__ = ["Pairs", "figures_of"]
 
 @dataclass
 class Pairs:
-    """Categories of matched objects that are not ambiguous: true and predicted."""
+    """True and predicted categories of matched objects; ambiguous objects are left out.
+
+    Attributes
+    ----------
+    truth : true categories.
+    labels : final categories of the tracks.
+    views : categories of the single views.
+    posteriors : posteriors (c,) of the single views.
+    """
 
     truth: list[str] = field(default_factory=list)
     labels: list[str] = field(default_factory=list)
@@ -25,7 +33,7 @@ class Pairs:
     posteriors: list[Any] = field(default_factory=list)
 
     def add(self, found: Sequence[Item], true: Sequence[Item], matched: Any) -> None:
-        """Add the pairs of a frame."""
+        """Add the matched pairs of a frame."""
         for i, j in matched.pairs.items():
             if true[j].decidable:
                 self.truth.append(true[j].category)
@@ -44,13 +52,16 @@ def figures_of(
     categories: Sequence[str],
     threshold: float,
 ) -> dict[str, Any]:
-    """Return all figures by name, as plain values; None where they cannot be computed.
+    """Return all metrics by name, as plain values; None if they cannot be computed.
 
     Parameters
     ----------
-    overlap : None without masks.
-    seen : None without identities.
-    categories : those of the model; true objects of others are left out where categories count.
+    frames : numbers of frames, by name.
+    overlap : overlap of the masks; None without masks.
+    seen : identities of each frame; None without identities.
+    rows : the `Difference` rows of all frames.
+    categories : categories of the model; the metrics of categories leave other true objects out.
+    threshold : similarity from which a pair is the same object, for the tracking metrics.
     """
     boxes = [row.box_iou for row in rows if row.box_iou is not None]
     return {
@@ -64,7 +75,7 @@ def figures_of(
 
 
 def _objects(rows: Sequence[Any], overlap: Overlap | None) -> dict[str, Any]:
-    """Count true and found objects, matched by masks, or by boxes without masks."""
+    """Count true and found objects, matched by masks, or by boxes if there are no masks."""
     true = sum(row.difference != "surplus" for row in rows)
     detections = sum(row.difference != "missed" for row in rows)
     hits = overlap.hits if overlap else sum(r.difference not in {"surplus", "missed"} for r in rows)
@@ -81,9 +92,9 @@ def _overlap(overlap: Overlap) -> dict[str, float]:
 
 
 def _category(pairs: Pairs, categories: Sequence[str]) -> dict[str, Any]:
-    """Score final labels and single views; calibration uses the posteriors of single views.
+    """Return the accuracies of final labels and single views, and the views' calibration error.
 
-    Where the truth is another run, it may say unknown: no category of the model, left out.
+    True objects outside the model's categories are left out, such as unknown ones of another run.
     """
     known = [k for k, name in enumerate(pairs.truth) if name in categories]
     truth = np.array([categories.index(pairs.truth[k]) for k in known], np.int64)
@@ -107,7 +118,7 @@ def _agreement(truth: Sequence[str], said: Sequence[str], known: Sequence[int]) 
 
 
 def _balanced(truth: Sequence[str], said: Sequence[str], known: Sequence[int]) -> float | None:
-    """Return the mean recall of the categories."""
+    """Return the mean recall over the categories."""
     names = sorted({truth[k] for k in known})
     recalls = [_agreement(truth, said, [k for k in known if truth[k] == name]) for name in names]
     return _mean([value for value in recalls if value is not None])

@@ -1,4 +1,4 @@
-"""Which found object is which true one, in a frame."""
+"""Matching of the found and true objects of a frame."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -13,16 +13,21 @@ from shapecat.evaluation.overlap import Overlap, box_iou, match_masks
 __all__ = ["SAME_BOX", "SAME_MASK", "Matched", "item_box_iou", "match_objects", "seen_together"]
 
 SAME_MASK = 0.5
-"""Intersection over union from which two masks are the same object (PASCAL VOC)."""
+"""IoU from which two masks are the same object (PASCAL VOC)."""
 SAME_BOX = 0.25
-"""The same of boxes in 3D, whose hidden sides are guesses (SUN RGB-D, Song 2015)."""
+"""IoU from which two 3D boxes are the same object; lower, as hidden sides are estimates (SUN RGB-D,
+Song 2015)."""
 
 
 class Matched(NamedTuple):
-    """Pairs of found and true objects of a frame.
+    """Matched objects of a frame.
 
-    ``similarity`` (found, true) is of all; ``f`` (found, true) and ``overlap`` are None without
-    masks.
+    Attributes
+    ----------
+    pairs : index of the true object for each matched found object.
+    similarity : (found, true) IoU of the masks, or of the 3D boxes if matched by boxes.
+    f : (found, true) overlap F of the masks; None if matched by boxes.
+    overlap : counts of the masks' pixels; None if matched by boxes.
     """
 
     pairs: dict[int, int]
@@ -32,7 +37,12 @@ class Matched(NamedTuple):
 
 
 def match_objects(found: Sequence[Item], true: Sequence[Item]) -> Matched:
-    """Match by masks where both have them, else by boxes."""
+    """Match the objects of a frame one to one.
+
+    If all objects of both sides have masks, pairs maximise the sum of overlap F and need an IoU of
+    at least 0.5. Otherwise all objects are matched by 3D boxes: pairs maximise the sum of IoU and
+    need an IoU of at least 0.25.
+    """
     masks = [[i.pixels for i in items if i.pixels is not None] for items in (found, true)]
     if len(masks[0]) == len(found) and len(masks[1]) == len(true):
         by_mask = match_masks(masks[0], masks[1])
@@ -49,12 +59,12 @@ def _best(iou: Any) -> dict[int, int]:
 
 
 def item_box_iou(a: Item, b: Item) -> float | None:
-    """Return the 3D overlap of two boxes; None if a box is missing."""
+    """Return the IoU of two objects' 3D boxes; None if a box is missing."""
     return None if a.box is None or b.box is None else box_iou(a.box, b.box)
 
 
 def seen_together(found: Sequence[Item], true: Sequence[Item], matched: Matched) -> SeenTogether:
-    """Return the objects for the tracking scores; of a merged track the most similar part."""
+    """Return the identities of a frame; a track with several detections keeps the most similar."""
     best: dict[int, int] = {}
     for i, item in enumerate(found):
         if item.track is None:

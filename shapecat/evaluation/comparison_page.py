@@ -1,4 +1,4 @@
-"""Output of a comparison: figures, a page with pictures, a table of all objects."""
+"""Output of a comparison: metrics, a page with pictures, and a table of all objects."""
 
 import json
 from collections.abc import Sequence
@@ -33,15 +33,15 @@ OBJECTS = pa.schema(
         ("box_iou", pa.float32()),
     ]
 )
-"""One row per true object with what was found of it, and per found object without a true one."""
+"""One row per true object, with the detection matched to it, and one per unmatched detection."""
 
 
 def require_new(folder: Path) -> None:
-    """Refuse a folder that holds something, before the work begins.
+    """Check, before the work begins, that a folder is new or empty.
 
     Raises
     ------
-    OutputError : it is there and not empty, or cannot be made.
+    OutputError : the folder is not empty, or cannot be created.
     """
     try:
         taken = folder.exists() and (not folder.is_dir() or any(folder.iterdir()))
@@ -59,7 +59,7 @@ def write_comparison(folder: Path, found: Comparison) -> None:
 
     Raises
     ------
-    OutputError : the folder holds something, or is not writable.
+    OutputError : the folder is not empty, or cannot be written.
     """
     require_new(folder)
     columns = zip(*found.rows, strict=True) if found.rows else ([] for _ in Difference._fields)
@@ -79,7 +79,7 @@ _Row = tuple[str, str, str]
 
 
 def figure_rows(found: Comparison) -> list[_Row]:
-    """Return name, value and meaning of each figure that could be computed."""
+    """Return name, value and meaning of each metric that could be computed."""
     figures, rows = found.figures, list[_Row]()
     frames, objects, category = (figures[n] for n in ("frames", "objects", "category"))
     aside = [
@@ -116,8 +116,8 @@ def _category_rows(category: dict[str, Any]) -> list[_Row]:
             _percent(category["accuracy"]),
             f"of {category['n']} matched objects" + (f"; {most}" if most else ""),
         ),
-        ("  of single views", _percent(category["view_accuracy"]), "before tracks fuse them"),
-        ("calibration error", f"{category['ece']:.3f}", "of single views (ECE); 0 is perfect"),
+        ("  single views", _percent(category["view_accuracy"]), "before fusion over the track"),
+        ("calibration error", f"{category['ece']:.3f}", "ECE of single views; 0 is perfect"),
     ]
 
 
@@ -143,7 +143,7 @@ def _text(value: float | None) -> str:
 
 
 def format_page(found: Comparison) -> str:
-    """Return a comparison as an HTML page with its pictures inside."""
+    """Return a comparison as an HTML page with embedded pictures."""
     differing = [row for row in found.rows if row.difference]
     return _PAGE.substitute(
         title=escape(f"{Path(found.run).name} compared with {Path(found.reference).name}"),
@@ -230,7 +230,7 @@ text-anchor:middle}
 border-radius:2px;margin-right:.4em;vertical-align:-1px}
 </style><body><h1>$title</h1><p class="sub">$subtitle</p>$notes
 $figures<h2>Frames that differ most</h2>
-<p>The one that differs most of each twelfth of the run.</p>
+<p>The frame with the most differences in each twelfth of the run.</p>
 <p class="legend">$legend</p><div class="pictures">$pictures</div>
 <h2>Frame by frame</h2><p>$count. All objects are in objects.parquet.</p>$rows</body></html>
 """

@@ -21,13 +21,13 @@ COLOURS = {
     "surplus": (30, 100, 220),
     "category": (160, 40, 170),
 }
-"""Pixels that both have for the same object, the truth alone, the run alone; and those of an
-object that has another category."""
+"""Colours of pixels: in the same object of both, only in the truth, only in the run, and in the
+same object with different categories."""
 _INK = 0.55
 
 
 class Caption(NamedTuple):
-    """A text at a place of the picture, in pixels."""
+    """A text and its position in the picture, pixels."""
 
     x: float
     y: float
@@ -35,7 +35,10 @@ class Caption(NamedTuple):
 
 
 class DifferenceImage(NamedTuple):
-    """A frame as a data URI of a PNG, with captions; the more it differs, the graver."""
+    """A picture of a frame: a PNG as a data URI, with captions and the differences it shows.
+
+    ``severity`` grows with the number of differences.
+    """
 
     topic: str
     frame: int
@@ -56,12 +59,17 @@ def draw_frame(
     rows: Sequence[Any],
     severity: float,
 ) -> DifferenceImage | None:
-    """Draw found and true masks over the depth image; None without an image.
+    """Draw found and true masks over the depth image.
 
     Parameters
     ----------
-    pairs : found objects and the true ones they are.
-    rows : what differs, first of each found object, in their order.
+    frame : the depth frame; None for a plain background.
+    pairs : index of the true object for each matched found object.
+    rows : `Difference` rows of the frame, those of the found objects first, in their order.
+
+    Returns
+    -------
+    The picture; None if the frame is not an image.
     """
     shape = true.shape
     if frame is not None:
@@ -82,9 +90,9 @@ def draw_frame(
 def _states(
     found: Labelling, true: Labelling, pairs: Mapping[int, int], rows: Sequence[Any], size: int
 ) -> U1:
-    """Return (n,) 0 for no object, else the number of the colour.
+    """Return (n,) the number of each pixel's colour, from 1; 0 without an object.
 
-    Pixels that belong to different objects are surplus: parts of objects that were split show.
+    Pixels of objects that are not matched with each other are surplus, so that split objects show.
     """
     state = np.zeros(size, np.int64)
     for number, labelling in ((2, true), (3, found)):
@@ -99,7 +107,7 @@ def _states(
 
 
 def _shades(frame: Frame | None, height: int, width: int) -> U1:
-    """Return (n,) the brightness of each pixel: lit from the camera, nearer is brighter."""
+    """Return (n,) the grey level of each pixel, shaded from the camera; nearer is brighter."""
     if frame is None or frame.depth is None:
         return np.full(height * width, _SHADES * 3 // 4)
     depth = np.asarray(frame.depth, np.float64)
@@ -115,7 +123,7 @@ def _shades(frame: Frame | None, height: int, width: int) -> U1:
 
 
 def _palette() -> U1:
-    """Return the colour table (k, 3): shades of grey, then the shades tinted by each colour."""
+    """Return the colour table (k, 3): shades of grey, then these shades tinted with each colour."""
     grey = np.repeat(np.linspace(0, 255, _SHADES)[:, None], 3, axis=1)
     tinted = [grey * (1 - _INK) + _INK * np.array(colour) for colour in COLOURS.values()]
     return np.concatenate([grey, *tinted]).astype(np.uint8)
@@ -124,7 +132,7 @@ def _palette() -> U1:
 def _captions(
     rows: Sequence[Any], found: Sequence[Item], true: Sequence[Item], width: int
 ) -> tuple[Caption, ...]:
-    """Return the differences, each at the place of its object."""
+    """Return a caption for each difference, at the position of its object."""
     captions = []
     for row in rows:
         mine = row.difference != "missed"
@@ -138,7 +146,7 @@ def _captions(
 
 
 def words_of(row: Any) -> str:
-    """Return the difference of a pair in words."""
+    """Return a difference in words."""
     track = "" if row.track is None else f" #{row.track}"
     return {
         "missed": f"missed {row.true_category}",

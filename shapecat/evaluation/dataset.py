@@ -1,7 +1,7 @@
 """Labelled object data sets: ``DATASET/<category>/<instance>/<view>.pcd`` (or .ply, .npz).
 
-One partial view a file, in metres, gravity aligned (+z up), standing on z = 0. The VIEWPOINT of a
-PCD file is the position of the sensor.
+Each file holds one partial view, in metres, with z up and the supporting plane at z = 0. The
+VIEWPOINT of a PCD file is the position of the sensor.
 """
 
 import zipfile
@@ -21,9 +21,9 @@ _FARTHEST_M = 100.0
 
 
 class View(Record):
-    """One partial view of one object, level: z is the height above the support.
+    """One partial view of one object in a level frame: z is the height above the support.
 
-    ``points`` (n, 3) metres, finite; ``eye`` (3,) position of the sensor.
+    ``points`` (n, 3) metres, finite; ``eye`` (3,) position of the sensor, metres.
     """
 
     points: F4 = array("n 3", "f4")
@@ -34,7 +34,7 @@ class View(Record):
 
 @dataclass(frozen=True)
 class Dataset:
-    """The files of a data set; views are read when they are asked for."""
+    """The files of a data set; views are read on demand."""
 
     root: Path
     files: tuple[Path, ...]
@@ -54,11 +54,11 @@ class Dataset:
 
 
 def read_dataset(root: Path) -> Dataset:
-    """Find the views of a data set.
+    """Find the files of a data set.
 
     Raises
     ------
-    RecordingError : there is none.
+    RecordingError : the folder holds no views.
     """
     files = tuple(sorted(path for path in root.glob("*/*/*") if path.suffix.lower() in _READERS))
     if not files:
@@ -71,9 +71,9 @@ def read_dataset(root: Path) -> Dataset:
 
 
 def read_view(path: Path) -> View:
-    """Read one view; category and instance are the names of its folders.
+    """Read one view; its folders name the category and the instance.
 
-    Where a file does not tell the position of the sensor, it is found by `find_viewpoint`.
+    If the file does not state the position of the sensor, `find_viewpoint` estimates it.
 
     Raises
     ------
@@ -115,27 +115,27 @@ _READERS: dict[str, Callable[[Path], CloudFile]] = {
 
 
 def _valid_eye(eye: F8 | None) -> F8 | None:
-    """Return a viewpoint, or None for the origin, which stands for an unknown one."""
+    """Return a viewpoint (3,); None if it is invalid or the origin, which means unknown."""
     if eye is None or eye.shape != (3,) or not np.all(np.isfinite(eye)) or not np.any(eye):
         return None
     return eye
 
 
 def find_viewpoint(points: F4, *, distance_m: float = 1.0) -> F8:
-    """Return the place from which most of a partial view's points can be seen apart.
+    """Estimate the position of the sensor from a partial view.
 
-    Seen from where it was taken, every point of a view has a direction of its own. Of 48 places
-    around the points, at 15 to 60 degrees of elevation, the one is taken from which they cover
-    the most cells of a grid; the lowest and first on ties.
+    Seen from the sensor, no two points of a view have the same direction. Of 48 positions around
+    the points, at 15 to 60 degrees of elevation, return the one from which the points cover the
+    most cells of a grid; on ties, the first.
 
     Parameters
     ----------
     points : (n, 3) metres, z up.
-    distance_m : distance of the place from the centre of the points.
+    distance_m : distance of the position from the centre of the points.
 
     Returns
     -------
-    (3,) metres.
+    The position (3,), metres.
     """
     centre = points.mean(axis=0, dtype=np.float64)
     azimuth, elevation = np.meshgrid(
@@ -156,7 +156,7 @@ def find_viewpoint(points: F4, *, distance_m: float = 1.0) -> F8:
 
 
 def _covered_cells(points: F8, direction: F8, cell: float) -> int:
-    """Return how many cells the points cover in the plane across a direction."""
+    """Return the number of cells that points (n, 3) cover, projected along a direction (3,)."""
     right = np.array([-direction[1], direction[0], 0.0])
     right /= np.linalg.norm(right)
     across = points @ np.stack([right, np.cross(direction, right)], axis=1)

@@ -21,17 +21,19 @@ def evaluate_folder(
     baselines: Path | None = None,
     observe: Observer = ignore,
 ) -> Report:
-    """Evaluate a model (by default the shipped one) on a labelled data set.
+    """Evaluate a model on a labelled data set.
 
     Parameters
     ----------
-    baselines : a data set to train the chain and plain learners on, which are then judged on
-        ``root`` too. It may be ``root`` itself: five folds by instance.
+    root : folder of the data set.
+    model : model file; the default model by default.
+    baselines : folder of a data set on which shapecat's classifier and baselines are trained, to be
+        tested on ``root``. If it is ``root`` itself, use five-fold cross-validation by instance.
 
     Raises
     ------
-    RecordingError : there are no views, or one cannot be read, or too few to train on.
-    ModelError : no usable model, or one that does not know a category of the data set.
+    RecordingError : there are no views, one cannot be read, or there are too few to train on.
+    ModelError : the model is unusable, or does not know a category of the data set.
     """
     categorizer = load_model(model)
     categorizer.require_descriptor(DESCRIPTOR_NAMES)

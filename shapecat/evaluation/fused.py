@@ -1,4 +1,4 @@
-"""Scores of several fused views of one object (thesis 7.5.2)."""
+"""Accuracy of several fused views of one object (thesis 7.5.2)."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -16,7 +16,7 @@ FUSED = (3, 10, 30)
 
 
 class Fused(NamedTuple):
-    """Scores of ``groups`` of ``views`` views each, by their fused posterior."""
+    """Accuracy and calibration error (ECE) of ``groups`` groups of ``views`` fused views each."""
 
     views: int
     groups: int
@@ -27,20 +27,21 @@ class Fused(NamedTuple):
 def fuse_views(
     truth: I4, posteriors: F4, objects: np.ndarray, *, counts: Sequence[int] = FUSED
 ) -> tuple[Fused, ...]:
-    """Fuse the views of each object in groups, in their order.
+    """Fuse the views of each object in groups of consecutive views, and measure the accuracy.
 
-    Views of one placement of an object err alike, so the product of their posteriors is tempered
-    by their number, as tracks are fused by default: their plain product is far too sure of
-    itself, their mean not sure enough.
+    The errors of an object's views are correlated, so the product of their posteriors is tempered
+    by their number, as in tracks. A plain product would be overconfident, a mean underconfident.
 
     Parameters
     ----------
-    truth : (n,) the true column of each view; posteriors : (n, c); objects : (n,) names.
-    counts : views per group. What is left over of an object is not used.
+    truth : (n,) true column of each view.
+    posteriors : (n, c).
+    objects : (n,) name of each view's object.
+    counts : numbers of views per group; leftover views are not used.
 
     Returns
     -------
-    One for each count that some object has enough views for.
+    One result for each count for which some object has enough views.
     """
     result = []
     for count in counts:

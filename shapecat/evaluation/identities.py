@@ -1,4 +1,4 @@
-"""How well tracks keep the identities of objects: MOTA, IDF1 and HOTA."""
+"""Tracking metrics: MOTA, IDF1 and HOTA."""
 
 from collections import Counter
 from collections.abc import Hashable, Iterable, Mapping, Sequence
@@ -19,8 +19,10 @@ _FORBIDDEN = 1e6
 class SeenTogether(NamedTuple):
     """The true and the found objects of a frame, and their similarity.
 
-    ``true`` and ``found`` are identities, each once; ``similarity`` (true, found) lies within 0
-    and 1, with 0 for pairs that cannot be the same object.
+    Attributes
+    ----------
+    true, found : identities, without duplicates.
+    similarity : (true, found) from 0 to 1; 0 for pairs that cannot be the same object.
     """
 
     true: Sequence[Hashable]
@@ -30,7 +32,7 @@ class SeenTogether(NamedTuple):
 
 @dataclass(frozen=True)
 class Identities:
-    """Tracking scores over all frames; NaN without true objects."""
+    """Tracking metrics over all frames; NaN if they are undefined."""
 
     idf1: float
     mota: float
@@ -43,12 +45,18 @@ class Identities:
     objects: int
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the figures by name."""
+        """Return the metrics by name."""
         return asdict(self)
 
 
 class _Occurrences(NamedTuple):
-    """How often each identity was there, and the frames with positions instead of identities."""
+    """Occurrences of the identities.
+
+    Attributes
+    ----------
+    true, found : number of frames with each identity.
+    frames : for each frame, the indices of its identities, and their similarity.
+    """
 
     true: F8
     found: F8
@@ -56,13 +64,15 @@ class _Occurrences(NamedTuple):
 
 
 def judge_identities(frames: Iterable[SeenTogether], *, threshold: float = 0.5) -> Identities:
-    """Judge tracks against true objects, frame by frame in the order of time.
+    """Compute tracking metrics.
 
     Source: Bernardin 2008 (MOTA), Ristani 2016 (IDF1), Luiten 2020 (HOTA).
 
     Parameters
     ----------
-    threshold : pairs less similar are not the same object; HOTA goes through all thresholds.
+    frames : the frames in the order of time.
+    threshold : similarity from which a pair is the same object, for MOTA and IDF1; HOTA averages
+        over thresholds from 0.05 to 0.95.
     """
     frames = list(frames)
     counts = _clear_mot(frames, threshold)
@@ -84,7 +94,7 @@ def judge_identities(frames: Iterable[SeenTogether], *, threshold: float = 0.5) 
 
 
 def _clear_mot(frames: Iterable[SeenTogether], threshold: float) -> Counter[str]:
-    """Count misses, false positives and switches; a pair goes on as long as it can."""
+    """Count misses, false positives and switches; a matched pair is kept as long as possible."""
     last: dict[Hashable, Hashable] = {}
     counts: Counter[str] = Counter()
     for frame in frames:
@@ -102,7 +112,7 @@ def _clear_mot(frames: Iterable[SeenTogether], threshold: float) -> Counter[str]
 def _pairs(
     frame: SeenTogether, allowed: Bool, last: Mapping[Hashable, Hashable]
 ) -> list[tuple[int, int]]:
-    """Match a frame: the pairs of before where they are allowed, then the most similar."""
+    """Match a frame: first the previous pairs that are still allowed, then the most similar."""
     true, found, similarity = frame
     place = {name: j for j, name in enumerate(found)}
     pairs: dict[int, int] = {}
@@ -135,7 +145,7 @@ def _occurrences(frames: Iterable[SeenTogether]) -> _Occurrences:
 
 
 def _idf1(seen: _Occurrences, threshold: float) -> float:
-    """Return the F of the best lasting one-to-one assignment of tracks to objects."""
+    """Return IDF1, the F1 of the best one-to-one assignment of tracks to objects."""
     together = np.zeros((seen.true.size, seen.found.size))
     for true, found, similarity in seen.frames:
         together[np.ix_(true, found)] += similarity >= threshold
@@ -145,7 +155,7 @@ def _idf1(seen: _Occurrences, threshold: float) -> float:
 
 
 def _hota(seen: _Occurrences) -> tuple[float, float, float]:
-    """Return HOTA, detection accuracy and association accuracy, the means over thresholds."""
+    """Return HOTA, detection accuracy and association accuracy, averaged over thresholds."""
     if not (seen.true.sum() and seen.found.sum()):
         return (0.0, 0.0, 0.0) if seen.true.sum() else (float("nan"),) * 3
     alignment = _alignment(seen)
@@ -165,7 +175,7 @@ def _hota(seen: _Occurrences) -> tuple[float, float, float]:
 
 
 def _alignment(seen: _Occurrences) -> F8:
-    """Return (true, found) how much of their time two identities spend together."""
+    """Return (true, found) the fraction of two identities' frames in which they coincide."""
     together = np.zeros((seen.true.size, seen.found.size))
     for true, found, similarity in seen.frames:
         beside = similarity.sum(axis=0) + similarity.sum(axis=1)[:, None] - similarity

@@ -16,11 +16,12 @@ class Item:
 
     Attributes
     ----------
-    track : its identity over time; None where it has none.
-    pixels : (n,) indices into the frame; None where only boxes are known.
-    box : in the sensor frame.
-    decidable : its category can be told from what is seen of it.
-    view_category, posterior : what the single view says, of a run.
+    track : number of its track; None if it has none.
+    pixels : (n,) flat indices into the frame; None if there is no mask.
+    box : 3D box in the sensor frame; None if there is none.
+    decidable : whether its category is unambiguous in this view.
+    confidence : of a run, that of the final label.
+    view_category, posterior : of a run, the category and posterior (c,) of the single view.
     """
 
     track: int | None
@@ -37,8 +38,10 @@ class Item:
 class Labelling:
     """The objects of a frame.
 
-    ``known`` (n,) tells the pixels with a label, all where it is None; ``shape`` is that of the
-    image, height and width.
+    Attributes
+    ----------
+    known : (n,) which pixels of the frame have a label; None if all have.
+    shape : height and width of the image; None if unknown.
     """
 
     items: tuple[Item, ...]
@@ -50,16 +53,16 @@ class Reference(ABC):
     """A reference for comparisons; frames are requested in recording order."""
 
     kind: str
-    """In words: truth of every pixel, COCO labels, KITTI labels, another run."""
+    """Kind of the reference, in words."""
     frames: int
-    """How many frames it has."""
+    """Number of frames."""
     tracked: bool = False
-    """Whether identities are the same over all frames."""
+    """Whether objects have identities over time."""
 
     @abstractmethod
     def at(self, key: Key, stamp_ns: int) -> Labelling | None:
-        """Return the objects of a frame; None if it has no such frame."""
+        """Return the objects of a frame; None if the reference lacks this frame."""
 
     @abstractmethod
     def describe_frames(self) -> str:
-        """Return which frames it has, in few words."""
+        """Describe the range of frames in a few words."""

@@ -1,7 +1,7 @@
-"""Figures of merit of posteriors against the truth, in plain numpy.
+"""Metrics of posteriors against the truth, in plain NumPy.
 
-Labels are columns of the posterior; every function takes the number of categories where it
-matters, so that a category without views has a place in the result.
+Labels are columns of the posterior. Where it matters, functions take the number of categories, so
+that categories without views appear in the result.
 """
 
 from typing import NamedTuple
@@ -23,7 +23,7 @@ __all__ = [
 
 
 class Bin(NamedTuple):
-    """Views of similar confidence: how many, how confident, how often right."""
+    """Views of similar confidence: their number, mean confidence and accuracy."""
 
     views: int
     confidence: float
@@ -31,7 +31,7 @@ class Bin(NamedTuple):
 
 
 def accuracy(truth: I4, predicted: I4) -> float:
-    """Return the share of views (n,) whose category is right; NaN without views."""
+    """Return the fraction of views (n,) with the right category; NaN without views."""
     return float(np.mean(truth == predicted)) if len(truth) else float("nan")
 
 
@@ -49,22 +49,22 @@ def confusion(truth: I4, predicted: I4, categories: int) -> I4:
 
 
 def recall(table: I4) -> F8:
-    """Return the share (c,) of each category that is right; NaN for one without views.
+    """Return the recall (c,) of each category; NaN for categories without views.
 
-    ``table`` is a confusion table (c, c), a row per true category.
+    ``table`` is a confusion matrix (c, c) with one row per true category.
     """
     totals = table.sum(axis=1)
     return np.where(totals > 0, np.diag(table) / np.maximum(totals, 1), np.nan)
 
 
 def balanced_accuracy(table: I4) -> float:
-    """Return the mean recall of the categories that have views, from a confusion table (c, c)."""
+    """Return the mean recall of the categories with views, from a confusion matrix (c, c)."""
     shares = recall(table)
     return float(np.nanmean(shares)) if np.any(table) else float("nan")
 
 
 def calibration_curve(truth: I4, posteriors: F4, *, bins: int = 15) -> tuple[Bin, ...]:
-    """Return the bins of equal width in confidence that hold views.
+    """Return the calibration curve: bins of equal width in confidence, without the empty ones.
 
     ``truth`` (n,) are the true columns of ``posteriors`` (n, c).
     """
@@ -79,11 +79,11 @@ def calibration_curve(truth: I4, posteriors: F4, *, bins: int = 15) -> tuple[Bin
 
 
 def expected_calibration_error(truth: I4, posteriors: F4, *, bins: int = 15) -> float:
-    """Return the mean distance between confidence and accuracy, over bins of confidence.
+    """Return the mean absolute difference between confidence and accuracy over bins of confidence.
 
-    ``truth`` (n,) are the true columns of ``posteriors`` (n, c).
+    ``truth`` (n,) are the true columns of ``posteriors`` (n, c). The result is NaN without views.
 
-    Source: Naeini et al. 2015; Guo et al. 2017, eq. 3. NaN without views.
+    Source: Naeini et al. 2015; Guo et al. 2017, eq. 3.
     """
     curve = calibration_curve(truth, posteriors, bins=bins)
     if not curve:
@@ -94,9 +94,9 @@ def expected_calibration_error(truth: I4, posteriors: F4, *, bins: int = 15) -> 
 
 
 def auroc(positive: F4, negative: F4) -> float:
-    """Return the probability that a positive scores above a negative, ties counting half.
+    """Return the probability that a positive scores higher than a negative; ties count half.
 
-    NaN if either is empty. O(n log n).
+    ``positive`` (m,) and ``negative`` (n,) are scores. The result is NaN if either is empty.
 
     Examples
     --------

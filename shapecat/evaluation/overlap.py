@@ -1,4 +1,4 @@
-"""How well found objects cover true ones: masks and boxes matched one to one."""
+"""Overlap of found and true objects: masks, matched one to one, and boxes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,10 +25,14 @@ _EDGES = np.array(
 
 @dataclass(frozen=True)
 class Overlap:
-    """Pixels and objects counted over frames; they can be added.
+    """Pixels and objects counted over frames; overlaps can be added.
 
-    ``shared``, ``found`` and ``true`` are pixels of matched pairs, of all found and of all true
-    objects; ``hits`` are true objects whose match has an overlap F of at least `MATCHED_F`.
+    Attributes
+    ----------
+    shared : pixels that matched pairs have in common.
+    found, true : pixels of all found and of all true objects.
+    hits : number of true objects matched with an overlap F of at least `MATCHED_F`.
+    objects, detections : number of true and of found objects.
     """
 
     shared: int = 0
@@ -39,17 +43,17 @@ class Overlap:
     detections: int = 0
 
     def __add__(self, other: "Overlap") -> "Overlap":
-        """Return the counts of both."""
+        """Return the sum of both counts."""
         return Overlap(*(a + b for a, b in zip(_counts(self), _counts(other), strict=True)))
 
     @property
     def precision(self) -> float:
-        """The share of found pixels that are right."""
+        """Fraction of the found pixels that are right."""
         return self.shared / max(self.found, 1)
 
     @property
     def recall(self) -> float:
-        """The share of true pixels that were found."""
+        """Fraction of the true pixels that were found."""
         return self.shared / max(self.true, 1)
 
     @property
@@ -59,7 +63,7 @@ class Overlap:
 
     @property
     def share_found(self) -> float:
-        """The share of true objects that are hits."""
+        """Fraction of the true objects that are hits."""
         return self.hits / max(self.objects, 1)
 
 
@@ -70,9 +74,13 @@ def _counts(overlap: Overlap) -> tuple[int, ...]:
 
 @dataclass(frozen=True)
 class MaskMatches:
-    """Found (rows) and true masks (columns) of a frame.
+    """Matches of the masks of a frame.
 
-    ``f`` and ``iou`` (found, true) are their overlaps; ``pairs`` are matched one to one.
+    Attributes
+    ----------
+    f, iou : (found, true) overlap of each pair of masks.
+    pairs : (found, true) indices, matched one to one.
+    overlap : counts of the frame.
     """
 
     f: F8
@@ -82,7 +90,7 @@ class MaskMatches:
 
 
 def match_masks(found: Sequence[U4], true: Sequence[U4]) -> MaskMatches:
-    """Match masks (pixel indices) to maximise the sum of their overlap F.
+    """Match masks, given as flat pixel indices (n,), to maximise the sum of their overlap F.
 
     Source: Xie et al. 2020 (overlap F of unseen objects), after Ochs et al. 2014.
     """
@@ -104,7 +112,7 @@ def match_masks(found: Sequence[U4], true: Sequence[U4]) -> MaskMatches:
 
 
 def _common(found: Sequence[U4], true: Sequence[U4]) -> F8:
-    """Return (found, true) how many pixels each two masks share."""
+    """Return (found, true) the number of pixels that each pair of masks has in common."""
     size = max((int(mask.max()) + 1 for mask in (*found, *true) if len(mask)), default=0)
     common = np.zeros((len(found), len(true)), np.int64)
     for k, mask in enumerate(true):
@@ -115,10 +123,10 @@ def _common(found: Sequence[U4], true: Sequence[U4]) -> F8:
 
 
 def box_iou(a: Box, b: Box) -> float:
-    """Return the intersection over union of two boxes in one frame, turned in any way.
+    """Return the intersection over union of two oriented boxes in the same frame.
 
-    The corners of the intersection are the corners of a box inside the other, and the points
-    where edges of a box pass through faces of the other.
+    The corners of the intersection are the corners of each box inside the other, and the points
+    where edges of one box cross faces of the other.
 
     Examples
     --------
@@ -138,7 +146,7 @@ def box_iou(a: Box, b: Box) -> float:
 
 
 def _inside(a: Box, b: Box) -> F8:
-    """Return (n, 3) corners and points of edges of ``a`` where they enter ``b``, and leave it."""
+    """Return the end points (n, 3) of the parts of the edges of ``a`` that lie inside ``b``."""
     turn = rotation_from_quaternion(b.orientation)
     corners = (box_corners(a) - b.center) @ turn
     half = b.size.astype(np.float64) / 2

@@ -30,7 +30,7 @@ _STYLE = (
 
 
 def write_page(path: Path, report: Report, *, title: str) -> None:
-    """Write an evaluation as an HTML page, or as Markdown if the file is called so.
+    """Write an evaluation as an HTML page, or as Markdown if the path ends in ``.md``.
 
     The pictures of ``NAME.md`` are ``NAME_confusion.svg``, ``NAME_calibration.svg``, and one for
     each breakdown, such as ``NAME_distance.svg``.
@@ -57,12 +57,12 @@ def write_page(path: Path, report: Report, *, title: str) -> None:
 
 
 _CALIBRATION = (
-    "Accuracy by confidence. On the diagonal, of views with a confidence of 0.8, 80 % are right."
+    "Accuracy by confidence. On the diagonal, 80 % of the views with a confidence of 0.8 are right."
 )
 
 
 def _pictures(report: Report) -> dict[str, str]:
-    """Return the pictures by name."""
+    """Return the pictures, as SVG, by name."""
     return {
         "confusion": confusion_svg(report.categories, report.confusion),
         "calibration": calibration_svg(report.calibration),
@@ -93,7 +93,7 @@ def format_page(report: Report, *, title: str) -> str:
 
 
 def format_markdown(report: Report, *, title: str, pictures: Mapping[str, str]) -> str:
-    """Return an evaluation as Markdown; ``pictures`` are the files of the pictures."""
+    """Return an evaluation as Markdown; ``pictures`` are the pictures' file names, by name."""
     parts = [
         f"# {_plain(title)}",
         _markdown(("", ""), _figures(report)),
@@ -137,7 +137,7 @@ def _breakdown(name: str, ranges: _Ranges) -> tuple[tuple[str, ...], _Rows]:
 
 
 def _comparisons(report: Report) -> list[tuple[str, tuple[str, ...], _Rows]]:
-    """Return title, head and rows of each table without a picture."""
+    """Return title, head and rows of each table that has no picture."""
     tables: list[tuple[str, tuple[str, ...], _Rows]] = []
     if report.fused:
         rows = [
@@ -157,13 +157,13 @@ def _comparisons(report: Report) -> list[tuple[str, tuple[str, ...], _Rows]]:
             )
             for item in report.baselines
         ]
-        columns = ("learner", "views learned", "accuracy", "balanced", "calibration error")
-        tables.append(("The chain beside plain learners", columns, list(learners)))
+        columns = ("classifier", "training views", "accuracy", "balanced", "calibration error")
+        tables.append(("Comparison with baselines", columns, list(learners)))
     return tables
 
 
 def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> str:
-    """Return a confusion table as a picture: rows are shaded by the share of their views."""
+    """Return a confusion matrix as SVG; cells are shaded by their fraction of the row's views."""
     size = _MARGIN + _CELL * len(categories)
     parts: list[str] = []
     for i, (name, row) in enumerate(zip(categories, table, strict=True)):
@@ -190,7 +190,7 @@ def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> 
 
 
 def calibration_svg(curve: Sequence[Bin], *, size: int = 280) -> str:
-    """Return accuracy over confidence; the area of a dot is its share of the views."""
+    """Return a calibration curve as SVG; a dot's area grows with its number of views."""
     low, top, side = 34.0, 18.0, size - 56.0  # room for the largest dot in a corner
     high, bottom = low + side, top + side
     parts = [
@@ -210,7 +210,7 @@ def calibration_svg(curve: Sequence[Bin], *, size: int = 280) -> str:
 
 
 def accuracy_svg(ranges: _Ranges, *, width: int = 480) -> str:
-    """Return accuracies as bars; the thickness of a bar is its share of the views."""
+    """Return accuracies as bars in SVG; a bar's thickness grows with its number of views."""
     low, step = 96, 34  # room for the longest label
     side = width - low - 56
     most = max((count for _, count, _ in ranges), default=1)
@@ -243,7 +243,7 @@ def _svg(width: float, height: float, parts: Sequence[str]) -> str:
 
 
 def _shade(share: float) -> str:
-    """Return white for 0 and ink for 1."""
+    """Return a CSS colour from white for 0 to the ink for 1."""
     return "rgb" + str(tuple(round(255 + (ink - 255) * share) for ink in _INK))
 
 

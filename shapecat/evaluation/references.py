@@ -1,4 +1,4 @@
-"""References for comparisons: simulated truth, labels of other tools, another run."""
+"""References for comparisons: simulated ground truth, labels of other tools, another run."""
 
 import json
 import zipfile
@@ -27,12 +27,12 @@ def open_reference(path: Path) -> Reference:
 
     Parameters
     ----------
-    path : a run folder; a folder with ``label_2`` (KITTI); a JSON file, of `shapecat simulate` or
-        COCO; or a simulated recording with its truth beside it.
+    path : a run folder; a KITTI folder, which has a folder ``label_2``; a JSON file of `shapecat
+        simulate` or COCO; or a simulated recording with its ground truth beside it.
 
     Raises
     ------
-    RecordingError : there is nothing of the kind, or it is damaged.
+    RecordingError : the path is none of these, or is damaged.
     """
     if (path / "run.json").is_file():
         return OtherRun(path)
@@ -59,7 +59,7 @@ def open_reference(path: Path) -> Reference:
 
 
 class SimulatedTruth(Reference):
-    """Truth of `shapecat simulate`: NAME.truth.json and NAME.labels.npz."""
+    """Ground truth of `shapecat simulate`: NAME.truth.json and NAME.labels.npz."""
 
     kind = "truth of every pixel"
 
@@ -91,19 +91,19 @@ class SimulatedTruth(Reference):
         return Labelling(tuple(items), flat > 0, (image.shape[0], image.shape[1]))
 
     def describe_frames(self) -> str:
-        """Return the range of stamps."""
+        """Return the range of timestamps."""
         stamps = list(self._by_stamp)
         return f"stamps {min(stamps)} to {max(stamps)}" if stamps else "no frames"
 
 
 class _LabelImages:
-    """``labels`` (t, h, w) uint8 of an .npz, read forward image by image in flat memory."""
+    """The array ``labels`` (t, h, w), uint8, of an .npz, read image by image, forward only."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
         self._next = 0
         try:
-            # Closed with the object: it is read from as long as frames are asked for.
+            # Closed together with this object, as frames are read until then.
             self._file = zipfile.ZipFile(path).open("labels.npy")  # noqa: SIM115
             self._shape = _image_shape(self._file)
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
@@ -111,11 +111,11 @@ class _LabelImages:
             raise RecordingError(msg) from error
 
     def read(self, index: int) -> U1:
-        """Return an image; earlier ones cannot be asked for any more.
+        """Return an image (h, w); afterwards, earlier images cannot be read any more.
 
         Raises
         ------
-        RecordingError : the file does not hold it.
+        RecordingError : the file is damaged, or ends before this image.
         """
         _, height, width = self._shape
         size = height * width
@@ -137,7 +137,7 @@ def _image_shape(file: IO[bytes]) -> tuple[int, int, int]:
 
     Raises
     ------
-    ValueError : it is another array.
+    ValueError : the array does not hold uint8 images.
     """
     version = np.lib.format.read_magic(file)
     shape, _, dtype = np.lib.format.read_array_header_1_0(file)
@@ -148,7 +148,7 @@ def _image_shape(file: IO[bytes]) -> tuple[int, int, int]:
 
 
 class OtherRun(Reference):
-    """Another run of the same recording; its final labels are taken for true."""
+    """Another run of the same recording, whose final labels count as the truth."""
 
     kind, tracked = "another run", True
 
@@ -180,7 +180,7 @@ def read_complete(folder: Path) -> FinishedRun:
 
     Raises
     ------
-    OutputError : it is no run, or was not completed.
+    OutputError : the folder is not a run, or the run is not complete.
     """
     if not (folder / "run.json").is_file():
         msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
@@ -192,10 +192,10 @@ def read_complete(folder: Path) -> FinishedRun:
 
 
 def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, Any], Labelling]]:
-    """Yield the frames of a run in order: topic and number, the row of the frame, its objects.
+    """Yield the frames of a run in order: topic and number, the frame's table row, its objects.
 
-    Detections without a track have their own category; those of deleted tracks are left out. Boxes
-    are around all of an object where that is known, as they are in labels.
+    Detections without a track keep the category of the single view; those of deleted tracks are
+    left out. Boxes are full boxes where these are known, else visible ones.
     """
     folder = finished.folder
     tracks = _tracks(folder)
@@ -217,7 +217,7 @@ def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, An
 
 
 def _tracks(folder: Path) -> dict[tuple[str, int, int], int]:
-    """Return the track of each detection."""
+    """Return the track of each detection, by topic, frame and detection."""
     tracks: dict[tuple[str, int, int], int] = {}
     names = ("topic", "frame", "detection", "track")
     for group in read_row_groups(folder / "tracks.parquet", names):

@@ -1,4 +1,4 @@
-"""COCO instance labels, on images of the size of the depth image."""
+"""COCO instance labels on images with the size of the depth images."""
 
 import re
 from collections import defaultdict
@@ -17,14 +17,14 @@ __all__ = ["CocoLabels", "filled_polygon", "rle_mask"]
 
 _MOST_PIXELS = 50_000_000
 _A_STAMP = 10**12
-"""Larger numbers in names of images are stamps in nanoseconds, smaller ones count frames."""
+"""Larger numbers in image names are timestamps in nanoseconds, smaller ones frame numbers."""
 
 
 class CocoLabels(Reference):
-    """Masks as polygons or run lengths.
+    """Masks of a COCO file, as polygons or run lengths.
 
-    An image is of the frame with its ``stamp_ns``, its ``frame``, or the last number in its
-    ``file_name``: a stamp in nanoseconds, or the number of the frame.
+    An image names its frame by ``stamp_ns``, by ``frame``, or by a number in its ``file_name``: a
+    timestamp in nanoseconds, else the last number, which is the frame number.
     """
 
     kind = "COCO labels"
@@ -66,7 +66,7 @@ class CocoLabels(Reference):
         )
 
     def describe_frames(self) -> str:
-        """Return the range of numbers."""
+        """Return the range of timestamps or frame numbers."""
         numbers = list(self._images)
         return f"images {min(numbers)} to {max(numbers)}" if numbers else "no images"
 
@@ -77,7 +77,7 @@ def _track_of(item: Mapping[str, Any]) -> int | None:
 
 
 def _number_of(image: Mapping[str, Any]) -> int:
-    """Return the stamp of an image, or the number of its frame."""
+    """Return the timestamp of an image, ns, or its frame number."""
     for name in ("stamp_ns", "frame"):
         if name in image:
             return int(image[name])
@@ -101,11 +101,16 @@ def _mask(segmentation: Any, height: int, width: int) -> Bool:
 
 
 def rle_mask(counts: str | Sequence[int], height: int, width: int) -> Bool:
-    """Return the mask (h, w) of run lengths, column by column; a text is COCO's compressed form.
+    """Decode run lengths into a mask (h, w).
+
+    Parameters
+    ----------
+    counts : run lengths in column-major order, beginning with zeros; or COCO's compressed string.
+    height, width : size of the image, pixels.
 
     Raises
     ------
-    ValueError : they do not fill the image.
+    ValueError : the run lengths are negative or do not fill the image.
 
     Examples
     --------
@@ -122,7 +127,11 @@ def rle_mask(counts: str | Sequence[int], height: int, width: int) -> Bool:
 
 
 def _uncompressed(text: str) -> list[int]:
-    """Return the run lengths of a text: five bits a letter, from the third on as differences."""
+    """Return the run lengths of a compressed string.
+
+    Each character holds five bits; from the fourth run on, values are differences to the run two
+    before.
+    """
     lengths: list[int] = []
     value = shift = 0
     for letter in text.encode("ascii"):
@@ -139,9 +148,9 @@ def _uncompressed(text: str) -> list[int]:
 
 
 def filled_polygon(corners: I4, height: int, width: int) -> Bool:
-    """Return (h, w) the pixels whose middle lies in a polygon of corners (n, 2), x and y.
+    """Return the mask (h, w) of pixels with their centre inside a polygon.
 
-    Pixel (0, 0) reaches from 0 to 1.
+    ``corners`` (n, 2) are x and y in pixels; the centre of pixel (0, 0) is at (0.5, 0.5).
     """
     corners = np.asarray(corners, np.float64)
     x, y = np.arange(width) + 0.5, np.arange(height) + 0.5

@@ -17,10 +17,11 @@ __all__ = ["KittiLabels"]
 
 
 class KittiLabels(Reference):
-    """Boxes, without pixels and identities.
+    """Boxes of KITTI labels, without masks and identities.
 
-    ``frames.csv`` tells the stamp of each number; without it the number is that of the frame.
-    Boxes are in the rectified camera; the rotation in ``P2`` leads back to the sensor.
+    ``frames.csv`` gives the timestamp of each label file; without it, the file's number is the
+    frame number. Boxes are in the rectified camera frame, and the rotation in ``P2`` turns them
+    into the sensor frame.
     """
 
     kind = "KITTI labels"
@@ -51,13 +52,13 @@ class KittiLabels(Reference):
         return Labelling(tuple(item for item in items if item.category != "DontCare"))
 
     def describe_frames(self) -> str:
-        """Return the range of stamps or numbers."""
+        """Return the range of timestamps or frame numbers."""
         known = list(self._names)
         return f"frames {min(known)} to {max(known)}" if known else "no frames"
 
 
 def _stamps(path: Path) -> dict[int, str]:
-    """Return the name of each frame by its stamp; empty without a table."""
+    """Return the name of each label file by timestamp, ns; empty without ``frames.csv``."""
     if not path.is_file():
         return {}
     with path.open(newline="", encoding="utf-8") as file:
@@ -65,7 +66,7 @@ def _stamps(path: Path) -> dict[int, str]:
 
 
 def _sensor_from_rectified(path: Path) -> F8:
-    """Return the (3, 3) rotation in ``P2``; the identity without a file."""
+    """Return the rotation (3, 3) in ``P2``; the identity if the file is missing."""
     if not path.is_file():
         return np.eye(3)
     lines = dict(line.split(":", 1) for line in path.read_text("utf-8").splitlines() if ":" in line)
@@ -75,7 +76,7 @@ def _sensor_from_rectified(path: Path) -> F8:
 
 
 def _item(words: list[str], turn: F8) -> Item:
-    """Return a label: type truncated occluded alpha bbox h w l x y z rotation_y."""
+    """Return the object of a line: type truncated occluded alpha bbox h w l x y z rotation_y."""
     height, width, length, x, y, z, yaw = map(float, words[8:15])
     c, s = np.cos(yaw), np.sin(yaw)
     axes = np.array([[c, s, 0.0], [0.0, 0.0, -1.0], [-s, c, 0.0]])  # columns: along, across, up

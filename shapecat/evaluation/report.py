@@ -1,4 +1,4 @@
-"""The tables of chapter 8 for any model and data set (thesis ch. 8)."""
+"""Evaluation of a model on labelled views: the tables of the thesis (ch. 8)."""
 
 import io
 import itertools
@@ -28,7 +28,10 @@ _POINTS = (0, 60, 120, 250, 500, 1000, math.inf)
 
 
 class Compared(NamedTuple):
-    """A learner, how many views it learned from, and how it did; undefined figures are None."""
+    """Results of a classifier; undefined metrics are None.
+
+    ``learned`` is its number of training views.
+    """
 
     learner: str
     learned: int
@@ -39,12 +42,24 @@ class Compared(NamedTuple):
 
 @dataclass(frozen=True)
 class Report:
-    """The results of an evaluation; undefined figures are None.
+    """The results of an evaluation; undefined metrics are None.
 
-    ``confusion`` counts true categories (rows) taken for others (columns), in the order of
-    ``categories``; ``by_distance``, ``by_elevation`` (how far the sensor looks down) and
-    ``by_points`` give (range, views, accuracy); ``fused`` is empty where no object has three
-    views; ``baselines`` are there where they were asked for.
+    Attributes
+    ----------
+    model : id of the model.
+    n : number of views with a category of the model.
+    ece : expected calibration error.
+    recall : recall of each category.
+    confusion : (c, c) number of views of each true category (row) by predicted category (column),
+        in the order of ``categories``.
+    novelty : ``n`` unknown shapes, ``rejected``, the fraction of them with a novelty above 1, and
+        ``auroc``; None without unknown shapes.
+    rejected_known : fraction of the known shapes with a novelty above 1.
+    skipped : number of views with too few points for a surface.
+    by_distance, by_points, by_elevation : (range, views, accuracy) over the distance in metres, the
+        number of voxels, and the angle by which the sensor looks down.
+    fused : accuracy after fusing several views; empty if no object has three views.
+    baselines : results of other classifiers; empty unless requested.
     """
 
     model: str
@@ -68,7 +83,7 @@ class Report:
 
     @property
     def breakdowns(self) -> tuple[tuple[str, tuple[tuple[str, int, float], ...]], ...]:
-        """Accuracies per range of a quantity, for ranges with views."""
+        """Name and rows of each breakdown that has any."""
         parts = (
             ("distance", self.by_distance),
             ("elevation", self.by_elevation),
@@ -94,12 +109,12 @@ class Report:
 def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
     """Compare the predictions of a model with the labels of described views.
 
-    Views labelled ``unknown`` count for novelty alone. The accuracies take the most probable
-    category of every other view, novel or not.
+    Views labelled ``unknown`` only affect the novelty metrics. The accuracies use the most probable
+    category of every other view, whether novel or not.
 
     Raises
     ------
-    ModelError : a label that the model does not know.
+    ModelError : the model does not know a label.
     """
     require_categories(np.unique(views.labels).tolist(), categorizer)
     begun = time.perf_counter()
@@ -141,7 +156,12 @@ def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
 
 
 def require_categories(names: Sequence[str], categorizer: Categorizer) -> None:
-    """Raise ModelError where a model does not know the category of a label."""
+    """Check that a model knows all labels.
+
+    Raises
+    ------
+    ModelError : the model does not know a label.
+    """
     strange = sorted(set(names) - set(categorizer.categories) - {UNKNOWN})
     if strange:
         msg = (
@@ -163,7 +183,7 @@ def _novelty_figures(unknown: F4, known: F4) -> dict[str, float | None]:
 def _accuracy_over(
     values: np.ndarray, right: I4, edges: Sequence[float], unit: str
 ) -> tuple[tuple[str, int, float], ...]:
-    """Return (range, views, accuracy) for each range of the values that has views."""
+    """Return (range, views, accuracy) for each range between ``edges`` that has views."""
     rows = []
     for low, high in itertools.pairwise(edges):
         mine = (values >= low) & (values < high)
@@ -187,7 +207,7 @@ def _defined(value: float) -> float | None:
 
 
 def format_report(report: Report) -> str:
-    """Return the tables for a terminal, 100 columns wide."""
+    """Return a report as text tables, 100 columns wide."""
     stream = io.StringIO()
     console = Console(file=stream, width=100, highlight=False)
     skipped = f", {report.skipped} without a surface left out" if report.skipped else ""
@@ -250,7 +270,7 @@ def _fused(report: Report) -> Table:
 
 
 def _baselines(report: Report) -> Table:
-    columns = ("learner", "views learned", "accuracy", "balanced", "calibration error")
+    columns = ("classifier", "training views", "accuracy", "balanced", "calibration error")
     table = _grid(None, *(f"\n{name}" for name in columns))
     for item in report.baselines:
         figures = (item.accuracy, item.balanced_accuracy, item.ece)

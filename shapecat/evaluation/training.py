@@ -1,4 +1,4 @@
-"""Learning from a labelled data set: a whole model, or new categories for an existing one."""
+"""Training on a labelled data set: a whole model, or new categories for an existing one."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -26,24 +26,25 @@ __all__ = [
 ]
 
 _HELD_OUT = 0.2
-"""Share of the instances of each category that judge the model."""
+"""Fraction of the instances of each category that are held out."""
 
 
 def train_on_folder(
     root: Path, out: Path, *, seed: int = 0, observe: Observer = ignore
 ) -> dict[str, Any]:
-    """Learn a model from a data set and write it.
+    """Train a model on a data set and write it.
 
-    A fifth of the instances of each category judges a first model and fits its temperature and
-    novelty threshold; the model that is written has then learned from all views.
+    A first model is trained on four fifths of the instances of each category; the remaining fifth
+    evaluates it and fits its temperature and novelty threshold. The written model is trained on all
+    views, with this temperature and threshold.
 
     Returns
     -------
-    Plain values: views, categories, model id, and the report on the held-out instances.
+    Plain values: number of views, categories, model id, and the report on the held-out instances.
 
     Raises
     ------
-    RecordingError : no views, an unreadable one, or fewer than two categories.
+    RecordingError : there are no views, one cannot be read, or there are fewer than two categories.
     ModelError : the model cannot be written.
     """
     views = _describe_folder(root, seed, observe)
@@ -68,20 +69,24 @@ def train_on_folder(
 def learn_on_folder(
     model: Path | None, root: Path, out: Path, *, seed: int = 0, observe: Observer = ignore
 ) -> dict[str, Any]:
-    """Teach a model the categories of a data set that it does not know; write the result.
+    """Add the new categories of a data set to a model and write the result.
 
-    The dictionary and the learners of the categories it knows stay as they are.
+    The dictionary and the classifiers of the old categories stay as they are.
+
+    Parameters
+    ----------
+    model : model file; None for the default model.
 
     Returns
     -------
-    Plain values: views, categories, the added ones, model id.
+    Plain values: number of views, categories, added categories, model id.
 
     Raises
     ------
-    RecordingError : no views, or an unreadable one.
-    ModelError : no usable model, no new category, or the result cannot be written.
+    RecordingError : there are no views, or one cannot be read.
+    ModelError : the model is unusable, there is no new category, or the result cannot be written.
     """
-    # Learning needs more of scipy than the rest of the program.
+    # Only learning needs these parts of SciPy.
     from shapecat.learning.incremental import add_categories  # noqa: PLC0415
 
     categorizer = load_model(model)
@@ -105,11 +110,11 @@ def learn_on_folder(
 def fit_views(
     train: DescribedViews, held_out: DescribedViews, *, seed: int, **choices: Any
 ) -> Categorizer:
-    """Learn a model from described views; ``choices`` are fields of `LearningSettings`.
+    """Train a model on described views; ``choices`` are fields of `LearningSettings`.
 
     Raises
     ------
-    ValueError : fewer than two categories.
+    ValueError : there are fewer than two categories.
     """
     # scikit-learn is only needed here.
     from shapecat.learning.training import (  # noqa: PLC0415
@@ -130,15 +135,16 @@ def fit_views(
 
 
 def order_categories(labels: Iterable[str]) -> tuple[str, ...]:
-    """Return the categories among labels: those of the default model first, then by name."""
+    """Return the categories among labels: those of the default model, then others by name."""
     found = {str(label) for label in labels} - {UNKNOWN}
     return (*(name for name in CATEGORIES if name in found), *sorted(found - set(CATEGORIES)))
 
 
 def split_instances(labels: np.ndarray, instances: np.ndarray, rng: np.random.Generator) -> Bool:
-    """Return a mask of held-out views: all views of a fifth of the instances of each label.
+    """Return the mask (n,) of held-out views: all views of a fifth of each label's instances.
 
-    At least one instance of a label is held out and one is not; of a single one nothing is.
+    At least one instance of each label is held out and at least one is kept; a label with a single
+    instance keeps it.
     """
     held_out = np.zeros(len(labels), bool)
     for label in np.unique(labels):

@@ -1,4 +1,4 @@
-"""From labelled views to descriptors: the chain of the product, without detection."""
+"""From labelled views to descriptors, as in a run but without detection."""
 
 import math
 import time
@@ -16,11 +16,12 @@ from shapecat.surface import reconstruct, thin
 __all__ = ["DescribedViews", "Observer", "describe_view", "describe_views", "ignore"]
 
 Observer = Callable[[str, int, int | None], None]
-"""Called with the name of the phase, the views done, and how many there are, if known."""
+"""Called with the name of the phase, the number of finished views, and the total, None if unknown.
+"""
 
 
 def ignore(_phase: str, _done: int, _total: int | None) -> None:
-    """Observe nothing."""
+    """Ignore progress."""
 
 
 _NOT_ASKED = np.zeros(0)
@@ -29,11 +30,17 @@ _NOT_ASKED = np.zeros(0)
 class DescribedViews(NamedTuple):
     """Described views, with the quantities for the breakdowns.
 
-    ``descriptors`` (n, d); ``labels``, ``instances`` (n,) names; ``points`` (n,) voxels;
-    ``distances`` (n,) metres from the sensor; ``seconds`` (n,) from points to descriptor;
-    ``skipped`` views with too few points for a surface; ``elevations`` (n,) degrees by which the
-    sensor looks down, empty where nobody asked; so ``functions`` (n, f), what
-    `shapecat.learning.baselines.shape_functions` returns.
+    Attributes
+    ----------
+    descriptors : (n, d).
+    labels, instances : (n,) names of categories and of instances.
+    points : (n,) number of voxels.
+    distances : (n,) distance from the sensor, metres.
+    seconds : (n,) time from points to descriptor.
+    skipped : number of views with too few points for a surface, which are left out.
+    elevations : (n,) angle by which the sensor looks down, degrees; may be empty.
+    functions : (n, f) shape distributions from `shapecat.learning.baselines.shape_functions`; may
+        be empty.
     """
 
     descriptors: F4
@@ -47,7 +54,7 @@ class DescribedViews(NamedTuple):
     functions: F4 = _NOT_ASKED
 
     def where(self, chosen: np.ndarray) -> "DescribedViews":
-        """Return the views that a mask or indices select."""
+        """Return the views that a mask (n,) or indices select."""
         columns = {
             name: value[chosen]
             for name, value in self._asdict().items()
@@ -57,7 +64,7 @@ class DescribedViews(NamedTuple):
 
 
 class DescribedView(NamedTuple):
-    """The descriptor (d,) of a view, its number of voxels, and the seconds that it took."""
+    """The descriptor (d,) of a view, its number of voxels, and the computing time in seconds."""
 
     descriptor: F4
     points: int
@@ -86,7 +93,13 @@ def describe_views(
     observe: Observer = ignore,
     with_functions: bool = False,
 ) -> DescribedViews:
-    """Describe each view; view k draws its random numbers from the seed (settings.seed, k)."""
+    """Describe each view; the random numbers of view k, from 1, have the seed (settings.seed, k).
+
+    Parameters
+    ----------
+    total : number of views, for ``observe``; None if unknown.
+    with_functions : whether to compute shape distributions too.
+    """
     found: list[tuple[DescribedView, str, str, float, float]] = []
     functions: list[F4] = []
     count = 0

@@ -217,8 +217,8 @@ def _studies(
     added = add_two_categories(learned.views, shown, blocks=tuple(BLOCKS), seed=seed)
     return [
         Table(
-            "Beside plain learners on the test tables, no view upside down",
-            ("learner", "views learned from", "accuracy", "balanced"),
+            "Baseline classifiers on the test tables, without upside-down views",
+            ("classifier", "training views", "accuracy", "balanced"),
             tuple(plain),
         ),
         Table(

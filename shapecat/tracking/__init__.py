@@ -1,6 +1,6 @@
 """Objects over time: association, tracks, hindsight and fusion (thesis 7.5.2).
 
-`track_recording` is the whole of it: detections per frame in, tracks out.
+`track_recording` does all of this: it turns the detections of each frame into tracks.
 """
 
 from shapecat.tracking.fusion import causal, fuse, view_weights

@@ -1,4 +1,4 @@
-"""Which detection continues which track: costs of the pairs, and the choice among them."""
+"""Data association of detections and tracks: differences between them, and the assignment."""
 
 from typing import Literal
 
@@ -10,13 +10,13 @@ from shapecat.arrays import F4, F8, I4
 __all__ = ["assign", "posterior_difference", "size_difference", "size_key"]
 
 _SIZE_SLACK_M = 0.01
-"""Added to every length before its logarithm: a centimetre on a flat side is noise."""
+"""Added to every length before taking its logarithm, as a flat side may vary by a centimetre."""
 
 
 def size_key(sizes: F4) -> F8:
-    """Return (n, 3) logarithms of sizes (n, 3): longer side, shorter side, height.
+    """Return (n, 3) logarithms of sizes (n, 3), metres: longer side, shorter side, height.
 
-    The sides are sorted because the yaw of a box may flip by a quarter turn between frames.
+    The sides are sorted, as the yaw of a box may change by a quarter turn between frames.
     """
     sizes = np.asarray(sizes, np.float64)
     sides = np.sort(sizes[:, :2], axis=1)[:, ::-1]
@@ -25,7 +25,7 @@ def size_key(sizes: F4) -> F8:
 
 
 def size_difference(keys_a: F8, keys_b: F8) -> F8:
-    """Return (m, n) mean absolute logarithms of the ratios of sizes, from their `size_key`."""
+    """Return (m, n) mean absolute differences of keys (m, 3) and (n, 3) from `size_key`."""
     return np.asarray(np.abs(keys_a[:, None] - keys_b[None]).mean(axis=2))
 
 
@@ -39,16 +39,16 @@ def assign(costs: F8, limit: float, method: Literal["hungarian", "greedy"]) -> I
 
     Parameters
     ----------
-    costs : (m, n) cost of each pair; infinite where a pair is impossible.
-    limit : no pair costs this much or more.
-    method : ``hungarian`` takes the pairs whose sum of ``cost - limit`` is least, so that a
-        far-fetched pair is not made only to use up a row (O(n^3) for n rows and columns);
-        ``greedy`` takes the cheapest pair, strikes out its row and column, and so on (the
-        first in row-major order on ties).
+    costs : (m, n) cost of each pair; infinite if a pair is impossible.
+    limit : only pairs with a lower cost are chosen.
+    method : ``hungarian`` minimises the sum of ``cost - limit`` over the chosen pairs, so that no
+        costly pair is made only to use up a row (O(n^3) for n rows and columns); ``greedy``
+        repeatedly takes the cheapest pair of unused rows and columns (on ties, the first in
+        row-major order).
 
     Returns
     -------
-    (k, 2) row and column of each pair, by row.
+    Row and column of each pair (k, 2), sorted by row.
     """
     gain = np.minimum(costs - limit, 0.0)
     if gain.size == 0 or not gain.any():

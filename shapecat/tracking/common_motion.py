@@ -1,4 +1,4 @@
-"""A motion that the objects share: of the table that turns, or of a sensor without a pose."""
+"""A motion common to all objects: that of a turning table, or of a sensor without a pose."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -12,11 +12,11 @@ from shapecat.tracking.hits import Hits
 
 __all__ = ["CommonMotion", "find_common_motion"]
 
-_LONG = 5  # detections of a track that tells a motion
-_MOVED_M = 0.06  # a centre strays less while its object stands still
-_MOST = 0.7  # share of the detections that must be of what moves, and move as one
-_TOGETHER_M = 0.03  # so near a detection is to where the common motion takes its object
-_NOISE_M = 0.01  # a detection that is so far off weighs half
+_LONG = 5  # fewest detections of a track that is used
+_MOVED_M = 0.06  # a track's centres spread less than this while its object stands still
+_MOST = 0.7  # fraction of the detections that must be of moving objects, and fit the motion
+_TOGETHER_M = 0.03  # largest distance of a detection that fits the common motion
+_NOISE_M = 0.01  # residual at which the weight of a detection is one half
 _ROUNDS = 10
 
 C16 = NDArray[Any]
@@ -24,16 +24,19 @@ C16 = NDArray[Any]
 
 @dataclass(frozen=True)
 class CommonMotion:
-    """For each frame, the transform into the frame in which the objects stand still.
+    """For each frame, the transform into a coordinate frame in which the objects stand still.
 
-    ``rotations`` (f, 3, 3) about the up direction, ``translations`` (f, 3) metres.
+    Attributes
+    ----------
+    rotations : (f, 3, 3) about the up direction.
+    translations : (f, 3) metres.
     """
 
     rotations: F8
     translations: F8
 
     def still(self, hits: Hits) -> Hits:
-        """Return the detections as if nothing had moved."""
+        """Return the detections transformed into the coordinate frame of the still objects."""
         centers = np.zeros(hits.centers.shape, np.float32)
         axes = None if hits.axes is None else np.zeros(hits.axes.shape, np.float32)
         for block in hits.blocks():
@@ -45,28 +48,29 @@ class CommonMotion:
         return replace(hits, centers=centers, axes=axes)
 
     def moved(self, rows: I4, places: F8) -> F8:
-        """Return where places (k, 3) of the still scene are in frames (k,)."""
+        """Transform positions (k, 3), metres, from the still scene into frames ``rows`` (k,)."""
         return np.asarray(
             np.einsum("kji,kj->ki", self.rotations[rows], places - self.translations[rows])
         )
 
 
 def find_common_motion(hits: Hits, members: Sequence[I4]) -> CommonMotion | None:
-    """Find the common rotation about up and the level shift of each frame, if any.
+    """Find the common rotation about up and horizontal translation of each frame, if any.
 
     Parameters
     ----------
-    members : the hits of each track, ascending; tracks may be pieces of the same object.
+    members : indices of the hits of each track, ascending; several tracks may be of one object.
 
     Returns
     -------
-    None if fewer than three objects, or not most of them, move, or not as one.
+    The motion; None if there are fewer than three tracks of at least five hits, if most of their
+    detections are of still objects, or if fewer than 70 % fit a common motion.
 
     Notes
     -----
-    Where each object is in the still scene, and how the scene lies in each frame, are found by
-    turns (generalized Procrustes analysis, Gower 1975), starting from the motion between
-    neighbouring frames. Detections that do not fit weigh less (Cauchy).
+    The position of each object in the still scene and the transform of each frame are estimated
+    alternately (generalized Procrustes analysis, Gower 1975), starting from the motion between
+    neighbouring frames. Outliers get less weight (Cauchy).
     """
     long = [member for member in members if len(member) >= _LONG]
     if hits.axes is None or len(long) < 3:
@@ -95,13 +99,13 @@ def find_common_motion(hits: Hits, members: Sequence[I4]) -> CommonMotion | None
 
 
 def _extent(centers: F8) -> float:
-    """Return how far a track got, without its farthest detections."""
+    """Return the diagonal between the 10 % and the 90 % quantiles of centres (k, 3), metres."""
     low, high = np.quantile(centers, [0.1, 0.9], axis=0)
     return float(np.linalg.norm(high - low))
 
 
 def _level(axes: F8) -> F8:
-    """Return the rotation into a frame whose third axis is up."""
+    """Return the rotation (3, 3) into a frame whose z axis is the mean up of boxes (n, 3, 3)."""
     up = axes[:, :, 2].mean(axis=0, dtype=np.float64)
     first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
     first /= np.linalg.norm(first)
@@ -110,7 +114,7 @@ def _level(axes: F8) -> F8:
 
 
 def _between_neighbours(plane: C16, rows: I4, owner: I4, count: int) -> tuple[C16, C16]:
-    """Chain the motions between neighbouring frames, of which each is fitted alone."""
+    """Return the motion of each frame as the product of the motions between neighbouring frames."""
     order = np.lexsort([rows, owner])
     a, b = order[:-1], order[1:]
     pair = (owner[a] == owner[b]) & (rows[b] - rows[a] == 1)
@@ -127,7 +131,10 @@ def _between_neighbours(plane: C16, rows: I4, owner: I4, count: int) -> tuple[C1
 
 
 def _fit(seen: C16, still: C16, rows: I4, weights: F8, turn: C16, shift: C16) -> tuple[C16, C16]:
-    """Fit a turn and a shift to the points of each frame; of fewer than two they are kept."""
+    """Fit a rotation and a translation to each frame; keep the given ones with fewer than 2 points.
+
+    Points and translations in the plane are complex numbers; a rotation is one of modulus 1.
+    """
     count = len(turn)
     mean_seen = _means(seen, rows, weights, count)
     mean_still = _means(still, rows, weights, count)
@@ -150,7 +157,7 @@ def _means(values: C16, groups: I4, weights: F8, count: int) -> C16:
 
 
 def _in_space(level: F8, turn: C16, shift: C16) -> CommonMotion:
-    """Make turns and shifts in the plane those of space."""
+    """Convert rotations and translations in the horizontal plane to 3D."""
     zero, one = np.zeros(len(turn)), np.ones(len(turn))
     flat = np.array(
         [[turn.real, -turn.imag, zero], [turn.imag, turn.real, zero], [zero, zero, one]]

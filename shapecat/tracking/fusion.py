@@ -1,4 +1,4 @@
-"""One posterior from the views of one object (thesis 7.5.2)."""
+"""Fusion of the posteriors and novelties of an object's views (thesis 7.5.2)."""
 
 from collections.abc import Iterator
 from typing import Literal
@@ -13,39 +13,44 @@ __all__ = ["PARTIAL_WEIGHT", "Method", "causal", "fuse", "fuse_novelty", "view_w
 Method = Literal["mean", "product", "vote"]
 
 PARTIAL_WEIGHT = 0.25
-"""Weight of a view that is cut by the image border or an occluder, relative to a whole one."""
+"""Weight of a view that is cut by the image border or an occluder, relative to a whole view."""
 
 _LENIENCE = 0.08
-"""How far above a single view's limit that of many is: so that simulated distractors are found
-as often from 2 to 30 views as from one (0.03 to 0.075 measured)."""
+"""How much the novelty limit of many views exceeds that of one, so that simulated distractors are
+rejected as often from 2 to 30 views as from one (0.03 to 0.075 measured)."""
 
 _FLOOR = 1e-6
-"""Smallest probability a single view can give in a product: none may veto all others."""
+"""Smallest probability of a single view in a product, so that no view can veto all others."""
 
 _BLOCK = 2**16
 
 
 def view_weights(partial: Bool) -> F8:
-    """Return the weights (k,) of views of which some are ``partial`` (k,)."""
+    """Return the weights (k,) of views; ``partial`` (k,) tells which of them are partial."""
     return np.where(np.asarray(partial, np.bool_), PARTIAL_WEIGHT, 1.0)
 
 
 def fuse(posteriors: ArrayLike, method: Method = "product", weights: ArrayLike | None = None) -> F8:
-    """Fuse the posteriors (k, c) of k views into one (c,) that sums to 1.
+    """Fuse the posteriors (k, c) of k views into one posterior (c,).
 
-    Views of one object share their error (an upside-down cup looks like a can from everywhere),
-    so no method grows more certain with the mere number of views.
+    The errors of an object's views are correlated (an upside-down cup looks like a can from all
+    sides), so the number of views alone does not raise the confidence.
 
     Parameters
     ----------
-    posteriors : rows that sum to 1.
-    method : ``product``, tempered by the number of views, which is the geometric mean; ``mean``;
-        ``vote``, the share of views won by each category, the first one on ties.
+    posteriors : (k, c) rows that sum to 1.
+    method : ``product``, tempered by the number of views, that is the normalised geometric mean;
+        ``mean``; or ``vote``, the fraction of the views that each category wins (on ties, the
+        first).
     weights : (k,) weights of the views, the first one positive; equal by default.
+
+    Returns
+    -------
+    (c,) which sums to 1.
 
     Raises
     ------
-    ValueError : there is no view, or an unknown method.
+    ValueError : there is no view, or the method does not exist.
 
     Examples
     --------
@@ -67,7 +72,7 @@ def causal(
 
 
 def _running(posteriors: ArrayLike, method: Method, weights: ArrayLike | None) -> Iterator[F8]:
-    """Yield the rows of `causal` in blocks: a track may have a million views."""
+    """Yield the rows of `causal` in blocks, as a track may have a million views."""
     views = np.asarray(posteriors)
     if views.ndim != 2 or len(views) == 0:
         msg = f"fusion needs (k, c) posteriors of at least one view, got shape {views.shape}"
@@ -87,11 +92,11 @@ def _running(posteriors: ArrayLike, method: Method, weights: ArrayLike | None) -
 
 
 def fuse_novelty(novelties: ArrayLike, weights: ArrayLike) -> float:
-    """Return the weighted mean of novelties (k,), above 1 where the object is none of the known.
+    """Fuse the novelties (k,) of k views; above 1, the object belongs to no known category.
 
-    The mean of several views strays less than a single one. It is divided by a limit that grows
-    with the number of whole views, so that objects of no category are found as often as from
-    single views, and fewer of the known ones are rejected.
+    The result is the weighted mean divided by a limit, which grows from 1 to 1.08 with the sum of
+    the weights. A mean scatters less than a single view, so with this limit as many unknown objects
+    are rejected as from single views, and fewer known ones.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""Hindsight: find scene cuts, and join the fragments of one object."""
+"""Hindsight: detecting scene cuts, and stitching the track fragments of one object."""
 
 from collections.abc import Iterator
 
@@ -13,24 +13,30 @@ from shapecat.tracking.tracker import reach
 
 __all__ = ["Fragments", "merge_fragments", "scene_cuts"]
 
-_NEIGHBOURHOOD_M = 0.3  # objects that far apart say nothing about each other
-_SLOW_S = 0.3  # frames this far apart are not expected to show a motion
-_KNOWN = 8  # whole views that tell a size; some that seem whole are not
-_SAME_SIZE = 0.25  # mean absolute logarithm of the ratio of sizes
-_SAME_POSTERIOR = 0.5  # total variation
-_TRUSTED = 0.4  # so much more where few views are whole, at the very place and in the very size
-_LOOKAHEAD = 8  # later fragments at the same place that are considered
+_NEIGHBOURHOOD_M = 0.3  # objects farther apart than this are not compared for scene cuts
+_SLOW_S = 0.3  # from this interval between frames on, motion does not explain a distance
+_KNOWN = 8  # whole views from which the size is known, as some views only seem whole
+_SAME_SIZE = 0.25  # largest difference of size keys of the same object
+_SAME_POSTERIOR = 0.5  # largest total variation distance of posteriors of the same object
+_TRUSTED = 0.4  # added to that if few views are whole, for the same position and size
+_LOOKAHEAD = 8  # later fragments at the same position that are considered
 
 
 class Fragments(Record):
-    """Tracks as they were found without knowing the future, one per row, in order of birth.
+    """Tracks found without knowing the future, one per row, in order of birth.
 
-    ``first_ns`` and ``last_ns`` (f,) times of the first and last detection; ``start`` and ``end``
-    (f, 3) metres, where it was then, and ``start_velocity``, ``end_velocity`` (f, 3) m/s;
-    ``sizes`` (f, 3) typical box lengths, metres, ``whole`` (f,) how many views seem to show all
-    of it, and ``rest`` (f, 3) where it is then, nan if it moves; ``cut`` (f, 2) whether the first
-    and the last view show only a part of it; ``posteriors`` (f, c), and ``novelties`` (f,), above
-    1 where they say nothing; ``scenes`` (f,) number of the scene, counted by `scene_cuts`.
+    Attributes
+    ----------
+    first_ns, last_ns : (f,) times of the first and the last detection.
+    start, end : (f, 3) positions at these times, metres.
+    start_velocity, end_velocity : (f, 3) velocities at these times, m/s.
+    sizes : (f, 3) typical box lengths, metres.
+    whole : (f,) number of views that seem to show the whole object.
+    rest : (f, 3) position in these views, metres; NaN if the object moves.
+    cut : (f, 2) whether the first and the last view are partial.
+    posteriors : (f, c) fused posteriors.
+    novelties : (f,) fused novelties; above 1, the posterior is meaningless.
+    scenes : (f,) number of the scene; `scene_cuts` separates scenes.
     """
 
     first_ns: I4 = array("f", "i8")
@@ -49,19 +55,20 @@ class Fragments(Record):
 
 
 def merge_fragments(fragments: Fragments, settings: TrackingSettings) -> I4:
-    """Join fragments of one object: same place, no overlap in time, alike in size and posterior.
+    """Stitch fragments that agree in position, size and posterior and do not overlap in time.
 
-    The end of one fragment is joined to the start of a later one, the best pair first; each end
-    and each start is used once, so that a chain never shows two detections at a time. An object
-    that was taken away and replaced by its like while nobody looked counts as the same.
+    The end of a fragment is linked to the start of a later one, the best pair first. Each end and
+    each start is used once, so that a chain never has two detections at a time. An object that was
+    replaced by a similar one while out of view counts as the same.
 
     Returns
     -------
-    (f,) position of the first fragment of the chain each one belongs to.
+    For each fragment (f,), the index of the first fragment of its chain.
 
     Notes
     -----
-    O(f log f) for fragments spread in space; at one place, eight successors are looked at.
+    Cost: O(f log f) for fragments spread in space; at one position, only eight successors are
+    considered.
     """
     result = np.arange(len(fragments.first_ns))
     used_end, used_start = np.zeros(result.size, bool), np.zeros(result.size, bool)
@@ -70,17 +77,17 @@ def merge_fragments(fragments: Fragments, settings: TrackingSettings) -> I4:
             used_end[i] = used_start[j] = True
             result[j] = i
     for j in np.argsort(fragments.first_ns, kind="stable"):
-        result[j] = result[result[j]]  # the predecessor is older and done
+        result[j] = result[result[j]]  # the predecessor is older and thus already resolved
     return result.astype(np.int32)
 
 
 def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, int]]:
-    """Return possible joins (earlier, later), the most likely first."""
+    """Return the possible links (earlier, later), the cheapest first."""
     keys = size_key(fragments.sizes)
     limit = reach(keys, settings.gate_m)
-    hidden = 2 * reach(keys, np.inf)  # one side goes behind something, the other comes out
+    hidden = 2 * reach(keys, np.inf)  # one side disappears behind an occluder, the other emerges
     known = fragments.whole >= _KNOWN
-    vague = (fragments.whole == 0) | (fragments.novelties > 1)  # looks like anything
+    vague = (fragments.whole == 0) | (fragments.novelties > 1)  # the posterior is meaningless
     found = []
     for i, after in enumerate(_successors(fragments, limit, settings)):
         within = np.where(fragments.cut[i, 1] & fragments.cut[after, 0], hidden[i], limit[i])
@@ -100,9 +107,10 @@ def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, 
 
 
 def _contradiction(key: F8, others: F8, known: Bool, others_known: Bool) -> F8:
-    """Return (k,) differences of a `size_key` to others (k, 3), as far as they contradict.
+    """Return (k,) contradictions between a `size_key` (3,) and others (k, 3).
 
-    An object whose size is not known may be larger than it was seen.
+    An object of unknown size may be larger than seen so far, so only lengths beyond a known size
+    count.
     """
     excess = key - others
     counts = np.where(excess > 0, others_known[:, None], known)
@@ -110,7 +118,7 @@ def _contradiction(key: F8, others: F8, known: Bool, others_known: Bool) -> F8:
 
 
 def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> Iterator[I4]:
-    """Yield, for each fragment, the later ones that start at its place or soon after its end."""
+    """Yield, for each fragment, later ones that start near its position or soon after its end."""
     if len(limit) == 0:
         return
     rests = np.isfinite(fragments.rest)
@@ -121,7 +129,7 @@ def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> 
     first = fragments.first_ns[order]
     window = int(settings.max_missed_s * 1e9)
     for i, end in enumerate(fragments.last_ns):
-        # One by one: all of them together are lists of millions of numbers after some hours.
+        # One by one, as all together would be lists of millions of numbers after some hours.
         places = [tree.query_ball_point(e[i], limit[i]) for tree in trees for e in ends]
         low, high = np.searchsorted(first, [end, end + window], side="right")
         for_place = np.unique(np.concatenate([np.array(p, np.int64) for p in places]))
@@ -132,11 +140,11 @@ def _successors(fragments: Fragments, limit: F8, settings: TrackingSettings) -> 
 
 
 def _distances(fragments: Fragments, i: int, after: I4, settings: TrackingSettings) -> F8:
-    """Return how far the starts of ``after`` (k,) are from the end of fragment i, in metres.
+    """Return the distances (k,), metres, between the end of fragment i and the starts of ``after``.
 
-    Where one stood still, that place counts as well: where it comes into view or goes out of it,
-    only a part of it was seen. Over a short gap a moving object may have gone on: both ends are
-    continued to the middle of the gap. The smallest distance counts.
+    Resting positions count like ends and starts, since objects that enter or leave the view are
+    only partly visible there. Over a short gap, both ends are also extrapolated with their
+    velocities to the middle of the gap. The smallest distance counts.
     """
     ways = (
         fragments.start[after] - fragments.end[i],
@@ -154,13 +162,13 @@ def _distances(fragments: Fragments, i: int, after: I4, settings: TrackingSettin
 
 
 def scene_cuts(hits: Hits, settings: TrackingSettings) -> Bool:
-    """Return (k,) which frames of one stream show another scene than the frames before.
+    """Return (f,) which frames of a stream begin a new scene.
 
-    Recordings made of single pictures put different objects at the same place from one frame to
-    the next. Two frames speak for a cut when fewer than half of the objects that have any
-    neighbour in the other frame are found again. A single odd frame is no cut: the frames on
-    both sides of it must disagree too. Frames without detections say nothing. A clock that
-    jumps back by more than ``max_missed_s`` is a cut as well.
+    Recordings of single images can show different objects at the same position from one frame to
+    the next. Two frames disagree if fewer than half of the objects that have a neighbour in the
+    other frame are found again. A single odd frame is no cut: the frames on both sides of it must
+    disagree too. Frames without detections are ignored. A clock that jumps back by more than
+    ``max_missed_s`` also begins a new scene.
     """
     stamps = hits.stamps_ns
     result = np.diff(stamps, prepend=stamps[:1]) < -settings.max_missed_s * 1e9
@@ -169,7 +177,7 @@ def scene_cuts(hits: Hits, settings: TrackingSettings) -> Bool:
         last, k = filled[n - 1], filled[n]
         slow = bool(stamps[k] - stamps[k - 1] > _SLOW_S * 1e9)
         if k - last > 1 and not slow:
-            continue  # unseen for some frames, an object may have moved anywhere
+            continue  # after some frames out of view, an object may be anywhere
         pairs = [(last, k)]
         if n + 1 < len(filled):
             pairs.append((last, filled[n + 1]))
@@ -180,9 +188,10 @@ def scene_cuts(hits: Hits, settings: TrackingSettings) -> Bool:
 
 
 def _continues(hits: Hits, i: int, j: int, *, slow: bool, settings: TrackingSettings) -> bool:
-    """Return whether frame j may show the scene of frame i: most objects there are the same.
+    """Return whether frames i and j may show the same scene: at least half of the objects match.
 
-    Where frames are ``slow`` to follow each other, a motion is no excuse for a distance.
+    With ``slow``, positions and posteriors must agree better, as the frames are not expected to
+    show motion.
     """
     a, b = hits.of_frame(i), hits.of_frame(j)
     distance = np.linalg.norm(hits.centers_of(a)[:, None] - hits.centers_of(b)[None], axis=2)

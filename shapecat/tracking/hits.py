@@ -1,4 +1,4 @@
-"""All detections of a stream in columns, and the frames between those of a track."""
+"""All detections of a stream in columns, with look-ups by frame and by track."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
@@ -13,7 +13,7 @@ from shapecat.tracking.records import FrameDetections
 
 __all__ = ["Hits", "gather"]
 
-_BLOCK = 2**16  # detections that are looked at together
+_BLOCK = 2**16  # detections processed at once
 
 _OF_FRAMES = {"topics": "i4", "frames": "i4", "stamps_ns": "i8"}
 _OF_HITS: dict[str, tuple[str, tuple[Any, ...]]] = {
@@ -30,16 +30,19 @@ _OF_HITS: dict[str, tuple[str, tuple[Any, ...]]] = {
 
 @dataclass(frozen=True)
 class Hits:
-    """All detections of a stream: some 110 bytes for each, as hours of them are kept at once.
+    """All detections of a stream, called hits, in the order of the frames.
+
+    A hit takes some 110 bytes, as the hits of many hours are kept at once.
 
     Attributes
     ----------
-    names : the topics.
-    topics, frames, stamps_ns : (f,) of each frame, its position in ``names``, number and time.
-    first : (f + 1,) the first detection of each frame; they are in the order of the frames.
-    rows : (n,) ascending, the position of the frame of each detection.
-    numbers, centers, sizes, posteriors, partial, novelties, described : as in `FrameDetections`.
-    axes : (n, 3, 3) of the boxes, None if those of some are not known.
+    names : the topics of the stream.
+    topics, frames, stamps_ns : (f,) index into ``names``, number and time of each frame.
+    first : (f + 1,) index of the first hit of each frame.
+    rows : (n,) index of the frame of each hit, ascending.
+    numbers, centers, sizes, posteriors, partial, novelties, described : (n, ...) as ``detections``
+        and the other columns in `FrameDetections`.
+    axes : (n, 3, 3) axes of the boxes; None if those of some hits are unknown.
     """
 
     names: tuple[str, ...]
@@ -59,43 +62,49 @@ class Hits:
 
     @classmethod
     def of(cls, frames: Iterable[FrameDetections]) -> Self:
-        """Gather the detections of one stream."""
+        """Collect the detections of one stream."""
         stream = _Gathered()
         for frame in frames:
             stream.add(frame)
         return cls(**stream.columns())
 
     def without_boxes(self) -> Self:
-        """Return them without sizes and axes, which no track is built from."""
+        """Return the hits without sizes and axes, which tracks do not need."""
         return replace(self, sizes=np.zeros((0, 3), np.float32), axes=None)
 
     def blocks(self) -> Iterator[slice]:
-        """Yield the detections of some frames, then those of the next ones, and so on."""
+        """Yield slices of hits that cover all frames in order, never dividing a frame."""
         stops = np.searchsorted(self.first, np.arange(_BLOCK, len(self.rows), _BLOCK))
         bounds = np.unique([0, *self.first[stops], len(self.rows)]).tolist()
         yield from map(slice, bounds[:-1], bounds[1:])
 
     def of_frame(self, row: int) -> slice:
-        """Return the detections of a frame."""
+        """Return the slice of a frame's hits."""
         return slice(int(self.first[row]), int(self.first[row + 1]))
 
     def centers_of(self, some: I4 | slice) -> F8:
-        """Return the centres (k, 3) of some hits, to reckon with."""
+        """Return the centres (k, 3) of some hits in double precision, metres."""
         return np.asarray(self.centers[some], np.float64)
 
     def owners(self, members: Sequence[I4]) -> I4:
-        """Return (n,) which of the tracks each detection is of, -1 if none."""
+        """Return (n,) the index of each hit's track, -1 if it has none.
+
+        ``members`` are the hits of each track.
+        """
         owner = np.full(len(self.rows), -1, np.int32)
         for k, member in enumerate(members):
             owner[member] = k
         return owner
 
     def stamps(self, hits: I4) -> I4:
-        """Return the times of some hits."""
+        """Return the times (k,) of hits (k,), ns."""
         return np.asarray(self.stamps_ns[self.rows[hits]])
 
     def weights(self, member: I4) -> F8:
-        """Return how much each view of the track ``member`` counts: one that is repeated, once."""
+        """Return the weights (k,) of a track's hits ``member`` (k,) in the fusion.
+
+        A repeated view counts only once.
+        """
         topics = self.topics[self.rows[member]].astype(np.int64)
         _, first = np.unique((topics << 32) + self.described[member], return_index=True)
         new = np.zeros(len(member), np.bool_)
@@ -103,16 +112,16 @@ class Hits:
         return np.where(new, view_weights(self.partial[member]), 0.0)
 
     def at(self, rows: I4) -> tuple[I4, I4]:
-        """Return the hits in some frames, and for each the position of its frame in ``rows``."""
+        """Return the hits of frames ``rows`` and, for each, the index of its frame in ``rows``."""
         first, stop = self.first[rows], self.first[rows + 1]
         which = np.repeat(np.arange(len(rows)), stop - first)
         return np.arange(which.size) - (np.cumsum(stop - first) - stop)[which], which
 
     def places(self, member: I4, rows: I4) -> F8:
-        """Return (k, 3) where the track ``member`` is in frames: on the line between its hits."""
+        """Return the positions (k, 3) of a track in frames ``rows`` (k,), interpolated, metres."""
         if len(rows) == 0:
             return np.zeros((0, 3))
-        # Those around the frames alone: a track of hours is asked for many short spans.
+        # Use only hits near these frames, as long tracks are queried for many short spans.
         before, after = np.searchsorted(member, self.first[[rows.min() + 1, rows.max()]])
         near = member[max(before - 1, 0) : after + 1]
         seen = self.rows[near]
@@ -120,9 +129,9 @@ class Hits:
         return np.column_stack(lines)
 
     def life(self, member: I4, max_gap_s: float) -> tuple[I4, Bool]:
-        """Return the frames of a track, and in which of them it is detected.
+        """Return the frames of a track from its first to its last hit, and which of them have hits.
 
-        Gaps that are longer than ``max_gap_s`` are left out, and so are topics that never see it.
+        Gaps longer than ``max_gap_s`` are left out, and so are topics without any of its hits.
         """
         seen = self.rows[member]
         gap_s = np.diff(self.stamps_ns[seen]) * 1e-9
@@ -132,26 +141,26 @@ class Hits:
         return rows, np.isin(rows, seen)
 
     def sees(self, member: I4, rows: I4) -> Bool:
-        """Return which frames are of a topic that sees the track ``member``."""
+        """Return which frames belong to topics with hits of the track ``member``."""
         return np.isin(self.topics[rows], self.topics[self.rows[member]])
 
     def seen_with(self, member: I4, other: I4) -> I4:
-        """Return the hits of another track in the topics that see the track ``member``."""
+        """Return the hits of another track in topics with hits of the track ``member``."""
         return other if len(self.names) == 1 else other[self.sees(member, self.rows[other])]
 
 
 def gather(frames: Iterable[FrameDetections], together: Collection[str] = ()) -> Iterator[Hits]:
-    """Yield the detections of each stream; of several topics ``together``, by time."""
+    """Yield the hits of each stream; the topics in ``together`` form one stream, sorted by time."""
     streams: dict[str, _Gathered] = {}
     for frame in frames:
         name = "" if frame.topic in together else frame.topic
         streams.setdefault(name, _Gathered()).add(frame)
-    while streams:  # none is kept longer than it is needed
+    while streams:  # free each stream as soon as possible
         yield Hits(**streams.pop(next(iter(streams))).columns())
 
 
 class _Gathered:
-    """The columns of a stream while it is read; bytes grow in place."""
+    """The columns of a stream while it is being read; bytes grow in place."""
 
     def __init__(self) -> None:
         self._names: dict[str, int] = {}
@@ -174,7 +183,7 @@ class _Gathered:
             self._bytes[name] += np.asarray(_column(frame, name), kind).tobytes()
 
     def columns(self) -> dict[str, Any]:
-        """Return the columns of `Hits`, and give up the bytes they are made of."""
+        """Return the columns of `Hits`, and free the bytes they were made from."""
         counts = np.array(self._counts, np.int32)
         of_frames = {name: self._taken(name, kind) for name, kind in _OF_FRAMES.items()}
         which: Any = slice(None)
@@ -209,6 +218,6 @@ def _column(frame: FrameDetections, name: str) -> Any:
 
 
 def _by_time(topics: I4, stamps_ns: I4) -> Any:
-    """Return the order of frames by time, those of each topic kept in their order of recording."""
+    """Return the order of frames by time that keeps each topic's order of recording."""
     streams = (np.flatnonzero(topics == topic).tolist() for topic in range(topics.max() + 1))
     return np.fromiter(merge(*streams, key=stamps_ns.tolist().__getitem__), np.int64)

@@ -1,4 +1,4 @@
-"""Tracks that are one object: it was split into pieces for some frames."""
+"""Joining the tracks of one object that was split into pieces in some frames."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -12,24 +12,28 @@ from shapecat.tracking.hits import Hits
 
 __all__ = ["join_pieces"]
 
-_NEAR_M = 0.35  # centres of pieces are nearer than that
-_SLACK, _SLACK_M = 1.1, 0.01  # pieces together may be so much longer than the whole
-_LACKING = 0.95  # a piece is shorter, on some side, than so much of the whole
-_MOSTLY = 0.34  # share of the frames with both in which they must be pieces
-_PASSING = 0.25  # share of either track's frames with both, at most, while it passes an occluder
-_CHANGING = 0.5  # the same, if it is seen on both sides at once in one of them
+_NEAR_M = 0.35  # largest distance between the centres of pieces
+_SLACK, _SLACK_M = 1.1, 0.01  # factor and length by which the pieces may exceed the whole object
+_LACKING = 0.95  # some length of a piece is less than this fraction of the whole object's
+_MOSTLY = 0.34  # fraction of the common frames in which two tracks must be pieces
+_PASSING = 0.25  # largest overlap in time of two tracks while an object passes an occluder
+_CHANGING = 0.5  # the same, if one detection sometimes covers both sides of the occluder
 
 
 def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
-    """Join tracks of one object that was split: together they are no larger than one of them alone.
+    """Join tracks that are pieces of one object.
 
-    Two objects side by side are larger than either of them. Of two pieces in the same frame the
-    larger one stays in the track.
+    The box around two pieces is no larger than the whole object, as one of the tracks shows it in
+    other frames; two objects side by side are larger. Of two pieces in the same frame, the larger
+    one stays in the track.
 
-    An object that goes behind a narrow thing comes out on its other side before it is gone on the
-    first: one track ends soon after the other one began. Whatever has been seen of it until then
-    is what stuck out to a side, so it may be as deep as it is long; or it was seen on both sides
-    at once, now and then, as one detection.
+    An object that moves behind a narrow occluder appears on one side before it has disappeared on
+    the other, so that one track ends soon after the other one began. It may then be as deep as its
+    visible part is long. If one detection sometimes covered both sides at once, its size counts.
+
+    Parameters
+    ----------
+    members : hits of each track, ascending.
 
     Returns
     -------
@@ -48,7 +52,7 @@ def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
 
 
 def _count_fits(hits: Hits, members: Sequence[I4]) -> Counter[tuple[int, int]]:
-    """Return in how many frames pairs of tracks are pieces of one object."""
+    """Return the number of frames in which two tracks are pieces of one object, for each pair."""
     owner, counts = hits.owners(members), Counter[tuple[int, int]]()
     rooms = _Rooms(hits, members)
     for block in hits.blocks():
@@ -61,18 +65,19 @@ def _count_fits(hits: Hits, members: Sequence[I4]) -> Counter[tuple[int, int]]:
 
 
 class _Rooms:
-    """How large the whole object is that two pieces may be of."""
+    """Sizes of the whole object that two pieces may belong to."""
 
     def __init__(self, hits: Hits, members: Sequence[I4]) -> None:
         self._hits, self._members = hits, members
         self._wholes = np.array([_wholes(hits, member) for member in members])
-        # Not of a method: a cycle would keep gigabytes of hits until they are collected.
+        # A cached method would make a reference cycle, which could keep gigabytes of hits alive.
         self._in_one = cache(partial(_seen_in_one, hits, members))
 
     def of(self, pairs: I4, owner: I4, duos: I4, which: I4) -> F8:
-        """Return (p, 2, 3) the lengths that either track of pairs (p, 2) of detections tells.
+        """Return (p, 2, 3) the lengths of the whole object from either track, metres.
 
-        ``which`` (p,) are their positions in ``duos`` (q, 2), the pairs of tracks.
+        ``pairs`` (p, 2) are pairs of hits, ``duos`` (q, 2) the pairs of tracks, and ``which`` (p,)
+        the position of each pair's tracks in ``duos``.
         """
         hits = self._hits
         rooms = self._wholes[owner[pairs], hits.topics[hits.rows[pairs]]]
@@ -85,9 +90,9 @@ class _Rooms:
 
 
 def _seen_in_one(hits: Hits, members: Sequence[I4], a: int, b: int) -> F8:
-    """Return the largest lengths of the hits of two tracks that are alone in their frames.
+    """Return the largest lengths (3,) of hits where only one of two tracks has a hit, metres.
 
-    Only while both last; 0 if there are none.
+    Only frames while both tracks last count; 0 if there are none.
     """
     both = np.concatenate([members[a], members[b]])
     start = max(hits.rows[members[k][0]] for k in (a, b))
@@ -108,7 +113,7 @@ def _sorted_sides(sizes: F8) -> F8:
 
 
 def _wholes(hits: Hits, member: I4) -> F8:
-    """Return (topics, 3) lengths of the whole object as each topic sees it, 0 if it does not."""
+    """Return (topics, 3) the whole object's lengths as seen by each topic, metres; 0 if unseen."""
     topics = hits.topics[hits.rows[member]]
     result = np.zeros((len(hits.names), 3))
     for topic in _where(np.bincount(topics) > 0):
@@ -117,14 +122,14 @@ def _wholes(hits: Hits, member: I4) -> F8:
 
 
 def _whole(hits: Hits, member: I4) -> F8:
-    """Return the lengths of the whole object: they are seen now and then."""
+    """Return the 75 % quantile (3,) of the lengths of whole views, or of all if none is whole."""
     uncut = member[~hits.partial[member]]
     lengths = _sorted_sides(hits.sizes[member if len(uncut) == 0 else uncut])
     return np.asarray(np.quantile(lengths, 0.75, axis=0))
 
 
 def _neighbours(hits: Hits, owner: I4, block: slice) -> I4:
-    """Return (p, 2) tracked detections of the same frame that are near each other."""
+    """Return (p, 2) pairs of tracked hits in the same frame that are near each other."""
     tracked = block.start + np.flatnonzero(owner[block] >= 0)
     places = np.column_stack([hits.centers[tracked], hits.rows[tracked]])
     found = cKDTree(places).query_pairs(_NEAR_M, output_type="ndarray")
@@ -133,9 +138,9 @@ def _neighbours(hits: Hits, owner: I4, block: slice) -> I4:
 
 
 def _changes(hits: Hits, members: Sequence[I4], duos: I4) -> F8:
-    """Return how long pairs (q, 2) of tracks both last, as a share of the shorter one's life.
+    """Return (q,) the overlap in time of pairs of tracks (q, 2), relative to the shorter track.
 
-    It is inf if that lies in the other's.
+    It is inf if one track lies within the other.
     """
     first = np.array([hits.rows[member[0]] for member in members])[duos]
     last = np.array([hits.rows[member[-1]] for member in members])[duos]
@@ -145,10 +150,10 @@ def _changes(hits: Hits, members: Sequence[I4], duos: I4) -> F8:
 
 
 def _fit(hits: Hits, pairs: I4, wholes: F8) -> Bool:
-    """Tell which pairs (p, 2) are pieces of either one's whole (p, 2, 3) object.
+    """Return (p,) which pairs of hits (p, 2) are pieces of either one's whole object (p, 2, 3).
 
-    Their common box is no larger than it, and neither shows all of it: in a bowl there may be
-    something.
+    Their joint box is no larger than the whole object, and neither of them shows all of it, unlike
+    a bowl with an object in it.
     """
     joint = np.minimum(_joint(hits, pairs), _joint(hits, pairs[:, ::-1]))
     lengths = _sorted_sides(hits.sizes[pairs.ravel()]).reshape(-1, 2, 3)
@@ -159,7 +164,7 @@ def _fit(hits: Hits, pairs: I4, wholes: F8) -> Bool:
 
 
 def _joint(hits: Hits, pairs: I4) -> F8:
-    """Return (p, 3) the lengths of the boxes of both, along the axes of the first."""
+    """Return (p, 3) the lengths of each pair's joint box, along the axes of the first, metres."""
     i, j = pairs.T
     if hits.axes is None:
         raise ValueError
@@ -172,7 +177,7 @@ def _joint(hits: Hits, pairs: I4) -> F8:
 
 
 def _largest(hits: Hits, member: I4) -> I4:
-    """Return the largest of the hits of each frame."""
+    """Return the largest hit of each frame."""
     volume = hits.sizes[member].astype(np.float64).prod(axis=1)
     order = member[np.lexsort([-volume, hits.rows[member]])]
     first = np.concatenate([[True], np.diff(hits.rows[order]) > 0])

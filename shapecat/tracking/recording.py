@@ -1,4 +1,4 @@
-"""From the detections of a recording to its tracks, with the future known."""
+"""From the detections of a recording to its tracks, offline: later frames are known."""
 
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,11 +19,11 @@ from shapecat.tracking.tracker import Tracker
 __all__ = ["track_recording"]
 
 _BURST_NS = 500_000_000
-"""A track proves itself by its hits among the frames this near its first one."""
+"""Frames this near to a track's first one decide how many hits confirm it."""
 
-_STILL_M = 0.05  # a centre strays less while its object stands still
-_GAP_S, _GAP_FRAMES = 0.7, 5  # unseen for longer, another detection begins a fragment
-_LINE = 10  # detections at either end of a track that tell its motion
+_STILL_M = 0.05  # a track's centres spread less than this while its object stands still
+_GAP_S, _GAP_FRAMES = 0.7, 5  # after a longer gap, the next detection begins a new fragment
+_LINE = 10  # detections at either end of a track from which its motion is estimated
 
 
 def track_recording(
@@ -36,17 +36,16 @@ def track_recording(
 
     Parameters
     ----------
-    frames : all frames, also those without detections, each stream in its order of recording.
-    together : topics whose centres are in one and the same frame: an object that several of
-        these sensors see is one track.
+    frames : all frames, including those without detections, each stream in recording order.
+    together : topics whose centres are in the same coordinate frame; an object seen by several of
+        these sensors gets one track.
 
     Returns
     -------
-    Confirmed tracks, each made as it is asked for, numbered from 1 in order of birth (time, then
-    stream, then position). A track is confirmed by ``settings.min_hits`` detections, or by as
-    many as there are frames of the same scene within half a second of its first; so a recording
-    of single pictures, one per second, keeps every detection. Detections of no confirmed track
-    are taken for false.
+    Confirmed tracks, made on demand, numbered from 1 in order of birth (time, then stream, then
+    position). A track is confirmed by ``settings.min_hits`` detections, or by fewer if fewer frames
+    of the same scene lie within half a second of its first. So a recording of single images, one
+    per second, keeps every detection. Detections without a confirmed track count as false.
 
     Notes
     -----
@@ -60,7 +59,7 @@ def track_recording(
 
 @dataclass(frozen=True)
 class _Followed:
-    """A stream whose detections belong to tracks, at rest where there is a common motion."""
+    """A tracked stream: its hits, without the common motion if there is one, and its tracks."""
 
     hits: Hits
     members: list[I4]
@@ -71,7 +70,7 @@ class _Followed:
 
 
 def _track_stream(hits: Hits, settings: TrackingSettings) -> _Followed:
-    """Track a stream; where its objects move as one, as if they stood still."""
+    """Track a stream; if its objects have a common motion, remove it and track again."""
     members = _follow(hits, settings)
     motion = find_common_motion(hits, members)
     if motion is not None:
@@ -81,7 +80,7 @@ def _track_stream(hits: Hits, settings: TrackingSettings) -> _Followed:
 
 
 def _follow(hits: Hits, settings: TrackingSettings) -> list[I4]:
-    """Return which detections of a stream are of the same object."""
+    """Return the hits (k,) of each object of a stream, ascending."""
     cuts = scene_cuts(hits, settings)
     scenes = np.cumsum(cuts)
     fragments = [
@@ -98,7 +97,7 @@ def _follow(hits: Hits, settings: TrackingSettings) -> list[I4]:
 
 
 def _associate(hits: Hits, cuts: Bool, settings: TrackingSettings) -> I4:
-    """Return the track of every detection, as the tracker numbers it."""
+    """Return (n,) the tracker's track number of each hit."""
     tracker, ids = Tracker(settings), np.zeros(len(hits.rows), np.int32)
     for row, (stamp_ns, cut) in enumerate(zip(hits.stamps_ns.tolist(), cuts.tolist(), strict=True)):
         if cut:
@@ -115,13 +114,13 @@ def _associate(hits: Hits, cuts: Bool, settings: TrackingSettings) -> I4:
 
 
 def _groups(labels: I4) -> list[I4]:
-    """Return the positions of each label, ascending, by ascending label."""
+    """Return the indices of each label, ascending; labels in ascending order."""
     order = np.argsort(labels, kind="stable").astype(np.int32)
     return np.split(order, np.flatnonzero(np.diff(labels[order])) + 1)
 
 
 def _without_gaps(hits: Hits, track: I4) -> list[I4]:
-    """Split a track at long gaps; hindsight joins the parts again."""
+    """Split a track at long gaps; `merge_fragments` may join the parts again."""
     if len(track) == 0:
         return []
     gap_s = np.diff(hits.stamps(track)) * 1e-9
@@ -130,7 +129,7 @@ def _without_gaps(hits: Hits, track: I4) -> list[I4]:
 
 
 def _describe(hits: Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
-    """Summarise fragments: sizes by medians, which a few odd views do not move."""
+    """Summarise fragments, given by their hits; ``scenes`` (f,) is the scene of each frame."""
     n = len(fragments)
     starts = [_line(hits, f[:_LINE], 0) for f in fragments]
     ends = [_line(hits, f[-_LINE:], -1) for f in fragments]
@@ -153,14 +152,14 @@ def _describe(hits: Hits, fragments: Sequence[I4], scenes: I4) -> Fragments:
 
 
 def _fused(hits: Hits, member: I4) -> tuple[F8, float]:
-    """Return the fused posterior and novelty of some views of one object."""
+    """Return the fused posterior (c,) and novelty of hits of one object."""
     weights = hits.weights(member)
     posterior = fuse(hits.posteriors[member], weights=weights)
     return posterior, fuse_novelty(hits.novelties[member], weights)
 
 
 def _extent(hits: Hits, member: I4) -> F8:
-    """Return the typical lengths of the whole views, or else the largest ones of the cut views."""
+    """Return the median lengths (3,) of whole views, or else the largest ones of partial views."""
     whole = member[~hits.partial[member]]
     if len(whole):
         return np.asarray(np.median(hits.sizes[whole].astype(np.float64), axis=0))
@@ -168,7 +167,7 @@ def _extent(hits: Hits, member: I4) -> F8:
 
 
 def _rest(hits: Hits, member: I4) -> F8:
-    """Return where the whole views are if they are in one place, else nan."""
+    """Return the median position (3,) of the whole views; NaN if they move or are too few."""
     whole = hits.centers_of(member[~hits.partial[member]])
     if (
         len(whole) < _LINE
@@ -179,9 +178,9 @@ def _rest(hits: Hits, member: I4) -> F8:
 
 
 def _line(hits: Hits, some: I4, at: int) -> tuple[F8, F8]:
-    """Fit a uniform motion; return the place at one of some hits, and the velocity in m/s.
+    """Fit a constant velocity to hits; return position (metres) at hit ``at`` and velocity (m/s).
 
-    A prior of standing still keeps the velocity of a few noisy points small.
+    A prior for standing still keeps the velocity of a few noisy points small.
     """
     stamps, centers = hits.stamps(some), hits.centers_of(some)
     t = (stamps - stamps[at]) * 1e-9
@@ -191,7 +190,7 @@ def _line(hits: Hits, some: I4, at: int) -> tuple[F8, F8]:
 
 
 def _needed(hits: Hits, scenes: I4, row: int, min_hits: int) -> int:
-    """Return how many detections confirm a track that was born in frame ``row``."""
+    """Return the number of hits that confirm a track born in frame ``row``."""
     near, stamps = 1, hits.stamps_ns
     for direction in (1, -1):
         for k in range(row + direction, row + direction * min_hits, direction):
@@ -206,7 +205,7 @@ def _build_track(number: int, stream: _Followed, member: I4, settings: TrackingS
     rows, source = hits.life(member, settings.max_missed_s)
     views, weights = hits.posteriors[member], hits.weights(member)
     posterior = fuse(views, settings.fusion, weights)
-    # The last detection up to each row.
+    # The last hit up to each row.
     at = np.searchsorted(hits.rows[member], rows, side="right") - 1
     places = hits.places(member, rows)
     return Track(

@@ -8,24 +8,23 @@ __all__ = ["FrameDetections", "Track"]
 
 
 class FrameDetections(Record):
-    """The detections of one frame as the tracker sees them; a frame may have none.
+    """The detections of one frame as input of the tracker; a frame may have none.
 
     Attributes
     ----------
     topic : the stream.
     frame : number of the frame in its stream.
     stamp_ns : time of the measurement.
-    detections : (n,) the numbers by which the detections are known.
-    centers : (n, 3) metres: centres of the boxes, in the fixed frame; in the sensor frame where
-        the recording has no fixed one. The frame must be the same over the whole stream.
-    sizes : (n, 3) metres: lengths of the boxes, the third one along the up direction.
-    posteriors : (n, c) posteriors of the single views, each sums to 1.
-    partial : (n,) whether the border of the image or something nearer cuts the object.
-    novelties : (n,) novelty of the single views.
-    axes : (n, 3, 3) the columns are the axes of the boxes, in the frame of the centres; None where
-        only sizes are known.
-    described : (n,) number of the frame whose view each detection repeats, its own where it was
-        described itself; None where all were.
+    detections : (n,) numbers of the detections.
+    centers : (n, 3) centres of the boxes, metres, in the fixed frame; in the sensor frame if the
+        recording has no fixed frame. All frames of a stream use the same coordinate frame.
+    sizes : (n, 3) lengths of the boxes, metres; the third one is along the up direction.
+    posteriors : (n, c) posteriors of the single views; each sums to 1.
+    partial : (n,) whether the image border or an occluder cuts the object.
+    novelties : (n,) novelties of the single views.
+    axes : (n, 3, 3) axes of the boxes as columns, in the frame of the centres; None if unknown.
+    described : (n,) number of the frame whose description each detection repeats, its own number
+        if it was described itself; None if all were.
     """
 
     topic: str
@@ -44,22 +43,22 @@ class FrameDetections(Record):
 class Track(Record):
     """One object over the frames of its streams, from its first to its last detection.
 
-    Between detections it *coasts*: such a row has no detection, its centre lies on the line
-    between its neighbours. A gap longer than `TrackingSettings.max_missed_s` has no rows.
+    Between detections a track *coasts*: such a row has no detection, and its centre is interpolated
+    linearly. A gap longer than `TrackingSettings.max_missed_s` has no rows.
 
     Attributes
     ----------
     id : number of the track in the recording, from 1, in order of birth.
-    topics : (k,) the stream of each frame: one, or several that were tracked together.
+    topics : (k,) stream of each frame: one, or several that were tracked together.
     hits : number of rows with a detection.
     frames : (k,) numbers of the frames in their streams, in the order of time.
     stamps_ns : (k,) times of the frames.
-    detections : (k,) numbers of the detections, -1 where it coasts.
-    centers : (k, 3) metres, in the frame of `FrameDetections.centers`.
+    detections : (k,) numbers of the detections, -1 where the track coasts.
+    centers : (k, 3) metres, in the coordinate frame of `FrameDetections.centers`.
     causal : (k, c) fused posterior of the views up to each row.
     posterior : (c,) fused posterior of all views.
-    confidence : the largest entry of `posterior`.
-    novelty : fused novelty of the views; above 1 the object is none of the known.
+    confidence : largest entry of `posterior`.
+    novelty : fused novelty of all views; above 1, the object belongs to no known category.
     """
 
     id: int
@@ -75,11 +74,11 @@ class Track(Record):
     novelty: float
 
     def part(self, rows: slice) -> "Track":
-        """Return some of its rows; what is said of the whole stays."""
+        """Return the track with only some of its rows; the values of the whole track stay."""
         columns = ("topics", "frames", "stamps_ns", "detections", "centers", "causal")
         return replace(self, **{name: getattr(self, name)[rows] for name in columns})
 
     @property
     def topic(self) -> str:
-        """Its stream; several are joined by a space."""
+        """Name of its stream; several names are joined by a space."""
         return " ".join(sorted(set(self.topics)))

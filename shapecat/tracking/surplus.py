@@ -1,4 +1,4 @@
-"""Tracks that are no objects: pieces of objects that were split for some frames."""
+"""Removal of false tracks: pieces of objects that were split in some frames."""
 
 from collections.abc import Sequence
 from functools import cache
@@ -10,15 +10,15 @@ from shapecat.tracking.hits import Hits
 
 __all__ = ["without_pieces", "without_shadows"]
 
-_SHADOW = 5  # a track this many times longer may have another one as its shadow
-_COVERED = 0.5  # covered frames for each seen one from which on a track is a piece
+_SHADOW = 5  # a track is removed only inside one that has this many times as many hits
+_COVERED = 0.5  # ratio of covered frames to hits above which a track is a piece
 
 
 def without_shadows(hits: Hits, members: Sequence[I4]) -> list[I4]:
-    """Drop short tracks inside longer ones: pieces of an object that was split for a moment.
+    """Remove short tracks near the centre of much longer ones: pieces of a briefly split object.
 
-    No object has its centre in the inner half of another one's for all the time it is seen.
-    ``members`` are the hits (k,) of each track, ascending.
+    A real object is rarely that close to another one's centre. ``members`` are the hits (k,) of
+    each track, ascending.
     """
     lengths = np.array([len(member) for member in members])
     first = np.array([hits.rows[member[0]] for member in members])
@@ -41,12 +41,11 @@ def _inside(hits: Hits, member: I4, host: I4, radius: float) -> bool:
 
 
 def without_pieces(hits: Hits, members: Sequence[I4], max_gap_s: float) -> list[I4]:
-    """Drop tracks that are too often a part of another object.
+    """Remove tracks that are too often a part of another object.
 
-    An object that is split in some frames leaves a track whose place lies, in the other frames,
-    in the box of the whole object. What only stands close to another object, or is hidden by it,
-    has its centre outside that box, whether it is seen or not. Frames without a view of the place
-    tell nothing. ``members`` are the hits (k,) of each track, ascending.
+    If an object is split in some frames, the track of a piece lies, in the other frames, in the box
+    of the whole object. An object that only stands near another one, or is hidden by it, has its
+    centre outside that box. ``members`` are the hits (k,) of each track, ascending.
     """
     if hits.axes is None:
         return list(members)
@@ -59,7 +58,7 @@ def without_pieces(hits: Hits, members: Sequence[I4], max_gap_s: float) -> list[
 
 
 def _covered(hits: Hits, member: I4, max_gap_s: float) -> int:
-    """Count the frames of its life in which a track is not seen, but in another one's box."""
+    """Count the frames between a track's hits in which it lies in another detection's box."""
     rows, seen = hits.life(member, max_gap_s)
     others, which = hits.at(rows[~seen])
     place = hits.places(member, rows[~seen])[which]
@@ -67,11 +66,11 @@ def _covered(hits: Hits, member: I4, max_gap_s: float) -> int:
 
 
 def _covered_beside(hits: Hits, k: int, members: Sequence[I4], owner: I4) -> int:
-    """Count the frames before and after its life in which a track lies in a neighbour's box.
+    """Count the frames before and after a track in which it lies in a neighbour's box.
 
-    The track is thought to move along with the neighbour. On either side half as many frames are
-    looked at as it has: one side alone does not make it a piece, as something may be put into a
-    bowl, or be pushed against another thing and be taken for a part of it from then on.
+    The track is assumed to move along with the neighbour. On either side, half as many frames are
+    checked as the track has hits. One side alone does not make it a piece, as an object may be put
+    into a bowl, or pushed against another object and merged with it from then on.
     """
     member, count = members[k], 0
     most = len(member) // 2
@@ -89,7 +88,7 @@ def _covered_beside(hits: Hits, k: int, members: Sequence[I4], owner: I4) -> int
 
 
 def _in_box(hits: Hits, which: I4, places: F8) -> Bool:
-    """Tell which places (n, 3) are in the boxes of detections (n,)."""
+    """Return (n,) whether each position (n, 3) lies in the box of the hit ``which`` (n,)."""
     axes = np.zeros((0, 3, 3)) if hits.axes is None else hits.axes
     local = np.einsum("nji,nj->ni", axes[which], places - hits.centers_of(which))
     return np.asarray((np.abs(local) <= 0.5 * hits.sizes[which]).all(axis=1))

@@ -1,4 +1,4 @@
-"""The nearest-centroid tracker (thesis 7.5.2): one of the two places that hold state."""
+"""The nearest-centroid tracker (thesis 7.5.2)."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -13,20 +13,21 @@ from shapecat.tracking.association import assign, posterior_difference, size_dif
 
 __all__ = ["Tracker", "reach"]
 
-_SPEED_M_S = 0.15  # standard deviation of an object's velocity: most stand still
-_SPEED_MEMORY_S = 1.0  # how long a velocity lasts
-_NOISE_M = 0.012  # standard deviation of a centre: points, segmentation, viewpoint
-_SURPRISE_M_S = 0.3  # speed at which a hand sets an object in motion between two frames
-_LIMIT = 1.0  # cost from which on a birth is likelier than a pair
+_SPEED_M_S = 0.15  # standard deviation of an object's velocity; most stand still
+_SPEED_MEMORY_S = 1.0  # time constant with which a velocity decays
+_NOISE_M = 0.012  # standard deviation of a centre, from noise, segmentation and viewpoint
+_SURPRISE_M_S = 0.3  # speed at which a hand may set an object in motion between two frames
+_LIMIT = 1.0  # cost from which a new track is likelier than a pair
 _SIZE_WEIGHT, _POSTERIOR_WEIGHT, _TENTATIVE_COST = 0.8, 0.5, 0.2
-_PATIENCE_S = 0.5  # even a track born just now is waited for so long
-_MEMORY_HITS = 10  # a track's size and posterior are means over about so many detections
+_PATIENCE_S = 0.5  # shortest time without detections after which a track may end
+_MEMORY_HITS = 10  # number of detections over which a track's size and posterior are averaged
 
 
 def reach(size_keys: F8, gate_m: float) -> F8:
-    """Return (m,) metres a centre may jump for an object of a given `size_key` (m, 3).
+    """Return the gate radius (m,), metres, of objects with a given `size_key` (m, 3).
 
-    Another view or an occluder moves the centre of the visible part by up to half the object.
+    A change of view, or an occluder, can move the centre of the visible part by half the object's
+    size. The radius is at most ``gate_m``.
     """
     return np.asarray(np.minimum(gate_m, 0.03 + 0.5 * np.exp(size_keys.max(axis=1))))
 
@@ -38,7 +39,7 @@ class _Active:
     ids: I4
     position: F8
     velocity: F8
-    variance: F8  # of position, both, velocity; the same along x, y and z
+    variance: F8  # of position, covariance, of velocity; the same along x, y and z
     size: F8
     posterior: F8
     hits: I4
@@ -47,7 +48,7 @@ class _Active:
     missed: I4
 
     def rows(self, which: Bool) -> Self:
-        """Return the tracks at ``which``."""
+        """Return the tracks selected by a mask."""
         columns = {f.name: getattr(self, f.name)[which] for f in dataclasses.fields(self)}
         return dataclasses.replace(self, **columns)
 
@@ -61,16 +62,16 @@ class _Active:
 
 
 class Tracker:
-    """Gives every detection of a stream of frames the number of its track.
+    """Assigns a track number to every detection of a stream of frames.
 
-    A detection continues the track whose predicted centre is near, whose size and posterior are
-    alike, and which has proved itself before; all pairs of a frame are chosen together. Positions
-    are predicted by a Kalman filter whose velocity fades (an Ornstein-Uhlenbeck process), so a
-    rolling object is followed through an occlusion while a standing one stays where it is.
+    A detection continues a track with a near predicted centre and a similar size and posterior;
+    confirmed tracks are preferred. All pairs of a frame are chosen together. A Kalman filter with
+    decaying velocity (an Ornstein-Uhlenbeck process) predicts the positions, so that a rolling
+    object is followed through an occlusion while a standing one keeps its position.
 
-    The result does not depend on the order of the detections in a frame: detections are taken in
-    the lexicographic order of centre, size and posterior, which also orders births within a
-    frame. Detections equal in all of these are interchangeable.
+    The result does not depend on the order of the detections in a frame: they are sorted by centre,
+    size and posterior, which also orders new tracks within a frame. Detections equal in all of
+    these are interchangeable.
     """
 
     def __init__(self, settings: TrackingSettings) -> None:
@@ -83,11 +84,11 @@ class Tracker:
 
     @property
     def active(self) -> int:
-        """Number of tracks that have not ended; only they cost time."""
+        """Number of tracks that have not ended; only these take computing time."""
         return 0 if self._active is None else len(self._active.ids)
 
     def reset(self) -> None:
-        """End all tracks; numbers are not used again."""
+        """End all tracks; their numbers are not reused."""
         self._active = None
 
     def step(
@@ -103,20 +104,20 @@ class Tracker:
 
         Parameters
         ----------
-        stamp_ns : time of the frame. A stamp before the last one counts as no time passed; one
-            that is earlier by more than ``max_missed_s`` ends all tracks.
-        centers : (n, 3) metres, always in the same frame.
-        sizes : (n, 3) metres, the third one along the up direction.
-        posteriors : (n, c) single-view posteriors.
-        partial : (n,) whether a view is cut by the image border or an occluder; none by default.
+        stamp_ns : time of the frame. If it is before the previous frame, no time is assumed to have
+            passed; if by more than ``max_missed_s``, all tracks end.
+        centers : (n, 3) metres, in the same coordinate frame for all frames.
+        sizes : (n, 3) metres; the third length is along the up direction.
+        posteriors : (n, c) posteriors of the single views.
+        partial : (n,) whether the image border or an occluder cuts the object; none by default.
 
         Returns
         -------
-        (n,) track of each detection, from 1, ascending in order of birth.
+        The track number (n,) of each detection; numbers start at 1, in order of birth.
 
         Raises
         ------
-        ValueError : shapes do not fit, or a centre or size is not finite.
+        ValueError : shapes do not match, or a centre or size is not finite.
         """
         shape_sizes: dict[str, int] = {}
         points = freeze(centers, "n 3", "f8", shape_sizes)
@@ -127,7 +128,7 @@ class Tracker:
             msg = f"centres and sizes must be finite, got {centers!r} and {sizes!r}"
             raise ValueError(msg)
         if len(points) == 0 and self._active is not None:
-            beliefs = self._active.posterior[:0]  # an empty frame may not know the categories
+            beliefs = self._active.posterior[:0]  # an empty frame may lack the categories
         order = np.lexsort(np.column_stack([points, lengths, beliefs, cut]).T[::-1])
         found = _seed(points[order], size_key(lengths[order]), beliefs[order])
         result = np.zeros(len(points), np.int32)
@@ -155,7 +156,7 @@ class Tracker:
         return found.ids
 
     def _tick(self, stamp_ns: int) -> float:
-        """Advance the clock, which never runs backwards; return the elapsed seconds."""
+        """Advance the clock, never backwards; return the elapsed seconds."""
         elapsed = 0 if self._stamp_ns is None else stamp_ns - self._stamp_ns
         self._stamp_ns = stamp_ns
         if elapsed < -self._settings.max_missed_s * 1e9:
@@ -164,9 +165,11 @@ class Tracker:
         return max(elapsed, 0) * 1e-9
 
     def _survivors(self, active: _Active) -> _Active:
-        """Drop tracks that were missed for too long: for longer than they were there before.
+        """Remove tracks that were missed for longer than they had been seen before.
 
-        A frame that comes late does not end a track by itself: nobody looked.
+        This time is at least half a second and at most ``max_missed_s``. A track must also be
+        missed in at least one frame, or in two if it is not confirmed, so that a long interval
+        between frames does not end it.
         """
         proved = active.hits >= self._settings.min_hits
         longest_s = max(self._settings.max_missed_s, _PATIENCE_S)
@@ -176,7 +179,7 @@ class Tracker:
 
 
 def _seed(centers: F8, size_keys: F8, posteriors: F8) -> _Active:
-    """Return new tracks of detections, without numbers."""
+    """Return new tracks for detections, without numbers."""
     n = len(centers)
     variance = np.tile([_NOISE_M**2, 0.0, _SPEED_M_S**2], (n, 1))
     return _Active(
@@ -194,7 +197,7 @@ def _seed(centers: F8, size_keys: F8, posteriors: F8) -> _Active:
 
 
 def _predict(tracks: _Active, elapsed_s: float) -> _Active:
-    """Move the tracks by their fading velocity; the variance is that of the process, exact."""
+    """Predict the tracks after ``elapsed_s`` seconds, with the exact variance of the process."""
     tau = _SPEED_MEMORY_S
     keep = np.exp(-elapsed_s / tau)
     horizon = tau * (1 - keep)
@@ -215,7 +218,10 @@ def _predict(tracks: _Active, elapsed_s: float) -> _Active:
 
 
 def _costs(tracks: _Active, found: _Active, clock_ns: int, settings: TrackingSettings) -> F8:
-    """Return (m, n) costs: distance relative to the gate, plus size, posterior and standing."""
+    """Return (m, n) costs of pairs: distance relative to the gate, plus size and posterior.
+
+    Tracks that are not confirmed cost more; pairs beyond the gate cost infinity.
+    """
     distance = np.linalg.norm(tracks.position[:, None] - found.position[None], axis=2)
     unseen_s = np.minimum((clock_ns - tracks.seen_ns) * 1e-9, 0.2)
     gate = np.minimum(
@@ -231,13 +237,13 @@ def _costs(tracks: _Active, found: _Active, clock_ns: int, settings: TrackingSet
 
 
 def _correct(tracks: _Active, found: _Active, pairs: I4, partial: Bool) -> None:
-    """Update the tracks in place by their detections; the others have missed one more frame."""
+    """Update tracks in place with their detections; the others have missed one more frame."""
     i, j = pairs.T
     tracks.missed += 1
     tracks.missed[i] = 0
     tracks.seen_ns[i] = found.seen_ns[j]
     tracks.hits[i] += 1
-    # A view of another size shows another part of the object: its centre says less.
+    # A view of another size shows another part of the object, so its centre is less reliable.
     odd = np.abs(tracks.size[i] - found.size[j]).mean(axis=1)
     noise = _NOISE_M**2 * (1 + 10 * odd + 3 * partial[j])
     pp, pv, vv = tracks.variance[i].T
