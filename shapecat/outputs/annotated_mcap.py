@@ -1,6 +1,6 @@
-"""The annotated recording: every original message, and the labelled objects.
+"""The annotated recording: all original messages, and the labelled objects.
 
-A finished MCAP file is copied byte for byte and extended; everything else is written anew, as
+A finished MCAP file is copied byte for byte and extended; any other recording is rewritten as
 MCAP. Annotations use the encoding of the source.
 """
 
@@ -29,13 +29,13 @@ from shapecat.types import ShownFrame
 __all__ = ["write_annotated"]
 
 _LIFETIME = 1.5
-"""Entities outlive the period of the frames by this factor."""
+"""Lifetime of scene entities, as a multiple of the frame period."""
 _BUFFER = 4 << 20
-"""Two threads that write the same file wait for each other: seldom is better."""
+"""Two threads that write to the same file wait for each other, so each writes much at a time."""
 _AT_ONCE = 256
 """Frames encoded together."""
 _PERIOD_NS = 1_000_000_000
-"""Assumed where a stream has a single frame."""
+"""Frame period assumed for a stream with a single frame."""
 
 
 def write_annotated(
@@ -49,21 +49,22 @@ def write_annotated(
 ) -> None:
     """Write a copy of a recording with annotation channels.
 
-    One message for each frame on ``/shapecat/detections`` and ``/shapecat/scene`` (also where it
-    has no object), with the stamp, frame id and log time of its source, and a metadata record
-    ``shapecat`` that holds ``run`` as JSON under ``run.json``. The file appears under its name
-    when it is complete.
+    Each frame gets a message on ``/shapecat/scene`` and, for ROS, on ``/shapecat/detections``, also
+    without objects, with the stamp, frame id and log time of the frame. The metadata record
+    ``shapecat`` holds ``run`` as JSON under ``run.json``. The file gets its name when it is
+    complete.
 
     Parameters
     ----------
-    markers : also write ``/shapecat/markers`` for RViz.
-    images : what is shown on the colour images, in the order of the recording: also write
+    frames : the boxes to show in each frame, in the order of the recording.
+    markers : whether to write ``/shapecat/markers`` for RViz, for ROS only.
+    images : the boxes to show on the colour images, in the order of the recording, for
         ``/shapecat/image_annotations`` and, for ROS, ``/shapecat/detections_2d``, with the stamp,
-        frame id and log time of the image.
+        frame id and log time of the image; None for neither.
 
     Raises
     ------
-    OutputError : it cannot be written.
+    OutputError : the file cannot be written.
     """
     metadata = {"run.json": json.dumps(run)}
     with _uncollected(), replacing(path) as hidden, hidden.open("wb", buffering=_BUFFER) as file:
@@ -80,7 +81,7 @@ def write_annotated(
 
 @contextmanager
 def _uncollected() -> Iterator[None]:
-    """Pause the garbage collector: there are no cycles to find."""
+    """Pause the garbage collector in the block, which makes no reference cycles."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -92,7 +93,7 @@ def _uncollected() -> Iterator[None]:
 
 @contextmanager
 def _copying(recording: McapRecording, path: Path, file: BinaryIO) -> Iterator[None]:
-    """Copy the data section of a recording while the block writes the annotations."""
+    """Copy the data section of a recording to ``path`` while the block writes annotations."""
     length = recording.summary.data_end
     with ThreadPoolExecutor(1) as pool:  # the copy does not hold the interpreter lock
         copying = pool.submit(copy_bytes, recording.path, path, length)
@@ -108,7 +109,7 @@ def _encoded(
     *,
     markers: bool,
 ) -> tuple[list[AnnotationChannel], Iterator[Item]]:
-    """Return the annotation channels and their messages, which are made as they are read."""
+    """Return the annotation channels, and an iterator that encodes their messages by log time."""
     annotations = _annotations(frames)
     first = next(annotations, None)
     encoding = _encoding(recording, first)
@@ -149,7 +150,7 @@ def _append(
     items: Iterable[Item],
     metadata: Mapping[str, str],
 ) -> None:
-    """Write the annotations behind where the original data section ends."""
+    """Write the annotations after the end of the original data section."""
     file.seek(summary.data_end)
     compression = summary.chunks[0].compression if summary.chunks else "zstd"
     with Appender(file, summary, compression) as appender:
@@ -163,7 +164,7 @@ def _append(
 
 
 def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
-    """Compute lifetimes from the next frame, and deletions from the frames before."""
+    """Add lifetimes, from the next frame, and deletions, from the previous frames."""
     periods: dict[str, int] = {}
     last: dict[str, int] = {}
     shown: dict[str, set[int]] = {}
@@ -179,12 +180,12 @@ def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
         here = {box.track for box in frame.objects}
         gone = (shown.get(frame.topic, set()) | set(frame.ended)) - here
         shown[frame.topic] = here
-        gone -= set().union(*shown.values())  # another sensor still sees it
+        gone -= set().union(*shown.values())  # unless another sensor still sees it
         yield Annotation(frame, round(_LIFETIME * period), tuple(sorted(gone)))
 
 
 def _encoding(recording: Recording, first: Annotation | None) -> str:
-    """Return the encoding to annotate in: that of the annotated topic, else the commonest."""
+    """Return the encoding for annotations: of the annotated topic, else the most common one."""
     if recording.kind == "ros1":
         return "cdr"
     topics = [topic for topic in recording.topics if topic.encoding in ENCODERS]

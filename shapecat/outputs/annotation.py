@@ -28,7 +28,7 @@ class AnnotationChannel(NamedTuple):
 
 
 class Annotation(NamedTuple):
-    """A frame to write, how long its entities live, and which tracks it no longer shows."""
+    """A frame to write, the lifetime of its entities, and the tracks to delete in it."""
 
     frame: ShownFrame
     lifetime_ns: int
@@ -36,7 +36,7 @@ class Annotation(NamedTuple):
 
 
 class Item(NamedTuple):
-    """An annotation to write: the position of its channel, its time, its bytes."""
+    """An encoded annotation: index of its channel, log time, and bytes."""
 
     channel: int
     log_time_ns: int
@@ -63,9 +63,9 @@ def properties(box: ShownBox) -> dict[str, str]:
 
 
 def text_position(center: Any, size: Any, orientation: Any) -> tuple[Any, Any, Any]:
-    """Return the position of the text, just above the box; metres, sensor frame.
+    """Return the position (x, y, z) of the text just above a box, metres, sensor frame.
 
-    The parts of the box are numbers, or columns of as many boxes.
+    Center, size and orientation consist of numbers, or of arrays (n,) for n boxes.
     """
     x, y, z = center
     qx, qy, qz, qw = orientation

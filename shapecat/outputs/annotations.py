@@ -1,4 +1,4 @@
-"""Annotation channels in each encoding of recordings."""
+"""Annotation channels for each message encoding."""
 
 import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -26,13 +26,13 @@ SCENE = "/shapecat/scene"
 MARKERS = "/shapecat/markers"
 
 Encode = Callable[[Sequence[Annotation]], Iterable[bytes]]
-"""Encodes some frames, in their order."""
+"""Encodes the annotations of frames: one message per frame, in order."""
 
 
 def encoder_for(encoding: str, *, markers: bool) -> list[tuple[AnnotationChannel, Encode]]:
-    """Return the annotation channels in an encoding, and how each encodes frames.
+    """Return the annotation channels for an encoding, each with its encoder.
 
-    An encoding that is not known gets JSON.
+    An unknown encoding is replaced by JSON. ``markers`` adds a channel for RViz, for ROS only.
     """
     return ENCODERS.get(encoding, _json)(markers)
 
@@ -97,16 +97,16 @@ ENCODERS: dict[str, Callable[[bool], list[tuple[AnnotationChannel, Encode]]]] = 
     "json": _json,
     "protobuf": _protobuf,
 }
-"""Annotations by the encoding of the source: files of mixed encodings break ROS tools."""
+"""Channels for each encoding of a source: files with mixed encodings break ROS tools."""
 
 
 _JSON = ("sec", "nsec")
 _PROTOBUF = ("seconds", "nanos")
-"""Names of the parts of a time."""
+"""Names of the two fields of a time."""
 
 
 def _plain_scene(annotation: Annotation, parts: tuple[str, str]) -> dict[str, Any]:
-    """Make a foxglove.SceneUpdate of plain values."""
+    """Return a foxglove.SceneUpdate as plain values; ``parts`` names the fields of a time."""
     frame = annotation.frame
     time, lifetime = (
         dict(zip(parts, divmod(value, 10**9), strict=True))

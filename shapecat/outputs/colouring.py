@@ -1,4 +1,4 @@
-"""Labelled frames beside what the sensor and the colour camera have seen."""
+"""Pair labelled frames with their depth and colour images from the recording."""
 
 from collections import Counter, deque
 from collections.abc import Iterable, Iterator
@@ -17,12 +17,12 @@ from shapecat.types import Frame, LabelledFrame
 __all__ = ["Coloured", "with_colour"]
 
 _AHEAD = 4
-"""Frames that are looked for in advance."""
+"""Labelled frames that are known in advance."""
 
 
 @dataclass(frozen=True)
 class Coloured:
-    """The colour image of a frame, and the mask of each of its objects, in their order."""
+    """The colour image of a frame, and the masks of its objects, in the same order."""
 
     view: ColourView
     masks: tuple[Mask, ...]
@@ -31,13 +31,21 @@ class Coloured:
 def with_colour(
     labelled: Iterable[LabelledFrame], recording: Recording, run: RunInfo
 ) -> Iterator[tuple[LabelledFrame, Frame, Coloured | None]]:
-    """Pair labelled frames, in the order they were read, with their clouds and colour images.
+    """Pair labelled frames with their frames and colour images from the recording.
 
-    Frames between them need not be read.
+    Frames that are not wanted are not read, where the file has an index.
+
+    Parameters
+    ----------
+    labelled : the wanted frames, in the order of the recording.
+
+    Yields
+    ------
+    Labelled frame, frame, and colour image with masks; None without a colour image.
 
     Raises
     ------
-    OutputError : the recording does not hold one of them any more.
+    OutputError : the recording no longer holds one of the frames.
     """
     awaited = _Awaited(labelled, run)
     read = read_frames(recording, run["options"], skipped=Counter(), needed=awaited.needs)
@@ -52,7 +60,7 @@ def with_colour(
 
 
 class _Awaited:
-    """Frames that are looked for; a few are known in advance, so that others need not be read."""
+    """The wanted frames; a few are known in advance, so that others need not be read."""
 
     def __init__(self, frames: Iterable[LabelledFrame], run: RunInfo) -> None:
         colours = run.get("color") or {}
@@ -61,17 +69,17 @@ class _Awaited:
         self._next = deque(islice(self._source, _AHEAD))
 
     def __iter__(self) -> Iterator[LabelledFrame]:
-        """Yield the frames, each awaited until the next one is asked for."""
+        """Yield the frames; each is awaited until the next one is requested."""
         while self._next:
             yield self._next[0]
             self._next.popleft()
             self._next.extend(islice(self._source, 1))
 
     def needs(self, topic: str, log_time_ns: int) -> bool:
-        """Return whether a reading or an image is awaited, or may be of a frame not yet known.
+        """Return whether a depth or colour message belongs to an awaited frame, or may do so.
 
-        Those frames are not earlier than the last one that is known, nor are their images earlier
-        than its image. Of other topics everything is needed.
+        It may belong to a frame that is not known yet if it is not earlier than the last known
+        frame, or its image. Messages of other topics are always needed.
         """
         if topic not in self._topics | self._colours:
             return True
@@ -83,7 +91,7 @@ class _Awaited:
 
 
 def _coloured(labelled: LabelledFrame, view: ColourView | None) -> Coloured | None:
-    """Return the image of a frame with the masks that were found on it."""
+    """Return the colour image of a frame with the masks of its objects; None if it has none."""
     if view is None or labelled.masks is None:
         return None
     masks = labelled.masks

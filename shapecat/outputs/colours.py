@@ -15,11 +15,11 @@ CATEGORY_COLOURS: dict[str, tuple[int, int, int]] = {
     "ball": (214, 80, 190),
     "unknown": (226, 226, 220),
 }
-"""Red, green, blue from 0 to 255, in tones that read on light and dark; grey is left to unknown."""
+"""Red, green, blue from 0 to 255, legible on light and dark; only unknown is grey."""
 
 
 def colour_of(category: str) -> tuple[int, int, int]:
-    """Return the colour of a category; a name of its own gets one that never changes.
+    """Return the colour of a category; for any other name it depends on the name alone.
 
     Examples
     --------

@@ -26,7 +26,7 @@ __all__ = ["DatasetImage", "Selection", "images_of", "snapped_masks", "split_run
 
 _log = logging.getLogger(__name__)
 
-_DEPTH_UNITS = 1000  # to a metre
+_DEPTH_UNITS = 1000  # per metre
 
 
 @dataclass(frozen=True)
@@ -35,12 +35,12 @@ class Selection:
 
     Attributes
     ----------
-    every : each so-many-th frame of a stream.
-    per_track : frames in which so many views of each track are, chosen to differ; 0 is all.
-    min_confidence : objects whose label is less certain are not labelled.
-    corrected_only : only objects are labelled whose label a person has given.
-    depth : the images are depth images, in millimetres.
-    val : share of the recordings that goes into the validation split.
+    every : take every n-th frame of a stream.
+    per_track : number of views per track, chosen to differ; only their frames are taken. 0 is all.
+    min_confidence : objects with a lower confidence are not used for training.
+    corrected_only : only objects with a label from a person are used for training.
+    depth : the images are depth images in millimetres, not colour images.
+    val : share of the recordings for the validation split, from 0 to below 1.
     """
 
     every: int = 1
@@ -53,9 +53,10 @@ class Selection:
 
 @dataclass(frozen=True)
 class DatasetImage:
-    """An image of the data set: its name without folder, its file, and the objects on it.
+    """An image of a data set, and the objects on it.
 
-    ``sure`` tells of each object whether its label is to be trained on.
+    ``name`` is the file name with suffix, ``contents`` the file. ``masks`` and ``sure`` are per
+    object: its mask, and whether its label is certain enough for training.
     """
 
     name: str
@@ -69,14 +70,14 @@ class DatasetImage:
 
 
 def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
-    """Return ``train`` or ``val`` for each run: all runs of one recording go to the same.
+    """Return ``train`` or ``val`` for each run; runs of the same recording are in the same split.
 
-    The recordings are drawn by a digest of their content, so that more runs change little; one
-    recording alone is for training.
+    The draw depends on the content of the recordings, so that adding runs changes little. A single
+    recording is for training.
 
     Raises
     ------
-    ValueError : ``val`` is no share.
+    ValueError : ``val`` is not in [0, 1).
     """
     if not 0 <= val < 1:
         msg = f"val must be at least 0 and less than 1, got {val}"
@@ -90,15 +91,19 @@ def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
 def images_of(
     finished: FinishedRun, selection: Selection, recording: Path | None = None
 ) -> Iterator[DatasetImage]:
-    """Yield the images of a run that have an object to train on; damaged ones are logged.
+    """Yield the images of a run with at least one object to train on; log damaged images.
 
-    Objects that a model is not to be trained on, as their label is not sure, are there as well;
-    those that are unknown are not.
+    The images also list objects whose label is not certain enough, but no unknown objects.
+
+    Parameters
+    ----------
+    recording : path of the recording; by default where it was processed.
 
     Raises
     ------
-    OutputError : the run has no colour images, and depth images were not asked for.
-    RecordingError : the recording is no longer there.
+    OutputError : the run has no colour images and ``selection.depth`` is False, or the content of
+        the recording has changed.
+    RecordingError : the recording is missing or unreadable.
     """
     if not selection.depth and not finished.run.get("color"):
         msg = f"{finished.folder}: no colour images; --depth exports depth images"
@@ -141,7 +146,7 @@ def _image(
     selection: Selection,
     corrected: set[int],
 ) -> DatasetImage | None:
-    """Return the image of a frame, or None."""
+    """Return the image of a frame; None if it has none."""
     found = _depth_file(labelled, frame) if selection.depth else _colour_file(frame, coloured)
     if found is None:
         return None
@@ -161,7 +166,7 @@ _File = tuple[str, bytes, tuple[int, int], tuple[Mask, ...]]
 
 
 def _colour_file(frame: Frame, coloured: Coloured | None) -> _File | None:
-    """Return suffix, content and size of a colour image, as it came, and masks that fit it."""
+    """Return suffix, content and (height, width) of a colour image, and its snapped masks."""
     if coloured is None or coloured.view.image.height <= 1:
         return None
     image = coloured.view.image
@@ -172,7 +177,7 @@ def _colour_file(frame: Frame, coloured: Coloured | None) -> _File | None:
 
 
 def _depth_file(labelled: LabelledFrame, frame: Frame) -> _File | None:
-    """Return a depth image as 16-bit PNG in millimetres, and the masks on it."""
+    """Return suffix, content, (height, width) and masks of a depth image, a PNG in millimetres."""
     if frame.depth is None:
         return None
     units = np.minimum(np.rint(frame.depth * _DEPTH_UNITS), 2**16 - 1).astype(np.uint16)
@@ -181,7 +186,7 @@ def _depth_file(labelled: LabelledFrame, frame: Frame) -> _File | None:
 
 
 def snapped_masks(frame: Frame, coloured: Coloured, pixels: U1) -> tuple[Mask, ...]:
-    """Return the masks of a frame whose outlines lie on the edges of its colour image."""
+    """Return the masks of a frame with outlines moved to the edges of its colour image."""
     lens, camera, scale = coloured.view.lens, frame.camera, 1.0
     if not coloured.view.registered and lens is not None and camera is not None:
         scale = lens.pinhole.fx / camera.fx
@@ -214,7 +219,7 @@ def _chosen(
 
 
 def _view(labelled: LabelledFrame, item: LabelledObject) -> F8:
-    """Return features for the choice of different views: direction, distance, size and shape."""
+    """Return features (8,) to choose different views: direction, distance, pixels and shape."""
     pose, center = labelled.fixed_from_sensor, np.asarray(item.box.center, np.float64)
     distance = float(np.linalg.norm(center))
     way = -center / max(distance, 1e-6)
@@ -225,7 +230,7 @@ def _view(labelled: LabelledFrame, item: LabelledObject) -> F8:
 
 
 def _different(views: F8, count: int) -> list[int]:
-    """Choose views: the one with most pixels, then always the one least like those chosen."""
+    """Choose views (farthest-point sampling): first the one with most pixels."""
     chosen = [int(views[:, 4].argmax())]
     apart = np.linalg.norm(views - views[chosen[0]], axis=1)
     while len(chosen) < min(count, len(views)):

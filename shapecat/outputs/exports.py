@@ -1,4 +1,4 @@
-"""The labels of a run in the formats of other tools."""
+"""Export the labels of runs in the formats of other tools."""
 
 import json
 from collections import Counter
@@ -42,7 +42,7 @@ _MARK = "export.json"
 
 
 def _ignore(_phase: str, _done: int, _total: int | None) -> None:
-    """Observe nothing."""
+    """Ignore the progress."""
 
 
 def export_run(
@@ -55,16 +55,18 @@ def export_run(
     recording: Path | None = None,
     observe: Observer = _ignore,
 ) -> int:
-    """Export the labels of a finished run with the points they belong to.
+    """Export the labels of a finished run with their points.
 
-    Crops are added to the data set ``out``; the other formats make ``out/NAME``, and replace only
-    what an earlier export has written there.
+    Crops are added to the data set ``out``. The other formats are written to ``out/NAME``, where
+    NAME is the name of the run folder; only an earlier export is replaced.
 
     Parameters
     ----------
-    every : keep each so-many-th frame of a stream.
-    visible_boxes : boxes are around what is seen of the objects, not around all of them.
-    recording : where the recording is now; where it was processed by default.
+    format : a key of `FORMATS`.
+    every : export every n-th frame of a stream.
+    visible_boxes : whether boxes enclose only the visible part of objects, not the whole.
+    recording : path of the recording; by default where it was processed.
+    observe : called with the phase, the number of frames done, and the total.
 
     Returns
     -------
@@ -72,9 +74,10 @@ def export_run(
 
     Raises
     ------
-    ValueError : an unknown format.
-    OutputError : not a finished run, or ``out`` is not writable or holds something else.
-    RecordingError : the recording is no longer there.
+    ValueError : the format is unknown.
+    OutputError : the folder is not a finished run, the content of the recording has changed, or
+        ``out`` is not writable or holds something else.
+    RecordingError : the recording is missing or unreadable.
     """
     if format not in FORMATS:
         msg = f"no export format {format!r}; known: {', '.join(FORMATS)}"
@@ -104,25 +107,26 @@ def export_dataset(
     recording: Path | None = None,
     observe: Observer = _ignore,
 ) -> int:
-    """Export the images of some runs, with their labels, as one data set.
+    """Export the images of several runs with their labels as one data set.
 
-    ``out`` is replaced only where an earlier export has written it. Images that are damaged are
-    left out.
+    ``out`` is replaced only if an earlier export wrote it. Damaged images are left out.
 
     Parameters
     ----------
     format : ``coco`` or ``yolo``.
-    recording : where the recording of a single run is now; where it was processed by default.
+    recording : path of the recording of a single run; by default where it was processed.
+    observe : called with the phase, the number of images done, and the number of frames.
 
     Returns
     -------
-    The number of objects to train on, counted in each image.
+    The number of objects for training, counted in each image.
 
     Raises
     ------
-    ValueError : an unknown format.
-    OutputError : not a finished run, one without images, or ``out`` holds something else.
-    RecordingError : a recording is no longer there.
+    ValueError : the format is unknown.
+    OutputError : a folder is not a finished run, a run has no images, the content of a recording
+        has changed, or ``out`` is not writable or holds something else.
+    RecordingError : a recording is missing or unreadable.
     """
     if format not in DATASETS:
         msg = f"no data set format {format!r}; known: {', '.join(DATASETS)}"
@@ -151,7 +155,7 @@ def _staged(
     about: Mapping[str, Any],
     write: Callable[[Path], int],
 ) -> int:
-    """Let ``write`` fill a folder that appears when complete, with the mark of an export."""
+    """Let ``write`` fill a folder that appears when complete, with the marker of an export."""
     recover(target, _made_by_export)
     _require_own(target, format)
     with staged(target, _made_by_export) as hidden:
@@ -183,7 +187,7 @@ def _read_mark(folder: Path) -> dict[str, Any]:
 def _made_by_export(folder: Path) -> Collection[str] | None:
     """Return the names that an export made in a folder; None if no export made the folder.
 
-    A killed export leaves no list of names: everything in its hidden folder is its own.
+    A killed export leaves no complete list: everything in its hidden folder belongs to it.
     """
     about = _read_mark(folder)
     if not about:
@@ -209,7 +213,12 @@ def _observed(
 
 
 def _require_own(target: Path, format: str) -> None:  # noqa: A002  # the word users know
-    """Refuse to replace anything but an earlier export, above all a run."""
+    """Check that a folder is missing, empty, or an unchanged earlier export of this format.
+
+    Raises
+    ------
+    OutputError : the folder holds something else, or a file was changed after the export.
+    """
     if not target.exists() or (target.is_dir() and not any(target.iterdir())):
         return
     made = _read_mark(target).get("format", "something else")

@@ -1,7 +1,7 @@
-"""Data sets of images with instance masks: COCO, and YOLO's segmentation labels.
+"""Data sets of images with instance masks: COCO, and YOLO segmentation labels.
 
-Source: the data format of the COCO challenge (Lin et al. 2014); the label files of Ultralytics'
-YOLO, a line per object: class, then x and y of each corner as shares of the image.
+Source: the data format of the COCO challenge (Lin et al. 2014); the label files of Ultralytics
+YOLO, with a line per object: class, then x and y of each corner, relative to the image size.
 """
 
 import json
@@ -21,10 +21,11 @@ Images = Iterable[tuple[str, FinishedRun, DatasetImage]]
 
 
 def write_coco(out: Path, images: Images, categories: Sequence[str]) -> int:
-    """Write images/SPLIT/ and annotations/instances_SPLIT.json; return how many objects.
+    """Write images/SPLIT/ and annotations/instances_SPLIT.json; return the number of objects.
 
-    Masks are compressed run lengths. Objects whose label is not sure are ``iscrowd``, which
-    evaluation ignores. ``track_id`` is unique in the data set; ``attributes`` name run and track.
+    Masks are compressed run lengths. Objects with an uncertain label have ``iscrowd`` set, so that
+    evaluation ignores them, and are not counted. ``track_id`` is unique in the data set;
+    ``attributes`` has the run and its own track number.
     """
     tracks: dict[tuple[str, int], int] = {}
     splits: dict[str, dict[str, list[dict[str, Any]]]] = {}
@@ -82,10 +83,10 @@ def _coco_image(number: int, finished: FinishedRun, image: DatasetImage) -> dict
 
 
 def write_yolo(out: Path, images: Images, categories: Sequence[str]) -> int:
-    """Write images/SPLIT/, labels/SPLIT/ and data.yaml; return how many objects.
+    """Write images/SPLIT/, labels/SPLIT/ and data.yaml; return the number of objects.
 
-    An object in several parts is one polygon whose parts are linked, as the format knows no
-    others; holes are filled. Objects whose label is not sure are left out.
+    The format allows one polygon per object: the parts of an object are linked, and holes are
+    filled. Objects with an uncertain label are left out.
     """
     count, splits = 0, set()
     for split, _, image in images:
@@ -110,4 +111,4 @@ def write_yolo(out: Path, images: Images, categories: Sequence[str]) -> int:
 
 
 DATASETS = {"coco": write_coco, "yolo": write_yolo}
-"""Formats that gather several runs in one data set."""
+"""Formats that merge several runs into one data set."""

@@ -1,7 +1,7 @@
 """Crops: each view of each object as a point cloud, in the layout of data sets.
 
-``DATASET/<category>/<instance>/<view>.pcd``: metres, z up, the support at z = 0; the VIEWPOINT is
-the place of the sensor.
+``DATASET/<category>/<instance>/<view>.pcd``: metres, z up, the support at z = 0; VIEWPOINT is the
+pose of the sensor.
 """
 
 import glob
@@ -20,16 +20,16 @@ __all__ = ["write_crops"]
 def write_crops(
     out: Path, frames: Iterable[tuple[LabelledFrame, Frame]], finished: FinishedRun
 ) -> int:
-    """Add the views of a run to a data set; return how many.
+    """Add the views of a run to a data set; return their number.
 
-    A run written before is replaced, so that no view keeps an earlier label. Deleted tracks are
-    left out; ``unknown`` is a folder like any other.
+    Earlier views of the same recording are replaced, so that none keeps an outdated label. Deleted
+    tracks are left out; ``unknown`` is a category like any other.
 
     Raises
     ------
-    OutputError : the place is not writable.
+    OutputError : ``out`` is not writable.
     """
-    # Recordings of the same name from different days are not taken for each other.
+    # The digest distinguishes recordings that have the same name.
     prefix = f"{safe_name(finished.name)}.{finished.run['input']['digest'].rpartition(':')[2][:8]}"
     hidden = out / f".{prefix}.partial"
     several = len(finished.run["options"]["topics"]) > 1

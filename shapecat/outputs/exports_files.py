@@ -1,4 +1,4 @@
-"""Files of exports: PCD clouds, 16-bit PNG images, level frames."""
+"""What several exports share: PCD and PNG files, names, and clouds in the level frame."""
 
 import re
 import struct
@@ -28,7 +28,7 @@ _COLOUR_TYPES = {"grey": 0, "palette": 3}
 
 
 def write_pcd(path: Path, points: F4, *, viewpoint: Pose = IDENTITY) -> None:
-    """Write points (n, 3) as a binary PCD file, version 0.7.
+    """Write points (n, 3), metres, as a binary PCD file, version 0.7.
 
     ``viewpoint`` is the pose of the sensor in the frame of the points.
     """
@@ -50,16 +50,21 @@ def png(
     level: int = 9,
     width: int | None = None,
 ) -> bytes:
-    """Encode an image (h, w), uint16 grey or uint8 entries of a palette (k, 3), as PNG.
+    """Encode an image as PNG.
 
-    ``alpha`` (k,) is the opacity of the first entries of the palette; ``level`` from 1 to 9 trades
-    time for size. With ``width`` an image has two pixels of so many to a byte, the left one in its
-    upper half.
+    Parameters
+    ----------
+    image : (h, w) grey values, uint16 or uint8; with a palette, its uint8 indices.
+    palette : (k, 3) red, green, blue.
+    alpha : (a,) opacity of the first entries of the palette.
+    level : compression from 1 (fast) to 9 (small).
+    width : if given, ``image`` is already packed two 4-bit pixels per byte, left pixel in the high
+        nibble, and this is the image width in pixels.
     """
     packed, height, width = width is not None, len(image), width or image.shape[1]
     wide = image.dtype == np.uint16
     rows = np.ascontiguousarray(image, ">u2" if wide else "u1").view(np.uint8).reshape(height, -1)
-    unfiltered = np.zeros((height, 1), np.uint8)  # each row begins with its filter: none
+    unfiltered = np.zeros((height, 1), np.uint8)  # filter type of each row: none
     kind = _COLOUR_TYPES["grey" if palette is None else "palette"]
     depth = 16 if wide else 4 if packed else 8
     header = struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, 0)
@@ -77,9 +82,9 @@ def png(
 
 
 def _compressed(rows: U1, level: int) -> bytes:
-    """Compress rows (h, n); level 1 encodes only runs of equal bytes, which suits masks.
+    """Compress rows (h, n) as zlib data; level 1 encodes only runs of equal bytes.
 
-    The blank rows before and after them, most of a picture of masks, are compressed once.
+    This suits masks. Compressed blank rows, at the top and bottom of most masks, are cached.
     """
     if level > 1:
         return zlib.compress(rows.tobytes(), level)
@@ -88,7 +93,7 @@ def _compressed(rows: U1, level: int) -> bytes:
     before, after = first * size, (len(rows) - last) * size
     middle = rows[first:last].tobytes()
     high, low = divmod(zlib.adler32(middle), 1 << 16)
-    high = (high + before + after * low) % _ADLER  # a blank adds the lower sum to the upper one
+    high = (high + before + after * low) % _ADLER  # each zero byte adds the low sum to the high one
     parts = _blank(before, zlib.Z_FULL_FLUSH), _deflated(middle, zlib.Z_FULL_FLUSH)
     end = _blank(after, zlib.Z_FINISH), struct.pack(">HH", high, low)
     return b"".join((b"\x78\x01", *parts, *end))
@@ -96,7 +101,7 @@ def _compressed(rows: U1, level: int) -> bytes:
 
 @lru_cache(maxsize=1024)
 def _blank(count: int, flush: int) -> bytes:
-    """Return so many zero bytes compressed; a flush of zlib ends them."""
+    """Return ``count`` zero bytes as raw deflate data, ended by a flush mode of zlib."""
     return _deflated(bytes(count), flush)
 
 
@@ -106,7 +111,7 @@ def _deflated(data: bytes, flush: int) -> bytes:
 
 
 def safe_name(text: str) -> str:
-    """Return a text as the name of a file or folder: no separators, not hidden.
+    """Return a text as the name of a file or folder, without separators and not hidden.
 
     Examples
     --------
@@ -117,24 +122,24 @@ def safe_name(text: str) -> str:
 
 
 def finite_points(frame: Frame) -> F4:
-    """Return (n, 3) the points of a frame that have a reading, in their order."""
+    """Return the points (n, 3) of a frame that have a reading, in order, metres, sensor frame."""
     points = frame.xyz()
     return np.asarray(points[np.isfinite(points).all(axis=1)])
 
 
 def support_offset(item: LabelledObject, up: F4) -> float:
-    """Return the offset of the support of an object along ``up`` (3,), metres, sensor frame."""
+    """Return the offset of an object's support along ``up`` (3,) from the sensor, metres."""
     middle = float(np.dot(np.asarray(up, np.float64), item.box.center))
     half = float(item.box.size[2]) / 2
     return middle - (item.height_m if np.isfinite(item.height_m) else half)
 
 
 def upward(labelled: LabelledFrame) -> F4:
-    """Return the unit vector up (3,) of a frame, sensor frame.
+    """Return the up direction of a frame in the sensor frame, a unit vector (3,).
 
     Raises
     ------
-    ValueError : it is not known.
+    ValueError : the up direction is unknown.
     """
     if labelled.up is None:
         msg = f"frame {labelled.index} of {labelled.topic} does not tell where up is"
@@ -145,9 +150,9 @@ def upward(labelled: LabelledFrame) -> F4:
 def upright_cloud(
     labelled: LabelledFrame, frame: Frame, item: LabelledObject
 ) -> tuple[F4, Pose] | None:
-    """Return the points (n, 3) of an object, standing on z = 0, and the pose of the sensor.
+    """Return the points (n, 3) of an object in the level frame, and the sensor's pose in it.
 
-    None if it has no point with a reading.
+    The support is at z = 0; metres. None if no point has a reading.
     """
     points = frame.xyz(item.indices)
     points = points[np.isfinite(points).all(axis=1)]

@@ -1,10 +1,10 @@
 """KITTI 3D object detection: label_2, calib and velodyne of each frame.
 
-KITTI boxes turn about the vertical alone, so the rectified camera is a level one: it looks where
-the sensor looks, but along the horizon. ``P2`` turns back to the real camera, so that it maps
-rectified points to the pixels of the image in image_2, the colour image without the distortion of
-its lens; to those of the depth image where a frame has no colour image. Source: the readme of the
-KITTI object development kit (Geiger 2012).
+KITTI boxes rotate only about the vertical, so the rectified camera frame is level: its z axis is
+the horizontal direction in which the sensor looks. ``P2`` includes the rotation back to the real
+camera. It maps rectified points to pixels of the undistorted colour image in image_2, or of the
+depth image if a frame has no colour image. Source: the readme of the KITTI object development kit
+(Geiger 2012).
 """
 
 import csv
@@ -39,12 +39,11 @@ def write_kitti(
     frames: Iterable[tuple[LabelledFrame, Frame, Coloured | None]],
     _finished: FinishedRun,
 ) -> int:
-    """Write label_2/, calib/ and velodyne/ with six digits per frame; return how many objects.
+    """Write label_2/, calib/ and velodyne/, files named by six digits; return how many objects.
 
-    Frames with a colour image have it in image_2/, as PNG without distortion.
-
-    ``frames.csv`` tells which frame a number is. Points are in the level frame of the sensor (x
-    forward, y left, z up), intensity 0. The type is the category, blanks replaced by ``_``.
+    Colour images are written to image_2/ as undistorted PNG. ``frames.csv`` lists the frame of
+    each number. Points are in the level frame of the sensor (x forward, y left, z up), with
+    intensity 0. The type is the category, with blanks replaced by ``_``.
     """
     for name in ("label_2", "calib", "velodyne"):
         (out / name).mkdir()
@@ -67,14 +66,19 @@ def write_kitti(
 
 
 def _optical(labelled: LabelledFrame, frame: Frame) -> bool:
-    """Return whether the sensor looks along its z axis, as cameras do."""
+    """Return whether the sensor looks along its z axis, as a camera does."""
     return frame.organized or bool(upward(labelled)[1] < -0.7)
 
 
 def rectified_from_sensor(up: F8, *, optical: bool) -> F8:
-    """Return the (3, 3) rotation into a level camera: x right, y down, z forward.
+    """Return the rotation (3, 3) from the sensor to a level camera: x right, y down, z forward.
 
-    Where the sensor looks straight down or up, its own upper side is forward.
+    If the sensor looks straight down or up, forward is the direction of its upper side.
+
+    Parameters
+    ----------
+    up : (3,) up direction in the sensor frame.
+    optical : whether the sensor looks along z with y down, else along x with z up.
     """
     up = np.asarray(up, np.float64) / np.linalg.norm(up)
     axes = np.array([[0, 0, 1], [0, -1, 0]] if optical else [[1, 0, 0], [0, 0, 1]], np.float64)
@@ -85,7 +89,10 @@ def rectified_from_sensor(up: F8, *, optical: bool) -> F8:
 
 
 class _Seen(NamedTuple):
-    """The camera that 2D boxes and P2 are of; no camera for clouds."""
+    """The camera for 2D boxes and P2; None for clouds.
+
+    ``pose`` is ``camera_from_sensor``; ``image`` is whether a colour image was written.
+    """
 
     camera: Camera | None
     pose: Pose
@@ -93,7 +100,7 @@ class _Seen(NamedTuple):
 
 
 def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None) -> _Seen:
-    """Write the colour image of a frame, if it has one; return the camera that took it."""
+    """Write the colour image of a frame and return its camera; without one, the depth camera."""
     own = _Seen(frame.camera, IDENTITY, image=False)
     if coloured is None or coloured.view.image.height <= 1:
         return own
@@ -114,7 +121,7 @@ def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None
 
 
 def _label(item: LabelledObject, frame: Frame, turn: F8, seen: _Seen) -> str:
-    """Return a line of 15 values: type truncated occluded alpha bbox h w l x y z rotation_y."""
+    """Return a line of 15 values: type truncated occluded alpha bbox(4) h w l x y z rotation_y."""
     length, width, height = map(float, item.box.size)
     x, y, z = turn @ item.box.center
     heading = turn @ rotation_from_quaternion(item.box.orientation)[:, 0]
@@ -130,7 +137,7 @@ def _label(item: LabelledObject, frame: Frame, turn: F8, seen: _Seen) -> str:
 
 
 def _pixels(item: LabelledObject, frame: Frame, seen: _Seen) -> tuple[float, ...]:
-    """Return left, top, right, bottom in pixels; -1 without an image."""
+    """Return left, top, right and bottom of an object, pixels; all -1 if it is not visible."""
     camera, nowhere = seen.camera, (-1.0, -1.0, -1.0, -1.0)
     if camera is None or not item.indices.size:
         return nowhere

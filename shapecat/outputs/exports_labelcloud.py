@@ -1,7 +1,7 @@
 """labelCloud projects: clouds, and boxes in each of its three JSON formats.
 
-Clouds and boxes are in the level frame of the sensor (z up), as labelCloud turns boxes about z.
-Source: labelCloud 1.1, its label formats ``centroid_rel``, ``centroid_abs`` and ``vertices``.
+Clouds and boxes are in the level frame of the sensor (z up), since labelCloud rotates boxes about
+z. Source: labelCloud 1.1, label formats ``centroid_rel``, ``centroid_abs`` and ``vertices``.
 """
 
 import json
@@ -26,10 +26,10 @@ _FORMATS = ("centroid_rel", "centroid_abs", "vertices")
 def write_labelcloud(
     out: Path, frames: Iterable[tuple[LabelledFrame, Frame]], finished: FinishedRun
 ) -> int:
-    """Write pointclouds/ and labels/ of a labelCloud project; return how many objects.
+    """Write pointclouds/ and labels/ of a labelCloud project; return the number of objects.
 
-    labels/ are in the format ``centroid_rel``; labels_centroid_abs/ and labels_vertices/ hold the
-    same boxes in the other two.
+    labels/ has the format ``centroid_rel``; labels_centroid_abs/ and labels_vertices/ hold the same
+    boxes in the other formats.
     """
     (out / "pointclouds").mkdir()
     for kind in _FORMATS:
@@ -69,11 +69,11 @@ def _described(item: LabelledObject, level: F8, kind: str) -> dict[str, Any]:
     if kind == "vertices":
         corners = box_corners(item.box) @ level.T
         for face in (corners[:4], corners[4:]):
-            face[:, 2] = face[:, 2].mean()  # else labelCloud takes rounding for a tilt
+            face[:, 2] = face[:, 2].mean()  # labelCloud would take rounding errors for a tilt
         return {"name": item.category, "vertices": _rounded(corners)}
     heading = level @ rotation_from_quaternion(item.box.orientation)[:, 0]
     yaw = float(np.arctan2(heading[1], heading[0]))
-    # Rounded first: the remainder of a tiny negative angle is 360 itself.
+    # Round first, since the remainder of a tiny negative angle would be 360 itself.
     turn = round(yaw, 8) if kind == "centroid_rel" else round(float(np.degrees(yaw)), 8) % 360
     sizes = _rounded(item.box.size)
     return {

@@ -1,7 +1,7 @@
 """Point labels: masks for depth images, SemanticKITTI labels for unorganized clouds.
 
-A label is a class and an instance, the number of the track; 0 is no object. ``labels.json`` names
-the classes and says what each instance is. Source of the binary form: the description of
+A label is a class and an instance (the track number); 0 is no object. ``labels.json`` lists the
+classes and the category of each instance. Source of the binary format: the description of
 SemanticKITTI (Behley 2019), uint32 with the class in the lower 16 bits, the instance above.
 """
 
@@ -29,15 +29,15 @@ _INDEX = ("number", "topic", "frame", "stamp_ns", "width", "height", "fx", "fy",
 def write_point_labels(
     out: Path, frames: Iterable[tuple[LabelledFrame, Frame]], finished: FinishedRun
 ) -> int:
-    """Write the labels of all points; return how many objects.
+    """Write the labels of all points; return the number of objects.
 
-    Depth images give depth/ (millimetres), semantic/ and instance/ as 16-bit PNG; clouds give
-    velodyne/ (x, y, z, 0; readings only, sensor frame) and labels/. frames.csv tells which frame a
-    number is, and its camera.
+    For depth images it writes depth/ (millimetres), semantic/ and instance/ as 16-bit PNG; for
+    clouds velodyne/ (x, y, z, 0 of points with a reading, sensor frame) and labels/. frames.csv
+    lists the frame of each number, and its camera.
 
     Raises
     ------
-    OutputError : more tracks than 16 bits can number.
+    OutputError : a track number does not fit in 16 bits.
     """
     if max(finished.labels, default=0) > _LARGEST:
         msg = f"{finished.folder}: has more than {_LARGEST} tracks; 16 bits cannot number them"
@@ -71,7 +71,7 @@ def _about(labelled: LabelledFrame, frame: Frame) -> tuple[Any, ...]:
 
 
 def _labels(labelled: LabelledFrame, frame: Frame, classes: dict[str, int]) -> U4:
-    """Return the label of each pixel or point of a frame: class, and instance times 65536."""
+    """Return the labels (n,) of all pixels or points of a frame: class + 65536 * instance."""
     source = frame.depth if frame.depth is not None else frame.xyz()
     labels = np.zeros(source.size if frame.organized else len(source), np.uint32)
     for item in labelled.objects:
@@ -115,7 +115,7 @@ def _legend(classes: dict[str, int], instances: dict[int, str]) -> str:
 
 
 def _yaml(classes: dict[str, int]) -> str:
-    """Return the settings of the SemanticKITTI tools; their colours are blue, green, red."""
+    """Return the settings for the SemanticKITTI tools, with colours as blue, green, red."""
     names = {0: "none", **{k: name for name, k in classes.items()}}
     colours = {k: colour_of(name)[::-1] if k else (0, 0, 0) for k, name in names.items()}
     lines = ["name: shapecat", "labels:"]

@@ -1,4 +1,4 @@
-"""Annotations on the colour images of the recording, in each encoding."""
+"""Annotations of colour images, for each message encoding."""
 
 import json
 from collections.abc import Callable, Iterator, Mapping
@@ -34,12 +34,12 @@ class ImageBox(NamedTuple):
 
     @property
     def text(self) -> str:
-        """What is written above it."""
+        """The text above the box."""
         return caption(self.track, self.category, self.confidence)
 
     @property
     def corners(self) -> list[tuple[float, float]]:
-        """Its corners around, on the borders of its pixels."""
+        """The corners of the box from the top left one clockwise, on the borders of its pixels."""
         left, top, width, height = (float(value) for value in self.box)
         right, bottom = left + width, top + height
         return [(left, top), (right, top), (right, bottom), (left, bottom)]
@@ -57,7 +57,7 @@ class ImageFrame(NamedTuple):
 def read_image_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterator[ImageFrame]:
     """Yield the annotations of the colour images of a run, each image once.
 
-    The colours of loose points are no image.
+    The colours of unorganized clouds are not an image.
     """
     shown = ShownTracks.read(folder, labels)
     last = None
@@ -82,9 +82,9 @@ Encode = Callable[[ImageFrame], bytes]
 
 
 def image_encoder_for(encoding: str) -> list[tuple[AnnotationChannel, Encode]]:
-    """Return the channels that annotate images in an encoding, and how each encodes.
+    """Return the channels that annotate images in an encoding, each with its encoder.
 
-    An encoding that is not known gets JSON.
+    An unknown encoding is replaced by JSON.
     """
     return _ENCODERS.get(encoding, _json)()
 
@@ -138,7 +138,7 @@ def _font_size(box: ImageBox) -> float:
 
 
 def _plain(frame: ImageFrame, parts: tuple[str, str]) -> dict[str, Any]:
-    """Make a foxglove.ImageAnnotations of plain values; ``parts`` of a time."""
+    """Return a foxglove.ImageAnnotations as plain values; ``parts`` names the fields of a time."""
     time = dict(zip(parts, divmod(frame.stamp_ns, 10**9), strict=True))
     points, texts = [], []
     for box in frame.boxes:

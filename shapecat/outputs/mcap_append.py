@@ -1,4 +1,4 @@
-"""Annotations at the end of a copy: every byte of the original data section stays as it is."""
+"""Append annotations to a copy of an MCAP file, whose data section stays byte for byte."""
 
 import errno
 import os
@@ -27,22 +27,22 @@ from shapecat.recordings.mcap_summary import Summary
 __all__ = ["Appender", "copy_bytes"]
 
 _CHUNK_BYTES = 256 << 10
-"""Small chunks: a reader that sorts by time holds one of them for the whole recording."""
+"""Small chunks, since a reader that sorts by time always holds one of them."""
 _RECORD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<BQHIQQ")
 """A record's opcode and length; a message's channel, sequence, log time and publish time."""
 _INDEX = struct.Struct("<BQHI")
-"""A message index up to its entries: opcode and length, channel, bytes of the entries."""
+"""The head of a message index record: opcode, length, channel, and bytes of the entries."""
 _COMPRESS = {"zstd": partial(zstandard.compress, level=1), "lz4": lz4.frame.compress}
 _WAITING = 8
-"""Filled chunks in memory."""
+"""Largest number of filled chunks in memory."""
 
 
 def _reserve(file: BinaryIO, length: int) -> None:
-    """Reserve disk space for so many bytes, and some for annotations.
+    """Reserve disk space for ``length`` bytes, and some for annotations.
 
-    A full disk shows at once. And ext4 writes a whole file out when one with space not yet
-    reserved is renamed over an older one, which takes as long as the copy.
+    A full disk is then noticed at once. Without reserved space, ext4 would write out the whole file
+    when it is renamed over an older one, which takes as long as the copy.
     """
     if not hasattr(os, "posix_fallocate"):
         return
@@ -56,9 +56,9 @@ def _reserve(file: BinaryIO, length: int) -> None:
 
 
 def copy_bytes(source: Path, target: Path, length: int) -> None:
-    """Copy the first bytes of a file over those of another, inside the kernel where it can.
+    """Copy the first ``length`` bytes of a file over those of another, in the kernel if possible.
 
-    The other may be longer afterwards than what is written to it: truncate it when all is.
+    The target also gets reserved space after them: truncate it when everything is written.
     """
     with source.open("rb") as file, target.open("r+b") as copy:
         _reserve(copy, length)
@@ -77,7 +77,7 @@ def copy_bytes(source: Path, target: Path, length: int) -> None:
 
 
 class _Limited:
-    """The first bytes of a file."""
+    """A reader of the first ``length`` bytes of a file."""
 
     def __init__(self, file: BinaryIO, length: int) -> None:
         self.file, self.left = file, length
@@ -95,23 +95,23 @@ class _Chunk:
 
     data: bytearray = field(default_factory=bytearray)
     entries: dict[int, list[int]] = field(default_factory=lambda: defaultdict(list))
-    """By channel, the log time and the offset of each message in turn."""
+    """For each channel, log time and offset of each message, alternating."""
 
 
 class Appender:
-    """Adds channels, messages and metadata to a data section, then writes a summary of all.
+    """Adds channels, messages and metadata to a data section, then writes the new summary.
 
-    A context manager: filled chunks are compressed and written by a thread.
+    Use it as a context manager: a thread compresses and writes filled chunks.
 
     Parameters
     ----------
-    file : open for writing; positioned where the original data section ends.
-    summary : that of the original.
-    compression : of the new chunks: ``zstd``, ``lz4`` or empty.
+    file : open for writing, positioned at the end of the original data section.
+    summary : the summary of the original.
+    compression : compression of the new chunks: ``zstd``, ``lz4`` or empty.
     """
 
     def __init__(self, file: BinaryIO, summary: Summary, compression: str) -> None:
-        """Take over the file."""
+        """Copy the summary; nothing is written yet."""
         self._file = file
         self._schemas = dict(summary.schemas)
         self._channels = dict(summary.channels)
@@ -136,7 +136,12 @@ class Appender:
         self._writer.shutdown(cancel_futures=True)
 
     def add_channel(self, channel: AnnotationChannel) -> int:
-        """Add a channel with its schema; return its number."""
+        """Add a channel with its schema; return the channel number.
+
+        Raises
+        ------
+        OSError : all channel numbers are taken.
+        """
         schema_id = max(self._schemas, default=0) + 1
         schema = records.Schema(
             id=schema_id,
@@ -177,7 +182,7 @@ class Appender:
         self._metadata.append(records.MetadataIndex(offset=offset, length=length, name=name))
 
     def finish(self) -> None:
-        """Write the summary of original and additions, the footer and the end."""
+        """Write the summary of the original and the additions, the footer, and the end."""
         self._flush(0)
         self._write([records.DataEnd(0)])
         start = self._file.tell()
@@ -227,7 +232,7 @@ class Appender:
         )
 
     def _flush(self, waiting: int) -> None:
-        """Let the chunk be written, if it has messages, until no more than so many are not."""
+        """Submit the chunk if it has messages; wait until at most ``waiting`` are unwritten."""
         if self._chunk.entries:
             self._waiting.append(self._writer.submit(self._write_chunk, self._chunk))
             self._chunk = _Chunk()
@@ -270,7 +275,7 @@ class Appender:
 
 
 def _message_index(channel: int, entries: Sequence[int]) -> bytes:
-    """Encode a message index record: the library takes a microsecond for each number."""
+    """Encode a message index record; the library would take a microsecond per number."""
     size = 8 * len(entries)
     numbers = struct.pack(f"<{len(entries)}Q", *entries)
     return _INDEX.pack(Opcode.MESSAGE_INDEX, 2 + 4 + size, channel, size) + numbers

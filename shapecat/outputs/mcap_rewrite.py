@@ -1,4 +1,4 @@
-"""A recording written anew as MCAP, its annotations in between by time."""
+"""Rewrite a recording as MCAP, with the annotations among its messages by time."""
 
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -27,9 +27,9 @@ def rewrite(
     items: Iterable[Item],
     metadata: Mapping[str, str],
 ) -> None:
-    """Write all messages of a recording, its attachments and metadata, and the annotations.
+    """Write the messages of a recording, its attachments and metadata, and the annotations.
 
-    ROS 1 bags become CDR; a message that cannot be converted is wrapped (`wrap_raw`).
+    Messages of ROS 1 bags are converted to CDR, or wrapped by `wrap_raw` if that is impossible.
     """
     writer = Writer(file, compression=CompressionType.LZ4)
     parts = [part for part in recording.parts() if isinstance(part, McapRecording)]
@@ -54,7 +54,7 @@ def rewrite(
 
 
 class _Source:
-    """Writes original messages, registering their channels as they appear."""
+    """Writes the original messages, and registers their channels as they appear."""
 
     def __init__(self, writer: Writer, *, convert: bool) -> None:
         self.writer = writer
@@ -66,7 +66,7 @@ class _Source:
         self.raw: dict[str, int] = {}
 
     def write(self, message: Message) -> None:
-        """Write a message."""
+        """Write a message, converted or wrapped if necessary."""
         channel = message.channel
         number, convert = self.number(channel)
         data: bytes | memoryview = message.data
@@ -80,7 +80,7 @@ class _Source:
     def number(
         self, channel: Channel
     ) -> tuple[int, Callable[[bytes | memoryview], memoryview] | None]:
-        """Return the number of a channel and how its messages are converted."""
+        """Return the number of a channel, and the function that converts its messages, or None."""
         if channel not in self.known:
             self.known[channel] = self._register(channel)
         return self.known[channel]
@@ -119,7 +119,7 @@ def _register(
 
 
 def _copy_extras(recording: McapRecording, writer: Writer) -> None:
-    """Copy attachments and metadata."""
+    """Copy attachments and metadata to the writer."""
     for item in _extras(recording):
         if isinstance(item, records.Attachment):
             writer.add_attachment(

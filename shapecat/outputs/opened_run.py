@@ -34,11 +34,11 @@ class Table:
         return tuple(pq.read_schema(self.path).names)
 
     def arrow(self, columns: Sequence[str] | None = None) -> pa.Table:
-        """Read it as an Arrow table.
+        """Read the table, or some columns, as an Arrow table.
 
         Raises
         ------
-        OutputError : it cannot be read, or has no such column.
+        OutputError : the table is unreadable, or has no such column.
         """
         try:
             known = self.columns
@@ -52,14 +52,14 @@ class Table:
             raise OutputError(msg) from error
 
     def pandas(self, columns: Sequence[str] | None = None) -> Any:
-        """Read it as a pandas data frame; pandas must be installed."""
+        """Read the table, or some columns, as a pandas data frame; pandas must be installed."""
         return self.arrow(columns).to_pandas()
 
     def numpy(self, column: str) -> Any:
-        """Read a column as an array: (n,), or (n, k) of lists of one length.
+        """Read a column as an array: (n,) for numbers or text, (n, k) for lists of equal length.
 
-        Lists of different lengths become an object array of arrays. A missing number is NaN, a
-        missing list a row of NaN.
+        Lists of different lengths become an object array of arrays. Null becomes NaN, or a row of
+        NaN.
         """
         values = self.arrow([column])[column].combine_chunks()
         if pa.types.is_fixed_size_list(values.type):
@@ -75,7 +75,7 @@ class Table:
 
 
 def _rows(values: pa.FixedSizeListArray, width: int) -> Any:
-    """Return (n, width) the numbers of lists, NaN where one is missing."""
+    """Return lists of fixed size as an array (n, width); null becomes NaN."""
     valid = np.asarray(values.is_valid().to_numpy(zero_copy_only=False), np.bool_)
     rows = np.full((len(values), width), np.nan, values.type.value_type.to_pandas_dtype())
     rows[valid] = values.drop_null().flatten().to_numpy().reshape(-1, width)
@@ -84,7 +84,7 @@ def _rows(values: pa.FixedSizeListArray, width: int) -> Any:
 
 @dataclass(frozen=True)
 class RunFrame:
-    """A frame of a run: its objects, the reading of the sensor, and the colour image, if any."""
+    """A frame of a run: its objects, its points, and its colour image; None if it has none."""
 
     labelled: LabelledFrame
     reading: Frame
@@ -92,7 +92,7 @@ class RunFrame:
 
     @property
     def objects(self) -> tuple[LabelledObject, ...]:
-        """The objects with their final labels, box, posterior and surface."""
+        """The objects with their final label, box, posterior and surface."""
         return self.labelled.objects
 
     @property
@@ -102,35 +102,35 @@ class RunFrame:
 
     @property
     def points(self) -> F4:
-        """(n, 3) metres, sensor frame; a row per pixel of a depth image, NaN without reading."""
+        """Points (n, 3), metres, sensor frame; one per pixel of a depth image, NaN if missing."""
         return self.reading.xyz()
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(h, w) of a depth image, (n,) of a cloud: that of masks and labels."""
+        """The shape of masks and labels: (h, w) for a depth image, (n,) for a cloud."""
         return (len(self.points),) if self.reading.depth is None else self.reading.depth.shape
 
     @property
     def labels(self) -> I4:
-        """The number of the track of each pixel or point, -1 where there is none."""
+        """The track number of each pixel or point, -1 without an object; int32, of `shape`."""
         image = np.full(self.shape, -1, np.int32)
         for item in self.objects:
             image.reshape(-1)[item.indices] = item.track
         return image
 
     def mask(self, item: LabelledObject) -> Bool:
-        """Return which pixels or points belong to an object."""
+        """Return which pixels or points belong to an object, bool, of `shape`."""
         mask = np.zeros(self.shape, np.bool_)
         mask.reshape(-1)[item.indices] = True
         return mask
 
     @property
     def color(self) -> U1 | None:
-        """(h, w, 3) uint8 red, green, blue: the colour image as it was taken; None without one."""
+        """The colour image as recorded, (h, w, 3) uint8 red, green, blue; None without one."""
         return None if self.coloured is None else pixels_of(self.coloured.view.image)
 
     def color_mask(self, item: LabelledObject) -> Bool | None:
-        """Return which pixels of the colour image, (h, w), belong to an object; None without."""
+        """Return an object's mask (h, w) on the colour image; None if there is no image."""
         if self.coloured is None:
             return None
         image = self.coloured.view.image
@@ -138,12 +138,12 @@ class RunFrame:
         return mask.full(image.height, image.width)
 
     def points_of(self, item: LabelledObject) -> F4:
-        """Return (n, 3) the points of an object: metres, sensor frame."""
+        """Return the points (n, 3) of an object, metres, sensor frame."""
         return self.reading.xyz(item.indices)
 
 
 class Run:
-    """A finished run: its tables, its tracks with their final labels, its frames."""
+    """A finished run: its tables, its tracks with their final labels, and its frames."""
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
@@ -159,17 +159,17 @@ class Run:
 
     @property
     def info(self) -> RunInfo:
-        """What run.json says: input, settings, counts, seconds, warnings."""
+        """The content of run.json: input, settings, counts, seconds, warnings."""
         return self._finished.run
 
     @property
     def categories(self) -> tuple[str, ...]:
-        """The categories in the order of every posterior, then those that a person has added."""
+        """The categories in the order of every posterior, then categories that a person added."""
         return self._finished.categories
 
     @cached_property
     def labels(self) -> dict[int, str]:
-        """The final category of each track, corrections included; deleted tracks are missing."""
+        """The final category of each track, with corrections; deleted tracks are missing."""
         return {track: label.category for track, label in self._finished.labels.items()}
 
     def posterior(self, track: int) -> tuple[Any, Any]:
@@ -177,8 +177,8 @@ class Run:
 
         Returns
         -------
-        (n,) seconds since the first frame of the run, and (n, categories) causal posteriors: of
-        the views so far.
+        (n,) seconds since the first frame of the run, and (n, categories) posteriors, each fused
+        from the views so far.
 
         Raises
         ------
@@ -192,20 +192,20 @@ class Run:
         return seconds, self.tracks.numpy("posterior")[rows]
 
     def labelled_frames(self) -> Iterator[LabelledFrame]:
-        """Yield the frames without their points: the recording is not needed."""
+        """Yield the frames without their points; this does not need the recording."""
         return self._finished.frames()
 
     def frames(self, recording: str | Path | None = None) -> Iterator[RunFrame]:
-        """Yield the frames with their points, in flat memory.
+        """Yield the frames with their points, in constant memory.
 
         Parameters
         ----------
-        recording : where the recording is now; where it was processed by default.
+        recording : path of the recording; by default where it was processed.
 
         Raises
         ------
-        RecordingError : it is not there.
-        OutputError : it is another one than it was.
+        RecordingError : the recording is missing or unreadable.
+        OutputError : the content of the recording differs from what was processed.
         """
         moved = None if recording is None else Path(recording)
         with open_source(self.info, moved) as source:

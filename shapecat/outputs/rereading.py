@@ -1,4 +1,4 @@
-"""A finished run, and the recording it was made from."""
+"""Read a finished run, and open the recording from which it was made."""
 
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
@@ -27,7 +27,7 @@ __all__ = [
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """A run folder: run.json, and what each of its tracks is shown as."""
+    """A run folder, with run.json and the final label of each track."""
 
     folder: Path
     run: RunInfo
@@ -35,12 +35,12 @@ class FinishedRun:
 
     @property
     def name(self) -> str:
-        """The name of the recording."""
+        """The name of the run folder."""
         return self.folder.resolve().name
 
     @property
     def categories(self) -> tuple[str, ...]:
-        """The categories of the model, followed by those that a person has added."""
+        """The categories of the model, then categories that a person added."""
         known = tuple(self.run["model"]["categories"])
         added = {label.category for label in self.labels.values()} - {*known, "unknown"}
         return (*known, *sorted(added))
@@ -50,7 +50,7 @@ class FinishedRun:
         return read_labelled_frames(self.folder, self.labels)
 
     def frames_with_full_boxes(self) -> Iterator[LabelledFrame]:
-        """Read the labelled frames with full boxes where they are known."""
+        """Read the labelled frames; their boxes are full boxes where these are known."""
         for frame in self.frames():
             objects = (replace(item, box=item.full or item.box) for item in frame.objects)
             yield replace(frame, objects=tuple(objects))
@@ -61,18 +61,20 @@ def read_finished(folder: Path) -> FinishedRun:
 
     Raises
     ------
-    OutputError : it is not a finished run, or its tracks.csv cannot be understood.
+    OutputError : the folder is not a finished run, or its tracks.csv is invalid.
     """
     run = read_run(folder)
     return FinishedRun(folder, run, read_labels(folder / "tracks.csv", run["model"]["categories"]))
 
 
 def find_runs(folders: Sequence[Path]) -> list[Path]:
-    """Return the runs among folders and in them, sorted by name, each once.
+    """Return the run folders among ``folders`` and directly below them, each once.
+
+    The runs below a folder are sorted by name.
 
     Raises
     ------
-    OutputError : a folder holds none.
+    OutputError : a folder is not a run and holds none.
     """
     runs = [run for folder in folders for run in _runs_in(folder)]
     return list({run.resolve(): run for run in runs}.values())
@@ -91,16 +93,16 @@ def _runs_in(folder: Path) -> list[Path]:
 
 @contextmanager
 def open_source(run: RunInfo, moved_to: Path | None = None) -> Iterator[Recording]:
-    """Open the recording that a run was made from.
+    """Open the recording from which a run was made.
 
     Parameters
     ----------
-    moved_to : where it is now; where it was processed by default.
+    moved_to : path of the recording; by default where it was processed.
 
     Raises
     ------
-    RecordingError : it is not there.
-    OutputError : it is another one than it was.
+    RecordingError : the recording is missing or unreadable.
+    OutputError : the content of the recording differs from what was processed.
     """
     path = moved_to or Path(run["input"]["path"])
     if moved_to is None and not path.exists():
@@ -115,7 +117,7 @@ def open_source(run: RunInfo, moved_to: Path | None = None) -> Iterator[Recordin
 
 
 def clouds_again(recording: Recording, run: RunInfo) -> Iterator[Frame]:
-    """Read the frames of a run again."""
+    """Read the frames of a run again from its recording."""
     options = run["options"]
     streams = choose_streams(recording, options["topics"])
     return frames(recording, streams, skipped=Counter(), **window_of(options))

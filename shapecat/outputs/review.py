@@ -1,35 +1,35 @@
-"""``review.rrd``: a run as a Rerun recording. This file and its siblings alone know Rerun.
+"""``review.rrd``: a run as a Rerun recording. Only this module and its siblings use Rerun.
 
 Entities
 --------
 ::
 
-    world                      up and handedness; the fixed frame if there is one
-    ├── paths/<topic>          where the tracks have moved (below <topic> without a fixed frame)
+    world                      handedness and up; the fixed frame if there is one
+    ├── paths/<topic>          paths of the tracks (below <topic> without a fixed frame)
     ├── <topic>                the sensor: fixed_from_sensor, in every frame
     │   ├── camera             pinhole, for depth images
     │   └── objects
     │       ├── boxes          labelled "#track category confidence"
     │       └── captions       shorter, drawn above the boxes
-    └── seen/<topic>           the scene, four to ten times a second, when it has changed: where the
-        ├── scene              sensor was then (below <topic> without a fixed frame)
+    └── seen/<topic>           the scene, four to ten times a second if it changes, with the sensor
+        ├── scene              pose of its frame (below <topic> without a fixed frame)
         ├── planes             outlines;  planes/fill  translucent
         └── objects
             ├── points         in the colour of the category
-            ├── full           boxes around all of the objects, dashed
+            ├── full           boxes of the whole objects, dashed
             ├── graphs         edges of the growing neural gas
-            └── surfaces       its triangles
-    images/<topic>             the colour image of a scene, as it was recorded if compressed
+            └── surfaces       triangles of the growing neural gas
+    images/<topic>             the colour image of a scene, as recorded if compressed
     ├── masks                  the pixels of each object, translucent in the colour of the category
     ├── boxes                  around the masks
     └── captions               labelled as in 3D
     tracks/<n>/posterior       fused posterior up to each frame, a line per category
     plots/objects/<category>   objects in view
     plots/seconds/<stage>      time spent on each frame
-    log                        births and ends of tracks, warnings of the run
-    run                        run.json, to read
+    log                        starts and ends of tracks, warnings of the run
+    run                        run.json as text
 
-Timelines: ``sensor_time`` (of the measurement) and ``frame``.
+Timelines: ``sensor_time`` (the stamp) and ``frame``.
 """
 
 import json
@@ -78,13 +78,13 @@ def write_review(
     Parameters
     ----------
     path : the file; it appears when complete and replaces an older one.
-    frames : in the order of the recording, those that are drawn with their points.
+    frames : all frames in the order of the recording, with points if their scene is drawn.
     name : name of the recording in the viewer.
-    run : the contents of run.json; a list under ``warnings`` is also logged.
+    run : the content of run.json; a list under ``warnings`` is also logged.
     categories : in the order of the posteriors.
-    cloud_points : about how many points of each cloud to keep; 0 keeps all.
-    fixed_frame : name of the frame in which tracks are shown; None for the sensor's own.
-    threads : so many paint ahead.
+    cloud_points : approximate number of points to keep of each cloud; 0 keeps all.
+    fixed_frame : name of the frame in which tracks are shown; None for the sensor frame.
+    threads : number of threads that paint frames ahead.
 
     Raises
     ------
@@ -92,8 +92,8 @@ def write_review(
 
     Notes
     -----
-    The content depends on the arguments alone. Memory does not grow with the number of frames
-    but for some numbers per track.
+    The content depends only on the arguments. Memory does not grow with the number of frames,
+    except for some numbers per track.
     """
     stream = _stream(name, run)
     with open_review(path, stream) as file:
@@ -111,7 +111,7 @@ def write_review(
 
 
 def _stream(name: str, run: Mapping[str, object]) -> rr.RecordingStream:
-    """Return a stream whose content depends on what is logged alone."""
+    """Return a stream whose content depends only on what is logged."""
     identity = uuid.uuid5(uuid.NAMESPACE_OID, name + json.dumps(run, sort_keys=True, default=str))
     stream = rr.RecordingStream("shapecat", recording_id=identity, send_properties=False)
     stream.set_log_time_enabled(False)
@@ -119,7 +119,7 @@ def _stream(name: str, run: Mapping[str, object]) -> rr.RecordingStream:
 
 
 class _Review:
-    """Writes frame after frame, and remembers what the layout and the paths need."""
+    """Writes frame after frame, and stores what the layout and the paths need."""
 
     def __init__(
         self,
@@ -131,18 +131,21 @@ class _Review:
         self._categories = tuple(categories)
         self._fixed_frame = fixed_frame
         self._eyes: dict[str, Eye] = {}
-        self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)  # of what has a fixed place
+        self._low, self._high = (
+            np.full(3, np.inf),
+            np.full(3, -np.inf),
+        )  # bounds of objects in the fixed frame
         self._cameras: dict[str, Camera] = {}
         self._tracks: dict[int, TrackView] = {}
-        self._aimed: set[str] = set()  # topics whose eye has seen an object
+        self._aimed: set[str] = set()  # topics whose eye was chosen with an object in view
         self._paths = Paths(self._columns)
         self._images = Images(stream, self._columns)
         self._styled: set[str] = set()  # entities whose style is written
-        self._counted: dict[str, None] = {}  # categories met, in order
+        self._counted: dict[str, None] = {}  # categories so far, in order
         self._warnings: list[str] = []
 
     def begin(self, run: Mapping[str, object]) -> None:
-        """Write what does not change."""
+        """Write the static data."""
         self._log(
             "run", rr.TextDocument(shapes.markdown(run), media_type="text/markdown"), static=True
         )
@@ -171,7 +174,7 @@ class _Review:
         self._plot(labelled)
 
     def end(self) -> None:
-        """Write the layout and all that is left."""
+        """Write the remaining rows and the layout."""
         self._columns.send()
         world = "/world"
         scenes = [
@@ -187,13 +190,13 @@ class _Review:
         nothing = (world, "no frame", Eye(np.ones(3), np.zeros(3), np.array([0.0, 0.0, 1.0])))
         tracks = [self._tracks[number] for number in sorted(self._tracks)]
         for track in tracks:
-            if track.frames == 1:  # a line of one point is not seen
+            if track.frames == 1:  # a line with one point is invisible
                 self._log(f"{track.entity}/posterior", self._dots(), static=True)
         images = self._images.entities
         self._stream.send_blueprint(lay_out(scenes or [nothing], tracks, images))
 
     def _draw(self, entity: str, painted: PaintedFrame) -> None:
-        """Write the sensor and the boxes, and the scene if it is due."""
+        """Write the sensor pose and the boxes, and the scene if it is drawn."""
         labelled = painted.labelled
         at, pose = (labelled.stamp_ns, labelled.index), self._pose(labelled)
         if pose is not None:
@@ -219,7 +222,7 @@ class _Review:
         self._stream.log(entity, *what, static=static)
 
     def _place_sensor(self, entity: str, labelled: LabelledFrame, frame: Frame) -> None:
-        """Write where the sensor is, and its axes and frustum when they are new."""
+        """Write the axes and the frustum of the sensor if they are new."""
         topic = labelled.topic
         if topic not in self._eyes or (labelled.objects and topic not in self._aimed):
             self._eyes[topic] = choose_eye(labelled, frame, fixed=self._fixed_frame is not None)
@@ -234,7 +237,7 @@ class _Review:
         return None if self._fixed_frame is None else labelled.fixed_from_sensor
 
     def _trace(self, entity: str, labelled: LabelledFrame) -> None:
-        """Extend the paths of the tracks; without a pose in the fixed frame none is seen."""
+        """Extend the paths of the tracks, unless the pose in the fixed frame is unknown."""
         pose = self._pose(labelled)
         seen = {}
         if pose is not None or self._fixed_frame is None:
@@ -300,7 +303,7 @@ class _Review:
 
 
 def _steps(category: str) -> rr.SeriesLines:
-    """Return the line of a number that changes at once."""
+    """Return the style of a count, which changes in steps."""
     return rr.SeriesLines(
         names=category,
         colors=colour_of(category),
@@ -310,6 +313,6 @@ def _steps(category: str) -> rr.SeriesLines:
 
 
 def _axes(frame: Frame, eye: Eye) -> rr.ViewCoordinates:
-    """Return the axes of the sensor: optical for images, and where up is along -y."""
+    """Return the axes of the sensor: optical for images and for up along -y, else z up."""
     optical = frame.organized or eye.up[1] < -0.7
     return rr.ViewCoordinates.RDF if optical else rr.ViewCoordinates.RIGHT_HAND_Z_UP

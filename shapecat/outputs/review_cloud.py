@@ -1,4 +1,4 @@
-"""The clouds of the review: which points are kept, and how they are coloured."""
+"""The clouds of the review: choose points and colour them."""
 
 from collections.abc import Sequence
 
@@ -13,16 +13,16 @@ from shapecat.types import Frame, LabelledObject, Plane
 
 __all__ = ["PaintedCloud", "paint"]
 
-_GROUND = np.array([118, 128, 140], np.uint8)  # points of no plane and no object
+_GROUND = np.array([118, 128, 140], np.uint8)  # points on no plane and no object
 _PLANES = np.array([[128, 112, 92], [104, 120, 108], [112, 104, 126], [100, 118, 128]], np.uint8)
 _RADIUS_M = 0.003  # of points of unorganized clouds
-_PLANE_M = 0.015  # points this near to a plane and inside its outline are its own
+_PLANE_M = 0.015  # largest distance of points from the plane that they belong to
 
 
 class PaintedCloud(Record):
-    """Points (n, 3) in the sensor frame, and how they are drawn.
+    """Points (n, 3), metres, sensor frame, with colours (n,) packed as 0xRRGGBBAA.
 
-    ``colours`` (n,) packed 0xRRGGBBAA; at ``radius_m`` they nearly close the surface.
+    Drawn with ``radius_m``, they nearly close the surface.
     """
 
     points: F4 = array("n 3", "f4")
@@ -38,12 +38,17 @@ def paint(
     limit: int,
     view: ColourView | None = None,
 ) -> tuple[PaintedCloud, PaintedCloud]:
-    """Return the scene and the points on objects, together about ``limit`` points (0: all).
+    """Return the points on no object and the points on objects, together about ``limit``.
 
-    Images are thinned on a grid of pixels, clouds by taking every k-th point; objects keep a
-    finer grid, up to half of the points. Points of an object have the colour of its category,
-    those of a plane a muted one, the others are grey; images are shaded as if lit from above the
-    camera. What a colour camera sees has its true colours, on objects tinted by the category.
+    Images are thinned on a grid of pixels, clouds by taking every k-th point; objects have a finer
+    grid, up to half of the points. Points on objects have the colour of the category, points on
+    planes a muted colour; all others are grey. Depth images are shaded as if lit from above the
+    camera. Points that a colour camera sees have their true colours, tinted on objects.
+
+    Parameters
+    ----------
+    limit : approximate number of points; 0 for all.
+    view : the colour image; None for none.
 
     Raises
     ------
@@ -72,7 +77,7 @@ def paint(
 def _shaded(
     frame: Frame, pixels: I4, points: F4, tones: U2, palette: U1, planes: Sequence[Plane]
 ) -> U4:
-    """Return (n,) the colours of points, from entries of the palette or of their plane."""
+    """Return the colours (n,) of points, 0xRRGGBBAA, from the palette or by plane, shaded."""
     light = np.ones(pixels.size, np.float32)
     if frame.depth is not None and frame.camera is not None:
         light = _light(frame.depth, pixels, frame.camera.fx, frame.camera.fy)
@@ -81,7 +86,7 @@ def _shaded(
 
 
 def _radius(frame: Frame, points: F4, step: int) -> float:
-    """Return the radius at which points, ``step`` pixels apart, nearly close the surface."""
+    """Return the radius, metres, at which points ``step`` pixels apart nearly touch."""
     if frame.camera is None:
         return _RADIUS_M
     middle = float(np.median(points[::16, 2])) if len(points) else 0.0
@@ -89,7 +94,7 @@ def _radius(frame: Frame, points: F4, step: int) -> float:
 
 
 def _owners(frame: Frame, objects: Sequence[LabelledObject]) -> U2:
-    """Return for each pixel or point the number of its object, from 1; 0 for none."""
+    """Return the number of each pixel's or point's object (n,), from 1; 0 without an object."""
     source = frame.depth if frame.depth is not None else frame.points
     size = 0 if source is None else source.size if frame.organized else len(source)
     owner = np.zeros(size, np.uint16)
@@ -99,7 +104,10 @@ def _owners(frame: Frame, objects: Sequence[LabelledObject]) -> U2:
 
 
 def _grid(frame: Frame, limit: int) -> tuple[int, I4]:
-    """Return the pitch and about ``limit`` pixels on a grid, or every k-th point; all if 0."""
+    """Return the step of a pixel grid and the flat indices of its about ``limit`` pixels.
+
+    A cloud has every k-th point instead. A limit of 0 means all.
+    """
     if frame.depth is None:
         n = 0 if frame.points is None else len(frame.points)
         step = -(-n // limit) if limit and n else 1
@@ -112,7 +120,7 @@ def _grid(frame: Frame, limit: int) -> tuple[int, I4]:
 
 
 def _thin(frame: Frame, owner: U2, limit: int) -> tuple[int, I4]:
-    """Return the pitch of a grid and the owned pixels on it, about ``limit``; all if 0."""
+    """Return step and indices as `_grid` does, but only of pixels or points on objects."""
     if frame.depth is None:
         pixels = np.flatnonzero(owner != 0)
         step = -(-pixels.size // limit) if limit and pixels.size else 1
@@ -128,14 +136,14 @@ def _step(size: int, limit: int) -> int:
 
 
 def _measured(frame: Frame, pixels: I4) -> I4:
-    """Return the pixels or points that have a reading."""
+    """Return the indices of the pixels or points that have a reading."""
     if frame.depth is not None:
         return np.asarray(pixels[frame.depth.reshape(-1)[pixels] > 0])
     return np.asarray(pixels[np.isfinite(frame.xyz(pixels)).all(axis=1)])
 
 
 def _plane_rows(planes: Sequence[Plane]) -> F4:
-    """Return (p, 8) normal, offset, middle of the outline, and its squared radius."""
+    """Return normal, offset, centre of the outline and its squared radius, (p, 8), metres."""
     rows = []
     for plane in planes:
         middle = plane.outline.mean(axis=0) if len(plane.outline) else np.zeros(3)
@@ -146,9 +154,15 @@ def _plane_rows(planes: Sequence[Plane]) -> F4:
 
 @kernel
 def _colours(points: F4, light: F4, tones: U2, palette: U1, planes: F4, plane_tones: int) -> U4:
-    """Return (n,) colours 0xRRGGBBAA: of the palette, of a near plane for tone 0, times light.
+    """Return the colours (n,) of points, 0xRRGGBBAA.
 
-    The last ``plane_tones`` entries of the palette (k, 3) are those of the planes in turn.
+    Parameters
+    ----------
+    points : (n, 3) metres, sensor frame.
+    light : (n,) factors of brightness.
+    tones : (n,) indices into the palette; points of index 0 get the colour of a near plane.
+    palette : (k, 3); the last ``plane_tones`` entries are for planes, in turn.
+    planes : (p, 8), from `_plane_rows`.
     """
     result = np.zeros(len(points), np.uint32)
     for i in range(len(points)):
@@ -170,7 +184,14 @@ def _colours(points: F4, light: F4, tones: U2, palette: U1, planes: F4, plane_to
 
 @kernel
 def _light(depth: F4, pixels: I4, fx: float, fy: float) -> F8:
-    """Return (n,) brightness, 0.55 to 1.2, of pixels lit from above and left of the camera."""
+    """Return the brightness (n,), 0.55 to 1.2, of pixels lit from above left of the camera.
+
+    Parameters
+    ----------
+    depth : (h, w) metres.
+    pixels : (n,) flat indices.
+    fx, fy : focal lengths, pixels.
+    """
     height, width = depth.shape
     result = np.ones(pixels.size, np.float32)
     reach = 3  # pixels: beyond the quantisation of the depth

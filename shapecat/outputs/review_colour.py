@@ -1,4 +1,4 @@
-"""The true colours of points, where a colour camera sees them."""
+"""The true colours of points that a colour camera sees."""
 
 import numpy as np
 
@@ -12,25 +12,25 @@ from shapecat.types import Frame
 __all__ = ["true_colours"]
 
 _TINT = 0.35
-"""Share of the colour of the category in that of an object."""
+"""Share of the category's colour in the colour of an object."""
 _HIDDEN = 0.05
-"""A point is hidden where something is nearer by more than this share of its distance."""
+"""A point is occluded if another one is nearer by more than this share of its depth."""
 
 
 def true_colours(
     frame: Frame, view: ColourView, points: F4, pixels: I4, pitch: int, palette: U1, tones: U2
 ) -> U4:
-    """Return (n,) the colours 0xRRGGBBAA of points of a frame; 0 where the camera sees them not.
+    """Return the colours (n,) of points, 0xRRGGBBAA; 0 if the colour camera does not see them.
 
-    32 tones of each colour are enough to tell things apart, and the noise of the others would
-    double the size of the file.
+    Each channel has 32 levels, which suffice: the noise of finer ones would double the file.
 
     Parameters
     ----------
     points : (n, 3) metres, sensor frame.
-    pixels : (n,) their indices in the frame.
-    pitch : about how many pixels of the frame lie between neighbours.
-    palette, tones : (k, 3) colours, and (n,) which of them tints a point; 0 is none.
+    pixels : (n,) flat indices of the points in the frame.
+    pitch : approximate distance of neighbouring points, pixels of the frame.
+    palette : (k, 3) colours.
+    tones : (n,) index of the colour that tints each point; 0 for none.
 
     Raises
     ------
@@ -44,7 +44,9 @@ def true_colours(
         return result
     finer = image.width / frame.camera.width if frame.camera is not None else 1.0
     apart = 1.5 * pitch * finer
-    shrink = next((k for k in (4, 2) if k <= apart), 1)  # finer than the points are apart
+    shrink = next(
+        (k for k in (4, 2) if k <= apart), 1
+    )  # still finer than the distance of the points
     if view.colour_from_depth is None or view.lens is None:
         seen = np.stack(np.divmod(pixels, image.width)[::-1], axis=1).astype(np.float32)
     else:
@@ -57,12 +59,20 @@ def true_colours(
 
 @kernel
 def _hide(seen: F4, shape: tuple[int, int], cell: float, share: float) -> None:
-    """Make the columns of points NaN that lie behind the nearest around their cell of an image."""
+    """Set the column of points to NaN if they are outside of the image or occluded.
+
+    Parameters
+    ----------
+    seen : (n, 3) column and row in pixels, and depth in metres; changed in place.
+    shape : height and width of the image.
+    cell : size of the cells in which the nearest point is found, pixels.
+    share : a point is occluded if the nearest depth is less than this share of its own.
+    """
     cells = np.zeros((int(shape[0] / cell) + 2, int(shape[1] / cell) + 2), np.float32)
     for i in range(seen.shape[0]):
         u, v, z = seen[i, 0], seen[i, 1], seen[i, 2]
         if -0.5 < u < shape[1] - 0.5 and -0.5 < v < shape[0] - 0.5 and z > 0:
-            # Of the four cells around it: neighbours may be more than a cell apart.
+            # In the four cells around it, since neighbours may be more than a cell apart.
             x, y = int(u / cell + 0.5), int(v / cell + 0.5)
             for row in (max(y - 1, 0), y):
                 for column in (max(x - 1, 0), x):
@@ -78,9 +88,14 @@ def _hide(seen: F4, shape: tuple[int, int], cell: float, share: float) -> None:
 
 @kernel
 def _take(image: U1, shape: tuple[int, int], seen: F4, palette: U1, tones: U2, colours: U4) -> None:
-    """Look up the colours 0xRRGGBBAA of points at columns and rows of an image.
+    """Write the colours of visible points, 0xRRGGBBAA, into ``colours`` (n,).
 
-    ``shape`` is that of the whole image; the one that is looked up may be shrunk.
+    Parameters
+    ----------
+    image : (h, w, 3) red, green, blue; may be smaller than the recorded image.
+    shape : height and width of the recorded image.
+    seen : (n, 2) or (n, 3), first column and row in the recorded image; NaN if not visible.
+    palette, tones : as for `true_colours`.
     """
     height, width, _ = image.shape
     tall, wide = height / shape[0], width / shape[1]

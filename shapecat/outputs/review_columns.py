@@ -1,7 +1,7 @@
-"""What the review writes over time: rows of an entity, held back and sent by the column.
+"""Rows of the review's entities over time, held back and sent as columns.
 
-A call for each row costs ten times as much, and Rerun remembers every chunk it wrote. So an entity
-is written when it holds enough rows, or enough numbers.
+A call for each row costs ten times as much, and Rerun keeps a record of each chunk. So an entity is
+written when enough rows, or enough numbers, are held back.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -14,17 +14,17 @@ import rerun as rr
 __all__ = ["At", "Columns", "curve"]
 
 At = tuple[int, int]
-"""Stamp in nanoseconds, and number of the frame."""
+"""Stamp in nanoseconds, and frame number."""
 
 _ROWS, _NUMBERS = 256, 1 << 17
-"""Rows, and numbers in them, that an entity holds."""
+"""An entity is written when it holds this many rows, or this many numbers in them."""
 
 _Draw = Callable[[Sequence[Any]], Iterable[rr.ComponentColumn]]
 
 
 @dataclass
 class _Held:
-    """Rows of an entity that are not written yet."""
+    """The rows of an entity that are not written yet."""
 
     draw: _Draw
     at: list[At] = field(default_factory=list)
@@ -33,10 +33,10 @@ class _Held:
 
 
 class Columns:
-    """The one place that holds back what frames show."""
+    """Holds back the rows of all entities, and writes them as columns."""
 
     def __init__(self, stream: rr.RecordingStream) -> None:
-        """Begin without rows."""
+        """Start without rows."""
         self._stream = stream
         self._held: dict[str, _Held] = {}
 
@@ -45,8 +45,8 @@ class Columns:
 
         Parameters
         ----------
-        draw : makes columns of the rows of this entity.
-        size : how many numbers the row keeps in memory.
+        draw : converts the rows of this entity to columns.
+        size : number of numbers that the row keeps in memory.
         """
         held = self._held.setdefault(entity, _Held(draw))
         held.at.append(at)
@@ -56,7 +56,7 @@ class Columns:
             self._send(entity)
 
     def send(self) -> None:
-        """Write all that is held back."""
+        """Write all rows that are held back."""
         for entity in self._held:
             self._send(entity)
 
@@ -68,14 +68,14 @@ class Columns:
 
 
 def curve(rows: Sequence[Sequence[float]]) -> Iterable[rr.ComponentColumn]:
-    """Return the values of a curve of one or several lines."""
+    """Return the columns of a plot with one or several lines: a row has one value per line."""
     values = np.array(rows, np.float64)
     columns = rr.Scalars.columns(scalars=values.ravel())
     yield from columns.partition([values.shape[1]] * len(values))
 
 
 def _times_of(at: Sequence[At]) -> list[rr.TimeColumn]:
-    """Return columns of stamps and of frames."""
+    """Return the columns of both timelines."""
     stamps, indices = np.array(at, np.int64).T
     return [
         rr.TimeColumn("sensor_time", timestamp=stamps.astype("datetime64[ns]")),

@@ -1,6 +1,6 @@
-"""The file of a review. Rerun writes into a pipe, so that an error of the disk is ours to handle.
+"""The file of a review. Rerun writes to a pipe, so that this module can handle disk errors.
 
-Rerun's own writer ends with the first error, and whoever logs after that waits for ever.
+Rerun's own writer ends at the first error, and logging after that blocks for ever.
 """
 
 import os
@@ -22,10 +22,10 @@ _PATIENCE_S = 60.0
 
 
 class ReviewFile:
-    """Takes what Rerun writes into a pipe to a file, in a thread; after an error it is dropped."""
+    """Copies what Rerun writes to a pipe into a file, in a thread; after an error it is dropped."""
 
     def __init__(self, stream: rr.RecordingStream, file: IO[bytes]) -> None:
-        """Let ``stream`` write to ``file``."""
+        """Connect ``stream`` to ``file``."""
         self._stream, self._file = stream, file
         self._error: OSError | None = None
         with tempfile.TemporaryDirectory(prefix="shapecat-") as folder:
@@ -47,7 +47,7 @@ class ReviewFile:
                         self._error = error
 
     def flush(self) -> None:
-        """Write out what is logged.
+        """Write everything logged so far.
 
         Raises
         ------
@@ -57,12 +57,12 @@ class ReviewFile:
         self.check()
 
     def check(self) -> None:
-        """Raise the error that writing has met, if any."""
+        """Raise the OSError of an earlier write, if there was one."""
         if self._error is not None:
             raise self._error
 
     def close(self) -> None:
-        """Write the rest, and end."""
+        """Write the rest and disconnect the stream."""
         self._stream.disconnect()
         self._thread.join()
 
@@ -73,7 +73,7 @@ def open_review(path: Path, stream: rr.RecordingStream) -> Iterator[ReviewFile]:
 
     Raises
     ------
-    OutputError : it cannot be written.
+    OutputError : the file cannot be written.
     """
     with replacing(path) as hidden, hidden.open("wb") as file:
         review = ReviewFile(stream, file)

@@ -1,4 +1,4 @@
-"""The colour images of the review: as they came, with the masks and boxes of the objects."""
+"""The colour images of the review, with the masks and boxes of the objects."""
 
 import io
 from collections.abc import Iterable, Sequence
@@ -28,7 +28,7 @@ _BYTES_PER_NUMBER = 4
 
 
 def as_file(image: ColourImage) -> tuple[bytes, str]:
-    """Return an image as a file and its media type: as it came, or raw pixels as JPEG.
+    """Return an image file and its media type: the recorded file, or raw pixels as JPEG.
 
     Raises
     ------
@@ -44,7 +44,11 @@ def as_file(image: ColourImage) -> tuple[bytes, str]:
 
 
 class Picture(NamedTuple):
-    """A colour image as it is shown: its file, the masks as a picture, boxes (n, 4) and labels."""
+    """A colour image to show, with its objects.
+
+    ``contents`` is the image file, ``masks`` a PNG; ``boxes`` (n, 4) are left, top, width and
+    height in pixels.
+    """
 
     topic: str
     contents: bytes
@@ -55,7 +59,7 @@ class Picture(NamedTuple):
 
 
 def picture_of(labelled: LabelledFrame, coloured: Coloured) -> Picture | None:
-    """Return the picture of a frame; None where colours are no image, as those of loose points.
+    """Return the picture of a frame; None if the colours are those of an unorganized cloud.
 
     Raises
     ------
@@ -76,10 +80,10 @@ def picture_of(labelled: LabelledFrame, coloured: Coloured) -> Picture | None:
 
 
 def _layer(shown: Sequence[tuple[LabelledObject, Mask]], height: int, width: int) -> bytes:
-    """Return a translucent picture of masks: a segmentation image is not compressed.
+    """Return masks as a translucent PNG; Rerun would not compress a segmentation image.
 
-    Two pixels to a byte are packed in half the time. A picture has 16 colours at most, categories
-    beyond them that of the last one.
+    Two pixels per byte take half the time. This allows 15 colours; further categories share the
+    last one.
     """
     colours = {colour: k for k, colour in enumerate(dict.fromkeys(map(_tone, shown)), start=1)}
     packed = np.zeros((height, (width + 1) // 2), np.uint8)
@@ -97,7 +101,13 @@ def _tone(shown: tuple[LabelledObject, Mask]) -> tuple[int, int, int]:
 
 @kernel
 def _pack(pixels: Bool, left: int, top: int, number: int, packed: U1) -> None:
-    """Write a number, at most 15, into the pixels of a mask."""
+    """Write a number, at most 15, to the pixels of a mask in an image of two pixels per byte.
+
+    Parameters
+    ----------
+    pixels : (h, w) the mask, with its top left pixel at row `top` and column `left`.
+    packed : (rows, columns / 2), left pixel in the high nibble; changed in place.
+    """
     for v in range(pixels.shape[0]):
         for u in range(pixels.shape[1]):
             if pixels[v, u]:
@@ -106,19 +116,19 @@ def _pack(pixels: Bool, left: int, top: int, number: int, packed: U1) -> None:
 
 
 _Boxes = tuple[F4, list[tuple[int, int, int]], list[str]]
-"""Boxes (n, 4) on an image, their colours and their captions."""
+"""Boxes (n, 4) on an image, with their colours and captions."""
 
 
 class Images:
-    """Writes the colour images of the frames. ``entities`` are those met, with their titles."""
+    """Writes the colour images of the frames; ``entities`` maps entities to their titles."""
 
     def __init__(self, stream: rr.RecordingStream, columns: Columns) -> None:
-        """Begin without images."""
+        """Start without images."""
         self._stream, self._columns = stream, columns
         self.entities: dict[str, str] = {}
 
     def add(self, topic: str, at: At, picture: Picture) -> None:
-        """Add a picture beside a frame of a topic."""
+        """Add the picture of a frame on a topic."""
         entity = rr.new_entity_path(["images", topic])
         if entity not in self.entities:
             self.entities[entity] = picture.topic
@@ -164,7 +174,7 @@ def _captions(rows: Sequence[_Boxes]) -> Iterable[rr.ComponentColumn]:
 
 
 def _joined(rows: Sequence[_Boxes]) -> tuple[F4, U1, list[int]]:
-    """Return the boxes and colours of the objects of all images, and how many each has."""
+    """Return the boxes (n, 4) and colours (n, 3) of all images, and the number in each image."""
     tones = [tone for _, tones, _ in rows for tone in tones]
     boxes = np.concatenate([boxes for boxes, _, _ in rows])
     counts = [len(texts) for _, _, texts in rows]

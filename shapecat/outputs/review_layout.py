@@ -1,4 +1,4 @@
-"""The layout of the review: which views it opens with, and where the eye stands."""
+"""The layout of the review: its views, and the eye of each 3D view."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,13 +15,13 @@ __all__ = ["Eye", "TrackView", "choose_eye", "lay_out", "stepped_back"]
 
 _BACKGROUND = (16, 18, 23)
 _TIME = rrb.TimeAxis(link=rrb.components.LinkAxis.LinkToGlobal)  # all plots show the same times
-_WIDEST_M = 1.5  # radius of what can be overlooked at once
-_MOST_TRACKS = 48  # views; the tracks seen longest have one each, all are in the recording
+_WIDEST_M = 1.5  # largest radius of a scene that is shown as a whole
+_MOST_TRACKS = 48  # views, for the longest tracks; the recording holds all tracks
 
 
 @dataclass(frozen=True)
 class Eye:
-    """Where a 3D view is looked at from, metres, in the frame of the view."""
+    """The eye of a 3D view: position, target and up direction (3,), metres, in its frame."""
 
     position: F8
     target: F8
@@ -30,7 +30,7 @@ class Eye:
 
 @dataclass
 class TrackView:
-    """A track as the layout knows it."""
+    """A track for the layout; ``frames`` is the number of frames that show it."""
 
     entity: str
     title: str
@@ -39,7 +39,10 @@ class TrackView:
 
 
 def choose_eye(labelled: LabelledFrame, frame: Frame, *, fixed: bool) -> Eye:
-    """Look at the objects from the sensor's side, a little above it."""
+    """Return an eye that looks at the objects from the sensor's side and from above.
+
+    It is in the fixed frame if ``fixed``, else in the sensor frame.
+    """
     pose = labelled.fixed_from_sensor if fixed else None
     pose = pose or IDENTITY
     up = _up(labelled, frame, pose, fixed=fixed)
@@ -48,13 +51,13 @@ def choose_eye(labelled: LabelledFrame, frame: Frame, *, fixed: bool) -> Eye:
     back = back - (back @ up) * up
     norm = np.linalg.norm(back)
     back = back / norm if norm > 1e-3 else np.zeros(3)
-    side = np.cross(up, back)  # from the side, so that the sensor does not stand in the way
+    side = np.cross(up, back)  # from one side, so that the sensor does not block the view
     distance = max(0.6, 2.2 * radius)
     return Eye(target + distance * (0.7 * back + 0.3 * side + 0.6 * up), target, up)
 
 
 def stepped_back(eye: Eye, low: F8, high: F8) -> Eye:
-    """Step back until a box between two corners (3,) is in view, unless it is too large."""
+    """Move the eye back until the box between two corners (3,) is in view, unless too large."""
     radius = float(np.linalg.norm(high - low) / 2) + 0.1
     if not radius <= _WIDEST_M:
         return eye
@@ -73,7 +76,7 @@ def _up(labelled: LabelledFrame, frame: Frame, pose: Pose, *, fixed: bool) -> F8
 
 
 def _subject(labelled: LabelledFrame, frame: Frame, pose: Pose) -> tuple[F8, float]:
-    """Return the middle and the radius of what is worth looking at."""
+    """Return centre (3,) and radius, metres, of the objects, or else the planes or points."""
     if labelled.objects:
         half = [np.full(3, o.box.size.max() / 2) for o in labelled.objects]
         centers = np.array([o.box.center for o in labelled.objects])
@@ -94,13 +97,13 @@ def lay_out(
     tracks: Sequence[TrackView],
     images: Mapping[str, str] | None = None,
 ) -> rrb.Blueprint:
-    """Return the blueprint: 3D and colour on the left; tracks, plots and texts on the right.
+    """Return the blueprint: 3D and colour views on the left; tracks, plots, texts on the right.
 
     Parameters
     ----------
     scenes : entity, title and eye of each 3D view.
-    tracks : all tracks, in order of birth.
-    images : title of each colour image by its entity.
+    tracks : all tracks, in order of their numbers.
+    images : title of each colour image view, by entity.
     """
     left = _one_of([_scene_view(*scene) for scene in scenes])
     if images:
@@ -157,7 +160,7 @@ def _scene_view(entity: str, title: str, eye: Eye) -> rrb.Spatial3DView:
 
 
 def _track_tabs(tracks: Sequence[TrackView]) -> rrb.Tabs:
-    """Return a tab for each track: plots one above the other are too low to read."""
+    """Return a tab for each of the longest tracks, since stacked plots are too low to read."""
     longest = sorted(tracks, key=lambda track: -track.frames)[:_MOST_TRACKS]
     shown = [_track_view(track) for track in tracks if track in longest]
     return rrb.Tabs(*shown, name="Posterior so far")

@@ -12,23 +12,23 @@ from shapecat.outputs.review_shapes import paths
 __all__ = ["Paths"]
 
 _STEP_M, _POINTS = 0.015, 500
-"""A path grows when its object has moved so far; places it keeps."""
+"""Distance at which a position is added to a path, and number of positions kept."""
 
 
 @dataclass
 class _Path:
-    """Where a track has been."""
+    """The positions (3,) of a track so far, metres."""
 
     category: str
     places: list[F8] = field(default_factory=list)
 
     @property
     def drawn(self) -> bool:
-        """Whether there is a line to draw."""
+        """Whether the path has at least two positions."""
         return len(self.places) > 1
 
     def grow(self, place: F8) -> bool:
-        """Add a place; return whether there is more to draw."""
+        """Add a position if the object has moved; return whether the path has changed."""
         if self.places and np.linalg.norm(place - self.places[-1]) <= _STEP_M:
             return False
         self.places.append(place)
@@ -37,17 +37,17 @@ class _Path:
 
 
 class Paths:
-    """Paths of tracks by entity, written all at once when one grows or ends."""
+    """The paths of tracks by entity; an entity is rewritten when a path grows or ends."""
 
     def __init__(self, columns: Columns) -> None:
-        """Begin without paths."""
+        """Start without paths."""
         self._columns = columns
         self._paths: dict[str, dict[int, _Path]] = {}
 
     def add(
         self, entity: str, at: At, seen: Mapping[int, tuple[str, F8]], ended: Iterable[int]
     ) -> None:
-        """Take the category and the place of each track that a frame shows."""
+        """Add the category and position of each track in a frame; remove ended tracks."""
         known = self._paths.setdefault(entity, {})
         gone = [known.pop(number) for number in ended if number in known]
         grown = [

@@ -1,4 +1,4 @@
-"""The frames of a review: their scenes, drawn seldom while nothing moves, and their painting."""
+"""Choose the frames of a review whose scene is drawn, and paint them."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -17,13 +17,13 @@ from shapecat.types import Frame, LabelledFrame
 __all__ = ["PaintedFrame", "ReviewFrame", "choose_scenes", "paint_frame", "with_clouds"]
 
 _SOON_NS, _LATE_NS = 90_000_000, 240_000_000
-"""From a scene to the next one: at least, and at most where the frames differ."""
+"""Shortest time between two scenes, and longest time if the frames differ."""
 _STILL_M = 0.015
-"""What has moved so far is drawn as soon as it may be."""
+"""After a motion of this size, the scene is drawn as soon as allowed."""
 
 
 class ReviewFrame(NamedTuple):
-    """A frame to be written, with its points and its image if its scene is drawn."""
+    """A frame to write, with its points and colour image if its scene is drawn."""
 
     labelled: LabelledFrame
     frame: Frame | None = None
@@ -33,11 +33,11 @@ class ReviewFrame(NamedTuple):
 def with_clouds(
     frames: Iterable[LabelledFrame], recording: Recording, run: RunInfo
 ) -> Iterator[ReviewFrame]:
-    """Yield all frames of a run, with the clouds and images of those whose scene is drawn.
+    """Yield all frames of a run; those whose scene is drawn have their points and colour image.
 
     Raises
     ------
-    OutputError : the recording does not hold one of them any more.
+    OutputError : the recording no longer holds one of the frames.
     """
     first, second = tee(choose_scenes(frames, fixed=run["fixed_frame"] is not None))
     read = with_colour((labelled for labelled, drawn in first if drawn), recording, run)
@@ -48,14 +48,15 @@ def with_clouds(
 def choose_scenes(
     frames: Iterable[LabelledFrame], *, fixed: bool
 ) -> Iterator[tuple[LabelledFrame, bool]]:
-    """Tell which frames have their scene drawn: none that repeats, few while nothing moves.
+    """Yield each frame, and whether its scene is drawn.
+
+    Repeated scenes are not drawn, and scenes in which nothing moves are drawn less often.
 
     Parameters
     ----------
-    fixed : objects are shown in a frame in which those that stand still keep their place, so that
-        a camera that moves does not move the scene.
+    fixed : whether motion is measured in the fixed frame, where a moving camera does not count.
     """
-    last: dict[str, LabelledFrame] = {}  # drawn of each topic
+    last: dict[str, LabelledFrame] = {}  # last drawn frame of each topic
     for labelled in frames:
         before = last.get(labelled.topic)
         drawn = before is None or _is_due(labelled, before, fixed=fixed)
@@ -65,7 +66,7 @@ def choose_scenes(
 
 
 def _is_due(labelled: LabelledFrame, before: LabelledFrame, *, fixed: bool) -> bool:
-    """Return whether a scene is worth drawing after the one drawn before it."""
+    """Return whether to draw a scene, given the last one drawn."""
     passed_ns = labelled.stamp_ns - before.stamp_ns
     if _first_seen(labelled) == _first_seen(before) or 0 <= passed_ns < _SOON_NS:
         return False
@@ -80,7 +81,7 @@ def _first_seen(labelled: LabelledFrame) -> int:
 
 
 def _places(labelled: LabelledFrame, *, fixed: bool) -> dict[int, F8]:
-    """Return where the tracks are, in the fixed frame if it is known."""
+    """Return the position (3,) of each track, in the fixed frame if ``fixed`` and known."""
     pose = labelled.fixed_from_sensor if fixed else None
     return {
         o.track: transform(pose or IDENTITY, (o.full or o.box).center) for o in labelled.objects
@@ -88,9 +89,10 @@ def _places(labelled: LabelledFrame, *, fixed: bool) -> dict[int, F8]:
 
 
 class PaintedFrame(NamedTuple):
-    """A frame ready to be written.
+    """A frame ready to write.
 
-    ``clouds`` are None where the scene is not drawn; ``damage`` is what is wrong with the image.
+    ``clouds`` are the points on no object and on objects, None if the scene is not drawn;
+    ``picture`` is None without a colour image; ``damage`` says why that is unreadable, or is empty.
     """
 
     labelled: LabelledFrame
@@ -101,7 +103,10 @@ class PaintedFrame(NamedTuple):
 
 
 def paint_frame(chosen: ReviewFrame, *, limit: int) -> PaintedFrame:
-    """Paint the clouds and the masks of a frame; without colour if its image is damaged."""
+    """Paint the clouds and masks of a frame, without colour if its image is damaged.
+
+    ``limit`` is the approximate number of points to keep, 0 for all.
+    """
     labelled, frame, coloured = chosen
     damage, parts = "", (labelled.planes, labelled.objects)
     if frame is None:

@@ -1,6 +1,6 @@
-"""What the review draws: records of the house as archetypes of Rerun.
+"""Convert records to Rerun archetypes for the review.
 
-What frames show goes by the column, some frames at once: a call for each costs ten times as much.
+Several frames are converted at a time, to columns: a call for each costs ten times as much.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -35,26 +35,26 @@ __all__ = [
 ]
 
 _PLANE = (190, 205, 220)
-_CAPTION_M = 0.02  # from the top of a box to its label
+_CAPTION_M = 0.02  # from the top of a box to its caption
 _SURE = 0.9
-"""A caption leaves out a higher confidence."""
+"""A caption omits a confidence of at least this."""
 
 _EDGES = np.array(
     [(k, (k + 1) % 4) for k in range(4)]
     + [(k + 4, (k + 1) % 4 + 4) for k in range(4)]
     + [(k, k + 4) for k in range(4)]
 )
-"""Pairs of the corners of a box, numbered as by `box_corners`."""
+"""The edges of a box as pairs of corners, in the order of `box_corners`."""
 _DASHES = (np.arange(5)[:, None] + [0.0, 0.5])[..., None] / 4.5
-"""(5, 2, 1) where the dashes of an edge begin and end, as shares of it: at both corners."""
+"""Start and end (5, 2, 1) of the dashes of an edge, as shares of its length, from 0 to 1."""
 
 _Columns = Iterable[rr.ComponentColumn]
 Way = tuple[str, F8]
-"""Category, and places (n, 3) in metres."""
+"""The category of a track and its path (n, 3), metres."""
 
 
 class Surface(NamedTuple):
-    """What is drawn of an object in a scene, without its pixels, which would fill the memory."""
+    """An object of a scene to draw, without its pixels, to save memory."""
 
     category: str
     full: Box | None
@@ -62,7 +62,7 @@ class Surface(NamedTuple):
 
 
 class DrawnScene(NamedTuple):
-    """A scene as it is drawn: its objects and planes, the points of no object, those on objects."""
+    """A scene to draw: objects, planes, the points on no object, and the points on objects."""
 
     objects: tuple[Surface, ...]
     planes: tuple[Plane, ...]
@@ -71,18 +71,18 @@ class DrawnScene(NamedTuple):
 
     @classmethod
     def of(cls, labelled: LabelledFrame, scene: PaintedCloud, points: PaintedCloud) -> "DrawnScene":
-        """Take from a frame what is drawn of it."""
+        """Return the scene of a frame with its painted clouds."""
         objects = tuple(Surface(o.category, o.full, o.gas) for o in labelled.objects)
         return cls(objects, labelled.planes, scene, points)
 
     @property
     def size(self) -> int:
-        """The number of its points."""
+        """The number of points."""
         return len(self.scene.points) + len(self.points.points)
 
 
 class Sketch(NamedTuple):
-    """The shapes that show an object in every frame."""
+    """The box and texts of an object, which are drawn in every frame."""
 
     box: Box
     category: str
@@ -91,7 +91,7 @@ class Sketch(NamedTuple):
 
 
 class Drawing(NamedTuple):
-    """How an entity is drawn: what never changes, and what each of some rows shows."""
+    """How an entity is drawn: its static style, and the function from rows to columns."""
 
     style: rr.AsComponents | None
     columns: Callable[[Sequence[Any]], _Columns]
@@ -103,12 +103,12 @@ def label(item: LabelledObject) -> str:
 
 
 def short_label(item: LabelledObject) -> str:
-    """Return ``#track category``, with the confidence where it is in doubt: long ones overlap."""
+    """Return ``#track category``, with the confidence only if it is low: long captions overlap."""
     return label(item) if item.confidence < _SURE else f"#{item.track} {item.category}"
 
 
 def sketch(labelled: LabelledFrame) -> list[Sketch]:
-    """Return what is drawn of the objects of a frame."""
+    """Return the boxes and texts of the objects in a frame."""
     return [Sketch(o.box, o.category, label(o), short_label(o)) for o in labelled.objects]
 
 
@@ -125,7 +125,7 @@ def _boxes(rows: Sequence[Sequence[Sketch]]) -> _Columns:
 
 
 def _captions(rows: Sequence[Sequence[Sketch]]) -> _Columns:
-    """Return the captions, each a little above its box."""
+    """Return the captions, each just above its box."""
     every = list(chain.from_iterable(rows))
     yield from rr.Points3D.columns(
         positions=_stacked([_above(o.box) for o in every], 3),
@@ -144,7 +144,7 @@ def _points(clouds: Sequence[PaintedCloud]) -> _Columns:
 
 
 def _scene(scenes: Sequence[DrawnScene]) -> _Columns:
-    """Return the points of no object."""
+    """Return the points on no object."""
     return _points([moment.scene for moment in scenes])
 
 
@@ -178,8 +178,8 @@ def _graphs(scenes: Sequence[DrawnScene]) -> _Columns:
 
 
 def _segments(pairs: F4) -> pa.Array:
-    """Return lines (n, 2, 3) as Rerun stores them: its own conversion goes one by one."""
-    kind = rr.components.LineStrip3DBatch._ARROW_DATATYPE  # noqa: SLF001  not told otherwise
+    """Return lines (n, 2, 3) as Rerun stores them; its own conversion is slow."""
+    kind = rr.components.LineStrip3DBatch._ARROW_DATATYPE  # noqa: SLF001  no public name
     flat = pa.array(np.ascontiguousarray(pairs, np.float32).ravel())
     corners = pa.FixedSizeListArray.from_arrays(flat, type=kind.value_type)
     offsets = pa.array(np.arange(0, 2 * len(pairs) + 1, 2, dtype=np.int32))
@@ -187,7 +187,7 @@ def _segments(pairs: F4) -> pa.Array:
 
 
 def _surfaces(scenes: Sequence[DrawnScene]) -> _Columns:
-    """Return the triangles of the graphs, one translucent mesh a frame."""
+    """Return the triangles of the graphs, one translucent mesh per frame."""
     shown = [[(o, faces) for o in m.objects if len(faces := _triangles(o))] for m in scenes]
     objects = [o for each in shown for o, _ in each]
     sizes = [len(o.gas.neurons) for o in objects]
@@ -210,7 +210,7 @@ def _outlines(scenes: Sequence[DrawnScene]) -> _Columns:
 
 
 def _fills(scenes: Sequence[DrawnScene]) -> _Columns:
-    """Return the planes as polygons: fans, as outlines are convex."""
+    """Return the planes as triangle fans, since outlines are convex."""
     shown = [[p.outline for p in m.planes if len(p.outline) >= 3] for m in scenes]
     corners = _stacked(list(chain.from_iterable(shown)), 3)
     counts = [sum(map(len, outlines)) for outlines in shown]
@@ -224,7 +224,7 @@ def _fan(corners: int) -> U4:
 
 
 def _mesh(parts: Sequence[tuple[int, U4]]) -> U4:
-    """Return the triangles of one mesh of parts, each so many vertices and its triangles."""
+    """Return the triangles of a mesh made of parts, given as vertex count and triangles."""
     starts = np.cumsum([0, *(vertices for vertices, _ in parts)])
     faces = [triangles + start for (_, triangles), start in zip(parts, starts, strict=False)]
     return np.concatenate(faces).astype(np.uint32) if faces else np.zeros((0, 3), np.uint32)
@@ -249,17 +249,17 @@ SCENE: Mapping[str, Drawing] = {
     "objects/graphs": Drawing(rr.LineStrips3D.from_fields(radii=0.0008), _graphs),
     "objects/surfaces": Drawing(None, _surfaces),
 }
-"""What is drawn of a `DrawnScene`, some times a second, by entity below that of the scene."""
+"""How a `DrawnScene` is drawn, by entity below the scene, a few times a second."""
 SKETCH: Mapping[str, Drawing] = {
     # Labels of boxes would cover the objects.
     "objects/boxes": Drawing(rr.Boxes3D.from_fields(radii=0.001, show_labels=False), _boxes),
     "objects/captions": Drawing(rr.Points3D.from_fields(radii=0.0005, show_labels=True), _captions),
 }
-"""What is drawn of the `Sketch` of every frame, by entity below that of the sensor."""
+"""How the `Sketch` of each object is drawn in every frame, by entity below the sensor."""
 
 
 def paths(snapshots: Sequence[Sequence[Way]]) -> _Columns:
-    """Return the ways of some frames."""
+    """Return the columns of the paths in several frames."""
     ways = [way for snapshot in snapshots for way in snapshot]
     yield from rr.LineStrips3D.columns(
         strips=[places for _, places in ways], colors=[_tint(category, 0.2) for category, _ in ways]
@@ -267,7 +267,7 @@ def paths(snapshots: Sequence[Sequence[Way]]) -> _Columns:
 
 
 def places(poses: Sequence[Pose]) -> _Columns:
-    """Return poses ``parent_from_child``."""
+    """Return the columns of poses ``parent_from_child``."""
     yield from rr.Transform3D.columns(
         translation=[pose.translation for pose in poses],
         quaternion=[quaternion_from_rotation(pose.rotation) for pose in poses],
@@ -286,7 +286,7 @@ def pinhole(camera: Camera) -> rr.Pinhole:
 
 
 def markdown(values: Mapping[str, object], level: int = 1) -> str:
-    """Return nested values as headings and lists."""
+    """Return nested values as Markdown headings and lists."""
     lines = [
         f"- **{key}**: {_inline(v)}" for key, v in values.items() if not isinstance(v, Mapping)
     ]
@@ -319,7 +319,7 @@ def _tint(category: str, white: float) -> tuple[int, int, int]:
 
 
 def _packed(objects: Sequence[Surface | Sketch], *, alpha: int = 255, white: float = 0.0) -> U4:
-    """Return (n,) colours 0xRRGGBBAA of the categories of objects."""
+    """Return the colours (n,) of objects, 0xRRGGBBAA, by category and mixed with white."""
     tints = {category: _tint(category, white) for category in {o.category for o in objects}}
     numbers = {
         category: (red << 24) | (green << 16) | (blue << 8) | alpha

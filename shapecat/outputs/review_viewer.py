@@ -1,4 +1,4 @@
-"""Opening a review in the Rerun viewer, with a window or without."""
+"""Open a review in the Rerun viewer: in a window, in a browser, or as a screenshot."""
 
 import os
 import shutil
@@ -20,20 +20,20 @@ from shapecat.errors import OutputError
 
 __all__ = ["open_viewer", "serve_viewer", "take_screenshot"]
 
-_SETTLE_S = 7.0  # until the viewer's greetings have faded; all else is drawn by then
+_SETTLE_S = 7.0  # until the viewer's notices have faded; everything else is drawn by then
 _LOAD_S = 30.0
 _OPEN_S = 2.0
-"""A viewer that cannot open a window ends sooner."""
+"""A viewer that cannot open a window ends within this time."""
 _HERE = "127.0.0.1"
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 
 
 def open_viewer(path: Path) -> None:
-    """Open a review in a window of its own, and return as soon as that stays open.
+    """Open a review in a window, and return when the window stays open.
 
     Raises
     ------
-    OutputError : there is no such file, no viewer, or no display.
+    OutputError : the file, the viewer or a display is missing.
     """
     _require_file(path)
     if sys.platform == "linux" and not any(os.environ.get(name) for name in _DISPLAYS):
@@ -48,11 +48,15 @@ def open_viewer(path: Path) -> None:
 
 @contextmanager
 def serve_viewer(path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """Serve a review to browsers on this machine; give the address and the process that serves.
+    """Serve a review to browsers on this machine during the block.
+
+    Yields
+    ------
+    The address, and the process that serves it.
 
     Raises
     ------
-    OutputError : there is no such file or no viewer, or it ends at once.
+    OutputError : the file or the viewer is missing, or the viewer ends at once.
     """
     _require_file(path)
     web, data = _free_port(), _free_port()
@@ -68,7 +72,7 @@ def serve_viewer(path: Path) -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
 
 
 def _start(options: Sequence[str], said: IO[bytes]) -> subprocess.Popen[bytes]:
-    """Start the viewer in a process group of its own, for this machine alone."""
+    """Start the viewer in a process group of its own, reachable only from this machine."""
     command = [_viewer(), "--bind", _HERE, *options]
     return subprocess.Popen(command, stdout=said, stderr=said, start_new_session=True)
 
@@ -86,12 +90,13 @@ def take_screenshot(
 
     Parameters
     ----------
+    png : the file to write.
     size : width and height in pixels.
-    stamp_ns : the time to show; the last one of the recording by default.
+    stamp_ns : the time to show; by default the last time in the recording.
 
     Raises
     ------
-    OutputError : there is no such file, no viewer, or nothing that can draw.
+    OutputError : the file, the viewer or a renderer is missing.
     """
     from rerun.experimental import ViewerClient  # noqa: PLC0415  only a screenshot needs it
 
@@ -144,7 +149,12 @@ def _require_file(path: Path) -> None:
 
 
 def _viewer() -> str:
-    """Return the path of the viewer: beside this Python first, then on the PATH."""
+    """Return the path of the viewer, beside this Python or else on the PATH.
+
+    Raises
+    ------
+    OutputError : there is no viewer.
+    """
     beside = shutil.which("rerun", path=str(Path(sys.executable).parent))
     found = beside or shutil.which("rerun")
     if found is None:
@@ -160,7 +170,13 @@ def _free_port() -> int:
 
 
 def _wait_for(viewer: subprocess.Popen[bytes], port: int, said: IO[bytes]) -> None:
-    """Wait until the viewer answers; say why when it ends before."""
+    """Wait until the viewer answers.
+
+    Raises
+    ------
+    OutputError : the viewer has ended; the text says why.
+    TimeoutError : the viewer does not answer.
+    """
 
     def answers() -> bool:
         if viewer.poll() is not None:
@@ -172,7 +188,7 @@ def _wait_for(viewer: subprocess.Popen[bytes], port: int, said: IO[bytes]) -> No
 
 
 def _has_ended(viewer: subprocess.Popen[bytes]) -> bool:
-    """Whether the viewer is gone, or about to go: its connection ends before it does."""
+    """Return whether the viewer has ended, or ends soon: its connection closes before that."""
     with suppress(subprocess.TimeoutExpired):
         viewer.wait(_SETTLE_S)
     return viewer.poll() is not None

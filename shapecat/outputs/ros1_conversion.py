@@ -1,4 +1,4 @@
-"""ROS 1 messages become ROS 2 messages: same fields, other encoding."""
+"""Convert ROS 1 messages to ROS 2 messages: same fields, other encoding."""
 
 from collections.abc import Callable
 from importlib.resources import files
@@ -38,23 +38,23 @@ _LATCHED = Qos(
     _FOREVER,
     avoid_ros_namespace_conventions=False,
 )
-"""What ROS 2 calls a latched topic."""
+"""The quality of service that corresponds to a latched ROS 1 topic."""
 _HEADER = "std_msgs/msg/Header"
 
 ConvertedChannel = tuple[AnnotationChannel, Callable[[bytes | memoryview], memoryview]]
 
 
 def convert_channel(channel: Channel) -> ConvertedChannel | None:
-    """Describe a ROS 1 channel in ROS 2 terms.
+    """Convert a ROS 1 channel to ROS 2.
 
-    Types that ROS 2 still has, laid out the same, get the ROS 2 definition (field names differ:
-    ``K`` became ``k``); all others keep the definition of the bag. Only the sequence number of
-    headers is lost: ROS 2 has none.
+    Types that exist in ROS 2 with the same layout get the ROS 2 definition, where field names
+    differ: ``K`` became ``k``. All others keep the definition in the bag. Only the sequence number
+    of headers is lost, since ROS 2 has none.
 
     Returns
     -------
-    The channel to write and the conversion of its messages; None if the definition cannot be
-    understood.
+    The channel to write, and the function that converts its messages; None if the definition is
+    invalid.
     """
     name = _RENAMED.get(channel.type, channel.type)
     try:
@@ -77,7 +77,7 @@ def convert_channel(channel: Channel) -> ConvertedChannel | None:
 
 
 def _same_layout(name: str, old: Any, new: Any) -> bool:
-    """Tell whether two definitions have the same types in the same order, whatever their names."""
+    """Return whether two definitions have fields of the same types in order, with any names."""
     if name == _HEADER:
         return True
     if name not in old or name not in new or len(old[name][1]) != len(new[name][1]):
@@ -92,7 +92,7 @@ def _same_layout(name: str, old: Any, new: Any) -> bool:
 
 
 def _reachable(name: str, store: Typestore) -> dict[str, Any]:
-    """Return the definitions that a type is made of."""
+    """Return the definitions of a type and of the types it contains."""
     found: dict[str, Any] = {}
     waiting = [name]
     while waiting:
@@ -108,15 +108,15 @@ def _reachable(name: str, store: Typestore) -> dict[str, Any]:
 
 
 def raw_channel(topic: str) -> AnnotationChannel:
-    """Describe a channel of messages that are kept as they were recorded."""
+    """Return the channel for messages that are kept as recorded; see `wrap_raw`."""
     text = files("shapecat.schemas").joinpath("RawMessage.msg").read_bytes()
     return AnnotationChannel(topic, "cdr", RAW_TYPE, "ros2msg", text)
 
 
 def wrap_raw(channel: Channel, data: bytes | memoryview) -> memoryview:
-    """Wrap a message that cannot be converted, byte for byte, with all that is needed to read it.
+    """Wrap a message that cannot be converted, with its type, encoding and definition.
 
-    A file of two encodings cannot be played or opened by most ROS tools.
+    Most ROS tools cannot play or open a file with two encodings.
     """
     store = _raw_store()
     message = store.types[RAW_TYPE](

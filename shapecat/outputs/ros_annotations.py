@@ -23,14 +23,14 @@ __all__ = ["ArrayMessage", "RosMessages"]
 
 
 class ArrayMessage(NamedTuple):
-    """A kind of message: its name, and what makes one of what is shown in a frame."""
+    """A message type: its name, and the function that makes a message from an annotation."""
 
     name: str
     make: Callable[[Annotation], Any]
 
 
 class RosMessages:
-    """Builds and serializes the messages, of ROS 1 or ROS 2."""
+    """Makes and serializes the messages of the annotations, for ROS 1 or ROS 2."""
 
     def __init__(self, *, ros1: bool) -> None:
         """Prepare the types."""
@@ -48,7 +48,7 @@ class RosMessages:
         self.markers = ArrayMessage("visualization_msgs/msg/MarkerArray", self._markers)
 
     def definition(self, name: str) -> bytes:
-        """Return the definition to embed: that of the store that encodes."""
+        """Return the definition of a type, to store with its channel."""
         return _definition(self.ros1, name)
 
     def make(self, kind: str, *values: Any) -> Any:
@@ -58,7 +58,7 @@ class RosMessages:
         return self._types[kind](*values)
 
     def colour(self, kind: str, category: str, alpha: float) -> Any:
-        """Return the colour of a category as a ``Color`` or ``ColorRGBA``: always the same one."""
+        """Return the colour of a category as a ``Color`` or ``ColorRGBA`` message, from a cache."""
         key = kind, category, alpha
         if key not in self._colours:
             tone = (part / 255 for part in colour_of(category))

@@ -1,4 +1,4 @@
-"""Foxglove's messages as Protocol Buffers, by the descriptors in `shapecat.schemas`."""
+"""Encode Foxglove messages as Protocol Buffers, with the descriptors in `shapecat.schemas`."""
 
 from functools import cache
 from importlib.resources import files
@@ -11,7 +11,7 @@ __all__ = ["descriptors_of", "encode_foxglove"]
 
 @cache
 def descriptors_of(name: str) -> bytes:
-    """Return the FileDescriptorSet of a message, as MCAP embeds it."""
+    """Return the serialized FileDescriptorSet of a message type, as MCAP stores it."""
     return files("shapecat.schemas").joinpath(f"{name.rpartition('.')[2]}.binpb").read_bytes()
 
 

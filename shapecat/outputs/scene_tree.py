@@ -1,4 +1,4 @@
-"""The hierarchy of one frame of a run, from its tables, as text."""
+"""Which objects of a frame stand on which, from the tables of a run, as text."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -18,7 +18,12 @@ __all__ = ["describe_scene", "read_scene"]
 
 
 def describe_scene(folder: Path, frame: int, *, topic: str | None = None) -> str:
-    """Return what stands on what in a frame, one plane or object a line, indented.
+    """Return the tree of planes and objects in a frame, indented, one per line.
+
+    Parameters
+    ----------
+    frame : number of the frame on its topic.
+    topic : needed only if several topics have the frame.
 
     Raises
     ------
@@ -83,7 +88,7 @@ def _topic(folder: Path, frame: int, topic: str | None) -> str:
 
     Raises
     ------
-    OutputError : none has it, or several.
+    OutputError : no topic has the frame, or several have it.
     """
     frames: dict[str, list[int]] = {}
     for group in read_row_groups(folder / "frames.parquet", ["topic", "frame"]):
@@ -103,7 +108,7 @@ def _topic(folder: Path, frame: int, topic: str | None) -> str:
 
 
 def _names(finished: FinishedRun, topic: str, frame: int) -> dict[int, str]:
-    """Return what each detection of a frame is shown as, by the first of its points."""
+    """Return category and track of each pixel or point that belongs to an object in a frame."""
     frames = read_labelled_frames(finished.folder, finished.labels)
     shown = next(item for item in frames if (item.topic, item.index) == (topic, frame))
     return {

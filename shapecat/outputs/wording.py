@@ -1,10 +1,10 @@
-"""Numbers and times in words, the same in every output."""
+"""Format captions, confidences, counts and times, the same in every output."""
 
 __all__ = ["caption", "confidence_text", "plural", "time_span"]
 
 
 def caption(track: int, category: str, confidence: float) -> str:
-    """Return what is written beside an object.
+    """Return the text beside an object: track, category and confidence.
 
     Examples
     --------
@@ -15,9 +15,9 @@ def caption(track: int, category: str, confidence: float) -> str:
 
 
 def confidence_text(confidence: float) -> str:
-    """Return a confidence with two digits, the same for one that tracks.csv has rounded to three.
+    """Return a confidence with two decimals, the same whether or not it was rounded to three.
 
-    Only what is certain to three digits is shown as certain.
+    It is 1.00 only if it rounds to 1.000.
 
     Examples
     --------
@@ -30,7 +30,7 @@ def confidence_text(confidence: float) -> str:
 
 
 def plural(count: int, noun: str) -> str:
-    """Return a number of things.
+    """Return a count with its noun, in the plural unless the count is 1.
 
     Examples
     --------
@@ -41,7 +41,7 @@ def plural(count: int, noun: str) -> str:
 
 
 def time_span(first_s: float, last_s: float) -> str:
-    """Return from when to when; one time if they look the same.
+    """Return a range of times in seconds, or one time if both round to the same.
 
     Examples
     --------

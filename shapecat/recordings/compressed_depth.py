@@ -20,10 +20,10 @@ _LARGEST = 1 << 26
 
 
 def depth_of_compressed(message: Any) -> F4:
-    """Read a decoded sensor_msgs/CompressedImage with a format of ``16UC1; compressedDepth …``.
+    """Read a decoded sensor_msgs/CompressedImage with a format such as ``16UC1; compressedDepth``.
 
-    The data begin with 12 bytes: a number, and two parameters A and B. For 32FC1 the stored value
-    is A / depth + B.
+    The data begins with 12 bytes: the compression format and two parameters A and B. For 32FC1 the
+    stored value is A / depth + B, with depth in metres; for 16UC1 it is in millimetres.
 
     Returns
     -------
@@ -31,7 +31,7 @@ def depth_of_compressed(message: Any) -> F4:
 
     Raises
     ------
-    MessageError : damaged, or another kind of image.
+    MessageError : the data is damaged, or is neither a 16-bit grey PNG nor RVL.
     """
     data = memoryview(message.data).cast("B").toreadonly()
     if len(data) < _HEADER.size + 8:
@@ -49,7 +49,7 @@ def depth_of_compressed(message: Any) -> F4:
 
 
 def _read_png(data: bytes) -> U2:
-    """Read a 16-bit grey PNG without interlacing, as the transport writes it."""
+    """Read a 16-bit grey PNG (h, w) without interlacing, as the transport writes it."""
     offset, packed, shape = len(_PNG), b"", (0, 0)
     while offset + 8 <= len(data):
         length, name = struct.unpack_from(">I4s", data, offset)
@@ -82,7 +82,16 @@ def _read_png(data: bytes) -> U2:
 
 @kernel
 def _unfilter(rows: U1) -> U1:
-    """Undo the row filters of a PNG (ISO/IEC 15948, 9.2) with two bytes a pixel."""
+    """Undo the row filters of a 16-bit grey PNG (ISO/IEC 15948, 9.2).
+
+    Parameters
+    ----------
+    rows : (h, 1 + 2 w) bytes; each row begins with its filter type.
+
+    Returns
+    -------
+    (h, 2 w) bytes.
+    """
     height, width = rows.shape[0], rows.shape[1] - 1
     out = np.zeros((height, width), np.uint8)
     for y in range(height):
@@ -107,10 +116,10 @@ def _unfilter(rows: U1) -> U1:
 
 
 def _read_rvl(data: bytes) -> U2:
-    """Read RVL: columns, rows, then nibbles in little-endian words."""
+    """Read RVL data: width, height, then nibbles in little-endian 32-bit words."""
     width, height = struct.unpack_from("<II", data)
     words = np.frombuffer(data, "<u4", (len(data) - 8) // 4, 8)
-    # A run of zeros costs at least a nibble, whatever its length: bound by the pixels alone.
+    # A nibble can hold a run of zeros of any length, so only the number of pixels is checked.
     if not 0 < height * width <= _LARGEST or words.size == 0:
         msg = f"compressed depth of {width} x {height} pixels in {len(data)} bytes"
         raise MessageError(msg)
@@ -123,12 +132,12 @@ def _read_rvl(data: bytes) -> U2:
 
 @kernel
 def _number(words: Any, at: int) -> tuple[int, int]:
-    """Read a number of a RVL stream: its value, and the nibble after it, -1 if the data end."""
+    """Read a number from the nibble `at`; return it and the index after it, -1 if the data ends."""
     value, shift = 0, 0
     while at < 8 * words.size and shift < 30:
         nibble = int(words[at // 8] >> np.uint32(28 - 4 * (at % 8))) & 15
         at += 1
-        value |= (nibble & 7) << shift  # three bits; the fourth says that more follow
+        value |= (nibble & 7) << shift  # three bits of the value; the fourth is set if more follow
         shift += 3
         if nibble & 8 == 0:
             return value, at
@@ -137,20 +146,22 @@ def _number(words: Any, at: int) -> tuple[int, int]:
 
 @kernel
 def _expand_rvl(words: Any, out: U2) -> bool:
-    """Expand runs of zeros and of differences; False if the data end early.
+    """Decode RVL words into `out`, depth values (h * w,); return False if they are damaged.
 
     Source: Wilson 2017, Fast Lossless Depth Image Compression, DecompressRVL.
     """
     at, filled, previous = 0, 0, 0
     while filled < out.size:
-        zeros, at = _number(words, at)  # (1) so many zeros
+        zeros, at = _number(words, at)  # (1) length of the run of zeros
         if at < 0 or zeros > out.size - filled:
             return False
         filled += zeros
-        others, at = _number(words, at)  # (2) so many readings
+        others, at = _number(words, at)  # (2) number of values after it
         if at < 0 or others > out.size - filled or zeros + others == 0:
             return False
-        for _ in range(others):  # (3) each as its zigzag-coded difference to the last
+        for _ in range(
+            others
+        ):  # (3) each value, as a zigzag-coded difference from the previous one
             value, at = _number(words, at)
             if at < 0:
                 return False

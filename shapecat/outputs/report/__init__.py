@@ -1,4 +1,4 @@
-"""The report of a run: a page to open as a file, or served to write corrections to disk."""
+"""The report of a run: a page to open as a file, or to serve so that corrections are saved."""
 
 from shapecat.outputs.report.writing import Reports, read_reports, write_reports
 

@@ -1,4 +1,4 @@
-"""The card of a track, and the picture of a frame, as HTML."""
+"""HTML for the card of a track and for a frame of the strip."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -20,15 +20,15 @@ from shapecat.types import UNKNOWN
 
 __all__ = ["Card", "asset", "card_html", "css_colour", "frame_html", "is_unsure", "template"]
 
-_LINES = 3  # categories in a time line
+_LINES = 3  # categories in a timeline
 _MOST_STEPS = 80
 _DIGITS = 9
-_ROOMY = 4  # boxes whose whole labels fit into a small frame
+_ROOMY = 4  # largest number of boxes whose full labels fit in a frame of the strip
 
 
 @dataclass(frozen=True)
 class Card:
-    """A track as the gallery shows it."""
+    """The content of a track's card; ``pictures`` is None if there are none."""
 
     row: TrackRow
     timeline: Timeline
@@ -37,22 +37,22 @@ class Card:
 
 @cache
 def asset(name: str) -> str:
-    """Return a file of the page."""
+    """Return the text of a file that is part of the page."""
     return (files("shapecat.outputs.report") / name).read_text("utf-8")
 
 
 def template(name: str) -> Template:
-    """Return a file of the page to fill in."""
+    """Return a file of the page as a template."""
     return Template(asset(name))
 
 
 def css_colour(category: str) -> str:
-    """Return the colour of a category as CSS writes it."""
+    """Return the colour of a category in CSS notation."""
     return "#" + "".join(f"{part:02x}" for part in colour_of(category))
 
 
 def is_unsure(row: TrackRow) -> bool:
-    """Return whether a track should be checked before others."""
+    """Return whether a track should be checked first: its category is unknown or uncertain."""
     return row.category == UNKNOWN or row.confidence < 0.8
 
 
@@ -61,9 +61,9 @@ def card_html(card: Card, categories: Sequence[str], names: Sequence[str], end: 
 
     Parameters
     ----------
-    categories : of the posterior.
-    names : of all categories, the unknown first: their places are their digits.
-    end : seconds from the first to the last frame of the run.
+    categories : in the order of the posterior.
+    names : all categories, starting with unknown: the index of each is its digit key.
+    end : time at the end of the last track, seconds since the first frame.
     """
     row, line = card.row, card.timeline
     return template("card.html").substitute(
@@ -82,7 +82,7 @@ def card_html(card: Card, categories: Sequence[str], names: Sequence[str], end: 
 
 
 def _guess(row: TrackRow) -> str:
-    """Return what an unknown object might be; nothing for the others."""
+    """Return the most likely category of an unknown object; empty for other objects."""
     guess = row.cells.get("guess", "")
     if row.category != UNKNOWN or not guess:
         return ""
@@ -126,7 +126,7 @@ def _facts(card: Card) -> list[str]:
 
 
 def _bars(line: Timeline, categories: Sequence[str], row: TrackRow, names: Sequence[str]) -> str:
-    """Return the posterior of all views, the likeliest category first; each bar is a button."""
+    """Return the posterior of all views as bars, the most likely first; each bar is a button."""
     last = line.causal[-1] if len(line.causal) else np.zeros(len(categories))
     shares = dict(zip(categories, last.tolist(), strict=False))
     order = sorted(shares, key=lambda name: -shares[name])
@@ -151,10 +151,10 @@ def _bar(name: str, share: float, digit: str) -> str:
 
 
 def _time_line(line: Timeline, categories: Sequence[str], end: float) -> str:
-    """Return the causal posterior over the time of the run, and below it when it was seen."""
+    """Return a plot of the causal posterior over time, with the times of detection below it."""
     chosen = _few(len(line.seconds))
     if len(chosen) == 1:
-        chosen = chosen.repeat(2)  # a line of one corner is not drawn
+        chosen = chosen.repeat(2)  # a line with one point is not drawn
     x = np.round(300 * line.seconds[chosen] / (end or 1), 1)
     best = np.argsort(-line.causal.max(axis=0, initial=0), kind="stable")[:_LINES]
     lines = []
@@ -176,12 +176,12 @@ def _time_line(line: Timeline, categories: Sequence[str], end: float) -> str:
 
 
 def _few(count: int) -> I4:
-    """Return at most `_MOST_STEPS` places of a row, the first and the last among them."""
+    """Return at most `_MOST_STEPS` of ``count`` indices, including the first and the last."""
     return np.unique(np.linspace(0, count - 1, min(count, _MOST_STEPS)).round().astype(int))
 
 
 def _spans(seconds: F8, seen: Bool, scale: float) -> list[tuple[float, float]]:
-    """Return from where to where the track was seen without a gap."""
+    """Return start and end of each interval in which the track was detected without a gap."""
     spans: list[tuple[float, float]] = []
     before = False
     for at, here in zip((seconds * scale).tolist(), seen.tolist(), strict=True):
@@ -198,8 +198,8 @@ def frame_html(frame: StripFrame, categories: Mapping[int, str], *, several: boo
 
     Parameters
     ----------
-    categories : by track.
-    several : the recording has several topics, so that the caption names one.
+    categories : the category of each track to show.
+    several : whether the run has several topics, so that the caption names the topic.
     """
     name = f"{frame.seconds:.1f} s" + (f" {frame.topic}" if several else "")
     boxes = "".join(

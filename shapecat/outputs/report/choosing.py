@@ -1,4 +1,4 @@
-"""Which frames the report reads again: the best few views of each track, and a strip of frames.
+"""Choose the frames that the report reads again: good views of each track, and a strip.
 
 Both are chosen from the tables alone, before the recording is opened.
 """
@@ -19,24 +19,30 @@ from shapecat.types import ImageMasks
 __all__ = ["Choice", "choose_frames"]
 
 _CANDIDATES = 4
-"""Views of a track that are looked at: the best of each quarter of them."""
+"""Views of a track that are read again: the best of each quarter of them."""
 _STRIP = 12
 _PARTIAL = 0.2
-"""Weight of a view that the border cuts off, or that something hides in part."""
+"""Weight of a view that is cut off by the image border or partly occluded."""
 _COLOURLESS = 0.05
-"""Weight of a view without colour, where others have it."""
+"""Weight of a view without a mask on a colour image."""
 
 
 @dataclass(frozen=True)
 class Choice:
-    """The tracks to be looked at in some frames, and the frames of the strip with their seconds."""
+    """The chosen frames.
+
+    Attributes
+    ----------
+    candidates : for each frame, the tracks of which it is a good view.
+    strip : the frames of the strip, with their time in seconds since the first frame.
+    """
 
     candidates: Mapping[Key, frozenset[int]]
     strip: Mapping[Key, float]
 
     @property
     def frames(self) -> frozenset[Key]:
-        """All frames that are needed."""
+        """All chosen frames."""
         return frozenset({*self.candidates, *self.strip})
 
 
@@ -47,7 +53,7 @@ class _View(NamedTuple):
 
 
 def choose_frames(folder: Path, timelines: Mapping[int, Timeline]) -> Choice:
-    """Choose the frames that show the tracks of a run best, and some that show all of the run."""
+    """Choose good views of each track, and frames that give an overview of the run."""
     owner = {key: track for track, line in timelines.items() for key in line.keys if key[2] >= 0}
     candidates: dict[Key, set[int]] = {}
     for track, views in _views(folder, owner).items():
@@ -61,7 +67,7 @@ def choose_frames(folder: Path, timelines: Mapping[int, Timeline]) -> Choice:
 
 
 def _views(folder: Path, owner: Mapping[Detected, int]) -> dict[int, list[_View]]:
-    """Return the views of each track in the order of time, by size and wholeness."""
+    """Return the views of each track in table order, rated by size and completeness."""
     columns = ["topic", "frame", "detection", "points", "touches_border", "occluded"]
     masks = _areas(read_masks(folder))
     views: dict[int, list[_View]] = {}
@@ -80,7 +86,7 @@ def _views(folder: Path, owner: Mapping[Detected, int]) -> dict[int, list[_View]
 
 
 def _areas(masks: Iterator[tuple[Key, ImageMasks]]) -> dict[Detected, tuple[float, bool]]:
-    """Return the pixels of each mask, and whether the border of the image cuts it."""
+    """Return the area of each mask in pixels, and whether it touches the image border."""
     found = {}
     for key, frame in masks:
         for number, (left, top, width, height) in frame.boxes.items():
@@ -91,14 +97,14 @@ def _areas(masks: Iterator[tuple[Key, ImageMasks]]) -> dict[Detected, tuple[floa
 
 
 def _best_of_parts(views: Sequence[_View]) -> list[_View]:
-    """Return the best view of each of a few parts of the time of a track."""
+    """Return the best view in each of `_CANDIDATES` parts of a track."""
     ends = np.linspace(0, len(views), min(_CANDIDATES, len(views)) + 1).astype(int)
     parts = [views[a:b] for a, b in pairwise(ends)]
     return [max(part, key=lambda view: (view.worth, -view.place)) for part in parts]
 
 
 def _stamps(folder: Path) -> list[tuple[int, Key]]:
-    """Return the stamp of each frame, by time."""
+    """Return stamp (ns) and key of each frame, sorted by time."""
     columns = ["stamp_ns", "topic", "frame"]
     rows = [
         (stamp, (topic, frame))
@@ -109,7 +115,11 @@ def _stamps(folder: Path) -> list[tuple[int, Key]]:
 
 
 def _strip(stamps: Sequence[tuple[int, Key]], shown: Mapping[Key, set[int]]) -> dict[Key, float]:
-    """Return one frame of each part of a run, those before others that show what none has shown."""
+    """Return one frame of each part of a run, with its seconds since the first frame.
+
+    In each part it is the frame with the most tracks that no earlier one shows, then the one with
+    the most tracks, then the one nearest to the middle.
+    """
     covered: set[tuple[str, int]] = set()
     strip = {}
     for part in np.array_split(np.arange(len(stamps)), min(_STRIP, len(stamps)) or 1):

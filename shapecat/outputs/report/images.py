@@ -1,4 +1,4 @@
-"""What a frame looks like: its colour image, or its depth shaded as a relief; and crops of it."""
+"""Pictures of frames, from the colour image or the shaded depth image, and crops of objects."""
 
 import base64
 import io
@@ -27,24 +27,24 @@ CROP_PX = 256
 _FRAME_PX = 960
 """Longest side of the picture of a frame."""
 _MARGIN = 1.5
-"""Side of a crop over the longer side of the object."""
+"""Side of a crop, relative to the longer side of the object's box."""
 _LEAST_PX = 24
 _GOOD_PX = 160
-"""An object of so many pixels across is shown as well as a larger one."""
+"""Square root of the mask area above which a larger object scores no higher."""
 _GOOD_DETAIL = 12.0
-"""Grey levels of the Laplacian of a picture that is sharp."""
+"""Standard deviation of the Laplacian at which sharpness is 0.5, grey levels."""
 _NEARER = 0.015
-"""What is so much nearer, metres and share of the distance, hides what is behind it."""
+"""A pixel occludes its neighbour if it is nearer by this many metres plus this share."""
 _CROWDED = 0.08
-"""Share of points behind others from which a cloud is taken for fused from several views."""
+"""With a larger share of occluded points, a cloud is taken to be fused from several views."""
 _FAR_M = 6.0
 _SAME_SURFACE = 0.02
-"""Neighbours whose depths differ by less than this share are of one surface."""
+"""Neighbours whose inverse depths differ by less than this share are on the same surface."""
 _NEAR_TONE, _FAR_TONE = np.array([255, 238, 205]), np.array([92, 112, 168])
 _BLANK = 24
-"""Grey where there is no reading."""
+"""Grey level of pixels without a reading."""
 _LIGHT = np.array([-0.45, -0.65, -0.62])
-"""Towards the light, in the optical frame: from above and left."""
+"""Direction to the light in the optical frame: above, left and towards the camera."""
 
 
 Window = tuple[int, int, int, int]
@@ -52,14 +52,14 @@ Window = tuple[int, int, int, int]
 
 
 class SeenFrame(Record):
-    """A frame as it can be pictured.
+    """A frame with what its pictures need.
 
     Attributes
     ----------
-    masks : the pixels of each object of the frame, in their order.
-    hidden : (n,) share of the outline of each object along which something nearer hides it.
-    depth : the depth image, of a cloud as well.
-    colour : (h, w, 3) red, green, blue; None where depth is shown.
+    masks : the mask of each object of the frame, in order.
+    hidden : (n,) share of each object's outline along which something nearer occludes it.
+    depth : the frame as a depth image, for a cloud from a virtual camera.
+    colour : (h, w, 3) red, green, blue; None if the depth image is shown.
     """
 
     masks: tuple[Mask, ...]
@@ -76,7 +76,7 @@ class SeenFrame(Record):
         return height, width
 
     def pixels(self, window: Window | None = None) -> U1:
-        """Return (h, w, 3) red, green, blue of a part of the picture; all by default."""
+        """Return a part of the picture, (h, w, 3) red, green, blue; by default all of it."""
         left, top, right, bottom = window or (0, 0, *self.shape[::-1])
         if self.colour is not None:
             return np.ascontiguousarray(self.colour[top:bottom, left:right])
@@ -84,7 +84,7 @@ class SeenFrame(Record):
 
 
 class Crop(NamedTuple):
-    """A picture of an object as a data URI, its size, and its outline in it as SVG path data."""
+    """A picture of an object as a data URI, its size in pixels, and its outline as SVG path."""
 
     image: str
     width: int
@@ -93,7 +93,7 @@ class Crop(NamedTuple):
 
 
 def look(labelled: LabelledFrame, frame: Frame, coloured: Coloured | None) -> SeenFrame | None:
-    """Return a frame as a picture; None where no camera can see a cloud."""
+    """Return a frame prepared for pictures; None for a cloud that no virtual camera can show."""
     found = _organized(labelled, frame)
     if found is None:
         return None
@@ -103,12 +103,12 @@ def look(labelled: LabelledFrame, frame: Frame, coloured: Coloured | None) -> Se
         try:
             return SeenFrame(coloured.masks, hidden, depth, pixels_of(coloured.view.image))
         except MessageError:
-            pass  # a damaged image: depth is shown instead
+            pass  # damaged image: show depth instead
     return SeenFrame(dense_masks(depth, objects), hidden, depth)
 
 
 def _organized(labelled: LabelledFrame, frame: Frame) -> tuple[Frame, list[U4]] | None:
-    """Return a frame as a depth image, and the pixels of its objects there."""
+    """Return a frame as a depth image, and its objects as flat pixel indices; or None."""
     indices = [item.indices for item in labelled.objects]
     if frame.depth is not None:
         return frame, indices
@@ -132,7 +132,7 @@ def _organized(labelled: LabelledFrame, frame: Frame) -> tuple[Frame, list[U4]] 
 
 
 def _upright(points: F4, up: F4 | None) -> F8:
-    """Return the (3, 3) rotation to a level optical frame that looks at a cloud."""
+    """Return the rotation (3, 3) from the sensor to a level optical frame that faces a cloud."""
     level = gravity_rotation((0.0, -1.0, 0.0) if up is None else up)
     x, y, _ = np.nan_to_num(np.nanmean(points @ level.T, axis=0)) if len(points) else (1.0, 0, 0)
     far = np.hypot(x, y)
@@ -141,7 +141,7 @@ def _upright(points: F4, up: F4 | None) -> F8:
 
 
 def _hidden_share(depth: F4 | None, pixels: U4) -> float:
-    """Return the share of an object's outline beyond which something is nearer than the object."""
+    """Return the share of an object's outline along which something outside it is nearer."""
     if depth is None or not pixels.size:
         return 0.0
     v, u = np.divmod(np.asarray(pixels, np.int64), depth.shape[1])
@@ -160,9 +160,9 @@ def _hidden_share(depth: F4 | None, pixels: U4) -> float:
 
 
 def _shaded(frame: Frame, window: Window) -> U1:
-    """Return (h, w, 3) a part of a depth image as a relief, lit from above and left.
+    """Return a part of a depth image as a shaded relief (h, w, 3), lit from above left.
 
-    A plane is linear in inverse depth: its normal is what the slopes say, in any perspective.
+    A plane is linear in inverse depth, so normals follow from the slopes of inverse depth.
     """
     left, top, right, bottom = window
     depth, camera = np.asarray(frame.depth)[top:bottom, left:right], frame.camera
@@ -183,7 +183,7 @@ def _shaded(frame: Frame, window: Window) -> U1:
 
 
 def _smooth(inverse: F8, passes: int = 6) -> F8:
-    """Average inverse depths with their neighbours on the same surface."""
+    """Average inverse depths (h, w) with their neighbours on the same surface."""
     for _ in range(passes):
         total, weight = inverse.copy(), np.ones_like(inverse)
         for axis in (0, 1):
@@ -197,7 +197,7 @@ def _smooth(inverse: F8, passes: int = 6) -> F8:
 
 
 def _slope(inverse: F8, axis: int) -> F8:
-    """Return the slope along an axis: the flatter side of a pixel, so that edges stay sharp."""
+    """Return the slope along an axis: the smaller one-sided difference, so edges stay sharp."""
     step = np.diff(inverse, axis=axis)
     ends = [(1, 0) if k == axis else (0, 0) for k in (0, 1)]
     before = np.pad(step, ends, mode="edge")
@@ -206,7 +206,7 @@ def _slope(inverse: F8, axis: int) -> F8:
 
 
 def encode(pixels: U1, *, quality: int = 72) -> tuple[str, int, int]:
-    """Return a picture as a data URI, no larger than the page shows it, and its width and height.
+    """Return a picture as a data URI, shrunk to `_FRAME_PX` if larger, and its width and height.
 
     ``pixels`` is (h, w, 3) or, with opacity, (h, w, 4).
     """
@@ -219,7 +219,7 @@ def encode(pixels: U1, *, quality: int = 72) -> tuple[str, int, int]:
 
 
 def _window(seen: SeenFrame, mask: Mask) -> Window:
-    """Return left, top, right and bottom of a square around an object, as far as the image goes."""
+    """Return left, top, right and bottom of a square around an object, within the image."""
     height, width = seen.shape
     x, y, w, h = mask.box
     side = round(max(_MARGIN * max(w, h), _LEAST_PX))
@@ -236,11 +236,15 @@ def _cut(seen: SeenFrame, window: Window) -> Image.Image:
 
 
 def worth_of(seen: SeenFrame, number: int) -> float:
-    """Return how well a frame shows its object of a number, from 0 to 1.
+    """Return how well a frame shows one of its objects, from 0 to 1.
 
-    The product of four measures: the size in pixels, up to a size that fills the picture; the share
-    of the outline that is not the border of the image; the share that nothing hides; and the
-    sharpness, the Laplacian of what is shown.
+    The score is the product of: the size, the square root of the mask area, saturating at 160
+    pixels; the squared share of the outline off the image border; the squared share of the outline
+    that is not occluded; and the sharpness, below 1, or 0.5 without a colour image.
+
+    Parameters
+    ----------
+    number : index of the object in the frame, from 0.
     """
     mask = seen.masks[number]
     if not mask.pixels.size:
@@ -271,7 +275,7 @@ def _border_share(mask: Mask, height: int, width: int) -> float:
 
 
 def _detail(seen: SeenFrame, mask: Mask) -> float:
-    """Return the deviation of the Laplacian on an object, in grey levels, at the size shown."""
+    """Return the standard deviation of the Laplacian on an object's crop, grey levels."""
     window = _window(seen, mask)
     grey = np.asarray(_cut(seen, window).convert("L"), np.float32)
     inside = _inside(mask.full(*seen.shape), window, grey.shape)
@@ -279,7 +283,7 @@ def _detail(seen: SeenFrame, mask: Mask) -> float:
 
 
 def _inside(mask: Bool, window: Window, shape: Sequence[int]) -> Bool:
-    """Return a mask in a crop, without its outline, whose contrast is that of the background."""
+    """Return a mask in a crop, eroded, since the contrast at its outline is not the object's."""
     left, top, right, bottom = window
     whole = Image.fromarray(mask[top:bottom, left:right])
     small = whole.resize((shape[1], shape[0]), Image.Resampling.NEAREST)
@@ -287,7 +291,7 @@ def _inside(mask: Bool, window: Window, shape: Sequence[int]) -> Bool:
 
 
 def crop_of(seen: SeenFrame, number: int) -> Crop:
-    """Return the picture of an object in a frame."""
+    """Return the picture of an object in a frame; ``number`` is its index, from 0."""
     mask = seen.masks[number]
     window = _window(seen, mask)
     uri, width, height = encode(np.asarray(_cut(seen, window)), quality=82)

@@ -1,4 +1,4 @@
-"""The report of a run as one HTML page that works from a file; and the index over many."""
+"""The report of a run as one HTML page that works as a file, and the index of several runs."""
 
 import hashlib
 import json
@@ -35,7 +35,11 @@ _SCRIPTS = ("labels.js", "saving.js", "cards.js", "frames.js", "keys.js")
 
 @dataclass(frozen=True)
 class Listed:
-    """A run as the index lists it; ``link`` to its report, ``faces`` some of its pictures."""
+    """A run in the index.
+
+    ``categories`` counts tracks; ``unsure`` and ``checked`` are numbers of tracks; ``faces`` are
+    some pictures as data URIs.
+    """
 
     link: str
     name: str
@@ -62,11 +66,11 @@ def run_page(
     Parameters
     ----------
     cards : the tracks, in the order of ``table``.
-    frames : the strip.
-    stages : seconds (frames,) by stage.
-    notes : warnings beside those of the run.
-    index : link to the index over many runs.
-    served : corrections go to a server, not to a table to download.
+    frames : the frames of the strip.
+    stages : (frames,) seconds of each stage.
+    notes : warnings in addition to those of the run.
+    index : link to the index of several runs; None if there is none.
+    served : whether corrections are sent to a server, instead of to a table to download.
     """
     run = finished.run
     counts = Counter(card.row.category for card in cards)
@@ -94,7 +98,7 @@ def run_page(
 
 
 def index_page(title: str, runs: Sequence[Listed]) -> str:
-    """Return the page that lists many runs."""
+    """Return the page that lists several runs."""
     total = sum((item.categories for item in runs), Counter[str]())
     tiles = {
         "recordings": len(runs),
@@ -113,7 +117,7 @@ def index_page(title: str, runs: Sequence[Listed]) -> str:
 
 
 def _head(title: str, scripts: str = "") -> str:
-    """Return the head of a page; ``scripts`` is what its policy allows them."""
+    """Return the head of a page; ``scripts`` is the part of its security policy for scripts."""
     filled = template("head.html").substitute(
         title=escape(title), style=asset("report.css"), scripts=scripts
     )
@@ -152,7 +156,7 @@ def _warnings(texts: Sequence[str]) -> str:
 
 
 def _strip(frames: Sequence[StripFrame], cards: Sequence[Card]) -> str:
-    """Return the strip of frames; nothing where there are none."""
+    """Return the strip of frames; empty if there are none."""
     if not frames:
         return ""
     categories = {card.row.track: card.row.category for card in cards}
@@ -170,7 +174,7 @@ def _chip(name: str, count: int) -> str:
 
 
 def _next_step(finished: FinishedRun, *, served: bool) -> str:
-    """Return how corrections get into the other outputs."""
+    """Return the instructions to apply corrections to the other outputs."""
     folder = shlex.quote(str(finished.folder))
     if served:
         text, command = "Corrections are in tracks.csv already.", f"shapecat annotate {folder}"
@@ -219,7 +223,7 @@ def _facts(run: Mapping[str, Any]) -> str:
 
 
 def _data(names: Sequence[str], table: TrackTable, *, served: bool) -> str:
-    """Return what the script needs; nothing in it can end the script element."""
+    """Return the data for the script as JSON, escaped so that it cannot end the script element."""
     rows = [
         {
             "track": str(row.track),

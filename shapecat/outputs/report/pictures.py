@@ -1,4 +1,4 @@
-"""The pictures of a report: of each track its best view, and a strip of frames with boxes."""
+"""The pictures of a report: the best view of each track, and a strip of frames with boxes."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,11 +24,14 @@ from shapecat.types import Frame, LabelledFrame, LabelledObject, NeuralGas
 __all__ = ["Pictures", "StripFrame", "TrackPictures", "take_pictures"]
 
 _UPRIGHT = np.array([0.0, -1.0, 0.0], np.float32)
-"""Up in an upright optical frame, where nothing else is known."""
+"""Up direction of a camera that is held upright, used if the up direction is unknown."""
 
 
 class TrackPictures(NamedTuple):
-    """The best view of a track: its crop, its surface, and the size of its box in metres."""
+    """The best view of a track: crop, drawings of the surface, and box size in metres.
+
+    ``crop`` is None if the recording or the object cannot be shown.
+    """
 
     crop: Crop | None
     surfaces: tuple[SurfaceDrawing, ...]
@@ -36,7 +39,10 @@ class TrackPictures(NamedTuple):
 
 
 class StripFrame(NamedTuple):
-    """A frame as a data URI; ``boxes`` are left, top, width and height by track, pixels."""
+    """A frame as a data URI, its size, and its time in seconds since the first frame.
+
+    ``boxes`` are left, top, width and height of each track, in pixels of the picture.
+    """
 
     image: str
     width: int
@@ -48,7 +54,10 @@ class StripFrame(NamedTuple):
 
 @dataclass(frozen=True)
 class Pictures:
-    """All pictures of a run, and why there are only surfaces from graphs, if so."""
+    """All pictures of a run.
+
+    ``reason`` says why surfaces are drawn from their meshes alone; it is empty if they are not.
+    """
 
     tracks: Mapping[int, TrackPictures]
     frames: Sequence[StripFrame]
@@ -66,14 +75,14 @@ class _Best(NamedTuple):
 
 @dataclass
 class _Taken:
-    """What was taken so far."""
+    """The pictures so far: the best view of each track, and the strip."""
 
     choice: Choice
     best: dict[int, _Best] = field(default_factory=dict)
     frames: list[StripFrame] = field(default_factory=list)
 
     def add(self, labelled: LabelledFrame, frame: Frame | None, coloured: Coloured | None) -> None:
-        """Take a chosen frame; without what the sensor has read, only its meshes."""
+        """Add a chosen frame; if ``frame`` is None, only the meshes are used."""
         key = (labelled.topic, labelled.index)
         if frame is not None:
             _require_unchanged(labelled, frame)
@@ -92,7 +101,7 @@ class _Taken:
             self.frames.append(_strip_frame(labelled, seen, self.choice.strip[key]))
 
     def pictures(self, reason: str = "") -> Pictures:
-        """Draw the surfaces."""
+        """Draw the surfaces and return all pictures."""
         tracks = {}
         for track, (_, crop, shot, item) in self.best.items():
             x, y, z = (float(side) for side in item.box.size)
@@ -101,9 +110,9 @@ class _Taken:
 
 
 def take_pictures(finished: FinishedRun, rows: Sequence[TrackRow], choice: Choice) -> Pictures:
-    """Read the chosen frames again and picture them.
+    """Read the chosen frames again and make the pictures.
 
-    Where the recording is gone, a track has its surface alone, drawn from its graph.
+    If the recording cannot be read, a track has only drawings of its mesh.
     """
     taken = _Taken(choice)
     try:
@@ -122,7 +131,7 @@ def take_pictures(finished: FinishedRun, rows: Sequence[TrackRow], choice: Choic
 def _frames(
     finished: FinishedRun, rows: Sequence[TrackRow], choice: Choice
 ) -> Iterator[LabelledFrame]:
-    """Yield the chosen frames, each track as it was found, before any correction."""
+    """Yield the chosen frames; tracks have their original labels, before any correction."""
     labels = {row.track: TrackLabel(row.track, row.category, row.confidence) for row in rows}
     left = set(choice.frames)
     for labelled in read_labelled_frames(finished.folder, labels):
@@ -145,7 +154,7 @@ def _strip_frame(labelled: LabelledFrame, seen: SeenFrame, seconds: float) -> St
 
 
 def _snapshot(labelled: LabelledFrame, frame: Frame | None, item: LabelledObject) -> Snapshot:
-    """Return an object as it stands: z up, the support at z = 0."""
+    """Return the points and mesh of an object in the level frame, its support at z = 0."""
     points = _points(frame, item)
     up = _UPRIGHT if labelled.up is None else labelled.up
     neurons, middle = item.gas.neurons, np.asarray([item.box.center])
@@ -156,7 +165,7 @@ def _snapshot(labelled: LabelledFrame, frame: Frame | None, item: LabelledObject
 
 
 def _points(frame: Frame | None, item: LabelledObject) -> F4:
-    """Return some points (n, 3) of an object, metres, sensor frame."""
+    """Return at most about `MOST_POINTS` points (n, 3) of an object, metres, sensor frame."""
     if frame is None:
         return np.zeros((0, 3), np.float32)
     points = frame.xyz(item.indices[:: 1 + item.indices.size // MOST_POINTS])
@@ -164,7 +173,12 @@ def _points(frame: Frame | None, item: LabelledObject) -> F4:
 
 
 def _require_unchanged(labelled: LabelledFrame, frame: Frame) -> None:
-    """Raise RecordingError if a frame has fewer readings than objects were found in."""
+    """Check that the pixels or points of all objects exist in a frame.
+
+    Raises
+    ------
+    RecordingError : the frame is smaller than when it was processed.
+    """
     readings = frame.depth.size if frame.depth is not None else len(frame.xyz())
     if any(item.indices.size and item.indices.max() >= readings for item in labelled.objects):
         msg = f"frame {frame.index} of {frame.topic} has changed since it was processed"

@@ -1,8 +1,8 @@
-"""Reports served to this machine alone; corrections go to tracks.csv as they are made.
+"""Serve reports to this machine only; corrections are written to tracks.csv as they are made.
 
-Every request needs the token in its path, a Host that names this machine, and, where a browser
-tells it, an Origin that is this server: a page of a stranger can neither guess the first nor,
-with a name of its own that leads here, have the second.
+Every request needs the secret token in its path and a Host header that names this machine; an
+Origin header, if present, must be this server. A page from elsewhere cannot guess the token, and a
+foreign domain name that resolves to this machine (DNS rebinding) fails the check of the Host.
 """
 
 import json
@@ -29,7 +29,7 @@ __all__ = ["serve_reports"]
 _HOST = "127.0.0.1"
 _NAMES = frozenset({_HOST, "localhost"})
 _LABELS = "labels"
-"""The address, beside a page, of the labels of its run."""
+"""Name of the resource beside a page that holds the labels of its run."""
 _LARGEST_BODY = 1 << 16
 _PATIENCE_S = 30
 _HEADERS = {
@@ -50,7 +50,7 @@ class _Answer(NamedTuple):
 
     @property
     def kind(self) -> str:
-        """The media type."""
+        """The media type of the content."""
         if not isinstance(self.content, str):
             return "application/json"
         return "text/html" if self.status is HTTPStatus.OK else "text/plain"
@@ -58,18 +58,18 @@ class _Answer(NamedTuple):
 
 @dataclass(frozen=True)
 class _Site:
-    """What is served: pages by address, and the labels beside each report."""
+    """The served content: pages by address, and the labels beside each report."""
 
     reports: Reports
     token: str = field(default_factory=lambda: secrets.token_urlsafe(24))
 
     @property
     def start(self) -> str:
-        """The address to begin with."""
+        """The address of the start page."""
         return INDEX if self.reports.indexed else self.reports.link(self.reports.runs[0])
 
     def get(self, address: str) -> _Answer:
-        """Return a page, or the labels of a run, as they are on disk."""
+        """Return a page, or the labels of a run, with the current content of tracks.csv."""
         if self.reports.indexed and address == INDEX:
             return _Answer(HTTPStatus.OK, self.reports.index())
         report, name = self._find(address)
@@ -80,7 +80,7 @@ class _Site:
         return _Answer(HTTPStatus.NOT_FOUND, "no such page")
 
     def post(self, address: str, body: bytes) -> _Answer:
-        """Write a label to disk; return those that are there then, and why it was not written."""
+        """Write a label to tracks.csv; return all labels, and the problem if it was rejected."""
         report, name = self._find(address)
         if report is None or name != _LABELS:
             return _Answer(HTTPStatus.NOT_FOUND, "no such page")
@@ -106,7 +106,7 @@ def _labels(folder: Path) -> dict[int, str]:
 
 
 def _correction(body: bytes) -> tuple[int, str, str] | None:
-    """Return track, label and the label seen before, if a body holds these and nothing strange."""
+    """Return track, label and the label seen before; None if the body is malformed."""
     try:
         found = json.loads(body)
         track, label, seen = found["track"], found["label"], found["seen"]
@@ -117,14 +117,14 @@ def _correction(body: bytes) -> tuple[int, str, str] | None:
 
 
 class _Server(ThreadingTCPServer):
-    """Unlike `http.server.HTTPServer` it asks no name server who it is."""
+    """A server that, unlike `http.server.HTTPServer`, does not look up its own name."""
 
     allow_reuse_address = True
     daemon_threads = True
     site: _Site
 
     def handle_error(self, request: Any, client_address: Any) -> None:  # noqa: ARG002  given
-        """Log what has failed, such as an answer that a browser does not wait for."""
+        """Log a failed request, for example if the browser closed the connection."""
         _log.warning("a request failed", exc_info=True)
 
 
@@ -135,11 +135,11 @@ class _Handler(BaseHTTPRequestHandler):
     sys_version = ""
 
     def do_GET(self) -> None:
-        """Answer with a page."""
+        """Send a page or labels."""
         self._serve(b"")
 
     def do_POST(self) -> None:
-        """Take a correction."""
+        """Accept a correction."""
         length = self.headers.get("Content-Length", "")
         if not length.isdecimal() or int(length) > _LARGEST_BODY:
             self._send(_Answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too long"))
@@ -161,7 +161,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._send(_Answer(HTTPStatus.INTERNAL_SERVER_ERROR, str(error)))
 
     def _from_here(self) -> bool:
-        """Return whether a request names this machine, and comes from a page of this server."""
+        """Return whether a request names this machine and does not come from a foreign page."""
         host, origin = self.headers.get("Host", ""), self.headers.get("Origin")
         return host.rpartition(":")[0] in _NAMES and origin in {None, f"http://{host}"}
 
@@ -183,15 +183,19 @@ class _Handler(BaseHTTPRequestHandler):
 
 @contextmanager
 def serve_reports(reports: Reports, *, port: int = 0) -> Iterator[str]:
-    """Serve reports on the loopback address in the block; give the address to open.
+    """Serve reports on the loopback address during the block.
 
     Parameters
     ----------
-    port : 0 for one that is free.
+    port : 0 to choose a free port.
+
+    Yields
+    ------
+    The URL of the start page, with the token.
 
     Raises
     ------
-    ConfigError : the port is taken, or not allowed.
+    ConfigError : the port is in use or not permitted.
     """
     try:
         server = _Server((_HOST, port), _Handler)

@@ -1,4 +1,4 @@
-"""The surface of an object: shaded points from three sides, and the mesh over them."""
+"""Draw the surface of an object from three sides: shaded points, and the mesh over them."""
 
 import base64
 from typing import NamedTuple
@@ -21,9 +21,9 @@ _LIGHT = np.array([-0.4, 0.65, 0.65]) / np.linalg.norm([-0.4, 0.65, 0.65])
 
 
 class Snapshot(Record):
-    """An object at rest, seen once: z up, the support at z = 0.
+    """One view of an object in the level frame: z up, the support at z = 0, metres.
 
-    ``points`` (n, 3), the neurons of ``gas``, and ``eye`` (3,), the place of the sensor, in metres.
+    ``points`` is (n, 3); ``eye`` (3,) is the position of the sensor.
     """
 
     points: F4 = array("n 3", "f4")
@@ -32,7 +32,7 @@ class Snapshot(Record):
 
 
 class SurfaceDrawing(NamedTuple):
-    """A picture as a data URI, and the graph over it as SVG path data in the same pixels."""
+    """A picture as a data URI, and the mesh over it as SVG path data in the same pixels."""
 
     title: str
     image: str
@@ -41,9 +41,9 @@ class SurfaceDrawing(NamedTuple):
 
 
 def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[SurfaceDrawing, ...]:
-    """Draw an object as the sensor sees it, from beside, and from above.
+    """Draw an object as the sensor sees it, from the side, and from above.
 
-    All three have one scale: that of the sphere around the points and neurons.
+    All three drawings have the same scale, from the sphere around the points and neurons.
     """
     points = np.asarray(shot.points[:: 1 + len(shot.points) // MOST_POINTS], np.float64)
     points = points if len(points) else np.asarray(graph_points(shot.gas), np.float64)
@@ -81,7 +81,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[SurfaceDrawing, 
 
 
 def graph_points(gas: NeuralGas) -> F4:
-    """Return points (n, 3), metres, over the triangles and edges of a graph whose cloud is gone."""
+    """Return points (n, 3), metres, on the triangles and edges of a mesh, to replace its cloud."""
     corners = gas.neurons[triangles_of(gas.edges, len(gas.neurons))]
     weights = np.array([[a, b, 8 - a - b] for a in range(9) for b in range(9 - a)]) / 8
     faces = np.einsum("kc,tcd->tkd", weights, corners).reshape(-1, 3)
@@ -92,21 +92,25 @@ def graph_points(gas: NeuralGas) -> F4:
 
 
 def _view(azimuth: float, elevation: float) -> F8:
-    """Return the (3, 3) right, up and towards the viewer, of a viewer in a direction."""
+    """Return the axes of a view as rows (3, 3): right, up, and towards the viewer.
+
+    ``azimuth`` and ``elevation`` are the direction of the viewer, radians.
+    """
     c, s, ce, se = np.cos(azimuth), np.sin(azimuth), np.cos(elevation), np.sin(elevation)
     return np.array([[-s, c, 0], [-c * se, -s * se, ce], [c * ce, s * ce, se]])
 
 
 def _project(points: F8, view: F8, scale: float) -> F8:
-    """Return (n, 3) column, row and nearness in pixels."""
+    """Return column, row and nearness to the viewer (n, 3), pixels."""
     right, up, near = (np.asarray(points, np.float64) @ view.T * scale).T
     return np.stack([SIDE / 2 + right, SIDE / 2 - up, near], axis=1)
 
 
 def _shade(spots: F8) -> U1:
-    """Return (h, w) shades, 1 to `_SHADES`, of points drawn as discs that hide each other; 0 bare.
+    """Return an image (h, w) of shades from 1 to `_SHADES`, 0 where there is no point.
 
-    The surface is lit from above and left by the slopes of its smoothed nearness.
+    Points are drawn as discs, the nearest in front. The surface is lit from above left, with
+    normals from the slopes of its smoothed nearness.
     """
     near = _closed(_nearest(spots))
     bare = ~np.isfinite(near)
@@ -121,7 +125,7 @@ def _shade(spots: F8) -> U1:
 
 
 def _nearest(spots: F8) -> F8:
-    """Return (h, w) the nearness of the nearest disc at each pixel, -inf where there is none."""
+    """Return the nearness (h, w) of the nearest disc at each pixel, -inf without a disc."""
     near = np.full((SIDE, SIDE), -np.inf)
     area = float(np.prod(np.ptp(spots[:, :2], axis=0) + 1))
     radius = float(np.clip(0.9 * np.sqrt(area / len(spots)), 1.0, 4.5))
@@ -138,7 +142,7 @@ def _nearest(spots: F8) -> F8:
 
 
 def _closed(near: F8, passes: int = 3) -> F8:
-    """Fill bare pixels that are mostly surrounded by the object."""
+    """Fill empty pixels that are mostly surrounded by the object."""
     for _ in range(passes):
         solid = np.isfinite(near)
         share = _blurred(solid.astype(np.float64))
@@ -148,7 +152,7 @@ def _closed(near: F8, passes: int = 3) -> F8:
 
 
 def _smoothed(near: F8, bare: U1, passes: int = 3) -> F8:
-    """Average each pixel with its neighbours on the object; bare pixels take theirs."""
+    """Average each pixel with its neighbours on the object; empty pixels get their average."""
     weight, value = (~bare).astype(np.float64), np.where(bare, 0.0, near)
     for _ in range(passes):
         value, weight = _blurred(value * weight), _blurred(weight)
@@ -164,7 +168,7 @@ def _blurred(image: F8) -> F8:
 
 
 def _palette(colour: tuple[int, int, int]) -> tuple[U1, U2]:
-    """Return the shades of a colour, from dark to light, behind one transparent entry."""
+    """Return a palette, a transparent entry then shades from dark to light, and its opacity."""
     light = np.linspace(0, 1, _SHADES)[:, None]
     base = np.array(colour, np.float64)
     dark, bright = 0.32 * base, base + 0.45 * (255 - base)

@@ -1,4 +1,4 @@
-"""The timeline of each track: when it was seen, and its posterior so far."""
+"""The timeline of each track: when it was detected, and its posterior so far."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,15 +14,18 @@ from shapecat.runs.tables import read_row_groups
 __all__ = ["Detected", "Timeline", "read_stage_seconds", "read_timelines"]
 
 Detected = tuple[str, int, int]
-"""Topic, frame, detection."""
+"""Topic, frame number, and detection number; the last is -1 while the track coasts."""
 
 
 class Timeline(Record):
     """A track over time.
 
-    ``seconds`` (k,) from the first frame of the run; ``seen`` (k,) where it was detected;
-    ``causal`` (k, c) the posterior of the views so far; ``keys`` topic, frame and detection of
-    each row, -1 where it coasts.
+    Attributes
+    ----------
+    seconds : (k,) time of each row since the first frame of the run.
+    seen : (k,) whether the track was detected.
+    causal : (k, c) posterior fused from the views so far.
+    keys : the detection of each row.
     """
 
     seconds: F8 = array("k", "f8")
@@ -57,7 +60,7 @@ def _first_stamps(folder: Path) -> Iterator[int]:
 
 
 def read_stage_seconds(folder: Path) -> dict[str, F8]:
-    """Return the seconds (frames,) each stage took, from the table of frames in a run's folder."""
+    """Return the duration of each stage in the frames of a run, (frames,) seconds."""
     found: dict[str, list[float]] = {}
     for group in read_row_groups(folder / "frames.parquet", ["stages", "seconds"]):
         for row in group.to_pylist():

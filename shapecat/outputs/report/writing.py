@@ -1,4 +1,4 @@
-"""``report.html`` of each run, and ``index.html`` over many."""
+"""Write ``report.html`` of each run, and ``index.html`` of several."""
 
 import os
 from collections import Counter
@@ -27,14 +27,15 @@ _FACES = 6
 
 
 def _ignore(_phase: str, _done: int, _total: int | None) -> None:
-    """Observe nothing."""
+    """Ignore the progress."""
 
 
 @dataclass(frozen=True)
 class RunReport:
-    """What a page tells of a run, but for the labels: those are read when it is written.
+    """The content of a run's page, except the labels, which are read when the page is made.
 
-    ``index`` links to the page over many runs.
+    ``stages`` has the seconds (frames,) of each stage; ``index`` is the link to the index of
+    several runs, None if there is none.
     """
 
     folder: Path
@@ -44,15 +45,15 @@ class RunReport:
     index: str | None = None
 
     def page(self, *, served: bool = False) -> str:
-        """Return the page with the labels on disk.
+        """Return the page with the current labels in tracks.csv.
 
         Parameters
         ----------
-        served : its corrections go to a server, not to a table to download.
+        served : whether corrections are sent to a server, instead of to a table to download.
 
         Raises
         ------
-        OutputError : the tracks.csv of the run cannot be understood.
+        OutputError : the tracks.csv of the run is invalid.
         """
         table, reason = self._table, self.pictures.reason
         notes = [f"surfaces are drawn from their meshes, without points: {reason}"]
@@ -68,7 +69,7 @@ class RunReport:
         )
 
     def listed(self, link: str) -> Listed:
-        """Return how an index lists the run."""
+        """Return the entry of the run in an index; ``link`` is the address of its page."""
         finished, cards = read_finished(self.folder), self._cards(self._table)
         return Listed(
             link=link,
@@ -94,31 +95,31 @@ class RunReport:
 
 @dataclass(frozen=True)
 class Reports:
-    """The reports of some runs, and whether an index lists them in the folder above all."""
+    """The reports of runs; ``indexed`` is whether there is an index in their common folder."""
 
     runs: Sequence[RunReport]
     indexed: bool = False
 
     @cached_property
     def above(self) -> Path:
-        """The folder that holds all of the runs."""
+        """The deepest folder that contains all runs."""
         return _above([report.folder for report in self.runs])
 
     def link(self, report: RunReport) -> str:
-        """Return the address of a page, relative to the folder above all."""
+        """Return the address of a page, relative to the common folder."""
         return _link(self.above, report.folder / PAGE)
 
     def index(self) -> str:
-        """Return the page that lists the runs, with the labels on disk."""
+        """Return the page that lists the runs, with their current labels."""
         listed = [report.listed(self.link(report)) for report in self.runs]
         return index_page(self.above.name, listed)
 
     def write(self) -> list[Path]:
-        """Write all pages, the index last, and return them.
+        """Write all pages, the index last, and return their paths.
 
         Raises
         ------
-        OutputError : a page cannot be written, or a tracks.csv cannot be understood.
+        OutputError : a page cannot be written, or a tracks.csv is invalid.
         """
         pages = {report.folder / PAGE: report.page() for report in self.runs}
         if self.indexed:
@@ -130,15 +131,16 @@ class Reports:
 
 
 def read_reports(folders: Sequence[Path], observe: Observer = _ignore) -> Reports:
-    """Read what the reports of runs show.
+    """Read the content of the reports of runs.
 
     Parameters
     ----------
-    folders : runs, or folders of runs; an index lists them unless it is one run.
+    folders : runs, or folders of runs. There is an index, unless this is a single run.
+    observe : called with the phase, the number of runs read, and the total.
 
     Raises
     ------
-    OutputError : a folder holds no run, or the tables of one cannot be understood.
+    OutputError : a folder holds no run, or a table of a run is unreadable or invalid.
     """
     runs = find_runs(folders)
     indexed = len(runs) > 1 or any(folder not in runs for folder in folders)
@@ -151,18 +153,21 @@ def read_reports(folders: Sequence[Path], observe: Observer = _ignore) -> Report
 
 
 def write_reports(folders: Sequence[Path], observe: Observer = _ignore) -> list[Path]:
-    """Write report.html into each run, and an index.html above them; return the pages."""
+    """Write report.html to each run, and index.html to their common folder; return the paths.
+
+    The parameters and errors are as for `read_reports`; there is no index for a single run.
+    """
     return read_reports(folders, observe).write()
 
 
 def read_report(folder: Path, *, index: str | None = None) -> RunReport:
-    """Read what the report of one run shows.
+    """Read the content of the report of one run.
 
-    Pictures come from the recording; where that is gone, surfaces are drawn from their meshes.
+    Pictures come from the recording. If it cannot be read, surfaces are drawn from their meshes.
 
     Raises
     ------
-    OutputError : not a finished run, or a tracks.csv that cannot be understood.
+    OutputError : the folder is not a finished run, or its tracks.csv is invalid.
     """
     finished = read_finished(folder)
     rows = read_track_table(folder / "tracks.csv").rows
@@ -180,7 +185,7 @@ def _link(start: Path, target: Path) -> str:
 
 
 def _faces(cards: Sequence[Card]) -> tuple[str, ...]:
-    """Return a picture of the surest track of each category, then of others."""
+    """Return pictures of the most certain track of each category, then of other tracks."""
     sure = sorted(cards, key=lambda card: -card.row.confidence)
     first = {card.row.category: card for card in reversed(sure)}
     chosen = [*first.values(), *(card for card in sure if card not in first.values())]
