@@ -63,6 +63,18 @@ def test_shares_of_a_ball_that_is_seen_from_the_side() -> None:
     assert value["context.share_up"] == pytest.approx(0.1, abs=0.04)
 
 
+@pytest.mark.parametrize("height", [0.9, -0.6])
+def test_from_below_more_of_a_ball_looks_down(height: float) -> None:
+    """From the side as much of it looks up as down: that tells no sign."""
+    middle, eye = np.array([0, 0, 0.2]), np.array([0.8, 0.3, height])
+    points = ball(middle, 0.06, eye)
+    normals = (points - middle) / 0.06
+
+    share = described(points, eye)["context.share_down"]
+
+    assert share == pytest.approx(np.mean(normals[:, 2] < -0.25), abs=0.04)
+
+
 def test_where_an_object_begins_and_how_it_is_seen() -> None:
     """It hangs 0.14 m above its support; the sensor looks down on it by the arc sine of 0.6."""
     middle = np.array([0.0, 0.0, 0.2])
