@@ -1,4 +1,4 @@
-"""Poses, quaternions, boxes, the gravity frame, limits of depth: what the stages share."""
+"""Geometry that the stages share: poses, quaternions, boxes, the level frame, depth limits."""
 
 import math
 from collections.abc import Sequence
@@ -31,9 +31,9 @@ __all__ = [
 ]
 
 DISCONTINUITY = 0.012
-"""Step in inverse depth that separates surfaces, 1/m: four steps of a Kinect, 1 cm at 0.9 m."""
+"""Step in inverse depth that separates two surfaces, 1/m: four steps of a Kinect, 1 cm at 0.9 m."""
 NEAREST_M = 0.05
-"""Nothing measures nearer; keeps inverse depth within bounds."""
+"""Smallest depth considered, metres: no sensor measures nearer, and inverse depth stays bounded."""
 IDENTITY = Pose(np.eye(3), np.zeros(3))
 """The pose that changes nothing."""
 
@@ -52,7 +52,7 @@ def inverse(a_from_b: Pose) -> Pose:
 
 
 def transform(a_from_b: Pose, points: ArrayLike) -> F8:
-    """Move points (n, 3) or one point (3,) from frame b to frame a."""
+    """Transform points (n, 3) or one point (3,) from frame b to frame a."""
     return np.asarray(np.asarray(points, np.float64) @ a_from_b.rotation.T + a_from_b.translation)
 
 
@@ -108,14 +108,14 @@ def _quaternion(first: _Row, second: _Row, third: _Row) -> tuple[float, float, f
 
 
 row_quaternion = kernel(_quaternion)
-"""`quaternion_from_rotation` for kernels: the three rows, as tuples, to (x, y, z, w)."""
+"""`quaternion_from_rotation` for kernels: takes the three rows as tuples, returns (x, y, z, w)."""
 
 
 def gravity_rotation(up: ArrayLike) -> F8:
     """Return ``level_from_sensor``: a (3, 3) rotation that turns ``up`` into +z.
 
-    The level x axis is the sensor's x axis made horizontal, or its y axis where that is steeper
-    than about 45 degrees, so that the result changes smoothly with ``up``.
+    The level x axis is the horizontal part of the sensor's x axis, or of its y axis if the x axis
+    is steeper than about 45 degrees, so that this part is never small.
 
     Examples
     --------
@@ -135,7 +135,7 @@ def _level_axes(x: float, y: float, z: float) -> tuple[tuple[float, float, float
 
 
 level_axes = kernel(_level_axes)
-"""`gravity_rotation` for kernels: (x, y, z) to its three rows."""
+"""`gravity_rotation` for kernels: takes x, y, z of ``up``, returns the three rows as tuples."""
 
 
 @kernel
@@ -146,20 +146,20 @@ def cross(a: F8, b: F8) -> F8:
 
 
 def level_from_sensor(up: ArrayLike, offset: float, points: ArrayLike) -> Pose:
-    """Return the pose that stands an object upright on z = 0.
+    """Return the pose ``level_from_sensor`` for the level frame of an object.
 
-    In the level frame z is the height above the support and the points are centred on the z axis;
-    the translation of the pose is the place of the sensor.
+    In that frame z is the height above the support, and the mean of the points lies on the z axis;
+    the translation of the pose is the position of the sensor.
 
     Parameters
     ----------
     up : (3,) vector, sensor frame.
-    offset : distance of the support from the sensor along ``up``, metres: ``up @ p`` of its points.
-    points : (n, 3) points of the object, metres, sensor frame, finite, at least one.
+    offset : metres, ``up @ p`` for the points p of the support.
+    points : (n, 3) points of the object, metres, sensor frame, finite.
 
     Raises
     ------
-    ValueError : there is no point.
+    ValueError : ``points`` is empty.
     """
     points = np.asarray(points, np.float64)
     if len(points) == 0:
@@ -171,14 +171,19 @@ def level_from_sensor(up: ArrayLike, offset: float, points: ArrayLike) -> Pose:
 
 
 def upright_box(points: F4, up: ArrayLike) -> Box:
-    """Return the smallest box around ``points`` (n, 3) with its z axis along ``up``.
+    """Return the smallest box around points with its z axis along ``up``.
 
-    Its yaw is the one of 60 (every 1.5 degrees) with the smallest horizontal area, the first on
-    ties. A single point gives a box of size 0.
+    Of 60 yaws, every 1.5 degrees, the one with the smallest footprint is chosen, the first on a
+    tie. A single point gives a box of size 0.
+
+    Parameters
+    ----------
+    points : (n, 3) metres, sensor frame.
+    up : (3,) vector, sensor frame.
 
     Raises
     ------
-    ValueError : there is no point.
+    ValueError : ``points`` is empty.
     """
     if len(points) == 0:
         msg = "a box needs at least one point"
@@ -189,12 +194,12 @@ def upright_box(points: F4, up: ArrayLike) -> Box:
 
 @kernel
 def level_box(points: F4, level: F8) -> tuple[F8, F8, F8]:
-    """Return centre, size and orientation of the box of `upright_box`, sensor frame.
+    """Return centre, size and orientation (x, y, z, w), sensor frame, of an `upright_box`.
 
     Parameters
     ----------
-    points : (3, n) in the level frame, float32.
-    level : (3, 3) the axes of that frame, from `level_axes`.
+    points : (3, n) float32, metres, in the level frame.
+    level : (3, 3) the axes of the level frame in the sensor frame, row by row.
     """
     yaw, low, high = _smallest_rectangle(points[0], points[1])
     low[2] = high[2] = points[2, 0]
@@ -215,7 +220,7 @@ def level_box(points: F4, level: F8) -> tuple[F8, F8, F8]:
 
 
 def box_corners(box: Box) -> F8:
-    """Return (8, 3) the corners of a box, sensor frame: the lower four around, then the upper."""
+    """Return the corners (8, 3) of a box, sensor frame: the lower ring of four, then the upper."""
     signs = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
     unit = np.array([[x, y, z] for z in (-1, 1) for x, y in signs.tolist()], np.float64)
     rotation = rotation_from_quaternion(box.orientation)
@@ -224,7 +229,7 @@ def box_corners(box: Box) -> F8:
 
 @kernel
 def _mean(points: F8) -> F8:
-    """Return the mean of points (n, 3): as numpy's, without its cost for so few columns."""
+    """Return the mean of points (n, 3), faster than numpy, which is slow for three columns."""
     x = y = z = 0.0
     for i in range(points.shape[0]):
         x += points[i, 0]
@@ -240,9 +245,9 @@ _COS, _SIN = np.cos(_YAWS).astype(np.float32), np.sin(_YAWS).astype(np.float32)
 
 @kernel(fast=True)
 def _smallest_rectangle(x: F4, y: F4) -> tuple[float, F8, F8]:
-    """Return yaw, least and greatest corner (3,) of the smallest rectangle around points.
+    """Return the yaw of the smallest rectangle around points (n,), and its low and high corner.
 
-    All yaws are turned to at once, one point after the other: this vectorises.
+    The corners (3,) have z = 0. The inner loop is over the yaws, so that it vectorises.
     """
     n = _YAWS.size
     left, back = np.full(n, np.float32(np.inf)), np.full(n, np.float32(np.inf))

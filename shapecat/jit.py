@@ -1,8 +1,8 @@
 """The one place where kernels are compiled.
 
-``@kernel`` is numba's ``njit`` with the settings of the house: the machine code is cached on disk
-as long as the files of the stage stay as they are, the interpreter lock is released, and division
-by zero follows IEEE 754 as in numpy.
+``@kernel`` is numba's ``njit`` with fixed options: machine code is cached on disk until a source
+file of its stage changes, the interpreter lock is released, and division by zero follows IEEE 754,
+as in numpy.
 """
 
 import hashlib
@@ -21,11 +21,11 @@ __all__ = ["code_folder", "kernel", "unset"]
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 _FAST = {"reassoc", "contract", "arcp", "nsz", "nnan"}
-"""Fast-math flags that keep infinities: sums and minima may be vectorised."""
+"""Fast-math flags without ``ninf``: sums and minima vectorise, and infinities stay valid."""
 _HERE = Path(__file__).parent
 _LARGE_BYTES = 2**24
 _SHARED = (_HERE / "geometry.py", _HERE / "jit.py", *(_HERE / "trees").glob("*.py"))
-"""Files whose kernels stages call."""
+"""Files whose kernels every stage may call."""
 
 
 def kernel(function: _F | None = None, *, fast: bool = False) -> Any:
@@ -54,11 +54,15 @@ def kernel(function: _F | None = None, *, fast: bool = False) -> Any:
 
 @cache
 def code_folder(stage: Path) -> Path | None:
-    """Return where the machine code of the kernels of a folder is kept: None if nothing can be.
+    """Return the cache folder for the kernels of a stage; None if no folder is writable.
 
-    Its name changes with any file that a kernel of the stage may be made of. Numba looks at the
-    file of the outermost kernel alone, but its machine code holds that of all it calls. Folders
-    of earlier files are removed; a process that still uses one makes it anew.
+    Its name holds a digest of all source files that the machine code can come from: numba checks
+    only the file of the outermost kernel, not those of the kernels it calls.
+    Folders of older sources are removed; a process that still uses one creates it again.
+
+    Parameters
+    ----------
+    stage : the folder with the source files of the stage.
     """
     name = f"kernels-{_digest(stage)}"
     for place in _places(stage):
@@ -77,13 +81,13 @@ def code_folder(stage: Path) -> Path | None:
 
 
 def _stage_of(file: Path) -> Path:
-    """Return the folder of the stage that a file is of: one here, also for files further down."""
+    """Return the folder of the package that contains a file; the file's own if it is elsewhere."""
     inside = (folder for folder in file.parents if folder.parent == _HERE)
     return next(inside, file.parent)
 
 
 def _digest(stage: Path) -> str:
-    """Return a digest of the files of a stage, and of those that every stage may call."""
+    """Return a digest of the files of a stage and of the shared files."""
     files = set(_SHARED) if stage == _HERE else {*stage.rglob("*.py"), *_SHARED}
     digest = hashlib.sha256()
     for file in sorted(files):
@@ -93,7 +97,7 @@ def _digest(stage: Path) -> str:
 
 
 def _places(stage: Path) -> tuple[Path, ...]:
-    """Return folders to try: the one the user names; else beside the files, or the user's own."""
+    """Return the folders to try: numba's if set; else beside the files, then the user's cache."""
     mine = f"{stage.name}-{hashlib.sha256(str(stage).encode()).hexdigest()[:16]}"
     if config.CACHE_DIR:
         return (Path(config.CACHE_DIR, mine),)
@@ -102,10 +106,10 @@ def _places(stage: Path) -> tuple[Path, ...]:
 
 
 def _keep_freed_memory() -> None:
-    """Let memory that is freed stay with the process: to map it anew costs 0.5 ms a frame.
+    """Keep freed memory in the process: mapping it again costs 0.5 ms per frame.
 
-    The allocator of glibc maps what is larger than a threshold apart, and gives the top of the rest
-    back; freeing a large block raises both bounds (mallopt(3), M_MMAP_THRESHOLD).
+    glibc maps blocks above a threshold separately, and returns free memory at the top of the heap;
+    freeing a large block raises both thresholds (mallopt(3), M_MMAP_THRESHOLD).
     """
     np.empty(_LARGE_BYTES, np.uint8)  # noqa: TID251  nothing is read
 
@@ -115,5 +119,8 @@ _keep_freed_memory()
 
 @kernel
 def unset(shape: Any, dtype: Any) -> Any:
-    """Return an array for kernels that write what they read: to clear an image takes 0.03 ms."""
+    """Return an uninitialised array, for kernels that write each element before they read it.
+
+    Clearing an image would take 0.03 ms.
+    """
     return np.empty(shape, dtype)  # noqa: TID251  the only one

@@ -322,4 +322,4 @@ def test_what_could_not_be_fused_is_said(job: Job, tmp_path: Path) -> None:
     process(replace(job, source=source))
 
     (warning,) = read_run(job.folder)["warnings"]
-    assert "nothing tells where the sensor was in 4 frames" in warning
+    assert "the pose of the sensor is unknown in 4 frames" in warning

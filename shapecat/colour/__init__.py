@@ -1,4 +1,4 @@
-"""What belongs to which pixel of a colour image: projection, occlusion, masks."""
+"""Objects on a colour image: projection, occlusion, masks."""
 
 from shapecat.colour.masks import Mask, dense_masks
 from shapecat.colour.projection import project

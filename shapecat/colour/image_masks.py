@@ -1,4 +1,4 @@
-"""The masks of the detections of a frame, as they are kept."""
+"""The masks of a frame's detections, as they are stored."""
 
 from collections.abc import Sequence
 
@@ -12,13 +12,15 @@ __all__ = ["box_of", "find_masks", "mask_of"]
 
 
 def find_masks(frame: Frame, view: ColourView, objects: Sequence[U4]) -> ImageMasks:
-    """Return the masks of detections on a colour image, whose pixels are not looked at.
+    """Return the masks of a frame's detections on a colour image.
 
-    Loose points have none.
+    They follow from the depth image and the cameras alone, not from the colours. A frame of loose
+    points has no masks.
 
     Parameters
     ----------
-    objects : (k,) uint32 flat indices into the frame, of the pixels of each detection.
+    view : the colour image with its camera.
+    objects : for each detection, (k,) uint32 flat indices of its pixels in the frame.
     """
     image = view.image
     masks: tuple[Mask, ...] = ()
@@ -38,11 +40,15 @@ def find_masks(frame: Frame, view: ColourView, objects: Sequence[U4]) -> ImageMa
 
 
 def mask_of(masks: ImageMasks, detections: Sequence[int]) -> Mask:
-    """Return the union of the masks of some detections.
+    """Return the union of the masks of some detections; an empty mask if none has one.
+
+    Parameters
+    ----------
+    detections : numbers in the frame, from 0.
 
     Raises
     ------
-    ValueError : a mask is not one of this image.
+    ValueError : the run lengths of a mask do not fill the image.
     """
     counts = [masks.counts[number] for number in detections if number in masks.counts]
     found = [rle_mask(runs, masks.height, masks.width) for runs in counts]
@@ -50,7 +56,10 @@ def mask_of(masks: ImageMasks, detections: Sequence[int]) -> Mask:
 
 
 def box_of(masks: ImageMasks, detections: Sequence[int]) -> tuple[int, int, int, int] | None:
-    """Return left, top, width and height around some detections, pixels; None if unseen."""
+    """Return left, top, width and height, in pixels, of the box around some detections' masks.
+
+    None if no detection has a mask; ``detections`` as in `mask_of`.
+    """
     boxes = [masks.boxes[number] for number in detections if number in masks.boxes]
     if not boxes:
         return None

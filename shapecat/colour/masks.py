@@ -13,17 +13,18 @@ from shapecat.types import Frame, Pose
 __all__ = ["NOTHING", "Mask", "dense_masks", "label_boxes", "labelled_masks", "united"]
 
 _NARROW_PX = 4.0
-"""Gaps in an object that are not wider, in pixels of the depth image, are closed."""
+"""Widest gap in an object that is filled, in pixels of the depth image."""
 _WIDE_PX = 24.0
-"""So far, in pixels of the depth image, unknown pixels look for the object around them."""
+"""Greatest distance, in pixels of the depth image, of an object that unknown pixels may join."""
 _RAGGED_PX = 5.0
 """Width, in pixels of the depth image, of the window that smooths the ragged outlines of depth."""
 
 
 class Mask(Record):
-    """The pixels of an object on an image: ``pixels`` (h, w) bool from row ``top``, ``left`` on.
+    """An object's mask, cropped to its bounding box.
 
-    An object that is not seen has no pixels: (0, 0).
+    ``pixels`` is (h, w) bool, (0, 0) if the object is not visible; its top-left pixel is at row
+    ``top`` and column ``left`` of the image.
     """
 
     left: int
@@ -32,17 +33,17 @@ class Mask(Record):
 
     @property
     def box(self) -> tuple[int, int, int, int]:
-        """Left, top, width and height, pixels."""
+        """The bounding box: left, top, width and height, pixels."""
         height, width = self.pixels.shape
         return self.left, self.top, width, height
 
     @property
     def area(self) -> int:
-        """The number of its pixels."""
+        """The number of pixels that belong to the object."""
         return int(np.count_nonzero(self.pixels))
 
     def full(self, height: int, width: int) -> Bool:
-        """Return (height, width) bool: the mask in its image."""
+        """Return the mask in the size of the image: (height, width) bool."""
         result = np.zeros((height, width), bool)
         left, top, w, h = self.box
         result[top : top + h, left : left + w] = self.pixels
@@ -50,7 +51,7 @@ class Mask(Record):
 
 
 NOTHING = Mask(0, 0, np.zeros((0, 0), bool))
-"""The mask of what is not seen."""
+"""The mask of an object that is not visible."""
 
 
 def dense_masks(
@@ -59,23 +60,27 @@ def dense_masks(
     lens: LensCamera | None = None,
     colour_from_depth: Pose | None = None,
 ) -> tuple[Mask, ...]:
-    """Return what a colour camera sees of objects that a depth image knows.
+    """Return the masks, on a colour image, of objects found in a depth image.
 
-    Labelled depth pixels are projected into the colour image, where the nearest shows; what is
-    narrow and between pixels of the same object belongs to it, and so do pixels of which nothing
-    is known, that it surrounds.
+    Labelled depth pixels are projected into the colour image, where the nearest one shows. Narrow
+    gaps between pixels of the same object are filled, and so are unknown pixels that an object
+    surrounds.
 
     Parameters
     ----------
     frame : a depth image.
-    objects : (k,) uint32 flat indices of the pixels of each object.
+    objects : for each object, (k,) uint32 flat indices of its pixels in the frame.
     lens : the colour camera; not needed for a registered image.
-    colour_from_depth : pose of the sensor in the optical frame of the colour camera; None where
-        the image is registered: its pixels are those of the depth image.
+    colour_from_depth : pose of the depth sensor in the optical frame of the colour camera; None
+        for a registered image, whose pixels are those of the depth image.
+
+    Returns
+    -------
+    One mask per object, in their order; no two share a pixel.
 
     Raises
     ------
-    ValueError : the frame is no depth image.
+    ValueError : the frame is not a depth image.
     """
     if frame.depth is None or frame.camera is None:
         msg = "masks need a depth image"
@@ -95,15 +100,15 @@ def dense_masks(
 def labelled_masks(
     seen: I4, boxes: I4, scale: float = 1.0, *, corner: tuple[int, int] = (0, 0)
 ) -> tuple[Mask, ...]:
-    """Return the dense mask of each label.
+    """Return the dense mask of each label, from 1 on.
 
     Parameters
     ----------
-    seen : (h, w) labels from 1, 0 for what is none, -1 where nothing is known; gaps in it are
-        filled.
-    boxes : around each label, of `label_boxes`.
-    scale : pixels of the image to a pixel of the depth image.
-    corner : column and row of the image where ``seen`` begins.
+    seen : (h, w) labels of the objects, from 1; 0 for other surfaces, -1 where nothing is known.
+        Its gaps are filled in place.
+    boxes : (n + 1, 4) the bounding box of each label, from `label_boxes`.
+    scale : pixels of the colour image per pixel of the depth image.
+    corner : column and row, in the image, of the first pixel of ``seen``.
     """
     narrow, wide = max(1, round(_NARROW_PX * scale)), max(1, round(_WIDE_PX * scale))
     for box in boxes[boxes[:, 2] > 0].tolist():
@@ -116,7 +121,7 @@ def labelled_masks(
 
 
 def _smoothed(filled: I4, label: int, box: list[int], reach: int, corner: tuple[int, int]) -> Mask:
-    """Return the pixels around which most others are of the label; no two labels share one."""
+    """Return the mask of the pixels whose surroundings are mostly of the label."""
     left, top, right, bottom = box
     if right <= left:
         return NOTHING
@@ -131,7 +136,7 @@ def _smoothed(filled: I4, label: int, box: list[int], reach: int, corner: tuple[
 
 
 def united(masks: Sequence[Mask]) -> Mask:
-    """Return the pixels of any of some masks of one image."""
+    """Return the union of masks of one image."""
     seen = [mask for mask in masks if mask.pixels.size]
     if len(seen) < 2:
         return seen[0] if seen else NOTHING
@@ -147,7 +152,14 @@ def united(masks: Sequence[Mask]) -> Mask:
 
 @kernel
 def label_boxes(seen: I4, count: int) -> I4:
-    """Return (count + 1, 4) left, top, and one more than right and bottom, of each label."""
+    """Return the bounding box of each label: (count + 1, 4) left, top, right + 1, bottom + 1.
+
+    Row 0, and the rows of labels that do not occur, are zeros.
+
+    Parameters
+    ----------
+    seen : (h, w) labels, from 1 to ``count``; others are ignored.
+    """
     boxes = np.zeros((count + 1, 4), np.int64)
     boxes[:, 0], boxes[:, 1] = seen.shape[1], seen.shape[0]
     for v in range(seen.shape[0]):
@@ -171,27 +183,27 @@ def label_boxes(seen: I4, count: int) -> I4:
 
 @kernel
 def _step(label: int, packed: int) -> int:
-    """Move one pixel on: ``packed`` tells of the last object, how far it is, what was between.
+    """Return ``packed`` after one more pixel, which has this label.
 
-    It is 4 times the distance, and 1 where a pixel was seen to be of no object; the object is
-    in the upper half.
+    It describes the last object met: its label in the upper 16 bits, and below them 4 times its
+    distance in pixels, plus 1 if a pixel of label 0 lies between.
     """
     return label << 16 if label > 0 else (packed + 4) | (label == 0)
 
 
 @kernel
 def _step_row(labels: I4, packed: I4, result: I4) -> None:
-    """Move all pixels of a row on."""
+    """Apply `_step` to all pixels of a row."""
     for u in range(labels.size):
         result[u] = _step(labels[u], packed[u])
 
 
 @kernel
 def _fill(seen: I4, region: tuple[int, int, int, int], narrow: int, wide: int) -> None:
-    """Give objects the pixels of no object that they surround in a region: a sweep there, one back.
+    """Add to objects the pixels that they surround in a region, with one sweep each way.
 
-    ``region`` is left, top, and one more than right and bottom. A pixel is filled once all others
-    know what it was.
+    ``region`` is left, top, right + 1, bottom + 1. A pixel changes only after its old label has
+    been passed on in all four directions.
     """
     left, top, right, bottom = region
     height, width = bottom - top, right - left
@@ -218,7 +230,10 @@ def _fill(seen: I4, region: tuple[int, int, int, int], narrow: int, wide: int) -
 
 @kernel
 def _surrounding(label: int, w: int, e: int, n: int, s: int, narrow: int, wide: int) -> int:
-    """Return the object that a pixel of none belongs to, from what lies in four directions."""
+    """Return the object that surrounds a pixel of label 0 or -1; the label itself if none does.
+
+    ``w``, ``e``, ``n`` and ``s`` are from `_step`, for the four directions.
+    """
     across = w >> 16 if w >> 16 == e >> 16 and _gap(w) + _gap(e) <= narrow + 1 else 0
     along = n >> 16 if n >> 16 == s >> 16 and _gap(n) + _gap(s) <= narrow + 1 else 0
     if label == 0:
@@ -239,13 +254,14 @@ def _gap(packed: int) -> int:
 
 @kernel
 def _majority(seen: I4, label: int, reach: int, pixels: Bool) -> tuple[int, int, int, int]:
-    """Set the pixels of which most of the square around them, in the image, is of a label.
+    """Set the pixels for which most of the square around them is of a label.
 
-    Returns left, top, and one more than right and bottom, of those that are set.
+    Only the part of the square within the image counts. Returns left, top, right + 1 and
+    bottom + 1 of the pixels that are set.
     """
     height, width = seen.shape
     west, north, east, south = width, height, 0, 0
-    column = np.zeros(width + 2 * reach, np.int32)  # of each column, in the rows around
+    column = np.zeros(width + 2 * reach, np.int32)  # pixels of the label, in the rows around
     middle = column[reach : reach + width]
     at = np.arange(width)
     columns = np.minimum(width, at + reach + 1) - np.maximum(0, at - reach)
@@ -277,6 +293,6 @@ def _majority(seen: I4, label: int, reach: int, pixels: Bool) -> tuple[int, int,
 
 @kernel
 def _count(row: I4, label: int, one: int, counts: I4) -> None:
-    """Add a number to the counts of the pixels of a label."""
+    """Add ``one`` to the counts of the pixels that have a label."""
     for u in range(row.size):
         counts[u] += one if row[u] == label else 0

@@ -11,22 +11,22 @@ from shapecat.jit import kernel
 __all__ = ["joined", "outlines"]
 
 _TOLERANCE_PX = 0.75
-"""Corners that stick out no farther are left out: the steps of slanted edges do by 0.71."""
+"""Corners that stick out less are dropped; the steps of a slanted edge stick out by 0.71."""
 
 
 def outlines(mask: Mask, tolerance_px: float = _TOLERANCE_PX) -> list[F8]:
-    """Return the outer outlines of the parts of a mask, the largest first.
+    """Return the outer outline of each connected part of a mask, the largest first.
 
-    Holes are not outlined; parts that touch by a corner alone are two.
+    Holes are ignored. Pixels that touch only at a corner are not connected.
 
     Parameters
     ----------
-    tolerance_px : so far an outline may be from the border of the pixels.
+    tolerance_px : greatest distance between an outline and the border of the pixels.
 
     Returns
     -------
-    (n, 2) columns and rows of at least three corners each, in the image; the first pixel is
-    between 0 and 1.
+    For each part, (n, 2) the column and row of its corners, at least three. The first pixel of the
+    image extends from 0 to 1.
 
     Examples
     --------
@@ -45,9 +45,9 @@ def outlines(mask: Mask, tolerance_px: float = _TOLERANCE_PX) -> list[F8]:
 
 
 def joined(rings: Sequence[F8]) -> F8:
-    """Return one polygon (n, 2) of several, linked there and back, for formats without parts.
+    """Join outlines (n, 2) into one polygon (m, 2), for formats that store one per object.
 
-    Source: as converters of COCO data sets do, by the nearest corners.
+    Source: as in converters of COCO data sets, a double edge links the nearest corners.
     """
     whole = rings[0]
     for ring in rings[1:]:
@@ -59,13 +59,13 @@ def joined(rings: Sequence[F8]) -> F8:
 
 
 def _area(ring: F8) -> float:
-    """Return the area inside of corners that go clockwise on the image; negative for holes."""
+    """Return the area inside corners (n, 2) in clockwise order on the image; holes are negative."""
     x, y = ring.T
     return float((x * np.roll(y, -1) - np.roll(x, -1) * y).sum()) / 2
 
 
 def _simplified(ring: F8, tolerance: float) -> F8:
-    """Leave out corners of a closed line (Douglas and Peucker 1973)."""
+    """Drop corners of a closed line (Douglas and Peucker 1973)."""
     far = int(((ring - ring[0]) ** 2).sum(axis=1).argmax())
     closed = np.concatenate([ring, ring[:1]])
     keep = np.zeros(len(closed), np.bool_)
@@ -78,7 +78,7 @@ def _simplified(ring: F8, tolerance: float) -> F8:
 
 @kernel
 def _keep_far(line: F8, first: int, last: int, tolerance: float, keep: Bool) -> None:
-    """Mark the corners between two that a straight line would miss by more than the tolerance."""
+    """Mark corners between two others that are off the simplified line by more than a tolerance."""
     stack = [(first, last)]
     while len(stack) > 0:
         a, b = stack.pop()
@@ -98,9 +98,10 @@ def _keep_far(line: F8, first: int, last: int, tolerance: float, keep: Bool) -> 
 
 @kernel
 def _trace(inside: Bool, corners: I4, ends: I4) -> int:
-    """Walk along the borders of pixels, the inside on the right; return how many walks there are.
+    """Trace the borders of regions, the inside on the right; return the number of borders.
 
-    ``inside`` has an empty border; each walk begins eastward above a pixel that was not walked.
+    ``inside`` (h, w) is False along its edge. ``corners`` gets column and row of the corners of
+    all borders, ``ends`` where each border ends. A border starts on top of a pixel, eastward.
     """
     walked = np.zeros(inside.shape, np.bool_)
     count = length = 0
@@ -115,7 +116,7 @@ def _trace(inside: Bool, corners: I4, ends: I4) -> int:
                 if du == 1:
                     walked[v, u] = True
                 u, v = u + du, v + dv
-                # The pixels ahead, left and right of the way: turn right where both are outside.
+                # The two pixels ahead, left and right of the border.
                 left = int(inside[v + (dv - 1 - du) // 2, u + (du - 1 + dv) // 2])
                 right = int(inside[v + (dv - 1 + du) // 2, u + (du - 1 - dv) // 2])
                 if u == u0 and v == v0 and _turn(du, dv, left, right) == (1, 0):
@@ -132,7 +133,7 @@ def _trace(inside: Bool, corners: I4, ends: I4) -> int:
 
 @kernel
 def _turn(du: int, dv: int, left: int, right: int) -> tuple[int, int]:
-    """Return where to go on: right along the pixel, straight, or left around what is ahead."""
+    """Return the next direction: right if ``right`` is outside, left if both are inside."""
     if not right:
         return -dv, du
     return (dv, -du) if left else (du, dv)

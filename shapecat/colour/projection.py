@@ -1,4 +1,4 @@
-"""Points of the depth sensor on the image of a colour camera, and its lens."""
+"""Projection of points from the depth sensor into the image of a colour camera."""
 
 from functools import lru_cache
 
@@ -13,25 +13,30 @@ from shapecat.types import Pose
 __all__ = ["Lens", "kernel_lens", "project", "rectified", "see"]
 
 _WIDEST = 3.0
-"""Slopes beyond this, 72 degrees off the axis, are not looked at."""
+"""Largest slope that a lens with distortion is taken to see: 72 degrees off the axis."""
 Lens = tuple[F4, int, F4, float]
-"""A lens for kernels: fx, fy, cx, cy; its kind (0 none, 1 the polynomial, 2 the fisheye); 8
-coefficients; and the square of the slope up to which it sees."""
+"""A lens for kernels: fx, fy, cx, cy in pixels; the kind of distortion (0 none, 1 polynomial,
+2 fisheye); its 8 coefficients; and the square of the largest slope that the lens sees."""
 _FISHEYE = {"equidistant", "fisheye"}
 
 
 def project(points: F4, lens: LensCamera, colour_from_depth: Pose) -> F4:
-    """Return where a colour camera sees points.
+    """Return the pixels where a colour camera sees points.
 
     Parameters
     ----------
-    points : (n, 3) metres, sensor frame; rows that are not finite stay so.
-    colour_from_depth : pose of the sensor in the optical frame of the colour camera.
+    points : (n, 3) metres, sensor frame; rows that are not finite give NaN.
+    lens : the colour camera.
+    colour_from_depth : pose of the depth sensor in the optical frame of the colour camera.
 
     Returns
     -------
-    (n, 3) column, row (0 is the middle of the first pixel) and distance along the optical axis,
-    metres; NaN behind the camera, and beyond what a lens with distortion maps one to one.
+    (n, 3) column and row (0 is the centre of the first pixel) and depth along the optical axis,
+    metres; NaN behind the camera, and beyond the slopes that the distortion maps one to one.
+
+    Raises
+    ------
+    ValueError : the distortion model is not known.
 
     Examples
     --------
@@ -49,7 +54,12 @@ def project(points: F4, lens: LensCamera, colour_from_depth: Pose) -> F4:
 
 
 def kernel_lens(lens: LensCamera) -> Lens:
-    """Return a lens for kernels."""
+    """Return a lens in the form that kernels take.
+
+    Raises
+    ------
+    ValueError : the distortion model is not known.
+    """
     if lens.model and lens.model not in LENS_MODELS:
         msg = f"lens distortion {lens.model!r} is not known"
         raise ValueError(msg)
@@ -62,9 +72,9 @@ def kernel_lens(lens: LensCamera) -> Lens:
 
 
 def rectified(pixels: U1, lens: LensCamera) -> U1:
-    """Return an image (h, w, 3) as the pinhole of its camera would show it.
+    """Return a colour image (h, w, 3) uint8 without the distortion of its lens.
 
-    Between four pixels colours are interpolated; what the lens has not seen is black.
+    Colours are interpolated bilinearly. Pixels that the original image does not show are black.
     """
     if not lens.model:
         return pixels
@@ -89,9 +99,9 @@ def rectified(pixels: U1, lens: LensCamera) -> U1:
 
 @lru_cache(maxsize=16)
 def _reach(lens: LensCamera) -> float:
-    """Return the slope up to which rays farther out are seen farther out.
+    """Return the slope up to which the distortion increases monotonically.
 
-    Beyond, the polynomial of a lens turns back and shows the side of the scene in its middle.
+    Beyond it the polynomial turns back, and would map the sides of the scene into the image.
     """
     slopes = np.linspace(0, _WIDEST, 601)[1:]
     seen = distort(np.column_stack([slopes, 0 * slopes]), lens.model, lens.coefficients)[:, 0]
@@ -101,7 +111,7 @@ def _reach(lens: LensCamera) -> float:
 
 @kernel
 def _turn(points: F4, rotation: F4, shift: F4, turned: F4) -> None:
-    """Move points (n, 3) into the frame of a camera; behind it where they are not finite."""
+    """Write points (n, 3) in the frame of a camera, (3, n); z is -1 where they are not finite."""
     for i in range(points.shape[0]):
         x, y, z = points[i, 0], points[i, 1], points[i, 2]
         known = np.isfinite(x + y + z)
@@ -112,10 +122,18 @@ def _turn(points: F4, rotation: F4, shift: F4, turned: F4) -> None:
 
 @kernel(fast=True)
 def see(x: F4, y: F4, z: F4, numbers: F4, kind: int, d: F4, reach: float) -> None:
-    """Turn points in the frame of a camera, in place, into column, row and inverse distance.
+    """Project points, in place, from the camera frame to the image.
 
-    The inverse distance is 0 for what is not seen. Source of the lenses:
-    `shapecat.cameras.lenses.distort`.
+    Source of the lens models: `shapecat.cameras.lenses.distort`.
+
+    Parameters
+    ----------
+    x, y, z : (n,) metres, in the optical frame of the camera. They become column and row in pixels
+        and inverse depth in 1/m, which is 0 where the camera does not see the point.
+    numbers : (4,) fx, fy, cx, cy, pixels.
+    kind : of distortion: 0 none, 1 polynomial, 2 fisheye.
+    d : (8,) distortion coefficients.
+    reach : the square of the largest slope that the lens sees; ignored without distortion.
     """
     one, two, nought = np.float32(1), np.float32(2), np.float32(0)
     for k in range(x.size):

@@ -1,4 +1,4 @@
-"""Masks as run lengths, as the COCO data set stores them: column by column, zeros first."""
+"""Run-length encoding of masks as in COCO data sets: column by column, zeros first."""
 
 import numpy as np
 
@@ -10,9 +10,10 @@ __all__ = ["rle_counts", "rle_mask", "rle_text"]
 
 
 def rle_counts(mask: Mask, height: int, width: int) -> U4:
-    """Return the lengths (n,) of the runs of a mask in its image, outside and inside by turns.
+    """Return the run lengths (n,) of a mask in its image, alternately outside and inside.
 
-    The image of ``height`` by ``width`` pixels is read column by column.
+    The image of ``height`` by ``width`` pixels is read column by column. The first run is outside
+    the mask, and may have length 0.
 
     Examples
     --------
@@ -28,11 +29,11 @@ def rle_counts(mask: Mask, height: int, width: int) -> U4:
 
 
 def rle_mask(counts: U4, height: int, width: int) -> Mask:
-    """Return the mask of run lengths (n,); the inverse of `rle_counts`.
+    """Return the mask with run lengths (n,): the inverse of `rle_counts`.
 
     Raises
     ------
-    ValueError : the runs do not fill the image.
+    ValueError : the run lengths do not add up to ``height * width``.
     """
     runs = np.asarray(counts, np.int64)
     if int(runs.sum()) != height * width:
@@ -53,9 +54,10 @@ def rle_mask(counts: U4, height: int, width: int) -> Mask:
 
 
 def rle_text(counts: U4) -> str:
-    """Return run lengths (n,) in COCO's own text.
+    """Return run lengths (n,) in COCO's compressed text format.
 
-    It holds the differences to the run before last, 5 bits a letter.
+    From the fourth on, a run is stored as the difference from the run two before it. Each
+    character holds 5 bits.
 
     Source: rleToString of the COCO API (Lin et al. 2014).
 
@@ -78,7 +80,7 @@ def rle_text(counts: U4) -> str:
 
 @kernel
 def _encode(pixels: Bool, left: int, top: int, height: int, width: int, runs: U4) -> int:
-    """Write the runs of a mask and return how many there are."""
+    """Write the run lengths of a mask to ``runs`` and return their number."""
     count, length, inside = 0, left * height, False
     for u in range(pixels.shape[1]):
         if inside and top > 0:

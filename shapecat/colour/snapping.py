@@ -1,8 +1,8 @@
-"""Outlines of masks, moved to the edges of the colours beside them.
+"""Outlines of masks, moved onto nearby edges in the colour image.
 
 Source: the local statistics of Lankton and Tannenbaum, Localizing region-based active contours,
-2008. differs: one step within a narrow band instead of a curve that evolves, since depth already
-tells the outline to a pixel or two.
+2008. differs: one step within a narrow band instead of an evolving curve, since the outline from
+depth is already right to a pixel or two.
 """
 
 from collections.abc import Sequence
@@ -17,36 +17,37 @@ from shapecat.jit import kernel
 __all__ = ["snapped"]
 
 _BAND_PX = 3.0
-"""Outlines move at most so far, in pixels of the depth image."""
+"""Greatest distance an outline moves. Like the next three, in pixels of the depth image."""
 _CORE_PX = 1.5
-"""Pixels farther than this from the outline show the colours of their side."""
+"""Pixels farther than this from the outline are samples of the colours on their side."""
 _WINDOW_PX = 6.0
-"""Half the width of the window in which they are looked at."""
+"""Half the width of the window from which samples are taken."""
 _ERROR_PX = 3.0
-"""So far from the outline of depth, colours need to be e times as likely."""
+"""A pixel this far from the outline changes sides if the other side is e times as likely."""
 _FEWEST = 4
-"""Samples of a side without which a pixel stays what it is."""
+"""Fewest samples of each side; with fewer, the colour of a pixel has no influence."""
 _NOISE = 64.0
-"""Variance of a channel, in squared grey levels, that every surface has."""
+"""Variance that noise adds to each channel, in squared grey levels."""
 _CERTAIN = 3.0
-"""Greatest logarithm of how much likelier one side is."""
+"""Greatest influence of the colour of a pixel, as a log-likelihood ratio."""
 
 
 def snapped(masks: Sequence[Mask], pixels: U1, scale: float = 1.0) -> tuple[Mask, ...]:
-    """Return masks whose outlines lie on the edges of the colours, where there are such edges.
+    """Return masks whose outlines follow the edges in a colour image, where it has edges.
 
-    Each pixel near an outline goes to the side whose colours, around it, it has; the nearer to the
-    outline, the less it takes. Where both sides look alike the outline stays. No two masks share a
-    pixel.
+    A pixel near an outline goes to the side whose colours, sampled around the pixel, match it
+    better; the farther it is from the outline, the clearer the match must be. Where both sides
+    have the same colours the outline stays. No two masks share a pixel.
 
     Parameters
     ----------
-    pixels : (h, w, 3) the colour image.
-    scale : pixels of it to a pixel of the depth image.
+    masks : of the objects on the colour image.
+    pixels : (h, w, 3) uint8, the colour image.
+    scale : pixels of the colour image per pixel of the depth image.
 
     Notes
     -----
-    O(length of the outlines); about a millisecond for an object.
+    Time grows with the length of the outlines: about a millisecond per object.
     """
     owners = np.zeros(pixels.shape[:2], np.int32)
     for number, mask in enumerate(masks, start=1):
@@ -60,7 +61,7 @@ def snapped(masks: Sequence[Mask], pixels: U1, scale: float = 1.0) -> tuple[Mask
 
 
 def _snapped(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> Mask:
-    """Return one mask anew, and note it in ``owners``."""
+    """Return one mask with its new outline, and update ``owners`` (h, w), the mask numbers."""
     band, window = max(2.0, _BAND_PX * scale), max(3, round(_WINDOW_PX * scale))
     margin, (left, top, width, height) = int(band) + window, mask.box
     top, bottom = max(0, top - margin), top + height + margin
@@ -69,7 +70,7 @@ def _snapped(mask: Mask, number: int, owners: I4, pixels: U1, scale: float) -> M
     inside = part == number
     if inside.all() or not inside.any():
         return mask
-    # The distance of the middles of pixels from the outline, positive inside.
+    # The distance of pixel centres from the outline, positive inside.
     within, without = (ndimage.distance_transform_edt(side) for side in (inside, ~inside))
     depth = np.where(inside, within - 0.5, 0.5 - without).astype(np.float32)
     near = np.abs(depth) <= band
@@ -92,10 +93,11 @@ def _cut_out(inside: Bool, left: int, top: int) -> Mask:
 
 @kernel
 def _compare(colours: U1, depth: F4, band: float, core: float, window: int, likelier: F4) -> None:
-    """Find by how much, as a logarithm, pixels of the band are likelier inside than outside.
+    """Write to ``likelier`` the log-likelihood ratio of inside to outside, for pixels in the band.
 
-    Either side has a normal distribution, of the same variance in all channels, of the colours
-    of a grid of pixels around.
+    The colours of each side are modelled by a normal distribution with the same variance in all
+    channels, fitted to a grid of pixels around. ``depth`` (h, w) is the distance from the outline
+    in pixels, positive inside.
     """
     height, width, channels = colours.shape
     step = max(1, window // 4)
@@ -129,7 +131,7 @@ def _compare(colours: U1, depth: F4, band: float, core: float, window: int, like
 
 @kernel
 def _unlikely(colour: U1, total: F4, squares: float, count: int) -> float:
-    """Return the negative logarithm of the density of a colour, but for a constant."""
+    """Return the negative log-likelihood of a colour, up to a constant."""
     apart, of_means = 0.0, 0.0
     for k in range(colour.size):
         mean = total[k] / count

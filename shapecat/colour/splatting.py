@@ -1,4 +1,4 @@
-"""What a colour camera sees of a depth image: its pixels splatted, the nearest on top."""
+"""A depth image as a colour camera sees it: its pixels splatted, the nearest on top."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -14,22 +14,25 @@ from shapecat.types import Camera, Pose
 __all__ = ["SplattedLabels", "splat_depth"]
 
 _FOOTPRINT_PX = 0.05
-"""A depth pixel covers so much more of the colour image on each side, to leave no gaps."""
+"""Margin on each side of a splatted depth pixel, in colour pixels, to leave no gaps."""
 _HIDDEN = 0.02
 """An object is hidden where something else is nearer by more than this share of its distance."""
 _SPARSE = 4
-"""Of what is of no object, every so-many-th row and column is looked at."""
+"""Outside objects, only every fourth row and column of the depth image is used."""
 _BESIDE_PX = 30
-"""Depth pixels so far from labelled ones are looked at, for what lies beside and between them."""
+"""Margin around the objects, in depth pixels, within which the other pixels are used."""
 
 
 class SplattedLabels(NamedTuple):
-    """A part of an image as the colour camera sees it, from row ``top`` and column ``left`` on.
+    """The labels in the part of the colour image where the objects are.
 
-    ``labels`` (h, w) int32 is what is seen, -1 where nothing is known. Row ``k`` of ``boxes``
-    (n + 1, 4) is left, top, and one more than right and bottom, in this part, of what is painted of
-    label ``k``, also where something hides it; 0 where nothing is. Outside of the boxes no pixel
-    is known to be of no object.
+    Attributes
+    ----------
+    left, top : column and row, in the image, of the first pixel of the part.
+    labels : (h, w) int32 the object, from 1; 0 for another surface, -1 where nothing is known.
+        Label 0 occurs only within ``boxes``.
+    boxes : (n + 1, 4) for each label, left, top, right + 1, bottom + 1, in the part, of its pixels
+        including hidden ones; zeros without pixels.
     """
 
     left: int
@@ -41,20 +44,23 @@ class SplattedLabels(NamedTuple):
 def splat_depth(
     depth: F4, camera: Camera, objects: Sequence[U4], lens: LensCamera, colour_from_depth: Pose
 ) -> SplattedLabels:
-    """Paint the objects of a depth image as a colour camera sees them.
+    """Label the pixels of a colour camera with the objects of a depth image.
 
-    Each depth pixel of an object covers a square on the colour image, as large as its own, and a
-    little more; where several cover a pixel, the nearest shows. The other pixels are painted
-    coarsely: they matter by what they hide, and by the gaps that are none.
+    Each depth pixel of an object covers a square of its own size on the colour image, slightly
+    enlarged; where squares overlap, the nearest one shows. The other depth pixels are splatted
+    coarsely: they only hide objects, or show that a gap belongs to none.
 
     Parameters
     ----------
     depth : (h, w) metres, 0 where there is no reading.
-    objects : indices of the pixels of each object.
+    camera : the depth camera.
+    objects : for each object, (k,) uint32 flat indices of its pixels in ``depth``.
+    lens : the colour camera.
+    colour_from_depth : pose of the depth sensor in the optical frame of the colour camera.
 
     Notes
     -----
-    O(pixels of the objects and what they cover; a few around them).
+    Time grows with the pixels of the objects and the pixels that they cover.
     """
     target = lens.pinhole
     scale = max(target.fx / camera.fx, target.fy / camera.fy)
@@ -70,7 +76,7 @@ def splat_depth(
 
 
 def _rays(camera: Camera, colour_from_depth: Pose) -> tuple[F4, F4, F4]:
-    """Return what column and row (3, n) give to a ray that is turned, and the shift (3,)."""
+    """Return the parts of a rotated ray due to column (3, w) and row (3, h), and the shift (3,)."""
     x = (np.arange(camera.width) - camera.cx) / camera.fx
     y = (np.arange(camera.height) - camera.cy) / camera.fy
     turn = colour_from_depth.rotation
@@ -94,10 +100,11 @@ def _splat(
     size: tuple[int, int],
     boxes: I4,
 ) -> tuple[int, int, I4]:
-    """Return left, top and labels of the part of an image of a size where pixels land.
+    """Return left, top and labels of the `SplattedLabels`, and write their boxes to ``boxes``.
 
-    ``parallax`` is in pixels per inverse distance; ``scale`` pixels of the image to one of the
-    depth image, at equal distance. ``boxes`` become those of `SplattedLabels`.
+    ``pixels`` and ``labels`` (n,) are flat depth pixels and their objects; ``parallax`` is in
+    pixels per 1/m; ``scale`` is the colour pixels per depth pixel at equal distance; ``size`` is
+    width and height of the colour image.
     """
     beside = _list_beside(depth, pixels, parallax)
     place, around = _see_pixels(depth, pixels, rays, lens), _see_pixels(depth, beside, rays, lens)
@@ -113,10 +120,10 @@ def _splat(
 
 @kernel
 def _list_beside(depth: F4, pixels: U4, parallax: float) -> U4:
-    """Return the sparse pixels of no object that may hide those of objects, or lie beside them.
+    """Return the sparse pixels outside objects that may hide an object or lie beside one.
 
-    Between a near and a far pixel that one camera sees in the same place, the other sees the
-    parallax: focal length by distance of the cameras by difference of the inverse depths.
+    A near and a far point that one camera sees in the same pixel are apart in the other by the
+    parallax: focal length times distance of the cameras times difference of the inverse depths.
     """
     rows, columns = (depth.shape[0] - 1) // _SPARSE + 1, (depth.shape[1] - 1) // _SPARSE + 1
     own = np.zeros((rows, columns), np.bool_)
@@ -136,7 +143,7 @@ def _list_beside(depth: F4, pixels: U4, parallax: float) -> U4:
 
 @kernel
 def _row_and_column(pixel: int, row: int, width: int) -> tuple[int, int]:
-    """Return where the pixel of an index lies; it is quick in the row of the pixel before."""
+    """Return row and column of a flat pixel index, quickly if it is in ``row``, a guess."""
     column = pixel - row * width
     if not 0 <= column < width:
         row = pixel // width
@@ -146,9 +153,10 @@ def _row_and_column(pixel: int, row: int, width: int) -> tuple[int, int]:
 
 @kernel
 def _extent(depth: F4, pixels: U4, own: Bool) -> tuple[int, int, int, int, float, float]:
-    """Return first and last row and column of some pixels, the least depth of all, their greatest.
+    """Return first and last row and column and greatest depth of some pixels, and the least of all.
 
-    ``own`` becomes which of the sparse pixels are theirs.
+    The order is top, bottom, left, right, least and greatest depth. ``own`` is set to True at the
+    sparse pixels that are among them.
     """
     top, bottom, left, right = depth.shape[0], -1, depth.shape[1], -1
     near, far = np.float32(np.inf), np.float32(0)
@@ -171,7 +179,11 @@ def _extent(depth: F4, pixels: U4, own: Bool) -> tuple[int, int, int, int, float
 
 @kernel
 def _see_pixels(depth: F4, pixels: U4, rays: tuple[F4, F4, F4], lens: Lens) -> F4:
-    """Return where a camera sees pixels: (4, n) column, row, inverse distance, and their depth."""
+    """Return the projection (4, n) of depth pixels into a camera.
+
+    The rows are column, row, inverse depth in the camera (0 where it does not see the pixel), and
+    depth in the depth image.
+    """
     by_column, by_row, shift = rays
     moved = np.zeros((4, pixels.size), np.float32)
     v, width = 0, depth.shape[1]
@@ -190,11 +202,11 @@ def _see_pixels(depth: F4, pixels: U4, rays: tuple[F4, F4, F4], lens: Lens) -> F
 
 @kernel
 def _land(place: F4, labels: I4, half: float, size: tuple[int, int], boxes: I4) -> I4:
-    """Return the pixels whose middle lies in the square that a pixel of the depth image covers.
+    """Return the square of image pixels that each depth pixel covers with their centres.
 
-    They are (n, 4) left, top, and one more than right and bottom; ``boxes`` become those around
-    the squares of each label. A pixel lands at (4, n) column, row, inverse distance, and has a
-    depth; ``half`` is half the pixels of the image to one of the depth image, at equal distance.
+    Squares are (n, 4) left, top, right + 1, bottom + 1; zeros outside the image. ``boxes`` is set
+    to the box around the squares of each label. ``place`` is from `_see_pixels`; ``half`` is half
+    the colour pixels per depth pixel at equal distance.
     """
     nought, one = np.float32(0), np.float32(1)
     width, height = np.float32(size[0]), np.float32(size[1])
@@ -216,7 +228,7 @@ def _land(place: F4, labels: I4, half: float, size: tuple[int, int], boxes: I4) 
 
 @kernel
 def _window(boxes: I4, margin: int, size: tuple[int, int]) -> tuple[int, int, int, int]:
-    """Return the window around boxes, which then tell of places in it; empty boxes become 0."""
+    """Return the window around boxes, and shift the boxes into it; empty boxes become zeros."""
     left, top, right, bottom = size[0], size[1], 0, 0
     for box in boxes:
         if box[2] > 0:
@@ -237,7 +249,10 @@ def _window(boxes: I4, margin: int, size: tuple[int, int]) -> tuple[int, int, in
 def _paint(
     squares: I4, labels: I4, near: F4, corner: tuple[int, int], nearest: F4, seen: I4
 ) -> None:
-    """Paint the labels of squares into a window from ``corner`` on, where they are the nearest."""
+    """Paint the labels of squares into the window at ``corner``, where they are the nearest.
+
+    ``near`` (n,) and ``nearest`` (h, w) are inverse depths.
+    """
     left, top = corner
     for i in range(labels.size):
         for v in range(squares[i, 1] - top, squares[i, 3] - top):
@@ -249,7 +264,10 @@ def _paint(
 
 @kernel
 def _front(around: F4, corner: tuple[int, int], cell: int, shape: tuple[int, int]) -> F4:
-    """Return the greatest inverse distance of points in each cell of a window."""
+    """Return the greatest inverse depth of points in each cell of a window.
+
+    ``around`` is from `_see_pixels`; cells are squares of ``cell`` pixels.
+    """
     height, width = np.float32(shape[0]), np.float32(shape[1])
     left, top, per_cell = np.float32(corner[0]), np.float32(corner[1]), np.float32(1 / cell)
     front = np.zeros((shape[0] // cell + 1, shape[1] // cell + 1), np.float32)
@@ -263,7 +281,7 @@ def _front(around: F4, corner: tuple[int, int], cell: int, shape: tuple[int, int
 
 @kernel
 def _hide(front: F4, cell: int, boxes: I4, nearest: F4, seen: I4) -> None:
-    """Give pixels in boxes no label where the front of their cell is nearer than they are."""
+    """Set the label of pixels in boxes to 0 where the front of their cell is nearer."""
     limit, share = np.zeros(seen.shape[1], np.float32), np.float32(1 - _HIDDEN)
     for k in range(boxes.shape[0]):
         left, top, right, bottom = boxes[k, 0], boxes[k, 1], boxes[k, 2], boxes[k, 3]

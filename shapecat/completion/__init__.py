@@ -1,4 +1,4 @@
-"""What is hidden of an object: its whole box, from the sides that are seen."""
+"""The box of a whole object, estimated from its visible sides."""
 
 from shapecat.completion.fused import BoxViews, FusedBox, FusedBoxes, fuse_boxes
 from shapecat.completion.outline import DIRECTIONS

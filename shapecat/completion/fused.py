@@ -1,4 +1,4 @@
-"""One whole box for an object, from its outlines in several views."""
+"""The full box of an object, fused from its outlines in several views."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -12,25 +12,26 @@ from shapecat.completion.whole import COSINES, SINES, faced, footprint
 __all__ = ["BoxViews", "FusedBox", "FusedBoxes", "fuse_boxes"]
 
 _STILL_M = 0.05
-"""Centres stray less while an object stands still."""
+"""While the centre moves less than this, the object stands still."""
 _UNSEEN = 0.05
-"""Weight of an outline where it does not face the sensor, beside those that do."""
+"""Weight of an outline in directions that do not face the sensor; in those that do it is 1."""
 _SQUARE = 0.2
-"""Weight of the yaw of a square footprint; that of an elongated one is its elongation more."""
+"""Weight of the yaw of a square footprint; the elongation of a footprint adds to it."""
 _COMMON = 0.5
-"""Share of a single view's error that all views have in common, as they see the same side."""
+"""Share of a view's variance that all views have in common, as they see the same side."""
 
 
 class BoxViews(NamedTuple):
-    """Full boxes of k views of one object, in one frame.
+    """The full boxes of one object in k views, in a common frame.
 
     Attributes
     ----------
-    centers, sizes, stds : (k, 3) metres: centres, lengths, and the deviations of the lengths.
+    centers : (k, 3) metres.
     axes : (k, 3, 3) the columns are the axes of the boxes; the third one is up.
-    outlines : (k, 96) metres, how far what is seen reaches from the centre in each direction, from
-        the first axis towards the second.
-    sensors : (k, 3) metres, where each view is from.
+    sizes, stds : (k, 3) metres, the lengths along the axes and their standard deviations.
+    outlines : (k, 96) metres, the visible outlines about the centres, as in
+        `shapecat.types.FullBox`.
+    sensors : (k, 3) metres, the position of the sensor in each view.
     """
 
     centers: F8
@@ -42,7 +43,7 @@ class BoxViews(NamedTuple):
 
 
 class FusedBoxes(NamedTuple):
-    """The boxes of one object, one per view and all of one size; fields as in `BoxViews`."""
+    """The box of one object in k views, of the same size in all; fields as in `BoxViews`."""
 
     centers: F8
     axes: F8
@@ -51,12 +52,12 @@ class FusedBoxes(NamedTuple):
 
 
 class FusedBox(NamedTuple):
-    """The box that several views of an object agree on.
+    """The box of an object, fused from the views in which it stands in one place.
 
     Attributes
     ----------
-    place : (3,) metres, the place of the object in those views.
-    center, axes, size, std : (3,), (3, 3), (3,), (3,) of the box at that place, as in `BoxViews`.
+    place : (3,) metres, the box centre of the most central view.
+    center, axes, size, std : (3,), (3, 3), (3,), (3,) the fused box, as in `BoxViews`.
     """
 
     place: F8
@@ -66,7 +67,10 @@ class FusedBox(NamedTuple):
     std: F8
 
     def in_views(self, centers: F8, axes: F8, sizes: F8) -> FusedBoxes:
-        """Return its box in views; one that shows it elsewhere keeps its own centre and yaw."""
+        """Return the box in views (k,) of the object, given their boxes as in `BoxViews`.
+
+        A view that shows the object elsewhere keeps its own centre and yaw.
+        """
         still = np.linalg.norm(centers - self.place, axis=1) < _STILL_M
         return FusedBoxes(
             np.where(still[:, None], self.center, centers),
@@ -77,16 +81,16 @@ class FusedBox(NamedTuple):
 
 
 def fuse_boxes(views: BoxViews, weights: F8, posterior: F8, categories: Sequence[str]) -> FusedBox:
-    """Return the size of an object, and the centre and the yaw that it has while it stands still.
+    """Estimate the size of an object, and its centre and yaw while it stands still.
 
-    The outlines of the views from which it stands in the same place are laid over each other, and
-    the footprint is estimated from their median.
+    The outlines of the views that show it in the same place are overlaid, and the footprint is
+    estimated from their median.
 
     Parameters
     ----------
     views : at least one.
-    weights : (k,) of the views.
-    posterior : (c,) of the track, in the order of ``categories``.
+    weights : (k,) the weight of each view.
+    posterior : (c,) probabilities of the track, in the order of ``categories``.
     """
     middle = _median(views.centers, weights)
     first = int(np.linalg.norm(views.centers - middle, axis=1).argmin())
@@ -109,7 +113,7 @@ def fuse_boxes(views: BoxViews, weights: F8, posterior: F8, categories: Sequence
 
 
 def _mean_axes(views: BoxViews, weights: F8) -> F8:
-    """Return the axes (3, 3) of the first view, turned to the mean yaw: quarter turns are alike."""
+    """Return the axes (3, 3) of the first view, turned to the mean yaw modulo 90 degrees."""
     first = views.axes[0]
     x, y, _ = first.T @ views.axes[:, :, 0].T
     length, width = views.sizes[:, 0], views.sizes[:, 1]
@@ -119,9 +123,9 @@ def _mean_axes(views: BoxViews, weights: F8) -> F8:
 
 
 def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F8]:
-    """Return the median outline about a place, and the share of views that face each direction.
+    """Return the median outline about ``origin``, and the share of views that see each direction.
 
-    Directions go around from the first of the axes ``base``.
+    Both are (96,), from the first of the axes ``base`` to the second.
     """
     x, y, _ = (views.axes[:, :, 0] @ base).T
     around = _turned(views.outlines, np.arctan2(y, x))
@@ -129,7 +133,7 @@ def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F
     reached = around + places[:, :1] * COSINES + places[:, 1:2] * SINES
     facing = faced(((views.sensors - origin) @ base)[:, :2])
     each = weights[:, None] * np.where(facing, 1.0, _UNSEEN)
-    # A view of a part reaches less far: it must not outvote what others show of the rest.
+    # A view of only a part reaches less far: it must not outvote views of the rest.
     whole = weights >= weights.max()
     shown = _median(reached[whole], each[whole])
     reached = np.where(whole[:, None], reached, np.maximum(reached, shown))
@@ -138,7 +142,7 @@ def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F
 
 
 def _turned(outlines: F8, angles: F8) -> F8:
-    """Return outlines (k, n), each turned by an angle, interpolated between its directions."""
+    """Return outlines (k, n), each turned by its angle (k,), radians, with interpolation."""
     rows = np.arange(len(outlines))[:, None]
     steps = np.arange(DIRECTIONS) - angles[:, None] * (DIRECTIONS / (2 * np.pi))
     before = np.floor(steps).astype(np.int64)
@@ -148,7 +152,7 @@ def _turned(outlines: F8, angles: F8) -> F8:
 
 
 def _alike(axes: F8, sizes: F8, size: F8) -> F8:
-    """Return axes (k, 3, 3), a quarter turned where a box is the other way round than ``size``."""
+    """Return axes (k, 3, 3), turned by 90 degrees where ``size`` has length and width swapped."""
     other = (sizes[:, 0] < sizes[:, 1]) != (size[0] < size[1])
     quarter = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]])
     return np.where(other[:, None, None], axes @ quarter, axes)
@@ -160,7 +164,7 @@ def _about_z(angle: float) -> F8:
 
 
 def _median(values: F8, weights: F8) -> F8:
-    """Return the weighted median (n,) of values (k, n); weights (k,), or for each value."""
+    """Return the weighted median (n,) of values (k, n) for weights (k,) or (k, n)."""
     weights = np.broadcast_to(weights if weights.ndim == 2 else weights[:, None], values.shape)
     order = np.argsort(values, axis=0, kind="stable")
     summed = np.cumsum(np.take_along_axis(weights, order, 0), axis=0)

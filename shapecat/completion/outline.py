@@ -1,9 +1,9 @@
-"""Outlines of footprints as support functions: how far points, an oval, both reach each way.
+"""Outlines of footprints as support functions.
 
-The reach h of a convex outline in the direction t is the largest ``p . t`` of its points. That of a
-circle is ``center . t + radius``; an oval is wider one way and narrower across, to first order by
-``p cos 2a + q sin 2a`` in the direction a. Both are linear in what is sought. The reach of a union
-is the larger one.
+The support function of a convex outline in the direction t is the largest ``p . t`` of its points
+p: how far the outline reaches that way. For a circle it is ``center . t + radius``. For an oval,
+``p cos 2a + q sin 2a`` is added at the angle a (to first order). Both are linear in the unknowns.
+For a union it is the larger one.
 """
 
 import numpy as np
@@ -14,24 +14,26 @@ from shapecat.jit import kernel
 __all__ = ["DIRECTIONS", "QUARTER", "fit_oval", "narrowest", "reach", "rectangle"]
 
 DIRECTIONS = 96
-"""Every 3.75 degrees; a quarter turn is a whole number of them."""
+"""Directions of an outline, every 3.75 degrees; a quarter turn is a whole number of them."""
 QUARTER, _HALF = DIRECTIONS // 4, DIRECTIONS // 2
 _ROUNDS = 5
 _OUTLIER = 0.03
-"""Deviations beyond this share of the radius are of handles, and pull no harder."""
+"""Huber threshold of the fit, as a share of the radius: handles deviate more."""
 
 
 @kernel
 def reach(x: F4, y: F4, strays: I4, noise: float, flat: float, cosines: F8, sines: F8) -> F8:
-    """Return (k,) how far points reach in each of k directions, but for some points each.
+    """Return the support function (k,) of points in k directions, without the farthest points.
 
     A flat side reaches as far as the mean of its points.
 
     Parameters
     ----------
-    strays : (k,) so many points are left out.
-    noise : metres; points so near to the farthest are of its side.
-    flat : a side is flat that has such a share of the points; with fewer, it counts for less.
+    x, y : (n,) the points, metres.
+    strays : (k,) number of points to leave out in each direction.
+    noise : metres; points less than this from the farthest one form a side. 0: no side is flat.
+    flat : share of the points that make a side flat; with fewer the correction is proportional.
+    cosines, sines : (k,) the directions.
     """
     result, highest = np.zeros(cosines.size), np.zeros(strays.max() + 1, np.float32)
     for k in range(cosines.size):
@@ -52,7 +54,7 @@ def reach(x: F4, y: F4, strays: I4, noise: float, flat: float, cosines: F8, sine
 
 @kernel
 def _lifted(x: F4, y: F4, a: float, b: float, top: float, noise: float, flat: float) -> float:
-    """Return how far the farthest points of a side are from the mean of them, if it is flat."""
+    """Return how far ``top`` is beyond the mean of the points of its side, if that is flat."""
     count, total = 0, 0.0
     for i in range(x.size):
         below = top - (a * x[i] + b * y[i])
@@ -74,20 +76,22 @@ def _insert(ascending: F4, first: int, value: float) -> None:
 def fit_oval(
     reached: F8, seen: F8, roundness: float, cosines: F8, sines: F8
 ) -> tuple[F8, float, float]:
-    """Fit an oval to an outline by weighted least squares, of which one side is seen.
+    """Fit an oval to an outline that is seen from one side, by robust least squares.
 
-    Of the side that faces no sensor counts what turns out to reach as far as the oval, as the far
+    A direction that faces no sensor counts only if the outline reaches the oval there, as the far
     rim of a bowl does.
 
     Parameters
     ----------
-    reached : (k,) of `reach`.
+    reached : (k,) metres, the support function from `reach`.
     seen : (k,) weight of each direction, 0 for those that face no sensor.
-    roundness : so many directions weigh against an oval.
+    roundness : weight of a circular shape, in directions.
+    cosines, sines : (k,) the directions.
 
     Returns
     -------
-    (k,) the reach of the oval; its mean radius; the root mean square deviation of what is seen.
+    The support function (k,) of the oval, its mean radius, and the root mean square deviation of
+    the directions that face a sensor; metres.
     """
     rows = np.ones((5, reached.size))
     rows[0], rows[1] = cosines, sines
@@ -112,9 +116,9 @@ def fit_oval(
 
 @kernel
 def narrowest(reached: F8) -> int:
-    """Return which of the first quarter of directions a rectangle of the least area has.
+    """Return the direction, below `QUARTER`, of the smallest rectangle around an outline.
 
-    ``reached`` (`DIRECTIONS`,) is how far the outline extends in each direction, metres.
+    ``reached`` (`DIRECTIONS`,) is the support function, metres.
     """
     best, least = 0, np.inf
     for k in range(QUARTER):
@@ -126,9 +130,16 @@ def narrowest(reached: F8) -> int:
 
 
 def rectangle(reached: F8, side: int) -> tuple[float, float, float, float]:
-    """Return the centre of an outline along a direction and across it, its length and its width.
+    """Return the rectangle around an outline along a direction.
 
-    In metres; ``reached`` as in `narrowest`, ``side`` the number of the direction.
+    Parameters
+    ----------
+    reached : (`DIRECTIONS`,) metres, the support function.
+    side : index of the direction, from `narrowest`.
+
+    Returns
+    -------
+    Its centre along and across the direction, its length, and its width; metres.
     """
     ahead, left = reached[side], reached[side + QUARTER]
     back, right = reached[side + _HALF], reached[side + QUARTER + _HALF]

@@ -1,4 +1,4 @@
-"""The whole box of an object of which one side is seen."""
+"""The full box of an object that is seen from one side."""
 
 import math
 from collections.abc import Sequence
@@ -23,33 +23,33 @@ __all__ = ["COSINES", "ENOUGH_POINTS", "SINES", "Footprint", "complete", "faced"
 _ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 COSINES, SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 ENOUGH_POINTS = 256
-"""So many points tell the outline; more cost time."""
+"""Points used for the outline; more only cost time."""
 
 _TOP = 0.98
 """Share of the points below the top."""
 _NOISY_M, _FLAT = 0.004, 1 / 3
-"""Noise lifts the highest points of a flat top by so much at most; a face is flat that has such a
-share of the points."""
+"""Most that noise lifts the highest points of a flat top; share of the points that make a face
+flat."""
 _HANDLE = 0.06
-"""What reaches farther beyond the oval of a cup, as a share of its radius, is a handle."""
+"""Least that a handle sticks out beyond the oval of a cup, as a share of its radius."""
 _EDGEWISE = -0.2
-"""Cosine of the angle to the sensor from which on an outline is seen: a little behind its edge."""
+"""Cosine of the angle to the sensor above which an outline is visible: just past edge-on."""
 _NOISE_M, _GUESS = 0.006, 0.35
-"""Deviation of a length that is seen, and of the part that is guessed, as a share of it."""
+"""Standard deviation of a visible length; that of the guessed part, as a share of it."""
 _ANGULAR, _HANDLED = "box", "cup"
 _CIRCULAR = 1e3
 
 
 class _Form(NamedTuple):
-    """What is known of the outlines of a category.
+    """What is known about the outlines of a category.
 
     Attributes
     ----------
-    stray : share of the points that noise and mixed pixels put beyond the outline: fewer where a
-        surface curves away than where many points lie at the outline, as those of a wall do.
-    noise : metres; so deep are the readings of a flat side.
-    roundness : so many directions weigh against an oval: one side tells little of the depth.
-    fits : an oval fits if the side that is seen deviates by less than this share of the radius.
+    stray : share of the points that noise and mixed pixels put outside the outline: less where
+        the surface curves away than where many points lie on the outline, as on a wall.
+    noise : metres, the spread in depth of the readings on a flat side.
+    roundness : weight of a circular shape, in directions: one side says little about the depth.
+    fits : largest deviation of the visible side from an oval that fits, as a share of its radius.
     """
 
     stray: float = 0.016
@@ -69,9 +69,13 @@ _FORMS = {
 
 
 class Footprint(NamedTuple):
-    """The rectangle around a footprint: centre (2,) and size (2,), the deviation of the size.
+    """The rectangle around a footprint.
 
-    Its length goes along the direction ``side``.
+    Attributes
+    ----------
+    center : (2,) metres, in the axes of the outline's directions.
+    size, std : (2,) metres, length and width, and their standard deviations.
+    side : index of the direction of the length.
     """
 
     center: F8
@@ -83,20 +87,20 @@ class Footprint(NamedTuple):
 def complete(
     points: F4, up: ArrayLike, offset: float, posterior: F4, categories: Sequence[str]
 ) -> FullBox:
-    """Estimate the box around all of an object from the points that are seen of it.
+    """Estimate the box around a whole object from its visible points.
 
-    It stands on its support, on the rectangle of `footprint`.
+    The box stands on the support, on the rectangle of `footprint`.
 
     Parameters
     ----------
     points : (n, 3) metres, sensor frame, finite; the sensor is at the origin.
     up : (3,) unit vector, sensor frame.
-    offset : metres; ``up @ p`` of the support.
-    posterior : (c,) in the order of ``categories``.
+    offset : metres, ``up @ p`` for the points p of the support.
+    posterior : (c,) probabilities, in the order of ``categories``.
 
     Raises
     ------
-    ValueError : there is no point.
+    ValueError : ``points`` is empty.
     """
     if len(points) == 0:
         msg = "a box needs at least one point"
@@ -122,22 +126,26 @@ def complete(
 
 
 def faced(toward: F8) -> Bool:
-    """Return (..., k) which directions of an outline sensors see, ``toward`` (..., 2) it."""
+    """Return whether each direction of an outline faces a sensor: (..., `DIRECTIONS`) bool.
+
+    ``toward`` (..., 2) are horizontal vectors from the object to the sensors.
+    """
     x, y = toward[..., :1], toward[..., 1:]
     return np.asarray(x * COSINES + y * SINES > _EDGEWISE * np.maximum(np.hypot(x, y), 1e-9))
 
 
 def footprint(seen: F8, facing: F8, posterior: F8, categories: Sequence[str]) -> Footprint:
-    """Estimate the footprint of an object from the outline of what is seen of it.
+    """Estimate the footprint of an object from its visible outline.
 
-    If it is angular, it is what is seen; else the oval that is seen the front of, and beyond that
-    of a cup what else is seen, its handle. Where no oval fits, as to a bottle that lies, it is what
-    is seen as well. The rectangle around it has the least area.
+    The footprint of a box is the visible outline. For other categories it is the oval fitted to
+    the visible side, for a cup with its handle; if no oval fits, as for a bottle that lies down,
+    it is again the visible outline. The result is the rectangle of least area around it.
 
     Parameters
     ----------
-    seen : (k,) metres, how far what is seen reaches in each direction.
+    seen : (k,) metres, the support function of the visible points.
     facing : (k,) weight of each direction, 0 for those that face no sensor.
+    posterior : (c,) probabilities, in the order of ``categories``.
     """
     likely = dict(zip(categories, np.asarray(posterior).tolist(), strict=True))
     category, angular = max(likely, key=likely.__getitem__), likely.get(_ANGULAR, 0.0)
@@ -165,13 +173,13 @@ def footprint(seen: F8, facing: F8, posterior: F8, categories: Sequence[str]) ->
 def _reach(points: F4, facing: Bool, category: str) -> F8:
     x, y = np.ascontiguousarray(points[:, :2].T)
     form = _FORMS.get(category, _Form())
-    # Noise goes along the rays: less of it lies beyond the edges that face no sensor.
+    # Noise is along the rays: less of it lies beyond edges that face no sensor.
     strays = (np.where(facing, 1.0, 0.5) * form.stray * len(points)).astype(np.int64)
     return np.asarray(reach(x, y, strays, form.noise, _FLAT, COSINES, SINES))
 
 
 def _bounds(heights: F4) -> tuple[float, float, float]:
-    """Return the bottom, the lowest height that is seen, and the top, above the support."""
+    """Return bottom, lowest visible height and top, from heights (n,) above the support, metres."""
     ascending, stray = np.sort(heights), int((1 - _TOP) * len(heights))
     lowest, top = float(ascending[stray]), float(ascending[-1 - stray])
     near = ascending[np.searchsorted(ascending, top - _NOISY_M) :]

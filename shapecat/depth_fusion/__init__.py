@@ -1,6 +1,6 @@
 """Depth fusion: consecutive depth images become one, before detection (thesis 4.2).
 
-`fuse` joins a frame with those that `RecentFrames` remembers.
+`fuse` joins a frame with the earlier ones that `RecentFrames` keeps.
 """
 
 from shapecat.depth_fusion.fusion import fuse, with_own_readings

@@ -1,8 +1,8 @@
 """Consecutive depth images become one with less noise and fewer holes (thesis 4.2).
 
-Every pixel of the current image is looked up in the earlier ones, where their camera saw the same
-point. So pixels keep their meaning, a reading that is hidden in the earlier image is never mixed
-in, and what has moved since disagrees and is left out.
+Each pixel of the current image is projected into the earlier ones. So the pixels stay those of the
+current camera, a surface that an earlier image does not see is never mixed in, and readings of
+anything that has moved since disagree and are left out.
 """
 
 from collections.abc import Sequence
@@ -20,37 +20,39 @@ from shapecat.types import Camera, Frame, Pose, Scene
 __all__ = ["fuse", "with_own_readings"]
 
 AGREE = 0.006
-"""Largest difference in inverse depth of two readings of one point, 1/m: two steps of a Kinect and
-twice its noise; 6 mm at 1 m, 24 mm at 2 m. With more, low things smear when they move."""
+"""Largest difference in inverse depth between two readings of one point, 1/m: two steps of a
+Kinect and twice its noise; 6 mm at 1 m, 24 mm at 2 m. With more, low objects smear when they
+move."""
 LEAST_SHARE = 0.9
-"""Of the readings compared those without a `DISCONTINUITY` between them: an image with fewer was
-taken elsewhere than its pose says."""
+"""Least share of the compared readings without a `DISCONTINUITY` between them; with less, the pose
+of the earlier image is wrong."""
 STRIDE = 8
-"""Pixels between those that are compared to tell that share."""
+"""Step between the pixels that are compared for that share."""
 REACH = 2
-"""Pixels from a hole to a reading of the surface that may be continued into it."""
+"""Greatest distance, in pixels, of a hole from a reading whose surface may continue into it."""
 
 
 def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
     """Average the readings of a depth image with those of earlier ones, and fill its holes.
 
-    1. An earlier image counts if most of what it shows is where the current one has it.
-    2. A reading becomes the mean of itself and of those that agree with it (`AGREE`); where they
-       do not, something has moved or was hidden, and the current reading stays as it is.
-    3. A hole gets the mean of earlier readings that continue a surface which the current image
-       sees beside it: not what stood there before it moved away.
+    1. An earlier image counts if most of its readings agree with the current ones.
+    2. A reading becomes the mean of itself and the earlier readings that agree with it (`AGREE`).
+       Where they disagree, something has moved or was hidden, and the current reading stays.
+    3. A hole gets the mean of the earlier readings that continue a surface beside it in the current
+       image. Readings of an object that has moved away do not.
 
-    differs: the thesis joins the clouds, and subsamples them.
+    differs: the thesis merges the clouds and subsamples them.
 
     Parameters
     ----------
+    frame : the current frame; a point cloud is returned as it is.
     earlier : from `RecentFrames`, the newest first.
-    range_m : readings farther away stay as they are.
+    range_m : metres; readings farther away stay as they are.
 
     Returns
     -------
-    The frame with another depth image; itself if no earlier image counts. Cost and memory do not
-    depend on what the images show.
+    The frame with the fused depth image; the frame itself if no earlier image counts. Time and
+    memory do not depend on the content of the images.
     """
     depth, camera = frame.depth, frame.camera
     if depth is None or camera is None or not earlier:
@@ -76,7 +78,7 @@ def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
 
 
 def with_own_readings(scene: Scene, frame: Frame) -> Scene:
-    """Leave out of the indices of a scene the pixels where the frame itself has no reading."""
+    """Remove from the candidates of a scene the pixels where the frame itself has no reading."""
     if frame.depth is None:
         return scene
     seen = frame.depth.reshape(-1) > 0
@@ -89,10 +91,10 @@ def with_own_readings(scene: Scene, frame: Frame) -> Scene:
 
 
 def _projection(camera: Camera, earlier_from_sensor: Pose) -> tuple[F4, F4]:
-    """Return the matrix H and the vector h that lead from pixels to pixels.
+    """Return H (3, 3) and h (3,), which map pixels of this image to pixels of an earlier one.
 
-    The point at depth z in pixel (u, v) is at ``z * H @ (u, v, 1) + h`` in the earlier image:
-    its pixel times its depth there, and this depth.
+    The point at depth z in pixel (u, v) has the depth z' and the pixel (u', v') in the earlier
+    image, where ``(z' u', z' v', z') = z * H @ (u, v, 1) + h``.
     """
     k = np.array([[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]])
     lens = k @ earlier_from_sensor.rotation @ np.linalg.inv(k)
@@ -101,7 +103,10 @@ def _projection(camera: Camera, earlier_from_sensor: Pose) -> tuple[F4, F4]:
 
 @kernel
 def _guide(depth: F4, range_m: float) -> F4:
-    """Return the depths to look for: the readings, and for holes that of a neighbour, negative."""
+    """Return the depth to look for at each pixel: its reading, or minus a neighbour's for a hole.
+
+    It is 0 beyond the range and without a neighbour.
+    """
     rows, columns = depth.shape
     guide = np.where(depth <= range_m, depth, np.float32(0))
     for v in range(rows):
@@ -126,7 +131,7 @@ def _guide(depth: F4, range_m: float) -> F4:
 
 @kernel
 def _share(guide: F4, before: F4, lens: F4, shift: F4) -> float:
-    """Return the share of the readings that can be compared which show the same surface."""
+    """Return the share of readings, among those in both images, that show the same surface."""
     columns = guide.shape[1]
     places = np.zeros((3, columns), np.float32)
     x, y, z = places[0], places[1], places[2]
@@ -143,7 +148,7 @@ def _share(guide: F4, before: F4, lens: F4, shift: F4) -> float:
 
 @kernel
 def _add_resting(guide: F4, before: F4, total: F4, count: F4) -> None:
-    """Do what `_add_moved` does for a camera that has not moved."""
+    """Do the same as `_add_moved`, for a camera that has not moved."""
     agree, jump = np.float32(AGREE), np.float32(DISCONTINUITY)
     zero, one = np.float32(0), np.float32(1)
     for v in range(guide.shape[0]):
@@ -160,7 +165,7 @@ def _add_resting(guide: F4, before: F4, total: F4, count: F4) -> None:
 
 @kernel
 def _add_moved(guide: F4, before: F4, lens: F4, shift: F4, total: F4, count: F4) -> None:
-    """Add readings of the same points that agree; fill holes that have got a reading."""
+    """Add the earlier readings that agree; a hole that gets one becomes a reading in ``guide``."""
     agree, jump = np.float32(AGREE), np.float32(DISCONTINUITY)
     places = np.zeros((3, guide.shape[1]), np.float32)
     x, y, z = places[0], places[1], places[2]
@@ -184,7 +189,7 @@ def _add_moved(guide: F4, before: F4, lens: F4, shift: F4, total: F4, count: F4)
 
 @kernel
 def _place(wanted: F4, v: int, lens: F4, shift: F4, x: F4, y: F4, z: F4) -> None:
-    """Write where the points of a row of pixels are in the earlier image: pixels and depth."""
+    """Write the column x, row y and depth z, in the earlier image, of the points of one row."""
     least = np.float32(NEAREST_M)
     row = np.float32(v)
     a, b = lens[0, 1] * row + lens[0, 2], lens[1, 1] * row + lens[1, 2]
@@ -199,7 +204,7 @@ def _place(wanted: F4, v: int, lens: F4, shift: F4, x: F4, y: F4, z: F4) -> None
 
 @kernel
 def _read(before: F4, x: float, y: float) -> Any:
-    """Interpolate between the four readings around a place; 0 where most of them is missing."""
+    """Interpolate between the four readings around (x, y); 0 if over half the weight is missing."""
     rows, columns = before.shape
     zero, one = np.float32(0), np.float32(1)
     if not ((x >= 0) & (y >= 0) & (x < columns - 1) & (y < rows - 1)):

@@ -1,4 +1,4 @@
-"""The last few frames of each topic, for those that fuse them (thesis 4.2)."""
+"""The last few frames of each topic, kept for depth fusion (thesis 4.2)."""
 
 from collections import Counter, deque
 from typing import NamedTuple
@@ -9,13 +9,13 @@ from shapecat.types import Frame, Pose
 __all__ = ["Earlier", "RecentFrames"]
 
 GAP_NS = 500_000_000
-"""Frames that are farther apart do not follow each other."""
+"""Longest time between two frames that are fused."""
 
 
 class Earlier(NamedTuple):
-    """A frame, and where the sensor of a later one stood in its sensor frame.
+    """An earlier frame, and the pose of the current sensor in its sensor frame.
 
-    The pose is None where it is not known: then the sensor can only be taken to have rested.
+    The pose is None if it is not known; the sensor is then assumed not to have moved.
     """
 
     frame: Frame
@@ -23,21 +23,21 @@ class Earlier(NamedTuple):
 
 
 class RecentFrames:
-    """Remembers of each topic as many frames as are fused with the next one."""
+    """Keeps, for each topic, the last frames, to be fused with the next one."""
 
     def __init__(self, count: int) -> None:
-        """Remember for fusing ``count`` frames into one; 1 remembers nothing."""
+        """Keep ``count - 1`` frames of each topic, so that ``count`` are fused into one."""
         self._kept = count - 1
         self._recent: dict[str, deque[tuple[Frame, Pose | None]]] = {}
         self._loose: Counter[str] = Counter()
         self._unplaced: Counter[str] = Counter()
 
     def before(self, frame: Frame, fixed_from_sensor: Pose | None) -> tuple[Earlier, ...]:
-        """Return the frames to fuse with this one, the newest first, and remember this one.
+        """Return the earlier frames to fuse with this one, the newest first, and keep this one.
 
-        None are left after a jump of the clock, a gap, another resolution or another sensor
-        frame, or when the pose comes or goes. Clouds that are no depth images are not fused:
-        without pixels nothing tells a reading of the same place from one of what was there before.
+        Earlier frames are dropped after a jump of the clock, a gap, a change of the camera or the
+        sensor frame, and when the pose becomes known or unknown. Point clouds are not fused:
+        without pixels, readings of an object that has moved away cannot be recognised.
         """
         if not self._kept:
             return ()
@@ -53,13 +53,13 @@ class RecentFrames:
         return found
 
     def warnings(self) -> list[str]:
-        """Return what a person should know about the frames seen so far."""
+        """Return warnings for the user about the frames so far."""
         return [
             f"{topic}: {n} frames are clouds, not depth images, and not fused"
             for topic, n in self._loose.items()
         ] + [
-            f"{topic}: nothing tells where the sensor was in {n} frames: "
-            "they are fused as if it had rested, where their readings agree"
+            f"{topic}: the pose of the sensor is unknown in {n} frames: "
+            "they are fused as if it had not moved, where their readings agree"
             for topic, n in self._unplaced.items()
             if n
         ]

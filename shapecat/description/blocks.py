@@ -1,4 +1,4 @@
-"""The layout of the descriptor: the blocks of numbers it is made of, and the name of each."""
+"""The layout of the descriptor: its blocks, and the names of its features."""
 
 from collections.abc import Iterator
 
@@ -70,9 +70,9 @@ def _slices() -> dict[str, slice]:
 
 
 BLOCKS: dict[str, slice] = _slices()
-"""Where each block of the descriptor is. ``metric`` and ``view`` depend on the scale."""
+"""The slice of each block in the descriptor. ``metric`` and ``view`` depend on the scale."""
 
 DESCRIPTOR_NAMES: tuple[str, ...] = tuple(
     f"{block}.{name}" for block, names in _BLOCK_NAMES.items() for name in names
 )
-"""The name of each number, ``block.name``."""
+"""The name of each feature, ``block.name``."""

@@ -1,4 +1,4 @@
-"""The context block: scale-free numbers about the whole object, upright in the world."""
+"""The context block: scale-free features of the whole object in its upright pose."""
 
 import numpy as np
 
@@ -55,7 +55,7 @@ _DIRECTIONS = 16
 
 @kernel
 def _ratio(a: float, b: float) -> float:
-    """Return a / (a + b): a ratio of lengths between 0 and 1; one half where both are 0."""
+    """Return a / (a + b), which maps a ratio of lengths to 0 to 1; 0.5 if both are 0."""
     return a / (a + b) if a + b > 0 else 0.5
 
 
@@ -71,7 +71,7 @@ def _width(px: F4, py: F4, c: float, s: float) -> float:
 
 @kernel
 def _sphere(x: F4, y: F4, z: F4, weight: F4) -> tuple[float, float, float]:
-    """Fit |p|^2 = 2 c.p + k; return residual / radius, radius and height of the centre."""
+    """Fit a sphere, |p|^2 = 2 c.p + k; return residual / radius, radius and z of the centre."""
     A = np.zeros((4, 5))
     for i in range(x.size):
         w = weight[i]
@@ -83,7 +83,7 @@ def _sphere(x: F4, y: F4, z: F4, weight: F4) -> tuple[float, float, float]:
             A[a, 4] += w * row[a] * squared
     for a in range(4):
         A[a, a] += 1e-4
-    # Gauss elimination: the matrix is positive definite, no pivots needed
+    # Gaussian elimination: A is positive definite and needs no pivots
     for a in range(4):
         for b in range(a + 1, 4):
             f = A[b, a] / A[a, a]
@@ -119,17 +119,25 @@ def context(
     high: float,
     out: F4,
 ) -> tuple[float, float, float]:
-    """Write the numbers named by `CONTEXT_NAMES`; return widths: greatest, across, along the view.
+    """Write the features named by `CONTEXT_NAMES`, and return three widths of the object.
 
     All lengths are in units of the mean distance between neurons, with the origin at their mean.
 
     Parameters
     ----------
-    points : (3, m) the points; base : height of the support; low, high : of the object.
-    x, y, z, weight : (k,) neurons and their share of the points.
-    normals, curvatures : as `fit_surfaces` returns them.
-    straight, paths : (k, k) distances between the neurons.
-    eye : (3,) the sensor.
+    points : (3, m) the points of the object.
+    x, y, z : (k,) positions of the neurons.
+    base : height of the support.
+    weight : (k,) each neuron's share of the points.
+    normals, curvatures : (3, k) and (2, k), from `fit_surfaces`.
+    straight, paths : (k, k) Euclidean distances, and distances along the surface.
+    eye : (3,) position of the sensor.
+    low, high : heights of the lowest and highest point.
+    out : the block ``context``, written in place.
+
+    Returns
+    -------
+    The greatest horizontal width, and the horizontal widths across and along the line of sight.
     """
     wide, across, along = _extents(points, high - low, eye, out[:5])
     _spreads(x, y, z, weight, normals, out[5:12])
@@ -151,7 +159,7 @@ def context(
 
 @kernel
 def _extents(points: F4, height: float, eye: F4, out: F4) -> tuple[float, float, float]:
-    """Compare height and widths; directions are counted from the line of sight, not of yaw."""
+    """Compare height and widths, in directions that start at the line of sight."""
     ex, ey = eye[0], eye[1]
     length = np.sqrt(ex * ex + ey * ey)
     ex, ey = (ex / length, ey / length) if length > 1e-6 else (1.0, 0.0)
@@ -198,7 +206,7 @@ def _spreads(x: F4, y: F4, z: F4, weight: F4, normals: F4, out: F4) -> None:
 
 @kernel
 def _harmonics(weight: F4, normals: F4, out: F4) -> None:
-    """Tell how the horizontal normals spread over yaw: the fourth harmonic is for boxes."""
+    """Write harmonics of the distribution of the normals over yaw; the fourth is high for boxes."""
     total = 1e-6
     c, s = np.zeros(3), np.zeros(3)
     for i in range(weight.size):
@@ -220,7 +228,7 @@ def _harmonics(weight: F4, normals: F4, out: F4) -> None:
 
 @kernel
 def _facing(level: F8, weight: F4, normals: F4, out: F4) -> None:
-    """Tell how much of the surface looks up, sideways and down."""
+    """Write the shares of the surface that face up, sideways and down."""
     for i in range(level.size):
         w, up = weight[i], normals[2, i]
         out[0] += w * (up > 0.8)
@@ -232,10 +240,10 @@ def _facing(level: F8, weight: F4, normals: F4, out: F4) -> None:
 
 @kernel
 def _axis(x: F4, y: F4, level: F8, height: float, weight: F4, normals: F4, out: F4) -> None:
-    """Compare the surface with one that turns about the vertical axis fitted to its normals."""
+    """Compare the surface with a surface of revolution about the axis from `vertical_axis`."""
     cx, cy, residual = vertical_axis(x, y, normals, weight)
     radius = radius2 = middle = 0.0
-    parts = np.zeros((2, 2))  # below and above half of the height: weight, radius
+    parts = np.zeros((2, 2))  # lower and upper half: weight, weighted radius
     for i in range(x.size):
         w = weight[i]
         rx, ry = x[i] - cx, y[i] - cy
@@ -265,7 +273,7 @@ def _axis(x: F4, y: F4, level: F8, height: float, weight: F4, normals: F4, out: 
 
 @kernel
 def _heights(level: F8, weight: F4, curvatures: F4, out: F4) -> None:
-    """Write mean, deviation and skew of the height, and the share that bulges."""
+    """Write mean, deviation and skew of the height, and the convex share of the surface."""
     mean = second = third = 0.0
     for i in range(level.size):
         mean += weight[i] * level[i]
@@ -281,7 +289,7 @@ def _heights(level: F8, weight: F4, curvatures: F4, out: F4) -> None:
 
 @kernel
 def _around(straight: F4, paths: F4, out: F4) -> None:
-    """Compare distances along the surface with straight ones."""
+    """Compare distances along the surface with Euclidean distances."""
     count = paths.shape[0]
     total = direct = longest = most = 0.0
     least = np.inf

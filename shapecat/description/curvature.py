@@ -1,4 +1,4 @@
-"""Normals and principal curvatures of the surface at each neuron, from the points around it."""
+"""Normals and principal curvatures of the surface at each neuron, from the nearby points."""
 
 import numpy as np
 
@@ -8,23 +8,24 @@ from shapecat.jit import kernel
 __all__ = ["assign", "fit_surfaces"]
 
 _RIDGE = 1e-3
-"""Weight of the pull of the quadric's coefficients to 0, per point of the neighbourhood."""
+"""Ridge penalty on the coefficients of the quadric, per point of the neighbourhood."""
 
 
 @kernel(fast=True)
 def assign(points: F4, x: F4, y: F4, z: F4, reach: float) -> tuple[F4, I4]:
-    """Sort points by the neuron nearest to them.
+    """Sort points by their nearest neuron.
 
     Parameters
     ----------
     points : (3, n) coordinates.
-    x, y, z : (k,) places of the neurons.
-    reach : points farther than this from every neuron are left out: they belong to a part of the
-        object that the graph does not cover.
+    x, y, z : (k,) positions of the neurons.
+    reach : greatest distance of a point from its neuron, in the same unit. Farther points are
+        dropped: they belong to a part of the object that the graph does not cover.
 
     Returns
     -------
-    (3, m) the sorted points, and (k + 1,) where those of each neuron begin.
+    (3, m) the sorted points, and (k + 1,) the index at which the points of each neuron begin, with
+    m at the end.
     """
     total, count = points.shape[1], x.size
     mask = np.int32(1)
@@ -76,23 +77,24 @@ def fit_surfaces(
 ) -> tuple[F4, F4]:
     """Fit a quadric around each neuron.
 
-    The neighbourhood is all points within ``radius`` of the neuron. In the frame of its principal
-    axes the height over the tangent plane is fitted by a full quadric (least squares, ridge), and
-    the curvatures follow from its first and second fundamental form.
+    The neighbourhood is all points within a radius of the neuron. The height above its plane of
+    least squares is fitted by a full quadric (ridge regression), and the curvatures follow from
+    the first and second fundamental forms.
 
     Parameters
     ----------
-    points, starts : as `assign` returns them.
-    x, y, z : (k,) places of the neurons.
-    straight : (k, k) distances between the neurons.
-    eye : (3,) the sensor.
+    points, starts : from `assign`.
+    x, y, z : (k,) positions of the neurons.
+    straight : (k, k) Euclidean distances between the neurons.
+    radius : of the neighbourhoods, in the same unit.
+    eye : (3,) position of the sensor.
 
     Returns
     -------
-    normals : (3, k) unit vectors, turned towards the eye.
+    normals : (3, k) unit vectors that point to the sensor's side.
     curvatures : (2, k) largest and smallest principal curvature, 1 / length; positive where the
-        surface bulges towards the eye. At least ``-4 / radius`` and at most ``4 / radius``: the
-        neighbourhood cannot show more. 0 where fewer than 6 points are near.
+        surface bulges towards the sensor. They are clipped to ``4 / radius`` either way, the most
+        that a neighbourhood can show, and 0 with fewer than 6 points in it.
     """
     count, total = x.size, points.shape[1]
     normals = np.zeros((3, count), np.float32)
@@ -112,7 +114,7 @@ def fit_surfaces(
     zero, one = np.uint64(0), np.uint64(1)
     for i in range(count):
         px, py, pz = x[i], y[i], z[i]
-        found = zero  # unsigned: no index is checked for counting from the end
+        found = zero  # unsigned: no check for negative indices
         for j in range(count):
             if straight[i, j] >= radius + reach[j]:
                 continue
@@ -139,7 +141,7 @@ def fit_surfaces(
 def _normal(
     u: F4, v: F4, w: F4, near: int, ex: float, ey: float, ez: float
 ) -> tuple[float, float, float]:
-    """Return the direction of least variance, (ex, ey, ez) made unit where there is none."""
+    """Return the direction of least variance; without one, the unit vector along (ex, ey, ez)."""
     su = sv = sw = suu = suv = suw = svv = svw = sww = np.float32(0)
     for k in range(near):
         a, b, c = u[k], v[k], w[k]
@@ -182,7 +184,7 @@ def _normal(
         if l1 > 1e-6:
             length = np.sqrt(l1)
             return a1 / length, b1 / length, c1 / length
-        # Points on a line: the normal is the part of the view across it.
+        # Points on a line: the normal is the part of the line of sight across it.
         if xx + yy + zz > 0:
             lx, ly, lz = xx, xy, xz
             if yy > xx and yy >= zz:
@@ -243,7 +245,7 @@ def _quadric(
         h11 += h * pq
         h02 += h * qq
     # Normal equations of h = c0 + c1 p + c2 q + c3 p^2 + c4 pq + c5 q^2. The ridge on c4 is half
-    # of the others': c3^2 + c4^2/2 + c5^2 does not depend on the choice of tangents.
+    # the others, as c3^2 + c4^2/2 + c5^2 does not depend on the choice of tangents.
     n = np.float64(near)
     ridge = _RIDGE * n
     A = np.zeros((6, 7))
@@ -257,7 +259,7 @@ def _quadric(
     A[0, 6], A[1, 6], A[2, 6], A[3, 6], A[4, 6], A[5, 6] = h00, h10, h01, h20, h11, h02
     _solve(A)
     p, q, r, s, t = A[1, 6], A[2, 6], 2 * A[3, 6], A[4, 6], 2 * A[5, 6]
-    # Fundamental forms of a height function; curvature is signed against the normal.
+    # Fundamental forms of a height function; curvature is positive away from the normal.
     root = np.sqrt(1 + p * p + q * q)
     E, F, G = 1 + p * p, p * q, 1 + q * q
     L, M, N = -r / root, -s / root, -t / root
@@ -277,7 +279,11 @@ def _quadric(
 
 @kernel(fast=True)
 def _solve(A: F4) -> None:
-    """Solve a positive definite system in place (Cholesky): lower half and right side in ``A``."""
+    """Solve a positive definite system in place (Cholesky).
+
+    ``A`` (n, n + 1) holds the lower half of the matrix, and the right side, which becomes the
+    solution.
+    """
     size = A.shape[0]
     for j in range(size):
         for k in range(j):

@@ -1,4 +1,4 @@
-"""The descriptor of the shape of an object: a fixed list of numbers."""
+"""The shape descriptor of an object: a vector of fixed length."""
 
 import numpy as np
 
@@ -20,9 +20,9 @@ __all__ = ["describe"]
 
 _MAX_POINTS = 1200
 _RADIUS = 2.2 * 1.15
-"""Radius of the neighbourhoods in which curvature is fitted, in spacings of the neurons."""
+"""Radius of the neighbourhoods in which curvature is fitted, in mean gaps between neurons."""
 _REACH = 3 * 1.15
-"""Points farther than this from every neuron are not described, in the same spacings."""
+"""Points farther than this from every neuron are ignored, in mean gaps between neurons."""
 _FAR = 1e6
 
 
@@ -39,21 +39,21 @@ def describe(points: F4, gas: NeuralGas, eye: F4) -> F4:
 
     Parameters
     ----------
-    points : (m, 3) metres, finite, level frame: z up, the support at z = 0; where x and y are 0
-        does not matter. Of more than 1200 every k-th is used.
+    points : (m, 3) metres, finite, level frame: z up, the support at z = 0, and the origin anywhere
+        on it. Of more than 1200 points, every k-th is used.
     gas : the graph of the points, in the same frame, with at least 2 neurons.
-    eye : (3,) metres, the place of the sensor in the same frame.
+    eye : (3,) metres, the position of the sensor in the same frame.
 
     Returns
     -------
-    (d,) finite numbers named by `DESCRIPTOR_NAMES`, in the blocks `BLOCKS`. They do not change
-    when everything turns about z or moves along x and y; nor, but for the blocks ``metric`` and
-    ``view``, when everything grows about the origin.
+    (d,) finite float32 features, named by `DESCRIPTOR_NAMES`, in the blocks `BLOCKS`. They are
+    invariant to rotations about z and to translations along x and y. All but the blocks ``metric``
+    and ``view`` are also invariant to scaling about the origin.
 
     Raises
     ------
     ValueError : an array has the wrong shape or is not finite, or the graph has fewer than 2
-        neurons or an edge to none of them.
+        neurons or an edge to a neuron that does not exist.
 
     Notes
     -----
@@ -92,7 +92,7 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
     cloud = np.zeros((3, total), np.float32)
     for k in range(total):
         for axis in range(3):
-            # so far away only from neurons that do not belong to these points; squares stay finite
+            # only points that are not the neurons' own are so far away; squares stay finite
             value = (points[k * step, axis] - middle[axis]) / unit
             cloud[axis, k] = min(max(value, -_FAR), _FAR)
     away = 0.0
@@ -106,7 +106,7 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
     paths = geodesic(straight, edges)
     cloud, starts = assign(cloud, x, y, z, np.float32(_REACH * gap))
     if cloud.shape[1] == 0:
-        # none is near: describe the neurons themselves
+        # no point is near: describe the neurons themselves
         cloud = _in_rows(x, y, z)
         for i in range(count):
             starts[i + 1] = i + 1
@@ -149,7 +149,7 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
 
 @kernel
 def _in_rows(x: F4, y: F4, z: F4) -> F4:
-    """Return coordinates as one array (3, n)."""
+    """Return x, y, z (n,) as one array (3, n)."""
     rows = np.zeros((3, x.size), np.float32)
     for i in range(x.size):
         rows[0, i], rows[1, i], rows[2, i] = x[i], y[i], z[i]
@@ -158,7 +158,7 @@ def _in_rows(x: F4, y: F4, z: F4) -> F4:
 
 @kernel
 def _owners(starts: I4) -> I4:
-    """Return the neuron of each point, of points that are sorted by neuron."""
+    """Return the neuron of each point, for points sorted by `assign`."""
     owner = np.zeros(starts[-1], np.int64)
     for k in range(starts.size - 1):
         for i in range(starts[k], starts[k + 1]):
@@ -177,9 +177,10 @@ def _finite(rows: F4) -> bool:
 
 @kernel
 def _own_units(neurons: F4) -> tuple[F4, F4, F4, F4, F8, float]:
-    """Return coordinates in the unit of the mean distance between neurons, about their mean.
+    """Return the neurons relative to their mean, in units of the mean distance between them.
 
-    Then the distances in these units, the mean, and the unit in metres (1 where all is one place).
+    The result is x, y, z (n,), the distances (n, n) in this unit, the mean (3,) in metres, and the
+    unit in metres, which is 1 if all neurons coincide.
     """
     count = neurons.shape[0]
     middle = np.zeros(3)
@@ -217,7 +218,7 @@ def _sum(rows: F4) -> float:
 
 @kernel
 def _height_range(z: F4) -> tuple[float, float]:
-    """Return the 2 % and 98 % quantile of ``z``, by a histogram of 256 bins."""
+    """Return the 2 % and 98 % quantiles of ``z`` (n,), from a histogram of 256 bins."""
     low, high = outer_range(z)
     if not high > low:
         return low, high

@@ -12,7 +12,7 @@ _NO_PATH = np.float32(1e30)
 
 @kernel(fast=True)
 def euclidean(x: F4, y: F4, z: F4) -> F4:
-    """Return the (n, n) distances between n places."""
+    """Return the distances (n, n) between points with coordinates x, y, z (n,)."""
     count = x.size
     result = np.zeros((count, count), np.float32)
     for i in range(count):
@@ -24,15 +24,15 @@ def euclidean(x: F4, y: F4, z: F4) -> F4:
 
 @kernel(fast=True)
 def geodesic(straight: F4, edges: U2) -> F4:
-    """Return the (n, n) lengths of the shortest paths along ``edges``.
+    """Return the lengths (n, n) of the shortest paths along the edges of a graph.
 
-    Source: Floyd 1962, Warshall 1962; thesis ch. 6. O(n**3), but 80 nodes take 16 µs: dense rows
-    are faster than Dijkstra's algorithm on a sparse graph of this size. Pairs without a path get
-    the straight distance plus the longest path there is.
+    A pair without a path gets its Euclidean distance plus the longest path in the graph. Source:
+    Floyd 1962, Warshall 1962; thesis ch. 6. O(n**3), but 80 nodes take 16 µs: for a graph of this
+    size, dense rows are faster than Dijkstra's algorithm.
 
     Parameters
     ----------
-    straight : (n, n) straight distances.
+    straight : (n, n) Euclidean distances.
     edges : (m, 2) pairs of nodes.
     """
     count = straight.shape[0]
@@ -45,7 +45,7 @@ def geodesic(straight: F4, edges: U2) -> F4:
     for i in range(count):
         paths[i, i] = 0
     via = np.zeros((4, padded), np.float32)
-    for k in range(0, count, 4):  # four nodes at a time: a row is read and written once for them
+    for k in range(0, count, 4):  # four nodes at a time: each row is read and written only once
         _ways(paths, k, via)
         for i in range(count):
             _shorten(paths, i, via, k)
@@ -60,7 +60,7 @@ def _less(a: float, b: float) -> float:
 
 @kernel(fast=True)
 def _ways(paths: F4, k: int, via: F4) -> None:
-    """Write row k, and the three after it, each with the shortcuts through those before it."""
+    """Write rows k to k + 3 to ``via``, each shortened through the rows before it."""
     first, second, third, fourth = paths[k], paths[k + 1], paths[k + 2], paths[k + 3]
     a = second[k]
     b = third[k]
@@ -79,7 +79,7 @@ def _ways(paths: F4, k: int, via: F4) -> None:
 
 @kernel(fast=True)
 def _shorten(paths: F4, i: int, via: F4, k: int) -> None:
-    """Let the paths of node i lead through the nodes k to k + 3 where that is shorter."""
+    """Route the paths of node i through the nodes k to k + 3 where that is shorter."""
     a = paths[i, k]
     b = _less(paths[i, k + 1], a + via[0, k + 1])
     c = _less(_less(paths[i, k + 2], a + via[0, k + 2]), b + via[1, k + 2])
@@ -94,7 +94,7 @@ def _shorten(paths: F4, i: int, via: F4, k: int) -> None:
 
 @kernel(fast=True)
 def _joined(paths: F4, straight: F4) -> F4:
-    """Return the paths without padding, and something for those that do not exist."""
+    """Return the paths without padding, and fill in those that do not exist."""
     count = straight.shape[0]
     result = np.zeros((count, count), np.float32)
     longest = np.float32(0)
@@ -119,7 +119,7 @@ def _joined(paths: F4, straight: F4) -> F4:
 
 @kernel(fast=True)
 def mean_gap(straight: F4) -> float:
-    """Return the mean distance from a node to the nearest other one; their distances are (n, n)."""
+    """Return the mean distance from a node to its nearest neighbour, from distances (n, n)."""
     count = straight.shape[0]
     total = 0.0
     for i in range(count):

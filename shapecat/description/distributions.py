@@ -1,4 +1,4 @@
-"""Histograms of distance and curvature over an object, its rings and its bands (thesis ch. 6)."""
+"""Histograms of distances and curvatures on an object, its rings and its bands (thesis ch. 6)."""
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from shapecat.jit import kernel
 __all__ = ["distributions"]
 
 _DISTANCE_RANGE = 2.6
-"""Distances between neurons are counted up to this many times their mean."""
+"""End of the distance histograms, in mean distances between neurons."""
 _CURVATURE = SHAPE_BINS + CURVED_BINS + MEAN_BINS
 # kernels read numbers, not dictionaries
 _CURVED, _UP = BLOCKS["curvature"].start, BLOCKS["up"].start
@@ -33,7 +33,7 @@ _BAND_PATHS, _BAND_STRAIGHT, _BAND_CURVED = (
 
 @kernel
 def _count(row: F4, start: int, bins: int, place: float, weight: float) -> None:
-    """Add ``weight`` at ``place`` (0 to 1) of a histogram, shared between the two nearest bins."""
+    """Add ``weight`` to a histogram at ``place`` (0 to 1), split between the two nearest bins."""
     at = min(max(place * bins - 0.5, 0.0), bins - 1.0)
     k = min(int(at), bins - 2)
     row[start + k] += weight * (k + 1 - at)
@@ -42,9 +42,9 @@ def _count(row: F4, start: int, bins: int, place: float, weight: float) -> None:
 
 @kernel
 def _find_bins(lengths: F4, i: int, scale: float, one: float, bins: I4, shares: F4) -> None:
-    """Write for row i of ``lengths`` the first of the two bins a length is shared between.
+    """Write, for each length in row i, the first of its two bins, and the share of the second.
 
-    And the share of the second, of a count of ``one``.
+    Shares add up to ``one``; ``scale`` is bins per unit of length.
     """
     last = np.float32(DISTANCE_BINS - 1)
     for j in range(lengths.shape[1]):
@@ -64,12 +64,12 @@ def distributions(
 
     Parameters
     ----------
-    z : (n,) heights of the nodes; the unit is the mean distance between neurons.
-    straight, paths : (n, n) distances in space and along the surface.
-    weight : (n,) shares of the points that the nodes stand for.
+    z : (n,) heights of the neurons, in units of the mean distance between neurons.
+    straight, paths : (n, n) Euclidean distances, and distances along the surface.
+    weight : (n,) each neuron's share of the points.
     normals : (3, n) unit vectors.
-    curvatures : (2, n) as `fit_surfaces` returns them.
-    out : the block of the descriptor, written in place.
+    curvatures : (2, n) from `fit_surfaces`.
+    out : the whole descriptor; the blocks ``curvature`` to ``band_curvature`` are written.
     """
     count = z.size
     width = 1 + _CURVATURE + 2 * DISTANCE_BINS
@@ -109,7 +109,7 @@ def distributions(
             curvature[k] += weight[i] * rows[i, 1 + k]
         place = (np.float64(normals[2, i]) + 1) / 2
         _count(up, np.int64(0), np.int64(UP_BINS), place, np.float64(weight[i]))
-    # numba compiles anew for every number that stands in a call, but not for these
+    # numba compiles a version for each literal number in a call, but not for these
     rings, bands = np.int64(RINGS), np.int64(BANDS)
     at, straight_at, curved_at = (
         np.int64(_RING_PATHS), np.int64(_RING_STRAIGHT), np.int64(_RING_CURVED),
@@ -146,9 +146,9 @@ def _partition(
     at_straight: int,
     at_curvature: int,
 ) -> None:
-    """Average ``rows`` over the parts in which ``order`` is cut at equal distances.
+    """Write the mean of ``rows`` over each of the equal intervals of ``order``.
 
-    A neuron counts in the two parts whose middles it lies between, so that a small change of the
+    A neuron counts in the two intervals whose middles are nearest, so that a small change of the
     graph changes the descriptor little.
     """
     low, high = outer_range(order)

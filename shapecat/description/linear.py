@@ -1,4 +1,4 @@
-"""Small linear systems that never fail."""
+"""A solver for small linear systems that never fails."""
 
 from shapecat.arrays import F8
 from shapecat.jit import kernel
@@ -10,9 +10,9 @@ _SINGULAR = 1e-10
 
 @kernel
 def solve(A: F8, b: F8) -> None:
-    """Solve A x = b in place for a symmetric positive matrix (n, n): b becomes x.
+    """Solve A x = b in place for a symmetric positive semidefinite matrix (n, n): b becomes x.
 
-    Gauss elimination; an unknown that the equations do not determine becomes 0.
+    The method is Gaussian elimination. An unknown that the equations do not determine becomes 0.
     """
     size = b.size
     for k in range(size):

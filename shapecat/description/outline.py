@@ -1,7 +1,7 @@
-"""The outline: how wide an object is in the image, slice by slice.
+"""The outline: the width of an object in the image, slice by slice.
 
-Depth cameras err along the line of sight, hardly across it; what widths tell is the surest part of
-a view from afar.
+Depth cameras err along the line of sight, hardly across it. In a view from afar, widths are the
+most reliable features.
 """
 
 import numpy as np
@@ -23,16 +23,23 @@ OUTLINE_NAMES = (
     "upright_fill",
     "long_fill",
 )
-_UPRIGHT, _TO_NARROW = np.bool_(0), np.bool_(1)  # Python's own would be compiled one by one
+_UPRIGHT, _TO_NARROW = np.bool_(0), np.bool_(1)  # Python's bools are compiled as two versions
 _LONG, _END = 2 * OUTLINE_SLICES, 4 * OUTLINE_SLICES
 
 
 @kernel
 def outline(cloud: F4, eye: F4, out: F4) -> None:
-    """Write the numbers named by `OUTLINE_NAMES` of points (3, n) seen from ``eye``.
+    """Write the features named by `OUTLINE_NAMES`.
 
-    Widths are measured twice: upwards, and along the longest direction of the outline, from its
-    wide to its narrow end. ``aside`` is how far the middle of a slice is from that of all.
+    Widths are measured in slices along two directions: upwards, and along the principal axis of
+    the outline from its wide to its narrow end. ``aside`` is the offset of the middle of a slice
+    from the mean of all slices.
+
+    Parameters
+    ----------
+    cloud : (3, n) points, z up, in units of the mean distance between neurons.
+    eye : (3,) position of the sensor in the same frame.
+    out : the block ``outline``, written in place.
     """
     across, upward = _image(cloud, eye)
     out[_END], out[_END + 3] = _widths(upward, across, _UPRIGHT, out[:_LONG])
@@ -54,7 +61,7 @@ def outline(cloud: F4, eye: F4, out: F4) -> None:
 
 @kernel
 def _image(cloud: F4, eye: F4) -> tuple[F4, F4]:
-    """Return the places of the points in an image: to the right, and upwards."""
+    """Return the image coordinates (n,) of the points: to the right, and upwards."""
     count = cloud.shape[1]
     across, upward = np.zeros(count, np.float32), np.zeros(count, np.float32)
     distance = max(np.sqrt(np.float64(eye[0]) ** 2 + eye[1] ** 2 + eye[2] ** 2), 1e-6)
@@ -77,7 +84,7 @@ def _widths(
     to_narrow: bool,  # noqa: FBT001  compiled kernels take their arguments by position
     out: F4,
 ) -> tuple[float, float]:
-    """Write width and offset of each slice; return the length and how much of its box is filled."""
+    """Write width and offset of each slice; return the relative length, and the filled share."""
     low, high = inner_range(along)
     length = max(high - low, 1e-6)
     least, most = np.zeros(OUTLINE_SLICES), np.zeros(OUTLINE_SLICES)

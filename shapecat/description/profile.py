@@ -14,11 +14,19 @@ PROFILE_NAMES = tuple(f"{i}_{name}" for i in range(PROFILE_SLICES) for name in _
 
 @kernel
 def vertical_axis(x: F4, y: F4, normals: F4, weight: F4) -> tuple[float, float, float]:
-    """Return the vertical line nearest to the horizontal lines along the normals.
+    """Find the vertical line nearest to the horizontal lines along the normals.
 
-    Its x and y, and the root mean square distance of the lines to it. ``x``, ``y`` and
-    ``weight`` are (n,), ``normals`` (3, n). A weak pull to the centre of
-    the neurons makes the answer unique where all normals are parallel or vertical.
+    A weak pull to the origin makes the result unique where all normals are parallel or vertical.
+
+    Parameters
+    ----------
+    x, y : (n,) positions of the neurons.
+    normals : (3, n) unit vectors.
+    weight : (n,) each neuron's share of the points.
+
+    Returns
+    -------
+    x and y of the line, and the root mean square distance of the horizontal lines from it.
     """
     axx = axy = ayy = bx = by = total = 0.0
     for i in range(x.size):
@@ -57,15 +65,17 @@ def profile(
 ) -> None:
     """Write the radial profile about the vertical axis, named by `PROFILE_NAMES`.
 
-    For each of 8 slices of the height: share of the points, mean and deviation of the radius over
-    the largest slice's, shares facing the axis and facing up, mean curvature.
+    Each of 8 horizontal slices has the share of the points, the mean radius and its deviation
+    (relative to the largest mean radius), the share that faces the axis, the mean of the normals'
+    z, and the mean curvature.
 
     Parameters
     ----------
-    x, y, z, weight : (n,) places of the nodes, and the shares of points they stand for.
-    normals, curvatures : (3, n) and (2, n) as `fit_surfaces` returns them.
+    x, y, z : (n,) positions of the neurons.
+    weight : (n,) each neuron's share of the points.
+    normals, curvatures : (3, n) and (2, n), from `fit_surfaces`.
     low, high : heights of the lowest and highest point.
-    out : the block of the descriptor, written in place.
+    out : the block ``profile``, written in place.
     """
     cx, cy, _ = vertical_axis(x, y, normals, weight)
     widest = 1e-6

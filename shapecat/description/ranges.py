@@ -1,4 +1,4 @@
-"""Ranges of values, also ones that a few stray values do not widen."""
+"""Ranges of values, with or without outliers."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ _LEAST = 1e-30
 
 @kernel(fast=True)
 def inner_range(values: F4) -> tuple[float, float]:
-    """Return the 2 % and the 98 % quantile of values (n,), interpolated in a histogram."""
+    """Return the 2 % and 98 % quantiles of values (n,), interpolated in a histogram."""
     low = high = values[0]
     for k in range(values.size):
         low = values[k] if values[k] < low else low
@@ -42,7 +42,7 @@ def inner_range(values: F4) -> tuple[float, float]:
 
 @kernel(fast=True)
 def outer_range(values: F4) -> tuple[float, float]:
-    """Return the smallest and the largest of values (n,)."""
+    """Return the smallest and the largest of values (n,), n >= 1."""
     low = high = values[0]
     for value in values:
         low = value if value < low else low

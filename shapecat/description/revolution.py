@@ -1,4 +1,4 @@
-"""The axis about which the points turn best, upright or not, and the profile along it."""
+"""Solids of revolution fitted to an object, upright or tilted, and the profile along the axis."""
 
 import numpy as np
 
@@ -22,24 +22,30 @@ REVOLUTION_NAMES = (
 )
 _ROUNDS = 4
 _OUTLIER = 3.0
-"""Residuals beyond this many root mean squares pull no harder."""
+"""Huber threshold of the fit, in root mean square residuals."""
 _DAMPING = 0.02
 _INWARD = -0.3
-_SHIFTS, _SHIFTS_AND_TILTS = np.int64(2), np.int64(4)  # plain numbers are compiled one by one
+_SHIFTS, _SHIFTS_AND_TILTS = np.int64(2), np.int64(4)  # numba compiles a version per literal
 
 
 @kernel
 def rotation_axis(x: F4, y: F4, z: F4, weight: F4, normals: F4) -> tuple[F8, F8, F8]:
-    """Find the line that the normals of the surface meet best.
+    """Find the line that comes closest to meeting all normals of a surface.
 
-    Source: Pottmann and Randrup 1998, for rotations alone. The line with direction a and moment b
-    meets the normal n at the point p when ``n . b + (p x n) . a`` is 0; the sum of its squares is
-    minimal over unit a, with b eliminated.
+    Source: Pottmann and Randrup 1998, restricted to rotations. A line with direction a and moment
+    b meets the normal n at the point p if ``n . b + (p x n) . a`` is 0. The weighted sum of
+    squares of this term is minimised over unit vectors a, with b eliminated.
+
+    Parameters
+    ----------
+    x, y, z : (n,) positions of the neurons.
+    weight : (n,) each neuron's share of the points.
+    normals : (3, n) unit vectors.
 
     Returns
     -------
-    A unit direction, a point, and (3,) the root mean squares along the three principal
-    directions of a, ascending: all small for a sphere, one for a cylinder.
+    The unit direction (3,), a point (3,) on the line, and the root mean squares (3,) for the three
+    principal directions of a, ascending: all are small for a sphere, one for a cylinder.
     """
     N, B, C = np.zeros((3, 3)), np.zeros((3, 3)), np.zeros((3, 3))
     for i in range(x.size):
@@ -52,7 +58,7 @@ def rotation_axis(x: F4, y: F4, z: F4, weight: F4, normals: F4) -> tuple[F8, F8,
                 B[j, k] += weight[i] * n[j] * m[k]
                 C[j, k] += weight[i] * m[j] * m[k]
     for j in range(3):
-        N[j, j] += 1e-2  # where the normals do not tell, the axis passes near the middle
+        N[j, j] += 1e-2  # where the normals leave it open, the axis passes near the origin
     _invert(N)
     # b = -N^-1 B a leaves a . (C - B^T N^-1 B) a to minimise.
     moment = np.zeros((3, 3))
@@ -106,13 +112,23 @@ def revolution(
     foot: F8,
     out: F4,
 ) -> None:
-    """Write the numbers named by `REVOLUTION_NAMES`.
+    """Write the features named by `REVOLUTION_NAMES`.
 
-    Two solids of revolution are fitted to the neurons (3, k) and measured on the points (3, n): one
-    whose axis is vertical through ``foot``, one whose axis begins as (``axis``, ``point``) and may
-    tilt. The axis of the second points to the narrow end: of each slice along it the share of the
-    points, the mean radius over the largest, the deviation from it, and the share of points facing
-    the axis.
+    Two solids of revolution are fitted to the neurons and measured on the points: one with a
+    vertical axis, and one whose axis may tilt. The second is cut into slices, from its wide to its
+    narrow end. Each slice has the share of the points, the mean radius (relative to the largest),
+    the deviation from that radius, and the share of the points that face the axis.
+
+    Parameters
+    ----------
+    cloud : (3, n) points.
+    owner : (n,) the nearest neuron of each point.
+    neurons, normals : (3, k) positions and unit vectors.
+    weight : (k,) each neuron's share of the points.
+    eye : (3,) position of the sensor.
+    axis, point : (3,) first guess of the tilted axis, from `rotation_axis`; overwritten.
+    foot : (3,) a point on the vertical axis, the first guess; overwritten.
+    out : the block ``revolution``, written in place.
     """
     slices = np.zeros((REVOLUTION_SLICES, 4))
     upright, before = np.zeros(3), np.zeros(3)
@@ -146,15 +162,16 @@ def revolution(
 
 @kernel
 def fit_axis(neurons: F4, weight: F4, normals: F4, axis: F8, point: F8, free: int) -> None:
-    """Move an axis so that the radius of the neurons is constant in each slice along it.
+    """Fit an axis such that the radius of the neurons is constant in each slice along it.
 
-    Gauss-Newton steps on the residuals of the radius, of which the mean of the slice is eliminated
-    (Golub and Pereyra 1973); neurons that face along the axis have no say about the radius.
+    Gauss-Newton steps reduce the deviations of the radius from the mean of its slice, which is
+    eliminated (Golub and Pereyra 1973). Neurons whose normal is along the axis have no weight.
 
     Parameters
     ----------
-    neurons, normals : (3, k); weight : (k,) share of the points.
-    axis, point : (3,) the first guess, overwritten by the result.
+    neurons, normals : (3, k) positions and unit vectors.
+    weight : (k,) each neuron's share of the points.
+    axis, point : (3,) direction and point of the first guess, overwritten by the result.
     free : 2 to shift the axis, 4 to tilt it as well.
     """
     limit = np.inf
@@ -164,7 +181,7 @@ def fit_axis(neurons: F4, weight: F4, normals: F4, axis: F8, point: F8, free: in
 
 @kernel
 def _across(axis: F8) -> tuple[F8, F8]:
-    """Return two unit vectors that make a right-handed frame with the axis."""
+    """Return two unit vectors that form a right-handed frame with the axis."""
     small = 0
     for j in range(1, 3):
         small = j if abs(axis[j]) < abs(axis[small]) else small
@@ -182,9 +199,10 @@ def _across(axis: F8) -> tuple[F8, F8]:
 def _place(
     cloud: F4, owner: I4, normals: F4, axis: F8, point: F8, first: F8, second: F8
 ) -> tuple[F8, F8]:
-    """Return rows along the axis, radius, direction across (2), weight; and the range along it.
+    """Return cylindrical coordinates (5, n) about the axis, and the range (2,) along it.
 
-    The weight is the fourth power of the sine between normal and axis.
+    The rows are the position along the axis, the radius, the radial unit vector (2), and a weight,
+    the fourth power of the sine of the angle between normal and axis.
     """
     rows = np.zeros((5, cloud.shape[1]))
     reach = np.zeros(2)
@@ -259,7 +277,7 @@ def _improve(
 
 @kernel
 def _derivatives(rows: F8, i: int, out: F8) -> None:
-    """Write 1, the radius, and its derivatives by two shifts and two tilts of the axis."""
+    """Write 1, the radius, and its derivatives with respect to two shifts and two tilts."""
     out[0], out[1] = 1.0, rows[1, i]
     out[2], out[3] = -rows[2, i], -rows[3, i]
     out[4], out[5] = -rows[2, i] * rows[0, i], -rows[3, i] * rows[0, i]
@@ -267,7 +285,7 @@ def _derivatives(rows: F8, i: int, out: F8) -> None:
 
 @kernel
 def _move(axis: F8, point: F8, first: F8, second: F8, move: F8, farthest: float) -> None:
-    """Shift and tilt the axis, by at most ``farthest`` and 0.3 rad."""
+    """Shift the axis by at most ``farthest``, and tilt it by at most 0.3 rad."""
     length = np.sqrt(move[0] ** 2 + move[1] ** 2)
     share = min(1.0, farthest / max(length, 1e-9))
     for j in range(3):
@@ -287,7 +305,12 @@ def _move(axis: F8, point: F8, first: F8, second: F8, move: F8, farthest: float)
 def _measure(
     cloud: F4, owner: I4, normals: F4, axis: F8, point: F8, slices: F8
 ) -> tuple[float, float, float]:
-    """Write the slices of `fit_axis` on all points; return its result."""
+    """Write the profile of all points about an axis, one row of ``slices`` per slice.
+
+    A row is the share of the points, the mean radius, the deviation from it, and the share of the
+    points that face the axis. Returns the root mean square residual, the length along the axis,
+    and the mean radius.
+    """
     first, second = _across(axis)
     rows, reach = _place(cloud, owner, normals, axis, point, first, second)
     count = rows.shape[1]

@@ -1,4 +1,4 @@
-"""A box and a ball fitted to the points: how well they fit, and where not."""
+"""A box and a ball fitted to the points: how well each fits, and where it does not."""
 
 import numpy as np
 
@@ -46,10 +46,20 @@ def solids(
     turned: F4,
     out: F4,
 ) -> None:
-    """Write the numbers named by `SOLID_NAMES`.
+    """Write the features named by `SOLID_NAMES`.
 
-    ``cloud`` (3, n) points in units of the object's size, ``owner`` (n,) their neurons, which are
-    at ``x``, ``y`` with ``normals``; ``turned`` the block about solids of revolution.
+    Lengths are in units of the mean distance between neurons.
+
+    Parameters
+    ----------
+    cloud : (3, n) points.
+    owner : (n,) the nearest neuron of each point.
+    x, y : (k,) positions of the neurons.
+    normals : (3, k) unit vectors.
+    eye : (3,) position of the sensor.
+    low, high : heights of the lowest and highest point.
+    turned : the block ``revolution``, already written.
+    out : the block ``solids``, written in place.
     """
     u, v = _box_frame(cloud, x, y, normals, eye)
     _box(u, v, cloud[2], owner, normals, low, high, out[:13])
@@ -66,13 +76,13 @@ def _log_ratio(a: float, b: float) -> float:
 
 @kernel
 def _box_frame(cloud: F4, x: F4, y: F4, normals: F4, eye: F4) -> tuple[F4, F4]:
-    """Return the points along the two sides of the upright box that fits the neurons best.
+    """Return the horizontal coordinates (n,) of the points in the upright box of best fit.
 
-    Both axes point to the sensor's side. The box is the one whose two visible walls the upright
-    surface is nearest to (Zhang et al. 2017, "L-shape fitting", by closeness).
+    Both axes point towards the sensor. The fit minimises the distance of the vertical surface from
+    the two visible walls (Zhang et al. 2017, "L-shape fitting", the closeness criterion).
     """
     u, v = np.zeros(x.size, np.float32), np.zeros(x.size, np.float32)
-    start = np.arctan2(eye[1], eye[0])  # so the answer turns with the scene
+    start = np.arctan2(eye[1], eye[0])  # so that the result turns with the scene
     one, zero = np.float32(1.0), np.float32(0.0)
     best, turn = np.inf, (one, zero, one, one)
     for k in range(_YAWS):
@@ -101,7 +111,7 @@ def _box_frame(cloud: F4, x: F4, y: F4, normals: F4, eye: F4) -> tuple[F4, F4]:
 
 @kernel
 def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, out: F4) -> None:
-    """Compare points with the three faces of a box that the sensor may see."""
+    """Compare points with the three faces of a box that the sensor can see."""
     count = u.size
     low_u, high_u = inner_range(u)
     low_v, high_v = inner_range(v)
@@ -120,7 +130,7 @@ def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, o
         face = 2 if dz <= du and dz <= dv else (0 if du <= dv else 1)
         share[face] += 1
         off[face] += min(du, dv, dz)
-        # 0 at the edge where two faces meet, 1 where a point is as far from it as can be
+        # 0 on the edge where two faces meet, 1 on the opposite edges
         corners[0, i] = max(du / long_u, dv / long_v)
         corners[1, i] = max(du / long_u, dz / tall)
         corners[2, i] = max(dv / long_v, dz / tall)
@@ -140,7 +150,7 @@ def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, o
 
 @kernel
 def _ball(cloud: F4, low: float, high: float, out: F4) -> None:
-    """Compare the points with the ball that fits them by least squares."""
+    """Compare the points with the ball fitted to them by least squares."""
     A, b = np.zeros((4, 4)), np.zeros(4)
     row = np.zeros(4)
     row[3] = 1.0

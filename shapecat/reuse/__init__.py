@@ -1,4 +1,4 @@
-"""Descriptions used again: an object that looks as in an earlier frame is not described anew."""
+"""Reuse of the descriptions of objects that look the same as in an earlier frame."""
 
 from shapecat.reuse.still import shows_the_same
 from shapecat.reuse.views import KeyView, find_repeats, reused, sight_of

@@ -10,12 +10,12 @@ from shapecat.types import Camera, Pose
 __all__ = ["AGREE", "agreement"]
 
 AGREE = 0.006
-"""Largest difference in inverse depth of two readings of one point, 1/m: two steps of a Kinect and
-twice its noise; 6 mm at 1 m, 24 mm at 2 m."""
+"""Largest difference in inverse depth between two readings of one point, 1/m: two steps of a
+Kinect and twice its noise; 6 mm at 1 m, 24 mm at 2 m."""
 _SAMPLES = 256
-"""About so many points are compared."""
+"""Approximate number of points to compare."""
 _KNOWN = 0.5
-"""So many of them must have a reading in the other image."""
+"""Least share of them that must have a reading in the other image."""
 
 
 def agreement(
@@ -25,14 +25,15 @@ def agreement(
 
     Parameters
     ----------
-    pixels : (n,) indices of the object in ``depth``.
+    pixels : (n,) flat indices of the object's pixels in ``depth``.
     depth, other : (h, w) metres, 0 where there is no reading.
-    other_from_one : moves points of ``depth`` to the frame of ``other``.
+    camera, other_camera : the cameras of ``depth`` and ``other``.
+    other_from_one : pose of the sensor of ``depth`` in the sensor frame of ``other``.
 
     Returns
     -------
-    The share of the points that ``other`` sees where they are, and by how much it sees these
-    nearer in the mean, in 1/m; (0, 0) if too few have a reading there.
+    The share of the compared points that agree with ``other``, and the mean inverse depth, in 1/m,
+    by which ``other`` sees these nearer; (0, 0) if too few points have a reading there.
     """
     turn, shift = other_from_one.rotation, other_from_one.translation
     known, agreeing, total = _compare(
@@ -63,7 +64,7 @@ def _compare(
     turn: F8,
     shift: F8,
 ) -> tuple[int, int, float]:
-    """Count points with a reading in the other image and those that agree; sum the differences."""
+    """Return how many points have a reading in ``other`` and agree, and their summed difference."""
     fx, fy, cx, cy = camera
     gx, gy, ax, ay = other_camera
     width = depth.shape[1]
@@ -93,10 +94,10 @@ def _compare(
 
 @kernel
 def _nearest_reading(depth: F4, row: int, column: int, expected: float) -> tuple[bool, float]:
-    """Return whether there is a reading, and its inverse depth less the expected one.
+    """Return whether there is a reading, and its inverse depth minus the expected one.
 
-    At an edge a neighbour counts as well: a pixel is as far as the outline may be off. What lies
-    outside of the image is seen, and does not agree.
+    If the pixel itself does not agree, its best neighbour counts: at an edge, the outline may be
+    off by a pixel. Outside the image there is a reading with an infinite difference.
     """
     height, width = depth.shape
     if not (0 <= row < height and 0 <= column < width):

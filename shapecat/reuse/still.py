@@ -1,4 +1,4 @@
-"""Whether a depth image shows what an earlier one from the same place showed."""
+"""Whether a depth image shows the same as an earlier one from the same pose."""
 
 import numpy as np
 
@@ -11,26 +11,28 @@ from shapecat.types import Frame, Pose
 __all__ = ["shows_the_same"]
 
 _MOVED_M, _TURNED_DEG = 0.003, 0.15
-"""A pose that differs by less is one that was measured twice."""
+"""Poses that differ by no more count as equal: the difference is noise."""
 _STRIDE = 2
-"""Pixels between those that are compared."""
+"""Step between the pixels that are compared."""
 _SQUARE = 3
-"""What has changed shows in so many neighbours each way that all disagree: 6 by 6 pixels, fewer
-than the smallest object has. The noise of outlines makes thin lines."""
+"""Side of the square of compared pixels that must all differ to show a change: 6 by 6 pixels, less
+than the smallest object has. Noise at outlines makes only thin lines."""
 
 
 def shows_the_same(
     now: Frame, pose: Pose | None, then: Frame, then_pose: Pose | None, *, range_m: float
 ) -> bool:
-    """Tell whether nothing within a range has moved, come or gone between two frames.
+    """Return whether nothing within range has moved, appeared or disappeared between two frames.
 
     Parameters
     ----------
-    pose, then_pose : ``fixed_from_sensor``, None where there is no fixed frame.
+    now, then : the frames to compare.
+    pose, then_pose : ``fixed_from_sensor`` of each; None where there is no fixed frame.
+    range_m : metres; readings farther away in both frames are not compared.
 
     Notes
     -----
-    Clouds that are no depth images are never the same: their points do not match one to one.
+    Point clouds are never the same: their points do not correspond one to one.
     """
     if now.depth is None or then.depth is None or now.camera != then.camera:
         return False
@@ -49,9 +51,9 @@ def _at_rest(pose: Pose | None, then: Pose | None) -> bool:
 
 @kernel
 def _changed(now: F4, then: F4, range_m: float) -> bool:
-    """Tell whether there is a square of readings that all disagree."""
+    """Return whether there is a square of readings that all differ."""
     height, width = now.shape
-    rows = np.zeros(width, np.int64)  # that end here with enough neighbours which disagree
+    rows = np.zeros(width, np.int64)  # consecutive rows with a long enough run that ends here
     differs = np.zeros(width, np.bool_)
     for v in range(0, height, _STRIDE):
         _mark(now[v], then[v], range_m, differs)
@@ -75,7 +77,10 @@ def _mark(now: F4, then: F4, range_m: float, differs: Bool) -> None:
 
 @kernel
 def _alone(now: F4, then: F4, row: int, column: int) -> bool:
-    """Tell whether neither reading of a pixel has its like beside the other; none is like none."""
+    """Return whether neither reading of a pixel occurs in the other image, there or beside it.
+
+    Two missing readings are equal.
+    """
     a, b = now[row, column], then[row, column]
     return a != b and not (
         (a > 0 and _finds(then, row, column, a)) or (b > 0 and _finds(now, row, column, b))
@@ -84,7 +89,7 @@ def _alone(now: F4, then: F4, row: int, column: int) -> bool:
 
 @kernel
 def _finds(depth: F4, row: int, column: int, z: float) -> bool:
-    """Tell whether there is such a reading at a pixel or beside it."""
+    """Return whether the depth ``z`` occurs at a pixel or beside it."""
     height, width = depth.shape
     for v in range(max(row - 1, 0), min(row + 2, height)):
         for u in range(max(column - 1, 0), min(column + 2, width)):

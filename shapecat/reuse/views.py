@@ -1,7 +1,7 @@
-"""Which object of a frame looks as it did in an earlier one, and what is then used again.
+"""Find objects that look the same as in an earlier frame, and reuse their descriptions.
 
-An object is compared with the view that was described, never with one that repeats it: so it
-cannot drift away from its description step by step.
+An object is compared with the view that was described, never with one that repeats it, so that
+it cannot drift away from its description step by step.
 """
 
 from collections.abc import Sequence
@@ -24,29 +24,32 @@ from shapecat.types import Candidate, Detection, Frame, FullBox, NeuralGas, Pose
 __all__ = ["KeyView", "Repeat", "Sight", "find_repeats", "reused", "sight_of"]
 
 _PLACE_M = 0.015
-"""The centre of what is seen of a still object strays less while the view changes little."""
+"""Most that the visible centre of a still object moves between similar views."""
 _TURN_DEG, _FARTHER = 6.0, 0.05
-"""A view from a direction and a distance that differ by less shows the same shape."""
+"""Most that similar views differ in direction, and in distance (as a share)."""
 _SIZE_M, _HEIGHT_M, _UP_DEG = 0.02, 0.01, 2.0
-"""Larger differences of the box, of its height above the support, and of up are no noise."""
+"""Most that noise changes the size of the box, its height above the support, and up."""
 _AREA = 0.25
-"""As is a larger share of pixels more or less, at the same distance."""
+"""Most that noise changes the number of pixels at the same distance, as a share."""
 _AGREE, _BIAS = 0.95, 0.002
-"""Share of the points that must be where they were, either way; how much nearer they may be in
-the mean, in 1/m: 2 mm at 1 m."""
+"""Least share of the points that must agree, both ways; largest mean difference of their inverse
+depths, 1/m: 2 mm at 1 m."""
 
 
 _TRIES = 3
-"""Views of an object that are compared point by point, the newest first: masks may flicker."""
+"""Earlier views that are compared point by point, the newest first: masks may flicker."""
 
 
 class Sight(NamedTuple):
-    """An object in a frame, before it is described.
+    """A view of an object, before it is described.
 
     Attributes
     ----------
     pose : ``fixed_from_sensor``; None where there is no fixed frame.
-    numbers : (15,) what is compared first; see `sight_of`.
+    numbers : (15,) compared before the points are: box centre (3), vector from the sensor to it (3)
+        and up (3), in the fixed frame if there is one, else in the sensor frame; longer side,
+        shorter side and height of the box; height above the support; number of pixels; flags as
+        an integer. In metres.
     """
 
     frame: Frame
@@ -57,18 +60,19 @@ class Sight(NamedTuple):
 
 _PLACE, _RAY, _UP, _SIZE = slice(3), slice(3, 6), slice(6, 9), slice(9, 12)
 _HEIGHT, _PIXELS, _KIND = 12, 13, 14
-"""Where in the numbers of a sight they are; all directions in the fixed frame, if there is one."""
+"""Indices into `Sight.numbers`."""
 
 
 def sight_of(
     frame: Frame, pose: Pose | None, candidate: Candidate, up: F4, height_m: float
 ) -> Sight:
-    """Note what tells whether a candidate was seen alike before.
+    """Return the view of a candidate, with the numbers that earlier views are compared by.
 
     Parameters
     ----------
+    pose : ``fixed_from_sensor``; None where there is no fixed frame.
     up : (3,) unit vector, sensor frame.
-    height_m : from what the object stands on to the centre of its box.
+    height_m : height of the box centre above the surface the object stands on, metres.
     """
     turn, shift = (pose or IDENTITY).rotation, (pose or IDENTITY).translation
     ray = turn @ candidate.box.center
@@ -81,16 +85,17 @@ def sight_of(
 
 
 class KeyView(NamedTuple):
-    """A sight and its description, to be used again in later frames."""
+    """A view and its description, for reuse in later frames."""
 
     sight: Sight
     detection: Detection
 
 
 class Move(NamedTuple):
-    """How the sensor frame of an earlier view lies in that of a later one.
+    """The motion of the sensor between an earlier and a later view.
 
-    ``pose`` is ``later_from_earlier``, ``back`` its inverse, ``quaternion`` (4,) x, y, z, w.
+    ``pose`` is ``later_from_earlier``, ``back`` its inverse, and ``quaternion`` (4,) x, y, z, w
+    its rotation.
     """
 
     pose: Pose
@@ -99,22 +104,23 @@ class Move(NamedTuple):
 
 
 class Repeat(NamedTuple):
-    """A view that an object repeats, and how the sensor has moved since."""
+    """An earlier view that an object repeats, and the motion of the sensor since."""
 
     key: KeyView
     move: Move
 
 
 def find_repeats(sights: Sequence[Sight], keys: Sequence[KeyView]) -> list[Repeat | None]:
-    """Find, for each object of a frame, the earlier view that it repeats; None where it is new.
+    """Find the earlier view that each object of a frame repeats; None for a new object.
 
     Parameters
     ----------
-    keys : described views of earlier frames of the same topic.
+    sights : the objects of the frame.
+    keys : described views in earlier frames of the same topic, the oldest first.
 
     Notes
     -----
-    Only depth images are compared: loose points do not tell what hides what.
+    Only depth images are compared: point clouds do not show which surface hides which.
     """
     if not keys or not sights:
         return [None] * len(sights)
@@ -129,7 +135,7 @@ def find_repeats(sights: Sequence[Sight], keys: Sequence[KeyView]) -> list[Repea
 
 
 def _repeat(sight: Sight, key: KeyView, moves: dict[int, Move]) -> Repeat | None:
-    """Return the view as repeated if the points of the object agree as well."""
+    """Return the repeat of a view if the points of the object agree as well, else None."""
     earlier = key.sight.frame.index
     if earlier not in moves:
         moves[earlier] = _between(key.sight, sight)
@@ -139,7 +145,10 @@ def _repeat(sight: Sight, key: KeyView, moves: dict[int, Move]) -> Repeat | None
 
 
 def reused(repeat: Repeat, sight: Sight) -> Detection:
-    """Return the detection of an object that repeats a view: what was learned moves with it."""
+    """Return the detection of an object that repeats a view.
+
+    Its surface and full box are moved to the current sensor frame.
+    """
     (key, move), first = repeat, repeat.key.detection
     return Detection(
         candidate=sight.candidate,
@@ -171,7 +180,7 @@ def _sights(keys: Sequence[KeyView]) -> list[Sight]:
 
 
 def _alike(now: F8, then: F8) -> Bool:
-    """Tell which sights (..., 15) were seen alike, before their points are compared."""
+    """Return which pairs of `Sight.numbers` (..., 15) are alike: (...) bool."""
     far, before = (np.linalg.norm(each[..., _RAY], axis=-1) for each in (now, then))
     area = now[..., _PIXELS] * far**2 / (then[..., _PIXELS] * before**2)
     turned = (now[..., _RAY] * then[..., _RAY]).sum(axis=-1) / (far * before)
@@ -189,7 +198,10 @@ def _alike(now: F8, then: F8) -> Bool:
 
 
 def _agree(one: Sight, other: Sight, move: Pose) -> bool:
-    """Tell whether the points of an object are where another frame sees something."""
+    """Return whether the points of an object agree with the depth image of another view.
+
+    ``move`` is ``other_from_one``.
+    """
     a, b = one.frame, other.frame
     if a.depth is None or a.camera is None or b.depth is None or b.camera is None:
         return False
@@ -201,7 +213,7 @@ _REST = Move(IDENTITY, IDENTITY, np.array([0.0, 0.0, 0.0, 1.0]))
 
 
 def _between(one: Sight, other: Sight) -> Move:
-    """Return how the sensor has moved from one sight to another."""
+    """Return the motion of the sensor from one view to another."""
     a, b = one.pose, other.pose
     if a is None or b is None:
         return _REST

@@ -15,27 +15,28 @@ from shapecat.types import NeuralGas
 __all__ = ["MAX_NEURONS", "MIN_POINTS", "reconstruct"]
 
 MIN_POINTS = 24
-"""Clouds with fewer points have no surface to speak of."""
+"""Fewest points of a cloud that has a surface."""
 MAX_NEURONS = 512
-"""Most neurons that can be asked for: distances are compared without their 10 lowest bits."""
+"""Most neurons that the settings may ask for: distances are compared without their 10 lowest bits,
+which hold the index of a neuron."""
 _MAX_POINTS = 1200
-"""Of more points every k-th is fired: the result does not get better with more, only slower."""
+"""Most points that are used, every k-th of a larger cloud: more only make the gas slower."""
 _NEURONS_PER_POINT = 0.45
 _FEWEST_NEURONS = 12
 _RATE = 0.1
-"""Epsilon_b, the share of the way the nearest neuron moves, at the start."""
+"""Epsilon_b at the start: the share of the distance to a signal that the nearest neuron moves."""
 _RATE_NEIGHBOUR = 0.06
 """Epsilon_n as a share of epsilon_b."""
 _OLDEST = 30
-"""Age beyond which an edge goes (a_max)."""
+"""Age above which an edge is removed (a_max)."""
 _GROWTH = 0.6
-"""Share of the signals after which all neurons are there."""
+"""Share of the signals within which all neurons are inserted."""
 _EPOCHS = 8
-"""Most epochs of the thesis's rule: it has hardly ever reached its distance limit before."""
+"""Most epochs of the thesis's rule: it hardly ever reaches its distance limit sooner."""
 _ERROR_LIMIT = 3.0
-"""t_gamma, in errors a neuron with its share of the surface gathers in an epoch."""
+"""t_gamma, relative to the error per epoch of a neuron with its share of the surface."""
 _DISTANCE_LIMIT = 0.7
-"""t_alpha, in spacings of the points: below it lies only their noise."""
+"""t_alpha, relative to the spacing of the points: smaller distances are noise."""
 
 
 def reconstruct(
@@ -43,33 +44,33 @@ def reconstruct(
 ) -> NeuralGas | None:
     """Learn the surface of one object as a graph.
 
-    It is computed in units of the object's size: moving or scaling the points does the same to
-    the neurons, up to rounding.
+    Coordinates are normalised by the size of the object: moving or scaling the points does the
+    same to the neurons, up to rounding.
 
     Parameters
     ----------
     points : (m, 3) metres, finite, evenly spread (see `voxelize`), in any frame. Of more than
-        1200 every k-th is used.
-    settings : ``method`` "fritzke" inserts a neuron every so many signals (thesis Algorithm 3),
-        "thesis" where the error is large (Algorithm 4).
-    rng : draws one number; the same points, settings and generator give the same graph.
+        1200 points, every k-th is used.
+    settings : with ``method`` "fritzke" a neuron is inserted at a fixed interval of signals (thesis
+        Algorithm 3), with "thesis" where the error is large (Algorithm 4).
+    rng : used for one draw; the same points, settings and generator state give the same graph.
 
     Returns
     -------
-    A connected graph of at least 3 neurons, each the nearest of some point and within the hull of
-    the points. None for fewer than `MIN_POINTS` points, or where they lie in so few places that
-    no 3 neurons are left.
+    A connected graph of at least 3 neurons, each within the convex hull of the points and nearest
+    to at least one of them. None if there are fewer than `MIN_POINTS` points, or if they lie in so
+    few places that fewer than 3 neurons remain.
 
     Raises
     ------
-    ValueError : the points are not (m, 3) or not finite, or more than `MAX_NEURONS` neurons are
-        asked for.
+    ValueError : the points are not (m, 3) or not finite, or the settings ask for more than
+        `MAX_NEURONS` neurons.
 
     Notes
     -----
-    Time grows with signals times neurons and hardly depends on the number of points. Sources:
-    Fritzke, *A growing neural gas network learns topologies*, 1995; thesis ch. 5. Deviations are
-    marked ``differs:`` in the kernels.
+    Time grows with the product of signals and neurons, and hardly depends on the number of points.
+    Sources: Fritzke, *A growing neural gas network learns topologies*, 1995; thesis ch. 5.
+    Deviations are marked ``differs:`` in the kernels.
     """
     points = np.ascontiguousarray(points, np.float32).view()
     if points.ndim != 2 or points.shape[1] != 3:
@@ -144,10 +145,10 @@ def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> _Found:
 
 @kernel
 def _normalise(points: F4) -> tuple[Cloud, F8]:
-    """Return at most `_MAX_POINTS` points within -1 to 1, and the frame to undo it.
+    """Return at most `_MAX_POINTS` points, scaled to -1 to 1, and the frame (4,) to undo it.
 
-    The frame is (x, y, z of the mean, largest distance from it along an axis): infinite where a
-    point is.
+    The frame is x, y, z of the mean, and the largest distance from it along an axis, which is
+    infinite if a point is not finite.
     """
     step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
     size = (points.shape[0] + step - 1) // step
@@ -189,7 +190,7 @@ def _wanted(cloud: Cloud, neurons: int) -> int:
 
 @kernel
 def _two_points(cloud: Cloud, gas: Gas, state: np.uint64) -> int:
-    """Do steps 1 to 3: two random points, one from each half of the cloud, linked."""
+    """Do steps 1 to 3: link two random points, one from each half of the cloud; return 2."""
     half = cloud.x.size // 2
     for i in range(2):
         k = i * half + np.int64((state >> np.uint64(20 * i)) % np.uint64(half))

@@ -1,4 +1,4 @@
-"""From a grown gas to a graph of the surface: every neuron used, one connected component."""
+"""From a grown gas to a connected graph of the surface, in which every neuron is used."""
 
 import numpy as np
 
@@ -11,27 +11,35 @@ from shapecat.surface.neurons import FAR, Gas, index_mask, is_edge
 __all__ = ["edge_list", "link"]
 
 _GAP = 1.15
-"""A square grid of the same density is this much wider than the mean nearest distance."""
+"""Spacing of a square grid of the same density, relative to the mean nearest distance."""
 _LONGEST = 3.0
 """Longest edge between neurons that are not the two nearest of a point, in spacings."""
 
 
 @kernel
 def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
-    """Finish the graph of ``count`` neurons; return the (n, n) adjacency of those that stay.
+    """Finish the graph of a gas; return the adjacency (n, n) of the n neurons that stay.
 
-    1. Neurons nearest to no point are removed.
-    2. The others move to the mean of the points they are nearest to (one step of Lloyd 1982). It
-       takes out what the last signals left, and keeps neurons within the hull.
-    3. Two neurons are linked when the gas linked them, when they are the two nearest of some point
-       (competitive Hebbian learning, Martinetz and Schulten 1994), or when one of them is its
-       third nearest and they are not far apart: by the edges of the gas alone, a third of them
-       has no triangle.
-    4. Parts with less than ``share`` of the points are removed, never the largest.
-    5. The parts that stay are joined at their smallest gap.
+    1. Remove neurons that are nearest to no point.
+    2. Move each neuron to the mean of the points it is nearest to (one step of Lloyd 1982). This
+       removes the pull of the last signals, and keeps neurons within the convex hull.
+    3. Link two neurons if the gas linked them, if they are the two nearest to some point
+       (competitive Hebbian learning, Martinetz and Schulten 1994), or if they are among the three
+       nearest to some point and not far apart. With the links of the gas alone, a third of the
+       neurons is in no triangle.
+    4. Remove components with less than a share of the points, but never the largest.
+    5. Connect the components that stay at their smallest gap.
 
-    The first neurons of ``gas`` are then those that stay, in their old order; fewer than 3 are
-    none.
+    Parameters
+    ----------
+    cloud : the points.
+    gas : the neurons, changed in place: those that stay come first, in their old order.
+    count : number of neurons in ``gas``.
+    share : least share of the points in a component.
+
+    Returns
+    -------
+    Empty, (0, 0), if fewer than 3 neurons stay.
     """
     adjacent = np.zeros((count, count), np.bool_)
     for i in range(count):
@@ -89,7 +97,7 @@ def edge_list(adjacent: Bool) -> U2:
     found = 0
     for i in range(count):
         for j in range(i + 1, count):
-            edges[found, 0], edges[found, 1] = i, j  # stays if it is one: no branch to guess
+            edges[found, 0], edges[found, 1] = i, j  # overwritten unless adjacent: no branch
             found += adjacent[i, j]
     return edges[:found].copy()
 
@@ -169,9 +177,9 @@ def _keep(gas: Gas, adjacent: Bool, members: I4, stays: Bool, count: int) -> int
 
 @kernel
 def _components(adjacent: Bool, count: int, part: I4) -> int:
-    """Label the connected parts from 0 in the order of their first neuron; return their number."""
+    """Label connected components, from 0 in order of their first neuron; return their number."""
     part[:count] = -1
-    others = np.zeros(count, np.int64)  # those that may have no part yet
+    others = np.zeros(count, np.int64)  # neurons that may have no label yet
     for i in range(count):
         others[i] = i
     left = count
@@ -203,7 +211,7 @@ def _components(adjacent: Bool, count: int, part: I4) -> int:
 
 @kernel
 def _bridge(gas: Gas, adjacent: Bool, count: int, part: I4) -> None:
-    """Link the two nearest neurons of different parts."""
+    """Link the two nearest neurons of different components."""
     best = np.inf
     a, b = 0, 0
     for i in range(count):

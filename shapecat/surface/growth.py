@@ -24,11 +24,11 @@ __all__ = ["Cloud", "grow_fritzke", "grow_thesis"]
 
 
 _GAIN = 1 / 0.9995
-"""What an error counts more than one a signal earlier."""
+"""Weight of an error relative to that of the previous signal: errors decay by 0.9995 a signal."""
 
 
 class Cloud(NamedTuple):
-    """Points, as one array for each coordinate."""
+    """Points, as one array (n,) for each coordinate."""
 
     x: F4
     y: F4
@@ -63,11 +63,13 @@ def _fire(
     rate_winner: float,
     rate_neighbour: float,
 ) -> tuple[int, int]:
-    """Do steps 5 to 9 of thesis Algorithm 3 for one signal; return winner and its oldest edge.
+    """Do steps 5 to 9 of thesis Algorithm 3 for one signal.
 
-    Takes the arrays of a `Gas` one by one: taking them out of it costs as much as a step. Step 10
-    is the caller's: with a call behind a branch in here, references to the arrays are counted up
-    and down for each signal, which costs more than all steps together.
+    Returns the winner, and the greatest age of its edges.
+
+    The arrays of a `Gas` are passed one by one: unpacking it takes as long as a step. Step 10 is
+    the caller's: with a conditional call in here, numba counts references to the arrays for each
+    signal, which takes longer than all steps together.
     """
     padded = (count + LANES - 1) // LANES * LANES
     # 5. the nearest and the second nearest neuron
@@ -117,10 +119,23 @@ def grow_fritzke(
     rate_neighbour: float,
     oldest: int,
 ) -> int:
-    """Fire ``signals`` points into a gas of ``count`` >= 2 linked neurons; return the new count.
+    """Adapt a gas to signals drawn from a cloud, and insert neurons; return their new number.
 
     Source: Fritzke 1995, thesis Algorithm 3, whose steps are numbered here and in `_fire` (steps
-    1 to 3 are the caller's). ``interval`` is lambda, ``oldest`` a_max.
+    1 to 3 are the caller's).
+
+    Parameters
+    ----------
+    cloud : the points.
+    state : of the random generator.
+    gas : at least 2 linked neurons, with room for ``target``; changed in place.
+    count : number of neurons in ``gas``.
+    target : number of neurons to grow to.
+    signals : number of signals.
+    interval : signals between insertions (lambda).
+    rate_winner, rate_neighbour : epsilon_b and epsilon_n for the first signal: the share of the
+        distance to it that the winner and its neighbours move.
+    oldest : age above which an edge is removed (a_max).
     """
     points = cloud.x.size
     px, py, pz = cloud
@@ -132,7 +147,7 @@ def grow_fritzke(
     fall = 0.9 / max(signals, 1)
     until = interval
     for signal in range(signals):
-        # 4. differs: each point once an epoch, in random order, rather than independent draws.
+        # 4. differs: each point once per epoch, in random order, rather than independent draws.
         if cursor == points:
             state = _shuffle(order, state)
             cursor = 0
@@ -180,11 +195,19 @@ def grow_thesis(
     rate_neighbour: float,
     oldest: int,
 ) -> int:
-    """Grow the gas until it is close to the points; return the new count.
+    """Grow a gas until its neurons are close to the points; return their new number.
 
-    Source: thesis 5.2, Algorithm 4: Algorithm 3 with step 12, a neuron is inserted where the error
-    exceeds ``error_limit`` (t_gamma), and step 18, the cloud is fired again until the mean
-    distance of the neurons to their nearest point (psi) is below ``distance_limit`` (t_alpha).
+    Source: thesis 5.2, Algorithm 4, which changes two steps of Algorithm 3. Step 12: a neuron is
+    inserted where the error exceeds a limit. Step 18: the cloud is presented again until the mean
+    distance of the neurons to their nearest point (psi) is below a limit.
+
+    Parameters
+    ----------
+    cloud, state, gas, count, rate_winner, rate_neighbour, oldest : as in `grow_fritzke`.
+    target : most neurons to grow to.
+    epochs : most times that each point is presented.
+    error_limit : squared distance, in the units of ``cloud`` (t_gamma).
+    distance_limit : distance, in the units of ``cloud`` (t_alpha).
     """
     points = cloud.x.size
     px, py, pz = cloud
@@ -211,7 +234,7 @@ def grow_thesis(
                 _drop_old_edges(degree, wins, born, count, a, oldest)
             rest -= fall
             # 12. differs: at most once in four signals, and the errors of all three neurons are
-            # reset; as published, the first epoch ends with as many neurons as there is room for.
+            # reset; as published, the gas is full after the first epoch.
             pause -= 1
             if gas.error[a] > error_limit and pause <= 0 and count < target:
                 pause = 4
@@ -219,7 +242,7 @@ def grow_thesis(
                 gas.error[a] = gas.error[f] = gas.error[count] = 0
                 before[count] = -1
                 count += 1
-        # differs: neurons that won nothing since the epoch began lie between surfaces and go.
+        # differs: neurons that were never nearest in this epoch lie between surfaces: remove them.
         count = _prune(gas, count, before)
         # 18.
         if epoch >= 2 and _mean_distance(cloud, gas, count) < distance_limit:
@@ -229,13 +252,13 @@ def grow_thesis(
 
 @kernel
 def _prune(gas: Gas, count: int, before: I4) -> int:
-    """Remove neurons with as many wins as ``before``, as long as 3 stay; return how many stay."""
+    """Remove neurons whose ``wins`` are still ``before``, down to 3; return the number left."""
     i = 0
     while i < count:
         if gas.wins[i] != before[i] or count <= 3:
             i += 1
             continue
-        heir = -1  # gets the edges, so that no neighbour is left alone
+        heir = -1  # takes over the edges, so that no neighbour is isolated
         for j in range(count):
             if is_edge(gas, i, j):
                 if heir >= 0:

@@ -1,9 +1,8 @@
-"""The two inner loops of a neural gas, written in vectors of 16 numbers.
+"""The two inner loops of a neural gas, written as instructions on vectors of 16 numbers.
 
 Numba's loop vectoriser checks for overlapping arrays and handles remainders on each call, which
-costs more than the work itself when the loops have five rounds; written as vector instructions of
-LLVM they are two to four times faster, a fifth of the time of a frame (docs/decisions/0011). LLVM
-splits the vectors on machines with narrower ones.
+costs more than the work itself in loops of five rounds. Written as vector instructions of LLVM,
+they are two to four times faster. LLVM splits the vectors on machines with narrower ones.
 """
 
 # ruff: noqa: ARG001  # numba calls an intrinsic with the types of all its arguments
@@ -26,11 +25,11 @@ _INTS = ir.VectorType(_I32, LANES)
 _FLOATS = ir.VectorType(ir.FloatType(), LANES)
 _LARGEST = 0x7FFFFFFF
 _Value = Any
-"""A value of LLVM."""
+"""An LLVM value."""
 
 
 class _Vectors:
-    """Vector instructions in terms of a function builder of LLVM."""
+    """Vector instructions, emitted by an LLVM builder."""
 
     def __init__(self, context: Any, builder: Any) -> None:
         self._context = context
@@ -61,7 +60,7 @@ class _Vectors:
         return self.build.select(self.build.icmp_signed(">", a, b), a, b)
 
     def multiply_add(self, a: _Value, b: _Value, c: _Value) -> _Value:
-        """Return a * b + c, fused where the machine can."""
+        """Return a * b + c, fused where the machine supports it."""
         return self._call(f"llvm.fmuladd.v{LANES}f32", _FLOATS, a, b, c)
 
     def reduce_least(self, a: _Value) -> _Value:
@@ -78,7 +77,7 @@ class _Vectors:
 
     @contextmanager
     def blocks(self, count: _Value) -> Iterator[tuple[_Value, _Value]]:
-        """Loop over the blocks of ``count`` elements: the index of the first, and of each."""
+        """Loop over blocks of `LANES` elements; yield the index of the first, and of each lane."""
         build = self.build
         first, lane = self.variable(_I64(0)), self.variable(ir.Constant(_INTS, [*range(LANES)]))
         test, body, end = (build.append_basic_block(name) for name in ("test", "body", "end"))
@@ -107,14 +106,14 @@ def _constant(value: int) -> _Value:
 
 
 def _nearest(wanted: int) -> Callable[..., Any]:
-    """Make the search for the ``wanted`` neurons nearest to a place."""
+    """Return an intrinsic that finds the ``wanted`` neurons nearest to a point."""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> _Value:
         v, build = _Vectors(context, builder), builder
         arrays = [v.array(signature.args[k], args[k]) for k in range(3)]
         padded, place, mask = args[3], [v.splat(value, _FLOATS) for value in args[4:7]], args[7]
         keep = build.not_(v.splat(mask, _INTS))
-        # In each lane the least keys met so far, in order.
+        # In each lane the smallest keys so far, in order.
         best = [v.variable(_constant(_LARGEST)) for _ in range(wanted)]
         with v.blocks(padded) as (i, index):
             squared = ir.Constant(_FLOATS, [0.0] * LANES)
@@ -144,17 +143,18 @@ def _nearest(wanted: int) -> Callable[..., Any]:
         result = types.UniTuple(whole, wanted)
         return result(x, y, z, whole, real, real, real, types.int32), emit
 
-    search.__doc__ = f"""Return the {wanted} neurons nearest to a place, nearest first.
+    search.__doc__ = f"""Return the {wanted} neurons nearest to a point, nearest first.
 
-    A key is a squared distance whose lowest bits are replaced by the index: positive floats order
-    as integers do, so minima of keys find the neurons. Distances that differ by less than the
-    replaced bits, 1 part in 2**16 for 128 neurons, count as equal; then the lower index is first.
+    The search minimises keys: squared distances whose lowest bits are replaced by the index.
+    Positive floats and their bits as integers have the same order. Distances that differ by less
+    than the replaced bits, 1 part in 2**16 for 128 neurons, count as equal; then the lower index is
+    first.
 
     Parameters
     ----------
-    x, y, z : float32 arrays, unused places far away.
-    padded : how many elements to look at, a multiple of `LANES`.
-    sx, sy, sz : the place.
+    x, y, z : float32 arrays of positions, far away where there is no neuron.
+    padded : number of elements to search, a multiple of `LANES`.
+    sx, sy, sz : the point.
     mask : 2**k - 1, at least the largest index.
     """
     return intrinsic(search)  # type: ignore[no-any-return]  # numba has no types
@@ -182,16 +182,16 @@ def adapt(
     rate_winner: Any,
     rate_neighbour: Any,
 ) -> Any:
-    """Move the winner and its neighbours to a place; return the largest ``wins[j] - born[j]``.
+    """Move the winner and its neighbours towards a point; return the largest ``wins - born``.
 
     Parameters
     ----------
     x, y, z, padded, sx, sy, sz : as in `two_nearest`.
-    born, row : edges of the winner: the int32 array and where its row begins in it.
-    absent : values of ``born`` from this one on are no edges.
-    wins : int32 array.
-    winner : its index.
-    rate_winner, rate_neighbour : share of the way to go.
+    born, row : the int32 array of `Gas`, and the index where the row of the winner begins.
+    absent : values of ``born`` that are no smaller mean that there is no edge.
+    wins : the int32 array of `Gas`.
+    winner : index of the winner.
+    rate_winner, rate_neighbour : share of the distance to move.
     """
     real, whole = types.float32, types.int64
     places = (x, y, z, whole, real, real, real)

@@ -29,11 +29,15 @@ FAR = np.float32(1e18)
 class Gas(NamedTuple):
     """A gas with room for more neurons than it has; its arrays are padded to whole vectors.
 
-    ``x, y, z`` are positions, `FAR` away where no neuron is; ``error`` the accumulated squared
-    distance; ``degree`` the number of edges. ``wins`` counts how often a neuron was the nearest:
-    it is the clock of its edges. ``born[i * x.size + j]`` is `ABSENT`, or ``wins[i] + wins[j]``
-    when edge i-j was last refreshed, so that its age is ``wins[i] + wins[j] - born``. So ageing
-    all edges of the winner is one increment, and adapting its neighbours is one loop over a row.
+    Attributes
+    ----------
+    x, y, z : (n,) positions; `FAR` where there is no neuron.
+    error : (n,) accumulated squared distances.
+    degree : (n,) numbers of edges.
+    wins : (n,) how often each neuron was the nearest.
+    born : (n * n,) for the edge i-j, element ``i * n + j`` is the sum ``wins[i] + wins[j]`` when it
+        was last refreshed; `ABSENT` without an edge. The age of an edge is the growth of that sum,
+        so one increment ages all edges of the winner, and its neighbours are in one row.
     """
 
     x: F4
@@ -47,7 +51,7 @@ class Gas(NamedTuple):
 
 @kernel
 def empty_gas(room: int) -> Gas:
-    """Return a gas without neurons that has room for at least ``room``."""
+    """Return a gas without neurons, with room for at least ``room`` of them."""
     size = (room + LANES - 1) // LANES * LANES
     gas = Gas(
         np.zeros(size, np.float32),
@@ -65,7 +69,7 @@ def empty_gas(room: int) -> Gas:
 
 @kernel
 def index_mask(count: int) -> int:
-    """Return the least 2**k - 1 that is at least ``count - 1``."""
+    """Return the smallest 2**k - 1 that is at least ``count - 1``, the largest index."""
     mask = 1
     while mask < count:
         mask <<= 1
@@ -80,13 +84,13 @@ def is_edge(gas: Gas, i: int, j: int) -> bool:
 
 @kernel
 def connect(gas: Gas, i: int, j: int) -> None:
-    """Link two neurons, or make their edge new."""
+    """Link neurons i and j, or reset the age of their edge."""
     refresh(gas.degree, gas.wins, gas.born, i, j)
 
 
 @kernel
 def refresh(degree: I4, wins: I4, born: I4, i: int, j: int) -> None:
-    """Link two of n neurons, or make their edge new, in the arrays (n,) and (n * n,) of a `Gas`."""
+    """Link neurons i and j, or reset the age of their edge; the arrays are those of a `Gas`."""
     if born[i * degree.size + j] == ABSENT:
         degree[i] += 1
         degree[j] += 1
@@ -97,7 +101,7 @@ def refresh(degree: I4, wins: I4, born: I4, i: int, j: int) -> None:
 
 @kernel
 def disconnect(degree: I4, born: I4, i: int, j: int) -> None:
-    """Remove the edge between two of n neurons, in the arrays (n,) and (n * n,) of a `Gas`."""
+    """Remove the edge between neurons i and j; the arrays are those of a `Gas`."""
     born[i * degree.size + j] = ABSENT
     born[j * degree.size + i] = ABSENT
     degree[i] -= 1
@@ -123,7 +127,7 @@ def insert(gas: Gas, count: int, q: int) -> int:
 
 @kernel
 def move(gas: Gas, last: int, place: int) -> None:
-    """Give neuron ``last`` the free ``place``."""
+    """Move neuron ``last`` to the free index ``place``."""
     size = gas.x.size
     if last != place:
         gas.x[place], gas.y[place], gas.z[place] = gas.x[last], gas.y[last], gas.z[last]

@@ -10,23 +10,28 @@ from shapecat.surface.voxels import read_only, voxelize
 __all__ = ["smooth", "thin"]
 
 _MOST_CELLS = 1 << 20
-"""Cells along an axis: three of them fit an index of 63 bits."""
+"""Most cells along an axis: three such indices fit in 63 bits."""
 _FEWEST_PLANE, _FEWEST_QUADRIC = 4, 9
-"""Neighbours, itself included, for a plane and for a quadric with some points to spare."""
+"""Fewest neighbours, including the point itself, for a plane and for a quadric; some more than they
+have unknowns."""
 _RIDGE = 1e-4
 _SQUARINGS = 6
 
 
 def thin(points: F4, *, settings: SurfaceSettings) -> F4:
-    """Return the points of an object as the gas gets them: (m, 3), a point in each voxel.
+    """Return the points of an object that the gas learns: (m, 3) metres, one for each voxel.
 
-    They are averaged in voxels, and then smoothed if the settings say so. differs: the thesis
-    smooths the whole cloud before it is thinned; on what is left of an object it costs a
-    hundredth, and takes out what the averages leave.
+    The points of a voxel are averaged, then smoothed if the settings ask for it. differs: the
+    thesis smooths the whole cloud before thinning; smoothing the thinned points of an object takes
+    a hundredth of the time, and removes the noise that the averages leave.
+
+    Parameters
+    ----------
+    points : (n, 3) metres, finite, in any frame.
 
     Raises
     ------
-    ValueError : as `voxelize` and `smooth`.
+    ValueError : as for `voxelize` and `smooth`.
     """
     cloud = voxelize(points, voxel_m=settings.voxel_m)
     radius = settings.smooth_radius_m
@@ -48,18 +53,17 @@ def smooth(points: F4, *, radius_m: float) -> F4:
     Parameters
     ----------
     points : (n, 3) metres, finite, in any frame.
-    radius_m : h, metres. Detail smaller than that is lost; three to five spacings of the points
-        are usual.
+    radius_m : h, metres. Smaller detail is lost; three to five spacings of the points are usual.
 
     Returns
     -------
-    (m, 3) the moved points in their order. With 4 to 8 points in the radius the plane alone is
-    used; points with fewer are left out: they belong to no surface.
+    (m, 3) the moved points, in their order. With 4 to 8 points within the radius, only the plane is
+    used; points with fewer are dropped, since they belong to no surface.
 
     Raises
     ------
-    ValueError : a point is not finite, the radius is not positive, or it is so small that the
-        cloud spans more than 2**20 of it.
+    ValueError : a point is not finite, the radius is not positive, or the cloud spans 2**20 radii
+        or more.
 
     Notes
     -----
@@ -97,7 +101,7 @@ def _smooth(points: F4, radius: float) -> F4:
         normal, height = _plane(near, found)
         # 2.
         bend = _quadric(near, found, normal, height) if found >= _FEWEST_QUADRIC else 0.0
-        # 3. differs: a fit that leaves the neighbourhood is not believed
+        # 3. differs: a fit that leaves the neighbourhood is ignored
         height += bend if abs(bend) < 1.0 else 0.0
         for axis in range(3):
             moved[kept, axis] = points[i, axis] + height * radius * normal[axis]
@@ -107,9 +111,10 @@ def _smooth(points: F4, radius: float) -> F4:
 
 @kernel
 def _cells(points: F4, radius: float) -> tuple[I4, I4]:
-    """Return the cell of each point in a grid of the radius, z fastest, and the grid's size.
+    """Return the cell (n,) of each point in a grid with the radius as spacing, and its size (3,).
 
-    The grid has an empty border, so that cells before and after one are beside it in space.
+    Cells are numbered with z fastest. The grid has an empty border, so that the numbers before and
+    after a cell's are its neighbours in space.
     """
     low, size = np.zeros(3), np.zeros(3, np.int64)
     for axis in range(3):
@@ -127,7 +132,10 @@ def _cells(points: F4, radius: float) -> tuple[I4, I4]:
 def _neighbours(
     points: F4, i: int, radius: float, cell: int, size: I4, keys: I4, order: I4, near: F8
 ) -> int:
-    """Write where the points within the radius of point i are, with their weights."""
+    """Write the offsets from point i, in radii, and the weights of its neighbours to ``near``.
+
+    Returns their number.
+    """
     found = 0
     for side in range(9):
         middle = cell + ((side // 3 - 1) * size[1] + side % 3 - 1) * size[2]
@@ -146,7 +154,7 @@ def _neighbours(
 
 @kernel
 def _plane(near: F8, found: int) -> tuple[F8, float]:
-    """Return the normal of the weighted points, and the height of their plane over the origin."""
+    """Return the normal of the plane of weighted points, and its height above the origin."""
     mean, spread = np.zeros(3), np.zeros((3, 3))
     total = 0.0
     for k in range(found):
@@ -164,9 +172,9 @@ def _plane(near: F8, found: int) -> tuple[F8, float]:
 
 @kernel
 def _least_direction(spread: F8) -> F8:
-    """Return a unit vector along the least eigenvalue of a symmetric (3, 3) matrix.
+    """Return the unit eigenvector of the smallest eigenvalue of a symmetric (3, 3) matrix.
 
-    It belongs to the greatest one of the adjugate, whose powers are soon nothing else.
+    It belongs to the largest eigenvalue of the adjugate, which dominates the powers of that.
     """
     power = np.zeros((3, 3))
     for a in range(3):
@@ -215,7 +223,7 @@ def _quadric(near: F8, found: int, normal: F8, height: float) -> float:
                 A[a, b] += weight * row[a] * row[b]
     for a in range(6):
         A[a, a] += _RIDGE * total  # keeps the fit to points on a line or two from running away
-    # Gauss elimination from the end: the matrix is positive definite, and the first is wanted
+    # Gaussian elimination from the end: A is positive definite, and only unknown 0 is needed
     for a in range(5, 0, -1):
         for b in range(a):
             factor = A[b, a] / A[a, a]

@@ -10,16 +10,21 @@ __all__ = ["triangles_of"]
 
 @kernel
 def triangles_of(edges: U2, nodes: int) -> U2:
-    """Return (t, 3) the triangles i < j < k of a graph, in lexicographic order.
+    """Return the triangles i < j < k of a graph, (t, 3), in lexicographic order.
 
     Parameters
     ----------
-    edges : (m, 2) pairs i < j of ``nodes`` nodes, each once, in lexicographic order.
+    edges : (m, 2) pairs i < j of nodes, each once, in lexicographic order.
+    nodes : the number of nodes.
+
+    Raises
+    ------
+    ValueError : an edge leads to a node that does not exist.
     """
     begin = np.zeros(nodes + 1, np.int32)
     for edge in range(len(edges)):
         if max(edges[edge, 0], edges[edge, 1]) >= nodes:
-            raise ValueError("an edge to a node that there is none of")  # noqa: EM101, TRY003  compiled
+            raise ValueError("an edge leads to a node that does not exist")  # noqa: EM101, TRY003  compiled
         begin[edges[edge, 0] + 1] += 1
     for node in range(nodes):
         begin[node + 1] += begin[node]
@@ -30,11 +35,11 @@ def triangles_of(edges: U2, nodes: int) -> U2:
 
 @kernel
 def _walk(edges: U2, begin: I4, result: U2) -> int:
-    """Write the triangles while there is room, and return how many there are."""
+    """Write the triangles while there is room, and return their total number."""
     found = 0
     for edge in range(len(edges)):
         i, j = edges[edge, 0], edges[edge, 1]
-        a, b = edge + 1, begin[j]  # what is joined to i beyond j, and to j
+        a, b = edge + 1, begin[j]  # the neighbours of i after j, and those of j
         while a < begin[i + 1] and b < begin[j + 1]:
             u, v = edges[a, 1], edges[b, 1]
             if u == v:

@@ -8,7 +8,7 @@ from shapecat.jit import kernel
 __all__ = ["read_only", "voxelize"]
 
 _FRACTION_BITS = 16
-"""Coordinates are summed as integers of a 2**16th voxel: sums do not depend on the order."""
+"""Coordinates are summed as integers, in units of 2**-16 voxels: the order does not matter."""
 _RADIX_BITS = 11
 _LARGEST = np.int64(1 << 62)
 
@@ -30,8 +30,8 @@ def voxelize(points: F4, *, voxel_m: float) -> F4:
 
     Raises
     ------
-    ValueError : a point is not finite, the edge is not positive, or it is so small that the cloud
-        spans more than 2**19 voxels from the origin.
+    ValueError : the points are not (n, 3) or not finite, the edge is not positive, or a point is
+        2**19 voxels or more from the origin along an axis.
 
     Examples
     --------
@@ -52,11 +52,11 @@ def voxelize(points: F4, *, voxel_m: float) -> F4:
 
 
 def read_only(points: F4) -> F4:
-    """Return points (n, 3) as kernels take them: one version is compiled, for read-only arrays.
+    """Return points (n, 3) as a read-only float32 array, so that kernels are compiled only once.
 
     Raises
     ------
-    ValueError : another shape.
+    ValueError : the points are not (n, 3).
     """
     points = np.ascontiguousarray(points, np.float32).view()
     if points.ndim != 2 or points.shape[1] != 3:

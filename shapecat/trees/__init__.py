@@ -1,4 +1,4 @@
-"""Decision trees that are walked by kernels: those of the dictionary, and boosted ones."""
+"""Decision trees for kernels: the trees of the dictionary, and boosted trees."""
 
 from shapecat.trees.boosted import BoostedTrees, logit_of, read_trees, write_trees
 from shapecat.trees.walking import LANES, Trees, find_leaves

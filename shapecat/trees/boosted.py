@@ -1,4 +1,4 @@
-"""Trees whose leaves add up to a logit, and their file."""
+"""Boosted decision trees, and their file."""
 
 from collections.abc import Iterator
 from io import BytesIO
@@ -15,18 +15,22 @@ __all__ = ["BoostedTrees", "logit_of", "read_trees", "write_trees"]
 
 
 class BoostedTrees(NamedTuple):
-    """Trees whose leaves add up to a logit; ``value`` (n,) is what each adds."""
+    """Trees whose leaf values add up to a logit; ``value`` (n,) has an element for each node."""
 
     trees: Trees
     value: F4
 
 
 def read_trees(content: bytes, features: np.dtype[Any]) -> BoostedTrees:
-    """Return the trees of a file that `write_trees` wrote.
+    """Return the trees in the content of a file that `write_trees` wrote.
+
+    Parameters
+    ----------
+    features : the record type of the features, by which the trees index them.
 
     Raises
     ------
-    ValueError : the trees were grown with other features, or with these in another order.
+    ValueError : the trees were trained with other features, or in another order.
     """
     with np.load(BytesIO(content), allow_pickle=False) as arrays:
         if arrays["names"].tolist() != list(_names(features)):
@@ -36,7 +40,7 @@ def read_trees(content: bytes, features: np.dtype[Any]) -> BoostedTrees:
 
 
 def write_trees(path: Path, grown: BoostedTrees, features: np.dtype[Any]) -> None:
-    """Write trees to a file, with the names of the fields of ``features``, which may be nested."""
+    """Write trees to a file, with the names of the fields of ``features``; these may be nested."""
     names = np.array(list(_names(features)))
     np.savez_compressed(path, **grown.trees._asdict(), value=grown.value, names=names)
 
@@ -49,7 +53,10 @@ def _names(features: np.dtype[Any]) -> Iterator[str]:
 
 @kernel
 def logit_of(grown: BoostedTrees, features: F4, hopeless: float) -> float:
-    """Return the sum of the leaves that features (n,) reach, or the first that is below a bound."""
+    """Return the logit of features (f,): the sum of the values of the leaves they reach.
+
+    The sum stops early, `LANES` trees at a time, once it is below ``hopeless``.
+    """
     (roots, feature, threshold, left), value = grown
     leaves, logit = np.zeros(LANES, np.int32), 0.0
     for first in range(0, roots.size, LANES):

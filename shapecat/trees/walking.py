@@ -1,4 +1,4 @@
-"""Decision trees as flat arrays, and how they are walked: a few side by side."""
+"""Decision trees as flat arrays, walked several at a time."""
 
 from typing import NamedTuple
 
@@ -10,17 +10,17 @@ from shapecat.jit import kernel
 __all__ = ["LANES", "Trees", "find_leaves"]
 
 LANES = 8
-"""Trees that are walked at the same time: one waits for memory while the others go on."""
+"""Trees that are walked at the same time: while one waits for memory, the others go on."""
 
 
 class Trees(NamedTuple):
-    """Trees whose nodes stand behind each other, children behind their parents.
+    """Trees whose n nodes are stored one after the other, children after their parents.
 
     Attributes
     ----------
-    roots : (t,) first node of each tree.
-    feature, threshold : (n,) what is described goes left where this feature is <= this.
-    left : (n,) the left child, the right one stands behind it; 0 in leaves.
+    roots : (t,) index of the root of each tree.
+    feature, threshold : (n,) a sample goes left if this feature is <= this threshold.
+    left : (n,) index of the left child, which the right child follows; 0 in leaves.
     """
 
     roots: I4
@@ -33,10 +33,17 @@ class Trees(NamedTuple):
 def find_leaves(
     x: F4, roots: I4, feature: I4, threshold: F4, left: I4, first: int, leaves: I4
 ) -> int:
-    """Walk the next `Trees` with features x (f,), from ``first`` on; return how many these are.
+    """Find the leaves that a sample reaches in up to `LANES` trees; return the number of trees.
 
-    ``leaves`` (`LANES`,) are nodes, any to begin with; the leaves that are reached are written.
-    The trees come as arrays: to take them from a tuple counts references, as long as a level takes.
+    The arrays of `Trees` are passed one by one: unpacking the tuple counts references, which takes
+    as long as one level of the trees.
+
+    Parameters
+    ----------
+    x : (f,) features of the sample.
+    roots, feature, threshold, left : as in `Trees`.
+    first : number of the first tree, from 0.
+    leaves : (`LANES`,) valid node indices, overwritten with the leaf reached in each tree.
     """
     count = min(LANES, roots.size - first)
     for lane in range(count):
