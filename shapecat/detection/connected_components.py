@@ -11,25 +11,26 @@ from shapecat.jit import kernel, unset
 __all__ = ["DOWN", "RIGHT", "SIDES", "connected_components", "span_of", "spans_of"]
 
 RIGHT, DOWN = 1, 2
-"""Bits of links: with the neighbour on the right, and with that below."""
+"""Bits of links: to the neighbour on the right, and to the one below."""
 SIDES = ((0, 1), (1, 0), (0, -1), (-1, 0))
-"""Rows and columns to the neighbours that a cell shares a side with."""
+"""Row and column offsets of the four neighbours of a cell."""
 
 
 @kernel
 def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I4:
-    """Label the connected cells from 1 on, in the order of their first cells.
+    """Label connected components, from 1 on, in the order of their first cells.
 
     Parameters
     ----------
-    inside : (rows, columns) which cells are numbered; none outside ``spans``.
-    links : (rows, columns) uint8, `RIGHT` and `DOWN` to neighbours; links to others are ignored.
-    spans : (rows, 2) columns of the first cell of each row that may be inside, and after the last.
-    component : (rows, columns) int32 to write to: within the spans, 0 where not inside.
+    inside : (rows, columns) bool, the cells to label; none is outside ``spans``.
+    links : (rows, columns) uint8, the bits `RIGHT` and `DOWN`; links to cells that are not inside
+        are ignored.
+    spans : (rows, 2) for each row, the first column that may be inside, and one after the last.
+    component : (rows, columns) int32, written within the spans: the labels, 0 where not inside.
 
     Returns
     -------
-    (n + 1,) how many cells each has; none has number 0.
+    (n + 1,) the number of cells with each label; 0 for label 0.
     """
     rows, columns = inside.shape
     within, ways, numbers = inside.reshape(-1), links.reshape(-1), component.reshape(-1)
@@ -39,7 +40,7 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
     parent = unset(most, np.int32)
     size = unset(most, np.int32)
     count = 0
-    # (1) first numbers, and which of them meet
+    # (1) provisional labels, and which of them are connected
     for i in range(rows):
         before = 0
         for p in range(i * columns + spans[i, 0], i * columns + spans[i, 1]):
@@ -61,7 +62,7 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
                 parent[max(a, b)] = me = min(a, b)
             numbers[p] = before = me
             size[me] += 1
-    # (2) final numbers
+    # (2) final labels
     for k in range(count, 0, -1):
         if parent[k] != k:
             size[parent[k]] += size[k]
@@ -70,7 +71,7 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
         if parent[k] == k:
             n += 1
             sizes[n] = size[k]
-            size[k] = n  # its final number, from here on
+            size[k] = n  # from here on, the final label
         else:
             size[k] = size[parent[k]]
     size[0] = 0
@@ -89,7 +90,7 @@ def _root(parent: I4, k: int) -> int:
 
 @kernel
 def spans_of(plane_id: I4) -> I4:
-    """Return (rows, 2) `span_of` each row of numbers (rows, columns)."""
+    """Return the `span_of` each row of ``plane_id`` (rows, columns): (rows, 2)."""
     spans = np.zeros((plane_id.shape[0], 2), np.int32)
     for i in range(len(spans)):
         spans[i, 0], spans[i, 1] = span_of(plane_id[i])
@@ -98,7 +99,10 @@ def spans_of(plane_id: I4) -> I4:
 
 @kernel
 def span_of(row: I4) -> tuple[int, int]:
-    """Return the columns of the first number above 0 of a row (n,) and after the last, or 0, 0."""
+    """Return the first column of a row (n,) with a value above 0, and one after the last.
+
+    Both are 0 if there is none.
+    """
     some = False
     for j in range(row.size):
         some |= row[j] > 0  # many rows have none, and this vectorises

@@ -1,7 +1,7 @@
-"""Depth grid: the depth image, downsampled to the resolution that the other steps work at.
+"""Depth grid: the depth image, downsampled to the working resolution of the detection.
 
-Everything is done in inverse depth ``w = 1 / z`` (1/m): a plane is exactly linear in (column, row,
-w), and the noise of disparity cameras is constant in w, so thresholds need no model of range.
+All steps use inverse depth ``w = 1 / z`` (1/m): a plane is exactly linear in (column, row, w), and
+the noise of disparity cameras is constant in w, so thresholds do not depend on range.
 """
 
 import math
@@ -26,14 +26,14 @@ __all__ = [
 ]
 
 CELL_M = 0.0035
-"""Size of a cell on the objects: small against the smallest object, larger than the noise."""
+"""Target size of a cell, metres: small against the smallest object, larger than the noise."""
 SMALL_M2 = 9e-4
-"""Surface of the smallest object."""
+"""Visible area of the smallest object."""
 BORDER_SHARE = 0.12
-"""Share of the image in which its readings may begin: a registered Kinect is blind in a tenth."""
+"""Largest share of the image that is blank along a side: a tenth for a registered Kinect."""
 LARGEST_FACTOR = 16
 MOST_CELLS = 100_000
-"""Bounds the time of a frame: images that look far have larger cells."""
+"""Bounds the time of a frame: cells are larger than `CELL_M` if a grid would have more."""
 
 
 class PinholeIntrinsics(NamedTuple):
@@ -46,14 +46,14 @@ class PinholeIntrinsics(NamedTuple):
 
 
 class DepthGrid(NamedTuple):
-    """The image of cells.
+    """A downsampled depth image; its elements are called cells, or samples if they have a reading.
 
     Attributes
     ----------
-    inv_depth : (rows, columns) float32 inverse depth, 1/m; 0 where there is no reading.
+    inverse_depth : (rows, columns) float32, 1/m; 0 where there is no reading.
     intrinsics : the camera in units of cells.
     factor : pixels along the edge of a cell.
-    size_m : width of a cell at the median depth.
+    size_m : width of a cell at the median depth, metres.
     """
 
     inverse_depth: F4
@@ -65,9 +65,13 @@ class DepthGrid(NamedTuple):
 def downsample(
     depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_M
 ) -> DepthGrid | None:
-    """Average pixels of ``depth`` (h, w), metres, into cells; None if there is no reading.
+    """Average the pixels of a depth image into cells; None if there is no reading.
 
-    Readings beyond ``range_m`` are left out (thesis 4.2, pass-through filter).
+    Parameters
+    ----------
+    depth : (h, w) metres, 0 where there is no reading.
+    range_m : readings farther away are ignored (thesis 4.2, pass-through filter).
+    cell_m : target width of a cell at the median depth.
     """
     sample = _sampled(depth, 5 if min(depth.shape) > 50 else 1, np.float32(range_m))
     if sample.size == 0:
@@ -89,13 +93,13 @@ def downsample(
 
 
 def _median_of(values: F4) -> float:
-    """Return the upper median of at least one value; `numpy.median` takes twice as long."""
+    """Return the upper median of values (n,), n >= 1; `numpy.median` takes twice as long."""
     return float(np.partition(values, values.size // 2)[values.size // 2])
 
 
 @kernel
 def _sampled(depth: F4, step: int, range_m: float) -> F4:
-    """Return the readings in range among every so many pixels."""
+    """Return the readings in range of every ``step``-th pixel, (n,) metres."""
     rows, columns = depth.shape
     result = np.zeros((rows // step + 1) * (columns // step + 1), np.float32)
     n, one, least = np.uint64(0), np.uint64(1), np.float32(NEAREST_M)
@@ -109,23 +113,31 @@ def _sampled(depth: F4, step: int, range_m: float) -> F4:
 
 @kernel
 def row_and_column(p: int, columns: int) -> tuple[int, int]:
-    """Return the row and column of a flat cell; to divide integers takes three times as long."""
+    """Return row and column of a flat cell index; integer division takes three times as long."""
     i = int((p + 0.5) * (1.0 / columns))
     return i, p - i * columns
 
 
 @kernel
 def smallest_object_at(grid: DepthGrid, depth_m: float) -> float:
-    """Return the number of cells of `SMALL_M2` at a depth, within reason."""
+    """Return the number of cells that `SMALL_M2` covers at a depth, clipped to 20 to 75."""
     return float(min(max(SMALL_M2 * grid.intrinsics.fx**2 / depth_m**2, 20.0), 75.0))
 
 
 @kernel
 def count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) -> I4:
-    """Count each label's samples at the range limit: (size,) for the labels below ``size``.
+    """Count the samples of each label that are at the range limit.
 
-    ``inv_depth`` (1/m) and ``labels`` are (rows, columns), ``range_m`` the limit in metres. Label 0
-    has none.
+    Parameters
+    ----------
+    inv_depth : (rows, columns) 1/m.
+    labels : (rows, columns) labels below ``size``.
+    size : number of labels, including 0.
+    range_m : the limit, metres.
+
+    Returns
+    -------
+    (size,) counts; 0 for label 0.
     """
     count = np.zeros(size, np.int64)
     most = np.float32(1 / range_m + DISCONTINUITY / 2)
@@ -134,7 +146,7 @@ def count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) -
         for j in range(inv_depth.shape[1]):
             some |= (labels[i, j] > 0) & (
                 inv_depth[i, j] < most
-            )  # few rows have any; this vectorises
+            )  # most rows have none, and this vectorises
         if not some:
             continue
         for j in range(inv_depth.shape[1]):
@@ -145,10 +157,17 @@ def count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) -
 
 @kernel
 def find_borders(inv_depth: F4, near: int) -> I4:
-    """Return (4, 2) how many lines at each side are blank, and how far the samples behind extend.
+    """Measure the blank border on each side of the image, and the samples next to it.
 
-    The sides are top, bottom, left and right. The extent, in cells along the side, is that of the
-    samples in the first ``near`` lines with any. Both are -1 if more than `BORDER_SHARE` are blank.
+    Parameters
+    ----------
+    inv_depth : (rows, columns) 1/m.
+    near : number of lines, from the first with a sample, in which the extent is measured.
+
+    Returns
+    -------
+    (4, 2) for top, bottom, left and right: the number of blank lines, and the extent of the samples
+    along the side, in cells; -1 for both if more than `BORDER_SHARE` of the lines are blank.
     """
     borders = np.full((4, 2), -1, np.int64)
     for side in range(4):
@@ -170,14 +189,14 @@ def find_borders(inv_depth: F4, near: int) -> I4:
 
 @kernel
 def _average(depth: F4, factor: int, range_m: float, jump: float, inv_depth: F4) -> None:
-    """Write the inverse of the mean depth of the pixels near the nearest one of each cell."""
+    """Write the inverse of each cell's mean depth, over the pixels close to its nearest pixel."""
     if factor == 2:  # the usual case, in a form that vectorises
         _average_two(depth, range_m, jump, inv_depth)
         return
     rows, columns = inv_depth.shape
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)
     far, least = np.float32(1e9), np.float32(NEAREST_M)
-    # The pixels of a row of cells, sorted by their place in the cell: loops over these vectorise.
+    # The pixels of a row of cells, sorted by their position in the cell, so that loops vectorise.
     parts = np.zeros((factor * factor, columns), np.float32)
     scratch = np.zeros((4, columns), np.float32)
     nearest, limit, total, count = scratch[0], scratch[1], scratch[2], scratch[3]

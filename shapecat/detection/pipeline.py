@@ -1,18 +1,18 @@
 """Detection on one page: from a frame to supporting planes and objects (thesis ch. 4).
 
-1. The depth image is downsampled to samples of inverse depth; a cloud is looked at through a
-   virtual camera first (`depth_grid`, `virtual_camera`).
-2. `planes`: the up direction; multi-plane RANSAC (Fischler and Bolles 1981); which of the planes
-   bear objects; how high every sample is above one (thesis Alg. 1 and 2).
-3. `foreground`: low-profile objects, walls, and what reaches over the edge of its plane.
-4. `segmentation`: surfaces are parted at depth discontinuities and concave edges (local convexity,
-   Stein et al. 2014) by a watershed (Meyer 1991), and where a stack changes its width.
-5. `merging`: relations between surface patches, learned (Richtsfeld et al. 2012, 2014), tell which
-   segments are of one object; others go on behind what is in front of them.
-6. `cleanup`: background structure and noise are rejected, holes are filled.
-7. `output`: boxes, what stands on what, labels at full resolution, the scene.
+1. The depth image is downsampled to samples of inverse depth; a point cloud is first turned into
+   the image of a virtual camera (`depth_grid`, `virtual_camera`).
+2. `planes`: the up direction; multi-plane RANSAC (Fischler and Bolles 1981); the planes that
+   support objects; the height of each sample above its plane (thesis Alg. 1 and 2).
+3. `foreground`: low-profile objects, walls, and objects that overhang the edge of their plane.
+4. `segmentation`: surfaces are split at depth discontinuities and concave edges (local convexity,
+   Stein et al. 2014) by a watershed (Meyer 1991), and where the width of a stack changes.
+5. `merging`: segments of one object are merged, by learned relations between surface patches
+   (Richtsfeld et al. 2012, 2014), and across an object in front.
+6. `cleanup`: structure rejection (of walls, furniture and noise), and hole filling.
+7. `output`: boxes, support relations, labels at full resolution, the scene.
 
-The thesis stops at objects that do not touch: steps 4 and 5 go beyond it.
+The thesis separates only objects that do not touch: steps 4 and 5 go beyond it.
 """
 
 from typing import NamedTuple
@@ -58,11 +58,11 @@ from shapecat.types import Camera, Frame, Scene
 __all__ = ["ALL_STEPS", "Steps", "Task", "detect", "label", "merge_segments", "oversegment"]
 
 DEFAULT_UP = (0.0, -1.0, 0.0)
-"""Up in an upright optical frame, where nothing else is known."""
+"""Up in the optical frame of an upright camera, used if nothing else is known."""
 
 
 class Task(NamedTuple):
-    """What the steps are told: settings, the source of RANSAC samples, which steps are taken."""
+    """The inputs of all steps: the settings, the generator for RANSAC, and the steps to take."""
 
     settings: DetectionSettings
     rng: np.random.Generator
@@ -82,27 +82,28 @@ def detect(
     Parameters
     ----------
     frame : a depth image or a cloud. The sensor is at the origin of its frame.
-    up : (3,) direction away from gravity, sensor frame, of any length but zero. With it only
-        planes within 15 degrees of level count; without, it is estimated from the dominant plane.
+    up : (3,) direction away from gravity, sensor frame, of any length but zero. With it, only
+        planes within 15 degrees of level are considered; without it, up is estimated from the
+        dominant plane.
     settings : see `DetectionSettings`.
-    rng : source of what RANSAC tries; the same state gives the same scene.
-    steps : which steps are taken, for measuring what one is worth.
+    rng : source of the RANSAC samples; the same state gives the same scene.
+    steps : the steps to take, to measure the effect of each.
 
     Returns
     -------
-    The planes, lowest first, and the objects in the order of their first point; both empty if no
-    supporting plane is seen.
+    The scene, with the planes lowest first and the objects in the order of their first point. It
+    has neither if there is no supporting plane.
 
     Raises
     ------
-    ValueError : ``up`` is not a direction.
+    ValueError : ``up`` is not of shape (3,), not finite, or zero.
 
     Notes
     -----
-    Depth images are worked on in image space. A cloud is looked at through a virtual camera at
-    its origin and goes the same way, so both give the same answer on the same scene. A cloud that
-    was not taken from its origin is looked at from above its dominant plane; the points of a
-    fused cloud that are hidden in the view join what they touch.
+    Depth images are processed in image space. A point cloud is first turned into the image of a
+    virtual camera at its origin, so that both give the same result for the same scene. If the
+    cloud was not taken from its origin, the virtual camera looks down on its dominant plane; the
+    points of a fused cloud that are hidden in that view join the objects they touch.
     """
     hint, task = None if up is None else _unit(up), Task(settings, rng, steps)
     if frame.depth is not None and frame.camera is not None:
@@ -156,9 +157,9 @@ def _seen(view: VirtualImage, hint: F8 | None, task: Task) -> Segmentation | Non
 def label(
     grid: DepthGrid, hint: F8 | None, task: Task, *, upright: bool = True
 ) -> Segmentation | None:
-    """Find planes and objects among the samples; None if there is no supporting plane.
+    """Find planes and objects in a depth grid; None if there is no supporting plane.
 
-    ``hint`` is the up direction (3,), if it is known; ``upright`` is of `find_supporting_planes`.
+    ``hint`` is the up direction (3,), if it is known; ``upright`` as in `find_supporting_planes`.
     """
     model = _find_planes(grid, hint, task, upright=upright)
     if model is None:
@@ -170,7 +171,7 @@ def label(
 
 
 def oversegment(grid: DepthGrid, task: Task) -> tuple[PlaneModel, OverSegmentation] | None:
-    """Find planes and the segments of objects; None if no plane bears anything."""
+    """Find planes and the segments of objects; None if there is no supporting plane."""
     model = _find_planes(grid, None, task)
     return None if model is None else (model, _oversegment(grid, model, task.steps))
 
@@ -178,11 +179,11 @@ def oversegment(grid: DepthGrid, task: Task) -> tuple[PlaneModel, OverSegmentati
 def _find_planes(
     grid: DepthGrid, hint: F8 | None, task: Task, *, upright: bool = True
 ) -> PlaneModel | None:
-    """Find what objects stand on and before; None if nothing bears anything."""
+    """Find planes, heights, low-profile objects and walls; None without a supporting plane."""
     trials, tallest_m = draw_trials(task.rng), task.settings.max_height_m
     hint = NO_HINT if hint is None else hint
     supports, up = find_supporting_planes(grid, hint, trials, tallest_m=tallest_m, upright=upright)
-    if not supports and not upright:  # a cloud may be looked at from elsewhere
+    if not supports and not upright:  # another view of the cloud may show a plane
         return None
     up = up if up.any() else np.array(DEFAULT_UP)
     model = _separate(grid, supports, up, trials, task)
@@ -200,7 +201,7 @@ def _find_planes(
 def _separate(
     grid: DepthGrid, supports: list[SupportingPlane], up: F8, trials: F8, task: Task
 ) -> PlaneModel:
-    """Measure what stands above the planes, without walls."""
+    """Measure the heights above the planes, and find low-profile objects and walls."""
     planes, largest_m = pack_planes(supports), task.settings.max_size_m
     heights = measure_heights(grid, planes, task.settings.max_height_m)
     low_profile = np.zeros(grid.inverse_depth.shape, np.int16)
@@ -211,7 +212,7 @@ def _separate(
 
 
 def _oversegment(grid: DepthGrid, model: PlaneModel, steps: Steps) -> OverSegmentation:
-    """Part what stands on the planes where two objects may meet."""
+    """Split the samples above the planes wherever two objects may meet."""
     heights, up = model.heights, model.up
     graph = connect_surfaces(grid, heights)
     labels, n = watershed(heights, graph, concave=steps.concavity)
@@ -225,7 +226,10 @@ def _oversegment(grid: DepthGrid, model: PlaneModel, steps: Steps) -> OverSegmen
 def merge_segments(
     grid: DepthGrid, model: PlaneModel, oversegmentation: OverSegmentation, steps: Steps
 ) -> Bool:
-    """Merge the segments of each object; return which are known to be low-profile objects."""
+    """Merge the segments of each object, in place.
+
+    Returns which segments are known to be low-profile objects: (segments,) bool.
+    """
     graph, labels, segments = oversegmentation
     known: Bool = merge_low_profile(segments, model.low_profile, labels, graph.spans)
     if steps.learned_merging:
@@ -243,7 +247,7 @@ def _clean_up(
     known: Bool,
     settings: DetectionSettings,
 ) -> I4:
-    """Reject what is no object, and number the others; return their representative segments."""
+    """Reject structure, and number the objects; return their representative segments."""
     graph, labels, segments = oversegmentation
     features = measure_object_features(grid, model, oversegmentation, known, settings.max_range_m)
     trees = structure.load_trees()
@@ -259,8 +263,8 @@ def _fill(
     representatives: I4,
     task: Task,
 ) -> Segmentation:
-    """Complete the labels near the planes, and measure the objects."""
-    _, labels, segments = oversegmentation  # labels of objects, from `_clean_up` on
+    """Fill contact boundaries and holes in the labels, and measure the objects."""
+    _, labels, segments = oversegmentation  # since `_clean_up`, the labels are those of objects
     if task.steps.contact_boundary:
         fill_contact_boundary(grid.inverse_depth, model.heights, labels)
     filled = np.zeros(labels.shape, np.uint8)

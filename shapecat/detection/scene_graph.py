@@ -1,4 +1,4 @@
-"""Scene graph: which planes and objects stand on which, the thesis's hierarchy (4.5)."""
+"""Scene graph: which objects and planes stand on which (the hierarchy of thesis 4.5)."""
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
@@ -14,12 +14,12 @@ from shapecat.types import Candidate, Plane, Scene
 __all__ = ["Hierarchy", "Node", "format_tree"]
 
 ON_TOP_M = 0.04
-"""A plane this near to the top of an object is that object's top."""
+"""A plane nearer than this to the top of an object is the object's top, metres."""
 
 
 @dataclass(frozen=True, order=True)
 class Node:
-    """A plane or an object: ``index`` counts `Scene.planes` or `Scene.candidates`."""
+    """A plane or an object; ``index`` is its index in `Scene.planes` or `Scene.candidates`."""
 
     kind: Literal["plane", "object"]
     index: int
@@ -27,10 +27,9 @@ class Node:
 
 @dataclass(frozen=True)
 class Hierarchy:
-    """A graph over a scene; every plane and every object is exactly one node.
+    """The support graph of a scene, with one node for each plane and each object.
 
-    A node may have several parents: a can on a microwave oven on a table is above the plane of
-    the table and above the top of the oven.
+    A node may have several parents.
 
     Examples
     --------
@@ -42,13 +41,13 @@ class Hierarchy:
 
     @cached_property
     def nodes(self) -> tuple[Node, ...]:
-        """All nodes: planes from low to high, then objects."""
+        """All nodes: planes in order of height, then objects."""
         planes = [Node("plane", k) for k in range(len(self.scene.planes))]
         return (*planes, *(Node("object", k) for k in range(len(self.scene.candidates))))
 
     @cached_property
     def edges(self) -> tuple[tuple[Node, Node], ...]:
-        """Pairs (lower, upper) of nodes where the upper stands directly on the lower."""
+        """Pairs (lower, upper) of nodes; the upper stands directly on the lower."""
         found = [
             (parent, Node("object", k))
             for k, candidate in enumerate(self.scene.candidates)
@@ -62,21 +61,21 @@ class Hierarchy:
 
     @property
     def roots(self) -> tuple[Node, ...]:
-        """The nodes that stand on nothing, planes from low to high."""
+        """The nodes that stand on nothing: planes in order of height, then objects."""
         upper = {b for _, b in self.edges}
         return tuple(node for node in self.nodes if node not in upper)
 
     def parents(self, node: Node) -> tuple[Node, ...]:
-        """Return what ``node`` stands on directly."""
+        """Return the nodes that ``node`` stands on directly."""
         return tuple(a for a, b in self.edges if b == node)
 
     def children(self, node: Node) -> tuple[Node, ...]:
-        """Return what stands directly on ``node``: planes from low to high, then objects."""
+        """Return the nodes directly on ``node``: planes in order of height, then objects."""
         upper = {b for a, b in self.edges if a == node}
         return tuple(n for n in self.nodes if n in upper)
 
     def above(self, node: Node) -> tuple[Node, ...]:
-        """Return all that ``node`` carries, directly or through others, each once."""
+        """Return all nodes that ``node`` supports, directly or indirectly, each once."""
         seen: set[Node] = set()
         open_nodes = [node]
         while open_nodes:
@@ -86,32 +85,32 @@ class Hierarchy:
         return tuple(n for n in self.nodes if n in seen)
 
     def objects_on(self, plane: int, *, direct: bool = False) -> tuple[int, ...]:
-        """Return the objects a plane carries; only those that touch it if ``direct``."""
+        """Return the indices of the objects on a plane; if ``direct``, only those touching it."""
         reach = self.children if direct else self.above
         return tuple(n.index for n in reach(Node("plane", plane)) if n.kind == "object")
 
     def count(self, plane: int, *, direct: bool = False) -> int:
-        """Return how many objects are on a plane."""
+        """Return the number of objects on a plane."""
         return len(self.objects_on(plane, direct=direct))
 
     def highest(self, plane: int) -> int | None:
-        """Return the object on a plane whose top is highest; None if there is no object."""
+        """Return the index of the object on a plane with the highest top; None without objects."""
         return max(self.objects_on(plane), key=lambda k: (self._top(k), -k), default=None)
 
     def lowest(self, plane: int) -> int | None:
-        """Return the object on a plane whose top is lowest; None if there is no object."""
+        """Return the index of the object on a plane with the lowest top; None without objects."""
         return min(self.objects_on(plane), key=lambda k: (self._top(k), k), default=None)
 
     def nearest(self, plane: int) -> int | None:
-        """Return the object on a plane that is nearest to the sensor, or None."""
+        """Return the index of the object on a plane nearest to the sensor; None without objects."""
         return min(self.objects_on(plane), key=lambda k: (self._range(k), k), default=None)
 
     def farthest(self, plane: int) -> int | None:
-        """Return the object on a plane that is farthest from the sensor, or None."""
+        """Return the index of the object on a plane farthest from the sensor, or None."""
         return max(self.objects_on(plane), key=lambda k: (self._range(k), -k), default=None)
 
     def objects_on_objects(self) -> tuple[tuple[int, int], ...]:
-        """Return pairs (lower, upper) of objects, the upper standing on the lower."""
+        """Return pairs (lower, upper) of objects, by index; the upper stands on the lower."""
         return tuple(
             (c.on_candidate, k)
             for k, c in enumerate(self.scene.candidates)
@@ -127,7 +126,7 @@ class Hierarchy:
             yield Node("plane", candidate.plane)
 
     def _below_plane(self, k: int) -> Node | None:
-        """Return the object whose top a plane is, or the highest plane under its middle."""
+        """Return the object whose top is plane k, or else the highest plane below its middle."""
         planes = self.scene.planes
         middle = planes[k].outline.mean(axis=0)
         for n, candidate in enumerate(self.scene.candidates):
@@ -153,7 +152,7 @@ class Hierarchy:
 
 
 def _covers(plane: Plane, point: F8) -> bool:
-    """Whether a point is above the convex outline of a plane."""
+    """Return whether a point is within the convex outline of a plane, seen from above."""
     level = gravity_rotation(plane.normal)[:2]
     outline, (x, y) = plane.outline @ level.T, level @ point
     sides = np.roll(outline, -1, axis=0) - outline
@@ -162,10 +161,13 @@ def _covers(plane: Plane, point: F8) -> bool:
 
 
 def format_tree(scene: Scene, describe: Callable[[Scene, Node], str] | None = None) -> str:
-    """Return the hierarchy as an indented text, one node per line as ``describe`` puts it.
+    """Return the hierarchy as indented text, one node per line.
 
-    A node that stands on several others is printed under each and marked ``=`` from its second
-    time on.
+    A node with several parents is printed under each, marked ``=`` after the first time.
+
+    Parameters
+    ----------
+    describe : returns the text for a node; by default its index and size.
 
     Examples
     --------

@@ -1,4 +1,4 @@
-"""The steps of the detection beyond the thesis, each of which can be left out."""
+"""The steps of the detection that go beyond the thesis; each can be left out."""
 
 from typing import NamedTuple
 
@@ -6,9 +6,9 @@ __all__ = ["ALL_STEPS", "Steps"]
 
 
 class Steps(NamedTuple):
-    """Which of the steps beyond the thesis are taken, to measure what each is worth.
+    """The steps beyond the thesis that are taken, so that the effect of each can be measured.
 
-    Without any of them what remains is the plane, the height above it, and depth discontinuities.
+    Without all of them, objects are separated by plane, height and depth discontinuities alone.
     """
 
     low_profile: bool = True

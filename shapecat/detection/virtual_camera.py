@@ -1,4 +1,4 @@
-"""Virtual camera: the image that a depth camera would have taken of an unorganized cloud."""
+"""Virtual camera: the image that a depth camera would take of an unorganized point cloud."""
 
 import math
 from typing import NamedTuple
@@ -14,27 +14,27 @@ from shapecat.types import Pose
 __all__ = ["VirtualImage", "top_view", "virtual_image"]
 
 FIELD = 1.5
-"""Largest tangent of the angle between a point and the optical axis."""
+"""Largest slope x / z or y / z of a point in view."""
 OUTSIDE = 9.0
-"""In place of the tangent of a point that is not in view."""
+"""Stands for the slope of a point that is not in view."""
 MOST_CELLS = 400_000
 MOST_ROWS = 2000
 LEAST_POINTS = 100
 FARTHEST_M = 100.0
 LOAD = 1.8
-"""Points per occupied cell: with fewer, a surface has holes."""
+"""Fewest points per occupied cell, on average; with fewer, surfaces have holes."""
 
 
 class VirtualImage(NamedTuple):
-    """A cloud in a virtual camera.
+    """A point cloud as a virtual camera sees it.
 
     Attributes
     ----------
-    grid : the image of the nearest points.
-    points : (n, 3) float32 in the frame of the virtual camera; 0 where not used.
-    cell : (n,) int32 flat cell of each point, -1 outside.
-    view_from_sensor : pose of the cloud in the frame of the virtual camera.
-    crowded : share of the points that lie well behind others of their cell.
+    grid : the depth grid of the nearest points.
+    points : (n, 3) float32 metres, in the frame of the virtual camera; 0 for points out of view.
+    cell : (n,) int32 flat index of each point's cell; -1 for points out of view.
+    view_from_sensor : pose of the sensor in the frame of the virtual camera.
+    crowded : share of the points that lie well behind another point in their cell.
     """
 
     grid: DepthGrid
@@ -45,10 +45,16 @@ class VirtualImage(NamedTuple):
 
 
 def virtual_image(points: F4, *, range_m: float, origin: F8 | None = None) -> VirtualImage | None:
-    """Look at ``points`` (n, 3), sensor frame, from ``origin``; None if there are too few.
+    """Return the image of a point cloud; None if there are too few points, or all around.
 
-    The optical axis points at the middle of the cloud; the cells are as wide as the points are
-    apart, and not narrower than those of depth images.
+    The optical axis points to the middle of the cloud. Cells are as wide as the spacing of the
+    points, but no narrower than those of depth images.
+
+    Parameters
+    ----------
+    points : (n, 3) metres, sensor frame; rows that are not finite are ignored.
+    range_m : points at a greater depth in the image are ignored, metres.
+    origin : (3,) the viewpoint, metres, sensor frame; by default the sensor.
     """
     origin = np.zeros(3) if origin is None else origin
     axis, n = _middle(points, origin, range_m)
@@ -66,21 +72,23 @@ def virtual_image(points: F4, *, range_m: float, origin: F8 | None = None) -> Vi
 def top_view(
     points: F4, hint: F8 | None, *, range_m: float, rng: np.random.Generator
 ) -> VirtualImage | None:
-    """Look at a cloud that was not taken from its origin, from above its dominant plane.
+    """Return the image of a point cloud from above its dominant plane.
 
-    The plane is the one with most points within 1 cm of it, of 200 through three points (with a
-    ``hint``, of those within 15 degrees of level); its upper side is the one with more points.
-    The viewpoint is 1 m from the middle of the cloud, 45 degrees above the plane.
+    It is for clouds that were not taken from their origin. The plane is the one with the most
+    points within 1 cm, of 200 planes through three random points. Its upper side is the one with
+    more points. The viewpoint is 1 m from the middle of the cloud, 45 degrees above the plane.
 
     Parameters
     ----------
-    points : (n, 3) metres, sensor frame; those that are not finite are left out.
-    hint : (3,) the up direction, if it is known.
-    range_m : metres; what is farther from the viewpoint is not seen.
+    points : (n, 3) metres, sensor frame; rows that are not finite are ignored.
+    hint : (3,) the up direction, if it is known. Then only planes within 15 degrees of level are
+        considered, and their upper side is the one that faces up.
+    range_m : points at a greater depth in the image are ignored, metres; at least 2 m.
+    rng : source of the random points.
 
     Returns
     -------
-    The image, or None where fewer than `LEAST_POINTS` points, or no plane, can be used.
+    The image; None if there are fewer than `LEAST_POINTS` points or no plane.
     """
     used = points[np.isfinite(points).all(axis=1) & (np.abs(points) < FARTHEST_M).all(axis=1)]
     if len(used) < LEAST_POINTS:
@@ -113,7 +121,10 @@ def top_view(
 
 @kernel
 def _middle(points: F4, origin: F8, range_m: float) -> tuple[F8, int]:
-    """Return the sum of the directions to the points within twice the range, and their number."""
+    """Return the sum (3,) of unit vectors to the points within twice the range, and their number.
+
+    The vectors start at ``origin``.
+    """
     ax = ay = az = 0.0
     n = 0
     for k in range(points.shape[0]):
@@ -138,9 +149,10 @@ def _turn(
     place: F4,
     bounds: F8,
 ) -> int:
-    """Move the points in view to the virtual camera; return how many they are.
+    """Transform the points in view to the frame of the virtual camera; return their number.
 
-    Their places (x / z, y / z), `OUTSIDE` for other points, and the bounds of these are written.
+    Writes their slopes x / z and y / z to ``place`` (n, 2), with `OUTSIDE` for the other points,
+    and left, top, right and bottom of the slopes to ``bounds`` (4,).
     """
     r, s = rotation, translation
     n = 0
@@ -168,7 +180,7 @@ def _turn(
 
 
 def _facing(axis: F8) -> F8:
-    """Return the rotation that turns ``axis`` to +z and keeps +x right as well as it can."""
+    """Return a rotation (3, 3) that turns ``axis`` to +z and keeps +x nearly to the right."""
     z = axis / np.linalg.norm(axis)
     x = np.array([1.0, 0.0, 0.0]) if abs(z[0]) < 0.8 else np.array([0.0, -1.0, 0.0])
     x = x - (x @ z) * z
@@ -201,8 +213,8 @@ def _imaged(turned: F4, place: F4, bounds: F8, n: int, pose: Pose) -> VirtualIma
 def _spacing(place: F4, bounds: F8, n: int) -> float:
     """Return the pitch of an image in which nearly every cell of a surface has a point.
 
-    On a grid that is fine against the points every point has a cell of its own; coarser grids
-    are tried until a cell holds ``LOAD`` points on average.
+    In a fine grid every point has a cell of its own; coarser grids are tried until an occupied
+    cell holds ``LOAD`` points on average.
     """
     span = max(bounds[2] - bounds[0], bounds[3] - bounds[1], 1e-6)
     side = 1024
@@ -227,7 +239,7 @@ def _occupied(place: F4, left: float, top: float, scale: float, side: int) -> in
 
 @kernel
 def _project(points: F4, place: F4, intrinsics: PinholeIntrinsics, inv_depth: F4, cell: I4) -> int:
-    """Average the nearest points of each cell; return how many lie well behind them."""
+    """Average the nearest points of each cell; return the number of points well behind them."""
     rows, columns = inv_depth.shape
     nearest = np.zeros(inv_depth.shape, np.float32)
     count = np.zeros(inv_depth.shape, np.float32)
@@ -260,7 +272,7 @@ def _project(points: F4, place: F4, intrinsics: PinholeIntrinsics, inv_depth: F4
 
 @kernel
 def _close_holes(inv_depth: F4) -> None:
-    """Give cells between two neighbours of one surface their mean."""
+    """Fill empty cells between two neighbours on one surface with their mean."""
     rows, columns = inv_depth.shape
     source = inv_depth.copy()
     for i in range(1, rows - 1):

@@ -1,4 +1,4 @@
-"""Supporting planes: up, RANSAC, parallel levels, what bears objects, heights above it."""
+"""Supporting planes: up direction, RANSAC, parallel planes, planes with objects, heights."""
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from shapecat.detection.planes.up_direction import estimate_up
 __all__ = ["NO_HINT", "find_supporting_planes"]
 
 NO_HINT = np.zeros(3)
-"""Takes the place of a direction away from gravity that is not known."""
+"""Stands for an unknown up direction."""
 
 
 def find_supporting_planes(
@@ -23,19 +23,20 @@ def find_supporting_planes(
 ) -> tuple[list[SupportingPlane], F8]:
     """Find the horizontal planes that objects may stand on (thesis 4.3).
 
-    Multi-plane RANSAC (Fischler and Bolles 1981): one plane for each accumulation of level
-    surface in height, then all of them with one normal, then those of which strips are seen.
+    Multi-plane RANSAC (Fischler and Bolles 1981): one plane for each peak of level surface in
+    height; then all planes get a common normal; then planes with only strips visible are added.
 
     Parameters
     ----------
-    hint : (3,) unit vector away from gravity, or `NO_HINT`.
+    hint : (3,) unit vector away from gravity, sensor frame, or `NO_HINT`.
     trials : from `draw_trials`.
-    tallest_m : height of the tallest object.
-    upright : whether the grid is the image of a camera, which is rarely held on its side.
+    tallest_m : height of the tallest object, metres.
+    upright : whether the grid is from a real camera, which is rarely held on its side.
 
     Returns
     -------
-    The planes, lowest first, and the normal (3,) of the largest.
+    The planes, lowest first, and the up direction (3,): the normal of the largest plane; zeros if
+    no level surface is found.
     """
     points = orient_points(grid)
     up = estimate_up(points, grid.intrinsics, hint, trials, UP.held if upright else 0.0)

@@ -1,7 +1,7 @@
-"""Assumed plane: a support that is not seen, below what no plane that is seen explains.
+"""Assumed plane: a hidden support, below the samples that no visible plane explains.
 
-In a bin, a compartment, or close up, objects hide what they lie on. Where much of the image
-stands above no plane, a level plane is assumed below it, so that it is segmented all the same.
+In a bin, in a compartment, or close up, objects hide the surface they lie on. If many samples are
+above no plane, a level plane is assumed below them, so that they are segmented all the same.
 """
 
 import numpy as np
@@ -16,13 +16,16 @@ from shapecat.geometry import gravity_rotation
 __all__ = ["assume_plane", "unexplained"]
 
 UNEXPLAINED = 0.2
-"""Share of the samples above no plane from which one is assumed; 0.06 at most on plain tables."""
+"""Share of unexplained samples above which a plane is assumed; at most 0.06 on plain tables."""
 FEW = 0.01
-"""Share of the unexplained samples that may lie below the plane: noise."""
+"""Share of the unexplained samples that may lie below the plane, as noise."""
 
 
 def unexplained(grid: DepthGrid, plane_id: I4, walls: U1) -> Bool | None:
-    """Return the samples (rows, columns) above no plane and on no wall; None if they are few."""
+    """Return the samples that belong to no plane, nor stand above one, nor are on a wall.
+
+    The result is (rows, columns) bool; None if there are few.
+    """
     seen = grid.inverse_depth > 0
     rest: Bool = ((plane_id.view(np.uint8) | walls) == 0) & seen
     few = np.count_nonzero(rest) <= UNEXPLAINED * np.count_nonzero(seen)
@@ -30,14 +33,16 @@ def unexplained(grid: DepthGrid, plane_id: I4, walls: U1) -> Bool | None:
 
 
 def assume_plane(grid: DepthGrid, rest: Bool, up: F8, tallest_m: float) -> SupportingPlane | None:
-    """Return the level plane below most of some samples, of area 0; None above the camera.
+    """Return the level plane below most unexplained samples; None if it is above the camera.
+
+    It is the plane with the most surface within the height of an object above it, where near
+    surface has more weight. Its visible area is 0.
 
     Parameters
     ----------
     rest : from `unexplained`.
-    up : (3,) unit normal of the plane.
-    tallest_m : height of the tallest object: the plane is the one with most surface within this
-        height above it, what is near counting more than what is far.
+    up : (3,) unit normal of the plane, sensor frame.
+    tallest_m : height of the tallest object, metres.
     """
     i, j = np.nonzero(rest)
     z = 1 / grid.inverse_depth[i, j].astype(np.float64)
@@ -45,7 +50,7 @@ def assume_plane(grid: DepthGrid, rest: Bool, up: F8, tallest_m: float) -> Suppo
     points = np.stack([(j - k.cx) / k.fx * z, (i - k.cy) / k.fy * z, z])
     across, along, height = gravity_rotation(up) @ points
     offset = _fullest(height, 1 / (1 + (z / UP.half_m) ** 2), tallest_m)
-    if offset >= 0:  # its upper side is not seen
+    if offset >= 0:  # its upper side is not visible
         return None
     held = (height > offset) & (height < offset + tallest_m)
     sides = COS[:, None] * across[held] + SIN[:, None] * along[held]
@@ -54,7 +59,7 @@ def assume_plane(grid: DepthGrid, rest: Bool, up: F8, tallest_m: float) -> Suppo
 
 
 def _fullest(height: F8, weight: F8, tallest_m: float) -> float:
-    """Return the height above which, up to ``tallest_m``, most weight lies, just below it."""
+    """Return a height just below the interval of length ``tallest_m`` with the most weight."""
     low = float(height.min())
     count = np.bincount(((height - low) / PLANES.bin_m).astype(np.int64), weight)
     window = round(tallest_m / PLANES.bin_m)

@@ -1,4 +1,4 @@
-"""Plane extent: the outline and the area of a horizontal plane."""
+"""Plane extent: the outline and the visible area of a horizontal plane."""
 
 import math
 from typing import NamedTuple
@@ -29,15 +29,20 @@ ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 COS, SIN = np.cos(ANGLES), np.sin(ANGLES)
 NEXT = (np.arange(DIRECTIONS) + 1) % DIRECTIONS
 BESIDE = 3
-"""Cells from a sample to those over which its surface was seen to go on."""
+"""Distance, in cells, from an inlier to the neighbours that may extend the plane."""
 
 
 class SupportingPlane(NamedTuple):
-    """A horizontal plane that objects may stand on, in units of cells.
+    """A horizontal plane that objects may stand on.
 
-    ``a * j + b * i + c`` is its inverse depth at cell (i, j); ``up`` (3,) its unit normal in the
-    sensor frame and ``offset`` its height along ``up``; ``extent`` (DIRECTIONS,) how far it extends
-    along evenly spaced directions of the level frame, metres; ``area_m2`` its visible area.
+    Attributes
+    ----------
+    a, b, c : the inverse depth at column j and row i of the grid is ``a * j + b * i + c``, 1/m.
+    up : (3,) unit normal, sensor frame.
+    offset : metres, ``up @ p`` for the points p of the plane.
+    extent : (DIRECTIONS,) metres, the support function of the outline: how far it extends from the
+        sensor in evenly spaced directions of the level frame (`gravity_rotation`).
+    area_m2 : visible area.
     """
 
     a: float
@@ -50,7 +55,7 @@ class SupportingPlane(NamedTuple):
 
 
 class PlaneCandidate(NamedTuple):
-    """A plane that may bear objects, samples near it, and what of it things cover, m²."""
+    """A plane that may support objects, the samples to measure it, and its covered area, m²."""
 
     plane: SupportingPlane
     samples: DepthSamples
@@ -59,7 +64,7 @@ class PlaneCandidate(NamedTuple):
 
 @kernel
 def measure_plane(grid: DepthGrid, samples: DepthSamples, plane: F8) -> SupportingPlane:
-    """Measure a plane (a, b, c) on the samples near it."""
+    """Measure height, extent and area of a plane (a, b, c) from its inliers."""
     normal = plane_normal(plane, grid.intrinsics)
     x, y = plane[0] * grid.intrinsics.fx, plane[1] * grid.intrinsics.fy
     z = plane[0] * grid.intrinsics.cx + plane[1] * grid.intrinsics.cy + plane[2]
@@ -72,9 +77,10 @@ def measure_plane(grid: DepthGrid, samples: DepthSamples, plane: F8) -> Supporti
 
 @kernel(fast=True)
 def area_of(samples: DepthSamples, plane: F8, distance: float) -> float:
-    """Return the visible area of a plane by that of a cell at 1 m, from its distance in metres.
+    """Return the visible area of a plane, relative to the area of a cell at 1 m.
 
-    ``plane`` (3,) are the coefficients of its inverse depth: per column, per row, constant.
+    ``plane`` (3,) is a, b, c of its inverse depth; ``distance`` is its distance from the sensor,
+    metres.
     """
     j, i, inv_depth = samples.j, samples.i, samples.inverse_depth
     total = 0.0
@@ -89,7 +95,7 @@ def area_of(samples: DepthSamples, plane: F8, distance: float) -> float:
 
 @kernel
 def _ends(samples: DepthSamples, plane: F8, rows: int, columns: int) -> I4:
-    """Return the first and last column (2, rows) of the inliers in each row; none: last is -1."""
+    """Return the first and last inlier column of each row, (2, rows); last is -1 without one."""
     ends = np.zeros((2, rows), np.int32)
     for i in range(rows):
         ends[0, i], ends[1, i] = columns, -1
@@ -103,10 +109,10 @@ def _ends(samples: DepthSamples, plane: F8, rows: int, columns: int) -> I4:
 
 @kernel
 def _extent_of(grid: DepthGrid, plane: F8, normal: F8, ends: I4) -> F8:
-    """Return how far the plane reaches along `DIRECTIONS`, metres, with a margin.
+    """Return the `SupportingPlane.extent` of a plane, with a margin.
 
-    The outline is convex in the image too: the first and last cell of each row tell it, and what
-    of the plane is beside these.
+    A convex outline is convex in the image too: it follows from the first and last inlier of each
+    row, and their neighbours on the plane.
     """
     inv_depth, intrinsics = grid.inverse_depth, grid.intrinsics
     rows, columns = inv_depth.shape
@@ -132,7 +138,7 @@ def _extent_of(grid: DepthGrid, plane: F8, normal: F8, ends: I4) -> F8:
 
 
 def outline_corners(plane: SupportingPlane) -> F8:
-    """Return the corners (k, 3) of the convex outline, sensor frame, in order, without repeats."""
+    """Return the corners (DIRECTIONS, 3) of the convex outline in order, metres, sensor frame."""
     # Neighbouring sides x cos + y sin = extent meet at a corner.
     along = (plane.extent[NEXT] - plane.extent * COS[1]) / SIN[1]
     level = np.full((DIRECTIONS, 3), plane.offset)

@@ -1,4 +1,4 @@
-"""Height map: the plane that every sample is above, and how far (thesis Alg. 2, step 2)."""
+"""Height map: the plane below each sample, and the height above it (thesis Alg. 2, step 2)."""
 
 from typing import NamedTuple
 
@@ -21,16 +21,16 @@ __all__ = [
 ]
 
 MIN_HEIGHT_M = 0.004
-"""Lowest height of an object cell, to which `HEIGHT_NOISE` times the squared range is added."""
+"""Least height of an object's sample; `HEIGHT_NOISE` times the squared depth is added."""
 HEIGHT_NOISE = 0.0025
 BEYOND_M = 0.1
-"""What is level with a plane and this near to its outline is the plane, not an object below."""
+"""Surface level with a plane and this near to its outline is the plane, not an object below."""
 OUT = -9.0
-"""Takes the place of the height of cells that do not stand on a plane."""
+"""Stands for the height of cells that do not belong to a plane."""
 OUTLINE = 10
-"""Where the outline begins in a row of `pack_planes`."""
+"""Index at which the outline begins in a row of `pack_planes`."""
 FINE = 65536
-"""Steps to 1/m of inverse depth, where it is rounded."""
+"""Steps per 1/m to which inverse depth is rounded."""
 
 
 class HeightMap(NamedTuple):
@@ -38,9 +38,9 @@ class HeightMap(NamedTuple):
 
     Attributes
     ----------
-    plane_id : (rows, columns) int8: k + 1 above plane k and inside its outline, -(k + 1) on its
-        surface, 0 elsewhere.
-    height : (rows, columns) float32, metres above the plane of `plane_id`.
+    plane_id : (rows, columns) int8. For plane k, from 0: k + 1 above it and inside its outline,
+        -(k + 1) on its surface. 0 elsewhere.
+    height : (rows, columns) float32, metres above the plane of ``plane_id``.
     """
 
     plane_id: I4
@@ -48,9 +48,10 @@ class HeightMap(NamedTuple):
 
 
 def pack_planes(supports: list[SupportingPlane]) -> F8:
-    """Return one row of numbers per plane: a, b, c, its depth, two level axes, the outline.
+    """Return planes as rows of numbers, for kernels: (planes, `OUTLINE` + `DIRECTIONS`).
 
-    (planes, `OUTLINE` + `DIRECTIONS`), lowest plane first; lengths in metres, sensor frame.
+    A row is a, b, c of inverse depth, the depth below the sensor, two level axes (3 + 3), and the
+    extent in each direction; lengths in metres, sensor frame.
     """
     rows = np.zeros((len(supports), OUTLINE + DIRECTIONS))
     for row, support in zip(rows, supports, strict=True):
@@ -62,9 +63,12 @@ def pack_planes(supports: list[SupportingPlane]) -> F8:
 
 @kernel
 def measure_heights(grid: DepthGrid, planes: F8, highest_m: float) -> HeightMap:
-    """Give every cell to the highest plane it is above, no more than ``highest_m`` metres.
+    """Assign each sample to the highest plane below it.
 
-    ``planes`` are from `pack_planes`.
+    Parameters
+    ----------
+    planes : from `pack_planes`, lowest first.
+    highest_m : greatest height above the plane, metres.
     """
     plane_id, height = (
         np.zeros(grid.inverse_depth.shape, np.int8),
@@ -93,10 +97,10 @@ def _assign(
     plane_id: I4,
     height: F4,
 ) -> None:
-    """Give the free cells inside the outline of a plane to it; the loops over a row vectorise.
+    """Assign the free cells inside the outline of a plane to it; the loops over a row vectorise.
 
-    Not ``fast``: there is nothing to reorder, and a copy compiled within its caller would round
-    heights otherwise, so that the process that compiles found others than those that follow.
+    Not ``fast``: there is nothing to reorder, and the copy that is inlined into the caller would
+    round heights differently, so that the process that compiles would differ from later ones.
     """
     rows, columns = inv_depth.shape
     a, scale, zero, one = np.float32(plane[0]), np.float32(plane[3]), np.float32(0), np.float32(1)
@@ -105,7 +109,7 @@ def _assign(
     above, surface = np.int8(number), np.int8(-number)
     x = np.arange(columns).astype(np.float32)
     line, slack = np.zeros(columns, np.float32), np.zeros(columns, np.float32)
-    # Level coordinates times inverse depth are linear in the image: (per column, per row, rest).
+    # Level coordinates times inverse depth are linear in the image: per column, per row, constant.
     sides = np.zeros((DIRECTIONS // 2, 3))
     for d in range(2):
         p, q = plane[4 + 3 * d] / intrinsics.fx, plane[5 + 3 * d] / intrinsics.fy
@@ -114,7 +118,7 @@ def _assign(
             sides[k, 0] += part * p
             sides[k, 1] += part * q
             sides[k, 2] += part * (plane[6 + 3 * d] - p * intrinsics.cx - q * intrinsics.cy)
-    # A plane seen edge on has heights between the steps of the sensor; so no division is unsafe.
+    # A plane seen edge-on has heights between the steps of the sensor; so no division is unsafe.
     for i in range(rows):
         base = np.float32(plane[1] * i + plane[2])
         some = False
@@ -136,7 +140,7 @@ def _assign(
                 np.float32(plane[OUTLINE + k]),
                 np.float32(plane[OUTLINE + k + DIRECTIONS // 2]),
             )
-            # Few rows reach beyond a side, and their bounds tell most of the others.
+            # Few rows reach beyond a side; bounds rule out most of the others.
             ends = step * left + first, step * right + first
             scratch = min(far * farthest, far * nearest), min(near * farthest, near * nearest)
             if max(ends[0], ends[1]) <= scratch[0] and -min(ends[0], ends[1]) <= scratch[1]:
@@ -157,7 +161,7 @@ def _assign(
 def _bounds(
     line: F4, inv_depth: F4, i: int
 ) -> tuple[np.float32, np.float32, np.float32, np.float32]:
-    """Return the first and last cell of a row with a height, and bounds of their values."""
+    """Return the first and last cell of a row with a height, and bounds of the inverse depth."""
     left, right = 0, line.size - 1
     while line[left] <= OUT:
         left += 1
@@ -176,9 +180,13 @@ def _bounds(
 
 @kernel
 def is_inside_outline(plane: F8, x: float, y: float, z: float, slack: float) -> bool:
-    """Tell whether a point is within the outline of a row of `pack_planes`, or ``slack`` beyond it.
+    """Return whether a point is inside the outline of a plane, or at most ``slack`` outside.
 
-    The point in the sensor frame and the slack are in metres.
+    Parameters
+    ----------
+    plane : a row of `pack_planes`.
+    x, y, z : the point, metres, sensor frame.
+    slack : metres.
     """
     p = plane[4] * x + plane[5] * y + plane[6] * z
     q = plane[7] * x + plane[8] * y + plane[9] * z

@@ -1,8 +1,9 @@
-"""Horizontal planes: one for each accumulation of level surface in height (thesis 4.3, Alg. 1).
+"""Horizontal planes: one for each peak of level surface in height (thesis 4.3, Alg. 1).
 
-They are parallel: all get the one normal that the larger ones tell best. A board seen at a grazing
-angle, or only a strip of one, does not tell its tilt well: half a degree is a centimetre of height
-a metre away. What is not level then, such as the top of a tilted thing, is left out.
+They are parallel: all get one normal, which the larger ones determine best. A board that is seen at
+a grazing angle or in part determines its tilt badly, and half a degree is a centimetre of height at
+a distance of one metre. Planes that are then not level, such as the top of a tilted object, are
+dropped.
 """
 
 from collections.abc import Iterable
@@ -37,15 +38,15 @@ __all__ = ["find_horizontal_planes"]
 
 MOST_PLANES = 10
 LEAST_SAMPLES = 44
-"""Points on a plane at least: a tenth of that is noise."""
+"""Fewest points on a plane; noise alone gives a tenth of that."""
 
 
 def find_horizontal_planes(
     grid: DepthGrid, points: OrientedPoints, up: F8, trials: F8
 ) -> list[PlaneCandidate]:
-    """Return the horizontal planes of the scene, lowest first, with one normal in common.
+    """Return the horizontal planes of the scene, lowest first, with a common normal.
 
-    ``up`` is a unit vector (3,); ``trials`` are from `draw_trials`.
+    ``up`` is a unit vector (3,), sensor frame; ``trials`` are from `draw_trials`.
     """
     found = _find(grid, points, up, trials)
     better = _common_up(found) if found else up
@@ -70,7 +71,7 @@ def _measure(grid: DepthGrid, samples: DepthSamples, planes: Iterable[F8]) -> li
 
 
 def _common_up(found: list[PlaneCandidate]) -> F8:
-    """Return the mean normal, weighted by how well each plane tells it: area and width squared."""
+    """Return the mean normal (3,), weighted by the precision of each: area times width squared."""
     half = DIRECTIONS // 2
     mean = np.zeros(3)
     for plane, *_ in found:
@@ -101,15 +102,17 @@ def _turn(
 def fit_horizontal_planes(
     rest: DepthSamples, height: F4, intrinsics: PinholeIntrinsics, up: F8, trials: F8
 ) -> F8:
-    """Return the horizontal planes (n, 3) of inverse depth, fullest first.
+    """Return the horizontal planes (n, 3), as a, b, c of inverse depth, most samples first.
 
     Parameters
     ----------
-    rest, height : from `level_samples`.
+    rest, height : the samples and their heights, from `level_samples`.
+    up : (3,) unit vector, sensor frame.
+    trials : from `draw_trials`.
     """
     found = np.zeros((MOST_PLANES, 3))
     n = 0
-    # (3) one plane candidate for each accumulation in height
+    # (3) one plane candidate for each peak in height
     for _ in range(MOST_PLANES):
         if height.size < LEAST_SAMPLES:
             break
@@ -141,7 +144,7 @@ def _heights(samples: DepthSamples, intrinsics: PinholeIntrinsics, up: F8) -> F4
 
 @kernel
 def _fullest(height: F4) -> float:
-    """Return the middle of the bin that with its neighbours holds most of the heights."""
+    """Return the middle of the bin that, with its neighbours, holds the most heights."""
     low = high = float(height[0])
     for h in height:
         low, high = min(low, h), max(high, h)
@@ -182,7 +185,7 @@ def _split(
 def _fit(
     near: DepthSamples, intrinsics: PinholeIntrinsics, up: F8, trials: F8, offset: float, plane: F8
 ) -> bool:
-    """Write the plane of samples at about one height; return whether it is large enough."""
+    """Fit a plane to samples at about one height; return whether it is large enough."""
     level = horizontal_plane(intrinsics, up, offset)
     plane[0], plane[1], plane[2] = level
     count = 0

@@ -1,4 +1,4 @@
-"""Oriented points: where smooth surface is, and which way it faces, for every third sample."""
+"""Oriented points: position, smoothness and normal of the surface at every third sample."""
 
 from typing import NamedTuple
 
@@ -14,21 +14,22 @@ from shapecat.jit import kernel
 __all__ = ["OrientedPoints", "level_samples", "orient_points"]
 
 STRIDE = 3
-"""Samples from one point to the next, and over which its surface is seen to be smooth: less tells
-the tilt of a noisy surface too badly, more leaves no point on narrow boards."""
+"""Samples from one point to the next, and to the neighbours that give its normal: with fewer, noise
+disturbs the normals; with more, narrow boards have no point."""
 FIRST = STRIDE // 2
 """First row and column of points."""
 
 
 class OrientedPoints(NamedTuple):
-    """The points of n samples, row by row.
+    """Oriented points, n = rows * columns, row by row.
 
     Attributes
     ----------
     inverse_depth : (rows, columns) float32, 1/m, of every third sample.
-    normals : (3, n) float32 unit vectors towards the camera; 0 where no smooth surface is seen.
-    positions : (3, n) float32, metres, sensor frame; 0 where nothing is seen.
-    smooth : how many are on smooth surface.
+    normals : (3, n) float32 unit vectors towards the camera, sensor frame; 0 where the surface is
+        not smooth.
+    positions : (3, n) float32, metres, sensor frame; 0 where there is no reading.
+    smooth : the number of points on smooth surface.
     """
 
     inverse_depth: F4
@@ -38,7 +39,7 @@ class OrientedPoints(NamedTuple):
 
 
 def orient_points(grid: DepthGrid) -> OrientedPoints:
-    """Return the normal of every third sample that lies on a plane with those around it."""
+    """Return every third sample, with its normal if its neighbours lie on a plane with it."""
     coarse = np.ascontiguousarray(grid.inverse_depth[FIRST::STRIDE, FIRST::STRIDE])
     normals, positions = np.zeros((2, 3, coarse.size), np.float32)
     smooth = _orient(coarse, grid.intrinsics, normals, positions)
@@ -47,7 +48,7 @@ def orient_points(grid: DepthGrid) -> OrientedPoints:
 
 @kernel
 def _orient(coarse: F4, intrinsics: PinholeIntrinsics, normals: F4, positions: F4) -> int:
-    """Write the normals and positions; return how many there are."""
+    """Write the normals and positions; return the number of points on smooth surface."""
     rows, columns = coarse.shape
     x = np.zeros(columns, np.float32)
     for c in range(columns):
@@ -63,7 +64,7 @@ def _orient(coarse: F4, intrinsics: PinholeIntrinsics, normals: F4, positions: F
 def _orient_row(
     coarse: F4, r: int, y: float, x: F4, focal: tuple[float, float], normals: F4, positions: F4
 ) -> int:
-    """Write the points of a row; return how many are on smooth surface. The loop vectorises."""
+    """Write the points of a row; return the number on smooth surface. The loop vectorises."""
     zero, one, two = np.float32(0), np.float32(1), np.float32(2)
     bend, count = np.float32(2 * DISCONTINUITY), np.int32(0)
     across, down = np.float32(focal[0] / (2 * STRIDE)), np.float32(focal[1] / (2 * STRIDE))
@@ -89,9 +90,9 @@ def _orient_row(
 
 @kernel
 def level_samples(points: OrientedPoints, up: F8) -> tuple[DepthSamples, F4]:
-    """Return the samples of points that face up within 25 degrees, and their heights.
+    """Return the samples whose normals are within 25 degrees of up, and their heights.
 
-    ``up`` is a unit vector (3,); the heights (n,) are in metres above the sensor.
+    ``up`` is a unit vector (3,), sensor frame; the heights (n,) are in metres above the sensor.
     """
     coarse, normals, positions = points.inverse_depth, points.normals, points.positions
     rows, columns = coarse.shape

@@ -1,4 +1,4 @@
-"""RANSAC: planes that many depth samples lie in (Fischler and Bolles 1981)."""
+"""RANSAC: planes with many inliers among depth samples (Fischler and Bolles 1981)."""
 
 import math
 from typing import NamedTuple
@@ -24,18 +24,23 @@ __all__ = [
 ]
 
 TRIALS, BLOCK = 240, 256
-"""Planes that are tried: one of a seventh of the samples is missed with a chance of a half. After
-so many samples it is asked if a plane can still win."""
+"""Planes tried: one with a seventh of the samples is missed with a probability of a half. Samples
+after which a plane that can no longer win is dropped."""
 LEAST_DOUBLE_AREA = 30.0
-"""Of the triangle of three samples, in cells squared: smaller ones are mostly noise."""
+"""Twice the least area of the triangle of three samples, in square cells: noise spoils smaller
+ones."""
 SAMPLE = 4800
-"""About as many cells propose planes and vote: more take longer and find no others."""
+"""Approximate number of cells that propose planes and vote: more only take longer."""
 
 
 class DepthSamples(NamedTuple):
-    """Depth samples in a list: ``j`` (n,) columns, ``i`` (n,) rows, ``inverse_depth`` (n,) 1/m.
+    """A list of depth samples.
 
-    All float32. ``share`` is how many cells each stands for.
+    Attributes
+    ----------
+    j, i : (n,) float32 columns and rows.
+    inverse_depth : (n,) float32, 1/m.
+    share : the number of cells that each sample stands for.
     """
 
     j: F4
@@ -46,7 +51,7 @@ class DepthSamples(NamedTuple):
 
 @kernel
 def sample_grid(inv_depth: F4, wanted: F4) -> DepthSamples:
-    """Return evenly spaced cells with a reading, where ``wanted`` (rows, columns) is above 0."""
+    """Return evenly spaced samples where ``wanted`` (rows, columns) is above 0."""
     rows, columns = inv_depth.shape
     stride = max(1, round(math.sqrt(inv_depth.size / SAMPLE)))
     result = np.zeros((3, (rows // stride + 1) * (columns // stride + 1)), np.float32)
@@ -60,9 +65,9 @@ def sample_grid(inv_depth: F4, wanted: F4) -> DepthSamples:
 
 @kernel
 def median_of(values: F4) -> float:
-    """Return the upper median of ``values`` (n,), at least one.
+    """Return the upper median of ``values`` (n,), n >= 1.
 
-    Source: Hoare 1961, Algorithm 65. `numpy.partition` in a kernel takes 15 ms to load.
+    Source: Hoare 1961, Algorithm 65. A kernel with `numpy.partition` takes 15 ms to load.
     """
     sample = values.copy()
     middle, low, high = sample.size // 2, 0, sample.size - 1
@@ -85,7 +90,7 @@ def median_of(values: F4) -> float:
 
 @kernel
 def off_plane(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSamples:
-    """Return the samples not within ``tolerance``, 1/m, of a plane (3,) of inverse depth."""
+    """Return the samples farther than ``tolerance`` (1/m) from a plane (a, b, c)."""
     a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     gate = np.float32(tolerance)
     rest = np.zeros((3, samples.inverse_depth.size), np.float32)
@@ -99,7 +104,10 @@ def off_plane(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSample
 
 @kernel
 def plane_normal(plane: F8, intrinsics: PinholeIntrinsics) -> F8:
-    """Return the unit normal towards the camera of a plane (a, b, c) of inverse depth."""
+    """Return the unit normal (3,), towards the camera, of a plane.
+
+    The inverse depth of the plane (a, b, c) at column j and row i is ``a * j + b * i + c``, 1/m.
+    """
     a, b, c = plane
     x, y, z = -a * intrinsics.fx, -b * intrinsics.fy, -(a * intrinsics.cx + b * intrinsics.cy + c)
     norm = math.sqrt(x * x + y * y + z * z)
@@ -114,7 +122,7 @@ def cosine(a: F8, b: F8) -> float:
 
 @kernel
 def horizontal_plane(intrinsics: PinholeIntrinsics, up: F8, offset: float) -> F8:
-    """Return the plane ``up @ p == offset`` as inverse depth (a, b, c)."""
+    """Return the plane ``up @ p == offset``, metres, sensor frame, as (a, b, c)."""
     a, b = up[0] / intrinsics.fx, up[1] / intrinsics.fy
     return np.array(
         [a / offset, b / offset, (up[2] - a * intrinsics.cx - b * intrinsics.cy) / offset]
@@ -122,7 +130,7 @@ def horizontal_plane(intrinsics: PinholeIntrinsics, up: F8, offset: float) -> F8
 
 
 def draw_trials(rng: np.random.Generator) -> F8:
-    """Draw the numbers (n, 3) from 0 to 1 that tell all kernels of a frame which to try."""
+    """Draw random numbers (n, 3) in [0, 1), which choose the samples in all kernels of a frame."""
     return rng.random((TRIALS, 3))
 
 
@@ -135,14 +143,15 @@ def ransac_plane(
     cosines: tuple[float, float],
     tolerance: float,
 ) -> tuple[F8, int]:
-    """Return the plane (a, b, c) with most inliers, and how many samples these are.
-
-    Only planes count whose normal towards the camera has a cosine within ``cosines`` to
-    ``guide``. No samples agree on a plane: 0.
+    """Return the plane (a, b, c) with the most inliers, and their number; 0 if none is found.
 
     Parameters
     ----------
-    trials : of `draw_trials`; the samples at these shares of the list propose planes.
+    trials : (n, 3) from `draw_trials`; each row picks three samples that propose a plane.
+    guide : (3,) unit vector, sensor frame.
+    cosines : bounds of the cosine between ``guide`` and the plane's normal towards the camera;
+        other planes are not considered.
+    tolerance : largest distance of an inlier in inverse depth, 1/m.
     """
     plane, best = np.zeros(3), np.zeros(3)
     most, n = 0, samples.inverse_depth.size
@@ -158,7 +167,7 @@ def ransac_plane(
         )
         if not ((along >= cosines[0] * norm) & (along <= cosines[1] * norm)):
             continue
-        # (2) all vote
+        # (2) all samples vote
         inliers = 0
         for start in range(0, n, BLOCK):
             if inliers + n - start <= most:
@@ -167,7 +176,7 @@ def ransac_plane(
         if inliers > most:
             most = inliers
             best[0], best[1], best[2] = plane[0], plane[1], plane[2]
-    # (3) the inliers refit
+    # (3) the plane is refitted to its inliers
     for _ in range(4):
         refine(samples, tolerance, best)
     return best, count_inliers(samples, best, tolerance) if most >= 3 else 0
@@ -175,7 +184,7 @@ def ransac_plane(
 
 @kernel
 def _propose(samples: DepthSamples, trials: F8, t: int, plane: F8) -> bool:
-    """Write the plane through three samples; return whether they are far enough apart."""
+    """Write the plane through the samples of trial t; return whether they are far enough apart."""
     n = samples.inverse_depth.size
     p, q, r = int(trials[t, 0] * n), int(trials[t, 1] * n), int(trials[t, 2] * n)
     j, i, w = samples.j[p], samples.i[p], samples.inverse_depth[p]
@@ -189,27 +198,27 @@ def _propose(samples: DepthSamples, trials: F8, t: int, plane: F8) -> bool:
 
 @kernel
 def count_inliers(samples: DepthSamples, plane: F8, tolerance: float) -> int:
-    """Count the samples within ``tolerance``, 1/m, of a plane (3,) of inverse depth."""
-    first = np.int64(0)  # a literal would be compiled apart
+    """Count the samples within ``tolerance`` (1/m) of a plane (a, b, c) of inverse depth."""
+    first = np.int64(0)  # numba would compile another version for a literal
     return int(_count_part(samples, plane, tolerance, first, samples.inverse_depth.size))
 
 
 @kernel(fast=True)
 def _count_part(samples: DepthSamples, plane: F8, tolerance: float, start: int, stop: int) -> int:
-    """Count the samples near a plane from place ``start`` to ``stop`` in the list."""
+    """Count the inliers of a plane among the samples from ``start`` to before ``stop``."""
     j, i, inv_depth = samples.j, samples.i, samples.inverse_depth
     a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     gate, total = np.float32(tolerance), np.int32(0)
-    for k in range(np.uint64(start), np.uint64(stop)):  # signed ones may count from the end
+    for k in range(np.uint64(start), np.uint64(stop)):  # unsigned: no check for negative indices
         total += np.int32(abs(inv_depth[k] - (a * j[k] + b * i[k] + c)) < gate)
     return int(total)
 
 
 @kernel(fast=True)
 def refine(samples: DepthSamples, tolerance: float, plane: F8) -> int:
-    """Fit a plane (a, b, c) to its inliers by least squares; return how many they are.
+    """Fit a plane (a, b, c) to its inliers by least squares, in place; return their number.
 
-    The plane stays as it is if they do not span one.
+    The plane does not change if the inliers do not determine it. ``tolerance`` is in 1/m.
     """
     j, i, inv_depth = samples.j, samples.i, samples.inverse_depth
     if inv_depth.size == 0:

@@ -10,102 +10,101 @@ class UpSettings(NamedTuple):
     """How the up direction is estimated."""
 
     facing_cos: float = math.cos(math.radians(20))
-    """A surface faces a direction within this angle: noise turns normals by up to 15 degrees."""
+    """A surface faces a direction within this angle; noise turns normals by up to 15 degrees."""
     hint_cos: float = math.cos(math.radians(15))
-    """Accelerometers and poses of cameras are off by less."""
+    """Normals within this angle of the hint are considered: IMUs and poses are off by less."""
     corner_cos: float = 0.3
-    """Two directions farther from each other than this may be of two walls."""
+    """Directions with a smaller absolute cosine between them may be the normals of two walls."""
     least_share: float = 0.04
-    """Share of the surface that faces up at least: of a table at the edge of the image."""
+    """Least share of the surface that faces up: a table at the edge of the image."""
     trials: int = 120
-    """Directions tried: one in 25 misses with a chance of less than a hundredth."""
+    """Directions tried: that of 1 normal in 25 is missed with a probability below 1 %."""
     level_bin_m: float = 0.04
-    """Height of a bin, metres: more than the noise at 2 m and less than a board is apart from the
-    next."""
+    """Height of a bin, metres: more than the noise at 2 m, less than the gap between boards."""
     several: float = 1.5
-    """Power of the number of levels: a shelf has several, the wall behind it one."""
+    """Exponent of the number of levels: a shelf has several, the wall behind it one."""
     clear: float = 2.0
-    """Power of the share of what faces a direction that lies in large levels."""
+    """Exponent of the share of the surface facing a direction that is in large levels."""
     aslant: float = 0.6
-    """What of a direction's merit is lost where the camera looks along it: at walls, not tables."""
+    """Share of the score that a direction along the optical axis loses: walls, not tables."""
     held: float = 3.0
-    """A direction that means a camera on its side or upside down counts a quarter."""
+    """Penalty on directions that imply a camera on its side or upside down: a quarter is left."""
     steep: float = 0.03
-    """Squared sine of the angle to the line of sight below which a direction tells no roll."""
+    """Squared sine of the angle to the optical axis below which a direction fixes no roll."""
     half_m: float = 1.5
-    """Distance at which a surface counts half: what is near decides."""
+    """Depth at which surface has half the weight: near surface decides."""
 
 
 class PlaneSettings(NamedTuple):
-    """How planes are found and told from the tops of objects."""
+    """How planes are found, and distinguished from the tops of objects."""
 
     tolerance: float = 0.01
     """Distance of an inlier from a plane in inverse depth, 1/m: three steps of a Kinect."""
     level_cos: float = math.cos(math.radians(25))
-    """Noise tilts a level surface by less than 25 degrees."""
+    """Normals within this angle of up belong to level surface: noise tilts them by less."""
     bin_m: float = 0.01
-    """Height of a bin of level surface, metres: as the noise at 1.5 m."""
+    """Height of a bin of level surface, metres: the noise at 1.5 m."""
     least_m2: float = 0.02
-    """Visible area of the smallest plane: a strip of a table that is left free."""
+    """Visible area of the smallest plane: the uncovered strip of a table."""
     margin_m: float = 0.01
-    """A plane goes on so far beyond the samples on it, metres: as far as these are apart."""
+    """A plane extends this far beyond its samples, metres: their spacing."""
     steady_cos: float = math.cos(math.radians(6))
-    """A plane that is tilted more against up does not follow from the samples at its height."""
+    """A plane tilted by more against up is not determined by the samples at its height."""
     close_share: float = 0.75
-    """Of the samples near a plane, fewer are within half the tolerance if it lies tilted between
-    two, as between a table and the plates on it."""
+    """Least share of the inliers within half the tolerance. A plane tilted between two others, such
+    as a table and the plates on it, has fewer."""
     turned_cos: float = math.cos(math.radians(1))
-    """Where up turns out to be off by more, heights blur by a centimetre at half a metre."""
+    """If up turns by more, planes are refitted: heights blur by a centimetre at half a metre."""
     furniture_m2: float = 0.25
-    """Larger planes are furniture, whatever is under their edge."""
+    """Larger planes are furniture, whatever is below their edge."""
     likely_m2: float = 0.1
-    """Larger planes are furniture if nothing is seen of what is under their edge."""
+    """Larger planes are furniture if the space below their edge is not visible."""
     board_m2: float = 0.03
-    """Smaller planes are no boards above another plane."""
+    """Smaller planes above another plane are not boards."""
     least_drop_m: float = 0.06
-    """What is less high above a plane is an object."""
+    """A plane that is less high above another is the top of an object."""
     step_m: float = 0.01
-    """Length of the steps by which the surroundings of an edge are looked at, metres."""
+    """Length of the steps in which the surroundings of an edge are searched, metres."""
     wall_m: float = 0.03
-    """Samples within this distance behind an edge are of the wall of a box, metres."""
+    """Samples within this distance behind an edge belong to the wall of a box, metres."""
     closed: float = 0.5
-    """Share of the samples below an edge on a wall that closes a box."""
+    """Share of the samples below an edge that are on a wall, above which the wall closes a box."""
     borne_m: float = 0.4
-    """What is higher above a large plane does not stand on it, metres."""
+    """Greatest height above a large plane of an object on it, metres."""
 
 
 class StripSettings(NamedTuple):
-    """How planes are found of which strips are seen."""
+    """How planes are found of which only narrow strips are visible."""
 
     bin_m: float = 0.005
-    """Height of a bin, metres: as the noise of strips at 1 m."""
+    """Height of a bin, metres: the noise of strips at 1 m."""
     grazing: float = 0.015
-    """Change of inverse depth from row to row, 1/m, from which a plane is seen at a grazing angle:
-    the tolerance is passed within a row."""
+    """Change of inverse depth per row, 1/m, above which a plane is seen at a grazing angle: from
+    one row to the next it exceeds the tolerance."""
     least_depth_m: float = 0.03
-    """Rays that fall less steeply, down over forward, run along a surface."""
+    """Smallest downward slope of a ray (down / forward); flatter rays run along a surface."""
     least_rise: float = 0.05
-    """Slope of a ray, down over forward, below which the surface of a cell is no larger."""
+    """Smallest downward slope that is used to compute the area a cell covers."""
     below: int = 10
-    """Bins below a plane in which there is next to nothing."""
+    """Bins below a plane that hold next to no surface."""
     above: int = 30
-    """Bins above a covered plane in which the tops of the things on it lie."""
+    """Bins above a covered plane that hold the tops of the objects on it."""
     covers: float = 1.0
-    """Tops of things that cover a plane show so many times its surface."""
+    """Least area of the tops of objects that cover a plane, relative to its visible area."""
     contrast: float = 2.0
-    """A plane has so many times the surface of what is below."""
+    """Least area of a plane, relative to that of the bins below."""
     dip: float = 0.6
-    """Above a plane the surface falls to this share of its own."""
+    """Just above a plane, the area falls below this share of its own."""
     least_m2: float = 0.001
-    """What is seen of a covered plane at least."""
+    """Least visible area of a covered plane."""
     least_points: int = 15
-    """Of every third sample, at a height that may be that of strips."""
+    """Fewest points, of every third sample, at a height that may have strips."""
     same_m: float = 0.012
-    """Planes whose heights differ by less, metres, are one."""
+    """Planes whose heights differ by less are the same plane, metres."""
     tallest_m: float = 0.15
-    """Height of the tallest things that cover a plane, metres."""
+    """Height of the tallest objects that cover a plane, metres."""
     most_seen: float = 0.45
-    """Share of its outline that is seen of a covered plane at most: a lid is seen whole."""
+    """Largest visible share of the outline of a covered plane; a lid is visible as a whole."""
 
 
 UP, PLANES, STRIPS = UpSettings(), PlaneSettings(), StripSettings()

@@ -1,8 +1,8 @@
-"""Planes by height alone: boards and tables of which narrow strips are seen.
+"""Planes found by height alone: boards and tables of which only narrow strips are visible.
 
-A strip is too narrow for its tilt to be told: a table between the flat boxes that cover it, or a
-board just below the camera that fills a few rows of the image. By height the samples of it lie
-within millimetres, so where the up direction is known, height alone is left to be found.
+A strip is too narrow to determine its tilt. Examples are a table between the flat boxes that cover
+it, and a board just below the camera that fills a few rows of the image. But the heights of its
+samples agree to millimetres, so if up is known, only the height has to be found.
 """
 
 import numpy as np
@@ -26,15 +26,20 @@ from shapecat.jit import kernel, unset
 __all__ = ["add_strip_planes", "may_have_strips"]
 
 APART = 2
-"""Columns between the samples that are looked at."""
+"""Step between the columns of the samples used."""
 ARM = 2
-"""Cells to each side over which a strip is seen to be level."""
+"""Distance, in cells, to the neighbours that show whether a sample is on level surface."""
 BINS = 600
-"""Of `StripSettings.bin_m`: no table is more than 3 m below the camera."""
+"""Number of bins of `StripSettings.bin_m`: no table is more than 3 m below the camera."""
 
 
 def may_have_strips(grid: DepthGrid, points: OrientedPoints, found: list[PlaneCandidate]) -> bool:
-    """Whether many points lie at a height where strips of a plane may be, with few below it."""
+    """Return whether many points lie at a height that may have strips, with few below it.
+
+    Parameters
+    ----------
+    found : parallel planes, at least one.
+    """
     count = _count_by_height(points, found[0].plane.up)
     return any(_may_be_strips(grid, found, *peak) for peak in _peaks(count, STRIPS.least_points))
 
@@ -42,7 +47,10 @@ def may_have_strips(grid: DepthGrid, points: OrientedPoints, found: list[PlaneCa
 def _may_be_strips(
     grid: DepthGrid, found: list[PlaneCandidate], height: float, above: float
 ) -> bool:
-    """Whether a board at a height is seen at a grazing angle, or covered by what has tops above."""
+    """Return whether a plane at a height is seen at a grazing angle, or covered by objects.
+
+    ``above`` is the level area just above it, relative to its own, from `_peaks`.
+    """
     large = [one.plane.offset for one in found if one.plane.area_m2 > PLANES.likely_m2]
     up = found[0].plane.up
     if height > up[1] / (grid.intrinsics.fy * STRIPS.grazing):
@@ -52,14 +60,18 @@ def _may_be_strips(
 
 
 def add_strip_planes(grid: DepthGrid, found: list[PlaneCandidate]) -> list[PlaneCandidate]:
-    """Add the planes of which strips are seen.
+    """Add the planes of which only narrow strips are visible.
 
-    They have next to nothing below. A board shows some surface, a covered table more of it just
-    above, on the things that cover it.
+    There is next to no surface below such a plane. A board shows some surface of its own; a covered
+    table shows more just above it, on the objects that cover it.
 
     Parameters
     ----------
-    found : parallel planes, lowest first, at least one. One that is known may reach farther.
+    found : parallel planes, lowest first, at least one.
+
+    Returns
+    -------
+    All planes, lowest first. A plane of ``found`` may have a larger extent now.
     """
     up = max(found, key=lambda one: one.plane.area_m2).plane.up
     strips, area = _level_strips(grid.inverse_depth, grid.intrinsics, up)
@@ -85,7 +97,7 @@ def _widened(known: PlaneCandidate, table: PlaneCandidate) -> PlaneCandidate:
 
 
 def _plane_at(grid: DepthGrid, strips: F4, up: F8, height: float) -> PlaneCandidate:
-    """Measure the level plane of the strips at a height."""
+    """Measure the level plane through the strips at a height."""
     near = np.ascontiguousarray(strips[:, abs(strips[3] - height) < 1.5 * STRIPS.bin_m])
     offset = float(np.median(near[3])) if near.size else height
     samples = DepthSamples(near[0], near[1], near[2], APART)
@@ -94,7 +106,7 @@ def _plane_at(grid: DepthGrid, strips: F4, up: F8, height: float) -> PlaneCandid
 
 
 def _covered(seen: PlaneCandidate, strips: F4, intrinsics: PinholeIntrinsics) -> PlaneCandidate:
-    """Measure what of a plane is covered: nothing where most of its outline is seen."""
+    """Set the covered area of a plane: 0 if most of its outline is visible."""
     plane = seen.plane
     corners = outline_corners(plane)
     turned = np.cross(corners, np.roll(corners, -1, axis=0)).sum(axis=0)
@@ -106,7 +118,7 @@ def _covered(seen: PlaneCandidate, strips: F4, intrinsics: PinholeIntrinsics) ->
 
 
 def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane) -> float:
-    """Return how much level surface lies over the outline of a plane, m²."""
+    """Return the area of level surface just above the outline of a plane, m²."""
     j, i, inv_depth, _ = strips.astype(np.float64)
     x, y = (j - intrinsics.cx) / intrinsics.fx, (i - intrinsics.cy) / intrinsics.fy
     level = gravity_rotation(plane.up) @ (np.stack([x, y, np.ones(j.size)]) / inv_depth)
@@ -119,14 +131,17 @@ def _area_over(strips: F4, intrinsics: PinholeIntrinsics, plane: SupportingPlane
 
 @kernel
 def _peaks(amount: F8, least: float) -> F8:
-    """Return (n, 2) heights, ascending, of level surface with next to nothing below it.
-
-    Beside each stands how many times as much surface there is just above: tops of what covers it.
+    """Find the heights of level surface with next to nothing below it.
 
     Parameters
     ----------
-    amount : (BINS,) of surface by height, the lowest first.
-    least : of a peak, with the bins beside it.
+    amount : (BINS,) level surface by height, the lowest first.
+    least : least amount in a peak and the two bins beside it.
+
+    Returns
+    -------
+    (n, 2) the heights above the sensor, metres, ascending; and the amount just above, relative to
+    the peak's own, which comes from the tops of objects that cover it.
     """
     peaks, n, bins = np.zeros((BINS, 2)), 0, STRIPS.below - 2
     for k in range(STRIPS.below, BINS - 3):
@@ -146,7 +161,7 @@ def _peaks(amount: F8, least: float) -> F8:
 
 @kernel
 def _count_by_height(points: OrientedPoints, up: F8) -> F8:
-    """Count the points (BINS,) by height, the lowest first, but those that face aside."""
+    """Count the points by height, (BINS,) lowest first, without those that face sideways."""
     x, y, z = np.float32(up[0]), np.float32(up[1]), np.float32(up[2])
     xs, ys, zs = points.positions[0], points.positions[1], points.positions[2]
     nx, ny, nz = points.normals[0], points.normals[1], points.normals[2]
@@ -162,10 +177,15 @@ def _count_by_height(points: OrientedPoints, up: F8) -> F8:
 
 @kernel
 def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple[F4, F8]:
-    """Return the columns, rows, inverse depths and heights (4, n) of samples on level surface.
+    """Find the samples on level surface.
 
-    Compared with cells beside them, most of these are nearer to level than to upright. With them
-    the area (BINS,) of their surface by height, the lowest first, m².
+    At least three of the four neighbours of such a sample are closer to a level surface through it
+    than to a vertical one.
+
+    Returns
+    -------
+    Columns, rows, inverse depths and heights (4, n) of the samples; and the area of their surface
+    by height, (BINS,) m², the lowest first.
     """
     rows, columns = inv_depth.shape
     across, down = np.float32(up[0] / intrinsics.fx), np.float32(up[1] / intrinsics.fy)
@@ -188,7 +208,7 @@ def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple
 
 @kernel(fast=True)
 def _find_level(inv_depth: F4, i: int, slope: tuple[float, float, float], level: Bool) -> None:
-    """Mark the cells of a row on level surface; the loop vectorises."""
+    """Mark the cells of row i that are on level surface; the loop vectorises."""
     start, across, down = slope
     steep = np.float32(0.5 * ARM) * np.sqrt(across * across + down * down)
     side, along = np.float32(ARM) * across, np.float32(ARM) * down

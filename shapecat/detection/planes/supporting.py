@@ -1,4 +1,4 @@
-"""Supporting planes: tables and boards, told from the tops of objects."""
+"""Supporting planes: tables and boards, distinguished from the tops of objects."""
 
 import math
 
@@ -15,25 +15,25 @@ from shapecat.jit import kernel
 __all__ = ["supporting_planes"]
 
 BESIDE, DOWN = 5, 20
-"""Steps from a sample towards the camera after which its plane may end, and steps down from there
-that are looked at."""
+"""Most steps from a sample towards the camera to the edge of its plane, and steps down from that
+edge."""
 LEAST_BELOW = 20
-"""Samples below an edge that say enough."""
+"""Fewest samples below an edge that allow a decision."""
 
 
 def supporting_planes(
     grid: DepthGrid, found: list[PlaneCandidate], tallest_m: float
 ) -> list[SupportingPlane]:
-    """Leave out the tops of objects.
+    """Return the planes that are not the tops of objects, lowest first.
 
-    Under the front edge of a table or shelf there is nothing; a box is closed down to what it
-    stands on. Things lower than 6 cm are never furniture; planes over a quarter of a square metre
-    always are, and what is higher than an object.
+    Below the front edge of a table or shelf board there is nothing; a box has a wall that goes down
+    to its support. A plane less than 6 cm above another is never furniture. A plane over a quarter
+    of a square metre always is, and so is one higher than the tallest object.
 
     Parameters
     ----------
-    found : planes, lowest first. What of each lies under things counts as seen.
-    tallest_m : height of the tallest object.
+    found : planes, lowest first; their covered area counts as visible.
+    tallest_m : height of the tallest object, metres.
     """
     kept: list[SupportingPlane] = []
     for plane, samples, covered_m2 in found:
@@ -55,7 +55,7 @@ def supporting_planes(
 
 
 def _overlaps(lower: SupportingPlane, upper: SupportingPlane) -> bool:
-    """Whether the middle (Steiner point) of a plane is over the outline of a parallel one."""
+    """Return whether the middle (Steiner point) of a plane is over the outline of another."""
     x, y = upper.extent @ COS * 2 / DIRECTIONS, upper.extent @ SIN * 2 / DIRECTIONS
     return bool(np.all(COS * x + SIN * y < lower.extent))
 
@@ -64,7 +64,7 @@ def _overlaps(lower: SupportingPlane, upper: SupportingPlane) -> bool:
 def _look_below(
     grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane, drop: float
 ) -> tuple[int, int]:
-    """Look below the edge of a plane: count samples on a wall down from it, and beyond it."""
+    """Count the samples below the edge of a plane that are on a wall, and those farther away."""
     on_wall = beyond = 0
     for k in range(samples.inverse_depth.size):
         i, j = samples.i[k], samples.j[k]
@@ -91,7 +91,7 @@ def _look_below(
 def _to_edge(
     grid: DepthGrid, plane: SupportingPlane, i: float, j: float, z: float
 ) -> tuple[float, float, float]:
-    """Go along a plane towards the camera; return where it ends, zeros if it does not, metres."""
+    """Follow a plane towards the camera; return its edge, metres, or zeros if none is found."""
     k, up = grid.intrinsics, plane.up
     x, y = (j - k.cx) / k.fx * z, (i - k.cy) / k.fy * z
     h = x * up[0] + y * up[1] + z * up[2]
@@ -103,7 +103,7 @@ def _to_edge(
         ahead = seen - 1 / (z + step * tz)
         if seen > 0 and ahead < -2 * PLANES.tolerance:
             return x, y, z
-        if seen <= 0 or ahead > 2 * PLANES.tolerance:  # nothing is known, or something is on it
+        if seen <= 0 or ahead > 2 * PLANES.tolerance:  # no reading, or an object on the plane
             break
         x, y, z = x + step * tx, y + step * ty, z + step * tz
     return 0.0, 0.0, 0.0
@@ -113,7 +113,7 @@ def _to_edge(
 def _inverse_depth_at(
     inv_depth: F4, intrinsics: PinholeIntrinsics, x: float, y: float, z: float
 ) -> float:
-    """Return what is seen in the direction of a point; -1 outside the image."""
+    """Return the inverse depth of the cell that shows a point; -1 outside the image."""
     if z <= NEAREST_M:
         return -1.0
     v = int(intrinsics.cy + intrinsics.fy * y / z + 0.5)

@@ -1,4 +1,4 @@
-"""Up estimation: the direction that the surfaces of the scene tell to be up."""
+"""Up estimation: the up direction from the surfaces of the scene."""
 
 import math
 
@@ -15,25 +15,31 @@ from shapecat.jit import kernel
 __all__ = ["estimate_up"]
 
 MOST_DIRECTIONS = 4
-"""Level surface, and the walls of a corner, are three."""
+"""Most directions to find: level surface and the walls of a corner make three."""
 BLOCK = 512
-"""After so many normals it is asked if a direction can still win."""
+"""Normals after which a direction that can no longer win is dropped."""
 BINS = 80
-"""Of `UpSettings.level_bin_m`: the floor is no more than 3 m below the camera."""
+"""Number of bins of `UpSettings.level_bin_m`: the floor is no more than 3 m below the camera."""
 
 
 @kernel
 def estimate_up(
     points: OrientedPoints, intrinsics: PinholeIntrinsics, hint: F8, trials: F8, held: float
 ) -> F8:
-    """Return the normal of the dominant supporting plane, (3,) unit, or zeros if there is none.
+    """Return the unit normal (3,) of the dominant supporting plane; zeros if there is none.
 
-    With a ``hint`` only planes within 15 degrees of being perpendicular to it count. Without, if
-    it is zeros, the direction wins that faces most large levels: the normal of one of the largest
-    planes, or the direction that two walls leave. What the camera looks at head-on counts less, so
-    that the boards of a shelf beat its back; what is far counts less than what is near. That
-    the camera is turned about its axis takes the more to be believed the larger ``held`` is:
-    `UpSettings.held`, or 0 where nothing is known of it. ``trials`` are of `draw_trials`.
+    Without a hint, the candidates are the normals of the largest planes and the directions
+    perpendicular to two walls. The candidate with the most surface in large levels wins. Surface
+    that the camera sees head-on has less weight, so that the boards of a shelf beat its back, and
+    so does distant surface.
+
+    Parameters
+    ----------
+    hint : (3,) unit vector, sensor frame: only normals within 15 degrees of it are considered.
+        Zeros if up is unknown.
+    trials : from `draw_trials`.
+    held : penalty on directions that imply a camera on its side or upside down:
+        `UpSettings.held`, or 0 if it may be held in any way.
     """
     surface = _every_second(points)
     normals, least = surface[:3], UP.least_share * surface.shape[1]
@@ -54,7 +60,7 @@ def estimate_up(
 
 @kernel
 def _every_second(points: OrientedPoints) -> F4:
-    """Return the normals, positions and weights (7, n) of half of the points, for speed."""
+    """Return the normals, positions and weights (7, n) of every second point, for speed."""
     normals, positions = points.normals, points.positions
     found = np.zeros((7, normals.shape[1] // 2 + 1), np.float32)
     n = 0
@@ -68,7 +74,7 @@ def _every_second(points: OrientedPoints) -> F4:
 
 @kernel
 def _directions(normals: F4, least: float, trials: F8) -> F8:
-    """Return directions (n, 3) that many normals face, most first: RANSAC on one at a time."""
+    """Return directions (n, 3) with many normals, most first: RANSAC for one after the other."""
     found = np.zeros((MOST_DIRECTIONS, 3))
     for k in range(MOST_DIRECTIONS):
         if normals.shape[1] <= least or _most_faced(normals, trials, found[k]) < least:
@@ -79,7 +85,7 @@ def _directions(normals: F4, least: float, trials: F8) -> F8:
 
 @kernel
 def _part(normals: F4, direction: F8, bounds: tuple[float, float]) -> F4:
-    """Return the normals (3, n) whose cosine to a direction is within bounds."""
+    """Return the normals (3, n) whose cosine with a direction is within bounds."""
     chosen = np.zeros(normals.shape, np.float32)
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     n = 0
@@ -93,7 +99,7 @@ def _part(normals: F4, direction: F8, bounds: tuple[float, float]) -> F4:
 
 @kernel
 def _most_faced(normals: F4, trials: F8, best: F8) -> int:
-    """Write the direction most normals (3, n) face; return how many do."""
+    """Write the direction near which most normals (3, n) are; return their number."""
     n, most = normals.shape[1], 0
     one = np.zeros(3)
     for t in range(UP.trials):
@@ -117,14 +123,14 @@ def _count_facing(normals: F4, direction: F8, start: int, stop: int) -> int:
     xs, ys, zs = normals[0], normals[1], normals[2]  # unpacked they would not be contiguous
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     least, inliers = np.float32(UP.facing_cos), np.int32(0)
-    for k in range(np.uint64(start), np.uint64(stop)):  # signed ones may count from the end
+    for k in range(np.uint64(start), np.uint64(stop)):  # unsigned: no check for negative indices
         inliers += np.int32(xs[k] * x + ys[k] * y + zs[k] * z > least)
     return int(inliers)
 
 
 @kernel(fast=True)
 def _turn_to_mean(normals: F4, direction: F8) -> int:
-    """Turn a direction to the mean of the normals that face it; return how many these are."""
+    """Turn a direction to the mean of the normals near it; return their number."""
     xs, ys, zs = normals[0], normals[1], normals[2]
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     least, zero = np.float32(UP.facing_cos), np.float32(0)
@@ -143,7 +149,7 @@ def _turn_to_mean(normals: F4, direction: F8) -> int:
 
 @kernel
 def _hypotheses(found: F8, corner_cos: float) -> F8:
-    """Return the directions (n, 3) that may be up: those found, and those that two walls leave."""
+    """Return candidates for up (n, 3): the directions found, and perpendiculars to two of them."""
     n = len(found)
     result = np.zeros((n * n, 3))
     for k in range(len(found)):
@@ -161,15 +167,15 @@ def _hypotheses(found: F8, corner_cos: float) -> F8:
 
 @kernel
 def _merit(surface: F4, direction: F8, held: float) -> float:
-    """Return how well a direction explains the surface: what of it lies in large levels."""
+    """Return the score of a direction: the weight of large levels, adjusted as in `estimate_up`."""
     count, facing, total = _count_levels(surface, direction)
     level, squares = _large_levels(count, UP.least_share * total)
     if level == 0:
         return 0.0
-    # The boards of a shelf are several, its back is one; what stands before a wall makes it several
-    # as well, but these are unlike in size, and much of what faces as it does lies in none.
+    # A shelf has several boards but one back. Objects in front of a wall add levels as well, but of
+    # unequal size, and much of the surface that faces like the wall is in none.
     levels, clear = level**2 / squares, level / facing
-    # A camera that looks down at a board sees it aslant, and rather the wall behind it head-on.
+    # A camera that looks down on a board sees it obliquely, and the wall behind it head-on.
     aslant = 1 - UP.aslant * direction[2] ** 2
     across, down = direction[0] ** 2, max(direction[1], 0.0) ** 2
     turned = (across + down) / (across + direction[1] ** 2 + UP.steep)
@@ -178,9 +184,9 @@ def _merit(surface: F4, direction: F8, held: float) -> float:
 
 @kernel
 def _large_levels(count: F8, least: float) -> tuple[float, float]:
-    """Return the weight of levels of more than ``least``, and the sum of its squares.
+    """Return the sum of the weights of levels above ``least``, and the sum of their squares.
 
-    A level fills two bins and stands out from the next two: a slanted surface has many heights.
+    A level fills two bins, and has more weight than its neighbours: slanted surface has no peaks.
     """
     weight = squares = 0.0
     last = count.size - 1
@@ -198,9 +204,9 @@ def _large_levels(count: F8, least: float) -> tuple[float, float]:
 
 @kernel
 def _count_levels(surface: F4, direction: F8) -> tuple[F8, float, float]:
-    """Weigh the points that face a direction by their height below the sensor.
+    """Sum the weights of the points that face a direction, by their height below the sensor.
 
-    Returns the weight in each bin, in all of them, and of all points.
+    Returns the weight in each bin, (BINS,), the sum over the bins, and the weight of all points.
     """
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
     nx, ny, nz, weights = surface[0], surface[1], surface[2], surface[6]
@@ -211,7 +217,7 @@ def _count_levels(surface: F4, direction: F8) -> tuple[F8, float, float]:
         below = scale * (px[k] * x + py[k] * y + pz[k] * z)
         faces = nx[k] * x + ny[k] * y + nz[k] * z > least
         bins[k] = np.int32(below) if faces & (below >= 0) & (below < BINS) else none
-    count = np.zeros(BINS + 1, np.float64)  # the last for what is out of bounds
+    count = np.zeros(BINS + 1, np.float64)  # the last bin is for the other points
     for k in range(nx.size):
         count[bins[k]] += weights[k]
     facing = np.sum(count[:BINS])
@@ -222,7 +228,7 @@ def _count_levels(surface: F4, direction: F8) -> tuple[F8, float, float]:
 def _settled(
     points: OrientedPoints, surface: F4, intrinsics: PinholeIntrinsics, direction: F8
 ) -> F8:
-    """Return the exact normal of the largest plane that faces ``direction``."""
+    """Return the refined normal (3,) of the largest plane that faces ``direction``."""
     count, _, _ = _count_levels(surface, direction)
     plane = horizontal_plane(intrinsics, direction, -(np.argmax(count) + 0.5) * UP.level_bin_m)
     samples, _ = level_samples(points, direction)
