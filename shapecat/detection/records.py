@@ -1,4 +1,4 @@
-"""What the steps of the detection hand on to each other."""
+"""The records that the steps of the detection pass on."""
 
 from typing import NamedTuple
 
@@ -13,16 +13,16 @@ __all__ = ["OverSegmentation", "PlaneModel", "Segmentation"]
 
 
 class PlaneModel(NamedTuple):
-    """What objects stand on and before.
+    """The supporting planes, the samples above them, and the walls.
 
     Attributes
     ----------
-    up : (3,) unit vector.
+    up : (3,) unit vector, sensor frame.
     supports : the planes, lowest first.
-    planes : their rows of `pack_planes`.
-    heights : of the samples, and the plane each is above.
-    low_profile : (rows, columns) int16, the numbers of the low-profile objects.
-    walls : (rows, columns) uint8, not 0 on walls.
+    planes : the same, from `pack_planes`.
+    heights : the plane below each sample, and the height above it.
+    low_profile : (rows, columns) int16, low-profile objects 1, 2, ..., 0 elsewhere.
+    walls : (rows, columns) uint8, from `remove_walls`; not 0 on walls.
     """
 
     up: F8
@@ -34,12 +34,12 @@ class PlaneModel(NamedTuple):
 
 
 class OverSegmentation(NamedTuple):
-    """What stands above the planes, parted where two objects may meet.
+    """The samples above the planes, split wherever two objects may meet.
 
     Attributes
     ----------
-    graph : which samples are connected, and which way they face.
-    labels : (rows, columns) int16, the segments, 0 elsewhere.
+    graph : the connections and normals of the samples.
+    labels : (rows, columns) int16, segments 1, 2, ..., 0 elsewhere.
     segments : their statistics.
     """
 
@@ -49,17 +49,17 @@ class OverSegmentation(NamedTuple):
 
 
 class Segmentation(NamedTuple):
-    """A depth grid with its objects.
+    """The objects in a depth grid.
 
     Attributes
     ----------
-    up : (3,) unit vector.
+    up : (3,) unit vector, sensor frame.
     supports : the planes, lowest first.
-    planes : their rows of `pack_planes`.
-    labels : (rows, columns) int16, 1..count, 0 elsewhere.
-    filled : (rows, columns) uint8, 1 where a label lies at the level of the plane.
-    plane_ids : (count + 1,) the plane that each label stands above; 0 for label 0.
-    measured : what is measured of the labels.
+    planes : the same, from `pack_planes`.
+    labels : (rows, columns) int16, objects 1..count, 0 elsewhere.
+    filled : (rows, columns) uint8, 1 where a labelled cell may be at the level of the plane.
+    plane_ids : (count + 1,) index in ``supports`` of the plane below each object; 0 for label 0.
+    measured : the boxes, supports and flags of the objects.
     """
 
     up: F8

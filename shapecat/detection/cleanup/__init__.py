@@ -1,1 +1,1 @@
-"""Clean-up: what is no object is rejected, holes and the contact boundary are filled."""
+"""Clean-up: structure rejection, and filling of holes and contact boundaries."""

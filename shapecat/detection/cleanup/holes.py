@@ -1,4 +1,4 @@
-"""Hole filling: cells at the level of the table that are of objects: contacts and floors."""
+"""Hole filling: cells of objects at the level of their plane: contact boundaries and floors."""
 
 import numpy as np
 
@@ -18,18 +18,18 @@ from shapecat.jit import kernel, unset
 __all__ = ["fill_contact_boundary", "fill_holes"]
 
 BOUNDARY, IN_FRONT, GOES_ON = range(3)
-"""Counts of sides of the cells of a hole that a label bounds: all, those where it is in front of
-the hole, and those where the surface goes on."""
+"""Indices of the counts of a hole's sides with a label: all, those where the label is in front of
+the hole, and those where the surface continues."""
 
 
 @kernel
 def fill_contact_boundary(inv_depth: F4, heights: HeightMap, labels: I4) -> None:
-    """Give the cells beside labelled ones, hardly above their plane, the same label, in place.
+    """Give the label of an object to adjacent cells that are slightly above its plane, in place.
 
     Parameters
     ----------
-    inv_depth : (rows, columns) inverse depth, 1/m; 0 where there is no sample.
-    labels : (rows, columns) int16, 0 is background.
+    inv_depth : (rows, columns) 1/m; 0 where there is no reading.
+    labels : (rows, columns) int16, the objects, 0 elsewhere.
     """
     plane_id, height = heights
     rows, columns = labels.shape
@@ -59,11 +59,17 @@ def fill_contact_boundary(inv_depth: F4, heights: HeightMap, labels: I4) -> None
 
 @kernel
 def fill_holes(inv_depth: F4, labels: I4, count: int, filled: U1) -> None:
-    """Give enclosed unlabelled cells to what encloses them, and mark them in ``filled``.
+    """Give enclosed cells the label of the object around them, in place.
 
-    A hole is connected, and has no sample without a label beside it. Most of its boundary is of one
-    of the labels 1..count, and every other label on it is in front of it. ``inv_depth`` (1/m),
-    ``labels`` and ``filled`` are (rows, columns).
+    A hole is connected, and no other unlabelled sample is next to it. Most of its boundary has one
+    label, and all other labels there are in front of the hole.
+
+    Parameters
+    ----------
+    inv_depth : (rows, columns) 1/m; 0 where there is no reading.
+    labels : (rows, columns) objects 1..count, 0 elsewhere; changed in place.
+    count : the number of objects.
+    filled : (rows, columns) uint8, set to 1 in the filled cells.
     """
     inside, spans = _between_labels(inv_depth, labels)
     component = unset(labels.shape, np.int32)
@@ -83,7 +89,10 @@ def fill_holes(inv_depth: F4, labels: I4, count: int, filled: U1) -> None:
 
 @kernel
 def _between_labels(inv_depth: F4, labels: I4) -> tuple[Bool, I4]:
-    """Return which unlabelled samples have labels on all four sides, and the spans of labels."""
+    """Return the unlabelled samples between labels, (rows, columns) bool, and the spans of labels.
+
+    A sample is between labels if there is one in all four directions.
+    """
     rows, columns = labels.shape
     first, last = np.full(columns, rows, np.int32), np.full(columns, -1, np.int32)
     inside, spans = np.zeros(labels.shape, np.bool_), spans_of(labels)
@@ -104,9 +113,10 @@ def _between_labels(inv_depth: F4, labels: I4) -> tuple[Bool, I4]:
 def _count_sides(
     inv_depth: F4, labels: I4, inside: Bool, spans: I4, component: I4, sides: I4, total: I4
 ) -> None:
-    """Count the sides of the cells of holes (n, labels, 3), and ``total`` (n,), with those to none.
+    """Count the sides of holes by label, (n, labels, 3), and in ``total`` (n,).
 
-    The total of a hole that is not enclosed is made too large for any label.
+    The total includes sides next to cells without a reading. For a hole that is not enclosed it is
+    too large for any label to have enough.
     """
     for i in range(len(spans)):
         for j in range(spans[i, 0], spans[i, 1]):
@@ -127,7 +137,7 @@ def _count_sides(
 
 @kernel
 def _owner_of(sides: I4, total: int) -> int:
-    """Return the label that a hole belongs to, 0 if it belongs to none."""
+    """Return the label that a hole belongs to; 0 if there is none."""
     best = np.argmax(sides[:, BOUNDARY])
     if (
         sides[best, BOUNDARY] <= CLEANUP.enclosed_share * total

@@ -1,7 +1,8 @@
-"""Object features: what tells an object from background structure and noise, by name.
+"""Object features: named features that distinguish objects from structure and noise.
 
-What a segment looks like, where it ends, and what it goes on in: walls of bins lie at the outline
-of their bottom, walls of rooms go on where no plane reaches, arms are cut by the image border.
+They describe how a segment looks, where it ends, and where its surface continues: walls of bins are
+at the outline of their floor, walls of rooms continue beyond all planes, and arms are cut off by
+the image border.
 """
 
 import math
@@ -30,41 +31,39 @@ __all__ = ["OBJECT_FEATURES", "measure_object_features"]
 
 _SURROUNDINGS = np.dtype(
     [
-        ("image_border", "f4"),  # cells at the border, by the outline of a square as large
-        ("range_limit", "f4"),  # shares of the cells: the last before the end of the range,
+        ("image_border", "f4"),  # cells at the border, over the perimeter of a square of equal area
+        ("range_limit", "f4"),  # shares of the cells: at the range limit,
         ("on_wall", "f4"),  # and on walls
-        ("beyond", "f4"),  # shares of the boundary: surface goes on where no plane is,
-        ("into_wall", "f4"),  # and in a wall
-        ("least_outside_m", "f4"),  # how far samples are outside the outline of the plane
+        ("beyond", "f4"),  # shares of the boundary: where the surface continues beyond all planes,
+        ("into_wall", "f4"),  # and into a wall
+        ("least_outside_m", "f4"),  # distance of the samples outside the outline of the plane
         ("mean_outside_m", "f4"),
         ("most_outside_m", "f4"),
-        ("low_profile", "f4"),  # 1 if it is known as a low-profile object
+        ("low_profile", "f4"),  # 1 for a known low-profile object
     ]
 )
-"""Where something ends, and what it goes on in."""
+"""Where a segment ends, and where its surface continues."""
 _VISIBILITY = np.dtype(
     [
         ("cells", "f4"),
         ("depth_m", "f4"),
         ("cell_m", "f4"),
         ("down", "f4"),  # cosine between the optical axis and up
-        ("top_by_noise", "f4"),  # by the least height of an object cell at that distance
-        ("slant", "f4"),  # area by what it covers of the view
-        ("ragged", "f4"),  # boundary squared by cells: 16 for a square
+        ("top_by_noise", "f4"),  # top over the least height of an object's sample at that depth
+        ("slant", "f4"),  # area over that of its cells if they faced the camera
+        ("ragged", "f4"),  # squared boundary over cells: 16 for a square
     ]
 )
-"""How well something is seen."""
+"""How well a segment is visible."""
 OBJECT_FEATURES = np.dtype(
     [("segment", SEGMENT_FEATURES), ("surroundings", _SURROUNDINGS), ("visibility", _VISIBILITY)]
 )
-"""The features of what may be an object, all float32: lengths in metres, or shares.
-
-The trees number them in this order.
-"""
+"""The features of a segment that may be an object; all are float32, lengths in metres or ratios.
+The trees index them in this order."""
 
 
 class LabelledGrid(NamedTuple):
-    """What is known of the samples: see `DepthGrid`, `PlaneModel` and `OverSegmentation`.
+    """Fields of `DepthGrid`, `PlaneModel` and `OverSegmentation` that kernels read together.
 
     ``owner`` (n + 1,) is the segment that each label has been merged into.
     """
@@ -85,9 +84,12 @@ def measure_object_features(
     low_profile: Bool,
     range_m: float,
 ) -> Records:
-    """Return (n + 1,) the `OBJECT_FEATURES` of merged segments; 0 of what was merged into them.
+    """Return the `OBJECT_FEATURES` (n + 1,) of merged segments; zeros for their former parts.
 
-    ``low_profile`` (n + 1,) tells the known low-profile objects, from `merge_low_profile`.
+    Parameters
+    ----------
+    low_profile : (n + 1,) the known low-profile objects, from `merge_low_profile`.
+    range_m : the range limit, metres.
     """
     graph, labels, segments = oversegmentation
     features = np.zeros(segments.parent.size, OBJECT_FEATURES)
@@ -101,7 +103,7 @@ def measure_object_features(
 
 
 def _border_lines(grid: DepthGrid) -> tuple[int, int, int, int]:
-    """Return the first and last row, and column, with samples; -1 if that is no image border."""
+    """Return the first and last row, and column, with samples; -1 if not at the image border."""
     rows, columns = grid.inverse_depth.shape
     top, bottom, left, right = find_borders(grid.inverse_depth, 1)[:, 0].tolist()
     tall, wide = CLEANUP.border_share * rows, CLEANUP.border_share * columns
@@ -117,9 +119,10 @@ def _border_lines(grid: DepthGrid) -> tuple[int, int, int, int]:
 def _count_cells(
     field: LabelledGrid, border: tuple[int, int, int, int], last: float, rows: Records
 ) -> None:
-    """Count the cells of each segment at borders and on walls, and where its surface goes on.
+    """Count the cells of each segment at borders and on walls, and where its surface continues.
 
-    ``last`` is the inverse depth of what ends with the range; ``rows`` are of `_SURROUNDINGS`.
+    ``last`` is the inverse depth below which a cell is at the range limit, 1/m; ``rows`` (n + 1,)
+    are records of `_SURROUNDINGS`.
     """
     inv_depth, planes, plane_id, walls, labels, spans, owner = field
     last_row, last_column = labels.shape[0] - 1, labels.shape[1] - 1
@@ -144,7 +147,7 @@ def _count_cells(
 
 @kernel
 def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: Records) -> None:
-    """Write the features of segments, whose cells are counted."""
+    """Write the features of merged segments, given the counts of `_count_cells`."""
     for p in range(1, segments.parent.size):
         if not is_root(segments, p):
             continue
@@ -166,7 +169,10 @@ def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: 
 
 @kernel
 def _measure_outside(grid: DepthGrid, plane: F8, samples: I4, out: Row) -> None:
-    """Write how far samples are outside the outline of a row of `pack_planes`, inside negative."""
+    """Write the distances of samples outside the outline of a plane; negative inside.
+
+    ``plane`` is a row of `pack_planes`.
+    """
     intrinsics, total, n = grid.intrinsics, 0.0, 0
     for s in samples:
         if s < 0:

@@ -6,30 +6,29 @@ __all__ = ["CLEANUP", "CleanupSettings"]
 
 
 class CleanupSettings(NamedTuple):
-    """How background is rejected and labels are completed."""
+    """How structure is rejected and labels are completed."""
 
     least_logit: float = -1.5
-    """Logit, of 0.18, from which on something is taken for an object: one that is missed is lost,
-    one too many can still be rejected over time."""
+    """Least logit of an object, for a probability of 0.18: a missed object is lost, a false one can
+    still be rejected over time."""
     hopeless: float = -8.0
-    """Logit of the first trees that the others never made up for."""
+    """Partial logit that the remaining trees never make up for."""
     border_share: float = 0.08
-    """Share of the image that sensors leave empty at most at its border."""
+    """Largest share of the image that sensors leave blank at a border."""
     cut_off_m: float = 0.02
-    """What reaches so near to the greatest height, metres, goes on above it."""
+    """A segment that comes this near to the greatest height continues above it, metres."""
     large_share: float = 0.02
-    """Share of the image that an arm, furniture or a bent end of a table covers at least."""
+    """Least share of the image covered by an arm, furniture or the bent end of a table."""
     cut_share: float = 0.4
-    """Share of its outline, taken for a square, that is at the border of the image then."""
+    """Least share of the perimeter of such structure, taken for a square, at the image border."""
     fringe: float = 0.6
-    """Share of the least height from which a sample next to an object belongs to it: the least
-    height is safe against the noise of the plane, and what is as low farther away is as often
-    the plane."""
+    """Least height of a sample next to an object to belong to it, relative to the least height
+    elsewhere, which is safe against noise: elsewhere, samples this low are as often the plane."""
     enclosed_share: float = 0.6
-    """Least share of the boundary of a hole that is of what encloses it: of a ring seen from the
-    side it is so much, of two objects side by side half."""
+    """Least share of the boundary of a hole with the label around it: a ring seen from the side has
+    this much, the gap between two objects half."""
     goes_on_share: float = 0.15
-    """Share of it where the surface goes on at least: not so through the hole of a handle."""
+    """Least share of the boundary of a hole where the surface continues; less in a handle."""
 
 
 CLEANUP = CleanupSettings()

@@ -26,7 +26,7 @@ FILE = "structure.npz"
 
 @cache
 def load_trees() -> BoostedTrees:
-    """Return the trees that belong to this version."""
+    """Return the trees of this version of the package."""
     return read_trees(
         files("shapecat.detection.cleanup").joinpath(FILE).read_bytes(), OBJECT_FEATURES
     )
@@ -39,9 +39,9 @@ def find_background(
     settings: DetectionSettings,
     grown: BoostedTrees,
 ) -> Bool:
-    """Return (n + 1,) whether each merged segment is no object: background, or too large for one.
+    """Return the merged segments to reject, as structure or as too large: (n + 1,) bool.
 
-    ``features`` are from `measure_object_features`.
+    ``features`` (n + 1,) are from `measure_object_features`.
     """
     rejected: Bool = _reject(segments, features.view(np.float32).reshape(len(features), -1), grown)
     segment, cells = features["segment"], features["visibility"]["cells"]
@@ -66,16 +66,19 @@ def _reject(segments: Segments, features: F4, grown: BoostedTrees) -> Bool:
 
 @kernel
 def number_objects(parent: I4, rejected: Bool, labels: I4, spans: I4) -> I4:
-    """Give the objects that are left numbers, and the cells of their segments these as labels.
+    """Assign numbers to the objects that are not rejected, and write them to the labels.
 
     Parameters
     ----------
-    parent : (n + 1,) of `Segments`; 0 from here on for what is rejected.
-    labels : (rows, columns) of segments, of objects from here on; 0 elsewhere.
+    parent : (n + 1,) from `Segments`; set to 0 for rejected segments.
+    rejected : (n + 1,) from `find_background`.
+    labels : (rows, columns) the segments, replaced by the objects 1, 2, ..., 0 elsewhere.
+    spans : (rows, 2) as in `SurfaceGraph`.
 
     Returns
     -------
-    (objects + 1,) the segment that each object is merged into; that of object 0 is 0.
+    (objects + 1,) the representative of each object: the segment that its segments are merged into;
+    0 for object 0.
     """
     representatives, n = np.zeros(parent.size, np.int64), 0
     numbers = np.zeros(parent.size, np.int16)

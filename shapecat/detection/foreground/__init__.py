@@ -1,1 +1,1 @@
-"""Foreground: which samples stand above a plane, where their height alone does not tell."""
+"""Foreground: samples that belong to objects, where their height alone does not decide."""

@@ -1,4 +1,4 @@
-"""Convex hull of a connected part of the grid, filled."""
+"""Filled convex hull of a connected part of the grid."""
 
 import math
 
@@ -13,9 +13,14 @@ __all__ = ["fill_hull"]
 
 @kernel
 def fill_hull(residual: F4, part: I4, stack: I4, count: int) -> int:
-    """Add the low cells within the convex hull of a part to it; return how many cells it has.
+    """Add to a part the low cells within its convex hull; return its new number of cells.
 
-    ``residual`` and ``part`` are (rows, columns), the first ``count`` of ``stack`` the flat cells.
+    Parameters
+    ----------
+    residual : (rows, columns) not 0 in low cells.
+    part : (rows, columns) numbers of the parts, changed in place.
+    stack, count : the first ``count`` of ``stack`` are the flat cells of the part; the added cells
+        are appended.
     """
     rows, columns = residual.shape
     parts = part.reshape(-1)
@@ -45,7 +50,7 @@ def fill_hull(residual: F4, part: I4, stack: I4, count: int) -> int:
 
 @kernel
 def _straighten(side: F8, first: int, last: int) -> None:
-    """Replace a side of an outline, by rows, with that of its hull, the largest convex one."""
+    """Replace one side of an outline, a column for each row, with that of its convex hull."""
     corners = np.zeros(side.size, np.int32)
     n = 0
     for i in range(first, last + 1):

@@ -1,6 +1,6 @@
-"""Low-frequency depth error: the slow waves that sensors see in a flat surface, levelled.
+"""Removal of low-frequency depth error: the slow waves that sensors see in a flat surface.
 
-They are higher than a plate is thick. What is left are steps and noise, which is measured.
+They are higher than a plate is thick. What is left is steps and noise, and the noise is measured.
 """
 
 import numpy as np
@@ -19,24 +19,24 @@ __all__ = [
 ]
 
 STEPS = 2**20
-"""Steps to 1/m of the sums, no more for a window of samples 1/m below the plane to fit 32 bits."""
+"""Steps per 1/m of the integer sums: for a window full of samples 1/m off, they fit in 32 bits."""
 BIN, BINS, EVERY = 2e-5, 500, 3
-"""How rises are counted: width of a bin, 1/m, their number, and every so many cells."""
+"""Histogram of rises: width of a bin, 1/m, number of bins, and step between the cells used."""
 
 
 @kernel
 def measure_residual(
     inv_depth: F4, plane_id: I4, height: F4, plane: F8, number: int, out: F4
 ) -> int:
-    """Write the smoothed inverse depth above the plane of its low cells; 0 elsewhere.
+    """Write the smoothed inverse depth of a plane's low cells, relative to the plane; 0 elsewhere.
 
-    Returns how many there are, but for those on the border of the image.
+    Returns the number of low cells, without those on the border of the image.
 
     Parameters
     ----------
     inv_depth, plane_id, height : (rows, columns) inverse depth, 1/m, and as in `HeightMap`.
-    plane : (3,) coefficients of its inverse depth: per column, per row, constant.
-    number : of the plane.
+    plane : (3,) or more, beginning with a, b, c of its inverse depth.
+    number : number of the plane, from 1, as in ``plane_id``.
     out : (rows, columns) 1/m, written in place.
     """
     rows, columns = inv_depth.shape
@@ -75,9 +75,10 @@ def measure_residual(
 def _find_low(
     inv_depth: F4, plane_id: I4, height: F4, plane: F8, number: int, i: int, raw: F4, mark: F4
 ) -> bool:
-    """Write how far the low cells of row ``i`` are above the plane, and 1 for them, or else 0.
+    """Write the inverse depth of the low cells of row ``i`` relative to the plane, and a mark of 1.
 
-    ``raw`` and ``mark`` (3, columns) hold the last three rows. Returns whether there are any.
+    ``raw`` and ``mark`` (3, columns) hold the last three rows; other cells are 0. Returns whether
+    there are any low cells.
     """
     zero, one, low = np.float32(0), np.float32(1), np.float32(LOW.low_m)
     slope, base = np.float32(plane[0]), np.float32(plane[1] * i + plane[2])
@@ -97,17 +98,17 @@ def _find_low(
 def clear_contact(
     inv_depth: F4, plane_id: I4, height: F4, number: int, residual: F4, stack: I4, drop: F4
 ) -> None:
-    """Clear the residual where what is not low meets the plane: steep cells from it downwards.
+    """Clear the residual at the foot of higher objects: steep low cells from their cells downwards.
 
-    All images are (rows, columns); ``residual`` is changed in place, ``stack`` and ``drop`` are
-    scratch, a number per cell.
+    All images are (rows, columns); ``residual`` is changed in place; ``stack`` and ``drop``
+    (cells,) are work space.
     """
     rows, columns = residual.shape
     top = 0
     high, edge = np.float32(LOW.low_m), np.zeros(columns, np.bool_)
     one, me = np.uint64(1), np.int8(number)
     for i in range(1, rows - 1):
-        # Few rows have high cells, few of these are beside what is low, and this vectorises.
+        # Few rows have high cells, and few of these are next to low ones; the tests vectorise.
         some = False
         for j in range(np.uint64(columns)):
             some |= (plane_id[i, j] == me) & (height[i, j] >= high)
@@ -153,13 +154,11 @@ def clear_contact(
 
 @kernel
 def filter_high_pass(residual: F4, high_pass: F4) -> None:
-    """Write the residual less its mean in a window around each low cell; 0 elsewhere.
+    """Write the residual minus its mean in a window around each low cell; 0 elsewhere.
 
-    Both are (rows, columns), 1/m.
-
-    The window slides: what enters it is added, what leaves it is taken away, down the rows for the
-    sums of the columns, and along a row for those of all its cells. Sums are of integers, which
-    take a quarter of the time of others in a row, and are exact.
+    Both arrays are (rows, columns), 1/m. The window slides: entering values are added and leaving
+    values subtracted, down the rows for the sums of columns, and along a row for the sums of
+    windows. Integer sums are exact, and take a quarter of the time of floating-point sums.
     """
     rows, columns = residual.shape
     sums = np.zeros(columns + 2 * LOW.window + 1, np.int32)
@@ -186,7 +185,7 @@ def filter_high_pass(residual: F4, high_pass: F4) -> None:
 
 @kernel
 def _slide(residual: F4, i: int, sign: int, sums: I4, counts: I4) -> None:
-    """Add a row to the sums of the columns, or take it away."""
+    """Add a row to the sums of the columns, or subtract it (``sign`` -1)."""
     steps, most, least = np.float32(STEPS), np.float32(LOW.most), np.float32(-1)
     margin = np.uint64(LOW.window + 1)
     for j in range(np.uint64(residual.shape[1])):
@@ -211,9 +210,13 @@ def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
 
 @kernel
 def measure_noise(high_pass: F4, plane_id: I4, number: int) -> float:
-    """Return the median rise, 1/m, between cells of the plane as far apart as at an outline.
+    """Return the median rise, 1/m, between cells of a plane that are `LOW.apart` cells apart.
 
-    ``high_pass`` (1/m) and ``plane_id`` are (rows, columns), ``number`` is of the plane.
+    Parameters
+    ----------
+    high_pass : (rows, columns) 1/m, from `filter_high_pass`.
+    plane_id : (rows, columns) as in `HeightMap`.
+    number : number of the plane, from 1, as in ``plane_id``.
     """
     rows, columns = high_pass.shape
     histogram = np.zeros(BINS, np.int64)

@@ -1,7 +1,7 @@
-"""Low-profile objects rise from their plane in a step, which slow errors of depth do not.
+"""Low-profile objects: they rise from their plane in a step, unlike low-frequency depth error.
 
-Only an object has an edge. So waves of the surface are levelled first (`waves`), and what is low
-is judged by its outline rather than by its height.
+Only an object has an edge. So waves of the surface are removed first (`depth_error`), and low
+parts are judged by their outline rather than by their height.
 """
 
 import math
@@ -27,14 +27,17 @@ from shapecat.jit import kernel, unset
 __all__ = ["find_low_profile"]
 
 BLOCK = 16
-"""Cells that are looked at together: most are not above any level."""
+"""Cells that are tested together: most are below all levels."""
 
 
 class Scratch(NamedTuple):
-    """Room for floods.
+    """Work space for floods.
 
-    ``seen`` and ``part`` (rows, columns) int32 hold the number of the last part at each cell, as
-    flooded and as filled; ``seeds`` and ``stack`` (cells,) int32 are lists of cells.
+    Attributes
+    ----------
+    seen, part : (rows, columns) int32, the number of the last part at each cell, as flooded, and
+        with its hull filled.
+    seeds, stack : (cells,) int32, lists of flat cells.
     """
 
     seen: I4
@@ -47,12 +50,14 @@ class Scratch(NamedTuple):
 def find_low_profile(
     grid: DepthGrid, heights: HeightMap, planes: F8, low_profile: I4, largest_m: float
 ) -> None:
-    """Give low objects the owners of objects, and swells those of the plane, in place.
+    """Find the low-profile objects, and assign swells of the surface to the plane.
 
     Parameters
     ----------
-    low_profile : (rows, columns) set to 1, 2, ... on low objects.
-    largest_m : wider things are swells or furniture.
+    heights : ``plane_id`` is changed in place.
+    planes : from `pack_planes`.
+    low_profile : (rows, columns) zeros; set to 1, 2, ... on low-profile objects.
+    largest_m : wider parts are swells or furniture, metres.
     """
     inv_depth, plane_id, height = grid.inverse_depth, heights.plane_id, heights.height
     widest = largest_m * grid.intrinsics.fx
@@ -63,7 +68,7 @@ def find_low_profile(
         unset(inv_depth.size, np.int32),
         unset(inv_depth.size, np.int32),
     )
-    objects = parts = np.int64(0)  # a literal would be compiled apart
+    objects = parts = np.int64(0)  # numba would compile another version for a literal
     for k in range(len(planes)):
         number, plane = k + 1, planes[k].copy()
         start, end = _rows_of(plane_id, number)
@@ -102,9 +107,9 @@ def find_low_profile(
 
 @kernel
 def _rows_of(plane_id: I4, number: int) -> tuple[int, int]:
-    """Return the rows from which on and before which the cells of a plane are, with a margin.
+    """Return the first row of the cells of a plane, and one after the last, with a margin.
 
-    They are the same if there is none. What is looked at around a cell lies within the margin.
+    They are equal if there is no cell. All neighbours that are read lie within the margin.
     """
     rows = plane_id.shape[0]
     above, on = np.int8(number), np.int8(-number)
@@ -133,11 +138,12 @@ def _raise(
     me: int,
     scratch: Scratch,
 ) -> tuple[int, int]:
-    """Mark the parts above each level, filled, whose outline is that of an object.
+    """Mark the parts above each level that have the outline of an object.
 
-    They are numbered from ``objects`` + 1 on, the parts that are looked at from ``me`` + 1 on.
-    Returns the last numbers. ``high_pass`` (rows, columns) is from `filter_high_pass`; ``bounds``
-    are the least mean rise and what levels are multiples of, 1/m, and the greatest width.
+    The objects are numbered from ``objects`` + 1 on, the tested parts from ``me`` + 1 on; the last
+    numbers are returned. ``high_pass`` (rows, columns) is from `filter_high_pass`; ``bounds`` are
+    the least mean rise and the unit of the levels, both 1/m, and the greatest width, in cells at
+    a depth of 1 m.
     """
     rise_least, level_least, widest = bounds
     flat, marks, plane_ids = high_pass.reshape(-1), low_profile.reshape(-1), plane_id.reshape(-1)
@@ -179,10 +185,10 @@ def _raise(
 
 @kernel
 def _find_seeds(high_pass: F4, least: float, seeds: I4) -> int:
-    """List cells above the lowest level that are higher than the ones before and above them.
+    """List the cells above ``least`` that are higher than their left and upper neighbours.
 
-    The first cell of a part above any level is one. Returns how many there are. Most cells are
-    lower, and to pass over many of them at a time vectorises.
+    The first cell of a part above any level is one of them. Returns their number. Most cells are
+    lower, and the test of a block of cells vectorises.
     """
     rows, columns = high_pass.shape
     flat = high_pass.reshape(-1)
@@ -209,9 +215,9 @@ def _find_seeds(high_pass: F4, least: float, seeds: I4) -> int:
 
 @kernel
 def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) -> int:
-    """Give the connected cells above ``level`` the number ``n``; return how many.
+    """Give the connected cells above ``level`` the number ``n``; return the number of cells.
 
-    The cells at the border of the image are 0.
+    ``residual`` must be 0 at the border of the image.
     """
     columns = residual.shape[1]
     flat, parts = residual.reshape(-1), part.reshape(-1)
@@ -222,9 +228,9 @@ def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) 
         p = stack[done]
         done += 1
         for step in (1, -1, columns, -columns):
-            q = np.uint64(p + step)  # saves to look whether an index counts from the end
+            q = np.uint64(p + step)  # unsigned: no check for negative indices
             new = (parts[q] != n) & (flat[q] > level)
-            parts[q] = n if new else parts[q]  # branches here are hard to foresee
+            parts[q] = n if new else parts[q]  # a branch would be unpredictable
             stack[top] = q
             top += int(new)
     return top
@@ -241,9 +247,9 @@ def _lower(
     me: int,
     scratch: Scratch,
 ) -> int:
-    """Give level parts of low object cells whose outline is that of a swell back to the plane.
+    """Assign flat parts of low object cells to the plane if they have the outline of a swell.
 
-    The parts are numbered from ``me`` + 1 on; returns the last number.
+    The parts are numbered from ``me`` + 1 on; the last number is returned.
     """
     rows, columns = residual.shape
     _, part, seeds, stack = scratch
@@ -281,7 +287,7 @@ def _lower(
 
 @kernel
 def _is_flat(residual: F4, i: int, j: int) -> bool:
-    """Whether a low cell is no part of the side of something."""
+    """Return whether a low cell is not on the side of an object."""
     rows, columns = residual.shape
     here = residual[i, j]
     for d in range(4):

@@ -1,4 +1,4 @@
-"""Outlines of parts of a plane: an object rises along its own in a step, a swell does not."""
+"""Outlines of low parts of a plane: an object rises in a step along it, a swell does not."""
 
 from typing import NamedTuple
 
@@ -12,15 +12,16 @@ __all__ = ["Outline", "is_object", "measure_outline", "width_of_part"]
 
 
 class Outline(NamedTuple):
-    """What is known of an outline.
+    """Counts of the sides of cells along an outline.
 
     Attributes
     ----------
-    sides : sides of cells; ``table`` of them look at the plane; ``known`` are these, those that
-        touch what is not low, and those before something farther; ``hidden`` end at something
-        nearer or where nothing is seen.
+    sides : all sides.
+    table : sides that face the plane.
+    known : the same, plus sides next to higher cells, and sides in front of a farther surface.
+    hidden : sides next to a nearer surface or a cell without a reading.
     rise : sum of the rises of the ``table`` sides, as multiples of the least mean rise.
-    steep : how many of them are steep.
+    steep : steep sides among the ``table`` sides.
     """
 
     sides: int
@@ -33,9 +34,10 @@ class Outline(NamedTuple):
 
 @kernel
 def width_of_part(inv_depth: F4, stack: I4, count: int) -> float:
-    """Return the extent of a part along the rows, in cells a metre away.
+    """Return the width of a part along the rows, in cells at a depth of 1 m.
 
-    ``inv_depth`` is (rows, columns), 1/m; the first ``count`` of ``stack`` are the flat cells.
+    ``inv_depth`` is (rows, columns), 1/m; the first ``count`` of ``stack`` are the flat cells of
+    the part.
     """
     columns = inv_depth.shape[1]
     first, last = columns, 0
@@ -47,7 +49,7 @@ def width_of_part(inv_depth: F4, stack: I4, count: int) -> float:
 
 @kernel
 def is_object(outline: Outline, count: int) -> bool:
-    """Whether an outline around so many cells is that of an object."""
+    """Return whether an outline around ``count`` cells is that of an object."""
     table, sides = outline.table, outline.sides
     if table < OUTLINES.known * sides and sides * sides > OUTLINES.ragged * count:
         return False
@@ -76,11 +78,13 @@ def measure_outline(
 
     Parameters
     ----------
-    inv_depth, residual, plane_id : (rows, columns) 1/m, 1/m, and as in `HeightMap`.
+    inv_depth : (rows, columns) 1/m.
+    residual : (rows, columns) 1/m above the plane; 0 where a cell is not low.
+    plane_id : (rows, columns) as in `HeightMap`.
     part : (rows, columns) numbers of the parts.
-    stack, count : the first ``count`` are the flat cells of this part.
-    number : of the plane it is on.
-    rise_least : 1/m; a smaller rise across the outline is noise.
+    stack, count : the first ``count`` of ``stack`` are the flat cells of this part.
+    number : number of its plane, from 1, as in ``plane_id``.
+    rise_least : least mean rise across the outline of an object, 1/m.
     """
     rows, columns = residual.shape
     parts = part.reshape(-1)

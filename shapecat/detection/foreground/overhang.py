@@ -1,7 +1,7 @@
-"""Overhang: what stands on a plane and reaches over its outline.
+"""Overhang: the parts of objects that extend beyond the outline of their plane.
 
-The outline is that of the samples: it ends before the far edge of a table where that is hidden,
-and at the front edge, over which things may stick out.
+The outline is that of the visible samples: it ends before the far edge of a table if that is
+hidden, and at the front edge, which objects may overhang.
 """
 
 from typing import NamedTuple
@@ -26,14 +26,15 @@ __all__ = ["extend_overhang"]
 
 
 class Overhang(NamedTuple):
-    """What is looked at around the outline of a plane.
+    """The data for the search around the outline of a plane.
 
     Attributes
     ----------
-    grid, heights, walls : of the frame.
-    me, plane : the number of the plane in ``heights``, and its row of `pack_planes`.
-    highest_m : so high above it an object reaches at most.
-    visited : (rows, columns) int8, ``me`` where it was looked at.
+    grid, heights, walls : as in `extend_overhang`.
+    me : number of the plane, from 1, as in `HeightMap.plane_id`.
+    plane : its row of `pack_planes`.
+    highest_m : greatest height of an object above it, metres.
+    visited : (rows, columns) int8, ``me`` in the cells already visited for this plane.
     """
 
     grid: DepthGrid
@@ -49,16 +50,17 @@ class Overhang(NamedTuple):
 def extend_overhang(
     grid: DepthGrid, heights: HeightMap, planes: F8, walls: U1, highest_m: float
 ) -> None:
-    """Give the parts of objects outside the outline of their plane to it, in place.
+    """Assign the parts of objects outside the outline of their plane to it, in place.
 
-    A connected object is not many times larger outside than inside: a wall behind a table does
-    not stand on it.
+    An object that is many times larger outside than inside is not extended: a wall behind a table
+    does not stand on it.
 
     Parameters
     ----------
-    planes : the rows of `pack_planes`.
-    walls : (rows, columns) from `remove_walls`; what is cleared stays so.
-    highest_m : metres above a plane up to which objects are looked for.
+    heights : changed in place.
+    planes : from `pack_planes`.
+    walls : (rows, columns) from `remove_walls`; cleared cells are not assigned.
+    highest_m : greatest height of an object above its plane, metres.
     """
     shape = grid.inverse_depth.shape
     visited, stack = np.zeros(shape, np.int8), unset(grid.inverse_depth.size, np.int32)
@@ -75,15 +77,13 @@ def extend_overhang(
 
 @kernel
 def _find_border(plane_id: I4, me: int, i: int, border: U1) -> bool:
-    """Mark the cells of a row above a plane that are beside cells of lower planes or of none.
+    """Mark the cells of row i above a plane that are next to cells of lower planes or of none.
 
-    Returns
-    -------
-    Whether there are any.
+    Returns whether there are any.
     """
     rows, columns = plane_id.shape
     above, below, one = max(i - 1, 0), min(i + 1, rows - 1), np.uint64(1)
-    mine = np.uint8(me)  # without a sign what lies on a surface is larger
+    mine = np.uint8(me)  # as unsigned numbers, cells on a surface are larger
     for j in range(np.uint64(columns)):
         lower = (np.uint8(plane_id[above, j]) < mine) | (np.uint8(plane_id[below, j]) < mine)
         border[j] = lower & (np.uint8(plane_id[i, j]) == mine)
@@ -101,7 +101,7 @@ def _find_border(plane_id: I4, me: int, i: int, border: U1) -> bool:
 
 @kernel
 def _goes_on(over: Overhang, i: int, j: int) -> bool:
-    """Whether the surface at a cell above the plane goes on outside: floods take longer."""
+    """Return whether the surface at a cell above the plane continues outside, without a flood."""
     rows, columns = over.visited.shape
     some, here = False, over.grid.inverse_depth[i, j]
     for di, dj in SIDES:
@@ -115,7 +115,7 @@ def _goes_on(over: Overhang, i: int, j: int) -> bool:
 
 @kernel
 def _extend(over: Overhang, i: int, j: int, stack: I4) -> None:
-    """Give the object at a cell above the plane what of it is outside, if that is not too much."""
+    """Assign the outside part of the object at cell (i, j) to its plane, unless it is too large."""
     inv_depth, plane_id, me = over.grid.inverse_depth, over.heights.plane_id, over.me
     rows, columns = inv_depth.shape
     stack[0], over.visited[i, j] = i * columns + j, me
@@ -145,7 +145,7 @@ def _extend(over: Overhang, i: int, j: int, stack: I4) -> None:
 
 @kernel
 def _height_beside(over: Overhang, i: int, j: int) -> float:
-    """Return how high a cell is above the plane; 0 where it is no part of what stands on it."""
+    """Return the height of a cell above the plane, metres; 0 if no object on it can be there."""
     w, k, plane = over.grid.inverse_depth[i, j], over.grid.intrinsics, over.plane
     if w <= 0 or over.walls[i, j] == CLEARED:
         return 0.0

@@ -21,24 +21,32 @@ from shapecat.jit import kernel, unset
 __all__ = ["CLEARED", "ON_WALL", "remove_walls"]
 
 ON_WALL, CLEARED = 1, 2
-"""Cells on a wall; the former are of a small part, which may be an object the wall goes through."""
+"""Marks of cells on a wall: in a small part, which may be an object in the plane of the wall; and
+in a large part, which is removed from the objects."""
 UNSEEN = 3
-"""Cells on a wall whose part is not known yet."""
+"""Mark of cells on a wall whose part is not measured yet."""
 
 STRIPS = 400
-"""Of `WallSettings.strip_m`, around the sensor."""
+"""Number of strips of `WallSettings.strip_m`, half on each side of the sensor."""
 
 
 @kernel
 def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, largest_m: float, trials: F8) -> U1:
-    """Take the cells on walls from the object cells of ``plane_id`` (rows, columns), in place.
+    """Remove the cells on walls from the objects, in place.
 
-    The vertical plane with most samples is taken, if it is a wall, then that with most others.
-    ``trials`` are of `draw_trials`.
+    The vertical plane with the most samples is tested first, then the one with the most remaining
+    samples.
+
+    Parameters
+    ----------
+    plane_id : (rows, columns) as in `HeightMap`; cleared cells become 0.
+    up : (3,) unit vector, sensor frame.
+    largest_m : size of the largest object, metres.
+    trials : from `draw_trials`.
 
     Returns
     -------
-    (rows, columns) uint8 `CLEARED` or `ON_WALL` on walls, 0 elsewhere. A plane through the fronts
+    (rows, columns) uint8, `CLEARED` or `ON_WALL` on walls, 0 elsewhere. A plane through the fronts
     of many objects looks like a wall too, but all its parts are small.
     """
     walls = np.zeros(plane_id.shape, np.uint8)
@@ -59,11 +67,11 @@ def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, largest_m: float, trials
 def _is_wall(
     grid: DepthGrid, samples: DepthSamples, plane: F8, normal: F8, up: F8, largest_m: float
 ) -> bool:
-    """Whether the inliers of a plane are more than the face of an object."""
+    """Return whether the inliers of a plane are more than the face of an object."""
     strips = np.zeros((2, STRIPS))
     area = _measure(grid.intrinsics, samples, plane, normal, up, strips)
     across = along = 0.0
-    for k in range(STRIPS):  # a strip of 5 cm counts that holds 5 cm of wall
+    for k in range(STRIPS):  # a strip counts if the wall in it is longer than the strip is wide
         across += WALLS.strip_m * (strips[0, k] > WALLS.strip_m**2)
         along += WALLS.strip_m * (strips[1, k] > WALLS.strip_m**2)
     if area <= WALLS.least_m2 or area <= WALLS.filled * across * along:
@@ -77,7 +85,7 @@ def _is_wall(
 
 @kernel
 def _is_cut_off(inv_depth: F4, samples: DepthSamples, plane: F8) -> bool:
-    """Whether the inliers of a plane reach two sides of the image, or of its samples near them."""
+    """Return whether the inliers of a plane reach two sides of the image, or of its samples."""
     own = _bounds(samples, plane, PLANES.tolerance)
     seen = _bounds(sample_grid(inv_depth, inv_depth), plane, np.inf)
     sides, margin = 0, 1.5 * math.sqrt(samples.share)
@@ -90,7 +98,7 @@ def _is_cut_off(inv_depth: F4, samples: DepthSamples, plane: F8) -> bool:
 
 @kernel
 def _bounds(samples: DepthSamples, plane: F8, tolerance: float) -> F8:
-    """Return the least column and row of the samples near a plane, then the greatest ones."""
+    """Return least column, least row, greatest column and greatest row of a plane's inliers."""
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
     for k in range(samples.inverse_depth.size):
         j, i = float(samples.j[k]), float(samples.i[k])
@@ -110,7 +118,7 @@ def _measure(
     up: F8,
     strips: F8,
 ) -> float:
-    """Return the area of the inliers of a plane; add it to the strips they lie in."""
+    """Return the area of the inliers of a plane, m², and add it to the strips they lie in."""
     total, side = 0.0, cross(normal, up)
     for k in range(samples.inverse_depth.size):
         j, i, v = samples.j[k], samples.i[k], samples.inverse_depth[k]
@@ -130,7 +138,7 @@ def _measure(
 
 @kernel
 def _clear(grid: DepthGrid, plane_id: I4, plane: F8, normal: F8, walls: U1) -> None:
-    """Take the connected parts of a wall that are large; others may be objects before it."""
+    """Clear the large connected parts of a wall; small parts may be objects in front of it."""
     inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape
     stack, found = unset(inv_depth.size, np.int32), unset(inv_depth.shape, np.uint8)
@@ -156,9 +164,10 @@ def _clear(grid: DepthGrid, plane_id: I4, plane: F8, normal: F8, walls: U1) -> N
 def _flood(
     grid: DepthGrid, plane: F8, normal: F8, i: int, j: int, found: U1, stack: I4
 ) -> tuple[int, float, float]:
-    """Collect a connected part of a wall.
+    """Collect the connected part of a wall at cell (i, j).
 
-    Returns how many cells it has, its area, m², and the sum of its squared distances, 1/m².
+    Returns the number of cells, their area, m², and the sum of their squared distances from the
+    plane, 1/m².
     """
     inv_depth, k = grid.inverse_depth, grid.intrinsics
     rows, columns = inv_depth.shape
@@ -183,7 +192,7 @@ def _flood(
 
 @kernel
 def _mark(inv_depth: F4, plane_id: I4, plane: F8, found: U1) -> None:
-    """Mark as unseen the cells on a wall that are no part of a level plane, as 0 the others."""
+    """Mark as `UNSEEN` the cells on a wall, unless they belong to a level plane; 0 elsewhere."""
     a = np.float32(plane[0])
     for i in range(inv_depth.shape[0]):
         values, plane_ids, states = inv_depth[i], plane_id[i], found[i]

@@ -1,1 +1,1 @@
-"""Merging: segments that are of one object come together again."""
+"""Merging: the segments of one object are joined again."""

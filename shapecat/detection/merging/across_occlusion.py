@@ -1,4 +1,4 @@
-"""Merging across an occluder: segments of one object on two sides of what is in front of it."""
+"""Merging across an occluder: segments of one object on both sides of an object in front of it."""
 
 import math
 
@@ -54,7 +54,7 @@ def merge_across_occluder(
 
 @kernel
 def _find_behind_one(segments: Segments) -> Bool:
-    """Return (n + 1, n + 1) which segments above one plane, p < q, one thing is in front of."""
+    """Return the pairs p < q of segments above one plane with a common occluder, (n + 1, n + 1)."""
     pairs, parent, plane_id = segments.pairs, segments.parent, segments.plane_id
     n = parent.size
     found = np.zeros((n, n), np.bool_)
@@ -74,7 +74,7 @@ def _find_behind_one(segments: Segments) -> Bool:
 
 @kernel
 def _local_planes(samples: I4, inv_depth: F4, intrinsics: PinholeIntrinsics, normal: F4) -> F8:
-    """Return (2, n, 3) the positions and normals of the samples of a segment, sensor frame."""
+    """Return the positions and normals of a segment's samples, (2, n, 3) metres, sensor frame."""
     n = 0
     for cell in samples:
         n += int(cell >= 0)
@@ -92,10 +92,10 @@ def _local_planes(samples: I4, inv_depth: F4, intrinsics: PinholeIntrinsics, nor
 
 @kernel
 def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
-    """Find the pairs of samples that lie in each other's local plane.
+    """Find the pairs of samples of two segments that lie in each other's local planes.
 
-    Returns the share of the samples that have a partner, of the segment with the lower one, and
-    some of the pairs, (n, 2, 3) positions.
+    Returns the smaller of the two segments' shares of samples with a partner, and the positions of
+    some of the pairs, (n, 2, 3). ``a`` and ``b`` are from `_local_planes`.
     """
     with_a, with_b = np.zeros(a.shape[1], np.bool_), np.zeros(b.shape[1], np.bool_)
     pairs, n = np.zeros((SAMPLES * SAMPLES, 2), np.uint8), 0
@@ -132,7 +132,7 @@ def _is_hidden(
     labels: I4,
     lines: F8,
 ) -> bool:
-    """Whether the lines (n, 2, 3) between two segments are behind something, not in free space."""
+    """Return whether lines (n, 2, 3) between two segments are hidden, not in free space."""
     free = hidden = looked = 0
     for k in range(len(lines)):
         for step in range(1, MERGING.line_steps):

@@ -1,4 +1,4 @@
-"""Adjacency: what segments meet along their outlines: each other, planes, and what hides them."""
+"""Adjacency: the other segments, planes and occluders along the boundary of each segment."""
 
 import math
 
@@ -20,13 +20,14 @@ __all__ = ["measure_adjacency"]
 def measure_adjacency(
     inv_depth: F4, heights: HeightMap, graph: SurfaceGraph, labels: I4, up: F8, segments: Segments
 ) -> None:
-    """Collect what segments meet, and their samples: what `measure_segments` leaves out.
+    """Measure the boundaries and contacts of segments, and choose their samples.
 
     Parameters
     ----------
-    inv_depth, labels : (rows, columns) inverse depth, 1/m, and the segments.
-    up : (3,) unit vector.
-    segments : from `measure_segments`; changed in place.
+    inv_depth : (rows, columns) 1/m.
+    labels : (rows, columns) the segments.
+    up : (3,) unit vector, sensor frame.
+    segments : from `measure_segments`, which leaves these out; changed in place.
     """
     rows, columns = inv_depth.shape
     plane_id, links, statistics = heights.plane_id, graph.links, segments.statistics
@@ -53,7 +54,7 @@ def measure_adjacency(
                     gap, y, x = gap + 1, y + down, x + 1 - down
                 beyond = y >= rows or x >= columns
                 q = 0 if beyond else labels[y, x]
-                ends = gap == 0 or p != q  # else the segment goes on behind the gap
+                ends = gap == 0 or p != q  # else the segment continues behind the gap
                 statistics[p].boundary += (p > 0) & ends
                 if beyond or gap > MERGING.shadow_cells:
                     continue
@@ -68,7 +69,7 @@ def measure_adjacency(
 
 @kernel
 def _find_changes(links: U1, here: I4, below: I4, change: U1) -> bool:
-    """Mark the cells of a row from which a segment does not just go on to the right and down.
+    """Mark the cells of a row from which a segment does not continue both to the right and down.
 
     Returns whether there are any.
     """
@@ -93,19 +94,21 @@ def _count(
     met: I4,
     segments: Segments,
 ) -> None:
-    """Count for the segments at the two cells of each meeting what each has at the other.
+    """Add pairs of cells on a boundary to the counts of the segments on both sides.
 
     Parameters
     ----------
-    met : (n, 6) column of the first cell, row and column of the second; 1 if it is the neighbour
-        below; cells without a reading between; and not 0 if the surface goes on.
+    row : the row of the first cells.
+    met : (n, 6) column of the first cell; row and column of the second; 1 if the second is below
+        the first, 0 if it is to the right; number of cells without a reading between them; and
+        not 0 if the surface continues.
     """
     plane_id, height = heights.plane_id, heights.height
     statistics, pairs = segments.statistics, segments.pairs
     steep = MERGING.down_cos * math.hypot(up[0], up[1])
     for m in range(2 * met.shape[0]):
         i, j, y, x = row, met[m // 2, 0], met[m // 2, 1], met[m // 2, 2]
-        fall = -up[met[m // 2, 3]]  # how much lower (y, x) is seen, however the image is turned
+        fall = -up[met[m // 2, 3]]  # above 0 if (y, x) is lower, however the image is turned
         gap, link = met[m // 2, 4], met[m // 2, 5]
         if m % 2 == 1:
             i, j, y, x, fall = y, x, row, met[m // 2, 0], -fall
@@ -124,7 +127,7 @@ def _count(
                     statistics[p].shelf_edge += 1
         elif link:
             pairs[p, q].contact += 1
-            # Whether the segment at (y, x) faces up a little further in.
+            # Whether the segment at (y, x) faces up, a few cells inside.
             v = min(max(i + MERGING.inward_cells * (y - i), 0), labels.shape[0] - 1)
             u = min(max(j + MERGING.inward_cells * (x - j), 0), labels.shape[1] - 1)
             facing = normal[v, 0, u] * up[0] + normal[v, 1, u] * up[1] + normal[v, 2, u] * up[2]

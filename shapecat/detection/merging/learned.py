@@ -1,10 +1,10 @@
-"""Learned merging: boosted trees tell whether two adjacent segments are of one object.
+"""Learned merging: boosted trees decide whether two adjacent segments are one object.
 
-Relations between surface patches, learned: Richtsfeld et al. 2012, 2014; the trees are grown on
+Learned relations between surface patches: Richtsfeld et al. 2012, 2014. The trees are trained on
 simulated scenes.
 
 A bottle and its neck, a plate and its foot, a cup and its handle, the halves of a toy: many weak
-features together tell them from what only touches or stands on it, and no few of them do.
+features together distinguish them from two objects that touch or are stacked, and no few do.
 """
 
 from functools import cache
@@ -36,21 +36,21 @@ FILE = "parts.npz"
 
 @cache
 def load_trees() -> BoostedTrees:
-    """Return the trees that belong to this version."""
+    """Return the trees of this version of the package."""
     return read_trees(
         files("shapecat.detection.merging").joinpath(FILE).read_bytes(), PAIR_FEATURES
     )
 
 
 class Scratch(NamedTuple):
-    """The `PAIR_FEATURES` of a pair (1,), by name and as numbers (features,): the same ones."""
+    """The `PAIR_FEATURES` of a pair, as a record (1,) and as a view of its numbers (features,)."""
 
     pair: Records
     features: F4
 
 
 def merge_learned(segments: Segments, view_geometry: ViewGeometry, grown: BoostedTrees) -> None:
-    """Merge segments that are likely parts of one object, the likeliest first."""
+    """Merge segments that are probably one object, in place, the most probable pair first."""
     pair = np.zeros(1, PAIR_FEATURES)
     _merge(segments, view_geometry, grown, Scratch(pair, pair.view(np.float32)))
 
@@ -71,7 +71,7 @@ def _merge(
         if logits[p, q] < MERGING.likely:
             return
         merge(segments, p, q)
-        write_segment_features(segments, p, features[p])  # others meet as much as before
+        write_segment_features(segments, p, features[p])  # those of other segments do not change
         for k in range(n):
             logits[q, k] = logits[k, q] = -np.inf
         _rate(segments, features, p, 1, view_geometry, grown, scratch, logits)
@@ -88,7 +88,7 @@ def _rate(
     scratch: Scratch,
     logits: F8,
 ) -> None:
-    """Write the logits of a segment with the others from ``first`` on, the lower one first."""
+    """Write the logits of segment ``p`` with the segments from ``first`` on, at [lower, higher]."""
     adjacent = find_adjacent(segments, p)
     for q in range(first, adjacent.size):
         low, high = min(p, q), max(p, q)

@@ -1,4 +1,4 @@
-"""Merging of low-profile objects: the segments of one are known by its outline."""
+"""Merging of low-profile objects, whose segments are known from `find_low_profile`."""
 
 import numpy as np
 
@@ -11,16 +11,18 @@ __all__ = ["merge_low_profile"]
 
 
 def merge_low_profile(segments: Segments, low_profile: I4, labels: I4, spans: I4) -> Bool:
-    """Join the segments of each low object that is known by its outline; return which they are.
+    """Merge the segments of each low-profile object.
 
     Parameters
     ----------
-    low_profile : (rows, columns) the numbers of the low objects, from `find_low_profile`.
-    spans : where there are ``labels``, as in `SurfaceGraph`.
+    segments : changed in place.
+    low_profile : (rows, columns) the numbers of the objects, from `find_low_profile`.
+    labels : (rows, columns) the segments.
+    spans : (rows, 2) as in `SurfaceGraph`.
 
     Returns
     -------
-    (n + 1,) whether most of a segment is low and known to be an object.
+    (n + 1,) bool, True for the segment of each low-profile object that the others merged into.
     """
     known = np.zeros(segments.parent.size, np.bool_)
     count = int(low_profile.max(initial=0))
@@ -41,7 +43,7 @@ def merge_low_profile(segments: Segments, low_profile: I4, labels: I4, spans: I4
 
 @kernel
 def _count_overlap(low_profile: I4, labels: I4, spans: I4, overlap: I4) -> None:
-    """Count the cells that each segment has of each low object."""
+    """Count the cells that each segment shares with each low-profile object."""
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):
             if low_profile[i, j] > 0:

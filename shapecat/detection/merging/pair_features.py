@@ -1,7 +1,7 @@
-"""Pair features: what tells whether two adjacent segments are of one object, by name.
+"""Pair features: named features that show whether two adjacent segments are one object.
 
-Richtsfeld et al. 2014 learn from relations between surface patches; here they are those of the
-segments' outlines, extents, curvatures and places.
+Richtsfeld et al. 2014 learn from relations between surface patches; here the relations are between
+the outlines, extents, curvatures and positions of segments.
 """
 
 from typing import NamedTuple
@@ -34,33 +34,33 @@ __all__ = [
 
 _ADJACENCY = np.dtype(
     [
-        ("contact_m", "f4"),  # length of the border where the surface goes on
-        ("contact", "f4"),  # shares of the border: where the surface goes on,
-        ("first_in_front", "f4"),
+        ("contact_m", "f4"),  # length of the border where the surface continues
+        ("contact", "f4"),  # shares of the border: where the surface continues,
+        ("first_in_front", "f4"),  # and where one is in front
         ("second_in_front", "f4"),
-        ("along_first", "f4"),  # contact by the outline of either
+        ("along_first", "f4"),  # shares of the boundary of each that is in contact
         ("along_second", "f4"),
         ("second_faces_up", "f4"),  # shares of the contact beyond which the other faces up
         ("first_faces_up", "f4"),
-        ("above_second_m", "f4"),  # how far above its top
+        ("above_second_m", "f4"),  # mean height of that contact above the other's top
         ("above_first_m", "f4"),
         ("border_m", "f4"),
     ]
 )
-"""What is where two segments meet."""
+"""Features of the border between two segments."""
 _RELATION = np.dtype(
     [
         ("area_ratio", "f4"),
         ("width_ratio", "f4"),
-        ("lateral_distance", "f4"),  # by the larger width
+        ("lateral_distance", "f4"),  # over the larger width
         ("depth_difference_m", "f4"),
-        ("depth_difference", "f4"),  # by the larger width
-        ("overlap", "f4"),  # of the lateral ranges, by the smaller width
+        ("depth_difference", "f4"),  # over the larger width
+        ("overlap", "f4"),  # of the lateral ranges, over the smaller width
         ("top_over_top_m", "f4"),
         ("bottom_over_top_m", "f4"),
         ("other_bottom_over_top_m", "f4"),
         ("bottom_over_bottom_m", "f4"),
-        ("most_beyond_m", "f4"),  # how far the first reaches over the sides of the second
+        ("most_beyond_m", "f4"),  # how far the first extends beyond the sides of the second
         ("least_beyond_m", "f4"),
         ("lateral_curvature", "f4"),  # of both together
         ("normal_position_correlation", "f4"),
@@ -69,7 +69,7 @@ _RELATION = np.dtype(
         ("down", "f4"),  # as in `ViewGeometry`
     ]
 )
-"""How two segments lie to each other, and how well they are seen."""
+"""The relative position of two segments, and how well they are visible."""
 PAIR_FEATURES = np.dtype(
     [
         ("adjacency", _ADJACENCY),
@@ -78,18 +78,19 @@ PAIR_FEATURES = np.dtype(
         ("relation", _RELATION),
     ]
 )
-"""The features of two segments, the smaller one first, all float32: lengths in metres, or shares.
-
-The trees number them in this order.
-"""
+"""The features of two segments, the smaller one first; all are float32, lengths in metres or
+ratios. The trees index them in this order."""
 FEATURES = PAIR_FEATURES.itemsize // np.dtype("f4").itemsize
-"""Their number."""
+"""The number of features of a pair."""
 
 
 class ViewGeometry(NamedTuple):
-    """How things are seen.
+    """The view of the scene.
 
-    ``focal`` length in cells; ``down`` the cosine between the optical axis and up, its third part.
+    Attributes
+    ----------
+    focal : focal length in cells.
+    down : cosine between the optical axis and up, the third component of up.
     """
 
     focal: float
@@ -98,9 +99,9 @@ class ViewGeometry(NamedTuple):
 
 @kernel
 def find_adjacent(segments: Segments, p: int) -> Bool:
-    """Return (n + 1,) with which others above its plane a segment may be of one object.
+    """Return (n + 1,) bool: the segments that may be one object with segment ``p``.
 
-    They touch, one hides the other, or they face each other.
+    They are above the same plane. They touch, one hides the other, or they face each other.
     """
     statistics, pairs, parent = segments.statistics, segments.pairs, segments.parent
     plane_id = segments.plane_id
@@ -115,7 +116,7 @@ def find_adjacent(segments: Segments, p: int) -> Bool:
 
 @kernel
 def _face(a: Row, b: Row) -> bool:
-    """Whether two segments may be the near and the far wall of a pot: these touch nowhere."""
+    """Return whether two segments may be the near and the far wall of a pot, which do not touch."""
     narrow, wide = min(width_of(a), width_of(b)), max(width_of(a), width_of(b))
     common = min(a.right, b.right) - max(a.left, b.left)
     level = abs(a.top - b.top) < MERGING.facing_m
@@ -128,7 +129,7 @@ def _face(a: Row, b: Row) -> bool:
 def pair_features(
     segments: Segments, p: int, q: int, view_geometry: ViewGeometry, out: Row
 ) -> None:
-    """Write the `PAIR_FEATURES` of two segments to a record of them."""
+    """Write the `PAIR_FEATURES` of segments ``p`` and ``q`` to the record ``out``."""
     features = np.zeros(segments.parent.size, SEGMENT_FEATURES)
     write_segment_features(segments, p, features[p])
     write_segment_features(segments, q, features[q])
@@ -139,7 +140,7 @@ def pair_features(
 def write_pair_features(
     segments: Segments, features: Records, p: int, q: int, view_geometry: ViewGeometry, out: Row
 ) -> None:
-    """Write `pair_features`; ``features`` (n + 1,) are the `SEGMENT_FEATURES` of each segment."""
+    """Write `pair_features`, given the `SEGMENT_FEATURES` (n + 1,) of all segments."""
     first, second = segments.statistics[p].area, segments.statistics[q].area
     if first > second or (first == second and p > q):
         p, q = q, p
@@ -178,7 +179,7 @@ def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) 
 
 @kernel
 def _above_top(segments: Segments, p: int, q: int) -> float:
-    """Return how far above the top of ``q`` faces up what ``p`` borders on there."""
+    """Return the mean height of the upward surface of ``q`` at ``p``, above the top of ``q``."""
     onto = segments.pairs[p, q].rests_on
     if onto == 0:
         return MERGING.nowhere_m

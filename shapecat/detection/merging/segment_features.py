@@ -1,4 +1,4 @@
-"""Segment features: how wide, round, hollow or closed on top a segment is."""
+"""Segment features: the size, shape, faces and boundary of a segment."""
 
 import math
 
@@ -27,20 +27,20 @@ SEGMENT_FEATURES = np.dtype(
         ("height_m", "f4"),
         ("lateral_curvature", "f4"),
         ("normal_position_correlation", "f4"),
-        ("plane_contact", "f4"),  # shares of the outline
+        ("plane_contact", "f4"),  # shares of the boundary
         ("hidden", "f4"),
         ("shelf_edge", "f4"),
         ("upper_silhouette", "f4"),
         ("touching", "f4"),
         ("in_front", "f4"),
         ("behind", "f4"),
-        ("top_area", "f4"),  # by the width squared
+        ("top_area", "f4"),  # over the squared width
         ("facing_up", "f4"),  # share of the area
         ("area_m2", "f4"),
-        ("filled", "f4"),  # area by width and height
+        ("filled", "f4"),  # area over width times height
     ]
 )
-"""Features of one segment: its size, shape and faces, and what its outline is made of."""
+"""Features of one segment: its size, shape and faces, and the composition of its boundary."""
 
 
 @kernel
@@ -51,21 +51,21 @@ def width_of(row: Row) -> float:
 
 @kernel
 def lateral_distance(a: Row, b: Row) -> float:
-    """Return the lateral distance of the middles of two segments, metres."""
+    """Return the lateral distance between the middles of two segments, metres."""
     return float(abs(a.left + a.right - b.left - b.right) / 2)
 
 
 @kernel
 def depth_difference(a: Row, b: Row) -> float:
-    """Return how much farther away than segment ``b`` segment ``a`` is on average, metres."""
+    """Return the mean depth of segment ``a`` minus that of segment ``b``, metres."""
     return float(a.depth_sum / a.count - b.depth_sum / b.count)
 
 
 @kernel
 def lateral_curvature(row: Row) -> float:
-    """Return by how much the lateral normal changes across a segment.
+    """Return the change of the lateral component of the normal across a segment.
 
-    2 for a whole cylinder seen from outside, -2 from inside, 0 for a plane.
+    It is 2 for a whole cylinder seen from outside, -2 from inside, and 0 for a plane.
     """
     spread, _, both = _moments(row)
     return float(both / max(spread, 1e-9) * width_of(row))
@@ -73,10 +73,10 @@ def lateral_curvature(row: Row) -> float:
 
 @kernel
 def normal_position_correlation(row: Row) -> float:
-    """Return the correlation of the lateral normal with the lateral position.
+    """Return the correlation between the lateral components of normal and position.
 
-    1 for what is turned about an upright axis; the faces of a box, and tops that are level, do not
-    turn steadily.
+    It is 1 for a solid of revolution with an upright axis, and less for the faces of a box and for
+    level tops, whose normals do not turn steadily.
     """
     spread, turning, both = _moments(row)
     return float(both / math.sqrt(max(spread * turning, 1e-12)))
@@ -84,7 +84,7 @@ def normal_position_correlation(row: Row) -> float:
 
 @kernel
 def _moments(row: Row) -> tuple[float, float, float]:
-    """Return the sums of squares of the lateral position and normal, and of products of both."""
+    """Return the centred sums of squares of lateral position and normal, and of their products."""
     n = max(row.fitted, np.float32(1))
     spread = row.xx_sum - row.x_sum * row.x_sum / n
     turning = row.normal_xx_sum - row.normal_x_sum * row.normal_x_sum / n
@@ -93,7 +93,7 @@ def _moments(row: Row) -> tuple[float, float, float]:
 
 @kernel
 def write_segment_features(segments: Segments, p: int, out: Row) -> None:
-    """Write the `SEGMENT_FEATURES` of a segment to a record of them."""
+    """Write the `SEGMENT_FEATURES` of segment ``p`` to the record ``out``."""
     row = segments.statistics[p]
     around = row.boundary
     front = back = touch = up = closed = 0.0
@@ -124,5 +124,5 @@ def write_segment_features(segments: Segments, p: int, out: Row) -> None:
 
 @kernel
 def share(part: float, whole: float) -> float:
-    """Return a part by the whole, 0 if there is none."""
+    """Return ``part / whole``; 0 if the whole is not positive."""
     return float(part / whole) if whole > 0 else 0.0

@@ -1,4 +1,4 @@
-"""Segments: the statistics of each segment, and of each pair of segments (from `adjacency`)."""
+"""Segments: the statistics of each segment and of each pair (`adjacency` adds the latter)."""
 
 import math
 from typing import Any, NamedTuple, TypeAlias
@@ -39,52 +39,52 @@ SEGMENT = np.dtype(
         ("right", "f4"),
         ("bottom", "f4"),  # range of heights above the plane, metres
         ("top", "f4"),
-        ("area", "f4"),  # of the surface seen, m2
+        ("area", "f4"),  # of the visible surface, m2
         ("depth_sum", "f4"),
-        ("fitted", "f4"),  # cells with a local plane, over which the next five are sums:
+        ("fitted", "f4"),  # cells with a local plane; the next five are sums over these:
         ("x_sum", "f4"),  # lateral position
         ("xx_sum", "f4"),
-        ("normal_x_sum", "f4"),  # lateral part of the normal
+        ("normal_x_sum", "f4"),  # lateral component of the normal
         ("normal_xx_sum", "f4"),
         ("x_normal_x_sum", "f4"),
-        ("plane_contact", "f4"),  # links with its plane
-        ("hidden", "f4"),  # boundary behind what is of no segment
-        ("shelf_edge", "f4"),  # links with a higher plane, from below
-        ("upper_silhouette", "f4"),  # places where it ends above what is farther away
+        ("plane_contact", "f4"),  # boundary with its plane
+        ("hidden", "f4"),  # boundary behind a surface of no segment
+        ("shelf_edge", "f4"),  # boundary with another plane
+        ("upper_silhouette", "f4"),  # lower boundary in front of a farther surface
     ]
 )
 """The statistics of a segment."""
 PAIR = np.dtype(
     [
         ("contact", "f4"),  # linked neighbours
-        ("in_front", "f4"),  # places where the first is in front of the second
-        ("near", "f4"),  # neighbours of equal depth over a gap
-        ("rests_on", "f4"),  # links whose far side, on the second, faces up
+        ("in_front", "f4"),  # neighbours where the first is in front of the second
+        ("near", "f4"),  # neighbours at the same depth that are not linked
+        ("rests_on", "f4"),  # links beyond which the second faces up
         ("rests_on_height", "f4"),  # the sum of the heights there
     ]
 )
-"""What two segments have in common."""
+"""The statistics of an ordered pair of segments: counts along their common border."""
 Records: TypeAlias = NDArray[np.void]
-"""An array of `SEGMENT` or `PAIR`."""
+"""An array of `SEGMENT` or `PAIR` records."""
 Row: TypeAlias = Any
-"""One of its records."""
+"""One such record."""
 SAMPLES = 48
-"""Most cells, evenly spaced, that stand for a segment where to look at all would take too long."""
+"""Most samples of a segment, evenly spaced, used where all its cells would take too long."""
 BAND_M, BANDS = 0.005, 128
-"""Height of a band, and their number; what is higher counts in the last one."""
+"""Height of a band, metres, and number of bands; higher cells count in the last one."""
 
 
 class Segments(NamedTuple):
-    """Statistics of n segments, row 0 is no segment; all but the samples add up in a merge.
+    """Statistics of segments 1..n; row 0 is unused. A merge adds up all but the samples.
 
     Attributes
     ----------
-    pairs : (n + 1, n + 1) of `PAIR`.
-    statistics : (n + 1,) of `SEGMENT`.
-    top_area : (n + 1, BANDS) float32 m2 of surface that faces up, by height.
-    samples : (n + 1, SAMPLES) int32 cells away from edges, -1 beyond the last.
-    plane_id : (n + 1,) int8 the plane it is above, as in `HeightMap.plane_id`.
-    parent : (n + 1,) int16 the segment it has been merged into.
+    pairs : (n + 1, n + 1) records of `PAIR`.
+    statistics : (n + 1,) records of `SEGMENT`.
+    top_area : (n + 1, BANDS) float32, area of upward surface by height, m2.
+    samples : (n + 1, SAMPLES) int32, flat cells away from edges; -1 beyond the last.
+    plane_id : (n + 1,) int8, the plane below each, as in `HeightMap.plane_id`.
+    parent : (n + 1,) int16, the segment that each has been merged into, at first itself.
     """
 
     pairs: Records
@@ -98,7 +98,10 @@ class Segments(NamedTuple):
 def measure_segments(
     grid: DepthGrid, heights: HeightMap, graph: SurfaceGraph, labels: I4, n: int, up: F8
 ) -> Segments:
-    """Collect the shapes of segments 1..n; `measure_adjacency` adds what they meet."""
+    """Measure segments 1..n; `measure_adjacency` adds their boundaries and samples.
+
+    ``labels`` (rows, columns) are the segments; ``up`` is a unit vector (3,), sensor frame.
+    """
     segments: Segments = _blank(n + 1)
     axis, intrinsics = lateral_axis(up), grid.intrinsics
     _measure(grid.inverse_depth, intrinsics, heights, graph, labels, up, axis, segments)
@@ -106,7 +109,7 @@ def measure_segments(
 
 
 def _blank(size: int) -> Segments:
-    """Return segments without any cell."""
+    """Return segments without cells."""
     segments = Segments(
         np.zeros((size, size), PAIR),
         np.zeros(size, SEGMENT),
@@ -122,7 +125,7 @@ def _blank(size: int) -> Segments:
 
 @kernel
 def lateral_axis(up: F8) -> F8:
-    """Return the horizontal direction across the view, (3,) unit."""
+    """Return the horizontal unit vector (3,) across the view, sensor frame."""
     across = math.hypot(up[0], up[1])
     if across < 0.2:  # the camera looks straight down
         return np.array(level_axes(up[0], up[1], up[2])[0])
@@ -140,7 +143,7 @@ def _measure(
     side: F8,
     segments: Segments,
 ) -> None:
-    """Add up the cells of the labels; label 0 is none."""
+    """Add the cells of labels 1..n to the statistics."""
     plane_ids, top_area = segments.plane_id, segments.top_area
     plane_id, height = heights.plane_id, heights.height
     zero, one, far_off = np.float32(0), np.float32(1), np.float32(np.inf)
@@ -160,7 +163,7 @@ def _measure(
             if p == 0:
                 j += 1
                 continue
-            # Sums over the cells of one segment that follow each other.
+            # Sums over a run of cells of one segment.
             far = fitted = sides = sides2 = turns = turns2 = both = areas = zero
             left, right, bottom, top = far_off, -far_off, far_off, -far_off
             while j < end and labels[i, j] == p:
@@ -204,7 +207,10 @@ def _measure(
 
 @kernel
 def choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None:
-    """Choose evenly spaced cells of each segment away from edges; ``labels`` (rows, columns)."""
+    """Choose evenly spaced samples of each segment, away from edges, in place.
+
+    ``labels`` (rows, columns) are the segments.
+    """
     rows, columns = labels.shape
     spans, local_plane, concavity, samples = (
         graph.spans,
@@ -230,7 +236,7 @@ def choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None:
 
 @kernel
 def merge(segments: Segments, p: int, q: int) -> None:
-    """Add segment ``q`` to segment ``p``; both are groups of their own before."""
+    """Merge segment ``q`` into segment ``p``, in place; both must be roots."""
     n = segments.parent.size
     pairs = segments.pairs
     for k in range(n):
@@ -258,7 +264,7 @@ def merge(segments: Segments, p: int, q: int) -> None:
 
 @kernel
 def _add_pair(a: Row, b: Row) -> None:
-    """Add a `PAIR` to another, and clear it."""
+    """Add the `PAIR` ``b`` to ``a``, and clear ``b``."""
     a.contact += b.contact
     a.in_front += b.in_front
     a.near += b.near
@@ -269,7 +275,7 @@ def _add_pair(a: Row, b: Row) -> None:
 
 @kernel
 def add_statistics(a: Row, b: Row) -> None:
-    """Add a `SEGMENT` to another."""
+    """Add the `SEGMENT` ``b`` to ``a``."""
     a.count += b.count
     a.boundary += b.boundary
     a.left, a.right = min(a.left, b.left), max(a.right, b.right)
@@ -290,12 +296,12 @@ def add_statistics(a: Row, b: Row) -> None:
 
 @kernel
 def depth_of(segments: Segments, p: int) -> float:
-    """Return the mean depth of a segment, metres; 1 where it has no cell."""
+    """Return the mean depth of a segment, metres; 1 if it has no cells."""
     count = segments.statistics[p].count
     return float(segments.statistics[p].depth_sum / count) if count > 0 else 1.0
 
 
 @kernel
 def is_root(segments: Segments, p: int) -> bool:
-    """Whether a segment has not been merged into another."""
+    """Return whether a segment has not been merged into another."""
     return bool(segments.parent[p] == p)

@@ -9,54 +9,55 @@ class MergingSettings(NamedTuple):
     """How segments are measured, compared and merged."""
 
     few: int = 3
-    """Links between two segments that are a contact rather than noise."""
+    """Fewest links between two segments that are a contact, not noise."""
     up_cos: float = 0.8
-    """Cosine of the largest angle to up of a normal that faces up: noise turns it by 35 degrees."""
+    """Least cosine to up of a normal that faces up: noise turns normals by up to 35 degrees."""
     edge_on_cos: float = 0.2
-    """Least cosine to the line of sight that areas are corrected for: below, noise decides."""
+    """Least cosine to the line of sight that areas are corrected for: below, noise dominates."""
     flat_deg: int = 20
-    """Concave angle, degrees, from which a cell is too near to an edge to stand for its segment."""
+    """Largest concave angle, degrees, of a sample of a segment; others are too near an edge."""
     gap_cells: int = 3
-    """Cells without a sample within one surface."""
+    """Most cells without a reading within one surface."""
     shadow_cells: int = 15
-    """And between two, of which the nearer keeps the light of the projector from the other."""
+    """Most cells without a reading between two surfaces, of which the nearer one blocks the light
+    of the projector."""
     inward_cells: int = 3
-    """Cells from a border to where it is known which way the surface faces."""
+    """Cells from a border inwards at which the normal of a surface is taken."""
     down_cos: float = 0.7
-    """Cosine of the largest angle, in the image, of the neighbour below to straight down."""
+    """Cosine of the largest angle, in the image, between a lower neighbour and straight down."""
     top_bands: int = 4
-    """Bands of height below the top, of 5 mm, in which what faces up closes it."""
+    """Bands of height, of 5 mm, below the top in which upward surface closes a segment."""
     facing_m: float = 0.015
-    """Difference of the tops of what may be the two walls of a pot, metres."""
+    """Largest height difference between the tops of two walls of a pot, metres."""
     facing_share: float = 0.5
-    """Share of the narrower one's width that has the other one before or behind it."""
+    """Least overlap of the lateral ranges of two walls of a pot, relative to the narrower one."""
     nowhere_m: float = -1.0
-    """Height of what faces up across a border where nothing does, metres: less than any."""
+    """Stands for the height of a contact with upward surface if there is none, metres."""
     likely: float = 0.3
-    """Logit, of 0.57, from which on two segments are merged: a wrong merge loses two objects, a
-    missing one seldom one."""
+    """Least logit of a pair that is merged, for a probability of 0.57: a wrong merge loses two
+    objects, a missing merge seldom one."""
     hopeless: float = -4.0
-    """Logit of the first trees that the others never made up for: half of the pairs."""
+    """Partial logit that the remaining trees never make up for: half of the pairs are below."""
     low_share: float = 0.5
-    """Share of the cells of a segment that belong to one low-profile object."""
+    """Least share of the cells of a segment in one low-profile object, to be part of it."""
     coplanar_m: float = 0.006
-    """How far a sample may lie off the local plane of another, metres: two steps of a Kinect."""
+    """Largest distance of a sample from the local plane of another: two steps of a Kinect."""
     coplanar_slope: float = 0.05
-    """And per metre between them: local planes are 3 degrees off."""
+    """Increase of that limit per metre between the samples: local planes are 3 degrees off."""
     coplanar_cos: float = 0.966
-    """Cosine of the largest angle between their normals, 15 degrees."""
+    """Least cosine between the normals of the samples, for 15 degrees."""
     partners: float = 0.45
-    """Share of the samples of either segment that continue the other; of round ones half do."""
+    """Least share of the samples of either segment that continue the other; half on round ones."""
     fewest_samples: int = 4
-    """Samples of a segment that say anything about its surface."""
+    """Fewest samples that describe the surface of a segment."""
     most_lines: int = 300
-    """Lines between partners that are looked along; this bounds the time."""
+    """Most lines between partners that are followed; this bounds the time."""
     line_steps: int = 8
-    """Places on each that are looked at: an occluder is wider than an eighth of the gap."""
+    """Steps on each line: an occluder is wider than an eighth of the gap."""
     free_share: float = 0.12
-    """Largest share of them in free space or on others: edges of the occluder are ragged."""
+    """Largest share of points on the lines in free space: edges of an occluder are ragged."""
     hidden_share: float = 0.05
-    """Least share of them behind something."""
+    """Least share of points on the lines behind an occluder."""
 
 
 MERGING = MergingSettings()

@@ -1,1 +1,1 @@
-"""Output: labels at full resolution, boxes, what stands on what, the scene."""
+"""Output: labels at full resolution, boxes, support relations, the scene."""

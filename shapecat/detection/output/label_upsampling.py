@@ -1,4 +1,4 @@
-"""Label upsampling: labels of cells brought back to full resolution."""
+"""Label upsampling: the labels of cells transferred to pixels at full resolution."""
 
 from itertools import pairwise
 from typing import NamedTuple
@@ -25,9 +25,9 @@ __all__ = [
 ]
 
 UNSURE, BARE = -1, -2
-"""Instead of a label: what takes more to tell, and cells without a label next to one that has."""
+"""Codes in place of a label: a closer test is needed; a cell without a label next to one with."""
 BLOCK = 16
-"""Pixels that are looked at together: most are as those before."""
+"""Pixels that are tested together: most are like the previous ones."""
 
 
 class GridLabels(NamedTuple):
@@ -41,11 +41,15 @@ class GridLabels(NamedTuple):
 
 
 def label_pixels(depth: F4, grid: DepthGrid, found: Segmentation, *, range_m: float) -> list[U4]:
-    """Return the ascending pixel indices (k,) of the labels 1, 2, ...
+    """Return the pixels of each label 1, 2, ...: ascending flat indices (k,) uint32.
 
-    ``depth`` is (height, width), metres, ``range_m`` the farthest reading that counts. A pixel
-    takes the label of its cell, or else of the neighbour whose depth fits best; it keeps it only
-    where it is above the plane itself, except in filled cells.
+    A pixel takes the label of its cell if its depth fits, or else of the neighbour whose depth fits
+    best. It keeps the label only if it is itself above the plane, or in a filled cell.
+
+    Parameters
+    ----------
+    depth : (height, width) metres, 0 where there is no reading.
+    range_m : readings farther away have no label, metres.
     """
     grid_labels = grid_labels_of(grid, found)
     return split_lists(
@@ -54,20 +58,20 @@ def label_pixels(depth: F4, grid: DepthGrid, found: Segmentation, *, range_m: fl
 
 
 def grid_labels_of(grid: DepthGrid, found: Segmentation) -> GridLabels:
-    """Gather the fields that the kernels here read."""
+    """Collect the fields that the kernels here read."""
     return GridLabels(grid.inverse_depth, found.labels, found.filled, found.planes, found.plane_ids)
 
 
 def split_lists(order: U4, ends: I4) -> list[U4]:
-    """Split what `list_runs` returns, (n,) and (labels,), into the lists of the labels."""
+    """Split the results of `list_runs`, (n,) and (labels,), into one list per label from 1."""
     return [order[a:b] for a, b in pairwise(ends.tolist())]
 
 
 @kernel
 def find_near(labels: I4, i: int, scratch: I4, near: I4) -> None:
-    """Mark the cells of row ``i`` that have a label or are next to one that has.
+    """Mark in ``near`` the cells of row ``i`` that have a label or a neighbour with one.
 
-    ``scratch`` is (columns + 2,) with 0 at both ends.
+    ``labels`` and ``near`` are (rows, columns); ``scratch`` (columns + 2,) is 0 at both ends.
     """
     rows, columns = labels.shape
     above, below, one = max(i - 1, 0), min(i + 1, rows - 1), np.uint64(1)
@@ -81,10 +85,10 @@ def find_near(labels: I4, i: int, scratch: I4, near: I4) -> None:
 def _list_pixels(
     depth: F4, grid_labels: GridLabels, factor: int, range_m: float, labels: int
 ) -> tuple[U4, I4]:
-    """Return the pixels of the labels below ``labels`` as `list_runs`."""
+    """Return the pixels of the labels below ``labels``, as `list_runs` does."""
     rows, columns = grid_labels.inverse_depth.shape
     height, width = depth.shape
-    # The cells of a row at full resolution, and what becomes of its pixels.
+    # The cells of a row at full resolution, and the marks of its pixels.
     wide_code, wide_w = np.zeros(width, np.int16), np.zeros(width, np.float32)
     line, marks = np.zeros(width, np.int16), np.zeros(width, np.int16)
     cells, places = np.zeros((2, width), np.int64), np.zeros((3, width), np.float64)
@@ -124,7 +128,7 @@ def _list_pixels(
 
 @kernel
 def _end_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
-    """Append the indices of a label to n runs, if it is one; return how many there are then."""
+    """Append a run of pixels to the n runs unless its label is 0; return their new number."""
     if label > 0:
         runs[n, 0], runs[n, 1], runs[n, 2] = label, first, end
         n += 1
@@ -133,10 +137,10 @@ def _end_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
 
 @kernel
 def list_runs(runs: I4, labels: int) -> tuple[U4, I4]:
-    """Return all pixel indices (n,) of the runs, sorted by label, and the end of each label's part.
+    """Return the pixel indices (n,) of runs, sorted by label, and where each label ends (labels,).
 
-    ``runs`` is (r, 3): label, first pixel, and one more than the last. Label 0 has no pixels: its
-    end is 0.
+    ``runs`` is (r, 3): label, first pixel, and one after the last. Label 0 has no pixels: its end
+    is 0.
     """
     place, total = np.zeros(labels, np.int64), 0  # where the next pixel of each label goes
     for r in range(len(runs)):
@@ -155,7 +159,7 @@ def list_runs(runs: I4, labels: int) -> tuple[U4, I4]:
 
 @kernel
 def _find_unsure(line: I4, start: int, end: int, cells: I4) -> int:
-    """Write the columns of unsure pixels to ``cells[1]``; return how many there are."""
+    """Write the columns of `UNSURE` pixels to ``cells[1]``; return their number."""
     n = 0
     for x in range(start, end, BLOCK):
         last, some = min(x + BLOCK, end), False
@@ -169,7 +173,7 @@ def _find_unsure(line: I4, start: int, end: int, cells: I4) -> int:
 
 @kernel
 def _end_of(line: I4, x: int, end: int, mark: int) -> int:
-    """Return the first place from ``x`` on, before ``end``, where something else is marked."""
+    """Return the first column from ``x`` on with another mark; ``end`` if there is none before."""
     while x + BLOCK <= end:
         same = True
         for k in range(np.uint64(x), np.uint64(x + BLOCK)):
@@ -184,10 +188,10 @@ def _end_of(line: I4, x: int, end: int, mark: int) -> int:
 
 @kernel
 def _code_cells(grid_labels: GridLabels) -> tuple[I4, I4]:
-    """Return (rows, columns) what the pixels that fit each cell are, and the spans of these.
+    """Return a code for the pixels that fit each cell, (rows, columns), and the spans of the codes.
 
-    That is its label if all of them have it, `UNSURE` if they may have it, `BARE` if it has none,
-    and 0 away from all labels.
+    The code is the label of the cell if all these pixels have it, `UNSURE` if they may have it,
+    `BARE` if the cell has none but a neighbour does, and 0 away from all labels.
     """
     inv_depth, labels, filled, planes, plane_ids = grid_labels
     code, spans = unset(labels.shape, np.int16), np.zeros((len(labels), 2), np.int32)
@@ -208,10 +212,7 @@ def _code_cells(grid_labels: GridLabels) -> tuple[I4, I4]:
 
 @kernel
 def _find_high(planes: F8, inv_depth: F4, i: int, span: I4, high: U1) -> None:
-    """Write whether every pixel that fits a cell rises above each plane.
-
-    The cells are those of a span of row i.
-    """
+    """Write whether all pixels that fit a cell are above each plane, for a span of row i."""
     jump, zero, nowhere = np.float32(DISCONTINUITY), np.float32(0), np.float32(1e-3)
     base = np.float32(CLEANUP.fringe * HEIGHT_NOISE)
     slope = np.float32(CLEANUP.fringe * MIN_HEIGHT_M)
@@ -232,7 +233,7 @@ def _find_high(planes: F8, inv_depth: F4, i: int, span: I4, high: U1) -> None:
 def _widen(
     code: I4, inv_depth: F4, i: int, factor: int, span: I4, wide_code: I4, wide_w: F4
 ) -> None:
-    """Write a span of a row of cells to their pixels; those beyond the last cell are its."""
+    """Copy a span of row i to full resolution; pixels beyond the last cell get its values."""
     start, end, two, one = np.uint64(span[0]), np.uint64(span[1]), np.uint64(2), np.uint64(1)
     if factor == 2:  # the usual case, in a form that vectorises
         for j in range(start, end):
@@ -251,10 +252,10 @@ def _widen(
 def _mark(
     depth: F4, inv_depth: F4, code: I4, run: tuple[int, int, int], range_m: float, marks: I4
 ) -> None:
-    """Write the labels of a run of pixels, `UNSURE` where it takes more to tell.
+    """Write the labels of a run of pixels, `UNSURE` where a closer test is needed.
 
-    ``run`` is a row, its first column and that after its last; ``inv_depth`` and ``code`` are
-    those of the cells, by column. This vectorises.
+    ``run`` is the row, the first column, and one after the last; ``inv_depth`` and ``code`` are
+    those of the cells, by column of the pixels. This vectorises.
     """
     least, zero, unsure, bare = np.float32(NEAREST_M), np.int16(0), np.int16(UNSURE), np.int16(BARE)
     y, start, end = run
@@ -268,13 +269,13 @@ def _mark(
 
 @kernel
 def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks: I4) -> None:
-    """Write the labels of the first ``n`` of some depths, 0 where there is none.
+    """Find the labels of the first ``n`` of m depth readings.
 
     Parameters
     ----------
-    cells : (2, m) row and column of the cell of each.
-    places : (3, m) its column, row, in cells, and depth.
-    marks : (m,) to write to.
+    cells : (2, m) row and column of the cell of each reading.
+    places : (3, m) column and row of each reading in units of cells, and its depth, metres.
+    marks : (m,) the labels are written here, 0 where there is none.
     """
     inv_depth, labels, filled = grid_labels.inverse_depth, grid_labels.labels, grid_labels.filled
     planes, plane_ids = grid_labels.planes, grid_labels.plane_ids
@@ -295,7 +296,7 @@ def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks:
             for y in range(max(i - 1, 0), min(i + 2, rows)):
                 for x in range(max(j - 1, 0), min(j + 2, columns)):
                     gap = abs(inv_depth[y, x] * z - np.float32(1))
-                    better = gap < nearest  # a choice, for no branch could be foretold
+                    better = gap < nearest  # a selection: a branch would be unpredictable
                     nearest = gap if better else nearest
                     row, column = y if better else row, x if better else column
             if row < 0:
@@ -312,5 +313,5 @@ def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks:
 
 @kernel
 def _fits(inv_depth: float, z: float) -> bool:
-    """Whether a depth is within one jump of a cell; both sides are multiplied by the depth."""
+    """Return whether a depth is within a `DISCONTINUITY` of a cell; computed without a division."""
     return bool(abs(inv_depth * z - np.float32(1)) < np.float32(DISCONTINUITY) * z)

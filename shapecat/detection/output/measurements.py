@@ -1,4 +1,4 @@
-"""Measurements of labelled cells: boxes, what each object stands on, and flags."""
+"""Measurements of labelled cells: boxes, support relations, and flags."""
 
 from typing import NamedTuple
 
@@ -22,17 +22,18 @@ __all__ = ["ObjectMeasurements", "measure_objects"]
 
 
 class ObjectMeasurements(NamedTuple):
-    """What is measured of the labels 1, 2, ..., one row each.
+    """Measurements of the objects 1..n, one row each.
 
     Attributes
     ----------
-    center, size, orientation : (n, 3), (n, 3) and (n, 4) of the upright box.
-    low, high : (n, 2) the first and last row and column of cells.
-    supported_by : (n,) the label that each stands on, 0 for its plane.
-    support_m : (n,) the height of that above the plane.
-    hidden : (n,) whether something nearer hides a part.
-    last : (n,) whether it ends where the range does, beyond which readings are left out.
-    least : (n,) cells of the smallest object at that distance.
+    center, size : (n, 3) metres, of the upright box, view frame.
+    orientation : (n, 4) quaternion x, y, z, w of the box, view frame.
+    low, high : (n, 2) the first and last row and column of its cells.
+    supported_by : (n,) the label of the object that each stands on; 0 for its plane.
+    support_m : (n,) the height of that support above the plane.
+    hidden : (n,) whether a nearer surface hides part of it.
+    last : (n,) whether it is cut off by the range limit.
+    least : (n,) float32, cells of the smallest object at its depth.
     """
 
     center: F8
@@ -51,11 +52,18 @@ class ObjectMeasurements(NamedTuple):
 def measure_objects(
     grid: DepthGrid, labels: I4, segments: Segments, representatives: I4, up: F8, range_m: float
 ) -> ObjectMeasurements:
-    """Measure the labels, the segments of each of which are merged into one of ``representatives``.
+    """Measure the objects.
 
-    The box is the smallest over 60 yaws, as `shapecat.geometry.upright_box`, on the outermost
-    cells. An object stands on another when it touches surface of it that faces up, more than it
-    touches the plane; or, where that contact is hidden, when it ends where the other begins.
+    The box is an `shapecat.geometry.upright_box` around the outermost cells. An object stands on
+    another if it touches upward surface of that more than it touches the plane; or, if that contact
+    is hidden, if its bottom is at the top of the other.
+
+    Parameters
+    ----------
+    labels : (rows, columns) objects 1..n, 0 elsewhere.
+    representatives : (n + 1,) from `number_objects`.
+    up : (3,) unit vector, view frame.
+    range_m : the range limit, metres.
     """
     count = representatives.size - 1
     measured = ObjectMeasurements(
@@ -97,7 +105,7 @@ def measure_objects(
 
 @kernel
 def _supporting_object(segments: Segments, representatives: I4, p: int) -> tuple[int, float]:
-    """Return what a segment stands on: a label or 0, and its height above the plane, metres."""
+    """Return the label a segment stands on, 0 for its plane, and the height of that, metres."""
     pairs, statistics = segments.pairs[p], segments.statistics
     best = 0
     for k in range(1, representatives.size):
@@ -118,7 +126,7 @@ def _supporting_object(segments: Segments, representatives: I4, p: int) -> tuple
 
 @kernel
 def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
-    """Return the label below a segment that it meets most, 0 if none."""
+    """Return the label below a segment with the most contact; 0 if there is none."""
     statistics, pairs = segments.statistics, segments.pairs
     middle = (statistics[p].left + statistics[p].right) / 2
     best, most = 0, 0.0
@@ -135,7 +143,7 @@ def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
 
 @kernel
 def _break_cycles(measured: ObjectMeasurements) -> None:
-    """Put what stands on itself, by way of others, on its plane."""
+    """Put objects that stand on themselves, through others, on their plane."""
     supported_by = measured.supported_by
     for k in range(supported_by.size):
         at = supported_by[k]
@@ -157,7 +165,7 @@ def _measure_boxes(
     for k in range(start.size - 1):
         if start[k] < start[k + 1]:
             center, size, turned = level_box(points[:, start[k] : start[k + 1]], level)
-            for d in range(4):  # whole rows would compile the error of one that does not fit
+            for d in range(4):  # assigning whole rows would compile a check of their sizes
                 measured.orientation[k, d] = turned[d]
             for d in range(3):
                 measured.center[k, d], measured.size[k, d] = center[d], size[d]
@@ -171,10 +179,10 @@ def _outer_points(
     level: F8,
     measured: ObjectMeasurements,
 ) -> tuple[F4, I4]:
-    """Return some cells of each label in the level frame (3, n), and where each label begins.
+    """Return points of each object in the level frame (3, n), and the index where each begins.
 
-    They are the outermost, of which come `ObjectMeasurements.low` and `ObjectMeasurements.high`,
-    and every 4th inside: the nearest point of a ball is inside its outline.
+    They are the outermost cells, and every 4th cell inside, since the nearest point of a ball is
+    inside its outline. Also writes ``low`` and ``high`` of the measurements.
     """
     rows, columns = labels.shape
     low, high = measured.low, measured.high
@@ -212,7 +220,7 @@ def _outer_points(
 
 @kernel
 def _find_outer(labels: I4, i: int, first: int, end: int, outer: Bool) -> None:
-    """Mark the labelled cells of a part of a row that are next to others, and every 4th inside."""
+    """Mark the labelled cells of part of a row that are next to other labels, and every 4th."""
     rows, columns = labels.shape
     if i == 0 or i == rows - 1:
         for j in range(first, end):

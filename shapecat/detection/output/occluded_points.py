@@ -1,7 +1,7 @@
-"""Occluded points: what one view does not see of a cloud fused from several.
+"""Occluded points: the points of a fused cloud that the virtual camera does not see.
 
-The rules work on the surface that the virtual camera sees. Points behind it belong to the object
-whose points they touch; what touches none is clustered by distance alone (thesis Alg. 2).
+Objects are found on the surface that the virtual camera sees. Points behind it join the object
+whose points they touch; the others are clustered by distance alone (thesis Alg. 2).
 """
 
 import numpy as np
@@ -14,17 +14,20 @@ __all__ = ["label_occluded_points"]
 
 
 def label_occluded_points(points: F4, labels: I4, first_new: int) -> I4:
-    """Complete the labels of ``points`` (n, 3), metres, any frame.
+    """Label all points: labels spread to the unlabelled points that touch labelled ones.
+
+    Points touch if their voxels of 1 cm are neighbours, also at a corner. Labels spread one voxel
+    at a time, so that the nearest object wins.
 
     Parameters
     ----------
-    labels : (n,) 1, 2, ... the known object; 0 to be found.
-    first_new : the label of the first cluster that touches no known object.
+    points : (n, 3) metres, any frame.
+    labels : (n,) the known labels, from 1; 0 where unknown.
+    first_new : the label of the first cluster that touches no known object; others count on.
 
     Returns
     -------
-    (n,) labels, none of them 0. Points in voxels of 1 cm that touch, also by a corner, are
-    connected; in order of distance from the known, in steps of one voxel.
+    (n,) labels, none of them 0.
     """
     cell = np.floor((points - points.min(axis=0)) / OUTPUT.voxel_m).astype(np.int64) + 1
     _, ny, nz = cell.max(axis=0) + 2

@@ -1,4 +1,4 @@
-"""Labels of points: what a cloud that was seen through a virtual camera takes from the cells."""
+"""Labels of points: the labels of cells transferred to the points of a cloud."""
 
 import numpy as np
 
@@ -23,10 +23,10 @@ __all__ = ["label_points"]
 
 
 def label_points(view: VirtualImage, found: Segmentation, *, fused: bool) -> list[U4]:
-    """Return the ascending point indices (k,) of the labels, as `label_pixels`.
+    """Return the points of each label 1, 2, ...: ascending indices (k,) uint32.
 
-    With ``fused`` points behind the visible surface are given to what they touch; lists beyond
-    the labels are clusters that touch nothing visible.
+    If ``fused``, points behind the visible surface join the objects they touch. Lists beyond the
+    labels are clusters that touch no visible object.
     """
     points, grid, labels = view.points, view.grid, found.plane_ids.size
     marks = np.zeros(len(points), np.int16)
@@ -47,7 +47,7 @@ def label_points(view: VirtualImage, found: Segmentation, *, fused: bool) -> lis
 
 @kernel
 def _above(points: F4, cell: I4, intrinsics: PinholeIntrinsics, plane: F8) -> Bool:
-    """Return which points are above a plane and inside its outline."""
+    """Return which points (n, 3) are above a plane and inside its outline, (n,)."""
     result = np.zeros(len(points), np.bool_)
     for k in range(len(points)):
         if cell[k] >= 0:
@@ -66,7 +66,7 @@ def _above(points: F4, cell: I4, intrinsics: PinholeIntrinsics, plane: F8) -> Bo
 
 @kernel
 def _mark_near(labels: I4) -> U1:
-    """Return 1 for the cells that have a label or are next to one that has."""
+    """Return 1 for the cells that have a label or a neighbour with one, (rows, columns)."""
     near = np.zeros(labels.shape, np.uint8)
     scratch = np.zeros(labels.shape[1] + 2, np.int16)
     for i in range(labels.shape[0]):
@@ -78,7 +78,10 @@ def _mark_near(labels: I4) -> U1:
 def _mark_points(
     points: F4, cell: I4, intrinsics: PinholeIntrinsics, grid_labels: GridLabels, marks: I4
 ) -> None:
-    """Write the labels of the points (n, 3); ``cell`` (n,) is flat, -1 of what is not seen."""
+    """Write the labels of points (n, 3) in the view frame to ``marks`` (n,).
+
+    ``cell`` (n,) is the flat cell of each point; -1 out of view.
+    """
     columns = grid_labels.inverse_depth.shape[1]
     near = _mark_near(grid_labels.labels).reshape(-1)
     count = points.shape[0]

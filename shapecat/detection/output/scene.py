@@ -34,10 +34,15 @@ def build_scene(
     settings: DetectionSettings,
     points: F4 | None = None,
 ) -> Scene:
-    """Return the scene of the labels whose points are ``indices``.
+    """Build the scene, in the sensor frame, from labelled cells and the points of each label.
 
-    Lists beyond the labels are objects that the view does not show; their boxes are measured on
-    ``points`` (n, 3), view frame.
+    Parameters
+    ----------
+    indices : for each label from 1, the ascending indices of its points in the frame. Lists beyond
+        the labels are objects that the view does not show.
+    sensor_from_view : pose of the virtual camera in the sensor frame; `IDENTITY` for an image.
+    points : (n, 3) metres, view frame, for the boxes of objects that the view does not show; None
+        for an image.
     """
     measured, seen = found.measured, found.plane_ids.size - 1
     numbers = _numbers_of_seen(found.supports)
@@ -49,7 +54,7 @@ def build_scene(
     cut = _cut(grid, measured) if points is None else _cut_cloud(grid, found, sensor_from_view)
     cut |= measured.last
     kept = _kept(grid, measured, indices, settings.min_points, image=points is None)
-    # What goes on beyond the image is rather furniture where no plane is seen below it.
+    # Without a visible plane below it, an object cut off by the border is probably furniture.
     kept = [k for k in kept if k >= seen or plane_id[k] is not None or not cut[k]]
     position = {k + 1: n for n, k in enumerate(kept)}
     boxes = _boxes(found, indices, points, sensor_from_view)
@@ -73,7 +78,7 @@ def build_scene(
 
 
 def _numbers_of_seen(supports: Sequence[SupportingPlane]) -> list[int | None]:
-    """Return the numbers of the planes that are seen; one that is assumed has none."""
+    """Return the index of each plane among the visible planes; None for an assumed plane."""
     numbers = count()
     return [next(numbers) if support.area_m2 > 0 else None for support in supports]
 
@@ -81,7 +86,7 @@ def _numbers_of_seen(supports: Sequence[SupportingPlane]) -> list[int | None]:
 def _kept(
     grid: DepthGrid, measured: ObjectMeasurements, indices: Sequence[U4], least: int, *, image: bool
 ) -> list[int]:
-    """Return which lists of points are objects, in the order of their first points."""
+    """Return the lists with enough points for an object, in the order of their first points."""
     limits = [float(least)] * len(indices)
     if image:
         limits = [
@@ -95,7 +100,7 @@ def _kept(
 def _boxes(
     found: Segmentation, indices: Sequence[U4], points: F4 | None, sensor_from_view: Pose
 ) -> list[Box]:
-    """Return the boxes of what the cells show, and on the points of what they do not."""
+    """Return the boxes of all lists: measured on cells, or on points for hidden objects."""
     measured = found.measured
     sizes = [measured.center, measured.size, measured.orientation]
     if sensor_from_view is IDENTITY:  # rows of frozen arrays need not be frozen one by one
@@ -123,10 +128,10 @@ def _cut(grid: DepthGrid, measured: ObjectMeasurements) -> Bool:
 
 
 def _cut_cloud(grid: DepthGrid, found: Segmentation, sensor_from_view: Pose) -> Bool:
-    """Return whether each object reaches a border of what the sensor of a cloud saw.
+    """Return whether each object reaches the border of the sensor's view, for a point cloud.
 
-    Such a border is a straight side of the cloud as seen from the sensor's place, with more than
-    one thing along it. A cloud fused from several views has none.
+    Such a border is a long straight side of the cloud as seen from the sensor. A cloud fused from
+    several views has none.
     """
     result = np.zeros(found.plane_ids.size, bool)
     valid = grid.inverse_depth > 0
@@ -154,7 +159,7 @@ def _cut_cloud(grid: DepthGrid, found: Segmentation, sensor_from_view: Pose) -> 
 
 
 def _ends(valid: Bool, last: int) -> tuple[I4, I4]:
-    """Return the first and the last row with a reading of every column; each has one."""
+    """Return the first and last row with a reading in each column; each column must have one."""
     return np.argmax(valid, axis=0), last - np.argmax(valid[::-1], axis=0)
 
 

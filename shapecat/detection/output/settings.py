@@ -6,35 +6,35 @@ __all__ = ["OUTPUT", "OutputSettings"]
 
 
 class OutputSettings(NamedTuple):
-    """How objects are measured and given back."""
+    """How objects are measured and labelled."""
 
     occluded_share: float = 0.12
-    """Share of the boundary behind something nearer that makes an object occluded."""
+    """Least share of the boundary of an occluded object that is behind a nearer surface."""
     gap_m: float = 0.025
-    """How far the bottom of an object may seem to be above the top of what it stands on, metres:
-    what is between is hidden."""
+    """Largest gap between the bottom of an object and the top of its support, metres: the part in
+    between is hidden."""
     overlap_m: float = 0.04
-    """And below it: a strip of it may go with the object."""
+    """Largest overlap of both, metres: a strip of the support may be labelled as the object."""
     lifted_m: float = 0.03
-    """What reaches no lower than this above its plane, metres, does not stand on it."""
+    """An object with a bottom higher than this above its plane, metres, does not stand on it."""
     sunk_m: float = 0.015
-    """What reaches this much lower than a surface, metres, does not stand on that."""
+    """An object that extends this far below a surface, metres, does not stand on it."""
     voxel_m: float = 0.01
-    """Occluded points in voxels of this size, metres, that touch are of one object."""
+    """Edge of the voxels in which occluded points are connected, metres."""
     most_labels: int = 1000
-    """Clusters of occluded points; this bounds the time."""
+    """Largest label of a cluster of occluded points; this bounds the time."""
     highest_m: float = 0.6
-    """Height above a plane of the highest of them, metres."""
+    """Greatest height of occluded points above a plane, metres."""
     enough_cells: int = 60
-    """Cells of what is no noise, however near and therefore small it is."""
+    """Cells of an object that are always enough, even if the smallest object nearby has more."""
     border_cells: float = 2.5
     """Width of the border of a cloud, in cells."""
     straight_share: float = 0.3
-    """Least share of a side that such a border is straight along."""
+    """Least share of a side along which such a border is straight."""
     forward_cos: float = 0.2
-    """Least cosine, about, of what is in front of a camera."""
+    """Approximate least cosine to the optical axis of a point in front of a camera."""
     crowded: float = 0.08
-    """Share of points behind others from which a cloud is taken for fused from several views."""
+    """Share of points behind others above which a cloud is taken to be fused from several views."""
 
 
 OUTPUT = OutputSettings()

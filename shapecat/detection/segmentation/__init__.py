@@ -1,1 +1,1 @@
-"""Over-segmentation: surfaces are parted at depth discontinuities and concave edges."""
+"""Over-segmentation: surfaces are split at depth discontinuities and concave edges."""

@@ -1,6 +1,6 @@
-"""Connectivity: which object cells are of one surface, and how concave it is at each.
+"""Connectivity: the links between object cells on one surface, and its concavity at each cell.
 
-Local convexity as a criterion to part objects: Stein et al. 2014.
+Local convexity as a criterion to separate objects: Stein et al. 2014.
 """
 
 import math
@@ -20,28 +20,28 @@ from shapecat.jit import kernel, unset
 __all__ = ["SurfaceGraph", "connect_surfaces"]
 
 BENT = 4
-"""The same bits times this mark, for a time, the links that only a local plane tells."""
+"""The bits of a link times this mark, for a while, that only a local plane supports the link."""
 LEAST_CHORD = 3e-4
-"""Squared distance of two normals from which their angle is a degree."""
+"""Squared distance between two unit normals at an angle of one degree."""
 
 BASE, BASE_DIAGONAL = SEGMENTATION.base, SEGMENTATION.base_diagonal
 REACH = SEGMENTATION.step_reach
 
 
 class SurfaceGraph(NamedTuple):
-    """What every object cell knows of its surface.
+    """The local surface at every object cell, and the links between cells.
 
     Attributes
     ----------
-    local_plane : (rows, 3, columns) float32: inverse depth of the fitted plane at the cell, and its
-        change per column and per row. The inverse depth is 0 where there is no fit, and the rest
-        as well in object cells; elsewhere, and far from object cells, nothing is written.
-    normal : (rows, 3, columns) float32 unit normal towards the camera, sensor frame, where
-        there is a local plane; 0 in other object cells.
-    links : (rows, columns) uint8: `RIGHT` and `DOWN` where the surface goes on to that neighbour.
-    concavity : (rows, columns) uint8: the largest concave angle across the cell, degrees.
-    spans : (rows, 2) int32: columns of the first object cell of each row and after the last; 0, 0
-        where a row has none.
+    local_plane : (rows, 3, columns) float32, inverse depth of the fitted plane at the cell, and its
+        change per column and per row; 0 in object cells without a fit. Of other cells, the inverse
+        depth is 0 near object cells; the rest is uninitialised.
+    normal : (rows, 3, columns) float32 unit normal towards the camera, sensor frame; 0 in object
+        cells without a fit, uninitialised elsewhere.
+    links : (rows, columns) uint8, `RIGHT` and `DOWN` where the surface continues to that neighbour.
+    concavity : (rows, columns) uint8, the largest concave angle across the cell, degrees.
+    spans : (rows, 2) int32, the first column of the object cells of each row, and one after the
+        last; 0, 0 if there is none.
     """
 
     local_plane: F4
@@ -52,7 +52,7 @@ class SurfaceGraph(NamedTuple):
 
 
 class FlatGraph(NamedTuple):
-    """The inverse depth, the local planes and the normals of all cells, as one row each."""
+    """The inverse depth, the local planes and the normals of all cells, flattened."""
 
     inv_depth: F4
     plane: F4
@@ -75,7 +75,10 @@ def connect_surfaces(grid: DepthGrid, heights: HeightMap) -> SurfaceGraph:
 
 @kernel
 def _blank(spans: I4, columns: int) -> F4:
-    """Return an array (2, rows, 3, columns) without local planes as far as is looked."""
+    """Return arrays (2, rows, 3, columns) for local planes and normals.
+
+    The inverse depth of the local planes is 0 in and near object cells; the rest is uninitialised.
+    """
     rows = len(spans)
     fits: F4 = unset((2, rows, 3, columns), np.float32)
     for i in range(rows):
@@ -90,7 +93,7 @@ def _blank(spans: I4, columns: int) -> F4:
 
 @kernel
 def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) -> None:
-    """Link neighbours that differ by less than a jump, or as either local plane tells."""
+    """Link neighbours without a depth discontinuity, or that a local plane of one supports."""
     rows, columns = inv_depth.shape
     depths, owners = inv_depth.reshape(-1), plane_id.reshape(-1)
     planes, bits = local_plane.reshape(-1), links.reshape(-1)
@@ -109,12 +112,12 @@ def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) ->
 
 @kernel
 def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links: U1) -> None:
-    """Take the links away that only a local plane tells, across a step.
+    """Remove links across a step that only a local plane supports.
 
-    There the readings change more from a cell to the next than they do before and after. The
-    window of a local plane reaches over a step and takes it for a slope, so that a plate would be
-    linked with the can it stands on. At the edge of a surface that is seen at a grazing angle only
-    one side has the slope.
+    At a step the readings change more from one cell to the next than before and after it. The
+    window of a local plane spans the step and takes it for a slope, so that a plate would be linked
+    with the can it stands on. At the edge of a surface seen at a grazing angle, only one side has
+    the slope.
     """
     some = False
     for j in range(np.uint64(start), np.uint64(end)):
@@ -155,9 +158,11 @@ def _link_some(
 
     Parameters
     ----------
-    run : its first cell, where the local planes of that begin, and the number of cells.
-    steps : from a cell to its neighbour, from the one's local plane to the other's, and from the
-        inverse depth of a local plane to its slope that way.
+    run : the index of its first cell, the index of that cell's local plane, and the number of
+        cells.
+    steps : index offsets from a cell to its neighbour, from its local plane to the neighbour's, and
+        from the inverse depth of a local plane to its slope in that direction.
+    bit : `RIGHT` or `DOWN`.
     """
     zero, jump = np.float32(0), np.float32(DISCONTINUITY)
     cell, fit, step = np.uint64(run[0]), np.uint64(run[1]), np.uint64(steps[0])
@@ -176,7 +181,7 @@ def _link_some(
 
 @kernel
 def _measure_concavity(inv_depth: F4, intrinsics: PinholeIntrinsics, graph: SurfaceGraph) -> None:
-    """Measure the largest concave angle between the surfaces on two sides of each cell."""
+    """Write the largest concave angle between the surfaces on opposite sides of each cell."""
     rows, columns = inv_depth.shape
     local_plane, concavity = graph.local_plane, graph.concavity
     flat = FlatGraph(inv_depth.reshape(-1), local_plane.reshape(-1), graph.normal.reshape(-1))
@@ -209,17 +214,19 @@ def _raise_concavity(
     chords: F4,
     worst: F4,
 ) -> None:
-    """Raise ``worst`` to the chord of the normals on two sides of some cells, where concave.
+    """Raise ``worst`` to the squared chord of the normals on opposite sides, where concave.
 
     Parameters
     ----------
-    cells : a row, the first of its columns, that after the last, and how many columns there are.
-    shift : rows and columns to the places that are compared, on both sides of a cell.
+    cells : the row, the first column, one after the last, and the number of columns.
+    shift : offset, in rows and columns, from a cell to the normals that are compared, both ways.
+    gaps, chords : (columns,) work space.
+    worst : (columns,) squared chords of the row.
 
     Notes
     -----
-    Three loops, for the compiler vectorises only those over few arrays; no slices, each of which
-    counts references; unsigned indices, for others may count from the end.
+    There are three loops, because the compiler vectorises only loops over few arrays; no slices,
+    because each counts references; and unsigned indices, which need no check for negative values.
     """
     i, first, last, columns = cells
     di, dj = shift
@@ -231,7 +238,7 @@ def _raise_concavity(
     x, y = np.float32(dj), np.float32(di)
     inv_depth, plane, normal = flat
     n, here, to = np.uint64(last - first), np.uint64(i * columns + first), np.uint64(first)
-    # where the values, their slopes per column and per row of both sides begin
+    # the indices of the inverse depth, and of its slopes per column and per row, on both sides
     a0 = np.uint64(3 * (i - di) * columns + first - dj)
     b0 = np.uint64(3 * (i + di) * columns + first + dj)
     row = np.uint64(columns)
@@ -261,7 +268,7 @@ def _raise_concavity(
 
 @kernel(fast=True)
 def _write_angles(level: F4, worst: F4, concavity: U1) -> None:
-    """Write the angles, in degrees, of the chords of cells with a local plane."""
+    """Write the angles of squared chords, in degrees; 0 for cells without a local plane."""
     degrees, most = np.float32(180 / math.pi), np.float32(120)
     for k in range(concavity.size):
         half = np.sqrt(worst[k]) * np.float32(0.5)

@@ -1,8 +1,8 @@
 """Normals: least-squares planes around the object cells, many cells at a time.
 
-Numba's compiler handles 16 cells at once only where it knows that arrays do not overlap, which
-takes few arrays with constant distances. So the windows of a run of cells are copied to a buffer of
-fixed width first, and the sums of each cell stay in registers.
+Numba vectorises over 16 cells only if it knows that arrays do not overlap, which requires few
+arrays at constant distances. So the windows of a run of cells are first copied to a buffer of
+fixed width, and the sums of each cell stay in registers.
 """
 
 from typing import Any
@@ -17,14 +17,14 @@ from shapecat.jit import kernel
 __all__ = ["fit_local_planes", "padded"]
 
 WINDOW = 3
-"""Half the edge of the window a local plane is fitted to, in cells."""
+"""Half the edge of the window to which a local plane is fitted, in cells."""
 SIDE = 2 * WINDOW + 1
 RUN = 128
 """Most cells in a run."""
 LANES = 8
-"""Runs are fitted in multiples of this, for what remains is not vectorised."""
+"""Runs are padded to multiples of this, because a remainder is not vectorised."""
 NONE = 1e9
-"""In place of the inverse depth of what is no sample."""
+"""Stands for the inverse depth of a cell that is not used."""
 PITCH = RUN + 2 * WINDOW
 """Width of a row of the buffers."""
 
@@ -40,13 +40,13 @@ def fit_local_planes(
 ) -> None:
     """Write the local planes and normals of the object cells, as in `SurfaceGraph`.
 
-    A plane is fitted to a checkerboard of 25 cells of the same owner; weights are 0 or 1. The
-    object cells of each row lie within ``spans``.
+    A plane is fitted to those of 25 cells, in a checkerboard pattern, that are above the same
+    supporting plane; weights are 0 or 1.
 
     Parameters
     ----------
     inv_depth, plane_id : (rows, columns) inverse depth, 1/m, and as in `HeightMap`.
-    spans : (rows, 2) first column of the object cells, and one more than the last.
+    spans : (rows, 2) first column of the object cells of each row, and one after the last.
     local_plane, normal : (rows, 3, columns), written in place.
     """
     values = np.zeros(SIDE * PITCH, np.float32)
@@ -65,13 +65,16 @@ def fit_local_planes(
 
 @kernel
 def padded(start: int, end: int) -> int:
-    """Return the end of the run from ``start`` on made a multiple of `LANES` long."""
+    """Return the end of a run that is padded to a multiple of `LANES` cells."""
     return start + (end - start + LANES - 1) // LANES * LANES
 
 
 @kernel
 def _write(fits: F4, planes: F4, normals: F4, at: int, columns: int, n: int) -> None:
-    """Copy the fits of a run to where its local planes begin; neither slices nor signed indices."""
+    """Copy the fits of a run to the local planes and normals from index ``at`` on.
+
+    For speed, without slices and signed indices.
+    """
     for d in range(3):
         to, plane = np.uint64(at + d * columns), np.uint64(d * PITCH)
         unit = np.uint64((3 + d) * PITCH)
@@ -83,9 +86,10 @@ def _write(fits: F4, planes: F4, normals: F4, at: int, columns: int, n: int) -> 
 
 @kernel
 def _next_run(owners: I4, row: int, j: int, last: int) -> tuple[int, int]:
-    """Return the columns from and before which the next object cells of one owner in a row lie.
+    """Return the first column of the next run of object cells above one plane, and one after it.
 
-    There are some before ``last``; the row begins at ``row``.
+    The search begins at column ``j``. There must be an object cell before ``last``; ``row`` is the
+    index of the first cell of the row.
     """
     while owners[row + j] <= 0:
         j += 1
@@ -103,11 +107,11 @@ def _next_run(owners: I4, row: int, j: int, last: int) -> tuple[int, int]:
 def _copy_windows(
     depths: F4, owners: I4, shape: tuple[int, int], run: tuple[int, int, int], values: F4
 ) -> None:
-    """Copy the rows around a run and `WINDOW` cells more at its ends; `NONE` for other owners.
+    """Copy the rows around a run, with `WINDOW` more cells at its ends; `NONE` for other planes.
 
     Parameters
     ----------
-    run : its row, its first column and that after its last.
+    run : its row, its first column, and one after its last.
     """
     rows, columns = shape
     i, start, end = run
@@ -130,7 +134,8 @@ def _fit_run(
 ) -> None:
     """Fit planes to the windows of ``n`` cells from (i, ``start``) on.
 
-    Rows of ``fits``: inverse depth, its two slopes, and the normal; 0 where there is no fit.
+    The rows of ``fits`` are inverse depth, its change per column and per row, and the normal (3);
+    0 where there is no fit.
     """
     zero, one = np.float32(0), np.float32(1)
     g0, g1 = np.float32(SEGMENTATION.gate), np.float32(SEGMENTATION.gate + SEGMENTATION.gate_slope)
@@ -182,7 +187,7 @@ def _fit_run(
 
 @kernel(fast=True)
 def _times_row(a: float, b: float, c: float, e: float, f: float, g: float) -> Any:
-    """Return the sum of what is known of each row but the middle one, times its place."""
+    """Return the sum of one value per row times the offset of the row; that of the middle is 0."""
     return np.float32(3) * (g - a) + np.float32(2) * (f - b) + (e - c)
 
 

@@ -6,47 +6,50 @@ __all__ = ["SEGMENTATION", "SegmentationSettings"]
 
 
 class SegmentationSettings(NamedTuple):
-    """How surfaces are fitted, linked and parted."""
+    """How surfaces are fitted, linked and split."""
 
     gate: float = 0.008
-    """A sample of a local plane lies this near to its centre in inverse depth, 1/m: two steps of a
-    Kinect."""
+    """Largest difference in inverse depth between a sample of a local plane and its centre, 1/m:
+    two steps of a Kinect."""
     gate_slope: float = 0.008
-    """So much more per cell from the centre, 1/m: surfaces slant."""
+    """Increase of that limit per cell from the centre, 1/m: surfaces slant."""
     fewest_samples: int = 5
-    """Samples of a local plane: three define one, noise takes more."""
+    """Fewest samples of a local plane: three define one, noise requires more."""
     least_spread: float = 0.2
-    """Determinant of their places, cells to the fourth: samples in a line define no plane."""
+    """Least determinant of the covariance of their positions, cells to the fourth power: samples
+    in a line define no plane."""
     bridged: int = 8
-    """Cells of others that a run of cells goes on across: a new run costs more."""
+    """Widest gap between the cells of a run: a new run takes longer."""
     base: int = 3
     """Cells between an edge and the surfaces that are compared: half a window of a local plane."""
     base_diagonal: int = 2
     """The same along each axis on diagonals, about as far."""
     step_reach: int = 2
-    """Cells beside a step over which slopes are measured: nearer is the step itself."""
+    """Cells before and after a step over which the slope is measured."""
     sure: float = 0.5
-    """How well one of two slopes that differ must explain a step, as a share of a discontinuity."""
+    """Least difference of a step from the slope on either side, relative to a discontinuity. On
+    one side it is at least a whole discontinuity."""
     edge_deg: int = 18
-    """Concave angle that may part two objects; a bowl of 7 cm turns 16 degrees over the same
-    cells."""
+    """Least concave angle that may separate two objects; a bowl of 7 cm turns by 16 degrees over
+    the same cells."""
     least_cells: int = 12
-    """Smaller parts are scraps, that belong to what is around them."""
+    """Fewest cells of a segment; smaller parts join the segments around them."""
     most_segments: int = 250
     """Bounds the time, which grows with the square of their number."""
     bucket_deg: int = 4
-    """Angles that differ less are flooded in one go: they are no more exact."""
+    """Cells whose angles are in the same range of this width are flooded together: the angles are
+    not more precise."""
     side_step_m: float = 0.01
-    """How far one side of the outline steps aside at least, metres; less is noise at 1.5 m."""
+    """Least step of one side of the outline, metres; less is noise at 1.5 m."""
     both_steps_m: float = 0.02
-    """How far both sides do together, metres."""
+    """Least sum of the steps of both sides, metres."""
     bands_beside: int = 5
-    """Bands of height below and above a step, of 5 mm: the nearest is left out, for a step is not
-    sharp; the others tell where the outline was and is."""
+    """Bands of height, of 5 mm, below and above a step. The nearest one is left out, as a step is
+    not sharp; the others show the outline before and after it."""
     part_cells: int = 60
-    """Cells on either side of a split: less is a knob or a handle."""
+    """Fewest cells on either side of a split: fewer are a knob or a handle."""
     shadow_cells: int = 6
-    """Cells without a sample beside what hides something, on a Kinect."""
+    """Cells without a sample beside an occluder, on a Kinect."""
 
 
 SEGMENTATION = SegmentationSettings()

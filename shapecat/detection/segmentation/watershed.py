@@ -12,18 +12,25 @@ from shapecat.jit import kernel, unset
 __all__ = ["relabel_above", "watershed"]
 
 NO_EDGE = 255
-"""Concave angle that no edge has, degrees."""
+"""Concave angle that no edge reaches, degrees."""
 BUCKETS = 256 // SEGMENTATION.bucket_deg
 LEFT, UP = 4, 8
-"""Bits beside `RIGHT` and `DOWN`: ways to the other two neighbours."""
+"""Bits of links to the other two neighbours, in addition to `RIGHT` and `DOWN`."""
 
 
 def watershed(heights: HeightMap, graph: SurfaceGraph, *, concave: bool) -> tuple[I4, int]:
-    """Label the object cells: (rows, columns) int16 labels 1..n, 0 elsewhere, and n.
+    """Split the object cells into segments at depth discontinuities and concave edges.
 
-    Flat cells that are linked make a seed; a flood from the seeds, flattest cells first, gives
-    the cells of an edge to its sides (Meyer 1991). With ``concave`` off only depth discontinuities
-    part segments.
+    Connected flat cells are a seed; a flood from the seeds, flattest cells first, assigns the cells
+    of an edge to its sides (Meyer 1991).
+
+    Parameters
+    ----------
+    concave : if False, only depth discontinuities separate segments.
+
+    Returns
+    -------
+    (rows, columns) int16 labels 1..n, 0 elsewhere; and n.
     """
     labels = np.zeros(heights.plane_id.shape, np.int16)
     edge_deg = SEGMENTATION.edge_deg if concave else NO_EDGE
@@ -34,7 +41,7 @@ def watershed(heights: HeightMap, graph: SurfaceGraph, *, concave: bool) -> tupl
 
 @kernel
 def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n: int) -> int:
-    """Label connected unlabelled cells with smaller angles, from ``n`` + 1 on; return the last."""
+    """Label connected unlabelled cells below ``edge_deg``, from ``n`` + 1 on; return the last."""
     inside: Bool = np.zeros(labels.shape, np.bool_)
     _find_unlabelled(plane_id, graph.concavity, graph.spans, edge_deg, labels, inside)
     spans, component = spans_of(inside.view(np.int8)), unset(labels.shape, np.int32)
@@ -54,7 +61,7 @@ def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n
 def _find_unlabelled(
     plane_id: I4, concavity: U1, spans: I4, edge_deg: int, labels: I4, inside: Bool
 ) -> None:
-    """Mark the object cells without a label whose angles are smaller; this vectorises."""
+    """Mark the object cells without a label whose angle is below ``edge_deg``; this vectorises."""
     columns, most = labels.shape[1], np.uint8(edge_deg)
     plane_ids, angle = plane_id.reshape(-1), concavity.reshape(-1)
     flat, marks = labels.reshape(-1), inside.reshape(-1)
@@ -66,10 +73,10 @@ def _find_unlabelled(
 
 @kernel
 def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4) -> None:
-    """Grow the labels over links, cells with small concave angles first.
+    """Grow the labels along links, cells with small concave angles first.
 
-    There is a queue for each range of angles: ``following`` holds the next cell of each cell, -1
-    behind the last one. Behind the cells are the heads of the queues.
+    There is a queue for each range of angles, as a linked list: ``following`` holds the successor
+    of each cell, -1 for the last one. The heads of the queues come after the cells.
     """
     columns, size = labels.shape[1], labels.size
     angle, flat = concavity.reshape(-1), labels.reshape(-1)
@@ -98,9 +105,9 @@ def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4) -> None:
 
 @kernel
 def _find_ways(links: U1, labels: I4, spans: I4, columns: int, ways: U1) -> None:
-    """Write in which directions each cell (n,) is linked with one without a label: bits.
+    """Write bits for the directions in which each cell (n,) is linked with an unlabelled one.
 
-    The loops vectorise: unsigned indices cannot count from the end.
+    The loops vectorise, because unsigned indices need no check for negative values.
     """
     one, below = np.uint64(1), np.uint64(columns)
     right, down, left, up = np.uint8(RIGHT), np.uint8(DOWN), np.uint8(LEFT), np.uint8(UP)
@@ -122,10 +129,15 @@ def _find_ways(links: U1, labels: I4, spans: I4, columns: int, ways: U1) -> None
 
 @kernel
 def relabel_above(labels: I4, spans: I4, height: F4, label: int, level: float, name: int) -> None:
-    """Give the cells of a label that are higher than a level, metres, another name, in place.
+    """Change the label of the cells that are higher than a level, in place.
 
-    ``labels`` and ``height`` are (rows, columns); the cells of each row lie within ``spans``
-    (rows, 2).
+    Parameters
+    ----------
+    labels : (rows, columns) changed in place; not 0 only within ``spans``.
+    spans : (rows, 2) as in `SurfaceGraph`.
+    height : (rows, columns) metres.
+    label, level : the cells with this label, and higher than this level, metres, are changed.
+    name : the new label.
     """
     for i in range(labels.shape[0]):
         for j in range(spans[i, 0], spans[i, 1]):

@@ -1,8 +1,7 @@
-"""Split at width changes: stacked objects whose fronts are flush, where the outline steps.
+"""Split at width changes: stacked objects with flush fronts, where the outline has a step.
 
-What stands on a wider object, or on a narrower one, shows it at its sides even where its front
-goes on in one surface with that below. So does a cup at the ends of its handle: that both parts
-are one object is left to the merging.
+An object on a wider or narrower one is visible as such at its sides, even if both fronts are one
+surface. A cup looks the same at the ends of its handle: it is for the merging to join its parts.
 """
 
 import math
@@ -26,14 +25,14 @@ BESIDE = SEGMENTATION.bands_beside
 
 
 class Outlines(NamedTuple):
-    """The lateral range of n labels, by bands of height.
+    """The lateral range of labels 1..n, by bands of height.
 
     Attributes
     ----------
-    ends : (2, n, BANDS) float32 lateral position, metres, of the left end, and of the right end
-        negated, so that both grow inwards; infinite where there is no cell.
-    at : (2, n, BANDS) int32 the cells there.
-    counts : (n, BANDS) int32 the number of cells.
+    ends : (2, n + 1, BANDS) float32 lateral position of the left end, metres, and of the right end
+        with its sign changed, so that both increase inwards; infinite in a band without cells.
+    at : (2, n + 1, BANDS) int32 the flat cells of the ends.
+    counts : (n + 1, BANDS) int32 the number of cells.
     """
 
     ends: F4
@@ -45,17 +44,18 @@ class Outlines(NamedTuple):
 def split_at_width_changes(
     grid: DepthGrid, heights: HeightMap, graph: SurfaceGraph, labels: I4, up: F8, n: int
 ) -> int:
-    """Give what is above a step a label of its own, in place; return how many labels there are.
+    """Give the part of a segment above a step a new label, in place; return the last label.
 
     Parameters
     ----------
-    labels : (rows, columns) 1..n, 0 elsewhere.
+    labels : (rows, columns) segments 1..n, 0 elsewhere.
+    up : (3,) unit vector, sensor frame.
     """
     side = lateral_axis(up)
     outlines = _outlines_of(grid, heights.height, graph.spans, labels, n, side)
     cuts, fresh = np.zeros(BANDS, np.bool_), n
     for p in range(1, n + 1):
-        rest = p  # what the cuts below have left
+        rest = p  # the label above the cuts so far
         for band in range(BANDS if _find_cuts(grid, outlines, p, side, cuts) else 0):
             if cuts[band]:
                 fresh += 1
@@ -73,7 +73,7 @@ def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, sid
         grid.inverse_depth.shape[1],
     )
     one, per_band = np.float32(1), np.float32(1 / BAND_M)
-    # The lateral position is linear in column and row, but for the depth.
+    # Lateral position over depth is linear in column and row.
     a, b = np.float32(side[0] / intrinsics.fx), np.float32(side[1] / intrinsics.fy)
     c = np.float32(
         side[2] - intrinsics.cx * side[0] / intrinsics.fx - intrinsics.cy * side[1] / intrinsics.fy
@@ -98,7 +98,7 @@ def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, sid
 
 @kernel
 def _find_cuts(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool) -> bool:
-    """Mark the bands (BANDS,) below which label ``p`` is to be cut; return whether it is."""
+    """Mark the bands (BANDS,) below which label ``p`` is cut; return whether there are any."""
     first, last, seen, above = 0, 0, 0, 0
     for band in range(BANDS):
         cells = outlines.counts[p, band]
@@ -126,7 +126,7 @@ def _find_cuts(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool
 
 @kernel
 def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -> float:
-    """Return by how much both sides step aside below a band, metres; 0 if neither does enough."""
+    """Return the sum of the steps of both sides below a band, metres; 0 if neither is enough."""
     both = most = 0.0
     for k in range(2):
         end, at = outlines.ends[k, p], outlines.at[k, p]
@@ -139,7 +139,7 @@ def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -
         if not abs(change) < np.inf:
             continue
         way = np.float32(1 if change > 0 else -1)
-        # A slope goes on as it is on one of the two sides.
+        # A slope continues from one of the two sides.
         slope = max(way * _slope_of(end, low), way * _slope_of(end, high), 0.0)
         step = -_second(end, high, -way) - _second(end, low, way) - BESIDE * slope
         if step < SEGMENTATION.side_step_m / 2:
@@ -153,20 +153,20 @@ def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -
 
 @kernel
 def _second(end: F4, k: int, way: float) -> float:
-    """Return the second largest of four values: noise makes spurs and dents one band high."""
+    """Return the second largest of four values times ``way``: spurs one band high are noise."""
     a, b, c, d = way * end[k], way * end[k + 1], way * end[k + 2], way * end[k + 3]
     return float(max(min(max(a, b), max(c, d)), min(a, b), min(c, d)))
 
 
 @kernel
 def _slope_of(end: F4, k: int) -> float:
-    """Return the change of four values from one to the next."""
+    """Return the mean change from one to the next of four values."""
     return float((end[k + 3] + end[k + 2] - end[k + 1] - end[k]) / 4)
 
 
 @kernel
 def _is_free(grid: DepthGrid, at: int, sign: float, side: F8) -> bool:
-    """Whether nothing nearer is beside a cell, left (-1) or right (1)."""
+    """Return whether no nearer surface is beside a cell, to the left (-1) or right (1)."""
     inv_depth = grid.inverse_depth
     rows, columns = inv_depth.shape
     i, j = at // columns, at % columns
