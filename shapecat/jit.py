@@ -57,8 +57,8 @@ def code_folder(stage: Path) -> Path | None:
     """Return the cache folder for the kernels of a stage; None if no folder is writable.
 
     Its name holds a digest of all source files that the machine code can come from: numba checks
-    only the file of the outermost kernel, not those of the kernels it calls.
-    Folders of older sources are removed; a process that still uses one creates it again.
+    only the file of the outermost kernel, not those of the kernels it calls. Folders of older
+    sources are removed; a process that still uses one creates it again.
 
     Parameters
     ----------

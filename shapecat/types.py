@@ -69,7 +69,7 @@ class Frame(Record):
     Attributes
     ----------
     topic : the stream of the recording.
-    index : number of the frame in its stream, from 0; skipped frames count.
+    index : number of the frame in its stream, from 0; skipped frames are counted too.
     stamp_ns : time of the measurement (``header.stamp``).
     log_time_ns : time of the recording.
     frame_id : name of the sensor frame.
@@ -331,7 +331,7 @@ class LabelledFrame(Record):
     Attributes
     ----------
     fixed_from_sensor : None where the recording has no fixed frame.
-    ended : the tracks that the previous frame of the topic was the last to show.
+    ended : tracks last shown in the previous frame of the topic.
     seconds : time spent in each stage.
     up : (3,) unit vector, sensor frame; None if unknown.
     reused_from : index of the earlier frame from which the scene is copied; None if it is new.

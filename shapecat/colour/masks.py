@@ -43,7 +43,7 @@ class Mask(Record):
         return int(np.count_nonzero(self.pixels))
 
     def full(self, height: int, width: int) -> Bool:
-        """Return the mask in the size of the image: (height, width) bool."""
+        """Return the mask at the size of the image: (height, width) bool."""
         result = np.zeros((height, width), bool)
         left, top, w, h = self.box
         result[top : top + h, left : left + w] = self.pixels

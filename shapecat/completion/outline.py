@@ -31,7 +31,7 @@ def reach(x: F4, y: F4, strays: I4, noise: float, flat: float, cosines: F8, sine
     ----------
     x, y : (n,) the points, metres.
     strays : (k,) number of points to leave out in each direction.
-    noise : metres; points less than this from the farthest one form a side. 0: no side is flat.
+    noise : metres; points within this distance of the farthest one form a side. 0 turns this off.
     flat : share of the points that make a side flat; with fewer the correction is proportional.
     cosines, sines : (k,) the directions.
     """
@@ -85,7 +85,7 @@ def fit_oval(
     ----------
     reached : (k,) metres, the support function from `reach`.
     seen : (k,) weight of each direction, 0 for those that face no sensor.
-    roundness : weight of a circular shape, in directions.
+    roundness : weight of the prior for a circle, as a number of directions.
     cosines, sines : (k,) the directions.
 
     Returns
@@ -116,7 +116,7 @@ def fit_oval(
 
 @kernel
 def narrowest(reached: F8) -> int:
-    """Return the direction, below `QUARTER`, of the smallest rectangle around an outline.
+    """Return the direction of the smallest rectangle around an outline: an index below `QUARTER`.
 
     ``reached`` (`DIRECTIONS`,) is the support function, metres.
     """
@@ -130,7 +130,7 @@ def narrowest(reached: F8) -> int:
 
 
 def rectangle(reached: F8, side: int) -> tuple[float, float, float, float]:
-    """Return the rectangle around an outline along a direction.
+    """Return the rectangle around an outline with its length along a given direction.
 
     Parameters
     ----------

@@ -48,7 +48,8 @@ class _Form(NamedTuple):
     stray : share of the points that noise and mixed pixels put outside the outline: less where
         the surface curves away than where many points lie on the outline, as on a wall.
     noise : metres, the spread in depth of the readings on a flat side.
-    roundness : weight of a circular shape, in directions: one side says little about the depth.
+    roundness : weight of the prior for a circle, as a number of directions: one side says little
+        about the depth.
     fits : largest deviation of the visible side from an oval that fits, as a share of its radius.
     """
 
@@ -73,7 +74,7 @@ class Footprint(NamedTuple):
 
     Attributes
     ----------
-    center : (2,) metres, in the axes of the outline's directions.
+    center : (2,) metres, along the directions 0 and `QUARTER` of the outline.
     size, std : (2,) metres, length and width, and their standard deviations.
     side : index of the direction of the length.
     """

@@ -39,7 +39,7 @@ def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
     2. A reading becomes the mean of itself and the earlier readings that agree with it (`AGREE`).
        Where they disagree, something has moved or was hidden, and the current reading stays.
     3. A hole gets the mean of the earlier readings that continue a surface beside it in the current
-       image. Readings of an object that has moved away do not.
+       image. Readings of an object that has since moved away are not used.
 
     differs: the thesis merges the clouds and subsamples them.
 

@@ -23,7 +23,7 @@ class Earlier(NamedTuple):
 
 
 class RecentFrames:
-    """Keeps, for each topic, the last frames, to be fused with the next one."""
+    """Keeps the last frames of each topic, to fuse them with the next one."""
 
     def __init__(self, count: int) -> None:
         """Keep ``count - 1`` frames of each topic, so that ``count`` are fused into one."""

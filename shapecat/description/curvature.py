@@ -86,7 +86,7 @@ def fit_surfaces(
     points, starts : from `assign`.
     x, y, z : (k,) positions of the neurons.
     straight : (k, k) Euclidean distances between the neurons.
-    radius : of the neighbourhoods, in the same unit.
+    radius : radius of the neighbourhoods, in the same unit.
     eye : (3,) position of the sensor.
 
     Returns

@@ -6,7 +6,7 @@ __all__ = ["ALL_STEPS", "Steps"]
 
 
 class Steps(NamedTuple):
-    """The steps beyond the thesis that are taken, so that the effect of each can be measured.
+    """Switches for the steps beyond the thesis, to measure the effect of each.
 
     Without all of them, objects are separated by plane, height and depth discontinuities alone.
     """

@@ -49,7 +49,7 @@ class Sight(NamedTuple):
     numbers : (15,) compared before the points are: box centre (3), vector from the sensor to it (3)
         and up (3), in the fixed frame if there is one, else in the sensor frame; longer side,
         shorter side and height of the box; height above the support; number of pixels; flags as
-        an integer. In metres.
+        an integer. Lengths are in metres.
     """
 
     frame: Frame
@@ -66,7 +66,7 @@ _HEIGHT, _PIXELS, _KIND = 12, 13, 14
 def sight_of(
     frame: Frame, pose: Pose | None, candidate: Candidate, up: F4, height_m: float
 ) -> Sight:
-    """Return the view of a candidate, with the numbers that earlier views are compared by.
+    """Return the view of a candidate, with the numbers for its comparison with earlier views.
 
     Parameters
     ----------

@@ -127,7 +127,7 @@ def grow_fritzke(
     Parameters
     ----------
     cloud : the points.
-    state : of the random generator.
+    state : state of the random generator, from a seed.
     gas : at least 2 linked neurons, with room for ``target``; changed in place.
     count : number of neurons in ``gas``.
     target : number of neurons to grow to.

@@ -188,7 +188,7 @@ def adapt(
     ----------
     x, y, z, padded, sx, sy, sz : as in `two_nearest`.
     born, row : the int32 array of `Gas`, and the index where the row of the winner begins.
-    absent : values of ``born`` that are no smaller mean that there is no edge.
+    absent : ``born`` is at least this where there is no edge.
     wins : the int32 array of `Gas`.
     winner : index of the winner.
     rate_winner, rate_neighbour : share of the distance to move.

@@ -110,7 +110,7 @@ def disconnect(degree: I4, born: I4, i: int, j: int) -> None:
 
 @kernel
 def insert(gas: Gas, count: int, q: int) -> int:
-    """Insert neuron ``count`` between q and f, its neighbour with the largest error; return f."""
+    """Insert neuron ``count`` between neuron q and its neighbour f of largest error; return f."""
     f = -1
     for j in range(count):
         if is_edge(gas, q, j) and (f < 0 or gas.error[j] > gas.error[f]):

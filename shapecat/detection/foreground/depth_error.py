@@ -98,10 +98,17 @@ def _find_low(
 def clear_contact(
     inv_depth: F4, plane_id: I4, height: F4, number: int, residual: F4, stack: I4, drop: F4
 ) -> None:
-    """Clear the residual at the foot of higher objects: steep low cells from their cells downwards.
+    """Set the residual to 0 on the steep foot of higher objects.
 
-    All images are (rows, columns); ``residual`` is changed in place; ``stack`` and ``drop``
-    (cells,) are work space.
+    From the cells of a higher object, low cells are followed downwards as long as they fall
+    steeply.
+
+    Parameters
+    ----------
+    inv_depth, plane_id, height : (rows, columns) inverse depth, 1/m, and as in `HeightMap`.
+    number : number of the plane, from 1, as in ``plane_id``.
+    residual : (rows, columns) 1/m, changed in place.
+    stack, drop : (cells,) work space.
     """
     rows, columns = residual.shape
     top = 0

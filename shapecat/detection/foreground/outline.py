@@ -18,7 +18,7 @@ class Outline(NamedTuple):
     ----------
     sides : all sides.
     table : sides that face the plane.
-    known : the same, plus sides next to higher cells, and sides in front of a farther surface.
+    known : ``table`` sides, sides next to higher cells, and sides in front of a farther surface.
     hidden : sides next to a nearer surface or a cell without a reading.
     rise : sum of the rises of the ``table`` sides, as multiples of the least mean rise.
     steep : steep sides among the ``table`` sides.

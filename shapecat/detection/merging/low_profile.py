@@ -22,7 +22,8 @@ def merge_low_profile(segments: Segments, low_profile: I4, labels: I4, spans: I4
 
     Returns
     -------
-    (n + 1,) bool, True for the segment of each low-profile object that the others merged into.
+    (n + 1,) bool, True for the representative of each low-profile object: the segment that its
+    other segments are merged into.
     """
     known = np.zeros(segments.parent.size, np.bool_)
     count = int(low_profile.max(initial=0))

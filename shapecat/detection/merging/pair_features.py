@@ -140,7 +140,7 @@ def pair_features(
 def write_pair_features(
     segments: Segments, features: Records, p: int, q: int, view_geometry: ViewGeometry, out: Row
 ) -> None:
-    """Write `pair_features`, given the `SEGMENT_FEATURES` (n + 1,) of all segments."""
+    """Do the same as `pair_features`, given the `SEGMENT_FEATURES` (n + 1,) of all segments."""
     first, second = segments.statistics[p].area, segments.statistics[q].area
     if first > second or (first == second and p > q):
         p, q = q, p
@@ -179,7 +179,7 @@ def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) 
 
 @kernel
 def _above_top(segments: Segments, p: int, q: int) -> float:
-    """Return the mean height of the upward surface of ``q`` at ``p``, above the top of ``q``."""
+    """Return the mean height, above the top of ``q``, of upward-facing contact of ``p`` with it."""
     onto = segments.pairs[p, q].rests_on
     if onto == 0:
         return MERGING.nowhere_m

@@ -81,7 +81,7 @@ class Segments(NamedTuple):
     ----------
     pairs : (n + 1, n + 1) records of `PAIR`.
     statistics : (n + 1,) records of `SEGMENT`.
-    top_area : (n + 1, BANDS) float32, area of upward surface by height, m2.
+    top_area : (n + 1, BANDS) float32, area of upward-facing surface by height, m2.
     samples : (n + 1, SAMPLES) int32, flat cells away from edges; -1 beyond the last.
     plane_id : (n + 1,) int8, the plane below each, as in `HeightMap.plane_id`.
     parent : (n + 1,) int16, the segment that each has been merged into, at first itself.

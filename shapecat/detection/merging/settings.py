@@ -26,13 +26,13 @@ class MergingSettings(NamedTuple):
     down_cos: float = 0.7
     """Cosine of the largest angle, in the image, between a lower neighbour and straight down."""
     top_bands: int = 4
-    """Bands of height, of 5 mm, below the top in which upward surface closes a segment."""
+    """Bands of height, of 5 mm, below the top in which upward-facing surface closes a segment."""
     facing_m: float = 0.015
     """Largest height difference between the tops of two walls of a pot, metres."""
     facing_share: float = 0.5
     """Least overlap of the lateral ranges of two walls of a pot, relative to the narrower one."""
     nowhere_m: float = -1.0
-    """Stands for the height of a contact with upward surface if there is none, metres."""
+    """Stands for the height of a contact with upward-facing surface if there is none, metres."""
     likely: float = 0.3
     """Least logit of a pair that is merged, for a probability of 0.57: a wrong merge loses two
     objects, a missing merge seldom one."""

@@ -55,8 +55,8 @@ def measure_objects(
     """Measure the objects.
 
     The box is an `shapecat.geometry.upright_box` around the outermost cells. An object stands on
-    another if it touches upward surface of that more than it touches the plane; or, if that contact
-    is hidden, if its bottom is at the top of the other.
+    another if it has more contact with upward-facing surface of the other than with the plane; or,
+    if that contact is hidden, if its bottom is at the top of the other.
 
     Parameters
     ----------

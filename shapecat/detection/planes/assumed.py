@@ -22,7 +22,7 @@ FEW = 0.01
 
 
 def unexplained(grid: DepthGrid, plane_id: I4, walls: U1) -> Bool | None:
-    """Return the samples that belong to no plane, nor stand above one, nor are on a wall.
+    """Return the samples that are neither on a plane, nor above one, nor on a wall.
 
     The result is (rows, columns) bool; None if there are few.
     """

@@ -74,7 +74,7 @@ class PlaneSettings(NamedTuple):
 
 
 class StripSettings(NamedTuple):
-    """How planes are found of which only narrow strips are visible."""
+    """How planes with only narrow visible strips are found."""
 
     bin_m: float = 0.005
     """Height of a bin, metres: the noise of strips at 1 m."""

@@ -136,7 +136,7 @@ def relabel_above(labels: I4, spans: I4, height: F4, label: int, level: float, n
     labels : (rows, columns) changed in place; not 0 only within ``spans``.
     spans : (rows, 2) as in `SurfaceGraph`.
     height : (rows, columns) metres.
-    label, level : the cells with this label, and higher than this level, metres, are changed.
+    label, level : cells with this label and a height above this level, metres, are changed.
     name : the new label.
     """
     for i in range(labels.shape[0]):
