@@ -1,8 +1,8 @@
 """Object features: named features that distinguish objects from structure and noise.
 
 They describe how a segment looks, where it ends, and where its surface continues: walls of bins are
-at the outline of their floor, walls of rooms continue beyond all planes, and arms are cut off by
-the image border.
+at the outline of their floor, walls of rooms continue beyond all planes, and furniture is cut off
+by the image border.
 """
 
 import math
