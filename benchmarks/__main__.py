@@ -3,7 +3,7 @@
 import os
 
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ[_name] = "1"  # before the libraries read it: everything is measured on one thread
+    os.environ[_name] = "1"  # one thread; set before the libraries read it
 
 from collections.abc import Callable  # noqa: E402  the environment comes first
 from pathlib import Path  # noqa: E402

@@ -1,8 +1,8 @@
-"""What each step of the detection gains: overlap with the truth, the steps added one by one.
+"""Ablation of the detection: overlap with the truth as steps are added and removed one by one.
 
     python -m benchmarks.ablation --first 500 --count 30
 
-On simulated clutter, and on real tables where there are any.
+The frames are simulated clutter and, if available, real tables.
 """
 
 from collections.abc import Iterator
@@ -23,7 +23,7 @@ NO_STEPS = Steps(*[False] * len(Steps._fields))
 
 
 def run(count: int, first_seed: int = 500) -> tuple[str, dict[str, Any]]:
-    """Score every set of steps on the same frames; return a Markdown table and the figures."""
+    """Score every set of steps on the same frames; return a Markdown table and the metrics."""
     sets = labelled_sets(count, first_seed)
     figures: dict[str, Any] = {}
     rows = []
@@ -51,7 +51,7 @@ def _words(name: str) -> str:
 
 
 def _clusters(frame: Frame) -> list[Array]:
-    """Find the largest level plane, and cluster what is above it by distance alone."""
+    """Find the largest horizontal plane and cluster the points above it by distance alone."""
     import open3d as o3d  # noqa: PLC0415  heavy
 
     points = frame.xyz().astype(np.float64)
@@ -77,9 +77,9 @@ def _clusters(frame: Frame) -> list[Array]:
 
 @click.command(help=__doc__)
 @click.option("--first", default=500, show_default=True, help="Seed of the first scene.")
-@click.option("--count", default=30, show_default=True, help="Simulated scenes.")
+@click.option("--count", default=30, show_default=True, help="Number of simulated scenes.")
 def main(*, first: int, count: int) -> None:
-    """Print a table, write ``build/benchmarks_ablation.json``."""
+    """Print a table and write ``build/benchmarks_ablation.json``."""
     table, figures = run(count, first)
     print(table)
     save(Path("build/benchmarks_ablation.json"), figures)

@@ -1,8 +1,8 @@
-"""Writing a corrected run's annotated.mcap again, beside a plain copy of the recording.
+"""Time to rewrite annotated.mcap after a correction, compared with copying the recording.
 
     python -m benchmarks.annotating
 
-Recording and copy lie in the page cache; the median of several turns counts.
+Recording and copy are in the page cache; the result is the median of several repetitions.
 """
 
 import subprocess
@@ -24,14 +24,14 @@ from shapecat.runs.jobs import Job
 
 
 def timed(work: Callable[[], object]) -> float:
-    """Return the seconds that some work takes."""
+    """Return the wall time of a call in seconds."""
     begun = time.perf_counter()
     work()
     return time.perf_counter() - begun
 
 
 def again(folder: Path, recording: Path) -> None:
-    """Write annotated.mcap, and nothing else, from the tables."""
+    """Write only annotated.mcap again, from the tables."""
     run = read_run(folder)
     run["options"]["rrd"] = False
     run["seconds"].pop("annotated.mcap")
@@ -40,7 +40,7 @@ def again(folder: Path, recording: Path) -> None:
 
 
 def measure(folder: Path, frames: int, turns: int) -> dict[str, Any]:
-    """Time annotations and copies of a recording of so many frames in turns."""
+    """Return the median times to annotate and to copy a recording, measured alternately."""
     recording = write(folder / f"frames{frames}.mcap", tabletop(min(frames, 60))[0], frames)
     run = folder / f"run{frames}"
     process(Job(recording, run, rrd=False))
@@ -54,10 +54,16 @@ def measure(folder: Path, frames: int, turns: int) -> dict[str, Any]:
 
 
 @click.command()
-@click.option("--frames", type=int, multiple=True, default=(300, 1000), help="Repeatable.")
-@click.option("--turns", default=9, help="The median of so many counts.")
+@click.option(
+    "--frames",
+    type=int,
+    multiple=True,
+    default=(300, 1000),
+    help="Frames of a recording. Repeatable.",
+)
+@click.option("--turns", default=9, help="Number of repetitions.")
 def main(*, frames: tuple[int, ...], turns: int) -> None:
-    """Print a table, write ``build/benchmarks_annotating.json``."""
+    """Print a table and write ``build/benchmarks_annotating.json``."""
     figures = {}
     with tempfile.TemporaryDirectory() as folder:
         for count in frames:

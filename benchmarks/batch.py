@@ -1,9 +1,9 @@
-"""Many recordings: the same tables whoever works on them, and how much faster two cores are.
+"""Many recordings: equal tables from every executor, and the speed-up of two cores.
 
     python -m benchmarks.batch            some minutes; prints a table
 
-Recordings of three formats, some broken, are processed one at a time, two at a time, on Dask, on
-Ray where it is installed, and in shards. Anything but the same tables is an error.
+Recordings of three formats, some of them broken, are processed one at a time, two at a time, on
+Dask, on Ray if it is installed, and in shards. It is an error if any tables differ.
 """
 
 import subprocess
@@ -27,7 +27,7 @@ SHARDS = 4
 
 
 def make(folder: Path, *, recordings: int, broken: int, frames: int) -> Path:
-    """Write recordings of all formats, and some that cannot be read."""
+    """Write recordings of all formats, some of which cannot be read."""
     folder.mkdir()
     views, _ = tabletop(60)
     for k in range(recordings - broken):
@@ -48,7 +48,7 @@ def process(recordings: Path, out: Path, *options: str) -> tuple[int, float]:
 
 
 def same(one: Path, two: Path) -> bool:
-    """Tell whether two folders of results have the same tables; times may differ."""
+    """Return whether two folders of results have equal tables, ignoring processing times."""
     names = [sorted(path.name for path in folder.glob("*/")) for folder in (one, two)]
     if names[0] != names[1]:
         return False
@@ -64,7 +64,7 @@ def same(one: Path, two: Path) -> bool:
 
 
 def ways() -> dict[str, Sequence[Sequence[str]]]:
-    """Return the options of each way to process, a run for each item."""
+    """Return the options of each way to process a batch, one list for each command to run."""
     every: dict[str, Sequence[Sequence[str]]] = {
         "--jobs 1": [["--jobs", "1"]],
         "--jobs 2": [["--jobs", "2"]],
@@ -78,11 +78,11 @@ def ways() -> dict[str, Sequence[Sequence[str]]]:
 
 
 @click.command()
-@click.option("--recordings", default=40)
-@click.option("--broken", default=4)
-@click.option("--frames", default=60, help="Of each recording.")
+@click.option("--recordings", default=40, help="Number of recordings.")
+@click.option("--broken", default=4, help="How many of them are broken.")
+@click.option("--frames", default=60, help="Frames of each recording.")
 def main(*, recordings: int, broken: int, frames: int) -> None:
-    """Process a batch in every way, print a table, write ``build/benchmarks_batch.json``."""
+    """Process a batch in every way, print a table and write ``build/benchmarks_batch.json``."""
     rows, figures = [], {}
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder)

@@ -1,12 +1,12 @@
-"""Boxes against the true ones, from simulated recordings to tables: 3D overlap by category.
+"""3D overlap of estimated and true boxes, by category, from simulated recordings to tables.
 
     python -m benchmarks.boxes --first 1000 --count 20 [--json]
 
-Each recording, of a camera that walks past a table or a pile, is processed as `shapecat process`
-does. Things with at least `SEEN_PIXELS` readings that were found are judged in every frame: the
-visible box, the full box of the single view, and that of the track. The overlap is that of
-upright boxes, exact. What is round about the vertical has no yaw of its own: its true box takes
-that of the box it is compared with.
+Recordings of a camera that moves past a table or a pile are processed as by `shapecat process`. In
+every frame, three boxes of each found object with at least `SEEN_PIXELS` readings are compared with
+the true box: the visible box, the full box of the single view, and the full box of the track. The
+overlap is the exact IoU of upright boxes. Objects that are round about the vertical have no yaw;
+their true boxes take the yaw of the estimated box.
 """
 
 import json
@@ -30,13 +30,13 @@ from shapecat.simulation.scenes import SceneKind
 
 Array = NDArray[Any]
 SEEN_PIXELS = 250
-"""With fewer readings a thing is not judged."""
+"""Objects with fewer readings are left out."""
 SAME = 0.5
-"""A detection is of a thing if their pixels overlap so much (intersection over union)."""
+"""IoU of masks from which a detection is of an object."""
 ROUND = ("cup", "can", "bottle", "bowl", "plate", "ball")
-"""Solids of revolution, of most of which the length and the width are alike."""
+"""Solids of revolution, most of which have nearly equal length and width."""
 ALIKE = 0.05
-"""One whose true length and width differ by a larger share is oval or has a handle, and a yaw."""
+"""Largest relative difference of length and width of a round object; others have a yaw."""
 JUDGED = ("cup", "can", "box", "bottle", "bowl", "ball")
 KINDS: tuple[SceneKind, ...] = ("tabletop", "pile")
 GROUPS = ("tabletop, upright", "tabletop, lying", "pile, upright", "pile, tilted")
@@ -46,7 +46,7 @@ COLUMNS = ("objects", "views", "visible", "full, single view", "full, track")
 
 
 class Upright(NamedTuple):
-    """A box in a level frame: centre (3,), size (3,), yaw."""
+    """A box in a level frame: centre (3,) and size (3,) in metres, yaw in radians."""
 
     center: Array
     size: Array
@@ -54,7 +54,11 @@ class Upright(NamedTuple):
 
 
 class Judged(NamedTuple):
-    """The overlaps of one object in one view: visible, full, and that of the track, if any."""
+    """The IoU of three boxes of an object in one frame.
+
+    ``overlaps`` (3,) are those of the visible box, the full box of the view, and that of the track,
+    NaN without a track; ``thing`` is the seed of the scene and the object's number.
+    """
 
     group: str
     category: str
@@ -67,7 +71,7 @@ class Judged(NamedTuple):
 @click.option("--count", default=20, show_default=True, help="Scenes of each kind.")
 @click.option("--json", "as_json", is_flag=True, help="Print the means as JSON.")
 def main(*, first: int, count: int, as_json: bool) -> None:
-    """Judge scenes and print a table."""
+    """Evaluate scenes and print a table."""
     found = [item for kind in KINDS for item in _judge_kind(kind, first, count)]
     rows = [row for group in GROUPS for row in _rows(found, group)]
     if as_json:
@@ -77,7 +81,7 @@ def main(*, first: int, count: int, as_json: bool) -> None:
 
 
 def _rows(found: Sequence[Judged], group: str) -> Iterator[list[Any]]:
-    """Yield the mean overlaps of each category and of all that are judged together."""
+    """Yield the mean overlaps of each category, and of the categories in `JUDGED` together."""
     some = [item for item in found if item.group == group]
     for category in sorted({item.category for item in some}):
         yield _row(f"{group}, {category}", [item for item in some if item.category == category])
@@ -143,7 +147,10 @@ def by_frame(path: Path) -> dict[int, list[dict[str, Any]]]:
 def matches(
     things: Sequence[dict[str, Any]], rows: Sequence[dict[str, Any]], labels: Array
 ) -> Iterator[tuple[dict[str, Any], dict[str, Any]]]:
-    """Match true and found objects one to one by their pixels."""
+    """Match true and found objects one to one by their pixels; yield the pairs.
+
+    ``labels`` (h, w) are the true pixel labels of the frame.
+    """
     inside = [np.bincount(labels.reshape(-1)[r["indices"]], minlength=256) for r in rows]
     iou = np.zeros((len(things), len(rows)))
     for i, thing in enumerate(things):

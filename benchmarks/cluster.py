@@ -1,12 +1,12 @@
 """A hundred thousand recordings on 1 to 1,000 workers, simulated from measured costs.
 
-    python -m benchmarks.cluster          writes docs/images/scaling.png, prints the tables
-    python -m benchmarks.cluster --check  compares the model with 1 to 4 workers on this machine
-    python -m benchmarks.cluster --limits measures planning and manifest up to a million recordings
+    python -m benchmarks.cluster            writes docs/images/scaling.png, prints the tables
+    python -m benchmarks.cluster --check    compares the model with 1 to 4 workers on this machine
+    python -m benchmarks.cluster --limits N measures planning and manifest with N recordings
 
-What is measured here: the cost of handing a task to a worker (locally and with Dask), of a line of
-the manifest, and of planning a recording. What is measured elsewhere and given as an option: CPU
-time per frame (`benchmarks.whole`). What is assumed is written in `Assumed`.
+Measured here are the costs of sending a task to a worker (locally and with Dask), of a line of the
+manifest, and of planning a recording. The CPU time per frame is measured by `benchmarks.whole` and
+given as an option. `Assumed` lists the assumptions.
 """
 
 import heapq
@@ -35,29 +35,29 @@ from shapecat.runs.jobs import Job
 
 ROOT = Path(__file__).parents[1]
 WORKERS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
-LINES = 3  # of the manifest for each recording: planned, running, complete
+LINES = 3  # lines of the manifest for each recording: planned, running, complete
 
 
 @dataclass(frozen=True)
 class Assumed:
-    """What the simulation takes as given."""
+    """Assumptions of the simulation."""
 
     recordings: int = 100_000
     median_frames: float = 1800.0  # a minute at 30 Hz
-    spread: float = 0.8  # of the logarithm of the frames: some last ten minutes
-    read_mb: float = 0.086  # per frame, compressed depth and transforms
+    spread: float = 0.8  # standard deviation of the logarithm of the number of frames
+    read_mb: float = 0.086  # per frame: compressed depth and transforms
     written_mb: float = 0.133  # per frame: annotated.mcap, review.rrd, tables
-    tables_mb: float = 0.016  # of these
-    storage_mb_s: float = 1250.0  # shared by all: a file server on 10 Gbit/s
-    stream_mb_s: float = 250.0  # one worker alone
+    tables_mb: float = 0.016  # the tables' part of written_mb
+    storage_mb_s: float = 1250.0  # shared by all workers: a file server on 10 Gbit/s
+    stream_mb_s: float = 250.0  # limit of one worker
     startup_s: float = 3.0  # of a worker, once
-    recording_s: float = 0.1  # CPU time of a recording beside its frames
-    cores: int = 0  # that the workers share; 0 for one each
+    recording_s: float = 0.1  # CPU time of a recording in addition to its frames
+    cores: int = 0  # shared by the workers; 0 for one core each
 
 
 @dataclass(frozen=True)
 class Measured:
-    """Seconds, measured on the machine that runs this."""
+    """Costs in seconds, measured on this machine: of a frame, a task, a manifest line, a plan."""
 
     frame_s: float
     task_s: float
@@ -69,11 +69,11 @@ class Queue:
     """A resource that serves one request after the other."""
 
     def __init__(self) -> None:
-        """Begin free."""
+        """Begin without requests."""
         self.free = self.busy = 0.0
 
     def serve(self, now: float, seconds: float) -> float:
-        """Return when a request that comes now has been served."""
+        """Return the time at which a request that arrives at ``now`` has been served."""
         self.free = max(self.free, now) + seconds
         self.busy += seconds
         return self.free
@@ -82,10 +82,10 @@ class Queue:
 def simulate(
     workers: int, costs: Measured, given: Assumed, *, written_mb: float | None = None
 ) -> dict[str, float]:
-    """Return hours, efficiency, and how busy each shared resource was.
+    """Return the hours, the efficiency, and the utilization of each shared resource.
 
-    Recordings are handed out largest first. Each waits its turn for the scheduler, for the
-    storage to read from, for its worker's core, for the storage to write to, and for the manifest.
+    Recordings are sent out largest first. Each one queues for the scheduler, for reading from the
+    storage, for its worker's core, for writing to the storage, and for the manifest.
     """
     rng = np.random.default_rng(0)
     frames = rng.lognormal(math.log(given.median_frames), given.spread, given.recordings)
@@ -142,7 +142,7 @@ def _task_s(executor: Executor, count: int) -> float:
 
 
 def measure(frame_s: float) -> dict[str, Measured]:
-    """Measure what the shared parts cost, with each executor that is installed."""
+    """Measure the costs of the shared resources, with local and with Dask workers."""
     with tempfile.TemporaryDirectory() as folder:
         manifest = Manifest(Path(folder) / "manifest.jsonl")
         entry = Entry("kitchen_0123", "/data/2024/kitchen_0123.mcap", "running", "0" * 16, "1" * 16)
@@ -188,7 +188,7 @@ def draw(path: Path, results: dict[str, list[dict[str, float]]]) -> None:
 
 
 def per_hour(costs: Measured, given: Assumed) -> list[tuple[str, ...]]:
-    """Return what a recorded hour costs: wall time, CPU time, storage, and which of them binds."""
+    """Return the cost of a recorded hour: wall time, CPU time, storage, and the bottleneck."""
     frames = 30 * 3600.0
     cpu_h = frames * costs.frame_s / 3600
     rows: list[tuple[str, ...]] = []
@@ -237,7 +237,7 @@ def check(folder: Path, *, recordings: int, frames: int) -> list[tuple[str, ...]
 
 
 def limits(count: int) -> tuple[str, ...]:
-    """Plan so many made-up recordings, note them all, read the manifest, and plan them again."""
+    """Plan synthetic recordings, record them as complete, read the manifest, and plan again."""
     first = f"kitchen_{0:07}"
     named = [
         (name := f"kitchen_{k:07}", Source("", f"s3://lab/{name}.mcap", name, "", f"{k:016x}", 4))
@@ -271,25 +271,25 @@ def limits(count: int) -> tuple[str, ...]:
 
 
 def planner(out: str, there: set[str], manifest: Manifest) -> _Planner:
-    """Return the part of a plan that sees what is done."""
+    """Return the planner that determines the state of each recording."""
     return _Planner(Job(Path(), Path()), out, there, manifest)
 
 
 def peak_mb() -> float:
-    """Return the most memory that this process has held."""
+    """Return the peak memory of this process in MB."""
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 
 @click.command()
-@click.option("--frame-ms", default=9.8, help="CPU time per frame, all outputs on.")
-@click.option("--recordings", default=100_000)
+@click.option("--frame-ms", default=9.8, help="CPU time per frame with all outputs.")
+@click.option("--recordings", default=100_000, help="Number of simulated recordings.")
 @click.option("--plot", type=click.Path(path_type=Path), default=ROOT / "docs/images/scaling.png")
 @click.option("--check", "only_check", is_flag=True, help="Compare the model with 1 to 4 workers.")
-@click.option("--limits", "count", type=int, help="Plan so many made-up recordings.")
+@click.option("--limits", "count", type=int, metavar="N", help="Plan N synthetic recordings.")
 def main(
     *, frame_ms: float, recordings: int, plot: Path, only_check: bool, count: int | None
 ) -> None:
-    """Simulate, print tables, draw a plot, write ``build/benchmarks_cluster.json``."""
+    """Simulate, print tables, draw a plot and write ``build/benchmarks_cluster.json``."""
     if only_check:
         with tempfile.TemporaryDirectory() as folder:
             rows = check(Path(folder), recordings=16, frames=60)

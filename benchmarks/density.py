@@ -1,4 +1,4 @@
-"""Response time against the number of points, sparse to dense (thesis figure 4.8)."""
+"""Computing time of the detection over the number of points (thesis figure 4.8)."""
 
 from functools import partial
 from pathlib import Path
@@ -17,7 +17,7 @@ STRIDES = (8, 6, 4, 3, 2, 1)
 
 
 def run(count: int, plot: Path) -> tuple[str, dict[str, Any]]:
-    """Time clouds and images of each density; return a table and the figures, save a plot."""
+    """Time clouds and images of each density; return a table and the times, and save a plot."""
     frames = list(simulated_clutter(count))
     figures: dict[str, list[tuple[float, float]]] = {"cloud": [], "depth image": []}
     for points in POINTS:
@@ -30,7 +30,7 @@ def run(count: int, plot: Path) -> tuple[str, dict[str, Any]]:
 
 
 def _median(frames: list[Frame]) -> tuple[float, float]:
-    """Return the median number of points of the frames, and of the milliseconds they take."""
+    """Return the median number of points and the median CPU time in ms of the frames."""
     spent = [cpu_ms(partial(_detect, frame), 2) for frame in frames]
     points = [np.count_nonzero(np.isfinite(frame.xyz()[:, 2])) for frame in frames]
     return float(np.median(points)), round(float(np.median(spent)), 3)

@@ -1,4 +1,4 @@
-"""Detection against Open3D and PCL, on the same frames in one run."""
+"""Speed of the detection compared with Open3D and PCL on the same frames."""
 
 import shutil
 import subprocess
@@ -17,12 +17,12 @@ from shapecat.detection import detect
 from shapecat.types import Frame
 
 ROUNDS = 8
-"""The pace of a machine changes within seconds: every method takes its turn so often."""
+"""Number of rounds; methods alternate, as the speed of a machine changes within seconds."""
 PCL = ("segmentation", "features", "filters", "sample_consensus", "search", "kdtree", "common")
 
 
 def run(count: int) -> tuple[str, dict[str, Any]]:
-    """Time every method on every frame; return a Markdown table and the figures."""
+    """Time every method on every frame; return a Markdown table and the times."""
     sets = {
         "simulated clutter": list(simulated_clutter(count)),
         "real tables": list(real_tables(every=max(1, 45 // count))),
@@ -45,7 +45,7 @@ def run(count: int) -> tuple[str, dict[str, Any]]:
 
 
 def _time_all(frames: list[Frame], program: Path | None) -> dict[str, dict[str, float]]:
-    """Time every method on every frame in rounds; the best of each frame counts."""
+    """Time every method on every frame in rounds; summarise each frame's best time."""
     settings = Settings().detection
     ups = [detect(f, settings=settings, rng=np.random.default_rng(0)).up for f in frames]
     loose = [_unorganized(frame) for frame in frames]
@@ -74,7 +74,7 @@ def _unorganized(frame: Frame) -> Frame:
 
 
 def _time_open3d(frames: list[Frame], ups: list[Any]) -> list[float]:
-    """Time pass-through, 1 cm voxels, RANSAC plane, DBSCAN above it, on one thread."""
+    """Return the CPU times of Open3D: pass-through, 1 cm voxels, RANSAC plane, DBSCAN above it."""
     try:
         import open3d as o3d  # noqa: PLC0415  may lack its system libraries
     except (ImportError, OSError):
@@ -102,7 +102,7 @@ def _time_open3d(frames: list[Frame], ups: list[Any]) -> list[float]:
 
 
 def _build_pcl(folder: Path) -> Path | None:
-    """Build the PCL program where PCL is installed."""
+    """Build the PCL program; return its path, or None if PCL is not installed."""
     compiler = shutil.which("g++")
     flags = subprocess.run(
         ["pkg-config", "--cflags-only-I", "pcl_segmentation"],
@@ -116,7 +116,7 @@ def _build_pcl(folder: Path) -> Path | None:
     program = folder / "pcl_detection"
     source = Path(__file__).with_name("pcl_detection.cpp")
     libraries = [f"-lpcl_{name}" for name in PCL]
-    # Not -march=native: it changes the alignment of Eigen's types against the packaged PCL.
+    # -march=native would make the alignment of Eigen's types differ from that of the packaged PCL.
     command = [compiler, "-O3", "-mtune=native", "-std=c++17", "-w", str(source)]
     subprocess.run(
         [*command, "-o", str(program), *flags.stdout.split(), *libraries, "-llz4"], check=True
@@ -125,7 +125,7 @@ def _build_pcl(folder: Path) -> Path | None:
 
 
 def _write_clouds(path: Path, frames: list[Frame], ups: list[Any]) -> Path:
-    """Write the frames as the PCL program reads them."""
+    """Write the frames in the format of the PCL program."""
     with path.open("wb") as file:
         for frame, up in zip(frames, ups, strict=True):
             height, width = frame.depth.shape if frame.depth is not None else (1, 0)
@@ -136,7 +136,7 @@ def _write_clouds(path: Path, frames: list[Frame], ups: list[Any]) -> Path:
 
 
 def _time_pcl(program: Path, clouds: Path) -> dict[str, list[float]]:
-    """Run the PCL program, on one core."""
+    """Return the times in ms that the PCL program measures, by method."""
     done = subprocess.run(
         [str(program), str(clouds), "1"], capture_output=True, text=True, check=True
     )

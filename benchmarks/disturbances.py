@@ -1,8 +1,8 @@
-"""How much overlap with the truth the detection loses when its frames are changed.
+"""Loss of the detection's overlap with the truth on disturbed frames.
 
     python -m benchmarks.disturbances --first 500 --count 30
 
-Mirrored, turned, at half the resolution, with more noise, with readings lost.
+Frames are mirrored, rotated, halved in resolution, made noisier, or lose readings.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from shapecat.detection.pipeline import ALL_STEPS
 from shapecat.types import Camera, Frame
 
 STEP_PER_M = 0.0029
-"""A Kinect measures disparity in steps of an eighth of a pixel: so much of 1/depth."""
+"""Step of 1/depth of a Kinect, which measures disparity in eighths of a pixel."""
 
 Change = Callable[[Array, Array, Camera, Generator], tuple[Array, Array, Camera]]
 """Changes a depth image, its labels (both h w) and its camera."""
@@ -36,7 +36,7 @@ def _upside_down(depth: Array, labels: Array, camera: Camera, _: Generator) -> A
 
 
 def _on_its_side(depth: Array, labels: Array, camera: Camera, _: Generator) -> Any:
-    """Turn counterclockwise: the right column becomes the top row."""
+    """Rotate counterclockwise: the right column becomes the top row."""
     turned = Camera(
         camera.height, camera.width, camera.fy, camera.fx, camera.cy, camera.width - 1 - camera.cx
     )
@@ -72,7 +72,7 @@ CHANGES: dict[str, Change] = {
 
 @click.command(help=__doc__)
 @click.option("--first", default=500, show_default=True, help="Seed of the first scene.")
-@click.option("--count", default=30, show_default=True, help="Simulated scenes.")
+@click.option("--count", default=30, show_default=True, help="Number of simulated scenes.")
 def main(*, first: int, count: int) -> None:
     """Print a table."""
     sets = labelled_sets(count, first)

@@ -1,4 +1,4 @@
-"""What fusing consecutive frames gains: noise of planes, detection, and what it costs."""
+"""Gains and cost of fusing consecutive frames: noise of planes, detection, CPU time."""
 
 from collections.abc import Iterator
 from dataclasses import replace
@@ -37,7 +37,7 @@ class Shot(NamedTuple):
     earlier: tuple[Earlier, ...]
 
     def fused(self, count: int) -> Frame:
-        """Return it fused with as many frames before it as make so many."""
+        """Return the frame fused with the preceding ones, ``count`` frames in total."""
         return fuse(self.frame, self.earlier[: count - 1], range_m=2.0)
 
 
@@ -53,8 +53,8 @@ def shots(
 
     Parameters
     ----------
-    rests : the camera stands still.
-    lost : share of the readings that fail, and the width in pixels of the squares they fail in.
+    rests : whether the camera stands still.
+    lost : fraction of the readings that are lost, and the width in pixels of the lost squares.
     """
     for kind, seed in ((k, s) for k in kinds for s in range(FIRST_SEED, FIRST_SEED + count)):
         world = make_scene(kind, np.random.default_rng(seed), frames=30, rate_hz=RATE_HZ)
@@ -80,7 +80,7 @@ def _without(frame: Frame, share: float, width: int, rng: np.random.Generator) -
 
 
 def run(count: int) -> tuple[str, dict[str, Any]]:
-    """Measure all on ``count`` scenes of each kind; return Markdown tables and the figures."""
+    """Measure on up to ``count`` scenes; return Markdown tables, and the values by name."""
     noise, found, times = _noise(count // 3), _found(count), _times(count // 4)
     title = tuple(f"{k} frames" if k > 1 else "1 frame" for k in FUSED)
     tables = [
@@ -96,9 +96,9 @@ def run(count: int) -> tuple[str, dict[str, Any]]:
 
 
 def _noise(count: int) -> dict[str, list[float]]:
-    """Return the noise of the readings of tables across their true plane, in millimetres.
+    """Return the noise of the readings of tables perpendicular to the true plane, millimetres.
 
-    It is 1.48 times the median deviation: outlines, where readings are ragged, count little.
+    It is 1.48 times the median absolute deviation, on which ragged outlines have little effect.
     """
     result = {}
     for name, sensor in SENSORS.items():
@@ -123,7 +123,7 @@ def _deviation(shot: Shot, count: int, sensor: Sensor) -> float:
 
 
 def _found(count: int) -> dict[str, list[tuple[float, float]]]:
-    """Return F and share of objects found on single and fused frames."""
+    """Return F and the fraction of objects found, on single and on fused frames."""
     sets: dict[str, dict[str, Any]] = {
         "tables, camera rests": {"kinds": TABLES, "rests": True},
         "tables, camera walks": {"kinds": TABLES},

@@ -1,10 +1,10 @@
-"""The track phase over hours: time and memory on made-up tables, as perceive would write them.
+"""Time and memory of the track phase over hours, on synthetic tables as perceive writes them.
 
     python -m benchmarks.hours --hours 1
     python -m benchmarks.hours --hours 10     a million frames, eight million detections
 
-Eight objects stand on a table before a camera that moves. Each is overlooked now and then, and is
-taken away for a while every few minutes; here and there is something false for a few frames.
+Eight objects stand on a table in front of a moving camera. Each is missed in some frames, and is
+removed for a while every few minutes; false detections appear for a few frames.
 """
 
 import json
@@ -32,12 +32,12 @@ from shapecat.types import CATEGORIES
 PER_HOUR, OBJECTS, PLACES_OF_FALSE = 100_000, 8, 8
 PERIOD_NS = 36_000_000
 NOISE_M = 0.004
-OVERLOOKED, FALSE = 0.01, 0.002  # shares of the detections, and of the frames that begin one
+OVERLOOKED, FALSE = 0.01, 0.002  # fractions: of missed detections; of frames with a new false one
 FALSE_FRAMES, VISIT_FRAMES, AWAY_FRAMES = 5, 10_000, 500
 
 
 def make_tables(folder: Path, frames: int) -> None:
-    """Write the frames and detections of a run; columns that tracking does not read are empty."""
+    """Write the frames and detections of a run; columns that tracking does not read are null."""
     rng = np.random.default_rng(0)
     count = OBJECTS + PLACES_OF_FALSE
     places = np.column_stack([rng.uniform(-0.5, 0.5, (count, 2)), np.full(count, 0.05)])
@@ -91,7 +91,7 @@ def _detections(numbers: Any, places: Any, beliefs: Any, rng: Any) -> dict[str, 
 
 
 def _shown(numbers: Any, rng: Any) -> tuple[Any, Any]:
-    """Return the rows of the frames of detections, and what each shows: the last ones are false."""
+    """Return the frame and the object of each detection; numbers from `OBJECTS` on are false."""
     shown = rng.random((len(numbers), OBJECTS + PLACES_OF_FALSE)) > OVERLOOKED
     turn = (numbers[:, None] + np.arange(OBJECTS) * VISIT_FRAMES // OBJECTS) % VISIT_FRAMES
     shown[:, :OBJECTS] &= turn >= AWAY_FRAMES
@@ -108,7 +108,7 @@ def _filled(columns: dict[str, Any], schema: pa.Schema) -> dict[str, Any]:
 
 
 def _track(folder: Path, answer: Connection) -> None:
-    """Track in a process of its own, and tell the seconds and the peak of its memory."""
+    """Track in this process; send the seconds, the peak memory and the number of tracks."""
     begun = time.perf_counter()
     counts = track_run(folder, TrackingSettings(), CATEGORIES)
     seconds = time.perf_counter() - begun
@@ -120,7 +120,7 @@ def _track(folder: Path, answer: Connection) -> None:
 
 
 def measure(frames: int) -> dict[str, Any]:
-    """Track a made-up run of so many frames."""
+    """Track a synthetic run in a process of its own; return time, memory and number of tracks."""
     with tempfile.TemporaryDirectory() as name:
         make_tables(Path(name), frames)
         os.environ.setdefault("ARROW_DEFAULT_MEMORY_POOL", "system")  # as the command does
@@ -138,7 +138,7 @@ def measure(frames: int) -> dict[str, Any]:
 @click.option("--hours", default=1.0, show_default=True, help="Hours of recording, at 28 Hz.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def main(*, hours: float, as_json: bool) -> None:
-    """Measure the track phase over so many hours, write ``build/benchmarks_hours.json``."""
+    """Measure the track phase, print a table and write ``build/benchmarks_hours.json``."""
     figures = measure(round(hours * PER_HOUR))
     save(Path("build/benchmarks_hours.json"), figures)
     rows = [(f"{hours:g}", *(round(value, 1) for value in figures.values()))]

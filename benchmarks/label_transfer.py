@@ -1,11 +1,11 @@
-"""Corrected labels in another run: how many find their object, and does any find a wrong one.
+"""Accuracy of the transfer of corrected labels to another run.
 
     python -m benchmarks.label_transfer            20 recordings, ten minutes
 
-Each recording is processed, its tracks are given names that tell which object they are (wrong
-tracks are deleted, parts are merged), and the labels are carried over to the same recording
-processed with another model and other settings, and to a second recording of the same table from
-elsewhere. The simulator knows which object each track is in each run.
+Each recording is processed, and its tracks are labelled with unique names of their true objects;
+false tracks are deleted, and tracks of the same object are merged. The labels are transferred to
+the same recording processed with another model and other settings, and to a second recording of the
+same table from another camera path. The simulator knows the object of each track in each run.
 """
 
 import json
@@ -43,7 +43,15 @@ OTHER = Settings(
 
 @dataclass(frozen=True)
 class Score:
-    """Counts of labels: given, on the right object, on a wrong one, told not to have found one."""
+    """Numbers of labels.
+
+    Attributes
+    ----------
+    given : labels whose object the other run shows.
+    right : labels transferred to the right object.
+    wrong : labels transferred to a wrong object, or lost without a message.
+    told : labels reported as not transferred.
+    """
 
     given: int
     right: int
@@ -52,15 +60,16 @@ class Score:
 
 
 def name_of(truth: int) -> str:
-    """Return a label that tells an object by its number."""
+    """Return a unique label for an object number."""
     tens, ones = divmod(truth, len(string.ascii_lowercase))
     return f"new thing {string.ascii_lowercase[tens]}{string.ascii_lowercase[ones]}"
 
 
 def objects_of(run: Path, recording: Path) -> dict[int, int]:
-    """Return by track which object of the simulator it shows, -1 for none.
+    """Return the simulated object that each track shows, -1 for none.
 
-    That of most of its points that belong to an object, if those are a third of all.
+    It is the object with most of the track's points, if at least a third of all its points belong
+    to objects.
     """
     with np.load(recording.with_suffix(".labels.npz")) as file:
         labels = file["labels"].reshape(len(file["labels"]), -1)
@@ -89,7 +98,7 @@ def _owner(count: Counter[int]) -> int:
 
 
 def correct(run: Path, objects: dict[int, int]) -> None:
-    """Label all tracks of a run: by their object, merged with its first track, or deleted."""
+    """Label all tracks of a run: by object, as merged with its first track, or as deleted."""
     first: dict[int, int] = {}
     labels = {}
     for track, thing in sorted(objects.items()):
@@ -104,10 +113,9 @@ def correct(run: Path, objects: dict[int, int]) -> None:
 
 
 def judge(source: Path, objects: dict[int, int], target: Path, there: dict[int, int]) -> Score:
-    """Carry the labels of one run over to another and compare with what the simulator knows.
+    """Transfer the labels of one run to another and compare the result with the ground truth.
 
-    Labels of objects that the other run does not show have nowhere to go and do not count, unless
-    they went somewhere.
+    Labels of objects that the other run does not show only count if they were transferred.
     """
     transfer = match_labels(source, target)
     shown = set(there.values())
@@ -131,7 +139,7 @@ def judge(source: Path, objects: dict[int, int], target: Path, there: dict[int, 
 
 
 def second_pass(world: World, seed: int, frames: int) -> World:
-    """Return the same things seen from a camera that walks elsewhere."""
+    """Return the same objects with another camera path."""
     rng = np.random.default_rng((seed, 2))
     height = next(s.height for s in world.supports if s.level and s.name != "floor")
     target = np.array([0, 0, height + 0.05])
@@ -142,7 +150,7 @@ def second_pass(world: World, seed: int, frames: int) -> World:
 
 
 def other_model(folder: Path) -> Path:
-    """Write a model that is less sure, and calls more objects unknown."""
+    """Write a model with lower confidences that rejects more objects as unknown."""
     model: Categorizer = load_model(None)
     path = folder / "other.npz"
     save_model(
@@ -153,10 +161,10 @@ def other_model(folder: Path) -> Path:
 
 @click.command()
 @click.option("--first", default=710000, help="Seed of the first recording.")
-@click.option("--count", default=20, help="Recordings.")
-@click.option("--frames", default=60, help="Frames of each.")
+@click.option("--count", default=20, help="Number of recordings.")
+@click.option("--frames", default=60, help="Frames of each recording.")
 def main(*, first: int, count: int, frames: int) -> None:
-    """Measure and print a table."""
+    """Measure the transfers and print a table."""
     total: dict[str, list[Score]] = {}
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)

@@ -1,12 +1,11 @@
-"""Masks on the colour image against the true ones, from simulated recordings to a data set.
+"""IoU of masks on the colour image with the true ones, from simulated recordings to a data set.
 
     python -m benchmarks.masks --first 1000 --count 20
 
-Recordings of tables and clutter, taken by a Kinect or a RealSense with a colour camera beside it,
-are processed as `shapecat process` does. Judged are things with at least `SEEN_PIXELS` readings
-that the colour camera sees with at least `SEEN_ON_IMAGE` pixels, by intersection over union: the
-masks of masks.parquet, which depth alone tells, and those of exports, which lie on the edges of
-the colours.
+Recordings of tables and clutter, by a Kinect or a RealSense with a colour camera beside it, are
+processed as by `shapecat process`. Two masks of each object are compared with the truth: that of
+masks.parquet, which comes from depth alone, and that of exports, whose outline follows the colour
+edges. Objects have at least `SEEN_PIXELS` readings and `SEEN_ON_IMAGE` pixels on the colour image.
 """
 
 import json
@@ -39,7 +38,7 @@ COLUMNS = ("", "objects", "found", "of depth", "exported", "exported, missed one
 
 
 class Judged(NamedTuple):
-    """The overlaps of one thing in one frame: of depth, and as exported; 0 if it was missed."""
+    """The IoU of an object's two masks in one frame: from depth, and as exported; 0 if missed."""
 
     sensor: str
     found: bool
@@ -48,9 +47,9 @@ class Judged(NamedTuple):
 
 @click.command(help=__doc__)
 @click.option("--first", default=1000, show_default=True, help="Seed of the first recording.")
-@click.option("--count", default=20, show_default=True, help="Recordings.")
+@click.option("--count", default=20, show_default=True, help="Number of recordings.")
 def main(*, first: int, count: int) -> None:
-    """Judge recordings and print a table."""
+    """Evaluate recordings and print a table."""
     judged = [item for number in range(count) for item in _judge(number, first + number)]
     rows = [_row(sensor, [item for item in judged if item.sensor == sensor]) for sensor in SENSORS]
     rows.append(_row("both", judged))
@@ -102,7 +101,7 @@ def _judge_run(folder: Path) -> Iterator[tuple[bool, tuple[float, float]]]:
 
 
 def _masks(folder: Path) -> Iterator[tuple[int, dict[int, tuple[Any, Any]]]]:
-    """Yield by frame the two masks of each detection."""
+    """Yield each frame's number and the two masks of each of its detections."""
     run = read_run(folder / "run")
     labels = read_labels(folder / "run" / "tracks.csv", run["model"]["categories"])
     labelled = read_labelled_frames(folder / "run", labels)

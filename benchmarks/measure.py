@@ -1,4 +1,4 @@
-"""How everything here is measured: process CPU time, one thread, the best of several runs."""
+"""Measuring and printing: process CPU time on one thread, the best of several runs."""
 
 import json
 import platform
@@ -11,7 +11,7 @@ import numpy as np
 
 
 def cpu_ms(work: Callable[[], Any], repeats: int = 5) -> float:
-    """Return the least CPU time of ``work`` in milliseconds, after one run to warm up."""
+    """Return the least CPU time of ``work`` in milliseconds, after one warm-up run."""
     work()
     best = float("inf")
     for _ in range(repeats):
@@ -22,7 +22,7 @@ def cpu_ms(work: Callable[[], Any], repeats: int = 5) -> float:
 
 
 def summary(values: Sequence[float]) -> dict[str, float]:
-    """Return median, 95th percentile and maximum."""
+    """Return the median, 95th percentile and maximum of values."""
     return {
         "median": round(float(np.median(values)), 3),
         "p95": round(float(np.percentile(values, 95)), 3),
@@ -38,7 +38,7 @@ def markdown(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) 
 
 
 def machine() -> dict[str, str]:
-    """Return what the figures were measured on."""
+    """Return the processor and the Python version of this machine."""
     model = next(
         (
             line.split(":")[1].strip()
@@ -51,6 +51,6 @@ def machine() -> dict[str, str]:
 
 
 def save(path: Path, results: dict[str, Any]) -> None:
-    """Write the results as JSON, with the machine."""
+    """Write results and the description of the machine as JSON."""
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps({"machine": machine(), **results}, indent=1) + "\n", "utf-8")

@@ -1,4 +1,4 @@
-"""Growing Neural Gas against what others have published as packages."""
+"""Speed of Growing Neural Gas compared with published packages."""
 
 import collections.abc
 import contextlib
@@ -20,7 +20,7 @@ from shapecat.surface import reconstruct, voxelize
 
 _NEURONS, _SIGNALS = 80, 6000
 _INTERVAL = 45
-"""Signals between two insertions, as ours has at this size."""
+"""Signals between two insertions, the same as in shapecat with these numbers."""
 
 
 def run(count: int) -> tuple[str, dict[str, Any]]:
@@ -51,7 +51,7 @@ def run(count: int) -> tuple[str, dict[str, Any]]:
 
 
 def _clouds(count: int) -> Iterator[F4]:
-    """Yield objects with enough points for all neurons."""
+    """Yield point clouds (n, 3) of objects with enough points for all neurons."""
     settings = Settings()
     for frame in simulated_clutter(count):
         scene = detect(frame, settings=settings.detection, rng=np.random.default_rng(0))
@@ -63,13 +63,13 @@ def _clouds(count: int) -> Iterator[F4]:
 
 
 def _microseconds(clouds: list[F4], learn: Callable[[F4], Any], *, repeats: int) -> float:
-    """Return the median time for a signal."""
+    """Return the median CPU time per signal in microseconds."""
     times = [cpu_ms(lambda cloud=cloud: learn(cloud), repeats) for cloud in clouds]  # type: ignore[misc]  # mypy infers no default
     return round(float(np.median(times)) / _SIGNALS * 1e3, 3)
 
 
 def _signals(cloud: F4) -> F4:
-    """Return the points in the order they are fired in."""
+    """Return the points in the order in which they are presented to the network."""
     rng = np.random.default_rng(0)
     epochs = _SIGNALS // len(cloud) + 1
     order = np.concatenate([rng.permutation(len(cloud)) for _ in range(epochs)])[:_SIGNALS]
@@ -77,13 +77,13 @@ def _signals(cloud: F4) -> F4:
 
 
 def _neupy() -> Callable[[F4], Any]:
-    """Load neupy: made for Python 3.6, so what its gas does not need gets a stand-in."""
+    """Load neupy, made for Python 3.6; mock the dependencies that its gas does not need."""
     for name in ("Iterable", "Mapping", "Sequence"):
         setattr(collections, name, getattr(collections.abc, name))
     for name in ("tensorflow", "numpy.core.umath_tests"):
         try:
             importlib.import_module(name)
-        except Exception:  # noqa: BLE001  any failure: it is not needed
+        except Exception:  # noqa: BLE001  any failure, as it is not needed
             sys.modules[name] = MagicMock()
     kind = importlib.import_module("neupy.algorithms").GrowingNeuralGas
 

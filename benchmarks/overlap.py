@@ -1,4 +1,4 @@
-"""How well found objects cover true ones, on simulated clutter and on real frames of tables."""
+"""Overlap of found and true objects on simulated clutter and on real tables."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -15,11 +15,11 @@ from shapecat.types import Frame
 
 Array = NDArray[Any]
 Finder = Callable[[Frame], list[Array]]
-"""Returns the points of each object it finds."""
+"""Returns the pixel indices of each object that it finds in a frame."""
 
 
 class Labelled(NamedTuple):
-    """A frame, the pixel labels (h w,) of its things, 0 where unknown, and which are objects."""
+    """A frame with its pixel labels (h * w,), 0 if unknown, and the labels of each object."""
 
     frame: Frame
     labels: Array
@@ -27,7 +27,7 @@ class Labelled(NamedTuple):
 
 
 def labelled_sets(count: int, first_seed: int) -> dict[str, list[Labelled]]:
-    """Return frames of so many simulated cluttered tables, and real ones where there are any."""
+    """Return frames of ``count`` simulated cluttered tables and, if available, real tables."""
     sets = {
         "simulated clutter": [Labelled(*f) for f in labelled_clutter(count, first_seed)],
         "real tables": [Labelled(*f) for f in labelled_tables()],
@@ -36,7 +36,7 @@ def labelled_sets(count: int, first_seed: int) -> dict[str, list[Labelled]]:
 
 
 def with_steps(steps: Steps) -> Finder:
-    """Return the detection with some of its steps."""
+    """Return a finder that runs only some steps of the detection."""
     settings = DetectionSettings()
 
     def find(frame: Frame) -> list[Array]:
@@ -47,7 +47,7 @@ def with_steps(steps: Steps) -> Finder:
 
 
 def score(frames: Sequence[Labelled], finder: Finder) -> dict[str, float]:
-    """Match found and true objects one to one; return the overlap F and the share matched."""
+    """Match found and true objects one to one; return overlap F and the fraction found."""
     total = Overlap()
     for frame, labels, things in frames:
         masks = [np.flatnonzero(np.isin(labels, parts)) for parts in things]

@@ -1,9 +1,9 @@
-"""How objects are found and categorized where physics let them fall: piles, bins, compartments.
+"""Detection and categorization of objects arranged by physics: piles, bins, compartments.
 
     python -m benchmarks.piles --first 740000 --count 60
     python -m benchmarks.piles --kind pile --sensor all --count 40
 
-Simulated scenes of twelve objects, one frame each, by a Kinect and a RealSense or by all sensors.
+One frame of each simulated scene of twelve objects, by a Kinect and a RealSense or by all sensors.
 """
 
 from collections.abc import Iterator
@@ -30,11 +30,14 @@ from shapecat.types import CATEGORIES, Detection
 Array = NDArray[Any]
 SCENES = {"pile": pile, "bin": bin_picking, "shelf bin": shelf_bin}
 OBJECTS, UNKNOWN = 12, 1 / 6
-"""How many objects are dropped, and the share of those of no category."""
+"""Number of dropped objects, and the fraction of them outside the categories."""
 
 
 class Judged(NamedTuple):
-    """An object that is seen: how well the best detection covers it, and that detection."""
+    """A visible object and the detection matched to it, None if missed.
+
+    ``shared`` is the number of their common pixels, ``overlap`` their overlap F.
+    """
 
     thing: Thing
     shared: int
@@ -43,7 +46,10 @@ class Judged(NamedTuple):
 
 
 class Scores(NamedTuple):
-    """The judged objects of some scenes, the pixels found and true, and how many were detected."""
+    """The judged objects of several scenes.
+
+    ``found`` and ``true`` are numbers of pixels, ``detections`` the number of detections.
+    """
 
     objects: list[Judged]
     found: int
@@ -54,7 +60,7 @@ class Scores(NamedTuple):
 def judge(
     kind: str, sensor: str, first: int, count: int, model: Categorizer, settings: Settings
 ) -> Scores:
-    """Perceive a frame of each of some scenes, and match what is found with what is there."""
+    """Perceive one frame of each scene, and match its detections with the true objects."""
     objects: list[Judged] = []
     found = true = detections = 0
     for seed in range(first, first + count):
@@ -75,7 +81,7 @@ def judge(
 def _matched(
     things: tuple[Thing, ...], labels: Array, seen: tuple[Detection, ...]
 ) -> Iterator[Judged]:
-    """Match objects and detections one to one, by how well they cover each other (F)."""
+    """Match objects and detections one to one by overlap F."""
     masks = {t.track: np.flatnonzero(labels == t.label) for t in things}
     things = tuple(t for t in things if len(masks[t.track]) >= SEEN_PIXELS)
     lists = [d.candidate.indices[labels[d.candidate.indices] > 0] for d in seen]
@@ -91,7 +97,7 @@ def _matched(
 
 
 def figures(scores: Scores, model: Categorizer) -> dict[str, float]:
-    """Return F, the share of objects found, and how well those are categorized."""
+    """Return F, the fraction of objects found, and metrics of their categories."""
     objects = scores.objects
     well = [o for o in objects if o.overlap >= MATCHED_F and o.detection is not None]
     known = [o for o in well if o.thing.category != "unknown" and not o.thing.indistinct]
@@ -112,7 +118,7 @@ def figures(scores: Scores, model: Categorizer) -> dict[str, float]:
 
 
 def _right(objects: list[Judged], model: Categorizer) -> float:
-    """Return the share that gets its category; *unknown* is wrong."""
+    """Return the fraction of objects with the right category; *unknown* counts as wrong."""
     right = [_category(o, model) == o.thing.category for o in objects]
     return float(np.mean(right)) if right else float("nan")
 
@@ -148,11 +154,13 @@ def _calibration(objects: list[Judged], model: Categorizer) -> float:
     default=("kinect", "realsense"),
     show_default=True,
 )
-@click.option("--model", type=click.Path(path_type=Path), help="Model file.  [default: ours]")
+@click.option(
+    "--model", type=click.Path(path_type=Path), help="Model file, else the default model."
+)
 def main(
     first: int, count: int, kinds: tuple[str, ...], sensors: tuple[str, ...], model: Path | None
 ) -> None:
-    """Judge piles, bins and compartments, and print a table."""
+    """Evaluate piles, bins and compartments, and print a table."""
     categorizer, settings = load_model(model), Settings()
     rows = []
     for kind in kinds or SCENES:

@@ -1,9 +1,10 @@
-"""Whether the plane of a table is found where little of the image tells which way is up.
+"""Detection of a table's plane where little of the image shows which way is up.
 
     python -m benchmarks.planes --first 730000 --count 100
 
-Simulated tables, one frame each, without a hint of up: covered to four fifths with flat boxes, cut
-to a fifth of the image, seen from 8 to 85 degrees of elevation.
+One frame of each simulated table, without a given up direction. Four fifths of the table are
+covered with flat boxes, or it fills only a fifth of the image, or the camera looks down by 8 to 85
+degrees.
 """
 
 from collections.abc import Callable, Iterator
@@ -28,15 +29,15 @@ from shapecat.types import Camera, Frame, Pose, Scene
 
 Array = NDArray[Any]
 HEIGHT_M, TILT_COS = 0.02, float(np.cos(np.radians(4)))
-"""How far the plane that is found may lie from the table, and how far it may be tilted."""
+"""Largest distance and tilt of a found plane from the table."""
 COVERED, SHOWN, SEEN = 0.8, 0.2, 0.01
-"""Share of a table that is under boxes; of the image that shows a table which is cut, with what is
-on it; least share that shows a covered one between its boxes."""
+"""Fraction of a covered table under boxes; fraction of the image filled by a cut table and its
+objects; least fraction of the image in which a covered table is visible between its boxes."""
 PREVIEW = Camera(80, 60, 65.6, 65.6, 39.5, 29.5)
 
 
 def covered(rng: Generator) -> World:
-    """Cover four fifths of a table with flat boxes, a dozen or more, that hardly touch."""
+    """Cover four fifths of a table with a dozen or more flat boxes with narrow gaps."""
     while True:
         table = make_table(rng, tuple(rng.uniform([0.6, 0.45], [0.9, 0.65])))
         supports = (*make_room(rng, wall_chance=0.3), table)
@@ -48,7 +49,7 @@ def covered(rng: Generator) -> World:
 
 def _flat_boxes(rng: Generator, table: Support) -> tuple[Thing, ...]:
     half = np.abs(table.outline[:, :2]).max(axis=0)
-    fill = rng.uniform(np.sqrt(COVERED), 0.97)  # of the length of each side of a tile
+    fill = rng.uniform(np.sqrt(COVERED), 0.97)  # side of a box relative to its tile
     tiles = list(_tiles(rng, -half, half, int(rng.integers(14, 28))))
     things: list[Thing] = []
     left = COVERED * np.prod(2 * half)
@@ -66,7 +67,7 @@ def _flat_boxes(rng: Generator, table: Support) -> tuple[Thing, ...]:
 
 
 def _tiles(rng: Generator, low: Array, high: Array, count: int) -> Iterator[tuple[Array, Array]]:
-    """Cut a rectangle across its longer side, again and again, into ``count`` of them."""
+    """Divide a rectangle recursively across its longer side into ``count`` tiles; yield corners."""
     if count == 1:
         yield low, high
         return
@@ -79,7 +80,7 @@ def _tiles(rng: Generator, low: Array, high: Array, count: int) -> Iterator[tupl
 
 
 def cut(rng: Generator) -> World:
-    """Look past a cluttered table, so far that a fifth of the image shows it."""
+    """Look past a cluttered table so that it fills only a fifth of the image."""
     while True:
         world = make_scene("clutter", rng, frames=1)
         pose, angle = world.path[0], rng.uniform(0, 2 * np.pi)
@@ -90,12 +91,12 @@ def cut(rng: Generator) -> World:
             gaze = np.cos(turn) * pose.rotation[:, 2] + np.sin(turn) * aside
             world = replace(world, path=(looking_at(pose.translation, pose.translation + gaze),))
             near, far = (turn, far) if sum(_shown(world)) > SHOWN else (near, turn)
-        if sum(_shown(world)) > SHOWN / 2:  # it is not nearer than a Kinect can tell
+        if sum(_shown(world)) > SHOWN / 2:  # else it is nearer than a Kinect can measure
             return world
 
 
 def _shown(world: World) -> tuple[float, float]:
-    """Return the shares of the image that tell the depth of the table, and of what is on it."""
+    """Return the fractions of the image with readings of the table and of the objects on it."""
     seen = render(world.geometry(0), PREVIEW, world.path[0])
     owners = np.where(seen.depth > KINECT.nearest_m, seen.owners, -1)
     table = owners == world.supports.index(_table(world))
@@ -103,7 +104,7 @@ def _shown(world: World) -> tuple[float, float]:
 
 
 def tilted(rng: Generator) -> World:
-    """Look at a cluttered table from any elevation between 8 and 85 degrees."""
+    """Look at a cluttered table from a random elevation between 8 and 85 degrees."""
     world = make_scene("clutter", rng, frames=1)
     pose = _view(rng, _table(world), rng.uniform(8, 85), rng.uniform(0.65, 1.3))
     return replace(world, path=(pose,))
@@ -125,14 +126,14 @@ SCENES: dict[str, Callable[[Generator], World]] = {
 
 
 def view_of(kind: str, seed: int) -> tuple[World, Frame]:
-    """Return a scene of a kind, and one Kinect frame of it."""
+    """Return a scene of a kind and a Kinect frame of it."""
     rng = np.random.default_rng(seed)
     world = SCENES[kind](rng)
     return world, render_frame(world, 0, rng=rng, sensor=KINECT)[0]
 
 
 def keeps_table(world: World, found: Scene) -> bool:
-    """Tell whether one of the planes that were found is the table."""
+    """Return whether one of the found planes is the table."""
     pose = inverse(world.path[0])
     up, height = pose.rotation[:, 2], _table(world).height - world.path[0].translation[2]
     return any(
@@ -149,7 +150,7 @@ def _table(world: World) -> Support:
 @click.option("--first", default=730000, show_default=True, help="Seed of the first scene.")
 @click.option("--count", default=100, show_default=True, help="Scenes of each kind.")
 def main(*, first: int, count: int) -> None:
-    """Print a table of how many keep their plane, and the seeds of those that do not."""
+    """Print the number of scenes in which the table is found, and the seeds of the others."""
     rows = []
     for kind in SCENES:
         lost = []

@@ -1,10 +1,10 @@
-"""How many detections in rooms full of other stuff are no object.
+"""False detections in rooms full of background equipment.
 
     python -m benchmarks.rooms --first 790000 --count 40
 
-Simulated rooms, one frame each, every sensor in turn. What robots, people, screens, chairs, plants
-on the floor, cables, curtains and walls are detected as is surplus; so is all but the best
-detection of one object. A laptop, keyboard or plant on the table is an object of no category.
+One frame of each simulated room; the sensors take turns. Detections on robots, people, screens,
+chairs, plants on the floor, cables, curtains and walls are surplus; so are all detections of an
+object except the best one. A laptop, keyboard or plant on the table is an unknown object.
 """
 
 from pathlib import Path
@@ -29,7 +29,14 @@ HEAD = ("sensor", "frames", "detections", "surplus", "of these pieces", "found",
 
 
 class Counts(NamedTuple):
-    """Of some frames: detections, those on no object, further pieces of one, objects, found."""
+    """Counts over several frames.
+
+    Attributes
+    ----------
+    elsewhere : detections on no object.
+    pieces : detections of an object in addition to the best one.
+    objects, found : number of true objects, and of those found.
+    """
 
     frames: int
     detections: int
@@ -51,7 +58,7 @@ class Counts(NamedTuple):
 
 
 def judge(sensor: str, seed: int, model: Categorizer, settings: Settings) -> Counts:
-    """Perceive a frame of a room, and count what is no object."""
+    """Perceive a frame of a room and count its detections."""
     rng = np.random.default_rng(seed)
     world = make_scene("room", rng, frames=1)
     frame, labels = render_frame(world, 0, rng=rng, sensor=PRESETS[sensor])
@@ -60,7 +67,7 @@ def judge(sensor: str, seed: int, model: Categorizer, settings: Settings) -> Cou
 
 
 def count(detections: list[Array], labels: Array) -> Counts:
-    """Count detections, lists of pixels, by what their pixels show."""
+    """Count detections, given by their pixels, by the true labels (h * w,) of these pixels."""
     on_things = [float(np.mean(labels[d] >= FIRST_THING_LABEL)) > 0.5 for d in detections]
     masks = [np.flatnonzero(labels == label) for label in np.unique(labels)]
     seen = [m for m in masks if labels[m[0]] >= FIRST_THING_LABEL]
@@ -75,8 +82,10 @@ def count(detections: list[Array], labels: Array) -> Counts:
 
 @click.command()
 @click.option("--first", default=3000, show_default=True, help="Seed of the first room.")
-@click.option("--count", "rooms", default=40, show_default=True, help="Rooms.")
-@click.option("--model", type=click.Path(path_type=Path), help="Model file.  [default: ours]")
+@click.option("--count", "rooms", default=40, show_default=True, help="Number of rooms.")
+@click.option(
+    "--model", type=click.Path(path_type=Path), help="Model file, else the default model."
+)
 def main(first: int, rooms: int, model: Path | None) -> None:
     """Count surplus detections in rooms, and print a table."""
     categorizer, settings = load_model(model), Settings()

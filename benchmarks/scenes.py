@@ -1,4 +1,4 @@
-"""The frames that are measured: simulated clutter, and real sensor data when present."""
+"""Frames for the benchmarks: simulated clutter and, if available, real tables."""
 
 import json
 from collections import Counter
@@ -15,11 +15,11 @@ from shapecat.types import Frame
 
 SHARED = Path(__file__).parents[2] / "shared" / "data"
 SEEN_PIXELS = 250
-"""Things with fewer readings are not expected to be found."""
+"""Objects with fewer readings are not expected to be found."""
 
 
 def simulated_clutter(count: int, first_seed: int = 500) -> Iterator[Frame]:
-    """Yield a frame of each of ``count`` cluttered tables."""
+    """Yield a Kinect frame of each of ``count`` cluttered tables."""
     for seed in range(first_seed, first_seed + count):
         rng = np.random.default_rng(seed)
         world = make_scene("clutter", rng, frames=1)
@@ -27,7 +27,7 @@ def simulated_clutter(count: int, first_seed: int = 500) -> Iterator[Frame]:
 
 
 def real_tables(every: int = 1) -> Iterator[Frame]:
-    """Yield real Kinect frames of tables; none where the data is absent."""
+    """Yield real Kinect frames of tables; none if the data are missing."""
     path = SHARED / "osd_learn" / "depth.mcap"
     if path.exists():
         with open_recording(path) as recording:
@@ -38,7 +38,7 @@ def real_tables(every: int = 1) -> Iterator[Frame]:
 def labelled_clutter(
     count: int, first_seed: int = 500
 ) -> Iterator[tuple[Frame, NDArray[Any], list[list[int]]]]:
-    """Yield frames as `simulated_clutter`, with pixel labels and the labels of each object."""
+    """Yield frames of `simulated_clutter`, pixel labels (h * w,), and each object's labels."""
     for seed in range(first_seed, first_seed + count):
         rng = np.random.default_rng(seed)
         world = make_scene("clutter", rng, frames=1)
@@ -49,7 +49,7 @@ def labelled_clutter(
 
 
 def labelled_tables() -> list[tuple[Frame, NDArray[Any], list[list[int]]]]:
-    """Return the real frames with their truth; none where the data is absent."""
+    """Return the real frames with their labels, as `labelled_clutter`; none if data are missing."""
     folder = SHARED / "osd_learn"
     if not (folder / "labels.npz").exists():
         return []

@@ -1,9 +1,10 @@
-"""How alike simulated sensors and real ones are: rough planes, wide edges, holes.
+"""Similarity of simulated and real sensors: roughness of planes, width of edges, holes.
 
     python -m benchmarks.sensors --real FOLDER --real FOLDER --picture sensors.png
 
-One line for each simulated sensor, on piles, and one for each folder of real recordings. The
-picture shows a frame of each as shaded surfaces, in which noise, edges and holes are seen best.
+The table has one line for each simulated sensor, on piles, and one for each folder of real
+recordings. The picture shows a frame of each as shaded surfaces, which show noise, edges and holes
+best.
 """
 
 from collections.abc import Iterator
@@ -22,17 +23,25 @@ from shapecat.types import Frame
 
 Array = NDArray[Any]
 WINDOWS = {"roughness": 16, "warp": 96}
-"""Width in pixels of an image 640 pixels wide: within the one noise shows, within the other what
-bends."""
+"""Width of the windows, pixels of an image 640 pixels wide: the small one shows noise, the large
+one the warping of planes."""
 QUIETEST = 0.25
-"""Windows on planes are the quietest quarter; the others have objects in them."""
+"""Quantile of the windows that is taken for planes; noisier windows contain objects."""
 JUMP_M, EDGE_PX = 0.06, 12
-"""Edges are steps of this height within so many pixels."""
+"""Edges are depth steps of at least this height within this number of pixels."""
 HEAD = ("sensor", "frames", "distance, m", "roughness, 1/m", "warp, 1/m", "edge, px", "holes")
 
 
 class Figures(NamedTuple):
-    """Of one frame: median distance in metres, errors of planes in 1/m, pixels, a share."""
+    """Measurements of one frame.
+
+    Attributes
+    ----------
+    distance : median depth, metres.
+    roughness, warp : standard deviation from planes in small and large windows, 1/m.
+    edge : width of edges, pixels of an image 640 pixels wide.
+    holes : fraction of pixels without reading inside the area with readings.
+    """
 
     distance: float
     roughness: float
@@ -42,7 +51,7 @@ class Figures(NamedTuple):
 
 
 def measure_frame(depth: Array) -> Figures:
-    """Measure a depth image (h, w) in metres, 0 where there is no reading."""
+    """Measure a depth image (h, w), metres, 0 without reading."""
     scale = depth.shape[1] / 640
     inverse = np.divide(1.0, depth, where=depth > 0, out=np.zeros(depth.shape))
     errors = [_roughness(inverse, max(round(w * scale), 6)) for w in WINDOWS.values()]
@@ -55,7 +64,7 @@ def measure_frame(depth: Array) -> Figures:
 
 
 def _roughness(inverse: Array, width: int) -> float:
-    """Return the deviation from planes, which are linear in inverse depth, in quiet windows."""
+    """Return the standard deviation of the inverse depth from planes in quiet windows, 1/m."""
     v, u = np.mgrid[:width, :width].reshape(2, -1) - width / 2
     design = np.column_stack([u, v, np.ones(width * width)])
     project = np.linalg.pinv(design)
@@ -70,7 +79,7 @@ def _roughness(inverse: Array, width: int) -> float:
 
 
 def _edge_width(depth: Array, width: int) -> float:
-    """Return how many pixels of a row lie between the two sides of a step, on average."""
+    """Return the mean number of pixels between the two sides of a depth step along rows."""
     near, far = depth[:, : -width - 1], depth[:, width + 1 :]
     step = (near > 0) & (far > 0) & (np.abs(far - near) > JUMP_M)
     between = np.zeros(step.shape, np.int64)
@@ -110,7 +119,7 @@ def _shaded(depth: Array, focal: float) -> Array:
 
 
 def draw(path: Path, seed: int, real: tuple[Path, ...]) -> None:
-    """Draw one pile as each sensor sees it, and the first frame of each real folder."""
+    """Draw one pile seen by each sensor, and the first frame of each real folder."""
     import matplotlib as mpl  # noqa: PLC0415  only for the picture
 
     mpl.use("agg")
@@ -142,8 +151,13 @@ def _row(name: str, figures: list[Figures]) -> tuple[Any, ...]:
 @click.command()
 @click.option("--first", default=3000, show_default=True, help="Seed of the first scene.")
 @click.option("--count", default=10, show_default=True, help="Scenes per sensor.")
-@click.option("--real", multiple=True, type=click.Path(path_type=Path), help="Folder. Repeatable.")
-@click.option("--picture", type=click.Path(path_type=Path), help="Draw a frame of each.")
+@click.option(
+    "--real",
+    multiple=True,
+    type=click.Path(path_type=Path),
+    help="Folder of real recordings. Repeatable.",
+)
+@click.option("--picture", type=click.Path(path_type=Path), help="Picture of a frame of each.")
 def main(first: int, count: int, real: tuple[Path, ...], picture: Path | None) -> None:
     """Measure simulated and real depth images, and print a table."""
     if picture is not None:

@@ -1,9 +1,9 @@
-"""Whole sequences, from simulated recordings to tracks: identities, labels, calibration.
+"""Tracking of whole simulated sequences: identities, labels, calibration.
 
     python -m benchmarks.sequences --seeds 10 --json
 
-Each sequence is written as an ordinary recording and processed as `shapecat process` does; its
-tables are judged against the truth.
+Each sequence is written as a recording and processed as by `shapecat process`; its tables are
+compared with the ground truth.
 """
 
 import json
@@ -34,17 +34,25 @@ from shapecat.types import CATEGORIES
 KINDS: tuple[SceneKind, ...] = ("turntable", "walking", "crossing", "rearranged")
 FRAMES, RATE_HZ = 60, 10.0
 NEAR_M = 0.1
-"""A track is at an object if its centre is this near the true one, or within half its length."""
+"""A track matches an object if their centres are this near, or nearer than half its length."""
 RANGE_M = 2.0
-"""What is farther from the sensor, an object or a track, counts neither for nor against."""
+"""Objects and tracks farther from the sensor are ignored."""
 SAME = 0.5
-"""A detection is of an object if their pixels overlap so much (intersection over union)."""
+"""IoU of masks from which a detection is of an object."""
 VIEWS = (1, 3, 10, 30)
 
 
 @dataclass(frozen=True)
 class Object:
-    """An object in a frame: ``spared`` if too little of it is seen to ask for it."""
+    """A true object in a frame.
+
+    Attributes
+    ----------
+    center : (3,) metres, fixed frame.
+    reach : largest distance of a matching track's centre, metres.
+    undecidable : whether its category is ambiguous in this view.
+    spared : whether too little of it is visible, or it is too far, so that it is ignored.
+    """
 
     track: int
     category: str
@@ -56,7 +64,14 @@ class Object:
 
 @dataclass(frozen=True)
 class View:
-    """A detection of a known object; ``single`` is the label of the view, ``final`` the track's."""
+    """A tracked detection of a known object.
+
+    Attributes
+    ----------
+    track : kind of the sequence, seed, and number of the track.
+    truth : true category.
+    single, final : category of the single view, and final category of the track.
+    """
 
     track: tuple[str, int, int]
     truth: str
@@ -68,7 +83,7 @@ class View:
 
 
 def make_sequence(folder: Path, kind: SceneKind, seed: int) -> None:
-    """Write a recording, its truth, and the tables of its run, unless they are there."""
+    """Write a recording, its ground truth, and the tables of its run, unless they exist."""
     if not (folder / "run").exists():
         source = simulate(
             folder / "recording.mcap", scene=kind, frames=FRAMES, seed=seed, rate_hz=RATE_HZ
@@ -77,7 +92,7 @@ def make_sequence(folder: Path, kind: SceneKind, seed: int) -> None:
 
 
 def read_truth(folder: Path) -> list[list[Object]]:
-    """Return the objects of each frame, also those that are hidden."""
+    """Return the objects of each frame, including hidden ones."""
     frames = json.loads((folder / "recording.truth.json").read_text("utf-8"))
     return [
         [_object(item, listed=True) for item in frame["objects"]]
@@ -99,10 +114,10 @@ def _object(item: dict[str, Any], *, listed: bool) -> Object:
 
 
 def seen_together(folder: Path, truth: Sequence[Sequence[Object]]) -> Iterator[SeenTogether]:
-    """Yield where the tracks are beside where the objects are, frame by frame.
+    """Yield the objects and tracks of each frame with their similarity.
 
-    A track at an object that is spared counts neither for nor against. Similarity falls with the
-    distance, from 1 to `SAME` at the largest reach.
+    Tracks that match a spared object are ignored. The similarity falls with the distance, from 1
+    to `SAME` at the largest reach.
     """
     table = _within_range(folder / "run")
     sequence = str(folder)
@@ -127,7 +142,7 @@ def seen_together(folder: Path, truth: Sequence[Sequence[Object]]) -> Iterator[S
 
 
 def _within_range(run: Path) -> list[dict[str, Any]]:
-    """Return the rows of tracks.parquet that are near the sensor."""
+    """Return the rows of tracks.parquet within `RANGE_M` of the sensor."""
     columns = ["frame", "fixed_translation"]
     frames = pq.read_table(run / "frames.parquet", columns=columns).to_pylist()
     sensor = {row["frame"]: row["fixed_translation"] for row in frames}
@@ -139,7 +154,7 @@ def _within_range(run: Path) -> list[dict[str, Any]]:
 
 
 def read_views(folder: Path, kind: str, seed: int) -> list[View]:
-    """Return the tracked detections that are of an object, whose pixels they have."""
+    """Return the tracked detections whose mask matches an object."""
     frames = json.loads((folder / "recording.truth.json").read_text("utf-8"))
     with np.load(folder / "recording.labels.npz") as archive:
         labels: U1 = archive["labels"]
@@ -171,7 +186,7 @@ def read_views(folder: Path, kind: str, seed: int) -> list[View]:
 def _seen(
     indices: Sequence[int], labels: U1, objects: Sequence[dict[str, Any]]
 ) -> dict[str, Any] | None:
-    """Return the object that a detection is of."""
+    """Return the object whose mask a detection matches; None if there is none."""
     own = np.bincount(labels.reshape(-1)[indices], minlength=256)
     label = int(own.argmax())
     union = len(indices) + int((labels == label).sum()) - own[label]
@@ -180,7 +195,7 @@ def _seen(
 
 
 def identities(seen: dict[str, list[SeenTogether]]) -> dict[str, dict[str, float]]:
-    """Return the figures of each kind of sequence, over all its frames."""
+    """Return the tracking metrics of each kind of sequence over all its frames."""
     names = ("idf1", "mota", "hota", "switches", "misses", "false_positives", "objects")
     result = {}
     for kind, frames in seen.items():
@@ -190,7 +205,7 @@ def identities(seen: dict[str, list[SeenTogether]]) -> dict[str, dict[str, float
 
 
 def label_errors(views: Iterable[View]) -> dict[str, float]:
-    """Return how often single views and their tracks' final labels are wrong."""
+    """Return the error rates of single views and of the final labels of their tracks."""
     pairs = np.array([(v.single != v.truth, v.final != v.truth) for v in views]).reshape(-1, 2)
     single, final = pairs.sum(axis=0).tolist()
     return {
@@ -202,7 +217,7 @@ def label_errors(views: Iterable[View]) -> dict[str, float]:
 
 
 def calibration(views: Iterable[View]) -> dict[int, dict[str, float]]:
-    """Return accuracy and calibration error of the fusion of so many views in a row."""
+    """Return accuracy and calibration error after fusing consecutive views, by their number."""
     tracks: dict[tuple[str, int, int], list[View]] = {}
     for view in views:
         tracks.setdefault(view.track, []).append(view)
@@ -228,7 +243,7 @@ def calibration(views: Iterable[View]) -> dict[int, dict[str, float]]:
 
 
 def evaluate(folder: Path, seeds: Iterable[int]) -> dict[str, Any]:
-    """Make, process and judge the sequences of all kinds."""
+    """Make, process and evaluate sequences of all kinds."""
     seen: dict[str, list[SeenTogether]] = {}
     views: list[View] = []
     for seed in seeds:
@@ -257,13 +272,13 @@ def evaluate(folder: Path, seeds: Iterable[int]) -> dict[str, Any]:
 
 
 def format_tables(figures: dict[str, Any]) -> str:
-    """Return the figures as Markdown tables."""
+    """Return the results as Markdown tables."""
     return "\n".join(
         markdown(title, [first, *next(iter(figures[key].values()))], rows)
         for title, key, first in (
             ("Identities", "identities", "sequences"),
-            ("Share of wrong labels", "labels", "sequences"),
-            ("Fusion of so many views", "calibration", "views"),
+            ("Error rates of labels", "labels", "sequences"),
+            ("Fusion of several views", "calibration", "views"),
         )
         if (rows := [(name, *values.values()) for name, values in figures[key].items()])
     )
@@ -275,7 +290,7 @@ def format_tables(figures: dict[str, Any]) -> str:
 @click.option("--keep", type=click.Path(path_type=Path), help="Keep recordings and runs here.")
 @click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
 def main(*, seeds: int, first: int, keep: Path | None, as_json: bool) -> None:
-    """Judge the tracking of simulated sequences: a turntable, a walking camera, and so on."""
+    """Evaluate tracking on simulated sequences: turntable, moving camera, moving objects."""
     with tempfile.TemporaryDirectory() as temporary:
         figures = evaluate(keep or Path(temporary), range(first, first + seeds))
     click.echo(json.dumps(figures, indent=1) if as_json else format_tables(figures))

@@ -1,9 +1,9 @@
-"""Detection on simulated scenes against their truth: objects, planes, what stands on what.
+"""Detection on simulated scenes compared with the truth: objects, planes, support relations.
 
     python -m benchmarks.simulated shelf empty --first 0 --count 24 [--json]
 
-One Kinect frame of each scene. Only things with at least `SEEN_PIXELS` readings are expected to be
-found; what is found of others counts neither for nor against.
+One Kinect frame of each scene. Only objects with at least `SEEN_PIXELS` readings are expected to be
+found; detections of other objects are ignored.
 """
 
 import json
@@ -32,14 +32,14 @@ SEEN_PLANE_PIXELS = 3000
 """Planes with fewer readings of their upper face are not expected to be found."""
 SAME_HEIGHT_M = 0.03
 FACE_M = 0.004
-"""Readings of the upper face of a board lie this near to its height; those of its front seldom."""
+"""Readings this near to the height of a board are taken for its upper face."""
 COLUMNS = (
     "objects", "recall", "precision", "planes, scenes", "relations", "empty scenes with objects"
 )  # fmt: skip
 
 
 class View(NamedTuple):
-    """A scene, its frame, the pixel labels (h w,), and what was found."""
+    """A scene, a frame of it, the frame's pixel labels (h * w,), and the detected scene."""
 
     world: World
     frame: Frame
@@ -64,7 +64,7 @@ def main(*, kinds: tuple[SceneKind, ...], first: int, count: int, as_json: bool)
 
 
 def score(kind: SceneKind, first: int, count: int) -> Counter[str]:
-    """Return what was found, missed and surplus in all scenes."""
+    """Return the counts over all scenes."""
     total: Counter[str] = Counter()
     for view in _views(kind, first, count):
         matches = _matches(view, total)
@@ -94,12 +94,12 @@ def _views(kind: SceneKind, first: int, count: int) -> Iterator[View]:
 
 
 def _matches(view: View, total: Counter[str]) -> dict[int, int]:
-    """Match candidates to things one to one; return {label: candidate} of the hits."""
+    """Match candidates and objects one to one; return the candidate of each hit by label."""
     labels, candidates = view.labels, view.found.candidates
     seen = np.bincount(labels, minlength=256)
     things = [t.label for t in view.world.things if seen[t.label] >= SEEN_PIXELS]
     small = [t.label for t in view.world.things if 0 < seen[t.label] < SEEN_PIXELS]
-    # Pixels without a label are mixtures of two surfaces.
+    # Pixels without a label mix two surfaces.
     inside = np.array([np.bincount(labels[c.indices], minlength=256) for c in candidates])
     inside = inside.reshape(-1, 256)
     inside[:, 0] = 0
@@ -118,13 +118,13 @@ def _matches(view: View, total: Counter[str]) -> dict[int, int]:
 
 
 def _heights(view: View) -> Array:
-    """Return the heights of the planes found, in the world."""
+    """Return the heights of the found planes in the world, metres."""
     camera = view.world.path[0].translation[2]
     return np.array([plane.offset + camera for plane in view.found.planes])
 
 
 def _judge_planes(view: View, total: Counter[str]) -> None:
-    """Count the scene if all planes that are well seen were found, and none that is not there."""
+    """Count the scene if all well visible planes were found, and no false ones."""
     up = inverse(view.world.path[0]).rotation[:, 2]
     points = view.frame.xyz()
     height = points @ up + view.world.path[0].translation[2]
@@ -142,7 +142,7 @@ def _judge_planes(view: View, total: Counter[str]) -> None:
 
 
 def _judge_relations(view: View, matches: dict[int, int], total: Counter[str]) -> None:
-    """Count the things that stand on what they truly stand on, where both were found."""
+    """Count the objects with the right support, if object and support were found."""
     by_track = {t.track: t for t in view.world.things}
     heights = {s.name: s.height for s in view.world.supports if s.level}
     found = _heights(view)

@@ -1,4 +1,4 @@
-"""The stages of one frame, and of one object."""
+"""Computing time of the stages for one object."""
 
 import time
 from collections.abc import Callable
@@ -20,7 +20,7 @@ from shapecat.surface import reconstruct, voxelize
 
 
 def run(count: int) -> tuple[str, dict[str, Any]]:
-    """Time each stage for each object of ``count`` frames; return a table and the figures."""
+    """Time each stage for each object of ``count`` frames; return a table and the times."""
     settings, model = Settings(), load_model(None)
     timed: dict[str, list[float]] = {}
     objects: list[tuple[F4, F8]] = []
@@ -57,12 +57,12 @@ def run(count: int) -> tuple[str, dict[str, Any]]:
 
 
 def _seeded(grow: Callable[..., Any]) -> Any:
-    """Grow the same graph each time."""
+    """Grow the same graph at each call."""
     return grow(rng=np.random.default_rng(0))
 
 
 def _categorize(points: F4, eye: F8, settings: Settings, model: Categorizer) -> None:
-    """Go the whole way of one object."""
+    """Run all stages of one object."""
     cloud = voxelize(points, voxel_m=settings.surface.voxel_m)
     gas = reconstruct(cloud, settings=settings.surface, rng=np.random.default_rng(0))
     if gas is not None:
@@ -70,7 +70,7 @@ def _categorize(points: F4, eye: F8, settings: Settings, model: Categorizer) -> 
 
 
 def _speedup(objects: list[tuple[F4, F8]], settings: Settings, model: Categorizer) -> float:
-    """Return how many times faster two threads do all objects than one: best wall times."""
+    """Return the speed-up of two threads over one for all objects, from the best wall times."""
     seconds = {}
     for threads in (1, 2):
         with ThreadPoolExecutor(threads) as pool:

@@ -2,11 +2,11 @@
 
     python -m benchmarks.whole                     ten minutes
     python -m benchmarks.whole --full              also 10,000 frames: ten minutes more, a gigabyte
-    python -m benchmarks.whole --against ../other  in turns with another checkout, with its .venv
+    python -m benchmarks.whole --against ../other  alternates with another checkout and its .venv
 
-The camera walks to and fro, or stands still. The command is run as a user runs it, on the cores
-that taskset leaves it. Start-up is the time of a run over the first frames alone; it is taken off
-and reported. With two cores a second process comes up meanwhile, which is not taken off.
+The camera moves back and forth, or stands still. The command runs as for a user, restricted to one
+or two cores. The start-up time, which a run over the first frames measures, is subtracted and
+reported. With two cores, the start of the second process is not subtracted.
 """
 
 import json
@@ -31,20 +31,20 @@ from shapecat.types import Frame, Pose
 OPTICAL = "camera_depth_optical_frame"
 EPOCH_NS, PERIOD_NS = 1_700_000_000_000_000_000, 33_333_333
 SEED = 11
-FEW_S = 0.1  # of the run that measures start-up
-REPEATS, MANY = 3, 1000  # shorter recordings are run so often
+FEW_S = 0.1  # seconds of recording in the run that measures start-up
+REPEATS, MANY = 3, 1000  # repetitions for recordings with fewer than MANY frames
 THESIS = "thesis (2012): 0.2 s to find planes and objects, up to 2 s for each of 8 objects"
 
 
 class View(NamedTuple):
-    """A frame and where it was taken from."""
+    """A frame and the pose ``world_from_camera`` from which it was taken."""
 
     frame: Frame
     pose: Pose
 
 
 def find_world(frames: int, objects: int) -> World:
-    """Return the first table with so many objects."""
+    """Return the first simulated table with this number of objects."""
     for seed in range(SEED, SEED + 100):
         world = make_scene("tabletop", np.random.default_rng(seed), frames=frames)
         if len(world.things) == objects:
@@ -53,7 +53,7 @@ def find_world(frames: int, objects: int) -> World:
 
 
 def tabletop(frames: int, *, objects: int = 8) -> tuple[list[View], int]:
-    """Render a table from a walking camera; return the views and the number of objects."""
+    """Render a table from a moving camera; return the views and the number of objects."""
     world, views = find_world(frames, objects), []
     for k in range(frames):
         frame, _ = render_frame(world, k, rng=np.random.default_rng(k), sensor=KINECT)
@@ -62,21 +62,21 @@ def tabletop(frames: int, *, objects: int = 8) -> tuple[list[View], int]:
 
 
 def standing(frames: int, *, objects: int = 8) -> list[View]:
-    """Render the same table so many times from one place: only the noise differs."""
+    """Render the same table from one position; the views differ only in noise."""
     world = find_world(frames, objects)
     sees = (np.random.default_rng(k) for k in range(frames))
     return [View(render_frame(world, 0, rng=rng, sensor=KINECT)[0], world.path[0]) for rng in sees]
 
 
 def to_and_fro(views: list[View], frames: int) -> Iterator[View]:
-    """Yield so many views of a camera that moves to and fro."""
+    """Yield the views of a camera that moves back and forth."""
     cycle = [*views, *views[-2:0:-1]]
     for k in range(frames):
         yield cycle[k % len(cycle)]
 
 
 def write(path: Path, views: list[View], frames: int, *, container: str = "mcap") -> Path:
-    """Write a recording of so many frames; ``path`` gets the suffix of the format."""
+    """Write a recording with ``frames`` frames; ``path`` gets the suffix of the format."""
     suffix, kind = CONTAINERS[container]
     path = path.with_name(path.name.removesuffix(suffix) + suffix)
     with kind(path) as writer:
@@ -97,7 +97,7 @@ def write(path: Path, views: list[View], frames: int, *, container: str = "mcap"
 
 
 class Spent(NamedTuple):
-    """What a run has cost."""
+    """Cost of a run, without compiling, and its run.json."""
 
     wall_s: float
     cpu_s: float
@@ -108,7 +108,7 @@ class Spent(NamedTuple):
 def spend(
     recording: Path, out: Path, cores: set[int], *options: str, checkout: Path | None = None
 ) -> Spent:
-    """Run ``shapecat process`` on some cores alone; that of another checkout, if there is one."""
+    """Run ``shapecat process``, of this or another checkout, on the given cores only."""
     out = out / (checkout.name if checkout else "here")  # another version does not overwrite runs
     out.mkdir(exist_ok=True)
     python = sys.executable if checkout is None else str(checkout / ".venv" / "bin" / "python")
@@ -135,7 +135,7 @@ def spend(
 def speed(
     folder: Path, frames: int, repeats: int, against: Path | None
 ) -> tuple[str, dict[str, Any]]:
-    """Measure frames per second, all outputs on, on one core and on two."""
+    """Measure the frames per second with all outputs, on one core and on two."""
     views, objects = tabletop(60)
     rows: list[tuple[Any, ...]] = []
     figures: dict[str, Any] = {"objects": objects, "frames": frames}
@@ -165,7 +165,7 @@ def speed(
 def _measure(
     recording: Path, folder: Path, cores: set[int], repeats: int, against: Path | None
 ) -> dict[str, Any]:
-    """Measure a recording; with another checkout in turns, as the machine may be shared."""
+    """Measure a recording, alternating with another checkout, as the machine may be shared."""
     rates: dict[Path | None, list[tuple[float, ...]]] = {}
     for _ in range(repeats):
         for checkout in (None, against) if against else (None,):
@@ -189,7 +189,7 @@ def _measure(
 
 
 def growth(folder: Path, counts: list[int]) -> tuple[str, dict[str, Any]]:
-    """Measure cost per further frame and peak memory over the number of frames, on one core."""
+    """Measure cost per additional frame and peak memory over the number of frames, on one core."""
     views, _ = tabletop(60)
     cores = set(sorted(os.sched_getaffinity(0))[:1])
     rows, figures = [], {}
@@ -199,7 +199,7 @@ def growth(folder: Path, counts: list[int]) -> tuple[str, dict[str, Any]]:
         if not done:
             few = [spend(recording, folder, cores, "--end", str(FEW_S)) for _ in range(REPEATS)]
             done, cpu_s = few[0].run["counts"]["frames"], min(spent.cpu_s for spent in few)
-        # Start-up weighs on short recordings, and differs from run to run.
+        # Start-up dominates short recordings and varies from run to run.
         runs = [spend(recording, folder, cores) for _ in range(REPEATS if frames < MANY else 1)]
         least = min(spent.cpu_s for spent in runs)
         each, peak = 1e3 * (least - cpu_s) / (frames - done), round(runs[0].peak_mb)
@@ -212,16 +212,16 @@ def growth(folder: Path, counts: list[int]) -> tuple[str, dict[str, Any]]:
 
 
 @click.command()
-@click.option("--full", is_flag=True, help="Recordings of up to 10,000 frames.")
-@click.option("--frames", default=1000, help="Frames of the recording that speed is measured on.")
-@click.option("--repeats", default=2, help="The best of so many runs counts.")
+@click.option("--full", is_flag=True, help="Include recordings of up to 10,000 frames.")
+@click.option("--frames", default=1000, help="Frames of the recordings that measure the speed.")
+@click.option("--repeats", default=2, help="Number of runs; the best one counts.")
 @click.option(
     "--against",
     type=click.Path(exists=True, path_type=Path),
-    help="Another checkout to compare with, whose .venv is installed.",
+    help="Another checkout to compare with, with its .venv installed.",
 )
 def main(*, full: bool, frames: int, repeats: int, against: Path | None) -> None:
-    """Measure whole recordings, print tables, write ``build/benchmarks_whole.json``."""
+    """Measure whole recordings, print tables and write ``build/benchmarks_whole.json``."""
     with tempfile.TemporaryDirectory() as folder:
         table, figures = speed(Path(folder), frames, repeats, against and against.resolve())
         print(table)
