@@ -207,8 +207,8 @@ def _fill(seen: I4, region: tuple[int, int, int, int], narrow: int, wide: int) -
     """
     left, top, right, bottom = region
     height, width = bottom - top, right - left
-    west = np.zeros((height, width + 1), np.int32)  # of the pixel before
-    north = np.zeros((height + 1, width), np.int32)  # of the pixel above
+    west = np.zeros((height, width + 1), np.int32)  # `_step` from the left
+    north = np.zeros((height + 1, width), np.int32)  # `_step` from above
     for v in range(height):
         row = seen[top + v, left:right]
         _step_row(row, north[v], north[v + 1])

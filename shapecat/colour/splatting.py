@@ -153,10 +153,11 @@ def _row_and_column(pixel: int, row: int, width: int) -> tuple[int, int]:
 
 @kernel
 def _extent(depth: F4, pixels: U4, own: Bool) -> tuple[int, int, int, int, float, float]:
-    """Return first and last row and column and greatest depth of some pixels, and the least of all.
+    """Return the extent of some pixels in the image and in depth.
 
-    The order is top, bottom, left, right, least and greatest depth. ``own`` is set to True at the
-    sparse pixels that are among them.
+    It is first and last row, first and last column, the least depth of all sparse pixels of the
+    image, and the greatest depth of these pixels. ``own`` is set to True at the sparse pixels
+    among them.
     """
     top, bottom, left, right = depth.shape[0], -1, depth.shape[1], -1
     near, far = np.float32(np.inf), np.float32(0)
@@ -167,7 +168,7 @@ def _extent(depth: F4, pixels: U4, own: Bool) -> tuple[int, int, int, int, float
         if z > 0:
             far = max(far, z)
             top, bottom, left, right = min(top, v), max(bottom, v), min(left, u), max(right, u)
-            if (v | u) % _SPARSE == 0:  # a power of 2: of both
+            if (v | u) % _SPARSE == 0:  # a power of 2, so that this tests both
                 own[v // _SPARSE, u // _SPARSE] = True
     for j in range(own.shape[0]):
         for i in range(own.shape[1]):

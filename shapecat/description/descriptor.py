@@ -92,7 +92,7 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
     cloud = np.zeros((3, total), np.float32)
     for k in range(total):
         for axis in range(3):
-            # only points that are not the neurons' own are so far away; squares stay finite
+            # points this far away are not the neurons' own: the bound keeps squares finite
             value = (points[k * step, axis] - middle[axis]) / unit
             cloud[axis, k] = min(max(value, -_FAR), _FAR)
     away = 0.0

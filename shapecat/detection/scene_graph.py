@@ -167,7 +167,7 @@ def format_tree(scene: Scene, describe: Callable[[Scene, Node], str] | None = No
 
     Parameters
     ----------
-    describe : returns the text for a node; by default its index and size.
+    describe : returns the text for a node; by default its kind, index and size.
 
     Examples
     --------

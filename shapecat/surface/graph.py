@@ -18,7 +18,7 @@ _LONGEST = 3.0
 
 @kernel
 def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
-    """Finish the graph of a gas; return the adjacency (n, n) of the n neurons that stay.
+    """Finish the graph of a gas; return the adjacency (n, n) of the n neurons that are kept.
 
     1. Remove neurons that are nearest to no point.
     2. Move each neuron to the mean of the points it is nearest to (one step of Lloyd 1982). This
@@ -28,18 +28,18 @@ def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
        nearest to some point and not far apart. With the links of the gas alone, a third of the
        neurons is in no triangle.
     4. Remove components with less than a share of the points, but never the largest.
-    5. Connect the components that stay at their smallest gap.
+    5. Connect the remaining components where they are nearest to each other.
 
     Parameters
     ----------
     cloud : the points.
-    gas : the neurons, changed in place: those that stay come first, in their old order.
+    gas : the neurons, changed in place: those that are kept come first, in their old order.
     count : number of neurons in ``gas``.
     share : least share of the points in a component.
 
     Returns
     -------
-    Empty, (0, 0), if fewer than 3 neurons stay.
+    Empty, (0, 0), if fewer than 3 neurons are kept.
     """
     adjacent = np.zeros((count, count), np.bool_)
     for i in range(count):

@@ -72,18 +72,18 @@ def _fire(
     signal, which takes longer than all steps together.
     """
     padded = (count + LANES - 1) // LANES * LANES
-    # 5. the nearest and the second nearest neuron
+    # 5. find the nearest and the second nearest neuron
     a, b = two_nearest(x, y, z, padded, sx, sy, sz, mask)
-    # 6. the edges of the nearest get older
+    # 6. age the edges of the nearest
     wins[a] += 1
-    # 7. its error grows by the squared distance
+    # 7. add the squared distance to its error
     dx, dy, dz = x[a] - sx, y[a] - sy, z[a] - sz
     error[a] += np.float32(gain) * (dx * dx + dy * dy + dz * dz)
-    # 8. it and its neighbours move towards the signal
+    # 8. move it and its neighbours towards the signal
     age = wins[a] + adapt(
         x, y, z, padded, sx, sy, sz, born, a * x.size, ABSENT, wins, a, rate_winner, rate_neighbour
     )
-    # 9. the two are linked, or their edge is new again
+    # 9. link the two, or reset the age of their edge
     refresh(degree, wins, born, a, b)
     return a, age
 
@@ -159,10 +159,10 @@ def grow_fritzke(
             x, y, z, error, degree, wins, born, count, mask, px[k], py[k], pz[k],
             gain, rate_winner * rest, rate_neighbour * rest,
         )  # fmt: skip
-        # 10. edges that are too old go
+        # 10. remove edges that are too old
         if age > oldest:
             _drop_old_edges(degree, wins, born, count, a, oldest)
-        # 11. a neuron where the error is largest, every ``interval`` signals
+        # 11. insert a neuron where the error is largest, every ``interval`` signals
         until -= 1
         if until == 0 and count < target:
             until = interval
@@ -172,12 +172,12 @@ def grow_fritzke(
             gas.error[f] *= np.float32(0.5)
             gas.error[count] = gas.error[q]
             count += 1
-        # 12. all errors decay: here each new one counts more instead
+        # 12. all errors decay: instead, each new one gets more weight
         gain *= _GAIN
         if gain > 1e6:
             gas.error[:] *= np.float32(1e-6)
             gain *= 1e-6
-    # 13. the number of signals ends it
+    # 13. stop after the number of signals
     return count
 
 
@@ -229,7 +229,7 @@ def grow_thesis(
                 x, y, z, error, degree, wins, born, count, mask, px[k], py[k], pz[k],
                 1.0, rate_winner * rest, rate_neighbour * rest,
             )  # fmt: skip
-            # 10. edges that are too old go
+            # 10. remove edges that are too old
             if age > oldest:
                 _drop_old_edges(degree, wins, born, count, a, oldest)
             rest -= fall

@@ -130,7 +130,7 @@ def _nearest(wanted: int) -> Callable[..., Any]:
         for _ in range(wanted):
             least = v.reduce_least(lists[0])
             found.append(build.zext(build.and_(least, mask), _I64))
-            # The lane that had it moves up.
+            # The lane with the minimum moves its list up.
             had = build.icmp_signed("==", lists[0], v.splat(least, _INTS))
             after = [*lists[1:], _constant(_LARGEST)]
             lists = [build.select(had, b, a) for a, b in zip(lists, after, strict=True)]

@@ -19,7 +19,7 @@ _SQUARINGS = 6
 
 
 def thin(points: F4, *, settings: SurfaceSettings) -> F4:
-    """Return the points of an object that the gas learns: (m, 3) metres, one for each voxel.
+    """Thin the points of an object for the gas: return (m, 3) metres, one point for each voxel.
 
     The points of a voxel are averaged, then smoothed if the settings ask for it. differs: the
     thesis smooths the whole cloud before thinning; smoothing the thinned points of an object takes
@@ -44,11 +44,11 @@ def smooth(points: F4, *, radius_m: float) -> F4:
     For the neighbours p_i of a point p within the radius h, weighted by
     ``w_i = exp(-|p_i - p|**2 / (h / 2)**2)``:
 
-    1. the plane through their weighted mean, along the normal n of least weighted variance; q is
-       the projection of p onto it;
-    2. the polynomial g of degree 2 over the plane, with origin q, that minimises
+    1. fit the plane through their weighted mean whose normal n is the direction of least weighted
+       variance; q is the projection of p onto it;
+    2. fit the polynomial g of degree 2 over the plane, with origin q, that minimises
        ``sum_i w_i (n . (p_i - q) - g(u_i, v_i))**2``;
-    3. p moves to ``q + g(0, 0) n``.
+    3. move p to ``q + g(0, 0) n``.
 
     Parameters
     ----------
@@ -174,7 +174,7 @@ def _plane(near: F8, found: int) -> tuple[F8, float]:
 def _least_direction(spread: F8) -> F8:
     """Return the unit eigenvector of the smallest eigenvalue of a symmetric (3, 3) matrix.
 
-    It belongs to the largest eigenvalue of the adjugate, which dominates the powers of that.
+    It belongs to the largest eigenvalue of the adjugate, and so dominates the adjugate's powers.
     """
     power = np.zeros((3, 3))
     for a in range(3):

@@ -52,7 +52,7 @@ def find_leaves(
     while inner:  # one level down in each tree
         inner = False
         for lane in range(LANES):
-            node = np.uint32(leaves[lane])  # unsigned: it cannot count from the end
+            node = np.uint32(leaves[lane])  # unsigned: no check for negative indices
             child = left[node]
             right = x[np.uint16(feature[node])] > threshold[node]
             leaves[lane] = child + np.int32(right) if child > 0 else leaves[lane]

@@ -22,8 +22,9 @@ class CleanupSettings(NamedTuple):
     cut_share: float = 0.4
     """Least share of the perimeter of such structure, taken for a square, at the image border."""
     fringe: float = 0.6
-    """Least height of a sample next to an object to belong to it, relative to the least height
-    elsewhere, which is safe against noise: elsewhere, samples this low are as often the plane."""
+    """Least height at which a sample next to an object belongs to it, relative to the least height
+    elsewhere. That one is safe against noise: away from objects, samples as low as this are as
+    often the plane."""
     enclosed_share: float = 0.6
     """Least share of the boundary of a hole with the label around it: a ring seen from the side has
     this much, the gap between two objects half."""

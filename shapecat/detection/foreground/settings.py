@@ -16,7 +16,7 @@ class LowProfileSettings(NamedTuple):
     step: float = 0.002
     """Least mean rise across the outline of an object, 1/m: less than a step of a Kinect."""
     steady: float = 3.5
-    """Least rise as a multiple of the median rise between plane cells at the same distance."""
+    """Least rise as a multiple of the median rise between plane cells equally far apart."""
     slip: float = 0.7
     """Least rise as a share of the plane's change per cell: at a grazing angle, samples slightly
     out of place seem to rise."""

@@ -264,7 +264,7 @@ def merge(segments: Segments, p: int, q: int) -> None:
 
 @kernel
 def _add_pair(a: Row, b: Row) -> None:
-    """Add the `PAIR` ``b`` to ``a``, and clear ``b``."""
+    """Add the statistics ``b`` of a pair to ``a``, and clear ``b``; both are records of `PAIR`."""
     a.contact += b.contact
     a.in_front += b.in_front
     a.near += b.near
@@ -275,7 +275,7 @@ def _add_pair(a: Row, b: Row) -> None:
 
 @kernel
 def add_statistics(a: Row, b: Row) -> None:
-    """Add the `SEGMENT` ``b`` to ``a``."""
+    """Add the statistics ``b`` of a segment to ``a``; both are records of `SEGMENT`."""
     a.count += b.count
     a.boundary += b.boundary
     a.left, a.right = min(a.left, b.left), max(a.right, b.right)

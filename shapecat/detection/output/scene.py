@@ -103,7 +103,7 @@ def _boxes(
     """Return the boxes of all lists: measured on cells, or on points for hidden objects."""
     measured = found.measured
     sizes = [measured.center, measured.size, measured.orientation]
-    if sensor_from_view is IDENTITY:  # rows of frozen arrays need not be frozen one by one
+    if sensor_from_view is IDENTITY:  # rows of a frozen array are frozen
         sizes = [freeze(rows, "n k", "f4") for rows in sizes]
     boxes = [Box(*row) for row in zip(*sizes, strict=True)]
     if points is not None:

@@ -102,7 +102,7 @@ def _turn(
 def fit_horizontal_planes(
     rest: DepthSamples, height: F4, intrinsics: PinholeIntrinsics, up: F8, trials: F8
 ) -> F8:
-    """Return the horizontal planes (n, 3), as a, b, c of inverse depth, most samples first.
+    """Return the horizontal planes (n, 3), as coefficients a, b, c, most samples first.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ def fit_horizontal_planes(
         near, near_height, rest, height = _split(rest, height, peak)
         if near_height.size < LEAST_SAMPLES:
             break
-        # (4) refine, and keep what lies in the plane
+        # (4) refine the plane, and drop the samples on it
         offset = median_of(near_height)
         if offset > -PLANES.margin_m or not _fit(near, intrinsics, up, trials, offset, found[n]):
             continue

@@ -18,13 +18,13 @@ class UpSettings(NamedTuple):
     least_share: float = 0.04
     """Least share of the surface that faces up: a table at the edge of the image."""
     trials: int = 120
-    """Directions tried: that of 1 normal in 25 is missed with a probability below 1 %."""
+    """Directions tried: one shared by 1 in 25 normals is missed with a probability below 1 %."""
     level_bin_m: float = 0.04
     """Height of a bin, metres: more than the noise at 2 m, less than the gap between boards."""
     several: float = 1.5
     """Exponent of the number of levels: a shelf has several, the wall behind it one."""
     clear: float = 2.0
-    """Exponent of the share of the surface facing a direction that is in large levels."""
+    """Exponent of the share of large levels in the surface that faces a direction."""
     aslant: float = 0.6
     """Share of the score that a direction along the optical axis loses: walls, not tables."""
     held: float = 3.0
@@ -68,7 +68,7 @@ class PlaneSettings(NamedTuple):
     wall_m: float = 0.03
     """Samples within this distance behind an edge belong to the wall of a box, metres."""
     closed: float = 0.5
-    """Share of the samples below an edge that are on a wall, above which the wall closes a box."""
+    """A wall closes a box if more than this share of the samples below an edge is on the wall."""
     borne_m: float = 0.4
     """Greatest height above a large plane of an object on it, metres."""
 

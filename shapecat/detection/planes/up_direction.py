@@ -29,9 +29,9 @@ def estimate_up(
     """Return the unit normal (3,) of the dominant supporting plane; zeros if there is none.
 
     Without a hint, the candidates are the normals of the largest planes and the directions
-    perpendicular to two walls. The candidate with the most surface in large levels wins. Surface
-    that the camera sees head-on has less weight, so that the boards of a shelf beat its back, and
-    so does distant surface.
+    perpendicular to two walls. The candidate with the most surface in large levels wins. Candidates
+    along the line of sight score less, so that the boards of a shelf beat its back, and distant
+    surface has less weight.
 
     Parameters
     ----------

@@ -20,7 +20,7 @@ from shapecat.jit import kernel, unset
 __all__ = ["SurfaceGraph", "connect_surfaces"]
 
 BENT = 4
-"""The bits of a link times this mark, for a while, that only a local plane supports the link."""
+"""Factor of the bits of a link that marks, temporarily, that only a local plane supports it."""
 LEAST_CHORD = 3e-4
 """Squared distance between two unit normals at an angle of one degree."""
 

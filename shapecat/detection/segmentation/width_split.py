@@ -44,12 +44,15 @@ class Outlines(NamedTuple):
 def split_at_width_changes(
     grid: DepthGrid, heights: HeightMap, graph: SurfaceGraph, labels: I4, up: F8, n: int
 ) -> int:
-    """Give the part of a segment above a step a new label, in place; return the last label.
+    """Split segments where their outline has a step, in place; return the last label.
+
+    The part above the step gets a new label.
 
     Parameters
     ----------
     labels : (rows, columns) segments 1..n, 0 elsewhere.
     up : (3,) unit vector, sensor frame.
+    n : the last label before.
     """
     side = lateral_axis(up)
     outlines = _outlines_of(grid, heights.height, graph.spans, labels, n, side)
