@@ -116,7 +116,7 @@ def process(
 ) -> Run:
     """Process one recording as `shapecat process` does, and open the results.
 
-    They are in ``out/NAME``, where NAME is the recording's file name without its suffix. If they
+    They are in ``out/NAME``, where NAME is the name of the recording without its suffix. If they
     are there already, complete and from the same input, settings and model, they are only opened.
 
     Parameters

@@ -114,8 +114,8 @@ def perceive(
     Parameters
     ----------
     up : (3,) up direction in the sensor frame, a unit vector; None to estimate it from planes.
-    earlier : frames to fuse with this one. The pixels of candidates are only those with a reading
-        in ``frame`` itself.
+    earlier : frames to fuse with this one. Candidates contain only pixels that have a reading in
+        ``frame`` itself.
     """
     view = View(frame, up, tuple(earlier))
     perception, _ = _perceive(view, _NOTHING, Perceiver(categorizer, settings, None))
@@ -321,4 +321,4 @@ _TELLS_M2 = 0.1
 _UNDECIDED = 2.0
 """Novelty of an object with too few points for a surface: above the threshold, so unknown."""
 _SAME_UP = float(np.cos(np.radians(1.0)))
-"""Cosine between two measurements of the same up direction: within one degree."""
+"""Cosine of 1 degree: closer up directions are treated as equal."""

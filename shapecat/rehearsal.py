@@ -1,4 +1,4 @@
-"""Compile the kernels of perception in two processes: once per installation, it takes minutes.
+"""Compile the kernels of perception in two processes; it takes minutes, once per installation.
 
     python -m shapecat.rehearsal
 

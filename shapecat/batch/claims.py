@@ -23,7 +23,7 @@ from shapecat.system import stopping
 __all__ = ["Claim", "claim_name", "claimed"]
 
 _BEAT_S = 10.0
-"""Period in which a claim is rewritten."""
+"""Time between two rewrites of a claim."""
 _STALE_S = 45.0
 """The owner of a claim that stays unchanged for this time is presumed dead."""
 _LOOK_S = 1.0

@@ -1,7 +1,7 @@
 """manifest.jsonl: the state of each recording of a batch, one line per change.
 
-The last line of a recording is valid. In a folder, complete lines are appended under a lock, so
-that several shards can write to one file; a line truncated by a crash or a full disk is skipped.
+Only the last line of each recording counts. In a folder, complete lines are appended under a lock,
+so that several shards can write to one file; a line truncated by a crash or a full disk is skipped.
 At a URL nothing can be appended: each writer writes files of its own, called parts.
 """
 
@@ -33,7 +33,7 @@ _PART_BYTES = 2**20
 _MOST_BYTES = 8 * 2**20
 """Lines are sent at once when more than this are waiting."""
 _SEND_S = 5.0
-"""Period in which lines are sent."""
+"""Time between two transmissions of lines."""
 
 State = Literal["planned", "running", "complete", "failed"]
 
@@ -113,8 +113,8 @@ class Manifest:
 class RemoteManifest(Manifest):
     """A manifest at a URL, in parts: ``.manifest/SHARD/PART.jsonl``.
 
-    Only its writer changes a part. It replaces the last one by a longer one every few seconds,
-    until that holds a megabyte. At the end, ``manifest.jsonl`` gets the last line of each
+    Only its writer changes a part. Every few seconds it replaces its last part by a longer one,
+    until the part holds a megabyte. At the end, ``manifest.jsonl`` gets the last line of each
     recording. Lines that a killed writer had not sent are recovered from the run folders.
     """
 

@@ -1,4 +1,4 @@
-"""Process a recording at a URL, or for a run folder at a URL, in a temporary folder.
+"""Process a recording in a temporary folder if it, or its run folder, is at a URL.
 
 Object stores cannot rename. A run folder there is complete if it holds run.json, which is uploaded
 last; without it, other files are not a run.

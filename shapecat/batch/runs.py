@@ -38,7 +38,7 @@ _LINES = 1000
 _REPORT_S = 0.2
 """Shortest time between progress reports of a worker in one phase."""
 _HEED_S = 0.1
-"""Period in which a wait for workers checks for signals."""
+"""Time between two checks for signals while waiting for workers."""
 
 
 @dataclass(frozen=True)

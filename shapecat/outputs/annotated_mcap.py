@@ -49,10 +49,10 @@ def write_annotated(
 ) -> None:
     """Write a copy of a recording with annotation channels.
 
-    Each frame gets a message on ``/shapecat/scene`` and, for ROS, on ``/shapecat/detections``, also
-    without objects, with the stamp, frame id and log time of the frame. The metadata record
-    ``shapecat`` holds ``run`` as JSON under ``run.json``. The file gets its name when it is
-    complete.
+    Each frame, with or without objects, gets a message on ``/shapecat/scene`` and, for ROS, on
+    ``/shapecat/detections``. Messages have the stamp, frame id and log time of the frame. The
+    metadata record ``shapecat`` holds ``run`` as JSON under ``run.json``. The file gets its name
+    when it is complete.
 
     Parameters
     ----------

@@ -65,7 +65,7 @@ def properties(box: ShownBox) -> dict[str, str]:
 def text_position(center: Any, size: Any, orientation: Any) -> tuple[Any, Any, Any]:
     """Return the position (x, y, z) of the text just above a box, metres, sensor frame.
 
-    Center, size and orientation consist of numbers, or of arrays (n,) for n boxes.
+    The components of the arguments are numbers, or arrays (n,) for n boxes.
     """
     x, y, z = center
     qx, qy, qz, qw = orientation

@@ -33,7 +33,7 @@ def with_colour(
 ) -> Iterator[tuple[LabelledFrame, Frame, Coloured | None]]:
     """Pair labelled frames with their frames and colour images from the recording.
 
-    Frames that are not wanted are not read, where the file has an index.
+    From an indexed file, only the wanted frames are read.
 
     Parameters
     ----------

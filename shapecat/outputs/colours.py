@@ -19,7 +19,7 @@ CATEGORY_COLOURS: dict[str, tuple[int, int, int]] = {
 
 
 def colour_of(category: str) -> tuple[int, int, int]:
-    """Return the colour of a category; for any other name it depends on the name alone.
+    """Return the colour of a category; an unlisted one gets a colour computed from its name.
 
     Examples
     --------

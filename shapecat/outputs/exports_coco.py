@@ -25,7 +25,7 @@ def write_coco(out: Path, images: Images, categories: Sequence[str]) -> int:
 
     Masks are compressed run lengths. Objects with an uncertain label have ``iscrowd`` set, so that
     evaluation ignores them, and are not counted. ``track_id`` is unique in the data set;
-    ``attributes`` has the run and its own track number.
+    ``attributes`` holds the run and the track number in that run.
     """
     tracks: dict[tuple[str, int], int] = {}
     splits: dict[str, dict[str, list[dict[str, Any]]]] = {}

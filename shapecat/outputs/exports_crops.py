@@ -1,4 +1,4 @@
-"""Crops: each view of each object as a point cloud, in the layout of data sets.
+"""Crops: each view of each object as a point cloud, in the folder layout of data sets.
 
 ``DATASET/<category>/<instance>/<view>.pcd``: metres, z up, the support at z = 0; VIEWPOINT is the
 pose of the sensor.

@@ -39,7 +39,7 @@ def write_kitti(
     frames: Iterable[tuple[LabelledFrame, Frame, Coloured | None]],
     _finished: FinishedRun,
 ) -> int:
-    """Write label_2/, calib/ and velodyne/, files named by six digits; return how many objects.
+    """Write label_2/, calib/ and velodyne/, with six-digit names; return the number of objects.
 
     Colour images are written to image_2/ as undistorted PNG. ``frames.csv`` lists the frame of
     each number. Points are in the level frame of the sensor (x forward, y left, z up), with

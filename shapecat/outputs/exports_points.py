@@ -32,8 +32,8 @@ def write_point_labels(
     """Write the labels of all points; return the number of objects.
 
     For depth images it writes depth/ (millimetres), semantic/ and instance/ as 16-bit PNG; for
-    clouds velodyne/ (x, y, z, 0 of points with a reading, sensor frame) and labels/. frames.csv
-    lists the frame of each number, and its camera.
+    clouds velodyne/ (x, y, z and 0 for each point with a reading, sensor frame) and labels/.
+    frames.csv lists the frame of each number, and its camera.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Append annotations to a copy of an MCAP file, whose data section stays byte for byte."""
+"""Append annotations to a copy of an MCAP file, whose data section stays unchanged."""
 
 import errno
 import os

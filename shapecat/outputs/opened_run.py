@@ -84,7 +84,7 @@ def _rows(values: pa.FixedSizeListArray, width: int) -> Any:
 
 @dataclass(frozen=True)
 class RunFrame:
-    """A frame of a run: its objects, its points, and its colour image; None if it has none."""
+    """A frame of a run: its objects, its points, and its colour image, if any."""
 
     labelled: LabelledFrame
     reading: Frame
@@ -112,14 +112,14 @@ class RunFrame:
 
     @property
     def labels(self) -> I4:
-        """The track number of each pixel or point, -1 without an object; int32, of `shape`."""
+        """The track number of each pixel or point, -1 for none; int32, with shape `shape`."""
         image = np.full(self.shape, -1, np.int32)
         for item in self.objects:
             image.reshape(-1)[item.indices] = item.track
         return image
 
     def mask(self, item: LabelledObject) -> Bool:
-        """Return which pixels or points belong to an object, bool, of `shape`."""
+        """Return which pixels or points belong to an object; bool, with shape `shape`."""
         mask = np.zeros(self.shape, np.bool_)
         mask.reshape(-1)[item.indices] = True
         return mask

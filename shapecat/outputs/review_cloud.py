@@ -104,9 +104,9 @@ def _owners(frame: Frame, objects: Sequence[LabelledObject]) -> U2:
 
 
 def _grid(frame: Frame, limit: int) -> tuple[int, I4]:
-    """Return the step of a pixel grid and the flat indices of its about ``limit`` pixels.
+    """Return the step of a pixel grid, and the flat indices of about ``limit`` pixels on it.
 
-    A cloud has every k-th point instead. A limit of 0 means all.
+    For a cloud, these are k and the indices of every k-th point. A limit of 0 means all.
     """
     if frame.depth is None:
         n = 0 if frame.points is None else len(frame.points)

@@ -22,7 +22,7 @@ _PATIENCE_S = 60.0
 
 
 class ReviewFile:
-    """Copies what Rerun writes to a pipe into a file, in a thread; after an error it is dropped."""
+    """Copies Rerun's output from a pipe to a file, in a thread; drops it after an error."""
 
     def __init__(self, stream: rr.RecordingStream, file: IO[bytes]) -> None:
         """Connect ``stream`` to ``file``."""

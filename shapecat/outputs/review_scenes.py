@@ -17,7 +17,7 @@ from shapecat.types import Frame, LabelledFrame
 __all__ = ["PaintedFrame", "ReviewFrame", "choose_scenes", "paint_frame", "with_clouds"]
 
 _SOON_NS, _LATE_NS = 90_000_000, 240_000_000
-"""Shortest time between two scenes, and longest time if the frames differ."""
+"""Shortest time between two drawn scenes, and longest time between scenes that differ."""
 _STILL_M = 0.015
 """After a motion of this size, the scene is drawn as soon as allowed."""
 

@@ -28,7 +28,7 @@ _HELD_FRAMES = 8
 _KEPT_IMAGES, _KEPT_BYTES = 16, 96 << 20
 """Limits on the colour images kept for later frames; two are always kept."""
 _STAMP_BYTES = 12
-"""A ROS message holds its stamp in these first bytes: they do not change a calibration."""
+"""The first bytes of a ROS message hold its stamp, which a comparison of calibrations ignores."""
 _PATIENCE_NS = 500_000_000
 """A frame waits no longer than this for a colour image, in log time."""
 _USUAL_PERIOD_NS = 100_000_000
@@ -57,8 +57,9 @@ def frames_with_colour(
 
     Yields
     ------
-    Each frame with the colour image nearest in stamp, or None if no readable image is within half
-    a period of the colour stream. Unless ``needed`` is given, warnings count the missing images.
+    Each frame with the colour image that has the nearest stamp, or None if no readable image is
+    within half a period of the colour stream. Unless ``needed`` is given, warnings of the
+    recording count the missing images.
     """
     partners = {
         stream.topic: _Partner(recording, stream, colours[stream.topic])

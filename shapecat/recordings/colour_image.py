@@ -20,7 +20,7 @@ __all__ = [
 ]
 
 _LARGEST = 1 << 26
-"""Images with more pixels are refused."""
+"""Images with more pixels are rejected."""
 
 _CHANNELS = {
     "rgb8": (1, (0, 1, 2), 3),

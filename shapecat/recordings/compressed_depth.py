@@ -16,7 +16,7 @@ __all__ = ["depth_of_compressed"]
 _HEADER = struct.Struct("<iff")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _LARGEST = 1 << 26
-"""Images with more pixels are refused."""
+"""Images with more pixels are rejected."""
 
 
 def depth_of_compressed(message: Any) -> F4:

@@ -1,4 +1,4 @@
-"""The readings of a depth sensor, frame by frame."""
+"""Read the frames of a recording in order."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -34,8 +34,8 @@ def frames(
     every : keep every n-th message of a stream.
     skipped : receives the number of unreadable frames by reason; they raise no error.
     heard : callbacks for the messages of other topics, so that the file is read only once.
-    needed : returns for a topic and a log time (ns) whether the frame, or the message for
-        ``heard``, is needed; an indexed file may leave out the rest.
+    needed : function of topic and log time (ns) that returns whether that frame, or message for
+        ``heard``, is needed; from an indexed file, the rest may be left out.
 
     Yields
     ------

@@ -37,7 +37,7 @@ class Upright:
     vector : (3,) the up direction in the sensor frame that the user gave, or None.
     sources : ``tf`` and ``imu``, in the order in which they are tried; empty with a vector.
     warnings : for the user.
-    dropped : topics whose given up direction is ignored, and the source of that direction.
+    dropped : maps each topic whose given up direction is ignored to the source of the direction.
     """
 
     transforms: TransformBuffer
@@ -99,7 +99,7 @@ class Upright:
         return vector
 
     def preview(self, frame: Frame) -> tuple[str, F4 | None]:
-        """Return the source of the up direction, and the direction (3,), without counting it."""
+        """Return the source and the up direction (3,) for a frame; do not count the look-up."""
         counted = self._failed, self._first_failure
         answer = self._find(frame)
         self._failed, self._first_failure = counted

@@ -18,7 +18,7 @@ class Lens:
     """The lens of unrectified depth images; recomputed when the calibration changes."""
 
     def __init__(self, recording: Recording, topic: str) -> None:
-        """Begin without a calibration."""
+        """Start without a calibration."""
         self._recording = recording
         self._topic = topic
         self._key: tuple[Camera, str, tuple[float, ...]] | None = None

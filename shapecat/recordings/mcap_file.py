@@ -43,7 +43,7 @@ __all__ = ["McapRecording"]
 _SMALL = 1 << 16
 """Messages up to this size are copied, so that they do not keep their chunk in memory."""
 _PART = 0.9
-"""If more than this share of a chunk is needed, all is decompressed and the checksum verified."""
+"""If more than this share of a chunk is needed, the whole chunk is decompressed and verified."""
 
 
 class McapRecording(Recording):

@@ -69,11 +69,11 @@ class TruncatedError(RecordingError):
 
 
 class ChunkError(RecordingError):
-    """A chunk that is damaged, or whose sizes are not plausible."""
+    """A chunk or record is damaged, or its sizes are not plausible."""
 
 
 class Record(NamedTuple):
-    """A record's opcode and its content's place in the file; ``whole`` is False if truncated."""
+    """A record's opcode, and offset and length of its content in bytes; ``whole`` if complete."""
 
     opcode: int
     offset: int

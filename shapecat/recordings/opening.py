@@ -17,7 +17,7 @@ def open_recording(path: Path) -> Recording:
 
     Raises
     ------
-    RecordingError : the path does not exist or is no readable recording; the text is one line.
+    RecordingError : the path does not exist or is not a readable recording.
     """
     path = Path(path)
     try:
@@ -54,7 +54,7 @@ _READERS: dict[str, Callable[[Path], Recording]] = {
     "SQLite format 3": _database,
     "folder": _folder,
 }
-"""The reader for each beginning of a file, and for folders."""
+"""Readers by the first bytes of a file; ``folder`` for folders."""
 
 _EXPECTED = "expected an .mcap, .bag or .db3 file, or a ROS 2 bag folder"
 

@@ -66,7 +66,7 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
 
 
 def still_fits(fit: PinholeFit, points: F4) -> bool:
-    """Return whether a camera fits an organized cloud (h, w, 3) about as well as its own points."""
+    """Return whether the camera of a fit also fits another organized cloud (h, w, 3)."""
     camera, sample = fit.camera, _sample(points)
     if sample is None:
         return points.shape[:2] == (camera.height, camera.width)  # too few points to contradict it

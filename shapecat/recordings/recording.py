@@ -49,7 +49,7 @@ class Recording(ABC):
         return tuple(self._channels.values())
 
     def parts(self) -> list["Recording"]:
-        """Return one recording per file; by default the recording itself."""
+        """Return one recording per file; a recording in a single file returns itself."""
         return [self]
 
     def messages(
@@ -65,7 +65,7 @@ class Recording(ABC):
         ----------
         topics : names to read; all by default.
         start_ns, stop_ns : messages with ``start_ns <= log time < stop_ns`` are read.
-        needed : an indexed file may yield messages that are not needed with empty data.
+        needed : an indexed file may leave the data of other messages empty.
 
         Yields
         ------
@@ -96,7 +96,7 @@ class Recording(ABC):
         return decode(message, self._decoders)
 
     def warn(self, text: str) -> None:
-        """Add a warning, unless it is a repetition or there are very many already."""
+        """Add a warning, unless it is there already or there are very many."""
         if text not in self.warnings and len(self.warnings) <= _MOST_WARNINGS:
             enough = len(self.warnings) == _MOST_WARNINGS
             self.warnings.append("and more of this kind" if enough else text)

@@ -127,7 +127,7 @@ class BagRecording(Recording):
         return record.fields
 
     def _read_index(self, header: dict[str, bytes]) -> Counter[int] | None:
-        """Read the index and return the messages per connection; None if missing or damaged."""
+        """Read the index; return the message count per connection, None if it is unusable."""
         counts: Counter[int] = Counter()
         chunks = []
         try:

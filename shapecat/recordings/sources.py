@@ -205,7 +205,7 @@ def _depth_units(recording: Recording, topic: str) -> float | None:
 
 
 def _first(recording: Recording, topic: str) -> Any:
-    """Return the first decodable message of a topic in the whole recording; None if none is."""
+    """Return the first decodable message of a topic in the recording; None if there is none."""
     for message in recording.messages([topic]):
         with suppress(MessageError):
             return recording.decode(message)

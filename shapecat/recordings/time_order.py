@@ -29,7 +29,7 @@ def in_time_order(
     Parameters
     ----------
     chunks : time of the first message (ns), offset in the file, and chunk.
-    read : yields the messages of a chunk; called only once they are needed.
+    read : yields the messages of a chunk; called when they are needed.
     """
     waiting = sorted(chunks, key=lambda chunk: chunk[:2], reverse=True)
     heap: list[tuple[int, int, int, int, _M]] = []

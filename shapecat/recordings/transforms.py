@@ -35,11 +35,11 @@ _FIXED = ("map", "odom", "world")
 
 
 class TransformError(ShapecatError):
-    """The recording does not hold a transform."""
+    """A transform cannot be determined from the recording."""
 
 
 class UnknownFrameError(TransformError):
-    """No transform names a frame."""
+    """A frame does not occur in any transform."""
 
 
 class DisconnectedError(TransformError):
@@ -61,7 +61,7 @@ class _Sample(NamedTuple):
 
 
 class _Track:
-    """The transforms from one frame to its parent, sorted by time; packed, since many."""
+    """The transforms from one frame to its parent, sorted by time, in packed arrays."""
 
     def __init__(self) -> None:
         self.stamps = array("q")
@@ -149,21 +149,21 @@ class TransformBuffer:
         return True
 
     def ancestors(self, frame_id: str) -> tuple[str, ...]:
-        """Return a frame and its ancestors, nearest first, by the latest transforms.
+        """Return a frame and its ancestors, nearest first, according to the latest transforms.
 
         Returns
         -------
-        Empty if no transform names the frame.
+        Empty if the frame does not occur in any transform.
 
         Raises
         ------
-        TransformLoopError : an ancestor of the frame is its own ancestor.
+        TransformLoopError : the frame or an ancestor is its own ancestor.
         """
         name = frame_id.lstrip("/")
         return tuple(self._ancestors(name)) if name in self._frames else ()
 
     def root_of(self, frame_id: str) -> str:
-        """Return the root of a frame's tree, by the latest transforms.
+        """Return the root of a frame's tree, according to the latest transforms.
 
         Raises
         ------
@@ -201,7 +201,7 @@ class TransformBuffer:
         return name
 
     def _ancestors(self, frame_id: str, stamp_ns: int | None = None) -> list[str]:
-        """Return a frame and its ancestors at a time; without one, by the latest transforms."""
+        """Return a frame and its ancestors at a time; by the latest transforms if it is None."""
         chain = [frame_id]
         while (parent := self._parent(chain[-1], stamp_ns)) is not None:
             if parent in chain or len(chain) > _DEEPEST:
@@ -279,7 +279,7 @@ def fixed_frame(buffer: TransformBuffer, frame_id: str) -> str | None:
 
     Returns
     -------
-    None if no transform names ``frame_id``, if it is the root itself, or if frames form a loop.
+    None if ``frame_id`` is in no transform, if it is the root itself, or if frames form a loop.
     """
     try:
         root = buffer.root_of(frame_id)

@@ -43,8 +43,8 @@ def new_id() -> str:
 def work_id(run: RunInfo) -> str:
     """Return the id of the work that run.json describes, once the digest of the input is known.
 
-    It is a hash of content, settings, options, model and version, without those that do not affect
-    the tables. The first letter keeps spreadsheets from reading a number.
+    It is a hash of content, settings, options, model and version, except what does not affect the
+    tables. The first letter keeps spreadsheets from reading a number.
     """
     settings = {name: value for name, value in run["settings"].items() if name != "outputs"}
     options = {name: value for name, value in run["options"].items() if name not in _OUTPUTS}
@@ -54,13 +54,16 @@ def work_id(run: RunInfo) -> str:
 
 
 def file_stats(path: Path) -> Stats:
-    """Return name, size and times of each file of a recording, without reading it."""
+    """Return name, size and times of each file of a recording, without reading the files."""
     stats = [(file.name, file.stat()) for file in input_files(path)]
     return [[name, s.st_size, s.st_mtime_ns, s.st_ctime_ns] for name, s in stats]
 
 
 def unchanged(before: Sequence[Sequence[Any]], path: Path) -> bool:
-    """Return whether the files of a recording have the same names, sizes and content times."""
+    """Return whether the files of a recording have the same names, sizes and modification times.
+
+    ``before`` is from `file_stats`.
+    """
     try:
         return [list(s[:3]) for s in before] == [s[:3] for s in file_stats(path)]
     except OSError:

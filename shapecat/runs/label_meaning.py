@@ -61,14 +61,14 @@ _Verdict = str | int | None
 def find_misread(
     rows: Sequence[TrackRow], categories: Iterable[str] = (), *, one_frame: bool = True
 ) -> dict[int, str]:
-    """Return why a label is invalid or contradicts other labels, by track."""
+    """Return the problem of each invalid or contradictory label, by track number."""
     return resolve_labels(rows, categories, one_frame=one_frame)[1]
 
 
 def resolve_labels(
     rows: Sequence[TrackRow], categories: Iterable[str], *, one_frame: bool
 ) -> tuple[dict[int, TrackLabel], dict[int, str]]:
-    """Return the final labels and the problems of invalid ones, both by track.
+    """Interpret the labels of all tracks.
 
     Parameters
     ----------
@@ -77,7 +77,8 @@ def resolve_labels(
 
     Returns
     -------
-    Deleted tracks have neither a label nor a problem.
+    The final labels, and the problems of invalid labels, both by track number. Deleted tracks have
+    neither.
     """
     known = {n.lower(): n for n in (UNKNOWN, *CATEGORIES, *categories, *(r.category for r in rows))}
     verdicts: dict[int, _Verdict] = {}

@@ -25,11 +25,11 @@ __all__ = [
 
 IN_TIME, IN_PLACE = "frames in common", "places in another recording"
 TABLE_ALONE = "places in the table alone"
-"""Matching without the table's run: its fixed frame is unknown, and which objects moved."""
+"""Matching without the run of the table: its fixed frame and moved objects are unknown."""
 
 
 class Transferred(NamedTuple):
-    """A transferred label; ``distance_m`` is between the object's centres in the two runs."""
+    """A transferred label; ``distance_m`` is the distance of the centres in the two runs."""
 
     old_track: int
     track: int
@@ -179,7 +179,7 @@ def _is_in_its_run(path: Path, table: TrackTable) -> bool:
 
 
 def _groups(labelled: Sequence[TrackRow]) -> Group:
-    """Return the function from a track to the track that it was finally merged with."""
+    """Return a function that maps a track to the track at the end of its merges."""
     partners = {row.track: merged_with(row.label) for row in labelled}
 
     def root(track: int) -> int:

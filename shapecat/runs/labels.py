@@ -53,7 +53,7 @@ def read_labelled_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iter
     number; if several of them are in one frame, they are joined into one object.
     """
     shown = ShownTracks.read(folder, labels, causal=True)
-    release_memory()  # which the table of tracks used
+    release_memory()  # of the table of tracks
     masks = _MasksByFrame(read_masks(folder))
     groups = (
         read_row_groups(folder / f"{name}.parquet", columns)

@@ -118,7 +118,7 @@ def perceive_all(work: Work) -> None:
 
 
 def revise(work: Work) -> None:
-    """Perceive frames that disagree with the rest again, and rewrite the tables.
+    """Perceive again the frames that disagree with the rest, and rewrite the tables.
 
     An up direction that the user gave is never revised. A frame keeps its first result if the
     second look finds nothing.
@@ -179,7 +179,7 @@ class _UpTrial:
         self._decided: set[str] = set()
 
     def before(self, source: Iterator[_Reading]) -> Iterator[_Reading]:
-        """Yield the frames, held back until the up direction of their topic is decided."""
+        """Yield all frames, but hold the first ones back until the up directions are decided."""
         held: list[_Reading] = []
         for reading in source:
             frame, _ = reading

@@ -25,7 +25,7 @@ __all__ = ["Group", "Match", "Matches", "match_in_place", "match_in_time"]
 _MOST_REACH_M = 0.10
 """Largest distance between two detections of one object in one frame, however segmented."""
 _MAJORITY = 0.6
-"""Least share of common frames in which matching tracks are mutual nearest neighbours."""
+"""Smallest share of common frames in which matching tracks are mutual nearest neighbours."""
 _RIVAL = 0.25
 """Another track with at least this share makes a match ambiguous."""
 _STILL_M = 0.04
@@ -34,7 +34,7 @@ _REACH = 0.5
 """Largest distance between the centres of one object in two views, relative to its width."""
 _LEAST_REACH_M = 0.04
 _CLEAR_M = 0.03
-"""The second nearest object must be farther than the nearest by this, or it is ambiguous."""
+"""A match is ambiguous unless the second nearest object is farther by at least this."""
 _SIZE_RATIO = 1.8
 """Largest ratio between the largest extents of an object in two recordings."""
 _SAMPLES = 40
@@ -65,10 +65,10 @@ class _Tracks(NamedTuple):
 
     Attributes
     ----------
-    tracks, numbers, detections : (n,) numbers of the track, the frame and the detection.
+    tracks, numbers, detections : (n,) track, frame and detection numbers.
     frames : topic and stamp (ns) of each detection.
     centers : (n, 3) metres, fixed frame.
-    keys : the detections of each topic and stamp.
+    keys : the rows of each topic and stamp.
     """
 
     tracks: I4

@@ -69,7 +69,7 @@ def _read_tables(segment: Path) -> _Tables:
 
 
 def _latest(folder: Path) -> Iterator[_Tables]:
-    """Yield the tables of each segment; frames are replaced if a second look found more."""
+    """Yield the tables of each segment; the results of a second look replace the first ones."""
     places = {
         key: segment
         for segment in list_segments(folder / REVISIONS)
@@ -105,8 +105,8 @@ def _picked(name: str, keys: Sequence[Key], sources: Sequence[_Tables]) -> pa.Ta
 def group_frames(frames: int) -> int:
     """Return the number of frames per row group, for a table of ``frames`` frames.
 
-    A reader holds one row group, and 30 kB of metadata for every one. So both the length and the
-    number of row groups grow with the square root of the number of frames.
+    A reader holds one row group, and 30 kB of metadata for each of them. So both the length and
+    the number of row groups grow with the square root of the number of frames.
     """
     return GROUP_FRAMES * max(1, isqrt(frames // _BALANCE))
 
