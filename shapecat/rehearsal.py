@@ -116,7 +116,7 @@ def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> 
     if notes is None or notes.exists():
         return 0.0
     if getattr(current_process(), "_inheriting", False):  # multiprocessing makes the same check
-        msg = 'a script that processes needs `if __name__ == "__main__":` around what it calls'
+        msg = 'a script that processes recordings needs `if __name__ == "__main__":`'
         raise RuntimeError(msg)
     begun = time.perf_counter()
     notes.parent.mkdir(parents=True, exist_ok=True)  # another version may have removed it

@@ -168,7 +168,7 @@ def test_the_table_tells_every_difference_once(shapecat: Run, run: Path, truth: 
     for words in ("box taken for can #2", "missed box", "surplus cup", "cup now #4", "data:image"):
         assert words in page
     assert "6 differences: 3 category" in result.stdout
-    assert "the recording is not there any more" in result.stderr
+    assert "the recording is missing" in result.stderr
 
 
 def test_nothing_is_replaced(shapecat: Run, run: Path, truth: Path) -> None:

@@ -203,7 +203,7 @@ def test_a_recording_that_is_still_written_to_has_no_results(
         if (phase, done) == ("perceive", 2):
             os.utime(source, ns=(1, 1))
 
-    with pytest.raises(RecordingError, match="has changed while it was processed"):
+    with pytest.raises(RecordingError, match="changed while it was processed"):
         process(Job(source, out / "live", end_s=0.1, rrd=False), write)
 
     assert not out.exists()

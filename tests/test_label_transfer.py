@@ -150,7 +150,7 @@ def test_a_table_without_the_column_is_the_runs_own_or_refused(tmp_path: Path) -
 
     adopt_labels(tmp_path / "mine.csv", mine)
     assert labels_of(mine) == {1: "bowl"}
-    with pytest.raises(OutputError, match="in other places"):
+    with pytest.raises(OutputError, match="at other positions"):
         adopt_labels(tmp_path / "theirs.csv", mine)
     assert labels_of(mine) == {1: "bowl"}
     adopt_labels(tmp_path / "hand.csv", mine)

@@ -87,11 +87,11 @@ def test_names_of_categories(run: Path, label: str, meant: str) -> None:
         ("cpu", "did you mean cup?"),
         ("catcus", "did you mean cactus?"),
         ("delte", "did you mean delete?"),
-        ("pan", "For a category of its own write `new pan`"),
+        ("pan", "For a new category write `new pan`"),
         ("merge with", "is not a category, `delete` or `merge with N`"),
         ("merge 2", "is not a category"),
         ("merge with 77", "there is no track 77"),
-        ("merge with 4", "leads in a circle: 4 -> 4"),
+        ("merge with 4", "forms a loop: 4 -> 4"),
         ("7", "is not a category"),
         ("../../etc", "is not a category"),
         ("a/b", "is not a category"),
@@ -116,7 +116,7 @@ def test_chains_of_merges_end_in_one_track(run: Path) -> None:
     assert {labels[k] for k in (2, 3, 4)} == {TrackLabel(3, "bowl", 1.0)}
 
     for wrong, message in [
-        ({"t4": "merge with 2", "t2": "merge with 4"}, "circle"),
+        ({"t4": "merge with 2", "t2": "merge with 4"}, "forms a loop"),
         ({"t4": "merge with 2", "t2": "delete"}, "track 2 is deleted"),
     ]:
         (run / "tracks.csv").write_text(labelled(**wrong))

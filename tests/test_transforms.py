@@ -121,7 +121,7 @@ def test_what_is_missing_is_named() -> None:
 
     with pytest.raises(UnknownFrameError, match="'x'; known frames: a, b, c, d"):
         buffer.lookup("a", "x", 0)
-    with pytest.raises(DisconnectedError, match="between b and d: they hang on a and c"):
+    with pytest.raises(DisconnectedError, match="between b and d: their roots are a and c"):
         buffer.lookup("b", "d", 0)
     with pytest.raises(TransformLoopError, match="loop"):
         buffer.lookup("e", "a", 0)

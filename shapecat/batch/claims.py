@@ -115,7 +115,7 @@ class Claim:
         OutputError : another process has, since this one was silent for too long.
         """
         if not self._is_held():
-            msg = f"{self._url}: another run has taken over: this one was not heard of for too long"
+            msg = f"{self._url}: another run has taken over, since this one was silent for too long"
             raise OutputError(msg)
 
     def beat(self) -> bool:

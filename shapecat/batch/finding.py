@@ -58,7 +58,8 @@ def find_recordings(sources: Sequence[str]) -> Found:
     paths, left_out = _find_paths([Path(source) for source in sources if not is_url(source)])
     kept = [_of_path(path) for path in paths] + list(remote.values())
     if not kept:
-        msg = f"{' '.join(sources[:3])}: no recording there: no .mcap, .bag or .db3, no ROS 2 bag"
+        named = " ".join(sources[:3])
+        msg = f"{named}: no recording there; expected .mcap, .bag or .db3 files, or a ROS 2 bag"
         raise RecordingError(msg)
     return Found(kept, left_out)
 

@@ -149,7 +149,7 @@ class _Turn(Generic[_Item, _Result]):
         error = self._future.exception()
         if error is None or self._item is None:
             return self._future.result()
-        _log.warning("another process failed (%s): going on without its result", error)
+        _log.warning("another process failed (%s): repeating its work here", error)
         return self._work(self._item)
 
 

@@ -142,7 +142,7 @@ def upward(labelled: LabelledFrame) -> F4:
     ValueError : the up direction is unknown.
     """
     if labelled.up is None:
-        msg = f"frame {labelled.index} of {labelled.topic} does not tell where up is"
+        msg = f"frame {labelled.index} of {labelled.topic} has no up direction"
         raise ValueError(msg)
     return labelled.up
 

@@ -86,7 +86,7 @@ def _runs_in(folder: Path) -> list[Path]:
     runs = sorted(path.parent for path in folder.glob("*/run.json"))
     runs = [run for run in runs if not run.name.startswith(".")]
     if not runs:
-        msg = f"{folder}: no run.json there or one level below; expected results of a process"
+        msg = f"{folder}: no run.json there or one level below; expected runs of `process`"
         raise OutputError(msg)
     return runs
 
@@ -106,7 +106,7 @@ def open_source(run: RunInfo, moved_to: Path | None = None) -> Iterator[Recordin
     """
     path = moved_to or Path(run["input"]["path"])
     if moved_to is None and not path.exists():
-        msg = f"{path}: the recording is not there any more; say where it is: --recording PATH"
+        msg = f"{path}: the recording is missing; if it was moved, give --recording PATH"
         raise RecordingError(msg)
     with open_recording(path) as recording:
         if not same_content(run["input"], path, lambda: content_digest(path)):

@@ -199,11 +199,11 @@ def _why(said: IO[bytes]) -> str:
     text = said.read().decode("utf-8", "replace")
     if any(word in text for word in ("adapter", "Vulkan", "render context")):
         return (
-            "the viewer finds nothing to draw with; without a graphics card install a software "
+            "the viewer found no graphics device; without a graphics card install a software "
             "renderer (Debian, Ubuntu: the package mesa-vulkan-drivers)"
         )
     lines = [line for line in text.splitlines() if line.strip()]
-    return f"the viewer ended: {lines[-1] if lines else 'it said nothing'}"
+    return f"the viewer ended: {lines[-1] if lines else 'without a message'}"
 
 
 def _wait_until(ready: Callable[[], bool]) -> None:

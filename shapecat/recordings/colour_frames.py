@@ -217,7 +217,7 @@ class _Partner:
 def _reason(error: Exception, topic: str) -> str:
     if isinstance(error, RecordingError):
         return str(error).removeprefix(f"{topic}: ")[:160]
-    return "message is not laid out as its type says"
+    return "message does not match its type"
 
 
 def _lens(camera: Camera | None) -> LensCamera | None:
@@ -231,7 +231,7 @@ def _lens_of(info: Any, topic: str) -> LensCamera:
         return LensCamera(camera)
     model = str(info.distortion_model)
     if model not in LENS_MODELS:
-        msg = f"lens distortion {model!r} is not known"
+        msg = f"unknown lens distortion {model!r}"
         raise MessageError(msg)
     coefficients = tuple(float(c) for c in (info.d if hasattr(info, "d") else info.D))
     return LensCamera(camera, model, coefficients)

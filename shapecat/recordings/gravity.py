@@ -131,9 +131,7 @@ class Upright:
         else:
             self.dropped[topic] = source
             name = "imu" if source.startswith("imu") else "tf"
-            self.warnings.append(
-                f"up ({source}) {off} and is not used; to go by it, give --up {name}"
-            )
+            self.warnings.append(f"up ({source}) {off} and is ignored; give --up {name} to use it")
 
     def _from_transforms(self, frame: Frame) -> tuple[str, F4 | None]:
         for level in (name for name in _LEVEL_FRAMES if name in self.transforms.frames):

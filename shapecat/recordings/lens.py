@@ -37,7 +37,7 @@ class Lens:
         coefficients = tuple(float(c) for c in (info.d if hasattr(info, "d") else info.D))
         self._calibrate((camera, model, coefficients), depth)
         if self._rays is None:
-            self._warn(f"lens distortion {model!r} is not known and left as it is")
+            self._warn(f"unknown lens distortion {model!r} is ignored")
             return {"depth": depth, "camera": camera}
         if self._fit is not None:
             return {"depth": depth, "camera": self._fit.camera}

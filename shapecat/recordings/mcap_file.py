@@ -126,7 +126,7 @@ class McapRecording(Recording):
     def _read_profile(self) -> str:
         self._file.seek(0)
         if self._file.read(len(MAGIC)) != MAGIC:
-            msg = "does not begin as an MCAP file"
+            msg = "does not begin like an MCAP file"
             raise RecordingError(msg)
         try:
             first = next(walk(self._file, len(MAGIC), self._size))
@@ -166,7 +166,7 @@ class McapRecording(Recording):
             lost = self._size - end
             self.warn(
                 f"the recording was not finished: recovered {self._counts.total()} messages"
-                + (f", of the last {lost} bytes what could be read" if lost else "")
+                + (f", with what is readable of the last {lost} bytes" if lost else "")
             )
 
     def _in_file(self, wanted: set[int]) -> Iterator[RawMessage]:
@@ -220,7 +220,7 @@ class McapRecording(Recording):
             else:
                 self.warn(f"left out messages of channel {message.channel_id}: not described")
         elif opcode not in _DEFINING and opcode not in _KNOWN:
-            self.warn(f"left out what is no message: records of kind {opcode}")
+            self.warn(f"left out records of unknown kind {opcode}")
         elif self.indexed:
             return
         elif opcode == Opcode.SCHEMA:

@@ -99,7 +99,7 @@ class Recording(ABC):
         """Add a warning, unless it is there already or there are very many."""
         if text not in self.warnings and len(self.warnings) <= _MOST_WARNINGS:
             enough = len(self.warnings) == _MOST_WARNINGS
-            self.warnings.append("and more of this kind" if enough else text)
+            self.warnings.append("and more warnings" if enough else text)
 
     def __enter__(self) -> Self:
         return self

@@ -34,7 +34,7 @@ def _counting(skipped: Counter[str]) -> Iterator[None]:
     except MessageError as error:
         skipped[str(error).split(": ", 1)[-1][:160]] += 1
     except _MALFORMED:
-        skipped["message is not laid out as its type says"] += 1
+        skipped["message does not match its type"] += 1
 
 
 class Source:

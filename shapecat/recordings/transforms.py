@@ -184,9 +184,8 @@ class TransformBuffer:
         up, down = self._ancestors(source, stamp_ns), self._ancestors(target, stamp_ns)
         shared = next((frame for frame in up if frame in set(down)), None)
         if shared is None:
-            msg = (
-                f"no transform between {target} and {source}: they hang on {down[-1]} and {up[-1]}"
-            )
+            roots = f"{down[-1]} and {up[-1]}"
+            msg = f"no transform between {target} and {source}: their roots are {roots}"
             raise DisconnectedError(msg)
         shared_from_source = self._chain(up[: up.index(shared)], stamp_ns)
         shared_from_target = self._chain(down[: down.index(shared)], stamp_ns)
@@ -320,7 +319,7 @@ def read_transforms(
         except (AttributeError, TypeError, ValueError, RecordingError) as error:
             recording.warn(f"left out transforms: {error}")
     if refused:
-        recording.warn(f"{refused} transforms are no transforms (NaN, no name) and were left out")
+        recording.warn(f"left out {refused} invalid transforms (NaN, no name)")
     return buffer
 
 

@@ -155,7 +155,7 @@ def correct_label(folder: Path, track: int, label: str, *, seen: str) -> str:
         if track not in rows:
             return f"there is no #{track}"
         if rows[track].label != seen:
-            return f"its label is {rows[track].label!r} by now"
+            return f"its label is now {rows[track].label!r}"
         return relabel(folder, {track: label}).get(track, "")
 
 
@@ -219,7 +219,7 @@ def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: boo
     elif table.runs:
         found = f"holds the tracks of {_described(path.parent, table.run)}"
     else:
-        found = "has tracks in other places (and no column `run`)"
+        found = "has tracks at other positions (and no column `run`)"
     msg = (
         f"{path}: {found}, not those of {_described(folder, own)}; to find the same objects by "
         "their places use --by-place"

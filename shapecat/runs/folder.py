@@ -98,7 +98,7 @@ def staged(
             raise
         reason = f"{folder}: cannot write the results: {getattr(error, 'strerror', '') or error}"
         text = str(error) if isinstance(error, OutputError) else reason
-        more = "; what is done is kept, and the same command goes on" if kept else ""
+        more = "; finished work is kept, and the same command resumes it" if kept else ""
         raise OutputError(text + more) from error
 
 

@@ -203,7 +203,7 @@ def require_unchanged(folder: Path, run: RunInfo, source: Path) -> None:
     """
     if not unchanged(run["input"]["files"], source):
         clear(folder)
-        msg = f"{source}: has changed while it was processed; run the same command again"
+        msg = f"{source}: changed while it was processed; run the same command again"
         raise RecordingError(msg)
 
 

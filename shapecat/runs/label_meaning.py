@@ -124,7 +124,7 @@ def _follow(track: int, verdicts: Mapping[int, _Verdict]) -> int:
             msg = f"there is no track {target}"
             raise ValueError(msg)
         if target in seen:
-            msg = f"leads in a circle: {' -> '.join(map(str, [*seen, target]))}"
+            msg = f"forms a loop: {' -> '.join(map(str, [*seen, target]))}"
             raise ValueError(msg)
         seen.append(target)
         if verdicts[target] is None:
@@ -155,7 +155,7 @@ def _understand(label: str, known: dict[str, str]) -> _Verdict:
     near = _nearest(name.lower(), [*known, DELETE])
     if near and not new:
         meant = known.get(near, near)
-        msg = f"{label!r}: did you mean {meant}? For a category of its own write `new {name}`"
+        msg = f"{label!r}: did you mean {meant}? For a new category write `new {name}`"
         raise ValueError(msg)
     return known.setdefault(name.lower(), name)
 

@@ -140,7 +140,7 @@ def _by_majority(
         rivals = [k for k in others if shares[k] >= _RIVAL]
         if shares[best] < _MAJORITY or rivals:
             for old in (old for k in (best, *rivals) for old in objects[k]):
-                reasons[old] = f"track {new} is it only part of the time"
+                reasons[old] = f"track {new} matches it only part of the time"
             continue
         for old in objects[best]:
             mean = apart[old, new] / votes[old, new]
@@ -206,7 +206,7 @@ def match_in_place(
         reasons: dict[int, str] = {}
     else:
         old, gone = _standing(source)
-        reasons = dict.fromkeys(gone, "it was moved, so that its place says nothing")
+        reasons = dict.fromkeys(gone, "it was moved, so it cannot be found by its place")
     found: dict[int, list[Match]] = {}
     taken: dict[int, int] = {}
     for thing in old:
@@ -242,7 +242,7 @@ def _nearest_there(
         return None, f"track {here.track} may also be track {rivals[0]}"
     ratio = max(thing.extent_m, here.extent_m) / min(thing.extent_m, here.extent_m)
     if ratio > _SIZE_RATIO:
-        return None, f"track {here.track} stands there, which has another size"
+        return None, f"track {here.track} is there, but has another size"
     return Match(here.track, round(distance, 4)), ""
 
 
@@ -271,7 +271,7 @@ def _require_one_frame(source: Path | None, target: Path) -> None:
 def _fixed_frame(folder: Path) -> str:
     name = read_run(folder)["fixed_frame"]
     if name is None:
-        msg = f"{folder}: has no fixed frame, in which objects could be found again by place"
+        msg = f"{folder}: has no fixed frame, which is needed to find objects by place"
         raise OutputError(msg)
     return name
 
@@ -286,7 +286,7 @@ def _place_of(row: TrackRow) -> F8:
     try:
         place = [float(row.cells[name].strip().replace(",", ".")) for name in "xyz"]
     except (KeyError, ValueError) as error:
-        msg = f"line {row.line}: no place x, y, z of track {row.track}"
+        msg = f"line {row.line}: no position x, y, z of track {row.track}"
         raise OutputError(msg) from error
     return np.array(place)
 

@@ -157,7 +157,7 @@ def read_segment(segment: Path, name: str) -> pa.Table:
         with pa.OSFile(str(path), "rb") as source, pa.ipc.open_file(source) as reader:
             return reader.read_all()
     except (OSError, pa.ArrowException) as error:
-        msg = f"{path}: what a killed run left there cannot be read ({error}); use --overwrite"
+        msg = f"{path}: unreadable, left by a killed run ({error}); use --overwrite"
         raise OutputError(msg) from error
 
 

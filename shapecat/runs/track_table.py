@@ -105,7 +105,7 @@ def _text(path: Path) -> str:
             return content.decode(encoding)
         except UnicodeDecodeError:
             continue
-    msg = f"{path}: not a text; save the table as CSV"
+    msg = f"{path}: not a text file; save the table as CSV"
     raise OutputError(msg)
 
 

@@ -182,7 +182,7 @@ def _next_step(finished: FinishedRun, *, served: bool) -> str:
         text = "Download tracks.csv first."
         command = f"shapecat annotate {folder} --labels tracks.csv"
     return (
-        f"{text} Bring them into annotated.mcap, review.rrd and every export with "
+        f"{text} Apply them to annotated.mcap, review.rrd and all exports with "
         f"<code>{escape(command)}</code>"
     )
 

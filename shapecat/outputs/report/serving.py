@@ -86,7 +86,7 @@ class _Site:
             return _Answer(HTTPStatus.NOT_FOUND, "no such page")
         wanted = _correction(body)
         if wanted is None:
-            return _Answer(HTTPStatus.BAD_REQUEST, "expected a track, its label, and the one seen")
+            return _Answer(HTTPStatus.BAD_REQUEST, "expected track, label and seen")
         track, label, seen = wanted
         problem = correct_label(report.folder, track, label, seen=seen)
         status = HTTPStatus.CONFLICT if problem else HTTPStatus.OK
@@ -152,7 +152,7 @@ class _Handler(BaseHTTPRequestHandler):
         token, _, address = path.removeprefix("/").partition("/")
         known = secrets.compare_digest(token.encode(), site.token.encode())
         if not (known and self._from_here()):
-            self._send(_Answer(HTTPStatus.FORBIDDEN, "use the address that shapecat has printed"))
+            self._send(_Answer(HTTPStatus.FORBIDDEN, "use the address that shapecat printed"))
             return
         try:
             post, address = self.command == "POST", unquote(address)

@@ -60,7 +60,7 @@ def draw(shot: Snapshot, colour: tuple[int, int, int]) -> tuple[SurfaceDrawing, 
     pictures = []
     for title, turn, rise in (
         ("as seen", 0.0, elevation),
-        ("from beside", np.radians(70), np.radians(16)),
+        ("from the side", np.radians(70), np.radians(16)),
         ("from above", 0.0, np.pi / 2),
     ):
         view = _view(azimuth + turn, rise)
