@@ -54,7 +54,7 @@ class Mailbox:
 
 
 def post(address: str, report: Any) -> None:
-    """Send a report without waiting; drop it if that fails, as from another machine."""
+    """Send a report without waiting; drop it if that fails, for example on another machine."""
     with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sender:
         sender.setblocking(False)  # noqa: FBT003  positional by definition
         sender.sendto(json.dumps(report).encode(), address)

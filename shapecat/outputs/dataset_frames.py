@@ -166,7 +166,7 @@ _File = tuple[str, bytes, tuple[int, int], tuple[Mask, ...]]
 
 
 def _colour_file(frame: Frame, coloured: Coloured | None) -> _File | None:
-    """Return suffix, content and (height, width) of a colour image, and its snapped masks."""
+    """Return suffix, content, (height, width) and snapped masks of a colour image, or None."""
     if coloured is None or coloured.view.image.height <= 1:
         return None
     image = coloured.view.image
@@ -177,7 +177,7 @@ def _colour_file(frame: Frame, coloured: Coloured | None) -> _File | None:
 
 
 def _depth_file(labelled: LabelledFrame, frame: Frame) -> _File | None:
-    """Return suffix, content, (height, width) and masks of a depth image, a PNG in millimetres."""
+    """Return suffix, content, (height, width) and masks of a depth image (PNG), or None."""
     if frame.depth is None:
         return None
     units = np.minimum(np.rint(frame.depth * _DEPTH_UNITS), 2**16 - 1).astype(np.uint16)
@@ -186,7 +186,7 @@ def _depth_file(labelled: LabelledFrame, frame: Frame) -> _File | None:
 
 
 def snapped_masks(frame: Frame, coloured: Coloured, pixels: U1) -> tuple[Mask, ...]:
-    """Return the masks of a frame with outlines moved to the edges of its colour image."""
+    """Return the masks of a frame with outlines moved to edges of its colour image (h, w, 3)."""
     lens, camera, scale = coloured.view.lens, frame.camera, 1.0
     if not coloured.view.registered and lens is not None and camera is not None:
         scale = lens.pinhole.fx / camera.fx
@@ -230,7 +230,7 @@ def _view(labelled: LabelledFrame, item: LabelledObject) -> F8:
 
 
 def _different(views: F8, count: int) -> list[int]:
-    """Choose views (farthest-point sampling): first the one with most pixels."""
+    """Choose views (n, 8) by farthest-point sampling, starting with the one with most pixels."""
     chosen = [int(views[:, 4].argmax())]
     apart = np.linalg.norm(views - views[chosen[0]], axis=1)
     while len(chosen) < min(count, len(views)):

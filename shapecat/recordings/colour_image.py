@@ -185,7 +185,7 @@ def _rows(image: ColourImage, pixel: int) -> U1:
 
 
 def _from_yuv(rows: U1, luma: int) -> U1:
-    """Convert YUV 4:2:2 to RGB with the JFIF matrix (ITU-R BT.601, full range)."""
+    """Convert YUV 4:2:2 (h, w, 2) to RGB with the JFIF matrix (ITU-R BT.601, full range)."""
     height, width, _ = rows.shape
     y = rows[..., luma].astype(np.float32)
     chroma = rows[..., 1 - luma].astype(np.float32) - 128
@@ -198,7 +198,7 @@ def _from_yuv(rows: U1, luma: int) -> U1:
 
 
 def _from_bayer(mosaic: U1, red: int) -> U1:
-    """Demosaic a Bayer image: all pixels of a 2 x 2 block get the same colour."""
+    """Demosaic a Bayer image (h, w): all pixels of a 2 x 2 block get the same colour."""
     height, width = (size // 2 * 2 for size in mosaic.shape)
     corner = [mosaic[k // 2 : height : 2, k % 2 : width : 2] for k in range(4)]
     green = [k for k in range(4) if k not in {red, 3 - red}]

@@ -70,8 +70,11 @@ def decode(message: Message, known: dict[tuple[str, str, bytes], Decoder]) -> An
 def typestore_of(channel: Channel) -> Typestore:
     """Return a type store with the message types of a channel's definition.
 
-    Without a definition it holds the types of ROS 1 Noetic or ROS 2 Humble. Raises one of
-    `LIBRARY_ERRORS` for a malformed definition.
+    Without a definition it holds the types of ROS 1 Noetic or ROS 2 Humble.
+
+    Raises
+    ------
+    ValueError : the definition is too long; other `LIBRARY_ERRORS` if it is malformed.
     """
     if not channel.schema:
         return _builtin(channel.encoding)

@@ -79,7 +79,7 @@ class Extrinsics:
         return None
 
     def _realsense(self) -> Pose | None:
-        """Read librealsense's extrinsics: ``p_colour = rotation @ p_depth + translation``."""
+        """Read librealsense's ``p_colour = rotation @ p_depth + translation``; None if absent."""
         for topic in self._recording.topics:
             if topic.name.endswith("/extrinsics/depth_to_color"):
                 with suppress(*_MALFORMED):

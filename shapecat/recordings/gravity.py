@@ -99,7 +99,7 @@ class Upright:
         return vector
 
     def preview(self, frame: Frame) -> tuple[str, F4 | None]:
-        """Return the source and the up direction (3,) for a frame; do not count the look-up."""
+        """Return the source and `up` of a frame (or None), without counting the look-up."""
         counted = self._failed, self._first_failure
         answer = self._find(frame)
         self._failed, self._first_failure = counted

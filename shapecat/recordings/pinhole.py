@@ -83,7 +83,7 @@ def _errors(camera: Camera, sample: tuple[F8, F8, F8, F8]) -> tuple[float, float
 
 
 def _sample(points: F4) -> tuple[F8, F8, F8, F8] | None:
-    """Return u, v, x / z and y / z of points spread over the image; None if there are few."""
+    """Return u, v, x / z and y / z, each (n,), of points spread over the image; None if few."""
     height, width = points.shape[:2]
     # A stride that shares no factor with the width visits all columns.
     stride = max(1, height * width // (4 * _SAMPLES)) | 1

@@ -110,7 +110,7 @@ class PointsSource(Source):
 
 
 def _placed(points: F4, pose: Pose | None) -> F4:
-    """Transform a cloud that has its own pose into the sensor frame."""
+    """Transform a cloud (h, w, 3) that has its own pose into the sensor frame."""
     return points if pose is None else transform(pose, points).astype(np.float32)
 
 

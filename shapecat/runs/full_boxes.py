@@ -108,7 +108,7 @@ class FullBoxes:
         return _Seen(at[known], rows[known], found[known])
 
     def _views(self, seen: "_Seen", some: I4, details: F4) -> BoxViews:
-        """Return the boxes of some views of a track in the fixed frame."""
+        """Return the boxes of some views of a track in the fixed frame; see `_details`."""
         boxes, poses = self.rows[seen.rows[some]], self.frames.poses[seen.frames[some]]
         centers, axes = _placed(boxes, poses)
         sizes, stds = boxes[:, 3:6].astype(np.float64), details[:, :3].astype(np.float64)

@@ -73,7 +73,7 @@ def read_masks(folder: Path, *, boxes_only: bool = False) -> Iterator[tuple[Key,
 
 
 def _run_lengths(column: pa.ChunkedArray) -> Iterator[U4]:
-    """Yield the run lengths of each mask, without making Python lists, which is slow."""
+    """Yield the run lengths (r,) of each mask, without making Python lists, which is slow."""
     masks = column.combine_chunks().flatten()
     ends, values = np.from_dlpack(masks.offsets), numbers(pa.chunked_array([masks]))
     ends = ends - ends[0] if len(ends) else ends

@@ -104,6 +104,7 @@ def match_in_time(source: Path, target: Path, group: Group) -> Matches:
 
     Parameters
     ----------
+    source, target : run folders of the same recording.
     group : maps merged tracks of the source to the same number; they are one object.
     """
     old, new = _read_tracks(source), _read_tracks(target)
@@ -193,6 +194,7 @@ def match_in_place(
     ----------
     rows : the tracks of the source; their positions are used if ``source`` is None.
     source : folder of the source run; None if only its tracks.csv exists.
+    target : folder of the other run.
     group : as for `match_in_time`.
 
     Raises

@@ -142,7 +142,7 @@ Key = tuple[str, int]
 
 
 def count_rows(folder: Path, table: str) -> int:
-    """Return the number of rows of a table of a run folder."""
+    """Return the number of rows of a table in a run folder."""
     with opened(folder / f"{table}.parquet") as file:
         return int(file.metadata.num_rows)
 
@@ -252,7 +252,7 @@ def arrow_table(columns: dict[str, Any], schema: pa.Schema) -> pa.Table:
 
 
 def lists(rows: Sequence[Any], kind: pa.DataType) -> pa.Array:
-    """Return rows of numbers, of any length, as a list column."""
+    """Return rows of numbers, which may differ in length, as a list column of type ``kind``."""
     flat = [np.ravel(row) for row in rows]
     offsets = np.concatenate([[0], np.cumsum([row.size for row in flat])]).astype(np.int32)
     values = np.concatenate(flat) if flat else np.zeros(0)

@@ -183,7 +183,7 @@ def _streams_with_poses(folder: Path) -> set[str]:
 
 
 def _columns(tracks: Sequence[Track], boxes: F4, categories: Sequence[str]) -> dict[str, Any]:
-    """Return the table columns of some tracks, track after track, each by time."""
+    """Return the table columns of some tracks and their full boxes (n, 13), track after track."""
 
     def column(name: str, kind: str, *width: int) -> Any:
         values = [np.asarray(getattr(track, name), kind) for track in tracks]

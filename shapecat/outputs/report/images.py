@@ -141,7 +141,10 @@ def _upright(points: F4, up: F4 | None) -> F8:
 
 
 def _hidden_share(depth: F4 | None, pixels: U4) -> float:
-    """Return the share of an object's outline along which something outside it is nearer."""
+    """Return the share of an object's outline along which something outside it is nearer.
+
+    ``depth`` is (h, w) in metres, ``pixels`` (n,) are flat indices of the object.
+    """
     if depth is None or not pixels.size:
         return 0.0
     v, u = np.divmod(np.asarray(pixels, np.int64), depth.shape[1])
@@ -197,7 +200,7 @@ def _smooth(inverse: F8, passes: int = 6) -> F8:
 
 
 def _slope(inverse: F8, axis: int) -> F8:
-    """Return the slope along an axis: the smaller one-sided difference, so edges stay sharp."""
+    """Return slopes (h, w) along an axis: the smaller one-sided difference keeps edges sharp."""
     step = np.diff(inverse, axis=axis)
     ends = [(1, 0) if k == axis else (0, 0) for k in (0, 1)]
     before = np.pad(step, ends, mode="edge")
@@ -283,7 +286,7 @@ def _detail(seen: SeenFrame, mask: Mask) -> float:
 
 
 def _inside(mask: Bool, window: Window, shape: Sequence[int]) -> Bool:
-    """Return a mask in a crop, eroded, since the contrast at its outline is not the object's."""
+    """Return a mask (h, w) cut to a crop, and eroded since its outline has other contrast."""
     left, top, right, bottom = window
     whole = Image.fromarray(mask[top:bottom, left:right])
     small = whole.resize((shape[1], shape[0]), Image.Resampling.NEAREST)

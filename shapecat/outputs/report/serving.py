@@ -93,7 +93,7 @@ class _Site:
         return _Answer(status, {"labels": _labels(report.folder), "problem": problem})
 
     def _find(self, address: str) -> tuple[RunReport | None, str]:
-        """Return the run whose folder contains an address, and the name of the resource in it."""
+        """Return the run whose folder contains an address, or None, and the resource's name."""
         place, _, name = address.rpartition("/")
         for report in self.reports.runs:
             if unquote(self.reports.link(report)) == f"{place}/{PAGE}".lstrip("/"):
