@@ -10,7 +10,7 @@ from typing import Any, get_args
 
 import pytest
 
-from shapecat.batch.finding import Source
+from shapecat.batch.finding import Source, find_recordings
 from shapecat.batch.manifest import Entry, Manifest, State
 from shapecat.batch.plans import Shard, name_folders, plan_batch
 from shapecat.batch.runs import Outcome, exit_code, process_on
@@ -92,6 +92,22 @@ def test_a_recording_that_was_written_to_has_changed_though_it_is_as_long(source
     assert not unchanged(before, source)
     source.unlink()
     assert not unchanged(before, source)
+
+
+def test_a_recording_is_processed_once_by_whatever_names_it_is_found(tmp_path: Path) -> None:
+    """Two run folders of one recording would be counted, and trained on, twice."""
+    data, other = tmp_path / "data", tmp_path / "other"
+    for folder, name in ((data, "a.mcap"), (data, "b.mcap"), (other, "a.mcap")):
+        folder.mkdir(exist_ok=True)
+        (folder / name).write_bytes(b"\x89MCAP")
+    (other / "linked.mcap").symlink_to(data / "b.mcap")
+    named = [data, data / "a.mcap", data / ".." / "data" / "a.mcap", other]
+
+    found = [Path(source.path) for source in find_recordings(list(map(str, named))).kept]
+
+    assert sorted(path.resolve() for path in found) == [
+        data / "a.mcap", data / "b.mcap", other / "a.mcap"
+    ]  # fmt: skip
 
 
 def partial(folder: Path, run: RunInfo) -> None:

@@ -355,6 +355,17 @@ def test_the_novelty_threshold_rejects_the_promised_share(rejected: float) -> No
     assert np.mean(fresh) == pytest.approx(rejected, abs=0.35 * rejected)
 
 
+def test_shapes_of_no_category_have_no_say_in_the_calibration(categorizer: Categorizer) -> None:
+    """They are to be rejected: counted among the known, they would loosen the threshold."""
+    known = blobs(60, 2)
+    mixed = blobs(60, 2, (*CATEGORIES, UNKNOWN))  # the same views, and 60 strange ones
+    assert np.array_equal(mixed.descriptors[: len(known.labels)], known.descriptors)
+    one, other = (calibrate(categorizer, views, rejected=0.05) for views in (known, mixed))
+
+    assert one.threshold == other.threshold != categorizer.threshold
+    assert one.temperature == other.temperature
+
+
 def test_new_categories_are_raised_by_views_that_are_right_and_not_learned_from(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -85,11 +85,11 @@ def test_a_short_sequence_is_judged_from_recording_to_figures(
     monkeypatch.setattr(sequences, "FRAMES", 8)
     monkeypatch.setattr(sequences, "KINDS", ("rearranged",))
 
-    figures = sequences.evaluate(tmp_path, [4])
+    figures = sequences.evaluate(tmp_path, [4])  # in which nothing is lost or taken for another
 
-    assert figures["identities"]["rearranged"]["idf1"] > 0.8
+    assert figures["identities"]["rearranged"]["idf1"] > 0.95
     assert figures["labels"]["all"]["views"] > 40
-    assert figures["labels"]["all"]["final"] < 0.4
+    assert figures["labels"]["all"]["final"] < 0.05
     assert np.isfinite([row["ece"] for row in figures["calibration"].values()]).any()
     assert "| rearranged |" in sequences.format_tables(figures)
     json.dumps(figures)
