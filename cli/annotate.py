@@ -45,7 +45,7 @@ def annotate(
     from shapecat.pipeline import annotate_again
 
     if by_place and labels is None:
-        msg = "--by-place needs --labels: the table, or folder, of the other run"
+        msg = "--by-place needs --labels, the folder or the table of the other run"
         raise click.UsageError(msg)
     with progress_bars() as bars:
         transfer = annotate_again(

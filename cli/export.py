@@ -100,7 +100,7 @@ def export(
 
     runs = find_runs(folders)
     if recording is not None and len(runs) > 1:
-        msg = f"--recording names the recording of one run, not of {len(runs)}"
+        msg = f"--recording is for a single run, not for {len(runs)}"
         raise click.UsageError(msg)
     if kind != "crops":
         _require_own_names(runs)
@@ -149,5 +149,5 @@ def _require_own_names(runs: Sequence[Path]) -> None:
     for run in runs:
         other = names.setdefault(run.resolve().name, run)
         if other is not run:
-            msg = f"{other} and {run} would both be exported as {run.resolve().name}; use two --out"
+            msg = f"{other} and {run} have the same name; export them to different --out"
             raise OutputError(msg)

@@ -74,7 +74,7 @@ def test_new_components_change_no_prediction(model: Categorizer) -> None:
 
 
 def test_a_descriptor_that_lost_a_component_is_refused(model: Categorizer) -> None:
-    with pytest.raises(ValueError, match="the descriptor has lost d"):
+    with pytest.raises(ValueError, match="the descriptor lacks d"):
         widened(
             model,
             examples(0.0, 1),

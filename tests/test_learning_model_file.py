@@ -156,10 +156,10 @@ _HOSTILE = {
     "temperature near 0": (edit_header(temperature=1e-300), "numbers"),
     "a category twice": (edit_header(categories=["cup", "cup"]), "category names"),
     "a category missing": (edit_header(categories=["cup"]), "categories"),
-    "a name is no text": (edit_header(categories=["cup", 3]), "wrong kind"),
+    "a name is no text": (edit_header(categories=["cup", 3]), "wrong type"),
     "an array missing": (lambda m: m.pop("votes.npy"), "no votes"),
-    "of another type": (put("votes", np.zeros((4, 2)), "f8"), "wrong kind"),
-    "of objects": (put("votes", np.zeros((4, 2)), "c8"), "size its header says"),
+    "of another type": (put("votes", np.zeros((4, 2)), "f8"), "wrong type"),
+    "of objects": (put("votes", np.zeros((4, 2)), "c8"), "differs from its header"),
     "a loop": (put("forest.left", [1, 0, 0, 3, 0, 0], "u4"), "damaged"),
     "a child behind the end": (put("forest.left", [1, 0, 0, 4, 0, 5], "u4"), "damaged"),
     "a root behind the end": (put("forest.roots", [0, 99], "u4"), "damaged"),
@@ -230,7 +230,7 @@ def test_pickles_are_never_loaded(saved: Path) -> None:
     np.save(stream, np.array([{}], object), allow_pickle=True)
     rewrite(saved, lambda m: m.update({"votes.npy": stream.getvalue()}))
 
-    with pytest.raises(ModelError, match="size its header says"):
+    with pytest.raises(ModelError, match="differs from its header"):
         load_model(saved)
 
 

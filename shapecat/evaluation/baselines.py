@@ -58,7 +58,7 @@ def compare_learners(
     """
     splits = list(_folds(test, seed)) if train is None else [(train, test)]
     if not splits or any(len(_known(part.labels)) < 2 for part, _ in splits):
-        msg = f"{root}: learners need at least two categories, with two objects each or more"
+        msg = f"{root}: training needs at least two categories with at least two objects each"
         raise RecordingError(msg)
     learners = _learners(tuple(blocks), seed, jobs)
     rows = []

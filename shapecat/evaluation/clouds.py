@@ -1,7 +1,7 @@
-"""Point cloud files, PCD and PLY: the points and the place of the sensor.
+"""Point cloud files, PCD and PLY: the points and the position of the sensor.
 
-Open3D reads both, but leaves out the VIEWPOINT of a PCD file and cannot be imported where there
-are no display libraries; data sets must be readable there too.
+Open3D reads both formats, but ignores the VIEWPOINT of PCD files and cannot be imported without
+display libraries, where data sets must be readable too.
 """
 
 import re
@@ -31,14 +31,17 @@ _PLY_TYPES = {
 
 
 class CloudFile(NamedTuple):
-    """``points`` (n, 3) as written, NaN included; ``viewpoint`` (3,) or None if not said."""
+    """Content of a file.
+
+    ``points`` (n, 3) as stored, including NaN; ``viewpoint`` (3,), None if the file has none.
+    """
 
     points: F8
     viewpoint: F8 | None
 
 
 class _Layout(NamedTuple):
-    """How points are stored: numpy type of one, how many, in which way, where they begin."""
+    """Storage of points: NumPy type of a point, their number, encoding, and first byte."""
 
     point: np.dtype
     number: int
@@ -51,7 +54,7 @@ def read_pcd(path: Path) -> CloudFile:
 
     Raises
     ------
-    RecordingError : it cannot be read, or is not a complete PCD file with x, y and z.
+    RecordingError : the file cannot be read, or is not a complete PCD file with x, y and z.
     """
     content = _content(path)
     try:
@@ -72,12 +75,12 @@ def read_pcd(path: Path) -> CloudFile:
 def read_ply(path: Path) -> CloudFile:
     """Read the vertices of a PLY file: ascii, or binary of either byte order.
 
-    A line ``comment VIEWPOINT x y z`` of the header tells the place of the sensor.
+    A header line ``comment VIEWPOINT x y z`` gives the position of the sensor.
 
     Raises
     ------
-    RecordingError : it cannot be read, or is not a complete PLY file that begins with its
-        vertices.
+    RecordingError : the file cannot be read, or is not a complete PLY file whose first element is
+        the vertices.
     """
     content = _content(path)
     try:
@@ -151,7 +154,7 @@ def _ply_header(content: bytes) -> tuple[F8 | None, _Layout]:
 
 
 def _xyz(body: bytes, layout: _Layout) -> F8:
-    """Return the points (n, 3) of an ascii or binary body; sizes are bounded by the body."""
+    """Return the points (n, 3) of an ascii or binary body; the body's size bounds the memory."""
     if layout.encoding == "ascii":
         columns = _ascii_columns(layout.point)
         lines = body.decode("ascii", "replace").splitlines()[: layout.number]
@@ -162,21 +165,21 @@ def _xyz(body: bytes, layout: _Layout) -> F8:
         points = [[float(row[column]) for column in columns] for row in words]
         return np.array(points, np.float64).reshape(-1, 3)
     if layout.encoding != "binary" or layout.number < 0:
-        msg = f"unknown encoding {layout.encoding}, or fewer than no points"
+        msg = f"unknown encoding {layout.encoding}, or a negative number of points"
         raise ValueError(msg)
     rows = np.frombuffer(body, layout.point, count=layout.number)
     return np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
 
 
 def _ascii_columns(point: np.dtype) -> list[int]:
-    """Return the words of a line that are x, y and z."""
+    """Return the positions of x, y and z among the words of a line."""
     widths = [int(np.prod(point[name].shape, dtype=int)) for name in point.names or ()]
     starts = dict(zip(point.names or (), np.cumsum([0, *widths]).tolist(), strict=False))
     return [starts[axis] for axis in "xyz"]
 
 
 def _unpack_pcd(body: bytes, layout: _Layout) -> F8:
-    """Unpack a compressed body: the values of the first field of all points, then the second."""
+    """Return the points (n, 3) of a compressed body, which stores field after field."""
     packed, size = np.frombuffer(body, "<u4", count=2).tolist()
     if size != layout.number * layout.point.itemsize or packed > len(body) - 8:
         msg = "the compressed part is not as long as announced"
@@ -200,7 +203,7 @@ def _unpack_pcd(body: bytes, layout: _Layout) -> F8:
 
 @kernel
 def _unpack_lzf(packed: U1, flat: U1) -> int:
-    """Unpack LZF (Lehmann 2000) into ``flat``; return how many bytes, -1 where damaged."""
+    """Unpack LZF (Lehmann 2000) into ``flat``; return the number of bytes, -1 if damaged."""
     i = np.int64(0)
     out = np.int64(0)
     while i < packed.size:

@@ -162,7 +162,7 @@ def compare(
 def _require_same_recording(finished: FinishedRun, other: OtherRun) -> None:
     a, b = finished.run["input"], other.finished.run["input"]
     if a["digest"] != b["digest"]:
-        msg = f"{other.finished.folder}: a run of another recording: {b['path']}, not {a['path']}"
+        msg = f"{other.finished.folder}: a run of another recording, {b['path']}, not {a['path']}"
         raise OutputError(msg)
 
 
@@ -227,7 +227,7 @@ def _labelled_part(found: Labelling, true: Labelling, key: Key) -> Labelling:
     size = None if true.shape is None else true.shape[0] * true.shape[1]
     pixels = [item.pixels for item in found.items if item.pixels is not None and item.pixels.size]
     if size is not None and any(int(some.max()) >= size for some in pixels):
-        msg = f"frame {key[1]} of {key[0]}: labels are of an image of another size, {true.shape}"
+        msg = f"frame {key[1]} of {key[0]}: the labels have another image size, {true.shape}"
         raise RecordingError(msg)
     if true.known is None:
         return found

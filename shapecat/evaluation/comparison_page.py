@@ -50,7 +50,7 @@ def require_new(folder: Path) -> None:
         msg = f"{folder}: cannot be written: {error.strerror or error}"
         raise OutputError(msg) from error
     if taken:
-        msg = f"{folder}: is there already; choose another --out, or move it away"
+        msg = f"{folder}: exists already; choose another --out, or move it away"
         raise OutputError(msg)
 
 

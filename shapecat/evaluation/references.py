@@ -54,7 +54,7 @@ def open_reference(path: Path) -> Reference:
         return CocoLabels(path, content)
     except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
         reason = f"it lacks {error}" if isinstance(error, KeyError) else error
-        msg = f"{path}: neither truth of `shapecat simulate` nor COCO labels ({reason})"
+        msg = f"{path}: neither ground truth of `shapecat simulate` nor COCO labels ({reason})"
         raise RecordingError(msg) from error
 
 
@@ -167,7 +167,7 @@ class OtherRun(Reference):
         for other, _, labelling in self._rest:
             if other == key:
                 return labelling
-        msg = f"{self.finished.folder}: frames in another order; process the recording again"
+        msg = f"{self.finished.folder}: the frames have another order; process the recording again"
         raise OutputError(msg)
 
     def describe_frames(self) -> str:
@@ -186,7 +186,7 @@ def read_complete(folder: Path) -> FinishedRun:
         msg = f"{folder}: no run.json there; expected a folder made by `shapecat process`"
         raise OutputError(msg)
     if not ((folder / "tracks.parquet").is_file() and (folder / "tracks.csv").is_file()):
-        msg = f"{folder}: the run is not complete: no tracks; give the same command again to go on"
+        msg = f"{folder}: the run is not complete; run the same command again to resume"
         raise OutputError(msg)
     return read_finished(folder)
 

@@ -83,7 +83,7 @@ def _number_of(image: Mapping[str, Any]) -> int:
             return int(image[name])
     digits = re.findall(r"\d+", Path(image["file_name"]).stem)
     if not digits:
-        msg = f"the name {image['file_name']!r} has neither a stamp nor a number of a frame"
+        msg = f"the name {image['file_name']!r} holds neither a timestamp nor a frame number"
         raise ValueError(msg)
     return max(map(int, digits)) if int(max(digits, key=int)) > _A_STAMP else int(digits[-1])
 

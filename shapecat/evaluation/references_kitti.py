@@ -47,7 +47,7 @@ class KittiLabels(Reference):
             lines = path.read_text("utf-8").splitlines()
             items = [_item(line.split(), turn) for line in lines if line.strip()]
         except (OSError, ValueError, IndexError, np.linalg.LinAlgError) as error:
-            msg = f"{path}: not a label of KITTI ({error})"
+            msg = f"{path}: not a KITTI label file ({error})"
             raise RecordingError(msg) from error
         return Labelling(tuple(item for item in items if item.category != "DontCare"))
 

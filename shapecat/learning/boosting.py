@@ -1,7 +1,8 @@
-"""Growing boosted trees on binned features: gradient boosting with the cross entropy.
+"""Growing boosted trees on binned features: gradient boosting with the cross-entropy loss.
 
-Source: Friedman 2001, algorithm 6 (one tree per category and round, each on what the posterior of
-its category still lacks); leaves and gains by second derivatives: Chen and Guestrin 2016, eq. 5, 7.
+Source: Friedman 2001, algorithm 6 (one tree per category and round, on the residual of the
+category's posterior); leaf values and gains from second derivatives: Chen and Guestrin 2016, eq. 5,
+7.
 """
 
 from typing import NamedTuple
@@ -14,15 +15,19 @@ from shapecat.jit import kernel
 __all__ = ["BINS", "Bins", "Tree", "TreeSettings", "grow_tree", "make_bins"]
 
 BINS = 64
-"""Values of a feature are told apart by the quantiles they lie between."""
+"""Number of quantile bins of each feature."""
 _LEAST_GAIN = 1e-6
 
 
 class TreeSettings(NamedTuple):
     """Settings of one tree.
 
-    ``leaves`` is their largest number; ``rate`` shrinks every leaf value; ``ridge`` is added to the
-    second derivative of a leaf; a leaf needs a second derivative of at least ``least``.
+    Attributes
+    ----------
+    leaves : maximum number of leaves.
+    rate : learning rate, which multiplies every leaf value.
+    ridge : L2 regularisation, added to the second derivative of a leaf.
+    least : minimum second derivative of a leaf.
     """
 
     leaves: int
@@ -32,17 +37,26 @@ class TreeSettings(NamedTuple):
 
 
 class Bins(NamedTuple):
-    """``edges`` (f, BINS - 1) ascending; ``binned`` (f, n): value <= edges[f, k] if bin <= k."""
+    """Binned features of n views.
+
+    Attributes
+    ----------
+    edges : (f, BINS - 1) upper edges of the bins, ascending.
+    binned : (f, n) bin of each value; bin <= k means value <= edges[f, k].
+    """
 
     edges: F4
     binned: U1
 
 
 class Tree(NamedTuple):
-    """Nodes of a tree, the root first: ``feature``, ``threshold``, ``left`` and ``value`` (m,).
+    """The m nodes of a tree, the root first.
 
-    A view goes left where its feature is <= threshold; the right child stands behind the left one.
-    Leaves have left 0 and add their value.
+    Attributes
+    ----------
+    feature, threshold : (m,) a view goes to the left child if its feature is <= threshold.
+    left : (m,) index of the left child, 0 for a leaf; the right child follows the left one.
+    value : (m,) value that a leaf adds to the score.
     """
 
     feature: I4
@@ -52,7 +66,7 @@ class Tree(NamedTuple):
 
 
 def make_bins(features: F4) -> Bins:
-    """Sort the values of features (n, f) into bins of about equal numbers of views."""
+    """Bin features (n, f) by their quantiles, so that bins hold about equal numbers of views."""
     edges = np.quantile(features, np.linspace(0, 1, BINS + 1)[1:-1], axis=0).T
     edges = np.ascontiguousarray(edges, np.float32)
     binned = np.zeros(features.shape[::-1], np.uint8)
@@ -64,13 +78,14 @@ def make_bins(features: F4) -> Bins:
 def grow_tree(
     bins: Bins, columns: I4, rows: I4, slope: F4, bend: F4, settings: TreeSettings, score: F4
 ) -> Tree:
-    """Grow one tree, best leaf first, and add its values to the ``score`` (n,) of all views.
+    """Grow one tree, best split first, and add its values to the ``score`` (n,) of all views.
 
     Parameters
     ----------
-    columns : features it may use.
-    rows : views it learns from; put into another order.
-    slope, bend : (n,) first and second derivative of the loss by the score of each view.
+    columns : indices of the features to use.
+    rows : int32 indices of the views to learn from; they are reordered in place.
+    slope, bend : (n,) first and second derivative of the loss with respect to the score.
+    score : (n,) updated in place.
     """
     room = 2 * settings.leaves - 1
     feature, cut, left = (np.zeros(room, np.int64) for _ in range(3))
@@ -100,10 +115,10 @@ def _grow(
     left: I4,
     value: F4,
 ) -> int:
-    """Write the nodes; return how many."""
+    """Write the nodes into ``feature``, ``cut``, ``left`` and ``value``; return their number."""
     room = feature.size
     first, last = np.zeros(room, np.int64), np.zeros(room, np.int64)
-    best = np.zeros((room, 3))  # gain, which column, bin
+    best = np.zeros((room, 3))  # gain, index into columns, bin
     sums = np.zeros((room, columns.size, BINS, 2), np.float32)
     spare = np.empty_like(rows)
     last[0] = rows.size
@@ -111,22 +126,22 @@ def _grow(
     value[0] = -rate * _best_cut(sums[0], ridge, least, best[0])
     count = 1
     for _ in range(leaves - 1):
-        # (1) the leaf that gains most is split
+        # (1) Choose the leaf whose split gains most.
         node = np.argmax(best[:count, 0])
         if best[node, 0] <= _LEAST_GAIN:
             break
         column = columns[int(best[node, 1])]
         feature[node], cut[node], left[node] = column, int(best[node, 2]), count
         middle = _divide(binned[column], rows, first[node], last[node], cut[node], spare)
-        # (2) its views are shared out, in their order
+        # (2) Divide its views, keeping their order.
         first[count], last[count] = first[node], middle
         first[count + 1], last[count + 1] = middle, last[node]
-        # (3) the smaller child is summed up, the larger one is what is left of the parent
+        # (3) Sum up the smaller child; the larger one is the parent minus this.
         small = count if middle - first[node] <= last[node] - middle else count + 1
         large = 2 * count + 1 - small
         _collect(binned, columns, rows[first[small] : last[small]], slope, bend, sums[small])
         sums[large] = sums[node] - sums[small]
-        # (4) and where each would be split next
+        # (4) Find the best split of each child.
         for child in (count, count + 1):
             value[child] = -rate * _best_cut(sums[child], ridge, least, best[child])
         best[node, 0] = 0.0
@@ -136,7 +151,7 @@ def _grow(
 
 @kernel
 def _collect(binned: U1, columns: I4, rows: I4, slope: F4, bend: F4, sums: F4) -> None:
-    """Sum slope and bend of some views by column and bin into sums (columns, BINS, 2)."""
+    """Add slope and bend of the views in ``rows`` to ``sums`` (columns, BINS, 2)."""
     g, h = slope[rows], bend[rows]
     for c in range(columns.size):
         bins, out = binned[columns[c]], sums[c]
@@ -148,7 +163,7 @@ def _collect(binned: U1, columns: I4, rows: I4, slope: F4, bend: F4, sums: F4) -
 
 @kernel
 def _best_cut(sums: F4, ridge: float, least: float, best: F8) -> float:
-    """Write gain, column and bin of the best split of a leaf; return its own step, unsplit."""
+    """Write gain, column and bin of a leaf's best split into ``best``; return its Newton step."""
     slope = bend = 0.0
     for k in range(BINS):
         slope += sums[0, k, 0]
@@ -177,7 +192,10 @@ def _best_cut(sums: F4, ridge: float, least: float, best: F8) -> float:
 
 @kernel
 def _divide(bins: U1, rows: I4, first: int, last: int, cut: int, spare: I4) -> int:
-    """Put views up to ``cut`` before the others, in their order; return where these begin."""
+    """Move the views with bins <= ``cut`` to the front of rows[first:last], keeping their order.
+
+    Return the index of the first view after them; ``spare`` is scratch memory.
+    """
     low, high = first, 0
     for i in range(first, last):
         if bins[rows[i]] <= cut:

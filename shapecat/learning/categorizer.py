@@ -1,4 +1,4 @@
-"""The fitted chain, from descriptor to posterior and novelty (thesis ch. 7)."""
+"""The fitted model, from descriptor to posterior and novelty (thesis ch. 7)."""
 
 import hashlib
 import json
@@ -18,14 +18,16 @@ from shapecat.learning.forest import FlatForest, fall
 __all__ = ["Categorizer", "Prediction", "parts_of"]
 
 _LARGEST = 1e6
-"""No weight of a real model is near this; sums of such weights stay finite."""
+"""Bound on the weights of a model: far above real ones, and their sums stay finite."""
 
 
 class Prediction(NamedTuple):
     """Predictions for n objects.
 
-    ``posteriors`` (n, c) sum to 1 in the order of the model's categories; ``novelty`` (n,) is 0
-    for a familiar shape, above 1 beyond the threshold, and at most 2.
+    Attributes
+    ----------
+    posteriors : (n, c) in the order of the model's categories; each row sums to 1.
+    novelty : (n,) from 0, a familiar shape, to 2; above 1 the shape is unknown.
     """
 
     posteriors: F4
@@ -33,27 +35,28 @@ class Prediction(NamedTuple):
 
 
 class Categorizer(Record):
-    """The fitted chain: densities, dictionary, a learner per category on the words, novelty.
+    """The fitted model: features, dictionary, a classifier per category on its words, novelty.
 
     Attributes
     ----------
-    categories : the names of the columns of the posterior.
-    descriptor_names : the components it expects, in order.
-    bank : what the learners see of a descriptor.
+    categories : names of the columns of the posterior.
+    descriptor_names : names of the descriptor's components, in order.
+    bank : computes features from a descriptor.
     forest : the dictionary; each leaf is a word.
-    votes : (w, k) what each word adds to the logit of each category, and then, where the model was
-        shown shapes of no category, to that of *unknown*: k is c or c + 1.
-    linear : (k, f) weights of the features in the logits; mostly zero.
+    votes : (w, k) the value that each word adds to each logit. k is c, the number of categories,
+        or c + 1 if the model was trained with unknown shapes, whose logit comes last.
+    linear : (k, f) weights of the features in the logits; nonzero only for added categories.
     bias : (k,) constants of the logits.
     temperature : posteriors are ``softmax(logits / temperature)``.
-    threshold : log odds of being unknown above which a shape is called so.
-    known_descriptors : (v, d) standardised descriptors of views the model has learned from, and
-    known_category : (v,) their columns of the logits: what a new category is learned against.
-    notes : how it was made; plain JSON values.
+    threshold : log odds of being unknown above which a shape is *unknown*.
+    known_descriptors : (v, d) standardised descriptors of some training views, which are the
+        negative examples for new categories.
+    known_category : (v,) their columns of the logits.
+    notes : how the model was made; plain JSON values.
 
     Raises
     ------
-    ValueError : parts that do not fit each other.
+    ValueError : the parts do not fit together.
     """
 
     categories: tuple[str, ...]
@@ -70,7 +73,7 @@ class Categorizer(Record):
     notes: Mapping[str, Any]
 
     def __post_init__(self) -> None:
-        """Check that the parts fit each other."""
+        """Check that the parts fit together."""
         super().__post_init__()
         sizes = {
             "descriptor": len(self.descriptor_names) > self.bank.columns.max(initial=0),
@@ -93,12 +96,12 @@ class Categorizer(Record):
         }
         wrong = [name for name, fits in sizes.items() if not fits]
         if wrong:
-            msg = f"parts of the model do not fit each other: {', '.join(wrong)}"
+            msg = f"parts of the model do not fit together: {', '.join(wrong)}"
             raise ValueError(msg)
 
     @cached_property
     def model_id(self) -> str:
-        """A hash of everything in the model: equal ids, equal predictions."""
+        """A hash of the whole model; models with equal ids give equal predictions."""
         digest = hashlib.sha256()
         for name, value in sorted(parts_of(self).items()):
             digest.update(name.encode())
@@ -111,15 +114,15 @@ class Categorizer(Record):
 
     @property
     def knows_unknown(self) -> bool:
-        """Whether the model has a learner for unknown shapes."""
+        """Whether the model has a logit for unknown shapes."""
         return self.bias.size > len(self.categories)
 
     def require_descriptor(self, names: Sequence[str]) -> None:
-        """Check that descriptors have the components this model was trained on.
+        """Check that descriptors have the components that this model was trained on.
 
         Raises
         ------
-        ModelError : they have not.
+        ModelError : the names or their order differ.
         """
         if tuple(names) != self.descriptor_names:
             msg = (
@@ -130,13 +133,11 @@ class Categorizer(Record):
             raise ModelError(msg)
 
     def predict(self, descriptors: F4) -> Prediction:
-        """Return posteriors and novelty of descriptors (n, d).
-
-        About 0.1 ms for one object.
+        """Return the posteriors and the novelty of descriptors (n, d), in about 0.1 ms each.
 
         Raises
         ------
-        ValueError : another number of components, or a component that is not finite.
+        ValueError : the number of components is wrong, or a component is not finite.
         """
         x = np.ascontiguousarray(descriptors, np.float32)
         if x.ndim != 2 or x.shape[1] != len(self.descriptor_names):
@@ -193,16 +194,16 @@ def _predict(
     trees, word = forest
     categories = posteriors.shape[1]
     features = np.zeros((x.shape[0], linear.shape[1]), np.float32)
-    # (1) the probabilistic neural networks, one density per block and category
+    # (1) Features: the standardised descriptor, and a density per block and category.
     write_features(
         x, columns, mean, scale, spans, bandwidth, level, spread, kernel_starts, kernels, features
     )
     words = np.zeros(trees.roots.size, np.int64)
     logits = np.zeros(bias.size)
     for i in range(x.shape[0]):
-        # (2) the dictionary: the leaf of each tree
+        # (2) Dictionary: the leaf of each tree.
         fall(features[i], trees, word, words)
-        # (3) the learners on the words
+        # (3) Logits of the categories.
         for c in range(bias.size):
             logits[c] = bias[c]
         for w in words:
@@ -222,7 +223,7 @@ def _predict(
             total += np.exp(logits[c] - best)
         for c in range(categories):
             posteriors[i, c] = np.exp(logits[c] - best) / total
-        # (4) novelty: the odds that it is none of them, or else that it is not the best of them
+        # (4) Novelty: the odds of being unknown, or else of not being the best category.
         if bias.size > categories:
             odds = logits[categories] - best - np.log(total)
         else:

@@ -1,4 +1,4 @@
-"""Features of a descriptor: its standardised values, and their Parzen densities."""
+"""Features of a descriptor: its standardised values and their Parzen densities."""
 
 import numpy as np
 
@@ -8,28 +8,28 @@ from shapecat.jit import kernel
 __all__ = ["FeatureBank"]
 
 _CLIP = 8.0
-"""Standardised values beyond this many deviations say no more than "far out"."""
+"""Standardised values are clipped to this many standard deviations."""
 
 
 class FeatureBank(Record):
-    """The fixed part of the probabilistic neural network: standardisation and Parzen kernels.
+    """Standardisation and Parzen densities of descriptors, as in a probabilistic neural network.
 
-    One density per category and block: a sum of Gaussians of the block's bandwidth around the
-    kernels of the category (Specht 1990, eq. 12). Kernels are kept in half precision.
+    The density of a category in a block is a sum of Gaussians with the block's bandwidth around the
+    kernels of the category (Specht 1990, eq. 12).
 
     Attributes
     ----------
-    columns : (d,) the components of the descriptor that are used, block after block.
-    mean, inverse_scale : (d,) standardise them; a constant one has inverse scale 0.
-    spans : (b, 2) where in ``columns`` each block with densities begins and ends.
+    columns : (d,) indices of the used components of the descriptor, block after block.
+    mean, inverse_scale : (d,) standardisation; a constant component has inverse scale 0.
+    spans : (b, 2) half-open range in ``columns`` of each block with densities.
     bandwidth : (b,) standard deviation of the Gaussians of a block, in standardised units.
-    level, spread : (b,) mean and deviation of the log density of a view under its own category.
-    starts : (s,) ``starts[c]`` to ``starts[c + 1]`` are the kernels of category c.
-    kernels : (k, d) standardised descriptors.
+    level, spread : (b,) mean and standard deviation of a view's log density under its own category.
+    starts : (s,) ``kernels[starts[c] : starts[c + 1]]`` belong to category c.
+    kernels : (k, d) standardised descriptors in half precision.
 
     Raises
     ------
-    ValueError : spans, starts or scales that do not fit each other.
+    ValueError : spans, starts or scales do not fit together.
     """
 
     columns: U2 = array("d", "u2")
@@ -43,7 +43,7 @@ class FeatureBank(Record):
     kernels: F4 = array("k d", "f2")
 
     def __post_init__(self) -> None:
-        """Check that every index and every number may be used without another look."""
+        """Check every index and number, so that kernels need no checks."""
         super().__post_init__()
         starts, spans = self.starts, self.spans.astype(np.int64)
         good = (
@@ -68,22 +68,22 @@ class FeatureBank(Record):
 
     @property
     def categories(self) -> int:
-        """How many categories have a density."""
+        """Number of categories."""
         return int(self.starts.size) - 1
 
     @property
     def width(self) -> int:
-        """Number of features: descriptor values, then the blocks of each category in turn."""
+        """Number of features: d standardised values, then a density per category and block."""
         return int(self.mean.size) + self.categories * int(self.bandwidth.size)
 
     def standardise(self, descriptors: F4) -> F4:
-        """Return the used part of descriptors, standardised and clipped: (n, d)."""
+        """Return the used components of whole descriptors, standardised and clipped, (n, d)."""
         used = np.asarray(descriptors, np.float32)[:, self.columns]
         z = (used - self.mean) * self.inverse_scale
         return np.asarray(np.clip(z, -_CLIP, _CLIP), np.float32)
 
     def features(self, descriptors: F4) -> F4:
-        """Return the features of whole descriptors: (n, width)."""
+        """Return the features (n, width) of whole descriptors."""
         x = np.ascontiguousarray(descriptors, np.float32)
         result = np.zeros((len(x), self.width), np.float32)
         write_features(x, *self.parameters, result)
@@ -91,7 +91,7 @@ class FeatureBank(Record):
 
     @property
     def parameters(self) -> tuple[np.ndarray, ...]:
-        """The arrays of `write_features`, in the types of the kernel."""
+        """The arrays for `write_features`, with the types of the kernel."""
         return (
             self.columns.astype(np.int64),
             self.mean,
@@ -119,7 +119,7 @@ def write_features(
     kernels: F4,
     result: F4,
 ) -> None:
-    """Write the features of whole descriptors x into result (n, width)."""
+    """Write the features of whole descriptors ``x`` (n, components) into ``result`` (n, width)."""
     width, blocks = columns.size, bandwidth.size
     clip = np.float32(_CLIP)
     exponents = np.zeros(kernels.shape[0], np.float32)
@@ -151,11 +151,12 @@ def _squared_distances(z: F4, kernels: F4, result: F4) -> None:
 
 @kernel
 def _log_density(squared: F4, own: float, bandwidth: float) -> float:
-    """Return the log of the mean Gaussian over kernels at these squared distances.
+    """Return the log of the mean Gaussian over kernels at squared distances (k,).
 
-    differs: a kernel at the very place of the view is the view itself, met in training, and does
-    not testify; densities of training views would be far too high otherwise. The factor that is
-    the same for every category is left out.
+    The factor that is the same for every category is left out; -1e9 if no kernel counts.
+
+    differs: a kernel within the squared distance ``own`` is taken for the view itself, met in
+    training, and does not count; otherwise the densities of training views would be far too high.
     """
     scale = -0.5 / (bandwidth * bandwidth)
     nearest = np.inf
@@ -178,7 +179,15 @@ def _log_density(squared: F4, own: float, bandwidth: float) -> float:
 def log_density_levels(
     z: F4, labels: I4, bank_starts: I4, kernels: F4, span: tuple[int, int], bandwidth: float
 ) -> F8:
-    """Return the log density of each view (n,) in one block under its own category."""
+    """Return the log density (n,) of each view in one block under its own category.
+
+    Parameters
+    ----------
+    z : (n, d) standardised descriptors.
+    labels : (n,) category of each view.
+    bank_starts, kernels : as ``starts`` and ``kernels`` of a `FeatureBank`.
+    span : half-open range of the block's columns.
+    """
     first, last = span
     own = np.float32(1e-4 * (last - first))
     distances = np.zeros(len(kernels), np.float32)

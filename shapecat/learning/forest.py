@@ -1,4 +1,4 @@
-"""Trees as flat arrays: each leaf is a word of the dictionary (thesis 7.3)."""
+"""A forest as flat arrays; each leaf is a word of the dictionary (thesis 7.3)."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -14,22 +14,21 @@ __all__ = ["FlatForest", "flatten"]
 
 
 class FlatForest(Record):
-    """Decision trees in four arrays, walked without scikit-learn.
+    """Decision trees in four arrays, evaluated without scikit-learn.
 
-    The children of a node stand side by side, behind their parent; words are the leaves in the
-    order of the nodes.
+    Both children of a node are adjacent and come after it. Words number the leaves in the order of
+    the nodes.
 
     Attributes
     ----------
-    roots : (t,) first node of each tree.
-    feature : (n,) feature that a node compares; 0 in leaves.
-    threshold : (n,) a view goes left when its feature is <= this.
-    left : (n,) the left child, the right one is ``left + 1``; 0 in leaves.
+    roots : (t,) index of each tree's root.
+    feature : (n,) index of the feature that a node compares; 0 for leaves.
+    threshold : (n,) a view goes to the left child if its feature is <= threshold.
+    left : (n,) index of the left child, 0 for leaves; the right child is ``left + 1``.
 
     Raises
     ------
-    ValueError : a child is not behind its parent or beyond the end: a walk might not end; or it
-        has two parents: there might be more ways than can be counted.
+    ValueError : a child does not come after its parent, lies beyond the end, or has two parents.
     """
 
     roots: U4 = array("t", "u4")
@@ -53,7 +52,7 @@ class FlatForest(Record):
 
     @cached_property
     def word(self) -> I4:
-        """(n,) the word of each leaf; of no meaning in inner nodes."""
+        """(n,) word of each leaf; meaningless for inner nodes."""
         return (np.cumsum(self.left == 0) - 1).astype(np.int32)
 
     @property
@@ -63,20 +62,20 @@ class FlatForest(Record):
 
     @cached_property
     def parameters(self) -> tuple[Trees, I4]:
-        """The trees and words of `fall`; small types keep a large forest in the cache."""
+        """The trees and words for `fall`; small types keep a large forest in the cache."""
         left = self.left.astype(np.int32)
         return Trees(self.roots, self.feature, self.threshold, left), self.word
 
     def fall(self, features: F4) -> I4:
-        """Return the word of each tree that features (n, f) fall into: (n, t).
+        """Return the words (n, t), one for each tree, of features (n, f).
 
         Raises
         ------
-        ValueError : there are fewer features than the trees ask for.
+        ValueError : there are fewer features than the trees compare.
         """
         x = np.ascontiguousarray(features, np.float32)
         if x.shape[1] <= self.feature.max(initial=0):
-            msg = f"the forest asks for feature {self.feature.max()}, got {x.shape[1]} features"
+            msg = f"the forest needs feature {self.feature.max()}, got {x.shape[1]} features"
             raise ValueError(msg)
         result = np.zeros((len(x), len(self.roots)), np.int64)
         for i, row in enumerate(x):
@@ -86,7 +85,7 @@ class FlatForest(Record):
 
 @kernel
 def fall(x: F4, trees: Trees, word: I4, result: I4) -> None:
-    """Write the word that x (f,) falls into in each tree into result (t,)."""
+    """Write the word of features ``x`` (f,) in each tree into ``result`` (t,)."""
     leaves, (roots, feature, threshold, left) = np.zeros(LANES, np.int32), trees
     for first in range(0, result.size, LANES):
         count = find_leaves(x, roots, feature, threshold, left, first, leaves)
@@ -97,8 +96,8 @@ def fall(x: F4, trees: Trees, word: I4, result: I4) -> None:
 def flatten(trees: Sequence[Any]) -> FlatForest:
     """Return fitted scikit-learn trees (the ``tree_`` of each) as a `FlatForest`.
 
-    Thresholds are rounded down to single precision: a single precision value is below the
-    rounded one exactly when it is below the double precision one.
+    Thresholds are rounded down to single precision: a single-precision value is <= the rounded
+    threshold exactly if it is <= the double-precision one.
     """
     roots, parts = [], []
     base = 0
@@ -119,9 +118,9 @@ def flatten(trees: Sequence[Any]) -> FlatForest:
 
 
 def _siblings_together(left: I4, right: I4) -> tuple[I4, I4]:
-    """Return the nodes breadth first, and for each the new place of its left child."""
+    """Return the nodes in breadth-first order, and the new index of each one's left child."""
     order, place = [0], np.zeros(left.size, np.int64)
-    for k, node in enumerate(order):  # grows while it is read: a queue
+    for k, node in enumerate(order):  # a queue: it grows during the iteration
         if left[node] >= 0:
             place[k] = len(order)
             order += [int(left[node]), int(right[node])]

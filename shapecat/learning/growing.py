@@ -40,7 +40,7 @@ def widened(
     place = {name: k for k, name in enumerate(descriptor_names)}
     lost = [name for name in categorizer.descriptor_names if name not in place]
     if lost:
-        msg = f"the descriptor has lost {', '.join(lost[:3])}"
+        msg = f"the descriptor lacks {', '.join(lost[:3])}"
         raise ValueError(msg)
     old = [place[categorizer.descriptor_names[k]] for k in categorizer.bank.columns]
     chosen = {k for name in used for k in range(blocks[name].start, blocks[name].stop)}
@@ -84,7 +84,7 @@ def grow_on(
     ValueError : the model has no logit for unknown shapes, or has Parzen kernels.
     """
     if not categorizer.knows_unknown or len(categorizer.bank.kernels):
-        msg = "more trees are grown for a model without kernels that knows shapes of no category"
+        msg = "more trees need a model without Parzen kernels, trained with unknown shapes"
         raise ValueError(msg)
     count = len(categorizer.categories)
     labels = encode(train.labels, categorizer.categories)

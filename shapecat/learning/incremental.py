@@ -122,7 +122,7 @@ def _order(old: int, new: int, *, unknown: bool) -> I4:
 
 def _known_views(categorizer: Categorizer) -> F4:
     if not len(categorizer.known_descriptors):
-        msg = f"model {categorizer.model_id} holds no known views to learn new categories against"
+        msg = f"model {categorizer.model_id} holds no known views, which new categories need"
         raise ModelError(msg)
     return categorizer.known_descriptors.astype(np.float32)
 

@@ -125,7 +125,7 @@ def _unpack(archive: zipfile.ZipFile) -> dict[str, bytes]:
     members, left = {}, _LARGEST_PART
     for item in archive.infolist():
         if item.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
-            msg = f"{item.filename} is compressed in an unknown way"
+            msg = f"{item.filename} has an unknown compression"
             raise _NotAModelError(msg)
         with archive.open(item) as stream:
             data = stream.read(left + 1)
@@ -141,12 +141,12 @@ def _parse_array(data: bytes) -> np.ndarray:
     """Read an array in .npy format; allocate no more memory than the data need."""
     stream = io.BytesIO(data)
     if np.lib.format.read_magic(stream) != (1, 0):
-        msg = "an array is of an unknown version"
+        msg = "an array has an unknown version"
         raise _NotAModelError(msg)
     shape, fortran, dtype = np.lib.format.read_array_header_1_0(stream)
     rest = data[stream.tell() :]
     if fortran or dtype.kind not in "fiu" or math.prod(shape) * dtype.itemsize != len(rest):
-        msg = "an array does not have the size its header says"
+        msg = "the size of an array differs from its header"
         raise _NotAModelError(msg)
     return np.frombuffer(rest, dtype).reshape(shape)
 
@@ -182,6 +182,6 @@ def _checked(key: str, value: Any, hint: Any, dtype: str | None) -> Any:
     else:
         good = isinstance(value, dict)
     if not good:
-        msg = f"{key} is of the wrong kind"
+        msg = f"{key} has the wrong type"
         raise _NotAModelError(msg)
     return value

@@ -1,4 +1,4 @@
-"""From true depth to what a depth camera reports."""
+"""Error model of a depth camera: from rendered depth to measured depth."""
 
 from functools import lru_cache
 
@@ -14,16 +14,17 @@ __all__ = ["measure"]
 
 
 def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
-    """Report a rendered image as a depth camera does.
+    """Measure a rendered image with the errors of a depth camera.
 
     Parameters
     ----------
-    image : what the sensor's camera, or a part of it, truly sees.
+    image : rendered with the sensor's camera, or with a crop of it.
+    rng : generator of the noise and the lost readings.
 
     Returns
     -------
-    depth : (h, w) float32 metres, 0 where there is no reading.
-    owners : (h, w) int16, the thing each reading belongs to, -1 where there is none.
+    depth : (h, w) float32 metres, 0 without reading.
+    owners : (h, w) int16 owner of each reading, -1 without reading.
     """
     inverse, owners, cosine = _displaced(image, sensor, rng)
     lost = np.zeros(image.inverse.shape, np.bool_)
@@ -48,7 +49,12 @@ def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
 
 
 def _displaced(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4]:
-    """Look up the true image at places a little beside: ragged outlines (Barron and Malik 2013)."""
+    """Sample the true image at slightly displaced pixels: ragged outlines.
+
+    Returns the inverse depth (1/m), owners and cosines, all (h, w).
+
+    Source: Barron and Malik 2013.
+    """
     inverse = np.array(image.inverse)
     owners, cosine = np.array(image.owners), np.array(image.cosine)
     if sensor.ragged_px > 0:
@@ -61,9 +67,9 @@ def _displaced(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4
 
 
 def _grain(shape: tuple[int, int], window: tuple[int, int], deviation: float, rng: Generator) -> F4:
-    """Return nearly normal noise that is alike in a window (across, down).
+    """Return nearly normal noise (h, w), correlated over a window (across, down) in pixels.
 
-    Sums of bytes: many times faster than normal numbers.
+    Sums of random bytes are many times faster than normal numbers.
     """
     wide, tall = window
     raw = rng.integers(0, 256, (shape[0] + tall - 1, shape[1] + wide - 1), np.uint8)
@@ -76,7 +82,7 @@ def _grain(shape: tuple[int, int], window: tuple[int, int], deviation: float, rn
 
 
 def _error(inverse: F8, sensor: Sensor, rng: Generator) -> F4:
-    """Return the error of the inverse depth before it is quantised."""
+    """Return the error (h, w) of the inverse depth before quantization, 1/m."""
     error = np.zeros(inverse.shape, np.float32)
     if sensor.noise > 0:
         error += _grain(inverse.shape, sensor.grain, sensor.noise, rng)
@@ -90,7 +96,7 @@ def _error(inverse: F8, sensor: Sensor, rng: Generator) -> F4:
 
 @lru_cache(maxsize=8)
 def _wave(shape: tuple[int, int], deviation: float, spacing: int, device: int) -> F4:
-    """Return the fixed error of a device: smooth, the same in every image."""
+    """Return the fixed error (h, w) of a device, 1/m: smooth, and the same in every image."""
     knots = (shape[0] // spacing + 2, shape[1] // spacing + 2)
     heights = np.random.default_rng(device).normal(0, 1.5 * deviation, knots)
     result = np.zeros(shape, np.float32)
@@ -99,7 +105,7 @@ def _wave(shape: tuple[int, int], deviation: float, spacing: int, device: int) -
 
 
 def _returned(cosine: F4, owners: I4, sensor: Sensor) -> F4:
-    """Return the cosines, as if what returns less light were seen under a smaller angle."""
+    """Return the cosines (h, w) of incidence, scaled by the reflectance of each owner."""
     if sensor.dark <= 0 or owners.max(initial=-1) < 0:
         return cosine
     draws = np.random.default_rng((sensor.device, 2)).normal(0, sensor.dark, owners.max() + 1)
@@ -108,7 +114,7 @@ def _returned(cosine: F4, owners: I4, sensor: Sensor) -> F4:
 
 
 def _lose_grazing(cosine: F4, sensor: Sensor, rng: Generator, lost: Bool) -> None:
-    """Lose readings where the ray grazes the surface."""
+    """Mark lost readings where the ray grazes the surface."""
     if sensor.grazing > 0:
         luck = _grain(cosine.shape, (3, 3), 0.5 * sensor.grazing, rng)
         lost |= cosine < luck + np.float32(sensor.grazing)
@@ -123,7 +129,7 @@ def _lose_border(sensor: Sensor, lost: Bool) -> None:
 
 
 def _punch_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
-    """Lose readings in small holes anywhere."""
+    """Mark lost readings in small random holes."""
     count = rng.poisson(sensor.holes * lost.size / 8) if sensor.holes > 0 else 0
     rows = rng.integers(0, lost.shape[0], count)
     columns = rng.integers(0, lost.shape[1], count)
@@ -133,7 +139,7 @@ def _punch_holes(sensor: Sensor, rng: Generator, lost: Bool) -> None:
 
 
 def _rounded(inverse: F8, width: int) -> F8:
-    """Average over a window what is of one surface, so that its edges and corners are round."""
+    """Average the inverse depth over a window within each surface, which rounds its edges."""
     across, both = np.zeros_like(inverse), np.zeros_like(inverse)
     _smooth(inverse, width // 2, across)
     _smooth(np.ascontiguousarray(across.T), width // 2, both.T)
@@ -141,7 +147,7 @@ def _rounded(inverse: F8, width: int) -> F8:
 
 
 def _blended(inverse: F8, width: int) -> F8:
-    """Mix near and far across outlines, as stereo windows and smoothing filters do."""
+    """Mix near and far inverse depth across outlines, like stereo windows and smoothing filters."""
     result = np.zeros_like(inverse)
     _blend(inverse, width // 2, result)
     return result
@@ -174,7 +180,7 @@ def _look_beside(
             x, y = int(np.floor(u + across[v, u] + 0.5)), int(np.floor(v + down[v, u] + 0.5))
             x, y = min(max(x, 0), width - 1), min(max(y, 0), height - 1)
             there, here = inverse[y, x], inverse[v, u]
-            # Only outlines move: on a surface the true depth of the pixel itself is reported.
+            # Only outlines move; on a surface, the pixel keeps its own true depth.
             if abs(there - here) < 0.03 and owners[y, x] == owners[v, u]:
                 x, y = u, v
             out[v, u] = inverse[y, x]
@@ -215,7 +221,10 @@ def _interpolate(knots: F8, spacing: int, out: F4) -> None:
 
 @kernel
 def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
-    """Mark what is hidden from a place beside the camera, at ``shift`` / focal length metres."""
+    """Mark pixels that are occluded from a second viewpoint beside the camera.
+
+    ``shift`` is the viewpoint's x position in metres times the focal length in pixels.
+    """
     height, width = inverse.shape
     margin = int(abs(shift) * 5) + 2
     nearest = np.zeros(width + 2 * margin)
@@ -226,7 +235,7 @@ def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
             x = u - shift * w
             start = int(np.floor(x + 0.5))
             end = start
-            if u + 1 < width and abs(inverse[v, u + 1] - w) < 0.03:  # the surface goes on
+            if u + 1 < width and abs(inverse[v, u + 1] - w) < 0.03:  # the same surface continues
                 end = max(start, int(np.floor(u + 1 - shift * inverse[v, u + 1] + 0.5)) - 1)
             for cell in range(start, end + 1):
                 at = cell + margin
@@ -241,7 +250,10 @@ def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
 
 @kernel
 def _fill_shadow(inverse: F8, owners: I4, shadow: Bool, eaten: I4) -> None:
-    """Let the nearer side of each shadow grow into it: windows see the outline too early."""
+    """Grow the nearer side of each shadow into it, as the windows of stereo matching do.
+
+    ``eaten`` (h // 3 + 1, 16) are the widths in pixels, which vary over the image.
+    """
     height, width = inverse.shape
     for v in range(height):
         u = 0
@@ -292,7 +304,7 @@ def _blend(inverse: F8, reach: int, out: F8) -> None:
 
 @kernel
 def _smooth(inverse: F8, reach: int, out: F8) -> None:
-    """Average along rows, as far as no step is met on the way."""
+    """Average along rows, up to ``reach`` pixels to each side, without crossing a depth step."""
     height, width = inverse.shape
     for v in range(height):
         for u in range(width):

@@ -239,7 +239,7 @@ def _move(made: Path, path: Path) -> None:
     if path.is_dir() and not path.is_symlink():
         files = list(path.iterdir())
         if any(file.name != "metadata.yaml" and file.suffix != ".db3" for file in files):
-            msg = f"{path}: a folder that is no recording; choose another name"
+            msg = f"{path}: a folder that is not a recording; choose another name"
             raise OutputError(msg)
         for file in files:
             file.unlink()

@@ -1,6 +1,6 @@
-"""A z-buffer rasterizer: what a pinhole camera sees of triangles.
+"""A z-buffer rasterizer of triangles for a pinhole camera.
 
-Plain double arithmetic in a fixed order, so that an image is the same on every machine.
+It uses plain double arithmetic in a fixed order, so that images are the same on every machine.
 """
 
 import numpy as np
@@ -14,13 +14,17 @@ from shapecat.types import Camera, Pose
 __all__ = ["Geometry", "Image", "alone_pixels", "cropped", "geometry", "render"]
 
 NEAR_M = 0.02
-"""Triangles with a corner nearer than this are looked for in the whole image."""
+"""A triangle with a corner nearer than this is tested in every pixel of the image."""
 
 
 class Geometry(Record):
-    """The triangles of several things in one frame.
+    """The triangles of several meshes in one coordinate frame.
 
-    ``owners`` (m,) tells for each triangle which thing it belongs to, from 0.
+    Attributes
+    ----------
+    vertices : (n, 3) metres.
+    triangles : (m, 3) indices into ``vertices``.
+    owners : (m,) index of the mesh that each triangle belongs to.
     """
 
     vertices: F8 = array("n 3", "f8")
@@ -29,13 +33,13 @@ class Geometry(Record):
 
 
 class Image(Record):
-    """What a camera sees.
+    """A rendered image.
 
     Attributes
     ----------
-    inverse : (h, w) 1 / metres along the optical axis, 0 where there is nothing.
-    owners : (h, w) the thing seen, -1 where there is nothing.
-    cosine : (h, w) of the angle between the ray and the surface normal, 0 where there is nothing.
+    inverse : (h, w) inverse of the depth along the optical axis, 1/m; 0 without surface.
+    owners : (h, w) index of the mesh seen, -1 without surface.
+    cosine : (h, w) cosine of the angle between the ray and the surface normal; 0 without surface.
     """
 
     inverse: F8 = array("h w", "f8")
@@ -44,13 +48,13 @@ class Image(Record):
 
     @property
     def depth(self) -> F8:
-        """(h, w) metres along the optical axis, 0 where there is nothing."""
+        """(h, w) depth along the optical axis, metres; 0 without surface."""
         with np.errstate(divide="ignore"):
             return np.where(self.inverse > 0, 1.0 / self.inverse, 0.0)
 
 
 def geometry(things: list[tuple[Mesh, Pose]]) -> Geometry:
-    """Gather meshes, each with its pose ``frame_from_mesh``; owners count from 0."""
+    """Merge meshes, each with its pose ``frame_from_mesh``, into one frame."""
     starts = np.cumsum([0, *(len(mesh.vertices) for mesh, _ in things)])
     vertices = np.zeros((int(starts[-1]), 3))
     for (mesh, pose), start in zip(things, starts[:-1], strict=True):
@@ -62,20 +66,22 @@ def geometry(things: list[tuple[Mesh, Pose]]) -> Geometry:
 
 
 def render(seen: Geometry, camera: Camera, frame_from_camera: Pose) -> Image:
-    """Draw things as a camera sees them; both sides of a triangle are visible.
+    """Render triangles, visible from both sides, with a z-buffer.
 
-    The inverse depth of a plane is linear in the image, and a ray meets a triangle where the three
-    planes through the camera and its edges agree on the side (Olano and Greer 1997): nothing needs
-    to be clipped, and neighbours leave no gap.
+    The inverse depth of a plane is linear in the image. A ray hits a triangle if it is on the same
+    side of the three planes through the camera and the triangle's edges. Triangles need no
+    clipping, and neighbours leave no gap.
 
     Parameters
     ----------
-    seen : vertices in any frame.
-    frame_from_camera : pose of the optical frame in that frame.
+    seen : triangles in any frame.
+    frame_from_camera : pose of the optical frame in this frame.
 
     Notes
     -----
-    O(triangles + their pixels). Of two surfaces at the same depth the first one shows.
+    Cost: O(triangles + their pixels). Of two surfaces at the same depth, the first is drawn.
+
+    Source: Olano and Greer 1997.
     """
     shape = (camera.height, camera.width)
     local = np.zeros_like(seen.vertices)
@@ -92,12 +98,15 @@ def render(seen: Geometry, camera: Camera, frame_from_camera: Pose) -> Image:
 
 
 def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
-    """Return the camera of a part of the image."""
+    """Return the intrinsics of a crop of the image; all lengths in pixels."""
     return Camera(width, height, camera.fx, camera.fy, camera.cx - left, camera.cy - top)
 
 
 def alone_pixels(seen: Geometry, owner: int, camera: Camera, frame_from_camera: Pose) -> int:
-    """Count the pixels a thing would have alone, in an image three times as wide and high."""
+    """Count the pixels of one owner without the others, in an image three times as wide and high.
+
+    The count is 0 if a vertex is behind the camera or nearer than `NEAR_M`.
+    """
     mine = seen.triangles[seen.owners == owner]
     if len(mine) == 0:
         return 0
@@ -136,7 +145,11 @@ def _draw(
     hits: I4,
     normals: F8,
 ) -> None:
-    """Find for each pixel the greatest inverse depth and the triangle that has it."""
+    """Find each pixel's greatest inverse depth (1/m) and the triangle with it.
+
+    ``points`` (n, 3) are in the optical frame; ``intrinsics`` are fx, fy, cx, cy in pixels. Fills
+    ``nearest`` and ``hits`` (h, w), and ``normals`` (m, 3) of the triangles.
+    """
     height, width = nearest.shape
     fx, fy, cx, cy = intrinsics
     edge = np.zeros((3, 3))
