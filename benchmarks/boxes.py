@@ -32,7 +32,7 @@ Array = NDArray[Any]
 SEEN_PIXELS = 250
 """Objects with fewer readings are left out."""
 SAME = 0.5
-"""IoU of masks from which a detection is of an object."""
+"""IoU of masks from which a detection matches an object."""
 ROUND = ("cup", "can", "bottle", "bowl", "plate", "ball")
 """Solids of revolution, most of which have nearly equal length and width."""
 ALIKE = 0.05
@@ -56,8 +56,8 @@ class Upright(NamedTuple):
 class Judged(NamedTuple):
     """The IoU of three boxes of an object in one frame.
 
-    ``overlaps`` (3,) are those of the visible box, the full box of the view, and that of the track,
-    NaN without a track; ``thing`` is the seed of the scene and the object's number.
+    ``overlaps`` (3,) belong to the visible box, the full box of the view, and the full box of the
+    track (NaN without a track); ``thing`` is the seed of the scene and the object's number.
     """
 
     group: str

@@ -3,8 +3,8 @@
     python -m benchmarks.masks --first 1000 --count 20
 
 Recordings of tables and clutter, by a Kinect or a RealSense with a colour camera beside it, are
-processed as by `shapecat process`. Two masks of each object are compared with the truth: that of
-masks.parquet, which comes from depth alone, and that of exports, whose outline follows the colour
+processed as by `shapecat process`. Two masks of each object are compared with the truth: that in
+masks.parquet, which comes from depth alone, and the exported one, whose outline follows the colour
 edges. Objects have at least `SEEN_PIXELS` readings and `SEEN_ON_IMAGE` pixels on the colour image.
 """
 

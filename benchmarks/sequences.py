@@ -38,7 +38,7 @@ NEAR_M = 0.1
 RANGE_M = 2.0
 """Objects and tracks farther from the sensor are ignored."""
 SAME = 0.5
-"""IoU of masks from which a detection is of an object."""
+"""IoU of masks from which a detection matches an object."""
 VIEWS = (1, 3, 10, 30)
 
 

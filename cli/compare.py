@@ -26,8 +26,8 @@ def compare(
 
     TRUTH is the NAME.truth.json that `shapecat simulate` writes (or the recording beside it), a
     COCO file, a KITTI folder (which has a folder label_2), or another run of the same recording.
-    Frames are matched by timestamp; those of another run, and those without a timestamp, by their
-    number.
+    Frames are matched by timestamp. Frames of another run, and frames without a timestamp, are
+    matched by number.
 
     \b
     shapecat compare results/demo demo.truth.json

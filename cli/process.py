@@ -133,9 +133,9 @@ def process(
 
     Each RECORDING is an MCAP file, a ROS 1 bag, a ROS 2 bag (file or folder), a folder with
     recordings, or a URL. The results of lab.mcap go to OUT/lab: tables, annotated.mcap for
-    Foxglove, and review.rrd for Rerun. If several recordings have the same name, each folder name
-    begins with that of the recording's parent folder. For several recordings, OUT/manifest.jsonl
-    records the state of each. Run the same command again to resume.
+    Foxglove, and review.rrd for Rerun. If recordings have the same name, their parent folders'
+    names are prepended: OUT/monday_lab. For several recordings, OUT/manifest.jsonl records the
+    state of each. Run the same command again to resume.
 
     \b
     shapecat process lab.mcap kitchen.bag --out results

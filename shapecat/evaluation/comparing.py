@@ -222,7 +222,7 @@ def _labelled_part(found: Labelling, true: Labelling, key: Key) -> Labelling:
 
     Raises
     ------
-    RecordingError : the size of the label image differs from that of the depth image.
+    RecordingError : the label image and the depth image differ in size.
     """
     size = None if true.shape is None else true.shape[0] * true.shape[1]
     pixels = [item.pixels for item in found.items if item.pixels is not None and item.pixels.size]

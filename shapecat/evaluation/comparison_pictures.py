@@ -65,7 +65,7 @@ def draw_frame(
     ----------
     frame : the depth frame; None for a plain background.
     pairs : index of the true object for each matched found object.
-    rows : `Difference` rows of the frame, those of the found objects first, in their order.
+    rows : `Difference` rows of the frame, first one for each found object, in their order.
 
     Returns
     -------

@@ -20,8 +20,8 @@ class Item:
     pixels : (n,) flat indices into the frame; None if there is no mask.
     box : 3D box in the sensor frame; None if there is none.
     decidable : whether its category is unambiguous in this view.
-    confidence : of a run, that of the final label.
-    view_category, posterior : of a run, the category and posterior (c,) of the single view.
+    confidence : confidence of the final label, in runs.
+    view_category, posterior : category and posterior (c,) of the single view, in runs.
     """
 
     track: int | None
@@ -61,7 +61,10 @@ class Reference(ABC):
 
     @abstractmethod
     def at(self, key: Key, stamp_ns: int) -> Labelling | None:
-        """Return the objects of a frame; None if the reference lacks this frame."""
+        """Return the objects of a frame; None if the reference lacks this frame.
+
+        ``key`` is the topic and the number of the frame, ``stamp_ns`` its timestamp.
+        """
 
     @abstractmethod
     def describe_frames(self) -> str:

@@ -194,8 +194,8 @@ def read_complete(folder: Path) -> FinishedRun:
 def run_labellings(finished: FinishedRun) -> Iterator[tuple[Key, Mapping[str, Any], Labelling]]:
     """Yield the frames of a run in order: topic and number, the frame's table row, its objects.
 
-    Detections without a track keep the category of the single view; those of deleted tracks are
-    left out. Boxes are full boxes where these are known, else visible ones.
+    Detections without a track keep the category of the single view; detections of deleted tracks
+    are left out. Boxes are full boxes where these are known, else visible ones.
     """
     folder = finished.folder
     tracks = _tracks(folder)

@@ -135,7 +135,7 @@ def fit_views(
 
 
 def order_categories(labels: Iterable[str]) -> tuple[str, ...]:
-    """Return the categories among labels: those of the default model, then others by name."""
+    """Return the categories among labels: first the default model's, then the others by name."""
     found = {str(label) for label in labels} - {UNKNOWN}
     return (*(name for name in CATEGORIES if name in found), *sorted(found - set(CATEGORIES)))
 

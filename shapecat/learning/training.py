@@ -229,6 +229,6 @@ def fit_threshold(categorizer: Categorizer, held_out: Examples, *, rejected: flo
 
 
 def encode(labels: np.ndarray, categories: Sequence[str]) -> I4:
-    """Return the column (n,) of each label (n,), -1 for labels outside the categories."""
+    """Return the index (n,) of each label in ``categories``, -1 for other labels."""
     column = {name: k for k, name in enumerate(categories)}
     return np.array([column.get(str(label), -1) for label in labels], np.int64)

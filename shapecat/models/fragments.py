@@ -37,7 +37,7 @@ def cut_fragment(view: View, rng: np.random.Generator) -> View | None:
 
 
 def cut_halo(view: View, rng: np.random.Generator) -> View:
-    """Remove the lowest points, as the removal of the plane does, more of them far away.
+    """Remove the lowest points, as plane removal does; more are removed at a larger distance.
 
     At 1 m, the lowest 4 to 9 mm are removed.
     """

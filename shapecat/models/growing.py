@@ -48,7 +48,7 @@ def grow(
     Parameters
     ----------
     features : (n, f).
-    truth : (n,) whether each row is of the positive class.
+    truth : (n,) whether each row belongs to the positive class.
     after : trees to continue from; by default the first tree is the log odds of the class.
 
     Returns

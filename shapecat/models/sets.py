@@ -100,7 +100,7 @@ def collect(views: Iterable[WorldView]) -> Simulated:
 
 
 def clear_views(views: Simulated) -> Bool:
-    """Return (n,) which views are whole, mostly visible, well segmented and not upside down.
+    """Return the mask (n,) of whole, mostly visible, well segmented views that are not upside down.
 
     If detection merges an object with others, no category is right. The evaluation of the detection
     covers this case; the model card gives badly segmented views a row of their own.
@@ -109,6 +109,6 @@ def clear_views(views: Simulated) -> Bool:
 
 
 def partial_views(views: Simulated) -> Bool:
-    """Return (n,) which views show only a part of an object, or more than the object."""
+    """Return the mask (n,) of views that show only a part of an object, or more than the object."""
     seen = (views.source != "fragment") & (views.visible >= MOSTLY)
     return np.asarray(~seen | (views.overlap < CUT_WELL))

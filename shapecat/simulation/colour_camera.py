@@ -21,8 +21,8 @@ __all__ = ["COLOUR", "ColourCamera", "jpeg", "render_colour"]
 class ColourCamera:
     """A colour camera mounted beside the depth camera.
 
-    ``depth_from_colour`` is its pose in the optical frame of the depth camera; ``quality`` is that
-    of its JPEG images, 1 to 95.
+    ``depth_from_colour`` is its pose in the optical frame of the depth camera, ``quality`` the JPEG
+    quality of its images, 1 to 95.
     """
 
     lens: LensCamera

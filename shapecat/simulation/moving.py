@@ -31,7 +31,7 @@ def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> Worl
 
 
 def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
-    """Slide two objects back and forth between two rows; they occlude others and each other."""
+    """Slide two objects between two rows of objects; they occlude these and each other."""
     room, table = make_room(rng, wall_chance=0.3), make_table(rng, (1.3, 0.85))
     layout = Layout(rng, gap=0.02, enclosed=True)
     t = filming.times()

@@ -144,7 +144,7 @@ def _wall(shares: ArrayLike, radius: float, height: float, *, power: float) -> F
 
 
 def _foot(rng: Generator, chance: float, tallest: float) -> tuple[float, float]:
-    """Return the radius of a foot ring, relative to that of the bottom, and its height."""
+    """Return the radius of a foot ring, relative to the bottom's radius, and its height, metres."""
     if rng.random() >= chance:
         return 1.0, 0.0
     return rng.uniform(0.7, 0.95), rng.uniform(0.3, 1.0) * tallest

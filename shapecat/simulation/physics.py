@@ -127,7 +127,8 @@ def _extreme_points(mesh: Mesh) -> F8:
 def _start(drop: Drop, points: F8, there: Sequence[F8]) -> Pose:
     """Return the pose of a dropped object, slightly above everything at its position.
 
-    ``points`` are its extreme vertices; ``there`` are those of the other meshes, world frame.
+    ``points`` (n, 3) are its extreme vertices; ``there`` are the vertices of the other meshes, in
+    the world frame.
     """
     turned = points @ drop.rotation.T
     middle = (turned.min(axis=0) + turned.max(axis=0)) / 2

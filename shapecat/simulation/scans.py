@@ -91,7 +91,7 @@ def upright_poses(mesh: Mesh, category: str) -> tuple[Rest, ...]:
 
 
 def fill_ratio(mesh: Mesh) -> float:
-    """Return the volume of the convex hull divided by that of the bounding box."""
+    """Return the volume of the convex hull divided by the volume of the bounding box."""
     hull = ConvexHull(np.asarray(mesh.vertices, np.float64))
     return float(hull.volume / np.prod(np.asarray(mesh.extents, np.float64)))
 

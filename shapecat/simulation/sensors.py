@@ -279,7 +279,7 @@ SENSORS = {"ideal": IDEAL, **PRESETS}
 
 
 def between(first: Sensor, second: Sensor, share: float) -> Sensor:
-    """Return the first sensor with an error model interpolated towards that of the second.
+    """Return the first sensor with an error model interpolated towards the second sensor's.
 
     ``share`` is 0 for the first model and 1 for the second. The first sensor keeps its intrinsics,
     device, shadows and borders.

@@ -1,6 +1,6 @@
 """Objects over time: association, tracks, hindsight and fusion (thesis 7.5.2).
 
-`track_recording` does all of this: it turns the detections of each frame into tracks.
+`track_recording` combines these steps: it turns the detections of each frame into tracks.
 """
 
 from shapecat.tracking.fusion import causal, fuse, view_weights

@@ -1,4 +1,4 @@
-"""A motion common to all objects: that of a turning table, or of a sensor without a pose."""
+"""A motion common to all objects, caused by a turning table or by a sensor without a pose."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -63,8 +63,8 @@ def find_common_motion(hits: Hits, members: Sequence[I4]) -> CommonMotion | None
 
     Returns
     -------
-    The motion; None if there are fewer than three tracks of at least five hits, if most of their
-    detections are of still objects, or if fewer than 70 % fit a common motion.
+    The motion; None if fewer than three tracks have at least five hits, if less than 70 % of their
+    hits belong to moving objects, or if less than 70 % fit a common motion.
 
     Notes
     -----

@@ -16,8 +16,8 @@ PARTIAL_WEIGHT = 0.25
 """Weight of a view that is cut by the image border or an occluder, relative to a whole view."""
 
 _LENIENCE = 0.08
-"""How much the novelty limit of many views exceeds that of one, so that simulated distractors are
-rejected as often from 2 to 30 views as from one (0.03 to 0.075 measured)."""
+"""How much the novelty limit of many views exceeds the limit of one view, so that simulated
+distractors are rejected as often from 2 to 30 views as from one (0.03 to 0.075 measured)."""
 
 _FLOOR = 1e-6
 """Smallest probability of a single view in a product, so that no view can veto all others."""
@@ -26,7 +26,7 @@ _BLOCK = 2**16
 
 
 def view_weights(partial: Bool) -> F8:
-    """Return the weights (k,) of views; ``partial`` (k,) tells which of them are partial."""
+    """Return the weights (k,) of views; ``partial`` (k,) marks partial views."""
     return np.where(np.asarray(partial, np.bool_), PARTIAL_WEIGHT, 1.0)
 
 

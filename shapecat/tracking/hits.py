@@ -42,7 +42,7 @@ class Hits:
     rows : (n,) index of the frame of each hit, ascending.
     numbers, centers, sizes, posteriors, partial, novelties, described : (n, ...) as ``detections``
         and the other columns in `FrameDetections`.
-    axes : (n, 3, 3) axes of the boxes; None if those of some hits are unknown.
+    axes : (n, 3, 3) axes of the boxes; None if some hits have no axes.
     """
 
     names: tuple[str, ...]
@@ -129,7 +129,7 @@ class Hits:
         return np.column_stack(lines)
 
     def life(self, member: I4, max_gap_s: float) -> tuple[I4, Bool]:
-        """Return the frames of a track from its first to its last hit, and which of them have hits.
+        """Return the frames (k,) of a track from its first to its last hit, and a mask of its hits.
 
         Gaps longer than ``max_gap_s`` are left out, and so are topics without any of its hits.
         """

@@ -150,10 +150,11 @@ def _changes(hits: Hits, members: Sequence[I4], duos: I4) -> F8:
 
 
 def _fit(hits: Hits, pairs: I4, wholes: F8) -> Bool:
-    """Return (p,) which pairs of hits (p, 2) are pieces of either one's whole object (p, 2, 3).
+    """Return the mask (p,) of pairs of hits (p, 2) that are pieces of one object.
 
-    Their joint box is no larger than the whole object, and neither of them shows all of it, unlike
-    a bowl with an object in it.
+    ``wholes`` (p, 2, 3) are the lengths of the whole object from either track. The joint box of two
+    pieces is no larger than the whole object, and neither piece is as large as the whole object; a
+    bowl with an object in it is.
     """
     joint = np.minimum(_joint(hits, pairs), _joint(hits, pairs[:, ::-1]))
     lengths = _sorted_sides(hits.sizes[pairs.ravel()]).reshape(-1, 2, 3)
