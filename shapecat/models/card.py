@@ -13,35 +13,36 @@ PICTURE = "worst_mistakes.png"
 _HEAD = """# The default model
 
 Model `{model}`, made by {command}
-from the simulator alone: no real reading was used to learn or to calibrate it. Settings were
-chosen on simulated objects; the figures on real readings below were seen while choosing, so they
-flatter it a little.
+from the simulator alone: no real data were used for training or calibration. Settings were chosen
+on simulated objects; the results on real data below were known during this choice, so they are
+slightly optimistic.
 
-It tells {categories} by shape, seen from one side by a depth camera 0.25 to 3 m away and 5 to
-90 degrees above, standing, lying, or as physics lets it fall in piles, bins and shelves; anything
-else should come out as *unknown* (novelty above 1). The threshold rejects 14 % of simulated views
-that show an object of these in part.
+It distinguishes {categories} by shape, seen by a depth camera from 0.25 to 3 m away and 5 to
+90 degrees above. Objects may stand, lie, or rest in any pose in piles, bins and shelves. All other
+shapes should be *unknown* (novelty above 1). The threshold rejects 14 % of the simulated partial
+views of known categories.
 
 ## Known confusions
 
-- A cup without a handle that stands upside down, or lies with its opening out of sight, cannot be
-  told from a can.
-- The lower the resolution, the worse: small objects beyond 1.4 m, and lying objects above all.
-- Borders are definitions: plate / bowl / cup by depth / diameter (0.2, 0.65), bottle / can by a
-  top clearly narrower than the body. Objects near a border are taken for either.
-- Cartons with a gable or a screw cap lie between box and bottle.
-- Objects of which much is hidden are categorized by the piece that is seen.
+- A cup without a handle looks like a can if it stands upside down, or lies with its opening out of
+  sight.
+- Accuracy falls with the resolution, most of all for small objects beyond 1.4 m and lying objects.
+- Some categories differ by a definition: plate, bowl and cup by depth / diameter (limits 0.2 and
+  0.65), bottle and can by a neck clearly narrower than the body. Objects near such a limit may get
+  either category.
+- Cartons with a gable or a screw cap are between box and bottle.
+- Mostly hidden objects are categorized by their visible part.
 
 ## The worst mistakes
 
-Views of the test set whose wrong label the model is surest of. Color is the distance.
+The views of the test set with the most confident wrong labels. Colour shows the distance.
 
-![Points of the worst mistakes, with what they are and what the model says]({picture})
+![Points of the worst mistakes, with their true and predicted labels]({picture})
 """
 _ANEW = "`make model` (`python -m shapecat.models.training`)"
 _AFTER = """`python -m shapecat.models.training --after`
-on top of model `{after}`, whose trees it keeps (what each part of the method is worth
-was measured on that one),"""
+on top of model `{after}`, whose trees it keeps (the studies of the method's parts
+were made with that model),"""
 
 
 @dataclass(frozen=True)

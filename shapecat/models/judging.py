@@ -35,8 +35,8 @@ _DRAWN = 20
 """Number of test tables from which the worst mistakes are drawn."""
 _MANNERS = ("upright", "lying")
 _STEADY = """\
-Accuracies that differ by a point are alike at this size. What the gas is there for is steadiness:
-random points are as accurate, and change nearly twice as much between frames."""
+Differences of one point in accuracy are not significant at this size. The advantage of the gas is
+stability: random points are as accurate, but change nearly twice as much between frames."""
 _THESIS = ("the thesis's own figures, all objects of its data", "about 0.9", "", "< 2000")
 _HEAD = ("", "views", "accuracy", "balanced", "ECE", "known rejected", "unknown rejected", "AUROC")
 
@@ -75,7 +75,7 @@ def judge(
         rows += _recorded_rows(folder, model)
     tables = [
         Table("Views", ("set", "views", "objects", "unknown"), tuple(_counts(sets))),
-        Table("What it reaches on objects it never saw, single views", _HEAD, tuple(rows)),
+        Table("Accuracy on unseen objects, single views", _HEAD, tuple(rows)),
         *((_fused_table(tracks, model),) if tracks else ()),
         *(_studies(sets["training"], judged, model, seed, jobs) if studies else ()),
     ]
@@ -111,7 +111,7 @@ def _parts(views: Simulated, model: Categorizer) -> list[tuple[str, Report]]:
     whole = views.source != "fragment"
     clear = clear_views(views)
     parts = {
-        "whole, mostly visible, cut well, not upside down": clear,
+        "whole, mostly visible, well segmented, not upside down": clear,
         "of these, upright": clear & (views.manner == "upright"),
         "of these, lying": clear & (views.manner == "lying"),
         "of these, tilted in piles": clear & (views.manner == "tilted"),
@@ -120,7 +120,7 @@ def _parts(views: Simulated, model: Categorizer) -> list[tuple[str, Report]]:
         "upside down": whole & (views.manner == "upside_down"),
         "30 to 70 % visible": whole & (views.visible < MOSTLY),
         "fragments": ~whole,
-        "cut badly (overlap 0.5 to 0.75)": whole & (views.overlap < CUT_WELL),
+        "badly segmented (IoU 0.5 to 0.75)": whole & (views.overlap < CUT_WELL),
         "as detected": clear & (views.source == "detected"),
         "all": np.ones_like(clear),
     }
@@ -135,7 +135,7 @@ def _recorded_rows(folder: Path, model: Categorizer) -> list[tuple[str, ...]]:
     rows = []
     if (folder / "labels.npz").exists():
         views = describe_views(labelled_views(folder), settings=Settings())
-        rows.append(_figures(f"{folder.name}, cut by hand", evaluate(views, model)))
+        rows.append(_figures(f"{folder.name}, segmented by hand", evaluate(views, model)))
     views = describe_views(detected_views(folder), settings=Settings())
     return [*rows, _figures(f"{folder.name}, as detected", evaluate(views, model))]
 
@@ -198,7 +198,7 @@ def _fused_table(tracks: dict[str, Simulated], model: Categorizer) -> Table:
             ]
     head = ("data", "objects", "views fused", "groups", "accuracy", "ECE")
     return Table(
-        "Several views of one placement of an object, fused as tracks are", head, tuple(rows)
+        "Several fused views of one placement of an object, fused as in tracks", head, tuple(rows)
     )
 
 
@@ -222,14 +222,14 @@ def _studies(
             tuple(plain),
         ),
         Table(
-            "Ways to a graph, each with a model of its own on the same few tables",
+            "Methods of surface reconstruction, each with its own model on the same few tables",
             ("surface", "accuracy", "instability between frames", "ms per object"),
             (*surfaces, _THESIS),
             _STEADY,
         ),
         Table(
-            "Two new categories on the fixed dictionary, beside learning everything anew",
-            ("data", "views each", "way", "new", "old", "old lost", "seconds"),
+            "Two new categories added to the fixed dictionary, compared with training from scratch",
+            ("data", "views each", "method", "new", "old", "old lost", "seconds"),
             tuple(added),
         ),
     ]

@@ -273,7 +273,7 @@ def _add(
         anew = fit_views(mixed, nothing, **choices)
         again = time.perf_counter() - begun
         for name, views in test.items():
-            for way, model, seconds in (("added", added, took), ("all anew", anew, again)):
+            for way, model, seconds in (("added", added, took), ("from scratch", anew, again)):
                 new, old = _right(model, views, pair)
                 yield (name, str(count), way), (new, old, before[name] - old, seconds)
 
