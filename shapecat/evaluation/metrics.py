@@ -31,12 +31,17 @@ class Bin(NamedTuple):
 
 
 def accuracy(truth: I4, predicted: I4) -> float:
-    """Return the fraction of views (n,) with the right category; NaN without views."""
+    """Return the fraction of views with the right category; NaN without views.
+
+    ``truth`` and ``predicted`` (n,) are columns of the posterior.
+    """
     return float(np.mean(truth == predicted)) if len(truth) else float("nan")
 
 
 def confusion(truth: I4, predicted: I4, categories: int) -> I4:
-    """Count the views of each true category (row) by their predicted category (column).
+    """Return the confusion matrix (c, c): views by true category (row) and predicted one (column).
+
+    ``truth`` and ``predicted`` (n,) are columns of the posterior, ``categories`` is c.
 
     Examples
     --------
@@ -58,7 +63,7 @@ def recall(table: I4) -> F8:
 
 
 def balanced_accuracy(table: I4) -> float:
-    """Return the mean recall of the categories with views, from a confusion matrix (c, c)."""
+    """Return the mean recall of the categories with views; ``table`` (c, c) is as for `recall`."""
     shares = recall(table)
     return float(np.nanmean(shares)) if np.any(table) else float("nan")
 

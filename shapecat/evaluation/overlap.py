@@ -90,7 +90,7 @@ class MaskMatches:
 
 
 def match_masks(found: Sequence[U4], true: Sequence[U4]) -> MaskMatches:
-    """Match masks, given as flat pixel indices (n,), to maximise the sum of their overlap F.
+    """Match found and true masks (n,), given as flat pixel indices, maximising the sum of overlap F.
 
     Source: Xie et al. 2020 (overlap F of unseen objects), after Ochs et al. 2014.
     """
@@ -123,7 +123,7 @@ def _common(found: Sequence[U4], true: Sequence[U4]) -> F8:
 
 
 def box_iou(a: Box, b: Box) -> float:
-    """Return the intersection over union of two oriented boxes in the same frame.
+    """Return the intersection over union of two oriented boxes in the same coordinate frame.
 
     The corners of the intersection are the corners of each box inside the other, and the points
     where edges of one box cross faces of the other.

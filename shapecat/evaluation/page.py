@@ -163,7 +163,7 @@ def _comparisons(report: Report) -> list[tuple[str, tuple[str, ...], _Rows]]:
 
 
 def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> str:
-    """Return a confusion matrix as SVG; cells are shaded by their fraction of the row's views."""
+    """Return a confusion matrix ``table`` (c, c) as SVG, shaded by the fraction of the row."""
     size = _MARGIN + _CELL * len(categories)
     parts: list[str] = []
     for i, (name, row) in enumerate(zip(categories, table, strict=True)):
@@ -190,7 +190,7 @@ def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> 
 
 
 def calibration_svg(curve: Sequence[Bin], *, size: int = 280) -> str:
-    """Return a calibration curve as SVG; a dot's area grows with its number of views."""
+    """Return a calibration curve as SVG, ``size`` pixels wide; a dot's area shows its views."""
     low, top, side = 34.0, 18.0, size - 56.0  # room for the largest dot in a corner
     high, bottom = low + side, top + side
     parts = [
@@ -210,7 +210,10 @@ def calibration_svg(curve: Sequence[Bin], *, size: int = 280) -> str:
 
 
 def accuracy_svg(ranges: _Ranges, *, width: int = 480) -> str:
-    """Return accuracies as bars in SVG; a bar's thickness grows with its number of views."""
+    """Return accuracies as bars in SVG; a bar's thickness shows its number of views.
+
+    ``ranges`` are (name, views, accuracy); ``width`` is in pixels.
+    """
     low, step = 96, 34  # room for the longest label
     side = width - low - 56
     most = max((count for _, count, _ in ranges), default=1)

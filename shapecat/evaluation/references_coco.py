@@ -148,7 +148,7 @@ def _uncompressed(text: str) -> list[int]:
 
 
 def filled_polygon(corners: I4, height: int, width: int) -> Bool:
-    """Return the mask (h, w) of pixels with their centre inside a polygon.
+    """Return the mask (height, width) of pixels with their centre inside a polygon.
 
     ``corners`` (n, 2) are x and y in pixels; the centre of pixel (0, 0) is at (0.5, 0.5).
     """

@@ -98,6 +98,7 @@ def describe_views(
     Parameters
     ----------
     total : number of views, for ``observe``; None if unknown.
+    phase : name of the phase, for ``observe``.
     with_functions : whether to compute shape distributions too.
     """
     found: list[tuple[DescribedView, str, str, float, float]] = []

@@ -119,7 +119,10 @@ def write_features(
     kernels: F4,
     result: F4,
 ) -> None:
-    """Write the features of whole descriptors ``x`` (n, components) into ``result`` (n, width)."""
+    """Write the features of whole descriptors ``x`` (n, components) into ``result`` (n, width).
+
+    The other arrays are the fields of a `FeatureBank`, in the types of `FeatureBank.parameters`.
+    """
     width, blocks = columns.size, bandwidth.size
     clip = np.float32(_CLIP)
     exponents = np.zeros(kernels.shape[0], np.float32)
@@ -187,6 +190,7 @@ def log_density_levels(
     labels : (n,) category of each view.
     bank_starts, kernels : as ``starts`` and ``kernels`` of a `FeatureBank`.
     span : half-open range of the block's columns.
+    bandwidth : standard deviation of the Gaussians, in standardised units.
     """
     first, last = span
     own = np.float32(1e-4 * (last - first))

@@ -82,7 +82,8 @@ class Examples(NamedTuple):
 def make_chain(blocks: Mapping[str, slice], settings: LearningSettings, *, seed: int) -> Pipeline:
     """Return the unfitted pipeline: features with densities, then the boosted dictionary.
 
-    It expects labels from `encode`, in which -1 is an unknown shape.
+    It expects labels from `encode`, in which -1 is an unknown shape. ``blocks`` is the range of
+    each block in the descriptor, by name.
     """
     names = settings.blocks or tuple(blocks)
     used = {name: (blocks[name].start, blocks[name].stop) for name in names}

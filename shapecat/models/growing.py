@@ -49,6 +49,7 @@ def grow(
     ----------
     features : (n, f).
     truth : (n,) whether each row belongs to the positive class.
+    growth : number and size of the trees.
     after : trees to continue from; by default the first tree is the log odds of the class.
 
     Returns

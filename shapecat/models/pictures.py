@@ -29,7 +29,7 @@ class Mistake(NamedTuple):
 def worst_mistakes(
     views: Sequence[WorldView], model: Categorizer, *, count: int = 12
 ) -> list[Mistake]:
-    """Return the most confident mistakes on different objects, the most confident first."""
+    """Return up to ``count`` mistakes on different objects, the most confident ones first."""
     answer = model.predict(np.array([seen.descriptor for seen in views]))
     found = []
     for seen, posterior, novelty in zip(views, answer.posteriors, answer.novelty, strict=True):

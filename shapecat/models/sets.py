@@ -67,7 +67,7 @@ class Simulated(NamedTuple):
 
 
 def world_of(name: str) -> World:
-    """Return the parameters of a set's arrangements."""
+    """Return the parameters of the arrangements of a set, given by its name in `SETS`."""
     kinds = [kind for k, kind in enumerate(DISTRACTORS) if (k % 3 == 0) == (name == "test")]
     if name == "training":
         kinds += _TIMES * list(PROCEDURAL)
@@ -75,7 +75,7 @@ def world_of(name: str) -> World:
 
 
 def simulate(name: str, worlds: int, jobs: int) -> Simulated:
-    """Simulate up to ``worlds`` arrangements of a set."""
+    """Simulate up to ``worlds`` arrangements of a set, given by its name in `SETS`."""
     numbers = range(min(worlds, SETS[name][1]))
     views = simulate_views(world_of(name), numbers, jobs=jobs)
     click.echo(f"simulating {len(numbers)} tables of the {name} set", err=True)

@@ -53,6 +53,11 @@ def compare_with_plain(
 ) -> list[tuple[str, ...]]:
     """Compare the model with baseline classifiers on the same test views.
 
+    Parameters
+    ----------
+    train : views of which some train the baselines.
+    blocks : names of the descriptor's blocks to use.
+
     Returns
     -------
     Rows of classifier, number of training views, accuracy, balanced accuracy.

@@ -142,7 +142,15 @@ def simulate_world(world: World, number: int) -> list[WorldView]:
 def simulate_mesh(
     mesh: Mesh, label: str, name: str, rest: Rest, *, cameras: int, rng: np.random.Generator
 ) -> list[WorldView]:
-    """Describe one given object, alone on the table, from several viewpoints."""
+    """Describe one given object, alone on the table, from several viewpoints.
+
+    Parameters
+    ----------
+    label : true category of the object.
+    name : prefix of its instance name.
+    rest : its resting pose.
+    cameras : number of viewpoints, each with its own sensor.
+    """
     actor = Actor(moved(mesh, rest.pose), label, rest.manner, 0.0)
     alone = Arrangement([placed(actor, (0.0, 0.0), 0.0, rng)], (ALONE,))
     return look(alone, name, cameras=cameras, rng=rng)

@@ -45,7 +45,7 @@ _FINE = 2
 
 
 def render_colour(world: World, frame: int, camera: ColourCamera = COLOUR) -> tuple[U1, U1]:
-    """Render a colour image of a world.
+    """Render a frame of a world as the colour camera beside the depth camera sees it.
 
     Returns
     -------
@@ -122,7 +122,7 @@ def _texture(points: F8, number: int, *, plain: bool) -> F8:
 
 
 def jpeg(colours: U1, quality: int = 85) -> bytes:
-    """Encode (h, w, 3) uint8 as JPEG."""
+    """Encode an image (h, w, 3), uint8, as JPEG; ``quality`` is from 1 to 95."""
     from PIL import Image as Picture  # noqa: PLC0415  # only for colour
 
     file = io.BytesIO()

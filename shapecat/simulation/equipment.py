@@ -120,7 +120,10 @@ def make_chair(rng: Generator, place: ArrayLike, *, degrees: float) -> list[Mesh
 
 
 def make_curtain(rng: Generator, width: float, height: float, place: ArrayLike) -> Mesh:
-    """Return a folded curtain along x whose lower edge is centred at ``place`` (3,); metres."""
+    """Return a folded curtain along x.
+
+    Its lower edge is centred at ``place`` (3,); lengths are in metres.
+    """
     x, z = np.linspace(-width / 2, width / 2, 160), np.linspace(0, height, 4)
     depth = rng.uniform(0.02, 0.06) * np.sin(x / rng.uniform(0.02, 0.05))
     depth = depth * (1 + 0.5 * np.sin(3 * x + rng.uniform(0, 6)))
@@ -150,7 +153,7 @@ def make_plant(rng: Generator) -> Mesh:
 
 
 def make_cable(rng: Generator, ends: F8) -> Mesh:
-    """Return a winding cable between two points (2, 3), metres."""
+    """Return a winding cable between two points ``ends`` (2, 3), metres."""
     steps = np.linspace(ends[0], ends[1], 6)
     steps[1:-1, :2] += rng.normal(0, 0.06, (4, 2))
     return tube(smooth_path(steps, 50), rng.uniform(0.002, 0.006), segments=6)

@@ -41,7 +41,7 @@ class Footprint(Record):
 
 
 def footprint(mesh: Mesh, world_from_mesh: Pose) -> Footprint:
-    """Return the footprint of a mesh at a pose."""
+    """Return the footprint of a mesh at a pose ``world_from_mesh``."""
     points = transform(world_from_mesh, mesh.vertices)
     low, high = float(points[:, 2].min()), float(points[:, 2].max())
     contact = points[points[:, 2] < low + 0.001, :2]
@@ -50,7 +50,7 @@ def footprint(mesh: Mesh, world_from_mesh: Pose) -> Footprint:
 
 
 def overlap(a: F8, b: F8, gap: float) -> bool:
-    """Return whether two convex outlines (k, 2), (m, 2) are closer than ``gap`` metres.
+    """Return whether two convex outlines ``a`` (k, 2) and ``b`` (m, 2) are closer than ``gap``.
 
     Source: separating axis theorem; the distance between two corners is not considered.
     """

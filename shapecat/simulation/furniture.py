@@ -55,7 +55,7 @@ def make_table(rng: Generator, least: tuple[float, float] | None = None) -> Supp
 
 
 def round_table(radius: float, height: float, thick: float) -> Support:
-    """Return a disc centred on the world's z axis, its upper face at ``height``."""
+    """Return a disc on the world's z axis, ``thick`` metres thick, its upper face at ``height``."""
     t = np.arange(48) * (2 * np.pi / 48)
     ring = np.stack([radius * np.cos(t), radius * np.sin(t)], -1)
     mesh = moved(extrude(ring, thick), Pose(np.eye(3), np.array([0, 0, height - thick])))
@@ -65,7 +65,10 @@ def round_table(radius: float, height: float, thick: float) -> Support:
 def make_shelf(
     width: float, depth: float, low: float, step: float
 ) -> tuple[list[Support], list[Support]]:
-    """Return three boards ``step`` apart, the lowest at z = ``low``; and two sides and a back."""
+    """Return three boards of a width and depth, and the two sides and the back of the shelf.
+
+    The lowest board is at z = ``low``, the others ``step`` above each other.
+    """
     thick = 0.02
     top = low + 3 * step
     boards = [

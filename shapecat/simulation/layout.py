@@ -109,7 +109,7 @@ class Layout:
     def put_piece(self, piece: Piece, support: Support, half: F8, *, tries: int = 40) -> bool:
         """Place a given object on a support; return whether there was room for it.
 
-        ``half`` is as for `put`; ``tries`` is the number of random positions to try.
+        ``half`` (2,) is as for `put`; ``tries`` is the number of random positions to try.
         """
         middle = support.outline[:, :2].mean(axis=0)
         for _ in range(tries):
@@ -123,6 +123,8 @@ class Layout:
 
     def room_for(self, k: int, support: Support, half: F8, *, tries: int = 200) -> F8 | None:
         """Reserve a second position for object ``k``, which keeps its first one.
+
+        The other parameters are as for `put_piece`.
 
         Returns
         -------

@@ -18,7 +18,7 @@ _DISTORTION = 5
 
 
 class MessageFactory:
-    """Makes messages of one ROS version.
+    """Makes messages of one ROS version; their timestamps are in nanoseconds.
 
     Parameters
     ----------

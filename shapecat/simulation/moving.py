@@ -17,7 +17,10 @@ __all__ = ["crossing", "rearranged", "walking"]
 
 
 def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
-    """Move the camera along a counter and back: objects leave the view and come back."""
+    """Return a counter with objects of these categories, which the camera passes back and forth.
+
+    Objects leave the view and come back.
+    """
     room, counter = make_room(rng, wall_chance=0.0), make_counter(rng)
     layout = Layout(rng, gap=rng.uniform(0.02, 0.05))
     for k, category in enumerate(categories):
@@ -31,7 +34,10 @@ def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> Worl
 
 
 def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
-    """Slide two objects between two rows of objects; they occlude these and each other."""
+    """Return two rows of objects of these categories, and two objects that slide between them.
+
+    The moving objects occlude the others and each other.
+    """
     room, table = make_room(rng, wall_chance=0.3), make_table(rng, (1.3, 0.85))
     layout = Layout(rng, gap=0.02, enclosed=True)
     t = filming.times()
@@ -54,7 +60,10 @@ def crossing(rng: Generator, categories: Sequence[str], filming: Filming) -> Wor
 
 
 def rearranged(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
-    """Add one object to a table, remove one, carry one to another place and push one."""
+    """Return a table with objects of these categories, four of which move.
+
+    One object is added, one is removed, one is carried to another position, and one is pushed.
+    """
     room, table = make_room(rng, wall_chance=0.3), make_table(rng, (1.3, 0.85))
     layout = Layout(rng, gap=0.04)
     lane = _strip(table, (-0.4, 0.4), (-0.32, -0.2))  # kept free for the pushed object

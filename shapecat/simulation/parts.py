@@ -36,7 +36,10 @@ def ellipsoid(axes: ArrayLike) -> Mesh:
 
 
 def turned_body(knots: Sequence[tuple[float, float]], count: int = 26) -> Mesh:
-    """Return a solid of revolution about z with a smooth profile through (radius, z) knots."""
+    """Return a solid of revolution about z with a smooth profile through (radius, z) knots.
+
+    ``count`` is the number of rings of the mesh; lengths are in metres.
+    """
     path = smooth_path(knots, count)
     path[:, 0] = np.maximum(path[:, 0], 0)
     return lathe(path, segments=36)

@@ -128,7 +128,15 @@ def _drawn(rng: Generator, value: Range) -> float:
 def hold(
     rng: Generator, target: F8, frames: int, *, distance: float, elevation: float
 ) -> tuple[Pose, ...]:
-    """Keep the camera still, looking at ``target`` (3,); lengths in metres, angles in degrees."""
+    """Keep the camera still, looking at a target.
+
+    Parameters
+    ----------
+    target : (3,) metres, world frame; the camera is on the side of negative y.
+    frames : number of poses.
+    distance : distance to the target, metres.
+    elevation : angle by which the camera looks down, degrees.
+    """
     up = np.radians(elevation)
     eye = target + distance * np.array([0, -np.cos(up), np.sin(up)])
     return (looking_at(eye, target, roll=float(np.radians(rng.normal(0, 1.0)))),) * frames
@@ -142,7 +150,15 @@ def scattered(
     distance: tuple[float, float] = (0.5, 2.0),
     elevation: tuple[float, float] = (15.0, 60.0),
 ) -> tuple[Pose, ...]:
-    """Look at ``target`` (3,) from random directions; ranges in metres and degrees."""
+    """Look at a target from random directions.
+
+    Parameters
+    ----------
+    target : (3,) metres, world frame.
+    count : number of poses.
+    distance : range of the distance to the target, metres.
+    elevation : range of the angle by which the camera looks down, degrees.
+    """
     poses = []
     for _ in range(count):
         up, side = np.radians(rng.uniform(*elevation)), rng.uniform(0, 2 * np.pi)

@@ -39,7 +39,13 @@ class Item(NamedTuple):
 def pile(
     rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
-    """Drop objects in a heap on a table; they lean on, lie across and lie in each other."""
+    """Return a heap of objects dropped on a table; they lean on, lie across and lie in each other.
+
+    Parameters
+    ----------
+    categories : category of each object, or ``unknown``.
+    kinds : kinds of distractors for ``unknown``.
+    """
     supports = (*make_room(rng, wall_chance=0.2), make_table(rng))
     table = supports[-1]
     spread = rng.uniform(0.07, 0.2)
@@ -63,7 +69,7 @@ def pile(
 def bin_picking(
     rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
-    """Drop objects into a bin and look into it from above."""
+    """Return objects dropped into a bin, seen from above; parameters as for `pile`."""
     bottom, sides = make_bin(rng)
     half = np.ptp(bottom.outline[:, :2], axis=0) / 2
     items = [make_item(category, rng, kinds) for category in categories]
@@ -82,7 +88,10 @@ def bin_picking(
 def shelf_bin(
     rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
-    """Drop objects into a shelf compartment and look into it from the front."""
+    """Return objects dropped into a shelf compartment, seen from the front.
+
+    The parameters are as for `pile`.
+    """
     board, walls, top = make_compartment(rng)
     half = np.ptp(board.outline[:, :2], axis=0) / 2
     room_m = top.mesh.vertices[:, 2].min() - board.height

@@ -70,6 +70,7 @@ def tube(
     ----------
     path : (k, 3) metres.
     radius : in the plane of the path, metres: a number, or (k,) one per point.
+    segments : number of corners of the cross-section.
     flatness : radius across the plane of the path divided by that in the plane.
     closed : whether the path is a ring; if not, the ends are capped.
     """

@@ -64,6 +64,7 @@ def simulate(
     color : also write the images of a colour camera beside the depth camera:
         /camera/color/image_raw/compressed (JPEG), /camera/color/camera_info, its pose in
         /tf_static, and ``NAME.color_labels.npz`` with the object of each colour pixel.
+    rate_hz : frames per second.
     observe : called with the phase, the number of finished frames, and the total.
 
     Returns

@@ -98,14 +98,15 @@ def render(seen: Geometry, camera: Camera, frame_from_camera: Pose) -> Image:
 
 
 def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Camera:
-    """Return the intrinsics of a crop of the image; all lengths in pixels."""
+    """Return the intrinsics of a crop with the given corner and size in pixels."""
     return Camera(width, height, camera.fx, camera.fy, camera.cx - left, camera.cy - top)
 
 
 def alone_pixels(seen: Geometry, owner: int, camera: Camera, frame_from_camera: Pose) -> int:
     """Count the pixels of one owner without the others, in an image three times as wide and high.
 
-    The count is 0 if a vertex is behind the camera or nearer than `NEAR_M`.
+    The count is 0 if a vertex is behind the camera or nearer than `NEAR_M`. ``seen`` and
+    ``frame_from_camera`` are as for `render`.
     """
     mine = seen.triangles[seen.owners == owner]
     if len(mine) == 0:

@@ -35,7 +35,7 @@ _DEVICES = {"laptop": make_laptop, "keyboard": make_keyboard, "plant": make_plan
 def room(
     rng: Generator, categories: Sequence[str], filming: Filming, *, kinds: Sequence[str] = KINDS
 ) -> World:
-    """Place objects on a table in a room full of background equipment."""
+    """Return objects on a table among background equipment; parameters as for `pile`."""
     supports = [*make_room(rng, wall_chance=0.7), make_table(rng)]
     table = supports[-1]
     supports += _walls(rng)

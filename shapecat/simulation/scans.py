@@ -50,7 +50,7 @@ def load_mesh(path: Path) -> Mesh:
 
 
 def uprighted(mesh: Mesh, category: str) -> Mesh:
-    """Turn a mesh upright: estimate from its shape which of its six axis directions is up.
+    """Turn a mesh of a category upright, estimating which of its six axis directions is up.
 
     A can stands on the axis along which its outline is roundest; a bottle also prefers its longest
     axis, with its narrow end up. A cup, bowl or plate is turned so that its surface, seen from

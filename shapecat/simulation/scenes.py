@@ -72,7 +72,7 @@ def make_scene(
 
     Parameters
     ----------
-    frames : number of frames; the objects do not depend on it.
+    frames, rate_hz : number of frames, and frames per second; the objects do not depend on them.
     categories : categories to draw from; each appears at least once where there is room.
     distractors : number of objects outside the categories; the kind of scene decides by default.
 

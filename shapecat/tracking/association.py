@@ -25,7 +25,7 @@ def size_key(sizes: F4) -> F8:
 
 
 def size_difference(keys_a: F8, keys_b: F8) -> F8:
-    """Return (m, n) mean absolute differences of keys (m, 3) and (n, 3) from `size_key`."""
+    """Return (m, n) mean absolute differences of `size_key` results (m, 3) and (n, 3)."""
     return np.asarray(np.abs(keys_a[:, None] - keys_b[None]).mean(axis=2))
 
 

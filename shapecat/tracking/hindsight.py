@@ -162,7 +162,7 @@ def _distances(fragments: Fragments, i: int, after: I4, settings: TrackingSettin
 
 
 def scene_cuts(hits: Hits, settings: TrackingSettings) -> Bool:
-    """Return (f,) which frames of a stream begin a new scene.
+    """Return the mask (f,) of frames of a stream that begin a new scene.
 
     Recordings of single images can show different objects at the same position from one frame to
     the next. Two frames disagree if fewer than half of the objects that have a neighbour in the

@@ -118,7 +118,10 @@ class Hits:
         return np.arange(which.size) - (np.cumsum(stop - first) - stop)[which], which
 
     def places(self, member: I4, rows: I4) -> F8:
-        """Return the positions (k, 3) of a track in frames ``rows`` (k,), interpolated, metres."""
+        """Return the interpolated positions (k, 3) of a track in frames ``rows`` (k,), metres.
+
+        ``member`` are the hits of the track.
+        """
         if len(rows) == 0:
             return np.zeros((0, 3))
         # Use only hits near these frames, as long tracks are queried for many short spans.
@@ -141,7 +144,7 @@ class Hits:
         return rows, np.isin(rows, seen)
 
     def sees(self, member: I4, rows: I4) -> Bool:
-        """Return which frames belong to topics with hits of the track ``member``."""
+        """Return the mask of frames ``rows`` whose topics have hits of the track ``member``."""
         return np.isin(self.topics[rows], self.topics[self.rows[member]])
 
     def seen_with(self, member: I4, other: I4) -> I4:

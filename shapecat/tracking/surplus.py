@@ -45,7 +45,8 @@ def without_pieces(hits: Hits, members: Sequence[I4], max_gap_s: float) -> list[
 
     If an object is split in some frames, the track of a piece lies, in the other frames, in the box
     of the whole object. An object that only stands near another one, or is hidden by it, has its
-    centre outside that box. ``members`` are the hits (k,) of each track, ascending.
+    centre outside that box. ``members`` are the hits (k,) of each track, ascending; longer gaps
+    than ``max_gap_s`` are ignored.
     """
     if hits.axes is None:
         return list(members)
