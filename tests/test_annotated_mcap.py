@@ -236,15 +236,31 @@ def test_recovered_recording_is_written_anew(tmp_path: Path) -> None:
     annotate(source, target)
 
     with open_recording(source) as recording:
-        kept = [bytes(message.data) for message in recording.messages()]
+        kept = [(*m[1:-1], bytes(m.data)) for m in recording.messages()]
     with open_recording(target) as recording:
-        read = [bytes(m.data) for m in recording.messages() if m.topic == "/points"]
+        read = [(*m[1:-1], bytes(m.data)) for m in recording.messages() if m.topic == "/points"]
         assert recording.warnings == []
     assert read == kept
     assert len(kept) >= 5
+    assert kept[2] == (EPOCH + 2, EPOCH, 2, string("message 2"))  # logged, published, sequence
     with target.open("rb") as file:
         assert {m.name for m in make_reader(file).iter_metadata()} == {"robot", "shapecat"}
     assert len(decoded(target, "/shapecat/scene")) == 3
+
+
+def test_what_lies_beside_the_messages_of_any_part_is_kept(tmp_path: Path) -> None:
+    source, target = tmp_path / "bag", tmp_path / "out.mcap"
+    source.mkdir()
+    for k in range(2):
+        write_mcap(source / f"bag_{k}.mcap")
+
+    annotate(source, target)
+
+    with target.open("rb") as file:
+        reader = make_reader(file)
+        names = [item.name for item in reader.iter_attachments()]
+        names += [item.name for item in reader.iter_metadata()]
+    assert sorted(names) == ["photo", "photo", "robot", "robot", "shapecat"]
 
 
 @pytest.mark.parametrize("plugin", list(StoragePlugin))

@@ -23,7 +23,7 @@ from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encod
 from shapecat.recordings import open_recording
 from shapecat.recordings.protobuf import message_decoder
 from shapecat.types import ShownBox, ShownFrame
-from tests.test_annotated_mcap import write_mcap
+from tests.test_annotated_mcap import EPOCH, write_mcap
 
 SECOND = 10**9
 STAMP = 1_700_000_123 * SECOND + 456_789_012
@@ -219,6 +219,27 @@ def test_added_messages_are_found_by_time(tmp_path: Path) -> None:
     topics = {channel.id: channel.topic for channel in summary.channels.values()}
     counts = {topics[k]: n for k, n in summary.statistics.channel_message_counts.items()}
     assert counts == {"/points": 9, "/shapecat/detections": 400, "/shapecat/scene": 400}
+
+
+def test_added_messages_are_found_though_they_are_not_in_order(tmp_path: Path) -> None:
+    """Two sensors are read by turns. The file begins and ends with whichever message does."""
+    offsets = (50, 20, 90, 70)
+    frames = [replace(FRAME, index=k, log_time_ns=EPOCH + t) for k, t in enumerate(offsets)]
+    target = tmp_path / "out.mcap"
+    with open_recording(write_mcap(tmp_path / "a.mcap")) as recording:
+        write_annotated(recording, target, iter(frames), run={}, markers=False)
+    with target.open("rb") as file:
+        reader = make_reader(file)
+        for start, stop, expected in ((20, 21, [20]), (80, 99, [90]), (3, 60, [20, 50])):
+            window = {"starting_at": EPOCH + start, "ending_before": EPOCH + stop}
+            found = reader.iter_messages(["/shapecat/scene"], **window)
+            assert [message.log_time - EPOCH for *_, message in found] == expected
+        summary = reader.get_summary()
+
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_start_time == EPOCH  # of the original
+    assert summary.statistics.message_end_time == EPOCH + 90
 
 
 def test_what_another_sensor_still_sees_is_not_taken_away(tmp_path: Path) -> None:

@@ -19,7 +19,8 @@ from scipy.spatial.transform import Rotation
 
 from shapecat.detection.scene_graph import Node
 from shapecat.errors import OutputError
-from shapecat.outputs.annotated_mcap import _annotations
+from shapecat.outputs.annotated_mcap import _annotations, _encoding
+from shapecat.outputs.annotation import Annotation
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.dataset_frames import Selection, _chosen, _different, _view, split_runs
 from shapecat.outputs.exports import _made_by_export, _require_own, _thinned
@@ -27,6 +28,7 @@ from shapecat.outputs.exports_files import png, support_offset, upright_cloud
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.image_annotations import ImageBox
 from shapecat.outputs.scene_tree import _candidate, _described
+from shapecat.recordings.messages import Topic
 from shapecat.runs.label_meaning import TrackLabel, _slips
 from shapecat.types import (
     Box,
@@ -81,6 +83,8 @@ def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
         shown("/a", 200, 3, ended=(9,)),
         shown("/b", 250, ended=(7,)),
         shown("/c", 260, 4),
+        shown("/c", 300, 4),
+        shown("/c", 400),
     ]
     found = [(a.lifetime_ns, a.gone) for a in _annotations(frames)]
 
@@ -90,11 +94,36 @@ def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
         (1_500_000_000, ()),  # a topic's first frame: a second is assumed
         (90, (9,)),  # 2 is still seen on /b
         (150, (2, 7)),
-        (1_500_000_000, ()),
+        (60, ()),
+        (150, ()),  # the next frame comes late
+        (150, (4,)),
     ]
 
 
 # ---- data sets of images: which frames
+
+
+@pytest.mark.parametrize(
+    ("annotated", "kind", "expected"),
+    [
+        ("/depth", "mcap", "cdr"),  # its own, though most topics are JSON
+        ("/bytes", "mcap", "json"),  # of an encoding that nothing can be annotated in
+        ("/depth", "ros1", "cdr"),
+        (None, "mcap", "json"),
+    ],
+)
+def test_annotations_are_encoded_as_the_topic_they_belong_to(
+    annotated: str | None, kind: str, expected: str
+) -> None:
+    """Viewers of one encoding would see the sensor without its objects."""
+    encodings = {"/a": "json", "/b": "json", "/depth": "cdr", "/bytes": "flatbuffer"}
+    topics = tuple(Topic(name, "t", encoding, 9) for name, encoding in encodings.items())
+    recording: Any = SimpleNamespace(kind=kind, topics=topics)
+    strange: Any = SimpleNamespace(kind="mcap", topics=topics[3:])
+    first = None if annotated is None else Annotation(shown(annotated, 5, 1), 7, ())
+
+    assert _encoding(recording, first) == expected
+    assert _encoding(strange, first) == "json"
 
 
 def finished(frames: list[LabelledFrame]) -> Any:
