@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from .options import ANY_PATH, json_option, model_option
-from .render import print_json, progress_bars
+from .render import plural, print_json, progress_bars
 
 
 @click.command()
@@ -55,7 +55,7 @@ def evaluate(
     with progress_bars() as bars:
         report = evaluate_folder(dataset, model, baselines=baselines, observe=bars)
     if page is not None:
-        write_page(page, report, title=f"{dataset.name}: {report.n} views")
+        write_page(page, report, title=f"{dataset.name}: {plural(report.n, 'view')}")
     if as_json:
         print_json(report.as_dict())
     else:

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from .options import ANY_PATH, json_option, seed_option
-from .render import print_json, progress_bars
+from .render import plural, print_json, progress_bars
 
 
 @click.command()
@@ -35,4 +35,6 @@ def learn(*, model: Path, dataset: Path, out: Path, seed: int, as_json: bool) ->
     if as_json:
         print_json(result)
     else:
-        click.echo(f"{out}: learned {', '.join(result['added'])} from {result['views']} views")
+        click.echo(
+            f"{out}: learned {', '.join(result['added'])} from {plural(result['views'], 'view')}"
+        )

@@ -264,7 +264,7 @@ def _print_corrections(outcome: Any) -> None:
     name = outcome.job.name.rpartition("/")[2]
     where = outcome.job.target or outcome.summary.folder
     kept = f"; the others are in {where}/tracks.previous.csv" if missed else ""
-    text = f"{name}: carried over {done} of {done + len(missed)} corrected labels{kept}"
+    text = f"{name}: transferred {done} of {done + len(missed)} corrected labels{kept}"
     click.echo("\n".join((text, *map(missed_words, missed))), err=True)
 
 

@@ -58,7 +58,10 @@ def _serve(reports: "Reports", port: int) -> None:
 
     with serve_reports(reports, port=port) as address:
         click.echo(address)
-        click.echo("corrections go to tracks.csv as you make them; Ctrl+C ends", err=True)
+        click.echo(
+            "corrections are written to tracks.csv as you make them; Ctrl+C stops the server",
+            err=True,
+        )
         try:
             while True:
                 stopping.check()

@@ -5,7 +5,7 @@ from pathlib import Path
 import click
 
 from .options import ANY_PATH, json_option, seed_option
-from .render import print_json, progress_bars
+from .render import plural, print_json, progress_bars
 
 
 @click.command()
@@ -34,4 +34,4 @@ def train(*, dataset: Path, out: Path, seed: int, as_json: bool) -> None:
     if as_json:
         print_json(result)
     else:
-        click.echo(f"{out}: {result['views']} views of {', '.join(result['categories'])}")
+        click.echo(f"{out}: {plural(result['views'], 'view')} of {', '.join(result['categories'])}")

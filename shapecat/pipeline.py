@@ -116,9 +116,9 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
 def _once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]) -> None:
     """Run a phase unless it is done, and write its duration to run.json."""
     if phase in run["seconds"]:
-        _log.info("%s: %s was done before", folder, phase)
+        _log.info("%s: %s is already done", folder, phase)
         return
-    _log.info("%s: %s begins", folder, phase)
+    _log.info("%s: %s starts", folder, phase)
     begun = time.perf_counter()
     work()
     release_memory()
@@ -143,7 +143,7 @@ def _finished(
     run = read_run(job.folder)
     if not (same_options(run, planned) and same_content(run["input"], job.source, content.result)):
         msg = (
-            f"{job.folder}: holds the results of another input, model or settings; "
+            f"{job.folder}: has results of another input, model or settings; "
             "choose another --out, or --overwrite it"
         )
         raise OutputError(msg)

@@ -235,7 +235,7 @@ def test_folders_are_searched_and_bags_are_not_taken_apart(tmp_path: Path) -> No
     alone = find_recordings([str(tmp_path / "notes.txt")])
     assert [source.stem for source in alone.kept] == ["notes"]
     (tmp_path / "none").mkdir()
-    with pytest.raises(RecordingError, match="no recording there"):
+    with pytest.raises(RecordingError, match="no recording found"):
         find_recordings([str(tmp_path / "none")])
 
 

@@ -310,7 +310,7 @@ def test_what_a_person_wrote_in_the_target_stays(tmp_path: Path) -> None:
 
     (missed,) = transfer_labels(source, target).missed
 
-    assert missed.reason == "track 5 is labelled teapot already"
+    assert missed.reason == "track 5 already has the label teapot"
     assert labels_of(target) == {5: "teapot"}
 
 
@@ -500,7 +500,7 @@ def test_overwriting_keeps_corrections(shapecat: Run, corrected: tuple[Path, Pat
     done = shapecat(*again, "--every", 2)
 
     assert done.exit_code == 0
-    assert "lab.mcap: carried over 1 of 1 corrected labels" in done.stderr
+    assert "lab.mcap: transferred 1 of 1 corrected labels" in done.stderr
     (row,) = [row for row in rows_of(run) if row["label"]]
     assert row["label"] == "teapot"
     assert np.allclose(place_of(row), place_of(before), atol=0.02)
@@ -510,7 +510,7 @@ def test_overwriting_keeps_corrections(shapecat: Run, corrected: tuple[Path, Pat
 
     done = shapecat(*again, "--discard-labels")
 
-    assert "carried over" not in done.stderr
+    assert "transferred" not in done.stderr
     assert labels_in(run / "tracks.csv") == set()
     assert "teapot" not in annotated(run)
 
@@ -539,7 +539,7 @@ def test_labels_that_find_nothing_are_named_and_kept(
     )
 
     assert done.exit_code == 0, done.stderr
-    assert "carried over 0 of 1 corrected labels" in done.stderr
+    assert "transferred 0 of 1 corrected labels" in done.stderr
     assert "teapot: nothing was found there" in done.stderr
     assert labels_in(run / "tracks.previous.csv") == {"teapot"}
 

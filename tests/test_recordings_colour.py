@@ -241,7 +241,7 @@ def test_frames_pair_with_the_nearest_image_up_to_half_a_period(tmp_path: Path) 
     nearest = [None if v is None else (v.image.stamp_ns - EPOCH) // MS for _, v in pairs]
     assert nearest == [0, 40, 80, None]
     assert [frame.index for frame, _ in pairs] == [0, 1, 2, 3]
-    assert any("1 times: frames without a colour image of their time" in w for w in warnings)
+    assert any("(1×): no colour image near the time of the frame" in w for w in warnings)
 
 
 def test_an_image_that_is_logged_late_is_waited_for(tmp_path: Path) -> None:
@@ -269,7 +269,7 @@ def test_damaged_images_are_left_out_and_counted(tmp_path: Path) -> None:
     pairs, warnings = read(path, "/cam/color/image_raw/compressed")
 
     assert [view is not None for _, view in pairs] == [False, False, False, False, True]
-    assert any("jpeg image is cut off" in w for w in warnings)
+    assert any("jpeg image is truncated" in w for w in warnings)
     assert any("neither JPEG nor PNG" in w for w in warnings)
 
 

@@ -277,7 +277,7 @@ def test_labels_survive_a_replacement_that_was_killed(
 
     (served / "run.mcap").unlink()
     assert done.exit_code == 0, done.output
-    assert "carried over 1 of 1" in done.stderr
+    assert "transferred 1 of 1" in done.stderr
     assert not [name for name in files(out) if name.startswith(".run.old")]
     assert bucket.exists()
 

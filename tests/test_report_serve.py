@@ -409,7 +409,7 @@ def test_an_interrupt_ends_it_with_the_corrections_in_the_page(
 
     assert server.returncode == 130
     assert "Traceback" not in errors
-    assert "corrections go to tracks.csv as you make them" in errors
+    assert "corrections are written to tracks.csv as you make them" in errors
     assert '"label":"teapot"' in (run / "report.html").read_text("utf-8")
     assert "1 checked" in (run.parent / "index.html").read_text("utf-8")
 

@@ -171,8 +171,8 @@ def test_events_tell_births_ends_and_warnings(recording: Path) -> None:
         "no transforms",
         "#1 cup 0.97 appears",
         "#2 can 0.97 appears",
-        "#2 can 0.97 is not seen again",
-        "#1 cup 0.97 is not seen again",
+        "#2 can 0.97 disappears",
+        "#1 cup 0.97 disappears",
     ]
 
 
@@ -324,7 +324,7 @@ def test_the_run_is_readable_as_text() -> None:
 def test_a_missing_review_or_viewer_is_said_in_one_line(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with pytest.raises(OutputError, match="there is no review here"):
+    with pytest.raises(OutputError, match="no review there"):
         review.open_viewer(tmp_path / "none.rrd")
     (tmp_path / "r.rrd").touch()
     monkeypatch.setattr("shutil.which", lambda *_, **__: None)

@@ -229,7 +229,7 @@ def test_transforms_of_a_ros2_recording(tmp_path: Path) -> None:
 
     with open_recording(path) as recording:
         buffer = read_transforms(recording)
-        assert recording.warnings[0].startswith("left out transforms: /tf: cannot decode")
+        assert recording.warnings[0].startswith("skipped transforms: /tf: cannot decode")
 
     assert buffer.lookup("odom", "camera", EPOCH + SECOND // 2).translation[0] == 10.5
 

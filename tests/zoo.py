@@ -414,7 +414,7 @@ def copy_of(path: Path, *, note: str) -> Path:
 
 _SQL, _MCAP = StoragePlugin.SQLITE3, StoragePlugin.MCAP
 _PACKED = CompressionMode
-_CUT = "not finished: recovered"
+_CUT = "not finished; messages recovered"
 
 ZOO: dict[str, Exhibit] = {
     **{f"mcap {c.name.lower()}": Exhibit(partial(mcap, compression=c)) for c in CompressionType},
@@ -458,7 +458,7 @@ ZOO: dict[str, Exhibit] = {
     "ros 2 message-compressed": Exhibit(lambda p: folder(p, _SQL, _PACKED.MESSAGE)),
     "ros 2 mcap file-compressed": Exhibit(lambda p: folder(p, _MCAP, _PACKED.FILE)),
     "ros 2 splits": Exhibit(splits, frames=2 * FRAMES, said="metadata"),
-    "ros 2 with a damaged part": Exhibit(locked_part, said="left out b.db3"),
+    "ros 2 with a damaged part": Exhibit(locked_part, said="skipped b.db3"),
     "ros 2 beside other files": Exhibit(lambda p: copy_of(p, note="mine")),
     "db3": Exhibit(lambda p: database(p, definitions=True)),
     "db3 without definitions": Exhibit(lambda p: database(p, definitions=False), said="Humble"),
@@ -487,7 +487,7 @@ ZOO: dict[str, Exhibit] = {
     "magic alone": Exhibit(lambda p: file(p, "a.mcap", b"\x89MCAP0\r\n"), 4, 0, "empty"),
     "zeros": Exhibit(lambda p: file(p, "a.db3", b"SQLite format 3\0" + bytes(999)), 3, 0, "not a"),
     "old bag": Exhibit(lambda p: file(p, "a.bag", b"#ROSBAG V1.2\n"), 3, 0, "version 2.0"),
-    "empty folder": Exhibit(empty_folder, 3, 0, "no recording there"),
+    "empty folder": Exhibit(empty_folder, 3, 0, "no recording found"),
     "missing": Exhibit(lambda p: p / "a.mcap", 3, 0, "does not exist"),
 }
 """By name. A recording that is not damaged is read in full; nothing else is said about it."""

@@ -59,7 +59,7 @@ def find_recordings(sources: Sequence[str]) -> Found:
     kept = [_of_path(path) for path in paths] + list(remote.values())
     if not kept:
         named = " ".join(sources[:3])
-        msg = f"{named}: no recording there; expected .mcap, .bag or .db3 files, or a ROS 2 bag"
+        msg = f"{named}: no recording found; expected .mcap, .bag or .db3 files, or a ROS 2 bag"
         raise RecordingError(msg)
     return Found(kept, left_out)
 

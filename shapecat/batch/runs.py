@@ -199,7 +199,7 @@ def _run_of(job: Job) -> RunInfo:
     try:
         run: RunInfo = json.loads((Location(job.target, OutputError) / "run.json").read() or b"")
     except ValueError as error:
-        msg = f"{job.target}: no run.json there, though the manifest says that it is complete"
+        msg = f"{job.target}: no run.json, although the manifest lists it as complete"
         raise OutputError(msg) from error
     return run
 

@@ -55,7 +55,7 @@ class RecentFrames:
     def warnings(self) -> list[str]:
         """Return warnings for the user about the frames so far."""
         return [
-            f"{topic}: {n} frames are clouds, not depth images, and not fused"
+            f"{topic}: clouds are not fused, only depth images (frames: {n})"
             for topic, n in self._loose.items()
         ] + [
             f"{topic}: the pose of the sensor is unknown in {n} frames: "

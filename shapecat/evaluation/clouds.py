@@ -106,7 +106,7 @@ def _content(path: Path) -> bytes:
 def _pcd_header(content: bytes) -> tuple[dict[str, list[str]], _Layout]:
     found = re.search(rb"^DATA +(\w+)\s*?\n", content[:_LARGEST_HEADER], re.MULTILINE)
     if not found:
-        msg = "there is no line DATA"
+        msg = "it has no line DATA"
         raise ValueError(msg)
     lines = content[: found.end()].decode("ascii", "replace").splitlines()
     header = {words[0]: words[1:] for line in lines if (words := line.split())}
@@ -130,7 +130,7 @@ def _pcd_header(content: bytes) -> tuple[dict[str, list[str]], _Layout]:
 def _ply_header(content: bytes) -> tuple[F8 | None, _Layout]:
     end = re.search(rb"^end_header\r?\n", content[:_LARGEST_HEADER], re.MULTILINE)
     if not content.startswith(b"ply") or not end:
-        msg = "there is no header"
+        msg = "it has no header"
         raise ValueError(msg)
     lines = [
         line.split() for line in content[: end.start()].decode("ascii", "replace").splitlines()
@@ -182,14 +182,14 @@ def _unpack_pcd(body: bytes, layout: _Layout) -> F8:
     """Return the points (n, 3) of a compressed body, which stores field after field."""
     packed, size = np.frombuffer(body, "<u4", count=2).tolist()
     if size != layout.number * layout.point.itemsize or packed > len(body) - 8:
-        msg = "the compressed part is not as long as announced"
+        msg = "the compressed data is not as long as the header says"
         raise ValueError(msg)
     if size > packed * 300:  # LZF packs 264 bytes into 3 at best
-        msg = "the compressed part claims to be impossibly long"
+        msg = "the header claims an impossible length of the data"
         raise ValueError(msg)
     flat = np.zeros(size, np.uint8)
     if _unpack_lzf(np.frombuffer(body, np.uint8, packed, 8), flat) != size:
-        msg = "the compressed part is damaged"
+        msg = "the compressed data is damaged"
         raise ValueError(msg)
     columns = {}
     start = 0

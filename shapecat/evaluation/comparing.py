@@ -185,7 +185,7 @@ def _clouds(
     except (RecordingError, OutputError) as error:
         if recording is not None:
             raise
-        return iter(()), [f"Pictures without depth: {error}"]
+        return iter(()), [f"The pictures lack depth: {error}"]
 
 
 def _compare_frame(

@@ -155,9 +155,9 @@ def format_page(found: Comparison) -> str:
             for name, colour in zip(
                 (
                     "both",
-                    "missed: only the reference",
-                    "surplus: only the run, or of another object",
-                    "taken for another category",
+                    "missed: only in the reference",
+                    "surplus: only in the run, or on another object",
+                    "wrong category",
                 ),
                 COLOURS.values(),
                 strict=True,
@@ -175,7 +175,7 @@ _HEAD = ("frame", "difference", "true", "found", "track", "confidence", "overlap
 
 
 def _count(rows: Sequence[Difference]) -> str:
-    more = f"; the first {_MOST_ROWS} are here" if len(rows) > _MOST_ROWS else ""
+    more = f"; the first {_MOST_ROWS} are listed" if len(rows) > _MOST_ROWS else ""
     return f"{len(rows)} difference{'s' if len(rows) != 1 else ''}{more}"
 
 

@@ -75,7 +75,7 @@ def format_page(report: Report, *, title: str) -> str:
     parts = [
         f"<h1>{escape(title)}</h1>",
         _table(("", ""), _figures(report)),
-        "<h2>Confusion</h2><p>True category (row) taken for (column).</p>",
+        "<h2>Confusion</h2><p>Rows: true category; columns: predicted category.</p>",
         confusion_svg(report.categories, report.confusion),
         f"<h2>Calibration</h2><p>{_CALIBRATION}</p>",
         calibration_svg(report.calibration),
@@ -97,7 +97,7 @@ def format_markdown(report: Report, *, title: str, pictures: Mapping[str, str]) 
     parts = [
         f"# {_plain(title)}",
         _markdown(("", ""), _figures(report)),
-        "## Confusion\n\nTrue category (row) taken for (column).",
+        "## Confusion\n\nRows: true category; columns: predicted category.",
         f"![Confusion]({pictures['confusion']})",
         f"## Calibration\n\n{_CALIBRATION}",
         f"![Calibration]({pictures['calibration']})",

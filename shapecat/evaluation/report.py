@@ -166,7 +166,7 @@ def require_categories(names: Sequence[str], categorizer: Categorizer) -> None:
     if strange:
         msg = (
             f"model {categorizer.model_id} does not know {', '.join(strange)} (it knows "
-            f"{', '.join(categorizer.categories)}); teach it with `shapecat learn`, or rename the "
+            f"{', '.join(categorizer.categories)}); add it with `shapecat learn`, or rename the "
             f"folder to {UNKNOWN}"
         )
         raise ModelError(msg)
@@ -210,7 +210,7 @@ def format_report(report: Report) -> str:
     """Return a report as text tables, 100 columns wide."""
     stream = io.StringIO()
     console = Console(file=stream, width=100, highlight=False)
-    skipped = f", {report.skipped} without a surface left out" if report.skipped else ""
+    skipped = f"; skipped {report.skipped} without a surface" if report.skipped else ""
     console.print(f"{report.n} views, model {report.model}{skipped}\n")
     console.print(_figures(report))
     console.print(_confusion(report))
@@ -249,7 +249,9 @@ def _figures(report: Report) -> Table:
 
 
 def _confusion(report: Report) -> Table:
-    table = _grid("\ntrue category (row) taken for (column)", "", *report.categories, "recall")
+    table = _grid(
+        "\nrows: true category; columns: predicted category", "", *report.categories, "recall"
+    )
     for name, row in zip(report.categories, report.confusion, strict=True):
         table.add_row(name, *(str(n) if n else "." for n in row), _text(report.recall[name]))
     return table

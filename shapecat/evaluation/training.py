@@ -95,8 +95,8 @@ def learn_on_folder(
     views = views.where(views.labels != UNKNOWN)
     if not set(views.labels.tolist()) - set(categorizer.categories):
         msg = (
-            f"{root}: model {categorizer.model_id} knows all its categories already; "
-            "`shapecat train` learns a model anew"
+            f"{root}: model {categorizer.model_id} already knows all its categories; "
+            "`shapecat train` trains a new model"
         )
         raise ModelError(msg)
     learned = add_categories(

@@ -120,7 +120,7 @@ def images_of(
             try:
                 image = _image(name, labelled, frame, coloured, selection, corrected)
             except MessageError as error:
-                _log.warning("%s: left out frame %d: %s", finished.name, labelled.index, error)
+                _log.warning("%s: skipped frame %d: %s", finished.name, labelled.index, error)
                 continue
             if image is not None and any(image.sure):
                 yield image

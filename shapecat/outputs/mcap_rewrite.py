@@ -140,4 +140,4 @@ def _extras(recording: McapRecording) -> Iterator[records.Attachment | records.M
             try:
                 yield parse(read, recording.content(record))
             except ChunkError as error:
-                recording.warn(f"left out a record at byte {record.offset}: {error}")
+                recording.warn(f"skipped a record at byte {record.offset}: {error}")

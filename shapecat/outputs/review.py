@@ -262,7 +262,7 @@ class _Review:
                 self._log("log", rr.TextLog(f"{shapes.label(item)} appears", level="INFO"))
         for number in labelled.ended:
             title = self._tracks[number].title if number in self._tracks else f"#{number}"
-            self._log("log", rr.TextLog(f"{title} is not seen again", level="INFO"))
+            self._log("log", rr.TextLog(f"{title} disappears", level="INFO"))
 
     def _add_track(self, item: LabelledObject) -> None:
         entity = f"/tracks/{item.track}"

@@ -144,7 +144,7 @@ def _last_stamp(client: Any) -> int | None:
 
 def _require_file(path: Path) -> None:
     if not path.is_file():
-        msg = f"{path}: there is no review here; process the recording without --no-rrd"
+        msg = f"{path}: no review there; process the recording without --no-rrd"
         raise OutputError(msg)
 
 

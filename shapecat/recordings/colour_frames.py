@@ -162,7 +162,7 @@ class _Partner:
         """Return the colour image nearest to a frame in time; None if none is usable."""
         nearest = min(self._images, key=lambda one: abs(one[0] - frame.stamp_ns), default=None)
         if nearest is None or 2 * abs(nearest[0] - frame.stamp_ns) > self._period():
-            self._left_out["frames without a colour image of their time"] += 1
+            self._left_out["no colour image near the time of the frame"] += 1
             return None
         try:
             return self._view(frame, *nearest)
@@ -173,7 +173,7 @@ class _Partner:
     def report(self) -> None:
         """Add a warning with a count for each reason why frames have no colour image."""
         for reason, count in self._left_out.items():
-            self._recording.warn(f"{self.stream.topic}: no colour {count} times: {reason}")
+            self._recording.warn(f"{self.stream.topic}: frames without colour ({count}×): {reason}")
 
     def _too_much(self) -> bool:
         kept = sum(len(image.data) for _, _, image in self._images)
@@ -201,7 +201,7 @@ class _Partner:
         if same_shape and one_frame and (lens is None or _alike(lens, frame.camera, _NEAR)):
             return ColourView(image, lens or _lens(frame.camera))
         if lens is None:
-            msg = "images without a sensor_msgs/CameraInfo"
+            msg = "colour images without a sensor_msgs/CameraInfo"
             raise MessageError(msg)
         pose = self._extrinsics.colour_from_depth(frame.frame_id, image.frame_id, frame.stamp_ns)
         if pose is not None:

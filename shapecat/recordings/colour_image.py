@@ -73,14 +73,14 @@ def compressed_size(data: bytes | memoryview) -> tuple[str, int, int]:
         raise MessageError(msg)
     end = b"\xff\xd9" if kind == "jpeg" else b"IEND"
     if end not in bytes(view[max(0, len(view) - 4096) :]):
-        msg = f"{kind} image is cut off"
+        msg = f"{kind} image is truncated"
         raise MessageError(msg)
     return kind, width, height
 
 
 def _png_size(data: memoryview) -> tuple[int, int]:
     if len(data) < 24:
-        msg = "png image is cut off"
+        msg = "png image is truncated"
         raise MessageError(msg)
     width, height = struct.unpack_from(">II", data, 16)
     return int(width), int(height)

@@ -35,7 +35,7 @@ def depth_of_compressed(message: Any) -> F4:
     """
     data = memoryview(message.data).cast("B").toreadonly()
     if len(data) < _HEADER.size + 8:
-        msg = f"compressed depth of {len(data)} bytes"
+        msg = f"compressed depth of only {len(data)} bytes"
         raise MessageError(msg)
     _, a, b = _HEADER.unpack_from(data)
     body = bytes(data[_HEADER.size :])
@@ -74,7 +74,7 @@ def _read_png(data: bytes) -> U2:
         msg = f"compressed depth is damaged: {error}"
         raise MessageError(msg) from error
     if len(plain) != need:
-        msg = "compressed depth is cut off"
+        msg = "compressed depth is truncated"
         raise MessageError(msg)
     rows = np.frombuffer(plain, np.uint8).reshape(height, 1 + 2 * width)
     return np.asarray(_unfilter(rows).view(">u2").astype(np.uint16))

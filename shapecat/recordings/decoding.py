@@ -79,7 +79,7 @@ def typestore_of(channel: Channel) -> Typestore:
     if not channel.schema:
         return _builtin(channel.encoding)
     if len(channel.schema) > _MAX_DEFINITION:
-        msg = f"definition of {len(channel.schema)} bytes"
+        msg = f"the definition is too long, {len(channel.schema)} bytes"
         raise ValueError(msg)
     return _defined(channel.type, channel.schema_encoding, channel.schema)
 
@@ -117,7 +117,7 @@ def _refuse_unrolling(types: dict[str, Any]) -> None:
             (kind, base), length = description[1]
             primitive = kind == Nodetype.BASE and base[0] != "string"
             if length > _MAX_UNROLLED and not primitive:
-                msg = f"{name}.{field}: array of {length}"
+                msg = f"{name}.{field}: an array of {length} is too long"
                 raise ValueError(msg)
 
 

@@ -125,7 +125,7 @@ class Upright:
         """
         off = f"differs by {np.median(angles_deg):.0f} degrees from the planes of {topic}"
         if not self.sources:
-            self.warnings.append(f"--up {off}: is it right? --up auto finds up from the planes")
+            self.warnings.append(f"--up {off}: is it right? --up auto estimates up from the planes")
         elif len(self.sources) == 1:
             self.warnings.append(f"up ({source}) {off}: is --up {self.sources[0]} right?")
         else:
@@ -170,7 +170,7 @@ class Upright:
         """
         if self._failed:
             self.warnings.append(
-                f"{self._failed} transform look-ups failed, the first: {self._first_failure}"
+                f"failed transform look-ups: {self._failed}, the first: {self._first_failure}"
             )
         source = max(self._given, key=lambda name: self._given[name], default="planes")
         report: dict[str, Any] = {"source": source}
@@ -186,9 +186,9 @@ class Upright:
         angles, bare = _angles_to_planes(perceived)
         typical = round(float(np.median(angles)), 1) if angles else None
         if typical is not None and typical > _DISAGREE_DEG:
-            self.warnings.append(f"up and the planes found differ by {typical} degrees")
+            self.warnings.append(f"up and the detected planes differ by {typical} degrees")
         elif bare > len(angles):
-            self.warnings.append(f"no level plane in {bare} frames: is up right? Try --up")
+            self.warnings.append(f"most frames have no level plane ({bare}): is up right? Try --up")
         return {"planes_differ_deg": typical, "frames_without_plane": bare}
 
 

@@ -59,7 +59,7 @@ def read_accelerometers(recording: Recording) -> tuple[Accelerometer, ...]:
             acceleration = np.array([a.x, a.y, a.z], np.float64)
             absent = float(imu.linear_acceleration_covariance[0]) == -1
         except (MessageError, AttributeError, LookupError, TypeError, ValueError) as error:
-            recording.warn(f"left out an IMU message: {error}")
+            recording.warn(f"skipped an IMU message: {error}")
             continue
         size = float(np.abs(acceleration).max())
         if not absent and 1e-3 < size < 1e4:

@@ -41,7 +41,7 @@ class Lens:
             return {"depth": depth, "camera": camera}
         if self._fit is not None:
             return {"depth": depth, "camera": self._fit.camera}
-        self._warn("not rectified: read as points along the undistorted rays")
+        self._warn("not rectified: converted to points along the undistorted rays")
         return unorganized(_points_along(self._rays, depth))
 
     def _calibrate(self, key: tuple[Camera, str, tuple[float, ...]], depth: F4) -> None:

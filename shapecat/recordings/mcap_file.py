@@ -161,12 +161,12 @@ class McapRecording(Recording):
         if low is not None and high is not None:
             self._times = [low, high]
         if finished:
-            self.warn("no index: messages are read in the order of the file")
+            self.warn("no index: messages are read in file order")
         else:
             lost = self._size - end
             self.warn(
-                f"the recording was not finished: recovered {self._counts.total()} messages"
-                + (f", with what is readable of the last {lost} bytes" if lost else "")
+                f"the recording was not finished; messages recovered: {self._counts.total()}"
+                + (f", and what was readable in the last {lost} bytes" if lost else "")
             )
 
     def _in_file(self, wanted: set[int]) -> Iterator[RawMessage]:
@@ -191,7 +191,7 @@ class McapRecording(Recording):
             try:
                 yield from self._take(record.opcode, memoryview(self.content(record)))
             except ChunkError as error:
-                self.warn(f"left out a record at byte {record.offset}: {error}")
+                self.warn(f"skipped a record at byte {record.offset}: {error}")
 
     def _chunk(self, record: Record, end: int | None = None) -> Iterator[RawMessage]:
         """Yield the messages of a chunk up to its end, its truncation, or the byte ``end``."""
@@ -200,7 +200,7 @@ class McapRecording(Recording):
                 yield from self._take(opcode, content)
         except ChunkError as error:
             part = "" if record.whole else "the rest of "
-            self.warn(f"left out {part}the chunk at byte {record.offset - 9}: {error}")
+            self.warn(f"skipped {part}the chunk at byte {record.offset - 9}: {error}")
 
     def _plain(self, record: Record, end: int | None) -> memoryview:
         """Return the decompressed records of a chunk; verify its checksum the first time."""
@@ -218,9 +218,11 @@ class McapRecording(Recording):
             if message.channel_id in self.summary.channels:
                 yield message
             else:
-                self.warn(f"left out messages of channel {message.channel_id}: not described")
+                self.warn(
+                    f"skipped messages of channel {message.channel_id}, which is not described"
+                )
         elif opcode not in _DEFINING and opcode not in _KNOWN:
-            self.warn(f"left out records of unknown kind {opcode}")
+            self.warn(f"skipped records of unknown kind {opcode}")
         elif self.indexed:
             return
         elif opcode == Opcode.SCHEMA:

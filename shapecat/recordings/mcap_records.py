@@ -104,7 +104,7 @@ def walk(file: BinaryIO, offset: int, end: int) -> Iterator[Record]:
         opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, end)
         content = offset + _HEAD.size
         if length > end - content:
-            msg = f"cut off in the record at byte {offset}"
+            msg = f"truncated in the record at byte {offset}"
             there = Record(opcode, content, end - content, whole=False)
             raise TruncatedError(msg, there if len(head) == _HEAD.size else None)
         yield Record(opcode, content, length)
@@ -141,7 +141,7 @@ def read_chunk_index(content: bytes) -> records.ChunkIndex:
     try:
         start, end, offset, length, entries = _INDEX.unpack_from(content)
         if entries % _ENTRY.size or _INDEX.size + entries > len(content):
-            msg = "damaged record: index entries that do not fit"
+            msg = "damaged record: index entries do not match"
             raise ChunkError(msg)
         at = _INDEX.size + entries
         offsets = dict(_ENTRY.iter_unpack(content[_INDEX.size : at]))
@@ -191,7 +191,7 @@ def read_chunk(content: bytes, *, end: int | None = None, checked: bool = False)
         return _decompress(_DECOMPRESS_PART[compression], data, min(end, size))[:end]
     plain = _decompress(_DECOMPRESS[compression], data, size)
     if len(plain) != size or (crc and not checked and zlib.crc32(plain) != crc):
-        msg = "damaged chunk: its checksum does not fit"
+        msg = "damaged chunk: its checksum does not match"
         raise ChunkError(msg)
     return plain
 
@@ -280,7 +280,7 @@ def split_chunk(chunk: memoryview) -> Iterator[tuple[int, memoryview]]:
     offset, end = 0, len(chunk)
     while offset < end:
         if end - offset < _HEAD.size:
-            msg = "cut off record in a chunk"
+            msg = "truncated record in a chunk"
             raise ChunkError(msg)
         opcode, length = _HEAD.unpack_from(chunk, offset)
         offset += _HEAD.size

@@ -61,14 +61,14 @@ def read_summary(file: BinaryIO, size: int, warn: Callable[[str], None]) -> Summ
         if not len(MAGIC) < start <= footer_at:
             return None
         if footer.summary_crc and footer.summary_crc != _checksum(file, size, start):
-            warn("the index is damaged: read from beginning to end instead")
+            warn("the index is damaged: reading the file from beginning to end instead")
             return None
         summary = _collect(file, start, footer_at)
         summary.data_end = _find_data_end(file, summary, start)
         if not footer.summary_crc and not _agrees(file, size, summary):
             return None
     except RecordingError:
-        warn("the index is damaged: read from beginning to end instead")
+        warn("the index is damaged: reading the file from beginning to end instead")
         return None
     return summary if _is_complete(summary) else None
 

@@ -59,7 +59,7 @@ def _axes(message: Any, step: int) -> list[tuple[int, str]]:
             msg = f"cloud without a field {name} of a known type; fields: {', '.join(fields)[:80]}"
             raise MessageError(msg)
         if int(field.offset) + np.dtype(kind).itemsize > step:
-            msg = f"field {name} at byte {field.offset} is outside of the point of {step} bytes"
+            msg = f"field {name} at byte {field.offset} lies outside the point of {step} bytes"
             raise MessageError(msg)
         axes.append((int(field.offset), order + kind))
     return axes

@@ -192,7 +192,7 @@ class BagRecording(Recording):
                 low = time if low is None else min(low, time)
                 high = time if high is None else max(high, time)
         self.start_ns, self.end_ns = low or 0, high or 0
-        self.warn(f"no index, or a damaged one: recovered {counts.total()} messages")
+        self.warn(f"no index, or a damaged one; messages recovered: {counts.total()}")
         if not self._channels:
             msg = "not a readable ROS 1 bag: no index and no messages in it"
             raise RecordingError(msg)
@@ -203,7 +203,7 @@ class BagRecording(Recording):
         try:
             yield from walk(self._file, self._first, self._size)
         except BagError as error:
-            self.warn(f"{error}: what follows is lost")
+            self.warn(f"{error}: everything after it is lost")
             if error.record is not None:
                 yield error.record
 
@@ -227,11 +227,11 @@ class BagRecording(Recording):
                     count += 1
                     yield found
             if self._chunks is not None and count != self._promised[record.start]:
-                problem = problem or f"{count} messages where the index has more or fewer"
+                problem = problem or f"the index does not list its {count} messages"
         except BagError as error:
             problem = problem or str(error)
         if problem:
-            self.warn(f"left out the rest of the record at byte {record.start}: {problem}")
+            self.warn(f"skipped the rest of the record at byte {record.start}: {problem}")
 
     def _take(
         self, fields: dict[str, bytes], data: memoryview
@@ -241,7 +241,7 @@ class BagRecording(Recording):
             number, time = u4(fields, "conn"), time_of(fields)
             if number in self._channels:
                 return number, time, data
-            self.warn(f"left out messages of connection {number}, which is not described")
+            self.warn(f"skipped messages of connection {number}, which is not described")
         elif kind == bytes([CONNECTION]) and self._chunks is None:
             self._connect(fields, data)
         return None

@@ -145,12 +145,12 @@ def walk(file: BinaryIO, start: int, end: int) -> Iterator[Record]:
         header = file.read(size) if size is not None and size <= _LONGEST_HEADER else b""
         length = _length(file.read(4))
         if size is None or len(header) != size or length is None:
-            msg = f"cut off or damaged at byte {start}"
+            msg = f"truncated or damaged at byte {start}"
             raise BagError(msg)
         begin = start + 8 + size
         record = Record(fields_of(header), start, begin, begin + length)
         if record.end > end:
-            msg = f"cut off in the record at byte {start}"
+            msg = f"truncated in the record at byte {start}"
             raise BagError(msg, record._replace(end=end))
         yield record
         start = record.end
@@ -172,7 +172,7 @@ def split(chunk: memoryview) -> Iterator[tuple[dict[str, bytes], memoryview]]:
         size = _length(bytes(chunk[at : at + 4]))
         length = None if size is None else _length(bytes(chunk[at + 4 + size : at + 8 + size]))
         if size is None or length is None or at + 8 + size + length > end:
-            msg = "cut off or damaged record in a chunk"
+            msg = "truncated or damaged record in a chunk"
             raise BagError(msg)
         begin = at + 8 + size
         yield fields_of(chunk[at + 4 : at + 4 + size]), chunk[begin : begin + length]
@@ -202,7 +202,7 @@ def expand(record: Record, data: bytes) -> tuple[memoryview, str]:
                 return memoryview(b""), f"{len(data)} bytes hold more than {limit}"
     except (OSError, RuntimeError, ValueError, EOFError) as error:
         return memoryview(bytes(plain)), f"damaged: {error}"
-    return memoryview(bytes(plain)), "" if worker.eof else "cut off"
+    return memoryview(bytes(plain)), "" if worker.eof else "truncated"
 
 
 _DECOMPRESSORS: dict[str, Callable[[], Any]] = {

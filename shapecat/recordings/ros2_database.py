@@ -71,11 +71,13 @@ class DatabaseRecording(Recording):
             except StopIteration:
                 return
             except (ReaderError, apsw.Error, OSError, *LIBRARY_ERRORS) as error:
-                self.warn(f"damaged: nothing read after this: {str(error) or type(error).__name__}")
+                self.warn(
+                    f"damaged: nothing after this was read: {str(error) or type(error).__name__}"
+                )
                 return
             channel = self._channels[connection.id]
             if not isinstance(data, bytes | memoryview):
-                self.warn(f"{channel.topic}: left out a message that holds no bytes")
+                self.warn(f"{channel.topic}: skipped a message without bytes")
                 continue
             plain = self._plain(channel, bytes(data))
             if plain is not None:
@@ -87,11 +89,11 @@ class DatabaseRecording(Recording):
             return data
         try:
             if zstandard.frame_content_size(data) > _LARGEST:
-                self.warn(f"{channel.topic}: left out a message that claims to hold over 1 GiB")
+                self.warn(f"{channel.topic}: skipped a message that claims more than 1 GiB")
                 return None
             return zstandard.ZstdDecompressor().decompress(data, max_output_size=_LARGEST)
         except (zstandard.ZstdError, MemoryError):
-            self.warn(f"{channel.topic}: left out a damaged compressed message")
+            self.warn(f"{channel.topic}: skipped a damaged compressed message")
             return None
 
 

@@ -135,7 +135,7 @@ class FolderRecording(Recording):
         if not self._parts:
             raise RecordingError("; ".join(reasons))
         for reason in reasons:
-            self.warn(f"left out {reason}")
+            self.warn(f"skipped {reason}")
 
     def _decompressed(self, file: Path) -> Path:
         """Decompress a file into a temporary folder, using at most half of the free space."""
@@ -151,7 +151,7 @@ class FolderRecording(Recording):
                 for block in reader.read_to_iter(source):
                     room -= target.write(block)
                     if room < 0:
-                        msg = "not enough room to decompress it in the temporary folder"
+                        msg = "not enough space in the temporary folder to decompress it"
                         raise RecordingError(msg)
         except zstandard.ZstdError as error:
             msg = f"damaged: {error}"

@@ -135,7 +135,7 @@ class DepthSource(Source):
             info = self.recording.decode(message)
             stamp = stamp_ns(info.header)
         except (MessageError, *_MALFORMED) as error:
-            self.recording.warn(f"left out a calibration: {error}")
+            self.recording.warn(f"skipped a calibration: {error}")
             return
         if self._waiting is None:
             self._info, self._info_stamp = info, stamp

@@ -57,8 +57,8 @@ class Clock:
 
 
 _TEXTS = {
-    "zero": "header.stamp is 0 in {} messages: their log time is used",
-    "epoch": "header.stamp of {} messages does not count from 1970: transforms may not match",
-    "back": "header.stamp goes backwards {} times",
-    "jump": "header.stamp jumps against the log time {} times",
+    "zero": "header.stamp is 0 ({}×): the log time is used instead",
+    "epoch": "header.stamp does not count from 1970 ({}×): transforms may not match",
+    "back": "header.stamp goes backwards ({}×)",
+    "jump": "header.stamp jumps relative to the log time ({}×)",
 }

@@ -317,9 +317,9 @@ def read_transforms(
             for transform in recording.decode(message).transforms:
                 refused += not _add(buffer, transform, static=message.topic.endswith("tf_static"))
         except (AttributeError, TypeError, ValueError, RecordingError) as error:
-            recording.warn(f"left out transforms: {error}")
+            recording.warn(f"skipped transforms: {error}")
     if refused:
-        recording.warn(f"left out {refused} invalid transforms (NaN, no name)")
+        recording.warn(f"skipped invalid transforms (NaN, no name): {refused}")
     return buffer
 
 

@@ -221,8 +221,8 @@ def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: boo
     else:
         found = "has tracks at other positions (and no column `run`)"
     msg = (
-        f"{path}: {found}, not those of {_described(folder, own)}; to find the same objects by "
-        "their places use --by-place"
+        f"{path}: {found}, not those of {_described(folder, own)}; to match objects by "
+        "place, use --by-place"
     )
     raise OutputError(msg)
 
@@ -269,7 +269,7 @@ def _relabelled(base: TrackTable, rows: Iterable[TrackRow]) -> TrackTable:
 def _refuse(path: Path, problems: Sequence[str]) -> None:
     if problems:
         listed = "\n  ".join(sorted(problems, key=lambda text: int(text.split()[1].rstrip(":"))))
-        msg = f"{path}: nothing was written, because of\n  {listed}"
+        msg = f"{path}: nothing was written:\n  {listed}"
         raise OutputError(msg)
 
 

@@ -95,7 +95,7 @@ def resolve_labels(
         try:
             shown = by_track[_follow(row.track, verdicts)]
             if not (one_frame or _share_a_topic(shown, row)):
-                msg = f"track {shown.track} is of another topic, {shown.topic or 'none'}"
+                msg = f"track {shown.track} belongs to another topic, {shown.topic or 'none'}"
                 raise ValueError(msg)  # noqa: TRY301  collected with those of the calls
         except ValueError as error:
             misread[row.track] = f"{row.label!r}: {error}"

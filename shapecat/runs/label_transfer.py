@@ -107,7 +107,7 @@ def _labelled_otherwise(transfer: Transfer, target: Path, run: RunInfo) -> dict[
     }
     own = {row.track: row.label for row in read_track_table(target / "tracks.csv").rows}
     return {
-        item.track: f"track {item.track} is labelled {own[item.track]} already"
+        item.track: f"track {item.track} already has the label {own[item.track]}"
         for item in transfer.transferred
         if own[item.track] not in ("", item.label) and (item.track, own[item.track]) not in earlier
     }
@@ -164,7 +164,9 @@ def _require_whole(path: Path, table: TrackTable) -> None:
         msg = f"{path}: {table.problems[0]}"
         raise OutputError(msg)
     if len(table.runs) > 1:
-        msg = f"{path}: holds tracks of several runs ({', '.join(table.runs)}); take one at a time"
+        msg = (
+            f"{path}: holds tracks of several runs ({', '.join(table.runs)}); give one run's table"
+        )
         raise OutputError(msg)
 
 

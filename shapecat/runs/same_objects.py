@@ -217,7 +217,7 @@ def match_in_place(
         if match is None:
             reasons[thing.track] = reason
         elif group(taken.get(match.track, thing.track)) != group(thing.track):
-            reasons[thing.track] = f"track {match.track} may also be track {taken[match.track]}"
+            reasons[thing.track] = f"track {match.track} could also be track {taken[match.track]}"
         else:
             taken[match.track] = thing.track
             found[thing.track] = [match]
@@ -241,7 +241,7 @@ def _nearest_there(
         return None, f"tracks {here.track} and {new[others[0][1]].track} are both there"
     rivals = [other.track for other in old if _apart(other, here) < distance + _CLEAR_M]
     if rivals:
-        return None, f"track {here.track} may also be track {rivals[0]}"
+        return None, f"track {here.track} could also be track {rivals[0]}"
     ratio = max(thing.extent_m, here.extent_m) / min(thing.extent_m, here.extent_m)
     if ratio > _SIZE_RATIO:
         return None, f"track {here.track} is there, but has another size"

@@ -93,7 +93,7 @@ def _text(path: Path) -> str:
     """Return the text of a table, in any of the encodings that spreadsheets use."""
     try:
         if path.stat().st_size > _LARGEST_TABLE:
-            msg = f"{path}: larger than {_LARGEST_TABLE >> 20} MB, not a tracks.csv"
+            msg = f"{path}: larger than {_LARGEST_TABLE >> 20} MB, too large for a tracks.csv"
             raise OutputError(msg)
         content = path.read_bytes()
     except OSError as error:

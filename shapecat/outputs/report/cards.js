@@ -74,7 +74,7 @@ function summarize() {
   const right = checked.filter((row) => labels.get(row.track) === row.category).length;
   byId("download").textContent = checked.length ? `Download tracks.csv (${checked.length})` : "Download tracks.csv";
   byId("verdict").textContent = checked.length
-    ? `${right} of ${checked.length} checked ${checked.length === 1 ? "track was" : "tracks were"} right. Rows: the category found; columns: your label.`
+    ? `${right} of ${checked.length} checked ${checked.length === 1 ? "track was" : "tracks were"} right. Rows: detected category; columns: your label.`
     : "Press a digit, or click a category on a card, to confirm or correct it.";
   byId("confusion").replaceChildren(...(checked.length ? [confusion(checked)] : []));
 }

@@ -170,7 +170,8 @@ def _time_line(line: Timeline, categories: Sequence[str], end: float) -> str:
     )
     return (
         '<svg class="line" viewBox="0 0 300 44" preserveAspectRatio="none" role="img" '
-        'aria-label="posterior over time"><title>posterior over time; below, when it was seen'
+        'aria-label="posterior over time"><title>posterior over time; the bar below shows when '
+        "the object was seen"
         f'</title><path class="grid" d="M0 2H300M0 33H300"/>{"".join(lines)}{seen}</svg>'
     )
 

@@ -177,7 +177,7 @@ def _next_step(finished: FinishedRun, *, served: bool) -> str:
     """Return the instructions to apply corrections to the other outputs."""
     folder = shlex.quote(str(finished.folder))
     if served:
-        text, command = "Corrections are in tracks.csv already.", f"shapecat annotate {folder}"
+        text, command = "Corrections are already in tracks.csv.", f"shapecat annotate {folder}"
     else:
         text = "Download tracks.csv first."
         command = f"shapecat annotate {folder} --labels tracks.csv"

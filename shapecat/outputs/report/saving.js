@@ -87,7 +87,7 @@ function showSaved() {
     byId("saved").textContent = "All corrections are in tracks.csv.";
   } else {
     byId("saved").textContent = lost
-      ? `${left} ${one ? "correction is" : "corrections are"} not on disk: ${lost}. Download the table to keep ${one ? "it" : "them"}.`
+      ? `${left} ${one ? "correction is" : "corrections are"} not saved: ${lost}. Download the table to keep ${one ? "it" : "them"}.`
       : "Saving …";
   }
 }

@@ -142,7 +142,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Accept a correction."""
         length = self.headers.get("Content-Length", "")
         if not length.isdecimal() or int(length) > _LARGEST_BODY:
-            self._send(_Answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "too long"))
+            self._send(_Answer(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, "request too long"))
             return
         self._serve(self.rfile.read(int(length)))
 
