@@ -90,7 +90,7 @@ class MaskMatches:
 
 
 def match_masks(found: Sequence[U4], true: Sequence[U4]) -> MaskMatches:
-    """Match found and true masks (n,), given as flat pixel indices, maximising the sum of overlap F.
+    """Match found and true masks, flat pixel indices (n,), maximising the sum of overlap F.
 
     Source: Xie et al. 2020 (overlap F of unseen objects), after Ochs et al. 2014.
     """
