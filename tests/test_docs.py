@@ -38,6 +38,22 @@ def test_every_command_explains_itself_with_an_example(
             assert parameter.help or parameter.name in {"seed", "scene", "sensor"}, parameter.name
 
 
+def test_the_root_page_cuts_no_description(shapecat: Callable[..., Result]) -> None:
+    """The library ends a description that is too long for a terminal with dots."""
+    assert "..." not in shapecat("--help").stdout.partition("Commands:")[2]
+
+
+@pytest.mark.parametrize(("command", "option"), [("simulate", "scene"), ("export", "kind")])
+def test_help_explains_each_choice(
+    shapecat: Callable[..., Result], command: str, option: str
+) -> None:
+    choice = next(p.type for p in commands()[command].params if p.name == option)
+    assert isinstance(choice, click.Choice)
+    lines = shapecat(command, "--help").stdout.splitlines()
+
+    assert [c for c in choice.choices if not any(x.startswith(f"  {c}  ") for x in lines)] == []
+
+
 def written_commands() -> list[tuple[str, str]]:
     return [
         (page.name, line.split("#")[0].strip())
