@@ -156,11 +156,11 @@ def evaluate(views: DescribedViews, categorizer: Categorizer) -> Report:
 
 
 def require_categories(names: Sequence[str], categorizer: Categorizer) -> None:
-    """Check that a model knows all labels.
+    """Check that a model knows all category names; ``unknown`` is always allowed.
 
     Raises
     ------
-    ModelError : the model does not know a label.
+    ModelError : the model does not know a name.
     """
     strange = sorted(set(names) - set(categorizer.categories) - {UNKNOWN})
     if strange:

@@ -75,7 +75,7 @@ too rare otherwise."""
 
 
 class Samples(NamedTuple):
-    """Merged segments: ``features`` (n, `FEATURES`); ``objects`` (n,), whether of an object."""
+    """Merged segments: ``features`` (n, `FEATURES`), and ``objects`` (n,), which are objects."""
 
     features: F4
     objects: Bool
