@@ -16,6 +16,7 @@ from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.perceived import FrameRow, PerceptionTables
 from shapecat.runs.run_info import Counts, InputInfo, Options, RunInfo
+from shapecat.runs.shown import _next_of_topic
 from shapecat.runs.tables import (
     DETECTIONS,
     FRAMES,
@@ -133,6 +134,20 @@ def test_labelled_frames_join_tracks_and_labels(tmp_path: Path) -> None:
     assert len(frames[2].planes) == 2
     assert frames[0].fixed_from_sensor is not None
     assert_allclose(frames[0].fixed_from_sensor.translation, [1, 2, 3])
+
+
+def test_what_has_ended_is_told_in_the_next_frame_of_the_same_sensor(tmp_path: Path) -> None:
+    """In a frame of another sensor nobody would look for it."""
+    names = ("/a", "/b", "/b", "/a", "/b")
+    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1") as tables:
+        for k, name in enumerate(names):
+            tables.write([replace(perception(10 * k, 1), topic=name)], [FrameRow(2000 + k, None)])
+
+    assert _next_of_topic(tmp_path) == {
+        ("/a", 0): ("/a", 30),
+        ("/b", 10): ("/b", 20),
+        ("/b", 20): ("/b", 40),
+    }
 
 
 def test_lists_of_nothing() -> None:

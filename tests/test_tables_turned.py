@@ -248,9 +248,12 @@ def test_tracks_csv_says_where_and_when(run: Path) -> None:
         assert float(row["novelty"]) == pytest.approx(fused, abs=0.006)
 
 
-def test_labelled_frames_and_annotations_show_the_same_boxes(run: Path) -> None:
-    """Two ways lead from the tables to what is shown."""
+@pytest.mark.parametrize("merged", [False, True])
+def test_labelled_frames_and_annotations_show_the_same_boxes(run: Path, *, merged: bool) -> None:
+    """Two ways lead from the tables to what is shown; up is another one in every frame."""
     labels = read_labels(run / "tracks.csv", CATEGORIES)
+    if merged:
+        labels[3] = labels[1]
     shown = list(read_shown_frames(run, labels))
     labelled = list(read_labelled_frames(run, labels))
 
@@ -259,6 +262,7 @@ def test_labelled_frames_and_annotations_show_the_same_boxes(run: Path) -> None:
         assert one.stamp_ns == other.stamp_ns == EPOCH + one.index * SECOND // 10
         assert other.fixed_from_sensor is not None
         assert_allclose(other.fixed_from_sensor.rotation, TURNS[one.index].as_matrix())
+        assert len(one.objects) == 3 - merged
         for item, same in zip(one.objects, other.objects, strict=True):
             assert (item.track, item.category) == (same.track, same.category)
             assert same.full is not None
