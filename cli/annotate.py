@@ -23,7 +23,11 @@ from .render import missed_words, progress_bars
     help="LABELS is another run, or its tracks.csv: transfer each of its labels to the object at "
     "the same place.",
 )
-@click.option("--boxes", type=click.Choice(BOXES), help=f"{BOXES_HELP}; as before by default.")
+@click.option(
+    "--boxes",
+    type=click.Choice(BOXES),
+    help=f"In annotated.mcap, {BOXES_HELP}; by default as in the run now.",
+)
 @click.option("--recording", type=ANY_PATH, help=RECORDING_HELP)
 def annotate(
     *,
@@ -43,6 +47,7 @@ def annotate(
     shapecat annotate again/lab --labels results/lab --by-place
     """
     from shapecat.pipeline import annotate_again
+    from shapecat.runs.folder import OUTPUTS
 
     if by_place and labels is None:
         msg = "--by-place needs --labels, the folder or the table of the other run"
@@ -51,7 +56,8 @@ def annotate(
         transfer = annotate_again(
             run, labels, bars, by_place=by_place, boxes=boxes, recording=recording
         )
-    click.echo(f"{run}: wrote annotated.mcap and review.rrd")
+    written = [name for name in OUTPUTS if (run / name).exists()]
+    click.echo(f"{run}: wrote {' and '.join(written) or 'no file but its tables'}")
     if transfer is not None:
         _show(transfer.as_dict(), labels)
 

@@ -22,7 +22,7 @@ from .render import plural, print_json, progress_bars
     type=ANY_PATH,
     metavar="TRAINING_SET",
     help="Train shapecat's model and simpler classifiers on these views and compare them on "
-    "DATASET. If both are the same data set, use five-fold cross-validation by instance.",
+    "DATASET. If TRAINING_SET is DATASET, use five-fold cross-validation by instance.",
 )
 @json_option
 def evaluate(
@@ -36,8 +36,8 @@ def evaluate(
     \b
     --baselines compares these classifiers with shapecat's own:
     forest        random forest on shapecat's descriptor
-    linear        logistic regression on the same
-    pnn           probabilistic neural network on the same
+    linear        logistic regression on shapecat's descriptor
+    pnn           probabilistic neural network on shapecat's descriptor
     forest words  linear classifiers on the leaves of a forest, as in the thesis
     D2            random forest on the distribution of point distances
     ESF-like      random forest on distributions of distances, areas and angles

@@ -44,12 +44,12 @@ _FORMATS = (*_DATASETS, "crops", *_WITH_BOXES, "point-labels")
     "--min-confidence",
     type=click.FloatRange(0, 1),
     default=0.0,
-    help="coco, yolo: label only objects with at least this confidence.",
+    help="coco, yolo: label only objects with at least this confidence, or labelled by a person.",
 )
 @click.option(
     "--corrected-only",
     is_flag=True,
-    help="coco, yolo: use only labels that a person has confirmed.",
+    help="coco, yolo: label only objects whose track a person has labelled.",
 )
 @click.option(
     "--depth", is_flag=True, help="coco, yolo: export 16-bit depth images instead of colour images."
@@ -64,7 +64,7 @@ _FORMATS = (*_DATASETS, "crops", *_WITH_BOXES, "point-labels")
 @click.option(
     "--boxes",
     type=click.Choice(BOXES),
-    help=f"kitti, labelcloud: {BOXES_HELP[0].lower()}{BOXES_HELP[1:]}; full by default.",
+    help=f"kitti, labelcloud: {BOXES_HELP}; full by default.",
 )
 @click.option("--recording", type=ANY_PATH, help=RECORDING_HELP)
 def export(
@@ -85,7 +85,7 @@ def export(
     \b
     coco          image segmentation: colour images with masks (RLE), boxes, tracks
     yolo          image segmentation: colour images with a polygon per object
-    crops         `shapecat train` and `learn`: the points of each object
+    crops         data set for `shapecat train` and `learn`: the points of each object
     kitti         3D detection: label_2, calib, velodyne, image_2
     labelcloud    editing 3D boxes by hand in the tool labelCloud
     point-labels  3D segmentation: masks of depth images, SemanticKITTI labels

@@ -58,7 +58,7 @@ verbose_option = click.option(
 )
 RECORDING_HELP = "Path of the recording, if it was moved."
 BOXES = ("full", "visible")
-BOXES_HELP = "Boxes enclose whole objects (full) or their visible parts"
+BOXES_HELP = "boxes enclose whole objects (full) or their visible parts"
 seed_option = click.option(
     "--seed",
     type=click.IntRange(0),

@@ -59,8 +59,8 @@ _MOST_ROWS = 100
     "--jobs",
     type=click.IntRange(1),
     metavar="N",
-    help="Number of processes; one per core by default. If there are fewer recordings, several "
-    "processes share the frames of one.",
+    help="Number of processes; one per core by default. If there are fewer recordings than "
+    "processes, several processes share the frames of one.",
 )
 @click.option(
     "--executor",
@@ -73,7 +73,9 @@ _MOST_ROWS = 100
     "--scheduler", metavar="ADDRESS", help="Address of a running Dask scheduler or Ray cluster."
 )
 @click.option(
-    "--shard", metavar="I/N", help="Process part I of N, for job arrays; I counts from 0 or 1."
+    "--shard",
+    metavar="I/N",
+    help="Process part I of N, for job arrays. Number the jobs 0 to N-1, or 1 to N.",
 )
 @click.option(
     "--progress",
@@ -89,13 +91,16 @@ _MOST_ROWS = 100
     help="Topic of colour images; by default those of the depth camera.",
 )
 @click.option("--no-color", is_flag=True, help="Do not use colour images.")
-@click.option("--boxes", type=click.Choice(BOXES), help=f"{BOXES_HELP}; full by default.")
+@click.option(
+    "--boxes", type=click.Choice(BOXES), help=f"In annotated.mcap, {BOXES_HELP}; full by default."
+)
 @click.option("--no-mcap", is_flag=True, help="Do not write annotated.mcap.")
 @click.option("--no-rrd", is_flag=True, help="Do not write review.rrd.")
 @click.option(
     "--overwrite",
     is_flag=True,
-    help="Replace earlier results; corrected labels go to the objects at the same places.",
+    help="Replace earlier results. Corrected labels are transferred to the objects at the same "
+    "places.",
 )
 @click.option("--discard-labels", is_flag=True, help="With --overwrite: drop corrected labels.")
 @click.option(

@@ -2,10 +2,12 @@
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from click.testing import Result
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from mcap.reader import make_reader
@@ -379,3 +381,15 @@ def test_no_stale_box_is_shown_after_corrections(guessed_run: Path, tmp_path: Pa
         wanted = {str(item.track) for item in frame.objects}
         assert {"".join(filter(str.isdigit, name)) for name in names} == wanted
         assert not {str(a), str(b)} & wanted
+
+
+def test_annotate_names_what_it_wrote(
+    guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result]
+) -> None:
+    """Without the review that `--no-rrd` left out, the line named a file that is not there."""
+    folder = tmp_path / "table"
+    shutil.copytree(guessed_run, folder)
+    done = shapecat("annotate", folder)
+
+    assert not (folder / "review.rrd").exists()
+    assert done.output.splitlines()[-1] == f"{folder}: wrote annotated.mcap"

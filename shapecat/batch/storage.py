@@ -187,9 +187,12 @@ class Location:
     def walk(self, *, deep: bool = True) -> Iterator[tuple[str, Mapping[str, Any]]]:
         """Yield URL and info of the files in a folder, or of the files that match a pattern.
 
+        A folder that does not exist yields nothing.
+
         Parameters
         ----------
-        deep : whether to descend into subfolders; otherwise these are yielded themselves.
+        deep : whether to yield the files in subfolders; if not, the subfolders are yielded. No
+            effect on a pattern.
         """
         found = self._match() if _is_pattern(self._path) else self._list(deep=deep)
         with suppress(FileNotFoundError):

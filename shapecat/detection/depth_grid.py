@@ -65,7 +65,10 @@ class DepthGrid(NamedTuple):
 def downsample(
     depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_M
 ) -> DepthGrid | None:
-    """Average the pixels of a depth image into cells; None if there is no reading.
+    """Average the pixels near the nearest one of each cell, and return the inverse depths.
+
+    Return None if there is no reading up to ``range_m``; of images larger than 50 pixels only every
+    fifth row and column is tried for it.
 
     Parameters
     ----------

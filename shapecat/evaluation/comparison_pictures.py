@@ -146,7 +146,7 @@ def _captions(
 
 
 def words_of(row: Any) -> str:
-    """Return a difference in words."""
+    """Describe a `Difference` as a short phrase; its ``difference`` must not be None."""
     track = "" if row.track is None else f" #{row.track}"
     return {
         "missed": f"missed {row.true_category}",

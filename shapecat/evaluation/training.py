@@ -34,13 +34,14 @@ def train_on_folder(
 ) -> dict[str, Any]:
     """Train a model on a data set and write it.
 
-    A first model is trained on four fifths of the instances of each category; the remaining fifth
-    evaluates it and fits its temperature and novelty threshold. The written model is trained on all
-    views, with this temperature and threshold.
+    A first model is trained on four fifths of the instances of each category. The remaining fifth
+    is used to evaluate it and to fit its temperature and novelty threshold. The written model is
+    trained on all views, with this temperature and threshold.
 
     Returns
     -------
-    Plain values: number of views, categories, model id, and the report on the held-out instances.
+    Plain values: ``views``, ``skipped``, ``categories``, ``model`` (its id), and ``held_out``, the
+    report on the instances held out.
 
     Raises
     ------

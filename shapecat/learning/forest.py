@@ -85,7 +85,10 @@ class FlatForest(Record):
 
 @kernel
 def fall(x: F4, trees: Trees, word: I4, result: I4) -> None:
-    """Write the word of features ``x`` (f,) in each tree into ``result`` (t,)."""
+    """Write the word (number of the leaf) that one view reaches in each tree into ``result`` (t,).
+
+    ``x`` (f,) are its features; ``word`` (n,) is from `FlatForest.word`.
+    """
     leaves, (roots, feature, threshold, left) = np.zeros(LANES, np.int32), trees
     for first in range(0, result.size, LANES):
         count = find_leaves(x, roots, feature, threshold, left, first, leaves)

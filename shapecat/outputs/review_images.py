@@ -46,8 +46,9 @@ def as_file(image: ColourImage) -> tuple[bytes, str]:
 class Picture(NamedTuple):
     """A colour image to show, with its objects.
 
-    ``contents`` is the image file, ``masks`` a PNG; ``boxes`` (n, 4) are left, top, width and
-    height in pixels.
+    ``contents`` is the image file. ``masks`` is a PNG overlay of the masks, translucent, in the
+    colours of the categories. Row k of ``boxes`` (n, 4), left, top, width and height in pixels,
+    belongs to ``objects[k]``; objects without a mask are left out.
     """
 
     topic: str

@@ -26,10 +26,13 @@ def in_time_order(
 ) -> Iterator[_M]:
     """Yield the messages of all chunks by time, in file order if times are equal.
 
+    While more than `_PENDING` bytes are held back no further chunk is read: then the messages of
+    overlapping chunks may come out of order.
+
     Parameters
     ----------
     chunks : time of the first message (ns), offset in the file, and chunk.
-    read : yields the messages of a chunk; called when they are needed.
+    read : yields the messages of a chunk; called when the chunk is due.
     """
     waiting = sorted(chunks, key=lambda chunk: chunk[:2], reverse=True)
     heap: list[tuple[int, int, int, int, _M]] = []

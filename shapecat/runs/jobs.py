@@ -164,9 +164,15 @@ def same_options(run: RunInfo, planned: RunInfo) -> bool:
 
 
 def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str]) -> RunInfo:
-    """Return the interrupted run in a folder if it does the planned work; else start anew.
+    """Return the run.json of the interrupted run in a folder if it can go on as planned.
 
-    Starting anew removes the files of other work and returns ``planned``.
+    It can if its settings, options, model, versions and recording are those of ``planned``.
+    Otherwise clear the folder, write ``planned`` as its run.json and return ``planned``.
+
+    Parameters
+    ----------
+    digest : returns the digest of the recording; called only if names, sizes or times of its files
+        differ.
     """
     with suppress(OutputError):
         run = read_run(folder)
@@ -225,7 +231,12 @@ def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
 
 
 def summarize(job: Job, run: RunInfo, *, processed: bool = True) -> Summary:
-    """Return the summary of a run."""
+    """Return the summary of a run.
+
+    Parameters
+    ----------
+    processed : False if the run was complete before; then ``corrections`` is None.
+    """
     return Summary(
         source=job.name,
         folder=job.folder,

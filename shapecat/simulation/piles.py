@@ -29,7 +29,10 @@ _SUNK_M = 0.02
 
 
 class Item(NamedTuple):
-    """An object to drop; ``kind`` is its category, or its kind of distractor."""
+    """An object to drop.
+
+    A distractor has the ``category`` ``unknown`` and its own ``kind``; for others both are equal.
+    """
 
     category: str
     kind: str

@@ -102,7 +102,7 @@ class World(Record):
     Attributes
     ----------
     kind : name of the kind of scene.
-    path : pose ``world_from_camera`` of the optical frame in each frame.
+    path : ``world_from_camera`` for each of the t images, with the camera's optical axes.
     turns : (t,) rotation of all objects about the world's z axis in each frame, radians.
     motions : motions of objects that also move by themselves.
     """

@@ -53,9 +53,9 @@ class Track(Record):
     hits : number of rows with a detection.
     frames : (k,) numbers of the frames in their streams, in the order of time.
     stamps_ns : (k,) times of the frames.
-    detections : (k,) numbers of the detections, -1 where the track coasts.
+    detections : (k,) number of the detection within its frame, -1 where the track coasts.
     centers : (k, 3) metres, in the coordinate frame of `FrameDetections.centers`.
-    causal : (k, c) fused posterior of the views up to each row.
+    causal : (k, c) fused posterior of the views up to each row, over the c categories.
     posterior : (c,) fused posterior of all views.
     confidence : largest entry of `posterior`.
     novelty : fused novelty of all views; above 1, the object belongs to no known category.

@@ -50,14 +50,15 @@ class Scratch(NamedTuple):
 def find_low_profile(
     grid: DepthGrid, heights: HeightMap, planes: F8, low_profile: I4, largest_m: float
 ) -> None:
-    """Find the low-profile objects, and assign swells of the surface to the plane.
+    """Find the low-profile objects on each plane, and give waves of depth error back to it.
 
     Parameters
     ----------
-    heights : ``plane_id`` is changed in place.
+    heights : ``plane_id`` is changed in place: k + 1 on the objects found on plane k, -(k + 1) on
+        cells that only a wave lifts.
     planes : from `pack_planes`.
     low_profile : (rows, columns) zeros; set to 1, 2, ... on low-profile objects.
-    largest_m : wider parts are swells or furniture, metres.
+    largest_m : a part that is wider, metres, is no low-profile object.
     """
     inv_depth, plane_id, height = grid.inverse_depth, heights.plane_id, heights.height
     widest = largest_m * grid.intrinsics.fx

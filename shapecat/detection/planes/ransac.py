@@ -90,7 +90,10 @@ def median_of(values: F4) -> float:
 
 @kernel
 def off_plane(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSamples:
-    """Return the samples farther than ``tolerance`` (1/m) from a plane (a, b, c)."""
+    """Return the samples whose inverse depth differs by more than ``tolerance``, 1/m, from a plane.
+
+    Its inverse depth at column j and row i is ``a * j + b * i + c``, 1/m.
+    """
     a, b, c = np.float32(plane[0]), np.float32(plane[1]), np.float32(plane[2])
     gate = np.float32(tolerance)
     rest = np.zeros((3, samples.inverse_depth.size), np.float32)
@@ -104,7 +107,7 @@ def off_plane(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSample
 
 @kernel
 def plane_normal(plane: F8, intrinsics: PinholeIntrinsics) -> F8:
-    """Return the unit normal (3,), towards the camera, of a plane.
+    """Return the unit normal (3,) of a plane, sensor frame, pointing towards the camera.
 
     The inverse depth of the plane (a, b, c) at column j and row i is ``a * j + b * i + c``, 1/m.
     """

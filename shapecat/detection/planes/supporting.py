@@ -26,9 +26,11 @@ def supporting_planes(
 ) -> list[SupportingPlane]:
     """Return the planes that are not the tops of objects, lowest first.
 
-    Below the front edge of a table or shelf board there is nothing; a box has a wall that goes down
-    to its support. A plane less than 6 cm above another is never furniture. A plane over a quarter
-    of a square metre always is, and so is one higher than the tallest object.
+    Heights count from the highest kept plane under the middle of a plane. A plane is dropped if it
+    is less than 6 cm high, or has less than 0.03 m2 and is neither the lowest nor higher than the
+    tallest object. Of the others it is kept if nothing is below it, if it is higher than the
+    tallest object, or if it has at least 0.25 m2. Any other plane is dropped if a wall is seen
+    below its front edge, as below that of a box; if little is seen there, it needs 0.1 m2.
 
     Parameters
     ----------

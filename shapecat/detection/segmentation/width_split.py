@@ -25,13 +25,13 @@ BESIDE = SEGMENTATION.bands_beside
 
 
 class Outlines(NamedTuple):
-    """The lateral range of labels 1..n, by bands of height.
+    """The lateral range of segments 1..n in bands of height of `BAND_M`; row 0 is not used.
 
     Attributes
     ----------
-    ends : (2, n + 1, BANDS) float32 lateral position of the left end, metres, and of the right end
-        with its sign changed, so that both increase inwards; infinite in a band without cells.
-    at : (2, n + 1, BANDS) int32 the flat cells of the ends.
+    ends : (2, n + 1, BANDS) float32 metres: the smallest position along `lateral_axis`, and minus
+        the largest, so that both grow where a segment narrows; infinite in a band without cells.
+    at : (2, n + 1, BANDS) int32 the cells at these ends, as row times columns plus column.
     counts : (n + 1, BANDS) int32 the number of cells.
     """
 

@@ -191,7 +191,7 @@ def serve_reports(reports: Reports, *, port: int = 0) -> Iterator[str]:
 
     Yields
     ------
-    The URL of the start page, with the token.
+    The URL of the start page. It holds the secret token that every request needs.
 
     Raises
     ------
