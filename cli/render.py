@@ -102,6 +102,6 @@ def plural(count: int, noun: str) -> str:
 
 
 def count_words(counts: Mapping[str, int]) -> str:
-    """Return counts as text, largest first: ``3 cup, 2 can``."""
+    """Return counts as text, largest first: ``cup 3, can 2``."""
     ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
-    return ", ".join(f"{count} {name}" for name, count in ordered) or "none"
+    return ", ".join(f"{name} {count}" for name, count in ordered) or "none"

@@ -110,7 +110,7 @@ def index_page(title: str, runs: Sequence[Listed]) -> str:
     return template("index.html").substitute(
         head=_head(title),
         title=escape(title),
-        subtitle=escape(", ".join(f"{n} {name}" for name, n in total.most_common())),
+        subtitle=escape(", ".join(f"{name} {n}" for name, n in total.most_common())),
         tiles=_tiles(tiles),
         runs="".join(map(_listed, runs)),
     )
@@ -248,10 +248,10 @@ def _data(names: Sequence[str], table: TrackTable, *, served: bool) -> str:
 
 def _listed(item: Listed) -> str:
     share = "".join(
-        f'<span style="--c:{css_colour(name)};--n:{count}" title="{count} {escape(name)}"></span>'
+        f'<span style="--c:{css_colour(name)};--n:{count}" title="{escape(name)} {count}"></span>'
         for name, count in item.categories.most_common()
     )
-    words = ", ".join(f"{count} {name}" for name, count in item.categories.most_common())
+    words = ", ".join(f"{name} {count}" for name, count in item.categories.most_common())
     seconds = item.run["seconds"].get("total", 0.0)
     notes = [plural(item.run["counts"]["frames"], "frame"), f"processed in {seconds:.1f} s"]
     notes += [f"{item.unsure} uncertain"] if item.unsure else []
