@@ -6,11 +6,13 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
 
 import shapecat
 from shapecat.errors import ConfigError, OutputError
+from shapecat.outputs.opened_run import Table
 from tests.loading import loaded_by
 from tests.test_docs_run import run_in_shell
 
@@ -28,6 +30,22 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "page.py").write_text("\n".join(blocks("python")), "utf-8")
     run_in_shell([*blocks("sh"), f"{sys.executable} page.py"], folder)
     return folder
+
+
+def test_the_times_of_a_posterior_count_from_the_first_frame(
+    guessed_run: Path, tmp_path: Path
+) -> None:
+    """Tracks are born at other times: drawn over their own age they could not be compared."""
+    run = shapecat.open_run(guessed_run)
+    rows = run.tracks.arrow()
+    pq.write_table(rows.filter(pc.greater_equal(rows["frame"], 3)), tmp_path / "late.parquet")
+    run.tracks = Table(tmp_path / "late.parquet")
+    stamps = run.frame_table.numpy("stamp_ns")
+
+    seconds, posteriors = run.posterior(1)
+
+    np.testing.assert_allclose(seconds, (stamps[3:] - stamps[0]) * 1e-9)
+    assert posteriors.shape == (len(stamps) - 3, len(run.categories))
 
 
 def test_every_block_of_the_page_works_as_printed(place: Path) -> None:

@@ -1,6 +1,7 @@
 """Calibrations and depth encodings with numbers that are all different, worked out by hand."""
 
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from shapecat.cameras.lenses import distort, undistorted_rays
 from shapecat.recordings.compressed_depth import depth_of_compressed
 from shapecat.recordings.depth_image import depth_of_image
 from shapecat.recordings.pinhole import camera_of_info, fit_pinhole
+from shapecat.recordings.sources import DepthSource
+from shapecat.recordings.streams import IMAGE, Stream
 from shapecat.types import Camera, Frame
 from tests.messages import (
     EPOCH,
@@ -54,6 +57,27 @@ def test_a_rectified_image_is_described_by_p_and_a_raw_one_by_k() -> None:
     raw, left = camera_of_info(calibration(d=np.array([0.1, 0, 0, 0, 0])), rectified=False)
     assert raw == Camera(*SIZE, 531.7, 527.1, 322.3, 243.9)
     assert left
+
+
+@pytest.mark.parametrize(
+    ("topic", "rectified"),
+    [
+        ("/camera/depth/image_rect", True),
+        ("/camera/depth/image_rect_raw", True),
+        ("/camera/depth/image_rect/compressedDepth", True),
+        ("/camera/depth/image_raw", False),
+        ("/camera/depth/image_raw/compressedDepth", False),
+        ("/rectified_camera/depth/image_raw", False),
+    ],
+)
+def test_the_name_of_a_topic_tells_whether_its_images_are_rectified(
+    topic: str, rectified: bool
+) -> None:
+    """A transport adds a part to the name; the namespace says nothing."""
+    recording: Any = SimpleNamespace(topics=())
+    stream = Stream(topic, IMAGE, "depth", "/info", 9, "optical", "16UC1")
+
+    assert DepthSource(recording, stream).rectified is rectified
 
 
 def test_without_p_a_rectified_image_is_described_by_k() -> None:

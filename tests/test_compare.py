@@ -20,7 +20,7 @@ from PIL import Image
 from shapecat.evaluation.comparing import Difference, compare
 from shapecat.evaluation.comparison_pictures import COLOURS, draw_frame
 from shapecat.evaluation.labellings import Item, Labelling
-from shapecat.evaluation.references_coco import filled_polygon, rle_mask
+from shapecat.evaluation.references_coco import CocoLabels, filled_polygon, rle_mask
 from shapecat.runs.tables import DETECTIONS, FRAMES, TRACKS
 
 Run = Callable[..., Result]
@@ -103,6 +103,26 @@ def write_truth(folder: Path) -> Path:
     ]
     (folder / "lab.truth.json").write_text(json.dumps(truth))
     return folder / "lab.truth.json"
+
+
+def test_a_crowd_of_coco_is_no_object_to_be_named() -> None:
+    """Other tools mark with it what nobody could tell; it is found, and its category not asked."""
+    square = [[1, 0, 3, 0, 3, 2, 1, 2]]
+    annotations = [
+        {"id": k, "image_id": 7, "category_id": 4, "segmentation": square, "iscrowd": k}
+        for k in (0, 1)
+    ]
+    images = [{"id": 7, "file_name": "a_000012.png", "width": 4, "height": 3}]
+    content = {"categories": [{"id": 4, "name": "cup"}], "annotations": annotations}
+    labels = CocoLabels(Path("labels.json"), {**content, "images": images}).at(("/depth", 12), 0)
+
+    assert labels is not None
+    assert [(item.category, item.decidable) for item in labels.items] == [
+        ("cup", True), ("cup", False)
+    ]  # fmt: skip
+    pixels = labels.items[0].pixels
+    assert pixels is not None
+    assert pixels.tolist() == [1, 2, 5, 6]
 
 
 @pytest.fixture

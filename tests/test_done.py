@@ -13,6 +13,7 @@ import pytest
 from shapecat.batch.finding import Source, find_recordings
 from shapecat.batch.manifest import Entry, Manifest, State
 from shapecat.batch.plans import Shard, name_folders, plan_batch
+from shapecat.batch.remote import Ticket
 from shapecat.batch.runs import Outcome, exit_code, process_on
 from shapecat.config import Settings
 from shapecat.errors import OutputError
@@ -92,6 +93,25 @@ def test_a_recording_that_was_written_to_has_changed_though_it_is_as_long(source
     assert not unchanged(before, source)
     source.unlink()
     assert not unchanged(before, source)
+
+
+@pytest.mark.parametrize(
+    ("known", "asked", "made"),
+    [
+        (("in1", "w1"), ("in1", "w1"), True),
+        (("in2", "w1"), ("in1", "w1"), False),
+        (("in1", "w2"), ("in1", "w1"), False),
+        (("", ""), ("", ""), False),  # what nothing is known of is not done
+    ],
+)
+def test_results_at_a_url_are_those_of_the_same_input_and_work(
+    source: Path, known: tuple[str, str], asked: tuple[str, str], *, made: bool
+) -> None:
+    run = planned(source)
+    assert not Ticket("b", *asked).made(run)
+    run["origin"] = {"input": known[0], "work": known[1]}
+
+    assert Ticket("b", *asked).made(run) is made
 
 
 def test_a_recording_is_processed_once_by_whatever_names_it_is_found(tmp_path: Path) -> None:

@@ -27,6 +27,16 @@ from shapecat.evaluation.training import (
 )
 
 
+def test_the_calibration_error_weighs_bins_by_their_views() -> None:
+    """Three views of which two are right at 0.9, one that is wrong at 0.6."""
+    posteriors = np.array([[0.9, 0.1], [0.1, 0.9], [0.9, 0.1], [0.6, 0.4]])
+    truth = np.array([0, 1, 1, 1])
+
+    error = metrics.expected_calibration_error(truth, posteriors)
+
+    assert error == pytest.approx(0.75 * (0.9 - 2 / 3) + 0.25 * 0.6)
+
+
 @settings(deadline=None, max_examples=30)
 @given(st.integers(1, 60), st.integers(2, 6), st.integers(0, 10_000))
 def test_metrics_agree_with_scikit_learn(n: int, categories: int, seed: int) -> None:

@@ -1,6 +1,7 @@
 """Labels of another run: refused as they are, found again by place and time, never guessed."""
 
 import csv
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from shapecat.runs.corrections import adopt_labels, read_labels
 from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.identity import new_id
 from shapecat.runs.label_transfer import TABLE_ALONE, match_labels, transfer_labels
+from shapecat.runs.same_objects import Match, _by_majority, _mutual_nearest
 from shapecat.runs.tables import DETECTIONS, FRAMES, TRACKS, write_table
 from shapecat.runs.track_table import read_track_table
 from tests.scenes import record
@@ -26,6 +28,39 @@ Path3 = Sequence[Sequence[float] | None]
 """Where an object is in each frame; None where it is not seen."""
 FRAMES_EACH = 10
 CUP, CAN, BOWL = (0.11, -0.42, 0.83), (0.34, -0.15, 0.79), (-0.27, 0.08, 0.86)
+
+
+def test_only_what_is_nearest_to_each_other_is_a_pair() -> None:
+    """Of two cups beside the place of one, a label goes to the nearer; to none out of reach."""
+    one = np.array([[0.00, 0.5, 0.3], [0.05, 0.5, 0.3], [0.9, 0.1, 0.2]])
+    other = np.array([[0.92, 0.1, 0.2], [0.04, 0.5, 0.3]])
+    reach = np.array([[0.1, 0.1], [0.1, 0.1], [0.019, 0.1]])
+
+    pairs = [(k, j, round(apart, 6)) for k, j, apart in _mutual_nearest(one, other, reach)]
+    wider = [(k, j, round(apart, 6)) for k, j, apart in _mutual_nearest(one, other, reach + 0.002)]
+
+    assert pairs == [(1, 1, 0.01)]
+    assert wider == [(1, 1, 0.01), (2, 0, 0.02)]
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        (7, 2, {1: [Match(9, 0.03)]}),  # of ten frames: the second has too small a share
+        (7, 3, {}),  # a rival
+        (5, 2, {}),  # no majority
+    ],
+)
+def test_a_track_is_the_object_it_is_nearest_to_unless_another_has_a_claim(
+    first: int, second: int, expected: dict[int, list[Match]]
+) -> None:
+    """It would get the label of one of two objects between which it changes."""
+    votes = {(1, 9): first, (2, 9): second}
+    apart = {(1, 9): 0.03 * first, (2, 9): 0.05 * second}
+    found = _by_majority(votes, apart, Counter({9: 10}), lambda track: track)
+
+    assert found.found == expected
+    assert set(found.reasons) == (set() if expected else {1, 2} if second == 3 else {1})
 
 
 def still(place: Sequence[float], *, frames: range = range(FRAMES_EACH)) -> Path3:

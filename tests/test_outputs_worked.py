@@ -22,7 +22,14 @@ from shapecat.errors import OutputError
 from shapecat.outputs.annotated_mcap import _annotations, _encoding
 from shapecat.outputs.annotation import Annotation
 from shapecat.outputs.colours import colour_of
-from shapecat.outputs.dataset_frames import Selection, _chosen, _different, _view, split_runs
+from shapecat.outputs.dataset_frames import (
+    Selection,
+    _chosen,
+    _depth_file,
+    _different,
+    _view,
+    split_runs,
+)
 from shapecat.outputs.exports import _made_by_export, _require_own, _thinned
 from shapecat.outputs.exports_files import png, support_offset, upright_cloud
 from shapecat.outputs.exports_points import write_point_labels
@@ -172,6 +179,19 @@ def test_a_view_is_a_direction_a_distance_a_size_and_a_shape() -> None:
     assert_allclose(found[3:5], [0, 0.3 * np.log(55)], atol=1e-6)
     assert_allclose(found[5:], [0.25, 0.07 / 0.48, 0.5], atol=1e-6)
     assert_allclose(_view(labelled_frame(0, item), item)[:3], -center, atol=1e-6)
+
+
+def test_depth_images_are_in_millimetres_and_end_where_16_bits_do() -> None:
+    """What is farther away would come near again."""
+    depth = np.array([[0.0, 1.2346, 65.535], [65.6, 70.0, 0.0005]], np.float32)
+    frame = Frame("/depth", 0, 0, 0, "cam", depth=depth, camera=Camera(3, 2, 5.0, 6.0, 1.0, 0.5))
+    found = _depth_file(labelled_frame(0), frame)
+    assert found is not None
+    suffix, contents, size, masks = found
+
+    assert (suffix, size, masks) == (".png", (2, 3), ())
+    image = np.asarray(Image.open(io.BytesIO(contents)))
+    assert image.tolist() == [[0, 1235, 65535], [65535, 65535, 0]]
 
 
 def runs(count: int, same: int = 0) -> Any:

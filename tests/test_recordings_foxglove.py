@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
 from shapecat.outputs.annotated_mcap import write_annotated
 from shapecat.outputs.scene_protobuf import descriptors_of, encode_foxglove
@@ -41,18 +42,19 @@ both = pytest.mark.parametrize("encoding", ["json", "protobuf"])
 def test_point_cloud_with_a_pose(tmp_path: Path, encoding: str) -> None:
     points = np.arange(12, dtype="<f4").reshape(4, 3) + 1
     fields = [{"name": name, "offset": 4 * k, "type": 7} for k, name in enumerate("xyz")]
-    turn = {
-        "position": {"x": 10.0, "y": 0.0, "z": 0.0},
-        "orientation": {"x": 0.0, "y": 0.0, "z": 1.0, "w": 0.0},
+    turn, place = Rotation.from_euler("zyx", [0.7, -0.4, 2.3]), [10.0, -3.0, 0.5]
+    pose = {
+        "position": dict(zip("xyz", place, strict=True)),
+        "orientation": dict(zip("xyzw", turn.as_quat().tolist(), strict=True)),
     }
-    values = {"pose": turn, "point_stride": 12, "fields": fields}
+    values = {"pose": pose, "point_stride": 12, "fields": fields}
     values["data"] = content(points.tobytes(), encoding)
 
     (frame,) = read(write(tmp_path / "a.mcap", encoding, [("/p", "foxglove.PointCloud", values)]))
 
     assert (frame.stamp_ns, frame.frame_id) == (EPOCH, "camera")
     assert frame.points is not None
-    np.testing.assert_allclose(frame.points, points * [-1, -1, 1] + [10, 0, 0], atol=1e-5)
+    np.testing.assert_allclose(frame.points, turn.apply(points) + place, atol=1e-5)
 
 
 @both

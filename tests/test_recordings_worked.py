@@ -362,7 +362,7 @@ def test_clocks_are_counted_for_what_is_wrong_with_them() -> None:
 
 def test_overlapping_chunks_are_merged_in_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Ties in the order of the file; a chunk is opened when it is due and there is room."""
-    chunks = {0: [10, 30, 50], 1: [20, 30, 40], 2: [50, 60], 3: [15, 70]}
+    chunks = {0: [50, 60], 1: [20, 30, 40], 2: [10, 30, 50], 3: [15, 70]}
     opened: list[int] = []
 
     def open_chunk(number: int) -> Any:
@@ -376,9 +376,9 @@ def test_overlapping_chunks_are_merged_in_little_memory(monkeypatch: pytest.Monk
 
     everything = sorted((t, n) for n, times in chunks.items() for t in times)
     assert merged() == everything
-    assert opened == [0, 3, 1, 2]
+    assert opened == [2, 3, 1, 0]
     monkeypatch.setattr(time_order, "_PENDING", 100)  # bytes: the next chunk waits for room
-    assert [n for _, n in merged()] == [0, 0, 0, 3, 3, 1, 1, 1, 2, 2]
+    assert [n for _, n in merged()] == [2, 2, 2, 3, 3, 1, 1, 1, 0, 0]
 
 
 def test_rotations_are_interpolated_as_scipy_does() -> None:

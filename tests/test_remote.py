@@ -1,6 +1,7 @@
 """Recordings and results at URLs: nothing half-done is seen, nothing is left in scratch."""
 
 import csv
+import errno
 import filecmp
 import functools
 import http.server
@@ -203,6 +204,31 @@ def test_a_bag_in_a_bucket(shapecat: Run, bucket: Path, tmp_path: Path) -> None:
     assert requests(bucket, "GET", "metadata.yaml")
 
 
+def answer(status: int) -> Exception:
+    error = Exception("the storage says so")
+    error.status = status  # type: ignore[attr-defined]  # as aiohttp's have
+    return error
+
+
+@pytest.mark.parametrize(
+    ("error", "passes"),
+    [
+        *((answer(status), True) for status in (429, 500, 503)),
+        *((answer(status), False) for status in (400, 401, 403, 404)),
+        (TimeoutError(), True),
+        (ConnectionResetError(), True),
+        (type("ServerDisconnectedError", (Exception,), {})(), True),
+        (OSError(errno.EBUSY, "slow down"), True),
+        (OSError(errno.EACCES, "not allowed"), False),
+        (ValueError("bucket"), False),
+    ],
+    ids=str,
+)
+def test_what_may_pass_is_tried_again(error: Exception, *, passes: bool) -> None:
+    """A busy server ends no batch, and a wrong key does not delay one."""
+    assert storage._may_pass(error) is passes
+
+
 def test_listings_come_in_pages(bucket: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(storage, "_PAGE", 3)
     for k in range(10):
@@ -296,6 +322,19 @@ def labelled(table: bytes, label: str) -> bytes:
 def fail(*_: object, **__: object) -> None:
     msg = "no space"
     raise OutputError(msg)
+
+
+def test_what_a_run_no_longer_makes_goes_with_the_run_it_replaces(made: Path) -> None:
+    """A review beside tables of other settings would show what they do not hold."""
+    url, names = "memory://renewed/run", {path.name for path in made.iterdir()}
+    assert "review.rrd" not in names
+    for name in ("review.rrd", "run.json"):
+        (Location(url) / name).write(b"{}")
+
+    with claimed(url, "one") as claim:
+        upload(made, url, claim)
+
+    assert files("memory://renewed") == {f"run/{name}" for name in names}
 
 
 def test_a_strangers_place_is_not_touched(made: Path) -> None:

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from shapecat.arrays import F8
 from shapecat.config import TrackingSettings
-from shapecat.tracking import tracker
+from shapecat.tracking import track_recording, tracker
 from shapecat.tracking.association import size_key
 from shapecat.tracking.common_motion import CommonMotion, _fit, _in_space, _level
 from shapecat.tracking.hindsight import Fragments, _contradiction, _distances
@@ -248,6 +248,38 @@ def test_what_is_not_known_whole_may_be_larger(
     key, others = np.array([1.4, 1.0, 0.6]), np.array([[1.0, 1.3, 0.5]])
     found = _contradiction(key, others, np.array(known), np.array([others_known]))
     assert found == pytest.approx([expected])
+
+
+# ---- several sensors
+
+
+def test_frames_of_two_sensors_are_put_in_the_order_of_time() -> None:
+    """They are recorded one sensor after the other; each keeps its own order."""
+    order = [
+        ("/a", 0, [0.1, 0.2]),
+        ("/a", 3, [0.3]),
+        ("/b", 1, [0.5]),
+        ("/b", 2, []),
+        ("/b", 4, [0.7]),
+    ]
+    frames = [frame(k, [[x, 0, 1] for x in xs], topic=name) for name, k, xs in order]
+    hits = Hits.of(frames)
+
+    assert hits.frames.tolist() == [0, 1, 2, 3, 4]
+    assert [hits.names[k] for k in hits.topics] == ["/a", "/b", "/b", "/a", "/b"]
+    assert hits.first.tolist() == [0, 2, 3, 3, 4, 5]
+    assert_allclose(hits.centers[:, 0], [0.1, 0.2, 0.5, 0.3, 0.7])
+    assert hits.rows.tolist() == [0, 0, 1, 3, 4]
+
+
+def test_tracks_are_numbered_by_birth_whichever_sensor_sees_them() -> None:
+    """What people call #1 is what appeared first."""
+    late = [frame(k, [0.3, 0.1, 1.0], topic="/a") for k in range(5, 15)]
+    early = [frame(k, [0.6, 0.2, 1.1], topic="/b") for k in range(10)]
+    found = list(track_recording([*late, *early], SETTINGS))
+
+    assert [(track.id, track.topic) for track in found] == [(1, "/b"), (2, "/a")]
+    assert_allclose(found[0].centers[0], [0.6, 0.2, 1.1], atol=1e-6)
 
 
 # ---- pieces
