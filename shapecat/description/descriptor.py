@@ -1,5 +1,7 @@
 """The shape descriptor of an object: a vector of fixed length."""
 
+from typing import Any
+
 import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U2
@@ -31,7 +33,7 @@ _CONTEXT, _CURVED = BLOCKS["context"].start, BLOCKS["curvature"].start
 _PROFILE, _REVOLUTION, _SOLIDS, _OUTLINE = (
     BLOCKS[name].start for name in ("profile", "revolution", "solids", "outline")
 )
-_METRIC, _VIEW = BLOCKS["metric"].start, BLOCKS["view"].start
+_METRIC = BLOCKS["metric"].start  # up to the end: the view is last
 
 
 def describe(points: F4, gas: NeuralGas, eye: F4) -> F4:
@@ -80,39 +82,17 @@ def describe(points: F4, gas: NeuralGas, eye: F4) -> F4:
     return result
 
 
-@kernel
 def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
-    """Write the descriptor; return whether the input was finite."""
+    """Write the descriptor; return whether the input was finite.
+
+    Each block is a kernel of its own: as one they would take two seconds more to compile.
+    """
     if not (_finite(neurons) and _finite(points) and _finite(eye.reshape(1, 3))):
         return False
-    count = neurons.shape[0]
-    x, y, z, straight, middle, unit = _own_units(neurons)
-    step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
-    total = (points.shape[0] + step - 1) // step
-    cloud = np.zeros((3, total), np.float32)
-    for k in range(total):
-        for axis in range(3):
-            # points this far away are not the neurons' own: the bound keeps squares finite
-            value = (points[k * step, axis] - middle[axis]) / unit
-            cloud[axis, k] = min(max(value, -_FAR), _FAR)
-    away = 0.0
-    for axis in range(3):
-        away += (eye[axis] - middle[axis]) ** 2
-    away = np.sqrt(away)
-    place = np.zeros(3, np.float32)
-    for axis in range(3):
-        place[axis] = (eye[axis] - middle[axis]) / max(unit, away / _FAR)
-    gap = max(mean_gap(straight), 1e-3)
-    paths = geodesic(straight, edges)
-    cloud, starts = assign(cloud, x, y, z, np.float32(_REACH * gap))
-    if cloud.shape[1] == 0:
-        # no point is near: describe the neurons themselves
-        cloud = _in_rows(x, y, z)
-        for i in range(count):
-            starts[i + 1] = i + 1
-    weight = np.zeros(count, np.float32)
-    for i in range(count):
-        weight[i] = (starts[i + 1] - starts[i]) / cloud.shape[1]
+    cloud, starts, owner, rows, middle, unit, straight, paths, weight, gap, place, away = _prepare(
+        points, neurons, edges, eye
+    )
+    x, y, z = rows
     normals, curvatures = fit_surfaces(
         cloud, starts, x, y, z, straight, np.float32(_RADIUS * gap), place
     )
@@ -123,28 +103,68 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
     )  # fmt: skip
     distributions(z, straight, paths, weight, normals, curvatures, out)
     profile(x, y, z, weight, normals, curvatures, low, high, out[_PROFILE:_REVOLUTION])
-    owner = _owners(starts)
     cx, cy, _ = vertical_axis(x, y, normals, weight)
     axis, point, _ = rotation_axis(x, y, z, weight, normals)
-    turned = out[_REVOLUTION:_SOLIDS]
-    foot = np.zeros(3)
-    foot[0], foot[1] = cx, cy
-    revolution(
-        cloud, owner, _in_rows(x, y, z), weight, normals, place, axis, point, foot, turned,
-    )  # fmt: skip
+    turned, foot = out[_REVOLUTION:_SOLIDS], np.array((cx, cy, 0.0))
+    revolution(cloud, owner, rows, weight, normals, place, axis, point, foot, turned)
     solids(cloud, owner, x, y, normals, place, low, high, turned, out[_SOLIDS:_OUTLINE])
     outline(cloud, place, out[_OUTLINE:_METRIC])
-    out[_METRIC] = (high - low) * unit
-    out[_METRIC + 1] = low * unit + middle[2]
-    out[_METRIC + 2], out[_METRIC + 3], out[_METRIC + 4] = (
+    out[_METRIC:] = (
+        (high - low) * unit,
+        low * unit + middle[2],
         wide * unit,
         across * unit,
         along * unit,
+        gap * unit,
+        (eye[2] - middle[2]) / away if away > 0 else 0.0,
+        away,
     )
-    out[_METRIC + 5] = gap * unit
-    out[_VIEW] = (eye[2] - middle[2]) / away if away > 0 else 0.0
-    out[_VIEW + 1] = away
     return True
+
+
+@kernel
+def _prepare(points: F4, neurons: F4, edges: U2, eye: F4) -> tuple[Any, ...]:
+    """Return what the blocks share, in the unit of the neurons.
+
+    The points (3, n) sorted by neuron, where those of each neuron start, the neuron of each; the
+    neurons (3, m), their mean and the unit in metres, their distances straight and along edges,
+    the share of the points that each has, the mean gap; the eye, and how far it is in metres.
+    """
+    x, y, z, straight, middle, unit = _own_units(neurons)
+    away = 0.0
+    for axis in range(3):
+        away += (eye[axis] - middle[axis]) ** 2
+    away = np.sqrt(away)
+    place = np.zeros(3, np.float32)
+    for axis in range(3):
+        place[axis] = (eye[axis] - middle[axis]) / max(unit, away / _FAR)
+    gap = max(mean_gap(straight), 1e-3)
+    paths, rows = geodesic(straight, edges), _in_rows(x, y, z)
+    cloud, starts = assign(_cloud_of(points, middle, unit), x, y, z, np.float32(_REACH * gap))
+    if cloud.shape[1] == 0:
+        # no point is near: describe the neurons themselves
+        cloud = rows
+        for i in range(x.size):
+            starts[i + 1] = i + 1
+    weight = np.zeros(x.size, np.float32)
+    for i in range(x.size):
+        weight[i] = (starts[i + 1] - starts[i]) / cloud.shape[1]
+    owner = _owners(starts)
+    return cloud, starts, owner, rows, middle, unit, straight, paths, weight, gap, place, away
+
+
+@kernel
+def _cloud_of(points: F4, middle: F8, unit: float) -> F4:
+    """Return every k-th point, (3, n), in the unit of the neurons, about their mean."""
+    step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
+    total = (points.shape[0] + step - 1) // step
+    cloud = np.zeros((3, total), np.float32)
+    for k in range(total):
+        for axis in range(3):
+            # points this far away are not the neurons' own: the bound keeps squares finite
+            value = (points[k * step, axis] - middle[axis]) / unit
+            cloud[axis, k] = min(max(value, -_FAR), _FAR)
+    return cloud
 
 
 @kernel
