@@ -52,7 +52,7 @@ def merge_across_occluder(
         changed[p] = changed[q] = True
 
 
-@kernel
+@kernel(inline=True)
 def _find_behind_one(segments: Segments) -> Bool:
     """Return the pairs p < q of segments above one plane with a common occluder, (n + 1, n + 1)."""
     pairs, parent, plane_id = segments.pairs, segments.parent, segments.plane_id
@@ -90,7 +90,7 @@ def _local_planes(samples: I4, inv_depth: F4, intrinsics: PinholeIntrinsics, nor
     return planes
 
 
-@kernel
+@kernel(inline=True)
 def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
     """Find the pairs of samples of two segments that lie in each other's local planes.
 
@@ -118,11 +118,21 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
     every = max(1, n // MERGING.most_lines)
     lines = np.zeros(((n + every - 1) // every, 2, 3))
     for k in range(len(lines)):
-        lines[k, 0], lines[k, 1] = a[0, pairs[k * every, 0]], b[0, pairs[k * every, 1]]
-    return float(min(np.mean(with_a), np.mean(with_b))), lines
+        s, t = pairs[k * every]
+        for d in range(3):
+            lines[k, 0, d], lines[k, 1, d] = a[0, s, d], b[0, t, d]
+    return min(_share(with_a), _share(with_b)), lines
 
 
 @kernel
+def _share(flags: Bool) -> float:
+    count = 0
+    for flag in flags:
+        count += int(flag)
+    return count / flags.size
+
+
+@kernel(inline=True)
 def _is_hidden(
     segments: Segments,
     p: int,
