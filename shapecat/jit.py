@@ -28,12 +28,14 @@ _SHARED = (_HERE / "geometry.py", _HERE / "jit.py", *(_HERE / "trees").glob("*.p
 """Files whose kernels every stage may call."""
 
 
-def kernel(function: _F | None = None, *, fast: bool = False) -> Any:
+def kernel(function: _F | None = None, *, fast: bool = False, inline: bool = False) -> Any:
     """Compile a function of numbers and arrays on its first call.
 
     Parameters
     ----------
     fast : let the compiler reorder sums. Only for kernels that never meet NaN.
+    inline : compile it as lines of the kernel that calls it, with whose ``fast`` it must agree.
+        For kernels with one call alone: each that is not compiled apart saves 0.08 s.
     """
 
     def compile_later(target: _F) -> Any:
@@ -45,6 +47,7 @@ def kernel(function: _F | None = None, *, fast: bool = False) -> Any:
                 cache=folder is not None,
                 error_model="numpy",
                 fastmath=_FAST if fast else False,
+                inline="always" if inline else "never",
             )(target)
         finally:
             config.CACHE_DIR = before

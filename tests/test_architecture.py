@@ -166,3 +166,41 @@ def test_the_picture_is_drawn_from_the_code_as_it_is() -> None:
 
 def test_a_library_that_is_loaded_is_seen() -> None:
     assert loaded_by("import json.decoder", {"json", "numpy"}) == {"json"}
+
+
+def test_an_inlined_kernel_has_one_caller_of_the_same_arithmetic() -> None:
+    """Each further call would be compiled anew, and other fast-math flags give other numbers."""
+    calls: dict[tuple[str, str], list[tuple[bool, bool]]] = {}
+    flags: dict[tuple[str, str], dict[str, bool]] = {}
+    for path in FILES:
+        tree = ast.parse(path.read_text("utf-8"))
+        module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        origins = {
+            alias.name: str(node.module)
+            for node in tree.body
+            if isinstance(node, ast.ImportFrom)
+            for alias in node.names
+        }
+        for function in (node for node in tree.body if isinstance(node, ast.FunctionDef)):
+            own = _kernel_flags(function)
+            if own is not None:
+                flags[module, function.name] = own
+            for node in ast.walk(function):
+                if isinstance(node, ast.Name) and node.id != function.name:
+                    called = origins.get(node.id, module), node.id
+                    fast = own is not None and own.get("fast", False)
+                    calls.setdefault(called, []).append((own is not None, fast))
+    inlined = {name: own for name, own in flags.items() if own.get("inline")}
+    assert inlined
+    for name, own in inlined.items():
+        assert calls[name] == [(True, own.get("fast", False))], name
+
+
+def _kernel_flags(function: ast.FunctionDef) -> dict[str, bool] | None:
+    """Return what ``@kernel`` is given; None without it."""
+    for decorator in function.decorator_list:
+        words = decorator.keywords if isinstance(decorator, ast.Call) else []
+        name = decorator.func if isinstance(decorator, ast.Call) else decorator
+        if isinstance(name, ast.Name) and name.id == "kernel":
+            return {str(word.arg): bool(ast.literal_eval(word.value)) for word in words}
+    return None

@@ -121,13 +121,13 @@ def row_and_column(p: int, columns: int) -> tuple[int, int]:
     return i, p - i * columns
 
 
-@kernel
+@kernel(inline=True)
 def smallest_object_at(grid: DepthGrid, depth_m: float) -> float:
     """Return the number of cells that `SMALL_M2` covers at a depth, clipped to 20 to 75."""
     return float(min(max(SMALL_M2 * grid.intrinsics.fx**2 / depth_m**2, 20.0), 75.0))
 
 
-@kernel
+@kernel(inline=True)
 def count_at_range_limit(inv_depth: F4, labels: I4, size: int, range_m: float) -> I4:
     """Count the samples of each label that are at the range limit.
 
@@ -229,7 +229,7 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, inv_depth: F4)
             out[j] = count[j] / total[j] if count[j] > zero else zero
 
 
-@kernel
+@kernel(inline=True)
 def _average_two(depth: F4, range_m: float, jump: float, inv_depth: F4) -> None:
     rows, columns = inv_depth.shape
     zero, one, half = np.float32(0), np.float32(1), np.float32(0.5)

@@ -87,7 +87,7 @@ def fill_holes(inv_depth: F4, labels: I4, count: int, filled: U1) -> None:
                 filled[i, j] = 1
 
 
-@kernel
+@kernel(inline=True)
 def _between_labels(inv_depth: F4, labels: I4) -> tuple[Bool, I4]:
     """Return the unlabelled samples between labels, (rows, columns) bool, and the spans of labels.
 
@@ -109,7 +109,7 @@ def _between_labels(inv_depth: F4, labels: I4) -> tuple[Bool, I4]:
     return inside, spans
 
 
-@kernel
+@kernel(inline=True)
 def _count_sides(
     inv_depth: F4, labels: I4, inside: Bool, spans: I4, component: I4, sides: I4, total: I4
 ) -> None:
@@ -135,7 +135,7 @@ def _count_sides(
                     total[p] += labels.size
 
 
-@kernel
+@kernel(inline=True)
 def _owner_of(sides: I4, total: int) -> int:
     """Return the label that a hole belongs to; 0 if there is none."""
     best = np.argmax(sides[:, BOUNDARY])

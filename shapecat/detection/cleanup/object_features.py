@@ -167,7 +167,7 @@ def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: 
         seen.ragged = share(shape.boundary * shape.boundary, shape.count)
 
 
-@kernel
+@kernel(inline=True)
 def _measure_outside(grid: DepthGrid, plane: F8, samples: I4, out: Row) -> None:
     """Write the distances of samples outside the outline of a plane; negative inside.
 

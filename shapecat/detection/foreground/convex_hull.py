@@ -11,7 +11,7 @@ from shapecat.jit import kernel
 __all__ = ["fill_hull"]
 
 
-@kernel
+@kernel(inline=True)
 def fill_hull(residual: F4, part: I4, stack: I4, count: int) -> int:
     """Add to a part the low cells within its convex hull; return its new number of cells.
 

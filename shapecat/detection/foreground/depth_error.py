@@ -71,7 +71,7 @@ def measure_residual(
     return n
 
 
-@kernel
+@kernel(inline=True)
 def _find_low(
     inv_depth: F4, plane_id: I4, height: F4, plane: F8, number: int, i: int, raw: F4, mark: F4
 ) -> bool:
@@ -201,7 +201,7 @@ def _slide(residual: F4, i: int, sign: int, sums: I4, counts: I4) -> None:
         counts[j + margin] += sign * np.int32(residual[i, j] != 0)
 
 
-@kernel
+@kernel(inline=True)
 def _add_windows(sums: I4, counts: I4, total: I4, count: I4) -> None:
     """Write the sums over the window around each column, and the counts, at least 1."""
     width = 2 * LOW.window + 1

@@ -46,7 +46,6 @@ class Scratch(NamedTuple):
     stack: I4
 
 
-@kernel
 def find_low_profile(
     grid: DepthGrid, heights: HeightMap, planes: F8, low_profile: I4, largest_m: float
 ) -> None:
@@ -69,7 +68,7 @@ def find_low_profile(
         unset(inv_depth.size, np.int32),
         unset(inv_depth.size, np.int32),
     )
-    objects = parts = np.int64(0)  # numba would compile another version for a literal
+    objects = parts = 0
     for k in range(len(planes)):
         number, plane = k + 1, planes[k].copy()
         start, end = _rows_of(plane_id, number)
@@ -184,7 +183,7 @@ def _raise(
     return objects, me
 
 
-@kernel
+@kernel(inline=True)
 def _find_seeds(high_pass: F4, least: float, seeds: I4) -> int:
     """List the cells above ``least`` that are higher than their left and upper neighbours.
 
@@ -286,7 +285,7 @@ def _lower(
     return me
 
 
-@kernel
+@kernel(inline=True)
 def _is_flat(residual: F4, i: int, j: int) -> bool:
     """Return whether a low cell is not on the side of an object."""
     rows, columns = residual.shape

@@ -32,7 +32,7 @@ class Outline(NamedTuple):
     steep: int
 
 
-@kernel
+@kernel(inline=True)
 def width_of_part(inv_depth: F4, stack: I4, count: int) -> float:
     """Return the width of a part along the rows, in cells at a depth of 1 m.
 
@@ -47,7 +47,7 @@ def width_of_part(inv_depth: F4, stack: I4, count: int) -> float:
     return float((last - first) / inv_depth[stack[0] // columns, stack[0] % columns])
 
 
-@kernel
+@kernel(inline=True)
 def is_object(outline: Outline, count: int) -> bool:
     """Return whether an outline around ``count`` cells is that of an object."""
     table, sides = outline.table, outline.sides

@@ -75,7 +75,7 @@ def extend_overhang(
                     _extend(over, i, j, stack)
 
 
-@kernel
+@kernel(inline=True)
 def _find_border(plane_id: I4, me: int, i: int, border: U1) -> bool:
     """Mark the cells of row i above a plane that are next to cells of lower planes or of none.
 
@@ -99,7 +99,7 @@ def _find_border(plane_id: I4, me: int, i: int, border: U1) -> bool:
     return bool(some > 0)
 
 
-@kernel
+@kernel(inline=True)
 def _goes_on(over: Overhang, i: int, j: int) -> bool:
     """Return whether the surface at a cell above the plane continues outside, without a flood."""
     rows, columns = over.visited.shape
@@ -113,7 +113,7 @@ def _goes_on(over: Overhang, i: int, j: int) -> bool:
     return some
 
 
-@kernel
+@kernel(inline=True)
 def _extend(over: Overhang, i: int, j: int, stack: I4) -> None:
     """Assign the outside part of the object at cell (i, j) to its plane, unless it is too large."""
     inv_depth, plane_id, me = over.grid.inverse_depth, over.heights.plane_id, over.me

@@ -63,7 +63,7 @@ def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, largest_m: float, trials
     return walls
 
 
-@kernel
+@kernel(inline=True)
 def _is_wall(
     grid: DepthGrid, samples: DepthSamples, plane: F8, normal: F8, up: F8, largest_m: float
 ) -> bool:
@@ -83,7 +83,7 @@ def _is_wall(
     return bool(max(across, along) > largest_m)
 
 
-@kernel
+@kernel(inline=True)
 def _is_cut_off(inv_depth: F4, samples: DepthSamples, plane: F8) -> bool:
     """Return whether the inliers of a plane reach two sides of the image, or of its samples."""
     own = _bounds(samples, plane, PLANES.tolerance)
@@ -109,7 +109,7 @@ def _bounds(samples: DepthSamples, plane: F8, tolerance: float) -> F8:
     return bounds
 
 
-@kernel
+@kernel(inline=True)
 def _measure(
     intrinsics: PinholeIntrinsics,
     samples: DepthSamples,
@@ -136,7 +136,7 @@ def _measure(
     return total
 
 
-@kernel
+@kernel(inline=True)
 def _clear(grid: DepthGrid, plane_id: I4, plane: F8, normal: F8, walls: U1) -> None:
     """Clear the large connected parts of a wall; small parts may be objects in front of it."""
     inv_depth = grid.inverse_depth
@@ -160,7 +160,7 @@ def _clear(grid: DepthGrid, plane_id: I4, plane: F8, normal: F8, walls: U1) -> N
             plane_ids[j] = 0 if states[j] == CLEARED else plane_ids[j]
 
 
-@kernel
+@kernel(inline=True)
 def _flood(
     grid: DepthGrid, plane: F8, normal: F8, i: int, j: int, found: U1, stack: I4
 ) -> tuple[int, float, float]:
@@ -190,7 +190,7 @@ def _flood(
     return top, area, off
 
 
-@kernel
+@kernel(inline=True)
 def _mark(inv_depth: F4, plane_id: I4, plane: F8, found: U1) -> None:
     """Mark as `UNSEEN` the cells on a wall, unless they belong to a level plane; 0 elsewhere."""
     a = np.float32(plane[0])

@@ -67,7 +67,7 @@ def measure_adjacency(
     choose_samples(graph, labels, segments)
 
 
-@kernel
+@kernel(inline=True)
 def _find_changes(links: U1, here: I4, below: I4, change: U1) -> bool:
     """Mark the cells of a row from which a segment does not continue both to the right and down.
 
@@ -83,7 +83,7 @@ def _find_changes(links: U1, here: I4, below: I4, change: U1) -> bool:
     return some
 
 
-@kernel
+@kernel(inline=True)
 def _count(
     inv_depth: F4,
     heights: HeightMap,

@@ -114,7 +114,7 @@ def find_adjacent(segments: Segments, p: int) -> Bool:
     return adjacent
 
 
-@kernel
+@kernel(inline=True)
 def _face(a: Row, b: Row) -> bool:
     """Return whether two segments may be the near and the far wall of a pot, which do not touch."""
     narrow, wide = min(width_of(a), width_of(b)), max(width_of(a), width_of(b))
@@ -159,7 +159,7 @@ def write_pair_features(
     relation.cells, relation.cell_m, relation.down = a.count, cell, view_geometry.down
 
 
-@kernel
+@kernel(inline=True)
 def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) -> None:
     pair, back = segments.pairs[p, q], segments.pairs[q, p]
     met = pair.contact + pair.near + pair.in_front + back.in_front
@@ -186,7 +186,7 @@ def _above_top(segments: Segments, p: int, q: int) -> float:
     return float(segments.pairs[p, q].rests_on_height / onto - segments.statistics[q].top)
 
 
-@kernel
+@kernel(inline=True)
 def _write_relation(a: Row, b: Row, out: Row) -> None:
     narrow, wide = width_of(a), width_of(b)
     most = max(narrow, wide)

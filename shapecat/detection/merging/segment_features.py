@@ -49,7 +49,7 @@ def width_of(row: Row) -> float:
     return float(row.right - row.left)
 
 
-@kernel
+@kernel(inline=True)
 def lateral_distance(a: Row, b: Row) -> float:
     """Return the lateral distance between the middles of two segments, metres."""
     return float(abs(a.left + a.right - b.left - b.right) / 2)

@@ -205,7 +205,7 @@ def _measure(
             row.area += areas
 
 
-@kernel
+@kernel(inline=True)
 def choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None:
     """Choose evenly spaced samples of each segment, away from edges, in place.
 

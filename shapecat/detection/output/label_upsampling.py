@@ -157,7 +157,7 @@ def list_runs(runs: I4, labels: int) -> tuple[U4, I4]:
     return order, place
 
 
-@kernel
+@kernel(inline=True)
 def _find_unsure(line: I4, start: int, end: int, cells: I4) -> int:
     """Write the columns of `UNSURE` pixels to ``cells[1]``; return their number."""
     n = 0
@@ -171,7 +171,7 @@ def _find_unsure(line: I4, start: int, end: int, cells: I4) -> int:
     return n
 
 
-@kernel
+@kernel(inline=True)
 def _end_of(line: I4, x: int, end: int, mark: int) -> int:
     """Return the first column from ``x`` on with another mark; ``end`` if there is none before."""
     while x + BLOCK <= end:
@@ -186,7 +186,7 @@ def _end_of(line: I4, x: int, end: int, mark: int) -> int:
     return x
 
 
-@kernel
+@kernel(inline=True)
 def _code_cells(grid_labels: GridLabels) -> tuple[I4, I4]:
     """Return a code for the pixels that fit each cell, (rows, columns), and the spans of the codes.
 
@@ -210,7 +210,7 @@ def _code_cells(grid_labels: GridLabels) -> tuple[I4, I4]:
     return code, spans
 
 
-@kernel
+@kernel(inline=True)
 def _find_high(planes: F8, inv_depth: F4, i: int, span: I4, high: U1) -> None:
     """Write whether all pixels that fit a cell are above each plane, for a span of row i."""
     jump, zero, nowhere = np.float32(DISCONTINUITY), np.float32(0), np.float32(1e-3)
@@ -229,7 +229,7 @@ def _find_high(planes: F8, inv_depth: F4, i: int, span: I4, high: U1) -> None:
             high[k, j] = (least - ground) * least * above > slope * least * least + base
 
 
-@kernel
+@kernel(inline=True)
 def _widen(
     code: I4, inv_depth: F4, i: int, factor: int, span: I4, wide_code: I4, wide_w: F4
 ) -> None:
@@ -248,7 +248,7 @@ def _widen(
         wide_code[x], wide_w[x] = code[i, -1], inv_depth[i, -1]
 
 
-@kernel
+@kernel(inline=True)
 def _mark(
     depth: F4, inv_depth: F4, code: I4, run: tuple[int, int, int], range_m: float, marks: I4
 ) -> None:
@@ -311,7 +311,7 @@ def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks:
             marks[m] = label
 
 
-@kernel
+@kernel(inline=True)
 def _fits(inv_depth: float, z: float) -> bool:
     """Return whether a depth is within a `DISCONTINUITY` of a cell; computed without a division."""
     return bool(abs(inv_depth * z - np.float32(1)) < np.float32(DISCONTINUITY) * z)

@@ -103,7 +103,7 @@ def measure_objects(
     return measured
 
 
-@kernel
+@kernel(inline=True)
 def _supporting_object(segments: Segments, representatives: I4, p: int) -> tuple[int, float]:
     """Return the label a segment stands on, 0 for its plane, and the height of that, metres."""
     pairs, statistics = segments.pairs[p], segments.statistics
@@ -124,7 +124,7 @@ def _supporting_object(segments: Segments, representatives: I4, p: int) -> tuple
     return 0, 0.0
 
 
-@kernel
+@kernel(inline=True)
 def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
     """Return the label below a segment with the most contact; 0 if there is none."""
     statistics, pairs = segments.statistics, segments.pairs
@@ -141,7 +141,7 @@ def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
     return best if most >= MERGING.few else 0
 
 
-@kernel
+@kernel(inline=True)
 def _break_cycles(measured: ObjectMeasurements) -> None:
     """Put objects that stand on themselves, through others, on their plane."""
     supported_by = measured.supported_by
@@ -171,7 +171,7 @@ def _measure_boxes(
                 measured.center[k, d], measured.size[k, d] = center[d], size[d]
 
 
-@kernel(fast=True)
+@kernel(fast=True, inline=True)
 def _outer_points(
     inv_depth: F4,
     intrinsics: PinholeIntrinsics,

@@ -93,7 +93,7 @@ def area_of(samples: DepthSamples, plane: F8, distance: float) -> float:
     return float(samples.share * total)
 
 
-@kernel
+@kernel(inline=True)
 def _ends(samples: DepthSamples, plane: F8, rows: int, columns: int) -> I4:
     """Return the first and last inlier column of each row, (2, rows); last is -1 without one."""
     ends = np.zeros((2, rows), np.int32)
@@ -107,7 +107,7 @@ def _ends(samples: DepthSamples, plane: F8, rows: int, columns: int) -> I4:
     return ends
 
 
-@kernel
+@kernel(inline=True)
 def _extent_of(grid: DepthGrid, plane: F8, normal: F8, ends: I4) -> F8:
     """Return the `SupportingPlane.extent` of a plane, with a margin.
 

@@ -87,7 +87,7 @@ def measure_heights(grid: DepthGrid, planes: F8, highest_m: float) -> HeightMap:
     return HeightMap(plane_id, height)
 
 
-@kernel
+@kernel(inline=True)
 def _assign(
     inv_depth: F4,
     intrinsics: PinholeIntrinsics,
@@ -157,7 +157,7 @@ def _assign(
             height[i, j] = line[j] if line[j] > below else height[i, j]
 
 
-@kernel
+@kernel(inline=True)
 def _bounds(
     line: F4, inv_depth: F4, i: int
 ) -> tuple[np.float32, np.float32, np.float32, np.float32]:

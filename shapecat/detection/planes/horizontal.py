@@ -130,7 +130,7 @@ def fit_horizontal_planes(
     return found[:n]
 
 
-@kernel
+@kernel(inline=True)
 def _heights(samples: DepthSamples, intrinsics: PinholeIntrinsics, up: F8) -> F4:
     heights = np.zeros(samples.inverse_depth.size, np.float32)
     for k in range(heights.size):
@@ -142,7 +142,7 @@ def _heights(samples: DepthSamples, intrinsics: PinholeIntrinsics, up: F8) -> F4
     return heights
 
 
-@kernel
+@kernel(inline=True)
 def _fullest(height: F4) -> float:
     """Return the middle of the bin that, with its neighbours, holds the most heights."""
     low = high = float(height[0])
@@ -159,7 +159,7 @@ def _fullest(height: F4) -> float:
     return low + (best - 0.5) * PLANES.bin_m
 
 
-@kernel
+@kernel(inline=True)
 def _split(
     samples: DepthSamples, height: F4, peak: float
 ) -> tuple[DepthSamples, F4, DepthSamples, F4]:
@@ -181,7 +181,7 @@ def _split(
     )
 
 
-@kernel
+@kernel(inline=True)
 def _fit(
     near: DepthSamples, intrinsics: PinholeIntrinsics, up: F8, trials: F8, offset: float, plane: F8
 ) -> bool:

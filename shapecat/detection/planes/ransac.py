@@ -63,7 +63,7 @@ def sample_grid(inv_depth: F4, wanted: F4) -> DepthSamples:
     return DepthSamples(result[0][:n], result[1][:n], result[2][:n], stride * stride)
 
 
-@kernel
+@kernel(inline=True)
 def median_of(values: F4) -> float:
     """Return the upper median of ``values`` (n,), n >= 1.
 
@@ -185,7 +185,7 @@ def ransac_plane(
     return best, count_inliers(samples, best, tolerance) if most >= 3 else 0
 
 
-@kernel
+@kernel(inline=True)
 def _propose(samples: DepthSamples, trials: F8, t: int, plane: F8) -> bool:
     """Write the plane through the samples of trial t; return whether they are far enough apart."""
     n = samples.inverse_depth.size

@@ -58,7 +58,7 @@ def estimate_up(
     return up
 
 
-@kernel
+@kernel(inline=True)
 def _every_second(points: OrientedPoints) -> F4:
     """Return the normals, positions and weights (7, n) of every second point, for speed."""
     normals, positions = points.normals, points.positions
@@ -72,7 +72,7 @@ def _every_second(points: OrientedPoints) -> F4:
     return found[:, :n].copy()
 
 
-@kernel
+@kernel(inline=True)
 def _directions(normals: F4, least: float, trials: F8) -> F8:
     """Return directions (n, 3) with many normals, most first: RANSAC for one after the other."""
     found = np.zeros((MOST_DIRECTIONS, 3))
@@ -97,7 +97,7 @@ def _part(normals: F4, direction: F8, bounds: tuple[float, float]) -> F4:
     return chosen[:, :n].copy()
 
 
-@kernel
+@kernel(inline=True)
 def _most_faced(normals: F4, trials: F8, best: F8) -> int:
     """Write the direction near which most normals (3, n) are; return their number."""
     n, most = normals.shape[1], 0
@@ -147,7 +147,7 @@ def _turn_to_mean(normals: F4, direction: F8) -> int:
     return int(inliers)
 
 
-@kernel
+@kernel(inline=True)
 def _hypotheses(found: F8, corner_cos: float) -> F8:
     """Return candidates for up (n, 3): the directions found, and perpendiculars to two of them."""
     n = len(found)
@@ -165,7 +165,7 @@ def _hypotheses(found: F8, corner_cos: float) -> F8:
     return result[:n]
 
 
-@kernel
+@kernel(inline=True)
 def _merit(surface: F4, direction: F8, held: float) -> float:
     """Return the score of a direction: the weight of large levels, adjusted as in `estimate_up`."""
     count, facing, total = _count_levels(surface, direction)
@@ -182,7 +182,7 @@ def _merit(surface: F4, direction: F8, held: float) -> float:
     return float(level * levels**UP.several * clear**UP.clear * aslant / (1 + held * turned))
 
 
-@kernel
+@kernel(inline=True)
 def _large_levels(count: F8, least: float) -> tuple[float, float]:
     """Return the sum of the weights of levels above ``least``, and the sum of their squares.
 
@@ -224,7 +224,7 @@ def _count_levels(surface: F4, direction: F8) -> tuple[F8, float, float]:
     return count[:BINS], facing, facing + count[BINS]
 
 
-@kernel
+@kernel(inline=True)
 def _settled(
     points: OrientedPoints, surface: F4, intrinsics: PinholeIntrinsics, direction: F8
 ) -> F8:

@@ -110,7 +110,7 @@ def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) ->
         _part_steps(inv_depth, plane_id, i, start, end, links)
 
 
-@kernel
+@kernel(inline=True)
 def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links: U1) -> None:
     """Remove links across a step that only a local plane supports.
 

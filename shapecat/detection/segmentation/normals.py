@@ -69,7 +69,7 @@ def padded(start: int, end: int) -> int:
     return start + (end - start + LANES - 1) // LANES * LANES
 
 
-@kernel
+@kernel(inline=True)
 def _write(fits: F4, planes: F4, normals: F4, at: int, columns: int, n: int) -> None:
     """Copy the fits of a run to the local planes and normals from index ``at`` on.
 
@@ -84,7 +84,7 @@ def _write(fits: F4, planes: F4, normals: F4, at: int, columns: int, n: int) -> 
             normals[to + k] = fits[unit + k]
 
 
-@kernel
+@kernel(inline=True)
 def _next_run(owners: I4, row: int, j: int, last: int) -> tuple[int, int]:
     """Return the first column of the next run of object cells above one plane, and one after it.
 
@@ -103,7 +103,7 @@ def _next_run(owners: I4, row: int, j: int, last: int) -> tuple[int, int]:
     return start, end
 
 
-@kernel
+@kernel(inline=True)
 def _copy_windows(
     depths: F4, owners: I4, shape: tuple[int, int], run: tuple[int, int, int], values: F4
 ) -> None:

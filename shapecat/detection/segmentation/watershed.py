@@ -57,7 +57,7 @@ def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n
     return n
 
 
-@kernel
+@kernel(inline=True)
 def _find_unlabelled(
     plane_id: I4, concavity: U1, spans: I4, edge_deg: int, labels: I4, inside: Bool
 ) -> None:
@@ -103,7 +103,7 @@ def _flood_labels(links: U1, concavity: U1, spans: I4, labels: I4) -> None:
             p = following[p]
 
 
-@kernel
+@kernel(inline=True)
 def _find_ways(links: U1, labels: I4, spans: I4, columns: int, ways: U1) -> None:
     """Write bits for the directions in which each cell (n,) is linked with an unlabelled one.
 
@@ -127,7 +127,7 @@ def _find_ways(links: U1, labels: I4, spans: I4, columns: int, ways: U1) -> None
             ways[p] |= up if (links[p - below] & down > 0) & (labels[p - below] <= 0) else none
 
 
-@kernel
+@kernel(inline=True)
 def relabel_above(labels: I4, spans: I4, height: F4, label: int, level: float, name: int) -> None:
     """Change the label of the cells that are higher than a level, in place.
 

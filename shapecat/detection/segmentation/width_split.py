@@ -67,7 +67,7 @@ def split_at_width_changes(
     return fresh
 
 
-@kernel
+@kernel(inline=True)
 def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, side: F8) -> Outlines:
     """Collect the outlines of the labels 1..n."""
     inv_depth, intrinsics, columns = (
@@ -99,7 +99,7 @@ def _outlines_of(grid: DepthGrid, height: F4, spans: I4, labels: I4, n: int, sid
     return Outlines(ends, at, count)
 
 
-@kernel
+@kernel(inline=True)
 def _find_cuts(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool) -> bool:
     """Mark the bands (BANDS,) below which label ``p`` is cut; return whether there are any."""
     first, last, seen, above = 0, 0, 0, 0
@@ -127,7 +127,7 @@ def _find_cuts(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool
     return some
 
 
-@kernel
+@kernel(inline=True)
 def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -> float:
     """Return the sum of the steps of both sides below a band, metres; 0 if neither is enough."""
     both = most = 0.0
