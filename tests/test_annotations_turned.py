@@ -20,9 +20,10 @@ from shapecat.outputs.annotation import Annotation, text_position
 from shapecat.outputs.annotations import encoder_for
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encoder_for
+from shapecat.outputs.review_shapes import _above
 from shapecat.recordings import open_recording
 from shapecat.recordings.protobuf import message_decoder
-from shapecat.types import ShownBox, ShownFrame
+from shapecat.types import Box, ShownBox, ShownFrame
 from tests.test_annotated_mcap import EPOCH, write_mcap
 
 SECOND = 10**9
@@ -97,6 +98,12 @@ def check_box(pose: Any, size: Any) -> None:
 def test_the_label_stands_above_the_top_of_the_box() -> None:
     """By the transposed rotation it stands beside a box that is tilted."""
     assert_allclose(text_position(*BOX[3:]), ABOVE, atol=1e-12)
+
+
+def test_the_caption_of_the_review_stands_there_as_well() -> None:
+    box = Box(np.array(CENTER), np.array(SIZE), TURN.as_quat())
+
+    assert_allclose(_above(box), CENTER + TURN.apply([0, 0, SIZE[2] / 2 + 0.02]), atol=1e-6)
 
 
 @pytest.mark.parametrize("encoding", ["cdr", "ros1", "json", "protobuf"])

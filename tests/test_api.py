@@ -96,6 +96,7 @@ def test_colour_masks_show_the_objects_that_are_there(place: Path) -> None:
     assert len(shares) > 20
     assert np.median(shares) > 0.9
     assert len({track for track, _ in owners}) == len(owners)  # one object a track
+    assert len({label for _, label in owners}) == len(owners)  # and one track an object
 
 
 def test_columns_are_arrays_with_nan_where_nothing_is(place: Path) -> None:

@@ -19,7 +19,7 @@ from shapecat.config import Settings
 from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.identity import file_stats, unchanged, work_id
-from shapecat.runs.jobs import Job, describe_run, resume, same_options
+from shapecat.runs.jobs import Job, describe_run, has_work, resume, same_options
 from shapecat.runs.run_info import RunInfo
 
 MODEL: Any = SimpleNamespace(model_id="m1", categories=("cup", "can"))
@@ -133,6 +133,20 @@ def test_a_recording_is_processed_once_by_whatever_names_it_is_found(tmp_path: P
 def partial(folder: Path, run: RunInfo) -> None:
     (folder / "segments" / "000000").mkdir(parents=True)
     write_run(folder, run)
+
+
+def test_what_an_error_has_left_is_kept_if_it_is_work(source: Path, tmp_path: Path) -> None:
+    """A disk that is full after an hour must not cost the hour."""
+    run = planned(source)
+    (tmp_path / "begun").mkdir()
+    write_run(tmp_path / "begun", run)
+    partial(tmp_path / "perceiving", run)
+    run["seconds"]["perceive"] = 1.5
+    (tmp_path / "perceived").mkdir()
+    write_run(tmp_path / "perceived", run)
+
+    names = ("nothing", "begun", "perceiving", "perceived")
+    assert [has_work(tmp_path / name) for name in names] == [False, False, True, True]
 
 
 def test_a_partial_run_of_the_same_work_goes_on(source: Path, tmp_path: Path) -> None:

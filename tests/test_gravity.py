@@ -6,11 +6,14 @@ from typing import Any
 import numpy as np
 import pytest
 
+from shapecat.config import Settings
 from shapecat.errors import ConfigError
 from shapecat.geometry import IDENTITY
 from shapecat.pipeline import process
 from shapecat.recordings import open_recording
 from shapecat.recordings.gravity import Upright
+from shapecat.recordings.transforms import TransformBuffer
+from shapecat.runs import perceiving
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
 from shapecat.simulation.messages import MessageFactory
@@ -93,6 +96,35 @@ def test_run_says_how_far_the_planes_found_disagree(
     else:
         dropped = {"/camera/depth/image_raw": "transforms, z of map"}
         assert run["up"] == {"source": "planes", "dropped": dropped}
+
+
+@pytest.mark.parametrize(
+    ("off_deg", "dropped"),
+    [
+        ((40, 30, 50), True),
+        ((40, 3), False),  # one frame confirms it: the other one saw a wall
+        ((3, 40), False),
+        ((None, 40), False),  # too few have had a say
+        ((40, None, None, 35, None, None, 45), True),
+        ((40, None, 2), False),
+    ],
+)
+def test_an_up_is_dropped_only_if_no_plane_confirms_it(
+    monkeypatch: pytest.MonkeyPatch, off_deg: tuple[float | None, ...], *, dropped: bool
+) -> None:
+    """A cupboard in view at the start must not cost what the robot knows."""
+    upright: Any = Upright(TransformBuffer(), None, None, ("tf", "imu"))
+    upright.preview = lambda _: ("tf", np.array([0.0, -1.0, 0.0]))
+    angles = [None if off is None else np.radians(off) for off in off_deg]
+    found = [None if a is None else np.array([0, -np.cos(a), -np.sin(a)]) for a in angles]
+    planes = iter(found)
+    monkeypatch.setattr(perceiving, "find_up", lambda *_: next(planes))
+    frames = [frame(EPOCH + k) for k in range(len(off_deg))]
+
+    read = list(perceiving._UpTrial(upright, Settings()).before((one, None) for one in frames))
+
+    assert [one for one, _ in read] == frames
+    assert upright.dropped == ({"/d": "tf"} if dropped else {})
 
 
 def test_without_any_source_up_is_that_of_the_planes(tmp_path: Path) -> None:

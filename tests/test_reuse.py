@@ -51,7 +51,8 @@ def perceive(world: World, **settings: Any) -> list[Perception]:
     views = []
     for k in range(len(world)):
         frame, _ = render_frame(world, k, rng=np.random.default_rng(k), sensor=KINECT)
-        views.append(View(replace(frame, index=k), None, (), world.path[k]))
+        frame = replace(frame, index=k, stamp_ns=1000 + 70 * k)
+        views.append(View(frame, None, (), world.path[k]))
     guesser: Any = Guesser()
     return Perceiver(guesser, Settings(**settings), None)(views)
 
@@ -67,6 +68,8 @@ def at(world: World, perceptions: Sequence[Perception], k: int, place: Any) -> D
 def test_a_still_scene_is_perceived_once() -> None:
     first, *others = perceive(still_world())
     assert len(first.detections) >= 6
+    times = [(seen.index, seen.stamp_ns) for seen in (first, *others)]
+    assert times == [(k, 1000 + 70 * k) for k in range(FRAMES)]
     assert first.reused_from is None
     assert {d.reused_from for d in first.detections} == {None}
     for other in others:

@@ -16,7 +16,7 @@ from shapecat.geometry import IDENTITY
 from shapecat.pipeline import process
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
-from shapecat.runs.second_look import frames_to_revise
+from shapecat.runs.second_look import _around, _streams, frames_to_revise
 from shapecat.runs.tables import FRAMES, PLANES
 from shapecat.simulation import IDEAL, make_scene, render_frame
 from shapecat.simulation.messages import MessageFactory
@@ -322,6 +322,16 @@ def test_a_still_camera_knows_up_from_its_neighbours() -> None:
     for revision in chosen.values():
         np.testing.assert_allclose(revision.up, leaning([35.0])[0], atol=1e-6)
         assert revision.up_given is None
+
+
+def test_no_frame_is_its_own_witness() -> None:
+    """Those within three seconds are heard, thirty at most to either side, and not itself."""
+    stream = _streams(tables(leaning(np.full(90, 35.0))))["/d"]
+    apart = stream._replace(stamps_ns=np.arange(90) * 1_000_000_000)
+
+    assert _around(stream, 2).tolist() == [0, 1, *range(3, 33)]
+    assert _around(stream, 40).tolist() == [*range(10, 40), *range(41, 71)]
+    assert _around(apart, 40).tolist() == [37, 38, 39, 41, 42, 43]
 
 
 def test_a_camera_that_moves_unknown_to_all_is_no_neighbour() -> None:

@@ -304,10 +304,10 @@ def test_the_place_of_a_track_is_the_usual_one() -> None:
     track = Track(
         id=3,
         topics=("/depth",) * 4,
-        hits=4,
+        hits=3,
         frames=np.arange(4),
         stamps_ns=np.arange(4) * SECOND,
-        detections=np.zeros(4, int),
+        detections=np.array([0, 0, -1, 0]),  # it coasts
         centers=centers,
         causal=np.full((4, 3), 1 / 3),
         posterior=np.array([0.2, 0.7, 0.1]),
@@ -318,4 +318,5 @@ def test_the_place_of_a_track_is_the_usual_one() -> None:
     line = _Line.of(track, CATEGORIES)
 
     assert_allclose(line.center, [0.315, 1.125, 0.71])
-    assert (line.track, line.category, line.first_ns, line.last_ns) == (3, "can", 0, 3 * SECOND)
+    assert (line.track, line.category, line.hits) == (3, "can", 3)
+    assert (line.first_ns, line.last_ns) == (0, 3 * SECOND)
