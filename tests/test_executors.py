@@ -1,10 +1,12 @@
 """Workers fail alone, end with their parent, and speak the interface of concurrent.futures."""
 
+import gc
 import os
 import signal
 import subprocess
 import sys
 import time
+import weakref
 from collections.abc import Iterator
 from concurrent.futures import Executor
 from itertools import count
@@ -13,6 +15,7 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
+import numpy as np
 import pytest
 
 from shapecat.errors import ConfigError
@@ -272,6 +275,30 @@ def test_the_last_items_do_not_wait_for_a_slow_process() -> None:
         workers = [worker for _, worker in processes.in_order(one_by_one())]
     assert workers[0] == workers[1] != os.getpid()
     assert workers[2] == os.getpid()
+
+
+def process_and_ones(k: int) -> tuple[int, np.ndarray]:
+    return os.getpid(), np.ones(k)
+
+
+def test_results_are_freed_without_collecting_garbage() -> None:
+    """Garbage is seldom collected: results in a cycle took gigabytes in a long recording."""
+    gc.disable()
+    try:
+        with Processes(process_and_ones, 2) as processes:
+            processes.start()
+            wait_for(lambda: all(future.done() for future in processes._waking))
+            left: list[tuple[int, Any]] = []
+            for _, (process, ones) in processes.in_order((k, k + 1) for k in range(60)):
+                left.append((process, weakref.ref(ones)))
+                del ones
+            held = {process: 0 for process, _ in left}
+            for process, ones in left:
+                held[process] += ones() is not None
+    finally:
+        gc.enable()
+    assert len(held) == 2
+    assert sum(held.values()) <= 1, held  # the last one is in the generator
 
 
 def inverse_of_rest(k: int) -> int:

@@ -6,6 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from functools import partial
 from itertools import islice
 from multiprocessing import current_process
 from typing import Generic, Self, TypeVar
@@ -121,18 +122,15 @@ class _Turn(Generic[_Item, _Result]):
     ) -> None:
         """Send the item, or work on it here if there is no executor."""
         self._work = work
-        self._item: _Item | None = None  # kept only while another process has it
+        self._item: list[_Item] = []  # kept only while another process has it
         self._future: Future[_Result]
         if executor is None:
             self._future = _done(work, item)
         else:
-            self._item = item
+            self._item.append(item)
             self._future = executor.submit(work, item)
-            self._future.add_done_callback(self._let_go)
-
-    def _let_go(self, future: Future[_Result]) -> None:
-        if not future.cancelled() and future.exception() is None:
-            self._item = None
+            # Futures keep their callbacks: one that knew this turn would keep the result for ever.
+            self._future.add_done_callback(partial(_let_go, self._item))
 
     def done(self) -> bool:
         """Return whether the work is finished."""
@@ -140,17 +138,23 @@ class _Turn(Generic[_Item, _Result]):
 
     def recall(self) -> None:
         """Work on the item here if it has not been sent yet."""
-        if self._item is not None and self._future.cancel():
-            self._future, self._item = _done(self._work, self._item), None
+        if self._item and self._future.cancel():
+            self._future = _done(self._work, self._item.pop())
 
     def result(self) -> _Result:
         """Return the result; work on the item here if another process failed."""
         self.recall()
         error = self._future.exception()
-        if error is None or self._item is None:
+        if error is None or not self._item:
             return self._future.result()
         _log.warning("another process failed (%s): repeating its work here", error)
-        return self._work(self._item)
+        return self._work(self._item[0])
+
+
+def _let_go(item: list[_Item], future: Future[_Result]) -> None:
+    """Drop the item of a future that has a result."""
+    if not future.cancelled() and future.exception() is None:
+        item.clear()
 
 
 def _wake(_work: object, warm_up: Callable[[], object]) -> None:
