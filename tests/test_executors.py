@@ -282,23 +282,28 @@ def process_and_ones(k: int) -> tuple[int, np.ndarray]:
 
 
 def test_results_are_freed_without_collecting_garbage() -> None:
-    """Garbage is seldom collected: results in a cycle took gigabytes in a long recording."""
+    """Garbage is seldom collected: results in cycles take memory in a long recording."""
+    received: list[Any] = []
+    deadline = time.monotonic() + 60
+
+    def items() -> Iterator[tuple[int, int]]:
+        for k in count():
+            yield k, k + 1
+            if len(received) >= 20 or time.monotonic() > deadline:
+                return
+
     gc.disable()
     try:
         with Processes(process_and_ones, 2) as processes:
-            processes.start()
-            wait_for(lambda: all(future.done() for future in processes._waking))
-            left: list[tuple[int, Any]] = []
-            for _, (process, ones) in processes.in_order((k, k + 1) for k in range(60)):
-                left.append((process, weakref.ref(ones)))
+            for _, (process, ones) in processes.in_order(items()):
+                if process != os.getpid():
+                    received.append(weakref.ref(ones))
                 del ones
-            held = {process: 0 for process, _ in left}
-            for process, ones in left:
-                held[process] += ones() is not None
+        assert len(received) >= 20
+        # Threads of the executor may hold the last ones for a moment.
+        wait_for(lambda: sum(ones() is not None for ones in received) <= 2, seconds=5)
     finally:
         gc.enable()
-    assert len(held) == 2
-    assert sum(held.values()) <= 1, held  # the last one is in the generator
 
 
 def inverse_of_rest(k: int) -> int:
