@@ -1,5 +1,6 @@
 """Which boxes leave the house: whole ones, or with `--boxes visible` those of what is seen."""
 
+import json
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -59,6 +60,26 @@ def test_annotations_have_the_boxes_asked_for(
     keys = sorted(found)
     assert np.allclose([found[k] for k in keys], [expected[k] for k in keys], atol=1e-6)
     assert not np.allclose([found[k] for k in keys], [other[k] for k in keys], atol=1e-3)
+
+
+@pytest.mark.parametrize("options", [(), ("--boxes", "visible")])
+def test_exports_have_the_boxes_asked_for(
+    guessed_run: Path, tmp_path: Path, shapecat: Callable[..., Result], options: tuple[str, ...]
+) -> None:
+    """What a model learns from visible boxes it will not say of whole objects."""
+    command = ("export", guessed_run, "--format", "labelcloud", "--out", tmp_path, "--every", 8)
+    assert shapecat(*command, *options).exit_code == 0
+
+    content = json.loads((tmp_path / "table" / "labels" / "000000.json").read_text())
+    found = sorted(list(item["dimensions"].values()) for item in content["objects"])
+    full, visible = (tables(guessed_run, full=full) for full in (True, False))
+    first = min(stamp for stamp, _ in full)
+    sizes, others = (
+        sorted(size for (stamp, _), size in known.items() if stamp == first)
+        for known in ((visible, full) if options else (full, visible))
+    )
+    assert np.allclose(found, sizes, atol=1e-6)
+    assert not np.allclose(found, others, atol=1e-3)
 
 
 def test_export_refuses_other_boxes_by_name(
