@@ -70,7 +70,8 @@ def test_exports_have_the_boxes_asked_for(
     command = ("export", guessed_run, "--format", "labelcloud", "--out", tmp_path, "--every", 8)
     assert shapecat(*command, *options).exit_code == 0
 
-    content = json.loads((tmp_path / "table" / "labels" / "000000.json").read_text())
+    (cloud,) = (tmp_path / "table" / "pointclouds").iterdir()  # of eight frames
+    content = json.loads((tmp_path / "table" / "labels" / f"{cloud.stem}.json").read_text())
     found = sorted(list(item["dimensions"].values()) for item in content["objects"])
     full, visible = (tables(guessed_run, full=full) for full in (True, False))
     first = min(stamp for stamp, _ in full)
