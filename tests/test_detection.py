@@ -670,7 +670,6 @@ def test_a_tilted_top_does_not_take_the_place_of_the_table() -> None:
     assert [plane.area_m2 > 0.3 for plane in scene.planes] == [True]
 
 
-@pytest.mark.xfail(reason="no simulated scene has racks: one of two posts is taken for an object")
 def test_posts_of_a_rack_are_no_objects() -> None:
     """Posts go on through the level of a board; a tall box that stops below it does not."""
     rack = [table(0.4, 0.2), table(0.4, 0.2, 0.32)]

@@ -7,14 +7,17 @@ from shapecat.config import DetectionSettings
 from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
 from shapecat.detection.cleanup.object_features import (
     OBJECT_FEATURES,
+    LabelledGrid,
     _border_lines,
+    _measure_plane,
     measure_object_features,
 )
 from shapecat.detection.cleanup.structure import find_background, load_trees, number_objects
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
 from shapecat.detection.merging.segments import _blank
 from shapecat.detection.pipeline import ALL_STEPS, Task, merge_segments, oversegment
-from shapecat.detection.planes.height_map import HeightMap
+from shapecat.detection.planes.extent import DIRECTIONS
+from shapecat.detection.planes.height_map import OUTLINE, HeightMap
 from shapecat.trees import BoostedTrees, Trees
 from tests.test_detection import Array, Shape, box, frame_of, render, table
 
@@ -52,6 +55,25 @@ def test_a_box_in_the_middle_of_a_table() -> None:
     assert segment["top_m"] == pytest.approx(0.12, abs=0.01)
     assert segment["width_m"] == pytest.approx(0.1, abs=0.015)
     assert not rejected.any()
+
+
+def test_how_rough_the_plane_is_around_a_segment() -> None:
+    """Four cells away: 1 mm below the plane on the left, 3 mm above it on the right."""
+    labels, plane_id = np.zeros((11, 11), np.int16), np.full((11, 11), -1, np.int8)
+    labels[5, 5] = plane_id[5, 5] = 1
+    plane_id[:, 10] = plane_id[1] = plane_id[9] = 0  # none above and below, nor at the border
+    height = np.full((11, 11), 0.9, np.float32)
+    height[5, 1], height[5, 9] = -0.001, 0.003
+    segments, rows = _blank(2), np.zeros(2, OBJECT_FEATURES)["surroundings"]
+    segments.statistics["count"], segments.statistics["depth_sum"] = 1, 2.0
+    inv_depth, owner = np.full((11, 11), 0.5, np.float32), np.arange(2, dtype=np.int16)
+    walls, spans = np.zeros((11, 11), np.uint8), np.tile(np.array([0, 11], np.int32), (11, 1))
+    planes = np.zeros((1, OUTLINE + DIRECTIONS))
+    field = LabelledGrid(inv_depth, planes, plane_id, height, walls, labels, spans, owner)
+    _measure_plane(field, segments, rows)
+    least = 0.004 + 0.0025 * 2.0**2
+    assert rows["plane_height"][1] == pytest.approx(0.001 / least)
+    assert rows["plane_noise"][1] == pytest.approx(0.002 / least)
 
 
 def test_what_is_wider_than_an_object_is_none() -> None:

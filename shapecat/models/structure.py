@@ -11,7 +11,7 @@ from dataclasses import replace
 from itertools import chain
 from multiprocessing import get_context
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import click
 import numpy as np
@@ -25,15 +25,17 @@ from shapecat.detection.pipeline import ALL_STEPS, Task, merge_segments, overseg
 from shapecat.models.growing import Growth, grow, growing_options
 from shapecat.models.parts import count_labels
 from shapecat.simulation import make_scene, render_frame
+from shapecat.simulation.paths import Filming, walk
 from shapecat.simulation.scenes import SceneKind
-from shapecat.simulation.sensors import PRESETS
+from shapecat.simulation.sensors import PRESETS, Sensor
+from shapecat.simulation.worlds import World
 from shapecat.trees import write_trees
-from shapecat.types import Frame
+from shapecat.types import Frame, Pose
 
 __all__ = ["Samples", "Series", "collect", "label_objects", "main"]
 
 FEATURES = OBJECT_FEATURES.itemsize // np.dtype("f4").itemsize
-_GROWTH = Growth(150, 16, 0.08)
+_GROWTH = Growth(300, 32, 0.06)
 _OBJECT = 0.5
 """A merged segment is an object if more than this fraction of its labelled cells shows objects."""
 _CHUNK = 10
@@ -42,7 +44,8 @@ _CHUNK = 10
 class Series(NamedTuple):
     """Scenes of one kind: the first seed and their number; the sensors take turns.
 
-    ``scale`` multiplies all sizes and distances.
+    ``scale`` multiplies all sizes and distances. The camera is on the ``path`` of the scene, or
+    ``anywhere``: near or far, low or straight above. On the ``floor`` the table is taken away.
     """
 
     kind: SceneKind
@@ -50,28 +53,40 @@ class Series(NamedTuple):
     scenes: int
     sensors: tuple[str, ...] = tuple(PRESETS)
     scale: float = 1.0
+    view: Literal["path", "anywhere", "floor"] = "path"
 
 
 _TWO = ("kinect", "realsense")
 _SERIES = (
     Series("bin", 600_000, 80),
     Series("bin", 610_000, 120),
-    Series("clutter", 602_000, 80, _TWO),
-    Series("clutter", 606_000, 50),
-    Series("empty", 604_000, 80, _TWO),
-    Series("empty", 608_000, 60),
-    Series("pile", 605_000, 50),
-    Series("shelf", 603_000, 60, _TWO),
-    Series("shelf", 607_000, 40),
+    Series("clutter", 602_000, 40, _TWO),
+    Series("clutter", 606_000, 30),
+    Series("empty", 604_000, 30, _TWO),
+    Series("empty", 608_000, 30),
+    Series("pile", 605_000, 30),
+    Series("shelf", 603_000, 40, _TWO),
+    Series("shelf", 607_000, 30),
     Series("shelf_bin", 601_000, 80),
-    Series("tabletop", 609_000, 30),
-    Series("clutter", 602_000, 80, _TWO, scale=1.8),
-    Series("clutter", 606_000, 50, scale=1.8),
-    Series("pile", 605_000, 50, scale=1.8),
-    Series("tabletop", 609_000, 30, scale=1.8),
+    Series("tabletop", 609_000, 20),
+    Series("clutter", 602_000, 40, _TWO, scale=1.8),
+    Series("clutter", 606_000, 20, scale=1.8),
+    Series("pile", 605_000, 20, scale=1.8),
+    Series("tabletop", 609_000, 20, scale=1.8),
+    Series("room", 612_000, 130),
+    Series("room", 640_000, 110, view="anywhere"),
+    Series("pile", 641_000, 40, view="anywhere"),
+    Series("clutter", 642_000, 40, view="anywhere"),
+    Series("tabletop", 643_000, 40, view="anywhere"),
+    Series("room", 650_000, 60, view="floor"),
+    Series("room", 650_500, 40, scale=1.8, view="floor"),
 )
 """The merging trees were not grown on these seeds. The scaled scenes add large objects, which are
-too rare otherwise."""
+too rare otherwise; rooms add arms and furniture, floors objects where furniture usually is."""
+_DISTANCE_M, _ELEVATION_DEG, _SWEEP_DEG = (0.35, 1.9), (12.0, 84.0), (20.0, 150.0)
+"""Where a camera anywhere is, from what it looks at."""
+_CLOSER_M = 0.08
+"""Distance that the nearest reading of the sensor adds at least."""
 
 
 class Samples(NamedTuple):
@@ -115,10 +130,43 @@ def _labelled(series: Series, seed: int) -> Iterator[tuple[F4, bool]]:
     rng = np.random.default_rng(seed)
     world = make_scene(series.kind, rng, frames=1)
     sensor = PRESETS[series.sensors[seed % len(series.sensors)]]
-    frame, owners = render_frame(world, 0, rng=rng, sensor=sensor)
+    world = _on_floor(world) if series.view == "floor" else world
+    view = 0 if series.view == "path" else _viewpoint(world, sensor, rng)
+    frame, owners = render_frame(world, view, rng=rng, sensor=sensor)
     depth = None if frame.depth is None else frame.depth * np.float32(series.scale)
     things = np.array([thing.label for thing in world.things], np.int64)
     yield from label_objects(replace(frame, depth=depth), owners, things)
+
+
+def _on_floor(world: World) -> World:
+    """Take away the table and what is on it but objects, and put these on the floor."""
+    table = next(support for support in world.supports if support.name == "table")
+    down = np.array([0.0, 0.0, -table.height])
+    things = (
+        replace(thing, pose=Pose(thing.pose.rotation, thing.pose.translation + down))
+        for thing in world.things
+    )
+    rest = (s for s in world.supports if s is not table and not s.name.startswith("robot"))
+    return replace(world, supports=tuple(rest), things=tuple(things))
+
+
+def _viewpoint(world: World, sensor: Sensor, rng: np.random.Generator) -> Pose | int:
+    """Return ``world_from_camera`` of a look at the objects; the path's if there are none."""
+    places = [thing.pose.translation for thing in world.things]
+    if not places:
+        return 0
+    target = (np.mean(places, axis=0) + places[rng.integers(len(places))]) / 2
+    nearest = max(_DISTANCE_M[0], sensor.nearest_m + _CLOSER_M)
+    distance = float(np.exp(rng.uniform(np.log(nearest), np.log(_DISTANCE_M[1]))))
+    (pose,) = walk(
+        rng,
+        np.asarray(target),
+        Filming(1, 30.0),
+        distance=distance,
+        elevation=_ELEVATION_DEG,
+        sweep=_SWEEP_DEG,
+    )
+    return pose
 
 
 def label_objects(frame: Frame, owners: U1, things: I4) -> Iterator[tuple[F4, bool]]:

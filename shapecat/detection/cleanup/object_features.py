@@ -40,9 +40,12 @@ _SURROUNDINGS = np.dtype(
         ("mean_outside_m", "f4"),
         ("most_outside_m", "f4"),
         ("low_profile", "f4"),  # 1 for a known low-profile object
+        ("depth_edge", "f4"),  # share of the boundary in front of what is farther away
+        ("plane_height", "f4"),  # heights of the plane around it, over the least of an object's
+        ("plane_noise", "f4"),  # sample: their mean, and their standard deviation
     ]
 )
-"""Where a segment ends, and where its surface continues."""
+"""Where a segment ends, where its surface continues, and how level the plane is around it."""
 _VISIBILITY = np.dtype(
     [
         ("cells", "f4"),
@@ -71,6 +74,7 @@ class LabelledGrid(NamedTuple):
     inverse_depth: F4
     planes: F8
     plane_id: I4
+    height: F4
     walls: U1
     labels: I4
     spans: I4
@@ -95,9 +99,10 @@ def measure_object_features(
     features = np.zeros(segments.parent.size, OBJECT_FEATURES)
     rows = features["surroundings"]
     rows["low_profile"] = low_profile
-    seen = grid.inverse_depth, model.planes, model.heights.plane_id, model.walls
+    seen = grid.inverse_depth, model.planes, *model.heights, model.walls
     field = LabelledGrid(*seen, labels, graph.spans, segments.parent)
     _count_cells(field, _border_lines(grid), 1 / range_m + DISCONTINUITY / 2, rows)
+    _measure_plane(field, segments, rows)
     _measure(grid, model.planes, segments, model.up[2], features)
     return features
 
@@ -124,7 +129,7 @@ def _count_cells(
     ``last`` is the inverse depth below which a cell is at the range limit, 1/m; ``rows`` (n + 1,)
     are records of `_SURROUNDINGS`.
     """
-    inv_depth, planes, plane_id, walls, labels, spans, owner = field
+    inv_depth, planes, plane_id, _, walls, labels, spans, owner = field
     last_row, last_column = labels.shape[0] - 1, labels.shape[1] - 1
     top, bottom, left, right = border
     for i in range(labels.shape[0]):
@@ -137,12 +142,38 @@ def _count_cells(
             row.on_wall += walls[i, j] == ON_WALL
             for di, dj in SIDES:
                 y, x = min(max(i + di, 0), last_row), min(max(j + dj, 0), last_column)
+                row.depth_edge += 0 < inv_depth[y, x] <= here - DISCONTINUITY
                 if plane_id[y, x] != 0 or abs(inv_depth[y, x] - here) >= DISCONTINUITY:
                     continue
                 k = plane_id[i, j] - 1
                 if inv_depth[y, x] > max(planes[k, 0] * x + planes[k, 1] * y + planes[k, 2], 0):
                     row.into_wall += walls[y, x] == CLEARED
                     row.beyond += walls[y, x] != CLEARED
+
+
+@kernel
+def _measure_plane(field: LabelledGrid, segments: Segments, rows: Records) -> None:
+    """Write mean and standard deviation of the heights of the plane a few cells from segments."""
+    plane_id, height = field.plane_id, field.height
+    count, (lines, columns) = np.zeros(len(rows)), plane_id.shape
+    for i in range(lines):
+        for j in range(field.spans[i, 0], field.spans[i, 1]):
+            if field.labels[i, j] == 0:
+                continue
+            p = field.owner[field.labels[i, j]]
+            for di, dj in SIDES:
+                y, x = i + CLEANUP.around_cells * di, j + CLEANUP.around_cells * dj
+                if 0 <= y < lines and 0 <= x < columns and plane_id[y, x] < 0:
+                    count[p] += 1
+                    rows[p].plane_height += height[y, x]
+                    rows[p].plane_noise += height[y, x] ** 2
+    for p in range(1, len(rows)):
+        if count[p] > 0:
+            row, depth = rows[p], depth_of(segments, p)
+            least = MIN_HEIGHT_M + HEIGHT_NOISE * depth * depth
+            mean = row.plane_height / count[p]
+            variance = max(row.plane_noise / count[p] - mean * mean, 0.0)
+            row.plane_height, row.plane_noise = mean / least, math.sqrt(variance) / least
 
 
 @kernel
@@ -160,6 +191,7 @@ def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: 
         around.on_wall = share(around.on_wall, shape.count)
         around.beyond = share(around.beyond, shape.boundary)
         around.into_wall = share(around.into_wall, shape.boundary)
+        around.depth_edge = share(around.depth_edge, shape.boundary)
         _measure_outside(grid, planes[segments.plane_id[p] - 1], segments.samples[p], around)
         seen.cells, seen.depth_m, seen.cell_m, seen.down = shape.count, depth, cell, down
         seen.top_by_noise = shape.top / (MIN_HEIGHT_M + HEIGHT_NOISE * depth * depth)

@@ -8,13 +8,15 @@ __all__ = ["CLEANUP", "CleanupSettings"]
 class CleanupSettings(NamedTuple):
     """How structure is rejected and labels are completed."""
 
-    least_logit: float = -1.5
-    """Least logit of an object, for a probability of 0.18: a missed object is lost, a false one can
+    least_logit: float = -1.2
+    """Least logit of an object, for a probability of 0.23: a missed object is lost, a false one can
     still be rejected over time."""
     hopeless: float = -8.0
     """Partial logit that the remaining trees never make up for."""
     border_share: float = 0.08
     """Largest share of the image that sensors leave blank at a border."""
+    around_cells: int = 4
+    """Cells from an object to where its plane shows how rough it is there."""
     cut_off_m: float = 0.02
     """A segment that comes this near to the greatest height continues above it, metres."""
     large_share: float = 0.02
