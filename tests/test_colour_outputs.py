@@ -163,7 +163,7 @@ def test_annotations_on_images_have_the_stamp_and_frame_of_the_image(run: Path) 
                 top + one.bbox.size_y,
             )
             assert points.type == 2
-            assert text.text.startswith(f"#{one.id} {one.results[0].hypothesis.class_id} ")
+            assert text.text.split()[:2] == [f"#{one.id}", one.results[0].hypothesis.class_id]
 
 
 def test_corrections_reach_the_images(run: Path, tmp_path: Path) -> None:

@@ -86,6 +86,7 @@ def test_what_is_not_certain_is_nowhere_shown_as_certain(run: Path) -> None:
         cells[column] = str(confidence)
         lines[k], shown[cells[track]] = ",".join(cells), text
         assert caption(3, "cup", confidence) == f"#3 cup {text}"
+    assert caption(4, "unknown", 0.97) == "#4 unknown"  # it is the confidence of something else
     (run / "tracks.csv").write_text("\n".join([header, *lines]) + "\n")
     (report,) = read_reports([run]).runs
     page = report.page()

@@ -1,16 +1,23 @@
 """Format captions, confidences, counts and times, the same in every output."""
 
+from shapecat.types import UNKNOWN
+
 __all__ = ["caption", "confidence_text", "plural", "time_span"]
 
 
 def caption(track: int, category: str, confidence: float) -> str:
     """Return the text beside an object: track, category and confidence.
 
+    An unknown object has no confidence in the text: its number is that of the most probable
+    category, and would read as the certainty that the object is unknown.
+
     Examples
     --------
-    >>> caption(6, "cup", 0.999)
-    '#6 cup 0.99'
+    >>> caption(6, "cup", 0.999), caption(7, "unknown", 0.44)
+    ('#6 cup 0.99', '#7 unknown')
     """
+    if category == UNKNOWN:
+        return f"#{track} {category}"
     return f"#{track} {category} {confidence_text(confidence)}"
 
 
