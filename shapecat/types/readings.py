@@ -1,0 +1,91 @@
+"""What a sensor measured, by which camera, and where it was."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from shapecat.arrays import F4, F8, U4, Record, array
+
+__all__ = ["Camera", "Frame", "Pose"]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole camera: pixel (u, v) sees the ray ((u - cx) / fx, (v - cy) / fy, 1)."""
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
+class Pose(Record):
+    """A rigid transform ``a_from_b``: ``p_a = rotation @ p_b + translation``."""
+
+    rotation: F8 = array("3 3", "f8")
+    translation: F8 = array("3", "f8")
+
+
+class Frame(Record):
+    """One measurement of a depth sensor: a depth image with its camera, or a point cloud.
+
+    It has either ``depth`` and ``camera``, or ``points``, never both. An index into a frame is a
+    pixel index (row by row) or the row of a point.
+
+    Attributes
+    ----------
+    topic : the stream of the recording.
+    index : number of the frame in its stream, from 0; skipped frames are counted too.
+    stamp_ns : time of the measurement (``header.stamp``).
+    log_time_ns : time of the recording.
+    frame_id : name of the sensor frame.
+    depth : (h, w) metres along the optical axis; 0 where there is no reading, never NaN.
+    points : (n, 3) metres, sensor frame; rows of NaN where there is no reading.
+    """
+
+    topic: str
+    index: int
+    stamp_ns: int
+    log_time_ns: int
+    frame_id: str
+    depth: F4 | None = array("h w", "f4", default=None)
+    camera: Camera | None = None
+    points: F4 | None = array("n 3", "f4", default=None)
+
+    def __post_init__(self) -> None:
+        """Check that the frame has either depth or points, and a camera of the same size."""
+        super().__post_init__()
+        if (self.depth is None) == (self.points is None):
+            msg = "a Frame has either depth or points"
+            raise ValueError(msg)
+        if self.depth is not None and (
+            self.camera is None or self.depth.shape != (self.camera.height, self.camera.width)
+        ):
+            msg = f"depth {self.depth.shape} needs a camera of the same size, got {self.camera}"
+            raise ValueError(msg)
+
+    @property
+    def organized(self) -> bool:
+        """Whether the frame is a depth image."""
+        return self.depth is not None
+
+    def xyz(self, indices: U4 | None = None) -> F4:
+        """Return the points at ``indices``, by default all: (n, 3) metres, sensor frame.
+
+        Points without a reading are rows of NaN.
+        """
+        if self.depth is None or self.camera is None:
+            points = self.points if self.points is not None else np.zeros((0, 3), np.float32)
+            return points if indices is None else points[indices]
+        camera, flat = self.camera, self.depth.reshape(-1)
+        pixel = np.arange(flat.size) if indices is None else np.asarray(indices, np.int64)
+        z = flat[pixel]
+        v, u = np.divmod(pixel, camera.width)
+        z = np.where(z > 0, z, np.float32(np.nan))
+        result = np.zeros((pixel.size, 3), np.float32)
+        result[:, 0] = (u - camera.cx) / camera.fx * z
+        result[:, 1] = (v - camera.cy) / camera.fy * z
+        result[:, 2] = z
+        return result

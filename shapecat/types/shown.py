@@ -1,0 +1,96 @@
+"""What the outputs show of one frame: objects with the final label of their track."""
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+from shapecat.arrays import F4, U4, Record, array
+from shapecat.types.found import Box, ImageMasks, NeuralGas, Plane
+from shapecat.types.readings import Pose
+
+__all__ = ["LabelledFrame", "LabelledObject", "ShownBox", "ShownFrame"]
+
+
+class LabelledObject(Record):
+    """One object in one frame as the outputs show it: a detection with its track's label.
+
+    Attributes
+    ----------
+    category, confidence : final, from all views of the track.
+    box, gas : the visible part, sensor frame.
+    indices : (n,) ascending indices into the frame.
+    posterior : (c,) from this view alone.
+    causal : (c,) fused from the track's views up to this frame.
+    height_m : height of the box centre above the surface it stands on; NaN if that is unknown.
+    touches_border, occluded : as in `Candidate`.
+    detections : numbers of its detections in the frame; several where tracks were merged.
+    full : the box of the whole object, estimated from the track's views; None if unknown.
+    """
+
+    track: int
+    category: str
+    confidence: float
+    box: Box
+    indices: U4 = array("n", "u4")
+    gas: NeuralGas
+    posterior: F4 = array("c", "f4")
+    causal: F4 = array("c", "f4")
+    height_m: float = float("nan")
+    touches_border: bool = False
+    occluded: bool = False
+    detections: tuple[int, ...] = ()
+    full: Box | None = None
+
+
+class LabelledFrame(Record):
+    """One frame as the outputs show it, without its points.
+
+    Attributes
+    ----------
+    fixed_from_sensor : None where the recording has no fixed frame.
+    ended : tracks last shown in the previous frame of the topic.
+    seconds : time spent in each stage.
+    up : (3,) unit vector, sensor frame; None if unknown.
+    reused_from : index of the earlier frame from which the scene is copied; None if it is new.
+    masks : None without a colour image.
+    """
+
+    topic: str
+    index: int
+    stamp_ns: int
+    log_time_ns: int
+    frame_id: str
+    fixed_from_sensor: Pose | None
+    planes: tuple[Plane, ...]
+    objects: tuple[LabelledObject, ...]
+    ended: tuple[int, ...]
+    seconds: dict[str, float]
+    up: F4 | None = array("3", "f4", default=None)
+    reused_from: int | None = None
+    masks: ImageMasks | None = None
+
+
+class ShownBox(NamedTuple):
+    """The annotation of one object, as plain numbers.
+
+    ``center`` (metres), ``size`` (metres) and ``orientation`` (x, y, z, w) are those of a `Box`.
+    """
+
+    track: int
+    category: str
+    confidence: float
+    center: tuple[float, float, float]
+    size: tuple[float, float, float]
+    orientation: tuple[float, float, float, float]
+
+
+@dataclass(frozen=True)
+class ShownFrame:
+    """The annotations of one frame; the fields are as in `LabelledFrame`."""
+
+    topic: str
+    index: int
+    stamp_ns: int
+    log_time_ns: int
+    frame_id: str
+    objects: tuple[ShownBox, ...]
+    ended: tuple[int, ...]
