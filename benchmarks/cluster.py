@@ -26,9 +26,9 @@ import numpy as np
 from benchmarks.batch import process
 from benchmarks.measure import markdown, save
 from shapecat.batch.finding import Source
+from shapecat.batch.ledger import Ledger
 from shapecat.batch.manifest import Entry, Manifest, RemoteManifest
 from shapecat.batch.plans import _Planner, plan_batch
-from shapecat.batch.runs import _Ledger
 from shapecat.batch.storage import Location
 from shapecat.executors import open_executor
 from shapecat.runs.jobs import Job
@@ -248,7 +248,7 @@ def limits(count: int) -> tuple[str, ...]:
     manifest = RemoteManifest(out)
     tasks = planner(out, set(), manifest).tasks(named)
     spent.append(time.process_time())
-    ledger = _Ledger(manifest)
+    ledger = Ledger(manifest)
     ledger.plan(tasks)
     for some in range(0, count, 1000):
         entries = [task.entry() for task in tasks[some : some + 1000]]

@@ -13,7 +13,7 @@ from shapecat.description import BLOCKS, DESCRIPTOR_NAMES, describe
 from shapecat.description.curvature import assign, fit_surfaces
 from shapecat.description.distances import euclidean, geodesic
 from shapecat.description.profile import vertical_axis
-from shapecat.description.revolution import rotation_axis
+from shapecat.description.rotation_axis import rotation_axis
 from shapecat.surface import reconstruct
 from shapecat.types import NeuralGas
 

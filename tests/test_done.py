@@ -11,10 +11,11 @@ from typing import Any, get_args
 import pytest
 
 from shapecat.batch.finding import Source, find_recordings
+from shapecat.batch.ledger import Outcome
 from shapecat.batch.manifest import Entry, Manifest, State
 from shapecat.batch.plans import Shard, name_folders, plan_batch
 from shapecat.batch.remote import Ticket
-from shapecat.batch.runs import Outcome, exit_code, process_on
+from shapecat.batch.runs import exit_code, process_on
 from shapecat.config import Settings
 from shapecat.errors import OutputError
 from shapecat.runs.folder import read_run, write_run

@@ -29,7 +29,8 @@ from shapecat.recordings.ros1_records import BagError, split
 from shapecat.recordings.stamps import Clock
 from shapecat.recordings.streams import info_topic_of
 from shapecat.recordings.time_order import Timed, in_time_order
-from shapecat.recordings.transforms import TransformBuffer, _slerp
+from shapecat.recordings.transform_samples import _slerp
+from shapecat.recordings.transforms import TransformBuffer
 from shapecat.types import Camera
 from tests.colour_messages import gradient, jpeg, packed, png, raw
 from tests.messages import EPOCH, SECOND, cloud, image, info, make, organized_points, wavy_depth

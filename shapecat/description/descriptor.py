@@ -13,7 +13,8 @@ from shapecat.description.distributions import distributions
 from shapecat.description.outline import outline
 from shapecat.description.profile import profile, vertical_axis
 from shapecat.description.ranges import outer_range
-from shapecat.description.revolution import revolution, rotation_axis
+from shapecat.description.revolution import revolution
+from shapecat.description.rotation_axis import rotation_axis
 from shapecat.description.solids import solids
 from shapecat.jit import kernel
 from shapecat.types import NeuralGas

@@ -4,18 +4,22 @@ Stamps are integer nanoseconds: today's time as a float in seconds has a resolut
 """
 
 import sys
-from array import array
 from bisect import bisect_right
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from shapecat.arrays import F8
 from shapecat.errors import RecordingError, ShapecatError
-from shapecat.geometry import IDENTITY, compose, inverse, rotation_from_quaternion
+from shapecat.geometry import IDENTITY, compose, inverse
 from shapecat.recordings.foxglove import ros_counterpart
 from shapecat.recordings.recording import Recording
 from shapecat.recordings.stamps import stamp_ns
+from shapecat.recordings.transform_samples import (
+    TransformSample,
+    TransformTrack,
+    interpolated,
+    pose_of,
+)
 from shapecat.types import Pose
 
 __all__ = [
@@ -54,42 +58,6 @@ class TransformLoopError(TransformError):
     """A frame is its own ancestor."""
 
 
-class _Sample(NamedTuple):
-    parent: str
-    translation: tuple[float, float, float]
-    quaternion: tuple[float, ...]
-
-
-class _Track:
-    """The transforms from one frame to its parent, sorted by time, in packed arrays."""
-
-    def __init__(self) -> None:
-        self.stamps = array("q")
-        self._parents: list[str] = []
-        self._numbers = array("d")  # seven per sample
-
-    def __getitem__(self, k: int) -> _Sample:
-        """Return sample `k`, counted from 0."""
-        x, y, z, *quaternion = self._numbers[7 * k : 7 * k + 7]
-        return _Sample(self._parents[k], (x, y, z), tuple(quaternion))
-
-    def add(self, stamp: int, sample: _Sample) -> None:
-        """Insert a sample by time; of three equal samples in a row, drop the middle one."""
-        at, count = bisect_right(self.stamps, stamp), len(self.stamps)
-        if at and self.stamps[at - 1] == stamp:
-            self._set(slice(at - 1, at), stamp, sample)
-        elif at == count >= 2 and self[count - 1] == self[count - 2] == sample:
-            self.stamps[-1] = stamp
-        else:
-            self._set(slice(at, at), stamp, sample)
-
-    def _set(self, at: slice, stamp: int, sample: _Sample) -> None:
-        self.stamps[at] = array("q", [stamp])
-        self._parents[at] = [sample.parent]
-        numbers = array("d", (*sample.translation, *sample.quaternion))
-        self._numbers[7 * at.start : 7 * at.stop] = numbers
-
-
 class TransformBuffer:
     """Transforms between frames; static ones are valid for all times.
 
@@ -102,8 +70,8 @@ class TransformBuffer:
     def __init__(self, *, tolerance_ns: int = 100_000_000) -> None:
         """Make an empty buffer."""
         self.tolerance_ns = tolerance_ns
-        self._static: dict[str, _Sample] = {}
-        self._moving: dict[str, _Track] = {}
+        self._static: dict[str, TransformSample] = {}
+        self._moving: dict[str, TransformTrack] = {}
         self._frames: set[str] = set()
 
     @property
@@ -140,12 +108,14 @@ class TransformBuffer:
         if not (fine and parent and child and parent != child):
             return False
         parent = sys.intern(parent)  # one for all samples
-        sample = _Sample(parent, tuple(translation.tolist()), tuple((quaternion / norm).tolist()))
+        sample = TransformSample(
+            parent, tuple(translation.tolist()), tuple((quaternion / norm).tolist())
+        )
         self._frames |= {parent, child}
         if static:
             self._static[child] = sample
         else:
-            self._moving.setdefault(child, _Track()).add(stamp_ns, sample)
+            self._moving.setdefault(child, TransformTrack()).add(stamp_ns, sample)
         return True
 
     def ancestors(self, frame_id: str) -> tuple[str, ...]:
@@ -227,7 +197,7 @@ class TransformBuffer:
 
     def _to_parent(self, frame_id: str, stamp_ns: int) -> Pose:
         if frame_id in self._static:
-            return _pose(self._static[frame_id])
+            return pose_of(self._static[frame_id])
         track = self._moving[frame_id]
         stamps = track.stamps
         late = stamp_ns - stamps[-1]
@@ -242,35 +212,12 @@ class TransformBuffer:
             raise ExtrapolationError(msg)
         at = bisect_right(stamps, stamp_ns)
         if at in {0, len(stamps)}:
-            return _pose(track[max(0, at - 1)])
+            return pose_of(track[max(0, at - 1)])
         before, after = track[at - 1], track[at]
         if before.parent != after.parent or before == after:
-            return _pose(before)
+            return pose_of(before)
         share = (stamp_ns - stamps[at - 1]) / (stamps[at] - stamps[at - 1])
-        return _between(before, after, share)
-
-
-def _pose(sample: _Sample) -> Pose:
-    return Pose(rotation_from_quaternion(sample.quaternion), np.array(sample.translation))
-
-
-def _between(a: _Sample, b: _Sample, share: float) -> Pose:
-    translation = (1 - share) * np.array(a.translation) + share * np.array(b.translation)
-    rotation = rotation_from_quaternion(
-        _slerp(np.array(a.quaternion), np.array(b.quaternion), share)
-    )
-    return Pose(rotation, translation)
-
-
-def _slerp(a: F8, b: F8, share: float) -> F8:
-    """Interpolate unit quaternions along the shorter arc (Shoemake 1985)."""
-    cosine = float(a @ b)
-    if cosine < 0:
-        b, cosine = -b, -cosine
-    if cosine > 0.9999:  # linear interpolation errs by less than 1e-7 rad
-        return a + share * (b - a)
-    angle = np.arccos(cosine)
-    return np.asarray(np.sin((1 - share) * angle) * a + np.sin(share * angle) * b)
+        return interpolated(before, after, share)
 
 
 def fixed_frame(buffer: TransformBuffer, frame_id: str) -> str | None:

@@ -31,6 +31,7 @@ ROOMS = ("batch", "cameras", "colour", "executors", "outputs", "recordings", "ru
          "tracking")  # fmt: skip
 KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.batch": ("test_done",),
+    "shapecat.batch.ledger": ("test_done", "test_batch"),
     "shapecat.batch.runs": ("test_done", "test_batch"),
     "shapecat.batch.claims": ("test_remote",),
     "shapecat.batch.remote": ("test_remote",),
@@ -63,7 +64,7 @@ KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.recordings.mcap": ("test_recordings_worked", "test_annotated_mcap",
                                  "test_recordings"),
     "shapecat.recordings.protobuf": ("test_recordings_foxglove",),
-    "shapecat.recordings.transforms": ("test_recordings_worked", "test_transforms",
+    "shapecat.recordings.transform": ("test_recordings_worked", "test_transforms",
                                        "test_cameras"),
     "shapecat.runs": ("test_tables_turned", "test_tables", "test_done", "test_labels"),
     "shapecat.runs.corrections": ("test_outputs_worked", "test_labels", "test_label_transfer"),
@@ -84,6 +85,7 @@ KNOWN_BY: dict[str, Sequence[str]] = {
 """Test files by the beginning of a module's name; the longest that fits counts."""
 SLOW = (
     "shapecat.batch.claims",
+    "shapecat.batch.ledger",
     "shapecat.batch.remote",
     "shapecat.batch.runs",
     "shapecat.batch.storage",

@@ -1,0 +1,142 @@
+"""The outcome of each recording of a batch, and its lines in the manifest."""
+
+import json
+import logging
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
+from threading import Lock
+from typing import Any
+
+from shapecat.batch.manifest import Entry, Manifest
+from shapecat.batch.plans import Task
+from shapecat.batch.storage import Location
+from shapecat.errors import OutputError
+from shapecat.executors import is_dropped
+from shapecat.runs.folder import read_run
+from shapecat.runs.jobs import Job, Summary, summarize
+from shapecat.runs.run_info import RunInfo
+
+__all__ = ["Ledger", "Outcome"]
+
+_log = logging.getLogger(__name__)
+
+_LINES = 1000
+"""Lines of the manifest written at a time."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The outcome of a job: a summary, or the message and exit code of an error."""
+
+    job: Job
+    summary: Summary | None = None
+    message: str = ""
+    code: int = 0
+
+
+class Ledger:
+    """Writes the manifest, if there is one; a failed write does not end the batch."""
+
+    def __init__(self, manifest: Manifest | None) -> None:
+        self._manifest = manifest
+        self._lock = Lock()
+        self._open: dict[str, Entry] = {}
+
+    def plan(self, tasks: Iterable[Task]) -> None:
+        """Record the recordings to process, unless the manifest has them already."""
+        entries = (task.entry() for task in tasks if task.status != "complete")
+        new = (entry for entry in entries if not self._is_noted(entry))
+        while some := list(islice(new, _LINES)):
+            self._write(some)
+
+    def _is_noted(self, entry: Entry) -> bool:
+        known = self._manifest.entries.get(entry.folder) if self._manifest is not None else None
+        return known is not None and known.state == "planned" and known.same_work(entry)
+
+    def known(self, task: Task) -> Outcome:
+        """Return the outcome of a task that was complete before."""
+        job = task.job
+        entry = self._manifest.entries.get(task.name) if self._manifest is not None else None
+        if entry is not None and entry.tracks is not None and entry.frames is not None:
+            counts = {"frames": entry.frames, "tracks": entry.tracks}
+            summary = Summary(
+                job.name, job.folder, counts, entry.seconds or 0.0, (), processed=False
+            )
+            return Outcome(job, summary)
+        try:
+            return Outcome(job, summarize(job, _run_of(job), processed=False))
+        except OutputError as error:
+            return Outcome(job, message=str(error), code=error.exit_code)
+
+    def begin(self, task: Task) -> None:
+        """Store a recording as submitted."""
+        with self._lock:
+            self._open.setdefault(task.name, replace(task.entry(), tries=1))
+
+    def running(self, name: str) -> None:
+        """Record the start of a recording, once per attempt."""
+        with self._lock:
+            entry = self._open.get(name)
+            if entry is not None and entry.state != "running":
+                self._note(entry, state="running")
+
+    def lost(self, task: Task, error: BaseException) -> int:
+        """Record a lost worker; return the number of workers lost on this recording."""
+        with self._lock:
+            entry = self._open[task.name]
+            waited = entry.state != "running"
+            if not (is_dropped(error) and waited):
+                entry = self._note(entry, state="planned", tries=entry.tries + 1)
+            return entry.tries - 1
+
+    def ended(self, task: Task, outcome: Outcome) -> None:
+        """Record the outcome of a recording."""
+        with self._lock:
+            entry, summary = self._open[task.name], outcome.summary
+            if summary is None:
+                self._note(entry, state="failed", exit_code=outcome.code, message=outcome.message)
+            elif not self._is_complete(entry):
+                self._note(
+                    entry,
+                    state="complete",
+                    seconds=round(summary.seconds, 3),
+                    frames=summary.counts["frames"],
+                    tracks=summary.counts["tracks"],
+                )
+            del self._open[task.name]
+
+    def _is_complete(self, entry: Entry) -> bool:
+        known = self._manifest.entries.get(entry.folder) if self._manifest is not None else None
+        return known is not None and known.state == "complete" and known.same_work(entry)
+
+    def _note(self, entry: Entry, **changes: Any) -> Entry:
+        new = self._open[entry.folder] = replace(entry, **changes)
+        self._write([new])
+        return new
+
+    def _write(self, entries: Sequence[Entry]) -> None:
+        if self._manifest is None:
+            return
+        try:
+            self._manifest.record(entries)
+        except OutputError as error:
+            _log.error("%s", error)
+            self._manifest = None
+
+
+def _run_of(job: Job) -> RunInfo:
+    """Return the content of run.json of a complete run.
+
+    Raises
+    ------
+    OutputError : the file is missing or unreadable.
+    """
+    if not job.target:
+        return read_run(job.folder)
+    try:
+        run: RunInfo = json.loads((Location(job.target, OutputError) / "run.json").read() or b"")
+    except ValueError as error:
+        msg = f"{job.target}: no run.json, although the manifest lists it as complete"
+        raise OutputError(msg) from error
+    return run
