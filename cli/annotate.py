@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from .options import ANY_PATH, BOXES, BOXES_HELP, RECORDING_HELP
+from .options import ANY_PATH, boxes_option, recording_option
 from .render import missed_words, progress_bars
 
 
@@ -23,12 +23,8 @@ from .render import missed_words, progress_bars
     help="LABELS is another run, or its tracks.csv: transfer each of its labels to the object at "
     "the same place.",
 )
-@click.option(
-    "--boxes",
-    type=click.Choice(BOXES),
-    help=f"In annotated.mcap, {BOXES_HELP}; by default as in the run now.",
-)
-@click.option("--recording", type=ANY_PATH, help=RECORDING_HELP)
+@boxes_option("In annotated.mcap, {}; by default as in the run now.")
+@recording_option
 def annotate(
     *,
     run: Path,

@@ -5,7 +5,9 @@ from typing import Any
 
 import click
 
-from .options import ANY_PATH, RECORDING_HELP, json_option
+from shapecat.outputs.counts import plural
+
+from .options import ANY_PATH, json_option, recording_option
 from .render import print_json, print_table, progress_bars
 
 
@@ -17,7 +19,7 @@ from .render import print_json, print_table, progress_bars
     type=ANY_PATH,
     help="New folder for a page with pictures, a table of all objects, and the metrics as JSON.",
 )
-@click.option("--recording", type=ANY_PATH, help=RECORDING_HELP)
+@recording_option
 @json_option
 def compare(
     *, run: Path, truth: Path, out: Path | None, recording: Path | None, as_json: bool
@@ -64,5 +66,4 @@ def _words(kinds: dict[str, int]) -> str:
     if not kinds:
         return "no differences"
     parts = [f"{count} {name}" for name, count in sorted(kinds.items(), key=lambda i: -i[1])]
-    total = sum(kinds.values())
-    return f"{total} difference{'s' if total != 1 else ''}: {', '.join(parts)}"
+    return f"{plural(sum(kinds.values()), 'difference')}: {', '.join(parts)}"

@@ -4,8 +4,10 @@ from pathlib import Path
 
 import click
 
+from shapecat.outputs.counts import plural
+
 from .options import ANY_PATH, json_option, model_option
-from .render import plural, print_json, progress_bars
+from .render import print_json, progress_bars
 
 
 @click.command()

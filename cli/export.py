@@ -6,8 +6,10 @@ from typing import Any
 
 import click
 
-from .options import ANY_PATH, BOXES, BOXES_HELP, RECORDING_HELP
-from .render import plural, progress_bars
+from shapecat.outputs.counts import plural
+
+from .options import ANY_PATH, boxes_option, recording_option
+from .render import progress_bars
 
 _DATASETS = ("coco", "yolo")
 _WITH_BOXES = ("kitti", "labelcloud")
@@ -61,12 +63,8 @@ _FORMATS = (*_DATASETS, "crops", *_WITH_BOXES, "point-labels")
     show_default=True,
     help="coco, yolo: fraction of the recordings in the validation split.",
 )
-@click.option(
-    "--boxes",
-    type=click.Choice(BOXES),
-    help=f"kitti, labelcloud: {BOXES_HELP}; full by default.",
-)
-@click.option("--recording", type=ANY_PATH, help=RECORDING_HELP)
+@boxes_option("kitti, labelcloud: {}; full by default.")
+@recording_option
 def export(
     *,
     folders: tuple[Path, ...],

@@ -56,9 +56,17 @@ verbose_option = click.option(
     callback=_be_verbose,
     help="Log each step to stderr.",
 )
-RECORDING_HELP = "Path of the recording, if it was moved."
-BOXES = ("full", "visible")
-BOXES_HELP = "boxes enclose whole objects (full) or their visible parts"
+recording_option = click.option(
+    "--recording", type=ANY_PATH, help="Path of the recording, if it was moved."
+)
+
+
+def boxes_option(where: str) -> Any:
+    """Return the option ``--boxes``; ``where`` says which boxes, and what is the default."""
+    about = "boxes enclose whole objects (full) or their visible parts"
+    return click.option("--boxes", type=click.Choice(["full", "visible"]), help=where.format(about))
+
+
 seed_option = click.option(
     "--seed",
     type=click.IntRange(0),

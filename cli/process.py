@@ -11,10 +11,9 @@ import click
 from shapecat.system.stopping import Stopped
 
 from .options import (
-    BOXES,
-    BOXES_HELP,
     SECONDS,
     array_option,
+    boxes_option,
     config_option,
     model_option,
     set_option,
@@ -91,9 +90,7 @@ _MOST_ROWS = 100
     help="Topic of colour images; by default those of the depth camera.",
 )
 @click.option("--no-color", is_flag=True, help="Do not use colour images.")
-@click.option(
-    "--boxes", type=click.Choice(BOXES), help=f"In annotated.mcap, {BOXES_HELP}; full by default."
-)
+@boxes_option("In annotated.mcap, {}; full by default.")
 @click.option("--no-mcap", is_flag=True, help="Do not write annotated.mcap.")
 @click.option("--no-rrd", is_flag=True, help="Do not write review.rrd.")
 @click.option(

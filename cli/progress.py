@@ -11,7 +11,9 @@ from typing import Any, Self
 
 import click
 
-from .render import COMPILING, PHASES, plural
+from shapecat.outputs.counts import plural
+
+from .render import COMPILING, PHASES
 
 _LINE_S = 5.0
 _EVENT_S = 0.5

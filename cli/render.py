@@ -95,12 +95,6 @@ def missed_words(missed: Mapping[str, Any]) -> str:
     return f"  track {missed['old_track']}, {missed['label']}: {missed['reason']}"
 
 
-def plural(count: int, noun: str) -> str:
-    """Return a count with its noun: ``1 file``, ``2 files``, ``3 processes``."""
-    ending = "" if count == 1 else "es" if noun.endswith("s") else "s"
-    return f"{count:,} {noun}{ending}"
-
-
 def count_words(counts: Mapping[str, int]) -> str:
     """Return counts as text, largest first: ``cup 3, can 2``."""
     ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))

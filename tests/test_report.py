@@ -20,6 +20,7 @@ from scipy import ndimage
 
 from shapecat.api import open_run
 from shapecat.colour.masks import Mask
+from shapecat.outputs.counts import plural
 from shapecat.outputs.report import read_reports, write_reports
 from shapecat.outputs.report.cards import Card
 from shapecat.outputs.report.choosing import choose_frames
@@ -29,7 +30,7 @@ from shapecat.outputs.report.pictures import TrackPictures
 from shapecat.outputs.report.surfaces import SIDE, Snapshot, draw
 from shapecat.outputs.report.tracks import Timeline, read_timelines
 from shapecat.outputs.rereading import FinishedRun, read_finished
-from shapecat.outputs.wording import caption, confidence_text, plural, time_span
+from shapecat.outputs.wording import caption, confidence_text, time_span
 from shapecat.runs.corrections import read_labels
 from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas

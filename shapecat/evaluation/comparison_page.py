@@ -12,6 +12,7 @@ import pyarrow as pa
 from shapecat.errors import OutputError
 from shapecat.evaluation.comparing import Comparison, Difference
 from shapecat.evaluation.comparison_pictures import COLOURS, DifferenceImage, words_of
+from shapecat.outputs.counts import plural
 from shapecat.runs.tables import FRAME_COLUMNS, write_table
 from shapecat.system.files import complete_folder
 
@@ -176,7 +177,7 @@ _HEAD = ("frame", "difference", "true", "found", "track", "confidence", "overlap
 
 def _count(rows: Sequence[Difference]) -> str:
     more = f"; the first {_MOST_ROWS} are listed" if len(rows) > _MOST_ROWS else ""
-    return f"{len(rows)} difference{'s' if len(rows) != 1 else ''}{more}"
+    return f"{plural(len(rows), 'difference')}{more}"
 
 
 def _cells(row: Difference) -> tuple[str, ...]:

@@ -198,14 +198,8 @@ class Run:
     def frames(self, recording: str | Path | None = None) -> Iterator[RunFrame]:
         """Yield the frames with their points, in constant memory.
 
-        Parameters
-        ----------
-        recording : path of the recording; by default where it was processed.
-
-        Raises
-        ------
-        RecordingError : the recording is missing or unreadable.
-        OutputError : the content of the recording differs from what was processed.
+        ``recording`` is its path; by default where it was processed. It must be readable, and have
+        the content that was processed; otherwise a `RecordingError` or `OutputError` is raised.
         """
         moved = None if recording is None else Path(recording)
         with open_source(self.info, moved) as source:

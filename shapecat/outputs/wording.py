@@ -1,8 +1,8 @@
-"""Format captions, confidences, counts and times, the same in every output."""
+"""Format captions, confidences and times, the same in every output."""
 
 from shapecat.types import UNKNOWN
 
-__all__ = ["caption", "confidence_text", "plural", "time_span"]
+__all__ = ["caption", "confidence_text", "time_span"]
 
 
 def caption(track: int, category: str, confidence: float) -> str:
@@ -34,17 +34,6 @@ def confidence_text(confidence: float) -> str:
     thousandths = round(1000 * confidence)
     hundredths = (thousandths + 5) // 10
     return f"{min(hundredths, 99 + thousandths // 1000) / 100:.2f}"
-
-
-def plural(count: int, noun: str) -> str:
-    """Return a count with its noun, in the plural unless the count is 1.
-
-    Examples
-    --------
-    >>> plural(1, "view"), plural(2, "view")
-    ('1 view', '2 views')
-    """
-    return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
 def time_span(first_s: float, last_s: float) -> str:

@@ -11,10 +11,11 @@ import numpy as np
 
 from shapecat.arrays import F8, I4, Bool
 from shapecat.outputs.colours import colour_of
+from shapecat.outputs.counts import plural
 from shapecat.outputs.report.pictures import StripFrame, TrackPictures
 from shapecat.outputs.report.surfaces import SIDE, SurfaceDrawing
 from shapecat.outputs.report.tracks import Timeline
-from shapecat.outputs.wording import confidence_text, plural, time_span
+from shapecat.outputs.wording import confidence_text, time_span
 from shapecat.runs.track_table import TrackRow
 from shapecat.types import UNKNOWN
 

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from shapecat.arrays import F8
+from shapecat.outputs.counts import plural
 from shapecat.outputs.report.cards import (
     Card,
     asset,
@@ -24,7 +25,6 @@ from shapecat.outputs.report.cards import (
 )
 from shapecat.outputs.report.pictures import StripFrame
 from shapecat.outputs.rereading import FinishedRun
-from shapecat.outputs.wording import plural
 from shapecat.runs.track_table import TrackTable
 from shapecat.types import UNKNOWN
 
