@@ -23,6 +23,7 @@ __all__ = [
     "level_axes",
     "level_box",
     "level_from_sensor",
+    "levelled",
     "quaternion_from_rotation",
     "rotation_from_quaternion",
     "row_quaternion",
@@ -185,11 +186,24 @@ def upright_box(points: F4, up: ArrayLike) -> Box:
     ------
     ValueError : ``points`` is empty.
     """
+    turned, level = levelled(points, up)
+    return Box(*level_box(np.ascontiguousarray(turned.T), level))
+
+
+def levelled(points: F4, up: ArrayLike) -> tuple[F4, F8]:
+    """Return the points of a box turned so that ``up`` becomes z, and the rotation (3, 3).
+
+    The parameters are as for `upright_box`.
+
+    Raises
+    ------
+    ValueError : ``points`` is empty.
+    """
     if len(points) == 0:
         msg = "a box needs at least one point"
         raise ValueError(msg)
     level = gravity_rotation(up)
-    return Box(*level_box(np.ascontiguousarray((points @ level.T.astype(np.float32)).T), level))
+    return points @ level.T.astype(np.float32), level
 
 
 @kernel

@@ -66,7 +66,7 @@ def kernel_lens(lens: LensCamera) -> Lens:
     d = np.zeros(8, np.float32)
     d[: len(lens.coefficients[:8])] = lens.coefficients[:8]
     kind = 0 if not lens.model else 2 if lens.model in _FISHEYE else 1
-    camera, reach = lens.pinhole, _reach(lens) ** 2 if kind else np.inf
+    camera, reach = lens.pinhole, _monotonic_up_to(lens) ** 2 if kind else np.inf
     numbers = np.array((camera.fx, camera.fy, camera.cx, camera.cy), np.float32)
     return numbers, kind, d, reach
 
@@ -84,7 +84,7 @@ def rectified(pixels: U1, lens: LensCamera) -> U1:
     x, y = distort(rays, lens.model, lens.coefficients).transpose(2, 0, 1)
     x, y = x * camera.fx + camera.cx, y * camera.fy + camera.cy
     inside = (x >= 0) & (x <= camera.width - 1) & (y >= 0) & (y <= camera.height - 1)
-    inside &= (rays**2).sum(axis=-1) < _reach(lens) ** 2
+    inside &= (rays**2).sum(axis=-1) < _monotonic_up_to(lens) ** 2
     x, y = np.where(inside, x, 0), np.where(inside, y, 0)
     left, top = (
         np.minimum(x.astype(int), camera.width - 2),
@@ -98,7 +98,7 @@ def rectified(pixels: U1, lens: LensCamera) -> U1:
 
 
 @lru_cache(maxsize=16)
-def _reach(lens: LensCamera) -> float:
+def _monotonic_up_to(lens: LensCamera) -> float:
     """Return the slope up to which the distortion increases monotonically.
 
     Beyond it the polynomial turns back, and would map the sides of the scene into the image.

@@ -11,7 +11,7 @@ import numpy as np
 from shapecat.arrays import F4, F8, I4
 from shapecat.jit import kernel
 
-__all__ = ["DIRECTIONS", "QUARTER", "fit_oval", "narrowest", "reach", "rectangle"]
+__all__ = ["DIRECTIONS", "QUARTER", "fit_oval", "narrowest", "rectangle", "support_function"]
 
 DIRECTIONS = 96
 """Directions of an outline, every 3.75 degrees; a quarter turn is a whole number of them."""
@@ -22,7 +22,9 @@ _OUTLIER = 0.03
 
 
 @kernel
-def reach(x: F4, y: F4, strays: I4, noise: float, flat: float, cosines: F8, sines: F8) -> F8:
+def support_function(
+    x: F4, y: F4, strays: I4, noise: float, flat: float, cosines: F8, sines: F8
+) -> F8:
     """Return the support function (k,) of points in k directions, without the farthest points.
 
     A flat side reaches as far as the mean of its points.
@@ -44,16 +46,16 @@ def reach(x: F4, y: F4, strays: I4, noise: float, flat: float, cosines: F8, sine
         for i in range(x.size):
             value = a * x[i] + b * y[i]
             if value > least:
-                _insert(highest, first, value)
+                _replace_smallest(highest, first, value)
                 least = highest[first]
         result[k] = least
         if noise > 0:
-            result[k] -= _lifted(x, y, a, b, least, noise, flat)
+            result[k] -= _overshoot(x, y, a, b, least, noise, flat)
     return result
 
 
 @kernel
-def _lifted(x: F4, y: F4, a: float, b: float, top: float, noise: float, flat: float) -> float:
+def _overshoot(x: F4, y: F4, a: float, b: float, top: float, noise: float, flat: float) -> float:
     """Return how far ``top`` is beyond the mean of the points of its side, if that is flat."""
     count, total = 0, 0.0
     for i in range(x.size):
@@ -64,7 +66,7 @@ def _lifted(x: F4, y: F4, a: float, b: float, top: float, noise: float, flat: fl
 
 
 @kernel
-def _insert(ascending: F4, first: int, value: float) -> None:
+def _replace_smallest(ascending: F4, first: int, value: float) -> None:
     """Insert a value into a list that is sorted from ``first``; the smallest value drops out."""
     at = first + 1
     while at < ascending.size and ascending[at] < value:
@@ -83,7 +85,7 @@ def fit_oval(
 
     Parameters
     ----------
-    reached : (k,) metres, the support function from `reach`.
+    reached : (k,) metres, the support function of `support_function`.
     seen : (k,) weight of each direction, 0 for those that face no sensor.
     roundness : weight of the prior for a circle, as a number of directions.
     cosines, sines : (k,) the directions.

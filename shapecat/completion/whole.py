@@ -12,10 +12,10 @@ from shapecat.completion.outline import (
     DIRECTIONS,
     fit_oval,
     narrowest,
-    reach,
     rectangle,
+    support_function,
 )
-from shapecat.geometry import gravity_rotation, quaternion_from_rotation
+from shapecat.geometry import levelled, quaternion_from_rotation
 from shapecat.types import FullBox
 
 __all__ = ["COSINES", "ENOUGH_POINTS", "SINES", "Footprint", "complete", "faced", "footprint"]
@@ -40,7 +40,7 @@ _ANGULAR, _HANDLED = "box", "cup"
 _CIRCULAR = 1e3
 
 
-class _Form(NamedTuple):
+class _OutlinePrior(NamedTuple):
     """What is known about the outlines of a category.
 
     Attributes
@@ -59,13 +59,14 @@ class _Form(NamedTuple):
     fits: float = 0.07
 
 
-_FORMS = {
-    "cup": _Form(roundness=_CIRCULAR),  # a handle would be taken for the long side of an oval
-    "box": _Form(noise=0.006),
-    "bottle": _Form(roundness=1.0, fits=0.1),  # many are oval
-    "bowl": _Form(stray=0.004),
-    "plate": _Form(stray=0.004),
-    "ball": _Form(stray=0.004, roundness=_CIRCULAR, fits=math.inf),
+_PRIORS = {
+    # A handle would be taken for the long side of an oval.
+    "cup": _OutlinePrior(roundness=_CIRCULAR),
+    "box": _OutlinePrior(noise=0.006),
+    "bottle": _OutlinePrior(roundness=1.0, fits=0.1),  # many are oval
+    "bowl": _OutlinePrior(stray=0.004),
+    "plate": _OutlinePrior(stray=0.004),
+    "ball": _OutlinePrior(stray=0.004, roundness=_CIRCULAR, fits=math.inf),
 }
 
 
@@ -103,14 +104,10 @@ def complete(
     ------
     ValueError : ``points`` is empty.
     """
-    if len(points) == 0:
-        msg = "a box needs at least one point"
-        raise ValueError(msg)
-    level = gravity_rotation(up)
-    some = points[:: max(1, -(-len(points) // ENOUGH_POINTS))] @ level.T.astype(np.float32)
+    some, level = levelled(points[:: max(1, -(-len(points) // ENOUGH_POINTS))], up)
     some[:, 2] -= np.float32(offset)
     facing = faced(-some[:, :2].mean(axis=0, dtype=np.float64))
-    seen = _reach(some, facing, categories[int(np.argmax(posterior))])
+    seen = _visible_outline(some, facing, categories[int(np.argmax(posterior))])
     plan = footprint(seen, facing.astype(np.float64), posterior, categories)
     bottom, lowest, top = _bounds(some[:, 2])
     c, s = COSINES[plan.side], SINES[plan.side]
@@ -150,11 +147,11 @@ def footprint(seen: F8, facing: F8, posterior: F8, categories: Sequence[str]) ->
     """
     likely = dict(zip(categories, np.asarray(posterior).tolist(), strict=True))
     category, angular = max(likely, key=likely.__getitem__), likely.get(_ANGULAR, 0.0)
-    form = _FORMS.get(category, _Form())
-    oval, radius, deviation = fit_oval(seen, facing, form.roundness, COSINES, SINES)
+    prior = _PRIORS.get(category, _OutlinePrior())
+    oval, radius, deviation = fit_oval(seen, facing, prior.roundness, COSINES, SINES)
     if category == _HANDLED and (seen - oval)[facing > 0].max() > _HANDLE * radius:
         oval = np.maximum(oval, np.where(facing > 0, seen, oval))
-    whole = oval if deviation < form.fits * radius else seen
+    whole = oval if deviation < prior.fits * radius else seen
     chosen = seen if category == _ANGULAR else whole
     side = narrowest(chosen)
     along, across, *size = rectangle(chosen, side)
@@ -171,12 +168,12 @@ def footprint(seen: F8, facing: F8, posterior: F8, categories: Sequence[str]) ->
     )
 
 
-def _reach(points: F4, facing: Bool, category: str) -> F8:
+def _visible_outline(points: F4, facing: Bool, category: str) -> F8:
     x, y = np.ascontiguousarray(points[:, :2].T)
-    form = _FORMS.get(category, _Form())
+    prior = _PRIORS.get(category, _OutlinePrior())
     # Noise is along the rays: less of it lies beyond edges that face no sensor.
-    strays = (np.where(facing, 1.0, 0.5) * form.stray * len(points)).astype(np.int64)
-    return np.asarray(reach(x, y, strays, form.noise, _FLAT, COSINES, SINES))
+    strays = (np.where(facing, 1.0, 0.5) * prior.stray * len(points)).astype(np.int64)
+    return np.asarray(support_function(x, y, strays, prior.noise, _FLAT, COSINES, SINES))
 
 
 def _bounds(heights: F4) -> tuple[float, float, float]:

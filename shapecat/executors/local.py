@@ -80,21 +80,20 @@ class LocalExecutor(Executor):
 
     def stop(self) -> None:
         """Ask running tasks to stop, as a signal would, and wait until they have."""
-        self.shutdown(wait=False, cancel_futures=True)
-        with self._lock:
-            for worker in self._workers.values():
-                worker.ask_to_stop()
-        for attendant in self._attendants:
-            attendant.join()
+        self._end(Worker.ask_to_stop)
 
     def terminate(self) -> None:
         """Kill the workers in the middle of their tasks."""
+        self._end(lambda worker: worker.process.kill(), timeout_s=1)
+
+    def _end(self, each: Callable[[Worker], object], *, timeout_s: float | None = None) -> None:
+        """Drop waiting tasks, call ``each`` for all workers, and wait for their attendants."""
         self.shutdown(wait=False, cancel_futures=True)
         with self._lock:
             for worker in self._workers.values():
-                worker.process.kill()
+                each(worker)
         for attendant in self._attendants:
-            attendant.join(timeout=1)
+            attendant.join(timeout_s)
 
     def _cancel_waiting(self) -> None:
         with suppress(Empty):

@@ -130,7 +130,7 @@ class _Turn(Generic[_Item, _Result]):
             self._item.append(item)
             self._future = executor.submit(work, item)
             # Futures keep their callbacks: one that knew this turn would keep the result for ever.
-            self._future.add_done_callback(partial(_let_go, self._item))
+            self._future.add_done_callback(partial(_drop_finished, self._item))
 
     def done(self) -> bool:
         """Return whether the work is finished."""
@@ -151,7 +151,7 @@ class _Turn(Generic[_Item, _Result]):
         return self._work(self._item[0])
 
 
-def _let_go(item: list[_Item], future: Future[_Result]) -> None:
+def _drop_finished(item: list[_Item], future: Future[_Result]) -> None:
     """Drop the item of a future that has a result."""
     if not future.cancelled() and future.exception() is None:
         item.clear()

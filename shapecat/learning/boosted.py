@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import ClassifierMixin
 from sklearn.utils import check_random_state
-from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import validate_data
 
 from shapecat.arrays import F4, F8, I4
@@ -83,7 +82,6 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
         labels.
         """
         x, y = validate_data(self, X, y, dtype=np.float32)
-        check_classification_targets(y)
         self.classes_, labels = known_labels(y, self.unknown)
         labels = np.where(labels < 0, len(self.classes_), labels)
         self.bias_ = np.log(np.bincount(labels) / labels.size)

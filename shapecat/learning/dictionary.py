@@ -7,7 +7,6 @@ from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, ClassifierMixin
 from sklearn.ensemble import RandomForestClassifier
 from sklearn.linear_model import LogisticRegression
-from sklearn.utils.multiclass import check_classification_targets
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from shapecat.arrays import F8, I4
@@ -52,7 +51,6 @@ class ForestDictionary(TreeDictionary):
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Grow the forest on features X (n, f) and labels y (n,), including unknown ones."""
         x, y = validate_data(self, X, y, dtype=np.float32)
-        check_classification_targets(y)
         forest = RandomForestClassifier(
             self.trees,
             min_samples_leaf=self.min_leaf,
@@ -97,7 +95,6 @@ class WordLearner(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # skle
     def fit(self, X: Any, y: ArrayLike) -> Self:
         """Fit to words X (n, words), zeros and ones, dense or sparse, and labels y (n,)."""
         x, y = validate_data(self, X, y, dtype=np.float64, accept_sparse="csr")
-        check_classification_targets(y)
         self.classes_, labels = known_labels(y, self.unknown)
         x, labels = x[labels >= 0], labels[labels >= 0]
         coef, self.intercept_ = self._fit_logits(x, labels)

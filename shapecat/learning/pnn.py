@@ -69,7 +69,6 @@ class ProbabilisticNeuralNetwork(
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Fit to descriptors X (n, d) and labels y (n,)."""
         x, y = validate_data(self, X, y, dtype=np.float32)
-        check_classification_targets(y)
         self.classes_, labels = known_labels(y, self.unknown)
         rng = np.random.default_rng(check_random_state(self.random_state).randint(2**31))
         blocks = {"all": (0, x.shape[1])} if self.blocks is None else self.blocks
@@ -109,8 +108,9 @@ def known_labels(y: ArrayLike, unknown: Any) -> tuple[Any, I4]:
 
     Raises
     ------
-    ValueError : fewer than two categories are left.
+    ValueError : the labels are not categories, or fewer than two categories are left.
     """
+    check_classification_targets(y)
     y = np.asarray(y)
     known = np.ones(y.shape, bool) if unknown is None else y != unknown
     classes = np.unique(y[known])

@@ -232,7 +232,7 @@ def _nearest_there(
     ``old`` are the other objects of the source, ``new`` the objects of the target.
     """
     near = sorted((_apart(thing, other), k) for k, other in enumerate(new))
-    reached = [(d, k) for d, k in near if d <= _reach(thing, new[k])]
+    reached = [(d, k) for d, k in near if d <= _match_radius(thing, new[k])]
     if not reached:
         return None, "nothing was found there"
     (distance, first), *others = reached
@@ -252,7 +252,7 @@ def _apart(a: _Standing, b: _Standing) -> float:
     return float(np.linalg.norm(a.center - b.center))
 
 
-def _reach(a: _Standing, b: _Standing) -> float:
+def _match_radius(a: _Standing, b: _Standing) -> float:
     return max(_LEAST_REACH_M, _REACH * float(np.fmax(a.width_m, b.width_m)))
 
 
