@@ -17,18 +17,8 @@ from shapecat.recordings.pinhole import camera_of_info, fit_pinhole
 from shapecat.recordings.sources import DepthSource
 from shapecat.recordings.streams import IMAGE, Stream
 from shapecat.types import Camera, Frame
-from tests.messages import (
-    EPOCH,
-    compressed,
-    image,
-    info,
-    make,
-    organized_points,
-    png,
-    rvl,
-    wavy_depth,
-    write,
-)
+from tests.depth_encodings import png, rvl
+from tests.messages import EPOCH, compressed, image, info, make, organized_points, wavy_depth, write
 from tests.test_recordings_frames import read
 
 K = (531.7, 0.0, 322.3, 0.0, 527.1, 243.9, 0.0, 0.0, 1.0)

@@ -24,6 +24,7 @@ from shapecat.recordings.pinhole import fit_pinhole, still_fits
 from shapecat.recordings.pointcloud2 import cloud_points
 from shapecat.recordings.sources import DepthSource
 from shapecat.types import Camera, Frame
+from tests.depth_encodings import png, rvl
 from tests.messages import (
     CAMERA,
     CLOUD,
@@ -38,8 +39,6 @@ from tests.messages import (
     info,
     make,
     organized_points,
-    png,
-    rvl,
     wavy_depth,
     write,
 )

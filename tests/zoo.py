@@ -18,6 +18,7 @@ from rosbags.rosbag2 import Writer as FolderWriter
 
 from shapecat.geometry import IDENTITY
 from shapecat.simulation.messages import MessageFactory
+from tests import depth_encodings as depth
 from tests import foxglove_messages as foxglove
 from tests import messages as ros
 from tests.messages import EPOCH, SECOND
@@ -462,8 +463,8 @@ ZOO: dict[str, Exhibit] = {
     "ros 2 beside other files": Exhibit(lambda p: copy_of(p, note="mine")),
     "db3": Exhibit(lambda p: database(p, definitions=True)),
     "db3 without definitions": Exhibit(lambda p: database(p, definitions=False), said="Humble"),
-    "compressed depth png": Exhibit(lambda p: compressed_depth(p, ros.png)),
-    "compressed depth rvl": Exhibit(lambda p: compressed_depth(p, ros.rvl)),
+    "compressed depth png": Exhibit(lambda p: compressed_depth(p, depth.png)),
+    "compressed depth rvl": Exhibit(lambda p: compressed_depth(p, depth.rvl)),
     "realsense viewer": Exhibit(realsense),
     "organized cloud": Exhibit(lambda p: record(p / "a.mcap", FRAMES, clouds=True)),
     **{
