@@ -21,7 +21,7 @@ PHASES = {
     "evaluate": "evaluating",
     "compare": "comparing",
 }
-COMPILING = "compiling kernels, once per installation: a few minutes"
+COMPILING = "compiling kernels, once per installation: about a minute"
 
 
 class Bars:

@@ -177,7 +177,7 @@ def main() -> None:
     ended = threading.Event()
 
     def tell() -> None:
-        say("compiling the kernels, once per installation: about two minutes on two cores")
+        say("compiling the kernels, once per installation: about a minute")
         while not ended.wait(_TELL_S):
             say(f"{_count()} kernels compiled")
 
