@@ -8,7 +8,7 @@ from benchmarks.planes import keeps_table, view_of
 from shapecat.config import DetectionSettings, Settings
 from shapecat.detection import detect
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
-from shapecat.detection.planes import NO_HINT
+from shapecat.detection.planes import NO_HINT, find_supporting_planes
 from shapecat.detection.planes.assumed import assume_plane, unexplained
 from shapecat.detection.planes.horizontal import find_horizontal_planes
 from shapecat.detection.planes.oriented_points import orient_points
@@ -59,6 +59,16 @@ def heights(meshes: list[Mesh]) -> tuple[list[float], list[float]]:
     return [one.plane.offset + np.sqrt(0.5) for one in planes], [one.covered_m2 for one in planes]
 
 
+def supports(meshes: list[Mesh]) -> list[float]:
+    """Return the heights of the planes that objects may stand on."""
+    trials = draw_trials(np.random.default_rng(0))
+    planes, up = find_supporting_planes(
+        grid_of(meshes), NO_HINT, trials, tallest_m=0.6, upright=True
+    )
+    assert up @ UP > np.cos(np.radians(2))
+    return [plane.offset + np.sqrt(0.5) for plane in planes]
+
+
 @pytest.mark.parametrize(
     ("kind", "seed"),
     [
@@ -88,6 +98,17 @@ def test_lid_under_a_box_is_not_covered() -> None:
     _, covered_m2 = heights([block(0, 0, -0.03, (1.2, 1.0, 0.03)), *boxes])
     assert covered_m2 == [0] * len(covered_m2)
     assert len(covered_m2) > 1
+
+
+def test_floor_of_a_raised_bin_is_a_plane_and_the_top_of_a_box_is_not() -> None:
+    """Both are too small for furniture, half a metre above the floor, and nothing is seen below."""
+    ground, body = block(0, 0.3, -0.53, (2.4, 2.4, 0.03)), block(0, 0, -0.5, (0.34, 0.3, 0.5))
+    sides = [
+        *(block(x, 0, 0, (0.01, 0.3, 0.08)) for x in (-0.165, 0.165)),
+        *(block(0, y, 0, (0.34, 0.01, 0.08)) for y in (-0.145, 0.145)),
+    ]
+    assert supports([ground, body]) == pytest.approx([-0.5], abs=0.01)
+    assert supports([ground, body, *sides]) == pytest.approx([-0.5, 0], abs=0.01)
 
 
 def test_camera_upside_down_is_believed_where_nothing_speaks_against_it() -> None:

@@ -8,10 +8,9 @@ import numpy as np
 
 from shapecat.arrays import F8, I4, U1, Bool
 from shapecat.detection.depth_grid import DepthGrid
-from shapecat.detection.planes.extent import COS, SIN, SupportingPlane
+from shapecat.detection.planes.extent import COS, SIN, SupportingPlane, level_coordinates
 from shapecat.detection.planes.ransac import horizontal_plane
 from shapecat.detection.planes.settings import PLANES, UP
-from shapecat.geometry import gravity_rotation
 
 __all__ = ["assume_plane", "unexplained"]
 
@@ -44,17 +43,14 @@ def assume_plane(grid: DepthGrid, rest: Bool, up: F8, tallest_m: float) -> Suppo
     up : (3,) unit normal of the plane, sensor frame.
     tallest_m : height of the tallest object, metres.
     """
-    i, j = np.nonzero(rest)
-    z = 1 / grid.inverse_depth[i, j].astype(np.float64)
-    k = grid.intrinsics
-    points = np.stack([(j - k.cx) / k.fx * z, (i - k.cy) / k.fy * z, z])
-    across, along, height = gravity_rotation(up) @ points
+    across, along, height = level_coordinates(grid, rest, up)
+    z = 1 / grid.inverse_depth[rest].astype(np.float64)
     offset = _fullest(height, 1 / (1 + (z / UP.half_m) ** 2), tallest_m)
     if offset >= 0:  # its upper side is not visible
         return None
     held = (height > offset) & (height < offset + tallest_m)
     sides = COS[:, None] * across[held] + SIN[:, None] * along[held]
-    a, b, c = horizontal_plane(k, up, offset)
+    a, b, c = horizontal_plane(grid.intrinsics, up, offset)
     return SupportingPlane(a, b, c, up, offset, sides.max(axis=1) + PLANES.margin_m, 0.0)
 
 

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from shapecat.arrays import F8, I4
+from shapecat.arrays import F8, I4, Bool
 from shapecat.detection.depth_grid import DepthGrid
 from shapecat.detection.planes.ransac import DepthSamples, plane_normal
 from shapecat.detection.planes.settings import PLANES
@@ -19,6 +19,7 @@ __all__ = [
     "PlaneCandidate",
     "SupportingPlane",
     "area_of",
+    "level_coordinates",
     "measure_plane",
     "outline_corners",
 ]
@@ -135,6 +136,15 @@ def _extent_of(grid: DepthGrid, plane: F8, normal: F8, ends: I4) -> F8:
                     there = COS[k] * p + SIN[k] * q + PLANES.margin_m
                     extent[k] = there if there > extent[k] else extent[k]
     return extent
+
+
+def level_coordinates(grid: DepthGrid, chosen: Bool, up: F8) -> F8:
+    """Return the chosen samples (rows, columns) as (3, n) metres in the level frame of ``up``."""
+    i, j = np.nonzero(chosen)
+    z = 1 / grid.inverse_depth[i, j].astype(np.float64)
+    k = grid.intrinsics
+    points = np.stack([(j - k.cx) / k.fx * z, (i - k.cy) / k.fy * z, z])
+    return np.asarray(gravity_rotation(up) @ points)
 
 
 def outline_corners(plane: SupportingPlane) -> F8:

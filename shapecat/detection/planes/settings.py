@@ -69,6 +69,12 @@ class PlaneSettings(NamedTuple):
     """Samples within this distance behind an edge belong to the wall of a box, metres."""
     closed: float = 0.5
     """A wall closes a box if more than this share of the samples below an edge is on the wall."""
+    around_m: float = 0.03
+    """Distance from a sample to the surroundings of its plane, metres."""
+    enclosed: float = 0.2
+    """Fewer drops than this, per rise, surround the floor of a bin."""
+    hidden_m: float = 0.2
+    """Greatest width of the part of such a floor that objects hide at one side, metres."""
     borne_m: float = 0.4
     """Greatest height above a large plane of an object on it, metres."""
 

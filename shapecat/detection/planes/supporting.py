@@ -6,7 +6,14 @@ import numpy as np
 
 from shapecat.arrays import F4
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
-from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN, PlaneCandidate, SupportingPlane
+from shapecat.detection.planes.extent import (
+    COS,
+    DIRECTIONS,
+    SIN,
+    PlaneCandidate,
+    SupportingPlane,
+    level_coordinates,
+)
 from shapecat.detection.planes.ransac import DepthSamples
 from shapecat.detection.planes.settings import PLANES
 from shapecat.geometry import NEAREST_M
@@ -27,8 +34,9 @@ def supporting_planes(
     """Return the planes that are not the tops of objects, lowest first.
 
     Heights count from the highest kept plane under the middle of a plane. A plane is dropped if it
-    is less than 6 cm high, or has less than 0.03 m2 and is neither the lowest nor higher than the
-    tallest object. Of the others it is kept if nothing is below it, if it is higher than the
+    is less than 6 cm high. It is kept if the surface rises around it, as around the floor of a bin.
+    Otherwise it is dropped if it has less than 0.03 m2 and is neither the lowest nor higher than
+    the tallest object. Of the others it is kept if nothing is below it, if it is higher than the
     tallest object, or if it has at least 0.25 m2. Any other plane is dropped if a wall is seen
     below its front edge, as below that of a box; if little is seen there, it needs 0.1 m2.
 
@@ -43,8 +51,14 @@ def supporting_planes(
         drops = [plane.offset - lower.offset for lower in kept if _overlaps(lower, plane)]
         drop = drops[-1] if drops else math.inf
         high = tallest_m < drop < math.inf
-        if drop < PLANES.least_drop_m or (kept and area_m2 < PLANES.board_m2 and not high):
+        if drop < PLANES.least_drop_m:
             continue
+        if kept and not high:
+            if _is_enclosed(grid, samples, plane):
+                kept.append(_up_to_walls(grid, plane))
+                continue
+            if area_m2 < PLANES.board_m2:
+                continue
         if drop > tallest_m or area_m2 >= PLANES.furniture_m2:
             kept.append(plane)
             continue
@@ -60,6 +74,40 @@ def _overlaps(lower: SupportingPlane, upper: SupportingPlane) -> bool:
     """Return whether the middle (Steiner point) of a plane is over the outline of another."""
     x, y = upper.extent @ COS * 2 / DIRECTIONS, upper.extent @ SIN * 2 / DIRECTIONS
     return bool(np.all(COS * x + SIN * y < lower.extent))
+
+
+def _up_to_walls(grid: DepthGrid, plane: SupportingPlane) -> SupportingPlane:
+    """Extend the floor of a bin to the walls, since objects hide parts of it."""
+    level = level_coordinates(grid, grid.inverse_depth > 0, plane.up)
+    above = level[2] - plane.offset
+    sides = COS[:, None] * level[0] + SIN[:, None] * level[1]
+    held = (above > PLANES.margin_m) & (above < PLANES.borne_m)
+    held &= (sides < plane.extent[:, None] + PLANES.hidden_m).all(axis=0)
+    reached = sides[:, held].max(axis=1, initial=-np.inf)
+    return plane._replace(extent=np.maximum(plane.extent, reached))
+
+
+@kernel
+def _is_enclosed(grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane) -> bool:
+    """Return whether the surface rises around a plane, as the walls do around the floor of a bin.
+
+    Around the top of an object it drops.
+    """
+    inv_depth = grid.inverse_depth
+    rises = drops = 0
+    for k in range(samples.inverse_depth.size):
+        i, j = int(samples.i[k]), int(samples.j[k])
+        level = plane.a * j + plane.b * i + plane.c
+        if level <= 0 or abs(samples.inverse_depth[k] - level) >= PLANES.tolerance:
+            continue
+        reach = max(2, int(PLANES.around_m * grid.intrinsics.fx * level))
+        for di, dj in ((-reach, 0), (reach, 0), (0, -reach), (0, reach)):
+            v, u = i + di, j + dj
+            if 0 <= v < inv_depth.shape[0] and 0 <= u < inv_depth.shape[1] and inv_depth[v, u] > 0:
+                ahead = inv_depth[v, u] - (plane.a * u + plane.b * v + plane.c)
+                rises += ahead > 2 * PLANES.tolerance
+                drops += ahead < -2 * PLANES.tolerance
+    return rises >= LEAST_BELOW and drops < PLANES.enclosed * rises
 
 
 @kernel
