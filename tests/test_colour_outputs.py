@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from copy import deepcopy
 from importlib import import_module
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -22,8 +23,14 @@ from shapecat.colour.masks import Mask
 from shapecat.colour.rle import rle_counts, rle_mask, rle_text
 from shapecat.config import Settings
 from shapecat.errors import NoStreamError
+from shapecat.outputs import image_annotations
 from shapecat.outputs.colouring import Coloured, with_colour
-from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encoder_for
+from shapecat.outputs.image_annotations import (
+    ImageBox,
+    ImageFrame,
+    image_encoder_for,
+    read_image_frames,
+)
 from shapecat.outputs.rereading import open_source, read_finished
 from shapecat.outputs.review import write_review
 from shapecat.outputs.review_scenes import ReviewFrame
@@ -33,6 +40,7 @@ from shapecat.recordings.protobuf import message_decoder
 from shapecat.runs.corrections import read_labels
 from shapecat.runs.jobs import Job
 from shapecat.runs.masks import read_masks
+from shapecat.types import ImageMasks
 from tests.colour_messages import gradient, png
 from tests.conftest import Guesser
 from tests.test_exports import relabel
@@ -164,6 +172,21 @@ def test_annotations_on_images_have_the_stamp_and_frame_of_the_image(run: Path) 
             )
             assert points.type == 2
             assert text.text.split()[:2] == [f"#{one.id}", one.results[0].hypothesis.class_id]
+
+
+def test_colours_of_a_loose_cloud_are_not_annotated_as_an_image(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """They are a row of points, for which no viewer has a picture."""
+    masks = [
+        (("/d", k), ImageMasks("/colour", 7 + k, 7, "camera", 64, height, {}, {}))
+        for k, height in enumerate((1, 48))
+    ]
+    monkeypatch.setattr(image_annotations, "read_masks", lambda *_, **__: iter(masks))
+    nothing = SimpleNamespace(read=lambda *_: SimpleNamespace(of=lambda _: ()))
+    monkeypatch.setattr(image_annotations, "ShownTracks", nothing)
+
+    assert [frame.stamp_ns for frame in read_image_frames(Path(), {})] == [8]
 
 
 def test_corrections_reach_the_images(run: Path, tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from click.testing import Result
 from PIL import Image
 
 from shapecat.evaluation.comparing import Difference, compare
+from shapecat.evaluation.comparison_matching import Matched, seen_together
 from shapecat.evaluation.comparison_pictures import COLOURS, draw_frame
 from shapecat.evaluation.labellings import Item, Labelling
 from shapecat.evaluation.references_coco import CocoLabels, filled_polygon, rle_mask
@@ -191,6 +192,24 @@ def test_the_table_tells_every_difference_once(shapecat: Run, run: Path, truth: 
     assert "the recording is missing" in result.stderr
 
 
+def test_an_object_in_doubt_has_no_wrong_category(run: Path, truth: Path) -> None:
+    """Nobody could tell what it is from this side, so that no answer is a difference."""
+    table = run / "tracks.csv"
+    table.write_text(table.read_text().replace("3,box,0.9,", "3,can,0.9,"))
+
+    assert compare(run, truth).as_dict()["differences"]["category"] == 3  # those of the sure box
+
+
+@pytest.mark.parametrize("overlaps", [(0.2, 0.8), (0.8, 0.2)])
+def test_a_track_in_two_pieces_is_judged_by_the_better_one(overlaps: tuple[float, float]) -> None:
+    """Otherwise a splinter would cost the identity of an object that is found."""
+    pieces = [Item(5, "cup"), Item(None, "cup"), Item(5, "cup")]
+    similarity = np.array([[overlaps[0]], [0.9], [overlaps[1]]])
+    seen = seen_together(pieces, [Item(1, "cup")], Matched({}, similarity, None, None))
+
+    assert (seen.true, seen.found, seen.similarity.tolist()) == ([1], [5], [[0.8]])
+
+
 def test_nothing_is_replaced(shapecat: Run, run: Path, truth: Path) -> None:
     (run.parent / "out").mkdir()
     (run.parent / "out" / "mine.txt").write_text("mine")
@@ -228,6 +247,8 @@ def test_a_run_differs_from_itself_in_nothing_and_from_a_corrected_one_in_the_la
     (other / "tracks.csv").write_text(text.replace("2,can,0.9,", "2,can,0.9,box") + "delete")
     changed = json.loads(shapecat("compare", run, other, "--json").stdout)
     assert changed["differences"] == {"category": 3, "surplus": 1}
+    # What is found is a share of the true objects, not of the detections.
+    assert changed["objects"] == {"true": 8, "detections": 9, "found": 8, "share_found": 1}
 
 
 def test_coco_masks_in_all_forms_are_compared(shapecat: Run, run: Path) -> None:

@@ -308,3 +308,15 @@ def test_a_quarter_turn_exchanges_length_and_width() -> None:
         assert lengths[first] == pytest.approx(0.06, abs=0.002)
         assert lengths[1 - first] == pytest.approx(0.15, abs=0.002)
         assert lengths[2] == pytest.approx(0.2)
+
+
+def test_many_views_of_one_side_do_not_make_its_size_certain() -> None:
+    """They share what they cannot see, so that the deviation never falls to a few micrometres."""
+    stds = []
+    for count in (1, 400):
+        sizes, axes = np.tile([0.2, 0.1, 0.3], (count, 1)), np.tile(np.eye(3), (count, 1, 1))
+        views = views_of(np.zeros((count, 3)), axes, sizes)
+        stds.append(fused_in(views, np.ones(count), sure("box"), CATEGORIES).stds[0])
+
+    assert_allclose(stds[0], [0.006, 0.006, 0.01], atol=1e-4)
+    assert_allclose(stds[1] / stds[0], np.sqrt(0.5), rtol=0.01)

@@ -39,6 +39,27 @@ def planned(source: Path, **changes: Any) -> RunInfo:
     return run
 
 
+def test_a_file_that_cannot_be_read_is_not_passed_over(
+    source: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Among others without a suffix: who has no permission should hear of it when it is opened."""
+    secret, note = source.with_name("secret"), source.with_name("note")
+    secret.write_bytes(b"#ROSBAG V2.0\n")
+    note.write_bytes(b"no recording")
+    opened = Path.open
+
+    def refuse(path: Path, *words: Any, **options: Any) -> Any:
+        if path.name == "secret":
+            raise PermissionError(path)
+        return opened(path, *words, **options)
+
+    monkeypatch.setattr(Path, "open", refuse)
+    found = find_recordings([str(source), str(secret), str(note)])
+
+    assert [kept.stem for kept in found.kept] == ["lab", "secret"]
+    assert found.left_out == 1
+
+
 CHANGES: Mapping[str, Mapping[str, Any]] = {
     "settings": {"settings": Settings(seed=8)},
     "start": {"start_s": 0.5},

@@ -18,7 +18,7 @@ from shapecat.geometry import IDENTITY
 from shapecat.outputs.dataset_frames import DatasetImage
 from shapecat.outputs.exports_coco import write_coco, write_yolo
 from shapecat.outputs.exports_kitti import rectified_from_sensor, write_kitti
-from shapecat.outputs.exports_labelcloud import write_labelcloud
+from shapecat.outputs.exports_labelcloud import _described, write_labelcloud
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas
 
 CAMERA = Camera(160, 120, 143.0, 139.0, 77.4, 61.9)
@@ -233,3 +233,12 @@ def test_yolo_leaves_out_what_is_not_sure(tmp_path: Path) -> None:
     x, y = corners.T
     area = abs(float(np.dot(x, np.roll(y, 1)) - np.dot(y, np.roll(x, 1)))) / 2
     assert area == pytest.approx(28, abs=14)
+
+
+def test_a_tiny_turn_to_the_right_is_no_full_turn() -> None:
+    """The remainder of a negative rounding error is 360 itself, which labelCloud cannot show."""
+    item = labelled(cut=False, hidden=False).objects[0]
+    for yaw in (-1e-12, 0.0, 1e-12):
+        half = np.array([0, 0, np.sin(yaw / 2), np.cos(yaw / 2)])
+        turned = replace(item, box=Box(np.zeros(3), SIZE, half))
+        assert _described(turned, np.eye(3), "centroid_abs")["rotations"]["z"] == 0

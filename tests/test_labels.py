@@ -15,7 +15,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from shapecat.errors import OutputError
 from shapecat.pipeline import annotate_again
-from shapecat.runs.corrections import adopt_labels, read_labels
+from shapecat.runs.corrections import _given, adopt_labels, read_labels
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.perceived import FrameRow, PerceptionTables
@@ -124,6 +124,19 @@ def test_chains_of_merges_end_in_one_track(run: Path) -> None:
         (run / "tracks.csv").write_text(labelled(**wrong))
         with pytest.raises(OutputError, match=message):
             read_labels(run / "tracks.csv")
+
+
+def test_of_labels_that_contradict_each_other_the_merge_is_refused(run: Path) -> None:
+    """A track merged into one that is deleted would vanish without anybody having said so."""
+    rows = read_track_table(run / "tracks.csv").rows
+    first, second = sorted(row.track for row in rows)[:2]
+    labels = {first: f"merge with {second}", second: "delete"}
+    kept, refused = _given(rows, labels, (), one_frame=True)
+
+    told = {row.track: row.label for row in kept}
+    assert (told[first], told[second]) == ("", "delete")
+    assert f"track {second} is deleted" in refused.pop(first)
+    assert refused == {}
 
 
 def test_tracks_of_two_sensors_are_not_merged(run: Path) -> None:

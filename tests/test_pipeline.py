@@ -4,6 +4,7 @@ import json
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from numpy.testing import assert_allclose
 
+from shapecat.pipeline import annotate
 from shapecat.simulation import simulate
 
 Run = Callable[..., Result]
@@ -246,6 +248,21 @@ def test_a_recording_without_clouds(shapecat: Run, tmp_path: Path, recording: Pa
     late = shapecat("process", recording, "--out", tmp_path / "out", "--start", 1000)
     assert late.exit_code == 4
     assert not (tmp_path / "out").exists()
+
+
+def test_a_warning_that_comes_again_is_told_once(tmp_path: Path) -> None:
+    """The recording is opened again by every command that writes its outputs."""
+    recording: Any = SimpleNamespace(warnings=["no index", "skipped 3"])
+    run: Any = {
+        "settings": {"outputs": {}},
+        "counts": {"frames": 0},
+        "options": {"rrd": False, "mcap": False},
+        "warnings": ["skipped 3", "tilted"],
+    }
+    annotate(tmp_path, recording, run)
+    annotate(tmp_path, recording, run)
+
+    assert run["warnings"] == ["skipped 3", "tilted", "no index"]
 
 
 def test_one_bad_recording_does_not_stop_the_others(

@@ -18,7 +18,7 @@ from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import paint
 from shapecat.outputs.review_layout import Eye, stepped_back
 from shapecat.outputs.review_scenes import ReviewFrame, choose_scenes
-from shapecat.outputs.review_shapes import markdown
+from shapecat.outputs.review_shapes import _fan, markdown
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 from tests.test_executors import alive
 
@@ -157,6 +157,12 @@ def test_graphs_have_their_edges_and_triangles(recording: Path) -> None:
     assert np.allclose(graph, GAS.neurons[GAS.edges])
     mesh = rows(recording, f"/world/{TOPIC}/objects/surfaces")[0]
     assert mesh["Mesh3D:triangle_indices"] == [[0, 1, 2], [4, 5, 6]]
+
+
+def test_a_plane_is_filled_to_its_last_corner() -> None:
+    """A triangle that is missing is a notch in the table."""
+    assert _fan(3).tolist() == [[0, 1, 2]]
+    assert _fan(5).tolist() == [[0, 1, 2], [0, 2, 3], [0, 3, 4]]
 
 
 def test_posterior_counts_and_times_are_plotted_for_every_frame(recording: Path) -> None:

@@ -177,6 +177,7 @@ def test_what_is_no_transform_is_refused(bad: Any) -> None:
         (["odom", "base", "camera"], "odom"),
         (["world", "odom", "camera"], "odom"),
         (["robot/map", "base", "camera"], "robot/map"),
+        (["earth", "robot/odom", "base", "camera"], "robot/odom"),
         (["base", "camera"], "base"),
         (["camera", "lens"], None),
     ],

@@ -1,0 +1,79 @@
+"""What the commands say, with numbers worked out by hand."""
+
+from collections.abc import Callable
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from click.testing import Result
+
+from tests.scenes import record
+
+Run = Callable[..., Result]
+
+PROGRESS: Any = import_module("shapecat.cli.progress")
+RENDER: Any = import_module("shapecat.cli.render")
+
+
+def task(name: str, status: str = "new", size: int = 0) -> Any:
+    return SimpleNamespace(name=name, status=status, bytes=size)
+
+
+def ended(name: str, *, processed: bool | None) -> Any:
+    """Return the outcome of a recording; without ``processed`` it failed."""
+    summary = None if processed is None else SimpleNamespace(processed=processed)
+    job = SimpleNamespace(folder=Path("out", name))
+    return SimpleNamespace(job=job, summary=summary, message="")
+
+
+def test_time_left_is_that_of_the_bytes_that_are_left(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was complete before took no time; what failed was read all the same."""
+    now = 100.0
+    monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
+    tasks = [task("a", size=100), task("b", size=300), task("c", "complete", 7000), task("d")]
+    progress = PROGRESS.Progress([*tasks, task("e", size=200)])
+    assert progress.remaining_s() is None
+    now = 120.0
+    progress.ended(ended("c", processed=False))
+    assert progress.remaining_s() is None
+    progress.ended(ended("a", processed=True))
+    assert progress.remaining_s() == pytest.approx(500 / 5)
+    progress.ended(ended("b", processed=None))
+    assert progress.remaining_s() == pytest.approx(200 / 20)
+    assert (progress.complete, progress.failed) == (2, 1)
+
+
+def test_plan_says_what_there_is_to_do() -> None:
+    """Its megabytes and processes are those of the recordings that are left."""
+    tasks = [
+        task("a", "complete", 9_000_000),
+        task("b", "retry", 1_200_000),
+        task("c", size=300_000),
+    ]
+    assert PROGRESS.describe_plan(tasks, 1, 2, 3) == (
+        "3 recordings: 1 already complete, 1 to retry, 1 new; 1.5 MB; 6 processes; "
+        "skipped 1 file of other formats"
+    )
+    assert PROGRESS.describe_plan(tasks[:1], 0, 2, 3) == "1 recording: 1 already complete"
+
+
+def test_categories_are_counted_from_the_most_frequent() -> None:
+    """A table shows the first few; those of equal number are in alphabetical order."""
+    assert RENDER.count_words({"can": 3, "plate": 12, "ball": 3}) == "plate 12, ball 3, can 3"
+    assert RENDER.count_words({}) == "none"
+
+
+def test_info_tells_some_unreadable_recordings_from_all(shapecat: Run, tmp_path: Path) -> None:
+    """A script goes on at exit code 1, with those that it can read."""
+    good = record(tmp_path / "good.mcap", 1)
+    (tmp_path / "bad.mcap").write_bytes(b"no recording")
+
+    assert shapecat("info", good).exit_code == 0
+    assert shapecat("info", tmp_path / "bad.mcap").exit_code == 3
+    for order in ((good, tmp_path / "bad.mcap"), (tmp_path / "bad.mcap", good)):
+        found = shapecat("info", *order)
+        assert found.exit_code == 1
+        assert "good.mcap: " in found.stdout
+        assert "bad.mcap" in found.stderr

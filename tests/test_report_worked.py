@@ -1,0 +1,132 @@
+"""The numbers on the pages of a report, worked out by hand."""
+
+import json
+import re
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from shapecat.colour.masks import Mask
+from shapecat.outputs.report import read_reports
+from shapecat.outputs.report.cards import Card, card_html
+from shapecat.outputs.report.choosing import choose_frames
+from shapecat.outputs.report.images import SeenFrame, encode
+from shapecat.outputs.report.page import run_page
+from shapecat.outputs.report.pictures import _strip_frame
+from shapecat.outputs.report.tracks import Timeline, read_timelines
+from shapecat.outputs.rereading import read_finished
+from shapecat.runs.track_table import TrackRow, read_track_table
+from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas
+
+NAMES = ("cup", "can", "box")
+
+
+@pytest.fixture
+def run(guessed_run: Path, tmp_path: Path) -> Path:
+    folder = tmp_path / "out" / "table"
+    shutil.copytree(guessed_run, folder)
+    return folder
+
+
+def test_a_card_shows_views_times_and_the_posterior_of_all_of_them() -> None:
+    """Between two detections a track coasts: that is no view. The likeliest bar is the first."""
+    seen = np.array([True, True, False, False, True, False])
+    causal = np.tile([0.2, 0.5, 0.3], (6, 1))
+    line = Timeline(np.array([1.0, 1.5, 2.0, 2.5, 3.2, 3.9]), seen, causal, ())
+    row = TrackRow(2, 4, "can", 0.5, "", "/d", {"novelty": "0.31"})
+    card = card_html(Card(row, line, None), NAMES, ("unknown", *NAMES), 4.0)
+
+    assert "3 views · 1.0–3.2 s · novelty 0.31" in card
+    assert re.findall(r'data-label="(\w+)"', card)[:3] == ["can", "box", "cup"]
+    assert re.findall(r"<kbd>(\d)</kbd>", card) == ["2", "3", "1"]
+    bars = re.findall(r'class="seen" x="([\d.]+)" y="38" width="([\d.]+)"', card)
+    assert bars == [("75.0", "37.5"), ("240.0", "1.5")]
+
+
+def test_durations_of_stages_are_in_milliseconds_and_of_phases_in_seconds(run: Path) -> None:
+    finished = read_finished(run)
+    finished.run["seconds"] = {"perceive": 12.34}
+    table = read_track_table(run / "tracks.csv")
+    text = run_page(finished, table, [], [], {"detect": np.array([0.002, 0.004, 0.104])})
+
+    assert "<td>detect</td><td>4.0</td><td>94.0</td><td>ms</td>" in text
+    assert "<td>perceive</td><td>12.3</td><td></td><td>s</td>" in text
+
+
+def test_index_counts_what_is_left_to_check(run: Path) -> None:
+    """A track that a person has labelled is no longer uncertain, however it was before."""
+    header, *lines = (run / "tracks.csv").read_text().splitlines()
+    names = header.split(",")
+    rows = [dict(zip(names, line.split(","), strict=True)) for line in lines]
+    for k, row in enumerate(rows):
+        row |= {"confidence": "0.5" if k < 3 else "0.9", "label": "cup" if k in {1, 4} else ""}
+        row["category"] = "can"
+    table = [header, *(",".join(row[name] for name in names) for row in rows)]
+    (run / "tracks.csv").write_text("\n".join(table) + "\n")
+
+    (report,) = read_reports([run]).runs
+    listed = report.listed("x")
+    assert (listed.unsure, listed.checked) == (2, 2)
+    assert listed.categories == {"can": len(rows) - 2, "cup": 2}
+
+
+def test_the_first_detection_of_a_frame_is_a_view(run: Path) -> None:
+    """It has number 0."""
+    rows = pq.read_table(run / "tracks.parquet").to_pylist()
+    assert any(row["detection"] == 0 for row in rows)
+    for track, line in read_timelines(run).items():
+        found = [row["detection"] is not None for row in rows if row["track"] == track]
+        assert sorted(line.seen.tolist()) == sorted(found)
+
+
+def test_a_whole_view_is_chosen_before_a_larger_one_that_is_cut_off(run: Path) -> None:
+    """The crop of a card should show the whole object."""
+    table = pq.read_table(run / "detections.parquet")
+    (run / "masks.parquet").unlink(missing_ok=True)
+    timelines = read_timelines(run)
+    track, line = max(timelines.items(), key=lambda item: len(item[1].keys))
+    owned = {key: k for k, key in enumerate(line.keys)}
+    rows = table.to_pylist()
+    for row in rows:
+        cut = owned.get((row["topic"], row["frame"], row["detection"]), 1) % 2 == 0
+        row |= {"points": 3000 if cut else 1000, "touches_border": cut, "occluded": False}
+    pq.write_table(pa.Table.from_pylist(rows, table.schema), run / "detections.parquet")
+    chosen = choose_frames(run, timelines).candidates
+    mine = [k for (topic, frame, _), k in owned.items() if track in chosen.get((topic, frame), ())]
+
+    assert len(line.keys) == 8
+    assert len(mine) == 4
+    assert all(k % 2 for k in mine)
+
+
+def test_boxes_of_the_strip_are_as_large_as_in_its_pictures() -> None:
+    """A wide image is made smaller for the page, and its boxes with it."""
+    camera = Camera(1200, 900, 800.0, 800.0, 600.0, 450.0)
+    frame = Frame("/d", 0, 0, 0, "camera", depth=np.ones((900, 1200)), camera=camera)
+    gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+    box = Box(np.array([0, 0, 1]), np.full(3, 0.1), np.array([0, 0, 0, 1]))
+    item = LabelledObject(5, "cup", 0.9, box, np.arange(3), gas, np.ones(1), np.ones(1))
+    labelled = LabelledFrame("/d", 0, 0, 0, "camera", None, (), (item,), (), {})
+    photo = np.zeros((900, 1200, 3), np.uint8)
+    seen = SeenFrame((Mask(300, 90, np.ones((180, 240), bool)),), np.zeros(1), frame, photo)
+    picture = _strip_frame(labelled, seen, 0.0)
+    _, width, height = encode(photo)
+
+    assert (picture.width, picture.height) == (width, height)
+    assert width < 1200
+    shares = np.divide(picture.boxes[5], (width, height, width, height))
+    np.testing.assert_allclose(shares, [0.25, 0.1, 0.2, 0.2], atol=0.002)
+
+
+def test_facts_of_a_run_are_those_of_run_json(run: Path) -> None:
+    about = json.loads((run / "run.json").read_text())
+    (report,) = read_reports([run]).runs
+    text = report.page()
+
+    for name in ("frames", "detections"):
+        assert f"<dt>{name}</dt><dd>{about['counts'][name]}</dd>" in text
+    assert f"<dt>tracks</dt><dd>{len(report.timelines)}</dd>" in text
