@@ -69,8 +69,9 @@ def recordings(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def planned(recordings: Path, out: Path) -> Any:
-    return plan_batch(Job(Path(), Path(), rrd=False), [str(recordings)], str(out))
+def planned(recordings: Path, out: Path, *, end_s: float | None = None) -> Any:
+    job = Job(Path(), Path(), rrd=False, end_s=end_s)
+    return plan_batch(job, [str(recordings)], str(out))
 
 
 @pytest.fixture(scope="module")
@@ -287,7 +288,7 @@ class Fragile(Executor):
 
 def test_recording_that_kills_its_workers_is_given_up(recordings: Path, tmp_path: Path) -> None:
     fragile, watcher = Fragile("bag"), Watcher()
-    with planned(recordings, tmp_path) as batch:
+    with planned(recordings, tmp_path, end_s=0.1) as batch:
         drain(batch, fragile, watcher)
 
     assert fragile.begun.count("bag") == 2
@@ -309,7 +310,7 @@ def test_recording_that_only_waited_is_not_blamed(recordings: Path, tmp_path: Pa
                 return future
             return super().submit(fn, *args, **kwargs)
 
-    with planned(recordings, tmp_path) as batch:
+    with planned(recordings, tmp_path, end_s=0.1) as batch:
         drain(batch, Forgetful(""), Watcher())
 
     assert states(tmp_path) == ALL_DONE
@@ -380,14 +381,14 @@ def test_dask_gives_the_same_tables_though_a_worker_is_killed(
 ) -> None:
     pytest.importorskip("distributed")
     killed: list[str] = []
-    with open_executor("dask", workers=2) as executor, planned(recordings, tmp_path) as batch:
+    with open_executor("dask", workers=1) as executor, planned(recordings, tmp_path) as batch:
         cluster: Any = executor
-        pids = list(cluster._client.run(os.getpid).values())
+        (pid,) = cluster._client.run(os.getpid).values()
 
         def kill_once(folder: str, phase: str) -> None:
             if phase == "perceive" and not killed:
                 killed.append(folder)
-                os.kill(pids[0], signal.SIGKILL)
+                os.kill(pid, signal.SIGKILL)
 
         outcomes = drain(batch, executor, Watcher(kill_once))
 

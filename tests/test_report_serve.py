@@ -12,6 +12,7 @@ import sys
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -20,8 +21,8 @@ import pyarrow.parquet as pq
 import pytest
 from click.testing import Result
 
-from shapecat.outputs.report import read_reports
 from shapecat.outputs.report.serving import serve_reports
+from shapecat.outputs.report.writing import Reports, RunReport, read_report
 from shapecat.runs.corrections import adopt_labels, read_labels
 from shapecat.runs.track_table import read_track_table
 from tests.browser import Browser
@@ -29,7 +30,7 @@ from tests.browser import Browser
 Run = Callable[..., Result]
 
 NAMES = ("cup", "can", "box", "bottle", "bowl", "plate", "ball")
-TRACKS = 50
+TRACKS = 20
 SAVED = (
     "return document.getElementById('saved').textContent === 'All corrections are in tracks.csv.'"
 )
@@ -180,10 +181,10 @@ TROUBLE = {
 
 @pytest.mark.parametrize("trouble", TROUBLE)
 def test_corrections_bear_what_happens_to_the_one_before(
-    browser: Browser, run: Path, trouble: str
+    browser: Browser, run: Path, drawn: RunReport, trouble: str
 ) -> None:
     """A late answer knows nothing of later labels; what is lost is sent again."""
-    with serving(run) as (address, _):
+    with serving(run, drawn) as (address, _):
         browser.open(address)
         browser.press("Right", "Left")
         browser.wait(NEWS)
@@ -222,10 +223,20 @@ def ask(
     return answer.status, text
 
 
+@pytest.fixture(scope="module")
+def drawn(guessed_run: Path) -> RunReport:
+    """Draw the pictures once for all copies of a run."""
+    return read_report(guessed_run)
+
+
 @contextmanager
-def serving(*folders: Path) -> Iterator[tuple[str, str]]:
-    """Serve in this process; give the address of the page and that of its labels."""
-    with serve_reports(read_reports(folders)) as address:
+def serving(run: Path, drawn: RunReport | None = None) -> Iterator[tuple[str, str]]:
+    """Serve in this process; give the address of the page and that of its labels.
+
+    ``drawn`` is the report of a run with the same tables, if there is one.
+    """
+    report = replace(drawn, folder=run) if drawn else read_report(run)
+    with serve_reports(Reports([report])) as address:
         yield address, urlsplit(address).path.rpartition("/")[0] + "/labels"
 
 
@@ -235,12 +246,12 @@ def correction(track: int, label: str, seen: str = "") -> str:
 
 @pytest.fixture(scope="module")
 def site(
-    guessed_run: Path, tmp_path_factory: pytest.TempPathFactory
+    guessed_run: Path, drawn: RunReport, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[tuple[Path, str, str]]:
     """Serve a run that no test of these changes: the run, its page, and its labels."""
     run = tmp_path_factory.mktemp("site") / "ta ble#2"
     shutil.copytree(guessed_run, run)
-    with serving(run) as (address, labels):
+    with serving(run, drawn) as (address, labels):
         yield run, address, labels
 
 
@@ -328,9 +339,9 @@ def test_what_makes_no_sense_is_not_written(
     assert (run / "tracks.csv").read_bytes() == before
 
 
-def test_a_correction_is_on_disk_before_it_is_confirmed(run: Path) -> None:
+def test_a_correction_is_on_disk_before_it_is_confirmed(run: Path, drawn: RunReport) -> None:
     first = (run / "tracks.csv").read_bytes()
-    with serving(run) as (address, labels):
+    with serving(run, drawn) as (address, labels):
         for label, seen in (
             ("wine glass", ""),
             ("merge with #2", "wine glass"),
@@ -343,10 +354,10 @@ def test_a_correction_is_on_disk_before_it_is_confirmed(run: Path) -> None:
     assert (run / "tracks.original.csv").read_bytes() == first
 
 
-def test_corrections_at_the_same_time_are_all_written(run: Path) -> None:
+def test_corrections_at_the_same_time_are_all_written(run: Path, drawn: RunReport) -> None:
     """Each reads and writes the whole table: without a lock the last would undo the others."""
     tracks = list(labels_on_disk(run))
-    with serving(run) as (address, labels), serving(run) as (again, others):
+    with serving(run, drawn) as (address, labels), serving(run, drawn) as (again, others):
         places = [(address, labels), (again, others)]
 
         def correct(job: tuple[int, int]) -> int:
@@ -359,9 +370,11 @@ def test_corrections_at_the_same_time_are_all_written(run: Path) -> None:
     assert labels_on_disk(run) == {t: NAMES[n % 7] for n, t in enumerate(tracks)}
 
 
-def test_two_tabs_do_not_overwrite_one_another(browser: Browser, run: Path) -> None:
+def test_two_tabs_do_not_overwrite_one_another(
+    browser: Browser, run: Path, drawn: RunReport
+) -> None:
     first, second, third = list(labels_on_disk(run))[:3]
-    with serving(run) as (address, _):
+    with serving(run, drawn) as (address, _):
         browser.open(address)
         one, two = browser.tabs()[0], browser.tab()
         browser.turn_to(two)

@@ -103,13 +103,19 @@ def test_frames_of_a_phase_that_was_done_count_as_resumed(
     def fail(*_: object) -> None:
         raise stopping.Stopped(signal.SIGTERM)
 
+    job = Job(recording, tmp_path / "table", rrd=False, end_s=0.5)
     with monkeypatch.context() as broken, pytest.raises(stopping.Stopped):
         broken.setattr("shapecat.pipeline.track", fail)
-        process(Job(recording, tmp_path / "table", rrd=False))
-    process(Job(recording, tmp_path / "table", rrd=False))
+        process(job)
+    begun = tmp_path / ".table.partial" / "run.json"
+    about = json.loads(begun.read_text())
+    about["seconds"]["perceive"] = 1000.0
+    begun.write_text(json.dumps(about))
+    process(job)
 
-    counts = read_run(tmp_path / "table")["counts"]
-    assert counts["resumed"] == counts["frames"] == FRAMES
+    run = read_run(tmp_path / "table")
+    assert run["counts"]["resumed"] == run["counts"]["frames"] > 10
+    assert 1000 < run["seconds"]["total"] < 2000  # also the time before the interruption
 
 
 def test_a_second_signal_leaves_at_once(recording: Path, undisturbed: Path, tmp_path: Path) -> None:
@@ -187,16 +193,14 @@ def test_workers_put_their_work_down_when_the_executor_stops(tmp_path: Path) -> 
     assert not (tmp_path / "never").exists()
 
 
-def test_a_recording_that_is_written_to_meanwhile_gives_no_results(
-    recording: Path, undisturbed: Path, tmp_path: Path
-) -> None:
+def test_a_recording_that_is_written_to_meanwhile_gives_no_results(tmp_path: Path) -> None:
     """Otherwise half of the tables are of another recording."""
-    moving = tmp_path / "table.mcap"
-    moving.write_bytes(recording.read_bytes())
+    moving = record(tmp_path / "table.mcap", 30)
+    process(Job(moving, tmp_path / "before" / "table", rrd=False))
 
     def write(phase: str, done: int, _total: int | None) -> None:
-        if (phase, done) == ("perceive", 100):
-            moving.write_bytes(recording.read_bytes())
+        if (phase, done) == ("perceive", 12):
+            moving.write_bytes(moving.read_bytes())
 
     from shapecat.errors import RecordingError  # noqa: PLC0415  beside its only use
 
@@ -207,4 +211,4 @@ def test_a_recording_that_is_written_to_meanwhile_gives_no_results(
 
     process(job)
 
-    assert_same_tables(job.folder, undisturbed / "table")
+    assert_same_tables(job.folder, tmp_path / "before" / "table")
