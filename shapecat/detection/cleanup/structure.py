@@ -2,7 +2,8 @@
 
 Background structure is walls of bins, sides and edges of shelves, furniture, bent ends of tables
 and blobs of noise. No single feature separates it from objects, many weak ones together do. The
-trees are grown on simulated scenes (`shapecat.models.structure`), none of which has a robot arm.
+trees are grown on simulated scenes (`shapecat.models.structure`), also of rooms with arms and
+people.
 """
 
 from functools import cache
