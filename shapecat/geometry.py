@@ -220,17 +220,22 @@ def level_box(points: F4, level: F8) -> tuple[F8, F8, F8]:
     for k in range(points.shape[1]):
         low[2], high[2] = min(low[2], points[2, k]), max(high[2], points[2, k])
     cos, sin = math.cos(yaw), math.sin(yaw)
-    axes, middle = np.zeros((3, 3)), (low + high) / 2
+    axes, size = np.zeros((3, 3)), np.zeros(3)
     for d in range(3):
+        size[d] = high[d] - low[d]
         axes[d, 0] = cos * level[0, d] + sin * level[1, d]
         axes[d, 1] = cos * level[1, d] - sin * level[0, d]
         axes[d, 2] = level[2, d]
     center = np.zeros(3)
+    x, y, z = (low[0] + high[0]) / 2, (low[1] + high[1]) / 2, (low[2] + high[2]) / 2
     for d in range(3):
-        center[d] = axes[d, 0] * middle[0] + axes[d, 1] * middle[1] + axes[d, 2] * middle[2]
-    a, b, c = axes
-    turned = row_quaternion((a[0], a[1], a[2]), (b[0], b[1], b[2]), (c[0], c[1], c[2]))
-    return center, high - low, np.array(turned)
+        center[d] = axes[d, 0] * x + axes[d, 1] * y + axes[d, 2] * z
+    turned = row_quaternion(
+        (axes[0, 0], axes[0, 1], axes[0, 2]),
+        (axes[1, 0], axes[1, 1], axes[1, 2]),
+        (axes[2, 0], axes[2, 1], axes[2, 2]),
+    )
+    return center, size, np.array(turned)
 
 
 def box_corners(box: Box) -> F8:

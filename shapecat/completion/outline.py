@@ -37,7 +37,10 @@ def support_function(
     flat : share of the points that make a side flat; with fewer the correction is proportional.
     cosines, sines : (k,) the directions.
     """
-    result, highest = np.zeros(cosines.size), np.zeros(strays.max() + 1, np.float32)
+    most = 0
+    for count in strays:
+        most = max(most, count)
+    result, highest = np.zeros(cosines.size), np.zeros(most + 1, np.float32)
     for k in range(cosines.size):
         a, b = np.float32(cosines[k]), np.float32(sines[k])
         first = highest.size - 1 - strays[k]

@@ -77,7 +77,9 @@ def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
         weight = np.zeros(parts, np.int64)
         for i in range(kept):
             weight[part[i]] += members[i]
-        heaviest = np.argmax(weight)
+        heaviest = 0
+        for k in range(1, parts):
+            heaviest = k if weight[k] > weight[heaviest] else heaviest
         for i in range(kept):
             stays[i] = part[i] == heaviest or weight[part[i]] >= share * cloud.x.size
         kept = _keep(gas, adjacent, members, stays, kept)

@@ -166,7 +166,9 @@ def grow_fritzke(
         until -= 1
         if until == 0 and count < target:
             until = interval
-            q = int(np.argmax(gas.error[:count]))
+            q = 0
+            for i in range(1, count):
+                q = i if error[i] > error[q] else q
             f = insert(gas, count, q)
             gas.error[q] *= np.float32(0.5)
             gas.error[f] *= np.float32(0.5)
@@ -175,7 +177,8 @@ def grow_fritzke(
         # 12. all errors decay: instead, each new one gets more weight
         gain *= _GAIN
         if gain > 1e6:
-            gas.error[:] *= np.float32(1e-6)
+            for i in range(count):
+                error[i] *= np.float32(1e-6)
             gain *= 1e-6
     # 13. stop after the number of signals
     return count

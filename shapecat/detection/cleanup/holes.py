@@ -138,7 +138,9 @@ def _count_sides(
 @kernel(inline=True)
 def _owner_of(sides: I4, total: int) -> int:
     """Return the label that a hole belongs to; 0 if there is none."""
-    best = np.argmax(sides[:, BOUNDARY])
+    best = 0
+    for k in range(1, len(sides)):
+        best = k if sides[k, BOUNDARY] > sides[best, BOUNDARY] else best
     if (
         sides[best, BOUNDARY] <= CLEANUP.enclosed_share * total
         or sides[best, GOES_ON] <= CLEANUP.goes_on_share * total

@@ -199,7 +199,7 @@ def _code_cells(grid_labels: GridLabels) -> tuple[I4, I4]:
     high = np.zeros((len(planes), labels.shape[1]), np.uint8)
     for i in range(len(labels)):
         find_near(labels, i, scratch, code)
-        spans[i] = span_of(code[i])
+        spans[i, 0], spans[i, 1] = span_of(code[i])
         _find_high(planes, inv_depth, i, spans[i], high)
         for j in range(np.uint64(spans[i, 0]), np.uint64(spans[i, 1])):
             label = labels[i, j]

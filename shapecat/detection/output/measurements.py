@@ -194,7 +194,7 @@ def _outer_points(
     chosen = np.zeros((cells, 2), np.int32)
     start = np.zeros(low.shape[0] + 1, np.int64)
     for i in range(rows):
-        first, end = spans[i]
+        first, end = spans[i, 0], spans[i, 1]
         _find_outer(labels, i, first, end, outer)
         for j in range(first, end):
             if outer[j]:
@@ -206,9 +206,11 @@ def _outer_points(
                 high[k, 0], high[k, 1] = i, max(high[k, 1], j)
                 chosen[n, 0], chosen[n, 1] = i, j
                 n += 1
-    start = np.cumsum(start)
+    for k in range(1, start.size):
+        start[k] += start[k - 1]
     place, points = start.copy(), np.zeros((3, n), np.float32)
-    for i, j in chosen[:n]:
+    for m in range(n):
+        i, j = chosen[m, 0], chosen[m, 1]
         k = labels[i, j] - 1
         z = 1 / inv_depth[i, j]
         x, y = (j - intrinsics.cx) / intrinsics.fx * z, (i - intrinsics.cy) / intrinsics.fy * z
