@@ -23,7 +23,7 @@ from .render import missed_words, progress_bars
     help="LABELS is another run, or its tracks.csv: transfer each of its labels to the object at "
     "the same place.",
 )
-@boxes_option("In annotated.mcap, {}; by default as in the run now.")
+@boxes_option("In annotated.mcap, {}; if not given, boxes stay as they are.")
 @recording_option
 def annotate(
     *,

@@ -27,7 +27,7 @@ def compare(
     """Compare a run with ground truth, other labels, or another run.
 
     TRUTH is the NAME.truth.json that `shapecat simulate` writes (or the recording beside it), a
-    COCO file, a KITTI folder (which has a folder label_2), or another run of the same recording.
+    COCO file, a KITTI folder that contains label_2, or another run of the same recording.
     Frames are matched by timestamp. Frames of another run, and frames without a timestamp, are
     matched by number.
 

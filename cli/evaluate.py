@@ -40,7 +40,7 @@ def evaluate(
     forest        random forest on shapecat's descriptor
     linear        logistic regression on shapecat's descriptor
     pnn           probabilistic neural network on shapecat's descriptor
-    forest words  linear classifiers on the leaves of a forest, as in the thesis
+    forest words  linear classifiers on the leaves of a forest (Mueller 2012)
     D2            random forest on the distribution of point distances
     ESF-like      random forest on distributions of distances, areas and angles
 

@@ -86,7 +86,7 @@ def export(
     crops         data set for `shapecat train` and `learn`: the points of each object
     kitti         3D detection: label_2, calib, velodyne, image_2
     labelcloud    editing 3D boxes by hand in the tool labelCloud
-    point-labels  3D segmentation: masks of depth images, SemanticKITTI labels
+    point-labels  3D segmentation: masks for depth images, SemanticKITTI labels for clouds
 
     \b
     shapecat export results/lab --format crops --out crops

@@ -62,7 +62,7 @@ recording_option = click.option(
 
 
 def boxes_option(where: str) -> Any:
-    """Return the option ``--boxes``; ``where`` says which boxes, and what is the default."""
+    """Return the option ``--boxes``; ``where`` states the outputs concerned and the default."""
     about = "boxes enclose whole objects (full) or their visible parts"
     return click.option("--boxes", type=click.Choice(["full", "visible"]), help=where.format(about))
 

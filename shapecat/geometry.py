@@ -48,7 +48,7 @@ def compose(a_from_b: Pose, b_from_c: Pose) -> Pose:
 
 
 def inverse(a_from_b: Pose) -> Pose:
-    """Return ``b_from_a``."""
+    """Return ``b_from_a``, the inverse of a pose."""
     return Pose(a_from_b.rotation.T, -a_from_b.rotation.T @ a_from_b.translation)
 
 

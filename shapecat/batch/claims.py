@@ -112,7 +112,7 @@ class Claim:
 
         Raises
         ------
-        OutputError : another process has, since this one was silent for too long.
+        OutputError : another process has taken it over, because this one was silent too long.
         """
         if not self._is_held():
             msg = f"{self._url}: another run has taken over, since this one was silent for too long"

@@ -70,7 +70,7 @@ class Ledger:
             return Outcome(job, message=str(error), code=error.exit_code)
 
     def begin(self, task: Task) -> None:
-        """Store a recording as submitted."""
+        """Note that a recording has been submitted to a worker."""
         with self._lock:
             self._open.setdefault(task.name, replace(task.entry(), tries=1))
 

@@ -102,7 +102,7 @@ class Shard:
 
     @classmethod
     def parse(cls, text: str) -> "Shard":
-        """Read ``I/N``, where I may be counted from 0 or from 1: N/N is the same as 0/N.
+        """Read ``I/N``, I from 0 to N; N/N is the same as 0/N, for jobs counted from 1.
 
         Raises
         ------

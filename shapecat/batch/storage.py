@@ -108,7 +108,7 @@ class Location:
         return self._error(f"{self.url}: cannot be {done}: {reason}")
 
     def info(self) -> Mapping[str, Any] | None:
-        """Return size, times and digest of a file; None if it does not exist."""
+        """Return size, times and digest of a file, as fsspec names them; None if it is missing."""
         with suppress(FileNotFoundError):
             known: Mapping[str, Any] = self._tried("read", lambda: self._system.info(self._path))
             return known

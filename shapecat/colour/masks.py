@@ -254,7 +254,7 @@ def _gap(packed: int) -> int:
 
 @kernel
 def _majority(seen: I4, label: int, reach: int, pixels: Bool) -> tuple[int, int, int, int]:
-    """Set the pixels for which most of the square around them is of a label.
+    """Set each pixel if most pixels of the square around it have the label.
 
     Only the part of the square within the image counts. Returns left, top, right + 1 and
     bottom + 1 of the pixels that are set.

@@ -31,7 +31,7 @@ _PLY_TYPES = {
 
 
 class CloudFile(NamedTuple):
-    """Content of a file.
+    """The content of a point cloud file.
 
     ``points`` (n, 3) as stored, including NaN; ``viewpoint`` (3,), None if the file has none.
     """

@@ -33,7 +33,7 @@ class Pairs:
     posteriors: list[Any] = field(default_factory=list)
 
     def add(self, found: Sequence[Item], true: Sequence[Item], matched: Any) -> None:
-        """Add the matched pairs of a frame."""
+        """Add the matched pairs of a frame; ``matched`` is from `match_objects`."""
         for i, j in matched.pairs.items():
             if true[j].decidable:
                 self.truth.append(true[j].category)
@@ -61,7 +61,7 @@ def figures_of(
     seen : identities of each frame; None without identities.
     rows : the `Difference` rows of all frames.
     categories : categories of the model; the metrics of categories leave other true objects out.
-    threshold : similarity from which a pair is the same object, for the tracking metrics.
+    threshold : lowest similarity of a pair that counts as the same object in the tracking metrics.
     """
     boxes = [row.box_iou for row in rows if row.box_iou is not None]
     return {

@@ -13,10 +13,10 @@ from shapecat.evaluation.overlap import Overlap, box_iou, match_masks
 __all__ = ["SAME_BOX", "SAME_MASK", "Matched", "item_box_iou", "match_objects", "seen_together"]
 
 SAME_MASK = 0.5
-"""IoU from which two masks are the same object (PASCAL VOC)."""
+"""Lowest IoU of two masks that count as the same object (PASCAL VOC)."""
 SAME_BOX = 0.25
-"""IoU from which two 3D boxes are the same object; lower, as hidden sides are estimates (SUN RGB-D,
-Song 2015)."""
+"""Lowest IoU of two 3D boxes that count as the same object; less than for masks, as hidden sides
+are estimates (SUN RGB-D, Song 2015)."""
 
 
 class Matched(NamedTuple):

@@ -71,8 +71,8 @@ def judge_identities(frames: Iterable[SeenTogether], *, threshold: float = 0.5) 
     Parameters
     ----------
     frames : the frames in the order of time.
-    threshold : similarity from which a pair is the same object, for MOTA and IDF1; HOTA averages
-        over thresholds from 0.05 to 0.95.
+    threshold : lowest similarity of a pair that counts as the same object, for MOTA and IDF1; HOTA
+        averages over thresholds from 0.05 to 0.95.
     """
     frames = list(frames)
     counts = _clear_mot(frames, threshold)

@@ -1,7 +1,7 @@
 """Metrics of posteriors against the truth, in plain NumPy.
 
-Labels are columns of the posterior. Where it matters, functions take the number of categories, so
-that categories without views appear in the result.
+A label is the index of a category: its column in the posterior. Where it matters, functions take
+the number of categories, so that categories without views appear in the result.
 """
 
 from typing import NamedTuple
@@ -33,7 +33,7 @@ class Bin(NamedTuple):
 def accuracy(truth: I4, predicted: I4) -> float:
     """Return the fraction of views with the right category; NaN without views.
 
-    ``truth`` and ``predicted`` (n,) are columns of the posterior.
+    ``truth`` and ``predicted`` (n,) are indices of categories.
     """
     return float(np.mean(truth == predicted)) if len(truth) else float("nan")
 
@@ -41,7 +41,7 @@ def accuracy(truth: I4, predicted: I4) -> float:
 def confusion(truth: I4, predicted: I4, categories: int) -> I4:
     """Return the confusion matrix (c, c): views by true category (row) and predicted one (column).
 
-    ``truth`` and ``predicted`` (n,) are columns of the posterior, ``categories`` is c.
+    ``truth`` and ``predicted`` (n,) are indices of categories, ``categories`` is c.
 
     Examples
     --------

@@ -14,7 +14,7 @@ from shapecat.types import Box
 __all__ = ["MATCHED_F", "MaskMatches", "Overlap", "box_iou", "match_masks"]
 
 MATCHED_F = 0.75
-"""Overlap F from which an object counts as found."""
+"""Lowest overlap F of an object that counts as found."""
 
 _EDGES = np.array(
     [[k, (k + 1) % 4] for k in range(4)]

@@ -72,7 +72,7 @@ class SimulatedTruth(Reference):
         self._labels = _LabelImages(labels)
 
     def at(self, key: Key, stamp_ns: int) -> Labelling | None:  # noqa: ARG002  stamps are enough
-        """Return the objects of a frame."""
+        """Return the objects of a frame; None if the ground truth lacks this frame."""
         entry = self._by_stamp.get(stamp_ns)
         if entry is None:
             return None
@@ -161,7 +161,12 @@ class OtherRun(Reference):
         self._rest = run_labellings(self.finished)
 
     def at(self, key: Key, stamp_ns: int) -> Labelling | None:  # noqa: ARG002  keys are enough
-        """Return the objects of a frame."""
+        """Return the objects of a frame; None if the other run lacks this frame.
+
+        Raises
+        ------
+        OutputError : the two runs have their frames in a different order.
+        """
         if key not in self._keys:
             return None
         for other, _, labelling in self._rest:

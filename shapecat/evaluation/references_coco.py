@@ -41,7 +41,7 @@ class CocoLabels(Reference):
         self.tracked = bool(items) and all(_track_of(item) is not None for item in items)
 
     def at(self, key: Key, stamp_ns: int) -> Labelling | None:
-        """Return the objects of a frame."""
+        """Return the objects of a frame; None if the labels lack this frame."""
         image = self._images.get(stamp_ns) or self._images.get(key[1])
         if image is None or image.get("topic", key[0]) != key[0]:
             return None

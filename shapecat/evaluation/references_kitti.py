@@ -37,7 +37,7 @@ class KittiLabels(Reference):
         self.frames = len(self._names)
 
     def at(self, key: Key, stamp_ns: int) -> Labelling | None:
-        """Return the objects of a frame."""
+        """Return the objects of a frame; None if the labels lack this frame."""
         name = self._names.get(stamp_ns) or self._names.get(key[1])
         if name is None:
             return None

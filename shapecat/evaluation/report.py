@@ -83,7 +83,7 @@ class Report:
 
     @property
     def breakdowns(self) -> tuple[tuple[str, tuple[tuple[str, int, float], ...]], ...]:
-        """Name and rows of each breakdown that has any."""
+        """The name and the rows of each breakdown that has rows."""
         parts = (
             ("distance", self.by_distance),
             ("elevation", self.by_elevation),

@@ -26,7 +26,7 @@ _FEWEST_ROWS = 100
 
 
 class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc]  # sklearn is untyped
-    """Gradient-boosted trees whose leaves are words; a category's logit sums its words' values.
+    """Gradient-boosted trees whose leaves are words; a category's logit is the sum of word values.
 
     Each round grows one tree per category against the rest, on the residual of its posterior. The
     dictionary and the classifiers on its words are thus learned together.
@@ -36,11 +36,11 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
     rounds : trees per category.
     leaves : maximum number of words (leaves) per tree.
     rate : learning rate.
-    columns, rows : fraction of the features and of the views that each tree draws.
+    columns, rows : fraction of the features and of the views, drawn at random for each tree.
     unknown : label of shapes that belong to no category; None if there are none. They get trees
         and a logit of their own, after those of the categories.
     jobs : number of trees grown at the same time; it does not affect the result.
-    random_state : seed of the draws.
+    random_state : seed of these random choices.
 
     Attributes
     ----------
@@ -76,7 +76,7 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
         self.random_state = random_state
 
     def fit(self, X: ArrayLike, y: ArrayLike, start: F4 | None = None) -> Self:
-        """Grow the trees on features X (n, f) and labels y (n,), including unknown ones.
+        """Grow the trees on features X (n, f) and labels y (n,); unknown shapes are included.
 
         ``start`` (n, k) are the logits that the trees add to; by default the log frequencies of the
         labels.
@@ -105,7 +105,7 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
         return softmax(self.logits(X)[:, : len(self.classes_)])
 
     def predict(self, X: ArrayLike) -> Any:
-        """Return the most probable label of each view."""
+        """Return the most probable label (n,) of each view, from features X (n, f)."""
         logits = self.logits(X)[:, : len(self.classes_)]
         return self.classes_[logits.argmax(axis=1)]
 

@@ -49,7 +49,7 @@ class ForestDictionary(TreeDictionary):
         self.random_state = random_state
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Grow the forest on features X (n, f) and labels y (n,), including unknown ones."""
+        """Grow the forest on features X (n, f) and labels y (n,); unknown shapes are included."""
         x, y = validate_data(self, X, y, dtype=np.float32)
         forest = RandomForestClassifier(
             self.trees,
@@ -108,18 +108,18 @@ class WordLearner(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # skle
         return logits[:, 1] - logits[:, 0] if len(self.classes_) == 2 else logits
 
     def logits(self, X: Any) -> F8:
-        """Return the logits (n, c)."""
+        """Return the logits (n, c) of words X (n, words)."""
         check_is_fitted(self)
         x = validate_data(self, X, dtype=np.float64, accept_sparse="csr", reset=False)
         return np.asarray(x @ self.coef_.T) + self.intercept_
 
     def predict_proba(self, X: Any) -> F8:
-        """Return posteriors (n, c)."""
+        """Return the posteriors (n, c) of words X (n, words)."""
         logits = self.logits(X)
         return softmax(logits / self.temperature_)
 
     def predict(self, X: Any) -> Any:
-        """Return the most probable label of each view."""
+        """Return the most probable label (n,) of each view, from words X (n, words)."""
         logits = self.logits(X)
         return self.classes_[logits.argmax(axis=1)]
 

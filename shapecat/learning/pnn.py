@@ -40,7 +40,7 @@ class ProbabilisticNeuralNetwork(
     kernels : Gaussians per category, drawn at random from its views; 0 leaves the densities out.
         differs: Specht keeps every training view.
     unknown : label of shapes that belong to no category and get no density; None if there are none.
-    random_state : seed of the draw.
+    random_state : seed of the random choice of kernels.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class ProbabilisticNeuralNetwork(
         return softmax(densities.astype(np.float64) @ bank.spread.astype(np.float64))
 
     def predict(self, X: ArrayLike) -> Any:
-        """Return the most probable label of each view."""
+        """Return the most probable label (n,) of each view, from descriptors X (n, d)."""
         posteriors = self.predict_proba(X)
         return self.classes_[posteriors.argmax(axis=1)]
 

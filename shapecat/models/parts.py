@@ -87,7 +87,10 @@ _SETTLED = (
 
 
 class Pairs(NamedTuple):
-    """Pairs of segments: ``features`` (n, `FEATURES`); ``same`` (n,), whether of one object."""
+    """Pairs of segments.
+
+    ``features`` (n, `FEATURES`); ``same`` (n,), whether both segments are of one object.
+    """
 
     features: F4
     same: Bool

@@ -37,9 +37,9 @@ _SHARES: dict[str, dict[str, Any]] = {
     "test": {"unknown": 0.3, "settled": 0.5},
 }
 CUT_WELL = 0.75
-"""IoU from which a detection counts as well segmented."""
+"""Lowest IoU of a detection that counts as well segmented."""
 MOSTLY = 0.7
-"""Visible fraction from which an object counts as mostly visible."""
+"""Lowest visible fraction of an object that counts as mostly visible."""
 _TIMES = 3
 """How many times as often as a kind of distractor a family of procedural objects is drawn."""
 
@@ -83,7 +83,7 @@ def simulate(name: str, worlds: int, jobs: int) -> Simulated:
 
 
 def collect(views: Iterable[WorldView]) -> Simulated:
-    """Collect views into columns."""
+    """Collect views into one array (n, ...) for each field."""
     rows = list(views)
     columns = {name: np.array([getattr(r, name) for r in rows]) for name in WorldView._fields}
     described = DescribedViews(

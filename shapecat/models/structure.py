@@ -90,7 +90,7 @@ _CLOSER_M = 0.08
 
 
 class Samples(NamedTuple):
-    """Merged segments: ``features`` (n, `FEATURES`), and ``objects`` (n,), which are objects."""
+    """Merged segments: ``features`` (n, `FEATURES`); ``objects`` (n,), whether it is an object."""
 
     features: F4
     objects: Bool

@@ -55,7 +55,7 @@ def compare_with_plain(
 
     Parameters
     ----------
-    train : views of which some train the baselines.
+    train : training views; a part of them trains the baselines.
     blocks : names of the descriptor's blocks to use.
 
     Returns

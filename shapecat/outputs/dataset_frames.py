@@ -55,7 +55,7 @@ class Selection:
 class DatasetImage:
     """An image of a data set, and the objects on it.
 
-    ``name`` is the file name with suffix, ``contents`` the file. ``masks`` and ``sure`` are per
+    ``name`` is the file name with suffix, ``contents`` its bytes. ``masks`` and ``sure`` are per
     object: its mask, and whether its label is certain enough for training.
     """
 

@@ -70,7 +70,7 @@ def export_run(
 
     Returns
     -------
-    The number of objects written, counted in each frame.
+    The number of objects written, summed over all frames.
 
     Raises
     ------
@@ -119,7 +119,7 @@ def export_dataset(
 
     Returns
     -------
-    The number of objects for training, counted in each image.
+    The number of objects labelled for training, summed over all images.
 
     Raises
     ------

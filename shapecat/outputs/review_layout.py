@@ -39,9 +39,9 @@ class TrackView:
 
 
 def choose_eye(labelled: LabelledFrame, frame: Frame, *, fixed: bool) -> Eye:
-    """Return an eye that looks at the objects from the sensor's side and from above.
+    """Choose the eye of a 3D view: it looks at the objects from the sensor's side and from above.
 
-    It is in the fixed frame if ``fixed``, else in the sensor frame.
+    Its coordinates are in the fixed frame if ``fixed``, else in the sensor frame.
     """
     pose = labelled.fixed_from_sensor if fixed else None
     pose = pose or IDENTITY

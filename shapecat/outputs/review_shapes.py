@@ -71,13 +71,13 @@ class DrawnScene(NamedTuple):
 
     @classmethod
     def of(cls, labelled: LabelledFrame, scene: PaintedCloud, points: PaintedCloud) -> "DrawnScene":
-        """Return the scene of a frame with its painted clouds."""
+        """Return a labelled frame as a scene to draw, with its painted points."""
         objects = tuple(Surface(o.category, o.full, o.gas) for o in labelled.objects)
         return cls(objects, labelled.planes, scene, points)
 
     @property
     def size(self) -> int:
-        """The number of points."""
+        """The number of points, on objects and elsewhere."""
         return len(self.scene.points) + len(self.points.points)
 
 

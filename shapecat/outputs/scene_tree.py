@@ -1,4 +1,4 @@
-"""Which objects of a frame stand on which, from the tables of a run, as text."""
+"""Format as text which objects of a frame stand on which, according to a run's tables."""
 
 from collections.abc import Sequence
 from pathlib import Path

@@ -116,11 +116,11 @@ class Upright:
         return source, vector
 
     def contradict(self, topic: str, source: str, angles_deg: Sequence[float]) -> None:
-        """Warn that no plane confirms a topic's up direction; ignore it unless the user chose it.
+        """Warn that the planes contradict a topic's up direction; drop it unless the user chose it.
 
         Parameters
         ----------
-        source : as from `preview`.
+        source : source of the up direction, as `preview` returns it.
         angles_deg : angles between the up direction and that of the planes, one per frame.
         """
         off = f"differs by {np.median(angles_deg):.0f} degrees from the planes of {topic}"

@@ -126,7 +126,7 @@ def camera_of_info(info: Any, *, rectified: bool) -> tuple[Camera, bool]:
 
     Parameters
     ----------
-    rectified : whether the image is rectified: then P describes it, otherwise K and D.
+    rectified : whether the image is rectified: P describes rectified images, K and D the others.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Whether two depth images show the same surface."""
+"""Decide whether two depth images show the same surface."""
 
 import numpy as np
 

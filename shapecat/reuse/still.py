@@ -1,4 +1,4 @@
-"""Whether a depth image shows the same as an earlier one from the same pose."""
+"""Decide whether two depth images from the same pose show the same scene."""
 
 import numpy as np
 

@@ -46,10 +46,10 @@ class Sight(NamedTuple):
     Attributes
     ----------
     pose : ``fixed_from_sensor``; None where there is no fixed frame.
-    numbers : (15,) compared before the points are: box centre (3), vector from the sensor to it (3)
-        and up (3), in the fixed frame if there is one, else in the sensor frame; longer side,
-        shorter side and height of the box; height above the support; number of pixels; flags as
-        an integer. Lengths are in metres.
+    numbers : (15,) a summary, which is compared before the points: box centre (3), vector from the
+        sensor to it (3) and up (3), in the fixed frame if there is one, else in the sensor frame;
+        longer side, shorter side and height of the box; height above the support; number of
+        pixels; flags as an integer. Lengths are in metres.
     """
 
     frame: Frame

@@ -148,7 +148,7 @@ class FullBoxes:
 
 
 class _Seen(NamedTuple):
-    """The views of a track: their positions in the track, in the detections and in the frames."""
+    """The views of a track: their indices in the track, in the detections and in the frames."""
 
     at: I4
     rows: I4

@@ -53,7 +53,7 @@ class PlacedFrames:
         return np.argsort(np.frombuffer(self._keys, np.int64), kind="stable")
 
     def find(self, topics: Sequence[str], frames: I4) -> I4:
-        """Return the positions (n,) of the frames with the given topics and numbers (n,)."""
+        """Return the row (n,) of each frame, given the topics and frame numbers (n,)."""
         codes = np.fromiter(map(self._codes.__getitem__, topics), np.int64, len(topics))
         keys = np.frombuffer(self._keys, np.int64)
         found = np.searchsorted(keys, _keys(codes, frames), sorter=self._order)

@@ -54,7 +54,7 @@ class Match(NamedTuple):
 
 @dataclass(frozen=True)
 class Matches:
-    """The tracks of the target that match each track of the source, or why there are none."""
+    """For each track of the source: its matches in the target, or the reason why it has none."""
 
     found: Mapping[int, Sequence[Match]]
     reasons: Mapping[int, str]

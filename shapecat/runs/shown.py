@@ -35,7 +35,7 @@ _NONE = np.zeros((0, 0), np.float32)
 
 
 class ShownDetection(NamedTuple):
-    """A shown detection: its number, label, and row in `ShownTracks.causal`."""
+    """A detection to show: its number in its frame, its label, its row in `ShownTracks.causal`."""
 
     detection: int
     label: TrackLabel

@@ -170,7 +170,7 @@ def read_row_groups(
 
 
 def frame_rows(table: pa.Table) -> dict[Key, slice]:
-    """Return the rows of each frame of a table, which are consecutive."""
+    """Return the slice of rows of each frame of a table; the rows of a frame are consecutive."""
     return rows_of(*topic_codes(table), numbers(table["frame"]))
 
 
@@ -181,7 +181,7 @@ def topic_codes(table: pa.Table) -> tuple[list[str], I4]:
 
 
 def rows_of(topics: Sequence[str], codes: I4, frames: I4) -> dict[Key, slice]:
-    """Return the rows of each frame, which are consecutive.
+    """Return the slice of rows of each frame; the rows of a frame are consecutive.
 
     Parameters
     ----------
@@ -245,7 +245,7 @@ def open_writer(path: Path, schema: pa.Schema) -> pq.ParquetWriter:
 
 
 def arrow_table(columns: dict[str, Any], schema: pa.Schema) -> pa.Table:
-    """Return columns as a table with a schema."""
+    """Make a table with the given schema from columns by name."""
     arrays = [
         column if isinstance(column, pa.Array) else pa.array(column, field.type)
         for field, column in ((field, columns[field.name]) for field in schema)

@@ -151,12 +151,12 @@ def _number(text: str) -> float:
 
 
 def unlabelled(table: TrackTable) -> TrackTable:
-    """Return a table without labels."""
+    """Return a copy of a table with all labels removed."""
     return replace(table, rows=tuple(with_label(row, "") for row in table.rows))
 
 
 def with_label(row: TrackRow, label: str) -> TrackRow:
-    """Return a row with a label."""
+    """Return a copy of a row with another label."""
     return replace(row, label=label, cells={**row.cells, "label": label})
 
 

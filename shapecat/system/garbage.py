@@ -1,4 +1,4 @@
-"""How often the processes of this program collect garbage."""
+"""Make the processes of this program collect garbage less often."""
 
 import gc
 

@@ -1,4 +1,4 @@
-"""Whether processes that the main script starts would run it again."""
+"""Find out whether spawned processes would run the main script again."""
 
 import sys
 from pathlib import Path

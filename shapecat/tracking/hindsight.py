@@ -14,8 +14,8 @@ from shapecat.tracking.tracker import reach
 __all__ = ["Fragments", "merge_fragments", "scene_cuts"]
 
 _NEIGHBOURHOOD_M = 0.3  # objects farther apart than this are not compared for scene cuts
-_SLOW_S = 0.3  # from this interval between frames on, motion does not explain a distance
-_KNOWN = 8  # whole views from which the size is known, as some views only seem whole
+_SLOW_S = 0.3  # beyond this interval between frames, motion does not explain a distance
+_KNOWN = 8  # whole views needed to know the size, as some views only seem whole
 _SAME_SIZE = 0.25  # largest difference of size keys of the same object
 _SAME_POSTERIOR = 0.5  # largest total variation distance of posteriors of the same object
 _TRUSTED = 0.4  # added to that if few views are whole, for the same position and size

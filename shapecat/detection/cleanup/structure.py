@@ -27,7 +27,7 @@ FILE = "structure.npz"
 
 @cache
 def load_trees() -> BoostedTrees:
-    """Return the trees of this version of the package."""
+    """Load shapecat's trees for rejecting structure."""
     return read_trees(
         files("shapecat.detection.cleanup").joinpath(FILE).read_bytes(), OBJECT_FEATURES
     )

@@ -36,7 +36,7 @@ FILE = "parts.npz"
 
 @cache
 def load_trees() -> BoostedTrees:
-    """Return the trees of this version of the package."""
+    """Load shapecat's trees for merging segments."""
     return read_trees(
         files("shapecat.detection.merging").joinpath(FILE).read_bytes(), PAIR_FEATURES
     )

@@ -33,7 +33,7 @@ class Choice:
 
     Attributes
     ----------
-    candidates : for each frame, the tracks of which it is a good view.
+    candidates : for each frame, the tracks that it shows well.
     strip : the frames of the strip, with their time in seconds since the first frame.
     """
 
