@@ -5,6 +5,7 @@ import pytest
 
 from benchmarks.piles import judge
 from benchmarks.planes import keeps_table, view_of
+from benchmarks.simulated import score
 from shapecat.config import DetectionSettings, Settings
 from shapecat.detection import detect
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
@@ -90,6 +91,12 @@ def test_table_is_found_in_strips_of_three_centimetres() -> None:
     np.testing.assert_allclose(found, [0, 0.04], atol=0.004)
     assert covered_m2[0] > 0.1
     assert covered_m2[1] == 0
+
+
+@pytest.mark.parametrize("seed", [500006, 520022])
+def test_strips_at_the_end_of_the_range_are_no_plane(seed: int) -> None:
+    """Beyond it nothing is seen, which looks like a board with nothing below."""
+    assert score("empty", seed, 1)["scenes with all planes"] == 1
 
 
 def test_lid_under_a_box_is_not_covered() -> None:

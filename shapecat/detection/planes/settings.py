@@ -99,6 +99,9 @@ class StripSettings(NamedTuple):
     """Least area of the tops of objects that cover a plane, relative to its visible area."""
     contrast: float = 2.0
     """Least area of a plane, relative to that of the bins below."""
+    end: float = 1.25
+    """Least inverse depth of strips, relative to that of the farthest sample: four fifths of the
+    range."""
     dip: float = 0.6
     """Just above a plane, the area falls below this share of its own."""
     least_m2: float = 0.001

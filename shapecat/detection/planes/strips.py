@@ -80,6 +80,8 @@ def add_strip_planes(grid: DepthGrid, found: list[PlaneCandidate]) -> list[Plane
         if not _may_be_strips(grid, found, height, above):
             continue
         new = _plane_at(grid, strips, up, height)
+        if new.plane.area_m2 == 0 or _is_at_the_end(grid, new.samples):
+            continue
         same = [k for k in planes if abs(k.plane.offset - new.plane.offset) < STRIPS.same_m]
         if above > STRIPS.covers:
             new = _covered(new, strips, grid.intrinsics)
@@ -89,6 +91,12 @@ def add_strip_planes(grid: DepthGrid, found: list[PlaneCandidate]) -> list[Plane
             continue
         planes = [one for one in planes if not any(one is k for k in same)] + [new]
     return sorted(planes, key=lambda one: one.plane.offset)
+
+
+def _is_at_the_end(grid: DepthGrid, strips: DepthSamples) -> bool:
+    """Return whether strips lie at the end of the range, where nothing below them is visible."""
+    seen = grid.inverse_depth[grid.inverse_depth > 0]
+    return bool(np.median(strips.inverse_depth) < STRIPS.end * seen.min(initial=np.inf))
 
 
 def _widened(known: PlaneCandidate, table: PlaneCandidate) -> PlaneCandidate:
