@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 from numba import config, njit
-from numba.core.types.misc import unliteral
 
 __all__ = ["code_folder", "kernel", "unset"]
 
@@ -43,31 +42,17 @@ def kernel(function: _F | None = None, *, fast: bool = False, inline: bool = Fal
         folder = code_folder(_stage_of(Path(target.__code__.co_filename)))
         before, config.CACHE_DIR = config.CACHE_DIR, str(folder or "")
         try:
-            compiled = njit(
+            return njit(
                 nogil=True,
                 cache=folder is not None,
                 error_model="numpy",
-                no_cfunc_wrapper=True,  # no kernel is handed to C
                 fastmath=_FAST if fast else False,
                 inline="always" if inline else "never",
             )(target)
         finally:
             config.CACHE_DIR = before
-        return _without_literals(compiled)
 
     return compile_later if function is None else compile_later(function)
-
-
-def _without_literals(dispatcher: Any) -> Any:
-    """Compile a kernel once for all numbers: numba does so again for each literal in a call."""
-    find = dispatcher.get_call_template
-
-    def find_general(args: Any, keywords: dict[str, Any]) -> Any:
-        general = {name: unliteral(kind) for name, kind in keywords.items()}
-        return find(tuple(map(unliteral, args)), general)
-
-    dispatcher.get_call_template = find_general
-    return dispatcher
 
 
 @cache

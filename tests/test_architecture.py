@@ -126,6 +126,20 @@ def test_no_print_eval_or_bare_except() -> None:
     assert wrong == []
 
 
+def test_only_documented_parts_of_numba_are_used() -> None:
+    """Its compiler's own modules and methods change with any release."""
+    documented = {"numba", "numba.extending"}
+    for path in FILES:
+        text = path.read_text("utf-8")
+        for node in ast.walk(ast.parse(text)):
+            if isinstance(node, ast.Import):
+                used = {alias.name for alias in node.names}
+            else:
+                used = {node.module or ""} if isinstance(node, ast.ImportFrom) else set()
+            assert {name for name in used if name.split(".")[0] == "numba"} <= documented, path
+        assert "get_call_template" not in text, path
+
+
 def test_help_loads_no_heavy_library() -> None:
     """A command that takes a second to explain itself makes people avoid it."""
     heavy = {"numba", "rerun", "open3d", "sklearn", "scipy", "pyarrow", "numpy", "rich"}
