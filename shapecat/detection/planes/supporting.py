@@ -53,7 +53,7 @@ def supporting_planes(
         high = tallest_m < drop < math.inf
         if drop < PLANES.least_drop_m:
             continue
-        if kept and not high:
+        if kept and not high and area_m2 < PLANES.furniture_m2:
             if _is_enclosed(grid, samples, plane):
                 kept.append(_up_to_walls(grid, plane))
                 continue
