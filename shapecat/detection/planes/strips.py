@@ -94,7 +94,11 @@ def add_strip_planes(grid: DepthGrid, found: list[PlaneCandidate]) -> list[Plane
 
 
 def _is_at_the_end(inv_depth: F4, strips: DepthSamples) -> bool:
-    """Return whether strips lie at the end of the range, where nothing below them is visible."""
+    """Return whether strips lie at the end of the range, where nothing below them is visible.
+
+    ``inv_depth`` (rows, columns) is the inverse depth of the grid, 1/m; every fourth row and column
+    shows where the range ends.
+    """
     some = inv_depth[::4, ::4]
     seen = some[some > 0]
     return bool(np.median(strips.inverse_depth) < STRIPS.end * seen.min(initial=np.inf))

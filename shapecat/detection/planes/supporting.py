@@ -77,7 +77,10 @@ def _overlaps(lower: SupportingPlane, upper: SupportingPlane) -> bool:
 
 
 def _up_to_walls(grid: DepthGrid, plane: SupportingPlane) -> SupportingPlane:
-    """Extend the floor of a bin to the walls, since objects hide parts of it."""
+    """Extend the floor of a bin to the walls, since objects hide parts of it.
+
+    The extent grows to the samples above the floor that are within 0.2 m of its visible part.
+    """
     level = level_coordinates(grid, grid.inverse_depth > 0, plane.up)
     above = level[2] - plane.offset
     sides = COS[:, None] * level[0] + SIN[:, None] * level[1]
