@@ -24,6 +24,8 @@ from shapecat.simulation.paths import looking_at
 from shapecat.simulation.primitives import rounded_box
 from shapecat.simulation.render import geometry, render
 from shapecat.types import Camera, Pose
+from tests.test_detection import ball, frame_of
+from tests.test_detection import render as made_up
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 UP = np.array([0.0, -np.sqrt(0.5), -np.sqrt(0.5)])
@@ -149,6 +151,19 @@ def test_assumed_plane_lies_just_below_what_no_plane_explains() -> None:
     level = plane.a * j + plane.b * i + plane.c  # inverse depth of the plane at each cell
     below = inv_depth[(inv_depth > 0) & (j < 80)] < level[(inv_depth > 0) & (j < 80)]
     assert below.mean() < 0.02
+
+
+def test_known_up_is_kept_where_nothing_is_level() -> None:
+    """A heap of balls hides its table: the plane below it follows the given direction."""
+    places = [(x / 10, y / 10, 0.03 * abs(x + y)) for x in range(-3, 4) for y in range(-2, 3)]
+    depth, _ = made_up([ball(place, 0.06) for place in places], tilt_deg=35, noise=0)
+    up = np.array([0.1, -0.8, -0.6]) / np.linalg.norm([0.1, -0.8, -0.6])
+
+    rng = np.random.default_rng(0)
+    scene = detect(frame_of(depth), up=up, settings=DetectionSettings(), rng=rng)
+
+    np.testing.assert_allclose(scene.up, up, atol=1e-6)
+    assert scene.candidates  # above the assumed plane
 
 
 def test_no_plane_is_assumed_for_a_few_samples_or_above_the_camera() -> None:

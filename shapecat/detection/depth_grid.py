@@ -28,7 +28,9 @@ __all__ = [
 CELL_M = 0.0035
 """Target size of a cell, metres: small against the smallest object, larger than the noise."""
 SMALL_M2 = 9e-4
-"""Visible area of the smallest object."""
+"""Visible area of the smallest object, m²."""
+FEWEST_CELLS, ENOUGH_CELLS = 20.0, 60.0
+"""Fewer cells may be noise; this many are an object, however small it is."""
 BORDER_SHARE = 0.12
 """Largest share of the image that is blank along a side: a tenth for a registered Kinect."""
 LARGEST_FACTOR = 16
@@ -123,8 +125,9 @@ def row_and_column(p: int, columns: int) -> tuple[int, int]:
 
 @kernel(inline=True)
 def smallest_object_at(grid: DepthGrid, depth_m: float) -> float:
-    """Return the number of cells that `SMALL_M2` covers at a depth, clipped to 20 to 75."""
-    return float(min(max(SMALL_M2 * grid.intrinsics.fx**2 / depth_m**2, 20.0), 75.0))
+    """Return the least number of cells of an object at a depth: those that `SMALL_M2` covers."""
+    covered = SMALL_M2 * grid.intrinsics.fx**2 / depth_m**2
+    return float(min(max(covered, FEWEST_CELLS), ENOUGH_CELLS))
 
 
 @kernel(inline=True)

@@ -2,8 +2,9 @@
 
 1. The depth image is downsampled to samples of inverse depth; a point cloud is first turned into
    the image of a virtual camera (`depth_grid`, `virtual_camera`).
-2. `planes`: the up direction; multi-plane RANSAC (Fischler and Bolles 1981); the planes that
-   support objects; the height of each sample above its plane (thesis Alg. 1 and 2).
+2. `planes`: the up direction; a plane at each peak of level surface in height, by RANSAC (Fischler
+   and Bolles 1981) where least squares fail; the planes that support objects; the height of each
+   sample above its plane (thesis Alg. 1 and 2).
 3. `foreground`: low-profile objects, walls, and objects that overhang the edge of their plane.
 4. `segmentation`: surfaces are split at depth discontinuities and concave edges (local convexity,
    Stein et al. 2014) by a watershed (Meyer 1991), and where the width of a stack changes.
@@ -181,11 +182,19 @@ def _find_planes(
 ) -> PlaneModel | None:
     """Find planes, heights, low-profile objects and walls; None without a supporting plane."""
     trials, tallest_m = draw_trials(task.rng), task.settings.max_height_m
-    hint = NO_HINT if hint is None else hint
-    supports, up = find_supporting_planes(grid, hint, trials, tallest_m=tallest_m, upright=upright)
+    supports, up = find_supporting_planes(
+        grid,
+        NO_HINT if hint is None else hint,
+        trials,
+        tallest_m=tallest_m,
+        upright=upright,
+    )
     if not supports and not upright:  # another view of the cloud may show a plane
         return None
-    up = up if up.any() else np.array(DEFAULT_UP)
+    if not supports and hint is not None:
+        up = hint
+    elif not up.any():
+        up = np.array(DEFAULT_UP)
     model = _separate(grid, supports, up, trials, task)
     rest = unexplained(grid, model.heights.plane_id, model.walls)
     assumed = None if rest is None else assume_plane(grid, rest, up, tallest_m)

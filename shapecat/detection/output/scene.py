@@ -89,10 +89,7 @@ def _kept(
     """Return the lists with enough points for an object, in the order of their first points."""
     limits = [float(least)] * len(indices)
     if image:
-        limits = [
-            max(least, min(n, OUTPUT.enough_cells) * grid.factor**2)
-            for n in measured.least.tolist()
-        ]
+        limits = [max(least, n * grid.factor**2) for n in measured.least.tolist()]
     enough = (k for k, limit in enumerate(limits) if indices[k].size >= limit)
     return sorted(enough, key=lambda k: int(indices[k][0]))
 

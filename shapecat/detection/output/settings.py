@@ -25,8 +25,6 @@ class OutputSettings(NamedTuple):
     """Largest label of a cluster of occluded points; this bounds the time."""
     highest_m: float = 0.6
     """Greatest height of occluded points above a plane, metres."""
-    enough_cells: int = 60
-    """Cells of an object that are always enough, even if the smallest object nearby has more."""
     border_cells: float = 2.5
     """Width of the border of a cloud, in cells."""
     straight_share: float = 0.3

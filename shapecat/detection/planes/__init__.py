@@ -23,8 +23,9 @@ def find_supporting_planes(
 ) -> tuple[list[SupportingPlane], F8]:
     """Find the horizontal planes that objects may stand on (thesis 4.3).
 
-    Multi-plane RANSAC (Fischler and Bolles 1981): one plane for each peak of level surface in
-    height; then all planes get a common normal; then planes with only strips visible are added.
+    One plane is fitted at each peak of level surface in height, by RANSAC where least squares fail
+    (Fischler and Bolles 1981); then all planes get a common normal; then planes with only strips
+    visible are added.
 
     Parameters
     ----------
