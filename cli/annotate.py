@@ -20,10 +20,10 @@ from .render import missed_words, progress_bars
 @click.option(
     "--by-place",
     is_flag=True,
-    help="LABELS is another run, or its tracks.csv: transfer each of its labels to the object at "
-    "the same place.",
+    help="LABELS is another run, or its tracks.csv: transfer its labels to the objects at "
+    "the same places.",
 )
-@boxes_option("In annotated.mcap, {}; if not given, boxes stay as they are.")
+@boxes_option("In annotated.mcap, {}; if not given, boxes are not changed.")
 @recording_option
 def annotate(
     *,

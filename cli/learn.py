@@ -20,8 +20,8 @@ def learn(*, model: Path, dataset: Path, out: Path, seed: int, as_json: bool) ->
     """Add the new categories of a data set to a model.
 
     MODEL is a model file, or `default` for the model that comes with shapecat. Its existing
-    categories stay as they are. DATASET is laid out as for `shapecat train`; `shapecat export
-    --format crops` writes such a data set.
+    categories do not change. DATASET is laid out as for `shapecat train`; `shapecat export --format
+    crops` writes such a data set.
 
     \b
     shapecat learn default crops --out mine.npz

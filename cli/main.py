@@ -1,4 +1,4 @@
-"""The entry point: the command group, which prints known errors as one line."""
+"""The entry point: the group of commands; it prints a known error as a single line."""
 
 import logging
 import os

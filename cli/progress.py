@@ -234,7 +234,7 @@ class LiveProgress(Progress):
         self._rich.console.print(text, markup=False, highlight=False, soft_wrap=True)
 
     def show(self, folder: str) -> None:
-        """Move the bar of a recording; each phase has its own length."""
+        """Move the bar of a recording, which starts again in each phase."""
         phase, done, total = self.running[folder]
         words = PHASES.get(phase, phase)
         text = words if self._whole is None else f"{folder}: {words}"

@@ -38,7 +38,7 @@ _SENSORS = (
     "--format",
     "container",
     type=click.Choice(["mcap", "ros1", "ros2"]),
-    help="Format; by default the one that OUT's suffix names.",
+    help="Format; by default that of OUT's suffix.",
 )
 @click.option(
     "--sensor",
@@ -85,7 +85,7 @@ def simulate(
     bin         objects dropped into a bin
     shelf_bin   objects in a compartment of a shelf, seen from the front
     room        a table among robot arms, people and furniture
-    turntable   a turning table before a still camera
+    turntable   a turntable in front of a fixed camera
     walking     a camera that moves along a counter and back
     crossing    two moving objects that hide others and each other
     rearranged  objects that are added, removed, carried and pushed

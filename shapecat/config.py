@@ -31,16 +31,16 @@ class DetectionSettings:
     """Planes and object candidates (thesis ch. 4). Lengths in metres, angles in degrees."""
 
     max_range_m: float = 2.0
-    """Points farther from the sensor are ignored (thesis 4.2)."""
+    """Points farther from the sensor than this are ignored (thesis 4.2)."""
     fuse_frames: int = 1
-    """Consecutive depth images fused before detection, including the current one (thesis 4.2); 1
-    turns fusion off."""
+    """Number of consecutive depth images that are fused before detection, including the current one
+    (thesis 4.2); 1 turns fusion off."""
     max_height_m: float = 0.6
-    """Points higher above a plane do not belong to an object on it."""
+    """Points higher than this above a plane do not belong to an object on it."""
     max_size_m: float = 0.6
-    """Larger segments are walls or furniture."""
+    """Segments larger than this are taken for walls or furniture."""
     min_points: int = 60
-    """Candidates with fewer points at full resolution are dropped."""
+    """Candidates with fewer points than this, at full resolution, are dropped."""
 
     def __post_init__(self) -> None:
         """Reject a ``fuse_frames`` that is out of range."""
@@ -54,18 +54,20 @@ class SurfaceSettings:
     """Growing Neural Gas (thesis ch. 5)."""
 
     method: Literal["fritzke", "thesis"] = "fritzke"
-    """Insert a neuron every lambda signals (Alg. 3), or on accumulated error (Alg. 4)."""
+    """When a neuron is inserted: `fritzke` at a fixed interval of signals (thesis, Algorithm 3),
+    `thesis` where the accumulated error is large (Algorithm 4)."""
     neurons: int = 80
-    """Neurons to grow to; fewer on small clouds."""
+    """Number of neurons at the end of growth; fewer on small clouds."""
     signals: int = 6000
-    """Signals fired in total."""
+    """Total number of signals: points drawn at random to adapt the neurons."""
     component_share: float = 0.35
-    """Separate parts of the graph with a smaller share of the points are dropped."""
+    """Separate parts of the graph with a smaller fraction of the points than this are dropped."""
     voxel_m: float = 0.005
-    """Edge of the voxels in which the points of an object are averaged before the gas."""
+    """Edge of the voxels in which the points of an object are averaged before the neural gas learns
+    them."""
     smooth_radius_m: float = 0.0
-    """Radius of moving least squares smoothing after the voxels, for example 0.015 (thesis 4.2);
-    0 turns it off."""
+    """Radius of moving least squares smoothing, applied to the averages of the voxels, for example
+    0.015 (thesis 4.2); 0 turns it off."""
 
 
 @dataclass(frozen=True)
@@ -73,19 +75,20 @@ class TrackingSettings:
     """Nearest-centroid tracker and fusion (thesis 7.5.2)."""
 
     association: Literal["hungarian", "greedy"] = "hungarian"
-    """Assign detections to tracks by the smallest total distance, or the nearest pair first."""
+    """How detections are assigned to tracks: `hungarian` minimises the total distance, `greedy`
+    takes the nearest pair first."""
     gate_m: float = 0.12
     """Largest distance between a track and the centroid of its next detection; smaller for
     small objects."""
     min_hits: int = 3
-    """Detections that confirm a track; fewer if fewer frames lie within half a second of its
-    first one."""
+    """Number of detections that confirm a track; fewer suffice if fewer frames lie within half a
+    second of its first detection."""
     max_missed_s: float = 5.0
-    """A track ends after this time without a detection; sooner while it is young. An object that
-    comes back to its place later gets its old track."""
+    """A track ends after this time without a detection, a recently started one sooner. An object
+    that later reappears in the same place gets its old track."""
     fusion: Literal["mean", "product", "vote"] = "product"
-    """Fusion of the posteriors of all views. The product is tempered by the number of views, so
-    that confidence does not grow with it."""
+    """How the posteriors of all views are fused: `product`, `mean` or `vote`. The product is
+    tempered by the number of views, so that more views alone do not raise the confidence."""
 
 
 @dataclass(frozen=True)
@@ -93,11 +96,11 @@ class OutputSettings:
     """Contents of annotated.mcap and review.rrd."""
 
     boxes: Literal["full", "visible"] = "full"
-    """Boxes in annotated.mcap: around the whole object, or its visible part."""
+    """Boxes in annotated.mcap: `full` encloses the whole object, `visible` its visible part."""
     markers: bool = False
     """Also write visualization_msgs/MarkerArray for RViz."""
     cloud_points: int = 30_000
-    """Points per cloud in review.rrd; 0 keeps all."""
+    """Approximate number of points per cloud in review.rrd; 0 keeps all."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +110,7 @@ class Settings:
     seed: int = 0
     reuse_frames: int = 16
     """Frames per block. Within a block, an object that looks the same as in an earlier frame keeps
-    the description from there; 1 describes every object in every frame."""
+    its description from that frame; 1 describes every object in every frame."""
     detection: DetectionSettings = field(default_factory=DetectionSettings)
     surface: SurfaceSettings = field(default_factory=SurfaceSettings)
     tracking: TrackingSettings = field(default_factory=TrackingSettings)
