@@ -116,8 +116,9 @@ def process(
 ) -> Run:
     """Process one recording as `shapecat process` does, and open the results.
 
-    They are in ``out/NAME``, where NAME is the name of the recording without its suffix. If they
-    are there already, complete and from the same input, settings and model, they are only opened.
+    The results are written to ``out/NAME``, where NAME is the name of the recording without its
+    suffix. Complete results of the same input, settings and model are opened instead of being
+    computed again.
 
     Parameters
     ----------
@@ -131,8 +132,8 @@ def process(
 
     Raises
     ------
-    ConfigError : a setting does not exist or has an invalid value, or a script without that line
-        asks for several cores.
+    ConfigError : a setting does not exist or has an invalid value, or a script without this line
+        asks for several processes.
     RecordingError, NoStreamError, ModelError, OutputError : as for the command, which prints them.
     """
     if cores > 1 and runs_again():

@@ -238,7 +238,7 @@ def annotate_again(
     labels : the corrected table; by default the run's own tracks.csv.
     by_place : ``labels`` is the table or folder of another run, and its labels are transferred to
         the objects at the same places.
-    boxes : ``full`` or ``visible``; by default, boxes stay as they are.
+    boxes : ``full`` or ``visible``; by default, boxes are not changed.
     recording : path of the recording; by default where it was processed.
 
     Returns

@@ -46,13 +46,14 @@ class Task:
 
     Attributes
     ----------
-    like : the job with the options of all tasks.
+    like : a job with the options that all tasks share.
     out : folder or URL of the batch; ``name`` is the run folder in it.
     path, url : the recording; one of them is empty.
     status : ``complete`` according to the manifest; ``resume`` if a run was interrupted; ``retry``
         if the last attempt failed; ``check`` if there are results of unknown origin; else ``new``.
     bytes : size of the recording, 0 if unknown.
-    input, work : change with the recording, and with the options, settings and model.
+    input, work : keys; ``input`` changes with the content of the recording, ``work`` with the
+        options, settings and model.
     """
 
     like: Job
@@ -167,7 +168,7 @@ def name_folders(names: Sequence[str], parents: Sequence[str]) -> list[str]:
 def plan_batch(
     job: Job, sources: Sequence[str], out: str, *, shard: str | None = None
 ) -> Iterator[Batch]:
-    """Plan a task for each recording, without opening any; the manifest is open in the block.
+    """Plan a task for each recording, without opening any; keep the manifest open during the block.
 
     Parameters
     ----------

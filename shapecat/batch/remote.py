@@ -1,7 +1,7 @@
 """Process a recording in a temporary folder if it, or its run folder, is at a URL.
 
-Object stores cannot rename. A run folder there is complete if it holds run.json, which is uploaded
-last; without it, other files are not a run.
+Object stores cannot rename. A run folder at a URL is complete if it holds run.json, which is
+uploaded last; without run.json, its files do not count as a run.
 """
 
 import dataclasses

@@ -32,7 +32,7 @@ class ColourImage(Record):
     Attributes
     ----------
     topic, stamp_ns, log_time_ns, frame_id : as in `shapecat.types.Frame`.
-    encoding : ``jpeg`` or ``png`` if ``data`` is such a file, otherwise a ROS image encoding.
+    encoding : ``jpeg`` or ``png`` if ``data`` is a JPEG or PNG file, otherwise a ROS encoding.
     width, height : pixels.
     step : bytes per row, for raw pixels.
     """

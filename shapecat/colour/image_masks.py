@@ -1,4 +1,4 @@
-"""The masks of a frame's detections, as they are stored."""
+"""The masks of a frame's detections, as stored in masks.parquet."""
 
 from collections.abc import Sequence
 

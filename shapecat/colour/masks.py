@@ -76,7 +76,7 @@ def dense_masks(
 
     Returns
     -------
-    One mask per object, in their order; no two share a pixel.
+    One mask per object, in the order of ``objects``; no two masks share a pixel.
 
     Raises
     ------
@@ -100,7 +100,7 @@ def dense_masks(
 def labelled_masks(
     seen: I4, boxes: I4, scale: float = 1.0, *, corner: tuple[int, int] = (0, 0)
 ) -> tuple[Mask, ...]:
-    """Return the dense mask of each label, from 1 on.
+    """Return the dense mask of each label, from 1 to n.
 
     Parameters
     ----------

@@ -32,7 +32,8 @@ def project(points: F4, lens: LensCamera, colour_from_depth: Pose) -> F4:
     Returns
     -------
     (n, 3) column and row (0 is the centre of the first pixel) and depth along the optical axis,
-    metres; NaN behind the camera, and beyond the slopes that the distortion maps one to one.
+    metres; NaN for points behind the camera, or so far off its axis that the distortion is no
+    longer one-to-one.
 
     Raises
     ------
@@ -131,7 +132,7 @@ def see(x: F4, y: F4, z: F4, numbers: F4, kind: int, d: F4, reach: float) -> Non
     x, y, z : (n,) metres, in the optical frame of the camera. They become column and row in pixels
         and inverse depth in 1/m, which is 0 where the camera does not see the point.
     numbers : (4,) fx, fy, cx, cy, pixels.
-    kind : of distortion: 0 none, 1 polynomial, 2 fisheye.
+    kind : kind of distortion: 0 none, 1 polynomial, 2 fisheye.
     d : (8,) distortion coefficients.
     reach : the square of the largest slope that the lens sees; ignored without distortion.
     """

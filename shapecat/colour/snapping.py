@@ -41,7 +41,7 @@ def snapped(masks: Sequence[Mask], pixels: U1, scale: float = 1.0) -> tuple[Mask
 
     Parameters
     ----------
-    masks : of the objects on the colour image.
+    masks : masks of the objects on the colour image.
     pixels : (h, w, 3) uint8, the colour image.
     scale : pixels of the colour image per pixel of the depth image.
 

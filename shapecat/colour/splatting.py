@@ -31,8 +31,8 @@ class SplattedLabels(NamedTuple):
     left, top : column and row, in the image, of the first pixel of the part.
     labels : (h, w) int32 the object, from 1; 0 for another surface, -1 where nothing is known.
         Label 0 occurs only within ``boxes``.
-    boxes : (n + 1, 4) for each label, left, top, right + 1, bottom + 1, in the part, of its pixels
-        including hidden ones; zeros without pixels.
+    boxes : (n + 1, 4) bounding box of each label's pixels, including hidden ones:
+        left, top, right + 1, bottom + 1, in pixels of the part; zeros for a label without pixels.
     """
 
     left: int

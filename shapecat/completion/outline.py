@@ -1,9 +1,9 @@
 """Outlines of footprints as support functions.
 
-The support function of a convex outline in the direction t is the largest ``p . t`` of its points
-p: how far the outline reaches that way. For a circle it is ``center . t + radius``. For an oval,
-``p cos 2a + q sin 2a`` is added at the angle a (to first order). Both are linear in the unknowns.
-For a union it is the larger one.
+The support function of a convex outline in the direction t is the largest ``x . t`` over its points
+x: the extent of the outline in that direction. For a circle it is ``center . t + radius``. An oval
+adds ``p cos 2a + q sin 2a``, to first order, where a is the angle of t. Both formulas are linear in
+their unknowns. The support function of a union of two outlines is the larger of theirs.
 """
 
 import numpy as np
@@ -25,16 +25,19 @@ _OUTLIER = 0.03
 def support_function(
     x: F4, y: F4, strays: I4, noise: float, flat: float, cosines: F8, sines: F8
 ) -> F8:
-    """Return the support function (k,) of points in k directions, without the farthest points.
+    """Return the support function (k,) of points in k directions, ignoring outliers.
 
-    A flat side reaches as far as the mean of its points.
+    The value of a flat side is the mean over its points, since noise would make their maximum too
+    large.
 
     Parameters
     ----------
     x, y : (n,) the points, metres.
-    strays : (k,) number of points to leave out in each direction.
-    noise : metres; points within this distance of the farthest one form a side. 0 turns this off.
-    flat : share of the points that make a side flat; with fewer the correction is proportional.
+    strays : (k,) number of farthest points to ignore in each direction.
+    noise : metres; points within this distance of the farthest one form its side; 0 turns off the
+        correction for flat sides.
+    flat : fraction of the points that a side needs for the full correction; a side with fewer is
+        corrected in proportion.
     cosines, sines : (k,) the directions.
     """
     most = 0

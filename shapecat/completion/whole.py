@@ -23,7 +23,7 @@ __all__ = ["COSINES", "ENOUGH_POINTS", "SINES", "Footprint", "complete", "faced"
 _ANGLES = np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS)
 COSINES, SINES = np.cos(_ANGLES), np.sin(_ANGLES)
 ENOUGH_POINTS = 256
-"""Points used for the outline; more only cost time."""
+"""Maximum number of points used for the outline; more only cost time."""
 
 _TOP = 0.98
 """Share of the points below the top."""
@@ -135,9 +135,9 @@ def faced(toward: F8) -> Bool:
 def footprint(seen: F8, facing: F8, posterior: F8, categories: Sequence[str]) -> Footprint:
     """Estimate the footprint of an object from its visible outline.
 
-    The footprint of a box is the visible outline. For other categories it is the oval fitted to
-    the visible side, for a cup with its handle; if no oval fits, as for a bottle that lies down,
-    it is again the visible outline. The result is the rectangle of least area around it.
+    For a box, the footprint is the visible outline. For other categories, it is the oval fitted to
+    the visible side; a cup's handle is added. If no oval fits, as for a bottle that lies down, the
+    visible outline is used instead. The result is the rectangle of least area around the footprint.
 
     Parameters
     ----------

@@ -20,16 +20,16 @@ from shapecat.types import Camera, Frame, Pose, Scene
 __all__ = ["fuse", "with_own_readings"]
 
 AGREE = 0.006
-"""Largest difference in inverse depth between two readings of one point, 1/m: two steps of a
-Kinect and twice its noise; 6 mm at 1 m, 24 mm at 2 m. With more, low objects smear when they
-move."""
+"""Largest difference in inverse depth between two readings of one point, 1/m: two steps of a Kinect
+and twice its noise; 6 mm at 1 m, 24 mm at 2 m. A larger value would smear low objects that move."""
 LEAST_SHARE = 0.9
-"""Least share of the compared readings without a `DISCONTINUITY` between them; with less, the pose
-of the earlier image is wrong."""
+"""Minimum fraction of the compared readings that differ by less than a `DISCONTINUITY`; below it,
+the pose of the earlier image is considered wrong."""
 STRIDE = 8
-"""Step between the pixels that are compared for that share."""
+"""Distance between the pixels that are compared for `LEAST_SHARE`, pixels."""
 REACH = 2
-"""Greatest distance, in pixels, of a hole from a reading whose surface may continue into it."""
+"""Largest distance, in pixels, from a hole to a reading whose surface may continue into the
+hole."""
 
 
 def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
@@ -45,9 +45,9 @@ def fuse(frame: Frame, earlier: Sequence[Earlier], *, range_m: float) -> Frame:
 
     Parameters
     ----------
-    frame : the current frame; a point cloud is returned as it is.
+    frame : the current frame; a point cloud is returned unchanged.
     earlier : from `RecentFrames`, the newest first.
-    range_m : metres; readings farther away stay as they are.
+    range_m : metres; readings farther away are not changed.
 
     Returns
     -------

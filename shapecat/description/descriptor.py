@@ -43,7 +43,7 @@ def describe(points: F4, gas: NeuralGas, eye: F4) -> F4:
     Parameters
     ----------
     points : (m, 3) metres, finite, level frame: z up, the support at z = 0, and the origin anywhere
-        on it. Of more than 1200 points, every k-th is used.
+        on it. If there are more than 1200, every k-th point is used.
     gas : the graph of the points, in the same frame, with at least 2 neurons.
     eye : (3,) metres, the position of the sensor in the same frame.
 

@@ -31,8 +31,8 @@ _LONG, _END = 2 * OUTLINE_SLICES, 4 * OUTLINE_SLICES
 def outline(cloud: F4, eye: F4, out: F4) -> None:
     """Write the features named by `OUTLINE_NAMES`.
 
-    Widths are measured in slices along two directions: upwards, and along the principal axis of
-    the outline from its wide to its narrow end. ``aside`` is the offset of the middle of a slice
+    Widths are measured in slices along two directions: upwards, and along the principal axis of the
+    outline from its wide to its narrow end. The feature ``aside`` is the offset of a slice's middle
     from the mean of all slices.
 
     Parameters

@@ -14,7 +14,10 @@ PROFILE_NAMES = tuple(f"{i}_{name}" for i in range(PROFILE_SLICES) for name in _
 
 @kernel
 def vertical_axis(x: F4, y: F4, normals: F4, weight: F4) -> tuple[float, float, float]:
-    """Find the vertical line nearest to the horizontal lines along the normals.
+    """Find the vertical axis that the normals of a surface point to or away from.
+
+    It is the vertical line nearest to the horizontal lines that pass through the neurons in the
+    horizontal direction of their normals.
 
     A weak pull to the origin makes the result unique where all normals are parallel or vertical.
 
@@ -65,9 +68,9 @@ def profile(
 ) -> None:
     """Write the radial profile about the vertical axis, named by `PROFILE_NAMES`.
 
-    Each of 8 horizontal slices has the share of the points, the mean radius and its deviation
-    (relative to the largest mean radius), the share that faces the axis, the mean of the normals'
-    z, and the mean curvature.
+    The features of each of 8 horizontal slices are its share of the points, the mean radius and its
+    deviation (relative to the largest mean radius), the share of the points that faces the axis,
+    the mean of the normals' z, and the mean curvature.
 
     Parameters
     ----------

@@ -45,8 +45,8 @@ def revolution(
 
     Two solids of revolution are fitted to the neurons and measured on the points: one with a
     vertical axis, and one whose axis may tilt. The second is cut into slices, from its wide to its
-    narrow end. Each slice has the share of the points, the mean radius (relative to the largest),
-    the deviation from that radius, and the share of the points that face the axis.
+    narrow end. The features of a slice are its share of the points, the mean radius (relative to
+    the largest), the deviation from that radius, and the share of the points that face the axis.
 
     Parameters
     ----------

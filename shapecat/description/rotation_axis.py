@@ -1,4 +1,4 @@
-"""The axis about which the surface of an object is most nearly one of revolution."""
+"""The axis about which an object is most nearly a surface of revolution."""
 
 import numpy as np
 

@@ -35,14 +35,14 @@ def compare_learners(
     jobs: int | None = None,
     observe: Observer = ignore,
 ) -> tuple[Compared, ...]:
-    """Train shapecat's classifier and baselines on the same views, and test them on the same views.
+    """Train shapecat's classifier and the baselines on the same views, and test all on ``test``.
 
     Parameters
     ----------
     test : test views; those labelled ``unknown`` are left out.
     train : training views. If None, use ``test`` in five-fold cross-validation by instance.
     categories : order of the posteriors; a category without training views counts as missed.
-    root : folder to name in errors.
+    root : folder of the data set, which error messages name.
     blocks : names of the descriptor's blocks to use.
     jobs : number of trees grown at the same time.
 

@@ -1,7 +1,7 @@
 """Point cloud files, PCD and PLY: the points and the position of the sensor.
 
-Open3D reads both formats, but ignores the VIEWPOINT of PCD files and cannot be imported without
-display libraries, where data sets must be readable too.
+Open3D reads both formats, but ignores the VIEWPOINT of PCD files and cannot be imported on a
+machine without display libraries. Data sets must be readable there too.
 """
 
 import re

@@ -122,7 +122,7 @@ def compare(
     Parameters
     ----------
     reference : path as for `open_reference`.
-    recording : present path of the recording, if it was moved; only the pictures need it.
+    recording : current path of the recording, if it was moved; only the pictures need it.
 
     Raises
     ------

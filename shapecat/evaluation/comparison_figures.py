@@ -60,7 +60,8 @@ def figures_of(
     overlap : overlap of the masks; None without masks.
     seen : identities of each frame; None without identities.
     rows : the `Difference` rows of all frames.
-    categories : categories of the model; the metrics of categories leave other true objects out.
+    categories : categories of the model; metrics of categories ignore true objects of any other
+        category.
     threshold : lowest similarity of a pair that counts as the same object in the tracking metrics.
     """
     boxes = [row.box_iou for row in rows if row.box_iou is not None]

@@ -21,8 +21,8 @@ COLOURS = {
     "surplus": (30, 100, 220),
     "category": (160, 40, 170),
 }
-"""Colours of pixels: in the same object of both, only in the truth, only in the run, and in the
-same object with different categories."""
+"""Colours of the pixels: run and truth agree, only in the truth, only in the run, and same object
+but different category."""
 _INK = 0.55
 
 

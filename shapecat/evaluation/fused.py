@@ -41,7 +41,7 @@ def fuse_views(
 
     Returns
     -------
-    One result for each count that at least one object has enough views for.
+    One result for each count for which at least one object has enough views.
     """
     result = []
     for count in counts:

@@ -63,7 +63,7 @@ class Overlap:
 
     @property
     def share_found(self) -> float:
-        """Fraction of the true objects that are hits."""
+        """Fraction of the true objects that were found."""
         return self.hits / max(self.objects, 1)
 
 

@@ -190,7 +190,10 @@ def confusion_svg(categories: Sequence[str], table: Sequence[Sequence[int]]) -> 
 
 
 def calibration_svg(curve: Sequence[Bin], *, size: int = 280) -> str:
-    """Return a calibration curve as SVG, ``size`` pixels wide; a dot's area shows its views."""
+    """Return a calibration curve as SVG, ``size`` pixels wide.
+
+    The area of a dot shows its number of views.
+    """
     low, top, side = 34.0, 18.0, size - 56.0  # room for the largest dot in a corner
     high, bottom = low + side, top + side
     parts = [

@@ -33,7 +33,7 @@ def share_cores(jobs: int | None, recordings: int) -> tuple[int, int]:
 
 @contextmanager
 def limited_threads(threads: int) -> Iterator[None]:
-    """Limit the threads of numeric libraries in processes that are started in the block."""
+    """Limit the threads of numeric libraries in processes that are started during the block."""
     before = {name: os.environ.get(name) for name in THREAD_LIMITS}
     os.environ.update(dict.fromkeys(THREAD_LIMITS, str(threads)))
     try:

@@ -75,7 +75,7 @@ class Processes(Generic[_Item, _Result]):
             self._executor.terminate()
 
     def start(self) -> None:
-        """Start the other processes now, not with the first items: it takes seconds."""
+        """Start the other processes now instead of with the first item: starting takes seconds."""
         if self._others and self._executor is None:
             self._executor = LocalExecutor(self._others, ahead=_AHEAD)
             for _ in range(self._others):
@@ -196,7 +196,8 @@ def map_ahead(
 ) -> Iterator[_Result]:
     """Yield ``function(item)`` for each item, in order, computed ahead in threads.
 
-    It pays for functions that spend their time in kernels, which release the interpreter lock.
+    Threads help only functions that spend their time in kernels, which release the interpreter
+    lock.
 
     Parameters
     ----------

@@ -40,7 +40,7 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
     unknown : label of shapes that belong to no category; None if there are none. They get trees
         and a logit of their own, after those of the categories.
     jobs : number of trees grown at the same time; it does not affect the result.
-    random_state : seed of these random choices.
+    random_state : seed of the random choices.
 
     Attributes
     ----------

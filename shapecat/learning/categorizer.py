@@ -51,7 +51,7 @@ class Categorizer(Record):
     threshold : log odds of being unknown above which a shape is *unknown*.
     known_descriptors : (v, d) standardised descriptors of some training views, which are the
         negative examples for new categories.
-    known_category : (v,) their columns of the logits.
+    known_category : (v,) index of the logit of each of these views.
     notes : how the model was made; plain JSON values.
 
     Raises

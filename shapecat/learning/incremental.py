@@ -49,12 +49,12 @@ def add_categories(
 
     Each new category gets its own densities, if the model has any, and its own linear classifier on
     the words, the densities and the descriptor. The dictionary, the classifiers and the temperature
-    of the old categories stay as they are. The known views stored in the model are the negative
+    of the old categories do not change. The known views stored in the model are the negative
     examples.
 
     Parameters
     ----------
-    descriptors : (n, d) views of the new categories; views of old categories are more negative
+    descriptors : (n, d) views of the new categories; views of old categories are further negative
         examples.
     labels : (n,) category names.
     ridge : strength of the L2 regularisation, per view.

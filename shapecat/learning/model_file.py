@@ -66,7 +66,7 @@ def load_model(path: Path | None = None) -> Categorizer:
 
     Raises
     ------
-    ModelError : the file does not exist, is damaged, is no model, or has another format version.
+    ModelError : the file does not exist, is damaged, is not a model, or has another format version.
     """
     name = str(path) if path is not None else "the default model"
     source = path if path is not None else files("shapecat.models") / "default.npz"

@@ -182,7 +182,7 @@ def collapse(
 
 
 def choose_evenly(codes: I4, count: int, rng: np.random.Generator) -> I4:
-    """Return up to ``count`` indices of views, in ascending order, evenly drawn from all codes.
+    """Return up to ``count`` indices of views, ascending, drawn evenly from all categories.
 
     Parameters
     ----------
@@ -202,8 +202,8 @@ def calibrate(categorizer: Categorizer, held_out: Examples, *, rejected: float) 
 
     Parameters
     ----------
-    held_out : views of instances that training has not seen. Views with other labels than the
-        model's categories are left out; if none is left, the model stays as it is.
+    held_out : views of instances that training has not seen. Views whose label is not a category of
+        the model are ignored; if none remain, the model is returned unchanged.
     rejected : fraction of the views that the novelty threshold rejects.
     """
     codes = encode(held_out.labels, categorizer.categories)

@@ -1,4 +1,4 @@
-"""Bags of words of views, as sparse rows."""
+"""Bags of words: the leaves that a view reaches in the trees, as a sparse row."""
 
 from typing import Any
 
@@ -25,12 +25,12 @@ class TreeDictionary(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # 
     forest_: FlatForest
 
     def words(self, X: ArrayLike) -> I4:
-        """Return the words (n, trees) of features X (n, f)."""
+        """Return the words (n, trees) of features X (n, f): the leaf reached in each tree."""
         check_is_fitted(self)
         return self.forest_.fall(validate_data(self, X, dtype=np.float32, reset=False))
 
     def transform(self, X: ArrayLike) -> sparse.csr_array:
-        """Return the `bag_of_words` (n, words) of features X (n, f)."""
+        """Return the sparse bags of words (n, words), zeros and ones, of features X (n, f)."""
         words = self.words(X)  # first, as this checks that the dictionary is fitted
         return bag_of_words(words, self.forest_.words)
 
@@ -42,7 +42,7 @@ class TreeDictionary(TransformerMixin, BaseEstimator):  # type: ignore[misc]  # 
 
 
 def bag_of_words(words: I4, vocabulary: int) -> sparse.csr_array:
-    """Return a row (vocabulary,) for each view: ones at its words (n, t), zeros elsewhere."""
+    """Return sparse rows (n, vocabulary), one per view: 1 at its words (n, t), 0 elsewhere."""
     views, trees = words.shape
     starts = np.arange(views + 1, dtype=np.int32) * trees
     columns = words.reshape(-1).astype(np.int32)

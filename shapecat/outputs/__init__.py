@@ -1,1 +1,1 @@
-"""What a run writes for people and other tools: annotated recordings, reviews, pages, exports."""
+"""Outputs for people and other tools: annotated recordings, reviews, pages, exports."""

@@ -97,7 +97,7 @@ ENCODERS: dict[str, Callable[[bool], list[tuple[AnnotationChannel, Encode]]]] = 
     "json": _json,
     "protobuf": _protobuf,
 }
-"""Channels for each encoding of a source: files with mixed encodings break ROS tools."""
+"""Annotation channels by the encoding of the source: files with mixed encodings break ROS tools."""
 
 
 _JSON = ("sec", "nsec")

@@ -36,7 +36,8 @@ class Selection:
     Attributes
     ----------
     every : take every n-th frame of a stream.
-    per_track : number of views per track, chosen to differ; only their frames are taken. 0 is all.
+    per_track : number of views per track, chosen to differ; only their frames are taken. 0 takes
+        all views.
     min_confidence : objects with a lower confidence are not used for training.
     corrected_only : only objects with a label from a person are used for training.
     depth : the images are depth images in millimetres, not colour images.
@@ -73,7 +74,7 @@ def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
     """Return ``train`` or ``val`` for each run; runs of the same recording are in the same split.
 
     The draw depends on the content of the recordings, so that adding runs changes little. A single
-    recording is for training.
+    recording goes to the training split.
 
     Raises
     ------

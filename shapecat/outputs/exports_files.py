@@ -1,4 +1,4 @@
-"""What several exports share: PCD and PNG files, names, and clouds in the level frame."""
+"""Functions that several exports share: PCD and PNG files, names, clouds in the level frame."""
 
 import re
 import struct

@@ -58,7 +58,7 @@ def _reserve(file: BinaryIO, length: int) -> None:
 def copy_bytes(source: Path, target: Path, length: int) -> None:
     """Copy the first ``length`` bytes of a file over those of another, in the kernel if possible.
 
-    The target also gets reserved space after them: truncate it when everything is written.
+    Disk space is also reserved behind these bytes: truncate the target when everything is written.
     """
     with source.open("rb") as file, target.open("r+b") as copy:
         _reserve(copy, length)
@@ -182,7 +182,7 @@ class Appender:
         self._metadata.append(records.MetadataIndex(offset=offset, length=length, name=name))
 
     def finish(self) -> None:
-        """Write the summary of the original and the additions, the footer, and the end."""
+        """Complete the file: write a summary of the original and the additions, and the footer."""
         self._flush(0)
         self._write([records.DataEnd(0)])
         start = self._file.tell()

@@ -1,6 +1,6 @@
 """The file of a review. Rerun writes to a pipe, so that this module can handle disk errors.
 
-Rerun's own writer ends at the first error, and logging after that blocks for ever.
+Rerun's own writer ends at the first error, and logging after that blocks forever.
 """
 
 import os

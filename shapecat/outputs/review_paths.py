@@ -37,7 +37,7 @@ class _Path:
 
 
 class Paths:
-    """The paths of tracks by entity; an entity is rewritten when a path grows or ends."""
+    """The paths of tracks, by Rerun entity; an entity is rewritten when its paths grow or end."""
 
     def __init__(self, columns: Columns) -> None:
         """Start without paths."""

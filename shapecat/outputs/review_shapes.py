@@ -249,13 +249,13 @@ SCENE: Mapping[str, Drawing] = {
     "objects/graphs": Drawing(rr.LineStrips3D.from_fields(radii=0.0008), _graphs),
     "objects/surfaces": Drawing(None, _surfaces),
 }
-"""How a `DrawnScene` is drawn, by entity below the scene, a few times a second."""
+"""The `Drawing` of each entity below the scene, made from a `DrawnScene` a few times a second."""
 SKETCH: Mapping[str, Drawing] = {
     # Labels of boxes would cover the objects.
     "objects/boxes": Drawing(rr.Boxes3D.from_fields(radii=0.001, show_labels=False), _boxes),
     "objects/captions": Drawing(rr.Points3D.from_fields(radii=0.0005, show_labels=True), _captions),
 }
-"""How the `Sketch` of each object is drawn in every frame, by entity below the sensor."""
+"""The `Drawing` of each entity below the sensor, made from the objects' `Sketch` in every frame."""
 
 
 def paths(snapshots: Sequence[Sequence[Way]]) -> _Columns:

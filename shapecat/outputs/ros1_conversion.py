@@ -47,9 +47,9 @@ ConvertedChannel = tuple[AnnotationChannel, Callable[[bytes | memoryview], memor
 def convert_channel(channel: Channel) -> ConvertedChannel | None:
     """Convert a ROS 1 channel to ROS 2.
 
-    Types that exist in ROS 2 with the same layout get the ROS 2 definition, where field names
-    differ: ``K`` became ``k``. All others keep the definition in the bag. Only the sequence number
-    of headers is lost, since ROS 2 has none.
+    Types that exist in ROS 2 with the same layout get the ROS 2 definition, in which some field
+    names differ (``K`` became ``k``). All others keep the definition in the bag. Only the sequence
+    number of headers is lost, since ROS 2 has none.
 
     Returns
     -------

@@ -1,4 +1,4 @@
-"""Format as text which objects of a frame stand on which, according to a run's tables."""
+"""The objects of a frame and what they stand on, as a text tree, from the tables of a run."""
 
 from collections.abc import Sequence
 from pathlib import Path

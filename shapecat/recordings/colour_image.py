@@ -109,8 +109,8 @@ def pixels_of(image: ColourImage, *, shrink: int = 1) -> U1:
 
     Parameters
     ----------
-    shrink : a JPEG image is decoded at 1/2, 1/4 or 1/8 of its size, which is several times as
-        fast, but not below 1 / ``shrink`` of it. Other formats ignore this.
+    shrink : a JPEG image may be decoded at 1/2, 1/4 or 1/8 of its size, which is several times as
+        fast, but at no less than 1 / ``shrink``. Other formats ignore this.
 
     Returns
     -------
@@ -130,7 +130,8 @@ def encoded(image: ColourImage, pixels: U1) -> tuple[str, bytes]:
 
     Parameters
     ----------
-    pixels : (h, w, 3), from `pixels_of` at full size; it has shown that the image is undamaged.
+    pixels : (h, w, 3), from `pixels_of` at full size, which has checked that the image is
+        undamaged.
     """
     from PIL import Image  # noqa: PLC0415  # loaded where there is colour
 

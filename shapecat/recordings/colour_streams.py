@@ -47,7 +47,7 @@ class ColourStream:
 
     @property
     def grey(self) -> bool:
-        """Whether the images are grey: they are used only on request."""
+        """Whether the images are grey; grey images are used only on request."""
         return self.encoding == "mono8"
 
 

@@ -51,7 +51,7 @@ def decode(message: Message, known: dict[tuple[str, str, bytes], Decoder]) -> An
 
     Raises
     ------
-    MessageError : the message cannot be decoded; the text gives topic, type and reason.
+    MessageError : the message cannot be decoded; the error message names topic, type and reason.
     """
     channel = message.channel
     key = (channel.type, channel.encoding, channel.schema)

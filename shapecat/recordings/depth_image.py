@@ -10,7 +10,7 @@ from shapecat.recordings.messages import MessageError
 __all__ = ["DEPTH_ENCODINGS", "clean_depth", "depth_of_image"]
 
 DEPTH_ENCODINGS = {"16UC1": ("u2", 1000), "mono16": ("u2", 1000), "32FC1": ("f4", 1)}
-"""Pixel type and units per metre (REP 118)."""
+"""Pixel type and units per metre of each depth encoding (REP 118)."""
 
 
 def depth_of_image(message: Any, units: float | None = None) -> F4:

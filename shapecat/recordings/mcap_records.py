@@ -59,7 +59,7 @@ _T = TypeVar("_T")
 class TruncatedError(RecordingError):
     """The file ends inside a record, or a record claims to be longer than the file.
 
-    ``record`` is what is left of the record; None if not even its head is complete.
+    ``record`` is the truncated record; None if not even its opcode and length are complete.
     """
 
     def __init__(self, message: str, record: "Record | None" = None) -> None:
@@ -73,7 +73,7 @@ class ChunkError(RecordingError):
 
 
 class Record(NamedTuple):
-    """A record's opcode, and offset and length of its content in bytes; ``whole`` if complete."""
+    """Opcode of a record, offset and length of its content in bytes, and whether it is whole."""
 
     opcode: int
     offset: int

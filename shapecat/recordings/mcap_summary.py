@@ -29,7 +29,7 @@ _FOOTER = 9 + 20
 
 @dataclass
 class Summary:
-    """The summary of a file, or what a full scan found; ``data_end`` is a byte offset."""
+    """The summary of a file, read or made by a full scan; ``data_end`` is a byte offset."""
 
     schemas: dict[int, records.Schema] = field(default_factory=dict)
     channels: dict[int, records.Channel] = field(default_factory=dict)

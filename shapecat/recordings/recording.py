@@ -65,7 +65,8 @@ class Recording(ABC):
         ----------
         topics : names to read; all by default.
         start_ns, stop_ns : messages with ``start_ns <= log time < stop_ns`` are read.
-        needed : an indexed file may leave the data of other messages empty.
+        needed : returns whether the data of a message is needed. Other messages from an indexed
+            file may have empty data.
 
         Yields
         ------

@@ -48,7 +48,7 @@ _RATIO = 1000
 class BagError(RecordingError):
     """A record is damaged, or extends beyond the end of the file or chunk.
 
-    ``record`` is what is left of a truncated record; None if its header is incomplete.
+    ``record`` is a truncated record; None if its header is incomplete.
     """
 
     def __init__(self, message: str, record: "Record | None" = None) -> None:

@@ -33,7 +33,7 @@ def agreement(
     Returns
     -------
     The share of the compared points that agree with ``other``, and the mean inverse depth, in 1/m,
-    by which ``other`` sees these nearer; (0, 0) if too few points have a reading there.
+    by which ``other`` sees these points nearer; (0, 0) if too few points have a reading there.
     """
     turn, shift = other_from_one.rotation, other_from_one.translation
     known, agreeing, total = _compare(

@@ -53,7 +53,7 @@ def read_labels(path: Path, categories: Iterable[str] = ()) -> dict[int, TrackLa
     Raises
     ------
     OutputError : the table is unreadable, belongs to another run, or has invalid lines, which the
-        text lists.
+        error message lists.
     """
     table = read_track_table(path)
     _require_same_run(path, table, path.parent)
@@ -72,7 +72,8 @@ def adopt_labels(corrected: Path, folder: Path) -> None:
     Raises
     ------
     OutputError : the table is unreadable, belongs to another run, names tracks that the run does
-        not have, or has invalid labels. The text lists all such lines, and nothing is written.
+        not have, or has invalid labels. The error message lists all these lines, and nothing is
+        written.
     """
     with holding(folder):
         _adopt(corrected, folder)

@@ -49,7 +49,8 @@ _BEGUN = (".run.json.partial", ".export.json.partial")
 """Files that a kill may leave in a folder without a marker."""
 
 Marker = Callable[[Path], Collection[str] | None]
-"""Returns the names that shapecat makes in a folder, the marker last; None without a marker."""
+"""A function of a folder: the names that shapecat makes in it, the marker last; None without a
+marker."""
 
 
 def made_by_run(folder: Path) -> Collection[str] | None:

@@ -164,10 +164,10 @@ def same_options(run: RunInfo, planned: RunInfo) -> bool:
 
 
 def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], str]) -> RunInfo:
-    """Return the run.json of the interrupted run in a folder if it can go on as planned.
+    """Return the run.json of the interrupted run in a folder if ``planned`` can continue it.
 
-    It can if its settings, options, model, versions and recording are those of ``planned``.
-    Otherwise clear the folder, write ``planned`` as its run.json and return ``planned``.
+    That is possible if settings, options, model, versions and recording are the same. Otherwise
+    clear the folder, write ``planned`` as its run.json and return ``planned``.
 
     Parameters
     ----------

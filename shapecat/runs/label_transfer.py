@@ -25,7 +25,7 @@ __all__ = [
 
 IN_TIME, IN_PLACE = "frames in common", "places in another recording"
 TABLE_ALONE = "places in the table alone"
-"""Matching without the run of the table: its fixed frame and moved objects are unknown."""
+"""`Transfer.by` for a table without its run: fixed frame and moved objects are unknown."""
 
 
 class Transferred(NamedTuple):

@@ -37,7 +37,7 @@ _SEGMENT_FRAMES = 2 * GROUP_FRAMES
 
 @dataclass(frozen=True)
 class FrameRow:
-    """Values of the frames table that a `Perception` lacks; ``again`` marks a second look."""
+    """Values of the frames table that a `Perception` lacks; ``again`` marks a second pass."""
 
     log_time_ns: int
     fixed_from_sensor: Pose | None
@@ -50,8 +50,9 @@ class PerceptionTables:
 
     Frames are first written as *segments*, folders that appear when complete, so that an
     interrupted run resumes after its last segment. Leaving the block joins the segments into
-    tables, which do not depend on where a run was interrupted. A second look has segments of its
-    own, whose frames replace those of the first look when the tables are joined.
+    tables, which do not depend on where a run was interrupted. Frames that are perceived a second
+    time (`shapecat.runs.second_look`) have segments of their own, and replace the earlier results
+    when the tables are joined.
 
     Attributes
     ----------

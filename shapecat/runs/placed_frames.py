@@ -45,7 +45,7 @@ class PlacedFrames:
 
     @cached_property
     def poses(self) -> F8:
-        """Return ``fixed_from_sensor`` (f, 3, 4), metres; the identity if unknown or not used."""
+        """Return ``fixed_from_sensor`` (f, 3, 4), metres; the identity where it is not used."""
         return np.frombuffer(self._poses, np.float64).reshape(-1, 3, 4)
 
     @cached_property

@@ -1,8 +1,8 @@
 """Choose the frames to perceive again with the up direction of the whole recording.
 
-If the sensor poses are known, up is the same direction of the fixed frame in all frames. If they
-are not, but the frames before and after agree, the camera was at rest, and their up direction is
-used.
+If the sensor poses are known, all frames have the same up direction in the fixed frame. If they are
+unknown and the frames before and after a frame agree with each other, the camera is taken to be at
+rest, and the up direction of these frames is used.
 """
 
 from collections.abc import Iterable, Iterator

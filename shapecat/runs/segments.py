@@ -105,8 +105,8 @@ def _picked(name: str, keys: Sequence[Key], sources: Sequence[_Tables]) -> pa.Ta
 def group_frames(frames: int) -> int:
     """Return the number of frames per row group, for a table of ``frames`` frames.
 
-    A reader holds one row group, and 30 kB of metadata for each of them. So both the length and
-    the number of row groups grow with the square root of the number of frames.
+    A reader holds one row group in memory, and 30 kB of metadata for every row group. So both the
+    length and the number of row groups grow with the square root of the number of frames.
     """
     return GROUP_FRAMES * max(1, isqrt(frames // _BALANCE))
 

@@ -105,8 +105,8 @@ def read_shown_frames(
     """Yield the annotations of a run, frame by frame in reading order.
 
     It omits points, surfaces and posteriors, and is several times as fast as
-    `shapecat.runs.labels.read_labelled_frames`. Boxes enclose whole objects, as far as known; with
-    ``visible``, only their visible parts.
+    `shapecat.runs.labels.read_labelled_frames`. Boxes enclose whole objects where their size is
+    known; with ``visible``, only their visible parts.
     """
     shown = ShownTracks.read(folder, labels)
     wanted = ("topic", "frame", "stamp_ns", "log_time_ns", "frame_id", "up")

@@ -15,7 +15,7 @@ from shapecat.simulation.toys import TOYS
 __all__ = ["DISTRACTORS", "make_distractor"]
 
 DISTRACTORS: dict[str, Callable[[Generator], Mesh]] = {**KITCHEN, **TOOLS, **TOYS}
-"""Kinds of objects outside the categories, with the functions that make them."""
+"""The function that makes each kind of object outside the categories."""
 
 
 def make_distractor(rng: Generator, kind: str | None = None) -> tuple[str, Mesh]:

@@ -155,4 +155,4 @@ EVERYDAY: dict[str, Callable[[Generator], Mesh]] = {
     "vehicle": _vehicle,
     "fixture": _fixture,
 }
-"""The families, with the functions that make them."""
+"""The function that makes each family of objects."""

@@ -65,7 +65,7 @@ def round_table(radius: float, height: float, thick: float) -> Support:
 def make_shelf(
     width: float, depth: float, low: float, step: float
 ) -> tuple[list[Support], list[Support]]:
-    """Return three boards of a width and depth, and the two sides and the back of the shelf.
+    """Return three shelf boards, ``width`` by ``depth``, and the two sides and the back.
 
     The lowest board is at z = ``low``, the others ``step`` above each other.
     """

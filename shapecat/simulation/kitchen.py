@@ -197,4 +197,4 @@ KITCHEN: dict[str, Callable[[Generator], Mesh]] = {
     "pear": _pear,
     "mushroom": _mushroom,
 }
-"""The kinds, with the functions that make them."""
+"""The function that makes each kind of object."""

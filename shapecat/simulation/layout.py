@@ -68,8 +68,8 @@ class Layout:
 
     Parameters
     ----------
-    gap : least distance between footprints, metres.
-    headroom : greatest height of an object's top above its support, metres.
+    gap : minimum distance between footprints, metres.
+    headroom : maximum height of an object's top above its support, metres.
     enclosed : whether objects must stay within the edges of their support.
     """
 

@@ -17,7 +17,7 @@ __all__ = ["crossing", "rearranged", "walking"]
 
 
 def walking(rng: Generator, categories: Sequence[str], filming: Filming) -> World:
-    """Return a counter with objects of these categories, which the camera passes back and forth.
+    """Return a counter with objects of these categories; the camera walks along it and back.
 
     Objects leave the view and come back.
     """

@@ -46,8 +46,9 @@ def pile(
 
     Parameters
     ----------
-    categories : category of each object, or ``unknown``.
-    kinds : kinds of distractors for ``unknown``.
+    categories : category of each object; ``unknown`` is a distractor.
+    filming : number of frames and frame rate.
+    kinds : kinds of distractors to choose from.
     """
     supports = (*make_room(rng, wall_chance=0.2), make_table(rng))
     table = supports[-1]
@@ -136,9 +137,10 @@ def settled(
     *,
     highest_m: float = np.inf,
 ) -> tuple[Thing, ...]:
-    """Drop items onto supports; return the objects that stay on ``below``, numbered in order.
+    """Drop items onto supports; return the objects that come to rest on the support ``below``.
 
-    Objects that rise ``highest_m`` or more above its surface are removed too.
+    They are numbered from 0 in the order of ``items``. Objects that rise ``highest_m`` metres or
+    more above the surface of ``below`` are left out too.
     """
     rests = settle([support.mesh for support in supports], drops)
     stays = [_stays(k.mesh, rest, below, highest_m) for k, rest in zip(items, rests, strict=True)]

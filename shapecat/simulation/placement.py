@@ -63,7 +63,7 @@ def turn_about_z(pose: Pose, angle: float, place: F8) -> Pose:
 
 
 def choose_rest(found: tuple[Rest, ...], manner: str, rng: Generator) -> Rest | None:
-    """Draw a resting pose of a manner; None if there is none."""
+    """Draw a random resting pose of the given manner; None if there is none."""
     fitting = [rest for rest in found if rest.manner == manner]
     return fitting[int(rng.integers(len(fitting)))] if fitting else None
 

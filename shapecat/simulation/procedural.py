@@ -139,4 +139,4 @@ PROCEDURAL: dict[str, Callable[[Generator], Mesh]] = {
     "frame": _frame,
     **EVERYDAY,
 }
-"""The families, with the functions that make them."""
+"""The function that makes each family of objects."""

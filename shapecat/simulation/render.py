@@ -14,7 +14,7 @@ from shapecat.types import Camera, Pose
 __all__ = ["Geometry", "Image", "alone_pixels", "cropped", "geometry", "render"]
 
 NEAR_M = 0.02
-"""A triangle with a corner nearer than this is tested in every pixel of the image."""
+"""A triangle with a corner nearer than this, in metres, is tested in every pixel of the image."""
 
 
 class Geometry(Record):
@@ -103,7 +103,7 @@ def cropped(camera: Camera, left: int, top: int, width: int, height: int) -> Cam
 
 
 def alone_pixels(seen: Geometry, owner: int, camera: Camera, frame_from_camera: Pose) -> int:
-    """Count the pixels of one owner without the others, in an image three times as wide and high.
+    """Count the pixels of one owner, unoccluded, in an image three times as wide and high.
 
     The count is 0 if a vertex is behind the camera or nearer than `NEAR_M`. ``seen`` and
     ``frame_from_camera`` are as for `render`.

@@ -193,4 +193,4 @@ SCENES: dict[str, Callable[[Generator, _Wish], World]] = {
     "rearranged": lambda rng, wish: rearranged(rng, wish.draw(rng, 8), wish.filming),
     "empty": _empty,
 }
-"""The kinds of scenes."""
+"""The function that makes each kind of scene."""

@@ -148,4 +148,4 @@ TOOLS: dict[str, Callable[[Generator], Mesh]] = {
     "spool": _stool,
     "shoe": _shoe,
 }
-"""The kinds, with the functions that make them."""
+"""The function that makes each kind of object."""

@@ -136,4 +136,4 @@ TOYS: dict[str, Callable[[Generator], Mesh]] = {
     "plush": _plush,
     "blob": _blob,
 }
-"""The kinds, with the functions that make them."""
+"""The function that makes each kind of object."""

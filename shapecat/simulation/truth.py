@@ -15,11 +15,12 @@ from shapecat.types import Pose
 __all__ = ["AMBIGUOUS_PIXELS", "AMBIGUOUS_SHARE", "LISTED_PIXELS", "Truth", "frame_truth"]
 
 LISTED_PIXELS = 100
-"""Objects with fewer readings are listed as hidden."""
+"""Objects with fewer visible depth pixels than this are listed as hidden."""
 AMBIGUOUS_PIXELS = 250
-"""Objects with fewer readings have an ambiguous category."""
+"""Objects with fewer visible depth pixels than this have an ambiguous category."""
 AMBIGUOUS_SHARE = 0.4
-"""So do objects with a smaller visible fraction of the side that faces the camera."""
+"""The category is also ambiguous if less than this fraction of the side that faces the camera is
+visible."""
 
 
 @dataclass(frozen=True)

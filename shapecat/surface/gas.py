@@ -15,10 +15,10 @@ from shapecat.types import NeuralGas
 __all__ = ["MAX_NEURONS", "MIN_POINTS", "reconstruct"]
 
 MIN_POINTS = 24
-"""Fewest points of a cloud that has a surface."""
+"""Minimum number of points from which a surface is learned."""
 MAX_NEURONS = 512
-"""Most neurons that the settings may ask for: distances are compared without their 10 lowest bits,
-which hold the index of a neuron."""
+"""Maximum number of neurons in the settings: the 10 lowest bits of a distance are replaced by the
+index of a neuron when distances are compared."""
 _MAX_POINTS = 1200
 """Most points that are used, every k-th of a larger cloud: more only make the gas slower."""
 _NEURONS_PER_POINT = 0.45
@@ -49,8 +49,8 @@ def reconstruct(
 
     Parameters
     ----------
-    points : (m, 3) metres, finite, evenly spread (see `voxelize`), in any frame. Of more than
-        1200 points, every k-th is used.
+    points : (m, 3) metres, finite, evenly spread (see `voxelize`), in any frame. If there are more
+        than 1200, every k-th point is used.
     settings : with ``method`` "fritzke" a neuron is inserted at a fixed interval of signals (thesis
         Algorithm 3), with "thesis" where the error is large (Algorithm 4).
     rng : used for one draw; the same points, settings and generator state give the same graph.

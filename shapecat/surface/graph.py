@@ -35,7 +35,7 @@ def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
     cloud : the points.
     gas : the neurons, changed in place: those that are kept come first, in their old order.
     count : number of neurons in ``gas``.
-    share : least share of the points in a component.
+    share : minimum fraction of the points in a component that is kept.
 
     Returns
     -------

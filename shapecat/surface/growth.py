@@ -119,7 +119,7 @@ def grow_fritzke(
     rate_neighbour: float,
     oldest: int,
 ) -> int:
-    """Adapt a gas to signals drawn from a cloud, and insert neurons; return their new number.
+    """Adapt a gas to signals drawn from a cloud, and insert neurons; return the number of neurons.
 
     Source: Fritzke 1995, thesis Algorithm 3, whose steps are numbered here and in `_fire` (steps
     1 to 3 are the caller's).
@@ -198,7 +198,7 @@ def grow_thesis(
     rate_neighbour: float,
     oldest: int,
 ) -> int:
-    """Grow a gas until its neurons are close to the points; return their new number.
+    """Grow a gas until its neurons are close to the points; return the number of neurons.
 
     Source: thesis 5.2, Algorithm 4, which changes two steps of Algorithm 3. Step 12: a neuron is
     inserted where the error exceeds a limit. Step 18: the cloud is presented again until the mean
@@ -207,8 +207,8 @@ def grow_thesis(
     Parameters
     ----------
     cloud, state, gas, count, rate_winner, rate_neighbour, oldest : as in `grow_fritzke`.
-    target : most neurons to grow to.
-    epochs : most times that each point is presented.
+    target : maximum number of neurons.
+    epochs : maximum number of times that each point is presented.
     error_limit : squared distance, in the units of ``cloud`` (t_gamma).
     distance_limit : distance, in the units of ``cloud`` (t_alpha).
     """

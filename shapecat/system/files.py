@@ -60,7 +60,7 @@ def replacing(path: Path) -> Iterator[Path]:
 
 
 def require_writable(path: Path) -> None:
-    """Make the folders above an output file, and check before the work that it can be written.
+    """Make the parent folders of an output file, and check in advance that it can be written.
 
     Raises
     ------
@@ -120,7 +120,8 @@ def lock(folder: Path) -> int | None:
 
     Returns
     -------
-    None if another process holds the lock; never on a file system without locks.
+    The file descriptor; None if another process holds the lock, which cannot be detected on a file
+    system without locks.
     """
     held = os.open(folder, os.O_RDONLY)
     try:
@@ -135,7 +136,7 @@ def lock(folder: Path) -> int | None:
 
 @contextmanager
 def holding(folder: Path) -> Iterator[None]:
-    """Hold the lock of a folder in the block; wait while another thread or process holds it.
+    """Hold the lock of a folder during the block; wait while another thread or process holds it.
 
     Raises
     ------

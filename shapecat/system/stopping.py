@@ -85,7 +85,7 @@ def _note(signum: int, frame: FrameType | None) -> None:
 
 @contextmanager
 def heeding_signals() -> Iterator[None]:
-    """Store SIGINT and SIGTERM in the block instead of raising.
+    """Store SIGINT and SIGTERM during the block instead of raising.
 
     Ignored signals, such as SIGINT in a background job, stay ignored. Outside the main thread,
     which alone may handle signals, nothing changes.

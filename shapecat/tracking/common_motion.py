@@ -1,4 +1,4 @@
-"""A motion common to all objects, caused by a turning table or by a sensor without a pose."""
+"""The common motion of all objects, on a turntable or before a sensor whose pose is unknown."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -55,16 +55,20 @@ class CommonMotion:
 
 
 def find_common_motion(hits: Hits, members: Sequence[I4]) -> CommonMotion | None:
-    """Find the common rotation about up and horizontal translation of each frame, if any.
+    """Find the motion that all objects have in common, relative to the sensor, if there is one.
+
+    In each frame it is a rotation about the up direction and a horizontal translation.
 
     Parameters
     ----------
-    members : indices of the hits of each track, ascending; several tracks may be of one object.
+    hits : all detections of a stream.
+    members : for each track, the indices of its detections in ``hits``, ascending; several tracks
+        may belong to one object.
 
     Returns
     -------
-    The motion; None if fewer than three tracks have at least five hits, if less than 70 % of their
-    hits belong to moving objects, or if less than 70 % fit a common motion.
+    The motion; None if fewer than three tracks have at least five detections, if less than 70 % of
+    their detections belong to moving objects, or if less than 70 % fit a common motion.
 
     Notes
     -----

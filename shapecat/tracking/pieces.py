@@ -28,9 +28,10 @@ def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
     one stays in the track.
 
     An object that moves behind a narrow occluder appears on one side before it has disappeared on
-    the other, so that one track ends soon after the other one began. Until then only a part of it
-    was visible, so its shorter side may be as long as its longer one. If one detection sometimes
-    covered both sides of the occluder, the size of this detection counts.
+    the other, so that one track ends soon after the other one began. In both tracks only a part of
+    the object was visible, so the shorter side of the whole object may be as long as its longer
+    side. If one detection sometimes covered both sides of the occluder, the size of this detection
+    counts.
 
     Parameters
     ----------

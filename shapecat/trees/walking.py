@@ -10,7 +10,7 @@ from shapecat.jit import kernel
 __all__ = ["LANES", "Trees", "find_leaves"]
 
 LANES = 8
-"""Trees that are walked at the same time: while one waits for memory, the others go on."""
+"""Number of trees walked at the same time: while one waits for memory, the others go on."""
 
 
 class Trees(NamedTuple):
@@ -20,7 +20,7 @@ class Trees(NamedTuple):
     ----------
     roots : (t,) index of the root of each tree.
     feature, threshold : (n,) a sample goes left if this feature is <= this threshold.
-    left : (n,) index of the left child, which the right child follows; 0 in leaves.
+    left : (n,) index of the left child, 0 in leaves; the right child is the next node.
     """
 
     roots: I4

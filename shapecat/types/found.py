@@ -1,4 +1,4 @@
-"""What is found in one frame, before tracking."""
+"""Records of the planes and objects found in one frame, before tracking."""
 
 from collections.abc import Mapping
 

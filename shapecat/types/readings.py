@@ -1,4 +1,4 @@
-"""What a sensor measured, by which camera, and where it was."""
+"""Records of the measurements of a sensor, its camera and its pose."""
 
 from dataclasses import dataclass
 

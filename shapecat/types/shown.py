@@ -1,4 +1,4 @@
-"""What the outputs show of one frame: objects with the final label of their track."""
+"""Records that the outputs show: the objects of a frame with the final label of their track."""
 
 from dataclasses import dataclass
 from typing import NamedTuple

@@ -43,7 +43,7 @@ def asset(name: str) -> str:
 
 
 def template(name: str) -> Template:
-    """Return a file of the page as a template."""
+    """Return a file that is part of the page, as a template to fill in."""
     return Template(asset(name))
 
 

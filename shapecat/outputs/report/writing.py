@@ -131,11 +131,11 @@ class Reports:
 
 
 def read_reports(folders: Sequence[Path], observe: Observer = _ignore) -> Reports:
-    """Read the content of the reports of runs.
+    """Read the content of the report page of each run, and of their index.
 
     Parameters
     ----------
-    folders : runs, or folders of runs. There is an index, unless this is a single run.
+    folders : runs, or folders of runs. There is no index if they hold a single run.
     observe : called with the phase, the number of runs read, and the total.
 
     Raises
