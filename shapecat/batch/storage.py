@@ -181,7 +181,7 @@ class Location:
             self._tried("removed", lambda: self._system.rm_file(self._path))
 
     def names(self) -> set[str]:
-        """Return the names in a folder."""
+        """Return the names of the files and folders in a folder."""
         return {PurePosixPath(url).name for url, _ in self.walk(deep=False)}
 
     def walk(self, *, deep: bool = True) -> Iterator[tuple[str, Mapping[str, Any]]]:

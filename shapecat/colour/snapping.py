@@ -25,7 +25,7 @@ _WINDOW_PX = 6.0
 _ERROR_PX = 3.0
 """A pixel this far from the outline changes sides if the other side is e times as likely."""
 _FEWEST = 4
-"""Fewest samples of each side; with fewer, the colour of a pixel has no influence."""
+"""Minimum number of samples of each side; with fewer, the colour of a pixel has no influence."""
 _NOISE = 64.0
 """Variance that noise adds to each channel, in squared grey levels."""
 _CERTAIN = 3.0

@@ -28,10 +28,10 @@ ENOUGH_POINTS = 256
 _TOP = 0.98
 """Share of the points below the top."""
 _NOISY_M, _FLAT = 0.004, 1 / 3
-"""Most that noise lifts the highest points of a flat top; share of the points that make a face
-flat."""
+"""Largest height by which noise lifts points of a flat top, metres; fraction of the points that
+make a face flat."""
 _HANDLE = 0.06
-"""Least that a handle sticks out beyond the oval of a cup, as a share of its radius."""
+"""Minimum length by which a handle sticks out of a cup's oval, as a fraction of the radius."""
 _EDGEWISE = -0.2
 """Cosine of the angle to the sensor above which an outline is visible: just past edge-on."""
 _NOISE_M, _GUESS = 0.006, 0.35
@@ -41,7 +41,7 @@ _CIRCULAR = 1e3
 
 
 class _OutlinePrior(NamedTuple):
-    """What is known about the outlines of a category.
+    """Prior knowledge about the outlines of a category.
 
     Attributes
     ----------

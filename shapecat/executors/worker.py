@@ -64,7 +64,7 @@ class Worker:
         self._ask.close()
 
     def send(self, task: Task) -> None:
-        """Send a call; it waits while another one runs. The listening thread sets its future."""
+        """Send a call, which waits while another one runs; the receiving thread sets its future."""
         parts = _packed(task.call)
         self._sent.put(task)
         with suppress(OSError):  # the listener gets the same error

@@ -107,8 +107,8 @@ def choose_colour(
 
     Returns
     -------
-    None if no colour stream belongs to the depth stream. ``info_topic`` is None where the only
-    calibration nearby is the depth stream's.
+    The colour stream; None if none belongs to the depth stream. ``info_topic`` is None where the
+    only calibration nearby is the depth stream's.
 
     Raises
     ------

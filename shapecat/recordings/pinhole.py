@@ -41,8 +41,8 @@ def fit_pinhole(points: F4) -> PinholeFit | None:
 
     Returns
     -------
-    None if there are few points, or they cover a narrow part of the image, or no camera reprojects
-    95 % of them to within `LARGEST_ERROR_PX`.
+    The fit; None if there are few points, or they cover a narrow part of the image, or no camera
+    reprojects 95 % of them to within `LARGEST_ERROR_PX`.
     """
     height, width = points.shape[:2]
     sample = _sample(points)

@@ -97,8 +97,8 @@ class TransformBuffer:
 
         Returns
         -------
-        False if the transform is invalid: a frame has no name or is its own parent, a number is
-        not finite, or the quaternion is zero.
+        Whether it was added; False if the transform is invalid: a frame has no name or is its own
+        parent, a number is not finite, or the quaternion is zero.
         """
         parent, child = parent.strip().lstrip("/"), child.strip().lstrip("/")
         translation, quaternion = (np.asarray(part, np.float64) for part in parent_from_child)
@@ -123,7 +123,7 @@ class TransformBuffer:
 
         Returns
         -------
-        Empty if the frame does not occur in any transform.
+        The frame ids; empty if the frame does not occur in any transform.
 
         Raises
         ------
@@ -225,7 +225,8 @@ def fixed_frame(buffer: TransformBuffer, frame_id: str) -> str | None:
 
     Returns
     -------
-    None if ``frame_id`` is in no transform, if it is the root itself, or if frames form a loop.
+    The frame id; None if ``frame_id`` is in no transform, if it is the root itself, or if frames
+    form a loop.
     """
     try:
         root = buffer.root_of(frame_id)

@@ -15,7 +15,7 @@ Kinect and twice its noise; 6 mm at 1 m, 24 mm at 2 m."""
 _SAMPLES = 256
 """Approximate number of points to compare."""
 _KNOWN = 0.5
-"""Least share of them that must have a reading in the other image."""
+"""Minimum fraction of the compared points that must have a reading in the other image."""
 
 
 def agreement(

@@ -24,20 +24,21 @@ from shapecat.types import Candidate, Detection, Frame, FullBox, NeuralGas, Pose
 __all__ = ["KeyView", "Repeat", "Sight", "find_repeats", "reused", "sight_of"]
 
 _PLACE_M = 0.015
-"""Most that the visible centre of a still object moves between similar views."""
+"""Largest shift of the visible centre of an object at rest, between similar views, metres."""
 _TURN_DEG, _FARTHER = 6.0, 0.05
-"""Most that similar views differ in direction, and in distance (as a share)."""
+"""Largest differences of similar views: in direction, degrees, and in distance, as a fraction."""
 _SIZE_M, _HEIGHT_M, _UP_DEG = 0.02, 0.01, 2.0
-"""Most that noise changes the size of the box, its height above the support, and up."""
+"""Largest changes due to noise, of the box size and the height above the support, metres, and of
+up, degrees."""
 _AREA = 0.25
-"""Most that noise changes the number of pixels at the same distance, as a share."""
+"""Largest change of the number of pixels due to noise, at the same distance, as a fraction."""
 _AGREE, _BIAS = 0.95, 0.002
-"""Least share of the points that must agree, both ways; largest mean difference of their inverse
-depths, 1/m: 2 mm at 1 m."""
+"""Minimum fraction of the points of either view that must agree with the other view; largest mean
+difference of their inverse depths, 1/m: 2 mm at 1 m."""
 
 
 _TRIES = 3
-"""Earlier views that are compared point by point, the newest first: masks may flicker."""
+"""Number of earlier views to compare point by point, the newest first: masks may flicker."""
 
 
 class Sight(NamedTuple):

@@ -145,7 +145,7 @@ def correct_label(folder: Path, track: int, label: str, *, seen: str) -> str:
 
     Returns
     -------
-    Why the label was rejected; empty if it was set.
+    The reason why the label was rejected; empty if it was set.
 
     Raises
     ------

@@ -15,7 +15,7 @@ _PITCH_M = 0.004
 _BLOCKS = 4
 """Blocks along each axis that a hollow mesh is cut into; a wall is nearly flat within a block."""
 _SKIN_M = 0.001
-"""Half the least thickness of a part: physics engines reject solids without volume."""
+"""Half the minimum thickness of a part: physics engines reject solids without volume."""
 _HOLLOW = 0.2
 _COLUMNS = 9
 

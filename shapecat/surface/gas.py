@@ -20,7 +20,7 @@ MAX_NEURONS = 512
 """Maximum number of neurons in the settings: the 10 lowest bits of a distance are replaced by the
 index of a neuron when distances are compared."""
 _MAX_POINTS = 1200
-"""Most points that are used, every k-th of a larger cloud: more only make the gas slower."""
+"""Maximum number of points used, every k-th of a larger cloud: more only make the gas slower."""
 _NEURONS_PER_POINT = 0.45
 _FEWEST_NEURONS = 12
 _RATE = 0.1
@@ -32,7 +32,7 @@ _OLDEST = 30
 _GROWTH = 0.6
 """Share of the signals within which all neurons are inserted."""
 _EPOCHS = 8
-"""Most epochs of the thesis's rule: it hardly ever reaches its distance limit sooner."""
+"""Maximum number of epochs of the thesis's rule, which rarely reaches its distance limit sooner."""
 _ERROR_LIMIT = 3.0
 """t_gamma, relative to the error per epoch of a neuron with its share of the surface."""
 _DISTANCE_LIMIT = 0.7

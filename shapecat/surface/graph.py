@@ -39,7 +39,7 @@ def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
 
     Returns
     -------
-    Empty, (0, 0), if fewer than 3 neurons are kept.
+    The adjacency (n, n); empty, (0, 0), if fewer than 3 neurons are kept.
     """
     adjacent = np.zeros((count, count), np.bool_)
     for i in range(count):

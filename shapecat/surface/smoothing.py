@@ -10,10 +10,10 @@ from shapecat.surface.voxels import read_only, voxelize
 __all__ = ["smooth", "thin"]
 
 _MOST_CELLS = 1 << 20
-"""Most cells along an axis: three such indices fit in 63 bits."""
+"""Maximum number of cells along an axis: three indices fit in 63 bits."""
 _FEWEST_PLANE, _FEWEST_QUADRIC = 4, 9
-"""Fewest neighbours, including the point itself, for a plane and for a quadric; some more than they
-have unknowns."""
+"""Minimum numbers of neighbours, including the point itself, for a plane and for a quadric: a few
+more than their unknowns."""
 _RIDGE = 1e-4
 _SQUARINGS = 6
 
