@@ -17,11 +17,12 @@ import pytest
 from click.testing import Result
 from PIL import Image
 
-from shapecat.evaluation.comparing import Difference, compare
+from shapecat.evaluation.comparing import Difference, _kind, _Tally, compare
 from shapecat.evaluation.comparison_matching import Matched, seen_together
 from shapecat.evaluation.comparison_pictures import COLOURS, draw_frame
 from shapecat.evaluation.labellings import Item, Labelling
 from shapecat.evaluation.references_coco import CocoLabels, filled_polygon, rle_mask
+from shapecat.evaluation.references_kitti import KittiLabels
 from shapecat.runs.tables import DETECTIONS, FRAMES, TRACKS
 
 Run = Callable[..., Result]
@@ -148,6 +149,7 @@ def test_figures_are_those_by_hand(run: Path, truth: Path) -> None:
     assert category["n"] == 6  # the box in doubt is not asked for
     assert category["accuracy"] == 0.5  # cups right, the box always a can
     assert category["view_accuracy"] == pytest.approx(2 / 6, abs=1e-4)
+    assert (category["balanced"], category["view_balanced"]) == (0.5, 0.3333)
     assert category["taken_for"] == [{"true": "box", "label": "can", "n": 3}]
     assert category["ece"] == pytest.approx(0.8 - 2 / 6, abs=1e-4)
     tracking = figures["tracking"]
@@ -190,6 +192,25 @@ def test_the_table_tells_every_difference_once(shapecat: Run, run: Path, truth: 
         assert words in page
     assert "6 differences: 3 category" in result.stdout
     assert "the recording is missing" in result.stderr
+
+
+def test_an_identity_is_lost_once() -> None:
+    """From the frame after the switch on, the new track is the one that the object had before."""
+    tally, cup = _Tally(), Item(11, "cup")
+    kinds = [_kind(tally, Item(track, "cup"), cup, 0.9) for track in (5, 5, 6, 6, 6, 5, 5)]
+
+    assert kinds == [None, None, "identity", None, None, "identity", None]
+
+
+def test_frames_of_one_side_alone_are_told_with_that_side(
+    shapecat: Run, run: Path, truth: Path
+) -> None:
+    """Swapped, they would send the reader to look for the gap in the wrong place."""
+    entries = json.loads(truth.read_text())
+    later = [{**entries[0], "stamp_ns": START + STEP * k} for k in (5, 6, 7, 8)]
+    truth.write_text(json.dumps([*entries[:2], *later]))
+
+    assert "1 only in the run, 4 only in the reference" in shapecat("compare", run, truth).stdout
 
 
 def test_an_object_in_doubt_has_no_wrong_category(run: Path, truth: Path) -> None:
@@ -332,6 +353,41 @@ def test_kitti_boxes_come_back_from_a_tilted_camera(
     assert found["box_iou"]["mean"] > 0.999
 
 
+def test_labels_of_two_topics_are_not_mixed(tmp_path: Path) -> None:
+    """Cameras that are triggered together give frames of the same stamps and numbers."""
+    topics = {"/left": "cup", "/right": "wine glass", "/top": None}
+    images = [
+        {"id": k, "topic": topic, "stamp_ns": START, "file_name": "x", "width": 4, "height": 3}
+        for k, topic in enumerate(topics)
+    ]
+    square = [[1, 0, 3, 0, 3, 2, 1, 2]]
+    annotations = [
+        {"id": k, "image_id": k, "category_id": k, "segmentation": square} for k in (0, 1)
+    ]
+    names = [{"id": k, "name": name} for k, name in enumerate(topics.values())]
+    content = {"categories": names, "annotations": annotations, "images": images}
+    (tmp_path / "label_2").mkdir()
+    lines = [f"{k},{topic},7,{START}" for k, topic in enumerate(topics)]
+    (tmp_path / "frames.csv").write_text("\n".join(["number,topic,frame,stamp_ns", *lines]))
+    for k, name in enumerate(topics.values()):
+        # Height 0.3, width 0.1, length 0.5; the bottom is in (1, 2, 4).
+        line = f"{str(name).replace(' ', '_')} 0 0 0 0 0 0 0 0.3 0.1 0.5 1 2 4 0.6\n"
+        (tmp_path / "label_2" / f"{k}.txt").write_text(line if name else "")
+
+    for labels in (CocoLabels(Path("labels.json"), content), KittiLabels(tmp_path)):
+        assert labels.frames == 3
+        assert labels.at(("/bottom", 7), START) is None
+        for topic, name in topics.items():
+            found = labels.at((topic, 7), START)
+            assert found is not None
+            assert [item.category for item in found.items] == ([name] if name else [])
+    found = KittiLabels(tmp_path).at(("/right", 7), START)
+    assert found is not None
+    box = found.items[0].box
+    assert box is not None
+    np.testing.assert_allclose([box.center, box.size], [[1, 1.85, 4], [0.5, 0.1, 0.3]], rtol=1e-6)
+
+
 def refused(shapecat: Run, *words: object) -> tuple[int, str]:
     result = shapecat("compare", *words)
     assert result.stdout == ""
@@ -380,3 +436,22 @@ def test_a_part_split_off_is_seen_in_the_picture() -> None:
         assert pixels[part][0].argmax() == np.argmax(COLOURS[name])
     assert (pixels[70:] == pixels[70]).all()
     assert len(np.unique(pixels, axis=0)) == 3
+
+
+def test_the_tint_of_an_object_is_that_of_its_own_difference() -> None:
+    """Found and true objects come in different orders."""
+    true = Labelling((Item(1, "cup", np.arange(60, 90)), Item(2, "box", np.arange(0, 40))))
+    found = Labelling((Item(5, "can", np.arange(0, 40)), Item(6, "cup", np.arange(60, 90))))
+    rows = [
+        Difference("/d", 0, START, "category", category="can"),
+        Difference("/d", 0, START, None),
+    ]
+    shape = Labelling(true.items, None, (10, 10))
+    picture = draw_frame(("/d", 0), None, found, shape, {0: 1, 1: 0}, rows, 1.0)
+
+    assert picture is not None
+    content = base64.b64decode(picture.image.split(",")[1])
+    pixels = np.array(Image.open(io.BytesIO(content)).convert("RGB")).reshape(100, 3).astype(int)
+    wrong, right = (pixels[k] - pixels[50] for k in (20, 75))
+    assert wrong.argmax() == np.argmax(COLOURS["category"])
+    assert right.argmax() == np.argmax(COLOURS["both"])

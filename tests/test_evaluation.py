@@ -18,7 +18,7 @@ from shapecat.arrays import F4
 from shapecat.errors import ModelError, RecordingError
 from shapecat.evaluation import Report, evaluate_folder, format_report, metrics, read_dataset
 from shapecat.evaluation.fused import Fused, fuse_views
-from shapecat.evaluation.page import write_page
+from shapecat.evaluation.page import confusion_svg, write_page
 from shapecat.evaluation.training import (
     learn_on_folder,
     order_categories,
@@ -226,6 +226,19 @@ def test_the_page_is_whole_and_escapes_names(trained: Path, tmp_path: Path) -> N
     for picture in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
         ET.fromstring(picture)  # noqa: S314  we wrote it
     assert page.count("<svg") == 2 + len(report.breakdowns) == 5
+
+
+def test_the_drawn_confusion_has_true_categories_in_rows() -> None:
+    """Transposed, it would tell that cans are taken for cups."""
+    root = ET.fromstring(confusion_svg(("cup", "can"), [[4, 3], [0, 7]]))  # noqa: S314  we drew it
+    texts = {e.text: e.attrib for e in root.iter() if e.tag.endswith("text")}
+    heads = [e.attrib for e in root.iter() if e.text == "can"]  # of its row and its column
+    cup = next(e.attrib for e in root.iter() if e.text == "cup")
+
+    assert texts["3"]["y"] == cup["y"]
+    assert float(texts["3"]["x"]) == max(float(head["x"]) for head in heads)
+    assert texts["7"]["y"] == heads[0]["y"] != cup["y"]
+    assert "0" not in texts
 
 
 def test_the_markdown_page_has_its_pictures_beside_it(trained: Path, tmp_path: Path) -> None:

@@ -1,13 +1,17 @@
 """Labelled objects of a frame, from any source."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import TypeVar
 
 from shapecat.arrays import F4, U4, Bool
 from shapecat.runs.tables import Key
 from shapecat.types import Box
 
-__all__ = ["Item", "Labelling", "Reference"]
+__all__ = ["Item", "Labelling", "Reference", "find_frame"]
+
+_Frame = TypeVar("_Frame")
 
 
 @dataclass(frozen=True)
@@ -69,3 +73,16 @@ class Reference(ABC):
     @abstractmethod
     def describe_frames(self) -> str:
         """Describe the range of frames in a few words."""
+
+
+def find_frame(
+    frames: Mapping[tuple[str | None, int], _Frame], key: Key, stamp_ns: int
+) -> _Frame | None:
+    """Return the entry of a frame; None if there is none.
+
+    Parameters
+    ----------
+    frames : entries by topic, None for any topic, and by timestamp (ns) or frame number.
+    """
+    places = ((topic, number) for number in (stamp_ns, key[1]) for topic in (key[0], None))
+    return next((frames[place] for place in places if place in frames), None)

@@ -10,7 +10,7 @@ import numpy as np
 
 from shapecat.arrays import I4, Bool
 from shapecat.errors import RecordingError
-from shapecat.evaluation.labellings import Item, Labelling, Reference
+from shapecat.evaluation.labellings import Item, Labelling, Reference, find_frame
 from shapecat.runs.tables import Key
 
 __all__ = ["CocoLabels", "filled_polygon", "rle_mask"]
@@ -24,7 +24,8 @@ class CocoLabels(Reference):
     """Masks of a COCO file, as polygons or run lengths.
 
     An image names its frame by ``stamp_ns``, by ``frame``, or by a number in its ``file_name``: a
-    timestamp in nanoseconds, else the last number, which is the frame number.
+    timestamp in nanoseconds, else the last number, which is the frame number. An image without
+    ``topic`` is of any topic.
     """
 
     kind = "COCO labels"
@@ -35,15 +36,17 @@ class CocoLabels(Reference):
         self._labels = defaultdict(list)
         for item in content["annotations"]:
             self._labels[item["image_id"]].append({**item, "name": names[item["category_id"]]})
-        self._images = {_number_of(image): image for image in content["images"]}
+        self._images = {
+            (image.get("topic"), _number_of(image)): image for image in content["images"]
+        }
         self.frames = len(self._images)
         items = [item for some in self._labels.values() for item in some]
         self.tracked = bool(items) and all(_track_of(item) is not None for item in items)
 
     def at(self, key: Key, stamp_ns: int) -> Labelling | None:
         """Return the objects of a frame; None if the labels lack this frame."""
-        image = self._images.get(stamp_ns) or self._images.get(key[1])
-        if image is None or image.get("topic", key[0]) != key[0]:
+        image = find_frame(self._images, key, stamp_ns)
+        if image is None:
             return None
         height, width = int(image["height"]), int(image["width"])
         if not 0 < height * width <= _MOST_PIXELS:
@@ -67,7 +70,7 @@ class CocoLabels(Reference):
 
     def describe_frames(self) -> str:
         """Return the range of timestamps or frame numbers."""
-        numbers = list(self._images)
+        numbers = [number for _, number in self._images]
         return f"images {min(numbers)} to {max(numbers)}" if numbers else "no images"
 
 

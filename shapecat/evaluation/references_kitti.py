@@ -8,7 +8,7 @@ from scipy.linalg import rq
 
 from shapecat.arrays import F8
 from shapecat.errors import RecordingError
-from shapecat.evaluation.labellings import Item, Labelling, Reference
+from shapecat.evaluation.labellings import Item, Labelling, Reference, find_frame
 from shapecat.geometry import quaternion_from_rotation
 from shapecat.runs.tables import Key
 from shapecat.types import Box
@@ -19,9 +19,9 @@ __all__ = ["KittiLabels"]
 class KittiLabels(Reference):
     """Boxes of KITTI labels, without masks and identities.
 
-    ``frames.csv`` gives the timestamp of each label file; without it, the file's number is the
-    frame number. Boxes are in the rectified camera frame, and the rotation in ``P2`` turns them
-    into the sensor frame.
+    ``frames.csv`` gives the timestamp of each label file, and its topic where there are several;
+    without it, the file's number is the frame number. Boxes are in the rectified camera frame, and
+    the rotation in ``P2`` turns them into the sensor frame.
     """
 
     kind = "KITTI labels"
@@ -30,7 +30,9 @@ class KittiLabels(Reference):
         self._folder = folder
         numbers = sorted(path.stem for path in (folder / "label_2").glob("*.txt"))
         try:
-            self._names = _stamps(folder / "frames.csv") or {int(name): name for name in numbers}
+            self._names = _stamps(folder / "frames.csv") or {
+                (None, int(name)): name for name in numbers
+            }
         except (OSError, ValueError, KeyError) as error:
             msg = f"{folder}: not a folder of KITTI labels ({error})"
             raise RecordingError(msg) from error
@@ -38,7 +40,7 @@ class KittiLabels(Reference):
 
     def at(self, key: Key, stamp_ns: int) -> Labelling | None:
         """Return the objects of a frame; None if the labels lack this frame."""
-        name = self._names.get(stamp_ns) or self._names.get(key[1])
+        name = find_frame(self._names, key, stamp_ns)
         if name is None:
             return None
         path = self._folder / "label_2" / f"{name}.txt"
@@ -53,16 +55,23 @@ class KittiLabels(Reference):
 
     def describe_frames(self) -> str:
         """Return the range of timestamps or frame numbers."""
-        known = list(self._names)
+        known = [number for _, number in self._names]
         return f"frames {min(known)} to {max(known)}" if known else "no frames"
 
 
-def _stamps(path: Path) -> dict[int, str]:
-    """Return the name of each label file by timestamp, ns; empty without ``frames.csv``."""
+def _stamps(path: Path) -> dict[tuple[str | None, int], str]:
+    """Return the name of each label file by topic and timestamp, ns; empty without ``frames.csv``.
+
+    Labels of a single topic are of any topic: a recording may call it otherwise.
+    """
     if not path.is_file():
         return {}
     with path.open(newline="", encoding="utf-8") as file:
-        return {int(row["stamp_ns"]): row["number"] for row in csv.DictReader(file)}
+        rows = list(csv.DictReader(file))
+    several = len({row.get("topic") for row in rows}) > 1
+    return {
+        (row["topic"] if several else None, int(row["stamp_ns"])): row["number"] for row in rows
+    }
 
 
 def _sensor_from_rectified(path: Path) -> F8:
