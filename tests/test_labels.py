@@ -15,7 +15,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from shapecat.errors import OutputError
 from shapecat.pipeline import annotate_again
-from shapecat.runs.corrections import _given, adopt_labels, read_labels
+from shapecat.runs.corrections import _given, adopt_labels, read_labels, relabel
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.perceived import FrameRow, PerceptionTables
@@ -201,6 +201,20 @@ def test_a_table_corrected_in_place_keeps_its_original(run: Path) -> None:
 
     assert (run / "tracks.original.csv").read_text() == ORIGINAL
     assert read_labels(run / "tracks.csv")[4].category == "bowl"
+
+
+def test_a_label_that_was_not_applied_yet_is_not_original(run: Path) -> None:
+    """A person writes some labels into tracks.csv, and takes others from elsewhere."""
+    (run / "tracks.csv").write_text(labelled(t4="bowl"))
+    other = run.parent / "other"
+    shutil.copytree(run, other)
+    (run.parent / "mine.csv").write_text(labelled(t2="box"))
+    adopt_labels(run.parent / "mine.csv", run)
+
+    assert relabel(other, {2: "box"}) == {}
+    for folder in (run, other):
+        assert (folder / "tracks.original.csv").read_text() == ORIGINAL
+    assert read_labels(other / "tracks.csv")[4].category == "bowl"
 
 
 def test_lines_left_out_keep_their_label(run: Path) -> None:

@@ -100,12 +100,7 @@ def _adopt(corrected: Path, folder: Path) -> None:
     known_categories = read_run(folder)["model"]["categories"]
     _, misread = resolve_labels(result.rows, known_categories, one_frame=_one_frame(folder))
     _refuse(corrected, problems + _lines(result.rows, misread))
-    if not original.exists():
-        with replacing(original) as path:
-            if in_place:
-                write_track_table(path, unlabelled(base))
-            else:
-                path.write_bytes(current.read_bytes())
+    _keep_original(folder, base)
     with replacing(current) as path:
         write_track_table(path, result)
 
@@ -121,19 +116,24 @@ def relabel(folder: Path, labels: Mapping[int, str]) -> dict[int, str]:
     ------
     OutputError : the run's table is unreadable, invalid or another run's, or cannot be written.
     """
-    current, original = folder / "tracks.csv", folder / ORIGINAL
+    current = folder / "tracks.csv"
     base = read_track_table(current)
     _require_same_run(current, base, folder)
     categories, one_frame = read_run(folder)["model"]["categories"], _one_frame(folder)
     before = find_misread(base.rows, categories, one_frame=one_frame)
     _refuse(current, [*base.problems, *_lines(base.rows, before)])
     rows, refused = _given(base.rows, labels, categories, one_frame=one_frame)
-    if not original.exists():
-        with replacing(original) as path:
-            write_track_table(path, unlabelled(base))
+    _keep_original(folder, base)
     with replacing(current) as path:
         write_track_table(path, replace(base, rows=rows))
     return refused
+
+
+def _keep_original(folder: Path, table: TrackTable) -> None:
+    """Write the table of a run without its labels to tracks.original.csv, unless it exists."""
+    if not (folder / ORIGINAL).exists():
+        with replacing(folder / ORIGINAL) as path:
+            write_track_table(path, unlabelled(table))
 
 
 def correct_label(folder: Path, track: int, label: str, *, seen: str) -> str:
