@@ -223,6 +223,7 @@ def test_added_messages_are_found_by_time(tmp_path: Path) -> None:
     assert summary is not None
     assert summary.statistics is not None
     assert summary.statistics.message_end_time == STAMP + 399 * SECOND
+    assert summary.statistics.chunk_count == len(summary.chunk_indexes) > 3
     topics = {channel.id: channel.topic for channel in summary.channels.values()}
     counts = {topics[k]: n for k, n in summary.statistics.channel_message_counts.items()}
     assert counts == {"/points": 9, "/shapecat/detections": 400, "/shapecat/scene": 400}

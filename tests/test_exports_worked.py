@@ -17,6 +17,7 @@ from shapecat.evaluation.clouds import read_pcd
 from shapecat.geometry import IDENTITY
 from shapecat.outputs.dataset_frames import DatasetImage
 from shapecat.outputs.exports_coco import write_coco, write_yolo
+from shapecat.outputs.exports_crops import write_crops
 from shapecat.outputs.exports_kitti import rectified_from_sensor, write_kitti
 from shapecat.outputs.exports_labelcloud import _described, write_labelcloud
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas
@@ -185,6 +186,27 @@ def test_a_lidar_looks_along_its_x_axis(up: Any, forward: Any) -> None:
 
     assert turn[2] @ np.array(forward) > 0.9  # the rectified z axis, in the sensor frame
     assert turn[0] @ np.array([0, -1, 0]) > 0.9  # x is right
+
+
+def test_crops_of_two_cameras_do_not_replace_each_other(tmp_path: Path) -> None:
+    """The frames of each topic are numbered from 0."""
+    topics = ["/left/depth", "/right/depth"]
+    run: dict[str, Any] = {
+        "input": {"digest": "xxh3-128:0123456789"},
+        "options": {"topics": topics},
+    }
+    lab: Any = SimpleNamespace(name="lab", run=run)
+    one = labelled(cut=False, hidden=False)
+    pairs = [(replace(one, topic=topic), replace(frame(), topic=topic)) for topic in topics]
+
+    assert write_crops(tmp_path, pairs, lab) == 2
+    (instance,) = tmp_path.glob("*/*")
+    assert instance.relative_to(tmp_path) == Path("bowl/lab.01234567.track-4")
+    assert len(list(instance.iterdir())) == 2
+
+    run["options"]["topics"] = topics[:1]
+    assert write_crops(tmp_path, pairs[:1], lab) == 1
+    assert [path.name for path in tmp_path.glob("*/*/*")] == ["000000.pcd"]
 
 
 def dataset_image() -> DatasetImage:

@@ -34,6 +34,7 @@ from shapecat.outputs.exports import _made_by_export, _require_own, _thinned
 from shapecat.outputs.exports_files import png, support_offset, upright_cloud
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.image_annotations import ImageBox
+from shapecat.outputs.review_paths import Paths
 from shapecat.outputs.scene_tree import _candidate, _described
 from shapecat.recordings.messages import Topic
 from shapecat.runs.label_meaning import TrackLabel, _slips
@@ -105,6 +106,25 @@ def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
         (150, ()),  # the next frame comes late
         (150, (4,)),
     ]
+
+
+# ---- the review: paths
+
+
+def test_a_long_path_is_forgotten_from_its_beginning() -> None:
+    """The newest five hundred positions stay; steps of no more than 15 mm are none."""
+    drawn: list[Any] = []
+    columns: Any = SimpleNamespace(add=lambda _entity, _at, ways, _draw, **_: drawn.append(ways))
+    paths = Paths(columns)
+    for k in range(507):
+        paths.add("/p", (k, k), {4: ("cup", np.array([0.02 * k, 0.3, 1.1]))}, ())
+        paths.add("/p", (k, k), {4: ("cup", np.array([0.02 * k, 0.3, 1.114]))}, ())
+    ((category, places),) = drawn[-1]
+
+    assert (len(drawn), category, places.shape) == (506, "cup", (500, 3))
+    assert_allclose(places[:, 0], 0.02 * np.arange(7, 507))
+    paths.add("/p", (508, 508), {}, (4,))
+    assert drawn[-1] == []
 
 
 # ---- data sets of images: which frames

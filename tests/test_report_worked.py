@@ -13,14 +13,24 @@ import pytest
 from shapecat.colour.masks import Mask
 from shapecat.outputs.report import read_reports
 from shapecat.outputs.report.cards import Card, card_html
-from shapecat.outputs.report.choosing import choose_frames
+from shapecat.outputs.report.choosing import _areas, choose_frames
 from shapecat.outputs.report.images import SeenFrame, encode
 from shapecat.outputs.report.page import run_page
-from shapecat.outputs.report.pictures import _strip_frame
+from shapecat.outputs.report.pictures import TrackPictures, _strip_frame
+from shapecat.outputs.report.surfaces import SurfaceDrawing
 from shapecat.outputs.report.tracks import Timeline, read_timelines
+from shapecat.outputs.report.writing import _faces
 from shapecat.outputs.rereading import read_finished
 from shapecat.runs.track_table import TrackRow, read_track_table
-from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas
+from shapecat.types import (
+    Box,
+    Camera,
+    Frame,
+    ImageMasks,
+    LabelledFrame,
+    LabelledObject,
+    NeuralGas,
+)
 
 NAMES = ("cup", "can", "box")
 
@@ -101,6 +111,39 @@ def test_a_whole_view_is_chosen_before_a_larger_one_that_is_cut_off(run: Path) -
     assert len(line.keys) == 8
     assert len(mine) == 4
     assert all(k % 2 for k in mine)
+
+
+@pytest.mark.parametrize(
+    ("box", "cut"),
+    [
+        ((0, 9, 7, 5), True),
+        ((9, 0, 7, 5), True),
+        ((33, 9, 7, 5), True),
+        ((9, 25, 7, 5), True),
+        ((1, 1, 38, 28), False),
+    ],
+)
+def test_a_mask_is_cut_by_each_border_of_its_image(
+    box: tuple[int, int, int, int], cut: bool
+) -> None:
+    """The image has 40 by 30 pixels; the mask has as many pixels as its odd runs."""
+    counts = np.array([100, 4, 36, 5, 1055], np.uint32)
+    masks = ImageMasks("/c", 1, 2, "camera", 40, 30, {3: box}, {3: counts})
+
+    assert _areas(iter([(("/d", 8), masks)])) == {("/d", 8, 3): (9.0, cut)}
+
+
+def test_faces_of_a_run_are_the_surest_of_each_category() -> None:
+    """Then the surest of the others, up to six."""
+    found = [("cup", 0.6), ("can", 0.7), ("cup", 0.95), ("cup", 0.9), ("unknown", 0.3)]
+    found += [("can", 0.8), ("cup", 0.5), ("cup", 0.4)]
+    line = Timeline(np.zeros(0), np.zeros(0, bool), np.zeros((0, 3)), ())
+    cards = []
+    for k, (category, confidence) in enumerate(found):
+        pictures = TrackPictures(None, (SurfaceDrawing("", str(k), "", ""),), (1.0, 1.0, 1.0))
+        cards.append(Card(TrackRow(k, k, category, confidence, "", "/d", {}), line, pictures))
+
+    assert _faces(cards) == ("2", "5", "4", "3", "1", "0")
 
 
 def test_boxes_of_the_strip_are_as_large_as_in_its_pictures() -> None:

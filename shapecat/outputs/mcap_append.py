@@ -121,7 +121,6 @@ class Appender:
         self._original = summary.statistics
         self._compression = compression if compression in _COMPRESS else ""
         self._counts: Counter[int] = Counter()
-        self._new_chunks = 0
         self._times: list[int] = []
         self._chunk = _Chunk()
         self._writer = ThreadPoolExecutor(1)
@@ -224,7 +223,7 @@ class Appender:
             schema_count=len(self._schemas),
             channel_count=len(self._channels),
             metadata_count=old.metadata_count + 1,
-            chunk_count=old.chunk_count + self._new_chunks,
+            chunk_count=len(self._chunks),
             message_count=old.message_count + self._counts.total(),
             message_start_time=min(times, default=0),
             message_end_time=max(times, default=0),
@@ -255,7 +254,6 @@ class Appender:
             offsets[channel] = self._file.tell()
             self._file.write(_message_index(channel, entries))
             self._counts[channel] += len(entries) // 2
-        self._new_chunks += 1
         self._chunks.append(
             records.ChunkIndex(
                 chunk_length=length,

@@ -187,6 +187,8 @@ def _link(start: Path, target: Path) -> str:
 def _faces(cards: Sequence[Card]) -> tuple[str, ...]:
     """Return pictures of the most certain track of each category, then of other tracks."""
     sure = sorted(cards, key=lambda card: -card.row.confidence)
-    first = {card.row.category: card for card in reversed(sure)}
+    first: dict[str, Card] = {}
+    for card in sure:
+        first.setdefault(card.row.category, card)
     chosen = [*first.values(), *(card for card in sure if card not in first.values())]
     return tuple(card.pictures.surfaces[0].image for card in chosen[:_FACES] if card.pictures)
