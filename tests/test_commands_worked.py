@@ -13,6 +13,7 @@ from tests.scenes import record
 
 Run = Callable[..., Result]
 
+PROCESS: Any = import_module("shapecat.cli.process")
 PROGRESS: Any = import_module("shapecat.cli.progress")
 RENDER: Any = import_module("shapecat.cli.render")
 
@@ -43,6 +44,58 @@ def test_time_left_is_that_of_the_bytes_that_are_left(monkeypatch: pytest.Monkey
     progress.ended(ended("b", processed=None))
     assert progress.remaining_s() == pytest.approx(200 / 20)
     assert (progress.complete, progress.failed) == (2, 1)
+
+
+def test_time_left_is_read_as_hours_minutes_and_seconds() -> None:
+    """An hour and five minutes are not an hour and a half."""
+    words = [PROGRESS._duration(seconds) for seconds in (3903.4, 36_000, 125, 59.6, -2)]
+
+    assert words == ["1:05:03", "10:00:00", "2:05", "1:00", "0:00"]
+
+
+def test_closing_table_is_in_the_order_of_the_plan(capsys: pytest.CaptureFixture[str]) -> None:
+    """Recordings end in any order; the table is compared with the list that was given."""
+    tally = PROCESS._Tally(keep_all=False)
+    for name, frames in (("b", 20), ("c", None), ("a", 3)):
+        counts = {"frames": frames, "tracks": {"cup": 2}}
+        summary = SimpleNamespace(
+            counts=counts, seconds=1.26, processed=name == "b", corrections=None, folder=name
+        )
+        job = SimpleNamespace(name=f"x/{name}", folder=Path("out", name), target="")
+        done = None if frames is None else summary
+        tally.add(SimpleNamespace(job=job, summary=done, code=0 if done else 3))
+    PROCESS._print_closing([task("a"), task("b"), task("c")], tally)
+    _, *rows, closing = capsys.readouterr().out.splitlines()
+
+    assert [row.split()[:2] for row in rows] == [["a", "3"], ["b", "20"]]
+    assert ["already complete" in row for row in rows] == [True, False]
+    assert "1.3" in rows[1]
+    assert closing == "2 complete, 1 failed, 23 frames"
+
+
+@pytest.mark.parametrize(("end", "refused"), [("2.4", True), ("2.5", True), ("2.6", False)])
+def test_an_empty_time_range_is_refused(
+    shapecat: Run, tmp_path: Path, end: str, *, refused: bool
+) -> None:
+    """It would be a run without frames, which looks like an empty scene."""
+    missing = tmp_path / "missing.mcap"
+    found = shapecat("process", missing, "--out", tmp_path, "--start", "2.5", "--end", end)
+
+    assert (found.exit_code == 2) == refused
+    assert ("is not after --start 2.5" in found.stderr) == refused
+
+
+def test_one_recording_is_not_that_of_several_runs(shapecat: Run, tmp_path: Path) -> None:
+    """A folder of runs is several runs, too."""
+    for name in ("a", "b"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+        (tmp_path / "runs" / name / "run.json").write_text("{}")
+    for kind in ("crops", "coco"):
+        words = ("--format", kind, "--out", tmp_path / "out", "--recording", tmp_path / "x.mcap")
+        found = shapecat("export", tmp_path / "runs", *words)
+
+        assert found.exit_code == 2
+        assert "--recording is for a single run, not for 2" in found.stderr
 
 
 def test_plan_says_what_there_is_to_do() -> None:

@@ -337,6 +337,9 @@ def test_many_views_reject_less_and_a_cut_view_counts_less() -> None:
     assert fuse_novelty([1.05], [1.0]) == pytest.approx(1.05)
     assert fuse_novelty([1.05] * 9, [1.0] * 9) < 1 < fuse_novelty([1.1] * 9, [1.0] * 9)
     assert fuse_novelty([0.5, 2.0], view_weights(np.array([False, True]))) < 1
+    # A whole view, a cut one, and one that repeats another: 1.25 views by weight.
+    mean, limit = (1.2 + 0.25 * 0.9) / 1.25, 1 + 0.08 * (1 - 1 / 1.25)
+    assert fuse_novelty([1.2, 0.9, 0.7], [1.0, 0.25, 0.0]) == pytest.approx(mean / limit)
 
 
 def boxed(frames: list[list[tuple[float, float]]]) -> list[FrameDetections]:

@@ -18,7 +18,7 @@ from shapecat.tracking.hindsight import Fragments, _contradiction, _distances
 from shapecat.tracking.hits import Hits
 from shapecat.tracking.pieces import _changes, _joint, _largest
 from shapecat.tracking.pieces import _fit as fit_pieces
-from shapecat.tracking.recording import _line, _needed
+from shapecat.tracking.recording import _describe, _line, _needed
 from shapecat.tracking.records import FrameDetections
 from shapecat.tracking.surplus import _in_box
 from shapecat.tracking.tracker import Tracker
@@ -199,6 +199,26 @@ def test_a_track_needs_as_many_detections_as_frames_are_near() -> None:
     assert needed == [3, 3, 4, 2, 2, 3, 2]
     assert _needed(hits, scenes, 2, 3) == 3
     assert _needed(hits, scenes, 1, 2) == 2
+
+
+def test_a_fragment_is_summed_up_from_its_beginning_to_its_end() -> None:
+    """Of an object that enters the view cut off, moves on and stays whole."""
+    places = [[[9.0, 9, 9], [0.1 * k, 0.02 * k, 0.7]] for k in range(4)]
+    cut = [True, False, True, False]
+    frames = [
+        frame(k, place, partial=np.array([False, cut[k]]), sizes=np.full((2, 3), 0.1 + 0.01 * k))
+        for k, place in enumerate(places)
+    ]
+    hits = Hits.of(frames)
+    found = _describe(hits, [np.array([1, 3, 5]), np.array([7])], np.array([4, 4, 4, 5]))
+
+    assert_allclose([found.first_ns, found.last_ns], [[0, 3e8], [2e8, 3e8]])
+    assert found.cut.tolist() == [[True, True], [False, False]]
+    assert _describe(hits, [np.array([1, 3])], np.zeros(4, int)).cut.tolist() == [[True, False]]
+    assert found.whole.tolist() == [1, 1]
+    assert found.scenes.tolist() == [4, 5]
+    assert_allclose(found.sizes[:, 0], [0.11, 0.13], rtol=1e-6)  # of the whole views
+    assert (found.start[0] < found.end[0])[:2].all()
 
 
 def fragments(**changes: Any) -> Fragments:
