@@ -62,6 +62,19 @@ def test_up_from_an_imu_is_smoothed_and_turned_into_the_sensor_frame(tmp_path: P
     assert late is None
 
 
+def test_an_imu_without_stamps_is_read_at_its_log_times(tmp_path: Path) -> None:
+    """Depth images without stamps have those times, too."""
+    items = [
+        ("/imu", EPOCH + k * SECOND, imu(0, a, "camera"))
+        for k, a in ((0, [0, -9.8, 0]), (7, [9.8, 0, 0]))
+    ]
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        upright = Upright.of(recording, up="imu", fixed_frame=None)
+        found = [upright.up(frame(EPOCH + k * SECOND)) for k in (0, 3, 7)]
+
+    assert [None if up is None else up.tolist() for up in found] == [[0, -1, 0], None, [1, 0, 0]]
+
+
 @pytest.mark.parametrize(("up", "said"), [("imu", "no sensor_msgs/Imu"), ("tf", "no transforms")])
 def test_a_source_that_is_not_there_is_said(tmp_path: Path, up: str, said: str) -> None:
     path = write(tmp_path / "a.mcap", [("/x", 1, make("std_msgs/msg/String", "x"))])

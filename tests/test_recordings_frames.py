@@ -287,7 +287,7 @@ def test_missing_readings_of_a_depth_image_are_zero(tmp_path: Path) -> None:
 
 def test_each_image_gets_the_calibration_of_its_own_time(tmp_path: Path) -> None:
     """Zoom and dynamic reconfiguration change it; it may be recorded before or after."""
-    other = Camera(64, 48, 99.0, 99.0, 30.0, 20.0)
+    other, last = (Camera(64, 48, f, f, 30.0, 20.0) for f in (99.0, 77.0))
     depth = wavy_depth()
     items = [
         ("/depth/image", 0, image(EPOCH, depth)),
@@ -295,12 +295,14 @@ def test_each_image_gets_the_calibration_of_its_own_time(tmp_path: Path) -> None
         ("/depth/camera_info", 2, info(EPOCH + 9, other)),
         ("/depth/image", 3, image(EPOCH + 9, depth)),
         ("/depth/image", 4, image(EPOCH + 20, depth)),
+        ("/depth/image", 5, image(EPOCH + 30, depth)),
+        ("/depth/camera_info", 6, info(EPOCH + 30, last)),
     ]
 
     read_frames, _, _ = read(write(tmp_path / "a.mcap", items))
 
-    assert [frame.camera for frame in read_frames] == [CAMERA, other, other]
-    assert [frame.index for frame in read_frames] == [0, 1, 2]
+    assert [frame.camera for frame in read_frames] == [CAMERA, other, other, last]
+    assert [frame.index for frame in read_frames] == [0, 1, 2, 3]
 
 
 def test_a_calibration_recorded_once_serves_all(tmp_path: Path) -> None:
