@@ -3,6 +3,7 @@
 import base64
 import io
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -17,8 +18,9 @@ import pytest
 from click.testing import Result
 from PIL import Image
 
-from shapecat.evaluation.comparing import Difference, _kind, _Tally, compare
+from shapecat.evaluation.comparing import Difference, _compare_frame, _kind, _Tally, compare
 from shapecat.evaluation.comparison_matching import Matched, seen_together
+from shapecat.evaluation.comparison_page import figure_rows, format_page
 from shapecat.evaluation.comparison_pictures import COLOURS, draw_frame
 from shapecat.evaluation.labellings import Item, Labelling
 from shapecat.evaluation.references_coco import CocoLabels, filled_polygon, rle_mask
@@ -200,6 +202,41 @@ def test_an_identity_is_lost_once() -> None:
     kinds = [_kind(tally, Item(track, "cup"), cup, 0.9) for track in (5, 5, 6, 6, 6, 5, 5)]
 
     assert kinds == [None, None, "identity", None, None, "identity", None]
+
+
+def test_the_page_has_each_figure_in_its_place(run: Path, truth: Path) -> None:
+    """The figures are those by hand above; the table has tracks of the run, not of the truth."""
+    found = compare(run, truth)
+    values = {name.strip(): (value, meaning) for name, value, meaning in figure_rows(found)}
+    rows = re.findall(r"<tr>(.*?)</tr>", format_page(found))
+    cells = [re.findall(r"<td>(.*?)</td>", row) for row in rows]
+    told = {(row[0], row[1]): row[2:] for row in cells if len(row) == 8}
+
+    assert values["frames"] == ("3", "the same in both")
+    assert values["objects found"] == ("88.9 %", "8 of 9; 9 detections")
+    assert values["overlap F"] == ("0.897", "precision 0.984, recall 0.824 of pixels")
+    assert values["category right"] == ("50.0 %", "of 6 matched objects; box as can 3×")
+    assert values["single views"][0] == "33.3 %"
+    assert values["calibration error"][0] == "0.467"
+    assert values["MOTA"] == ("0.778", "1 miss, 0 false positives, 1 identity switch")
+    assert values["IDF1"][0] == "0.824"
+    assert told["0", "missed box"] == ["box", "", "", "", "", ""]
+    assert told["2", "cup now #4"] == ["cup", "cup", "#4", "0.90", "1.00", ""]
+    assert told["1", "box taken for can #2"] == ["box", "can", "#2", "0.90", "0.86", ""]
+
+
+def test_the_picture_of_a_part_is_that_of_its_worst_frame() -> None:
+    """Of the frames in a twelfth of the run, the one with most differences is shown."""
+    masks = np.arange(0, 20), np.arange(40, 90)
+    tally = _Tally()
+    for k, names in enumerate((("can", "cup"), ("can", "can"), ("cup", "can"))):
+        true = tuple(Item(j, "cup", mask) for j, mask in enumerate(masks))
+        found = tuple(Item(j, name, masks[j]) for j, name in enumerate(names))
+        both = Labelling(found), Labelling(true, None, (10, 10))
+        _compare_frame(tally, ("/d", 7 + k), {"stamp_ns": k}, *both, iter(()), 5)
+
+    assert list(tally.pictures) == [5]
+    assert (tally.pictures[5].frame, len(tally.pictures[5].rows)) == (8, 2)
 
 
 def test_frames_of_one_side_alone_are_told_with_that_side(

@@ -1,6 +1,7 @@
 """Evaluation: the metrics against scikit-learn, and the way from a folder to a report."""
 
 import json
+import math
 import re
 from dataclasses import replace
 from importlib import import_module
@@ -19,6 +20,7 @@ from shapecat.errors import ModelError, RecordingError
 from shapecat.evaluation import Report, evaluate_folder, format_report, metrics, read_dataset
 from shapecat.evaluation.fused import Fused, fuse_views
 from shapecat.evaluation.page import confusion_svg, write_page
+from shapecat.evaluation.report import _accuracy_over
 from shapecat.evaluation.training import (
     learn_on_folder,
     order_categories,
@@ -226,6 +228,17 @@ def test_the_page_is_whole_and_escapes_names(trained: Path, tmp_path: Path) -> N
     for picture in re.findall(r"<svg.*?</svg>", page, re.DOTALL):
         ET.fromstring(picture)  # noqa: S314  we wrote it
     assert page.count("<svg") == 2 + len(report.breakdowns) == 5
+
+
+def test_accuracies_over_ranges_are_those_by_hand() -> None:
+    """A view at a limit is in the upper range; a range without views is left out."""
+    values, right = np.array([2.0, 1.0, 5.5, 1.5, 2.9, 5.0]), np.array([1, 1, 1, 0, 1, 0], bool)
+
+    assert _accuracy_over(values, right, (1, 2, 3, 5, math.inf), " m") == (
+        ("1-2 m", 2, 0.5),
+        ("2-3 m", 2, 1.0),
+        ("5 m or more", 2, 0.5),
+    )
 
 
 def test_the_drawn_confusion_has_true_categories_in_rows() -> None:

@@ -83,6 +83,7 @@ def figure_rows(found: Comparison) -> list[_Row]:
     """Return name, value and meaning of each metric that could be computed."""
     figures, rows = found.figures, list[_Row]()
     frames, objects, category = (figures[n] for n in ("frames", "objects", "category"))
+    detections = plural(objects["detections"], "detection")
     aside = [
         f"{frames[name]} only in the {words}"
         for name, words in (("only_in_run", "run"), ("only_in_reference", "reference"))
@@ -93,7 +94,7 @@ def figure_rows(found: Comparison) -> list[_Row]:
         (
             "objects found",
             _percent(objects["share_found"]),
-            f"{objects['found']} of {objects['true']}; {objects['detections']} detections",
+            f"{objects['found']} of {objects['true']}; {detections}",
         )
     )
     if overlap := figures["overlap"]:
@@ -103,7 +104,9 @@ def figure_rows(found: Comparison) -> list[_Row]:
         rows += _category_rows(category)
     if figures["box_iou"]["n"]:
         boxes = figures["box_iou"]
-        rows.append(("box IoU", f"{boxes['mean']:.3f}", f"mean of {boxes['n']} pairs, in 3D"))
+        rows.append(
+            ("box IoU", f"{boxes['mean']:.3f}", f"mean of {plural(boxes['n'], 'pair')}, in 3D")
+        )
     if tracking := figures["tracking"]:
         rows += _tracking_rows(tracking)
     return rows
@@ -115,7 +118,7 @@ def _category_rows(category: dict[str, Any]) -> list[_Row]:
         (
             "category right",
             _percent(category["accuracy"]),
-            f"of {category['n']} matched objects" + (f"; {most}" if most else ""),
+            f"of {plural(category['n'], 'matched object')}" + (f"; {most}" if most else ""),
         ),
         ("  single views", _percent(category["view_accuracy"]), "before fusion over the track"),
         ("calibration error", f"{category['ece']:.3f}", "ECE of single views; 0 is perfect"),
@@ -123,14 +126,15 @@ def _category_rows(category: dict[str, Any]) -> list[_Row]:
 
 
 def _tracking_rows(tracking: dict[str, Any]) -> list[_Row]:
-    lost = f"{tracking['misses']} misses, {tracking['false_positives']} false positives"
+    nouns = {"misses": "miss", "false_positives": "false positive", "switches": "identity switch"}
+    errors = ", ".join(plural(tracking[name], noun) for name, noun in nouns.items())
     parts = (
         f"detection {_text(tracking['detection_accuracy'])}, "
         f"association {_text(tracking['association_accuracy'])}"
     )
     return [
         ("IDF1", _text(tracking["idf1"]), "how long identities are kept"),
-        ("MOTA", _text(tracking["mota"]), f"{lost}, {tracking['switches']} identity switches"),
+        ("MOTA", _text(tracking["mota"]), errors),
         ("HOTA", _text(tracking["hota"]), parts),
     ]
 

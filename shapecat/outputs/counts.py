@@ -8,8 +8,8 @@ def plural(count: int, noun: str) -> str:
 
     Examples
     --------
-    >>> plural(1, "view"), plural(2000, "view"), plural(3, "process")
-    ('1 view', '2,000 views', '3 processes')
+    >>> plural(1, "view"), plural(2000, "view"), plural(3, "process"), plural(0, "switch")
+    ('1 view', '2,000 views', '3 processes', '0 switches')
     """
-    ending = "" if count == 1 else "es" if noun.endswith("s") else "s"
+    ending = "" if count == 1 else "es" if noun.endswith(("s", "ch")) else "s"
     return f"{count:,} {noun}{ending}"
