@@ -33,15 +33,17 @@ from shapecat.outputs.dataset_frames import (
 from shapecat.outputs.exports import _made_by_export, _require_own, _thinned
 from shapecat.outputs.exports_files import png, support_offset, upright_cloud
 from shapecat.outputs.exports_points import write_point_labels
-from shapecat.outputs.image_annotations import ImageBox
+from shapecat.outputs.image_annotations import ImageBox, read_image_frames
 from shapecat.outputs.review_paths import Paths
 from shapecat.outputs.scene_tree import _candidate, _described
 from shapecat.recordings.messages import Topic
 from shapecat.runs.label_meaning import TrackLabel, _slips
+from shapecat.runs.shown import ShownDetection
 from shapecat.types import (
     Box,
     Camera,
     Frame,
+    ImageMasks,
     LabelledFrame,
     LabelledObject,
     NeuralGas,
@@ -106,6 +108,26 @@ def test_annotations_outlive_their_period_and_are_deleted_once() -> None:
         (150, ()),  # the next frame comes late
         (150, (4,)),
     ]
+
+
+def test_images_of_two_cameras_with_the_same_stamp_are_both_annotated(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Cameras are triggered together. An image beside two depth images is annotated once."""
+    seen = [("/l", 5, 30), ("/r", 5, 30)] * 2 + [("/r", 9, 30), ("/cloud", 11, 1)]
+    masks = [
+        (("/d", k), ImageMasks(topic, stamp, stamp + 1, "c", 40, height, {0: (3, 4, 7, 9)}, {}))
+        for k, (topic, stamp, height) in enumerate(seen)
+    ]
+    item = ShownDetection(0, TrackLabel(6, "cup", 0.8), 0)
+    place = "shapecat.outputs.image_annotations"
+    monkeypatch.setattr(f"{place}.read_masks", lambda _folder, **_: iter(masks))
+    tracks = SimpleNamespace(of=lambda _key: [item])
+    monkeypatch.setattr(f"{place}.ShownTracks.read", lambda _folder, _labels: tracks)
+    frames = list(read_image_frames(Path(), {}))
+
+    assert [frame.stamp_ns for frame in frames] == [5, 5, 9]
+    assert {frame.boxes for frame in frames} == {(ImageBox(6, "cup", 0.8, (3, 4, 7, 9)),)}
 
 
 # ---- the review: paths

@@ -60,11 +60,11 @@ def read_image_frames(folder: Path, labels: Mapping[int, TrackLabel]) -> Iterato
     The colours of unorganized clouds are not an image.
     """
     shown = ShownTracks.read(folder, labels)
-    last = None
+    latest: dict[str, int] = {}
     for key, masks in read_masks(folder, boxes_only=True):
-        if (masks.topic, masks.stamp_ns) == last or masks.height <= 1:
+        if masks.height <= 1 or latest.get(masks.topic) == masks.stamp_ns:
             continue
-        last = masks.topic, masks.stamp_ns
+        latest[masks.topic] = masks.stamp_ns
         parts: dict[int, list[int]] = {}
         named: dict[int, TrackLabel] = {}
         for item in shown.of(key):
