@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from benchmarks.boxes import Upright, overlap
 from shapecat.completion import DIRECTIONS, BoxViews, FusedBoxes, complete, fuse_boxes
 from shapecat.geometry import gravity_rotation, rotation_from_quaternion
+from shapecat.runs.full_boxes import _spread
 from shapecat.types import CATEGORIES, FullBox
 
 TILT = np.radians(37)
@@ -320,3 +321,13 @@ def test_many_views_of_one_side_do_not_make_its_size_certain() -> None:
 
     assert_allclose(stds[0], [0.006, 0.006, 0.01], atol=1e-4)
     assert_allclose(stds[1] / stds[0], np.sqrt(0.5), rtol=0.01)
+
+
+def test_the_views_that_tell_the_size_are_spread_over_the_track() -> None:
+    """An object that is walked around shows its other side in the end."""
+    some = _spread(7000)
+
+    assert (len(some), some[0], some[-1]) == (1000, 0, 6999)
+    assert set(np.diff(some)) <= {7, 8}
+    assert _spread(4).tolist() == [0, 1, 2, 3]
+    assert _spread(0).size == 0

@@ -3,6 +3,8 @@
 import json
 import re
 import shutil
+from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,12 +14,12 @@ import pytest
 
 from shapecat.colour.masks import Mask
 from shapecat.outputs.report import read_reports
-from shapecat.outputs.report.cards import Card, card_html
-from shapecat.outputs.report.choosing import _areas, choose_frames
-from shapecat.outputs.report.images import SeenFrame, encode
-from shapecat.outputs.report.page import run_page
-from shapecat.outputs.report.pictures import TrackPictures, _strip_frame
-from shapecat.outputs.report.surfaces import SurfaceDrawing
+from shapecat.outputs.report.cards import Card, _few, card_html
+from shapecat.outputs.report.choosing import Choice, _areas, choose_frames
+from shapecat.outputs.report.images import SeenFrame, _border_share, encode
+from shapecat.outputs.report.page import Listed, index_page, run_page
+from shapecat.outputs.report.pictures import TrackPictures, _strip_frame, _Taken
+from shapecat.outputs.report.surfaces import Snapshot, SurfaceDrawing, draw
 from shapecat.outputs.report.tracks import Timeline, read_timelines
 from shapecat.outputs.report.writing import _faces
 from shapecat.outputs.rereading import read_finished
@@ -65,6 +67,56 @@ def test_durations_of_stages_are_in_milliseconds_and_of_phases_in_seconds(run: P
 
     assert "<td>detect</td><td>4.0</td><td>94.0</td><td>ms</td>" in text
     assert "<td>perceive</td><td>12.3</td><td></td><td>s</td>" in text
+
+
+def test_time_lines_end_with_the_last_track(run: Path) -> None:
+    """The scale is the same on all cards, and no line is drawn beyond its card."""
+    ends = {4: [1.0, 2.5], 5: [0.5, 6.25], 6: [3.0]}
+    cards = [
+        Card(
+            TrackRow(2, track, "can", 0.5, "", "/d", {}),
+            Timeline(
+                np.array(at), np.ones(len(at), bool), np.tile([0.2, 0.5, 0.3], (len(at), 1)), ()
+            ),
+            None,
+        )
+        for track, at in ends.items()
+    ]
+    table = read_track_table(run / "tracks.csv")
+    text = run_page(read_finished(run), table, cards, [], {})
+    lines = re.findall(r'<polyline points="([^"]+)"', text)
+
+    assert "<dt>length</dt><dd>6.2 s</dd>" in text
+    assert [line.split()[0].split(",")[0] for line in lines[::3]] == ["48", "24", "144"]
+    assert [line.split()[-1].split(",")[0] for line in lines[::3]] == ["120", "300", "144"]
+
+
+def test_a_long_time_line_is_drawn_to_its_ends() -> None:
+    """What a track was taken for last is what counts."""
+    assert _few(80).tolist() == list(range(80))
+    assert _few(3).tolist() == [0, 1, 2]
+    some = _few(1001)
+    assert (len(some), some[0], some[-1]) == (80, 0, 1000)
+    assert set(np.diff(some)) == {12, 13}
+
+
+def test_the_index_adds_up_its_runs() -> None:
+    listed = []
+    for k, (frames, unsure, checked) in enumerate([(7, 2, 5), (40, 1, 0)]):
+        counts = Counter({"cup": 3 + k, "can": 6})
+        about = {"counts": {"frames": frames}, "seconds": {"total": 12.34}, "warnings": ["x"] * k}
+        listed.append(Listed(f"{k}.html", f"run {k}", about, counts, unsure, checked, ("data:p",)))
+    text = index_page("runs", listed)
+
+    tiles = dict(re.findall(r"<dt>(\w+)</dt><dd>(\d+)</dd>", text))
+    assert tiles == {
+        "recordings": "2", "frames": "47", "tracks": "19", "uncertain": "3", "checked": "5"
+    }  # fmt: skip
+    assert "can 12, cup 7" in text
+    assert "7 frames · processed in 12.3 s · 2 uncertain · 5 checked</p>" in text
+    assert "40 frames · processed in 12.3 s · 1 uncertain · <span" in text
+    assert "⚠ 1 warning</span>" in text
+    assert "can 6, cup 4" in text
 
 
 def test_index_counts_what_is_left_to_check(run: Path) -> None:
@@ -131,6 +183,60 @@ def test_a_mask_is_cut_by_each_border_of_its_image(
     masks = ImageMasks("/c", 1, 2, "camera", 40, 30, {3: box}, {3: counts})
 
     assert _areas(iter([(("/d", 8), masks)])) == {("/d", 8, 3): (9.0, cut)}
+
+
+def test_the_outline_on_the_border_is_that_of_the_side_that_is_there() -> None:
+    """The mask has 5, 6, 1 and 2 pixels on its left, upper, right and lower side."""
+    pixels = np.array(
+        [
+            [1, 1, 1, 1, 1, 1, 0],
+            [1, 1, 1, 1, 1, 1, 1],
+            [1, 1, 0, 0, 0, 0, 0],
+            [1, 1, 0, 0, 0, 0, 0],
+            [1, 1, 1, 1, 0, 0, 0],
+            [0, 0, 1, 1, 0, 0, 0],
+        ],
+        bool,
+    )
+    padded = np.pad(pixels, 1).astype(int)
+    outline = sum(int(np.abs(np.diff(padded, axis=axis)).sum()) for axis in (0, 1))
+    places = {(0, 9): 5, (9, 0): 6, (33, 9): 1, (9, 24): 2, (33, 24): 3, (9, 9): 0}
+    for (left, top), there in places.items():
+        share = _border_share(Mask(left, top, pixels), 30, 40)
+        assert share == pytest.approx(there / outline), (left, top)
+
+
+def test_a_card_shows_the_best_of_its_views() -> None:
+    """Without the recording, that is the one of most points."""
+    gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+    box = Box(np.array([0, 0, 1]), np.full(3, 0.1), np.array([0, 0, 0, 1]))
+    taken = _Taken(Choice({("/d", k): frozenset({5}) for k in range(4)}, {}))
+    for k, points in enumerate((5, 9, 7)):
+        item = LabelledObject(5, "cup", 0.9, box, np.arange(points), gas, np.ones(1), np.ones(1))
+        other = replace(item, track=6, indices=np.arange(99))  # not wanted from this frame
+        frame = LabelledFrame("/d", k, k, k, "camera", None, (), (other, item), (), {})
+        taken.add(frame, None, None)
+
+    assert {track: best.item.indices.size for track, best in taken.best.items()} == {5: 9}
+
+
+def test_drawings_are_from_the_sensor_the_side_and_above() -> None:
+    """Right is to the right of who looks, and what is nearer is lower."""
+    ends = [[0.1, 0, 0], [-0.1, 0, 0], [0, 0.07, 0], [0, 0, 0.12]]
+    gas = NeuralGas(np.array(ends), np.array([[0, 1]]))
+    shot = Snapshot(np.zeros((0, 3), np.float32), gas, np.array([2.0, 0.0, 1.5]))
+    spots = [
+        np.array(re.findall(r"M(-?\d+) (-?\d+)h0", picture.neurons), int)
+        for picture in draw(shot, (200, 60, 60))
+    ]
+    (near, far, right, top), from_side, (low, high, east, middle) = spots
+
+    assert abs(near[0] - far[0]) < 5 < right[0] - near[0]
+    assert top[1] < far[1] < right[1] < near[1]
+    assert from_side[0, 0] < from_side[3, 0] < from_side[1, 0]  # from 70 degrees to its left
+    assert from_side[3, 1] < from_side[:3, 1].min()
+    assert abs(low[0] - high[0]) < 5 < east[0] - low[0]
+    assert high[1] < middle[1] < low[1]
 
 
 def test_faces_of_a_run_are_the_surest_of_each_category() -> None:
