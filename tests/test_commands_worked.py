@@ -73,6 +73,40 @@ def test_closing_table_is_in_the_order_of_the_plan(capsys: pytest.CaptureFixture
     assert closing == "2 complete, 1 failed, 23 frames"
 
 
+@pytest.mark.parametrize(("count", "listed"), [(1, 1), (100, 100), (101, 0)])
+def test_closing_table_lists_a_hundred_recordings_or_none(
+    capsys: pytest.CaptureFixture[str], count: int, listed: int
+) -> None:
+    """A table that lacks some of them would be taken for all."""
+    names = [f"r{k}" for k in range(count)]
+    tally = PROCESS._Tally(keep_all=False)
+    for name in names:
+        summary = SimpleNamespace(
+            counts={"frames": 30, "tracks": {}}, seconds=1.0, processed=True,
+            corrections=None, folder=name,
+        )  # fmt: skip
+        job = SimpleNamespace(name=name, folder=Path("out", name), target="")
+        tally.add(SimpleNamespace(job=job, summary=summary, code=0))
+    PROCESS._print_closing([task(name) for name in names], tally)
+    out = capsys.readouterr().out
+
+    assert [line.split()[0] for line in out.splitlines() if " 30 " in line] == names[:listed]
+    assert count == 1 or f"{count} complete, 0 failed, {30 * count:,} frames" in out
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "a.truth.json", "a.labels.npz", "a.color_labels.npz"])
+def test_nothing_that_a_simulation_writes_is_replaced_unasked(
+    shapecat: Run, tmp_path: Path, name: str
+) -> None:
+    """Also the truth beside a recording, which somebody may have moved elsewhere."""
+    (tmp_path / name).write_text("mine")
+    found = shapecat("simulate", tmp_path / "a.mcap", "--color", "--frames", 1)
+
+    assert found.exit_code == 2
+    assert f"{name} exists already" in found.stderr
+    assert [(path.name, path.read_text()) for path in tmp_path.iterdir()] == [(name, "mine")]
+
+
 @pytest.mark.parametrize(("end", "refused"), [("2.4", True), ("2.5", True), ("2.6", False)])
 def test_an_empty_time_range_is_refused(
     shapecat: Run, tmp_path: Path, end: str, *, refused: bool
