@@ -16,9 +16,9 @@ from shapecat.colour.masks import Mask
 from shapecat.outputs.report import read_reports
 from shapecat.outputs.report.cards import Card, _few, card_html
 from shapecat.outputs.report.choosing import Choice, _areas, choose_frames
-from shapecat.outputs.report.images import SeenFrame, _border_share, encode
+from shapecat.outputs.report.images import SeenFrame, _border_share, _hidden_share, encode
 from shapecat.outputs.report.page import Listed, index_page, run_page
-from shapecat.outputs.report.pictures import TrackPictures, _strip_frame, _Taken
+from shapecat.outputs.report.pictures import TrackPictures, _points, _strip_frame, _Taken
 from shapecat.outputs.report.surfaces import Snapshot, SurfaceDrawing, draw
 from shapecat.outputs.report.tracks import Timeline, read_timelines
 from shapecat.outputs.report.writing import _faces
@@ -136,6 +136,24 @@ def test_index_counts_what_is_left_to_check(run: Path) -> None:
     assert listed.categories == {"can": len(rows) - 2, "cup": 2}
 
 
+def test_merged_tracks_are_one_object_of_the_index(run: Path) -> None:
+    """A person has found that three tracks are one object, and a fourth none."""
+    rows = (run / "tracks.csv").read_text().splitlines()
+    at = rows[0].split(",").index("label")
+    names = [row.split(",")[0] for row in rows[1:]]
+    labels = ["mug", *[f"merge with {names[0]}"] * 2, "delete"]
+    for k, label in enumerate(labels, start=1):
+        cells = rows[k].split(",")
+        rows[k] = ",".join([*cells[:at], label, *cells[at + 1 :]])
+    (run / "tracks.csv").write_text("\n".join(rows) + "\n")
+    (report,) = read_reports([run]).runs
+    listed = report.listed("x")
+
+    assert listed.categories["mug"] == 1
+    assert listed.categories.total() == len(names) - 3
+    assert listed.checked == 4
+
+
 def test_the_first_detection_of_a_frame_is_a_view(run: Path) -> None:
     """It has number 0."""
     rows = pq.read_table(run / "tracks.parquet").to_pylist()
@@ -204,6 +222,35 @@ def test_the_outline_on_the_border_is_that_of_the_side_that_is_there() -> None:
     for (left, top), there in places.items():
         share = _border_share(Mask(left, top, pixels), 30, 40)
         assert share == pytest.approx(there / outline), (left, top)
+
+
+def test_an_object_is_hidden_where_its_neighbours_are_clearly_nearer() -> None:
+    """Of ten edges, the left ones are of the same surface, and the right ones of an occluder."""
+    depth = np.full((8, 9), 2.0, np.float32)
+    depth[2:5, 3:5] = 1.0
+    depth[2:5, 2] = 0.98  # within 15 mm and 1.5 % it may be noise or a slope
+    depth[2:5, 5] = 0.96
+    depth[1, 3] = 0.0  # no reading hides nothing
+    pixels = np.flatnonzero(depth == 1.0)
+
+    assert _hidden_share(depth, pixels) == pytest.approx(3 / 10)
+    for columns, share in ((3, 3 / 10), (4, 0)):  # the occluder, then the object is at the border
+        moved = np.roll(depth, columns, axis=1)
+        found = _hidden_share(moved, np.flatnonzero(moved == 1.0))
+        assert found == pytest.approx(share)
+
+
+def test_only_pixels_with_a_reading_are_drawn() -> None:
+    """Masks are filled where single readings are missing."""
+    camera = Camera(3, 2, 2.0, 2.0, 1.0, 0.5)
+    depth = np.array([[1.5, 0, 1.5], [2.5, 2.5, 0]], np.float32)
+    frame = Frame("/d", 0, 0, 0, "camera", depth=depth, camera=camera)
+    gas = NeuralGas(np.zeros((0, 3)), np.zeros((0, 2)))
+    box = Box(np.array([0, 0, 1]), np.full(3, 0.1), np.array([0, 0, 0, 1]))
+    item = LabelledObject(5, "cup", 0.9, box, np.arange(1, 5), gas, np.ones(1), np.ones(1))
+
+    expected = [[0.75, -0.375, 1.5], [-1.25, 0.625, 2.5], [0, 0.625, 2.5]]
+    np.testing.assert_allclose(_points(frame, item), expected)
 
 
 def test_a_card_shows_the_best_of_its_views() -> None:

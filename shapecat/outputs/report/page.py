@@ -37,8 +37,8 @@ _SCRIPTS = ("labels.js", "saving.js", "cards.js", "frames.js", "keys.js")
 class Listed:
     """A run in the index.
 
-    ``categories`` counts tracks; ``unsure`` and ``checked`` are numbers of tracks; ``faces`` are
-    some pictures as data URIs.
+    ``categories`` counts tracks, merged ones once; ``unsure`` and ``checked`` are numbers of tracks
+    before merging; ``faces`` are some pictures as data URIs.
     """
 
     link: str

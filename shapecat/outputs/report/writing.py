@@ -71,11 +71,12 @@ class RunReport:
     def listed(self, link: str) -> Listed:
         """Return the entry of the run in an index; ``link`` is the address of its page."""
         finished, cards = read_finished(self.folder), self._cards(self._table)
+        objects = set(finished.labels.values())  # merged tracks have the same label
         return Listed(
             link=link,
             name=finished.name,
             run=finished.run,
-            categories=Counter(label.category for label in finished.labels.values()),
+            categories=Counter(label.category for label in objects),
             unsure=sum(card.row.label == "" and is_unsure(card.row) for card in cards),
             checked=sum(card.row.label != "" for card in cards),
             faces=_faces(cards),
