@@ -19,13 +19,14 @@ from click.testing import Result
 from PIL import Image
 
 from shapecat.evaluation.comparing import Difference, _compare_frame, _kind, _Tally, compare
-from shapecat.evaluation.comparison_matching import Matched, seen_together
+from shapecat.evaluation.comparison_matching import Matched, match_objects, seen_together
 from shapecat.evaluation.comparison_page import figure_rows, format_page
 from shapecat.evaluation.comparison_pictures import COLOURS, draw_frame
 from shapecat.evaluation.labellings import Item, Labelling
 from shapecat.evaluation.references_coco import CocoLabels, filled_polygon, rle_mask
 from shapecat.evaluation.references_kitti import KittiLabels
 from shapecat.runs.tables import DETECTIONS, FRAMES, TRACKS
+from shapecat.types import Box
 
 Run = Callable[..., Result]
 SCORER = Path(__file__).parents[2] / "shared" / "tools" / "score_scenes.py"
@@ -237,6 +238,19 @@ def test_the_picture_of_a_part_is_that_of_its_worst_frame() -> None:
 
     assert list(tally.pictures) == [5]
     assert (tally.pictures[5].frame, len(tally.pictures[5].rows)) == (8, 2)
+
+
+@pytest.mark.parametrize(("shift", "iou"), [(0.2, 1 / 3), (0.23, 17 / 63), (0.25, None)])
+def test_boxes_are_matched_from_a_quarter_of_overlap_on(shift: float, iou: float | None) -> None:
+    """Hidden sides are estimates, so that masks would need more. Without masks, pairs have no F."""
+    size, still = np.array([0.4, 0.2, 0.3]), np.array([0, 0, 0, 1])
+    found = [Item(5, "cup", box=Box(np.array([0.1 + shift, 0.2, 1]), size, still))]
+    true = [Item(None, "can"), Item(1, "cup", box=Box(np.array([0.1, 0.2, 1]), size, still))]
+    matched = match_objects(found, true)
+
+    assert matched.pairs == ({} if iou is None else {0: 1})
+    assert (matched.f, matched.overlap) == (None, None)
+    assert iou is None or matched.similarity.tolist()[0] == pytest.approx([0, iou])
 
 
 def test_frames_of_one_side_alone_are_told_with_that_side(

@@ -16,9 +16,9 @@ from shapecat.errors import OutputError
 from shapecat.outputs import review, review_viewer
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.review_cloud import paint
-from shapecat.outputs.review_layout import Eye, stepped_back
+from shapecat.outputs.review_layout import Eye, TrackView, _track_tabs, stepped_back
 from shapecat.outputs.review_scenes import ReviewFrame, choose_scenes
-from shapecat.outputs.review_shapes import _fan, markdown
+from shapecat.outputs.review_shapes import _fan, markdown, short_label
 from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Plane, Pose
 from tests.test_executors import alive
 
@@ -231,6 +231,28 @@ def walked(places: Iterable[float]) -> list[tuple[LabelledFrame, Frame]]:
         scene(k, [labelled_object(1, x=x - 0.1 * k)], pose=pose)
         for (k, pose), x in zip(enumerate(poses), places, strict=True)
     ]
+
+
+def test_a_caption_names_a_confidence_that_is_low() -> None:
+    """What is nearly certain need not be said, and long captions cover the scene."""
+    item = labelled_object(7)
+    low, high, strange = (
+        short_label(dataclasses.replace(item, confidence=confidence, category=category))
+        for confidence, category in ((0.61, "cup"), (0.93, "cup"), (0.5, "unknown"))
+    )
+
+    assert (low, high, strange) == ("#7 cup 0.61", "#7 cup", "#7 unknown")
+
+
+def test_tabs_are_those_of_the_longest_tracks() -> None:
+    """Of hundreds of tracks most are short; tabs are in the order of their numbers."""
+    frames = {k: 300 if k % 2 else k for k in range(1, 101)}
+    tracks = [TrackView(f"/tracks/{k}", f"#{k}", "cup", n) for k, n in frames.items()]
+    titles = [str(view.name) for view in _track_tabs(tracks).contents]
+    few = [str(view.name) for view in _track_tabs(tracks[:3]).contents]
+
+    assert titles == [f"#{k}" for k in range(1, 97, 2)]
+    assert few == ["#1", "#2", "#3"]
 
 
 def test_scenes_are_drawn_less_often_while_nothing_moves() -> None:
