@@ -49,7 +49,7 @@ KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.outputs.image_annotations": ("test_outputs_worked", "test_annotations_turned",
                                            "test_colour_outputs"),
     "shapecat.outputs.opened_run": ("test_api",),
-    "shapecat.outputs.report": ("test_report", "test_report_serve"),
+    "shapecat.outputs.report": ("test_report_worked", "test_report", "test_report_serve"),
     "shapecat.outputs.rereading": ("test_tables_truth", "test_exports"),
     "shapecat.outputs.review": ("test_review",),
     "shapecat.outputs.wording": ("test_outputs_worked",),
