@@ -18,10 +18,16 @@ from shapecat.outputs.report.cards import Card, _few, card_html
 from shapecat.outputs.report.choosing import Choice, _areas, choose_frames
 from shapecat.outputs.report.images import SeenFrame, _border_share, _hidden_share, encode
 from shapecat.outputs.report.page import Listed, index_page, run_page
-from shapecat.outputs.report.pictures import TrackPictures, _points, _strip_frame, _Taken
+from shapecat.outputs.report.pictures import (
+    Pictures,
+    TrackPictures,
+    _points,
+    _strip_frame,
+    _Taken,
+)
 from shapecat.outputs.report.surfaces import Snapshot, SurfaceDrawing, draw
 from shapecat.outputs.report.tracks import Timeline, read_timelines
-from shapecat.outputs.report.writing import _faces
+from shapecat.outputs.report.writing import RunReport, _faces
 from shapecat.outputs.rereading import read_finished
 from shapecat.runs.track_table import TrackRow, read_track_table
 from shapecat.types import (
@@ -130,8 +136,7 @@ def test_index_counts_what_is_left_to_check(run: Path) -> None:
     table = [header, *(",".join(row[name] for name in names) for row in rows)]
     (run / "tracks.csv").write_text("\n".join(table) + "\n")
 
-    (report,) = read_reports([run]).runs
-    listed = report.listed("x")
+    listed = RunReport(run, read_timelines(run), Pictures({}, []), {}).listed("x")
     assert (listed.unsure, listed.checked) == (2, 2)
     assert listed.categories == {"can": len(rows) - 2, "cup": 2}
 
@@ -146,8 +151,7 @@ def test_merged_tracks_are_one_object_of_the_index(run: Path) -> None:
         cells = rows[k].split(",")
         rows[k] = ",".join([*cells[:at], label, *cells[at + 1 :]])
     (run / "tracks.csv").write_text("\n".join(rows) + "\n")
-    (report,) = read_reports([run]).runs
-    listed = report.listed("x")
+    listed = RunReport(run, read_timelines(run), Pictures({}, []), {}).listed("x")
 
     assert listed.categories["mug"] == 1
     assert listed.categories.total() == len(names) - 3
