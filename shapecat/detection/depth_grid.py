@@ -32,7 +32,7 @@ SMALL_M2 = 9e-4
 FEWEST_CELLS, ENOUGH_CELLS = 20.0, 60.0
 """Fewer cells may be noise; this many are an object, however small it is."""
 BORDER_SHARE = 0.12
-"""Largest share of the image that is blank along a side: a tenth for a registered Kinect."""
+"""Maximum fraction of the image that is blank along a side: a tenth for a registered Kinect."""
 LARGEST_FACTOR = 16
 MOST_CELLS = 100_000
 """Bounds the time of a frame: cells are larger than `CELL_M` if a grid would have more."""

@@ -22,7 +22,7 @@ MOST_ROWS = 2000
 LEAST_POINTS = 100
 FARTHEST_M = 100.0
 LOAD = 1.8
-"""Fewest points per occupied cell, on average; with fewer, surfaces have holes."""
+"""Minimum number of points per occupied cell, on average; with fewer, surfaces have holes."""
 
 
 class VirtualImage(NamedTuple):

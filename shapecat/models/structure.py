@@ -170,7 +170,7 @@ def _viewpoint(world: World, sensor: Sensor, rng: np.random.Generator) -> Pose |
 
 
 def label_objects(frame: Frame, owners: U1, things: I4) -> Iterator[tuple[F4, bool]]:
-    """Yield the merged segments of a frame: features (1, `FEATURES`), and whether an object.
+    """Yield the features (1, `FEATURES`) of each merged segment, and whether it is an object.
 
     Parameters
     ----------

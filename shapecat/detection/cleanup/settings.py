@@ -9,29 +9,31 @@ class CleanupSettings(NamedTuple):
     """How structure is rejected and labels are completed."""
 
     least_logit: float = -1.2
-    """Least logit of an object, for a probability of 0.23: a missed object is lost, a false one can
-    still be rejected over time."""
+    """Minimum logit of an object, for a probability of 0.23: a missed object is lost, a false one
+    can still be rejected over time."""
     hopeless: float = -8.0
-    """Partial logit that the remaining trees never make up for."""
+    """Partial logit below which evaluation stops: the remaining trees can hardly raise it
+    enough."""
     border_share: float = 0.08
-    """Largest share of the image that sensors leave blank at a border."""
+    """Maximum fraction of the image that sensors leave blank at a border."""
     around_cells: int = 4
     """Cells from an object to where its plane shows how rough it is there."""
     cut_off_m: float = 0.02
     """A segment that comes this near to the greatest height continues above it, metres."""
     large_share: float = 0.02
-    """Least share of the image covered by an arm, furniture or the bent end of a table."""
+    """Minimum fraction of the image covered by an arm, furniture or the bent end of a table."""
     cut_share: float = 0.4
-    """Least share of the perimeter of such structure, taken for a square, at the image border."""
+    """Minimum fraction of the perimeter of such structure, taken for a square, at the image
+    border."""
     fringe: float = 0.6
-    """Least height at which a sample next to an object belongs to it, relative to the least height
-    elsewhere. That one is safe against noise: away from objects, samples as low as this are as
-    often the plane."""
+    """Minimum height at which a sample next to an object belongs to it, relative to the least
+    height elsewhere. That one is safe against noise: away from objects, samples as low as this are
+    as often the plane."""
     enclosed_share: float = 0.6
-    """Least share of the boundary of a hole with the label around it: a ring seen from the side has
-    this much, the gap between two objects half."""
+    """Minimum fraction of the boundary of a hole with the label around it: a ring seen from the
+    side has this much, the gap between two objects half."""
     goes_on_share: float = 0.15
-    """Least share of the boundary of a hole where the surface continues; less in a handle."""
+    """Minimum fraction of the boundary of a hole where the surface continues; less in a handle."""
 
 
 CLEANUP = CleanupSettings()

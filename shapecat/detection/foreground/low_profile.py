@@ -35,8 +35,8 @@ class Scratch(NamedTuple):
 
     Attributes
     ----------
-    seen, part : (rows, columns) int32, the number of the last part at each cell, as flooded, and
-        with its hull filled.
+    seen : (rows, columns) int32, the number of the last part that was flooded at each cell.
+    part : (rows, columns) int32, the number of the last part whose filled hull holds each cell.
     seeds, stack : (cells,) int32, lists of flat cells.
     """
 

@@ -20,7 +20,7 @@ class Outline(NamedTuple):
     table : sides that face the plane.
     known : ``table`` sides, sides next to higher cells, and sides in front of a farther surface.
     hidden : sides next to a nearer surface or a cell without a reading.
-    rise : sum of the rises of the ``table`` sides, as multiples of the least mean rise.
+    rise : sum of the rises of the ``table`` sides, each divided by the minimum mean rise.
     steep : steep sides among the ``table`` sides.
     """
 

@@ -14,27 +14,27 @@ class LowProfileSettings(NamedTuple):
     fine: float = 0.006
     """Upper bound of that least rise, 1/m: more is not noise but a plane at a grazing angle."""
     step: float = 0.002
-    """Least mean rise across the outline of an object, 1/m: less than a step of a Kinect."""
+    """Minimum mean rise across the outline of an object, 1/m: less than a step of a Kinect."""
     steady: float = 3.5
-    """Least rise as a multiple of the median rise between plane cells equally far apart."""
+    """Minimum rise as a multiple of the median rise between plane cells equally far apart."""
     slip: float = 0.7
-    """Least rise as a share of the plane's change per cell: at a grazing angle, samples slightly
+    """Minimum rise as a share of the plane's change per cell: at a grazing angle, samples slightly
     out of place seem to rise."""
     grown: float = 0.95
     """A part replaces the objects found within it if its rise per side exceeds this share of their
     greatest one: an object together with a swell rises less."""
     side: float = 0.004
-    """Least rise over two cells on the side of an object, 1/m."""
+    """Minimum rise over two cells on the side of an object, 1/m."""
     slope: float = 0.0016
-    """Least fall per cell on the side of an object, 1/m."""
+    """Minimum fall per cell on the side of an object, 1/m."""
     same: float = 0.9
     """A part with a larger share of its cells in known objects is not tested again."""
     least_cells: int = 80
-    """Fewest cells of a low-profile object: smaller parts are noise."""
+    """Minimum number of cells of a low-profile object: smaller parts are noise."""
     small_part: int = 12
-    """Fewest cells of a part whose outline can be judged."""
+    """Minimum number of cells of a part whose outline can be judged."""
     beside: float = 0.3
-    """Least share of the outline of a swell that faces the plane."""
+    """Minimum fraction of the outline of a swell that faces the plane."""
     low_m: float = 0.03
     """Cells higher than this belong to objects anyway, metres."""
     window: int = 20
@@ -46,27 +46,28 @@ class LowProfileSettings(NamedTuple):
 
 
 class OutlineSettings(NamedTuple):
-    """What the outline of an object looks like. Its sides are counted as in `Outline`."""
+    """Thresholds that tell outlines of objects from those of swells; `Outline` counts the sides."""
 
     steep: float = 0.5
-    """Least rise of a steep side, relative to the least mean rise: more than noise."""
+    """Minimum rise of a steep side, relative to the least mean rise: more than noise."""
     steep_share: float = 0.7
-    """Least share of steep sides among those that face the plane."""
+    """Minimum fraction of steep sides among those that face the plane."""
     most_steps: float = 3
     """Upper bound of the rise of one side, relative to the least mean rise."""
     all_around: float = 0.75
-    """Least sum of the rises over the number of sides, including those that do not face the plane.
+    """Minimum sum of the rises over the number of sides, including those that do not face the
+    plane.
     """
     chance: float = 16
     """Extra rise of short outlines, this over the number of sides: few waves rise all around."""
     inward: int = 2
     """Distance from the outline, in cells, at which its inside is measured."""
     least_sides: int = 30
-    """Fewest sides that face the plane; fewer prove nothing."""
+    """Minimum number of sides that face the plane; fewer prove nothing."""
     along: float = 0.4
-    """Least share of the sides that face the plane."""
+    """Minimum fraction of the sides that face the plane."""
     known: float = 0.65
-    """Least share of known sides among those that are not hidden."""
+    """Minimum fraction of known sides among those that are not hidden."""
     broad: float = 1.5
     """Cells per side above which a part may be partly hidden: strips beside objects have fewer."""
     ragged: float = 80
@@ -78,26 +79,28 @@ class WallSettings(NamedTuple):
     """How walls are found."""
 
     most: int = 5
-    """Most planes that are tested, which bounds the time."""
+    """Maximum number of planes that are tested, which bounds the time."""
     least_samples: int = 50
-    """Fewest samples on a wall: about a hundredth of the image."""
+    """Minimum number of samples on a wall: about a hundredth of the image."""
     vertical_cos: float = 0.2
     """Largest cosine between up and the normal of a wall: shelves lean by a few degrees."""
     least_m2: float = 0.05
-    """Least area of a wall."""
+    """Minimum area of a wall."""
     part_m2: float = 0.04
-    """Least area of a connected part that is cleared: smaller ones may be objects."""
+    """Minimum area of a connected part that is cleared: smaller ones may be objects."""
     cleared_m2: float = 0.1
-    """Least area of all cleared parts together."""
+    """Minimum area of all cleared parts together."""
     patch_m2: float = 0.008
-    """Least area of a part that is cleared because it lies exactly in the wall."""
+    """Minimum area of a part that is cleared because it lies exactly in the wall."""
     exact: float = 0.0045
     """Largest standard deviation of such a part from the wall, 1/m: that of a wall's samples."""
     cut_off: float = 0.75
-    """Least diagonal of a wall that two sides of the image cut off, relative to the largest object.
+    """Minimum diagonal of a wall that two sides of the image cut off, relative to the largest
+    object.
     """
     filled: float = 0.3
-    """Least share of its extent that a wall fills: front edges of a shelf are in a plane too."""
+    """Minimum fraction of its extent that a wall fills: front edges of a shelf are in a plane
+    too."""
     strip_m: float = 0.05
     """Width of the strips whose areas give the extent of a wall, metres."""
 

@@ -3,8 +3,8 @@
 Learned relations between surface patches: Richtsfeld et al. 2012, 2014. The trees are trained on
 simulated scenes.
 
-A bottle and its neck, a plate and its foot, a cup and its handle, the halves of a toy: many weak
-features together distinguish them from two objects that touch or are stacked, and no few do.
+Many weak features together distinguish a bottle and its neck, a plate and its foot, a cup and its
+handle, or the halves of a toy from two objects that touch or are stacked. A few features do not.
 """
 
 from functools import cache
@@ -43,7 +43,10 @@ def load_trees() -> BoostedTrees:
 
 
 class Scratch(NamedTuple):
-    """The `PAIR_FEATURES` of a pair, as a record (1,) and as a view of its numbers (features,)."""
+    """Memory for the features of one pair, which the trees read.
+
+    ``pair`` (1,) is a record of `PAIR_FEATURES`; ``features`` (features,) are the same numbers.
+    """
 
     pair: Records
     features: F4

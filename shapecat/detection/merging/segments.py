@@ -69,7 +69,8 @@ Records: TypeAlias = NDArray[np.void]
 Row: TypeAlias = Any
 """One such record."""
 SAMPLES = 48
-"""Most samples of a segment, evenly spaced, used where all its cells would take too long."""
+"""Maximum number of samples of a segment, evenly spaced, used where all its cells would take too
+long."""
 BAND_M, BANDS = 0.005, 128
 """Height of a band, metres, and number of bands; higher cells count in the last one."""
 

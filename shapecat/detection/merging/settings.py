@@ -9,18 +9,18 @@ class MergingSettings(NamedTuple):
     """How segments are measured, compared and merged."""
 
     few: int = 3
-    """Fewest links between two segments that are a contact, not noise."""
+    """Minimum number of links between two segments that are a contact, not noise."""
     up_cos: float = 0.8
-    """Least cosine to up of a normal that faces up: noise turns normals by up to 35 degrees."""
+    """Minimum cosine to up of a normal that faces up: noise turns normals by up to 35 degrees."""
     edge_on_cos: float = 0.2
-    """Least cosine to the line of sight that areas are corrected for: below, noise dominates."""
+    """Minimum cosine to the line of sight that areas are corrected for: below, noise dominates."""
     flat_deg: int = 20
     """Largest concave angle, degrees, of a sample of a segment; others are too near an edge."""
     gap_cells: int = 3
-    """Most cells without a reading within one surface."""
+    """Maximum number of cells without a reading within one surface."""
     shadow_cells: int = 15
-    """Most cells without a reading between two surfaces, of which the nearer one blocks the light
-    of the projector."""
+    """Maximum number of cells without a reading between two surfaces, of which the nearer one
+    blocks the light of the projector."""
     inward_cells: int = 3
     """Cells from a border inwards at which the normal of a surface is taken."""
     down_cos: float = 0.7
@@ -30,34 +30,37 @@ class MergingSettings(NamedTuple):
     facing_m: float = 0.015
     """Largest height difference between the tops of two walls of a pot, metres."""
     facing_share: float = 0.5
-    """Least overlap of the lateral ranges of two walls of a pot, relative to the narrower one."""
+    """Minimum overlap of the lateral ranges of two walls of a pot, relative to the narrower one."""
     nowhere_m: float = -1.0
-    """Stands for the height of a contact with upward-facing surface if there is none, metres."""
+    """Value of the feature for the height of a contact with upward-facing surface, if there is no
+    contact, metres."""
     likely: float = 0.3
-    """Least logit of a pair that is merged, for a probability of 0.57: a wrong merge loses two
+    """Minimum logit of a pair that is merged, for a probability of 0.57: a wrong merge loses two
     objects, a missing merge seldom one."""
     hopeless: float = -4.0
-    """Partial logit that the remaining trees never make up for: half of the pairs are below."""
+    """Partial logit below which evaluation stops: the remaining trees never raise it enough. Half
+    of the pairs are below."""
     low_share: float = 0.5
-    """Least share of the cells of a segment in one low-profile object, to be part of it."""
+    """Minimum fraction of the cells of a segment in one low-profile object, to be part of it."""
     coplanar_m: float = 0.006
     """Largest distance of a sample from the local plane of another: two steps of a Kinect."""
     coplanar_slope: float = 0.05
     """Increase of that limit per metre between the samples: local planes are 3 degrees off."""
     coplanar_cos: float = 0.966
-    """Least cosine between the normals of the samples, for 15 degrees."""
+    """Minimum cosine between the normals of the samples, for 15 degrees."""
     partners: float = 0.45
-    """Least share of the samples of either segment that continue the other; half on round ones."""
+    """Minimum fraction of the samples of either segment that continue the other; half on round
+    ones."""
     fewest_samples: int = 4
-    """Fewest samples that describe the surface of a segment."""
+    """Minimum number of samples that describe the surface of a segment."""
     most_lines: int = 300
-    """Most lines between partners that are followed; this bounds the time."""
+    """Maximum number of lines between partners that are followed; this bounds the time."""
     line_steps: int = 8
     """Steps on each line: an occluder is wider than an eighth of the gap."""
     free_share: float = 0.12
-    """Largest share of points on the lines in free space: edges of an occluder are ragged."""
+    """Maximum fraction of points on the lines in free space: edges of an occluder are ragged."""
     hidden_share: float = 0.05
-    """Least share of points on the lines behind an occluder."""
+    """Minimum fraction of points on the lines behind an occluder."""
 
 
 MERGING = MergingSettings()

@@ -9,7 +9,7 @@ class OutputSettings(NamedTuple):
     """How objects are measured and labelled."""
 
     occluded_share: float = 0.12
-    """Least share of the boundary of an occluded object that is behind a nearer surface."""
+    """Minimum fraction of the boundary of an occluded object that is behind a nearer surface."""
     gap_m: float = 0.025
     """Largest gap between the bottom of an object and the top of its support, metres: the part in
     between is hidden."""
@@ -28,7 +28,7 @@ class OutputSettings(NamedTuple):
     border_cells: float = 2.5
     """Width of the border of a cloud, in cells."""
     straight_share: float = 0.3
-    """Least share of a side along which such a border is straight."""
+    """Minimum fraction of a side along which such a border is straight."""
     forward_cos: float = 0.2
     """Approximate least cosine to the optical axis of a point in front of a camera."""
     crowded: float = 0.08

@@ -21,7 +21,7 @@ __all__ = [
 ]
 
 MIN_HEIGHT_M = 0.004
-"""Least height of an object's sample; `HEIGHT_NOISE` times the squared depth is added."""
+"""Minimum height of an object's sample; `HEIGHT_NOISE` times the squared depth is added."""
 HEIGHT_NOISE = 0.0025
 BEYOND_M = 0.1
 """Surface level with a plane and this near to its outline is the plane, not an object below."""

@@ -38,7 +38,7 @@ __all__ = ["find_horizontal_planes"]
 
 MOST_PLANES = 10
 LEAST_SAMPLES = 44
-"""Fewest points on a plane; noise alone gives a tenth of that."""
+"""Minimum number of points on a plane; noise alone gives a tenth of that."""
 
 
 def find_horizontal_planes(

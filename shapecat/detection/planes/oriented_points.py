@@ -14,8 +14,8 @@ from shapecat.jit import kernel
 __all__ = ["OrientedPoints", "level_samples", "orient_points"]
 
 STRIDE = 3
-"""Samples from one point to the next, and to the neighbours that give its normal: with fewer, noise
-disturbs the normals; with more, narrow boards have no point."""
+"""Distance between points, and from a point to the neighbours that give its normal, in samples. If
+it is shorter, noise disturbs the normals; if it is longer, narrow boards have no point."""
 FIRST = STRIDE // 2
 """First row and column of points."""
 

@@ -10,21 +10,25 @@ class UpSettings(NamedTuple):
     """How the up direction is estimated."""
 
     facing_cos: float = math.cos(math.radians(20))
-    """A surface faces a direction within this angle; noise turns normals by up to 15 degrees."""
+    """Minimum cosine between a direction and the normal of surface that faces it, for 20 degrees:
+    noise turns normals by up to 15."""
     hint_cos: float = math.cos(math.radians(15))
-    """Normals within this angle of the hint are considered: IMUs and poses are off by less."""
+    """Minimum cosine between a normal and the hint, for 15 degrees: IMUs and poses are off by
+    less."""
     corner_cos: float = 0.3
     """Directions with a smaller absolute cosine between them may be the normals of two walls."""
     least_share: float = 0.04
-    """Least share of the surface that faces up: a table at the edge of the image."""
+    """Minimum fraction of the surface that faces up: a table at the edge of the image."""
     trials: int = 120
     """Directions tried: one shared by 1 in 25 normals is missed with a probability below 1 %."""
     level_bin_m: float = 0.04
     """Height of a bin, metres: more than the noise at 2 m, less than the gap between boards."""
     several: float = 1.5
-    """Exponent of the number of levels: a shelf has several, the wall behind it one."""
+    """Exponent of the number of levels in the score of an up direction: a shelf has several levels,
+    the wall behind it one."""
     clear: float = 2.0
-    """Exponent of the share of large levels in the surface that faces a direction."""
+    """Exponent, in that score, of the fraction of the surface facing the direction that lies in
+    large levels."""
     aslant: float = 0.6
     """Share of the score that a direction along the optical axis loses: walls, not tables."""
     held: float = 3.0
@@ -51,8 +55,8 @@ class PlaneSettings(NamedTuple):
     steady_cos: float = math.cos(math.radians(6))
     """A plane tilted by more against up is not determined by the samples at its height."""
     close_share: float = 0.75
-    """Least share of the inliers within half the tolerance. A plane tilted between two others, such
-    as a table and the plates on it, has fewer."""
+    """Minimum fraction of the inliers within half the tolerance. A plane tilted between two others,
+    such as a table and the plates on it, has fewer."""
     turned_cos: float = math.cos(math.radians(1))
     """If up turns by more, planes are refitted: heights blur by a centimetre at half a metre."""
     furniture_m2: float = 0.25
@@ -96,18 +100,18 @@ class StripSettings(NamedTuple):
     above: int = 30
     """Bins above a covered plane that hold the tops of the objects on it."""
     covers: float = 1.0
-    """Least area of the tops of objects that cover a plane, relative to its visible area."""
+    """Minimum area of the tops of objects that cover a plane, relative to its visible area."""
     contrast: float = 2.0
-    """Least area of a plane, relative to that of the bins below."""
+    """Minimum area of a plane, relative to that of the bins below."""
     end: float = 1.25
-    """Least inverse depth of strips, relative to that of the farthest sample: four fifths of the
+    """Minimum inverse depth of strips, relative to that of the farthest sample: four fifths of the
     range."""
     dip: float = 0.6
     """Just above a plane, the area falls below this share of its own."""
     least_m2: float = 0.001
-    """Least visible area of a covered plane."""
+    """Minimum visible area of a covered plane."""
     least_points: int = 15
-    """Fewest points, of every third sample, at a height that may have strips."""
+    """Minimum number of points, of every third sample, at a height that may have strips."""
     same_m: float = 0.012
     """Planes whose heights differ by less are the same plane, metres."""
     tallest_m: float = 0.15

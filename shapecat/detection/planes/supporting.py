@@ -25,7 +25,7 @@ BESIDE, DOWN = 5, 20
 """Most steps from a sample towards the camera to the edge of its plane, and steps down from that
 edge."""
 LEAST_BELOW = 20
-"""Fewest samples below an edge that allow a decision."""
+"""Minimum number of samples below an edge that allow a decision."""
 
 
 def supporting_planes(

@@ -20,7 +20,7 @@ WINDOW = 3
 """Half the edge of the window to which a local plane is fitted, in cells."""
 SIDE = 2 * WINDOW + 1
 RUN = 128
-"""Most cells in a run."""
+"""Maximum number of cells in a run."""
 LANES = 8
 """Runs are padded to multiples of this, because a remainder is not vectorised."""
 NONE = 1e9

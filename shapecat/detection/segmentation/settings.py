@@ -14,9 +14,9 @@ class SegmentationSettings(NamedTuple):
     gate_slope: float = 0.008
     """Increase of that limit per cell from the centre, 1/m: surfaces slant."""
     fewest_samples: int = 5
-    """Fewest samples of a local plane: three define one, noise requires more."""
+    """Minimum number of samples of a local plane: three define one, noise requires more."""
     least_spread: float = 0.2
-    """Least determinant of the covariance of their positions, cells to the fourth power: samples
+    """Minimum determinant of the covariance of their positions, cells to the fourth power: samples
     in a line define no plane."""
     bridged: int = 8
     """Widest gap between the cells of a run: a new run takes longer."""
@@ -25,29 +25,29 @@ class SegmentationSettings(NamedTuple):
     base_diagonal: int = 2
     """The same along each axis on diagonals, about as far."""
     step_reach: int = 2
-    """Cells before and after a step over which the slope is measured."""
+    """Cells on either side of a step over which the slope there is measured."""
     sure: float = 0.5
-    """Least difference of a step from the slope on either side, relative to a discontinuity. On
+    """Minimum difference of a step from the slope on either side, relative to a discontinuity. On
     one side it is at least a whole discontinuity."""
     edge_deg: int = 18
-    """Least concave angle that may separate two objects; a bowl of 7 cm turns by 16 degrees over
+    """Minimum concave angle that may separate two objects; a bowl of 7 cm turns by 16 degrees over
     the same cells."""
     least_cells: int = 12
-    """Fewest cells of a segment; smaller parts join the segments around them."""
+    """Minimum number of cells of a segment; smaller parts join the segments around them."""
     most_segments: int = 250
     """Bounds the time, which grows with the square of their number."""
     bucket_deg: int = 4
     """Cells whose angles are in the same range of this width are flooded together: the angles are
     not more precise."""
     side_step_m: float = 0.01
-    """Least step of one side of the outline, metres; less is noise at 1.5 m."""
+    """Minimum step of one side of the outline, metres; less is noise at 1.5 m."""
     both_steps_m: float = 0.02
-    """Least sum of the steps of both sides, metres."""
+    """Minimum sum of the steps of both sides, metres."""
     bands_beside: int = 5
     """Bands of height, of 5 mm, below and above a step. The nearest one is left out, as a step is
     not sharp; the others show the outline before and after it."""
     part_cells: int = 60
-    """Fewest cells on either side of a split: fewer are a knob or a handle."""
+    """Minimum number of cells on either side of a split: fewer are a knob or a handle."""
     shadow_cells: int = 6
     """Cells without a sample beside an occluder, on a Kinect."""
 
