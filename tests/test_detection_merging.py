@@ -78,11 +78,35 @@ def test_features_of_two_boxes() -> None:
     assert out["adjacency"]["contact_m"] == pytest.approx(50 / 250 * 0.8, rel=1e-3)
     assert out["relation"]["top_over_top_m"] == pytest.approx(0.032, rel=1e-3)  # smaller first
     assert abs(out["relation"]["lateral_curvature"][0]) < 0.1
+    relation = out["relation"][0]
+    assert relation["normal_cos"] == pytest.approx(1, abs=1e-3)
+    assert abs(relation["second_off_first_m"]) < 1e-3  # one plane
+    # The hull closes a corner of 10 by 50 cells with a line, and adds half of it.
+    assert relation["first_convexity"] == pytest.approx(1, rel=0.02)
+    assert relation["both_convexity"] == pytest.approx(4900 / 5150, rel=0.04)
+    assert relation["hull_growth"] == pytest.approx(5150 / 4900, rel=0.04)
     segment = np.zeros(1, SEGMENT_FEATURES)
     write_segment_features(segments, 1, segment[0])
     assert segment["filled"] == pytest.approx(1, rel=0.06)
     assert segment["facing_up"] == 0
     assert share(1, 0) == 0
+
+
+def test_features_of_two_boards_that_meet_in_a_corner() -> None:
+    """Each leans at 45 degrees and ends in the other: a sign of two objects."""
+    depth, labels = np.zeros((150, 200)), np.zeros((150, 200), np.int16)
+    across = (np.arange(200) - INTRINSICS.cx) / INTRINSICS.fx
+    depth[50:100, 50:150] = (1 / (1 + abs(across)))[50:150]
+    labels[50:100, 50:100], labels[50:100, 100:150] = 1, 2
+    segments, _, _ = measured(depth, labels)
+    out = np.zeros(1, PAIR_FEATURES)
+    pair_features(segments, 1, 2, ViewGeometry(250.0, 0.0), out[0])
+    relation = out["relation"][0]
+    assert relation["normal_cos"] == pytest.approx(0, abs=0.1)
+    middle = (across * depth[75])[100:150].mean()  # and as far in front of the other's plane
+    assert relation["second_off_first_m"] == pytest.approx(2**0.5 * middle, rel=0.1)
+    assert relation["first_off_second_m"] == pytest.approx(2**0.5 * middle, rel=0.1)
+    assert out["adjacency"]["concavity_deg"] == pytest.approx(90, abs=15)
 
 
 def test_what_is_merged_adds_up() -> None:

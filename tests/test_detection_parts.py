@@ -99,24 +99,6 @@ def test_without_the_trees_objects_stay_in_pieces(seed: int) -> None:
     assert found[1] > found[0]
 
 
-def test_trees_that_are_added_correct_the_first() -> None:
-    """The first trees were shown one rule; what comes after adds another, and keeps the first."""
-    rng = np.random.default_rng(3)
-    features = rng.normal(size=(3000, FEATURES)).astype(np.float32)
-    old = features[:, 9] > 0.2
-    new = old & (features[:, 40] < 1.0)  # what the first find hopeless is not asked again
-    first = grow(features, old, GROWTH, seed=0)
-    both = grow(features, new, GROWTH, seed=0, after=first)
-    count = len(first.value)
-    for whole, part in zip(
-        (*both.trees[1:], both.value), (*first.trees[1:], first.value), strict=True
-    ):
-        assert np.array_equal(whole[:count], part)
-    told = np.array([[logit_of(t, row, -9) > 0 for row in features] for t in (first, both)])
-    assert np.mean(told[0] == new) < 0.95
-    assert np.mean(told[1] == new) > 0.97
-
-
 @pytest.mark.many
 def test_pairs_do_not_depend_on_the_number_of_processes() -> None:
     """Trees are grown on what several processes collect."""

@@ -167,7 +167,7 @@ def tower_of_cans(rng: np.random.Generator) -> list[Shape]:
 def test_towers_of_three_cans_of_two_widths() -> None:
     """What stands on another may bear a third."""
     whole = ALL_STEPS._replace(concavity=False, width_split=False)
-    assert share_found(tower_of_cans, ALL_STEPS, 0.75) > 0.7
+    assert share_found(tower_of_cans, ALL_STEPS, 0.75) > 0.6
     assert share_found(tower_of_cans, whole, 0.75) < 0.2
 
 

@@ -135,7 +135,7 @@ def test_statistics_of_two_segments_add_up() -> None:
 
 def test_records_are_floats_without_gaps() -> None:
     """The trees read the features of a pair as one row of numbers."""
-    assert PAIR_FEATURES.itemsize == 4 * FEATURES == 4 * 62
+    assert PAIR_FEATURES.itemsize == 4 * FEATURES == 4 * 70
     assert SEGMENT.itemsize == 4 * len(SEGMENT.names or ())
     assert PAIR.itemsize == 4 * len(PAIR.names or ())
 

@@ -40,60 +40,32 @@ def growing_options(out: Path) -> Callable[[Callable[..., Any]], Callable[..., A
     return add
 
 
-def grow(
-    features: F4, truth: Bool, growth: Growth, seed: int, *, after: BoostedTrees | None = None
-) -> BoostedTrees:
+def grow(features: F4, truth: Bool, growth: Growth, seed: int) -> BoostedTrees:
     """Grow trees by gradient boosting with the cross-entropy loss.
+
+    The first tree is a single leaf, the log odds of the class.
 
     Parameters
     ----------
     features : (n, f).
     truth : (n,) whether each row belongs to the positive class.
     growth : number and size of the trees.
-    after : trees to continue from; by default the first tree is the log odds of the class.
-
-    Returns
-    -------
-    The trees of ``after`` followed by the new ones.
 
     Source: Friedman 2001.
     """
     rng = np.random.default_rng(seed)
     bins, n = make_bins(features), len(truth)
     share = truth.mean()
-    first = after or _joined([_leaf(float(np.log(share / (1 - share))))])
-    logit = _logits(first, features)
+    grown = [_leaf(float(np.log(share / (1 - share))))]
+    logit = np.full(n, grown[0].value[0], np.float32)
     settings = TreeSettings(growth.leaves, growth.rate, _RIDGE, _LEAST)
-    grown: list[Tree] = []
     columns = np.arange(features.shape[1])
     for _ in range(growth.rounds):
         posterior = 1 / (1 + np.exp(-logit))
         rows = np.sort(rng.permutation(n)[: round(_ROWS * n)]).astype(np.int32)
         slope, bend = posterior - truth, posterior * (1 - posterior)
         grown.append(grow_tree(bins, columns, rows, slope, bend, settings, logit))
-    return _appended(first, _joined(grown))
-
-
-def _logits(grown: BoostedTrees, features: F4) -> F4:
-    """Return the sum of all trees' leaf values for each row of features, (n,)."""
-    trees, value = grown
-    logit, rows = np.zeros(len(features), np.float32), np.arange(len(features))
-    for root in trees.roots:
-        node = np.full(len(features), root)
-        while (inner := trees.left[node] > 0).any():
-            right = features[rows, trees.feature[node]] > trees.threshold[node]
-            node = np.where(inner, trees.left[node] + right, node)
-        logit += value[node]
-    return logit
-
-
-def _appended(first: BoostedTrees, more: BoostedTrees) -> BoostedTrees:
-    count = len(first.value)
-    left = np.where(more.trees.left > 0, more.trees.left + count, 0).astype(np.int32)
-    roots = (more.trees.roots + count).astype(np.int32)
-    later = more.trees._replace(roots=roots, left=left)
-    both = Trees(*(np.concatenate(pair) for pair in zip(first.trees, later, strict=True)))
-    return BoostedTrees(both, np.concatenate([first.value, more.value]))
+    return _joined(grown)
 
 
 def _leaf(value: float) -> Tree:

@@ -33,7 +33,7 @@ from shapecat.detection.pipeline import Task, oversegment
 from shapecat.models.growing import Growth, grow, growing_options
 from shapecat.simulation import KINECT, REALSENSE, make_scene, render_frame
 from shapecat.simulation.scenes import SceneKind
-from shapecat.simulation.sensors import IDEAL, Sensor
+from shapecat.simulation.sensors import IDEAL, PRESETS, Sensor
 from shapecat.trees import write_trees
 from shapecat.types import CATEGORIES, Camera
 
@@ -46,8 +46,7 @@ _BLENDED = replace(IDEAL, noise=0.0015, blend_px=3)
 _CHUNK = 25
 
 
-_FIRST, _MORE = Growth(200, 64, 0.1), Growth(80, 32, 0.05)
-"""Growth of the trees for tables and shelves, and of those that piles add to them."""
+_GROWTH = Growth(200, 128, 0.1)
 
 
 class Series(NamedTuple):
@@ -60,6 +59,8 @@ class Series(NamedTuple):
     categories: tuple[str, ...] = CATEGORIES
 
 
+_OTHERS: dict[SceneKind, int] = {"pile": 50, "clutter": 50, "shelf": 25, "room": 50}
+"""Number of scenes of each kind for each of the other sensors."""
 _SERIES = (
     Series("clutter", KINECT, 2000, 2700),
     Series("clutter", REALSENSE, 10_000, 1200),
@@ -72,9 +73,6 @@ _SERIES = (
     Series("clutter", KINECT, 50_000, 600, ("box",)),
     Series("clutter", REALSENSE, 60_000, 150, ("box",)),
     Series("clutter", KINECT, 70_000, 150, ("box", "can", "plate")),
-)
-"""Seeds below 2000 are for development, seeds from 100000 on for evaluation only."""
-_SETTLED = (
     Series("pile", KINECT, 80_000, 1500),
     Series("pile", REALSENSE, 85_000, 900),
     Series("pile", _BLENDED, 88_000, 200),
@@ -82,8 +80,17 @@ _SETTLED = (
     Series("bin", REALSENSE, 92_000, 300),
     Series("shelf_bin", KINECT, 94_000, 300),
     Series("shelf_bin", REALSENSE, 96_000, 300),
+    Series("room", KINECT, 98_500, 150),
+    Series("room", REALSENSE, 98_700, 150),
+    *(
+        Series(kind, PRESETS[name], 98_000 + 50 * k, count)
+        for kind, count in _OTHERS.items()
+        for k, name in enumerate(PRESETS)
+        if PRESETS[name] not in (KINECT, REALSENSE)
+    ),
 )
-"""Scenes arranged by physics, in which objects lean, lie across each other and touch walls."""
+"""Seeds below 2000 are for development, seeds from 100000 on for evaluation only. In piles and
+bins, objects lean, lie across each other and touch walls."""
 
 
 class Pairs(NamedTuple):
@@ -99,15 +106,10 @@ class Pairs(NamedTuple):
 @click.command()
 @click.option("--share", default=1.0, show_default=True, help="Fraction of the scenes to use.")
 @growing_options(Path(learned.__file__).with_name(learned.FILE))
-@click.option("--more", is_flag=True, help="Keep the existing trees, and add those for piles.")
-def main(*, share: float, seed: int, jobs: int, out: Path, more: bool) -> None:
+def main(*, share: float, seed: int, jobs: int, out: Path) -> None:
     """Simulate scenes, collect pairs of segments, and grow and write the trees."""
-    at_rest = collect(_SERIES, share, jobs)
-    grown = learned.load_trees() if more else grow(*at_rest, _FIRST, seed)
-    settled = collect(_SETTLED, share, jobs)
-    pairs = Pairs(*(np.concatenate(both) for both in zip(at_rest, settled, strict=True)))
-    grown = grow(*pairs, _MORE, seed, after=grown)
-    write_trees(out, grown, PAIR_FEATURES)
+    pairs = collect(_SERIES, share, jobs)
+    write_trees(out, grow(*pairs, _GROWTH, seed), PAIR_FEATURES)
     click.echo(f"{len(pairs.same)} pairs, {pairs.same.mean():.0%} of one object; {out}")
 
 

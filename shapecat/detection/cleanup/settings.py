@@ -8,8 +8,8 @@ __all__ = ["CLEANUP", "CleanupSettings"]
 class CleanupSettings(NamedTuple):
     """How structure is rejected and labels are completed."""
 
-    least_logit: float = -1.2
-    """Minimum logit of an object, for a probability of 0.23: a missed object is lost, a false one
+    least_logit: float = -1.0
+    """Minimum logit of an object, for a probability of 0.27: a missed object is lost, a false one
     can still be rejected over time."""
     hopeless: float = -8.0
     """Partial logit below which evaluation stops: the remaining trees can hardly raise it

@@ -63,7 +63,7 @@ def measure_adjacency(
                     met[n, 0], met[n, 1], met[n, 2], met[n, 3] = j, y, x, down
                     met[n, 4], met[n, 5] = gap, 0 if gap > 0 else link
                     n += 1
-        _count(inv_depth, heights, graph.normal, labels, up, i, met[:n], segments)
+        _count(inv_depth, heights, graph, labels, up, i, met[:n], segments)
     choose_samples(graph, labels, segments)
 
 
@@ -87,7 +87,7 @@ def _find_changes(links: U1, here: I4, below: I4, change: U1) -> bool:
 def _count(
     inv_depth: F4,
     heights: HeightMap,
-    normal: F4,
+    graph: SurfaceGraph,
     labels: I4,
     up: F8,
     row: int,
@@ -104,6 +104,7 @@ def _count(
         not 0 if the surface continues.
     """
     plane_id, height = heights.plane_id, heights.height
+    normal, concavity = graph.normal, graph.concavity
     statistics, pairs = segments.statistics, segments.pairs
     steep = MERGING.down_cos * math.hypot(up[0], up[1])
     for m in range(2 * met.shape[0]):
@@ -127,6 +128,7 @@ def _count(
                     statistics[p].shelf_edge += 1
         elif link:
             pairs[p, q].contact += 1
+            pairs[p, q].concavity += max(concavity[i, j], concavity[y, x])
             # Whether the segment at (y, x) faces up, a few cells inside.
             v = min(max(i + MERGING.inward_cells * (y - i), 0), labels.shape[0] - 1)
             u = min(max(j + MERGING.inward_cells * (x - j), 0), labels.shape[1] - 1)

@@ -4,6 +4,7 @@ Richtsfeld et al. 2014 learn from relations between surface patches; here the re
 the outlines, extents, curvatures and positions of segments.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -19,7 +20,14 @@ from shapecat.detection.merging.segment_features import (
     width_of,
     write_segment_features,
 )
-from shapecat.detection.merging.segments import SEGMENT, Records, Row, Segments, add_statistics
+from shapecat.detection.merging.segments import (
+    SEGMENT,
+    Records,
+    Row,
+    Segments,
+    add_statistics,
+    hull_area,
+)
 from shapecat.detection.merging.settings import MERGING
 from shapecat.jit import kernel
 
@@ -45,6 +53,7 @@ _ADJACENCY = np.dtype(
         ("above_second_m", "f4"),  # mean height of that contact above the other's top
         ("above_first_m", "f4"),
         ("border_m", "f4"),
+        ("concavity_deg", "f4"),  # mean concave angle of the contact
     ]
 )
 """Features of the border between two segments."""
@@ -64,6 +73,13 @@ _RELATION = np.dtype(
         ("least_beyond_m", "f4"),
         ("lateral_curvature", "f4"),  # of both together
         ("normal_position_correlation", "f4"),
+        ("normal_cos", "f4"),  # cosine between the mean normals
+        ("second_off_first_m", "f4"),  # distance of the middle of one from the mean plane of the
+        ("first_off_second_m", "f4"),  # other, positive in front of it
+        ("first_convexity", "f4"),  # cells over those of the convex hull
+        ("second_convexity", "f4"),
+        ("both_convexity", "f4"),
+        ("hull_growth", "f4"),  # convex hull of both over those of each
         ("cells", "f4"),  # of the first
         ("cell_m", "f4"),
         ("down", "f4"),  # as in `ViewGeometry`
@@ -141,8 +157,8 @@ def write_pair_features(
     segments: Segments, features: Records, p: int, q: int, view_geometry: ViewGeometry, out: Row
 ) -> None:
     """Do the same as `pair_features`, given the `SEGMENT_FEATURES` (n + 1,) of all segments."""
-    first, second = segments.statistics[p].area, segments.statistics[q].area
-    if first > second or (first == second and p > q):
+    smaller, larger = segments.statistics[p].area, segments.statistics[q].area
+    if smaller > larger or (smaller == larger and p > q):
         p, q = q, p
     a, b = segments.statistics[p], segments.statistics[q]
     cell = a.depth_sum / a.count / view_geometry.focal
@@ -150,6 +166,13 @@ def write_pair_features(
     out.first, out.second = features[p], features[q]
     relation = out.relation
     _write_relation(a, b, relation)
+    own, other = segments.hull[p], segments.hull[q]
+    first, second = hull_area(own, own), hull_area(other, other)
+    hull = hull_area(own, other)
+    relation.first_convexity = share(a.count, first)
+    relation.second_convexity = share(b.count, second)
+    relation.both_convexity = share(a.count + b.count, hull)
+    relation.hull_growth = share(hull, first + second)
     both = np.zeros(1, SEGMENT)[0]
     both.left, both.right = np.inf, -np.inf
     add_statistics(both, a)
@@ -175,6 +198,7 @@ def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) 
     out.above_second_m = _above_top(segments, p, q)
     out.above_first_m = _above_top(segments, q, p)
     out.border_m = met * cell
+    out.concavity_deg = share(pair.concavity, pair.contact)
 
 
 @kernel
@@ -202,3 +226,12 @@ def _write_relation(a: Row, b: Row, out: Row) -> None:
     out.other_bottom_over_top_m = b.bottom - a.top
     out.bottom_over_bottom_m = a.bottom - b.bottom
     out.most_beyond_m, out.least_beyond_m = max(left, right), min(left, right)
+    n, m = max(a.fitted, np.float32(1)), max(b.fitted, np.float32(1))
+    x, y = b.px_sum / m - a.px_sum / n, b.py_sum / m - a.py_sum / n
+    z = b.pz_sum / m - a.pz_sum / n
+    length = max(math.sqrt(a.nx_sum**2 + a.ny_sum**2 + a.nz_sum**2), 1e-9)
+    other = max(math.sqrt(b.nx_sum**2 + b.ny_sum**2 + b.nz_sum**2), 1e-9)
+    alike = a.nx_sum * b.nx_sum + a.ny_sum * b.ny_sum + a.nz_sum * b.nz_sum
+    out.normal_cos = alike / (length * other)
+    out.second_off_first_m = (x * a.nx_sum + y * a.ny_sum + z * a.nz_sum) / length
+    out.first_off_second_m = -(x * b.nx_sum + y * b.ny_sum + z * b.nz_sum) / other

@@ -25,6 +25,7 @@ __all__ = [
     "add_statistics",
     "choose_samples",
     "depth_of",
+    "hull_area",
     "is_root",
     "lateral_axis",
     "measure_segments",
@@ -41,7 +42,13 @@ SEGMENT = np.dtype(
         ("top", "f4"),
         ("area", "f4"),  # of the visible surface, m2
         ("depth_sum", "f4"),
-        ("fitted", "f4"),  # cells with a local plane; the next five are sums over these:
+        ("fitted", "f4"),  # cells with a local plane; the next eleven are sums over these:
+        ("px_sum", "f4"),  # position, sensor frame
+        ("py_sum", "f4"),
+        ("pz_sum", "f4"),
+        ("nx_sum", "f4"),  # normal, sensor frame
+        ("ny_sum", "f4"),
+        ("nz_sum", "f4"),
         ("x_sum", "f4"),  # lateral position
         ("xx_sum", "f4"),
         ("normal_x_sum", "f4"),  # lateral component of the normal
@@ -57,6 +64,7 @@ SEGMENT = np.dtype(
 PAIR = np.dtype(
     [
         ("contact", "f4"),  # linked neighbours
+        ("concavity", "f4"),  # the sum of the concave angles there, degrees
         ("in_front", "f4"),  # neighbours where the first is in front of the second
         ("near", "f4"),  # neighbours at the same depth that are not linked
         ("rests_on", "f4"),  # links beyond which the second faces up
@@ -74,6 +82,11 @@ long."""
 BAND_M, BANDS = 0.005, 128
 """Height of a band, metres, and number of bands; higher cells count in the last one."""
 
+DIRECTIONS = 16
+"""Directions in the image, evenly spaced, in which the extent of a segment is measured."""
+_COS = np.cos(2 * np.pi / DIRECTIONS * np.arange(DIRECTIONS)).astype(np.float32)
+_SIN = np.sin(2 * np.pi / DIRECTIONS * np.arange(DIRECTIONS)).astype(np.float32)
+
 
 class Segments(NamedTuple):
     """Statistics of segments 1..n; row 0 is unused. A merge adds up all but the samples.
@@ -83,6 +96,7 @@ class Segments(NamedTuple):
     pairs : (n + 1, n + 1) records of `PAIR`.
     statistics : (n + 1,) records of `SEGMENT`.
     top_area : (n + 1, BANDS) float32, area of upward-facing surface by height, m2.
+    hull : (n + 1, DIRECTIONS) float32 support function of the convex hull in the image, cells.
     samples : (n + 1, SAMPLES) int32, flat cells away from edges; -1 beyond the last.
     plane_id : (n + 1,) int8, the plane below each, as in `HeightMap.plane_id`.
     parent : (n + 1,) int16, the segment that each has been merged into, at first itself.
@@ -91,6 +105,7 @@ class Segments(NamedTuple):
     pairs: Records
     statistics: Records
     top_area: F4
+    hull: F4
     samples: I4
     plane_id: I4
     parent: I4
@@ -115,6 +130,7 @@ def _blank(size: int) -> Segments:
         np.zeros((size, size), PAIR),
         np.zeros(size, SEGMENT),
         np.zeros((size, BANDS), np.float32),
+        np.full((size, DIRECTIONS), -1e9, np.float32),
         np.full((size, SAMPLES), -1, np.int32),
         np.zeros(size, np.int8),
         np.arange(size).astype(np.int16),
@@ -166,6 +182,7 @@ def _measure(
                 continue
             # Sums over a run of cells of one segment.
             far = fitted = sides = sides2 = turns = turns2 = both = areas = zero
+            px = py = pz = nxs = nys = nzs = zero
             left, right, bottom, top = far_off, -far_off, far_off, -far_off
             while j < end and labels[i, j] == p:
                 z = one / inv_depth[i, j]
@@ -179,6 +196,12 @@ def _measure(
                     nx, ny, nz = normal[i, 0, j], normal[i, 1, j], normal[i, 2, j]
                     turn = nx * sx + ny * sy + nz * sz
                     fitted += one
+                    px += x
+                    py += y
+                    pz += z
+                    nxs += nx
+                    nys += ny
+                    nzs += nz
                     sides += along
                     sides2 += along * along
                     turns += turn
@@ -191,6 +214,9 @@ def _measure(
                         band = min(max(int(h / np.float32(BAND_M)), 0), BANDS - 1)
                         top_area[p, band] += area
                 j += 1
+            for d in range(DIRECTIONS):
+                at = np.float32(first if _COS[d] < 0 else j - 1)
+                segments.hull[p, d] = max(segments.hull[p, d], at * _COS[d] + i * _SIN[d])
             plane_ids[p] = plane_id[i, first]
             row = segments.statistics[p]
             row.count += j - first
@@ -198,6 +224,12 @@ def _measure(
             row.left, row.right = min(row.left, left), max(row.right, right)
             row.top, row.bottom = max(row.top, top), min(row.bottom, bottom)
             row.fitted += fitted
+            row.px_sum += px
+            row.py_sum += py
+            row.pz_sum += pz
+            row.nx_sum += nxs
+            row.ny_sum += nys
+            row.nz_sum += nzs
             row.x_sum += sides
             row.xx_sum += sides2
             row.normal_x_sum += turns
@@ -245,9 +277,12 @@ def merge(segments: Segments, p: int, q: int) -> None:
     for k in range(n):
         _add_pair(pairs[k, p], pairs[k, q])
     own = pairs[p, p]
-    own.contact = own.in_front = own.near = own.rests_on = own.rests_on_height = 0.0
+    own.contact = own.concavity = own.in_front = 0.0
+    own.near = own.rests_on = own.rests_on_height = 0.0
     for band in range(BANDS):
         segments.top_area[p, band] += segments.top_area[q, band]
+    for d in range(DIRECTIONS):
+        segments.hull[p, d] = max(segments.hull[p, d], segments.hull[q, d])
     add_statistics(segments.statistics[p], segments.statistics[q])
     # Half of the samples from each side.
     samples, first, mixed = segments.samples, np.zeros(SAMPLES, np.int32), 0
@@ -267,11 +302,13 @@ def merge(segments: Segments, p: int, q: int) -> None:
 def _add_pair(a: Row, b: Row) -> None:
     """Add the statistics ``b`` of a pair to ``a``, and clear ``b``; both are records of `PAIR`."""
     a.contact += b.contact
+    a.concavity += b.concavity
     a.in_front += b.in_front
     a.near += b.near
     a.rests_on += b.rests_on
     a.rests_on_height += b.rests_on_height
-    b.contact = b.in_front = b.near = b.rests_on = b.rests_on_height = 0.0
+    b.contact = b.concavity = b.in_front = 0.0
+    b.near = b.rests_on = b.rests_on_height = 0.0
 
 
 @kernel
@@ -284,6 +321,12 @@ def add_statistics(a: Row, b: Row) -> None:
     a.area += b.area
     a.depth_sum += b.depth_sum
     a.fitted += b.fitted
+    a.px_sum += b.px_sum
+    a.py_sum += b.py_sum
+    a.pz_sum += b.pz_sum
+    a.nx_sum += b.nx_sum
+    a.ny_sum += b.ny_sum
+    a.nz_sum += b.nz_sum
     a.x_sum += b.x_sum
     a.xx_sum += b.xx_sum
     a.normal_x_sum += b.normal_x_sum
@@ -293,6 +336,24 @@ def add_statistics(a: Row, b: Row) -> None:
     a.hidden += b.hidden
     a.shelf_edge += b.shelf_edge
     a.upper_silhouette += b.upper_silhouette
+
+
+@kernel
+def hull_area(a: F4, b: F4) -> float:
+    """Return the area of the convex hull of two segments, cells.
+
+    ``a`` and ``b`` are their rows of `Segments.hull`. The area is half the sum of each side of the
+    polygon, whose length follows from its neighbours, times its distance from the origin.
+    """
+    turn, half = 2 * math.pi / DIRECTIONS, np.float32(0.5)  # cells are squares, not points
+    twice, total = 2 * math.cos(turn), 0.0
+    before = max(a[DIRECTIONS - 2], b[DIRECTIONS - 2]) + half
+    here = max(a[DIRECTIONS - 1], b[DIRECTIONS - 1]) + half
+    for d in range(DIRECTIONS):
+        after = max(a[d], b[d]) + half
+        total += here * (before + after - twice * here)
+        before, here = here, after
+    return float(total / (2 * math.sin(turn)))
 
 
 @kernel

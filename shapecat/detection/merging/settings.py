@@ -38,8 +38,8 @@ class MergingSettings(NamedTuple):
     """Minimum logit of a pair that is merged, for a probability of 0.57: a wrong merge loses two
     objects, a missing merge seldom one."""
     hopeless: float = -4.0
-    """Partial logit below which evaluation stops: the remaining trees never raise it enough. Half
-    of the pairs are below."""
+    """Partial logit below which evaluation stops: of 60,000 pairs, a third fall below it, and none
+    of these would be merged."""
     low_share: float = 0.5
     """Minimum fraction of the cells of a segment in one low-profile object, to be part of it."""
     coplanar_m: float = 0.006
