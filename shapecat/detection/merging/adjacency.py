@@ -6,7 +6,7 @@ import numpy as np
 
 from shapecat.arrays import F4, F8, I4, U1
 from shapecat.detection.connected_components import DOWN, RIGHT
-from shapecat.detection.merging.segments import Segments, choose_samples
+from shapecat.detection.merging.segments import SAMPLES, Segments
 from shapecat.detection.merging.settings import MERGING
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
@@ -64,7 +64,7 @@ def measure_adjacency(
                     met[n, 4], met[n, 5] = gap, 0 if gap > 0 else link
                     n += 1
         _count(inv_depth, heights, graph, labels, up, i, met[:n], segments)
-    choose_samples(graph, labels, segments)
+    _choose_samples(graph, labels, segments)
 
 
 @kernel(inline=True)
@@ -140,3 +140,32 @@ def _count(
             pairs[p, q].in_front += 1
         elif ahead > -DISCONTINUITY and gap <= MERGING.gap_cells:
             pairs[p, q].near += 1
+
+
+@kernel(inline=True)
+def _choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None:
+    """Choose evenly spaced samples of each segment, away from edges, in place.
+
+    ``labels`` (rows, columns) are the segments.
+    """
+    rows, columns = labels.shape
+    spans, local_plane, concavity, samples = (
+        graph.spans,
+        graph.local_plane,
+        graph.concavity,
+        segments.samples,
+    )
+    n = segments.parent.size
+    stride, wait, taken = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
+    for p in range(n):
+        stride[p] = wait[p] = max(int(segments.statistics[p].count) // SAMPLES, 1)
+    for i in range(rows):
+        for j in range(spans[i, 0], spans[i, 1]):
+            p = labels[i, j]
+            if p == 0 or concavity[i, j] > MERGING.flat_deg or not local_plane[i, 0, j] > 0:
+                continue
+            wait[p] -= 1
+            if wait[p] == 0 and taken[p] < SAMPLES:
+                samples[p, taken[p]] = i * columns + j
+                taken[p] += 1
+                wait[p] = stride[p]

@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from shapecat.arrays import Bool
+from shapecat.detection.merging.image_hull import hull_area
 from shapecat.detection.merging.segment_features import (
     SEGMENT_FEATURES,
     depth_difference,
@@ -20,14 +21,7 @@ from shapecat.detection.merging.segment_features import (
     width_of,
     write_segment_features,
 )
-from shapecat.detection.merging.segments import (
-    SEGMENT,
-    Records,
-    Row,
-    Segments,
-    add_statistics,
-    hull_area,
-)
+from shapecat.detection.merging.segments import SEGMENT, Records, Row, Segments, add_statistics
 from shapecat.detection.merging.settings import MERGING
 from shapecat.jit import kernel
 
@@ -166,7 +160,7 @@ def write_pair_features(
     out.first, out.second = features[p], features[q]
     relation = out.relation
     _write_relation(a, b, relation)
-    own, other = segments.hull[p], segments.hull[q]
+    own, other = segments.hulls[p], segments.hulls[q]
     first, second = hull_area(own, own), hull_area(other, other)
     hull = hull_area(own, other)
     relation.first_convexity = share(a.count, first)
@@ -226,12 +220,22 @@ def _write_relation(a: Row, b: Row, out: Row) -> None:
     out.other_bottom_over_top_m = b.bottom - a.top
     out.bottom_over_bottom_m = a.bottom - b.bottom
     out.most_beyond_m, out.least_beyond_m = max(left, right), min(left, right)
-    n, m = max(a.fitted, np.float32(1)), max(b.fitted, np.float32(1))
-    x, y = b.px_sum / m - a.px_sum / n, b.py_sum / m - a.py_sum / n
-    z = b.pz_sum / m - a.pz_sum / n
-    length = max(math.sqrt(a.nx_sum**2 + a.ny_sum**2 + a.nz_sum**2), 1e-9)
-    other = max(math.sqrt(b.nx_sum**2 + b.ny_sum**2 + b.nz_sum**2), 1e-9)
-    alike = a.nx_sum * b.nx_sum + a.ny_sum * b.ny_sum + a.nz_sum * b.nz_sum
-    out.normal_cos = alike / (length * other)
-    out.second_off_first_m = (x * a.nx_sum + y * a.ny_sum + z * a.nz_sum) / length
-    out.first_off_second_m = -(x * b.nx_sum + y * b.ny_sum + z * b.nz_sum) / other
+    (x, y, z), (u, v, w) = _mean_position(a), _mean_position(b)
+    (nx, ny, nz), (mx, my, mz) = _mean_normal(a), _mean_normal(b)
+    x, y, z = u - x, v - y, w - z  # from the middle of the first to that of the second
+    out.normal_cos = nx * mx + ny * my + nz * mz
+    out.second_off_first_m = x * nx + y * ny + z * nz
+    out.first_off_second_m = -(x * mx + y * my + z * mz)
+
+
+@kernel
+def _mean_position(row: Row) -> tuple[float, float, float]:
+    n = max(row.fitted, np.float32(1))
+    return row.position_x_sum / n, row.position_y_sum / n, row.position_z_sum / n
+
+
+@kernel
+def _mean_normal(row: Row) -> tuple[float, float, float]:
+    x, y, z = row.facing_x_sum, row.facing_y_sum, row.facing_z_sum
+    length = max(math.sqrt(x * x + y * y + z * z), 1e-9)
+    return x / length, y / length, z / length

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from shapecat.arrays import F4, F8, I4
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics
+from shapecat.detection.merging.image_hull import empty_hulls, extend_hull, merge_hulls
 from shapecat.detection.merging.settings import MERGING
 from shapecat.detection.planes.height_map import HeightMap
 from shapecat.detection.segmentation.connectivity import SurfaceGraph
@@ -23,9 +24,7 @@ __all__ = [
     "Row",
     "Segments",
     "add_statistics",
-    "choose_samples",
     "depth_of",
-    "hull_area",
     "is_root",
     "lateral_axis",
     "measure_segments",
@@ -43,12 +42,12 @@ SEGMENT = np.dtype(
         ("area", "f4"),  # of the visible surface, m2
         ("depth_sum", "f4"),
         ("fitted", "f4"),  # cells with a local plane; the next eleven are sums over these:
-        ("px_sum", "f4"),  # position, sensor frame
-        ("py_sum", "f4"),
-        ("pz_sum", "f4"),
-        ("nx_sum", "f4"),  # normal, sensor frame
-        ("ny_sum", "f4"),
-        ("nz_sum", "f4"),
+        ("position_x_sum", "f4"),  # position, sensor frame
+        ("position_y_sum", "f4"),
+        ("position_z_sum", "f4"),
+        ("facing_x_sum", "f4"),  # normal, sensor frame
+        ("facing_y_sum", "f4"),
+        ("facing_z_sum", "f4"),
         ("x_sum", "f4"),  # lateral position
         ("xx_sum", "f4"),
         ("normal_x_sum", "f4"),  # lateral component of the normal
@@ -82,11 +81,6 @@ long."""
 BAND_M, BANDS = 0.005, 128
 """Height of a band, metres, and number of bands; higher cells count in the last one."""
 
-DIRECTIONS = 16
-"""Directions in the image, evenly spaced, in which the extent of a segment is measured."""
-_COS = np.cos(2 * np.pi / DIRECTIONS * np.arange(DIRECTIONS)).astype(np.float32)
-_SIN = np.sin(2 * np.pi / DIRECTIONS * np.arange(DIRECTIONS)).astype(np.float32)
-
 
 class Segments(NamedTuple):
     """Statistics of segments 1..n; row 0 is unused. A merge adds up all but the samples.
@@ -96,7 +90,7 @@ class Segments(NamedTuple):
     pairs : (n + 1, n + 1) records of `PAIR`.
     statistics : (n + 1,) records of `SEGMENT`.
     top_area : (n + 1, BANDS) float32, area of upward-facing surface by height, m2.
-    hull : (n + 1, DIRECTIONS) float32 support function of the convex hull in the image, cells.
+    hulls : (n + 1, DIRECTIONS) float32, convex hulls in the image, from `empty_hulls`.
     samples : (n + 1, SAMPLES) int32, flat cells away from edges; -1 beyond the last.
     plane_id : (n + 1,) int8, the plane below each, as in `HeightMap.plane_id`.
     parent : (n + 1,) int16, the segment that each has been merged into, at first itself.
@@ -105,7 +99,7 @@ class Segments(NamedTuple):
     pairs: Records
     statistics: Records
     top_area: F4
-    hull: F4
+    hulls: F4
     samples: I4
     plane_id: I4
     parent: I4
@@ -130,7 +124,7 @@ def _blank(size: int) -> Segments:
         np.zeros((size, size), PAIR),
         np.zeros(size, SEGMENT),
         np.zeros((size, BANDS), np.float32),
-        np.full((size, DIRECTIONS), -1e9, np.float32),
+        empty_hulls(size),
         np.full((size, SAMPLES), -1, np.int32),
         np.zeros(size, np.int8),
         np.arange(size).astype(np.int16),
@@ -214,9 +208,7 @@ def _measure(
                         band = min(max(int(h / np.float32(BAND_M)), 0), BANDS - 1)
                         top_area[p, band] += area
                 j += 1
-            for d in range(DIRECTIONS):
-                at = np.float32(first if _COS[d] < 0 else j - 1)
-                segments.hull[p, d] = max(segments.hull[p, d], at * _COS[d] + i * _SIN[d])
+            extend_hull(segments.hulls[p], i, first, j - 1)
             plane_ids[p] = plane_id[i, first]
             row = segments.statistics[p]
             row.count += j - first
@@ -224,47 +216,18 @@ def _measure(
             row.left, row.right = min(row.left, left), max(row.right, right)
             row.top, row.bottom = max(row.top, top), min(row.bottom, bottom)
             row.fitted += fitted
-            row.px_sum += px
-            row.py_sum += py
-            row.pz_sum += pz
-            row.nx_sum += nxs
-            row.ny_sum += nys
-            row.nz_sum += nzs
+            row.position_x_sum += px
+            row.position_y_sum += py
+            row.position_z_sum += pz
+            row.facing_x_sum += nxs
+            row.facing_y_sum += nys
+            row.facing_z_sum += nzs
             row.x_sum += sides
             row.xx_sum += sides2
             row.normal_x_sum += turns
             row.normal_xx_sum += turns2
             row.x_normal_x_sum += both
             row.area += areas
-
-
-@kernel(inline=True)
-def choose_samples(graph: SurfaceGraph, labels: I4, segments: Segments) -> None:
-    """Choose evenly spaced samples of each segment, away from edges, in place.
-
-    ``labels`` (rows, columns) are the segments.
-    """
-    rows, columns = labels.shape
-    spans, local_plane, concavity, samples = (
-        graph.spans,
-        graph.local_plane,
-        graph.concavity,
-        segments.samples,
-    )
-    n = segments.parent.size
-    stride, wait, taken = np.zeros(n, np.int32), np.zeros(n, np.int32), np.zeros(n, np.int32)
-    for p in range(n):
-        stride[p] = wait[p] = max(int(segments.statistics[p].count) // SAMPLES, 1)
-    for i in range(rows):
-        for j in range(spans[i, 0], spans[i, 1]):
-            p = labels[i, j]
-            if p == 0 or concavity[i, j] > MERGING.flat_deg or not local_plane[i, 0, j] > 0:
-                continue
-            wait[p] -= 1
-            if wait[p] == 0 and taken[p] < SAMPLES:
-                samples[p, taken[p]] = i * columns + j
-                taken[p] += 1
-                wait[p] = stride[p]
 
 
 @kernel
@@ -281,8 +244,7 @@ def merge(segments: Segments, p: int, q: int) -> None:
     own.near = own.rests_on = own.rests_on_height = 0.0
     for band in range(BANDS):
         segments.top_area[p, band] += segments.top_area[q, band]
-    for d in range(DIRECTIONS):
-        segments.hull[p, d] = max(segments.hull[p, d], segments.hull[q, d])
+    merge_hulls(segments.hulls[p], segments.hulls[q])
     add_statistics(segments.statistics[p], segments.statistics[q])
     # Half of the samples from each side.
     samples, first, mixed = segments.samples, np.zeros(SAMPLES, np.int32), 0
@@ -321,12 +283,12 @@ def add_statistics(a: Row, b: Row) -> None:
     a.area += b.area
     a.depth_sum += b.depth_sum
     a.fitted += b.fitted
-    a.px_sum += b.px_sum
-    a.py_sum += b.py_sum
-    a.pz_sum += b.pz_sum
-    a.nx_sum += b.nx_sum
-    a.ny_sum += b.ny_sum
-    a.nz_sum += b.nz_sum
+    a.position_x_sum += b.position_x_sum
+    a.position_y_sum += b.position_y_sum
+    a.position_z_sum += b.position_z_sum
+    a.facing_x_sum += b.facing_x_sum
+    a.facing_y_sum += b.facing_y_sum
+    a.facing_z_sum += b.facing_z_sum
     a.x_sum += b.x_sum
     a.xx_sum += b.xx_sum
     a.normal_x_sum += b.normal_x_sum
@@ -336,24 +298,6 @@ def add_statistics(a: Row, b: Row) -> None:
     a.hidden += b.hidden
     a.shelf_edge += b.shelf_edge
     a.upper_silhouette += b.upper_silhouette
-
-
-@kernel
-def hull_area(a: F4, b: F4) -> float:
-    """Return the area of the convex hull of two segments, cells.
-
-    ``a`` and ``b`` are their rows of `Segments.hull`. The area is half the sum of each side of the
-    polygon, whose length follows from its neighbours, times its distance from the origin.
-    """
-    turn, half = 2 * math.pi / DIRECTIONS, np.float32(0.5)  # cells are squares, not points
-    twice, total = 2 * math.cos(turn), 0.0
-    before = max(a[DIRECTIONS - 2], b[DIRECTIONS - 2]) + half
-    here = max(a[DIRECTIONS - 1], b[DIRECTIONS - 1]) + half
-    for d in range(DIRECTIONS):
-        after = max(a[d], b[d]) + half
-        total += here * (before + after - twice * here)
-        before, here = here, after
-    return float(total / (2 * math.sin(turn)))
 
 
 @kernel

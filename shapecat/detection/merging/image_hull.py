@@ -1,0 +1,51 @@
+"""Convex hulls of segments in the image, as support functions that merge by their maximum."""
+
+import math
+
+import numpy as np
+
+from shapecat.arrays import F4
+from shapecat.detection.planes.extent import COS, DIRECTIONS, SIN
+from shapecat.jit import kernel
+
+__all__ = ["empty_hulls", "extend_hull", "hull_area", "merge_hulls"]
+
+_COS, _SIN = COS.astype(np.float32), SIN.astype(np.float32)
+
+
+def empty_hulls(count: int) -> F4:
+    """Return the hulls (count, `DIRECTIONS`) of segments without cells."""
+    return np.full((count, DIRECTIONS), -1e9, np.float32)
+
+
+@kernel(inline=True)
+def extend_hull(hull: F4, row: int, first: int, last: int) -> None:
+    """Extend a hull (`DIRECTIONS`,), in place, to the cells of a row from ``first`` to ``last``."""
+    for d in range(DIRECTIONS):
+        column = np.float32(first if _COS[d] < 0 else last)
+        hull[d] = max(hull[d], column * _COS[d] + row * _SIN[d])
+
+
+@kernel(inline=True)
+def merge_hulls(hull: F4, other: F4) -> None:
+    """Extend a hull (`DIRECTIONS`,), in place, to another one."""
+    for d in range(DIRECTIONS):
+        hull[d] = max(hull[d], other[d])
+
+
+@kernel
+def hull_area(a: F4, b: F4) -> float:
+    """Return the area of the convex hull around two hulls (`DIRECTIONS`,), in cells.
+
+    It is half the sum of each side of the polygon, whose length follows from the neighbours, times
+    its distance from the origin.
+    """
+    turn, half = 2 * math.pi / DIRECTIONS, np.float32(0.5)  # cells are squares, not points
+    twice, total = 2 * math.cos(turn), 0.0
+    before = max(a[DIRECTIONS - 2], b[DIRECTIONS - 2]) + half
+    here = max(a[DIRECTIONS - 1], b[DIRECTIONS - 1]) + half
+    for d in range(DIRECTIONS):
+        after = max(a[d], b[d]) + half
+        total += here * (before + after - twice * here)
+        before, here = here, after
+    return float(total / (2 * math.sin(turn)))
