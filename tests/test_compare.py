@@ -494,6 +494,23 @@ def test_kitti_boxes_come_back_from_a_tilted_camera(
     assert found["box_iou"]["mean"] > 0.999
 
 
+def test_types_of_kitti_are_the_categories_of_the_run(run: Path) -> None:
+    """A type cannot hold blanks, so that an underscore may be either."""
+    table = run / "tracks.csv"
+    text = table.read_text().replace("1,cup,0.9,", "1,cup,0.9,wine_glass")
+    table.write_text(text.replace("2,can,0.9,", "2,can,0.9,tea pot"))
+    labels = run.parent / "kitti"
+    (labels / "label_2").mkdir(parents=True)
+    lines = [f"{name} 0 0 0 0 0 0 0 0.2 0.3 0.1 {x} 0.1 1 0\n" for name, x in
+             (("wine_glass", 0), ("tea_pot", 0.1))]  # fmt: skip
+    (labels / "label_2" / "000000.txt").write_text("".join(lines))
+    found = compare(run, labels)
+
+    assert found.figures["box_iou"] == {"n": 2, "mean": 1}
+    assert [row.true_category for row in found.rows] == ["wine_glass", "tea pot"]
+    assert found.as_dict()["differences"] == {}
+
+
 def test_labels_of_two_topics_are_not_mixed(tmp_path: Path) -> None:
     """Cameras that are triggered together give frames of the same stamps and numbers."""
     topics = {"/left": "cup", "/right": "wine glass", "/top": None}

@@ -130,7 +130,7 @@ def compare(
     RecordingError : the reference cannot be read, or has no frame in common with the run.
     """
     finished = read_complete(folder)
-    other = open_reference(reference)
+    other = open_reference(reference, finished.categories)
     if isinstance(other, OtherRun):
         _require_same_recording(finished, other)
     tally = _Tally()

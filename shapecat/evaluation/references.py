@@ -2,7 +2,7 @@
 
 import json
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, Any, cast
 
@@ -22,13 +22,14 @@ from shapecat.types import Box
 __all__ = ["OtherRun", "SimulatedTruth", "open_reference", "read_complete", "run_labellings"]
 
 
-def open_reference(path: Path) -> Reference:
+def open_reference(path: Path, categories: Sequence[str] = ()) -> Reference:
     """Open a reference.
 
     Parameters
     ----------
     path : a run folder; a KITTI folder, which has a folder ``label_2``; a JSON file of `shapecat
         simulate` or COCO; or a simulated recording with its ground truth beside it.
+    categories : of the run to compare; they tell blanks in the types of KITTI from underscores.
 
     Raises
     ------
@@ -37,7 +38,7 @@ def open_reference(path: Path) -> Reference:
     if (path / "run.json").is_file():
         return OtherRun(path)
     if (path / "label_2").is_dir():
-        return KittiLabels(path)
+        return KittiLabels(path, categories)
     beside = path.with_name(f"{path.stem}.truth.json")
     if path.suffix != ".json" and beside.is_file():
         path = beside

@@ -1,6 +1,7 @@
 """KITTI 3D labels: label_2 and calib, as `shapecat export --format kitti` writes them."""
 
 import csv
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,7 @@ from shapecat.arrays import F8
 from shapecat.errors import RecordingError
 from shapecat.evaluation.labellings import Item, Labelling, Reference, find_frame
 from shapecat.geometry import quaternion_from_rotation
+from shapecat.outputs.exports_kitti import kitti_type
 from shapecat.runs.tables import Key
 from shapecat.types import Box
 
@@ -22,12 +24,16 @@ class KittiLabels(Reference):
     ``frames.csv`` gives the timestamp of each label file, and its topic where there are several;
     without it, the file's number is the frame number. Boxes are in the rectified camera frame, and
     the rotation in ``P2`` turns them into the sensor frame.
+
+    A type cannot hold blanks. It names the one of ``categories`` that it is written for, the first
+    of several; in any other type, each ``_`` is a blank.
     """
 
     kind = "KITTI labels"
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, categories: Sequence[str] = ()) -> None:
         self._folder = folder
+        self._categories = {kitti_type(name): name for name in reversed(categories)}
         numbers = sorted(path.stem for path in (folder / "label_2").glob("*.txt"))
         try:
             self._names = _stamps(folder / "frames.csv") or {
@@ -47,11 +53,15 @@ class KittiLabels(Reference):
         try:
             turn = _sensor_from_rectified(self._folder / "calib" / f"{name}.txt")
             lines = path.read_text("utf-8").splitlines()
-            items = [_item(line.split(), turn) for line in lines if line.strip()]
+            items = [self._item(line.split(), turn) for line in lines if line.strip()]
         except (OSError, ValueError, IndexError, np.linalg.LinAlgError) as error:
             msg = f"{path}: not a KITTI label file ({error})"
             raise RecordingError(msg) from error
         return Labelling(tuple(item for item in items if item.category != "DontCare"))
+
+    def _item(self, words: list[str], turn: F8) -> Item:
+        category = self._categories.get(words[0], words[0].replace("_", " "))
+        return Item(track=None, category=category, box=_box(words, turn))
 
     def describe_frames(self) -> str:
         """Return the range of timestamps or frame numbers."""
@@ -84,14 +94,13 @@ def _sensor_from_rectified(path: Path) -> F8:
     return np.asarray(np.sign(np.diag(intrinsic))[:, None] * turn)
 
 
-def _item(words: list[str], turn: F8) -> Item:
-    """Return the object of a line: type truncated occluded alpha bbox h w l x y z rotation_y."""
+def _box(words: list[str], turn: F8) -> Box:
+    """Return the box of a line: type truncated occluded alpha bbox h w l x y z rotation_y."""
     height, width, length, x, y, z, yaw = map(float, words[8:15])
     c, s = np.cos(yaw), np.sin(yaw)
     axes = np.array([[c, s, 0.0], [0.0, 0.0, -1.0], [-s, c, 0.0]])  # columns: along, across, up
-    box = Box(
+    return Box(
         turn @ np.array([x, y - height / 2, z]),
         np.array([length, width, height]),
         quaternion_from_rotation(turn @ axes),
     )
-    return Item(track=None, category=words[0].replace("_", " "), box=box)

@@ -27,7 +27,7 @@ from shapecat.recordings import MessageError
 from shapecat.recordings.colour_image import pixels_of
 from shapecat.types import Camera, Frame, LabelledFrame, LabelledObject, Pose
 
-__all__ = ["rectified_from_sensor", "write_kitti"]
+__all__ = ["kitti_type", "rectified_from_sensor", "write_kitti"]
 
 _log = logging.getLogger(__name__)
 
@@ -120,6 +120,11 @@ def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None
     return _Seen(lens.pinhole, view.colour_from_depth or IDENTITY, image=True)
 
 
+def kitti_type(category: str) -> str:
+    """Return a category as a type, which cannot hold blanks."""
+    return category.replace(" ", "_")
+
+
 def _label(item: LabelledObject, frame: Frame, turn: F8, seen: _Seen) -> str:
     """Return a line of 15 values: type truncated occluded alpha bbox(4) h w l x y z rotation_y."""
     length, width, height = map(float, item.box.size)
@@ -133,7 +138,7 @@ def _label(item: LabelledObject, frame: Frame, turn: F8, seen: _Seen) -> str:
         *(f"{value:.5f}" for value in (alpha, *_pixels(item, frame, seen))),
         *(f"{value:.5f}" for value in (height, width, length, x, y + height / 2, z, yaw)),
     )
-    return " ".join([item.category.replace(" ", "_"), *map(str, numbers)]) + "\n"
+    return " ".join([kitti_type(item.category), *map(str, numbers)]) + "\n"
 
 
 def _pixels(item: LabelledObject, frame: Frame, seen: _Seen) -> tuple[float, ...]:
