@@ -1,5 +1,7 @@
 """What the commands say, with numbers worked out by hand."""
 
+import json
+import re
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
@@ -164,3 +166,93 @@ def test_info_tells_some_unreadable_recordings_from_all(shapecat: Run, tmp_path:
         assert found.exit_code == 1
         assert "good.mcap: " in found.stdout
         assert "bad.mcap" in found.stderr
+
+
+def test_info_tells_what_is_in_a_recording(capsys: pytest.CaptureFixture[str]) -> None:
+    """A megabyte is a million bytes, as for `ls --si` and in the other outputs."""
+    topics = [
+        {"name": "/d", "type": "sensor_msgs/Image", "encoding": "cdr", "count": 61,
+         "use": "depth stream"},
+        {"name": "/tf", "type": "tf2_msgs/TFMessage", "encoding": "ros1", "count": 1075,
+         "use": ""},
+    ]  # fmt: skip
+    import_module("shapecat.cli.info")._show(
+        {"path": "a/lab.mcap", "kind": "MCAP", "bytes": 98_760_000, "start_ns": 5,
+         "seconds": 12.34, "topics": topics, "warnings": ["the last chunk is cut"]}
+    )  # fmt: skip
+    first, *table, last = capsys.readouterr().out.splitlines()
+
+    assert first == "a/lab.mcap: MCAP, 98.8 MB, 12.3 s"
+    assert [re.split(r"\s{2,}", line.strip()) for line in table] == [
+        ["topic", "type", "encoding", "messages", "use"],
+        ["/d", "sensor_msgs/Image", "cdr", "61", "depth stream"],
+        ["/tf", "tf2_msgs/TFMessage", "ros1", "1075"],
+    ]
+    assert last == "warning: the last chunk is cut"
+
+
+def test_events_tell_zeros_and_leave_out_what_is_unknown(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A program that waits for ``exit_code`` would take a success for still running."""
+    now = 100.0
+    monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
+    tasks = [task("a", size=700), task("b", "retry", 40), task("c", "complete", 3), task("d")]
+    for item in tasks:
+        item.recording = f"in/{item.name}.bag"
+    progress = PROGRESS.JsonProgress(tasks)
+    progress.progress("a", "perceive", 0, None)
+    now = 100.3
+    progress.progress("a", "perceive", 3, None)  # too early to tell
+    now = 100.6
+    progress.progress("a", "perceive", 5, 61)
+    progress.progress("a", "annotate", 0, 61)
+    progress.progress("elsewhere", "perceive", 7, 8)
+    for name, code, processed in (("c", 0, False), ("b", 3, None)):
+        done = ended(name, processed=processed)
+        done.code, done.job.name = code, f"in/{name}"
+        if done.summary is None:
+            done.message = "b.bag: damaged"
+        else:
+            done.summary.seconds = 1.23456
+        progress.ended(done)
+    progress.note("a note")
+    events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
+
+    a = {"event": "progress", "recording": "in/a.bag"}
+    end = {"event": "ended", "of": 4, "complete": 1}
+    assert events == [
+        {"event": "plan", "recordings": 4, "bytes": 740,
+         "status": {"new": 2, "retry": 1, "complete": 1}},
+        {**a, "phase": "perceive", "done": 0},
+        {**a, "phase": "perceive", "done": 5, "total": 61},
+        {**a, "phase": "annotate", "done": 0, "total": 61},
+        {**end, "recording": "in/c", "folder": "out/c", "state": "complete", "seconds": 1.235,
+         "processed": False, "exit_code": 0, "failed": 0},
+        {**end, "recording": "in/b", "folder": "out/b", "state": "failed", "exit_code": 3,
+         "message": "b.bag: damaged", "failed": 1},
+        {"event": "note", "text": "a note"},
+    ]  # fmt: skip
+
+
+def test_lines_tell_what_is_done_running_and_left(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """At most one line in five seconds. The time left is that of the bytes that are not read."""
+    now = 100.0
+    monkeypatch.setattr("shapecat.cli.progress.time.monotonic", lambda: now)
+    progress = PROGRESS.PlainProgress([task("a", size=100), task("b", size=300), task("c")])
+    now = 104.9
+    progress.progress("a", "perceive", 1, 9)
+    now = 110.0
+    progress.ended(ended("a", processed=None))
+    progress.progress("c", "annotate", 2, None)
+    progress.progress("b", "perceive", 3, 61)
+    now = 115.0
+    progress.progress("b", "perceive", 4, 61)
+
+    done, busy = "1/3 recordings, 1 failed, about", "c: writing annotated.mcap 2"
+    assert capsys.readouterr().err.splitlines() == [
+        f"{done} 0:30 left; {busy}",
+        f"{done} 0:45 left; b: finding and categorizing objects 4/61, {busy}",
+    ]

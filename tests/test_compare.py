@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -22,10 +23,24 @@ from scipy.spatial import ConvexHull, HalfspaceIntersection
 from scipy.spatial.transform import Rotation
 
 from shapecat.evaluation import comparing
-from shapecat.evaluation.comparing import Difference, _compare_frame, _kind, _Tally, compare
+from shapecat.evaluation.comparing import (
+    Comparison,
+    Difference,
+    _compare_frame,
+    _kind,
+    _Tally,
+    compare,
+)
 from shapecat.evaluation.comparison_matching import Matched, match_objects, seen_together
-from shapecat.evaluation.comparison_page import figure_rows, format_page
-from shapecat.evaluation.comparison_pictures import COLOURS, _captions, _shades, draw_frame
+from shapecat.evaluation.comparison_page import figure_rows, format_page, write_comparison
+from shapecat.evaluation.comparison_pictures import (
+    COLOURS,
+    Caption,
+    DifferenceImage,
+    _captions,
+    _shades,
+    draw_frame,
+)
 from shapecat.evaluation.labellings import Item, Labelling
 from shapecat.evaluation.overlap import Overlap, box_iou
 from shapecat.evaluation.references_coco import CocoLabels, filled_polygon, rle_mask
@@ -229,6 +244,169 @@ def test_the_page_has_each_figure_in_its_place(run: Path, truth: Path) -> None:
     assert told["0", "missed box"] == ["box", "", "", "", "", ""]
     assert told["2", "cup now #4"] == ["cup", "cup", "#4", "0.90", "1.00", ""]
     assert told["1", "box taken for can #2"] == ["box", "can", "#2", "0.90", "0.86", ""]
+
+
+def worked() -> Comparison:
+    """Return a comparison in which no two numbers are equal."""
+    head = "/d", 6, START
+    rows = (
+        Difference(*head, "outline", 11, "cup", 21, "cup", 0.91, 0.62, 0.45, 0.33),
+        Difference(*head, "missed", true_track=12, true_category="can"),
+        Difference("/d", 7, START, "surplus", track=22, category="bowl", confidence=0.52),
+        Difference("/d", 7, START, None, 13, "box", 23, "box", 0.99, 0.98, 0.97, 0.96),
+        Difference("/d", 8, START, "surplus", track=24, category="jar", confidence=0.43),
+        Difference("/d", 9, START, "category", 14, "cup", 25, "can", 0.84, 0.89, 0.81, 0.74),
+        Difference("/d", 9, START, "surplus", track=26, category="pot", confidence=0.35),
+        Difference("/d", 9, START, "missed", true_track=15, true_category="a & b"),
+        Difference("/d", 9, START, "identity", 16, "ball", 27, "ball", 0.76, 0.95, 0.91, 0.88),
+    )
+    captions = (
+        Caption(20.0, 150.4, "left"), Caption(290.0, 9.0, "high"), Caption(144.0, 60.0, "in")
+    )  # fmt: skip
+    picture = DifferenceImage(
+        "/d", 9, "data:image/png;base64,AA", 300, 200, captions, 3.5, rows[5:]
+    )
+    taken_for = [
+        {"true": true, "label": label, "n": n}
+        for true, label, n in (
+            ("cup", "can", 8),
+            ("jar", "pot", 7),
+            ("box", "can", 6),
+            ("a", "b", 1),
+        )
+    ]
+    figures = {
+        "frames": {"compared": 31, "only_in_run": 4, "only_in_reference": 5},
+        "objects": {"true": 90, "detections": 1093, "found": 81, "share_found": 0.9012},
+        "overlap": {"f": 0.8123, "precision": 0.9348, "recall": 0.7234},
+        "category": {
+            "n": 70, "accuracy": 0.6543, "balanced": 0.6111, "view_accuracy": 0.5432,
+            "view_balanced": 0.5222, "ece": 0.0678, "taken_for": taken_for,
+        },
+        "box_iou": {"n": 66, "mean": 0.4567},
+        "tracking": {
+            "idf1": 0.7111, "mota": 0.6222, "hota": 0.5333, "detection_accuracy": 0.4444,
+            "association_accuracy": 0.3557, "switches": 2, "misses": 14, "false_positives": 1,
+            "objects": 99,
+        },
+    }  # fmt: skip
+    notes = ("The pictures lack depth: it <is> gone",)
+    return Comparison("runs/lab", "truth/t.json", "COCO labels", figures, rows, (picture,), notes)
+
+
+FIGURES = [
+    ["frames", "31", "4 only in the run, 5 only in the reference"],
+    ["objects found", "90.1 %", "81 of 90; 1,093 detections"],
+    ["overlap F", "0.812", "precision 0.935, recall 0.723 of pixels"],
+    [
+        "category right", "65.4 %",
+        "of 70 matched objects; cup as can 8×, jar as pot 7×, box as can 6×",
+    ],
+    ["single views", "54.3 %", "before fusion over the track"],
+    ["calibration error", "0.068", "ECE of single views; 0 is perfect"],
+    ["box IoU", "0.457", "mean of 66 pairs, in 3D"],
+    ["IDF1", "0.711", "how long identities are kept"],
+    ["MOTA", "0.622", "14 misses, 1 false positive, 2 identity switches"],
+    ["HOTA", "0.533", "detection 0.444, association 0.356"],
+]  # fmt: skip
+
+
+def test_the_command_prints_each_figure_under_its_name(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """A swapped pair of numbers or words is still a plausible table."""
+    found = worked()
+    import_module("shapecat.cli.compare")._print(found, figure_rows(found))
+    printed = capsys.readouterr()
+    first, _, head, *table, _, last = printed.out.splitlines()
+
+    assert first == "runs/lab compared with truth/t.json (COCO labels)"
+    assert head.split() == ["metric", "value", "meaning"]
+    assert [re.split(r"\s{2,}", line.strip()) for line in table] == FIGURES
+    assert last == "8 differences: 3 surplus, 2 missed, 1 outline, 1 category, 1 identity"
+    assert printed.err == "The pictures lack depth: it <is> gone\n"
+
+
+def test_the_page_shows_each_number_once_and_in_its_place() -> None:
+    """All that a reader sees, in order: text, tables, and captions inside of the picture."""
+    page = format_page(worked())
+    figures, rows = (
+        [re.findall(r"<t[hd]>(.*?)</t[hd]>", row) for row in re.findall(r"<tr>(.*?)</tr>", table)]
+        for table in re.findall(r"<table>(.*?)</table>", page)
+    )
+    text = re.findall(r"<(?:title|h1|h2|p|b)\b[^>]*>([^<]+)", page)
+    legend = re.findall(r"rgb(\(.*?\))\"></i>(.*?)</span>", page)
+    (svg,) = re.findall(r"<svg .*?</svg>", page)
+
+    assert text == [
+        "lab compared with t.json",
+        "lab compared with t.json",
+        "runs/lab · truth/t.json (COCO labels)",
+        "The pictures lack depth: it &lt;is&gt; gone",
+        "Frames that differ most",
+        "The frame with the most differences in each twelfth of the run.",
+        "/d frame 9",
+        "Frame by frame",
+        "8 differences. All objects are in objects.parquet.",
+    ]
+    assert [[cell.strip() for cell in row] for row in figures] == FIGURES
+    assert rows == [
+        ["frame", "difference", "true", "found", "track", "confidence", "overlap F", "box IoU"],
+        ["6", "cup #21: outline differs", "cup", "cup", "#21", "0.91", "0.62", "0.33"],
+        ["6", "missed can", "can", "", "", "", "", ""],
+        ["7", "surplus bowl #22", "", "bowl", "#22", "0.52", "", ""],
+        ["8", "surplus jar #24", "", "jar", "#24", "0.43", "", ""],
+        ["9", "cup taken for can #25", "cup", "can", "#25", "0.84", "0.89", "0.74"],
+        ["9", "surplus pot #26", "", "pot", "#26", "0.35", "", ""],
+        ["9", "missed a &amp; b", "a &amp; b", "", "", "", "", ""],
+        ["9", "ball now #27", "ball", "ball", "#27", "0.76", "0.95", "0.88"],
+    ]
+    assert legend == [
+        (str(COLOURS["both"]), "both"),
+        (str(COLOURS["missed"]), "missed: only in the reference"),
+        (str(COLOURS["surplus"]), "surplus: only in the run, or on another object"),
+        (str(COLOURS["category"]), "wrong category"),
+    ]
+    assert '<svg viewBox="0 0 300 200"' in svg
+    assert 'href="data:image/png;base64,AA" width="300" height="200"' in svg
+    assert re.findall(r'<text x="(.*?)" y="(.*?)">(.*?)</text>', svg) == [
+        ("70", "150", "left"), ("230", "14", "high"), ("144", "60", "in"),
+    ]  # fmt: skip
+    assert page.count(
+        "cup taken for can #25; surplus pot #26; missed a &amp; b; ball now #27"
+    ) == 2  # fmt: skip
+
+
+def test_the_table_has_each_number_in_its_column(tmp_path: Path) -> None:
+    """Read by another program, which knows the columns by their names."""
+    found = worked()
+    write_comparison(tmp_path / "out", found)
+    rows = pq.read_table(tmp_path / "out" / "objects.parquet").to_pylist()
+    told = json.loads((tmp_path / "out" / "comparison.json").read_text("utf-8"))
+
+    assert rows == [pytest.approx(row._asdict()) for row in found.rows]
+    assert list(told) == [
+        "run", "reference", "kind", *found.figures, "differences", "notes"
+    ]  # fmt: skip
+    assert told["tracking"] == found.figures["tracking"]
+    assert told["notes"] == list(found.notes)
+
+
+@pytest.mark.parametrize(
+    ("name", "key"),
+    [
+        ("session2_000012.png", ("/d", 12)),
+        ("camera1/7_depth_12.v3.jpg", ("/d", 3)),
+        (f"12_{START}_5.png", ("/d", 99)),
+    ],
+)
+def test_an_image_is_of_the_frame_that_its_name_says(name: str, key: tuple[str, int]) -> None:
+    """Names begin with numbers of sessions and cameras; a stamp is told by its size."""
+    images = [{"id": 1, "file_name": name, "width": 4, "height": 3}]
+    labels = CocoLabels(Path("x.json"), {"categories": [], "annotations": [], "images": images})
+
+    assert labels.at(key, START) is not None
+    assert [labels.at(("/d", k), 0) is None for k in (1, 2, 5, 7)] == [True] * 4
 
 
 def test_the_picture_of_a_part_is_that_of_its_worst_frame() -> None:

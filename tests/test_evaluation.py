@@ -19,8 +19,16 @@ from shapecat.arrays import F4
 from shapecat.errors import ModelError, RecordingError
 from shapecat.evaluation import Report, evaluate_folder, format_report, metrics, read_dataset
 from shapecat.evaluation.fused import Fused, fuse_views
-from shapecat.evaluation.page import confusion_svg, write_page
-from shapecat.evaluation.report import _accuracy_over
+from shapecat.evaluation.metrics import Bin
+from shapecat.evaluation.page import (
+    accuracy_svg,
+    calibration_svg,
+    confusion_svg,
+    format_markdown,
+    format_page,
+    write_page,
+)
+from shapecat.evaluation.report import Compared, _accuracy_over
 from shapecat.evaluation.training import (
     learn_on_folder,
     order_categories,
@@ -252,6 +260,157 @@ def test_the_drawn_confusion_has_true_categories_in_rows() -> None:
     assert float(texts["3"]["x"]) == max(float(head["x"]) for head in heads)
     assert texts["7"]["y"] == heads[0]["y"] != cup["y"]
     assert "0" not in texts
+
+
+def worked() -> Report:
+    """Return a report in which no two numbers are equal."""
+    return Report(
+        model="m-7",
+        n=57,
+        categories=("cup", "can", "box"),
+        accuracy=0.8123,
+        balanced_accuracy=0.7234,
+        ece=0.0456,
+        recall={"cup": 0.6667, "can": 0.7777, "box": None},
+        confusion=((12, 5, 1), (3, 28, 8), (0, 0, 0)),
+        seconds_per_object=0.0345,
+        novelty={"n": 9, "auroc": 0.9348, "rejected": 0.5678},
+        rejected_known=0.0234,
+        skipped=4,
+        calibration=(Bin(40, 0.9, 0.75), Bin(10, 0.6, 0.5)),
+        by_distance=(("0-0.8 m", 11, 0.5), ("0.8-1.1 m", 44, 0.875)),
+        by_points=(("0-60", 13, 0.25),),
+        by_elevation=(("below 15°", 17, 0.125),),
+        fused=(Fused(3, 19, 0.8877, 0.1122),),
+        baselines=(Compared("forest", 140, 0.6657, 0.5544, None),),
+    )
+
+
+FIGURES = {
+    "accuracy": "0.812",
+    "balanced accuracy": "0.723",
+    "calibration error": "0.046",
+    "known shapes rejected": "0.023",
+    "unknown shapes rejected": "0.568",
+    "novelty AUROC": "0.935",
+}
+TABLES = [
+    [["distance", "views", "accuracy"], ["0-0.8 m", "11", "0.500"], ["0.8-1.1 m", "44", "0.875"]],
+    [["elevation", "views", "accuracy"], ["below 15°", "17", "0.125"]],
+    [["points", "views", "accuracy"], ["0-60", "13", "0.250"]],
+    [["views fused", "objects", "accuracy", "calibration error"], ["3", "19", "0.888", "0.112"]],
+    [
+        ["classifier", "training views", "accuracy", "balanced", "calibration error"],
+        ["forest", "140", "0.666", "0.554"],
+    ],
+]  # fmt: skip
+
+
+def test_the_printed_report_has_each_number_under_its_name() -> None:
+    """A swapped pair of metrics is still a plausible report."""
+    first, *lines = format_report(worked()).splitlines()
+    cells = [re.split(r"\s{2,}", line.strip()) for line in lines if line.strip()]
+    split = next(k for k, row in enumerate(cells) if row[0].startswith("rows:"))
+
+    assert first == "57 views, model m-7; skipped 4 without a surface"
+    assert cells[:split] == [*map(list, FIGURES.items()), ["ms per object", "34.500"]]
+    head = next(k for k, row in enumerate(cells) if row[-1] == "recall")
+    said = " ".join(word for row in cells[split:head] for word in row)
+    assert said == "rows: true category; columns: predicted category"
+    assert cells[head : head + 4] == [
+        ["cup", "can", "box", "recall"],
+        ["cup", "12", "5", "1", "0.667"],
+        ["can", "3", "28", "8", "0.778"],
+        ["box", ".", ".", ".", "-"],
+    ]
+    told = [row for table in TABLES for row in table]
+    told[-1] = [*told[-1], "-"]
+    assert cells[head + 4 :] == told
+
+
+def test_the_page_and_its_markdown_have_each_number_in_its_place() -> None:
+    report = worked()
+    page = format_page(report, title="a|b & c")
+    names = {name: f"{name}.svg" for name in ("confusion", "calibration", "distance", "points")}
+    names["elevation"] = "elevation.svg"
+    text = format_markdown(report, title="a|b & c", pictures=names)
+    recalls = [("recall of cup", "0.667"), ("recall of can", "0.778"), ("recall of box", "–")]
+    figures = [("views", "57"), *FIGURES.items(), ("model", "m-7"), *recalls]
+    tables = [[list(row) for row in figures], *TABLES]
+    tables[-1] = [tables[-1][0], [*tables[-1][1], "–"]]
+    heads = [
+        "Confusion", "Calibration", "Accuracy by distance", "Accuracy by elevation",
+        "Accuracy by points", "Several views of one object", "Comparison with baselines",
+    ]  # fmt: skip
+
+    found = [
+        [re.findall(r"<t[hd]>(.*?)</t[hd]>", row) for row in re.findall(r"<tr>(.*?)</tr>", table)]
+        for table in re.findall(r"<table>(.*?)</table>", page)
+    ]
+    assert found == tables
+    assert re.findall(r"<title>(.*?)<|<h1>(.*?)<", page) == [
+        ("a|b &amp; c", ""), ("", "a|b &amp; c")
+    ]  # fmt: skip
+    assert re.findall(r"<h2>(.*?)</h2>", page) == heads
+    blocks = [block.splitlines() for block in text.strip().split("\n\n")]
+    written = [
+        [line.strip("| ").split(" | ") for line in block if "---" not in line]
+        for block in blocks
+        if block[0].startswith("|")
+    ]
+    assert written == [[[""], *tables[0]], *tables[1:]]  # its head is empty
+    assert [b[0].removeprefix("## ") for b in blocks if b[0].startswith("##")] == heads
+    assert blocks[0] == ["# a\\|b &amp; c"]
+    for said in (page, text):
+        assert "Rows: true category; columns: predicted category." in said
+        assert "On the diagonal, 80 % of the views with a confidence of 0.8 are right." in said
+    assert re.findall(r"!\[(.*?)\]\((.*?)\)", text) == [
+        ("Confusion", "confusion.svg"), ("Calibration", "calibration.svg"),
+        ("Accuracy by distance", "distance.svg"), ("Accuracy by elevation", "elevation.svg"),
+        ("Accuracy by points", "points.svg"),
+    ]  # fmt: skip
+
+
+def drawn(svg: str, kind: str, *names: str) -> list[tuple[str | None, ...]]:
+    """Return some attributes of all elements of a kind; ``text`` is what they contain."""
+    found = [e for e in ET.fromstring(svg).iter() if e.tag.endswith(kind)]  # noqa: S314  ours
+    return [tuple(e.text if n == "text" else e.get(n) for n in names) for e in found]
+
+
+def test_pictures_of_a_report_are_drawn_to_scale() -> None:
+    """Shades are shares of the row, areas of dots and thicknesses of bars numbers of views."""
+    report = worked()
+    cells = drawn(confusion_svg(report.categories, report.confusion), "rect", "x", "y", "fill")
+    ink = np.array([31, 78, 121])
+    rows = [(row, k, share) for row, count in enumerate(report.confusion)
+            for k, share in enumerate(np.array(count) / max(sum(count), 1))]  # fmt: skip
+    assert [(float(str(x)), float(str(y))) for x, y, _ in cells] == [
+        (74 + 46 * k, 74 + 46 * row) for row, k, _ in rows
+    ]
+    shades = [tuple(np.round(255 + (ink - 255) * share).astype(int).tolist()) for *_, share in rows]
+    assert [fill for *_, fill in cells] == [f"rgb{shade}" for shade in shades]
+    texts = drawn(confusion_svg(report.categories, report.confusion), "text", "text", "fill")
+    assert [item for item in texts if item[1]] == [
+        ("12", "white"), ("5", "black"), ("1", "black"),
+        ("3", "black"), ("28", "white"), ("8", "black"),
+    ]  # fmt: skip
+
+    curve = calibration_svg(report.calibration)
+    assert drawn(curve, "circle", "cx", "cy", "r") == [
+        (f"{34 + 224 * 0.9:.1f}", f"{18 + 224 * 0.25:.1f}", f"{2 + 14 * 0.8**0.5:.1f}"),
+        (f"{34 + 224 * 0.6:.1f}", f"{18 + 224 * 0.5:.1f}", f"{2 + 14 * 0.2**0.5:.1f}"),
+    ]
+    assert drawn(curve, "line", "x1", "y1", "x2", "y2") == [("34.0", "242.0", "258.0", "18.0")]
+    assert drawn(curve, "text", "text") == [("confidence",), ("accuracy",)]
+
+    bars = accuracy_svg(report.by_distance)
+    assert drawn(bars, "rect", "x", "y", "width", "height")[:-1] == [
+        ("96", f"{17 - 9.5 / 2:.1f}", f"{328 * 0.5:.1f}", "9.5"),
+        ("96", f"{51 - 26 / 2:.1f}", f"{328 * 0.875:.1f}", "26.0"),
+    ]
+    assert drawn(bars, "text", "text", "y") == [
+        ("0-0.8 m", "21.0"), ("0.500", "21.0"), ("0.8-1.1 m", "55.0"), ("0.875", "55.0")
+    ]  # fmt: skip
 
 
 def test_the_markdown_page_has_its_pictures_beside_it(trained: Path, tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import shutil
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -16,10 +17,11 @@ from shapecat.colour.masks import Mask
 from shapecat.outputs.report import read_reports
 from shapecat.outputs.report.cards import Card, _few, card_html
 from shapecat.outputs.report.choosing import Choice, _areas, choose_frames
-from shapecat.outputs.report.images import SeenFrame, _border_share, _hidden_share, encode
-from shapecat.outputs.report.page import Listed, index_page, run_page
+from shapecat.outputs.report.images import Crop, SeenFrame, _border_share, _hidden_share, encode
+from shapecat.outputs.report.page import Listed, _strip, index_page, run_page
 from shapecat.outputs.report.pictures import (
     Pictures,
+    StripFrame,
     TrackPictures,
     _points,
     _strip_frame,
@@ -28,8 +30,9 @@ from shapecat.outputs.report.pictures import (
 from shapecat.outputs.report.surfaces import Snapshot, SurfaceDrawing, draw
 from shapecat.outputs.report.tracks import Timeline, read_timelines
 from shapecat.outputs.report.writing import RunReport, _faces
-from shapecat.outputs.rereading import read_finished
-from shapecat.runs.track_table import TrackRow, read_track_table
+from shapecat.outputs.rereading import FinishedRun, read_finished
+from shapecat.runs.label_meaning import TrackLabel
+from shapecat.runs.track_table import TrackRow, TrackTable, read_track_table
 from shapecat.types import (
     Box,
     Camera,
@@ -63,6 +66,144 @@ def test_a_card_shows_views_times_and_the_posterior_of_all_of_them() -> None:
     assert re.findall(r"<kbd>(\d)</kbd>", card) == ["2", "3", "1"]
     bars = re.findall(r'class="seen" x="([\d.]+)" y="38" width="([\d.]+)"', card)
     assert bars == [("75.0", "37.5"), ("240.0", "1.5")]
+
+
+def text_of(html: str) -> list[str]:
+    """Return what a reader sees of HTML, in order."""
+    return [part.strip() for part in re.split(r"<[^>]*>", html) if part.strip()]
+
+
+def worked_card() -> Card:
+    """Return a card with a posterior that changes from cup to can, and no two equal numbers."""
+    causal = [[0.7, 0.2, 0.1], [0.5, 0.3, 0.2], [0.5, 0.3, 0.2], [0.16, 0.58, 0.26]]
+    seen = np.array([True, False, True, False])
+    line = Timeline(np.array([1.0, 1.5, 2.5, 3.2]), seen, np.array(causal), ())
+    sides = tuple(SurfaceDrawing(n, f"data:{n}", f"M{n}", f"N{n}") for n in ("front", "top"))
+    pictures = TrackPictures(Crop("data:crop", 60, 40, "M1 2L3 4"), sides, (0.123, 0.071, 0.234))
+    return Card(TrackRow(2, 17, "can", 0.644, "", "/d", {"novelty": "0.31"}), line, pictures)
+
+
+def test_a_card_has_each_number_in_its_place() -> None:
+    """The bars are of all views: the last posterior, not the first. A track may coast at its end.
+
+    On the time line, 300 wide and 4 s long, probable is up: 0 is at 33 and 1 at 2.
+    """
+    card = card_html(worked_card(), NAMES, ("unknown", *NAMES), 4.0)
+    about = re.search(r"<article [^>]*>", card)
+    lines = re.findall(r'<polyline points="(.*?)" stroke="(.*?)"', card)
+    bars = re.findall(r'data-label="(\w+)" style="--c:(#\w+);--w:([\d.]+%)"', card)
+
+    assert text_of(card) == [
+        "can", "0.64", "#17",
+        "posterior over time; the bar below shows when the object was seen",
+        "2", "can", "0.58", "3", "box", "0.26", "1", "cup", "0.16",
+        "2 views · 1.0–2.5 s · 12 × 7 × 23 cm · novelty 0.31", "unknown", "delete",
+    ]  # fmt: skip
+    assert about is not None
+    for name, value in (
+        ("track", "17"), ("category", "can"), ("confidence", "0.644"), ("first", "1")
+    ):  # fmt: skip
+        assert f'data-{name}="{value}"' in about[0]
+    assert bars == [
+        ("can", "#46a758", "58.0%"), ("box", "#3e82f6", "26.0%"), ("cup", "#e5484d", "16.0%")
+    ]  # fmt: skip
+    assert lines == [
+        ("75,29.9 112.5,26.8 187.5,26.8 240,24.9", "#3e82f6"),
+        ("75,26.8 112.5,23.7 187.5,23.7 240,15", "#46a758"),
+        ("75,11.3 112.5,17.5 187.5,17.5 240,28", "#e5484d"),
+    ]
+    assert re.findall(r'class="seen" x="(.*?)" y="38" width="(.*?)"', card) == [
+        ("75.0", "1.5"), ("187.5", "1.5")
+    ]  # fmt: skip
+    assert re.findall(r'src="(.*?)"', card) == ["data:crop", "data:front", "data:top"]
+    assert re.findall(r'viewBox="([\d ]+)"', card)[:2] == ["0 0 60 40", "0 0 160 160"]
+    assert re.findall(r'<path (?:class="nodes" )?d="(.*?)"/>', card) == [
+        "M1 2L3 4", "Mfront", "Nfront", "Mtop", "Ntop"
+    ]  # fmt: skip
+    assert re.findall(r'title="(front|top)"', card) == ["front", "top"]
+
+
+@pytest.mark.parametrize("topics", [("/d", "/d"), ("/d", "/e")])
+def test_the_strip_has_each_box_in_its_place(topics: tuple[str, str]) -> None:
+    """Left and width are shares of the width, top and height of the height.
+
+    Topics are named where there are several of them.
+    """
+    boxes = {17: (50, 30, 20, 15), 99: (1, 2, 3, 4)}
+    few = StripFrame("data:few", 200, 100, 0.52, topics[0], boxes)
+    many = StripFrame("data:many", 100, 80, 3.48, topics[1], {k: (k, 4, 8, 6) for k in range(5)})
+    strip = _strip([few, many], [worked_card()])
+    names = ["0.5 s /d", "3.5 s /e"] if topics[0] != topics[1] else ["0.5 s", "3.5 s"]
+
+    assert text_of(strip) == ["#17", "can", names[0], names[1]]  # 99 has no card
+    assert re.findall(r'data-track="(\d+)" style="(.*?)"', strip) == [
+        ("17", "left:25.0%;top:30.0%;width:10.0%;height:15.0%;--c:#46a758")
+    ]
+    assert re.findall(r'class="(frame.*?)" style="(.*?)" data-name="(.*?)"', strip) == [
+        ("frame", "--ratio:2.0000", names[0]), ("frame crowded", "--ratio:1.2500", names[1])
+    ]  # fmt: skip
+    assert re.findall(r'src="(.*?)"', strip) == ["data:few", "data:many"]
+
+
+@pytest.mark.parametrize("served", [False, True])
+def test_the_page_of_a_run_has_each_number_under_its_name(*, served: bool) -> None:
+    about: Any = {
+        "input": {"path": "/data/lab.mcap", "bytes": 12_340_000, "digest": "xxh3-128:77"},
+        "options": {"topics": ["/d", "/e"]},
+        "counts": {"frames": 61, "detections": 143, "skipped": {"too few points": 5}},
+        "model": {"id": "m-7", "categories": list(NAMES)},
+        "warnings": ["it <was> dark"],
+        "seconds": {"perceive": 12.34, "total": 15.67},
+        "fixed_frame": "map",
+        "up": {"source": "imu"},
+        "color": {"/d": "/rgb", "/e": None},
+        "versions": {"shapecat": "1.2", "python": "3.13"},
+    }
+    lab = FinishedRun(Path("out/my lab"), about, {17: TrackLabel(17, "mug", 1.0)})
+    row = worked_card().row
+    table = TrackTable(("track", "label"), (row,), ())
+    stages = {"detect": np.array([0.0021, 0.0042, 0.1044]), "rest": np.array([])}
+    text = run_page(
+        lab, table, [worked_card()], [], stages, notes=["a note"], index="../i.html", served=served
+    )
+    facts = dict(re.findall(r"<dt>(.*?)</dt><dd>(.*?)</dd>", text.partition("Glossary")[0]))
+    (times,) = re.findall(r"<h2>Time</h2><table>(.*?)</table>", text)
+    cells = [
+        re.findall(r"<t[hd]>(.*?)</t[hd]>", line) for line in re.findall(r"<tr>.*?</tr>", times)
+    ]
+    (saying,) = re.findall(
+        r'</div>\s*<p class="muted">(.*?)</code>', text[text.index("confusion") :]
+    )
+    what = "" if served else " --labels tracks.csv"
+
+    assert facts == {
+        "frames": "61", "length": "3.2 s", "detections": "143", "tracks": "1", "uncertain": "1",
+        "model": "m-7", "categories": "cup, can, box", "fixed frame": "map", "up": "imu",
+        "colour images": "/rgb", "skipped frames": "5 too few points", "shapecat": "1.2",
+        "python": "3.13", "input digest": "xxh3-128:77",
+    }  # fmt: skip
+    assert "/data/lab.mcap · 12.3 MB · /d, /e" in text
+    assert re.findall(r"<li>⚠ (.*?)</li>", text) == ["it &lt;was&gt; dark", "a note"]
+    assert '<a href="../i.html">all runs</a>' in text
+    assert cells == [
+        ["stage, per frame", "median", "95th percentile", ""],
+        ["detect", "4.2", "94.4", "ms"],
+        ["rest", "0.0", "0.0", "ms"],
+        ["phase", "total", "", ""],
+        ["perceive", "12.3", "", "s"],
+        ["total", "15.7", "", "s"],
+    ]
+    assert text_of(saying)[-1] == f"shapecat annotate &#x27;out/my lab&#x27;{what}"
+    assert ("already in tracks.csv" in saying) == served
+    assert ("connect-src 'self'" in text) == served
+    assert re.findall(r'<option value="(unknown|cup|can|box|mug)">', text) == [
+        "unknown", "cup", "can", "box", "mug"
+    ]  # fmt: skip
+    assert re.findall(r'data-category="(\w+)" aria-pressed', text) == ["can"]
+    data = json.loads(re.findall(r'id="data">(.*?)</script>', text)[0])
+    assert data["served"] is served
+    assert data["categories"] == ["unknown", "cup", "can", "box", "mug"]
+    assert data["rows"] == [{"track": "17", "category": "can", "label": "", "cells": ["", ""]}]
 
 
 def test_durations_of_stages_are_in_milliseconds_and_of_phases_in_seconds(run: Path) -> None:
