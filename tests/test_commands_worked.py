@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 from click.testing import Result
 
+from shapecat.outputs.dataset_frames import Selection
+from shapecat.runs.label_transfer import TABLE_ALONE
 from tests.scenes import record
 
 Run = Callable[..., Result]
@@ -255,4 +257,124 @@ def test_lines_tell_what_is_done_running_and_left(
     assert capsys.readouterr().err.splitlines() == [
         f"{done} 0:30 left; {busy}",
         f"{done} 0:45 left; b: finding and categorizing objects 4/61, {busy}",
+    ]
+
+
+CALLS = {
+    "simulate o.mcap --scene shelf --sensor d435 --frames 7 --clouds --color --seed 3": (
+        "shapecat.simulation.simulate",
+        [Path("o.mcap")],
+        {"scene": "shelf", "format": "mcap", "sensor": "d435", "frames": 7, "clouds": True,
+         "color": True, "seed": 3},
+        Path("done.mcap"),
+        "done.mcap\n",
+    ),
+    "learn default data --out m.npz --seed 5": (
+        "shapecat.evaluation.training.learn_on_folder",
+        [None, Path("data"), Path("m.npz")],
+        {"seed": 5},
+        {"added": ["jar", "mug"], "views": 1075},
+        "m.npz: learned jar, mug from 1,075 views\n",
+    ),
+    "train data --out m.npz --seed 5": (
+        "shapecat.evaluation.training.train_on_folder",
+        [Path("data"), Path("m.npz")],
+        {"seed": 5},
+        {"categories": ["cup", "can"], "views": 1},
+        "m.npz: 1 view of cup, can\n",
+    ),
+    "export a b --format coco --out o --every 3 --per-track 7 --min-confidence 0.6 "
+    "--corrected-only --depth --val 0.4": (
+        "shapecat.outputs.exports.export_dataset",
+        [[Path("a"), Path("b")], "coco", Path("o"), Selection(3, 7, 0.6, True, True, 0.4)],
+        {"recording": None},
+        1075,
+        "2 runs: 1,075 labelled views in o\n",
+    ),
+    "export a --format kitti --out o --every 3 --boxes visible --recording r.bag": (
+        "shapecat.outputs.exports.export_run",
+        [Path("a"), "kitti", Path("o")],
+        {"every": 3, "visible_boxes": True, "recording": Path("r.bag")},
+        1,
+        "a: 1 labelled view in o\n",
+    ),
+}  # fmt: skip
+"""By command line the function that works, its arguments, its answer, and what is printed."""
+
+
+@pytest.mark.parametrize("line", CALLS)
+def test_options_reach_the_work_and_its_answer_the_reader(
+    shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, line: str
+) -> None:
+    """An option that is lost on the way changes a result without a word."""
+    work, words, options, answer, said = CALLS[line]
+    calls = []
+
+    def stub(*arguments: Any, observe: Any, **named: Any) -> Any:
+        calls.append((list(arguments), named))
+        assert isinstance(observe, RENDER.Bars)
+        return answer
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(work, stub)
+    monkeypatch.setattr("shapecat.outputs.rereading.find_runs", list)
+    done = shapecat(*line.split())
+
+    assert (done.exit_code, done.stdout) == (0, said), done.stderr
+    assert calls == [(words, options)]
+
+
+def test_annotate_tells_what_was_written_and_which_labels_were_not_transferred(
+    shapecat: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Labels that silently stay behind would be taken for applied."""
+    calls = []
+    missed = [{"old_track": 17, "label": "tea pot", "reason": "no object there"}]
+    answer = {"transferred": [{}] * 5, "not_transferred": missed, "by": TABLE_ALONE}
+
+    def stub(*arguments: Any, **named: Any) -> Any:
+        calls.append(([*arguments[:2]], named))
+        return SimpleNamespace(as_dict=lambda: answer)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("shapecat.pipeline.annotate_again", stub)
+    Path("lab").mkdir()
+    options = ("--by-place", "--boxes", "visible", "--recording", "r.bag")
+    words = ("annotate", "lab", "--labels", "t.csv", *options)
+    bare = shapecat(*words)
+    for name in ("review.rrd", "annotated.mcap"):
+        Path("lab", name).touch()
+    done = shapecat(*words)
+
+    chosen = {"by_place": True, "boxes": "visible", "recording": Path("r.bag")}
+    assert calls == [([Path("lab"), Path("t.csv")], chosen)] * 2
+    assert bare.stdout.splitlines()[0] == "lab: wrote no file but its tables"
+    assert done.stdout.splitlines() == [
+        "lab: wrote annotated.mcap and review.rrd", "5 of 6 labels transferred"
+    ]  # fmt: skip
+    warning, reason = done.stderr.splitlines()
+    assert warning == (
+        "t.csv: this table is not in a run folder, so shapecat assumes the same fixed frame and "
+        "unmoved objects; give the run folder to check both"
+    )
+    assert reason == "  track 17, tea pot: no object there"
+
+
+def test_process_tells_where_labels_are_that_were_not_transferred(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    missed = [{"old_track": 17, "label": "tea pot", "reason": "no object there"}]
+    for target, left in (("", missed), ("s3://b/lab", missed), ("", [])):
+        corrections = {"transferred": [{}] * 5, "not_transferred": left}
+        summary = SimpleNamespace(corrections=corrections, folder=Path("out/lab"))
+        job = SimpleNamespace(name="in/lab", target=target)
+        PROCESS._print_corrections(SimpleNamespace(job=job, summary=summary))
+
+    told = "lab: transferred 5 of 6 corrected labels; the others are in"
+    assert capsys.readouterr().err.splitlines() == [
+        f"{told} out/lab/tracks.previous.csv",
+        "  track 17, tea pot: no object there",
+        f"{told} s3://b/lab/tracks.previous.csv",
+        "  track 17, tea pot: no object there",
+        "lab: transferred 5 of 5 corrected labels",
     ]

@@ -264,3 +264,96 @@ def test_a_tiny_turn_to_the_right_is_no_full_turn() -> None:
         half = np.array([0, 0, np.sin(yaw / 2), np.cos(yaw / 2)])
         turned = replace(item, box=Box(np.zeros(3), SIZE, half))
         assert _described(turned, np.eye(3), "centroid_abs")["rotations"]["z"] == 0
+
+
+def test_files_of_data_sets_tell_frames_runs_and_categories(tmp_path: Path) -> None:
+    """Two runs have a track 4: in the data set they are two. Ids count from 1, in each split."""
+    view = replace(labelled(cut=False, hidden=False), topic="/left", index=17, stamp_ns=12_345)
+    second = replace(dataset_image(), name="b.jpg", labelled=view)
+    other = SimpleNamespace(folder=Path("runs/hall"), name="hall")
+    images: Any = [
+        ("train", finished(), dataset_image()), ("train", other, second), ("val", other, second)
+    ]  # fmt: skip
+    categories = ("cup", "can", "bowl")
+    assert write_coco(tmp_path, images, categories) == 3
+    assert write_yolo(tmp_path, images, categories) == 3
+    train, val = (
+        json.loads((tmp_path / "annotations" / f"instances_{split}.json").read_text())
+        for split in ("train", "val")
+    )
+
+    size = {"width": 40, "height": 20}
+    b = {"file_name": "b.jpg", **size, "recording": "hall", "topic": "/left", "frame": 17,
+         "stamp_ns": 12_345}  # fmt: skip
+    assert train["images"] == [
+        {"id": 1, "file_name": "a.jpg", **size, "recording": "lab", "topic": "/depth", "frame": 0,
+         "stamp_ns": 5},
+        {"id": 2, **b},
+    ]  # fmt: skip
+    assert val["images"] == [{"id": 1, **b}]
+    assert [[c["id"], c["name"]] for c in train["categories"]] == [
+        [1, "cup"],
+        [2, "can"],
+        [3, "bowl"],
+    ]
+    names = ("id", "image_id", "category_id", "track_id")
+    assert [[a[name] for name in names] for a in train["annotations"]] == [
+        [1, 1, 3, 1], [2, 1, 1, 2], [3, 2, 3, 3], [4, 2, 1, 4]
+    ]  # fmt: skip
+    assert [[a[name] for name in names] for a in val["annotations"]] == [[1, 1, 3, 3], [2, 1, 1, 4]]
+    runs = [(a["attributes"]["run"], a["attributes"]["track"]) for a in train["annotations"]]
+    assert runs == [("lab", 4), ("lab", 9), ("hall", 4), ("hall", 9)]
+    assert (tmp_path / "data.yaml").read_text().splitlines() == [
+        "path: .", "train: images/train", "val: images/val", "names:",
+        '  0: "cup"', '  1: "can"', '  2: "bowl"',
+    ]  # fmt: skip
+    assert sorted(str(p.relative_to(tmp_path)) for p in tmp_path.glob("*/*/*")) == [
+        "images/train/a.jpg", "images/train/b.jpg", "images/val/b.jpg",
+        "labels/train/a.txt", "labels/train/b.txt", "labels/val/b.txt",
+    ]  # fmt: skip
+
+
+def test_labelcloud_forms_hold_the_same_box_each_in_its_units(tmp_path: Path) -> None:
+    """Absolute angles are in degrees, from 0 to 360; relative ones in radians."""
+    labelcloud(tmp_path)
+    relative, absolute = (
+        json.loads((tmp_path / folder / "000000.json").read_text())
+        for folder in ("labels", "labels_centroid_abs")
+    )
+    (a,), (b,) = relative.pop("objects"), absolute.pop("objects")
+    turn = a["rotations"].pop("z"), b["rotations"].pop("z")
+
+    assert a == b
+    assert a["dimensions"] == pytest.approx({"length": 0.31, "width": 0.14, "height": 0.23})
+    assert (a["rotations"], a["name"]) == ({"x": 0, "y": 0}, "bowl")
+    # The level frame differs from the level camera only by a turn about the vertical.
+    assert a["centroid"]["z"] == pytest.approx(-0.52)
+    assert np.hypot(a["centroid"]["x"], a["centroid"]["y"]) == pytest.approx(np.hypot(0.37, 1.64))
+    assert turn[1] == pytest.approx(np.degrees(turn[0]) % 360)
+    assert 0.1 < abs(turn[0]) < np.pi
+    assert relative == absolute == {
+        "folder": "pointclouds", "filename": "000000.pcd", "path": "pointclouds/000000.pcd"
+    }  # fmt: skip
+    for folder, form in (
+        ("labels", "centroid_rel"), ("labels_centroid_abs", "centroid_abs"),
+        ("labels_vertices", "vertices"),
+    ):  # fmt: skip
+        classes = json.loads((tmp_path / folder / "_classes.json").read_text())
+        assert classes["format"] == form
+        assert [[c["id"], c["name"], c["color"]] for c in classes["classes"]] == [
+            [0, "unknown", "#e2e2dc"], [1, "cup", "#e5484d"], [2, "bowl", "#f0b928"]
+        ]  # fmt: skip
+
+
+def test_frames_of_kitti_numbers_are_listed(tmp_path: Path) -> None:
+    """It is the only way back from a label to its moment."""
+    view = labelled(cut=False, hidden=False)
+    other = replace(view, topic="/left", index=17, stamp_ns=12_345, objects=())
+    seen: Any = [(view, frame(), None), (other, frame(), None)]
+    unused: Any = SimpleNamespace()
+
+    assert write_kitti(tmp_path, seen, unused) == 1
+    assert (tmp_path / "frames.csv").read_text() == (
+        "number,topic,frame,stamp_ns\n000000,/depth,0,5\n000001,/left,17,12345\n"
+    )
+    assert (tmp_path / "label_2" / "000001.txt").read_text() == ""
