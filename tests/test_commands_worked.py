@@ -378,3 +378,22 @@ def test_process_tells_where_labels_are_that_were_not_transferred(
         "  track 17, tea pot: no object there",
         "lab: transferred 5 of 5 corrected labels",
     ]
+
+
+@pytest.mark.parametrize(
+    ("name", "container", "said"),
+    [
+        ("a.bag", "mcap", "--format mcap writes a file: name it a.mcap, not a.bag"),
+        ("a.mcap", "ros2", "--format ros2 writes a folder: name it a, not a.mcap"),
+        ("a.zip", "ros1", "a.zip: name it a.mcap, a.bag, or a for a ROS 2 folder"),
+    ],
+)
+def test_a_name_that_contradicts_the_format_is_told_the_right_one(
+    shapecat: Run, tmp_path: Path, name: str, container: str, said: str
+) -> None:
+    """Written all the same, no program would open it."""
+    found = shapecat("simulate", tmp_path / name, "--format", container)
+
+    assert found.exit_code == 2
+    assert found.stderr.splitlines()[-1] == f"Error: {said}"
+    assert not list(tmp_path.iterdir())

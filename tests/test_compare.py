@@ -43,6 +43,7 @@ from shapecat.evaluation.comparison_pictures import (
 )
 from shapecat.evaluation.labellings import Item, Labelling
 from shapecat.evaluation.overlap import Overlap, box_iou
+from shapecat.evaluation.references import open_reference
 from shapecat.evaluation.references_coco import CocoLabels, filled_polygon, rle_mask
 from shapecat.evaluation.references_kitti import KittiLabels
 from shapecat.runs.tables import DETECTIONS, FRAMES, TRACKS
@@ -407,6 +408,27 @@ def test_an_image_is_of_the_frame_that_its_name_says(name: str, key: tuple[str, 
 
     assert labels.at(key, START) is not None
     assert [labels.at(("/d", k), 0) is None for k in (1, 2, 5, 7)] == [True] * 4
+
+
+def test_truth_of_every_other_frame_is_that_of_the_same_image(tmp_path: Path) -> None:
+    """A run of every n-th frame skips label images, which are read forward."""
+    images = np.zeros((6, 3, 4), np.uint8)
+    for k in range(6):
+        images[k].flat[k + 2] = 7
+    np.savez_compressed(tmp_path / "lab.labels.npz", labels=images)
+    truth = [
+        {"frame": k, "stamp_ns": START + STEP * k, "objects": true_objects()[:1]} for k in range(6)
+    ]
+    (tmp_path / "lab.truth.json").write_text(json.dumps(truth))
+    reference = open_reference(tmp_path / "lab.mcap")
+
+    for k in (1, 2, 4, 5):
+        found = reference.at(("/d", 9), START + STEP * k)
+        assert found is not None
+        assert found.shape == (3, 4)
+        assert [list(map(int, item.pixels)) for item in found.items if item.pixels is not None] == [
+            [k + 2]
+        ]
 
 
 def test_the_picture_of_a_part_is_that_of_its_worst_frame() -> None:

@@ -408,6 +408,10 @@ def test_pictures_of_a_report_are_drawn_to_scale() -> None:
         ("96", f"{17 - 9.5 / 2:.1f}", f"{328 * 0.5:.1f}", "9.5"),
         ("96", f"{51 - 26 / 2:.1f}", f"{328 * 0.875:.1f}", "26.0"),
     ]
+    confusion = confusion_svg(report.categories, report.confusion)
+    for picture, width, height in ((confusion, 212, 212), (curve, 280, 280), (bars, 480, 68)):
+        whole = drawn(picture, "svg", "width", "height", "viewBox")  # else they are cut off
+        assert whole == [(str(width), str(height), f"0 0 {width} {height}")]
     assert drawn(bars, "text", "text", "y") == [
         ("0-0.8 m", "21.0"), ("0.500", "21.0"), ("0.8-1.1 m", "55.0"), ("0.875", "55.0")
     ]  # fmt: skip
