@@ -55,7 +55,7 @@ def bump(radius: float, edge: float) -> Array:
 
 def test_a_swell_of_the_table_is_no_object() -> None:
     """A wave of the sensor's error that is higher than the least height of an object."""
-    frame = measured(depth_of(0.011 * bump(50, 90)))
+    frame = measured(depth_of(0.013 * bump(50, 90)))
     assert len(found(frame).candidates) == 0
     assert len(found(frame, low_profile=False).candidates) > 0, "the test shows nothing"
 
