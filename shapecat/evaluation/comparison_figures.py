@@ -105,20 +105,12 @@ def _category(pairs: Pairs, categories: Sequence[str]) -> dict[str, Any]:
     error = expected_calibration_error(truth, posteriors) if known else None
     return {
         "n": len(known),
-        **_accuracies("", pairs.truth, pairs.labels, known),
-        **_accuracies("view_", pairs.truth, pairs.views, known),
+        "accuracy": _agreement(pairs.truth, pairs.labels, known),
+        "balanced": _balanced(pairs.truth, pairs.labels, known),
+        "view_accuracy": _agreement(pairs.truth, pairs.views, known),
+        "view_balanced": _balanced(pairs.truth, pairs.views, known),
         "ece": None if error is None else round(error, 4),
         "taken_for": [{"true": a, "label": b, "n": count} for a, b, count in names],
-    }
-
-
-def _accuracies(
-    prefix: str, truth: Sequence[str], said: Sequence[str], known: Sequence[int]
-) -> dict[str, float | None]:
-    """Return accuracy and balanced accuracy; their names begin with ``prefix``."""
-    return {
-        f"{prefix}accuracy": _agreement(truth, said, known),
-        f"{prefix}balanced": _balanced(truth, said, known),
     }
 
 

@@ -121,7 +121,7 @@ def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None
 
 
 def kitti_type(category: str) -> str:
-    """Return a category as a type, which cannot hold blanks."""
+    """Return the KITTI type of a category: a type cannot hold blanks."""
     return category.replace(" ", "_")
 
 

@@ -151,8 +151,8 @@ def write_pair_features(
     segments: Segments, features: Records, p: int, q: int, view_geometry: ViewGeometry, out: Row
 ) -> None:
     """Do the same as `pair_features`, given the `SEGMENT_FEATURES` (n + 1,) of all segments."""
-    smaller, larger = segments.statistics[p].area, segments.statistics[q].area
-    if smaller > larger or (smaller == larger and p > q):
+    area_p, area_q = segments.statistics[p].area, segments.statistics[q].area
+    if area_p > area_q or (area_p == area_q and p > q):
         p, q = q, p
     a, b = segments.statistics[p], segments.statistics[q]
     cell = a.depth_sum / a.count / view_geometry.focal
