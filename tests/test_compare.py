@@ -8,6 +8,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -326,6 +327,15 @@ def test_the_command_prints_each_figure_under_its_name(
     assert [re.split(r"\s{2,}", line.strip()) for line in table] == FIGURES
     assert last == "8 differences: 3 surplus, 2 missed, 1 outline, 1 category, 1 identity"
     assert printed.err == "The pictures lack depth: it <is> gone\n"
+
+
+def test_a_page_without_differences_says_so_and_has_no_empty_table() -> None:
+    same = tuple(row for row in worked().rows if not row.difference)
+    page = format_page(replace(worked(), rows=same, pictures=()))
+
+    assert "<p>No frame differs.</p>" in page
+    assert "<p>0 differences. All objects are in objects.parquet.</p></body>" in page
+    assert page.count("<table>") == 1
 
 
 def test_the_page_shows_each_number_once_and_in_its_place() -> None:

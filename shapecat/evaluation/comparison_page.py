@@ -150,6 +150,7 @@ def _text(value: float | None) -> str:
 def format_page(found: Comparison) -> str:
     """Return a comparison as an HTML page with embedded pictures."""
     differing = [row for row in found.rows if row.difference]
+    rows = [_cells(row) for row in differing[:_MOST_ROWS]]
     return _PAGE.substitute(
         title=escape(f"{Path(found.run).name} compared with {Path(found.reference).name}"),
         subtitle=escape(f"{found.run} · {found.reference} ({found.kind})"),
@@ -172,7 +173,7 @@ def format_page(found: Comparison) -> str:
         if not differing or found.pictures
         else "<p>No pictures: the frames are not images.</p>",
         count=_count(differing),
-        rows=_table(_HEAD, [_cells(row) for row in differing[:_MOST_ROWS]]),
+        rows=_table(_HEAD, rows) if rows else "",
     )
 
 
