@@ -6,9 +6,10 @@ OPEN3D_LIBRARIES := libegl1 libgl1 libx11-6 libusb-1.0-0
 SCREENS := chromium chromium-driver mesa-vulkan-drivers
 DEMO := demo
 MUTATIONS := nice -n 19 $(BIN)/python -m tests.mutations
-# Two test processes use both cores, so their libraries must not start threads.
-PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist loadfile \
-    --no-loadscope-reorder
+# Two test processes use both cores, so their libraries must not start threads. The many processes that
+# they start read the bytecode of the first, also in containers, most of which forbid writing it.
+PYTEST := PYTHONDONTWRITEBYTECODE= OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest -q \
+    -n 2 --dist loadfile --no-loadscope-reorder
 
 .DEFAULT_GOAL := help
 .PHONY: help setup demo test test-all mutations coverage screens kernels fixtures picture odd faults lint format \

@@ -1,20 +1,23 @@
 """The door from Python: light to import, arrays of the stated shapes, every printed block works."""
 
 import re
+import runpy
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
+from click.testing import Result
 
 import shapecat
 from shapecat.errors import ConfigError, OutputError
 from shapecat.outputs.opened_run import Table
 from tests.loading import loaded_by
-from tests.test_docs_run import run_in_shell
+from tests.test_docs_run import run_here
 
 PAGE = Path(__file__).parents[1] / "docs" / "python.md"
 
@@ -24,11 +27,15 @@ def blocks(kind: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def place(shapecat: Callable[..., Result], tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Run every block of the page, in order, in an empty folder, as one script."""
     folder = tmp_path_factory.mktemp("python")
     (folder / "page.py").write_text("\n".join(blocks("python")), "utf-8")
-    run_in_shell([*blocks("sh"), f"{sys.executable} page.py"], folder)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for line in "".join(blocks("sh")).splitlines():
+            run_here(line, shapecat)
+        runpy.run_path("page.py", run_name="__main__")
     return folder
 
 

@@ -2,7 +2,9 @@
 
 import ast
 import graphlib
+from functools import cache
 from pathlib import Path
+from typing import Any
 
 from tests.loading import loaded_by
 
@@ -43,6 +45,12 @@ FLOOR = {
 FILES = sorted([*ROOT.glob("shapecat/**/*.py"), *ROOT.glob("cli/*.py")])
 
 
+@cache
+def nodes(path: Path) -> tuple[ast.AST, ...]:
+    """Return all nodes of the code of a file, its module first."""
+    return tuple(ast.walk(ast.parse(path.read_text("utf-8"))))
+
+
 def room(path: Path) -> str:
     parts = path.relative_to(ROOT).with_suffix("").parts
     return "cli" if parts[0] == "cli" else parts[1]
@@ -50,7 +58,7 @@ def room(path: Path) -> str:
 
 def imported_rooms(path: Path) -> set[str]:
     found = set()
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             names = [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.level == 0:
@@ -91,7 +99,7 @@ def module_of(path: Path) -> str:
 def imported_modules(path: Path, modules: set[str]) -> set[str]:
     """Return what the code of a file imports, also inside its functions."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+    for node in nodes(path):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
@@ -120,7 +128,7 @@ def test_no_print_eval_or_bare_except() -> None:
     wrong = [
         f"{path.relative_to(ROOT)}:{getattr(node, 'lineno', 0)}"
         for path in FILES
-        for node in ast.walk(ast.parse(path.read_text("utf-8")))
+        for node in nodes(path)
         if is_forbidden(node)
     ]
     assert wrong == []
@@ -130,14 +138,13 @@ def test_only_documented_parts_of_numba_are_used() -> None:
     """Its compiler's own modules and methods change with any release."""
     documented = {"numba", "numba.extending"}
     for path in FILES:
-        text = path.read_text("utf-8")
-        for node in ast.walk(ast.parse(text)):
+        for node in nodes(path):
             if isinstance(node, ast.Import):
                 used = {alias.name for alias in node.names}
             else:
                 used = {node.module or ""} if isinstance(node, ast.ImportFrom) else set()
             assert {name for name in used if name.split(".")[0] == "numba"} <= documented, path
-        assert "get_call_template" not in text, path
+        assert "get_call_template" not in path.read_text("utf-8"), path
 
 
 def test_help_loads_no_heavy_library() -> None:
@@ -187,7 +194,7 @@ def test_an_inlined_kernel_has_one_caller_of_the_same_arithmetic() -> None:
     calls: dict[tuple[str, str], list[tuple[bool, bool]]] = {}
     flags: dict[tuple[str, str], dict[str, bool]] = {}
     for path in FILES:
-        tree = ast.parse(path.read_text("utf-8"))
+        tree: Any = nodes(path)[0]
         module = ".".join(path.relative_to(ROOT).with_suffix("").parts)
         origins = {
             alias.name: str(node.module)

@@ -7,7 +7,8 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from html.parser import HTMLParser
 from importlib import import_module
 from pathlib import Path
@@ -79,18 +80,29 @@ def test_an_impossible_range_is_wrong_usage(
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("place", ["before", "after"])
-def test_verbose_tells_what_is_done(recording: Path, tmp_path: Path, place: str) -> None:
-    """In a process of its own: logging is set up once."""
-    before, after = (["-v"], []) if place == "before" else ([], ["-v"])
-    command = [sys.executable, "-m", "shapecat", *before, "process", str(recording), *after]
-    done = subprocess.run(
-        [*command, "--out", str(tmp_path), "--no-rrd", "--jobs", "1", "--progress", "none"],
-        check=True,
-        capture_output=True,
-        text=True,
-    )
+@contextmanager
+def new_logging() -> Iterator[None]:
+    """Let the command set up logging, which it does once in a process."""
+    ours = logging.getLogger("shapecat")
+    before = ours.level
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(logging.root, "handlers", [])
+        ours.setLevel(logging.NOTSET)
+        yield
+        ours.setLevel(before)
 
+
+@pytest.mark.parametrize("place", ["before", "after"])
+def test_verbose_tells_what_is_done(
+    shapecat: Run, recording: Path, tmp_path: Path, place: str
+) -> None:
+    """An option that is taken at one place only seems to do nothing at the other."""
+    before, after = (["-v"], []) if place == "before" else ([], ["-v"])
+    options = ("--out", tmp_path, "--no-rrd", "--jobs", "1", "--progress", "none")
+    with new_logging():
+        done = shapecat(*before, "process", recording, *after, *options)
+
+    assert done.exit_code == 0
     for words in ("/camera/depth/image_raw", "perceive", "track", "annotated.mcap", "default"):
         assert words in done.stderr, done.stderr
     assert done.stderr.count("\n") < 20

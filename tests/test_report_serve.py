@@ -30,7 +30,7 @@ from tests.browser import Browser
 Run = Callable[..., Result]
 
 NAMES = ("cup", "can", "box", "bottle", "bowl", "plate", "ball")
-TRACKS = 50
+TRACKS = 20
 SAVED = (
     "return document.getElementById('saved').textContent === 'All corrections are in tracks.csv.'"
 )
