@@ -4,6 +4,7 @@ import os
 import shutil
 import signal
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -105,13 +106,24 @@ def guessed_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="session")
-def reported_run(guessed_run: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def drawn(guessed_run: Path) -> Any:
+    """Draw the pictures of that run once; `replace` its folder by that of a copy of the run.
+
+    Returns its `RunReport`, whose page shows the labels of the folder.
+    """
+    from shapecat.outputs.report.writing import read_report  # noqa: PLC0415  the same
+
+    return read_report(guessed_run)
+
+
+@pytest.fixture(scope="session")
+def reported_run(guessed_run: Path, drawn: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return that run with its report. Copy it to change it."""
-    from shapecat.outputs.report import write_reports  # noqa: PLC0415  the same
+    from shapecat.outputs.report.writing import Reports  # noqa: PLC0415  the same
 
     folder = tmp_path_factory.mktemp("reported") / "out" / "table"
     shutil.copytree(guessed_run, folder)
-    write_reports([folder])
+    Reports([replace(drawn, folder=folder)]).write()
     return folder
 
 

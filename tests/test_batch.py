@@ -29,7 +29,7 @@ from tests.test_executors import alive, wait_for
 Run = Callable[..., Result]
 TABLES = ("frames", "detections", "planes", "tracks")
 NAMES = ("bag", "folder", "log")
-FRAMES = 40
+FRAMES = 24
 QUIET: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 
 

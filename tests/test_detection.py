@@ -1,6 +1,7 @@
 """Detection on scenes drawn by a small ray caster, each named by the hazard it holds."""
 
 from collections.abc import Callable
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,11 @@ Shape = Callable[[Array, Array], Array]
 
 CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 DEFAULTS = DetectionSettings()
+
+
+def squared(vectors: Array) -> Array:
+    """Return the squared lengths of vectors (..., n); a sum along so short an axis is slow."""
+    return reduce(np.add, np.moveaxis(vectors**2, -1, 0))
 
 
 def table(x: float = 0.5, y: float = 0.4, z: float = 0.0) -> Shape:
@@ -48,7 +54,9 @@ def box(
         d = rays @ turn.T
         with np.errstate(divide="ignore", invalid="ignore"):
             a, b = (-half - o) / d, (half - o) / d
-        near, far = np.minimum(a, b).max(axis=-1), np.maximum(a, b).min(axis=-1)
+        # Along an axis of three, numpy's own maximum takes five times as long.
+        near = reduce(np.maximum, np.moveaxis(np.minimum(a, b), -1, 0))
+        far = reduce(np.minimum, np.moveaxis(np.maximum(a, b), -1, 0))
         return np.where((near < far) & (near > 0), near, np.inf)
 
     return hit
@@ -64,7 +72,7 @@ def shell(center: tuple[float, float, float], radius: float, rim: float | None) 
 
     def hit(origin: Array, rays: Array) -> Array:
         o = origin - np.array(center)
-        a, b, c = (rays * rays).sum(-1), 2 * rays @ o, o @ o - radius**2
+        a, b, c = squared(rays), 2 * rays @ o, o @ o - radius**2
         root = b * b - 4 * a * c
         with np.errstate(invalid="ignore"):
             first, second = ((-b + s * np.sqrt(root)) / (2 * a) for s in (-1, 1))
@@ -84,7 +92,7 @@ def can(x: float, y: float, z: float, radius: float, height: float) -> Shape:
     def hit(origin: Array, rays: Array) -> Array:
         o = origin - np.array([x, y, z])
         d = rays
-        a, b = (d[..., :2] ** 2).sum(-1), 2 * d[..., :2] @ o[:2]
+        a, b = squared(d[..., :2]), 2 * d[..., :2] @ o[:2]
         root = b * b - 4 * a * (o[:2] @ o[:2] - radius**2)
         with np.errstate(invalid="ignore", divide="ignore"):
             t = (-b - np.sqrt(root)) / (2 * a)
@@ -92,7 +100,7 @@ def can(x: float, y: float, z: float, radius: float, height: float) -> Shape:
             side = np.where((root > 0) & (t > 0) & (h > 0) & (h < height), t, np.inf)
             u = (height - o[2]) / d[..., 2]
             p = o[:2] + u[..., None] * d[..., :2]
-            lid = np.where((u > 0) & ((p**2).sum(-1) < radius**2), u, np.inf)
+            lid = np.where((u > 0) & (squared(p) < radius**2), u, np.inf)
         return np.minimum(side, lid)
 
     return hit

@@ -176,6 +176,8 @@ def test_options_choose_frames_and_labels_at_the_door(
     runs: Path, tmp_path: Path, shapecat: Run
 ) -> None:
     """Each option alone, from the command to the file."""
+    for name in ("lab0", "lab1"):
+        shutil.copytree(runs / name, tmp_path / "two" / name)
     found = {}
     options = {
         "all": (),
@@ -185,7 +187,9 @@ def test_options_choose_frames_and_labels_at_the_door(
         "corrected": ("--corrected-only",),
     }
     for name, chosen in options.items():
-        export(shapecat, runs, tmp_path / name, "--format", "coco", *chosen)
+        export(
+            shapecat, tmp_path / "two", tmp_path / name, "--format", "coco", "--val", "0.5", *chosen
+        )
         found[name] = rows(tmp_path / name)
     images = {
         name: sum(len(read_coco(tmp_path / name, split)["images"]) for split in ("train", "val"))
@@ -193,7 +197,7 @@ def test_options_choose_frames_and_labels_at_the_door(
     }
 
     assert images["every"] == images["all"] / 2
-    assert RUNS <= images["track"] < images["all"]
+    assert 2 <= images["track"] < images["all"]
     assert {r["attributes"]["track"] for r in found["track"]} == {
         r["attributes"]["track"] for r in found["all"]
     }

@@ -140,7 +140,7 @@ def test_other_containers_give_the_same(
     shapecat: Run, tmp_path: Path, run_folder: Path, container: str, name: str
 ) -> None:
     path = tmp_path / name
-    options = ("--frames", 20, "--seed", 3, "--format", container)
+    options = ("--frames", 8, "--seed", 3, "--format", container)  # the first of the recording
     assert shapecat("simulate", path, *options).exit_code == 0
     assert shapecat("process", path, "--out", tmp_path / "out", "--end", 0.2).exit_code == 0
 
@@ -151,7 +151,7 @@ def test_clouds_give_the_same_as_depth_images(
     shapecat: Run, tmp_path: Path, run_folder: Path
 ) -> None:
     path = tmp_path / "table.mcap"
-    assert shapecat("simulate", path, "--frames", 20, "--seed", 3, "--clouds").exit_code == 0
+    assert shapecat("simulate", path, "--frames", 8, "--seed", 3, "--clouds").exit_code == 0
     result = shapecat("process", path, "--out", tmp_path / "out", "--end", 0.2)
     assert result.exit_code == 0, result.output
 
@@ -301,25 +301,35 @@ def test_a_recording_in_which_nothing_is_found(shapecat: Run, tmp_path: Path) ->
         assert again.exit_code == 0, (command, again.output)
 
 
-@pytest.mark.parametrize(
-    "name", ["osd_learn/clouds.mcap", "osd_learn/clouds.bag", "osd_learn/clouds_ros2"]
-)
+def centres(shapecat: Run, recording: Path, out: Path) -> dict[int, list[Any]]:
+    """Process a recording; return the centres of its detections by the time of their frame."""
+    done = shapecat("process", recording, "--out", out, "--no-rrd", "--no-mcap")
+    assert done.exit_code == 0, done.output
+    found: dict[int, list[Any]] = {}
+    for row in rows(out / recording.stem, "detections"):
+        found.setdefault(row["stamp_ns"], []).append(row["center"])
+    return found
+
+
+@pytest.fixture(scope="module")
+def in_depth_images(
+    shapecat: Run, real_data: Path, tmp_path_factory: pytest.TempPathFactory
+) -> dict[int, list[Any]]:
+    return centres(shapecat, real_data / "osd_learn/depth.mcap", tmp_path_factory.mktemp("depth"))
+
+
+@pytest.mark.parametrize("name", ["clouds.mcap", "clouds.bag", "clouds_ros2"])
 def test_real_clouds_give_what_their_depth_images_give(
-    shapecat: Run, real_data: Path, tmp_path: Path, name: str
+    shapecat: Run,
+    real_data: Path,
+    in_depth_images: dict[int, list[Any]],
+    tmp_path: Path,
+    name: str,
 ) -> None:
     """Same objects, centres within 2 mm, in every wrapping of the same sensor data."""
-    for source in ("osd_learn/depth.mcap", name):
-        done = shapecat("process", real_data / source, "--out", tmp_path, "--no-rrd", "--no-mcap")
-        assert done.exit_code == 0, done.output
-    depth = {r["stamp_ns"]: r["frame"] for r in rows(tmp_path / "depth", "frames")}
-    want: dict[int, list[Any]] = {}
-    for row in rows(tmp_path / "depth", "detections"):
-        want.setdefault(row["stamp_ns"], []).append(row["center"])
-    have: dict[int, list[Any]] = {}
-    for row in rows(tmp_path / Path(name).stem, "detections"):
-        have.setdefault(row["stamp_ns"], []).append(row["center"])
+    have = centres(shapecat, real_data / "osd_learn" / name, tmp_path)
 
     assert have
-    assert set(have) <= set(depth)
-    for stamp, centers in have.items():
-        assert_allclose(centers, want[stamp], atol=2e-3)
+    assert set(have) <= set(in_depth_images)
+    for stamp, found in have.items():
+        assert_allclose(found, in_depth_images[stamp], atol=2e-3)

@@ -29,6 +29,7 @@ from shapecat.outputs.report.page import run_page
 from shapecat.outputs.report.pictures import TrackPictures
 from shapecat.outputs.report.surfaces import SIDE, Snapshot, draw
 from shapecat.outputs.report.tracks import Timeline, read_timelines
+from shapecat.outputs.report.writing import Reports, RunReport
 from shapecat.outputs.rereading import FinishedRun, read_finished
 from shapecat.outputs.wording import caption, confidence_text, time_span
 from shapecat.runs.corrections import read_labels
@@ -78,7 +79,7 @@ def test_page_needs_nothing_from_outside(reported_run: Path) -> None:
     assert "url(" not in text
 
 
-def test_what_is_not_certain_is_nowhere_shown_as_certain(run: Path) -> None:
+def test_what_is_not_certain_is_nowhere_shown_as_certain(run: Path, drawn: RunReport) -> None:
     header, *lines = (run / "tracks.csv").read_text().splitlines()
     track, column = (header.split(",").index(name) for name in ("track", "confidence"))
     shown = {}
@@ -89,8 +90,7 @@ def test_what_is_not_certain_is_nowhere_shown_as_certain(run: Path) -> None:
         assert caption(3, "cup", confidence) == f"#3 cup {text}"
     assert caption(4, "unknown", 0.97) == "#4 unknown"  # it is the confidence of something else
     (run / "tracks.csv").write_text("\n".join([header, *lines]) + "\n")
-    (report,) = read_reports([run]).runs
-    page = report.page()
+    page = replace(drawn, folder=run).page()
 
     cards = dict(re.findall(r'id="track-(\d+)".*?<span class="sure">(.*?)</span>', page, re.DOTALL))
     assert {track: cards[track] for track in shown} == shown
@@ -385,10 +385,10 @@ def many_tracks(folder: Path, count: int) -> str:
 
 
 def test_corrections_clicked_in_a_browser_are_adopted(
-    browser: Browser, shapecat: Run, run: Path
+    browser: Browser, shapecat: Run, run: Path, drawn: RunReport
 ) -> None:
     """From click to annotated.mcap: what the page writes is what `annotate` reads."""
-    (page,) = write_reports([run])
+    (page,) = Reports([replace(drawn, folder=run)]).write()
     rows = read_track_table(run / "tracks.csv").rows
     a, b, c, d, e = (row.track for row in rows[:5])
     other = "bowl" if rows[0].category != "bowl" else "can"

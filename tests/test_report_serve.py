@@ -223,12 +223,6 @@ def ask(
     return answer.status, text
 
 
-@pytest.fixture(scope="module")
-def drawn(guessed_run: Path) -> RunReport:
-    """Draw the pictures once for all copies of a run."""
-    return read_report(guessed_run)
-
-
 @contextmanager
 def serving(run: Path, drawn: RunReport | None = None) -> Iterator[tuple[str, str]]:
     """Serve in this process; give the address of the page and that of its labels.

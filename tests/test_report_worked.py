@@ -14,7 +14,6 @@ import pyarrow.parquet as pq
 import pytest
 
 from shapecat.colour.masks import Mask
-from shapecat.outputs.report import read_reports
 from shapecat.outputs.report.cards import Card, _few, card_html
 from shapecat.outputs.report.choosing import Choice, _areas, choose_frames
 from shapecat.outputs.report.images import Crop, SeenFrame, _border_share, _hidden_share, encode
@@ -463,11 +462,10 @@ def test_boxes_of_the_strip_are_as_large_as_in_its_pictures() -> None:
     np.testing.assert_allclose(shares, [0.25, 0.1, 0.2, 0.2], atol=0.002)
 
 
-def test_facts_of_a_run_are_those_of_run_json(run: Path) -> None:
-    about = json.loads((run / "run.json").read_text())
-    (report,) = read_reports([run]).runs
-    text = report.page()
+def test_facts_of_a_run_are_those_of_run_json(drawn: RunReport) -> None:
+    about = json.loads((drawn.folder / "run.json").read_text())
+    text = drawn.page()
 
     for name in ("frames", "detections"):
         assert f"<dt>{name}</dt><dd>{about['counts'][name]}</dd>" in text
-    assert f"<dt>tracks</dt><dd>{len(report.timelines)}</dd>" in text
+    assert f"<dt>tracks</dt><dd>{len(drawn.timelines)}</dd>" in text

@@ -14,9 +14,9 @@ THING = FIRST_THING_LABEL
 
 def test_rooms_hold_objects_and_much_else() -> None:
     """Otherwise the benchmark counts nothing."""
-    rooms = [make_scene("room", np.random.default_rng(seed), frames=1) for seed in range(8)]
-    assert sum(any(s.name.startswith("robot") for s in room.supports) for room in rooms) > 4
-    assert sum(any(s.name.startswith("room_") for s in room.supports) for room in rooms) > 4
+    rooms = [make_scene("room", np.random.default_rng(seed), frames=1) for seed in range(4)]
+    assert sum(any(s.name.startswith("robot") for s in room.supports) for room in rooms) > 2
+    assert sum(any(s.name.startswith("room_") for s in room.supports) for room in rooms) > 2
     for room in rooms:
         assert len(room.things) >= 3
         assert len({s.name for s in room.supports}) == len(room.supports)

@@ -29,7 +29,13 @@ SETTLED = {"pile", "bin", "shelf_bin", "room"}  # by physics: things touch, and 
 KINDS: tuple[SceneKind, ...] = tuple(k for k in get_args(SceneKind) if k not in SETTLED)
 
 
-@pytest.fixture(scope="module", params=[(kind, seed) for kind in KINDS for seed in (1, 2)], ids=str)
+WORLDS = [
+    *((kind, 1) for kind in KINDS),
+    *(pytest.param((kind, 2), marks=pytest.mark.many) for kind in KINDS),
+]
+
+
+@pytest.fixture(scope="module", params=WORLDS, ids=str)
 def world(request: pytest.FixtureRequest) -> World:
     kind, seed = request.param
     return make_scene(kind, np.random.default_rng(seed), frames=40)
@@ -103,10 +109,10 @@ def test_stacks_occur_in_clutter_and_on_shelves() -> None:
     stacked = [
         sum(t.on_track is not None for t in make_scene(kind, np.random.default_rng(s)).things)
         for kind in ("clutter", "shelf")
-        for s in range(6)
+        for s in range(3)
     ]
 
-    assert sum(stacked) >= 8
+    assert sum(stacked) >= 5
 
 
 def test_frames_of_a_turntable_turn_the_things_not_the_table() -> None:
@@ -142,10 +148,11 @@ def test_a_stage_shows_its_thing_from_all_sides() -> None:
         assert (labels == thing.label).sum() > 100
 
 
-def test_what_moves_stays_on_the_table_and_touches_nothing() -> None:
+@pytest.mark.parametrize("seed", [3, pytest.param(4, marks=pytest.mark.many)])
+def test_what_moves_stays_on_the_table_and_touches_nothing(seed: int) -> None:
     """Truth would lie about objects that pass through each other or through the table."""
     kinds: tuple[SceneKind, ...] = ("crossing", "rearranged")
-    for kind, seed in ((kind, seed) for kind in kinds for seed in (3, 4)):
+    for kind in kinds:
         moving = make_scene(kind, np.random.default_rng(seed), frames=24, rate_hz=4)
         assert moving.motions
         table = next(s for s in moving.supports if s.name == "table")

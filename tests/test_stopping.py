@@ -20,7 +20,7 @@ from tests.test_batch import heed_interrupts
 from tests.test_crash import assert_same_tables, contents
 from tests.test_executors import wait_for
 
-FRAMES = 240
+FRAMES = 160
 
 
 @pytest.fixture(scope="module")
