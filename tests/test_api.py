@@ -115,8 +115,8 @@ def test_columns_are_arrays_with_nan_where_nothing_is(place: Path) -> None:
     assert run.detections.numpy("posterior").shape == (n, 7)
     assert run.detections.numpy("indices").shape == (n,)  # of different lengths
     assert run.detections.numpy("indices")[0].dtype.kind in "ui"
-    assert run.frame_table.numpy("up_given").shape == (6, 3)
-    assert run.frame_table.numpy("fixed_rotation").shape == (6, 9)
+    assert run.frame_table.numpy("up_given").shape == (4, 3)
+    assert run.frame_table.numpy("fixed_rotation").shape == (4, 9)
     with pytest.raises(OutputError, match=r"no column centre; known: .*center"):
         run.detections.numpy("centre")
     with pytest.raises(KeyError):

@@ -94,7 +94,10 @@ def test_what_misses_the_table_falls() -> None:
     assert transform(rest.pose, box.vertices)[:, 2].max() < 0.5
 
 
-@pytest.mark.parametrize("kind", SETTLED)
+@pytest.mark.parametrize(
+    "kind",
+    ["pile", "shelf_bin", *(pytest.param(k, marks=pytest.mark.many) for k in ("bin", "room"))],
+)
 def test_settled_scenes_are_the_same_again(kind: SceneKind) -> None:
     """Training and judging name their scenes by seeds."""
     one, other = settled(kind, 1), make_scene(kind, np.random.default_rng(1), frames=2)

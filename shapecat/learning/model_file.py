@@ -7,7 +7,9 @@ import zipfile
 import zlib
 from collections.abc import Mapping
 from dataclasses import fields
+from functools import cache
 from importlib.resources import files
+from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any, get_type_hints
 
@@ -68,8 +70,16 @@ def load_model(path: Path | None = None) -> Categorizer:
     ------
     ModelError : the file does not exist, is damaged, is not a model, or has another format version.
     """
-    name = str(path) if path is not None else "the default model"
-    source = path if path is not None else files("shapecat.models") / "default.npz"
+    return _read(path, str(path)) if path is not None else _default_model()
+
+
+@cache
+def _default_model() -> Categorizer:
+    """Read the default model once, for all recordings of a batch."""
+    return _read(files("shapecat.models") / "default.npz", "the default model")
+
+
+def _read(source: Traversable, name: str) -> Categorizer:
     try:
         content = source.read_bytes()
     except OSError as error:
