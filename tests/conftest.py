@@ -19,15 +19,11 @@ from shapecat.system.garbage import collect_seldom
 from tests.browser import Browser
 
 LONGEST = (
-    *(
-        "test_batch",
-        "test_docs_run",
-        "test_report_serve",
-        "test_simulation_physics",
-        "test_stopping",
-    ),
-    *("test_report", "test_review", "test_pipeline", "test_learning_default_model", "test_loop"),
-    *("test_packaging", "test_detection_stacks", "test_tracking_scenes", "test_jit", "test_api"),
+    *("test_batch", "test_docs_run", "test_report_serve", "test_stopping", "test_remote"),
+    *("test_odd", "test_pipeline", "test_simulation_worlds", "test_detection_stacks"),
+    *("test_packaging", "test_loop", "test_crash", "test_review", "test_report"),
+    *("test_evaluation", "test_learning_default_model", "test_learning", "test_second_look"),
+    *("test_api", "test_simulation_physics", "test_detection", "test_tracking_scenes"),
 )
 """Files of tests by the seconds that they take, longest first."""
 SHARED = Path(__file__).parents[2] / "shared" / "data"

@@ -57,6 +57,11 @@ def test_level_shoulder_of_a_bottle_is_no_ledge() -> None:
     check([table(), bottle], [1], tilt_deg=25)
 
 
+def again(*case: object) -> Any:
+    """Return a further scene of the same hazard, which takes longer to make than the others."""
+    return pytest.param(*case, marks=pytest.mark.many)
+
+
 def overlap_in_clutter(seed: int, labels: list[int]) -> float:
     """Return how well the worst of some things in a cluttered scene is found."""
     rng = np.random.default_rng(seed)
@@ -69,13 +74,13 @@ def test_ball_that_touches_a_box_is_no_handle() -> None:
     assert overlap_in_clutter(690, [27]) > 0.8
 
 
-@pytest.mark.parametrize(("seed", "label"), [(2, 25), (39, 30), (430, 20)])
+@pytest.mark.parametrize(("seed", "label"), [(430, 20), again(2, 25), again(39, 30)])
 def test_neighbour_that_hides_where_it_stands_is_no_handle(seed: int, label: int) -> None:
     """Little of its foot is seen, but it meets what it seems to hang on along a short line."""
     assert overlap_in_clutter(seed, [label]) > 0.8
 
 
-@pytest.mark.parametrize(("seed", "labels"), [(400, [20, 21]), (532, [21]), (708, [21])])
+@pytest.mark.parametrize(("seed", "labels"), [(400, [20, 21]), (708, [21]), again(532, [21])])
 def test_what_stands_on_a_top_seen_edge_on_is_no_part_of_it(seed: int, labels: list[int]) -> None:
     """A can on a box shows nothing of the top that bears it, but a step at its foot."""
     assert overlap_in_clutter(seed, labels) > 0.8
@@ -262,7 +267,7 @@ def test_boxes_with_flush_fronts_are_parted_where_the_outline_steps(upper: float
     assert min(overlaps_by(shapes, UNMERGED._replace(width_split=False))) < 0.8
 
 
-@pytest.mark.parametrize(("seed", "label"), [(1076, 20), (1132, 20), (1187, 21), (1395, 22)])
+@pytest.mark.parametrize(("seed", "label"), [(1132, 20), (1187, 21), (1395, 22), again(1076, 20)])
 def test_stack_without_an_edge_in_clutter(seed: int, label: int) -> None:
     """Only the outline tells where one object ends."""
     assert overlap_in_clutter(seed, [label]) > 0.75
