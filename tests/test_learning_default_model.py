@@ -42,6 +42,11 @@ def test_the_shipped_model_is_small_and_has_its_card() -> None:
     assert load_model().model_id in (folder / "MODEL_CARD.md").read_text("utf-8")
 
 
+def test_the_default_model_is_read_once() -> None:
+    """A batch of short recordings would spend a tenth of its time on parsing it again."""
+    assert load_model() is load_model()
+
+
 def test_unseen_simulated_objects_are_recognised(model: Categorizer) -> None:
     """A few tables of a seed that nothing was made with; the card has the real figures."""
     kinds = ("pan", "hammer", "shoe", "chair")
