@@ -139,7 +139,7 @@ level_axes = kernel(_level_axes)
 """`gravity_rotation` for kernels: takes x, y, z of ``up``, returns the three rows as tuples."""
 
 
-@kernel
+@kernel(inner=True)
 def cross(a: F8, b: F8) -> F8:
     """Return the cross product of two vectors (3,)."""
     (ax, ay, az), (bx, by, bz) = a, b
@@ -262,7 +262,7 @@ _YAWS = np.arange(60) * (np.pi / 120)
 _COS, _SIN = np.cos(_YAWS).astype(np.float32), np.sin(_YAWS).astype(np.float32)
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _smallest_rectangle(x: F4, y: F4) -> tuple[float, F8, F8]:
     """Return the yaw of the smallest rectangle around points (n,), and its low and high corner.
 

@@ -181,7 +181,7 @@ def label_boxes(seen: I4, count: int) -> I4:
     return boxes
 
 
-@kernel
+@kernel(inner=True)
 def _step(label: int, packed: int) -> int:
     """Return ``packed`` after one more pixel, which has this label.
 
@@ -191,7 +191,7 @@ def _step(label: int, packed: int) -> int:
     return label << 16 if label > 0 else (packed + 4) | (label == 0)
 
 
-@kernel
+@kernel(inner=True)
 def _step_row(labels: I4, packed: I4, result: I4) -> None:
     """Apply `_step` to all pixels of a row."""
     for u in range(labels.size):
@@ -228,7 +228,7 @@ def _fill(seen: I4, region: tuple[int, int, int, int], narrow: int, wide: int) -
                     row[u] = found
 
 
-@kernel
+@kernel(inner=True)
 def _surrounding(label: int, w: int, e: int, n: int, s: int, narrow: int, wide: int) -> int:
     """Return the object that surrounds a pixel of label 0 or -1; the label itself if none does.
 
@@ -247,7 +247,7 @@ def _surrounding(label: int, w: int, e: int, n: int, s: int, narrow: int, wide: 
     return found if sides >= 3 and found > 0 else -1
 
 
-@kernel
+@kernel(inner=True)
 def _gap(packed: int) -> int:
     return (packed & 0xFFFF) >> 2
 
@@ -291,7 +291,7 @@ def _majority(seen: I4, label: int, reach: int, pixels: Bool) -> tuple[int, int,
     return west, north, east, south
 
 
-@kernel
+@kernel(inner=True)
 def _count(row: I4, label: int, one: int, counts: I4) -> None:
     """Add ``one`` to the counts of the pixels that have a label."""
     for u in range(row.size):

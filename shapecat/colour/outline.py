@@ -131,7 +131,7 @@ def _trace(inside: Bool, corners: I4, ends: I4) -> int:
     return count
 
 
-@kernel
+@kernel(inner=True)
 def _turn(du: int, dv: int, left: int, right: int) -> tuple[int, int]:
     """Return the next direction: right if ``right`` is outside, left if both are inside."""
     if not right:

@@ -129,7 +129,7 @@ def _compare(colours: U1, depth: F4, band: float, core: float, window: int, like
                 likelier[v, u] = min(max(other - own, -_CERTAIN), _CERTAIN)
 
 
-@kernel
+@kernel(inner=True)
 def _unlikely(colour: U1, total: F4, squares: float, count: int) -> float:
     """Return the negative log-likelihood of a colour, up to a constant."""
     apart, of_means = 0.0, 0.0

@@ -118,7 +118,7 @@ def _splat(
     return left, top, seen
 
 
-@kernel
+@kernel(inner=True)
 def _list_beside(depth: F4, pixels: U4, parallax: float) -> U4:
     """Return the sparse pixels outside objects that may hide an object or lie beside one.
 
@@ -141,7 +141,7 @@ def _list_beside(depth: F4, pixels: U4, parallax: float) -> U4:
     return found[:count]
 
 
-@kernel
+@kernel(inner=True)
 def _row_and_column(pixel: int, row: int, width: int) -> tuple[int, int]:
     """Return row and column of a flat pixel index, quickly if it is in ``row``, a guess."""
     column = pixel - row * width
@@ -151,7 +151,7 @@ def _row_and_column(pixel: int, row: int, width: int) -> tuple[int, int]:
     return row, column
 
 
-@kernel
+@kernel(inner=True)
 def _extent(depth: F4, pixels: U4, own: Bool) -> tuple[int, int, int, int, float, float]:
     """Return the extent of some pixels in the image and in depth.
 
@@ -178,7 +178,7 @@ def _extent(depth: F4, pixels: U4, own: Bool) -> tuple[int, int, int, int, float
     return top, bottom, left, right, float(near), float(far)
 
 
-@kernel
+@kernel(inner=True)
 def _see_pixels(depth: F4, pixels: U4, rays: tuple[F4, F4, F4], lens: Lens) -> F4:
     """Return the projection (4, n) of depth pixels into a camera.
 
@@ -201,7 +201,7 @@ def _see_pixels(depth: F4, pixels: U4, rays: tuple[F4, F4, F4], lens: Lens) -> F
     return moved
 
 
-@kernel
+@kernel(inner=True)
 def _land(place: F4, labels: I4, half: float, size: tuple[int, int], boxes: I4) -> I4:
     """Return the square of image pixels that each depth pixel covers with their centres.
 
@@ -227,7 +227,7 @@ def _land(place: F4, labels: I4, half: float, size: tuple[int, int], boxes: I4) 
     return squares
 
 
-@kernel
+@kernel(inner=True)
 def _window(boxes: I4, margin: int, size: tuple[int, int]) -> tuple[int, int, int, int]:
     """Return the window around boxes, and shift the boxes into it; empty boxes become zeros."""
     left, top, right, bottom = size[0], size[1], 0, 0
@@ -246,7 +246,7 @@ def _window(boxes: I4, margin: int, size: tuple[int, int]) -> tuple[int, int, in
     return left, top, min(right + margin, size[0]), min(bottom + margin, size[1])
 
 
-@kernel
+@kernel(inner=True)
 def _paint(
     squares: I4, labels: I4, near: F4, corner: tuple[int, int], nearest: F4, seen: I4
 ) -> None:
@@ -263,7 +263,7 @@ def _paint(
                     seen[v, u] = labels[i]
 
 
-@kernel
+@kernel(inner=True)
 def _front(around: F4, corner: tuple[int, int], cell: int, shape: tuple[int, int]) -> F4:
     """Return the greatest inverse depth of points in each cell of a window.
 
@@ -280,7 +280,7 @@ def _front(around: F4, corner: tuple[int, int], cell: int, shape: tuple[int, int
     return front
 
 
-@kernel
+@kernel(inner=True)
 def _hide(front: F4, cell: int, boxes: I4, nearest: F4, seen: I4) -> None:
     """Set the label of pixels in boxes to 0 where the front of their cell is nearer."""
     limit, share = np.zeros(seen.shape[1], np.float32), np.float32(1 - _HIDDEN)

@@ -60,7 +60,7 @@ def support_function(
     return result
 
 
-@kernel
+@kernel(inline=True)
 def _overshoot(x: F4, y: F4, a: float, b: float, top: float, noise: float, flat: float) -> float:
     """Return how far ``top`` is beyond the mean of the points of its side, if that is flat."""
     count, total = 0, 0.0
@@ -71,7 +71,7 @@ def _overshoot(x: F4, y: F4, a: float, b: float, top: float, noise: float, flat:
     return min(1.0, count / (flat * x.size)) * total / count
 
 
-@kernel
+@kernel(inline=True)
 def _replace_smallest(ascending: F4, first: int, value: float) -> None:
     """Insert a value into a list that is sorted from ``first``; the smallest value drops out."""
     at = first + 1

@@ -187,7 +187,7 @@ def _add_moved(guide: F4, before: F4, lens: F4, shift: F4, total: F4, count: F4)
                     wanted[u] = found
 
 
-@kernel
+@kernel(inner=True)
 def _place(wanted: F4, v: int, lens: F4, shift: F4, x: F4, y: F4, z: F4) -> None:
     """Write the column x, row y and depth z, in the earlier image, of the points of one row."""
     least = np.float32(NEAREST_M)
@@ -202,7 +202,7 @@ def _place(wanted: F4, v: int, lens: F4, shift: F4, x: F4, y: F4, z: F4) -> None
         y[u] = (depth * (lens[1, 0] * column + b) + shift[1]) * inverse
 
 
-@kernel
+@kernel(inner=True)
 def _read(before: F4, x: float, y: float) -> Any:
     """Interpolate between the four readings around (x, y); 0 if over half the weight is missing."""
     rows, columns = before.shape

@@ -53,13 +53,13 @@ CONTEXT_NAMES = (
 _DIRECTIONS = 16
 
 
-@kernel
+@kernel(inner=True)
 def _ratio(a: float, b: float) -> float:
     """Return a / (a + b), which maps a ratio of lengths to 0 to 1; 0.5 if both are 0."""
     return a / (a + b) if a + b > 0 else 0.5
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _width(px: F4, py: F4, c: float, s: float) -> float:
     low = high = c * px[0] + s * py[0]
     for k in range(px.size):
@@ -69,7 +69,7 @@ def _width(px: F4, py: F4, c: float, s: float) -> float:
     return float(high - low)
 
 
-@kernel
+@kernel(inline=True)
 def _sphere(x: F4, y: F4, z: F4, weight: F4) -> tuple[float, float, float]:
     """Fit a sphere, |p|^2 = 2 c.p + k; return residual / radius, radius and z of the centre."""
     A = np.zeros((4, 5))
@@ -157,7 +157,7 @@ def context(
     return wide, across, along
 
 
-@kernel
+@kernel(inline=True)
 def _extents(points: F4, height: float, eye: F4, out: F4) -> tuple[float, float, float]:
     """Compare height and widths, in directions that start at the line of sight."""
     ex, ey = eye[0], eye[1]
@@ -183,7 +183,7 @@ def _extents(points: F4, height: float, eye: F4, out: F4) -> tuple[float, float,
     return wide, across, along
 
 
-@kernel
+@kernel(inline=True)
 def _spreads(x: F4, y: F4, z: F4, weight: F4, normals: F4, out: F4) -> None:
     """Compare the principal variances of the neurons and of the normals."""
     spread, bend = np.zeros((3, 3)), np.zeros((3, 3))
@@ -204,7 +204,7 @@ def _spreads(x: F4, y: F4, z: F4, weight: F4, normals: F4, out: F4) -> None:
     out[6] = abs(vectors[2, 0])
 
 
-@kernel
+@kernel(inline=True)
 def _harmonics(weight: F4, normals: F4, out: F4) -> None:
     """Write harmonics of the distribution of the normals over yaw; the fourth is high for boxes."""
     total = 1e-6
@@ -226,7 +226,7 @@ def _harmonics(weight: F4, normals: F4, out: F4) -> None:
         out[k] = np.sqrt(c[k] * c[k] + s[k] * s[k]) / total
 
 
-@kernel
+@kernel(inline=True)
 def _facing(level: F8, weight: F4, normals: F4, out: F4) -> None:
     """Write the shares of the surface that face up, sideways and down."""
     for i in range(level.size):
@@ -238,7 +238,7 @@ def _facing(level: F8, weight: F4, normals: F4, out: F4) -> None:
         out[4] += w * (up > 0.7 and level[i] < 0.3)
 
 
-@kernel
+@kernel(inline=True)
 def _axis(x: F4, y: F4, level: F8, height: float, weight: F4, normals: F4, out: F4) -> None:
     """Compare the surface with a surface of revolution about the axis from `vertical_axis`."""
     cx, cy, residual = vertical_axis(x, y, normals, weight)
@@ -271,7 +271,7 @@ def _axis(x: F4, y: F4, level: F8, height: float, weight: F4, normals: F4, out: 
     out[8] = slope / max(spread, 1e-4) / max(radius, 1e-6)
 
 
-@kernel
+@kernel(inline=True)
 def _heights(level: F8, weight: F4, curvatures: F4, out: F4) -> None:
     """Write mean, deviation and skew of the height, and the convex share of the surface."""
     mean = second = third = 0.0
@@ -287,7 +287,7 @@ def _heights(level: F8, weight: F4, curvatures: F4, out: F4) -> None:
     out[2] = third / max(second**1.5, 1e-6)
 
 
-@kernel
+@kernel(inline=True)
 def _around(straight: F4, paths: F4, out: F4) -> None:
     """Compare distances along the surface with Euclidean distances."""
     count = paths.shape[0]

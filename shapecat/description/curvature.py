@@ -137,7 +137,7 @@ def fit_surfaces(
     return normals, curvatures
 
 
-@kernel(fast=True)
+@kernel(fast=True, inline=True)
 def _normal(
     u: F4, v: F4, w: F4, near: int, ex: float, ey: float, ez: float
 ) -> tuple[float, float, float]:
@@ -201,7 +201,7 @@ def _normal(
     return 0.0, 0.0, 1.0
 
 
-@kernel(fast=True)
+@kernel(fast=True, inline=True)
 def _quadric(
     u: F4, v: F4, w: F4, near: int, a: float, b: float, c: float
 ) -> tuple[float, float, float, float, float]:
@@ -277,7 +277,7 @@ def _quadric(
     )
 
 
-@kernel(fast=True)
+@kernel(fast=True, inline=True)
 def _solve(A: F4) -> None:
     """Solve a positive definite system in place (Cholesky).
 

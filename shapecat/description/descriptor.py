@@ -154,7 +154,7 @@ def _prepare(points: F4, neurons: F4, edges: U2, eye: F4) -> tuple[Any, ...]:
     return cloud, starts, owner, rows, middle, unit, straight, paths, weight, gap, place, away
 
 
-@kernel
+@kernel(inline=True)
 def _cloud_of(points: F4, middle: F8, unit: float) -> F4:
     """Return every k-th point, (3, n), in the unit of the neurons, about their mean."""
     step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
@@ -168,7 +168,7 @@ def _cloud_of(points: F4, middle: F8, unit: float) -> F4:
     return cloud
 
 
-@kernel
+@kernel(inline=True)
 def _in_rows(x: F4, y: F4, z: F4) -> F4:
     """Return x, y, z (n,) as one array (3, n)."""
     rows = np.zeros((3, x.size), np.float32)
@@ -177,7 +177,7 @@ def _in_rows(x: F4, y: F4, z: F4) -> F4:
     return rows
 
 
-@kernel
+@kernel(inline=True)
 def _owners(starts: I4) -> I4:
     """Return the neuron of each point, for points sorted by `assign`."""
     owner = np.zeros(starts[-1], np.int64)
@@ -196,7 +196,7 @@ def _finite(rows: F4) -> bool:
     return True
 
 
-@kernel
+@kernel(inline=True)
 def _own_units(neurons: F4) -> tuple[F4, F4, F4, F4, F8, float]:
     """Return the neurons relative to their mean, in units of the mean distance between them.
 
@@ -228,7 +228,7 @@ def _own_units(neurons: F4) -> tuple[F4, F4, F4, F4, F8, float]:
     return x, y, z, straight, middle, unit
 
 
-@kernel
+@kernel(inline=True)
 def _sum(rows: F4) -> float:
     total = np.float32(0.0)
     for i in range(rows.shape[0]):

@@ -53,12 +53,12 @@ def geodesic(straight: F4, edges: U2) -> F4:
     return joined
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _less(a: float, b: float) -> float:
     return a if a < b else b
 
 
-@kernel(fast=True)
+@kernel(fast=True, inline=True)
 def _ways(paths: F4, k: int, via: F4) -> None:
     """Write rows k to k + 3 to ``via``, each shortened through the rows before it."""
     first, second, third, fourth = paths[k], paths[k + 1], paths[k + 2], paths[k + 3]
@@ -77,7 +77,7 @@ def _ways(paths: F4, k: int, via: F4) -> None:
         via[0, j], via[1, j], via[2, j], via[3, j] = w0, w1, w2, w3
 
 
-@kernel(fast=True)
+@kernel(fast=True, inline=True)
 def _shorten(paths: F4, i: int, via: F4, k: int) -> None:
     """Route the paths of node i through the nodes k to k + 3 where that is shorter."""
     a = paths[i, k]
@@ -92,7 +92,7 @@ def _shorten(paths: F4, i: int, via: F4, k: int) -> None:
         paths[i, j] = _less(best, d + via[3, j])
 
 
-@kernel(fast=True)
+@kernel(fast=True, inline=True)
 def _joined(paths: F4, straight: F4) -> F4:
     """Return the paths without padding, and fill in those that do not exist."""
     count = straight.shape[0]
@@ -117,7 +117,7 @@ def _joined(paths: F4, straight: F4) -> F4:
     return result
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def mean_gap(straight: F4) -> float:
     """Return the mean distance from a node to its nearest neighbour, from distances (n, n)."""
     count = straight.shape[0]

@@ -31,7 +31,7 @@ _BAND_PATHS, _BAND_STRAIGHT, _BAND_CURVED = (
 )
 
 
-@kernel
+@kernel(inner=True)
 def _count(row: F4, start: int, bins: int, place: float, weight: float) -> None:
     """Add ``weight`` to a histogram at ``place`` (0 to 1), split between the two nearest bins."""
     at = min(max(place * bins - 0.5, 0.0), bins - 1.0)
@@ -40,7 +40,7 @@ def _count(row: F4, start: int, bins: int, place: float, weight: float) -> None:
     row[start + k + 1] += weight * (at - k)
 
 
-@kernel
+@kernel(inner=True)
 def _find_bins(lengths: F4, i: int, scale: float, one: float, bins: I4, shares: F4) -> None:
     """Write, for each length in row i, the first of its two bins, and the share of the second.
 
@@ -108,34 +108,26 @@ def distributions(
         for k in range(_CURVATURE):
             curvature[k] += weight[i] * rows[i, 1 + k]
         place = (np.float64(normals[2, i]) + 1) / 2
-        _count(up, np.int64(0), np.int64(UP_BINS), place, np.float64(weight[i]))
-    # numba compiles a version for each literal number in a call, but not for these
-    rings, bands = np.int64(RINGS), np.int64(BANDS)
-    at, straight_at, curved_at = (
-        np.int64(_RING_PATHS), np.int64(_RING_STRAIGHT), np.int64(_RING_CURVED),
-    )  # fmt: skip
-    _partition(rows, sums, weight, rings, out, at, straight_at, curved_at)
-    at, straight_at, curved_at = (
-        np.int64(_BAND_PATHS), np.int64(_BAND_STRAIGHT), np.int64(_BAND_CURVED),
-    )  # fmt: skip
-    _partition(rows, z, weight, bands, out, at, straight_at, curved_at)
+        _count(up, 0, UP_BINS, place, np.float64(weight[i]))
+    _partition(rows, sums, weight, RINGS, out, _RING_PATHS, _RING_STRAIGHT, _RING_CURVED)
+    _partition(rows, z, weight, BANDS, out, _BAND_PATHS, _BAND_STRAIGHT, _BAND_CURVED)
 
 
-@kernel
+@kernel(inline=True)
 def _curvature_row(row: F4, first: float, second: float) -> None:
     row[0] = 1
     spread = first - second
     index = 2 / np.pi * np.arctan2(first + second, spread)
-    _count(row, np.int64(1), np.int64(SHAPE_BINS), (index + 1) / 2, 1.0)
+    _count(row, 1, SHAPE_BINS, (index + 1) / 2, 1.0)
     curved = np.sqrt((first * first + second * second) / 2)
     place = (np.log2(curved + 1e-6) + 3) / 7
-    _count(row, np.int64(1 + SHAPE_BINS), np.int64(CURVED_BINS), place, 1.0)
+    _count(row, 1 + SHAPE_BINS, CURVED_BINS, place, 1.0)
     mean = (first + second) / 2
     place = (mean / (1 + abs(mean)) + 1) / 2
-    _count(row, np.int64(1 + SHAPE_BINS + CURVED_BINS), np.int64(MEAN_BINS), place, 1.0)
+    _count(row, 1 + SHAPE_BINS + CURVED_BINS, MEAN_BINS, place, 1.0)
 
 
-@kernel
+@kernel(inner=True)
 def _partition(
     rows: F4,
     order: F4,

@@ -8,7 +8,7 @@ __all__ = ["solve"]
 _SINGULAR = 1e-10
 
 
-@kernel
+@kernel(inner=True)
 def solve(A: F8, b: F8) -> None:
     """Solve A x = b in place for a symmetric positive semidefinite matrix (n, n): b becomes x.
 

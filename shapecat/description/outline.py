@@ -59,7 +59,7 @@ def outline(cloud: F4, eye: F4, out: F4) -> None:
     out[_END + 2] = abs(c)
 
 
-@kernel
+@kernel(inline=True)
 def _image(cloud: F4, eye: F4) -> tuple[F4, F4]:
     """Return the image coordinates (n,) of the points: to the right, and upwards."""
     count = cloud.shape[1]
@@ -77,7 +77,7 @@ def _image(cloud: F4, eye: F4) -> tuple[F4, F4]:
     return across, upward
 
 
-@kernel
+@kernel(inner=True)
 def _widths(
     along: F4,
     across: F4,

@@ -157,7 +157,7 @@ def _slice(along: float, reach: F8) -> int:
     return min(int(share * REVOLUTION_SLICES), REVOLUTION_SLICES - 1)
 
 
-@kernel
+@kernel(inline=True)
 def _improve(
     neurons: F4, weight: F4, normals: F4, axis: F8, point: F8, free: int, limit: float
 ) -> float:
@@ -204,7 +204,7 @@ def _improve(
     return float(np.sqrt(cost / max(total, 1e-6)))
 
 
-@kernel
+@kernel(inner=True)
 def _derivatives(rows: F8, i: int, out: F8) -> None:
     """Write 1, the radius, and its derivatives with respect to two shifts and two tilts."""
     out[0], out[1] = 1.0, rows[1, i]
@@ -212,7 +212,7 @@ def _derivatives(rows: F8, i: int, out: F8) -> None:
     out[4], out[5] = -rows[2, i] * rows[0, i], -rows[3, i] * rows[0, i]
 
 
-@kernel
+@kernel(inline=True)
 def _move(axis: F8, point: F8, first: F8, second: F8, move: F8, farthest: float) -> None:
     """Shift the axis by at most ``farthest``, and tilt it by at most 0.3 rad."""
     length = np.sqrt(move[0] ** 2 + move[1] ** 2)
@@ -230,7 +230,7 @@ def _move(axis: F8, point: F8, first: F8, second: F8, move: F8, farthest: float)
             axis[j] /= np.sqrt(squared)
 
 
-@kernel
+@kernel(inner=True)
 def _measure(
     cloud: F4, owner: I4, normals: F4, axis: F8, point: F8, slices: F8
 ) -> tuple[float, float, float]:

@@ -64,7 +64,7 @@ def rotation_axis(x: F4, y: F4, z: F4, weight: F4, normals: F4) -> tuple[F8, F8,
     return axis, point, rest
 
 
-@kernel
+@kernel(inline=True)
 def _invert(A: F8) -> None:
     """Invert a symmetric positive definite (3, 3) matrix in place."""
     xx, xy, xz = A[0, 0], A[0, 1], A[0, 2]

@@ -69,12 +69,12 @@ def solids(
     out[18] = _log_ratio(out[15], out[1])
 
 
-@kernel
+@kernel(inner=True)
 def _log_ratio(a: float, b: float) -> float:
     return float(np.log((a + 1e-3) / (b + 1e-3)))
 
 
-@kernel
+@kernel(inline=True)
 def _box_frame(cloud: F4, x: F4, y: F4, normals: F4, eye: F4) -> tuple[F4, F4]:
     """Return the horizontal coordinates (n,) of the points in the upright box of best fit.
 
@@ -109,7 +109,7 @@ def _box_frame(cloud: F4, x: F4, y: F4, normals: F4, eye: F4) -> tuple[F4, F4]:
     return u, v
 
 
-@kernel
+@kernel(inline=True)
 def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, out: F4) -> None:
     """Compare points with the three faces of a box that the sensor can see."""
     count = u.size
@@ -148,7 +148,7 @@ def _box(u: F4, v: F4, z: F4, owner: I4, normals: F4, low: float, high: float, o
         out[10 + k] = off[face] / max(share[face], 1.0) / size
 
 
-@kernel
+@kernel(inline=True)
 def _ball(cloud: F4, low: float, high: float, out: F4) -> None:
     """Compare the points with the ball fitted to them by least squares."""
     A, b = np.zeros((4, 4)), np.zeros(4)

@@ -81,7 +81,7 @@ def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I
     return sizes[: n + 1]
 
 
-@kernel
+@kernel(inner=True)
 def _root(parent: I4, k: int) -> int:
     while parent[k] != k:
         k = parent[k]

@@ -116,7 +116,7 @@ def _sampled(depth: F4, step: int, range_m: float) -> F4:
     return result[:n]
 
 
-@kernel
+@kernel(inner=True)
 def row_and_column(p: int, columns: int) -> tuple[int, int]:
     """Return row and column of a flat cell index; integer division takes three times as long."""
     i = int((p + 0.5) * (1.0 / columns))

@@ -149,7 +149,7 @@ def _grow(
     return count
 
 
-@kernel
+@kernel(inner=True)
 def _collect(binned: U1, columns: I4, rows: I4, slope: F4, bend: F4, sums: F4) -> None:
     """Add slope and bend of the views in ``rows`` to ``sums`` (columns, BINS, 2)."""
     g, h = slope[rows], bend[rows]
@@ -161,7 +161,7 @@ def _collect(binned: U1, columns: I4, rows: I4, slope: F4, bend: F4, sums: F4) -
             out[k, 1] += h[i]
 
 
-@kernel
+@kernel(inner=True)
 def _best_cut(sums: F4, ridge: float, least: float, best: F8) -> float:
     """Write gain, column and bin of a leaf's best split into ``best``; return its Newton step."""
     slope = bend = 0.0
@@ -190,7 +190,7 @@ def _best_cut(sums: F4, ridge: float, least: float, best: F8) -> float:
     return slope / (bend + ridge)
 
 
-@kernel
+@kernel(inline=True)
 def _divide(bins: U1, rows: I4, first: int, last: int, cut: int, spare: I4) -> int:
     """Move the views with bins <= ``cut`` to the front of rows[first:last], keeping their order.
 

@@ -130,7 +130,7 @@ def _read_rvl(data: bytes) -> U2:
     return values.reshape(height, width)
 
 
-@kernel
+@kernel(inner=True)
 def _number(words: Any, at: int) -> tuple[int, int]:
     """Read a number from the nibble `at`; return it and the index after it, -1 if the data ends."""
     value, shift = 0, 0

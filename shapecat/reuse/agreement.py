@@ -92,7 +92,7 @@ def _compare(
     return known, agreeing, total
 
 
-@kernel
+@kernel(inline=True)
 def _nearest_reading(depth: F4, row: int, column: int, expected: float) -> tuple[bool, float]:
     """Return whether there is a reading, and its inverse depth minus the expected one.
 

@@ -66,7 +66,7 @@ def _changed(now: F4, then: F4, range_m: float) -> bool:
     return False
 
 
-@kernel
+@kernel(inline=True)
 def _mark(now: F4, then: F4, range_m: float, differs: Bool) -> None:
     """Mark the readings of a row that differ, unless both are out of range."""
     for u in range(len(now)):
@@ -75,7 +75,7 @@ def _mark(now: F4, then: F4, range_m: float, differs: Bool) -> None:
         differs[u] = near & (abs(a - b) > np.float32(AGREE) * a * b)
 
 
-@kernel
+@kernel(inline=True)
 def _alone(now: F4, then: F4, row: int, column: int) -> bool:
     """Return whether neither reading of a pixel occurs in the other image, there or beside it.
 
@@ -87,7 +87,7 @@ def _alone(now: F4, then: F4, row: int, column: int) -> bool:
     )
 
 
-@kernel
+@kernel(inner=True)
 def _finds(depth: F4, row: int, column: int, z: float) -> bool:
     """Return whether the depth ``z`` occurs at a pixel or beside it."""
     height, width = depth.shape

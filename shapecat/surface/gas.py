@@ -143,7 +143,7 @@ def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> _Found:
     return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent), True
 
 
-@kernel
+@kernel(inner=True)
 def _normalise(points: F4) -> tuple[Cloud, F8]:
     """Return at most `_MAX_POINTS` points, scaled to -1 to 1, and the frame (4,) to undo it.
 
@@ -172,7 +172,7 @@ def _normalise(points: F4) -> tuple[Cloud, F8]:
     return Cloud(x, y, z), frame
 
 
-@kernel
+@kernel(inner=True)
 def _in_metres(gas: Gas, count: int, frame: F8) -> F4:
     neurons = np.zeros((count, 3), np.float32)
     for i in range(count):
@@ -182,7 +182,7 @@ def _in_metres(gas: Gas, count: int, frame: F8) -> F4:
     return neurons
 
 
-@kernel
+@kernel(inner=True)
 def _wanted(cloud: Cloud, neurons: int) -> int:
     most = max(_FEWEST_NEURONS, int(_NEURONS_PER_POINT * cloud.x.size))
     return max(3, min(neurons, most))
@@ -195,11 +195,11 @@ def _two_points(cloud: Cloud, gas: Gas, state: np.uint64) -> int:
     for i in range(2):
         k = i * half + np.int64((state >> np.uint64(20 * i)) % np.uint64(half))
         gas.x[i], gas.y[i], gas.z[i] = cloud.x[k], cloud.y[k], cloud.z[k]
-    connect(gas, np.int64(0), np.int64(1))
+    connect(gas, 0, 1)
     return 2
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _spacing(cloud: Cloud, samples: int) -> float:
     """Return the mean distance to the nearest other point, over a sample of the points."""
     x, y, z = cloud.x, cloud.y, cloud.z

@@ -91,7 +91,7 @@ def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
     return adjacent[:kept, :kept]
 
 
-@kernel
+@kernel(inner=True)
 def edge_list(adjacent: Bool) -> U2:
     """Return the (m, 2) pairs i < j that are adjacent, in lexicographic order."""
     count = adjacent.shape[0]
@@ -104,7 +104,7 @@ def edge_list(adjacent: Bool) -> U2:
     return edges[:found].copy()
 
 
-@kernel
+@kernel(inner=True)
 def _three_nearest(cloud: Cloud, gas: Gas, count: int, nearest: I4) -> None:
     """Write the three neurons nearest to each point, nearest first."""
     padded = (count + LANES - 1) // LANES * LANES
@@ -115,7 +115,7 @@ def _three_nearest(cloud: Cloud, gas: Gas, count: int, nearest: I4) -> None:
         )
 
 
-@kernel
+@kernel(inline=True)
 def _settle(cloud: Cloud, gas: Gas, count: int, nearest: I4) -> None:
     """Move each neuron to the mean of the points it is nearest to."""
     sums = np.zeros((count, 4))
@@ -132,7 +132,7 @@ def _settle(cloud: Cloud, gas: Gas, count: int, nearest: I4) -> None:
             gas.z[i] = sums[i, 2] / sums[i, 3]
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _mean_gap(gas: Gas, count: int) -> float:
     """Return the mean distance from a neuron to the nearest other one."""
     x, y, z = gas.x, gas.y, gas.z
@@ -150,13 +150,13 @@ def _mean_gap(gas: Gas, count: int) -> float:
     return total / count
 
 
-@kernel
+@kernel(inner=True)
 def _squared(gas: Gas, i: int, j: int) -> float:
     dx, dy, dz = gas.x[i] - gas.x[j], gas.y[i] - gas.y[j], gas.z[i] - gas.z[j]
     return float(dx * dx + dy * dy + dz * dz)
 
 
-@kernel
+@kernel(inner=True)
 def _keep(gas: Gas, adjacent: Bool, members: I4, stays: Bool, count: int) -> int:
     """Move the neurons that stay to the front; return their number."""
     kept = 0
@@ -177,7 +177,7 @@ def _keep(gas: Gas, adjacent: Bool, members: I4, stays: Bool, count: int) -> int
     return kept
 
 
-@kernel
+@kernel(inner=True)
 def _components(adjacent: Bool, count: int, part: I4) -> int:
     """Label connected components, from 0 in order of their first neuron; return their number."""
     part[:count] = -1
@@ -211,7 +211,7 @@ def _components(adjacent: Bool, count: int, part: I4) -> int:
     return parts
 
 
-@kernel
+@kernel(inline=True)
 def _bridge(gas: Gas, adjacent: Bool, count: int, part: I4) -> None:
     """Link the two nearest neurons of different components."""
     best = np.inf

@@ -35,7 +35,7 @@ class Cloud(NamedTuple):
     z: F4
 
 
-@kernel
+@kernel(inner=True)
 def _drop_old_edges(degree: I4, wins: I4, born: I4, count: int, a: int, oldest: int) -> None:
     for j in range(count):
         age = wins[a] + wins[j] - born[a * degree.size + j]
@@ -45,7 +45,7 @@ def _drop_old_edges(degree: I4, wins: I4, born: I4, count: int, a: int, oldest: 
             disconnect(degree, born, a, j)
 
 
-@kernel
+@kernel(inner=True)
 def _fire(
     x: F4,
     y: F4,
@@ -88,7 +88,7 @@ def _fire(
     return a, age
 
 
-@kernel
+@kernel(inner=True)
 def _in_order(count: int) -> I4:
     order = np.zeros(count, np.int64)
     for i in range(count):
@@ -96,7 +96,7 @@ def _in_order(count: int) -> I4:
     return order
 
 
-@kernel
+@kernel(inner=True)
 def _shuffle(order: I4, state: np.uint64) -> np.uint64:
     """Shuffle in place (Fisher-Yates) with a 64-bit linear congruential generator (Knuth)."""
     for i in range(order.size - 1, 0, -1):
@@ -106,7 +106,7 @@ def _shuffle(order: I4, state: np.uint64) -> np.uint64:
     return state
 
 
-@kernel
+@kernel(inline=True)
 def grow_fritzke(
     cloud: Cloud,
     state: np.uint64,
@@ -184,7 +184,7 @@ def grow_fritzke(
     return count
 
 
-@kernel
+@kernel(inline=True)
 def grow_thesis(
     cloud: Cloud,
     state: np.uint64,
@@ -253,7 +253,7 @@ def grow_thesis(
     return count
 
 
-@kernel
+@kernel(inline=True)
 def _prune(gas: Gas, count: int, before: I4) -> int:
     """Remove neurons whose ``wins`` are still ``before``, down to 3; return the number left."""
     i = 0
@@ -278,7 +278,7 @@ def _prune(gas: Gas, count: int, before: I4) -> int:
     return count
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _mean_distance(cloud: Cloud, gas: Gas, count: int) -> float:
     """Return psi: the mean distance from the neurons to their nearest point."""
     total = 0.0

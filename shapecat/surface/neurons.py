@@ -49,7 +49,7 @@ class Gas(NamedTuple):
     born: I4
 
 
-@kernel
+@kernel(inner=True)
 def empty_gas(room: int) -> Gas:
     """Return a gas without neurons, with room for at least ``room`` of them."""
     size = (room + LANES - 1) // LANES * LANES
@@ -67,7 +67,7 @@ def empty_gas(room: int) -> Gas:
     return gas
 
 
-@kernel
+@kernel(inner=True)
 def index_mask(count: int) -> int:
     """Return the smallest 2**k - 1 that is at least ``count - 1``, the largest index."""
     mask = 1
@@ -76,19 +76,19 @@ def index_mask(count: int) -> int:
     return mask - 1
 
 
-@kernel
+@kernel(inner=True)
 def is_edge(gas: Gas, i: int, j: int) -> bool:
     """Return whether two neurons are linked."""
     return bool(gas.born[i * gas.x.size + j] < ABSENT)
 
 
-@kernel
+@kernel(inner=True)
 def connect(gas: Gas, i: int, j: int) -> None:
     """Link neurons i and j, or reset the age of their edge."""
     refresh(gas.degree, gas.wins, gas.born, i, j)
 
 
-@kernel
+@kernel(inner=True)
 def refresh(degree: I4, wins: I4, born: I4, i: int, j: int) -> None:
     """Link neurons i and j, or reset the age of their edge; the arrays are those of a `Gas`."""
     if born[i * degree.size + j] == ABSENT:
@@ -99,7 +99,7 @@ def refresh(degree: I4, wins: I4, born: I4, i: int, j: int) -> None:
     born[j * degree.size + i] = now
 
 
-@kernel
+@kernel(inner=True)
 def disconnect(degree: I4, born: I4, i: int, j: int) -> None:
     """Remove the edge between neurons i and j; the arrays are those of a `Gas`."""
     born[i * degree.size + j] = ABSENT
@@ -108,7 +108,7 @@ def disconnect(degree: I4, born: I4, i: int, j: int) -> None:
     degree[j] -= 1
 
 
-@kernel
+@kernel(inner=True)
 def insert(gas: Gas, count: int, q: int) -> int:
     """Insert neuron ``count`` between neuron q and its neighbour f of largest error; return f."""
     f = -1
@@ -125,7 +125,7 @@ def insert(gas: Gas, count: int, q: int) -> int:
     return f
 
 
-@kernel
+@kernel(inline=True)
 def move(gas: Gas, last: int, place: int) -> None:
     """Move neuron ``last`` to the free index ``place``."""
     size = gas.x.size

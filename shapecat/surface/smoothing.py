@@ -109,7 +109,7 @@ def _smooth(points: F4, radius: float) -> F4:
     return moved[:kept].copy()
 
 
-@kernel
+@kernel(inline=True)
 def _cells(points: F4, radius: float) -> tuple[I4, I4]:
     """Return the cell (n,) of each point in a grid with the radius as spacing, and its size (3,).
 
@@ -128,7 +128,7 @@ def _cells(points: F4, radius: float) -> tuple[I4, I4]:
     return cells, size
 
 
-@kernel
+@kernel(inline=True)
 def _neighbours(
     points: F4, i: int, radius: float, cell: int, size: I4, keys: I4, order: I4, near: F8
 ) -> int:
@@ -152,7 +152,7 @@ def _neighbours(
     return found
 
 
-@kernel
+@kernel(inline=True)
 def _plane(near: F8, found: int) -> tuple[F8, float]:
     """Return the normal of the plane of weighted points, and its height above the origin."""
     mean, spread = np.zeros(3), np.zeros((3, 3))
@@ -170,7 +170,7 @@ def _plane(near: F8, found: int) -> tuple[F8, float]:
     return normal, normal[0] * mean[0] + normal[1] * mean[1] + normal[2] * mean[2]
 
 
-@kernel
+@kernel(inline=True)
 def _least_direction(spread: F8) -> F8:
     """Return the unit eigenvector of the smallest eigenvalue of a symmetric (3, 3) matrix.
 
@@ -199,7 +199,7 @@ def _least_direction(spread: F8) -> F8:
     return power[best] / length if length > 0 else np.array([0.0, 0.0, 1.0])
 
 
-@kernel
+@kernel(inline=True)
 def _quadric(near: F8, found: int, normal: F8, height: float) -> float:
     """Return the height of the fitted quadric over the plane, at the projection of the origin."""
     small = 0

@@ -33,7 +33,7 @@ def triangles_of(edges: U2, nodes: int) -> U2:
     return result
 
 
-@kernel
+@kernel(inner=True)
 def _walk(edges: U2, begin: I4, result: U2) -> int:
     """Write the triangles while there is room, and return their total number."""
     found = 0

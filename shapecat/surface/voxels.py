@@ -123,7 +123,7 @@ def _voxelize(points: F4, voxel: float) -> tuple[F4, bool]:
     return result[:found].copy(), True
 
 
-@kernel
+@kernel(inline=True)
 def _radix_order(keys: np.ndarray, bound: int) -> np.ndarray:
     """Return the stable order that sorts ``keys``, which are >= 0 and below ``bound``."""
     order = np.zeros(keys.size, np.int64)

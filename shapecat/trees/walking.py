@@ -29,7 +29,7 @@ class Trees(NamedTuple):
     left: I4
 
 
-@kernel
+@kernel(inline=True)
 def find_leaves(
     x: F4, roots: I4, feature: I4, threshold: F4, left: I4, first: int, leaves: I4
 ) -> int:

@@ -190,7 +190,7 @@ def filter_high_pass(residual: F4, high_pass: F4) -> None:
             high_pass[i, j] = level if residual[i, j] != zero else zero
 
 
-@kernel
+@kernel(inner=True)
 def _slide(residual: F4, i: int, sign: int, sums: I4, counts: I4) -> None:
     """Add a row to the sums of the columns, or subtract it (``sign`` -1)."""
     steps, most, least = np.float32(STEPS), np.float32(LOW.most), np.float32(-1)

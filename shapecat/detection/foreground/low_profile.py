@@ -213,7 +213,7 @@ def _find_seeds(high_pass: F4, least: float, seeds: I4) -> int:
     return n
 
 
-@kernel
+@kernel(inner=True)
 def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) -> int:
     """Give the connected cells above ``level`` the number ``n``; return the number of cells.
 
@@ -253,7 +253,7 @@ def _lower(
     """
     rows, columns = residual.shape
     _, part, seeds, stack = scratch
-    above = np.zeros(residual.shape, np.uint8)
+    above = np.zeros(residual.shape, np.float32)
     n = 0
     for i in range(rows):
         some = False
@@ -273,7 +273,7 @@ def _lower(
         if parts[s] > first:
             continue
         me += 1
-        count = _flood(above, np.uint8(0), s, me, part, stack)
+        count = _flood(above, np.float32(0), s, me, part, stack)
         if count < LOW.small_part:
             continue
         line = measure_outline(

@@ -63,7 +63,7 @@ def is_object(outline: Outline, count: int) -> bool:
     return bool(outline.rise > least and outline.steep > OUTLINES.steep_share * table)
 
 
-@kernel
+@kernel(inner=True)
 def measure_outline(
     inv_depth: F4,
     residual: F4,

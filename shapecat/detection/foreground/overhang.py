@@ -143,7 +143,7 @@ def _extend(over: Overhang, i: int, j: int, stack: I4) -> None:
                 over.heights.height[y, x], plane_id[y, x] = _height_beside(over, y, x), me
 
 
-@kernel
+@kernel(inner=True)
 def _height_beside(over: Overhang, i: int, j: int) -> float:
     """Return the height of a cell above the plane, metres; 0 if no object on it can be there."""
     w, k, plane = over.grid.inverse_depth[i, j], over.grid.intrinsics, over.plane

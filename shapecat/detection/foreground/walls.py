@@ -96,7 +96,7 @@ def _is_cut_off(inv_depth: F4, samples: DepthSamples, plane: F8) -> bool:
     return sides >= 2
 
 
-@kernel
+@kernel(inner=True)
 def _bounds(samples: DepthSamples, plane: F8, tolerance: float) -> F8:
     """Return least column, least row, greatest column and greatest row of a plane's inliers."""
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])

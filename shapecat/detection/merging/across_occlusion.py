@@ -27,7 +27,7 @@ def merge_across_occluder(
     labels : (rows, columns) int16, the segments.
     """
     n = segments.parent.size
-    scores, changed = np.zeros((n, n), np.float32), np.ones(n, np.bool_)
+    scores, changed = np.zeros((n, n)), np.ones(n, np.bool_)
     while True:
         behind_one = _find_behind_one(segments)
         for p in range(1, n):
@@ -72,7 +72,7 @@ def _find_behind_one(segments: Segments) -> Bool:
     return found
 
 
-@kernel
+@kernel(inner=True)
 def _local_planes(samples: I4, inv_depth: F4, intrinsics: PinholeIntrinsics, normal: F4) -> F8:
     """Return the positions and normals of a segment's samples, (2, n, 3) metres, sensor frame."""
     n = 0
@@ -124,7 +124,7 @@ def _find_partners(a: F8, b: F8) -> tuple[float, F8]:
     return min(_share(with_a), _share(with_b)), lines
 
 
-@kernel
+@kernel(inner=True)
 def _share(flags: Bool) -> float:
     count = 0
     for flag in flags:

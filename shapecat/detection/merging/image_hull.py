@@ -33,7 +33,7 @@ def merge_hulls(hull: F4, other: F4) -> None:
         hull[d] = max(hull[d], other[d])
 
 
-@kernel
+@kernel(inner=True)
 def hull_area(a: F4, b: F4) -> float:
     """Return the area of the convex hull around two hulls (`DIRECTIONS`,), in cells.
 

@@ -66,9 +66,8 @@ def _merge(
     logits, features = np.full((n, n), -np.inf), np.zeros(n, SEGMENT_FEATURES)
     for p in range(1, n):
         write_segment_features(segments, p, features[p])
-    first = np.int64(1)  # a literal would be compiled apart
     for p in range(1, n):
-        _rate(segments, features, p, p + first, view_geometry, grown, scratch, logits)
+        _rate(segments, features, p, p + 1, view_geometry, grown, scratch, logits)
     while True:
         best = np.argmax(logits)
         p, q = int(best // n), int(best % n)
@@ -78,10 +77,10 @@ def _merge(
         write_segment_features(segments, p, features[p])  # those of other segments do not change
         for k in range(n):
             logits[q, k] = logits[k, q] = -np.inf
-        _rate(segments, features, p, first, view_geometry, grown, scratch, logits)
+        _rate(segments, features, p, 1, view_geometry, grown, scratch, logits)
 
 
-@kernel
+@kernel(inner=True)
 def _rate(
     segments: Segments,
     features: Records,

@@ -146,7 +146,7 @@ def pair_features(
     write_pair_features(segments, features, p, q, view_geometry, out)
 
 
-@kernel
+@kernel(inner=True)
 def write_pair_features(
     segments: Segments, features: Records, p: int, q: int, view_geometry: ViewGeometry, out: Row
 ) -> None:
@@ -195,7 +195,7 @@ def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) 
     out.concavity_deg = share(pair.concavity, pair.contact)
 
 
-@kernel
+@kernel(inner=True)
 def _above_top(segments: Segments, p: int, q: int) -> float:
     """Return the mean height, above the top of ``q``, of upward-facing contact of ``p`` with it."""
     onto = segments.pairs[p, q].rests_on
@@ -228,13 +228,13 @@ def _write_relation(a: Row, b: Row, out: Row) -> None:
     out.first_off_second_m = -(x * mx + y * my + z * mz)
 
 
-@kernel
+@kernel(inner=True)
 def _mean_position(row: Row) -> tuple[float, float, float]:
     n = max(row.fitted, np.float32(1))
     return row.position_x_sum / n, row.position_y_sum / n, row.position_z_sum / n
 
 
-@kernel
+@kernel(inner=True)
 def _mean_normal(row: Row) -> tuple[float, float, float]:
     x, y, z = row.facing_x_sum, row.facing_y_sum, row.facing_z_sum
     length = max(math.sqrt(x * x + y * y + z * z), 1e-9)

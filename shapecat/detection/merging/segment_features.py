@@ -43,7 +43,7 @@ SEGMENT_FEATURES = np.dtype(
 """Features of one segment: its size, shape and faces, and the composition of its boundary."""
 
 
-@kernel
+@kernel(inner=True)
 def width_of(row: Row) -> float:
     """Return the lateral extent of a segment, metres; ``row`` is a `SEGMENT`."""
     return float(row.right - row.left)
@@ -55,13 +55,13 @@ def lateral_distance(a: Row, b: Row) -> float:
     return float(abs(a.left + a.right - b.left - b.right) / 2)
 
 
-@kernel
+@kernel(inner=True)
 def depth_difference(a: Row, b: Row) -> float:
     """Return the mean depth of segment ``a`` minus that of segment ``b``, metres."""
     return float(a.depth_sum / a.count - b.depth_sum / b.count)
 
 
-@kernel
+@kernel(inner=True)
 def lateral_curvature(row: Row) -> float:
     """Return the change of the lateral component of the normal across a segment.
 
@@ -71,7 +71,7 @@ def lateral_curvature(row: Row) -> float:
     return float(both / max(spread, 1e-9) * width_of(row))
 
 
-@kernel
+@kernel(inner=True)
 def normal_position_correlation(row: Row) -> float:
     """Return the correlation between the lateral components of normal and position.
 
@@ -82,7 +82,7 @@ def normal_position_correlation(row: Row) -> float:
     return float(both / math.sqrt(max(spread * turning, 1e-12)))
 
 
-@kernel
+@kernel(inner=True)
 def _moments(row: Row) -> tuple[float, float, float]:
     """Return the centred sums of squares of lateral position and normal, and of their products."""
     n = max(row.fitted, np.float32(1))
@@ -122,7 +122,7 @@ def write_segment_features(segments: Segments, p: int, out: Row) -> None:
     out.filled = share(row.area, wide * tall)
 
 
-@kernel
+@kernel(inner=True)
 def share(part: float, whole: float) -> float:
     """Return ``part / whole``; 0 if the whole is not positive."""
     return float(part / whole) if whole > 0 else 0.0

@@ -260,7 +260,7 @@ def merge(segments: Segments, p: int, q: int) -> None:
             segments.parent[k] = p
 
 
-@kernel
+@kernel(inner=True)
 def _add_pair(a: Row, b: Row) -> None:
     """Add the statistics ``b`` of a pair to ``a``, and clear ``b``; both are records of `PAIR`."""
     a.contact += b.contact
@@ -300,14 +300,14 @@ def add_statistics(a: Row, b: Row) -> None:
     a.upper_silhouette += b.upper_silhouette
 
 
-@kernel
+@kernel(inner=True)
 def depth_of(segments: Segments, p: int) -> float:
     """Return the mean depth of a segment, metres; 1 if it has no cells."""
     count = segments.statistics[p].count
     return float(segments.statistics[p].depth_sum / count) if count > 0 else 1.0
 
 
-@kernel
+@kernel(inner=True)
 def is_root(segments: Segments, p: int) -> bool:
     """Return whether a segment has not been merged into another."""
     return bool(segments.parent[p] == p)

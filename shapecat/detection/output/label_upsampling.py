@@ -67,7 +67,7 @@ def split_lists(order: U4, ends: I4) -> list[U4]:
     return [order[a:b] for a, b in pairwise(ends.tolist())]
 
 
-@kernel
+@kernel(inner=True)
 def find_near(labels: I4, i: int, scratch: I4, near: I4) -> None:
     """Mark in ``near`` the cells of row ``i`` that have a label or a neighbour with one.
 
@@ -91,7 +91,7 @@ def _list_pixels(
     # The cells of a row at full resolution, and the marks of its pixels.
     wide_code, wide_w = np.zeros(width, np.int16), np.zeros(width, np.float32)
     line, marks = np.zeros(width, np.int16), np.zeros(width, np.int16)
-    cells, places = np.zeros((2, width), np.int64), np.zeros((3, width), np.float64)
+    cells, places = np.zeros((2, width), np.int64), np.zeros((3, width))
     runs, n = np.zeros((4 * width, 3), np.int32), 0
     code, spans = _code_cells(grid_labels)
     far, shift, scale = np.float32(range_m), (factor - 1) * 0.5, 1.0 / factor
@@ -126,7 +126,7 @@ def _list_pixels(
     return listed
 
 
-@kernel
+@kernel(inner=True)
 def _end_run(label: int, first: int, end: int, runs: I4, n: int) -> int:
     """Append a run of pixels to the n runs unless its label is 0; return their new number."""
     if label > 0:
@@ -267,7 +267,7 @@ def _mark(
         marks[x] = mark if (z >= least) & (z <= range_m) else zero
 
 
-@kernel
+@kernel(inner=True)
 def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks: I4) -> None:
     """Find the labels of the first ``n`` of m depth readings.
 

@@ -153,7 +153,7 @@ def _break_cycles(measured: ObjectMeasurements) -> None:
             supported_by[k], measured.support_m[k] = 0, 0.0
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _measure_boxes(
     inv_depth: F4,
     intrinsics: PinholeIntrinsics,
@@ -220,7 +220,7 @@ def _outer_points(
     return points, start
 
 
-@kernel
+@kernel(inner=True)
 def _find_outer(labels: I4, i: int, first: int, end: int, outer: Bool) -> None:
     """Mark the labelled cells of part of a row that are next to other labels, and every 4th."""
     rows, columns = labels.shape

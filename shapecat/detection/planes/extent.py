@@ -76,7 +76,7 @@ def measure_plane(grid: DepthGrid, samples: DepthSamples, plane: F8) -> Supporti
     return SupportingPlane(plane[0], plane[1], plane[2], normal, offset, extent, area)
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def area_of(samples: DepthSamples, plane: F8, distance: float) -> float:
     """Return the visible area of a plane, relative to the area of a cell at 1 m.
 

@@ -178,7 +178,7 @@ def _bounds(
     return np.float32(left), np.float32(right), farthest, nearest
 
 
-@kernel
+@kernel(inner=True)
 def is_inside_outline(plane: F8, x: float, y: float, z: float, slack: float) -> bool:
     """Return whether a point is inside the outline of a plane, or at most ``slack`` outside.
 

@@ -60,7 +60,7 @@ def _orient(coarse: F4, intrinsics: PinholeIntrinsics, normals: F4, positions: F
     return smooth
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _orient_row(
     coarse: F4, r: int, y: float, x: F4, focal: tuple[float, float], normals: F4, positions: F4
 ) -> int:

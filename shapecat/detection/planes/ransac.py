@@ -88,7 +88,7 @@ def median_of(values: F4) -> float:
     return float(sample[middle])
 
 
-@kernel
+@kernel(inner=True)
 def off_plane(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSamples:
     """Return the samples whose inverse depth differs by more than ``tolerance``, 1/m, from a plane.
 
@@ -105,7 +105,7 @@ def off_plane(samples: DepthSamples, plane: F8, tolerance: float) -> DepthSample
     return DepthSamples(rest[0][:n], rest[1][:n], rest[2][:n], samples.share)
 
 
-@kernel
+@kernel(inner=True)
 def plane_normal(plane: F8, intrinsics: PinholeIntrinsics) -> F8:
     """Return the unit normal (3,) of a plane, sensor frame, pointing towards the camera.
 
@@ -117,7 +117,7 @@ def plane_normal(plane: F8, intrinsics: PinholeIntrinsics) -> F8:
     return np.array([x / norm, y / norm, z / norm])
 
 
-@kernel
+@kernel(inner=True)
 def cosine(a: F8, b: F8) -> float:
     """Return the cosine of the angle between two unit vectors (3,)."""
     return float(a[0] * b[0] + a[1] * b[1] + a[2] * b[2])
@@ -199,7 +199,7 @@ def _propose(samples: DepthSamples, trials: F8, t: int, plane: F8) -> bool:
     return bool(abs(double) >= LEAST_DOUBLE_AREA)
 
 
-@kernel
+@kernel(inner=True)
 def count_inliers(samples: DepthSamples, plane: F8, tolerance: float) -> int:
     """Count the samples within ``tolerance`` (1/m) of a plane (a, b, c) of inverse depth."""
     first = np.int64(0)  # numba would compile another version for a literal
@@ -217,7 +217,7 @@ def _count_part(samples: DepthSamples, plane: F8, tolerance: float, start: int, 
     return int(total)
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def refine(samples: DepthSamples, tolerance: float, plane: F8) -> int:
     """Fit a plane (a, b, c) to its inliers by least squares, in place; return their number.
 

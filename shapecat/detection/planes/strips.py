@@ -219,7 +219,7 @@ def _level_strips(inv_depth: F4, intrinsics: PinholeIntrinsics, up: F8) -> tuple
     return found[:, :n].copy(), area
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _find_level(inv_depth: F4, i: int, slope: tuple[float, float, float], level: Bool) -> None:
     """Mark the cells of row i that are on level surface; the loop vectorises."""
     start, across, down = slope

@@ -140,7 +140,7 @@ def _look_below(
     return on_wall, beyond
 
 
-@kernel
+@kernel(inline=True)
 def _to_edge(
     grid: DepthGrid, plane: SupportingPlane, i: float, j: float, z: float
 ) -> tuple[float, float, float]:
@@ -162,7 +162,7 @@ def _to_edge(
     return 0.0, 0.0, 0.0
 
 
-@kernel
+@kernel(inner=True)
 def _inverse_depth_at(
     inv_depth: F4, intrinsics: PinholeIntrinsics, x: float, y: float, z: float
 ) -> float:

@@ -83,7 +83,7 @@ def _directions(normals: F4, least: float, trials: F8) -> F8:
     return found
 
 
-@kernel
+@kernel(inner=True)
 def _part(normals: F4, direction: F8, bounds: tuple[float, float]) -> F4:
     """Return the normals (3, n) whose cosine with a direction is within bounds."""
     chosen = np.zeros(normals.shape, np.float32)
@@ -118,7 +118,7 @@ def _most_faced(normals: F4, trials: F8, best: F8) -> int:
     return most
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _count_facing(normals: F4, direction: F8, start: int, stop: int) -> int:
     xs, ys, zs = normals[0], normals[1], normals[2]  # unpacked they would not be contiguous
     x, y, z = np.float32(direction[0]), np.float32(direction[1]), np.float32(direction[2])
@@ -128,7 +128,7 @@ def _count_facing(normals: F4, direction: F8, start: int, stop: int) -> int:
     return int(inliers)
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _turn_to_mean(normals: F4, direction: F8) -> int:
     """Turn a direction to the mean of the normals near it; return their number."""
     xs, ys, zs = normals[0], normals[1], normals[2]
@@ -202,7 +202,7 @@ def _large_levels(count: F8, least: float) -> tuple[float, float]:
     return weight, squares
 
 
-@kernel
+@kernel(inner=True)
 def _count_levels(surface: F4, direction: F8) -> tuple[F8, float, float]:
     """Sum the weights of the points that face a direction, by their height below the sensor.
 
@@ -217,7 +217,7 @@ def _count_levels(surface: F4, direction: F8) -> tuple[F8, float, float]:
         below = scale * (px[k] * x + py[k] * y + pz[k] * z)
         faces = nx[k] * x + ny[k] * y + nz[k] * z > least
         bins[k] = np.int32(below) if faces & (below >= 0) & (below < BINS) else none
-    count = np.zeros(BINS + 1, np.float64)  # the last bin is for the other points
+    count = np.zeros(BINS + 1)  # the last bin is for the other points
     for k in range(nx.size):
         count[bins[k]] += weights[k]
     facing = np.sum(count[:BINS])

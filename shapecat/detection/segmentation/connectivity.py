@@ -103,10 +103,10 @@ def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) ->
             continue
         cell, fit = i * columns + start, 3 * i * columns + start
         run, right = (cell, fit, end - 1 - start), (1, 1, columns)
-        _link_some(owners, depths, planes, run, right, np.int64(RIGHT), bits)
+        _link_some(owners, depths, planes, run, right, RIGHT, bits)
         if i + 1 < rows:
             run, below = (cell, fit, end - start), (columns, 3 * columns, 2 * columns)
-            _link_some(owners, depths, planes, run, below, np.int64(DOWN), bits)
+            _link_some(owners, depths, planes, run, below, DOWN, bits)
         _part_steps(inv_depth, plane_id, i, start, end, links)
 
 
@@ -144,7 +144,7 @@ def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links
         links[i, j] &= RIGHT | DOWN
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _link_some(
     plane_id: I4,
     inv_depth: F4,
@@ -204,7 +204,7 @@ def _measure_concavity(inv_depth: F4, intrinsics: PinholeIntrinsics, graph: Surf
         _write_angles(local_plane[i, 0, start:end], worst[start:end], concavity[i, start:end])
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _raise_concavity(
     flat: FlatGraph,
     intrinsics: PinholeIntrinsics,
@@ -266,7 +266,7 @@ def _raise_concavity(
         worst[to + k] = chord if chord > worst[to + k] else worst[to + k]
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _write_angles(level: F4, worst: F4, concavity: U1) -> None:
     """Write the angles of squared chords, in degrees; 0 for cells without a local plane."""
     degrees, most = np.float32(180 / math.pi), np.float32(120)

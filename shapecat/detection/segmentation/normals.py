@@ -63,7 +63,7 @@ def fit_local_planes(
             _write(fits, planes, normals, 3 * i * shape[1] + start, shape[1], end - start)
 
 
-@kernel
+@kernel(inner=True)
 def padded(start: int, end: int) -> int:
     """Return the end of a run that is padded to a multiple of `LANES` cells."""
     return start + (end - start + LANES - 1) // LANES * LANES
@@ -128,7 +128,7 @@ def _copy_windows(
                 values[to + k] = depths[at + k] if owners[at + k] == me else none
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _fit_run(
     values: F4, intrinsics: PinholeIntrinsics, i: int, start: int, n: int, fits: F4
 ) -> None:
@@ -185,13 +185,13 @@ def _fit_run(
         fits[5 * PITCH + k] = nz * unit
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _times_row(a: float, b: float, c: float, e: float, f: float, g: float) -> Any:
     """Return the sum of one value per row times the offset of the row; that of the middle is 0."""
     return np.float32(3) * (g - a) + np.float32(2) * (f - b) + (e - c)
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _four(
     values: F4, p: int, center: float, far: float, near: float
 ) -> tuple[float, float, float, float, float]:
@@ -205,7 +205,7 @@ def _four(
     return a + b + c + d, x, xx, va + vb + vc + vd, three * (vd - va) + (vc - vb)
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _three(
     values: F4, p: int, center: float, far: float, near: float
 ) -> tuple[float, float, float, float, float]:
@@ -217,7 +217,7 @@ def _three(
     return a + b + c, two * (c - a), two * two * (a + c), va + vb + vc, two * (vc - va)
 
 
-@kernel(fast=True)
+@kernel(fast=True, inner=True)
 def _sample(values: F4, p: int, center: float, gate: float) -> tuple[Any, Any]:
     """Return the weight of a sample, 0 or 1, and its weighted difference from the centre."""
     v = values[p] - center

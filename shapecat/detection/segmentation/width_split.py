@@ -110,7 +110,7 @@ def _find_cuts(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool
             seen, above = seen + 1, above + cells
     if seen < 2 * BESIDE:
         return False
-    steps, some = np.zeros(BANDS, np.float64), False
+    steps, some = np.zeros(BANDS), False
     cuts[:] = False
     for band in range(first + BESIDE, last - BESIDE + 2):
         steps[band] = _step_at(grid, outlines, p, band, side)
@@ -154,20 +154,20 @@ def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -
     return both if most >= SEGMENTATION.side_step_m else 0.0
 
 
-@kernel
+@kernel(inner=True)
 def _second(end: F4, k: int, way: float) -> float:
     """Return the second largest of four values times ``way``: spurs one band high are noise."""
     a, b, c, d = way * end[k], way * end[k + 1], way * end[k + 2], way * end[k + 3]
     return float(max(min(max(a, b), max(c, d)), min(a, b), min(c, d)))
 
 
-@kernel
+@kernel(inner=True)
 def _slope_of(end: F4, k: int) -> float:
     """Return the mean change from one to the next of four values."""
     return float((end[k + 3] + end[k + 2] - end[k + 1] - end[k]) / 4)
 
 
-@kernel
+@kernel(inner=True)
 def _is_free(grid: DepthGrid, at: int, sign: float, side: F8) -> bool:
     """Return whether no nearer surface is beside a cell, to the left (-1) or right (1)."""
     inv_depth = grid.inverse_depth
