@@ -39,6 +39,7 @@ def kernel(
     fast : let the compiler reorder sums. Only for kernels that never meet NaN.
     inner : the function is called by kernels only, so that it needs no wrapper for Python, no file
         in the cache, and no version for each literal. Called from Python, it is not compiled.
+        Callers that differ in ``fast`` or ``inner`` compile versions of their own.
     inline : compile the function as part of its caller, which must have the same ``fast``. Use it
         for kernels that are called in a single place: each saves 0.08 s of compilation.
     """

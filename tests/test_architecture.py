@@ -191,6 +191,31 @@ def test_a_library_that_is_loaded_is_seen() -> None:
 
 def test_an_inlined_kernel_has_one_caller_of_the_same_arithmetic() -> None:
     """Each further call would be compiled anew, and other fast-math flags give other numbers."""
+    flags, calls = kernels()
+    inlined = {name: own for name, own in flags.items() if own.get("inline")}
+    assert inlined
+    for name, own in inlined.items():
+        assert calls[name] == [(True, own.get("fast", False))], name
+
+
+def test_an_inner_kernel_is_called_by_kernels_alone() -> None:
+    """Python would run it uncompiled, a hundred times slower, and nothing would tell."""
+    flags, calls = kernels()
+    inner = [name for name, own in flags.items() if own.get("inner")]
+    assert inner
+    for name in inner:
+        assert calls[name], name
+        assert all(by_kernel for by_kernel, _ in calls[name]), name
+
+
+def kernels() -> tuple[
+    dict[tuple[str, str], dict[str, bool]], dict[tuple[str, str], list[tuple[bool, bool]]]
+]:
+    """Return what each ``@kernel`` is given, and the uses of each function elsewhere.
+
+    Functions are named by their module and name. A use says whether it is in a kernel, and whether
+    that is ``fast``.
+    """
     calls: dict[tuple[str, str], list[tuple[bool, bool]]] = {}
     flags: dict[tuple[str, str], dict[str, bool]] = {}
     for path in FILES:
@@ -202,24 +227,26 @@ def test_an_inlined_kernel_has_one_caller_of_the_same_arithmetic() -> None:
             if isinstance(node, ast.ImportFrom)
             for alias in node.names
         }
-        for function in (node for node in tree.body if isinstance(node, ast.FunctionDef)):
-            own = _kernel_flags(function)
+        for part in tree.body:
+            name = getattr(part, "name", "")
+            own = _kernel_flags(part)
             if own is not None:
-                flags[module, function.name] = own
-            for node in ast.walk(function):
-                if isinstance(node, ast.Name) and node.id != function.name:
-                    called = origins.get(node.id, module), node.id
-                    fast = own is not None and own.get("fast", False)
-                    calls.setdefault(called, []).append((own is not None, fast))
-    inlined = {name: own for name, own in flags.items() if own.get("inline")}
-    assert inlined
-    for name, own in inlined.items():
-        assert calls[name] == [(True, own.get("fast", False))], name
+                flags[module, name] = own
+            for node in ast.walk(part):
+                if isinstance(node, ast.Name) and node.id != name:
+                    used = origins.get(node.id, module), node.id
+                elif isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+                    used = f"{origins.get(node.value.id)}.{node.value.id}", node.attr
+                else:
+                    continue
+                fast = own is not None and own.get("fast", False)
+                calls.setdefault(used, []).append((own is not None, fast))
+    return flags, calls
 
 
-def _kernel_flags(function: ast.FunctionDef) -> dict[str, bool] | None:
+def _kernel_flags(part: ast.stmt) -> dict[str, bool] | None:
     """Return what ``@kernel`` is given; None without it."""
-    for decorator in function.decorator_list:
+    for decorator in part.decorator_list if isinstance(part, ast.FunctionDef) else ():
         words = decorator.keywords if isinstance(decorator, ast.Call) else []
         name = decorator.func if isinstance(decorator, ast.Call) else decorator
         if isinstance(name, ast.Name) and name.id == "kernel":

@@ -58,11 +58,14 @@ def run(stage: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixt
     return run_once
 
 
-def test_an_edit_of_a_called_kernel_counts(stage: Path, run: Run) -> None:
+@pytest.mark.parametrize("decorator", ["@kernel", "@kernel(inner=True)", "@kernel(inline=True)"])
+def test_an_edit_of_a_called_kernel_counts(stage: Path, run: Run, decorator: str) -> None:
     """Numba's own cache would go on with the old code: the file of the caller is the same."""
+    callee = CALLEE.replace("@kernel", decorator)
+    (stage / "callee.py").write_text(callee)
     assert run() == "7 0"
     assert run() == "7 1", "nothing was kept"
-    (stage / "callee.py").write_text(CALLEE.replace("2 * x", "20 * x"))
+    (stage / "callee.py").write_text(callee.replace("2 * x", "20 * x"))
     assert run() == "61 0"
     assert len([*stage.glob("__pycache__/kernels-*")]) == 1, "code of earlier files is left"
 
