@@ -25,7 +25,7 @@ def fill_hull(residual: F4, part: I4, stack: I4, count: int) -> int:
     rows, columns = residual.shape
     parts = part.reshape(-1)
     me = parts[stack[0]]
-    left, right = np.full(rows, columns, np.float64), np.full(rows, -1.0)
+    left, right = np.full(rows, float(columns)), np.full(rows, -1.0)
     for t in range(count):
         i, j = row_and_column(stack[t], columns)
         left[i], right[i] = min(left[i], j), max(right[i], j)

@@ -253,7 +253,7 @@ def _lower(
     """
     rows, columns = residual.shape
     _, part, seeds, stack = scratch
-    above = np.zeros(residual.shape, np.uint8)
+    above = np.zeros(residual.shape, np.float32)
     n = 0
     for i in range(rows):
         some = False
@@ -273,7 +273,7 @@ def _lower(
         if parts[s] > first:
             continue
         me += 1
-        count = _flood(above, np.uint8(0), s, me, part, stack)
+        count = _flood(above, np.float32(0), s, me, part, stack)
         if count < LOW.small_part:
             continue
         line = measure_outline(

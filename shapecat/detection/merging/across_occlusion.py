@@ -27,7 +27,7 @@ def merge_across_occluder(
     labels : (rows, columns) int16, the segments.
     """
     n = segments.parent.size
-    scores, changed = np.zeros((n, n), np.float32), np.ones(n, np.bool_)
+    scores, changed = np.zeros((n, n)), np.ones(n, np.bool_)
     while True:
         behind_one = _find_behind_one(segments)
         for p in range(1, n):

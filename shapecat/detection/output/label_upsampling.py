@@ -91,7 +91,7 @@ def _list_pixels(
     # The cells of a row at full resolution, and the marks of its pixels.
     wide_code, wide_w = np.zeros(width, np.int16), np.zeros(width, np.float32)
     line, marks = np.zeros(width, np.int16), np.zeros(width, np.int16)
-    cells, places = np.zeros((2, width), np.int64), np.zeros((3, width), np.float64)
+    cells, places = np.zeros((2, width), np.int64), np.zeros((3, width))
     runs, n = np.zeros((4 * width, 3), np.int32), 0
     code, spans = _code_cells(grid_labels)
     far, shift, scale = np.float32(range_m), (factor - 1) * 0.5, 1.0 / factor

@@ -85,7 +85,7 @@ def _mark_points(
     columns = grid_labels.inverse_depth.shape[1]
     near = _mark_near(grid_labels.labels).reshape(-1)
     count = points.shape[0]
-    cells, places = np.zeros((2, count), np.int64), np.zeros((3, count), np.float64)
+    cells, places = np.zeros((2, count), np.int64), np.zeros((3, count))
     chosen, found = np.zeros(count, np.int64), np.zeros(count, np.int16)
     n = 0
     for k in range(count):

@@ -121,7 +121,7 @@ def fit_horizontal_planes(
         if near_height.size < LEAST_SAMPLES:
             break
         # (4) refine the plane, and drop the samples on it
-        offset = float(median_of(near_height))
+        offset = np.float64(median_of(near_height))
         if offset > -PLANES.margin_m or not _fit(near, intrinsics, up, trials, offset, found[n]):
             continue
         off = off_plane(rest, found[n], 3 * PLANES.tolerance)

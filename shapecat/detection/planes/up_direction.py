@@ -217,7 +217,7 @@ def _count_levels(surface: F4, direction: F8) -> tuple[F8, float, float]:
         below = scale * (px[k] * x + py[k] * y + pz[k] * z)
         faces = nx[k] * x + ny[k] * y + nz[k] * z > least
         bins[k] = np.int32(below) if faces & (below >= 0) & (below < BINS) else none
-    count = np.zeros(BINS + 1, np.float64)  # the last bin is for the other points
+    count = np.zeros(BINS + 1)  # the last bin is for the other points
     for k in range(nx.size):
         count[bins[k]] += weights[k]
     facing = np.sum(count[:BINS])

@@ -110,7 +110,7 @@ def _find_cuts(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool
             seen, above = seen + 1, above + cells
     if seen < 2 * BESIDE:
         return False
-    steps, some = np.zeros(BANDS, np.float64), False
+    steps, some = np.zeros(BANDS), False
     cuts[:] = False
     for band in range(first + BESIDE, last - BESIDE + 2):
         steps[band] = _step_at(grid, outlines, p, band, side)
