@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -25,6 +26,7 @@ _FEWEST_COLUMNS = 10
 _FEWEST_ROWS = 100
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc]  # sklearn is untyped
     """Gradient-boosted trees whose leaves are words; a category's logit is the sum of word values.
 
@@ -54,26 +56,14 @@ class BoostedDictionary(ClassifierMixin, TreeDictionary):  # type: ignore[misc] 
     classifiers on top, see docs/decisions/0008-boosted-dictionary.md.
     """
 
-    def __init__(
-        self,
-        *,
-        rounds: int = 100,
-        leaves: int = 16,
-        rate: float = 0.1,
-        columns: float = 0.08,
-        rows: float = 0.5,
-        unknown: Any = None,
-        jobs: int | None = None,
-        random_state: int | None = None,
-    ) -> None:
-        self.rounds = rounds
-        self.leaves = leaves
-        self.rate = rate
-        self.columns = columns
-        self.rows = rows
-        self.unknown = unknown
-        self.jobs = jobs
-        self.random_state = random_state
+    rounds: int = 100
+    leaves: int = 16
+    rate: float = 0.1
+    columns: float = 0.08
+    rows: float = 0.5
+    unknown: Any = None
+    jobs: int | None = None
+    random_state: int | None = None
 
     def fit(self, X: ArrayLike, y: ArrayLike, start: F4 | None = None) -> Self:
         """Grow the trees on features X (n, f) and labels y (n,); unknown shapes are included.

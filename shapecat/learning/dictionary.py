@@ -1,5 +1,6 @@
 """A random forest as a dictionary, and linear classifiers on its words (thesis 7.3, 7.4)."""
 
+from dataclasses import dataclass
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -18,6 +19,7 @@ from shapecat.learning.words import TreeDictionary
 __all__ = ["ForestDictionary", "WordLearner"]
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class ForestDictionary(TreeDictionary):
     """A random forest as a dictionary: the leaf that a view reaches in each tree is a word.
 
@@ -35,18 +37,10 @@ class ForestDictionary(TreeDictionary):
     Source: thesis 7.3; Moosmann et al. 2006 for forests as codebooks.
     """
 
-    def __init__(
-        self,
-        *,
-        trees: int = 100,
-        min_leaf: int = 2,
-        jobs: int | None = None,
-        random_state: int | None = None,
-    ) -> None:
-        self.trees = trees
-        self.min_leaf = min_leaf
-        self.jobs = jobs
-        self.random_state = random_state
+    trees: int = 100
+    min_leaf: int = 2
+    jobs: int | None = None
+    random_state: int | None = None
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Grow the forest on features X (n, f) and labels y (n,); unknown shapes are included."""
@@ -63,6 +57,7 @@ class ForestDictionary(TreeDictionary):
         return self
 
 
+@dataclass(kw_only=True, eq=False, repr=False)
 class WordLearner(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # sklearn is untyped
     """Logistic regression on the words of a view.
 
@@ -81,16 +76,9 @@ class WordLearner(ClassifierMixin, BaseEstimator):  # type: ignore[misc]  # skle
     temperature_ : divisor of the logits; 1 until calibrated.
     """
 
-    def __init__(
-        self,
-        *,
-        strategy: Literal["multinomial", "one_vs_rest"] = "multinomial",
-        C: float = 0.01,
-        unknown: Any = None,
-    ) -> None:
-        self.strategy = strategy
-        self.C = C
-        self.unknown = unknown
+    strategy: Literal["multinomial", "one_vs_rest"] = "multinomial"
+    C: float = 0.01
+    unknown: Any = None
 
     def fit(self, X: Any, y: ArrayLike) -> Self:
         """Fit to words X (n, words), zeros and ones, dense or sparse, and labels y (n,)."""

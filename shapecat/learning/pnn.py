@@ -2,6 +2,7 @@
 
 import itertools
 from collections.abc import Mapping
+from dataclasses import KW_ONLY, dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -22,6 +23,7 @@ _JUDGES = 60
 """Number of views per category on which a bandwidth is fitted."""
 
 
+@dataclass(eq=False, repr=False)
 class ProbabilisticNeuralNetwork(
     ClassifierMixin,  # type: ignore[misc]  # sklearn is untyped
     TransformerMixin,  # type: ignore[misc]
@@ -53,18 +55,11 @@ class ProbabilisticNeuralNetwork(
     that maximises the likelihood of views under their own category, each view left out.
     """
 
-    def __init__(
-        self,
-        blocks: Mapping[str, tuple[int, int]] | None = None,
-        *,
-        kernels: int = 100,
-        unknown: Any = None,
-        random_state: int | None = None,
-    ) -> None:
-        self.blocks = blocks
-        self.kernels = kernels
-        self.unknown = unknown
-        self.random_state = random_state
+    blocks: Mapping[str, tuple[int, int]] | None = None
+    _: KW_ONLY
+    kernels: int = 100
+    unknown: Any = None
+    random_state: int | None = None
 
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Fit to descriptors X (n, d) and labels y (n,)."""
