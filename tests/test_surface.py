@@ -14,7 +14,7 @@ from shapecat.jit import kernel
 from shapecat.surface import MIN_POINTS, reconstruct, voxelize
 from shapecat.surface.gas import MAX_NEURONS
 from shapecat.surface.graph import link
-from shapecat.surface.growth import Cloud, grow_fritzke
+from shapecat.surface.growth import Cloud, Rates, grow_fritzke
 from shapecat.surface.lanes import adapt, three_nearest, two_nearest
 from shapecat.surface.neurons import connect, empty_gas, index_mask
 from shapecat.surface.triangles import triangles_of
@@ -301,7 +301,7 @@ def test_the_kernel_is_the_published_algorithm() -> None:
     connect(gas, 0, 1)
     count = grow_fritzke(
         Cloud(*(np.ascontiguousarray(axis) for axis in points.T)),
-        np.uint64(7), gas, 2, 20, 600, 18, 0.1, 0.006, 10,
+        np.uint64(7), gas, 2, 20, 600, 18, Rates(0.1, 0.006, 10),
     )  # fmt: skip
     expected = _fritzke(points, 7, 20, 600, 18)
     assert count == len(expected.neurons) == 20

@@ -8,7 +8,7 @@ from shapecat.arrays import F4, F8, U2
 from shapecat.config import SurfaceSettings
 from shapecat.jit import kernel
 from shapecat.surface.graph import edge_list, link
-from shapecat.surface.growth import Cloud, grow_fritzke, grow_thesis
+from shapecat.surface.growth import Cloud, Rates, grow_fritzke, grow_thesis
 from shapecat.surface.neurons import FAR, Gas, connect, empty_gas
 from shapecat.types import NeuralGas
 
@@ -23,12 +23,7 @@ _MAX_POINTS = 1200
 """Maximum number of points used, every k-th of a larger cloud: more only make the gas slower."""
 _NEURONS_PER_POINT = 0.45
 _FEWEST_NEURONS = 12
-_RATE = 0.1
-"""Epsilon_b at the start: the share of the distance to a signal that the nearest neuron moves."""
-_RATE_NEIGHBOUR = 0.06
-"""Epsilon_n as a share of epsilon_b."""
-_OLDEST = 30
-"""Age above which an edge is removed (a_max)."""
+_RATES = Rates(winner=0.1, neighbour=0.006, oldest=30)
 _GROWTH = 0.6
 """Share of the signals within which all neurons are inserted."""
 _EPOCHS = 8
@@ -111,10 +106,7 @@ def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float)
         return np.zeros((0, 3), np.float32), np.zeros((0, 2), np.uint16), False
     interval = int(_GROWTH * signals) // target
     count = _two_points(cloud, gas, state)
-    count = grow_fritzke(
-        cloud, state, gas, count, target, signals,
-        max(interval, 1), _RATE, _RATE * _RATE_NEIGHBOUR, _OLDEST,
-    )  # fmt: skip
+    count = grow_fritzke(cloud, state, gas, count, target, signals, max(interval, 1), _RATES)
     adjacent = link(cloud, gas, count, share)
     return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent), True
 
@@ -137,7 +129,7 @@ def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> _Found:
     count = grow_thesis(
         cloud, state, gas, count, 2 * target, _EPOCHS,
         _ERROR_LIMIT * each * square / 6, _DISTANCE_LIMIT * spacing,
-        _RATE, _RATE * _RATE_NEIGHBOUR, _OLDEST,
+        _RATES,
     )  # fmt: skip
     adjacent = link(cloud, gas, count, share)
     return _in_metres(gas, adjacent.shape[0], frame), edge_list(adjacent), True

@@ -20,7 +20,7 @@ from shapecat.surface.neurons import (
     refresh,
 )
 
-__all__ = ["Cloud", "grow_fritzke", "grow_thesis"]
+__all__ = ["Cloud", "Rates", "grow_fritzke", "grow_thesis"]
 
 
 _GAIN = 1 / 0.9995
@@ -33,6 +33,21 @@ class Cloud(NamedTuple):
     x: F4
     y: F4
     z: F4
+
+
+class Rates(NamedTuple):
+    """How far neurons move, and how long edges last.
+
+    Attributes
+    ----------
+    winner, neighbour : epsilon_b and epsilon_n for the first signal: the share of the distance to
+        it that the winner and its neighbours move.
+    oldest : age above which an edge is removed (a_max).
+    """
+
+    winner: float
+    neighbour: float
+    oldest: int
 
 
 @kernel(inner=True)
@@ -115,9 +130,7 @@ def grow_fritzke(
     target: int,
     signals: int,
     interval: int,
-    rate_winner: float,
-    rate_neighbour: float,
-    oldest: int,
+    rates: Rates,
 ) -> int:
     """Adapt a gas to signals drawn from a cloud, and insert neurons; return the number of neurons.
 
@@ -133,9 +146,7 @@ def grow_fritzke(
     target : number of neurons to grow to.
     signals : number of signals.
     interval : signals between insertions (lambda).
-    rate_winner, rate_neighbour : epsilon_b and epsilon_n for the first signal: the share of the
-        distance to it that the winner and its neighbours move.
-    oldest : age above which an edge is removed (a_max).
+    rates : how far neurons move, and how long edges last.
     """
     points = cloud.x.size
     px, py, pz = cloud
@@ -157,11 +168,11 @@ def grow_fritzke(
         rest = 1.0 - fall * signal
         a, age = _fire(
             x, y, z, error, degree, wins, born, count, mask, px[k], py[k], pz[k],
-            gain, rate_winner * rest, rate_neighbour * rest,
+            gain, rates.winner * rest, rates.neighbour * rest,
         )  # fmt: skip
         # 10. remove edges that are too old
-        if age > oldest:
-            _drop_old_edges(degree, wins, born, count, a, oldest)
+        if age > rates.oldest:
+            _drop_old_edges(degree, wins, born, count, a, rates.oldest)
         # 11. insert a neuron where the error is largest, every ``interval`` signals
         until -= 1
         if until == 0 and count < target:
@@ -194,9 +205,7 @@ def grow_thesis(
     epochs: int,
     error_limit: float,
     distance_limit: float,
-    rate_winner: float,
-    rate_neighbour: float,
-    oldest: int,
+    rates: Rates,
 ) -> int:
     """Grow a gas until its neurons are close to the points; return the number of neurons.
 
@@ -206,7 +215,7 @@ def grow_thesis(
 
     Parameters
     ----------
-    cloud, state, gas, count, rate_winner, rate_neighbour, oldest : as in `grow_fritzke`.
+    cloud, state, gas, count, rates : as in `grow_fritzke`.
     target : maximum number of neurons.
     epochs : maximum number of times that each point is presented.
     error_limit : squared distance, in the units of ``cloud`` (t_gamma).
@@ -230,11 +239,11 @@ def grow_thesis(
         for k in order:
             a, age = _fire(
                 x, y, z, error, degree, wins, born, count, mask, px[k], py[k], pz[k],
-                1.0, rate_winner * rest, rate_neighbour * rest,
+                1.0, rates.winner * rest, rates.neighbour * rest,
             )  # fmt: skip
             # 10. remove edges that are too old
-            if age > oldest:
-                _drop_old_edges(degree, wins, born, count, a, oldest)
+            if age > rates.oldest:
+                _drop_old_edges(degree, wins, born, count, a, rates.oldest)
             rest -= fall
             # 12. differs: at most once in four signals, and the errors of all three neurons are
             # reset; as published, the gas is full after the first epoch.
