@@ -2,6 +2,7 @@
 
 import logging
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,13 @@ verbose_option = click.option(
 recording_option = click.option(
     "--recording", type=ANY_PATH, help="Path of the recording, if it was moved."
 )
+
+
+def choice_option(name: str, choices: Sequence[str], text: str) -> Any:
+    """Return an option with one of several values, by default the first; ``text`` is its help."""
+    return click.option(
+        name, type=click.Choice(choices), default=choices[0], show_default=True, help=text
+    )
 
 
 def boxes_option(where: str) -> Any:

@@ -14,6 +14,7 @@ from .options import (
     SECONDS,
     array_option,
     boxes_option,
+    choice_option,
     config_option,
     model_option,
     set_option,
@@ -61,12 +62,10 @@ _MOST_ROWS = 100
     help="Number of processes; one per core by default. If there are fewer recordings than "
     "processes, several processes share the frames of one.",
 )
-@click.option(
+@choice_option(
     "--executor",
-    type=click.Choice(["local", "dask", "ray"]),
-    default="local",
-    show_default=True,
-    help="Run the processes on this machine, or with Dask or Ray.",
+    ("local", "dask", "ray"),
+    "Run the processes on this machine, or with Dask or Ray.",
 )
 @click.option(
     "--scheduler", metavar="ADDRESS", help="Address of a running Dask scheduler or Ray cluster."
@@ -76,12 +75,10 @@ _MOST_ROWS = 100
     metavar="I/N",
     help="Process part I of N, for job arrays. Number the jobs 0 to N-1, or 1 to N.",
 )
-@click.option(
+@choice_option(
     "--progress",
-    type=click.Choice(["auto", *KINDS]),
-    default="auto",
-    show_default=True,
-    help="Show progress on stderr as bars (rich), plain lines, JSON lines, or not at all. auto "
+    ("auto", *KINDS),
+    "Show progress on stderr as bars (rich), plain lines, JSON lines, or not at all. auto "
     "shows bars on a terminal, else plain lines.",
 )
 @click.option(

@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from .options import ANY_PATH, seed_option
+from .options import ANY_PATH, choice_option, seed_option
 from .render import progress_bars
 
 _SCENES = ("tabletop", "shelf", "clutter", "pile", "bin", "shelf_bin", "room", "turntable",
@@ -27,26 +27,14 @@ _SENSORS = (
 
 @click.command()
 @click.argument("out", type=ANY_PATH)
-@click.option(
-    "--scene",
-    type=click.Choice(_SCENES),
-    default="tabletop",
-    show_default=True,
-    help="Kind of scene, listed above.",
-)
+@choice_option("--scene", _SCENES, "Kind of scene, listed above.")
 @click.option(
     "--format",
     "container",
     type=click.Choice(["mcap", "ros1", "ros2"]),
     help="Format; by default that of OUT's suffix.",
 )
-@click.option(
-    "--sensor",
-    type=click.Choice(_SENSORS),
-    default="kinect",
-    show_default=True,
-    help="Depth camera to simulate.",
-)
+@choice_option("--sensor", _SENSORS, "Depth camera to simulate.")
 @click.option(
     "--frames",
     type=click.IntRange(1),
