@@ -285,4 +285,4 @@ def _fill(
     plane_ids[0] = 0
     range_m = task.settings.max_range_m
     measured = measure_objects(grid, labels, segments, representatives, model.up, range_m)
-    return Segmentation(model.up, model.supports, model.planes, labels, filled, plane_ids, measured)
+    return Segmentation(model, labels, filled, plane_ids, measured)

@@ -53,18 +53,15 @@ class Segmentation(NamedTuple):
 
     Attributes
     ----------
-    up : (3,) unit vector, sensor frame.
-    supports : the planes, lowest first.
-    planes : the same, from `pack_planes`.
+    model : the planes, the samples above them, and the walls.
     labels : (rows, columns) int16, objects 1..count, 0 elsewhere.
     filled : (rows, columns) uint8, 1 where a labelled cell may be at the level of the plane.
-    plane_ids : (count + 1,) index in ``supports`` of the plane below each object; 0 for label 0.
+    plane_ids : (count + 1,) index in ``model.supports`` of the plane below each object; 0 for
+        label 0.
     measured : the boxes, supports and flags of the objects.
     """
 
-    up: F8
-    supports: list[SupportingPlane]
-    planes: F8
+    model: PlaneModel
     labels: I4
     filled: U1
     plane_ids: I4

@@ -59,7 +59,9 @@ def label_pixels(depth: F4, grid: DepthGrid, found: Segmentation, *, range_m: fl
 
 def grid_labels_of(grid: DepthGrid, found: Segmentation) -> GridLabels:
     """Collect the fields that the kernels here read."""
-    return GridLabels(grid.inverse_depth, found.labels, found.filled, found.planes, found.plane_ids)
+    return GridLabels(
+        grid.inverse_depth, found.labels, found.filled, found.model.planes, found.plane_ids
+    )
 
 
 def split_lists(order: U4, ends: I4) -> list[U4]:

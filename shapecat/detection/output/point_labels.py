@@ -33,7 +33,7 @@ def label_points(view: VirtualImage, found: Segmentation, *, fused: bool) -> lis
     _mark_points(points, view.cell, grid.intrinsics, grid_labels_of(grid, found), marks)
     if fused:
         above = marks > 0
-        for plane in found.planes:
+        for plane in found.model.planes:
             above |= _above(points, view.cell, grid.intrinsics, plane)
         loose = np.flatnonzero(above)
         if loose.size:

@@ -45,7 +45,7 @@ def build_scene(
         for an image.
     """
     measured, seen = found.measured, found.plane_ids.size - 1
-    numbers = _numbers_of_seen(found.supports)
+    numbers = _numbers_of_seen(found.model.supports)
     plane_id, supported_by, hidden = (
         [numbers[k] for k in found.plane_ids[1:].tolist()],
         measured.supported_by.tolist(),
@@ -72,9 +72,9 @@ def build_scene(
                 occluded=k < seen and hidden[k],
             )
         )
-    seen_planes = [s for s in found.supports if s.area_m2 > 0]
+    seen_planes = [s for s in found.model.supports if s.area_m2 > 0]
     planes = tuple(_plane(s, seen_planes[0].offset, sensor_from_view) for s in seen_planes)
-    return Scene(sensor_from_view.rotation @ found.up, planes, tuple(candidates))
+    return Scene(sensor_from_view.rotation @ found.model.up, planes, tuple(candidates))
 
 
 def _numbers_of_seen(supports: Sequence[SupportingPlane]) -> list[int | None]:
@@ -105,7 +105,7 @@ def _boxes(
     boxes = [Box(*row) for row in zip(*sizes, strict=True)]
     if points is not None:
         extra = indices[found.plane_ids.size - 1 :]
-        boxes += [upright_box(points[index], found.up) for index in extra]
+        boxes += [upright_box(points[index], found.model.up) for index in extra]
     return boxes if sensor_from_view is IDENTITY else [_moved(sensor_from_view, b) for b in boxes]
 
 
