@@ -10,7 +10,7 @@ from zlib import crc32
 
 import numpy as np
 
-from shapecat.arrays import F4, F8, I4
+from shapecat.arrays import F4, F8
 from shapecat.config import Settings
 from shapecat.detection import detect
 from shapecat.evaluation import View
@@ -24,35 +24,21 @@ from shapecat.geometry import (
 from shapecat.learning.baselines import shape_functions
 from shapecat.models.arrangements import ALONE, Actor, Arrangement, World, arrange, placed
 from shapecat.models.fragments import cut_fragment, cut_halo
-from shapecat.simulation.measuring import measure
+from shapecat.models.rendered_views import RenderedView, render_view
 from shapecat.simulation.mesh import Mesh, moved
-from shapecat.simulation.paths import looking_at
 from shapecat.simulation.placement import Rest
-from shapecat.simulation.render import Geometry, geometry, render
-from shapecat.simulation.sensors import PRESETS, Sensor, between, resized
+from shapecat.simulation.render import geometry
 from shapecat.surface import voxelize
-from shapecat.types import Camera, Frame, Pose, Scene
+from shapecat.types import Scene
 
 __all__ = ["WorldView", "simulate_mesh", "simulate_views", "simulate_world"]
 
-_FEWEST_PIXELS = 80
 _LEAST_VISIBLE = 0.3
 _OVERLAP = 0.5
 _DETECTED = 0.75
 """Fraction of the detected objects whose view is segmented by the detection."""
 _FRAGMENTS = 0.3
 """Fraction of the views that also give a partial view."""
-_COARSE = 4
-"""Visible fractions are computed in images this many times smaller."""
-_SCALES = (0.5, 1.0, 1.0, 1.0, 1.5)
-"""Factors on the sensors' own resolutions."""
-_WIDTHS = (224, 1280)
-"""Least and greatest image width, pixels."""
-_OFTEN = {"kinect": 3.0, "realsense": 2.0}
-"""Weights of sensors that most recordings come from; others have weight 1."""
-_DISTANCES_M = (0.25, 3.0)
-_CLOSER_M = 0.03
-"""Least distance of the target beyond the sensor's near limit."""
 _SETTINGS = Settings()
 
 
@@ -89,23 +75,6 @@ class WorldView(NamedTuple):
     sensor: str
     functions: F4
     view: View | None
-
-
-class _Shot(NamedTuple):
-    """One image of an arrangement.
-
-    Attributes
-    ----------
-    owners : (h, w) index of the object or furniture of each reading, -1 without.
-    visible : (k,) visible fraction of each object.
-    table_from_camera : pose of the optical frame.
-    """
-
-    frame: Frame
-    owners: I4
-    visible: F8
-    table_from_camera: Pose
-    sensor: str
 
 
 class _Seen(NamedTuple):
@@ -179,113 +148,26 @@ def look(
     seen = geometry([(mesh, IDENTITY) for mesh in meshes])
     views: list[WorldView] = []
     for _ in range(cameras):
-        shot = _shoot(seen, arrangement, rng)
-        scene = detect(shot.frame, up=None, settings=_SETTINGS.detection, rng=rng)
+        image = render_view(seen, arrangement, rng)
+        scene = detect(image.frame, up=None, settings=_SETTINGS.detection, rng=rng)
         for k, actor in enumerate(actors):
-            if shot.visible[k] >= _LEAST_VISIBLE:
-                views += _views_of(shot, scene, k, actor, f"{name}/{k}", rng)
+            if image.visible[k] >= _LEAST_VISIBLE:
+                views += _views_of(image, scene, k, actor, f"{name}/{k}", rng)
     return views if keep else [view._replace(view=None) for view in views]
 
 
-# --- the camera --------------------------------------------------------------------------------
-
-
-def _shoot(seen: Geometry, arrangement: Arrangement, rng: np.random.Generator) -> _Shot:
-    """Take an image of an arrangement with a random sensor from a random viewpoint."""
-    name, sensor = _draw_sensor(rng)
-    camera, pose = sensor.camera, _viewpoint(arrangement, sensor, rng)
-    image = render(seen, camera, pose)
-    depth, owners = measure(image, sensor, rng)
-    visible = _visible_shares(seen, owners, camera, pose, len(arrangement.actors))
-    frame = Frame("/camera", 0, 0, 0, "camera", depth=depth, camera=camera)
-    return _Shot(frame, owners, visible, pose, name)
-
-
-def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
-    """Draw a preset, perhaps mixed with another, and vary its errors and resolution."""
-    names = list(PRESETS)
-    shares = np.array([_OFTEN.get(each, 1.0) for each in names])
-    name, other = (str(each) for each in rng.choice(names, 2, p=shares / shares.sum()))
-    share = float(rng.uniform(0, 0.6)) if rng.random() < 0.5 else 0.0
-    sensor = between(PRESETS[name], PRESETS[other], share)
-    least, most = np.log([0.4, 0.4, 0.5, 0.5, 0.7]), np.log([2.0, 2.5, 1.5, 8.0, 2.0])
-    noise, wave, ragged, holes, dark = np.exp(rng.uniform(least, most))
-    sensor = replace(
-        sensor,
-        noise=float(sensor.noise * noise),
-        noise_m=float(sensor.noise_m * noise),
-        wave=float(sensor.wave * wave),
-        device=int(rng.integers(1_000_000)),
-        ragged_px=float(sensor.ragged_px * ragged),
-        holes=float(sensor.holes * holes),
-        grazing=float(sensor.grazing * dark),
-        dark=float(sensor.dark * dark),
-    )
-    scale = np.clip(rng.choice(_SCALES), *(np.array(_WIDTHS) / sensor.camera.width))
-    return name, resized(sensor, float(scale))
-
-
-def _viewpoint(arrangement: Arrangement, sensor: Sensor, rng: np.random.Generator) -> Pose:
-    """Return ``table_from_camera``: 0.25 to 3 m away, in the elevations of the arrangement."""
-    points = np.concatenate([actor.mesh.vertices for actor in arrangement.actors])
-    target = points.mean(axis=0) + rng.normal(0, 0.04, 3)
-    nearest, farthest = _DISTANCES_M
-    nearest = max(nearest, sensor.nearest_m + _CLOSER_M)
-    farthest = min(farthest, sensor.farthest_m)
-    distance = float(np.exp(rng.uniform(np.log(nearest), np.log(farthest))))
-    azimuth = np.radians(rng.uniform(*arrangement.azimuth))
-    elevation = np.radians(rng.uniform(*arrangement.elevation))
-    back = np.array(
-        [
-            np.cos(azimuth) * np.cos(elevation),
-            np.sin(azimuth) * np.cos(elevation),
-            np.sin(elevation),
-        ]
-    )
-    return looking_at(target + distance * back, target, roll=rng.normal(0, 0.05))
-
-
-def _visible_shares(seen: Geometry, owners: I4, camera: Camera, pose: Pose, count: int) -> F8:
-    """Return (count,) the visible fraction of each object.
-
-    It is the number of readings divided by the pixels that the object would have alone in an image
-    twice as wide and high; 0 with fewer than `_FEWEST_PIXELS` readings.
-    """
-    seen_pixels = np.bincount(owners[owners >= 0], minlength=count + 1)
-    width, height = camera.width // _COARSE, camera.height // _COARSE
-    wide = Camera(
-        2 * width,
-        2 * height,
-        camera.fx / _COARSE,
-        camera.fy / _COARSE,
-        camera.cx / _COARSE + width // 2,
-        camera.cy / _COARSE + height // 2,
-    )
-    result = np.zeros(count)
-    for k in range(count):
-        mine = seen.owners == k
-        alone = Geometry(seen.vertices, seen.triangles[mine], seen.owners[mine])
-        total = int((render(alone, wide, pose).owners >= 0).sum()) * _COARSE**2
-        if seen_pixels[k] >= _FEWEST_PIXELS:
-            result[k] = min(1.0, seen_pixels[k] / max(total, 1))
-    return result
-
-
-# --- the views ---------------------------------------------------------------------------------
-
-
 def _views_of(
-    shot: _Shot, scene: Scene, k: int, actor: Actor, instance: str, rng: np.random.Generator
+    image: RenderedView, scene: Scene, k: int, actor: Actor, instance: str, rng: np.random.Generator
 ) -> list[WorldView]:
     """Return a view of an object, segmented by truth or detection, and perhaps a partial view."""
-    found = _cut_by_detection(shot, scene, k)
+    found = _cut_by_detection(image, scene, k)
     if found is not None and rng.random() < _DETECTED:
         (view, overlap), source = found, "detected"
     else:
-        view, overlap = cut_halo(_cut_by_truth(shot, k, actor, rng), rng), 1.0
+        view, overlap = cut_halo(_cut_by_truth(image, k, actor, rng), rng), 1.0
         source = "truth"
     view = View(view.points, view.eye, actor.label, instance)
-    seen = _Seen(actor, shot.sensor, float(shot.visible[k]), overlap)
+    seen = _Seen(actor, image.sensor, float(image.visible[k]), overlap)
     described = [_described(view, source, seen)]
     if rng.random() < _FRAGMENTS:
         piece = cut_fragment(view, rng)
@@ -294,27 +176,27 @@ def _views_of(
     return [item for item in described if item is not None]
 
 
-def _cut_by_detection(shot: _Shot, scene: Scene, k: int) -> tuple[View, float] | None:
+def _cut_by_detection(image: RenderedView, scene: Scene, k: int) -> tuple[View, float] | None:
     """Return the object as detection segments it, with the IoU; None if it was not found."""
-    owners = shot.owners.reshape(-1)
-    valid = np.asarray(shot.frame.depth).reshape(-1) > 0
+    owners = image.owners.reshape(-1)
+    valid = np.asarray(image.frame.depth).reshape(-1) > 0
     total = int(np.count_nonzero((owners == k) & valid))
     for candidate in scene.candidates:
         hits = int(np.count_nonzero(owners[candidate.indices] == k))
         overlap = hits / (total + candidate.indices.size - hits)
         if overlap >= _OVERLAP:
-            points = shot.frame.xyz(candidate.indices)
+            points = image.frame.xyz(candidate.indices)
             points = points[np.isfinite(points[:, 0])]
             level = level_from_sensor(scene.up, scene.support_offset(candidate), points)
             return View(transform(level, points), level.translation, "", ""), overlap
     return None
 
 
-def _cut_by_truth(shot: _Shot, k: int, actor: Actor, rng: np.random.Generator) -> View:
+def _cut_by_truth(image: RenderedView, k: int, actor: Actor, rng: np.random.Generator) -> View:
     """Return the object's true pixels in a level frame with errors of a degree and some mm."""
-    indices = np.flatnonzero((shot.owners == k) & (np.asarray(shot.frame.depth) > 0))
-    points = shot.frame.xyz(indices)
-    camera_from_table = inverse(shot.table_from_camera)
+    indices = np.flatnonzero((image.owners == k) & (np.asarray(image.frame.depth) > 0))
+    points = image.frame.xyz(indices)
+    camera_from_table = inverse(image.table_from_camera)
     up = camera_from_table.rotation[:, 2] + rng.normal(0, 0.008, 3)
     up /= np.linalg.norm(up)
     foot = np.array([*_centre(actor), actor.support_m])

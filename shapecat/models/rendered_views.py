@@ -1,0 +1,132 @@
+"""Images of arrangements, as random depth cameras see them from random viewpoints."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+
+from shapecat.arrays import F8, I4
+from shapecat.models.arrangements import Arrangement
+from shapecat.simulation.measuring import measure
+from shapecat.simulation.paths import looking_at
+from shapecat.simulation.render import Geometry, render
+from shapecat.simulation.sensors import PRESETS, Sensor, between, resized
+from shapecat.types import Camera, Frame, Pose
+
+__all__ = ["RenderedView", "render_view"]
+
+_FEWEST_PIXELS = 80
+_COARSE = 4
+"""Visible fractions are computed in images this many times smaller."""
+_SCALES = (0.5, 1.0, 1.0, 1.0, 1.5)
+"""Factors on the sensors' own resolutions."""
+_WIDTHS = (224, 1280)
+"""Least and greatest image width, pixels."""
+_OFTEN = {"kinect": 3.0, "realsense": 2.0}
+"""Weights of sensors that most recordings come from; others have weight 1."""
+_DISTANCES_M = (0.25, 3.0)
+_CLOSER_M = 0.03
+"""Least distance of the target beyond the sensor's near limit."""
+
+
+class RenderedView(NamedTuple):
+    """One image of an arrangement.
+
+    Attributes
+    ----------
+    frame : the depth image.
+    owners : (h, w) index of the object or furniture that each pixel shows, -1 without a reading.
+    visible : (k,) visible fraction of each object.
+    table_from_camera : pose of the optical frame.
+    sensor : name of the sensor.
+    """
+
+    frame: Frame
+    owners: I4
+    visible: F8
+    table_from_camera: Pose
+    sensor: str
+
+
+def render_view(seen: Geometry, arrangement: Arrangement, rng: np.random.Generator) -> RenderedView:
+    """Take an image of an arrangement with a random sensor from a random viewpoint.
+
+    ``seen`` holds the meshes of the arrangement: its objects first, then its furniture.
+    """
+    name, sensor = _draw_sensor(rng)
+    camera, pose = sensor.camera, _viewpoint(arrangement, sensor, rng)
+    image = render(seen, camera, pose)
+    depth, owners = measure(image, sensor, rng)
+    visible = _visible_fractions(seen, owners, camera, pose, len(arrangement.actors))
+    frame = Frame("/camera", 0, 0, 0, "camera", depth=depth, camera=camera)
+    return RenderedView(frame, owners, visible, pose, name)
+
+
+def _draw_sensor(rng: np.random.Generator) -> tuple[str, Sensor]:
+    """Draw a preset, perhaps mixed with another, and vary its errors and resolution."""
+    names = list(PRESETS)
+    shares = np.array([_OFTEN.get(each, 1.0) for each in names])
+    name, other = (str(each) for each in rng.choice(names, 2, p=shares / shares.sum()))
+    share = float(rng.uniform(0, 0.6)) if rng.random() < 0.5 else 0.0
+    sensor = between(PRESETS[name], PRESETS[other], share)
+    least, most = np.log([0.4, 0.4, 0.5, 0.5, 0.7]), np.log([2.0, 2.5, 1.5, 8.0, 2.0])
+    noise, wave, ragged, holes, dark = np.exp(rng.uniform(least, most))
+    sensor = replace(
+        sensor,
+        noise=float(sensor.noise * noise),
+        noise_m=float(sensor.noise_m * noise),
+        wave=float(sensor.wave * wave),
+        device=int(rng.integers(1_000_000)),
+        ragged_px=float(sensor.ragged_px * ragged),
+        holes=float(sensor.holes * holes),
+        grazing=float(sensor.grazing * dark),
+        dark=float(sensor.dark * dark),
+    )
+    scale = np.clip(rng.choice(_SCALES), *(np.array(_WIDTHS) / sensor.camera.width))
+    return name, resized(sensor, float(scale))
+
+
+def _viewpoint(arrangement: Arrangement, sensor: Sensor, rng: np.random.Generator) -> Pose:
+    """Return ``table_from_camera``: 0.25 to 3 m away, in the elevations of the arrangement."""
+    points = np.concatenate([actor.mesh.vertices for actor in arrangement.actors])
+    target = points.mean(axis=0) + rng.normal(0, 0.04, 3)
+    nearest, farthest = _DISTANCES_M
+    nearest = max(nearest, sensor.nearest_m + _CLOSER_M)
+    farthest = min(farthest, sensor.farthest_m)
+    distance = float(np.exp(rng.uniform(np.log(nearest), np.log(farthest))))
+    azimuth = np.radians(rng.uniform(*arrangement.azimuth))
+    elevation = np.radians(rng.uniform(*arrangement.elevation))
+    back = np.array(
+        [
+            np.cos(azimuth) * np.cos(elevation),
+            np.sin(azimuth) * np.cos(elevation),
+            np.sin(elevation),
+        ]
+    )
+    return looking_at(target + distance * back, target, roll=rng.normal(0, 0.05))
+
+
+def _visible_fractions(seen: Geometry, owners: I4, camera: Camera, pose: Pose, count: int) -> F8:
+    """Return (count,) the visible fraction of each object.
+
+    It is the number of readings divided by the pixels that the object would have alone in an image
+    twice as wide and high; 0 with fewer than `_FEWEST_PIXELS` readings.
+    """
+    seen_pixels = np.bincount(owners[owners >= 0], minlength=count + 1)
+    width, height = camera.width // _COARSE, camera.height // _COARSE
+    wide = Camera(
+        2 * width,
+        2 * height,
+        camera.fx / _COARSE,
+        camera.fy / _COARSE,
+        camera.cx / _COARSE + width // 2,
+        camera.cy / _COARSE + height // 2,
+    )
+    result = np.zeros(count)
+    for k in range(count):
+        mine = seen.owners == k
+        alone = Geometry(seen.vertices, seen.triangles[mine], seen.owners[mine])
+        total = int((render(alone, wide, pose).owners >= 0).sum()) * _COARSE**2
+        if seen_pixels[k] >= _FEWEST_PIXELS:
+            result[k] = min(1.0, seen_pixels[k] / max(total, 1))
+    return result
