@@ -208,7 +208,7 @@ def _run(
 
 @contextmanager
 def _closing(executor: Any) -> Iterator[Any]:
-    """Shut the workers down after the work; after a signal, ask them to stop and save theirs."""
+    """Shut the workers down after the work; after a signal, let them stop and save results."""
     try:
         yield executor
     except Stopped:

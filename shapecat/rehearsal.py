@@ -41,7 +41,7 @@ _RADIUS_M = 0.05
 
 
 def find_ball() -> int:
-    """Detect a synthetic ball on a table; return the number of objects found again."""
+    """Detect a synthetic ball on a table; return the number of repeated objects."""
     v, u = np.mgrid[:480, :640]
     rays = np.stack([(u - 320) / 525, (v - 240) / 525, np.ones(u.shape)], axis=-1)
     up = np.array([0, -np.sqrt(0.5), -np.sqrt(0.5)])

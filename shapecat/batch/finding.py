@@ -19,7 +19,7 @@ _MAGIC = (b"\x89MCAP", b"#ROSBAG", b"SQLite format 3")
 
 @dataclass(frozen=True, slots=True)
 class Source:
-    """A recording at a path or a URL; the other one is empty.
+    """A recording at a path or a URL; the field that does not apply is empty.
 
     ``stem`` is its name without suffix and ``parent`` the name of its folder; both serve to name
     the run folder. ``key`` changes with the content at a URL, and ``bytes`` is its size; they are
@@ -76,7 +76,7 @@ def _of_url(url: str, key: str, size: int) -> Source:
 
 
 def _at(url: str) -> list[Source]:
-    """Return the recordings that match a pattern or are below a folder; any other URL itself.
+    """Return the recordings that match a URL pattern or are below a folder, or the URL itself.
 
     Raises
     ------

@@ -85,7 +85,7 @@ class Location:
         return Location(f"{self.url.rstrip('/')}/{name}", self._error)
 
     def _tried(self, done: str, call: Callable[[], _T]) -> _T:
-        """Return the result of a call, repeated while it may still succeed.
+        """Return the result of a call; repeat the call while it may still succeed.
 
         Raises
         ------

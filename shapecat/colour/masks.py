@@ -121,7 +121,7 @@ def labelled_masks(
 
 
 def _smoothed(filled: I4, label: int, box: list[int], reach: int, corner: tuple[int, int]) -> Mask:
-    """Return the mask of the pixels whose surroundings are mostly of the label."""
+    """Return the mask of the pixels around which most pixels have the label."""
     left, top, right, bottom = box
     if right <= left:
         return NOTHING
@@ -183,10 +183,10 @@ def label_boxes(seen: I4, count: int) -> I4:
 
 @kernel(inner=True)
 def _step(label: int, packed: int) -> int:
-    """Return ``packed`` after one more pixel, which has this label.
+    """Return ``packed`` updated with the label of the next pixel.
 
-    It describes the last object met: its label in the upper 16 bits, and below them 4 times its
-    distance in pixels, plus 1 if a pixel of label 0 lies between.
+    ``packed`` describes the last object met: its label in the upper 16 bits, and below them 4
+    times its distance in pixels, plus 1 if a pixel of label 0 lies between.
     """
     return label << 16 if label > 0 else (packed + 4) | (label == 0)
 

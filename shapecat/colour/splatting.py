@@ -76,7 +76,7 @@ def splat_depth(
 
 
 def _rays(camera: Camera, colour_from_depth: Pose) -> tuple[F4, F4, F4]:
-    """Return the parts of a rotated ray due to column (3, w) and row (3, h), and the shift (3,)."""
+    """Return the terms of a rotated ray for each column (3, w) and row (3, h), and a shift (3,)."""
     x = (np.arange(camera.width) - camera.cx) / camera.fx
     y = (np.arange(camera.height) - camera.cy) / camera.fy
     turn = colour_from_depth.rotation
@@ -143,7 +143,7 @@ def _list_beside(depth: F4, pixels: U4, parallax: float) -> U4:
 
 @kernel(inner=True)
 def _row_and_column(pixel: int, row: int, width: int) -> tuple[int, int]:
-    """Return row and column of a flat pixel index, quickly if it is in ``row``, a guess."""
+    """Return row and column of a flat pixel index, quickly if the guess ``row`` is right."""
     column = pixel - row * width
     if not 0 <= column < width:
         row = pixel // width
@@ -155,9 +155,9 @@ def _row_and_column(pixel: int, row: int, width: int) -> tuple[int, int]:
 def _extent(depth: F4, pixels: U4, own: Bool) -> tuple[int, int, int, int, float, float]:
     """Return the extent of some pixels in the image and in depth.
 
-    It is first and last row, first and last column, the least depth of all sparse pixels of the
-    image, and the greatest depth of these pixels. ``own`` is set to True at the sparse pixels
-    among them.
+    The result is first and last row, first and last column, the least depth of all sparse pixels of
+    the image, and the greatest depth of the given pixels. ``own`` is set to True at the sparse
+    pixels among these.
     """
     top, bottom, left, right = depth.shape[0], -1, depth.shape[1], -1
     near, far = np.float32(np.inf), np.float32(0)
@@ -203,7 +203,7 @@ def _see_pixels(depth: F4, pixels: U4, rays: tuple[F4, F4, F4], lens: Lens) -> F
 
 @kernel(inner=True)
 def _land(place: F4, labels: I4, half: float, size: tuple[int, int], boxes: I4) -> I4:
-    """Return the square of image pixels that each depth pixel covers with their centres.
+    """Return the square of image pixels whose centres each depth pixel covers.
 
     Squares are (n, 4) left, top, right + 1, bottom + 1; zeros outside the image. ``boxes`` is set
     to the box around the squares of each label. ``place`` is from `_see_pixels`; ``half`` is half

@@ -125,11 +125,12 @@ def _describe(points: F4, neurons: F4, edges: U2, eye: F4, out: F4) -> bool:
 
 @kernel
 def _prepare(points: F4, neurons: F4, edges: U2, eye: F4) -> tuple[Any, ...]:
-    """Return what the blocks share, in the unit of the neurons.
+    """Return the quantities that several blocks use, in units of `_own_units` unless in metres.
 
-    The points (3, n) sorted by neuron, where those of each neuron start, the neuron of each; the
-    neurons (3, m), their mean and the unit in metres, their distances straight and along edges,
-    the share of the points that each has, the mean gap; the eye, and how far it is in metres.
+    They are: the points (3, n) sorted by neuron, the index where each neuron's points start, the
+    neuron of each point; the neurons (3, m), their mean and the unit (both in metres), their
+    Euclidean distances and distances along edges, each neuron's share of the points, the mean gap;
+    the sensor's position, and its distance in metres.
     """
     x, y, z, straight, middle, unit = _own_units(neurons)
     away = 0.0
@@ -156,7 +157,7 @@ def _prepare(points: F4, neurons: F4, edges: U2, eye: F4) -> tuple[Any, ...]:
 
 @kernel(inline=True)
 def _cloud_of(points: F4, middle: F8, unit: float) -> F4:
-    """Return every k-th point, (3, n), in the unit of the neurons, about their mean."""
+    """Return every k-th point (3, n) relative to the mean of the neurons, in their unit."""
     step = (points.shape[0] + _MAX_POINTS - 1) // _MAX_POINTS
     total = (points.shape[0] + step - 1) // step
     cloud = np.zeros((3, total), np.float32)

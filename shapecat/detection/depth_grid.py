@@ -67,10 +67,10 @@ class DepthGrid(NamedTuple):
 def downsample(
     depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_M
 ) -> DepthGrid | None:
-    """Average the pixels near the nearest one of each cell, and return the inverse depths.
+    """Average the depths in each cell that are close to its nearest; return the inverse depths.
 
-    Return None if there is no reading up to ``range_m``; of images larger than 50 pixels only every
-    fifth row and column is tried for it.
+    Return None if no reading is within ``range_m``; in images larger than 50 pixels, only every
+    fifth row and column is searched for one.
 
     Parameters
     ----------

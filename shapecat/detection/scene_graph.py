@@ -94,19 +94,19 @@ class Hierarchy:
         return len(self.objects_on(plane, direct=direct))
 
     def highest(self, plane: int) -> int | None:
-        """Of a plane's objects, return the index of the one with the highest top, or None."""
+        """Return the index of the object on a plane that has the highest top, or None."""
         return max(self.objects_on(plane), key=lambda k: (self._top(k), -k), default=None)
 
     def lowest(self, plane: int) -> int | None:
-        """Of a plane's objects, return the index of the one with the lowest top, or None."""
+        """Return the index of the object on a plane that has the lowest top, or None."""
         return min(self.objects_on(plane), key=lambda k: (self._top(k), k), default=None)
 
     def nearest(self, plane: int) -> int | None:
-        """Of a plane's objects, return the index of the one nearest to the sensor, or None."""
+        """Return the index of the object on a plane that is nearest to the sensor, or None."""
         return min(self.objects_on(plane), key=lambda k: (self._range(k), k), default=None)
 
     def farthest(self, plane: int) -> int | None:
-        """Of a plane's objects, return the index of the one farthest from the sensor, or None."""
+        """Return the index of the object on a plane that is farthest from the sensor, or None."""
         return max(self.objects_on(plane), key=lambda k: (self._range(k), -k), default=None)
 
     def objects_on_objects(self) -> tuple[tuple[int, int], ...]:

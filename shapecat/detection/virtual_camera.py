@@ -45,7 +45,7 @@ class VirtualImage(NamedTuple):
 
 
 def virtual_image(points: F4, *, range_m: float, origin: F8 | None = None) -> VirtualImage | None:
-    """Return the image of a point cloud; None if the points are too few, or all around.
+    """Return the image of a point cloud; None if the points are too few or surround the viewpoint.
 
     The optical axis points to the middle of the cloud. Cells are as wide as the spacing of the
     points, but no narrower than those of depth images.

@@ -24,8 +24,8 @@ class Item:
     pixels : (n,) flat indices into the frame; None if there is no mask.
     box : 3D box in the sensor frame; None if there is none.
     decidable : whether its category is unambiguous in this view.
-    confidence : confidence of the final label, in runs.
-    view_category, posterior : category and posterior (c,) of the single view, in runs.
+    confidence : confidence of the final label; only in runs.
+    view_category, posterior : category and posterior (c,) of the single view; only in runs.
     """
 
     track: int | None

@@ -25,7 +25,7 @@ class CocoLabels(Reference):
 
     An image names its frame by ``stamp_ns``, by ``frame``, or by a number in its ``file_name``: a
     timestamp in nanoseconds, else the last number, which is the frame number. An image without
-    ``topic`` is of any topic.
+    ``topic`` matches any topic.
     """
 
     kind = "COCO labels"

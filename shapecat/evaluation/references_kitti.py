@@ -25,8 +25,8 @@ class KittiLabels(Reference):
     without it, the file's number is the frame number. Boxes are in the rectified camera frame, and
     the rotation in ``P2`` turns them into the sensor frame.
 
-    A type cannot hold blanks. It names the one of ``categories`` that it is written for, the first
-    of several; in any other type, each ``_`` is a blank.
+    A type cannot hold blanks. It stands for the first of ``categories`` that is written this way;
+    in any other type, each ``_`` is a blank.
     """
 
     kind = "KITTI labels"
@@ -72,7 +72,7 @@ class KittiLabels(Reference):
 def _stamps(path: Path) -> dict[tuple[str | None, int], str]:
     """Return the name of each label file by topic and timestamp, ns; empty without ``frames.csv``.
 
-    Labels of a single topic are of any topic: a recording may call it otherwise.
+    Labels of a single topic match any topic, since the recording may use another name.
     """
     if not path.is_file():
         return {}
@@ -85,7 +85,7 @@ def _stamps(path: Path) -> dict[tuple[str | None, int], str]:
 
 
 def _sensor_from_rectified(path: Path) -> F8:
-    """Return the rotation (3, 3) in ``P2``; the identity if the file is missing."""
+    """Return the rotation (3, 3) in ``P2`` of a calibration file; the identity if it is missing."""
     if not path.is_file():
         return np.eye(3)
     lines = dict(line.split(":", 1) for line in path.read_text("utf-8").splitlines() if ":" in line)

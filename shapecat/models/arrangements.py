@@ -103,7 +103,7 @@ _SETTLED: tuple[tuple[Callable[..., Scene], float, Arrangement], ...] = (
 
 
 def arrange(world: World, rng: np.random.Generator) -> Arrangement:
-    """Return random objects on a table, or settled by physics."""
+    """Arrange random objects on a table, or let them settle by physics."""
     if world.settled > 0 and rng.random() < world.settled:
         return _settled(world, rng)
     return Arrangement(_spread(world, rng), (ALONE,))

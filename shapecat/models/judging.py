@@ -176,7 +176,7 @@ def _tracks(jobs: int) -> Iterable[WorldView]:
 
 
 def _fused_table(tracks: dict[str, Simulated], model: Categorizer) -> Table:
-    """Return the accuracy of several fused views of one placement of an object."""
+    """Return a table of the accuracy after fusing several views of one placement of an object."""
     rows = []
     for name, seen in tracks.items():
         clear = seen.where(clear_views(seen))

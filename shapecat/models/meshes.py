@@ -22,8 +22,8 @@ def mesh_views(
 
     Parameters
     ----------
-    placements : each mesh is placed 3 times upright and 2 times lying for each unit; balls, bowls
-        and plates are always upright.
+    placements : number of rounds. In each, a mesh is placed 3 times upright and 2 times lying;
+        balls, bowls and plates are always upright.
     cameras : images of each placement, whose views share their instance name.
 
     Raises

@@ -148,7 +148,7 @@ def _collect(chunk: tuple[Series, int, int]) -> Pairs:
 def _pairs(
     depth: F4, camera: Camera, owners: U1, things: I4, rng: np.random.Generator
 ) -> Iterator[tuple[F4, bool]]:
-    """Yield the pairs of a frame, of single and of merged segments: features, whether one object.
+    """Yield the features of pairs of segments, single or merged, and whether they are one object.
 
     Parameters
     ----------

@@ -90,7 +90,7 @@ _CLOSER_M = 0.08
 
 
 class Samples(NamedTuple):
-    """Merged segments: ``features`` (n, `FEATURES`); ``objects`` (n,), whether it is an object."""
+    """Merged segments: ``features`` (n, `FEATURES`); ``objects`` (n,), which are objects."""
 
     features: F4
     objects: Bool
@@ -139,7 +139,7 @@ def _labelled(series: Series, seed: int) -> Iterator[tuple[F4, bool]]:
 
 
 def _on_floor(world: World) -> World:
-    """Take away the table and what is on it but objects, and put these on the floor."""
+    """Remove the table and everything on it except the objects, and put these on the floor."""
     table = next(support for support in world.supports if support.name == "table")
     down = np.array([0.0, 0.0, -table.height])
     things = (
@@ -151,7 +151,7 @@ def _on_floor(world: World) -> World:
 
 
 def _viewpoint(world: World, sensor: Sensor, rng: np.random.Generator) -> Pose | int:
-    """Return ``world_from_camera`` of a look at the objects; the path's if there are none."""
+    """Return a random ``world_from_camera`` facing the objects; the path's if there are none."""
     places = [thing.pose.translation for thing in world.things]
     if not places:
         return 0

@@ -193,7 +193,7 @@ def _cut_by_detection(image: RenderedView, scene: Scene, k: int) -> tuple[View, 
 
 
 def _cut_by_truth(image: RenderedView, k: int, actor: Actor, rng: np.random.Generator) -> View:
-    """Return the object's true pixels in a level frame with errors of a degree and some mm."""
+    """Return the object's true pixels in a level frame with errors of half a degree and 2 mm."""
     indices = np.flatnonzero((image.owners == k) & (np.asarray(image.frame.depth) > 0))
     points = image.frame.xyz(indices)
     camera_from_table = inverse(image.table_from_camera)
@@ -211,7 +211,7 @@ def _centre(actor: Actor) -> F8:
 
 
 def _described(view: View, source: str, seen: _Seen) -> WorldView | None:
-    """Describe a view by its voxels, which also seed the random generator; None if impossible."""
+    """Describe a view by its voxels, which also seed the random generator; None if too few."""
     distance = float(np.linalg.norm(view.points.mean(axis=0) - view.eye))
     view = replace(view, points=voxelize(view.points, voxel_m=_SETTINGS.surface.voxel_m))
     rng = np.random.default_rng(crc32(view.points.tobytes()))

@@ -60,7 +60,7 @@ def write_annotated(
     markers : whether to write ``/shapecat/markers`` for RViz, for ROS only.
     images : the boxes to show on the colour images, in the order of the recording, for
         ``/shapecat/image_annotations`` and, for ROS, ``/shapecat/detections_2d``, with the stamp,
-        frame id and log time of the image; None for neither.
+        frame id and log time of the image; None to write neither.
 
     Raises
     ------
@@ -164,7 +164,7 @@ def _append(
 
 
 def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
-    """Add lifetimes, from the next frame, and deletions, from the previous frames."""
+    """Add lifetimes, from the time of the next frame, and tracks to delete, from earlier frames."""
     periods: dict[str, int] = {}
     last: dict[str, int] = {}
     shown: dict[str, set[int]] = {}
@@ -185,7 +185,7 @@ def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
 
 
 def _encoding(recording: Recording, first: Annotation | None) -> str:
-    """Return the encoding for annotations: of the annotated topic, else the most common one."""
+    """Return the encoding for annotations: that of the annotated topic, else the commonest."""
     if recording.kind == "ros1":
         return "cdr"
     topics = [topic for topic in recording.topics if topic.encoding in ENCODERS]

@@ -78,7 +78,7 @@ class _Awaited:
     def needs(self, topic: str, log_time_ns: int) -> bool:
         """Return whether a depth or colour message belongs to an awaited frame, or may do so.
 
-        It may belong to a frame that is not known yet if it is not earlier than the last known
+        It may belong to a frame that is not known yet unless it is earlier than the last known
         frame, or its image. Messages of other topics are always needed.
         """
         if topic not in self._topics | self._colours:

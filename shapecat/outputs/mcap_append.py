@@ -127,7 +127,7 @@ class Appender:
         self._waiting: deque[Future[None]] = deque()
 
     def __enter__(self) -> Self:
-        """Return itself."""
+        """Return this appender."""
         return self
 
     def __exit__(self, *_: object) -> None:

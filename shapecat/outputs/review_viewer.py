@@ -29,7 +29,7 @@ _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY", "WAYLAND_SOCKET")
 
 
 def open_viewer(path: Path) -> None:
-    """Open a review in a window, and return when the window stays open.
+    """Open a review in a window, and return once the window has stayed open.
 
     Raises
     ------

@@ -63,7 +63,7 @@ class Extrinsics:
     def _lookup(
         self, number: int, depth_frame: str, colour_frame: str, stamp_ns: int
     ) -> Pose | None:
-        """Look up a transform among the static ones (`number` 0) or all (1); None if missing."""
+        """Look up a transform, static if ``number`` is 0, any if it is 1; None if missing."""
         buffer = self._buffers[number]
         if buffer is None:
             buffer = read_transforms(self._recording, static_only=number == 0)

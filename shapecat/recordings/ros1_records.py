@@ -52,7 +52,7 @@ class BagError(RecordingError):
     """
 
     def __init__(self, message: str, record: "Record | None" = None) -> None:
-        """Store what is left of the record."""
+        """Store the truncated record."""
         super().__init__(message)
         self.record = record
 

@@ -229,7 +229,7 @@ def _require_same_run(path: Path, table: TrackTable, folder: Path, *, known: boo
 
 
 def _places_agree(table: TrackTable, folder: Path) -> bool:
-    """Return whether the tracks of a table have the same positions as in the run, or none."""
+    """Return whether the tracks of a table have no positions, or the same as in the run."""
     own = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
     return all(
         _number(row.cells.get(axis)) in {None, _number(own[row.track].cells.get(axis))}

@@ -88,7 +88,7 @@ class PerceptionTables:
         self.done = sum(read_segment(s, "frames").num_rows for s in self._segments)
 
     def __enter__(self) -> Self:
-        """Return itself."""
+        """Return this writer."""
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *error: object) -> None:

@@ -104,7 +104,7 @@ def read_shown_frames(
 ) -> Iterator[ShownFrame]:
     """Yield the annotations of a run, frame by frame in reading order.
 
-    It omits points, surfaces and posteriors, and is several times as fast as
+    This omits points, surfaces and posteriors, and is several times as fast as
     `shapecat.runs.labels.read_labelled_frames`. Boxes enclose whole objects where their size is
     known; with ``visible``, only their visible parts.
     """

@@ -252,7 +252,7 @@ def _cast_shadow(inverse: F8, shift: float, shadow: Bool) -> None:
 def _fill_shadow(inverse: F8, owners: I4, shadow: Bool, eaten: I4) -> None:
     """Grow the nearer side of each shadow into it, as the windows of stereo matching do.
 
-    ``eaten`` (h // 3 + 1, 16) are the widths in pixels, which vary over the image.
+    ``eaten`` (h // 3 + 1, 16) holds the widths of this growth in pixels, which vary over the image.
     """
     height, width = inverse.shape
     for v in range(height):

@@ -70,7 +70,7 @@ def leave(signum: int, _frame: FrameType | None = None) -> None:
 
 
 def _say(text: bytes) -> None:
-    """Write to stderr without its buffer: the signal may have interrupted a write to that."""
+    """Write to stderr past its buffer, since the signal may have interrupted a buffered write."""
     with suppress(OSError):
         os.write(2, text)
 

@@ -167,7 +167,7 @@ class Tracker:
     def _survivors(self, active: _Active) -> _Active:
         """Remove tracks that were missed for longer than they had been seen before.
 
-        This time is at least half a second and at most ``max_missed_s``. A track must also be
+        The limit is at least half a second and at most ``max_missed_s``. A track must also be
         missed in at least one frame, or in two if it is not confirmed, so that a long interval
         between frames does not end it.
         """

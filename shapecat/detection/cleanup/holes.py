@@ -61,8 +61,8 @@ def fill_contact_boundary(inv_depth: F4, heights: HeightMap, labels: I4) -> None
 def fill_holes(inv_depth: F4, labels: I4, count: int, filled: U1) -> None:
     """Give enclosed cells the label of the object around them, in place.
 
-    A hole is connected, and no other unlabelled sample is next to it. Most of its boundary has one
-    label, and all other labels there are in front of the hole.
+    A hole is a connected component of unlabelled samples between labels. Most of its boundary has
+    one label, and all other labels on the boundary are in front of the hole.
 
     Parameters
     ----------
@@ -91,7 +91,7 @@ def fill_holes(inv_depth: F4, labels: I4, count: int, filled: U1) -> None:
 def _between_labels(inv_depth: F4, labels: I4) -> tuple[Bool, I4]:
     """Return the unlabelled samples between labels, (rows, columns) bool, and the spans of labels.
 
-    A sample is between labels if there is one in all four directions.
+    A sample is between labels if a label lies in each of the four directions.
     """
     rows, columns = labels.shape
     first, last = np.full(columns, rows, np.int32), np.full(columns, -1, np.int32)
@@ -115,8 +115,8 @@ def _count_sides(
 ) -> None:
     """Count the sides of holes by label, (n, labels, 3), and in ``total`` (n,).
 
-    The total includes sides next to cells without a reading. For a hole that is not enclosed it is
-    too large for any label to have enough.
+    The total includes sides next to cells without a reading. If a hole is not enclosed, the total
+    is so large that no label has a sufficient share.
     """
     for i in range(len(spans)):
         for j in range(spans[i, 0], spans[i, 1]):

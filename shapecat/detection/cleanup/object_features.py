@@ -88,7 +88,7 @@ def measure_object_features(
     low_profile: Bool,
     range_m: float,
 ) -> Records:
-    """Return the `OBJECT_FEATURES` (n + 1,) of merged segments; zeros for their former parts.
+    """Return the `OBJECT_FEATURES` (n + 1,) of merged segments; zeros for merged parts.
 
     Parameters
     ----------
@@ -108,7 +108,7 @@ def measure_object_features(
 
 
 def _border_lines(grid: DepthGrid) -> tuple[int, int, int, int]:
-    """Return the first and last row, and column, with samples; -1 if not at the image border."""
+    """Return first and last row, first and last column with samples; -1 if not at the border."""
     rows, columns = grid.inverse_depth.shape
     top, bottom, left, right = find_borders(grid.inverse_depth, 1)[:, 0].tolist()
     tall, wide = CLEANUP.border_share * rows, CLEANUP.border_share * columns
@@ -201,7 +201,7 @@ def _measure(grid: DepthGrid, planes: F8, segments: Segments, down: float, out: 
 
 @kernel(inline=True)
 def _measure_outside(grid: DepthGrid, plane: F8, samples: I4, out: Row) -> None:
-    """Write the distances of samples outside the outline of a plane; negative inside.
+    """Write how far samples are outside the outline of a plane; negative inside.
 
     ``plane`` is a row of `pack_planes`.
     """

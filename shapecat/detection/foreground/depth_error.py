@@ -78,7 +78,7 @@ def _find_low(
     """Write the inverse depth of the low cells of row ``i`` relative to the plane, and a mark of 1.
 
     ``raw`` and ``mark`` (3, columns) hold the last three rows; other cells are 0. Returns whether
-    there are any low cells.
+    the row has low cells.
     """
     zero, one, low = np.float32(0), np.float32(1), np.float32(LOW.low_m)
     slope, base = np.float32(plane[0]), np.float32(plane[1] * i + plane[2])

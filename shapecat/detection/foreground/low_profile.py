@@ -49,7 +49,7 @@ class Scratch(NamedTuple):
 def find_low_profile(
     grid: DepthGrid, heights: HeightMap, planes: F8, low_profile: I4, largest_m: float
 ) -> None:
-    """Find the low-profile objects on each plane, and give waves of depth error back to it.
+    """Find the low-profile objects on each plane, and assign waves of depth error to the plane.
 
     Parameters
     ----------
@@ -187,8 +187,8 @@ def _raise(
 def _find_seeds(high_pass: F4, least: float, seeds: I4) -> int:
     """List the cells above ``least`` that are higher than their left and upper neighbours.
 
-    The first cell of a part above any level is one of them. Returns their number. Most cells are
-    lower, and the test of a block of cells vectorises.
+    They include the first cell of every part above any level. Returns their number. Most cells are
+    below ``least``, and the test of a block of cells vectorises.
     """
     rows, columns = high_pass.shape
     flat = high_pass.reshape(-1)

@@ -79,7 +79,7 @@ def extend_overhang(
 def _find_border(plane_id: I4, me: int, i: int, border: U1) -> bool:
     """Mark the cells of row i above a plane that are next to cells of lower planes or of none.
 
-    Returns whether there are any.
+    Returns whether there are any such cells.
     """
     rows, columns = plane_id.shape
     above, below, one = max(i - 1, 0), min(i + 1, rows - 1), np.uint64(1)
@@ -101,7 +101,7 @@ def _find_border(plane_id: I4, me: int, i: int, border: U1) -> bool:
 
 @kernel(inline=True)
 def _goes_on(over: Overhang, i: int, j: int) -> bool:
-    """Return whether the surface at a cell above the plane continues outside, without a flood."""
+    """Return whether the surface at a cell above the plane continues outside it; needs no flood."""
     rows, columns = over.visited.shape
     some, here = False, over.grid.inverse_depth[i, j]
     for di, dj in SIDES:

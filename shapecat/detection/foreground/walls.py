@@ -67,7 +67,7 @@ def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, largest_m: float, trials
 def _is_wall(
     grid: DepthGrid, samples: DepthSamples, plane: F8, normal: F8, up: F8, largest_m: float
 ) -> bool:
-    """Return whether the inliers of a plane are more than the face of an object."""
+    """Return whether the inliers of a plane are too many for the face of an object."""
     strips = np.zeros((2, STRIPS))
     area = _measure(grid.intrinsics, samples, plane, normal, up, strips)
     across = along = 0.0
@@ -85,7 +85,7 @@ def _is_wall(
 
 @kernel(inline=True)
 def _is_cut_off(inv_depth: F4, samples: DepthSamples, plane: F8) -> bool:
-    """Return whether the inliers of a plane reach two sides of the image, or of its samples."""
+    """Return whether the inliers of a plane reach two sides of the image or of its sampled part."""
     own = _bounds(samples, plane, PLANES.tolerance)
     seen = _bounds(sample_grid(inv_depth, inv_depth), plane, np.inf)
     sides, margin = 0, 1.5 * math.sqrt(samples.share)
@@ -192,7 +192,7 @@ def _flood(
 
 @kernel(inline=True)
 def _mark(inv_depth: F4, plane_id: I4, plane: F8, found: U1) -> None:
-    """Mark as `UNSEEN` the cells on a wall, unless they belong to a level plane; 0 elsewhere."""
+    """Mark the cells on a wall as `UNSEEN`, unless a level plane holds them; write 0 elsewhere."""
     a = np.float32(plane[0])
     for i in range(inv_depth.shape[0]):
         values, plane_ids, states = inv_depth[i], plane_id[i], found[i]

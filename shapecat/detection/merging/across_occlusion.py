@@ -54,7 +54,7 @@ def merge_across_occluder(
 
 @kernel(inline=True)
 def _find_behind_one(segments: Segments) -> Bool:
-    """Return the pairs p < q of segments above one plane with a common occluder, (n + 1, n + 1)."""
+    """Return which segments p < q share an occluder and a supporting plane, (n + 1, n + 1) bool."""
     pairs, parent, plane_id = segments.pairs, segments.parent, segments.plane_id
     n = parent.size
     found = np.zeros((n, n), np.bool_)

@@ -27,7 +27,7 @@ def measure_adjacency(
     inv_depth : (rows, columns) 1/m.
     labels : (rows, columns) the segments.
     up : (3,) unit vector, sensor frame.
-    segments : from `measure_segments`, which leaves these out; changed in place.
+    segments : from `measure_segments`, still without these measurements; changed in place.
     """
     rows, columns = inv_depth.shape
     plane_id, links, statistics = heights.plane_id, graph.links, segments.statistics
@@ -71,7 +71,7 @@ def measure_adjacency(
 def _find_changes(links: U1, here: I4, below: I4, change: U1) -> bool:
     """Mark the cells of a row from which a segment does not continue both to the right and down.
 
-    Returns whether there are any.
+    Returns whether there are any such cells.
     """
     for j in range(here.size):
         change[j] = (here[j] != below[j]) | ((here[j] > 0) & (links[j] != RIGHT | DOWN))

@@ -28,7 +28,7 @@ def extend_hull(hull: F4, row: int, first: int, last: int) -> None:
 
 @kernel(inline=True)
 def merge_hulls(hull: F4, other: F4) -> None:
-    """Extend a hull (`DIRECTIONS`,), in place, to another one."""
+    """Extend a hull (`DIRECTIONS`,), in place, to contain another one."""
     for d in range(DIRECTIONS):
         hull[d] = max(hull[d], other[d])
 
@@ -37,8 +37,8 @@ def merge_hulls(hull: F4, other: F4) -> None:
 def hull_area(a: F4, b: F4) -> float:
     """Return the area of the convex hull around two hulls (`DIRECTIONS`,), in cells.
 
-    It is half the sum of each side of the polygon, whose length follows from the neighbours, times
-    its distance from the origin.
+    It is half the sum, over the sides of the polygon, of length times distance from the origin. The
+    length of a side follows from its neighbours.
     """
     turn, half = 2 * math.pi / DIRECTIONS, np.float32(0.5)  # cells are squares, not points
     twice, total = 2 * math.cos(turn), 0.0

@@ -111,7 +111,7 @@ class ViewGeometry(NamedTuple):
 def find_adjacent(segments: Segments, p: int) -> Bool:
     """Return (n + 1,) bool: the segments that may be one object with segment ``p``.
 
-    They are above the same plane. They touch, one hides the other, or they face each other.
+    Both are above the same plane; they touch, or one hides the other, or they face each other.
     """
     statistics, pairs, parent = segments.statistics, segments.pairs, segments.parent
     plane_id = segments.plane_id
@@ -197,7 +197,7 @@ def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) 
 
 @kernel(inner=True)
 def _above_top(segments: Segments, p: int, q: int) -> float:
-    """Return the mean height, above the top of ``q``, of upward-facing contact of ``p`` with it."""
+    """Return the mean height of the contacts of ``p`` with upward-facing ``q``, from the top of ``q``."""
     onto = segments.pairs[p, q].rests_on
     if onto == 0:
         return MERGING.nowhere_m

@@ -43,8 +43,8 @@ class GridLabels(NamedTuple):
 def label_pixels(depth: F4, grid: DepthGrid, found: Segmentation, *, range_m: float) -> list[U4]:
     """Return the pixels of each label 1, 2, ...: ascending flat indices (k,) uint32.
 
-    A pixel takes the label of its cell if its depth fits, or else of the neighbour whose depth fits
-    best. It keeps the label only if it is itself above the plane, or in a filled cell.
+    A pixel takes the label of its cell if their depths agree, else that of the neighbouring cell
+    whose depth agrees best. It keeps the label only if it is above the plane or in a filled cell.
 
     Parameters
     ----------
@@ -175,7 +175,7 @@ def _find_unsure(line: I4, start: int, end: int, cells: I4) -> int:
 
 @kernel(inline=True)
 def _end_of(line: I4, x: int, end: int, mark: int) -> int:
-    """Return the first column from ``x`` on with another mark; ``end`` if there is none before."""
+    """Return the first column from ``x`` to ``end`` with another mark; ``end`` if there is none."""
     while x + BLOCK <= end:
         same = True
         for k in range(np.uint64(x), np.uint64(x + BLOCK)):

@@ -105,7 +105,7 @@ def measure_objects(
 
 @kernel(inline=True)
 def _supporting_object(segments: Segments, representatives: I4, p: int) -> tuple[int, float]:
-    """Return the label a segment stands on, 0 for its plane, and the height of that, metres."""
+    """Return the label below a segment, 0 for its plane, and the height of this support, metres."""
     pairs, statistics = segments.pairs[p], segments.statistics
     best = 0
     for k in range(1, representatives.size):
@@ -143,7 +143,7 @@ def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
 
 @kernel(inline=True)
 def _break_cycles(measured: ObjectMeasurements) -> None:
-    """Put objects that stand on themselves, through others, on their plane."""
+    """Put objects on their plane that would stand on themselves, through others."""
     supported_by = measured.supported_by
     for k in range(supported_by.size):
         at = supported_by[k]
@@ -181,8 +181,8 @@ def _outer_points(
 ) -> tuple[F4, I4]:
     """Return points of each object in the level frame (3, n), and the index where each begins.
 
-    They are the outermost cells, and every 4th cell inside, since the nearest point of a ball is
-    inside its outline. Also writes ``low`` and ``high`` of the measurements.
+    The points are the outermost cells, and every 4th cell inside, since the nearest point of a ball
+    is inside its outline. Also writes ``low`` and ``high`` of the measurements.
     """
     rows, columns = labels.shape
     low, high = measured.low, measured.high

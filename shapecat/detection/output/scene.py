@@ -86,7 +86,7 @@ def _numbers_of_seen(supports: Sequence[SupportingPlane]) -> list[int | None]:
 def _kept(
     grid: DepthGrid, measured: ObjectMeasurements, indices: Sequence[U4], least: int, *, image: bool
 ) -> list[int]:
-    """Return the lists with enough points for an object, in the order of their first points."""
+    """Return the numbers of the lists with enough points for an object, by their first points."""
     limits = [float(least)] * len(indices)
     if image:
         limits = [max(least, n * grid.factor**2) for n in measured.least.tolist()]
@@ -110,7 +110,7 @@ def _boxes(
 
 
 def _cut(grid: DepthGrid, measured: ObjectMeasurements) -> Bool:
-    """Return whether each object reaches the border of the image, or of its samples near it."""
+    """Return whether each object reaches the border of the image, or a blank strip along it."""
     near, shape = max(1, round(2 / grid.factor)), grid.inverse_depth.shape
     cut = np.zeros(len(measured.low), bool)
     for side, (blank, extent) in enumerate(find_borders(grid.inverse_depth, near).tolist()):

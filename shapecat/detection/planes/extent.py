@@ -96,7 +96,7 @@ def area_of(samples: DepthSamples, plane: F8, distance: float) -> float:
 
 @kernel(inline=True)
 def _ends(samples: DepthSamples, plane: F8, rows: int, columns: int) -> I4:
-    """Return the first and last inlier column of each row, (2, rows); last is -1 without one."""
+    """Return first and last inlier column of each row, (2, rows); the last is -1 if none."""
     ends = np.zeros((2, rows), np.int32)
     for i in range(rows):
         ends[0, i], ends[1, i] = columns, -1

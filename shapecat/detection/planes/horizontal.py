@@ -84,7 +84,7 @@ def _common_up(found: list[PlaneCandidate]) -> F8:
 def _turn(
     intrinsics: PinholeIntrinsics, samples: DepthSamples, plane: SupportingPlane, up: F8
 ) -> F8:
-    """Fit a plane with the normal ``up`` to the inliers of another, by least squares."""
+    """Fit a plane with the normal ``up`` to the inliers of another plane, by least squares."""
     # The inverse depth of the plane up @ p == offset is along / offset.
     squares = products = 0.0
     for k in range(samples.inverse_depth.size):

@@ -21,11 +21,11 @@ FIRST = STRIDE // 2
 
 
 class OrientedPoints(NamedTuple):
-    """Oriented points, n = rows * columns, row by row.
+    """Every third sample of a depth grid with its normal; n = rows * columns, row by row.
 
     Attributes
     ----------
-    inverse_depth : (rows, columns) float32, 1/m, of every third sample.
+    inverse_depth : (rows, columns) float32, 1/m.
     normals : (3, n) float32 unit vectors towards the camera, sensor frame; 0 where the surface is
         not smooth.
     positions : (3, n) float32, metres, sensor frame; 0 where there is no reading.

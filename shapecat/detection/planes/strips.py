@@ -34,7 +34,7 @@ BINS = 600
 
 
 def may_have_strips(grid: DepthGrid, points: OrientedPoints, found: list[PlaneCandidate]) -> bool:
-    """Return whether many points lie at a height that may have strips, with few below it.
+    """Return whether some height has many points with few below it, and so may have strips.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def _may_be_strips(
 ) -> bool:
     """Return whether a plane at a height is seen at a grazing angle, or covered by objects.
 
-    ``above`` is the level area just above it, relative to its own, from `_peaks`.
+    ``above`` is the level area just above the plane, relative to its own area, from `_peaks`.
     """
     large = [one.plane.offset for one in found if one.plane.area_m2 > PLANES.likely_m2]
     up = found[0].plane.up
@@ -62,8 +62,8 @@ def _may_be_strips(
 def add_strip_planes(grid: DepthGrid, found: list[PlaneCandidate]) -> list[PlaneCandidate]:
     """Add the planes of which only narrow strips are visible.
 
-    There is next to no surface below such a plane. A board shows some surface of its own; a covered
-    table shows more just above it, on the objects that cover it.
+    Hardly any surface lies below such a plane. A board shows some surface at its own height; a
+    covered table shows more just above, on the objects that cover it.
 
     Parameters
     ----------

@@ -33,12 +33,17 @@ def supporting_planes(
 ) -> list[SupportingPlane]:
     """Return the planes that are not the tops of objects, lowest first.
 
-    Heights count from the highest kept plane under the middle of a plane. A plane is dropped if it
-    is less than 6 cm high. It is kept if the surface rises around it, as around the floor of a bin.
-    Otherwise it is dropped if it has less than 0.03 m2 and is neither the lowest nor higher than
-    the tallest object. Of the others it is kept if nothing is below it, if it is higher than the
-    tallest object, or if it has at least 0.25 m2. Any other plane is dropped if a wall is seen
-    below its front edge, as below that of a box; if little is seen there, it needs 0.1 m2.
+    Planes are judged from the lowest up; the height of a plane is measured from the highest kept
+    plane under its middle. The first rule that applies decides:
+
+    1. Drop a plane less than 6 cm high.
+    2. Keep the lowest plane, a plane higher than the tallest object, or one of at least 0.25 m2.
+    3. Keep a plane around which the surface rises, as around the floor of a bin.
+    4. Drop a plane of less than 0.03 m2.
+    5. Keep a plane with no other below it.
+    6. Drop a plane with a wall below its front edge, as below the top of a box.
+    7. Drop a plane of less than 0.1 m2 if little is visible below its front edge.
+    8. Keep all others.
 
     Parameters
     ----------
@@ -94,7 +99,7 @@ def _up_to_walls(grid: DepthGrid, plane: SupportingPlane) -> SupportingPlane:
 def _is_enclosed(grid: DepthGrid, samples: DepthSamples, plane: SupportingPlane) -> bool:
     """Return whether the surface rises around a plane, as the walls do around the floor of a bin.
 
-    Around the top of an object it drops.
+    Around the top of an object the surface drops.
     """
     inv_depth = grid.inverse_depth
     rises = drops = 0

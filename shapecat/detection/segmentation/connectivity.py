@@ -93,7 +93,7 @@ def _blank(spans: I4, columns: int) -> F4:
 
 @kernel
 def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) -> None:
-    """Link neighbours without a depth discontinuity, or that a local plane of one supports."""
+    """Link neighbours at similar depths, or of which one lies on the local plane of the other."""
     rows, columns = inv_depth.shape
     depths, owners = inv_depth.reshape(-1), plane_id.reshape(-1)
     planes, bits = local_plane.reshape(-1), links.reshape(-1)

@@ -73,7 +73,7 @@ def padded(start: int, end: int) -> int:
 def _write(fits: F4, planes: F4, normals: F4, at: int, columns: int, n: int) -> None:
     """Copy the fits of a run to the local planes and normals from index ``at`` on.
 
-    For speed, without slices and signed indices.
+    Slices and signed indices would be slower.
     """
     for d in range(3):
         to, plane = np.uint64(at + d * columns), np.uint64(d * PITCH)
@@ -107,7 +107,7 @@ def _next_run(owners: I4, row: int, j: int, last: int) -> tuple[int, int]:
 def _copy_windows(
     depths: F4, owners: I4, shape: tuple[int, int], run: tuple[int, int, int], values: F4
 ) -> None:
-    """Copy the rows around a run, with `WINDOW` more cells at its ends; `NONE` for other planes.
+    """Copy the rows around a run and `WINDOW` cells beyond its ends; `NONE` above other planes.
 
     Parameters
     ----------
@@ -187,7 +187,7 @@ def _fit_run(
 
 @kernel(fast=True, inner=True)
 def _times_row(a: float, b: float, c: float, e: float, f: float, g: float) -> Any:
-    """Return the sum of one value per row times the offset of the row; that of the middle is 0."""
+    """Return the sum of one value per row, each times the offset from the middle row."""
     return np.float32(3) * (g - a) + np.float32(2) * (f - b) + (e - c)
 
 

@@ -21,8 +21,8 @@ LEFT, UP = 4, 8
 def watershed(heights: HeightMap, graph: SurfaceGraph, *, concave: bool) -> tuple[I4, int]:
     """Split the object cells into segments at depth discontinuities and concave edges.
 
-    Connected flat cells are a seed; a flood from the seeds, flattest cells first, assigns the cells
-    of an edge to its sides (Meyer 1991).
+    Each connected component of flat cells is a seed. A flood from the seeds, flattest cells first,
+    assigns the cells of concave edges to the segments beside them (Meyer 1991).
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ def watershed(heights: HeightMap, graph: SurfaceGraph, *, concave: bool) -> tupl
 
 @kernel
 def _label_parts(plane_id: I4, graph: SurfaceGraph, edge_deg: int, labels: I4, n: int) -> int:
-    """Label connected unlabelled cells below ``edge_deg``, from ``n`` + 1 on; return the last."""
+    """Label connected cells with angles below ``edge_deg``, from ``n`` + 1 on; return the last."""
     inside: Bool = np.zeros(labels.shape, np.bool_)
     _find_unlabelled(plane_id, graph.concavity, graph.spans, edge_deg, labels, inside)
     spans, component = spans_of(inside.view(np.int8)), unset(labels.shape, np.int32)

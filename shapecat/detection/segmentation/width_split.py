@@ -163,7 +163,7 @@ def _second(end: F4, k: int, way: float) -> float:
 
 @kernel(inner=True)
 def _slope_of(end: F4, k: int) -> float:
-    """Return the mean change from one to the next of four values."""
+    """Return the mean difference of consecutive values, over four values."""
     return float((end[k + 3] + end[k + 2] - end[k + 1] - end[k]) / 4)
 
 
