@@ -197,7 +197,7 @@ def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) 
 
 @kernel(inner=True)
 def _above_top(segments: Segments, p: int, q: int) -> float:
-    """Return the mean height of the contacts of ``p`` with upward-facing ``q``, from the top of ``q``."""
+    """Return how far above the top of ``q`` its upward-facing surface touches ``p``, on average."""
     onto = segments.pairs[p, q].rests_on
     if onto == 0:
         return MERGING.nowhere_m
