@@ -32,7 +32,7 @@ _SENSORS = (
     "--format",
     "container",
     type=click.Choice(["mcap", "ros1", "ros2"]),
-    help="Format; by default that of OUT's suffix.",
+    help="Format of the recording; by default that of OUT's suffix.",
 )
 @choice_option("--sensor", _SENSORS, "Depth camera to simulate.")
 @click.option(
@@ -75,7 +75,7 @@ def simulate(
     room        a table among robot arms, people and furniture
     turntable   a turntable in front of a fixed camera
     walking     a camera that moves along a counter and back
-    crossing    two moving objects that hide others and each other
+    crossing    two moving objects that occlude each other and others
     rearranged  objects that are added, removed, carried and pushed
 
     \b

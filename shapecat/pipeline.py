@@ -243,7 +243,7 @@ def annotate_again(
 
     Returns
     -------
-    The outcome of the transfer by place; None without one.
+    The outcome of the transfer by place; None if there was none.
 
     Raises
     ------

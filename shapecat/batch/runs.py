@@ -173,6 +173,7 @@ def _attempt_elsewhere(job: Job, address: str, cores: int, ticket: Ticket) -> Ou
 
 
 def _reporter(name: str, address: str) -> Observer:
+    """Return an observer that sends progress to the mailbox at ``address``, now and then."""
     last = ("", 0.0)
 
     def observe(phase: str, done: int, total: int | None) -> None:

@@ -158,7 +158,7 @@ def _drop_finished(item: list[_Item], future: Future[_Result]) -> None:
 
 
 def _wake(_work: object, warm_up: Callable[[], object]) -> None:
-    """Warm up; unpickling the work has already imported what it needs."""
+    """Warm up; unpickling the work has already imported its modules."""
     warm_up()
 
 

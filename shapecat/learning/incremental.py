@@ -186,6 +186,7 @@ def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, ridge: float, steps
     by_word = inputs.words.T.tocsr()
 
     def loss(flat: F8) -> tuple[float, F8]:
+        """Return the loss of the flattened weights, and its gradient."""
         weights = flat.reshape(start.shape)
         new = _logits(inputs, weights)
         total = np.logaddexp.reduce(np.concatenate([offset, new], axis=1), axis=1)

@@ -152,7 +152,7 @@ def _pairs(
 
     Parameters
     ----------
-    depth : (h, w) metres, 0 without reading.
+    depth : (h, w) metres, 0 where there is no reading.
     owners : (h, w) pixel labels of the scene.
     things : (k,) labels of objects.
     """

@@ -126,7 +126,7 @@ class RunFrame:
 
     @property
     def color(self) -> U1 | None:
-        """The colour image as recorded, (h, w, 3) uint8 red, green, blue; None without one."""
+        """The colour image as recorded, (h, w, 3) uint8 red, green, blue; None if there is none."""
         return None if self.coloured is None else pixels_of(self.coloured.view.image)
 
     def color_mask(self, item: LabelledObject) -> Bool | None:

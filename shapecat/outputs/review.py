@@ -119,7 +119,7 @@ def _stream(name: str, run: Mapping[str, object]) -> rr.RecordingStream:
 
 
 class _Review:
-    """Writes frame after frame, and stores what the layout and the paths need."""
+    """Writes frame by frame, and stores the data for the layout and the paths."""
 
     def __init__(
         self,

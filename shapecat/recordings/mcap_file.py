@@ -176,7 +176,7 @@ class McapRecording(Recording):
             yield from (m for m in self._expand(record) if m.channel_id in wanted)
 
     def _records(self) -> Iterator[Record]:
-        """Yield the records of the file; a truncated last chunk is shortened to what is left."""
+        """Yield the records of the file; a truncated last chunk is cut to its readable part."""
         try:
             yield from walk(self._file, len(MAGIC), self._size)
         except TruncatedError as error:

@@ -199,7 +199,7 @@ class BagRecording(Recording):
         return counts
 
     def _records(self) -> Iterator[Record]:
-        """Yield the records in file order; a truncated last one is shortened to what is left."""
+        """Yield the records in file order; a truncated last one is cut to its readable part."""
         try:
             yield from walk(self._file, self._first, self._size)
         except BagError as error:

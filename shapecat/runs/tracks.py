@@ -186,6 +186,7 @@ def _columns(tracks: Sequence[Track], boxes: F4, categories: Sequence[str]) -> d
     """Return the table columns of some tracks and their full boxes (n, 13), track after track."""
 
     def column(name: str, kind: str, *width: int) -> Any:
+        """Concatenate an attribute of the tracks, of which there may be none."""
         values = [np.asarray(getattr(track, name), kind) for track in tracks]
         return np.concatenate([np.zeros((0, *width), kind), *values])
 

@@ -23,8 +23,8 @@ def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
 
     Returns
     -------
-    depth : (h, w) float32 metres, 0 without reading.
-    owners : (h, w) int16 owner of each reading, -1 without reading.
+    depth : (h, w) float32 metres, 0 where there is no reading.
+    owners : (h, w) int16 owner of each reading, -1 where there is none.
     """
     inverse, owners, cosine = _displaced(image, sensor, rng)
     lost = np.zeros(image.inverse.shape, np.bool_)

@@ -57,7 +57,7 @@ class MessageFactory:
         )
 
     def cloud(self, points: F4, stamp_ns: int, frame_id: str) -> Any:
-        """Return points (h, w, 3), metres, NaN without reading, as an organized PointCloud2."""
+        """Return points (h, w, 3), metres, NaN if missing, as an organized PointCloud2."""
         height, width, _ = points.shape
         data = np.zeros((height, width, 4), "<f4")
         data[..., :3] = points

@@ -109,6 +109,7 @@ def _nearest(wanted: int) -> Callable[..., Any]:
     """Return an intrinsic that finds the ``wanted`` neurons nearest to a point."""
 
     def emit(context: Any, builder: Any, signature: Any, args: Any) -> _Value:
+        """Emit the instructions of ``search``, below."""
         v, build = _Vectors(context, builder), builder
         arrays = [v.array(signature.args[k], args[k]) for k in range(3)]
         padded, place, mask = args[3], [v.splat(value, _FLOATS) for value in args[4:7]], args[7]

@@ -52,7 +52,7 @@ Window = tuple[int, int, int, int]
 
 
 class SeenFrame(Record):
-    """A frame with what its pictures need.
+    """A frame with all data for its pictures.
 
     Attributes
     ----------
