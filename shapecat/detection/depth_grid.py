@@ -67,7 +67,7 @@ class DepthGrid(NamedTuple):
 def downsample(
     depth: F4, camera: Camera, *, range_m: float, cell_m: float = CELL_M
 ) -> DepthGrid | None:
-    """Average the depths in each cell that are close to its nearest; return the inverse depths.
+    """Average, in each cell, the depths close to the nearest one; return the inverse means.
 
     Return None if no reading is within ``range_m``; in images larger than 50 pixels, only every
     fifth row and column is searched for one.
@@ -125,7 +125,7 @@ def row_and_column(p: int, columns: int) -> tuple[int, int]:
 
 @kernel(inline=True)
 def smallest_object_at(grid: DepthGrid, depth_m: float) -> float:
-    """Return the least number of cells of an object at a depth: those that `SMALL_M2` covers."""
+    """Return the number of cells that the smallest object, of `SMALL_M2`, covers at a depth."""
     covered = SMALL_M2 * grid.intrinsics.fx**2 / depth_m**2
     return float(min(max(covered, FEWEST_CELLS), ENOUGH_CELLS))
 

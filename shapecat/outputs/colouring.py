@@ -76,10 +76,10 @@ class _Awaited:
             self._next.extend(islice(self._source, 1))
 
     def needs(self, topic: str, log_time_ns: int) -> bool:
-        """Return whether a depth or colour message belongs to an awaited frame, or may do so.
+        """Return whether a depth or colour message belongs, or may belong, to an awaited frame.
 
-        It may belong to a frame that is not known yet unless it is earlier than the last known
-        frame, or its image. Messages of other topics are always needed.
+        Only the next few awaited frames are known. A message that is not earlier than the last of
+        them, or its image, may belong to a further one. Messages of other topics are always needed.
         """
         if topic not in self._topics | self._colours:
             return True

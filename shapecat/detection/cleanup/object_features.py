@@ -153,7 +153,7 @@ def _count_cells(
 
 @kernel
 def _measure_plane(field: LabelledGrid, segments: Segments, rows: Records) -> None:
-    """Write mean and standard deviation of the heights of the plane a few cells from segments."""
+    """Write mean and standard deviation of the heights of plane samples near each segment."""
     plane_id, height = field.plane_id, field.height
     count, (lines, columns) = np.zeros(len(rows)), plane_id.shape
     for i in range(lines):

@@ -84,7 +84,7 @@ def normal_position_correlation(row: Row) -> float:
 
 @kernel(inner=True)
 def _moments(row: Row) -> tuple[float, float, float]:
-    """Return the centred sums of squares of lateral position and normal, and of their products."""
+    """Return the centred sums of lateral position squared, normal squared, and their product."""
     n = max(row.fitted, np.float32(1))
     spread = row.xx_sum - row.x_sum * row.x_sum / n
     turning = row.normal_xx_sum - row.normal_x_sum * row.normal_x_sum / n

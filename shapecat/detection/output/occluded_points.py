@@ -23,7 +23,8 @@ def label_occluded_points(points: F4, labels: I4, first_new: int) -> I4:
     ----------
     points : (n, 3) metres, any frame.
     labels : (n,) the known labels, from 1; 0 where unknown.
-    first_new : the label of the first cluster that touches no known object; others count on.
+    first_new : the label of the first cluster that touches no known object; further clusters get
+        the numbers after it.
 
     Returns
     -------

@@ -163,7 +163,7 @@ def _fullest(height: F4) -> float:
 def _split(
     samples: DepthSamples, height: F4, peak: float
 ) -> tuple[DepthSamples, F4, DepthSamples, F4]:
-    """Return the samples within five bins around a height, with their heights, and the others."""
+    """Return the samples within five bins around a height, their heights, and both of the rest."""
     parts = np.zeros((2, 4, height.size), np.float32)
     n = np.zeros(2, np.int64)
     for k in range(height.size):
