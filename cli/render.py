@@ -33,7 +33,7 @@ class Bars:
         self._told = False
 
     def __call__(self, phase: str, done: int, total: int | None) -> None:
-        """Show the progress of a phase; stop here after a signal."""
+        """Show the progress of a phase; raise `Stopped` after a signal."""
         stopping.check()
         if phase == "compile":
             if not self._told:

@@ -113,7 +113,7 @@ class Manifest:
 class RemoteManifest(Manifest):
     """A manifest at a URL, in parts: ``.manifest/SHARD/PART.jsonl``.
 
-    Only its writer changes a part. Every few seconds it replaces its last part by a longer one,
+    Each part has one writer. Every few seconds the writer replaces its last part by a longer one,
     until the part holds a megabyte. At the end, ``manifest.jsonl`` gets the last line of each
     recording. Lines that a killed writer had not sent are recovered from the run folders.
     """

@@ -87,7 +87,7 @@ class LocalExecutor(Executor):
         self._end(lambda worker: worker.process.kill(), timeout_s=1)
 
     def _end(self, each: Callable[[Worker], object], *, timeout_s: float | None = None) -> None:
-        """Drop waiting tasks, call ``each`` for all workers, and wait for their attendants."""
+        """Drop waiting tasks, call ``each`` for all workers, and wait for their threads."""
         self.shutdown(wait=False, cancel_futures=True)
         with self._lock:
             for worker in self._workers.values():

@@ -70,7 +70,7 @@ class Actor(NamedTuple):
     ----------
     mesh : metres, in the frame of the arrangement.
     label : category, or ``unknown``.
-    manner : ``upright``, ``upside_down``, ``lying``, ``leaning`` or ``tilted``.
+    manner : resting pose: ``upright``, ``upside_down``, ``lying``, ``leaning`` or ``tilted``.
     support_m : height of the surface that it stands on; in piles, of its lowest vertex.
     """
 

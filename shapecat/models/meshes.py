@@ -11,7 +11,7 @@ from shapecat.simulation.scans import load_mesh, upright_poses, uprighted
 __all__ = ["mesh_views"]
 
 _PLACEMENTS = {"upright": 3, "lying": 2}
-"""Number of placements in each resting manner, for each unit of ``placements``."""
+"""Number of placements in each resting manner, per round (see `mesh_views`)."""
 _NEVER_LIE = {"ball", "bowl", "plate"}
 
 

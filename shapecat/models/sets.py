@@ -41,7 +41,7 @@ CUT_WELL = 0.75
 MOSTLY = 0.7
 """Lowest visible fraction of an object that counts as mostly visible."""
 _TIMES = 3
-"""How many times as often as a kind of distractor a family of procedural objects is drawn."""
+"""Frequency of a family of procedural objects, relative to that of a kind of distractor."""
 
 
 class Simulated(NamedTuple):

@@ -84,9 +84,9 @@ _SERIES = (
 """The merging trees were not grown on these seeds. The scaled scenes add large objects, which are
 too rare otherwise; rooms add arms and furniture, floors objects where furniture usually is."""
 _DISTANCE_M, _ELEVATION_DEG, _SWEEP_DEG = (0.35, 1.9), (12.0, 84.0), (20.0, 150.0)
-"""Where a camera anywhere is, from what it looks at."""
+"""Ranges of the position of a camera ``anywhere``, relative to its target."""
 _CLOSER_M = 0.08
-"""Distance that the nearest reading of the sensor adds at least."""
+"""Least distance of the target beyond the sensor's near limit."""
 
 
 class Samples(NamedTuple):

@@ -26,7 +26,7 @@ _REJECTED = 0.14
 """Fraction of the partial views of known categories that the novelty threshold rejects. Real
 objects are often partly hidden, and a partial view is more novel than a whole one."""
 _TREES: dict[str, Any] = {"rounds": 320, "leaves": 40, "rate": 0.09}
-"""This many views support larger trees; fewer of these take as long as the default ones."""
+"""The many views support trees larger than the default; fewer of them take the same time."""
 _MORE: dict[str, Any] = {"rounds": 150, "rate": 0.06}
 """Settings of the trees that are added to an existing model."""
 

@@ -53,7 +53,7 @@ class WorldView(NamedTuple):
     points : number of voxels.
     distance : mean distance from the sensor, metres.
     seconds : time from points to descriptor.
-    manner : ``upright``, ``lying``, ``upside_down``, ``leaning`` or ``tilted``.
+    manner : resting pose: ``upright``, ``lying``, ``upside_down``, ``leaning`` or ``tilted``.
     source : how the view was segmented: ``truth``, ``detected`` or ``fragment``.
     visible : fraction of the object's unoccluded pixels that have readings.
     overlap : IoU of the view's points and the object's readings.

@@ -127,7 +127,7 @@ def _around(stream: _Stream, k: int) -> I4:
 
 
 def _other_support(stream: _Stream, off: Bool) -> Bool:
-    """Return whether all planes of a frame differ in height from the lowest of nearby frames.
+    """Return whether all planes of a frame differ in height from the lowest ones of nearby frames.
 
     ``off`` (n,) marks the frames that are not compared; the result is (n,) too.
     """

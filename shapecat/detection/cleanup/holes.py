@@ -1,4 +1,4 @@
-"""Hole filling: cells of objects at the level of their plane: contact boundaries and floors."""
+"""Hole filling: object cells at the level of their plane, as in contact boundaries and floors."""
 
 import numpy as np
 

@@ -1,6 +1,7 @@
-"""Removal of low-frequency depth error: the slow waves that sensors see in a flat surface.
+"""Removal of low-frequency depth error: slow waves that sensors measure on a flat surface.
 
-They are higher than a plate is thick. What is left is steps and noise, and the noise is measured.
+The waves are higher than a plate is thick. Without them, steps and noise remain; the noise is then
+measured.
 """
 
 import numpy as np

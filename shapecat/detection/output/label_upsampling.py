@@ -25,7 +25,7 @@ __all__ = [
 ]
 
 UNSURE, BARE = -1, -2
-"""Codes in place of a label: a closer test is needed; a cell without a label next to one with."""
+"""Codes in place of a label: a closer test is needed; an unlabelled cell next to a labelled one."""
 BLOCK = 16
 """Pixels that are tested together: most are like the previous ones."""
 

@@ -34,8 +34,8 @@ class SurfaceGraph(NamedTuple):
     Attributes
     ----------
     local_plane : (rows, 3, columns) float32, inverse depth of the fitted plane at the cell, and its
-        change per column and per row; 0 in object cells without a fit. Of other cells, the inverse
-        depth is 0 near object cells; the rest is uninitialised.
+        change per column and per row; 0 in object cells without a fit. In other
+        cells near these, the inverse depth is 0; the rest is uninitialised.
     normal : (rows, 3, columns) float32 unit normal towards the camera, sensor frame; 0 in object
         cells without a fit, uninitialised elsewhere.
     links : (rows, columns) uint8, `RIGHT` and `DOWN` where the surface continues to that neighbour.

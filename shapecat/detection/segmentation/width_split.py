@@ -1,7 +1,7 @@
 """Split at width changes: stacked objects with flush fronts, where the outline has a step.
 
-An object on a wider or narrower one is visible as such at its sides, even if both fronts are one
-surface. A cup looks the same at the ends of its handle: it is for the merging to join its parts.
+Where a wider or narrower object begins, both sides of the outline step in or out, even if the
+fronts are one surface. The ends of a cup's handle look the same; merging joins its parts again.
 """
 
 import math
