@@ -131,6 +131,22 @@ def test_a_colour_camera_that_is_calibrated_anew_has_another_lens(tmp_path: Path
     assert lenses == [WIDE, WIDE, OTHER]
 
 
+def test_a_colour_camera_may_be_calibrated_anew_in_its_distortion_alone(tmp_path: Path) -> None:
+    """The focal lengths of a new calibration may be those of the old one."""
+    distortions = ((0.11, -0.07, 0.002, 0.001, 0.03), (0.05, 0.02, -0.001, 0.003, -0.04), ())
+    stamps = [EPOCH + 100 * k * MS for k in range(len(distortions))]
+    items = [*depth_items(*stamps)]
+    items.append(("/tf_static", EPOCH, static("camera", "color", (0.05, 0, 0), (0, 0, 0, 1))))
+    for stamp, numbers in zip(stamps, distortions, strict=True):
+        items.append(("/cam/color/camera_info", stamp, info(stamp, WIDE, numbers)))
+        items.append(("/cam/color/image_raw", stamp, raw(stamp, gradient(60, 80), "rgb8", "color")))
+    pairs, _ = read(record(tmp_path / "a.mcap", in_order(items)))
+
+    lenses = [view.lens for _, view in pairs if view is not None and view.lens is not None]
+    assert [lens.coefficients for lens in lenses] == list(distortions)
+    assert [lens.pinhole for lens in lenses] == [WIDE] * 3
+
+
 DEPTH = Camera(64, 48, 60.0, 61.0, 31.2, 23.7)
 
 

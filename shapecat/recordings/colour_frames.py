@@ -115,7 +115,6 @@ class _Partner:
         self.stream = colour
         self._recording = recording
         self._images: deque[tuple[int, int, Any]] = deque()  # stamp, log time, decoded
-        self._info: Any = None
         self._calibration = b""
         self._lens: LensCamera | None = None
         self._steps: deque[int] = deque(maxlen=9)
@@ -146,10 +145,7 @@ class _Partner:
         if content == self._calibration:
             return
         try:
-            info = self._recording.decode(message)
-            key = np.concatenate([np.ravel(info.k if hasattr(info, "k") else info.K)])
-            if self._info is None or not np.array_equal(key, self._info[0]):
-                self._info, self._lens = (key, info), _lens_of(info, self.stream.topic)
+            self._lens = _lens_of(self._recording.decode(message), self.stream.topic)
             self._calibration = content
         except _MALFORMED as error:
             self._left_out[f"calibration: {_reason(error, self.stream.topic)}"] += 1
