@@ -327,3 +327,10 @@ def test_recordings_of_one_name_have_folders_of_their_own() -> None:
     folders = name_folders(["x", "x", "x", "y"], ["a", "b", "a", "a"])
 
     assert folders == ["a_x", "b_x", "a_x_3", "y"]
+
+
+def test_a_name_that_a_number_makes_may_be_taken() -> None:
+    """Two recordings in one folder would each be taken for the other, and one be lost."""
+    folders = name_folders(["a_x_3", "x", "x", "a_x_4", "x"], ["b", "a", "a", "b", "a"])
+
+    assert folders == ["a_x_3", "a_x", "a_x_4", "a_x_4_4", "a_x_5"]

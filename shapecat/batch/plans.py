@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import dataclass
-from itertools import chain
+from itertools import chain, count
 from pathlib import Path
 from typing import Literal
 
@@ -158,7 +158,8 @@ def name_folders(names: Sequence[str], parents: Sequence[str]) -> list[str]:
     folders = []
     for k, (name, parent) in enumerate(zip(names, parents, strict=True)):
         unique = name if counts[name] == 1 else f"{parent}_{name}"
-        free = unique if unique not in taken else f"{unique}_{k + 1}"
+        numbered = (f"{unique}_{number}" for number in count(k + 1))
+        free = next(folder for folder in chain([unique], numbered) if folder not in taken)
         taken.add(free)
         folders.append(free)
     return folders
