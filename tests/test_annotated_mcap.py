@@ -155,6 +155,52 @@ def test_other_readers_accept_the_file(tmp_path: Path) -> None:
     assert b"/shapecat/scene" in checked.stdout
 
 
+@pytest.mark.parametrize("markers", [False, True])
+def test_channels_of_the_original_keep_their_numbers(tmp_path: Path, *, markers: bool) -> None:
+    """Writers may leave out numbers; one that is given twice mixes the messages of two topics."""
+    source, target, text = tmp_path / "a.mcap", tmp_path / "out.mcap", b"string data"
+    with source.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        for k, topic in enumerate(("/first", "/gone", "/points", "/last")):
+            schema = writer.register_schema(STRING, "ros2msg", text + bytes(k))
+            channel = writer.register_channel(topic, "cdr", schema)
+            if topic != "/gone":
+                writer.add_message(channel, EPOCH + k, string(topic), EPOCH, k)
+        for kind in ("channels", "schemas"):  # the library itself leaves nothing out
+            vars(writer)[f"_Writer__{kind}"].pop(2)
+        writer.finish()
+    annotate(source, target, markers=markers)
+
+    own = {f"/{name}": string(f"/{name}") for name in ("first", "points", "last")}
+    added = ("detections", "scene", *(("markers",) if markers else ()))
+    with target.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        summary = reader.get_summary()
+        found = list(reader.iter_messages())
+    assert summary is not None
+    channels = list(summary.channels.values())
+    assert sorted(one.topic for one in channels) == sorted(
+        [*own, *(f"/shapecat/{name}" for name in added)]
+    )
+    assert len({one.schema_id for one in channels}) == len(summary.schemas) == len(channels)
+    statistics = summary.statistics
+    assert statistics is not None
+    times = [m.log_time for _, _, m in found]
+    assert (statistics.message_start_time, statistics.message_end_time) == (min(times), max(times))
+    assert statistics.channel_message_counts == Counter(c.id for _, c, _ in found)
+    assert (statistics.channel_count, statistics.schema_count) == (len(channels), len(channels))
+    assert statistics.chunk_count == len(summary.chunk_indexes)
+    assert {c.topic: bytes(m.data) for _, c, m in found if c.topic in own} == own
+    assert Counter(c.topic for _, c, _ in found if c.topic not in own) == {
+        f"/shapecat/{name}": len(FRAMES) for name in added
+    }
+    for name in added:
+        assert [time for time, _ in decoded(target, f"/shapecat/{name}")] == [
+            frame.log_time_ns for frame in FRAMES
+        ]
+
+
 def test_summary_checksum_is_right(tmp_path: Path) -> None:
     """Readers of other languages verify it; the Python library does not."""
     import zlib  # noqa: PLC0415  # only here

@@ -232,6 +232,42 @@ def test_a_batch_takes_nothing_of_another_model_for_done(
     assert status_of(job, source, out) == "check"
 
 
+@pytest.mark.parametrize(
+    ("noted", "there", "status"),
+    [
+        (("annotated.mcap", "review.rrd"), ("annotated.mcap", "review.rrd"), "complete"),
+        (("annotated.mcap", "review.rrd"), ("annotated.mcap",), "check"),  # a person removed it
+        (("annotated.mcap",), ("annotated.mcap", "review.rrd"), "check"),  # `annotate` was killed
+        ((), (), "check"),
+    ],
+)
+def test_a_batch_takes_no_run_without_its_outputs_for_done(
+    source: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    noted: tuple[str, ...],
+    there: tuple[str, ...],
+    status: str,
+) -> None:
+    """The manifest knows nothing of what happened to a folder since."""
+    (source.parent / "other.mcap").write_bytes(b"another")
+    out, job, run = tmp_path / "out", Job(Path(), Path()), planned(source)
+    (out / "lab").mkdir(parents=True)
+    write_run(out / "lab", {**run, "seconds": dict.fromkeys(noted, 1.5)})
+    for name in there:
+        (out / "lab" / name).write_bytes(b"something")
+    model = SimpleNamespace(model_id="m1")
+    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: model)
+    with plan_batch(job, [str(source.parent)], str(out)) as batch:
+        assert batch.manifest is not None
+        (task,) = (task for task in batch.tasks if task.name == "lab")
+        batch.manifest.record(
+            [Entry("lab", "lab.mcap", "complete", input=task.input, work=task.work)]
+        )
+
+    assert status_of(job, source, out) == status
+
+
 def test_a_full_disk_leaves_no_torn_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The half of a line that did fit is taken back; else the next line is glued to it."""
     path = tmp_path / "manifest.jsonl"

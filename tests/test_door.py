@@ -17,6 +17,7 @@ from urllib.parse import unquote
 import pytest
 from click.testing import Result
 
+from shapecat.runs.folder import read_run
 from tests.scenes import record
 from tests.test_executors import wait_for
 
@@ -250,6 +251,10 @@ def test_a_recording_that_was_moved_can_be_named(
     assert exported.exit_code == 0, exported.stderr
     assert shapecat("annotate", tmp_path / "lab", "--recording", lab).exit_code == 0
     assert shapecat("annotate", tmp_path / "lab").exit_code == 0  # it remembers
+    known, stat = read_run(tmp_path / "lab")["input"], lab.stat()
+    assert known["path"] == str(lab.resolve())
+    # A recording that is known by these is not read whole again by each command.
+    assert known["files"] == [["renamed.mcap", stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns]]
 
 
 def test_view_without_a_display_says_what_to_do(

@@ -75,6 +75,19 @@ def test_an_imu_without_stamps_is_read_at_its_log_times(tmp_path: Path) -> None:
     assert [None if up is None else up.tolist() for up in found] == [[0, -1, 0], None, [1, 0, 0]]
 
 
+def test_an_imu_that_is_logged_late_is_read_at_its_stamps(tmp_path: Path) -> None:
+    """Drivers send packets of measurements: the robot had turned by the time they were logged."""
+    items = [
+        ("/imu", EPOCH + (k + 7) * SECOND, imu(EPOCH + k * SECOND, a, "camera"))
+        for k, a in ((1, [0, -9.8, 0]), (8, [9.8, 0, 0]))
+    ]
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        upright = Upright.of(recording, up="imu", fixed_frame=None)
+        found = [upright.up(frame(EPOCH + k * SECOND)) for k in (1, 8, 15)]
+
+    assert [None if up is None else up.tolist() for up in found] == [[0, -1, 0], [1, 0, 0], None]
+
+
 @pytest.mark.parametrize(("up", "said"), [("imu", "no sensor_msgs/Imu"), ("tf", "no transforms")])
 def test_a_source_that_is_not_there_is_said(tmp_path: Path, up: str, said: str) -> None:
     path = write(tmp_path / "a.mcap", [("/x", 1, make("std_msgs/msg/String", "x"))])

@@ -35,6 +35,7 @@ from shapecat.outputs.exports_files import png, support_offset, upright_cloud
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.image_annotations import ImageBox, read_image_frames
 from shapecat.outputs.review_paths import Paths
+from shapecat.outputs.review_scenes import with_clouds
 from shapecat.outputs.scene_tree import _candidate, _described
 from shapecat.recordings.messages import Topic
 from shapecat.runs.label_meaning import TrackLabel, _slips
@@ -128,6 +129,35 @@ def test_images_of_two_cameras_with_the_same_stamp_are_both_annotated(
 
     assert [frame.stamp_ns for frame in frames] == [5, 5, 9]
     assert {frame.boxes for frame in frames} == {(ImageBox(6, "cup", 0.8, (3, 4, 7, 9)),)}
+
+
+# ---- the review: which scenes are drawn
+
+
+@pytest.mark.parametrize(("fixed_frame", "drawn"), [("map", [0, 3]), (None, [0, 1, 2, 3])])
+def test_a_camera_that_passes_by_moves_nothing_in_the_fixed_frame(
+    monkeypatch: pytest.MonkeyPatch, fixed_frame: str | None, drawn: list[int]
+) -> None:
+    """Drawn anew for every step of a robot, the review of a resting table is ten times as long."""
+    turn = Rotation.from_euler("zyx", [0.7, -0.4, 0.3]).as_matrix()
+    place = np.array([1.31, -0.24, 0.87])
+    frames = []
+    for k in range(4):
+        pose = Pose(turn, np.array([0.12 * k, 0.05, -0.03]))
+        moved = np.array([0.02 if k == 3 else 0.0, 0.0, 0.0])  # a hand moves it in the end
+        box = box_at(turn.T @ (place + moved - pose.translation), (0.12, 0.07, 0.19))
+        one = labelled_frame(k, labelled_object(6, box=box))
+        frames.append(replace(one, stamp_ns=100 * k * MS, fixed_from_sensor=pose))
+    monkeypatch.setattr(
+        "shapecat.outputs.review_scenes.with_colour",
+        lambda some, _recording, _run: ((one, object(), None) for one in some),
+    )
+    run: Any = {"fixed_frame": fixed_frame}
+    recording: Any = None
+    found = list(with_clouds(frames, recording, run))
+
+    assert [one.labelled.index for one in found] == [0, 1, 2, 3]
+    assert [one.labelled.index for one in found if one.frame is not None] == drawn
 
 
 # ---- the review: paths

@@ -9,6 +9,14 @@ from typing import Any
 import numpy as np
 import pytest
 from mcap.writer import CompressionType, IndexType, Writer
+from rosbags.interfaces import (
+    Qos,
+    QosDurability,
+    QosHistory,
+    QosLiveliness,
+    QosReliability,
+    QosTime,
+)
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as FolderWriter
@@ -371,6 +379,71 @@ def test_splits_that_overlap_are_merged(tmp_path: Path) -> None:
     write_mcap(tmp_path / "b_1.mcap", [30, 50, 70, 90])
 
     assert times_read(tmp_path) == [0, 20, 30, 40, 50, 60, 70, 90]
+
+
+QOS = Qos(
+    QosHistory.KEEP_LAST,
+    7,
+    QosReliability.BEST_EFFORT,
+    QosDurability.VOLATILE,
+    *(QosTime(2147483647, 4294967295),) * 2,
+    QosLiveliness.AUTOMATIC,
+    QosTime(2147483647, 4294967295),
+    avoid_ros_namespace_conventions=False,
+)
+
+
+def two_publishers(path: Path, container: str) -> Path:
+    """Write three and four messages on /a, which have a channel each, and two on /b."""
+    published = [("/a", "one", 3), ("/a", "two", 4), ("/b", "one", 2)]
+    if container == "mcap":
+        with path.open("wb") as file:
+            writer = Writer(file)
+            writer.start("ros2", "test")
+            schema = writer.register_schema(STRING, "ros2msg", b"string data")
+            for topic, who, count in published:
+                channel = writer.register_channel(topic, "cdr", schema, {"who": who})
+                for k in range(count):
+                    writer.add_message(channel, 10 + k, text("hello"), 10 + k)
+            writer.finish()
+    elif container == "ros1":
+        store = get_typestore(Stores.ROS1_NOETIC)
+        with BagWriter(path) as bag:
+            for topic, who, count in published:
+                link = bag.add_connection(topic, STRING, typestore=store, callerid=f"/{who}")
+                hello = store.serialize_ros1(store.types[STRING]("hello"), STRING)
+                for k in range(count):
+                    bag.write(link, 10 + k, hello)
+    else:
+        with FolderWriter(path, version=9, storage_plugin=StoragePlugin[container]) as folder:
+            for topic, who, count in published:
+                qos = [QOS] if who == "two" else []
+                end = folder.add_connection(
+                    topic, STRING, typestore=STORE, offered_qos_profiles=qos
+                )
+                for k in range(count):
+                    folder.write(end, 10 + k, text("hello"))
+    return path
+
+
+@pytest.mark.parametrize("container", ["mcap", "ros1", "MCAP", "SQLITE3"])
+def test_messages_of_all_publishers_of_a_topic_are_counted(tmp_path: Path, container: str) -> None:
+    """The topic with most messages may be chosen, and the count is that of the progress."""
+    suffix = {"mcap": ".mcap", "ros1": ".bag"}.get(container, "")
+    with open_recording(two_publishers(tmp_path / f"lab{suffix}", container)) as recording:
+        assert [(topic.name, topic.count) for topic in recording.topics] == [("/a", 7), ("/b", 2)]
+        assert [sum(1 for _ in recording.messages([name])) for name in ("/a", "/b")] == [7, 2]
+
+
+def test_a_split_that_lasts_longest_tells_the_end_whichever_began_last(tmp_path: Path) -> None:
+    """Of two recorders started one after the other, the first may have been stopped last."""
+    write_mcap(tmp_path / "b_0.mcap", [11, 40, 97])
+    write_mcap(tmp_path / "b_1.mcap", [23, 58])
+
+    with open_recording(tmp_path) as recording:
+        assert (recording.start_ns, recording.end_ns) == (11, 97)
+        assert [topic.count for topic in recording.topics] == [3, 2]
+    assert times_read(tmp_path) == [11, 23, 40, 58, 97]
 
 
 def test_missing_split_is_said(tmp_path: Path) -> None:

@@ -380,7 +380,10 @@ def test_a_batch_follows_its_own_dead_at_once(bucket: Path) -> None:
     first = claims.Claim("s3://lab/same/run", "one")
     second = claims.Claim("s3://lab/same/run", "one")
     assert (first.inherited, second.inherited) == (False, True)
+    first.release()  # it wakes up, but the claim is no longer its own
+    second.require()
     second.release()
+    assert files("s3://lab/same") == set()
     assert bucket.exists()
 
 

@@ -208,6 +208,33 @@ def test_tracks_stay_where_their_objects_stand(run: Path) -> None:
         assert_allclose(np.sort(row["size_full"]), SIZE + 0.01, atol=0.03)
 
 
+def test_a_cut_view_says_little_of_the_whole_box(tmp_path: Path) -> None:
+    """Four views in which the image cuts an object weigh as much as one of the two whole ones."""
+    cut = (True, False, True, True, False, True)
+    heights = [0.11 if one else 0.21 for one in cut]
+    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
+        for k in range(FRAMES):
+            up = TURNS[k].inv().apply(UP)
+            found = [seen(k, item) for item in range(3)]
+            first, whole = found[1].candidate, found[1].full
+            assert whole is not None
+            found[1] = replace(
+                found[1],
+                candidate=replace(first, occluded=cut[k]),
+                full=replace(whole, size=np.array([*whole.size[:2], heights[k]])),
+            )
+            scene = Scene(up, (Plane(up, -0.5, OUTLINE, 0.7, 0.0),), ())
+            stamp = EPOCH + k * SECOND // 10
+            perception = Perception("/depth", k, stamp, "cam", scene, tuple(found), {})
+            pose = Pose(TURNS[k].as_matrix(), PLACES[k])
+            tables.write([perception], [FrameRow(stamp, pose, up)])
+    track_run(tmp_path, TrackingSettings(), CATEGORIES)
+
+    for row in rows(tmp_path, "tracks"):
+        height = 0.21 if row["detection"] == 1 else SIZE[2] + 0.01
+        assert row["size_full"][2] == pytest.approx(height, abs=1e-5)
+
+
 def test_causal_posteriors_know_their_own_view_and_none_after_it(run: Path) -> None:
     """Row k is the geometric mean of views 0 to k; of those that are cut a quarter counts."""
     for item in range(3):
