@@ -183,7 +183,6 @@ def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, ridge: float, steps
     target[rows, truth[rows] - first] = 1.0
     offset = np.logaddexp.reduce(old, axis=1, keepdims=True)
     own_old = np.where(truth < first, old[np.arange(views), np.minimum(truth, first - 1)], 0.0)
-    by_word = inputs.words.T.tocsr()
 
     def loss(flat: F8) -> tuple[float, F8]:
         """Return the loss of the flattened weights, and its gradient."""
@@ -193,7 +192,7 @@ def _fit_new(inputs: _Inputs, old: F8, truth: I4, start: F8, ridge: float, steps
         own = np.where(truth < first, own_old, (new * target).sum(axis=1))
         residual = share[:, None] * (np.exp(new - total[:, None]) - target)
         own_slope = np.einsum("nf,nc->cf", inputs.features, residual).T
-        slope = np.concatenate([own_slope, by_word @ residual, residual.sum(axis=0)[None]])
+        slope = np.concatenate([own_slope, inputs.words.T @ residual, residual.sum(axis=0)[None]])
         slope[:-1] += ridge * weights[:-1]
         value = float(share @ (total - own)) + 0.5 * ridge * float((weights[:-1] ** 2).sum())
         return value, slope.reshape(-1)
