@@ -16,7 +16,7 @@ from shapecat.learning.boosting import Bins, Tree, TreeSettings, grow_tree, make
 from shapecat.learning.calibration import softmax
 from shapecat.learning.forest import FlatForest
 from shapecat.learning.pnn import known_labels
-from shapecat.learning.words import TreeDictionary
+from shapecat.learning.tree_dictionary import TreeDictionary
 
 __all__ = ["BoostedDictionary"]
 

@@ -14,7 +14,7 @@ from shapecat.arrays import F8, I4
 from shapecat.learning.calibration import softmax
 from shapecat.learning.forest import flatten
 from shapecat.learning.pnn import known_labels
-from shapecat.learning.words import TreeDictionary
+from shapecat.learning.tree_dictionary import TreeDictionary
 
 __all__ = ["ForestDictionary", "WordLearner"]
 
