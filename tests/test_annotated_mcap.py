@@ -23,6 +23,7 @@ from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Writer as BagWriter
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as FolderWriter
+from rosbags.rosbag2.metadata import parse_qos
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from shapecat.errors import OutputError
@@ -32,6 +33,7 @@ from shapecat.outputs.mcap_append import Appender
 from shapecat.recordings import open_recording
 from shapecat.recordings.mcap_records import ChunkError, read_chunk_index, write_chunk_index
 from shapecat.types import CATEGORIES, ShownBox, ShownFrame
+from tests.test_recordings import QOS
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE1 = get_typestore(Stores.ROS1_NOETIC)
@@ -120,6 +122,12 @@ def test_every_original_message_stays_byte_for_byte(
 
     assert not digest(source) - digest(target)
     assert digest(target).total() == 9 + 3 * 3
+    with target.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    # Who recorded without zstd may have no reader for it.
+    name = compression.name.lower().replace("none", "")
+    assert {chunk.compression for chunk in summary.chunk_indexes} == {name}
     with open_recording(source) as recording:
         end = recording.summary.data_end  # type: ignore[attr-defined]  # it is an MCAP file
     assert target.read_bytes()[:end] == source.read_bytes()[:end]
@@ -313,12 +321,20 @@ def test_what_lies_beside_the_messages_of_any_part_is_kept(tmp_path: Path) -> No
 def test_ros2_folder_keeps_its_bytes(tmp_path: Path, plugin: StoragePlugin) -> None:
     source, target = tmp_path / "bag", tmp_path / "out.mcap"
     with FolderWriter(source, version=9, storage_plugin=plugin) as writer:
-        connection = writer.add_connection("/points", STRING, typestore=STORE)
+        connection = writer.add_connection(
+            "/points", STRING, typestore=STORE, offered_qos_profiles=[QOS]
+        )
         for k in range(5):
             writer.write(connection, EPOCH + k, string(f"message {k}"))
 
     annotate(source, target)
 
+    with target.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    (channel,) = (one for one in summary.channels.values() if one.topic == "/points")
+    # Without it, who plays the file publishes what no subscriber gets.
+    assert parse_qos(channel.metadata["offered_qos_profiles"]) == [QOS]
     with AnyReader([target]) as reader:
         chosen = [c for c in reader.connections if c.topic == "/points"]
         read = [bytes(data) for _, _, data in reader.messages(chosen)]

@@ -22,6 +22,7 @@ from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.identity import file_stats, unchanged, work_id
 from shapecat.runs.jobs import Job, describe_run, has_work, resume, same_options
 from shapecat.runs.run_info import RunInfo
+from shapecat.system.files import partial_path
 
 MODEL: Any = SimpleNamespace(model_id="m1", categories=("cup", "can"))
 
@@ -256,6 +257,7 @@ def test_a_batch_takes_no_run_without_its_outputs_for_done(
     write_run(out / "lab", {**run, "seconds": dict.fromkeys(noted, 1.5)})
     for name in there:
         (out / "lab" / name).write_bytes(b"something")
+    partial_path(out / "lab").mkdir()  # a kill may leave it, which is no reason to begin anew
     model = SimpleNamespace(model_id="m1")
     monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: model)
     with plan_batch(job, [str(source.parent)], str(out)) as batch:

@@ -60,6 +60,9 @@ def test_annotations_have_the_boxes_asked_for(
     keys = sorted(found)
     assert np.allclose([found[k] for k in keys], [expected[k] for k in keys], atol=1e-6)
     assert not np.allclose([found[k] for k in keys], [other[k] for k in keys], atol=1e-3)
+    if options == ("--boxes", "visible"):  # once more, for the sake of a label: boxes stay
+        assert shapecat("annotate", folder).exit_code == 0
+        assert annotated(folder) == found
 
 
 @pytest.mark.parametrize("options", [(), ("--boxes", "visible")])

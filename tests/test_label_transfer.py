@@ -229,6 +229,18 @@ def test_labels_find_the_tracks_that_were_in_the_same_places(tmp_path: Path) -> 
     assert read_track_table(target / "tracks.original.csv").rows[0].label == ""
 
 
+def test_frames_of_one_recording_are_not_compared_in_two_coordinate_frames(tmp_path: Path) -> None:
+    """A cup in the one frame may be where a bowl is in the other, at every moment."""
+    source = make_run(
+        tmp_path / "source", {1: still(CUP), 2: still(CAN)}, labels={1: "mug"}, fixed_frame="odom"
+    )
+    target = make_run(tmp_path / "target", {1: still(CAN), 2: still(CUP)})
+
+    with pytest.raises(OutputError, match="fixed frames differ"):
+        transfer_labels(source, target)
+    assert set(labels_of(target).values()) == {""}
+
+
 def test_time_tells_apart_what_changed_places(tmp_path: Path) -> None:
     """Two objects swap places halfway: their medians are the same, their times are not."""
     half = FRAMES_EACH // 2

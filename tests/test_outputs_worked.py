@@ -35,7 +35,7 @@ from shapecat.outputs.exports_files import png, support_offset, upright_cloud
 from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.image_annotations import ImageBox, read_image_frames
 from shapecat.outputs.review_paths import Paths
-from shapecat.outputs.review_scenes import with_clouds
+from shapecat.outputs.review_scenes import choose_scenes, with_clouds
 from shapecat.outputs.scene_tree import _candidate, _described
 from shapecat.recordings.messages import Topic
 from shapecat.runs.label_meaning import TrackLabel, _slips
@@ -158,6 +158,24 @@ def test_a_camera_that_passes_by_moves_nothing_in_the_fixed_frame(
 
     assert [one.labelled.index for one in found] == [0, 1, 2, 3]
     assert [one.labelled.index for one in found if one.frame is not None] == drawn
+
+
+def test_a_scene_is_drawn_if_a_whole_object_moves_or_the_clock_goes_back() -> None:
+    """What is seen of an object that rests changes from frame to frame."""
+    rests = box_at((0.31, -0.24, 1.17), (0.12, 0.07, 0.19))
+    seen = [(0, 0.0, 0.0), (100, 0.03, 0.0), (200, 0.03, 0.02), (150, 0.03, 0.02), (220, 0.0, 0.02)]
+    frames = []
+    for k, (time, visible, whole) in enumerate(seen):
+        box, full = (
+            replace(rests, center=rests.center + np.array([x, 0, 0])) for x in (visible, whole)
+        )
+        one = labelled_frame(k, labelled_object(6, box=box, full=full))
+        frames.append(replace(one, stamp_ns=time * MS))
+
+    assert [drawn for _, drawn in choose_scenes(frames, fixed=False)] == [
+        *(True, False),
+        *(True, True, False),  # the fourth is earlier than the third, the last one soon after it
+    ]
 
 
 # ---- the review: paths

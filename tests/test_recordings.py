@@ -433,6 +433,7 @@ def test_messages_of_all_publishers_of_a_topic_are_counted(tmp_path: Path, conta
     with open_recording(two_publishers(tmp_path / f"lab{suffix}", container)) as recording:
         assert [(topic.name, topic.count) for topic in recording.topics] == [("/a", 7), ("/b", 2)]
         assert [sum(1 for _ in recording.messages([name])) for name in ("/a", "/b")] == [7, 2]
+        assert (recording.start_ns, recording.end_ns) == (10, 13)
 
 
 def test_a_split_that_lasts_longest_tells_the_end_whichever_began_last(tmp_path: Path) -> None:

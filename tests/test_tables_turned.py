@@ -235,6 +235,31 @@ def test_a_cut_view_says_little_of_the_whole_box(tmp_path: Path) -> None:
         assert row["size_full"][2] == pytest.approx(height, abs=1e-5)
 
 
+@pytest.mark.parametrize("posed", [3, 4])
+def test_a_pose_that_is_missing_in_half_of_the_frames_is_not_used(
+    tmp_path: Path, posed: int
+) -> None:
+    """Detections without a pose would be lost; with few of them, they are."""
+    own = np.array([0.31, -0.12, 0.94])
+    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
+        for k in range(FRAMES):
+            one = seen(0, 1)
+            box = replace(one.candidate.box, center=own)
+            one = replace(one, candidate=replace(one.candidate, box=box))
+            pose = Pose(TURNS[0].as_matrix(), PLACES[0]) if k < posed else None
+            scene = Scene(UP, (Plane(UP, -0.5, OUTLINE, 0.7, 0.0),), ())
+            stamp = EPOCH + k * SECOND // 10
+            perception = Perception("/depth", k, stamp, "cam", scene, (one,), {})
+            tables.write([perception], [FrameRow(stamp, pose, UP)])
+    track_run(tmp_path, TrackingSettings(), CATEGORIES)
+
+    place, count = (TURNS[0].apply(own) + PLACES[0], 4) if posed == 4 else (own, FRAMES)
+    tracks = [row for row in rows(tmp_path, "tracks") if row["detection"] is not None]
+    assert [row["frame"] for row in tracks] == list(range(count))
+    assert_allclose([row["center_fixed"] for row in tracks], [place] * count, atol=1e-5)
+    assert [row["frames"] for row in lines(tmp_path)] == [str(count)]
+
+
 def test_causal_posteriors_know_their_own_view_and_none_after_it(run: Path) -> None:
     """Row k is the geometric mean of views 0 to k; of those that are cut a quarter counts."""
     for item in range(3):
