@@ -90,7 +90,8 @@ def _exit_code(process: BaseProcess, seconds: float) -> int | None:
 
 def _trace(test: Path, answer: Connection) -> None:
     os.setpgrp()
-    coverage = Coverage(data_file=None, config_file=False, source=[str(ROOT / "shapecat")])
+    source = [str(ROOT / "shapecat"), str(ROOT / "cli")]
+    coverage = Coverage(data_file=None, config_file=False, source=source)
     with coverage.collect():
         ended = _tested([test], _Contexts(coverage))
     data = coverage.get_data()
@@ -103,15 +104,16 @@ def _judge(mutant: Mutant, tests: Sequence[Path], first: set[str]) -> None:
     os.setpgrp()
     tree = flipped(mutant.file.read_text("utf-8"), mutant.flip)
     code = compile(ast.fix_missing_locations(tree), str(mutant.file), "exec")
-    sys.meta_path.insert(0, _Mutated(mutant.module, mutant.file, code))
-    os._exit(_tested(tests, _Order(first)))
+    finder = _Mutated(mutant.module, mutant.file, code)
+    sys.meta_path.insert(0, finder)
+    os._exit(_tested(tests, _Order(first), finder))
 
 
-def _tested(tests: Sequence[Path], plugin: object) -> int:
+def _tested(tests: Sequence[Path], *plugins: object) -> int:
     options = ["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "-m", "not many",
                "-W", "ignore::pytest.PytestAssertRewriteWarning"]  # fmt: skip
     with Path(os.devnull).open("w") as nowhere, redirect_stdout(nowhere), redirect_stderr(nowhere):
-        return int(pytest.main([*options, *map(str, tests)], plugins=[plugin]))
+        return int(pytest.main([*options, *map(str, tests)], plugins=plugins))
 
 
 class _Contexts:
@@ -140,6 +142,10 @@ class _Mutated(importlib.abc.MetaPathFinder, importlib.abc.Loader):
 
     def __init__(self, name: str, file: Path, code: CodeType) -> None:
         self.name, self.file, self.code = name, file, code
+
+    def pytest_sessionstart(self) -> None:
+        """Stand before pytest's own finder, which loads a module whose examples are run."""
+        sys.meta_path.insert(0, self)
 
     def find_spec(
         self, name: str, _path: object, _target: object = None
