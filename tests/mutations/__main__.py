@@ -27,8 +27,8 @@ from tests.mutations.flips import flips_of
 LIBRARIES = ("numba", "scipy.spatial.transform", "pyarrow.parquet", "rosbags.typesys",
              "mcap.reader", "mcap_ros2.decoder", "click.testing", "scipy.optimize")  # fmt: skip
 """Loaded once, before processes are forked."""
-ROOMS = ("batch", "cameras", "colour", "executors", "outputs", "recordings", "runs", "system",
-         "tracking")  # fmt: skip
+ROOMS = ("batch", "cameras", "cli", "colour", "evaluation", "executors", "outputs", "recordings",
+         "runs", "system", "tracking")  # fmt: skip
 KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.batch": ("test_done",),
     "shapecat.batch.ledger": ("test_done", "test_batch"),
@@ -37,7 +37,23 @@ KNOWN_BY: dict[str, Sequence[str]] = {
     "shapecat.batch.remote": ("test_remote",),
     "shapecat.batch.storage": ("test_remote",),
     "shapecat.cameras": ("test_cameras", "test_colour", "test_recordings_colour"),
+    "shapecat.cli": ("test_commands_worked", "test_door", "test_pipeline", "test_exports_readback",
+                     "test_full_boxes_door"),
+    "shapecat.cli.compare": ("test_compare",),
+    "shapecat.cli.evaluate": ("test_evaluation", "test_door"),
+    "shapecat.cli.process": ("test_commands_worked", "test_door", "test_pipeline", "test_batch",
+                             "test_colour_outputs"),
+    "shapecat.cli.progress": ("test_commands_worked", "test_door", "test_batch"),
+    "shapecat.cli.report": ("test_report", "test_report_serve"),
     "shapecat.colour": ("test_colour", "test_colour_outputs", "test_exports_images"),
+    "shapecat.evaluation": ("test_evaluation", "test_evaluation_dataset",
+                            "test_learning_studies"),
+    "shapecat.evaluation.comparing": ("test_compare",),
+    "shapecat.evaluation.comparison": ("test_compare",),
+    "shapecat.evaluation.identities": ("test_identities", "test_compare"),
+    "shapecat.evaluation.labellings": ("test_compare",),
+    "shapecat.evaluation.overlap": ("test_compare", "test_identities"),
+    "shapecat.evaluation.references": ("test_compare",),
     "shapecat.executors": ("test_executors",),
     "shapecat.outputs": ("test_outputs_worked", "test_annotations_turned",
                          "test_annotated_mcap", "test_exports_worked"),
@@ -89,19 +105,25 @@ SLOW = (
     "shapecat.batch.remote",
     "shapecat.batch.runs",
     "shapecat.batch.storage",
+    "shapecat.cli",
+    "shapecat.evaluation",
     "shapecat.executors",
     "shapecat.outputs.report",
     "shapecat.outputs.review",
     "shapecat.runs.perceiving",
     "shapecat.runs.second_look",
 )
-"""Judged by tests with a browser, a viewer, object storage or whole recordings: not `quick`."""
+"""Judged by browsers, viewers, object storage, whole recordings or commands: not `quick`."""
 
 
 def modules(only: str) -> dict[str, Path]:
     """Return the modules without kernels whose name contains a text, by name."""
-    files = (f for room in ROOMS for f in (ROOT / "shapecat" / room).rglob("*.py"))
-    named = {".".join(f.relative_to(ROOT).with_suffix("").parts): f for f in files}
+    folders = {room: ROOT / "shapecat" / room for room in ROOMS} | {"cli": ROOT / "cli"}
+    named = {
+        ".".join(("shapecat", room, *file.relative_to(folder).with_suffix("").parts)): file
+        for room, folder in folders.items()
+        for file in folder.rglob("*.py")
+    }
     return {
         name: file
         for name, file in named.items()
