@@ -3,9 +3,11 @@
 import json
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -14,6 +16,7 @@ from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn import metrics as reference
+from sklearn.ensemble import RandomForestClassifier
 
 from shapecat.arrays import F4
 from shapecat.errors import ModelError, RecordingError
@@ -447,7 +450,23 @@ def test_the_command_writes_the_page(trained: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def compared(trained: Path, tmp_path_factory: pytest.TempPathFactory) -> Report:
+def few_trees() -> Iterator[None]:
+    """Grow a tenth of the trees of the forests beside the chain: their accuracy is no question."""
+
+    def grow(trees: int, **options: Any) -> RandomForestClassifier:
+        return RandomForestClassifier(trees // 10, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("shapecat.learning.baselines.RandomForestClassifier", grow)
+        yield
+
+
+@pytest.fixture(scope="module")
+def compared(
+    trained: Path,
+    few_trees: None,  # noqa: ARG001  in force while it compares
+    tmp_path_factory: pytest.TempPathFactory,
+) -> Report:
     folder = tmp_path_factory.mktemp("compared")
     dataset = write_dataset(folder / "data", ("box", "ball", "unknown"), instances=3, seed=9)
     return evaluate_folder(dataset, trained, baselines=dataset)
@@ -468,6 +487,7 @@ def test_plain_learners_are_judged_beside_the_chain(compared: Report, tmp_path: 
     assert "| forest on D2 | 12 |" in (tmp_path / "page.md").read_text("utf-8")
 
 
+@pytest.mark.usefixtures("few_trees")
 def test_learners_may_have_a_training_set_of_their_own(trained: Path, tmp_path: Path) -> None:
     """It may hold other categories in another order: each learner's columns are its own."""
     train = write_dataset(tmp_path / "train", ("ball", "box", "plate"), instances=3, seed=3)
