@@ -45,10 +45,7 @@ def run(guessed_run: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def long_run(run: Path) -> Path:
-    """Return a run of `TRACKS` tracks, copies of those that were found; its recording is gone.
-
-    A page is served sooner without pictures of the recording.
-    """
+    """Return a run of `TRACKS` tracks, copies of those that were found; its recording is gone."""
     with (run / "tracks.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     tracks = pq.read_table(run / "tracks.parquet")
@@ -65,6 +62,11 @@ def long_run(run: Path) -> Path:
         writer.writeheader()
         writer.writerows(many)
     pq.write_table(pa.concat_tables(tables), run / "tracks.parquet")
+    return without_recording(run)
+
+
+def without_recording(run: Path) -> Path:
+    """Let a run forget its recording: a page is served sooner without pictures of it."""
     about = json.loads((run / "run.json").read_text())
     about["input"]["path"] = str(run / "gone.mcap")
     (run / "run.json").write_text(json.dumps(about))
@@ -410,7 +412,7 @@ def test_an_interrupt_ends_it_with_the_corrections_in_the_page(
     served: Callable[..., Server], run: Path
 ) -> None:
     """The page that is mailed afterwards shows what was corrected."""
-    server = served(run.parent)
+    server = served(without_recording(run).parent)
     assert urlsplit(server.address).path.endswith("/index.html")
     page = server.address.replace("index.html", "table/report.html")
     assert ask(page, "GET")[0] == 200
