@@ -29,7 +29,7 @@ from tests.test_executors import alive, wait_for
 Run = Callable[..., Result]
 TABLES = ("frames", "detections", "planes", "tracks")
 NAMES = ("bag", "folder", "log")
-FRAMES = 24
+FRAMES = 16
 QUIET: Any = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
 
 
@@ -244,6 +244,7 @@ def drain(batch: Batch, executor: Executor, watcher: Watcher) -> list[Outcome]:
     return list(process_on(executor, batch.tasks, watcher, manifest=batch.manifest))
 
 
+@pytest.mark.many
 def test_killed_local_worker_is_replaced(
     recordings: Path, one_by_one: Path, tmp_path: Path
 ) -> None:
