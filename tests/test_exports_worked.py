@@ -1,6 +1,7 @@
 """Exports of one turned box that is worked out by hand, read as each format is described."""
 
 import json
+import re
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,15 +13,17 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from shapecat.cameras.colour import ColourImage, ColourView, LensCamera
 from shapecat.colour.masks import Mask
 from shapecat.evaluation.clouds import read_pcd
 from shapecat.geometry import IDENTITY
+from shapecat.outputs.colouring import Coloured
 from shapecat.outputs.dataset_frames import DatasetImage
 from shapecat.outputs.exports_coco import write_coco, write_yolo
 from shapecat.outputs.exports_crops import write_crops
 from shapecat.outputs.exports_kitti import rectified_from_sensor, write_kitti
 from shapecat.outputs.exports_labelcloud import _described, write_labelcloud
-from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas
+from shapecat.types import Box, Camera, Frame, LabelledFrame, LabelledObject, NeuralGas, Pose
 
 CAMERA = Camera(160, 120, 143.0, 139.0, 77.4, 61.9)
 PITCH, ROLL = np.radians(34.0), np.radians(6.0)
@@ -109,6 +112,37 @@ def test_kitti_calibration_leads_from_points_to_pixels(tmp_path: Path) -> None:
     level = LEVEL_FROM_SENSOR.apply(own)  # x right, y down, z forward
     assert_allclose(velo[:, :3], level[:, [2, 0, 1]] * [1, -1, -1], atol=1e-5)
     assert (points[:, 3] == 0).all()
+
+
+def test_kitti_calibration_leads_to_the_pixels_of_a_colour_camera_beside_it(tmp_path: Path) -> None:
+    """Its pose is in P2, and its pixels are those of the 2D box."""
+    camera = Camera(200, 150, 171.0, 166.0, 103.2, 71.5)
+    pose = Pose(
+        Rotation.from_euler("xyz", [0.05, -0.08, 0.03]).as_matrix(), np.array([0.06, -0.02, 0.01])
+    )
+    data = np.zeros((150, 200, 3), np.uint8).tobytes()
+    image = ColourImage("/color", 5, 6, "color", "rgb8", 200, 150, 600, data)
+    view = ColourView(image, LensCamera(camera), pose)
+    seen: Any = [(labelled(cut=False, hidden=False), frame(), Coloured(view, ()))]
+    unused: Any = SimpleNamespace()
+    assert write_kitti(tmp_path, seen, unused) == 1
+
+    x, y, z = (frame().xyz() @ pose.rotation.T + pose.translation).T
+    u, v = 171.0 * x / z + 103.2, 166.0 * y / z + 71.5
+    text = (tmp_path / "calib" / "000000.txt").read_text()
+    projection, mount = (
+        np.array(list(map(float, re.findall(rf"{name}: (.*)", text)[0].split()))).reshape(3, 4)
+        for name in ("P2", "Tr_velo_to_cam")
+    )
+    points = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
+    points[:, 3] = 1
+    pixels = projection @ np.vstack([mount @ points.T, np.ones(len(points))])
+    assert_allclose(pixels[:2] / pixels[2], [u, v], atol=2e-3)
+    of_object = [row * CAMERA.width + column for column, row in PIXELS]
+    box = [float(word) for word in (tmp_path / "label_2" / "000000.txt").read_text().split()[4:8]]
+    low, high = ([f(at[of_object]) for at in (u, v)] for f in (np.min, np.max))
+    assert box == np.rint([*low, *high]).tolist()
+    assert (tmp_path / "image_2" / "000000.png").exists()
 
 
 def labelcloud(folder: Path) -> None:

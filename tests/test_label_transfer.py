@@ -444,6 +444,21 @@ def test_what_was_moved_is_told_not_guessed(tmp_path: Path) -> None:
     assert labels_of(target) == {1: ""}
 
 
+@pytest.mark.parametrize(("size", "moved"), [(0.08, True), (0.31, False)])
+def test_a_large_object_may_scatter_more_than_a_small_one(
+    tmp_path: Path, size: float, *, moved: bool
+) -> None:
+    """Seen from another side, the middle of what is visible of a box is another one."""
+    path = [shifted(CUP, x=0.025 * k) for k in range(FRAMES_EACH)]  # half of it within 6 cm
+    source = make_run(tmp_path / "source", {1: path}, labels={1: "mug"}, size=size)
+    target = second(tmp_path / "target", {1: still(shifted(CUP, x=0.11))}, size=size)
+
+    transfer = transfer_labels(source, target)
+
+    assert labels_of(target) == {1: "" if moved else "mug"}
+    assert ["moved" in one.reason for one in transfer.missed] == [True] * moved
+
+
 def test_two_candidates_are_told_not_guessed(tmp_path: Path) -> None:
     """They stand around the old place, equally near."""
     source = make_run(tmp_path / "source", {1: still(CUP)}, labels={1: "mug"})

@@ -208,6 +208,29 @@ def test_tracks_stay_where_their_objects_stand(run: Path) -> None:
         assert_allclose(np.sort(row["size_full"]), SIZE + 0.01, atol=0.03)
 
 
+def test_frames_of_two_sensors_with_the_same_numbers_are_not_exchanged(tmp_path: Path) -> None:
+    """Each box is shown in the frame of the sensor that saw it."""
+    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m") as tables:
+        for k in range(FRAMES):
+            up = TURNS[k].inv().apply(UP)
+            scene = Scene(up, (Plane(up, -0.5, OUTLINE, 0.7, 0.0),), ())
+            found = tuple(seen(k, item) for item in range(3))
+            stamp, topic = EPOCH + k * SECOND // 10, "/right" if k % 2 else "/left"
+            perception = Perception(topic, k // 2, stamp, topic, scene, found, {})
+            pose = Pose(TURNS[k].as_matrix(), PLACES[k])
+            tables.write([perception], [FrameRow(stamp, pose, up)])
+    track_run(tmp_path, TrackingSettings(), CATEGORIES)
+
+    tracks = rows(tmp_path, "tracks")
+    assert len(tracks) == 3 * FRAMES
+    for row in tracks:
+        k, item = 2 * row["frame"] + (row["topic"] == "/right"), row["detection"]
+        assert row["stamp_ns"] == EPOCH + k * SECOND // 10
+        assert_allclose(row["center_fixed"], CENTERS[item], atol=1e-5)
+        own = TURNS[k].inv().apply(CENTERS[item] - PLACES[k])
+        assert_allclose(row["center_full"], own, atol=0.02)
+
+
 def test_a_cut_view_says_little_of_the_whole_box(tmp_path: Path) -> None:
     """Four views in which the image cuts an object weigh as much as one of the two whole ones."""
     cut = (True, False, True, True, False, True)
