@@ -169,6 +169,17 @@ def test_the_first_frame_waits_for_no_library_it_does_not_need() -> None:
     assert loaded_by("import shapecat.batch, shapecat.recordings.decoding", late) == set()
 
 
+def test_commands_do_without_pandas() -> None:
+    """Arrow loads it with its first array, which takes half a second."""
+    code = (
+        "import types, pyarrow, shapecat.__main__ as entry;"
+        "command = types.SimpleNamespace(main=lambda **_: pyarrow.array([1]));"
+        "entry.import_module = lambda _: command; entry.run()"
+    )
+
+    assert loaded_by(code, {"pandas"}) == set()
+
+
 def test_root_of_the_package_holds_what_everybody_uses() -> None:
     """A file of one room that lies in the root hides which room it is of."""
     assert len(list((ROOT / "shapecat").glob("*.py"))) <= 12

@@ -93,6 +93,18 @@ def test_results_errors_and_deaths_reach_their_own_futures(executor: Executor) -
         assert "SIGKILL" in str(error)
 
 
+def loads_pandas() -> bool:
+    import pyarrow as pa  # noqa: PLC0415  in a worker
+
+    pa.array([1])
+    return "pandas" in sys.modules
+
+
+def test_workers_do_without_pandas(executor: Executor) -> None:
+    """Arrow loads it with its first array, which takes half a second in each worker."""
+    assert not executor.submit(loads_pandas).result()
+
+
 def test_what_cannot_be_sent_fails_alone(executor: Executor) -> None:
     assert executor.submit(lambda: 1).exception() is not None
     assert executor.submit(abs, -1).result() == 1
