@@ -19,11 +19,12 @@ from shapecat.system.garbage import collect_seldom
 from tests.browser import Browser
 
 LONGEST = (
-    *("test_batch", "test_docs_run", "test_report_serve", "test_stopping", "test_remote"),
-    *("test_odd", "test_pipeline", "test_simulation_worlds", "test_detection_stacks"),
-    *("test_packaging", "test_loop", "test_crash", "test_review", "test_report"),
-    *("test_evaluation", "test_learning_default_model", "test_learning", "test_second_look"),
-    *("test_api", "test_simulation_physics", "test_detection", "test_tracking_scenes"),
+    *("test_report_serve", "test_docs_run", "test_stopping", "test_batch", "test_report"),
+    *("test_simulation_worlds", "test_remote", "test_odd", "test_detection_stacks"),
+    *("test_learning_default_model", "test_packaging", "test_pipeline", "test_crash"),
+    *("test_simulation_physics", "test_executors", "test_review", "test_loop", "test_detection"),
+    *("test_api", "test_architecture", "test_tracking_scenes", "test_second_look"),
+    *("test_learning", "test_exports_images", "test_detection_shelf", "test_door"),
 )
 """Files of tests by the seconds that they take, longest first."""
 SHARED = Path(__file__).parents[2] / "shared" / "data"
