@@ -5,7 +5,7 @@ from importlib import import_module
 from typing import Any
 
 from shapecat.system.garbage import collect_seldom
-from shapecat.system.libraries import leave_out_pandas
+from shapecat.system.libraries import block_pandas
 from shapecat.system.stopping import leave
 
 
@@ -13,7 +13,7 @@ def run() -> None:
     """Run the command line. A signal that arrives before it handles signals ends the process."""
     _handle(leave)
     collect_seldom()
-    leave_out_pandas()
+    block_pandas()
     try:
         # By name: type checkers see this package as the top-level folder cli.
         import_module("shapecat.cli.main").main(prog_name="shapecat")

@@ -451,7 +451,7 @@ def test_the_command_writes_the_page(trained: Path, tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def few_trees() -> Iterator[None]:
-    """Grow a tenth of the trees of the forests beside the chain: their accuracy is no question."""
+    """Grow a tenth of the trees of the forests beside the chain: their accuracy does not matter."""
 
     def grow(trees: int, **options: Any) -> RandomForestClassifier:
         return RandomForestClassifier(trees // 10, **options)

@@ -51,7 +51,8 @@ class RenderedView(NamedTuple):
 def render_view(seen: Geometry, arrangement: Arrangement, rng: np.random.Generator) -> RenderedView:
     """Take an image of an arrangement with a random sensor from a random viewpoint.
 
-    ``seen`` holds the meshes of the arrangement: its objects first, then its furniture.
+    ``seen`` holds the meshes of the arrangement, metres, table frame: first its objects,
+    then its furniture.
     """
     name, sensor = _draw_sensor(rng)
     camera, pose = sensor.camera, _viewpoint(arrangement, sensor, rng)

@@ -4,23 +4,26 @@ import sys
 from importlib.abc import MetaPathFinder
 from typing import Any
 
-__all__ = ["leave_out_pandas"]
+__all__ = ["block_pandas"]
 
 
-class _Absent(MetaPathFinder):
-    """Finds no pandas, even if it is installed."""
+class _PandasBlocker(MetaPathFinder):
+    """Raises for pandas, even if it is installed.
+
+    None in `sys.modules` would do the same, but scikit-learn looks for a module there.
+    """
 
     def find_spec(self, fullname: str, *_: Any) -> None:
-        """Say of pandas that it is missing; leave other modules to other finders."""
+        """Raise ModuleNotFoundError for pandas; leave other modules to other finders."""
         if fullname == "pandas":
             msg = "this process does without pandas"
             raise ModuleNotFoundError(msg, name=fullname)
 
 
-def leave_out_pandas() -> None:
-    """Let this process import no pandas; call it in processes that run nothing but shapecat.
+def block_pandas() -> None:
+    """Keep this process from importing pandas; for processes that run nothing but shapecat.
 
     With its first array, Arrow loads pandas where it is installed, in order to recognise data
     frames. That takes 0.4 s in each process, and no command has any.
     """
-    sys.meta_path.insert(0, _Absent())
+    sys.meta_path.insert(0, _PandasBlocker())
