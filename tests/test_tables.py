@@ -11,6 +11,7 @@ from numpy.testing import assert_allclose
 
 from shapecat.config import Settings
 from shapecat.errors import OutputError
+from shapecat.runs import shown
 from shapecat.runs.folder import read_run
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
@@ -21,8 +22,10 @@ from shapecat.runs.tables import (
     DETECTIONS,
     FRAMES,
     PLANES,
+    TRACKS,
     lists,
     read_row_groups,
+    write_table,
 )
 from shapecat.types import Box, Candidate, Detection, NeuralGas, Perception, Plane, Pose, Scene
 from tests.track_tables import write_tracks
@@ -143,11 +146,33 @@ def test_what_has_ended_is_told_in_the_next_frame_of_the_same_sensor(tmp_path: P
         for k, name in enumerate(names):
             tables.write([replace(perception(10 * k, 1), topic=name)], [FrameRow(2000 + k, None)])
 
-    assert _next_of_topic(tmp_path) == {
-        ("/a", 0): ("/a", 30),
-        ("/b", 10): ("/b", 20),
-        ("/b", 20): ("/b", 40),
-    }
+    wanted = {("/a", 0), ("/a", 30), ("/b", 20)}
+    assert _next_of_topic(tmp_path, wanted) == {("/a", 0): ("/a", 30), ("/b", 20): ("/b", 40)}
+
+
+def test_each_detection_keeps_its_track_when_rows_are_read_a_few_at_a_time(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Tracks are written one after the other and shown frame by frame; some boxes are unknown."""
+    monkeypatch.setattr(shown, "_ROWS", 2)
+    write_run_tables(tmp_path, [2, 2, 1])
+    rows = [(5, 0, 1), (5, 1, 0), (5, 2, None), (6, 0, 0), (6, 2, 0), (7, 1, 1)]
+    write_tracks(tmp_path, rows)
+    table = pq.read_table(tmp_path / "tracks.parquet").to_pydict()
+    table["posterior"] = [[0.1 * k, 1 - 0.1 * k] for k in range(6)]
+    for name, width in (("center_full", 3), ("size_full", 3), ("orientation_full", 4)):
+        table[name] = [None if k in {1, 3} else [0.5 + k] * width for k in range(6)]
+    write_table(tmp_path / "tracks.parquet", table, TRACKS)
+    labels = {track: TrackLabel(track, "cup", 0.7) for track in (5, 6)}
+
+    found = shown.ShownTracks.read(tmp_path, labels, causal=True)
+
+    order = [3, 0, 1, 4]  # by frame and detection; 7 was deleted
+    assert found.tracks.tolist() == [rows[k][0] for k in order]
+    assert found.detections.tolist() == [rows[k][2] for k in order]
+    assert_allclose(found.causal, [table["posterior"][k] for k in order], rtol=1e-6)
+    assert_allclose(found.full[:, 0], [np.nan, 0.5, np.nan, 4.5])
+    assert_allclose(found.full[3], np.full(10, 4.5))
 
 
 def test_lists_of_nothing() -> None:

@@ -1,6 +1,6 @@
 """The detections to show with the labels of their tracks, and the boxes to annotate."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from pathlib import Path
@@ -29,6 +29,7 @@ from shapecat.types import Box, ShownBox, ShownFrame
 __all__ = ["ShownTracks", "read_shown_frames"]
 
 _AT_ONCE = 8  # row groups of boxes in memory
+_ROWS = 2**13  # rows of tracks.parquet in memory
 _NO_ROWS = slice(0, 0)
 _FULL = {name: FULL_WIDTHS[name] for name in ("center_full", "size_full", "orientation_full")}
 _NONE = np.zeros((0, 0), np.float32)
@@ -70,7 +71,7 @@ class ShownTracks:
         cls, folder: Path, labels: Mapping[int, TrackLabel], *, causal: bool = False
     ) -> "ShownTracks":
         """Read the tracks of a run; those missing from ``labels`` are not shown."""
-        with pq.ParquetFile(folder / "tracks.parquet") as file:
+        with pq.ParquetFile(folder / "tracks.parquet", read_dictionary=["topic"]) as file:
             table = file.read(columns=["track", "topic", "frame", "stamp_ns", "detection"])
             topics, codes = topic_codes(table)
             seen = pa.compute.indices_nonzero(table["detection"].is_valid())
@@ -88,8 +89,8 @@ class ShownTracks:
                 tracks,
                 labels,
                 _ended(folder, of_frames, shown, numbers(table["stamp_ns"])[rows]),
-                _causal(file)[rows] if causal else _NONE,
-                _full(file)[rows],
+                _causal(file, rows) if causal else _NONE,
+                _full(file, rows),
             )
 
     def of(self, key: Key) -> Iterator[ShownDetection]:
@@ -152,17 +153,37 @@ def _box(label: TrackLabel, row: Sequence[float]) -> ShownBox:
     return ShownBox(*label, center, size, orientation)  # type: ignore[arg-type]  # as long as these
 
 
-def _causal(file: pq.ParquetFile) -> F4:
-    """Return the causal posteriors (n, k) of all rows."""
-    values, count = numbers(file.read(columns=["posterior"])["posterior"]), file.metadata.num_rows
-    return np.reshape(values, (count, values.size // max(count, 1)))
+def _causal(file: pq.ParquetFile, rows: I4) -> F4:
+    """Return the causal posteriors (n, k) of some rows."""
+
+    def values(table: pa.Table) -> F4:
+        return np.reshape(numbers(table["posterior"]), (len(table), -1))
+
+    return _gather(file, ["posterior"], rows, values)
 
 
-def _full(file: pq.ParquetFile) -> F4:
-    """Return the full boxes (n, 10) of all rows; NaN if unknown."""
+def _full(file: pq.ParquetFile, rows: I4) -> F4:
+    """Return the full boxes (n, 10) of some rows; NaN if unknown."""
     if "center_full" not in file.schema_arrow.names:  # from an older version
-        return np.full((file.metadata.num_rows, sum(_FULL.values())), np.nan, np.float32)
-    return numbers_or_nan(file.read(columns=list(_FULL)), _FULL)
+        return np.full((len(rows), sum(_FULL.values())), np.nan, np.float32)
+    return _gather(file, list(_FULL), rows, lambda table: numbers_or_nan(table, _FULL))
+
+
+def _gather(
+    file: pq.ParquetFile, columns: list[str], rows: I4, values: Callable[[pa.Table], F4]
+) -> F4:
+    """Return the ``values`` (n, k) of some rows; few rows at a time are in memory."""
+    place = np.full(file.metadata.num_rows, -1)
+    place[rows] = np.arange(len(rows))
+    found, start = _NONE, 0
+    for batch in file.iter_batches(_ROWS, columns=columns, use_threads=False):
+        some = values(pa.Table.from_batches([batch]))
+        if not start:
+            found = np.zeros((len(rows), some.shape[1]), np.float32)
+        at = place[start : start + len(some)]
+        found[at[at >= 0]] = some[at >= 0]
+        start += len(some)
+    return found
 
 
 def _places(table: pa.Table) -> F8:
@@ -200,21 +221,26 @@ def _ended(
     keys = np.repeat(np.arange(len(frames)), [rows.stop - rows.start for rows in frames.values()])
     latest = np.argsort(stamps_ns, kind="stable")[::-1]
     gone, at = np.unique(tracks[latest], return_index=True)
-    following = _next_of_topic(folder)
     names = list(frames)
+    last = {
+        track: names[k] for track, k in zip(gone.tolist(), keys[latest[at]].tolist(), strict=True)
+    }
+    following = _next_of_topic(folder, set(last.values()))
     ended: dict[Key, list[int]] = {}
-    for track, frame in zip(gone.tolist(), keys[latest[at]].tolist(), strict=True):
-        if names[frame] in following:
-            ended.setdefault(following[names[frame]], []).append(track)
+    for track, frame in last.items():
+        if frame in following:
+            ended.setdefault(following[frame], []).append(track)
     return {key: tuple(gone) for key, gone in ended.items()}
 
 
-def _next_of_topic(folder: Path) -> dict[Key, Key]:
+def _next_of_topic(folder: Path, wanted: Container[Key]) -> dict[Key, Key]:
+    """Return the next frame of the same topic after each of the ``wanted`` frames."""
     following: dict[Key, Key] = {}
     latest: dict[str, Key] = {}
     for group in read_row_groups(folder / "frames.parquet", ["topic", "frame"], at_once=64):
         for key in zip(group["topic"].to_pylist(), group["frame"].to_pylist(), strict=True):
-            if key[0] in latest:
-                following[latest[key[0]]] = key
+            before = latest.get(key[0])
+            if before is not None and before in wanted:
+                following[before] = key
             latest[key[0]] = key
     return following
