@@ -1,4 +1,4 @@
-"""Connected components: the one flood fill of the detection.
+"""Connected components of cells, for all steps of detection.
 
 Two passes with a table of equivalent labels (Rosenfeld and Pfaltz 1966).
 """
@@ -18,7 +18,7 @@ SIDES = ((0, 1), (1, 0), (0, -1), (-1, 0))
 
 @kernel
 def connected_components(inside: Bool, links: U1, spans: I4, component: I4) -> I4:
-    """Label connected components, from 1 on, in the order of their first cells.
+    """Label connected components from 1, in the order of their first cells.
 
     Parameters
     ----------
@@ -90,7 +90,7 @@ def _root(parent: I4, k: int) -> int:
 
 @kernel
 def spans_of(plane_id: I4) -> I4:
-    """Return the `span_of` each row of ``plane_id`` (rows, columns): (rows, 2)."""
+    """Return the span (rows, 2) of each row of ``plane_id`` (rows, columns), as `span_of` does."""
     spans = np.zeros((plane_id.shape[0], 2), np.int32)
     for i in range(len(spans)):
         spans[i, 0], spans[i, 1] = span_of(plane_id[i])

@@ -1,4 +1,4 @@
-"""Depth grid: the depth image, downsampled to the working resolution of the detection.
+"""Depth grid: the depth image, downsampled to the working resolution of detection.
 
 All steps use inverse depth ``w = 1 / z`` (1/m): a plane is exactly linear in (column, row, w), and
 the noise of disparity cameras is constant in w, so thresholds do not depend on range.
@@ -32,10 +32,10 @@ SMALL_M2 = 9e-4
 FEWEST_CELLS, ENOUGH_CELLS = 20.0, 60.0
 """Fewer cells may be noise; this many are an object, however small it is."""
 BORDER_SHARE = 0.12
-"""Maximum fraction of the image that is blank along a side: a tenth for a registered Kinect."""
+"""Maximum fraction of the image in a blank border; a registered Kinect leaves a tenth."""
 LARGEST_FACTOR = 16
 MOST_CELLS = 100_000
-"""Bounds the time of a frame: cells are larger than `CELL_M` if a grid would have more."""
+"""Maximum number of cells, to bound the time per frame; cells become larger than `CELL_M`."""
 
 
 class PinholeIntrinsics(NamedTuple):
@@ -216,7 +216,7 @@ def _average(depth: F4, factor: int, range_m: float, jump: float, inv_depth: F4)
                 part[j] = z if (z >= least) & (z <= range_m) else far
                 nearest[j] = part[j] if part[j] < nearest[j] else nearest[j]
         for j in range(columns):
-            # The depth that is one jump behind the nearest, in inverse depth.
+            # The depth that is one discontinuity, in inverse depth, behind the nearest.
             slope = jump * nearest[j]
             behind = nearest[j] / (one - (slope if slope < half else half))
             limit[j] = behind if nearest[j] < far else zero

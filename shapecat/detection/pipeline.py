@@ -2,9 +2,9 @@
 
 1. The depth image is downsampled to samples of inverse depth; a point cloud is first turned into
    the image of a virtual camera (`depth_grid`, `virtual_camera`).
-2. `planes`: the up direction; a plane at each peak of level surface in height, by RANSAC (Fischler
-   and Bolles 1981) where least squares fail; the planes that support objects; the height of each
-   sample above its plane (thesis Alg. 1 and 2).
+2. `planes`: the up direction; a plane at each peak of a height histogram, by least squares or else
+   RANSAC (Fischler and Bolles 1981); the planes that support objects; the height of each sample
+   above its plane (thesis Alg. 1 and 2).
 3. `foreground`: low-profile objects, walls, and objects that overhang the edge of their plane.
 4. `segmentation`: surfaces are split at depth discontinuities and concave edges (local convexity,
    Stein et al. 2014) by a watershed (Meyer 1991), and where the width of a stack changes.
@@ -88,7 +88,7 @@ def detect(
         dominant plane.
     settings : see `DetectionSettings`.
     rng : source of the RANSAC samples; the same state gives the same scene.
-    steps : the steps to take, to measure the effect of each.
+    steps : the optional steps to take, for ablation.
 
     Returns
     -------

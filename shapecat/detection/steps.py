@@ -8,7 +8,7 @@ __all__ = ["ALL_STEPS", "Steps"]
 class Steps(NamedTuple):
     """Switches for the steps beyond the thesis, to measure the effect of each.
 
-    Without all of them, objects are separated by plane, height and depth discontinuities alone.
+    With all of them off, objects are separated by plane, height and depth discontinuities alone.
     """
 
     low_profile: bool = True

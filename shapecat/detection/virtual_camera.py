@@ -16,7 +16,7 @@ __all__ = ["VirtualImage", "top_view", "virtual_image"]
 FIELD = 1.5
 """Largest slope x / z or y / z of a point in view."""
 OUTSIDE = 9.0
-"""Stands for the slope of a point that is not in view."""
+"""Placeholder for the slope of a point that is not in view."""
 MOST_CELLS = 400_000
 MOST_ROWS = 2000
 LEAST_POINTS = 100

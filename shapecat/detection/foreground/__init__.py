@@ -1,1 +1,1 @@
-"""Foreground: samples that belong to objects, where their height alone does not decide."""
+"""Foreground segmentation where the height above the plane does not suffice."""

@@ -1,7 +1,7 @@
 """Removal of low-frequency depth error: slow waves that sensors measure on a flat surface.
 
-The waves are higher than a plate is thick. Without them, steps and noise remain; the noise is then
-measured.
+The waves are higher than a plate is thick. When they are removed, steps and noise remain, and the
+noise is measured.
 """
 
 import numpy as np

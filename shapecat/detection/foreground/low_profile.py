@@ -1,6 +1,6 @@
 """Low-profile objects: they rise from their plane in a step, unlike low-frequency depth error.
 
-Only an object has an edge. So waves of the surface are removed first (`depth_error`), and low
+Only an object has an edge. So low-frequency depth error is removed first (`depth_error`), and low
 parts are judged by their outline rather than by their height.
 """
 
@@ -31,7 +31,7 @@ BLOCK = 16
 
 
 class Scratch(NamedTuple):
-    """Work space for floods.
+    """Work space for flood fills.
 
     Attributes
     ----------
@@ -49,15 +49,15 @@ class Scratch(NamedTuple):
 def find_low_profile(
     grid: DepthGrid, heights: HeightMap, planes: F8, low_profile: I4, largest_m: float
 ) -> None:
-    """Find the low-profile objects on each plane, and assign waves of depth error to the plane.
+    """Find the low-profile objects on each plane, and assign depth error to the plane.
 
     Parameters
     ----------
     heights : ``plane_id`` is changed in place: k + 1 on the objects found on plane k, -(k + 1) on
-        cells that only a wave lifts.
+        cells that only depth error raises.
     planes : from `pack_planes`.
     low_profile : (rows, columns) zeros; set to 1, 2, ... on low-profile objects.
-    largest_m : a part that is wider, metres, is no low-profile object.
+    largest_m : maximum width of a low-profile object, metres.
     """
     inv_depth, plane_id, height = grid.inverse_depth, heights.plane_id, heights.height
     widest = largest_m * grid.intrinsics.fx
@@ -142,7 +142,7 @@ def _raise(
 
     The objects are numbered from ``objects`` + 1 on, the tested parts from ``me`` + 1 on; the last
     numbers are returned. ``high_pass`` (rows, columns) is from `filter_high_pass`; ``bounds`` are
-    the least mean rise and the unit of the levels, both 1/m, and the greatest width, in cells at
+    the minimum mean rise and the unit of the levels, both 1/m, and the greatest width, in cells at
     a depth of 1 m.
     """
     rise_least, level_least, widest = bounds
@@ -188,7 +188,7 @@ def _find_seeds(high_pass: F4, least: float, seeds: I4) -> int:
     """List the cells above ``least`` that are higher than their left and upper neighbours.
 
     They include the first cell of every part above any level. Returns their number. Most cells are
-    below ``least``, and the test of a block of cells vectorises.
+    below ``least``, so a vectorised test skips whole blocks.
     """
     rows, columns = high_pass.shape
     flat = high_pass.reshape(-1)
@@ -215,7 +215,7 @@ def _find_seeds(high_pass: F4, least: float, seeds: I4) -> int:
 
 @kernel(inner=True)
 def _flood(residual: F4, level: float, start: int, n: int, part: I4, stack: I4) -> int:
-    """Give the connected cells above ``level`` the number ``n``; return the number of cells.
+    """Set ``part`` to ``n`` in the connected cells above ``level``; return their number.
 
     ``residual`` must be 0 at the border of the image.
     """
@@ -247,7 +247,7 @@ def _lower(
     me: int,
     scratch: Scratch,
 ) -> int:
-    """Assign flat parts of low object cells to the plane if they have the outline of a swell.
+    """Assign flat parts of low object cells to the plane if their outline is that of depth error.
 
     The parts are numbered from ``me`` + 1 on; the last number is returned.
     """

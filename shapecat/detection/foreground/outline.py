@@ -1,4 +1,4 @@
-"""Outlines of low parts of a plane: an object rises in a step along it, a swell does not."""
+"""Outlines of low parts of a plane: an object has a step along it, depth error does not."""
 
 from typing import NamedTuple
 
@@ -84,7 +84,7 @@ def measure_outline(
     part : (rows, columns) numbers of the parts.
     stack, count : the first ``count`` of ``stack`` are the flat cells of this part.
     number : number of its plane, from 1, as in ``plane_id``.
-    rise_least : least mean rise across the outline of an object, 1/m.
+    rise_least : minimum mean rise across the outline of an object, 1/m.
     """
     rows, columns = residual.shape
     parts = part.reshape(-1)

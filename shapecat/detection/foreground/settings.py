@@ -9,20 +9,20 @@ class LowProfileSettings(NamedTuple):
     """How low-profile objects are distinguished from low-frequency depth error."""
 
     levels: tuple[float, ...] = (3.0, 2.0, 1.3, 0.9, 0.6, 0.4)
-    """Thresholds above the mean whose outlines are tested, as multiples of the least rise: one of
-    them separates an object from the swell beside it."""
+    """Thresholds above the mean whose outlines are tested, as multiples of the minimum rise: one
+    of them separates an object from the depth error beside it."""
     fine: float = 0.006
-    """Upper bound of that least rise, 1/m: more is not noise but a plane at a grazing angle."""
+    """Upper bound of that minimum rise, 1/m: more is not noise but a plane at a grazing angle."""
     step: float = 0.002
     """Minimum mean rise across the outline of an object, 1/m: less than a step of a Kinect."""
     steady: float = 3.5
     """Minimum rise as a multiple of the median rise between plane cells equally far apart."""
     slip: float = 0.7
-    """Minimum rise as a share of the plane's change per cell: at a grazing angle, samples slightly
-    out of place seem to rise."""
+    """Minimum rise as a share of the plane's change per cell: at a grazing angle, slightly
+    displaced samples seem to rise."""
     grown: float = 0.95
     """A part replaces the objects found within it if its rise per side exceeds this share of their
-    greatest one: an object together with a swell rises less."""
+    greatest one: an object together with depth error rises less."""
     side: float = 0.004
     """Minimum rise over two cells on the side of an object, 1/m."""
     slope: float = 0.0016
@@ -34,11 +34,11 @@ class LowProfileSettings(NamedTuple):
     small_part: int = 12
     """Minimum number of cells of a part whose outline can be judged."""
     beside: float = 0.3
-    """Minimum fraction of the outline of a swell that faces the plane."""
+    """Minimum fraction of the outline of depth error that faces the plane."""
     low_m: float = 0.03
     """Cells higher than this belong to objects anyway, metres."""
     window: int = 20
-    """Cells to each side over which the mean is taken: wider than a rim, narrower than a wave."""
+    """Half the window of the mean, in cells: wider than a rim, narrower than a wave of error."""
     most: float = 0.006
     """Upper bound of a cell's value in the mean, 1/m: an object must not cause a pit around it."""
     apart: int = 5
@@ -46,20 +46,20 @@ class LowProfileSettings(NamedTuple):
 
 
 class OutlineSettings(NamedTuple):
-    """Thresholds that tell outlines of objects from those of swells; `Outline` counts the sides."""
+    """Thresholds that tell objects from depth error by the sides that `Outline` counts."""
 
     steep: float = 0.5
-    """Minimum rise of a steep side, relative to the least mean rise: more than noise."""
+    """Minimum rise of a steep side, relative to the minimum mean rise: more than noise."""
     steep_share: float = 0.7
     """Minimum fraction of steep sides among those that face the plane."""
     most_steps: float = 3
-    """Upper bound of the rise of one side, relative to the least mean rise."""
+    """Upper bound of the rise of one side, relative to the minimum mean rise."""
     all_around: float = 0.75
     """Minimum sum of the rises over the number of sides, including those that do not face the
     plane.
     """
     chance: float = 16
-    """Extra rise of short outlines, this over the number of sides: few waves rise all around."""
+    """Extra mean rise of an outline, times its number of sides: error seldom rises all around."""
     inward: int = 2
     """Distance from the outline, in cells, at which its inside is measured."""
     least_sides: int = 30
@@ -71,8 +71,8 @@ class OutlineSettings(NamedTuple):
     broad: float = 1.5
     """Cells per side above which a part may be partly hidden: strips beside objects have fewer."""
     ragged: float = 80
-    """Largest squared number of sides over cells, of a part that hardly faces the plane: 16 for a
-    square, 50 for a crescent."""
+    """Largest ratio of squared number of sides to number of cells, for a part that hardly faces the
+    plane: 16 for a square, 50 for a crescent."""
 
 
 class WallSettings(NamedTuple):
@@ -95,12 +95,12 @@ class WallSettings(NamedTuple):
     exact: float = 0.0045
     """Largest standard deviation of such a part from the wall, 1/m: that of a wall's samples."""
     cut_off: float = 0.75
-    """Minimum diagonal of a wall that two sides of the image cut off, relative to the largest
+    """Minimum diagonal of a wall that is cut off by two sides of the image, relative to the largest
     object.
     """
     filled: float = 0.3
-    """Minimum fraction of its extent that a wall fills: front edges of a shelf are in a plane
-    too."""
+    """Minimum fraction of its extent that a wall fills: the front edges of a shelf are also in one
+    plane."""
     strip_m: float = 0.05
     """Width of the strips whose areas give the extent of a wall, metres."""
 

@@ -98,7 +98,7 @@ def _is_cut_off(inv_depth: F4, samples: DepthSamples, plane: F8) -> bool:
 
 @kernel(inner=True)
 def _bounds(samples: DepthSamples, plane: F8, tolerance: float) -> F8:
-    """Return least column, least row, greatest column and greatest row of a plane's inliers."""
+    """Return the first column, first row, last column and last row of a plane's inliers."""
     bounds = np.array([np.inf, np.inf, -np.inf, -np.inf])
     for k in range(samples.inverse_depth.size):
         j, i = float(samples.j[k]), float(samples.i[k])
@@ -192,7 +192,7 @@ def _flood(
 
 @kernel(inline=True)
 def _mark(inv_depth: F4, plane_id: I4, plane: F8, found: U1) -> None:
-    """Mark the cells on a wall as `UNSEEN`, unless a level plane holds them; write 0 elsewhere."""
+    """Mark the cells on a wall as `UNSEEN`, unless they are on a level plane; write 0 elsewhere."""
     a = np.float32(plane[0])
     for i in range(inv_depth.shape[0]):
         values, plane_ids, states = inv_depth[i], plane_id[i], found[i]

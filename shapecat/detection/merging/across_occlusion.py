@@ -1,4 +1,4 @@
-"""Merging across an occluder: segments of one object on both sides of an object in front of it."""
+"""Merging across an occluder: segments of one object on both sides of a nearer object."""
 
 import math
 

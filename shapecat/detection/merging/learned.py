@@ -1,7 +1,7 @@
 """Learned merging: boosted trees decide whether two adjacent segments are one object.
 
-Learned relations between surface patches: Richtsfeld et al. 2012, 2014. The trees are trained on
-simulated scenes.
+Source: Richtsfeld et al. 2012, 2014 (learned relations between surface patches). The trees are
+trained on simulated scenes.
 
 Many weak features together distinguish a bottle and its neck, a plate and its foot, a cup and its
 handle, or the halves of a toy from two objects that touch or are stacked. A few features do not.

@@ -1,4 +1,4 @@
-"""Merging of low-profile objects, whose segments are known from `find_low_profile`."""
+"""Merge the segments of each low-profile object that `find_low_profile` found."""
 
 import numpy as np
 

@@ -109,9 +109,9 @@ class ViewGeometry(NamedTuple):
 
 @kernel
 def find_adjacent(segments: Segments, p: int) -> Bool:
-    """Return (n + 1,) bool: the segments that may be one object with segment ``p``.
+    """Return which segments may be one object with segment ``p``: (n + 1,) bool.
 
-    Both are above the same plane; they touch, or one hides the other, or they face each other.
+    They are above the same plane as ``p``, and touch it, hide it, are hidden by it, or face it.
     """
     statistics, pairs, parent = segments.statistics, segments.pairs, segments.parent
     plane_id = segments.plane_id
@@ -197,7 +197,7 @@ def _write_adjacency(segments: Segments, p: int, q: int, cell: float, out: Row) 
 
 @kernel(inner=True)
 def _above_top(segments: Segments, p: int, q: int) -> float:
-    """Return how far above the top of ``q`` its upward-facing surface touches ``p``, on average."""
+    """Return the mean height at which ``p`` rests on ``q``, above the top of ``q``, metres."""
     onto = segments.pairs[p, q].rests_on
     if onto == 0:
         return MERGING.nowhere_m

@@ -13,20 +13,20 @@ class MergingSettings(NamedTuple):
     up_cos: float = 0.8
     """Minimum cosine to up of a normal that faces up: noise turns normals by up to 35 degrees."""
     edge_on_cos: float = 0.2
-    """Minimum cosine to the line of sight that areas are corrected for: below, noise dominates."""
+    """Minimum cosine to the line of sight in the correction of areas: below, noise dominates."""
     flat_deg: int = 20
     """Largest concave angle, degrees, of a sample of a segment; others are too near an edge."""
     gap_cells: int = 3
     """Maximum number of cells without a reading within one surface."""
     shadow_cells: int = 15
-    """Maximum number of cells without a reading between two surfaces, of which the nearer one
-    blocks the light of the projector."""
+    """Maximum number of cells without a reading between two surfaces: the nearer one shadows the
+    projector."""
     inward_cells: int = 3
-    """Cells from a border inwards at which the normal of a surface is taken."""
+    """Distance from a border, in cells, at which the normal of a surface is taken."""
     down_cos: float = 0.7
     """Cosine of the largest angle, in the image, between a lower neighbour and straight down."""
     top_bands: int = 4
-    """Bands of height, of 5 mm, below the top in which upward-facing surface closes a segment."""
+    """Number of 5 mm bands below the top in which upward-facing surface closes a segment."""
     facing_m: float = 0.015
     """Largest height difference between the tops of two walls of a pot, metres."""
     facing_share: float = 0.5
@@ -41,7 +41,7 @@ class MergingSettings(NamedTuple):
     """Partial logit below which evaluation stops: of 60,000 pairs, a third fall below it, and none
     of these would be merged."""
     low_share: float = 0.5
-    """Minimum fraction of the cells of a segment in one low-profile object, to be part of it."""
+    """Minimum fraction of a segment's cells in a low-profile object to which it belongs."""
     coplanar_m: float = 0.006
     """Largest distance of a sample from the local plane of another: two steps of a Kinect."""
     coplanar_slope: float = 0.05

@@ -293,7 +293,7 @@ def settle_labels(grid_labels: GridLabels, cells: I4, places: F8, n: int, marks:
         )
         marks[m] = 0
         if not abs(inv_depth[i, j] * z - np.float32(1)) < jump * z:
-            # The neighbour whose depth fits best, if any is within two jumps.
+            # The neighbour whose depth fits best, if any is within two discontinuities.
             row, column, nearest = -1, -1, np.float32(2 * DISCONTINUITY) * z
             for y in range(max(i - 1, 0), min(i + 2, rows)):
                 for x in range(max(j - 1, 0), min(j + 2, columns)):

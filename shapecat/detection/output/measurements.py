@@ -32,8 +32,8 @@ class ObjectMeasurements(NamedTuple):
     supported_by : (n,) the label of the object that each stands on; 0 for its plane.
     support_m : (n,) the height of that support above the plane.
     hidden : (n,) whether a nearer surface hides part of it.
-    last : (n,) whether it is cut off by the range limit.
-    least : (n,) float32, cells of the smallest object at its depth.
+    last : (n,) whether the range limit cuts it off.
+    least : (n,) float32, number of cells of the smallest object at its depth.
     """
 
     center: F8
@@ -54,9 +54,9 @@ def measure_objects(
 ) -> ObjectMeasurements:
     """Measure the objects.
 
-    The box is an `shapecat.geometry.upright_box` around the outermost cells. An object stands on
-    another if it has more contact with upward-facing surface of the other than with the plane; or,
-    if that contact is hidden, if its bottom is at the top of the other.
+    The box is a `shapecat.geometry.upright_box` around the outermost cells. An object stands on
+    another if it has more contact with the other's upward-facing surface than with the plane. If
+    that contact is hidden, its bottom must be at the top of the other.
 
     Parameters
     ----------
@@ -143,7 +143,7 @@ def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
 
 @kernel(inline=True)
 def _break_cycles(measured: ObjectMeasurements) -> None:
-    """Put objects on their plane that would stand on themselves, through others."""
+    """Put objects on their plane if they would otherwise stand, through others, on themselves."""
     supported_by = measured.supported_by
     for k in range(supported_by.size):
         at = supported_by[k]
@@ -222,7 +222,7 @@ def _outer_points(
 
 @kernel(inner=True)
 def _find_outer(labels: I4, i: int, first: int, end: int, outer: Bool) -> None:
-    """Mark the labelled cells of part of a row that are next to other labels, and every 4th."""
+    """Mark the labelled cells in part of a row that are next to other labels, and every 4th."""
     rows, columns = labels.shape
     if i == 0 or i == rows - 1:
         for j in range(first, end):

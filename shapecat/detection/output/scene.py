@@ -86,7 +86,7 @@ def _numbers_of_seen(supports: Sequence[SupportingPlane]) -> list[int | None]:
 def _kept(
     grid: DepthGrid, measured: ObjectMeasurements, indices: Sequence[U4], least: int, *, image: bool
 ) -> list[int]:
-    """Return the numbers of the lists with enough points for an object, by their first points."""
+    """Return the lists with enough points for an object, in the order of their first points."""
     limits = [float(least)] * len(indices)
     if image:
         limits = [max(least, n * grid.factor**2) for n in measured.least.tolist()]

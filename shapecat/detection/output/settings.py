@@ -14,7 +14,7 @@ class OutputSettings(NamedTuple):
     """Largest gap between the bottom of an object and the top of its support, metres: the part in
     between is hidden."""
     overlap_m: float = 0.04
-    """Largest overlap of both, metres: a strip of the support may be labelled as the object."""
+    """Largest overlap of the two, metres: a strip of the support may be labelled as the object."""
     lifted_m: float = 0.03
     """An object with a bottom higher than this above its plane, metres, does not stand on it."""
     sunk_m: float = 0.015
@@ -30,9 +30,9 @@ class OutputSettings(NamedTuple):
     straight_share: float = 0.3
     """Minimum fraction of a side along which such a border is straight."""
     forward_cos: float = 0.2
-    """Approximate least cosine to the optical axis of a point in front of a camera."""
+    """Approximate minimum cosine to the optical axis of a point in front of a camera."""
     crowded: float = 0.08
-    """Share of points behind others above which a cloud is taken to be fused from several views."""
+    """Share of points behind others above which a cloud counts as fused from several views."""
 
 
 OUTPUT = OutputSettings()

@@ -15,7 +15,7 @@ from shapecat.detection.planes.up_direction import estimate_up
 __all__ = ["NO_HINT", "find_supporting_planes"]
 
 NO_HINT = np.zeros(3)
-"""Stands for an unknown up direction."""
+"""Placeholder for an unknown up direction."""
 
 
 def find_supporting_planes(
@@ -23,9 +23,9 @@ def find_supporting_planes(
 ) -> tuple[list[SupportingPlane], F8]:
     """Find the horizontal planes that objects may stand on (thesis 4.3).
 
-    One plane is fitted at each peak of level surface in height, by RANSAC where least squares fail
-    (Fischler and Bolles 1981); then all planes get a common normal; then planes with only strips
-    visible are added.
+    One plane is fitted at each peak in the height histogram of level surface, by least squares or
+    else RANSAC (Fischler and Bolles 1981). Then all planes get a common normal, and planes of which
+    only strips are visible are added.
 
     Parameters
     ----------

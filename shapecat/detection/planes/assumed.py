@@ -1,7 +1,7 @@
 """Assumed plane: a hidden support, below the samples that no visible plane explains.
 
 In a bin, in a compartment, or close up, objects hide the surface they lie on. If many samples are
-above no plane, a level plane is assumed below them, so that they are segmented all the same.
+above no plane, a level plane is assumed below them, so that they are segmented anyway.
 """
 
 import numpy as np
@@ -15,7 +15,7 @@ from shapecat.detection.planes.settings import PLANES, UP
 __all__ = ["assume_plane", "unexplained"]
 
 UNEXPLAINED = 0.2
-"""Share of unexplained samples above which a plane is assumed; at most 0.06 on plain tables."""
+"""Share of unexplained samples above which a plane is assumed; plain tables have at most 0.06."""
 FEW = 0.01
 """Share of the unexplained samples that may lie below the plane, as noise."""
 
@@ -34,8 +34,8 @@ def unexplained(grid: DepthGrid, plane_id: I4, walls: U1) -> Bool | None:
 def assume_plane(grid: DepthGrid, rest: Bool, up: F8, tallest_m: float) -> SupportingPlane | None:
     """Return the level plane below most unexplained samples; None if it is above the camera.
 
-    It is the plane with the most surface within the height of an object above it, where near
-    surface has more weight. Its visible area is 0.
+    It is the plane with the most surface within the height of an object above it; near surface has
+    more weight. Its visible area is 0.
 
     Parameters
     ----------

@@ -24,9 +24,9 @@ MIN_HEIGHT_M = 0.004
 """Minimum height of an object's sample; `HEIGHT_NOISE` times the squared depth is added."""
 HEIGHT_NOISE = 0.0025
 BEYOND_M = 0.1
-"""Surface level with a plane and this near to its outline is the plane, not an object below."""
+"""Surface level with a plane, and this near to its outline, is not an object on a lower plane."""
 OUT = -9.0
-"""Stands for the height of cells that do not belong to a plane."""
+"""Placeholder for the height of cells that do not belong to a plane."""
 OUTLINE = 10
 """Index at which the outline begins in a row of `pack_planes`."""
 FINE = 65536
@@ -118,7 +118,6 @@ def _assign(
             sides[k, 0] += part * p
             sides[k, 1] += part * q
             sides[k, 2] += part * (plane[6 + 3 * d] - p * intrinsics.cx - q * intrinsics.cy)
-    # A plane seen edge-on has heights between the steps of the sensor; so no division is unsafe.
     for i in range(rows):
         base = np.float32(plane[1] * i + plane[2])
         some = False

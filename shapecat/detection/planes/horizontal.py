@@ -1,9 +1,9 @@
-"""Horizontal planes: one for each peak of level surface in height (thesis 4.3, Alg. 1).
+"""Horizontal planes: one for each peak in the height histogram (thesis 4.3, Alg. 1).
 
-They are parallel: all get one normal, which the larger ones determine best. A board that is seen at
-a grazing angle or in part determines its tilt badly, and half a degree is a centimetre of height at
-a distance of one metre. Planes that are then not level, such as the top of a tilted object, are
-dropped.
+They are parallel: all get one normal, which the larger ones determine best. A board that is partly
+visible or seen at a grazing angle constrains its tilt poorly, and half a degree is a centimetre of
+height at a distance of one metre. Planes that are then not level, such as the top of a tilted
+object, are dropped.
 """
 
 from collections.abc import Iterable
@@ -163,7 +163,7 @@ def _fullest(height: F4) -> float:
 def _split(
     samples: DepthSamples, height: F4, peak: float
 ) -> tuple[DepthSamples, F4, DepthSamples, F4]:
-    """Return the samples within five bins around a height, their heights, and both of the rest."""
+    """Split samples and their heights into those within five bins around a height and the rest."""
     parts = np.zeros((2, 4, height.size), np.float32)
     n = np.zeros(2, np.int64)
     for k in range(height.size):

@@ -24,13 +24,13 @@ __all__ = [
 ]
 
 TRIALS, BLOCK = 240, 256
-"""Planes tried: one with a seventh of the samples is missed with a probability of a half. Samples
-after which a plane that can no longer win is dropped."""
+"""Number of planes tried: one with a seventh of the samples is missed with a probability of a half.
+Number of samples after which a plane that can no longer win is dropped."""
 LEAST_DOUBLE_AREA = 30.0
-"""Twice the least area of the triangle of three samples, in square cells: noise spoils smaller
+"""Twice the minimum area of the triangle of three samples, in square cells: noise spoils smaller
 ones."""
 SAMPLE = 4800
-"""Approximate number of cells that propose planes and vote: more only take longer."""
+"""Approximate number of samples for RANSAC: more only take longer."""
 
 
 class DepthSamples(NamedTuple):
@@ -170,7 +170,7 @@ def ransac_plane(
         )
         if not ((along >= cosines[0] * norm) & (along <= cosines[1] * norm)):
             continue
-        # (2) all samples vote
+        # (2) count the inliers
         inliers = 0
         for start in range(0, n, BLOCK):
             if inliers + n - start <= most:

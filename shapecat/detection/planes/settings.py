@@ -30,11 +30,11 @@ class UpSettings(NamedTuple):
     """Exponent, in that score, of the fraction of the surface facing the direction that lies in
     large levels."""
     aslant: float = 0.6
-    """Share of the score that a direction along the optical axis loses: walls, not tables."""
+    """Share of the score that a direction along the optical axis loses: it is that of a wall."""
     held: float = 3.0
-    """Penalty on directions that imply a camera on its side or upside down: a quarter is left."""
+    """Penalty on directions that imply a camera on its side or upside down: a quarter remains."""
     steep: float = 0.03
-    """Squared sine of the angle to the optical axis below which a direction fixes no roll."""
+    """Squared sine of the angle to the optical axis below which a direction implies no roll."""
     half_m: float = 1.5
     """Depth at which surface has half the weight: near surface decides."""
 
@@ -53,7 +53,7 @@ class PlaneSettings(NamedTuple):
     margin_m: float = 0.01
     """A plane extends this far beyond its samples, metres: their spacing."""
     steady_cos: float = math.cos(math.radians(6))
-    """A plane tilted by more against up is not determined by the samples at its height."""
+    """The samples at the height of a plane do not determine it if it is tilted more from up."""
     close_share: float = 0.75
     """Minimum fraction of the inliers within half the tolerance. A plane tilted between two others,
     such as a table and the plates on it, has fewer."""
@@ -66,7 +66,7 @@ class PlaneSettings(NamedTuple):
     board_m2: float = 0.03
     """Smaller planes above another plane are not boards."""
     least_drop_m: float = 0.06
-    """A plane that is less high above another is the top of an object."""
+    """A plane lower than this above another is the top of an object."""
     step_m: float = 0.01
     """Length of the steps in which the surroundings of an edge are searched, metres."""
     wall_m: float = 0.03
@@ -76,11 +76,11 @@ class PlaneSettings(NamedTuple):
     around_m: float = 0.03
     """Distance from a sample to the surroundings of its plane, metres."""
     enclosed: float = 0.2
-    """Fewer drops than this, per rise, surround the floor of a bin."""
+    """Upper bound of the ratio of drops to rises around the floor of a bin."""
     hidden_m: float = 0.2
-    """Greatest width of the part of such a floor that objects hide at one side, metres."""
+    """Maximum width that objects hide of such a floor at one side, metres."""
     borne_m: float = 0.4
-    """Greatest height above a large plane of an object on it, metres."""
+    """Maximum height of an object above the large plane it stands on, metres."""
 
 
 class StripSettings(NamedTuple):
@@ -96,9 +96,9 @@ class StripSettings(NamedTuple):
     least_rise: float = 0.05
     """Smallest downward slope that is used to compute the area a cell covers."""
     below: int = 10
-    """Bins below a plane that hold next to no surface."""
+    """Number of bins below a plane that hold next to no surface."""
     above: int = 30
-    """Bins above a covered plane that hold the tops of the objects on it."""
+    """Number of bins above a covered plane that hold the tops of the objects on it."""
     covers: float = 1.0
     """Minimum area of the tops of objects that cover a plane, relative to its visible area."""
     contrast: float = 2.0
@@ -107,7 +107,7 @@ class StripSettings(NamedTuple):
     """Minimum inverse depth of strips, relative to that of the farthest sample: four fifths of the
     range."""
     dip: float = 0.6
-    """Just above a plane, the area falls below this share of its own."""
+    """Just above a plane, the area of level surface falls below this share of the plane's."""
     least_m2: float = 0.001
     """Minimum visible area of a covered plane."""
     least_points: int = 15
@@ -117,7 +117,7 @@ class StripSettings(NamedTuple):
     tallest_m: float = 0.15
     """Height of the tallest objects that cover a plane, metres."""
     most_seen: float = 0.45
-    """Largest visible share of the outline of a covered plane; a lid is visible as a whole."""
+    """Largest visible share of the outline of a covered plane; a lid is fully visible."""
 
 
 UP, PLANES, STRIPS = UpSettings(), PlaneSettings(), StripSettings()

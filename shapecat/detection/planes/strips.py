@@ -149,12 +149,12 @@ def _peaks(amount: F8, least: float) -> F8:
     Parameters
     ----------
     amount : (BINS,) level surface by height, the lowest first.
-    least : least amount in a peak and the two bins beside it.
+    least : minimum amount in a peak and the two bins beside it.
 
     Returns
     -------
-    (n, 2) the heights above the sensor, metres, ascending; and the amount just above, relative to
-    the peak's own, which comes from the tops of objects that cover it.
+    (n, 2) the heights above the sensor, metres, ascending; and the amount just above each, relative
+    to that of the peak: the tops of objects that cover it.
     """
     peaks, n, bins = np.zeros((BINS, 2)), 0, STRIPS.below - 2
     for k in range(STRIPS.below, BINS - 3):

@@ -22,8 +22,8 @@ from shapecat.jit import kernel
 __all__ = ["supporting_planes"]
 
 BESIDE, DOWN = 5, 20
-"""Most steps from a sample towards the camera to the edge of its plane, and steps down from that
-edge."""
+"""Maximum number of steps from a sample towards the camera to the edge of its plane, and down from
+that edge."""
 LEAST_BELOW = 20
 """Minimum number of samples below an edge that allow a decision."""
 

@@ -15,9 +15,9 @@ from shapecat.jit import kernel
 __all__ = ["estimate_up"]
 
 MOST_DIRECTIONS = 4
-"""Most directions to find: level surface and the walls of a corner make three."""
+"""Maximum number of directions to find: level surface and the walls of a corner make three."""
 BLOCK = 512
-"""Normals after which a direction that can no longer win is dropped."""
+"""Number of normals after which a direction that can no longer win is dropped."""
 BINS = 80
 """Number of bins of `UpSettings.level_bin_m`: the floor is no more than 3 m below the camera."""
 
@@ -173,7 +173,7 @@ def _merit(surface: F4, direction: F8, held: float) -> float:
     if level == 0:
         return 0.0
     # A shelf has several boards but one back. Objects in front of a wall add levels as well, but of
-    # unequal size, and much of the surface that faces like the wall is in none.
+    # unequal size, and much of the surface parallel to the wall is in no level.
     levels, clear = level**2 / squares, level / facing
     # A camera that looks down on a board sees it obliquely, and the wall behind it head-on.
     aslant = 1 - UP.aslant * direction[2] ** 2

@@ -1,6 +1,6 @@
 """Connectivity: the links between object cells on one surface, and its concavity at each cell.
 
-Local convexity as a criterion to separate objects: Stein et al. 2014.
+Source: Stein et al. 2014 (local convexity as a criterion to separate objects).
 """
 
 import math
@@ -20,7 +20,7 @@ from shapecat.jit import kernel, unset
 __all__ = ["SurfaceGraph", "connect_surfaces"]
 
 BENT = 4
-"""Factor of the bits of a link that marks, temporarily, that only a local plane supports it."""
+"""Factor of a link's bits that marks temporarily that only a local plane supports the link."""
 LEAST_CHORD = 3e-4
 """Squared distance between two unit normals at an angle of one degree."""
 
@@ -93,7 +93,7 @@ def _blank(spans: I4, columns: int) -> F4:
 
 @kernel
 def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) -> None:
-    """Link neighbours at similar depths, or of which one lies on the local plane of the other."""
+    """Link neighbours at similar depths, or where one lies on the local plane of the other."""
     rows, columns = inv_depth.shape
     depths, owners = inv_depth.reshape(-1), plane_id.reshape(-1)
     planes, bits = local_plane.reshape(-1), links.reshape(-1)

@@ -24,7 +24,7 @@ RUN = 128
 LANES = 8
 """Runs are padded to multiples of this, because a remainder is not vectorised."""
 NONE = 1e9
-"""Stands for the inverse depth of a cell that is not used."""
+"""Placeholder for the inverse depth of a cell that is not used."""
 PITCH = RUN + 2 * WINDOW
 """Width of a row of the buffers."""
 

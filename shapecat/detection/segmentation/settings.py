@@ -19,11 +19,11 @@ class SegmentationSettings(NamedTuple):
     """Minimum determinant of the covariance of their positions, cells to the fourth power: samples
     in a line define no plane."""
     bridged: int = 8
-    """Widest gap between the cells of a run: a new run takes longer."""
+    """Widest gap within a run, in cells: a new run takes longer."""
     base: int = 3
     """Cells between an edge and the surfaces that are compared: half a window of a local plane."""
     base_diagonal: int = 2
-    """The same along each axis on diagonals, about as far."""
+    """The same distance on a diagonal, in cells along each axis."""
     step_reach: int = 2
     """Cells on either side of a step over which the slope there is measured."""
     sure: float = 0.5
@@ -35,7 +35,7 @@ class SegmentationSettings(NamedTuple):
     least_cells: int = 12
     """Minimum number of cells of a segment; smaller parts join the segments around them."""
     most_segments: int = 250
-    """Bounds the time, which grows with the square of their number."""
+    """Maximum number of segments: the time grows with its square."""
     bucket_deg: int = 4
     """Cells whose angles are in the same range of this width are flooded together: the angles are
     not more precise."""
@@ -44,12 +44,12 @@ class SegmentationSettings(NamedTuple):
     both_steps_m: float = 0.02
     """Minimum sum of the steps of both sides, metres."""
     bands_beside: int = 5
-    """Bands of height, of 5 mm, below and above a step. The nearest one is left out, as a step is
-    not sharp; the others show the outline before and after it."""
+    """Number of 5 mm bands below and above a step. The nearest one is left out, as a step is not
+    sharp; the others show the outline before and after it."""
     part_cells: int = 60
     """Minimum number of cells on either side of a split: fewer are a knob or a handle."""
     shadow_cells: int = 6
-    """Cells without a sample beside an occluder, on a Kinect."""
+    """Width of a Kinect's shadow beside an occluder, in cells."""
 
 
 SEGMENTATION = SegmentationSettings()

@@ -31,7 +31,7 @@ class Outlines(NamedTuple):
     ----------
     ends : (2, n + 1, BANDS) float32 metres: the smallest position along `lateral_axis`, and minus
         the largest, so that both grow where a segment narrows; infinite in a band without cells.
-    at : (2, n + 1, BANDS) int32 the cells at these ends, as row times columns plus column.
+    at : (2, n + 1, BANDS) int32 flat indices of the cells at these ends.
     counts : (n + 1, BANDS) int32 the number of cells.
     """
 
@@ -129,7 +129,7 @@ def _find_cuts(grid: DepthGrid, outlines: Outlines, p: int, side: F8, cuts: Bool
 
 @kernel(inline=True)
 def _step_at(grid: DepthGrid, outlines: Outlines, p: int, band: int, side: F8) -> float:
-    """Return the sum of the steps of both sides below a band, metres; 0 if neither is enough."""
+    """Return the sum of the steps of both sides below a band, metres; 0 if both are small."""
     both = most = 0.0
     for k in range(2):
         end, at = outlines.ends[k, p], outlines.at[k, p]
