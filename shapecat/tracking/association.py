@@ -14,7 +14,7 @@ _SIZE_SLACK_M = 0.01
 
 
 def size_key(sizes: F4) -> F8:
-    """Return (n, 3) logarithms of sizes (n, 3), metres: longer side, shorter side, height.
+    """Return the logarithms (n, 3) of sizes (n, 3), metres: longer side, shorter side, height.
 
     The sides are sorted, as the yaw of a box may change by a quarter turn between frames.
     """
@@ -25,12 +25,12 @@ def size_key(sizes: F4) -> F8:
 
 
 def size_difference(keys_a: F8, keys_b: F8) -> F8:
-    """Return (m, n) mean absolute differences of `size_key` results (m, 3) and (n, 3)."""
+    """Return the mean absolute differences (m, n) of `size_key` results (m, 3) and (n, 3)."""
     return np.asarray(np.abs(keys_a[:, None] - keys_b[None]).mean(axis=2))
 
 
 def posterior_difference(a: F8, b: F8) -> F8:
-    """Return (m, n) total variation distances, 0 to 1, between posteriors (m, c) and (n, c)."""
+    """Return the total variation distances (m, n), 0 to 1, of posteriors (m, c) and (n, c)."""
     return np.asarray(0.5 * np.abs(a[:, None] - b[None]).sum(axis=2))
 
 

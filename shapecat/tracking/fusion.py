@@ -67,7 +67,7 @@ def fuse(posteriors: ArrayLike, method: Method = "product", weights: ArrayLike |
 def causal(
     posteriors: ArrayLike, method: Method = "product", weights: ArrayLike | None = None
 ) -> F4:
-    """Return (k, c) float32, in which row i is `fuse` of the first i + 1 views; O(1) per view."""
+    """Return a float32 array (k, c): row i is `fuse` of the first i + 1 views; O(1) per view."""
     return np.concatenate([b.astype(np.float32) for b in _running(posteriors, method, weights)])
 
 

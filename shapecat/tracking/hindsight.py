@@ -107,7 +107,7 @@ def _links(fragments: Fragments, settings: TrackingSettings) -> list[tuple[int, 
 
 
 def _contradiction(key: F8, others: F8, known: Bool, others_known: Bool) -> F8:
-    """Return (k,) contradictions between a `size_key` (3,) and others (k, 3).
+    """Return the contradictions (k,) between a `size_key` (3,) and others (k, 3).
 
     An object of unknown size may be larger than seen so far, so only lengths beyond a known size
     count.

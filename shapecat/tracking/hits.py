@@ -87,7 +87,7 @@ class Hits:
         return np.asarray(self.centers[some], np.float64)
 
     def owners(self, members: Sequence[I4]) -> I4:
-        """Return (n,) the index of each hit's track, -1 if it has none.
+        """Return the track index of each hit, (n,), -1 if it has none.
 
         ``members`` are the hits of each track.
         """
@@ -163,7 +163,7 @@ def gather(frames: Iterable[FrameDetections], together: Collection[str] = ()) ->
 
 
 class _Gathered:
-    """The columns of a stream while it is being read; bytes grow in place."""
+    """The columns of a stream while it is being read, as bytes that grow."""
 
     def __init__(self) -> None:
         self._names: dict[str, int] = {}

@@ -23,9 +23,9 @@ _CHANGING = 0.5  # the same, if one detection sometimes covers both sides of the
 def join_pieces(hits: Hits, members: Sequence[I4]) -> list[I4]:
     """Join tracks that are pieces of one object.
 
-    The box around two pieces is no larger than the whole object, as one of the tracks shows it in
-    other frames; two objects side by side are larger. Of two pieces in the same frame, the larger
-    one stays in the track.
+    The size of the whole object is known from frames in which it was not split. The box around two
+    pieces is no larger than that; the box around two objects side by side is. Of two pieces in the
+    same frame, the larger one stays in the track.
 
     An object that moves behind a narrow occluder appears on one side before it has disappeared on
     the other, so that one track ends soon after the other one began. In both tracks only a part of
@@ -76,7 +76,7 @@ class _Rooms:
         self._in_one = cache(partial(_seen_in_one, hits, members))
 
     def of(self, pairs: I4, owner: I4, duos: I4, which: I4) -> F8:
-        """Return (p, 2, 3) the lengths of the whole object from either track, metres.
+        """Return the lengths (p, 2, 3) of the whole object from either track, metres.
 
         ``pairs`` (p, 2) are pairs of hits, ``duos`` (q, 2) the pairs of tracks, and ``which`` (p,)
         the position of each pair's tracks in ``duos``.
@@ -115,7 +115,7 @@ def _sorted_sides(sizes: F8) -> F8:
 
 
 def _wholes(hits: Hits, member: I4) -> F8:
-    """Return (topics, 3) the whole object's lengths as seen by each topic, metres; 0 if unseen."""
+    """Return the whole object's lengths (topics, 3) as seen by each topic, metres; 0 if unseen."""
     topics = hits.topics[hits.rows[member]]
     result = np.zeros((len(hits.names), 3))
     for topic in _where(np.bincount(topics) > 0):
@@ -131,7 +131,7 @@ def _whole(hits: Hits, member: I4) -> F8:
 
 
 def _neighbours(hits: Hits, owner: I4, block: slice) -> I4:
-    """Return (p, 2) pairs of tracked hits in the same frame that are near each other."""
+    """Return the pairs (p, 2) of tracked hits in the same frame that are near each other."""
     tracked = block.start + np.flatnonzero(owner[block] >= 0)
     places = np.column_stack([hits.centers[tracked], hits.rows[tracked]])
     found = cKDTree(places).query_pairs(_NEAR_M, output_type="ndarray")
@@ -140,7 +140,7 @@ def _neighbours(hits: Hits, owner: I4, block: slice) -> I4:
 
 
 def _changes(hits: Hits, members: Sequence[I4], duos: I4) -> F8:
-    """Return (q,) the overlap in time of pairs of tracks (q, 2), relative to the shorter track.
+    """Return the overlap in time (q,) of pairs of tracks (q, 2), relative to the shorter track.
 
     It is inf if one track lies within the other.
     """
@@ -167,7 +167,7 @@ def _fit(hits: Hits, pairs: I4, wholes: F8) -> Bool:
 
 
 def _joint(hits: Hits, pairs: I4) -> F8:
-    """Return (p, 3) the lengths of each pair's joint box, along the axes of the first, metres."""
+    """Return the lengths (p, 3) of the box around each pair, along the first box's axes, metres."""
     i, j = pairs.T
     if hits.axes is None:
         raise ValueError

@@ -97,7 +97,7 @@ def _follow(hits: Hits, settings: TrackingSettings) -> list[I4]:
 
 
 def _associate(hits: Hits, cuts: Bool, settings: TrackingSettings) -> I4:
-    """Return (n,) the tracker's track number of each hit."""
+    """Return the tracker's track number of each hit, (n,)."""
     tracker, ids = Tracker(settings), np.zeros(len(hits.rows), np.int32)
     for row, (stamp_ns, cut) in enumerate(zip(hits.stamps_ns.tolist(), cuts.tolist(), strict=True)):
         if cut:

@@ -41,12 +41,12 @@ def _inside(hits: Hits, member: I4, host: I4, radius: float) -> bool:
 
 
 def without_pieces(hits: Hits, members: Sequence[I4], max_gap_s: float) -> list[I4]:
-    """Remove tracks that are too often a part of another object.
+    """Remove tracks that are often a part of another object.
 
     If an object is split in some frames, the track of a piece lies, in the other frames, in the box
     of the whole object. An object that only stands near another one, or is hidden by it, has its
-    centre outside that box. ``members`` are the hits (k,) of each track, ascending; longer gaps
-    than ``max_gap_s`` are ignored.
+    centre outside that box. ``members`` are the hits (k,) of each track, ascending; gaps in a track
+    that are longer than ``max_gap_s`` are not checked.
     """
     if hits.axes is None:
         return list(members)
@@ -89,7 +89,7 @@ def _covered_beside(hits: Hits, k: int, members: Sequence[I4], owner: I4) -> int
 
 
 def _in_box(hits: Hits, which: I4, places: F8) -> Bool:
-    """Return (n,) whether each position (n, 3) lies in the box of the hit ``which`` (n,)."""
+    """Return whether each position (n, 3) lies in the box of the hit ``which`` (n,): (n,) bool."""
     axes = np.zeros((0, 3, 3)) if hits.axes is None else hits.axes
     local = np.einsum("nji,nj->ni", axes[which], places - hits.centers_of(which))
     return np.asarray((np.abs(local) <= 0.5 * hits.sizes[which]).all(axis=1))

@@ -218,7 +218,7 @@ def _predict(tracks: _Active, elapsed_s: float) -> _Active:
 
 
 def _costs(tracks: _Active, found: _Active, clock_ns: int, settings: TrackingSettings) -> F8:
-    """Return (m, n) costs of pairs: distance relative to the gate, plus size and posterior.
+    """Return the costs (m, n) of pairs: distance relative to the gate, plus size and posterior.
 
     Tracks that are not confirmed cost more; pairs beyond the gate cost infinity.
     """
