@@ -27,7 +27,7 @@ class _Seconds(click.FloatRange):
 
 SECONDS = _Seconds(min=0)
 
-json_option = click.option("--json", "as_json", is_flag=True, help="Print one JSON object.")
+json_option = click.option("--json", "as_json", is_flag=True, help="Print the result as JSON.")
 array_option = click.option(
     "--json", "as_json", is_flag=True, help="Print a JSON array with one object per recording."
 )

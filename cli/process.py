@@ -221,7 +221,7 @@ def _closing(executor: Any) -> Iterator[Any]:
 
 
 class _Tally:
-    """Counts of all outcomes of a batch, and the first 100 outcomes, or all if ``keep_all``."""
+    """Counts of a batch's outcomes, and its first 100 outcomes, or all if ``keep_all``."""
 
     def __init__(self, *, keep_all: bool) -> None:
         self.complete = self.failed = self.frames = 0

@@ -196,7 +196,7 @@ def _event(event: str, **values: Any) -> None:
 
 
 class LiveProgress(Progress):
-    """Bars on a terminal: one for the whole, one for each running recording."""
+    """Bars on a terminal: one for the batch, one for each running recording."""
 
     def __init__(self, tasks: Sequence[Any]) -> None:
         """Prepare the bars."""
