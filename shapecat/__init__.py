@@ -12,7 +12,7 @@ __version__ = "0.1.0"
 
 
 def __getattr__(name: str) -> Any:
-    """Load `shapecat.api` when one of its names is first used: `shapecat --help` needs none."""
+    """Load `shapecat.api` when one of its names is first used; `shapecat --help` uses none."""
     if name in __all__:
         return getattr(import_module("shapecat.api"), name)
     msg = f"module 'shapecat' has no attribute {name!r}"

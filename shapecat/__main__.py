@@ -10,7 +10,7 @@ from shapecat.system.stopping import leave
 
 
 def run() -> None:
-    """Run the command line. A signal that arrives before it handles signals ends the process."""
+    """Run the command line. Until it handles signals itself, a signal ends the process."""
     _handle(leave)
     collect_seldom()
     block_pandas()

@@ -66,7 +66,7 @@ class OpenRecording:
         end_s: float | None = None,
         every: int = 1,
     ) -> Iterator[Frame]:
-        """Yield the frames of depth sensors by log time; the options are as for `process`.
+        """Yield the frames of depth sensors in order of log time; the options are as for `process`.
 
         Unreadable frames are skipped.
 
@@ -132,8 +132,8 @@ def process(
 
     Raises
     ------
-    ConfigError : a setting does not exist or has an invalid value, or a script without this line
-        asks for several processes.
+    ConfigError : a setting does not exist or has an invalid value, or several processes are wanted
+        and the script lacks the ``__main__`` line.
     RecordingError, NoStreamError, ModelError, OutputError : as for the command, which prints them.
     """
     if cores > 1 and runs_again():

@@ -191,7 +191,7 @@ def upright_box(points: F4, up: ArrayLike) -> Box:
 
 
 def levelled(points: F4, up: ArrayLike) -> tuple[F4, F8]:
-    """Return the points of a box turned so that ``up`` becomes z, and the rotation (3, 3).
+    """Return the points rotated so that ``up`` becomes z, (n, 3), and the rotation (3, 3).
 
     The parameters are as for `upright_box`.
 

@@ -83,7 +83,7 @@ def recognize_ball() -> str:
 
 
 _REHEARSALS: tuple[Callable[[], object], ...] = (find_ball, recognize_ball)
-"""They take about equally long, and none needs the kernels of another."""
+"""Functions that compile the kernels, for processes that share no kernel and take equally long."""
 _POLL_S = 0.1
 _TELL_S = 10.0
 _STAGES = ("completion", "description", "detection", "learning", "reuse", "surface")

@@ -114,7 +114,7 @@ def _size(info: Mapping[str, Any]) -> int:
 
 
 def _search_remote(location: Location) -> Iterator[tuple[str, str, int]]:
-    """Yield URL, key and size in bytes of the recordings below a folder, also ROS 2 bag folders."""
+    """Yield URL, key and size in bytes of the recordings and ROS 2 bag folders below a folder."""
     files: list[tuple[str, str, int]] = []
     bags, runs = set(), set()
     for url, info in location.walk():

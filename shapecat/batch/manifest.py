@@ -200,7 +200,7 @@ class RemoteManifest(Manifest):
 
     def _send_now_and_then(self) -> None:
         while not self._ended.wait(_SEND_S):
-            with suppress(ShapecatError):  # reported in the end, if it goes on
+            with suppress(ShapecatError):  # reported at the end if it persists
                 self.send()
 
 

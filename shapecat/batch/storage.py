@@ -89,8 +89,8 @@ class Location:
 
         Raises
         ------
-        ShapecatError : the call failed; ``done`` is the verb of the message.
-        FileNotFoundError, FileExistsError : as from the storage.
+        ShapecatError : the call failed: the URL "cannot be" ``done``.
+        FileNotFoundError, FileExistsError : raised by the storage.
         """
         for wait_s in (*_WAITS_S, 0.0):
             try:

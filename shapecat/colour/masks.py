@@ -121,7 +121,7 @@ def labelled_masks(
 
 
 def _smoothed(filled: I4, label: int, box: list[int], reach: int, corner: tuple[int, int]) -> Mask:
-    """Return the mask of the pixels around which most pixels have the label."""
+    """Return the mask of a label after a majority filter."""
     left, top, right, bottom = box
     if right <= left:
         return NOTHING

@@ -13,7 +13,7 @@ from shapecat.types import Pose
 __all__ = ["Lens", "kernel_lens", "project", "rectified", "see"]
 
 _WIDEST = 3.0
-"""Largest slope that a lens with distortion is taken to see: 72 degrees off the axis."""
+"""Largest slope that a lens with distortion is assumed to see: 72 degrees off the axis."""
 Lens = tuple[F4, int, F4, float]
 """A lens for kernels: fx, fy, cx, cy in pixels; the kind of distortion (0 none, 1 polynomial,
 2 fisheye); its 8 coefficients; and the square of the largest slope that the lens sees."""
@@ -75,7 +75,7 @@ def kernel_lens(lens: LensCamera) -> Lens:
 def rectified(pixels: U1, lens: LensCamera) -> U1:
     """Return a colour image (h, w, 3) uint8 without the distortion of its lens.
 
-    Colours are interpolated bilinearly. Pixels that the original image does not show are black.
+    Colours are interpolated bilinearly. Pixels outside the original image are black.
     """
     if not lens.model:
         return pixels

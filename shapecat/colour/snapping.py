@@ -96,8 +96,8 @@ def _compare(colours: U1, depth: F4, band: float, core: float, window: int, like
     """Write to ``likelier`` the log-likelihood ratio of inside to outside, for pixels in the band.
 
     The colours of each side are modelled by a normal distribution with the same variance in all
-    channels, fitted to a grid of pixels around. ``depth`` (h, w) is the distance from the outline
-    in pixels, positive inside.
+    channels, fitted to a grid of pixels around it. ``depth`` (h, w) is the distance from the
+    outline in pixels, positive inside.
     """
     height, width, channels = colours.shape
     step = max(1, window // 4)

@@ -155,8 +155,8 @@ def _row_and_column(pixel: int, row: int, width: int) -> tuple[int, int]:
 def _extent(depth: F4, pixels: U4, own: Bool) -> tuple[int, int, int, int, float, float]:
     """Return the extent of some pixels in the image and in depth.
 
-    The result is first and last row, first and last column, the least depth of all sparse pixels of
-    the image, and the greatest depth of the given pixels. ``own`` is set to True at the sparse
+    The result is first and last row, first and last column, the smallest depth of all sparse pixels
+    of the image, and the largest depth of the given pixels. ``own`` is set to True at the sparse
     pixels among these.
     """
     top, bottom, left, right = depth.shape[0], -1, depth.shape[1], -1

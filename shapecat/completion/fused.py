@@ -133,7 +133,7 @@ def _overlaid(views: BoxViews, weights: F8, origin: F8, base: F8) -> tuple[F8, F
     reached = around + places[:, :1] * COSINES + places[:, 1:2] * SINES
     facing = faced(((views.sensors - origin) @ base)[:, :2])
     each = weights[:, None] * np.where(facing, 1.0, _UNSEEN)
-    # A view of only a part reaches less far: it must not outvote views of the rest.
+    # The outline of a partial view is smaller: it must not outvote complete views.
     whole = weights >= weights.max()
     shown = _median(reached[whole], each[whole])
     reached = np.where(whole[:, None], reached, np.maximum(reached, shown))

@@ -26,7 +26,7 @@ ENOUGH_POINTS = 256
 """Maximum number of points used for the outline; more only cost time."""
 
 _TOP = 0.98
-"""Share of the points below the top."""
+"""Fraction of the points below the top; the others count as noise."""
 _NOISY_M, _FLAT = 0.004, 1 / 3
 """Largest height by which noise lifts points of a flat top, metres; fraction of the points that
 make a face flat."""
@@ -50,7 +50,7 @@ class _OutlinePrior(NamedTuple):
     noise : metres, the spread in depth of the readings on a flat side.
     roundness : weight of the prior for a circle, as a number of directions: one side says little
         about the depth.
-    fits : largest deviation of the visible side from an oval that fits, as a share of its radius.
+    fits : largest deviation of the visible side from an accepted oval, as a share of its radius.
     """
 
     stray: float = 0.016
@@ -137,7 +137,7 @@ def footprint(seen: F8, facing: F8, posterior: F8, categories: Sequence[str]) ->
 
     For a box, the footprint is the visible outline. For other categories, it is the oval fitted to
     the visible side; a cup's handle is added. If no oval fits, as for a bottle that lies down, the
-    visible outline is used instead. The result is the rectangle of least area around the footprint.
+    visible outline is used instead. The result is the smallest rectangle around the footprint.
 
     Parameters
     ----------

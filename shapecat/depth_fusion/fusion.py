@@ -103,7 +103,7 @@ def _projection(camera: Camera, earlier_from_sensor: Pose) -> tuple[F4, F4]:
 
 @kernel
 def _guide(depth: F4, range_m: float) -> F4:
-    """Return the depth to look for at each pixel: its reading; for a hole, minus a neighbour's.
+    """Return the depth to look for at each pixel: its own, or for a hole, minus a neighbour's.
 
     It is 0 beyond the range and without a neighbour.
     """

@@ -159,7 +159,7 @@ def context(
 
 @kernel(inline=True)
 def _extents(points: F4, height: float, eye: F4, out: F4) -> tuple[float, float, float]:
-    """Compare height and widths, in directions that start at the line of sight."""
+    """Compare the height with horizontal widths; return the largest, across and along the view."""
     ex, ey = eye[0], eye[1]
     length = np.sqrt(ex * ex + ey * ey)
     ex, ey = (ex / length, ey / length) if length > 1e-6 else (1.0, 0.0)

@@ -77,9 +77,9 @@ def fit_surfaces(
 ) -> tuple[F4, F4]:
     """Fit a quadric around each neuron.
 
-    The neighbourhood is all points within a radius of the neuron. The height above its plane of
-    least squares is fitted by a full quadric (ridge regression), and the curvatures follow from
-    the first and second fundamental forms.
+    The neighbourhood is all points within a radius of the neuron. The height above its
+    least-squares plane is fitted by a full quadric (ridge regression), and the curvatures follow
+    from the first and second fundamental forms.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def fit_surfaces(
 def _normal(
     u: F4, v: F4, w: F4, near: int, ex: float, ey: float, ez: float
 ) -> tuple[float, float, float]:
-    """Return the direction of least variance; without one, the unit vector along (ex, ey, ez)."""
+    """Return the direction of least variance; if there is none, that of (ex, ey, ez)."""
     su = sv = sw = suu = suv = suw = svv = svw = sww = np.float32(0)
     for k in range(near):
         a, b, c = u[k], v[k], w[k]
@@ -157,7 +157,7 @@ def _normal(
     n = max(near, 1)
     xx, xy, xz = suu / n - su * su / n / n, suv / n - su * sv / n / n, suw / n - su * sw / n / n
     yy, yz, zz = svv / n - sv * sv / n / n, svw / n - sv * sw / n / n, sww / n - sw * sw / n / n
-    # Least eigenvalue of a symmetric 3x3 matrix in closed form (Smith 1961).
+    # Smallest eigenvalue of a symmetric 3x3 matrix in closed form (Smith 1961).
     mean = (xx + yy + zz) / 3
     off = xy * xy + xz * xz + yz * yz
     p = np.sqrt(((xx - mean) ** 2 + (yy - mean) ** 2 + (zz - mean) ** 2 + 2 * off) / 6)
@@ -169,7 +169,7 @@ def _normal(
         )
         half = min(1.0, max(-1.0, det / 2))
         least = mean + 2 * p * np.cos(np.arccos(half) / 3 + 2 * np.pi / 3)
-        # Its vector is the longest cross product of two rows of (matrix - least).
+        # Its eigenvector is the longest cross product of two rows of (matrix - least).
         xx, yy, zz = (xx - least) / p, (yy - least) / p, (zz - least) / p
         xy, xz, yz = cxy, cxz, cyz
         a1, b1, c1 = xy * yz - xz * yy, xz * xy - xx * yz, xx * yy - xy * xy
@@ -184,7 +184,7 @@ def _normal(
         if l1 > 1e-6:
             length = np.sqrt(l1)
             return a1 / length, b1 / length, c1 / length
-        # Points on a line: the normal is the part of the line of sight across it.
+        # Points on a line: the normal is the line of sight's component perpendicular to it.
         if xx + yy + zz > 0:
             lx, ly, lz = xx, xy, xz
             if yy > xx and yy >= zz:

@@ -163,7 +163,7 @@ def _cloud_of(points: F4, middle: F8, unit: float) -> F4:
     cloud = np.zeros((3, total), np.float32)
     for k in range(total):
         for axis in range(3):
-            # points this far away are not the neurons' own: the bound keeps squares finite
+            # points this far away belong to no neuron: the bound keeps squares finite
             value = (points[k * step, axis] - middle[axis]) / unit
             cloud[axis, k] = min(max(value, -_FAR), _FAR)
     return cloud

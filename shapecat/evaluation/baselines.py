@@ -136,7 +136,7 @@ def _chain(blocks: tuple[str, ...], seed: int, jobs: int | None) -> _Learner:
 
 
 def _plain(make: Callable[[], Any], features: Callable[[DescribedViews], F4]) -> _Learner:
-    """Return a classifier of scikit-learn on features of the views; unknown shapes are left out."""
+    """Return a scikit-learn classifier on features of the views; unknown shapes are left out."""
 
     def learn(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
         known = train.where(train.labels != UNKNOWN)

@@ -90,7 +90,7 @@ def draw_frame(
 def _states(
     found: Labelling, true: Labelling, pairs: Mapping[int, int], rows: Sequence[Any], size: int
 ) -> U1:
-    """Return (n,) the number of each pixel's colour, from 1; 0 without an object.
+    """Return the colour number of each pixel, (n,), from 1; 0 without an object.
 
     Pixels of objects that are not matched with each other are surplus, so that split objects show.
     """
@@ -107,7 +107,7 @@ def _states(
 
 
 def _shades(frame: Frame | None, height: int, width: int) -> U1:
-    """Return (n,) the grey level of each pixel, shaded from the camera; nearer is brighter."""
+    """Return the grey level of each pixel, (n,), shaded from the camera; nearer is brighter."""
     if frame is None or frame.depth is None:
         return np.full(height * width, _SHADES * 3 // 4)
     depth = np.asarray(frame.depth, np.float64)

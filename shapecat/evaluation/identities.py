@@ -175,7 +175,7 @@ def _hota(seen: _Occurrences) -> tuple[float, float, float]:
 
 
 def _alignment(seen: _Occurrences) -> F8:
-    """Return (true, found) the fraction of two identities' frames in which they coincide."""
+    """Return the fraction of two identities' frames in which they coincide, (true, found)."""
     together = np.zeros((seen.true.size, seen.found.size))
     for true, found, similarity in seen.frames:
         beside = similarity.sum(axis=0) + similarity.sum(axis=1)[:, None] - similarity

@@ -112,7 +112,7 @@ def match_masks(found: Sequence[U4], true: Sequence[U4]) -> MaskMatches:
 
 
 def _common(found: Sequence[U4], true: Sequence[U4]) -> F8:
-    """Return (found, true) the number of pixels that each pair of masks has in common."""
+    """Return the number of pixels that each pair of masks has in common, (found, true)."""
     size = max((int(mask.max()) + 1 for mask in (*found, *true) if len(mask)), default=0)
     common = np.zeros((len(found), len(true)), np.int64)
     for k, mask in enumerate(true):

@@ -131,13 +131,13 @@ _Ranges: TypeAlias = Sequence[tuple[str, int, float]]
 
 
 def _breakdown(name: str, ranges: _Ranges) -> tuple[tuple[str, ...], _Rows]:
-    """Return head and rows of a table of accuracies."""
+    """Return header and rows of a table of accuracies."""
     rows = [(label, str(count), _text(value)) for label, count, value in ranges]
     return (name, "views", "accuracy"), list(rows)
 
 
 def _comparisons(report: Report) -> list[tuple[str, tuple[str, ...], _Rows]]:
-    """Return title, head and rows of each table that has no picture."""
+    """Return title, header and rows of each table that has no picture."""
     tables: list[tuple[str, tuple[str, ...], _Rows]] = []
     if report.fused:
         rows = [

@@ -30,7 +30,7 @@ _POINTS = (0, 60, 120, 250, 500, 1000, math.inf)
 class Compared(NamedTuple):
     """Results of a classifier; undefined metrics are None.
 
-    ``learned`` is its number of training views.
+    ``learned`` is the number of views that it was trained on.
     """
 
     learner: str

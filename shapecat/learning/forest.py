@@ -16,8 +16,8 @@ __all__ = ["FlatForest", "flatten"]
 class FlatForest(Record):
     """Decision trees in four arrays, evaluated without scikit-learn.
 
-    Both children of a node are adjacent and come after it. Words number the leaves in the order of
-    the nodes.
+    Both children of a node are adjacent and come after it. A word is the number of a leaf, counted
+    in the order of the nodes.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class FlatForest(Record):
 
     @cached_property
     def word(self) -> I4:
-        """(n,) word of each leaf; meaningless for inner nodes."""
+        """The word of each leaf, (n,); meaningless for inner nodes."""
         return (np.cumsum(self.left == 0) - 1).astype(np.int32)
 
     @property

@@ -29,13 +29,13 @@ def widened(
     Parameters
     ----------
     train : views whose statistics standardise the new components.
-    descriptor_names : names of all components of the present descriptor.
+    descriptor_names : names of all components of the current descriptor.
     blocks : range of each block in the descriptor, by name.
     used : names of the blocks that the model should have.
 
     Raises
     ------
-    ValueError : the present descriptor lacks a component of the model.
+    ValueError : the current descriptor lacks a component of the model.
     """
     place = {name: k for k, name in enumerate(descriptor_names)}
     lost = [name for name in categorizer.descriptor_names if name not in place]

@@ -45,7 +45,7 @@ class World:
     seed : seed of all arrangements.
     kinds : kinds of distractors to choose from.
     unknown : fraction of the objects that are distractors.
-    lying : fraction of cups, cans and bottles that lie; None for the usual one. Lying objects are
+    lying : fraction of cups, cans and bottles that lie; None for the default. Lying objects are
         harder, so training uses more of them.
     leaning : fraction of the objects on tables that are tilted, as if they leant on something.
     settled : fraction of the arrangements made by physics: piles, bins, crowded compartments.

@@ -186,7 +186,7 @@ def _pairs(
 
 
 def count_labels(owners: U1, labels: I4, grid: DepthGrid) -> I4:
-    """Return (segments, labels) the number of cells of each segment with each label.
+    """Return the number of cells of each segment with each label, (segments, labels).
 
     Parameters
     ----------
@@ -214,7 +214,7 @@ def _whose(segments: Segments, counts: I4, things: I4) -> tuple[I4, I4]:
 
 
 def _meeting(segments: Segments, whose: I4) -> Iterator[tuple[int, int]]:
-    """Yield the adjacent pairs of segments that are not mixed, at least one of an object."""
+    """Yield adjacent pairs of unmixed segments, of which at least one belongs to an object."""
     n = segments.parent.size
     for p in range(1, n):
         adjacent = find_adjacent(segments, p)

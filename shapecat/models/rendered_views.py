@@ -21,12 +21,12 @@ _COARSE = 4
 _SCALES = (0.5, 1.0, 1.0, 1.0, 1.5)
 """Factors on the sensors' own resolutions."""
 _WIDTHS = (224, 1280)
-"""Least and greatest image width, pixels."""
+"""Minimum and maximum image width, pixels."""
 _OFTEN = {"kinect": 3.0, "realsense": 2.0}
 """Weights of sensors that most recordings come from; others have weight 1."""
 _DISTANCES_M = (0.25, 3.0)
 _CLOSER_M = 0.03
-"""Least distance of the target beyond the sensor's near limit."""
+"""Minimum distance of the target beyond the sensor's near limit."""
 
 
 class RenderedView(NamedTuple):
@@ -108,7 +108,7 @@ def _viewpoint(arrangement: Arrangement, sensor: Sensor, rng: np.random.Generato
 
 
 def _visible_fractions(seen: Geometry, owners: I4, camera: Camera, pose: Pose, count: int) -> F8:
-    """Return (count,) the visible fraction of each object.
+    """Return the visible fraction of each object, (count,).
 
     It is the number of readings divided by the pixels that the object would have alone in an image
     twice as wide and high; 0 with fewer than `_FEWEST_PIXELS` readings.

@@ -30,7 +30,7 @@ __all__ = [
 ]
 
 SETS = {"training": (1, 100_000), "calibration": (2, 160), "test": (100_003, 100)}
-"""Seed and greatest number of tables of each set; seeds from 100000 on are for evaluation only."""
+"""Seed and maximum number of tables of each set; seeds from 100000 on are for evaluation only."""
 _SHARES: dict[str, dict[str, Any]] = {
     "training": {"unknown": 0.3, "lying": 0.35, "leaning": 0.05, "settled": 0.4, "cameras": 10},
     "calibration": {"unknown": 0.17, "settled": 0.4},

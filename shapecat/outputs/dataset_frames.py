@@ -73,8 +73,8 @@ class DatasetImage:
 def split_runs(runs: Sequence[FinishedRun], val: float) -> list[str]:
     """Return ``train`` or ``val`` for each run; runs of the same recording are in the same split.
 
-    The draw depends on the content of the recordings, so that adding runs changes little. A single
-    recording goes to the training split.
+    The random draw depends on the content of the recordings, so that adding runs changes little. A
+    single recording goes to the training split.
 
     Raises
     ------

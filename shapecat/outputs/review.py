@@ -119,7 +119,7 @@ def _stream(name: str, run: Mapping[str, object]) -> rr.RecordingStream:
 
 
 class _Review:
-    """Writes frame by frame, and stores the data for the layout and the paths."""
+    """Writes a review frame by frame, and keeps the data for its layout and paths."""
 
     def __init__(
         self,

@@ -41,7 +41,7 @@ def ros_counterpart(kind: str) -> str:
 
 
 def _plain(kind: str) -> str:
-    """Return a Foxglove type's name as in JSON and protobuf, also given its ROS name."""
+    """Return a Foxglove type's name in JSON and protobuf, given this name or its ROS name."""
     return kind.replace("foxglove_msgs/msg/", "foxglove.")
 
 

@@ -57,6 +57,6 @@ class Lens:
 
 
 def _points_along(rays: F8, depth: F4) -> F4:
-    """Return (h, w, 3) points at ``depth`` along the rays; NaN where there is no reading."""
+    """Return the points (h, w, 3) at ``depth`` along the rays; NaN where there is no reading."""
     z = np.where(depth > 0, depth, np.float32(np.nan))
     return np.stack([rays[..., 0] * z, rays[..., 1] * z, z], axis=-1).astype(np.float32)

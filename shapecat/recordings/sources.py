@@ -115,7 +115,7 @@ def _placed(points: F4, pose: Pose | None) -> F4:
 
 
 class DepthSource(Source):
-    """A stream of depth images; each is held back until the calibration of its stamp arrives."""
+    """A stream of depth images; each waits for the calibration with its stamp."""
 
     def __init__(self, recording: Recording, stream: Stream) -> None:
         """Start without a calibration."""

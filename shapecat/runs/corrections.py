@@ -240,7 +240,7 @@ def _places_agree(table: TrackTable, folder: Path) -> bool:
 
 
 def _number(cell: str | None) -> float | None:
-    """Return the number in a cell, also with a decimal comma; None if it is not a number."""
+    """Return the number in a cell, which may have a decimal comma; None if it is not a number."""
     with suppress(ValueError, AttributeError):
         return float((cell or "").strip().replace(",", "."))
     return None

@@ -1,8 +1,8 @@
 """Choose the frames to perceive again with the up direction of the whole recording.
 
 If the sensor poses are known, all frames have the same up direction in the fixed frame. If they are
-unknown and the frames before and after a frame agree with each other, the camera is taken to be at
-rest, and the up direction of these frames is used.
+unknown and the frames before and after a frame agree with each other, the camera is assumed to be
+at rest, and the up direction of these frames is used.
 """
 
 from collections.abc import Iterable, Iterator
@@ -36,7 +36,7 @@ _AROUND, _AROUND_NS = 30, 3_000_000_000
 _FEWEST = 4
 """With fewer frames to compare, nothing is decided."""
 _STILL_M, _OFF_M = 0.03, 0.08
-"""Largest variation of the height of a support below a camera at rest, and the least height
+"""Largest variation of the height of a support below a camera at rest, and smallest height
 difference to another support."""
 
 

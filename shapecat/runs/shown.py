@@ -52,7 +52,7 @@ class ShownTracks:
     frames : the rows of the arrays below, for each frame.
     detections, tracks : (rows,) numbers of the detections in their frames, and of their tracks.
     labels : the label of each track.
-    ended : for each frame, the tracks that were shown last in the previous frame of the topic.
+    ended : for each frame, the tracks whose last frame was the previous one of the topic.
     causal : (rows, categories) causal posteriors; empty unless requested.
     full : (rows, 10) centre, size (metres) and orientation of the full boxes in the sensor frame;
         NaN if unknown.
@@ -217,7 +217,7 @@ def _join(parts: Sequence[ShownBox], up: F4) -> ShownBox:
 def _ended(
     folder: Path, frames: Mapping[Key, slice], tracks: I4, stamps_ns: I4
 ) -> dict[Key, tuple[int, ...]]:
-    """Return the tracks that end in each frame: those shown last in the frame before it."""
+    """Return the tracks that end in each frame: those whose last frame is the one before it."""
     keys = np.repeat(np.arange(len(frames)), [rows.stop - rows.start for rows in frames.values()])
     latest = np.argsort(stamps_ns, kind="stable")[::-1]
     gone, at = np.unique(tracks[latest], return_index=True)

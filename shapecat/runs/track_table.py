@@ -1,4 +1,4 @@
-"""tracks.csv: one line per track, to read and correct, also in a spreadsheet.
+"""tracks.csv: one line per track, to read and correct, for example in a spreadsheet.
 
 Any separator, quotes, line ends, encoding, order of columns, and numbers such as ``1.0`` are read.
 """
@@ -58,7 +58,7 @@ class TrackTable:
 
 
 def read_track_table(path: Path) -> TrackTable:
-    """Read a tracks.csv, also one that a spreadsheet has saved.
+    """Read a tracks.csv, even if a spreadsheet has saved it.
 
     Raises
     ------

@@ -64,7 +64,7 @@ def overlap(a: F8, b: F8, gap: float) -> bool:
 
 
 def inside(points: F8, outline: F8, margin: float) -> bool:
-    """Return whether all points (n, 2) lie in a convex outline (k, 2), ``margin`` from its edge.
+    """Return whether all points (n, 2) lie in a convex outline, at least ``margin`` from its edge.
 
     An outline that is a point or a line contains nothing.
     """

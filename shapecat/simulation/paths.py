@@ -52,7 +52,7 @@ def walk(
     elevation: Range,
     sweep: Range,
 ) -> tuple[Pose, ...]:
-    """Walk back and forth on an arc in front of a target, swaying slightly, looking at the target.
+    """Carry a camera back and forth on an arc in front of a target, with the sway of a walk.
 
     Parameters
     ----------
@@ -98,7 +98,7 @@ def stroll(
     elevation: Range,
     reach: Range,
 ) -> tuple[Pose, ...]:
-    """Walk sideways back and forth along a counter, swaying slightly, looking straight ahead.
+    """Carry a camera back and forth along a counter that it faces, with the sway of a walk.
 
     Parameters
     ----------
@@ -128,7 +128,7 @@ def _drawn(rng: Generator, value: Range) -> float:
 def hold(
     rng: Generator, target: F8, frames: int, *, distance: float, elevation: float
 ) -> tuple[Pose, ...]:
-    """Keep the camera still, looking at a target.
+    """Keep a camera still, aimed at a target.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ def scattered(
     distance: tuple[float, float] = (0.5, 2.0),
     elevation: tuple[float, float] = (15.0, 60.0),
 ) -> tuple[Pose, ...]:
-    """Look at a target from random directions.
+    """Aim a camera at a target from random directions.
 
     Parameters
     ----------

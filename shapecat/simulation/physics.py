@@ -67,7 +67,7 @@ def settle(obstacles: Sequence[Mesh], drops: Sequence[Drop]) -> list[Rest]:
 
     Returns
     -------
-    One resting pose for each drop, also of objects that fell off.
+    One resting pose for each drop, including objects that fell off.
     """
     import mujoco  # type: ignore[import-untyped]  # noqa: PLC0415  slow; most scenes need no physics
 

@@ -80,7 +80,7 @@ def _centre_of_mass(corners: F8, origin: F8) -> F8:
 
 
 def _inside(corners: F8, normals: F8, foot: F8) -> F8:
-    """Return (k,) whether each point lies in its triangle, with a tolerance of 1e-9."""
+    """Return whether each point lies in its triangle, (k,), with a tolerance of 1e-9."""
     signs = []
     for k in range(3):
         a, b = corners[:, k], corners[:, (k + 1) % 3]

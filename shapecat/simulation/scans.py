@@ -124,7 +124,7 @@ def _slice_area(corners: F8, z: float) -> float:
 
 
 def _hollow(points: F8, mesh: Mesh) -> float:
-    """Return the median depth below the top of the middle of the surface, seen from above.
+    """Return the median depth, below the top, of the central surface as seen from above.
 
     The depth is relative to the greatest distance from the z axis.
     """

@@ -36,7 +36,7 @@ SceneKind = Literal[
 
 @dataclass(frozen=True)
 class _Wish:
-    """Content of a scene; ``distractors`` None leaves their number to the kind of scene."""
+    """Contents of a scene; if ``distractors`` is None, the kind of scene decides their number."""
 
     filming: Filming
     categories: tuple[str, ...]

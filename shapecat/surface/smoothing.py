@@ -1,4 +1,4 @@
-"""Moving least squares: points move onto the surface that their neighbourhood suggests."""
+"""Moving least squares: points move onto a surface fitted to their neighbourhood."""
 
 import numpy as np
 

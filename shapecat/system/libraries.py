@@ -1,4 +1,4 @@
-"""Keep the processes of this program from loading a library for nothing."""
+"""Keep the processes of this program from loading a library that they do not use."""
 
 import sys
 from importlib.abc import MetaPathFinder
@@ -24,6 +24,6 @@ def block_pandas() -> None:
     """Keep this process from importing pandas; for processes that run nothing but shapecat.
 
     With its first array, Arrow loads pandas where it is installed, in order to recognise data
-    frames. That takes 0.4 s in each process, and no command has any.
+    frames. That takes 0.4 s in each process, and no command uses data frames.
     """
     sys.meta_path.insert(0, _PandasBlocker())

@@ -20,7 +20,7 @@ class Trees(NamedTuple):
     ----------
     roots : (t,) index of the root of each tree.
     feature, threshold : (n,) a sample goes left if this feature is <= this threshold.
-    left : (n,) index of the left child, 0 in leaves; the right child is the next node.
+    left : (n,) index of the left child, 0 in leaves; the right child is ``left + 1``.
     """
 
     roots: I4

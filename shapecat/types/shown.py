@@ -47,7 +47,7 @@ class LabelledFrame(Record):
     Attributes
     ----------
     fixed_from_sensor : None where the recording has no fixed frame.
-    ended : tracks last shown in the previous frame of the topic.
+    ended : tracks whose last frame was the previous one of the topic.
     seconds : time spent in each stage.
     up : (3,) unit vector, sensor frame; None if unknown.
     reused_from : index of the earlier frame from which the scene is copied; None if it is new.

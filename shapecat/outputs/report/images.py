@@ -36,7 +36,7 @@ _GOOD_DETAIL = 12.0
 _NEARER = 0.015
 """A pixel occludes its neighbour if it is nearer by this many metres plus this share."""
 _CROWDED = 0.08
-"""With a larger share of occluded points, a cloud is taken to be fused from several views."""
+"""With a larger share of occluded points, a cloud counts as fused from several views."""
 _FAR_M = 6.0
 _SAME_SURFACE = 0.02
 """Neighbours whose inverse depths differ by less than this share are on the same surface."""

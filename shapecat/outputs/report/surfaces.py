@@ -152,7 +152,7 @@ def _closed(near: F8, passes: int = 3) -> F8:
 
 
 def _smoothed(near: F8, bare: U1, passes: int = 3) -> F8:
-    """Average each pixel (h, w) with its neighbours on the object, also for empty pixels."""
+    """Average each pixel (h, w), even if empty, with its neighbours on the object."""
     weight, value = (~bare).astype(np.float64), np.where(bare, 0.0, near)
     for _ in range(passes):
         value, weight = _blurred(value * weight), _blurred(weight)
@@ -168,7 +168,7 @@ def _blurred(image: F8) -> F8:
 
 
 def _palette(colour: tuple[int, int, int]) -> tuple[U1, U2]:
-    """Return a palette (k, 3) and its opacity: a transparent entry, then shades from dark on."""
+    """Return a palette (k, 3) and its opacity: a transparent entry, then shades, darkest first."""
     light = np.linspace(0, 1, _SHADES)[:, None]
     base = np.array(colour, np.float64)
     dark, bright = 0.32 * base, base + 0.45 * (255 - base)
