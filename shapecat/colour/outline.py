@@ -47,7 +47,7 @@ def outlines(mask: Mask, tolerance_px: float = _TOLERANCE_PX) -> list[F8]:
 def joined(rings: Sequence[F8]) -> F8:
     """Join outlines (n, 2) into one polygon (m, 2), for formats that store one per object.
 
-    Source: as in converters of COCO data sets, a double edge links the nearest corners.
+    A double edge links the nearest corners, as in converters of COCO data sets.
     """
     whole = rings[0]
     for ring in rings[1:]:

@@ -23,7 +23,7 @@ def vertical_axis(x: F4, y: F4, normals: F4, weight: F4) -> tuple[float, float, 
 
     Parameters
     ----------
-    x, y : (n,) positions of the neurons.
+    x, y : (n,) positions of the neurons, in any unit of length.
     normals : (3, n) unit vectors.
     weight : (n,) each neuron's share of the points.
 
@@ -74,7 +74,7 @@ def profile(
 
     Parameters
     ----------
-    x, y, z : (n,) positions of the neurons.
+    x, y, z : (n,) positions of the neurons, in units of the mean distance between neurons.
     weight : (n,) each neuron's share of the points.
     normals, curvatures : (3, n) and (2, n), from `fit_surfaces`.
     low, high : heights of the lowest and highest point.

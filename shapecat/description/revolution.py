@@ -47,6 +47,7 @@ def revolution(
     vertical axis, and one whose axis may tilt. The second is cut into slices, from its wide to its
     narrow end. The features of a slice are its share of the points, the mean radius (relative to
     the largest), the deviation from that radius, and the share of the points that face the axis.
+    Lengths are in units of the mean distance between neurons.
 
     Parameters
     ----------

@@ -125,7 +125,7 @@ def _learners(blocks: tuple[str, ...], seed: int, jobs: int | None) -> dict[str,
 
 
 def _chain(blocks: tuple[str, ...], seed: int, jobs: int | None) -> _Learner:
-    """Return shapecat's classifier, trained also on unknown shapes, like `shapecat train`."""
+    """Return shapecat's classifier; like `shapecat train`, it also learns unknown shapes."""
 
     def learn(train: DescribedViews, test: DescribedViews, categories: tuple[str, ...]) -> F8:
         nothing = train.where(np.zeros(0, np.int64))

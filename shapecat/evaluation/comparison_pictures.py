@@ -65,7 +65,7 @@ def draw_frame(
     ----------
     frame : the depth frame; None for a plain background.
     pairs : index of the true object for each matched found object.
-    rows : `Difference` rows of the frame, first one for each found object, in their order.
+    rows : `Difference` rows of the frame; those of the found objects come first, in their order.
 
     Returns
     -------
@@ -92,7 +92,8 @@ def _states(
 ) -> U1:
     """Return the colour number of each pixel, (n,), from 1; 0 without an object.
 
-    Pixels of objects that are not matched with each other are surplus, so that split objects show.
+    Where a found object lies on a true one that it is not matched with, its pixels are surplus, so
+    that split objects show.
     """
     state = np.zeros(size, np.int64)
     for number, labelling in ((2, true), (3, found)):

@@ -46,7 +46,7 @@ class Worker:
     """
 
     def __init__(self, threads: int, room: threading.Semaphore) -> None:
-        """Start the process, with ``threads`` for numeric libraries; answers release ``room``."""
+        """Start a process with ``threads`` for numeric libraries; each answer releases ``room``."""
         self.lost = False
         self._socket, far = socket.socketpair()
         asked, self._ask = _SPAWN.Pipe(duplex=False)

@@ -127,7 +127,7 @@ def _encoded(
 def _image_items(
     images: Iterable[ImageFrame], encoders: Sequence[Callable[[ImageFrame], bytes]], first: int
 ) -> Iterator[Item]:
-    """Encode image annotations for the channels from ``first`` on."""
+    """Encode image annotations; their channels are numbered from ``first``."""
     for image in images:
         for number, encode in enumerate(encoders, start=first):
             yield Item(number, image.log_time_ns, encode(image))
@@ -185,7 +185,7 @@ def _annotations(frames: Iterable[ShownFrame]) -> Iterator[Annotation]:
 
 
 def _encoding(recording: Recording, first: Annotation | None) -> str:
-    """Return the encoding for annotations: that of the annotated topic, else the commonest."""
+    """Return the encoding for annotations: that of the annotated topic, else the most common."""
     if recording.kind == "ros1":
         return "cdr"
     topics = [topic for topic in recording.topics if topic.encoding in ENCODERS]

@@ -22,9 +22,9 @@ def caption(track: int, category: str, confidence: float) -> str:
 
 
 def confidence_text(confidence: float) -> str:
-    """Return a confidence with two decimals, the same whether or not it was rounded to three.
+    """Return a confidence with two decimals; 1.00 only if it rounds to 1.000.
 
-    It is 1.00 only if it rounds to 1.000.
+    The text of a confidence rounded to three decimals, as in tracks.csv, is the same.
 
     Examples
     --------

@@ -204,7 +204,7 @@ def _translate(
 ) -> tuple[tuple[Transferred, ...], tuple[Missed, ...]]:
     """Return the labels for the tracks of the target, and the labels without a match.
 
-    The label of a whole, the track that others were merged with, is copied to its matches. Matches
+    A *whole* is a track that others were merged with. Its label is copied to its matches. Matches
     of the other tracks are merged with the first match of the whole.
     """
     given: dict[int, Transferred] = {}

@@ -39,7 +39,7 @@ class Container(Protocol):
     def __exit__(self, *_: object) -> None: ...
 
     def write(self, topic: str, message: Any, log_time_ns: int) -> None:
-        """Append a message of the ROS version of `messages`; times are in nanoseconds."""
+        """Append a message made by `messages`; times are in nanoseconds."""
 
 
 class _Mcap:

@@ -67,7 +67,7 @@ def make_shelf(
 ) -> tuple[list[Support], list[Support]]:
     """Return three shelf boards, ``width`` by ``depth``, and the two sides and the back.
 
-    The lowest board is at z = ``low``, the others ``step`` above each other.
+    The lowest board is at z = ``low``, and each of the others ``step`` higher.
     """
     thick = 0.02
     top = low + 3 * step

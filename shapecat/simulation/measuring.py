@@ -49,7 +49,7 @@ def measure(image: Image, sensor: Sensor, rng: Generator) -> tuple[F4, I4]:
 
 
 def _displaced(image: Image, sensor: Sensor, rng: Generator) -> tuple[F8, I4, F4]:
-    """Sample the true image at slightly displaced pixels: ragged outlines.
+    """Sample the true image at slightly displaced pixels, which makes outlines ragged.
 
     Returns the inverse depth (1/m), owners and cosines, all (h, w).
 

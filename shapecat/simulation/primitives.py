@@ -100,7 +100,7 @@ def tube(
 
 
 def _across(path: F8, along: F8) -> F8:
-    """Return unit vectors (k, 3) perpendicular to a path, with the least rotation along it."""
+    """Return unit vectors (k, 3) perpendicular to a path, with minimal rotation along it."""
     spread = np.linalg.svd(path - path.mean(axis=0), full_matrices=False)[2]
     start = spread[-1] if abs(spread[-1] @ along[0]) < 0.9 else spread[0]
     if start[np.argmax(np.abs(start))] < 0:  # the sign of a singular vector is free

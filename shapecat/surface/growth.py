@@ -264,7 +264,7 @@ def grow_thesis(
 
 @kernel(inline=True)
 def _prune(gas: Gas, count: int, before: I4) -> int:
-    """Remove neurons whose ``wins`` are still ``before``, down to 3; return the number left."""
+    """Remove neurons that have not won since ``before``, down to 3; return the number left."""
     i = 0
     while i < count:
         if gas.wins[i] != before[i] or count <= 3:

@@ -101,7 +101,7 @@ def _find_border(plane_id: I4, me: int, i: int, border: U1) -> bool:
 
 @kernel(inline=True)
 def _goes_on(over: Overhang, i: int, j: int) -> bool:
-    """Return whether the surface at a cell above the plane continues outside it; needs no flood."""
+    """Return whether the surface at a cell above the plane continues in a neighbour outside it."""
     rows, columns = over.visited.shape
     some, here = False, over.grid.inverse_depth[i, j]
     for di, dj in SIDES:

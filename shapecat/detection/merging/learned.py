@@ -91,7 +91,7 @@ def _rate(
     scratch: Scratch,
     logits: F8,
 ) -> None:
-    """Write the logits of pairs of ``p`` with segments from ``first`` on, at [lower, higher]."""
+    """Write the logits of ``p`` with segments from ``first`` on; the lower number is the row."""
     adjacent = find_adjacent(segments, p)
     for q in range(first, adjacent.size):
         low, high = min(p, q), max(p, q)

@@ -117,8 +117,8 @@ def _stamps(folder: Path) -> list[tuple[int, Key]]:
 def _strip(stamps: Sequence[tuple[int, Key]], shown: Mapping[Key, set[int]]) -> dict[Key, float]:
     """Return one frame of each part of a run, with its seconds since the first frame.
 
-    In each part it is the frame with the most tracks that no earlier one shows, then the one with
-    the most tracks, then the one nearest to the middle.
+    In each part it is the frame with the most tracks that no earlier one shows; on ties, the one
+    with the most tracks, then the one nearest to the middle.
     """
     covered: set[tuple[str, int]] = set()
     strip = {}
