@@ -1,4 +1,4 @@
-"""Compile the kernels of perception in two processes; it takes minutes, once per installation.
+"""Compile the kernels of perception in two processes: about a minute, once per installation.
 
     python -m shapecat.rehearsal
 

@@ -227,7 +227,7 @@ def _labelled_part(found: Labelling, true: Labelling, key: Key) -> Labelling:
     size = None if true.shape is None else true.shape[0] * true.shape[1]
     pixels = [item.pixels for item in found.items if item.pixels is not None and item.pixels.size]
     if size is not None and any(int(some.max()) >= size for some in pixels):
-        msg = f"frame {key[1]} of {key[0]}: the labels have another image size, {true.shape}"
+        msg = f"frame {key[1]} of {key[0]}: the labels have a different image size, {true.shape}"
         raise RecordingError(msg)
     if true.known is None:
         return found

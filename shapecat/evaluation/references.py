@@ -173,7 +173,7 @@ class OtherRun(Reference):
         for other, _, labelling in self._rest:
             if other == key:
                 return labelling
-        msg = f"{self.finished.folder}: the frames have another order; process the recording again"
+        msg = f"{self.finished.folder}: its frames are in a different order; process it again"
         raise OutputError(msg)
 
     def describe_frames(self) -> str:

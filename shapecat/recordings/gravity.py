@@ -99,7 +99,7 @@ class Upright:
         return vector
 
     def preview(self, frame: Frame) -> tuple[str, F4 | None]:
-        """Return the source and `up` of a frame (or None), without counting the look-up."""
+        """Return the source of a frame's up direction, and `up`; do not count the look-up."""
         counted = self._failed, self._first_failure
         answer = self._find(frame)
         self._failed, self._first_failure = counted

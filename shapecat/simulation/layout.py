@@ -1,4 +1,4 @@
-"""Placing objects on supports and on each other without collisions."""
+"""Place objects on supports and on each other without collisions."""
 
 from typing import NamedTuple
 

@@ -97,7 +97,7 @@ _Found: TypeAlias = tuple[F4, U2, bool]
 
 @kernel
 def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float) -> _Found:
-    """Grow by Algorithm 3."""
+    """Grow a gas on points (m, 3) by Algorithm 3 of the thesis."""
     cloud, frame = _normalise(points)
     target = _wanted(cloud, neurons)
     gas = empty_gas(target)
@@ -113,7 +113,7 @@ def _by_fritzke(points: F4, seed: int, neurons: int, signals: int, share: float)
 
 @kernel
 def _by_thesis(points: F4, seed: int, neurons: int, share: float) -> _Found:
-    """Grow by Algorithm 4."""
+    """Grow a gas on points (m, 3) by Algorithm 4 of the thesis."""
     cloud, frame = _normalise(points)
     target = _wanted(cloud, neurons)
     # differs: a bound on the neurons, for memory; and thresholds relative to the object. A neuron

@@ -34,8 +34,7 @@ STRIPS = 400
 def remove_walls(grid: DepthGrid, plane_id: I4, up: F8, largest_m: float, trials: F8) -> U1:
     """Remove the cells on walls from the objects, in place.
 
-    The vertical plane with the most samples is tested first, then the one with the most remaining
-    samples.
+    Vertical planes are tested one after the other, each the one with the most remaining samples.
 
     Parameters
     ----------

@@ -146,7 +146,7 @@ def ransac_plane(
     cosines: tuple[float, float],
     tolerance: float,
 ) -> tuple[F8, int]:
-    """Return the plane (a, b, c) with the most inliers, and their number; 0 if none is found.
+    """Return the plane (a, b, c) of inverse depth with the most inliers, and their number, or 0.
 
     Parameters
     ----------

@@ -112,7 +112,7 @@ def _link(inv_depth: F4, plane_id: I4, spans: I4, local_plane: F4, links: U1) ->
 
 @kernel(inline=True)
 def _part_steps(inv_depth: F4, plane_id: I4, i: int, start: int, end: int, links: U1) -> None:
-    """Remove links across a step that only a local plane supports.
+    """Remove links that cross a step and are supported by a local plane only.
 
     At a step the readings change more from one cell to the next than before and after it. The
     window of a local plane spans the step and takes it for a slope, so that a plate would be linked
