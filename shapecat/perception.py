@@ -259,7 +259,7 @@ def find_up(frame: Frame, settings: Settings) -> F4 | None:
 
 
 def _rng(settings: Settings, frame: Frame, item: int) -> np.random.Generator:
-    """Return a generator seeded by (seed, stamp, object), whatever worker uses it and when."""
+    """Return a generator seeded by (seed, stamp, object), whichever worker uses it and when."""
     return np.random.default_rng((settings.seed, abs(frame.stamp_ns), item))
 
 

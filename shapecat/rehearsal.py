@@ -161,7 +161,7 @@ def _rehearse(cores: int) -> None:
 
 
 def _uncollected(rehearsal: Callable[[], object]) -> None:
-    """Compile in a short-lived process without garbage collection, a twelfth of the time."""
+    """Compile in a short-lived process without garbage collection, which saves a twelfth."""
     gc.disable()
     rehearsal()
 

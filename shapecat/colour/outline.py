@@ -25,8 +25,8 @@ def outlines(mask: Mask, tolerance_px: float = _TOLERANCE_PX) -> list[F8]:
 
     Returns
     -------
-    For each part, (n, 2) the column and row of its corners, at least three. The first pixel of the
-    image extends from 0 to 1.
+    For each part, the column and row of its corners, (n, 2), at least three corners. The first
+    pixel of the image extends from 0 to 1.
 
     Examples
     --------

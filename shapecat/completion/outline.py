@@ -62,7 +62,7 @@ def support_function(
 
 @kernel(inline=True)
 def _overshoot(x: F4, y: F4, a: float, b: float, top: float, noise: float, flat: float) -> float:
-    """Return how far ``top`` is beyond the mean of the points of its side; less if it is curved."""
+    """Return how far ``top`` is beyond the mean of its side's points; less on a curved side."""
     count, total = 0, 0.0
     for i in range(x.size):
         below = top - (a * x[i] + b * y[i])

@@ -91,7 +91,7 @@ def complete(
 ) -> FullBox:
     """Estimate the box around a whole object from its visible points.
 
-    The box stands on the support, on the rectangle of `footprint`.
+    The box stands on the support; its base is the rectangle of `footprint`.
 
     Parameters
     ----------

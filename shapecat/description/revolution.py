@@ -99,7 +99,7 @@ def fit_axis(neurons: F4, weight: F4, normals: F4, axis: F8, point: F8, free: in
 
     Parameters
     ----------
-    neurons, normals : (3, k) positions and unit vectors.
+    neurons, normals : (3, k) positions, in any unit of length, and unit vectors.
     weight : (k,) each neuron's share of the points.
     axis, point : (3,) direction and point of the first guess, overwritten by the result.
     free : 2 to shift the axis, 4 to tilt it as well.

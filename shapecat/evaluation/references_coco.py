@@ -132,7 +132,7 @@ def rle_mask(counts: str | Sequence[int], height: int, width: int) -> Bool:
 def _uncompressed(text: str) -> list[int]:
     """Return the run lengths of a compressed string.
 
-    Each character holds five bits; from the fourth run on, values are differences to the run two
+    Each character holds five bits; from the fourth run on, values are differences from the run two
     before.
     """
     lengths: list[int] = []

@@ -102,7 +102,7 @@ class LocalExecutor(Executor):
                     task.future.cancel()
 
     def _attend(self, seat: int) -> None:
-        """Send tasks to the worker in a seat of the pool and its successors, until shutdown."""
+        """Send tasks to the worker in a seat of the pool, or its successors, until shutdown."""
         resource_tracker.ensure_running()  # starting it later would unblock the signals
         signal.pthread_sigmask(signal.SIG_BLOCK, _SIGNALS)  # the workers inherit it
         room = threading.Semaphore(1 + self._ahead)

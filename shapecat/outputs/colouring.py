@@ -79,7 +79,7 @@ class _Awaited:
         """Return whether a depth or colour message belongs, or may belong, to an awaited frame.
 
         Only the next few awaited frames are known. A message that is not earlier than the last of
-        them, or its image, may belong to a further one. Messages of other topics are always needed.
+        them, or its image, may belong to a later one. Messages of other topics are always needed.
         """
         if topic not in self._topics | self._colours:
             return True

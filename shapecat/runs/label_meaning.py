@@ -22,8 +22,7 @@ _NAME = re.compile(r"[^\W\d_][\w .+&'()-]{0,58}[\w)]|[^\W\d_]")
 class TrackLabel(NamedTuple):
     """The number, category and confidence with which a track is shown.
 
-    ``track`` is its own number. For a merged track it is the number of the track it was merged
-    with, and category and confidence are also from there.
+    A track that was merged with another one takes all three from the other.
     """
 
     track: int

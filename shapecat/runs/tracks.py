@@ -115,9 +115,9 @@ def _parts(some: list[Track]) -> Iterator[tuple[list[Track], slice]]:
 
 
 def _read_frames(folder: Path, categories: int, fixed: set[str]) -> Iterator[FrameDetections]:
-    """Yield the detections of each frame, in the sensor frame.
+    """Yield the detections of each frame.
 
-    For the topics in ``fixed`` they are in the fixed frame.
+    They are in the fixed frame for the topics in ``fixed``, else in the sensor frame.
     """
     groups = zip(
         read_row_groups(

@@ -33,7 +33,7 @@ class Sensor:
     ragged_window : (across, down) correlation window of this displacement, pixels.
     shadow_m : x positions of the light source and the other cameras, metres; a surface that one of
         them does not see has no reading.
-    filled_px : mean width by which shadows are narrower than their geometry, pixels.
+    filled_px : mean width by which shadows are narrower than geometry predicts, pixels.
     grazing : cosine of the angle of incidence at which half of the readings fail.
     dark : standard deviation of the logarithm of the objects' reflectance; a dark object loses
         readings at smaller angles of incidence.

@@ -22,8 +22,8 @@ _MAKERS = {
 def make_object(category: str, rng: Generator) -> Mesh:
     """Make a random object of one of `shapecat.types.CATEGORIES`, standing on the origin.
 
-    The shapes keep the definitions of the categories: the depth / diameter of cups, bowls and
-    plates, and the narrow neck of bottles.
+    The shapes obey the definitions of the categories: the ratio of depth to diameter of cups, bowls
+    and plates, and the narrow neck of bottles.
 
     Raises
     ------

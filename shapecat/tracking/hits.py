@@ -32,7 +32,7 @@ _OF_HITS: dict[str, tuple[str, tuple[Any, ...]]] = {
 class Hits:
     """All detections of a stream, called hits, in the order of the frames.
 
-    A hit takes some 110 bytes, as the hits of many hours are kept at once.
+    A hit takes only about 110 bytes, as the hits of many hours are kept at once.
 
     Attributes
     ----------

@@ -155,8 +155,8 @@ def _fit(hits: Hits, pairs: I4, wholes: F8) -> Bool:
     """Return the mask (p,) of pairs of hits (p, 2) that are pieces of one object.
 
     ``wholes`` (p, 2, 3) are the lengths of the whole object from either track. The joint box of two
-    pieces is no larger than the whole object, and neither piece is as large as the whole object; a
-    bowl with an object in it is.
+    pieces is no larger than the whole object, and neither piece is as large as the whole object, as
+    a bowl with an object in it would be.
     """
     joint = np.minimum(_joint(hits, pairs), _joint(hits, pairs[:, ::-1]))
     lengths = _sorted_sides(hits.sizes[pairs.ravel()]).reshape(-1, 2, 3)

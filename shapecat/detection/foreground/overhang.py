@@ -50,7 +50,7 @@ class Overhang(NamedTuple):
 def extend_overhang(
     grid: DepthGrid, heights: HeightMap, planes: F8, walls: U1, highest_m: float
 ) -> None:
-    """Assign the parts of objects outside the outline of their plane to it, in place.
+    """Assign to each plane, in place, the parts of its objects that lie outside its outline.
 
     An object that is many times larger outside than inside is not extended: a wall behind a table
     does not stand on it.

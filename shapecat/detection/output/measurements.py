@@ -56,7 +56,7 @@ def measure_objects(
 
     The box is a `shapecat.geometry.upright_box` around the outermost cells. An object stands on
     another if it has more contact with the other's upward-facing surface than with the plane. If
-    that contact is hidden, its bottom must be at the top of the other.
+    the contact is hidden, the bottom of the upper object must be at the top of the lower one.
 
     Parameters
     ----------
@@ -126,7 +126,7 @@ def _supporting_object(segments: Segments, representatives: I4, p: int) -> tuple
 
 @kernel(inline=True)
 def _hidden_support(segments: Segments, representatives: I4, p: int) -> int:
-    """Return the label below a segment with the most contact; 0 if there is none."""
+    """Return the label that has the most contact with a segment from below; 0 if there is none."""
     statistics, pairs = segments.statistics, segments.pairs
     middle = (statistics[p].left + statistics[p].right) / 2
     best, most = 0, 0.0

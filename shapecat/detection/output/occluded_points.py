@@ -16,7 +16,7 @@ __all__ = ["label_occluded_points"]
 def label_occluded_points(points: F4, labels: I4, first_new: int) -> I4:
     """Label all points: labels spread to the unlabelled points that touch labelled ones.
 
-    Points touch if their voxels of 1 cm are neighbours, also at a corner. Labels spread one voxel
+    Points touch if their voxels of 1 cm share at least a corner. Labels spread one voxel
     at a time, so that the nearest object wins.
 
     Parameters

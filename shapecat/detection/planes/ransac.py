@@ -40,7 +40,7 @@ class DepthSamples(NamedTuple):
     ----------
     j, i : (n,) float32 columns and rows.
     inverse_depth : (n,) float32, 1/m.
-    share : the number of cells that each sample stands for.
+    share : the number of cells that each sample represents.
     """
 
     j: F4

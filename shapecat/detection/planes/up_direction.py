@@ -39,7 +39,7 @@ def estimate_up(
         Zeros if up is unknown.
     trials : from `draw_trials`.
     held : penalty on directions that imply a camera on its side or upside down:
-        `UpSettings.held`, or 0 if it may be held in any way.
+        `UpSettings.held`, or 0 if the camera may be held in any way.
     """
     surface = _every_second(points)
     normals, least = surface[:3], UP.least_share * surface.shape[1]
@@ -74,7 +74,7 @@ def _every_second(points: OrientedPoints) -> F4:
 
 @kernel(inline=True)
 def _directions(normals: F4, least: float, trials: F8) -> F8:
-    """Return directions (n, 3) with many normals, most first: RANSAC for one after the other."""
+    """Return directions (n, 3) with many normals, most first, found one by one by RANSAC."""
     found = np.zeros((MOST_DIRECTIONS, 3))
     for k in range(MOST_DIRECTIONS):
         if normals.shape[1] <= least or _most_faced(normals, trials, found[k]) < least:

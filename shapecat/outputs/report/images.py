@@ -286,7 +286,7 @@ def _detail(seen: SeenFrame, mask: Mask) -> float:
 
 
 def _inside(mask: Bool, window: Window, shape: Sequence[int]) -> Bool:
-    """Return a mask (h, w) cut to a crop, and eroded since its outline has other contrast."""
+    """Return a mask (h, w) cut to a crop, and eroded, since the outline adds contrast."""
     left, top, right, bottom = window
     whole = Image.fromarray(mask[top:bottom, left:right])
     small = whole.resize((shape[1], shape[0]), Image.Resampling.NEAREST)
