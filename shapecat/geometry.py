@@ -239,7 +239,7 @@ def level_box(points: F4, level: F8) -> tuple[F8, F8, F8]:
 
 
 def box_corners(box: Box) -> F8:
-    """Return the corners (8, 3) of a box, sensor frame: the lower ring of four, then the upper."""
+    """Return the corners (8, 3) of a box, metres, sensor frame: the lower four, then the upper."""
     signs = np.array([[-1, -1], [-1, 1], [1, 1], [1, -1]])
     unit = np.array([[x, y, z] for z in (-1, 1) for x, y in signs.tolist()], np.float64)
     rotation = rotation_from_quaternion(box.orientation)

@@ -253,7 +253,7 @@ class _Clock:
 
 
 def find_up(frame: Frame, settings: Settings) -> F4 | None:
-    """Return the up direction (3,) of the supporting planes; None if the planes are too small."""
+    """Return up (3,), sensor frame, from the supporting planes; None if these are too small."""
     scene = detect(frame, settings=settings.detection, rng=_rng(settings, frame, 0))
     return scene.up if sum(plane.area_m2 for plane in scene.planes) >= _TELLS_M2 else None
 

@@ -57,7 +57,7 @@ def choose_eye(labelled: LabelledFrame, frame: Frame, *, fixed: bool) -> Eye:
 
 
 def stepped_back(eye: Eye, low: F8, high: F8) -> Eye:
-    """Move the eye back until the box between two corners (3,) is in view.
+    """Move the eye back until the box between two corners (3,), metres, is in view.
 
     The eye stays where it is if the box is too large.
     """

@@ -162,7 +162,7 @@ def _views_again(
 def _blocks(
     views: Iterator[tuple[FrameRow, View]], size: int
 ) -> Iterator[tuple[tuple[FrameRow, ...], tuple[View, ...]]]:
-    """Yield blocks of ``size`` consecutive frames, always the same, until asked to stop."""
+    """Yield blocks of ``size`` frames, the same in every run, until asked to stop."""
     while not stopping.asked() and (block := tuple(islice(views, size))):
         rows, seen = zip(*block, strict=True)
         yield rows, seen

@@ -128,7 +128,7 @@ class Layout:
 
         Returns
         -------
-        The translation (3,) of its pose there, or None if there is no room.
+        The translation (3,) of its pose there, metres, or None if there is no room.
         """
         thing, middle = self.things[k], support.outline[:, :2].mean(axis=0)
         for _ in range(tries):
