@@ -86,7 +86,7 @@ def _write(fits: F4, planes: F4, normals: F4, at: int, columns: int, n: int) -> 
 
 @kernel(inline=True)
 def _next_run(owners: I4, row: int, j: int, last: int) -> tuple[int, int]:
-    """Return the first column of the next run of object cells above one plane, and one after it.
+    """Return first column, and one after the last, of the next run of cells above one plane.
 
     The search begins at column ``j``. There must be an object cell before ``last``; ``row`` is the
     index of the first cell of the row.
