@@ -131,6 +131,28 @@ def test_unfinished_mcap_is_recovered(tmp_path: Path) -> None:
         assert any(f"messages recovered: {len(read)}" in text for text in recording.warnings)
 
 
+def test_a_chunk_without_messages_has_no_time(tmp_path: Path) -> None:
+    """Its times are 0, as the format says: a recording of today would begin in 1970.
+
+    `--end 5` would then read nothing. Some writers begin with a chunk of schemas and channels.
+    """
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE)
+        writer.start("ros2", "test")
+        schema = writer.register_schema(STRING, "ros2msg", b"string data")
+        channel = writer.register_channel("/a", "cdr", schema)
+        vars(writer)["_Writer__chunk_builder"].num_messages = 1  # the library writes no such chunk
+        getattr(writer, "_Writer__finalize_chunk")()  # noqa: B009  a plain name would be mangled
+        for k in range(3):
+            writer.add_message(channel, 10**18 + k, text("hello"), 10**18 + k)
+        writer.finish()
+    with open_recording(path) as recording:
+        assert (recording.start_ns, recording.end_ns) == (10**18, 10**18 + 2)
+        assert [m.log_time_ns - 10**18 for m in recording.messages()] == [0, 1, 2]
+        assert not recording.warnings
+
+
 def test_every_truncation_ends_sensibly(tmp_path: Path) -> None:
     """A power cut can happen at any byte."""
     whole = write_mcap(tmp_path / "a.mcap", list(range(8))).read_bytes()

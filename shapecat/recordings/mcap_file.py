@@ -141,7 +141,8 @@ class McapRecording(Recording):
         if statistics is not None:
             self._counts = Counter(statistics.channel_message_counts)
         for chunk in self.summary.chunks:
-            self._times += [chunk.message_start_time, chunk.message_end_time]
+            if chunk.message_end_time or chunk.message_index_offsets:  # else it has no messages
+                self._times += [chunk.message_start_time, chunk.message_end_time]
 
     def _scan(self) -> None:
         """Read the whole file to find its channels, counts and times."""
