@@ -100,13 +100,16 @@ def results(url: str) -> set[str]:
 def test_from_a_server_to_a_folder(
     shapecat: Run, address: str, served: Path, tmp_path: Path
 ) -> None:
-    urls = [f"{address}/{name}" for name in ("a.mcap", "b.bag", "broken.mcap", "missing.mcap")]
+    """A signed URL has a query, which is no part of a name."""
+    names = ("a.mcap", "b.bag?signature=4/2.mcap", "broken.mcap", "missing.mcap")
+    urls = [f"{address}/{name}" for name in names]
     done = shapecat("process", *urls, "--out", tmp_path / "out", *OPTIONS)
     here = shapecat("process", served / "a.mcap", "--out", tmp_path / "here", *OPTIONS)
 
     assert (done.exit_code, here.exit_code) == (1, 0), done.output
     for name in ("broken.mcap", "missing.mcap"):
         assert f"{address}/{name}" in done.stderr
+    assert {path.parent.name for path in (tmp_path / "out").glob("*/run.json")} == {"a", "b"}
     run = json.loads((tmp_path / "out" / "a" / "run.json").read_text())
     assert run["input"]["path"] == urls[0]
     tables = [tmp_path / out / "a" / "tracks.csv" for out in ("out", "here")]

@@ -162,8 +162,10 @@ class Location:
         """
 
         def get() -> None:
-            folder = self._system.isdir(self._path)
-            self._system.get(self._path, str(target), recursive=folder, **self._in_parts())
+            if self._system.isdir(self._path):
+                self._system.get(self._path, str(target), recursive=True, **self._in_parts())
+            else:  # `get` would take a URL with a query for a pattern, and make a folder
+                self._system.get_file(self._path, str(target), **self._in_parts())
 
         with suppress(FileNotFoundError):
             self._tried("downloaded", get)
