@@ -230,7 +230,7 @@ def test_added_messages_are_found_by_time(tmp_path: Path) -> None:
 
 
 def test_added_messages_are_found_though_they_are_not_in_order(tmp_path: Path) -> None:
-    """Two sensors are read by turns. The file begins and ends with whichever message does."""
+    """Two sensors are read by turns."""
     offsets = (50, 20, 90, 70)
     frames = [replace(FRAME, index=k, log_time_ns=EPOCH + t) for k, t in enumerate(offsets)]
     target = tmp_path / "out.mcap"
@@ -242,12 +242,30 @@ def test_added_messages_are_found_though_they_are_not_in_order(tmp_path: Path) -
             window = {"starting_at": EPOCH + start, "ending_before": EPOCH + stop}
             found = reader.iter_messages(["/shapecat/scene"], **window)
             assert [message.log_time - EPOCH for *_, message in found] == expected
-        summary = reader.get_summary()
+
+
+@pytest.mark.parametrize(
+    ("offsets", "first", "last"),
+    [((50, 20, 90, 70), 0, 90), ((5, 2, 7, 3), 0, 8), ((-4, 6), -4, 8)],
+)
+def test_the_file_begins_and_ends_with_whichever_message_does(
+    tmp_path: Path, offsets: tuple[int, ...], first: int, last: int
+) -> None:
+    """A player takes its length from the statistics: what lies beyond is not played.
+
+    The messages of the original are at 0 to 8.
+    """
+    frames = [replace(FRAME, index=k, log_time_ns=EPOCH + t) for k, t in enumerate(offsets)]
+    target = tmp_path / "out.mcap"
+    with open_recording(write_mcap(tmp_path / "a.mcap")) as recording:
+        write_annotated(recording, target, iter(frames), run={}, markers=False)
+    with target.open("rb") as file:
+        summary = make_reader(file).get_summary()
 
     assert summary is not None
     assert summary.statistics is not None
-    assert summary.statistics.message_start_time == EPOCH  # of the original
-    assert summary.statistics.message_end_time == EPOCH + 90
+    assert summary.statistics.message_start_time == EPOCH + first
+    assert summary.statistics.message_end_time == EPOCH + last
 
 
 def test_what_another_sensor_still_sees_is_not_taken_away(tmp_path: Path) -> None:
