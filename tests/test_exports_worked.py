@@ -145,6 +145,36 @@ def test_kitti_calibration_leads_to_the_pixels_of_a_colour_camera_beside_it(tmp_
     assert (tmp_path / "image_2" / "000000.png").exists()
 
 
+@pytest.mark.parametrize(
+    ("left", "top", "width", "height", "box"),
+    [
+        (45, 60, 30, 50, [7, 21, 18, 32]),
+        (30, 75, 60, 20, [22, 6, 33, 17]),
+        (35, 60, 20, 60, [5, 10, 17, 21]),
+        (30, 65, 60, 20, [10, 5, 22, 16]),
+    ],
+    ids=["left", "top", "right", "bottom"],
+)
+def test_the_box_of_kitti_ends_with_the_colour_image(
+    tmp_path: Path, left: int, top: int, width: int, height: int, box: list[int]
+) -> None:
+    """A colour camera often sees less than the depth sensor; pixels outside are no part of a box.
+
+    It sees what the depth camera sees in a window that cuts the object.
+    """
+    camera = replace(CAMERA, width=width, height=height, cx=CAMERA.cx - left, cy=CAMERA.cy - top)
+    image = ColourImage(
+        "/color", 5, 6, "color", "rgb8", width, height, 3 * width, bytes(3 * width * height)
+    )
+    coloured = Coloured(ColourView(image, LensCamera(camera), IDENTITY), ())
+    seen: Any = [(labelled(cut=False, hidden=False), frame(), coloured)]
+    unused: Any = SimpleNamespace()
+    write_kitti(tmp_path, seen, unused)
+    words = (tmp_path / "label_2" / "000000.txt").read_text().split()
+
+    assert list(map(float, words[4:8])) == box
+
+
 def labelcloud(folder: Path) -> None:
     finished: Any = SimpleNamespace(
         categories=("cup", "bowl"), run={"versions": {"shapecat": "0"}}, labels={}
