@@ -8,6 +8,7 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -40,6 +41,12 @@ def assert_same_tables(a: Path, b: Path) -> None:
         if "height_m" in apart:  # no number equals itself to Arrow where there is none
             np.testing.assert_array_equal(one["height_m"], other["height_m"])
     assert (a / "tracks.csv").read_bytes() == (b / "tracks.csv").read_bytes()
+    assert counts(a) == counts(b)
+
+
+def counts(folder: Path) -> dict[str, Any]:
+    """Return what a run counts, besides what an interrupted one had done."""
+    return {name: n for name, n in read_run(folder)["counts"].items() if name != "resumed"}
 
 
 def contents(folder: Path) -> set[str]:
