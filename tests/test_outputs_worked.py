@@ -131,6 +131,28 @@ def test_images_of_two_cameras_with_the_same_stamp_are_both_annotated(
     assert {frame.boxes for frame in frames} == {(ImageBox(6, "cup", 0.8, (3, 4, 7, 9)),)}
 
 
+def test_a_merged_track_has_one_box_around_all_its_parts_on_an_image(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A box around one part alone teaches a detector half an object; a part may be out of sight."""
+    boxes = {0: (3, 4, 7, 9), 1: (20, 1, 2, 3), 2: (5, 11, 12, 6)}
+    masks = ImageMasks("/l", 5, 6, "c", 40, 30, boxes, {})
+    whole, other = TrackLabel(6, "cup", 0.8), TrackLabel(9, "can", 0.7)
+    items = [
+        ShownDetection(k, label, 0) for k, label in enumerate((whole, other, whole, whole))
+    ]  # the last one has no mask
+    place = "shapecat.outputs.image_annotations"
+    monkeypatch.setattr(f"{place}.read_masks", lambda _folder, **_: iter([(("/d", 0), masks)]))
+    tracks = SimpleNamespace(of=lambda _key: items)
+    monkeypatch.setattr(f"{place}.ShownTracks.read", lambda _folder, _labels: tracks)
+    (frame,) = read_image_frames(Path(), {})
+
+    assert frame.boxes == (
+        ImageBox(6, "cup", 0.8, (3, 4, 14, 13)),
+        ImageBox(9, "can", 0.7, (20, 1, 2, 3)),
+    )
+
+
 # ---- the review: which scenes are drawn
 
 
