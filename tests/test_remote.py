@@ -27,6 +27,7 @@ from shapecat.batch.manifest import Entry, RemoteManifest
 from shapecat.batch.remote import Ticket, process_remote, scratch, upload
 from shapecat.batch.storage import Location
 from shapecat.errors import OutputError, RecordingError
+from shapecat.runs.folder import RUN_FILES
 from shapecat.runs.jobs import Job
 from tests.object_storage import object_storage, requests
 from tests.scenes import record
@@ -236,6 +237,7 @@ def test_listings_come_in_pages(bucket: Path, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr(storage, "_PAGE", 3)
     for k in range(10):
         (Location("s3://lab/pages") / f"{k}" / "x.mcap").write(b"x")
+    (Location("s3://lab/pages-beside") / "x.mcap").write(b"x")  # no part of the folder
 
     assert Location("s3://lab/pages").names() == set("0123456789")
     assert len(find_recordings(["s3://lab/pages/"]).kept) == 10
@@ -328,10 +330,10 @@ def fail(*_: object, **__: object) -> None:
 
 
 def test_what_a_run_no_longer_makes_goes_with_the_run_it_replaces(made: Path) -> None:
-    """A review beside tables of other settings would show what they do not hold."""
+    """Masks or a report beside tables of other settings would show what they do not hold."""
     url, names = "memory://renewed/run", {path.name for path in made.iterdir()}
     assert "review.rrd" not in names
-    for name in ("review.rrd", "run.json"):
+    for name in RUN_FILES:
         (Location(url) / name).write(b"{}")
 
     with claimed(url, "one") as claim:
