@@ -3,7 +3,7 @@
 import json
 import os
 from collections.abc import Mapping
-from concurrent.futures import Executor, Future
+from concurrent.futures import CancelledError, Executor, Future
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, get_args
@@ -11,13 +11,15 @@ from typing import Any, get_args
 import pytest
 
 from shapecat.batch.finding import Source, find_recordings
-from shapecat.batch.ledger import Outcome
-from shapecat.batch.manifest import Entry, Manifest, State
+from shapecat.batch.ledger import Ledger, Outcome
+from shapecat.batch.manifest import Entry, Manifest, RemoteManifest, State
 from shapecat.batch.plans import Shard, name_folders, plan_batch
 from shapecat.batch.remote import Ticket
 from shapecat.batch.runs import exit_code, process_on
+from shapecat.batch.storage import Location
 from shapecat.config import Settings
 from shapecat.errors import OutputError
+from shapecat.executors import WorkerLostError
 from shapecat.runs.folder import read_run, write_run
 from shapecat.runs.identity import file_stats, unchanged, work_id
 from shapecat.runs.jobs import Job, describe_run, has_work, resume, same_options
@@ -308,6 +310,66 @@ def test_the_last_line_of_a_recording_holds(tmp_path: Path) -> None:
         Manifest(path).record([Entry("a", "a.mcap", state)])
 
     assert Manifest(path).entries["a"].state == get_args(State)[-1]
+
+
+@pytest.mark.parametrize("part_bytes", [1, 10**6])
+def test_a_manifest_at_a_url_ends_as_one_file(
+    monkeypatch: pytest.MonkeyPatch, part_bytes: int
+) -> None:
+    """It holds the last line of each recording, whether its last part is full or not.
+
+    A short recording begins and ends in one millisecond: the last line holds then too.
+    """
+    monkeypatch.setattr("shapecat.batch.manifest._PART_BYTES", part_bytes)
+    place = f"memory://one-file-{part_bytes}"
+    with RemoteManifest(place) as manifest:
+        states: tuple[tuple[str, State], ...] = (
+            ("a", "running"),
+            ("b", "failed"),
+            ("a", "complete"),
+        )
+        manifest.record([Entry(name, f"{name}.mcap", state) for name, state in states])
+        manifest.send()
+    lines = (Location(place) / "manifest.jsonl").read() or b""
+    with RemoteManifest(f"{place}-none"):
+        pass
+
+    found = {known["folder"]: known["state"] for known in map(json.loads, lines.splitlines())}
+    assert found == {"a": "complete", "b": "failed"}
+    assert len(lines.splitlines()) == 2
+    assert {n: e.state for n, e in RemoteManifest(place).entries.items()} == found
+    assert (Location(f"{place}-none") / "manifest.jsonl").read() is None
+
+
+@pytest.mark.parametrize(
+    ("error", "begun", "tries"),
+    [
+        (CancelledError(), False, 1),  # it has only waited for a scheduler that is gone
+        (CancelledError(), True, 2),  # it may have been what killed the machine
+        (WorkerLostError(), False, 2),
+        (WorkerLostError(), True, 2),
+    ],
+)
+def test_a_recording_that_had_begun_is_blamed_for_what_is_lost(
+    source: Path, monkeypatch: pytest.MonkeyPatch, error: BaseException, *, begun: bool, tries: int
+) -> None:
+    """Blamed for nothing, one that kills its machine would be tried for ever."""
+    (source.parent / "other.mcap").write_bytes(b"another")
+    monkeypatch.setattr("shapecat.batch.plans.load_model", lambda _path: MODEL)
+    out = str(source.parent / "out")
+    with plan_batch(Job(Path(), Path()), [str(source.parent)], out) as batch:
+        (task,) = (task for task in batch.tasks if task.name == "lab")
+        ledger = Ledger(batch.manifest)
+        ledger.plan(batch.tasks)
+        ledger.begin(task)
+        if begun:
+            ledger.running("lab")
+        assert ledger.lost(task, error) == tries - 1
+        ledger.begin(task)
+        ledger.ended(task, Outcome(task.job, message="gave up", code=1))
+    entry = Manifest(Path(out) / "manifest.jsonl").entries["lab"]
+
+    assert (entry.state, entry.tries, entry.message) == ("failed", tries, "gave up")
 
 
 @pytest.mark.parametrize(
