@@ -11,6 +11,8 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from numpy.testing import assert_allclose
 from numpy.typing import ArrayLike
@@ -21,6 +23,7 @@ from shapecat.detection.scene_graph import Node
 from shapecat.errors import OutputError
 from shapecat.outputs.annotated_mcap import _annotations, _encoding
 from shapecat.outputs.annotation import Annotation
+from shapecat.outputs.colouring import with_colour
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.dataset_frames import (
     Selection,
@@ -36,7 +39,7 @@ from shapecat.outputs.exports_points import write_point_labels
 from shapecat.outputs.image_annotations import ImageBox, read_image_frames
 from shapecat.outputs.review_paths import Paths
 from shapecat.outputs.review_scenes import choose_scenes, with_clouds
-from shapecat.outputs.scene_tree import _candidate, _described
+from shapecat.outputs.scene_tree import _candidate, _described, _topic
 from shapecat.recordings.messages import Topic
 from shapecat.runs.label_meaning import TrackLabel, _slips
 from shapecat.runs.shown import ShownDetection
@@ -151,6 +154,22 @@ def test_a_merged_track_has_one_box_around_all_its_parts_on_an_image(
         ImageBox(6, "cup", 0.8, (3, 4, 14, 13)),
         ImageBox(9, "can", 0.7, (20, 1, 2, 3)),
     )
+
+
+def test_a_frame_has_a_colour_image_only_together_with_its_masks(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A run of an older version has no masks: exports then go without colours, not to ruin."""
+    masks = ImageMasks("/color", 5, 6, "c", 40, 30, {}, {})
+    labelled = [replace(labelled_frame(k), masks=masks if k % 2 else None) for k in range(4)]
+    read: Any = [(SimpleNamespace(topic="/depth", index=k), "view" if k < 2 else None)
+                 for k in range(4)]  # fmt: skip
+    monkeypatch.setattr("shapecat.outputs.colouring.read_frames", lambda *_, **__: iter(read))
+    run: Any = {"options": {"topics": ["/depth"]}}
+    recording: Any = SimpleNamespace(path="a.mcap")
+    found = [coloured for *_, coloured in with_colour(labelled, recording, run)]
+
+    assert [one is not None for one in found] == [False, True, False, False]
 
 
 # ---- the review: which scenes are drawn
@@ -479,6 +498,22 @@ def test_a_node_is_described_by_its_track_its_size_and_what_is_missing() -> None
 
 
 # ---- image boxes and labels
+
+
+def test_a_missing_frame_is_answered_with_the_ones_that_are_there(tmp_path: Path) -> None:
+    """Frames of a part of a recording, or of every n-th message, do not count from 0 to the end."""
+    rows = pa.table({"topic": ["/a", "/b", "/a", "/b", "/a"], "frame": [3, 0, 6, 2, 9]})
+    pq.write_table(rows, tmp_path / "frames.parquet")
+
+    assert _topic(tmp_path, 6, None) == "/a"
+    for frame, topic, said in (
+        (2, "/a", "no frame 2 on /a; there are /a: 3 to 9"),
+        (4, None, "no frame 4; there are /a: 3 to 9; /b: 0 to 2"),
+        (6, "/c", "no frame 6 on /c; there are none"),
+    ):
+        with pytest.raises(OutputError) as error:
+            _topic(tmp_path, frame, topic)
+        assert str(error.value) == f"{tmp_path}: {said}"
 
 
 def test_the_corners_of_an_image_box_are_the_borders_of_its_pixels() -> None:

@@ -131,6 +131,19 @@ def test_unfinished_mcap_is_recovered(tmp_path: Path) -> None:
         assert any(f"messages recovered: {len(read)}" in text for text in recording.warnings)
 
 
+@pytest.mark.parametrize("rest", [b"", b"\x05" + struct.pack("<Q", 1000) + b"abc"])
+def test_it_is_said_how_much_of_an_unfinished_mcap_is_lost(tmp_path: Path, rest: bytes) -> None:
+    """A user wants to know whether a power cut has cost anything: twelve bytes, or nothing."""
+    path = write_mcap(tmp_path / "a.mcap", list(range(20)), unfinished=True)
+    path.write_bytes(path.read_bytes() + rest)
+    with open_recording(path) as recording:
+        (said,) = recording.warnings
+
+    lost = ", and what was readable in the last 12 bytes" if rest else ""
+    assert said.startswith("the recording was not finished; messages recovered: ")
+    assert said.partition("recovered: ")[2].lstrip("0123456789") == lost
+
+
 def test_a_chunk_without_messages_has_no_time(tmp_path: Path) -> None:
     """Its times are 0, as the format says: a recording of today would begin in 1970.
 
@@ -312,6 +325,8 @@ def test_bag_cut_anywhere_gives_what_is_there(tmp_path: Path) -> None:
             with open_recording(path) as recording:
                 read = [message.log_time_ns for message in recording.messages()]
                 assert read == [SECOND, 2 * SECOND][: len(read)]
+                ends = (read[0], read[-1]) if read else (0, 0)
+                assert (recording.start_ns, recording.end_ns) == ends
                 assert "recovered" in " ".join(recording.warnings)
                 counts.append(len(read))
         except RecordingError as error:

@@ -8,7 +8,7 @@ import pytest
 from shapecat.errors import OutputError
 from shapecat.runs.folder import previous_path, read_run, recover, staged, write_run
 from shapecat.runs.identity import content_digest, file_stats, new_id, same_content
-from shapecat.system.files import partial_path, replacing
+from shapecat.system.files import holding, partial_path, replacing, require_writable
 
 
 def test_folder_appears_whole(tmp_path: Path) -> None:
@@ -28,6 +28,22 @@ def test_nothing_is_left_after_an_error(tmp_path: Path) -> None:
         raise RuntimeError
 
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_place_that_cannot_be_written_is_one_line_in_words(tmp_path: Path) -> None:
+    """A number, and the path a second time, tell a user nothing."""
+    (tmp_path / "file").write_text("")
+    below, missing = tmp_path / "file" / "model.npz", tmp_path / "none"
+
+    with pytest.raises(OutputError) as error:
+        require_writable(below)
+    assert str(error.value) == f"{below}: cannot be written: File exists"
+    with pytest.raises(OutputError) as error, replacing(below) as path:
+        path.touch()
+    assert str(error.value) == f"{below}: cannot be written: Not a directory"
+    with pytest.raises(OutputError) as error, holding(missing):
+        pass
+    assert str(error.value) == f"{missing}: No such file or directory"
 
 
 def own(folder: Path, **files: str) -> Path:

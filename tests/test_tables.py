@@ -2,6 +2,7 @@ import json
 from dataclasses import replace
 from importlib.resources import files
 from pathlib import Path
+from types import SimpleNamespace
 from typing import get_type_hints
 
 import numpy as np
@@ -15,8 +16,9 @@ from shapecat.runs import shown
 from shapecat.runs.folder import read_run
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.labels import read_labelled_frames
-from shapecat.runs.perceived import FrameRow, PerceptionTables
+from shapecat.runs.perceived import _SEGMENT_FRAMES, FrameRow, PerceptionTables
 from shapecat.runs.run_info import Counts, InputInfo, Options, RunInfo
+from shapecat.runs.segments import count_segments
 from shapecat.runs.shown import _next_of_topic
 from shapecat.runs.tables import (
     DETECTIONS,
@@ -99,6 +101,23 @@ def test_row_groups_cover_the_same_frames(tmp_path: Path) -> None:
         known = set(frames["frame"].to_pylist())
         assert set(detections["frame"].to_pylist()) <= known
         assert set(planes["frame"].to_pylist()) <= known
+
+
+def test_frames_are_stored_when_many_or_old(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A kill may cost two seconds; and many quick frames would fill the memory before that."""
+    clock = [7.0]
+    place = "shapecat.runs.perceived"
+    monkeypatch.setattr(f"{place}.time", SimpleNamespace(monotonic=lambda: clock[0]))
+    stored = []
+    with PerceptionTables(tmp_path, categories=CATEGORIES, model_id="m1") as tables:
+        for index in range(_SEGMENT_FRAMES + 3):
+            clock[0] += {_SEGMENT_FRAMES + 1: 1.9, _SEGMENT_FRAMES + 2: 0.2}.get(index, 0)
+            tables.write([perception(index, 1)], [FrameRow(2000 + index, None)])
+            stored.append(count_segments(tmp_path))
+
+    assert stored == [0] * (_SEGMENT_FRAMES - 1) + [1] * 3 + [2]
 
 
 def test_a_second_look_replaces_a_frame_only_where_it_sees_more_than_nothing(
