@@ -19,7 +19,7 @@ from shapecat.runs.labels import read_labelled_frames
 from shapecat.runs.perceived import _SEGMENT_FRAMES, FrameRow, PerceptionTables
 from shapecat.runs.run_info import Counts, InputInfo, Options, RunInfo
 from shapecat.runs.segments import count_segments
-from shapecat.runs.shown import _next_of_topic
+from shapecat.runs.shown import _next_of_topic, read_shown_frames
 from shapecat.runs.tables import (
     DETECTIONS,
     FRAMES,
@@ -136,6 +136,19 @@ def test_a_second_look_replaces_a_frame_only_where_it_sees_more_than_nothing(
     assert seen["frames"]["revised"].to_pylist() == [False, True, False, False]
     assert seen["detections"]["frame"].to_pylist() == [0, 0, 1, 1, 1, 3, 3]
     assert seen["planes"]["frame"].to_pylist() == [0, 0, 1, 1, 2, 2, 3, 3]
+
+
+@pytest.mark.parametrize("count", [0, 2])
+def test_frames_without_tracks_are_shown_empty(tmp_path: Path, count: int) -> None:
+    """A bare table is a result too, and so are detections that no track confirms."""
+    write_run_tables(tmp_path, [count, 0])
+    write_tracks(tmp_path, [])
+
+    assert [(f.index, tuple(f.objects)) for f in read_shown_frames(tmp_path, {})] == [
+        (0, ()),
+        (1, ()),
+    ]
+    assert [f.objects for f in read_labelled_frames(tmp_path, {})] == [(), ()]
 
 
 def test_labelled_frames_join_tracks_and_labels(tmp_path: Path) -> None:

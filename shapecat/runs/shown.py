@@ -164,9 +164,11 @@ def _causal(file: pq.ParquetFile, rows: I4) -> F4:
 
 def _full(file: pq.ParquetFile, rows: I4) -> F4:
     """Return the full boxes (n, 10) of some rows; NaN if unknown."""
+    width = sum(_FULL.values())
     if "center_full" not in file.schema_arrow.names:  # from an older version
-        return np.full((len(rows), sum(_FULL.values())), np.nan, np.float32)
-    return _gather(file, list(_FULL), rows, lambda table: numbers_or_nan(table, _FULL))
+        return np.full((len(rows), width), np.nan, np.float32)
+    found = _gather(file, list(_FULL), rows, lambda table: numbers_or_nan(table, _FULL))
+    return found.reshape(-1, width)  # also without rows
 
 
 def _gather(
