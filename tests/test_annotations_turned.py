@@ -21,6 +21,7 @@ from shapecat.outputs.annotations import encoder_for
 from shapecat.outputs.colours import colour_of
 from shapecat.outputs.image_annotations import ImageBox, ImageFrame, image_encoder_for
 from shapecat.outputs.review_shapes import _above
+from shapecat.outputs.ros_annotations import RosMessages
 from shapecat.recordings import open_recording
 from shapecat.recordings.protobuf import message_decoder
 from shapecat.types import Box, ShownBox, ShownFrame
@@ -242,6 +243,16 @@ def test_added_messages_are_found_though_they_are_not_in_order(tmp_path: Path) -
             window = {"starting_at": EPOCH + start, "ending_before": EPOCH + stop}
             found = reader.iter_messages(["/shapecat/scene"], **window)
             assert [message.log_time - EPOCH for *_, message in found] == expected
+
+
+def test_stamps_beyond_those_of_ros_are_its_last_second() -> None:
+    """Its seconds have 31 bits: a clock that counts otherwise must not end the writing."""
+    ros = RosMessages(ros1=False)
+    for seconds, written in ((2**31 - 2, 2**31 - 2), (2**31, 2**31 - 1), (9 * 10**9, 2**31 - 1)):
+        frame = replace(FRAME, stamp_ns=seconds * SECOND + 7, objects=())
+        made = ros.detections.make(Annotation(frame, SECOND, ()))
+        assert (made.header.stamp.sec, made.header.stamp.nanosec) == (written, 7)
+        assert ros.serialize(made, ros.detections.name)
 
 
 @pytest.mark.parametrize(

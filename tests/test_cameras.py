@@ -100,6 +100,16 @@ def test_a_region_is_given_in_pixels_before_binning() -> None:
     assert_allclose([camera.cx, camera.cy], [121.15, 71.3])
 
 
+@pytest.mark.parametrize(("width", "height"), [(0, 0), (400, 0), (0, 300)])
+def test_a_region_without_pixels_is_the_whole_image(width: int, height: int) -> None:
+    """Drivers that fill in only some of its fields mean no region."""
+    plain, _ = camera_of_info(calibration(), rectified=False)
+
+    assert (
+        camera_of_info(calibration(roi=region(80, 30, width, height)), rectified=False)[0] == plain
+    )
+
+
 def fisheye_of_opencv(ray: Any, k: Any) -> Any:
     """Project slopes as the documentation of cv::fisheye says, term by term."""
     a, b = ray

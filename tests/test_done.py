@@ -21,7 +21,13 @@ from shapecat.config import Settings
 from shapecat.errors import OutputError
 from shapecat.executors import WorkerLostError
 from shapecat.runs.folder import read_run, write_run
-from shapecat.runs.identity import file_stats, unchanged, work_id
+from shapecat.runs.identity import (
+    ContentDigest,
+    content_digest,
+    file_stats,
+    unchanged,
+    work_id,
+)
 from shapecat.runs.jobs import Job, describe_run, has_work, resume, same_options
 from shapecat.runs.run_info import RunInfo
 from shapecat.system.files import partial_path
@@ -118,6 +124,17 @@ def test_a_recording_that_was_written_to_has_changed_though_it_is_as_long(source
     assert not unchanged(before, source)
     source.unlink()
     assert not unchanged(before, source)
+
+
+def test_a_digest_that_nobody_needs_is_not_waited_for(source: Path) -> None:
+    """Left before it has begun, it is no error; left later, it does not go on in secret."""
+    with ContentDigest(source) as content:
+        assert not content._thread.is_alive()
+    with ContentDigest(source) as content:
+        content.start()
+    assert not content._thread.is_alive()
+    with ContentDigest(source) as content:
+        assert content.result() == content_digest(source)
 
 
 @pytest.mark.parametrize(

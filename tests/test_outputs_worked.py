@@ -5,6 +5,7 @@ import io
 import json
 import os
 import zlib
+from contextlib import nullcontext
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -31,6 +32,7 @@ from shapecat.outputs.dataset_frames import (
     _depth_file,
     _different,
     _view,
+    images_of,
     split_runs,
 )
 from shapecat.outputs.exports import _made_by_export, _require_own, _thinned
@@ -301,15 +303,40 @@ def test_the_views_of_a_track_are_the_most_different_ones() -> None:
 
 def test_a_view_is_a_direction_a_distance_a_size_and_a_shape() -> None:
     turn = Rotation.from_euler("zyx", [0.4, 1.1, -0.3])
-    center, size = np.array([0.36, -0.48, 0.8]), np.array([0.12, 0.07, 0.24])
-    item = labelled_object(1, range(55), box=box_at(center, size))
+    way, size = np.array([-0.36, 0.48, -0.8]), np.array([0.12, 0.07, 0.24])
+    item = labelled_object(1, range(55), box=box_at(-1.7 * way, size))
     frame = replace(labelled_frame(0, item), fixed_from_sensor=Pose(turn.as_matrix(), np.zeros(3)))
     found = _view(frame, item)
 
-    assert_allclose(found[:3], turn.apply(-center), atol=1e-6)  # it is a metre away
-    assert_allclose(found[3:5], [0, 0.3 * np.log(55)], atol=1e-6)
+    assert_allclose(found[:3], turn.apply(way), atol=1e-6)
+    assert_allclose(found[3:5], [np.log(1.7), 0.3 * np.log(55)], atol=1e-6)
     assert_allclose(found[5:], [0.25, 0.07 / 0.48, 0.5], atol=1e-6)
-    assert_allclose(_view(labelled_frame(0, item), item)[:3], -center, atol=1e-6)
+    assert_allclose(_view(labelled_frame(0, item), item)[:3], way, atol=1e-6)
+
+
+def test_images_without_an_object_to_train_on_are_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To a detector, an image with nothing in it but doubtful objects says that none is there."""
+    images = [
+        None,
+        *(SimpleNamespace(sure=sure) for sure in ((False, True), (False,), (), (True,))),
+    ]
+    place = "shapecat.outputs.dataset_frames"
+    labelled = [labelled_frame(k) for k in range(len(images))]
+    stand_ins: dict[str, Any] = {
+        "_corrected": lambda _folder: set(),
+        "_chosen": lambda *_: {("/depth", k) for k in range(len(images))},
+        "open_source": lambda *_: nullcontext(),
+        "with_colour": lambda frames, *_: ((one, None, None) for one in frames),
+        "_image": lambda _name, one, *_: images[one.index],
+    }
+    for name, stand_in in stand_ins.items():
+        monkeypatch.setattr(f"{place}.{name}", stand_in)
+    run: Any = {"options": {"topics": ["/depth"]}, "color": {"/depth": "/color"}}
+    finished: Any = SimpleNamespace(
+        folder=Path(), run=run, name="lab", frames=lambda: iter(labelled)
+    )
+
+    assert list(images_of(finished, Selection())) == [images[1], images[4]]
 
 
 def test_depth_images_are_in_millimetres_and_end_where_16_bits_do() -> None:

@@ -3,6 +3,7 @@
 import os
 import struct
 from collections.abc import Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +24,8 @@ from rosbags.rosbag2 import Writer as FolderWriter
 from rosbags.typesys import Stores, get_typestore
 
 from shapecat.errors import RecordingError
-from shapecat.recordings import MessageError, Topic, open_recording
+from shapecat.recordings import Channel, MessageError, Topic, open_recording
+from shapecat.recordings.decoding import typestore_of
 from shapecat.system.files import lock
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
@@ -387,6 +389,30 @@ def test_ros2_folder(
         assert read == [f"message {k}" for k in range(5)]
         assert recording.topics == (Topic("/a", STRING, "cdr", 5),)
         assert bool(recording.warnings) is not metadata
+
+
+def test_a_file_that_is_no_part_of_a_bag_is_not_read(tmp_path: Path) -> None:
+    """A recording put beside the parts, or a damaged part that was repaired, is none of them."""
+    path = write_folder(tmp_path / "bag", StoragePlugin.MCAP)
+    write_mcap(path / "another.mcap", [7, 8])
+
+    assert times_read(path) == [k * SECOND for k in range(5)]
+    (path / "metadata.yaml").unlink()
+    assert len(times_read(path)) == 7
+
+
+@pytest.mark.parametrize(
+    ("kind", "length", "refused"),
+    [("string", 5000, True), ("uint8", 5000, False), ("string", 9, False)],
+)
+def test_long_arrays_of_texts_are_not_unrolled(kind: str, length: int, *, refused: bool) -> None:
+    """The library writes code for each element: a definition of a line would fill the memory."""
+    name, definition = "lab/msg/Long", f"{kind}[{length}] data".encode()
+    channel = Channel("/a", name, "cdr", name, "ros2msg", definition)
+    expected = pytest.raises(ValueError, match=f"an array of {length} is too long")
+
+    with expected if refused else nullcontext():
+        assert name in typestore_of(channel).types
 
 
 def test_parts_unpacked_by_a_killed_process_are_removed(

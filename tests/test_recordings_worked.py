@@ -333,6 +333,9 @@ def test_raw_pixels_may_end_with_the_last_pixel_and_not_before() -> None:
             pixels_of(ColourImage("", 0, 0, "", "bgr8", 2, 3, step, data[: size - 1]))
     with pytest.raises(MessageError, match="needs"):
         pixels_of(ColourImage("", 0, 0, "", "bgr8", 2, 3, 5, data))
+    for width, height in ((0, 3), (2, 0)):
+        with pytest.raises(MessageError, match=f"image of {width} x {height} pixels"):
+            pixels_of(ColourImage("", 0, 0, "", "bgr8", width, height, 6, data))
 
 
 def test_packed_colours_may_end_with_the_last_point_and_not_before() -> None:

@@ -89,6 +89,16 @@ def test_columns_are_those_of_the_contract(tmp_path: Path) -> None:
     assert pq.read_table(tmp_path / "frames.parquet")["frame"].to_pylist() == [0, 1, 2]
 
 
+def test_pixel_indices_are_stored_as_differences(tmp_path: Path) -> None:
+    """They are most of a table: plain numbers would take ten times the space."""
+    write_run_tables(tmp_path, [2])
+    group = pq.read_metadata(tmp_path / "detections.parquet").row_group(0)
+    columns = [group.column(k) for k in range(group.num_columns)]
+    (indices,) = (one for one in columns if one.path_in_schema == "indices.list.element")
+
+    assert "DELTA_BINARY_PACKED" in indices.encodings
+
+
 def test_row_groups_cover_the_same_frames(tmp_path: Path) -> None:
     """They are read side by side; a frame without planes or detections must not shift them."""
     counts = [k % 3 for k in range(150)]
