@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from shapecat.config import DetectionSettings
+from shapecat.detection.cleanup.context import add_context, weigh_neighbours
 from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
 from shapecat.detection.cleanup.object_features import (
     OBJECT_FEATURES,
@@ -12,7 +13,13 @@ from shapecat.detection.cleanup.object_features import (
     _measure_plane,
     measure_object_features,
 )
-from shapecat.detection.cleanup.structure import find_background, load_trees, number_objects
+from shapecat.detection.cleanup.structure import (
+    RejectionTrees,
+    find_background,
+    judge,
+    load_trees,
+    number_objects,
+)
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
 from shapecat.detection.merging.segments import _blank
 from shapecat.detection.pipeline import ALL_STEPS, Task, merge_segments, oversegment
@@ -21,6 +28,9 @@ from shapecat.detection.planes.height_map import OUTLINE, HeightMap
 from shapecat.trees import BoostedTrees, Trees
 from tests.test_detection import Array, Shape, box, frame_of, render, table
 
+_LEAF = BoostedTrees(Trees(*np.zeros((4, 1), np.int32)), np.ones(1, np.float32))
+ALWAYS = RejectionTrees(_LEAF, _LEAF)
+"""Trees for which everything is an object."""
 INTRINSICS = PinholeIntrinsics(262.5, 262.5, 19.5, 19.5)
 
 
@@ -76,25 +86,82 @@ def test_how_rough_the_plane_is_around_a_segment() -> None:
     assert rows["plane_noise"][1] == pytest.approx(0.002 / least)
 
 
+def _seen(cells: int) -> Array:
+    """Return the features of a segment of so many cells, 1 m away; the rest are 0."""
+    features = np.zeros(2, OBJECT_FEATURES)
+    features["visibility"]["cells"], features["visibility"]["depth_m"] = cells, 1.0
+    return features
+
+
 def test_what_is_wider_than_an_object_is_none() -> None:
     segments = _blank(2)
-    features = np.zeros(2, OBJECT_FEATURES)
+    features = _seen(400)
     features["segment"]["width_m"] = 0.2
     grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, 0.003)
-    always = BoostedTrees(Trees(*np.zeros((4, 1), np.int32)), np.ones(1, np.float32))
     for widest, expected in ((0.1, True), (0.3, False)):
         settings = DetectionSettings(max_size_m=widest)
-        assert find_background(segments, features, grid, settings, always)[1] == expected
+        assert find_background(segments, features, grid, settings, ALWAYS)[1] == expected
 
 
-@pytest.mark.parametrize(("cells", "border"), [(400, 0.5), (20, 0.5), (400, 0.3)])
+@pytest.mark.parametrize(("cells", "border"), [(400, 0.5), (31, 0.5), (400, 0.3)])
 def test_what_is_large_and_cut_across_by_the_border_is_an_arm(cells: int, border: float) -> None:
-    features = np.zeros(2, OBJECT_FEATURES)
-    features["visibility"]["cells"], features["surroundings"]["image_border"] = cells, border
+    features = _seen(cells)
+    features["surroundings"]["image_border"] = border
     grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, 0.003)
-    always = BoostedTrees(Trees(*np.zeros((4, 1), np.int32)), np.ones(1, np.float32))
-    found = find_background(_blank(2), features, grid, DetectionSettings(), always)[1]
+    found = find_background(_blank(2), features, grid, DetectionSettings(), ALWAYS)[1]
     assert found == (cells > 100 and border > 0.4)
+
+
+@pytest.mark.parametrize(("cells", "rejected"), [(29, True), (31, False)])
+def test_what_is_far_too_small_goes_before_holes_are_filled(cells: int, rejected: bool) -> None:
+    """Else it splits a hole in an object, and is dropped only after that."""
+    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, 0.003)
+    found = find_background(_blank(2), _seen(cells), grid, DetectionSettings(), ALWAYS)
+    assert found[1] == rejected  # the smallest object covers 60 cells here
+
+
+@pytest.mark.parametrize(
+    ("alone", "in_context", "rejected"),
+    [(2.9, -1.1, True), (-2.9, -0.9, False), (3.1, -9.0, False), (-3.1, 9.0, True)],
+)
+def test_context_decides_on_doubtful_segments_only(
+    alone: float, in_context: float, rejected: bool
+) -> None:
+    features = _seen(400)
+    grid = DepthGrid(np.zeros((40, 40), np.float32), INTRINSICS, 1, 0.003)
+    trees = RejectionTrees(
+        *(_LEAF._replace(value=np.array([v], np.float32)) for v in (alone, in_context))
+    )
+    found = find_background(_blank(2), features, grid, DetectionSettings(), trees)
+    assert found[1] == rejected
+
+
+def test_verdicts_stop_where_they_are_certain() -> None:
+    """The features of a context have the same range in training and in use."""
+    for value, expected in ((9.0, 5.0), (-9.0, -5.0), (1.5, 1.5)):
+        trees = _LEAF._replace(value=np.array([value], np.float32))
+        assert judge(np.zeros((1, 1), np.float32), trees).tolist() == [expected]
+
+
+def test_the_verdicts_on_neighbours_count_by_the_length_of_the_border() -> None:
+    """Of four segments, one was merged; the background hides a part of the object beside it."""
+    segments = _blank(5)
+    segments.parent[:] = [0, 1, 2, 2, 4]
+    segments.pairs["contact"][1, 2], segments.pairs["contact"][2, 4] = 6, 2
+    segments.pairs["contact"][2, 2] = 9  # the seam within a merged segment
+    segments.pairs["in_front"][4, 1], segments.pairs["near"][4, 2] = 3, 1
+    roots, weights = weigh_neighbours(segments)
+    assert roots.tolist() == [1, 2, 4]
+    features = np.zeros(3, OBJECT_FEATURES)
+    features["segment"]["width_m"] = [0.1, 0.2, 0.3]
+    found = add_context(features, np.array([8.0, -1.0, -4.0], np.float32), weights)
+    assert found["object"]["segment"]["width_m"] == pytest.approx([0.1, 0.2, 0.3])
+    assert found["logit"].tolist() == [8, -1, -4]
+    yes, doubt, no = np.tanh([2, -0.25, -1])
+    assert found["connected"] == pytest.approx([doubt, (6 * yes + 2 * no) / 8, doubt])
+    assert found["behind"] == pytest.approx([0, 0, yes])
+    assert found["in_front"] == pytest.approx([no, 0, 0])
+    assert found["near"] == pytest.approx([0, no, doubt])
 
 
 def test_the_image_border_is_where_samples_begin() -> None:

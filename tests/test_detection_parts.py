@@ -8,6 +8,7 @@ import pytest
 from shapecat.config import DetectionSettings
 from shapecat.detection import detect
 from shapecat.detection.cleanup import structure
+from shapecat.detection.cleanup.context import CONTEXT_FEATURES
 from shapecat.detection.cleanup.object_features import OBJECT_FEATURES
 from shapecat.detection.depth_grid import downsample
 from shapecat.detection.merging import learned
@@ -31,8 +32,12 @@ GROWTH = Growth(100, 32, 0.1)
 
 @pytest.mark.parametrize(
     ("grown", "features"),
-    [(learned.load_trees(), FEATURES), (structure.load_trees(), OBJECT_FEATURES.itemsize // 4)],
-    ids=["merging", "structure"],
+    [
+        (learned.load_trees(), FEATURES),
+        (structure.load_trees().alone, OBJECT_FEATURES.itemsize // 4),
+        (structure.load_trees().in_context, CONTEXT_FEATURES.itemsize // 4),
+    ],
+    ids=["merging", "alone", "in context"],
 )
 def test_every_walk_through_the_trees_ends(grown: BoostedTrees, features: int) -> None:
     """A child before its parent would be a walk without end."""
@@ -116,5 +121,5 @@ def test_grown_trees_tell_what_they_were_shown() -> None:
     first, second = (grow(features, same, GROWTH, seed=1) for _ in range(2))
     assert all(np.array_equal(a, b) for a, b in zip(first.trees, second.trees, strict=True))
     assert np.array_equal(first.value, second.value)
-    told = np.array([logit_of(first, row, -np.inf) > 0 for row in features])
+    told = np.array([logit_of(first, row, -np.inf, np.inf) > 0 for row in features])
     assert np.mean(told == same) > 0.95

@@ -123,7 +123,7 @@ def row_and_column(p: int, columns: int) -> tuple[int, int]:
     return i, p - i * columns
 
 
-@kernel(inline=True)
+@kernel
 def smallest_object_at(grid: DepthGrid, depth_m: float) -> float:
     """Return the number of cells that the smallest object, of `SMALL_M2`, covers at a depth."""
     covered = SMALL_M2 * grid.intrinsics.fx**2 / depth_m**2

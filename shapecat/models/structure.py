@@ -5,7 +5,7 @@ furniture and walls, and of noise. Grow the trees of `shapecat.models.parts` fir
 the segments.
 """
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from itertools import chain
@@ -19,23 +19,29 @@ import numpy as np
 from shapecat.arrays import F4, I4, U1, Bool
 from shapecat.config import DetectionSettings
 from shapecat.detection.cleanup import structure
+from shapecat.detection.cleanup.context import CONTEXT_FEATURES, add_context, weigh_neighbours
 from shapecat.detection.cleanup.object_features import OBJECT_FEATURES, measure_object_features
+from shapecat.detection.cleanup.structure import FILES, RejectionTrees, as_rows, doubtful, judge
 from shapecat.detection.depth_grid import downsample
+from shapecat.detection.merging.segments import Records
 from shapecat.detection.pipeline import ALL_STEPS, Task, merge_segments, oversegment
 from shapecat.models.growing import Growth, grow, growing_options
 from shapecat.models.parts import count_labels
 from shapecat.simulation import make_scene, render_frame
+from shapecat.simulation.equipment import make_own_arms, make_resting_arms
+from shapecat.simulation.furniture import EQUIPMENT, make_rack, make_tote
 from shapecat.simulation.paths import Filming, walk
 from shapecat.simulation.scenes import SceneKind
-from shapecat.simulation.sensors import PRESETS, Sensor
-from shapecat.simulation.worlds import World
-from shapecat.trees import write_trees
-from shapecat.types import Frame, Pose
+from shapecat.simulation.sensors import PRESETS, Sensor, resized
+from shapecat.simulation.worlds import Support, World
+from shapecat.trees import BoostedTrees, write_trees
+from shapecat.types import Camera, Frame, Pose
 
-__all__ = ["Samples", "Series", "collect", "label_objects", "main"]
+__all__ = ["Samples", "Series", "collect", "grow_both", "label_objects", "main"]
 
-FEATURES = OBJECT_FEATURES.itemsize // np.dtype("f4").itemsize
-_GROWTH = Growth(300, 32, 0.06)
+_GROWTH = Growth(500, 64, 0.06)
+_FOLDS = 3
+"""Parts of the samples, each judged by trees grown on the others."""
 _OBJECT = 0.5
 """A merged segment is an object if more than this fraction of its labelled cells shows objects."""
 _CHUNK = 10
@@ -45,7 +51,10 @@ class Series(NamedTuple):
     """Scenes of one kind: the first seed and their number; the sensors take turns.
 
     ``scale`` multiplies all sizes and distances. The camera is on the ``path`` of the scene, or
-    ``anywhere``: near or far, low or straight above. On the ``floor`` the table is taken away.
+    ``anywhere``: near or far, low or straight above. On the ``floor`` the table is taken away,
+    ``changed`` turns its bin into a tote or its shelf into a rack. Arms of the robot with the
+    camera, or of a person, are ``reaching`` for the objects or ``resting`` at the image border.
+    ``coarse`` images have a fraction of the sensor's resolution.
     """
 
     kind: SceneKind
@@ -54,6 +63,9 @@ class Series(NamedTuple):
     sensors: tuple[str, ...] = tuple(PRESETS)
     scale: float = 1.0
     view: Literal["path", "anywhere", "floor"] = "path"
+    changed: Callable[[np.random.Generator, Sequence[Support]], list[Support]] | None = None
+    arms: Literal["none", "reaching", "resting"] = "none"
+    coarse: bool = False
 
 
 _TWO = ("kinect", "realsense")
@@ -80,33 +92,72 @@ _SERIES = (
     Series("tabletop", 643_000, 120, view="anywhere"),
     Series("room", 650_000, 180, view="floor"),
     Series("room", 650_500, 120, scale=1.8, view="floor"),
+    Series("room", 651_000, 240),
+    Series("room", 652_000, 600, view="anywhere"),
+    Series("bin", 653_000, 180, changed=make_tote),
+    Series("bin", 653_500, 240, view="anywhere", changed=make_tote),
+    Series("clutter", 654_000, 240, view="anywhere", arms="reaching"),
+    Series("pile", 655_000, 240, view="anywhere", arms="reaching"),
+    Series("tabletop", 656_000, 240, view="anywhere", arms="reaching"),
+    Series("room", 657_000, 240, view="floor", arms="reaching"),
+    Series("bin", 658_000, 120, view="anywhere", changed=make_tote, arms="reaching"),
+    Series("clutter", 659_000, 150, view="anywhere", arms="resting"),
+    Series("pile", 659_500, 150, view="anywhere", arms="resting"),
+    Series("tabletop", 660_000, 180, view="anywhere", arms="resting"),
+    Series("room", 660_500, 120, view="anywhere", arms="resting"),
+    Series("clutter", 661_000, 120, coarse=True),
+    Series("clutter", 661_500, 120, view="anywhere", coarse=True),
+    Series("pile", 662_000, 120, view="anywhere", coarse=True),
+    Series("tabletop", 662_500, 120, view="anywhere", coarse=True),
+    Series("shelf", 663_000, 180, coarse=True),
+    Series("room", 663_500, 120, view="anywhere", coarse=True),
+    Series("bin", 664_000, 90, coarse=True),
+    Series("shelf", 664_500, 180, changed=make_rack),
+    Series("shelf", 665_000, 120, scale=1.8, changed=make_rack),
+    Series("clutter", 665_500, 90, scale=1.8, view="anywhere"),
+    Series("tabletop", 666_000, 90, scale=1.8, view="anywhere"),
 )
 """The merging trees were not grown on these seeds. The scaled scenes add large objects, which are
 too rare otherwise; rooms add arms and furniture, floors objects where furniture usually is."""
 _DISTANCE_M, _ELEVATION_DEG, _SWEEP_DEG = (0.35, 1.9), (12.0, 84.0), (20.0, 150.0)
 """Ranges of the position of a camera ``anywhere``, relative to its target."""
+_LOOKS = {"path": 2, "anywhere": 6, "floor": 6}
+"""Looks at each scene, with one sensor after the other: all from one place on the path."""
 _CLOSER_M = 0.08
 """Least distance of the target beyond the sensor's near limit."""
 
 
 class Samples(NamedTuple):
-    """Merged segments: ``features`` (n, `FEATURES`); ``objects`` (n,), which are objects."""
+    """The merged segments of several frames.
 
-    features: F4
+    Attributes
+    ----------
+    features : (n,) `OBJECT_FEATURES`.
+    objects : (n,) whether each is an object.
+    weights : for each frame, those of its segments as from `weigh_neighbours`.
+    """
+
+    features: Records
     objects: Bool
+    weights: tuple[F4, ...]
 
 
 @click.command()
-@growing_options(Path(structure.__file__).with_name(structure.FILE))
+@growing_options(Path(structure.__file__).parent)
 def main(*, seed: int, jobs: int, out: Path) -> None:
     """Simulate scenes, detect merged segments, and grow and write the trees."""
     samples = collect(_SERIES, jobs)
-    write_trees(out, grow(*samples, _GROWTH, seed), OBJECT_FEATURES)
-    click.echo(f"{len(samples.objects)} segments, {samples.objects.mean():.0%} of objects; {out}")
+    for (name, features), grown in zip(FILES.items(), grow_both(samples, seed), strict=True):
+        write_trees(out / name, grown, features)
+    objects = np.concatenate([part.objects for part in samples])
+    click.echo(f"{len(objects)} segments, {objects.mean():.0%} of objects; {out}")
 
 
-def collect(scenes: tuple[Series, ...], jobs: int) -> Samples:
-    """Return the merged segments of all scenes; the number of jobs does not affect the result."""
+def collect(scenes: tuple[Series, ...], jobs: int) -> list[Samples]:
+    """Return the merged segments of all scenes; the number of jobs does not affect the result.
+
+    Samples of the same scene are in the same part.
+    """
     chunks = [
         s._replace(first=s.first + k, scenes=min(_CHUNK, s.scenes - k))
         for s in scenes
@@ -116,26 +167,70 @@ def collect(scenes: tuple[Series, ...], jobs: int) -> Samples:
         ProcessPoolExecutor(jobs, mp_context=get_context("spawn")) as pool,
         click.progressbar(pool.map(_collect, chunks), length=len(chunks), label="scenes") as bar,
     ):
-        return Samples(*(np.concatenate(part) for part in zip(*bar, strict=True)))
+        return list(bar)
+
+
+def grow_both(samples: Sequence[Samples], seed: int) -> RejectionTrees:
+    """Grow the trees that judge segments alone, and those that judge them in their context.
+
+    The second ones learn from doubtful segments, and verdicts of trees that have not seen the same
+    scenes.
+    """
+    rows = [as_rows(part.features) for part in samples]
+    objects = [part.objects for part in samples]
+    context: dict[int, tuple[F4, Bool]] = {}
+    for fold in range(_FOLDS):
+        rest = [k for k in range(len(samples)) if k % _FOLDS != fold]
+        grown = _grow([rows[k] for k in rest], [objects[k] for k in rest], seed)
+        for k in range(fold, len(samples), _FOLDS):
+            logits = judge(rows[k], grown)
+            unsure = doubtful(logits)
+            context[k] = _in_context(samples[k], logits)[unsure], objects[k][unsure]
+    again = [context[k] for k in range(len(samples))]
+    in_context = _grow([features for features, _ in again], [known for _, known in again], seed)
+    return RejectionTrees(_grow(rows, objects, seed), in_context)
+
+
+def _grow(rows: Sequence[F4], objects: Sequence[Bool], seed: int) -> BoostedTrees:
+    return grow(np.concatenate(rows), np.concatenate(objects), _GROWTH, seed)
+
+
+def _in_context(samples: Samples, logits: F4) -> F4:
+    """Return the features of segments, judged alone with ``logits`` (n,), in their context."""
+    stops = np.cumsum([0, *(weights.shape[1] for weights in samples.weights)])
+    frames = [
+        add_context(samples.features[a:b], logits[a:b], weights)
+        for a, b, weights in zip(stops[:-1], stops[1:], samples.weights, strict=True)
+    ]
+    return as_rows(np.concatenate([np.zeros(0, CONTEXT_FEATURES), *frames]))
 
 
 def _collect(series: Series) -> Samples:
-    frames = (_labelled(series, seed) for seed in range(series.first, series.first + series.scenes))
-    found = list(chain.from_iterable(frames))
-    rows = np.array([features for features, _ in found], np.float32).reshape(-1, FEATURES)
-    return Samples(rows, np.array([is_object for _, is_object in found], bool))
+    seeds = range(series.first, series.first + series.scenes)
+    frames = list(chain.from_iterable(_looks(series, seed) for seed in seeds))
+    return Samples(
+        np.concatenate([np.zeros(0, OBJECT_FEATURES), *(frame.features for frame in frames)]),
+        np.concatenate([np.zeros(0, np.bool_), *(frame.objects for frame in frames)]),
+        tuple(chain.from_iterable(frame.weights for frame in frames)),
+    )
 
 
-def _labelled(series: Series, seed: int) -> Iterator[tuple[F4, bool]]:
+def _looks(series: Series, seed: int) -> Iterator[Samples]:
+    """Yield the segments of every look at one scene; a look costs a tenth of the scene."""
     rng = np.random.default_rng(seed)
     world = make_scene(series.kind, rng, frames=1)
-    sensor = PRESETS[series.sensors[seed % len(series.sensors)]]
     world = _on_floor(world) if series.view == "floor" else world
-    view = 0 if series.view == "path" else _viewpoint(world, sensor, rng)
-    frame, owners = render_frame(world, view, rng=rng, sensor=sensor)
-    depth = None if frame.depth is None else frame.depth * np.float32(series.scale)
+    if series.changed is not None:
+        world = replace(world, supports=tuple(series.changed(rng, world.supports)))
     things = np.array([thing.label for thing in world.things], np.int64)
-    yield from label_objects(replace(frame, depth=depth), owners, things)
+    for look in range(_LOOKS[series.view]):
+        sensor = PRESETS[series.sensors[(seed + look) % len(series.sensors)]]
+        view = 0 if series.view == "path" else _viewpoint(world, sensor, rng)
+        sensor = resized(sensor, 1 / rng.integers(2, 5)) if series.coarse else sensor
+        seen = _with_arms(world, view, sensor.camera, series.arms, rng)
+        frame, owners = render_frame(seen, view, rng=rng, sensor=sensor)
+        depth = None if frame.depth is None else frame.depth * np.float32(series.scale)
+        yield from label_objects(replace(frame, depth=depth), owners, things)
 
 
 def _on_floor(world: World) -> World:
@@ -148,6 +243,22 @@ def _on_floor(world: World) -> World:
     )
     rest = (s for s in world.supports if s is not table and not s.name.startswith("robot"))
     return replace(world, supports=tuple(rest), things=tuple(things))
+
+
+def _with_arms(
+    world: World, view: Pose | int, intrinsics: Camera, arms: str, rng: np.random.Generator
+) -> World:
+    """Add the arms of the robot whose camera takes the frame, or of a person beside it."""
+    if arms == "none":
+        return world
+    pose = view if isinstance(view, Pose) else world.path[view]
+    height = max(support.height for support in world.supports if support.level)
+    if arms == "reaching":
+        meshes = make_own_arms(rng, pose, height)
+    else:
+        meshes = make_resting_arms(rng, pose, intrinsics, height)
+    seen = (Support(f"arm_{k}", EQUIPMENT, mesh, np.zeros((0, 3))) for k, mesh in enumerate(meshes))
+    return replace(world, supports=(*world.supports, *seen))
 
 
 def _viewpoint(world: World, sensor: Sensor, rng: np.random.Generator) -> Pose | int:
@@ -169,8 +280,8 @@ def _viewpoint(world: World, sensor: Sensor, rng: np.random.Generator) -> Pose |
     return pose
 
 
-def label_objects(frame: Frame, owners: U1, things: I4) -> Iterator[tuple[F4, bool]]:
-    """Yield the features (1, `FEATURES`) of each merged segment, and whether it is an object.
+def label_objects(frame: Frame, owners: U1, things: I4) -> Iterator[Samples]:
+    """Yield the merged segments of a frame, if it shows a supporting plane.
 
     Parameters
     ----------
@@ -194,8 +305,8 @@ def label_objects(frame: Frame, owners: U1, things: I4) -> Iterator[tuple[F4, bo
     np.add.at(merged, segments.parent, counts)
     known_cells = merged[:, 1:].sum(axis=1)
     shares = merged[:, things[things < merged.shape[1]]].sum(axis=1) / np.maximum(known_cells, 1)
-    for p in np.unique(segments.parent[1:]):
-        yield features[p : p + 1].view(np.float32), bool(shares[p] > _OBJECT)
+    roots, weights = weigh_neighbours(segments)
+    yield Samples(features[roots], shares[roots] > _OBJECT, (weights,))
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from shapecat.arrays import F8
 from shapecat.simulation.mesh import Mesh, join, moved, scaled, standing
 from shapecat.simulation.parts import ellipsoid, placed, rod
 from shapecat.simulation.primitives import lathe, rounded_box, smooth_path, tube
-from shapecat.types import Pose
+from shapecat.types import Camera, Pose
 
 __all__ = [
     "make_arm",
@@ -22,7 +22,9 @@ __all__ = [
     "make_keyboard",
     "make_laptop",
     "make_monitor",
+    "make_own_arms",
     "make_plant",
+    "make_resting_arms",
 ]
 
 
@@ -41,6 +43,88 @@ def make_arm(rng: Generator, base: F8, reach: F8) -> list[Mesh]:
     foot = placed(rod(0.04, 2 * thick), base)
     links = [foot, *_links([base, shoulder, elbow, wrist], [thick, 0.9 * thick, 0.75 * thick])]
     return [*links, *_gripper(rng, wrist, reach)]
+
+
+def make_own_arms(rng: Generator, camera: Pose, height: float) -> list[Mesh]:
+    """Return the arms of the robot that carries the camera; they enter the image from its border.
+
+    Parameters
+    ----------
+    camera : ``world_from_camera`` with optical axes.
+    height : height of the support that they reach for, metres, world frame.
+    """
+    ahead = camera.rotation[:, 2]
+    far = (camera.translation[2] - height) / max(-float(ahead[2]), 0.3)
+    below = 1 if rng.random() < 0.75 else -1  # else it looks back at its own body
+    links: list[Mesh] = []
+    for side in rng.permutation([-1, 1])[: int(rng.integers(1, 3))]:
+        thick = rng.uniform(0.035, 0.09)
+        base = [side * rng.uniform(0.1, 0.55), below * rng.uniform(0.2, 0.6), rng.uniform(0, 0.4)]
+        depth = far * rng.uniform(0.55, 0.95)
+        aside = side * depth * rng.uniform(-0.05, 0.45)
+        reach = [aside, below * depth * rng.uniform(-0.1, 0.4), depth]
+        start, tip = (camera.rotation @ p + camera.translation for p in (base, reach))
+        tip[2] = max(tip[2], height + rng.uniform(0.03, 0.12))
+        wrist = _above(tip, rng.uniform(0.1, 0.24))
+        elbow = _above((start + wrist) / 2, rng.uniform(-0.05, 0.25))
+        joints = [start, elbow, wrist] if rng.random() < 0.7 else [start, wrist]
+        links += _links(joints, [thick, 0.85 * thick][: len(joints) - 1])
+        links += _gripper(rng, wrist, tip)
+    return links
+
+
+def make_resting_arms(
+    rng: Generator, camera: Pose, intrinsics: Camera, height: float
+) -> list[Mesh]:
+    """Return arms that lie on a support, or just above, and that the image border cuts off.
+
+    Parameters
+    ----------
+    camera : ``world_from_camera`` with optical axes.
+    height : height of the support, metres, world frame.
+    """
+    parts: list[Mesh] = []
+    side = rng.choice(4, p=[0.6, 0.15, 0.15, 0.1])  # bottom, left, right, top
+    for along in rng.uniform(0.05, 0.95, int(rng.integers(1, 3))):
+        deep = rng.uniform(0.05, 0.35)
+        ends = []
+        for inside, shift in ((-0.3, rng.uniform(-0.2, 0.2)), (deep, 0.0)):
+            u = along + shift
+            places = [(u, 1 - inside), (inside, u), (1 - inside, u), (u, inside)]
+            ends.append(_on_support(places[side], camera, intrinsics, height))
+        parts += _resting_arm(rng, *ends)
+    return parts
+
+
+def _on_support(uv: ArrayLike, camera: Pose, intrinsics: Camera, height: float) -> F8:
+    """Return where a pixel, in shares of the image, shows a support, at most 2 m away."""
+    u, v = np.asarray(uv, float) * [intrinsics.width, intrinsics.height]
+    ray = [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, 1.0]
+    ray = camera.rotation @ ray
+    depth = (camera.translation[2] - height) / max(-float(ray[2]), 1e-3)
+    place = camera.translation + min(depth, 2.0) * ray
+    place[2] = max(place[2], height)
+    return np.asarray(place)
+
+
+def _resting_arm(rng: Generator, start: F8, end: F8) -> list[Mesh]:
+    """Return a forearm from ``start`` (3,) to a hand or gripper at ``end`` (3,), on a support."""
+    thick, rise, gap = rng.uniform(0.03, 0.08), rng.uniform(0, 0.25), rng.uniform(-0.005, 0.05)
+    kind = rng.random()
+    if kind < 0.25:
+        return make_forearm(rng, _above(end, 0.03 + gap), _above(start, 0.05 + rise))
+    wrist, elbow = _above(end, thick + gap), _above(start, thick + gap + rise)
+    if kind < 0.6:
+        links = _links([elbow, wrist], [thick])
+        return [*links, *_gripper(rng, _above(wrist, thick), _above(end, gap))]
+    ahead = (end - start) / max(np.linalg.norm(end - start), 1e-6)
+    heading = float(np.degrees(np.arctan2(ahead[1], ahead[0]))) + rng.uniform(-20, 20)
+    size = [rng.uniform(0.12, 0.25), rng.uniform(0.07, 0.16), rng.uniform(0.06, 0.16)]
+    hand = rounded_box(size, radius=rng.uniform(0.005, 0.03))
+    housing = placed(placed(hand, [0, 0, 0], about="z", degrees=heading), _above(end, gap))
+    finger = placed(rounded_box([0.07, 0.02, 0.02]), [size[0] / 2 + 0.02, 0, 0.3 * size[2]])
+    finger = placed(placed(finger, [0, 0, 0], about="z", degrees=heading), _above(end, gap))
+    return [housing, finger, *_links([elbow, _above(end, gap + size[2] / 2)], [thick])]
 
 
 def _links(joints: Sequence[F8], radii: Sequence[float]) -> list[Mesh]:

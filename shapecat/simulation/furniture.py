@@ -1,11 +1,13 @@
 """Floors, walls, tables, shelves and bins; lengths in metres, z up."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.random import Generator
 
-from shapecat.simulation.mesh import moved
+from shapecat.arrays import F8
+from shapecat.simulation.mesh import Mesh, moved
 from shapecat.simulation.primitives import extrude, rounded_box
 from shapecat.simulation.worlds import Support
 from shapecat.types import Pose
@@ -14,15 +16,19 @@ __all__ = [
     "make_bin",
     "make_compartment",
     "make_counter",
+    "make_rack",
     "make_room",
     "make_shelf",
     "make_table",
+    "make_tote",
     "make_wall",
     "round_table",
 ]
 
-FLOOR, TABLE, BOARD, SIDE, BACK, WALL = 1, 2, 2, 7, 8, 9
+FLOOR, TABLE, BOARD, EQUIPMENT, SIDE, BACK, WALL = 1, 2, 2, 6, 7, 8, 9
 """Pixel labels; the boards of a shelf count up from `BOARD`."""
+_SIDES = ("left_side", "right_side", "front", "back")
+"""Names of the sides of a bin."""
 
 
 def make_room(rng: Generator, *, wall_chance: float) -> list[Support]:
@@ -84,6 +90,20 @@ def make_shelf(
     return boards, sides
 
 
+def make_rack(rng: Generator, supports: Sequence[Support]) -> list[Support]:
+    """Replace the sides of the shelf among some supports by posts; keep every third back."""
+    points = np.concatenate([s.mesh.vertices for s in supports if s.name.startswith("board")])
+    wide = rng.uniform(0.012, 0.05, 2)
+    place = np.abs(points[:, :2]).max(axis=0) + rng.uniform(-0.7, 0.5) * wide
+    tall = float(points[:, 2].max()) + rng.uniform(0.02, 0.4)
+    posts = [
+        _upright(f"post_{k}", EQUIPMENT, (*wide, tall), place * (x, y))
+        for k, (x, y) in enumerate([(-1, -1), (-1, 1), (1, -1), (1, 1)])
+    ]
+    gone = {"left_side", "right_side", "back" if rng.random() < 2 / 3 else ""}
+    return [*(support for support in supports if support.name not in gone), *posts]
+
+
 def make_bin(rng: Generator) -> tuple[Support, list[Support]]:
     """Return the bottom of an open bin, on the floor or 0.4 to 0.9 m high, and its four sides."""
     width, depth, tall = rng.uniform(0.3, 0.6), rng.uniform(0.25, 0.45), rng.uniform(0.1, 0.3)
@@ -92,14 +112,46 @@ def make_bin(rng: Generator) -> tuple[Support, list[Support]]:
     beside, before = (width + thick) / 2, (depth + thick) / 2
     sides = [
         _board(name, label, size, (x, y, height))
-        for name, label, size, x, y in (
-            ("left_side", SIDE, (thick, depth, tall), -beside, 0),
-            ("right_side", SIDE, (thick, depth, tall), beside, 0),
-            ("front", BACK, (width + 2 * thick, thick, tall), 0, -before),
-            ("back", BACK, (width + 2 * thick, thick, tall), 0, before),
+        for name, (label, size, x, y) in zip(
+            _SIDES,
+            (
+                (SIDE, (thick, depth, tall), -beside, 0),
+                (SIDE, (thick, depth, tall), beside, 0),
+                (BACK, (width + 2 * thick, thick, tall), 0, -before),
+                (BACK, (width + 2 * thick, thick, tall), 0, before),
+            ),
+            strict=True,
         )
     ]
     return bottom, sides
+
+
+def make_tote(rng: Generator, supports: Sequence[Support]) -> list[Support]:
+    """Lean the sides of the bin among some supports outwards; add a rim to every second bin."""
+    bottom = next(support for support in supports if support.name == "bin")
+    sides = [support for support in supports if support.name in _SIDES]
+    points = np.concatenate([side.mesh.vertices for side in sides])
+    half, top = np.ptp(points[:, :2], axis=0) / 2, float(points[:, 2].max())
+    if rng.random() < 0.5:
+        sides += _rim(half, rng.uniform(0.01, 0.05), top)
+    slope = np.tan(np.radians(rng.uniform(2, 25)))
+    leaning = [replace(s, mesh=_widened(s.mesh, half, slope, bottom.height)) for s in sides]
+    return [*(support for support in supports if support.name not in _SIDES), *leaning]
+
+
+def _rim(half: F8, wide: float, height: float) -> Iterator[Support]:
+    """Yield the four boards of a rim around a bin of half size ``half`` (2,)."""
+    for name, axis, side in (("left", 0, -1), ("right", 0, 1), ("near", 1, -1), ("far", 1, 1)):
+        size, place = 2 * half + 2 * wide, np.zeros(2)
+        size[axis], place[axis] = wide, side * (half[axis] + wide / 2)
+        yield _board(f"{name}_rim", SIDE, (*size, 0.006), (*place, height))
+
+
+def _widened(mesh: Mesh, half: F8, slope: float, height: float) -> Mesh:
+    """Return a mesh that, around a bin of half size ``half`` (2,), widens above ``height``."""
+    points = mesh.vertices.astype(np.float64)
+    points[:, :2] *= 1 + slope * np.maximum(points[:, 2:] - height, 0) / half
+    return Mesh(points.astype(np.float32), mesh.triangles)
 
 
 def make_compartment(rng: Generator) -> tuple[Support, list[Support], Support]:

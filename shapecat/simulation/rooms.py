@@ -17,7 +17,7 @@ from shapecat.simulation.equipment import (
     make_monitor,
     make_plant,
 )
-from shapecat.simulation.furniture import make_room, make_table, make_wall
+from shapecat.simulation.furniture import EQUIPMENT, make_room, make_table, make_wall
 from shapecat.simulation.mesh import Mesh
 from shapecat.simulation.paths import Filming, walk
 from shapecat.simulation.physics import Drop
@@ -26,8 +26,6 @@ from shapecat.simulation.worlds import Support, World, turned_about_z
 
 __all__ = ["room"]
 
-_EQUIPMENT = 6
-"""Pixel label of background equipment."""
 _DEVICES = {"laptop": make_laptop, "keyboard": make_keyboard, "plant": make_plant}
 """Large objects on the table, outside the categories."""
 
@@ -59,7 +57,7 @@ def room(
 
 def _named(name: str, meshes: Sequence[Mesh]) -> list[Support]:
     nothing = np.zeros((0, 3))
-    return [Support(f"{name}_{k}", _EQUIPMENT, mesh, nothing) for k, mesh in enumerate(meshes)]
+    return [Support(f"{name}_{k}", EQUIPMENT, mesh, nothing) for k, mesh in enumerate(meshes)]
 
 
 def _devices(rng: Generator) -> Iterator[tuple[str, Callable[[Generator], Mesh]]]:

@@ -3,33 +3,57 @@
 Background structure is walls of bins, sides and edges of shelves, furniture, bent ends of tables
 and blobs of noise. No single feature separates it from objects, many weak ones together do. The
 trees are grown on simulated scenes (`shapecat.models.structure`), also of rooms with arms and
-people.
+people. They judge each segment alone, and then among the others (`context`).
 """
 
 from functools import cache
 from importlib.resources import files
+from typing import NamedTuple
 
 import numpy as np
 
 from shapecat.arrays import F4, I4, Bool
 from shapecat.config import DetectionSettings
+from shapecat.detection.cleanup.context import CONTEXT_FEATURES, add_context, weigh_neighbours
 from shapecat.detection.cleanup.object_features import OBJECT_FEATURES
 from shapecat.detection.cleanup.settings import CLEANUP
-from shapecat.detection.depth_grid import DepthGrid
-from shapecat.detection.merging.segments import Records, Segments, is_root
+from shapecat.detection.depth_grid import DepthGrid, smallest_object_at
+from shapecat.detection.merging.segments import Records, Segments
 from shapecat.jit import kernel
 from shapecat.trees import BoostedTrees, logit_of, read_trees
 
-__all__ = ["FILE", "find_background", "load_trees", "number_objects"]
+__all__ = [
+    "FILES",
+    "RejectionTrees",
+    "as_rows",
+    "doubtful",
+    "find_background",
+    "judge",
+    "load_trees",
+    "number_objects",
+]
 
-FILE = "structure.npz"
+
+class RejectionTrees(NamedTuple):
+    """Trees that judge a segment ``alone``, and then ``in_context``, among the others."""
+
+    alone: BoostedTrees
+    in_context: BoostedTrees
+
+
+FILES = {"structure.npz": OBJECT_FEATURES, "structure_in_context.npz": CONTEXT_FEATURES}
+"""The files of both, with their features."""
 
 
 @cache
-def load_trees() -> BoostedTrees:
+def load_trees() -> RejectionTrees:
     """Load shapecat's trees for rejecting structure."""
-    return read_trees(
-        files("shapecat.detection.cleanup").joinpath(FILE).read_bytes(), OBJECT_FEATURES
+    folder = files("shapecat.detection.cleanup")
+    return RejectionTrees(
+        *(
+            read_trees(folder.joinpath(name).read_bytes(), features)
+            for name, features in FILES.items()
+        )
     )
 
 
@@ -38,14 +62,23 @@ def find_background(
     features: Records,
     grid: DepthGrid,
     settings: DetectionSettings,
-    grown: BoostedTrees,
+    grown: RejectionTrees,
 ) -> Bool:
-    """Return the merged segments to reject, as structure or as too large: (n + 1,) bool.
+    """Return the merged segments to reject, as structure or for their size: (n + 1,) bool.
 
     ``features`` (n + 1,) are from `measure_object_features`.
     """
-    rejected: Bool = _reject(segments, features.view(np.float32).reshape(len(features), -1), grown)
+    rejected = np.zeros(len(features), np.bool_)
+    roots, weights = weigh_neighbours(segments)
+    alone = judge(as_rows(features[roots]), grown.alone)
+    again = doubtful(alone)
+    context = add_context(features[roots], alone, weights)[again]
+    logits = alone.copy()
+    logits[again] = judge(as_rows(context), grown.in_context)
+    rejected[roots] = logits < CLEANUP.least_logit
     segment, cells = features["segment"], features["visibility"]["cells"]
+    enough = [smallest_object_at(grid, z) for z in features["visibility"]["depth_m"][roots]]
+    rejected[roots] |= cells[roots] < CLEANUP.tiny_share * np.array(enough)
     rejected |= segment["width_m"] > settings.max_size_m
     rejected |= segment["top_m"] > settings.max_height_m - CLEANUP.cut_off_m
     # Large and mostly outside the image: furniture, which the trees were not shown.
@@ -54,15 +87,29 @@ def find_background(
     return rejected
 
 
+def as_rows(features: Records) -> F4:
+    """Return records of float32 fields (n,) as an array (n, fields)."""
+    return features.view(np.float32).reshape(len(features), features.dtype.itemsize // 4)
+
+
+def doubtful(logits: F4) -> Bool:
+    """Return which segments, judged alone with ``logits`` (n,), to judge again in context, (n,)."""
+    again: Bool = np.abs(logits) < CLEANUP.doubtful_logit
+    return again
+
+
 @kernel
-def _reject(segments: Segments, features: F4, grown: BoostedTrees) -> Bool:
-    rejected = np.zeros(len(features), np.bool_)
-    for p in range(1, len(features)):
-        rejected[p] = (
-            is_root(segments, p)
-            and logit_of(grown, features[p], CLEANUP.hopeless) < CLEANUP.least_logit
-        )
-    return rejected
+def judge(features: F4, grown: BoostedTrees) -> F4:
+    """Return the logits (n,) that segments with these features (n, f) are objects.
+
+    They are within `CleanupSettings.certain_logit` of 0.
+    """
+    certain = CLEANUP.certain_logit
+    logits = np.zeros(len(features), np.float32)
+    for p in range(len(features)):
+        logit = logit_of(grown, features[p], -certain, certain)
+        logits[p] = min(max(logit, -certain), certain)
+    return logits
 
 
 @kernel

@@ -98,4 +98,4 @@ def _rate(
         logits[low, high] = -np.inf
         if adjacent[q]:
             write_pair_features(segments, features, low, high, view_geometry, scratch.pair[0])
-            logits[low, high] = logit_of(grown, scratch.features, MERGING.hopeless)
+            logits[low, high] = logit_of(grown, scratch.features, MERGING.hopeless, np.inf)

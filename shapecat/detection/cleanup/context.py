@@ -1,0 +1,58 @@
+"""Context: how the segments beside a segment have been judged.
+
+A finger of a gripper looks like an object, but it is connected to an arm. So trees that judge each
+segment by itself are followed by others, which also see the verdicts on its neighbours.
+
+Source: auto-context (Tu 2008).
+"""
+
+import numpy as np
+
+from shapecat.arrays import F4, I4
+from shapecat.detection.cleanup.object_features import OBJECT_FEATURES
+from shapecat.detection.cleanup.settings import CLEANUP
+from shapecat.detection.merging.segments import Records, Segments
+
+__all__ = ["CONTEXT_FEATURES", "add_context", "weigh_neighbours"]
+
+_NEIGHBOURS = ("connected", "behind", "in_front", "near")
+CONTEXT_FEATURES = np.dtype(
+    [
+        ("object", OBJECT_FEATURES),
+        ("logit", "f4"),  # by itself; then the mean verdicts from -1, background, to 1, object,
+        *((name, "f4") for name in _NEIGHBOURS),  # on its neighbours of each kind; 0 without any
+    ]
+)
+"""The features of a segment among others."""
+
+
+def weigh_neighbours(segments: Segments) -> tuple[I4, F4]:
+    """Return the merged segments (r,), and how long each borders on each other one.
+
+    The lengths (4, r, r), in cells, are of the borders where the two are connected, where the
+    second is behind and in front of the first, and where both are near without being connected.
+    """
+    roots = np.flatnonzero(segments.parent == np.arange(segments.parent.size))[1:]
+    pairs = segments.pairs[np.ix_(roots, roots)]
+    contact, in_front, near = pairs["contact"], pairs["in_front"], pairs["near"]
+    weights = np.stack([contact + contact.T, in_front, in_front.T, near + near.T])
+    weights[:, np.arange(len(roots)), np.arange(len(roots))] = 0
+    return roots, weights
+
+
+def add_context(features: Records, logits: F4, weights: F4) -> Records:
+    """Return the `CONTEXT_FEATURES` (r,) of the merged segments of a frame.
+
+    Parameters
+    ----------
+    features : (r,) `OBJECT_FEATURES`.
+    logits : (r,) that each is an object, judged by itself.
+    weights : (4, r, r) from `weigh_neighbours`.
+    """
+    judged = np.zeros(len(features), CONTEXT_FEATURES)
+    judged["object"], judged["logit"] = features, logits
+    verdicts = np.tanh(logits / CLEANUP.sure_logit)
+    means = weights @ verdicts / np.maximum(weights.sum(axis=2), 1)
+    for name, mean in zip(_NEIGHBOURS, means, strict=True):
+        judged[name] = mean
+    return judged
