@@ -81,6 +81,7 @@ def make_resting_arms(
     Parameters
     ----------
     camera : ``world_from_camera`` with optical axes.
+    intrinsics : of this camera.
     height : height of the support, metres, world frame.
     """
     parts: list[Mesh] = []

@@ -15,8 +15,8 @@ class CleanupSettings(NamedTuple):
     """Partial logit beyond which evaluation stops, on either side of 0: the remaining trees can
     hardly change the verdict."""
     doubtful_logit: float = 3.0
-    """Logit below which a segment is judged again in its context, on either side of 0. With all
-    segments judged again, none of 98,747 changes its verdict."""
+    """Logit below which a segment is judged again in its context, on either side of 0. If all of
+    98,747 segments were, the numbers of lost objects and of false ones would change by 0.3 %."""
     sure_logit: float = 4.0
     """Logit at which a verdict on a neighbour counts as nearly certain: three quarters of one."""
     tiny_share: float = 0.5
