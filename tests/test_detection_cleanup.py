@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from shapecat.config import DetectionSettings
-from shapecat.detection.cleanup.context import add_context, weigh_neighbours
+from shapecat.detection.cleanup.context import add_context, measure_borders
 from shapecat.detection.cleanup.holes import fill_contact_boundary, fill_holes
 from shapecat.detection.cleanup.object_features import (
     OBJECT_FEATURES,
@@ -16,8 +16,8 @@ from shapecat.detection.cleanup.object_features import (
 from shapecat.detection.cleanup.structure import (
     RejectionTrees,
     find_background,
-    judge,
     load_trees,
+    logits_of,
     number_objects,
 )
 from shapecat.detection.depth_grid import DepthGrid, PinholeIntrinsics, downsample
@@ -140,7 +140,7 @@ def test_verdicts_stop_where_they_are_certain() -> None:
     """The features of a context have the same range in training and in use."""
     for value, expected in ((9.0, 5.0), (-9.0, -5.0), (1.5, 1.5)):
         trees = _LEAF._replace(value=np.array([value], np.float32))
-        assert judge(np.zeros((1, 1), np.float32), trees).tolist() == [expected]
+        assert logits_of(np.zeros((1, 1), np.float32), trees).tolist() == [expected]
 
 
 def test_the_verdicts_on_neighbours_count_by_the_length_of_the_border() -> None:
@@ -150,7 +150,7 @@ def test_the_verdicts_on_neighbours_count_by_the_length_of_the_border() -> None:
     segments.pairs["contact"][1, 2], segments.pairs["contact"][2, 4] = 6, 2
     segments.pairs["contact"][2, 2] = 9  # the seam within a merged segment
     segments.pairs["in_front"][4, 1], segments.pairs["near"][4, 2] = 3, 1
-    roots, weights = weigh_neighbours(segments)
+    roots, weights = measure_borders(segments)
     assert roots.tolist() == [1, 2, 4]
     features = np.zeros(3, OBJECT_FEATURES)
     features["segment"]["width_m"] = [0.1, 0.2, 0.3]

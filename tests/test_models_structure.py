@@ -1,13 +1,15 @@
 """What the trees that reject background learn from."""
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from shapecat.arrays import F4
 from shapecat.detection.cleanup.context import add_context
 from shapecat.detection.cleanup.object_features import OBJECT_FEATURES
-from shapecat.detection.cleanup.structure import as_rows, doubtful, judge
+from shapecat.detection.cleanup.structure import as_rows, is_uncertain, logits_of
 from shapecat.geometry import transform
 from shapecat.models.structure import (
     Samples,
@@ -16,11 +18,12 @@ from shapecat.models.structure import (
     _viewpoint,
     _with_arms,
     collect,
-    grow_both,
+    grow_rejection_trees,
     label_objects,
 )
 from shapecat.simulation import IDEAL, KINECT, make_scene, render_frame
 from shapecat.simulation.furniture import EQUIPMENT, make_rack, make_tote
+from shapecat.simulation.worlds import World
 from shapecat.types import Pose
 
 SERIES = (Series("bin", 2000, 2, ("kinect",)), Series("clutter", 2000, 1, ("kinect",), scale=1.5))
@@ -108,19 +111,24 @@ def test_a_rack_has_posts_at_the_corners_of_its_boards_and_no_sides() -> None:
         assert places == pytest.approx(np.tile(corner[:2], (4, 1)), abs=0.05)
 
 
+def _armed(world: World, arms: str) -> Iterator[tuple[np.random.Generator, Pose, World, F4]]:
+    """Yield eight viewpoints, each with the world, arms added, and the arms' vertices (n, 3)."""
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        pose = _viewpoint(world, KINECT, rng)
+        assert isinstance(pose, Pose)
+        armed = _with_arms(world, pose, KINECT.camera, arms, rng)
+        added = armed.supports[len(world.supports) :]
+        assert {arm.label for arm in added} == {EQUIPMENT}
+        yield rng, pose, armed, np.concatenate([arm.mesh.vertices for arm in added])
+
+
 def test_the_arms_of_a_robot_come_from_beside_its_camera() -> None:
     """They end above the support, and hide something in most images."""
     world = make_scene("clutter", np.random.default_rng(2003), frames=1)
     table = max(support.height for support in world.supports if support.level)
     seen = 0
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        pose = _viewpoint(world, KINECT, rng)
-        assert isinstance(pose, Pose)
-        armed = _with_arms(world, pose, KINECT.camera, "reaching", rng)
-        arms = armed.supports[len(world.supports) :]
-        assert {arm.label for arm in arms} == {EQUIPMENT}
-        points = np.concatenate([arm.mesh.vertices for arm in arms])
+    for rng, pose, armed, points in _armed(world, "reaching"):
         assert points[:, 2].min() > table
         assert np.linalg.norm(points - pose.translation, axis=1).min() < 0.75
         seen += bool((render_frame(armed, pose, rng=rng, sensor=KINECT)[1] == EQUIPMENT).any())
@@ -132,13 +140,8 @@ def test_resting_arms_lie_on_the_support_and_are_cut_off_by_the_image_border() -
     world = make_scene("clutter", np.random.default_rng(2003), frames=1)
     table = max(support.height for support in world.supports if support.level)
     cut = 0
-    for seed in range(8):
-        rng = np.random.default_rng(seed)
-        pose = _viewpoint(world, KINECT, rng)
-        armed = _with_arms(world, pose, KINECT.camera, "resting", rng)
-        arms = armed.supports[len(world.supports) :]
-        assert {arm.label for arm in arms} == {EQUIPMENT}
-        lowest = min(float(arm.mesh.vertices[:, 2].min()) for arm in arms) - table
+    for rng, pose, armed, points in _armed(world, "resting"):
+        lowest = float(points[:, 2].min()) - table
         assert lowest > -0.1  # joints are thicker than the links
         owners = render_frame(armed, pose, rng=rng, sensor=IDEAL)[1].reshape(480, 640)
         rim = np.concatenate([owners[0], owners[-1], owners[:, 0], owners[:, -1]])
@@ -162,12 +165,12 @@ def test_a_verdict_on_a_neighbour_is_learned_from() -> None:
         weights = np.zeros((4, 3, 3), np.float32)
         weights[0, 0, 1] = weights[0, 1, 0] = 5
         samples.append(Samples(features, np.array([False, False, True]), (weights,)))
-    alone, in_context = grow_both(samples, 0)
+    alone, in_context = grow_rejection_trees(samples, 0)
     features["segment"]["top_m"] = [0.5, 0.1, 0.1]
-    logits = judge(as_rows(features), alone)
+    logits = logits_of(as_rows(features), alone)
     assert logits[0] < logits[1] == logits[2]
-    told = judge(as_rows(add_context(features, logits, weights)), in_context)
-    assert doubtful(logits).tolist() == [False, True, True]
+    told = logits_of(as_rows(add_context(features, logits, weights)), in_context)
+    assert is_uncertain(logits).tolist() == [False, True, True]
     assert (told[1:] > 0).tolist() == [False, True]
 
 

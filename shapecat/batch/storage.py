@@ -89,7 +89,7 @@ class Location:
 
         Raises
         ------
-        ShapecatError : the call failed: the URL "cannot be" ``done``.
+        ShapecatError : the call failed; ``done`` is the participle for the message ("read").
         FileNotFoundError, FileExistsError : raised by the storage.
         """
         for wait_s in (*_WAITS_S, 0.0):

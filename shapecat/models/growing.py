@@ -25,7 +25,7 @@ class Growth(NamedTuple):
 
 
 def growing_options(out: Path) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Add the options that commands for growing trees share; ``out`` is the default file."""
+    """Add the options that commands for growing trees share; ``out`` is the default for --out."""
     options = (
         click.option("--seed", default=0, show_default=True, help="Seed of the random generator."),
         click.option("--jobs", default=2, show_default=True, help="Number of processes."),

@@ -19,9 +19,15 @@ import numpy as np
 from shapecat.arrays import F4, I4, U1, Bool
 from shapecat.config import DetectionSettings
 from shapecat.detection.cleanup import structure
-from shapecat.detection.cleanup.context import CONTEXT_FEATURES, add_context, weigh_neighbours
+from shapecat.detection.cleanup.context import CONTEXT_FEATURES, add_context, measure_borders
 from shapecat.detection.cleanup.object_features import OBJECT_FEATURES, measure_object_features
-from shapecat.detection.cleanup.structure import FILES, RejectionTrees, as_rows, doubtful, judge
+from shapecat.detection.cleanup.structure import (
+    FILES,
+    RejectionTrees,
+    as_rows,
+    is_uncertain,
+    logits_of,
+)
 from shapecat.detection.depth_grid import downsample
 from shapecat.detection.merging.segments import Records
 from shapecat.detection.pipeline import ALL_STEPS, Task, merge_segments, oversegment
@@ -37,7 +43,7 @@ from shapecat.simulation.worlds import Support, World
 from shapecat.trees import BoostedTrees, write_trees
 from shapecat.types import Camera, Frame, Pose
 
-__all__ = ["Samples", "Series", "collect", "grow_both", "label_objects", "main"]
+__all__ = ["Samples", "Series", "collect", "grow_rejection_trees", "label_objects", "main"]
 
 _GROWTH = Growth(500, 64, 0.06)
 _FOLDS = 3
@@ -121,8 +127,8 @@ _SERIES = (
 too rare otherwise; rooms add arms and furniture, floors objects where furniture usually is."""
 _DISTANCE_M, _ELEVATION_DEG, _SWEEP_DEG = (0.35, 1.9), (12.0, 84.0), (20.0, 150.0)
 """Ranges of the position of a camera ``anywhere``, relative to its target."""
-_LOOKS = {"path": 2, "anywhere": 6, "floor": 6}
-"""Looks at each scene, with one sensor after the other: all from one place on the path."""
+_VIEWS = {"path": 2, "anywhere": 6, "floor": 6}
+"""Views of each scene, with one sensor after the other; on the path, from a single place."""
 _CLOSER_M = 0.08
 """Least distance of the target beyond the sensor's near limit."""
 
@@ -134,7 +140,7 @@ class Samples(NamedTuple):
     ----------
     features : (n,) `OBJECT_FEATURES`.
     objects : (n,) whether each is an object.
-    weights : for each frame, those of its segments as from `weigh_neighbours`.
+    weights : for each frame, those of its segments as from `measure_borders`.
     """
 
     features: Records
@@ -147,7 +153,9 @@ class Samples(NamedTuple):
 def main(*, seed: int, jobs: int, out: Path) -> None:
     """Simulate scenes, detect merged segments, and grow and write the trees."""
     samples = collect(_SERIES, jobs)
-    for (name, features), grown in zip(FILES.items(), grow_both(samples, seed), strict=True):
+    for (name, features), grown in zip(
+        FILES.items(), grow_rejection_trees(samples, seed), strict=True
+    ):
         write_trees(out / name, grown, features)
     objects = np.concatenate([part.objects for part in samples])
     click.echo(f"{len(objects)} segments, {objects.mean():.0%} of objects; {out}")
@@ -170,11 +178,11 @@ def collect(scenes: tuple[Series, ...], jobs: int) -> list[Samples]:
         return list(bar)
 
 
-def grow_both(samples: Sequence[Samples], seed: int) -> RejectionTrees:
+def grow_rejection_trees(samples: Sequence[Samples], seed: int) -> RejectionTrees:
     """Grow the trees that judge segments alone, and those that judge them in their context.
 
-    The second ones learn from doubtful segments, and verdicts of trees that have not seen the same
-    scenes.
+    The second ones learn from the uncertain segments, with logits of trees that were grown on the
+    other parts of the samples.
     """
     rows = [as_rows(part.features) for part in samples]
     objects = [part.objects for part in samples]
@@ -183,8 +191,8 @@ def grow_both(samples: Sequence[Samples], seed: int) -> RejectionTrees:
         rest = [k for k in range(len(samples)) if k % _FOLDS != fold]
         grown = _grow([rows[k] for k in rest], [objects[k] for k in rest], seed)
         for k in range(fold, len(samples), _FOLDS):
-            logits = judge(rows[k], grown)
-            unsure = doubtful(logits)
+            logits = logits_of(rows[k], grown)
+            unsure = is_uncertain(logits)
             context[k] = _in_context(samples[k], logits)[unsure], objects[k][unsure]
     again = [context[k] for k in range(len(samples))]
     in_context = _grow([features for features, _ in again], [known for _, known in again], seed)
@@ -207,7 +215,7 @@ def _in_context(samples: Samples, logits: F4) -> F4:
 
 def _collect(series: Series) -> Samples:
     seeds = range(series.first, series.first + series.scenes)
-    frames = list(chain.from_iterable(_looks(series, seed) for seed in seeds))
+    frames = list(chain.from_iterable(_views(series, seed) for seed in seeds))
     return Samples(
         np.concatenate([np.zeros(0, OBJECT_FEATURES), *(frame.features for frame in frames)]),
         np.concatenate([np.zeros(0, np.bool_), *(frame.objects for frame in frames)]),
@@ -215,16 +223,16 @@ def _collect(series: Series) -> Samples:
     )
 
 
-def _looks(series: Series, seed: int) -> Iterator[Samples]:
-    """Yield the segments of every look at one scene; a look costs a tenth of the scene."""
+def _views(series: Series, seed: int) -> Iterator[Samples]:
+    """Yield the segments of every view of one scene; a view costs a tenth of the scene."""
     rng = np.random.default_rng(seed)
     world = make_scene(series.kind, rng, frames=1)
     world = _on_floor(world) if series.view == "floor" else world
     if series.changed is not None:
         world = replace(world, supports=tuple(series.changed(rng, world.supports)))
     things = np.array([thing.label for thing in world.things], np.int64)
-    for look in range(_LOOKS[series.view]):
-        sensor = PRESETS[series.sensors[(seed + look) % len(series.sensors)]]
+    for k in range(_VIEWS[series.view]):
+        sensor = PRESETS[series.sensors[(seed + k) % len(series.sensors)]]
         view = 0 if series.view == "path" else _viewpoint(world, sensor, rng)
         sensor = resized(sensor, 1 / rng.integers(2, 5)) if series.coarse else sensor
         seen = _with_arms(world, view, sensor.camera, series.arms, rng)
@@ -248,7 +256,10 @@ def _on_floor(world: World) -> World:
 def _with_arms(
     world: World, view: Pose | int, intrinsics: Camera, arms: str, rng: np.random.Generator
 ) -> World:
-    """Add the arms of the robot whose camera takes the frame, or of a person beside it."""
+    """Add the arms of the robot whose camera takes the frame, or of a person beside it.
+
+    ``arms`` is as in `Series`, ``intrinsics`` are those of the camera at ``view``.
+    """
     if arms == "none":
         return world
     pose = view if isinstance(view, Pose) else world.path[view]
@@ -305,7 +316,7 @@ def label_objects(frame: Frame, owners: U1, things: I4) -> Iterator[Samples]:
     np.add.at(merged, segments.parent, counts)
     known_cells = merged[:, 1:].sum(axis=1)
     shares = merged[:, things[things < merged.shape[1]]].sum(axis=1) / np.maximum(known_cells, 1)
-    roots, weights = weigh_neighbours(segments)
+    roots, weights = measure_borders(segments)
     yield Samples(features[roots], shares[roots] > _OBJECT, (weights,))
 
 

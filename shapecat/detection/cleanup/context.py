@@ -13,7 +13,7 @@ from shapecat.detection.cleanup.object_features import OBJECT_FEATURES
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.merging.segments import Records, Segments
 
-__all__ = ["CONTEXT_FEATURES", "add_context", "weigh_neighbours"]
+__all__ = ["CONTEXT_FEATURES", "add_context", "measure_borders"]
 
 _NEIGHBOURS = ("connected", "behind", "in_front", "near")
 CONTEXT_FEATURES = np.dtype(
@@ -26,7 +26,7 @@ CONTEXT_FEATURES = np.dtype(
 """The features of a segment among others."""
 
 
-def weigh_neighbours(segments: Segments) -> tuple[I4, F4]:
+def measure_borders(segments: Segments) -> tuple[I4, F4]:
     """Return the merged segments (r,), and how long each borders on each other one.
 
     The lengths (4, r, r), in cells, are of the borders where the two are connected, where the
@@ -47,7 +47,7 @@ def add_context(features: Records, logits: F4, weights: F4) -> Records:
     ----------
     features : (r,) `OBJECT_FEATURES`.
     logits : (r,) that each is an object, judged by itself.
-    weights : (4, r, r) from `weigh_neighbours`.
+    weights : (4, r, r) from `measure_borders`.
     """
     judged = np.zeros(len(features), CONTEXT_FEATURES)
     judged["object"], judged["logit"] = features, logits

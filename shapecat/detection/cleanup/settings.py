@@ -14,7 +14,7 @@ class CleanupSettings(NamedTuple):
     certain_logit: float = 5.0
     """Partial logit beyond which evaluation stops, on either side of 0: the remaining trees can
     hardly change the verdict."""
-    doubtful_logit: float = 3.0
+    uncertain_logit: float = 3.0
     """Logit below which a segment is judged again in its context, on either side of 0. If all of
     98,747 segments were, the numbers of lost objects and of false ones would change by 0.3 %."""
     sure_logit: float = 4.0

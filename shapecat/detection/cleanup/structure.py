@@ -14,7 +14,7 @@ import numpy as np
 
 from shapecat.arrays import F4, I4, Bool
 from shapecat.config import DetectionSettings
-from shapecat.detection.cleanup.context import CONTEXT_FEATURES, add_context, weigh_neighbours
+from shapecat.detection.cleanup.context import CONTEXT_FEATURES, add_context, measure_borders
 from shapecat.detection.cleanup.object_features import OBJECT_FEATURES
 from shapecat.detection.cleanup.settings import CLEANUP
 from shapecat.detection.depth_grid import DepthGrid, smallest_object_at
@@ -26,10 +26,10 @@ __all__ = [
     "FILES",
     "RejectionTrees",
     "as_rows",
-    "doubtful",
     "find_background",
-    "judge",
+    "is_uncertain",
     "load_trees",
+    "logits_of",
     "number_objects",
 ]
 
@@ -69,12 +69,12 @@ def find_background(
     ``features`` (n + 1,) are from `measure_object_features`.
     """
     rejected = np.zeros(len(features), np.bool_)
-    roots, weights = weigh_neighbours(segments)
-    alone = judge(as_rows(features[roots]), grown.alone)
-    again = doubtful(alone)
+    roots, weights = measure_borders(segments)
+    alone = logits_of(as_rows(features[roots]), grown.alone)
+    again = is_uncertain(alone)
     context = add_context(features[roots], alone, weights)[again]
     logits = alone.copy()
-    logits[again] = judge(as_rows(context), grown.in_context)
+    logits[again] = logits_of(as_rows(context), grown.in_context)
     rejected[roots] = logits < CLEANUP.least_logit
     segment, cells = features["segment"], features["visibility"]["cells"]
     enough = [smallest_object_at(grid, z) for z in features["visibility"]["depth_m"][roots]]
@@ -92,14 +92,14 @@ def as_rows(features: Records) -> F4:
     return features.view(np.float32).reshape(len(features), features.dtype.itemsize // 4)
 
 
-def doubtful(logits: F4) -> Bool:
-    """Return which segments, judged alone with ``logits`` (n,), to judge again in context, (n,)."""
-    again: Bool = np.abs(logits) < CLEANUP.doubtful_logit
+def is_uncertain(logits: F4) -> Bool:
+    """Return which segments, with these ``logits`` (n,) alone, to judge again in context, (n,)."""
+    again: Bool = np.abs(logits) < CLEANUP.uncertain_logit
     return again
 
 
 @kernel
-def judge(features: F4, grown: BoostedTrees) -> F4:
+def logits_of(features: F4, grown: BoostedTrees) -> F4:
     """Return the logits (n,) that segments with these features (n, f) are objects.
 
     They are within `CleanupSettings.certain_logit` of 0.
