@@ -28,16 +28,13 @@ class Footprint(Record):
     low: float
     high: float
 
-    def moved(self, shift: F8) -> "Footprint":
-        """Return the footprint moved by ``shift`` (3,), metres."""
-        flat = np.asarray(shift)[:2]
-        return Footprint(
-            self.outline + flat,
-            self.contact + flat,
-            self.top + flat,
-            self.low + shift[2],
-            self.high + shift[2],
+    def moved(self, turn: Pose) -> "Footprint":
+        """Return the footprint of the object after a turn about z and a shift."""
+        about_z, (x, y, z) = turn.rotation[:2, :2].T, turn.translation
+        outline, contact, top = (
+            flat @ about_z + (x, y) for flat in (self.outline, self.contact, self.top)
         )
+        return Footprint(outline, contact, top, self.low + z, self.high + z)
 
 
 def footprint(mesh: Mesh, world_from_mesh: Pose) -> Footprint:

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.random import Generator
 
 from shapecat.arrays import F8
+from shapecat.geometry import compose
 from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.footprints import Footprint, footprint, inside, overlap
 from shapecat.simulation.mesh import Mesh
@@ -24,6 +25,7 @@ _WIDEST_M = 0.42
 _BEARERS = {"box", "can"}
 _SMALLEST_TOP_M = 0.035
 _EDGE_M = 0.01
+_STILL = Pose(np.eye(3), np.zeros(3))
 
 
 class Piece(NamedTuple):
@@ -49,7 +51,7 @@ def make_piece(category: str, rng: Generator, *, manner: str | None = None) -> P
     else:
         kind, mesh = category, make_object(category, rng)
     wanted = manner or _draw_manner(category, rng)
-    rest = Rest(Pose(np.eye(3), np.zeros(3)), "upright")
+    rest = Rest(_STILL, "upright")
     if wanted != "upright" and category not in {"ball", "unknown"}:
         rest = choose_rest(rests(mesh), wanted, rng) or rest
     return Piece(category, kind, mesh, rest)
@@ -112,12 +114,13 @@ class Layout:
         ``half`` (2,) is as for `put`; ``tries`` is the number of random positions to try.
         """
         middle = support.outline[:, :2].mean(axis=0)
+        resting = footprint(piece.mesh, piece.rest.pose)
         for _ in range(tries):
             spot = middle + self._rng.uniform(-half, half)
-            pose = self._posed(piece, np.array([*spot, support.height]))
-            here = footprint(piece.mesh, pose)
+            turn = self._drawn_turn(np.array([*spot, support.height]))
+            here = resting.moved(turn)
             if self._fits(here, support):
-                self._add(piece, pose, here, support, None)
+                self._add(piece, turn, here, support, None)
                 return True
         return False
 
@@ -131,10 +134,11 @@ class Layout:
         The translation (3,) of its pose there, metres, or None if there is no room.
         """
         thing, middle = self.things[k], support.outline[:, :2].mean(axis=0)
+        first = self._places[k]
         for _ in range(tries):
             spot = np.round(middle + self._rng.uniform(-half, half), 6)
             place = np.array([*spot, thing.pose.translation[2]])
-            here = footprint(thing.mesh, Pose(thing.pose.rotation, place))
+            here = first.moved(Pose(np.eye(3), place - thing.pose.translation))
             if self._fits(here, support):
                 self._places.append(here)
                 return place
@@ -144,21 +148,23 @@ class Layout:
         bearers = [k for k in range(len(self.things)) if self._can_bear(k)]
         if not bearers or piece.category == "ball":
             return False
+        resting = footprint(piece.mesh, piece.rest.pose)
         for _ in range(tries):
             k = bearers[int(self._rng.integers(len(bearers)))]
             below = self._places[k]
             slack = 0.25 * np.ptp(below.top, axis=0)
             spot = [*below.top.mean(axis=0) + self._rng.uniform(-slack, slack), below.high]
-            pose = self._posed(piece, np.array(spot))
-            here = footprint(piece.mesh, pose)
+            turn = self._drawn_turn(np.array(spot))
+            here = resting.moved(turn)
             if _bears(below, here) and self._fits(here, self._roots[k]):
-                self._add(piece, pose, here, self._roots[k], self.things[k].track)
+                self._add(piece, turn, here, self._roots[k], self.things[k].track)
                 return True
         return False
 
-    def _posed(self, piece: Piece, place: F8) -> Pose:
+    def _drawn_turn(self, place: F8) -> Pose:
+        """Return a random turn about z that moves the origin to ``place`` (3,)."""
         angle = self._rng.uniform(0, 2 * np.pi)
-        return turn_about_z(piece.rest.pose, angle, np.round(place, 6))
+        return turn_about_z(_STILL, angle, np.round(place, 6))
 
     def _fits(self, here: Footprint, support: Support) -> bool:
         on_board = here.low < support.height + 1e-4
@@ -178,7 +184,7 @@ class Layout:
         return flat and self.things[k].category in _BEARERS
 
     def _add(
-        self, piece: Piece, pose: Pose, here: Footprint, support: Support, bearer: int | None
+        self, piece: Piece, turn: Pose, here: Footprint, support: Support, bearer: int | None
     ) -> None:
         manner = "upright" if piece.category == "box" else piece.rest.manner  # a box has no upright
         thing = Thing(
@@ -186,7 +192,7 @@ class Layout:
             piece.category,
             piece.kind,
             piece.mesh,
-            pose,
+            compose(turn, piece.rest.pose),
             support.name if bearer is None else None,
             bearer,
             lying=manner == "lying",
