@@ -219,6 +219,7 @@ def test_an_inner_kernel_is_called_by_kernels_alone() -> None:
         assert all(by_kernel for by_kernel, _ in calls[name]), name
 
 
+@cache
 def kernels() -> tuple[
     dict[tuple[str, str], dict[str, bool]], dict[tuple[str, str], list[tuple[bool, bool]]]
 ]:

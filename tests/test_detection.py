@@ -144,11 +144,11 @@ def overlaps(scene: Scene, seen: NDArray[np.int64], objects: list[int]) -> list[
     """Return the largest IoU of each true object with any candidate."""
     best = []
     for k in objects:
-        truth = np.flatnonzero(seen.ravel() == k)
-        ious = [
-            np.intersect1d(truth, c.indices).size / np.union1d(truth, c.indices).size
-            for c in scene.candidates
-        ]
+        truth = seen.ravel() == k
+        ious = []
+        for c in scene.candidates:
+            shared = np.count_nonzero(truth[c.indices])
+            ious.append(shared / (np.count_nonzero(truth) + len(c.indices) - shared))
         best.append(max(ious, default=0.0))
     return best
 

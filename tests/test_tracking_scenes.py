@@ -300,6 +300,7 @@ def recorded(
     return record(*scene(seed), seed)
 
 
+@pytest.mark.parametrize("count", [3, pytest.param(len(SEEDS), marks=pytest.mark.many)])
 @pytest.mark.parametrize(
     ("scene", "idf1", "mota", "switches", "association"),
     [
@@ -319,16 +320,17 @@ def test_identities_survive_noise_misses_splits_and_occlusions(
     mota: float,
     switches: int,
     association: Literal["hungarian", "greedy"],
+    count: int,
 ) -> None:
-    """Six recordings each, on seeds that were not used to choose the tracker's constants."""
+    """Several recordings each, on seeds that were not used to choose the tracker's constants."""
     settings = replace(SETTINGS, association=association)
     scores = []
-    for seed in SEEDS:
+    for seed in SEEDS[:count]:
         rows, truth = recorded(scene, seed)
         scores.append(score(tuple(track_recording(rows, settings)), truth))
     assert np.mean([s.idf1 for s in scores]) >= idf1
     assert np.mean([s.mota for s in scores]) >= mota
-    assert sum(s.switches for s in scores) <= switches
+    assert sum(s.switches for s in scores) <= switches * count / len(SEEDS)
 
 
 def test_score_agrees_with_a_published_library() -> None:
