@@ -34,10 +34,9 @@ def convex_parts(mesh: Mesh) -> list[F8]:
 
 def hollowness(mesh: Mesh) -> float:
     """Return the fraction (0 to 1) of the convex hull's volume that is empty and open above."""
-    points = _samples(mesh)
-    low, high = points.min(axis=0), points.max(axis=0)
-    size = np.maximum(high - low, 1e-9)
-    hull = ConvexHull(mesh.vertices)
+    points, hull = _samples(mesh), ConvexHull(mesh.vertices)
+    low = hull.min_bound
+    size = np.maximum(hull.max_bound - low, 1e-9)
     column = np.minimum(((points - low) / size * _COLUMNS).astype(int), _COLUMNS - 1)
     top = np.full((_COLUMNS, _COLUMNS), low[2])
     np.maximum.at(top, (column[:, 0], column[:, 1]), points[:, 2])
@@ -51,15 +50,14 @@ def hollowness(mesh: Mesh) -> float:
 
 def _span(hull: ConvexHull, spots: F8) -> tuple[F8, F8]:
     """Return the largest and the smallest z of a hull at horizontal positions (n, 2)."""
-    normals, offsets = hull.equations[:, :3], hull.equations[:, 3]
-    lid, base = np.full(len(spots), np.inf), np.full(len(spots), -np.inf)
-    for (x, y, z), d in zip(normals, offsets, strict=True):
-        across = spots @ [x, y] + d
-        if abs(z) < 1e-9:
-            lid[across > 0] = -np.inf
-            continue
-        limit = -across / z
-        lid, base = (np.minimum(lid, limit), base) if z > 0 else (lid, np.maximum(base, limit))
+    upward = hull.equations[:, 2]
+    flat = np.column_stack([spots, np.ones(len(spots))])
+    across = flat @ hull.equations[:, [0, 1, 3]].T
+    level = np.abs(upward) < 1e-9
+    limit = -across / np.where(level, 1.0, upward)
+    lid = np.where(upward > 0, limit, np.inf).min(axis=1, where=~level, initial=np.inf)
+    base = np.where(upward < 0, limit, -np.inf).max(axis=1, where=~level, initial=-np.inf)
+    lid[(across[:, level] > 0).any(axis=1)] = -np.inf
     return lid, base
 
 
