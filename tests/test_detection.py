@@ -1,7 +1,7 @@
 """Detection on scenes drawn by a small ray caster, each named by the hazard it holds."""
 
 from collections.abc import Callable
-from functools import reduce
+from functools import lru_cache, reduce
 from typing import Any
 
 import numpy as np
@@ -28,6 +28,12 @@ def squared(vectors: Array) -> Array:
     return reduce(np.add, np.moveaxis(vectors**2, -1, 0))
 
 
+def turned_by(turn: Array, rays: Array) -> list[Array]:
+    """Return each component of turned vectors (..., 3), which lie in memory one after the other."""
+    x, y, z = np.moveaxis(rays, -1, 0)
+    return [row[0] * x + row[1] * y + row[2] * z for row in turn]
+
+
 def table(x: float = 0.5, y: float = 0.4, z: float = 0.0) -> Shape:
     """Return a horizontal rectangle of half sizes x, y at height z."""
 
@@ -51,12 +57,11 @@ def box(
 
     def hit(origin: Array, rays: Array) -> Array:
         o = turn @ (origin - np.array(center) - [0, 0, half[2]])
-        d = rays @ turn.T
-        with np.errstate(divide="ignore", invalid="ignore"):
-            a, b = (-half - o) / d, (half - o) / d
-        # Along an axis of three, numpy's own maximum takes five times as long.
-        near = reduce(np.maximum, np.moveaxis(np.minimum(a, b), -1, 0))
-        far = reduce(np.minimum, np.moveaxis(np.maximum(a, b), -1, 0))
+        near, far = np.zeros(rays.shape[:-1]), np.full(rays.shape[:-1], np.inf)
+        for axis, d in enumerate(turned_by(turn, rays)):
+            with np.errstate(divide="ignore", invalid="ignore"):
+                a, b = (-half[axis] - o[axis]) / d, (half[axis] - o[axis]) / d
+            near, far = np.maximum(near, np.minimum(a, b)), np.minimum(far, np.maximum(a, b))
         return np.where((near < far) & (near > 0), near, np.inf)
 
     return hit
@@ -72,15 +77,17 @@ def shell(center: tuple[float, float, float], radius: float, rim: float | None) 
 
     def hit(origin: Array, rays: Array) -> Array:
         o = origin - np.array(center)
-        a, b, c = squared(rays), 2 * rays @ o, o @ o - radius**2
+        a, (b,), c = squared(rays), turned_by(2 * o[None], rays), o @ o - radius**2
         root = b * b - 4 * a * c
-        with np.errstate(invalid="ignore"):
-            first, second = ((-b + s * np.sqrt(root)) / (2 * a) for s in (-1, 1))
-        best = np.full(a.shape, np.inf)
-        for t in (first, second):
-            z = origin[2] + t * rays[..., 2]
-            ok = (root > 0) & (t > 0) & ((rim is None) | (z < (rim or 0)))
-            best = np.where(ok & (t < best), t, best)
+        best, close = np.full(a.shape, np.inf), root > 0  # the others pass it by
+        d, a, b, root = rays[close], a[close], b[close], root[close]
+        nearest = np.full(a.shape, np.inf)
+        for sign in (-1, 1):
+            t = (-b + sign * np.sqrt(root)) / (2 * a)
+            z = origin[2] + t * d[..., 2]
+            ok = (t > 0) & ((rim is None) | (z < (rim or 0)))
+            nearest = np.where(ok & (t < nearest), t, nearest)
+        best[close] = nearest
         return best
 
     return hit
@@ -91,17 +98,21 @@ def can(x: float, y: float, z: float, radius: float, height: float) -> Shape:
 
     def hit(origin: Array, rays: Array) -> Array:
         o = origin - np.array([x, y, z])
-        d = rays
-        a, b = squared(d[..., :2]), 2 * d[..., :2] @ o[:2]
+        best = np.full(rays.shape[:-1], np.inf)
+        a = squared(rays[..., :2])
+        b = 2 * (o[0] * rays[..., 0] + o[1] * rays[..., 1])
         root = b * b - 4 * a * (o[:2] @ o[:2] - radius**2)
+        close = root > 0  # the others pass it by
+        d, a, b, root = rays[close], a[close], b[close], root[close]
         with np.errstate(invalid="ignore", divide="ignore"):
             t = (-b - np.sqrt(root)) / (2 * a)
             h = o[2] + t * d[..., 2]
-            side = np.where((root > 0) & (t > 0) & (h > 0) & (h < height), t, np.inf)
+            side = np.where((t > 0) & (h > 0) & (h < height), t, np.inf)
             u = (height - o[2]) / d[..., 2]
             p = o[:2] + u[..., None] * d[..., :2]
             lid = np.where((u > 0) & (squared(p) < radius**2), u, np.inf)
-        return np.minimum(side, lid)
+        best[close] = np.minimum(side, lid)
+        return best
 
     return hit
 
@@ -116,20 +127,28 @@ def render(
     seed: int = 0,
 ) -> tuple[Array, NDArray[np.int64]]:
     """Return depth (h, w) of a camera looking at the world's origin, and which shape is seen."""
+    forward, rays = looking(tilt_deg, camera)
+    z, seen = np.full(rays.shape[:-1], np.inf), np.full(rays.shape[:-1], -1)
+    for k, shape in enumerate(shapes):
+        hits = shape(-distance * forward, rays)
+        seen[hits < z] = k
+        z = np.minimum(z, hits)
+    w = 1 / z + np.random.default_rng(seed).normal(0, noise, z.shape)
+    return np.where(np.isfinite(z), 1 / np.maximum(w, 1e-3), 0), seen
+
+
+@lru_cache(maxsize=8)
+def looking(tilt_deg: float, camera: Camera) -> tuple[Array, Array]:
+    """Return the direction (3,) of a camera and the rays (h, w, 3) of its pixels."""
     t = np.radians(tilt_deg)
     right = np.array([1.0, 0, 0])
     forward = np.array([0, np.cos(t), -np.sin(t)])
     down = np.cross(forward, right)
     v, u = np.mgrid[: camera.height, : camera.width]
-    rays = (
-        ((u - camera.cx) / camera.fx)[..., None] * right
-        + ((v - camera.cy) / camera.fy)[..., None] * down
-        + forward
-    )
-    hits = np.stack([shape(-distance * forward, rays) for shape in shapes])
-    seen, z = hits.argmin(axis=0), hits.min(axis=0)
-    w = 1 / z + np.random.default_rng(seed).normal(0, noise, z.shape)
-    return np.where(np.isfinite(z), 1 / np.maximum(w, 1e-3), 0), np.where(np.isfinite(z), seen, -1)
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    # Each component lies in one piece of memory: sums along so short an axis are slow.
+    rays = np.stack([x * right[k] + y * down[k] + forward[k] for k in range(3)])
+    return forward, np.moveaxis(rays, 0, -1)
 
 
 def frame_of(depth: Array, camera: Camera = CAMERA) -> Frame:
