@@ -360,7 +360,7 @@ def test_a_missing_review_or_viewer_is_said_in_one_line(
         review.take_screenshot(tmp_path / "r.rrd", tmp_path / "r.png")
 
 
-_ANSWERS = "import socket, time; s = socket.create_server(('127.0.0.1', PORT)); time.sleep(2)"
+_ANSWERS = "import socket, time; s = socket.create_server(('127.0.0.1', PORT)); time.sleep(0.5)"
 
 
 @pytest.mark.parametrize(
@@ -389,7 +389,7 @@ def test_no_viewer_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     fake.write_text(f"#!/bin/sh\nsleep 60 &\necho $! > {tmp_path / 'pid'}\nwait\n")
     fake.chmod(0o755)
     monkeypatch.setattr(review_viewer, "_viewer", lambda: str(fake))
-    monkeypatch.setattr(review_viewer, "_LOAD_S", 1.0)
+    monkeypatch.setattr(review_viewer, "_LOAD_S", 0.6)
     monkeypatch.setattr(review_viewer, "_SETTLE_S", 0.1)
     with pytest.raises(OutputError, match="no answer"):
         review.take_screenshot(fake, tmp_path / "r.png")
