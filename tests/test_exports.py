@@ -278,12 +278,16 @@ def test_masks_label_the_pixels_of_each_object(run: Path, tmp_path: Path) -> Non
         if row["detection"] is not None
     }
     labels = read_finished(run).labels
+    images = {
+        path.stem: [
+            np.asarray(image.open(out / kind / path.name)).ravel()
+            for kind in ("instance", "semantic", "depth")
+        ]
+        for path in (out / "instance").iterdir()
+    }
     for row in rows(run, "detections"):
         track = owner.get((row["frame"], row["detection"]), 0)
-        name = f"{row['frame']:06d}.png"
-        instance = np.asarray(image.open(out / "instance" / name)).ravel()
-        semantic = np.asarray(image.open(out / "semantic" / name)).ravel()
-        depth = np.asarray(image.open(out / "depth" / name)).ravel()
+        instance, semantic, depth = images[f"{row['frame']:06d}"]
         if track not in labels:
             assert not instance[row["indices"]].any()
             continue

@@ -156,9 +156,10 @@ def test_index_lists_runs_and_links_to_them(shapecat: Run, run: Path) -> None:
     shutil.copytree(run, other)
     (run.parent / ".table.partial").mkdir()
     (run.parent / ".table.partial" / "run.json").write_text("{}")
-    about = json.loads((other / "run.json").read_text())
-    about["input"]["path"] = str(run / "gone.mcap")  # its page needs fewer pictures
-    (other / "run.json").write_text(json.dumps(about))
+    for folder in (run, other):
+        about = json.loads((folder / "run.json").read_text())
+        about["input"]["path"] = str(run / "gone.mcap")  # its page needs fewer pictures
+        (folder / "run.json").write_text(json.dumps(about))
 
     result = shapecat("report", run.parent)
 
