@@ -89,7 +89,7 @@ def _write_masks(out: Path, name: str, frame: Frame, labels: U4) -> None:
     }
     for folder, image in images.items():
         (out / folder).mkdir(exist_ok=True)
-        (out / folder / f"{name}.png").write_bytes(png(image.astype(np.uint16)))
+        (out / folder / f"{name}.png").write_bytes(png(image.astype(np.uint16), level=6))
 
 
 def _write_cloud(out: Path, name: str, frame: Frame, labels: U4) -> None:
