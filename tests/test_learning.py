@@ -14,7 +14,7 @@ from sklearn.utils.estimator_checks import check_estimator
 
 from shapecat.arrays import F4
 from shapecat.learning import Categorizer
-from shapecat.learning.baselines import make_baselines, shape_functions
+from shapecat.learning.baselines import make_baselines
 from shapecat.learning.boosted import BoostedDictionary
 from shapecat.learning.calibration import fit_temperature, softmax
 from shapecat.learning.dictionary import ForestDictionary, WordLearner
@@ -22,6 +22,7 @@ from shapecat.learning.features import FeatureBank
 from shapecat.learning.forest import FlatForest, flatten
 from shapecat.learning.incremental import _Inputs, _shift, add_categories
 from shapecat.learning.pnn import ProbabilisticNeuralNetwork
+from shapecat.learning.shape_functions import shape_functions
 from shapecat.learning.training import (
     Examples,
     LearningSettings,

@@ -10,7 +10,7 @@ from shapecat.description import BLOCKS, DESCRIPTOR_NAMES
 from shapecat.evaluation import View
 from shapecat.evaluation.training import fit_views
 from shapecat.evaluation.views import DescribedViews
-from shapecat.learning.baselines import shape_functions
+from shapecat.learning.shape_functions import shape_functions
 from shapecat.models.arrangements import World
 from shapecat.models.studies import compare_with_plain, next_frames, sampled, spread, subsample
 from shapecat.models.worlds import simulate_world

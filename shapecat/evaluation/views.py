@@ -11,6 +11,7 @@ from shapecat.arrays import F4
 from shapecat.config import Settings
 from shapecat.description import DESCRIPTOR_NAMES, describe
 from shapecat.evaluation.dataset import View
+from shapecat.learning.shape_functions import shape_functions
 from shapecat.surface import reconstruct, thin
 
 __all__ = ["DescribedViews", "Observer", "describe_view", "describe_views", "ignore"]
@@ -39,7 +40,7 @@ class DescribedViews(NamedTuple):
     seconds : (n,) time from points to descriptor.
     skipped : number of views with too few points for a surface, which are left out.
     elevations : (n,) angle by which the sensor looks down, degrees; may be empty.
-    functions : (n, f) shape distributions from `shapecat.learning.baselines.shape_functions`; may
+    functions : (n, f) shape distributions from `shapecat.learning.shape_functions`; may
         be empty.
     """
 
@@ -132,6 +133,4 @@ def describe_views(
 
 
 def _functions(view: View, seed: tuple[int, ...]) -> F4:
-    from shapecat.learning.baselines import shape_functions  # noqa: PLC0415  loads scikit-learn
-
     return shape_functions(view.points, np.random.default_rng(seed))

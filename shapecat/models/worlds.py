@@ -21,7 +21,7 @@ from shapecat.geometry import (
     level_from_sensor,
     transform,
 )
-from shapecat.learning.baselines import shape_functions
+from shapecat.learning.shape_functions import shape_functions
 from shapecat.models.arrangements import ALONE, Actor, Arrangement, World, arrange, placed
 from shapecat.models.fragments import cut_fragment, cut_halo
 from shapecat.models.rendered_views import RenderedView, render_view
