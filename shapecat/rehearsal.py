@@ -5,13 +5,14 @@
 compiles them ahead of time, for example while a container image is built.
 """
 
+import argparse
 import gc
 import hashlib
 import os
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import wait
 from contextlib import suppress
 from multiprocessing import current_process
@@ -172,8 +173,20 @@ def _count() -> int:
     return sum(len([*folder.rglob("*.nbi")]) for folder in folders if folder is not None)
 
 
-def main() -> None:
-    """Compile the kernels, and print their number every ten seconds."""
+def main(words: Sequence[str] | None = None) -> None:
+    """Compile the kernels, and print their number every ten seconds.
+
+    Parameters
+    ----------
+    words : arguments of the command line, by default those of this process. There are none but
+        ``--help``.
+
+    Raises
+    ------
+    SystemExit : there are arguments.
+    """
+    about = "Compile the kernels of perception ahead of time, unless they are compiled."
+    argparse.ArgumentParser("python -m shapecat.rehearsal", description=about).parse_args(words)
     ended = threading.Event()
 
     def tell() -> None:

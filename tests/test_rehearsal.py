@@ -80,13 +80,27 @@ def test_whoever_waits_is_told(
     monkeypatch.setattr(rehearsal, "_count", count)
     monkeypatch.setattr(rehearsal, "_rehearse", lambda _: counted.wait())
 
-    rehearsal.main()
+    rehearsal.main([])
     first, second, *_, last = capfd.readouterr().out.splitlines()
     assert first.startswith("compiling")
     assert second == "7 kernels compiled"
     assert last.startswith("all 7 kernels")
-    rehearsal.main()
+    rehearsal.main([])
     assert not capfd.readouterr().out
+    assert not trace.exists()
+
+
+@pytest.mark.parametrize(("word", "code"), [("--help", 0), ("now", 2)])
+def test_whoever_asks_for_help_need_not_wait(
+    trace: Path, capsys: pytest.CaptureFixture[str], word: str, code: int
+) -> None:
+    """The module took no notice of its arguments, and compiled for a minute."""
+    with pytest.raises(SystemExit) as ended:
+        rehearsal.main([word])
+
+    assert ended.value.code == code
+    said = capsys.readouterr()
+    assert "python -m shapecat.rehearsal [-h]" in said.out + said.err
     assert not trace.exists()
 
 
@@ -105,7 +119,7 @@ from pathlib import Path
 from shapecat import rehearsal
 rehearsal._notes = lambda: Path({notes!r})
 rehearsal._REHEARSALS = (int, int)
-assert rehearsal.compile_all() > 0
+assert rehearsal.compile_all(cores=1) > 0
 print("processed")
 """
 
