@@ -31,6 +31,7 @@ from shapecat.executors import (
     usable_cores,
 )
 from shapecat.executors.order import Processes, read_ahead
+from shapecat.system import stopping
 
 
 def kill_self(_: object = None) -> None:
@@ -154,6 +155,25 @@ def test_terminate_kills_running_tasks(tmp_path: Path) -> None:
     assert not alive(int((tmp_path / "pid").read_text()))
     with pytest.raises(RuntimeError):
         one.submit(abs, -1)
+
+
+def work_until_asked(path: str) -> None:
+    Path(path).write_text("begun")
+    while True:
+        stopping.check()
+
+
+def test_workers_put_their_work_down_when_the_executor_stops(tmp_path: Path) -> None:
+    executor = LocalExecutor(1)
+    running = executor.submit(work_until_asked, str(tmp_path / "begun"))
+    waiting = executor.submit(work_until_asked, str(tmp_path / "never"))
+    wait_for((tmp_path / "begun").exists)
+
+    executor.stop()
+
+    assert isinstance(running.exception(timeout=0), stopping.Stopped)
+    assert waiting.cancelled()
+    assert not (tmp_path / "never").exists()
 
 
 def test_workers_end_when_their_parent_is_killed(tmp_path: Path) -> None:

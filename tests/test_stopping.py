@@ -10,7 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from shapecat.executors import LocalExecutor
 from shapecat.pipeline import process
 from shapecat.runs.folder import read_run
 from shapecat.runs.jobs import Job
@@ -18,7 +17,6 @@ from shapecat.system import stopping
 from tests.scenes import record
 from tests.test_batch import heed_interrupts
 from tests.test_crash import assert_same_tables, contents
-from tests.test_executors import wait_for
 
 FRAMES = 160
 
@@ -172,25 +170,6 @@ def test_frames_in_work_are_finished(
 
     partial = tmp_path / ".table.partial" / "segments"
     assert len(list(partial.glob("[0-9]*"))) == 1
-
-
-def work_until_asked(path: str) -> None:
-    Path(path).write_text("begun")
-    while True:
-        stopping.check()
-
-
-def test_workers_put_their_work_down_when_the_executor_stops(tmp_path: Path) -> None:
-    executor = LocalExecutor(1)
-    running = executor.submit(work_until_asked, str(tmp_path / "begun"))
-    waiting = executor.submit(work_until_asked, str(tmp_path / "never"))
-    wait_for((tmp_path / "begun").exists)
-
-    executor.stop()
-
-    assert isinstance(running.exception(timeout=0), stopping.Stopped)
-    assert waiting.cancelled()
-    assert not (tmp_path / "never").exists()
 
 
 def test_a_recording_that_is_written_to_meanwhile_gives_no_results(tmp_path: Path) -> None:
