@@ -40,6 +40,8 @@ COLOUR = ColourCamera(
 )
 """Like the colour camera of a RealSense: 5 cm to the right, turned by a degree, a wider image."""
 
+_NOTHING = 18
+"""Red, green and blue where nothing is seen."""
 _FINE = 2
 """Oversampling of the rendered pinhole image, which the rays of the lens then sample."""
 
@@ -82,22 +84,24 @@ def _paint(
     world: World, frame: int, pose: Pose, camera: Camera, image: Image, rows: I4, columns: I4
 ) -> U1:
     """Return the shaded colours (h, w, 3) uint8; the texture moves with each object."""
-    near, owners = image.inverse[rows, columns], image.owners[rows, columns]
-    facing = np.abs(image.cosine[rows, columns])
-    z = 1 / np.where(near > 0, near, 1.0)
-    rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy], axis=-1)
-    points = np.concatenate([rays * z[..., None], z[..., None]], axis=-1)
-    points = points @ pose.rotation.T + pose.translation
-    colours = np.full((*near.shape, 3), 40.0)
-    for owner in np.unique(owners[near > 0]).tolist():
-        here = owners == owner
-        own = points[here]
+    owners = image.owners[rows, columns].reshape(-1)
+    order = np.argsort(owners, kind="stable")  # the pixels of each owner together
+    found, starts = np.unique(owners[order], return_index=True)
+    colours = np.full((owners.size, 3), _NOTHING, np.uint8)
+    for owner, here in zip(found.tolist(), np.split(order, starts[1:]), strict=True):
+        if owner < 0:
+            continue
+        row, column = rows.reshape(-1)[here], columns.reshape(-1)[here]
+        z = 1 / image.inverse[row, column]
+        x, y = (column - camera.cx) / camera.fx * z, (row - camera.cy) / camera.fy * z
+        points = np.stack([x, y, z], axis=-1) @ pose.rotation.T + pose.translation
         if owner >= len(world.supports):
             thing = world.things[owner - len(world.supports)]
-            own = _in_mesh(own, world.pose_of(thing, frame))
-        colours[here] = _texture(own, owner, plain=owner < len(world.supports))
-    shade = 0.45 + 0.55 * facing[..., None]
-    return np.clip(np.rint(colours * shade), 0, 255).astype(np.uint8)
+            points = _in_mesh(points, world.pose_of(thing, frame))
+        shade = 0.45 + 0.55 * np.abs(image.cosine[row, column])
+        plain = _texture(points, owner, plain=owner < len(world.supports))
+        colours[here] = np.clip(np.rint(plain * shade[:, None]), 0, 255)
+    return colours.reshape(*rows.shape, 3)
 
 
 def _in_mesh(points: F8, world_from_mesh: Pose) -> F8:

@@ -172,9 +172,9 @@ def _shaded(frame: Frame, window: Window) -> U1:
     valid = depth > 0
     if camera is None or not valid.any():
         return np.full((*depth.shape, 3), _BLANK, np.uint8)
-    inverse = _smooth(np.divide(1, depth, out=np.zeros(depth.shape), where=valid))
+    inverse = _smooth(np.divide(1, depth, out=np.zeros_like(depth), where=valid))
     along, across = (_slope(inverse, axis) for axis in (0, 1))
-    v, u = np.indices(depth.shape)
+    v, u = np.indices(depth.shape, np.float32)
     towards = inverse - across * (u + left - camera.cx) - along * (v + top - camera.cy)
     normal = -np.stack([across * camera.fx, along * camera.fy, towards], axis=-1)
     normal /= np.maximum(np.linalg.norm(normal, axis=-1, keepdims=True), 1e-9)
@@ -185,21 +185,22 @@ def _shaded(frame: Frame, window: Window) -> U1:
     return np.where(valid[..., None], tone, _BLANK).astype(np.uint8)
 
 
-def _smooth(inverse: F8, passes: int = 6) -> F8:
+def _smooth(inverse: F4, passes: int = 6) -> F4:
     """Average inverse depths (h, w) with their neighbours on the same surface."""
+    behind, ahead = slice(None, -1), slice(1, None)
     for _ in range(passes):
-        total, weight = inverse.copy(), np.ones_like(inverse)
-        for axis in (0, 1):
-            for step in (-1, 1):
-                other = np.roll(inverse, step, axis)
-                same = np.abs(other - inverse) < _SAME_SURFACE * inverse
-                total += np.where(same, other, 0)
-                weight += same
+        total, weight, limit = inverse.copy(), np.ones_like(inverse), _SAME_SURFACE * inverse
+        for before, after in (((behind,), (ahead,)), ((..., behind), (..., ahead))):
+            apart = np.abs(inverse[after] - inverse[before])
+            for here, there in ((before, after), (after, before)):
+                same = apart < limit[here]
+                total[here] += same * inverse[there]
+                weight[here] += same
         inverse = total / weight
     return inverse
 
 
-def _slope(inverse: F8, axis: int) -> F8:
+def _slope(inverse: F4, axis: int) -> F4:
     """Return slopes (h, w) along an axis: the smaller one-sided difference keeps edges sharp."""
     step = np.diff(inverse, axis=axis)
     ends = [(1, 0) if k == axis else (0, 0) for k in (0, 1)]
