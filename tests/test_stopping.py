@@ -18,7 +18,7 @@ from tests.scenes import record
 from tests.test_batch import heed_interrupts
 from tests.test_crash import assert_same_tables, contents
 
-FRAMES = 160
+FRAMES = 100
 
 
 @pytest.fixture(scope="module")
