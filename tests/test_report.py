@@ -21,7 +21,7 @@ from scipy import ndimage
 from shapecat.api import open_run
 from shapecat.colour.masks import Mask
 from shapecat.outputs.counts import plural
-from shapecat.outputs.report import read_reports, write_reports
+from shapecat.outputs.report import read_reports
 from shapecat.outputs.report.cards import Card
 from shapecat.outputs.report.choosing import choose_frames
 from shapecat.outputs.report.images import Crop, SeenFrame, crop_of, encode, look, worth_of
@@ -426,7 +426,7 @@ def test_corrections_clicked_in_a_browser_are_adopted(
     assert b not in labels
     assert browser.complaints() == []
 
-    write_reports([run])
+    Reports([replace(drawn, folder=run)]).write()
     browser.open(page)
     assert browser.run("return document.querySelectorAll('.changed').length") == 4
 

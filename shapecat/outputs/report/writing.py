@@ -18,7 +18,7 @@ from shapecat.outputs.rereading import find_runs, read_finished
 from shapecat.runs.track_table import TrackTable, read_track_table
 from shapecat.system.files import replacing
 
-__all__ = ["INDEX", "PAGE", "Reports", "RunReport", "read_report", "read_reports", "write_reports"]
+__all__ = ["INDEX", "PAGE", "Reports", "RunReport", "read_report", "read_reports"]
 
 Observer = Callable[[str, int, int | None], None]
 
@@ -151,14 +151,6 @@ def read_reports(folders: Sequence[Path], observe: Observer = _ignore) -> Report
         reports.append(read_report(run, index=_link(run, index) if indexed else None))
         observe("report", done, len(runs))
     return Reports(reports, indexed)
-
-
-def write_reports(folders: Sequence[Path], observe: Observer = _ignore) -> list[Path]:
-    """Write report.html to each run, and index.html to their common folder; return the paths.
-
-    The parameters and errors are as for `read_reports`; there is no index for a single run.
-    """
-    return read_reports(folders, observe).write()
 
 
 def read_report(folder: Path, *, index: str | None = None) -> RunReport:
