@@ -19,12 +19,12 @@ from shapecat.system.garbage import collect_seldom
 from tests.browser import Browser
 
 LONGEST = (
-    *("test_report_serve", "test_docs_run", "test_stopping", "test_batch", "test_report"),
-    *("test_simulation_worlds", "test_remote", "test_odd", "test_detection_stacks"),
-    *("test_learning_default_model", "test_packaging", "test_pipeline", "test_crash"),
-    *("test_simulation_physics", "test_executors", "test_review", "test_loop", "test_detection"),
-    *("test_api", "test_architecture", "test_tracking_scenes", "test_second_look"),
-    *("test_learning", "test_exports_images", "test_detection_shelf", "test_door"),
+    *("test_docs_run", "test_report_serve", "test_batch", "test_report", "test_remote"),
+    *("test_stopping", "test_odd", "test_packaging", "test_second_look", "test_executors"),
+    *("test_crash", "test_simulation_worlds", "test_simulation_physics", "test_api", "test_loop"),
+    *("test_architecture", "test_review", "test_learning_default_model", "test_pipeline"),
+    *("test_door", "test_exports_images", "test_evaluation", "test_learning", "test_jit"),
+    *("test_rehearsal", "test_detection_stacks", "test_exports_readback", "test_tracking_scenes"),
 )
 """Files of tests by the seconds that they take, longest first."""
 SHARED = Path(__file__).parents[2] / "shared" / "data"
@@ -154,6 +154,19 @@ def coloured_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(shapecat.pipeline, "load_model", lambda _path: Guesser())
         shapecat.pipeline.process(Job(source=source, folder=folder / "out" / "table"), cores=2)
     return folder / "out" / "table"
+
+
+@pytest.fixture(scope="module")
+def few_trees() -> Iterator[None]:
+    """Grow a tenth of the trees of the forests beside the chain: their accuracy does not matter."""
+    from sklearn.ensemble import RandomForestClassifier  # noqa: PLC0415  the same
+
+    def grow(trees: int, **options: Any) -> Any:
+        return RandomForestClassifier(trees // 10, **options)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("shapecat.learning.baselines.RandomForestClassifier", grow)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -212,11 +212,11 @@ def test_masks_agree_with_what_the_simulated_colour_camera_sees(
     from shapecat.simulation import simulate  # noqa: PLC0415  slow to load
 
     scores = []
-    for seed, scene in enumerate(("tabletop", "clutter", "tabletop", "clutter"), start=21):
+    for seed, scene in enumerate(("tabletop", "clutter"), start=21):
         path = tmp_path / f"{seed}.mcap"
         simulate(path, scene=scene, frames=1, seed=seed, sensor=sensor, color=True)  # type: ignore[arg-type]
         scores += overlaps(path)
-    assert len(scores) > 25
+    assert len(scores) > 12
     assert np.mean(scores) >= 0.9
 
 

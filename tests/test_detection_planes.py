@@ -183,11 +183,11 @@ def test_no_plane_is_assumed_for_a_few_samples_or_above_the_camera() -> None:
 
 @pytest.mark.parametrize("first", [3002, pytest.param(3005, marks=pytest.mark.many)])
 def test_objects_in_compartments_are_found_where_their_board_is_hardly_seen(first: int) -> None:
-    """Without a plane below them none of these 24 objects was found."""
+    """Without a plane below them none of these objects was found."""
     found = seen = 0
-    for seed in range(first, first + 3):
+    for seed in range(first, first + 2):
         scores = judge("shelf bin", "kinect", seed, 1, load_model(None), Settings())
         found += sum(judged.overlap >= MATCHED_F for judged in scores.objects)
         seen += len(scores.objects)
-    assert seen > 20
+    assert seen > 12
     assert found > 0.55 * seen

@@ -3,11 +3,9 @@
 import json
 import math
 import re
-from collections.abc import Iterator
 from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -16,7 +14,6 @@ from click.testing import CliRunner
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn import metrics as reference
-from sklearn.ensemble import RandomForestClassifier
 
 from shapecat.arrays import F4
 from shapecat.errors import ModelError, RecordingError
@@ -447,18 +444,6 @@ def test_the_command_writes_the_page(trained: Path, tmp_path: Path) -> None:
 
     assert result.exit_code == 0, result.output
     assert "data: 8 views" in page.read_text("utf-8")
-
-
-@pytest.fixture(scope="module")
-def few_trees() -> Iterator[None]:
-    """Grow a tenth of the trees of the forests beside the chain: their accuracy does not matter."""
-
-    def grow(trees: int, **options: Any) -> RandomForestClassifier:
-        return RandomForestClassifier(trees // 10, **options)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("shapecat.learning.baselines.RandomForestClassifier", grow)
-        yield
 
 
 @pytest.fixture(scope="module")

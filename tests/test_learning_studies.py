@@ -89,6 +89,7 @@ def described(seed: int) -> DescribedViews:
     )
 
 
+@pytest.mark.usefixtures("few_trees")
 def test_the_model_stands_beside_plain_learners_on_the_same_views() -> None:
     train, test = described(1), described(2)
     nothing = train.where(np.zeros(0, np.int64))

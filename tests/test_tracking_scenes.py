@@ -92,12 +92,13 @@ def hidden_share(k: int, places: dict[int, F8], things: Sequence[Thing], eye: F8
 
 def detections_at(
     things: Sequence[Thing], sensor: Sensor, t: float, random: np.random.Generator
-) -> list[tuple[int, F8, F8, F8]]:
-    """Return (category or -1, centre, size, posterior) of what a detector reports."""
+) -> tuple[list[tuple[int, F8, F8, F8]], Truth]:
+    """Return (category, centre, size, posterior) of what a detector reports, and the truth."""
     found = []
     places, eye = truth_at(things, sensor, t), sensor.eye(t)
+    shares = {k: hidden_share(k, places, things, eye) for k in places}
     for k, place in places.items():
-        hidden = hidden_share(k, places, things, eye)
+        hidden = shares[k]
         if hidden > HIDDEN or random.random() < sensor.miss:
             continue
         toward = (eye - place) * [1, 1, 0]
@@ -113,7 +114,8 @@ def detections_at(
     for _ in range(random.poisson(sensor.false)):
         place = random.uniform([-0.4, -0.4, 0.03], [0.4, 0.4, 0.1]) + sensor.looks_at(t) * [1, 1, 0]
         found.append((int(random.integers(CATEGORIES)), place, random.uniform(0.03, 0.15, 3)))
-    return [(c, p + random.normal(0, 0.01, 3), s, view_of(c, random)) for c, p, s in found]
+    reported = [(c, p + random.normal(0, 0.01, 3), s, view_of(c, random)) for c, p, s in found]
+    return reported, Truth(places, {k for k, share in shares.items() if share > HIDDEN})
 
 
 def view_of(category: int, random: np.random.Generator) -> F8:
@@ -130,10 +132,9 @@ def record(
     rows, truth = [], []
     for k in range(frames):
         t = k * PERIOD_S
-        rows.append(frame_of(k, int(t * 1e9), detections_at(things, sensor, t, random)))
-        places = truth_at(things, sensor, t)
-        hidden = {o for o in places if hidden_share(o, places, things, sensor.eye(t)) > HIDDEN}
-        truth.append(Truth(places, hidden))
+        found, real = detections_at(things, sensor, t, random)
+        rows.append(frame_of(k, int(t * 1e9), found))
+        truth.append(real)
     return rows, truth
 
 
