@@ -107,7 +107,7 @@ def test_whoever_asks_for_help_need_not_wait(
 def test_the_other_processes_end(monkeypatch: pytest.MonkeyPatch) -> None:
     before = set(multiprocessing.active_children())
     monkeypatch.setattr(rehearsal, "_REHEARSALS", (multiprocessing.active_children,) * 2)
-    rehearsal._rehearse(2)
+    rehearsal._rehearse(1)
     left = set(multiprocessing.active_children()) - before
     for process in left:
         process.join(timeout=10)
