@@ -14,7 +14,7 @@ from shapecat.runs.segments import group_frames
 from shapecat.tracking import fusion, hits
 from shapecat.types import CATEGORIES
 
-FRAMES = 600
+FRAMES = 300
 
 
 def tracked(folder: Path) -> tuple[pa.Table, str]:
