@@ -17,6 +17,8 @@ from .render import COMPILING, PHASES
 
 _LINE_S = 5.0
 _EVENT_S = 0.5
+_WARNINGS = 3
+"""At most this many warnings about a recording are printed."""
 WORDS = {
     "complete": "already complete",
     "resume": "to resume",
@@ -107,9 +109,15 @@ class Progress:
         """Show the progress of a recording."""
 
     def show_ended(self, outcome: Any) -> None:
-        """Show the outcome of a recording."""
+        """Show the error of a recording, or the warnings about its new results."""
         if outcome.message:
             self.note(f"Error: {outcome.message}")
+        if outcome.summary is not None and outcome.summary.processed:
+            name, warnings = outcome.job.folder.name, outcome.summary.warnings
+            for text in warnings[:_WARNINGS]:
+                self.note(f"Warning: {name}: {text}")
+            if rest := warnings[_WARNINGS:]:
+                self.note(f"Warning: {name}: {plural(len(rest), 'more warning')} in run.json")
 
 
 class PlainProgress(Progress):
@@ -184,6 +192,7 @@ class JsonProgress(Progress):
             processed=None if known is None else known.processed,
             exit_code=outcome.code,
             message=outcome.message or None,
+            warnings=None if known is None else list(known.warnings) or None,
             complete=self.complete,
             failed=self.failed,
             of=len(self.tasks),

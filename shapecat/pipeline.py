@@ -43,6 +43,7 @@ from shapecat.runs.jobs import (
 )
 from shapecat.runs.label_meaning import TrackLabel
 from shapecat.runs.label_transfer import Transfer, transfer_labels
+from shapecat.runs.missing_planes import explain_missing_planes
 from shapecat.runs.perceiving import Observer, Work, ignore, perceive_all, revise
 from shapecat.runs.run_info import RunInfo
 from shapecat.runs.segments import discard_segments
@@ -99,7 +100,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             earlier = sum(run["seconds"].values())
             work = Work(recording, folder, run, job, categorizer, observe, cores)
             _once("perceive", folder, run, lambda: perceive_all(work))
-            _once("revise", folder, run, lambda: revise(work))
+            _once("revise", folder, run, lambda: _revise(work))
             identify(run, content)
             write_run(folder, run)
             discard_segments(folder)
@@ -111,6 +112,14 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             run["seconds"]["total"] = earlier + time.perf_counter() - begun
             write_run(folder, run)
     return summarize(job, run)
+
+
+def _revise(work: Work) -> None:
+    """Look again at the frames that disagree with the rest; warn if most have no plane."""
+    revise(work)
+    range_m = work.job.settings.detection.max_range_m
+    found = explain_missing_planes(work.recording, work.folder, work.run, range_m)
+    work.run["warnings"] += found
 
 
 def _once(phase: str, folder: Path, run: RunInfo, work: Callable[[], object]) -> None:

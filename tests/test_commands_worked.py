@@ -26,9 +26,10 @@ def task(name: str, status: str = "new", size: int = 0) -> Any:
     return SimpleNamespace(name=name, status=status, bytes=size)
 
 
-def ended(name: str, *, processed: bool | None) -> Any:
+def ended(name: str, *, processed: bool | None, warnings: tuple[str, ...] = ()) -> Any:
     """Return the outcome of a recording; without ``processed`` it failed."""
-    summary = None if processed is None else SimpleNamespace(processed=processed)
+    known = SimpleNamespace(processed=processed, warnings=warnings)
+    summary = None if processed is None else known
     job = SimpleNamespace(folder=Path("out", name))
     return SimpleNamespace(job=job, summary=summary, message="")
 
@@ -216,7 +217,7 @@ def test_events_tell_zeros_and_leave_out_what_is_unknown(
         if done.summary is None:
             done.message = "b.bag: damaged"
         else:
-            done.summary.seconds = 1.23456
+            done.summary.seconds, done.summary.warnings = 1.23456, ("no depth",)
         progress.ended(done)
     progress.note("a note")
     events = [json.loads(line) for line in capsys.readouterr().err.splitlines()]
@@ -230,11 +231,24 @@ def test_events_tell_zeros_and_leave_out_what_is_unknown(
         {**a, "phase": "perceive", "done": 5, "total": 61},
         {**a, "phase": "annotate", "done": 0, "total": 61},
         {**end, "recording": "in/c", "folder": "out/c", "state": "complete", "seconds": 1.235,
-         "processed": False, "exit_code": 0, "failed": 0},
+         "processed": False, "exit_code": 0, "warnings": ["no depth"], "failed": 0},
         {**end, "recording": "in/b", "folder": "out/b", "state": "failed", "exit_code": 3,
          "message": "b.bag: damaged", "failed": 1},
         {"event": "note", "text": "a note"},
     ]  # fmt: skip
+
+
+def test_a_few_warnings_about_new_results_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
+    """A thousand damaged recordings may have ten each; those of earlier runs were printed then."""
+    progress = PROGRESS.Progress([task("a"), task("b"), task("c")])
+    progress.ended(ended("a", processed=True, warnings=tuple("stuvw")))
+    progress.ended(ended("b", processed=False, warnings=("old",)))
+    progress.ended(ended("c", processed=True, warnings=tuple("xyz")))
+
+    assert capsys.readouterr().err.splitlines() == [
+        *(f"Warning: a: {text}" for text in ("s", "t", "u", "2 more warnings in run.json")),
+        *(f"Warning: c: {text}" for text in "xyz"),
+    ]
 
 
 def test_lines_tell_what_is_done_running_and_left(

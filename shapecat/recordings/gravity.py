@@ -187,8 +187,6 @@ class Upright:
         typical = round(float(np.median(angles)), 1) if angles else None
         if typical is not None and typical > _DISAGREE_DEG:
             self.warnings.append(f"up and the detected planes differ by {typical} degrees")
-        elif bare > len(angles):
-            self.warnings.append(f"most frames have no level plane ({bare}): is up right? Try --up")
         return {"planes_differ_deg": typical, "frames_without_plane": bare}
 
 

@@ -1,0 +1,87 @@
+"""Explain why most frames of a run have no supporting plane, and so no objects."""
+
+from collections import Counter
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import pyarrow as pa
+
+from shapecat.arrays import F4
+from shapecat.recordings import Recording
+from shapecat.runs.run_info import RunInfo
+from shapecat.runs.selection import read_frames
+from shapecat.runs.tables import Key, read_row_groups
+from shapecat.types import Frame
+
+__all__ = ["explain_missing_planes"]
+
+_FRAMES = 3
+"""Number of frames without a plane whose readings are examined."""
+
+
+def explain_missing_planes(
+    recording: Recording, folder: Path, run: RunInfo, range_m: float
+) -> list[str]:
+    """Return a warning with the likely reason if most frames have no plane; else nothing.
+
+    Parameters
+    ----------
+    folder : with the tables of frames and planes.
+    run : its options select the frames.
+    range_m : the range of detection, metres.
+    """
+    frames, bare, first = _count(folder)
+    if 2 * bare <= frames:
+        return []
+    text = f"no supporting plane in {bare} of {frames} frames"
+    readings = far = 0
+    for frame in islice(_frames(recording, run, first), len(first)):
+        distance = _distances(frame)
+        readings += distance.size
+        far += int(np.count_nonzero(distance > range_m))
+    if not readings:
+        return [f"{text}: they have no valid depth"]
+    if 2 * far > readings:
+        share, setting = far / readings, f"detection.max_range_m, {range_m:g} m"
+        return [f"{text}: {share:.0%} of their depth is beyond {setting}; try a larger one"]
+    source = run["up"]["source"]
+    if source == "option":
+        return [f"{text}: is --up right? --up auto estimates up from the planes"]
+    return [text if source == "planes" else f"{text}: is up ({source}) right? Try another --up"]
+
+
+def _count(folder: Path) -> tuple[int, int, set[Key]]:
+    """Return the number of frames, of those without a plane, and the first few of the latter."""
+    count, bare, first = 0, 0, list[Key]()
+    tables = (
+        read_row_groups(folder / f"{name}.parquet", ["topic", "frame"])
+        for name in ("frames", "planes")
+    )
+    for frames, planes in zip(*tables, strict=True):
+        level = set(_keys(planes))
+        without = [key for key in _keys(frames) if key not in level]
+        count, bare = count + frames.num_rows, bare + len(without)
+        first += without[: _FRAMES - len(first)]
+    return count, bare, set(first)
+
+
+def _keys(rows: pa.Table) -> Iterator[Key]:
+    return zip(rows["topic"].to_pylist(), rows["frame"].to_pylist(), strict=True)
+
+
+def _frames(recording: Recording, run: RunInfo, wanted: set[Key]) -> Iterator[Frame]:
+    for frame, _ in read_frames(recording, run["options"], skipped=Counter()):
+        if (frame.topic, frame.index) in wanted:
+            yield frame
+
+
+def _distances(frame: Frame) -> F4:
+    """Return the depths (n,) of a depth image, or the distances of a cloud's points, metres."""
+    if frame.depth is not None:
+        depths: F4 = frame.depth[frame.depth > 0]
+        return depths
+    points = frame.xyz()
+    distances: F4 = np.linalg.norm(points[np.isfinite(points).all(axis=1)], axis=1)
+    return distances

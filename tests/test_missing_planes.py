@@ -1,0 +1,73 @@
+"""A run without planes finds nothing: the user is told why, in run.json and on the screen."""
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from shapecat.config import DetectionSettings, Settings
+from shapecat.pipeline import process
+from shapecat.runs.folder import read_run
+from shapecat.runs.jobs import Job
+from shapecat.simulation.messages import MessageFactory
+from tests.messages import CAMERA, EPOCH, SECOND, write
+from tests.scenes import record
+
+MAKE = MessageFactory(2)
+
+
+def walls(path: Path, depths_m: list[float]) -> Path:
+    """Record a wall that the camera faces, at these depths; 0 is no reading."""
+    items: list[tuple[str, int, Any]] = []
+    for k, depth_m in enumerate(depths_m):
+        stamp = EPOCH + k * SECOND // 10
+        depth = np.full((CAMERA.height, CAMERA.width), depth_m, np.float32)
+        items.append(("/depth/camera_info", stamp, MAKE.camera_info(CAMERA, stamp, "camera")))
+        items.append(("/depth/image_raw", stamp, MAKE.image(depth, stamp, "camera")))
+    return write(path, items)
+
+
+def warnings_of(path: Path, out: Path, *, up: str = "auto", range_m: float = 2.0) -> list[str]:
+    settings = Settings(detection=DetectionSettings(max_range_m=range_m))
+    process(Job(path, out / path.stem, settings=settings, up=up, rrd=False, mcap=False))
+    return read_run(out / path.stem)["warnings"]
+
+
+def test_a_table_beyond_the_range_is_named_as_the_reason(tmp_path: Path) -> None:
+    """It would look like a table without objects; and the advice would be to change up."""
+    path = record(tmp_path / "far.mcap", 3)
+
+    (warning,) = warnings_of(path, tmp_path, range_m=0.3)
+
+    assert warning == (
+        "no supporting plane in 3 of 3 frames: 100% of their depth is beyond "
+        "detection.max_range_m, 0.3 m; try a larger one"
+    )
+    assert not warnings_of(path, tmp_path / "again", range_m=2.0)
+
+
+def test_frames_without_depth_and_frames_in_range_have_other_reasons(tmp_path: Path) -> None:
+    """A covered lens is no matter of the range; nor is a wall at 1 m, where up may be wrong."""
+    none = warnings_of(walls(tmp_path / "none.mcap", [0.0] * 3), tmp_path)
+    near = warnings_of(walls(tmp_path / "near.mcap", [1.0, 1.1, 1.2, 1.0]), tmp_path, up="0,-1,0")
+
+    assert none == ["no supporting plane in 3 of 3 frames: they have no valid depth"]
+    assert near[-1] == (
+        "no supporting plane in 4 of 4 frames: "
+        "is --up right? --up auto estimates up from the planes"
+    )
+
+
+def test_the_reason_is_printed(tmp_path: Path) -> None:
+    """Nobody opens run.json to learn why a table has no tracks."""
+    path = record(tmp_path / "far.mcap", 2)
+    out = str(tmp_path / "out")
+    command = [sys.executable, "-m", "shapecat", "process", str(path), "--out", out]
+    command += ["--set", "detection.max_range_m=0.3", "--jobs", "1", "--no-rrd"]
+
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+
+    assert "Warning: far: no supporting plane in 2 of 2 frames: 100%" in done.stderr
+    assert "none" in done.stdout
