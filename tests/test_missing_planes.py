@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyarrow.parquet as pq
 
 from shapecat.config import DetectionSettings, Settings
 from shapecat.pipeline import process
@@ -14,6 +15,7 @@ from shapecat.runs.jobs import Job
 from shapecat.simulation.messages import MessageFactory
 from tests.messages import CAMERA, EPOCH, SECOND, write
 from tests.scenes import record
+from tests.test_detection import ball, frame_of, render
 
 MAKE = MessageFactory(2)
 
@@ -58,6 +60,24 @@ def test_frames_without_depth_and_frames_in_range_have_other_reasons(tmp_path: P
         "no supporting plane in 4 of 4 frames: "
         "is --up right? --up auto estimates up from the planes"
     )
+
+
+def test_objects_on_a_plane_that_is_only_assumed_need_no_reason(tmp_path: Path) -> None:
+    """A heap of balls hides its table, so that no plane is in the tables."""
+    places = [(x / 10, y / 10, 0.03 * abs(x + y)) for x in range(-3, 4) for y in range(-2, 3)]
+    depth, _ = render([ball(place, 0.06) for place in places], tilt_deg=35, noise=0)
+    camera = frame_of(depth).camera
+    assert camera is not None
+    info = MAKE.camera_info(camera, EPOCH, "camera")
+    image = MAKE.image(depth, EPOCH, "camera")
+    path = write(
+        tmp_path / "heap.mcap",
+        [("/depth/camera_info", EPOCH, info), ("/depth/image_raw", EPOCH, image)],
+    )
+
+    assert not warnings_of(path, tmp_path, up="0.1,-0.8,-0.6")
+    assert read_run(tmp_path / "heap")["counts"]["detections"] > 0
+    assert pq.read_metadata(tmp_path / "heap" / "planes.parquet").num_rows == 0
 
 
 def test_the_reason_is_printed(tmp_path: Path) -> None:

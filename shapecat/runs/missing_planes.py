@@ -53,14 +53,17 @@ def explain_missing_planes(
 
 
 def _count(folder: Path) -> tuple[int, int, set[Key]]:
-    """Return the number of frames, of those without a plane, and the first few of the latter."""
+    """Return the number of frames, of those without a plane, and the first few of the latter.
+
+    A frame with objects has a plane, even if it is only assumed and not in the table.
+    """
     count, bare, first = 0, 0, list[Key]()
     tables = (
         read_row_groups(folder / f"{name}.parquet", ["topic", "frame"])
-        for name in ("frames", "planes")
+        for name in ("frames", "planes", "detections")
     )
-    for frames, planes in zip(*tables, strict=True):
-        level = set(_keys(planes))
+    for frames, planes, detections in zip(*tables, strict=True):
+        level = {*_keys(planes), *_keys(detections)}
         without = [key for key in _keys(frames) if key not in level]
         count, bare = count + frames.num_rows, bare + len(without)
         first += without[: _FRAMES - len(first)]
