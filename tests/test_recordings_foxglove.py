@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from mcap.writer import Writer
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from scipy.spatial.transform import Rotation
 
 from shapecat.outputs.annotated_mcap import write_annotated
@@ -18,6 +20,7 @@ from shapecat.recordings.protobuf import message_decoder
 from shapecat.types import Camera, Frame, ShownFrame
 from tests.foxglove_messages import (
     EPOCH,
+    SECOND,
     content,
     descriptors,
     encode,
@@ -55,6 +58,68 @@ def test_point_cloud_with_a_pose(tmp_path: Path, encoding: str) -> None:
     assert (frame.stamp_ns, frame.frame_id) == (EPOCH, "camera")
     assert frame.points is not None
     np.testing.assert_allclose(frame.points, turn.apply(points) + place, atol=1e-5)
+
+
+@both
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    list(enumerate(["<u1", "<i1", "<u2", "<i2", "<u4", "<i4", "<f4", "<f8"], start=1)),
+)
+def test_coordinates_of_every_numeric_type(
+    tmp_path: Path, encoding: str, number: int, kind: str
+) -> None:
+    """Foxglove numbers the types otherwise than ROS does: -7 would become a large number."""
+    odd = np.iinfo(kind).max - 2 if "u" in kind else -7
+    points = np.array([[odd, 5, 9], [2, odd, 7]]).astype(kind)
+    size = points.itemsize
+    fields = [{"name": name, "offset": size * k, "type": number} for k, name in enumerate("xyz")]
+    values = {"point_stride": 3 * size, "fields": fields}
+    values["data"] = content(points.tobytes(), encoding)
+
+    (frame,) = read(write(tmp_path / "a.mcap", encoding, [("/p", "foxglove.PointCloud", values)]))
+
+    np.testing.assert_array_equal(frame.points, points.astype(np.float32))
+
+
+def test_stamps_of_foxglove_messages_in_ros(tmp_path: Path) -> None:
+    """ROS names the second part of a time otherwise: all frames of a second would be at once."""
+    kind, stamp = "foxglove_msgs/msg/PointCloud", EPOCH + 123_456_789
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    store.register(get_types_from_msg(_CLOUD, kind))
+    time, field = (
+        store.types[name]
+        for name in ("builtin_interfaces/msg/Time", "foxglove_msgs/msg/PackedElementField")
+    )
+    fields = [field(name, 4 * k, 7) for k, name in enumerate("xyz")]
+    data = np.array([1, 2, 3], "<f4").view(np.uint8)
+    message = store.types[kind](time(*divmod(stamp, SECOND)), "camera", 12, fields, data)
+    path = tmp_path / "a.mcap"
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start("ros2", "test")
+        text = store.generate_msgdef(kind, ros_version=2)[0].encode()
+        channel = writer.register_channel(
+            "/p", "cdr", writer.register_schema(kind, "ros2msg", text)
+        )
+        writer.add_message(channel, EPOCH, bytes(store.serialize_cdr(message, kind)), EPOCH)
+        writer.finish()
+
+    (frame,) = read(path)
+
+    assert frame.stamp_ns == stamp
+
+
+_CLOUD = """builtin_interfaces/Time timestamp
+string frame_id
+uint32 point_stride
+foxglove_msgs/PackedElementField[] fields
+uint8[] data
+================================================================================
+MSG: foxglove_msgs/PackedElementField
+string name
+uint32 offset
+uint8 type
+"""
 
 
 @both
