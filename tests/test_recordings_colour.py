@@ -84,6 +84,8 @@ def beside(path: Path, *more: tuple[str, int, Any], frame_id: str = "color_optic
         ("bgr8", gradient()[..., ::-1]),
         ("rgba8", np.concatenate([gradient(), np.full((48, 64, 1), 7, np.uint8)], axis=-1)),
         ("bgra8", np.concatenate([gradient()[..., ::-1], np.zeros((48, 64, 1), "u1")], axis=-1)),
+        ("8UC3", gradient()[..., ::-1]),  # OpenCV's order
+        ("8UC4", np.concatenate([gradient()[..., ::-1], np.zeros((48, 64, 1), "u1")], axis=-1)),
         ("rgb16", gradient().astype("<u2") * 256 + 99),
         ("bgr16", gradient()[..., ::-1].astype("<u2") * 256 + 99),
     ],

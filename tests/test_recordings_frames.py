@@ -486,11 +486,12 @@ def test_damaged_compressed_depth_is_a_message_error(data: bytes, pack: Any, at:
 
 
 def test_realsense_viewer_bag(tmp_path: Path) -> None:
-    """It has its own topic names, its depth is mono16, and it states the unit."""
+    """It has its own topic names, its depth is mono16, and it states the unit of each sensor."""
     depth = wavy_depth()
-    sensor = "/device_0/sensor_0"
-    unit = make("std_msgs/msg/Float32", 0.00025)
+    sensor = "/device_0/sensor_1"
+    unit, other = (make("std_msgs/msg/Float32", metres) for metres in (0.00025, 0.001))
     items = [
+        ("/device_0/sensor_0/option/Depth_Units/value", 0, other),
         (f"{sensor}/option/Depth_Units/value", 0, unit),
         (f"{sensor}/Depth_0/info/camera_info", 0, info(0)),
         (f"{sensor}/Infrared_1/info/camera_info", 0, info(0)),
