@@ -170,3 +170,17 @@ def test_the_imu_stands_in_where_transforms_do_not_reach(tmp_path: Path) -> None
 
     assert up is not None
     np.testing.assert_allclose(up, [0, -1, 0], atol=1e-6)
+
+
+def test_a_failed_look_up_is_counted_once(tmp_path: Path) -> None:
+    """Frames are looked at before they are used: the warning would count some of them twice."""
+    items = [("/tf", EPOCH, MAKE.transforms([("map", "elsewhere", IDENTITY)], EPOCH))]
+    with open_recording(write(tmp_path / "a.mcap", items)) as recording:
+        upright = Upright.of(recording, up="auto", fixed_frame=None)
+    for stamp in (EPOCH, EPOCH + 1):
+        upright.preview(frame(stamp))
+        assert upright.up(frame(stamp)) is None
+    upright.report([])
+
+    (warning,) = upright.warnings
+    assert warning.startswith("failed transform look-ups: 2, the first: ")
