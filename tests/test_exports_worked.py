@@ -243,6 +243,18 @@ def test_kitti_of_a_cloud_has_no_pixels(tmp_path: Path) -> None:
     assert len(rows) == len(points)
 
 
+def test_the_cloud_of_a_level_lidar_stays_as_it_is_in_kitti(tmp_path: Path) -> None:
+    """Taken for a camera that looks up, its points and boxes would be turned on their side."""
+    points = np.array([[4.0, 1.0, -0.5], [2.0, -3.0, 0.25]], np.float32)
+    level = replace(labelled(cut=False, hidden=False), up=np.array([0.0, 0.0, 1.0]), objects=())
+    seen: Any = [(level, Frame("/scan", 0, 5, 6, "laser", points=points), None)]
+    unused: Any = SimpleNamespace()
+    write_kitti(tmp_path, seen, unused)
+
+    rows = np.fromfile(tmp_path / "velodyne" / "000000.bin", "<f4").reshape(-1, 4)
+    assert_allclose(rows[:, :3], points, atol=1e-6)
+
+
 @pytest.mark.parametrize(("up", "forward"), [((0, 0, 1), (1, 0, 0)), ((0.3, 0, 0.95), (1, 0, 0))])
 def test_a_lidar_looks_along_its_x_axis(up: Any, forward: Any) -> None:
     """REP 103: x forward, y left, z up; a camera looks along z."""
