@@ -69,6 +69,19 @@ def test_a_file_that_cannot_be_read_is_not_passed_over(
     assert found.left_out == 1
 
 
+def test_files_of_a_bag_are_not_counted_as_skipped(tmp_path: Path) -> None:
+    """A pattern names them beside the bag that they belong to."""
+    bag, note = tmp_path / "bag", tmp_path / "note.txt"
+    bag.mkdir()
+    files = [bag / "bag_0.db3", bag / "metadata.yaml", note]
+    for file in files:
+        file.write_bytes(b"no recording by itself")
+    found = find_recordings([str(path) for path in (bag, *files)])
+
+    assert [kept.path for kept in found.kept] == [str(bag)]
+    assert found.left_out == 1
+
+
 CHANGES: Mapping[str, Mapping[str, Any]] = {
     "settings": {"settings": Settings(seed=8)},
     "start": {"start_s": 0.5},
@@ -107,9 +120,12 @@ def test_another_model_version_or_content_is_other_work(source: Path, key: str) 
 
 @pytest.mark.parametrize("name", ["color", "mcap", "rrd"])
 def test_outputs_do_not_change_what_the_tables_are_of(source: Path, name: str) -> None:
-    """So that labels of a run without a review fit one with it."""
+    """So that labels of a run without a review fit one with it, which is yet another run."""
     changed: Any = {"color": {"color": ""}, "mcap": {"mcap": False}, "rrd": {"rrd": False}}
-    assert work_id(planned(source)) == work_id(planned(source, **changed[name]))
+    run, other = planned(source), planned(source, **changed[name])
+
+    assert work_id(run) == work_id(other)
+    assert not same_options(run, other)  # a folder without colour is not taken for one with it
 
 
 def test_a_recording_that_was_written_to_has_changed_though_it_is_as_long(source: Path) -> None:
