@@ -6,10 +6,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from shapecat.arrays import F8, I4, U1
+from shapecat.arrays import F4, F8, I4, U1
 from shapecat.cameras.colour import LensCamera
 from shapecat.cameras.lenses import undistorted_rays
 from shapecat.geometry import compose, inverse, rotation_from_quaternion
+from shapecat.jit import kernel
 from shapecat.simulation.render import Image, render
 from shapecat.simulation.worlds import World
 from shapecat.types import Camera, Pose
@@ -42,6 +43,11 @@ COLOUR = ColourCamera(
 
 _NOTHING = 18
 """Red, green and blue where nothing is seen."""
+_GRAIN_M = 0.005
+_SPREAD = (73856093, 19349663, 83492791)
+"""Factors that spread the cells of the grain over its levels."""
+_BAND = 0.6
+"""Share of a band that has the first of its two colours."""
 _FINE = 2
 """Oversampling of the rendered pinhole image, which the rays of the lens then sample."""
 
@@ -84,45 +90,72 @@ def _paint(
     world: World, frame: int, pose: Pose, camera: Camera, image: Image, rows: I4, columns: I4
 ) -> U1:
     """Return the shaded colours (h, w, 3) uint8; the texture moves with each object."""
-    owners = image.owners[rows, columns].reshape(-1)
-    order = np.argsort(owners, kind="stable")  # the pixels of each owner together
-    found, starts = np.unique(owners[order], return_index=True)
-    colours = np.full((owners.size, 3), _NOTHING, np.uint8)
-    for owner, here in zip(found.tolist(), np.split(order, starts[1:]), strict=True):
-        if owner < 0:
-            continue
-        row, column = rows.reshape(-1)[here], columns.reshape(-1)[here]
-        z = 1 / image.inverse[row, column]
-        x, y = (column - camera.cx) / camera.fx * z, (row - camera.cy) / camera.fy * z
-        points = np.stack([x, y, z], axis=-1) @ pose.rotation.T + pose.translation
-        if owner >= len(world.supports):
-            thing = world.things[owner - len(world.supports)]
-            points = _in_mesh(points, world.pose_of(thing, frame))
-        shade = 0.45 + 0.55 * np.abs(image.cosine[row, column])
-        plain = _texture(points, owner, plain=owner < len(world.supports))
-        colours[here] = np.clip(np.rint(plain * shade[:, None]), 0, 255)
-    return colours.reshape(*rows.shape, 3)
+    supports = len(world.supports)
+    places = [pose] * supports
+    places += [compose(inverse(world.pose_of(thing, frame)), pose) for thing in world.things]
+    textures = np.array([_texture(k, plain=k < supports) for k in range(len(places))])
+    turns = np.array([place.rotation for place in places])
+    shifts = np.array([place.translation for place in places])
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    colours = np.full((*rows.shape, 3), _NOTHING, np.uint8)
+    _colour_in(
+        *(image.inverse, image.owners, image.cosine, rows, columns),
+        *(intrinsics, turns, shifts, textures, colours),
+    )
+    return colours
 
 
-def _in_mesh(points: F8, world_from_mesh: Pose) -> F8:
-    back = inverse(world_from_mesh)
-    return points @ back.rotation.T + back.translation
+def _texture(number: int, *, plain: bool) -> F8:
+    """Draw the texture (3, 3) of an object: two colours, 0 to 255, and its bands.
 
-
-def _texture(points: F8, number: int, *, plain: bool) -> F8:
-    """Return the colours (n, 3), 0 to 255, of surface points (n, 3): two-tone bands and fine grain.
-
-    The texture uses only basic arithmetic, no sines, so that images are equal on every machine.
+    The last row is the direction across the bands, divided by their distance, 1/m.
     """
     draw = np.random.default_rng(number + 71)
     tone = draw.uniform(90, 180, 3) if plain else draw.uniform(30, 235, 3)
     other = tone + draw.uniform(-25, 25, 3) if plain else draw.uniform(30, 235, 3)
     way, width = draw.normal(size=3), draw.uniform(0.03, 0.08)
-    along = points @ (way / np.sqrt((way * way).sum())) / width
-    band = np.abs(along - np.rint(along)) * 2 > 0.6
-    cells: I4 = np.floor(points / 0.005).astype(np.int64) * [73856093, 19349663, 83492791]
-    grain = ((cells[:, 0] ^ cells[:, 1] ^ cells[:, 2]) % 13).astype(np.float64) - 6
-    return np.asarray(np.where(band[:, None], other, tone) + grain[:, None])
+    return np.stack([tone, other, way / np.sqrt((way * way).sum()) / width])
+
+
+@kernel
+def _colour_in(
+    near: F8,
+    owners: I4,
+    cosine: F4,
+    rows: I4,
+    columns: I4,
+    intrinsics: F8,
+    turns: F8,
+    shifts: F8,
+    textures: F8,
+    colours: U1,
+) -> None:
+    """Write the colours (h, w, 3) of the pixels that rays hit: two-tone bands and fine grain.
+
+    The texture uses only basic arithmetic, no sines, so that images are equal on every machine.
+    ``turns`` (k, 3, 3) and ``shifts`` (k, 3) lead from the camera to the frame of each texture.
+    """
+    fx, fy, cx, cy = intrinsics
+    point = np.zeros(3)
+    for i in range(rows.shape[0]):
+        for j in range(rows.shape[1]):
+            row, column = rows[i, j], columns[i, j]
+            owner = owners[row, column]
+            if owner < 0:
+                continue
+            z = 1.0 / near[row, column]
+            x, y = (column - cx) / fx * z, (row - cy) / fy * z
+            turn, shift, texture = turns[owner], shifts[owner], textures[owner]
+            cell, along = 0, 0.0
+            for k in range(3):
+                point[k] = turn[k, 0] * x + turn[k, 1] * y + turn[k, 2] * z + shift[k]
+                cell ^= int(np.floor(point[k] / _GRAIN_M)) * _SPREAD[k]
+                along += point[k] * texture[2, k]
+            tone = texture[1] if abs(along - np.floor(along + 0.5)) * 2 > _BAND else texture[0]
+            shade = 0.45 + 0.55 * abs(cosine[row, column])
+            for k in range(3):
+                value = (tone[k] + cell % 13 - 6) * shade
+                colours[i, j, k] = min(max(np.floor(value + 0.5), 0.0), 255.0)
 
 
 def jpeg(colours: U1, quality: int = 85) -> bytes:
