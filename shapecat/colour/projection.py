@@ -4,7 +4,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from shapecat.arrays import F4, U1
+from shapecat.arrays import F4, F8, I4, U1, Bool
 from shapecat.cameras.colour import LensCamera
 from shapecat.cameras.lenses import LENS_MODELS, distort
 from shapecat.jit import kernel
@@ -79,6 +79,20 @@ def rectified(pixels: U1, lens: LensCamera) -> U1:
     """
     if not lens.model:
         return pixels
+    left, top, a, b, inside = _sources(lens)
+    upper = pixels[top, left] * (1 - a) + pixels[top, left + 1] * a
+    lower = pixels[top + 1, left] * (1 - a) + pixels[top + 1, left + 1] * a
+    mixed = upper * (1 - b) + lower * b
+    return np.asarray(np.rint(mixed * inside), np.uint8)
+
+
+@lru_cache(maxsize=2)  # a recording has one lens
+def _sources(lens: LensCamera) -> tuple[I4, I4, F8, F8, Bool]:
+    """Return where the lens shows each ray of the pinhole camera.
+
+    These are column and row (h, w) of the pixel above left, the shares (h, w, 1) of its neighbours
+    on the right and below, and whether it is within the image (h, w, 1).
+    """
     camera = lens.pinhole
     v, u = np.mgrid[: camera.height, : camera.width]
     rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1)
@@ -91,11 +105,7 @@ def rectified(pixels: U1, lens: LensCamera) -> U1:
         np.minimum(x.astype(int), camera.width - 2),
         np.minimum(y.astype(int), camera.height - 2),
     )
-    a, b = (x - left)[..., None], (y - top)[..., None]
-    upper = pixels[top, left] * (1 - a) + pixels[top, left + 1] * a
-    lower = pixels[top + 1, left] * (1 - a) + pixels[top + 1, left + 1] * a
-    mixed = upper * (1 - b) + lower * b
-    return np.asarray(np.rint(mixed * inside[..., None]), np.uint8)
+    return left, top, (x - left)[..., None], (y - top)[..., None], inside[..., None]
 
 
 @lru_cache(maxsize=16)
