@@ -14,6 +14,7 @@ from shapecat.config import DetectionSettings
 from shapecat.detection import Hierarchy, Node, detect, format_tree
 from shapecat.detection.depth_grid import row_and_column
 from shapecat.detection.pipeline import Steps
+from shapecat.detection.virtual_camera import _occupied
 from shapecat.types import Camera, Frame, Scene
 
 Array = NDArray[Any]
@@ -536,6 +537,13 @@ def test_any_image_gives_a_scene(h: int, w: int, seed: int, odd: float) -> None:
     depth[rng.random((h, w)) < 0.3] = odd
     scene = found(frame_of(depth, Camera(w, h, 30, 30, w / 2, h / 2)))
     assert np.isfinite(scene.up).all()
+
+
+def test_points_in_nearly_one_place_are_counted_within_the_grid() -> None:
+    """Rounded they may lie beyond their bounds: compiled code would write beside the grid."""
+    place = np.array([[0.3, 0.3], [0.3 + 2e-6, 0.3 - 1e-6]], np.float32)
+
+    assert _occupied.py_func(place, 0.3, 0.3, 1024 / 1e-6 * 0.999, 1024) == 2
 
 
 @given(

@@ -231,7 +231,9 @@ def _occupied(place: F4, left: float, top: float, scale: float, side: int) -> in
     n = 0
     for k in range(place.shape[0]):
         if place[k, 0] < OUTSIDE:
-            j, i = int((place[k, 0] - left) * scale), int((place[k, 1] - top) * scale)
+            # Single precision may round a place beyond its bounds, where these are close together.
+            j = min(max(int((place[k, 0] - left) * scale), 0), side - 1)
+            i = min(max(int((place[k, 1] - top) * scale), 0), side - 1)
             n += 1 - seen[i, j]
             seen[i, j] = 1
     return n
