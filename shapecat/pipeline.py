@@ -13,7 +13,6 @@ from typing import TypeVar
 
 from shapecat.description import DESCRIPTOR_NAMES
 from shapecat.errors import OutputError
-from shapecat.executors.order import read_ahead
 from shapecat.learning import load_model
 from shapecat.recordings import Recording, choose_streams, open_recording
 from shapecat.recordings.colour_streams import pair_colours
@@ -57,9 +56,6 @@ __all__ = ["Observer", "annotate", "annotate_again", "process", "track"]
 _Shown = TypeVar("_Shown", LabelledFrame, ShownFrame)
 
 _log = logging.getLogger(__name__)
-
-_AHEAD = 4
-"""Frames read ahead while one is written."""
 
 
 def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
@@ -106,7 +102,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
             discard_segments(folder)
             _once("track", folder, run, lambda: track(folder, run, job))
             _once("labels", folder, run, lambda: keep_labels(folder, run, job))
-            annotate(folder, recording, run, observe, cores=cores)
+            annotate(folder, recording, run, observe)
             require_unchanged(folder, run, job.source)
             run["seconds"]["compile"] = compiling_s
             run["seconds"]["total"] = earlier + time.perf_counter() - begun
@@ -175,13 +171,8 @@ def annotate(
     recording: Recording,
     run: RunInfo,
     observe: Observer = ignore,
-    *,
-    cores: int = 1,
 ) -> None:
-    """Write review.rrd and annotated.mcap from the tables and the recording.
-
-    With several cores, one thread reads frames while others write.
-    """
+    """Write review.rrd and annotated.mcap from the tables and the recording."""
     settings, total = run["settings"]["outputs"], run["counts"]["frames"]
 
     def labels() -> dict[int, TrackLabel]:
@@ -211,16 +202,14 @@ def annotate(
 
         labelled = read_labelled_frames(folder, labels())
         shown = _observed(labelled, "review", total, observe)
-        pairs = with_clouds(shown, recording, run)
         write_review(
             folder / "review.rrd",
-            read_ahead(pairs, count=_AHEAD) if cores > 1 else pairs,
+            with_clouds(shown, recording, run),
             name=recording.path.name,
             run=run,
             categories=run["model"]["categories"],
             cloud_points=settings["cloud_points"],
             fixed_frame=run["fixed_frame"],
-            threads=cores,
         )
 
     if run["options"]["rrd"]:

@@ -341,7 +341,6 @@ def test_a_damaged_image_costs_the_review_only_itself(tmp_path: Path) -> None:
         categories=("cup", "can"),
         cloud_points=1000,
         fixed_frame=None,
-        threads=2,
     )
 
     entity = f"/images/{TOPIC}"

@@ -30,7 +30,7 @@ from shapecat.executors import (
     share_cores,
     usable_cores,
 )
-from shapecat.executors.order import Processes, read_ahead
+from shapecat.executors.order import Processes
 from shapecat.system import stopping
 
 
@@ -272,21 +272,6 @@ def test_a_killed_process_loses_no_item() -> None:
     assert results == [(k, -k) for k in range(200)]
 
 
-def test_reading_ahead_holds_few_items() -> None:
-    made: list[int] = []
-    used: list[int] = []
-
-    def items() -> Iterator[int]:
-        for k in range(200):
-            made.append(k)
-            assert len(made) - len(used) <= 5
-            yield k
-
-    for item in read_ahead(items(), count=3):
-        used.append(item)  # noqa: PERF402  the source looks at it meanwhile
-    assert used == list(range(200))
-
-
 def slow_elsewhere(seconds: float) -> int:
     if parent_process() is not None:
         time.sleep(seconds)
@@ -348,15 +333,6 @@ def test_errors_come_at_their_turn() -> None:
         assert [next(results)[1] for _ in range(12)] == [0] * 11 + [1]
         with pytest.raises(ZeroDivisionError):
             next(results)
-
-    def broken() -> Iterator[int]:
-        yield 1
-        raise EOFError
-
-    ahead = read_ahead(broken(), count=3)
-    assert next(ahead) == 1
-    with pytest.raises(EOFError):
-        next(ahead)
 
 
 class UnreadableError(Exception):

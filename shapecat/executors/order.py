@@ -1,10 +1,10 @@
-"""Process items in several processes or threads, and yield the results in order."""
+"""Process items in several processes, and yield the results in order."""
 
 import logging
 import sys
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from concurrent.futures import Executor, Future
 from contextlib import contextmanager
 from functools import partial
 from itertools import islice
@@ -13,7 +13,7 @@ from typing import Generic, Self, TypeVar
 
 from shapecat.executors.local import LocalExecutor
 
-__all__ = ["Processes", "map_ahead", "read_ahead"]
+__all__ = ["Processes"]
 
 _log = logging.getLogger(__name__)
 
@@ -169,56 +169,6 @@ def _done(work: Callable[[_Item], _Result], item: _Item) -> Future[_Result]:
     except Exception as error:  # noqa: BLE001  raised when its turn comes
         result.set_exception(error)
     return result
-
-
-def read_ahead(items: Iterable[_Item], *, count: int) -> Iterator[_Item]:
-    """Yield the items while a thread prepares the next ``count`` of them.
-
-    Examples
-    --------
-    >>> list(read_ahead(range(3), count=2))
-    [0, 1, 2]
-    """
-    source = iter(items)
-
-    def take() -> tuple[_Item, ...]:
-        return tuple(islice(source, 1))
-
-    with _switching(), ThreadPoolExecutor(1) as pool:
-        pending = deque(pool.submit(take) for _ in range(count))
-        while taken := pending.popleft().result():
-            pending.append(pool.submit(take))
-            yield taken[0]
-
-
-def map_ahead(
-    function: Callable[[_Item], _Result], items: Iterable[_Item], *, threads: int
-) -> Iterator[_Result]:
-    """Yield ``function(item)`` for each item, in order, computed ahead in threads.
-
-    Threads help only functions that spend their time in kernels, which release the interpreter
-    lock.
-
-    Parameters
-    ----------
-    threads : with 1, each result is computed in this thread when it is requested.
-
-    Examples
-    --------
-    >>> list(map_ahead(abs, [-1, 2, -3], threads=2))
-    [1, 2, 3]
-    """
-    if threads < 2:
-        yield from map(function, items)
-        return
-    with _switching(), ThreadPoolExecutor(threads) as pool:
-        pending: deque[Future[_Result]] = deque()
-        for item in items:
-            pending.append(pool.submit(function, item))
-            if len(pending) > 2 * threads:
-                yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
 
 
 @contextmanager

@@ -36,14 +36,12 @@ import json
 import uuid
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import rerun as rr
 
-from shapecat.executors.order import map_ahead
 from shapecat.geometry import IDENTITY, transform
 from shapecat.outputs import review_shapes as shapes
 from shapecat.outputs.colours import colour_of
@@ -71,7 +69,6 @@ def write_review(
     categories: Sequence[str],
     cloud_points: int,
     fixed_frame: str | None,
-    threads: int = 1,
 ) -> None:
     """Write a run as a Rerun recording with its layout embedded.
 
@@ -84,7 +81,6 @@ def write_review(
     categories : in the order of the posteriors.
     cloud_points : approximate number of points to keep of each cloud; 0 keeps all.
     fixed_frame : name of the frame in which tracks are shown; None for the sensor frame.
-    threads : number of threads that paint frames ahead.
 
     Raises
     ------
@@ -100,10 +96,9 @@ def write_review(
         stream.send_recording_name(name)
         review = _Review(stream, categories, fixed_frame)
         review.begin(run)
-        painted = map_ahead(partial(paint_frame, limit=cloud_points), frames, threads=threads)
-        for k, one in enumerate(painted):
+        for k, frame in enumerate(frames):
             file.check()
-            review.add(one)
+            review.add(paint_frame(frame, limit=cloud_points))
             if k % _FLUSH_FRAMES == _FLUSH_FRAMES - 1:
                 file.flush()
         review.end()

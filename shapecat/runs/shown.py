@@ -12,7 +12,6 @@ import pyarrow.compute
 import pyarrow.parquet as pq
 
 from shapecat.arrays import F4, F8, I4
-from shapecat.executors.order import read_ahead
 from shapecat.geometry import box_corners, upright_box
 from shapecat.runs.full_boxes import FULL_WIDTHS, numbers_or_nan
 from shapecat.runs.label_meaning import TrackLabel
@@ -118,7 +117,7 @@ def read_shown_frames(
         read_row_groups(folder / "detections.parquet", found, at_once=_AT_ONCE),
         strict=True,
     )
-    for frames, detections in read_ahead(groups, count=1):
+    for frames, detections in groups:
         plain = [frames[name].to_pylist() for name in wanted[:-1]]
         keys = list(zip(*plain[:2], strict=True))
         boxes = _boxes(keys, shown, detections, visible=visible)
