@@ -113,13 +113,18 @@ def test_bad_recordings_are_named_and_the_others_complete(
 
 
 def test_plan_progress_and_closing_table(shapecat: Run, recordings: Path, tmp_path: Path) -> None:
-    options = ("--out", tmp_path, "--end", 0.1, "--no-rrd", "--jobs", 1)
-    first = shapecat("process", recordings, *options, "--progress", "jsonl")
-    again = shapecat("process", recordings, *options, "--progress", "plain")
+    """Events come from two processes at once."""
+    options = ("--out", tmp_path, "--end", 0.1, "--no-rrd")
+    first = shapecat("process", recordings, *options, "--jobs", 2, "--progress", "jsonl")
+    again = shapecat("process", recordings, *options, "--jobs", 1, "--progress", "plain")
 
     events = [json.loads(line) for line in first.stderr.splitlines()]
     assert events[0]["event"] == "plan"
     assert events[0]["recordings"] == 4
+    assert {e["folder"] for e in events if e["event"] == "ended"} == {
+        str(tmp_path / name) for name in ALL_DONE
+    }
+    assert states(tmp_path) == ALL_DONE
     ended = [event for event in events if event["event"] == "ended"]
     assert sorted(event["state"] for event in ended) == ["complete"] * 3 + ["failed"]
     assert {e["recording"] for e in events if e["event"] == "progress"} <= {
