@@ -111,7 +111,7 @@ def process(job: Job, observe: Observer = ignore, *, cores: int = 1) -> Summary:
 
 
 def _revise(work: Work) -> None:
-    """Look again at the frames that disagree with the rest; warn if most have no plane."""
+    """Perceive again the frames that disagree with the rest; warn if most have no plane."""
     revise(work)
     range_m = work.job.settings.detection.max_range_m
     found = explain_missing_planes(work.recording, work.folder, work.run, range_m)
@@ -166,12 +166,7 @@ def track(folder: Path, run: RunInfo, job: Job) -> None:
     )
 
 
-def annotate(
-    folder: Path,
-    recording: Recording,
-    run: RunInfo,
-    observe: Observer = ignore,
-) -> None:
+def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer = ignore) -> None:
     """Write review.rrd and annotated.mcap from the tables and the recording."""
     settings, total = run["settings"]["outputs"], run["counts"]["frames"]
 

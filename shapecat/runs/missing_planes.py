@@ -28,7 +28,7 @@ def explain_missing_planes(
 
     Parameters
     ----------
-    folder : with the tables of frames and planes.
+    folder : with the tables of frames, planes and detections.
     run : its options select the frames.
     range_m : the range of detection, metres.
     """
@@ -63,8 +63,8 @@ def _count(folder: Path) -> tuple[int, int, set[Key]]:
         for name in ("frames", "planes", "detections")
     )
     for frames, planes, detections in zip(*tables, strict=True):
-        level = {*_keys(planes), *_keys(detections)}
-        without = [key for key in _keys(frames) if key not in level]
+        found = {*_keys(planes), *_keys(detections)}
+        without = [key for key in _keys(frames) if key not in found]
         count, bare = count + frames.num_rows, bare + len(without)
         first += without[: _FRAMES - len(first)]
     return count, bare, set(first)

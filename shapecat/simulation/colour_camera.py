@@ -133,7 +133,15 @@ def _colour_in(
     """Write the colours (h, w, 3) of the pixels that rays hit: two-tone bands and fine grain.
 
     The texture uses only basic arithmetic, no sines, so that images are equal on every machine.
-    ``turns`` (k, 3, 3) and ``shifts`` (k, 3) lead from the camera to the frame of each texture.
+
+    Parameters
+    ----------
+    near, owners, cosine : the rendered image: inverse depth (1/m), number of the object, -1 for
+        none, and cosine of the angle of incidence.
+    rows, columns : (h, w) the pixel of that image to show in each pixel of ``colours``.
+    intrinsics : fx, fy, cx, cy of the rendered image, pixels.
+    turns, shifts : (k, 3, 3) and (k, 3) from the camera to the frame of each texture, metres.
+    textures : (k, 3, 3) from `_texture`.
     """
     fx, fy, cx, cy = intrinsics
     point = np.zeros(3)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.random import Generator
 
 from shapecat.arrays import F8
-from shapecat.geometry import compose
+from shapecat.geometry import IDENTITY, compose
 from shapecat.simulation.distractors import make_distractor
 from shapecat.simulation.footprints import Footprint, footprint, inside, overlap
 from shapecat.simulation.mesh import Mesh
@@ -25,7 +25,6 @@ _WIDEST_M = 0.42
 _BEARERS = {"box", "can"}
 _SMALLEST_TOP_M = 0.035
 _EDGE_M = 0.01
-_STILL = Pose(np.eye(3), np.zeros(3))
 
 
 class Piece(NamedTuple):
@@ -51,7 +50,7 @@ def make_piece(category: str, rng: Generator, *, manner: str | None = None) -> P
     else:
         kind, mesh = category, make_object(category, rng)
     wanted = manner or _draw_manner(category, rng)
-    rest = Rest(_STILL, "upright")
+    rest = Rest(IDENTITY, "upright")
     if wanted != "upright" and category not in {"ball", "unknown"}:
         rest = choose_rest(rests(mesh), wanted, rng) or rest
     return Piece(category, kind, mesh, rest)
@@ -164,7 +163,7 @@ class Layout:
     def _drawn_turn(self, place: F8) -> Pose:
         """Return a random turn about z that moves the origin to ``place`` (3,)."""
         angle = self._rng.uniform(0, 2 * np.pi)
-        return turn_about_z(_STILL, angle, np.round(place, 6))
+        return turn_about_z(IDENTITY, angle, np.round(place, 6))
 
     def _fits(self, here: Footprint, support: Support) -> bool:
         on_board = here.low < support.height + 1e-4

@@ -32,7 +32,7 @@ _LABELS = "labels"
 """Name of the resource beside a page that holds the labels of its run."""
 _LARGEST_BODY = 1 << 16
 _PATIENCE_S = 30
-_HEED_S = 0.05
+_POLL_S = 0.05
 """Longest time until the server notices that it should stop."""
 _HEADERS = {
     "Cache-Control": "no-store",
@@ -205,7 +205,7 @@ def serve_reports(reports: Reports, *, port: int = 0) -> Iterator[str]:
         msg = f"--port {port}: {error.strerror or error}"
         raise ConfigError(msg) from error
     server.site = _Site(reports)
-    thread = threading.Thread(target=server.serve_forever, args=(_HEED_S,), daemon=True)
+    thread = threading.Thread(target=server.serve_forever, args=(_POLL_S,), daemon=True)
     thread.start()
     try:
         yield f"http://{_HOST}:{server.server_address[1]}/{server.site.token}/{server.site.start}"
