@@ -30,7 +30,7 @@ from .render import print_json, progress_bars
 def evaluate(
     *, dataset: Path, model: Path | None, page: Path | None, baselines: Path | None, as_json: bool
 ) -> None:
-    """Measure a model on labelled views of objects.
+    """Evaluate a model on labelled views of objects.
 
     Print accuracy, confusion matrix, calibration error and novelty detection, and the accuracy
     after fusing 3, 10 and 30 views of an instance. DATASET is laid out as for `shapecat train`.
@@ -40,7 +40,7 @@ def evaluate(
     forest        random forest on shapecat's descriptor
     linear        logistic regression on shapecat's descriptor
     pnn           probabilistic neural network on shapecat's descriptor
-    forest words  linear classifiers on the leaves of a forest (Mueller 2012)
+    forest words  method of the thesis: linear classifiers on the leaves of a forest
     D2            random forest on the distribution of point distances
     ESF-like      random forest on distributions of distances, areas and angles
 

@@ -98,7 +98,7 @@ def rehearse() -> None:
 
 
 def compile_all(begin: Callable[[], None] = lambda: None, *, cores: int = 2) -> float:
-    """Compile the kernels in other processes, unless they are compiled; return the seconds taken.
+    """Compile the kernels in other processes unless that is done; return the seconds it took.
 
     Only one process at a time compiles; others wait for it.
 
@@ -162,7 +162,7 @@ def _rehearse(cores: int) -> None:
 
 
 def _uncollected(rehearsal: Callable[[], object]) -> None:
-    """Compile in a short-lived process without garbage collection, which saves a twelfth."""
+    """Compile without garbage collection, in a short-lived process; saves a twelfth of the time."""
     gc.disable()
     rehearsal()
 
@@ -185,7 +185,7 @@ def main(words: Sequence[str] | None = None) -> None:
     ------
     SystemExit : there are arguments.
     """
-    about = "Compile the kernels of perception ahead of time, unless they are compiled."
+    about = "Compile the kernels of perception ahead of time, unless that is already done."
     argparse.ArgumentParser("python -m shapecat.rehearsal", description=about).parse_args(words)
     ended = threading.Event()
 

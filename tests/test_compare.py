@@ -307,7 +307,7 @@ FIGURES = [
     ["single views", "54.3 %", "before fusion over the track"],
     ["calibration error", "0.068", "ECE of single views; 0 is perfect"],
     ["box IoU", "0.457", "mean of 66 pairs, in 3D"],
-    ["IDF1", "0.711", "how long identities are kept"],
+    ["IDF1", "0.711", "consistency of identities over time"],
     ["MOTA", "0.622", "14 misses, 1 false positive, 2 identity switches"],
     ["HOTA", "0.533", "detection 0.444, association 0.356"],
 ]  # fmt: skip
@@ -705,7 +705,7 @@ def test_kitti_boxes_come_back_from_a_tilted_camera(
 
 
 def test_types_of_kitti_are_the_categories_of_the_run(run: Path) -> None:
-    """A type cannot hold blanks, so that an underscore may be either."""
+    """A type cannot hold spaces, so an underscore may be either."""
     table = run / "tracks.csv"
     text = table.read_text().replace("1,cup,0.9,", "1,cup,0.9,wine_glass")
     table.write_text(text.replace("2,can,0.9,", "2,can,0.9,tea pot"))

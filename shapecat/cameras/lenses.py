@@ -63,7 +63,7 @@ def undistorted_rays(camera: Camera, model: str, coefficients: Sequence[float]) 
     u, v = np.meshgrid(np.arange(camera.width), np.arange(camera.height))
     seen = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy], axis=-1)
     rays = seen.copy()
-    with np.errstate(all="ignore"):  # a hostile lens diverges: found below
+    with np.errstate(all="ignore"):  # absurd coefficients diverge: rejected below
         for _ in range(_ROUNDS):
             rays += seen - distort(rays, model, coefficients)
         error = np.abs(distort(rays, model, coefficients) - seen) * (camera.fx, camera.fy)

@@ -122,8 +122,8 @@ def _splat(
 def _list_beside(depth: F4, pixels: U4, parallax: float) -> U4:
     """Return the sparse pixels outside objects that may hide an object or lie beside one.
 
-    A near and a far point that one camera sees in the same pixel are apart in the other by the
-    parallax: focal length times distance of the cameras times difference of the inverse depths.
+    A near and a far point in the same pixel of one camera are separated in the other by the
+    parallax: focal length times baseline times the difference of the inverse depths.
     """
     rows, columns = (depth.shape[0] - 1) // _SPARSE + 1, (depth.shape[1] - 1) // _SPARSE + 1
     own = np.zeros((rows, columns), np.bool_)

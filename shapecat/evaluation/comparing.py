@@ -76,7 +76,7 @@ class Comparison:
     kind : kind of the reference, in words.
     figures : metrics by name, plain values; None if they cannot be computed.
     rows : all objects of all compared frames.
-    pictures : the frames that differ most, in the order of time.
+    pictures : the frames that differ most, in temporal order.
     notes : remarks for the reader.
     """
 

@@ -133,7 +133,7 @@ def _tracking_rows(tracking: dict[str, Any]) -> list[_Row]:
         f"association {_text(tracking['association_accuracy'])}"
     )
     return [
-        ("IDF1", _text(tracking["idf1"]), "how long identities are kept"),
+        ("IDF1", _text(tracking["idf1"]), "consistency of identities over time"),
         ("MOTA", _text(tracking["mota"]), errors),
         ("HOTA", _text(tracking["hota"]), parts),
     ]

@@ -70,7 +70,7 @@ def judge_identities(frames: Iterable[SeenTogether], *, threshold: float = 0.5) 
 
     Parameters
     ----------
-    frames : the frames in the order of time.
+    frames : the frames in temporal order.
     threshold : lowest similarity of a pair that counts as the same object, for MOTA and IDF1; HOTA
         averages over thresholds from 0.05 to 0.95.
     """

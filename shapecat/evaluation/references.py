@@ -29,7 +29,7 @@ def open_reference(path: Path, categories: Sequence[str] = ()) -> Reference:
     ----------
     path : a run folder; a KITTI folder, which has a folder ``label_2``; a JSON file of `shapecat
         simulate` or COCO; or a simulated recording with its ground truth beside it.
-    categories : those of the run to compare, which show where a KITTI type has ``_`` for a blank.
+    categories : those of the run to compare; they show which ``_`` in a KITTI type are spaces.
 
     Raises
     ------

@@ -44,7 +44,12 @@ class CocoLabels(Reference):
         self.tracked = bool(items) and all(_track_of(item) is not None for item in items)
 
     def at(self, key: Key, stamp_ns: int) -> Labelling | None:
-        """Return the objects of a frame; None if the labels lack this frame."""
+        """Return the objects of a frame; None if the labels lack this frame.
+
+        Raises
+        ------
+        RecordingError : the image size or a mask is invalid.
+        """
         image = find_frame(self._images, key, stamp_ns)
         if image is None:
             return None

@@ -25,8 +25,8 @@ class KittiLabels(Reference):
     without it, the file's number is the frame number. Boxes are in the rectified camera frame, and
     the rotation in ``P2`` turns them into the sensor frame.
 
-    A type cannot hold blanks. It stands for the first of ``categories`` that is written this way;
-    in any other type, each ``_`` is a blank.
+    A type cannot hold spaces. It stands for the first of ``categories`` that is written this way;
+    in any other type, each ``_`` is a space.
     """
 
     kind = "KITTI labels"

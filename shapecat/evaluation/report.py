@@ -57,7 +57,7 @@ class Report:
     rejected_known : fraction of the known shapes with a novelty above 1.
     skipped : number of views with too few points for a surface.
     by_distance, by_points, by_elevation : (range, views, accuracy) over the distance in metres, the
-        number of voxels, and the angle by which the sensor looks down.
+        number of voxels, and the elevation of the sensor in degrees.
     fused : accuracy after fusing several views; empty if no object has three views.
     baselines : results of other classifiers; empty unless requested.
     """

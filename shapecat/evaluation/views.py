@@ -39,7 +39,7 @@ class DescribedViews(NamedTuple):
     distances : (n,) distance from the sensor, metres.
     seconds : (n,) time from points to descriptor.
     skipped : number of views with too few points for a surface, which are left out.
-    elevations : (n,) angle by which the sensor looks down, degrees; may be empty.
+    elevations : (n,) elevation of the sensor as seen from the object, degrees; may be empty.
     functions : (n, f) shape distributions from `shapecat.learning.shape_functions`; may
         be empty.
     """

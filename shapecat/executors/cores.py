@@ -17,7 +17,7 @@ def usable_cores() -> int:
 
 
 def share_cores(jobs: int | None, recordings: int) -> tuple[int, int]:
-    """Return how many recordings to process at once, and how many frames of each at once.
+    """Return the number of recordings, and of frames in each, to process at the same time.
 
     The product does not exceed the usable cores, unless ``jobs`` does.
 

@@ -1,8 +1,8 @@
 """Growing boosted trees on binned features: gradient boosting with the cross-entropy loss.
 
 Source: Friedman 2001, algorithm 6 (one tree per category and round, on the residual of the
-category's posterior); leaf values and gains from second derivatives: Chen and Guestrin 2016, eq. 5,
-7.
+category's posterior); leaf values and gains from second derivatives: Chen and Guestrin 2016, eqs. 5
+and 7.
 """
 
 from typing import NamedTuple

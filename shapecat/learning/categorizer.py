@@ -52,7 +52,7 @@ class Categorizer(Record):
     known_descriptors : (v, d) standardised descriptors of some training views, which are the
         negative examples for new categories.
     known_category : (v,) index of the logit of each of these views.
-    notes : how the model was made; plain JSON values.
+    notes : origin of the model and its training settings; plain JSON values.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""What the dictionaries of trees have in common while they are trained with scikit-learn."""
+"""Base class of the tree dictionaries, as scikit-learn transformers for training."""
 
 from typing import Any
 

@@ -29,7 +29,9 @@ def growing_options(out: Path) -> Callable[[Callable[..., Any]], Callable[..., A
     options = (
         click.option("--seed", default=0, show_default=True, help="Seed of the random generator."),
         click.option("--jobs", default=2, show_default=True, help="Number of processes."),
-        click.option("--out", default=out, type=click.Path(path_type=Path), help="Where to write."),
+        click.option(
+            "--out", default=out, type=click.Path(path_type=Path), help="Path to write to."
+        ),
     )
 
     def add(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -57,7 +57,7 @@ def judge(
     Parameters
     ----------
     sets : the sets named in `SETS`.
-    studies : whether to run the studies of the method's parts.
+    studies : whether to run the ablation studies.
     meshes : folder of meshes to evaluate on; None for none.
     recorded : folders of labelled recordings to evaluate on.
     """
@@ -205,7 +205,7 @@ def _fused_table(tracks: dict[str, Simulated], model: Categorizer) -> Table:
 def _studies(
     train: Simulated, judged: dict[str, Simulated], model: Categorizer, seed: int, jobs: int
 ) -> list[Table]:
-    """Return tables that show what each part of the method contributes."""
+    """Return the tables of the ablation studies."""
     known = {
         name: s.where(clear_views(s) & (s.views.labels != UNKNOWN)) for name, s in judged.items()
     }

@@ -107,7 +107,7 @@ class Pairs(NamedTuple):
 @click.option("--share", default=1.0, show_default=True, help="Fraction of the scenes to use.")
 @growing_options(Path(learned.__file__).with_name(learned.FILE))
 def main(*, share: float, seed: int, jobs: int, out: Path) -> None:
-    """Simulate scenes, collect pairs of segments, and grow and write the trees."""
+    """Train the trees that decide which segments to merge, on simulated scenes."""
     pairs = collect(_SERIES, share, jobs)
     write_trees(out, grow(*pairs, _GROWTH, seed), PAIR_FEATURES)
     click.echo(f"{len(pairs.same)} pairs, {pairs.same.mean():.0%} of one object; {out}")

@@ -1,4 +1,4 @@
-"""Studies for the model card: what each part of the method contributes."""
+"""Ablation studies for the model card: the contribution of each part of the method."""
 
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -103,8 +103,8 @@ def compare_surfaces(
 ) -> list[tuple[str, ...]]:
     """Compare methods of surface reconstruction, each with a model of its own.
 
-    Instability is how far the descriptor moves between two frames, relative to the mean distance
-    between views of different categories.
+    Instability is the mean change of the descriptor between two frames, relative to the mean
+    difference between views of different categories.
 
     Returns
     -------

@@ -32,20 +32,22 @@ _MORE: dict[str, Any] = {"rounds": 150, "rate": 0.06}
 
 
 @click.command()
-@click.option("--worlds", default=8000, show_default=True, help="Number of training tables.")
-@click.option("--seed", default=0, show_default=True, help="Seed of the training.")
+@click.option("--worlds", default=8000, show_default=True, help="Number of training scenes.")
+@click.option("--seed", default=0, show_default=True, help="Seed of the random generator.")
 @click.option("--jobs", default=2, show_default=True, help="Number of processes.")
 @click.option("--out", default=_HERE, type=click.Path(path_type=Path), help="Folder to write to.")
 @click.option(
-    "--after", type=click.Path(path_type=Path), help="Model whose trees are kept and extended."
+    "--after",
+    type=click.Path(path_type=Path),
+    help="Model to extend: its trees stay, more are added.",
 )
-@click.option("--studies/--no-studies", default=True, help="Run the studies of the method's parts.")
-@click.option("--meshes", type=click.Path(path_type=Path), help="Folder of meshes to evaluate on.")
+@click.option("--studies/--no-studies", default=True, help="Run the ablation studies.")
+@click.option("--meshes", type=click.Path(path_type=Path), help="Folder of meshes for evaluation.")
 @click.option(
     "--recorded",
     multiple=True,
     type=click.Path(path_type=Path),
-    help="Folder of labelled recordings to evaluate on. Repeatable.",
+    help="Folder of labelled recordings for evaluation. Repeatable.",
 )
 def main(
     *,

@@ -43,7 +43,7 @@ def write_kitti(
 
     Colour images are written to image_2/ as undistorted PNG. ``frames.csv`` lists the frame of
     each number. Points are in the level frame of the sensor (x forward, y left, z up), with
-    intensity 0. The type is the category, with blanks replaced by ``_``.
+    intensity 0. The type is the category, with spaces replaced by ``_``.
     """
     for name in ("label_2", "calib", "velodyne"):
         (out / name).mkdir()
@@ -121,7 +121,7 @@ def _write_image(out: Path, number: int, frame: Frame, coloured: Coloured | None
 
 
 def kitti_type(category: str) -> str:
-    """Return the KITTI type of a category: a type cannot hold blanks."""
+    """Return the KITTI type of a category: a type cannot hold spaces."""
     return category.replace(" ", "_")
 
 

@@ -164,7 +164,7 @@ class Appender:
         return number
 
     def add_message(self, channel: int, log_time: int, sequence: int, data: bytes) -> None:
-        """Add a message."""
+        """Add a message; ``log_time``, in nanoseconds, is also its publish time."""
         chunk = self._chunk
         chunk.entries[channel] += (log_time, len(chunk.data))
         length = _MESSAGE.size - _RECORD.size + len(data)

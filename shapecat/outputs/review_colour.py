@@ -22,7 +22,7 @@ def true_colours(
 ) -> U4:
     """Return the colours (n,) of points, 0xRRGGBBAA; 0 if the colour camera does not see them.
 
-    Each channel has 32 levels, which suffice: the noise of finer ones would double the file.
+    Each channel is quantised to 32 levels; finer levels would store noise and double the file.
 
     Parameters
     ----------

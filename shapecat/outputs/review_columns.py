@@ -46,7 +46,7 @@ class Columns:
         Parameters
         ----------
         draw : converts the rows of this entity to columns.
-        size : how many numbers the row keeps in memory.
+        size : number of values that the row keeps in memory.
         """
         held = self._held.setdefault(entity, _Held(draw))
         held.at.append(at)

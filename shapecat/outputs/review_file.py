@@ -22,7 +22,7 @@ _PATIENCE_S = 60.0
 
 
 class ReviewFile:
-    """Copies Rerun's output from a pipe to a file, in a thread; drops it after an error."""
+    """Copies Rerun's output from a pipe to a file, in a thread; after an error, discards it."""
 
     def __init__(self, stream: rr.RecordingStream, file: IO[bytes]) -> None:
         """Connect ``stream`` to ``file``."""

@@ -37,7 +37,7 @@ class Upright:
     vector : (3,) the up direction in the sensor frame that the user gave, or None.
     sources : ``tf`` and ``imu``, in the order in which they are tried; empty with a vector.
     warnings : for the user.
-    dropped : maps each topic whose given up direction is ignored to the source of the direction.
+    dropped : for each topic whose given up direction is ignored, the source of that direction.
     """
 
     transforms: TransformBuffer

@@ -45,7 +45,7 @@ def describe_recording(path: Path) -> dict[str, Any]:
 
 
 def _uses(recording: Recording, streams: Mapping[str, Stream]) -> dict[str, str]:
-    """Return what each topic is used for; unused topics are absent."""
+    """Return the use of each topic, in words; unused topics are absent."""
     uses = {stream.info_topic: "camera" for stream in streams.values() if stream.info_topic}
     for topic, stream in streams.items():
         uses[topic] = f"{stream.kind} stream"

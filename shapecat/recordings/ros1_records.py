@@ -184,7 +184,7 @@ def expand(record: Record, data: bytes) -> tuple[memoryview, str]:
 
     Returns
     -------
-    The decompressed data, and why the rest of the chunk is missing; empty if it is complete.
+    The decompressed data, and the reason why the rest is missing; empty if the chunk is complete.
     """
     method = record.fields.get("compression", b"").decode("latin-1")
     if method == "none":

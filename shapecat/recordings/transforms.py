@@ -63,8 +63,8 @@ class TransformBuffer:
 
     Parameters
     ----------
-    tolerance_ns : how long before its first and after its last sample a transform is assumed to be
-        constant, nanoseconds.
+    tolerance_ns : time before its first and after its last sample during which a transform is
+        assumed to be constant, nanoseconds.
     """
 
     def __init__(self, *, tolerance_ns: int = 100_000_000) -> None:

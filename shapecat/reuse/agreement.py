@@ -64,7 +64,7 @@ def _compare(
     turn: F8,
     shift: F8,
 ) -> tuple[int, int, float]:
-    """Return the number of points to compare, how many agree, and the sum of their differences."""
+    """Return the numbers of points compared and in agreement, and the sum of their differences."""
     fx, fy, cx, cy = camera
     gx, gy, ax, ay = other_camera
     width = depth.shape[1]

@@ -38,7 +38,7 @@ class Transferred(NamedTuple):
 
 
 class Missed(NamedTuple):
-    """A label that could not be transferred, and why."""
+    """A label that could not be transferred, and the reason."""
 
     old_track: int
     label: str
@@ -229,6 +229,6 @@ def _translate(
 
 
 def _why(track: int, whole: int, matches: Matches) -> str:
-    """Return why the whole of a track has no match."""
+    """Return the reason why the whole that a track belongs to has no match."""
     reason = matches.reasons.get(whole, "nothing was found there")
     return reason if track == whole else f"track {whole}, which it is merged with: {reason}"

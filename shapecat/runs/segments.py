@@ -137,7 +137,7 @@ def _cut(tables: _Tables, count: int) -> tuple[_Tables, _Tables]:
 
 
 def write_segment(segment: Path, name: str, table: pa.Table) -> None:
-    """Write a segment's rows of a table uncompressed: they are soon read again, once or twice."""
+    """Write a segment's part of a table; uncompressed, because it is soon read again."""
     with (
         pa.OSFile(str(_part(segment, name)), "wb") as sink,
         pa.ipc.new_file(sink, table.schema) as writer,

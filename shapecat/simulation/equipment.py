@@ -98,7 +98,10 @@ def make_resting_arms(
 
 
 def _on_support(uv: ArrayLike, camera: Pose, intrinsics: Camera, height: float) -> F8:
-    """Return where a pixel, in shares of the image, shows a support, at most 2 m away."""
+    """Return the point (3,) at the height of a support that a pixel shows, at most 2 m away.
+
+    ``uv`` is column and row of the pixel, as fractions of the image size.
+    """
     u, v = np.asarray(uv, float) * [intrinsics.width, intrinsics.height]
     ray = [(u - intrinsics.cx) / intrinsics.fx, (v - intrinsics.cy) / intrinsics.fy, 1.0]
     ray = camera.rotation @ ray

@@ -91,7 +91,10 @@ def make_shelf(
 
 
 def make_rack(rng: Generator, supports: Sequence[Support]) -> list[Support]:
-    """Replace the sides of the shelf among some supports by posts; keep every third back."""
+    """Return shelf ``supports`` with posts instead of the sides.
+
+    The back is kept with probability 1/3.
+    """
     points = np.concatenate([s.mesh.vertices for s in supports if s.name.startswith("board")])
     wide = rng.uniform(0.012, 0.05, 2)
     place = np.abs(points[:, :2]).max(axis=0) + rng.uniform(-0.7, 0.5) * wide
@@ -127,7 +130,7 @@ def make_bin(rng: Generator) -> tuple[Support, list[Support]]:
 
 
 def make_tote(rng: Generator, supports: Sequence[Support]) -> list[Support]:
-    """Lean the sides of the bin among some supports outwards; add a rim to every second bin."""
+    """Return bin ``supports`` whose sides lean outwards; with probability 1/2, they have a rim."""
     bottom = next(support for support in supports if support.name == "bin")
     sides = [support for support in supports if support.name in _SIDES]
     points = np.concatenate([side.mesh.vertices for side in sides])
@@ -148,7 +151,10 @@ def _rim(half: F8, wide: float, height: float) -> Iterator[Support]:
 
 
 def _widened(mesh: Mesh, half: F8, slope: float, height: float) -> Mesh:
-    """Return a mesh that, around a bin of half size ``half`` (2,), widens above ``height``."""
+    """Return a mesh whose horizontal extent grows with ``slope`` above ``height``, metres.
+
+    ``half`` (2,) are half the length and width of the bin about the z axis.
+    """
     points = mesh.vertices.astype(np.float64)
     points[:, :2] *= 1 + slope * np.maximum(points[:, 2:] - height, 0) / half
     return Mesh(points.astype(np.float32), mesh.triangles)

@@ -19,7 +19,7 @@ class Filming(NamedTuple):
     rate_hz: float
 
     def times(self) -> F8:
-        """Return the time of each frame since the first, seconds."""
+        """Return the times (frames,) since the first frame, seconds."""
         return np.arange(self.frames) / self.rate_hz
 
 
@@ -58,7 +58,7 @@ def walk(
     ----------
     target : (3,) metres, world frame; the camera is on the side of negative y.
     distance : mean distance to the target, metres.
-    elevation : mean angle by which the camera looks down, degrees.
+    elevation : mean angle of the line of sight below the horizontal, degrees.
     sweep : half the angle of the arc, degrees.
     """
     distance, elevation, sweep = (_drawn(rng, value) for value in (distance, elevation, sweep))
@@ -104,7 +104,7 @@ def stroll(
     ----------
     target : (3,) middle of the counter, metres; the camera is on the side of negative y.
     distance : distance to the counter, metres.
-    elevation : angle by which the camera looks down, degrees.
+    elevation : angle of the line of sight below the horizontal, degrees.
     reach : distance from the middle of the counter to the turning points, metres.
     """
     distance, elevation, reach = (_drawn(rng, value) for value in (distance, elevation, reach))
@@ -135,7 +135,7 @@ def hold(
     target : (3,) metres, world frame; the camera is on the side of negative y.
     frames : number of poses.
     distance : distance to the target, metres.
-    elevation : angle by which the camera looks down, degrees.
+    elevation : angle of the line of sight below the horizontal, degrees.
     """
     up = np.radians(elevation)
     eye = target + distance * np.array([0, -np.cos(up), np.sin(up)])
@@ -157,7 +157,7 @@ def scattered(
     target : (3,) metres, world frame.
     count : number of poses.
     distance : range of the distance to the target, metres.
-    elevation : range of the angle by which the camera looks down, degrees.
+    elevation : range of the angle of the line of sight below the horizontal, degrees.
     """
     poses = []
     for _ in range(count):

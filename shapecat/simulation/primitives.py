@@ -139,7 +139,7 @@ def rounded_box(size: ArrayLike, *, radius: float = 0.0, bulge: float = 0.0, fin
     ----------
     size : (3,) metres.
     radius : radius of the edges, metres; at most 0.45 of half the smallest size.
-    bulge : how far the middle of each side face bulges outward, metres.
+    bulge : outward displacement of the middle of each side face, metres.
     fine : number of mesh cells along the flat part of a face.
     """
     half = np.asarray(size, np.float64) / 2

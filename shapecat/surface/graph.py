@@ -26,7 +26,7 @@ def link(cloud: Cloud, gas: Gas, count: int, share: float) -> Bool:
     3. Link two neurons if the gas linked them, if they are the two nearest to some point
        (competitive Hebbian learning, Martinetz and Schulten 1994), or if they are among the three
        nearest to some point and not far apart. With the links of the gas alone, a third of the
-       neurons is in no triangle.
+       neurons are in no triangle.
     4. Remove components with less than a share of the points, but never the largest.
     5. Connect the remaining components where they are nearest to each other.
 

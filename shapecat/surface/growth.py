@@ -36,12 +36,12 @@ class Cloud(NamedTuple):
 
 
 class Rates(NamedTuple):
-    """How far neurons move, and how long edges last.
+    """Learning rates of the neurons, and the maximum age of edges.
 
     Attributes
     ----------
-    winner, neighbour : epsilon_b and epsilon_n for the first signal: the share of the distance to
-        it that the winner and its neighbours move.
+    winner, neighbour : epsilon_b and epsilon_n at the first signal: the fractions of the distance
+        to the signal by which the winner and its neighbours move.
     oldest : age above which an edge is removed (a_max).
     """
 
@@ -146,7 +146,7 @@ def grow_fritzke(
     target : number of neurons to grow to.
     signals : number of signals.
     interval : signals between insertions (lambda).
-    rates : how far neurons move, and how long edges last.
+    rates : learning rates, and the maximum age of edges.
     """
     points = cloud.x.size
     px, py, pz = cloud

@@ -1,7 +1,7 @@
 """The two inner loops of a neural gas, written as instructions on vectors of 16 numbers.
 
 Numba's loop vectoriser checks for overlapping arrays and handles remainders on each call, which
-costs more than the work itself in loops of five rounds. Written as vector instructions of LLVM,
+costs more than the work itself in loops of five iterations. Written as vector instructions of LLVM,
 they are two to four times faster. LLVM splits the vectors on machines with narrower ones.
 """
 

@@ -34,7 +34,7 @@ class Gas(NamedTuple):
     x, y, z : (n,) positions; `FAR` where there is no neuron.
     error : (n,) accumulated squared distances.
     degree : (n,) numbers of edges.
-    wins : (n,) how often each neuron was the nearest.
+    wins : (n,) number of signals for which each neuron was the nearest.
     born : (n * n,) for the edge i-j, element ``i * n + j`` is the sum ``wins[i] + wins[j]`` when it
         was last refreshed; `ABSENT` without an edge. The age of an edge is the growth of that sum,
         so one increment ages all edges of the winner, and its neighbours are in one row.

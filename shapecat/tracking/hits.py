@@ -148,7 +148,7 @@ class Hits:
         return np.isin(self.topics[rows], self.topics[self.rows[member]])
 
     def seen_with(self, member: I4, other: I4) -> I4:
-        """Return the hits of another track in topics with hits of the track ``member``."""
+        """Return the hits ``other`` whose topics also have hits of the track ``member``."""
         return other if len(self.names) == 1 else other[self.sees(member, self.rows[other])]
 
 

@@ -51,7 +51,7 @@ class Track(Record):
     id : number of the track in the recording, from 1, in order of birth.
     topics : (k,) stream of each frame: one, or several that were tracked together.
     hits : number of rows with a detection.
-    frames : (k,) numbers of the frames in their streams, in the order of time.
+    frames : (k,) numbers of the frames in their streams, in temporal order.
     stamps_ns : (k,) times of the frames.
     detections : (k,) number of the detection within its frame, -1 where the track coasts.
     centers : (k, 3) metres, in the coordinate frame of `FrameDetections.centers`.

@@ -240,11 +240,11 @@ def _cut(seen: SeenFrame, window: Window) -> Image.Image:
 
 
 def worth_of(seen: SeenFrame, number: int) -> float:
-    """Return how well a frame shows one of its objects, from 0 to 1.
+    """Return a score, from 0 to 1, for the view of an object in a frame.
 
-    The score is the product of: the size, the square root of the mask area, saturating at 160
-    pixels; the squared share of the outline off the image border; the squared share of the outline
-    that is not occluded; and the sharpness, below 1, or 0.5 without a colour image.
+    The score is the product of four factors: the size (square root of the mask area, saturating at
+    160 pixels); the fraction of the outline off the image border, squared; the unoccluded fraction
+    of the outline, squared; and the sharpness (below 1; 0.5 without a colour image).
 
     Parameters
     ----------
