@@ -147,5 +147,5 @@ def _require_own_names(runs: Sequence[Path]) -> None:
     for run in runs:
         other = names.setdefault(run.resolve().name, run)
         if other is not run:
-            msg = f"{other} and {run} have the same name; export them to different --out"
+            msg = f"{other} and {run} have the same name; export them to different folders (--out)"
             raise OutputError(msg)

@@ -41,8 +41,8 @@ The views of the test set with the most confident wrong labels. Colour shows the
 """
 _ANEW = "`make model` (`python -m shapecat.models.training`)"
 _AFTER = """`python -m shapecat.models.training --after`
-on top of model `{after}`, whose trees it keeps (the studies of the method's parts
-were made with that model),"""
+on top of model `{after}`, whose trees it keeps (the ablation
+studies used that model),"""
 
 
 @dataclass(frozen=True)

@@ -154,7 +154,7 @@ def correct_label(folder: Path, track: int, label: str, *, seen: str) -> str:
     with holding(folder):
         rows = {row.track: row for row in read_track_table(folder / "tracks.csv").rows}
         if track not in rows:
-            return f"there is no #{track}"
+            return f"there is no track #{track}"
         if rows[track].label != seen:
             return f"its label is now {rows[track].label!r}"
         return relabel(folder, {track: label}).get(track, "")

@@ -13,7 +13,7 @@ function known(name) {
 function problem(track, label) {
   const merge = label.match(MERGE);
   if (merge && merge[1] === track) return `A track cannot be merged with itself.`;
-  if (merge && !labels.has(merge[1])) return `There is no #${merge[1]}.`;
+  if (merge && !labels.has(merge[1])) return `There is no track #${merge[1]}.`;
   if (!merge && /^merged? /i.test(label)) return "Write: merge with #3";
   if (!merge && label && !/^\p{L}/u.test(label)) return "A name begins with a letter.";
   if (/[\/\\:*?"<>|,;]/.test(label)) return "Use only letters, digits, spaces and - _ . + & ' ( )";

@@ -174,7 +174,7 @@ def _chip(name: str, count: int) -> str:
 
 
 def _next_step(finished: FinishedRun, *, served: bool) -> str:
-    """Return the instructions to apply corrections to the other outputs."""
+    """Return instructions for writing the corrections to the other outputs."""
     folder = shlex.quote(str(finished.folder))
     if served:
         text, command = "Corrections are already in tracks.csv.", f"shapecat annotate {folder}"
@@ -182,7 +182,7 @@ def _next_step(finished: FinishedRun, *, served: bool) -> str:
         text = "Download tracks.csv first."
         command = f"shapecat annotate {folder} --labels tracks.csv"
     return (
-        f"{text} Apply them to annotated.mcap, review.rrd and all exports with "
+        f"{text} To write the corrections to annotated.mcap, review.rrd and later exports, run "
         f"<code>{escape(command)}</code>"
     )
 
