@@ -158,7 +158,12 @@ def _finished(
 
 
 def track(folder: Path, run: RunInfo, job: Job) -> None:
-    """Track the detections and fuse their posteriors; write tracks.parquet and tracks.csv."""
+    """Track the detections and fuse their posteriors; write tracks.parquet and tracks.csv.
+
+    Raises
+    ------
+    OutputError : a table is unreadable, or cannot be written.
+    """
     from shapecat.runs.tracks import track_run  # noqa: PLC0415  loads SciPy on first use
 
     run["counts"]["tracks"] = track_run(
@@ -167,7 +172,12 @@ def track(folder: Path, run: RunInfo, job: Job) -> None:
 
 
 def annotate(folder: Path, recording: Recording, run: RunInfo, observe: Observer = ignore) -> None:
-    """Write review.rrd and annotated.mcap from the tables and the recording."""
+    """Write review.rrd and annotated.mcap from the tables and the recording.
+
+    Raises
+    ------
+    OutputError : a file cannot be written, or tracks.csv is invalid.
+    """
     settings, total = run["settings"]["outputs"], run["counts"]["frames"]
 
     def labels() -> dict[int, TrackLabel]:

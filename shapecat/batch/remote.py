@@ -46,7 +46,12 @@ class Ticket:
         return bool(self.input and self.work) and run.get("origin") == self._origin()
 
     def note(self, folder: Path) -> None:
-        """Add input and work to run.json as its ``origin``."""
+        """Add input and work to run.json as its ``origin``.
+
+        Raises
+        ------
+        OutputError : run.json is unreadable, or cannot be written.
+        """
         run = read_run(folder)
         run["origin"] = self._origin()
         write_run(folder, run)

@@ -45,7 +45,12 @@ class KittiLabels(Reference):
         self.frames = len(self._names)
 
     def at(self, key: Key, stamp_ns: int) -> Labelling | None:
-        """Return the objects of a frame; None if the labels lack this frame."""
+        """Return the objects of a frame; None if the labels lack this frame.
+
+        Raises
+        ------
+        RecordingError : a label or calibration file is missing or damaged.
+        """
         name = find_frame(self._names, key, stamp_ns)
         if name is None:
             return None

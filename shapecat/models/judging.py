@@ -60,6 +60,11 @@ def judge(
     studies : whether to run the ablation studies.
     meshes : folder of meshes to evaluate on; None for none.
     recorded : folders of labelled recordings to evaluate on.
+
+    Raises
+    ------
+    RecordingError : a mesh or a labelled recording is unreadable.
+    ModelError : the model does not know a category of the meshes or recordings.
     """
     judged = {"test": sets["test"]}
     rows = [_figures(name, report) for name, report in _parts(sets["test"], model)]

@@ -29,6 +29,7 @@ def mesh_views(
     Raises
     ------
     RecordingError : a file is not a mesh.
+    ConfigError : Open3D is not installed.
     """
     for number, path in enumerate(sorted(folder.glob("*/*.ply"))):
         label = path.parent.name

@@ -55,7 +55,7 @@ class Simulated(NamedTuple):
     sensor: np.ndarray
 
     def where(self, chosen: Bool) -> "Simulated":
-        """Return the chosen views."""
+        """Return the views that a mask (n,) selects."""
         return Simulated(
             self.views.where(chosen),
             self.manner[chosen],

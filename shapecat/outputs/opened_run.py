@@ -126,7 +126,12 @@ class RunFrame:
 
     @property
     def color(self) -> U1 | None:
-        """The colour image as recorded, (h, w, 3) uint8 red, green, blue; None if there is none."""
+        """The colour image as recorded, (h, w, 3) uint8 red, green, blue; None if there is none.
+
+        Raises
+        ------
+        MessageError : the image is damaged.
+        """
         return None if self.coloured is None else pixels_of(self.coloured.view.image)
 
     def color_mask(self, item: LabelledObject) -> Bool | None:
@@ -198,8 +203,12 @@ class Run:
     def frames(self, recording: str | Path | None = None) -> Iterator[RunFrame]:
         """Yield the frames with their points, in constant memory.
 
-        ``recording`` is its path; by default where it was processed. It must be readable, and have
-        the content that was processed; otherwise a `RecordingError` or `OutputError` is raised.
+        ``recording`` is its path; by default where it was processed.
+
+        Raises
+        ------
+        RecordingError : the recording is missing or unreadable.
+        OutputError : its content differs from what was processed.
         """
         moved = None if recording is None else Path(recording)
         with open_source(self.info, moved) as source:

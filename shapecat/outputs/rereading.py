@@ -117,7 +117,12 @@ def open_source(run: RunInfo, moved_to: Path | None = None) -> Iterator[Recordin
 
 
 def clouds_again(recording: Recording, run: RunInfo) -> Iterator[Frame]:
-    """Read the frames of a run again from its recording."""
+    """Read the frames of a run again from its recording.
+
+    Raises
+    ------
+    NoStreamError : a topic of the run is missing or not usable.
+    """
     options = run["options"]
     streams = choose_streams(recording, options["topics"])
     return frames(recording, streams, skipped=Counter(), **window_of(options))

@@ -220,7 +220,12 @@ def _missing_parents(folder: Path) -> list[Path]:
 
 
 def write_run(folder: Path, run: RunInfo) -> None:
-    """Write run.json."""
+    """Write run.json.
+
+    Raises
+    ------
+    OutputError : the file cannot be written.
+    """
     with replacing(folder / "run.json") as path:
         path.write_text(json.dumps(run, indent=1) + "\n", "utf-8")
 

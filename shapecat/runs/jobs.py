@@ -173,6 +173,10 @@ def resume(folder: Path, planned: RunInfo, source: Path, digest: Callable[[], st
     ----------
     digest : returns the digest of the recording; called only if names, sizes or times of its files
         differ.
+
+    Raises
+    ------
+    OutputError : the folder cannot be written.
     """
     with suppress(OutputError):
         run = read_run(folder)
@@ -195,7 +199,12 @@ def has_work(folder: Path) -> bool:
 
 
 def identify(run: RunInfo, content: ContentDigest) -> None:
-    """Set the digest of the input and the id of the work."""
+    """Set the digest of the input and the id of the work.
+
+    Raises
+    ------
+    RecordingError : the recording cannot be read.
+    """
     run["input"]["digest"] = run["input"]["digest"] or content.result()
     run["work"] = work_id(run)
 
@@ -217,6 +226,10 @@ def keep_labels(folder: Path, run: RunInfo, job: Job) -> None:
     """Transfer the corrected labels of the replaced results to the new ones.
 
     The table with the original labels is kept as tracks.previous.csv.
+
+    Raises
+    ------
+    OutputError : the table of the replaced results is unreadable, or a file cannot be written.
     """
     previous = job.folder / "tracks.csv"
     if job.discard_labels or not has_labels(previous):

@@ -69,7 +69,12 @@ class Transfer:
 
 
 def lost_labels(source: Path, reason: str) -> Transfer:
-    """Return the outcome if none of a run's labels can be transferred."""
+    """Return the outcome if none of a run's labels can be transferred.
+
+    Raises
+    ------
+    OutputError : the tracks.csv of ``source`` is unreadable.
+    """
     table = read_track_table(source / "tracks.csv")
     missed = (Missed(row.track, row.label, reason) for row in table.rows if row.label)
     return Transfer(table.run, (), tuple(missed))

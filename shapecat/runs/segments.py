@@ -50,7 +50,12 @@ def discard_segments(folder: Path) -> None:
 
 
 def read_segments(folder: Path) -> Iterator[tuple[pa.Table, pa.Table]]:
-    """Yield frames and planes of the first look, segment by segment."""
+    """Yield frames and planes of the first look, segment by segment.
+
+    Raises
+    ------
+    OutputError : a segment is unreadable.
+    """
     for segment in list_segments(folder / SEGMENTS):
         yield read_segment(segment, "frames"), read_segment(segment, "planes")
 

@@ -22,6 +22,10 @@ def read_frames(
     Parameters
     ----------
     skipped, needed : as for `shapecat.recordings.frames`.
+
+    Raises
+    ------
+    NoStreamError : a topic is missing or not usable.
     """
     streams = choose_streams(recording, options["topics"])
     colours = pair_colours(recording, streams, options.get("color"))
@@ -30,7 +34,12 @@ def read_frames(
 
 
 def count_frames(recording: Recording, options: Options) -> int | None:
-    """Return the approximate number of selected frames; None if it is not known in advance."""
+    """Return the approximate number of selected frames; None if it is not known in advance.
+
+    Raises
+    ------
+    NoStreamError : a topic is missing or not usable.
+    """
     if options["start_s"] is not None or options["end_s"] is not None:
         return None
     streams = choose_streams(recording, options["topics"])

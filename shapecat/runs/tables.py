@@ -145,7 +145,12 @@ Key = tuple[str, int]
 
 
 def count_rows(folder: Path, table: str) -> int:
-    """Return the number of rows of a table in a run folder."""
+    """Return the number of rows of a table in a run folder.
+
+    Raises
+    ------
+    OutputError : the table is missing or unreadable.
+    """
     with opened(folder / f"{table}.parquet") as file:
         return int(file.metadata.num_rows)
 
@@ -160,7 +165,12 @@ def write_table(path: Path, columns: dict[str, Any], schema: pa.Schema) -> None:
 def read_row_groups(
     path: Path, columns: Sequence[str] | None = None, *, at_once: int = 1
 ) -> Iterator[pa.Table]:
-    """Yield the row groups of a table of a run folder, ``at_once`` at a time."""
+    """Yield the row groups of a table of a run folder, ``at_once`` at a time.
+
+    Raises
+    ------
+    OutputError : the table is missing or unreadable.
+    """
     with opened(path) as file:
         count = file.num_row_groups
         for first in range(0, count, at_once):

@@ -61,6 +61,10 @@ def track_run(
     Returns
     -------
     The number of tracks per category.
+
+    Raises
+    ------
+    OutputError : a table of the run is unreadable, or a table cannot be written.
     """
     placed = _streams_with_poses(folder)
     frames = _read_frames(folder, len(categories), placed)

@@ -108,6 +108,11 @@ def record(
     """Write a recording of a world, as `simulate` does.
 
     ``seed`` seeds the sensor noise and names the scene in the ground truth.
+
+    Raises
+    ------
+    ValueError : the format does not exist.
+    OutputError : the recording cannot be written.
     """
     if format not in CONTAINERS:
         msg = f"no recording format {format!r}; known: {', '.join(CONTAINERS)}"

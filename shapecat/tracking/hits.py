@@ -112,7 +112,7 @@ class Hits:
         return np.where(new, view_weights(self.partial[member]), 0.0)
 
     def at(self, rows: I4) -> tuple[I4, I4]:
-        """Return the hits of frames ``rows`` and, for each, the index of its frame in ``rows``."""
+        """Return the hits (k,) of frames ``rows``, and the index in ``rows`` (k,) of each hit."""
         first, stop = self.first[rows], self.first[rows + 1]
         which = np.repeat(np.arange(len(rows)), stop - first)
         return np.arange(which.size) - (np.cumsum(stop - first) - stop)[which], which
@@ -144,7 +144,7 @@ class Hits:
         return rows, np.isin(rows, seen)
 
     def sees(self, member: I4, rows: I4) -> Bool:
-        """Return the mask of frames ``rows`` whose topics have hits of the track ``member``."""
+        """Return the mask (n,) of frames ``rows`` whose topics have hits ``member`` of a track."""
         return np.isin(self.topics[rows], self.topics[self.rows[member]])
 
     def seen_with(self, member: I4, other: I4) -> I4:

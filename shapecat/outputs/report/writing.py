@@ -69,7 +69,12 @@ class RunReport:
         )
 
     def listed(self, link: str) -> Listed:
-        """Return the entry of the run in an index; ``link`` is the address of its page."""
+        """Return the entry of the run in an index; ``link`` is the address of its page.
+
+        Raises
+        ------
+        OutputError : the tracks.csv of the run is invalid.
+        """
         finished, cards = read_finished(self.folder), self._cards(self._table)
         objects = set(finished.labels.values())  # merged tracks have the same label
         return Listed(
